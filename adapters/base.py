@@ -48,7 +48,7 @@ def open_scene(uri: str) -> Scene:
     camera_path = query.pop(CAMERA_PATH_KEY, None)
     ground_z = query.pop(GROUND_KEY, None)
     if scheme is None:
-        scheme = recognise(Path(path))
+        scheme = detect_scheme_of_path(Path(path))
     entry = SCHEMES.get(scheme)
     if entry is None:
         near = nearest_word(scheme, tuple(SCHEMES))
@@ -91,7 +91,7 @@ def _with_ground(scene: Scene, text: str) -> Scene:
     return dataclasses.replace(scene, ground_z_m=height, ground=ground, source=source)
 
 
-def recognise(path: Path) -> str:
+def detect_scheme_of_path(path: Path) -> str:
     """Return the scheme of a path by its contents."""
     _check_there(path)
     scheme = detect_scheme(path)
@@ -228,5 +228,5 @@ def _from(folder: Path, value: str) -> str:
 
 def _uri(scheme: str | None, path: str, query: dict[str, str]) -> str:
     if scheme is None and query:
-        scheme = recognise(Path(path))
+        scheme = detect_scheme_of_path(Path(path))
     return path if scheme is None else format_uri(scheme, path, query)

@@ -22,7 +22,7 @@ from augment.files.ply import SPLAT_SUFFIXES
 from augment.files.scene_file import is_scene_file, is_scene_folder
 from augment.files.sog import META, is_sog_folder
 from augment.files.streamed_sog import LOD_META
-from augment.jobs.mirror import SourceTree
+from augment.jobs.mirror import DatasetFolder
 from augment.scene import Scene
 from recipes.files import open_file
 
@@ -32,7 +32,7 @@ _KITTI_SWEEP = r"velodyne_points/data/\d+\.bin"
 _KITTI_CAMERA = r"image_\d\d/data/\d+\.(?i:png|jpg)"
 
 
-def source_tree(scene: Scene) -> SourceTree:
+def source_tree(scene: Scene) -> DatasetFolder:
     """Return the dataset from which the scene was made: the opened one, or the one that recorded
     it.
     """
@@ -58,14 +58,14 @@ def source_tree(scene: Scene) -> SourceTree:
         )
     tree = find(Path(os.path.abspath(path)), query)
     entries = None if tree.entries is None else tuple(sorted(tree.entries))
-    return SourceTree(uri, tree.root, tree.images, entries, tree.sweeps)
+    return DatasetFolder(uri, tree.root, tree.images, entries, tree.sweeps)
 
 
 _NONE = r"(?!)"  # matches nothing
 
 
 class _Found(NamedTuple):
-    """Folders of a dataset, as in SourceTree."""
+    """Folders of a dataset, as in DatasetFolder."""
 
     root: Path
     images: str

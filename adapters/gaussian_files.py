@@ -47,7 +47,7 @@ from adapters.uri import UriOptions, format_uri
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.cameras import Frame
 from augment.errors import AdapterError
-from augment.files.export import joined_gaussians
+from augment.files.export import concatenate_gaussians
 from augment.files.ply import SPLAT_SUFFIXES, SplatFile, read_splats, recentring_origin
 from augment.files.sog import META, is_sog_folder
 from augment.files.streamed_sog import LOD_META
@@ -522,7 +522,7 @@ def _read_parts(files: Sequence[Path], options: GaussianOptions) -> SplatFile:
     if len({part.sh_degree for part in moved}) > 1:
         sentence += ". Colours by direction of a lower degree are filled up with zeros"
     problems = (sentence, *(problem for part in parts for problem in part.problems))
-    return SplatFile(joined_gaussians(moved), origin, notes, problems)
+    return SplatFile(concatenate_gaussians(moved), origin, notes, problems)
 
 
 def _stand_in_sky(path: Path) -> tuple[float, float, float]:

@@ -133,7 +133,7 @@ class RayHits(NamedTuple):
     rgb: np.ndarray | None
 
 
-class TrueView(NamedTuple):
+class ExactView(NamedTuple):
     """Exact image of a camera.
 
     Attributes:
@@ -218,7 +218,7 @@ class StreetTruth:
                 rgb[surface_rays] += cover[:, None] * (SHADOW_RGB - rgb[surface_rays])
         return RayHits(distance, normal, semantic, instance, shape, rgb)
 
-    def render(self, camera: Camera) -> TrueView:
+    def render(self, camera: Camera) -> ExactView:
         """Cast a ray through every pixel centre."""
         size = (camera.height, camera.width)
         rays = camera.ray_directions(torch.float64)
@@ -228,7 +228,7 @@ class StreetTruth:
         sky = self.sky.sample(rays.float()).numpy()
         is_sky = np.isinf(hits.distance).reshape(size)
         rgb = np.where(is_sky[..., None], sky, hits.rgb.reshape(*size, 3)).astype(np.float32)
-        return TrueView(
+        return ExactView(
             rgb=rgb,
             depth=(hits.distance / np.linalg.norm(flat, axis=1)).reshape(size),
             normal=hits.normal.reshape(*size, 3),

@@ -147,7 +147,7 @@ def _has_images(scene: Scene, folder: Path) -> bool:
     return all(has_image(Path(path)) for path in paths if path.startswith(image_prefix))
 
 
-def leave_out_cache() -> None:
+def disable_scene_cache() -> None:
     """Disable the cache in this process and those that it starts."""
     os.environ[LIMIT_KEY] = "0"
 

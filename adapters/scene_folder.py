@@ -82,7 +82,7 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
     return dataclasses.replace(scene, labels=labels, recorded_source=recorded.uri)
 
 
-def storable(scene: Scene) -> Scene:
+def prepare_for_storage(scene: Scene) -> Scene:
     """Return an opened scene in the form in which it belongs into another saved scene.
 
     A recording that is missing today is no fact about the scene, and a relative path to it stays
@@ -111,14 +111,14 @@ def recorded_labels(recording: Recording) -> LabelSource | None:
 
 def _recording_of_query(uri: str) -> Recording:
     """Return the recording of the `data` key."""
-    from adapters.base import recognise
+    from adapters.base import detect_scheme_of_path
 
     recording = _recording(uri, Path.cwd())
     if recording is None:
         scheme, path, query = parse_uri(uri)
         if scheme is not None:
             raise AdapterError(f"{_DATA_KEY}={uri}: no recording is named so")
-        return Recording(recognise(Path(path)), os.path.abspath(path), query)
+        return Recording(detect_scheme_of_path(Path(path)), os.path.abspath(path), query)
     if not recording.is_there:
         raise AdapterError(f"{_DATA_KEY}={uri}: no such file or folder: {recording.path}")
     return recording

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from augment.errors import AdapterError
-from augment.files.export import moved_gaussians
+from augment.files.export import transform_gaussians_rigidly
 from augment.scene import Gaussians
 from augment.semantics import class_of_label
 
@@ -77,7 +77,7 @@ class WorldChange:
         if not turned and self.scale == 1.0 and not shift.any():
             return gaussians
         rotation = torch.from_numpy(np.ascontiguousarray(self.rotation))
-        return moved_gaussians(gaussians, rotation, torch.from_numpy(shift), self.scale)
+        return transform_gaussians_rigidly(gaussians, rotation, torch.from_numpy(shift), self.scale)
 
 
 def parse_up(text: str) -> np.ndarray:

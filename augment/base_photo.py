@@ -52,9 +52,9 @@ from augment.render.buffers import (
     RGB,
     SPLAT_IDS,
     RenderOutput,
-    kernels_for,
+    choose_kernels,
 )
-from augment.render.composite import add_elevation, map_colors, pixels_at_unit_depth
+from augment.render.composite import add_elevation, map_colors, unit_depth_coordinates
 from augment.render.cuda import runtime as gpu
 from augment.render.fog import Fog, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
@@ -73,26 +73,26 @@ RADIUS = 1 / 320
 # Variance of display-encoded colour that the guided filter counts as an edge.
 EDGE = 0.05**2
 # Radius for the sky's share, in radii: splats of sky and of pale walls are told apart badly.
-WIDER = 4
+SKY_RADIUS_FACTOR = 4
 # Distance by which splats lie beside what the photo shows, metres: many pixels for close things.
-OFF_M = 0.12
+EDGE_OFFSET_M = 0.12
 # Least contrast of an edge of T between surfaces that may have to be moved.
-EDGE_OF_T = 0.1
+MIN_TRANSMITTANCE_STEP = 0.1
 # Offset of an edge below which it stays, pixels.
-FEWEST_PX = 2
+MIN_EDGE_OFFSET_PX = 2
 # Largest offset of an edge, as a part of the image's width.
-WIDEST = 1 / 30
+MAX_OFFSET_FRACTION = 1 / 30
 # Width of the copy in which edges are moved, pixels.
 ALIGNED_PX = 480
 # Least contrast of an edge of the photo, of 255.
 PLAIN = 26
 # Size of the neighbourhood in which most of T's edges must lie on edges of the photo to be where
 # they belong, as a part of the image's width.
-NEARBY = 1 / 20
+NEIGHBOURHOOD_FRACTION = 1 / 20
 # Least weight of T in the smoothing, for what is nothing but edge; T counts more far from edges.
-LITTLE = 0.02
+MIN_WEIGHT = 0.02
 # Strength of the smoothing (lambda of Min et al. 2014), squared pixels.
-REACH = 1000.0
+SMOOTHING_RADIUS_PX2 = 1000.0
 # Colour difference that stops the smoothing (sigma of Min et al. 2014), of 255.
 ALIKE = 5.0
 # Fall of a ray, metres a metre, from which it meets the road, not the sky, where nothing is
@@ -101,7 +101,7 @@ LEVEL = 0.02
 # Largest condition number of a colour map that is undone: 8 bits come back exactly.
 MAX_CONDITION = 1e3
 # Largest height of a camera above the road, metres; more is a hill's.
-HIGHEST_M = 4.0
+MAX_CAMERA_HEIGHT_M = 4.0
 # Image rows that a thread takes at a time.
 ROWS = 32
 # Colour map that leaves black.
@@ -283,7 +283,7 @@ class Photo:
         if self._takes_marks(parts):
             assert self.style is not None
             return self.style.marked(parts), frozenset({RGB})
-        return blackened(parts), self.buffers_for(parts)
+        return blacken_parts(parts), self.buffers_for(parts)
 
     def _takes_marks(self, parts: Sequence[PosedGaussians]) -> bool:
         """Return True if splats show marks of the style in place of their colours.
@@ -303,7 +303,7 @@ class Photo:
         """Return a layer that shows the photo in place of its splats.
 
         Args:
-            raster: buffers of `blackened` parts; with `photo_share`, of the parts in their own
+            raster: buffers of `blacken_parts` parts; with `photo_share`, of the parts in their own
                 colours.
             parts: the parts of the layer.
             camera: the view, a window of the photo's camera.
@@ -348,16 +348,18 @@ class Photo:
         if not self._takes_marks(parts):
             surface_rgb, sky_rgb, level = self.colors(raster, parts, self.camera)
             return mix(
-                surface_rgb, sky_rgb, self.sharpen(self._sky_share(raster.alpha, level), WIDER)
+                surface_rgb,
+                sky_rgb,
+                self.sharpen(self._sky_share(raster.alpha, level), SKY_RADIUS_FACTOR),
             )
         alpha = raster.alpha
         marks = raster.rgb
         assert marks is not None
-        if kernels_for(self.backend, alpha, marks) == CPU:
-            share = self.sharpen(self._marked_share_on_cpu(alpha, marks), WIDER)
+        if choose_kernels(self.backend, alpha, marks) == CPU:
+            share = self.sharpen(self._marked_share_on_cpu(alpha, marks), SKY_RADIUS_FACTOR)
         else:
             level = (marks[..., 0] / alpha.clamp_min(1e-6)).clamp_max(1)
-            share = self.sharpen(self._sky_share(alpha, level), WIDER)
+            share = self.sharpen(self._sky_share(alpha, level), SKY_RADIUS_FACTOR)
         if style.others is None and self.backend == CPU:
             return self._in_both_on_cpu(style, share)
         surface_rgb = self._land
@@ -380,7 +382,7 @@ class Photo:
         """Return the share of sky in each pixel, from marks, by the CPU kernel."""
         out = np.empty(tuple(alpha.shape), np.float32)
         fall = (-self.camera.world_from_camera[2, :3]).tolist()
-        numbers = (CLEAR_ALPHA, OPAQUE_ALPHA), *pixels_at_unit_depth(self.camera)
+        numbers = (CLEAR_ALPHA, OPAQUE_ALPHA), *unit_depth_coordinates(self.camera)
         numbers = *numbers, (*fall, math.inf if self.height_m is None else LEVEL)
         with kernel_threads(ROWS):
             kernels.sky_share(
@@ -396,7 +398,7 @@ class Photo:
         )
         out = np.empty(self.pixels.shape, np.float32)
         with kernel_threads(ROWS):
-            kernels.styled_colors(self.pixels, *maps, share.numpy(), out)
+            kernels.map_photo_colors_with_sky(self.pixels, *maps, share.numpy(), out)
         return torch.from_numpy(out)
 
     def colors(
@@ -454,7 +456,7 @@ class Photo:
             lit_share, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR
         )
         if camera is self.camera:
-            lit_share = self.sharpen(torch.from_numpy(lit_share), WIDER).numpy()
+            lit_share = self.sharpen(torch.from_numpy(lit_share), SKY_RADIUS_FACTOR).numpy()
         lit_steps = cv2.merge([np.rint(lit_share * 255).astype(np.uint8)] * 3)
         return rgb * torch.from_numpy(cv2.LUT(lit_steps, factors[None])).to(rgb.device)
 
@@ -484,7 +486,7 @@ class Photo:
             out = np.empty(self.pixels.shape, np.float32)
             matrix = np.eye(3, 4, dtype=np.float32) if color_map is None else color_map.numpy()
             with kernel_threads(ROWS):
-                kernels.scene_colors(self.pixels, matrix, np.float32(min_value), out)
+                kernels.map_photo_colors(self.pixels, matrix, np.float32(min_value), out)
             return torch.from_numpy(out)
         pixels = torch.from_numpy(self.pixels)
         rgb = (gpu.upload(pixels) if self.backend == CUDA else pixels).float() / 255
@@ -522,7 +524,7 @@ class Photo:
         assert raster.alpha is not None and raster.expected_depth is not None
         alpha = opaque_alpha(raster.alpha)
         depth = raster.expected_depth
-        if kernels_for(self.backend, alpha, depth) == CPU:
+        if choose_kernels(self.backend, alpha, depth) == CPU:
             transmittance = self._transmittance_on_cpu(alpha, depth, fog)
             return self.sharpen(self.aligned(transmittance, alpha, depth))
         camera = self.camera
@@ -564,19 +566,21 @@ class Photo:
         z = np.where(small_alpha > 0.5, z, np.float32(math.inf))
         square = np.ones((5, 5), np.uint8)
         clean_values = cv2.medianBlur(small_values, 5)  # without the dots of a reconstruction
-        edges = (_contrast(clean_values) > EDGE_OF_T) & np.isfinite(cv2.dilate(z, square))
+        edges = (_contrast(clean_values) > MIN_TRANSMITTANCE_STEP) & np.isfinite(
+            cv2.dilate(z, square)
+        )
         nearest_m = np.maximum(cv2.erode(z, square), 1e-3)
-        offset_px = np.where(edges, self.camera.fx / factor * OFF_M / nearest_m, 0)
-        if offset_px.max() < FEWEST_PX:
+        offset_px = np.where(edges, self.camera.fx / factor * EDGE_OFFSET_M / nearest_m, 0)
+        if offset_px.max() < MIN_EDGE_OFFSET_PX:
             return values
         guide = cv2.resize(self.pixels, size, interpolation=cv2.INTER_AREA)
-        window_px = (max(3, round(NEARBY * size[0])),) * 2
-        is_movable = (offset_px >= FEWEST_PX).astype(np.float32)
+        window_px = (max(3, round(NEIGHBOURHOOD_FRACTION * size[0])),) * 2
+        is_movable = (offset_px >= MIN_EDGE_OFFSET_PX).astype(np.float32)
         is_unseen = is_movable * (_contrast(guide).max(-1) < PLAIN)
         offset_px[cv2.blur(is_unseen, window_px) < 0.5 * cv2.blur(is_movable, window_px)] = 0
         trust = np.ones(small_values.shape, np.float32)
-        radius = FEWEST_PX
-        while radius <= WIDEST * size[0]:
+        radius = MIN_EDGE_OFFSET_PX
+        while radius <= MAX_OFFSET_FRACTION * size[0]:
             is_beside = offset_px >= radius
             if is_beside.any():
                 distance_px = cv2.distanceTransform((~is_beside).astype(np.uint8), cv2.DIST_L2, 3)
@@ -584,8 +588,8 @@ class Photo:
             radius *= 2
         if trust.min() == 1:
             return values
-        smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, REACH, ALIKE)
-        weight = np.maximum(trust, np.float32(LITTLE))
+        smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, SMOOTHING_RADIUS_PX2, ALIKE)
+        weight = np.maximum(trust, np.float32(MIN_WEIGHT))
         smoothed = smoother.filter(weight * small_values) / np.maximum(
             smoother.filter(weight), 1e-6
         )
@@ -696,7 +700,7 @@ def open_photo(
     height_m = None
     if scene.has_known_gravity and scene.ground_z_m is not None:
         camera_height_m = float(camera.centre[2]) - scene.ground_z_m
-        height_m = min(camera_height_m, HIGHEST_M) if camera_height_m > 0 else None
+        height_m = min(camera_height_m, MAX_CAMERA_HEIGHT_M) if camera_height_m > 0 else None
     return Photo(camera, pixels, backend, undone, height_m)
 
 
@@ -712,7 +716,7 @@ def _contrast(image: np.ndarray) -> np.ndarray:
     return cv2.dilate(image, square) - cv2.erode(image, square)
 
 
-def blackened(parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
+def blacken_parts(parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
     """Return the parts in black, except those that lie on the scene.
 
     The colours of black parts come from the photo.
@@ -735,7 +739,7 @@ def mix(
 
     The result equals `rgb` to the bit where the weight is 0, and `other` where it is 1.
     """
-    if kernels_for(AUTO, rgb, other, weight) != CPU:
+    if choose_kernels(AUTO, rgb, other, weight) != CPU:
         return (1 - weight)[..., None] * rgb + weight[..., None] * other
     return _run(kernels.mix, rgb, other, weight)
 
@@ -744,7 +748,7 @@ def add_faded(
     base: Float[Tensor, "H W 3"], rgb: Float[Tensor, "H W 3"], weight: Float[Tensor, "H W"]
 ) -> Float[Tensor, "H W 3"]:
     """Return base + weight rgb."""
-    if kernels_for(AUTO, base, rgb, weight) != CPU:
+    if choose_kernels(AUTO, base, rgb, weight) != CPU:
         return base + weight[..., None] * rgb
     return _run(kernels.add_faded, base, rgb, weight)
 

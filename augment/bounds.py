@@ -67,10 +67,10 @@ class Bounds:
 
 def bound(gaussians: Gaussians, owner: int = 0) -> Bounds:
     """Return one box around all Gaussians opaque enough to be drawn; none where there are none."""
-    return bound_chunks(gaussians, gaussians.opacities.detach().numpy() >= ALPHA_MIN, owner=owner)
+    return bound_squares(gaussians, gaussians.opacities.detach().numpy() >= ALPHA_MIN, owner=owner)
 
 
-def bound_chunks(
+def bound_squares(
     gaussians: Gaussians, chosen: np.ndarray, side_m: float = math.inf, owner: int = 0
 ) -> Bounds:
     """Return boxes around chosen Gaussians, one for each square of x and y that has any.
@@ -174,7 +174,7 @@ def _half_spaces(camera: Camera, near_m: float) -> tuple[np.ndarray, np.ndarray,
     return sides, offsets, np.array([0.0, *reach, *reach])
 
 
-def owners_seen(
+def find_visible_owners(
     bounds: Bounds, poses: Mapping[int, np.ndarray], cameras: Iterable[Camera], near_m: float
 ) -> set[int]:
     """Return the instance ids of boxes that may be seen.

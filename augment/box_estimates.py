@@ -27,17 +27,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from scipy.spatial import KDTree
 
-from augment.boxes import NEAR_M, Occlusion, Outlines, PlacedBoxes
+from augment.boxes import NEAR_M, Occlusion, Outlines, WorldBoxes
 from augment.cameras import Camera
 from augment.errors import ClimateGSError
-from augment.memo import Latest, memo_of
+from augment.memo import LatestValue, memo_of
 from augment.scene import Scene
 
 _log = logging.getLogger(__name__)
 
 # Share of an object's pixels below which depth does not resolve it. Of a resolved object depth
 # shows half and more: a car fills three quarters of its projected box.
-MIN_SHOWN = 0.25
+MIN_SHOWN_FRACTION = 0.25
 # Returns in the box that prove a free line of sight; one or two may be stray or on the ground.
 MIN_RETURNS = 3
 # Returns in the box beyond which depth can find its surface.
@@ -48,7 +48,7 @@ GROUND_M = 0.25
 # Height of that part over the height of the box, at most.
 MAX_OF_HEIGHT = 0.25
 # Distance before a box from which a surface hides it, along the optical axis, metres.
-CLEAR_M = 0.5
+MIN_OCCLUDER_GAP_M = 0.5
 # Pixels of a projected box below which its shape is not known.
 MIN_OUTLINE_PX = 36
 # Splats in a box from which the scene is taken to draw its object.
@@ -69,7 +69,7 @@ class SortedPoints:
         return SortedPoints(points_m[np.argsort(points_m[:, 0], kind="stable")])
 
     def inside(
-        self, boxes: PlacedBoxes, number: int, low_m: np.ndarray, *, margins: bool = True
+        self, boxes: WorldBoxes, number: int, low_m: np.ndarray, *, margins: bool = True
     ) -> Int64[np.ndarray, " P"]:
         """Return indices of the points in a box.
 
@@ -91,7 +91,7 @@ class SortedPoints:
 
 
 def _are_inside(
-    points_m: np.ndarray, boxes: PlacedBoxes, number: int, low_m: np.ndarray, high_m: np.ndarray
+    points_m: np.ndarray, boxes: WorldBoxes, number: int, low_m: np.ndarray, high_m: np.ndarray
 ) -> Bool[np.ndarray, " P"]:
     """Return the mask of points [P, 3] between two corners of a box, in the box's axes."""
     local_m = (points_m.astype(np.float64) - boxes.centres_m[number]) @ boxes.rotations[number]
@@ -109,7 +109,7 @@ class Evidence:
     actors: frozenset[str]
     """Track ids of the scene's actors."""
 
-    def draws(self, boxes: PlacedBoxes, number: int, track_id: str) -> bool:
+    def draws(self, boxes: WorldBoxes, number: int, track_id: str) -> bool:
         """Return True if the scene's splats show the object of a box."""
         if track_id in self.actors:
             return True
@@ -138,7 +138,7 @@ def evidence_of(scene: Scene, frame: int) -> Evidence | None:
         return SortedPoints.of(scene.background.means.detach().cpu().numpy())
 
     memo = memo_of(scene)
-    return memo.get(("evidence of boxes",), Latest).get(frame, read)
+    return memo.get(("evidence of boxes",), LatestValue).get(frame, read)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ class Estimate:
 
 
 def estimate_boxes(
-    boxes: PlacedBoxes,
+    boxes: WorldBoxes,
     track_ids: tuple[str, ...],
     camera: Camera,
     outlines: Outlines,
@@ -192,7 +192,7 @@ def estimate_boxes(
     """
     buried_m = np.zeros(len(boxes)) if buried_m is None else buried_m
     areas = (outlines.xyxy[:, 2:] - outlines.xyxy[:, :2]).prod(axis=1)
-    is_doubtful = (occlusion.shown < MIN_SHOWN * areas) & (areas >= MIN_OUTLINE_PX)
+    is_doubtful = (occlusion.shown < MIN_SHOWN_FRACTION * areas) & (areas >= MIN_OUTLINE_PX)
     numbers = np.flatnonzero(is_doubtful & outlines.in_view)
     frame_evidence = evidence() if len(numbers) else None
     estimates: dict[int, Estimate] = {}
@@ -201,7 +201,7 @@ def estimate_boxes(
     view = _BoxesInImage(boxes, camera, outlines, frame_evidence.returns, own_car, buried_m)
     for number in numbers.tolist():
         estimate = view.estimate(number)
-        if estimate is None or occlusion.shown[number] >= MIN_SHOWN * len(estimate.rows):
+        if estimate is None or occlusion.shown[number] >= MIN_SHOWN_FRACTION * len(estimate.rows):
             continue
         if on_photo or frame_evidence.draws(boxes, number, track_ids[number]):
             estimates[number] = estimate
@@ -212,7 +212,7 @@ def estimate_boxes(
 class _BoxesInImage:
     """A frame's boxes and returns before one camera; fields are as in `estimate_boxes`."""
 
-    boxes: PlacedBoxes
+    boxes: WorldBoxes
     camera: Camera
     outlines: Outlines
     returns: SortedPoints
@@ -248,7 +248,10 @@ class _BoxesInImage:
         is_free = is_in_outline & ~self._covered(number, centres, enter)
         if self.own_car is not None:
             is_free &= ~self.own_car[rows, columns]
-        if is_in_outline.sum() < MIN_OUTLINE_PX or is_free.sum() < MIN_SHOWN * is_in_outline.sum():
+        if (
+            is_in_outline.sum() < MIN_OUTLINE_PX
+            or is_free.sum() < MIN_SHOWN_FRACTION * is_in_outline.sum()
+        ):
             return None
         pixels_on_box, pixels_before, num_behind = self._returns_at(
             number, on_box, (left, top, right, bottom), is_free
@@ -261,7 +264,7 @@ class _BoxesInImage:
         shown_pixels = np.flatnonzero(is_free)[nearest < len(pixels_on_box)]
         if (
             len(shown_pixels) <= is_free.sum() / 2
-            or len(shown_pixels) < MIN_SHOWN * is_in_outline.sum()
+            or len(shown_pixels) < MIN_SHOWN_FRACTION * is_in_outline.sum()
         ):
             return None
         return Estimate(
@@ -328,7 +331,7 @@ class _BoxesInImage:
         is_free = is_free_pixel[(row - top) * (right - left) + (column - left)]
         enter, leave = self._spans(number, pixels[candidates])
         is_on = np.isin(candidates, on_box)
-        is_before = (enter <= leave) & (depths_m[candidates] < enter - CLEAR_M)
+        is_before = (enter <= leave) & (depths_m[candidates] < enter - MIN_OCCLUDER_GAP_M)
         is_behind = (enter <= leave) & (depths_m[candidates] > leave) & is_free
         before_box = candidates[is_before]
         is_in_box = np.zeros(len(before_box), bool)

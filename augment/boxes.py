@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16
 
 from augment.cameras import Camera
 from augment.geometry import rotmat_from_quat
-from augment.kernels import count_occlusion
+from augment.kernels import count_box_pixels
 from augment.labels import Boxes, LabelSource
 from augment.memo import memo_of
 from augment.scene import Scene
@@ -35,12 +35,12 @@ NOT_COUNTED = -1
 # the box as often as not: labels, ground and depth agree to some 5 cm. Of the pixels in the boxes
 # of a recorded drive, 1.2 % are then road, against 6.1 % with the whole box and 3.5 % with 4 cm
 # less left out; 0.3 % of the vehicles' pixels are lost.
-BOTTOM_M = 0.08
+BOTTOM_MARGIN_M = 0.08
 # Largest height of that part over the height of the box: a low box keeps three quarters.
 MAX_OF_HEIGHT = 0.25
 # Margin on the other five sides in which a box owns surfaces, metres. Boxes are drawn tight
 # (mirrors and bumpers reach beyond them), and splats blur a surface by a few centimetres.
-SIDES_M = 0.10
+SIDE_MARGIN_M = 0.10
 # Depth below which the parts of a box are not projected, metres.
 NEAR_M = 0.01
 
@@ -62,7 +62,7 @@ class BoxPixels:
     """Those of them that a mask marks."""
 
 
-def fraction_of(
+def marked_fraction(
     marked: Int64[np.ndarray, " B"], pixels: Int64[np.ndarray, " B"]
 ) -> Float64[np.ndarray, " B"]:
     """Return marked / pixels; 0 where pixels were not counted, NaN where there are none."""
@@ -70,7 +70,7 @@ def fraction_of(
 
 
 def count_pixels(
-    boxes: PlacedBoxes,
+    boxes: WorldBoxes,
     camera: Camera,
     depth_m: Float32[np.ndarray, "H W"],
     mask: UInt8[np.ndarray, "H W"],
@@ -92,7 +92,7 @@ def count_pixels(
 
 
 def shown_pixels(
-    boxes: PlacedBoxes, camera: Camera, depth_m: Float32[np.ndarray, "H W"]
+    boxes: WorldBoxes, camera: Camera, depth_m: Float32[np.ndarray, "H W"]
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Yield (box, rows [P], columns [P]) of the pixels that show each box that has any.
 
@@ -129,7 +129,7 @@ def are_usable(
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedBoxes:
+class WorldBoxes:
     """B boxes in the scene's world.
 
     Boxes that are not usable hold zeros.
@@ -146,7 +146,7 @@ class PlacedBoxes:
     """world_from_box."""
     low_m: Float64[np.ndarray, "B 3"]
     """Lowest corner of the part that owns surfaces, along the box's axes from its centre: the
-    lowest centimetres are left out, other sides are drawn wider (BOTTOM_M, SIDES_M)."""
+    lowest centimetres are left out, other sides are drawn wider (BOTTOM_MARGIN_M, SIDE_MARGIN_M)."""
     high_m: Float64[np.ndarray, "B 3"]
     """Highest corner of that part."""
     corners_m: Float64[np.ndarray, "B 8 3"]
@@ -156,7 +156,7 @@ class PlacedBoxes:
         return len(self.is_usable)
 
     @staticmethod
-    def of(boxes: Boxes, world_origin_m: Float64[np.ndarray, "3"]) -> PlacedBoxes:
+    def of(boxes: Boxes, world_origin_m: Float64[np.ndarray, "3"]) -> WorldBoxes:
         """Return labelled boxes in the scene's world.
 
         Args:
@@ -170,13 +170,13 @@ class PlacedBoxes:
         rotations = rotmat_from_quat(torch.from_numpy(quats)).numpy()
         centres = np.where(is_usable[:, None], boxes.centers_m - world_origin_m, 0.0)
         sizes = np.where(is_usable[:, None], boxes.sizes_m, 0.0)
-        low = -sizes / 2 - SIDES_M
-        high = sizes / 2 + SIDES_M
-        low[:, 2] = -sizes[:, 2] / 2 + np.minimum(BOTTOM_M, MAX_OF_HEIGHT * sizes[:, 2])
+        low = -sizes / 2 - SIDE_MARGIN_M
+        high = sizes / 2 + SIDE_MARGIN_M
+        low[:, 2] = -sizes[:, 2] / 2 + np.minimum(BOTTOM_MARGIN_M, MAX_OF_HEIGHT * sizes[:, 2])
         corners = _to_world(centres, rotations, CORNERS * sizes[:, None, :])
-        return PlacedBoxes(is_usable, centres, sizes, rotations, low, high, corners)
+        return WorldBoxes(is_usable, centres, sizes, rotations, low, high, corners)
 
-    def without_margins(self) -> PlacedBoxes:
+    def without_margins(self) -> WorldBoxes:
         """Return the boxes with sides that own surfaces no further out than they are labelled.
 
         Tops and bottoms stay.
@@ -194,7 +194,7 @@ def _to_world(centres_m: np.ndarray, rotations: np.ndarray, points_m: np.ndarray
     return centres_m[:, None, :] + points_m @ rotations.transpose(0, 2, 1)
 
 
-def pixel_windows(boxes: PlacedBoxes, camera: Camera) -> Int64[np.ndarray, "B 4"]:
+def pixel_windows(boxes: WorldBoxes, camera: Camera) -> Int64[np.ndarray, "B 4"]:
     """Return left, top, right and bottom of the pixels that can show each box.
 
     Right and bottom are excluded; the window of a box out of view is empty.
@@ -232,7 +232,7 @@ def cut_edges(end: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _pixels_inside(
-    boxes: PlacedBoxes,
+    boxes: WorldBoxes,
     number: int,
     world_from_camera: np.ndarray,
     rays: tuple[np.ndarray, np.ndarray],
@@ -303,7 +303,7 @@ class Occlusion:
     for."""
 
 
-def outline_placed(boxes: PlacedBoxes, camera: Camera) -> Outlines:
+def outline_world_boxes(boxes: WorldBoxes, camera: Camera) -> Outlines:
     """Return the outlines of boxes in the scene's world."""
     world_from_camera = camera.world_from_camera.numpy()
     rotation = world_from_camera[:3, :3]
@@ -354,7 +354,7 @@ def outline_boxes(
 
 
 def find_occlusion(
-    boxes: PlacedBoxes,
+    boxes: WorldBoxes,
     camera: Camera,
     depth_m: Float32[np.ndarray, "H W"],
     instance: UInt16[np.ndarray, "H W"] | None = None,
@@ -394,7 +394,7 @@ def find_occlusion(
     half_sizes = boxes.sizes_m / 2
     counts = np.zeros((num_boxes, 6), np.int64)
     owners = np.zeros(depth_m.shape if with_owners else (0, 0), np.uint16)
-    count_occlusion(
+    count_box_pixels(
         np.ascontiguousarray(depth_m),
         np.ascontiguousarray(instance),
         scenery,
@@ -581,9 +581,9 @@ def instances_of(scene: Scene) -> Instances:
     return memo_of(scene).get(("instances",), lambda: Instances(actors, frames, scene.labels))
 
 
-def with_boxes(
+def paint_boxes(
     instance: UInt16[np.ndarray, "H W"],
-    boxes: PlacedBoxes,
+    boxes: WorldBoxes,
     numbers: UInt16[np.ndarray, " B"],
     camera: Camera,
     depth_m: Float32[np.ndarray, "H W"],

@@ -221,7 +221,7 @@ def shadows_of(scene: Scene) -> CastShadows | None:
     return memo_of(scene).get(_MEMO, find)[0]
 
 
-def share_shadows(scene: Scene) -> None:
+def precompute_shadows(scene: Scene) -> None:
     """Compute the shadows now, so that a job's processes need not."""
     memo_of(scene).put(_MEMO, (shadows_of(scene),), shared=True)
 
@@ -501,7 +501,7 @@ def _otsu_threshold(values: np.ndarray) -> float:
 # which multiplies linear colours by E' / E, and encoded ones by its 1/2.2th power.
 
 # Depth of uniform smog, which has no top, metres: fog lies 50 to 300 m deep.
-SMOG_DEEP_M = 200.0
+SMOG_DEPTH_M = 200.0
 # Sine of the sun's elevation, at least, whatever its shadows look like.
 _LOWEST_SUN = math.sin(math.radians(10.0))
 # Steps from shaded to lit.
@@ -599,7 +599,7 @@ def sun_transmittance(fog: Fog, shadows: CastShadows, ground_z_m: float) -> floa
     """Return T of the sun's light, down to the ground."""
     sun_sine = max(math.sin(math.radians(shadows.elevation_deg)), _LOWEST_SUN)
     if fog.scale_height_m is None:
-        return math.exp(-fog.sigma_per_m * SMOG_DEEP_M / sun_sine)
+        return math.exp(-fog.sigma_per_m * SMOG_DEPTH_M / sun_sine)
     return math.exp(-vertical_optical_depth(fog, ground_z_m) / sun_sine)
 
 

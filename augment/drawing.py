@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from augment.base_photo import Photo, blackened, mix
+from augment.base_photo import Photo, blacken_parts, mix
 from augment.cameras import Camera
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.composite import add_elevation, composite_sky
 from augment.render.constants import RasterSettings
-from augment.render.fog import Fog, blend_airlight, fog_raster, sky_optical_depth
+from augment.render.fog import Fog, apply_fog_to_render, blend_airlight, sky_optical_depth
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians
@@ -36,7 +36,7 @@ class LayerRenderer:
     """The sky behind all parts."""
     fog: Fog | None
     """The fog before parts and sky; None for clear air."""
-    fog_on_buffers: bool
+    applies_fog_to_buffers: bool
     """If True, fog is applied to finished buffers, by their depth; else it is blended Gaussian by
     Gaussian while rasterising."""
     settings: RasterSettings
@@ -99,19 +99,19 @@ class LayerRenderer:
         photo_share: Float[Tensor, "H W"] | None = None,
     ) -> RenderOutput:
         """Return what `draw` returns, with the airlight of the horizon at every elevation."""
-        buffer_fog = self.fog if self.fog_on_buffers else None
+        buffer_fog = self.fog if self.applies_fog_to_buffers else None
         photo = self.photo if self.photo is not None and self.photo.is_seen_by(camera) else None
         parts = self.parts
         if photo is not None:
             buffers = buffers | photo.buffers_for(parts)
-            parts = blackened(parts) if photo_share is None else parts
+            parts = blacken_parts(parts) if photo_share is None else parts
         has_elevation_airlight = self.fog is not None and self.fog.overcast > 0
         raster = rasterize(
             parts,
             camera,
             buffers=buffers | {EXPECTED_DEPTH} if buffer_fog or has_elevation_airlight else buffers,
             settings=self.settings,
-            fog=None if self.fog_on_buffers else self.fog,
+            fog=None if self.applies_fog_to_buffers else self.fog,
             clip=clip,
             pixel_mask=pixel_mask,
             backend=self.backend,
@@ -121,10 +121,10 @@ class LayerRenderer:
                 raster = photo.paint(raster, parts, camera, photo_share)
         if buffer_fog is not None:
             with timed("smog on buffers"):
-                raster = replace(raster, rgb=fog_raster(raster, camera, buffer_fog))
+                raster = replace(raster, rgb=apply_fog_to_render(raster, camera, buffer_fog))
         return raster
 
-    def draw_whole(
+    def render_with_sky(
         self, camera: Camera, buffers: frozenset[str]
     ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
         """Return the picture with its sky, not clamped, and the buffers of the scene.

@@ -385,7 +385,7 @@ def ground_of(scene: Scene) -> Ground:
 
     def find() -> Ground:
         ground = _measure_ground(scene)
-        logger.info("%s: %s", scene.name, ground_sentence(ground))
+        logger.info("%s: %s", scene.name, describe_ground(ground))
         return ground
 
     return memo_of(scene).get(("ground",), find)
@@ -419,7 +419,7 @@ def check_metric_and_level(scene: Scene) -> None:
     )
 
 
-def ground_sentence(ground: Ground) -> str:
+def describe_ground(ground: Ground) -> str:
     """Return heights, source and residual as a text for people."""
     text = (
         f"lowest z = {ground.lowest_z_m:.2f} m, median {ground.median_z_m:.2f} m under the path; "

@@ -1,8 +1,8 @@
 """Numba kernels for the records themselves: poses and colours over time, merged splats, boxes
 against depth images, hashes.
 
-`augment.scene` (poses_at, colors_at), `augment.lod` (covered_plane) and `augment.boxes`
-(count_occlusion) prepare the arrays and call these. Kernels of effects call `mix`. Every other
+`augment.scene` (poses_at, colors_at), `augment.lod` (sum_covered_areas) and `augment.boxes`
+(count_box_pixels) prepare the arrays and call these. Kernels of effects call `mix`. Every other
 kernel fills its last arguments in place.
 """
 
@@ -172,7 +172,7 @@ def colors_at(sh, coefficients, weights, turn, out):
 
 
 @kernel
-def covered_plane(starts, opacities, places, covariances, out):
+def sum_covered_areas(starts, opacities, places, covariances, out):
     """Compute the area that each of G groups of splats covers in a plane.
 
     The area is the integral of 1 - prod_i (1 - alpha_i), taken at 49 places within 3.15 standard
@@ -207,7 +207,7 @@ def covered_plane(starts, opacities, places, covariances, out):
 
 # This kernel takes one thread: it runs beside the renderer, on threads that write files.
 @serial_kernel
-def count_occlusion(
+def count_box_pixels(
     depth,
     instance,
     scenery,
@@ -329,7 +329,7 @@ def count_occlusion(
 
 @inner()
 def _add(counts, row, column):
-    """Add one pixel to a box's counts (a row of `count_occlusion`'s)."""
+    """Add one pixel to a box's counts (a row of `count_box_pixels`'s)."""
     counts[0] += 1
     counts[2], counts[3] = min(counts[2], column), min(counts[3], row)
     counts[4], counts[5] = max(counts[4], column + 1), max(counts[5], row + 1)

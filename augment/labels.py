@@ -127,7 +127,7 @@ class KnowsLidarOrigins(Protocol):
 
 
 @runtime_checkable
-class KnowsLidarTop(Protocol):
+class KnowsLidarElevation(Protocol):
     """A LabelSource with lasers of several reaches, of which the near ones see higher.
 
     For other sources the returns themselves show how high the LiDAR sees.

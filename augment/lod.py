@@ -55,7 +55,7 @@ from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.memo import memo_of
 from augment.render.buffers import SPLAT_IDS, RenderOutput
 from augment.render.constants import ALPHA_MIN, COV2D_BLUR, RasterSettings
-from augment.render.cpu.order import CELL, known_of, may_be_drawn
+from augment.render.cpu.order import CELL_SIZE, cached_of_tensor, find_visible_boxes
 from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.sh import SH_C0
@@ -65,16 +65,16 @@ from augment.semantics import SemanticClass
 
 # Splats of a part below which it is drawn as it is.
 MIN_SPLATS = 20_000
-# Candidates of c_1, metres: the first is taken whose cells leave at most MOST_LEFT of the splats.
+# Candidates of c_1, metres: the first is taken whose cells leave at most MAX_REMAINING_SHARE of the splats.
 CELLS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 # Share of the splats that merging in the finest cells may leave.
-MOST_LEFT = 0.6
+MAX_REMAINING_SHARE = 0.6
 # Cells of c_1 along a square of level 0.
 CELLS_ACROSS = 64
 # Levels that a part has at most, above level 0.
 MAX_LEVELS = 12
 # Squares of a level from which no further level is made.
-FEW_SQUARES = 4
+MIN_SQUARES = 4
 # Width of the band in which levels fade, as a part of d_k.
 BAND = 0.12
 # Largest difference of alike colours, of 1, in each channel of the encoded colours.
@@ -88,13 +88,13 @@ FLAT_TOP = 2.0
 # Largest opacity of a merged splat.
 MAX_OPACITY = math.exp(FLAT_TOP - 1)
 # Smallest standard deviation of a merged splat, metres.
-THINNEST_M = 1e-4
+MIN_SCALE_M = 1e-4
 # Number of squares up to which testing their splats takes no longer than testing the squares.
-FEW_TESTED = 1024
+MAX_UNTESTED_SQUARES = 1024
 # Splats that are merged at once.
 BATCH = 1 << 18
 # Offset of the cells' grid, in cells: walls and ground at round numbers then lie inside one cell.
-OFF_GRID = (0.37, 0.37, 0.5)
+GRID_OFFSET_CELLS = (0.37, 0.37, 0.5)
 # Odd factor that mixes the bits of cell numbers.
 _ODD = np.uint64(0x9E3779B97F4A7C15)
 # Half the number of squares that keys can tell apart along an axis.
@@ -211,9 +211,11 @@ class Level:
         if self.unchecked is None:
             return
         cells = np.unique(cells[~self._checked[cells]])
-        ends = (np.diff(cells) != 1) | (cells[1:] % (BATCH // CELL) == 0)
+        ends = (np.diff(cells) != 1) | (cells[1:] % (BATCH // CELL_SIZE) == 0)
         for run in np.split(cells, np.flatnonzero(ends) + 1) if len(cells) else []:
-            rows = slice(int(run[0]) * CELL, min(int(run[-1] + 1) * CELL, len(self.gaussians)))
+            rows = slice(
+                int(run[0]) * CELL_SIZE, min(int(run[-1] + 1) * CELL_SIZE, len(self.gaussians))
+            )
             numbers = self.stands_for[rows]
             is_own = numbers.min() >= 0 and numbers.max() < self.splats
             where = f"{self.unchecked}: splats {rows.start} to {rows.stop}"
@@ -321,7 +323,7 @@ def check_background(gaussians: Gaussians) -> None:
 # ---- Merging -------------------------------------------------------------------------------------
 
 
-class Piece(NamedTuple):
+class LevelPiece(NamedTuple):
     """Splats of some squares."""
 
     gaussians: Gaussians
@@ -341,15 +343,15 @@ def levels_of(gaussians: Gaussians, *, antialiased: bool = False) -> Levels:
     """
 
     def make() -> Levels:
-        stored = known_of(gaussians.means, "levels", lambda: None)
+        stored = cached_of_tensor(gaussians.means, "levels", lambda: None)
         if stored is None or antialiased or not _has_shapes(gaussians, stored.levels[0].gaussians):
             return build_levels(gaussians, antialiased=antialiased)
-        return edited_levels(stored, gaussians)
+        return update_levels(stored, gaussians)
 
     return memo_of(gaussians).get((*_LEVELS, antialiased), make)
 
 
-def keep_levels(gaussians: Gaussians, levels: Levels) -> None:
+def store_levels(gaussians: Gaussians, levels: Levels) -> None:
     """Let `levels_of` know levels that lie in a file.
 
     Args:
@@ -357,7 +359,7 @@ def keep_levels(gaussians: Gaussians, levels: Levels) -> None:
         levels: their levels, which must not hold this object or its means.
     """
     memo_of(gaussians).put(_STORED, levels, shared=True)
-    known_of(gaussians.means, "levels", lambda: levels)
+    cached_of_tensor(gaussians.means, "levels", lambda: levels)
 
 
 def _has_shapes(g: Gaussians, other: Gaussians) -> bool:
@@ -365,7 +367,7 @@ def _has_shapes(g: Gaussians, other: Gaussians) -> bool:
     return all(getattr(g, n).data_ptr() == getattr(other, n).data_ptr() for n in _COLUMNS[:3])
 
 
-def edited_levels(levels: Levels, g: Gaussians) -> Levels:
+def update_levels(levels: Levels, g: Gaussians) -> Levels:
     """Return the levels of Gaussians with other colours or lower opacities.
 
     Nothing moves: mean colours and sums of opacities are computed anew.
@@ -434,26 +436,26 @@ def _reweigh(finer: Level, g: Gaussians, level: Level) -> Gaussians:
     )
 
 
-def keeps_levels(gaussians: Gaussians) -> bool:
+def has_stored_levels(gaussians: Gaussians) -> bool:
     """Return True if levels lie in a file with these Gaussians."""
     is_known = memo_of(gaussians).known(_STORED)
     return is_known and levels_of(gaussians).levels[0].unchecked is not None
 
 
-def join_pieces(pieces: Iterable[Piece]) -> Piece:
+def join_pieces(pieces: Iterable[LevelPiece]) -> LevelPiece:
     """Return all pieces as one, in memory."""
     gaussians, stands_for, keys = zip(*pieces, strict=True)
     columns = {name: torch.cat([getattr(g, name) for g in gaussians]) for name in _COLUMNS}
     classes = [g.semantic for g in gaussians if g.semantic is not None]
     joined = Gaussians(**columns, semantic=torch.cat(classes) if classes else None)
-    return Piece(joined, np.concatenate(stands_for), np.concatenate(keys))
+    return LevelPiece(joined, np.concatenate(stands_for), np.concatenate(keys))
 
 
 def build_levels(
     gaussians: Gaussians,
     *,
     antialiased: bool = False,
-    keep: Callable[[Iterable[Piece]], Piece] = join_pieces,
+    keep: Callable[[Iterable[LevelPiece]], LevelPiece] = join_pieces,
 ) -> Levels:
     """Build the levels of one Gaussian or more.
 
@@ -467,16 +469,18 @@ def build_levels(
     """
     detached = rows_of(gaussians, slice(None))
     finest_m, order, keys = square_order(detached)
-    piece = Piece(detached, order.astype(np.int32), keys)
+    piece = LevelPiece(detached, order.astype(np.int32), keys)
     if not (np.diff(piece.stands_for) == 1).all():
         piece = keep(
-            Piece(detached.select(torch.from_numpy(order[rows])), *(v[rows] for v in piece[1:]))
+            LevelPiece(
+                detached.select(torch.from_numpy(order[rows])), *(v[rows] for v in piece[1:])
+            )
             for rows in batches(len(order))
         )
     levels = [level_of(piece)]
-    while len(levels[-1].squares) > FEW_SQUARES and len(levels) <= MAX_LEVELS:
+    while len(levels[-1].squares) > MIN_SQUARES and len(levels) <= MAX_LEVELS:
         cell_m = finest_m * 2.0 ** (len(levels) - 1)
-        piece = keep(coarser(levels[-1], cell_m, antialiased=antialiased))
+        piece = keep(build_coarser_level(levels[-1], cell_m, antialiased=antialiased))
         levels.append(level_of(piece, levels[-1].squares))
     return Levels(finest_m, tuple(levels))
 
@@ -511,7 +515,7 @@ def finest_cell_m(means: Float[Tensor, "N 3"]) -> float:
                 numbers[(numbers.astype(np.uint64) * _ODD) >> np.uint64(60) == 0]
             )
         numbers = np.concatenate(sampled_numbers)
-        if len(np.unique(numbers)) <= MOST_LEFT * len(numbers):
+        if len(np.unique(numbers)) <= MAX_REMAINING_SHARE * len(numbers):
             return cell_m
     return CELLS_M[-1]
 
@@ -530,7 +534,7 @@ def square_keys(means: Float[Tensor, "N 3"], side_m: float) -> Int64[np.ndarray,
 
 def _cells(means: Float[Tensor, "N 3"], cell_m: float) -> Int64[np.ndarray, "N"]:
     """Return the cell of each mean, as its number along a Morton curve."""
-    places = np.floor(means.double().numpy() / cell_m + OFF_GRID).astype(np.int64)
+    places = np.floor(means.double().numpy() / cell_m + GRID_OFFSET_CELLS).astype(np.int64)
     return _along_curve(places & (_BIAS - 1))
 
 
@@ -543,7 +547,7 @@ def _along_curve(places: Int64[np.ndarray, "N 3"]) -> Int64[np.ndarray, "N"]:
     return (x | (y << np.uint64(1)) | (z << np.uint64(2))).astype(np.int64)
 
 
-def level_of(piece: Piece, finer: Squares | None = None) -> Level:
+def level_of(piece: LevelPiece, finer: Squares | None = None) -> Level:
     """Return one level.
 
     Args:
@@ -559,12 +563,14 @@ def level_of(piece: Piece, finer: Squares | None = None) -> Level:
         firsts = np.searchsorted(finer.keys >> 2, keys)
         lows = np.minimum.reduceat(finer.lows, firsts)
         highs = np.maximum.reduceat(finer.highs, firsts)
-    boxes = Boxes.around(g, np.arange(0, len(g), CELL))
+    boxes = Boxes.around(g, np.arange(0, len(g), CELL_SIZE))
     parents = np.full(len(g), -1, np.int32)
     return Level(g, piece.stands_for, Squares(keys, starts, lows, highs, longest), boxes, parents)
 
 
-def coarser(finer: Level, cell_m: float, *, antialiased: bool = False) -> Iterator[Piece]:
+def build_coarser_level(
+    finer: Level, cell_m: float, *, antialiased: bool = False
+) -> Iterator[LevelPiece]:
     """Yield the next level, a few squares at a time, and note its splats as parents in `finer`.
 
     Args:
@@ -592,7 +598,7 @@ def coarser(finer: Level, cell_m: float, *, antialiased: bool = False) -> Iterat
         )
         finer.parents[rows] = np.where(targets < 0, -1, targets + count)
         count += len(leads)
-        yield Piece(merged, finer.stands_for[rows][leads], squares[leads])
+        yield LevelPiece(merged, finer.stands_for[rows][leads], squares[leads])
         first_square = end_square
 
 
@@ -711,13 +717,13 @@ def merge_groups(
     variances, axes = np.linalg.eigh(mean(covariances + offsets[:, :, None] * offsets[:, None]))
     axes[np.linalg.det(axes) < 0, :, 0] *= -1
     # Axes of the plane that the group lies in, in units of its standard deviations.
-    units = np.sqrt(np.maximum(variances[:, 1:], THINNEST_M**2) + blur_m**2)
+    units = np.sqrt(np.maximum(variances[:, 1:], MIN_SCALE_M**2) + blur_m**2)
     plane = (axes[:, :, 1:] / units[:, None])[groups]
     plane_covariances = plane.transpose(0, 2, 1) @ covariances @ plane
     plane_covariances[:, [0, 1], [0, 1]] += (blur_m / units[groups]) ** 2
     covered_areas = np.empty(len(firsts))
     with kernel_threads():
-        kernels.covered_plane(
+        kernels.sum_covered_areas(
             np.append(firsts, len(g)),
             opacities,
             (offsets[:, None] @ plane)[:, 0],
@@ -730,7 +736,7 @@ def merge_groups(
     merged = (
         centres,
         quat_from_rotmat(torch.from_numpy(axes)).numpy(),
-        np.sqrt(np.maximum(variances, THINNEST_M**2)),
+        np.sqrt(np.maximum(variances, MIN_SCALE_M**2)),
         np.where(area_ratio <= 1, area_ratio, flat_top),
         mean(g.sh.double().numpy()),
     )
@@ -760,7 +766,7 @@ def _find_heaviest(g: Gaussians, weights: np.ndarray, groups: np.ndarray) -> np.
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen:
+class ReplacedParts:
     """Parts to draw in place of other parts."""
 
     parts: tuple[PosedGaussians, ...]
@@ -794,7 +800,7 @@ def choose_parts(
     clip: HeightClip | None = None,
     *,
     whole: bool = True,
-) -> Chosen:
+) -> ReplacedParts:
     """Return the parts that a camera needs of large backgrounds, and all other parts.
 
     Args:
@@ -811,7 +817,7 @@ def choose_parts(
     first_splat = 0
     for part in parts:
         replacements = [(part, None)]
-        if has_levels(part):
+        if takes_levels(part):
             levels = levels_of(part.gaussians, antialiased=settings.antialiased)
             taken_runs = [*_select_runs(levels, part, camera, settings, fog, clip)]
             if _is_merged(levels, taken_runs):
@@ -828,10 +834,10 @@ def choose_parts(
             replace(parts[0], gaussians=no_gaussians, color_maps=None, color_rows=None)
         )
         stood_for.append((0, None))
-    return Chosen(tuple(chosen_parts), tuple(stood_for))
+    return ReplacedParts(tuple(chosen_parts), tuple(stood_for))
 
 
-def has_levels(part: PosedGaussians) -> bool:
+def takes_levels(part: PosedGaussians) -> bool:
     """Return True if a part is drawn in levels.
 
     Actors and what lies on the scene are not, nor are small parts.
@@ -925,25 +931,27 @@ def _select_runs(
     """
     pose = None if part.world_from_part is None else part.world_from_part.numpy()
     tree = levels.tree
-    squares, shares = squares_taken(levels, part, camera, settings)
-    if len(squares) > FEW_TESTED:
-        may_be_seen = may_be_drawn(tree.boxes.bounds(squares), pose, camera, settings, fog, clip)
+    squares, shares = choose_squares(levels, part, camera, settings)
+    if len(squares) > MAX_UNTESTED_SQUARES:
+        may_be_seen = find_visible_boxes(
+            tree.boxes.bounds(squares), pose, camera, settings, fog, clip
+        )
         squares = squares[may_be_seen]
         shares = shares[may_be_seen]
-    first_cells = tree.firsts[squares] // CELL
-    num_cells = -(-tree.ends[squares] // CELL) - first_cells
+    first_cells = tree.firsts[squares] // CELL_SIZE
+    num_cells = -(-tree.ends[squares] // CELL_SIZE) - first_cells
     square_of_cell = np.repeat(np.arange(len(squares)), num_cells)
     cells = (
         np.arange(len(square_of_cell))
         + (first_cells - num_cells.cumsum() + num_cells)[square_of_cell]
     )
     cell_bounds = tree.cells.bounds(cells + tree.cell_starts[tree.numbers[squares]][square_of_cell])
-    may_be_seen = may_be_drawn(cell_bounds, pose, camera, settings, fog, clip)
+    may_be_seen = find_visible_boxes(cell_bounds, pose, camera, settings, fog, clip)
     cells = cells[may_be_seen]
     square_of_cell = square_of_cell[may_be_seen]
     square = squares[square_of_cell]
-    firsts = np.maximum(tree.firsts[square], cells * CELL)
-    ends = np.minimum(tree.ends[square], (cells + 1) * CELL)
+    firsts = np.maximum(tree.firsts[square], cells * CELL_SIZE)
+    ends = np.minimum(tree.ends[square], (cells + 1) * CELL_SIZE)
     is_first = np.ones(len(firsts), bool)
     is_first[1:] = (firsts[1:] != ends[:-1]) | (np.diff(shares[square_of_cell]) != 0)
     is_first[1:] |= np.diff(tree.numbers[square]) != 0
@@ -960,7 +968,7 @@ def _select_runs(
             yield _LevelRuns(level, rows[is_of_level], run_shares[is_of_level])
 
 
-def squares_taken(
+def choose_squares(
     levels: Levels, part: PosedGaussians, camera: Camera, settings: RasterSettings
 ) -> tuple[Int64[np.ndarray, "T"], Float[np.ndarray, "T"]]:
     """Return the tree's squares that a camera takes, wherever it looks, and their shares.

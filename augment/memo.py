@@ -24,7 +24,7 @@ Value = TypeVar("Value")
 
 
 @runtime_checkable
-class Stored(Protocol):
+class StoredValue(Protocol):
     """A value that lies in a file, in place of the value itself; picklable."""
 
     def load(self) -> Any:
@@ -66,7 +66,9 @@ class SceneMemo:
                     return self._values[key]
                 shared_value = self._shared.get(key)
             try:
-                value = shared_value.load() if isinstance(shared_value, Stored) else shared_value
+                value = (
+                    shared_value.load() if isinstance(shared_value, StoredValue) else shared_value
+                )
                 return self._keep(key, make() if value is None else value)
             finally:
                 with self._lock:
@@ -90,7 +92,7 @@ class SceneMemo:
             self._values.pop(key, None)
             if shared:
                 self._shared[key] = value
-        if not isinstance(value, Stored):
+        if not isinstance(value, StoredValue):
             self._keep(key, value)
 
     def shared(self) -> dict[Hashable, Any]:
@@ -122,7 +124,7 @@ class SceneMemo:
         return value
 
 
-class Latest:
+class LatestValue:
     """The value of the last key that was asked for.
 
     Threads may share it: one makes the value.

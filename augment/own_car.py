@@ -1,7 +1,7 @@
 """Pixels of a camera's images that show the recording car itself.
 
 In: the images of one camera, in the order in which the car moved. Out: a bool mask
-(`find_ego_mask`; `own_car_mask` for a scene's recorded images). `augment.views` passes the mask on
+(`find_own_car_mask`; `own_car_mask` for a scene's recorded images). `augment.views` passes the mask on
 to the estimates of boxes; training views leave these pixels out of the loss.
 
 The recording car stays as it is while the road moves by. It is looked for from the image's bottom
@@ -87,7 +87,7 @@ def spread(items: Sequence[T], count: int) -> list[T]:
     return [items[i] for i in places]
 
 
-def find_ego_mask(cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> np.ndarray:
+def find_own_car_mask(cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> np.ndarray:
     """Return the pixels that show the recording car, bool [H, W].
 
     Nothing is found in fewer than six images, above the horizon, or where the car shows no edge
@@ -260,5 +260,5 @@ def _find_own_car(scene: Scene, name: str) -> tuple[Camera, np.ndarray] | None:
         images.append(image)
     if len({image.shape for image in images}) != 1:  # none, or of several sizes
         return None
-    mask = find_ego_mask(cameras, images)
+    mask = find_own_car_mask(cameras, images)
     return (cameras[0].scaled(_SCALE), mask) if mask.any() else None

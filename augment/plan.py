@@ -15,11 +15,20 @@ import numpy as np
 
 from augment import effects
 from augment.base_photo import RECORDED, check_base
-from augment.bounds import actor_boxes, owners_seen
+from augment.bounds import actor_boxes, find_visible_owners
 from augment.cameras import Camera
-from augment.effects.effect import DRAWING, PICTURE, SCENE, Active, Effect, Placed, Sight, Step
+from augment.effects.effect import (
+    DRAWING,
+    PICTURE,
+    SCENE,
+    Effect,
+    EffectInScene,
+    EffectPlan,
+    Step,
+    ViewQuery,
+)
 from augment.lod import check_background
-from augment.prune import pruned_share
+from augment.prune import prune_error_of
 from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.scene import Scene
@@ -38,7 +47,7 @@ BARE = "bare surface"
 class Plan:
     """Passes and buffers of one recipe in one scene, for all views."""
 
-    placed: Mapping[str, Placed]
+    placed: Mapping[str, EffectPlan]
     """Plan of every effect in the scene, by effect name."""
     settings: RasterSettings
     """Settings of the rasteriser."""
@@ -63,7 +72,7 @@ class Plan:
     under it."""
     finds_boxes: bool
     """If True, labels or instance images need the depth of the solid surfaces."""
-    recorded_exposure: bool
+    uses_recorded_exposure: bool
     """If True, the cameras' colour maps are applied to the finished picture."""
     on_photo: bool
     """If True, the recorded image stays the picture, and the scene supplies the weather."""
@@ -80,20 +89,20 @@ class Plan:
         levels = (p.water_level_z_m for p in self.placed.values() if p.data is not None)
         return next((level for level in levels if level is not None), None)
 
-    def active(self, scene: Scene, *, backend: str = AUTO) -> tuple[Active, ...]:
+    def active(self, scene: Scene, *, backend: str = AUTO) -> tuple[EffectInScene, ...]:
         """Return the effects that change anything, in the order in which they are applied.
 
         Args:
             scene: the scene.
             backend: the rasteriser's backend.
         """
-        active_effects: tuple[Active, ...] = ()
+        active_effects: tuple[EffectInScene, ...] = ()
         for effect in effects.EFFECTS:
             data = self.placed[effect.name].data
             if data is not None:
                 active_effects = (
                     *active_effects,
-                    Active(effect, data, scene, backend, active_effects),
+                    EffectInScene(effect, data, scene, backend, active_effects),
                 )
         return active_effects
 
@@ -127,7 +136,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     check_base(recipe, scene)
     if any(effect.reads_splats(recipe) for effect in effects.EFFECTS):
         check_background(scene.background)
-    effect_plans = dict[str, Placed]()
+    effect_plans = dict[str, EffectPlan]()
     for effect in reversed(effects.EFFECTS):  # later effects may cover earlier ones
         effect_plans[effect.name] = effect.place(recipe, scene, effect_plans)
     effect_plans = {effect.name: effect_plans[effect.name] for effect in effects.EFFECTS}
@@ -162,7 +171,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             fog_cut=render.fog_cut,
             lod_px=render.lod_px,
         ),
-        prune=pruned_share(render),
+        prune=prune_error_of(render),
         buffers=buffers,
         image_buffers=frozenset(image_buffers),
         bare_buffers=frozenset(bare_buffers),
@@ -171,7 +180,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         instance=output.instance,
         shows_first=output.surface == "first",
         finds_boxes=finds_boxes,
-        recorded_exposure=exposure.runs,
+        uses_recorded_exposure=exposure.runs,
         on_photo=recipe.render.base == RECORDED,
         sensor=recipe.camera,
         seed=recipe.seed,
@@ -182,7 +191,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
 def _all_steps(
     recipe: Recipe,
     scene: Scene,
-    effect_plans: Mapping[str, Placed],
+    effect_plans: Mapping[str, EffectPlan],
     buffers: Iterable[str],
     bare_buffers: Iterable[str],
     exposure: Step,
@@ -218,7 +227,7 @@ def _all_steps(
     )
 
 
-def _is_covered(candidates: Iterable[Effect], effect_plans: Mapping[str, Placed]) -> bool:
+def _is_covered(candidates: Iterable[Effect], effect_plans: Mapping[str, EffectPlan]) -> bool:
     """Return True if an effect lies on the scene."""
     return any(e.lies_on_scene and effect_plans[e.name].data is not None for e in candidates)
 
@@ -235,7 +244,7 @@ def _photo_step(recipe: Recipe) -> Step:
 def _exposure_step(recipe: Recipe, scene: Scene) -> Step:
     """Return the pass that applies the cameras' colour maps."""
     name = "camera colour map"
-    names = scene.mapped_cameras
+    names = scene.color_mapped_cameras
     if not names:
         return Step(name, False, "the scene's cameras record the scene's own colours")
     if recipe.render.exposure == "neutral":
@@ -258,7 +267,7 @@ class ViewPlan:
 
     actors: tuple[int, ...]
     """Instance ids (1 + index in the scene) of the actors to render."""
-    effects: tuple[Active, ...]
+    effects: tuple[EffectInScene, ...]
     """Effects that can be seen, in the order in which they are applied."""
     buffers: frozenset[str]
     """Buffers that the rasteriser computes, as those of `Plan`."""
@@ -304,9 +313,9 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     ]
     cameras = tuple(effect_cameras) or (camera,)
     poses = scene.poses_at(camera.timestamp_ns)
-    query = Sight(camera, cameras, {0: np.eye(4), **poses}, plan.settings.near_m)
-    owners = owners_seen(actor_boxes(scene), poses, cameras, plan.settings.near_m)
-    effects_in_view = list[Active]()
+    query = ViewQuery(camera, cameras, {0: np.eye(4), **poses}, plan.settings.near_m)
+    owners = find_visible_owners(actor_boxes(scene), poses, cameras, plan.settings.near_m)
+    effects_in_view = list[EffectInScene]()
     skip_reasons = dict[str, str]()
     for effect in active_effects:
         visibility = effect.effect.in_view(effect, query)

@@ -10,20 +10,20 @@ from typing import Any
 
 from tqdm import tqdm
 
-from augment.render.cpu.jit import seconds_compiling
+from augment.render.cpu.jit import compile_seconds
 
 
 class ProgressBar(tqdm):
     """tqdm's bar, on a clock that stands still while kernels are compiled."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        self._compiling_s = seconds_compiling()
+        self._compiling_s = compile_seconds()
         super().__init__(*args, **options)
 
     def update(self, n: float | None = 1) -> bool | None:
         """Advance by n, as tqdm does."""
         if not self.disable:  # a disabled bar has no times
-            total_s = seconds_compiling()
+            total_s = compile_seconds()
             spent_s = total_s - self._compiling_s
             self._compiling_s = total_s
             self.start_t += spent_s

@@ -1,16 +1,16 @@
 """Pruning: splats of the background that no recorded view would miss, left out of near views.
 
 In: the parts of a view, a scene and an error (`prune_parts`, called by `augment.views`). Out: the
-parts with the opacities of such splats set to 0. `share_errors` finds the errors of all splats
+parts with the opacities of such splats set to 0. `precompute_errors` finds the errors of all splats
 once, before a job's processes would.
 
 Without splat i, of colour c_i and weight w_i = alpha_i T_i at a pixel, the pixel shows more of what
 is behind it, B_i, and changes by w_i (B_i - c_i). To first order this is alpha_i dL/dalpha_i, which
 the rasteriser's backward pass adds up over a view. A splat's change in a view is
 
-    max(|sum of w_i L(B_i - c_i)|, LEAST_CONTRAST sum of w_i) / pixels,    L: luma,
+    max(|sum of w_i L(B_i - c_i)|, MIN_CONTRAST sum of w_i) / pixels,    L: luma,
 
-and the view that would change most counts. LEAST_CONTRAST stands for what changes of both signs
+and the view that would change most counts. MIN_CONTRAST stands for what changes of both signs
 hide, and for the changes that neighbours make when they go together. Splats that change least go
 first, until their changes add up to the error that is allowed in some view. After each of the
 ROUNDS the views are rendered again without the splats that have gone, since what these covered
@@ -34,12 +34,12 @@ from jaxtyping import Bool, Float, Int, Int32
 
 from augment.base_photo import RECORDED
 from augment.cameras import Camera
-from augment.lod import keeps_levels
+from augment.lod import has_stored_levels
 from augment.memo import memo_of
 from augment.progress import ProgressBar
 from augment.render.constants import RasterSettings
-from augment.render.cpu.order import known_of
-from augment.render.threads import divided_threads, views_at_once
+from augment.render.cpu.order import cached_of_tensor
+from augment.render.threads import num_concurrent_views, split_threads
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.timing import counted
 from recipes.schema import Render
@@ -59,7 +59,7 @@ LUMA = (0.299, 0.587, 0.114)
 # Luma behind all splats.
 SKY = 0.7
 # Contrast that a splat has at least, of 1.
-LEAST_CONTRAST = 0.05
+MIN_CONTRAST = 0.05
 # Errors up to which splats go in each round, shares of white.
 ROUNDS = (0.0002, 0.0004, 0.0008, 0.0016, 0.0032, math.inf)
 # Alpha that is not clamped: nothing is known of what is behind a splat whose alpha is clamped.
@@ -70,10 +70,10 @@ _ERRORS = ("errors without splats",)
 _search_lock = threading.RLock()
 
 # Indices of splats, and the change that each makes.
-Changes = tuple[Int32[np.ndarray, "_"], Float[np.ndarray, "_"]]
+SplatChanges = tuple[Int32[np.ndarray, "_"], Float[np.ndarray, "_"]]
 
 
-def pruned_share(render: Render) -> float:
+def prune_error_of(render: Render) -> float:
     """Return the recipe's error, or 0 where nothing is pruned: merged splats, recorded images."""
     return 0.0 if render.base == RECORDED or render.lod_px > 0 else render.prune
 
@@ -99,7 +99,7 @@ def prune_parts(
     )
 
 
-def share_errors(scene: Scene, most: float = math.inf, *, progress: bool = False) -> None:
+def precompute_errors(scene: Scene, most: float = math.inf, *, progress: bool = False) -> None:
     """Find the errors up to `most` now, so that other processes take them over.
 
     Args:
@@ -107,7 +107,7 @@ def share_errors(scene: Scene, most: float = math.inf, *, progress: bool = False
         most: largest error that is needed, share of white.
         progress: if True, show a bar on stderr.
     """
-    if not keeps_levels(scene.background):
+    if not has_stored_levels(scene.background):
         errors_of(scene, most, progress=progress)
         memo_of(scene).put(_ERRORS, _search_of(scene), shared=True)
 
@@ -139,7 +139,7 @@ def _is_background(part: PosedGaussians, scene: Scene) -> bool:
     """Return True if a part is the scene's background, without levels in a file."""
     g = part.gaussians
     is_plain = part.instance_id == 0 and not part.is_overlay and len(g) == len(scene.background)
-    return is_plain and not keeps_levels(scene.background)
+    return is_plain and not has_stored_levels(scene.background)
 
 
 def _is_near(camera: Camera, scene: Scene) -> bool:
@@ -164,7 +164,7 @@ def _prune_part(part: PosedGaussians, scene: Scene, error: float) -> PosedGaussi
         return errors, torch.where(is_pruned, opacities, 0.0)
 
     # One pruned tensor for one tensor of opacities, so that the rasteriser knows it again.
-    known_errors, pruned_opacities = known_of(opacities, f"pruned at {error}", prune)
+    known_errors, pruned_opacities = cached_of_tensor(opacities, f"pruned at {error}", prune)
     if known_errors is not errors:  # the same tensor in a scene of other views
         pruned_opacities = prune()[1]
     return replace(part, gaussians=replace(part.gaussians, opacities=pruned_opacities))
@@ -181,7 +181,7 @@ class _ErrorSearch:
     rounds: int = 0
     """Number of rounds that there have been."""
 
-    def leave_out(self, views: Sequence[Changes]) -> None:
+    def leave_out(self, views: Sequence[SplatChanges]) -> None:
         """Do one more round, by the changes that each remaining splat makes in each view."""
         count = len(self.errors)
         order = _order_by_change(views, np.isinf(self.errors))
@@ -214,14 +214,14 @@ def _find_errors(scene: Scene, search: _ErrorSearch, num_rounds: int, progress: 
     is_opaque = opacities.numpy() >= _ALPHA_MAX
     num_steps = (num_rounds - search.rounds) * len(cameras)
     title = "finding splats to leave out"
-    count = min(views_at_once(len(is_opaque)), len(cameras))
-    pool = divided_threads(count) if count > 1 else None
+    count = min(num_concurrent_views(len(is_opaque)), len(cameras))
+    pool = split_threads(count) if count > 1 else None
     with (
         ProgressBar(desc=title, total=num_steps, unit="view", disable=not progress) as bar,
         counted(title, num_steps) as advance,
     ):
 
-        def find_changes(camera: Camera) -> Changes:
+        def find_changes(camera: Camera) -> SplatChanges:
             if not hasattr(spaces, "scratch"):
                 spaces.scratch = Scratch()
             return _find_changes(remaining_scene, camera, is_opaque, spaces.scratch)
@@ -233,7 +233,7 @@ def _find_errors(scene: Scene, search: _ErrorSearch, num_rounds: int, progress: 
                 )
                 background = replace(scene.background, opacities=opacities_left)
                 remaining_scene = replace(scene, background=background)
-                views = list[Changes]()
+                views = list[SplatChanges]()
                 for view in (pool.map if pool else map)(find_changes, cameras):
                     views.append(view)
                     bar.update()
@@ -244,7 +244,7 @@ def _find_errors(scene: Scene, search: _ErrorSearch, num_rounds: int, progress: 
                 pool.shutdown(cancel_futures=True)
 
 
-def _changes_of_all(view: Changes, count: int) -> Float[np.ndarray, "N"]:
+def _changes_of_all(view: SplatChanges, count: int) -> Float[np.ndarray, "N"]:
     """Return the change by every splat, float64; 0 where it is not in the frame."""
     ids, changes = view
     all_changes = np.zeros(count)
@@ -253,7 +253,7 @@ def _changes_of_all(view: Changes, count: int) -> Float[np.ndarray, "N"]:
 
 
 def _order_by_change(
-    views: Sequence[Changes], is_candidate: Bool[np.ndarray, "N"]
+    views: Sequence[SplatChanges], is_candidate: Bool[np.ndarray, "N"]
 ) -> Int[np.ndarray, "M"]:
     """Return the indices of splats in a view's frame, by the largest change that they make in any.
 
@@ -268,7 +268,9 @@ def _order_by_change(
     return framed[np.argsort(largest[framed], kind="stable")]
 
 
-def _find_changes(scene: Scene, camera: Camera, is_opaque: np.ndarray, scratch: Any) -> Changes:
+def _find_changes(
+    scene: Scene, camera: Camera, is_opaque: np.ndarray, scratch: Any
+) -> SplatChanges:
     """Return the background's splats in a camera's frame, and each one's change of the view's
     mean.
     """
@@ -280,11 +282,11 @@ def _find_changes(scene: Scene, camera: Camera, is_opaque: np.ndarray, scratch: 
     inputs = gather_inputs(parts, camera, settings, None, with_color=True, culled=True)
     tape = record(inputs, camera, settings, scratch, with_depth=False)
     d_rgb = np.broadcast_to(np.array(LUMA, np.float32), tape.rgb.shape).copy()
-    ids, weights, effects = tape.splat_effects(d_rgb, np.full_like(tape.alpha, -SKY))
+    ids, weights, effects = tape.sum_splat_effects(d_rgb, np.full_like(tape.alpha, -SKY))
     is_background = (ids >= 0) & (ids < len(is_opaque))
     ids = ids[is_background]
     weights = weights[is_background] / np.float32(LUMA[0])
-    min_changes = np.where(is_opaque[ids], np.float32(1), np.float32(LEAST_CONTRAST)) * weights
+    min_changes = np.where(is_opaque[ids], np.float32(1), np.float32(MIN_CONTRAST)) * weights
     return ids, np.maximum(np.abs(effects[is_background]), min_changes) / np.float32(
         tape.alpha.size
     )

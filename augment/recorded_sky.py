@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from augment.cameras import Camera, Frame
 from augment.files.recorded_images import decode_image
-from augment.labels import KnowsLidarTop
+from augment.labels import KnowsLidarElevation
 from augment.memo import memo_of
 from augment.render.buffers import ALPHA
 from augment.render.rasterize import rasterize
@@ -87,7 +87,7 @@ def _luma(rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
     return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 
-def looks_like_sky(
+def find_sky_like_pixels(
     rgb: UInt8[np.ndarray, "H W 3"],
     candidates: Bool[np.ndarray, "H W"],
     window_px: int | None = None,
@@ -210,7 +210,7 @@ def find_sky(
         reaches_top = np.any(hits & (elevation_rad > lidar_top_rad - TOP_MARGIN_RAD), axis=0)[None]
         is_above_returns = np.cumsum(is_solid, axis=0) == 0  # above all returns of the column
         is_unknown = is_above_returns & is_above_horizon & _grow_mask(reaches_top, 1, _BESIDE_PX)
-    is_bright = looks_like_sky(rgb, is_above_horizon, _WINDOW_PX)
+    is_bright = find_sky_like_pixels(rgb, is_above_horizon, _WINDOW_PX)
     sky_seed = _regions_at_top(is_bright & is_above_horizon & ~is_solid & ~is_unknown)
     if sky_seed.mean() < _MIN_PART:
         return None
@@ -264,7 +264,7 @@ def _recorded_sky(scene: Scene, frame: Frame, camera: Camera) -> RecordedSky | N
     points = memo_of(scene).get(("sweep", frame.index), lambda: (_sweep(scene, frame),))[0]
     if points is None:
         return find_sky(rgb, elevation_rad(camera))
-    if isinstance(scene.labels, KnowsLidarTop):
+    if isinstance(scene.labels, KnowsLidarElevation):
         top_rad = scene.labels.lidar_top_rad
     else:
         top_rad = _top_rad(points, camera.centre.numpy().astype(np.float32))
@@ -315,7 +315,7 @@ def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
     It is known from the labels, or measured from the returns of some frames (too low where nothing
     tall stood near). None where there are not enough of them.
     """
-    if isinstance(scene.labels, KnowsLidarTop):
+    if isinstance(scene.labels, KnowsLidarElevation):
         return scene.labels.lidar_top_rad
     tops = []
     for index in frames:
@@ -357,7 +357,7 @@ def sky_mask(
         True  # also thin things that are not in the scene: wires, twigs
     )
     is_open = _find_open_pixels(camera, is_covered | has_return, lidar_top_rad)
-    is_sure = is_open & looks_like_sky(rgb, is_open)
+    is_sure = is_open & find_sky_like_pixels(rgb, is_open)
     ray_rise = camera.ray_directions().numpy()[..., 2]
     is_above_horizon = (ray_rise > 0) & ~has_return
     is_likely = (
@@ -381,12 +381,12 @@ def sky_mask(
 
 
 def _as_bright_as_sky(rgb: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """Return the pixels of `looks_like_sky`, and those brighter than most of the candidates."""
+    """Return the pixels of `find_sky_like_pixels`, and those brighter than most of the candidates."""
     luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     if not candidates.any():
         return candidates
     bright_luma = max(float(np.quantile(luma[candidates], 0.9)), _MIN_LUMA)
-    return looks_like_sky(rgb, candidates) | (luma > bright_luma)
+    return find_sky_like_pixels(rgb, candidates) | (luma > bright_luma)
 
 
 def _shrink(image: np.ndarray, interpolation: int) -> np.ndarray:

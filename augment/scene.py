@@ -25,8 +25,8 @@ from augment.cameras import Camera, Frame
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat
 from augment.labels import Boxes, LabelSource, LidarSweep
-from augment.memo import Latest, memo_of
-from augment.render.sh import rotate_sh, sh_turn
+from augment.memo import LatestValue, memo_of
+from augment.render.sh import rotate_sh, sh_rotation
 from augment.render.threads import kernel_threads
 from augment.sky import Sky
 
@@ -190,7 +190,7 @@ def _rotation(quat: Sequence[float]) -> list[list[float]]:
 
 
 @dataclass(frozen=True, eq=False)
-class ColorWaves:
+class ColorSeries:
     """Change of sh[:, 0] of N Gaussians over time, as a Fourier series.
 
     c_0 is sh[:, 0] itself, as b_0 is 1.
@@ -236,7 +236,7 @@ class ColorWaves:
         """Return b_1 to b_{F-1} at a time."""
         return basis(self.phase_at(timestamp_ns), self.coefficients.shape[1] + 1)[1:]
 
-    def change_at(self, timestamp_ns: int) -> Float[Tensor, "N 3"]:
+    def color_offset_at(self, timestamp_ns: int) -> Float[Tensor, "N 3"]:
         """Return the colours to add to sh[:, 0] at a time."""
         weights = self.weights_at(timestamp_ns)
         change = torch.zeros_like(self.coefficients[:, 0])
@@ -255,7 +255,7 @@ def basis(phase: float, terms: int) -> list[float]:
 
 def colors_at(
     sh: Float[Tensor, "N K 3"],
-    waves: ColorWaves | None,
+    waves: ColorSeries | None,
     timestamp_ns: int,
     turn: Float[Tensor, "3 3"] | None,
     *,
@@ -274,13 +274,13 @@ def colors_at(
     if fast and sh.dtype == torch.float32 and not sh.requires_grad:
         return _colors_by_kernel(sh, waves, timestamp_ns, turn)
     if waves is not None:
-        base_colors = sh[:, :1] + waves.change_at(timestamp_ns)[:, None]
+        base_colors = sh[:, :1] + waves.color_offset_at(timestamp_ns)[:, None]
         sh = torch.cat([base_colors, sh[:, 1:]], 1)
     return sh if turn is None or sh.shape[1] == 1 else rotate_sh(sh, turn)
 
 
 def _colors_by_kernel(
-    sh: Tensor, waves: ColorWaves | None, timestamp_ns: int, turn: Tensor | None
+    sh: Tensor, waves: ColorSeries | None, timestamp_ns: int, turn: Tensor | None
 ) -> Tensor:
     """Return `colors_at` of float32 values, by the CPU kernel."""
     coefficients = np.zeros((len(sh), 0, 3), np.float32)
@@ -290,7 +290,7 @@ def _colors_by_kernel(
         weights = waves.weights_at(timestamp_ns)
     turn_matrix = np.zeros((0, 0), np.float32)
     if turn is not None and sh.shape[1] > 1:
-        turn_matrix = sh_turn(turn, math.isqrt(sh.shape[1]) - 1).numpy().astype(np.float32)
+        turn_matrix = sh_rotation(turn, math.isqrt(sh.shape[1]) - 1).numpy().astype(np.float32)
     out = np.empty(tuple(sh.shape), np.float32)
     sh_rows = sh.detach().contiguous().numpy()
     term_weights = np.asarray(weights, np.float32)
@@ -303,7 +303,7 @@ def _colors_by_kernel(
 # and squares and cells are still numbers.
 MAX_EXTENT_M = 1e7
 # Numbers K of spherical harmonics that Gaussians may have: (degree + 1)^2 for degrees 0 to 3.
-SH_COUNTS = (1, 4, 9, 16)
+NUM_SH_BY_DEGREE = (1, 4, 9, 16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,9 +343,14 @@ class Gaussians:
                     f"got {value.dtype}"
                 )
         shape = tuple(self.sh.shape)
-        if len(shape) != 3 or shape[0] != count or shape[1] not in SH_COUNTS or shape[2] != 3:
+        if (
+            len(shape) != 3
+            or shape[0] != count
+            or shape[1] not in NUM_SH_BY_DEGREE
+            or shape[2] != 3
+        ):
             raise ValueError(
-                f"sh must be [N, K, 3] with N={count} and K in {SH_COUNTS} (degrees 0-3); "
+                f"sh must be [N, K, 3] with N={count} and K in {NUM_SH_BY_DEGREE} (degrees 0-3); "
                 f"got {list(shape)}"
             )
         if self.semantic is not None and tuple(self.semantic.shape) != (count,):
@@ -357,7 +362,7 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         """Return the degree of the spherical harmonics, 0 to 3."""
-        return SH_COUNTS.index(self.sh.shape[1])
+        return NUM_SH_BY_DEGREE.index(self.sh.shape[1])
 
     @property
     def nbytes(self) -> int:
@@ -376,7 +381,7 @@ class Gaussians:
     @staticmethod
     def empty(sh_degree: int = 0) -> Gaussians:
         """Return no Gaussians, of float32."""
-        shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, SH_COUNTS[sh_degree], 3))
+        shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, NUM_SH_BY_DEGREE[sh_degree], 3))
         return Gaussians(*(torch.zeros(shape) for shape in shapes))
 
 
@@ -394,7 +399,7 @@ class Actor:
     """Poses over time."""
     size_m: tuple[float, float, float]
     """Length, width and height of the box, metres."""
-    color_waves: ColorWaves | None = None
+    color_waves: ColorSeries | None = None
     """Change of the colours over time, a row for each Gaussian; None where there is none."""
     colors_in_world: bool = False
     """If True, SH are for directions of the world, however the actor is turned, as Street Gaussians
@@ -428,7 +433,7 @@ class Actor:
         if any(tensor.requires_grad or tensor.is_inference() for tensor in inputs):
             return color()
         moment = timestamp_ns, *(tensor._version for tensor in inputs)
-        return memo_of(self).get(("colours of a moment",), Latest).get(moment, color)
+        return memo_of(self).get(("colours of a moment",), LatestValue).get(moment, color)
 
 
 @dataclass(frozen=True, eq=False)
@@ -660,7 +665,7 @@ class Scene:
         return color_map
 
     @property
-    def mapped_cameras(self) -> tuple[str, ...]:
+    def color_mapped_cameras(self) -> tuple[str, ...]:
         """Return the names of cameras with a colour map, for all or for single images, in order."""
         maps = [*self.color_maps.items(), *((n, m) for (n, _), m in self.image_color_maps.items())]
         identity = torch.eye(3, 4)
@@ -671,7 +676,7 @@ class Scene:
     def common_color_map(self) -> Float[Tensor, "3 4"] | None:
         """Return the mean of all colour maps, float64; None where none changes anything."""
         maps = [*self.color_maps.values(), *self.image_color_maps.values()]
-        return torch.stack(maps).double().mean(0) if self.mapped_cameras else None
+        return torch.stack(maps).double().mean(0) if self.color_mapped_cameras else None
 
     def boxes(self, frame_index: int) -> Boxes:
         """Return the labelled boxes of a frame."""

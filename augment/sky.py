@@ -70,7 +70,7 @@ class CubemapSky:
         return _sample_bordered(bordered_faces(self), directions)
 
 
-def is_stand_in(sky: Sky) -> bool:
+def is_unknown_sky(sky: Sky) -> bool:
     """Return True if the sky is one grey in every direction (black and white included).
 
     Then nothing is known of the sky, and its colour says nothing about the scene's.

@@ -117,7 +117,7 @@ class FitRecord(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class SeenView:
+class SourceView:
     """An image that the scene was made from."""
 
     frame: int
@@ -129,10 +129,10 @@ class SeenView:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SourceViews:
     """The images that a scene was made from; none where they are not known."""
 
-    views: tuple[SeenView, ...]
+    views: tuple[SourceView, ...]
     """The images."""
     is_fit: bool
     """If True, the scene was fitted to the images; else made from a recording."""
@@ -142,7 +142,7 @@ class Seen:
         """Return the names of the cameras, in the order in which they first appear."""
         return tuple(dict.fromkeys(view.camera.name for view in self.views))
 
-    def of(self, name: str) -> tuple[SeenView, ...]:
+    def of(self, name: str) -> tuple[SourceView, ...]:
         """Return the views of one camera."""
         return tuple(view for view in self.views if view.camera.name == name)
 
@@ -167,7 +167,7 @@ class Seen:
         return distance_m, np.arccos(np.clip(cosine, -1, 1))
 
 
-class Nearest(NamedTuple):
+class NearestView(NamedTuple):
     """The seen view nearest to a camera."""
 
     distance_m: float
@@ -178,7 +178,7 @@ class Nearest(NamedTuple):
     """Pixels of the camera for one pixel of the view, of the same thing."""
 
 
-def seen_views(scene: Scene) -> Seen:
+def source_views(scene: Scene) -> SourceViews:
     """Return the views that a scene was made from.
 
     For a fitted scene they are those that it was fitted to, as its files say; else all that was
@@ -189,7 +189,7 @@ def seen_views(scene: Scene) -> Seen:
 
 def unfitted_cameras(scene: Scene) -> tuple[str, ...]:
     """Return the recorded cameras that a fit has never learnt from."""
-    sources = seen_views(scene)
+    sources = source_views(scene)
     if not sources.is_fit or not sources.views:
         return ()
     recorded_names = dict.fromkeys(name for frame in _made_from(scene) for name in frame.cameras)
@@ -201,7 +201,7 @@ def _made_from(scene: Scene) -> tuple[Frame, ...]:
     return scene.frames if scene.seen_frames is None else scene.seen_frames
 
 
-def left_out_sentence(names: Sequence[str], how: str) -> str:
+def skipped_cameras_sentence(names: Sequence[str], how: str) -> str:
     """Return a job's sentence about cameras that it leaves out.
 
     Args:
@@ -214,7 +214,7 @@ def left_out_sentence(names: Sequence[str], how: str) -> str:
     )
 
 
-def magnified_sentence(learnt_scale: float | None, scale: float) -> str | None:
+def magnification_sentence(learnt_scale: float | None, scale: float) -> str | None:
     """Return a sentence on pictures that are too large; None where they are not.
 
     Args:
@@ -230,7 +230,7 @@ def magnified_sentence(learnt_scale: float | None, scale: float) -> str | None:
     )
 
 
-def nearest_view(sources: Seen, camera: Camera) -> Nearest | None:
+def nearest_view(sources: SourceViews, camera: Camera) -> NearestView | None:
     """Return the seen view nearest to a camera; None where no view is known.
 
     A metre of distance counts as much as 7.5 degrees.
@@ -240,7 +240,7 @@ def nearest_view(sources: Seen, camera: Camera) -> Nearest | None:
     distance_m, angle_rad = sources.away(camera)
     best = int(np.argmin(_pose_difference(distance_m, angle_rad)))
     magnification = camera.fx / sources.views[best].camera.fx
-    return Nearest(float(distance_m[best]), float(angle_rad[best]), magnification)
+    return NearestView(float(distance_m[best]), float(angle_rad[best]), magnification)
 
 
 def _pose_difference(distance_m: Any, angle_rad: Any) -> Any:
@@ -248,8 +248,8 @@ def _pose_difference(distance_m: Any, angle_rad: Any) -> Any:
     return distance_m / MAX_DISTANCE_M + angle_rad / MAX_ANGLE_RAD
 
 
-def _find_seen_views(scene: Scene) -> Seen:
-    """Return the views that a scene was made from, as `seen_views`."""
+def _find_seen_views(scene: Scene) -> SourceViews:
+    """Return the views that a scene was made from, as `source_views`."""
     frames = _made_from(scene)
     fit = _fit_record(scene.made_by, frames)
     has_images = any(frame.image_paths for frame in frames)
@@ -260,10 +260,10 @@ def _find_seen_views(scene: Scene) -> Seen:
                 continue
             if fit is not None:
                 if frame.index in fit.views.get(name, ()):
-                    views.append(SeenView(frame.index, camera.scaled(fit.scale), fit.scale))
+                    views.append(SourceView(frame.index, camera.scaled(fit.scale), fit.scale))
             elif name in frame.image_paths or not has_images:
-                views.append(SeenView(frame.index, camera))
-    return Seen(tuple(views), fit is not None)
+                views.append(SourceView(frame.index, camera))
+    return SourceViews(tuple(views), fit is not None)
 
 
 def _fit_record(made_by: Mapping[str, Any], frames: Sequence[Frame]) -> FitRecord | None:
@@ -487,7 +487,7 @@ def _view_points(camera: Camera, view: _ClearView) -> _ViewPoints:
 def _measure_detail(scene: Scene, camera: Camera, points: _ViewPoints, backend: str) -> np.ndarray:
     """Return how finely some view of the scene has seen each point unhidden, 0 to 1, [P]."""
     trust = np.zeros(len(points.world))
-    sources = seen_views(scene)
+    sources = source_views(scene)
     for number, view in _nearest_views(sources, camera):
         remaining = np.flatnonzero(trust < 1 - _MIN_GAIN)
         if len(remaining) == 0:
@@ -544,9 +544,9 @@ def _measure_support(
     return num_agreeing / num_images
 
 
-def _witnesses(scene: Scene, camera: Camera) -> list[tuple[int, SeenView]]:
+def _witnesses(scene: Scene, camera: Camera) -> list[tuple[int, SourceView]]:
     """Return the nearest views of the same camera from another place, with their numbers."""
-    sources = seen_views(scene)
+    sources = source_views(scene)
     distance_m, angle_rad = sources.away(camera) if sources.views else (np.zeros(0), np.zeros(0))
     order = np.argsort(_pose_difference(distance_m, angle_rad), kind="stable").tolist()
     names = {camera.name} if camera.name in sources.names else set(sources.names)
@@ -564,7 +564,7 @@ class _RecordedRange(NamedTuple):
     """Highest values, float32 [h, w, 3]."""
 
 
-def _recorded_range(scene: Scene, number: int, view: SeenView) -> _RecordedRange | None:
+def _recorded_range(scene: Scene, number: int, view: SourceView) -> _RecordedRange | None:
     """Return the ranges of a view's recorded image; None where there is none that can be read."""
 
     def make() -> tuple[_RecordedRange | None]:
@@ -600,7 +600,7 @@ def _points_in_view(
     return _project_points(view, moved_world)
 
 
-def _nearest_views(sources: Seen, camera: Camera) -> list[tuple[int, SeenView]]:
+def _nearest_views(sources: SourceViews, camera: Camera) -> list[tuple[int, SourceView]]:
     """Return the nearest views with their numbers."""
     order = np.argsort(_pose_difference(*sources.away(camera)), kind="stable")[:_NUM_VIEWS]
     return [(n, sources.views[n]) for n in order.tolist()]
@@ -738,7 +738,7 @@ class CameraTrust:
     """Width of the largest of them; None without any."""
     seen_path_m: float
     """Length of the path between them."""
-    nearest: Nearest | None
+    nearest: NearestView | None
     """Nearest view to the frame that is farthest from any view; None without any."""
     away: tuple[int, ...]
     """Numbers of frames that stand away from all views."""
@@ -842,7 +842,7 @@ def judge_scene(
     )
     unknown = []
     judged_views = [view for camera in judged_cameras for view in camera.views]
-    if not seen_views(scene).views:
+    if not source_views(scene).views:
         unknown.append("from where the scene was seen: no camera that it was made from is known")
     if judged_views and all(view.sky_covered is None for view in judged_views):
         unknown.append("whether the sky is empty: no recorded image tells where it is")
@@ -855,7 +855,7 @@ def _judge_camera(
     scene: Scene, frames: Sequence[Frame], name: str, scale: float | None, count: int, backend: str
 ) -> CameraTrust:
     """Judge one camera; the arguments are those of `judge_scene`."""
-    sources = seen_views(scene)
+    sources = source_views(scene)
     seen_by_camera = sources.of(name)
     camera_frames = [f for f in frames if name in f.cameras and not f.cameras[name].is_orthographic]
     nearest_views = {
@@ -896,7 +896,7 @@ def _judge_camera(
     )
     problems = failures + _find_problems(camera_trust, is_unfitted, len(camera_frames))
     if farthest_view is not None and scale is not None and not is_unfitted:
-        sentence = magnified_sentence(1 / farthest_view.magnification, 1.0)
+        sentence = magnification_sentence(1 / farthest_view.magnification, 1.0)
         problems += [] if sentence is None else [sentence]
     return dataclasses.replace(camera_trust, problems=tuple(problems))
 
@@ -906,7 +906,7 @@ def _shrink_camera(camera: Camera) -> Camera:
     return camera.scaled(min(1.0, WORK_WIDTH / camera.width))
 
 
-def _is_away(nearest: Nearest) -> bool:
+def _is_away(nearest: NearestView) -> bool:
     """Return True if a view is beyond the limits of distance or angle."""
     return nearest.distance_m > MAX_DISTANCE_M or nearest.angle_rad > MAX_ANGLE_RAD
 

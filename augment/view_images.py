@@ -51,7 +51,7 @@ class ViewImages:
     """Masks of the effects in view, by name, uint8 [H, W], 0 or 255."""
 
 
-def begin_images(view: WeatheredBuffers, plan: Plan) -> Callable[[], ViewImages]:
+def start_images(view: WeatheredBuffers, plan: Plan) -> Callable[[], ViewImages]:
     """Begin the images that the plan asks for, and return a function that waits for them.
 
     Args:

@@ -22,7 +22,7 @@ from augment import effects
 from augment.base_photo import open_photo
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
-from augment.effects.effect import Drawn, EffectView
+from augment.effects.effect import LabelInputs, RenderedView
 from augment.jobs.layout import TRUST
 from augment.jobs.processes import awaited, choose_backend, renders_on_gpu
 from augment.own_car import own_car_mask
@@ -32,11 +32,11 @@ from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
 from augment.render.composite import map_colors
 from augment.render.rasterize import rasterize
 from augment.render.sensor import add_noise, blur_lens
-from augment.render.threads import divided_threads, views_at_once
+from augment.render.threads import num_concurrent_views, split_threads
 from augment.scene import PosedGaussians, Scene
 from augment.timing import timed
 from augment.trust import trust_mask
-from augment.view_images import SURFACE_ALPHA, ViewImages, begin_images
+from augment.view_images import SURFACE_ALPHA, ViewImages, start_images
 from recipes.schema import Recipe
 
 # ---- The passes of one view, in the order in which they run --------------------------------------
@@ -67,7 +67,7 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
     with timed("plan"):
         plan = make_plan(recipe, scene)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
-    images = begin_images(buffers, plan)
+    images = start_images(buffers, plan)
     # The closure below holds the camera and not the buffers, which the images may long outlive.
     camera = buffers.camera
     trust = dict[str, np.ndarray]()
@@ -96,7 +96,7 @@ def render_buffers(
         view = plan_view(plan, scene, camera, backend=backend)
     with timed("parts"):
         bare_parts = scene.parts_for(camera, view.actors)
-    color_map = scene.color_map(camera) if plan.recorded_exposure else None
+    color_map = scene.color_map(camera) if plan.uses_recorded_exposure else None
     photo = None
     if plan.on_photo:
         with timed("photo"):
@@ -139,7 +139,7 @@ def render_buffers(
     )
 
 
-def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> Drawn:
+def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> RenderedView:
     """Return the view as rendered by the last effect that draws the scene in layers of its own, or,
     without such an effect, as one layer with its sky.
     """
@@ -147,10 +147,10 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> Drawn:
         rendered = effect.effect.draw(effect, layers, camera, view.buffers)
         if rendered is not None:
             return rendered
-    return Drawn(*layers.draw_whole(camera, view.buffers), layers)
+    return RenderedView(*layers.render_with_sky(camera, view.buffers), layers)
 
 
-def _masks(view: ViewPlan, rendered: Drawn) -> dict[str, Tensor]:
+def _masks(view: ViewPlan, rendered: RenderedView) -> dict[str, Tensor]:
     """Return a bool mask for each effect in view: the pixels that show the effect.
 
     A pixel that several opaque effects cover belongs to the one that is applied last.
@@ -223,7 +223,7 @@ def _weathered(
 ) -> WeatheredView:
     """Return the finished view: the images, and what labels are measured from."""
     masks = dict(trust)
-    views = dict[str, EffectView]()
+    views = dict[str, LabelInputs]()
     for effect in effects.EFFECTS:
         if effect.of(recipe) is None:
             continue
@@ -231,7 +231,7 @@ def _weathered(
         mask = images.masks.get(effect.mask or "")
         is_in_view = effect_plan.data is not None and (effect.mask is None or mask is not None)
         depth = images.scene_depth_m if is_in_view else None
-        views[effect.name] = EffectView(effect_plan, depth, mask, plan.water_level_z_m)
+        views[effect.name] = LabelInputs(effect_plan, depth, mask, plan.water_level_z_m)
         if effect.mask is not None:
             empty_mask = np.zeros((camera.height, camera.width), np.uint8)
             masks[effect.mask] = empty_mask if mask is None else mask
@@ -247,7 +247,9 @@ def _weathered(
     )
 
 
-def _surface_view(images: ViewImages, plan: Plan, own_car: np.ndarray | None) -> SurfaceView | None:
+def _surface_view(
+    images: ViewImages, plan: Plan, own_car: np.ndarray | None
+) -> LabelSurfaces | None:
     """Return the surfaces that labels are measured from; None where nobody asks for boxes."""
     depth = images.scene_depth_m
     is_bare = bool(plan.bare_buffers)
@@ -256,12 +258,12 @@ def _surface_view(images: ViewImages, plan: Plan, own_car: np.ndarray | None) ->
     shows_first = plan.shows_first and plan.water_level_z_m is not None
     # The other images show the surfaces of this depth, unless they are bare or show the water.
     is_of_depth = not (is_bare or shows_first)
-    return SurfaceView(
+    return LabelSurfaces(
         depth_m=depth,
         actors=images.instance if is_of_depth else None,
         classes=images.semantic if is_of_depth else None,
-        shown_depth_m=images.depth_m if is_bare else depth,
-        shown_classes=images.semantic,
+        instance_depth_m=images.depth_m if is_bare else depth,
+        instance_classes=images.semantic,
         is_bare=is_bare,
         own_car=own_car,
     )
@@ -306,7 +308,7 @@ class WeatheredBuffers:
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceView:
+class LabelSurfaces:
     """Surfaces of one view that labels are measured from.
 
     Depths are float32 [H, W], z in metres, 0 = none.
@@ -316,12 +318,12 @@ class SurfaceView:
     """Depth of the first solid surface: snow counts, water does not."""
     actors: np.ndarray | None
     """Instance image of those surfaces, uint16 [H, W], actors only; None where there is none."""
-    shown_depth_m: np.ndarray | None
+    instance_depth_m: np.ndarray | None
     """Depth of the surfaces that the view's instance image shows; None without one."""
-    shown_classes: np.ndarray | None
+    instance_classes: np.ndarray | None
     """Classes of the surfaces that the view's instance image shows; None without one."""
     is_bare: bool
-    """If True, `shown_depth_m` and `shown_classes` are without what lies on the scene."""
+    """If True, `instance_depth_m` and `instance_classes` are without what lies on the scene."""
     classes: np.ndarray | None = None
     """Classes of the surfaces of `depth_m`, uint8 [H, W]; None where no image shows them."""
     own_car: np.ndarray | None = None
@@ -347,9 +349,9 @@ class WeatheredView:
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Masks by name, uint8 [H, W]: 255 where the pixel shows the effect, else 0; TRUST holds 0 to
     255."""
-    effects: Mapping[str, EffectView] = field(default_factory=dict)
+    effects: Mapping[str, LabelInputs] = field(default_factory=dict)
     """Inputs of the effects' own labels, for every effect that the recipe has, by name."""
-    surface: SurfaceView | None = None
+    surface: LabelSurfaces | None = None
     """Surfaces that boxes are measured from; None where nobody asks for boxes."""
 
 
@@ -398,10 +400,10 @@ class ViewPool:
         self.ahead = int(renders_on_gpu(backend))
         self._threads = None
         if backend == CPU:
-            count = min(views, views_at_once(sum(map(len, scene.all_gaussians))))
+            count = min(views, num_concurrent_views(sum(map(len, scene.all_gaussians))))
             if count > 1:
                 self.ahead = count
-                self._threads = divided_threads(count)
+                self._threads = split_threads(count)
 
     def begin(
         self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO

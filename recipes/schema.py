@@ -594,6 +594,6 @@ def tier_settings(recipe: Recipe, tier: str) -> dict[str, Value]:
     return {knob.path: values.get(knob.path, knob.reference) for knob in free_knobs(recipe)}
 
 
-def as_reference(recipe: Recipe) -> Recipe:
+def with_reference_settings(recipe: Recipe) -> Recipe:
     """Return the recipe with every knob that a tier may set at its reference, given or not."""
     return with_settings(recipe, {k.path: k.reference for k in knobs_of(recipe) if k.chosen})

@@ -9,7 +9,7 @@ import torch
 from scenes import camera_ahead, random_gaussians, random_pose
 
 from augment.cameras import Frame
-from augment.scene import Actor, ColorWaves, Gaussians, Ground, Scene, Track
+from augment.scene import Actor, ColorSeries, Gaussians, Ground, Scene, Track
 from augment.sky import CubemapSky
 
 START_NS = 1_557_540_079_200_123_457  # too many digits for a float64
@@ -26,7 +26,7 @@ def fitted_scene(**changes) -> Scene:
     car = Track(times, poses, hold_ns=5)
     person = Track(times[:1], poses[:1], max_gap_ns=300_000_001)
     phases = torch.tensor([0.1, 1 / 3, 2.0], dtype=torch.float64)
-    waves = ColorWaves(torch.from_numpy(rng.normal(0, 0.1, (7, 4, 3)).astype("f4")), times, phases)
+    waves = ColorSeries(torch.from_numpy(rng.normal(0, 0.1, (7, 4, 3)).astype("f4")), times, phases)
     actors = (
         Actor(
             "car/1",

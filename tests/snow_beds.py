@@ -6,7 +6,13 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowCells, SnowSupport
+from augment.effects.snow.cells import (
+    FLUSH,
+    MAX_EDGE_DISTANCE_M,
+    OPEN_EDGE,
+    ExposedCells,
+    ExposedSurface,
+)
 from augment.geometry import rigid
 from augment.scene import Actor, Gaussians, Scene
 from augment.semantics import SemanticClass
@@ -26,7 +32,7 @@ def cells_on_grid(
     tracks: np.ndarray | None = None,
     light: np.ndarray | None = None,
     banks: tuple[float, float] = (0.0, 0.0),
-) -> SnowCells:
+) -> ExposedCells:
     """Cells over a grid of heights z_m [nx, ny]; NaN where there is none.
 
     corner_m: of the first cell. border: what follows at the grid's own border. holes: what follows
@@ -52,7 +58,7 @@ def cells_on_grid(
     def flat(values, usual):
         return torch.full((count,), usual) if values is None else _tensor(values[there])
 
-    return SnowCells(
+    return ExposedCells(
         centers_m=_tensor(centers),
         normals=_tensor(normals),
         sizes_m=torch.full((count,), float(cell_m)),
@@ -73,18 +79,18 @@ def _edge_distance(around: np.ndarray, cell_m: float) -> np.ndarray:
 
     solid = (around != OPEN_EDGE).astype(np.uint8)
     steps = cv2.distanceTransform(solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.clip((steps - 0.5) * cell_m, 0.5 * cell_m, EDGE_CAP_M)[1:-1, 1:-1]
+    return np.clip((steps - 0.5) * cell_m, 0.5 * cell_m, MAX_EDGE_DISTANCE_M)[1:-1, 1:-1]
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def bed_of_cells(ground: SnowCells, **actors: SnowCells) -> SnowSupport:
-    return SnowSupport(ground, actors)
+def bed_of_cells(ground: ExposedCells, **actors: ExposedCells) -> ExposedSurface:
+    return ExposedSurface(ground, actors)
 
 
-def level_bed(size_m: float = 10.0, cell_m: float = 0.05, **options) -> SnowSupport:
+def level_bed(size_m: float = 10.0, cell_m: float = 0.05, **options) -> ExposedSurface:
     """Level ground at z = 0, from (0, 0) to (size_m, size_m)."""
     count = max(1, round(size_m / cell_m))
     return bed_of_cells(cells_on_grid(np.zeros((count, count)), cell_m, **options))

@@ -655,9 +655,9 @@ def main(arguments: list[str] | None = None) -> int:
         if isinstance(result, int | None):
             return result
         if isinstance(result, SceneCommand) and not result.cache:
-            from adapters.scene_cache import leave_out_cache
+            from adapters.scene_cache import disable_scene_cache
 
-            leave_out_cache()
+            disable_scene_cache()
         return result.run()
     except KeyboardInterrupt as interruption:
         print(str(interruption) or "interrupted", file=sys.stderr)

@@ -18,9 +18,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from augment.errors import OutputError
-from augment.jobs.atomic import replaced_file, write_atomic
+from augment.jobs.atomic import write_atomic, write_file_atomically
 from augment.jobs.files import decode_image
-from augment.jobs.layout import folder_name, reading_back, resolve_inside
+from augment.jobs.layout import folder_name, parse_errors_as_output_errors, resolve_inside
 from augment.jobs.manifest import OK, Row, read_manifest
 from augment.jobs.store import Store, open_store
 from recipes.schema import columns_of_effects, parse_frames
@@ -171,7 +171,7 @@ def cameras_on_car(store: Store, table: pa.Table) -> list[str]:
     calibration_rows = table.select(["camera", "frame", "calibration_path"]).drop_null()
     for row in calibration_rows.take(first_of_each(calibration_rows, "camera")).to_pylist():
         name = row["camera"]
-        with suppress(OutputError), reading_back("calibration", ""):
+        with suppress(OutputError), parse_errors_as_output_errors("calibration", ""):
             entry = read_entries(row["calibration_path"])[row["frame"]]
             world_from_camera = np.array(entry["cameras"][name]["world_from_camera"], float)
             ego_from_world = np.linalg.inv(np.array(entry["world_from_ego"], float))
@@ -378,7 +378,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: flo
     first = next(frames := iter(frames))
     height, width = first.shape[:2]
     frames = itertools.chain([first], frames)
-    with replaced_file(path, ending=path.suffix) as file:
+    with write_file_atomically(path, ending=path.suffix) as file:
         try:
             from imageio_ffmpeg import get_ffmpeg_exe
         except ImportError:

@@ -28,16 +28,16 @@ from augment.errors import OutputError
 from augment.geometry import invert_rigid
 from augment.jobs.files import depth_in_metres
 from augment.jobs.layout import folder_name, variant_folder
-from augment.jobs.manifest import OK, read_finished
+from augment.jobs.manifest import OK, read_manifest_rows
 from augment.jobs.store import Store, open_store
 from augment.jobs.tables import read_boxes
 from augment.metrics.consistency import (
     ActorPaths,
     DepthView,
     Warp,
-    carry,
     consistency_of,
     find_warp,
+    move_surfaces,
 )
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
 from augment.render.sensor import noise_variance
@@ -210,7 +210,7 @@ class Views:
         scenes: Sequence[str] | None = None,
         recipes: Sequence[str] | None = None,
     ) -> None:
-        table = read_finished(store)
+        table = read_manifest_rows(store)
         table = table.filter(pc.equal(table["status"], OK))
         for column, names in (("scene", scenes), ("recipe", recipes)):
             if names is None:
@@ -381,7 +381,7 @@ def compare(views: Views, pair: Pair) -> Compared:
     view_b = views.view(pair.b)
     a = view_a.depth_view
     b = view_b.depth_view
-    carried = carry(views.paths(pair.a), a, b, view_a.shows_actor)
+    carried = move_surfaces(views.paths(pair.a), a, b, view_a.shows_actor)
     alpha = np.where(carried.unclear_b, np.float32(0), b.alpha)
     warp = find_warp(a, dataclasses.replace(b, alpha=alpha), carried.points_m)
     water = None

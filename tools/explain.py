@@ -18,12 +18,12 @@ from adapters.base import open_scene
 from adapters.raw_drive import IncompleteDrive
 from augment import effects
 from augment.cameras import Camera, Frame
-from augment.dataset.label_files import planned_labels
+from augment.dataset.label_files import forecast_labels
 from augment.errors import ClimateGSError, SceneError
-from augment.ground import ground_of, ground_sentence
-from augment.jobs.quality import resolve_quality, resolved_recipe
+from augment.ground import describe_ground, ground_of
+from augment.jobs.quality import apply_settings, resolve_quality
 from augment.plan import Plan, make_plan, plan_view
-from augment.render.threads import thread_count
+from augment.render.threads import num_kernel_threads
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.timing import stopwatch
@@ -113,7 +113,7 @@ def describe_drive(incomplete: IncompleteDrive) -> dict[str, Any]:
     boxes = {frame.index: drive.labels.boxes(frame.index) for frame in drive.frames}
     sentence = "not known: it is measured as a scene is made, or told by a map"
     if ground is not None:
-        sentence = ground_sentence(ground)
+        sentence = describe_ground(ground)
     cameras = _describe_cameras(drive.frames)
     for camera in cameras:
         camera["images"] = sum(camera["name"] in frame.image_paths for frame in drive.frames)
@@ -183,7 +183,7 @@ def _describe_ground(scene: Scene) -> dict[str, Any]:
         ground = ground_of(scene)
     except SceneError as error:
         return {"sentence": f"not known: {error}"}
-    return {**dataclasses.asdict(ground), "sentence": ground_sentence(ground)}
+    return {**dataclasses.asdict(ground), "sentence": describe_ground(ground)}
 
 
 def _describe_labels(scene: Scene) -> dict[str, Any]:
@@ -232,7 +232,7 @@ def explain_recipe(
             resolved = resolve_quality(resolved, scene, progress=True).recipe
     elif is_open:
         reference = {knob.path: knob.reference for knob in free_knobs(resolved)}
-        resolved = resolved_recipe(resolved, reference)
+        resolved = apply_settings(resolved, reference)
     plan = make_plan(resolved, scene)
     facts = {
         "recipe": resolved.model_dump(mode="json"),
@@ -248,7 +248,7 @@ def explain_recipe(
             "frames": len(scene.frames),
         },
         "plan": plan.as_dict(),
-        "labels": planned_labels(scene, resolved.output),
+        "labels": forecast_labels(scene, resolved.output),
         "times": None,
     }
     if times and any(frame.cameras for frame in scene.frames):
@@ -315,7 +315,7 @@ def measure_passes(recipe: Recipe, scene: Scene, count: int = VIEWS) -> dict[str
     return {
         "views": len(cameras),
         "rounds": ROUNDS,
-        "threads": thread_count(),
+        "threads": num_kernel_threads(),
         "frame_ms": 1e3 * total / len(cameras),
         "share": share,
         "folded": {

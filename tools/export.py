@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from adapters.base import open_scene
 from adapters.detect_format import source_tree
-from adapters.scene_folder import storable
+from adapters.scene_folder import prepare_for_storage
 from adapters.uri import parse_uri
 from augment.errors import AdapterError, ClimateGSError, OutputError
 from augment.files.export import (
@@ -37,15 +37,15 @@ from augment.files.scene_file import (
     save_scene_file,
 )
 from augment.jobs.files import RECORDED
-from augment.jobs.layout import MANIFEST, folder_name, variant_folder, variant_name
+from augment.jobs.layout import MANIFEST_FILE, folder_name, variant_folder, variant_name
 from augment.jobs.manifest import OK, read_manifest, rows_of
 from augment.jobs.mirror import (
     MIRROR_FOLDER,
+    DatasetFolder,
+    FileCounts,
     Links,
+    Replacement,
     Shown,
-    SourceTree,
-    Survey,
-    Weathered,
     check_disjoint,
     dataset_format,
     is_weathered,
@@ -56,7 +56,7 @@ from augment.jobs.mirror import (
     weathered_images,
     weathered_sweeps,
 )
-from augment.jobs.mirror_sweeps import frames_of_span, is_sweep_between, weather_sweeps_between
+from augment.jobs.mirror_sweeps import find_span_frames, is_sweep_between, weather_sweeps_between
 from augment.jobs.processes import OutputLock
 from augment.labels import StoresLidar
 from augment.scene import Scene
@@ -139,7 +139,7 @@ def clear_notes(
     if not isinstance(scene.labels, StoresLidar):
         return [*notes, "no LiDAR sweep has a file of its own in the dataset: they stay clear"]
     rendered_frames = {number for number, names in cameras_by_frame.items() if names}
-    span = frames_of_span(
+    span = find_span_frames(
         scene.frames, rendered_frames, {n for names in cameras_by_frame.values() for n in names}
     )
     sweeps = {
@@ -227,7 +227,7 @@ def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "har
         rows_by_scene.setdefault(row["scene"], []).append(row)
     sources = [scene_uri] if scene_uri else sorted(names_by_source)
     if not sources:
-        raise OutputError(f"{out / MANIFEST} lists no images; render some first")
+        raise OutputError(f"{out / MANIFEST_FILE} lists no images; render some first")
     for source in sources:
         scene = open_scene(source)
         for name in names_by_source.get(scene.source, [scene.name]):
@@ -243,7 +243,7 @@ def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "har
     return 0
 
 
-def _dataset(scene: Scene) -> tuple[SourceTree, Survey]:
+def _dataset(scene: Scene) -> tuple[DatasetFolder, FileCounts]:
     tree = source_tree(scene)
     extent = survey(tree)
     if not extent.images:
@@ -257,8 +257,8 @@ def _dataset(scene: Scene) -> tuple[SourceTree, Survey]:
 def _mirror_rows(
     scene: Scene,
     out: Path,
-    tree: SourceTree,
-    extent: Survey,
+    tree: DatasetFolder,
+    extent: FileCounts,
     name: str,
     rows: list[dict[str, Any]],
     links: Links,
@@ -302,18 +302,20 @@ def _mirror_rows(
     return [*page.split("\n"), *(f"  {note}" for note in [*notes, *sweep_notes])]
 
 
-def _of_other_scenes(out: Path, variant: str, entries: Mapping[str, Shown]) -> dict[str, Weathered]:
+def _of_other_scenes(
+    out: Path, variant: str, entries: Mapping[str, Shown]
+) -> dict[str, Replacement]:
     """Return the files of other scenes in the copy that the manifest still has, by place."""
     if not entries:
         return {}
     table = rows_of(read_manifest(out), {(entry.scene, variant) for entry in entries.values()})
     rows = [row for row in table if row["status"] == OK]
-    by_path = {row["lidar_path"]: Weathered.sweep(out, row) for row in rows if is_weathered(row)}
-    by_path |= {row["image_path"]: Weathered.image(out, row) for row in rows}
+    by_path = {row["lidar_path"]: Replacement.sweep(out, row) for row in rows if is_weathered(row)}
+    by_path |= {row["image_path"]: Replacement.image(out, row) for row in rows}
     for entry in entries.values():
         path = entry.sweep
         if path and path not in by_path and is_sweep_between(out, variant, entry.scene, path):
-            by_path[path] = Weathered.sweep(out, {"scene": entry.scene, "lidar_path": path})
+            by_path[path] = Replacement.sweep(out, {"scene": entry.scene, "lidar_path": path})
     files = {place: by_path.get(entry.image or entry.sweep) for place, entry in entries.items()}
     return {
         place: file for place, file in files.items() if file is not None and file.path.is_file()
@@ -339,7 +341,7 @@ def _rows(
     absent_variants = sorted(name for name, rows in rows_by_variant.items() if not rows)
     if absent_variants or not rows_by_variant:
         raise OutputError(
-            f"{out / MANIFEST} has no images of scene {scene.name!r}"
+            f"{out / MANIFEST_FILE} has no images of scene {scene.name!r}"
             + (f" and {', '.join(absent_variants)}" if absent_variants else "")
             + "; render them first, or name another scene"
         )
@@ -355,7 +357,7 @@ def _recipe_file(scene: Scene, out: Path, name: str) -> Path:
 def _check_there(scene: Scene, out: Path, deleted: Sequence[str]) -> None:
     if deleted:
         raise OutputError(
-            f"{_recipe_file(scene, out, deleted[0])} was deleted, though {out / MANIFEST} lists "
+            f"{_recipe_file(scene, out, deleted[0])} was deleted, though {out / MANIFEST_FILE} lists "
             f"images of {deleted[0]}; render it again"
         )
 
@@ -388,7 +390,7 @@ def _has_all(scene: Scene, rows: list[dict[str, Any]]) -> bool:
 
 def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> None:
     """Images of the same recipe in another format are not rendered twice beside each other."""
-    if not (out / MANIFEST).is_file() or recipe.output.image == written_as:
+    if not (out / MANIFEST_FILE).is_file() or recipe.output.image == written_as:
         return
     rows = rows_of(read_manifest(out), {(scene.name, variant_name(recipe))})
     if rows and rows[0]["recipe_hash"] == recipe.hash:
@@ -409,12 +411,12 @@ def label_files(
     Raises:
         ClimateGSError: the split is none. OutputError: nothing asks for formats.
     """
-    from augment.dataset.label_files import WHOLE, LabelsAsked, write_labels
+    from augment.dataset.label_files import WHOLE, LabelOptions, write_labels
 
     request = None
     if split or seed or changes:
         shares = _shares(split) if split else WHOLE
-        request = LabelsAsked(split=shares, seed=seed, changes=tuple(changes))
+        request = LabelOptions(split=shares, seed=seed, changes=tuple(changes))
     try:
         done = write_labels(out, request)
     except ValueError as error:
@@ -466,7 +468,7 @@ def export_scene(options: ExportOptions) -> int:
     for problem in scene.problems:
         print_note(f"note: {problem}")
     moment = _moment(scene, options.frame)
-    for path in _write(storable(scene), out, kind, moment, options.half):
+    for path in _write(prepare_for_storage(scene), out, kind, moment, options.half):
         print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
     for loss in export_losses(scene, kind, moment, half=options.half):
         print(f"note: {loss}")

@@ -21,7 +21,7 @@ from adapters.uri import parse_uri
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.geometry import rigid
-from augment.jobs.atomic import make_folder, output_error, write_atomic
+from augment.jobs.atomic import make_folder, make_output_error, write_atomic
 from augment.metrics.image import DepthErrors, depth_errors, flip, flip_map, psnr, ssim
 from augment.plan import make_plan
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
@@ -190,7 +190,7 @@ def _write_pictures(
         for name in (CURVES, PICTURES, TRAINING_PICTURES):
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
-        raise output_error(folder, error) from error
+        raise make_output_error(folder, error) from error
     titles: dict[str, str] = {}
     if scores:
         name = PICTURES if split == "test" else TRAINING_PICTURES
@@ -234,7 +234,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-class RenderedView(NamedTuple):
+class HeldOutRender(NamedTuple):
     """A camera's view as users get it without weather. rgb: uint8 [H, W, 3], clamped to [0, 1] and
     rounded to 8 bits. alpha, median_depth_m, expected_depth_m: float32 [H, W]. has_surface: bool
     [H, W], where a depth is written to files.
@@ -301,7 +301,7 @@ def means_by_camera(scores: Sequence[ViewScore]) -> dict[str, dict[str, float]]:
     }
 
 
-def render_recorded(scene: Scene, camera: Camera) -> RenderedView:
+def render_recorded(scene: Scene, camera: Camera) -> HeldOutRender:
     """The view at the camera's own resolution under no weather, as its camera records it."""
     plan = make_plan(_clear(), scene)
     depths = {EXPECTED_DEPTH, MEDIAN_DEPTH}
@@ -311,7 +311,7 @@ def render_recorded(scene: Scene, camera: Camera) -> RenderedView:
     assert raster.alpha is not None
     assert raster.median_depth is not None and raster.expected_depth is not None
     alpha = raster.alpha.numpy()
-    return RenderedView(
+    return HeldOutRender(
         rgb=quantise(buffers.rgb),
         alpha=alpha,
         median_depth_m=raster.median_depth.numpy(),

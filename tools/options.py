@@ -224,12 +224,12 @@ def resolved_uri(uri: str) -> tuple[str, str, dict[str, str]]:
     Raises:
         AdapterError: no such path, or a path that is recognised as no scene.
     """
-    from adapters.base import recognise
+    from adapters.base import detect_scheme_of_path
     from adapters.uri import parse_uri
 
     scheme, path, query = parse_uri(uri)
     if scheme is None:
-        scheme = recognise(Path(path))
+        scheme = detect_scheme_of_path(Path(path))
     place = Path(path)
     if place.exists():
         # Without `..`, but with the last name as given, even of a link: it names the scene.

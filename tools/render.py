@@ -21,30 +21,30 @@ from adapters.base import open_scene, scenes_of
 from adapters.camera_files.paths import frames_from_path_file
 from adapters.scene_cache import scene_digest
 from augment import effects
-from augment.boxes import PlacedBoxes, find_occlusion
+from augment.boxes import WorldBoxes, find_occlusion
 from augment.cameras import Camera, Frame
 from augment.dataset.label_files import NothingLabelled
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import ClimateGSError
 from augment.geometry import rigid
-from augment.jobs.block_worker import WorkSetup
-from augment.jobs.blocks import JobStatus, read_status, shard_of
+from augment.jobs.block_worker import JobWorkerSetup
+from augment.jobs.blocks import JobStatus, read_status, select_shard
 from augment.jobs.files import SceneIndex, check_frames, has_lidar, uses_boxes
 from augment.jobs.generate import GenerateJob, default_scratch, plan_job, run_generate
 from augment.jobs.layout import STATE_FOLDER, variant_name
 from augment.jobs.manifest import lidar_notes
 from augment.jobs.processes import choose_backend, renders_on_gpu
-from augment.jobs.quality import recipes_to_try, resolve_quality_for
+from augment.jobs.quality import choose_settings, recipes_to_try
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import open_store
-from augment.jobs.worker import shares_of
+from augment.jobs.worker import compute_time_shares
 from augment.labels import Boxes, LidarSweep
 from augment.plan import make_plan
 from augment.render.buffers import CPU, CUDA
 from augment.render.cuda.runtime import is_interpreted
 from augment.scene import Gaussians, Ground, Scene
 from augment.sky import CubemapSky
-from augment.trust import judge_scene, left_out_sentence, unfitted_cameras
+from augment.trust import judge_scene, skipped_cameras_sentence, unfitted_cameras
 from augment.views import render_view
 from recipes.fields import found
 from recipes.job import load_job, load_job_recipes, scaled_recipe
@@ -126,7 +126,7 @@ def _alters_picture(recipe: Recipe) -> bool:
 def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
     kernel_sets = set()
     if any(uses_boxes(recipe) for recipe in recipes):
-        nothing = PlacedBoxes.of(Boxes.empty(), np.zeros(3))
+        nothing = WorldBoxes.of(Boxes.empty(), np.zeros(3))
         find_occlusion(nothing, _camera(1.0), np.zeros((SIZE, SIZE), np.float32))
     for recipe in recipes:
         output = recipe.output
@@ -226,7 +226,7 @@ def generate_dataset(options: GenerateOptions) -> int:
     recipes = load_job_recipes(requested, job.parent)
     store = open_store(out)
     number, count = map(int, options.shard.split("/"))
-    setup = WorkSetup(
+    setup = JobWorkerSetup(
         store_uri=out if store.local_dir is None else store.uri,
         scratch=options.scratch or default_scratch(out),
         backend=backend,
@@ -251,7 +251,7 @@ def generate_dataset(options: GenerateOptions) -> int:
     with ended_by_sigterm():
         result = run_generate(task, prepare=lambda recipes: warm_up_for_workers(recipes, backend))
     print_images(result, duration_text(result.seconds))
-    if shares := shares_of(result.timings):
+    if shares := compute_time_shares(result.timings):
         print(shares.sentence)
     for uri, why in result.unusable.items():
         print_note(f"cannot be used: {uri}: {why}")
@@ -288,7 +288,7 @@ def _dry_run(job: GenerateJob) -> int:
         recipes=len({block.recipe.name for block in plan.blocks}),
         variants=len({(block.scene, block.variant) for block in plan.blocks}),
         shard=job.shard,
-        blocks=shard_of(plan.blocks, *job.shard),
+        blocks=select_shard(plan.blocks, *job.shard),
         max_lines=_MAX_LINES,
     )
     print(page)
@@ -409,7 +409,7 @@ def render_recipes(options: RenderOptions) -> int:
         kinds = ("render", "encode", "write")
         times = [f"{1000 * result.timings.get(k, 0.0) / result.written:.0f} ms {k}" for k in kinds]
         print(f"per image: {', '.join(times)} (on threads that overlap)")
-    if shares := shares_of(result.timings, held_up=options.workers):
+    if shares := compute_time_shares(result.timings, held_up=options.workers):
         print(shares.sentence)
     print(f"manifest: {result.manifest}")
     _write_labels(out, recipes, result.written + result.skipped)
@@ -441,7 +441,7 @@ def _cameras(
     unfitted_names = () if path is not None else unfitted_cameras(scene)
     if not unfitted_names:
         return None
-    print_note(f"note: {left_out_sentence(unfitted_names, '--cameras all')}")
+    print_note(f"note: {skipped_cameras_sentence(unfitted_names, '--cameras all')}")
     return [name for name in scene.camera_names if name not in unfitted_names]
 
 
@@ -479,7 +479,7 @@ def _with_quality(
     """The recipe with the settings of its quality; a note says which it had to choose."""
     if not recipe.quality.is_open:
         return recipe
-    resolved = resolve_quality_for(
+    resolved = choose_settings(
         open_store(options.out),
         recipe,
         scene,

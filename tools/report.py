@@ -28,7 +28,7 @@ from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.files import box_tables
 from augment.jobs.layout import STATE_FOLDER, folder_name, path_kinds
-from augment.jobs.manifest import OK, read_finished
+from augment.jobs.manifest import OK, read_manifest_rows
 from augment.jobs.store import Store, StoredFile, open_store
 from tools.drawing import cameras_on_car, evenly, first_of_each, value_codes
 from tools.report_numbers import (
@@ -142,7 +142,7 @@ def write_report(out: str | Path, html: Path | None = None, images: int = IMAGES
 
 def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
     """Return the page's text and the number of unreadable files. html: the page's future path."""
-    table = read_finished(store, _UNUSED)
+    table = read_manifest_rows(store, _UNUSED)
     cameras = cameras_on_car(store, table)
     table = add_variant_key(table.drop_columns("calibration_path"))
     is_beside, page_names = _beside(store, html)

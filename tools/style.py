@@ -20,7 +20,7 @@ import torch
 from pydantic import ValidationError
 
 from adapters.base import open_scene
-from adapters.scene_folder import storable
+from adapters.scene_folder import prepare_for_storage
 from augment.cameras import Camera
 from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, styled_scene
 from augment.effects.style.content import content_pictures, content_statistics, select_views
@@ -341,7 +341,7 @@ def apply_style(options: ApplyOptions) -> dict[str, Any]:
     scene = open_scene(options.scene)
     for problem in scene.problems:
         print_note(f"note: {problem}")
-    scene = storable(scene)
+    scene = prepare_for_storage(scene)
     open_s = time.perf_counter()
     if requested.changes and requested.method == "gscm":
         content_pictures(scene)

@@ -33,9 +33,9 @@ from augment.errors import OutputError
 from augment.jobs.atomic import (
     flush_folder,
     make_folder,
-    refusals_of,
+    raise_output_error,
     remove_temporaries,
-    temporary_beside,
+    temporary_path,
     write_atomic,
 )
 from augment.jobs.layout import STATE_FOLDER
@@ -325,7 +325,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
     # What killed runs left half-written, too; safetensors has temporary names of its own.
     for path in (*folder.glob(_STATES), *folder.glob(".tmp*")):
         if state is None or path.name != state.file:
-            with refusals_of(path):
+            with raise_output_error(path):
                 path.unlink(missing_ok=True)
     return plan
 
@@ -404,9 +404,9 @@ def _write_state(path: Path, arrays: dict[str, np.ndarray]) -> str:
     Raises:
         OutputError: the system refused.
     """
-    temporary = temporary_beside(path)
+    temporary = temporary_path(path)
     try:
-        with refusals_of(path):
+        with raise_output_error(path):
             make_folder(path.parent)
             save_file({name: np.asarray(a, order="C") for name, a in arrays.items()}, temporary)
             with temporary.open("rb") as file:

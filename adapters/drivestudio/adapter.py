@@ -47,7 +47,7 @@ from augment.files.checkpoints import load_checkpoint, section, taken, tensor
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.render.composite import composite_sky
 from augment.render.sh import SH_C0, rotate_sh
-from augment.scene import SH_COUNTS, Actor, Gaussians, Scene, Track, check_gaussians
+from augment.scene import NUM_SH_BY_DEGREE, Actor, Gaussians, Scene, Track, check_gaussians
 from augment.sky import ConstantSky, CubemapSky, Sky, cubemap_coordinates, directions_of_cubemap
 
 # ---- The Gaussians of a run's models: tensors of a checkpoint, activated -------------------------
@@ -84,16 +84,16 @@ def read_gaussians(
     means = tensor(content, "_means", (None, 3), where)
     count = len(means)
     sh_rest = tensor(content, "_features_rest", (count, None, 3), where)
-    if sh_rest.shape[1] + 1 not in SH_COUNTS:
+    if sh_rest.shape[1] + 1 not in NUM_SH_BY_DEGREE:
         raise AdapterError(
             f"{where}: _features_rest must have 0, 3, 8 or 15 rows (degrees 0 to 3 of spherical "
             f"harmonics); got {sh_rest.shape[1]}"
         )
-    degree = SH_COUNTS.index(sh_rest.shape[1] + 1)
+    degree = NUM_SH_BY_DEGREE.index(sh_rest.shape[1] + 1)
     active_degree = min(step // sh_interval, degree)
-    sh = torch.empty(count, SH_COUNTS[active_degree], 3)
+    sh = torch.empty(count, NUM_SH_BY_DEGREE[active_degree], 3)
     taken(tensor(content, "_features_dc", (count, 3), where), sh[:, 0])
-    taken(sh_rest[:, : SH_COUNTS[active_degree] - 1], sh[:, 1:])
+    taken(sh_rest[:, : NUM_SH_BY_DEGREE[active_degree] - 1], sh[:, 1:])
     if degree == 0:
         sh.sigmoid_().sub_(0.5).div_(SH_C0)
     gaussians = Gaussians(

@@ -50,7 +50,7 @@ from adapters.uri import UriOptions
 from adapters.world import rotation_to_z_up
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
-from augment.files.checkpoints import finite_numbers, section
+from augment.files.checkpoints import finite_array, section
 from augment.files.image_size import read_image_header
 from augment.geometry import invert_rigid, quat_from_rotmat
 from augment.labels import Boxes, LidarSweep
@@ -459,8 +459,8 @@ def read_corrections(models: Mapping[str, Any], run: Run, where: str) -> ImageCo
 
 def _read_color_maps(content: Mapping[str, Any], count: int, where: str) -> ImageCorrections:
     """Compute the colour maps from an embedding and a network of two layers."""
-    embedding = finite_numbers(content, "embedding.weight", (count, None), where)
-    hidden_weights = finite_numbers(content, "decoder.0.weight", (None, None), where)
+    embedding = finite_array(content, "embedding.weight", (count, None), where)
+    hidden_weights = finite_array(content, "decoder.0.weight", (None, None), where)
     num_hidden, num_inputs = hidden_weights.shape
     if num_inputs == embedding.shape[1] + 2:
         problem = (
@@ -473,9 +473,9 @@ def _read_color_maps(content: Mapping[str, Any], count: int, where: str) -> Imag
             f"{where}: decoder.0.weight must take the {embedding.shape[1]} numbers of "
             f"embedding.weight; it takes {num_inputs}"
         )
-    hidden_bias = finite_numbers(content, "decoder.0.bias", (num_hidden,), where)
-    output_weights = finite_numbers(content, "decoder.2.weight", (12, num_hidden), where)
-    output_bias = finite_numbers(content, "decoder.2.bias", (12,), where)
+    hidden_bias = finite_array(content, "decoder.0.bias", (num_hidden,), where)
+    output_weights = finite_array(content, "decoder.2.weight", (12, num_hidden), where)
+    output_bias = finite_array(content, "decoder.2.bias", (12,), where)
 
     def decode(embedding: np.ndarray) -> np.ndarray:
         values = (
@@ -495,7 +495,7 @@ def _pose_changes(content: Mapping[str, Any], count: int, where: str) -> np.ndar
     rows before Gram and Schmidt (Zhou et al. 2019, "On the Continuity of Rotation Representations
     in Neural Networks", sec. B).
     """
-    values = finite_numbers(content, "embeds.weight", (count, 9), where)
+    values = finite_array(content, "embeds.weight", (count, 9), where)
     first_row = values[:, 3:6] + [1.0, 0, 0]
     second_row = values[:, 6:9] + [0, 1.0, 0]
     with np.errstate(all="ignore"):

@@ -41,7 +41,7 @@ from adapters.world import join_gaussians
 from augment.cameras import Frame
 from augment.errors import AdapterError
 from augment.ground import measure_from_classes
-from augment.own_car import find_ego_mask, moving_frames
+from augment.own_car import find_own_car_mask, moving_frames
 from augment.scene import Actor, Gaussians, Ground, Scene
 
 logger = logging.getLogger(__name__)
@@ -84,7 +84,7 @@ def with_own_car(views: Sequence[View]) -> tuple[View, ...]:
         images = [read_image(view.path, _MASK_SCALE) for view in moving]
         image_numbers = [i for i, image in enumerate(images) if image is not None]
         cameras = [moving[i].camera for i in image_numbers]
-        masks[name] = find_ego_mask(cameras, [images[i] for i in image_numbers])
+        masks[name] = find_own_car_mask(cameras, [images[i] for i in image_numbers])
     return tuple(
         dataclasses.replace(view, own_car=mask) if (mask := masks[view.camera.name]).any() else view
         for view in views

@@ -62,7 +62,7 @@ from adapters.recording.files import (
 )
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
-from augment.effects.lidar.beam import intensity_column
+from augment.effects.lidar.beam import find_intensity_column
 from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError, OutputError
 from augment.jobs.files import decode_png, depth_in_metres
@@ -126,7 +126,7 @@ class RecordingLabels:
         with _reading(file, _LIDAR_FILE):
             table = read_table(file, str(file)).take(pa.array(sweep.columns[INDEX_COLUMN]))
             columns = {name: np.asarray(sweep.columns[name]) for name in "xyz"}
-            if (intensity := intensity_column(sweep)) is not None:
+            if (intensity := find_intensity_column(sweep)) is not None:
                 columns[intensity] = np.asarray(sweep.columns[intensity])
             if _CLASS in sweep.columns and is_in_air(sweep).any():
                 columns[_CLASS] = self._classes_with_air(sweep)

@@ -79,7 +79,7 @@ from augment.files.pickles import PickleError
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.memo import SceneMemo
-from augment.scene import Actor, ColorWaves, Scene, Track
+from augment.scene import Actor, ColorSeries, Scene, Track
 from augment.sky import ConstantSky, CubemapSky
 
 
@@ -279,7 +279,7 @@ def make_actor(
         span = tracked.end_frame - tracked.start_frame
         steps = np.array([images[i].frame for i in first_rows], np.float64) - tracked.start_frame
         phases = config.fourier_scale * steps / span if span else np.zeros(len(first_rows))
-        waves = ColorWaves(part.terms, torch.from_numpy(knots), torch.from_numpy(phases))
+        waves = ColorSeries(part.terms, torch.from_numpy(knots), torch.from_numpy(phases))
     actor = Actor(
         track_id=str(tracked.track_id),
         label=tracked.label,

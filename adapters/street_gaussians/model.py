@@ -23,17 +23,10 @@ from adapters.raw_drive import DriveOptions
 from adapters.street_gaussians.data import ModelConfig, Number
 from adapters.uri import UriOptions
 from augment.errors import AdapterError, SceneError
-from augment.files.checkpoints import (
-    finite_numbers,
-    load_checkpoint,
-    release,
-    section,
-    taken,
-    tensor,
-)
+from augment.files.checkpoints import finite_array, load_checkpoint, release, section, taken, tensor
 from augment.files.ply import SEMANTIC, PlyElement, PlyHeader, read_columns, read_ply_header
 from augment.geometry import rotmat_from_quat
-from augment.scene import SH_COUNTS, Gaussians, check_gaussians, drawable_rows, is_drawable
+from augment.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians, drawable_rows, is_drawable
 
 # ---- What the URI of a trained model may ask for -----------------------------------------------
 
@@ -245,8 +238,8 @@ def check_counts(where: str, num_rest: int, num_terms: int, *, is_background: bo
         num_terms: number F of Fourier terms.
         is_background: True for the background.
     """
-    if num_rest + 1 not in SH_COUNTS:
-        counts = ", ".join(str(count - 1) for count in SH_COUNTS)
+    if num_rest + 1 not in NUM_SH_BY_DEGREE:
+        counts = ", ".join(str(count - 1) for count in NUM_SH_BY_DEGREE)
         raise AdapterError(
             f"{where}: feature_rest must have {counts} coefficients a channel (SH degrees 0 to 3); "
             f"got {num_rest}"
@@ -478,8 +471,8 @@ def _read_pose_changes(tables: _Tables, *, has_actors: bool) -> PoseChanges | No
     params = tables.of("actor_pose", "opt_track")
     if params is None:
         return None
-    positions = finite_numbers(params, "opt_trans", (None, None, 3), tables.where("actor_pose"))
-    half_turns = finite_numbers(
+    positions = finite_array(params, "opt_trans", (None, None, 3), tables.where("actor_pose"))
+    half_turns = finite_array(
         params, "opt_rots", (*positions.shape[:2], 1), tables.where("actor_pose")
     )
     return PoseChanges(positions, half_turns[..., 0])
@@ -527,7 +520,7 @@ def _read_color_maps(tables: _Tables) -> Tensor | None:
             f"out; images have the scene's own colours"
         )
         return None
-    maps = finite_numbers(params, "affine_trans", (None, 3, 4), tables.where(name))
+    maps = finite_array(params, "affine_trans", (None, 3, 4), tables.where(name))
     return torch.from_numpy(maps.astype(np.float32))
 
 
@@ -537,8 +530,8 @@ def _read_camera_changes(tables: _Tables) -> np.ndarray | None:
     params = tables.of(name, "use_pose_correction")
     if params is None:
         return None
-    centres = finite_numbers(params, "pose_correction_trans", (None, 3), tables.where(name))
-    quats = finite_numbers(params, "pose_correction_rots", (len(centres), 4), tables.where(name))
+    centres = finite_array(params, "pose_correction_trans", (None, 3), tables.where(name))
+    quats = finite_array(params, "pose_correction_rots", (len(centres), 4), tables.where(name))
     if (np.linalg.norm(quats, axis=1) == 0).any():
         raise AdapterError(
             f"{tables.where(name)}: pose_correction_rots holds a quaternion of zeros"

@@ -378,7 +378,7 @@ def _speed_mps(path: Sequence[Camera], scene: Scene, key: ViewKey) -> float:
 
 
 @dataclass(frozen=True)
-class Checks:
+class ViewCheckResults:
     """Results of `check_views`.
 
     Attributes:
@@ -406,7 +406,7 @@ class Checks:
         }
 
 
-def check_views(scene: Scene, views: RecordedViews) -> Checks:
+def check_views(scene: Scene, views: RecordedViews) -> ViewCheckResults:
     """Compare LiDAR with images and images with each other; takes some seconds.
 
     The calibration is not checked where sweeps have no intensity."""
@@ -446,7 +446,7 @@ def check_views(scene: Scene, views: RecordedViews) -> Checks:
         if offset is not None:
             offsets.append(offset)
             problems += offset.problems
-    return Checks(tuple(problems), time_offset_s, tuple(offsets))
+    return ViewCheckResults(tuple(problems), time_offset_s, tuple(offsets))
 
 
 def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:

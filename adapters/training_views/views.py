@@ -19,7 +19,7 @@ from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import SceneMemo
-from augment.own_car import find_ego_mask, moving_frames
+from augment.own_car import find_own_car_mask, moving_frames
 from augment.reconstruct.view import RecordedView, ViewKey
 from augment.recorded_sky import lidar_top_rad, sky_mask
 from augment.scene import Scene
@@ -241,7 +241,7 @@ class RecordedViews:
                 continue
             moving = [views[i] for i in moving_frames([camera for _, camera in views])]
             images = [self.image(key) for key, _ in moving]
-            masks[name] = find_ego_mask([camera for _, camera in moving], images)
+            masks[name] = find_own_car_mask([camera for _, camera in moving], images)
         if masks_dir is not None and not masks:
             raise AdapterError(
                 f"{masks_dir} holds no mask {names[0]}.png or of another camera; expected images "

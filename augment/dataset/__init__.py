@@ -12,7 +12,7 @@ from augment.dataset.clips_pairs import (
     clean_frames,
     split_by_scene,
 )
-from augment.dataset.label_files import LabelsAsked, write_labels
+from augment.dataset.label_files import LabelOptions, write_labels
 from augment.dataset.live import SceneDataset
 from augment.dataset.samples import collate_frames
 from augment.dataset.weather_dataset import WeatherDataset
@@ -20,7 +20,7 @@ from augment.dataset.weather_dataset import WeatherDataset
 __all__ = [
     "Boxes2d",
     "ClipDataset",
-    "LabelsAsked",
+    "LabelOptions",
     "MixedDataset",
     "PairedDataset",
     "SceneDataset",

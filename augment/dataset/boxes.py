@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from augment.boxes import PlacedBoxes, outline_boxes, shown_pixels
+from augment.boxes import WorldBoxes, outline_boxes, shown_pixels
 from augment.cameras import Camera
 from augment.dataset.samples import buffers, check_choice, moved_points, turned_quats
 from augment.geometry import invert_rigid, rotmat_from_quat
@@ -207,7 +207,7 @@ def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
     camera_boxes = Boxes(names, tuple(boxes["labels"]), centers_m, boxes["sizes_m"].numpy(), quats)
     masks = np.zeros((len(names), camera["height"], camera["width"]), bool)
     for number, rows, columns in shown_pixels(
-        PlacedBoxes.of(camera_boxes, np.zeros(3)), view, depth.numpy()
+        WorldBoxes.of(camera_boxes, np.zeros(3)), view, depth.numpy()
     ):
         masks[number, rows, columns] = True
     return torch.from_numpy(masks)

@@ -21,8 +21,8 @@ from augment.dataset.samples import (
     buffers,
     check_choice,
     check_index,
-    stack_alike,
     stack_cameras,
+    stack_same_shape,
 )
 from augment.dataset.weather_dataset import Rows, WeatherDataset, number_groups
 from augment.jobs.manifest import effect_masks
@@ -492,7 +492,7 @@ def _joined(values: list[list[Any]]) -> Any:
     Returns:
         The stack; None if all are None; the lists if they differ in shape.
     """
-    stack = stack_alike([value for frame in values for value in frame])
+    stack = stack_same_shape([value for frame in values for value in frame])
     if isinstance(stack, torch.Tensor):
         return stack.unflatten(0, (len(values), -1))
     return None if stack is None else values

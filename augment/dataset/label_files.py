@@ -38,15 +38,15 @@ from augment.jobs.atomic import (
     copy_file,
     link_file,
     path_below,
+    raise_output_error,
     read_file,
-    refusals_of,
-    replaced_folder,
+    write_folder_atomically,
 )
 from augment.jobs.box_tables import BOXES_2D, MASK_SIDES, MASKS, SIDES
-from augment.jobs.claims import hold
+from augment.jobs.claims import hold_claim
 from augment.jobs.files import CameraRecord, box_tables, visibility
 from augment.jobs.layout import folder_name, resolve_inside
-from augment.jobs.manifest import MANIFEST, OK, read_finished
+from augment.jobs.manifest import MANIFEST_FILE, OK, read_manifest_rows
 from augment.jobs.store import open_store
 from augment.jobs.tables import read_boxes
 from augment.scene import Scene
@@ -77,7 +77,7 @@ class NothingLabelled(OutputError):
     """No image of the output has what labels are written from."""
 
 
-class LabelsAsked(BaseModel, frozen=True, extra="forbid"):
+class LabelOptions(BaseModel, frozen=True, extra="forbid"):
     """Options of `write_labels`."""
 
     split: dict[str, float] = WHOLE
@@ -91,7 +91,7 @@ class LabelsAsked(BaseModel, frozen=True, extra="forbid"):
 class LabelsRecord(BaseModel, frozen=True, extra="forbid"):
     """Content of the file RECORD of an output."""
 
-    asked: LabelsAsked
+    asked: LabelOptions
     """Options of the labels."""
     categories: tuple[str, ...]
     """Names of the categories, in the order of their numbers."""
@@ -106,7 +106,7 @@ class LabelsRecord(BaseModel, frozen=True, extra="forbid"):
 
 
 @dataclass(frozen=True)
-class LabelsWritten:
+class LabelsResult:
     """Labels that one call of `write_labels` has written."""
 
     folder: Path
@@ -128,7 +128,7 @@ class LabelsWritten:
     """Number of kitti objects that are DontCare because a number of their 3D box is not usable."""
 
 
-def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWritten:
+def write_labels(out: Path | str, asked: LabelOptions | None = None) -> LabelsResult:
     """Write the labels of an output on this machine; they replace the labels that it has.
 
     Args:
@@ -147,8 +147,8 @@ def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWri
     request = asked or _last_request(folder)
     if wrong := [part for part in request.split if folder_name(part) != part]:
         raise ValueError(f"parts are names of files: letters, digits, -, _ and .; got {wrong[0]!r}")
-    with hold(store, LABELS):
-        table = read_finished(store)
+    with hold_claim(store, LABELS):
+        table = read_manifest_rows(store)
         parts = split_by_scene(table, request.split, request.seed)
         of_scene = {
             s: part
@@ -165,21 +165,21 @@ def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWri
         rows = [row for row in rows if (row["scene"], row["variant"]) in policies]
         if not rows:
             raise NothingLabelled(
-                f"{out / MANIFEST}: no image has masks to write labels from; render a scene that "
+                f"{out / MANIFEST_FILE}: no image has masks to write labels from; render a scene that "
                 f"has boxes with output.labels: [{', '.join(FORMATS)}], or some of them"
             )
         names = _categories(out, rows, policies)
         run = _Writing(out, RowReader(store, verify=False), request, policies, names)
-        with replaced_folder(folder, (*FORMATS, INDEX, RECORD)) as new:
+        with write_folder_atomically(folder, (*FORMATS, INDEX, RECORD)) as new:
             return replace(run.go(new, rows, of_scene), folder=folder)
 
 
-def _last_request(folder: Path) -> LabelsAsked:
+def _last_request(folder: Path) -> LabelOptions:
     """Return the options of the folder's labels; the defaults if they cannot be read."""
     try:
-        return LabelsAsked.model_validate(json.loads(read_file(folder / RECORD))["asked"])
+        return LabelOptions.model_validate(json.loads(read_file(folder / RECORD))["asked"])
     except (OSError, LookupError, TypeError, ValueError, RecursionError):
-        return LabelsAsked()
+        return LabelOptions()
 
 
 # ---- Categories of the labels --------------------------------------------------------------------
@@ -221,7 +221,7 @@ def category_of(label: str, table: Sequence[Category] | None) -> str | None:
     return next((row.name for row in table if row.takes(label)), None)
 
 
-def planned_labels(scene: Scene, output: Output) -> dict[str, Any] | None:
+def forecast_labels(scene: Scene, output: Output) -> dict[str, Any] | None:
     """Return a forecast of the labels that a job will write for a scene.
 
     None if the recipe asks for no format.
@@ -262,9 +262,9 @@ class _Categories(NamedTuple):
     names: tuple[str, ...]
     """All names, in the order of their numbers."""
     unmapped: Mapping[str, int]
-    """As in LabelsWritten."""
+    """As in LabelsResult."""
     unused: tuple[str, ...]
-    """As in LabelsWritten."""
+    """As in LabelsResult."""
 
 
 def _categories(
@@ -513,12 +513,12 @@ def kitti_calibration(camera: CameraRecord, world_from_ego: torch.Tensor) -> str
 @dataclass(eq=False)
 class _Writing:
     """One call of write_labels. counts: numbers of images, objects and hidden objects, by kind and
-    format. without_numbers: as in LabelsWritten.
+    format. without_numbers: as in LabelsResult.
     """
 
     out: Path
     reader: RowReader
-    request: LabelsAsked
+    request: LabelOptions
     policies: Mapping[Variant, Output]
     categories: _Categories
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -527,10 +527,10 @@ class _Writing:
 
     def go(
         self, new: Path, rows: Sequence[Mapping[str, Any]], of_scene: Mapping[str, str]
-    ) -> LabelsWritten:
+    ) -> LabelsResult:
         formats = {f for output in self.policies.values() for f in output.label_formats}
         self.parts.update(dict.fromkeys(self.request.split, 0))
-        with refusals_of(new):
+        with raise_output_error(new):
             self._make_folders(new, formats)
             coco = _CocoFiles(new / "coco", self.request.split, self.categories.names, formats)
             sets = {part: list[str]() for part in self.request.split}
@@ -546,7 +546,7 @@ class _Writing:
                     if "kitti" in self._write_image(new, number, part, row, coco):
                         sets[part].append(f"{number:06d}\n")
             self._write_lists(new, formats, sets)
-        return LabelsWritten(
+        return LabelsResult(
             folder=new,
             **self._counted(formats),
             parts=dict(self.parts),

@@ -22,7 +22,7 @@ from augment.dataset.samples import (
     check_index,
     make_sample,
 )
-from augment.effects import Sharing, share_effects
+from augment.effects import JobContext, precompute_effects
 from augment.errors import BackendUnavailable
 from augment.jobs.files import (
     SceneIndex,
@@ -116,7 +116,7 @@ class SceneDataset(Dataset):
         selection = select_frames(self._index, frames, cameras)
         check_photos([self.recipe], scene.name, selection)
         self._items = [(frame, name) for frame, names in selection for name in names]
-        share_effects(Sharing(scene, [self.recipe], backend=self._backend))
+        precompute_effects(JobContext(scene, [self.recipe], backend=self._backend))
         self._memo = memo_of(scene).shared()
 
     def __setstate__(self, state: dict[str, Any]) -> None:

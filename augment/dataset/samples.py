@@ -56,7 +56,7 @@ class Buffer(NamedTuple):
     """Type of the file's pixels."""
     tensor: Callable[[np.ndarray], torch.Tensor]
     """Function that makes the sample's tensor of the file's pixels."""
-    in_all: bool = True
+    is_in_all_samples: bool = True
     """If True, a batch has the image of all samples or of none."""
 
 
@@ -66,9 +66,11 @@ _BUFFERS = {
     "instance": Buffer(np.uint16, lambda ids: torch.from_numpy(ids.astype(np.int32))),
 }
 # Form of a mask, uint8, 0 or 255; only samples with such weather have it, or those asked for it.
-_MASK = Buffer(np.uint8, lambda mask: torch.from_numpy(mask == 255), in_all=False)
+_MASK = Buffer(np.uint8, lambda mask: torch.from_numpy(mask == 255), is_in_all_samples=False)
 # Form of the trust mask, whose values are graded.
-_TRUST = Buffer(np.uint8, lambda mask: torch.from_numpy(mask).float() / 255, in_all=False)
+_TRUST = Buffer(
+    np.uint8, lambda mask: torch.from_numpy(mask).float() / 255, is_in_all_samples=False
+)
 
 
 def buffers() -> dict[str, Buffer]:
@@ -327,9 +329,9 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         return {side: collate_frames([pair[side] for pair in samples]) for side in first}
     batch: dict[str, Any] = {key: [sample[key] for sample in samples] for key in first}
     for key in ("image", *buffers()):
-        if key == "image" or buffers()[key].in_all:
+        if key == "image" or buffers()[key].is_in_all_samples:
             _check_in_all(key, samples)
-        batch[key] = stack_alike(batch[key], _stack_shared)
+        batch[key] = stack_same_shape(batch[key], _stack_shared)
     batch["camera"] = stack_cameras(batch["camera"], _stack_shared)
     batch["frame"] = _stack_numbers(batch["frame"], _stack_shared)
     columns = dict.fromkeys(name for weather in batch["weather"] for name in weather)
@@ -355,7 +357,7 @@ def _check_in_all(key: str, samples: Sequence[Mapping[str, Any]]) -> None:
 Stack = Callable[[list[torch.Tensor]], torch.Tensor]
 
 
-def stack_alike(values: list[Any], stack: Stack = torch.stack) -> Any:
+def stack_same_shape(values: list[Any], stack: Stack = torch.stack) -> Any:
     """Stack tensors of one shape.
 
     Returns:
@@ -395,4 +397,4 @@ def stack_cameras(cameras: Sequence[Mapping[str, Any]], stack: Stack) -> dict[st
 def _stack_numbers(values: list[Any], stack: Stack) -> Any:
     """Stack tensors, or make a tensor int64 [N] of whole numbers."""
     is_tensor = isinstance(values[0], torch.Tensor)
-    return stack_alike(values, stack) if is_tensor else torch.tensor(values)
+    return stack_same_shape(values, stack) if is_tensor else torch.tensor(values)

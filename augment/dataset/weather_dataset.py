@@ -51,7 +51,7 @@ from augment.jobs.files import (
     read_entries,
 )
 from augment.jobs.layout import mask_names, path_kinds, resolve_inside
-from augment.jobs.manifest import OK, concat_rows, read_finished, weather_columns
+from augment.jobs.manifest import OK, concat_rows, read_manifest_rows, weather_columns
 from augment.jobs.store import Store, StoredFileMissing, open_store
 from augment.jobs.tables import read_boxes, read_lidar
 
@@ -554,7 +554,7 @@ def _read_rows(
     stores: Sequence[Store], where: Expression | None, requested: dict[str, Collection | None]
 ) -> Rows:
     """Return the finished rows of the stores that a filter keeps."""
-    tables = [read_finished(store) for store in stores]
+    tables = [read_manifest_rows(store) for store in stores]
     uris = [store.uri for store in stores]
     table = tables[0]
     if len(stores) > 1:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from augment.effects.effect import Effect, Sharing
+from augment.effects.effect import Effect, JobContext
 from augment.effects.falling.effect import RainEffect, SnowfallEffect
 from augment.effects.flood.effect import FloodEffect
 from augment.effects.lens_drops.effect import LensDropsEffect
@@ -11,7 +11,7 @@ from augment.effects.snow.effect import SnowEffect
 from augment.effects.spray.effect import SprayEffect
 from augment.effects.style.effect import StyleEffect
 from augment.effects.wet.effect import WetEffect
-from augment.prune import pruned_share, share_errors
+from augment.prune import precompute_errors, prune_error_of
 from recipes.schema import add_section, remove_section
 
 # Style colours what stands in the weather, rain wets it; then come the air before it, snow on it,
@@ -29,7 +29,7 @@ EFFECTS: tuple[Effect, ...] = (
 )
 
 
-def share_effects(job: Sharing, *, only_files: bool = False) -> None:
+def precompute_effects(job: JobContext, *, only_files: bool = False) -> None:
     """Work out what all images of a job share, once: it is then in the scene's memo, whose
     `shared()` other processes take over. only_files: nothing but what lies in files.
 
@@ -39,9 +39,9 @@ def share_effects(job: Sharing, *, only_files: bool = False) -> None:
     for effect in EFFECTS:
         if effect.shares_files or not only_files:
             effect.share(job)
-    error = max((pruned_share(recipe.render) for recipe in job.recipes), default=0)
+    error = max((prune_error_of(recipe.render) for recipe in job.recipes), default=0)
     if error > 0 and not only_files:
-        share_errors(job.scene, error, progress=job.progress)
+        precompute_errors(job.scene, error, progress=job.progress)
 
 
 def add_effect(effect: Effect) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
-from augment.boxes import PlacedBoxes
+from augment.boxes import WorldBoxes
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
 from augment.jobs.box_tables import BoxTable
@@ -65,7 +65,7 @@ def skipped(names: Sequence[str], why: str, stage: str = DRAWING) -> tuple[Step,
 
 
 @dataclass(frozen=True)
-class Placed:
+class EffectPlan:
     """Plan of one effect in a scene: plain facts that can be printed, compared and tested."""
 
     data: Any
@@ -82,14 +82,14 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
-class Active:
+class EffectInScene:
     """An effect that is at work in a scene. Every hook that draws receives this record."""
 
     effect: Effect
     """The effect's hooks."""
 
     data: Any
-    """`Placed.data` of the effect; never None."""
+    """`EffectPlan.data` of the effect; never None."""
 
     scene: Scene
     """The scene that the effect changes."""
@@ -97,11 +97,11 @@ class Active:
     backend: str
     """Name of the backend that renders the images."""
 
-    earlier: tuple[Active, ...] = ()
+    earlier: tuple[EffectInScene, ...] = ()
     """Effects that are applied before this one."""
 
     seen: Any = None
-    """`InView.seen` of the view at hand, as `Effect.in_view` returned it."""
+    """`Visibility.seen` of the view at hand, as `Effect.in_view` returned it."""
 
     @cached_property
     def prepared(self) -> Any:
@@ -116,7 +116,7 @@ class Active:
 
 
 @dataclass(frozen=True, eq=False)
-class Sharing:
+class JobContext:
     """Everything that a job will render. `Effect.share` precomputes from it."""
 
     scene: Scene
@@ -141,7 +141,7 @@ class Sharing:
 
 
 @dataclass(frozen=True)
-class Sight:
+class ViewQuery:
     """Query for `Effect.in_view`: one view of a scene."""
 
     camera: Camera
@@ -158,7 +158,7 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class InView:
+class Visibility:
     """What one view can show of an effect."""
 
     is_seen: bool = True
@@ -171,11 +171,11 @@ class InView:
     """Instance ids of the parts that must be drawn for the effect."""
 
     seen: Any = None
-    """Data that the other hooks of the view need; they read it as `Active.seen`."""
+    """Data that the other hooks of the view need; they read it as `EffectInScene.seen`."""
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class RenderedView:
     """A rendered picture, which later effects edit."""
 
     rgb: Float[Tensor, "H W 3"]
@@ -209,10 +209,10 @@ class FrontSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class EffectView:
+class LabelInputs:
     """Inputs that an effect's labels are measured from, for one view."""
 
-    placed: Placed
+    placed: EffectPlan
     """The effect's plan for the recipe."""
 
     depth_m: Float32[np.ndarray, "H W"] | None
@@ -287,7 +287,7 @@ class Effect:
         """
         return None
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
         """Return the plan of the effect, in the scene's heights and scale.
 
         Args:
@@ -300,15 +300,15 @@ class Effect:
         """
         raise NotImplementedError
 
-    def prepare(self, own: Active) -> Any:
+    def prepare(self, own: EffectInScene) -> Any:
         """Return data that all views share; it is kept in the scene's memo (`memo_of`)."""
         return None
 
-    def relight(self, own: Active) -> Scene | None:
+    def relight(self, own: EffectInScene) -> Scene | None:
         """Return the scene in the light that later effects should use; None if unchanged."""
         return None
 
-    def share(self, job: Sharing) -> None:
+    def share(self, job: JobContext) -> None:
         """Precompute data that each process of a job would otherwise compute for itself.
 
         The results are `put` into the scene's memo as shared.
@@ -316,39 +316,41 @@ class Effect:
 
     # ---- Once a view -----------------------------------------------------------------------------
 
-    def cameras(self, own: Active, camera: Camera) -> tuple[Camera, ...] | None:
+    def cameras(self, own: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
         """Return the cameras that look into the scene for this view; None for `camera` alone."""
         return None
 
-    def in_view(self, own: Active, sight: Sight) -> InView:
+    def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
         """Return what the view can show of the effect, at little cost.
 
         The answer saves work only: it must not change a single bit of any picture.
         """
-        return InView()
+        return Visibility()
 
-    def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
+    def edit_scene(
+        self, own: EffectInScene, layers: LayerRenderer, camera: Camera
+    ) -> LayerRenderer:
         """Return this view's scene (parts, sky, fog) with the effect in it."""
         return layers
 
     def draw(
-        self, own: Active, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
-    ) -> Drawn | None:
+        self, own: EffectInScene, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
+    ) -> RenderedView | None:
         """Return the picture, if the effect draws the scene in its own layers; else None."""
         return None
 
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         """Return the finished picture with the effect on it."""
         return drawn
 
-    def mask_of(self, own: Active, drawn: Drawn) -> Bool[Tensor, "H W"] | None:
+    def mask_of(self, own: EffectInScene, drawn: RenderedView) -> Bool[Tensor, "H W"] | None:
         """Return the pixels that show the effect.
 
         The caller removes the pixels that belong to masks of later effects.
         """
         return drawn.masks.get(self.mask or "")
 
-    def front_surface(self, own: Active, camera: Camera) -> FrontSurface | None:
+    def front_surface(self, own: EffectInScene, camera: Camera) -> FrontSurface | None:
         """Return the effect's surface in the pixels of its mask.
 
         None if the first surface along those rays is one of the scene.
@@ -358,7 +360,7 @@ class Effect:
     # ---- Labels, in the writing threads ----------------------------------------------------------
 
     def measure(
-        self, placed: PlacedBoxes, camera: Camera, view: EffectView
+        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
         """Return the stored columns of `table`, [B] each.
 
@@ -369,19 +371,19 @@ class Effect:
         """
         raise NotImplementedError
 
-    def grow_boxes(self, placed: PlacedBoxes, view: EffectView) -> PlacedBoxes:
+    def grow_boxes(self, placed: WorldBoxes, view: LabelInputs) -> WorldBoxes:
         """Return the boxes grown by what the effect lays on them, which counts as their own."""
         return placed
 
     # ---- LiDAR -----------------------------------------------------------------------------------
 
-    def meet(self, own: Active, echoes: Any, frame_ns: int) -> None:
+    def meet(self, own: EffectInScene, echoes: Any, frame_ns: int) -> None:
         """Apply surfaces of the effect that stop or bend beams.
 
         echoes: `augment.effects.lidar.beam.Echoes`, changed in place.
         """
 
-    def attenuate(self, own: Active, echoes: Any, rng: np.random.Generator) -> None:
+    def attenuate(self, own: EffectInScene, echoes: Any, rng: np.random.Generator) -> None:
         """Weaken echoes by the effect's particles in the air and add the particles' own echoes.
 
         It runs after `meet` of all effects.

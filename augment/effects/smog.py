@@ -19,25 +19,25 @@ from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
 from augment.base_photo import RECORDED
-from augment.boxes import NOT_COUNTED, PlacedBoxes, shown_pixels
+from augment.boxes import NOT_COUNTED, WorldBoxes, shown_pixels
 from augment.cameras import Camera
 from augment.cast_shadows import (
     FadedShadows,
     faded_shadows,
+    precompute_shadows,
     shadows_of,
-    share_shadows,
     sun_transmittance,
 )
 from augment.drawing import LayerRenderer
 from augment.effects.effect import (
     PICTURE,
     SCENE,
-    Active,
-    Drawn,
     Effect,
-    EffectView,
-    Placed,
-    Sharing,
+    EffectInScene,
+    EffectPlan,
+    JobContext,
+    LabelInputs,
+    RenderedView,
     Step,
     skipped,
 )
@@ -46,7 +46,7 @@ from augment.effects.lidar.codes import LOST, SCATTERED
 from augment.errors import SceneError
 from augment.jobs.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
-from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_of_arrays
+from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
 from augment.render.scatter import scatter_forward
 from augment.scene import Scene
 from augment.timing import timed
@@ -67,8 +67,8 @@ DAMPING = 1e-4  # added to the squared gains of a camera's colour map when it is
 
 
 @dataclass(frozen=True)
-class PlacedSmog:
-    """Numbers of the smog in a scene, `Placed.data` of `SmogEffect`."""
+class SmogPlan:
+    """Numbers of the smog in a scene, `EffectPlan.data` of `SmogEffect`."""
 
     fog: Fog
     """The fog in the scene's heights."""
@@ -109,13 +109,13 @@ class SmogEffect(Effect):
         smog = self.of(recipe)
         return smog is not None and smog.shadow_fade > 0
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
         smog = self.of(recipe)
         fog, reason = _in_heights(smog, scene)
         if fog is None:
             nothing = skipped((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason)
             unchanged = skipped((SHADOWS,), reason, SCENE)
-            return Placed(None, (*unchanged, *nothing, *skipped((SCATTER,), reason, PICTURE)))
+            return EffectPlan(None, (*unchanged, *nothing, *skipped((SCATTER,), reason, PICTURE)))
         is_common = recipe.render.exposure == "common" and scene.common_color_map is not None
         if is_common:
             reason += "; one airlight for all cameras, by the mean of their exposures"
@@ -139,17 +139,19 @@ class SmogEffect(Effect):
         buffers = {EXPECTED_DEPTH} if on_buffers or fog.overcast > 0 else set[str]()
         if smog.scatter > 0:
             buffers.add(MEDIAN_DEPTH)  # which costs nothing where depth images are written
-        data = PlacedSmog(fog, on_buffers, is_common, smog.scatter, sun)
-        return Placed(data, steps, frozenset(buffers))
+        data = SmogPlan(fog, on_buffers, is_common, smog.scatter, sun)
+        return EffectPlan(data, steps, frozenset(buffers))
 
-    def prepare(self, own: Active) -> FadedShadows | None:
+    def prepare(self, own: EffectInScene) -> FadedShadows | None:
         return faded_shadows(own.scene, own.data.sun)
 
-    def share(self, job: Sharing) -> None:
+    def share(self, job: JobContext) -> None:
         if any(smog and smog.shadow_fade > 0 for smog in map(self.of, job.recipes)):
-            share_shadows(job.scene)
+            precompute_shadows(job.scene)
 
-    def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
+    def edit_scene(
+        self, own: EffectInScene, layers: LayerRenderer, camera: Camera
+    ) -> LayerRenderer:
         faded = own.prepared if own.data.sun < 1 else None
         if faded is not None:
             with timed(SHADOWS):
@@ -159,10 +161,10 @@ class SmogEffect(Effect):
         fog = own.data.fog
         common = own.scene.common_color_map
         if own.data.is_common and common is not None:
-            fog = before_map(fog, own.scene.color_map(camera), common)
-        return replace(layers, fog=fog, fog_on_buffers=own.data.on_buffers)
+            fog = fog_before_color_map(fog, own.scene.color_map(camera), common)
+        return replace(layers, fog=fog, applies_fog_to_buffers=own.data.on_buffers)
 
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         if own.data.scatter == 0:
             return drawn
         alpha = drawn.raster.alpha
@@ -177,14 +179,14 @@ class SmogEffect(Effect):
         return replace(drawn, rgb=rgb)
 
     def measure(
-        self, placed: PlacedBoxes, camera: Camera, view: EffectView
+        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
         data = view.placed.data
         fog = None if data is None else data.fog
         estimate = box_transmittance(placed, camera, fog, view.depth_m, view.water_level_z_m)
         return {"transmittance": estimate.transmittance, "pixels": estimate.pixels}
 
-    def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
+    def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
         fog_echoes(echoes, own.data.fog, rng)
 
 
@@ -226,7 +228,7 @@ def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:
     return fog, reason
 
 
-def before_map(
+def fog_before_color_map(
     fog: Fog, color_map: Float[Tensor, "3 4"] | None, common: Float[Tensor, "3 4"]
 ) -> Fog:
     """Return the fog whose airlight, after a camera's colour map, looks as in the common exposure.
@@ -270,7 +272,7 @@ class BoxTransmittance:
 
 
 def box_transmittance(
-    placed: PlacedBoxes,
+    placed: WorldBoxes,
     camera: Camera,
     fog: Fog | None,
     surface_depth_m: Float32[np.ndarray, "H W"] | None,
@@ -296,7 +298,7 @@ def box_transmittance(
     is_dry = water_level_z_m is None or eye_m[2] > water_level_z_m
 
     def transmittance_to(distance_m: np.ndarray, point_z_m: np.ndarray) -> np.ndarray:
-        t = np.exp(-optical_depth_of_arrays(fog, distance_m, eye_m[2], point_z_m))
+        t = np.exp(-optical_depth_numpy(fog, distance_m, eye_m[2], point_z_m))
         return t if is_dry else np.where(point_z_m <= water_level_z_m, 1.0, t)
 
     points = np.concatenate([placed.corners_m, placed.centres_m[:, None]], axis=1)  # [B, 9, 3]
@@ -454,7 +456,7 @@ def fog_echoes(echoes: Echoes, fog: Fog, rng: np.random.Generator) -> None:
     eyes_z = echoes.origins[:, 2]
     air = echoes.air_m
     ends_z = eyes_z + air * echoes.directions[:, 2]
-    tau = optical_depth_of_arrays(fog, air, eyes_z, ends_z, series_below=1e-4)
+    tau = optical_depth_numpy(fog, air, eyes_z, ends_z, series_below=1e-4)
     echoes.gain *= np.exp(-2 * tau)
     scatter = scatter_before(fog, eyes_z, air, model, rng)
     echoes.haze_per_m += extinction_at(fog, eyes_z)

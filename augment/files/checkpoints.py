@@ -338,7 +338,7 @@ def tensor(
     return values.detach()
 
 
-def finite_numbers(
+def finite_array(
     content: Mapping[str, Any], name: str, shape: Sequence[int | None], where: str
 ) -> np.ndarray:
     """Return a small checked float32 tensor as float64.

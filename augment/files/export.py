@@ -27,10 +27,10 @@ from augment.files.sog import MAX_PALETTE, write_sog
 from augment.files.spz import write_spz
 from augment.files.usd import write_usd
 from augment.geometry import multiply_quats, quat_from_rotmat, rotmat_from_quat
-from augment.jobs.atomic import refusals_of, replaced_folder, write_atomic
+from augment.jobs.atomic import raise_output_error, write_atomic, write_folder_atomically
 from augment.jobs.layout import folder_name
 from augment.render.sh import rotate_sh
-from augment.scene import SH_COUNTS, Gaussians, Scene
+from augment.scene import NUM_SH_BY_DEGREE, Gaussians, Scene
 from augment.semantics import SemanticClass
 
 # ---- What an exported file cannot keep of a scene: one sentence each, for people -----------------
@@ -113,9 +113,9 @@ def _place_losses(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> I
 def _colour_losses(scene: Scene, kind: ExportKind) -> Iterator[str]:
     """Losses in colours, sky and classes."""
     yield "the sky is left out"
-    if scene.mapped_cameras:
+    if scene.color_mapped_cameras:
         yield (
-            f"how the recorded colours of {', '.join(scene.mapped_cameras)} differ from the "
+            f"how the recorded colours of {', '.join(scene.color_mapped_cameras)} differ from the "
             f"scene's (colour maps) is left out"
         )
     waves = sum(actor.color_waves is not None for actor in scene.actors)
@@ -189,7 +189,7 @@ def _greatest_delay_ns(scene: Scene, timestamp_ns: int) -> int:
 _ROWS_AT_ONCE = 65536  # Gaussians whose colours are rotated together
 
 
-def moved_gaussians(
+def transform_gaussians_rigidly(
     gaussians: Gaussians,
     rotation: Float[Tensor, "3 3"],
     shift: Float[Tensor, "3"],
@@ -218,7 +218,7 @@ def moved_gaussians(
     return dataclasses.replace(moved, quats=multiply_quats(quat, gaussians.quats), sh=sh)
 
 
-def transformed_gaussians(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians:
+def transform_gaussians(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians:
     """Return the Gaussians under a linear map without mirrors; their shapes are exact.
 
     SH rotate by the rotation that is nearest to the map.
@@ -234,7 +234,7 @@ def transformed_gaussians(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) ->
     if float(stretch[0] - stretch[2]) <= 1e-6 * scale:
         if torch.allclose(rotation, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12):
             rotation = torch.eye(3, dtype=torch.float64)  # changes no bit
-        return moved_gaussians(gaussians, rotation, no_shift, scale)
+        return transform_gaussians_rigidly(gaussians, rotation, no_shift, scale)
     quats = torch.nn.functional.normalize(gaussians.quats.double(), dim=1)
     axes = matrix @ rotmat_from_quat(quats) * gaussians.scales.double()[:, None]
     is_usable = axes.isfinite().all(2).all(1)
@@ -242,7 +242,7 @@ def transformed_gaussians(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) ->
     axes, scales, _ = torch.linalg.svd(axes)  # covariance = axes scales^2 axes^T
     scales = torch.where(is_usable[:, None], scales, torch.nan)
     axes = axes * torch.linalg.det(axes)[:, None, None]
-    moved = moved_gaussians(gaussians, rotation, no_shift)
+    moved = transform_gaussians_rigidly(gaussians, rotation, no_shift)
     return dataclasses.replace(
         moved,
         means=(gaussians.means.double() @ matrix.T).to(gaussians.means.dtype),
@@ -262,12 +262,12 @@ def baked(scene: Scene, timestamp_ns: int) -> Gaussians:
         gaussians = part.gaussians
         pose = part.world_from_part
         if pose is not None:
-            gaussians = moved_gaussians(gaussians, pose[:3, :3], pose[:3, 3])
+            gaussians = transform_gaussians_rigidly(gaussians, pose[:3, :3], pose[:3, 3])
         parts.append(gaussians)
-    return joined_gaussians(parts)
+    return concatenate_gaussians(parts)
 
 
-def joined_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
+def concatenate_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     """Return the Gaussians of all parts, one part after another.
 
     Colours of a lower degree are filled up with zero bands, unknown classes with UNKNOWN.
@@ -277,7 +277,7 @@ def joined_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     names = ("means", "quats", "scales", "opacities")
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
     count = sum(map(len, parts))
-    bands = SH_COUNTS[max(part.sh_degree for part in parts if len(part) or count == 0)]
+    bands = NUM_SH_BY_DEGREE[max(part.sh_degree for part in parts if len(part) or count == 0)]
     sh = torch.zeros(count, bands, 3, dtype=parts[0].sh.dtype)
     has_classes = any(part.semantic is not None for part in parts)
     semantic = torch.full((count,), int(SemanticClass.UNKNOWN), dtype=torch.int16)
@@ -347,7 +347,7 @@ def export_usd(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
 def _y_up(gaussians: Gaussians) -> Gaussians:
     """Return Gaussians with z up as Gaussians with y up."""
     z_to_y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
-    return moved_gaussians(gaussians, z_to_y, torch.zeros(3, dtype=torch.float64))
+    return transform_gaussians_rigidly(gaussians, z_to_y, torch.zeros(3, dtype=torch.float64))
 
 
 def export_sog(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
@@ -361,7 +361,7 @@ def export_sog(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
     if "up" in notes:
         notes["up"] = "-y"
     zero = torch.zeros(3, dtype=torch.float64)
-    write_sog(path, moved_gaussians(gaussians, z_to_minus_y, zero), notes=notes)
+    write_sog(path, transform_gaussians_rigidly(gaussians, z_to_minus_y, zero), notes=notes)
 
 
 def export_cameras(scene: Scene, folder: str | Path) -> bool:
@@ -408,14 +408,14 @@ def export_ply_parts(scene: Scene, folder: str | Path) -> None:
     Parts without Gaussians have no file. An earlier export in the folder is replaced.
     """
     folder = Path(folder).resolve()
-    with refusals_of(folder):
+    with raise_output_error(folder):
         is_free = not folder.exists() or is_parts_folder(folder)
     if not is_free:
         raise OutputError(
             f"{folder} holds something else than exported parts, so it is not replaced; choose "
             f"another folder"
         )
-    with replaced_folder(folder, (BACKGROUND, CAMERAS, PARTS, ACTORS)) as new:
+    with write_folder_atomically(folder, (BACKGROUND, CAMERAS, PARTS, ACTORS)) as new:
         _write_parts(scene, new)
 
 

@@ -35,11 +35,11 @@ from pydantic import (
 )
 
 from augment.errors import SceneError
-from augment.files.limits import check_memory, parsed_json
-from augment.files.ply import SplatFile, join_placed
+from augment.files.limits import check_memory, parse_json_object
+from augment.files.ply import SplatFile, join_positioned_parts
 from augment.geometry import rotmat_from_quat
-from augment.jobs.atomic import replaced_file
-from augment.scene import SH_COUNTS, Gaussians
+from augment.jobs.atomic import write_file_atomically
+from augment.scene import NUM_SH_BY_DEGREE, Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"  # the extension's name
 GLB = b"glTF"  # first bytes of a .glb
@@ -227,7 +227,7 @@ class _File:
     def __init__(self, path: Path) -> None:
         self.path = path
         text, self.chunk = _read_chunks(path)
-        document = parsed_json(text, str(path), max_values=_MAX_VALUES)
+        document = parse_json_object(text, str(path), max_values=_MAX_VALUES)
         self.document = _Document.model_validate(document)
         self.buffers: dict[int, np.ndarray] = {}
         self.problems: list[str] = []
@@ -258,7 +258,7 @@ class _File:
                 f"{self.path}: negative scales are taken as logarithms, as an earlier draft of "
                 f"{EXTENSION} stored all scales"
             )
-        return join_placed(parts, self.path, NOTES, self.problems)
+        return join_positioned_parts(parts, self.path, NOTES, self.problems)
 
     def check_rows(self, primitives: Sequence[_Primitive]) -> None:
         """Refuse more Gaussians, or copies of them, than the buffers that exist can hold."""
@@ -356,7 +356,7 @@ class _File:
                 f"{EXTENSION} requires; it has {', '.join(primitive.attributes) or 'nothing'}"
             )
         names = [_sh_name(0, 0)]
-        for degree in range(1, len(SH_COUNTS)):
+        for degree in range(1, len(NUM_SH_BY_DEGREE)):
             band_names = [_sh_name(degree, n) for n in range(2 * degree + 1)]
             if not any(name in accessors for name in band_names):
                 break
@@ -490,7 +490,7 @@ def _place_columns(columns: _Columns, matrix: np.ndarray) -> tuple[np.ndarray, G
 
     The means of these Gaussians are unused.
     """
-    from augment.files.export import transformed_gaussians  # imported here: it imports this module
+    from augment.files.export import transform_gaussians  # imported here: it imports this module
 
     gaussians = Gaussians(
         means=torch.zeros(len(columns.means), 3),
@@ -500,7 +500,7 @@ def _place_columns(columns: _Columns, matrix: np.ndarray) -> tuple[np.ndarray, G
         },
     )
     positions = columns.means.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    return positions, transformed_gaussians(gaussians, torch.from_numpy(matrix[:3, :3].copy()))
+    return positions, transform_gaussians(gaussians, torch.from_numpy(matrix[:3, :3].copy()))
 
 
 # ---- Writing -------------------------------------------------------------------------------------
@@ -556,7 +556,7 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
     total = first_header.size + len(text) + second_header.size + ends[-1]
     if total >= 1 << 32:
         raise SceneError(f"{path}: {total} bytes; a .glb ends at 4 GiB: export as .ply or .spz")
-    with replaced_file(Path(path)) as file:
+    with write_file_atomically(Path(path)) as file:
         file.write(first_header.pack(GLB, 2, total, len(text), _JSON_CHUNK) + text)
         file.write(second_header.pack(ends[-1], _BINARY_CHUNK))
         for array in arrays:

@@ -31,16 +31,16 @@ from augment.lod import (
     MAX_LEVELS,
     Boxes,
     Level,
+    LevelPiece,
     Levels,
-    Piece,
     Squares,
     batches,
     build_levels,
     rows_of,
     square_order,
 )
-from augment.render.cpu.order import CELL
-from augment.scene import SH_COUNTS, Gaussians, Scene
+from augment.render.cpu.order import CELL_SIZE
+from augment.scene import NUM_SH_BY_DEGREE, Gaussians, Scene
 
 # Shapes of one row of the arrays, by name.
 _ROW_SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
@@ -73,10 +73,10 @@ def save_large_scene(scene: Scene, pieces: Iterable[Gaussians], folder: str | Pa
         save_scene(complete_scene, folder, levels=_arrays(levels), finest_m=levels.finest_m)
 
 
-def _pieces_of_level_0(pieces: Iterable[Gaussians]) -> Iterator[Piece]:
+def _pieces_of_level_0(pieces: Iterable[Gaussians]) -> Iterator[LevelPiece]:
     """Yield pieces without levels."""
     for piece in pieces:
-        yield Piece(piece, np.zeros(0, np.int32), np.zeros(0, np.int64))
+        yield LevelPiece(piece, np.zeros(0, np.int32), np.zeros(0, np.int64))
 
 
 class _Spool:
@@ -86,7 +86,7 @@ class _Spool:
         self._folder = folder
         self._spool_numbers = itertools.count()
 
-    def keep(self, pieces: Iterable[Piece]) -> Piece:
+    def keep(self, pieces: Iterable[LevelPiece]) -> LevelPiece:
         """Write pieces into files and return them as one mapped piece."""
         spool_number = next(self._spool_numbers)
         row_numbers = list[tuple[np.ndarray, np.ndarray]]()
@@ -109,7 +109,7 @@ class _Spool:
             for name, (dtype, shape) in array_types.items()
         }
         stands_for, keys = (np.concatenate(arrays) for arrays in zip(*row_numbers, strict=True))
-        return Piece(Gaussians(**mapped), stands_for, keys)
+        return LevelPiece(Gaussians(**mapped), stands_for, keys)
 
 
 def _arrays(levels: Levels) -> dict[str, np.ndarray]:
@@ -158,7 +158,7 @@ def read_levels(path: Path, background: Gaussians) -> Levels:
         squares = _squares(
             tensors, number, len(gaussians), levels[-1].squares if levels else None, path
         )
-        cells_shape = (-(-len(gaussians) // CELL),)
+        cells_shape = (-(-len(gaussians) // CELL_SIZE),)
         box_arrays = _boxes(tensors, f"{number}.boxes.", cells_shape, str(path))
         boxes = Boxes(*(box_arrays[name] for name in Boxes._fields))
         parents = _take(
@@ -187,7 +187,7 @@ def _splats(
     stands_for = _take(tensors, f"{number}.stands_for", (None,), where, torch.int32)
     count = len(stands_for)
     num_sh = background.sh.shape[1]
-    assert num_sh in SH_COUNTS
+    assert num_sh in NUM_SH_BY_DEGREE
     shapes = _ROW_SHAPES | {"sh": (num_sh, 3)}
     columns = {
         name: _take(tensors, f"{number}.{name}", (count, *shape), where, torch.float32)

@@ -57,7 +57,7 @@ def row_slices(count: int) -> Iterator[slice]:
 
 
 def read_json(path: Path, most: int) -> dict[str, Any]:
-    """Read a JSON file that holds an object; see `parsed_json`.
+    """Read a JSON file that holds an object; see `parse_json_object`.
 
     Args:
         path: the file.
@@ -71,7 +71,7 @@ def read_json(path: Path, most: int) -> dict[str, Any]:
         text = file.read(most + 1)
     if len(text) > most:
         raise SceneError(f"{path} is larger than the {most} bytes that are read of such a file")
-    return parsed_json(text, str(path))
+    return parse_json_object(text, str(path))
 
 
 def check_values(text: bytes, where: str, *, max_values: int = MAX_VALUES) -> None:
@@ -81,7 +81,7 @@ def check_values(text: bytes, where: str, *, max_values: int = MAX_VALUES) -> No
         raise SceneError(f"{where}: its JSON holds {values} values; at most {max_values} are read")
 
 
-def parsed_json(text: bytes, where: str, *, max_values: int = MAX_VALUES) -> dict[str, Any]:
+def parse_json_object(text: bytes, where: str, *, max_values: int = MAX_VALUES) -> dict[str, Any]:
     """Return the object of a JSON text.
 
     Args:

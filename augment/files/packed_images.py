@@ -28,8 +28,8 @@ from augment.errors import AdapterError, OutputError
 from augment.files.image_size import image_header
 from augment.files.recorded_images import decode_pixels
 from augment.files.stated_sizes import StatedSizeError, check_row_group
-from augment.jobs.atomic import temporary_beside
-from augment.jobs.tables import opened_parquet
+from augment.jobs.atomic import temporary_path
+from augment.jobs.tables import open_parquet
 from recipes.files import open_file
 
 PACKED = "packed.json"  # the file that describes a folder's images
@@ -102,7 +102,7 @@ class RowReader:
         self._stack = ExitStack()
         self._lock = threading.Lock()
         with reading(path):
-            self._content, self._file = self._stack.enter_context(opened_parquet(path, str(path)))
+            self._content, self._file = self._stack.enter_context(open_parquet(path, str(path)))
             metadata = self._file.metadata
             schema = self._file.schema_arrow
             sizes = [metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)]
@@ -392,7 +392,7 @@ def _write(path: Path, data: bytes) -> None:
     """Write a file atomically."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        new = temporary_beside(path)
+        new = temporary_path(path)
         new.write_bytes(data)
         os.replace(new, path)
     except OSError as error:

@@ -22,9 +22,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.errors import SceneError
-from augment.jobs.atomic import replaced_file
+from augment.jobs.atomic import write_file_atomically
 from augment.render.sh import SH_C0
-from augment.scene import SH_COUNTS, Gaussians, check_gaussians
+from augment.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
 # ---- The container: a header, and tables of rows that are read in pieces -------------------------
 
@@ -352,9 +352,9 @@ def _check_columns(header: PlyHeader, table: PlyElement, *, has_terms: bool) -> 
                 f"{where}: {prefix}0, {prefix}1, … must be a multiple of 3 in number (a channel's "
                 f"values after the other's) and numbered without gaps; got {len(prefix_columns)}"
             )
-    if 1 + counts["f_rest_"] not in SH_COUNTS:
+    if 1 + counts["f_rest_"] not in NUM_SH_BY_DEGREE:
         raise SceneError(
-            f"{where}: f_rest_0, f_rest_1, … must be {tuple(3 * (k - 1) for k in SH_COUNTS)} in "
+            f"{where}: f_rest_0, f_rest_1, … must be {tuple(3 * (k - 1) for k in NUM_SH_BY_DEGREE)} in "
             f"number (SH degrees 0 to 3); got {3 * counts['f_rest_']}"
         )
     return counts["f_dc_"], counts["f_rest_"]
@@ -595,7 +595,7 @@ def write_ply(
     dtype = np.dtype([(name, "<i2" if name == SEMANTIC else "<f4") for name in names])
     lines.append(f"element vertex {len(gaussians)}")
     lines += [f"property {'short' if name == SEMANTIC else 'float'} {name}" for name in names]
-    with replaced_file(Path(path)) as file:
+    with write_file_atomically(Path(path)) as file:
         file.write(("\n".join([*lines, "end_header"]) + "\n").encode())
         for start in range(0, len(gaussians), ROWS_PER_CHUNK):
             stop = min(start + ROWS_PER_CHUNK, len(gaussians))
@@ -632,7 +632,7 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> None:
     records["rgba"] = (rgba * 255).round().detach().cpu().numpy()
     quats = (gaussians.quats * 128 + 128).round().clamp(0, 255)
     records["quat"] = quats.detach().cpu().numpy()
-    with replaced_file(Path(path)) as file:
+    with write_file_atomically(Path(path)) as file:
         file.write(records.tobytes())
 
 
@@ -649,7 +649,7 @@ def recentring_origin(points: Float[np.ndarray, "N 3"]) -> np.ndarray:
     return np.round(median) if np.linalg.norm(median) > RECENTRE_BEYOND_M else np.zeros(3)
 
 
-def join_placed(
+def join_positioned_parts(
     parts: Sequence[tuple[np.ndarray, Gaussians]],
     path: Path,
     notes: Mapping[str, str],

@@ -42,12 +42,12 @@ from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
 from augment.files.checkpoints import tensor
 from augment.files.limits import check_values
-from augment.jobs.atomic import replaced_file, replaced_folder
-from augment.lod import keep_levels
+from augment.jobs.atomic import write_file_atomically, write_folder_atomically
+from augment.lod import store_levels
 from augment.scene import (
-    SH_COUNTS,
+    NUM_SH_BY_DEGREE,
     Actor,
-    ColorWaves,
+    ColorSeries,
     Gaussians,
     Ground,
     GroundSource,
@@ -218,9 +218,11 @@ def _take_part(
         name: _take_array(tensors, f"{part}.{name}", name, count, precision, where)
         for name in (*_ARRAYS, *(["waves"] if has_waves else []))
     }
-    if columns["sh"].shape[1] not in SH_COUNTS:
+    if columns["sh"].shape[1] not in NUM_SH_BY_DEGREE:
         shape = list(columns["sh"].shape)
-        raise SceneError(f"{where}: {part}.sh must be [N, K, 3] with K in {SH_COUNTS}; got {shape}")
+        raise SceneError(
+            f"{where}: {part}.sh must be [N, K, 3] with K in {NUM_SH_BY_DEGREE}; got {shape}"
+        )
     waves = columns.pop("waves", None)
     if waves is not None and waves.shape[1] > MAX_WAVES:
         raise SceneError(
@@ -498,10 +500,10 @@ def read_document(path: Path) -> SceneDocument:
         raise SceneError(f"{path} cannot be read: {error.strerror}") from error
     if len(text) > MAX_BYTES:
         raise SceneError(f"{path}: a scene.json has at most {MAX_BYTES} bytes")
-    return parsed_document(text, str(path))
+    return parse_document(text, str(path))
 
 
-def parsed_document(text: bytes | str, where: str) -> SceneDocument:
+def parse_document(text: bytes | str, where: str) -> SceneDocument:
     """Check a scene's JSON text and return its content."""
     try:
         data = text if isinstance(text, bytes) else text.encode()
@@ -714,7 +716,7 @@ def _actor(entry: ActorEntry, part: SavedPart) -> Actor:
         if entry.color_waves is not None:
             assert part.waves is not None
             phases = torch.tensor(entry.color_waves.phases, dtype=torch.float64)
-            waves = ColorWaves(part.waves, times(entry.color_waves), phases)
+            waves = ColorSeries(part.waves, times(entry.color_waves), phases)
     except ValueError as error:
         raise ValueError(f"actor {entry.track_id!r}: {error}") from error
     size_m = (length, width, height)
@@ -859,7 +861,7 @@ def save_scene(
     if levels is not None:
         arrays[LEVELS] = dict(levels)
         facts[LEVELS] = {"finest_m": repr(finest_m)}
-    with replaced_folder(folder, (*FILES, LEVELS)) as new:
+    with write_folder_atomically(folder, (*FILES, LEVELS)) as new:
         (new / DOCUMENT).write_text(document_text(document), encoding="utf-8")
         for name, tensors in arrays.items():
             with (new / name).open("wb") as file:
@@ -897,7 +899,7 @@ def save_scene_file(scene: Scene, path: str | Path, *, half: bool = False) -> No
     sky = {_SKY_PREFIX + name: array for name, array in sky_arrays(scene, precision).items()}
     metadata = {"format": FORMAT, "version": str(VERSION), "document": document}
     arrays = part_arrays(scene, precision) | sky
-    with replaced_file(path) as file:
+    with write_file_atomically(path) as file:
         write_tensors(file, arrays, metadata)
 
 
@@ -939,7 +941,7 @@ def read_saved_scene(path: str | Path) -> SavedScene:
     if is_large:
         from augment.files.level_file import read_levels
 
-        keep_levels(scene.background, read_levels(levels, scene.background))
+        store_levels(scene.background, read_levels(levels, scene.background))
     return SavedScene(scene, Path(document.working_folder))
 
 
@@ -971,7 +973,7 @@ def _open_file(path: Path) -> _Opened:
     check_format(metadata.get("format"), stated_version, str(path))
     if "document" not in metadata:
         raise SceneError(f"{path} is damaged: its metadata has no 'document'")
-    document = parsed_document(metadata["document"], f"{path}, document")
+    document = parse_document(metadata["document"], f"{path}, document")
     sky = {
         name.removeprefix(_SKY_PREFIX): tensors.pop(name)
         for name in list(tensors)

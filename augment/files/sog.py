@@ -31,10 +31,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from augment.errors import SceneError
 from augment.files.image_size import image_header
-from augment.files.limits import check_memory, parsed_json, row_slices
+from augment.files.limits import check_memory, parse_json_object, row_slices
 from augment.files.ply import SplatFile
 from augment.files.scene_file import checked
-from augment.jobs.atomic import replaced_file
+from augment.jobs.atomic import write_file_atomically
 from augment.rng import rng_for
 from augment.scene import Gaussians, check_gaussians
 from recipes.files import open_file
@@ -212,12 +212,12 @@ def read_sog(path: str | Path) -> SplatFile:
         SceneError: files are missing, truncated or damaged, or of another version.
     """
     path = Path(path)
-    all_gaussians, notes = read_stored_sog(path)
+    all_gaussians, notes = read_all_sog_gaussians(path)
     gaussians, problems = check_gaussians(all_gaussians, where=str(path))
     return SplatFile(gaussians, notes=notes, problems=problems)
 
 
-def read_stored_sog(path: Path) -> tuple[Gaussians, dict[str, str]]:
+def read_all_sog_gaussians(path: Path) -> tuple[Gaussians, dict[str, str]]:
     """Read all Gaussians of a .sog, including those that cannot be rendered, and its notes.
 
     The Gaussians have the file's order.
@@ -282,7 +282,7 @@ def _read(files: _Files) -> tuple[Gaussians, dict[str, str]]:
 def _read_meta(files: _Files) -> _Meta:
     """Read and check meta.json."""
     where = str(files.path) if files.zip is None else f"{files.path}: {META}"
-    content = parsed_json(files.read(META, _MAX_META_BYTES), where)
+    content = parse_json_object(files.read(META, _MAX_META_BYTES), where)
     if "means" not in content:
         raise SceneError(f"{where} does not describe splats: it has no 'means'")
     if content.get("version") != 2:
@@ -430,7 +430,7 @@ def write_sog(
         images |= {names[0]: codes, names[1]: _image_of_codes(label_bytes.astype(np.uint8))}
         palette_facts = {"count": len(palette), "bands": gaussians.sh_degree}
         meta["shN"] = {**palette_facts, "codebook": sh_book, "files": names}
-    with replaced_file(Path(path)) as file, zipfile.ZipFile(file, "w") as archive:
+    with write_file_atomically(Path(path)) as file, zipfile.ZipFile(file, "w") as archive:
         archive.writestr(zipfile.ZipInfo(META), json.dumps(meta))
         for name, pixels in images.items():
             archive.writestr(zipfile.ZipInfo(name), _encode_webp(pixels))

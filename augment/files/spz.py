@@ -27,8 +27,8 @@ import torch
 from augment.errors import SceneError
 from augment.files.limits import check_memory, row_slices
 from augment.files.ply import SplatFile
-from augment.jobs.atomic import replaced_file
-from augment.scene import SH_COUNTS, Gaussians, check_gaussians
+from augment.jobs.atomic import write_file_atomically
+from augment.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
 SUFFIX = ".spz"  # the end of the files' names
 UP = "+y"  # the axis that points up
@@ -135,7 +135,7 @@ def refuse_bare_spz(path: Path, start: bytes) -> None:
 def _decode_gaussians(header: _Header, columns: Mapping[str, np.ndarray]) -> Gaussians:
     """Decode the file's columns piece by piece."""
     count = header.num
-    num_rest = min(_NUM_SH_REST[header.degree], SH_COUNTS[-1] - 1)
+    num_rest = min(_NUM_SH_REST[header.degree], NUM_SH_BY_DEGREE[-1] - 1)
     means = np.empty((count, 3), np.float32)
     quats = np.empty((count, 4), np.float32)
     scales = np.empty((count, 3), np.float32)
@@ -186,7 +186,7 @@ def _unpack_header(path: Path, data: bytes) -> _Header:
             "file "
             f"holds 1 to {max_bytes // row_bytes} of them: truncated, or its header is wrong"
         )
-    num_sh = 1 + min(_NUM_SH_REST[header.degree], SH_COUNTS[-1] - 1)
+    num_sh = 1 + min(_NUM_SH_REST[header.degree], NUM_SH_BY_DEGREE[-1] - 1)
     check_memory(str(path), header.num, functions=num_sh, size=size)
     return header
 
@@ -272,7 +272,10 @@ def write_spz(path: str | Path, gaussians: Gaussians) -> None:
     count = len(gaussians)
     degree = gaussians.sh_degree
     header = _HEADER.pack(_MAGIC, WRITTEN_VERSION, count, degree, bits, 0, 0)
-    with replaced_file(Path(path)) as file, gzip.GzipFile("", "wb", 6, file, mtime=0) as stream:
+    with (
+        write_file_atomically(Path(path)) as file,
+        gzip.GzipFile("", "wb", 6, file, mtime=0) as stream,
+    ):
         stream.write(header)
         for column in columns:
             stream.write(np.ascontiguousarray(column).tobytes())

@@ -21,8 +21,8 @@ from augment.errors import SceneError
 from augment.files.limits import check_memory, read_json
 from augment.files.ply import SplatFile
 from augment.files.scene_file import checked
-from augment.files.sog import META, SUFFIX, read_stored_sog
-from augment.scene import SH_COUNTS, Gaussians, check_gaussians
+from augment.files.sog import META, SUFFIX, read_all_sog_gaussians
+from augment.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
 LOD_META = "lod-meta.json"  # the name of the file that describes the scene
 _MAX_META_BYTES = 128 << 20  # bytes of it; a tree of a hundred thousand leaves has about 20 MB
@@ -179,7 +179,7 @@ def _gather_gaussians(
     notes = dict[str, str]()
     for number, chunk_runs in by_file.items():
         file = _chunk_path(path, meta.filenames[number])
-        chunk_gaussians, chunk_notes = read_stored_sog(file)
+        chunk_gaussians, chunk_notes = read_all_sog_gaussians(file)
         if parts and chunk_notes != notes:
             raise SceneError(
                 f"{file} says {chunk_notes} of up and unit; chunks before it say {notes}"
@@ -198,7 +198,7 @@ def _gather_gaussians(
         num_sh = max(part.sh.shape[1] for part in parts)
         check_memory(str(path), num_rows, functions=num_sh, size=size)
     bands = max(part.sh.shape[1] for part in parts)
-    assert bands in SH_COUNTS
+    assert bands in NUM_SH_BY_DEGREE
     sh = [torch.nn.functional.pad(p.sh, (0, 0, 0, bands - p.sh.shape[1])) for p in parts]
     names = ("means", "quats", "scales", "opacities")
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}

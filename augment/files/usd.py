@@ -26,11 +26,11 @@ import numpy as np
 import torch
 
 from augment.errors import SceneError
-from augment.files.limits import check_memory, parsed_json
-from augment.files.ply import SplatFile, join_placed
+from augment.files.limits import check_memory, parse_json_object
+from augment.files.ply import SplatFile, join_positioned_parts
 from augment.files.usd_stage import ATTRIBUTES, COEFFICIENTS
-from augment.jobs.atomic import make_folder, refusals_of, replaced_file
-from augment.scene import SH_COUNTS, Gaussians
+from augment.jobs.atomic import make_folder, raise_output_error, write_file_atomically
+from augment.scene import NUM_SH_BY_DEGREE, Gaussians
 
 _BASE_MEMORY_BYTES = 2 << 30  # bytes of address space to read a file of any size
 _MEMORY_PER_BYTE = 16  # bytes beyond that for each byte of the file
@@ -68,7 +68,7 @@ def read_usd(path: str | Path) -> SplatFile:
     with tempfile.TemporaryFile() as output:
         _run_reader(path, output)
         output.seek(0)
-        facts = parsed_json(output.readline(), f"{path}: OpenUSD's reader")
+        facts = parse_json_object(output.readline(), f"{path}: OpenUSD's reader")
         if "error" in facts:
             raise SceneError(f"{path}: {facts['error']}")
         return _splats(path, facts, output)
@@ -121,7 +121,7 @@ def _splats(path: Path, facts: dict[str, Any], output: IO[bytes]) -> SplatFile:
         facts: the line of JSON that `usd_stage.py` wrote.
         output: its output after that line.
     """
-    from augment.files.export import transformed_gaussians  # imported here: it imports this module
+    from augment.files.export import transform_gaussians  # imported here: it imports this module
 
     problems = [f"{path}: {sentence}" for sentence in facts["problems"]]
     prims = facts["prims"]
@@ -130,9 +130,9 @@ def _splats(path: Path, facts: dict[str, Any], output: IO[bytes]) -> SplatFile:
         raise SceneError(
             f"{path}: no visible ParticleField3DGaussianSplat with positions; splats are needed"
         )
-    max_degree = min(max(prim["degree"] for prim in prims), len(SH_COUNTS) - 1)
+    max_degree = min(max(prim["degree"] for prim in prims), len(NUM_SH_BY_DEGREE) - 1)
     check_memory(
-        str(path), num_gaussians, functions=SH_COUNTS[max_degree], size=path.stat().st_size
+        str(path), num_gaussians, functions=NUM_SH_BY_DEGREE[max_degree], size=path.stat().st_size
     )
     parts = []
     for prim in prims:
@@ -143,25 +143,25 @@ def _splats(path: Path, facts: dict[str, Any], output: IO[bytes]) -> SplatFile:
         matrix = np.array(prim["matrix"], np.float64).reshape(4, 4)
         gaussians = _gaussians(columns, prim["degree"])
         problems += [f"{path}: {prim['path']}: {sentence}" for sentence in prim["problems"]]
-        if prim["degree"] >= len(SH_COUNTS):
+        if prim["degree"] >= len(NUM_SH_BY_DEGREE):
             problems.append(
                 f"{path}: {prim['path']}: spherical harmonics of degree {prim['degree']} are cut "
-                f"off at {len(SH_COUNTS) - 1}"
+                f"off at {len(NUM_SH_BY_DEGREE) - 1}"
             )
         with np.errstate(
             over="ignore", invalid="ignore"
         ):  # infinite values are left out later, and reported
             positions = columns["positions"].astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        placed_gaussians = transformed_gaussians(gaussians, torch.from_numpy(matrix[:3, :3].copy()))
+        placed_gaussians = transform_gaussians(gaussians, torch.from_numpy(matrix[:3, :3].copy()))
         parts.append((positions, placed_gaussians))
-    return join_placed(parts, path, facts["notes"], problems)
+    return join_positioned_parts(parts, path, facts["notes"], problems)
 
 
 def _gaussians(columns: dict[str, np.ndarray], degree: int) -> Gaussians:
     """Return a prim's Gaussians in its axes with zero means; missing columns have the default."""
     count = len(columns["positions"])
     num_sh = (degree + 1) ** 2
-    num_kept_sh = min(num_sh, SH_COUNTS[-1])
+    num_kept_sh = min(num_sh, NUM_SH_BY_DEGREE[-1])
 
     def values(name: str, rows: int) -> np.ndarray:
         if name in columns:
@@ -220,10 +220,10 @@ def write_usd(path: str | Path, gaussians: Gaussians, *, is_upright: bool, is_me
     coefficients = numbers(gaussians.sh.reshape(-1, 3))
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(to_vectors(coefficients))
     path = Path(path)
-    with refusals_of(path):
+    with raise_output_error(path):
         make_folder(path.parent)
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             temporary_file = Path(folder) / "a.usdc"
             layer.Export(str(temporary_file))
-            with temporary_file.open("rb") as source, replaced_file(path) as file:
+            with temporary_file.open("rb") as source, write_file_atomically(path) as file:
                 shutil.copyfileobj(source, file)

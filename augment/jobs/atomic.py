@@ -59,13 +59,13 @@ _HINTS = {
 
 
 def write_atomic(path: Path, data: bytes, *, clear: bool = True) -> None:
-    """Put `data` at `path`, replacing an earlier file in one step; see replaced_file."""
-    with replaced_file(path, clear=clear) as file:
+    """Put `data` at `path`, replacing an earlier file in one step; see write_file_atomically."""
+    with write_file_atomically(path, clear=clear) as file:
         file.write(data)
 
 
 @contextlib.contextmanager
-def replaced_file(
+def write_file_atomically(
     path: Path, *, clear: bool = True, flush: bool = True, ending: str = ""
 ) -> Iterator[BinaryIO]:
     """Context manager of a new file that takes its name once it is complete and on the disk.
@@ -80,13 +80,13 @@ def replaced_file(
     Raises:
         OutputError: The system refuses (disk full, no permission ...); `path` is then as it was.
     """
-    with refusals_of(path):
+    with raise_output_error(path):
         make_folder(path.parent)
         if clear:
             remove_temporaries(path.parent, name=path.name, recursive=False)
         is_ours = False
         while not is_ours:
-            temporary = path.with_name(temporary_beside(path).name + ending)
+            temporary = path.with_name(temporary_path(path).name + ending)
             file = temporary.open("xb")
             try:
                 is_ours = _lock_new(temporary, file.fileno())
@@ -106,16 +106,16 @@ def replaced_file(
 _NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
 
 
-def write_new(path: Path, data: bytes) -> None:
+def write_new_file(path: Path, data: bytes) -> None:
     """Write a file at an unused path in one step; replaces nothing, and follows no link.
 
     Raises:
         FileExistsError: The path is in use, possibly by a link to nothing.
         OutputError: The system refuses.
     """
-    with refusals_of(path):
+    with raise_output_error(path):
         make_folder(path.parent)
-    temporary = temporary_beside(path)
+    temporary = temporary_path(path)
     try:
         try:
             _create_new(temporary, data)
@@ -129,7 +129,7 @@ def write_new(path: Path, data: bytes) -> None:
     except FileExistsError:
         raise
     except OSError as error:
-        raise output_error(path, error) from error
+        raise make_output_error(path, error) from error
 
 
 def _create_new(path: Path, data: bytes) -> None:
@@ -173,7 +173,7 @@ def path_below(root: Path, parts: tuple[str, ...]) -> Path:
     return path
 
 
-def temporary_beside(path: Path) -> Path:
+def temporary_path(path: Path) -> Path:
     """Return a new temporary name in the folder of `path`."""
     return path.with_name(f".{_shorten_name(path.name)}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
 
@@ -216,7 +216,7 @@ def remove_temporaries(folder: Path, *, name: str = "", recursive: bool = True) 
     for folder_path, _, names in os.walk(folder):  # skips folders that vanish meanwhile
         for temporary_name in temporary_names(names, name):
             path = Path(folder_path, temporary_name)
-            with refusals_of(path):
+            with raise_output_error(path):
                 _clear_abandoned(
                     path, os.O_NONBLOCK, lambda path=path: path.unlink(missing_ok=True)
                 )
@@ -225,22 +225,22 @@ def remove_temporaries(folder: Path, *, name: str = "", recursive: bool = True) 
 
 
 def temporary_names(names: Iterable[str], name: str = "") -> list[str]:
-    """Return the names that `temporary_beside` has made, for the file `name` if it is given."""
+    """Return the names that `temporary_path` has made, for the file `name` if it is given."""
     middle = rf"{re.escape(_shorten_name(name))}\.[^.]+(\.old)?" if name else ".*"
     pattern = re.compile(rf"\.{middle}{re.escape(TEMPORARY_SUFFIX)}(\.[^.]+)?", re.DOTALL)
     return [other_name for other_name in names if pattern.fullmatch(other_name)]
 
 
 @contextlib.contextmanager
-def refusals_of(path: Path) -> Iterator[None]:
+def raise_output_error(path: Path) -> Iterator[None]:
     """Context manager that turns refusals of the system into an OutputError that names the path."""
     try:
         yield
     except OSError as error:
-        raise output_error(path, error) from error
+        raise make_output_error(path, error) from error
 
 
-def output_error(path: Path, error: OSError) -> OutputError:
+def make_output_error(path: Path, error: OSError) -> OutputError:
     """Return an OutputError that names the file and says what to do."""
     hint = _HINTS.get(error.errno or 0, "check the disk, then run the same command again")
     return OutputError(f"cannot write {path}: {error.strerror}; {hint}")
@@ -317,7 +317,7 @@ def open_lock(path: Path) -> int:
             something else than a lock's mark; nothing has been changed then.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-    with refusals_of(path):
+    with raise_output_error(path):
         make_folder(path.parent)
         try:
             descriptor = os.open(path, flags, 0o666)
@@ -418,7 +418,7 @@ _CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTTY, 
 
 
 @contextlib.contextmanager
-def replaced_folder(target: Path, own_names: Collection[str]) -> Iterator[Path]:
+def write_folder_atomically(target: Path, own_names: Collection[str]) -> Iterator[Path]:
     """Context manager of a new folder that replaces `target` when the block ends without error.
 
     Args:
@@ -429,7 +429,7 @@ def replaced_folder(target: Path, own_names: Collection[str]) -> Iterator[Path]:
         OutputError: The system refuses; `target` is then as it was.
     """
     target = target.resolve()  # a link to a folder stays a link
-    with refusals_of(target):
+    with raise_output_error(target):
         make_folder(target.parent)
         new_folder, descriptor = _locked_folder(target)
         try:
@@ -453,7 +453,7 @@ def replaced_folder(target: Path, own_names: Collection[str]) -> Iterator[Path]:
 def _locked_folder(target: Path) -> tuple[Path, int]:
     """Make a new folder beside the target; return it and the descriptor that holds its lock."""
     while True:
-        new_folder = temporary_beside(target)
+        new_folder = temporary_path(target)
         new_folder.mkdir()
         with contextlib.suppress(FileNotFoundError):  # another process took it for left behind
             descriptor = os.open(new_folder, os.O_RDONLY)
@@ -529,19 +529,19 @@ def link_file(original: str, target: str) -> bool:
         try:
             os.link(original, target, follow_symlinks=False)
         except FileExistsError:
-            temporary = temporary_beside(Path(target))
+            temporary = temporary_path(Path(target))
             os.link(original, temporary, follow_symlinks=False)
             move_temporary(temporary, target)
     except OSError as error:
         if error.errno in _CANNOT_LINK:
             return False
-        raise output_error(Path(target), error) from error
+        raise make_output_error(Path(target), error) from error
     return True
 
 
 def copy_file(original: str, target: str) -> None:
     """Copy a file's bytes and its time of change."""
-    with replaced_file(Path(target), clear=False, flush=False) as file:
+    with write_file_atomically(Path(target), clear=False, flush=False) as file:
         shutil.copyfile(original, file.name)
         facts = os.stat(original)
         os.utime(file.fileno(), ns=(facts.st_mtime_ns, facts.st_mtime_ns))

@@ -21,19 +21,25 @@ import pyarrow as pa
 
 from augment import effects
 from augment.errors import ClimateGSError, GpuLost, OutputError, SceneError, StyleError
-from augment.jobs.atomic import copy_file, link_file, make_folder, refusals_of, remove_temporaries
+from augment.jobs.atomic import (
+    copy_file,
+    link_file,
+    make_folder,
+    raise_output_error,
+    remove_temporaries,
+)
 from augment.jobs.blocks import Block, SceneRecord
-from augment.jobs.claims import CLAIMS_FOLDER, hold, try_claim
+from augment.jobs.claims import CLAIMS_FOLDER, hold_claim, try_claim
 from augment.jobs.files import box_tables
 from augment.jobs.layout import (
-    MANIFEST,
+    MANIFEST_FILE,
     STATE_FOLDER,
     SWEEPS,
     FileListing,
     folder_name,
     item_paths,
+    parse_errors_as_output_errors,
     path_kinds,
-    reading_back,
     variant_folder,
 )
 from augment.jobs.manifest import (
@@ -47,10 +53,10 @@ from augment.jobs.manifest import (
     read_manifest,
     write_manifest,
 )
-from augment.jobs.pools import OnOutcome
+from augment.jobs.pools import OutcomeCallback
 from augment.jobs.processes import file_lock
 from augment.jobs.quality import FOLDER as QUALITY
-from augment.jobs.quality import resolve_quality_for
+from augment.jobs.quality import choose_settings
 from augment.jobs.render_job import RenderJob, SceneLoader, file_folders, run_job
 from augment.jobs.store import LocalStore, Store, StoredFileMissing, open_store
 from augment.jobs.worker import Outcome, Renderer, TaskFailed, WorkTimes, describe
@@ -157,7 +163,7 @@ def link_published_sweeps(store: Store, folder: Path, block: Block) -> None:
     for frame in block.frames:
         path = item_paths(block.scene, block.recipe, "", frame)["lidar"] or ""
         if (store.local_dir / path).is_file():
-            with refusals_of(folder / path):
+            with raise_output_error(folder / path):
                 make_folder((folder / path).parent)
                 link_file(str(store.local_dir / path), str(folder / path))
 
@@ -167,7 +173,7 @@ def link_published_files(store: Store, folder: Path, block: Block, part: Part) -
 
     `run_job` then makes the missing files there, and nothing else.
     """
-    if store.local_dir is None or (folder / MANIFEST).is_file():
+    if store.local_dir is None or (folder / MANIFEST_FILE).is_file():
         return
     rows = parse_manifest(store.read(part.path), f"{store.uri}/{part.path}")
     staged_rows = _rename_shared_files(rows, lambda path: path.parent.with_suffix(path.suffix))
@@ -182,7 +188,7 @@ def link_published_files(store: Store, folder: Path, block: Block, part: Part) -
     listing = FileListing(store.local_dir)
     for stored_path, staged_path in staged_path_of.items():
         if listing.has(stored_path):
-            with refusals_of(folder / staged_path):
+            with raise_output_error(folder / staged_path):
                 make_folder((folder / staged_path).parent)
                 if not link_file(str(store.local_dir / stored_path), str(folder / staged_path)):
                     copy_file(str(store.local_dir / stored_path), str(folder / staged_path))
@@ -227,11 +233,11 @@ def enter_variant(store: Store, scene: str, variant: str, identity: Identity) ->
     try:
         data = store.read(path)
     except StoredFileMissing:
-        with hold(store, folder_name(f"variant.{folder.replace('/', '.')}")):
+        with hold_claim(store, folder_name(f"variant.{folder.replace('/', '.')}")):
             if not store.exists(path):
                 store.write(path, json.dumps(vars(identity), sort_keys=True).encode())
             data = store.read(path)
-    with reading_back(f"{store.uri}/{path}", "Delete it and start the job again"):
+    with parse_errors_as_output_errors(f"{store.uri}/{path}", "Delete it and start the job again"):
         stored_identity = Identity(**json.loads(data))
     identity.check(stored_identity, f"{store.uri}/{folder}")
 
@@ -310,7 +316,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class WorkSetup:
+class JobWorkerSetup:
     """Everything that all workers of a job share; picklable."""
 
     store_uri: str
@@ -331,7 +337,7 @@ class WorkSetup:
         """URI of the output, for messages."""
         return self.store_uri
 
-    def worker(self, on_outcome: OnOutcome) -> BlockWorker:
+    def worker(self, on_outcome: OutcomeCallback) -> BlockWorker:
         """Return a worker for this process."""
         return BlockWorker(self, on_outcome)
 
@@ -380,7 +386,7 @@ Task = IndexTask | ResolveTask | BlockTask
 
 
 @dataclass(frozen=True)
-class BlockDone:
+class BlockResult:
     """Counts of a block's images."""
 
     written: int = 0
@@ -391,7 +397,7 @@ class BlockDone:
     """Images that could not be rendered."""
     failures: tuple[str, ...] = ()
     """One line for each failure."""
-    is_elsewhere: bool = False
+    is_claimed_elsewhere: bool = False
     """True if another process has claimed the block; nothing was done."""
     seconds: dict[str, float] | None = None
     """Seconds by kind of work, as of `worker.WorkTimes`."""
@@ -405,7 +411,7 @@ class ResolvedRecipes:
     """Resolved recipes."""
 
 
-Result = SceneRecord | ResolvedRecipes | BlockDone | TaskFailed
+Result = SceneRecord | ResolvedRecipes | BlockResult | TaskFailed
 
 
 class BlockWorker:
@@ -416,7 +422,7 @@ class BlockWorker:
         on_outcome: Called with every image's Outcome, from several threads.
     """
 
-    def __init__(self, setup: WorkSetup, on_outcome: OnOutcome) -> None:
+    def __init__(self, setup: JobWorkerSetup, on_outcome: OutcomeCallback) -> None:
         self._setup = setup
         self._on_outcome = on_outcome
         self._store: Store = open_store(setup.store_uri)
@@ -461,7 +467,7 @@ class BlockWorker:
         scene = self._open_scene(task.uri, task.name)
         setup = self._setup
         try:
-            return resolve_quality_for(
+            return choose_settings(
                 self._store,
                 recipe,
                 scene,
@@ -495,21 +501,21 @@ class BlockWorker:
         self._scene = self._scene_key = None
         gc.collect()
 
-    def _render(self, task: BlockTask) -> BlockDone:
+    def _render(self, task: BlockTask) -> BlockResult:
         """Claim a block and render it, unless it is finished already."""
         block = task.block
         claim = try_claim(self._store, block.claim)
         if claim is None:
-            return BlockDone(is_elsewhere=True)
+            return BlockResult(is_claimed_elsewhere=True)
         with claim:
             part = list_parts(self._store, folder_name(block.scene)).get(block.key)
             if part is not None and not part.has_failures and not task.is_damaged:
                 # A killed process may have left the folder.
                 clear_block(self._store, self._setup.scratch, block)
-                return BlockDone(skipped=block.images)
+                return BlockResult(skipped=block.images)
             return self._render_claimed(task, part if task.is_damaged else None)
 
-    def _render_claimed(self, task: BlockTask, damaged_part: Part | None) -> BlockDone:
+    def _render_claimed(self, task: BlockTask, damaged_part: Part | None) -> BlockResult:
         """Render and publish a block whose claim this process holds."""
         block = task.block
         times = WorkTimes()
@@ -557,7 +563,7 @@ class BlockWorker:
                 clear_block(self._store, self._setup.scratch, block)
         times.update(result.timings)
         counts = result.written, result.skipped, result.failed, result.failures
-        return BlockDone(*counts, seconds=times.so_far())
+        return BlockResult(*counts, seconds=times.so_far())
 
     def _enter_variant(self, block: Block) -> None:
         """Make sure that the images of the block's variant have one identity; once per variant."""
@@ -584,8 +590,8 @@ class BlockWorker:
             folder = self._shared_dir()
             lock = folder / f"beds-{folder_name(block.scene)}.lock"
             with file_lock(lock, "finds where snow can lie"):
-                sharing = effects.Sharing(scene, [recipe], folder=folder, backend=backend)
-                effects.share_effects(sharing, only_files=True)
+                sharing = effects.JobContext(scene, [recipe], folder=folder, backend=backend)
+                effects.precompute_effects(sharing, only_files=True)
 
 
 class _SceneFailed(ClimateGSError):

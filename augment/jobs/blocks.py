@@ -25,11 +25,17 @@ from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.jobs.atomic import read_file
 from augment.jobs.claims import CLAIMS_FOLDER, try_claim
 from augment.jobs.files import RECORDED, SceneIndex, has_lidar, select_frames
-from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, reading_back, variant_name
-from augment.jobs.manifest import OK, Identity, Part, Pictured, list_parts, read_manifest
+from augment.jobs.layout import (
+    MANIFEST_FILE,
+    STATE_FOLDER,
+    folder_name,
+    parse_errors_as_output_errors,
+    variant_name,
+)
+from augment.jobs.manifest import OK, Identity, ImageFacts, Part, list_parts, read_manifest
 from augment.jobs.store import Store
 from augment.scene import Scene
-from augment.trust import judge_scene, seen_views, unfitted_cameras
+from augment.trust import judge_scene, source_views, unfitted_cameras
 from recipes.job import ALL, JobRecipes, JobScene
 from recipes.schema import Recipe, parse_frames
 
@@ -98,7 +104,7 @@ class SceneRecord:
             open_s,
             tuple(frames),
             unfitted=unfitted,
-            learnt_scale=seen_views(scene).scale,
+            learnt_scale=source_views(scene).scale,
             problems=judge_scene(scene, cameras=cameras, scale=None, count=1).problems,
             digest=digest,
         )
@@ -114,7 +120,7 @@ class SceneRecord:
         Args:
             source_name: Name of the file, for errors.
         """
-        with reading_back(source_name, "Delete it; the scene is opened again"):
+        with parse_errors_as_output_errors(source_name, "Delete it; the scene is opened again"):
             return _RECORD.validate_json(data, strict=True)
 
 
@@ -172,13 +178,13 @@ class Block:
         version = augment.__version__
         return Identity(self.source, self.recipe.hash, RECORDED, version, backend, self.digest)
 
-    def pictured(self, record: SceneRecord) -> list[Pictured]:
+    def pictured(self, record: SceneRecord) -> list[ImageFacts]:
         """Return all images of the block, by frame and camera."""
         frame_numbers = set(self.frames)
         camera_names = set(self.cameras)
         scale = self.recipe.render.scale
         return [
-            Pictured(frame.number, name, time_ns, *scaled_size(width, height, scale))
+            ImageFacts(frame.number, name, time_ns, *scaled_size(width, height, scale))
             for frame in record.frames
             if frame.number in frame_numbers
             for name, (width, height, time_ns) in frame.cameras.items()
@@ -359,7 +365,7 @@ def make_plan(
     return Plan(recipes.job.name, backend, tuple(blocks), records, names, unusable)
 
 
-def shard_of(blocks: Sequence[Block], number: int, count: int) -> list[Block]:
+def select_shard(blocks: Sequence[Block], number: int, count: int) -> list[Block]:
     """Return the blocks of shard `number` of `count`, counted from 1.
 
     Each shard is a run of about as many images as every other one, so that most scenes are opened
@@ -444,7 +450,7 @@ def _check_folder(records: Mapping[str, SceneRecord], record: SceneRecord) -> No
 
 def _from_json(data: bytes, source_name: str) -> StoredPlan:
     """Return the plan in a file's bytes."""
-    with reading_back(source_name, "Start the job again, which writes it anew"):
+    with parse_errors_as_output_errors(source_name, "Start the job again, which writes it anew"):
         return _STORED_PLAN.validate_json(data, strict=True)
 
 
@@ -572,7 +578,7 @@ def _count_staged_images(store: Store) -> dict[str, int]:
         with contextlib.suppress(OSError, OutputError):  # another process has published it
             progress_logs = list(folder.glob(f"{STATE_FOLDER}/journal/*/*.jsonl"))
             finished = sum(read_file(j).count(b'"status":"ok"') for j in progress_logs)
-            if (folder / MANIFEST).is_file():  # a run that was stopped, or had failures
+            if (folder / MANIFEST_FILE).is_file():  # a run that was stopped, or had failures
                 finished += read_manifest(folder)["status"].to_pylist().count(OK)
             counts[folder.name] = finished
     return counts

@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from augment.boxes import NOT_COUNTED, fraction_of
+from augment.boxes import NOT_COUNTED, marked_fraction
 from augment.errors import OutputError
 from augment.jobs.tables import (
-    as_described,
     check_count,
     checked_int,
+    column_texts,
+    metadata_errors_as_output_errors,
     parquet_bytes,
     read_parquet,
-    texts_of,
 )
 
 # Frame number and camera name of an image.
@@ -143,8 +143,8 @@ class BoxTable:
         table, note = read_parquet(path)
         if note.get("kind") != self.kind:
             raise OutputError(f"{path} holds {note.get('kind')!r} data; expected {self.kind!r}")
-        with as_described(path):
-            track_ids = texts_of(table["track_id"])
+        with metadata_errors_as_output_errors(path):
+            track_ids = column_texts(table["track_id"])
             absent_columns = self.later.keys() - set(table.column_names)
             columns = {
                 name: np.full(len(table), self.later[name], self.columns[name])
@@ -166,7 +166,7 @@ class BoxTable:
     def _column(self, data: pa.ChunkedArray, name: str) -> np.ndarray:
         """Return a column as an array of its type."""
         if self.columns[name] is object:
-            return np.array(texts_of(data), object)
+            return np.array(column_texts(data), object)
         if self.columns[name] is np.int64:
             data = data.fill_null(NOT_COUNTED)
         return data.to_numpy().astype(self.columns[name], casting="safe", copy=False)
@@ -176,7 +176,7 @@ def _joined(arrays: list[np.ndarray], dtype: type) -> np.ndarray:
     return np.concatenate([np.zeros(0, dtype), *arrays])
 
 
-def share_of_pixels(column_name: str) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
+def pixel_fraction(column_name: str) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
     """Return a function that divides a column by the box's `pixels`, float64 [B].
 
     The result is 0 where the column was not counted, and NaN for a box without pixels.
@@ -184,7 +184,7 @@ def share_of_pixels(column_name: str) -> Callable[[Mapping[str, np.ndarray]], np
     Args:
         column_name: Column with a number of pixels.
     """
-    return lambda columns: fraction_of(columns[column_name], columns["pixels"])
+    return lambda columns: marked_fraction(columns[column_name], columns["pixels"])
 
 
 def _visible_fraction(columns: Mapping[str, np.ndarray]) -> np.ndarray:

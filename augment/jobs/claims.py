@@ -31,7 +31,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from augment.errors import OutputError
-from augment.jobs.atomic import is_named, open_lock, path_below, refusals_of
+from augment.jobs.atomic import is_named, open_lock, path_below, raise_output_error
 from augment.jobs.layout import STATE_FOLDER, folder_name
 from augment.jobs.store import RemoteStore, Store, StoredVersion
 
@@ -104,7 +104,7 @@ def try_claim(store: Store, name: str, times: ClaimTimes | None = None) -> Claim
 
 
 @contextlib.contextmanager
-def hold(
+def hold_claim(
     store: Store, name: str, patience_s: float = 120.0, doing: str = "writes there"
 ) -> Iterator[Claim]:
     """Context manager that holds a claim; waits for other holders, and logs that once.
@@ -171,7 +171,7 @@ class FileClaim(Claim):
         # The name goes first: then no other process can open this file, and a process that has
         # opened it already sees that it has no name, and opens the next one.
         try:
-            with refusals_of(self._path):
+            with raise_output_error(self._path):
                 if is_named(self._path, descriptor):
                     self._path.unlink(missing_ok=True)
                     with contextlib.suppress(OSError):  # fails while there are other claims
@@ -183,7 +183,7 @@ class FileClaim(Claim):
 
 def try_lock(path: Path) -> FileClaim | None:
     """Lock the file, which is made if missing; return None where another process holds it."""
-    with refusals_of(path):
+    with raise_output_error(path):
         for _ in range(_MAX_RACES):
             with contextlib.ExitStack() as stack:
                 try:

@@ -32,12 +32,12 @@ from augment.boxes import (
     Instances,
     Occlusion,
     Outlines,
-    PlacedBoxes,
+    WorldBoxes,
     encode_masks,
     find_occlusion,
     instances_of,
-    outline_placed,
-    with_boxes,
+    outline_world_boxes,
+    paint_boxes,
 )
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
@@ -52,7 +52,7 @@ from augment.jobs.box_tables import (
     BoxTable,
     BoxWeather,
 )
-from augment.jobs.layout import TRUST, share_columns
+from augment.jobs.layout import TRUST, mask_share_columns
 from augment.jobs.processes import renders_on_gpu, uninterrupted
 from augment.jobs.tables import checked_int
 from augment.labels import Boxes, LabelSource
@@ -74,8 +74,8 @@ class View(Protocol):
     instance: np.ndarray | None  # uint16 [H, W]
     masks: Mapping[str, np.ndarray]  # uint8 [H, W], by name: 0 or 255, of TRUST also between
     # The data that labels are measured from, as in augment.views.
-    effects: Mapping[str, Any]  # EffectView by name, of the recipe's effects
-    surface: Any  # SurfaceView, None without boxes
+    effects: Mapping[str, Any]  # LabelInputs by name, of the recipe's effects
+    surface: Any  # LabelSurfaces, None without boxes
 
 
 def box_tables() -> dict[str, BoxTable]:
@@ -104,14 +104,16 @@ def measure_boxes(
         world_origin_m: Origin that was subtracted from the dataset's world, metres.
         camera: Camera at the written resolution.
         view: The image, with the data that labels are measured from.
-        box_visibility: Result of `show_boxes` for the image, with masks by depth if it has owners;
+        box_visibility: Result of `find_box_visibility` for the image, with masks by depth if it has owners;
             computed here if None.
     """
-    world_boxes = PlacedBoxes.of(boxes, world_origin_m)
+    world_boxes = WorldBoxes.of(boxes, world_origin_m)
     numbers_of_table: dict[str, BoxNumbers] = {}
     if view.surface is not None:
         numbers = instances.of(boxes.track_ids)
-        box_visibility = box_visibility or show_boxes(boxes, instances, world_boxes, camera, view)
+        box_visibility = box_visibility or find_box_visibility(
+            boxes, instances, world_boxes, camera, view
+        )
         columns = {"instance": numbers.astype(np.int64), **box_visibility.columns()}
         numbers_of_table[BOXES_2D.name] = BOXES_2D.numbers(boxes.track_ids, **columns)
         if box_visibility.occlusion.owners is not None:
@@ -129,7 +131,7 @@ def measure_boxes(
     return numbers_of_table
 
 
-def _grow_boxes(world_boxes: PlacedBoxes, view: View) -> PlacedBoxes:
+def _grow_boxes(world_boxes: WorldBoxes, view: View) -> WorldBoxes:
     """Return the boxes grown by the layers that lie on them, such as snow."""
     for effect in effects.EFFECTS:
         if effect.name in view.effects:
@@ -197,10 +199,10 @@ class BoxVisibility:
         return painted_image
 
 
-def show_boxes(
+def find_box_visibility(
     boxes: Boxes,
     instances: Instances,
-    world_boxes: PlacedBoxes,
+    world_boxes: WorldBoxes,
     camera: Camera,
     view: View,
     *,
@@ -221,7 +223,7 @@ def show_boxes(
         on_photo: True if the picture is a recorded one.
     """
     surface = _with_own_car(view.surface)
-    outlines = outline_placed(world_boxes, camera)
+    outlines = outline_world_boxes(world_boxes, camera)
     numbers = instances.of(boxes.track_ids)
     actor_numbers = np.where(numbers <= len(instances.actors), numbers, 0)
     grown_boxes = _grow_boxes(world_boxes, view)
@@ -251,7 +253,7 @@ def show_boxes(
 
 
 def _with_own_car(surface: Any) -> Any:
-    """Return the SurfaceView with the recording car as the nearest surface of its pixels."""
+    """Return the LabelSurfaces with the recording car as the nearest surface of its pixels."""
     if surface.own_car is None:
         return surface
     actors = surface.actors
@@ -803,7 +805,7 @@ def write_view(
     for relative, data in files.items():
         write_atomic(out_dir / relative, data, clear=False)
     write_s = time.perf_counter() - encoded_s
-    columns = {mask: c for mask, c in share_columns().items() if mask in view.masks}
+    columns = {mask: c for mask, c in mask_share_columns().items() if mask in view.masks}
     shares = {column: _mean_share(view.masks[mask]) for mask, column in columns.items()}
     return Written(checksum, tuple(files), encoded_s - start_s, write_s, shares)
 
@@ -920,12 +922,12 @@ def label_view(
     wants_masks = bool(recipe.output.label_formats)
     output = recipe.output
     surface = view.surface
-    world_boxes = PlacedBoxes.of(boxes, world_origin_m)
+    world_boxes = WorldBoxes.of(boxes, world_origin_m)
     box_visibility = None
     if surface is not None:
         uses_depth = wants_masks and not output.instance
         on_photo = recipe.render.base == base_photo.RECORDED
-        box_visibility = show_boxes(
+        box_visibility = find_box_visibility(
             boxes,
             instances,
             world_boxes,
@@ -941,21 +943,21 @@ def label_view(
         )
     if view.instance is None or surface is None or box_visibility is None:
         return view, numbers_of_table
-    assert surface.shown_depth_m is not None and surface.shown_classes is not None
+    assert surface.instance_depth_m is not None and surface.instance_classes is not None
     box_numbers = instances.of(boxes.track_ids)
     if not surface.is_bare:
         world_boxes = _grow_boxes(world_boxes, view)
-    instance_image = with_boxes(
+    instance_image = paint_boxes(
         view.instance,
         world_boxes,
         box_numbers,
         camera,
-        surface.shown_depth_m,
-        surface.shown_classes,
+        surface.instance_depth_m,
+        surface.instance_classes,
         len(instances.actors),
     )
     instance_image = box_visibility.paint_estimates(
-        instance_image, box_numbers, surface.shown_classes
+        instance_image, box_numbers, surface.instance_classes
     )
     if surface.own_car is not None:
         instance_image = np.where(surface.own_car, np.uint16(0), instance_image)

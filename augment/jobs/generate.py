@@ -28,21 +28,21 @@ import pyarrow as pa
 
 import augment
 from augment.errors import OutputError
-from augment.jobs.atomic import refusals_of
+from augment.jobs.atomic import raise_output_error
 from augment.jobs.block_worker import (
-    BlockDone,
+    BlockResult,
     BlockTask,
     IndexTask,
+    JobWorkerSetup,
     ResolvedRecipes,
     ResolveTask,
-    WorkSetup,
     clear_leftovers,
 )
-from augment.jobs.blocks import Block, Plan, SceneRecord, make_plan, shard_of, store_plan
+from augment.jobs.blocks import Block, Plan, SceneRecord, make_plan, select_shard, store_plan
 from augment.jobs.claims import try_claim
 from augment.jobs.files import RECORDED
 from augment.jobs.layout import (
-    MANIFEST,
+    MANIFEST_FILE,
     STATE_FOLDER,
     FileListing,
     path_kinds,
@@ -62,7 +62,7 @@ from augment.jobs.manifest import (
     list_parts,
     parts_to_merge,
     publish_part,
-    read_finished,
+    read_manifest_rows,
     rows_to_table,
     rows_without_files,
 )
@@ -76,7 +76,7 @@ from augment.jobs.worker import WORKERS, Outcome, TaskFailed
 from augment.progress import ProgressBar
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Scene
-from augment.trust import left_out_sentence, magnified_sentence
+from augment.trust import magnification_sentence, skipped_cameras_sentence
 from recipes.files import with_digest
 from recipes.job import JobRecipes, JobScene
 from recipes.schema import Recipe, columns_of_effects
@@ -162,7 +162,7 @@ class Tally:
     seconds: Counter[str] = field(default_factory=Counter)
     """Seconds by kind of work."""
 
-    def add(self, done: BlockDone) -> None:
+    def add(self, done: BlockResult) -> None:
         """Add the counts of a finished block."""
         self.written += done.written
         self.skipped += done.skipped
@@ -271,12 +271,12 @@ class BlockWork(Work):
         self._free_slot(slot)
         return [replace(task, is_trial=True)]
 
-    def done(self, slot: int, task: BlockTask, result: BlockDone | TaskFailed) -> None:
+    def done(self, slot: int, task: BlockTask, result: BlockResult | TaskFailed) -> None:
         self._free_slot(slot)
         if isinstance(result, TaskFailed):
             other_blocks = self._queue.take_all(task.block.scene) if result.of_scene else []
             self._give_up([task.block, *other_blocks], result.text)
-        elif result.is_elsewhere:
+        elif result.is_claimed_elsewhere:
             self._postponed.append((time.monotonic() + ELSEWHERE_S, task.block))
         else:
             self.tally.add(result)
@@ -528,7 +528,7 @@ class GenerateJob:
     """Loaded recipes of the job."""
     scenes: Sequence[JobScene]
     """Scenes of the job, with patterns already expanded."""
-    setup: WorkSetup
+    setup: JobWorkerSetup
     """Output, backend and scene loader of the workers."""
     executor: str = "processes"
     """`serial` renders in this process, `processes` in several processes of this machine, `ray` in
@@ -570,7 +570,7 @@ class GenerateResult:
     seconds: float
     """Wall-clock time of the call, seconds."""
     timings: dict[str, float] = field(default_factory=dict)
-    """Seconds by kind of work, summed over threads and workers (see `worker.shares_of`). Measured
+    """Seconds by kind of work, summed over threads and workers (see `worker.compute_time_shares`). Measured
     by the clock: `plan`, `scan` of what is finished, and `render_wall`, everything else.
     """
 
@@ -666,7 +666,7 @@ def default_scratch(store_uri: str) -> Path | None:
         return None
     digest = hashlib.sha256(store.uri.encode()).hexdigest()[:16]
     root = Path(tempfile.gettempdir()) / f"climategs-{os.getuid()}"
-    with refusals_of(root):
+    with raise_output_error(root):
         root.mkdir(mode=0o700, exist_ok=True)
         if root.stat().st_uid != os.getuid() or root.is_symlink():
             raise OutputError(f"{root} belongs to somebody else; name another folder (--scratch)")
@@ -700,7 +700,7 @@ class _Generation:
             self._plan = plan
             self._accept_changes(changes)
             self._timings["plan"] = time.perf_counter() - start_s
-            blocks = shard_of(plan.blocks, *self._job.shard)
+            blocks = select_shard(plan.blocks, *self._job.shard)
             pending_blocks = self._find_pending_blocks(blocks)
             self._timings["scan"] = time.perf_counter() - start_s - self._timings["plan"]
             work = BlockWork(
@@ -778,11 +778,11 @@ class _Generation:
         column_names = (*leading_columns(), *columns_of_effects(), *TRAILING)
         columns = {*KEY, "status", "source_digest", *(f"{kind}_path" for kind in path_kinds())}
         try:
-            return read_finished(
+            return read_manifest_rows(
                 self._store, [name for name in column_names if name not in columns]
             )
         except OutputError:
-            if self._store.exists(MANIFEST):
+            if self._store.exists(MANIFEST_FILE):
                 raise
             return None
 
@@ -894,7 +894,7 @@ class _Generation:
                     compact(self._store)
                 break
             if not wait or time.monotonic() - start_s > _MERGE_PATIENCE_S:
-                _log.info("%s is being written by another process", MANIFEST)
+                _log.info("%s is being written by another process", MANIFEST_FILE)
                 break
             time.sleep(0.2)
         self._merged_at = time.monotonic()
@@ -910,11 +910,11 @@ def _trust_notes(blocks: Sequence[Block], records: Mapping[str, SceneRecord]) ->
         cameras = {camera for block in scene_blocks for camera in block.cameras}
         if omitted_cameras := [camera for camera in record.unfitted if camera not in cameras]:
             notes.append(
-                f"{name}: {left_out_sentence(omitted_cameras, '`cameras: all` in the job')}"
+                f"{name}: {skipped_cameras_sentence(omitted_cameras, '`cameras: all` in the job')}"
             )
         notes += [f"{name}: {text}" for text in record.problems]
         scale = max(block.recipe.render.scale for block in scene_blocks)
-        if sentence := magnified_sentence(record.learnt_scale, scale):
+        if sentence := magnification_sentence(record.learnt_scale, scale):
             notes.append(f"{name}: {sentence}")
     return notes
 
@@ -1011,9 +1011,9 @@ def _record_path(uri: str, name: str | None) -> str:
 def _check_not_mixed(store: Store, plan: Plan, blocks: Sequence[Block]) -> None:
     """Refuse to put images beside images of the same name that were made otherwise."""
     try:
-        table = read_finished(store)
+        table = read_manifest_rows(store)
     except OutputError:
-        if store.exists(MANIFEST):
+        if store.exists(MANIFEST_FILE):
             raise
         return
     block_of_variant = {(block.scene, block.variant): block for block in blocks}

@@ -29,27 +29,27 @@ from augment.errors import OutputError
 from augment.jobs.atomic import (
     flush_folder,
     make_folder,
-    output_error,
+    make_output_error,
     path_below,
+    raise_output_error,
     read_file,
-    refusals_of,
     remove_temporaries,
     write_atomic,
 )
 from augment.jobs.box_tables import BoxNumbers, Item
-from augment.jobs.claims import hold
+from augment.jobs.claims import hold_claim
 from augment.jobs.files import SceneIndex, box_tables, calibration_bytes, frame_entry, read_entries
 from augment.jobs.layout import (
-    MANIFEST,
+    MANIFEST_FILE,
     STATE_FOLDER,
     SWEEPS,
     FileListing,
     box_weather_files,
     folder_name,
     item_paths,
+    parse_errors_as_output_errors,
     path_columns,
     path_kinds,
-    reading_back,
     variant_folder,
     variant_name,
 )
@@ -57,7 +57,7 @@ from augment.jobs.manifest import (
     OK,
     PARTS,
     Identity,
-    Pictured,
+    ImageFacts,
     check_rows,
     image_row,
     later_columns,
@@ -110,11 +110,13 @@ class ProgressLog:
 
     def reading(self) -> contextlib.AbstractContextManager[None]:
         """Return a context manager that turns errors of reading the lines into an OutputError."""
-        return reading_back(str(self.path), "Delete it; what it lists is rendered again")
+        return parse_errors_as_output_errors(
+            str(self.path), "Delete it; what it lists is rendered again"
+        )
 
     def begin(self, identity: Identity) -> None:
         """Open the log for appending; writes the identity, and keeps all complete lines."""
-        with refusals_of(self.path):
+        with raise_output_error(self.path):
             data = read_file(self.path) if self.path.exists() else b""
             rows = data[data.find(b"\n") + 1 : data.rfind(b"\n") + 1]
             write_atomic(self.path, _line(asdict(identity)) + rows)
@@ -132,7 +134,7 @@ class ProgressLog:
                 os.fsync(self._file)
             except OSError as error:
                 os.ftruncate(self._file, length)  # a later line must not join half of this one
-                raise output_error(self.path, error) from error
+                raise make_output_error(self.path, error) from error
 
     def close(self) -> None:
         if self._file is not None:
@@ -142,7 +144,7 @@ class ProgressLog:
     def remove(self) -> None:
         """Delete the progress log and the folders it leaves empty."""
         self.close()
-        with refusals_of(self.path):
+        with raise_output_error(self.path):
             self.path.unlink(missing_ok=True)
             for folder in (self.path.parent, self.path.parent.parent):
                 if folder.is_dir() and not any(folder.iterdir()):
@@ -382,7 +384,7 @@ class VariantState:
             index.name,
             recipe,
             self.identity,
-            Pictured(frame.index, camera.name, camera.timestamp_ns, camera.width, camera.height),
+            ImageFacts(frame.index, camera.name, camera.timestamp_ns, camera.width, camera.height),
             paths=paths | {f"{kind}_path": None for kind in absent_kinds},
             status=outcome.status,
             message=outcome.message,
@@ -446,7 +448,7 @@ class JobState:
 
     def open(self, *, overwrite: bool) -> None:
         """Delete leftovers of a killed run, and read the rows that it finished."""
-        if (self.out_dir / MANIFEST).is_file():
+        if (self.out_dir / MANIFEST_FILE).is_file():
             self._table = read_manifest(self.out_dir)
         path_below(self.out_dir, (STATE_FOLDER, PROGRESS_LOGS, folder_name(self.index.name)))
         listing = FileListing(self.out_dir)
@@ -476,7 +478,7 @@ class JobState:
 
     def is_complete(self) -> bool:
         """Return True if `finish` has nothing to write."""
-        has_manifest = (self.out_dir / MANIFEST).is_file()
+        has_manifest = (self.out_dir / MANIFEST_FILE).is_file()
         return has_manifest and all(variant.is_complete() for variant in self.variants)
 
     def close(self) -> None:
@@ -492,7 +494,7 @@ class JobState:
         trash_dir = self.out_dir / STATE_FOLDER / "trash"
         for number, variant in enumerate(variants):
             if variant.place.is_dir():
-                with refusals_of(variant.place):
+                with raise_output_error(variant.place):
                     make_folder(trash_dir)
                     variant.place.rename(trash_dir / str(number))
                     flush_folder(variant.place.parent)
@@ -515,7 +517,7 @@ class JobState:
         assert self._table is not None, "the manifest has just been written"
         listed_paths = set(self._table["lidar_path"].to_pylist())
         folder = self.out_dir / folder_name(self.index.name) / SWEEPS
-        with refusals_of(folder):
+        with raise_output_error(folder):
             for path in folder.glob("*.parquet"):
                 if path.relative_to(self.out_dir).as_posix() not in listed_paths:
                     path.unlink()
@@ -524,8 +526,8 @@ class JobState:
 
     def _replace_rows(self, rows: list[dict[str, Any]], variants: Sequence[VariantState]) -> None:
         """Exchange rows of the manifest as it is now: other jobs may have merged rows meanwhile."""
-        with hold(open_store(self.out_dir), "manifest"):
-            has_manifest = (self.out_dir / MANIFEST).is_file()
+        with hold_claim(open_store(self.out_dir), "manifest"):
+            has_manifest = (self.out_dir / MANIFEST_FILE).is_file()
             keys = {variant.key for variant in variants}
             self._table = merge_rows(
                 read_manifest(self.out_dir) if has_manifest else None, rows, keys
@@ -560,5 +562,5 @@ def _read_table(kind: str, path: Path) -> dict[Item, BoxNumbers]:
 
 def _remove_tree(folder: Path) -> None:
     """Delete a folder with everything in it, if it exists."""
-    with refusals_of(folder), contextlib.suppress(FileNotFoundError):
+    with raise_output_error(folder), contextlib.suppress(FileNotFoundError):
         shutil.rmtree(folder)

@@ -23,7 +23,7 @@ from augment.jobs.box_tables import BOXES_2D, MASKS
 from recipes.schema import Recipe
 
 # File of the table of all images.
-MANIFEST = "manifest.parquet"
+MANIFEST_FILE = "manifest.parquet"
 # Folder of the jobs' state.
 STATE_FOLDER = ".climategs"
 # Folder of LiDAR sweeps, inside a variant's folder; inside the scene's for sweeps without weather.
@@ -42,7 +42,7 @@ def folder_name(name: str) -> str:
     name's SHA-256 are added. Therefore two names never share a folder, and no name leads out of the
     output folder.
     """
-    if _SAFE_NAME.fullmatch(name) and name != MANIFEST:
+    if _SAFE_NAME.fullmatch(name) and name != MANIFEST_FILE:
         return name
     digest = hashlib.sha256(name.encode()).hexdigest()[:8]
     readable = _UNSAFE_CHARACTERS.sub("_", name).lstrip("._-")[:80]
@@ -86,7 +86,7 @@ def mask_names() -> tuple[str, ...]:
     return (*(e.mask for e in reversed(effects.EFFECTS) if e.mask), TRUST)
 
 
-def share_columns() -> dict[str, str]:
+def mask_share_columns() -> dict[str, str]:
     """Return the manifest's column for the marked share of pixels, by mask name."""
     shares = ((e.mask, e.share_column) for e in reversed(effects.EFFECTS))
     return {**{m: column for m, column in shares if m and column}, TRUST: "trusted_fraction"}
@@ -187,7 +187,7 @@ class FileListing:
 
 
 @contextlib.contextmanager
-def reading_back(source_name: str, advice: str) -> Iterator[None]:
+def parse_errors_as_output_errors(source_name: str, advice: str) -> Iterator[None]:
     """Context manager that turns errors of reading the output's own JSON into an OutputError.
 
     Args:
@@ -231,7 +231,7 @@ def resolve_inside(root: Path, relative: str) -> Path:
     parts = relative_parts(relative)
     if parts is None:
         raise OutputError(
-            f"{root / MANIFEST} names the file {relative!r}; paths there must be relative to "
+            f"{root / MANIFEST_FILE} names the file {relative!r}; paths there must be relative to "
             f"{root}, without '..'. The manifest is damaged or not from this project: do not "
             f"trust the folder"
         )

@@ -26,11 +26,11 @@ import pyarrow.parquet as pq
 from augment.errors import OutputError
 from augment.jobs.atomic import read_file, write_atomic
 from augment.jobs.layout import (
-    MANIFEST,
+    MANIFEST_FILE,
     STATE_FOLDER,
     FileListing,
+    mask_share_columns,
     path_kinds,
-    share_columns,
     variant_name,
 )
 from augment.jobs.store import Store, StoredFileMissing
@@ -84,7 +84,7 @@ def leading_columns() -> dict[str, pa.DataType]:
         **{"width": integer, "height": integer},
         **dict.fromkeys(("base", "surface", "lidar", "lidar_note", *text_columns, "quality"), text),
         **{"render_scale": pa.float64(), "settings": text, "source_digest": text},
-        **dict.fromkeys(share_columns().values(), pa.float64()),
+        **dict.fromkeys(mask_share_columns().values(), pa.float64()),
     }
 
 
@@ -165,7 +165,7 @@ def read_manifest(out_dir: Path) -> pa.Table:
 
     A manifest of an older version gains the columns that it lacks.
     """
-    path = Path(out_dir) / MANIFEST
+    path = Path(out_dir) / MANIFEST_FILE
     if not path.is_file():
         raise OutputError(
             f"{path} does not exist: {out_dir} is no finished output folder. A job writes its "
@@ -250,7 +250,7 @@ def _check_values(table: pa.Table, source_name: str) -> None:
         elif name == "render_scale":
             is_scale = pc.and_(pc.greater(column, 0), pc.is_finite(column))
             _refuse(table, name, pc.invert(is_scale), "a number above 0, or null", source_name)
-        elif name in share_columns().values():
+        elif name in mask_share_columns().values():
             is_share = pc.and_(pc.greater_equal(column, 0), pc.less_equal(column, 1))
             _refuse(table, name, pc.invert(is_share), "0 to 1, or null", source_name)
         elif pa.types.is_floating(column.type):
@@ -346,7 +346,7 @@ def rows_of(table: pa.Table, variants: set[tuple[str, str]]) -> list[dict[str, A
 
 def write_manifest(out_dir: Path, table: pa.Table) -> Path:
     """Replace the manifest in one step; leave it as it is where the content is the same."""
-    path = Path(out_dir) / MANIFEST
+    path = Path(out_dir) / MANIFEST_FILE
     data = manifest_bytes(table)
     if not (path.is_file() and read_file(path) == data):
         write_atomic(path, data)
@@ -489,7 +489,7 @@ def publish_part(store: Store, key: str, rows: pa.Table) -> Part:
     return part
 
 
-def read_finished(store: Store, without: Collection[str] = ()) -> pa.Table:
+def read_manifest_rows(store: Store, without: Collection[str] = ()) -> pa.Table:
     """Return the rows of all finished and failed images, sorted by `manifest.KEY`.
 
     Args:
@@ -501,7 +501,7 @@ def read_finished(store: Store, without: Collection[str] = ()) -> pa.Table:
     table = _merge_parts(store, without)[0]
     if table is None:
         raise OutputError(
-            f"{store.uri} holds neither {MANIFEST} nor finished blocks: it is no output folder, or "
+            f"{store.uri} holds neither {MANIFEST_FILE} nor finished blocks: it is no output folder, or "
             f"nothing in it is finished yet. A job writes its manifest when it ends"
         )
     return table
@@ -520,7 +520,7 @@ def compact(store: Store) -> pa.Table | None:
         table.replace_schema_metadata({_PARTS_KEY: part_names} if parts else None)
     )
     if data != old_data:
-        store.write(MANIFEST, data)
+        store.write(MANIFEST_FILE, data)
     rank_of_key = {part.key: _part_rank(part) for part in parts}
     store.delete(
         [p.path for p in _all_parts(store) if _part_rank(p) < rank_of_key.get(p.key, _part_rank(p))]
@@ -567,10 +567,10 @@ def _load_manifest(
 ) -> tuple[pa.Table | None, bytes | None]:
     """Return the manifest's table and bytes; None for both where there is no manifest."""
     try:
-        data = store.read(MANIFEST)
+        data = store.read(MANIFEST_FILE)
     except StoredFileMissing:
         return None, None
-    return parse_manifest(data, f"{store.uri}/{MANIFEST}", without), data
+    return parse_manifest(data, f"{store.uri}/{MANIFEST_FILE}", without), data
 
 
 def _merged_part_names(table: pa.Table | None) -> Collection[str]:
@@ -664,7 +664,7 @@ class Identity:
             )
 
 
-class Pictured(NamedTuple):
+class ImageFacts(NamedTuple):
     """Identification of one image."""
 
     frame: int
@@ -683,7 +683,7 @@ def image_row(
     scene: str,
     recipe: Recipe,
     identity: Identity,
-    pictured: Pictured,
+    pictured: ImageFacts,
     *,
     paths: Mapping[str, str | None],
     status: str,
@@ -709,7 +709,7 @@ def image_row(
         **recipe_columns(recipe),
         "lidar": lidar,
         "lidar_note": lidar_note,
-        **dict.fromkeys(share_columns().values()),
+        **dict.fromkeys(mask_share_columns().values()),
         **(shares or {}),
         "seed": recipe.seed,
         "recipe": recipe.name,

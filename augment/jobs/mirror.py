@@ -1,6 +1,6 @@
 """Copy of a dataset's folder in which images and sweeps of a variant replace the recorded ones.
 
-In: the dataset's folder (`SourceTree`), and the files to put in place (`Weathered`). Out: the copy,
+In: the dataset's folder (`DatasetFolder`), and the files to put in place (`Replacement`). Out: the copy,
 and a record of it. Called by `climategs export` (`tools/export.py`).
 
     <out>/source/<variant>/<dataset's folder>/...                    files for the dataset's tools
@@ -31,23 +31,23 @@ from pydantic import BaseModel
 from tqdm import tqdm
 
 from augment.cameras import Frame
-from augment.effects.lidar.codes import drop_lost
+from augment.effects.lidar.codes import drop_lost_returns
 from augment.errors import AdapterError, OutputError
 from augment.files.image_size import read_image_header
 from augment.jobs.atomic import (
     copy_file,
     flush_folder,
     link_file,
+    make_output_error,
     move_temporary,
-    output_error,
-    refusals_of,
-    replaced_file,
-    temporary_beside,
+    raise_output_error,
     temporary_names,
+    temporary_path,
     write_atomic,
+    write_file_atomically,
 )
 from augment.jobs.files import WritePump, decode_image, encode_image
-from augment.jobs.layout import folder_name, reading_back, resolve_inside
+from augment.jobs.layout import folder_name, parse_errors_as_output_errors, resolve_inside
 from augment.jobs.manifest import OK
 from augment.jobs.placed_files import ANY_SIZE, PlacedFile, PlacedFiles, digest_of
 from augment.jobs.tables import read_lidar
@@ -62,7 +62,7 @@ from recipes.schema import Output
 
 
 @dataclass(frozen=True)
-class SourceTree:
+class DatasetFolder:
     """A dataset in a folder."""
 
     uri: str
@@ -158,7 +158,7 @@ class SourceFolder(NamedTuple):
     """Relative path and text of each link in it; links lead to other parts of the dataset."""
 
 
-class Survey(NamedTuple):
+class FileCounts(NamedTuple):
     """Counts of a dataset's files."""
 
     files: int
@@ -169,13 +169,13 @@ class Survey(NamedTuple):
     """Number of LiDAR sweeps."""
 
 
-def survey(tree: SourceTree) -> Survey:
+def survey(tree: DatasetFolder) -> FileCounts:
     """Count the files of a dataset without reading them."""
     names = [file.relative for folder in walk(tree) for file in folder.files]
-    return Survey(len(names), sum(map(tree.is_image, names)), sum(map(tree.is_sweep, names)))
+    return FileCounts(len(names), sum(map(tree.is_image, names)), sum(map(tree.is_sweep, names)))
 
 
-def walk(tree: SourceTree, relative: str = "", path: str = "") -> Iterator[SourceFolder]:
+def walk(tree: DatasetFolder, relative: str = "", path: str = "") -> Iterator[SourceFolder]:
     """Yield the folders of a dataset, each before those in it, in order of name.
 
     Args:
@@ -215,7 +215,7 @@ def is_within(path: str, folder: str) -> bool:
     return path == folder or path.startswith(folder.rstrip("/") + "/")
 
 
-def _link_text(tree: SourceTree, place: str, path: str) -> str:
+def _link_text(tree: DatasetFolder, place: str, path: str) -> str:
     """Return the text of the copy's link that leads to the same part of the copy."""
     target = tree.relative(path)
     if target is None:
@@ -251,7 +251,7 @@ def find_placement(target: str, original: os.stat_result) -> str | None:
 
 def write_file(data: bytes, target: str, mtime_ns: int) -> None:
     """Write a file with that time of change."""
-    with replaced_file(Path(target), clear=False, flush=False) as file:
+    with write_file_atomically(Path(target), clear=False, flush=False) as file:
         file.write(data)
         file.flush()
         os.utime(file.fileno(), ns=(mtime_ns, mtime_ns))
@@ -259,10 +259,10 @@ def write_file(data: bytes, target: str, mtime_ns: int) -> None:
 
 def put_link(text: str, target: str) -> bool:
     """Make a symbolic link with this text; return False where it exists already."""
-    with refusals_of(Path(target)):
+    with raise_output_error(Path(target)):
         if os.path.islink(target) and os.readlink(target) == text:
             return False
-        temporary = temporary_beside(Path(target))
+        temporary = temporary_path(Path(target))
         os.symlink(text, temporary)
         move_temporary(temporary, target)
     return True
@@ -272,7 +272,7 @@ def make_real_folder(folder: str) -> bool:
     """Make sure that a folder of the copy is a real one; return True where it had to be made."""
     facts = _facts(folder)
     if facts is None:
-        with refusals_of(Path(folder)):
+        with raise_output_error(Path(folder)):
             os.mkdir(folder)
         return True
     if not stat.S_ISDIR(facts.st_mode):
@@ -286,7 +286,7 @@ def make_real_folder(folder: str) -> bool:
 
 def find_foreign_names(folder: str, expected_names: set[str]) -> list[str]:
     """Return foreign names in a folder of the copy; leftovers of a killed run are deleted."""
-    with refusals_of(Path(folder)):
+    with raise_output_error(Path(folder)):
         unexpected_names = set(os.listdir(folder)) - expected_names
         temporary_leftovers = set(temporary_names(unexpected_names))
         for name in temporary_leftovers:
@@ -347,13 +347,13 @@ def mirror_folder(out_dir: Path, variant: str) -> Path:
     return out_dir / MIRROR_FOLDER / folder_name(variant)
 
 
-def record_names(tree: SourceTree, folder: Path) -> tuple[Path, Path]:
+def record_names(tree: DatasetFolder, folder: Path) -> tuple[Path, Path]:
     """Return the paths of a complete copy's record, and of the record while the copy is changed."""
     record = folder / f"climategs-mirror-{tree.root.name}.json"
     return record, record.with_name(record.name + ".begun")
 
 
-def read_record(tree: SourceTree, folder: Path) -> MirrorRecord:
+def read_record(tree: DatasetFolder, folder: Path) -> MirrorRecord:
     """Return the record of the dataset's copy in a folder; it is empty where there is none.
 
     The record of a copy that was stopped while it was being changed counts too.
@@ -362,7 +362,7 @@ def read_record(tree: SourceTree, folder: Path) -> MirrorRecord:
     if path is None:
         return MirrorRecord(folder=str(tree.root))
     advice = "Delete it and build the copy again, once for each scene whose images are in it"
-    with reading_back(str(path), advice):
+    with parse_errors_as_output_errors(str(path), advice):
         record = MirrorRecord.model_validate_json(path.read_bytes())
     if os.path.realpath(record.folder) != os.path.realpath(tree.root):
         raise OutputError(
@@ -389,7 +389,7 @@ class ImageForm(NamedTuple):
     """True for one channel; known only of PNG."""
 
 
-class Weathered(NamedTuple):
+class Replacement(NamedTuple):
     """File that shall stand in a recorded file's place."""
 
     path: Path
@@ -404,17 +404,17 @@ class Weathered(NamedTuple):
     """
 
     @staticmethod
-    def image(out_dir: Path, row: Mapping[str, Any]) -> Weathered:
+    def image(out_dir: Path, row: Mapping[str, Any]) -> Replacement:
         """Return the replacement from a manifest's row of a finished image."""
         name = row["image_path"]
         form = ImageForm("jpg" if name.endswith(".jpg") else "png", (row["width"], row["height"]))
         shown = Shown(scene=row["scene"], image=name, sha256=row["checksum"])
-        return Weathered(resolve_inside(out_dir, name), shown, form)
+        return Replacement(resolve_inside(out_dir, name), shown, form)
 
     @staticmethod
     def sweep(
         out_dir: Path, row: Mapping[str, Any], content: Callable[[Path], bytes] | None = None
-    ) -> Weathered:
+    ) -> Replacement:
         """Return the replacement from a manifest's row with a weathered sweep.
 
         Args:
@@ -422,7 +422,7 @@ class Weathered(NamedTuple):
         """
         path = resolve_inside(out_dir, row["lidar_path"])
         shown = Shown(scene=row["scene"], sweep=row["lidar_path"])
-        return Weathered(path, shown, content=content and partial(content, path))
+        return Replacement(path, shown, content=content and partial(content, path))
 
 
 def is_weathered(row: Mapping[str, Any]) -> bool:
@@ -431,15 +431,15 @@ def is_weathered(row: Mapping[str, Any]) -> bool:
 
 
 def weathered_images(
-    out_dir: Path, rows: Sequence[Mapping[str, Any]], frames: Sequence[Frame], tree: SourceTree
-) -> tuple[dict[str, Weathered], list[str]]:
+    out_dir: Path, rows: Sequence[Mapping[str, Any]], frames: Sequence[Frame], tree: DatasetFolder
+) -> tuple[dict[str, Replacement], list[str]]:
     """Return the finished images of a variant's rows by their place in the dataset.
 
     Returns:
         The images, and notes on those without a place of their own.
     """
     recorded_paths = {frame.index: frame.image_paths for frame in frames}
-    images: dict[str, Weathered] = {}
+    images: dict[str, Replacement] = {}
     unplaced_images = []
     shared_places = []
     notes = []
@@ -453,7 +453,7 @@ def weathered_images(
             continue
         if place in images:
             shared_places.append(place)
-        images[place] = Weathered.image(out_dir, row)
+        images[place] = Replacement.image(out_dir, row)
     if unplaced_images:
         notes.append(
             f"{len(unplaced_images)} rendered images, such as {unplaced_images[0]}, have no "
@@ -468,8 +468,11 @@ def weathered_images(
 
 
 def weathered_sweeps(
-    out_dir: Path, rows: Sequence[Mapping[str, Any]], labels: LabelSource | None, tree: SourceTree
-) -> tuple[dict[str, Weathered], list[str]]:
+    out_dir: Path,
+    rows: Sequence[Mapping[str, Any]],
+    labels: LabelSource | None,
+    tree: DatasetFolder,
+) -> tuple[dict[str, Replacement], list[str]]:
     """Return the weathered sweeps of a variant's rows by their place in the dataset.
 
     A dataset may have several files for one sweep. Lost returns are left out.
@@ -478,7 +481,7 @@ def weathered_sweeps(
         The sweeps, and notes on those without a place.
     """
     row_of_frame = {row["frame"]: row for row in rows if row["status"] == OK and is_weathered(row)}
-    sweeps: dict[str, Weathered] = {}
+    sweeps: dict[str, Replacement] = {}
     unplaced_frames = []
     notes = []
     for frame, row in sorted(row_of_frame.items()):
@@ -490,7 +493,7 @@ def weathered_sweeps(
             continue
         for place, file in file_of_place.items():
             content = partial(_encode_sweep, lidar_labels, frame, file)
-            sweeps[str(place)] = Weathered.sweep(out_dir, row, content)
+            sweeps[str(place)] = Replacement.sweep(out_dir, row, content)
     if unplaced_frames:
         notes.append(
             f"{len(unplaced_frames)} weathered LiDAR sweeps, the first of frame "
@@ -503,7 +506,7 @@ def weathered_sweeps(
 
 def _encode_sweep(labels: StoresLidar, frame: int, file: Path, sweep: Path) -> bytes:
     """Return the bytes of a recorded file's replacement, without lost returns."""
-    return labels.lidar_content(frame, file, drop_lost(read_lidar(sweep)))
+    return labels.lidar_content(frame, file, drop_lost_returns(read_lidar(sweep)))
 
 
 def _encode_fitted_image(
@@ -519,7 +522,7 @@ def _encode_fitted_image(
     try:
         rgb = decode_image(image.read_bytes())
     except OSError as error:
-        raise output_error(image, error) from error
+        raise make_output_error(image, error) from error
     except ValueError as error:
         raise OutputError(f"{image} is damaged ({error}); delete it and render again") from error
     size = recorded.size
@@ -585,7 +588,7 @@ _BYTE_KINDS: tuple[str, ...] = (LINKED, COPIED, "new_images")
 
 
 @dataclass
-class Mirrored:
+class MirrorResult:
     """Result of building a copy."""
 
     folder: Path
@@ -610,7 +613,7 @@ class Mirrored:
     """Files of the copy that the source does not have."""
 
 
-def check_disjoint(tree: SourceTree, out_dir: Path) -> None:
+def check_disjoint(tree: DatasetFolder, out_dir: Path) -> None:
     """Raise OutputError where the output folder lies in the dataset: copies would hold copies."""
     if tree.relative(out_dir) is not None:
         raise OutputError(
@@ -620,15 +623,15 @@ def check_disjoint(tree: SourceTree, out_dir: Path) -> None:
 
 
 def mirror_dataset(
-    tree: SourceTree,
+    tree: DatasetFolder,
     folder: Path,
-    weathered: Mapping[str, Weathered],
+    weathered: Mapping[str, Replacement],
     scenes: Mapping[str, Any],
     *,
-    extent: Survey,
+    extent: FileCounts,
     links: Links = "hard",
     progress: bool = True,
-) -> Mirrored:
+) -> MirrorResult:
     """Build the copy of a dataset in a folder, or bring it up to date.
 
     The caller holds the lock of the output folder.
@@ -657,7 +660,7 @@ def mirror_dataset(
         files=files_by_kind,
         bytes=bytes_by_kind,
     )
-    mirroring = _Mirroring(tree, folder, weathered, Mirrored(folder / tree.root.name, record))
+    mirroring = _Mirroring(tree, folder, weathered, MirrorResult(folder / tree.root.name, record))
     with tqdm(total=extent.files, unit="file", desc="copy", disable=not progress) as bar:
         mirroring.fill_copy(bar)
     mirroring.finish()
@@ -668,13 +671,13 @@ def mirror_dataset(
 class _Mirroring:
     """State of one call of mirror_dataset."""
 
-    tree: SourceTree
+    tree: DatasetFolder
     """The dataset."""
     folder: Path
     """Folder of the copies."""
-    weathered: Mapping[str, Weathered]
+    weathered: Mapping[str, Replacement]
     """Files that shall stand in the copy, by place in the dataset."""
-    result: Mirrored
+    result: MirrorResult
     """Result so far."""
     changed_folders: set[str] = field(default_factory=set)
     """Folders with new names, to be made durable."""
@@ -694,7 +697,7 @@ class _Mirroring:
         self._check_untouched()
         for folder in (self.folder.parent, self.folder):
             self._make_folder(str(folder))
-        with refusals_of(self.record):
+        with raise_output_error(self.record):
             if self.record.exists():
                 os.replace(self.record, self.unfinished_record)
                 flush_folder(self.folder)
@@ -722,7 +725,7 @@ class _Mirroring:
         self.files["replaced_images"] = len(record.replaced)
         self.files["replaced_lidar_files"] = len(record.replaced_sweeps)
         text = (json.dumps(record.model_dump(exclude_none=True), indent=1) + "\n").encode()
-        with refusals_of(self.folder):
+        with raise_output_error(self.folder):
             for folder in sorted(self.changed_folders):
                 flush_folder(Path(folder))
             if self.unfinished_record.is_file() and self.unfinished_record.read_bytes() == text:
@@ -730,7 +733,7 @@ class _Mirroring:
         self.placed.finish()
         if not self.record.exists():
             write_atomic(self.record, text)
-        with refusals_of(self.unfinished_record):
+        with raise_output_error(self.unfinished_record):
             self.unfinished_record.unlink(missing_ok=True)
 
     def _check_untouched(self) -> None:
@@ -806,7 +809,7 @@ class _Mirroring:
             if put_link(text, self._target(name)):
                 self._note_change(path)
 
-    def _replace(self, file: SourceFile, replacement: Weathered) -> bool:
+    def _replace(self, file: SourceFile, replacement: Replacement) -> bool:
         """Put a weathered file in place; return False where the recorded file has to stay.
 
         It stays where an image has a format that this package does not write, or where only another
@@ -880,7 +883,7 @@ class _Mirroring:
         known_file = self.placed.find(name, os.lstat(target))
         if known_file is not None and known_file.source_ctime_ns == placed_file.source_ctime_ns:
             return True
-        with refusals_of(Path(target)):
+        with raise_output_error(Path(target)):
             is_same = digest_of(original) == digest_of(target)
         if not is_same and known_file is None:
             raise self._edited_files_error([name])

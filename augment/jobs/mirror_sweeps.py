@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 from augment.cameras import Frame
-from augment.effects import Sharing, share_effects
+from augment.effects import JobContext, precompute_effects
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
@@ -30,7 +30,7 @@ from augment.scene import Scene
 from recipes.schema import Recipe
 
 
-class SweepsBetween(NamedTuple):
+class SweepResult(NamedTuple):
     """Sweeps that were weathered without an image."""
 
     rows: list[dict[str, Any]]
@@ -39,7 +39,7 @@ class SweepsBetween(NamedTuple):
     """Reasons why sweeps stay clear, by frame number."""
 
 
-def frames_of_span(
+def find_span_frames(
     frames: Sequence[Frame], rendered: Collection[int], cameras: Collection[str]
 ) -> list[int]:
     """Return the numbers of the rendered frames and of the frames between them.
@@ -74,7 +74,7 @@ def weather_sweeps_between(
     out_dir: Path,
     *,
     progress: bool = True,
-) -> SweepsBetween:
+) -> SweepResult:
     """Write the missing weathered sweeps of the span that belong to no finished image.
 
     Args:
@@ -83,11 +83,11 @@ def weather_sweeps_between(
         rows: The variant's rows of the manifest.
         out_dir: Output folder, whose lock the caller holds.
     """
-    sweeps_between = SweepsBetween([], {})
+    sweeps_between = SweepResult([], {})
     if recipe.lidar != "weather" or not isinstance(scene.labels, StoresLidar):
         return sweeps_between
     cameras = {row["camera"] for row in rows}
-    span_frames = frames_of_span(scene.frames, {row["frame"] for row in rows}, cameras)
+    span_frames = find_span_frames(scene.frames, {row["frame"] for row in rows}, cameras)
     finished_frames = {row["frame"] for row in rows if row["status"] == OK}
     path_of_frame = {
         number: str(item_paths(scene.name, recipe, "", number)["lidar"])
@@ -100,7 +100,9 @@ def weather_sweeps_between(
     if missing_frames:
         folder = out_dir / STATE_FOLDER
         backend = rows[0]["backend"]
-        share_effects(Sharing(scene, [recipe], folder=folder, backend=backend, progress=progress))
+        precompute_effects(
+            JobContext(scene, [recipe], folder=folder, backend=backend, progress=progress)
+        )
     for number in tqdm(
         missing_frames,
         desc="LiDAR between images",

@@ -16,8 +16,8 @@ from typing import BinaryIO, NamedTuple
 
 from pydantic import TypeAdapter
 
-from augment.jobs.atomic import refusals_of, write_atomic
-from augment.jobs.layout import reading_back
+from augment.jobs.atomic import raise_output_error, write_atomic
+from augment.jobs.layout import parse_errors_as_output_errors
 from recipes.files import open_file
 
 # Size of a file whose contents are encoded after its line is written.
@@ -65,10 +65,10 @@ class PlacedFiles:
         self._has_new_lines = False
         if not self.exists:
             return
-        with refusals_of(path), open_file(path) as file:
+        with raise_output_error(path), open_file(path) as file:
             self._file_text = file.read()
         advice = "Delete it and run again; edits in the copy are not noticed then"
-        with reading_back(str(path), advice):
+        with parse_errors_as_output_errors(str(path), advice):
             # A line without its end was being written when the power went.
             for line in self._file_text[: self._file_text.rfind(b"\n") + 1].splitlines():
                 name, placed_file = _LINE.validate_json(line)
@@ -94,7 +94,7 @@ class PlacedFiles:
 
     def begin(self) -> None:
         """Open the list for further lines."""
-        with refusals_of(self._path):
+        with raise_output_error(self._path):
             if self._file_text and not self._file_text.endswith(b"\n"):
                 self._file_text = self._file_text[: self._file_text.rfind(b"\n") + 1]
                 write_atomic(self._path, self._file_text)
@@ -105,7 +105,7 @@ class PlacedFiles:
         """Add the line of a file that is about to be put in place."""
         assert self._file is not None, "begin() comes before"
         self._new_lines[name] = placed_file
-        with refusals_of(self._path):
+        with raise_output_error(self._path):
             self._file.write(_file_text({name: placed_file}))
         self._has_new_lines = True
 

@@ -39,7 +39,7 @@ from augment.jobs.processes import (
 from augment.jobs.worker import Outcome, TaskFailed
 from augment.render.buffers import CUDA
 
-OnOutcome = Callable[[Outcome], None]
+OutcomeCallback = Callable[[Outcome], None]
 # Called with a slot and the outcome of an image that its worker has finished.
 Tick = Callable[[int, Outcome], None]
 
@@ -67,7 +67,7 @@ class WorkerSetup(Protocol):
         """Name of the output, for messages."""
         ...
 
-    def worker(self, on_outcome: OnOutcome) -> Worker: ...
+    def worker(self, on_outcome: OutcomeCallback) -> Worker: ...
 
 
 @dataclass(frozen=True)

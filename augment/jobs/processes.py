@@ -36,10 +36,10 @@ from augment.jobs.atomic import (
     MAX_MARK_BYTES,
     lock_holder,
     make_folder,
+    make_output_error,
     open_lock,
-    output_error,
     path_below,
-    temporary_beside,
+    temporary_path,
     wait_for_lock,
 )
 from augment.jobs.layout import STATE_FOLDER
@@ -162,7 +162,7 @@ class ChildProcess:
         self._process = context.Process(
             target=target, args=(child_connection, *arguments), daemon=daemon
         )
-        with thread_limits(threads), interrupts_blocked():
+        with thread_limits(threads), block_interrupts():
             self._process.start()
         child_connection.close()
 
@@ -277,7 +277,7 @@ def thread_limits(threads: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def quick_turns(is_enabled: bool) -> Iterator[None]:
+def shorten_switch_interval(is_enabled: bool) -> Iterator[None]:
     """Context manager that shortens a thread's wait for Python from five milliseconds to 0.5.
 
     A thread that launches kernels gives its turn away with each kernel, and the GPU would wait for
@@ -296,7 +296,7 @@ def quick_turns(is_enabled: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def interrupts_blocked() -> Iterator[None]:
+def block_interrupts() -> Iterator[None]:
     """Context manager in which started children never see Ctrl-C; the parent stops them instead."""
     resource_tracker.ensure_running()  # starting it later, with the child, would lift the block
     old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -487,7 +487,7 @@ def share_scene(scene: Scene, frames: Sequence[Frame], folder: Path) -> SharedSc
         ValueError: A part of the scene, such as its label source, cannot be sent to another
             process.
     """
-    path = temporary_beside(folder / "scene")
+    path = temporary_path(folder / "scene")
     try:
         make_folder(folder)
         with path.open("xb") as file:
@@ -503,7 +503,7 @@ def share_scene(scene: Scene, frames: Sequence[Frame], folder: Path) -> SharedSc
             file.write(b"\0" * ALIGNMENT)  # an empty file cannot be mapped
     except OSError as error:
         path.unlink(missing_ok=True)
-        raise output_error(path, error) from error
+        raise make_output_error(path, error) from error
     except BaseException:
         path.unlink(missing_ok=True)
         raise

@@ -23,11 +23,11 @@ import numpy as np
 
 import augment
 from augment.cameras import Camera, Frame
-from augment.effects import Sharing, share_effects
+from augment.effects import JobContext, precompute_effects
 from augment.errors import SceneError
-from augment.jobs.claims import hold
+from augment.jobs.claims import hold_claim
 from augment.jobs.files import trajectory_id
-from augment.jobs.layout import STATE_FOLDER, reading_back
+from augment.jobs.layout import STATE_FOLDER, parse_errors_as_output_errors
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.worker import Renderer, default_renderer
 from augment.memo import memo_of
@@ -83,10 +83,10 @@ def render_trial(
     if depth is not None and depth.shape != (height, width):
         # Nearest, because a mean of near and far would be a surface that does not exist.
         depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    return Trial(upsampled(view.rgb, width, height), depth, seconds)
+    return Trial(resize_picture(view.rgb, width, height), depth, seconds)
 
 
-def upsampled(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+def resize_picture(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     """Return the picture [H, W, 3] at another size, in its own type, as a viewer would show it.
 
     It is bilinear where the picture grows, and a mean over areas where it shrinks; otherwise the
@@ -184,7 +184,7 @@ class Cost(NamedTuple):
     """Mean FLIP against reference."""
 
 
-def useful(costs: Sequence[Cost]) -> list[Cost]:
+def select_useful_values(costs: Sequence[Cost]) -> list[Cost]:
     """Return the values of a knob that are worth a step, from reference on.
 
     Args:
@@ -209,7 +209,7 @@ def steps_back(costs: Mapping[str, Sequence[Cost]]) -> tuple[Ladders, list[Step]
     The ladders go from reference to the fastest of the useful values. The steps go back to slower
     values, and those that undo the most error come first, because the worst error shows.
     """
-    ladders = {path: useful(knob_costs) for path, knob_costs in costs.items()}
+    ladders = {path: select_useful_values(knob_costs) for path, knob_costs in costs.items()}
     saved_error = {
         (path, slow.value): fast.flip - slow.flip
         for path, ladder in ladders.items()
@@ -228,7 +228,7 @@ _COLUMN_WIDTH_PX = 48
 
 
 @dataclass(eq=False)
-class Bench:
+class SettingsBench:
     """Measures settings of a recipe's free knobs on a scene, against pictures at `reference`.
 
     Raises:
@@ -302,13 +302,13 @@ class Bench:
 
     def _trial(self, view: View, settings: Settings) -> Trial:
         """Render one view under the settings."""
-        recipe = resolved_recipe(self.recipe, settings)
+        recipe = apply_settings(self.recipe, settings)
         recipe = replaced(recipe, "camera.noise", 0.0)  # noise of another image size differs
         if self.cameras is not None and self.renderer is None:
             # Otherwise pictures would compute shared data for the scene's own cameras.
-            share_effects(Sharing(self.scene, [recipe], self.cameras, backend=self.backend))
+            precompute_effects(JobContext(self.scene, [recipe], self.cameras, backend=self.backend))
         self.on_picture()
-        reference = resolved_recipe(self.recipe, self.reference)
+        reference = apply_settings(self.recipe, self.reference)
         reference_camera = view.camera.scaled(reference.render.scale)
         arguments = (self.scene, view.camera, recipe, self.backend)
         return render_trial(
@@ -350,7 +350,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Resolved:
+class SettingsChoice:
     """Result of choosing settings.
 
     The recipe, settings, is_met, flip and views are the same for the same scene, recipe and backend
@@ -386,7 +386,7 @@ def resolve_quality(
     backend: str = "auto",
     renderer: Renderer | None = None,
     progress: bool = False,
-) -> Resolved:
+) -> SettingsChoice:
     """Return the recipe with the settings that its max_flip or budget_ms chooses in this scene.
 
     With max_flip the choice is the same every time; with budget_ms it depends on this machine. A
@@ -402,7 +402,7 @@ def resolve_quality(
     """
     quality = recipe.quality
     if not quality.is_open:
-        return Resolved(recipe)
+        return SettingsChoice(recipe)
     start_s = perf_counter()
     views = calibration_views(scene.frames if camera_path is None else camera_path)
     cameras = None
@@ -419,7 +419,7 @@ def resolve_quality(
             reference = first_settings(values_of_knob)
             arguments = (recipe, trial_scene, views, reference, backend, cameras, renderer)
             try:
-                bench = Bench(*arguments, bar.update)
+                bench = SettingsBench(*arguments, bar.update)
                 break
             except SceneError:
                 if len(values_of_knob.get(_SNOW_CELL_KNOB, ())) < 2:
@@ -436,9 +436,9 @@ def resolve_quality(
             ms = bench.ms(settings)
             reference_ms = bench.ms(reference)
         worst_flip = bench.flip(settings)
-    chosen_recipe = resolved_recipe(recipe, settings)
+    chosen_recipe = apply_settings(recipe, settings)
     if cameras is None and renderer is None:  # keep the images' shared data
-        share_effects(Sharing(trial_scene, [chosen_recipe], backend=backend))
+        precompute_effects(JobContext(trial_scene, [chosen_recipe], backend=backend))
         memo_of(scene).update(memo_of(trial_scene).shared())
     is_met = ms is None or ms <= (quality.budget_ms or 0)
     if not is_met:
@@ -452,12 +452,12 @@ def resolve_quality(
         )
     view_names = tuple((v.frame, v.name) for v in views)
     seconds = perf_counter() - start_s
-    return Resolved(
+    return SettingsChoice(
         chosen_recipe, settings, is_met, worst_flip, view_names, ms, reference_ms, seconds
     )
 
 
-def _within_budget(bench: Bench, values_of_knob: Ladders, budget_ms: float) -> Settings:
+def _within_budget(bench: SettingsBench, values_of_knob: Ladders, budget_ms: float) -> Settings:
     """Return settings that keep the budget; the fastest settings where none keep it."""
 
     def keeps(settings: Settings) -> bool:
@@ -476,7 +476,7 @@ def _within_budget(bench: Bench, values_of_knob: Ladders, budget_ms: float) -> S
     return search(ladders, keeps, steps) if keeps(fastest) else fastest
 
 
-def resolved_recipe(recipe: Recipe, settings: Settings) -> Recipe:
+def apply_settings(recipe: Recipe, settings: Settings) -> Recipe:
     """Return the recipe with chosen settings.
 
     Raises:
@@ -504,7 +504,7 @@ def recipes_to_try(recipe: Recipe) -> list[Recipe]:
     single_changes = [
         {path: value} for path, values in values_of_knob.items() for value in values[:-1]
     ]
-    return [resolved_recipe(recipe, reference | changes) for changes in [{}, *single_changes]]
+    return [apply_settings(recipe, reference | changes) for changes in [{}, *single_changes]]
 
 
 def _allowed_values(recipe: Recipe) -> dict[str, tuple[Value, ...]]:
@@ -579,7 +579,7 @@ class Question:
         return f"{FOLDER}/{self.digest}.json"
 
 
-def resolve_quality_for(
+def choose_settings(
     store: Store,
     recipe: Recipe,
     scene: Scene,
@@ -605,7 +605,7 @@ def resolve_quality_for(
         return recipe
     question = Question(recipe, scene.name, scene.source, trajectory_id(camera_path), backend)
 
-    def choose() -> Resolved:
+    def choose() -> SettingsChoice:
         options = {"backend": backend, "renderer": renderer, "progress": progress}
         return resolve_quality(recipe, scene, camera_path=camera_path, **options)
 
@@ -615,7 +615,7 @@ def resolve_quality_for(
         return choose().recipe
     claim_name = f"quality.{question.digest}"
     activity = "is choosing the same settings"
-    with hold(store, claim_name, MAX_CHOOSING_S, activity) as claim:
+    with hold_claim(store, claim_name, MAX_CHOOSING_S, activity) as claim:
         if not anew and (stored_recipe := recorded(store, question)):
             return stored_recipe
         result = choose()
@@ -631,7 +631,7 @@ def recorded(store: Store, question: Question) -> Recipe | None:
     except StoredFileMissing:
         return None
     subject = f"the settings chosen for recipe {question.recipe.name} in scene {question.scene}"
-    with reading_back(
+    with parse_errors_as_output_errors(
         f"{store.uri}/{question.path}, {subject},",
         "Delete it, and they are chosen anew; images of other settings then have to be overwritten",
     ):
@@ -645,10 +645,10 @@ def recorded(store: Store, question: Question) -> Recipe | None:
             knob = KNOBS.get(path)
             if knob is None or not any(value == v and type(value) is type(v) for v in knob.values):
                 raise ValueError(f"{path} = {value!r} is none of the values to choose from")
-        return resolved_recipe(question.recipe, settings)
+        return apply_settings(question.recipe, settings)
 
 
-def _to_json(question: Question, result: Resolved) -> bytes:
+def _to_json(question: Question, result: SettingsChoice) -> bytes:
     """Return the file of a choice."""
     values = vars(result)
     document = {

@@ -24,12 +24,12 @@ from typing import Any
 import augment
 from augment.base_photo import check_photos
 from augment.cameras import Frame
-from augment.effects import Sharing, share_effects
+from augment.effects import JobContext, precompute_effects
 from augment.errors import ClimateGSError, OutputError
 from augment.jobs.atomic import path_below, read_file, write_atomic
 from augment.jobs.files import SceneIndex, select_frames, trajectory_id, uses_boxes
 from augment.jobs.job_state import BoxCache, JobState
-from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, variant_name
+from augment.jobs.layout import MANIFEST_FILE, STATE_FOLDER, folder_name, variant_name
 from augment.jobs.manifest import FAILED, OK, Identity
 from augment.jobs.pools import ProcessPool, SerialPool, Work, WorkerPool, run_tasks
 from augment.jobs.processes import (
@@ -39,15 +39,15 @@ from augment.jobs.processes import (
     choose_backend,
     share_scene,
 )
-from augment.jobs.quality import resolve_quality_for
+from augment.jobs.quality import choose_settings
 from augment.jobs.store import open_store
 from augment.jobs.worker import (
     WORKERS,
     Chunk,
     Outcome,
     Renderer,
+    RenderSetup,
     SceneSetup,
-    Setup,
     TaskFailed,
     WorkTimes,
 )
@@ -245,7 +245,7 @@ class JobResult:
     """One line for each failure."""
     timings: dict[str, float] = field(default_factory=dict)
     """Seconds by kind of work, summed over threads and workers, or of the job itself (open, settle,
-    prepare, labels, share, finish). `worker.shares_of` says what bound the job.
+    prepare, labels, share, finish). `worker.compute_time_shares` says what bound the job.
     """
 
 
@@ -288,7 +288,7 @@ def run_job(
         written=job_run.counts[OK],
         skipped=job_run.skipped,
         failed=job_run.counts[FAILED],
-        manifest=job_run.out_dir / MANIFEST,
+        manifest=job_run.out_dir / MANIFEST_FILE,
         seconds=seconds,
         failures=tuple(sorted(job_run.failures)),
         timings=job_run.times.so_far(),
@@ -442,7 +442,7 @@ class _Run:
             self._begin(chunks)
             chunks = self._fail_unlabelled(chunks)
         assert self.scene is not None
-        setup = Setup(
+        setup = RenderSetup(
             out_dir=str(self.out_dir),
             recipes=self.recipes,
             backend=self.backend,
@@ -469,7 +469,9 @@ class _Run:
             if shared_scene is not None:
                 shared_scene.remove()
 
-    def _pool(self, setup: Setup, shared_scene: SharedScene | None, lock: OutputLock) -> WorkerPool:
+    def _pool(
+        self, setup: RenderSetup, shared_scene: SharedScene | None, lock: OutputLock
+    ) -> WorkerPool:
         """Return a pool of this process, or of several processes that open the shared scene."""
         workers = self.job.workers
         if shared_scene is None:
@@ -485,7 +487,7 @@ class _Run:
             return recipe
         assert self.scene is not None
         with self.times.spent("settle"):
-            return resolve_quality_for(
+            return choose_settings(
                 open_store(self.out_dir),
                 recipe,
                 self.scene,
@@ -522,7 +524,7 @@ class _Run:
         with self.times.spent("prepare"):
             folder = self.job.shared_dir or self.out_dir / STATE_FOLDER
             arguments = (self.scene, recipes, cameras, folder, self.backend, self.progress)
-            share_effects(Sharing(*arguments))
+            precompute_effects(JobContext(*arguments))
 
     def _begin(self, chunks: Sequence[Chunk]) -> None:
         """Note the variants that will be written, before their first file."""

@@ -19,8 +19,8 @@ import pyarrow.compute
 from augment.errors import OutputError
 from augment.jobs.block_worker import VARIANTS, clear_staged
 from augment.jobs.blocks import Block
-from augment.jobs.claims import hold
-from augment.jobs.layout import MANIFEST, folder_name
+from augment.jobs.claims import hold_claim
+from augment.jobs.layout import MANIFEST_FILE, folder_name
 from augment.jobs.manifest import list_parts, read_manifest, write_manifest
 from augment.jobs.store import Store
 
@@ -65,16 +65,16 @@ class SceneChange:
         """Delete the output's records of the old images, whose files have been deleted.
 
         Args:
-            scratch: Folder of `block_worker.WorkSetup`.
+            scratch: Folder of `block_worker.JobWorkerSetup`.
         """
         folder = folder_name(self.scene)
         store.delete([part.path for part in list_parts(store, folder).values()])
         store.delete(store.list(f"{VARIANTS}/{folder}"))
         store.delete([] if self.record_path is None else [self.record_path])
         clear_staged(store, scratch, folder)
-        if store.local_dir is None or not store.exists(MANIFEST):
+        if store.local_dir is None or not store.exists(MANIFEST_FILE):
             return
-        with hold(store, "manifest"):
+        with hold_claim(store, "manifest"):
             table = read_manifest(store.local_dir)
             write_manifest(store.local_dir, table.filter(pc.not_equal(table["scene"], self.scene)))
 

@@ -31,8 +31,8 @@ from augment.jobs.atomic import (
     link_file,
     make_folder,
     path_below,
+    raise_output_error,
     read_file,
-    refusals_of,
     write_atomic,
 )
 from augment.jobs.layout import relative_parts
@@ -191,7 +191,7 @@ class LocalStore:
         for file, source in source_of_target.items():
             _retry_write(lambda file=file, source=source: _link_or_copy(source, file))
         for folder in sorted({file.parent for file in source_of_target}):
-            with refusals_of(folder):
+            with raise_output_error(folder):
                 flush_folder(folder)
 
     def list(self, folder: str) -> dict[str, StoredFile]:
@@ -255,7 +255,7 @@ def _retry_write(write: Callable[[], None]) -> None:
 
 def _link_or_copy(original: Path, file: Path) -> None:
     """Link or copy a file into the store."""
-    with refusals_of(file):
+    with raise_output_error(file):
         make_folder(file.parent)
         if not link_file(str(original), str(file)):
             copy_file(str(original), str(file))
@@ -364,7 +364,7 @@ def _parse(uri: str) -> _Place:
 
 
 @dataclass(frozen=True)
-class Patience:
+class RetrySettings:
     """How passing failures (timeouts, lost connections, 500, 503) are waited out.
 
     Each retry comes after a longer random wait; all of them end after three minutes at most.
@@ -399,13 +399,13 @@ class RemoteStore:
 
     local_dir = None
 
-    def __init__(self, uri: str, patience: Patience = Patience()) -> None:
+    def __init__(self, uri: str, patience: RetrySettings = RetrySettings()) -> None:
         self._place = _parse(uri)
         self.uri = self._place.public
         self.patience = patience
         self._uri = uri
         # Connections by process: a parent's are kept, because closing them in a child is not safe.
-        self._connections: dict[tuple[int, Patience], Any] = {}
+        self._connections: dict[tuple[int, RetrySettings], Any] = {}
 
     def __repr__(self) -> str:
         return f"RemoteStore({self.uri!r})"
@@ -526,7 +526,7 @@ class RemoteStore:
         operation: str,
         path: str,
         call: Callable[[Any, Any], _T],
-        patience: Patience | None = None,
+        patience: RetrySettings | None = None,
     ) -> _T:
         """Return the result of a call of obstore, with this process's connection."""
         obs = _load_obstore()
@@ -562,7 +562,7 @@ def _mark(facts: Mapping[str, Any]) -> dict[str, str]:
     return {name: facts[name] for name in ("e_tag", "version") if facts[name] is not None}
 
 
-def _open(obs: Any, place: _Place, patience: Patience) -> Any:
+def _open(obs: Any, place: _Place, patience: RetrySettings) -> Any:
     """Return obstore's store of the place."""
     backoff = {"init_backoff": timedelta(seconds=patience.first_wait_s)}
     retry = {"max_retries": patience.retries, "backoff": backoff}
@@ -621,7 +621,7 @@ def _load_obstore() -> Any:
             _obstore_folder = str(Path(importlib.import_module("obstore").__file__ or "").parent)
         elif _loaded_by != os.getpid():
             temporary = Path(tempfile.gettempdir())
-            with refusals_of(temporary), tempfile.TemporaryDirectory() as folder:
+            with raise_output_error(temporary), tempfile.TemporaryDirectory() as folder:
                 shutil.copytree(_obstore_folder, f"{folder}/obstore")
                 for name in [name for name in sys.modules if name.split(".")[0] == "obstore"]:
                     del sys.modules[name]

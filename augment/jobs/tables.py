@@ -99,7 +99,7 @@ def checked_int(value: object) -> int:
     return value
 
 
-def texts_of(data: pa.ChunkedArray) -> list[str]:
+def column_texts(data: pa.ChunkedArray) -> list[str]:
     """Return the texts of a column without gaps.
 
     Raises:
@@ -168,7 +168,7 @@ def read_table(
         columns: If given, only those of these columns that the file has.
         without: Columns to leave out.
     """
-    with opened_parquet(source, source_name) as (content, file):
+    with open_parquet(source, source_name) as (content, file):
         name_counts = Counter(file.schema_arrow.names)
         if repeated_names := [name for name, count in name_counts.items() if count > 1]:
             raise OutputError(f"{source_name} has several columns {repeated_names[0]!r}; leave one")
@@ -202,14 +202,14 @@ def read_parquet(path: Path) -> tuple[pa.Table, dict[str, Any]]:
 
 def read_note(path: Path) -> dict[str, Any]:
     """Return the metadata without reading a column."""
-    with opened_parquet(path, str(path)) as (_, file):
+    with open_parquet(path, str(path)) as (_, file):
         schema = file.schema_arrow
     return _note(schema, path)
 
 
 def is_ours(path: Path) -> bool:
     """Return True if a Parquet file has metadata as `parquet_bytes` writes them."""
-    with opened_parquet(path, str(path)) as (_, file):
+    with open_parquet(path, str(path)) as (_, file):
         return METADATA_KEY in (file.schema_arrow.metadata or {})
 
 
@@ -227,7 +227,7 @@ def _note(schema: pa.Schema, path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def as_described(path: Path) -> Iterator[None]:
+def metadata_errors_as_output_errors(path: Path) -> Iterator[None]:
     """Context manager for reading columns by their metadata; errors become an OutputError."""
     try:
         yield
@@ -239,7 +239,7 @@ def as_described(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def opened_parquet(
+def open_parquet(
     source: Path | bytes, source_name: str
 ) -> Iterator[tuple[pa.NativeFile, pq.ParquetFile]]:
     """Context manager of a file's content and its reader; errors of Arrow become an OutputError.
@@ -391,7 +391,7 @@ def lidar_bytes(sweep: LidarSweep, *, note: str | None = None) -> bytes:
 def read_lidar(path: Path) -> LidarSweep:
     """Return the sweep that was written, including its dtypes."""
     table, note = _read_kind(Path(path), "lidar")
-    with as_described(path):
+    with metadata_errors_as_output_errors(path):
         kinds = note["columns"]
         return LidarSweep({name: unpack_column(table[name], *kinds[name]) for name in kinds})
 
@@ -452,9 +452,9 @@ def boxes_bytes(frames: Mapping[int, FrameBoxes]) -> bytes:
 def read_boxes(path: Path) -> dict[int, FrameBoxes]:
     """Return the boxes of every frame in the file, including the dtypes of the attributes."""
     table, note = _read_kind(Path(path), "boxes")
-    with as_described(path):
-        track_ids = texts_of(table["track_id"])
-        labels = texts_of(table["label"])
+    with metadata_errors_as_output_errors(path):
+        track_ids = column_texts(table["track_id"])
+        labels = column_texts(table["label"])
         vectors = {
             field: np.stack([table[name].to_numpy() for name in names], axis=1)
             for field, names in _VECTORS.items()

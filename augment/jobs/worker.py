@@ -1,6 +1,6 @@
 """Rendering of an opened scene's images, one frame of one variant at a time, and their writing.
 
-In: a scene, its frames and a `Setup`. Out: files in the output folder, and an `Outcome` for each
+In: a scene, its frames and a `RenderSetup`. Out: files in the output folder, and an `Outcome` for each
 image. `render_job` calls it. The same code runs in the job's own process and in its workers.
 """
 
@@ -40,8 +40,8 @@ from augment.jobs.processes import (
     InheritedLock,
     available_cores,
     gpu_is_lost,
-    quick_turns,
     renders_on_gpu,
+    shorten_switch_interval,
 )
 from augment.jobs.tables import lidar_bytes, read_lidar_note
 from augment.labels import Boxes, LidarSweep
@@ -159,7 +159,7 @@ class Shares:
         )
 
 
-def shares_of(seconds: Mapping[str, float], held_up: int = 1) -> Shares | None:
+def compute_time_shares(seconds: Mapping[str, float], held_up: int = 1) -> Shares | None:
     """Return the shares of a job's seconds by kind of work; None where nothing was rendered.
 
     Args:
@@ -223,7 +223,7 @@ class Pending(Protocol):
 
 
 @dataclass(frozen=True)
-class Setup:
+class RenderSetup:
     """Everything that rendering needs besides scene and frames; small and picklable."""
 
     out_dir: str
@@ -361,7 +361,7 @@ class FrameRunner:
         self,
         scene: Scene,
         frames: Sequence[Frame],
-        setup: Setup,
+        setup: RenderSetup,
         renderer: Renderer | None,
         deliver: Callable[[Outcome], None],
         pump: WritePump,
@@ -604,7 +604,7 @@ def _lidar_entries(recipe: Recipe, fault: str | None) -> PassedLidar:
 class SceneSetup:
     """Everything that the workers of one scene share."""
 
-    setup: Setup
+    setup: RenderSetup
     """Recipes, output and backend."""
     scene: Callable[[], tuple[Scene, Sequence[Frame]]]
     """Opens the scene, with its frames, in the worker's process."""
@@ -663,7 +663,7 @@ class SceneWorker:
         runner = FrameRunner(
             *self._opened, scene_setup.setup, scene_setup.renderer, self._on_outcome, pump
         )
-        with quick_turns(on_gpu):
+        with shorten_switch_interval(on_gpu):
             try:
                 for chunk in task:
                     runner.run(chunk)

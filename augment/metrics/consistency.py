@@ -10,7 +10,7 @@ depths are mixtures. B's colour there is bilinear. The error is the root of the 
 differences of display-encoded colours over all pixels that count and all three channels.
 
 The world has to stand still between the two: render both at one time stamp, or say where A's points
-are when B is taken (`carry` computes it for the points of actors). The sky is not part of it.
+are when B is taken (`move_surfaces` computes it for the points of actors). The sky is not part of it.
 Warping is no exact inverse of rendering (bilinear colours, depths of blended surfaces, colours that
 truly depend on the direction), so the error of a perfect scene is small and not 0.
 
@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from augment.boxes import CORNERS, PlacedBoxes, shown_pixels
+from augment.boxes import CORNERS, WorldBoxes, shown_pixels
 from augment.cameras import Camera
 from augment.geometry import invert_rigid, quat_from_rotmat, rigid
 from augment.jobs.tables import FrameBoxes
@@ -304,7 +304,7 @@ class ActorPaths:
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class MovedSurfaces:
     """Positions of A's surfaces when B is taken."""
 
     points_m: np.ndarray
@@ -315,9 +315,9 @@ class Carried:
     """Pixels of B that are left out, bool [H, W]."""
 
 
-def carry(
+def move_surfaces(
     paths: ActorPaths, a: DepthView, b: DepthView, is_actor: np.ndarray | None = None
-) -> Carried:
+) -> MovedSurfaces:
     """Return the positions of A's surfaces when B is taken.
 
     Cameras are in the world of the boxes.
@@ -354,7 +354,7 @@ def carry(
     points[unclear_a | (claims > 1)] = np.nan
     if is_actor is not None:
         points[is_actor & ~_inside(list(at_a.values()), a)] = np.nan
-    return Carried(points, claims == 1, unclear_b)
+    return MovedSurfaces(points, claims == 1, unclear_b)
 
 
 def _moves(a: PosedBox | None, b: PosedBox | None) -> bool:
@@ -395,7 +395,7 @@ def _shown(
     if not boxes:
         return iter(())
     poses = torch.from_numpy(np.stack([box.world_from_box for box in boxes]))
-    placed_boxes = PlacedBoxes.of(
+    placed_boxes = WorldBoxes.of(
         Boxes(
             ("",) * len(boxes),
             ("",) * len(boxes),
@@ -414,7 +414,7 @@ def _shown(
 
 def _finite_boxes(boxes: Boxes) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield track, size [3] and world_from_box [4, 4] of every box whose numbers are usable."""
-    placed_boxes = PlacedBoxes.of(boxes, np.zeros(3))
+    placed_boxes = WorldBoxes.of(boxes, np.zeros(3))
     poses = rigid(
         torch.from_numpy(placed_boxes.rotations), torch.from_numpy(placed_boxes.centres_m)
     ).numpy()

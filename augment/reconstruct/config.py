@@ -90,7 +90,7 @@ class Growth:
 class Tuning:
     """Settings that users do not choose. Weights of the loss are in `LossWeights`."""
 
-    sh_every: int = 500  # steps after which one more band of SH is learnt
+    steps_per_sh_band: int = 500  # steps after which one more band of SH is learnt
     exposure_pull: float = 0.001  # pulls each camera's colour map to the identity
     pose_pull: float = 1e-4  # 1/m^2, pulls boxes and cameras to their recorded poses
     rates: LearningRates = field(default_factory=LearningRates)

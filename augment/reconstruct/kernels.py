@@ -15,14 +15,14 @@ from numba import prange
 from augment.render import layout as L
 from augment.render.cpu import simd as v8
 from augment.render.cpu.backward_kernels import (
-    G_ABS,
+    G_ABS_MEAN,
     G_COLOR,
+    G_MAX_SIGMA,
     G_MEAN,
     G_OPACITY,
     G_QUAT,
-    G_RADIUS,
     G_SCALE,
-    GRAD,
+    NUM_GRADIENTS,
 )
 from augment.render.cpu.geometry import from_eye
 from augment.render.cpu.jit import inner, kernel, serial_kernel
@@ -636,7 +636,7 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
         for i in range(MOMENTS):
             moments[block, i] = 0.0
         for at in range(U(block * BLOCK), U(block * BLOCK + counts[block])):
-            row = at * U(GRAD)
+            row = at * U(NUM_GRADIENTS)
             splat = U(ids[at])
             p = U(3) * splat
             q = U(4) * splat
@@ -738,9 +738,9 @@ R_SMALLEST = 20  # the least scale, metres
 R_LARGEST = 21  # the largest scale, metres
 R_ABS_UNIT = 22  # factor from 1/px to the unit of Splats.grads
 R_RADIUS_UNIT = 23  # factor from px to the unit of Splats.grads
-RATES = 24  # numbers of an update
+NUM_RATES = 24  # numbers of an update
 
-CORRECTED = 10_000  # updates after which Adam's bias is neglected
+MAX_CORRECTED_UPDATES = 10_000  # updates after which Adam's bias is neglected
 
 _EPS = np.float32(1e-15)  # added to the root of the second moment
 _MIN_OPACITY = np.float32(1e-4)
@@ -752,7 +752,7 @@ _SH_NUMBERS = 48  # numbers of a splat's SH; the work space holds gradients, mom
 
 def bias_corrections(beta1: float, beta2: float) -> np.ndarray:
     """Return the moments' factors after each number of updates, float32 [CORRECTED + 1, 2]."""
-    n = np.arange(CORRECTED + 1, dtype=np.float64)[:, None]
+    n = np.arange(MAX_CORRECTED_UPDATES + 1, dtype=np.float64)[:, None]
     n[0] = 1  # never read: a splat is updated before it is corrected
     return (1 / (1 - np.array([beta1, beta2]) ** n)).astype(np.float32)
 
@@ -815,17 +815,17 @@ def update_splats(
         for at in range(U(0), U(counts[block]), U(LANES)):
             _write_bases(means, ids, base + at, U(counts[block]) - at, view, functions, basis)
             for lane in range(min(U(LANES), U(counts[block]) - at)):
-                row = (base + at + lane) * U(GRAD)
+                row = (base + at + lane) * U(NUM_GRADIENTS)
                 splat = U(ids[base + at + lane])
                 moment_row = U(firsts[part]) + splat
                 if not math.isfinite(_row_power(rows, row)):
                     continue
                 age[moment_row] += 1
-                grads[U(3) * moment_row] += rows[row + U(G_ABS)] * rates[R_ABS_UNIT]
+                grads[U(3) * moment_row] += rows[row + U(G_ABS_MEAN)] * rates[R_ABS_UNIT]
                 grads[U(3) * moment_row + U(1)] += np.float32(1)
-                radius = rows[row + U(G_RADIUS)] * rates[R_RADIUS_UNIT]
+                radius = rows[row + U(G_MAX_SIGMA)] * rates[R_RADIUS_UNIT]
                 grads[U(3) * moment_row + U(2)] = max(grads[U(3) * moment_row + U(2)], radius)
-                n = U(min(age[moment_row], CORRECTED))
+                n = U(min(age[moment_row], MAX_CORRECTED_UPDATES))
                 first = corrections[U(2) * n]
                 second = corrections[U(2) * n + U(1)]
                 _update_geometry(
@@ -843,7 +843,7 @@ def update_splats(
 def _row_power(rows, row):
     """Return the sum of squares: not finite if a number or its second moment is not finite."""
     total = np.float32(0)
-    for i in range(U(GRAD)):
+    for i in range(U(NUM_GRADIENTS)):
         total += rows[row + i] * rows[row + i]
     return total
 
@@ -966,7 +966,7 @@ def update_rows(values, m, v, age, rows, grads, rate, betas, corrections):
         for i in range(U(run * _ROWS_AT_ONCE), U(min((run + 1) * _ROWS_AT_ONCE, rows.size))):
             row = U(rows[i])
             age[row] += 1
-            n = U(min(age[row], CORRECTED))
+            n = U(min(age[row], MAX_CORRECTED_UPDATES))
             first = corrections[U(2) * n]
             second = corrections[U(2) * n + U(1)]
             for channel in range(U(3)):

@@ -19,7 +19,7 @@ from augment.reconstruct.config import Growth, LearningRates
 from augment.reconstruct.kernels import GEOMETRY
 from augment.render.cpu.backward_kernels import G_MEAN, G_OPACITY, G_QUAT, G_SCALE
 from augment.render.threads import kernel_threads
-from augment.scene import SH_COUNTS, Gaussians
+from augment.scene import NUM_SH_BY_DEGREE, Gaussians
 
 
 @dataclass(eq=False)
@@ -64,7 +64,7 @@ class Splats:
     @staticmethod
     def of(parts: Sequence[Gaussians], sh_degree: int) -> Splats:
         """Copy the parts' Gaussians, with zero moments; SH are cut off or filled up with zeros."""
-        num_sh = SH_COUNTS[sh_degree]
+        num_sh = NUM_SH_BY_DEGREE[sh_degree]
         counts = [len(part) for part in parts]
         total = sum(counts)
 
@@ -408,7 +408,7 @@ def splat_rates(rates: LearningRates, done: float, camera: Camera, extent_m: flo
         extent_m: the largest scale, metres.
     """
     late_factor = rates.late**done
-    values = np.zeros(kernels.RATES, np.float32)
+    values = np.zeros(kernels.NUM_RATES, np.float32)
     values[G_MEAN : G_MEAN + 3] = decayed(rates.means, rates.means_end, done)
     values[G_QUAT : G_QUAT + 4] = rates.quats * late_factor
     values[G_SCALE : G_SCALE + 3] = rates.scales * late_factor

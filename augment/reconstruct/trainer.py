@@ -53,9 +53,9 @@ from augment.render.cpu import backward_kernels
 from augment.render.cpu.backward import SplatGradients, Tape, record
 from augment.render.cpu.driver import Inputs, Scratch
 from augment.render.cuda import runtime
-from augment.render.gsplat_backend import GsplatImages, draw_with_gsplat, import_gsplat
-from augment.render.layout import BLOCK, M_FUNCTIONS
-from augment.render.part_views import part_poses, part_views, raster_modes
+from augment.render.gsplat_backend import GsplatImages, import_gsplat, render_with_gsplat
+from augment.render.layout import BLOCK, M_NUM_SH_FUNCTIONS
+from augment.render.part_views import part_views, raster_modes, stack_poses
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
@@ -352,7 +352,7 @@ def splat_inputs(
         strides, np.uint64
     )
     # no part has gradients of light, or colour maps
-    no_addresses = np.zeros((len(starts), layout.ADDRESSES - len(_FIELDS)), np.uint64)
+    no_addresses = np.zeros((len(starts), layout.NUM_ADDRESSES - len(_FIELDS)), np.uint64)
     return Inputs(
         addresses=np.concatenate([addresses, no_addresses], 1),
         sizes=np.stack([counts, np.full_like(counts, num_sh)], 1),
@@ -420,7 +420,7 @@ class GsplatRenderer:
     """
 
     def __init__(self) -> None:
-        runtime.check_can_run()
+        runtime.require_gpu()
         import_gsplat()
         self._splats: Splats | None = None
         self._copies: dict[str, Tensor] = {}
@@ -444,12 +444,12 @@ class GsplatRenderer:
             is_world = np.array_equal(pose, np.eye(4))
             world_from_part = None if is_world else torch.from_numpy(np.ascontiguousarray(pose))
             parts.append(PosedGaussians(Gaussians(**part_leaves), world_from_part))
-        images = draw_with_gsplat(
+        images = render_with_gsplat(
             parts,
             camera,
             SETTINGS,
             with_depth=with_depth,
-            functions=int(inputs.modes[M_FUNCTIONS]),
+            functions=int(inputs.modes[M_NUM_SH_FUNCTIONS]),
             keep_color_slopes=True,
         )
         depth = None if images.expected_depth is None else _array(images.expected_depth)
@@ -501,7 +501,7 @@ class GsplatRenderer:
             - (np.cumsum(rows_per_block) - rows_per_block)[block_of_row]
         )
         all_rows = self._scratch.array(
-            "rows", (num_blocks * BLOCK, backward_kernels.GRAD), np.float32
+            "rows", (num_blocks * BLOCK, backward_kernels.NUM_GRADIENTS), np.float32
         )
         all_ids = self._scratch.array("ids", (num_blocks * BLOCK,), np.int32)
         all_rows[row_slots] = rows
@@ -538,7 +538,7 @@ class GsplatTape:
         with torch.no_grad():
             ids, order = torch.sort(ids.long())
             rows = self._rows(ids, order)
-            shown_rows = torch.nonzero((rows[:, : backward_kernels.G_RADIUS] != 0).any(1))[
+            shown_rows = torch.nonzero((rows[:, : backward_kernels.G_MAX_SIGMA] != 0).any(1))[
                 :, 0
             ]  # waits for the GPU
             return self.renderer.rows_of(
@@ -569,11 +569,11 @@ class GsplatTape:
         rows = {
             backward_kernels.G_MEAN: gradients["means"],
             backward_kernels.G_QUAT: gradients["quats"] - radial_gradient * quats,
-            backward_kernels.G_ABS: absolute_gradients.norm(dim=1, keepdim=True),
+            backward_kernels.G_ABS_MEAN: absolute_gradients.norm(dim=1, keepdim=True),
             backward_kernels.G_SCALE: gradients["scales"] * values["scales"],
             backward_kernels.G_OPACITY: (gradients["opacities"] * values["opacities"])[:, None],
             backward_kernels.G_COLOR: _gradient_of(self.images.colors)[ids],
-            backward_kernels.G_RADIUS: torch.sqrt(variance)[:, None],
+            backward_kernels.G_MAX_SIGMA: torch.sqrt(variance)[:, None],
         }
         return torch.cat([rows[column] for column in sorted(rows)], 1)
 
@@ -784,7 +784,7 @@ class Trainer:
             if part.instance_id == 0 or starts[part.instance_id] < starts[part.instance_id + 1]
         ]
         numbers = [part.instance_id for part in posed_parts]
-        poses = part_poses([part.world_from_part for part in posed_parts])
+        poses = stack_poses([part.world_from_part for part in posed_parts])
         for index, number in enumerate(numbers):
             if number > 0:
                 poses[index] = self.actor_poses.corrected(
@@ -795,7 +795,7 @@ class Trainer:
     def _render(self, parts: _PosedParts, camera: Camera) -> Tape | GsplatTape:
         """Render a view for its gradients."""
         inputs = splat_inputs(self.splats, parts.numbers, parts.poses, camera, SETTINGS)
-        inputs.modes[M_FUNCTIONS] = self._num_sh
+        inputs.modes[M_NUM_SH_FUNCTIONS] = self._num_sh
         with_depth = self._weights.depth > 0
         return self._renderer.record(
             self.splats, inputs, parts.poses, camera, with_depth=with_depth
@@ -809,7 +809,7 @@ class Trainer:
     @property
     def _num_sh(self) -> int:
         """Return the number of SH functions that are learnt now."""
-        degree = min(self._config.sh_degree, self.step // self._tuning.sh_every)
+        degree = min(self._config.sh_degree, self.step // self._tuning.steps_per_sh_band)
         return (degree + 1) ** 2
 
     def _update(

@@ -55,13 +55,13 @@ def import_cuda() -> ModuleType:
     """
     from augment.render.cuda import runtime
 
-    runtime.check_can_run()
+    runtime.require_gpu()
     from augment.render.cuda import driver as cuda
 
     return cuda
 
 
-def kernels_for(backend: str, *images: Tensor | None) -> str:
+def choose_kernels(backend: str, *images: Tensor | None) -> str:
     """Return the kernels for a pass over finished images: REFERENCE (plain torch), CPU or CUDA.
 
     Kernels take float32 without gradients; torch does everything else. AUTO follows the images: it

@@ -21,7 +21,7 @@ import numba
 from numba import types
 
 from augment.render.cpu.jit import KERNELS, compiling
-from augment.render.threads import thread_count
+from augment.render.threads import num_kernel_threads
 
 # A type as JSON holds it.
 Form = str | list[Any]
@@ -96,7 +96,7 @@ def compile_ahead(parts: Iterable[str]) -> Iterator[None]:
     arguments = (tuple(parts),)
     processes = [
         spawn.Process(target=compile_listed, args=arguments, daemon=True)
-        for _ in range(thread_count() - 1)
+        for _ in range(num_kernel_threads() - 1)
     ]
     for process in processes:
         process.start()

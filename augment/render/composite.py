@@ -18,7 +18,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render import composite_kernels, picture_kernels
-from augment.render.buffers import AUTO, CPU, RenderOutput, kernels_for
+from augment.render.buffers import AUTO, CPU, RenderOutput, choose_kernels
 from augment.render.fog import (
     Fog,
     airlight_gain,
@@ -46,7 +46,7 @@ NUM_GAINS = 8
 AIRLIGHT_SIZE = 64
 
 
-def sky_behind(sky: Sky, fog: Fog | None) -> tuple[Sky, Fog | None]:
+def simplify_sky(sky: Sky, fog: Fog | None) -> tuple[Sky, Fog | None]:
     """Return the sky and the fog that have to be evaluated per pixel, simplified where possible.
 
     Uniform fog hides the sky altogether (infinite distance), so only its airlight is left. Fog
@@ -86,7 +86,9 @@ def _gains(overcast: float) -> np.ndarray:
     return np.resize(np.append(series.coef, np.zeros(NUM_GAINS)), NUM_GAINS).astype(np.float32)
 
 
-def pixels_at_unit_depth(camera: Camera) -> tuple[Float[np.ndarray, " W"], Float[np.ndarray, " H"]]:
+def unit_depth_coordinates(
+    camera: Camera,
+) -> tuple[Float[np.ndarray, " W"], Float[np.ndarray, " H"]]:
     """Return the positions of columns and rows in the plane at z = 1, float32."""
     u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
@@ -113,7 +115,7 @@ def add_elevation(
     alpha = raster.alpha
     depth = raster.expected_depth
     assert rgb is not None and alpha is not None and depth is not None
-    if kernels_for(backend, rgb, alpha) != CPU or not rgb.is_contiguous():
+    if choose_kernels(backend, rgb, alpha) != CPU or not rgb.is_contiguous():
         tau = optical_depth(fog, *ray_distances(raster, camera, fog))
         rays = camera.ray_directions(rgb.dtype, rgb.device)
         gain = airlight_gain(fog, rays[..., 2] / rays.norm(dim=-1))
@@ -129,7 +131,7 @@ def add_elevation(
     fog_numbers = fog.sigma_per_m, eye_above_base_m * per_height, per_height
     kernel_inputs = camera.world_from_camera[2, :3].numpy(), fog_numbers, _gains(fog.overcast)
     kernel_inputs = (
-        *pixels_at_unit_depth(camera),
+        *unit_depth_coordinates(camera),
         *kernel_inputs,
         fog.varying_rgb or fog.rgb,
         fog.rgb if behind else (),
@@ -168,9 +170,9 @@ def composite_sky(
     Raises:
         ValueError: the camera is orthographic and the sky depends on the direction.
     """
-    sky, fog = sky_behind(sky, fog)
+    sky, fog = simplify_sky(sky, fog)
     if isinstance(sky, ConstantSky) and fog is None:  # the sky is the same in all directions
-        if kernels_for(backend, rgb, alpha) == CPU:
+        if choose_kernels(backend, rgb, alpha) == CPU:
             return _composite_constant(rgb, alpha, sky)
         return rgb + (1 - alpha)[..., None] * sky.rgb.to(rgb.device, rgb.dtype)
     if camera.is_orthographic:
@@ -178,7 +180,7 @@ def composite_sky(
             f"camera {camera.name!r} is orthographic: its rays are parallel and see the sky in one "
             f"direction only; composite a ConstantSky, without layered fog"
         )
-    if isinstance(sky, CubemapSky) and kernels_for(backend, rgb, alpha) == CPU:
+    if isinstance(sky, CubemapSky) and choose_kernels(backend, rgb, alpha) == CPU:
         return _composite_cubemap(rgb, alpha, camera, bordered_faces(sky), fog)
     directions = camera.ray_directions(rgb.dtype, rgb.device)
     color = sample_at(sky, directions)
@@ -242,7 +244,7 @@ def map_colors(
     within float rounding. Then `rgb` is overwritten: fresh memory would take as long as the
     arithmetic.
     """
-    if kernels_for(backend, rgb, color_map) != CPU or not rgb.is_contiguous():
+    if choose_kernels(backend, rgb, color_map) != CPU or not rgb.is_contiguous():
         color_map = color_map.to(rgb.device, rgb.dtype)
         return rgb @ color_map[:, :3].T + color_map[:, 3]
     with kernel_threads(ROWS):
@@ -253,7 +255,7 @@ def map_colors(
 def to_bytes(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
     """Return the image clamped to [0, 1], times 255, rounded to the nearest, on the same device."""
     rgb = rgb.detach()
-    if kernels_for(AUTO, rgb) != CPU:
+    if choose_kernels(AUTO, rgb) != CPU:
         return (rgb.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
     out = np.empty(tuple(rgb.shape), np.uint8)
     rows = rgb.contiguous().numpy()

@@ -14,7 +14,7 @@ from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import inner, kernel
 from augment.render.fog import MAX_EXPONENT
 from augment.render.layout import LANES, U
-from augment.render.sh import BLACK, FOLDED
+from augment.render.sh import BLACK, NUM_FOLDED
 
 # ---- Numba kernel: finished pixels become opaque (see augment.render.rasterize) ------------------
 
@@ -385,7 +385,7 @@ def _map_run(source, first, end, work, functions, classes, folded):
             while class_end < end and U(classes[class_end]) == map_index:
                 class_end += U(1)
         target_start = (splat - first) * row
-        if folded[map_index, U(FOLDED - 1)] != np.float32(0):
+        if folded[map_index, U(NUM_FOLDED - 1)] != np.float32(0):
             _map_splats(
                 source,
                 splat * row,

@@ -164,7 +164,7 @@ def airlight_gain(fog: Fog, slope: Float[Tensor, "*B"]) -> Float[Tensor, "*B 3"]
     return torch.expm1(growth)[..., None] * growth.new_tensor(varying_rgb)
 
 
-def fog_buffers(
+def apply_deferred_fog(
     rgb: Float[Tensor, "H W 3"],
     alpha: Float[Tensor, "H W"],
     ray_distance: Float[Tensor, "H W"],
@@ -191,13 +191,13 @@ def fog_buffers(
     return t * rgb + (1 - t) * alpha[..., None] * airlight
 
 
-def fog_raster(raster: RenderOutput, camera: Camera, fog: Fog) -> Float[Tensor, "H W 3"]:
+def apply_fog_to_render(raster: RenderOutput, camera: Camera, fog: Fog) -> Float[Tensor, "H W 3"]:
     """Return the colours of a render in deferred fog. The render has colour, alpha and expected
     depth.
     """
     assert raster.rgb is not None and raster.alpha is not None
     distance_and_heights = ray_distances(raster, camera, fog)
-    return fog_buffers(
+    return apply_deferred_fog(
         raster.rgb, raster.alpha, distance_and_heights[0], fog, *distance_and_heights[1:]
     )
 
@@ -221,7 +221,7 @@ def ray_distances(
     return ray_distance, eye_z_m, point_z_m
 
 
-def optical_depth_of_arrays(
+def optical_depth_numpy(
     fog: Fog,
     ray_distance: np.ndarray,
     eye_z_m: float | np.ndarray,

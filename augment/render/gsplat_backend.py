@@ -105,7 +105,7 @@ def _check_compiled() -> None:
         )
 
 
-def draw_with_gsplat(
+def render_with_gsplat(
     parts: Sequence[PosedGaussians],
     camera: Camera,
     settings: RasterSettings,

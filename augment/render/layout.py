@@ -33,7 +33,7 @@ import numpy as np
 # Parallel rays need no inverse depth: z(p) is exact for a plane, and the height is linear in p.
 # With a clip, expected and mode depth are taken over these surfaces, too: over 1/i(p), at most as
 # far from the centre as the splat reaches. The centres of large splats lie nearer or farther than
-# what a pixel shows of them, by more than shallow water is deep. `UNCUT` asks for these depths and
+# what a pixel shows of them, by more than shallow water is deep. `SURFACE_DEPTHS_ONLY` asks for these depths and
 # cuts nothing.
 
 ABOVE = "above"
@@ -98,7 +98,7 @@ class HeightClip:
 
 # A clip that cuts nothing: images have the same bits as without a clip, except for the depths,
 # which are those of the splats' surfaces.
-UNCUT = HeightClip(z_m=-1e9, keep="above")
+SURFACE_DEPTHS_ONLY = HeightClip(z_m=-1e9, keep="above")
 
 
 # Type of every index in the CPU kernels.
@@ -166,14 +166,14 @@ IS_OVERLAY = 15
 
 # ---- The cut of a splat that is clipped at a height: CUT float32 ---------------------------------
 # With x and y from its mean, pixels, the kept share of its alpha is
-# clamp(C_AT + C_X x + C_Y y, 0, 1). The depth of its surface is the depth of its centre over
+# clamp(C_VALUE + C_X x + C_Y y, 0, 1). The depth of its surface is the depth of its centre over
 # 1 - clamp(C_RIGHT x + C_DOWN y, -C_REACH, C_REACH), or, for an orthographic camera, the depth of
 # its centre plus that clamped line.
 
 # float32 numbers of a cut.
 CUT = 8
 # Kept share at the mean, before the clamp.
-C_AT = 0
+C_VALUE = 0
 # Slope of the kept share along x, 1/px.
 C_X = 1
 # Slope of the kept share along y, 1/px.
@@ -268,7 +268,7 @@ A_MAPS = 6
 # int16 row of the colour maps for every Gaussian; they are read where V_MAPS > 1.
 A_ROWS = 7
 # Number of these addresses.
-ADDRESSES = 8
+NUM_ADDRESSES = 8
 # Numbers of a colour map.
 MAP = 12
 
@@ -277,7 +277,7 @@ MAP = 12
 # 1 if colours are computed.
 M_COLOR = 0
 # Largest number of SH functions that is evaluated.
-M_FUNCTIONS = 1
+M_NUM_SH_FUNCTIONS = 1
 # 1 if opacities are scaled by sqrt(det / det_blurred).
 M_ANTIALIASED = 2
 # NO_FOG, UNIFORM_FOG or LAYERED_FOG.

@@ -35,7 +35,7 @@ def views_of(
     clip: HeightClip | None,
 ) -> np.ndarray:
     """Return views float32 [P, VIEW] of posed parts, with their light and colour maps."""
-    poses = part_poses([part.world_from_part for part in parts])
+    poses = stack_poses([part.world_from_part for part in parts])
     views = part_views(poses, camera, settings, fog, clip)
     views[:, layout.V_OVERLAY] = [part.is_overlay for part in parts]
     views[:, layout.V_MAPS] = [_map_count(part) for part in parts]
@@ -132,7 +132,7 @@ def part_views(
     return views.astype(np.float32)
 
 
-def part_poses(poses: Sequence[torch.Tensor | None]) -> np.ndarray:
+def stack_poses(poses: Sequence[torch.Tensor | None]) -> np.ndarray:
     """Return the poses of parts, float64 [P, 4, 4]; None stands for the identity."""
     return np.stack([np.eye(4) if pose is None else pose.numpy() for pose in poses])
 
@@ -144,7 +144,7 @@ def raster_modes(
     degree = MAX_DEGREE if settings.sh_degree is None else settings.sh_degree
     modes = np.zeros(layout.MODES, np.int64)
     modes[layout.M_COLOR] = with_color
-    modes[layout.M_FUNCTIONS] = (degree + 1) ** 2
+    modes[layout.M_NUM_SH_FUNCTIONS] = (degree + 1) ** 2
     modes[layout.M_ANTIALIASED] = settings.antialiased
     modes[layout.M_CLIP] = clip is not None
     if fog is not None:

@@ -14,7 +14,7 @@ from augment.render.layout import U
 
 
 @kernel
-def scene_colors(pixels, color_map, min_color, out):
+def map_photo_colors(pixels, color_map, min_color, out):
     """Write out = max(M (pixels / 255) + m, min_color).
 
     Args:
@@ -48,7 +48,7 @@ def scene_colors(pixels, color_map, min_color, out):
 
 
 @kernel
-def styled_colors(pixels, land, sky, share, out):
+def map_photo_colors_with_sky(pixels, land, sky, share, out):
     """Write out = (1 - share) max(land, 0) + share max(sky, 0), each a map [3, 4] of pixels / 255.
 
     Args:

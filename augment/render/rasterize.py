@@ -26,9 +26,9 @@ from augment.render.buffers import (
     REFERENCE,
     RGB,
     RenderOutput,
+    choose_kernels,
     import_cpu,
     import_cuda,
-    kernels_for,
 )
 from augment.render.constants import (
     COV2D_BLUR,
@@ -63,7 +63,7 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
     assert alpha is not None
     images = {name: getattr(output, name) for name in ("rgb", "overlay")}
     images = {name: image for name, image in images.items() if image is not None}
-    if kernels_for(backend, alpha, *images.values()) == CPU:
+    if choose_kernels(backend, alpha, *images.values()) == CPU:
         from augment.render import composite_kernels
         from augment.render.threads import kernel_threads
 

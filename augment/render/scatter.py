@@ -45,8 +45,8 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render import picture_kernels
-from augment.render.buffers import AUTO, CPU, kernels_for
-from augment.render.composite import ROWS, pixels_at_unit_depth
+from augment.render.buffers import AUTO, CPU, choose_kernels
+from augment.render.composite import ROWS, unit_depth_coordinates
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
 
@@ -95,7 +95,7 @@ def scatter_forward(
     # Levels whose kernel would be larger than the image are left out.
     levels = max(0, min(NUM_LEVELS, int(math.log2(min(size))) - 1))
     shares = level_shares(DIFFRACTION_RAD * camera.fx / factor)[: levels + 1]
-    if kernels_for(backend, rgb, alpha, depth) == CPU:
+    if choose_kernels(backend, rgb, alpha, depth) == CPU:
         weight = _scattered_share(alpha, depth, camera, medium, strength)
         return _exchange_light(rgb, weight, size, shares)
     weight = _scattered_share_by_torch(alpha, depth, camera, medium, strength)[..., None]
@@ -156,7 +156,7 @@ def _scattered_share(
         picture_kernels.scattered_share(
             alpha.contiguous().numpy(),
             depth.contiguous().numpy(),
-            *pixels_at_unit_depth(camera),
+            *unit_depth_coordinates(camera),
             camera.world_from_camera[2, :3].numpy().astype(np.float32),
             np.float32(strength),
             np.float32(min(extinction_per_m, 1e30)),

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render import picture_kernels
-from augment.render.buffers import AUTO, CPU, kernels_for
+from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.composite import ROWS
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
@@ -84,7 +84,7 @@ def add_noise(
     """
     draws = draw_noise(camera, seed=seed, scene=scene)
     sigmas = noise_sigmas() * np.float32(noise / (_LEVEL_SD * _DEMOSAICED_SD))
-    if kernels_for(backend, rgb) == CPU:
+    if choose_kernels(backend, rgb) == CPU:
         noisy_rgb = rgb.detach().contiguous().numpy()
         with kernel_threads(ROWS):
             rows = noisy_rgb.reshape(len(noisy_rgb), -1), draws.reshape(len(noisy_rgb), -1)

@@ -85,12 +85,12 @@ def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Flo
     band.
     """
     degree = math.isqrt(sh.shape[1]) - 1
-    turn = sh_turn(rotation, degree).to(sh.dtype)
+    turn = sh_rotation(rotation, degree).to(sh.dtype)
     bands = [slice(band * band, (band + 1) ** 2) for band in range(degree + 1)]
     return torch.cat([torch.einsum("ij,njc->nic", turn[b, b], sh[:, b]) for b in bands], 1)
 
 
-def sh_turn(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "K K"]:
+def sh_rotation(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "K K"]:
     """Return the matrix that turns coefficients by a rotation, float64; it has a block for each
     band.
 
@@ -132,6 +132,6 @@ def _sphere_samples(count: int) -> Float[Tensor, "S 3"]:
 
 # Numbers of a folded map: 9 of its matrix row by row, 3 that are added to the first function, and
 # one that is not 0 if the map changes anything.
-FOLDED = 13
+NUM_FOLDED = 13
 # First coefficient of a colour of 0.
 BLACK = np.float32(-0.5 / SH_C0)

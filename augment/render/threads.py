@@ -113,7 +113,7 @@ def _preload_tbb() -> bool:
 
 @contextmanager
 def kernel_threads(chunk: int = 1) -> Iterator[None]:
-    """Give the parallel kernels that are launched inside as many threads as `thread_count` says.
+    """Give the parallel kernels that are launched inside as many threads as `num_kernel_threads` says.
 
     Work is handed out `chunk` iterations at a time, which keeps all threads busy. Iterations differ
     much in cost; with numba's default, one equal share per thread, all would wait for the slowest.
@@ -121,14 +121,14 @@ def kernel_threads(chunk: int = 1) -> Iterator[None]:
     caller_lock = _one_caller_at_a_time if select_thread_pool() == _ONE_CALLER else nullcontext()
     num_threads_before = numba.get_num_threads()
     with caller_lock, numba.parallel_chunksize(chunk):
-        numba.set_num_threads(thread_count())
+        numba.set_num_threads(num_kernel_threads())
         try:
             yield
         finally:
             numba.set_num_threads(num_threads_before)
 
 
-def thread_count() -> int:
+def num_kernel_threads() -> int:
     """Return the number of threads that kernels launched from this thread use.
 
     The number is at most numba's own setting and the limit of `limit_threads`. Without such a limit
@@ -142,7 +142,7 @@ def thread_count() -> int:
     return min(limit, numba.get_num_threads())
 
 
-def serves_several() -> bool:
+def has_concurrent_kernels() -> bool:
     """Return True if several threads of this process can run kernels at the same time."""
     return select_thread_pool() != _ONE_CALLER
 
@@ -153,19 +153,21 @@ BYTES_PER_SPLAT = 110
 MAX_WORK_SPACE_BYTES = 1 << 29
 
 
-def views_at_once(gaussians: int) -> int:
+def num_concurrent_views(gaussians: int) -> int:
     """Return how many views of so many Gaussians are drawn at a time, one thread each."""
-    if not serves_several():
+    if not has_concurrent_kernels():
         return 1
-    return min(thread_count(), 1 + MAX_WORK_SPACE_BYTES // (BYTES_PER_SPLAT * max(gaussians, 1)))
+    return min(
+        num_kernel_threads(), 1 + MAX_WORK_SPACE_BYTES // (BYTES_PER_SPLAT * max(gaussians, 1))
+    )
 
 
-def divided_threads(count: int) -> ThreadPoolExecutor:
+def split_threads(count: int) -> ThreadPoolExecutor:
     """Return a pool of `count` threads for whole tasks. They divide the threads of the calling one.
 
-    The calling thread's share is `thread_count`.
+    The calling thread's share is `num_kernel_threads`.
     """
-    total = thread_count()
+    total = num_kernel_threads()
     torch_threads = torch.get_num_threads()
     all_started = threading.Barrier(count + 1)
 

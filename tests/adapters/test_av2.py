@@ -23,7 +23,7 @@ from shown import assert_same_bits, psnr_of
 
 from adapters.av2.adapter import Av2Log, open_av2, read_av2
 from adapters.av2.files import GroundMap, sensor_of_laser
-from adapters.base import recognise
+from adapters.base import detect_scheme_of_path
 from adapters.raw_drive import DriveOptions
 from adapters.uri import SCHEMES, format_uri
 from augment.cameras import Camera
@@ -87,7 +87,7 @@ def mounting(scene, name: str) -> np.ndarray:
 def test_the_scene_is_described(scene, folder):
     assert scene.name == files.NAME and scene.problems == ()
     assert scene.source == format_uri("av2", str(folder), QUERY)
-    assert recognise(folder) == "av2"
+    assert detect_scheme_of_path(folder) == "av2"
     assert scene.camera_names == tuple(files.CAMERAS)
     assert [f.timestamp_ns for f in scene.frames] == list(files.STAMPS_NS)
     np.testing.assert_array_equal(scene.world_origin_m, ORIGIN)

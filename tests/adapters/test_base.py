@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pandaset_folder import write_sequence
 from splat_scenes import street
 
-from adapters.base import open_scene, recognise, scenes_of
+from adapters.base import detect_scheme_of_path, open_scene, scenes_of
 from adapters.camera_files.camera_files import read_views
 from adapters.detect_format import FILES, FOLDERS, describe_unrecognised, detect_scheme
 from adapters.drivestudio.drive import read_config as drivestudio_config
@@ -26,7 +26,7 @@ from adapters.pandaset import PandaSetLabels
 from adapters.plain_files import check_image, read_json, read_numbers, read_pose, resolve_inside
 from adapters.recording.adapter import read_sweep
 from adapters.safe_pickle import read_array, read_frame
-from adapters.scene_folder import storable
+from adapters.scene_folder import prepare_for_storage
 from adapters.street_gaussians.model import read_config as street_gaussians_config
 from adapters.training_views.depth_priors import read_metric
 from adapters.uri import format_uri, parse_uri
@@ -241,13 +241,13 @@ def test_files_are_recognised(tmp_path):
     grow(tmp_path, list(known), b"x")
     assert {path.name: detect_scheme(path) for path in sorted(tmp_path.iterdir())} == known
     write_ply(tmp_path / "a.bin", street(length=8))
-    assert recognise(tmp_path / "a.bin") == "gaussians"
+    assert detect_scheme_of_path(tmp_path / "a.bin") == "gaussians"
 
 
 def test_what_is_not_known_is_answered_with_what_was_looked_for(tmp_path):
     grow(tmp_path / "set" / "seq", dict(TREES)["nuscenes"])
     with pytest.raises(AdapterError) as caught:
-        recognise(tmp_path / "set")
+        detect_scheme_of_path(tmp_path / "set")
     for signature in FOLDERS:
         assert signature.what in str(caught.value)
     assert f"give one, such as {tmp_path}/set/seq. Looked for" in str(caught.value)
@@ -276,7 +276,7 @@ def test_an_unknown_folder_is_told_what_it_lacks(tmp_path, files, said):
     grow(tmp_path / "new", files, b"x")
     (tmp_path / "new").mkdir(exist_ok=True)
     with pytest.raises(AdapterError, match=said):
-        recognise(tmp_path / "new")
+        detect_scheme_of_path(tmp_path / "new")
 
 
 def uris(folder: Path, *entries: str | JobScene) -> list[str]:
@@ -367,7 +367,7 @@ def save(tmp_path: Path, **changes) -> Path:
 
 def test_a_scene_folder_is_recognised_and_opened(tmp_path):
     folder = save(tmp_path)
-    assert recognise(folder) == "scene"
+    assert detect_scheme_of_path(folder) == "scene"
     for uri in (f"scene:{folder}", str(folder)):
         scene = open_scene(uri)
         assert scene.source == f"scene:{folder}"
@@ -390,7 +390,7 @@ def test_bad_uris_and_folders(tmp_path):
         with pytest.raises((AdapterError, SceneError), match=message):
             open_scene(uri)
     (folder / "sky.safetensors").unlink()
-    assert recognise(folder) == "scene"  # so that what is wrong with it is said
+    assert detect_scheme_of_path(folder) == "scene"  # so that what is wrong with it is said
     with pytest.raises(SceneError, match=r"it has no sky\.safetensors"):
         open_scene(str(folder))
 
@@ -398,7 +398,7 @@ def test_bad_uris_and_folders(tmp_path):
 def test_a_scene_file_is_recognised_and_opened(tmp_path):
     path = tmp_path / "fit.CLIMATEGS"
     save_scene_file(fitted_scene(recorded_source=STREET), path)
-    assert recognise(path) == "scene"
+    assert detect_scheme_of_path(path) == "scene"
     scene = open_scene(str(path))
     assert scene.source == f"scene:{path}" and scene.problems == fitted_scene().problems
     assert_same(scene, fitted_scene(), but=("source", "labels", "recorded_source"))
@@ -420,11 +420,11 @@ def test_what_is_saved_again_is_storable(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path / "other")
     scene = open_scene(f"scene:{folder}")
     assert "boxes and LiDAR are left out" in scene.problems[-1]
-    kept = storable(scene)
+    kept = prepare_for_storage(scene)
     assert kept.problems == fitted_scene().problems
     assert kept.recorded_source == f"pandaset:{tmp_path}/raw/002"
     street = open_scene(STREET)
-    assert storable(street) is street
+    assert prepare_for_storage(street) is street
 
 
 def test_labels_come_from_the_recording(tmp_path):

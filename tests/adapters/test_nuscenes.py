@@ -16,7 +16,7 @@ import pandaset_folder as street
 import pytest
 from shown import psnr, psnr_of, render
 
-from adapters.base import recognise
+from adapters.base import detect_scheme_of_path
 from adapters.nuscenes.adapter import EGO_BOX_M, nuscenes_labels, open_nuscenes
 from adapters.nuscenes.tables import read_rows, read_tables
 from adapters.uri import format_uri
@@ -55,7 +55,7 @@ def into_street(points: np.ndarray) -> np.ndarray:
 def test_the_scene_is_described(scene, folder):
     assert scene.name == TWO and scene.problems == ()
     assert scene.source == format_uri("nuscenes", str(folder), QUERY)
-    assert recognise(folder) == "nuscenes"
+    assert detect_scheme_of_path(folder) == "nuscenes"
     assert scene.camera_names == ("CAM_FRONT", "CAM_FRONT_LEFT")
     assert [f.index for f in scene.frames] == list(range(files.SWEEPS))
     assert [f.timestamp_ns for f in scene.frames] == [t * 1000 for t in files.sweep_times_us(1)]
@@ -417,7 +417,7 @@ def test_tables_of_other_writers_go_by_any_folder_name_and_may_begin_with_a_mark
     root = files.write_dataset(tmp_path / "test", version="converted", scenes=[TWO])
     for path in (root / "converted").glob("*.json"):
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert recognise(root) == "nuscenes"
+    assert detect_scheme_of_path(root) == "nuscenes"
     assert tables(root, None).version == "converted"
     shutil.copytree(root / "converted", root / "v1.0-mini")
     assert tables(root, None).version == "v1.0-mini"  # the dataset's own name comes first

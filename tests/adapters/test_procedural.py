@@ -11,7 +11,7 @@ import torch
 from shown import assert_same_bits
 
 from adapters.base import open_scene
-from adapters.procedural import StreetTruth, TrueView, open_procedural, open_truth
+from adapters.procedural import ExactView, StreetTruth, open_procedural, open_truth
 from adapters.street.forms import (
     ALL_EDGES,
     U0,
@@ -244,7 +244,7 @@ def test_truth_sees_moving_things_where_they_are(truth):
         assert hits.normal[0, 2] > 0.5
 
 
-def _smooth_pixels(view: TrueView) -> np.ndarray:
+def _smooth_pixels(view: ExactView) -> np.ndarray:
     """Pixels whose 5x5 neighbourhood is one surface: one class and instance, colour within 8/255,
     and inverse depth (linear on a plane) without a bend or a step.
     """

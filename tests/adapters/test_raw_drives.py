@@ -43,10 +43,10 @@ from augment.effects.lidar import (
     PRECIPITATION,
     SCATTERED,
     UNCHANGED,
-    drop_lost,
+    drop_lost_returns,
     is_in_air,
 )
-from augment.effects.lidar.beam import intensity_column
+from augment.effects.lidar.beam import find_intensity_column
 from augment.errors import AdapterError
 from augment.jobs.tables import lidar_bytes
 from augment.labels import LidarSweep, StoresLidar
@@ -289,7 +289,7 @@ def weathered(sweep: LidarSweep) -> LidarSweep:
         noisy = columns[axis] + sigma * rng.normal(0, 1, len(sweep))
         columns[axis] = np.where(sigma > 0, noisy, columns[axis])
         columns[axis][codes == LOST] = np.nan
-    name = intensity_column(sweep)
+    name = find_intensity_column(sweep)
     if name is not None:
         values = columns[name] * np.where(codes == UNCHANGED, 1, 0.5)
         columns[name] = values.astype(sweep.columns[name].dtype)
@@ -302,7 +302,7 @@ def test_files_give_back_the_weathered_sweep(dataset: str, tmp_path: Path) -> No
     labels = DATASETS[dataset](tmp_path / "data")
     assert isinstance(labels, StoresLidar)
     source = labels.lidar(0)
-    wanted = drop_lost(weathered(source))
+    wanted = drop_lost_returns(weathered(source))
     assert 0.8 < len(wanted) / len(source) < 0.9
     files = labels.lidar_files(0)
     contents = [labels.lidar_content(0, file, wanted) for file in files]
@@ -342,7 +342,7 @@ def test_without_a_class_of_that_name_returns_of_the_air_have_none() -> None:
 def test_pandas_opens_the_tables_and_their_rows_still_name_each_other(tmp_path: Path) -> None:
     labels = _pandaset(tmp_path)
     before = [pd.read_pickle(file) for file in labels.lidar_files(0)]
-    wanted = drop_lost(weathered(labels.lidar(0)))
+    wanted = drop_lost_returns(weathered(labels.lidar(0)))
     for file, old in zip(labels.lidar_files(0), before, strict=True):
         file.write_bytes(labels.lidar_content(0, file, wanted))
         new = pd.read_pickle(file)
@@ -354,7 +354,7 @@ def test_pandas_opens_the_tables_and_their_rows_still_name_each_other(tmp_path: 
 
 def test_labels_of_nuscenes_returns_stay_with_their_returns(tmp_path: Path) -> None:
     labels = _nuscenes(tmp_path)
-    wanted = drop_lost(weathered(labels.lidar(0)))
+    wanted = drop_lost_returns(weathered(labels.lidar(0)))
     names = [file.parts[len(tmp_path.parts)] for file in labels.lidar_files(0)]
     assert names == ["samples", "lidarseg", "panoptic"]
     panoptic = labels.lidar_files(0)[2]
@@ -381,7 +381,7 @@ def test_a_recordings_file_keeps_its_notes(tmp_path: Path) -> None:
     labels = _ours(tmp_path)
     (file,) = labels.lidar_files(0)
     schema = pq.read_schema(file)
-    file.write_bytes(labels.lidar_content(0, file, drop_lost(weathered(labels.lidar(0)))))
+    file.write_bytes(labels.lidar_content(0, file, drop_lost_returns(weathered(labels.lidar(0)))))
     assert pq.read_schema(file).equals(schema, check_metadata=True)
 
 

@@ -15,9 +15,9 @@ from adapters.training_views.masks import read_ego_mask
 from adapters.training_views.views import RecordedViews
 from augment.cameras import Frame
 from augment.errors import AdapterError
-from augment.own_car import find_ego_mask, moving_frames, own_car_mask
+from augment.own_car import find_own_car_mask, moving_frames, own_car_mask
 from augment.reconstruct.view import ViewKey
-from augment.recorded_sky import lidar_top_rad, looks_like_sky, sky_mask
+from augment.recorded_sky import find_sky_like_pixels, lidar_top_rad, sky_mask
 from augment.scene import Scene
 from augment.sky import ConstantSky
 from tests.scenes import one_gaussian
@@ -95,12 +95,12 @@ def test_the_picture_has_to_agree():
     rgb[10:30, 20:60] = 90  # a dark tower that no splat shows
     rgb[30:50:3, 100:140] = 120  # a billboard
     rgb[5, :] = 100  # a wire
-    found = looks_like_sky(rgb, np.arange(120)[:, None] < np.full((1, 160), 58))
+    found = find_sky_like_pixels(rgb, np.arange(120)[:, None] < np.full((1, 160), 58))
     assert not found[10:30, 20:60].any() and not found[30:48, 100:140].any()
     assert not found[5].any() and found[35:55, 20:60].all()
-    assert not looks_like_sky(rgb, np.zeros((120, 160), bool)).any()
+    assert not find_sky_like_pixels(rgb, np.zeros((120, 160), bool)).any()
     night = sky_picture(sky=30, wall=10)
-    assert not looks_like_sky(night, np.ones((120, 160), bool)).any()
+    assert not find_sky_like_pixels(night, np.ones((120, 160), bool)).any()
 
 
 def test_the_lidars_highest_view_is_measured(tmp_path):
@@ -168,7 +168,7 @@ def drive_pictures(*, rotation=drives.AHEAD, frames=12, step_m=0.6, **what):
 def test_a_bonnet_is_found_where_it_is():
     rows = 95 - 8 * np.sin(np.linspace(0, np.pi, 160))
     cameras, pictures = drive_pictures(car_rows=rows)
-    mask = find_ego_mask(cameras, pictures)
+    mask = find_own_car_mask(cameras, pictures)
     top = np.where(mask.any(axis=0), mask.argmax(axis=0), 120)
     # The window that evidence is averaged in reaches four pixels over the edge, less two.
     assert np.abs(top - rows).max() < 4 and np.abs(np.median(top - rows)) < 2.5
@@ -176,10 +176,10 @@ def test_a_bonnet_is_found_where_it_is():
 
 def test_nothing_is_found_where_the_car_is_not_seen(monkeypatch):
     for rotation in (drives.AHEAD, drives.LEFT):
-        assert not find_ego_mask(*drive_pictures(car_rows=None, rotation=rotation)).any()
+        assert not find_own_car_mask(*drive_pictures(car_rows=None, rotation=rotation)).any()
     # A smooth road, and a car ahead that always keeps its distance.
     monkeypatch.setitem(globals(), "ROAD", np.full_like(ROAD, 100))
-    assert not find_ego_mask(*drive_pictures(car_rows=None, lead_car=True)).any()
+    assert not find_own_car_mask(*drive_pictures(car_rows=None, lead_car=True)).any()
 
 
 @pytest.mark.parametrize("missing", [0, 8])
@@ -212,8 +212,8 @@ def test_frames_are_taken_where_the_car_moved():
     assert moving_frames(standing(20, 0.0)) == [0]
     chosen = moving_frames(standing(100, 0.2))
     assert len(chosen) == 24 and chosen == sorted(set(chosen))
-    assert not find_ego_mask(*drive_pictures(frames=1, car_rows=np.full(160, 90))).any()
-    assert find_ego_mask([], []).shape == (0, 0)
+    assert not find_own_car_mask(*drive_pictures(frames=1, car_rows=np.full(160, 90))).any()
+    assert find_own_car_mask([], []).shape == (0, 0)
 
 
 @pytest.fixture

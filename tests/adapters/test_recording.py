@@ -21,7 +21,7 @@ import torch
 from recording_folder import QUERY, edit_calibration, write_recording
 from shown import assert_same_bits, psnr_of, render
 
-from adapters.base import open_scene, recognise
+from adapters.base import detect_scheme_of_path, open_scene
 from adapters.recording.adapter import (
     RecordingLabels,
     all_boxes,
@@ -123,9 +123,9 @@ def test_what_a_job_wrote_is_a_recording(tmp_path):
     job = RenderJob(LABELLED_STREET, [load_recipe("clear").resolve(0)], tmp_path / "raw")
     assert run_job(job, scene_loader=lambda _: source).failed == 0
     folder = tmp_path / "raw" / source.name / "clear-000"
-    assert recognise(folder) == "recording"
+    assert detect_scheme_of_path(folder) == "recording"
     with pytest.raises(AdapterError, match=r"It holds scenes: give one, such as .*clear-000"):
-        recognise(tmp_path / "raw")
+        detect_scheme_of_path(tmp_path / "raw")
     scene = open_scene(f"{folder}?image_scale=1&sky_size=32&voxel_m=0.3")
     assert scene.problems == () and scene.name == f"{source.name}-clear-000"
     assert scene.source.startswith("recording:")
@@ -269,7 +269,7 @@ def test_a_generated_variant_opens_as_a_rendered_one_does(tmp_path):
     expected = open_recording(str(write_recording(tmp_path / "whole")), QUERY)
     root = in_blocks(write_recording(tmp_path / "blocks"))
     scene = open_recording(str(root), QUERY)
-    assert recognise(root) == "recording"
+    assert detect_scheme_of_path(root) == "recording"
     assert [f.cameras.keys() for f in scene.frames] == [f.cameras.keys() for f in expected.frames]
     assert torch.equal(scene.background.means, expected.background.means)
     for frame in expected.frames:

@@ -17,7 +17,7 @@ import waymo_files as files
 from shown import psnr_of
 from waymo_files import DRIVER, ORIGIN, PARKED, Form, Rig, Street, car_pose, changed
 
-from adapters.base import open_scene, recognise
+from adapters.base import detect_scheme_of_path, open_scene
 from adapters.raw_drive import IncompleteDrive, RawDrive
 from adapters.waymo.adapter import WaymoOptions, read_waymo, waymo_labels
 from adapters.waymo.tables import Rows, SegmentFiles
@@ -327,7 +327,12 @@ def test_segments_go_by_their_names_or_first_parts(written: Path, tmp_path: Path
         names = pa.array([other] * len(table))
         table = table.set_column(place, "key.segment_context_name", names)
         pq.write_table(table, path.with_stem(other))
-    assert recognise(root) == recognise(root / "validation") == recognise(written) == "waymo"
+    assert (
+        detect_scheme_of_path(root)
+        == detect_scheme_of_path(root / "validation")
+        == detect_scheme_of_path(written)
+        == "waymo"
+    )
     for segment in (other, other.split("_")[0], f"segment-{other}_with_camera_labels"):
         labels = waymo_labels(str(root), {"segment": segment})
         assert labels.segment.files.name == other and len(labels.boxes(0)) == 2

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.effects.effect import EffectView, Placed
-from augment.effects.smog import PlacedSmog
-from augment.effects.snow.cells import OPEN_EDGE, SnowCells, SnowSupport
-from augment.effects.snow.placement import PlacementSettings
-from augment.effects.snow.snow import PlacedSnow
-from augment.effects.snow.support import support_of
+from augment.effects.effect import EffectPlan, LabelInputs
+from augment.effects.smog import SmogPlan
+from augment.effects.snow.cells import OPEN_EDGE, ExposedCells, ExposedSurface
+from augment.effects.snow.placement import ExposureSettings
+from augment.effects.snow.snow import SnowPlan
+from augment.effects.snow.support import exposed_surface_of
 from augment.effects.style.color_maps import StyleMaps
 from augment.errors import AdapterError
 from augment.jobs.render_job import RenderJob, run_job
@@ -32,7 +32,7 @@ from augment.render.fog import Fog
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky
-from augment.views import SurfaceView
+from augment.views import LabelSurfaces
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
@@ -90,8 +90,8 @@ class FakeView:
     semantic: np.ndarray | None = None
     instance: np.ndarray | None = None
     masks: dict[str, np.ndarray] = field(default_factory=dict)
-    effects: dict[str, EffectView] = field(default_factory=dict)
-    surface: SurfaceView | None = None
+    effects: dict[str, LabelInputs] = field(default_factory=dict)
+    surface: LabelSurfaces | None = None
 
 
 def open_fake(uri: str) -> Scene:
@@ -191,45 +191,47 @@ def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -
     )
 
 
-def fake_surface(rng: np.random.Generator, shape: tuple[int, int]) -> SurfaceView:
+def fake_surface(rng: np.random.Generator, shape: tuple[int, int]) -> LabelSurfaces:
     """Surfaces where the boxes are, of classes that none is of."""
     depth = rng.uniform(0, 4, shape).astype(np.float32)
     classes = np.full(shape, SemanticClass.ROAD, np.uint8)
-    return SurfaceView(depth, None, depth, classes, False)
+    return LabelSurfaces(depth, None, depth, classes, False)
 
 
-def fake_effects(camera: Camera, recipe: Recipe, rng: np.random.Generator) -> dict[str, EffectView]:
+def fake_effects(
+    camera: Camera, recipe: Recipe, rng: np.random.Generator
+) -> dict[str, LabelInputs]:
     """Water on a third of the pixels and snow on half of them, but none in view of one image;
     surfaces where the boxes are.
     """
     weather, shape = recipe.weather, (camera.height, camera.width)
 
-    def seen(placed: Placed, share: float | None = None) -> EffectView:
+    def seen(placed: EffectPlan, share: float | None = None) -> LabelInputs:
         mask = None
         if share is not None:
             if camera.timestamp_ns == DRY_NS:
-                return EffectView(placed, None, None, None)
+                return LabelInputs(placed, None, None, None)
             mask = np.where(rng.random(shape) < share, 255, 0).astype(np.uint8)
-        return EffectView(placed, rng.uniform(0, 4, shape).astype(np.float32), mask, None)
+        return LabelInputs(placed, rng.uniform(0, 4, shape).astype(np.float32), mask, None)
 
     effects = {}
     if weather.flood is not None:
-        effects["flood"] = seen(Placed(None, (), water_level_z_m=LEVEL_Z_M), 1 / 3)
+        effects["flood"] = seen(EffectPlan(None, (), water_level_z_m=LEVEL_Z_M), 1 / 3)
     if weather.snow is not None:
-        snow = PlacedSnow(weather.snow.model_copy(update={"depth_m": THICKNESS_M}), 0)
-        effects["snow"] = seen(Placed(snow, ()), 1 / 2)
+        snow = SnowPlan(weather.snow.model_copy(update={"depth_m": THICKNESS_M}), 0)
+        effects["snow"] = seen(EffectPlan(snow, ()), 1 / 2)
     if weather.smog is not None:
         smog = weather.smog
-        fog = PlacedSmog(Fog(smog.sigma_per_m, smog.color), False) if smog.sigma_per_m else None
-        effects["smog"] = seen(Placed(fog, ()))
+        fog = SmogPlan(Fog(smog.sigma_per_m, smog.color), False) if smog.sigma_per_m else None
+        effects["smog"] = seen(EffectPlan(fog, ()))
     if recipe.style is not None:
-        effects["style"] = EffectView(Placed(None, ()), None, None, None)
+        effects["style"] = LabelInputs(EffectPlan(None, ()), None, None, None)
     return effects
 
 
-def make_bed(x_m: float) -> SnowSupport:
+def make_bed(x_m: float) -> ExposedSurface:
     """One cell at x_m, without anything under it."""
-    cells = SnowCells(
+    cells = ExposedCells(
         centers_m=torch.tensor([[x_m, 0.0, 0.0]]),
         normals=torch.tensor([[0.0, 0.0, 1.0]]),
         sizes_m=torch.ones(1),
@@ -242,14 +244,16 @@ def make_bed(x_m: float) -> SnowSupport:
         buried=torch.zeros(0, dtype=torch.int32),
         buried_by=torch.zeros(0, 5, dtype=torch.int32),
     )
-    return SnowSupport(cells, {})
+    return ExposedSurface(cells, {})
 
 
 def bed_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     """As `style_render`, with the number that `make_bed` was given in the first pixel's red."""
     snow = recipe.weather.snow
     assert snow is not None
-    bed = support_of(scene, PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg))
+    bed = exposed_surface_of(
+        scene, ExposureSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg)
+    )
     view = style_render(scene, camera, recipe, backend=backend)
     view.rgb[0, 0, 0] = round(bed.ground.centers_m[0, 0].item() * 20)
     return view

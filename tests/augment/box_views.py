@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from batch_scenes import ORIGIN_M
 
-from augment.boxes import PlacedBoxes
+from augment.boxes import WorldBoxes
 from augment.cameras import Camera
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes
@@ -22,8 +22,8 @@ def make_boxes(*boxes: tuple, origin: np.ndarray = ORIGIN_M) -> Boxes:
     return Boxes(names, ("Car",) * len(boxes), centres + origin, sizes, quats)
 
 
-def placed(boxes: Boxes) -> PlacedBoxes:
-    return PlacedBoxes.of(boxes, ORIGIN_M)
+def placed(boxes: Boxes) -> WorldBoxes:
+    return WorldBoxes.of(boxes, ORIGIN_M)
 
 
 def make_camera(width: int = 160, height: int = 106, pitch: float = 0.0) -> Camera:

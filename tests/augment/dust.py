@@ -11,9 +11,18 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from augment.boxes import PlacedBoxes
+from augment.boxes import WorldBoxes
 from augment.cameras import Camera
-from augment.effects.effect import PICTURE, Active, Drawn, Effect, EffectView, Placed, Step, skipped
+from augment.effects.effect import (
+    PICTURE,
+    Effect,
+    EffectInScene,
+    EffectPlan,
+    LabelInputs,
+    RenderedView,
+    Step,
+    skipped,
+)
 from augment.effects.lidar.beam import Echoes
 from augment.jobs.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH
@@ -58,14 +67,14 @@ class DustEffect(Effect):
         visible="clear_fraction",
     )
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
         dust = self.of(recipe)
         if dust is None:
-            return Placed(None, skipped((TINT,), "the recipe has no dust", PICTURE))
+            return EffectPlan(None, skipped((TINT,), "the recipe has no dust", PICTURE))
         step = Step(TINT, True, f"half of what stands {dust.half_m:g} m away is dust", PICTURE)
-        return Placed(dust, (step,), buffers=frozenset({EXPECTED_DEPTH}))
+        return EffectPlan(dust, (step,), buffers=frozenset({EXPECTED_DEPTH}))
 
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         raster, dust = drawn.raster, own.data
         assert raster.expected_depth is not None and raster.alpha is not None
         with timed(TINT):
@@ -79,10 +88,10 @@ class DustEffect(Effect):
         return replace(drawn, rgb=rgb, masks={**drawn.masks, "dust": clear < 0.5})
 
     def measure(
-        self, placed: PlacedBoxes, camera: Camera, view: EffectView
+        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
         away_m = np.linalg.norm(placed.centres_m - camera.centre.numpy(), axis=1)
         return {"clear_fraction": np.exp2(-away_m / view.placed.data.half_m)}
 
-    def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
+    def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
         echoes.gain *= np.exp2(-2 * echoes.air_m / own.data.half_m)  # there and back

@@ -19,8 +19,8 @@ from pydantic import ValidationError
 
 from augment import effects
 from augment.cameras import Camera
-from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import support_of
+from augment.effects.snow.snow import exposure_settings
+from augment.effects.snow.support import exposed_surface_of
 from augment.geometry import rigid
 from augment.memo import memo_of
 from augment.plan import make_plan
@@ -171,8 +171,8 @@ class Place:
             sky=sky,
         )
         for slope in SLOPES_DEG:
-            settings = placement_settings(snow_model(max_slope_deg=slope), base)
-            memo_of(scene).put(("snow support", settings), support_of(base, settings))
+            settings = exposure_settings(snow_model(max_slope_deg=slope), base)
+            memo_of(scene).put(("snow support", settings), exposed_surface_of(base, settings))
         return scene
 
 

@@ -19,11 +19,11 @@ from batch_scenes import FakeView, fake_render, open_fake, tree_digest
 
 from augment.cameras import Camera
 from augment.errors import OutputError
-from augment.jobs.block_worker import WorkSetup
+from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.generate import GenerateJob
 from augment.jobs.job_state import ProgressLog
 from augment.jobs.layout import STATE_FOLDER
-from augment.jobs.manifest import read_finished
+from augment.jobs.manifest import read_manifest_rows
 from augment.jobs.store import open_store
 from augment.scene import Scene
 from recipes.job import Job, JobRecipes, JobScene
@@ -71,7 +71,7 @@ def make_job(
 ) -> GenerateJob:
     """7 frames of 2 cameras in 2 scenes under 2 recipes, 28 images, unless told otherwise."""
     entries = [s if isinstance(s, JobScene) else JobScene(uri=s) for s in scenes]
-    setup = WorkSetup(str(out), scratch, "auto", opener, renderer)
+    setup = JobWorkerSetup(str(out), scratch, "auto", opener, renderer)
     return GenerateJob(recipes or make_recipes(), entries, setup, executor=executor, **options)
 
 
@@ -194,7 +194,7 @@ def check_reader(out: Path, reference_digests: dict[str, str], *, may_fail: bool
     expected.
     """
     try:
-        table = read_finished(open_store(out))
+        table = read_manifest_rows(open_store(out))
     except OutputError as error:
         assert "neither" in str(error), error
         return 0

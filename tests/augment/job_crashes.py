@@ -46,7 +46,7 @@ from augment.errors import OutputError
 from augment.jobs.atomic import TEMPORARY_SUFFIX
 from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
 from augment.jobs.layout import STATE_FOLDER
-from augment.jobs.manifest import read_finished
+from augment.jobs.manifest import read_manifest_rows
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import open_store
 from augment.jobs.tables import lidar_bytes
@@ -445,7 +445,7 @@ def die_at_one_image(folder: Path) -> dict:
     require(
         "was killed by SIGKILL while rendering this image" in str(counts["failures"]), f"{counts}"
     )
-    rows = read_finished(open_store(out)).to_pylist()
+    rows = read_manifest_rows(open_store(out)).to_pylist()
     failed = [(r["variant"], r["frame"], r["camera"]) for r in rows if r["status"] == "failed"]
     require(failed == [("fog-000", 1, "front")] and len(rows) == 28, f"dying: {failed}")
     before = sum(rendered_images()[1].values())
@@ -479,7 +479,7 @@ def die_while_opening(folder: Path) -> dict:
     finish(generating(out, shard=(1, 2)), "half")
     counts = render_dying()
     require(counts["skipped"] + counts["written"] == 16 and counts["failed"] == 12, f"{counts}")
-    rows = read_finished(open_store(out)).to_pylist()
+    rows = read_manifest_rows(open_store(out)).to_pylist()
     failed = {row["scene"] for row in rows if row["status"] == "failed"}
     require(failed == {"b"} and len(rows) == 28, f"opening later: {failed}")
     finish(generating(out), "opening later: it goes on")

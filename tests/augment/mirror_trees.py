@@ -12,8 +12,8 @@ import numpy as np
 
 from augment.jobs.manifest import read_manifest
 from augment.jobs.mirror import (
-    Mirrored,
-    SourceTree,
+    DatasetFolder,
+    MirrorResult,
     mirror_dataset,
     mirror_folder,
     survey,
@@ -49,8 +49,8 @@ def write_dataset(
     return root
 
 
-def tree_of(root: Path, **options) -> SourceTree:
-    return SourceTree(f"test:{root}", root.absolute(), IMAGES, **options)
+def tree_of(root: Path, **options) -> DatasetFolder:
+    return DatasetFolder(f"test:{root}", root.absolute(), IMAGES, **options)
 
 
 _open = functools.cache(open_fake)
@@ -84,7 +84,7 @@ def render(root: Path, out: Path, *, scale: float = 1.0, name: str = "fog", **op
     run_job(job, scene_loader=lambda _: scene_of(root), renderer=renderer, progress=False)
 
 
-def mirror(root: Path, out: Path, variant: str = "fog-000", **options) -> Mirrored:
+def mirror(root: Path, out: Path, variant: str = "fog-000", **options) -> MirrorResult:
     """Build the copy of the dataset with the images that `render` made."""
     tree = options.pop("tree", None) or tree_of(root)
     rows = [row for row in read_manifest(out).to_pylist() if row["variant"] == variant]

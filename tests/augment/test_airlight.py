@@ -8,10 +8,10 @@ import torch
 from pydantic import ValidationError
 
 from augment.cameras import Camera
-from augment.effects.smog import before_map
+from augment.effects.smog import fog_before_color_map
 from augment.plan import make_plan
 from augment.render.buffers import RenderOutput
-from augment.render.composite import add_elevation, composite_sky, sky_behind
+from augment.render.composite import add_elevation, composite_sky, simplify_sky
 from augment.render.fog import Fog, airlight_gain
 from augment.scene import Ground, Scene
 from augment.sky import CubemapSky
@@ -125,12 +125,12 @@ def test_a_camera_that_is_blind_to_a_channel_does_not_blow_up():
     nothing, faint = torch.zeros(3, 4), 1e-20 * torch.eye(3, 4)
     mixed = torch.tensor([[1.0, 1, 1, 0], [1, 1, 1, 0], [1, 1, 1.001, 0]])  # all but singular
     for color_map in (blind, nothing, faint, mixed, 0.01 * mixed, 1e6 * mixed):
-        found = np.array(before_map(fog, color_map, common).rgb)
+        found = np.array(fog_before_color_map(fog, color_map, common).rgb)
         # No residual counts for more than 1 / (2 sqrt(1e-4)) = 50 times itself.
         residual = (common - color_map)[:, :3] @ torch.tensor(AIR).double() + common[:, 3]
         assert np.linalg.norm(found - AIR) <= 50.01 * float(residual.norm())
-    assert before_map(fog, nothing, common).rgb == pytest.approx(AIR)
-    red, green, _ = before_map(fog, blind, common).rgb
+    assert fog_before_color_map(fog, nothing, common).rgb == pytest.approx(AIR)
+    red, green, _ = fog_before_color_map(fog, blind, common).rgb
     assert red == pytest.approx(AIR[0]) and green == pytest.approx(1.05 * AIR[1] + 0.0575, abs=1e-3)
 
 
@@ -222,7 +222,7 @@ def test_the_kernels_are_the_definition(height, eye_z):
 def test_endless_fog_is_a_sky_of_its_airlight(road):
     """Which water mirrors, too."""
     fog = Fog(0.05, AIR, overcast=1.0)
-    sky, before = sky_behind(road.sky, fog)
+    sky, before = simplify_sky(road.sky, fog)
     assert before is None
     rays = torch.randn(500, 3, generator=torch.Generator().manual_seed(2))
     expected = torch.tensor(AIR) + airlight_gain(fog, rays[:, 2] / rays.norm(dim=-1))

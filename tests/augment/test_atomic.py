@@ -20,10 +20,10 @@ from augment.jobs.atomic import (
     path_below,
     read_file,
     remove_temporaries,
-    replaced_file,
-    replaced_folder,
     wait_for_lock,
     write_atomic,
+    write_file_atomically,
+    write_folder_atomically,
 )
 from augment.jobs.claims import try_lock
 from augment.jobs.processes import OutputLock, file_lock
@@ -33,7 +33,7 @@ DATA = b"whole" * 1000
 
 
 def write_folder(path: Path) -> None:
-    with replaced_folder(path, ("data", "more")) as new:
+    with write_folder_atomically(path, ("data", "more")) as new:
         (new / "more").mkdir()
         (new / "more" / "data").write_bytes(DATA)
 
@@ -103,7 +103,11 @@ def test_what_a_living_process_writes_stays(tmp_path, kind):
     begun = os.pipe()
 
     def slowly() -> None:
-        write = replaced_file(path) if kind == "file" else replaced_folder(path, ("mine",))
+        write = (
+            write_file_atomically(path)
+            if kind == "file"
+            else write_folder_atomically(path, ("mine",))
+        )
         with write as target:
             os.write(begun[1], b".")
             os.read(go_on[0], 1)
@@ -201,7 +205,7 @@ def test_a_name_may_be_as_long_as_the_system_allows(tmp_path):
         write_folder(tmp_path / "folders" / name)
         assert (tmp_path / name).read_bytes() == DATA
     assert not temporaries(tmp_path)
-    assert atomic.temporary_beside(tmp_path / "x") != atomic.temporary_beside(tmp_path / "x")
+    assert atomic.temporary_path(tmp_path / "x") != atomic.temporary_path(tmp_path / "x")
 
 
 def _link(path: Path) -> None:

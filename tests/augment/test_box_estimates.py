@@ -11,13 +11,13 @@ from batch_scenes import ORIGIN_M
 from box_views import UPRIGHT, make_boxes, make_camera
 
 from augment.box_estimates import Evidence, SortedPoints, estimate_boxes
-from augment.boxes import Instances, PlacedBoxes, find_occlusion, outline_placed
+from augment.boxes import Instances, WorldBoxes, find_occlusion, outline_world_boxes
 from augment.cameras import Camera
 from augment.jobs.box_tables import BOXES_2D, BoxNumbers
 from augment.jobs.files import BoxWeather, label_view
 from augment.labels import Boxes
 from augment.semantics import SemanticClass
-from augment.views import SurfaceView, WeatheredView
+from augment.views import LabelSurfaces, WeatheredView
 from recipes.schema import Output, Recipe, Render
 
 CAR = ((30.0, 0.0, 0.75), (4.0, 1.8, 1.5), UPRIGHT)
@@ -47,7 +47,7 @@ def label(
     depth = np.broadcast_to(np.float32(depth_m), size).copy()
     unknown = np.full(size, SemanticClass.UNKNOWN, np.uint8)
     none = np.zeros(size, np.uint16) if instance else None
-    surface = SurfaceView(
+    surface = LabelSurfaces(
         depth, none, depth, unknown if classes is None else classes,
         is_bare=False, classes=classes, own_car=own_car,
     )  # fmt: skip
@@ -85,8 +85,8 @@ class _Labels:
 
 
 def amodal_of(*boxes: tuple) -> np.ndarray:
-    world_boxes = PlacedBoxes.of(make_boxes(*boxes), ORIGIN_M)
-    return outline_placed(world_boxes, CAMERA).xyxy
+    world_boxes = WorldBoxes.of(make_boxes(*boxes), ORIGIN_M)
+    return outline_world_boxes(world_boxes, CAMERA).xyxy
 
 
 @pytest.mark.parametrize(
@@ -144,13 +144,13 @@ def test_a_rendered_picture_shows_only_what_has_splats(splats: list, is_drawn: b
 
 
 def test_what_snow_buries_of_an_object_is_not_estimated() -> None:
-    world_boxes = PlacedBoxes.of(make_boxes(CAR), ORIGIN_M)
+    world_boxes = WorldBoxes.of(make_boxes(CAR), ORIGIN_M)
     depth_m = np.full((CAMERA.height, CAMERA.width), 100, np.float32)
     evidence = Evidence(SortedPoints.of(np.array(ON_CAR)), NO_POINTS, frozenset())
     bottoms = []
     for buried_m in (0.0, 0.4):
         estimates = estimate_boxes(
-            world_boxes, ("car",), CAMERA, outline_placed(world_boxes, CAMERA),
+            world_boxes, ("car",), CAMERA, outline_world_boxes(world_boxes, CAMERA),
             find_occlusion(world_boxes, CAMERA, depth_m), lambda: evidence,
             on_photo=True, buried_m=np.array([buried_m]),
         )  # fmt: skip

@@ -19,7 +19,7 @@ from augment.cast_shadows import (
     shadows_of,
     sun_transmittance,
 )
-from augment.effects.snow.light import illumination_of, light_of, told_light
+from augment.effects.snow.light import describe_light, find_scene_light, find_snow_light
 from augment.plan import make_plan
 from augment.render.fog import Fog
 from augment.render.sh import SH_C0
@@ -90,8 +90,8 @@ def test_dark_asphalt_is_no_shadow_and_a_grey_day_has_none():
         scene = street(np.ones(len(spots)), albedo=albedo)
         shadows = found(scene)
         assert shadows.certainty == 0 and shadows.luminance_ratio == 1
-        assert light_of(scene).sun_share == pytest.approx(0.1)
-        assert "flat" in told_light(scene, Snow(depth_m=0.1))
+        assert find_scene_light(scene).sun_share == pytest.approx(0.1)
+        assert "flat" in describe_light(scene, Snow(depth_m=0.1))
 
 
 def test_snow_has_the_contrast_of_the_ground():
@@ -99,7 +99,7 @@ def test_snow_has_the_contrast_of_the_ground():
     light = np.array([0.2126, 0.7152, 0.0722])
 
     def contrast(scene: Scene, snow: Snow) -> float:
-        own = illumination_of(scene, snow)
+        own = find_snow_light(scene, snow)
         lit, shadow = (
             float(np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4) @ light)
             for c in (np.array(own.lit_rgb), np.array(own.shadow_rgb))
@@ -114,7 +114,7 @@ def test_snow_has_the_contrast_of_the_ground():
     assert contrast(mild, snow) == pytest.approx(ratio, abs=0.02)
     assert 0.35 < contrast(street(in_sun()), snow) < 0.5
     snow_without_sun = Snow(depth_m=0.1, light=SnowLight(sun=0.0))
-    assert contrast(mild, snow_without_sun) > 0.9 and "light.sun is 0" in told_light(
+    assert contrast(mild, snow_without_sun) > 0.9 and "light.sun is 0" in describe_light(
         mild, snow_without_sun
     )
 
@@ -124,7 +124,7 @@ def test_little_or_no_ground_tells_nothing():
     little = drive(sheet((0, 2), (0, 2), semantic=ROAD), wall(3, (0, 2), (0, 2)))
     for scene in (open_road, little):
         assert shadows_of(scene) is None
-        assert light_of(scene).shadow_ratio is None
+        assert find_scene_light(scene).shadow_ratio is None
 
 
 # ---- Shadows in smog -----------------------------------------------------------------------------

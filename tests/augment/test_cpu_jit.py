@@ -21,7 +21,7 @@ from augment.render import threads
 from augment.render.compile_ahead import describe_type, find_type, read_signatures
 from augment.render.cpu import jit as cpu_jit
 from augment.render.cpu import simd as v8
-from augment.render.cpu.jit import KERNELS, kernel, seconds_compiling
+from augment.render.cpu.jit import KERNELS, compile_seconds, kernel
 from augment.render.cpu.kernel_cache import (
     KEEP_DAYS,
     SECONDS_A_DAY,
@@ -122,7 +122,7 @@ def test_the_time_of_a_progress_bar_leaves_out_compiling(tmp_path, monkeypatch):
             kernel(double)(values)
         bar.update()
         passed_s = time.perf_counter() - started
-        assert seconds_compiling() > 0 and bar.format_dict["elapsed"] < passed_s / 2
+        assert compile_seconds() > 0 and bar.format_dict["elapsed"] < passed_s / 2
 
 
 def test_the_folder_of_a_kernel_is_named_by_all_its_sources(tmp_path):
@@ -440,11 +440,11 @@ def test_without_tbb_callers_take_turns():
 
 def test_limits():
     threads.limit_threads(1)
-    assert threads.thread_count() == 1
+    assert threads.num_kernel_threads() == 1
     with threads.kernel_threads():
         assert numba.get_num_threads() == 1
     threads.limit_threads(10_000)
-    assert threads.thread_count() == numba.get_num_threads()
+    assert threads.num_kernel_threads() == numba.get_num_threads()
     with pytest.raises(ValueError, match="count must be >= 1 thread, or None for no limit; got 0"):
         threads.limit_threads(0)
 

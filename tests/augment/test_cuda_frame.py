@@ -21,14 +21,14 @@ pytest.importorskip("triton")
 
 from augment.cameras import Camera
 from augment.effects.snow import placement
-from augment.effects.snow.placement import PlacementSettings, place_snow_support
+from augment.effects.snow.placement import ExposureSettings, find_exposed_surface
 from augment.geometry import rigid, rotmat_from_quat
 from augment.labels import Boxes
 from augment.render.buffers import CUDA, RenderOutput, available_backends
 from augment.render.composite import composite_sky, map_colors, quantise
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.runtime import upload
-from augment.render.fog import Fog, fog_raster
+from augment.render.fog import Fog, apply_fog_to_render
 from augment.render.rasterize import renormalise_alpha
 from augment.scene import Ground, Scene
 from augment.semantics import SemanticClass
@@ -116,8 +116,8 @@ def test_the_sky_behind_the_splats(away, name, smog):
 @pytest.mark.parametrize("medium", [UNIFORM, LAYERED, Fog(5.0, (0.1, 0.2, 0.3), 3.0)])
 def test_smog_on_buffers(away, medium):
     seen, view = images(), camera()
-    expected = fog_raster(seen, view, medium)
-    got = fog_raster(on_gpu(seen), view, medium)
+    expected = apply_fog_to_render(seen, view, medium)
+    got = apply_fog_to_render(on_gpu(seen), view, medium)
     torch.testing.assert_close(got.cpu(), expected, atol=2e-6, rtol=0)
 
 
@@ -269,12 +269,12 @@ def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
     ground = dataclasses.replace(small, means=16 * small.means, scales=16 * small.scales)
     scene = drive(ground, places=[(-3.0, 0.0, 1.5)])
     cameras = [camera.scaled(0.12) for camera in cameras_of(scene)]
-    settings = PlacementSettings(cell_m=8.0)
-    monkeypatch.setattr(placement, "_SQUARE_CELLS", 16)  # several, which threads work on
-    expected = place_snow_support(scene, cameras, settings)
+    settings = ExposureSettings(cell_m=8.0)
+    monkeypatch.setattr(placement, "_MAX_SQUARE_CELLS", 16)  # several, which threads work on
+    expected = find_exposed_surface(scene, cameras, settings)
     assert len(expected.ground) > 5
     with pretended_gpu(monkeypatch):
-        found = place_snow_support(scene, cameras, settings, backend="cuda")
+        found = find_exposed_surface(scene, cameras, settings, backend="cuda")
     assert_alike(found.ground, expected.ground)
 
 
@@ -282,9 +282,9 @@ def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
 def test_a_larger_bed_with_a_vehicle_is_the_cpus():
     car = box_car(start=(6.0, 0.0))
     scene = drive(sheet((-6.0, 20.0), (-8.0, 8.0)), actors=[car])
-    expected = place_snow_support(scene, cameras_of(scene), PlacementSettings(cell_m=0.1))
-    found = place_snow_support(
-        scene, cameras_of(scene), PlacementSettings(cell_m=0.1), backend="cuda"
+    expected = find_exposed_surface(scene, cameras_of(scene), ExposureSettings(cell_m=0.1))
+    found = find_exposed_surface(
+        scene, cameras_of(scene), ExposureSettings(cell_m=0.1), backend="cuda"
     )
     assert found.actors.keys() == expected.actors.keys() == {"car"}
     for a, b in ((found.ground, expected.ground), (found.actors["car"], expected.actors["car"])):

@@ -19,7 +19,7 @@ from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
 from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
 from augment.render.fog import Fog
-from augment.render.gsplat_backend import draw_with_gsplat
+from augment.render.gsplat_backend import render_with_gsplat
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from tests.augment import gsplat_stand_in
@@ -176,7 +176,7 @@ def test_gsplat_says_which_splats_it_drew(monkeypatch):
     gsplat_stand_in.install(monkeypatch)
     gaussians = stack(one_gaussian((-3.0, 0.0, 0.0)), one_gaussian())
     part = tracked(PosedGaussians(gaussians), "means")
-    drawn = draw_with_gsplat([part], camera_ahead(9, 9, 9.0), DEFAULT, with_depth=False)
+    drawn = render_with_gsplat([part], camera_ahead(9, 9, 9.0), DEFAULT, with_depth=False)
     assert drawn.ids.tolist() == [1] and drawn.means2d.shape == (1, 2)
     assert drawn.expected_depth is None and drawn.colors.shape == (2, 3)
     drawn.rgb.sum().backward()

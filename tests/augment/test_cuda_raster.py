@@ -28,7 +28,7 @@ from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.driver import list_tiles
 from augment.render.cuda.splats import BLOCK, HIDDEN, TILE, CudaSplats, CudaTiles
-from augment.render.layout import UNCUT, HeightClip
+from augment.render.layout import SURFACE_DEPTHS_ONLY, HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close, assert_labels_equal, assert_stored_render
@@ -253,7 +253,7 @@ def test_all_kinds_of_parts():
 @pytest.mark.parametrize(
     ("clip", "is_orthographic"),
     [
-        pytest.param(UNCUT, False, marks=LONG),
+        pytest.param(SURFACE_DEPTHS_ONLY, False, marks=LONG),
         pytest.param(HeightClip(0.1, "above"), False, marks=LONG),
         pytest.param(HeightClip(0.1, "below", reach_m=0.5), False, marks=LONG),
         (HeightClip(0.2, "below", overlaps=True), True),

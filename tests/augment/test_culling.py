@@ -17,7 +17,7 @@ from augment.render.composite import composite_sky
 from augment.render.constants import ALPHA_MIN, RasterSettings
 from augment.render.cpu import order
 from augment.render.cpu.driver import gather_inputs, rasterize_cpu
-from augment.render.cpu.order import CELL, order_of
+from augment.render.cpu.order import CELL_SIZE, spatial_order
 from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
@@ -34,7 +34,7 @@ COUNT = 6000  # a dozen cells
 @pytest.fixture(autouse=True)
 def _small_scenes_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have few Gaussians taken by their boxes, which costs more than it saves."""
-    monkeypatch.setattr(order, "_MIN_COUNT", 8 * CELL)
+    monkeypatch.setattr(order, "_MIN_COUNT", 8 * CELL_SIZE)
 
 
 def copy_of(gaussians: Gaussians) -> Gaussians:
@@ -44,8 +44,8 @@ def copy_of(gaussians: Gaussians) -> Gaussians:
 
 def drawn(gaussians: Gaussians) -> Gaussians:
     """As they are after a view, so that the next one takes them block by block."""
-    order_of(gaussians)
-    assert order_of(gaussians) is not None
+    spatial_order(gaussians)
+    assert spatial_order(gaussians) is not None
     return gaussians
 
 
@@ -110,13 +110,13 @@ def test_those_too_faint_for_any_view_are_not_read_and_change_no_bit():
     scene.opacities[5] = math.nan  # of which nothing is known
     expected = draw(copy_of(scene), camera, BUFFERS)
     places_read(drawn(scene), camera)
-    known = order_of(scene)
+    known = spatial_order(scene)
     assert known is not None
     assert COUNT - len(known.ids) == int((scene.opacities < ALPHA_MIN).sum()) > COUNT / 2
     assert_same_bits(draw(scene, camera, BUFFERS), expected, BUFFERS)
     again = dataclasses.replace(scene, opacities=shown)  # the same means and scales beside others
     assert_same_bits(draw(again, camera), draw(copy_of(again), camera))
-    whole = order_of(again)
+    whole = spatial_order(again)
     assert whole is not None and len(whole.ids) == COUNT
     scene.opacities[:] = shown
     assert_same_bits(draw(scene, camera, BUFFERS), draw(copy_of(scene), camera, BUFFERS), BUFFERS)
@@ -124,7 +124,7 @@ def test_those_too_faint_for_any_view_are_not_read_and_change_no_bit():
 
 def test_rows_go_with_their_order():
     scene = random_gaussians(COUNT)
-    own = order_of(drawn(scene))
+    own = spatial_order(drawn(scene))
     assert own is not None
     another = own.without(scene.opacities.numpy() < 0.5, scene.means.numpy())
     rows = weakref.ref(another.sorted(scene.scales).rows)

@@ -43,7 +43,7 @@ from augment.dataset.weather_dataset import Rows
 from augment.errors import BackendUnavailable, OutputError, SceneError
 from augment.geometry import invert_rigid, rotmat_from_quat, transform_points
 from augment.jobs.files import box_tables
-from augment.jobs.layout import MANIFEST
+from augment.jobs.layout import MANIFEST_FILE
 from augment.jobs.manifest import parse_manifest, publish_part
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import StoredFile, StoredFileMissing
@@ -388,8 +388,8 @@ def test_a_remote_folder_reads_like_a_local_one(folder: Path, remote: MemoryStor
 
 
 def test_blocks_of_running_jobs_are_seen(folder: Path, remote: MemoryStore) -> None:
-    table = parse_manifest(remote.read(MANIFEST), "here")
-    remote.delete([MANIFEST])
+    table = parse_manifest(remote.read(MANIFEST_FILE), "here")
+    remote.delete([MANIFEST_FILE])
     publish_part(remote, "block", table.slice(0, 8))
     expected = WeatherDataset(folder).table.slice(0, 8)
     assert same_tables(WeatherDataset(remote).table, expected)
@@ -454,7 +454,7 @@ def test_only_what_is_asked_for_is_read(remote: MemoryStore) -> None:
 @pytest.mark.parametrize("checksum", ["ab" * 32, None, "x"])
 def test_columns_are_the_manifests(folder: Path, checksum: str | None) -> None:
     """Also those with more values than 16 bits tell apart, or with other checksums."""
-    table = pq.read_table(folder / MANIFEST)
+    table = pq.read_table(folder / MANIFEST_FILE)
     all_rows = WeatherDataset(folder).rows
     chosen = all_rows.take(np.array([5, 3, -1]))
     assert same_tables(all_rows.to_arrow(), table)

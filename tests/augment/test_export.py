@@ -28,13 +28,13 @@ from augment.files.export import (
     export_usd,
     inria_cameras,
     is_parts_folder,
-    moved_gaussians,
+    transform_gaussians_rigidly,
 )
 from augment.files.ply import read_ply, read_splats
 from augment.geometry import rigid, rotmat_from_quat, transform_points
 from augment.render.rasterize import rasterize
 from augment.render.sh import evaluate_sh
-from augment.scene import Actor, ColorWaves, Gaussians, PosedGaussians, Scene, Track
+from augment.scene import Actor, ColorSeries, Gaussians, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
 
 NOW = START_NS + 100_000_000
@@ -51,7 +51,7 @@ def drive(**changes) -> Scene:
     )
     moved = rigid(turned[:3, :3], turned[:3, 3] + 0.4)
     rng = torch.Generator().manual_seed(5)
-    waves = ColorWaves(
+    waves = ColorSeries(
         0.3 * torch.randn(60, 4, 3, generator=rng), times, torch.tensor([0.0, 0.7]).double()
     )
     around = random_gaussians(60, seed=3, sh_degree=3)
@@ -134,7 +134,7 @@ def test_shape_and_colour_turn_along(quat, shift, degree):
     """Covariances, and the colour seen from a direction that turns with the Gaussians."""
     before = random_gaussians(20, sh_degree=degree)
     rotation = rotmat_from_quat(torch.tensor(quat, dtype=torch.float64))
-    after = moved_gaussians(before, rotation, torch.tensor(shift, dtype=torch.float64))
+    after = transform_gaussians_rigidly(before, rotation, torch.tensor(shift, dtype=torch.float64))
 
     def covariances(gaussians: Gaussians) -> torch.Tensor:
         axes = rotmat_from_quat(gaussians.quats.double()) * gaussians.scales[:, None].double()

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from augment.cameras import Camera
-from augment.effects.snow.cells import SnowCells
-from augment.effects.snow.layer import find_depths, profile_of, surface_heights
-from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import support_of
+from augment.effects.snow.cells import ExposedCells
+from augment.effects.snow.layer import find_depths, find_snow_tops, make_depth_profile
+from augment.effects.snow.snow import exposure_settings
+from augment.effects.snow.support import exposed_surface_of
 from augment.plan import make_plan
 from augment.rng import rng_for
 from augment.scene import Actor, Gaussians, Track
@@ -199,18 +199,18 @@ def test_higher_water_never_uncovers(place: Place, camera: Camera, levels: list[
 DEPTHS_M = (0.0, 1e-8, 0.002, 0.01, 0.03, 0.05, 0.1, 0.2, 0.29, 0.3, 0.31, 0.5, 1.0, 2.0, 10.0)
 
 
-def rough_cells(seed: int, relief_m: float) -> SnowCells:
+def rough_cells(seed: int, relief_m: float) -> ExposedCells:
     """Ground no two neighbouring cells of which are level."""
     heights = np.random.default_rng(seed).normal(0, relief_m, (24, 20)).astype(np.float32)
     return cells_on_grid(heights, 0.05)
 
 
-def surface(cells: SnowCells, snow: Snow, seed: int) -> np.ndarray:
+def surface(cells: ExposedCells, snow: Snow, seed: int) -> np.ndarray:
     """Height of every cell's surface, snow included."""
     rng = rng_for(seed=seed, scene="extremes", effect="snow")
-    profile = profile_of(snow, rng, on_ground=True)
+    profile = make_depth_profile(snow, rng, on_ground=True)
     depths = find_depths(cells, profile, rng.integers(0, 2**64, dtype=np.uint64))
-    return surface_heights(cells, depths.heights)
+    return find_snow_tops(cells, depths.heights)
 
 
 @pytest.mark.long
@@ -229,7 +229,7 @@ def test_deeper_snow_never_lowers_the_surface(
     relief_m: float | None, depths: list[float], coverage: float, drift: float, tracks: str, seed
 ):
     if relief_m is None:
-        cells = support_of(street(), placement_settings(snow_model(), street())).ground
+        cells = exposed_surface_of(street(), exposure_settings(snow_model(), street())).ground
     else:
         cells = rough_cells(seed, relief_m)
     more = {"coverage": coverage, "wind": {"drift": drift}, "tracks": tracks}

@@ -13,14 +13,14 @@ import torch
 from augment.cameras import Camera, Frame
 from augment.effects.falling import air, reference
 from augment.effects.falling.air import (
-    Falling,
     Glow,
+    Precipitation,
+    cell_walk,
+    compute_clear_share,
     draw_falling,
-    drawn_depths_m,
     find_drops,
-    left_clear,
+    max_depths_m,
     veil_of,
-    walk_of,
 )
 from augment.effects.falling.drops import sizes_of
 from augment.effects.falling.shutter import STANDING, Motion, motion_of
@@ -36,7 +36,7 @@ from recipes.schema import Rain, Recipe, Sensor, Weather
 from recipes.snowfall import Snowfall
 from tests.scenes import camera_ahead, random_gaussians
 
-RAIN = Falling("rain", 20.0, (3.0, -1.0), 0.0, 7, 0.005, 0.25)
+RAIN = Precipitation("rain", 20.0, (3.0, -1.0), 0.0, 7, 0.005, 0.25)
 FORWARD = Motion(np.array([10.0, 1, 0]), np.array([0, 0, 0.3]))
 GLOW = Glow(np.array([0.5, 0.6, 0.7]), np.full(3, 0.3), 0.1 * np.eye(3))
 
@@ -93,9 +93,9 @@ def test_sizes_are_numbers_at_any_rate():
 def test_drops_in_the_lattice_are_as_many_as_the_law_says():
     """As many in the view's pyramid, over 100 heights of it: 5 % is three sigma and more."""
     camera, sizes = view(), RAIN.sizes
-    ends = drawn_depths_m(RAIN, camera)
+    ends = max_depths_m(RAIN, camera)
     found = 0.0
-    walk = walk_of(dataclasses.replace(RAIN, exposure_s=1e-6), camera, STANDING, "x")
+    walk = cell_walk(dataclasses.replace(RAIN, exposure_s=1e-6), camera, STANDING, "x")
     for second in range(100):
         moved = walk._replace(moves=walk.moves + np.array([0.0, 0.0, 1000.0 * second]))
         u, v, *_ = find_drops(moved).T.astype(np.float64)
@@ -113,7 +113,7 @@ def test_the_same_drop_is_in_two_cameras():
     """What one sees of a point, projected by hand, the other finds at the same place."""
     still = dataclasses.replace(RAIN, exposure_s=1e-9)
     cameras = [view(), view(position=(0.05, 0.1, 0.02), yaw=0.1)]
-    seen = [find_drops(walk_of(still, c, STANDING, "x")).astype(np.float64) for c in cameras]
+    seen = [find_drops(cell_walk(still, c, STANDING, "x")).astype(np.float64) for c in cameras]
     u, v, _, _, per_z = seen[0].T[:5]
     local = np.stack([(u - cameras[0].cx) / cameras[0].fx, (v - cameras[0].cy) / cameras[0].fy])
     local = np.concatenate([local, np.ones((1, len(u)))]) / per_z
@@ -133,7 +133,7 @@ def test_a_streak_is_as_long_as_its_drop_moves():
     """|v| T f / z of a standing camera that looks level: the fall is across the view."""
     calm = dataclasses.replace(RAIN, wind_mps=(0.0, 0.0))
     camera = view()
-    drops = find_drops(walk_of(calm, camera, STANDING, "x")).astype(np.float64)
+    drops = find_drops(cell_walk(calm, camera, STANDING, "x")).astype(np.float64)
     assert np.abs(drops[:, 0] - drops[:, 2]).max() < 1e-3
     fall_m = (drops[:, 3] - drops[:, 1]) / drops[:, 4] / camera.fy
     speeds = calm.sizes.speeds_mps * calm.exposure_s
@@ -144,16 +144,16 @@ def test_a_streak_is_as_long_as_its_drop_moves():
 def test_streaks_radiate_from_where_the_camera_drives_to():
     camera = view()
     motion = Motion(np.array([200.0, 0, 0]), np.zeros(3))
-    drops = find_drops(walk_of(RAIN, camera, motion, "x")).astype(np.float64)
+    drops = find_drops(cell_walk(RAIN, camera, motion, "x")).astype(np.float64)
     outward = (drops[:, 2:4] - drops[:, :2]) * (drops[:, :2] - (camera.cx, camera.cy))
     assert (outward.sum(1) > 0).mean() > 0.97
 
 
 @pytest.mark.parametrize("kind", ["rain", "snow"])
 def test_kernels_equal_their_reference(kind):
-    falling = Falling(kind, 5.0 if kind == "rain" else 1.0, (3.0, -1.0), 0.3, 7, 0.01, 0.25)
+    falling = Precipitation(kind, 5.0 if kind == "rain" else 1.0, (3.0, -1.0), 0.3, 7, 0.01, 0.25)
     camera = view(yaw=0.3, timestamp_ns=10**18)
-    walk = walk_of(falling, camera, FORWARD, "x")
+    walk = cell_walk(falling, camera, FORWARD, "x")
     drops, slow = find_drops(walk), reference.find_drops_by_numpy(walk)
     assert len(drops) == len(slow) > 30
     order, slow_order = np.lexsort(drops.T), np.lexsort(slow.T)
@@ -161,7 +161,7 @@ def test_kernels_equal_their_reference(kind):
     rng = np.random.default_rng(0)
     alpha, depth = rng.random((2, 120, 160), np.float32)
     depth *= 8 * (depth > 0.2)
-    clear = left_clear(drops, alpha, depth)
+    clear = compute_clear_share(drops, alpha, depth)
     np.testing.assert_allclose(clear, reference.cover_by_numpy(drops, alpha, depth), atol=1e-5)
 
 
@@ -206,13 +206,13 @@ def test_a_bright_sky_does_not_shine_through_the_edges_of_what_is_near():
 
 def test_a_streak_takes_twice_its_drops_cross_section():
     """Whatever its length, its blur and where pixels lie: summed over the image."""
-    drops = find_drops(walk_of(RAIN, view(), FORWARD, "x"))
+    drops = find_drops(cell_walk(RAIN, view(), FORWARD, "x"))
     inside = (drops[:, :4] > 10).all(1) & (drops[:, [0, 2]] < 150).all(1)
     inside &= (drops[:, [1, 3]] < 110).all(1)
     shape = (120, 160)
     for drop in drops[inside][:60]:
         nothing = np.zeros(shape, np.float32)
-        clear = left_clear(drop[None], nothing, nothing)
+        clear = compute_clear_share(drop[None], nothing, nothing)
         length = math.hypot(drop[2] - drop[0], drop[3] - drop[1])
         i, o = drop[6], drop[7]
         area = length * (2 * i + (2 * o + i) * (o - i) / (1.5 * (o + i)))
@@ -234,8 +234,8 @@ def test_what_is_not_drawn_is_veil():
             torch.ones(shape),
             torch.full(shape, 400.0),
         )
-        drops = find_drops(walk_of(own, camera, FORWARD, scene.name))
-        clear = left_clear(drops, solid.numpy(), far.numpy())
+        drops = find_drops(cell_walk(own, camera, FORWARD, scene.name))
+        clear = compute_clear_share(drops, solid.numpy(), far.numpy())
         rgb, _ = draw_falling(white, solid, far, camera, own, scene=scene, motion=FORWARD)
         extinction, _, grows, _, whole = veil_of(own, camera, GLOW).bands.astype(np.float64).T
         tau = float((extinction * (400 - whole + grows / 2)).sum())
@@ -246,9 +246,9 @@ def test_what_is_not_drawn_is_veil():
 
 
 def test_drops_behind_a_surface_are_hidden():
-    drops, shape = find_drops(walk_of(RAIN, view(), STANDING, "x")), (120, 160)
+    drops, shape = find_drops(cell_walk(RAIN, view(), STANDING, "x")), (120, 160)
     near = np.full(shape, 0.1, np.float32)
-    assert (left_clear(drops, np.ones(shape, np.float32), near) == 1).all()
+    assert (compute_clear_share(drops, np.ones(shape, np.float32), near) == 1).all()
 
 
 def test_eddies_carry_flakes_at_their_speed_and_bring_them_back():
@@ -292,8 +292,8 @@ def test_streaks_hardly_show_before_the_sky_and_brighten_the_dark():
     contrast = []
     for level in (0.05, 0.8):
         rgb, near = torch.full((*shape, 3), level), torch.full(shape, 8.0)
-        drops = find_drops(walk_of(falling, camera, STANDING, scene.name))
-        clear = left_clear(drops, np.ones(shape, np.float32), near.numpy())
+        drops = find_drops(cell_walk(falling, camera, STANDING, scene.name))
+        clear = compute_clear_share(drops, np.ones(shape, np.float32), near.numpy())
         out, streak = draw_falling(rgb, torch.ones(shape), near, camera, falling, scene=scene)
         contrast.append(float(out[streak].mean() - out[clear > 0.999].mean()))
     assert contrast[0] > 0.03
@@ -310,7 +310,7 @@ def test_streaks_hardly_show_before_the_sky_and_brighten_the_dark():
     ],
 )
 def test_numbers_stay_finite(rate, exposure_ms, fog, depth):
-    falling = Falling("rain", rate, (60.0, 0.0), 0.0, 0, exposure_ms / 1000, 0.1)
+    falling = Precipitation("rain", rate, (60.0, 0.0), 0.0, 0, exposure_ms / 1000, 0.1)
     shape, scene = (120, 160), drive(sky=0.0)
     rgb = torch.tensor([-1.0, 0.0, 3.0]).expand(*shape, 3).contiguous()
     z = torch.full(shape, depth)

@@ -12,17 +12,17 @@ import torch
 from pydantic import ValidationError
 
 from augment import effects
-from augment.boxes import NOT_COUNTED, PlacedBoxes
+from augment.boxes import NOT_COUNTED, WorldBoxes
 from augment.dataset import WeatherDataset
-from augment.effects.effect import EffectView
+from augment.effects.effect import LabelInputs
 from augment.effects.falling.lidar import (
     DROP_REFLECTANCE,
     Scatterers,
     beam_width,
     echo_table,
     precipitation_echoes,
+    receiver_overlap,
     scatterers_of,
-    seen_share,
     sphere_reflectance,
     strongest_drops,
 )
@@ -31,8 +31,8 @@ from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import fog_echoes
 from augment.effects.wet.ground import CELL_M, WetGround
-from augment.effects.wet.kernels import CHANNELS, HOLLOW, OPEN
-from augment.effects.wet.lidar import film_gain, wet_echoes
+from augment.effects.wet.kernels import NUM_CHANNELS, OPEN, PUDDLE_ORDER
+from augment.effects.wet.lidar import dim_wet_echoes, wet_echo_ratio
 from augment.jobs.files import box_tables, visibility
 from augment.jobs.manifest import effect_masks, read_manifest
 from augment.jobs.render_job import RenderJob, run_job
@@ -114,7 +114,9 @@ def test_the_strongest_echo_is_that_of_drops_strewn_one_by_one(kind: Scatterers)
     r = np.interp(rng.random(len(beam)) * volume[-1], volume, far)
     wider = rng.random(len(beam)) * number
     diameter = np.interp(wider, kind.wider_per_m3[::-1], kind.diameters_mm[::-1])
-    share = np.minimum((1e-3 * diameter / beam_width(MODEL, r)) ** 2, 1) * seen_share(MODEL, r)
+    share = np.minimum((1e-3 * diameter / beam_width(MODEL, r)) ** 2, 1) * receiver_overlap(
+        MODEL, r
+    )
     power = signal(kind.reflectance * share, np.maximum(r, 0.1))
     power *= np.exp(-2 * kind.extinction_per_m * r)
     best = np.zeros(count)
@@ -153,7 +155,7 @@ def test_rain_takes_and_adds_by_its_rate() -> None:
         echoes = echoes_of(points, 0.05)
         clear = echoes.ranges_m.copy()
         precipitation_echoes(echoes, rain(rate), np.random.default_rng(1))
-        echoes.lose_faint()
+        echoes.drop_faint()
         sweep = echoes.sweep()
         codes = sweep.columns["weather_code"]
         hard = codes == ATTENUATED
@@ -176,13 +178,13 @@ def test_ranges_are_as_noisy_as_what_is_left_of_their_echo() -> None:
     kind = rain(25)
     gain = math.exp(-2 * kind.extinction_per_m * distance)
     echoes.gain *= gain
-    echoes.spread_ranges(np.ones(count), np.random.default_rng(0).standard_normal(count))
+    echoes.add_range_noise(np.ones(count), np.random.default_rng(0).standard_normal(count))
     level = 0.3 / MODEL.noise_reflectance(np.full(1, distance))[0]
     sigma = 0.09 / math.sqrt(2 * level) * math.sqrt(1 / gain - 1)
     assert echoes.ranges_m.std() == pytest.approx(sigma, rel=0.03)
     assert 0.001 < sigma < 0.05
     untouched = echoes_of(points)
-    untouched.spread_ranges(np.ones(count), np.ones(count))
+    untouched.add_range_noise(np.ones(count), np.ones(count))
     assert (untouched.codes == UNCHANGED).all() and not untouched.is_moved.any()
 
 
@@ -215,7 +217,7 @@ def test_precipitation_of_every_density_stays_finite() -> None:
     ):
         echoes = echoes_of(points)
         precipitation_echoes(echoes, kind, np.random.default_rng(0))
-        echoes.lose_faint()
+        echoes.drop_faint()
         found = echoes.sweep()
         assert np.isfinite(echoes.ranges_m).all() and np.isfinite(echoes.gain).all()
         assert (found.columns["weather_code"][-2:] == UNCHANGED).all()
@@ -228,8 +230,8 @@ def test_precipitation_of_every_density_stays_finite() -> None:
 def ground_of(open_: float = 1.0, hollow: float = 0.0) -> WetGround:
     """Level ground at z = 0, 60 m about the origin."""
     side = round(120 / CELL_M)
-    channels = torch.zeros(side, side, CHANNELS)
-    channels[..., OPEN], channels[..., HOLLOW] = open_, hollow
+    channels = torch.zeros(side, side, NUM_CHANNELS)
+    channels[..., OPEN], channels[..., PUDDLE_ORDER] = open_, hollow
     flat = torch.zeros(side, side)
     return WetGround(-60.0, -60.0, channels, flat, flat + 1, np.array([-1.0, 0.0, 1.0], np.float32))
 
@@ -240,14 +242,14 @@ def test_water_takes_what_fresnel_and_the_film_take() -> None:
     down = 0.9799**2 / (1.33**2 * (1 - p * 0.3))
     one, flat = np.ones(1), np.array([0.2])
     for puddle in (0 * one, one):
-        assert film_gain(one, 0.3 * one, puddle)[0] == pytest.approx(down, rel=0.005)
+        assert wet_echo_ratio(one, 0.3 * one, puddle)[0] == pytest.approx(down, rel=0.005)
     cosines = np.linspace(0, 1, 300)
     for puddle in (np.zeros(300), np.ones(300)):
-        gains = film_gain(cosines, 0.1 * cosines, puddle)
+        gains = wet_echo_ratio(cosines, 0.1 * cosines, puddle)
         assert (np.diff(gains) > -1e-6).all() and (gains >= 0).all() and gains[-1] < 0.6
     rs, rp = (float(np.square(r)) for r in fresnel(0.2, 1.33))
     mirrored = (1 - (rs + rp) / 2) ** 2 / (1.33**2 * (1 - p * 0.1))
-    assert film_gain(flat, 0.1 * flat, one)[0] == pytest.approx(mirrored, rel=0.02)
+    assert wet_echo_ratio(flat, 0.1 * flat, one)[0] == pytest.approx(mirrored, rel=0.02)
 
 
 def fresnel(cosine: float, index: float) -> tuple[float, float]:
@@ -263,7 +265,7 @@ def test_wet_ground_returns_less_and_nothing_else_does() -> None:
 
     def gains(ground: WetGround, wetness: float = 1.0, puddles: float = 0.0) -> np.ndarray:
         echoes = echoes_of(points, 0.02)
-        wet_echoes(echoes, ground, wetness, puddles)
+        dim_wet_echoes(echoes, ground, wetness, puddles)
         return echoes.gain
 
     soaked, damp = gains(ground_of()), gains(ground_of(), wetness=0.5)
@@ -275,7 +277,7 @@ def test_wet_ground_returns_less_and_nothing_else_does() -> None:
     assert (gains(ground_of(hollow=-2.0), puddles=0.3) == soaked).all()
     covered = echoes_of(points, 0.02)
     covered.codes[:] = MOVED  # onto snow
-    wet_echoes(covered, ground_of(), 1.0, 0.0)
+    dim_wet_echoes(covered, ground_of(), 1.0, 0.0)
     assert (covered.gain == 1).all()
 
 
@@ -345,10 +347,10 @@ def test_boxes_say_what_rain_leaves_of_them() -> None:
         np.full((3, 3), 4.0),
         np.tile([1.0, 0, 0, 0], (3, 1)),
     )
-    placed = PlacedBoxes.of(boxes, np.zeros(3))
+    placed = WorldBoxes.of(boxes, np.zeros(3))
     scene = street()
     plan = make_plan(wet(100.0), scene).placed["rain"]
-    found = effect.measure(placed, camera, EffectView(plan, depth, mask, None))
+    found = effect.measure(placed, camera, LabelInputs(plan, depth, mask, None))
     numbers = effect.table.numbers(boxes.track_ids, **found)
     sigma = rain(100.0).extinction_per_m
     assert numbers["rain_transmittance"][0] == pytest.approx(math.exp(-20 * sigma), abs=1e-3)
@@ -359,10 +361,10 @@ def test_boxes_say_what_rain_leaves_of_them() -> None:
     assert numbers["streak_fraction"][0] == numbers["streak_pixels"][0] / numbers["pixels"][0] > 0
     left = visibility({"box_rain": numbers}, 3)
     np.testing.assert_array_equal(left[:2], numbers["rain_transmittance"][:2])
-    unseen = effect.measure(placed, camera, EffectView(plan, None, None, None))
+    unseen = effect.measure(placed, camera, LabelInputs(plan, None, None, None))
     assert (unseen["pixels"] == NOT_COUNTED).all() and (unseen["streak_pixels"] == 0).all()
     dry = make_plan(wet(0.0), scene).placed["rain"]
-    clear = effect.measure(placed, camera, EffectView(dry, None, None, None))
+    clear = effect.measure(placed, camera, LabelInputs(dry, None, None, None))
     np.testing.assert_array_equal(clear["rain_transmittance"], [1, 1, np.nan])
 
 

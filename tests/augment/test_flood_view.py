@@ -23,9 +23,9 @@ from box_views import (
 from adapters.base import open_scene
 from adapters.procedural import open_truth
 from augment import drawing
-from augment.boxes import BOTTOM_M, SIDES_M
+from augment.boxes import BOTTOM_MARGIN_M, SIDE_MARGIN_M
 from augment.cameras import Camera, Frame
-from augment.effects.flood.effect import flood_medium, hidden_pixels, submerged_fraction
+from augment.effects.flood.effect import flood_of_recipe, hidden_pixels, submerged_fraction
 from augment.effects.flood.flood import exact, schlick
 from augment.effects.flood.flood_view import visible_depth_m
 from augment.geometry import rigid
@@ -274,7 +274,7 @@ def test_a_smaller_image_widens_no_splat_with_the_blur_of_the_larger_one():
 
 def test_bed_that_hardly_comes_up_is_left_out_of_mere_pictures(scene):
     down = camera(pitch=0.5)
-    medium, _ = flood_medium(flood(turbidity_ntu=20), 0, scene)  # 0.4 m of it: exp(-4) comes up
+    medium, _ = flood_of_recipe(flood(turbidity_ntu=20), 0, scene)  # 0.4 m of it: exp(-4) comes up
     cut = dataclasses.replace(medium, bed_cut=0.03)
     steepest = math.cos(math.radians(90) - (0.5 + math.atan2(30, 60)))  # sine to the horizon
     way = 1 / math.sqrt(1 - (1 - steepest**2) / 1.333**2)
@@ -472,8 +472,8 @@ def test_pixels_are_those_counted_one_by_one() -> None:
     got = hidden_pixels(placed(boxes), camera, depth, water)
     extents = []
     for size in boxes.sizes_m:
-        low, high = -size / 2 - SIDES_M, size / 2 + SIDES_M
-        low[2] = -size[2] / 2 + min(BOTTOM_M, size[2] / 4)
+        low, high = -size / 2 - SIDE_MARGIN_M, size / 2 + SIDE_MARGIN_M
+        low[2] = -size[2] / 2 + min(BOTTOM_MARGIN_M, size[2] / 4)
         extents.append((low, high))
     pixels, hidden = count_by_hand(boxes, extents, camera, depth, water)
     assert sum(p > 0 for p in pixels) > 30 and sum(p == 0 for p in pixels) > 5

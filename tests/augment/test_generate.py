@@ -31,11 +31,11 @@ from augment.jobs.atomic import write_atomic
 from augment.jobs.blocks import read_status, stored_plans
 from augment.jobs.generate import GenerateJob, GenerateResult, Workers, plan_job, run_generate
 from augment.jobs.layout import STATE_FOLDER, folder_name
-from augment.jobs.manifest import list_parts, read_finished, read_manifest
+from augment.jobs.manifest import list_parts, read_manifest, read_manifest_rows
 from augment.jobs.processes import available_cores
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import open_store
-from augment.jobs.worker import shares_of
+from augment.jobs.worker import compute_time_shares
 from recipes.job import JobRecipes, JobScene
 
 
@@ -69,7 +69,7 @@ def rendered(job: GenerateJob) -> list[str]:
 
 
 def rows_of(out: Path, **values) -> list[dict]:
-    rows = read_finished(open_store(out)).to_pylist()
+    rows = read_manifest_rows(open_store(out)).to_pylist()
     return [r for r in rows if all(r[key] == value for key, value in values.items())]
 
 
@@ -365,10 +365,10 @@ def test_a_dataset_job_measures_what_bound_it(tmp_path: Path) -> None:
     timings = result.timings
     assert 0 < timings["renderers"] < timings["workers"] <= timings["render_wall"]
     assert timings["publish"] > 0
-    shares = shares_of(timings)
+    shares = compute_time_shares(timings)
     assert shares is not None
     assert shares.rendering + shares.held + shares.beside == pytest.approx(1)
-    assert shares_of(run(job_of(tmp_path, "auto")).timings) is None
+    assert compute_time_shares(run(job_of(tmp_path, "auto")).timings) is None
 
 
 # ---- Names, damage, kills -----------------------------------------------------------------------

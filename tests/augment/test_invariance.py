@@ -31,7 +31,7 @@ from augment.render.constants import RasterSettings
 from augment.render.cpu import backward as cpu_backward
 from augment.render.cpu.driver import Scratch
 from augment.render.layout import HeightClip
-from augment.render.part_views import part_poses
+from augment.render.part_views import stack_poses
 from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads, limit_threads
 from augment.scene import Gaussians, Ground, PosedGaussians, Scene
@@ -479,7 +479,7 @@ def test_splats_and_poses_are_finite_after_a_step(kind, seed, fov_deg, steepness
     start = hard_gaussians(kind, camera, 60, seed=seed, sh_degree=3)
     pose = rigid(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     splats = Splats.of([start, start.select(torch.arange(20))], 3)
-    poses = part_poses([None, pose])
+    poses = stack_poses([None, pose])
     rates = LearningRates()
     inputs = splat_inputs(splats, [0, 1], poses, camera, RasterSettings())
     knots = Knots([np.array([0, 10])], 6)

@@ -27,12 +27,12 @@ from batch_scenes import (
     tree_digest,
 )
 
-from augment.boxes import PlacedBoxes
+from augment.boxes import WorldBoxes
 from augment.cameras import Camera
 from augment.dataset import WeatherDataset
 from augment.effects.flood.effect import hidden_pixels, submerged_fraction
 from augment.effects.smog import box_transmittance
-from augment.effects.snow.snow import snow_pixels
+from augment.effects.snow.snow import count_snow_pixels
 from augment.effects.style import style as scene_maps
 from augment.errors import OutputError, StyleError
 from augment.jobs.files import box_tables, visibility
@@ -105,7 +105,7 @@ def test_masks_hold_what_was_rendered(finished_dir: Path, recipe: Recipe, kind: 
 
 def expected_numbers(kind: str, boxes: Boxes, camera: Camera, view: FakeView) -> dict:
     """Of what the file has of each box, without what follows from it."""
-    world_boxes = PlacedBoxes.of(boxes, ORIGIN_M)
+    world_boxes = WorldBoxes.of(boxes, ORIGIN_M)
     if kind == "smog":
         effect_view = view.effects["smog"]
         columns = box_transmittance(
@@ -116,7 +116,7 @@ def expected_numbers(kind: str, boxes: Boxes, camera: Camera, view: FakeView) ->
     if kind == "snow":
         if effect_view.depth_m is None:
             return {}
-        counted = snow_pixels(
+        counted = count_snow_pixels(
             world_boxes, camera, effect_view.depth_m, view.masks["snow"], THICKNESS_M
         )
         return {"pixels": counted.pixels, "snow_pixels": counted.marked}

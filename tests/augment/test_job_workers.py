@@ -38,7 +38,7 @@ from augment.jobs.files import WritePump
 from augment.jobs.manifest import read_manifest
 from augment.jobs.processes import available_cores, awaited, share_scene, thread_limits
 from augment.jobs.render_job import JobResult, RenderJob, run_job
-from augment.jobs.worker import shares_of
+from augment.jobs.worker import compute_time_shares
 from augment.scene import Actor, Track
 from augment.sky import LatLongSky
 from recipes.flood import Flood
@@ -332,7 +332,7 @@ def test_who_is_busiest_bounds_the_job() -> None:
     }
 
     def shares(**seconds: float):
-        time_shares = shares_of({**common_seconds, **seconds})
+        time_shares = compute_time_shares({**common_seconds, **seconds})
         assert time_shares is not None
         return time_shares
 
@@ -370,7 +370,7 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     show.
     """
     monkeypatch.setattr(
-        "augment.effects.snow.support.place_snow_support", lambda *_, **__: make_bed(3.0)
+        "augment.effects.snow.support.find_exposed_surface", lambda *_, **__: make_bed(3.0)
     )
     monkeypatch.setattr("augment.effects.style.style._find_maps", lambda *_: make_maps(0.4))
     style = Style(preset="dusk")

@@ -15,9 +15,9 @@ from batch_scenes import FakeLabels, fake_render, open_fake, tree_digest
 from generate_jobs import make_job, make_recipes
 from test_boxes_2d import StreetLabels, open_street, street
 
-from augment.boxes import PlacedBoxes, encode_masks, find_occlusion
-from augment.dataset import LabelsAsked, write_labels
-from augment.dataset.label_files import NothingLabelled, category_of, planned_labels
+from augment.boxes import WorldBoxes, encode_masks, find_occlusion
+from augment.dataset import LabelOptions, write_labels
+from augment.dataset.label_files import NothingLabelled, category_of, forecast_labels
 from augment.errors import OutputError
 from augment.jobs.generate import run_generate
 from augment.jobs.manifest import read_manifest
@@ -119,7 +119,7 @@ def test_a_pixel_by_depth_shows_the_smallest_box_that_has_its_surface() -> None:
     boxes, camera = scene.boxes(0), scene.frames[0].cameras["ahead"].scaled(0.25)
     rng = np.random.default_rng(1)
     depth = rng.uniform(0, 20, (camera.height, camera.width)).astype(np.float32)
-    world_boxes = PlacedBoxes.of(boxes, np.asarray(scene.world_origin_m))
+    world_boxes = WorldBoxes.of(boxes, np.asarray(scene.world_origin_m))
     sizes = [world_boxes.sizes_m, world_boxes.sizes_m * [[3], [1], [2]]]
     tight = [replace(world_boxes, sizes_m=s, low_m=-s / 2, high_m=s / 2) for s in sizes]
     points = depth[..., None] * camera.ray_directions(torch.float64).numpy()
@@ -335,7 +335,7 @@ def test_the_first_row_that_takes_a_label_names_its_category() -> None:
 
 def test_what_will_be_written_is_known_before(output: Path) -> None:
     table = "categories: [{label: Car, name: vehicle}], min_visibility: 0.4"
-    planned = planned_labels(street(), recipe(f"{ALL}, {table}").output)
+    planned = forecast_labels(street(), recipe(f"{ALL}, {table}").output)
     assert planned is not None and planned["min_visibility"] == 0.4
     patterns = [name.replace("*", "000000*") for name in planned["files"]]
     both = [name for text in patterns for name in _expanded(text)]
@@ -351,7 +351,7 @@ def test_what_will_be_written_is_known_before(output: Path) -> None:
     expected_categories = {"vehicle": {"boxes": labels.count("Car"), "objects": len(tracks)}}
     assert planned["categories"] == expected_categories
     assert sum(planned["unmapped"].values()) == len(labels) - labels.count("Car")
-    assert planned_labels(street(), recipe("labels: true").output) is None
+    assert forecast_labels(street(), recipe("labels: true").output) is None
 
 
 def _expanded(pattern: str) -> list[str]:
@@ -366,7 +366,7 @@ def test_categories_can_be_changed_without_rendering(output: Path, tmp_path: Pat
     rows = '[{label: "Tr*", name: Truck}, {label: Car, name: "Big car"}]'
     changes = (f"output.categories={rows}", "output.labels=[kitti, coco]")
     try:
-        done = write_labels(output, LabelsAsked(changes=changes))
+        done = write_labels(output, LabelOptions(changes=changes))
         assert done.unused == ("Tr*",) and not done.unmapped
         names = [c["name"] for c in coco_of(output)["categories"]]
         assert names == ["Truck", "Big car"] and not (output / "labels/yolo").exists()
@@ -376,11 +376,11 @@ def test_categories_can_be_changed_without_rendering(output: Path, tmp_path: Pat
         write_labels(output)  # as the last time
         assert tree_digest(output / "labels") == before
         with pytest.raises(OutputError, match=r"names Lorry; .* The labels are Car$"):
-            write_labels(output, LabelsAsked(changes=(
+            write_labels(output, LabelOptions(changes=(
                 "output.categories=[{label: Lorry, name: Truck}]",)))  # fmt: skip
         assert tree_digest(output / "labels") == before
     finally:
-        write_labels(output, LabelsAsked())
+        write_labels(output, LabelOptions())
 
 
 LABELLED = {"fog": f"weather: {{smog: {{visibility_m: 50}}}}\noutput: {{{ALL}}}\n"}
@@ -407,7 +407,7 @@ def test_the_files_do_not_depend_on_how_the_job_went(tmp_path: Path) -> None:
     count = sum(len(FakeLabels().boxes(frame)) for frame in range(4))
     shown_ids = {a["track_id"] for a in coco_of(tmp_path / "parts")["annotations"]}
     assert shown_ids and shown_ids <= {f"track-{k}" for k in range(count)}
-    split = LabelsAsked(split={"train": 0.5, "val": 0.5}, seed=0)
+    split = LabelOptions(split={"train": 0.5, "val": 0.5}, seed=0)
     parts = write_labels(tmp_path / "parts", split).parts
     scenes = {p: {i["scene"] for i in coco_of(tmp_path / "parts", p)["images"]} for p in parts}
     assert parts == {"train": 8, "val": 6} or parts == {"train": 6, "val": 8}
@@ -421,8 +421,8 @@ def test_refusals(tmp_path: Path) -> None:
         write_labels(tmp_path / "out")
     assert not (tmp_path / "out/labels").exists()
     with pytest.raises(ValueError, match="add up to 1"):
-        write_labels(tmp_path / "out", LabelsAsked(split={"train": 0.5}))
+        write_labels(tmp_path / "out", LabelOptions(split={"train": 0.5}))
     with pytest.raises(ValueError, match=r"got '\.\./up'"):
-        write_labels(tmp_path / "out", LabelsAsked(split={"../up": 1.0}))
+        write_labels(tmp_path / "out", LabelOptions(split={"../up": 1.0}))
     with pytest.raises(OutputError, match="neither"):
         write_labels(tmp_path / "nothing")

@@ -13,7 +13,7 @@ import torch
 from augment.cameras import Camera, Frame
 from augment.dataset import WeatherDataset
 from augment.drawing import LayerRenderer
-from augment.effects.lens_drops.drops import Drops, PlacedDrops, drops_at
+from augment.effects.lens_drops.drops import Drops, LensDropsPlan, drops_at
 from augment.effects.lens_drops.optics import COVERED, blend_drops, draw_drops, map_surroundings
 from augment.geometry import rigid
 from augment.jobs.manifest import read_manifest
@@ -56,9 +56,9 @@ def driving(scene: Scene, speed_mps: float) -> Scene:
     return dataclasses.replace(scene, frames=frames)
 
 
-def placed(**fields) -> PlacedDrops:
+def placed(**fields) -> LensDropsPlan:
     drops = LensDrops(**{"count": 200, "radius_mm": 2.0} | fields)
-    return PlacedDrops(drops, seed=5)
+    return LensDropsPlan(drops, seed=5)
 
 
 # ---- Optics --------------------------------------------------------------------------------------
@@ -156,10 +156,10 @@ def test_fewer_drops_are_the_first_of_more():
 
 def test_rain_brings_drops_by_its_rate_and_none_without_it():
     own = LensDrops(wiper_s=4.0)
-    counts = [PlacedDrops(own, 0, rate).count_on(camera()) for rate in (0.0, 2.5, 10.0, 100.0)]
+    counts = [LensDropsPlan(own, 0, rate).count_on(camera()) for rate in (0.0, 2.5, 10.0, 100.0)]
     area_m2, flux = (GLASS_M / 490) ** 2 * 480 * 270, (0, 1381, 3114, 9743)  # by the integral
     assert counts == pytest.approx([4 * area_m2 * f for f in flux], rel=0.08)
-    assert PlacedDrops(own, 0, 300.0).count_on(camera().scaled(2.0)) <= 500
+    assert LensDropsPlan(own, 0, 300.0).count_on(camera().scaled(2.0)) <= 500
     scene = open_street(LABELLED_STREET)
     dry, wet = Recipe(), Recipe(weather=Weather(rain=Rain(rate_mm_h=20.0)))
     for recipe, runs in ((dry, False), (wet, True)):
@@ -203,7 +203,7 @@ def test_numbers_stay_finite_at_the_extremes():
     ):
         own = LensDrops(**fields)
         view = camera(2**62, 60, 40)
-        drops = drops_at(PlacedDrops(own, 2**62), scene, view)
+        drops = drops_at(LensDropsPlan(own, 2**62), scene, view)
         around = map_surroundings(rgb, view, None, level=False)
         drawn = draw_drops(drops, around, view, glass_m=own.glass_m, aperture_m=own.aperture_m)
         seen, _ = blend_drops(rgb.clone(), *drawn, backend=CPU)

@@ -20,11 +20,11 @@ from augment.cameras import Camera
 from augment.effects.flood.flood import FloodMedium
 from augment.effects.flood.lidar import ABSORPTION_905_PER_M, meet_water
 from augment.effects.flood.waves import make_waves
-from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
+from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost_returns
 from augment.effects.lidar.beam import LidarModel, find_beam_origins
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import soft_echo, soft_response, wavelength_factor
-from augment.effects.snow.cells import SnowCells, SnowSupport
+from augment.effects.snow.cells import ExposedCells, ExposedSurface
 from augment.effects.snow.effect import snow_layers_of
 from augment.effects.snow.lidar import (
     GROUND_SLACK_M,
@@ -33,7 +33,7 @@ from augment.effects.snow.lidar import (
     intersect_layers,
     make_snow_grid,
 )
-from augment.effects.snow.snow import PlacedSnow, placement_settings
+from augment.effects.snow.snow import SnowPlan, exposure_settings
 from augment.errors import OutputError
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
@@ -104,11 +104,11 @@ def test_every_row_keeps_its_place() -> None:
     same = (out.points_m == sweep.points_m).all(1)
     assert not same[np.isin(code, [SCATTERED, LOST, MOVED])].any()
     assert same[~np.isin(code, [SCATTERED, LOST, MOVED])].all()
-    received = drop_lost(out)
+    received = drop_lost_returns(out)
     assert len(received) == (code != LOST).sum() < 500
     assert np.isfinite(received.points_m).all()
     np.testing.assert_array_equal(received.columns["ring"], received.columns["source_index"])
-    assert drop_lost(sweep) is sweep
+    assert drop_lost_returns(sweep) is sweep
 
 
 def test_returns_that_are_none_and_sweeps_without_intensity() -> None:
@@ -178,7 +178,7 @@ def test_lidar_agrees_with_depth_under_snow_by_default() -> None:
     deep = Recipe(weather=Weather(snow=Snow(depth_m=0.2)))
     gaps: dict[bool, list[np.ndarray]] = {True: [], False: []}
     source = scene.lidar(1)
-    sweep = drop_lost(weathered_sweep(scene, deep, 1, source))
+    sweep = drop_lost_returns(weathered_sweep(scene, deep, 1, source))
     for name in ("front", "left"):
         camera = scene.frame(1).cameras[name].scaled(4.0)  # pixels that are small on the road
         view = render_view(scene, camera, deep)
@@ -319,12 +319,12 @@ def scene():
     car = box_car(start=(4.0, 3.0), moved_m=3.0)
     opened = street(actors=(car,))
     roof = cells_on_grid(np.full((40, 18), 0.75), 0.1, corner_m=(-2.0, -0.9))
-    support = SnowSupport(ground=FLAT, actors={"car": roof})
-    memo_of(opened).put(("snow support", placement_settings(SNOW, opened)), support)
+    support = ExposedSurface(ground=FLAT, actors={"car": roof})
+    memo_of(opened).put(("snow support", exposure_settings(SNOW, opened)), support)
     return opened
 
 
-def meets(cells: SnowCells, depths: np.ndarray | float, points: np.ndarray) -> np.ndarray:
+def meets(cells: ExposedCells, depths: np.ndarray | float, points: np.ndarray) -> np.ndarray:
     """Return the points where beams end on a layer of snow, [N, 3]."""
     layer = make_snow_grid(cells, np.broadcast_to(np.float32(depths), len(cells)).copy())
     snow = LidarSnow(layer, {}, 0.8)
@@ -382,7 +382,7 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
 
 
 def test_the_layer_is_that_of_the_images(scene) -> None:
-    recipe_snow = PlacedSnow(SNOW, seed=0)
+    recipe_snow = SnowPlan(SNOW, seed=0)
     top = find_lidar_snow(scene, recipe_snow).ground.top
     means = snow_layers_of(scene, recipe_snow).ground.gaussians.means.numpy()
     covered = np.isfinite(top)

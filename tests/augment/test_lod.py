@@ -86,7 +86,7 @@ def test_one_place_covers_what_its_splats_cover_together(opacity):
     out, count = np.empty(1), 3
     args = np.full(count, opacity), np.zeros((count, 2)), np.tile(np.eye(2), (count, 1, 1))
     with kernel_threads():
-        kernels.covered_plane(np.array([0, count]), *args, out)
+        kernels.sum_covered_areas(np.array([0, count]), *args, out)
     r = np.arange(0, 6, 1e-3)
     exact = 2 * np.pi * (r * (1 - (1 - opacity * np.exp(-r * r / 2)) ** count)).sum() * 1e-3
     assert out[0] == pytest.approx(exact, rel=0.02)  # what lies beyond 3.15 deviations is left out
@@ -95,7 +95,7 @@ def test_one_place_covers_what_its_splats_cover_together(opacity):
 def test_large_splats_stay_as_they_are_and_clear_ones_are_left_out():
     small, large = one_gaussian((1.0, 1.0, 0.0), 0.02), one_gaussian((1.0, 1.0, 0.01), 0.9)
     g = lod.join_pieces(
-        lod.Piece(splat, np.zeros(1, np.int32), np.zeros(1, np.int64))
+        lod.LevelPiece(splat, np.zeros(1, np.int32), np.zeros(1, np.int64))
         for splat in (small, large, small, dataclasses.replace(small, opacities=torch.zeros(1)))
     ).gaussians
     merged, leads, into = lod.merge_cells(g, np.zeros(4, np.int64), 0.4, 0.1)
@@ -134,7 +134,7 @@ def test_each_level_has_about_a_quarter_of_the_one_before(part):
     levels = lod.levels_of(part.gaussians).levels
     counts = [len(level.gaussians) for level in levels]
     assert len(counts) >= 3 and counts[0] == len(part.gaussians)
-    assert counts[1] <= lod.MOST_LEFT * counts[0]
+    assert counts[1] <= lod.MAX_REMAINING_SHARE * counts[0]
     # Cells at borders, and where the wall stands on the road, hold fewer splats.
     assert all(b < 0.4 * a for a, b in itertools.pairwise(counts[1:]))
     assert sorted(levels[0].stands_for.tolist()) == list(range(counts[0]))
@@ -185,7 +185,7 @@ def test_shares_add_up_to_one_wherever_the_camera_is(part):
         for settings in (near, SHARP):
             total[:] = 0
             for square, share in zip(
-                *lod.squares_taken(levels, part, camera, settings), strict=True
+                *lod.choose_squares(levels, part, camera, settings), strict=True
             ):
                 number = int(levels.tree.numbers[square])
                 within = int(square) - np.searchsorted(levels.tree.numbers, number)
@@ -198,7 +198,7 @@ def test_turning_the_camera_changes_no_share(part):
     levels = lod.levels_of(part.gaussians)
 
     def taken(yaw):
-        squares, shares = lod.squares_taken(levels, part, eye(20.0, yaw), SHARP)
+        squares, shares = lod.choose_squares(levels, part, eye(20.0, yaw), SHARP)
         return dict(zip(squares.tolist(), shares.tolist(), strict=True))
 
     ahead, turned = taken(0.0), taken(0.3)

@@ -23,7 +23,7 @@ from augment.jobs.manifest import (
     MAX_SIDE_PX,
     OK,
     Identity,
-    Pictured,
+    ImageFacts,
     compact,
     image_row,
     later_columns,
@@ -33,8 +33,8 @@ from augment.jobs.manifest import (
     parse_manifest,
     parts_to_merge,
     publish_part,
-    read_finished,
     read_manifest,
+    read_manifest_rows,
     rows_to_table,
 )
 from augment.jobs.render_job import RenderJob, run_job
@@ -206,7 +206,7 @@ PATHS = {f"{kind}_path": "a.png" if kind == "image" else None for kind in path_k
 def table(frames: dict[int, bool], message: str = "", scene: str = "a") -> pa.Table:
     """Rows of frames; the values say whether they are finished."""
     rows = [
-        image_row(scene, RECIPE, IDENTITY, Pictured(frame, "front", frame, 4, 3), paths=PATHS,
+        image_row(scene, RECIPE, IDENTITY, ImageFacts(frame, "front", frame, 4, 3), paths=PATHS,
                   status=OK if done else FAILED, message=message)
         for frame, done in frames.items()
     ]  # fmt: skip
@@ -218,7 +218,7 @@ def seen(rows: pa.Table) -> dict[tuple[str, int], tuple[bool, str]]:
 
 
 def frames_of(store: Store) -> dict[int, tuple[bool, str]]:
-    return {frame: state for (_, frame), state in seen(read_finished(store)).items()}
+    return {frame: state for (_, frame), state in seen(read_manifest_rows(store)).items()}
 
 
 @st.composite

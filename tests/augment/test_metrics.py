@@ -17,9 +17,9 @@ from augment.errors import MetricError
 from augment.metrics.consistency import (
     ActorPaths,
     DepthView,
-    carry,
     consistency_of,
     find_warp,
+    move_surfaces,
     warp_view,
     warped_consistency,
 )
@@ -270,7 +270,7 @@ FRAMES = 9
 
 def compared(paths, a, b, **kwargs):
     """(consistency over the pixels that moved, over all, what moved and counts)."""
-    carried = carry(paths, a, b, **kwargs)
+    carried = move_surfaces(paths, a, b, **kwargs)
     clear = dataclasses.replace(b, alpha=np.where(carried.unclear_b, 0.0, b.alpha))
     warp = find_warp(a, clear, carried.points_m)
     warped = warp.sample(b.picture)

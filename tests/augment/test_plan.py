@@ -128,7 +128,7 @@ def test_colour_maps_apply_where_cameras_have_them_and_the_recipe_lets_them():
     def step(recipe: Recipe, **color_maps):
         plan = make_plan(recipe, scene(frames=frames, color_maps=color_maps))
         [exposure_step] = [s for s in plan.steps if s.name == "camera colour map"]
-        assert exposure_step.runs == plan.recorded_exposure
+        assert exposure_step.runs == plan.uses_recorded_exposure
         return exposure_step
 
     dark = torch.eye(3, 4) * 0.5

@@ -11,7 +11,7 @@ import torch
 
 from augment import prune
 from augment.cameras import Camera, Frame
-from augment.effects import Sharing, share_effects
+from augment.effects import JobContext, precompute_effects
 from augment.lod import MIN_SPLATS
 from augment.memo import memo_of
 from augment.plan import make_plan
@@ -72,7 +72,7 @@ def test_changes_are_those_of_pictures_without_the_splat(monkeypatch):
             [PosedGaussians(splats.select(torch.tensor([i])))], camera, backend="cpu"
         )
         assert splat_view.alpha is not None  # weights are no more than alphas
-        most = max(change * 1.03, prune.LEAST_CONTRAST * float(splat_view.alpha.mean()))
+        most = max(change * 1.03, prune.MIN_CONTRAST * float(splat_view.alpha.mean()))
         assert errors_by_order[i] <= most + 1e-7
 
 
@@ -172,19 +172,19 @@ def test_views_from_elsewhere_draw_all():
 def test_nothing_is_looked_for_where_nothing_is_left_out(render: Render):
     scene, camera = street_of_walls()
     recipe = Recipe(render=render)
-    share_effects(Sharing(scene, [recipe]))
+    precompute_effects(JobContext(scene, [recipe]))
     assert not memo_of(scene).shared()
     plan = make_plan(recipe, scene)
     assert plan.prune == 0
     left = render_buffers(scene, camera, plan, backend="cpu").parts[0].gaussians.opacities
     assert left is scene.background.opacities
-    assert prune.pruned_share(Render(prune=0.1, base="recorded")) == 0
+    assert prune.prune_error_of(Render(prune=0.1, base="recorded")) == 0
 
 
 def test_other_processes_take_the_changes_over():
     scene, camera = street_of_walls()
     recipe = Recipe(render=Render(prune=HIDDEN))
-    share_effects(Sharing(scene, [recipe]))
+    precompute_effects(JobContext(scene, [recipe]))
     other = dataclasses.replace(scene)
     memo_of(other).update(pickle.loads(pickle.dumps(memo_of(scene).shared())))
     np.testing.assert_array_equal(prune.errors_of(other), prune.errors_of(scene))
@@ -216,7 +216,7 @@ def test_scenes_of_vehicles_alone_are_drawn_whole():
     scene = dataclasses.replace(street, background=nothing)
     camera = scene.frames[0].cameras["front"].scaled(0.1)
     recipes = [Recipe(render=Render(prune=error)) for error in (0.0, 1e-3)]
-    share_effects(Sharing(scene, recipes))
+    precompute_effects(JobContext(scene, recipes))
     full_rgb, left = (render_view(scene, camera, recipe).rgb for recipe in recipes)
     np.testing.assert_array_equal(full_rgb, left)
 

@@ -22,17 +22,17 @@ from augment.jobs.manifest import read_manifest
 from augment.jobs.quality import (
     Cost,
     Question,
+    apply_settings,
     calibration_views,
+    choose_settings,
     recipes_to_try,
     recorded,
     render_trial,
+    resize_picture,
     resolve_quality,
-    resolve_quality_for,
-    resolved_recipe,
     search,
+    select_useful_values,
     steps_back,
-    upsampled,
-    useful,
 )
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import open_store
@@ -42,7 +42,7 @@ from augment.views import render_view
 from recipes.errors import RecipeError
 from recipes.fields import found
 from recipes.load import load_recipe, parse_recipe
-from recipes.schema import Recipe, as_reference
+from recipes.schema import Recipe, with_reference_settings
 
 # ---- The search, in tables of errors and times ---------------------------------------------------
 
@@ -120,8 +120,11 @@ def test_values_that_save_nothing_are_left_out() -> None:
     fastest = Cost("fastest", 50, 0.2)
     free = Cost("free", 80, 0)
     costs = [fastest, worse, equal, good, slower, noise, reference]
-    assert useful(costs) == [reference, good, fastest]
-    assert useful([free, reference]) == [reference, free]  # as accurate as reference, and faster
+    assert select_useful_values(costs) == [reference, good, fastest]
+    assert select_useful_values([free, reference]) == [
+        reference,
+        free,
+    ]  # as accurate as reference, and faster
 
 
 # ---- Views and trials ----------------------------------------------------------------------------
@@ -149,10 +152,10 @@ def test_views_are_spread_over_frames_and_cameras() -> None:
 def test_small_pictures_are_enlarged_and_depths_are_not_mixed() -> None:
     picture = np.zeros((2, 2, 3), np.uint8)
     picture[:, 1] = 200
-    assert upsampled(picture, 2, 2) is picture
-    wide = upsampled(picture, 4, 2)
+    assert resize_picture(picture, 2, 2) is picture
+    wide = resize_picture(picture, 4, 2)
     assert wide[0, :, 0].tolist() == [0, 50, 150, 200]
-    assert upsampled(wide, 2, 2)[0, :, 0].tolist() == [25, 175]  # means over areas
+    assert resize_picture(wide, 2, 2)[0, :, 0].tolist() == [25, 175]  # means over areas
 
     def render(scene, camera, recipe, *, backend: str) -> FakeView:
         return FakeView(picture, np.array([[1, 9], [1, 9]], np.float32))
@@ -220,9 +223,9 @@ def test_a_choice_by_error_is_within_the_bound_and_the_same_again() -> None:
     assert chosen.recipe.quality.words == "max_flip 0.06"
     errors = []
     for view in calibration_views(scene.frames):
-        truth = render_view(scene, view.camera, as_reference(chosen.recipe)).rgb
+        truth = render_view(scene, view.camera, with_reference_settings(chosen.recipe)).rgb
         got = render_view(scene, view.camera, chosen.recipe).rgb
-        errors.append(flip(upsampled(got, view.camera.width, view.camera.height), truth))
+        errors.append(flip(resize_picture(got, view.camera.width, view.camera.height), truth))
     assert max(errors) == chosen.flip <= 0.06
     assert chosen.recipe.render.scale < 1 or max(errors) > 0  # something was given up
     assert len(chosen.views) == 3 and chosen.views[0] == (0, "front")
@@ -286,7 +289,7 @@ def test_what_has_not_chosen_is_not_rendered() -> None:
     assert recipes_to_try(tried[0]) == [tried[0]]
     assert resolve_quality(tried[0], scene).recipe is tried[0]
     with pytest.raises(ValueError, match="leaves free render"):
-        resolved_recipe(recipe, {"render.near_m": 1.0})
+        apply_settings(recipe, {"render.near_m": 1.0})
 
 
 # ---- What an output keeps of it ------------------------------------------------------------------
@@ -339,7 +342,7 @@ def test_a_damaged_choice_is_told(bench: Workbench, tmp_path: Path) -> None:
     recipe = open_recipe("max_flip: 0.5")
     scene = open_fake("fake:a")
     arguments = (store, recipe, scene)
-    chosen = resolve_quality_for(*arguments, backend="cpu", renderer=bench.render)
+    chosen = choose_settings(*arguments, backend="cpu", renderer=bench.render)
     question = Question(recipe, scene.name, scene.source, "recorded", "cpu")
     assert recorded(store, question) == chosen
     document = json.loads(store.read(question.path))
@@ -354,7 +357,7 @@ def test_a_damaged_choice_is_told(bench: Workbench, tmp_path: Path) -> None:
         store.write(question.path, data)
         message = r"recipe fog in scene a, is damaged: .*Delete it"
         with pytest.raises(OutputError, match=message):
-            resolve_quality_for(*arguments, backend="cpu", renderer=bench.render)
+            choose_settings(*arguments, backend="cpu", renderer=bench.render)
 
 
 def test_what_a_recipe_leaves_free_is_part_of_the_question() -> None:
@@ -377,7 +380,7 @@ def _choose_slowly(folder: str, worst_scale: float, answers) -> None:
     recipe = open_recipe("max_flip: 0.5")
     store = open_store(folder)
     options = {"backend": "cpu", "renderer": render}
-    answers.put(resolve_quality_for(store, recipe, open_fake("fake:a"), **options).render.scale)
+    answers.put(choose_settings(store, recipe, open_fake("fake:a"), **options).render.scale)
 
 
 def test_two_processes_agree(tmp_path: Path) -> None:

@@ -33,17 +33,17 @@ from augment.reconstruct.trainer import splat_inputs
 from augment.reconstruct.view import RecordedView
 from augment.render.constants import RasterSettings
 from augment.render.cpu.backward_kernels import (
-    G_ABS,
+    G_ABS_MEAN,
     G_COLOR,
+    G_MAX_SIGMA,
     G_MEAN,
     G_OPACITY,
     G_QUAT,
-    G_RADIUS,
     G_SCALE,
-    GRAD,
+    NUM_GRADIENTS,
 )
 from augment.render.layout import BLOCK
-from augment.render.part_views import part_poses
+from augment.render.part_views import stack_poses
 from augment.render.sh import sh_basis
 from augment.render.threads import kernel_threads, limit_threads
 from augment.scene import Gaussians
@@ -359,10 +359,12 @@ def random_update(splats: Splats, seed: int, *, present=BOTH) -> Update:
     for part, _ in present:
         count = int(np.diff(splats.starts)[part])
         touched[part] = np.flatnonzero(rng.random(count) < 0.67)
-        size = (len(touched[part]), GRAD)
+        size = (len(touched[part]), NUM_GRADIENTS)
         signs = rng.choice([-1.0, 1.0], size)
         gradients[part] = (signs * 10 ** rng.uniform(-6, 2, size)).astype(np.float32)
-        gradients[part][:, [G_ABS, G_RADIUS]] = np.abs(gradients[part][:, [G_ABS, G_RADIUS]])
+        gradients[part][:, [G_ABS_MEAN, G_MAX_SIGMA]] = np.abs(
+            gradients[part][:, [G_ABS_MEAN, G_MAX_SIGMA]]
+        )
     camera = camera_ahead(64, 48, 40.0 + seed, yaw=0.05 * seed, position=(0.1 * seed, 0.0, 0.0))
     return Update(camera, list(present), touched, gradients, step=seed)
 
@@ -370,9 +372,11 @@ def random_update(splats: Splats, seed: int, *, present=BOTH) -> Update:
 def apply_update(splats: Splats, update: Update, rates: LearningRates = FASTER) -> None:
     """The update as the trainer makes it: rows block by block, in the order of the splats."""
     parts = [part for part, _ in update.present]
-    poses = part_poses([pose for _, pose in update.present])
+    poses = stack_poses([pose for _, pose in update.present])
     inputs = splat_inputs(splats, parts, poses, update.camera, RasterSettings())
-    rows = np.full((inputs.slots, GRAD), np.nan, np.float32)  # what is not counted is not read
+    rows = np.full(
+        (inputs.slots, NUM_GRADIENTS), np.nan, np.float32
+    )  # what is not counted is not read
     ids = np.full(inputs.slots, -1, np.int32)
     counts = np.zeros(len(inputs.blocks), np.int64)
     for block, (number, first, last) in enumerate(inputs.blocks):
@@ -425,9 +429,9 @@ class PlainAdam:
             at = self.starts[part] + local
             self.age[at] += 1
             side = max(update.camera.width, update.camera.height)
-            self.grads[at, 0] += g[:, G_ABS] * side / 2
+            self.grads[at, 0] += g[:, G_ABS_MEAN] * side / 2
             self.grads[at, 1] += 1
-            self.grads[at, 2] = np.maximum(self.grads[at, 2], g[:, G_RADIUS] / side)
+            self.grads[at, 2] = np.maximum(self.grads[at, 2], g[:, G_MAX_SIGMA] / side)
 
             camera_from_part = update.camera.camera_from_world.numpy()
             if pose is not None:
@@ -542,7 +546,7 @@ def test_a_gradient_that_is_not_finite_leaves_its_splat_as_it_was():
     before = copied(splats)
     update = random_update(splats, 3)
     apply_update(clean, update)
-    bad, columns = [0, 7, 8, 1000], (G_MEAN, G_QUAT + 2, G_ABS, G_COLOR + 2)
+    bad, columns = [0, 7, 8, 1000], (G_MEAN, G_QUAT + 2, G_ABS_MEAN, G_COLOR + 2)
     for row, column, number in zip(bad, columns, (np.nan, np.inf, -np.inf, 1e30), strict=True):
         update.gradients[0][row, column] = number
     apply_update(splats, update)

@@ -18,7 +18,7 @@ from augment.render.constants import COV2D_BLUR, RasterSettings
 from augment.render.cpu import backward as cpu_backward
 from augment.render.cpu.driver import Scratch, gather_inputs
 from augment.render.fog import Fog
-from augment.render.layout import UNCUT, HeightClip
+from augment.render.layout import SURFACE_DEPTHS_ONLY, HeightClip
 from augment.render.mode_depth import GAMMA, HIGH, LOW, Clusters
 from augment.render.rasterize import rasterize
 from augment.render.reference import project_parts
@@ -277,12 +277,14 @@ def test_one_gaussian_is_its_density():
         assert_images_close(image.alpha, alpha, p999=1e-5, max_flips=1)
 
 
-@pytest.mark.parametrize("clip", [None, UNCUT, HeightClip(0.3, "above"), HeightClip(0.3, "below")])
+@pytest.mark.parametrize(
+    "clip", [None, SURFACE_DEPTHS_ONLY, HeightClip(0.3, "above"), HeightClip(0.3, "below")]
+)
 def test_kernels_see_along_parallel_rays_as_the_definition_does(clip):
     scene, camera = random_gaussians(400), map_camera()
     actual = render_orthographic(scene, camera, "cpu", clip)
     expected = render_orthographic(in_float64(scene), camera, "reference", clip)
-    is_cut = clip is not None and clip is not UNCUT
+    is_cut = clip is not None and clip is not SURFACE_DEPTHS_ONLY
     # A cut that runs nearly parallel to its splat moves by pixels with the last bit of float32.
     for name in (RGB, ALPHA):
         assert_images_close(
@@ -301,7 +303,7 @@ def test_kernels_see_along_parallel_rays_as_the_definition_does(clip):
 def test_a_tilted_discs_surface_is_its_plane(slope, backend):
     scene, normal = disc(slope)
     camera = down(60, 60, 20.0)
-    image = render_orthographic(scene, camera, backend, UNCUT)
+    image = render_orthographic(scene, camera, backend, SURFACE_DEPTHS_ONLY)
     y, x = np.mgrid[:60, :60] + 0.5
     x, y = (x - 30) / 20, -(y - 30) / 20
     plane = 20.0 + (normal[0] * x + normal[1] * y) / normal[2]
@@ -453,7 +455,7 @@ def test_moving_and_scaling_depths():
 # ---- images ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("clip", [None, UNCUT], ids=["centres", "surfaces"])
+@pytest.mark.parametrize("clip", [None, SURFACE_DEPTHS_ONLY], ids=["centres", "surfaces"])
 @pytest.mark.parametrize("parallel", [False, True], ids=["pinhole", "orthographic"])
 def test_kernels_find_the_modes_of_the_definition(parallel, clip):
     camera = camera_ahead(97, 61, 20.0 if parallel else 80.0)

@@ -17,8 +17,13 @@ import augment.views
 from augment.cameras import Camera
 from augment.dataset import SceneDataset
 from augment.jobs.render_job import JobResult, RenderJob, run_job
-from augment.render.cpu.order import order_of
-from augment.render.threads import divided_threads, limit_threads, serves_several, thread_count
+from augment.render.cpu.order import spatial_order
+from augment.render.threads import (
+    has_concurrent_kernels,
+    limit_threads,
+    num_kernel_threads,
+    split_threads,
+)
 from augment.scene import Gaussians, Scene
 from augment.views import ViewPool, WeatheredView, begin_view, render_view, render_views
 from recipes.flood import Flood
@@ -47,7 +52,7 @@ RECIPES = {
 @pytest.fixture(autouse=True)
 def threads() -> Iterator[None]:
     limit_threads(None)
-    if thread_count() < 2 or not serves_several():
+    if num_kernel_threads() < 2 or not has_concurrent_kernels():
         pytest.skip("views are drawn at once where this process may use two cores and has TBB")
     yield
     limit_threads(1)
@@ -105,7 +110,7 @@ def test_scenes_of_too_many_splats_are_drawn_one_by_one(scene) -> None:
     with ViewPool(dataclasses.replace(scene, background=many), "cpu") as pool:
         assert pool.ahead == 0
     with ViewPool(scene, "cpu") as pool:
-        assert pool.ahead == thread_count()
+        assert pool.ahead == num_kernel_threads()
     with ViewPool(scene, "reference") as pool:
         assert pool.ahead == 0
 
@@ -114,17 +119,17 @@ def test_scenes_of_too_many_splats_are_drawn_one_by_one(scene) -> None:
 
 
 def test_threads_divide_what_the_process_may_use() -> None:
-    whole, of_torch, together = thread_count(), torch.get_num_threads(), threading.Barrier(2)
+    whole, of_torch, together = num_kernel_threads(), torch.get_num_threads(), threading.Barrier(2)
 
     def shares() -> tuple[int, int]:
         together.wait(10)  # so that each thread takes one
-        return thread_count(), torch.get_num_threads()
+        return num_kernel_threads(), torch.get_num_threads()
 
-    with divided_threads(2) as pool:
+    with split_threads(2) as pool:
         found = [task.result() for task in [pool.submit(shares) for _ in range(2)]]
     assert sum(own for own, _ in found) == whole
     assert all(own_of_torch <= max(own, 1) for own, own_of_torch in found)
-    assert (thread_count(), torch.get_num_threads()) == (whole, of_torch)
+    assert (num_kernel_threads(), torch.get_num_threads()) == (whole, of_torch)
     with ThreadPoolExecutor(1) as pool:  # threads begun later have what the process had
         assert pool.submit(torch.get_num_threads).result() == of_torch
 
@@ -135,7 +140,7 @@ def test_threads_that_draw_the_same_gaussians_find_one_order() -> None:
 
     def find() -> list:
         together.wait(10)
-        return [order_of(gaussians) for _ in range(3)]
+        return [spatial_order(gaussians) for _ in range(3)]
 
     with ThreadPoolExecutor(4) as pool:
         found = [task.result() for task in [pool.submit(find) for _ in range(4)]]

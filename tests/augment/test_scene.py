@@ -21,7 +21,7 @@ from augment.memo import SceneMemo, memo_of
 from augment.render.sh import evaluate_sh
 from augment.scene import (
     Actor,
-    ColorWaves,
+    ColorSeries,
     Gaussians,
     Scene,
     Track,
@@ -229,10 +229,10 @@ def test_a_colour_map_of_an_image_goes_before_that_of_its_camera():
     assert s.color_map(named("rear", 5)) is None
 
 
-def waves(count: int = 3) -> ColorWaves:
+def waves(count: int = 3) -> ColorSeries:
     times, phases = torch.tensor([1_000, 2_000]), torch.tensor([0.0, 1.0], dtype=torch.float64)
     coefficients = torch.arange(count * 12, dtype=torch.float32).reshape(count, 4, 3) / 10
-    return ColorWaves(coefficients, times, phases)
+    return ColorSeries(coefficients, times, phases)
 
 
 def test_an_actors_colours_follow_its_waves():

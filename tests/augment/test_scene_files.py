@@ -34,7 +34,7 @@ from augment.files.scene_file import (
 from augment.geometry import multiply_quats
 from augment.jobs import atomic as atomic_folder
 from augment.render.sh import evaluate_sh
-from augment.scene import Actor, ColorWaves, Gaussians, Track
+from augment.scene import Actor, ColorSeries, Gaussians, Track
 from augment.sky import ConstantSky, LatLongSky
 
 DIFFERENT = ("source", "labels")  # a loaded scene is opened from its folder
@@ -42,7 +42,7 @@ DIFFERENT = ("source", "labels")  # a loaded scene is opened from its folder
 
 def waving(terms: int) -> Actor:
     """An actor of one Gaussian, whose colours change in so many terms."""
-    waves = ColorWaves(torch.zeros(1, terms, 3), torch.tensor([0]), torch.zeros(1).double())
+    waves = ColorSeries(torch.zeros(1, terms, 3), torch.tensor([0]), torch.zeros(1).double())
     track = Track(torch.tensor([0]), torch.eye(4, dtype=torch.float64)[None])
     return Actor("1", "Car", random_gaussians(1), track, (1.0, 1.0, 1.0), waves)
 

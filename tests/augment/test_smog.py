@@ -12,16 +12,16 @@ from box_views import CAR_M, UPRIGHT, boxes_at_random, make_boxes, make_camera, 
 
 from adapters.procedural import open_truth
 from adapters.uri import parse_uri
-from augment.boxes import BOTTOM_M, NOT_COUNTED, SIDES_M
+from augment.boxes import BOTTOM_MARGIN_M, NOT_COUNTED, SIDE_MARGIN_M
 from augment.effects.smog import box_transmittance
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes
 from augment.render.fog import (
     Fog,
+    apply_deferred_fog,
     blend_airlight,
-    fog_buffers,
     optical_depth,
-    optical_depth_of_arrays,
+    optical_depth_numpy,
     sky_optical_depth,
 )
 from tests.streets import open_street
@@ -116,7 +116,7 @@ def test_deferred_smog_fogs_what_covers_the_pixel_and_leaves_the_rest_to_the_sky
     medium = Fog(0.1, GREY)
     rgb = torch.tensor([[[0.2, 0.2, 0.2], [0.0, 0.0, 0.0]]])  # half covered; not covered
     alpha = torch.tensor([[0.5, 0.0]])
-    out = fog_buffers(rgb, alpha, torch.tensor([[10.0, 0.0]]), medium, 0.0)
+    out = apply_deferred_fog(rgb, alpha, torch.tensor([[10.0, 0.0]]), medium, 0.0)
     t = math.exp(-1)
     assert torch.allclose(out[0, 0], t * rgb[0, 0] + (1 - t) * 0.5 * torch.tensor(GREY))
     assert torch.equal(out[0, 1], torch.zeros(3))
@@ -175,8 +175,8 @@ def test_the_mean_is_that_over_the_pixels_that_show_the_box(medium: Fog) -> None
     distance, height = z * rays.norm(dim=-1), EYE_Z_M + z * rays[..., 2]
     through = torch.exp(-optical_depth(medium, distance, EYE_Z_M, height)).numpy()
     for k, size in enumerate(boxes.sizes_m):
-        low, high = -size / 2 - SIDES_M, size / 2 + SIDES_M
-        low[2] = -size[2] / 2 + min(BOTTOM_M, size[2] / 4)
+        low, high = -size / 2 - SIDE_MARGIN_M, size / 2 + SIDE_MARGIN_M
+        low[2] = -size[2] / 2 + min(BOTTOM_MARGIN_M, size[2] / 4)
         rotation = rotmat_from_quat(torch.from_numpy(boxes.quats[k])).numpy()
         points = camera.centre.numpy() + depth[..., None].astype(np.float64) * rays.numpy()
         along = (points - (boxes.centers_m[k] - ORIGIN_M)) @ rotation
@@ -202,7 +202,7 @@ def test_the_optical_depth_is_that_of_the_image(medium: Fog) -> None:
     rng = np.random.default_rng(1)
     distance, z = rng.uniform(0, 300, 500), rng.uniform(-20, 80, 500)
     z[:3] = EYE_Z_M, EYE_Z_M + 1e-9, EYE_Z_M - 3e-5
-    got = optical_depth_of_arrays(medium, distance, EYE_Z_M, z)
+    got = optical_depth_numpy(medium, distance, EYE_Z_M, z)
     tensors = torch.from_numpy(distance), torch.from_numpy(z)
     expected = optical_depth(medium, tensors[0], EYE_Z_M, tensors[1]).numpy()
     # The image's takes a straight line below 1e-4, which float32 does not tell from the curve.

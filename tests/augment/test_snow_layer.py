@@ -17,15 +17,20 @@ from augment.effects.snow.cells import FLUSH, OPEN_EDGE
 from augment.effects.snow.kernels import MAX_FOLIAGE_DEPTH_M, MAX_GRAIN_DISTANCE_M, MIN_DEPTH_M
 from augment.effects.snow.layer import (
     PRESSED_SHARE,
-    build_snow_layer,
     covered_share,
     define_depths,
     find_depths,
     gradient_noise,
+    lay_snow,
+    make_depth_profile,
     mottle_noise,
-    profile_of,
 )
-from augment.effects.snow.light import Illumination, display_from_linear, illumination_of, light_of
+from augment.effects.snow.light import (
+    SnowIllumination,
+    display_from_linear,
+    find_scene_light,
+    find_snow_light,
+)
 from augment.effects.snow.near_camera import Crystals, Layer, SnowLayers
 from augment.effects.snow.relief import Carrier, Grain, add_grain
 from augment.geometry import rigid
@@ -42,18 +47,18 @@ from tests.snow_beds import bed_of_cells, cells_on_grid, grid_surface, level_bed
 
 CELL_M = 0.05
 SUN = (0.8, 0.0, 0.6)
-LIGHT = Illumination(SUN, (0.95, 0.94, 0.92), (0.62, 0.68, 0.78), 0.3)
+LIGHT = SnowIllumination(SUN, (0.95, 0.94, 0.92), (0.62, 0.68, 0.78), 0.3)
 CALM = {"wind": {"drift": 0}, "grain": 0, "tracks": "never"}
 FAR_AWAY = scene_of(grid_surface(np.zeros((1, 1)), CELL_M, corner_m=(-90.0, -90.0)))
 
 
 def _lay(bed, scene=FAR_AWAY, *, seed=3, water=None, light=LIGHT, **options) -> SnowLayers:
-    return build_snow_layer(bed, scene, Snow(**options), light, seed=seed, water_level_z_m=water)
+    return lay_snow(bed, scene, Snow(**options), light, seed=seed, water_level_z_m=water)
 
 
 def _depths(cells, *, seed=3, water=None, **options) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    profile = profile_of(Snow(**options), rng, on_ground=True, water_level_z_m=water)
+    profile = make_depth_profile(Snow(**options), rng, on_ground=True, water_level_z_m=water)
     return find_depths(cells, profile, np.uint64(seed)).heights
 
 
@@ -272,7 +277,7 @@ def test_sparkle_adds_a_few_glints_that_change_with_the_view():
     moved = cover.parts_for(FAR_AWAY, looking((3.5, 5.0, 1.5), (6.0, 4.0, 0.0)))[-1]
     here, there = (set(map(tuple, p.gaussians.means.tolist())) for p in (glints, moved))
     assert len(here & there) < 0.6 * len(here)
-    overcast = Illumination(SUN, LIGHT.lit_rgb, LIGHT.lit_rgb, 0.3)
+    overcast = SnowIllumination(SUN, LIGHT.lit_rgb, LIGHT.lit_rgb, 0.3)
     assert _lay(bed, depth_m=0.1, sparkle=1.0, light=overcast).ground.crystals is None
 
 
@@ -334,7 +339,7 @@ def test_kernel_computes_what_the_definition_says(options, corner_m, water):
     """Everything is float64 but the result, which is rounded to float32."""
     cells = _rugged_cells(corner_m)
     rng = np.random.default_rng(9)
-    profile = profile_of(Snow(**options), rng, on_ground=True, water_level_z_m=water)
+    profile = make_depth_profile(Snow(**options), rng, on_ground=True, water_level_z_m=water)
     depths = find_depths(cells, profile, SEED)
     expected = define_depths(cells, profile)
     open_m = expected[cells.semantic.numpy() != SemanticClass.VEGETATION]
@@ -397,7 +402,7 @@ def snow(*, albedo: float = 0.85, **light: float) -> Snow:
     return Snow(depth_m=0.1, albedo=albedo, light=SnowLight(**light))
 
 
-def level(light: Illumination) -> np.ndarray:
+def level(light: SnowIllumination) -> np.ndarray:
     """Linear colour of level snow that sees the sun."""
     lit, shadow = (linear_from_display(np.array(c)) for c in (light.lit_rgb, light.shadow_rgb))
     return shadow + (lit - shadow) * (light.sun[2] + light.wrap) / (1 + light.wrap)
@@ -411,7 +416,7 @@ def degrees_between(a: object, b: object) -> float:
     return math.degrees(math.acos(min(1.0, float(np.dot(np.asarray(a), np.asarray(b))))))
 
 
-def check(light: Illumination) -> None:
+def check(light: SnowIllumination) -> None:
     values = (*light.sun, *light.lit_rgb, *light.shadow_rgb, light.wrap)
     assert all(type(value) is float and math.isfinite(value) for value in values)
     assert math.hypot(*light.sun) == pytest.approx(1, abs=1e-12)
@@ -429,7 +434,7 @@ def test_encoding_is_srgb_and_inverts() -> None:
 
 @pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), [(-170, 12), (64, 45), (179, 85)])
 def test_the_sun_is_found(azimuth_deg: float, elevation_deg: float) -> None:
-    light = illumination_of(street(sky_with_sun(azimuth_deg, elevation_deg)), snow())
+    light = find_snow_light(street(sky_with_sun(azimuth_deg, elevation_deg)), snow())
     # samples are 1.1 degrees apart and are averaged over 8
     assert degrees_between(light.sun, unit(azimuth_deg, elevation_deg)) < 1.5
     check(light)
@@ -437,7 +442,7 @@ def test_the_sun_is_found(azimuth_deg: float, elevation_deg: float) -> None:
 
 def test_an_even_sky_is_overcast() -> None:
     for rgb in ((0.5, 0.5, 0.5), (1.0, 1.0, 1.0), (0.2, 0.3, 0.6)):
-        light = illumination_of(street(ConstantSky(torch.tensor(rgb))), snow())
+        light = find_snow_light(street(ConstantSky(torch.tensor(rgb))), snow())
         assert light.sun == pytest.approx(unit(135, 45), abs=1e-9)
         # soft shadows: 8 to 10 % darker than what faces the light
         assert 0.90 < luminance(light.shadow_rgb) / luminance(light.lit_rgb) < 0.92
@@ -446,9 +451,9 @@ def test_an_even_sky_is_overcast() -> None:
 
 
 def test_a_clear_sky_makes_blue_shadows_half_as_bright_and_warm_light() -> None:
-    scene_light = light_of(street(sky_with_sun(0, 45, radius_deg=4)))
+    scene_light = find_scene_light(street(sky_with_sun(0, 45, radius_deg=4)))
     assert scene_light.sun_share == pytest.approx(0.9)
-    light = illumination_of(street(sky_with_sun(0, 45, radius_deg=4)), snow())
+    light = find_snow_light(street(sky_with_sun(0, 45, radius_deg=4)), snow())
     assert 0.45 < luminance(light.shadow_rgb) / luminance(light.lit_rgb) < 0.6
     red, green, blue = light.shadow_rgb
     assert red < green < blue and blue - red < 0.2
@@ -460,7 +465,7 @@ def test_level_snow_gets_the_light_of_the_road() -> None:
     """Far below white, linear radiance is the road's times the ratio of the albedos."""
     for sky in (sky_with_sun(0, 30, radius_deg=4), ConstantSky(torch.tensor([0.2, 0.2, 0.2]))):
         for rgb in ((0.05, 0.05, 0.05), (0.2, 0.2, 0.2)):
-            light = illumination_of(street(sky, rgb), snow(albedo=0.8))
+            light = find_snow_light(street(sky, rgb), snow(albedo=0.8))
             snow_luminance = float(level(light) @ [0.2126, 0.7152, 0.0722])
             # sRGB's two halves are given to four digits
             assert snow_luminance == pytest.approx(luminance(rgb) * 0.8 / 0.10, rel=1e-4)
@@ -468,22 +473,22 @@ def test_level_snow_gets_the_light_of_the_road() -> None:
 
 def test_what_the_recipe_says_holds() -> None:
     place = street(sky_with_sun(50, 40))
-    scene_light = light_of(place)
-    azimuth = illumination_of(place, snow(sun_azimuth_deg=-100))
+    scene_light = find_scene_light(place)
+    azimuth = find_snow_light(place, snow(sun_azimuth_deg=-100))
     assert azimuth.sun == pytest.approx(unit(-100, scene_light.elevation_deg), abs=1e-9)
-    elevation = illumination_of(place, snow(sun_elevation_deg=0))
+    elevation = find_snow_light(place, snow(sun_elevation_deg=0))
     assert elevation.sun == pytest.approx(unit(scene_light.azimuth_deg, 0), abs=1e-9)
-    both = illumination_of(place, snow(sun_azimuth_deg=90, sun_elevation_deg=90))
+    both = find_snow_light(place, snow(sun_azimuth_deg=90, sun_elevation_deg=90))
     assert both.sun == pytest.approx((0, 0, 1), abs=1e-9)
     ratios = []
     for share in (0.0, 0.5, 1.0):
-        light = illumination_of(place, snow(sun=share))
+        light = find_snow_light(place, snow(sun=share))
         ratios.append(luminance(light.shadow_rgb) / luminance(light.lit_rgb))
         check(light)
     assert ratios[0] > ratios[1] > ratios[2] and ratios[2] == pytest.approx(0.5, abs=0.01)
-    bright = illumination_of(place, snow(brightness=0.8))
+    bright = find_snow_light(place, snow(brightness=0.8))
     assert luminance(bright.lit_rgb) == pytest.approx(luminance((0.8, 0.8, 0.8)), rel=1e-6)
-    check(illumination_of(place, snow(brightness=1.0, albedo=1.0)))
+    check(find_snow_light(place, snow(brightness=1.0, albedo=1.0)))
 
 
 def test_any_scene_gives_colours() -> None:
@@ -492,7 +497,7 @@ def test_any_scene_gives_colours() -> None:
         count = 1 if road == 0.5 else 30
         place = scene(ConstantSky(torch.full((3,), sky)), discs((road,) * 3, semantic, count=count))
         for recipe in (snow(), snow(albedo=1.0, sun=1.0), snow(brightness=0.0)):
-            check(illumination_of(place, recipe))
+            check(find_snow_light(place, recipe))
 
 
 # ---- near the camera -----------------------------------------------------------------------------

@@ -12,16 +12,28 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowCells, SnowSupport
+from augment.effects.snow.cells import (
+    FLUSH,
+    MAX_EDGE_DISTANCE_M,
+    OPEN_EDGE,
+    ExposedCells,
+    ExposedSurface,
+)
 from augment.effects.snow.placement import (
     EGO_WIDTH_M,
     WHEEL_OFFSET_SHARE,
-    PlacementSettings,
+    ExposureSettings,
+    find_exposed_surface,
     find_wheel_paths,
-    place_snow_support,
 )
-from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import FORMAT, load_support, save_support, support_key, support_of
+from augment.effects.snow.snow import exposure_settings
+from augment.effects.snow.support import (
+    FORMAT,
+    exposed_surface_key,
+    exposed_surface_of,
+    load_exposed_surface,
+    save_exposed_surface,
+)
 from augment.effects.snow.surface import is_vehicle
 from augment.errors import OutputError, SceneError
 from augment.labels import EGO_VEHICLE
@@ -33,13 +45,13 @@ from recipes.snow import Snow
 from tests.scenes import one_gaussian, stack
 from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, wall
 
-COARSE = PlacementSettings(cell_m=0.1)
+COARSE = ExposureSettings(cell_m=0.1)
 GROUND = sheet((-6, 20), (-8, 8))
 LEFT, RIGHT, BACK, FRONT = range(4)
 
 
-def place(scene: Scene, settings: PlacementSettings = COARSE) -> SnowSupport:
-    bed = place_snow_support(scene, cameras_of(scene), settings)
+def place(scene: Scene, settings: ExposureSettings = COARSE) -> ExposedSurface:
+    bed = find_exposed_surface(scene, cameras_of(scene), settings)
     check_cells(bed.ground, len(scene.background))
     for actor in scene.actors:
         if actor.track_id in bed.actors:
@@ -47,10 +59,10 @@ def place(scene: Scene, settings: PlacementSettings = COARSE) -> SnowSupport:
     return bed
 
 
-def check_cells(cells: SnowCells, gaussians: int) -> None:
+def check_cells(cells: ExposedCells, gaussians: int) -> None:
     """Check the rules that the cells of every scene keep."""
     count = len(cells)
-    for field in dataclasses.fields(SnowCells):
+    for field in dataclasses.fields(ExposedCells):
         values = getattr(cells, field.name)
         assert bool(torch.isfinite(values.double()).all()), field.name
         if not field.name.startswith("buried"):
@@ -58,7 +70,9 @@ def check_cells(cells: SnowCells, gaussians: int) -> None:
     np.testing.assert_allclose(cells.normals.norm(dim=1), 1, atol=1e-5)
     assert bool((cells.normals[:, 2] > 0).all())
     assert bool((cells.edge_m >= 0.499 * cells.sizes_m).all())
-    assert bool((cells.edge_m <= torch.clamp(cells.sizes_m / 2, min=EDGE_CAP_M) + 1e-5).all())
+    assert bool(
+        (cells.edge_m <= torch.clamp(cells.sizes_m / 2, min=MAX_EDGE_DISTANCE_M) + 1e-5).all()
+    )
     assert bool(((cells.light >= 0.25) & (cells.light <= 1.5)).all())
     assert bool(((cells.tracks >= 0) & (cells.tracks <= 1)).all())
     assert bool((cells.banks.norm(dim=1) <= 1 + 1e-5).all())
@@ -70,7 +84,7 @@ def check_cells(cells: SnowCells, gaussians: int) -> None:
         assert len(cells.buried.unique()) == len(cells.buried)
 
 
-def check_neighbours(cells: SnowCells) -> None:
+def check_neighbours(cells: ExposedCells) -> None:
     """Every link leads one cell aside, to a cell of the same size that links back."""
     steps = torch.tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
     for side, step in enumerate(steps):
@@ -86,20 +100,20 @@ def check_neighbours(cells: SnowCells) -> None:
         np.testing.assert_allclose(moved, expected, atol=rounding)
 
 
-def under(cells: SnowCells, x: float, y: float) -> int:
+def under(cells: ExposedCells, x: float, y: float) -> int:
     """The number of the cell under a point, -1 where there is none."""
     gap = (cells.centers_m[:, :2] - torch.tensor([x, y])).abs().amax(1)
     found = torch.nonzero(gap <= cells.sizes_m / 2 + 1e-6)[:, 0]
     return int(found[0]) if len(found) else -1
 
 
-def within(cells: SnowCells, x: tuple[float, float], y: tuple[float, float]) -> torch.Tensor:
+def within(cells: ExposedCells, x: tuple[float, float], y: tuple[float, float]) -> torch.Tensor:
     px, py = cells.centers_m[:, 0], cells.centers_m[:, 1]
     return (px > x[0]) & (px < x[1]) & (py > y[0]) & (py < y[1])
 
 
 @pytest.fixture(scope="module")
-def flat_ground() -> tuple[Scene, SnowSupport]:
+def flat_ground() -> tuple[Scene, ExposedSurface]:
     scene = drive(GROUND)
     return scene, place(scene)
 
@@ -113,7 +127,7 @@ def test_level_ground_ahead_is_covered_once(flat_ground) -> None:
     assert lowest < 0.005
     assert float(cells.normals[chosen, 2].min()) > 0.999
     np.testing.assert_allclose(cells.light[chosen], 1, atol=0.02)
-    assert float(cells.edge_m[chosen].min()) == EDGE_CAP_M
+    assert float(cells.edge_m[chosen].min()) == MAX_EDGE_DISTANCE_M
 
 
 def test_bits_do_not_depend_on_threads_or_on_who_watches(flat_ground) -> None:
@@ -121,7 +135,7 @@ def test_bits_do_not_depend_on_threads_or_on_who_watches(flat_ground) -> None:
     limit_threads(2)
     told = list[PassProgress]()
     with watched(told.append):
-        together = place_snow_support(scene, cameras_of(scene), COARSE)
+        together = find_exposed_surface(scene, cameras_of(scene), COARSE)
     assert_equal_cells(together.ground, bed.ground)
     total = told[0].total
     assert [progress.done for progress in told] == [*range(total + 1)] and total > 1
@@ -156,7 +170,7 @@ def test_a_platform_has_open_edges_and_the_ground_beside_it_none() -> None:
 )
 def test_the_slope_decides(slope: float, limit: float, cell_m: float, expected: int) -> None:
     ramp = sheet((5, 10), (-3, 3), slope_deg=slope)
-    settings = PlacementSettings(cell_m=cell_m, max_slope_deg=limit)
+    settings = ExposureSettings(cell_m=cell_m, max_slope_deg=limit)
     cells = place(drive(ramp), settings).ground
     inside = within(cells, (6, 9), (-2, 2))
     assert bool(inside.any()) == bool(expected)
@@ -179,18 +193,18 @@ def test_nothing_lies_under_a_canopy() -> None:
 def test_cells_that_would_take_too_much_memory_are_refused_at_once() -> None:
     scene = drive(GROUND)
     with pytest.raises(SceneError, match=r"0\.001 m would take [\d,]+ million cells.* GB.*cell_m"):
-        place_snow_support(scene, cameras_of(scene), PlacementSettings(cell_m=0.001))
+        find_exposed_surface(scene, cameras_of(scene), ExposureSettings(cell_m=0.001))
 
 
 def test_unknown_scale_or_gravity_and_wrong_settings_are_refused(unchecked) -> None:
     for unknown in ("has_metric_scale", "has_known_gravity"):
         scene = drive(GROUND, **{unknown: False})
         with pytest.raises(SceneError, match="not known"):
-            place_snow_support(scene, cameras_of(scene), COARSE)
+            find_exposed_surface(scene, cameras_of(scene), COARSE)
     wrong = [("cell_m", 0.0), ("cell_m", math.nan), ("max_slope_deg", 90.0), ("estimator", "mean")]
     for name, value in wrong:
         with pytest.raises(ValueError, match=name):
-            PlacementSettings(**{name: value})
+            ExposureSettings(**{name: value})
 
 
 def hole_at(ground: Gaussians, x: float, y: float, radius: float) -> Gaussians:
@@ -225,7 +239,7 @@ def test_wires_and_boards_on_edge_carry_nothing(cell_m: float) -> None:
     wire = one_gaussian(mean=(0.0, 0.0, 5.0), scale=(0.08, 0.01, 0.01), opacity=0.99)
     wire = stack(*(dataclasses.replace(wire, means=torch.tensor([[v, 0.5, 5.0]])) for v in x))
     board = [wall(10 + 0.02 * i, (-3, -1), (1.0, 3.0)) for i in range(3)]
-    cells = place(drive(GROUND, wire, *board), PlacementSettings(cell_m=cell_m)).ground
+    cells = place(drive(GROUND, wire, *board), ExposureSettings(cell_m=cell_m)).ground
     assert float(cells.centers_m[:, 2].max()) < 0.1
     assert bool(within(cells, (6.5, 8.5), (-0.2, 1.2)).any())
 
@@ -266,7 +280,7 @@ def test_vehicles_carry_snow_on_what_is_level_alone(slope: float, expected: bool
     """45 degrees are below the recipe's limit, which holds for roofs of houses."""
     for semantic, carries in ((SemanticClass.VEHICLE, expected), (SemanticClass.BUILDING, True)):
         ramp = sheet((5, 8), (-2, 2), slope_deg=slope, semantic=semantic)
-        cells = place(drive(ramp), PlacementSettings(cell_m=0.05)).ground
+        cells = place(drive(ramp), ExposureSettings(cell_m=0.05)).ground
         assert bool(within(cells, (5.5, 7.5), (-1.5, 1.5)).any()) == carries, semantic
 
 
@@ -318,14 +332,14 @@ def test_wheel_tracks_are_those_of_a_recorded_drive() -> None:
     on_path = dataclasses.replace(recorded, frames=frames, seen_frames=recorded.frames)
     assert [float(path.points_m[:, 1].mean()) for path in find_wheel_paths(on_path)] == y_m
     for tracks, expected in (("auto", False), ("always", True)):
-        settings = placement_settings(Snow(depth_m=0.1, tracks=tracks), invented)
-        assert settings.invented_tracks == expected
-        assert not placement_settings(Snow(depth_m=0.1, tracks=tracks), recorded).invented_tracks
+        settings = exposure_settings(Snow(depth_m=0.1, tracks=tracks), invented)
+        assert settings.has_invented_tracks == expected
+        assert not exposure_settings(Snow(depth_m=0.1, tracks=tracks), recorded).has_invented_tracks
 
 
 def test_wheels_leave_tracks_beside_the_path() -> None:
     scene = drive(sheet((-6, 30), (-8, 8)), places=[(x, 0.0, 1.5) for x in (0.0, 2.0, 4.0)])
-    cells = place(scene, PlacementSettings(cell_m=0.05)).ground
+    cells = place(scene, ExposureSettings(cell_m=0.05)).ground
     wheels = WHEEL_OFFSET_SHARE * EGO_WIDTH_M
     for x in (6.0, 12.0):
         for y in (wheels, -wheels):
@@ -342,7 +356,7 @@ def test_shade_on_the_ground_is_kept_and_markings_are_no_light() -> None:
         sheet((9, 14), (-8, 8), rgb=(0.3, 0.3, 0.3), semantic=road),
         sheet((3, 7), (-0.2, 0.2), 0.004, rgb=(1, 1, 1), semantic=SemanticClass.LANE_MARKING),
     ]
-    cells = place(drive(*parts), PlacementSettings(cell_m=0.05)).ground
+    cells = place(drive(*parts), ExposureSettings(cell_m=0.05)).ground
     marked = cells.semantic == SemanticClass.LANE_MARKING
     assert int(marked.sum()) > 50
     lit = within(cells, (2.5, 8), (-2, 2)) & ~marked
@@ -382,17 +396,17 @@ def test_which_actors_are_vehicles() -> None:
     for label, semantic, expected in cases:
         assert is_vehicle(box_car(label=label, semantic=semantic)) is expected, label
     walker = drive(GROUND, actors=[box_car(label="Pedestrian")])
-    assert place(walker, PlacementSettings(cell_m=0.2)).actors == {}
+    assert place(walker, ExposureSettings(cell_m=0.2)).actors == {}
 
 
-def assert_equal_cells(a: SnowCells, b: SnowCells) -> None:
-    for field in dataclasses.fields(SnowCells):
+def assert_equal_cells(a: ExposedCells, b: ExposedCells) -> None:
+    for field in dataclasses.fields(ExposedCells):
         assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
 # ---- supports in files ---------------------------------------------------------------------------
 
-SETTINGS = PlacementSettings(cell_m=0.2)
+SETTINGS = ExposureSettings(cell_m=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -402,47 +416,47 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def support(scene: Scene) -> SnowSupport:
-    found = place_snow_support(scene, cameras_of(scene), SETTINGS)
+def support(scene: Scene) -> ExposedSurface:
+    found = find_exposed_surface(scene, cameras_of(scene), SETTINGS)
     assert len(found.ground) > 500 and set(found.actors) == {"car", "täxi/2"}
     return found
 
 
-def assert_equal(a: SnowSupport, b: SnowSupport) -> None:
+def assert_equal(a: ExposedSurface, b: ExposedSurface) -> None:
     assert list(a.actors) == list(b.actors)
     for one, other in ((a.ground, b.ground), *((a.actors[k], b.actors[k]) for k in a.actors)):
-        for field in dataclasses.fields(SnowCells):
+        for field in dataclasses.fields(ExposedCells):
             x, y = getattr(one, field.name), getattr(other, field.name)
             assert x.dtype == y.dtype and torch.equal(x, y), field.name
 
 
-def test_a_file_gives_back_the_support_to_the_bit(support: SnowSupport, tmp_path: Path) -> None:
+def test_a_file_gives_back_the_support_to_the_bit(support: ExposedSurface, tmp_path: Path) -> None:
     path = tmp_path / "new" / "snow.safetensors"
-    save_support(path, support, "a key")
-    assert_equal(load_support(path, "a key"), support)
+    save_exposed_surface(path, support, "a key")
+    assert_equal(load_exposed_surface(path, "a key"), support)
     assert [p.name for p in path.parent.iterdir()] == [path.name]
-    save_support(path, dataclasses.replace(support, actors={}), "another")
-    assert load_support(path, "another").actors == {}
+    save_exposed_surface(path, dataclasses.replace(support, actors={}), "another")
+    assert load_exposed_surface(path, "another").actors == {}
 
 
-def test_the_same_support_is_the_same_bytes(support: SnowSupport, tmp_path: Path) -> None:
+def test_the_same_support_is_the_same_bytes(support: ExposedSurface, tmp_path: Path) -> None:
     for name in "ab":
-        save_support(tmp_path / name, support, "k")
+        save_exposed_surface(tmp_path / name, support, "k")
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     ground = dataclasses.replace(support.ground, light=support.ground.tracks)
-    shared = SnowSupport(ground, {"a": support.actors["car"], "b": support.actors["car"]})
-    save_support(tmp_path / "support", shared, "k")
-    assert_equal(load_support(tmp_path / "support", "k"), shared)
-    empty = place_snow_support(drive(sheet((-2, 14), (-6, 6))), [], SETTINGS)
-    save_support(tmp_path / "b", empty, "k")
-    assert_equal(load_support(tmp_path / "b", "k"), empty)
+    shared = ExposedSurface(ground, {"a": support.actors["car"], "b": support.actors["car"]})
+    save_exposed_surface(tmp_path / "support", shared, "k")
+    assert_equal(load_exposed_surface(tmp_path / "support", "k"), shared)
+    empty = find_exposed_surface(drive(sheet((-2, 14), (-6, 6))), [], SETTINGS)
+    save_exposed_surface(tmp_path / "b", empty, "k")
+    assert_equal(load_exposed_surface(tmp_path / "b", "k"), empty)
 
 
 def test_keys_tell_contents_apart(scene: Scene) -> None:
     cameras, ground, car = cameras_of(scene), scene.background, scene.actors[0]
     again = drive(sheet((-2, 14), (-6, 6), semantic=1), actors=scene.actors)
-    key = support_key(scene, cameras, SETTINGS)
-    assert support_key(again, cameras_of(again), SETTINGS) == key
+    key = exposed_surface_key(scene, cameras, SETTINGS)
+    assert exposed_surface_key(again, cameras_of(again), SETTINGS) == key
     moved = ground.means.clone()
     moved[7, 2] += 1e-3
     track = Track(car.track.timestamps_ns, car.track.world_from_actor + 0)
@@ -459,10 +473,10 @@ def test_keys_tell_contents_apart(scene: Scene) -> None:
     ]
     first = dataclasses.replace(scene.frames[0], world_from_ego=ego)
     scenes.append(dataclasses.replace(scene, frames=(first, *scene.frames[1:])))
-    keys = [key, *(support_key(other, cameras, SETTINGS) for other in scenes)]
-    keys.append(support_key(scene, cameras[:1], SETTINGS))
+    keys = [key, *(exposed_surface_key(other, cameras, SETTINGS) for other in scenes)]
+    keys.append(exposed_surface_key(scene, cameras[:1], SETTINGS))
     for change in ({"cell_m": 0.3}, {"max_slope_deg": 40.0}, {"estimator": "median"}):
-        keys.append(support_key(scene, cameras, dataclasses.replace(SETTINGS, **change)))
+        keys.append(exposed_surface_key(scene, cameras, dataclasses.replace(SETTINGS, **change)))
     assert len(set(keys)) == len(keys)
 
 
@@ -470,46 +484,46 @@ def test_a_support_is_found_once_and_a_damaged_file_is_written_anew(
     scene: Scene, tmp_path: Path, caplog
 ) -> None:
     own = dataclasses.replace(scene)
-    first = support_of(own, SETTINGS, folder=tmp_path)
-    assert support_of(own, SETTINGS) is first
+    first = exposed_surface_of(own, SETTINGS, folder=tmp_path)
+    assert exposed_surface_of(own, SETTINGS) is first
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()
     path.write_bytes(whole[:-5])
-    again = support_of(dataclasses.replace(scene), SETTINGS, folder=tmp_path)
+    again = exposed_surface_of(dataclasses.replace(scene), SETTINGS, folder=tmp_path)
     assert_equal(again, first)
     assert "placed anew" in caplog.text and path.read_bytes() == whole
 
 
-def test_files_of_something_else_are_refused(support: SnowSupport, tmp_path: Path) -> None:
+def test_files_of_something_else_are_refused(support: ExposedSurface, tmp_path: Path) -> None:
     path = tmp_path / "snow.safetensors"
     with pytest.raises(SceneError, match="no such file"):
-        load_support(path, "k")
-    save_support(path, support, "k")
+        load_exposed_surface(path, "k")
+    save_exposed_surface(path, support, "k")
     with pytest.raises(SceneError, match="of something else: its key is 'k', expected 'other'"):
-        load_support(path, "other")
+        load_exposed_surface(path, "other")
     save_file({"x": torch.zeros(3)}, path)
     with pytest.raises(SceneError, match="no snow support of this version"):
-        load_support(path, "k")
+        load_exposed_surface(path, "k")
     path.write_text("no tensors")
     with pytest.raises(SceneError, match="damaged"):
-        load_support(path, "k")
+        load_exposed_surface(path, "k")
     with pytest.raises(SceneError, match="damaged"):
-        load_support(tmp_path, "k")
+        load_exposed_surface(tmp_path, "k")
 
 
-def test_cut_files_are_refused(support: SnowSupport, tmp_path: Path) -> None:
+def test_cut_files_are_refused(support: ExposedSurface, tmp_path: Path) -> None:
     path = tmp_path / "snow.safetensors"
-    save_support(path, support, "k")
+    save_exposed_surface(path, support, "k")
     data = path.read_bytes()
     for length in (0, 1, 7, 100, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:length])
         with pytest.raises(SceneError, match="damaged"):
-            load_support(path, "k")
+            load_exposed_surface(path, "k")
 
 
-def test_contents_that_do_not_fit_are_refused(support: SnowSupport, tmp_path: Path) -> None:
+def test_contents_that_do_not_fit_are_refused(support: ExposedSurface, tmp_path: Path) -> None:
     path = tmp_path / "snow.safetensors"
-    save_support(path, support, "k")
+    save_exposed_surface(path, support, "k")
     whole = load_file(path)
     ids: dict = {"format": FORMAT, "key": "k", "track_ids": list(support.actors)}
     short = whole["ground.light"][1:].clone()
@@ -529,11 +543,11 @@ def test_contents_that_do_not_fit_are_refused(support: SnowSupport, tmp_path: Pa
     ):
         save_file(tensors, path, metadata={"snow_bed": json.dumps(about)})
         with pytest.raises(SceneError, match="damaged"):
-            load_support(path, "k")
+            load_exposed_surface(path, "k")
 
 
 def test_a_folder_that_cannot_be_written_is_an_error(scene: Scene, tmp_path: Path) -> None:
     in_the_way = tmp_path / "file"
     in_the_way.write_text("")
     with pytest.raises(OutputError, match="cannot write"):
-        support_of(dataclasses.replace(scene), SETTINGS, folder=in_the_way)
+        exposed_surface_of(dataclasses.replace(scene), SETTINGS, folder=in_the_way)

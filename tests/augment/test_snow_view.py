@@ -21,9 +21,9 @@ from box_views import (
 
 from adapters.base import open_scene, parse_uri
 from adapters.procedural import open_truth
-from augment.boxes import SIDES_M
-from augment.effects.snow.placement import PlacementSettings, place_snow_support
-from augment.effects.snow.snow import snow_pixels
+from augment.boxes import SIDE_MARGIN_M
+from augment.effects.snow.placement import ExposureSettings, find_exposed_surface
+from augment.effects.snow.snow import count_snow_pixels
 from augment.errors import SceneError
 from augment.labels import Boxes
 from augment.plan import make_plan
@@ -219,12 +219,12 @@ def test_pixels_are_those_counted_one_by_one(thickness_m: float) -> None:
     snow = np.where(rng.random((106, 160)) < 0.4, 255, 0).astype(np.uint8)
     extents = []
     for size in boxes.sizes_m:
-        low, high = -size / 2 - SIDES_M, size / 2 + SIDES_M
+        low, high = -size / 2 - SIDE_MARGIN_M, size / 2 + SIDE_MARGIN_M
         bottom = max(min(0.08, size[2] / 4), min(thickness_m + 0.05, size[2] * 3 / 4))
         low[2] = -size[2] / 2 + bottom
         high[2] = size[2] / 2 + max(0.10, 1.5 * thickness_m + 0.05)
         extents.append((low, high))
-    got = snow_pixels(placed(boxes), camera, depth, snow, thickness_m)
+    got = count_snow_pixels(placed(boxes), camera, depth, snow, thickness_m)
     pixels, marked = count_by_hand(boxes, extents, camera, depth, snow)
     assert sum(p > 0 for p in pixels) > 30 and sum(marked) > 0
     np.testing.assert_array_equal(got.pixels, pixels)
@@ -236,13 +236,13 @@ def test_snow_on_the_roof_is_the_cars_and_snow_around_its_wheels_is_not(thicknes
     boxes = make_boxes(((8, 0, 0.75), CAR_M, UPRIGHT))  # from the road to 1.5 m
     high = dataclasses.replace(make_camera(pitch=0.5), camera_from_world=raised(4.0, 0.5))
     roof = plane_depth(high, 1.5 + thickness_m)
-    got = snow_pixels(placed(boxes), high, roof, ALL, thickness_m)
+    got = count_snow_pixels(placed(boxes), high, roof, ALL, thickness_m)
     assert got.pixels[0] == got.marked[0] > 300
     # Drifts on the roof are half as deep again.
     drift = plane_depth(high, 1.5 + 1.5 * thickness_m)
-    assert snow_pixels(placed(boxes), high, drift, ALL, thickness_m).pixels[0] > 300
+    assert count_snow_pixels(placed(boxes), high, drift, ALL, thickness_m).pixels[0] > 300
     ground = plane_depth(high, thickness_m)
-    assert snow_pixels(placed(boxes), high, ground, ALL, thickness_m).pixels[0] == 0
+    assert count_snow_pixels(placed(boxes), high, ground, ALL, thickness_m).pixels[0] == 0
 
 
 @pytest.mark.parametrize("resolution", [0.5, 1.0, 2.0])
@@ -254,7 +254,7 @@ def test_the_snowy_part_is_that_of_the_cap(resolution: float) -> None:
     z = 1.6 + 9.5 * rays[..., 2]
     depth = np.where(z < 2.4, 9.5, 0).astype(np.float32)  # the snow's top, and sky
     snow = np.where(z > 2.0, 255, 0).astype(np.uint8)
-    got = snow_pixels(placed(boxes), camera, depth, snow, 0.4)
+    got = count_snow_pixels(placed(boxes), camera, depth, snow, 0.4)
     expected = 0.4 / (2.4 - 0.45)  # the lowest 45 cm stand in snow
     # Each edge is off by half a pixel, of the 20 that the face has at resolution 1.
     assert got.marked[0] / got.pixels[0] == pytest.approx(expected, abs=1 / 20 / resolution)
@@ -309,7 +309,7 @@ def points(true_street, truth):
 
 
 def covered_by(scene, points):
-    bed = place_snow_support(scene, all_cameras(scene), PlacementSettings(cell_m=0.2))
+    bed = find_exposed_surface(scene, all_cameras(scene), ExposureSettings(cell_m=0.2))
     flat = points.chosen(points.is_seen & (points.slope < math.radians(30)))
     return bed.ground, flat
 

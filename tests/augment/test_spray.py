@@ -15,8 +15,8 @@ from augment.effects.lidar.codes import SCATTERED, UNCHANGED
 from augment.effects.spray.lidar import extinction_at, look_through, spray_echoes
 from augment.effects.spray.picture import blend_puffs, windows_of
 from augment.effects.spray.puffs import (
-    FROM_MPS,
     INTERVAL_S,
+    MIN_SPEED_MPS,
     Puffs,
     film_depth_m,
     spray_puffs,
@@ -91,7 +91,7 @@ def test_slow_vehicles_lift_nothing_and_fast_ones_more_than_less_fast_ones():
         for speed in (14.0, 25.0, 33.0)
     ]
     assert 3 * strengths[0] < strengths[1] < strengths[2]
-    assert pytest.approx(11.11, abs=0.01) == FROM_MPS
+    assert pytest.approx(11.11, abs=0.01) == MIN_SPEED_MPS
     assert len(puffs_at(scene, 9.0, 0.0).extinction_per_m) == 0
 
 

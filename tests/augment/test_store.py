@@ -34,7 +34,7 @@ from augment.jobs.atomic import TEMPORARY_SUFFIX
 from augment.jobs.blocks import read_status
 from augment.jobs.claims import CLAIMS_FOLDER, ClaimTimes, try_claim, try_lock
 from augment.jobs.generate import run_generate
-from augment.jobs.store import LocalStore, Patience, RemoteStore, StoredFileMissing, open_store
+from augment.jobs.store import LocalStore, RemoteStore, RetrySettings, StoredFileMissing, open_store
 from tools.view.outputs import OutputViewer, find_output
 
 # ---- An S3 server in this process, and failures to order ----------------------------------------
@@ -183,7 +183,7 @@ def hang_up(environ: dict[str, Any]) -> Iterable[bytes]:
     raise ConnectionAbortedError
 
 
-QUICK = Patience(3, 0.001, timeout_s=5.0)
+QUICK = RetrySettings(3, 0.001, timeout_s=5.0)
 _numbers = itertools.count()
 
 
@@ -463,7 +463,7 @@ def test_writes_arrive_after_failures_or_leave_what_was_there(server, remote):
     server.fail(1, method="PUT", path="partNumber=1", cut="upload")
     remote.write("b", big)
     assert remote.read("b") == big
-    impatient = RemoteStore(remote.uri, Patience(6, 0.001, timeout_s=1.0))
+    impatient = RemoteStore(remote.uri, RetrySettings(6, 0.001, timeout_s=1.0))
     server.fail(1, method="PUT", delay_s=1.6, status=500)
     impatient.write("a", b"2")
     assert remote.read("a") == b"2"
@@ -738,14 +738,14 @@ def test_lost_requests_lose_no_claim(server, remote):
 
 @pytest.mark.long
 def test_requests_that_arrive_late_hit_no_other_claim(server, remote):
-    impatient = RemoteStore(remote.uri, Patience(0, 0.001, timeout_s=0.5))
+    impatient = RemoteStore(remote.uri, RetrySettings(0, 0.001, timeout_s=0.5))
     with try_claim(impatient, "a", ClaimTimes(0.1, 60.0)) as claim:
         server.fail(2, method="PUT", path="claims/a", delay_s=0.8)
         wait_for(lambda: not any(fault.left for fault in server.faults))
         time.sleep(1.5)
         claim.check()  # the late renewal is the holder's own
     assert remote.list("") == {}
-    claims = [try_claim(RemoteStore(remote.uri, Patience(2, 0.001, timeout_s=0.5)), "a")]
+    claims = [try_claim(RemoteStore(remote.uri, RetrySettings(2, 0.001, timeout_s=0.5)), "a")]
     server.fail(1, method="DELETE", path="claims/a", delay_s=0.8)
     claims[0].release()
     wait_for(lambda: claims.append(try_claim(remote, "a")) or claims[-1])

@@ -37,7 +37,7 @@ from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0, evaluate_sh
 from augment.render.threads import limit_threads
-from augment.scene import Actor, ColorWaves, Gaussians, PosedGaussians, Scene, Track
+from augment.scene import Actor, ColorSeries, Gaussians, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
 from augment.views import render_buffers, render_view
@@ -196,7 +196,7 @@ def test_without_directions_a_colour_below_0_is_mapped_as_the_black_that_it_show
 
 def test_colours_that_change_over_time_are_mapped_at_all_times():
     gaussians = with_classes(50, 1)
-    waves = ColorWaves(
+    waves = ColorSeries(
         0.1 * torch.randn(50, 4, 3, generator=torch.Generator().manual_seed(3)),
         torch.tensor([0, 1_000]),
         torch.tensor([0.0, 1.0], dtype=torch.float64),

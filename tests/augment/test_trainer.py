@@ -55,7 +55,7 @@ GAIN = {"left": 1.0, "right": 0.9}  # the right camera records everything darker
 PLAN = Recipe(output=Output(depth="expected"))
 ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 STEPS = 120
-QUICK = Tuning(sh_every=30, growth=Growth(every=20, start=0.1, stop=0.8))
+QUICK = Tuning(steps_per_sh_band=30, growth=Growth(every=20, start=0.1, stop=0.8))
 
 
 # ---- a truth, what is recorded of it, and where a fit starts -----------------------------------
@@ -553,7 +553,7 @@ def test_an_actor_is_pushed_along_its_forces_in_the_world():
 # ---- with gsplat ---------------------------------------------------------------------------------
 
 CONFIG = FitConfig(max_splats=600)
-TUNING = Tuning(sh_every=1, growth=Growth(every=3, start=0.1, stop=0.6))
+TUNING = Tuning(steps_per_sh_band=1, growth=Growth(every=3, start=0.1, stop=0.6))
 
 
 def trainer_on(device: str, source) -> Trainer:
@@ -575,7 +575,7 @@ def gsplat(monkeypatch):
 
 def dense_rows(trainer: Trainer, grads, inputs) -> np.ndarray:
     """A row for each of the trainer's splats."""
-    rows = np.zeros((len(trainer.splats), columns.GRAD))
+    rows = np.zeros((len(trainer.splats), columns.NUM_GRADIENTS))
     for block, (part, _, _) in enumerate(inputs.blocks):
         own = slice(block * BLOCK, block * BLOCK + grads.counts[block])
         ids = grads.ids[own]
@@ -593,7 +593,7 @@ def test_gradients_are_those_of_the_cpu_s_kernels(three_views):
     found = []
     for device in ("cpu", "cuda"):
         trainer = quick(start(), three_views, device=device)
-        trainer.step = QUICK.sh_every  # two bands are learnt
+        trainer.step = QUICK.steps_per_sh_band  # two bands are learnt
         tape = trainer._render(trainer._posed(view.camera), view.camera)
         rows = dense_rows(trainer, tape.backward(*slopes), tape.inputs)
         found.append((tape.rgb, tape.alpha, tape.expected_depth, rows))
@@ -605,11 +605,11 @@ def test_gradients_are_those_of_the_cpu_s_kernels(three_views):
         error = np.linalg.norm(cuda[:, first:last] - cpu[:, first:last])
         assert error < 1e-3 * np.linalg.norm(cpu[:, first:last]), (first, error)
     shown = np.abs(cuda).any(1)
-    radii = (rows[shown, columns.G_RADIUS] for rows in (cpu, cuda))
+    radii = (rows[shown, columns.G_MAX_SIGMA] for rows in (cpu, cuda))
     np.testing.assert_allclose(*radii, rtol=1e-4)
     # The stand-in takes the absolute value of the sum, which is at most the sum of those.
-    gap = cuda[shown, columns.G_ABS] - cpu[shown, columns.G_ABS]
-    assert gap.max() < 1e-3 * cpu[:, columns.G_ABS].max() and cuda[:, columns.G_ABS].any()
+    gap = cuda[shown, columns.G_ABS_MEAN] - cpu[shown, columns.G_ABS_MEAN]
+    assert gap.max() < 1e-3 * cpu[:, columns.G_ABS_MEAN].max() and cuda[:, columns.G_ABS_MEAN].any()
 
 
 @pytest.mark.usefixtures("gsplat")

@@ -30,7 +30,7 @@ from augment.trust import (
     judge_scene,
     judge_view,
     nearest_view,
-    seen_views,
+    source_views,
     trust_mask,
     unfitted_cameras,
 )
@@ -212,11 +212,11 @@ def test_cameras_that_were_never_fitted_are_named_and_left_out():
 def test_fits_of_before_there_was_a_record_tell_by_their_settings():
     street = open_street()
     settings = {"scale": 0.5, "cameras": "front,back", "holdout": "every-2nd"}
-    old = seen_views(dataclasses.replace(street, made_by={"settings": settings}))
+    old = source_views(dataclasses.replace(street, made_by={"settings": settings}))
     assert old.is_fit and {view.frame for view in old.views} == {street.frames[0].index}
     assert old.names == ("front", "back") and old.views[0].camera.width == 480
     for damaged in ({"scale": -1, "views": {}}, {"views": 3}, "front"):
-        assert not seen_views(dataclasses.replace(street, made_by={"fitted": damaged})).is_fit
+        assert not source_views(dataclasses.replace(street, made_by={"fitted": damaged})).is_fit
 
 
 def test_only_what_was_seen_from_near_enough_is_trusted():
@@ -231,7 +231,7 @@ def test_only_what_was_seen_from_near_enough_is_trusted():
     ):
         assert least <= mean_trust(scene, cameras["front"].scaled(scale)) <= most
     assert mean_trust(scene, cameras["back"].scaled(0.25)) < 0.05
-    nearest = nearest_view(seen_views(scene), cameras["front"])
+    nearest = nearest_view(source_views(scene), cameras["front"])
     assert nearest.magnification == pytest.approx(4) and nearest.magnification > MAX_MAGNIFICATION
 
 
@@ -264,13 +264,13 @@ def test_a_camera_path_is_judged_by_what_the_scene_was_made_from(tmp_path):
         ])
     )  # fmt: skip
     moved = with_camera_path(street, path)
-    assert len(seen_views(moved).views) == 4
+    assert len(source_views(moved).views) == 4
     (camera_trust,) = judge_scene(moved, count=1).cameras
     assert camera_trust.away and "stand away from all images" in camera_trust.problems[0]
     save_scene(moved, tmp_path / "saved")
     again = load_scene_parts(tmp_path / "saved")
     assert [f.index for f in again.seen_frames] == [f.index for f in street.frames]
-    assert len(seen_views(again).views) == 4
+    assert len(source_views(again).views) == 4
     save_scene(street, tmp_path / "plain")  # older versions read what has no such frames
     assert "seen_frames" not in (tmp_path / "plain/scene.json").read_text()
     nowhere = dataclasses.replace(street, made_by={}, seen_frames=())

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from augment import views as apply
-from augment.bounds import Bounds, bound_chunks, may_show
+from augment.bounds import Bounds, bound_squares, may_show
 from augment.boxes import instances_of
 from augment.cameras import Camera, Frame
 from augment.geometry import rigid, rotmat_from_quat
@@ -293,7 +293,7 @@ def test_a_gaussian_that_touches_the_image_is_never_out_of_view(kind):
     assert may[is_shown].all()
     assert is_shown.sum() > 200 and (~may).sum() > 200
     # One box around neighbours is in view wherever one of them is.
-    groups = bound_chunks(g, np.ones(count, bool), 1.0)
+    groups = bound_squares(g, np.ones(count, bool), 1.0)
     squares = np.floor(g.means.numpy()[:, :2].astype(float) / 1.0).astype(int)
     numbers = np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1)
     assert may_show(groups, pose.numpy(), camera, 0.01)[numbers[may]].all()

@@ -12,7 +12,7 @@ import torch
 from augment.cameras import Camera, Frame
 from augment.effects.flood.water_plane import mirrored_camera
 from augment.effects.flood.waves import WaveField
-from augment.effects.snow.cells import SnowSupport
+from augment.effects.snow.cells import ExposedSurface
 from augment.effects.wet import kernels, reflection
 from augment.effects.wet.darkening import (
     darken_gaussians,
@@ -30,7 +30,7 @@ from augment.effects.wet.ground import (
     wet_ground,
     wet_splats,
 )
-from augment.effects.wet.kernels import CHANNELS, HEIGHT, HOLLOW, OPEN, SLOPE_X
+from augment.effects.wet.kernels import HEIGHT, NUM_CHANNELS, OPEN, PUDDLE_ORDER, SLOPE_X
 from augment.effects.wet.reflection import (
     Film,
     Mirror,
@@ -41,7 +41,13 @@ from augment.effects.wet.reflection import (
     plane_in_view,
     shade_wet,
 )
-from augment.effects.wet.ripples import RING_M2, drops_per_m2_s, ring_slopes, rings_of, with_rings
+from augment.effects.wet.ripples import (
+    RING_M2,
+    add_ring_waves,
+    drops_per_m2_s,
+    make_rings,
+    ring_slopes,
+)
 from augment.memo import memo_of
 from augment.plan import make_plan, plan_view
 from augment.render.rasterize import rasterize
@@ -55,7 +61,7 @@ from recipes.schema import Output, Recipe, Render, Weather
 from tests.scenes import one_gaussian, random_gaussians, stack
 from tests.snow_beds import cells_on_grid, grid_surface, looking
 
-NO_RINGS = rings_of(0.0, 0, 0)
+NO_RINGS = make_rings(0.0, 0, 0)
 ROAD = (0.3, 0.3, 0.3)
 QUIET = Output(depth="none", semantic=False, labels=False)
 
@@ -64,9 +70,9 @@ def flat_map(size_m: float = 60.0, rise: float = 0.0, hollow: float = 0.0) -> We
     """Open ground about the origin that climbs towards +x."""
     count = round(size_m / CELL_M)
     x = (np.arange(count) + 0.5) * CELL_M - size_m / 2
-    channels = torch.zeros(count, count, CHANNELS)
+    channels = torch.zeros(count, count, NUM_CHANNELS)
     channels[..., HEIGHT] = torch.from_numpy(rise * x).float()
-    channels[..., OPEN], channels[..., SLOPE_X], channels[..., HOLLOW] = 1.0, rise, hollow
+    channels[..., OPEN], channels[..., SLOPE_X], channels[..., PUDDLE_ORDER] = 1.0, rise, hollow
     tops = channels[..., HEIGHT].clone()
     return WetGround(
         *(-size_m / 2, -size_m / 2, channels, tops, torch.ones_like(tops)), np.zeros(16, np.float32)
@@ -128,7 +134,7 @@ def scene_with(z_m: np.ndarray, cell_m=0.2, corner_m=(0.0, 0.0), above=(), frame
         frames=frames,
     )
     cells = cells_on_grid(z_m, cell_m, corner_m=corner_m)
-    memo_of(scene).put(("snow support", PLACEMENT_SETTINGS), SnowSupport(cells, {}))
+    memo_of(scene).put(("snow support", PLACEMENT_SETTINGS), ExposedSurface(cells, {}))
     return scene
 
 
@@ -156,16 +162,16 @@ def test_water_stands_in_hollows_first_and_never_on_a_slope():
     slope = np.where(x < 8, 0.4 * (8 - x), 0.0)[:, None]  # 22 degrees
     ground = wet_ground(scene_with(bowl + slope), 5)
     for share in (0.05, 0.3):
-        level = ground.puddle_level(share)
+        level = ground.find_puddle_threshold(share)
         channels = ground.channels
         is_open = channels[..., OPEN] > 0.5
-        wet = channels[..., HOLLOW] > level
+        wet = channels[..., PUDDLE_ORDER] > level
         assert float((wet & is_open).sum() / is_open.sum()) == pytest.approx(share, abs=0.01)
         at = ground.at(*torch.tensor([[20.0], [7.0]], dtype=torch.float64))
-        assert float(at[0, HOLLOW]) > level
+        assert float(at[0, PUDDLE_ORDER]) > level
         columns = ground.left_m + (torch.arange(channels.shape[1]) + 0.5) * CELL_M
         assert not bool(wet[:, columns < 6].any())
-    assert ground.puddle_level(0.0) == NO_PUDDLES
+    assert ground.find_puddle_threshold(0.0) == NO_PUDDLES
 
 
 def test_a_scene_without_open_ground_is_left_as_it_is():
@@ -274,7 +280,7 @@ def test_kernels_do_as_the_definitions_do():
     gen = torch.Generator().manual_seed(0)
     camera = looking((-10.0, 1.0, 1.4), (0.0, 0.0, 0.2), 97, 61, 90.0, timestamp_ns=1_234_567_891)
     ground = flat_map()
-    ground.channels[..., HOLLOW] = torch.randn(ground.channels.shape[:2], generator=gen)
+    ground.channels[..., PUDDLE_ORDER] = torch.randn(ground.channels.shape[:2], generator=gen)
     ground.channels[..., SLOPE_X] = 0.01 * torch.randn(ground.channels.shape[:2], generator=gen)
     ground.channels[..., HEIGHT] = 0.05 * torch.randn(ground.channels.shape[:2], generator=gen)
     rays = camera.ray_directions(torch.float64)
@@ -290,7 +296,7 @@ def test_kernels_do_as_the_definitions_do():
     view = mirror_camera(camera, Plane((0.0, 0.0, 1.0), 0.0)).cropped(0, 5, 97, 40)
     far = 30 * torch.rand(40, 97, generator=gen)
     mirror = Mirror(view, levels, torch.where(far > 6, far, 0.0))
-    film = Film(0.8, 0.3, rings_of(8.0, 7, camera.timestamp_ns))
+    film = Film(0.8, 0.3, make_rings(8.0, 7, camera.timestamp_ns))
     rgb = torch.rand(61, 97, 3, generator=gen)
     arguments = camera, depth, share, ground, film, mirror
     actual = shade_wet(rgb.clone(), *arguments)
@@ -305,13 +311,13 @@ def test_kernels_do_as_the_definitions_do():
 def test_rings_on_a_flood_are_the_definitions():
     camera = looking((0.0, 0.0, 1.2), (2.0, 0.3, 0.0), 80, 60, 3000.0, timestamp_ns=987_654_321)
     still = WaveField(*(torch.zeros(60, 80) for _ in range(3)))
-    rings = rings_of(20.0, 1, camera.timestamp_ns)
-    field = with_rings(still, camera, 0.0, rings)
-    expected = with_rings(still, camera, 0.0, rings, backend="reference")
+    rings = make_rings(20.0, 1, camera.timestamp_ns)
+    field = add_ring_waves(still, camera, 0.0, rings)
+    expected = add_ring_waves(still, camera, 0.0, rings, backend="reference")
     for name in ("normal_x", "normal_y", "slope_variance"):
         assert torch.allclose(getattr(field, name), getattr(expected, name), atol=1e-6)
     assert float(field.normal_x.abs().max()) > 0.02 and float(still.normal_x.abs().max()) == 0
-    assert with_rings(still, camera, 0.0, NO_RINGS) is still
+    assert add_ring_waves(still, camera, 0.0, NO_RINGS) is still
 
 
 # ---- Rings ---------------------------------------------------------------------------------------
@@ -327,7 +333,7 @@ def test_rings_are_a_function_of_seed_place_and_time():
     fine = torch.full((4000,), 1e-3)
 
     def at(seed=3, ns=10**18 + 5, rate=5.0, footprint=fine):
-        return ring_slopes(rings_of(rate, seed, ns), x, y, footprint)
+        return ring_slopes(make_rings(rate, seed, ns), x, y, footprint)
 
     same = at()
     assert all(torch.equal(a, b) for a, b in zip(same, at(), strict=True))
@@ -336,7 +342,7 @@ def test_rings_are_a_function_of_seed_place_and_time():
     assert float((later - same[0]).abs().mean()) < 0.3 * float(same[0].abs().mean())
     far = at(footprint=torch.full((4000,), 0.5))
     assert not bool(far[0].any()) and float(far[2][0]) == pytest.approx(
-        rings_of(5.0, 3, 0).variance
+        make_rings(5.0, 3, 0).variance
     )
     assert all(not bool(part.any()) for part in at(rate=0.0))
 
@@ -344,11 +350,11 @@ def test_rings_are_a_function_of_seed_place_and_time():
 def test_slopes_of_rings_have_the_variance_that_stands_for_them():
     gen = torch.Generator().manual_seed(0)
     x, y = (50 * torch.rand(60_000, generator=gen).double() for _ in range(2))
-    rings = rings_of(3.0, 0, 77)
+    rings = make_rings(3.0, 0, 77)
     sx, sy, _ = ring_slopes(rings, x, y, torch.full((60_000,), 1e-4))
     measured = float((sx**2 + sy**2).mean())
     assert measured == pytest.approx(rings.variance - rings.unseen, rel=0.25)
-    assert rings_of(300.0, 0, 0).variance < 0.1 and RING_M2 > 0
+    assert make_rings(300.0, 0, 0).variance < 0.1 and RING_M2 > 0
 
 
 # ---- Whole pictures ------------------------------------------------------------------------------

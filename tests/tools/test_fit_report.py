@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.procedural import TrueView, open_procedural, open_truth
+from adapters.procedural import ExactView, open_procedural, open_truth
 from augment.cameras import Camera, Frame
 from augment.geometry import rigid
 from augment.reconstruct.view import RecordedView, ViewKey
@@ -207,7 +207,7 @@ class OwnTruth:
     def __init__(self, scene: Scene):
         self.scene = scene
 
-    def render(self, camera: Camera) -> TrueView:
+    def render(self, camera: Camera) -> ExactView:
         depth = render_recorded(self.scene, camera).median_depth_m.astype(np.float64)
         depth[depth == 0] = 7.0
         semantic = np.full(depth.shape, SemanticClass.ROAD, np.int16)
@@ -216,7 +216,7 @@ class OwnTruth:
         semantic[:, half:] = SemanticClass.BUILDING
         depth[:10], semantic[:10] = np.inf, SemanticClass.SKY
         nothing = np.zeros((*depth.shape, 3), np.float32)
-        return TrueView(nothing, depth, nothing, semantic, semantic.astype(np.int32))
+        return ExactView(nothing, depth, nothing, semantic, semantic.astype(np.int32))
 
 
 def test_depth_errors_are_those_of_a_known_difference():

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from adapters import detect_format as source_trees
-from augment.effects.lidar import drop_lost
+from augment.effects.lidar import drop_lost_returns
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import AdapterError, ClimateGSError, OutputError
 from augment.jobs.manifest import read_manifest
-from augment.jobs.mirror_sweeps import frames_of_span
+from augment.jobs.mirror_sweeps import find_span_frames
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import read_lidar
 from augment.labels import LidarSweep
@@ -197,7 +197,7 @@ def test_weathered_sweeps_stand_in_the_copy(root, tmp_path, bin_sweeps):
     lidar = {place for place in changed(root, copy) if place.endswith(".bin")}
     assert lidar == {place for place in LIDAR_FILES if "01" not in place}
     for frame in (0, 2):
-        sweep = drop_lost(read_lidar(out / f"street/wet-000/lidar/{frame:06d}.parquet"))
+        sweep = drop_lost_returns(read_lidar(out / f"street/wet-000/lidar/{frame:06d}.parquet"))
         assert 0 < len(sweep) < 50
         assert (copy / f"lidar/{frame:02d}.bin").read_bytes() == sweep.points_m.tobytes()
         intensity = sweep.columns["intensity"].tobytes()
@@ -278,7 +278,7 @@ def test_sweeps_between_images_have_the_weather_too(root, tmp_path, bin_sweeps):
     wet = make_recipe("wet", **WET)
     render(one, out, wet)
     assert lidar_line(mirror_outputs(one, out, progress=False)).startswith("2 of 3 LiDAR sweeps")
-    expected = drop_lost(weathered_sweep(one, wet, 1, one.lidar(1)))
+    expected = drop_lost_returns(weathered_sweep(one, wet, 1, one.lidar(1)))
     assert (copy / "lidar/01.bin").read_bytes() == expected.points_m.tobytes()
     before = contents(copy)
     assert "(up to date)" in mirror_outputs(one, out, progress=False)[0]
@@ -307,7 +307,7 @@ def test_the_span_has_the_frames_between_rendered_ones(rendered, span):
     scene = open_fake("fake:street")
     pictured, empty = scene.frames[0], dataclasses.replace(scene.frames[0], cameras={})
     frames = [dataclasses.replace(pictured if n % 2 else empty, index=n) for n in range(7)]
-    assert tuple(frames_of_span(frames, rendered, pictured.cameras)) == span
+    assert tuple(find_span_frames(frames, rendered, pictured.cameras)) == span
 
 
 def test_what_will_stay_clear_is_said_before(root, bin_sweeps):

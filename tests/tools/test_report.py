@@ -21,7 +21,7 @@ import pytest
 
 from augment.errors import OutputError
 from augment.jobs.files import box_tables, visibility
-from augment.jobs.layout import MANIFEST
+from augment.jobs.layout import MANIFEST_FILE
 from augment.jobs.manifest import publish_part, rows_to_table, write_manifest
 from augment.jobs.store import LocalStore
 from tests.tools.report_outputs import make_row, street_rows, write_output
@@ -208,12 +208,12 @@ def test_outputs_of_every_state_have_a_page(street, tmp_path) -> None:
     assert "3 failed" in page.text and "0 images" in page.text and page.tags["img"] == 0
     old, rows = tmp_path / "old", street_rows(scenes=1, frames=1)
     write_output(old, rows, buffers=False)
-    table = pq.read_table(old / MANIFEST)
+    table = pq.read_table(old / MANIFEST_FILE)
     young = ["box_smog_path", "snow_path", "style", "snow_depth_m", "style_strength", "surface"]
-    pq.write_table(table.drop_columns(young), old / MANIFEST)
+    pq.write_table(table.drop_columns(young), old / MANIFEST_FILE)
     page = page_of(old)
     assert "10 images" in page.text and "Labels" not in page.text
-    (old / MANIFEST).unlink()  # a running job's
+    (old / MANIFEST_FILE).unlink()  # a running job's
     publish_part(LocalStore(old), "block", rows_to_table(rows[:6]))
     assert "6 images" in page_of(old).text
 

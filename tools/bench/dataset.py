@@ -21,7 +21,7 @@ from torch.utils.data import DataLoader, Dataset
 from adapters.base import open_scene
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
 from augment.jobs.atomic import write_atomic
-from augment.jobs.layout import MANIFEST
+from augment.jobs.layout import MANIFEST_FILE
 from augment.jobs.manifest import manifest_bytes, read_manifest
 from augment.views import render_view
 from recipes.load import load_recipe
@@ -123,7 +123,7 @@ def _write_manifest_of(target: Path, folder: Path, count: int) -> Path:
         columns["variant"] = pa.array([name] * piece.num_rows, columns["variant"].type)
         columns["checksum"] = pa.array([f"{first + n:064x}" for n in range(piece.num_rows)])
         pieces.append(pa.table(columns))
-    write_atomic(target / MANIFEST, manifest_bytes(pa.concat_tables(pieces)))
+    write_atomic(target / MANIFEST_FILE, manifest_bytes(pa.concat_tables(pieces)))
     return target
 
 

@@ -118,7 +118,7 @@ def time_steps(uri: str, scale: float, case: FitCase) -> tuple[Table, Figures]:
     started = time.perf_counter()
     warm_up()
     config = FitConfig(densify="none")
-    tuning = Tuning(sh_every=1)
+    tuning = Tuning(steps_per_sh_band=1)
     trainer = Trainer(scene, source, config, NOMINAL_STEPS, tuning=tuning)
     for _ in range(UNTIMED):
         trainer.run_step()

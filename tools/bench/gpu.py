@@ -38,10 +38,10 @@ from augment.render.buffers import ALPHA, CPU, RGB, RenderOutput
 from augment.render.constants import ALPHA_MIN, COV2D_BLUR, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.cuda.driver import list_tiles, project, rasterize_cuda
 from augment.render.cuda.runtime import gpu_device, launch
-from augment.render.cuda.splats import TILE, CudaSplats, CudaTiles, GpuStageTimer, gather_inputs
+from augment.render.cuda.splats import TILE, CudaSplats, CudaStageTimer, CudaTiles, gather_inputs
 from augment.render.fog import Fog
 from augment.render.layout import (
-    C_AT,
+    C_VALUE,
     C_X,
     C_Y,
     FALL_Y,
@@ -63,13 +63,13 @@ from tools.bench.harness import (
     WallClock,
     figures,
     gpu_facts,
-    guarded,
     image_difference,
     machine_facts,
     markdown,
     peak_gpu_mib,
     replace_marked,
     rounds,
+    run_and_time,
     run_in_subprocess,
     spread,
     spread_ms,
@@ -245,7 +245,7 @@ def count_blends(
         alpha = alpha.where(log_alpha >= math.log2(ALPHA_MIN), 0)
         if splats.cuts is not None:
             cut = splats.cuts[ids].T[..., None]
-            alpha = alpha * (cut[C_AT] + cut[C_X] * dx + cut[C_Y] * dy).clamp(0, 1)
+            alpha = alpha * (cut[C_VALUE] + cut[C_X] * dx + cut[C_Y] * dy).clamp(0, 1)
         after = (1 - alpha).cumprod(0)
         before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
         blended = (alpha > 0) & (before > stop) & (after > min(stop, TRANSMITTANCE_STOP))
@@ -275,7 +275,7 @@ def measure_raster(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figu
     frames = {"clean": lambda: draw(parts, camera), "smog": lambda: draw(parts, camera, MEDIUM)}
     stages = []
     for _ in range(timing.warm_up + timing.repeats):  # in frames of their own
-        timer = GpuStageTimer()
+        timer = CudaStageTimer()
         draw(parts, camera, timer=timer)
         stages.append(timer.milliseconds())
     peak, extra = peak_gpu_mib(frames["clean"])  # before gsplat's copy of the scene lies there, too
@@ -640,7 +640,7 @@ def measure(
         left_s = 60 * minutes - (time.perf_counter() - start)
         work = (run_section, (name, case, timing, ceilings))
         with mock.patch.dict(os.environ, {"TRITON_INTERPRET": "1"} if name == LAUNCHES else {}):
-            found[name] = run_in_subprocess(*work, left_s) if in_processes else guarded(*work)
+            found[name] = run_in_subprocess(*work, left_s) if in_processes else run_and_time(*work)
         if "bytes_per_s" in found[name]:
             ceilings = Ceilings(found[name]["bytes_per_s"], found[name]["blends_per_s"])
         write_json(json_file, gpu_figures(found, timing, machine), say=False)

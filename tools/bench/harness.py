@@ -170,7 +170,7 @@ def rounds(
     for repeat in tqdm(range(warm_up + repeats), unit="round", leave=False):
         if repeat == warm_up:
             clock.wait()
-        for name in in_turns(cases, repeat):
+        for name in alternate_order(cases, repeat):
             start = clock.mark()
             cases[name]()
             marks[name].append((start, clock.mark()))
@@ -181,7 +181,7 @@ def rounds(
     }
 
 
-def in_turns(names: Mapping[str, Any], repeat: int) -> list[str]:
+def alternate_order(names: Mapping[str, Any], repeat: int) -> list[str]:
     """Return the names in order, and every other time in the opposite order."""
     return [*names] if repeat % 2 else [*names][::-1]
 
@@ -290,7 +290,7 @@ def _extra_mib_of(work: Callable[..., Action], arguments: tuple[Any, ...]) -> Fi
     return {"mib": extra_mib(work(*arguments))}
 
 
-def guarded(work: Callable[..., Figures], arguments: tuple[Any, ...]) -> Figures:
+def run_and_time(work: Callable[..., Figures], arguments: tuple[Any, ...]) -> Figures:
     """Return the figures of the work with the `seconds` that it took, or its error as `failed`."""
     start = time.perf_counter()
     try:
@@ -304,7 +304,7 @@ def guarded(work: Callable[..., Figures], arguments: tuple[Any, ...]) -> Figures
 def run_in_subprocess(
     work: Callable[..., Figures], arguments: tuple[Any, ...], within_s: float
 ) -> Figures:
-    """As `guarded`, in a fresh process; `left_out` where no time is left or it takes longer.
+    """As `run_and_time`, in a fresh process; `left_out` where no time is left or it takes longer.
 
     work: of a module, so that the other process finds it.
     """
@@ -330,7 +330,7 @@ def run_in_subprocess(
 def _send_result(
     sending: Connection, work: Callable[..., Figures], arguments: tuple[Any, ...]
 ) -> None:
-    sending.send(guarded(work, arguments))
+    sending.send(run_and_time(work, arguments))
 
 
 # ---- the machine --------------------------------------------------------------------------------
@@ -341,7 +341,7 @@ def machine_facts() -> Figures:
 
     load: processes that ran or waited over the minute before; more than a few tenths disturb.
     """
-    from augment.render.threads import select_thread_pool, thread_count
+    from augment.render.threads import num_kernel_threads, select_thread_pool
 
     flags = (_proc_field("/proc/cpuinfo", "flags") or "").split()
     total = _proc_field("/proc/meminfo", "MemTotal")
@@ -351,7 +351,7 @@ def machine_facts() -> Figures:
         "simd": [name for name in ("sse4_2", "avx", "avx2", "fma", "avx512f") if name in flags],
         "memory_gib": None if total is None else round(int(total.split()[0]) / 2**20, 1),
         "thread_pool": select_thread_pool(),  # before anything starts a pool of numba's choice
-        "threads": thread_count(),
+        "threads": num_kernel_threads(),
         "torch_threads": torch.get_num_threads(),
         "load": load_average(),
         "platform": platform.platform(),

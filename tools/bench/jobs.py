@@ -26,7 +26,7 @@ from adapters.base import open_scene
 from augment.cameras import Camera, Frame
 from augment.files.export import export_ply
 from augment.files.scene_file import save_scene, save_scene_file
-from augment.jobs.block_worker import WorkSetup
+from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.blocks import Block, read_status
 from augment.jobs.files import WritePump, encode_depth, encode_image
 from augment.jobs.generate import BlockWork, GenerateJob, Workers, plan_job, run_generate
@@ -214,7 +214,7 @@ def _job(
 ) -> GenerateJob:
     fields = {"scenes": ["-"], "recipes": [template.name], "scale": scale}
     job = Job.model_validate({**fields, "block_images": block_images})
-    given = WorkSetup(str(out), None, "auto", **{"open_scene": open_scene, **setup})
+    given = JobWorkerSetup(str(out), None, "auto", **{"open_scene": open_scene, **setup})
     scenes = [job.scenes[0].model_copy(update={"uri": uri})]
     return GenerateJob(JobRecipes(job, {template.name: template}), scenes, given)
 

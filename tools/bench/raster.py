@@ -145,7 +145,7 @@ def multiply_add(rounds, sums):
     """Chains of fused multiply-adds of v8.WIDE lanes, as many as keep all units busy, a thread."""
     for run in prange(sums.size // v8.WIDE):
         one = v8.wide_columns()
-        half = v8.splat_as(one, np.float32(0.5))
+        half = v8.broadcast_as(one, np.float32(0.5))
         a = one
         b = one
         c = one

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from adapters.procedural import StreetTruth, TrueView
+from adapters.procedural import ExactView, StreetTruth
 from augment.cameras import Camera
 from augment.plan import make_plan
 from augment.render.fog import blend_airlight, optical_depth
@@ -74,7 +74,7 @@ class TruthView:
 
     camera: Camera
     clean: Tensor
-    exact: TrueView
+    exact: ExactView
     regions: Mapping[str, np.ndarray]
 
 
@@ -100,7 +100,7 @@ def smog_error(recipe: Recipe, scene: Scene, view: TruthView) -> np.ndarray:
     return (fogged - exact).abs().amax(-1).numpy() * 255
 
 
-def away_from_silhouettes(view: TrueView) -> np.ndarray:
+def away_from_silhouettes(view: ExactView) -> np.ndarray:
     """Pixels whose square of SMOOTH px shows one object, one class, and little change of depth."""
     kernel = np.ones((SMOOTH, SMOOTH), np.uint8)
     far = np.where(np.isfinite(view.depth), view.depth, 1e6).astype(np.float32)

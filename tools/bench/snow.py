@@ -22,17 +22,17 @@ import torch
 from adapters.base import open_scene
 from adapters.procedural import RayHits, StreetTruth
 from augment.cameras import Camera
-from augment.effects.snow.cells import SnowCells, SnowSupport
-from augment.effects.snow.height_map import Estimator
-from augment.effects.snow.layer import build_snow_layer
-from augment.effects.snow.light import illumination_of
-from augment.effects.snow.placement import PlacementSettings, place_snow_support
-from augment.effects.snow.snow import placement_settings
+from augment.effects.snow.cells import ExposedCells, ExposedSurface
+from augment.effects.snow.height_map import DepthEstimator
+from augment.effects.snow.layer import lay_snow
+from augment.effects.snow.light import find_snow_light
+from augment.effects.snow.placement import ExposureSettings, find_exposed_surface
+from augment.effects.snow.snow import exposure_settings
 from augment.geometry import rigid
 from augment.metrics.consistency import DepthView, find_warp
 from augment.render.buffers import BUFFERS
 from augment.render.constants import RasterSettings
-from augment.render.layout import UNCUT
+from augment.render.layout import SURFACE_DEPTHS_ONLY
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
@@ -50,7 +50,7 @@ from tools.bench.scenes import (
 NEXT_CAMERA = "next camera"
 AHEAD = "1 ahead"
 SHADINGS = ("per_splat", "per_pixel")
-ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
+ESTIMATORS: tuple[DepthEstimator, ...] = get_args(DepthEstimator)
 DEPTHS_M = (0.02, 0.1, 0.4)
 SKY_Z_M = 60.0  # above everything on the street
 OVER_M = 0.2  # a cell farther above or below the true surface does not lie on it
@@ -99,11 +99,11 @@ def tables(case: EffectCase, repeats: int) -> list[Table]:
 # ---- placement: what it takes, and what it covers -----------------------------------------------
 
 
-def placement(scene: Scene, cell_m: float, backend: str = "auto") -> Callable[[], SnowSupport]:
+def placement(scene: Scene, cell_m: float, backend: str = "auto") -> Callable[[], ExposedSurface]:
     """Return an action that places snow for all cameras."""
-    settings = placement_settings(snow_recipe(cell_m=cell_m).weather.snow, scene)
+    settings = exposure_settings(snow_recipe(cell_m=cell_m).weather.snow, scene)
     cameras = all_cameras(scene)
-    return functools.partial(place_snow_support, scene, cameras, settings, backend=backend)
+    return functools.partial(find_exposed_surface, scene, cameras, settings, backend=backend)
 
 
 def placement_table(uri: str, case: EffectCase, repeats: int) -> Table:
@@ -116,7 +116,7 @@ def placement_table(uri: str, case: EffectCase, repeats: int) -> Table:
 
     def lay(shading: str) -> object:
         snow = recipe_of({"snow": {"depth_m": next(depths_m), "shading": shading}}).weather.snow
-        return build_snow_layer(support, scene, snow, illumination_of(scene, snow), seed=0)
+        return lay_snow(support, scene, snow, find_snow_light(scene, snow), seed=0)
 
     laid = rounds({name: functools.partial(lay, name) for name in SHADINGS}, repeats)
     stages |= {f"another depth, {name}": seconds for name, seconds in laid.items()}
@@ -133,8 +133,8 @@ def placement_table(uri: str, case: EffectCase, repeats: int) -> Table:
 
 def _warm_placement(uri: str, cell_m: float) -> Action:
     scene = open_scene(uri)
-    settings = placement_settings(snow_recipe(cell_m=10 * cell_m).weather.snow, scene)
-    place_snow_support(scene, all_cameras(scene)[:1], settings)  # loads the kernels
+    settings = exposure_settings(snow_recipe(cell_m=10 * cell_m).weather.snow, scene)
+    find_exposed_surface(scene, all_cameras(scene)[:1], settings)  # loads the kernels
     return placement(scene, cell_m)
 
 
@@ -260,7 +260,7 @@ def snow_accuracy(
     reach_m: float,
     pixel_m: float,
     depths_m: Sequence[float] = DEPTHS_M,
-    estimators: Sequence[Estimator] = ESTIMATORS,
+    estimators: Sequence[DepthEstimator] = ESTIMATORS,
 ) -> dict[str, Any]:
     """Figures of every estimator that placement can use. reach_m: level distance from the cameras
     within which points are taken. pixel_m: of the view from above; every second of its pixels along
@@ -272,14 +272,14 @@ def snow_accuracy(
     points = true_points(
         street, cameras, pixel_places(above)[1::2, 1::2].reshape(-1, 2), reach_m=reach_m
     )
-    max_slope = math.radians(PlacementSettings(cell_m=cell_m).max_slope_deg)
+    max_slope = math.radians(ExposureSettings(cell_m=cell_m).max_slope_deg)
     flat = points.chosen(points.is_seen & (points.slope < max_slope))
     crown = flat.semantic == SemanticClass.VEGETATION
     bias = _scene_bias_m(scene, street, flat, above)
     estimator_rows = []
     for estimator in estimators:
-        settings = PlacementSettings(cell_m=cell_m, estimator=estimator)
-        support = place_snow_support(scene, cameras, settings)
+        settings = ExposureSettings(cell_m=cell_m, estimator=estimator)
+        support = find_exposed_surface(scene, cameras, settings)
         covered = cells_over(support.ground, flat) >= 0
         rings = {}
         for low, high in itertools.pairwise(RINGS_M):
@@ -336,7 +336,7 @@ def accuracy_tables(street: str, accuracy: dict[str, Any]) -> list[Table]:
     ]
 
 
-def cells_over(cells: SnowCells, points: TruePoints) -> np.ndarray:
+def cells_over(cells: ExposedCells, points: TruePoints) -> np.ndarray:
     """int64 [P]: the cell over each point and close to its surface, -1 where there is none."""
     centers = cells.centers_m.numpy().astype(np.float64)
     sizes = cells.sizes_m.numpy()
@@ -360,7 +360,7 @@ def _keys(columns_rows: np.ndarray) -> np.ndarray:
     return (columns_rows[:, 0] << 32) + columns_rows[:, 1]
 
 
-def _heights(cells: SnowCells, which: np.ndarray, xy: np.ndarray) -> np.ndarray:
+def _heights(cells: ExposedCells, which: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """z of cells' planes at places [P, 2]."""
     centers = cells.centers_m.numpy()[which].astype(np.float64)
     normals = cells.normals.numpy()[which].astype(np.float64)
@@ -368,7 +368,7 @@ def _heights(cells: SnowCells, which: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return centers[:, 2] + (slopes * (xy - centers[:, :2])).sum(1)
 
 
-def support_heights(cells: SnowCells, points: TruePoints) -> np.ndarray:
+def support_heights(cells: ExposedCells, points: TruePoints) -> np.ndarray:
     """z [P] of the support under each point, NaN where it has none."""
     over = cells_over(cells, points)
     z = np.full(len(points), np.nan)
@@ -391,7 +391,9 @@ def _scene_bias_m(scene: Scene, truth: StreetTruth, points: TruePoints, above: C
     the centres of those that are heaviest there. A fitted or sampled surface has such an offset,
     which no placement can know.
     """
-    out = rasterize([PosedGaussians(scene.background)], above, buffers=BUFFERS, clip=UNCUT)
+    out = rasterize(
+        [PosedGaussians(scene.background)], above, buffers=BUFFERS, clip=SURFACE_DEPTHS_ONLY
+    )
     ids = np.unique(out.splat_ids.numpy()[pixels_of(above, points.xy)])
     means = scene.background.means.numpy()[ids[ids >= 0]].astype(np.float64)
     off = means[:, 2] - surface_below(truth, means[:, :2])
@@ -400,7 +402,7 @@ def _scene_bias_m(scene: Scene, truth: StreetTruth, points: TruePoints, above: C
 
 def _drawn(
     scene: Scene,
-    support: SnowSupport,
+    support: ExposedSurface,
     truth: StreetTruth,
     flat: TruePoints,
     above: Camera,
@@ -412,11 +414,11 @@ def _drawn(
     with the scene's own offset.
     """
     snow = recipe_of({"snow": {"depth_m": depth_m}}).weather.snow
-    layer = build_snow_layer(support, scene, snow, illumination_of(scene, snow), seed=0).ground
+    layer = lay_snow(support, scene, snow, find_snow_light(scene, snow), seed=0).ground
     without_snow = dataclasses.replace(scene.background, opacities=layer.opacities)
     parts = [PosedGaussians(without_snow), PosedGaussians(layer.gaussians, is_overlay=True)]
     settings = RasterSettings(sh_degree=0)
-    out = rasterize(parts, above, buffers=BUFFERS, settings=settings, clip=UNCUT)
+    out = rasterize(parts, above, buffers=BUFFERS, settings=settings, clip=SURFACE_DEPTHS_ONLY)
     height = SKY_Z_M - out.mode_depth.to(torch.float64).numpy()
     shows_snow = out.overlay.numpy() >= 0.5
     z = height[pixels_of(above, flat.xy)]

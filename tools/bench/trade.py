@@ -44,14 +44,14 @@ from augment.cameras import Camera
 from augment.errors import ClimateGSError, SceneError
 from augment.ground import ground_of
 from augment.jobs.files import decode_image, encode_image
-from augment.jobs.quality import Cost, Settings, Trial, render_trial, search, useful
+from augment.jobs.quality import Cost, Settings, Trial, render_trial, search, select_useful_values
 from augment.jobs.worker import default_renderer
 from augment.memo import memo_of
 from augment.metrics.consistency import DepthView, warp_view
 from augment.metrics.image import depth_errors, flip, ssim
-from augment.prune import share_errors
+from augment.prune import precompute_errors
 from augment.render.buffers import CPU, CUDA
-from augment.render.cpu.driver import release_scratch
+from augment.render.cpu.driver import free_scratch
 from augment.scene import Scene
 from augment.view_images import SURFACE_ALPHA
 from augment.views import render_view
@@ -65,8 +65,8 @@ from recipes.schema import (
     Recipe,
     Value,
     Weather,
-    as_reference,
     knobs_of,
+    with_reference_settings,
     with_settings,
 )
 from tools.bench import harness
@@ -160,7 +160,7 @@ def settings_of_trade(recipe: Recipe, wholes: Wholes | None = None) -> list[tupl
 
     wholes: settings of many knobs that replace all but the reference.
     """
-    best = as_reference(recipe)
+    best = with_reference_settings(recipe)
     knobs = knobs_of(recipe)
     references = {knob.path: knob.reference for knob in knobs if knob.chosen}
     single: list[tuple[Row, Recipe]] = []
@@ -226,7 +226,7 @@ class Standard:
         return covered if effect.lies_on_scene else covered & self.surfaces
 
 
-def standard_of(
+def render_standard(
     scene: Scene, camera: Camera, recipe: Recipe, true_m: np.ndarray | None, backend: str
 ) -> Standard:
     """recipe: at reference. true_m: of the scene without what lies on it."""
@@ -372,7 +372,7 @@ def bench_trade(
     scene = open_scene(scene_uri)
     with contextlib.suppress(SceneError):  # looked for once, not for every copy of the scene
         scene = dataclasses.replace(scene, ground=ground_of(scene))
-    share_errors(scene)
+    precompute_errors(scene)
     views = trade_views(scene, case.width)
     cameras = [camera for _, camera in views]
     machine = harness.machine_facts()
@@ -386,7 +386,7 @@ def bench_trade(
         memo_of(recipe_scene).update(memo_of(scene).shared())
         settings = settings_of_trade(recipe, wholes)
         standards = [
-            standard_of(recipe_scene, camera, settings[0][1], true, backend)
+            render_standard(recipe_scene, camera, settings[0][1], true, backend)
             for camera, true in zip(cameras, true_m, strict=True)
         ]
         rows: list[Row] = []
@@ -426,7 +426,7 @@ def setting_rows(
     """Rows, and pictures of the first view. settings: reference first. Timed frames take turns, on
     one view after the other; all has been rendered, and so loaded and laid, before.
     """
-    clean = as_reference(recipe.model_copy(update={"weather": Weather(), "style": None}))
+    clean = with_reference_settings(recipe.model_copy(update={"weather": Weather(), "style": None}))
     cameras = [standard.camera for standard in standards]
 
     def frame(trial_recipe: Recipe, camera: Camera) -> harness.Action:
@@ -463,7 +463,7 @@ def frame_mib(frame: harness.Action, backend: str) -> float | None:
     """
     if backend == CUDA:
         return harness.peak_gpu_mib(frame)[1]
-    release_scratch()
+    free_scratch()
     return harness.extra_mib(frame)
 
 
@@ -565,7 +565,9 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
         if knob.chosen:
             costs = [value_cost(rows, path, value) for value in knob.values[:-1]]
             known_costs = [cost for cost in costs if cost is not None]
-            fast_first = useful([*known_costs, Cost(knob.reference, 100.0, 0.0)])[::-1]
+            fast_first = select_useful_values([*known_costs, Cost(knob.reference, 100.0, 0.0)])[
+                ::-1
+            ]
             # What is beyond the bound alone need not be rendered with others.
             ladders[path] = [cost for cost in fast_first if cost.flip <= bound]
     by_time = sorted(ladders, key=lambda path: _saved(rows, path, ladders[path]), reverse=True)

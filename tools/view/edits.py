@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from augment.errors import OutputError
-from augment.jobs.atomic import write_new
+from augment.jobs.atomic import write_new_file
 from augment.jobs.render_job import copy_files, portable_recipe
 from recipes.errors import RecipeError, short
 from recipes.fields import found, replaced
@@ -165,7 +165,7 @@ def save_recipe(recipe: Recipe, path: Path) -> None:
     for section, effect in portable.sections().items():
         for name, file in effect.files.items():
             portable = replaced(portable, f"{section}.{name}", f"{files_dir.name}/{file}")
-    write_new(path, dump_recipe(portable).encode())
+    write_new_file(path, dump_recipe(portable).encode())
     try:
         copy_files(recipe, files_dir)
     except BaseException:
@@ -205,7 +205,7 @@ def create_file(folder: Path, name: str, ending: str, data: bytes) -> Path:
     for number in itertools.count(1):
         path = folder / f"{name if number == 1 else f'{name}-{number}'}{ending}"
         try:
-            write_new(path, data)
+            write_new_file(path, data)
         except FileExistsError:
             continue
         return path

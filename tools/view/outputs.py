@@ -14,7 +14,7 @@ from augment.errors import OutputError
 from augment.files.image_size import image_header
 from augment.jobs.files import decode_image, decode_png, depth_in_metres
 from augment.jobs.layout import mask_names, resolve_inside
-from augment.jobs.manifest import MANIFEST, OK, Row, read_finished, weather_columns
+from augment.jobs.manifest import MANIFEST_FILE, OK, Row, read_manifest_rows, weather_columns
 from augment.jobs.store import Store, open_store
 from recipes.files import open_file
 from recipes.schema import columns_of_effects
@@ -41,9 +41,9 @@ def find_output(text: str) -> Store | None:
         OutputError: a bucket that cannot be read.
     """
     if "://" not in text:
-        return open_store(text) if (Path(text) / MANIFEST).is_file() else None
+        return open_store(text) if (Path(text) / MANIFEST_FILE).is_file() else None
     store = open_store(text)
-    return store if store.exists(MANIFEST) else None
+    return store if store.exists(MANIFEST_FILE) else None
 
 
 class OutputViewer:
@@ -55,7 +55,7 @@ class OutputViewer:
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        table = read_finished(store)
+        table = read_manifest_rows(store)
         self.rows: list[Row] = [row for row in table.to_pylist() if row["status"] == OK]
         if not self.rows:
             raise OutputError(f"{store.uri} holds no finished image; run `climategs render` first")

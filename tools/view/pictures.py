@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from augment import effects
-from augment.boxes import EDGES, PlacedBoxes
+from augment.boxes import EDGES, WorldBoxes
 from augment.cameras import Camera, Frame
-from augment.effects.lidar.codes import CODE_COLUMN, drop_lost
+from augment.effects.lidar.codes import CODE_COLUMN, drop_lost_returns
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.geometry import invert_rigid, rigid, rotmat_from_quat
 from augment.jobs.layout import TRUST
@@ -23,7 +23,7 @@ from augment.plan import make_plan
 from augment.render.buffers import AUTO, SPLAT_IDS
 from augment.scene import Scene
 from augment.semantics import SemanticClass
-from augment.trust import MAX_ANGLE_RAD, MAX_DISTANCE_M, nearest_view, seen_views
+from augment.trust import MAX_ANGLE_RAD, MAX_DISTANCE_M, nearest_view, source_views
 from augment.views import render_buffers, render_view
 from recipes.fields import replaced
 from recipes.schema import Recipe
@@ -109,7 +109,7 @@ def away_sentence(scene: Scene, camera: Camera) -> str | None:
         A sentence for the page; None if an image that the scene was made from is near enough, or
         if distances or those images are not known.
     """
-    nearest = nearest_view(seen_views(scene), camera)
+    nearest = nearest_view(source_views(scene), camera)
     if nearest is None or not scene.has_metric_scale:
         return None
     if nearest.distance_m <= MAX_DISTANCE_M and nearest.angle_rad <= MAX_ANGLE_RAD:
@@ -275,7 +275,7 @@ _CODE_COLORS = np.array(
 def box_lines(scene: Scene, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Edges of the frame's labelled boxes in the scene's world, [N, 2, 3], and their colours."""
     boxes = scene.boxes(frame.index)
-    world_boxes = PlacedBoxes.of(boxes, np.asarray(scene.world_origin_m))
+    world_boxes = WorldBoxes.of(boxes, np.asarray(scene.world_origin_m))
     lines = world_boxes.corners_m[world_boxes.is_usable][:, EDGES].reshape(-1, 2, 3)
     labels = np.array([sum(map(ord, label)) for label in boxes.labels], np.uint32)
     colors = color_numbers(labels[world_boxes.is_usable])
@@ -291,6 +291,6 @@ def lidar_points(
     sweep = scene.lidar(frame.index)
     if sweep is None:
         return None
-    sweep = drop_lost(weathered_sweep(scene, recipe, frame.index, sweep))
+    sweep = drop_lost_returns(weathered_sweep(scene, recipe, frame.index, sweep))
     points = sweep.points_m - np.asarray(scene.world_origin_m)
     return points, _CODE_COLORS[sweep.columns[CODE_COLUMN]].astype(np.uint8)

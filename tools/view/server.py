@@ -32,7 +32,7 @@ from adapters.base import open_scene
 from adapters.camera_files.paths import frames_from_path_file
 from augment.cameras import Camera
 from augment.errors import ClimateGSError
-from augment.jobs.atomic import write_new
+from augment.jobs.atomic import write_new_file
 from augment.jobs.files import check_frames, encode_image
 from augment.jobs.processes import choose_backend
 from augment.plan import make_plan, plan_view
@@ -574,7 +574,7 @@ class Viewer:
         if with_picture:
             view = render_view(self.scene, camera, recipe, backend=self.backend)
             picture = path.with_name(f"{path.name}.{recipe.output.image}")
-            write_new(picture, encode_image(view.rgb, recipe.output))
+            write_new_file(picture, encode_image(view.rgb, recipe.output))
             file_names.append(picture.name)
         source = shlex.quote(str(path.with_name(path.name + ".yaml")))
         out = shlex.quote(str(path.with_name(path.name + "-images")))
@@ -595,7 +595,7 @@ class Viewer:
             "camera": camera.name,
             "world_from_camera": pose.tolist(),
         }
-        write_new(path, (json.dumps({**sizes, "frames": [frame]}, indent=1) + "\n").encode())
+        write_new_file(path, (json.dumps({**sizes, "frames": [frame]}, indent=1) + "\n").encode())
 
     def _where(self, wish: Wish, camera_path: Path | None) -> str:
         """Return the scene and the view in words of the command line."""

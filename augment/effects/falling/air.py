@@ -32,15 +32,15 @@ from augment.cameras import Camera
 from augment.effects.falling import kernels
 from augment.effects.falling.drops import Kind, Sizes, cell_counts, sizes_of
 from augment.effects.falling.shutter import STANDING, Motion
-from augment.effects.snow.light import display_from_linear, light_of
+from augment.effects.snow.light import display_from_linear, find_scene_light
 from augment.memo import memo_of
-from augment.render.buffers import CPU, kernels_for
+from augment.render.buffers import CPU, choose_kernels
 from augment.render.fog import MAX_EXPONENT, Fog
 from augment.render.layout import LANES
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Scene
-from augment.sky import is_stand_in
+from augment.sky import is_unknown_sky
 
 LAYER_M = 1000.0  # height of the layer from which rain and snow fall, metres
 MAX_DROPS = 50_000  # most drops that are drawn in a picture; more make the veil begin sooner
@@ -60,7 +60,7 @@ SWAY_REACH_S = 0.95  # kernels._sway moves a flake by at most its speed times th
 
 
 @dataclass(frozen=True)
-class Falling:
+class Precipitation:
     """Precipitation in a scene's air."""
 
     kind: Kind
@@ -115,10 +115,10 @@ def glow_of(scene: Scene) -> Glow:
         unknown_light = np.asarray(UNKNOWN_AIRLIGHT) ** 2
         light = np.tile(unknown_light, (_NUM_DIRECTIONS, 1))
         is_above = z > 0
-        if not is_stand_in(scene.sky):
+        if not is_unknown_sky(scene.sky):
             rgb = scene.sky.sample(torch.from_numpy(directions[is_above].astype(np.float32)))
             light[is_above] = np.clip(np.nan_to_num(rgb.double().numpy()), 0, 1) ** 2
-        ground = np.asarray(light_of(scene).ground_rgb_linear)
+        ground = np.asarray(find_scene_light(scene).ground_rgb_linear)
         light[~is_above] = display_from_linear(np.clip(ground, 0, 1)) ** 2
         # The mean of a half space about d of what varies as c . d' is c . d / 2, and c is 3 <l d'>.
         slope = 1.5 * (light[:, :, None] * directions[:, None]).mean(0)
@@ -148,7 +148,7 @@ def _in_fog(glow: Glow, fog: Fog | None, eye_z_m: float, extinction_per_m: float
 # ---- Drops in a camera's view --------------------------------------------------------------------
 
 
-class Walk(NamedTuple):
+class CellWalk(NamedTuple):
     """Arguments of kernels.find_drops, in its order."""
 
     slabs: np.ndarray
@@ -164,7 +164,7 @@ class Walk(NamedTuple):
     lens: np.ndarray
 
 
-def drawn_depths_m(falling: Falling, camera: Camera) -> np.ndarray:
+def max_depths_m(falling: Precipitation, camera: Camera) -> np.ndarray:
     """Return the depth up to which each class is drawn [B].
 
     There a drop is `min_width_px` wide. The depth is smaller if more than MAX_DROPS would be drawn,
@@ -181,10 +181,10 @@ def drawn_depths_m(falling: Falling, camera: Camera) -> np.ndarray:
     return np.where(farthest > NEAR_M, farthest, 0.0)
 
 
-def walk_of(falling: Falling, camera: Camera, motion: Motion, scene: str) -> Walk:
+def cell_walk(falling: Precipitation, camera: Camera, motion: Motion, scene: str) -> CellWalk:
     """Return the cells that the camera's view crosses, and their drops' motion."""
     sizes = falling.sizes
-    farthest = drawn_depths_m(falling, camera)
+    farthest = max_depths_m(falling, camera)
     half_s = falling.exposure_s / 2
     seconds = camera.timestamp_ns * 1e-9
     times = seconds + np.array([-half_s, 0.0, half_s])
@@ -217,7 +217,7 @@ def walk_of(falling: Falling, camera: Camera, motion: Motion, scene: str) -> Wal
     slabs, columns = _columns_of(camera, cells_m, reach, farthest, moves[:, 1])
     rng = rng_for(seed=falling.seed, scene=scene, effect=f"{falling.kind} in the air")
     lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    return Walk(
+    return CellWalk(
         slabs,
         columns,
         np.stack([cells_m, reach, farthest, spread_m], 1),
@@ -271,7 +271,7 @@ def _columns_of(
     return np.concatenate(slabs), np.stack([first[:, 1], end[:, 1]], 1)
 
 
-def find_drops(walk: Walk) -> Float32[np.ndarray, "N 9"]:
+def find_drops(walk: CellWalk) -> Float32[np.ndarray, "N 9"]:
     """Return the drops in a camera's view, in the format of kernels.find_drops, ordered by cell."""
     slab_counts = np.zeros(len(walk.slabs), np.int64)
     empty = np.empty((0, kernels.NUM_NUMBERS), np.float32)
@@ -298,7 +298,7 @@ def _list_drops(drops: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray,
     return drops, listed, begins
 
 
-def left_clear(
+def compute_clear_share(
     drops: Float32[np.ndarray, "N 9"], alpha: np.ndarray, depth: np.ndarray
 ) -> Float32[np.ndarray, "H W"]:
     """Return the share of each pixel that no drop covers. alpha, depth: float32 [H, W]."""
@@ -332,10 +332,10 @@ class Veil(NamedTuple):
     glow: np.ndarray
 
 
-def veil_of(falling: Falling, camera: Camera, glow: Glow) -> Veil:
+def veil_of(falling: Precipitation, camera: Camera, glow: Glow) -> Veil:
     """Return the veil: extinction of the drops that are not drawn, and its light."""
     extinctions = falling.sizes.extinctions_per_m
-    full_depths = drawn_depths_m(falling, camera)
+    full_depths = max_depths_m(falling, camera)
     begin = kernels.FADE * full_depths
     grows = full_depths - begin
     half_inverse = np.divide(0.5, grows, out=np.zeros_like(grows), where=grows > 0)
@@ -361,7 +361,7 @@ def draw_falling(
     alpha: Float[Tensor, "H W"],
     depth: Float[Tensor, "H W"],
     camera: Camera,
-    falling: Falling,
+    falling: Precipitation,
     *,
     scene: Scene,
     fog: Fog | None = None,
@@ -387,14 +387,14 @@ def draw_falling(
             augment.effects.falling.reference within 1e-4, and `rgb` is overwritten.
     """
     surfaces = [t.detach().float().cpu().numpy() for t in (alpha, depth)]
-    drops = find_drops(walk_of(falling, camera, motion, scene.name))
+    drops = find_drops(cell_walk(falling, camera, motion, scene.name))
     extinction = falling.sizes.extinction_per_m
     glow = _in_fog(glow_of(scene), fog, float(camera.centre[2]), extinction)
     veil = veil_of(falling, camera, glow)
-    if kernels_for(backend, rgb, alpha, depth) != CPU:
+    if choose_kernels(backend, rgb, alpha, depth) != CPU:
         from augment.effects.falling.reference import blend_by_torch
 
-        clear = torch.from_numpy(left_clear(drops, *surfaces)).to(rgb.device)
+        clear = torch.from_numpy(compute_clear_share(drops, *surfaces)).to(rgb.device)
         return blend_by_torch(rgb, alpha, depth, clear, veil, splats), clear < CLEAR
     picture = rgb.detach().numpy()
     splat_colors = (

@@ -11,10 +11,19 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.boxes import PlacedBoxes
+from augment.boxes import WorldBoxes
 from augment.cameras import Camera
-from augment.effects.effect import PICTURE, Active, Drawn, Effect, EffectView, Placed, Step, skipped
-from augment.effects.falling.air import Falling, draw_falling
+from augment.effects.effect import (
+    PICTURE,
+    Effect,
+    EffectInScene,
+    EffectPlan,
+    LabelInputs,
+    RenderedView,
+    Step,
+    skipped,
+)
+from augment.effects.falling.air import Precipitation, draw_falling
 from augment.effects.falling.drops import Kind
 from augment.effects.falling.labels import falling_table, measure_falling
 from augment.effects.falling.lidar import precipitation_echoes, scatterers_of
@@ -33,7 +42,7 @@ FLAKES = "snowflakes and veil"
 
 
 class FallingEffect(Effect):
-    """Precipitation in the air. The data of its plan are a `Falling`."""
+    """Precipitation in the air. The data of its plan are a `Precipitation`."""
 
     is_see_through: ClassVar[bool] = True
 
@@ -41,7 +50,7 @@ class FallingEffect(Effect):
     """Name of the pass."""
 
     kind: ClassVar[Kind]
-    """Kind of the precipitation, as in `Falling`."""
+    """Kind of the precipitation, as in `Precipitation`."""
 
     def reads_splats(self, recipe: Recipe) -> bool:
         return False
@@ -49,17 +58,17 @@ class FallingEffect(Effect):
     def kernels(self, section: Rain | Snowfall) -> Any:
         return section.changes or None
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
         section: Rain | Snowfall | None = self.of(recipe)
         if section is None or not section.changes:
             why = f"the recipe has no {self.name}"
             if section is not None:
                 why = f"{self.section}.rate_mm_h is 0"
-            return Placed(None, skipped((self.step,), why, PICTURE))
-        falling = Falling(
+            return EffectPlan(None, skipped((self.step,), why, PICTURE))
+        falling = Precipitation(
             self.kind,
             section.rate_mm_h,
-            blows_to(section.wind_mps, section.wind_from_deg),
+            wind_velocity_mps(section.wind_mps, section.wind_from_deg),
             section.turbulence_mps if isinstance(section, Snowfall) else 0.0,
             recipe.seed,
             recipe.camera.exposure_ms / 1000,
@@ -68,17 +77,17 @@ class FallingEffect(Effect):
         )
         return _plan_of(falling, self.step, scene)
 
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         assert self.mask is not None
         return _draw_over(own, drawn, camera, self.step, self.mask)
 
     def measure(
-        self, placed: PlacedBoxes, camera: Camera, view: EffectView
+        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
         assert self.table is not None
         return measure_falling(self.table, placed, camera, view)
 
-    def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
+    def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
         kind = own.data.kind
         rate = float(own.data.rate_mm_h)
         precipitation_echoes(echoes, scatterers_of(kind, rate), rng)
@@ -108,13 +117,13 @@ class SnowfallEffect(FallingEffect):
     table = falling_table("snowfall", "flake")
 
 
-def blows_to(speed_mps: float, from_deg: float) -> tuple[float, float]:
+def wind_velocity_mps(speed_mps: float, from_deg: float) -> tuple[float, float]:
     """Return a wind's velocity along x and y. from_deg: 0 comes from +x, 90 from +y."""
     angle = math.radians(from_deg)
     return -speed_mps * math.cos(angle), -speed_mps * math.sin(angle)
 
 
-def _plan_of(falling: Falling, step: str, scene: Scene) -> Placed:
+def _plan_of(falling: Precipitation, step: str, scene: Scene) -> EffectPlan:
     """Return the plan. Raise SceneError if the exposure is longer than the frame interval."""
     interval = frame_interval_s(scene)
     if interval is not None and falling.exposure_s >= interval:
@@ -133,10 +142,14 @@ def _plan_of(falling: Falling, step: str, scene: Scene) -> Placed:
         why += "; the scene's unit is not known to be a metre, so sizes are in scene units"
     if not scene.has_known_gravity:
         why += "; it falls along -z, which is not known to point down"
-    return Placed(falling, (Step(step, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH}))
+    return EffectPlan(
+        falling, (Step(step, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH})
+    )
 
 
-def _draw_over(own: Active, drawn: Drawn, camera: Camera, step: str, mask: str) -> Drawn:
+def _draw_over(
+    own: EffectInScene, drawn: RenderedView, camera: Camera, step: str, mask: str
+) -> RenderedView:
     alpha = drawn.raster.alpha
     depth = drawn.raster.expected_depth
     assert alpha is not None and depth is not None
@@ -157,7 +170,7 @@ def _draw_over(own: Active, drawn: Drawn, camera: Camera, step: str, mask: str) 
     return replace(drawn, rgb=rgb, masks=masks)
 
 
-def _surfaces_of(drawn: Drawn) -> Float[Tensor, "H W 3"] | None:
+def _surfaces_of(drawn: RenderedView) -> Float[Tensor, "H W 3"] | None:
     """Return the Gaussians' part of the picture; None if something was drawn over all of it."""
     splats = drawn.raster.rgb
     if splats is None or drawn.layers.photo is not None:

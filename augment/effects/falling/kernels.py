@@ -462,10 +462,10 @@ def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, tau, sk
     b = blue
     edge = v8.minimum(opacity, ones - opacity) - v8.splat(np.float32(EDGE))
     is_mixed = False
-    if splats.size > 0 and v8.any_not_negative(edge):
+    if splats.size > 0 and v8.has_nonnegative_lane(edge):
         r, g, b = v8.load_colours(splats, U(3) * pixel)
         edge = v8.minimum(edge, green - g - v8.splat(np.float32(EDGE)))
-        is_mixed = v8.any_not_negative(edge)
+        is_mixed = v8.has_nonnegative_lane(edge)
     edge = v8.at_least(edge, zeros)
     red = _veil(
         v8.maximum(red, zeros), r, is_mixed, edge, light[0], opacity, surface_transmittance, sky

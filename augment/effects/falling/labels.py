@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from augment.boxes import NOT_COUNTED, PlacedBoxes, count_pixels
+from augment.boxes import NOT_COUNTED, WorldBoxes, count_pixels
 from augment.cameras import Camera
-from augment.effects.effect import EffectView
+from augment.effects.effect import LabelInputs
 from augment.effects.smog import box_transmittance
-from augment.jobs.box_tables import BoxTable, share_of_pixels
+from augment.jobs.box_tables import BoxTable, pixel_fraction
 from augment.render.fog import Fog
 
 
@@ -30,13 +30,13 @@ def falling_table(name: str, drop: str) -> BoxTable:
         kind=f"box {name}",
         columns={through: np.float64, "pixels": np.int64, marked: np.int64, share: np.float64},
         sampled=(through, share),
-        derived={share: share_of_pixels(marked)},
+        derived={share: pixel_fraction(marked)},
         visible=through,
     )
 
 
 def measure_falling(
-    table: BoxTable, placed: PlacedBoxes, camera: Camera, view: EffectView
+    table: BoxTable, placed: WorldBoxes, camera: Camera, view: LabelInputs
 ) -> dict[str, np.ndarray]:
     """Return the stored columns of a `falling_table`.
 

@@ -7,7 +7,7 @@ count on average, by Beer-Lambert, and single large ones are drawn at random.
     drop at r        (rho_d / pi) min(1, D / w)^2 exp(-2 alpha r) xi(r) / r^2
 
 The strongest echo counts. alpha is the extinction of the images, w = aperture + divergence r is the
-beam's width, and xi is the share of a near spot's light that the receiver collects (`seen_share`).
+beam's width, and xi is the share of a near spot's light that the receiver collects (`receiver_overlap`).
 n(D) dD drops per volume are a Poisson process along the beam. So the strongest echo is stronger
 than s with probability 1 - exp(-M(s)), where M is the mean number of drops with a stronger echo
 (`EchoTable`). Two random numbers a beam, at any rate, give the strength and range of the echo, so
@@ -124,7 +124,7 @@ def echo_table(scatterers: Scatterers, model: LidarModel) -> EchoTable:
     count = math.ceil(math.log(max(model.reach_m / _NEAR_M, 1.0)) / _GROWTH)
     ranges = np.concatenate([near, _NEAR_M * np.exp(_GROWTH * np.arange(count + 1))])
     r = (ranges[1:] + ranges[:-1]) / 2
-    white = seen_share(model, r) * signal(np.exp(-2 * scatterers.extinction_per_m * r), r)
+    white = receiver_overlap(model, r) * signal(np.exp(-2 * scatterers.extinction_per_m * r), r)
     width_mm = 1e3 * beam_width(model, r)
     share = np.minimum(1.0, scatterers.diameters_mm[-1] / width_mm) ** 2
     strongest = scatterers.reflectance * white * share
@@ -152,7 +152,7 @@ def beam_width(model: LidarModel, ranges_m: np.ndarray) -> np.ndarray:
     return model.aperture_m + model.divergence_rad * ranges_m
 
 
-def seen_share(model: LidarModel, ranges_m: np.ndarray) -> np.ndarray:
+def receiver_overlap(model: LidarModel, ranges_m: np.ndarray) -> np.ndarray:
     """Return the share of a lit spot's light on the receiver's lens that its field holds."""
     overlap = (ranges_m - model.overlap_from_m) / (model.overlap_full_m - model.overlap_from_m)
     return np.clip(overlap, 0.0, 1.0) * np.minimum(1.0, ranges_m / model.focus_m) ** 2
@@ -194,7 +194,7 @@ def precipitation_echoes(echoes: Echoes, scatterers: Scatterers, rng: np.random.
     air = echoes.air_m
     before = echoes.gain.copy()
     echoes.gain *= np.exp(-2 * scatterers.extinction_per_m * air)
-    echoes.spread_ranges(before, rng.standard_normal(len(air)))
+    echoes.add_range_noise(before, rng.standard_normal(len(air)))
     strength, ranges = strongest_drops(echo_table(scatterers, model), air, rng)
     # The fog between sensor and drop is taken as dense as at the sensor.
     strength *= np.exp(-2 * np.minimum(echoes.haze_per_m * ranges, 300.0))

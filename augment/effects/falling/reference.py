@@ -15,16 +15,16 @@ from augment.effects.falling.kernels import EDGE, FADE, LEAST_RADIUS, SOFT
 from augment.rng import STEP_X, mix
 
 if TYPE_CHECKING:
-    from augment.effects.falling.air import Veil, Walk
+    from augment.effects.falling.air import CellWalk, Veil
 
 
-def find_drops_by_numpy(walk: Walk) -> Float32[np.ndarray, "N 9"]:
+def find_drops_by_numpy(walk: CellWalk) -> Float32[np.ndarray, "N 9"]:
     """Find drops as kernels.find_drops does, in all cells of the box around each class's view."""
     drops = [_drops_of_class(walk, number) for number in range(len(walk.cells))]
     return np.concatenate(drops).astype(np.float32)
 
 
-def _drops_of_class(walk: Walk, number: int) -> np.ndarray:
+def _drops_of_class(walk: CellWalk, number: int) -> np.ndarray:
     size, reach, farthest, _ = walk.cells[number]
     rows = walk.slabs[walk.slabs[:, 0] == number, 1]
     if len(rows) == 0:

@@ -12,20 +12,20 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from augment.bounds import lowest_z_m
-from augment.boxes import NOT_COUNTED, BoxPixels, PlacedBoxes, count_pixels
+from augment.boxes import NOT_COUNTED, BoxPixels, WorldBoxes, count_pixels
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
 from augment.effects.effect import (
-    Active,
-    Drawn,
     Effect,
-    EffectView,
+    EffectInScene,
+    EffectPlan,
     FrontSurface,
-    InView,
-    Placed,
-    Sharing,
-    Sight,
+    JobContext,
+    LabelInputs,
+    RenderedView,
     Step,
+    ViewQuery,
+    Visibility,
     skipped,
 )
 from augment.effects.flood.flood import FloodMedium
@@ -36,7 +36,7 @@ from augment.effects.flood.waves import make_waves
 from augment.effects.lidar.beam import Echoes
 from augment.errors import SceneError
 from augment.ground import ground_of
-from augment.jobs.box_tables import BoxTable, share_of_pixels
+from augment.jobs.box_tables import BoxTable, pixel_fraction
 from augment.memo import memo_of
 from augment.scene import Scene
 from augment.semantics import SemanticClass
@@ -76,65 +76,65 @@ class FloodEffect(Effect):
             "hidden_fraction": np.float64,
         },
         sampled=("submerged_fraction", "hidden_fraction"),
-        derived={"hidden_fraction": share_of_pixels("hidden_pixels")},
+        derived={"hidden_fraction": pixel_fraction("hidden_pixels")},
         hidden="hidden_fraction",
     )
 
     def kernels(self, section: Flood) -> Hashable:
         return section.reflection
 
-    def share(self, job: Sharing) -> None:
+    def share(self, job: JobContext) -> None:
         """Precompute the height of the road."""
         if any(self.of(recipe) is not None for recipe in job.recipes):
             with suppress(SceneError):  # every image reports the error itself
                 memo_of(job.scene).put(("ground",), ground_of(job.scene), shared=True)
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
         flood = self.of(recipe)
         if flood is None:
-            return Placed(
+            return EffectPlan(
                 None, tuple(Step(name, False, "the recipe has no flood") for name in PASSES)
             )
         rain = recipe.weather.rain
         rain_mm_h = rain.rate_mm_h if rain is not None else 0.0
-        medium, reason = flood_medium(flood, recipe.seed, scene, rain_mm_h)
+        medium, reason = flood_of_recipe(flood, recipe.seed, scene, rain_mm_h)
         level_z_m = medium.level_z_m
         if lowest_z_m(scene) >= level_z_m:
             why = f"no splat reaches below the level, z = {level_z_m:.2f} m"
-            return Placed(None, skipped(PASSES, why), water_level_z_m=level_z_m)
-        return Placed(medium, _steps(medium, reason), water_level_z_m=level_z_m)
+            return EffectPlan(None, skipped(PASSES, why), water_level_z_m=level_z_m)
+        return EffectPlan(medium, _steps(medium, reason), water_level_z_m=level_z_m)
 
-    def cameras(self, own: Active, camera: Camera) -> tuple[Camera, ...] | None:
+    def cameras(self, own: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
         is_drawn = _is_under(own.data, camera) or plane_window(camera, own.data.level_z_m)
         return layer_cameras(own.data, camera) if is_drawn else None
 
-    def in_view(self, own: Active, sight: Sight) -> InView:
+    def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
         camera = sight.camera
         if _is_under(own.data, camera):
             why = "the camera is under water: it sees what lies below and what lies above"
-            return InView(skipped=dict.fromkeys(PASSES, why))
+            return Visibility(skipped=dict.fromkeys(PASSES, why))
         if plane_window(camera, own.data.level_z_m) is None:
             why = "no ray of this camera meets the water's plane"
-            return InView(False, dict.fromkeys(PASSES, why))
-        return InView()
+            return Visibility(False, dict.fromkeys(PASSES, why))
+        return Visibility()
 
     def draw(
-        self, own: Active, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
-    ) -> Drawn | None:
+        self, own: EffectInScene, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
+    ) -> RenderedView | None:
         image = render_flooded(layers, camera, own.data, buffers)
         if image is None:
             return None
         why = "what stands before the water hides all of it"
         skip_reasons = dict.fromkeys(PASSES if image.is_hidden else (), why)
-        return Drawn(image.rgb, image.scene, layers, {"water": image.water}, skip_reasons)
+        return RenderedView(image.rgb, image.scene, layers, {"water": image.water}, skip_reasons)
 
-    def front_surface(self, own: Active, camera: Camera) -> FrontSurface | None:
+    def front_surface(self, own: EffectInScene, camera: Camera) -> FrontSurface | None:
         if _is_under(own.data, camera):  # from below, the surface has no depth
             return FrontSurface(int(SemanticClass.WATER), None)
         return FrontSurface(int(SemanticClass.WATER), plane_depth(camera, own.data.level_z_m))
 
     def measure(
-        self, placed: PlacedBoxes, camera: Camera, view: EffectView
+        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
         level_z_m = view.placed.water_level_z_m
         assert level_z_m is not None
@@ -147,7 +147,7 @@ class FloodEffect(Effect):
         submerged = submerged_fraction(placed, level_z_m)
         return {"submerged_fraction": submerged, "pixels": pixels, "hidden_pixels": num_hidden}
 
-    def meet(self, own: Active, echoes: Echoes, frame_ns: int) -> None:
+    def meet(self, own: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
         meet_flood(echoes, own.data)
 
 
@@ -155,7 +155,7 @@ def _is_under(medium: FloodMedium, camera: Camera) -> bool:
     return float(camera.centre[2]) <= medium.level_z_m
 
 
-def flood_medium(
+def flood_of_recipe(
     flood: Flood, seed: int, scene: Scene, rain_mm_h: float = 0.0
 ) -> tuple[FloodMedium, str]:
     """Return the flood at its height in the scene, and the text that explains it.
@@ -228,7 +228,7 @@ def _grown(camera: Camera, margin_px: float) -> Camera:
 # ---- Labelled boxes ------------------------------------------------------------------------------
 
 
-def submerged_fraction(placed: PlacedBoxes, level_z_m: float) -> Float64[np.ndarray, " B"]:
+def submerged_fraction(placed: WorldBoxes, level_z_m: float) -> Float64[np.ndarray, " B"]:
     """Return the share of each box's height that is under water, 0 to 1.
 
     The corners give the height, also of tilted boxes. A box without height is either under water
@@ -250,7 +250,7 @@ def submerged_fraction(placed: PlacedBoxes, level_z_m: float) -> Float64[np.ndar
 
 
 def hidden_pixels(
-    placed: PlacedBoxes,
+    placed: WorldBoxes,
     camera: Camera,
     scene_depth_m: Float32[np.ndarray, "H W"],
     water: UInt8[np.ndarray, "H W"],

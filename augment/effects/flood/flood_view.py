@@ -42,9 +42,9 @@ from augment.effects.flood.water_plane import (
     resized,
 )
 from augment.effects.flood.waves import wave_field
-from augment.effects.wet.ripples import rings_of, with_rings
-from augment.render.buffers import ALPHA, CPU, EXPECTED_DEPTH, RGB, RenderOutput, kernels_for
-from augment.render.composite import sky_behind
+from augment.effects.wet.ripples import add_ring_waves, make_rings
+from augment.render.buffers import ALPHA, CPU, EXPECTED_DEPTH, RGB, RenderOutput, choose_kernels
+from augment.render.composite import simplify_sky
 from augment.render.constants import DEPTH_EPS
 from augment.render.fog import Fog, blend_airlight, sky_optical_depth
 from augment.render.layout import ABOVE, BELOW, HeightClip
@@ -66,7 +66,7 @@ def find_water(
     alpha: opacity of the scene in front of the water. A pixel shows water where alpha leaves more
     than half of it.
     """
-    if kernels_for(backend, alpha) == CPU:
+    if choose_kernels(backend, alpha) == CPU:
         water = np.empty(tuple(alpha.shape), np.uint8)
         max_shares = np.empty(len(alpha), np.float32)
         with kernel_threads(ROWS):
@@ -95,7 +95,7 @@ def composite_water(
     assert front.rgb is not None and front.alpha is not None
     rgb = front.rgb
     alpha = front.alpha
-    in_place = kernels_for(renderer.backend, rgb, alpha) == CPU
+    in_place = choose_kernels(renderer.backend, rgb, alpha) == CPU
     image = rgb if in_place else rgb.clone()
     dry = _dry_rows(camera)
     mixed_rows = rgb[window.top : dry].clone()  # rows that show water and sky
@@ -157,7 +157,7 @@ def merge_depths(
     if not requested:
         return RenderOutput()
     image_slices, window_slices = window.overlap(front.alpha)
-    if kernels_for(backend, front.alpha) == CPU:
+    if choose_kernels(backend, front.alpha) == CPU:
         values = {name: getattr(front, name) for name in (*requested, ALPHA)}
         alphas = (front.alpha.numpy()[image_slices], behind.alpha.numpy()[window_slices])
         with kernel_threads(ROWS):
@@ -220,7 +220,7 @@ def view_from_below(
     up = directions[..., 2] / lengths
     air_directions = _into_air(directions / lengths[..., None], medium.refraction_index)
     reflected = exact(up.clamp_min(0), 1 / medium.refraction_index)[..., None]
-    behind, fog = sky_behind(sky, fog)
+    behind, fog = simplify_sky(sky, fog)
     sky_rgb = sample_at(behind, air_directions)
     if fog is not None:
         tau = sky_optical_depth(fog, air_directions[..., 2], medium.level_z_m)
@@ -334,8 +334,8 @@ def render_flooded(
     shows_water = cover <= HIDDEN_COVER
     with timed("flood: waves"):
         field = wave_field(medium.waves, crop, medium.level_z_m, device=device, backend=backend)
-        rings = rings_of(medium.rain_mm_h, medium.seed, camera.timestamp_ns)
-        field = with_rings(field, crop, medium.level_z_m, rings, backend=backend)
+        rings = make_rings(medium.rain_mm_h, medium.seed, camera.timestamp_ns)
+        field = add_ring_waves(field, crop, medium.level_z_m, rings, backend=backend)
     margins = _bed_margins(camera, medium)
     bed_window = window.grown(margins)
     bed_camera = bed_window.of(camera)

@@ -699,7 +699,7 @@ def _run(pyramid, view, lanes, xs, ys, count, lengths, trusts):
         ray, state, to_sky, scale = _set_up(view, xs, ys, at)
         for _ in range(MAX_STEPS):
             # The sign bit is clear while a ray goes on. A ray that ends exactly here does no harm.
-            if not v8.any_not_negative(state[1] - state[0]):
+            if not v8.has_nonnegative_lane(state[1] - state[0]):
                 break
             state = _step(pyramid, ray, state)
         _finish(pyramid, view, lanes, ray, state, to_sky, scale, at, lengths, trusts)

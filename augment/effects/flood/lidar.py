@@ -114,7 +114,7 @@ def meet_flood(echoes: Echoes, medium: FloodMedium) -> None:
     water = meet_water(medium, echoes.origins, echoes.directions, ends_m, echoes.reflectance)
     has_bed = water.is_bed
     has_mud = ~water.is_bed
-    echoes.see_through(
+    echoes.move_and_dim(
         water.rows[has_bed],
         water.range_m[has_bed],
         water.surface_m[has_bed],

@@ -31,7 +31,7 @@ from augment.cameras import Camera
 from augment.effects.flood import kernels
 from augment.effects.flood.flood import Layer
 from augment.effects.flood.water_plane import Window, falling, window_offset
-from augment.render.buffers import CPU, kernels_for
+from augment.render.buffers import CPU, choose_kernels
 from augment.render.threads import kernel_threads
 
 # The kernels' thresholds as Python floats, which torch accepts.
@@ -100,7 +100,7 @@ def trace_screen(
         return ScreenReflection(front, distance, torch.zeros_like(distance))
     if needed is None:
         needed = torch.ones(size, dtype=torch.bool, device=device)
-    if kernels_for(backend, front.alpha.detach()) == CPU:
+    if choose_kernels(backend, front.alpha.detach()) == CPU:
         vertical = _vertical(front.camera, level_z_m)
         distance_and_weight = _run_kernels(front, camera, vertical, (left, top), stride, needed)
     else:

@@ -38,8 +38,8 @@ from augment.effects.flood.water_kernels import (
 from augment.effects.flood.water_plane import image_coordinates, scale_and_offset
 from augment.effects.flood.waves import WaveField
 from augment.memo import memo_of
-from augment.render.buffers import CPU, kernels_for
-from augment.render.composite import sky_behind
+from augment.render.buffers import CPU, choose_kernels
+from augment.render.composite import simplify_sky
 from augment.render.fog import Fog, blend_airlight, optical_depth, vertical_optical_depth
 from augment.render.threads import kernel_threads
 from augment.sky import (
@@ -106,7 +106,7 @@ def shade_water(
     water = Water(camera, cover, medium, field, bed, mirror, screen, sky, fog)
     layers = (bed, mirror, None if screen is None else screen.layer)
     images = [(i.rgb, i.alpha, i.depth) for i in layers if i is not None]
-    if kernels_for(backend, cover, *(part for parts in images for part in parts)) == CPU:
+    if choose_kernels(backend, cover, *(part for parts in images for part in parts)) == CPU:
         return _run_kernel(water)
     surface = meet_plane(camera, medium.level_z_m, bed.rgb)
     smooth = is_smooth(field, camera)
@@ -456,7 +456,7 @@ def reflect_sky(
     surface: Surface, rays: Float[Tensor, "T H W 3"], water: Water
 ) -> Float[Tensor, "T H W 3"]:
     """Return the sky in rising unit directions, through the fog before it and the surface."""
-    visible_sky, layered = sky_behind(water.sky, water.fog)
+    visible_sky, layered = simplify_sky(water.sky, water.fog)
     colors = sample_at(visible_sky, rays)
     if layered is None:
         return colors
@@ -599,7 +599,7 @@ def _array(part: Tensor) -> np.ndarray:
 
 def _flat_faces(sky: Sky, fog: Fog | None) -> tuple[Tensor, int, Fog | None]:
     """Return (flat cube map, size of its faces with border, the fog before them)."""
-    visible_sky, layered = sky_behind(sky, fog)
+    visible_sky, layered = simplify_sky(sky, fog)
     if isinstance(visible_sky, ConstantSky):
         return _padded(visible_sky.rgb.expand(6, 3, 3, 3)), 3, layered
     if isinstance(visible_sky, CubemapSky):

@@ -425,7 +425,7 @@ def _norm(x, y, z):
 
 @inner()
 def _any(mask):
-    return v8.any_not_negative(v8.select(mask, v8.splat(ONE), v8.splat(-ONE)))
+    return v8.has_nonnegative_lane(v8.select(mask, v8.splat(ONE), v8.splat(-ONE)))
 
 
 @inner()

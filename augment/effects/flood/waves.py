@@ -23,7 +23,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.effects.flood import kernels as waves_kernels
-from augment.render.buffers import CPU, kernels_for
+from augment.render.buffers import CPU, choose_kernels
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from recipes.flood import Wave, Waves
@@ -266,7 +266,7 @@ def wave_field(
     if waves.is_flat or abs(height) < TOUCHING_M:
         still = torch.zeros(camera.height, camera.width, device=device)
         return WaveField(still, still, still)
-    if kernels_for(backend) == CPU and (device is None or device.type == "cpu"):
+    if choose_kernels(backend) == CPU and (device is None or device.type == "cpu"):
         return _run_kernel(waves, camera, height)
     rays = camera.ray_directions(torch.float64, device)
     depth = -height / rays[..., 2]

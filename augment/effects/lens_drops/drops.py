@@ -48,7 +48,7 @@ class Drops(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PlacedDrops:
+class LensDropsPlan:
     """Numbers of the drops on cameras' glasses."""
 
     drops: LensDrops
@@ -73,7 +73,7 @@ class PlacedDrops:
         return min(round(FLUX * self.rate_mm_h**0.53 * area_m2 * stay_s), MAX_COUNT)
 
 
-def drops_at(plan: PlacedDrops, scene: Scene, camera: Camera) -> Drops:
+def drops_at(plan: LensDropsPlan, scene: Scene, camera: Camera) -> Drops:
     """Return the drops on the camera's glass at its time."""
     section = plan.drops
     count = plan.count_on(camera)

@@ -6,8 +6,16 @@ from collections.abc import Hashable, Mapping
 from dataclasses import replace
 
 from augment.cameras import Camera
-from augment.effects.effect import PICTURE, Active, Drawn, Effect, Placed, Step, skipped
-from augment.effects.lens_drops.drops import PlacedDrops, drops_at
+from augment.effects.effect import (
+    PICTURE,
+    Effect,
+    EffectInScene,
+    EffectPlan,
+    RenderedView,
+    Step,
+    skipped,
+)
+from augment.effects.lens_drops.drops import LensDropsPlan, drops_at
 from augment.effects.lens_drops.optics import blend_drops, draw_drops, map_surroundings
 from augment.scene import Scene
 from augment.timing import timed
@@ -34,7 +42,7 @@ class LensDropsEffect(Effect):
     def kernels(self, section: LensDrops) -> Hashable:
         return section.changes or None
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
         drops = self.of(recipe)
         rate_mm_h = found(recipe, "weather.rain.rate_mm_h") or 0.0
         why = ""
@@ -44,7 +52,7 @@ class LensDropsEffect(Effect):
         elif drops.count is None and rate_mm_h == 0:
             why = "camera.lens_drops.count is null, and there is no rain"
         if drops is None or why:
-            return Placed(None, skipped((ON_GLASS,), why, PICTURE))
+            return EffectPlan(None, skipped((ON_GLASS,), why, PICTURE))
         blur_mrad = 2000 * drops.aperture_m / drops.glass_m
         many = f"{rate_mm_h:g} mm/h of" if drops.count is None else f"{drops.count}"
         why = (
@@ -52,10 +60,10 @@ class LensDropsEffect(Effect):
             f"before the lens, blurred over {blur_mrad:.3g} mrad; "
         )
         why += "never wiped" if drops.wiper_s is None else f"wiped every {drops.wiper_s:g} s"
-        data = PlacedDrops(drops, recipe.seed, rate_mm_h)
-        return Placed(data, (Step(ON_GLASS, True, why, PICTURE),))
+        data = LensDropsPlan(drops, recipe.seed, rate_mm_h)
+        return EffectPlan(data, (Step(ON_GLASS, True, why, PICTURE),))
 
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         if camera.is_orthographic:
             return drawn
         with timed(ON_GLASS):

@@ -26,11 +26,11 @@ from augment.cameras import Camera
 from augment.drawing import LayerRenderer
 from augment.effects.lens_drops import kernels
 from augment.effects.lens_drops.drops import Drops
-from augment.render.buffers import CPU, kernels_for
-from augment.render.composite import ROWS, sky_behind
+from augment.render.buffers import CPU, choose_kernels
+from augment.render.composite import ROWS, simplify_sky
 from augment.render.fog import blend_airlight, sky_optical_depth
 from augment.render.threads import kernel_threads
-from augment.sky import is_stand_in
+from augment.sky import is_unknown_sky
 
 WATER = 1.33  # refractive index
 COVERED = 0.1  # share of a pixel's light from drops from which the mask holds the pixel
@@ -68,7 +68,7 @@ def map_surroundings(
     picture = cv2.remap(
         _shrunk(rgb, size), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    if layers is not None and level and not is_stand_in(layers.sky):
+    if layers is not None and level and not is_unknown_sky(layers.sky):
         u, v = np.meshgrid(slopes, slopes)
         rotation = camera.world_from_camera[:3, :3].numpy()
         rays = np.stack([u, v, np.ones_like(u)], -1) @ rotation.T
@@ -88,7 +88,7 @@ def _shrunk(rgb: Float[Tensor, "H W 3"], size: tuple[int, int]) -> Float32[np.nd
 
 def _sky_colors(layers: LayerRenderer, rays: np.ndarray, eye_z_m: float) -> np.ndarray:
     """Return the sky's colours in world directions [N, 3], through the fog."""
-    sky, fog = sky_behind(layers.sky, layers.fog)
+    sky, fog = simplify_sky(layers.sky, layers.fog)
     directions = F.normalize(torch.from_numpy(rays).float(), dim=-1)
     colors = sky.sample(directions)
     if fog is not None:
@@ -270,7 +270,7 @@ def blend_drops(
     overwritten.
     """
     height, width, _ = rgb.shape
-    if kernels_for(backend, rgb) == CPU and rgb.is_contiguous():
+    if choose_kernels(backend, rgb) == CPU and rgb.is_contiguous():
         mask = np.empty((height, width), np.bool_)
         numbers = np.float32(step), margin, np.float32(MIN_SHARE), np.float32(COVERED)
         with kernel_threads(ROWS):

@@ -7,7 +7,7 @@ from augment.effects.lidar.codes import (
     PRECIPITATION,
     SCATTERED,
     UNCHANGED,
-    drop_lost,
+    drop_lost_returns,
     is_in_air,
 )
 
@@ -18,6 +18,6 @@ __all__ = [
     "PRECIPITATION",
     "SCATTERED",
     "UNCHANGED",
-    "drop_lost",
+    "drop_lost_returns",
     "is_in_air",
 ]

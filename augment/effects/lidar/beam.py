@@ -77,7 +77,7 @@ class LidarModel:
 DEFAULT_MODEL = LidarModel()
 
 
-def intensity_column(sweep: LidarSweep) -> str | None:
+def find_intensity_column(sweep: LidarSweep) -> str | None:
     """Return the name of the column that holds intensities; None where there is none."""
     for name in INTENSITY_COLUMNS:
         column = sweep.columns.get(name)
@@ -116,7 +116,7 @@ def reflectances(sweep: LidarSweep) -> np.ndarray:
 
     It includes the cosine of incidence, since sensors do not divide by it.
     """
-    name = intensity_column(sweep)
+    name = find_intensity_column(sweep)
     if name is None:
         return np.full(len(sweep), UNKNOWN_REFLECTANCE)
     values = np.asarray(sweep.columns[name], np.float64)
@@ -225,7 +225,7 @@ class Echoes:
         self.codes[rows] = code
         self.is_new[rows] = self.is_moved[rows] = True
 
-    def see_through(
+    def move_and_dim(
         self, rows: np.ndarray, ranges_m: np.ndarray, air_m: np.ndarray, transmittance: np.ndarray
     ) -> None:
         """Move the returns in rows [M] along their beams, and dim them by a transmittance [M]."""
@@ -236,7 +236,7 @@ class Echoes:
         self.air_m[rows] = air_m
         self.gain[rows] *= transmittance
 
-    def spread_ranges(self, gain_before: np.ndarray, normal: np.ndarray) -> None:
+    def add_range_noise(self, gain_before: np.ndarray, normal: np.ndarray) -> None:
         """Add noise to the ranges of echoes that have become fainter.
 
         An echo has lost gain since gain_before [N]; the recorded range holds the noise of the rest.
@@ -253,7 +253,7 @@ class Echoes:
         self.is_moved[rows] = True
         self.codes[rows[self.codes[rows] == UNCHANGED]] = ATTENUATED
 
-    def lose_faint(self) -> None:
+    def drop_faint(self) -> None:
         """Mark echoes below the sensor's noise as lost."""
         is_faint = self.reflectance * self.gain < self.model.noise_reflectance(self.ranges_m)
         self.codes[is_faint & (self.ranges_m > 0)] = LOST
@@ -262,7 +262,7 @@ class Echoes:
         """Return the weathered sweep, as `weathered_sweep` does."""
         columns = {name: np.asarray(column) for name, column in self.source.columns.items()}
         columns |= self._coordinates(columns)
-        name = intensity_column(self.source)
+        name = find_intensity_column(self.source)
         if name is not None:
             columns[name] = self._intensity(columns[name])
         columns[INDEX_COLUMN] = np.arange(len(self.codes), dtype=np.int32)

@@ -28,7 +28,7 @@ def is_in_air(sweep: LidarSweep) -> np.ndarray:
     return np.isin(sweep.columns[CODE_COLUMN], (SCATTERED, PRECIPITATION))
 
 
-def drop_lost(sweep: LidarSweep) -> LidarSweep:
+def drop_lost_returns(sweep: LidarSweep) -> LidarSweep:
     """Return the sweep without lost returns: what the sensor would have sent.
 
     `source_index` still names the source's return of each row. A sweep without codes is returned as

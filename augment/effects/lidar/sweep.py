@@ -65,5 +65,5 @@ def weathered_sweep(
         rng_key = f"lidar.{active_effect.effect.name}"
         rng = rng_for(seed=recipe.seed, scene=scene.name, frame=frame_index, effect=rng_key)
         active_effect.effect.attenuate(active_effect, echoes, rng)
-    echoes.lose_faint()
+    echoes.drop_faint()
     return echoes.sweep()

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from jaxtyping import Float32, Int16, Int32
 from torch import Tensor
 
-# Codes in SnowCells.neighbours for a side where no cell of the same size follows.
+# Codes in ExposedCells.neighbours for a side where no cell of the same size follows.
 OPEN_EDGE = -1  # the surface falls away: a roof's edge, or the shade of something above it
 # The surface goes on or rises (a wall, cells of another size); the layer keeps its depth.
 FLUSH = -2
-EDGE_CAP_M = 2.0  # largest distance to an edge that is recorded
+MAX_EDGE_DISTANCE_M = 2.0  # largest distance to an edge that is recorded
 
 
 @dataclass(frozen=True, eq=False)
-class SnowCells:
+class ExposedCells:
     """Cells on the surfaces of one part of a scene that are open to the sky.
 
     Each of the C cells is a square seen from above, in the part's frame (an actor's frame has its
@@ -35,7 +35,7 @@ class SnowCells:
     # Sides of the squares.
     sizes_m: Float32[Tensor, "C"]
     # Level distance from the middle to the nearest open edge (OPEN_EDGE): half a cell at least,
-    # EDGE_CAP_M at most.
+    # MAX_EDGE_DISTANCE_M at most.
     edge_m: Float32[Tensor, "C"]
     # Indices of the cells to the -x, +x, -y and +y side, or OPEN_EDGE or FLUSH.
     neighbours: Int32[Tensor, "C 4"]
@@ -59,8 +59,8 @@ class SnowCells:
 
 
 @dataclass(frozen=True, eq=False)
-class SnowSupport:
+class ExposedSurface:
     """Cells of a whole scene."""
 
-    ground: SnowCells  # cells of the background
-    actors: Mapping[str, SnowCells]  # cells of the actors that can carry snow, by track_id
+    ground: ExposedCells  # cells of the background
+    actors: Mapping[str, ExposedCells]  # cells of the actors that can carry snow, by track_id

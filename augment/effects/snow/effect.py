@@ -11,44 +11,44 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from augment.bounds import Bounds, bound_chunks, bound_points, owners_seen
-from augment.boxes import NOT_COUNTED, PlacedBoxes
+from augment.bounds import Bounds, bound_points, bound_squares, find_visible_owners
+from augment.boxes import NOT_COUNTED, WorldBoxes
 from augment.cameras import Camera
-from augment.cast_shadows import share_shadows
+from augment.cast_shadows import precompute_shadows
 from augment.drawing import LayerRenderer
 from augment.effects.effect import (
     PICTURE,
     SCENE,
-    Active,
-    Drawn,
     Effect,
-    EffectView,
-    InView,
-    Placed,
-    Sharing,
-    Sight,
+    EffectInScene,
+    EffectPlan,
+    JobContext,
+    LabelInputs,
+    RenderedView,
     Step,
+    ViewQuery,
+    Visibility,
     skipped,
 )
 from augment.effects.lidar.beam import Echoes
 from augment.effects.snow.kernels import MAX_GRAIN_DISTANCE_M
-from augment.effects.snow.layer import build_snow_layer
+from augment.effects.snow.layer import lay_snow
 from augment.effects.snow.lidar import intersect_snow
-from augment.effects.snow.light import illumination_of, told_light
+from augment.effects.snow.light import describe_light, find_snow_light
 from augment.effects.snow.near_camera import GLINT_SIZE_M, Layer, SnowLayers
 from augment.effects.snow.relief import Carrier, add_grain
 from augment.effects.snow.snow import (
-    PlacedSnow,
+    SnowPlan,
+    count_snow_pixels,
+    exposure_settings,
     extend_boxes_by_snow,
-    placement_settings,
-    snow_pixels,
 )
-from augment.effects.snow.support import share_support, support_of
+from augment.effects.snow.support import exposed_surface_of, share_exposed_surface
 from augment.ground import check_metric_and_level
-from augment.jobs.box_tables import BoxTable, share_of_pixels
+from augment.jobs.box_tables import BoxTable, pixel_fraction
 from augment.memo import memo_of
 from augment.render.buffers import EXPECTED_DEPTH, OVERLAY
-from augment.render.fog import Fog, optical_depth_of_arrays
+from augment.render.fog import Fog, optical_depth_numpy
 from augment.scene import Gaussians, Scene
 from augment.timing import timed
 from recipes.schema import Recipe
@@ -75,21 +75,21 @@ class SnowEffect(Effect):
         LIGHT_PASS: ("weather.snow.shading", "per_splat"),
     }
     # pixels: number that show the box or the snow on it, or NOT_COUNTED without snow in view.
-    # snow_pixels: number of them that show snow.
+    # count_snow_pixels: number of them that show snow.
     table = BoxTable(
         name="box_snow",
         file="labels/snow.parquet",
         kind="box snow",
         columns={"pixels": np.int64, "snow_pixels": np.int64, "snow_fraction": np.float64},
         sampled=("snow_fraction",),
-        derived={"snow_fraction": share_of_pixels("snow_pixels")},
+        derived={"snow_fraction": pixel_fraction("snow_pixels")},
         hidden="snow_fraction",
     )
 
     def kernels(self, section: Snow) -> Hashable:
         return section.shading
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
         snow = self.of(recipe)
         if snow is None or not snow.changes:
             reason = "the recipe has no snow"
@@ -97,12 +97,12 @@ class SnowEffect(Effect):
                 nothing = "depth" if snow.depth_m == 0 else "coverage"
                 reason = f"the snow has no {nothing}, so it changes nothing"
             steps = (*skipped(PASSES, reason, SCENE), Step(GRAIN_PASS, False, reason, PICTURE))
-            return Placed(None, steps)
+            return EffectPlan(None, steps)
         check_metric_and_level(scene)
         reason = (
             f"{snow.depth_m:g} m deep on {100 * snow.coverage:.3g} % of what is open to the sky, "
             f"no steeper than {snow.max_slope_deg:g} deg and seen by a camera; cells of "
-            f"{100 * snow.cell_m:g} cm near the path; {told_light(scene, snow)}"
+            f"{100 * snow.cell_m:g} cm near the path; {describe_light(scene, snow)}"
         )
         levels = (other.water_level_z_m for other in later.values())
         level_z_m = next((level for level in levels if level is not None), None)
@@ -116,42 +116,44 @@ class SnowEffect(Effect):
         )
         seed = recipe.seed if snow.seed is None else snow.seed
         buffers = {OVERLAY, EXPECTED_DEPTH} if snow.grain > 0 else {OVERLAY}
-        return Placed(PlacedSnow(snow, seed, level_z_m), steps, frozenset(buffers))
+        return EffectPlan(SnowPlan(snow, seed, level_z_m), steps, frozenset(buffers))
 
-    def prepare(self, own: Active) -> SnowLayers:
+    def prepare(self, own: EffectInScene) -> SnowLayers:
         return snow_layers_of(own.scene, own.data, own.light, backend=own.backend)
 
-    def share(self, job: Sharing) -> None:
+    def share(self, job: JobContext) -> None:
         """Find where snow can lie, once for all recipes of the job."""
         sections = (self.of(recipe) for recipe in job.recipes)
         distinct = dict.fromkeys(
-            placement_settings(snow, job.scene) for snow in sections if snow and snow.changes
+            exposure_settings(snow, job.scene) for snow in sections if snow and snow.changes
         )
         for settings in distinct:
-            share_shadows(job.scene)
-            share_support(job, settings)
+            precompute_shadows(job.scene)
+            share_exposed_surface(job, settings)
 
-    def in_view(self, own: Active, sight: Sight) -> InView:
+    def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
         layers = own.prepared
         boxes = memo_of(layers).get(("boxes of snow",), lambda: _bound_layers(own.scene, layers))
-        owners = owners_seen(boxes, sight.poses, sight.cameras, sight.near_m)
+        owners = find_visible_owners(boxes, sight.poses, sight.cameras, sight.near_m)
         if not owners:
             why = "neither snow nor what it buries can be in view"
-            return InView(False, dict.fromkeys((*PASSES, GRAIN_PASS), why))
+            return Visibility(False, dict.fromkeys((*PASSES, GRAIN_PASS), why))
         is_lit_per_pixel = any(_is_lit_per_pixel(layers.layer_on(own.scene, n)) for n in owners)
         why = (
             {} if is_lit_per_pixel else {LIGHT_PASS: "no snow that is lit per pixel can be in view"}
         )
-        return InView(skipped=why, owners=frozenset(owners - {0}), seen=frozenset(owners))
+        return Visibility(skipped=why, owners=frozenset(owners - {0}), seen=frozenset(owners))
 
-    def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
+    def edit_scene(
+        self, own: EffectInScene, layers: LayerRenderer, camera: Camera
+    ) -> LayerRenderer:
         with timed(LAYER_PASS):
             parts = own.prepared.parts_for(
                 own.scene, camera, layers.parts, own.seen, backend=own.backend
             )
         return replace(layers, parts=parts)
 
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         snow = drawn.raster.overlay
         depth = drawn.raster.expected_depth
         if own.data.snow.grain == 0 or camera.is_orthographic or snow is None or depth is None:
@@ -173,29 +175,29 @@ class SnowEffect(Effect):
             )
         return replace(drawn, rgb=rgb)
 
-    def mask_of(self, own: Active, drawn: Drawn) -> Bool[Tensor, "H W"] | None:
+    def mask_of(self, own: EffectInScene, drawn: RenderedView) -> Bool[Tensor, "H W"] | None:
         overlay = drawn.raster.overlay
         return None if overlay is None else overlay >= MIN_MASK_SHARE
 
     def measure(
-        self, placed: PlacedBoxes, camera: Camera, view: EffectView
+        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
         if _shows_snow(view) and view.depth_m is not None and view.mask is not None:
             thickness_m = view.placed.data.snow.depth_m
-            counted = snow_pixels(placed, camera, view.depth_m, view.mask, thickness_m)
+            counted = count_snow_pixels(placed, camera, view.depth_m, view.mask, thickness_m)
             return {"pixels": counted.pixels, "snow_pixels": counted.marked}
         no_pixels = np.zeros(len(placed), np.int64)
         return {"pixels": np.full(len(placed), NOT_COUNTED), "snow_pixels": no_pixels}
 
-    def grow_boxes(self, placed: PlacedBoxes, view: EffectView) -> PlacedBoxes:
+    def grow_boxes(self, placed: WorldBoxes, view: LabelInputs) -> WorldBoxes:
         shows_snow = _shows_snow(view)
         return extend_boxes_by_snow(placed, view.placed.data.snow.depth_m) if shows_snow else placed
 
-    def meet(self, own: Active, echoes: Echoes, frame_ns: int) -> None:
+    def meet(self, own: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
         intersect_snow(echoes, own.scene, own.data, echoes.source, frame_ns)
 
 
-def _find_carriers(snow_effect: Active, camera: Camera) -> list[Carrier]:
+def _find_carriers(snow_effect: EffectInScene, camera: Camera) -> list[Carrier]:
     """Return the vehicles close to the camera that snow lies on."""
     carriers = list[Carrier]()
     for number in sorted(snow_effect.seen - {0}):
@@ -222,16 +224,16 @@ def _extinction_at(camera: Camera, fog: Fog | None) -> float:
     if fog is None:
         return 0.0
     eye_z_m = np.array([float(camera.centre[2])])
-    return float(optical_depth_of_arrays(fog, np.ones(1), eye_z_m, eye_z_m)[0])
+    return float(optical_depth_numpy(fog, np.ones(1), eye_z_m, eye_z_m)[0])
 
 
-def _shows_snow(view: EffectView) -> bool:
+def _shows_snow(view: LabelInputs) -> bool:
     """Tell if the view shows snow."""
     return view.placed.data is not None and view.mask is not None and bool(view.mask.any())
 
 
 def snow_layers_of(
-    scene: Scene, recipe_snow: PlacedSnow, light: Scene | None = None, *, backend: str = "auto"
+    scene: Scene, recipe_snow: SnowPlan, light: Scene | None = None, *, backend: str = "auto"
 ) -> SnowLayers:
     """Return the snow in the scene.
 
@@ -245,15 +247,15 @@ def snow_layers_of(
     Raises:
         SceneError: snow cannot be placed in this scene, or not with cells this small.
     """
-    support = support_of(scene, placement_settings(recipe_snow.snow, scene), backend=backend)
+    support = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene), backend=backend)
     light = None if light is scene else light
 
     def build_layers() -> SnowLayers:
-        return build_snow_layer(
+        return lay_snow(
             support,
             scene,
             recipe_snow.snow,
-            illumination_of(light or scene, recipe_snow.snow),
+            find_snow_light(light or scene, recipe_snow.snow),
             seed=recipe_snow.seed,
             water_level_z_m=recipe_snow.water_level_z_m,
         )
@@ -278,8 +280,8 @@ def _bound_layer(layer: Layer, gaussians: Gaussians, owner: int) -> Bounds:
     """
     is_buried = (layer.opacities.numpy() == 0) & (gaussians.opacities.numpy() > 0)
     everywhere = np.ones(len(layer.gaussians), bool)
-    snow = bound_chunks(layer.gaussians, everywhere, _CHUNK_M, owner)
-    bounds = [snow, bound_chunks(gaussians, is_buried, _CHUNK_M, owner)]
+    snow = bound_squares(layer.gaussians, everywhere, _CHUNK_M, owner)
+    bounds = [snow, bound_squares(gaussians, is_buried, _CHUNK_M, owner)]
     if layer.crystals is not None:
         places = layer.crystals.places_m.numpy().astype(np.float64)
         bounds.append(bound_points(places, np.full(len(places), GLINT_SIZE_M), _CHUNK_M, owner))

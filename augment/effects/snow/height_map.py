@@ -35,9 +35,9 @@ from augment.render.buffers import (
 )
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSettings
 from augment.render.cuda import runtime as gpu
-from augment.render.layout import UNCUT
+from augment.render.layout import SURFACE_DEPTHS_ONLY
 from augment.render.rasterize import rasterize
-from augment.render.threads import kernel_threads, thread_count
+from augment.render.threads import kernel_threads, num_kernel_threads
 from augment.scene import Gaussians, PosedGaussians
 from augment.semantics import SemanticClass
 
@@ -84,7 +84,7 @@ def in_order(
     """
     items = list(items)
     results = []
-    threads = min(thread_count(), len(items), _MAX_THREADS)
+    threads = min(num_kernel_threads(), len(items), _MAX_THREADS)
     is_serial = threads <= 1 or _worker.is_busy or backend == CUDA
     with (
         nullcontext()
@@ -107,7 +107,7 @@ def slices_of(count: int) -> list[slice]:
 
 # ---- The highest surface -------------------------------------------------------------------------
 
-Estimator = Literal["mode", "expected", "median"]
+DepthEstimator = Literal["mode", "expected", "median"]
 
 MIN_COVERED_ALPHA = 0.5  # least alpha of a pixel in which something lies
 _EYE_HEIGHT_M = 100.0  # height of the camera over the highest centre
@@ -207,7 +207,7 @@ def draw_from_above(
     corner_m: tuple[float, float],
     cell_m: float,
     shape: tuple[int, int],
-    estimator: Estimator,
+    estimator: DepthEstimator,
     pixel_mask: np.ndarray | None = None,
     with_thin: bool = True,
     top_m: float | None = None,
@@ -295,7 +295,7 @@ def _render_buffers(
         camera,
         buffers=names if MODE_DEPTH in names else BUFFERS,
         settings=RasterSettings(sh_degree=0, antialiased=antialiased),
-        clip=UNCUT,
+        clip=SURFACE_DEPTHS_ONLY,
         pixel_mask=gpu.upload(pixel_mask)
         if pixel_mask is not None and backend == CUDA
         else pixel_mask,
@@ -413,7 +413,11 @@ def draw_views(
             min(1.0, DEPTH_IMAGE_WIDTH_PX / max(camera.width, camera.height))
         )
         render = rasterize(
-            parts, small_camera, buffers=(ALPHA, EXPECTED_DEPTH), clip=UNCUT, backend=backend
+            parts,
+            small_camera,
+            buffers=(ALPHA, EXPECTED_DEPTH),
+            clip=SURFACE_DEPTHS_ONLY,
+            backend=backend,
         )
         assert render.alpha is not None and render.expected_depth is not None
         depths.append(

@@ -223,7 +223,7 @@ def _write_quaternion(nx, ny, nz, s, quats):
 
 
 class CellArrays(NamedTuple):
-    """Arrays of SnowCells that snow is made from."""
+    """Arrays of ExposedCells that snow is made from."""
 
     centers: np.ndarray
     normals: np.ndarray
@@ -873,7 +873,7 @@ def _exit_distance(o, inverse_d, low, size):
 def fill_layer(centers, sizes, depths, corner, cell, base, top):
     """Enter snow on square cells [C] into a grid; the highest counts where several cells meet.
 
-    centers [C, 3], sizes [C]: see SnowCells. depths [C]: 0 is no snow. base, top: float32 [H, W],
+    centers [C, 3], sizes [C]: see ExposedCells. depths [C]: 0 is no snow. base, top: float32 [H, W],
     -inf before the call.
     """
     rows, columns = base.shape

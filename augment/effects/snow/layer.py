@@ -1,6 +1,6 @@
 """Lays snow of a recipe's depth on a scene's support, as Gaussians in the colours of its light.
 
-Input: a `SnowSupport`, the recipe's snow, its light and a seed; the result depends on nothing else.
+Input: a `ExposedSurface`, the recipe's snow, its light and a seed; the result depends on nothing else.
 Output: `SnowLayers`. Caller: `effect.snow_layers_of`; `lidar` uses the depths alone. The depth of
 the snow is
 
@@ -27,9 +27,9 @@ import torch
 from torch import Tensor
 
 from augment.effects.snow import kernels
-from augment.effects.snow.cells import EDGE_CAP_M, SnowCells, SnowSupport
+from augment.effects.snow.cells import MAX_EDGE_DISTANCE_M, ExposedCells, ExposedSurface
 from augment.effects.snow.kernels import CellArrays, CellDepths, SplatArrays
-from augment.effects.snow.light import Illumination
+from augment.effects.snow.light import SnowIllumination
 from augment.effects.snow.near_camera import Layer, SnowLayers, draw_crystals
 from augment.effects.snow.relief import Grain
 from augment.render.threads import kernel_threads
@@ -193,7 +193,7 @@ class DepthSettings(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Profile:
+class DepthProfile:
     """Everything besides the cells that the depth of the snow on a part is made from."""
 
     settings: DepthSettings
@@ -208,9 +208,9 @@ def covered_share(snow: Snow) -> float:
     return 1.0 if share > MIN_FULL_SHARE else share
 
 
-def profile_of(
+def make_depth_profile(
     snow: Snow, rng: np.random.Generator, *, on_ground: bool, water_level_z_m: float | None = None
-) -> Profile:
+) -> DepthProfile:
     """Return the profile of the recipe's snow.
 
     Args:
@@ -252,17 +252,17 @@ def profile_of(
         depth_m=depth_m,
         threshold=max(min(threshold, 1e9), -1e9),
         rim=PATCH_RIM_M * PATCH_RIM_SLOPE,
-        radius_m=min(max(depth_m, 1e-3), EDGE_CAP_M),
+        radius_m=min(max(depth_m, 1e-3), MAX_EDGE_DISTANCE_M),
         drift=drift if on_ground else 0.0,
         wind_x=math.cos(wind_rad),
         wind_y=math.sin(wind_rad),
         pressed=PRESSED_SHARE if has_tracks and on_ground else 0.0,
         floor_z_m=floor_z_m,
     )
-    return Profile(settings, drifts, patches, draw_octaves(_MOTTLE_OCTAVES, rng))
+    return DepthProfile(settings, drifts, patches, draw_octaves(_MOTTLE_OCTAVES, rng))
 
 
-def define_depths(cells: SnowCells, profile: Profile) -> np.ndarray:
+def define_depths(cells: ExposedCells, profile: DepthProfile) -> np.ndarray:
     """Return the depth of the snow on each cell, metres, float64 [C]; depths below BARE_M become 0.
 
     This is the definition of `kernels.find_depths`.
@@ -331,7 +331,7 @@ def _pillow(t: np.ndarray) -> np.ndarray:
     return np.sqrt(t * (2 - t))
 
 
-def mottle_noise(cells: SnowCells, profile: Profile) -> np.ndarray:
+def mottle_noise(cells: ExposedCells, profile: DepthProfile) -> np.ndarray:
     """Noise of about unit deviation that the snow's colour follows, float64 [C]."""
     x_m, y_m = (cells.centers_m[:, i].numpy().astype(np.float64) for i in range(2))
     return sum_octaves(profile.mottle, x_m, y_m, cells.sizes_m.numpy().astype(np.float64))
@@ -357,11 +357,11 @@ class LayerColors(NamedTuple):
     is_baked: bool  # True if `sh` holds the light by the splats' normals
 
 
-def build_snow_layer(
-    support: SnowSupport,
+def lay_snow(
+    support: ExposedSurface,
     scene: Scene,
     snow: Snow,
-    light: Illumination,
+    light: SnowIllumination,
     *,
     seed: int,
     water_level_z_m: float | None = None,
@@ -381,7 +381,7 @@ def build_snow_layer(
             on actors stays. None without water.
     """
 
-    def layer_of(cells: SnowCells, gaussians: Gaussians, track_id: str | None) -> Layer:
+    def layer_of(cells: ExposedCells, gaussians: Gaussians, track_id: str | None) -> Layer:
         """Return the layer on one part; track_id: None for the background."""
         profile, rng = profile_on_part(track_id, scene, snow, seed, water_level_z_m)
         return _build_part_layer(
@@ -401,14 +401,16 @@ def build_snow_layer(
 
 def profile_on_part(
     track_id: str | None, scene: Scene, snow: Snow, seed: int, water_level_z_m: float | None
-) -> tuple[Profile, np.random.Generator]:
+) -> tuple[DepthProfile, np.random.Generator]:
     """Return the profile and the random numbers of an actor's snow, or of the ground's (None)."""
     part = "ground" if track_id is None else f"actor {track_id}"
     rng = rng_for(seed=seed, scene=scene.name, effect=f"snow.layer of {part}")
-    return profile_of(snow, rng, on_ground=track_id is None, water_level_z_m=water_level_z_m), rng
+    return make_depth_profile(
+        snow, rng, on_ground=track_id is None, water_level_z_m=water_level_z_m
+    ), rng
 
 
-def _grain_of_snow(snow: Snow, scene: Scene, light: Illumination, seed: int) -> Grain:
+def _grain_of_snow(snow: Snow, scene: Scene, light: SnowIllumination, seed: int) -> Grain:
     """Return the grain of the recipe's snow in the scene's light."""
     rng = rng_for(seed=seed, scene=scene.name, effect="snow.grain")
     lit = math.fsum(light.lit_rgb)
@@ -418,11 +420,11 @@ def _grain_of_snow(snow: Snow, scene: Scene, light: Illumination, seed: int) -> 
 
 
 def _build_part_layer(
-    cells: SnowCells,
+    cells: ExposedCells,
     gaussians: Gaussians,
     snow: Snow,
-    light: Illumination,
-    profile: Profile,
+    light: SnowIllumination,
+    profile: DepthProfile,
     rng: np.random.Generator,
     *,
     moves: bool,
@@ -461,7 +463,7 @@ def _build_part_layer(
     )
 
 
-def cell_arrays(cells: SnowCells) -> CellArrays:
+def cell_arrays(cells: ExposedCells) -> CellArrays:
     """Return the arrays of cells, as kernels take them."""
     c = cells
     tensors = (
@@ -478,7 +480,7 @@ def cell_arrays(cells: SnowCells) -> CellArrays:
     return CellArrays(*_as_arrays(*tensors))
 
 
-def find_depths(cells: SnowCells, profile: Profile, seed: np.uint64) -> CellDepths:
+def find_depths(cells: ExposedCells, profile: DepthProfile, seed: np.uint64) -> CellDepths:
     """Compute the depth of the snow on every cell, as `define_depths` defines it."""
     count = len(cells)
     heights, mottle = np.empty((2, count), np.float32)
@@ -498,7 +500,7 @@ def find_depths(cells: SnowCells, profile: Profile, seed: np.uint64) -> CellDept
 
 
 def _make_splats(
-    cells: SnowCells,
+    cells: ExposedCells,
     depths: CellDepths,
     depth_m: float,
     lights: np.ndarray,
@@ -510,7 +512,7 @@ def _make_splats(
     """Make the Gaussians of the snow, with their normals and slopes if asked for."""
     depths_m = depths.heights
     arrays = cell_arrays(cells)._replace(light=_soften_light(cells, depths_m, depth_m))
-    tops = surface_heights(cells, depths_m)
+    tops = find_snow_tops(cells, depths_m)
     counts = np.empty(len(cells), np.int64)
     with kernel_threads(CELLS_PER_TASK):
         kernels.count_splats(
@@ -532,7 +534,7 @@ def _make_splats(
     return gaussians, normals if keep_normals else None, slopes if keep_slopes else None
 
 
-def surface_heights(cells: SnowCells, depths_m: np.ndarray) -> np.ndarray:
+def find_snow_tops(cells: ExposedCells, depths_m: np.ndarray) -> np.ndarray:
     """Return z of every cell's surface with snow of these heights on it, float64 [C].
 
     Snow evens out the relief beneath it. Deeper snow never lies lower.
@@ -549,7 +551,7 @@ def surface_heights(cells: SnowCells, depths_m: np.ndarray) -> np.ndarray:
     return tops
 
 
-def _soften_light(cells: SnowCells, depths_m: np.ndarray, depth_m: float) -> np.ndarray:
+def _soften_light(cells: ExposedCells, depths_m: np.ndarray, depth_m: float) -> np.ndarray:
     """Return the light on the bare surface without its finest spots, float32 [C].
 
     The deeper the snow, the fewer spots it shows.
@@ -565,7 +567,7 @@ def _soften_light(cells: SnowCells, depths_m: np.ndarray, depth_m: float) -> np.
     return light
 
 
-def _hide_buried(cells: SnowCells, gaussians: Gaussians, depths_m: np.ndarray) -> Tensor:
+def _hide_buried(cells: ExposedCells, gaussians: Gaussians, depths_m: np.ndarray) -> Tensor:
     """Return opacities of a part's own Gaussians, 0 for those that the snow buries."""
     if len(cells.buried) == 0 or not depths_m.any():
         return gaussians.opacities

@@ -16,10 +16,10 @@ import numpy as np
 from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import MOVED
 from augment.effects.snow import kernels
-from augment.effects.snow.cells import SnowCells, SnowSupport
+from augment.effects.snow.cells import ExposedCells, ExposedSurface
 from augment.effects.snow.layer import find_depths, profile_on_part
-from augment.effects.snow.snow import PlacedSnow, placement_settings
-from augment.effects.snow.support import support_of
+from augment.effects.snow.snow import SnowPlan, exposure_settings
+from augment.effects.snow.support import exposed_surface_of
 from augment.labels import LidarSweep
 from augment.memo import memo_of
 from augment.scene import Scene
@@ -63,7 +63,7 @@ class LidarSnow:
 
 
 def intersect_snow(
-    echoes: Echoes, scene: Scene, recipe_snow: PlacedSnow, sweep: LidarSweep, frame_ns: int
+    echoes: Echoes, scene: Scene, recipe_snow: SnowPlan, sweep: LidarSweep, frame_ns: int
 ) -> None:
     """End beams on the snow where they meet it first. Thread-safe.
 
@@ -80,7 +80,7 @@ def intersect_snow(
 
 
 def make_snow_grid(
-    cells: SnowCells, depths_m: np.ndarray, *, grid_m: float = GRID_M
+    cells: ExposedCells, depths_m: np.ndarray, *, grid_m: float = GRID_M
 ) -> SnowGrid | None:
     """Return snow of depths [C] on cells as a grid; None where there is none."""
     centers = cells.centers_m.numpy()
@@ -106,13 +106,13 @@ def make_snow_grid(
     return SnowGrid(low, cell, base, top, highest, radius)
 
 
-def find_lidar_snow(scene: Scene, recipe_snow: PlacedSnow) -> LidarSnow:
+def find_lidar_snow(scene: Scene, recipe_snow: SnowPlan) -> LidarSnow:
     """Return the snow of a recipe in a scene. Thread-safe.
 
     Raises:
         SceneError: snow cannot be placed in this scene.
     """
-    support = support_of(scene, placement_settings(recipe_snow.snow, scene))
+    support = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene))
     key = ("lidar snow", scene.name, recipe_snow)
     return memo_of(support).get(key, lambda: _build_grids(support, scene, recipe_snow))
 
@@ -198,10 +198,10 @@ def _intersect_grid(
     )
 
 
-def _build_grids(support: SnowSupport, scene: Scene, recipe_snow: PlacedSnow) -> LidarSnow:
+def _build_grids(support: ExposedSurface, scene: Scene, recipe_snow: SnowPlan) -> LidarSnow:
     """Compute the snow of a recipe on every part of the scene."""
 
-    def layer(cells: SnowCells, track_id: str | None) -> SnowGrid | None:
+    def layer(cells: ExposedCells, track_id: str | None) -> SnowGrid | None:
         """Return the grid of one part; track_id: None for the background."""
         snow_settings = (recipe_snow.snow, recipe_snow.seed, recipe_snow.water_level_z_m)
         profile, rng = profile_on_part(track_id, scene, *snow_settings)

@@ -1,7 +1,7 @@
 """Estimates the light on snow in a scene: direction, brightness and colour of the sun.
 
 Input: a `Scene` and the recipe's snow. Output: `SceneLight`, what the scene shows, and
-`Illumination`, the light on snow. Callers: snow's `effect`, wet ground, falling snow and rain.
+`SnowIllumination`, the light on snow. Callers: snow's `effect`, wet ground, falling snow and rain.
 
 A recording rarely shows its sun, and its pictures hold no physical unit. Each question has its own
 evidence:
@@ -85,7 +85,7 @@ _LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)  # weights of linear sRGB
 
 
 @dataclass(frozen=True)
-class Illumination:
+class SnowIllumination:
     """Light on snow."""
 
     sun: tuple[float, float, float]  # unit vector towards the sun, world
@@ -109,10 +109,10 @@ class SceneLight:
     ground_albedo: float | None  # assumed albedo of the ground; None where no ground was found
     # Colour of sunlit ground: its median without shadows; the sky's mean without ground.
     ground_rgb_linear: tuple[float, float, float]
-    ground_is_grey: bool  # True if the ground's tint is the light's
+    is_ground_grey: bool  # True if the ground's tint is the light's
 
 
-def illumination_of(scene: Scene, snow: Snow) -> Illumination:
+def find_snow_light(scene: Scene, snow: Snow) -> SnowIllumination:
     """Estimate the light on a recipe's snow in a scene; the scene fills gaps of the recipe.
 
     Level snow in the sun gets radiance = albedo x ground / ground's albedo, in linear light. Snow
@@ -120,7 +120,7 @@ def illumination_of(scene: Scene, snow: Snow) -> Illumination:
     subsurface scattering"), bent below white by a soft shoulder. Shadows keep their ratio to it.
     Without ground, snow in shadow gets the mean light of the sky.
     """
-    scene_light = light_of(scene)
+    scene_light = find_scene_light(scene)
     light = snow.light
     azimuth_deg, elevation_deg, share = (
         scene_value if recipe_value is None else recipe_value
@@ -149,7 +149,7 @@ def illumination_of(scene: Scene, snow: Snow) -> Illumination:
         lit = min(1.0, recipe_luminance * snow.albedo / FRESH_ALBEDO)
     # A grey road shows the light's colour, but also its own and its shadows': a quarter is taken.
     ground_tint = (
-        _tint(scene_light.ground_rgb_linear, 0.25) if scene_light.ground_is_grey else np.ones(3)
+        _tint(scene_light.ground_rgb_linear, 0.25) if scene_light.is_ground_grey else np.ones(3)
     )
     lit_linear = lit * _normalize_luminance(ground_tint * np.asarray(_SUN_TINT) ** share)
     sky_linear = lit * _normalize_luminance(
@@ -159,7 +159,7 @@ def illumination_of(scene: Scene, snow: Snow) -> Illumination:
         _three_floats(display_from_linear(np.clip(linear, 0, 1)))
         for linear in (lit_linear, _shadow_colour(lit_linear, sky_linear, shade))
     )
-    return Illumination(sun, lit_rgb, shadow_rgb, wrap)
+    return SnowIllumination(sun, lit_rgb, shadow_rgb, wrap)
 
 
 def display_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -186,7 +186,7 @@ def _shadow_colour(lit: np.ndarray, tinted: np.ndarray, shade: float) -> np.ndar
     return np.minimum(shade * (lit + strength * (tinted - lit)), lit)
 
 
-def light_of(scene: Scene) -> SceneLight:
+def find_scene_light(scene: Scene) -> SceneLight:
     """Return the light that the scene shows; it is computed once for each scene object."""
     return memo_of(scene).get(("snow light",), lambda: _find_light(scene))
 
@@ -227,15 +227,15 @@ def _find_light(scene: Scene) -> SceneLight:
         sky_rgb_linear=_three_floats(sky_rgb),
         ground_albedo=albedo,
         ground_rgb_linear=_three_floats(rgb),
-        ground_is_grey=is_grey,
+        is_ground_grey=is_grey,
     )
 
 
-def told_light(scene: Scene, snow: Snow) -> str:
+def describe_light(scene: Scene, snow: Snow) -> str:
     """Describe in a few words where the light on a recipe's snow comes from."""
     if snow.light.sun is not None:
         return f"light: weather.snow.light.sun is {snow.light.sun:g}"
-    light = light_of(scene)
+    light = find_scene_light(scene)
     if light.shadow_ratio is None:
         return f"light: {100 * light.sun_share:.0f} % of it the sun's, by the contrast of the sky"
     if light.shadow_ratio == 1:

@@ -1,6 +1,6 @@
 """Records of the snow that lies in a scene, ready to be rendered for a camera, and its glints.
 
-`layer.build_snow_layer` makes the records once a scene. `SnowLayers.parts_for` turns them into
+`layer.lay_snow` makes the records once a scene. `SnowLayers.parts_for` turns them into
 posed Gaussians for each view.
 """
 

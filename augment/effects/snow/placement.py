@@ -1,7 +1,7 @@
 """Finds the surfaces of a scene that are open to the sky and visible to a camera.
 
-Input: a `Scene`, the cameras that must see the surfaces, `PlacementSettings`. Output: a
-`SnowSupport`, square cells on the background and on vehicles. Caller: `support.support_of`.
+Input: a `Scene`, the cameras that must see the surfaces, `ExposureSettings`. Output: a
+`ExposedSurface`, square cells on the background and on vehicles. Caller: `support.exposed_surface_of`.
 
 1. `plan_tiles` plans square tiles about the cameras' path, with finer cells near it.
 2. `draw_views` renders the depth that some cameras along the drive see.
@@ -30,9 +30,9 @@ import torch
 from augment.cameras import Camera
 from augment.cast_shadows import CastShadows, shadows_of
 from augment.effects.snow import surface_kernels
-from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, SnowCells, SnowSupport
+from augment.effects.snow.cells import FLUSH, MAX_EDGE_DISTANCE_M, ExposedCells, ExposedSurface
 from augment.effects.snow.height_map import (
-    Estimator,
+    DepthEstimator,
     Footprints,
     HeightMap,
     Views,
@@ -437,7 +437,7 @@ def ground_luminance(
 def relative_light(
     luminance: np.ndarray, classes: np.ndarray, in_light: np.ndarray | None = None
 ) -> np.ndarray:
-    """Luminance of each cell over the median of its class, float32 [C], see SnowCells.light.
+    """Luminance of each cell over the median of its class, float32 [C], see ExposedCells.light.
 
     Args:
         luminance: float32 [C]; where it is NaN, the result is 1.
@@ -864,8 +864,8 @@ def separate_foliage(surface: Surface, classes: np.ndarray) -> np.ndarray:
 
 # ---- The support of a scene ----------------------------------------------------------------------
 
-_SQUARE_CELLS = 1024  # cells on a side of the square that is rendered at once, about
-_MARGIN_M = EDGE_CAP_M + 0.2  # width of the margin that is rendered about a square
+_MAX_SQUARE_CELLS = 1024  # cells on a side of the square that is rendered at once, about
+_MARGIN_M = MAX_EDGE_DISTANCE_M + 0.2  # width of the margin that is rendered about a square
 _MARGIN_CELLS = 4  # least width of that margin
 _VISIBLE_MARGIN_CELLS = 2  # width by which the visible area grows
 # Height below the lowest camera from which on a camera sees ground, not sky, behind a point.
@@ -873,13 +873,15 @@ _MIN_DROP_BELOW_CAMERAS_M = 0.5
 
 
 @dataclass(frozen=True)
-class PlacementSettings:
+class ExposureSettings:
     """Settings that decide where a support has cells."""
 
     cell_m: float = 0.05  # side of the cells near the path; it doubles with the distance from it
     max_slope_deg: float = 50.0  # steeper surfaces carry no snow
-    estimator: Estimator = "mode"  # depth buffer that heights from above are taken from
-    invented_tracks: bool = False  # if True, the ego leaves wheel tracks on an invented drive, too
+    estimator: DepthEstimator = "mode"  # depth buffer that heights from above are taken from
+    has_invented_tracks: bool = (
+        False  # if True, the ego leaves wheel tracks on an invented drive, too
+    )
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.cell_m) and self.cell_m > 0):
@@ -892,14 +894,14 @@ class PlacementSettings:
             )
 
 
-def place_snow_support(
+def find_exposed_surface(
     scene: Scene,
     cameras: Sequence[Camera],
-    settings: PlacementSettings = PlacementSettings(),
+    settings: ExposureSettings = ExposureSettings(),
     *,
     backend: str = AUTO,
     progress: bool = False,
-) -> SnowSupport:
+) -> ExposedSurface:
     """Find the cells of a scene that are open to the sky and that some of the cameras can see.
 
     The result is the same to the bit for any number of threads. It is empty without cameras, or
@@ -927,10 +929,10 @@ def place_snow_support(
     squares = [
         (level, window)
         for level in range(int(plan.levels.max()) + 1)
-        for window in plan.squares(level, _SQUARE_CELLS)
+        for window in plan.squares(level, _MAX_SQUARE_CELLS)
     ]
     if not squares:
-        return SnowSupport(_empty_cells(), {})
+        return ExposedSurface(_empty_cells(), {})
     parked_actors = tuple(_parked_actors(scene))
     steps = len(views) + len(squares) + len(vehicles)
     with (
@@ -944,7 +946,7 @@ def place_snow_support(
 
         visible_parts = [PosedGaussians(background), *parked_actors]
         visible_depths = draw_views(views, visible_parts, backend=backend, after_each=after_each)
-        paths = find_wheel_paths(scene, with_invented=settings.invented_tracks)
+        paths = find_wheel_paths(scene, with_invented=settings.has_invented_tracks)
         search = _GroundSearch(
             background,
             parked_actors,
@@ -967,7 +969,7 @@ def place_snow_support(
         )
         on_vehicles = zip(vehicles, map_in_order(find_cells, vehicles), strict=True)
         actors = {actor.track_id: cells for actor, cells in on_vehicles if cells is not None}
-    return SnowSupport(search.join(square_cells), actors)
+    return ExposedSurface(search.join(square_cells), actors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -1001,7 +1003,7 @@ class _GroundSearch:
         cameras: Sequence[Camera],
         views: Views,
         paths: tuple[WheelPath, ...],
-        settings: PlacementSettings,
+        settings: ExposureSettings,
         shadows: CastShadows | None,
         backend: str,
     ) -> None:
@@ -1046,7 +1048,7 @@ class _GroundSearch:
         window = square.window
         return _SquareCells(square.level, columns + window.left, rows + window.bottom, cells)
 
-    def join(self, square_cells: Sequence[_SquareCells | None]) -> SnowCells:
+    def join(self, square_cells: Sequence[_SquareCells | None]) -> ExposedCells:
         """Join the cells of all squares, and link them across squares."""
         squares = [part for part in square_cells if part is not None]
         if not squares:
@@ -1157,7 +1159,7 @@ def _margin_cells(cell_m: float) -> int:
 
 
 def _side_codes(surface: Surface, has_cells: np.ndarray) -> np.ndarray:
-    """Side codes as in SnowCells.neighbours, with LINK where a cell follows, int8 [H, W, 4].
+    """Side codes as in ExposedCells.neighbours, with LINK where a cell follows, int8 [H, W, 4].
 
     The code is FLUSH where the same surface goes on without cells: no camera sees it there, or
     other cells cover it.
@@ -1192,7 +1194,7 @@ def _height_range(scene: Scene) -> tuple[float, float]:
     return (float(z.min()), float(z.max())) if len(z) else (0.0, 0.0)
 
 
-def _empty_cells() -> SnowCells:
+def _empty_cells() -> ExposedCells:
     """Return a record without cells."""
     numbers = CellNumbers(plan_tiles([], 1.0, (0.0, 0.0)))
     return make_cells(CellList.empty(), np.zeros(0, np.float32), numbers.at, Gaussians.empty())

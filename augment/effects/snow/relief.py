@@ -28,7 +28,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.effects.snow import kernels
 from augment.effects.snow.kernels import MAX_GRAIN_DISTANCE_M, GrainView
-from augment.render.buffers import AUTO, CPU, kernels_for
+from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.threads import kernel_threads
 
 # Brightness per slope of the relief towards the sun at a clear day's contrast, and brightness per
@@ -87,7 +87,7 @@ def add_grain(
             rounding.
     """
     view = _grain_view(camera, grain, sun, carriers, extinction_per_m)
-    if kernels_for(backend, rgb, depth_m, snow) != CPU:
+    if choose_kernels(backend, rgb, depth_m, snow) != CPU:
         return _add_grain(rgb, depth_m, snow, occluded, view)
     hidden_mask = np.zeros((0, 0), bool) if occluded is None else occluded.contiguous().numpy()
     rgb = rgb.contiguous()

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from augment.boxes import SIDES_M, BoxPixels, PlacedBoxes, count_pixels
+from augment.boxes import SIDE_MARGIN_M, BoxPixels, WorldBoxes, count_pixels
 from augment.cameras import Camera
-from augment.effects.snow.placement import PlacementSettings, has_invented_drive
+from augment.effects.snow.placement import ExposureSettings, has_invented_drive
 from augment.scene import Scene
 from recipes.snow import Snow
 
 
 @dataclass(frozen=True)
-class PlacedSnow:
+class SnowPlan:
     """Snow of one recipe."""
 
     snow: Snow
@@ -25,12 +25,12 @@ class PlacedSnow:
     water_level_z_m: float | None = None
 
 
-def placement_settings(snow: Snow, scene: Scene) -> PlacementSettings:
+def exposure_settings(snow: Snow, scene: Scene) -> ExposureSettings:
     """Return the settings of a recipe's snow that decide where it can lie in a scene."""
-    return PlacementSettings(
+    return ExposureSettings(
         cell_m=snow.cell_m,
         max_slope_deg=snow.max_slope_deg,
-        invented_tracks=snow.tracks == "always" and has_invented_drive(scene),
+        has_invented_tracks=snow.tracks == "always" and has_invented_drive(scene),
     )
 
 
@@ -41,8 +41,8 @@ DRIFT_DEPTH_RATIO = 1.5  # depth of the layer in drifts over its depth on level 
 MIN_BOX_HEIGHT_SHARE = 0.25  # least share of a low box, from its top down, that stays in deep snow
 
 
-def snow_pixels(
-    boxes: PlacedBoxes,
+def count_snow_pixels(
+    boxes: WorldBoxes,
     camera: Camera,
     surface_depth_m: Float32[np.ndarray, "H W"],
     snow: UInt8[np.ndarray, "H W"],
@@ -62,7 +62,7 @@ def snow_pixels(
     return count_pixels(extend_boxes_by_snow(boxes, thickness_m), camera, surface_depth_m, snow)
 
 
-def extend_boxes_by_snow(boxes: PlacedBoxes, thickness_m: float) -> PlacedBoxes:
+def extend_boxes_by_snow(boxes: WorldBoxes, thickness_m: float) -> WorldBoxes:
     """Return the boxes with the snow on them; thickness_m: depth of the layer on level ground.
 
     The top of a box is raised, since the snow on it counts as the box. Its bottom is raised, since
@@ -73,5 +73,5 @@ def extend_boxes_by_snow(boxes: PlacedBoxes, thickness_m: float) -> PlacedBoxes:
     high = boxes.high_m.copy()
     above_ground = np.minimum(thickness_m + SURFACE_MARGIN_M, (1 - MIN_BOX_HEIGHT_SHARE) * height)
     low[:, 2] = np.maximum(low[:, 2], above_ground - height / 2)
-    high[:, 2] = height / 2 + max(SIDES_M, DRIFT_DEPTH_RATIO * thickness_m + SURFACE_MARGIN_M)
+    high[:, 2] = height / 2 + max(SIDE_MARGIN_M, DRIFT_DEPTH_RATIO * thickness_m + SURFACE_MARGIN_M)
     return dataclasses.replace(boxes, low_m=low, high_m=high)

@@ -1,7 +1,7 @@
 """Finds a scene's support once: it is remembered while the scene lives, and stored in a folder.
 
-`placement.place_snow_support` does the work. Callers: snow and wet ground (`support_of` for
-pictures and sweeps, `share_support` at the start of a job).
+`placement.find_exposed_surface` does the work. Callers: snow and wet ground (`exposed_surface_of` for
+pictures and sweeps, `share_exposed_surface` at the start of a job).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from safetensors.torch import save
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.effect import Sharing
-from augment.effects.snow.cells import FLUSH, SnowCells, SnowSupport
-from augment.effects.snow.placement import PlacementSettings, place_snow_support
+from augment.effects.effect import JobContext
+from augment.effects.snow.cells import FLUSH, ExposedCells, ExposedSurface
+from augment.effects.snow.placement import ExposureSettings, find_exposed_surface
 from augment.errors import SceneError
 from augment.jobs.atomic import write_atomic
 from augment.memo import memo_of
@@ -36,19 +36,19 @@ logger = logging.getLogger(__name__)
 # a file would hold it otherwise.
 FORMAT = "climategs-snow-bed-7"
 _METADATA_KEY = "snow_bed"  # key of the metadata in a file
-# Types of the fields of SnowCells other than float32.
+# Types of the fields of ExposedCells other than float32.
 _DTYPES = {
     "neighbours": torch.int32,
     "semantic": torch.int16,
     "buried": torch.int32,
     "buried_by": torch.int32,
 }
-# Second dimension of the fields of SnowCells that have one.
+# Second dimension of the fields of ExposedCells that have one.
 _COLUMNS = {"centers_m": 3, "normals": 3, "neighbours": 4, "banks": 2, "buried_by": 5}
 
 
-def support_key(
-    scene: Scene, cameras: Sequence[Camera], settings: PlacementSettings, *, backend: str = AUTO
+def exposed_surface_key(
+    scene: Scene, cameras: Sequence[Camera], settings: ExposureSettings, *, backend: str = AUTO
 ) -> str:
     """Return a hex digest of everything that a support depends on.
 
@@ -72,12 +72,12 @@ def support_key(
         _add_tensors(digest, camera.camera_from_world)
     _add_tensors(digest, *(frame.world_from_ego for frame in scene.frames))
     if scene.seen_frames is not None:  # wheel tracks are those of the recorded drive
-        digest.update(repr(settings.invented_tracks).encode())
+        digest.update(repr(settings.has_invented_tracks).encode())
         _add_tensors(digest, *(frame.world_from_ego for frame in scene.seen_frames))
     return digest.hexdigest()
 
 
-def save_support(path: Path, support: SnowSupport, key: str) -> None:
+def save_exposed_surface(path: Path, support: ExposedSurface, key: str) -> None:
     """Write a support, as a whole or not at all. Equal supports are equal bytes: no time is stored.
 
     Raises:
@@ -93,7 +93,7 @@ def save_support(path: Path, support: SnowSupport, key: str) -> None:
     )
 
 
-def load_support(path: Path, key: str) -> SnowSupport:
+def load_exposed_surface(path: Path, key: str) -> ExposedSurface:
     """Read the support of a file.
 
     Raises:
@@ -109,7 +109,7 @@ def load_support(path: Path, key: str) -> SnowSupport:
             track_id: _cells_from_tensors(path, tensors, f"actors.{number}")
             for number, track_id in enumerate(track_ids)
         }
-        return SnowSupport(_cells_from_tensors(path, tensors, "ground"), actors)
+        return ExposedSurface(_cells_from_tensors(path, tensors, "ground"), actors)
     except FileNotFoundError as error:
         raise SceneError(f"{path}: no such file, so no snow support to read") from error
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
@@ -134,17 +134,17 @@ def _check_metadata(path: Path, metadata: Any, key: str) -> None:
         )
 
 
-def _named_tensors(part: str, cells: SnowCells) -> dict[str, Tensor]:
+def _named_tensors(part: str, cells: ExposedCells) -> dict[str, Tensor]:
     """Return the tensors of one part's cells, by their names in a file."""
     return {
         f"{part}.{field.name}": getattr(cells, field.name).contiguous().clone()
-        for field in fields(SnowCells)
+        for field in fields(ExposedCells)
     }
 
 
-def _cells_from_tensors(path: Path, tensors: Mapping[str, Tensor], part: str) -> SnowCells:
+def _cells_from_tensors(path: Path, tensors: Mapping[str, Tensor], part: str) -> ExposedCells:
     """Return the cells of one part, after a check of every shape and every index."""
-    fields_by_name = {field.name: tensors[f"{part}.{field.name}"] for field in fields(SnowCells)}
+    fields_by_name = {field.name: tensors[f"{part}.{field.name}"] for field in fields(ExposedCells)}
     num_rows = {"cell": len(fields_by_name["sizes_m"]), "buried": len(fields_by_name["buried"])}
     for name, tensor in fields_by_name.items():
         rows = num_rows["buried" if name.startswith("buried") else "cell"]
@@ -164,7 +164,7 @@ def _cells_from_tensors(path: Path, tensors: Mapping[str, Tensor], part: str) ->
             raise ValueError(f"{part}.{name} names cells that are not there")
     if num_rows["buried"] and int(fields_by_name["buried"].min()) < 0:
         raise ValueError(f"{part}.buried names Gaussians that are not there")
-    return SnowCells(**fields_by_name)
+    return ExposedCells(**fields_by_name)
 
 
 def _add_gaussians(digest: hashlib.blake2b, gaussians: Gaussians) -> None:
@@ -182,15 +182,15 @@ def _add_tensors(digest: hashlib.blake2b, *tensors: Tensor) -> None:
         digest.update(array.view(np.uint8).data if array.size else b"")
 
 
-def support_of(
+def exposed_surface_of(
     scene: Scene,
-    settings: PlacementSettings,
+    settings: ExposureSettings,
     *,
     cameras: Sequence[Camera] | None = None,
     folder: Path | None = None,
     backend: str = AUTO,
     progress: bool = False,
-) -> SnowSupport:
+) -> ExposedSurface:
     """Return the support of a scene: remembered, read from the folder, or placed and written there.
 
     A scene and its settings have one support, so that its pictures, sweeps and labels agree.
@@ -201,53 +201,55 @@ def support_of(
         cameras: cameras that must see the snow; None for all of the scene's.
         folder: folder that keeps supports as snow-<key>.safetensors. A file that cannot be used is
             replaced, with a warning.
-        backend: backend that places a support which is not remembered yet, see place_snow_support.
+        backend: backend that places a support which is not remembered yet, see find_exposed_surface.
         progress: if True, a progress bar is shown.
 
     Raises:
-        SceneError: as place_snow_support.
+        SceneError: as find_exposed_surface.
         OutputError: the folder cannot be written.
     """
 
-    def find_support() -> SnowSupport:
+    def find_support() -> ExposedSurface:
         viewing_cameras = all_cameras(scene) if cameras is None else cameras
         key = (
-            "" if folder is None else support_key(scene, viewing_cameras, settings, backend=backend)
+            ""
+            if folder is None
+            else exposed_surface_key(scene, viewing_cameras, settings, backend=backend)
         )
-        path = None if folder is None else support_path(folder, key)
+        path = None if folder is None else exposed_surface_path(folder, key)
         if path is not None and path.is_file():
             try:
-                return load_support(path, key)
+                return load_exposed_surface(path, key)
             except SceneError as error:
                 logger.warning("the snow of %s is placed anew: %s", scene.name, error)
-        support = place_snow_support(
+        support = find_exposed_surface(
             scene, viewing_cameras, settings, backend=backend, progress=progress
         )
         if path is not None:
-            save_support(path, support, key)
+            save_exposed_surface(path, support, key)
         return support
 
     return memo_of(scene).get(("snow support", settings), find_support)
 
 
 @dataclass(frozen=True)
-class StoredSupport:
+class StoredExposedSurface:
     """Support in its file."""
 
     path: str
     key: str
 
-    def load(self) -> SnowSupport:
+    def load(self) -> ExposedSurface:
         """Read the support."""
-        return load_support(Path(self.path), self.key)
+        return load_exposed_surface(Path(self.path), self.key)
 
 
-def share_support(job: Sharing, settings: PlacementSettings) -> None:
+def share_exposed_surface(job: JobContext, settings: ExposureSettings) -> None:
     """Find the support of a job's scene and share it with the processes that take over its memo.
 
     It is shared as a file where the job has a folder.
     """
-    support = support_of(
+    support = exposed_surface_of(
         job.scene,
         settings,
         cameras=job.cameras,
@@ -255,14 +257,14 @@ def share_support(job: Sharing, settings: PlacementSettings) -> None:
         backend=job.backend,
         progress=job.progress,
     )
-    stored: SnowSupport | StoredSupport = support
+    stored: ExposedSurface | StoredExposedSurface = support
     if job.folder is not None:
         viewing_cameras = all_cameras(job.scene) if job.cameras is None else job.cameras
-        key = support_key(job.scene, viewing_cameras, settings, backend=job.backend)
-        path = support_path(job.folder, key)
+        key = exposed_surface_key(job.scene, viewing_cameras, settings, backend=job.backend)
+        path = exposed_surface_path(job.folder, key)
         if not path.is_file():  # this process remembers it from a job in another folder
-            save_support(path, support, key)
-        stored = StoredSupport(str(path), key)
+            save_exposed_surface(path, support, key)
+        stored = StoredExposedSurface(str(path), key)
     memo = memo_of(job.scene)
     memo.put(("snow support", settings), stored, shared=True)
     memo.put(("snow support", settings), support)
@@ -273,6 +275,6 @@ def all_cameras(scene: Scene) -> list[Camera]:
     return [camera for frame in scene.frames for camera in frame.cameras.values()]
 
 
-def support_path(folder: Path, key: str) -> Path:
+def exposed_surface_path(folder: Path, key: str) -> Path:
     """Return the file in which a folder keeps the support of a key."""
     return folder / f"snow-{key}.safetensors"

@@ -1,7 +1,7 @@
 """Finds the surfaces on a height map that can carry snow.
 
 Input: a `HeightMap` of one square, seen from above. Output: a `Surface` with slopes, sides and
-distances to open edges; `CellList` arrays of its cells; `SnowCells`, the finished record. Callers:
+distances to open edges; `CellList` arrays of its cells; `ExposedCells`, the finished record. Callers:
 `placement` for the background, and `find_actor_cells` here for a vehicle.
 """
 
@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from augment.effects.snow import surface_kernels
-from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, SnowCells
+from augment.effects.snow.cells import FLUSH, MAX_EDGE_DISTANCE_M, ExposedCells
 from augment.effects.snow.height_map import (
-    Estimator,
+    DepthEstimator,
     Footprints,
     HeightMap,
     classes_of,
@@ -75,7 +75,7 @@ class Surface:
     slopes: np.ndarray  # float32 [H, W, 2], dz/dx and dz/dy
     can_carry: np.ndarray  # bool, snow stays on the cell
     sides: np.ndarray  # int8 [H, W, 4], see surface_kernels.compare_sides
-    edge_m: np.ndarray  # float32, see SnowCells
+    edge_m: np.ndarray  # float32, see ExposedCells
 
 
 def find_surface(
@@ -155,7 +155,9 @@ def find_surface(
     sides = _compare_sides(fitted_m, lowest, covered, can_carry, max_step_m)
     edges = np.empty(shape, np.float32)
     with kernel_threads(_ROWS_PER_TASK):
-        surface_kernels.edge_distances(can_carry, sides, max(EDGE_CAP_M / cell, 0.5), edges)
+        surface_kernels.edge_distances(
+            can_carry, sides, max(MAX_EDGE_DISTANCE_M / cell, 0.5), edges
+        )
     return Surface(height_map, fitted_m, slopes, can_carry, sides, edges * np.float32(cell))
 
 
@@ -167,7 +169,7 @@ def find_narrow_things(height_map: HeightMap, may_carry: np.ndarray) -> np.ndarr
 
 
 def find_banks(surface: Surface) -> np.ndarray:
-    """Vectors towards obstacles, float32 [H, W, 2], see SnowCells.banks; 0 on obstacles."""
+    """Vectors towards obstacles, float32 [H, W, 2], see ExposedCells.banks; 0 on obstacles."""
     cell = surface.map.cell_m
     covered = surface.map.covered
     heights = np.where(covered, surface.height_m, np.float32(np.inf))
@@ -415,7 +417,7 @@ def find_buried(
     """Find the Gaussians that are the surface or lie close beneath it.
 
     Returns:
-        buried int32 [B] and buried_by int32 [B, 5], see SnowCells, of Gaussians that snow can hide.
+        buried int32 [B] and buried_by int32 [B, 5], see ExposedCells, of Gaussians that snow can hide.
     """
     results = []
     if len(cells.sizes_m):
@@ -482,7 +484,7 @@ def _find_buried_slice(
 
 
 class CellList(NamedTuple):
-    """Cells of some grid: C rows of arrays, with the fields of SnowCells and two others."""
+    """Cells of some grid: C rows of arrays, with the fields of ExposedCells and two others."""
 
     centers_m: np.ndarray
     normals: np.ndarray
@@ -566,7 +568,7 @@ def _link_slice(
 
 def make_cells(
     cells: CellList, light: np.ndarray, cells_under: CellsUnder, gaussians: Gaussians
-) -> SnowCells:
+) -> ExposedCells:
     """Make the record of cells: link neighbours by their places, and find the buried Gaussians."""
     neighbours = cells.sides.astype(np.int32)
     in_order(
@@ -575,7 +577,7 @@ def make_cells(
     )
     buried, buried_by = find_buried(gaussians, cells_under, cells)
     copied_names = ("normals", "sizes_m", "edge_m", "tracks", "banks", "semantic")
-    return SnowCells(
+    return ExposedCells(
         **{name: torch.from_numpy(getattr(cells, name)) for name in copied_names},
         centers_m=torch.from_numpy(cells.centers_m.astype(np.float32)),
         neighbours=torch.from_numpy(neighbours),
@@ -622,8 +624,13 @@ def is_moving(actor: Actor) -> bool:
 
 
 def find_actor_cells(
-    actor: Actor, *, cell_m: float, max_slope_deg: float, estimator: Estimator, backend: str = AUTO
-) -> SnowCells | None:
+    actor: Actor,
+    *,
+    cell_m: float,
+    max_slope_deg: float,
+    estimator: DepthEstimator,
+    backend: str = AUTO,
+) -> ExposedCells | None:
     """Find the cells on a vehicle, in its own frame; None where it has too few to carry snow.
 
     All cells on its outline have open edges, since the surface falls away there.

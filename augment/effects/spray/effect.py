@@ -8,21 +8,27 @@ from dataclasses import dataclass, replace
 from augment.cameras import Camera
 from augment.effects.effect import (
     PICTURE,
-    Active,
-    Drawn,
     Effect,
-    InView,
-    Placed,
-    Sight,
+    EffectInScene,
+    EffectPlan,
+    RenderedView,
     Step,
+    ViewQuery,
+    Visibility,
     skipped,
 )
 from augment.effects.falling.air import glow_of
-from augment.effects.falling.effect import blows_to
+from augment.effects.falling.effect import wind_velocity_mps
 from augment.effects.lidar.beam import Echoes
 from augment.effects.spray.lidar import spray_echoes
 from augment.effects.spray.picture import blend_puffs, windows_of
-from augment.effects.spray.puffs import FROM_MPS, Puffs, film_depth_m, spray_puffs, spraying_actors
+from augment.effects.spray.puffs import (
+    MIN_SPEED_MPS,
+    Puffs,
+    film_depth_m,
+    spray_puffs,
+    spraying_actors,
+)
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH
 from augment.rng import rng_for
 from augment.scene import Scene
@@ -34,7 +40,7 @@ SPRAY = "spray behind vehicles"
 
 
 @dataclass(frozen=True)
-class PlacedSpray:
+class SprayPlan:
     """Numbers of the spray in a scene."""
 
     water_m: float
@@ -64,7 +70,7 @@ class SprayEffect(Effect):
     def kernels(self, section: Rain) -> Hashable:
         return (section.changes and section.spray) or None
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
         rain = self.of(recipe)
         why = ""
         if rain is None or not rain.changes:
@@ -74,27 +80,29 @@ class SprayEffect(Effect):
         elif rain.ground_wetness == 0:
             why = "weather.rain.wetness is 0"
         elif not spraying_actors(scene):
-            why = f"no actor drives faster than {3.6 * FROM_MPS:.0f} km/h"
+            why = f"no actor drives faster than {3.6 * MIN_SPEED_MPS:.0f} km/h"
         if rain is None or why:
-            return Placed(None, skipped((SPRAY,), why, PICTURE))
-        wind_mps = blows_to(rain.wind_mps, rain.wind_from_deg)
+            return EffectPlan(None, skipped((SPRAY,), why, PICTURE))
+        wind_mps = wind_velocity_mps(rain.wind_mps, rain.wind_from_deg)
         water_m = film_depth_m(rain.rate_mm_h) * rain.ground_wetness
-        spray = PlacedSpray(water_m, wind_mps, recipe.seed)
+        spray = SprayPlan(water_m, wind_mps, recipe.seed)
         why = (
-            f"{len(spraying_actors(scene))} actors drive faster than {3.6 * FROM_MPS:.0f} km/h on "
+            f"{len(spraying_actors(scene))} actors drive faster than {3.6 * MIN_SPEED_MPS:.0f} km/h on "
             f"{1000 * spray.water_m:.2g} mm of water"
         )
-        return Placed(spray, (Step(SPRAY, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH}))
+        return EffectPlan(
+            spray, (Step(SPRAY, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH})
+        )
 
-    def in_view(self, own: Active, sight: Sight) -> InView:
+    def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
         puffs = own.data.puffs(own.scene, sight.camera.timestamp_ns)
         camera = sight.camera
         windows = windows_of(puffs, camera)
         if not ((windows[:, 0] < windows[:, 1]) & (windows[:, 2] < windows[:, 3])).any():
-            return InView(False, {SPRAY: "no spray can be in view"})
-        return InView(seen=puffs)
+            return Visibility(False, {SPRAY: "no spray can be in view"})
+        return Visibility(seen=puffs)
 
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         raster = drawn.raster
         assert raster.alpha is not None and raster.expected_depth is not None
         with timed(SPRAY):
@@ -110,7 +118,7 @@ class SprayEffect(Effect):
             )
         return replace(drawn, rgb=rgb)
 
-    def meet(self, own: Active, echoes: Echoes, frame_ns: int) -> None:
+    def meet(self, own: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
         key = f"lidar.spray at {frame_ns} ns"
         rng = rng_for(seed=own.data.seed, scene=own.scene.name, effect=key)
         spray_echoes(echoes, own.data.puffs(own.scene, frame_ns), rng)

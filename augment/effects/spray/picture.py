@@ -22,9 +22,9 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.effects.spray import kernels
 from augment.effects.spray.puffs import CUT, Puffs
-from augment.render.buffers import CPU, kernels_for
+from augment.render.buffers import CPU, choose_kernels
 from augment.render.composite import ROWS
-from augment.render.fog import Fog, optical_depth_of_arrays
+from augment.render.fog import Fog, optical_depth_numpy
 from augment.render.threads import kernel_threads
 
 _RUNS_PER_SD = 12  # runs of pixels in a standard deviation of a puff
@@ -116,7 +116,7 @@ def blend_puffs(
     fog_light = np.zeros(3)
     if fog is not None:
         fog_light = np.square(np.asarray(fog.rgb, np.float64))
-    if kernels_for(backend, rgb, depth) == CPU and rgb.is_contiguous():
+    if choose_kernels(backend, rgb, depth) == CPU and rgb.is_contiguous():
         # By numpy: torch's threads would wait for more work, on the cores that the kernel needs.
         z = depth.contiguous().numpy()
         surfaces = np.where((alpha.detach().numpy() >= 0.5) & (z > 0), z, np.float32(np.inf))
@@ -148,9 +148,7 @@ def _numbers(puffs: Puffs, camera: Camera, fog: Fog | None) -> np.ndarray:
         distances = np.linalg.norm(offsets, axis=1)
         heights = puffs.centres_m[:, 2]
         fog_transmittance = np.exp(
-            -optical_depth_of_arrays(
-                fog, distances, np.full(len(camera_whitenings), eye[2]), heights
-            )
+            -optical_depth_numpy(fog, distances, np.full(len(camera_whitenings), eye[2]), heights)
         )
     strength = math.sqrt(2 * math.pi) * puffs.extinction_per_m
     numbers = [

@@ -25,7 +25,7 @@ from augment.memo import memo_of
 from augment.rng import STEP_X, mix, rng_for
 from augment.scene import Actor, Scene
 
-FROM_MPS = 40 / 3.6  # speed from which a vehicle lifts spray
+MIN_SPEED_MPS = 40 / 3.6  # speed from which a vehicle lifts spray
 _FULL_MPS = 90 / 3.6  # speed at which _FULL_SHARE of the water is in the air
 _FULL_SHARE = 0.1  # share of the water that is in the air at _FULL_MPS
 _MAX_SHARE = 0.2  # largest share of the water that is in the air
@@ -72,7 +72,7 @@ def spraying_actors(scene: Scene) -> tuple[int, ...]:
     """Return the numbers (from 0) of the actors that are ever fast enough; cached per scene."""
 
     def compute() -> tuple[int, ...]:
-        return tuple(n for n, actor in enumerate(scene.actors) if _top_speed(actor) > FROM_MPS)
+        return tuple(n for n, actor in enumerate(scene.actors) if _top_speed(actor) > MIN_SPEED_MPS)
 
     return memo_of(scene).get(("actors that spray",), compute)
 
@@ -118,7 +118,9 @@ def _puffs_of(
     born_s = (births - start_ns) / 1e9
     velocity = _velocities(actor, born_s)
     speed = np.linalg.norm(velocity, axis=1)
-    share = np.clip((speed - FROM_MPS) / (_FULL_MPS - FROM_MPS) * _FULL_SHARE, 0, _MAX_SHARE)
+    share = np.clip(
+        (speed - MIN_SPEED_MPS) / (_FULL_MPS - MIN_SPEED_MPS) * _FULL_SHARE, 0, _MAX_SHARE
+    )
     share[speed > _MAX_MPS] = 0
     length, width, height = actor.size_m
     size = min(length / _CAR_SIZE_M[0], 4.0) * min(width / _CAR_SIZE_M[1], 2.0)

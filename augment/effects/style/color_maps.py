@@ -23,13 +23,13 @@ from torch import Tensor
 from augment.memo import memo_of
 from augment.render import composite_kernels
 from augment.render import sh as sh_layout
-from augment.render.buffers import AUTO, CPU, CUDA, kernels_for
+from augment.render.buffers import AUTO, CPU, CUDA, choose_kernels
 from augment.render.cuda import runtime
 from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
 from augment.scene import Actor, Gaussians, Scene
 from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky, is_stand_in
+from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky, is_unknown_sky
 
 CLASSES = max(SemanticClass) + 1
 
@@ -93,7 +93,7 @@ def sky_levels(scene: Scene, maps: StyleMaps) -> Int16[Tensor, "N"] | None:
     in front of a grey stand-in. Remembered while the scene lives: it is the same for every style.
     """
     seen = maps.seen_sky
-    if seen is None or is_stand_in(scene.sky):
+    if seen is None or is_unknown_sky(scene.sky):
         return None
     return memo_of(scene).get(("sky levels", seen.numpy().tobytes()), lambda: _find(scene, seen))
 
@@ -193,7 +193,7 @@ def style_gaussians(
         splats, classes = level_maps(maps), map_rows(levels, gaussians.semantic, len(splats))
     if out is None and not bool(_changes(splats).any()):
         return gaussians
-    kernels = kernels_for(backend, sh)
+    kernels = choose_kernels(backend, sh)
     if kernels == CPU:
         return dataclasses.replace(gaussians, sh=_on_cpu(sh, out, classes, fold_maps(splats)))
     sh = runtime.resident(sh) if kernels == CUDA else sh
@@ -249,7 +249,7 @@ def map_sh(
     """
     folded = fold_maps(maps, sh.dtype).to(sh.device)
     if classes is None:
-        rows = folded[:1].expand(len(sh), sh_layout.FOLDED)
+        rows = folded[:1].expand(len(sh), sh_layout.NUM_FOLDED)
     else:
         rows = folded[classes.long().to(sh.device)]
     shown = sh.clamp_min(float(sh_layout.BLACK)) if sh.shape[1] == 1 else sh

@@ -36,7 +36,7 @@ from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, Sky, is_stand_in
+from augment.sky import ConstantSky, Sky, is_unknown_sky
 
 VIEWS = 12  # views that the statistics are taken from
 VIEW_PIXELS = 200 * 130  # approximate number of pixels of a view
@@ -162,7 +162,7 @@ def _statistics(scene: Scene, views: Sequence[Camera], per_region: bool) -> Stat
     land = np.concatenate([view.land for view in view_pixels])
     total = float(alpha.size)
     regions: dict[str, ColorStatistics] = {}
-    if is_stand_in(scene.sky):  # a grey that nobody saw has no part in the scene's mood
+    if is_unknown_sky(scene.sky):  # a grey that nobody saw has no part in the scene's mood
         _add(regions, WHOLE, land, alpha, float(alpha.sum(dtype=np.float64)))
     else:
         picture = np.concatenate([view.picture for view in view_pixels])
@@ -236,7 +236,7 @@ def _pictures(scene: Scene, views: Sequence[Camera]) -> Float[Tensor, "B 3 256 2
 
 def _sky_of_pictures(scene: Scene, rgb: Tensor, alpha: Tensor) -> Sky:
     """The scene's; where that is a stand-in, one of the mean colour of what else is seen."""
-    if not is_stand_in(scene.sky):
+    if not is_unknown_sky(scene.sky):
         return scene.sky
     return ConstantSky((rgb.sum((0, 1)) / alpha.sum()).clamp(0, 1))
 

@@ -11,7 +11,16 @@ import torch
 
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
-from augment.effects.effect import PICTURE, SCENE, Active, Drawn, Effect, Placed, Sharing, Step
+from augment.effects.effect import (
+    PICTURE,
+    SCENE,
+    Effect,
+    EffectInScene,
+    EffectPlan,
+    JobContext,
+    RenderedView,
+    Step,
+)
 from augment.effects.style.color_maps import StyleMaps
 from augment.effects.style.style import SceneStyle, scene_style_of, style_maps
 from augment.memo import memo_of
@@ -55,14 +64,14 @@ class StyleEffect(Effect):
     def kernels(self, section: Style) -> Hashable:
         return (section.applied_to, section.method) if section.changes else None
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
         style = self.of(recipe)
         if style is None or not style.changes:
             why = "the recipe has no style"
             if style is not None:
                 why = "the style has no strength, so it changes nothing"
             steps = (Step(ON_SCENE, False, why, SCENE), Step(ON_PICTURE, False, why, PICTURE))
-            return Placed(None, steps)
+            return EffectPlan(None, steps)
         source = f"image {Path(style.image or '').name}"
         if style.preset:
             source = f"preset {style.preset!r}"
@@ -79,15 +88,15 @@ class StyleEffect(Effect):
             Step(ON_SCENE, not on_picture, other_reason if on_picture else scene_reason, SCENE),
             Step(ON_PICTURE, on_picture, reason if on_picture else other_reason, PICTURE),
         )
-        return Placed(style, steps)
+        return EffectPlan(style, steps)
 
-    def prepare(self, own: Active) -> SceneStyle:
+    def prepare(self, own: EffectInScene) -> SceneStyle:
         return scene_style_of(own.scene, own.data)
 
-    def relight(self, own: Active) -> Scene | None:
+    def relight(self, own: EffectInScene) -> Scene | None:
         return own.prepared.lighting_scene if own.data.applied_to == "scene" else None
 
-    def share(self, job: Sharing) -> None:
+    def share(self, job: JobContext) -> None:
         """Precompute the maps, so that other processes render no content and read no files."""
         styles = (self.of(recipe) for recipe in job.recipes)
         for style in dict.fromkeys(s for s in styles if s and s.changes):
@@ -96,7 +105,9 @@ class StyleEffect(Effect):
             memo.put(("style maps", style), PackedMaps.of(maps), shared=True)
             memo.put(("style maps", style), maps)
 
-    def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
+    def edit_scene(
+        self, own: EffectInScene, layers: LayerRenderer, camera: Camera
+    ) -> LayerRenderer:
         if own.data.applied_to == "picture":
             return layers
         style = own.prepared
@@ -106,7 +117,7 @@ class StyleEffect(Effect):
         parts = style.on(layers.parts, backend=own.backend)
         return replace(layers, parts=parts, sky=style.sky, photo=photo)
 
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         if own.data.applied_to != "picture":
             return drawn
         with timed(ON_PICTURE):

@@ -15,18 +15,18 @@ from augment.drawing import LayerRenderer
 from augment.effects.effect import (
     PICTURE,
     SCENE,
-    Active,
-    Drawn,
     Effect,
-    InView,
-    Placed,
-    Sharing,
-    Sight,
+    EffectInScene,
+    EffectPlan,
+    JobContext,
+    RenderedView,
     Step,
+    ViewQuery,
+    Visibility,
 )
 from augment.effects.lidar.beam import Echoes
-from augment.effects.snow.light import light_of
-from augment.effects.snow.support import share_support
+from augment.effects.snow.light import find_scene_light
+from augment.effects.snow.support import share_exposed_surface
 from augment.effects.wet.darkening import darken_gaussians, wet_ratio, white_level
 from augment.effects.wet.ground import (
     PLACEMENT_SETTINGS,
@@ -35,7 +35,7 @@ from augment.effects.wet.ground import (
     wet_ground,
     wet_splats,
 )
-from augment.effects.wet.lidar import wet_echoes
+from augment.effects.wet.lidar import dim_wet_echoes
 from augment.effects.wet.reflection import (
     Film,
     Mirror,
@@ -46,7 +46,7 @@ from augment.effects.wet.reflection import (
     plane_in_view,
     shade_wet,
 )
-from augment.effects.wet.ripples import rings_of
+from augment.effects.wet.ripples import make_rings
 from augment.ground import check_metric_and_level
 from augment.memo import memo_of
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
@@ -76,7 +76,7 @@ UPPER_MARGIN_SHARE = 0.2
 
 
 @dataclass(frozen=True)
-class PlacedWet:
+class WetGroundPlan:
     """Wet ground of a recipe."""
 
     seed: int  # seed of the puddles' noise
@@ -99,7 +99,7 @@ class WetEffect(Effect):
         rain = self.of(recipe)
         return rain is not None and rain.ground_wetness > 0
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
         rain = self.of(recipe)
         reason = ""
         if rain is None or rain.ground_wetness == 0:
@@ -108,7 +108,7 @@ class WetEffect(Effect):
             reason = "wetness is null, and the scene's metres or gravity are not known"
         if rain is None or reason:
             stages = (SCENE, PICTURE, PICTURE)
-            return Placed(
+            return EffectPlan(
                 None, tuple(Step(n, False, reason, s) for n, s in zip(PASSES, stages, strict=True))
             )
         check_metric_and_level(scene)
@@ -125,31 +125,33 @@ class WetEffect(Effect):
             ),
         )
         numbers = rain.ground_wetness, rain.puddle_share, rain.rate_mm_h, rain.mirror_px
-        data = PlacedWet(recipe.seed, *numbers)
-        return Placed(data, steps, frozenset({EXPECTED_DEPTH}))
+        data = WetGroundPlan(recipe.seed, *numbers)
+        return EffectPlan(data, steps, frozenset({EXPECTED_DEPTH}))
 
-    def prepare(self, own: Active) -> WetGround:
+    def prepare(self, own: EffectInScene) -> WetGround:
         return wet_ground(own.scene, own.data.seed, backend=own.backend)
 
-    def share(self, job: Sharing) -> None:
+    def share(self, job: JobContext) -> None:
         """Find where rain can fall, once for the job."""
         rains = (self.of(recipe) for recipe in job.recipes)
         if any(rain and rain.ground_wetness > 0 for rain in rains):
-            share_support(job, PLACEMENT_SETTINGS)
+            share_exposed_surface(job, PLACEMENT_SETTINGS)
 
-    def cameras(self, own: Active, camera: Camera) -> tuple[Camera, ...] | None:
+    def cameras(self, own: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
         plane = _find_plane(own, camera)
         return (
             None if plane is None else (camera, _mirror_camera(camera, plane, (0, camera.height)))
         )
 
-    def in_view(self, own: Active, sight: Sight) -> InView:
+    def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
         if _find_plane(own, sight.camera) is not None:
-            return InView()
+            return Visibility()
         reason = "no open ground is in view"
-        return InView(skipped=dict.fromkeys((MIRROR_PASS, REFLECTION_PASS), reason))
+        return Visibility(skipped=dict.fromkeys((MIRROR_PASS, REFLECTION_PASS), reason))
 
-    def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
+    def edit_scene(
+        self, own: EffectInScene, layers: LayerRenderer, camera: Camera
+    ) -> LayerRenderer:
         splats = wet_splats(own.scene, own.prepared)
         with timed(DARKENING_PASS):
             parts = [
@@ -160,7 +162,7 @@ class WetEffect(Effect):
             ]
         return replace(layers, parts=parts)
 
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         plane = _find_plane(own, camera)
         depth = drawn.raster.expected_depth
         alpha = drawn.raster.alpha
@@ -186,18 +188,18 @@ class WetEffect(Effect):
             mirror = _render_mirror(own, drawn.layers, camera, plane, rows)
         with timed(REFLECTION_PASS):
             data = own.data
-            rings = rings_of(data.rate_mm_h, data.seed, camera.timestamp_ns)
-            film = Film(data.wetness, own.prepared.puddle_level(data.puddles), rings)
+            rings = make_rings(data.rate_mm_h, data.seed, camera.timestamp_ns)
+            film = Film(data.wetness, own.prepared.find_puddle_threshold(data.puddles), rings)
             rgb = shade_wet(
                 rgb, camera, depth, share, own.prepared, film, mirror, backend=own.backend
             )
         return replace(drawn, rgb=rgb)
 
-    def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
-        wet_echoes(echoes, own.prepared, own.data.wetness, own.data.puddles)
+    def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
+        dim_wet_echoes(echoes, own.prepared, own.data.wetness, own.data.puddles)
 
 
-def _find_plane(wet_effect: Active, camera: Camera) -> Plane | None:
+def _find_plane(wet_effect: EffectInScene, camera: Camera) -> Plane | None:
     """Return the plane of the ground in view, remembered with the camera."""
     return memo_of(camera).get(
         ("wet plane", wet_effect.prepared), lambda: plane_in_view(camera, wet_effect.prepared)
@@ -214,7 +216,11 @@ def _mirror_camera(camera: Camera, plane: Plane, rows: tuple[int, int]) -> Camer
 
 
 def _render_mirror(
-    wet_effect: Active, layers: LayerRenderer, camera: Camera, plane: Plane, rows: tuple[int, int]
+    wet_effect: EffectInScene,
+    layers: LayerRenderer,
+    camera: Camera,
+    plane: Plane,
+    rows: tuple[int, int],
 ) -> Mirror:
     """Render the mirrored view."""
     view = _mirror_camera(camera, plane, rows).scaled(1 / wet_effect.data.mirror_px)
@@ -243,7 +249,7 @@ def _render_mirror(
 
 
 def _darken_photo(
-    wet_effect: Active, view: Drawn, camera: Camera, share: Float[Tensor, "H W"]
+    wet_effect: EffectInScene, view: RenderedView, camera: Camera, share: Float[Tensor, "H W"]
 ) -> Float[Tensor, "H W 3"]:
     """Darken the ground of a recorded picture as its splats are darkened.
 
@@ -265,15 +271,15 @@ def _darken_photo(
         clear_rgb = (rgb - (1 - transmittance)[..., None] * airlight) / transmittance.clamp_min(
             MIN_PHOTO_TRANSMITTANCE
         )[..., None]
-    white = white_level(light_of(wet_effect.light))
+    white = white_level(find_scene_light(wet_effect.light))
     ratio = wet_ratio(clear_rgb.clamp_min(0), white, wet_effect.data.wetness * share)
     return rgb + transmittance[..., None] * clear_rgb * (ratio - 1)
 
 
-def _darken_part(gaussians: Gaussians, splats: WetSplats, wet_effect: Active) -> Gaussians:
+def _darken_part(gaussians: Gaussians, splats: WetSplats, wet_effect: EffectInScene) -> Gaussians:
     """Return a part's Gaussians, darkened by water; remembered with them."""
     wetness = wet_effect.data.wetness
-    white = white_level(light_of(wet_effect.light))
+    white = white_level(find_scene_light(wet_effect.light))
     return memo_of(gaussians).get(
         ("wetted", wetness, white, splats),
         lambda: darken_gaussians(gaussians, wetness * splats.wet, white),

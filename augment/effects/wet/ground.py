@@ -18,11 +18,11 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from augment.effects.snow.cells import SnowCells
+from augment.effects.snow.cells import ExposedCells
 from augment.effects.snow.layer import draw_octaves, sum_octaves
-from augment.effects.snow.placement import PlacementSettings
-from augment.effects.snow.support import support_of
-from augment.effects.wet.kernels import CHANNELS, HEIGHT, OPEN
+from augment.effects.snow.placement import ExposureSettings
+from augment.effects.snow.support import exposed_surface_of
+from augment.effects.wet.kernels import HEIGHT, NUM_CHANNELS, OPEN
 from augment.geometry import rotmat_from_quat
 from augment.memo import memo_of
 from augment.rng import rng_for
@@ -30,7 +30,7 @@ from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 
 # Settings of the cells. They equal those of snow by default, so that both share one search.
-PLACEMENT_SETTINGS = PlacementSettings()
+PLACEMENT_SETTINGS = ExposureSettings()
 CELL_M = 0.2  # side of the map's cells; the ground's water is less finely patched
 
 # Share of a wet surface that a film of water covers: asphalt and concrete hold a film, soil and
@@ -86,7 +86,7 @@ class WetGround:
     # How open that surface is to the rain, 0 to 1.
     exposed: Float[Tensor, "Y X"]
     # Values of HOLLOW on open ground, in rising order.
-    ordered_hollows: np.ndarray
+    sorted_puddle_order: np.ndarray
 
     @property
     def is_empty(self) -> bool:
@@ -110,7 +110,7 @@ class WetGround:
         v = (y - j)[..., None].float()
         i1 = (i + 1).clamp_max(columns - 1)
         j1 = (j + 1).clamp_max(rows - 1)
-        flat = self.channels.reshape(-1, CHANNELS)
+        flat = self.channels.reshape(-1, NUM_CHANNELS)
         below = flat[j * columns + i] * (1 - u) + flat[j * columns + i1] * u
         above = flat[j1 * columns + i] * (1 - u) + flat[j1 * columns + i1] * u
         values = below * (1 - v) + above * v
@@ -127,9 +127,9 @@ class WetGround:
         values[..., OPEN] *= is_inside
         return values
 
-    def puddle_level(self, share: float) -> float:
+    def find_puddle_threshold(self, share: float) -> float:
         """Return the HOLLOW above which water stands if `share` of the open ground has puddles."""
-        ordered = self.ordered_hollows
+        ordered = self.sorted_puddle_order
         if share <= 0 or not len(ordered):
             return NO_PUDDLES
         return float(ordered[min(int((1 - share) * len(ordered)), len(ordered) - 1)])
@@ -141,7 +141,7 @@ def wet_ground(scene: Scene, seed: int, *, backend: str = "auto") -> WetGround:
     Raises:
         SceneError: metres or gravity are not known.
     """
-    cells = support_of(scene, PLACEMENT_SETTINGS, backend=backend).ground
+    cells = exposed_surface_of(scene, PLACEMENT_SETTINGS, backend=backend).ground
     key = ("wet ground", seed)
     places = [frame.world_from_ego[:3, 3].numpy() for frame in scene.frames]
     places += [camera.centre.numpy() for f in scene.frames for camera in f.cameras.values()]
@@ -150,13 +150,13 @@ def wet_ground(scene: Scene, seed: int, *, backend: str = "auto") -> WetGround:
     )
 
 
-def _make_ground(cells: SnowCells, path: np.ndarray, seed: int) -> WetGround:
+def _make_ground(cells: ExposedCells, path: np.ndarray, seed: int) -> WetGround:
     """Make the map from the scene's cells."""
     classes = cells.semantic.numpy()
     is_kept = classes != SemanticClass.VEGETATION
     if not is_kept.any():
         empty_map = torch.zeros(2, 2)
-        channels = torch.zeros(2, 2, CHANNELS)
+        channels = torch.zeros(2, 2, NUM_CHANNELS)
         return WetGround(0.0, 0.0, channels, empty_map / 0, empty_map, np.zeros(0, np.float32))
     centres = cells.centers_m.double().numpy()[is_kept]
     sizes = cells.sizes_m.double().numpy()[is_kept]

@@ -19,7 +19,7 @@ from augment.render.layout import LANES, U
 from augment.rng import STEP_X, STEP_Y
 
 # Channels of the ground's map, see ground.WetGround; CHANNELS is their number.
-HEIGHT, OPEN, SLOPE_X, SLOPE_Y, HOLLOW, WHEEL_TRACK, CHANNELS = range(7)
+HEIGHT, OPEN, SLOPE_X, SLOPE_Y, PUDDLE_ORDER, WHEEL_TRACK, NUM_CHANNELS = range(7)
 
 # ---- Rings of drops ------------------------------------------------------------------------------
 
@@ -163,8 +163,8 @@ def _any(mask):
 @inner()
 def _store_texels(texels, spare, u, v, i, j):
     """Store texels of float coordinates (column, row), and shares of the way to the next texels."""
-    v8.store_whole(texels, U(0), i)
-    v8.store_whole(texels, U(LANES), j)
+    v8.store_integers(texels, U(0), i)
+    v8.store_integers(texels, U(LANES), j)
     v8.store(spare, U(0), u - i)
     v8.store(spare, U(LANES), v - j)
 
@@ -243,8 +243,8 @@ def _interpolate_channels(cells, columns, channel, count, texels, spare):
 
     The results go to spare[RESULTS_START + k LANES + lane].
     """
-    step = U(CHANNELS)
-    down = U(columns * CHANNELS)
+    step = U(NUM_CHANNELS)
+    down = U(columns * NUM_CHANNELS)
     for lane in range(U(LANES)):
         start = U(texels[lane + U(LANES)]) * down + U(texels[lane]) * step + U(channel)
         u = spare[lane]
@@ -511,8 +511,8 @@ def _distance_at(mirror, depth, column, row, px, py, pz, texels, spare):
     width = U(mirror.width)
     i = v8.floor(_clamp(column, 0, mirror.width - 1))
     j = v8.floor(_clamp(row, 0, mirror.rows - 1))
-    v8.store_whole(texels, U(0), i)
-    v8.store_whole(texels, U(LANES), j)
+    v8.store_integers(texels, U(0), i)
+    v8.store_integers(texels, U(LANES), j)
     for lane in range(U(LANES)):
         spare[lane] = depth[U(texels[lane + U(LANES)]) * width + U(texels[lane])]
     z = v8.load(spare, U(0))

@@ -31,8 +31,8 @@ from augment.effects.wet.kernels import (
     ASPHALT_ROUGHNESS,
     FILM_SHARE,
     HEIGHT,
-    HOLLOW,
     OPEN,
+    PUDDLE_ORDER,
     PUDDLE_ROUGHNESS,
     SLOPE_X,
     SLOPE_Y,
@@ -60,7 +60,7 @@ def mean_transmission(slope: float) -> np.ndarray:
     return (weights * transmission).sum(1) / weights.sum(1)
 
 
-def film_gain(cosine: np.ndarray, reflectance: np.ndarray, puddle: np.ndarray) -> np.ndarray:
+def wet_echo_ratio(cosine: np.ndarray, reflectance: np.ndarray, puddle: np.ndarray) -> np.ndarray:
     """Return the echo of wet ground over that of dry ground, [N].
 
     Args:
@@ -84,7 +84,7 @@ def film_gain(cosine: np.ndarray, reflectance: np.ndarray, puddle: np.ndarray) -
     ) / film_factor
 
 
-def wet_echoes(echoes: Echoes, ground: WetGround, wetness: float, puddles: float) -> None:
+def dim_wet_echoes(echoes: Echoes, ground: WetGround, wetness: float, puddles: float) -> None:
     """Dim the echoes of wet ground; echoes of other weather's surfaces stay as they are."""
     is_dry_surface = (echoes.codes == UNCHANGED) | (echoes.codes == ATTENUATED)
     rows = np.flatnonzero(is_dry_surface & (echoes.ranges_m > 0))
@@ -96,6 +96,8 @@ def wet_echoes(echoes: Echoes, ground: WetGround, wetness: float, puddles: float
     slope = channels[:, [SLOPE_X, SLOPE_Y]]
     cosine = (slope * directions[:, :2]).sum(1) - directions[:, 2]
     cosine = np.clip(cosine / np.sqrt(1 + (slope**2).sum(1)), 0.0, 1.0)
-    is_puddle = (channels[:, HOLLOW] > ground.puddle_level(puddles)).astype(np.float64)
-    gain = film_gain(cosine, echoes.reflectance[rows], is_puddle)
+    is_puddle = (channels[:, PUDDLE_ORDER] > ground.find_puddle_threshold(puddles)).astype(
+        np.float64
+    )
+    gain = wet_echo_ratio(cosine, echoes.reflectance[rows], is_puddle)
     echoes.gain[rows] *= 1 + local_wetness * (gain - 1)

@@ -48,7 +48,6 @@ from augment.effects.wet.kernels import (
     GROUND_TOLERANCE_M,
     GROUND_TOLERANCE_PER_M,
     HEIGHT,
-    HOLLOW,
     MAX_GROUND_OFFSET_M,
     MAX_GROUND_OFFSET_PER_M,
     MIN_BLUR_PX,
@@ -57,6 +56,7 @@ from augment.effects.wet.kernels import (
     MOTTLE_SIDE,
     NUM_LEVELS,
     OPEN,
+    PUDDLE_ORDER,
     PUDDLE_RIM,
     PUDDLE_ROUGHNESS,
     R0,
@@ -68,7 +68,7 @@ from augment.effects.wet.kernels import (
 )
 from augment.effects.wet.ripples import Rings, ring_arrays, ring_slopes
 from augment.geometry import rigid
-from augment.render.buffers import AUTO, CPU, kernels_for
+from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.layout import ABOVE, LANES, HeightClip
 from augment.render.threads import kernel_threads
 
@@ -183,7 +183,7 @@ def blur_upright(
 
     backend: on the CPU OpenCV blurs, equal to the definition within float rounding.
     """
-    if kernels_for(backend, rgb) == CPU and rgb.numel() >= LANES:
+    if choose_kernels(backend, rgb) == CPU and rgb.numel() >= LANES:
         linear = np.empty(tuple(rgb.shape), np.float32)
         with kernel_threads():
             kernels.decode_srgb(_flat_array(rgb), linear.reshape(-1))
@@ -307,7 +307,7 @@ def find_ground(
     Returns:
         The shares [H, W]; the first row with open ground, and one past the last.
     """
-    if kernels_for(backend, depth, visible_share) == CPU and camera.width >= LANES:
+    if choose_kernels(backend, depth, visible_share) == CPU and camera.width >= LANES:
         share = np.empty(tuple(depth.shape), np.float32)
         row_max = np.empty(len(share), np.float32)
         flat_share = share.reshape(-1)
@@ -377,7 +377,7 @@ def shade_wet(
         backend: the CPU's kernel equals the definition within float rounding.
     """
     is_wide_enough = camera.width >= LANES and mirror.camera.width >= 2
-    if kernels_for(backend, rgb, depth, share) == CPU and rgb.is_contiguous() and is_wide_enough:
+    if choose_kernels(backend, rgb, depth, share) == CPU and rgb.is_contiguous() and is_wide_enough:
         with kernel_threads(ROWS_PER_TASK):
             kernels.shade_wet(
                 *_map_view(camera, ground),
@@ -393,7 +393,7 @@ def shade_wet(
     puddle = film.wetness * _smoothstep(
         film.puddle_threshold - PUDDLE_RIM,
         film.puddle_threshold + PUDDLE_RIM,
-        channels[..., HOLLOW],
+        channels[..., PUDDLE_ORDER],
     )
     to_eye = -points / distance.clamp_min(1e-6)[..., None]
     footprint = distance / camera.fy / to_eye[..., 2].clamp_min(MIN_FOOTPRINT_SINE)

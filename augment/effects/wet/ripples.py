@@ -1,6 +1,6 @@
 """Draws the rings of drops on standing water: the torch definition.
 
-Callers: wet ground (`ring_slopes`) and floods (`with_rings`). The plane is cut into squares. In
+Callers: wet ground (`ring_slopes`) and floods (`add_ring_waves`). The plane is cut into squares. In
 each square, a few drops at a time meet the water; a hash of the square, the drop's number and the
 number of its falls says which drops fall and where. So the rings at a moment are a pure function of
 seed, place and time. A ring of capillary waves runs at their least speed and fades. Its slope at a
@@ -40,7 +40,7 @@ from augment.effects.wet.kernels import (
     SPEED_MPS,
     SQUARE_M,
 )
-from augment.render.buffers import AUTO, CPU, kernels_for
+from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.threads import kernel_threads
 from augment.rng import MIX_A, MIX_B, STEP_X, STEP_Y
 
@@ -83,7 +83,7 @@ def drops_per_m2_s(rate_mm_h: float, min_diameter_mm: float = 1.0) -> float:
     )
 
 
-def rings_of(rate_mm_h: float, seed: int, timestamp_ns: int) -> Rings:
+def make_rings(rate_mm_h: float, seed: int, timestamp_ns: int) -> Rings:
     """Return the rings of rain at a moment."""
     rings_per_m2 = drops_per_m2_s(rate_mm_h) * _LIFE_S  # rings per m2
     max_rings_per_m2 = MAX_DROPS / SQUARE_M**2
@@ -179,7 +179,7 @@ def _signed(number: int) -> int:
 ROWS_PER_TASK = 8  # number of image rows that a thread takes at a time
 
 
-def with_rings(
+def add_ring_waves(
     field: WaveField, camera: Camera, level_z_m: float, rings: Rings, *, backend: str = AUTO
 ) -> WaveField:
     """Return the surface of a level plane with drops' rings on its waves.
@@ -190,7 +190,7 @@ def with_rings(
     height = float(camera.centre[2]) - level_z_m
     if rings.variance == 0 or height <= 0:
         return field
-    if kernels_for(backend, field.normal_x) == CPU:
+    if choose_kernels(backend, field.normal_x) == CPU:
         x, y, variance = (
             tensor.clone() for tensor in (field.normal_x, field.normal_y, field.slope_variance)
         )

@@ -105,7 +105,7 @@ class Tape:
         inputs = self.inputs
         slots = inputs.slots
         blocks = len(inputs.blocks)
-        rows = scratch.array("grads", (slots, backward_kernels.GRAD), np.float32)
+        rows = scratch.array("grads", (slots, backward_kernels.NUM_GRADIENTS), np.float32)
         ids = scratch.array("grad_ids", (slots,), np.int32)
         counts = scratch.array("grad_counts", (blocks,), np.int64)
         images = (self.rgb, self.alpha, depth, d_rgb, d_alpha, d_depth)
@@ -118,7 +118,7 @@ class Tape:
             timer.end_stage("project backward")
         return SplatGradients(rows, ids, counts, inputs.blocks)
 
-    def splat_effects(
+    def sum_splat_effects(
         self, d_rgb: np.ndarray, d_alpha: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return numbers, summed weights and summed effects on alpha of the frame's splats.

@@ -332,16 +332,16 @@ def sum_shares(tile_splat_ids, tile_offsets, num_reached, shares, ranges, sums, 
 
 # A row of gradients, one cache line: by mean (3, metres, in the part's axes), unit quaternion (4,
 # tangential), logarithms of scales (3) and opacity, colour before its clamp at 0 (3). The row also
-# holds two numbers for densification: G_ABS, the sum of |dL/d mean| over pixels (1/px), and
-# G_RADIUS, the largest sigma, px.
-GRAD = 16
+# holds two numbers for densification: G_ABS_MEAN, the sum of |dL/d mean| over pixels (1/px), and
+# G_MAX_SIGMA, the largest sigma, px.
+NUM_GRADIENTS = 16
 G_MEAN = 0
 G_QUAT = 3
-G_ABS = 7
+G_ABS_MEAN = 7
 G_SCALE = 8
 G_OPACITY = 11
 G_COLOR = 12
-G_RADIUS = 15
+G_MAX_SIGMA = 15
 
 _INVERSE_LN2 = np.float32(1 / math.log(2))
 _SLOPES = 16  # rows of eight: gradients of the SH functions, weighted
@@ -368,7 +368,7 @@ def project_backward(inputs, splats, is_touched, sums, grads, ids, counts):
         addresses = inputs.addresses
         slots = np.empty(BLOCK + LANES, np.int32)
         gaussian_ids = np.empty(BLOCK + LANES, np.int32)
-        rows = np.empty((_SLOPES + GRAD) * LANES, np.float32)
+        rows = np.empty((_SLOPES + NUM_GRADIENTS) * LANES, np.float32)
         base = block * BLOCK
         num_touched = U(0)
         # Touched splats of the block, filled up to a whole group of eight.
@@ -391,7 +391,7 @@ def project_backward(inputs, splats, is_touched, sums, grads, ids, counts):
         quats = floats_at(addresses[part, L.A_QUATS], count * 4)
         scales = floats_at(addresses[part, L.A_SCALES], count * 3)
         sh = floats_at(addresses[part, L.A_SH], count * functions * 3)
-        num_functions = min(modes[L.M_FUNCTIONS], functions)
+        num_functions = min(modes[L.M_NUM_SH_FUNCTIONS], functions)
         # Gradients of eight Gaussians, then their rows.
         for group in range(U(0), num_touched, U(LANES)):
             _color_backward(
@@ -411,8 +411,8 @@ def project_backward(inputs, splats, is_touched, sums, grads, ids, counts):
                 means, quats, scales, view, slots, gaussian_ids, group, modes, records, sums, rows
             )
             for lane in range(min(U(LANES), num_touched - group)):
-                row = (U(base) + group + lane) * U(GRAD)
-                for field in range(U(GRAD)):
+                row = (U(base) + group + lane) * U(NUM_GRADIENTS)
+                for field in range(U(NUM_GRADIENTS)):
                     grads[row + field] = rows[(U(_SLOPES) + field) * U(LANES) + lane]
 
 
@@ -519,8 +519,8 @@ def _geometry_backward(
     g_py = two * (fall * _share(sums, slots, group, S_Y) - sharp_x * lean_x * sum_x)
     abs_x = two * sharp_x * _share(sums, slots, group, S_ABS_X)
     abs_y = two * _share(sums, slots, group, S_ABS_Y)
-    _write(rows, G_ABS, v8.sqrt(v8.fmuladd(abs_x, abs_x, abs_y * abs_y)))
-    _write(rows, G_RADIUS, v8.sqrt(v8.maximum(cxx, cyy)))
+    _write(rows, G_ABS_MEAN, v8.sqrt(v8.fmuladd(abs_x, abs_x, abs_y * abs_y)))
+    _write(rows, G_MAX_SIGMA, v8.sqrt(v8.maximum(cxx, cyy)))
     _write(rows, G_OPACITY, v8.splat(_INVERSE_LN2) * sum_0)
 
     # Semi-axes: xx = sum x_j^2, xy = sum x_j y_j, yy = sum y_j^2.

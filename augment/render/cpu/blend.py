@@ -230,8 +230,8 @@ def add_sample(state, at, depth, weight, floor):
 
     state, at: a tile's state, and the position of the pixels in the plane FIRST.
     """
-    zeros = v8.splat_as(depth, np.float32(0))
-    minus_ones = v8.splat_as(depth, np.float32(-1))
+    zeros = v8.broadcast_as(depth, np.float32(0))
+    minus_ones = v8.broadcast_as(depth, np.float32(-1))
     first_depth = v8.load_as(depth, state, at + FIRST)
     mass = v8.load_as(depth, state, at + MASS)
     moment = v8.load_as(depth, state, at + MOMENT)
@@ -240,15 +240,17 @@ def add_sample(state, at, depth, weight, floor):
     mass_offset = v8.fmuladd(depth_offset, mass, v8.negate(moment))  # mass (z - mean)
     spread = _spread(mass, moment, square)
     is_farther = v8.at_least(mass_offset, zeros)
-    reach = v8.select(is_farther, v8.splat_as(depth, _FARTHER), v8.splat_as(depth, _NEARER))
-    reach_2 = v8.select(is_farther, v8.splat_as(depth, _FARTHER_2), v8.splat_as(depth, _NEARER_2))
-    floor_margin = v8.splat_as(depth, floor) * reach * mass - v8.absolute(mass_offset)
+    reach = v8.select(is_farther, v8.broadcast_as(depth, _FARTHER), v8.broadcast_as(depth, _NEARER))
+    reach_2 = v8.select(
+        is_farther, v8.broadcast_as(depth, _FARTHER_2), v8.broadcast_as(depth, _NEARER_2)
+    )
+    floor_margin = v8.broadcast_as(depth, floor) * reach * mass - v8.absolute(mass_offset)
     spread_margin = v8.fmuladd(reach_2, spread, v8.negate(mass_offset * mass_offset))
     has_joined = v8.greater(v8.maximum(floor_margin, spread_margin), zeros)
     new_cluster_sign = v8.select(
         has_joined, minus_ones, v8.select(v8.greater(weight, zeros), zeros, minus_ones)
     )
-    if v8.any_not_negative(new_cluster_sign):
+    if v8.has_nonnegative_lane(new_cluster_sign):
         is_new = v8.at_least(new_cluster_sign, zeros)
         best = v8.load_as(depth, state, at + HEAVIEST)
         is_heavier = v8.both(is_new, v8.greater(mass, best))
@@ -277,12 +279,12 @@ def can_grow(state, at, transmittance):
 
     transmittance: transmittance of the pixels, negative where blending has stopped.
     """
-    minus_ones = v8.splat_as(transmittance, np.float32(-1))
+    minus_ones = v8.broadcast_as(transmittance, np.float32(-1))
     mass = v8.load_as(transmittance, state, at + MASS)
     best = v8.load_as(transmittance, state, at + HEAVIEST)
-    possible_gain = mass + transmittance + v8.splat_as(transmittance, _SLACK) - best
+    possible_gain = mass + transmittance + v8.broadcast_as(transmittance, _SLACK) - best
     return v8.select(
-        v8.greater(transmittance, v8.splat_as(transmittance, np.float32(0))),
+        v8.greater(transmittance, v8.broadcast_as(transmittance, np.float32(0))),
         possible_gain,
         minus_ones,
     )
@@ -306,13 +308,13 @@ def close_clusters(state, start):
 def _spread(mass, moment, square):
     """Return mass^2 times the variance."""
     spread = v8.fmuladd(mass, square, v8.negate(moment * moment))
-    return v8.maximum(spread, v8.splat_as(spread, np.float32(0)))
+    return v8.maximum(spread, v8.broadcast_as(spread, np.float32(0)))
 
 
 @inner()
 def _mode(first, mass, moment, spread):
     """Return the mode of a cluster."""
-    return first + (moment - v8.splat_as(first, _MODE_SHIFT) * v8.sqrt(spread)) / mass
+    return first + (moment - v8.broadcast_as(first, _MODE_SHIFT) * v8.sqrt(spread)) / mass
 
 
 # Tiles that a thread takes at a time.
@@ -580,8 +582,8 @@ def _can_change(state, strip, rows, buffer_bits, columns):
     It finds none once its transmittance has fallen below one half and the best weight so far. Most
     pixels reach that early; the remaining list then costs them no more than colour does.
     """
-    possible_gain = v8.splat_as(columns, np.float32(-1))
-    half = v8.splat_as(columns, np.float32(0.5))
+    possible_gain = v8.broadcast_as(columns, np.float32(-1))
+    half = v8.broadcast_as(columns, np.float32(0.5))
     for row in range(rows[2 * strip] // ROWS * ROWS, rows[2 * strip + 1], ROWS):
         at = U(strip * STRIP + row * LANES)
         transmittance = v8.load_as(columns, state, at)
@@ -593,7 +595,7 @@ def _can_change(state, strip, rows, buffer_bits, columns):
             )
         if buffer_bits & MODES:
             possible_gain = v8.maximum(possible_gain, can_grow(state, at + P_MODE, transmittance))
-    return v8.any_not_negative(possible_gain)
+    return v8.has_nonnegative_lane(possible_gain)
 
 
 @inner()
@@ -625,12 +627,12 @@ def _is_open(state, strip, row, columns):
     first = U(row) - U(row) % rows_per_item
     transmittance = v8.load_as(columns, state, U(strip * STRIP) + first * U(LANES))
     if rows_per_item == U(1):
-        return v8.any_not_negative(transmittance)
+        return v8.has_nonnegative_lane(transmittance)
     row_numbers = v8.row_numbers(columns)
-    is_row = v8.splat_as(columns, np.float32(U(row) - first))
+    is_row = v8.broadcast_as(columns, np.float32(U(row) - first))
     is_row = v8.both(v8.at_least(row_numbers, is_row), v8.at_least(is_row, row_numbers))
-    return v8.any_not_negative(
-        v8.select(is_row, transmittance, v8.splat_as(columns, np.float32(-1)))
+    return v8.has_nonnegative_lane(
+        v8.select(is_row, transmittance, v8.broadcast_as(columns, np.float32(-1)))
     )
 
 
@@ -643,11 +645,11 @@ def _blend_items(work, items, columns, limits, buffer_bits):
     places = work.places
     lines = work.lines
     staged_lights = work.staged_lights
-    alpha_max = v8.splat_as(columns, limits[0])
-    log_cut = v8.splat_as(columns, limits[1])
-    min_transmittance = v8.splat_as(columns, limits[2])
-    stop = v8.splat_as(columns, limits[7])
-    zeros = v8.splat_as(columns, np.float32(0))
+    alpha_max = v8.broadcast_as(columns, limits[0])
+    log_cut = v8.broadcast_as(columns, limits[1])
+    min_transmittance = v8.broadcast_as(columns, limits[2])
+    stop = v8.broadcast_as(columns, limits[7])
+    zeros = v8.broadcast_as(columns, np.float32(0))
     n = U(BATCH)
     ends_early = limits[7] > limits[2]
     places[items] = 0  # one item is read beyond the last
@@ -695,7 +697,7 @@ def _blend_items(work, items, columns, limits, buffer_bits):
                 _add(state, at + P_OVERLAY, weight, staged[U(L.IS_OVERLAY) * n + splat])
             if buffer_bits & SURFACES:
                 centre = staged[U(L.DEPTH) * n + splat]
-                depth = v8.splat_as(columns, centre)
+                depth = v8.broadcast_as(columns, centre)
                 if buffer_bits & CLIP:
                     depth = surface_depth(
                         lines, work.surfaces, splat, item, columns, centre, limits[3]
@@ -706,11 +708,11 @@ def _blend_items(work, items, columns, limits, buffer_bits):
                 if buffer_bits & MODES:
                     add_sample(state, at + P_MODE, depth, weight, limits[4])
             if buffer_bits & MEDIAN:
-                half = v8.splat_as(columns, np.float32(0.5))
+                half = v8.broadcast_as(columns, np.float32(0.5))
                 has_crossed = v8.both(
                     v8.at_least(transmittance, half), v8.greater(half, transmittance_behind)
                 )
-                depth = v8.splat_as(columns, staged[U(L.DEPTH) * n + splat])
+                depth = v8.broadcast_as(columns, staged[U(L.DEPTH) * n + splat])
                 previous = v8.load_as(columns, state, at + P_MEDIAN)
                 v8.store(
                     state,
@@ -721,7 +723,7 @@ def _blend_items(work, items, columns, limits, buffer_bits):
                 best = v8.load_as(columns, state, at + P_BEST)
                 is_heavier = v8.greater(weight, best)
                 v8.store(state, at + P_BEST, v8.select(is_heavier, weight, best))
-                number = v8.splat_as(columns, staged[U(L.SPLAT_ID) * n + splat])
+                number = v8.broadcast_as(columns, staged[U(L.SPLAT_ID) * n + splat])
                 previous = v8.load_as(columns, state, at + P_ID)
                 v8.store(state, at + P_ID, v8.select(is_heavier, number, previous))
 
@@ -729,7 +731,7 @@ def _blend_items(work, items, columns, limits, buffer_bits):
 @inner()
 def log2_alpha(staged, values, splat, item, columns):
     """Return the log2 of a splat's alpha at an item's pixels (see augment.render.layout)."""
-    sharp = v8.splat_as(columns, staged[U(L.SHARP_X) * U(BATCH) + splat])
+    sharp = v8.broadcast_as(columns, staged[U(L.SHARP_X) * U(BATCH) + splat])
     rows = U(ITEMS) // v8.rows_in(columns)
     off = v8.fmuladd(sharp, columns, v8.by_row(columns, values, item + rows))
     return v8.fmuladd(v8.negate(off), off, v8.by_row(columns, values, item))
@@ -754,7 +756,7 @@ def remaining_transmittance(transmittance, transmittance_behind, is_blended, sto
 @inner()
 def _add(state, at, weight, value):
     before = v8.load_as(weight, state, at)
-    v8.store(state, at, v8.fmuladd(weight, v8.splat_as(weight, value), before))
+    v8.store(state, at, v8.fmuladd(weight, v8.broadcast_as(weight, value), before))
 
 
 @inner()

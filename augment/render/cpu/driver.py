@@ -48,11 +48,11 @@ from augment.render.constants import (
 from augment.render.cpu import blend as blend_kernels
 from augment.render.cpu import geometry
 from augment.render.cpu import project as project_kernels
-from augment.render.cpu.order import cut_in_fog, order_of
-from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_of_arrays
+from augment.render.cpu.order import cut_in_fog, spatial_order
+from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
-from augment.render.threads import kernel_threads, thread_count, usable_cores
+from augment.render.threads import kernel_threads, num_kernel_threads, usable_cores
 from augment.scene import Gaussians, PosedGaussians
 
 # ---- Inputs of the CPU kernels: scene parts by address, and the numbers of a view ----------------
@@ -124,7 +124,7 @@ def gather_inputs(
     for number, part in enumerate(parts):
         gaussians = part.gaussians
         count = len(part.gaussians)
-        order = order_of(gaussians) if culled and part.rows is None else None
+        order = spatial_order(gaussians) if culled and part.rows is None else None
         if order is None:
             rows = np.array([[0, count]]) if part.rows is None else part.rows
             block_rows = (
@@ -159,7 +159,7 @@ def gather_inputs(
     modes = raster_modes(settings, fog, clip, with_color=with_color)
     modes[layout.M_LIGHT] = with_color and any(part.shading is not None for part in parts)
     return Inputs(
-        addresses=np.array(addresses, np.uint64).reshape(-1, layout.ADDRESSES),
+        addresses=np.array(addresses, np.uint64).reshape(-1, layout.NUM_ADDRESSES),
         sizes=np.array(sizes, np.int64).reshape(-1, 2),
         first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
         views=views_of(parts, camera, settings, fog, clip),
@@ -250,7 +250,7 @@ def borrowed_scratch() -> Iterator[Scratch]:
         _SPACES.append(scratch)
 
 
-def release_scratch() -> None:
+def free_scratch() -> None:
     """Free all work spaces; the next render allocates its own."""
     _SPACES.clear()
 
@@ -331,7 +331,7 @@ def _max_transmittance(fog: Fog, camera: Camera, distance_m: float) -> float:
     """
     eye_z_m = float(camera.centre[2])
     ray_distance = np.array([distance_m])
-    depth = float(optical_depth_of_arrays(fog, ray_distance, eye_z_m, eye_z_m + ray_distance)[0])
+    depth = float(optical_depth_numpy(fog, ray_distance, eye_z_m, eye_z_m + ray_distance)[0])
     return math.exp(-min(depth, MAX_EXPONENT))
 
 
@@ -582,7 +582,7 @@ class Tiles:
         tile_offsets = np.append(0, np.cumsum(counts))
         heads = np.where(self.status != blend_kernels.CLOSED, tile_offsets[:-1], -1)
         tile_splat_ids = self._scratch.array("tile_splat_ids", (int(tile_offsets[-1]),), np.int32)
-        bands = min(self._rows, 2 * thread_count())
+        bands = min(self._rows, 2 * num_kernel_threads())
         blend_kernels.fill_lists(
             slots, rects, first, end, self._columns, heads, tile_splat_ids, bands
         )
@@ -591,7 +591,9 @@ class Tiles:
     def _count(self, rects: np.ndarray, first: int, end: int) -> np.ndarray:
         """Return the number of the splats [first, end) in each tile, int64 [tiles]; 0 if closed."""
         shape = (self._rows + 1, self._columns + 1)
-        corners = self._scratch.array("corners", (thread_count(), shape[0] * shape[1]), np.int32)
+        corners = self._scratch.array(
+            "corners", (num_kernel_threads(), shape[0] * shape[1]), np.int32
+        )
         blend_kernels.count_corners(rects, first, end, self._columns, corners)
         totals = corners.sum(0, dtype=np.int64).reshape(shape).cumsum(0).cumsum(1)
         return np.where(self.status != blend_kernels.CLOSED, totals[:-1, :-1].reshape(-1), 0)

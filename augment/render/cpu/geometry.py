@@ -61,8 +61,8 @@ def stage(records, tile_splat_ids, at, count, corner, staged):
     """
     stride = U(BATCH)
     wide = v8.wide_columns()
-    left_edge = v8.splat_as(wide, corner[0])
-    top_edge = v8.splat_as(wide, corner[1])
+    left_edge = v8.broadcast_as(wide, corner[0])
+    top_edge = v8.broadcast_as(wide, corner[1])
     for k in range(U(0), count, U(WIDE)):
         v8.transpose_rows(wide, records, tile_splat_ids, at + k, at + count - U(1), staged, k)
         v8.store(
@@ -101,14 +101,14 @@ def find_spans(staged, count, strip, rows, log_cut, spans, starts):
     n = U(BATCH)
     wide = v8.wide_columns()
     span_bits = U(0)
-    zeros = v8.splat_as(wide, np.float32(0))
-    half = v8.splat_as(wide, np.float32(0.5))
+    zeros = v8.broadcast_as(wide, np.float32(0))
+    half = v8.broadcast_as(wide, np.float32(0.5))
     first_x = np.float32(strip * LANES) + np.float32(0.5)
-    west = v8.splat_as(wide, first_x)
-    east = v8.splat_as(wide, first_x + np.float32(LANES - 1))
-    low_row = v8.splat_as(wide, np.float32(rows[2 * strip]))
-    high_row = v8.splat_as(wide, np.float32(rows[2 * strip + 1]))
-    cut = v8.splat_as(wide, log_cut)
+    west = v8.broadcast_as(wide, first_x)
+    east = v8.broadcast_as(wide, first_x + np.float32(LANES - 1))
+    low_row = v8.broadcast_as(wide, np.float32(rows[2 * strip]))
+    high_row = v8.broadcast_as(wide, np.float32(rows[2 * strip + 1]))
+    cut = v8.broadcast_as(wide, log_cut)
     for k in range(U(0), count, U(WIDE)):
         mean_x = v8.load_as(wide, staged, U(L.MEAN_X) * n + k)
         mean_y = v8.load_as(wide, staged, U(L.MEAN_Y) * n + k)
@@ -135,8 +135,8 @@ def find_spans(staged, count, strip, rows, log_cut, spans, starts):
         first_row = v8.floor(v8.minimum(v8.maximum(first_row, low_row), high_row))
         end_row = v8.floor(v8.minimum(end_row, high_row))
         # Spans, and the numbers that list_items begins with.
-        v8.store_whole(spans, k, first_row)
-        v8.store_whole(spans, n + k, v8.maximum(end_row, first_row))
+        v8.store_integers(spans, k, first_row)
+        v8.store_integers(spans, n + k, v8.maximum(end_row, first_row))
         v8.store(starts, k, first_row + half - mean_y)
         v8.store(starts, n + k, sharp * (west - mean_x))
         v8.store(starts, U(2) * n + k, v8.negate(sharp) * lean_x)
@@ -170,11 +170,11 @@ def list_items(staged, span_bits, strip, spans, starts, columns, values, places)
         row = U(spans[k])
         end = U(spans[n + k])
         is_odd = row & (rows_per_item - U(1))
-        fall = v8.splat_as(columns, -staged[U(L.FALL_Y) * n + k])
-        peak = v8.splat_as(columns, staged[U(L.LOG_OPACITY) * n + k])
-        y = v8.splat_as(columns, starts[k])
-        start = v8.splat_as(columns, starts[n + k])
-        step = v8.splat_as(columns, starts[U(2) * n + k])
+        fall = v8.broadcast_as(columns, -staged[U(L.FALL_Y) * n + k])
+        peak = v8.broadcast_as(columns, staged[U(L.LOG_OPACITY) * n + k])
+        y = v8.broadcast_as(columns, starts[k])
+        start = v8.broadcast_as(columns, starts[n + k])
+        step = v8.broadcast_as(columns, starts[U(2) * n + k])
         first = k * U(PLACES) + (strip * U(TILE_H) + row) // rows_per_item
         for j in range(U(0), U(TILE_H), U(LANES) * rows_per_item):
             table = is_odd * U(TILE_H) + j
@@ -477,7 +477,7 @@ def stage_cuts(cuts, tile_splat_ids, at, count, staged, has_surfaces, lines):
         y = staged[U(L.MEAN_Y) * n + k]
         lx = cuts[cut + U(L.C_X)]
         ly = cuts[cut + U(L.C_Y)]
-        lines[k] = cuts[cut + U(L.C_AT)] - lx * x - ly * y
+        lines[k] = cuts[cut + U(L.C_VALUE)] - lx * x - ly * y
         lines[n + k] = lx
         lines[U(2) * n + k] = ly
         any_cut = any_cut or lx != np.float32(0) or ly != np.float32(0)
@@ -508,10 +508,10 @@ def list_lines(lines, kind, span_bits, spans, strip, columns, values):
         slope = lines[U(kind) + U(2) * n + k]
         start = lines[U(kind) + k] + lines[U(kind) + n + k] * first_x
         start = start + slope * (np.float32(row) + half)
-        slopes = v8.splat_as(columns, slope)
+        slopes = v8.broadcast_as(columns, slope)
         for j in range(U(0), U(TILE_H), U(LANES) * rows_per_item):
             table = is_odd * U(TILE_H) + j
-            first = v8.splat_as(columns, start) + slopes * v8.load_as(columns, _HALVES, table)
+            first = v8.broadcast_as(columns, start) + slopes * v8.load_as(columns, _HALVES, table)
             row_steps = v8.load_as(columns, _STEPS, table)
             v8.store(values, items * rows_per_item + j, v8.fmuladd(slopes, row_steps, first))
         items += (end - row + is_odd + rows_per_item - U(1)) // rows_per_item
@@ -520,7 +520,7 @@ def list_lines(lines, kind, span_bits, spans, strip, columns, values):
 @inner()
 def line_at(lines, kind, values, splat, item, columns):
     """Return a line's values at the pixels of an item."""
-    slope = v8.splat_as(columns, lines[U(kind) + U(BATCH) + splat])
+    slope = v8.broadcast_as(columns, lines[U(kind) + U(BATCH) + splat])
     return v8.fmuladd(slope, columns, v8.by_row(columns, values, item))
 
 
@@ -530,12 +530,12 @@ def surface_depth(lines, values, splat, item, columns, depth, parallel):
     else 0.
     """
     one_f32 = np.float32(1)
-    reach = v8.splat_as(columns, lines[U(REACHES) + splat])
+    reach = v8.broadcast_as(columns, lines[U(REACHES) + splat])
     growth = v8.minimum(line_at(lines, SURFACE, values, splat, item, columns), reach)
     growth = v8.maximum(growth, v8.negate(reach))
-    depths = v8.fmuladd(v8.splat_as(columns, parallel), growth, v8.splat_as(columns, depth))
+    depths = v8.fmuladd(v8.broadcast_as(columns, parallel), growth, v8.broadcast_as(columns, depth))
     return depths / (
-        v8.splat_as(columns, one_f32) - v8.splat_as(columns, one_f32 - parallel) * growth
+        v8.broadcast_as(columns, one_f32) - v8.broadcast_as(columns, one_f32 - parallel) * growth
     )
 
 
@@ -543,8 +543,8 @@ def surface_depth(lines, values, splat, item, columns, depth, parallel):
 def kept_share(lines, values, splat, item, columns):
     """Return the share of alpha that a cut keeps at an item's pixels."""
     value = line_at(lines, SHARE, values, splat, item, columns)
-    zeros = v8.splat_as(columns, np.float32(0))
-    ones = v8.splat_as(columns, np.float32(1))
+    zeros = v8.broadcast_as(columns, np.float32(0))
+    ones = v8.broadcast_as(columns, np.float32(1))
     return v8.maximum(v8.minimum(value, ones), zeros)
 
 
@@ -633,29 +633,29 @@ def light_share(staged_lights, staged, splat, log_alpha, place, columns, limits)
             and 1/fy^2.
     """
     n = U(BATCH)
-    zeros = v8.splat_as(columns, np.float32(0))
-    ones = v8.splat_as(columns, np.float32(1))
+    zeros = v8.broadcast_as(columns, np.float32(0))
+    ones = v8.broadcast_as(columns, np.float32(1))
     half = np.float32(0.5)
     row = place * v8.rows_in(columns)
     left = np.float32(row // U(TILE_H) * U(LANES)) + half - staged[U(L.MEAN_X) * n + splat]
-    down = v8.splat_as(columns, np.float32(row % U(TILE_H)) + half) + v8.row_numbers(columns)
-    x = columns + v8.splat_as(columns, left)
-    y = down - v8.splat_as(columns, staged[U(L.MEAN_Y) * n + splat])
+    down = v8.broadcast_as(columns, np.float32(row % U(TILE_H)) + half) + v8.row_numbers(columns)
+    x = columns + v8.broadcast_as(columns, left)
+    y = down - v8.broadcast_as(columns, staged[U(L.MEAN_Y) * n + splat])
     # The squared distance from the mean, relative to that of the alpha cut-off, follows from the
     # log of alpha.
     peak = staged[U(L.LOG_OPACITY) * n + splat]
-    span = v8.splat_as(columns, max(peak - limits[1], _TINY))
-    rim_share = (v8.splat_as(columns, peak) - log_alpha) / span
+    span = v8.broadcast_as(columns, max(peak - limits[1], _TINY))
+    rim_share = (v8.broadcast_as(columns, peak) - log_alpha) / span
     rim_share = v8.maximum(v8.minimum(rim_share, ones), zeros)
-    lean_x = v8.splat_as(columns, staged_lights[U(L_LEAN_X) * n + splat])
-    lean = lean_x * x + v8.splat_as(columns, staged_lights[U(L_LEAN_Y) * n + splat]) * y
-    distance_squared = v8.splat_as(columns, limits[6]) * y * y + v8.splat_as(columns, _TINY)
+    lean_x = v8.broadcast_as(columns, staged_lights[U(L_LEAN_X) * n + splat])
+    lean = lean_x * x + v8.broadcast_as(columns, staged_lights[U(L_LEAN_Y) * n + splat]) * y
+    distance_squared = v8.broadcast_as(columns, limits[6]) * y * y + v8.broadcast_as(columns, _TINY)
     distance_squared = v8.fmuladd(lean, lean, distance_squared)
-    distance_squared = v8.fmuladd(v8.splat_as(columns, limits[5]) * x, x, distance_squared)
-    tilt_x = v8.splat_as(columns, staged_lights[U(L_X) * n + splat])
-    tilt = tilt_x * x + v8.splat_as(columns, staged_lights[U(L_Y) * n + splat]) * y
-    wrap = v8.splat_as(columns, staged_lights[U(L_WRAP) * n + splat])
+    distance_squared = v8.fmuladd(v8.broadcast_as(columns, limits[5]) * x, x, distance_squared)
+    tilt_x = v8.broadcast_as(columns, staged_lights[U(L_X) * n + splat])
+    tilt = tilt_x * x + v8.broadcast_as(columns, staged_lights[U(L_Y) * n + splat]) * y
+    wrap = v8.broadcast_as(columns, staged_lights[U(L_WRAP) * n + splat])
     share = v8.fmuladd(v8.sqrt(rim_share / distance_squared), tilt, wrap)
-    facing = v8.splat_as(columns, staged_lights[U(L_FACING) * n + splat])
+    facing = v8.broadcast_as(columns, staged_lights[U(L_FACING) * n + splat])
     share = v8.fmuladd(v8.sqrt(ones - rim_share), facing, share)
     return v8.maximum(v8.minimum(share, ones), zeros)

@@ -165,7 +165,7 @@ COMPILE_NOTE = "compiling kernels (once; kept in %s) ..."
 event.register("numba:compile", _CompileLog())
 
 
-def seconds_compiling() -> float:
+def compile_seconds() -> float:
     """Return how many seconds this process has spent on having its kernels compiled so far."""
     return _CLOCK.seconds
 

@@ -24,16 +24,16 @@ from augment.cameras import Camera
 from augment.render import layout
 from augment.render.buffers import ALPHA, RGB
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSettings
-from augment.render.fog import Fog, optical_depth_of_arrays
+from augment.render.fog import Fog, optical_depth_numpy
 from augment.render.layout import HeightClip
 from augment.scene import Gaussians, PosedGaussians
 
 # Gaussians of a cell.
-CELL = 512
+CELL_SIZE = 512
 # Cells of a block.
-_CELLS_PER_BLOCK = layout.BLOCK // CELL
+_CELLS_PER_BLOCK = layout.BLOCK // CELL_SIZE
 # Smallest number of Gaussians for which an order is made: fewer are read as quickly as their boxes.
-_MIN_COUNT = 32 * CELL
+_MIN_COUNT = 32 * CELL_SIZE
 # Smallest share of Gaussians too faint for any view at which leaving them out pays.
 _MIN_FAINT_SHARE = 0.1
 # Bits of each coordinate along the curve.
@@ -59,7 +59,7 @@ _tensor_cache = TensorCache()
 _cache_lock = threading.RLock()  # views that are drawn at once need the same values
 
 
-def known_of(
+def cached_of_tensor(
     tensor: Tensor, name: str, make: Callable[[], Value], cache: TensorCache = _tensor_cache
 ) -> Value:
     """Return what `make` gave for the tensor under this name. It is made again after a change in
@@ -141,7 +141,7 @@ class Order(NamedTuple):
         bounds = Bounds(self.lows + halves, halves, longest, owners)
         pose = None if part.world_from_part is None else part.world_from_part.numpy()
         # No comparison with NaN holds, so a cell with NaN stays.
-        is_visible = may_be_drawn(bounds, pose, camera, settings, fog, clip)
+        is_visible = find_visible_boxes(bounds, pose, camera, settings, fog, clip)
         is_visible &= ~(self.sorted(gaussians.opacities).largest < np.float32(ALPHA_MIN))
         return _blocks_of(is_visible, len(self.ids))
 
@@ -156,12 +156,12 @@ class Order(NamedTuple):
 
     def sorted(self, tensor: Tensor) -> SortedRows:
         """Return the tensor's rows in this order."""
-        return known_of(tensor, "sorted", lambda: self._sort(tensor), self.cache)
+        return cached_of_tensor(tensor, "sorted", lambda: self._sort(tensor), self.cache)
 
     def _sort(self, tensor: Tensor) -> SortedRows:
         rows = tensor.detach().numpy()[self.ids]
         largest = rows if rows.ndim == 1 else rows.max(1)
-        starts = np.arange(0, len(rows), CELL)
+        starts = np.arange(0, len(rows), CELL_SIZE)
         return SortedRows(rows, np.maximum.reduceat(largest, starts).astype(np.float64))
 
 
@@ -176,7 +176,7 @@ class SortedRows(NamedTuple):
     largest: np.ndarray
 
 
-def order_of(gaussians: Gaussians) -> Order | None:
+def spatial_order(gaussians: Gaussians) -> Order | None:
     """Return the order of Gaussians that have been drawn before; None for others, or if no order
     pays.
 
@@ -185,7 +185,7 @@ def order_of(gaussians: Gaussians) -> Order | None:
     g = gaussians
     if len(g) < _MIN_COUNT or not all(_is_plain(t) for t in (g.means, g.quats, g.scales)):
         return None
-    mean_uses = known_of(g.means, "order", _Uses)
+    mean_uses = cached_of_tensor(g.means, "order", _Uses)
     with _cache_lock:
         mean_uses.count += 1
         if mean_uses.count > 1 and mean_uses.order is None and _is_plain(g.opacities):
@@ -197,7 +197,7 @@ def _order_of_visible(gaussians: Gaussians, mean_uses: _Uses) -> Order | None:
     """Return the order without the Gaussians that are too faint for any view, once it pays."""
     if not _is_plain(gaussians.opacities):
         return mean_uses.order
-    opacity_uses = known_of(gaussians.opacities, "order", _Uses)
+    opacity_uses = cached_of_tensor(gaussians.opacities, "order", _Uses)
     opacity_uses.count += 1
     if opacity_uses.count == 1 or mean_uses.order is None:
         return mean_uses.order
@@ -237,10 +237,10 @@ def _find_order(means: np.ndarray) -> Order:
 
 def _in_cells(ids: np.ndarray, means: np.ndarray) -> Order:
     """Return the order of ids, which are sorted within each cell, and the cells' boxes."""
-    for first in range(0, len(ids), CELL):
-        ids[first : first + CELL].sort()  # colours are read in the scene's own order
+    for first in range(0, len(ids), CELL_SIZE):
+        ids[first : first + CELL_SIZE].sort()  # colours are read in the scene's own order
     rows = means[ids]
-    starts = np.arange(0, len(ids), CELL)
+    starts = np.arange(0, len(ids), CELL_SIZE)
     bounds = (
         extremum.reduceat(rows, starts, axis=0).astype(np.float64)
         for extremum in (np.minimum, np.maximum)
@@ -271,7 +271,7 @@ def cut_in_fog(
     return replace(settings, fog_cut=0.0)
 
 
-def may_be_drawn(
+def find_visible_boxes(
     bounds: Bounds,
     pose: np.ndarray | None,
     camera: Camera,
@@ -339,7 +339,7 @@ def _min_optical_depth(
         return fog.sigma_per_m * distance
     blur = _BLUR_PX * distance / min(camera.fx, camera.fy)
     highest_z_m = _heights(bounds, pose, np.array([0.0, 0.0, 1.0]))[1] + blur
-    return optical_depth_of_arrays(fog, distance, float(camera.centre[2]), highest_z_m)
+    return optical_depth_numpy(fog, distance, float(camera.centre[2]), highest_z_m)
 
 
 def _blocks_of(is_visible: np.ndarray, count: int) -> np.ndarray:
@@ -349,4 +349,4 @@ def _blocks_of(is_visible: np.ndarray, count: int) -> np.ndarray:
     blocks = np.flatnonzero(cells.any(1))
     first = blocks * _CELLS_PER_BLOCK + cells[blocks].argmax(1)
     last = (blocks + 1) * _CELLS_PER_BLOCK - cells[blocks][:, ::-1].argmax(1)
-    return np.stack([first * CELL, np.minimum(last * CELL, count)], 1)
+    return np.stack([first * CELL_SIZE, np.minimum(last * CELL_SIZE, count)], 1)

@@ -459,7 +459,7 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
     map_rows = shorts_at(addresses[part, L.A_ROWS], count if map_count > 1 else 1)
     is_ordered = inputs.orders[part] != U(0)
     order = floats_at(inputs.orders[part], count if is_ordered else 1)
-    num_functions = min(modes[L.M_FUNCTIONS], functions)
+    num_functions = min(modes[L.M_NUM_SH_FUNCTIONS], functions)
     # Project eight Gaussians, then write those that touch an open tile one by one.
     slot = U(base)
     for group in range(U(0), U(num_picked), U(LANES)):
@@ -672,7 +672,7 @@ def _project_eight(
             quats, scales, gaussian_ids, group, d, x, y, inverse, view
         )
         is_drawn = v8.both(is_drawn, has_kept_part)
-        v8.store(rows, U((_CUTS + L.C_AT) * LANES), offset)
+        v8.store(rows, U((_CUTS + L.C_VALUE) * LANES), offset)
         v8.store(rows, U((_CUTS + L.C_X) * LANES), lx)
         v8.store(rows, U((_CUTS + L.C_Y) * LANES), ly)
         v8.store(rows, U((_CUTS + L.C_RIGHT) * LANES), gx)

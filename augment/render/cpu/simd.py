@@ -175,7 +175,7 @@ def store(typingctx, array, index, value):
 
 
 @intrinsic
-def store_whole(typingctx, array, index, value):
+def store_integers(typingctx, array, index, value):
     """Store array[index : index + lanes] = value without its fraction, for an int32 array."""
 
     def codegen(context, builder, sig, args):
@@ -327,7 +327,7 @@ _comparison = _operation(_Masks, _Floats, _Floats)
 
 # The same number in all lanes, of eight or of the vector's; 0, 1, ... 7; a b + c, rounded once.
 splat = _operation(float8, types.float32)(lambda b, value: _broadcast(b, value, LANES))
-splat_as = _operation(_Floats, _Floats, types.float32)(
+broadcast_as = _operation(_Floats, _Floats, types.float32)(
     lambda b, vector, value: _broadcast(b, value, vector.type.count)
 )
 lane_numbers = _operation(float8)(
@@ -505,7 +505,7 @@ def store_colours(typingctx, array, index, red, green, blue):
 
 
 @_operation(types.boolean, _Floats)
-def any_not_negative(builder, value):
+def has_nonnegative_lane(builder, value):
     """Return True if the sign bit of any lane is clear."""
     all_bits = ir.IntType(value.type.count)
     clear = builder.icmp_signed(">=", _bits(builder, value), _like(value, 0))

@@ -23,8 +23,8 @@ from augment.render.cuda import blend_kernels as kernels
 from augment.render.cuda.driver import blend, limits_of, list_tiles, project
 from augment.render.cuda.runtime import launch, resident
 from augment.render.cuda.splats import CudaSplats, CudaTiles, gather_inputs
-from augment.render.gsplat_backend import draw_with_gsplat, tracked_geometry
-from augment.render.layout import M_FUNCTIONS, VIEW
+from augment.render.gsplat_backend import render_with_gsplat, tracked_geometry
+from augment.render.layout import M_NUM_SH_FUNCTIONS, VIEW
 from augment.scene import PosedGaussians
 
 # ---- Gradients of colours on the GPU: the transposed blend, then the spherical harmonics ---------
@@ -144,7 +144,7 @@ def rasterize_with_gradients(
         BackendUnavailable: geometry requires gradients, and gsplat is not installed.
     """
     if tracked_geometry(parts):
-        gsplat_images = draw_with_gsplat(
+        gsplat_images = render_with_gsplat(
             parts, camera, settings, with_depth=EXPECTED_DEPTH in buffers
         )
         return RenderOutput(**{name: getattr(gsplat_images, name) for name in buffers})
@@ -180,7 +180,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.splats = splats
         ctx.tiles = tiles
         ctx.views = inputs.views.reshape(-1, VIEW)
-        ctx.max_functions = int(inputs.modes[M_FUNCTIONS])
+        ctx.max_functions = int(inputs.modes[M_NUM_SH_FUNCTIONS])
         ctx.sh_layouts = [(sh.device, sh.shape[1]) for sh in shs]
         # Kept by autograd, so that a change in place before backward is noticed.
         ctx.save_for_backward(*[resident(part.gaussians.means) for part in parts])

@@ -30,8 +30,8 @@ from augment.render.cuda.splats import (
     TILE,
     CudaInputs,
     CudaSplats,
+    CudaStageTimer,
     CudaTiles,
-    GpuStageTimer,
     gather_inputs,
 )
 from augment.render.fog import Fog
@@ -69,7 +69,7 @@ def project(inputs: CudaInputs) -> CudaSplats:
         inputs.block_parts,
         (splats.records, splats.keys, splats.rects, splats.counts, splats.cuts, splats.lights),
         COLOR=modes[layout.M_COLOR],
-        FUNCTIONS=modes[layout.M_FUNCTIONS],
+        FUNCTIONS=modes[layout.M_NUM_SH_FUNCTIONS],
         ANTIALIASED=modes[layout.M_ANTIALIASED],
         FOG=modes[layout.M_FOG],
         BLOCK=BLOCK,
@@ -187,7 +187,7 @@ assert (layout.MEAN_X, layout.MEAN_Y, layout.LEAN_X, layout.SHARP_X) == (0, 1, 2
 assert (layout.FALL_Y, layout.LOG_OPACITY, layout.LEAN_Y) == (4, 5, 8)
 assert (layout.DEPTH, layout.SPLAT_ID) == (10, 11)
 assert (layout.RED, layout.GREEN, layout.BLUE, layout.IS_OVERLAY) == (12, 13, 14, 15)
-assert (layout.C_AT, layout.C_X, layout.C_Y, layout.C_RIGHT) == (0, 1, 2, 3)
+assert (layout.C_VALUE, layout.C_X, layout.C_Y, layout.C_RIGHT) == (0, 1, 2, 3)
 assert (layout.C_DOWN, layout.C_REACH) == (4, 5)
 
 
@@ -242,7 +242,7 @@ def rasterize_cuda(
     clip: HeightClip | None = None,
     pixel_mask: torch.Tensor | None = None,
     *,
-    timer: GpuStageTimer | None = None,
+    timer: CudaStageTimer | None = None,
 ) -> RenderOutput:
     """Return the image of the parts in float32, on the GPU, without gradients.
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from augment.errors import BackendUnavailable
 
 
-def check_can_run() -> None:
+def require_gpu() -> None:
     """Check that Triton's kernels can run here.
 
     Raises:

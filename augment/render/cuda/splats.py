@@ -28,7 +28,7 @@ BLOCK = 128
 
 # A part's row in the table: ADDRESSES (see layout), its Gaussians, the SH functions of each, and
 # how many Gaussians and how many programs the parts before it take.
-T_COUNT, T_FUNCTIONS, T_FIRST, T_BLOCK = range(layout.ADDRESSES, layout.ADDRESSES + 4)
+T_COUNT, T_FUNCTIONS, T_FIRST, T_BLOCK = range(layout.NUM_ADDRESSES, layout.NUM_ADDRESSES + 4)
 COLUMNS = T_BLOCK + 1
 
 
@@ -202,7 +202,7 @@ class CudaTiles:
     rows: int
 
 
-class GpuStageTimer:
+class CudaStageTimer:
     """Times of a frame's stages on the GPU, by events, so that nothing waits until they are read.
 
     If kernels are interpreted there is no GPU to time, and all times are 0.
