@@ -272,7 +272,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 from augment.render.cpu.driver import rasterize_cpu
 from augment.render.constants import RasterSettings
-from augment.render.threads import limit_threads, thread_count
+from augment.render.threads import limit_threads, num_kernel_threads
 from augment.scene import PosedGaussians
 from tests.scenes import camera_ahead, random_gaussians
 
@@ -286,7 +286,7 @@ class Frames(Dataset):
     def __len__(self):
         return 6
     def __getitem__(self, index):
-        return render(index), thread_count()
+        return render(index), num_kernel_threads()
 
 if __name__ == "__main__":
     limit_threads(2)
@@ -407,7 +407,7 @@ from augment.render import threads
 try:
     print(threads.select_thread_pool(), end=" ")
     with threads.kernel_threads():
-        print(threads.thread_count() > 0)
+        print(threads.num_kernel_threads() > 0)
 except BackendUnavailable as error:
     print(error)
 """
