@@ -120,7 +120,7 @@ _NAME_KEYS = ("files",)  # name files in the scene's folder, not beside the job
 MAX_ENTRIES = 200_000  # files and folders, for one pattern: a second or two
 
 
-def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
+def expand_job_scenes(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
     """Return every scene of a job once, in the job's order.
 
     An entry whose path has `*`, `**` or `[...]` stands for all paths that match (a `?` begins the

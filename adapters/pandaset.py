@@ -407,7 +407,9 @@ def _moving_boxes(
 
     tables = ((frame, cuboids[frame.index]) for frame in frames)
     objects = find_objects(
-        (timed(frame, table) for frame, table in tables if table is not None), origin, several=True
+        (timed(frame, table) for frame, table in tables if table is not None),
+        origin,
+        allows_several_boxes=True,
     )
     by_frame: dict[int, list[BoxSample]] = defaultdict(list)
     for box in objects.moving_boxes:

@@ -459,7 +459,7 @@ class TimedBoxes:
     frame: int
     boxes: Boxes
     timestamps_ns: np.ndarray | int
-    moves: np.ndarray | None = None
+    is_moving: np.ndarray | None = None
     rotations: np.ndarray | None = None
 
     def samples(self, world_origin_m: np.ndarray) -> Iterator[tuple[BoxSample | None, bool]]:
@@ -472,7 +472,7 @@ class TimedBoxes:
         rotations = self.rotations
         if rotations is None:
             rotations = rotmat_from_quat(torch.from_numpy(boxes.quats)).numpy()
-        moves = self.moves
+        moves = self.is_moving
         if moves is None:
             stationary = _attribute(boxes, _STATIONARY)
             moves = [False] * len(boxes) if stationary is None else list(map(_is_false, stationary))
@@ -526,7 +526,7 @@ class RecordedObjects:
 
 
 def find_objects(
-    frames: Iterable[TimedBoxes], world_origin_m: np.ndarray, *, several: bool = False
+    frames: Iterable[TimedBoxes], world_origin_m: np.ndarray, *, allows_several_boxes: bool = False
 ) -> RecordedObjects:
     """Find the objects in the boxes of frames.
 
@@ -545,7 +545,7 @@ def find_objects(
         for sample, moves in timed.samples(world_origin_m):
             if sample is None:
                 bad.append(timed.frame)
-            elif sample.object_id in frame_object_ids and not several:
+            elif sample.object_id in frame_object_ids and not allows_several_boxes:
                 twice.append((sample.object_id, timed.frame))
             else:
                 frame_object_ids.add(sample.object_id)
@@ -674,7 +674,7 @@ def scene_of_drive(
     drive: RawDrive,
     options: DriveOptions,
     *,
-    added: Gaussians | None = None,
+    extra_background: Gaussians | None = None,
     ground: Ground | None = None,
 ) -> Scene:
     """Build the scene of a drive: accumulated returns, coloured by the images.
@@ -710,7 +710,7 @@ def scene_of_drive(
             drive,
             ground,
         )
-    return build_lidar_scene(drive, options, added=added, ground=ground)
+    return build_lidar_scene(drive, options, added=extra_background, ground=ground)
 
 
 def _check_frames_of_reference(drive: RawDrive) -> RawDrive:

@@ -222,9 +222,9 @@ def _files_of(
 
         yield from sorted(kitti_root(path)[1].glob("calib_*.txt"))
     elif scheme == "recording":  # a variant of a job has its scene's sweeps
-        from augment.jobs.layout import SWEEPS
+        from augment.jobs.layout import SWEEP_FOLDER
 
-        yield root / os.pardir / SWEEPS
+        yield root / os.pardir / SWEEP_FOLDER
 
 
 def _facts_of(paths: Iterable[Path]) -> Iterator[tuple[str, int, int]]:
@@ -455,7 +455,7 @@ def _lock_entry(folder: Path, key: str) -> Iterator[bool]:
             return
         stack.callback(os.close, lock)
         try:
-            wait_for_lock(path, lock, patience_s=MAX_BUILDING_S, doing="builds this scene")
+            wait_for_lock(path, lock, patience_s=MAX_BUILDING_S, activity="builds this scene")
         except OutputError as error:
             logger.warning("%s. The scene is built without the cache", error)
             yield False

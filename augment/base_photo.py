@@ -54,7 +54,7 @@ from augment.render.buffers import (
     RenderOutput,
     choose_kernels,
 )
-from augment.render.composite import add_elevation, map_colors, unit_depth_coordinates
+from augment.render.composite import add_airlight_elevation, apply_color_map, unit_depth_coordinates
 from augment.render.cuda import runtime as gpu
 from augment.render.fog import Fog, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
@@ -69,9 +69,9 @@ CLEAR_ALPHA = 0.04
 # Alpha of reconstructed surfaces from which a pixel counts as opaque.
 OPAQUE_ALPHA = 0.96
 # Radius of the guided filter, as a part of the image's width.
-RADIUS = 1 / 320
+FILTER_RADIUS_FRACTION = 1 / 320
 # Variance of display-encoded colour that the guided filter counts as an edge.
-EDGE = 0.05**2
+EDGE_VARIANCE = 0.05**2
 # Radius for the sky's share, in radii: splats of sky and of pale walls are told apart badly.
 SKY_RADIUS_FACTOR = 4
 # Distance by which splats lie beside what the photo shows, metres: many pixels for close things.
@@ -85,7 +85,7 @@ MAX_OFFSET_FRACTION = 1 / 30
 # Width of the copy in which edges are moved, pixels.
 ALIGNED_PX = 480
 # Least contrast of an edge of the photo, of 255.
-PLAIN = 26
+MIN_PHOTO_CONTRAST = 26
 # Size of the neighbourhood in which most of T's edges must lie on edges of the photo to be where
 # they belong, as a part of the image's width.
 NEIGHBOURHOOD_FRACTION = 1 / 20
@@ -94,16 +94,16 @@ MIN_WEIGHT = 0.02
 # Strength of the smoothing (lambda of Min et al. 2014), squared pixels.
 SMOOTHING_RADIUS_PX2 = 1000.0
 # Colour difference that stops the smoothing (sigma of Min et al. 2014), of 255.
-ALIKE = 5.0
+COLOR_SIGMA = 5.0
 # Fall of a ray, metres a metre, from which it meets the road, not the sky, where nothing is
 # rendered.
-LEVEL = 0.02
+MIN_ROAD_FALL = 0.02
 # Largest condition number of a colour map that is undone: 8 bits come back exactly.
 MAX_CONDITION = 1e3
 # Largest height of a camera above the road, metres; more is a hill's.
 MAX_CAMERA_HEIGHT_M = 4.0
 # Image rows that a thread takes at a time.
-ROWS = 32
+ROWS_PER_THREAD = 32
 # Colour map that leaves black.
 _NO_COLOR = torch.zeros(1, 3, 4)
 
@@ -217,30 +217,30 @@ def _is_window(outer: Camera, inner: Camera) -> bool:
 class PhotoStyle:
     """A style's colour maps for a photo."""
 
-    splats: Float[Tensor, "C 3 4"]
+    surface_maps: Float[Tensor, "C 3 4"]
     """Maps of surfaces, [C, 3, 4]: one, or one a class."""
-    sky: Float[Tensor, "3 4"]
+    sky_map: Float[Tensor, "3 4"]
     """Map of the sky."""
-    levels: Float[Tensor, " M"] | None = None
+    sky_levels: Float[Tensor, " M"] | None = None
     """Share of sky in each of the background's M - 2 splats, 0 to 1, between a zero for no splat
     and a zero for actors' splats; None where no splat shows sky."""
-    others: Float[Tensor, "K 3 4"] | None = None
+    other_splat_maps: Float[Tensor, "K 3 4"] | None = None
     """Those of the splats' maps that differ from the first; None where there are none."""
-    marks: Float[Tensor, "R 3 4"] | None = None
+    mark_maps: Float[Tensor, "R 3 4"] | None = None
     """Maps that turn any colour into marks: the share of sky in a splat, and how far it takes each
     of `others`; [R, 3, 4], by rows of the background's splats, or by classes where `rows` is None.
     None where there is nothing to mark, or where `others` are more than two."""
-    rows: Int16[Tensor, " N"] | None = None
+    mark_rows: Int16[Tensor, " N"] | None = None
     """Row of `marks` of each splat of the background; None where `marks` go by classes."""
 
-    def marked(self, parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
+    def with_marks(self, parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
         """Return the parts in the colours of their marks."""
-        assert self.marks is not None
-        class_marks = self.marks[: len(self.splats)].contiguous()
+        assert self.mark_maps is not None
+        class_marks = self.mark_maps[: len(self.surface_maps)].contiguous()
         return tuple(
             replace(part, color_maps=class_marks, color_rows=None)
-            if part.instance_id > 0 or self.rows is None
-            else replace(part, color_maps=self.marks, color_rows=self.rows)
+            if part.instance_id > 0 or self.mark_rows is None
+            else replace(part, color_maps=self.mark_maps, color_rows=self.mark_rows)
             for part in parts
         )
 
@@ -255,14 +255,14 @@ class Photo:
     """The image as recorded."""
     backend: str
     """Backend that draws."""
-    undone: Float[Tensor, "3 4"] | None = None
+    scene_from_recorded: Float[Tensor, "3 4"] | None = None
     """Map from recorded colours to the scene's, which the camera's colour map turns back in the
     finished picture; None where they are the same."""
     height_m: float | None = None
     """Height of the camera above the road, metres; None where unknown."""
     style: PhotoStyle | None = None
     """Colour maps of a style; None without a style."""
-    faded: FadedShadows | None = None
+    faded_shadows: FadedShadows | None = None
     """Shadows on the ground that fade in smog; None where none fade."""
 
     def is_seen_by(self, camera: Camera) -> bool:
@@ -272,17 +272,19 @@ class Photo:
     def buffers_for(self, parts: Sequence[PosedGaussians]) -> frozenset[str]:
         """Return the buffers that painting layers of these parts needs."""
         buffers = {RGB, OVERLAY} if any(part.is_overlay for part in parts) else set[str]()
-        if self.style is not None and (len(self.style.splats) > 1 or self.style.levels is not None):
+        if self.style is not None and (
+            len(self.style.surface_maps) > 1 or self.style.sky_levels is not None
+        ):
             buffers.add(SPLAT_IDS)
         return frozenset(buffers)
 
-    def prepare(
+    def prepare_parts(
         self, parts: Sequence[PosedGaussians]
     ) -> tuple[tuple[PosedGaussians, ...], frozenset[str]]:
         """Return the parts and the buffers that `clear_picture` needs."""
         if self._takes_marks(parts):
             assert self.style is not None
-            return self.style.marked(parts), frozenset({RGB})
+            return self.style.with_marks(parts), frozenset({RGB})
         return blacken_parts(parts), self.buffers_for(parts)
 
     def _takes_marks(self, parts: Sequence[PosedGaussians]) -> bool:
@@ -290,7 +292,7 @@ class Photo:
 
         This takes half as long as finding the heaviest splat of each pixel.
         """
-        marks = None if self.style is None else self.style.marks
+        marks = None if self.style is None else self.style.mark_maps
         return marks is not None and not any(part.is_overlay for part in parts)
 
     def paint(
@@ -311,18 +313,18 @@ class Photo:
                 parts' colours. None means 1 everywhere.
         """
         assert raster.rgb is not None and raster.alpha is not None
-        surface_rgb, sky_rgb, sky_share = self.colors(raster, parts, camera)
+        surface_rgb, sky_rgb, sky_share = self.layer_colors(raster, parts, camera)
         surface = surface_rgb if sky_share is None else mix(surface_rgb, sky_rgb, sky_share)
         surface = self._without_sun(surface, raster, camera)
         if photo_share is not None:
             weight = photo_share if camera is self.camera else photo_share * self._inside(camera)
             rest_rgb = (1 - weight)[..., None] * raster.rgb
-            return replace(raster, rgb=add_faded(rest_rgb, surface, weight * raster.alpha))
+            return replace(raster, rgb=add_weighted(rest_rgb, surface, weight * raster.alpha))
         alpha = photo_alpha = opaque_alpha(raster.alpha)
         if raster.overlay is not None:
             alpha = torch.maximum(alpha, raster.overlay)
             photo_alpha = alpha - raster.overlay
-        return replace(raster, rgb=add_faded(raster.rgb, surface, photo_alpha), alpha=alpha)
+        return replace(raster, rgb=add_weighted(raster.rgb, surface, photo_alpha), alpha=alpha)
 
     def clear_picture(
         self, raster: RenderOutput, parts: Sequence[PosedGaussians]
@@ -338,7 +340,7 @@ class Photo:
         if raster.overlay is None:
             return rgb
         assert raster.rgb is not None
-        return add_faded(raster.rgb, rgb, 1 - raster.overlay)
+        return add_weighted(raster.rgb, rgb, 1 - raster.overlay)
 
     def _styled(
         self, style: PhotoStyle, raster: RenderOutput, parts: Sequence[PosedGaussians]
@@ -346,7 +348,7 @@ class Photo:
         """Return the photo in the colours of a style."""
         assert raster.alpha is not None
         if not self._takes_marks(parts):
-            surface_rgb, sky_rgb, level = self.colors(raster, parts, self.camera)
+            surface_rgb, sky_rgb, level = self.layer_colors(raster, parts, self.camera)
             return mix(
                 surface_rgb,
                 sky_rgb,
@@ -360,10 +362,12 @@ class Photo:
         else:
             level = (marks[..., 0] / alpha.clamp_min(1e-6)).clamp_max(1)
             share = self.sharpen(self._sky_share(alpha, level), SKY_RADIUS_FACTOR)
-        if style.others is None and self.backend == CPU:
+        if style.other_splat_maps is None and self.backend == CPU:
             return self._in_both_on_cpu(style, share)
         surface_rgb = self._land
-        for number, other in enumerate(() if style.others is None else style.others):
+        for number, other in enumerate(
+            () if style.other_splat_maps is None else style.other_splat_maps
+        ):
             weight = (marks[..., 1 + number] / alpha.clamp_min(1e-6)).clamp_max(1)
             surface_rgb = mix(surface_rgb, self._in_colors(other), weight)
         return mix(surface_rgb, self._sky, share)
@@ -375,7 +379,7 @@ class Photo:
         alpha = opaque_alpha(alpha)
         share = 1 - alpha if level is None else 1 - alpha * (1 - level)
         if self.height_m is not None:
-            share = share.masked_fill(self.fall > LEVEL, 0.0)
+            share = share.masked_fill(self.ray_fall > MIN_ROAD_FALL, 0.0)
         return share
 
     def _marked_share_on_cpu(self, alpha: Tensor, marks: Tensor) -> Tensor:
@@ -383,9 +387,9 @@ class Photo:
         out = np.empty(tuple(alpha.shape), np.float32)
         fall = (-self.camera.world_from_camera[2, :3]).tolist()
         numbers = (CLEAR_ALPHA, OPAQUE_ALPHA), *unit_depth_coordinates(self.camera)
-        numbers = *numbers, (*fall, math.inf if self.height_m is None else LEVEL)
-        with kernel_threads(ROWS):
-            kernels.sky_share(
+        numbers = *numbers, (*fall, math.inf if self.height_m is None else MIN_ROAD_FALL)
+        with kernel_threads(ROWS_PER_THREAD):
+            kernels.compute_sky_share(
                 alpha.detach().numpy(), marks.detach().numpy(),
                 *(np.asarray(n, np.float32) for n in numbers), out,
             )  # fmt: skip
@@ -394,14 +398,15 @@ class Photo:
     def _in_both_on_cpu(self, style: PhotoStyle, share: Tensor) -> Tensor:
         """Return the photo in the style's maps of surfaces and sky, mixed by the share of sky."""
         maps = (
-            _composed(style_map, self.undone).numpy() for style_map in (style.splats[0], style.sky)
+            _composed(style_map, self.scene_from_recorded).numpy()
+            for style_map in (style.surface_maps[0], style.sky_map)
         )
         out = np.empty(self.pixels.shape, np.float32)
-        with kernel_threads(ROWS):
+        with kernel_threads(ROWS_PER_THREAD):
             kernels.map_photo_colors_with_sky(self.pixels, *maps, share.numpy(), out)
         return torch.from_numpy(out)
 
-    def colors(
+    def layer_colors(
         self, raster: RenderOutput, parts: Sequence[PosedGaussians], camera: Camera
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return colours of surfaces [H, W, 3] and of the sky, and the share of sky in surfaces [H,
@@ -415,20 +420,22 @@ class Photo:
         sky_share = None
         if style is None:
             return surface_rgb, self.sky_colors(camera), None
-        if len(style.splats) > 1:
+        if len(style.surface_maps) > 1:
             assert raster.splat_ids is not None
             has_splat = raster.splat_ids >= 0
             table = _classes(parts, surface_rgb.device)
             classes = torch.where(has_splat, table[raster.splat_ids.clamp_min(0)], 0)
             for class_number in torch.unique(classes).tolist():
-                if class_number and not torch.equal(style.splats[class_number], style.splats[0]):
-                    class_rgb = self._cut(self._in_colors(style.splats[class_number]), camera)
+                if class_number and not torch.equal(
+                    style.surface_maps[class_number], style.surface_maps[0]
+                ):
+                    class_rgb = self._cut(self._in_colors(style.surface_maps[class_number]), camera)
                     surface_rgb = torch.where(
                         (classes == class_number)[..., None], class_rgb, surface_rgb
                     )
-        if style.levels is not None:
+        if style.sky_levels is not None:
             assert raster.splat_ids is not None
-            levels = style.levels.to(surface_rgb.device)
+            levels = style.sky_levels.to(surface_rgb.device)
             sky_share = levels[(raster.splat_ids + 1).clamp_max(len(levels) - 1)]
         return surface_rgb, self.sky_colors(camera), sky_share
 
@@ -438,7 +445,7 @@ class Photo:
         """Return the colours of surfaces with the shadows on the ground faded."""
         depth = raster.expected_depth
         alpha = raster.alpha
-        if self.faded is None or depth is None or alpha is None:
+        if self.faded_shadows is None or depth is None or alpha is None:
             return rgb
         small_camera = camera.resized(*_at_most(camera, ALIGNED_PX))
         z, small_alpha = (
@@ -451,7 +458,7 @@ class Photo:
         )
         points = z[..., None] * small_camera.ray_directions().numpy() + camera.centre.numpy()
         points[small_alpha < 0.5] = math.inf
-        lit_share, factors = self.faded.gains(points.astype(np.float32))
+        lit_share, factors = self.faded_shadows.gains_at(points.astype(np.float32))
         lit_share = cv2.resize(
             lit_share, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR
         )
@@ -467,32 +474,32 @@ class Photo:
     @cached_property
     def _land(self) -> Float[Tensor, "H W 3"]:
         """Return the photo in the colours of surfaces."""
-        return self._in_colors(None if self.style is None else self.style.splats[0])
+        return self._in_colors(None if self.style is None else self.style.surface_maps[0])
 
     @cached_property
     def _sky(self) -> Float[Tensor, "H W 3"]:
         """Return the photo in the colours of the sky."""
         assert self.style is not None
-        return self._in_colors(self.style.sky)
+        return self._in_colors(self.style.sky_map)
 
     def _in_colors(self, style_map: Float[Tensor, "3 4"] | None) -> Float[Tensor, "H W 3"]:
         """Return the photo in the scene's colours, or in a style's map of them, which ends at 0."""
-        color_map = self.undone
+        color_map = self.scene_from_recorded
         min_value = -math.inf
         if style_map is not None:
-            color_map = _composed(style_map, self.undone)
+            color_map = _composed(style_map, self.scene_from_recorded)
             min_value = 0.0
         if self.backend == CPU:
             out = np.empty(self.pixels.shape, np.float32)
             matrix = np.eye(3, 4, dtype=np.float32) if color_map is None else color_map.numpy()
-            with kernel_threads(ROWS):
+            with kernel_threads(ROWS_PER_THREAD):
                 kernels.map_photo_colors(self.pixels, matrix, np.float32(min_value), out)
             return torch.from_numpy(out)
         pixels = torch.from_numpy(self.pixels)
         rgb = (gpu.upload(pixels) if self.backend == CUDA else pixels).float() / 255
         if color_map is None:
             return rgb
-        return map_colors(rgb, color_map, backend=self.backend).clamp_min(min_value)
+        return apply_color_map(rgb, color_map, backend=self.backend).clamp_min(min_value)
 
     def sharpen(self, values: Float[Tensor, "H W"], times: int = 1) -> Float[Tensor, "H W"]:
         """Return values of 0 to 1 with their edges moved to the photo's.
@@ -501,7 +508,7 @@ class Photo:
             values: the values.
             times: radius of the guided filter, in RADIUS.
         """
-        radius = max(2, round(RADIUS * times * self.camera.width))
+        radius = max(2, round(FILTER_RADIUS_FRACTION * times * self.camera.width))
         source = np.ascontiguousarray(values.detach().cpu().float().numpy())
         rows_with_values = np.flatnonzero(source.max(1) > 0)
         if not len(rows_with_values):
@@ -513,7 +520,9 @@ class Photo:
         # A guide in colour would take twice as long.
         guide = cv2.cvtColor(self.pixels[rows], cv2.COLOR_RGB2GRAY)
         sharpened = np.zeros_like(source)
-        sharpened[rows] = cv2.ximgproc.guidedFilter(guide, source[rows], radius, EDGE * 255**2)
+        sharpened[rows] = cv2.ximgproc.guidedFilter(
+            guide, source[rows], radius, EDGE_VARIANCE * 255**2
+        )
         return torch.from_numpy(np.clip(sharpened, 0, 1, out=sharpened)).to(values.device)
 
     def transmittance(self, raster: RenderOutput, fog: Fog) -> Float[Tensor, "H W"]:
@@ -526,10 +535,10 @@ class Photo:
         depth = raster.expected_depth
         if choose_kernels(self.backend, alpha, depth) == CPU:
             transmittance = self._transmittance_on_cpu(alpha, depth, fog)
-            return self.sharpen(self.aligned(transmittance, alpha, depth))
+            return self.sharpen(self.align_edges(transmittance, alpha, depth))
         camera = self.camera
         device = alpha.device
-        fall = self.fall
+        fall = self.ray_fall
         lengths = camera.ray_lengths(device=device)
         eye_z_m = float(camera.centre[2])
         surface_transmittance = torch.exp(
@@ -537,14 +546,14 @@ class Photo:
         )
         background_depth = sky_optical_depth(fog, -fall / lengths, eye_z_m)
         if self.height_m is not None:
-            distance = self.height_m / fall.clamp_min(LEVEL) * lengths
+            distance = self.height_m / fall.clamp_min(MIN_ROAD_FALL) * lengths
             road_z_m = torch.full_like(fall, eye_z_m - self.height_m)
             road_depth = optical_depth(fog, distance, eye_z_m, road_z_m)
-            background_depth = torch.where(fall > LEVEL, road_depth, background_depth)
+            background_depth = torch.where(fall > MIN_ROAD_FALL, road_depth, background_depth)
         transmittance = alpha * surface_transmittance + (1 - alpha) * torch.exp(-background_depth)
-        return self.sharpen(self.aligned(transmittance, alpha, depth))
+        return self.sharpen(self.align_edges(transmittance, alpha, depth))
 
-    def aligned(
+    def align_edges(
         self, values: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"], depth: Float[Tensor, "H W"]
     ) -> Float[Tensor, "H W"]:
         """Return values of about 0 to 1, replaced beside edges of close things by those around.
@@ -576,7 +585,7 @@ class Photo:
         guide = cv2.resize(self.pixels, size, interpolation=cv2.INTER_AREA)
         window_px = (max(3, round(NEIGHBOURHOOD_FRACTION * size[0])),) * 2
         is_movable = (offset_px >= MIN_EDGE_OFFSET_PX).astype(np.float32)
-        is_unseen = is_movable * (_contrast(guide).max(-1) < PLAIN)
+        is_unseen = is_movable * (_contrast(guide).max(-1) < MIN_PHOTO_CONTRAST)
         offset_px[cv2.blur(is_unseen, window_px) < 0.5 * cv2.blur(is_movable, window_px)] = 0
         trust = np.ones(small_values.shape, np.float32)
         radius = MIN_EDGE_OFFSET_PX
@@ -588,7 +597,9 @@ class Photo:
             radius *= 2
         if trust.min() == 1:
             return values
-        smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, SMOOTHING_RADIUS_PX2, ALIKE)
+        smoother = cv2.ximgproc.createFastGlobalSmootherFilter(
+            guide, SMOOTHING_RADIUS_PX2, COLOR_SIGMA
+        )
         weight = np.maximum(trust, np.float32(MIN_WEIGHT))
         smoothed = smoother.filter(weight * small_values) / np.maximum(
             smoother.filter(weight), 1e-6
@@ -601,14 +612,16 @@ class Photo:
 
     def airlight(self, fog: Fog) -> Float[Tensor, "#H #W 3"]:
         """Return the fog's colour at each pixel; [1, 1, 3] where all pixels have the same."""
-        if fog.overcast == 0:
-            return torch.tensor(fog.rgb, device=self._device)[None, None]
+        if fog.elevation_gain == 0:
+            return torch.tensor(fog.airlight_rgb, device=self._device)[None, None]
         size = (self.camera.height, self.camera.width)
         zeros = torch.zeros(size, device=self._device)
         raster = RenderOutput(
             rgb=torch.zeros(*size, 3, device=self._device), alpha=zeros, expected_depth=zeros
         )
-        return add_elevation(raster, self.camera, fog, behind=True, backend=self.backend)
+        return add_airlight_elevation(
+            raster, self.camera, fog, has_fog_behind=True, backend=self.backend
+        )
 
     def _transmittance_on_cpu(self, alpha: Tensor, depth: Tensor, fog: Fog) -> Tensor:
         """Return T up to the rendered depth, by the CPU kernel."""
@@ -619,16 +632,16 @@ class Photo:
         over_base_m = float(camera.centre[2]) - fog.base_z_m
         numbers = (
             *(lens, (-camera.world_from_camera[2, :3]).tolist()),
-            (fog.sigma_per_m, inverse_m, over_base_m),
-            (self.height_m or 0.0, LEVEL),
+            (fog.extinction_per_m, inverse_m, over_base_m),
+            (self.height_m or 0.0, MIN_ROAD_FALL),
         )
         arrays = [np.array(values, np.float32) for values in numbers]
-        with kernel_threads(ROWS):
-            kernels.transmittance(alpha.numpy(), depth.detach().numpy(), *arrays, out)
+        with kernel_threads(ROWS_PER_THREAD):
+            kernels.compute_transmittance(alpha.numpy(), depth.detach().numpy(), *arrays, out)
         return torch.from_numpy(out)
 
     @cached_property
-    def fall(self) -> Float[Tensor, "H W"]:
+    def ray_fall(self) -> Float[Tensor, "H W"]:
         """Return the metres by which each pixel's ray falls per metre of depth."""
         camera = self.camera
         device = self._device
@@ -741,22 +754,22 @@ def mix(
     """
     if choose_kernels(AUTO, rgb, other, weight) != CPU:
         return (1 - weight)[..., None] * rgb + weight[..., None] * other
-    return _run(kernels.mix, rgb, other, weight)
+    return _run(kernels.blend_images, rgb, other, weight)
 
 
-def add_faded(
+def add_weighted(
     base: Float[Tensor, "H W 3"], rgb: Float[Tensor, "H W 3"], weight: Float[Tensor, "H W"]
 ) -> Float[Tensor, "H W 3"]:
     """Return base + weight rgb."""
     if choose_kernels(AUTO, base, rgb, weight) != CPU:
         return base + weight[..., None] * rgb
-    return _run(kernels.add_faded, base, rgb, weight)
+    return _run(kernels.add_weighted, base, rgb, weight)
 
 
 def _run(kernel: Any, *images: Tensor) -> Tensor:
     """Return the image that a CPU kernel makes of some images."""
     out = np.empty(tuple(images[0].shape), np.float32)
-    with kernel_threads(ROWS):
+    with kernel_threads(ROWS_PER_THREAD):
         kernel(*(image.detach().contiguous().numpy() for image in images), out)
     return torch.from_numpy(out)
 
@@ -786,7 +799,7 @@ def _classes(parts: Sequence[PosedGaussians], device: torch.device) -> Int16[Ten
     ]
     return torch.cat(
         [
-            part_classes if part_classes.device == device else gpu.resident(part_classes)
+            part_classes if part_classes.device == device else gpu.gpu_copy(part_classes)
             for part_classes in classes
         ]
     )

@@ -44,13 +44,13 @@ class Bounds:
     """Centres, metres."""
     halves: Float[np.ndarray, "B 3"]
     """Half sides, metres."""
-    longest: Float[np.ndarray, "B"]
+    max_scales: Float[np.ndarray, "B"]
     """Largest standard deviation of a Gaussian in each box, metres."""
     owners: Int64[np.ndarray, "B"]
     """Instance id of each box's part, 0 for the background."""
 
     def __len__(self) -> int:
-        return len(self.longest)
+        return len(self.max_scales)
 
     def select(self, rows: np.ndarray) -> Bounds:
         """Return some of the boxes."""
@@ -65,13 +65,13 @@ class Bounds:
         return Bounds(*(np.concatenate([getattr(b, name) for b in all_bounds]) for name in names))
 
 
-def bound(gaussians: Gaussians, owner: int = 0) -> Bounds:
+def bound_gaussians(gaussians: Gaussians, owner: int = 0) -> Bounds:
     """Return one box around all Gaussians opaque enough to be drawn; none where there are none."""
     return bound_squares(gaussians, gaussians.opacities.detach().numpy() >= ALPHA_MIN, owner=owner)
 
 
 def bound_squares(
-    gaussians: Gaussians, chosen: np.ndarray, side_m: float = math.inf, owner: int = 0
+    gaussians: Gaussians, is_chosen: np.ndarray, side_m: float = math.inf, owner: int = 0
 ) -> Bounds:
     """Return boxes around chosen Gaussians, one for each square of x and y that has any.
 
@@ -81,8 +81,8 @@ def bound_squares(
         side_m: side of the squares; infinite for one box.
         owner: instance id of the part.
     """
-    means = gaussians.means.detach().numpy()[chosen].astype(np.float64)
-    longest = gaussians.scales.detach().numpy()[chosen].max(1, initial=0).astype(np.float64)
+    means = gaussians.means.detach().numpy()[is_chosen].astype(np.float64)
+    longest = gaussians.scales.detach().numpy()[is_chosen].max(1, initial=0).astype(np.float64)
     return bound_points(means, longest, side_m, owner)
 
 
@@ -138,7 +138,7 @@ def may_show(
         centres = (axes * bounds.centres[:, None]).sum(-1)
         extents = (np.abs(axes) * bounds.halves[:, None]).sum(-1)
     shifts = shift @ sides.T + offsets
-    upper_bounds = centres + shifts + extents + bounds.longest[:, None] * reach
+    upper_bounds = centres + shifts + extents + bounds.max_scales[:, None] * reach
     tolerance = _ROUNDING * (np.abs(centres) + np.abs(shifts) + extents)
     return ~(upper_bounds + tolerance < 0).any(-1)  # not `>=`, which would be False for NaN
 
@@ -200,7 +200,7 @@ def actor_boxes(scene: Scene) -> Bounds:
 
     def find() -> Bounds:
         numbered = enumerate(scene.actors, start=1)
-        return Bounds.join(bound(a.gaussians, n) for n, a in numbered)
+        return Bounds.join(bound_gaussians(a.gaussians, n) for n, a in numbered)
 
     return memo_of(scene).get(("boxes of actors",), find)
 

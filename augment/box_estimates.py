@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from scipy.spatial import KDTree
 
-from augment.boxes import NEAR_M, Occlusion, Outlines, WorldBoxes
+from augment.boxes import MIN_DEPTH_M, Occlusion, Outlines, WorldBoxes
 from augment.cameras import Camera
 from augment.errors import ClimateGSError
 from augment.memo import LatestValue, memo_of
@@ -46,7 +46,7 @@ MAX_RETURNS = 100
 # height is known to some 20 cm.
 GROUND_M = 0.25
 # Height of that part over the height of the box, at most.
-MAX_OF_HEIGHT = 0.25
+MAX_GROUND_FRACTION = 0.25
 # Distance before a box from which a surface hides it, along the optical axis, metres.
 MIN_OCCLUDER_GAP_M = 0.5
 # Pixels of a projected box below which its shape is not known.
@@ -63,13 +63,13 @@ class SortedPoints:
     """The points."""
 
     @staticmethod
-    def of(points_m: np.ndarray) -> SortedPoints:
+    def from_points(points_m: np.ndarray) -> SortedPoints:
         """Return the finite points of an array, ordered by x."""
         points_m = points_m[np.isfinite(points_m).all(axis=1)]
         return SortedPoints(points_m[np.argsort(points_m[:, 0], kind="stable")])
 
     def inside(
-        self, boxes: WorldBoxes, number: int, low_m: np.ndarray, *, margins: bool = True
+        self, boxes: WorldBoxes, number: int, low_m: np.ndarray, *, with_margins: bool = True
     ) -> Int64[np.ndarray, " P"]:
         """Return indices of the points in a box.
 
@@ -80,7 +80,7 @@ class SortedPoints:
             margins: if True, sides reach as far as the box owns surfaces; else as far as it is
                 labelled.
         """
-        high_m = boxes.high_m[number] if margins else boxes.sizes_m[number] / 2
+        high_m = boxes.high_m[number] if with_margins else boxes.sizes_m[number] / 2
         centre = boxes.centres_m[number]
         reach_m = np.linalg.norm(np.maximum(np.abs(low_m), high_m))
         ends = np.array([centre[0] - reach_m, centre[0] + reach_m], self.points_m.dtype)
@@ -109,7 +109,7 @@ class Evidence:
     actors: frozenset[str]
     """Track ids of the scene's actors."""
 
-    def draws(self, boxes: WorldBoxes, number: int, track_id: str) -> bool:
+    def shows_object(self, boxes: WorldBoxes, number: int, track_id: str) -> bool:
         """Return True if the scene's splats show the object of a box."""
         if track_id in self.actors:
             return True
@@ -130,12 +130,14 @@ def evidence_of(scene: Scene, frame: int) -> Evidence | None:
             return None
         if sweep is None:
             return None
-        returns = SortedPoints.of(sweep.points_m - np.asarray(scene.world_origin_m, np.float64))
+        returns = SortedPoints.from_points(
+            sweep.points_m - np.asarray(scene.world_origin_m, np.float64)
+        )
         actors = frozenset(actor.track_id for actor in scene.actors)
         return Evidence(returns, memo.get(("sorted splats",), sort_splats), actors)
 
     def sort_splats() -> SortedPoints:
-        return SortedPoints.of(scene.background.means.detach().cpu().numpy())
+        return SortedPoints.from_points(scene.background.means.detach().cpu().numpy())
 
     memo = memo_of(scene)
     return memo.get(("evidence of boxes",), LatestValue).get(frame, read)
@@ -149,11 +151,11 @@ class Estimate:
     """Rows of the pixels that show it."""
     columns: Int64[np.ndarray, " P"]
     """Columns of the pixels that show it."""
-    hidden: int
+    num_hidden: int
     """Number of pixels of its projection that other things hide."""
 
     @property
-    def pixels(self) -> int:
+    def num_pixels(self) -> int:
         """Return the number of pixels that show the box."""
         return len(self.rows)
 
@@ -192,7 +194,7 @@ def estimate_boxes(
     """
     buried_m = np.zeros(len(boxes)) if buried_m is None else buried_m
     areas = (outlines.xyxy[:, 2:] - outlines.xyxy[:, :2]).prod(axis=1)
-    is_doubtful = (occlusion.shown < MIN_SHOWN_FRACTION * areas) & (areas >= MIN_OUTLINE_PX)
+    is_doubtful = (occlusion.num_shown < MIN_SHOWN_FRACTION * areas) & (areas >= MIN_OUTLINE_PX)
     numbers = np.flatnonzero(is_doubtful & outlines.in_view)
     frame_evidence = evidence() if len(numbers) else None
     estimates: dict[int, Estimate] = {}
@@ -201,9 +203,11 @@ def estimate_boxes(
     view = _BoxesInImage(boxes, camera, outlines, frame_evidence.returns, own_car, buried_m)
     for number in numbers.tolist():
         estimate = view.estimate(number)
-        if estimate is None or occlusion.shown[number] >= MIN_SHOWN_FRACTION * len(estimate.rows):
+        if estimate is None or occlusion.num_shown[number] >= MIN_SHOWN_FRACTION * len(
+            estimate.rows
+        ):
             continue
-        if on_photo or frame_evidence.draws(boxes, number, track_ids[number]):
+        if on_photo or frame_evidence.shows_object(boxes, number, track_ids[number]):
             estimates[number] = estimate
     return estimates
 
@@ -230,13 +234,15 @@ class _BoxesInImage:
         camera = self.camera
         camera_from_world = self.camera.camera_from_world.numpy()
         local = points_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-        z = np.where(local[:, 2] > NEAR_M, local[:, 2], np.nan)
+        z = np.where(local[:, 2] > MIN_DEPTH_M, local[:, 2], np.nan)
         pixels = local[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         return pixels, local[:, 2]
 
     def estimate(self, number: int) -> Estimate | None:
         """Return the pixels of one box; None where the returns do not prove that it is in sight."""
-        on_box = self.returns.inside(self.boxes, number, self._above_ground(number), margins=False)
+        on_box = self.returns.inside(
+            self.boxes, number, self._above_ground(number), with_margins=False
+        )
         if not MIN_RETURNS <= len(on_box) <= MAX_RETURNS or not self._may_show(number, on_box):
             return None
         left, top = np.floor(self.outlines.xyxy[number, :2]).astype(int).tolist()
@@ -372,7 +378,7 @@ class _BoxesInImage:
         enter = np.minimum(a, b)
         leave = np.maximum(a, b)
         first_depth = np.maximum(np.maximum(enter[:, 0], enter[:, 1]), enter[:, 2])
-        return np.maximum(first_depth, NEAR_M), np.minimum(
+        return np.maximum(first_depth, MIN_DEPTH_M), np.minimum(
             np.minimum(leave[:, 0], leave[:, 1]), leave[:, 2]
         )
 
@@ -380,5 +386,5 @@ class _BoxesInImage:
         """Return the lowest corner of the part of a box in which a return is not the ground's."""
         size = self.boxes.sizes_m[number]
         low = -size / 2
-        low[2] += min(GROUND_M, MAX_OF_HEIGHT * size[2])
+        low[2] += min(GROUND_M, MAX_GROUND_FRACTION * size[2])
         return low

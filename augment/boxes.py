@@ -37,12 +37,12 @@ NOT_COUNTED = -1
 # less left out; 0.3 % of the vehicles' pixels are lost.
 BOTTOM_MARGIN_M = 0.08
 # Largest height of that part over the height of the box: a low box keeps three quarters.
-MAX_OF_HEIGHT = 0.25
+MAX_BOTTOM_FRACTION = 0.25
 # Margin on the other five sides in which a box owns surfaces, metres. Boxes are drawn tight
 # (mirrors and bumpers reach beyond them), and splats blur a surface by a few centimetres.
 SIDE_MARGIN_M = 0.10
 # Depth below which the parts of a box are not projected, metres.
-NEAR_M = 0.01
+MIN_DEPTH_M = 0.01
 
 # Corners of a unit cube about its centre.
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -56,9 +56,9 @@ EDGES = np.array(
 class BoxPixels:
     """Numbers of pixels of B boxes in an image."""
 
-    pixels: Int64[np.ndarray, " B"]
+    num_pixels: Int64[np.ndarray, " B"]
     """Pixels that show each box."""
-    marked: Int64[np.ndarray, " B"]
+    num_marked: Int64[np.ndarray, " B"]
     """Those of them that a mask marks."""
 
 
@@ -85,13 +85,13 @@ def count_pixels(
     """
     pixels = np.zeros(len(boxes), np.int64)
     marked = np.zeros(len(boxes), np.int64)
-    for number, rows, columns in shown_pixels(boxes, camera, depth_m):
+    for number, rows, columns in pixels_of_boxes(boxes, camera, depth_m):
         pixels[number] = len(rows)
         marked[number] = np.count_nonzero(mask[rows, columns] == 255)
     return BoxPixels(pixels, marked)
 
 
-def shown_pixels(
+def pixels_of_boxes(
     boxes: WorldBoxes, camera: Camera, depth_m: Float32[np.ndarray, "H W"]
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Yield (box, rows [P], columns [P]) of the pixels that show each box that has any.
@@ -156,7 +156,7 @@ class WorldBoxes:
         return len(self.is_usable)
 
     @staticmethod
-    def of(boxes: Boxes, world_origin_m: Float64[np.ndarray, "3"]) -> WorldBoxes:
+    def from_labels(boxes: Boxes, world_origin_m: Float64[np.ndarray, "3"]) -> WorldBoxes:
         """Return labelled boxes in the scene's world.
 
         Args:
@@ -172,7 +172,9 @@ class WorldBoxes:
         sizes = np.where(is_usable[:, None], boxes.sizes_m, 0.0)
         low = -sizes / 2 - SIDE_MARGIN_M
         high = sizes / 2 + SIDE_MARGIN_M
-        low[:, 2] = -sizes[:, 2] / 2 + np.minimum(BOTTOM_MARGIN_M, MAX_OF_HEIGHT * sizes[:, 2])
+        low[:, 2] = -sizes[:, 2] / 2 + np.minimum(
+            BOTTOM_MARGIN_M, MAX_BOTTOM_FRACTION * sizes[:, 2]
+        )
         corners = _to_world(centres, rotations, CORNERS * sizes[:, None, :])
         return WorldBoxes(is_usable, centres, sizes, rotations, low, high, corners)
 
@@ -207,7 +209,7 @@ def pixel_windows(boxes: WorldBoxes, camera: Camera) -> Int64[np.ndarray, "B 4"]
     a = corners[:, EDGES[:, 0]]  # [B, 12, 3]
     b = corners[:, EDGES[:, 1]]
     ends = np.concatenate([cut_edges(a, b), cut_edges(b, a)], axis=1)
-    is_before_camera = (np.maximum(a[..., 2], b[..., 2]) > NEAR_M) & boxes.is_usable[:, None]
+    is_before_camera = (np.maximum(a[..., 2], b[..., 2]) > MIN_DEPTH_M) & boxes.is_usable[:, None]
     is_before_camera = np.concatenate([is_before_camera, is_before_camera], axis=1)
     z = np.where(is_before_camera, ends[..., 2], 1.0)
     windows = np.zeros((len(corners), 4), np.int64)
@@ -226,8 +228,8 @@ def pixel_windows(boxes: WorldBoxes, camera: Camera) -> Int64[np.ndarray, "B 4"]
 def cut_edges(end: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return `end` of each edge [..., 3], moved along the edge to z = NEAR_M where it is nearer."""
     length = other[..., 2] - end[..., 2]
-    is_behind = (end[..., 2] < NEAR_M) & (length > 0)
-    t = np.where(is_behind, (NEAR_M - end[..., 2]) / np.where(is_behind, length, 1.0), 0.0)
+    is_behind = (end[..., 2] < MIN_DEPTH_M) & (length > 0)
+    t = np.where(is_behind, (MIN_DEPTH_M - end[..., 2]) / np.where(is_behind, length, 1.0), 0.0)
     return end + t[..., None] * (other - end)
 
 
@@ -292,13 +294,13 @@ class Outlines:
 class Occlusion:
     """Visible and hidden pixels of B boxes."""
 
-    shown: Int64[np.ndarray, " B"]
+    num_shown: Int64[np.ndarray, " B"]
     """Pixels that show each box."""
-    hidden: Int64[np.ndarray, " B"]
+    num_hidden: Int64[np.ndarray, " B"]
     """Pixels inside each outline that show what stands before the box."""
     xyxy: Float64[np.ndarray, "B 4"]
     """Left, top, right, bottom of the shown pixels; NaN where there are none."""
-    owners: UInt16[np.ndarray, "H W"] | None = None
+    owner_boxes: UInt16[np.ndarray, "H W"] | None = None
     """1 + the smallest of the boxes that a pixel shows by depth, 0 = none; None unless asked
     for."""
 
@@ -408,7 +410,7 @@ def find_occlusion(
         np.stack(
             [np.maximum(boxes.low_m, -half_sizes), np.minimum(boxes.high_m, half_sizes)], axis=1
         ),
-        NEAR_M,
+        MIN_DEPTH_M,
         counts,
         owners,
     )
@@ -453,9 +455,9 @@ def _project_edges(corners_m: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np
     """
     a = corners_m[:, EDGES[:, 0]]  # [B, 12, 3]
     b = corners_m[:, EDGES[:, 1]]
-    is_before_camera = np.maximum(a[..., 2], b[..., 2]) > NEAR_M
+    is_before_camera = np.maximum(a[..., 2], b[..., 2]) > MIN_DEPTH_M
     ends = np.concatenate([cut_edges(a, b), cut_edges(b, a)], axis=1)
-    z = np.maximum(ends[..., 2:], NEAR_M)  # nearer ones belong to edges that are not seen
+    z = np.maximum(ends[..., 2:], MIN_DEPTH_M)  # nearer ones belong to edges that are not seen
     pixels = ends[..., :2] / z * K[[0, 1], [0, 1]] + K[:2, 2]
     return pixels, np.concatenate([is_before_camera, is_before_camera], axis=1)
 
@@ -492,7 +494,7 @@ def _rays_hit_boxes(
         )
     enter = depths[0].max(axis=-1)
     leave = depths[1].min(axis=-1)
-    return np.maximum(enter, NEAR_M) <= leave
+    return np.maximum(enter, MIN_DEPTH_M) <= leave
 
 
 # ---- Numbers of a scene's objects, in instance images and beside its boxes -----------------------
@@ -557,15 +559,15 @@ class Instances:
             )
         return numbers
 
-    def agree(self, track_ids: tuple[str, ...], numbers: np.ndarray) -> bool:
+    def has_same_numbers(self, track_ids: tuple[str, ...], numbers: np.ndarray) -> bool:
         """Return True if boxes that were numbered earlier still have these numbers.
 
         Tracks that are not known are left out.
         """
         is_known = np.array([track_id in self.by_track for track_id in track_ids], bool)
-        return bool((self.of(track_ids) == numbers)[is_known].all())
+        return bool((self.numbers_of(track_ids) == numbers)[is_known].all())
 
-    def of(self, track_ids: tuple[str, ...]) -> UInt16[np.ndarray, " B"]:
+    def numbers_of(self, track_ids: tuple[str, ...]) -> UInt16[np.ndarray, " B"]:
         """Return the number of each box, by its track.
 
         It is 0 for a track of none of the scene's frames, and beyond MAX_INSTANCE.
@@ -609,7 +611,7 @@ def paint_boxes(
     volumes = np.prod(boxes.sizes_m, axis=1)
     painted_instance = instance.copy()
     for sided_boxes in (boxes, boxes.without_margins()):
-        shown_boxes = list(shown_pixels(sided_boxes, camera, depth_m))
+        shown_boxes = list(pixels_of_boxes(sided_boxes, camera, depth_m))
         # The last stays: the smallest, and of equal ones that of the lowest number.
         shown_boxes.sort(key=lambda pixels: (-volumes[pixels[0]], -int(numbers[pixels[0]])))
         for number, rows, columns in shown_boxes:

@@ -96,7 +96,7 @@ class CastShadows:
 
     certainty: float
     """0 without any shadow, 1 where shadows are plain."""
-    ratio: tuple[float, float, float]
+    shade_ratio: tuple[float, float, float]
     """Shaded over lit ground, linear red, green and blue."""
     lit_rgb: tuple[float, float, float]
     """Colour of the lit road, linear; its median without shadows."""
@@ -106,12 +106,12 @@ class CastShadows:
     """Azimuth of the sun by its shadows; 0 degrees is world +x."""
     elevation_deg: float
     """Elevation of the sun by its shadows."""
-    explained: Float32[np.ndarray, "A E"]
+    explained_share: Float32[np.ndarray, "A E"]
     """Share of the variance of log luminance that shadows explain, -1 to 1, by azimuth and
     elevation of the grid."""
-    lit: Float32[np.ndarray, "H W"]
+    sun_share: Float32[np.ndarray, "H W"]
     """Share of the sun that each cell sees, 0 to 1; the first axis is x."""
-    known: Float32[np.ndarray, "H W"]
+    known_share: Float32[np.ndarray, "H W"]
     """1 for cells of known ground, else 0."""
     height_m: Float32[np.ndarray, "H W"]
     """Height of the ground in each cell."""
@@ -123,19 +123,19 @@ class CastShadows:
     @property
     def luminance_ratio(self) -> float:
         """Return shaded over lit luminance."""
-        return float(np.dot(self.ratio, _LUMINANCE))
+        return float(np.dot(self.shade_ratio, _LUMINANCE))
 
     def explained_by(self, azimuth_deg: float, elevation_deg: float) -> float:
         """Return the variance that a sun near a direction explains, over that of the best
         direction.
         """
-        best = float(self.explained.max())
+        best = float(self.explained_share.max())
         if best <= 0:
             return 0.0
         azimuth_index = round(azimuth_deg / 10) % len(_AZIMUTHS)
         elevation_index = int(np.abs(_ELEVATIONS - math.radians(elevation_deg)).argmin())
         neighbours = np.take(
-            self.explained,
+            self.explained_share,
             [azimuth_index - 1, azimuth_index, (azimuth_index + 1) % len(_AZIMUTHS)],
             axis=0,
         )
@@ -143,13 +143,13 @@ class CastShadows:
 
     def light_at(self, places_m: np.ndarray) -> np.ndarray:
         """Return luminance over that in the sun at places [N, 3], [N]; NaN off the known ground."""
-        lit, known_share, height_m = self.at(places_m[:, 0], places_m[:, 1])
+        lit, known_share, height_m = self.sample(places_m[:, 0], places_m[:, 1])
         ratio = self.luminance_ratio
         on_ground = (known_share > 0.5) & (np.abs(places_m[:, 2] - height_m) < ON_GROUND_M)
         light = ratio + (1 - ratio) * lit / np.maximum(known_share, 0.5)
         return np.where(on_ground, light, np.nan)
 
-    def at(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def sample(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return lit, known and height_m at places of any shape, float32, interpolated.
 
         `known` is 0 beyond the map.
@@ -161,7 +161,7 @@ class CastShadows:
         rows, columns = (np.atleast_2d(np.nan_to_num(c, nan=-9.0)) for c in (rows, columns))
         rows = _wrapped(rows)
         columns = _wrapped(columns)
-        maps = (self.lit, self.known, self.height_m)
+        maps = (self.sun_share, self.known_share, self.height_m)
         map_values = (
             cv2.remap(m, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
             for m in maps
@@ -301,14 +301,14 @@ def _find_shadows(scene: Scene) -> CastShadows | None:
     lit = (lit / max(lit_level - dark_level, 1e-3 * lit_level)).clip(0, 1)
     return CastShadows(
         certainty=certainty,
-        ratio=_triple(ratio),
+        shade_ratio=_triple(ratio),
         lit_rgb=_triple(np.exp(modes[1] if certainty > 0 else np.median(log_rgb, 0))),
         lit_share=float(lit[all_ground.is_known].mean()),
         azimuth_deg=math.degrees(_AZIMUTHS[azimuth_index]),
         elevation_deg=math.degrees(_ELEVATIONS[elevation_index]),
-        explained=explained.astype(np.float32),
-        lit=np.where(all_ground.is_known, lit, 0).astype(np.float32),
-        known=all_ground.is_known.astype(np.float32),
+        explained_share=explained.astype(np.float32),
+        sun_share=np.where(all_ground.is_known, lit, 0).astype(np.float32),
+        known_share=all_ground.is_known.astype(np.float32),
         height_m=np.where(all_ground.is_known, all_ground.height_m, 0).astype(np.float32),
         corner_m=(float(grid.corner[0]), float(grid.corner[1])),
         cell_m=grid.cell_m,
@@ -525,12 +525,12 @@ class FadedShadows:
     maps: Float[Tensor, "K 3 4"]
     """Colour maps, [NUM_FADES + 1, 3, 4]; the first changes nothing."""
 
-    def on(self, part: PosedGaussians) -> PosedGaussians:
+    def apply_to(self, part: PosedGaussians) -> PosedGaussians:
         """Return the background with its shadows faded, before any maps that it has."""
         if part.color_maps is None:
             return replace(part, color_maps=self.maps, color_rows=self.rows)
         outer_maps = part.color_maps.to(self.maps)
-        outer_rows = part.map_rows
+        outer_rows = part.color_map_rows
         maps = outer_maps[:, None, :, :3] @ self.maps[None, :, :, :3]
         maps = torch.cat([maps, outer_maps[:, None, :, 3:].expand(-1, len(self.maps), -1, -1)], -1)
         if outer_rows is None:
@@ -542,7 +542,7 @@ class FadedShadows:
             color_rows=(safe_rows * len(self.maps) + self.rows).to(torch.int16),
         )
 
-    def gains(
+    def gains_at(
         self, points_m: Float32[np.ndarray, "H W 3"]
     ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "K 3"]]:
         """Return what fades the colours of points in the world.
@@ -599,7 +599,7 @@ def sun_transmittance(fog: Fog, shadows: CastShadows, ground_z_m: float) -> floa
     """Return T of the sun's light, down to the ground."""
     sun_sine = max(math.sin(math.radians(shadows.elevation_deg)), _LOWEST_SUN)
     if fog.scale_height_m is None:
-        return math.exp(-fog.sigma_per_m * SMOG_DEPTH_M / sun_sine)
+        return math.exp(-fog.extinction_per_m * SMOG_DEPTH_M / sun_sine)
     return math.exp(-vertical_optical_depth(fog, ground_z_m) / sun_sine)
 
 
@@ -607,7 +607,7 @@ def _lit_near(
     shadows: CastShadows, x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray
 ) -> np.ndarray:
     """Return the share of the sun that places see, blended to the mean off the ground."""
-    lit, known_share, height_m = shadows.at(x_m, y_m)
+    lit, known_share, height_m = shadows.sample(x_m, y_m)
     relative_height = np.abs(z_m - height_m / np.maximum(known_share, 1e-6)) / ON_GROUND_M
     weight = known_share * (2 - 2 * relative_height).clip(0, 1)
     return shadows.lit_share + weight * (lit / np.maximum(known_share, 1e-6) - shadows.lit_share)
@@ -615,7 +615,7 @@ def _lit_near(
 
 def _fade_factors(shadows: CastShadows, transmittance: float, lit: np.ndarray) -> np.ndarray:
     """Return (E' / E)^(1/2.2) for shares of the sun [K], float32 [K, 3]."""
-    q = np.array(shadows.ratio)
+    q = np.array(shadows.shade_ratio)
     sun_share = lit[:, None]
     mean_share = shadows.lit_share
     faded_light = q + (1 - q) * (transmittance * sun_share + (1 - transmittance) * mean_share)

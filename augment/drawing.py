@@ -16,7 +16,7 @@ from torch import Tensor
 from augment.base_photo import Photo, blacken_parts, mix
 from augment.cameras import Camera
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
-from augment.render.composite import add_elevation, composite_sky
+from augment.render.composite import add_airlight_elevation, composite_sky
 from augment.render.constants import RasterSettings
 from augment.render.fog import Fog, apply_fog_to_render, blend_airlight, sky_optical_depth
 from augment.render.layout import HeightClip
@@ -46,7 +46,7 @@ class LayerRenderer:
     photo: Photo | None = None
     """The recorded image that replaces the splats' colours in views of the camera that took it;
     None to show the splats."""
-    unpruned: Sequence[PosedGaussians] | None = None
+    unpruned_parts: Sequence[PosedGaussians] | None = None
     """The parts before pruning, if `parts` have been pruned (`augment.prune`); else None."""
 
     def without_fog(self) -> LayerRenderer:
@@ -65,7 +65,7 @@ class LayerRenderer:
         settings = replace(self.settings, blur_px2=self.settings.blur_px2 * scale * scale)
         return replace(self, settings=settings)
 
-    def draw(
+    def render_layer(
         self,
         camera: Camera,
         clip: HeightClip | None,
@@ -84,10 +84,10 @@ class LayerRenderer:
                 everywhere.
         """
         raster = self._draw_level(camera, clip, buffers, pixel_mask, photo_share)
-        if self.fog is None or self.fog.overcast == 0:
+        if self.fog is None or self.fog.elevation_gain == 0:
             return raster
         with timed("airlight by elevation"):
-            rgb = add_elevation(raster, camera, self.fog, backend=self.backend)
+            rgb = add_airlight_elevation(raster, camera, self.fog, backend=self.backend)
         return replace(raster, rgb=rgb)
 
     def _draw_level(
@@ -105,7 +105,7 @@ class LayerRenderer:
         if photo is not None:
             buffers = buffers | photo.buffers_for(parts)
             parts = blacken_parts(parts) if photo_share is None else parts
-        has_elevation_airlight = self.fog is not None and self.fog.overcast > 0
+        has_elevation_airlight = self.fog is not None and self.fog.elevation_gain > 0
         raster = rasterize(
             parts,
             camera,
@@ -136,13 +136,15 @@ class LayerRenderer:
         if self.photo is not None:
             return self._draw_on_photo(self.photo, camera, buffers)
         fog = self.fog if self.fog is not None and self.fog.scale_height_m is None else None
-        if fog is not None and fog.overcast > 0:
+        if fog is not None and fog.elevation_gain > 0:
             with timed("rasterise"):
                 raster = self._draw_level(camera, None, buffers)
             with timed("airlight by elevation"):  # of the surfaces and behind them at once
-                return add_elevation(raster, camera, fog, behind=True, backend=self.backend), raster
+                return add_airlight_elevation(
+                    raster, camera, fog, has_fog_behind=True, backend=self.backend
+                ), raster
         with timed("rasterise"):
-            raster = self.draw(camera, None, buffers)
+            raster = self.render_layer(camera, None, buffers)
         assert raster.rgb is not None and raster.alpha is not None
         with timed("sky" if fog is None else "airlight behind the splats"):  # which hides the sky
             return self.add_sky(raster.rgb, raster.alpha, camera), raster
@@ -174,7 +176,7 @@ class LayerRenderer:
         depth,
         and the buffers of the scene.
         """
-        parts, photo_buffers = photo.prepare(self.parts)
+        parts, photo_buffers = photo.prepare_parts(self.parts)
         requested_buffers = (buffers - {RGB}) | photo_buffers | {ALPHA}
         if self.fog is not None:
             requested_buffers = requested_buffers | {EXPECTED_DEPTH}

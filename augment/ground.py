@@ -38,7 +38,7 @@ from augment.semantics import SemanticClass
 # Length of a stretch, metres.
 STRETCH_M = 3.0
 # Height above or below the car from which a road is another one, metres.
-LEVEL_M = 6.0
+MAX_ROAD_HEIGHT_M = 6.0
 # Half widths of the corridor across and along the path, metres. A LiDAR sees no road right below
 # itself, so that beside a short path the road must be sought further away.
 _CORRIDORS_M = ((2.5, STRETCH_M / 2), (4.0, 4.0), (8.0, 8.0), (16.0, 16.0), (math.inf, math.inf))
@@ -83,7 +83,7 @@ class Stretches:
         return len(self.middles)
 
     @staticmethod
-    def of(positions: np.ndarray) -> Stretches:
+    def along_path(positions: np.ndarray) -> Stretches:
         """Return stretches of STRETCH_M along a path.
 
         Args:
@@ -121,7 +121,11 @@ class Stretches:
 
 
 def measure_ground(
-    points: np.ndarray, positions: np.ndarray, source: GroundSource, *, level_m: float = LEVEL_M
+    points: np.ndarray,
+    positions: np.ndarray,
+    source: GroundSource,
+    *,
+    max_height_m: float = MAX_ROAD_HEIGHT_M,
 ) -> Ground | None:
     """Return the road's heights along a path; None where there are too few points.
 
@@ -131,12 +135,12 @@ def measure_ground(
         source: origin of the points.
         level_m: height above or below the path from which points are another road's.
     """
-    stretches = Stretches.of(positions)
+    stretches = Stretches.along_path(positions)
     points = np.asarray(points[:: 1 + len(points) // _MAX_MEASURED], np.float64)
     if len(points) < _MIN_IN_ALL:
         return None
     located = stretches.locate(points)
-    is_on_level = np.abs(points[:, 2] - stretches.middles[located.stretch, 2]) <= level_m
+    is_on_level = np.abs(points[:, 2] - stretches.middles[located.stretch, 2]) <= max_height_m
     groups = _group_points(located, is_on_level, len(stretches))
     if not groups:
         return None
@@ -273,7 +277,7 @@ def ground_points(points: np.ndarray, positions: np.ndarray) -> np.ndarray:
         BackendUnavailable: open3d, or a library it needs, is not installed.
     """
     o3d = load_open3d()
-    stretches = Stretches.of(positions)
+    stretches = Stretches.along_path(positions)
     located = stretches.locate(points)
     window = located.stretch // math.ceil(WINDOW_M / STRETCH_M)
     for reach_m in _REACHES_M:
@@ -523,7 +527,7 @@ def _below_cameras(scene: Scene) -> np.ndarray:
 
 
 def _measure_by_planes(
-    points: np.ndarray, positions: np.ndarray, *, level_m: float = LEVEL_M
+    points: np.ndarray, positions: np.ndarray, *, level_m: float = MAX_ROAD_HEIGHT_M
 ) -> Ground | None:
     """Return the ground by open3d's planes; None, and a warning, where open3d cannot be had."""
     if len(points) == 0:
@@ -533,7 +537,7 @@ def _measure_by_planes(
     except BackendUnavailable as error:
         logger.warning("the road is not looked for among unlabelled points: %s", error)
         return None
-    return measure_ground(road_points, positions, "ransac", level_m=level_m)
+    return measure_ground(road_points, positions, "ransac", max_height_m=level_m)
 
 
 def _estimate_from_path(scene: Scene, positions: np.ndarray) -> Ground:

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.render.cpu.jit import inner, kernel, serial_kernel
+from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
 from augment.rng import MIX_A, MIX_B
 
 BLOCK = 2048  # splats that a thread takes at a time
@@ -22,7 +22,7 @@ _B = np.uint64(MIX_B)
 _S27, _S30, _S31 = (np.uint64(s) for s in (27, 30, 31))
 
 
-@inner()
+@kernel_function()
 def mix(bits):
     """Return the mixed bits of `augment.rng.mix`, for one uint64."""
     bits = (bits ^ (bits >> _S30)) * _A
@@ -77,7 +77,7 @@ def poses_at(timestamp_ns, straight_rad, tracks, is_present, out):
                 out[actor, k // 4, k % 4] = tracks.poses[sample, k // 4, k % 4]
 
 
-@inner()
+@kernel_function()
 def _interpolate(tracks, before, after, fraction, straight_rad, out):
     """Set `out` [4, 4] to the pose between two samples: slerp in rotation, linear in position.
 
@@ -327,7 +327,7 @@ def count_box_pixels(
                 counts[box, k] = 0
 
 
-@inner()
+@kernel_function()
 def _add(counts, row, column):
     """Add one pixel to a box's counts (a row of `count_box_pixels`'s)."""
     counts[0] += 1

@@ -134,7 +134,7 @@ class KnowsLidarElevation(Protocol):
     """
 
     @property
-    def lidar_top_rad(self) -> float:
+    def max_lidar_elevation_rad(self) -> float:
         """Return the highest elevation that the laser of the longest reach looks at."""
         ...
 

@@ -76,9 +76,9 @@ MAX_LEVELS = 12
 # Squares of a level from which no further level is made.
 MIN_SQUARES = 4
 # Width of the band in which levels fade, as a part of d_k.
-BAND = 0.12
+FADE_BAND = 0.12
 # Largest difference of alike colours, of 1, in each channel of the encoded colours.
-ALIKE = 0.03
+MAX_COLOR_DIFFERENCE = 0.03
 # Standard deviation of the rasteriser's blur, in cells. A pixel is 1 to 2 cells where a level
 # serves with lod_px = 1.
 BLUR_CELLS = math.sqrt(2 * COV2D_BLUR)
@@ -92,7 +92,7 @@ MIN_SCALE_M = 1e-4
 # Number of squares up to which testing their splats takes no longer than testing the squares.
 MAX_UNTESTED_SQUARES = 1024
 # Splats that are merged at once.
-BATCH = 1 << 18
+MERGE_BATCH = 1 << 18
 # Offset of the cells' grid, in cells: walls and ground at round numbers then lie inside one cell.
 GRID_OFFSET_CELLS = (0.37, 0.37, 0.5)
 # Odd factor that mixes the bits of cell numbers.
@@ -146,7 +146,7 @@ class Squares:
         return len(self.keys)
 
 
-class Boxes(NamedTuple):
+class SplatBoxes(NamedTuple):
     """Boxes around the means of every CELL splats of a level."""
 
     lows: Float[np.ndarray, "C 3"]
@@ -157,17 +157,17 @@ class Boxes(NamedTuple):
     """Largest standard deviation of the splats in each box, metres."""
 
     @staticmethod
-    def around(g: Gaussians, starts: np.ndarray) -> Boxes:
+    def around(g: Gaussians, starts: np.ndarray) -> SplatBoxes:
         """Return boxes around the splats from each start to the next."""
         means = g.means.numpy()
         longest = g.scales.numpy().max(1)
         lows, highs = (f.reduceat(means, starts) for f in (np.minimum, np.maximum))
-        return Boxes(lows, highs, np.maximum.reduceat(longest, starts))
+        return SplatBoxes(lows, highs, np.maximum.reduceat(longest, starts))
 
     @staticmethod
-    def join(boxes: Sequence[Boxes]) -> Boxes:
+    def join(boxes: Sequence[SplatBoxes]) -> SplatBoxes:
         """Return all boxes, in their order."""
-        return Boxes(*map(np.concatenate, zip(*boxes, strict=True)))
+        return SplatBoxes(*map(np.concatenate, zip(*boxes, strict=True)))
 
     def bounds(self, rows: np.ndarray) -> Bounds:
         """Return some of the boxes as bounds of the background."""
@@ -187,14 +187,14 @@ class Level:
     """Index of the part's own splat that gives each its number and class, [N]."""
     squares: Squares
     """The squares of the level."""
-    boxes: Boxes
+    boxes: SplatBoxes
     """Boxes around every CELL splats."""
     parents: Int32[np.ndarray, "N"]
     """Splat of the next level that each splat is merged into, [N]; -1 for none."""
-    unchecked: str | None = None
+    unchecked_file: str | None = None
     """Name of the file that the splats come from, whose numbers are checked when they are taken;
     None where they need no check."""
-    splats: int = 0
+    num_part_splats: int = 0
     """Number of the part's splats, where `unchecked` is set."""
     _checked: Bool[np.ndarray, "C"] = field(init=False)
     """Mask of the boxes whose splats have been checked."""
@@ -208,25 +208,25 @@ class Level:
         Args:
             cells: indices of the boxes of CELL splats.
         """
-        if self.unchecked is None:
+        if self.unchecked_file is None:
             return
         cells = np.unique(cells[~self._checked[cells]])
-        ends = (np.diff(cells) != 1) | (cells[1:] % (BATCH // CELL_SIZE) == 0)
+        ends = (np.diff(cells) != 1) | (cells[1:] % (MERGE_BATCH // CELL_SIZE) == 0)
         for run in np.split(cells, np.flatnonzero(ends) + 1) if len(cells) else []:
             rows = slice(
                 int(run[0]) * CELL_SIZE, min(int(run[-1] + 1) * CELL_SIZE, len(self.gaussians))
             )
             numbers = self.stands_for[rows]
-            is_own = numbers.min() >= 0 and numbers.max() < self.splats
-            where = f"{self.unchecked}: splats {rows.start} to {rows.stop}"
-            _check(rows_of(self.gaussians, rows), bool(is_own), where)
+            is_own = numbers.min() >= 0 and numbers.max() < self.num_part_splats
+            where = f"{self.unchecked_file}: splats {rows.start} to {rows.stop}"
+            _check(slice_gaussians(self.gaussians, rows), bool(is_own), where)
         self._checked[cells] = True
 
 
 class Tree(NamedTuple):
     """The S squares of all levels, those of level 0 first."""
 
-    boxes: Boxes
+    boxes: SplatBoxes
     """Boxes around the squares."""
     numbers: Int64[np.ndarray, "S"]
     """Level of each square."""
@@ -238,7 +238,7 @@ class Tree(NamedTuple):
     """Last splat of each square, plus 1."""
     cells_m: Float[np.ndarray, "S"]
     """c_k of each square's level, metres; 0 at level 0."""
-    cells: Boxes
+    cells: SplatBoxes
     """Boxes around every CELL splats, of all levels."""
     cell_starts: Int64[np.ndarray, "_"]
     """First of `cells` of each level."""
@@ -266,13 +266,15 @@ class Levels:
             coarse_squares = starts[number + 1] + np.searchsorted(level.keys, finer.keys >> 2)
             parents[starts[number] : starts[number + 1]] = coarse_squares
         return Tree(
-            Boxes.join([Boxes(level.lows, level.highs, level.longest) for level in level_squares]),
+            SplatBoxes.join(
+                [SplatBoxes(level.lows, level.highs, level.longest) for level in level_squares]
+            ),
             numbers,
             parents,
             np.concatenate([level.starts[:-1] for level in level_squares]),
             np.concatenate([level.starts[1:] for level in level_squares]),
             np.where(numbers > 0, self.finest_m * 2.0 ** (numbers - 1), 0),
-            Boxes.join(cells),
+            SplatBoxes.join(cells),
             np.cumsum([0, *(len(level.longest) for level in cells)]),
         )
 
@@ -281,7 +283,7 @@ class Levels:
         return self.finest_m * 2.0 ** (number - 1)
 
 
-def rows_of(g: Gaussians, rows: slice) -> Gaussians:
+def slice_gaussians(g: Gaussians, rows: slice) -> Gaussians:
     """Return a run of the Gaussians, without a copy."""
     means, quats, scales, opacities, sh = (getattr(g, name).detach()[rows] for name in _COLUMNS)
     semantic = None if g.semantic is None else g.semantic[rows]
@@ -315,7 +317,7 @@ def check_background(gaussians: Gaussians) -> None:
     Raises:
         SceneError: some cannot be drawn.
     """
-    if memo_of(gaussians).known(_STORED):
+    if memo_of(gaussians).has(_STORED):
         level = levels_of(gaussians).levels[0]
         level.check(np.arange(len(level.boxes.longest)))
 
@@ -379,12 +381,14 @@ def update_levels(levels: Levels, g: Gaussians) -> Levels:
     Raises:
         SceneError: the levels' file is damaged.
     """
-    new_levels = [replace(levels.levels[0], gaussians=rows_of(g, slice(None)), unchecked=None)]
+    new_levels = [
+        replace(levels.levels[0], gaussians=slice_gaussians(g, slice(None)), unchecked=None)
+    ]
     for finer, level in itertools.pairwise(levels.levels):
         if len(finer.parents) and not -1 <= finer.parents.min() <= finer.parents.max() < len(
             level.gaussians
         ):
-            raise SceneError(f"{level.unchecked}: parents must be splats of the next level")
+            raise SceneError(f"{level.unchecked_file}: parents must be splats of the next level")
         new_levels.append(
             replace(level, gaussians=_reweigh(finer, new_levels[-1].gaussians, level))
         )
@@ -438,8 +442,8 @@ def _reweigh(finer: Level, g: Gaussians, level: Level) -> Gaussians:
 
 def has_stored_levels(gaussians: Gaussians) -> bool:
     """Return True if levels lie in a file with these Gaussians."""
-    is_known = memo_of(gaussians).known(_STORED)
-    return is_known and levels_of(gaussians).levels[0].unchecked is not None
+    is_known = memo_of(gaussians).has(_STORED)
+    return is_known and levels_of(gaussians).levels[0].unchecked_file is not None
 
 
 def join_pieces(pieces: Iterable[LevelPiece]) -> LevelPiece:
@@ -455,7 +459,7 @@ def build_levels(
     gaussians: Gaussians,
     *,
     antialiased: bool = False,
-    keep: Callable[[Iterable[LevelPiece]], LevelPiece] = join_pieces,
+    store_piece: Callable[[Iterable[LevelPiece]], LevelPiece] = join_pieces,
 ) -> Levels:
     """Build the levels of one Gaussian or more.
 
@@ -467,11 +471,11 @@ def build_levels(
             image.
         keep: puts the pieces of a level where the level is to lie.
     """
-    detached = rows_of(gaussians, slice(None))
+    detached = slice_gaussians(gaussians, slice(None))
     finest_m, order, keys = square_order(detached)
     piece = LevelPiece(detached, order.astype(np.int32), keys)
     if not (np.diff(piece.stands_for) == 1).all():
-        piece = keep(
+        piece = store_piece(
             LevelPiece(
                 detached.select(torch.from_numpy(order[rows])), *(v[rows] for v in piece[1:])
             )
@@ -480,7 +484,7 @@ def build_levels(
     levels = [level_of(piece)]
     while len(levels[-1].squares) > MIN_SQUARES and len(levels) <= MAX_LEVELS:
         cell_m = finest_m * 2.0 ** (len(levels) - 1)
-        piece = keep(build_coarser_level(levels[-1], cell_m, antialiased=antialiased))
+        piece = store_piece(build_coarser_level(levels[-1], cell_m, antialiased=antialiased))
         levels.append(level_of(piece, levels[-1].squares))
     return Levels(finest_m, tuple(levels))
 
@@ -502,7 +506,7 @@ def square_order(g: Gaussians) -> tuple[float, Int64[np.ndarray, "N"], Int64[np.
 
 def batches(count: int) -> Iterator[slice]:
     """Return slices that cut `count` rows into runs of BATCH."""
-    return (slice(first, min(first + BATCH, count)) for first in range(0, count, BATCH))
+    return (slice(first, min(first + MERGE_BATCH, count)) for first in range(0, count, MERGE_BATCH))
 
 
 def finest_cell_m(means: Float[Tensor, "N 3"]) -> float:
@@ -558,12 +562,12 @@ def level_of(piece: LevelPiece, finer: Squares | None = None) -> Level:
     firsts = np.flatnonzero(np.diff(piece.keys, prepend=-1))
     keys = piece.keys[firsts]
     starts = np.append(firsts, len(piece.keys))
-    lows, highs, longest = Boxes.around(g, firsts)
+    lows, highs, longest = SplatBoxes.around(g, firsts)
     if finer is not None:
         firsts = np.searchsorted(finer.keys >> 2, keys)
         lows = np.minimum.reduceat(finer.lows, firsts)
         highs = np.maximum.reduceat(finer.highs, firsts)
-    boxes = Boxes.around(g, np.arange(0, len(g), CELL_SIZE))
+    boxes = SplatBoxes.around(g, np.arange(0, len(g), CELL_SIZE))
     parents = np.full(len(g), -1, np.int32)
     return Level(g, piece.stands_for, Squares(keys, starts, lows, highs, longest), boxes, parents)
 
@@ -586,7 +590,7 @@ def build_coarser_level(
     count = 0
     while first_square < len(starts) - 1:
         end_square = max(
-            int(np.searchsorted(starts, starts[first_square] + BATCH, "right")) - 1,
+            int(np.searchsorted(starts, starts[first_square] + MERGE_BATCH, "right")) - 1,
             first_square + 1,
         )
         rows = slice(int(starts[first_square]), int(starts[end_square]))
@@ -594,7 +598,7 @@ def build_coarser_level(
             keys[firsts[first_square:end_square]], np.diff(starts[first_square : end_square + 1])
         )
         merged, leads, targets = merge_cells(
-            rows_of(finer.gaussians, rows), squares, cell_m, blur_m
+            slice_gaussians(finer.gaussians, rows), squares, cell_m, blur_m
         )
         finer.parents[rows] = np.where(targets < 0, -1, targets + count)
         count += len(leads)
@@ -681,7 +685,7 @@ def _find_alike(
     starts = np.flatnonzero(is_first)
     counts = np.diff(starts, append=len(order))
     lows, highs = (f.reduceat(sh[order], starts) for f in (np.minimum, np.maximum))
-    has_one_color = (SH_C0 * (highs - lows).max(1) <= ALIKE) & (counts > 1)
+    has_one_color = (SH_C0 * (highs - lows).max(1) <= MAX_COLOR_DIFFERENCE) & (counts > 1)
     is_alike = np.zeros(len(order), bool)
     is_alike[order] = np.repeat(has_one_color, counts)
     return is_alike & ~is_large
@@ -771,7 +775,7 @@ class ReplacedParts:
 
     parts: tuple[PosedGaussians, ...]
     """The parts to draw."""
-    pieces: tuple[tuple[int, Int32[np.ndarray, "_"] | None], ...]
+    stood_for: tuple[tuple[int, Int32[np.ndarray, "_"] | None], ...]
     """For each part, the splats of the replaced parts that its splats stand for: a first number,
     and numbers that are added to it (None: 0, 1, ...)."""
 
@@ -783,7 +787,7 @@ class ReplacedParts:
         starts = np.cumsum([0, *(len(part.gaussians) for part in self.parts)])
         piece_numbers = np.searchsorted(starts, ids, "right") - 1
         restored_ids = np.full_like(ids, -1)
-        for number, (first, stands_for) in enumerate(self.pieces):
+        for number, (first, stands_for) in enumerate(self.stood_for):
             is_of_piece = piece_numbers == number
             local_ids = ids[is_of_piece] - starts[number]
             restored_ids[is_of_piece] = first + (
@@ -829,7 +833,7 @@ def choose_parts(
             stood_for.append((first_splat, stands_for))
         first_splat += len(part.gaussians)
     if not chosen_parts:  # a rasteriser wants to know at least the parts' type
-        no_gaussians = rows_of(parts[0].gaussians, slice(0))
+        no_gaussians = slice_gaussians(parts[0].gaussians, slice(0))
         chosen_parts.append(
             replace(parts[0], gaussians=no_gaussians, color_maps=None, color_rows=None)
         )
@@ -863,7 +867,7 @@ def _is_merged(levels: Levels, level_runs: Sequence[_LevelRuns]) -> bool:
 
     Where all splats are those of level 0, the part stays as it is.
     """
-    is_checked = levels.levels[0].unchecked is None
+    is_checked = levels.levels[0].unchecked_file is None
     return not is_checked or any(runs.level is not levels.levels[0] for runs in level_runs)
 
 
@@ -873,7 +877,7 @@ def _pieces(
     """Yield the parts of one level's runs, each with the numbers that its splats stand for."""
     level = runs.level
     is_faded = runs.shares < 1
-    is_small = len(level.gaussians) <= BATCH  # then a copy costs less than a second part
+    is_small = len(level.gaussians) <= MERGE_BATCH  # then a copy costs less than a second part
     for is_chosen in [np.ones_like(is_faded)] if is_small else [~is_faded, is_faded]:
         rows = runs.rows[is_chosen]
         shares = runs.shares[is_chosen]
@@ -885,7 +889,7 @@ def _pieces(
             opacities = torch.from_numpy(run_rows.copy() if is_small else np.empty_like(run_rows))
             for (first, last), share in zip(rows.tolist(), shares.tolist(), strict=True):
                 if share < 1:
-                    opacities[first:last] = faded(g.opacities[first:last], share)
+                    opacities[first:last] = fade_opacities(g.opacities[first:last], share)
             g = replace(g, opacities=opacities)
         color_rows = None
         if part.color_rows is not None:
@@ -901,12 +905,12 @@ def _pieces(
         for run_rows in itertools.starmap(slice, rows.tolist()):
             run_color_rows = None if color_rows is None else color_rows[run_rows]
             run_part = replace(
-                piece, gaussians=rows_of(g, run_rows), color_rows=run_color_rows, rows=None
+                piece, gaussians=slice_gaussians(g, run_rows), color_rows=run_color_rows, rows=None
             )
             yield run_part, level.stands_for[run_rows]
 
 
-def faded(opacities: Float[Tensor, "N"], share: float) -> Float[Tensor, "N"]:
+def fade_opacities(opacities: Float[Tensor, "N"], share: float) -> Float[Tensor, "N"]:
     """Return the opacities of splats that are drawn for a share of what they hide.
 
     Args:
@@ -989,7 +993,9 @@ def choose_squares(
     else:
         axis_distances_m = np.maximum(tree.boxes.lows - eye_m, eye_m - tree.boxes.highs)
         distance_m = np.linalg.norm(np.maximum(axis_distances_m, 0), axis=1)
-        refined_share = np.clip((1 + BAND - distance_m / np.maximum(cell_px, 1e-9)) / BAND, 0, 1)
+        refined_share = np.clip(
+            (1 + FADE_BAND - distance_m / np.maximum(cell_px, 1e-9)) / FADE_BAND, 0, 1
+        )
     refined_share[tree.numbers == 0] = 0
     # A square that holds a partly refined one is refined wholly, because d_k doubles from level to
     # level.

@@ -74,7 +74,7 @@ class SceneMemo:
                 with self._lock:
                     self._making.pop(key, None)
 
-    def known(self, key: Hashable) -> bool:
+    def has(self, key: Hashable) -> bool:
         """Return True if `get` would make nothing."""
         with self._lock:
             return key in self._values or key in self._shared
@@ -100,7 +100,7 @@ class SceneMemo:
         with self._lock:
             return dict(self._shared)
 
-    def update(self, shared: Mapping[Hashable, Any]) -> None:
+    def take_shared(self, shared: Mapping[Hashable, Any]) -> None:
         """Take over the values that another process's memo shares."""
         for key, value in shared.items():
             self.put(key, value, shared=True)

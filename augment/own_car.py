@@ -78,10 +78,10 @@ def moving_frames(cameras: Sequence[Camera]) -> list[int]:
         if last_centre is None or np.linalg.norm(centre - last_centre) >= _STEP_M:
             positions.append(i)
             last_centre = centre
-    return spread(positions, MAX_IMAGES)
+    return spread_evenly(positions, MAX_IMAGES)
 
 
-def spread(items: Sequence[T], count: int) -> list[T]:
+def spread_evenly(items: Sequence[T], count: int) -> list[T]:
     """Return at most `count` of the items, evenly spread, with the first and the last."""
     places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
     return [items[i] for i in places]

@@ -36,18 +36,18 @@ from recipes.errors import RecipeError
 from recipes.schema import Recipe, Sensor
 
 # Name of the pass that blurs the finished picture as a lens does.
-LENS = "lens blur"
+LENS_BLUR_PASS = "lens blur"
 # Name of the pass that adds sensor noise, the last one of all.
-NOISE = "sensor noise"
+SENSOR_NOISE_PASS = "sensor noise"
 # Name of the pass that renders the scene without what lies on it.
-BARE = "bare surface"
+BARE_SURFACE_PASS = "bare surface"
 
 
 @dataclass(frozen=True)
 class Plan:
     """Passes and buffers of one recipe in one scene, for all views."""
 
-    placed: Mapping[str, EffectPlan]
+    effect_plans: Mapping[str, EffectPlan]
     """Plan of every effect in the scene, by effect name."""
     settings: RasterSettings
     """Settings of the rasteriser."""
@@ -63,18 +63,18 @@ class Plan:
     where these show what lies on it."""
     depth_buffer: str | None
     """Name of the buffer that is written as depth; None without a depth image."""
-    semantic: bool
+    has_semantic: bool
     """If True, a semantic image is written."""
-    instance: bool
+    has_instance: bool
     """If True, an instance image is written."""
-    shows_first: bool
+    shows_first_hit: bool
     """If True, those images show the first thing that a ray meets, such as water; else the scene
     under it."""
     finds_boxes: bool
     """If True, labels or instance images need the depth of the solid surfaces."""
     uses_recorded_exposure: bool
     """If True, the cameras' colour maps are applied to the finished picture."""
-    on_photo: bool
+    is_on_photo: bool
     """If True, the recorded image stays the picture, and the scene supplies the weather."""
     sensor: Sensor
     """Lens and sensor of the recipe."""
@@ -86,10 +86,10 @@ class Plan:
     @property
     def water_level_z_m(self) -> float | None:
         """Return the height of the water that is drawn, scene world; None without water."""
-        levels = (p.water_level_z_m for p in self.placed.values() if p.data is not None)
+        levels = (p.water_level_z_m for p in self.effect_plans.values() if p.data is not None)
         return next((level for level in levels if level is not None), None)
 
-    def active(self, scene: Scene, *, backend: str = AUTO) -> tuple[EffectInScene, ...]:
+    def active_effects(self, scene: Scene, *, backend: str = AUTO) -> tuple[EffectInScene, ...]:
         """Return the effects that change anything, in the order in which they are applied.
 
         Args:
@@ -98,7 +98,7 @@ class Plan:
         """
         active_effects: tuple[EffectInScene, ...] = ()
         for effect in effects.EFFECTS:
-            data = self.placed[effect.name].data
+            data = self.effect_plans[effect.name].data
             if data is not None:
                 active_effects = (
                     *active_effects,
@@ -106,10 +106,10 @@ class Plan:
                 )
         return active_effects
 
-    def without(self, names: Iterable[str]) -> Plan:
+    def without_effects(self, names: Iterable[str]) -> Plan:
         """Return the plan as if the named effects changed nothing."""
-        idle_plans = {name: replace(self.placed[name], data=None) for name in names}
-        return replace(self, placed={**self.placed, **idle_plans})
+        idle_plans = {name: replace(self.effect_plans[name], data=None) for name in names}
+        return replace(self, effect_plans={**self.effect_plans, **idle_plans})
 
     def as_dict(self) -> dict[str, object]:
         """Return the plan for machines: buffers sorted, one entry a step."""
@@ -127,9 +127,9 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         SceneError: the recipe needs what the scene does not have (the road's height, photos).
         RecipeError: the recipe's quality has still to choose its settings.
     """
-    if recipe.quality.is_open:
+    if recipe.quality.has_open_choice:
         raise RecipeError(
-            f"recipe {recipe.name}, variant {recipe.variant}: quality {recipe.quality.words} has "
+            f"recipe {recipe.name}, variant {recipe.variant}: quality {recipe.quality.summary} has "
             f"still to choose its settings in view of a scene, as jobs do; settle the recipe first "
             f"(augment.jobs.quality)"
         )
@@ -138,7 +138,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         check_background(scene.background)
     effect_plans = dict[str, EffectPlan]()
     for effect in reversed(effects.EFFECTS):  # later effects may cover earlier ones
-        effect_plans[effect.name] = effect.place(recipe, scene, effect_plans)
+        effect_plans[effect.name] = effect.plan_in_scene(recipe, scene, effect_plans)
     effect_plans = {effect.name: effect_plans[effect.name] for effect in effects.EFFECTS}
     output = recipe.output
     render = recipe.render
@@ -160,7 +160,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     buffers = frozenset(image_buffers).union(*effect_buffers)
     exposure = _exposure_step(recipe, scene)
     return Plan(
-        placed=effect_plans,
+        effect_plans=effect_plans,
         settings=RasterSettings(
             near_m=render.near_m,
             alpha_max=render.alpha_max,
@@ -176,12 +176,12 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         image_buffers=frozenset(image_buffers),
         bare_buffers=frozenset(bare_buffers),
         depth_buffer=depth_buffer,
-        semantic=output.semantic,
-        instance=output.instance,
-        shows_first=output.surface == "first",
+        has_semantic=output.semantic,
+        has_instance=output.instance,
+        shows_first_hit=output.surface == "first",
         finds_boxes=finds_boxes,
         uses_recorded_exposure=exposure.runs,
-        on_photo=recipe.render.base == RECORDED,
+        is_on_photo=recipe.render.base == RECORDED,
         sensor=recipe.camera,
         seed=recipe.seed,
         steps=_all_steps(recipe, scene, effect_plans, buffers, bare_buffers, exposure),
@@ -215,11 +215,15 @@ def _all_steps(
         Step("rasterise", True, f"{raster_reason}; buffers {', '.join(sorted(buffers))}"),
         _photo_step(recipe),
         *drawing_steps,
-        Step(BARE, bool(bare), bare_reason),
+        Step(BARE_SURFACE_PASS, bool(bare), bare_reason),
         *steps_of_effects(PICTURE),
         exposure,
-        Step(LENS, recipe.camera.psf_px > 0, f"camera.psf_px is {recipe.camera.psf_px:g}"),
-        Step(NOISE, recipe.camera.noise > 0, f"camera.noise is {recipe.camera.noise:g}"),
+        Step(
+            LENS_BLUR_PASS, recipe.camera.psf_px > 0, f"camera.psf_px is {recipe.camera.psf_px:g}"
+        ),
+        Step(
+            SENSOR_NOISE_PASS, recipe.camera.noise > 0, f"camera.noise is {recipe.camera.noise:g}"
+        ),
         Step("depth image", output.depth != "none", f"output.depth is {output.depth!r}"),
         Step("semantic image", output.semantic, _output_reason("semantic", recipe)),
         Step("instance image", output.instance, _output_reason("instance", recipe)),
@@ -229,7 +233,7 @@ def _all_steps(
 
 def _is_covered(candidates: Iterable[Effect], effect_plans: Mapping[str, EffectPlan]) -> bool:
     """Return True if an effect lies on the scene."""
-    return any(e.lies_on_scene and effect_plans[e.name].data is not None for e in candidates)
+    return any(e.adds_overlays and effect_plans[e.name].data is not None for e in candidates)
 
 
 def _photo_step(recipe: Recipe) -> Step:
@@ -265,7 +269,7 @@ def _output_reason(name: str, recipe: Recipe) -> str:
 class ViewPlan:
     """Passes and buffers of one camera's image."""
 
-    actors: tuple[int, ...]
+    actor_ids: tuple[int, ...]
     """Instance ids (1 + index in the scene) of the actors to render."""
     effects: tuple[EffectInScene, ...]
     """Effects that can be seen, in the order in which they are applied."""
@@ -277,11 +281,11 @@ class ViewPlan:
     """Steps of the plan, each with this camera's reason."""
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def effect_names(self) -> tuple[str, ...]:
         """Return the names of the effects."""
-        return tuple(effect.effect.name for effect in self.effects)
+        return tuple(effect.hooks.name for effect in self.effects)
 
-    def skipping(self, reasons: Mapping[str, str]) -> ViewPlan:
+    def skip_steps(self, reasons: Mapping[str, str]) -> ViewPlan:
         """Return the plan without passes that rendering has shown to be needless.
 
         Args:
@@ -305,11 +309,11 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     Raises:
         SceneError: an effect cannot be placed in this scene.
     """
-    active_effects = plan.active(scene, backend=backend)
+    active_effects = plan.active_effects(scene, backend=backend)
     effect_cameras = [
         effect_camera
         for effect in active_effects
-        for effect_camera in effect.effect.cameras(effect, camera) or ()
+        for effect_camera in effect.hooks.cameras(effect, camera) or ()
     ]
     cameras = tuple(effect_cameras) or (camera,)
     poses = scene.poses_at(camera.timestamp_ns)
@@ -318,23 +322,23 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     effects_in_view = list[EffectInScene]()
     skip_reasons = dict[str, str]()
     for effect in active_effects:
-        visibility = effect.effect.in_view(effect, query)
-        skip_reasons |= visibility.skipped
-        if visibility.is_seen:
-            owners |= visibility.owners
-            effects_in_view.append(replace(effect, seen=visibility.seen))
-    effect_buffers = (plan.placed[effect.effect.name].buffers for effect in effects_in_view)
+        visibility = effect.hooks.visibility(effect, query)
+        skip_reasons |= visibility.skip_reasons
+        if visibility.is_visible:
+            owners |= visibility.instance_ids
+            effects_in_view.append(replace(effect, view_data=visibility.view_data))
+    effect_buffers = (plan.effect_plans[effect.hooks.name].buffers for effect in effects_in_view)
     buffers = plan.image_buffers.union(*effect_buffers)
     bare_buffers = plan.bare_buffers
     is_layered = cameras != (camera,)  # then the picture differs even for a bare scene
     if (
         bare_buffers
         and not is_layered
-        and not any(effect.effect.lies_on_scene for effect in effects_in_view)
+        and not any(effect.hooks.adds_overlays for effect in effects_in_view)
     ):
         buffers = buffers | bare_buffers
         bare_buffers = frozenset[str]()
-        skip_reasons[BARE] = "nothing that lies on the scene can be in view"
+        skip_reasons[BARE_SURFACE_PASS] = "nothing that lies on the scene can be in view"
     raster_reason = (
         f"background and {len(owners)} of {len(scene.actors)} actors "
         f"({len(scene.actors) - len(poses)} absent at this time, "
@@ -342,7 +346,7 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     )
     steps = _skip(plan.steps, skip_reasons)
     return ViewPlan(
-        actors=tuple(sorted(owners)),
+        actor_ids=tuple(sorted(owners)),
         effects=tuple(effects_in_view),
         buffers=buffers,
         bare_buffers=bare_buffers,

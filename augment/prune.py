@@ -41,7 +41,7 @@ from augment.render.constants import RasterSettings
 from augment.render.cpu.order import cached_of_tensor
 from augment.render.threads import num_concurrent_views, split_threads
 from augment.scene import Gaussians, PosedGaussians, Scene
-from augment.timing import counted
+from augment.timing import counted_steps
 from recipes.schema import Render
 
 # Recorded views that are rendered, at least, where there are as many.
@@ -53,15 +53,15 @@ MAX_WIDTH_PX = 320
 # Product of views and splats, at most: larger backgrounds are rendered in fewer views.
 MAX_NUMBERS = 200_000_000
 # Distance from all recorded cameras beyond which a view may show what none of them did, metres.
-FARTHEST_M = 2.0
+MAX_DISTANCE_M = 2.0
 # Weights of red, green and blue in luma.
 LUMA = (0.299, 0.587, 0.114)
 # Luma behind all splats.
-SKY = 0.7
+SKY_LUMA = 0.7
 # Contrast that a splat has at least, of 1.
 MIN_CONTRAST = 0.05
 # Errors up to which splats go in each round, shares of white.
-ROUNDS = (0.0002, 0.0004, 0.0008, 0.0016, 0.0032, math.inf)
+ROUND_ERRORS = (0.0002, 0.0004, 0.0008, 0.0016, 0.0032, math.inf)
 # Alpha that is not clamped: nothing is known of what is behind a splat whose alpha is clamped.
 _ALPHA_MAX = 0.9999
 # Key of the errors in a scene's memo.
@@ -99,7 +99,7 @@ def prune_parts(
     )
 
 
-def precompute_errors(scene: Scene, most: float = math.inf, *, progress: bool = False) -> None:
+def precompute_errors(scene: Scene, max_error: float = math.inf, *, progress: bool = False) -> None:
     """Find the errors up to `most` now, so that other processes take them over.
 
     Args:
@@ -108,12 +108,12 @@ def precompute_errors(scene: Scene, most: float = math.inf, *, progress: bool = 
         progress: if True, show a bar on stderr.
     """
     if not has_stored_levels(scene.background):
-        errors_of(scene, most, progress=progress)
+        errors_of(scene, max_error, progress=progress)
         memo_of(scene).put(_ERRORS, _search_of(scene), shared=True)
 
 
 def errors_of(
-    scene: Scene, most: float = math.inf, *, progress: bool = False
+    scene: Scene, max_error: float = math.inf, *, progress: bool = False
 ) -> Float[np.ndarray, "N"]:
     """Return the error that leaving out each splat of the background makes, share of white,
     float32.
@@ -128,7 +128,7 @@ def errors_of(
         progress: if True, show a bar on stderr.
     """
     search = _search_of(scene)
-    num_rounds = min(bisect_left(ROUNDS, most) + 1, len(ROUNDS))
+    num_rounds = min(bisect_left(ROUND_ERRORS, max_error) + 1, len(ROUND_ERRORS))
     with _search_lock:
         if search.rounds < num_rounds:
             _find_errors(scene, search, num_rounds, progress)
@@ -146,7 +146,7 @@ def _is_near(camera: Camera, scene: Scene) -> bool:
     """Return True if a camera is near a recorded one."""
     centres = memo_of(scene).get(("camera centres",), lambda: _centres_of(scene))
     distances_m = np.linalg.norm(centres - camera.centre.numpy(), axis=1)
-    return bool(distances_m.min(initial=np.inf) <= FARTHEST_M)
+    return bool(distances_m.min(initial=np.inf) <= MAX_DISTANCE_M)
 
 
 def _centres_of(scene: Scene) -> Float[np.ndarray, "C 3"]:
@@ -188,7 +188,7 @@ class _ErrorSearch:
         sums = np.zeros(len(order))
         for view, view_change in zip(views, self.gone, strict=True):
             np.maximum(sums, view_change + _changes_of_all(view, count)[order].cumsum(), out=sums)
-        leaving = order[: np.searchsorted(sums, ROUNDS[self.rounds], side="right")]
+        leaving = order[: np.searchsorted(sums, ROUND_ERRORS[self.rounds], side="right")]
         self.errors[leaving] = sums[: len(leaving)]
         self.gone += [_changes_of_all(view, count)[leaving].sum() for view in views]
         self.rounds += 1
@@ -218,7 +218,7 @@ def _find_errors(scene: Scene, search: _ErrorSearch, num_rounds: int, progress: 
     pool = split_threads(count) if count > 1 else None
     with (
         ProgressBar(desc=title, total=num_steps, unit="view", disable=not progress) as bar,
-        counted(title, num_steps) as advance,
+        counted_steps(title, num_steps) as advance,
     ):
 
         def find_changes(camera: Camera) -> SplatChanges:
@@ -274,15 +274,15 @@ def _find_changes(
     """Return the background's splats in a camera's frame, and each one's change of the view's
     mean.
     """
-    from augment.render.cpu.backward import record
+    from augment.render.cpu.backward import record_render
     from augment.render.cpu.driver import gather_inputs
 
     settings = RasterSettings(alpha_max=_ALPHA_MAX)
     parts = [_on_cpu(part) for part in scene.parts_for(camera)]
-    inputs = gather_inputs(parts, camera, settings, None, with_color=True, culled=True)
-    tape = record(inputs, camera, settings, scratch, with_depth=False)
+    inputs = gather_inputs(parts, camera, settings, None, with_color=True, is_culled=True)
+    tape = record_render(inputs, camera, settings, scratch, with_depth=False)
     d_rgb = np.broadcast_to(np.array(LUMA, np.float32), tape.rgb.shape).copy()
-    ids, weights, effects = tape.sum_splat_effects(d_rgb, np.full_like(tape.alpha, -SKY))
+    ids, weights, effects = tape.sum_splat_effects(d_rgb, np.full_like(tape.alpha, -SKY_LUMA))
     is_background = (ids >= 0) & (ids < len(is_opaque))
     ids = ids[is_background]
     weights = weights[is_background] / np.float32(LUMA[0])

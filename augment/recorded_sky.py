@@ -178,16 +178,16 @@ class RecordedSky(NamedTuple):
     Pixels in neither mask cannot be told.
     """
 
-    sky: Bool[np.ndarray, "H W"]
+    is_sky: Bool[np.ndarray, "H W"]
     """Pixels that surely show sky."""
-    solid: Bool[np.ndarray, "H W"]
+    is_solid: Bool[np.ndarray, "H W"]
     """Pixels that surely show no sky."""
 
 
 def find_sky(
     rgb: UInt8[np.ndarray, "H W 3"],
     elevation_rad: Float[np.ndarray, "H W"],
-    hits: Bool[np.ndarray, "H W"] | None = None,
+    has_return: Bool[np.ndarray, "H W"] | None = None,
     lidar_top_rad: float = math.inf,
 ) -> RecordedSky | None:
     """Return the sky of an image; None at night, or with no sky in view.
@@ -205,9 +205,11 @@ def find_sky(
     if not is_above_horizon.any():
         return RecordedSky(is_above_horizon, ~is_above_horizon)
     is_solid = is_unknown = np.zeros(is_above_horizon.shape, bool)
-    if hits is not None:
-        is_solid = _grow_mask(hits, _HIT_PX, _HIT_PX)
-        reaches_top = np.any(hits & (elevation_rad > lidar_top_rad - TOP_MARGIN_RAD), axis=0)[None]
+    if has_return is not None:
+        is_solid = _grow_mask(has_return, _HIT_PX, _HIT_PX)
+        reaches_top = np.any(has_return & (elevation_rad > lidar_top_rad - TOP_MARGIN_RAD), axis=0)[
+            None
+        ]
         is_above_returns = np.cumsum(is_solid, axis=0) == 0  # above all returns of the column
         is_unknown = is_above_returns & is_above_horizon & _grow_mask(reaches_top, 1, _BESIDE_PX)
     is_bright = find_sky_like_pixels(rgb, is_above_horizon, _WINDOW_PX)
@@ -265,7 +267,7 @@ def _recorded_sky(scene: Scene, frame: Frame, camera: Camera) -> RecordedSky | N
     if points is None:
         return find_sky(rgb, elevation_rad(camera))
     if isinstance(scene.labels, KnowsLidarElevation):
-        top_rad = scene.labels.lidar_top_rad
+        top_rad = scene.labels.max_lidar_elevation_rad
     else:
         top_rad = _top_rad(points, camera.centre.numpy().astype(np.float32))
     return find_sky(
@@ -316,7 +318,7 @@ def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
     tall stood near). None where there are not enough of them.
     """
     if isinstance(scene.labels, KnowsLidarElevation):
-        return scene.labels.lidar_top_rad
+        return scene.labels.max_lidar_elevation_rad
     tops = []
     for index in frames:
         cameras = scene.frame(index).cameras.values()

@@ -132,11 +132,11 @@ class PackedTracks(NamedTuple):
     """world_from_actor of all samples, float64 [K, 4, 4]."""
     holds_ns: np.ndarray
     """hold_ns of each track, int64 [A]."""
-    gaps_ns: np.ndarray
+    max_gaps_ns: np.ndarray
     """max_gap_ns of each track, int64 [A]; -1 where it has none."""
 
     @staticmethod
-    def of(tracks: Sequence[Track]) -> PackedTracks:
+    def from_tracks(tracks: Sequence[Track]) -> PackedTracks:
         """Return the tracks packed, in their order."""
         knots = [track._knots for track in tracks]
         starts = np.cumsum([0, *(len(track_knots.times_ns) for track_knots in knots)])
@@ -234,7 +234,7 @@ class ColorSeries:
 
     def weights_at(self, timestamp_ns: int) -> list[float]:
         """Return b_1 to b_{F-1} at a time."""
-        return basis(self.phase_at(timestamp_ns), self.coefficients.shape[1] + 1)[1:]
+        return fourier_basis(self.phase_at(timestamp_ns), self.coefficients.shape[1] + 1)[1:]
 
     def color_offset_at(self, timestamp_ns: int) -> Float[Tensor, "N 3"]:
         """Return the colours to add to sh[:, 0] at a time."""
@@ -245,7 +245,7 @@ class ColorSeries:
         return change
 
 
-def basis(phase: float, terms: int) -> list[float]:
+def fourier_basis(phase: float, terms: int) -> list[float]:
     """Return b_0 to b_{terms-1} at a phase."""
     return [
         math.cos(math.pi * k * phase) if k % 2 == 0 else math.sin(math.pi * (k + 1) * phase)
@@ -257,7 +257,7 @@ def colors_at(
     sh: Float[Tensor, "N K 3"],
     waves: ColorSeries | None,
     timestamp_ns: int,
-    turn: Float[Tensor, "3 3"] | None,
+    rotation: Float[Tensor, "3 3"] | None,
     *,
     fast: bool = True,
 ) -> Float[Tensor, "N K 3"]:
@@ -272,11 +272,11 @@ def colors_at(
             rounding.
     """
     if fast and sh.dtype == torch.float32 and not sh.requires_grad:
-        return _colors_by_kernel(sh, waves, timestamp_ns, turn)
+        return _colors_by_kernel(sh, waves, timestamp_ns, rotation)
     if waves is not None:
         base_colors = sh[:, :1] + waves.color_offset_at(timestamp_ns)[:, None]
         sh = torch.cat([base_colors, sh[:, 1:]], 1)
-    return sh if turn is None or sh.shape[1] == 1 else rotate_sh(sh, turn)
+    return sh if rotation is None or sh.shape[1] == 1 else rotate_sh(sh, rotation)
 
 
 def _colors_by_kernel(
@@ -481,7 +481,7 @@ class PosedGaussians:
     all."""
 
     @property
-    def map_rows(self) -> Int16[Tensor, "N"] | None:
+    def color_map_rows(self) -> Int16[Tensor, "N"] | None:
         """Return the row of each splat's colour map; None where all take the first."""
         if self.color_maps is None or len(self.color_maps) == 1:
             return None
@@ -615,7 +615,7 @@ class Scene:
         )
 
     def parts_at(
-        self, timestamp_ns: int, only: Collection[int] | None = None
+        self, timestamp_ns: int, actor_ids: Collection[int] | None = None
     ) -> Iterator[PosedGaussians]:
         """Yield the background and every actor that exists at a time, posed.
 
@@ -625,7 +625,7 @@ class Scene:
         """
         yield PosedGaussians(self.background)
         for number, actor in enumerate(self.actors, start=1):
-            if only is not None and number not in only:
+            if actor_ids is not None and number not in actor_ids:
                 continue
             pose = actor.track.pose_at(timestamp_ns)
             if pose is not None:
@@ -639,7 +639,7 @@ class Scene:
         if not self.actors:
             return {}
         tracks = memo_of(self).get(
-            ("tracks",), lambda: PackedTracks.of([actor.track for actor in self.actors])
+            ("tracks",), lambda: PackedTracks.from_tracks([actor.track for actor in self.actors])
         )
         is_present = np.empty(len(self.actors), np.uint8)
         poses = np.empty((len(is_present), 4, 4))
@@ -647,10 +647,10 @@ class Scene:
         return {int(n) + 1: poses[n] for n in np.flatnonzero(is_present)}
 
     def parts_for(
-        self, camera: Camera, only: Collection[int] | None = None
+        self, camera: Camera, actor_ids: Collection[int] | None = None
     ) -> tuple[PosedGaussians, ...]:
         """Return the parts at the moment of the camera's image, as `parts_at` yields them."""
-        return tuple(self.parts_at(camera.timestamp_ns, only))
+        return tuple(self.parts_at(camera.timestamp_ns, actor_ids))
 
     def color_map(self, camera: Camera) -> Float[Tensor, "3 4"] | None:
         """Return the image's colour map, or else the camera's.

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.memo import memo_of
-from augment.render.cuda.runtime import resident
+from augment.render.cuda.runtime import gpu_copy
 
 
 @runtime_checkable
@@ -85,9 +85,9 @@ def sample_at(sky: Sky, directions: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 
     if isinstance(sky, ConstantSky):
         return ConstantSky(sky.rgb.to(directions.device)).sample(directions)
     if isinstance(sky, LatLongSky):
-        return LatLongSky(resident(sky.image)).sample(directions)
+        return LatLongSky(gpu_copy(sky.image)).sample(directions)
     if isinstance(sky, CubemapSky):
-        return _sample_bordered(resident(bordered_faces(sky)), directions)
+        return _sample_bordered(gpu_copy(bordered_faces(sky)), directions)
     return sky.sample(directions.cpu()).to(directions.device)
 
 

@@ -56,9 +56,9 @@ class PassProgress:
 
     name: str
     """The pass's name, as plans have it: "rasterise"; or a preparation's: "placing snow"."""
-    done: int = 0
+    num_done: int = 0
     """Steps that are done."""
-    total: int = 0
+    num_steps: int = 0
     """Steps that there are; 0 where the pass has none to count."""
 
 
@@ -78,7 +78,7 @@ class PassWatch:
     def advance(self) -> None:
         """Report one step more of the innermost pass."""
         last = self._open[-1]
-        self._open[-1] = PassProgress(last.name, last.done + 1, last.total)
+        self._open[-1] = PassProgress(last.name, last.num_done + 1, last.num_steps)
         self._report(self._open[-1])
 
     def stop(self, *, has_failed: bool) -> None:
@@ -116,7 +116,7 @@ class timed:
 
 
 @contextmanager
-def counted(name: str, total: int) -> Iterator[Callable[[], None]]:
+def counted_steps(name: str, total: int) -> Iterator[Callable[[], None]]:
     """Report a preparation that takes many steps to a watcher.
 
     Yields a function, which is to be called after each step.

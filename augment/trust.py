@@ -142,7 +142,7 @@ class SourceViews:
         """Return the names of the cameras, in the order in which they first appear."""
         return tuple(dict.fromkeys(view.camera.name for view in self.views))
 
-    def of(self, name: str) -> tuple[SourceView, ...]:
+    def of_camera(self, name: str) -> tuple[SourceView, ...]:
         """Return the views of one camera."""
         return tuple(view for view in self.views if view.camera.name == name)
 
@@ -159,7 +159,7 @@ class SourceViews:
         axes = np.array([c.camera_from_world.numpy()[2, :3] for c in cameras]).reshape(-1, 3)
         return centres, axes
 
-    def away(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    def pose_differences(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Return the distance of a camera from each view: metres and radians, [V] each."""
         centres, axes = self.poses
         cosine = axes @ camera.camera_from_world.numpy()[2, :3]
@@ -237,7 +237,7 @@ def nearest_view(sources: SourceViews, camera: Camera) -> NearestView | None:
     """
     if not sources.views:
         return None
-    distance_m, angle_rad = sources.away(camera)
+    distance_m, angle_rad = sources.pose_differences(camera)
     best = int(np.argmin(_pose_difference(distance_m, angle_rad)))
     magnification = camera.fx / sources.views[best].camera.fx
     return NearestView(float(distance_m[best]), float(angle_rad[best]), magnification)
@@ -319,7 +319,7 @@ class _ClearView(NamedTuple):
     @property
     def sky_share(self) -> float:
         """Return the share of the image that the recording shows as sky; 0 where unknown."""
-        return 0.0 if self.sky is None else float(self.sky.sky.mean())
+        return 0.0 if self.sky is None else float(self.sky.is_sky.mean())
 
     @property
     def has_surface(self) -> Bool[np.ndarray, "H W"]:
@@ -429,7 +429,7 @@ def _measure_trust(scene: Scene, camera: Camera, view: _ClearView, backend: str)
     is_open_sky = view.elevation_rad > 0
     is_solid = has_surface & ~(is_below_horizon & (view.alpha < MIN_GROUND_ALPHA))
     if view.sky is not None:
-        is_open_sky &= ~_erode_border(view.sky.solid)
+        is_open_sky &= ~_erode_border(view.sky.is_solid)
         if view.sky_share >= MIN_SKY_SHARE:
             is_solid &= ~_find_panes(scene, camera, view)
     is_fit = np.where(has_surface, is_solid, is_open_sky)
@@ -446,7 +446,7 @@ def _find_panes(scene: Scene, camera: Camera, view: _ClearView) -> np.ndarray:
     assert view.sky is not None
     distance_m = view.z_m * camera.ray_lengths().numpy()
     is_near = distance_m < (SKY_FROM_M if scene.has_metric_scale else math.inf)
-    return _erode_border(view.sky.sky) & view.has_surface & is_near
+    return _erode_border(view.sky.is_sky) & view.has_surface & is_near
 
 
 class _ViewPoints(NamedTuple):
@@ -547,7 +547,9 @@ def _measure_support(
 def _witnesses(scene: Scene, camera: Camera) -> list[tuple[int, SourceView]]:
     """Return the nearest views of the same camera from another place, with their numbers."""
     sources = source_views(scene)
-    distance_m, angle_rad = sources.away(camera) if sources.views else (np.zeros(0), np.zeros(0))
+    distance_m, angle_rad = (
+        sources.pose_differences(camera) if sources.views else (np.zeros(0), np.zeros(0))
+    )
     order = np.argsort(_pose_difference(distance_m, angle_rad), kind="stable").tolist()
     names = {camera.name} if camera.name in sources.names else set(sources.names)
     numbers = [n for n in order if distance_m[n] >= _PARALLAX_M]
@@ -602,7 +604,9 @@ def _points_in_view(
 
 def _nearest_views(sources: SourceViews, camera: Camera) -> list[tuple[int, SourceView]]:
     """Return the nearest views with their numbers."""
-    order = np.argsort(_pose_difference(*sources.away(camera)), kind="stable")[:_NUM_VIEWS]
+    order = np.argsort(_pose_difference(*sources.pose_differences(camera)), kind="stable")[
+        :_NUM_VIEWS
+    ]
     return [(n, sources.views[n]) for n in order.tolist()]
 
 
@@ -792,7 +796,7 @@ def judge_view(scene: Scene, camera: Camera, frame_index: int, *, backend: str =
     has_surface = view.has_surface
     sky_covered = None
     if view.sky is not None:
-        is_sky = _erode_border(view.sky.sky) & ~view.is_own_car
+        is_sky = _erode_border(view.sky.is_sky) & ~view.is_own_car
         sky_covered = _share_within(_find_panes(scene, camera, view), is_sky)
     distances_m = (view.z_m * camera.ray_lengths().numpy())[has_surface]
     return ViewTrust(
@@ -856,7 +860,7 @@ def _judge_camera(
 ) -> CameraTrust:
     """Judge one camera; the arguments are those of `judge_scene`."""
     sources = source_views(scene)
-    seen_by_camera = sources.of(name)
+    seen_by_camera = sources.of_camera(name)
     camera_frames = [f for f in frames if name in f.cameras and not f.cameras[name].is_orthographic]
     nearest_views = {
         f.index: nearest_view(sources, f.cameras[name].scaled(scale or 1.0)) for f in camera_frames

@@ -19,7 +19,7 @@ from torch import Tensor
 from augment.plan import Plan
 from augment.render.buffers import RenderOutput
 from augment.render.composite import to_bytes
-from augment.render.cuda.runtime import download, resident
+from augment.render.cuda.runtime import download, gpu_copy
 from augment.scene import PosedGaussians
 from augment.semantics import SemanticClass
 from augment.timing import timed
@@ -72,23 +72,23 @@ def start_images(view: WeatheredBuffers, plan: Plan) -> Callable[[], ViewImages]
 
 def _make_images(view: WeatheredBuffers, plan: Plan) -> dict[str, Tensor | None]:
     """Return the fields of ViewImages as tensors, on the device of the buffers."""
-    label_surface = view.bare or view
-    paints_boxes = plan.instance and plan.finds_boxes  # by depth and class of what is shown
-    shows_depth = plan.depth_buffer is not None or (paints_boxes and view.bare is not None)
+    label_surface = view.bare_buffers or view
+    paints_boxes = plan.has_instance and plan.finds_boxes  # by depth and class of what is shown
+    shows_depth = plan.depth_buffer is not None or (paints_boxes and view.bare_buffers is not None)
     fronts = [
-        (view.masks[mask], effect.effect.front_surface(effect, view.camera))
+        (view.masks[mask], effect.hooks.front_surface(effect, view.camera))
         for effect in view.plan.effects
-        if plan.shows_first and (mask := effect.effect.mask) in view.masks and mask
+        if plan.shows_first_hit and (mask := effect.hooks.mask_name) in view.masks and mask
     ]
     device = view.rgb.device
     depth = label_surface.depth_m if shows_depth else None
     semantic = None
     instance = None
-    if plan.semantic or paints_boxes:
+    if plan.has_semantic or paints_boxes:
         with timed("semantic image"):
             table = _semantic_table(label_surface.parts, device)
             semantic = _look_up(label_surface.raster, table, int(SemanticClass.SKY))
-    if plan.instance:
+    if plan.has_instance:
         with timed("instance image"):
             instance = _look_up(
                 label_surface.raster, _instance_table(label_surface.parts, device), 0
@@ -96,7 +96,7 @@ def _make_images(view: WeatheredBuffers, plan: Plan) -> dict[str, Tensor | None]
     for mask, front in fronts:
         if front is None:
             continue
-        semantic = None if semantic is None else semantic.masked_fill(mask, front.semantic)
+        semantic = None if semantic is None else semantic.masked_fill(mask, front.semantic_class)
         instance = None if instance is None else instance.masked_fill(mask, 0)
         if depth is not None:
             with timed("depth image"):
@@ -128,7 +128,7 @@ def _semantic_table(parts: tuple[PosedGaussians, ...], device: torch.device) -> 
             if part_classes is None
             else part_classes
             if part_classes.device == device
-            else resident(part_classes)
+            else gpu_copy(part_classes)
             for p, part_classes in zip(parts, classes, strict=True)
         ]
     )

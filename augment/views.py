@@ -24,12 +24,20 @@ from augment.cameras import Camera
 from augment.drawing import LayerRenderer
 from augment.effects.effect import LabelInputs, RenderedView
 from augment.jobs.layout import TRUST
-from augment.jobs.processes import awaited, choose_backend, renders_on_gpu
+from augment.jobs.processes import choose_backend, renders_on_gpu, wait_for_result
 from augment.own_car import own_car_mask
-from augment.plan import BARE, LENS, NOISE, Plan, ViewPlan, make_plan, plan_view
+from augment.plan import (
+    BARE_SURFACE_PASS,
+    LENS_BLUR_PASS,
+    SENSOR_NOISE_PASS,
+    Plan,
+    ViewPlan,
+    make_plan,
+    plan_view,
+)
 from augment.prune import prune_parts
 from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
-from augment.render.composite import map_colors
+from augment.render.composite import apply_color_map
 from augment.render.rasterize import rasterize
 from augment.render.sensor import add_noise, blur_lens
 from augment.render.threads import num_concurrent_views, split_threads
@@ -75,7 +83,7 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
         with timed("trust mask"):
             trust[TRUST] = trust_mask(scene, camera, backend=backend)
     own_car = None
-    if plan.on_photo and plan.finds_boxes:
+    if plan.is_on_photo and plan.finds_boxes:
         with timed("recording car"):
             own_car = own_car_mask(scene, camera)
     return PendingView(lambda: _weathered(images(), camera, plan, recipe, trust, own_car))
@@ -95,31 +103,31 @@ def render_buffers(
     with timed("view plan"):
         view = plan_view(plan, scene, camera, backend=backend)
     with timed("parts"):
-        bare_parts = scene.parts_for(camera, view.actors)
+        bare_parts = scene.parts_for(camera, view.actor_ids)
     color_map = scene.color_map(camera) if plan.uses_recorded_exposure else None
     photo = None
-    if plan.on_photo:
+    if plan.is_on_photo:
         with timed("photo"):
             photo = open_photo(scene, camera, color_map, backend=backend)
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     for effect in view.effects:
-        layers = effect.effect.edit_scene(effect, layers, camera)
+        layers = effect.hooks.edit_scene(effect, layers, camera)
     if plan.prune > 0:
         with timed("prune"):
             parts = prune_parts(layers.parts, scene, camera, plan.prune)
-            layers = replace(layers, parts=parts, unpruned=layers.parts)
+            layers = replace(layers, parts=parts, unpruned_parts=layers.parts)
     rendered = _draw(view, layers, camera)
     for effect in view.effects:
-        rendered = effect.effect.edit_image(effect, rendered, camera)
+        rendered = effect.hooks.edit_image(effect, rendered, camera)
     rgb = rendered.rgb
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         with timed("camera colour map"):
-            rgb = map_colors(rgb, color_map, backend=backend)
+            rgb = apply_color_map(rgb, color_map, backend=backend)
     if plan.sensor.psf_px > 0:
-        with timed(LENS):
+        with timed(LENS_BLUR_PASS):
             rgb = blur_lens(rgb, plan.sensor.psf_px)
     if plan.sensor.noise > 0:
-        with timed(NOISE):
+        with timed(SENSOR_NOISE_PASS):
             noise_sigma = plan.sensor.noise
             noise_seed = plan.seed
             rgb = add_noise(
@@ -133,9 +141,9 @@ def render_buffers(
         raster=rendered.raster,
         depth_m=depth_m,
         parts=tuple(layers.parts),
-        plan=view.skipping(rendered.skipped),
+        plan=view.skip_steps(rendered.skip_reasons),
         masks=_masks(view, rendered),
-        bare=_bare(rendered.raster, bare_parts, camera, plan, view, backend),
+        bare_buffers=_bare(rendered.raster, bare_parts, camera, plan, view, backend),
     )
 
 
@@ -144,7 +152,7 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> RenderedView
     without such an effect, as one layer with its sky.
     """
     for effect in reversed(view.effects):
-        rendered = effect.effect.draw(effect, layers, camera, view.buffers)
+        rendered = effect.hooks.draw(effect, layers, camera, view.buffers)
         if rendered is not None:
             return rendered
     return RenderedView(*layers.render_with_sky(camera, view.buffers), layers)
@@ -158,12 +166,12 @@ def _masks(view: ViewPlan, rendered: RenderedView) -> dict[str, Tensor]:
     masks = dict[str, Tensor]()
     opaque_masks = list[Tensor]()
     for effect in reversed(view.effects):
-        mask = effect.effect.mask_of(effect, rendered)
-        if mask is not None and effect.effect.mask is not None:
+        mask = effect.hooks.visible_mask(effect, rendered)
+        if mask is not None and effect.hooks.mask_name is not None:
             for opaque_mask in opaque_masks:
                 mask = mask & ~opaque_mask
-            masks[effect.effect.mask] = mask
-            opaque_masks += [] if effect.effect.is_see_through else [mask]
+            masks[effect.hooks.mask_name] = mask
+            opaque_masks += [] if effect.hooks.is_see_through else [mask]
     return masks
 
 
@@ -206,7 +214,7 @@ def _bare(
     if not plan.bare_buffers:
         return None
     if view.bare_buffers:
-        with timed(BARE):
+        with timed(BARE_SURFACE_PASS):
             raster = rasterize(
                 parts, camera, buffers=view.bare_buffers, settings=plan.settings, backend=backend
             )
@@ -225,21 +233,21 @@ def _weathered(
     masks = dict(trust)
     views = dict[str, LabelInputs]()
     for effect in effects.EFFECTS:
-        if effect.of(recipe) is None:
+        if effect.section_of(recipe) is None:
             continue
-        effect_plan = plan.placed[effect.name]
-        mask = images.masks.get(effect.mask or "")
-        is_in_view = effect_plan.data is not None and (effect.mask is None or mask is not None)
+        effect_plan = plan.effect_plans[effect.name]
+        mask = images.masks.get(effect.mask_name or "")
+        is_in_view = effect_plan.data is not None and (effect.mask_name is None or mask is not None)
         depth = images.scene_depth_m if is_in_view else None
         views[effect.name] = LabelInputs(effect_plan, depth, mask, plan.water_level_z_m)
-        if effect.mask is not None:
+        if effect.mask_name is not None:
             empty_mask = np.zeros((camera.height, camera.width), np.uint8)
-            masks[effect.mask] = empty_mask if mask is None else mask
+            masks[effect.mask_name] = empty_mask if mask is None else mask
     return WeatheredView(
         camera=camera,
         rgb=images.rgb,
         depth_m=None if plan.depth_buffer is None else images.depth_m,
-        semantic=images.semantic if plan.semantic else None,
+        semantic=images.semantic if plan.has_semantic else None,
         instance=images.instance,
         masks=masks,
         effects=views,
@@ -255,12 +263,12 @@ def _surface_view(
     is_bare = bool(plan.bare_buffers)
     if depth is None:
         return None
-    shows_first = plan.shows_first and plan.water_level_z_m is not None
+    shows_first = plan.shows_first_hit and plan.water_level_z_m is not None
     # The other images show the surfaces of this depth, unless they are bare or show the water.
     is_of_depth = not (is_bare or shows_first)
     return LabelSurfaces(
         depth_m=depth,
-        actors=images.instance if is_of_depth else None,
+        actor_instance=images.instance if is_of_depth else None,
         classes=images.semantic if is_of_depth else None,
         instance_depth_m=images.depth_m if is_bare else depth,
         instance_classes=images.semantic,
@@ -303,7 +311,7 @@ class WeatheredBuffers:
     """The passes that were carried out."""
     masks: Mapping[str, Bool[Tensor, "H W"]] = field(default_factory=dict)
     """Pixels that show an effect, by the effect's mask name; only effects that can be in view."""
-    bare: BareBuffers | None = None
+    bare_buffers: BareBuffers | None = None
     """Buffers of the scene without what lies on it; None unless planned."""
 
 
@@ -316,7 +324,7 @@ class LabelSurfaces:
 
     depth_m: np.ndarray
     """Depth of the first solid surface: snow counts, water does not."""
-    actors: np.ndarray | None
+    actor_instance: np.ndarray | None
     """Instance image of those surfaces, uint16 [H, W], actors only; None where there is none."""
     instance_depth_m: np.ndarray | None
     """Depth of the surfaces that the view's instance image shows; None without one."""
@@ -395,14 +403,14 @@ class ViewPool:
         views: the largest number of views that will be begun.
     """
 
-    def __init__(self, scene: Scene, backend: str = AUTO, views: int = sys.maxsize) -> None:
+    def __init__(self, scene: Scene, backend: str = AUTO, max_views: int = sys.maxsize) -> None:
         backend = choose_backend(backend, scene) if backend == AUTO else backend
-        self.ahead = int(renders_on_gpu(backend))
+        self.num_in_flight = int(renders_on_gpu(backend))
         self._threads = None
         if backend == CPU:
-            count = min(views, num_concurrent_views(sum(map(len, scene.all_gaussians))))
+            count = min(max_views, num_concurrent_views(sum(map(len, scene.all_gaussians))))
             if count > 1:
-                self.ahead = count
+                self.num_in_flight = count
                 self._threads = split_threads(count)
 
     def begin(
@@ -414,7 +422,7 @@ class ViewPool:
         future = self._threads.submit(
             lambda: begin_view(scene, camera, recipe, backend=backend).result()
         )
-        return PendingView(lambda: awaited(future))
+        return PendingView(lambda: wait_for_result(future))
 
     def close(self) -> None:
         """Begin no further view; views that are being rendered are finished, and nobody waits for
@@ -447,7 +455,7 @@ def render_views(
         pending_views = deque[tuple[Camera, PendingView]]()
         for camera in cameras:
             pending_views.append((camera, pool.begin(scene, camera, recipe, backend=backend)))
-            if len(pending_views) > pool.ahead:
+            if len(pending_views) > pool.num_in_flight:
                 yield _finish_view(*pending_views.popleft())
         for pending_view in pending_views:
             yield _finish_view(*pending_view)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
-from recipes.fields import Closed
+from recipes.fields import ClosedModel
 
 Value = float | int | str | bool | None
 
@@ -36,9 +36,9 @@ class Knob:
 
     path: str
     values: tuple[Value, ...]
-    what: str
+    description: str
     rank: float
-    chosen: bool = True
+    is_selectable: bool = True
     tiers: Mapping[str, Value] = field(default_factory=dict, hash=False)
     applies_to: Callable[[Any], bool] = lambda section: True
     section: str = ""
@@ -70,38 +70,38 @@ class Column:
     value: Callable[[Any], Value]
     title: str = ""
     unit: str = ""
-    absent: float | None = math.nan
-    shows: Literal["all", "nonzero", None] = None
-    refutes: bool = True
+    value_if_absent: float | None = math.nan
+    presence_values: Literal["all", "nonzero", None] = None
+    decides_absence: bool = True
     factor: float = 1.0
-    over: float | None = None
+    numerator: float | None = None
     linear: bool = False
     label: str = ""
     caption: str = ""
 
     @property
     def is_number(self) -> bool:
-        return self.absent is not None
+        return self.value_if_absent is not None
 
     @property
     def formula(self) -> str:
-        return self.name if self.over is None else f"{self.over} / {self.name}"
+        return self.name if self.numerator is None else f"{self.numerator} / {self.name}"
 
-    def of(self, section: Closed | None) -> float | str | None:
+    def value_of(self, section: ClosedModel | None) -> float | str | None:
         """Return the column's value in a manifest row."""
-        value: Any = self.absent if section is None else self.value(section)
+        value: Any = self.value_if_absent if section is None else self.value(section)
         return math.nan if value is None and self.is_number else value
 
-    def shown(self, numbers: Any) -> Any:
+    def to_unit(self, numbers: Any) -> Any:
         """Return a manifest number, or an array of them, in `unit`."""
-        return self.factor * numbers if self.over is None else self.over / numbers
+        return self.factor * numbers if self.numerator is None else self.numerator / numbers
 
     def is_present(self, numbers: Any) -> Any:
         """Return True where a manifest number says that the effect is present; also for arrays."""
-        return (numbers == numbers) & ((numbers != 0) | (self.shows == "all"))
+        return (numbers == numbers) & ((numbers != 0) | (self.presence_values == "all"))
 
 
-class Section(Closed):
+class Section(ClosedModel):
     """Part of a recipe.
 
     knobs: the knobs among its fields. later_fields: fields that are younger than the section.
@@ -129,7 +129,7 @@ class EffectModel(Section):
     synonyms: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     @property
-    def changes(self) -> bool:
+    def has_effect(self) -> bool:
         """Return True if the effect changes anything with these settings."""
         return True
 

@@ -80,7 +80,7 @@ class OneOf:
         return {"enum": list(self.names())}
 
 
-class Closed(BaseModel):
+class ClosedModel(BaseModel):
     """Base of every section of a recipe: frozen, and an unknown key is an error.
 
     The text below a field is its description.
@@ -96,7 +96,7 @@ class Closed(BaseModel):
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def found(model: BaseModel, path: str) -> Any:
+def section_at(model: BaseModel, path: str) -> Any:
     """Return the value at a dotted path, or None if a section on the path is absent."""
     value: Any = model
     for name in path.split("."):
@@ -116,7 +116,7 @@ def is_given(model: BaseModel, path: str) -> bool:
     return True
 
 
-def replaced(model: Model, path: str, value: object) -> Model:
+def with_unchecked_field(model: Model, path: str, value: object) -> Model:
     """Return a copy with one field set, unchecked. The field then counts as given.
 
     Raises:
@@ -127,7 +127,7 @@ def replaced(model: Model, path: str, value: object) -> Model:
         section = getattr(model, name)
         if section is None:
             raise KeyError(f"{name} is absent, so {path} cannot be set")
-        value = replaced(section, inner_path, value)
+        value = with_unchecked_field(section, inner_path, value)
     return model.model_copy(update={name: value})
 
 
@@ -139,7 +139,7 @@ def changed(model: Model, values: Mapping[str, object]) -> Model:
         KeyError: a section on the path is absent.
     """
     for path, value in values.items():
-        model = replaced(model, path, value)
+        model = with_unchecked_field(model, path, value)
     type(model).model_validate(model.model_dump())
     return model
 

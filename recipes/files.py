@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from recipes.effect import EffectModel
 from recipes.errors import RecipeError, nearest_word, short
-from recipes.fields import found, replaced
+from recipes.fields import section_at, with_unchecked_field
 from recipes.schema import SECTIONS, Recipe
 
 # Largest file that is read, MiB.
@@ -38,7 +38,7 @@ def with_digest(recipe: Recipe) -> Recipe:
             continue
         try:
             hashes = {name: _hash(section, name) for name in section.files}
-            recipe = replaced(recipe, f"{path}.digest", _check_digest(section, hashes))
+            recipe = with_unchecked_field(recipe, f"{path}.digest", _check_digest(section, hashes))
         except ValueError as error:
             raise RecipeError(f"recipe {recipe.name}, variant {recipe.variant}: {error}") from None
     return recipe
@@ -170,7 +170,7 @@ def _hash(section: EffectModel, name: str) -> str:
 
 def _check_digest(section: EffectModel, hashes: Mapping[str, str]) -> str:
     digest = digest_of(hashes)
-    recipe_digest: str | None = found(section, "digest")
+    recipe_digest: str | None = section_at(section, "digest")
     if recipe_digest not in (None, digest):
         paths = ", ".join(section.files.values())
         subject = "the file has" if len(hashes) == 1 else "one of the files has"

@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic.config import JsonDict
 
 from recipes.effect import Column, EffectModel, Knob
-from recipes.fields import PRESENT, Angle, Closed, Colour, Number, Rates, Whole
+from recipes.fields import PRESENT, Angle, ClosedModel, Colour, Number, Rates, Whole
 
 MAX_WAVES = 64
 # Absorption of pure water at 650, 550 and 450 nm, 1/metre (Pope and Fry 1997).
@@ -26,7 +26,7 @@ _ONE_CLARITY: JsonDict = {
 }
 
 
-class Wave(Closed):
+class Wave(ClosedModel):
     """One Gerstner wave."""
 
     direction_deg: Angle = 0.0
@@ -53,7 +53,7 @@ class Wave(Closed):
         return self
 
 
-class Waves(Closed):
+class Waves(ClosedModel):
     """The water's surface: a preset's spectrum, drawn from a seed, or waves one by one."""
 
     preset: Literal["still", "calm", "breeze", "wind"] = "calm"
@@ -129,7 +129,7 @@ class Flood(EffectModel):
             lambda flood: flood.level_m,
             "Water level",
             "m",
-            shows="all",  # at a level of 0 too
+            presence_values="all",  # at a level of 0 too
             linear=True,
             label="water at",
             caption="water at {flood_level_m:.2f} m",

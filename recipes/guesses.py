@@ -81,10 +81,10 @@ def _guess_switch(node: ScalarNode, leaf: Leaf) -> str:
         return "; write 0" if leaf.accepts(0) else ""
     if leaf.accepts(is_on):
         return f"; write {str(is_on).lower()}"
-    word = next((w for w in (_ON_WORDS if is_on else _OFF_WORDS) if w in leaf.words), None)
+    word = next((w for w in (_ON_WORDS if is_on else _OFF_WORDS) if w in leaf.allowed_words), None)
     if word is not None:
         return f"; write {word}"
-    has_default = leaf.words and not leaf.info.is_required()
+    has_default = leaf.allowed_words and not leaf.info.is_required()
     return f"; leave it out for {leaf.info.default}" if has_default else ""
 
 
@@ -96,8 +96,8 @@ def guess_section(node: Node, path: str) -> str:
 
 
 def _guess_text(text: str, leaf: Leaf) -> str:
-    if leaf.words:
-        word = nearest_word(text, leaf.words)
+    if leaf.allowed_words:
+        word = nearest_word(text, leaf.allowed_words)
         return f"; did you mean {word}?" if word else ""
     if leaf.is_number:
         if _DECIMAL_COMMA.fullmatch(text):
@@ -113,7 +113,7 @@ def _guess_text(text: str, leaf: Leaf) -> str:
 def why_no_range(node: MapNode, leaf: Leaf) -> str:
     """Return why a mapping in the place of a value is no range."""
     if not leaf.rangeable:
-        return f"must be {leaf.allowed()}; it cannot be a range"
+        return f"must be {leaf.describe_allowed_values()}; it cannot be a range"
     kinds = [key for key in node if key in RANGE_KINDS]
     if len(kinds) == 1:
         allowed_kinds = "choice" if leaf.channel is None else "uniform or choice"
@@ -123,7 +123,7 @@ def why_no_range(node: MapNode, leaf: Leaf) -> str:
         if kind is not None and kind != key:
             return f"no range is called {short(key)!r}; did you mean {kind}?"
     ranges = ", ".join(RANGE_KINDS)
-    return f"must be {leaf.allowed()}, or a range: a mapping with one of {ranges}"
+    return f"must be {leaf.describe_allowed_values()}, or a range: a mapping with one of {ranges}"
 
 
 # ---- Keys ----------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
 from recipes.errors import Place, Problems, RecipeError, did_you_mean, dotted, nearest_word, short
-from recipes.fields import Closed, Number, Whole, changed
+from recipes.fields import ClosedModel, Number, Whole, changed
 from recipes.load import load_recipe, preset_names, read_text
 from recipes.schema import Recipe, parse_frames
 from recipes.template import RecipeTemplate
@@ -29,14 +29,14 @@ def _expand_text(key: str) -> BeforeValidator:
     return BeforeValidator(lambda value: {key: value} if isinstance(value, str) else value)
 
 
-ALL = ("all",)
+ALL_CAMERAS = ("all",)
 
 
 def _parse_all(value: Any) -> Any:
-    return ALL if value == "all" else value
+    return ALL_CAMERAS if value == "all" else value
 
 
-class JobScene(Closed):
+class JobScene(ClosedModel):
     """A scene of the job, or with `*` in its path all that match."""
 
     uri: Text
@@ -60,7 +60,7 @@ class JobScene(Closed):
         return text
 
 
-class JobRecipe(Closed):
+class JobRecipe(ClosedModel):
     """A recipe of the job."""
 
     recipe: Text
@@ -73,7 +73,7 @@ class JobRecipe(Closed):
     """Fields that replace the recipe's, by dotted path: `weather.smog.visibility_m: 60`."""
 
 
-class Job(Closed):
+class Job(ClosedModel):
     """A job file: its scenes, its recipes and how they are drawn."""
 
     version: Literal[1] = 1
@@ -119,7 +119,7 @@ class JobRecipes:
     job: Job
     templates: dict[str, RecipeTemplate]
 
-    def of_scene(self, entry: JobScene, scene_name: str) -> list[Recipe]:
+    def resolve_for_scene(self, entry: JobScene, scene_name: str) -> list[Recipe]:
         """Return the recipes in numbers under which a scene is rendered."""
         recipes = []
         for name in self.templates if entry.recipes is None else dict.fromkeys(entry.recipes):

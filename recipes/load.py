@@ -243,7 +243,7 @@ def _read_parent(parent: Node) -> tuple[str, Place]:
     place = parent.place
     name = parent.text if isinstance(parent, ScalarNode) else ""
     if not leaf.accepts(name):
-        raise place.error(f"extends = {show(parent)}: must be {leaf.allowed()}")
+        raise place.error(f"extends = {show(parent)}: must be {leaf.describe_allowed_values()}")
     try:
         if name in preset_names():
             return _read(name)[:2]
@@ -320,7 +320,7 @@ def dump_recipe(recipe: Recipe) -> str:
     quality has still to choose are left out.
     """
     data = recipe.model_dump()
-    for knob in free_knobs(recipe) if recipe.quality.is_open else ():
+    for knob in free_knobs(recipe) if recipe.quality.has_open_choice else ():
         *sections, name = knob.path.split(".")
         holder = data
         for section in sections:

@@ -38,7 +38,7 @@ from pydantic_core import core_schema as cs
 from typing_extensions import TypeAliasType
 
 from recipes.errors import Place, Problems, dotted, join, readable
-from recipes.fields import Closed, Digest, FilePath, Number, Unit, Whole
+from recipes.fields import ClosedModel, Digest, FilePath, Number, Unit, Whole
 from recipes.files import file_below
 from recipes.guesses import RANGE_KINDS, guess_section, guess_value, show, why_no_key, why_no_range
 from recipes.ranges import (
@@ -170,7 +170,7 @@ class Leaf:
         return tuple((sign, self._schema[k]) for k, sign in _LIMITS.items() if k in self._schema)
 
     @property
-    def words(self) -> tuple[str, ...]:
+    def allowed_words(self) -> tuple[str, ...]:
         """Return the words that the field takes besides true and false; empty if they cannot be
         listed.
         """
@@ -188,22 +188,22 @@ class Leaf:
             return False
         return True
 
-    def allowed(self, value: object = None) -> str:
+    def describe_allowed_values(self, value: object = None) -> str:
         """Return in words which values the field takes.
 
         value: the refused value; conditions that it meets are left out.
         """
         if self.channel is not None:
-            text = f"[red, green, blue], each {self.channel.allowed()}"
+            text = f"[red, green, blue], each {self.channel.describe_allowed_values()}"
         elif self.is_number:
             text = self._allowed_number(value) + (f" ({self.unit})" if self.unit else "")
         elif self.list_words:
             text = f"true, false or a list of {', '.join(self.list_words)}"
         elif self.kind is bool or "anyOf" in self._schema:
-            *first, last = ("true", "false", *self.words)
+            *first, last = ("true", "false", *self.allowed_words)
             text = f"{', '.join(first)} or {last}"
-        elif self.words:
-            text = f"one of {', '.join(self.words)}"
+        elif self.allowed_words:
+            text = f"one of {', '.join(self.allowed_words)}"
         else:
             text = self.info.title or self._schema.get("title", "text")
         return text + (", or null" if self.nullable and not is_number(value) else "")
@@ -251,13 +251,15 @@ class Leaf:
         if self.list_words and isinstance(node, ListNode):
             value: Any = tuple(getattr(item, "value", None) for item in node)
         elif isinstance(node, ListNode):
-            raise refusal(f"must be {self.allowed()}{guess_value(node, self)}")
+            raise refusal(f"must be {self.describe_allowed_values()}{guess_value(node, self)}")
         else:  # a name may look like a number
             value = node.text if self.kind is str and node.value is not None else node.value
         try:
             checked_value = handler(value)
         except ValidationError:
-            raise refusal(f"must be {self.allowed(value)}{guess_value(node, self)}") from None
+            raise refusal(
+                f"must be {self.describe_allowed_values(value)}{guess_value(node, self)}"
+            ) from None
         is_file = self.annotation == FilePath and checked_value is not None
         return _named_file(node) if is_file else Fixed(checked_value)  # type: ignore[arg-type]
 
@@ -376,7 +378,7 @@ def _line(fields: SectionFields) -> TripleLine:
 # ---- Sections: mappings of fields ----------------------------------------------------------------
 
 
-class Section(Closed):
+class Section(ClosedModel):
     """Base of the models of a file's mappings. Reading one gives a dict of the given fields.
 
     PATH: dotted, with [] for the items of a list. MODEL: the model of `schema` that checks draws.
@@ -425,7 +427,7 @@ class Section(Closed):
         assert isinstance(extra, dict), "the models state what else holds as JSON, not as functions"
         handler.resolve_ref_schema(json_schema).update(extra)
         if (shorthand := getattr(cls.MODEL, "SHORTHAND", None)) is not None:
-            return {"anyOf": [json_schema, {"enum": [*cls.LEAVES[shorthand].words]}]}
+            return {"anyOf": [json_schema, {"enum": [*cls.LEAVES[shorthand].allowed_words]}]}
         return json_schema
 
 
@@ -468,14 +470,14 @@ def _problem(item: ErrorDetails) -> tuple[Place, str]:
         why = why_no_key(str(key), section, recipe_file())
         return node.place, f"{path}: {'no part of a range' if in_range else why}"
     if kind == "missing":
-        what = "" if in_range else f", {section.LEAVES[str(key)].allowed()}"
+        what = "" if in_range else f", {section.LEAVES[str(key)].describe_allowed_values()}"
         return node.place, f"{path}: must be given{what}"
     if kind == "rule":
         return node.place, "\n".join(f"{path}: {text}" for text in item["msg"].splitlines())
     return node.place, f"{path} = {show(node)}: {item['msg'].replace('Input should', 'must', 1)}"
 
 
-class _FileFields(Closed):
+class _FileFields(ClosedModel):
     """Fields of a recipe file that a recipe in numbers does not have."""
 
     variants: Whole = Field(default=1, ge=1, le=1_000_000)
@@ -489,14 +491,16 @@ class _FileFields(Closed):
     """The recipe whose fields hold where this file gives none."""
 
 
-class _EffectFields(Closed):
+class _EffectFields(ClosedModel):
     """Fields of an effect in a recipe file that its model does not have."""
 
     probability: Unit = 1.0
     """Share of the variants that have this effect."""
 
 
-def _section(path: str, model: type[BaseModel], extra: type[Closed] = Closed) -> type[Section]:
+def _section(
+    path: str, model: type[BaseModel], extra: type[ClosedModel] = ClosedModel
+) -> type[Section]:
     """Return the model of a section. extra: further fields besides those of the model, without
     ranges.
     """
@@ -515,7 +519,7 @@ def _section(path: str, model: type[BaseModel], extra: type[Closed] = Closed) ->
             limit = Field(max_length=item.MAX_ITEMS)
             fields[name] = (Annotated[list[item] | None, limit, validator], None)
         elif isinstance(kind, type) and issubclass(kind, BaseModel):
-            inner[name] = _section(field_path, kind, _EffectFields if nullable else Closed)
+            inner[name] = _section(field_path, kind, _EffectFields if nullable else ClosedModel)
             fields[name] = (inner[name] | None, None)
         else:
             rangeable = bool(path) and name not in extra.model_fields and kind != Digest

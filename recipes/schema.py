@@ -20,16 +20,16 @@ from pydantic.fields import FieldInfo
 
 from recipes.effect import Column, EffectModel, Knob, Section, Value
 from recipes.fields import (
-    Closed,
+    ClosedModel,
     Flag,
     Number,
     Seed,
     Unit,
     Whole,
     changed,
-    found,
     is_given,
-    replaced,
+    section_at,
+    with_unchecked_field,
 )
 from recipes.flood import Flood
 from recipes.lens_drops import LensDrops
@@ -45,7 +45,7 @@ Tier = Literal["draft", "balanced", "reference"]
 TARGETS = ("max_flip", "budget_ms")
 
 
-class Quality(Closed):
+class Quality(ClosedModel):
     """Speed against accuracy. It chooses every setting of the table of knobs that the recipe does
     not give itself; `quality: balanced` is short for `quality: {tier: balanced}`.
     """
@@ -79,12 +79,12 @@ class Quality(Closed):
         return self.max_flip is not None or self.budget_ms is not None
 
     @property
-    def is_open(self) -> bool:
+    def has_open_choice(self) -> bool:
         """Return True while settings have still to be chosen for a scene."""
         return self.has_target and not self.settled
 
     @property
-    def words(self) -> str | None:
+    def summary(self) -> str | None:
         """Return the target for the manifest: `balanced`, `max_flip 0.03`, `budget_ms 150`, or
         None.
         """
@@ -165,7 +165,7 @@ def _piece(text: str) -> int | slice:
 VERSION = 1
 
 
-class Weather(Closed):
+class Weather(ClosedModel):
     """The effects of a recipe; null if one is absent."""
 
     smog: Smog | None = None
@@ -201,7 +201,7 @@ class Render(Section):
             (2.0, 1.0, 0.5, 0.0),
             "far splats are merged in cells as large",
             13,
-            chosen=False,  # it saves in scenes of many millions, and there nothing is pruned
+            is_selectable=False,  # it saves in scenes of many millions, and there nothing is pruned
         ),
         Knob(
             "transmittance_stop",
@@ -287,7 +287,7 @@ LabelFormat = Literal["coco", "kitti", "yolo"]
 ANY_LABEL = "*"  # in a category's label: any characters
 
 
-class Category(Closed):
+class Category(ClosedModel):
     """One row of the table from the dataset's labels to categories."""
 
     label: str = Field(min_length=1, max_length=200, title="a label, where * stands for any text")
@@ -297,7 +297,7 @@ class Category(Closed):
     )
     """The category; several rows may have the same."""
 
-    def takes(self, label: str) -> bool:
+    def matches(self, label: str) -> bool:
         """Return True if a label of the dataset belongs to this row."""
         parts = map(re.escape, self.label.split(ANY_LABEL))
         return re.fullmatch(".*".join(parts), label, re.DOTALL) is not None
@@ -314,7 +314,7 @@ class Output(Section):
             (60, 75, 92, 100),
             "size and error of jpg files",
             12,
-            chosen=False,
+            is_selectable=False,
             applies_to=lambda output: output.image == "jpg",
         ),
     )
@@ -358,7 +358,7 @@ class Output(Section):
         return () if isinstance(self.labels, bool) else tuple(sorted(set(self.labels)))
 
 
-class Recipe(Closed):
+class Recipe(ClosedModel):
     """A recipe in numbers: together with the package version it determines every pixel."""
 
     version: Literal[1] = VERSION
@@ -386,7 +386,7 @@ class Recipe(Closed):
         if self.quality.tier is not None:
             for path, value in tier_settings(self, self.quality.tier).items():
                 name, _, inner_path = path.partition(".")
-                section = replaced(getattr(self, name), inner_path, value)
+                section = with_unchecked_field(getattr(self, name), inner_path, value)
                 object.__setattr__(self, name, section)  # as yet nobody else has it
                 self.model_fields_set.add(name)
         return self
@@ -478,13 +478,13 @@ class Recipe(Closed):
 
     def sections(self) -> dict[str, EffectModel]:
         """Return the effects of the recipe, by dotted path."""
-        sections = ((path, found(self, path)) for path in SECTIONS)
+        sections = ((path, section_at(self, path)) for path in SECTIONS)
         return {path: section for path, section in sections if section is not None}
 
     def columns(self) -> dict[str, float | str | None]:
         """Return the manifest values of the recipe's effects, by column."""
         return {
-            column.name: column.of(found(self, path))
+            column.name: column.value_of(section_at(self, path))
             for path, model in SECTIONS.items()
             for column in model.columns
         }
@@ -524,7 +524,7 @@ def remove_section(path: str) -> None:
     _rebuild()
 
 
-def _place(path: str) -> tuple[type[Closed], str]:
+def _place(path: str) -> tuple[type[ClosedModel], str]:
     holder, _, name = path.rpartition(".")
     return {"weather": Weather, "camera": Sensor, "": Recipe}[holder], name
 
@@ -563,7 +563,7 @@ def columns_of_effects() -> dict[str, Column]:
 
 def knobs_of(recipe: Recipe) -> tuple[Knob, ...]:
     """Return the knobs that have an effect on the recipe's pictures or files."""
-    sections = ((knob, found(recipe, knob.section)) for knob in KNOBS.values())
+    sections = ((knob, section_at(recipe, knob.section)) for knob in KNOBS.values())
     return tuple(
         knob for knob, section in sections if section is not None and knob.applies_to(section)
     )
@@ -571,12 +571,12 @@ def knobs_of(recipe: Recipe) -> tuple[Knob, ...]:
 
 def free_knobs(recipe: Recipe) -> tuple[Knob, ...]:
     """Return the knobs that a tier or a target may set: the recipe does not give their field."""
-    return tuple(k for k in knobs_of(recipe) if k.chosen and not is_given(recipe, k.path))
+    return tuple(k for k in knobs_of(recipe) if k.is_selectable and not is_given(recipe, k.path))
 
 
 def settings_of(recipe: Recipe) -> dict[str, Value]:
     """Return the values of the recipe's knobs, by path."""
-    return {knob.path: found(recipe, knob.path) for knob in knobs_of(recipe)}
+    return {knob.path: section_at(recipe, knob.path) for knob in knobs_of(recipe)}
 
 
 def with_settings(recipe: Recipe, settings: Mapping[str, Value]) -> Recipe:
@@ -596,4 +596,4 @@ def tier_settings(recipe: Recipe, tier: str) -> dict[str, Value]:
 
 def with_reference_settings(recipe: Recipe) -> Recipe:
     """Return the recipe with every knob that a tier may set at its reference, given or not."""
-    return with_settings(recipe, {k.path: k.reference for k in knobs_of(recipe) if k.chosen})
+    return with_settings(recipe, {k.path: k.reference for k in knobs_of(recipe) if k.is_selectable})

@@ -7,10 +7,10 @@ from typing import Literal
 from pydantic import Field
 
 from recipes.effect import Column, EffectModel, Knob
-from recipes.fields import Angle, Closed, Number, Unit, Whole
+from recipes.fields import Angle, ClosedModel, Number, Unit, Whole
 
 
-class SnowLight(Closed):
+class SnowLight(ClosedModel):
     """The light on the snow; null leaves a field to what the scene's sky and ground show."""
 
     sun_azimuth_deg: Number | None = Field(default=None, ge=-360, le=360)
@@ -25,7 +25,7 @@ class SnowLight(Closed):
     scene's ground suggests."""
 
 
-class SnowWind(Closed):
+class SnowWind(ClosedModel):
     """The wind that the snow fell with."""
 
     direction_deg: Angle = 0.0
@@ -58,7 +58,7 @@ class Snow(EffectModel):
             lambda snow: snow.depth_m,
             "Snow depth",
             "cm",
-            shows="nonzero",
+            presence_values="nonzero",
             factor=100,
             label="snow",
             caption="snow {snow_depth_m:.3g} cm",
@@ -67,7 +67,7 @@ class Snow(EffectModel):
             "snow_coverage",
             lambda snow: snow.coverage,
             "Snow coverage",
-            shows="nonzero",
+            presence_values="nonzero",
             linear=True,
         ),
     )

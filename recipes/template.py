@@ -54,7 +54,7 @@ class RecipeTemplate:
         number = self.first_variant + variant
         leaf = recipe_file().LEAVES["variant"]
         if variant < 0 or not leaf.accepts(number):
-            allowed = leaf.allowed(number)
+            allowed = leaf.describe_allowed_values(number)
             raise RecipeError(f"{self.source}: variant = {variant}: must be {allowed}")
         prefix = f"{self.source}: variant {number}"
         names = {"version": VERSION, "name": self.name, "seed": self.seed, "variant": number}

@@ -62,14 +62,14 @@ def cells_on_grid(
         centers_m=_tensor(centers),
         normals=_tensor(normals),
         sizes_m=torch.full((count,), float(cell_m)),
-        edge_m=_tensor(_edge_distance(around, cell_m)[there]),
+        edge_distance_m=_tensor(_edge_distance(around, cell_m)[there]),
         neighbours=torch.from_numpy(np.stack(sides, -1)[there].astype(np.int32)),
-        light=flat(light, 1.0),
-        tracks=flat(tracks, 0.0),
-        banks=torch.tensor(banks).repeat(count, 1),
+        relative_light=flat(light, 1.0),
+        track_share=flat(tracks, 0.0),
+        obstacle_vectors=torch.tensor(banks).repeat(count, 1),
         semantic=torch.full((count,), int(SemanticClass.ROAD), dtype=torch.int16),
-        buried=torch.zeros(0, dtype=torch.int32),
-        buried_by=torch.zeros(0, 5, dtype=torch.int32),
+        hideable_ids=torch.zeros(0, dtype=torch.int32),
+        covering_cells=torch.zeros(0, 5, dtype=torch.int32),
     )
 
 

@@ -230,7 +230,7 @@ class RecordOptions(Command):
         )
         road = recording.road
         print(
-            f"{recording.frames} frames, {recording.images} images; {recording.left_out} have no "
+            f"{recording.frames} frames, {recording.images} images; {recording.num_images_without_pose} have no "
             f"pose, left out"
         )
         print(

@@ -230,19 +230,21 @@ def _numbers(row: Row) -> list[float]:
     """Return the numbers that captions tell; old folders lack some of the columns."""
     number_columns = (c for c in columns_of_effects().values() if c.caption and c.is_number)
     absence_numbers = {"all": -math.inf, "nonzero": 0.0}
-    numbers = ((row.get(column.name, math.nan), column.shows) for column in number_columns)
+    numbers = (
+        (row.get(column.name, math.nan), column.presence_values) for column in number_columns
+    )
     return [absence_numbers[shows or "all"] if math.isnan(n) else n for n, shows in numbers]
 
 
 def _weather(row: Row) -> str:
     """The variant's name and what its weather means to a person."""
     columns = sorted(columns_of_effects().values(), key=lambda column: column.is_number)
-    values = {column.name: row.get(column.name, column.of(None)) for column in columns}
+    values = {column.name: row.get(column.name, column.value_of(None)) for column in columns}
     present_columns = [
         c for c in columns if (c.is_present if c.is_number else bool)(values[c.name])
     ]
     caption_values = values | {
-        c.name: c.shown(values[c.name]) for c in present_columns if c.is_number
+        c.name: c.to_unit(values[c.name]) for c in present_columns if c.is_number
     }
     texts = [
         column.caption.format_map(caption_values) for column in present_columns if column.caption

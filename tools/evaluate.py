@@ -222,7 +222,7 @@ class Views:
                     f"{', '.join(sorted(column_values)) or 'none'}"
                 )
             table = table.filter(pc.is_in(table[column], pa.array(names, pa.string())))
-        self.rows = Rows.of(table)
+        self.rows = Rows.from_table(table)
         self._store = store
         self._reader = RowReader(store, verify=False)
         self.view = functools.lru_cache(_KEPT)(self._read)
@@ -293,7 +293,9 @@ class Views:
         path = self.rows.row(row)["labels_path"]
         if path is None:
             return ActorPaths({})
-        return self._reader.parsed("actors", path, lambda file: (ActorPaths(read_boxes(file)),))[0]
+        return self._reader.read_parsed(
+            "actors", path, lambda file: (ActorPaths(read_boxes(file)),)
+        )[0]
 
     def _read(self, row: int) -> View:
         """Read the view that the row's files hold.
@@ -382,7 +384,7 @@ def compare(views: Views, pair: Pair) -> Compared:
     a = view_a.depth_view
     b = view_b.depth_view
     carried = move_surfaces(views.paths(pair.a), a, b, view_a.shows_actor)
-    alpha = np.where(carried.unclear_b, np.float32(0), b.alpha)
+    alpha = np.where(carried.is_unclear_in_b, np.float32(0), b.alpha)
     warp = find_warp(a, dataclasses.replace(b, alpha=alpha), carried.points_m)
     water = None
     if view_a.shows_water is not None and view_b.shows_water is not None:
@@ -390,24 +392,24 @@ def compare(views: Views, pair: Pair) -> Compared:
         in_b = warp.sample(view_b.shows_water[..., None].astype(np.float64))[..., 0] > 0
         water = view_a.shows_water | in_b
     warped_picture = warp.sample(b.picture)
-    moved_mask = carried.moved & warp.counts
+    moved_mask = carried.is_moved & warp.is_counted
     noise = None
     sigma = views.noise(pair.a)
     if sigma > 0:
-        noise = np.zeros((*warp.counts.shape, 2))
+        noise = np.zeros((*warp.is_counted.shape, 2))
         zero_offsets = np.zeros(len(warp.rows))
         offsets = warp.rows % 1, warp.columns % 1
-        noise[warp.counts, 0] = noise_variance(
-            a.picture[warp.counts], zero_offsets, zero_offsets, sigma
+        noise[warp.is_counted, 0] = noise_variance(
+            a.picture[warp.is_counted], zero_offsets, zero_offsets, sigma
         )
-        noise[warp.counts, 1] = noise_variance(warped_picture[warp.counts], *offsets, sigma)
+        noise[warp.is_counted, 1] = noise_variance(warped_picture[warp.is_counted], *offsets, sigma)
     return Compared(view_a, warped_picture, warp, moved_mask, water, noise)
 
 
 def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> dict[str, Any]:
     """Compute the numbers of one pair."""
     comparison = compare(views, pair)
-    counts = comparison.warp.counts
+    counts = comparison.warp.is_counted
     cameras = [views.camera(row) for row in (pair.a, pair.b)]
     parts = {ALL: counts}
     if comparison.water is not None:
@@ -508,7 +510,7 @@ def pair_picture(views: Views, record: dict[str, Any]) -> np.ndarray:
     """uint8 [H', W', 3]: its frame, the other one warped, their error and the mask."""
     comparison = compare(views, record["rows"])
     picture = comparison.a.depth_view.picture
-    counts = comparison.warp.counts
+    counts = comparison.warp.is_counted
     error = np.abs(comparison.warped - picture).mean(2) * counts
     mask = np.zeros(picture.shape, np.uint8)
     mask[counts] = _COUNTS

@@ -29,7 +29,7 @@ from augment.semantics import SemanticClass
 from augment.timing import stopwatch
 from augment.trust import judge_scene
 from augment.views import render_view
-from recipes.fields import replaced
+from recipes.fields import with_unchecked_field
 from recipes.load import load_recipe
 from recipes.schema import Recipe, free_knobs, settings_of
 from recipes.template import RecipeTemplate
@@ -226,7 +226,7 @@ def explain_recipe(
         raise ClimateGSError(f"--variant {variant}: {template.name} has {variants_text}")
     resolved = template.resolve(variant)
     scene = open_scene(scene_uri)
-    is_open = resolved.quality.is_open
+    is_open = resolved.quality.has_open_choice
     if is_open and times:
         with compiling_noted():
             resolved = resolve_quality(resolved, scene, progress=True).recipe
@@ -238,7 +238,7 @@ def explain_recipe(
         "recipe": resolved.model_dump(mode="json"),
         "recipe_hash": resolved.hash,
         "variants": template.variants,
-        "quality": resolved.quality.words,
+        "quality": resolved.quality.summary,
         "is_chosen": times or not is_open,
         "settings": settings_of(resolved),
         "scene": {
@@ -261,21 +261,21 @@ def _view_facts(plan: Plan, scene: Scene, scale: float, *, all_of_it: bool) -> d
     """In how many of the scene's views actors and what effects have masks of (water, snow) can be
     seen; None of an effect that is absent, or that takes long to prepare, unless all_of_it.
     """
-    slow_effects = [] if all_of_it else [e.name for e in effects.EFFECTS if e.shares_files]
-    quick_plan = plan.without(slow_effects)
+    slow_effects = [] if all_of_it else [e.name for e in effects.EFFECTS if e.precomputes_files]
+    quick_plan = plan.without_effects(slow_effects)
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
     views = [plan_view(quick_plan, scene, camera.scaled(scale)) for camera in cameras]
     return {
         "count": len(views),
         **{
-            effect.mask: None
-            if quick_plan.placed[effect.name].data is None
-            else sum(effect.name in view.names for view in views)
+            effect.mask_name: None
+            if quick_plan.effect_plans[effect.name].data is None
+            else sum(effect.name in view.effect_names for view in views)
             for effect in effects.EFFECTS
-            if effect.mask is not None
+            if effect.mask_name is not None
         },
-        "actors": sum(bool(view.actors) for view in views) if scene.actors else None,
-        "mean_actors": sum(len(view.actors) for view in views) / len(views) if views else None,
+        "actors": sum(bool(view.actor_ids) for view in views) if scene.actors else None,
+        "mean_actors": sum(len(view.actor_ids) for view in views) / len(views) if views else None,
         "scene_actors": len(scene.actors),
     }
 
@@ -292,12 +292,12 @@ def measure_passes(recipe: Recipe, scene: Scene, count: int = VIEWS) -> dict[str
     cameras = sample_views(scene, count)
     once_s = {}
     plan = make_plan(recipe, scene)
-    for effect_in_scene in plan.active(scene):
-        if effect_in_scene.effect.shares_files:
+    for effect_in_scene in plan.active_effects(scene):
+        if effect_in_scene.hooks.precomputes_files:
             start = time.perf_counter()
-            _ = effect_in_scene.prepared
+            _ = effect_in_scene.prepared_data
             seconds = time.perf_counter() - start
-            once_s[plan.placed[effect_in_scene.effect.name].steps[0].name] = seconds
+            once_s[plan.effect_plans[effect_in_scene.hooks.name].steps[0].name] = seconds
     # A recipe's runs stand side by side, since a scene keeps the snow of two recipes at most.
     variants = {"": recipe} | without_folded(recipe, scene)
     runs = {name: [_runs(scene, c, variant) for c in cameras] for name, variant in variants.items()}
@@ -306,7 +306,7 @@ def measure_passes(recipe: Recipe, scene: Scene, count: int = VIEWS) -> dict[str
         name: [min(v, key=lambda r: r[FRAME]) for v in views] for name, views in runs.items()
     }
     total = _sum(fastest[""], FRAME)
-    drawing_passes = ("rasterise", *(name for e in effects.EFFECTS for name in e.draws))
+    drawing_passes = ("rasterise", *(name for e in effects.EFFECTS for name in e.raster_passes))
     passes = dict.fromkeys(name for run in fastest[""] for name in run if name != FRAME)
     share = {name: _sum(fastest[""], name) / total for name in passes}
     share["everything else"] = max(0.0, 1 - sum(share.values()))
@@ -343,8 +343,12 @@ def sample_views(scene: Scene, count: int) -> list[Camera]:
 def without_folded(recipe: Recipe, scene: Scene) -> dict[str, Recipe]:
     """The recipe without each of the passes that run inside the rasteriser, by the pass's name."""
     runs = {step.name for step in make_plan(recipe, scene).steps if step.runs}
-    folded = {name: f for effect in effects.EFFECTS for name, f in effect.folded.items()}
-    return {name: replaced(recipe, *change) for name, change in folded.items() if name in runs}
+    folded = {name: f for effect in effects.EFFECTS for name, f in effect.off_switches.items()}
+    return {
+        name: with_unchecked_field(recipe, *change)
+        for name, change in folded.items()
+        if name in runs
+    }
 
 
 def _runs(scene: Scene, camera: Camera, recipe: Recipe) -> list[dict[str, float]]:
@@ -370,7 +374,7 @@ def explanation_text(facts: dict[str, Any]) -> str:
         **facts,
         numbers=[item for name, n in sections.items() if n for item in _flat(name, n)],
         passes=_pass_lines(facts["plan"]["steps"], facts["times"]),
-        seen=[*(e.mask for e in reversed(effects.EFFECTS) if e.mask), "actors"],
+        seen=[*(e.mask_name for e in reversed(effects.EFFECTS) if e.mask_name), "actors"],
         absent=[name for name, count in facts["views"].items() if count is None],
     )
 

@@ -38,14 +38,14 @@ from augment.files.scene_file import (
 )
 from augment.jobs.files import RECORDED
 from augment.jobs.layout import MANIFEST_FILE, folder_name, variant_folder, variant_name
-from augment.jobs.manifest import OK, read_manifest, rows_of
+from augment.jobs.manifest import OK, read_manifest, select_variant_rows
 from augment.jobs.mirror import (
     MIRROR_FOLDER,
     DatasetFolder,
     FileCounts,
     Links,
     Replacement,
-    Shown,
+    ReplacementRecord,
     check_disjoint,
     dataset_format,
     is_weathered,
@@ -126,7 +126,7 @@ def clear_notes(
         if frames is None or frame.index in frames
     }
     images = {
-        tree.relative(path): name in cameras_by_frame.get(frame.index, ())
+        tree.place_of(path): name in cameras_by_frame.get(frame.index, ())
         for frame in scene.frames
         for name, path in frame.image_paths.items()
     }
@@ -143,7 +143,7 @@ def clear_notes(
         scene.frames, rendered_frames, {n for names in cameras_by_frame.values() for n in names}
     )
     sweeps = {
-        tree.relative(file): frame.index in span
+        tree.place_of(file): frame.index in span
         for frame in scene.frames
         for file in scene.labels.lidar_files(frame.index)[:1]
     }
@@ -270,11 +270,11 @@ def _mirror_rows(
     sweeps_between = weather_sweeps_between(scene, recipe, rows, out, progress=progress)
     images, notes = weathered_images(out, rows, scene.frames, tree)
     sweeps, sweep_notes = weathered_sweeps(out, [*rows, *sweeps_between.rows], scene.labels, tree)
-    if sweeps_between.faults:
-        first_frame = min(sweeps_between.faults)
+    if sweeps_between.errors:
+        first_frame = min(sweeps_between.errors)
         sweep_notes.append(
-            f"{len(sweeps_between.faults)} LiDAR sweeps without an image stay clear, the first of "
-            f"frame {first_frame}: {sweeps_between.faults[first_frame]}"
+            f"{len(sweeps_between.errors)} LiDAR sweeps without an image stay clear, the first of "
+            f"frame {first_frame}: {sweeps_between.errors[first_frame]}"
         )
     entries = {**record.replaced, **record.replaced_sweeps}
     of_others = {place: entry for place, entry in entries.items() if entry.scene != scene.name}
@@ -286,7 +286,7 @@ def _mirror_rows(
             f"{len(lost_places)} images of other scenes, such as {lost_places[0]}, are no longer "
             f"in {out} or its manifest: the source's own stand there again"
         )
-    scenes = {file.shown.scene for file in other_files.values()} & record.scenes.keys()
+    scenes = {file.record.scene for file in other_files.values()} & record.scenes.keys()
     facts = {key: rows[0][key] for key in ("source", "recipe_hash", "version", "backend")}
     done = mirror_dataset(
         tree,
@@ -303,12 +303,14 @@ def _mirror_rows(
 
 
 def _of_other_scenes(
-    out: Path, variant: str, entries: Mapping[str, Shown]
+    out: Path, variant: str, entries: Mapping[str, ReplacementRecord]
 ) -> dict[str, Replacement]:
     """Return the files of other scenes in the copy that the manifest still has, by place."""
     if not entries:
         return {}
-    table = rows_of(read_manifest(out), {(entry.scene, variant) for entry in entries.values()})
+    table = select_variant_rows(
+        read_manifest(out), {(entry.scene, variant) for entry in entries.values()}
+    )
     rows = [row for row in table if row["status"] == OK]
     by_path = {row["lidar_path"]: Replacement.sweep(out, row) for row in rows if is_weathered(row)}
     by_path |= {row["image_path"]: Replacement.image(out, row) for row in rows}
@@ -337,7 +339,7 @@ def _rows(
         )
     if variants is None:
         variants = sorted({variant for name, variant in pairs if name == scene.name})
-    rows_by_variant = {name: rows_of(table, {(scene.name, name)}) for name in variants}
+    rows_by_variant = {name: select_variant_rows(table, {(scene.name, name)}) for name in variants}
     absent_variants = sorted(name for name, rows in rows_by_variant.items() if not rows)
     if absent_variants or not rows_by_variant:
         raise OutputError(
@@ -392,7 +394,7 @@ def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> N
     """Images of the same recipe in another format are not rendered twice beside each other."""
     if not (out / MANIFEST_FILE).is_file() or recipe.output.image == written_as:
         return
-    rows = rows_of(read_manifest(out), {(scene.name, variant_name(recipe))})
+    rows = select_variant_rows(read_manifest(out), {(scene.name, variant_name(recipe))})
     if rows and rows[0]["recipe_hash"] == recipe.hash:
         folder = out / variant_folder(scene.name, variant_name(recipe))
         raise OutputError(
@@ -424,7 +426,7 @@ def label_files(
     counts = [f"{name} {done.objects[name]} in {done.images[name]} images" for name in done.images]
     parts = ", ".join(f"{name} {count}" for name, count in done.parts.items())
     lines = [f"labels: {done.folder} ({'; '.join(counts)}; parts: {parts})"]
-    if num_hidden := max(done.hidden.values(), default=0):
+    if num_hidden := max(done.num_hidden.values(), default=0):
         lines.append(f"  {num_hidden} objects are hidden by the weather (output.min_visibility)")
     if done.unmapped:
         categories_text = ", ".join(
@@ -437,8 +439,10 @@ def label_files(
             f"  {done.without_numbers} objects are DontCare in kitti: centre, size or rotation of "
             f"their box is not finite, or a side is not longer than 0"
         )
-    if done.unused:
-        lines.append(f"  rows of output.categories that no label is of: {', '.join(done.unused)}")
+    if done.unused_rows:
+        lines.append(
+            f"  rows of output.categories that no label is of: {', '.join(done.unused_rows)}"
+        )
     return lines
 
 

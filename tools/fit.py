@@ -18,7 +18,7 @@ from typing import Any
 
 from adapters.base import open_scene
 from adapters.training_views.checks import check_views, with_camera_times
-from adapters.training_views.starting_scene import starting_scene
+from adapters.training_views.starting_scene import complete_starting_scene
 from adapters.training_views.views import RecordedViews, holdout_step
 from adapters.uri import SCHEMES, format_uri
 from augment.errors import AdapterError, ClimateGSError
@@ -126,7 +126,7 @@ def _prepare(options: FitOptions, folder: Path, before: Checkpoint | None) -> _R
             f"where it was then"
         )
         notes = (*notes, sentence)
-    scene = starting_scene(scene, source)
+    scene = complete_starting_scene(scene, source)
     for problem in dict.fromkeys((*scene.problems, *source.problems, *notes)):
         print_note(f"note: {problem}")
     facts = _data_facts(scene, source)
@@ -153,7 +153,7 @@ def _prepare(options: FitOptions, folder: Path, before: Checkpoint | None) -> _R
         result="scene",
         changed=f"{options.scene} is not what {options.out} was fitted to so far",
     )
-    return _Run(options, training, scene, source, notes, dict(checks.facts))
+    return _Run(options, training, scene, source, notes, dict(checks.to_json))
 
 
 def _recorded_views(scene: Scene, options: FitOptions) -> RecordedViews:

@@ -26,7 +26,7 @@ from augment.metrics.image import DepthErrors, depth_errors, flip, flip_map, psn
 from augment.plan import make_plan
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
-from augment.render.composite import quantise
+from augment.render.composite import to_byte_array
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.views import SURFACE_ALPHA, render_buffers
@@ -312,7 +312,7 @@ def render_recorded(scene: Scene, camera: Camera) -> HeldOutRender:
     assert raster.median_depth is not None and raster.expected_depth is not None
     alpha = raster.alpha.numpy()
     return HeldOutRender(
-        rgb=quantise(buffers.rgb),
+        rgb=to_byte_array(buffers.rgb),
         alpha=alpha,
         median_depth_m=raster.median_depth.numpy(),
         expected_depth_m=raster.expected_depth.numpy(),

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from adapters.base import open_scene, scenes_of
+from adapters.base import expand_job_scenes, open_scene
 from adapters.camera_files.paths import frames_from_path_file
 from adapters.scene_cache import scene_digest
 from augment import effects
@@ -46,7 +46,7 @@ from augment.scene import Gaussians, Ground, Scene
 from augment.sky import CubemapSky
 from augment.trust import judge_scene, skipped_cameras_sentence, unfitted_cameras
 from augment.views import render_view
-from recipes.fields import found
+from recipes.fields import section_at
 from recipes.job import load_job, load_job_recipes, scaled_recipe
 from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe, free_knobs, parse_frames
@@ -108,7 +108,7 @@ def kernel_modules(
     if renders_on_gpu(backend):
         return street
     present_effects = [
-        e for e in effects.EFFECTS if any(e.of(recipe) is not None for recipe in recipes)
+        e for e in effects.EFFECTS if any(e.section_of(recipe) is not None for recipe in recipes)
     ]
     folders = (type(effect).__module__.removesuffix(".effect") for effect in present_effects)
     pictures = (f"augment.render.{name}" for name in ("cpu", "composite_kernels"))
@@ -126,13 +126,13 @@ def _alters_picture(recipe: Recipe) -> bool:
 def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
     kernel_sets = set()
     if any(uses_boxes(recipe) for recipe in recipes):
-        nothing = WorldBoxes.of(Boxes.empty(), np.zeros(3))
+        nothing = WorldBoxes.from_labels(Boxes.empty(), np.zeros(3))
         find_occlusion(nothing, _camera(1.0), np.zeros((SIZE, SIZE), np.float32))
     for recipe in recipes:
         output = recipe.output
-        sections = ((effect, effect.of(recipe)) for effect in effects.EFFECTS)
+        sections = ((effect, effect.section_of(recipe)) for effect in effects.EFFECTS)
         effect_kernels = tuple(
-            e.kernels(section) if section is not None else None for e, section in sections
+            e.kernel_key(section) if section is not None else None for e, section in sections
         )
         for_boxes = uses_boxes(recipe) and output.depth == "none"
         ids = output.semantic or output.instance
@@ -155,7 +155,7 @@ def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
 
 def _warm_recipe(recipe: Recipe, photo: str, backend: str) -> None:
     scene = _warm_up_scene(0.0, photo, with_labels=False)
-    effect_plans = make_plan(recipe, scene).placed.values()
+    effect_plans = make_plan(recipe, scene).effect_plans.values()
     level_z_m = next((p.water_level_z_m for p in effect_plans if p.water_level_z_m), 0.0)
     scene = _warm_up_scene(level_z_m, photo, with_labels=recipe.output.labels)
     render_view(scene, scene.frames[0].cameras["warm-up"], recipe, backend=backend)
@@ -228,19 +228,19 @@ def generate_dataset(options: GenerateOptions) -> int:
     number, count = map(int, options.shard.split("/"))
     setup = JobWorkerSetup(
         store_uri=out if store.local_dir is None else store.uri,
-        scratch=options.scratch or default_scratch(out),
+        scratch_dir=options.scratch or default_scratch(out),
         backend=backend,
         open_scene=open_scene,
-        digest_of=scene_digest,
+        scene_digest=scene_digest,
     )
     task = GenerateJob(
         recipes,
-        scenes_of(requested.scenes, job.parent),
+        expand_job_scenes(requested.scenes, job.parent),
         setup,
         executor=options.executor,
         workers=options.workers,
         shard=(number, count),
-        rescan=options.rescan,
+        reopens_scenes=options.rescan,
     )
     if options.dry_run:
         return _dry_run(task)
@@ -279,7 +279,7 @@ def show_status(out: str) -> int:
 
 
 def _dry_run(job: GenerateJob) -> int:
-    from augment.jobs.generate import estimate
+    from augment.jobs.generate import estimate_job
 
     plan = plan_job(job)
     page = fill(
@@ -292,14 +292,14 @@ def _dry_run(job: GenerateJob) -> int:
         max_lines=_MAX_LINES,
     )
     print(page)
-    guess = estimate(plan, open_scene, each=lambda name: print_note(f"trying {name}"))
+    guess = estimate_job(plan, open_scene, on_recipe=lambda name: print_note(f"trying {name}"))
     for name, sample in guess.samples.items():
         print(
             f"  {name}: {sample.seconds_per_mpx:.2f} s and {_size(sample.bytes_per_mpx)} a "
             f"megapixel, {sample.prepare_s:.1f} s to prepare"
         )
-    if guess.unsampled:
-        print(f"  taken as their mean: {', '.join(guess.unsampled)}")
+    if guess.unsampled_recipes:
+        print(f"  taken as their mean: {', '.join(guess.unsampled_recipes)}")
     print(
         f"about {duration_text(guess.seconds)} of one worker, {_size(guess.bytes)} "
         f"(from one picture a recipe; right to a factor of two or so)"
@@ -312,7 +312,7 @@ def _status_text(status: JobStatus) -> str:
         kind: [(name, g) for name, g in groups.items() if g.published < g.planned]
         for kind, groups in (("scene", status.by_scene), ("recipe", status.by_recipe))
     }
-    left = duration_text(status.left_s) if status.left_s and not _is_done(status) else ""
+    left = duration_text(status.remaining_s) if status.remaining_s and not _is_done(status) else ""
     return fill("status.txt", status=status, left=left, unfinished=unfinished, max_lines=_MAX_LINES)
 
 
@@ -384,7 +384,7 @@ def render_recipes(options: RenderOptions) -> int:
     for problem in judge_scene(scene, frames, cameras, scale=scale, count=1).problems:
         print_note(f"note: not fit for weather: {problem}")
     notes = lidar_notes(recipes)
-    labelled_frames = SceneIndex.of(scene, path).labelled
+    labelled_frames = SceneIndex.of(scene, path).labelled_frames
     sweep_frames = (
         labelled_frames if frame_numbers is None else labelled_frames.intersection(frame_numbers)
     )
@@ -409,7 +409,7 @@ def render_recipes(options: RenderOptions) -> int:
         kinds = ("render", "encode", "write")
         times = [f"{1000 * result.timings.get(k, 0.0) / result.written:.0f} ms {k}" for k in kinds]
         print(f"per image: {', '.join(times)} (on threads that overlap)")
-    if shares := compute_time_shares(result.timings, held_up=options.workers):
+    if shares := compute_time_shares(result.timings, num_waiting_workers=options.workers):
         print(shares.sentence)
     print(f"manifest: {result.manifest}")
     _write_labels(out, recipes, result.written + result.skipped)
@@ -477,7 +477,7 @@ def _with_quality(
     recipe: Recipe, scene: Scene, options: RenderOptions, path: Sequence[Frame] | None
 ) -> Recipe:
     """The recipe with the settings of its quality; a note says which it had to choose."""
-    if not recipe.quality.is_open:
+    if not recipe.quality.has_open_choice:
         return recipe
     resolved = choose_settings(
         open_store(options.out),
@@ -485,12 +485,12 @@ def _with_quality(
         scene,
         backend=choose_backend(options.backend, scene),
         camera_path=path,
-        anew=options.overwrite,
+        choose_again=options.overwrite,
         progress=True,
     )
-    settings = [f"{k.path} {found(resolved, k.path)}" for k in free_knobs(recipe)]
+    settings = [f"{k.path} {section_at(resolved, k.path)}" for k in free_knobs(recipe)]
     print_note(
-        f"{variant_name(recipe)}: quality {recipe.quality.words} chose {', '.join(settings)}"
+        f"{variant_name(recipe)}: quality {recipe.quality.summary} chose {', '.join(settings)}"
     )
     return resolved
 

@@ -342,7 +342,11 @@ def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> di
 
     The product of what every effect leaves, as `augment.jobs.files.visibility` has it.
     """
-    kinds = (kind for kind, of_boxes in box_tables().items() if of_boxes.visible or of_boxes.hidden)
+    kinds = (
+        kind
+        for kind, of_boxes in box_tables().items()
+        if of_boxes.visible_column or of_boxes.hidden_column
+    )
     columns = [f"{kind}_path" for kind in kinds if f"{kind}_path" in table.column_names]
 
     def count_boxes(paths: dict[str, str | None]) -> Counter[int] | None:
@@ -432,7 +436,7 @@ def _visible(paths: Mapping[str, str | None], files: ReportFiles) -> np.ndarray 
         if path is None:
             continue
         kind = box_tables()[column.removesuffix("_path")]
-        share_column = kind.visible or kind.hidden
+        share_column = kind.visible_column or kind.hidden_column
         has_pixels = "pixels" in kind.columns
         types = {
             **_BOX,
@@ -446,7 +450,7 @@ def _visible(paths: Mapping[str, str | None], files: ReportFiles) -> np.ndarray 
             continue
         if table.schema.types != [*types.values()]:
             return files.note(path, "its columns are not of the types that a job writes")
-        share = pc.subtract(1.0, table[share_column]) if kind.hidden else table[share_column]
+        share = pc.subtract(1.0, table[share_column]) if kind.hidden_column else table[share_column]
         share = pc.fill_null(pc.if_else(pc.is_finite(share), share, 1.0), 1.0)
         is_shown = pc.greater(table["pixels"], 0) if has_pixels else pa.repeat(True, len(table))
         part = table.select(list(_BOX)).append_column("left", share)

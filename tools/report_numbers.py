@@ -53,11 +53,11 @@ def shown_numbers(quantity: Column, numbers: np.ndarray) -> np.ndarray:
     or are none that an effect has.
     """
     has_effect = np.abs(numbers) < _MAX_NUMBER  # false for NaN
-    if quantity.absent == 0:
+    if quantity.value_if_absent == 0:
         has_effect &= numbers != 0
-    if quantity.over is not None:  # a visibility of infinity or below 0 is none
+    if quantity.numerator is not None:  # a visibility of infinity or below 0 is none
         has_effect &= numbers > 1 / _MAX_NUMBER
-    return quantity.shown(np.where(has_effect, numbers, np.nan))
+    return quantity.to_unit(np.where(has_effect, numbers, np.nan))
 
 
 def find_draws(table: pa.Table) -> pa.Table:

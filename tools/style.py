@@ -44,7 +44,7 @@ from augment.effects.style.train import (
 from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.files.scene_file import save_scene
 from augment.jobs.atomic import write_atomic
-from augment.render.composite import composite_sky, quantise
+from augment.render.composite import composite_sky, to_byte_array
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
@@ -519,7 +519,7 @@ def _picture(scene: Scene, styled: Scene) -> np.ndarray | None:
     rows = []
     for camera in _views(scene):
         panels = [
-            captioned(quantise(_render(panel_scene, camera)), title, camera.name)
+            captioned(to_byte_array(_render(panel_scene, camera)), title, camera.name)
             for panel_scene, title in ((scene, "before"), (styled, "after"))
         ]
         rows.append(strip(panels))

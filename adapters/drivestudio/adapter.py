@@ -43,7 +43,12 @@ from adapters.uri import format_uri
 from adapters.world import WorldChange, with_class_of
 from augment.cameras import Camera
 from augment.errors import AdapterError, SceneError
-from augment.files.checkpoints import load_checkpoint, section, taken, tensor
+from augment.files.checkpoints import (
+    checked_tensor,
+    copy_mapped_tensor,
+    dictionary_in,
+    load_checkpoint,
+)
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.render.composite import composite_sky
 from augment.render.sh import SH_C0, rotate_sh
@@ -81,9 +86,9 @@ def read_gaussians(
             f"over time in ways that are not known here. Known models are VanillaGaussians and "
             f"RigidNodes"
         )
-    means = tensor(content, "_means", (None, 3), where)
+    means = checked_tensor(content, "_means", (None, 3), where)
     count = len(means)
-    sh_rest = tensor(content, "_features_rest", (count, None, 3), where)
+    sh_rest = checked_tensor(content, "_features_rest", (count, None, 3), where)
     if sh_rest.shape[1] + 1 not in NUM_SH_BY_DEGREE:
         raise AdapterError(
             f"{where}: _features_rest must have 0, 3, 8 or 15 rows (degrees 0 to 3 of spherical "
@@ -92,15 +97,17 @@ def read_gaussians(
     degree = NUM_SH_BY_DEGREE.index(sh_rest.shape[1] + 1)
     active_degree = min(step // sh_interval, degree)
     sh = torch.empty(count, NUM_SH_BY_DEGREE[active_degree], 3)
-    taken(tensor(content, "_features_dc", (count, 3), where), sh[:, 0])
-    taken(sh_rest[:, : NUM_SH_BY_DEGREE[active_degree] - 1], sh[:, 1:])
+    copy_mapped_tensor(checked_tensor(content, "_features_dc", (count, 3), where), sh[:, 0])
+    copy_mapped_tensor(sh_rest[:, : NUM_SH_BY_DEGREE[active_degree] - 1], sh[:, 1:])
     if degree == 0:
         sh.sigmoid_().sub_(0.5).div_(SH_C0)
     gaussians = Gaussians(
-        means=taken(means),
-        quats=taken(tensor(content, "_quats", (count, 4), where)),
-        scales=taken(tensor(content, "_scales", (count, 3), where)).exp_(),
-        opacities=taken(tensor(content, "_opacities", (count, 1), where)).sigmoid_()[:, 0],
+        means=copy_mapped_tensor(means),
+        quats=copy_mapped_tensor(checked_tensor(content, "_quats", (count, 4), where)),
+        scales=copy_mapped_tensor(checked_tensor(content, "_scales", (count, 3), where)).exp_(),
+        opacities=copy_mapped_tensor(
+            checked_tensor(content, "_opacities", (count, 1), where)
+        ).sigmoid_()[:, 0],
         sh=sh,
     )
     if active_degree == degree:
@@ -117,7 +124,7 @@ def undrawn_models(models: Mapping[str, Any], where: str) -> list[str]:
     for name in models:
         if name in (BACKGROUND, RIGID, *OTHER_MODELS):
             continue
-        means = section(models, name, where).get("_means")
+        means = dictionary_in(models, name, where).get("_means")
         is_count = isinstance(means, Tensor)
         subject = f"{len(means)} Gaussians of {name} are" if is_count else f"the model {name} is"
         reason = _REASONS_BY_MODEL.get(name, "models of this kind are not known here")
@@ -186,7 +193,7 @@ def read_poses(content: Mapping[str, Any], run: Run, where: str) -> RigidPoses:
     Gaussians themselves, but not their places, by such a frame's own untrained pose. Here one pose
     does both.)
     """
-    is_visible = tensor(content, "instances_fv", (None, None), where, dtype=torch.bool)
+    is_visible = checked_tensor(content, "instances_fv", (None, None), where, dtype=torch.bool)
     frames, count = is_visible.shape
     if frames != len(run.frames):
         raise AdapterError(
@@ -194,10 +201,16 @@ def read_poses(content: Mapping[str, Any], run: Run, where: str) -> RigidPoses:
             f"{len(run.frames)} ({run.frames.start} to {run.frames[-1]}). Is it the scene that the "
             f"run was trained on?"
         )
-    quats = taken(tensor(content, "instances_quats", (frames, count, 4), where)).double()
-    positions = taken(tensor(content, "instances_trans", (frames, count, 3), where)).double()
-    sizes = taken(tensor(content, "instances_size", (count, 3), where)).double()
-    is_visible = taken(is_visible)
+    quats = copy_mapped_tensor(
+        checked_tensor(content, "instances_quats", (frames, count, 4), where)
+    ).double()
+    positions = copy_mapped_tensor(
+        checked_tensor(content, "instances_trans", (frames, count, 3), where)
+    ).double()
+    sizes = copy_mapped_tensor(
+        checked_tensor(content, "instances_size", (count, 3), where)
+    ).double()
+    is_visible = copy_mapped_tensor(is_visible)
     norms = quats.norm(dim=2)
     is_usable = torch.isfinite(positions).all(2) & torch.isfinite(norms) & (norms > 0)
     if not bool((is_usable | ~is_visible).all()) or not bool((sizes > 0).all()):
@@ -365,16 +378,16 @@ def read_sky(
     black = ConstantSky(torch.zeros(3))
     if "Sky" not in models:
         return black, (f"{where} holds no Sky; the sky is black",)
-    content = section(models, "Sky", where)
+    content = dictionary_in(models, "Sky", where)
     where = f"{where} Sky"
     if "base" in content:
-        base = tensor(content, "base", (6, None, None, 3), where)
+        base = checked_tensor(content, "base", (6, None, None, 3), where)
         if base.shape[1] != base.shape[2] or not 1 <= base.shape[1] <= _MAX_FACE_SIZE:
             raise AdapterError(
                 f"{where}: base must be [6, R, R, 3] with R from 1 to {_MAX_FACE_SIZE}; "
                 f"got {list(base.shape)}"
             )
-        faces = taken(base)
+        faces = copy_mapped_tensor(base)
         if not bool(torch.isfinite(faces).all()):
             raise AdapterError(f"{where}: base holds NaN or infinite numbers")
         return CubemapSky(rotate_cubemap(faces, _LOOKUP_FROM_MODEL @ scene_from_model.T)), ()
@@ -430,7 +443,9 @@ def _bake_network_sky(
     appearance = torch.zeros(0)
     problems = ()
     if "appearance_embedding.weight" in content:
-        embeddings = taken(tensor(content, "appearance_embedding.weight", (None, None), where))
+        embeddings = copy_mapped_tensor(
+            checked_tensor(content, "appearance_embedding.weight", (None, None), where)
+        )
         appearance = embeddings.mean(0)
         if bool((embeddings != appearance).any()):
             problems = (
@@ -438,12 +453,18 @@ def _bake_network_sky(
                 f"the project gives it to images that were not trained on",
             )
     num_inputs = 3 + 6 * _NUM_OCTAVES + len(appearance)
-    num_hidden = tensor(content, "sky_head.layers.0.weight", (None, num_inputs), where).shape[0]
+    num_hidden = checked_tensor(
+        content, "sky_head.layers.0.weight", (None, num_inputs), where
+    ).shape[0]
     shapes = ((num_hidden, num_inputs), (num_hidden, num_hidden + num_inputs), (3, num_hidden))
     layers = [
         (
-            taken(tensor(content, f"sky_head.layers.{i}.weight", shape, where)),
-            taken(tensor(content, f"sky_head.layers.{i}.bias", shape[:1], where)),
+            copy_mapped_tensor(
+                checked_tensor(content, f"sky_head.layers.{i}.weight", shape, where)
+            ),
+            copy_mapped_tensor(
+                checked_tensor(content, f"sky_head.layers.{i}.bias", shape[:1], where)
+            ),
         )
         for i, shape in enumerate(shapes)
     ]
@@ -496,13 +517,13 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
     step = content.get("step")
     if type(step) is not int or step < 0:
         raise AdapterError(f"{where}: step must be a number of training steps; got {step!r}")
-    models = section(content, "models", where)
+    models = dictionary_in(content, "models", where)
     corrections = read_corrections(models, run, where)
     frames, frame_problems = read_drive(run, numbers, corrections)
     color_maps, image_color_maps = corrections.maps_of(run, frames)
     sky, sky_problems = read_sky(models, scene_from_model(run), where)
     background, background_problems = read_gaussians(
-        section(models, BACKGROUND, where),
+        dictionary_in(models, BACKGROUND, where),
         step=step,
         sh_interval=run.sh_interval(BACKGROUND),
         where=f"{where} {BACKGROUND}",
@@ -561,14 +582,14 @@ def _actors(
     """Return the actors of a run's rigid objects, and sentences."""
     if RIGID not in models:
         return [], []
-    content = section(models, RIGID, where)
+    content = dictionary_in(models, RIGID, where)
     where = f"{where} {RIGID}"
     gaussians, problems = read_gaussians(
         content, step=step, sh_interval=run.sh_interval(RIGID), where=where
     )
     poses = read_poses(content, run, where)
-    ids = tensor(content, "points_ids", (len(gaussians), 1), where, dtype=torch.int64)
-    owners = taken(ids)[:, 0].numpy()
+    ids = checked_tensor(content, "points_ids", (len(gaussians), 1), where, dtype=torch.int64)
+    owners = copy_mapped_tensor(ids)[:, 0].numpy()
     count = poses.is_visible.shape[1]
     if len(owners) and not 0 <= owners.min() <= owners.max() < count:
         raise AdapterError(

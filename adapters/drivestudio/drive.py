@@ -50,7 +50,7 @@ from adapters.uri import UriOptions
 from adapters.world import rotation_to_z_up
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
-from augment.files.checkpoints import finite_array, section
+from augment.files.checkpoints import dictionary_in, finite_array
 from augment.files.image_size import read_image_header
 from augment.geometry import invert_rigid, quat_from_rotmat
 from augment.labels import Boxes, LidarSweep
@@ -448,11 +448,15 @@ def read_corrections(models: Mapping[str, Any], run: Run, where: str) -> ImageCo
     count = len(run.frames) * len(run.cameras)
     corrections = ImageCorrections()
     if "Affine" in models:
-        corrections = _read_color_maps(section(models, "Affine", where), count, f"{where} Affine")
+        corrections = _read_color_maps(
+            dictionary_in(models, "Affine", where), count, f"{where} Affine"
+        )
     pose_changes = None
     for name in _POSE_MODELS:
         if name in models:
-            pose_change = _pose_changes(section(models, name, where), count, f"{where} {name}")
+            pose_change = _pose_changes(
+                dictionary_in(models, name, where), count, f"{where} {name}"
+            )
             pose_changes = pose_change if pose_changes is None else pose_changes @ pose_change
     return dataclasses.replace(corrections, pose_changes=pose_changes)
 

@@ -546,7 +546,9 @@ def moving_boxes(
             else None
         )
         timed_boxes.append(TimedBoxes(number, boxes, times_ns, is_moving, rotations))
-    moving_samples = find_objects(timed_boxes, world_origin_m, several=True).moving_boxes
+    moving_samples = find_objects(
+        timed_boxes, world_origin_m, allows_several_boxes=True
+    ).moving_boxes
     first_time_ns = frames[0].sweep.timestamp_ns
     last_time_ns = frames[-1].sweep.timestamp_ns
     times = [sample.timestamp_ns for sample in tables.samples]

@@ -66,8 +66,14 @@ from augment.effects.lidar.beam import find_intensity_column
 from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError, OutputError
 from augment.jobs.files import decode_png, depth_in_metres
-from augment.jobs.layout import SWEEPS, folder_name
-from augment.jobs.tables import ATTRIBUTE_PREFIX, is_ours, read_boxes, read_lidar, read_table
+from augment.jobs.layout import SWEEP_FOLDER, folder_name
+from augment.jobs.tables import (
+    ATTRIBUTE_PREFIX,
+    has_climategs_metadata,
+    read_boxes,
+    read_lidar,
+    read_table,
+)
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Gaussians, Ground, Scene
 from augment.semantics import SemanticClass
@@ -183,8 +189,8 @@ def lidar_files(root: Path) -> dict[int, Path]:
 
     A variant that a job wrote has none of its own where the weather changed no sweep; those of its
     scene are returned then."""
-    is_variant = (root / "recipe.yaml").is_file() and not (root / SWEEPS).is_dir()
-    return numbered_files(root.parent if is_variant else root, SWEEPS, (".parquet",))
+    is_variant = (root / "recipe.yaml").is_file() and not (root / SWEEP_FOLDER).is_dir()
+    return numbered_files(root.parent if is_variant else root, SWEEP_FOLDER, (".parquet",))
 
 
 def all_boxes(root: Path) -> dict[int, FrameBoxes]:
@@ -203,7 +209,7 @@ def all_boxes(root: Path) -> dict[int, FrameBoxes]:
 def read_sweep(path: Path) -> LidarSweep:
     """Read the sweep in a file, every column under its own name."""
     with _reading(path, _LIDAR_FILE):
-        if is_ours(path):
+        if has_climategs_metadata(path):
             sweep = read_lidar(path)
         else:
             table = read_table(path, str(path))
@@ -221,7 +227,7 @@ def read_frame_boxes(path: Path) -> dict[int, FrameBoxes]:
 
 @lru_cache(maxsize=_CACHED_FILES)
 def _read_boxes(path: Path, _changed_ns: int, _size: int) -> dict[int, FrameBoxes]:
-    if is_ours(path):
+    if has_climategs_metadata(path):
         return {
             number: FrameBoxes(f.boxes, np.full(len(f.boxes), f.timestamp_ns, np.int64))
             for number, f in read_boxes(path).items()
@@ -571,7 +577,7 @@ def _best_scene(
     )
     # Whatever is found in the guessed surfaces is the height they were given.
     ground = Ground(float(road[:, 2].min()), float(np.median(road[:, 2])), "ego path")
-    return scene_of_drive(guessed_drive, coarse, added=shells, ground=ground)
+    return scene_of_drive(guessed_drive, coarse, extra_background=shells, ground=ground)
 
 
 def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:

@@ -92,7 +92,7 @@ class Road(NamedTuple):
     residual: float
 
 
-class Recorded(NamedTuple):
+class RecordingSummary(NamedTuple):
     """Summary of a recording that `record_colmap` wrote.
 
     Attributes:
@@ -105,7 +105,7 @@ class Recorded(NamedTuple):
 
     frames: int
     images: int
-    left_out: int
+    num_images_without_pose: int
     road: Road
     metres: float | None
     residual_m: float | None
@@ -119,7 +119,7 @@ def record_colmap(
     fps: float,
     camera_height_m: float | None = None,
     positions: Path | None = None,
-) -> Recorded:
+) -> RecordingSummary:
     """Write the recording of a COLMAP model to the folder `out`.
 
     Args:
@@ -177,7 +177,9 @@ def record_colmap(
     }
     (out / CALIBRATION).write_text(json.dumps(content, indent=1), encoding="utf-8")
     num_files = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in images.rglob("*"))
-    return Recorded(len(frames), len(shots), num_files - len(shots), road, metres, residual_m)
+    return RecordingSummary(
+        len(frames), len(shots), num_files - len(shots), road, metres, residual_m
+    )
 
 
 # ---- The model -----------------------------------------------------------------------------------

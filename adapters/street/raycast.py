@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adapters.street.forms import Kind, Shapes
-from augment.render.cpu.jit import inner, serial_kernel
+from augment.render.cpu.jit import kernel_function, serial_kernel
 
 # ---- Kernels: walk a tree of boxes, meet the shapes in its leaves --------------------------------
 # A box [6] is (-low, high), so that it grows by six maxima. A tree is flat and depth first: boxes
@@ -101,7 +101,7 @@ def trace(
         hit_local[ray, 0], hit_local[ray, 1], hit_local[ray, 2] = local
 
 
-@inner()
+@kernel_function()
 def _rotate(m, x, y, z):
     """Return the product of a matrix [3, 3] and a vector (x, y, z)."""
     return (
@@ -111,7 +111,7 @@ def _rotate(m, x, y, z):
     )
 
 
-@inner()
+@kernel_function()
 def _box_entry_distance(box, origin, direction, limit):
     """Return the distance at which a ray enters a box; infinite if it misses or starts too late."""
     entry_distance = 0.0
@@ -132,7 +132,7 @@ def _box_entry_distance(box, origin, direction, limit):
     return entry_distance if entry_distance <= exit_distance else math.inf
 
 
-@inner()
+@kernel_function()
 def _shape_distance(kind, a, b, c, da, db, dc, limit):
     """Return the distance at which a ray, in a shape's own frame, meets it.
 
@@ -215,7 +215,7 @@ def build(
     return num_nodes
 
 
-@inner()
+@kernel_function()
 def _grow_box(box, other):
     """Grow a box so that it encloses another one, in place."""
     # Element by element: assignments to slices, whose shapes numba checks, take long to compile.
@@ -223,7 +223,7 @@ def _grow_box(box, other):
         box[side] = max(box[side], other[side])
 
 
-@inner()
+@kernel_function()
 def _half_box_area(box):
     """Return half of a box's surface area."""
     x = box[3] + box[0]
@@ -232,13 +232,13 @@ def _half_box_area(box):
     return x * y + y * z + z * x
 
 
-@inner()
+@kernel_function()
 def _bin_of_box(box, axis, low, high):
     """Return the number of the bin between low and high that holds twice the box's centre."""
     return min(BINS - 1, int((box[3 + axis] - box[axis] - low) / (high - low) * BINS))
 
 
-@inner()
+@kernel_function()
 def _split(boxes, order, start, stop, scratch):
     """Reorder a range so that its halves cost least by the binned surface-area heuristic.
 

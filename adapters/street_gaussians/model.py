@@ -23,7 +23,14 @@ from adapters.raw_drive import DriveOptions
 from adapters.street_gaussians.data import ModelConfig, Number
 from adapters.uri import UriOptions
 from augment.errors import AdapterError, SceneError
-from augment.files.checkpoints import finite_array, load_checkpoint, release, section, taken, tensor
+from augment.files.checkpoints import (
+    checked_tensor,
+    copy_mapped_tensor,
+    dictionary_in,
+    finite_array,
+    load_checkpoint,
+    release,
+)
 from augment.files.ply import SEMANTIC, PlyElement, PlyHeader, read_columns, read_ply_header
 from augment.geometry import rotmat_from_quat
 from augment.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians, drawable_rows, is_drawable
@@ -351,7 +358,7 @@ def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
     for name in (_BACKGROUND_PART, *(name for name in content if actor_id(str(name)) is not None)):
         where = f"{path}, {name}"
         is_background = name == _BACKGROUND_PART
-        entry = section(content, name, str(path))
+        entry = dictionary_in(content, name, str(path))
         arrays = _part_arrays(entry, where, problems, is_background=is_background)
         parts[name] = make_part(arrays, where, problems, is_background=is_background)
     background, actors = _separate_background(parts)
@@ -383,13 +390,13 @@ def _part_arrays(
     content: Mapping[str, Any], where: str, problems: list[str], *, is_background: bool
 ) -> dict[str, Tensor]:
     """Return copies of a part's tensors in the form that `make_part` takes."""
-    means = tensor(content, "xyz", (None, 3), where)
+    means = checked_tensor(content, "xyz", (None, 3), where)
     count = len(means)
-    colours = tensor(content, "feature_dc", (count, None, 3), where)
-    sh_rest = tensor(content, "feature_rest", (count, None, 3), where)
-    scales = tensor(content, "scaling", (count, 3), where)
-    quats = tensor(content, "rotation", (count, 4), where)
-    logits = tensor(content, "opacity", (count, 1), where)
+    colours = checked_tensor(content, "feature_dc", (count, None, 3), where)
+    sh_rest = checked_tensor(content, "feature_rest", (count, None, 3), where)
+    scales = checked_tensor(content, "scaling", (count, 3), where)
+    quats = checked_tensor(content, "rotation", (count, 4), where)
+    logits = checked_tensor(content, "opacity", (count, 1), where)
     check_counts(where, sh_rest.shape[1], colours.shape[1], is_background=is_background)
     semantic = content.get("semantic")
     if isinstance(semantic, Tensor) and semantic.dim() == 2 and semantic.shape[1] > 0:
@@ -400,9 +407,13 @@ def _part_arrays(
         problems.append(f"{where}: it also holds {', '.join(unknown_keys[:8])}, which is not used")
     sh = torch.empty(count, 1 + sh_rest.shape[1], 3)
     terms = torch.empty_like(colours[:, 1:])
-    arrays = {"means": taken(means), "quats": taken(quats), "scales": taken(scales)}
-    arrays["opacities"] = taken(logits)[:, 0]
-    taken(sh_rest, sh[:, 1:])
+    arrays = {
+        "means": copy_mapped_tensor(means),
+        "quats": copy_mapped_tensor(quats),
+        "scales": copy_mapped_tensor(scales),
+    }
+    arrays["opacities"] = copy_mapped_tensor(logits)[:, 0]
+    copy_mapped_tensor(sh_rest, sh[:, 1:])
     rows = max(1, _CHUNK_NUMBERS // max(1, colours[:1].numel()))
     for start in range(0, count, rows):  # memory is given back as it goes
         chunk = colours[start : start + rows]
@@ -446,7 +457,9 @@ class _Tables:
                 f"{', '.join(map(str, list(self._content)[:12]))}. Copy the model and its "
                 f"configs/ from the same training"
             )
-        return section(section(self._content, name, str(self.path)), "params", self.where(name))
+        return dictionary_in(
+            dictionary_in(self._content, name, str(self.path)), "params", self.where(name)
+        )
 
     def where(self, name: str) -> str:
         """Return the name of an entry's table, for messages."""
@@ -496,12 +509,12 @@ def _read_sky(tables: _Tables) -> Tensor | None:
             f"background's colour instead"
         )
         return None
-    faces = tensor(params, "sky_cube_map", (6, None, None, 3), where)
+    faces = checked_tensor(params, "sky_cube_map", (6, None, None, 3), where)
     if faces.shape[1] != faces.shape[2] or faces.shape[1] == 0:
         raise AdapterError(
             f"{where}: sky_cube_map must be float32 [6, R, R, 3]; got {list(faces.shape)}"
         )
-    faces = taken(faces)
+    faces = copy_mapped_tensor(faces)
     if not np.isfinite([faces.numpy().min(), faces.numpy().max()]).all():
         raise AdapterError(f"{where}: sky_cube_map holds NaN or infinite numbers")
     return faces.clamp_(0, 1)

@@ -34,7 +34,7 @@ from augment.geometry import (
     slerp,
 )
 from augment.labels import LidarSweep
-from augment.own_car import spread
+from augment.own_car import spread_evenly
 from augment.reconstruct.view import ViewKey
 from augment.scene import Scene
 
@@ -393,7 +393,7 @@ class ViewCheckResults:
     offsets: tuple[CameraOffset, ...]
 
     @property
-    def facts(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return JSON-able facts for reports: pixels of the compared image, to the right and
         down.
         """
@@ -424,7 +424,7 @@ def check_views(scene: Scene, views: RecordedViews) -> ViewCheckResults:
         for name, camera_keys in keys_by_camera.items()
     }
     keys_by_camera = {
-        name: spread(camera_keys, _NUM_FRAMES)
+        name: spread_evenly(camera_keys, _NUM_FRAMES)
         for name, camera_keys in train_keys.items()
         if camera_keys
     }

@@ -29,7 +29,7 @@ from adapters.world import join_gaussians
 from augment.cameras import Camera
 from augment.geometry import rigid
 from augment.labels import EGO_VEHICLE
-from augment.own_car import spread
+from augment.own_car import spread_evenly
 from augment.reconstruct.view import ViewSource
 from augment.recorded_sky import TOP_MARGIN_RAD
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
@@ -65,7 +65,7 @@ _WALL_SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
 _ACTOR_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def starting_scene(scene: Scene, views: RecordedViews) -> Scene:
+def complete_starting_scene(scene: Scene, views: RecordedViews) -> Scene:
     """Return the scene with upper walls and with a body of the recording car, from training
     views alone.
 
@@ -89,7 +89,7 @@ def continue_walls(scene: Scene, views: RecordedViews) -> Gaussians:
         return background
     classes = background.semantic.numpy()
     room = _MAX_WALL_SPLATS
-    for key in spread(views.train, _MAX_WALL_IMAGES):
+    for key in spread_evenly(views.train, _MAX_WALL_IMAGES):
         view = views.load(key)
         camera = view.camera.scaled(min(1.0, _WALL_COLUMNS / view.camera.width))
         parts = dataclasses.replace(scene, background=background).parts_for(camera)

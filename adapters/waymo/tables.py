@@ -25,7 +25,7 @@ from adapters.raw_drive import describe_frames
 from adapters.scene_cache import image_folder
 from adapters.uri import WAYMO_REQUIRED, WAYMO_SPLITS
 from augment.errors import AdapterError
-from augment.files.packed_images import NUMBER_LISTS, Lens, PackedImages, is_number, reading
+from augment.files.packed_images import NUMBER_LISTS, Lens, PackedImages, is_number, parquet_errors
 from augment.jobs.manifest import MAX_SIDE_PX
 from augment.jobs.tables import read_table
 
@@ -82,7 +82,7 @@ def find_segment(path: Path, segment_name: str | None) -> SegmentFiles:
     files = SegmentFiles("", path, is_alone=True)
     if files.has(WAYMO_REQUIRED[0]):
         file = files.path(WAYMO_REQUIRED[0])
-        with reading(file):
+        with parquet_errors(file):
             table = read_table(file, str(file), [SEGMENT])
         names = set(_segment_names(table, file))
         segments = {str(name): SegmentFiles(str(name), path, is_alone=True) for name in names}
@@ -142,7 +142,7 @@ class Rows:
         self.path = files.path(component)
         self._class = COMPONENTS[component]
         columns = [field if field == STAMP else self.name(field) for field in fields]
-        with reading(self.path):
+        with parquet_errors(self.path):
             table = read_table(self.path, str(self.path), [SEGMENT, *columns])
             names = _segment_names(table, self.path)
             is_segment = pa.array([name == files.name for name in names], pa.bool_())
@@ -545,7 +545,7 @@ def extract_images(
     )
     frames = set(numbers)
     requested = {file: shot for file, shot in shots.items() if shot[0] in frames}
-    faults = packed.put(
+    faults = packed.write_folder(
         folder, list(requested), [f for f, shot in requested.items() if shot[0] in now]
     )
     sentences = [

@@ -13,9 +13,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from augment.boxes import WorldBoxes, outline_boxes, shown_pixels
+from augment.boxes import WorldBoxes, outline_boxes, pixels_of_boxes
 from augment.cameras import Camera
-from augment.dataset.samples import buffers, check_choice, moved_points, turned_quats
+from augment.dataset.samples import buffers, check_choice, points_in_frame, quats_in_frame
 from augment.geometry import invert_rigid, rotmat_from_quat
 from augment.labels import Boxes
 from augment.semantics import class_of_label
@@ -78,7 +78,7 @@ def boxes_in_camera(
     frame_from_camera = camera["world_from_camera"].numpy()
     if boxes["frame"] == "ego":
         frame_from_camera = invert_rigid(camera["world_from_ego"]).numpy() @ frame_from_camera
-    return moved_points(centers_m, frame_from_camera), turned_quats(quats, frame_from_camera)
+    return points_in_frame(centers_m, frame_from_camera), quats_in_frame(quats, frame_from_camera)
 
 
 # ---- Samples in the shape that torchvision's detectors and transforms (v2) take ------------------
@@ -206,8 +206,8 @@ def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
     names = tuple(boxes["track_ids"])
     camera_boxes = Boxes(names, tuple(boxes["labels"]), centers_m, boxes["sizes_m"].numpy(), quats)
     masks = np.zeros((len(names), camera["height"], camera["width"]), bool)
-    for number, rows, columns in shown_pixels(
-        WorldBoxes.of(camera_boxes, np.zeros(3)), view, depth.numpy()
+    for number, rows, columns in pixels_of_boxes(
+        WorldBoxes.from_labels(camera_boxes, np.zeros(3)), view, depth.numpy()
     ):
         masks[number, rows, columns] = True
     return torch.from_numpy(masks)

@@ -66,7 +66,7 @@ class ShardedSampler(Sampler[int]):
         ranks: int | None = None,
         shuffle: bool = True,
         seed: int = 0,
-        uneven: Uneven = "exact",
+        remainder: Uneven = "exact",
     ) -> None:
         process_rank, num_processes = _process_rank()
         self.rank = process_rank if rank is None else rank
@@ -74,10 +74,10 @@ class ShardedSampler(Sampler[int]):
         self.count = samples if isinstance(samples, int) else len(samples)
         self.shuffle = shuffle
         self.seed = seed
-        self.uneven = uneven
+        self.uneven = remainder
         if not 0 <= self.rank < self.ranks:
             raise ValueError(f"rank must be 0 to {self.ranks - 1} of {self.ranks}; got {self.rank}")
-        check_choice("uneven", uneven, Uneven)
+        check_choice("uneven", remainder, Uneven)
         self.epoch = 0
         self._num_done = 0  # samples of all ranks before the place where the epoch goes on
         self._num_yielded = 0
@@ -103,7 +103,7 @@ class ShardedSampler(Sampler[int]):
             -(-num_remaining // self.ranks) if self.uneven == "pad" else num_remaining // self.ranks
         )
 
-    def state_dict(self, given: int | None = None) -> dict[str, Any]:
+    def state_dict(self, num_trained: int | None = None) -> dict[str, Any]:
         """Return the place in the epoch, in plain numbers that JSON holds.
 
         Args:
@@ -112,7 +112,7 @@ class ShardedSampler(Sampler[int]):
                 same number. None takes the number that this sampler yielded, which is right if no
                 worker reads ahead.
         """
-        ahead = (self._num_yielded if given is None else given) * self.ranks
+        ahead = (self._num_yielded if num_trained is None else num_trained) * self.ranks
         return {
             "epoch": self.epoch,
             "done": min(self._num_done + ahead, self.count),
@@ -167,7 +167,7 @@ DEFAULT_FRACTIONS: Mapping[str, float] = {"train": 0.8, "val": 0.2}
 
 
 def split_by_scene(
-    whole: Splittable,
+    dataset: Splittable,
     fractions: Mapping[str, float] = DEFAULT_FRACTIONS,
     seed: int = 0,
     *,
@@ -193,8 +193,8 @@ def split_by_scene(
     shares = list(fractions.values())
     if not shares or min(shares) < 0 or not math.isclose(sum(shares), 1, abs_tol=1e-9):
         raise ValueError(f"fractions must be >= 0 and add up to 1; got {dict(fractions)}")
-    source: Any = whole
-    is_dataset = isinstance(whole, WeatherDataset)
+    source: Any = dataset
+    is_dataset = isinstance(dataset, WeatherDataset)
     column = source.rows["scene"] if is_dataset else source["scene"].combine_chunks()
     scenes = column.dictionary_encode()
     places = np.array([_place(name, seed) for name in scenes.dictionary.to_pylist()])
@@ -268,7 +268,7 @@ class PairedDataset(Dataset):
         partner = _partners(clean.rows, weathered.rows)
         self._weathered_rows = np.flatnonzero(partner >= 0)
         self._clean_rows = partner[self._weathered_rows]
-        self.unpaired = len(partner) - len(self._weathered_rows)
+        self.num_unpaired = len(partner) - len(self._weathered_rows)
         if len(clean) and len(weathered) and not len(self):
             raise ValueError(
                 "no clean image has the scene, frame and camera of a weathered one; render the "

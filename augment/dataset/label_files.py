@@ -30,7 +30,7 @@ from pydantic import BaseModel, NonNegativeInt
 
 from augment.boxes import are_usable
 from augment.dataset.clips_pairs import split_by_scene
-from augment.dataset.samples import moved_points
+from augment.dataset.samples import points_in_frame
 from augment.dataset.weather_dataset import RowReader
 from augment.errors import OutputError
 from augment.geometry import invert_rigid, rotmat_from_quat
@@ -44,7 +44,7 @@ from augment.jobs.atomic import (
 )
 from augment.jobs.box_tables import BOXES_2D, MASK_SIDES, MASKS, SIDES
 from augment.jobs.claims import hold_claim
-from augment.jobs.files import CameraRecord, box_tables, visibility
+from augment.jobs.files import CameraRecord, box_tables, combine_visibility
 from augment.jobs.layout import folder_name, resolve_inside
 from augment.jobs.manifest import MANIFEST_FILE, OK, read_manifest_rows
 from augment.jobs.store import open_store
@@ -115,20 +115,20 @@ class LabelsResult:
     """Number of images by format."""
     objects: Mapping[str, int]
     """Number of objects by format."""
-    hidden: Mapping[str, int]
+    num_hidden: Mapping[str, int]
     """Number of objects that the weather hides by format, whether they are marked or left out."""
     parts: Mapping[str, int]
     """Number of images by part."""
     unmapped: Mapping[str, int]
     """Number of boxes by label, for labels without a category ("" where the dataset gives no
     label)."""
-    unused: tuple[str, ...]
+    unused_rows: tuple[str, ...]
     """Rows of category tables that match no label."""
     without_numbers: int = 0
     """Number of kitti objects that are DontCare because a number of their 3D box is not usable."""
 
 
-def write_labels(out: Path | str, asked: LabelOptions | None = None) -> LabelsResult:
+def write_labels(out: Path | str, options: LabelOptions | None = None) -> LabelsResult:
     """Write the labels of an output on this machine; they replace the labels that it has.
 
     Args:
@@ -144,7 +144,7 @@ def write_labels(out: Path | str, asked: LabelOptions | None = None) -> LabelsRe
     out = Path(out).absolute()
     folder = path_below(out, (LABELS,))
     store = open_store(out)
-    request = asked or _last_request(folder)
+    request = options or _last_request(folder)
     if wrong := [part for part in request.split if folder_name(part) != part]:
         raise ValueError(f"parts are names of files: letters, digits, -, _ and .; got {wrong[0]!r}")
     with hold_claim(store, LABELS):
@@ -218,7 +218,7 @@ def category_of(label: str, table: Sequence[Category] | None) -> str | None:
         return None
     if table is None:
         return label
-    return next((row.name for row in table if row.takes(label)), None)
+    return next((row.name for row in table if row.matches(label)), None)
 
 
 def forecast_labels(scene: Scene, output: Output) -> dict[str, Any] | None:
@@ -296,7 +296,7 @@ def _categories(
         )
     tables = (output.categories or () for output in policies.values())
     table_rows = dict.fromkeys(row for table in tables for row in table)
-    unused = tuple(row.label for row in table_rows if not any(map(row.takes, label_counts)))
+    unused = tuple(row.label for row in table_rows if not any(map(row.matches, label_counts)))
     if table_rows and label_counts and not free_labels and len(unused) == len(table_rows):
         raise OutputError(
             f"{out}: output.categories names {', '.join(unused[:5])}; no object has such a label. "
@@ -360,9 +360,9 @@ def objects_of(
 ) -> list[LabelledObject]:
     """Return the objects of a category that a row's image shows, in the order of the labels."""
     key = row["frame"], row["camera"]
-    frames = reader.parsed("labels", row["labels_path"], read_boxes)
+    frames = reader.read_parsed("labels", row["labels_path"], read_boxes)
     tables = {
-        kind: reader.parsed(kind, row[f"{kind}_path"], table.read).get(key)
+        kind: reader.read_parsed(kind, row[f"{kind}_path"], table.read).get(key)
         for kind, table in box_tables().items()
         if row[f"{kind}_path"] is not None
     }
@@ -376,9 +376,9 @@ def objects_of(
     weather: Any = tables
     masks = weather[MASKS.name]
     boxes_2d = weather[BOXES_2D.name]
-    visibilities = visibility(weather, len(boxes))
+    visibilities = combine_visibility(weather, len(boxes))
     world_from_camera = camera.world_from_camera.numpy()
-    centres = moved_points(boxes.centers_m, world_from_camera)
+    centres = points_in_frame(boxes.centers_m, world_from_camera)
     rotations = rotmat_from_quat(torch.from_numpy(boxes.quats)).numpy()
     objects = []
     for k, label in enumerate(boxes.labels):
@@ -551,7 +551,7 @@ class _Writing:
             **self._counted(formats),
             parts=dict(self.parts),
             unmapped=self.categories.unmapped,
-            unused=self.categories.unused,
+            unused_rows=self.categories.unused,
             without_numbers=self.without_numbers,
         )
 

@@ -26,7 +26,7 @@ from augment.effects import JobContext, precompute_effects
 from augment.errors import BackendUnavailable
 from augment.jobs.files import (
     SceneIndex,
-    View,
+    ViewResult,
     camera_record,
     check_view,
     decode_image,
@@ -97,7 +97,7 @@ class SceneDataset(Dataset):
         box_frame: BoxFrame = "world",
         transform: Callable[[Sample], Any] | None = None,
     ) -> None:
-        self.options = SampleOptions.checked(image_type, load, box_frame)
+        self.options = SampleOptions.create(image_type, load, box_frame)
         if load is not None and "lidar" in load:
             raise ValueError(
                 "load must not have 'lidar' for a live scene: run a job with output: {lidar: true} "
@@ -123,7 +123,7 @@ class SceneDataset(Dataset):
         """Restore the state; fill the memo of the scene, which is a new object in this process."""
         self.__dict__.update(state)
         self._process = os.getpid()
-        memo_of(self.scene).update(self._memo)
+        memo_of(self.scene).take_shared(self._memo)
 
     def __len__(self) -> int:
         return len(self._items)
@@ -152,7 +152,7 @@ class SceneDataset(Dataset):
         options = {"backend": self._backend}
         return (self._renderer(self.scene, camera, self.recipe, **options) for camera in cameras)
 
-    def _sample(self, frame: Frame, name: str, view: View) -> Sample:
+    def _sample(self, frame: Frame, name: str, view: ViewResult) -> Sample:
         """Return the sample of one view."""
         recipe = self.recipe
         origin_m = self._index.world_origin_m
@@ -167,7 +167,7 @@ class SceneDataset(Dataset):
             camera=camera_record(camera, origin_m),
             world_from_ego=world_from_ego,
             labels=labels,
-            described={
+            metadata={
                 "weather": {n: v for n, v in recipe.columns().items() if isinstance(v, float)},
                 "paths": dict.fromkeys(path_kinds()),
                 "scene": self.scene.name,
@@ -178,7 +178,7 @@ class SceneDataset(Dataset):
             },
         )
 
-    def _images(self, view: View) -> dict[str, np.ndarray]:
+    def _images(self, view: ViewResult) -> dict[str, np.ndarray]:
         """Return the images of a view that samples hold, with the pixels that files would have."""
         output = self.recipe.output
         images = {"semantic": view.semantic, "instance": view.instance, **view.masks}
@@ -189,7 +189,7 @@ class SceneDataset(Dataset):
             images["depth"] = quantise_depth(view.depth_m)
         return {k: v for k, v in images.items() if k in self.options.load and v is not None}
 
-    def _label(self, frame: Frame, camera: Camera, view: View) -> tuple[View, Labels]:
+    def _label(self, frame: Frame, camera: Camera, view: ViewResult) -> tuple[ViewResult, Labels]:
         """Return the view with the frame's boxes in its instance image, and the frame's labels.
 
         The labels are those that the files of a job would hold.
@@ -203,7 +203,7 @@ class SceneDataset(Dataset):
         recipe = self.recipe
         index = self._index
         requested = uses_boxes(recipe) and ("boxes" in load or "instance" in load)
-        if not requested or frame.index not in index.labelled:
+        if not requested or frame.index not in index.labelled_frames:
             return view, Labels()
         boxes = self.scene.boxes(frame.index)
         view, measured = label_view(
@@ -217,4 +217,4 @@ class SceneDataset(Dataset):
         )
         if not (recipe.output.labels and "boxes" in load):
             return view, Labels()
-        return view, Labels(boxes, measured, instances=index.instances.of(boxes.track_ids))
+        return view, Labels(boxes, measured, instances=index.instances.numbers_of(boxes.track_ids))

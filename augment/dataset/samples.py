@@ -39,7 +39,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.utils.data import get_worker_info
 
-from augment.jobs.files import BoxWeather, CameraRecord, box_tables, depth_in_metres, visibility
+from augment.jobs.files import (
+    BoxWeather,
+    CameraRecord,
+    box_tables,
+    combine_visibility,
+    depth_in_metres,
+)
 from augment.jobs.layout import TRUST, mask_names
 from augment.labels import Boxes, LidarSweep
 
@@ -95,7 +101,7 @@ class SampleOptions:
     """Frame of boxes and LiDAR points."""
 
     @staticmethod
-    def checked(
+    def create(
         image_type: str = "float32", load: Collection[str] | None = None, box_frame: str = "world"
     ) -> SampleOptions:
         """Return checked options.
@@ -157,7 +163,7 @@ def make_sample(
     camera: CameraRecord,
     world_from_ego: torch.Tensor,
     labels: Labels,
-    described: Mapping[str, Any],
+    metadata: Mapping[str, Any],
 ) -> Sample:
     """Return one sample, a dictionary as the head of this module lists it.
 
@@ -183,7 +189,7 @@ def make_sample(
         sample["boxes"] = box_tensors(labels.boxes, weather, *axes, instances=labels.instances)
     if labels.lidar is not None:
         sample["lidar"] = lidar_tensors(labels.lidar, *axes)
-    return {**sample, "camera": {**vars(camera), "world_from_ego": world_from_ego}, **described}
+    return {**sample, "camera": {**vars(camera), "world_from_ego": world_from_ego}, **metadata}
 
 
 def image_tensor(rgb: np.ndarray, image_type: ImageType) -> torch.Tensor:
@@ -245,12 +251,12 @@ def box_tensors(
     centers_m = boxes.centers_m.copy()
     quats = boxes.quats.copy()
     if box_frame != "world":
-        centers_m = moved_points(centers_m, world_from_frame)
-        quats = turned_quats(quats, world_from_frame)
+        centers_m = points_in_frame(centers_m, world_from_frame)
+        quats = quats_in_frame(quats, world_from_frame)
     fractions = {
         name: torch.from_numpy(weather[kind][name].copy()) if kind in weather else None
         for kind, table in box_tables().items()
-        for name in table.sampled
+        for name in table.sample_columns
     }
     return {
         "frame": box_frame,
@@ -262,17 +268,17 @@ def box_tensors(
         "attributes": dict(boxes.attributes),
         "instance": None if instances is None else torch.from_numpy(instances.astype(np.int32)),
         **fractions,
-        "visibility": torch.from_numpy(visibility(weather, len(boxes))),
+        "visibility": torch.from_numpy(combine_visibility(weather, len(boxes))),
     }
 
 
-def moved_points(points_m: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
+def points_in_frame(points_m: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
     """Return points of the world [N, 3] in the coordinates of another frame."""
     with np.errstate(invalid="ignore"):  # points that are not finite stay so
         return (points_m - world_from_frame[:3, 3]) @ world_from_frame[:3, :3]
 
 
-def turned_quats(quats: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
+def quats_in_frame(quats: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
     """Return rotations world_from_box as frame_from_box; the quaternions keep their norms."""
     x, y, z, w = Rotation.from_matrix(world_from_frame[:3, :3].T).as_quat()
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
@@ -296,7 +302,7 @@ def lidar_tensors(
     """
     points_m = sweep.points_m
     if frame != "world":
-        points_m = moved_points(points_m, world_from_frame)
+        points_m = points_in_frame(points_m, world_from_frame)
     other_columns = {name: column for name, column in sweep.columns.items() if name not in "xyz"}
     return {
         "points_m": torch.from_numpy(points_m),

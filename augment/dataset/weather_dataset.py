@@ -82,7 +82,7 @@ class Rows:
     """Names of the columns that hold weather numbers."""
 
     @staticmethod
-    def of(table: pa.Table) -> Rows:
+    def from_table(table: pa.Table) -> Rows:
         """Return the rows of a manifest's table; columns ending in `_path` hold paths."""
         encoded: dict[str, pa.Array] = {}
         for name, column in zip(table.column_names, table.columns, strict=True):
@@ -184,7 +184,7 @@ class Rows:
         group = number_groups([self.codes(name)[0] for name in names])
         return np.unique(group, return_index=True)[1], group
 
-    def has(self, kind: str) -> np.ndarray:
+    def has_file(self, kind: str) -> np.ndarray:
         """Return the mask of rows that name a file of a kind of `samples.loadable`, bool [N]."""
         codes, names = self.codes(f"{'labels' if kind == 'boxes' else kind}_path")
         is_file = np.array([name is not None for name in names], bool)
@@ -294,7 +294,7 @@ class RowReader:
                 f"{row['variant']!r}, {_item_text(row)} has status ok and names no calibration "
                 f"file; it is damaged"
             )
-        entries = self.parsed("calibration", path, read_entries)
+        entries = self.read_parsed("calibration", path, read_entries)
         with self._named(path, f" ({_item_text(row)})"):
             entry = entries[row["frame"]]
             ego = torch.tensor(entry["world_from_ego"], dtype=torch.float64)
@@ -305,7 +305,7 @@ class RowReader:
         box_fields = {}
         sweep = None
         if "boxes" in load and (path := row["labels_path"]) is not None:
-            frames = self.parsed("labels", path, read_boxes)
+            frames = self.read_parsed("labels", path, read_boxes)
             with self._named(path):
                 if row["frame"] not in frames:
                     raise ValueError(f"it lacks frame {row['frame']}")
@@ -317,7 +317,7 @@ class RowReader:
                 "box_weather": weather,
             }
         if "lidar" in load and (path := row["lidar_path"]) is not None:
-            sweep = self.parsed("lidar", path, read_lidar)
+            sweep = self.read_parsed("lidar", path, read_lidar)
         return Labels(**box_fields, lidar=sweep)
 
     def _box_weather(self, row: Row, count: int) -> Iterator[tuple[str, BoxNumbers]]:
@@ -325,9 +325,9 @@ class RowReader:
         image.
         """
         for kind, table in box_tables().items():
-            if (path := row[f"{kind}_path"]) is None or not table.sampled:
+            if (path := row[f"{kind}_path"]) is None or not table.sample_columns:
                 continue
-            numbers = self.parsed(kind, path, table.read).get((row["frame"], row["camera"]))
+            numbers = self.read_parsed(kind, path, table.read).get((row["frame"], row["camera"]))
             with self._named(path):
                 if numbers is None:
                     raise ValueError(f"it lacks {_item_text(row)}")
@@ -337,7 +337,7 @@ class RowReader:
                     )
             yield kind, numbers
 
-    def parsed(self, kind: str, path: str, parse_file: Callable[[Path], Any]) -> Any:
+    def read_parsed(self, kind: str, path: str, parse_file: Callable[[Path], Any]) -> Any:
         """Return the result of `parse_file` for a file of a kind.
 
         Results are cached for each kind: the last used one, and more of them while they have at
@@ -483,7 +483,7 @@ class WeatherDataset(Dataset):
         box_frame: BoxFrame = "world",
         transform: Callable[[Sample], Any] | None = None,
     ) -> None:
-        self.options = SampleOptions.checked(image_type, load, box_frame)
+        self.options = SampleOptions.create(image_type, load, box_frame)
         self.transform = transform
         roots = [root] if isinstance(root, str | Path | Store) else list(root)
         if not roots:
@@ -498,7 +498,7 @@ class WeatherDataset(Dataset):
     def given(self) -> frozenset[str]:
         """Return the names of `load` that the samples have, without the masks."""
         load = self.options.load.difference(mask_names())
-        return frozenset(k for k in load if k == "image" or self.rows.has(k).any())
+        return frozenset(k for k in load if k == "image" or self.rows.has_file(k).any())
 
     @property
     def table(self) -> pa.Table:
@@ -540,7 +540,7 @@ class WeatherDataset(Dataset):
             camera=camera,
             world_from_ego=world_from_ego,
             labels=reader.labels(row, load),
-            described=described | {name: row[name] for name in NAMES},
+            metadata=described | {name: row[name] for name in NAMES},
         )
 
     def select(self, rows: np.ndarray) -> WeatherDataset:
@@ -561,7 +561,7 @@ def _read_rows(
         codes = np.repeat(np.arange(len(stores)), [len(table) for table in tables])
         outputs = pa.DictionaryArray.from_arrays(codes, uris)
         table = concat_rows(tables).append_column(_OUTPUT, outputs)
-    rows = Rows.of(table)
+    rows = Rows.from_table(table)
     finished = mask = pc.equal(rows["status"], OK)
     for name, values in requested.items():
         if values is None:
@@ -589,7 +589,7 @@ def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
     first, group = rows.groups()
     variants_without_kind = {}
     for kind in sorted(set(load).difference(mask_names(), ["image"])):
-        has_kind = np.bincount(group[rows.has(kind)], minlength=len(first)) > 0
+        has_kind = np.bincount(group[rows.has_file(kind)], minlength=len(first)) > 0
         if has_kind.any() and not has_kind.all():
             variants_without_kind[kind] = _list_variants(
                 [rows.row(int(row)) for row in first[~has_kind]], uris[0]

@@ -29,7 +29,7 @@ EFFECTS: tuple[Effect, ...] = (
 )
 
 
-def precompute_effects(job: JobContext, *, only_files: bool = False) -> None:
+def precompute_effects(context: JobContext, *, only_files: bool = False) -> None:
     """Work out what all images of a job share, once: it is then in the scene's memo, whose
     `shared()` other processes take over. only_files: nothing but what lies in files.
 
@@ -37,11 +37,11 @@ def precompute_effects(job: JobContext, *, only_files: bool = False) -> None:
         SceneError, StyleError: an effect cannot be had in this scene.
     """
     for effect in EFFECTS:
-        if effect.shares_files or not only_files:
-            effect.share(job)
-    error = max((prune_error_of(recipe.render) for recipe in job.recipes), default=0)
+        if effect.precomputes_files or not only_files:
+            effect.precompute(context)
+    error = max((prune_error_of(recipe.render) for recipe in context.recipes), default=0)
     if error > 0 and not only_files:
-        precompute_errors(job.scene, error, progress=job.progress)
+        precompute_errors(context.scene, error, progress=context.progress)
 
 
 def add_effect(effect: Effect) -> None:

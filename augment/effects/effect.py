@@ -34,7 +34,7 @@ from augment.jobs.box_tables import BoxTable
 from augment.render.buffers import RenderOutput
 from augment.scene import Scene
 from recipes.effect import EffectModel
-from recipes.fields import found
+from recipes.fields import section_at
 from recipes.schema import Recipe
 
 # Stages of a view. A pass runs while the scene is put together, while it is drawn, or on the
@@ -85,10 +85,10 @@ class EffectPlan:
 class EffectInScene:
     """An effect that is at work in a scene. Every hook that draws receives this record."""
 
-    effect: Effect
+    hooks: Effect
     """The effect's hooks."""
 
-    data: Any
+    settings: Any
     """`EffectPlan.data` of the effect; never None."""
 
     scene: Scene
@@ -97,21 +97,21 @@ class EffectInScene:
     backend: str
     """Name of the backend that renders the images."""
 
-    earlier: tuple[EffectInScene, ...] = ()
+    earlier_effects: tuple[EffectInScene, ...] = ()
     """Effects that are applied before this one."""
 
-    seen: Any = None
+    view_data: Any = None
     """`Visibility.seen` of the view at hand, as `Effect.in_view` returned it."""
 
     @cached_property
-    def prepared(self) -> Any:
+    def prepared_data(self) -> Any:
         """Result of `Effect.prepare`."""
-        return self.effect.prepare(self)
+        return self.hooks.prepare(self)
 
     @cached_property
-    def light(self) -> Scene:
+    def lit_scene(self) -> Scene:
         """Scene that the effect takes its light from: the scene as earlier effects relit it."""
-        relit = (other.effect.relight(other) for other in reversed(self.earlier))
+        relit = (other.hooks.relight(other) for other in reversed(self.earlier_effects))
         return next((scene for scene in relit if scene is not None), self.scene)
 
 
@@ -150,7 +150,7 @@ class ViewQuery:
     cameras: tuple[Camera, ...]
     """Cameras that look into the scene for this view; together they cover all that it can show."""
 
-    poses: Mapping[int, np.ndarray]
+    world_from_parts: Mapping[int, np.ndarray]
     """world_from_part [4, 4] of the parts that exist, by instance id; 0 is the background."""
 
     near_m: float
@@ -161,16 +161,16 @@ class ViewQuery:
 class Visibility:
     """What one view can show of an effect."""
 
-    is_seen: bool = True
+    is_visible: bool = True
     """False if the effect cannot change the image."""
 
-    skipped: Mapping[str, str] = field(default_factory=dict)
+    skip_reasons: Mapping[str, str] = field(default_factory=dict)
     """Reason for each pass that this view does not need, by the pass's name."""
 
-    owners: frozenset[int] = frozenset()
+    instance_ids: frozenset[int] = frozenset()
     """Instance ids of the parts that must be drawn for the effect."""
 
-    seen: Any = None
+    view_data: Any = None
     """Data that the other hooks of the view need; they read it as `EffectInScene.seen`."""
 
 
@@ -190,7 +190,7 @@ class RenderedView:
     masks: Mapping[str, Bool[Tensor, "H W"]] = field(default_factory=dict)
     """Masks of effects, by the mask's name."""
 
-    skipped: Mapping[str, str] = field(default_factory=dict)
+    skip_reasons: Mapping[str, str] = field(default_factory=dict)
     """Reason for each pass that proved needless while drawing, by the pass's name."""
 
 
@@ -201,7 +201,7 @@ class FrontSurface:
     Images of the first surface along a ray show it in the pixels of the effect's mask.
     """
 
-    semantic: int
+    semantic_class: int
     """Semantic class of the surface."""
 
     depth_m: Float[Tensor, "H W"] | None
@@ -212,7 +212,7 @@ class FrontSurface:
 class LabelInputs:
     """Inputs that an effect's labels are measured from, for one view."""
 
-    placed: EffectPlan
+    plan: EffectPlan
     """The effect's plan for the recipe."""
 
     depth_m: Float32[np.ndarray, "H W"] | None
@@ -239,7 +239,7 @@ class Effect:
     model: ClassVar[type[EffectModel]]
     """Recipe model of that section."""
 
-    mask: ClassVar[str | None] = None
+    mask_name: ClassVar[str | None] = None
     """Name of the effect's mask image and file; None if it has no mask."""
 
     is_see_through: ClassVar[bool] = False
@@ -248,28 +248,28 @@ class Effect:
     share_column: ClassVar[str | None] = None
     """Manifest column with the share of an image's pixels that lie in the mask."""
 
-    table: ClassVar[BoxTable | None] = None
+    box_table: ClassVar[BoxTable | None] = None
     """Label table: how the effect changes the labelled boxes."""
 
-    lies_on_scene: ClassVar[bool] = False
+    adds_overlays: ClassVar[bool] = False
     """If True, the effect adds surfaces to the scene as overlays (PosedGaussians.is_overlay).
     `output.surface = "scene"` leaves them out.
     """
 
-    shares_files: ClassVar[bool] = False
+    precomputes_files: ClassVar[bool] = False
     """If True, `share` takes long and stores large results in files."""
 
-    draws: ClassVar[tuple[str, ...]] = ()
+    raster_passes: ClassVar[tuple[str, ...]] = ()
     """Names of those passes that run the rasteriser."""
 
-    folded: ClassVar[Mapping[str, tuple[str, Any]]] = {}
+    off_switches: ClassVar[Mapping[str, tuple[str, Any]]] = {}
     """Passes that run inside the rasteriser: by name, the dotted path of a recipe field and the
     value of it that turns the pass off.
     """
 
-    def of(self, recipe: Recipe) -> Any:
+    def section_of(self, recipe: Recipe) -> Any:
         """Return the effect's section of a recipe, or None."""
-        return found(recipe, self.section)
+        return section_at(recipe, self.section)
 
     # ---- Once a recipe and scene, once a scene ---------------------------------------------------
 
@@ -278,16 +278,18 @@ class Effect:
 
         A large scene is then read completely, instead of only what the views show.
         """
-        return self.of(recipe) is not None
+        return self.section_of(recipe) is not None
 
-    def kernels(self, section: Any) -> Hashable:
+    def kernel_key(self, section: Any) -> Hashable:
         """Return the settings of a section that choose compiled kernels; None if none does.
 
         Warm-up compiles once for each distinct value.
         """
         return None
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
+    def plan_in_scene(
+        self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
+    ) -> EffectPlan:
         """Return the plan of the effect, in the scene's heights and scale.
 
         Args:
@@ -308,7 +310,7 @@ class Effect:
         """Return the scene in the light that later effects should use; None if unchanged."""
         return None
 
-    def share(self, job: JobContext) -> None:
+    def precompute(self, context: JobContext) -> None:
         """Precompute data that each process of a job would otherwise compute for itself.
 
         The results are `put` into the scene's memo as shared.
@@ -320,7 +322,7 @@ class Effect:
         """Return the cameras that look into the scene for this view; None for `camera` alone."""
         return None
 
-    def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
+    def visibility(self, own: EffectInScene, query: ViewQuery) -> Visibility:
         """Return what the view can show of the effect, at little cost.
 
         The answer saves work only: it must not change a single bit of any picture.
@@ -343,12 +345,12 @@ class Effect:
         """Return the finished picture with the effect on it."""
         return drawn
 
-    def mask_of(self, own: EffectInScene, drawn: RenderedView) -> Bool[Tensor, "H W"] | None:
+    def visible_mask(self, own: EffectInScene, drawn: RenderedView) -> Bool[Tensor, "H W"] | None:
         """Return the pixels that show the effect.
 
         The caller removes the pixels that belong to masks of later effects.
         """
-        return drawn.masks.get(self.mask or "")
+        return drawn.masks.get(self.mask_name or "")
 
     def front_surface(self, own: EffectInScene, camera: Camera) -> FrontSurface | None:
         """Return the effect's surface in the pixels of its mask.
@@ -359,8 +361,8 @@ class Effect:
 
     # ---- Labels, in the writing threads ----------------------------------------------------------
 
-    def measure(
-        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
+    def measure_boxes(
+        self, boxes: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
         """Return the stored columns of `table`, [B] each.
 
@@ -371,19 +373,19 @@ class Effect:
         """
         raise NotImplementedError
 
-    def grow_boxes(self, placed: WorldBoxes, view: LabelInputs) -> WorldBoxes:
+    def grow_boxes(self, boxes: WorldBoxes, view: LabelInputs) -> WorldBoxes:
         """Return the boxes grown by what the effect lays on them, which counts as their own."""
-        return placed
+        return boxes
 
     # ---- LiDAR -----------------------------------------------------------------------------------
 
-    def meet(self, own: EffectInScene, echoes: Any, frame_ns: int) -> None:
+    def intersect_beams(self, own: EffectInScene, echoes: Any, frame_ns: int) -> None:
         """Apply surfaces of the effect that stop or bend beams.
 
         echoes: `augment.effects.lidar.beam.Echoes`, changed in place.
         """
 
-    def attenuate(self, own: EffectInScene, echoes: Any, rng: np.random.Generator) -> None:
+    def attenuate_beams(self, own: EffectInScene, echoes: Any, rng: np.random.Generator) -> None:
         """Weaken echoes by the effect's particles in the air and add the particles' own echoes.
 
         It runs after `meet` of all effects.

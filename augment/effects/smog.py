@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
 from augment.base_photo import RECORDED
-from augment.boxes import NOT_COUNTED, WorldBoxes, shown_pixels
+from augment.boxes import NOT_COUNTED, WorldBoxes, pixels_of_boxes
 from augment.cameras import Camera
 from augment.cast_shadows import (
     FadedShadows,
@@ -101,16 +101,16 @@ class SmogEffect(Effect):
         file="labels/smog.parquet",
         kind="box smog",
         columns={"transmittance": np.float64, "pixels": np.int64},
-        sampled=("transmittance",),
-        visible="transmittance",
+        sample_columns=("transmittance",),
+        visible_column="transmittance",
     )
 
     def reads_splats(self, recipe: Recipe) -> bool:
-        smog = self.of(recipe)
+        smog = self.section_of(recipe)
         return smog is not None and smog.shadow_fade > 0
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
-        smog = self.of(recipe)
+        smog = self.section_of(recipe)
         fog, reason = _in_heights(smog, scene)
         if fog is None:
             nothing = skipped((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason)
@@ -132,46 +132,50 @@ class SmogEffect(Effect):
             Step(SHADOWS, sun < 1, shadow_reason, SCENE),
             Step(PER_GAUSSIAN, not on_buffers, other_reason if on_buffers else reason),
             Step(ON_BUFFERS, on_buffers, reason if on_buffers else other_reason),
-            Step(ELEVATION, fog.overcast > 0, f"weather.smog.overcast is {fog.overcast:g}"),
+            Step(
+                ELEVATION,
+                fog.elevation_gain > 0,
+                f"weather.smog.overcast is {fog.elevation_gain:g}",
+            ),
             sky,
             Step(SCATTER, smog.scatter > 0, f"weather.smog.scatter is {smog.scatter:g}", PICTURE),
         )
-        buffers = {EXPECTED_DEPTH} if on_buffers or fog.overcast > 0 else set[str]()
+        buffers = {EXPECTED_DEPTH} if on_buffers or fog.elevation_gain > 0 else set[str]()
         if smog.scatter > 0:
             buffers.add(MEDIAN_DEPTH)  # which costs nothing where depth images are written
         data = SmogPlan(fog, on_buffers, is_common, smog.scatter, sun)
         return EffectPlan(data, steps, frozenset(buffers))
 
     def prepare(self, own: EffectInScene) -> FadedShadows | None:
-        return faded_shadows(own.scene, own.data.sun)
+        return faded_shadows(own.scene, own.settings.sun)
 
     def share(self, job: JobContext) -> None:
-        if any(smog and smog.shadow_fade > 0 for smog in map(self.of, job.recipes)):
+        if any(smog and smog.shadow_fade > 0 for smog in map(self.section_of, job.recipes)):
             precompute_shadows(job.scene)
 
     def edit_scene(
         self, own: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
-        faded = own.prepared if own.data.sun < 1 else None
+        faded = own.prepared_data if own.settings.sun < 1 else None
         if faded is not None:
             with timed(SHADOWS):
                 parts = [p if p.instance_id or p.is_overlay else faded.on(p) for p in layers.parts]
-                photo = layers.photo and replace(layers.photo, faded=faded)
+                photo = layers.photo and replace(layers.photo, faded_shadows=faded)
                 layers = replace(layers, parts=tuple(parts), photo=photo)
-        fog = own.data.fog
+        fog = own.settings.fog
         common = own.scene.common_color_map
-        if own.data.is_common and common is not None:
+        if own.settings.is_common and common is not None:
             fog = fog_before_color_map(fog, own.scene.color_map(camera), common)
-        return replace(layers, fog=fog, applies_fog_to_buffers=own.data.on_buffers)
+        return replace(layers, fog=fog, applies_fog_to_buffers=own.settings.on_buffers)
 
     def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
-        if own.data.scatter == 0:
+        if own.settings.scatter == 0:
             return drawn
         alpha = drawn.raster.alpha
         depth = drawn.raster.median_depth
         assert alpha is not None and depth is not None
-        fog = own.data.fog
-        scatter = own.data.scatter
+        fog = own.settings.fog
+        scatter = own.settings.scatter
         with timed(SCATTER):
             rgb = scatter_forward(
                 drawn.rgb, alpha, depth, camera, fog, scatter, backend=own.backend
@@ -181,13 +185,13 @@ class SmogEffect(Effect):
     def measure(
         self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
-        data = view.placed.data
+        data = view.plan.data
         fog = None if data is None else data.fog
         estimate = box_transmittance(placed, camera, fog, view.depth_m, view.water_level_z_m)
-        return {"transmittance": estimate.transmittance, "pixels": estimate.pixels}
+        return {"transmittance": estimate.transmittance, "pixels": estimate.num_pixels}
 
     def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
-        fog_echoes(echoes, own.data.fog, rng)
+        fog_echoes(echoes, own.settings.fog, rng)
 
 
 def _sun_in(fog: Fog, smog: Smog, scene: Scene) -> tuple[float, str]:
@@ -197,7 +201,7 @@ def _sun_in(fog: Fog, smog: Smog, scene: Scene) -> tuple[float, str]:
     shadows = shadows_of(scene)
     if shadows is None or shadows.certainty == 0:
         return 1.0, "the ground shows no shadows of a sun"
-    ground_z_m = float(np.median(shadows.height_m[shadows.known > 0]))
+    ground_z_m = float(np.median(shadows.height_m[shadows.known_share > 0]))
     sun = 1 - smog.shadow_fade * (1 - sun_transmittance(fog, shadows, ground_z_m))
     return sun, (
         f"shadows have {shadows.luminance_ratio:.2f} of the light beside them; {100 * sun:.0f} % "
@@ -249,10 +253,12 @@ def fog_before_color_map(
     left, gains, right = torch.linalg.svd(camera_map[:, :3])
     damped = (gains / (gains**2 + DAMPING))[:, None]
     change = right.T @ (damped * (left.T @ (common - camera_map)))  # [3, 4]
-    airlight = torch.tensor(fog.rgb, dtype=torch.float64)
+    airlight = torch.tensor(fog.airlight_rgb, dtype=torch.float64)
     varying = airlight + change[:, :3] @ airlight
     rgb = varying + change[:, 3]
-    return replace(fog, rgb=tuple(rgb.tolist()), varying_rgb=tuple(varying.tolist()))
+    return replace(
+        fog, airlight_rgb=tuple(rgb.tolist()), varying_airlight_rgb=tuple(varying.tolist())
+    )
 
 
 # ---- On labelled boxes ---------------------------------------------------------------------------
@@ -265,7 +271,7 @@ class BoxTransmittance:
     transmittance: Float64[np.ndarray, " B"]
     """0 to 1; NaN for boxes whose numbers are not finite."""
 
-    pixels: Int64[np.ndarray, " B"]
+    num_pixels: Int64[np.ndarray, " B"]
     """Number of pixels that the transmittance is the mean of. With 0 or NOT_COUNTED, the
     transmittance is an estimate.
     """
@@ -307,7 +313,7 @@ def box_transmittance(
     if surface_depth_m is not None:
         pixels[:] = 0
         upwards = camera.world_from_camera[2, :3].numpy()  # the world's z along the camera's axes
-        for number, rows, columns in shown_pixels(placed, camera, surface_depth_m):
+        for number, rows, columns in pixels_of_boxes(placed, camera, surface_depth_m):
             z = surface_depth_m[rows, columns].astype(np.float64)
             across = (columns + 0.5 - camera.cx) / camera.fx
             down = (rows + 0.5 - camera.cy) / camera.fy
@@ -364,9 +370,9 @@ def wavelength_factor(extinction_per_m: float, wavelength_um: float = 0.905) -> 
 def extinction_at(fog: Fog, z_m: np.ndarray) -> np.ndarray:
     """Return alpha [N] at heights z_m [N] (scene world), 1/metre."""
     if fog.scale_height_m is None:
-        return np.full(len(z_m), fog.sigma_per_m)
+        return np.full(len(z_m), fog.extinction_per_m)
     height = (z_m - fog.base_z_m) / fog.scale_height_m
-    return fog.sigma_per_m * np.exp(np.minimum(-height, MAX_EXPONENT))
+    return fog.extinction_per_m * np.exp(np.minimum(-height, MAX_EXPONENT))
 
 
 class SoftEcho(NamedTuple):
@@ -435,7 +441,7 @@ def scatter_before(
         if not len(rows):
             continue
         is_uniform = fog.scale_height_m is None
-        mean = fog.sigma_per_m if is_uniform else math.exp(number * _DENSITY_STEP)
+        mean = fog.extinction_per_m if is_uniform else math.exp(number * _DENSITY_STEP)
         echo = soft_echo(float(mean), model)
         last = ((ends_m[rows] - echo.ranges_m[0]) / _STEP_M).astype(np.int64)
         last = np.clip(last, 0, len(echo.ranges_m) - 1)
@@ -451,19 +457,19 @@ def fog_echoes(echoes: Echoes, fog: Fog, rng: np.random.Generator) -> None:
     fog: the fog with its extinction of visible light.
     """
     model = echoes.model
-    factor = wavelength_factor(fog.sigma_per_m, model.wavelength_um)
-    fog = dataclasses.replace(fog, sigma_per_m=factor * fog.sigma_per_m)
+    factor = wavelength_factor(fog.extinction_per_m, model.wavelength_um)
+    fog = dataclasses.replace(fog, extinction_per_m=factor * fog.extinction_per_m)
     eyes_z = echoes.origins[:, 2]
-    air = echoes.air_m
+    air = echoes.air_path_m
     ends_z = eyes_z + air * echoes.directions[:, 2]
     tau = optical_depth_numpy(fog, air, eyes_z, ends_z, series_below=1e-4)
     echoes.gain *= np.exp(-2 * tau)
     scatter = scatter_before(fog, eyes_z, air, model, rng)
-    echoes.haze_per_m += extinction_at(fog, eyes_z)
+    echoes.extinction_per_m += extinction_at(fog, eyes_z)
     echo = signal(echoes.reflectance * echoes.gain, np.maximum(echoes.ranges_m, 1e-3))
     wins = (scatter.signal > echo) & (echoes.ranges_m > 0) & (echoes.codes != LOST)
     rows = np.flatnonzero(wins)
     ranges = scatter.ranges_m[rows]
     # Reflectance of a surface whose echo from that range is as strong.
     white = signal(np.ones(len(rows)), np.maximum(ranges, 1e-3))
-    echoes.replace(rows, ranges, scatter.signal[rows] / white, SCATTERED)
+    echoes.replace_echoes(rows, ranges, scatter.signal[rows] / white, SCATTERED)

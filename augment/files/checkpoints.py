@@ -275,7 +275,7 @@ def _names() -> dict[tuple[str, str], Callable[..., Any]]:
 _NAMES = _names()
 
 
-def section(content: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+def dictionary_in(content: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
     """Return a dictionary inside a checkpoint.
 
     Raises:
@@ -288,7 +288,7 @@ def section(content: Mapping[str, Any], name: str, where: str) -> Mapping[str, A
     return entries
 
 
-def tensor(
+def checked_tensor(
     content: Mapping[str, Any],
     name: str,
     shape: Sequence[int | None],
@@ -346,13 +346,13 @@ def finite_array(
     Raises:
         AdapterError: as `tensor`, or the tensor holds NaN or infinite numbers.
     """
-    values = taken(tensor(content, name, shape, where)).double().numpy()
+    values = copy_mapped_tensor(checked_tensor(content, name, shape, where)).double().numpy()
     if not np.isfinite(values).all():
         raise AdapterError(f"{where}: {name} holds NaN or infinite numbers")
     return values
 
 
-def taken(source: Tensor, out: Tensor | None = None) -> Tensor:
+def copy_mapped_tensor(source: Tensor, out: Tensor | None = None) -> Tensor:
     """Copy a mapped tensor and give its pages back on the way, so that its memory is needed once.
 
     Args:

@@ -251,7 +251,7 @@ def transform_gaussians(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> G
     )
 
 
-def baked(scene: Scene, timestamp_ns: int) -> Gaussians:
+def bake_scene(scene: Scene, timestamp_ns: int) -> Gaussians:
     """Return the background and the actors of one moment as Gaussians of the scene's world.
 
     They have the colours of that moment, and the order of `Scene.parts_at`. Colours of a lower
@@ -477,7 +477,7 @@ def _baked_or_error(scene: Scene, timestamp_ns: int) -> Gaussians:
     Raises:
         SceneError: it shows no Gaussians then.
     """
-    gaussians = baked(scene, timestamp_ns)
+    gaussians = bake_scene(scene, timestamp_ns)
     if len(gaussians) == 0:
         raise SceneError(f"scene {scene.name!r} shows no Gaussians at {timestamp_ns} ns")
     return gaussians

@@ -277,7 +277,7 @@ class _File:
                 f"{max_gaussians} that its buffers have room for; place fewer copies"
             )
         num_sh = max(sum(_SH_INFIX in name for name in p.attributes) for p in primitives)
-        check_memory(str(self.path), num_gaussians, functions=num_sh, size=sum(sizes.values()))
+        check_memory(str(self.path), num_gaussians, num_sh=num_sh, file_bytes=sum(sizes.values()))
 
     def placed_primitives(self) -> Iterator[tuple[_Primitive, np.ndarray]]:
         """Yield primitives of Gaussians with world_from_node, in the order of the scene's nodes."""

@@ -24,19 +24,19 @@ import torch
 from torch import Tensor
 
 from augment.errors import SceneError
-from augment.files.checkpoints import tensor
+from augment.files.checkpoints import checked_tensor
 from augment.files.scene_file import read_tensors, save_scene
 from augment.lod import (
     CELLS_M,
     MAX_LEVELS,
-    Boxes,
     Level,
     LevelPiece,
     Levels,
+    SplatBoxes,
     Squares,
     batches,
     build_levels,
-    rows_of,
+    slice_gaussians,
     square_order,
 )
 from augment.render.cpu.order import CELL_SIZE
@@ -68,7 +68,9 @@ def save_large_scene(scene: Scene, pieces: Iterable[Gaussians], folder: str | Pa
         background = spool.keep(_pieces_of_level_0(pieces)).gaussians
         order = square_order(background)[1]
         pieces = (background.select(torch.from_numpy(order[rows])) for rows in batches(len(order)))
-        levels = build_levels(spool.keep(_pieces_of_level_0(pieces)).gaussians, keep=spool.keep)
+        levels = build_levels(
+            spool.keep(_pieces_of_level_0(pieces)).gaussians, store_piece=spool.keep
+        )
         complete_scene = replace(scene, background=levels.levels[0].gaussians)
         save_scene(complete_scene, folder, levels=_arrays(levels), finest_m=levels.finest_m)
 
@@ -151,7 +153,7 @@ def read_levels(path: Path, background: Gaussians) -> Levels:
     while f"{len(levels)}.keys" in tensors and len(levels) <= MAX_LEVELS:
         number = len(levels)
         count = len(background)
-        gaussians = rows_of(background, slice(None))
+        gaussians = slice_gaussians(background, slice(None))
         stands_for = np.arange(count, dtype=np.int32)
         if number > 0:
             gaussians, stands_for = _splats(tensors, number, background, str(path))
@@ -160,12 +162,18 @@ def read_levels(path: Path, background: Gaussians) -> Levels:
         )
         cells_shape = (-(-len(gaussians) // CELL_SIZE),)
         box_arrays = _boxes(tensors, f"{number}.boxes.", cells_shape, str(path))
-        boxes = Boxes(*(box_arrays[name] for name in Boxes._fields))
+        boxes = SplatBoxes(*(box_arrays[name] for name in SplatBoxes._fields))
         parents = _take(
             tensors, f"{number}.parents", (len(gaussians),), str(path), torch.int32
         ).numpy()
         level = Level(
-            gaussians, stands_for, squares, boxes, parents, unchecked=str(path), splats=count
+            gaussians,
+            stands_for,
+            squares,
+            boxes,
+            parents,
+            unchecked_file=str(path),
+            num_part_splats=count,
         )
         levels.append(level)
     if tensors or not levels:
@@ -175,7 +183,7 @@ def read_levels(path: Path, background: Gaussians) -> Levels:
 
 def _take(tensors: dict[str, Tensor], name: str, shape: tuple, where: str, dtype: torch.dtype):
     """Remove a checked tensor from the file's tensors and return it."""
-    values = tensor(tensors, name, shape, where, dtype=dtype, error=SceneError)
+    values = checked_tensor(tensors, name, shape, where, dtype=dtype, error=SceneError)
     del tensors[name]
     return values
 

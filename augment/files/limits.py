@@ -26,7 +26,7 @@ MAX_VALUES = 16_000_000  # values of a JSON text, counted by its commas and brac
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 
 
-def check_memory(where: str, rows: int, *, functions: int, size: int) -> None:
+def check_memory(where: str, num_gaussians: int, *, num_sh: int, file_bytes: int) -> None:
     """Refuse a file whose Gaussians would take far more memory than the file has bytes.
 
     Args:
@@ -38,12 +38,12 @@ def check_memory(where: str, rows: int, *, functions: int, size: int) -> None:
     Raises:
         SceneError: they take more than FREE_BYTES and BYTES_PER_BYTE for each byte of the file.
     """
-    row_bytes = _ROW_BYTES + _COLOUR_BYTES * functions
-    max_rows = (FREE_BYTES + BYTES_PER_BYTE * size) // row_bytes
-    if rows > max_rows:
+    row_bytes = _ROW_BYTES + _COLOUR_BYTES * num_sh
+    max_rows = (FREE_BYTES + BYTES_PER_BYTE * file_bytes) // row_bytes
+    if num_gaussians > max_rows:
         raise SceneError(
-            f"{where} announces {rows} Gaussians of {row_bytes} bytes in memory each; at most "
-            f"{max_rows} are taken from its {size} bytes ({FREE_BYTES >> 20} MiB, and "
+            f"{where} announces {num_gaussians} Gaussians of {row_bytes} bytes in memory each; at most "
+            f"{max_rows} are taken from its {file_bytes} bytes ({FREE_BYTES >> 20} MiB, and "
             f"{BYTES_PER_BYTE} bytes for each of the file's): it is damaged, or made to fill the "
             "memory. If it is whole, "
             f"export it as .ply"
@@ -56,7 +56,7 @@ def row_slices(count: int) -> Iterator[slice]:
         yield slice(start, min(start + _ROWS_AT_ONCE, count))
 
 
-def read_json(path: Path, most: int) -> dict[str, Any]:
+def read_json_object(path: Path, max_bytes: int) -> dict[str, Any]:
     """Read a JSON file that holds an object; see `parse_json_object`.
 
     Args:
@@ -68,9 +68,11 @@ def read_json(path: Path, most: int) -> dict[str, Any]:
         OSError: the file cannot be read.
     """
     with open_file(path) as file:
-        text = file.read(most + 1)
-    if len(text) > most:
-        raise SceneError(f"{path} is larger than the {most} bytes that are read of such a file")
+        text = file.read(max_bytes + 1)
+    if len(text) > max_bytes:
+        raise SceneError(
+            f"{path} is larger than the {max_bytes} bytes that are read of such a file"
+        )
     return parse_json_object(text, str(path))
 
 

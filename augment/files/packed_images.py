@@ -44,7 +44,7 @@ _NUM_THREADS = 4  # decoders and encoders release the interpreter
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
+def parquet_errors(path: Path) -> Iterator[None]:
     """Turn errors of Arrow and the system into AdapterErrors that name the file."""
     try:
         yield
@@ -101,7 +101,7 @@ class RowReader:
         self._rows_at_once = rows_at_once
         self._stack = ExitStack()
         self._lock = threading.Lock()
-        with reading(path):
+        with parquet_errors(path):
             self._content, self._file = self._stack.enter_context(open_parquet(path, str(path)))
             metadata = self._file.metadata
             schema = self._file.schema_arrow
@@ -126,7 +126,7 @@ class RowReader:
     def read(self, rows: Sequence[int]) -> dict[int, dict[str, Any]]:
         """Return the cells of rows, Arrow's scalars, by row number and column."""
         cells_of_row = {}
-        with self._lock, reading(self._path):
+        with self._lock, parquet_errors(self._path):
             for row in sorted(map(int, rows)):
                 batch = self._batch_of(row)
                 index = row - self._first
@@ -235,7 +235,7 @@ class Lens:
         v = (v - 0.5).astype(np.float32)
         return cv2.convertMaps(u, v, cv2.CV_16SC2)
 
-    def undistorted(self, image: np.ndarray) -> np.ndarray:
+    def undistort(self, image: np.ndarray) -> np.ndarray:
         """Return the image without distortion."""
         return cv2.remap(image, *self.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
@@ -256,7 +256,7 @@ class PackedImages(BaseModel):
     lenses: Mapping[str, Lens]  # by camera
     rows: Mapping[str, NonNegativeInt]  # row of the table by CAMERA/NAME.jpg
 
-    def put(
+    def write_folder(
         self, folder: Path, checked_names: Sequence[str], written_names: Sequence[str]
     ) -> dict[str, str]:
         """Write packed.json, check images, and write some of them at once if they are missing.
@@ -383,7 +383,7 @@ def _unpack(job: tuple[Path | None, Any, Lens]) -> str:
         if image is None:
             return "cannot be decoded"
         quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-        data = cv2.imencode(".jpg", lens.undistorted(image), quality)[1].tobytes()
+        data = cv2.imencode(".jpg", lens.undistort(image), quality)[1].tobytes()
     _write(path, data)
     return ""
 

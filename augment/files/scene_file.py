@@ -40,7 +40,7 @@ from torch import Tensor
 
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
-from augment.files.checkpoints import tensor
+from augment.files.checkpoints import checked_tensor
 from augment.files.limits import check_values
 from augment.jobs.atomic import write_file_atomically, write_folder_atomically
 from augment.lod import store_levels
@@ -128,7 +128,11 @@ def sky_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
 
 
 def take_parts(
-    tensors: dict[str, Tensor], document: SceneDocument, where: str, *, unread: bool = False
+    tensors: dict[str, Tensor],
+    document: SceneDocument,
+    where: str,
+    *,
+    skips_background_check: bool = False,
 ) -> tuple[list[SavedPart], list[str]]:
     """Remove the arrays of background and actors from `tensors` and check them.
 
@@ -147,7 +151,7 @@ def take_parts(
     problems = []
     for number, count in enumerate(counts):
         name = _part_name(number)
-        is_read = number > 0 or not unread
+        is_read = number > 0 or not skips_background_check
         part = _take_part(
             tensors, name, count, document.precision, has_waves[number], where, is_read=is_read
         )
@@ -233,7 +237,9 @@ def _take_part(
     semantic = None
     name = f"{part}.semantic"
     if name in tensors:
-        semantic = tensor(tensors, name, (count,), where, dtype=torch.int16, error=SceneError)
+        semantic = checked_tensor(
+            tensors, name, (count,), where, dtype=torch.int16, error=SceneError
+        )
         del tensors[name]
         low, high = _range(semantic) if is_read else (0, 0)
         if low < min(SemanticClass) or high > max(SemanticClass):
@@ -255,7 +261,7 @@ def _take_array(
     """
     is_halved = precision == "float16" and (kind in _HALF_ARRAYS or kind in _SKY_ARRAYS.values())
     dtype = torch.float16 if is_halved else torch.float32
-    values = tensor(
+    values = checked_tensor(
         tensors, name, (count, *_ROW_SHAPES[kind]), where, dtype=dtype, error=SceneError
     )
     del tensors[name]
@@ -514,7 +520,7 @@ def parse_document(text: bytes | str, where: str) -> SceneDocument:
     if not isinstance(raw, dict):
         raise SceneError(f"{where} describes no scene: expected an object; got {raw!r:.80}")
     check_format(raw.get("format"), raw.get("version"), where)
-    return checked(SceneDocument, raw, where)
+    return validate_model(SceneDocument, raw, where)
 
 
 def check_format(format_name: object, version: object, where: str) -> None:
@@ -530,7 +536,7 @@ def check_format(format_name: object, version: object, where: str) -> None:
         )
 
 
-def checked(model: type[Entry], content: object, where: str) -> Entry:
+def validate_model(model: type[Entry], content: object, where: str) -> Entry:
     """Return JSON, or a record, as the model.
 
     Raises:
@@ -606,7 +612,7 @@ def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, 
         "frames": _stored_frames(scene.frames),
         "seen_frames": None if scene.seen_frames is None else _stored_frames(scene.seen_frames),
     }
-    return checked(SceneDocument, content, f"scene {scene.name!r}").model_dump()
+    return validate_model(SceneDocument, content, f"scene {scene.name!r}").model_dump()
 
 
 def _stored_frames(frames: Sequence[Frame]) -> list[Frame]:
@@ -699,7 +705,7 @@ def scene_of(
 
 def track_entry(track: Track, where: str) -> dict[str, Any]:
     """Return a track as JSON stores it."""
-    return checked(TrackEntry, track, where).model_dump()
+    return validate_model(TrackEntry, track, where).model_dump()
 
 
 def _actor(entry: ActorEntry, part: SavedPart) -> Actor:
@@ -932,7 +938,7 @@ def read_saved_scene(path: str | Path) -> SavedScene:
     (in_document, in_parts, in_sky) = opened.sources
     levels = path / LEVELS
     is_large = levels.is_file()
-    parts, problems = take_parts(opened.parts, document, in_parts, unread=is_large)
+    parts, problems = take_parts(opened.parts, document, in_parts, skips_background_check=is_large)
     if problems:
         all_problems = [*document.problems, *problems]
         document = document.model_copy(update={"problems": all_problems})

@@ -33,7 +33,7 @@ from augment.errors import SceneError
 from augment.files.image_size import image_header
 from augment.files.limits import check_memory, parse_json_object, row_slices
 from augment.files.ply import SplatFile
-from augment.files.scene_file import checked
+from augment.files.scene_file import validate_model
 from augment.jobs.atomic import write_file_atomically
 from augment.rng import rng_for
 from augment.scene import Gaussians, check_gaussians
@@ -290,14 +290,14 @@ def _read_meta(files: _Files) -> _Meta:
             f"{where}: only version 2 of SOG is read; got {content.get('version')!r:.20}. Save it "
             f"anew with SplatTransform or SuperSplat, or as .ply"
         )
-    meta = checked(_Meta, content, where)
+    meta = validate_model(_Meta, content, where)
     names = [*meta.means.files, *meta.scales.files, *meta.quats.files, *meta.sh0.files]
     names += [] if meta.shN is None else meta.shN.files
     size = files.path.stat().st_size
     if files.zip is None:
         size = sum((files.path.parent / Path(name).name).stat().st_size for name in {*names})
     bands = 0 if meta.shN is None else meta.shN.bands
-    check_memory(where, meta.count, functions=1 + _NUM_SH_REST[bands], size=size)
+    check_memory(where, meta.count, num_sh=1 + _NUM_SH_REST[bands], file_bytes=size)
     return meta
 
 

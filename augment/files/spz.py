@@ -187,7 +187,7 @@ def _unpack_header(path: Path, data: bytes) -> _Header:
             f"holds 1 to {max_bytes // row_bytes} of them: truncated, or its header is wrong"
         )
     num_sh = 1 + min(_NUM_SH_REST[header.degree], NUM_SH_BY_DEGREE[-1] - 1)
-    check_memory(str(path), header.num, functions=num_sh, size=size)
+    check_memory(str(path), header.num, num_sh=num_sh, file_bytes=size)
     return header
 
 

@@ -18,9 +18,9 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 from augment.errors import SceneError
-from augment.files.limits import check_memory, read_json
+from augment.files.limits import check_memory, read_json_object
 from augment.files.ply import SplatFile
-from augment.files.scene_file import checked
+from augment.files.scene_file import validate_model
 from augment.files.sog import META, SUFFIX, read_all_sog_gaussians
 from augment.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
@@ -70,7 +70,7 @@ def read_streamed_sog(path: str | Path, level: int = 0) -> SplatFile:
     """
     path = Path(path)
     try:
-        content = read_json(path, _MAX_META_BYTES)
+        content = read_json_object(path, _MAX_META_BYTES)
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error.strerror or error}") from error
     if content.get("version") not in _VERSIONS:
@@ -78,7 +78,7 @@ def read_streamed_sog(path: str | Path, level: int = 0) -> SplatFile:
             f"{path}: version 1 of streamed SOG is read; got {content['version']!r:.20}. Save it "
             f"anew with SplatTransform"
         )
-    meta = checked(_Meta, content, str(path))
+    meta = validate_model(_Meta, content, str(path))
     if not 0 <= level < meta.lodLevels:
         raise SceneError(
             f"{path} has no level {level}; it has 0, the finest, to {meta.lodLevels - 1}"
@@ -122,7 +122,7 @@ def _runs(tree: object, level: int, where: str) -> Iterator[_Run]:
             pending_nodes += children
         elif isinstance(lods, dict) and not children:
             if (run := lods.get(str(level))) is not None:
-                yield checked(_Run, run, f"{where}, lods of a leaf")
+                yield validate_model(_Run, run, f"{where}, lods of a leaf")
         else:
             raise SceneError(
                 f"{where}: a node of its tree must have either children, a list, or lods, an "
@@ -152,7 +152,7 @@ def _check_runs(path: Path, meta: _Meta, runs: list[_Run]) -> int:
     if len(chunks) < len(numbers):
         raise SceneError(f"{path} names a chunk twice: its {len(numbers)} are {len(chunks)} files")
     size = sum(map(_chunk_bytes, chunks))
-    check_memory(str(path), sum(run.count for run in runs), functions=1, size=size)
+    check_memory(str(path), sum(run.count for run in runs), num_sh=1, file_bytes=size)
     return size
 
 
@@ -196,7 +196,7 @@ def _gather_gaussians(
         parts.append(chunk_gaussians)
         num_rows = sum(map(len, parts))
         num_sh = max(part.sh.shape[1] for part in parts)
-        check_memory(str(path), num_rows, functions=num_sh, size=size)
+        check_memory(str(path), num_rows, num_sh=num_sh, file_bytes=size)
     bands = max(part.sh.shape[1] for part in parts)
     assert bands in NUM_SH_BY_DEGREE
     sh = [torch.nn.functional.pad(p.sh, (0, 0, 0, bands - p.sh.shape[1])) for p in parts]

@@ -132,7 +132,10 @@ def _splats(path: Path, facts: dict[str, Any], output: IO[bytes]) -> SplatFile:
         )
     max_degree = min(max(prim["degree"] for prim in prims), len(NUM_SH_BY_DEGREE) - 1)
     check_memory(
-        str(path), num_gaussians, functions=NUM_SH_BY_DEGREE[max_degree], size=path.stat().st_size
+        str(path),
+        num_gaussians,
+        num_sh=NUM_SH_BY_DEGREE[max_degree],
+        file_bytes=path.stat().st_size,
     )
     parts = []
     for prim in prims:

@@ -337,7 +337,7 @@ def open_lock(path: Path) -> int:
     return descriptor
 
 
-def wait_for_lock(path: Path, descriptor: int, *, patience_s: float, doing: str) -> None:
+def wait_for_lock(path: Path, descriptor: int, *, patience_s: float, activity: str) -> None:
     """Lock the open file; logs a message once where the wait takes a while.
 
     Args:
@@ -358,14 +358,14 @@ def wait_for_lock(path: Path, descriptor: int, *, patience_s: float, doing: str)
         if waited_s > patience_s:
             raise OutputError(
                 f"{path}: another process{lock_holder(descriptor)} has held this lock for "
-                f"{patience_s:.0f} s ({doing}); end it, then run the same command again"
+                f"{patience_s:.0f} s ({activity}); end it, then run the same command again"
             )
         if waited_s > _LOG_AFTER_S and not is_logged:
             is_logged = True
             _log.info(
                 "another process%s %s; waiting for it at most %.0f min (%s)",
                 lock_holder(descriptor),
-                doing,
+                activity,
                 patience_s / 60,
                 path,
             )

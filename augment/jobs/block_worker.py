@@ -34,7 +34,7 @@ from augment.jobs.files import box_tables
 from augment.jobs.layout import (
     MANIFEST_FILE,
     STATE_FOLDER,
-    SWEEPS,
+    SWEEP_FOLDER,
     FileListing,
     folder_name,
     item_paths,
@@ -55,11 +55,11 @@ from augment.jobs.manifest import (
 )
 from augment.jobs.pools import OutcomeCallback
 from augment.jobs.processes import file_lock
-from augment.jobs.quality import FOLDER as QUALITY
+from augment.jobs.quality import CHOICES_FOLDER as QUALITY
 from augment.jobs.quality import choose_settings
 from augment.jobs.render_job import RenderJob, SceneLoader, file_folders, run_job
 from augment.jobs.store import LocalStore, Store, StoredFileMissing, open_store
-from augment.jobs.worker import Outcome, Renderer, TaskFailed, WorkTimes, describe
+from augment.jobs.worker import Outcome, Renderer, TaskFailed, WorkTimes, describe_error
 from augment.scene import Scene
 from recipes.schema import Recipe
 
@@ -151,7 +151,7 @@ class Publisher:
         self._uploads[target] = self._pool.submit(self._upload, self._folder / source, target)
 
     def _upload(self, source: Path, target: str) -> None:
-        is_shared = target.startswith(f"{folder_name(self._block.scene)}/{SWEEPS}/")
+        is_shared = target.startswith(f"{folder_name(self._block.scene)}/{SWEEP_FOLDER}/")
         if not (is_shared and self._store.exists(target)):
             self._store.put_file(target, source)
 
@@ -307,7 +307,7 @@ def clear_files_of(store: Store, block: Block) -> None:
     """Delete files that were half-written to the output when a worker at this block was killed."""
     if store.local_dir is not None:
         remove_temporaries(store.local_dir / variant_folder(block.scene, block.variant))
-        remove_temporaries(store.local_dir / folder_name(block.scene) / SWEEPS)
+        remove_temporaries(store.local_dir / folder_name(block.scene) / SWEEP_FOLDER)
 
 
 # ---- The worker ----------------------------------------------------------------------------------
@@ -321,7 +321,7 @@ class JobWorkerSetup:
 
     store_uri: str
     """URI of the output."""
-    scratch: Path | None
+    scratch_dir: Path | None
     """Folder where blocks are rendered on their way to an output that is not on this machine."""
     backend: str
     """Name of the rasteriser's backend."""
@@ -329,7 +329,7 @@ class JobWorkerSetup:
     """Opens a scene by its URI; an importable function."""
     renderer: Renderer | None = None
     """Importable function that renders an image; None for the library's own."""
-    digest_of: Callable[[str], str | None] | None = None
+    scene_digest: Callable[[str], str | None] | None = None
     """Importable function that returns the digest of a scene's content; None notes no digest."""
 
     @property
@@ -450,7 +450,7 @@ class BlockWorker:
             raise
         except _SceneFailed as error:
             of_memory = isinstance(error.__cause__, MemoryError)
-            return TaskFailed(str(error), of_scene=True, of_memory=of_memory)
+            return TaskFailed(str(error), is_scene_error=True, of_memory=of_memory)
         except Exception as error:
             _log.debug("task failed", exc_info=True)
             return TaskFailed(_message_of(error), of_memory=isinstance(error, MemoryError))
@@ -459,7 +459,9 @@ class BlockWorker:
         """Open a scene and return its record."""
         start_s = time.perf_counter()
         scene = self._open_scene(task.uri, task.name)
-        digest = self._setup.digest_of(task.uri) if self._setup.digest_of is not None else None
+        digest = (
+            self._setup.scene_digest(task.uri) if self._setup.scene_digest is not None else None
+        )
         return SceneRecord.of(scene, task.uri, time.perf_counter() - start_s, digest)
 
     def _resolve(self, task: ResolveTask, recipe: Recipe) -> Recipe:
@@ -473,11 +475,11 @@ class BlockWorker:
                 scene,
                 backend=setup.backend,
                 renderer=setup.renderer,
-                keep=task.keep,
+                keep_choice=task.keep,
             )
         except (SceneError, StyleError) as error:
             raise ClimateGSError(
-                f"recipe {recipe.name}, variant {recipe.variant}: quality {recipe.quality.words} "
+                f"recipe {recipe.name}, variant {recipe.variant}: quality {recipe.quality.summary} "
                 f"cannot choose its settings: {error}"
             ) from error
 
@@ -511,7 +513,7 @@ class BlockWorker:
             part = list_parts(self._store, folder_name(block.scene)).get(block.key)
             if part is not None and not part.has_failures and not task.is_damaged:
                 # A killed process may have left the folder.
-                clear_block(self._store, self._setup.scratch, block)
+                clear_block(self._store, self._setup.scratch_dir, block)
                 return BlockResult(skipped=block.images)
             return self._render_claimed(task, part if task.is_damaged else None)
 
@@ -522,12 +524,12 @@ class BlockWorker:
         if task.is_trial:  # its processes open the scene themselves: never two in memory
             self._drop_scene()
         else:
-            with times.spent("open"):
+            with times.measure("open"):
                 scene = self._open_scene(block.uri, task.name)
-            with times.spent("prepare"):
+            with times.measure("prepare"):
                 self._share_files(block, scene)
         self._enter_variant(block)
-        folder = staging_folder(self._store, self._setup.scratch, block)
+        folder = staging_folder(self._store, self._setup.scratch_dir, block)
         if folder.is_dir():
             clear_files_of(self._store, block)
         if damaged_part is not None:
@@ -541,7 +543,7 @@ class BlockWorker:
             cameras=block.cameras,
             backend=self._setup.backend,
             workers=2 if task.is_trial else 1,
-            shared_dir=self._shared_dir(),
+            shared_files_dir=self._shared_dir(),
             source_digest=block.digest,
         )
         with Publisher(self._store, folder, block) as publisher:
@@ -557,10 +559,10 @@ class BlockWorker:
                 progress=False,
                 on_outcome=on_outcome,
             )
-            with times.spent("publish"):
+            with times.measure("publish"):
                 publisher.finish()
             if not result.failed:
-                clear_block(self._store, self._setup.scratch, block)
+                clear_block(self._store, self._setup.scratch_dir, block)
         times.update(result.timings)
         counts = result.written, result.skipped, result.failed, result.failures
         return BlockResult(*counts, seconds=times.so_far())
@@ -576,8 +578,8 @@ class BlockWorker:
         """Return the folder for files that images share."""
         if self._store.local_dir is not None:
             return self._store.local_dir / STATE_FOLDER
-        assert self._setup.scratch is not None
-        return self._setup.scratch
+        assert self._setup.scratch_dir is not None
+        return self._setup.scratch_dir
 
     def _share_files(self, block: Block, scene: Scene) -> None:
         """Let one process compute the files that images share.
@@ -586,7 +588,7 @@ class BlockWorker:
         """
         recipe = block.recipe
         backend = self._setup.backend
-        if any(e.shares_files and e.of(recipe) is not None for e in effects.EFFECTS):
+        if any(e.precomputes_files and e.section_of(recipe) is not None for e in effects.EFFECTS):
             folder = self._shared_dir()
             lock = folder / f"beds-{folder_name(block.scene)}.lock"
             with file_lock(lock, "finds where snow can lie"):
@@ -602,4 +604,4 @@ def _message_of(error: Exception) -> str:
     """Return an error's message; the type is added unless the error is one of this package."""
     if isinstance(error, MemoryError):
         return f"memory ran out ({error}); use fewer workers, or a machine with more"
-    return str(error) if isinstance(error, ClimateGSError) else describe(error, "in a worker")
+    return str(error) if isinstance(error, ClimateGSError) else describe_error(error, "in a worker")

@@ -36,7 +36,7 @@ from augment.jobs.manifest import OK, Identity, ImageFacts, Part, list_parts, re
 from augment.jobs.store import Store
 from augment.scene import Scene
 from augment.trust import judge_scene, source_views, unfitted_cameras
-from recipes.job import ALL, JobRecipes, JobScene
+from recipes.job import ALL_CAMERAS, JobRecipes, JobScene
 from recipes.schema import Recipe, parse_frames
 
 # ---- Record of a scene that is not open, and the blocks of images it is cut into -----------------
@@ -178,7 +178,7 @@ class Block:
         version = augment.__version__
         return Identity(self.source, self.recipe.hash, RECORDED, version, backend, self.digest)
 
-    def pictured(self, record: SceneRecord) -> list[ImageFacts]:
+    def list_images(self, record: SceneRecord) -> list[ImageFacts]:
         """Return all images of the block, by frame and camera."""
         frame_numbers = set(self.frames)
         camera_names = set(self.cameras)
@@ -221,7 +221,7 @@ def cut_into_blocks(
     camera_names = {name for frame in record.frames for name in frame.cameras}
     if cameras is None:
         cameras = tuple(sorted(camera_names - set(record.unfitted))) if record.unfitted else None
-    elif tuple(cameras) == ALL:
+    elif tuple(cameras) == ALL_CAMERAS:
         cameras = None
     if cameras is not None and (unknown_cameras := sorted(set(cameras) - camera_names)):
         raise SceneError(
@@ -286,7 +286,7 @@ JOBS = f"{STATE_FOLDER}/jobs"
 
 
 @dataclass(frozen=True)
-class Plan:
+class JobPlan:
     """Blocks of a whole job."""
 
     job: str
@@ -308,13 +308,13 @@ class Plan:
         return sum(block.images for block in self.blocks)
 
 
-def make_plan(
+def make_job_plan(
     recipes: JobRecipes,
     scenes: Sequence[JobScene],
     scene_records: Mapping[tuple[str, str | None], SceneRecord | str],
     backend: str,
     resolved: Mapping[tuple[str, str], Recipe | str] = MappingProxyType({}),
-) -> Plan:
+) -> JobPlan:
     """Return the plan of a job.
 
     Args:
@@ -336,7 +336,7 @@ def make_plan(
             unusable[entry.uri] = record
             continue
         _check_folder(records, record)
-        recipe_draws = recipes.of_scene(entry, record.name)
+        recipe_draws = recipes.resolve_for_scene(entry, record.name)
         resolved_recipes = [
             resolved.get((record.name, variant_name(recipe)), recipe) for recipe in recipe_draws
         ]
@@ -362,7 +362,7 @@ def make_plan(
         raise ClimateGSError(f"job {recipes.job.name}: none of its scenes can be used:{reasons}")
     pairs = [(entry, scene_records[entry.uri, entry.name]) for entry in scenes]
     names = {record.name: e.name for e, record in pairs if isinstance(record, SceneRecord)}
-    return Plan(recipes.job.name, backend, tuple(blocks), records, names, unusable)
+    return JobPlan(recipes.job.name, backend, tuple(blocks), records, names, unusable)
 
 
 def select_shard(blocks: Sequence[Block], number: int, count: int) -> list[Block]:
@@ -421,7 +421,7 @@ class StoredPlan:
 _STORED_PLAN = TypeAdapter(StoredPlan)
 
 
-def store_plan(store: Store, plan: Plan) -> None:
+def store_plan(store: Store, plan: JobPlan) -> None:
     """Write the plan's file; it is the same for every shard and every run."""
     blocks = [PlannedBlock(b.key, b.scene, b.variant, b.recipe.name, b.images) for b in plan.blocks]
     stored_plan = StoredPlan(plan.job, augment.__version__, tuple(blocks), dict(plan.unusable))
@@ -461,7 +461,7 @@ _NUM_RECENT = 20
 
 
 @dataclass
-class Progress:
+class ImageCounts:
     """Counts of the images of a group."""
 
     planned: int = 0
@@ -480,11 +480,11 @@ class JobStatus:
     """Name of the job."""
     version: str
     """Version of this package that planned the job."""
-    total: Progress
+    total: ImageCounts
     """Counts of all images."""
-    by_scene: dict[str, Progress]
+    by_scene: dict[str, ImageCounts]
     """Counts by scene name."""
-    by_recipe: dict[str, Progress]
+    by_recipe: dict[str, ImageCounts]
     """Counts by recipe name."""
     unusable: dict[str, str]
     """Reasons why scenes cannot be used, by URI."""
@@ -500,7 +500,7 @@ class JobStatus:
     """Number of blocks that a process has claimed."""
 
     @property
-    def left_s(self) -> float | None:
+    def remaining_s(self) -> float | None:
         """Seconds that the remaining images take at that speed; None where it is not known."""
         if not self.images_per_s:
             return None
@@ -525,9 +525,9 @@ def _status(
     plan: StoredPlan, parts: dict[str, Part], staged_images: dict[str, int], claim_names: set[str]
 ) -> JobStatus:
     """Return the status of one job."""
-    total = Progress()
-    scenes: defaultdict[str, Progress] = defaultdict(Progress)
-    recipes: defaultdict[str, Progress] = defaultdict(Progress)
+    total = ImageCounts()
+    scenes: defaultdict[str, ImageCounts] = defaultdict(ImageCounts)
+    recipes: defaultdict[str, ImageCounts] = defaultdict(ImageCounts)
     num_published = 0
     num_staged = 0
     num_claimed = 0

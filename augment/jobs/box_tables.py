@@ -61,54 +61,56 @@ class BoxTable:
     """Kind of content that the file states."""
     columns: Mapping[str, type]
     """Types of the file's columns by name; `object` for texts."""
-    sampled: tuple[str, ...]
+    sample_columns: tuple[str, ...]
     """Columns that samples of the datasets have."""
-    derived: Mapping[str, Callable[[Mapping[str, Any]], np.ndarray]] = field(default_factory=dict)
+    derived_columns: Mapping[str, Callable[[Mapping[str, Any]], np.ndarray]] = field(
+        default_factory=dict
+    )
     """Functions that compute columns from the stored ones, by name; those in `columns` are written
     for other readers.
     """
-    visible: str = ""
+    visible_column: str = ""
     """Column with the fraction of each box that the effect leaves visible, 0 to 1; NaN where
     unknown. Empty if there is none.
     """
-    hidden: str = ""
+    hidden_column: str = ""
     """Column with the fraction of each box that the effect hides, 0 to 1; NaN where unknown. Empty
     if there is none.
     """
-    later: Mapping[str, Any] = field(default_factory=dict)
+    later_columns: Mapping[str, Any] = field(default_factory=dict)
     """The last columns, which files of older versions lack, with the values to assume."""
 
     @property
-    def stored(self) -> tuple[str, ...]:
+    def stored_columns(self) -> tuple[str, ...]:
         """Names of the columns that are stored and not derived."""
-        return tuple(name for name in self.columns if name not in self.derived)
+        return tuple(name for name in self.columns if name not in self.derived_columns)
 
-    def left(self, columns: Any) -> np.ndarray | None:
+    def visible_fractions(self, columns: Any) -> np.ndarray | None:
         """Return the fraction of each box that the effect leaves visible, float64 [B].
 
         None where the table does not say.
         """
-        if self.hidden:
-            return 1 - columns[self.hidden]
-        return columns[self.visible] if self.visible else None
+        if self.hidden_column:
+            return 1 - columns[self.hidden_column]
+        return columns[self.visible_column] if self.visible_column else None
 
-    def numbers(self, track_ids: Sequence[str], **stored: np.ndarray) -> BoxNumbers:
+    def make_numbers(self, track_ids: Sequence[str], **stored: np.ndarray) -> BoxNumbers:
         """Return the numbers of an image, with the derived columns."""
-        derived = {name: derive(stored) for name, derive in self.derived.items()}
+        derived = {name: derive(stored) for name, derive in self.derived_columns.items()}
         return BoxNumbers(tuple(track_ids), stored | derived)
 
     def to_json(self, numbers: BoxNumbers) -> list[list[Any]]:
         """Return the numbers as lists for the progress log; floats keep all their digits."""
-        return [list(numbers.track_ids), *(numbers[name].tolist() for name in self.stored)]
+        return [list(numbers.track_ids), *(numbers[name].tolist() for name in self.stored_columns)]
 
     def from_json(self, columns: Sequence[Sequence[Any]]) -> BoxNumbers:
         """Return the numbers that `to_json` made lists of."""
         track_ids, *arrays = columns
-        names = self.stored
-        if len(arrays) == len(names) - len(self.later):  # log of an older version
-            arrays += [[value] * len(track_ids) for value in self.later.values()]
+        names = self.stored_columns
+        if len(arrays) == len(names) - len(self.later_columns):  # log of an older version
+            arrays += [[value] * len(track_ids) for value in self.later_columns.values()]
         pairs = zip(names, arrays, strict=True)
-        return self.numbers(track_ids, **{n: np.array(a, self.columns[n]) for n, a in pairs})
+        return self.make_numbers(track_ids, **{n: np.array(a, self.columns[n]) for n, a in pairs})
 
     def to_bytes(self, items: Mapping[Item, BoxNumbers]) -> bytes:
         """Return all images' boxes as one Parquet file, by frame, camera and order in the labels.
@@ -145,12 +147,12 @@ class BoxTable:
             raise OutputError(f"{path} holds {note.get('kind')!r} data; expected {self.kind!r}")
         with metadata_errors_as_output_errors(path):
             track_ids = column_texts(table["track_id"])
-            absent_columns = self.later.keys() - set(table.column_names)
+            absent_columns = self.later_columns.keys() - set(table.column_names)
             columns = {
-                name: np.full(len(table), self.later[name], self.columns[name])
+                name: np.full(len(table), self.later_columns[name], self.columns[name])
                 if name in absent_columns
                 else self._column(table[name], name)
-                for name in self.stored
+                for name in self.stored_columns
             }
             items = {}
             start = 0
@@ -158,7 +160,7 @@ class BoxTable:
                 rows = slice(start, start + count)
                 # Copies: Arrow's own memory is read-only, which torch.from_numpy warns about.
                 values = {name: column[rows].copy() for name, column in columns.items()}
-                items[checked_int(frame), camera] = self.numbers(track_ids[rows], **values)
+                items[checked_int(frame), camera] = self.make_numbers(track_ids[rows], **values)
                 start += count
             check_count(table, start)
         return items
@@ -225,9 +227,9 @@ BOXES_2D = BoxTable(
         "truncated_fraction": np.float64,
         "is_estimated": np.bool_,
     },
-    sampled=("modal_xyxy", "visible_fraction", "truncated_fraction", "is_estimated"),
-    later={"is_estimated": False},
-    derived={"visible_fraction": _visible_fraction, "modal_xyxy": _modal_xyxy},
+    sample_columns=("modal_xyxy", "visible_fraction", "truncated_fraction", "is_estimated"),
+    later_columns={"is_estimated": False},
+    derived_columns={"visible_fraction": _visible_fraction, "modal_xyxy": _modal_xyxy},
 )
 # Bounds of a mask, from the first pixel's edge to the last one's.
 MASK_SIDES = ("left", "top", "right", "bottom")
@@ -239,5 +241,5 @@ MASKS = BoxTable(
     file="labels/masks.parquet",
     kind="boxes masks",
     columns={**dict.fromkeys((*MASK_SIDES, "pixels"), np.int64), "rle": object},
-    sampled=(),
+    sample_columns=(),
 )

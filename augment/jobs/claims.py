@@ -105,7 +105,7 @@ def try_claim(store: Store, name: str, times: ClaimTimes | None = None) -> Claim
 
 @contextlib.contextmanager
 def hold_claim(
-    store: Store, name: str, patience_s: float = 120.0, doing: str = "writes there"
+    store: Store, name: str, patience_s: float = 120.0, activity: str = "writes there"
 ) -> Iterator[Claim]:
     """Context manager that holds a claim; waits for other holders, and logs that once.
 
@@ -131,7 +131,7 @@ def hold_claim(
             _log.info(
                 "%s: another process %s; waiting for its claim %r, at most %.0f min",
                 store.uri,
-                doing,
+                activity,
                 name,
                 patience_s / 60,
             )

@@ -28,7 +28,7 @@ from jaxtyping import Float64, UInt8, UInt16
 from augment import base_photo, effects
 from augment.box_estimates import Estimate, Evidence, estimate_boxes
 from augment.boxes import (
-    NEAR_M,
+    MIN_DEPTH_M,
     Instances,
     Occlusion,
     Outlines,
@@ -53,7 +53,7 @@ from augment.jobs.box_tables import (
     BoxWeather,
 )
 from augment.jobs.layout import TRUST, mask_share_columns
-from augment.jobs.processes import renders_on_gpu, uninterrupted
+from augment.jobs.processes import renders_on_gpu, run_uninterrupted
 from augment.jobs.tables import checked_int
 from augment.labels import Boxes, LabelSource
 from augment.scene import Scene
@@ -61,11 +61,11 @@ from augment.semantics import SemanticClass
 from recipes.schema import Output, Recipe
 
 # Depth of the recording car in a picture that shows it, metres: nearer than every box.
-OWN_CAR_DEPTH_M = NEAR_M / 2
+OWN_CAR_DEPTH_M = MIN_DEPTH_M / 2
 
 
 @runtime_checkable
-class View(Protocol):
+class ViewResult(Protocol):
     """Result of a renderer, a dataclass: `augment.views.WeatheredView` or a stand-in."""
 
     rgb: np.ndarray  # uint8 [H, W, 3]
@@ -83,7 +83,7 @@ def box_tables() -> dict[str, BoxTable]:
 
     They are the tables of the boxes and those of the effects.
     """
-    effect_tables = (e.table for e in reversed(effects.EFFECTS) if e.table is not None)
+    effect_tables = (e.box_table for e in reversed(effects.EFFECTS) if e.box_table is not None)
     return {table.name: table for table in (BOXES_2D, MASKS, *effect_tables)}
 
 
@@ -92,7 +92,7 @@ def measure_boxes(
     instances: Instances,
     world_origin_m: np.ndarray,
     camera: Camera,
-    view: View,
+    view: ViewResult,
     *,
     box_visibility: BoxVisibility | None = None,
 ) -> dict[str, BoxNumbers]:
@@ -107,31 +107,33 @@ def measure_boxes(
         box_visibility: Result of `find_box_visibility` for the image, with masks by depth if it has owners;
             computed here if None.
     """
-    world_boxes = WorldBoxes.of(boxes, world_origin_m)
+    world_boxes = WorldBoxes.from_labels(boxes, world_origin_m)
     numbers_of_table: dict[str, BoxNumbers] = {}
     if view.surface is not None:
-        numbers = instances.of(boxes.track_ids)
+        numbers = instances.numbers_of(boxes.track_ids)
         box_visibility = box_visibility or find_box_visibility(
             boxes, instances, world_boxes, camera, view
         )
         columns = {"instance": numbers.astype(np.int64), **box_visibility.columns()}
-        numbers_of_table[BOXES_2D.name] = BOXES_2D.numbers(boxes.track_ids, **columns)
-        if box_visibility.occlusion.owners is not None:
+        numbers_of_table[BOXES_2D.name] = BOXES_2D.make_numbers(boxes.track_ids, **columns)
+        if box_visibility.occlusion.owner_boxes is not None:
             box_numbers = np.arange(1, len(boxes) + 1).astype(np.uint16)
-            owners = box_visibility.paint_estimates(box_visibility.occlusion.owners, box_numbers)
-            numbers_of_table[MASKS.name] = MASKS.numbers(
+            owners = box_visibility.paint_estimates(
+                box_visibility.occlusion.owner_boxes, box_numbers
+            )
+            numbers_of_table[MASKS.name] = MASKS.make_numbers(
                 boxes.track_ids, **encode_masks(owners, box_numbers)
             )
     for effect in effects.EFFECTS:
-        table = effect.table
+        table = effect.box_table
         effect_view = view.effects.get(effect.name)
         if table is not None and effect_view is not None:
-            columns = effect.measure(world_boxes, camera, effect_view)
-            numbers_of_table[table.name] = table.numbers(boxes.track_ids, **columns)
+            columns = effect.measure_boxes(world_boxes, camera, effect_view)
+            numbers_of_table[table.name] = table.make_numbers(boxes.track_ids, **columns)
     return numbers_of_table
 
 
-def _grow_boxes(world_boxes: WorldBoxes, view: View) -> WorldBoxes:
+def _grow_boxes(world_boxes: WorldBoxes, view: ViewResult) -> WorldBoxes:
     """Return the boxes grown by the layers that lie on them, such as snow."""
     for effect in effects.EFFECTS:
         if effect.name in view.effects:
@@ -154,13 +156,13 @@ class BoxVisibility:
         """Return the stored columns of BOXES_2D, without the instances."""
         occlusion = self.occlusion
         xyxy = occlusion.xyxy.copy()
-        pixels = occlusion.shown.copy()
-        hidden_pixels = occlusion.hidden.copy()
+        pixels = occlusion.num_shown.copy()
+        hidden_pixels = occlusion.num_hidden.copy()
         is_estimated = np.zeros(len(pixels), bool)
         for box, estimate in self.estimates.items():
             xyxy[box] = estimate.xyxy
-            pixels[box] = estimate.pixels
-            hidden_pixels[box] = estimate.hidden
+            pixels[box] = estimate.num_pixels
+            hidden_pixels[box] = estimate.num_hidden
             is_estimated[box] = True
         return {
             **dict(zip(SIDES, self.outlines.xyxy.T.copy(), strict=True)),
@@ -204,7 +206,7 @@ def find_box_visibility(
     instances: Instances,
     world_boxes: WorldBoxes,
     camera: Camera,
-    view: View,
+    view: ViewResult,
     *,
     masks: bool = False,
     evidence: Callable[[], Evidence | None] | None = None,
@@ -224,7 +226,7 @@ def find_box_visibility(
     """
     surface = _with_own_car(view.surface)
     outlines = outline_world_boxes(world_boxes, camera)
-    numbers = instances.of(boxes.track_ids)
+    numbers = instances.numbers_of(boxes.track_ids)
     actor_numbers = np.where(numbers <= len(instances.actors), numbers, 0)
     grown_boxes = _grow_boxes(world_boxes, view)
     occlusion = find_occlusion(
@@ -264,7 +266,7 @@ def _with_own_car(surface: Any) -> Any:
     )
 
 
-def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
+def combine_visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
     """Return the fraction of each box that the weather leaves visible, float64 [B], 0 to 1.
 
     It is the product of the fractions of all effects. An effect that is absent, or that has no
@@ -275,7 +277,10 @@ def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
         count: Number of boxes.
     """
     tables = box_tables()
-    factors = [np.ones(count), *(tables[name].left(numbers) for name, numbers in weather.items())]
+    factors = [
+        np.ones(count),
+        *(tables[name].visible_fractions(numbers) for name, numbers in weather.items()),
+    ]
     return np.prod([np.where(np.isnan(f), 1.0, f) for f in factors if f is not None], axis=0)
 
 
@@ -294,7 +299,7 @@ class SceneIndex:
     """The scene's own frames, or those of a camera path."""
     labels: LabelSource | None
     """Source of boxes and LiDAR; None if there is none."""
-    labelled: frozenset[int]
+    labelled_frames: frozenset[int]
     """Numbers of the frames whose boxes and LiDAR pass through. For a camera path these are the
     frames with number and timestamp of a frame of the scene.
     """
@@ -318,7 +323,7 @@ class SceneIndex:
             source=scene.source,
             frames=frames,
             labels=scene.labels,
-            labelled=frozenset(labelled) if scene.labels is not None else frozenset(),
+            labelled_frames=frozenset(labelled) if scene.labels is not None else frozenset(),
             instances=instances_of(scene),
             world_origin_m=np.asarray(scene.world_origin_m, np.float64),
             has_metric_scale=scene.has_metric_scale,
@@ -714,7 +719,7 @@ def _mean_share(mask: np.ndarray) -> float:
 
 
 @dataclass(frozen=True)
-class Written:
+class ViewFiles:
     """Files of one view."""
 
     checksum: str
@@ -729,15 +734,17 @@ class Written:
     """Shares of the image's pixels in masks, by the manifest's column."""
 
 
-def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
+def check_view(view: ViewResult, camera: Camera, recipe: Recipe) -> None:
     """Raise ValueError unless the view has the size and the buffers that the recipe asks for.
 
     Args:
         camera: Camera at the written resolution.
     """
-    present_effects = [effect for effect in effects.EFFECTS if effect.of(recipe) is not None]
+    present_effects = [
+        effect for effect in effects.EFFECTS if effect.section_of(recipe) is not None
+    ]
     effect_names = {effect.name for effect in present_effects}
-    measured_names = {effect.name for effect in present_effects if effect.table is not None}
+    measured_names = {effect.name for effect in present_effects if effect.box_table is not None}
     if not measured_names <= set(view.effects) <= effect_names:
         raise ValueError(
             f"the renderer returned what labels of "
@@ -745,7 +752,7 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
             f"with {_join_names(sorted(effect_names)) or 'no effect'}"
         )
     output = recipe.output
-    masks = {e.mask for e in effects.EFFECTS if e.name in effect_names}
+    masks = {e.mask_name for e in effects.EFFECTS if e.name in effect_names}
     masks |= {TRUST} if output.trust else set()
     is_requested = {
         "rgb": True,
@@ -778,8 +785,8 @@ _BUFFERS: Mapping[str, tuple[str, Callable[[Any], bytes]]] = {
 
 
 def write_view(
-    out_dir: Path, paths: Mapping[str, str | None], view: View, recipe: Recipe
-) -> Written:
+    out_dir: Path, paths: Mapping[str, str | None], view: ViewResult, recipe: Recipe
+) -> ViewFiles:
     """Encode and write all files of a view that `check_view` has passed.
 
     Args:
@@ -807,7 +814,7 @@ def write_view(
     write_s = time.perf_counter() - encoded_s
     columns = {mask: c for mask, c in mask_share_columns().items() if mask in view.masks}
     shares = {column: _mean_share(view.masks[mask]) for mask, column in columns.items()}
-    return Written(checksum, tuple(files), encoded_s - start_s, write_s, shares)
+    return ViewFiles(checksum, tuple(files), encoded_s - start_s, write_s, shares)
 
 
 class WritePump:
@@ -843,7 +850,7 @@ class WritePump:
         if self._slots.acquire(blocking=False):
             return self._queue(task)
         # A rendered view is written also where an interrupt comes during the wait.
-        return uninterrupted(lambda: self._queue_when_free(task))
+        return run_uninterrupted(lambda: self._queue_when_free(task))
 
     def _queue_when_free(self, task: Callable[[], Any]) -> Future:
         self._slots.acquire()
@@ -901,10 +908,10 @@ def label_view(
     instances: Instances,
     world_origin_m: np.ndarray,
     camera: Camera,
-    view: View,
+    view: ViewResult,
     recipe: Recipe,
     evidence: Callable[[], Evidence | None] | None = None,
-) -> tuple[View, BoxWeather]:
+) -> tuple[ViewResult, BoxWeather]:
     """Return the view with its frame's boxes, and the measured numbers of the boxes.
 
     Boxes without an actor are added to the view's instance image. Numbers are measured where labels
@@ -922,7 +929,7 @@ def label_view(
     wants_masks = bool(recipe.output.label_formats)
     output = recipe.output
     surface = view.surface
-    world_boxes = WorldBoxes.of(boxes, world_origin_m)
+    world_boxes = WorldBoxes.from_labels(boxes, world_origin_m)
     box_visibility = None
     if surface is not None:
         uses_depth = wants_masks and not output.instance
@@ -944,7 +951,7 @@ def label_view(
     if view.instance is None or surface is None or box_visibility is None:
         return view, numbers_of_table
     assert surface.instance_depth_m is not None and surface.instance_classes is not None
-    box_numbers = instances.of(boxes.track_ids)
+    box_numbers = instances.numbers_of(boxes.track_ids)
     if not surface.is_bare:
         world_boxes = _grow_boxes(world_boxes, view)
     instance_image = paint_boxes(
@@ -962,7 +969,7 @@ def label_view(
     if surface.own_car is not None:
         instance_image = np.where(surface.own_car, np.uint16(0), instance_image)
     if wants_masks:
-        numbers_of_table[MASKS.name] = MASKS.numbers(
+        numbers_of_table[MASKS.name] = MASKS.make_numbers(
             boxes.track_ids, **encode_masks(instance_image, box_numbers)
         )
     untyped_view: Any = view

@@ -38,7 +38,7 @@ from augment.jobs.block_worker import (
     ResolveTask,
     clear_leftovers,
 )
-from augment.jobs.blocks import Block, Plan, SceneRecord, make_plan, select_shard, store_plan
+from augment.jobs.blocks import Block, JobPlan, SceneRecord, make_job_plan, select_shard, store_plan
 from augment.jobs.claims import try_claim
 from augment.jobs.files import RECORDED
 from augment.jobs.layout import (
@@ -68,7 +68,7 @@ from augment.jobs.manifest import (
 )
 from augment.jobs.pools import ProcessPool, RayPool, SerialPool, Work, WorkerPool, run_tasks
 from augment.jobs.processes import available_cores, renders_on_gpu
-from augment.jobs.quality import Question, recorded
+from augment.jobs.quality import Question, read_choice
 from augment.jobs.render_job import RenderJob, SceneLoader, lacks_recipe, run_job, write_recipe
 from augment.jobs.scene_changes import SceneChange, changes_in
 from augment.jobs.store import Store, StoredFileMissing, open_store
@@ -274,7 +274,7 @@ class BlockWork(Work):
     def done(self, slot: int, task: BlockTask, result: BlockResult | TaskFailed) -> None:
         self._free_slot(slot)
         if isinstance(result, TaskFailed):
-            other_blocks = self._queue.take_all(task.block.scene) if result.of_scene else []
+            other_blocks = self._queue.take_all(task.block.scene) if result.is_scene_error else []
             self._give_up([task.block, *other_blocks], result.text)
         elif result.is_claimed_elsewhere:
             self._postponed.append((time.monotonic() + ELSEWHERE_S, task.block))
@@ -348,11 +348,11 @@ def resolve_recipes(
         (Question(recipe, record.name, record.source, RECORDED, job.setup.backend), entry)
         for entry in job.scenes
         if isinstance(record := scene_records[entry.uri, entry.name], SceneRecord)
-        for recipe in job.recipes.of_scene(entry, record.name)
-        if recipe.quality.is_open
+        for recipe in job.recipes.resolve_for_scene(entry, record.name)
+        if recipe.quality.has_open_choice
     ]
     with ThreadPoolExecutor(_NUM_READS, thread_name_prefix="choices") as pool:
-        answers = list(pool.map(lambda pair: recorded(store, pair[0]), questions))
+        answers = list(pool.map(lambda pair: read_choice(store, pair[0]), questions))
     choices: Choices = {}
     open_recipes: defaultdict[tuple[str, str | None, str], list[Recipe]] = defaultdict(list)
     for (question, entry), answer in zip(questions, answers, strict=True):
@@ -383,8 +383,8 @@ def resolve_recipes(
         ordered_tasks = [*tasks][start:] + [*tasks][:start]
         activity = "choosing the settings of its recipes"
         # Choices that measure frame times run one by one, so that none disturbs another's times.
-        workers.do(
-            SceneWork(ordered_tasks, on_result, activity, workers.opened),
+        workers.run(
+            SceneWork(ordered_tasks, on_result, activity, workers.scene_of_slot),
             slots=1 if is_timed else None,
         )
     return choices
@@ -417,12 +417,12 @@ class Estimate:
     """Seconds of a single worker, including the time to open its scenes."""
     bytes: float
     """Bytes of all files."""
-    unsampled: tuple[str, ...]
+    unsampled_recipes: tuple[str, ...]
     """Names of the recipes that were not tried."""
 
 
-def estimate(
-    plan: Plan, open_scene: SceneLoader, *, each: Callable[[str], None] = lambda name: None
+def estimate_job(
+    plan: JobPlan, open_scene: SceneLoader, *, on_recipe: Callable[[str], None] = lambda name: None
 ) -> Estimate:
     """Estimate time and size of a job from two pictures of each recipe.
 
@@ -442,7 +442,7 @@ def estimate(
     samples: dict[str, Sample] = {}
     scene_by_uri: dict[str, Scene] = {}  # at most one scene at a time
     for name, block in sampled_blocks.items():
-        each(name)
+        on_recipe(name)
         if block.uri not in scene_by_uri:
             scene_by_uri.clear()
             scene_by_uri[block.uri] = open_scene(block.uri)
@@ -463,23 +463,23 @@ def estimate(
     )
 
 
-def _megapixels(plan: Plan) -> tuple[dict[str, float], dict[str, int]]:
+def _megapixels(plan: JobPlan) -> tuple[dict[str, float], dict[str, int]]:
     """Return the millions of pixels of all images and the number of scenes, by recipe."""
     megapixels: defaultdict[str, float] = defaultdict(float)
     scenes: defaultdict[str, set[str]] = defaultdict(set)
     for block in plan.blocks:
-        pictured = block.pictured(plan.records[block.scene])
+        pictured = block.list_images(plan.records[block.scene])
         megapixels[block.recipe.name] += sum(p.width * p.height for p in pictured) / 1e6
         scenes[block.recipe.name].add(block.scene)
     return dict(megapixels), {name: len(scene_names) for name, scene_names in scenes.items()}
 
 
-def _sample(block: Block, loader: SceneLoader, plan: Plan) -> Sample:
+def _sample(block: Block, loader: SceneLoader, plan: JobPlan) -> Sample:
     """Render the block's middle frame twice and return its cost."""
     record = plan.records[block.scene]
     camera = block.cameras[0]
     frame_numbers = [f.number for f in record.frames if camera in f.cameras]
-    pictured = next(p for p in block.pictured(record) if p.camera == camera)
+    pictured = next(p for p in block.list_images(record) if p.camera == camera)
     megapixels = pictured.width * pictured.height / 1e6
     picture_times_s = []
     num_bytes = 0
@@ -492,7 +492,7 @@ def _sample(block: Block, loader: SceneLoader, plan: Plan) -> Sample:
                 frames=[frame_numbers[len(frame_numbers) // 2]],
                 cameras=[camera],
                 backend=plan.backend,
-                shared_dir=Path(folder) / "beds",
+                shared_files_dir=Path(folder) / "beds",
             )
             start_s = time.perf_counter()
             run_job(job, scene_loader=loader, progress=False)
@@ -540,7 +540,7 @@ class GenerateJob:
     """
     shard: tuple[int, int] = (1, 1)
     """Part of the job that is done here, counted from 1, and the number of parts."""
-    rescan: bool = False
+    reopens_scenes: bool = False
     """If True, all scenes are opened again, in case they have changed."""
 
     def __post_init__(self) -> None:
@@ -603,7 +603,7 @@ def run_generate(
     return _Generation(_with_backend(job), progress, prepare, on_image).run()
 
 
-def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
+def plan_job(job: GenerateJob, *, progress: bool = True) -> JobPlan:
     """Return the job's plan; opens scenes that have no record yet, and writes nothing."""
     job = _with_backend(job)
     store = open_store(job.setup.store_uri)
@@ -623,11 +623,11 @@ class Workers:
 
     def __init__(self, job: GenerateJob) -> None:
         self.pool = _make_pool(job)
-        self.opened = dict[int, str]()
+        self.scene_of_slot = dict[int, str]()
         self.slots = self.pool.slots
         self.close = self.pool.close
 
-    def do(self, work: Work, **options: Any) -> None:
+    def run(self, work: Work, **options: Any) -> None:
         """Do all of the work; options as of `run_tasks`."""
         run_tasks(self.pool, work, **options)
 
@@ -706,7 +706,7 @@ class _Generation:
             work = BlockWork(
                 pending_blocks,
                 plan.names,
-                workers.opened,
+                workers.scene_of_slot,
                 self._publish_failure,
                 self._show_progress,
                 self._damaged_keys,
@@ -754,7 +754,7 @@ class _Generation:
         store_plan(self._store, self._plan)
         pending_keys = {block.key for block in pending_blocks}
         published_blocks = [block for block in blocks if block.key not in pending_keys]
-        clear_leftovers(self._store, self._job.setup.scratch, published_blocks)
+        clear_leftovers(self._store, self._job.setup.scratch_dir, published_blocks)
         return pending_blocks
 
     def _accept_changes(self, changes: Iterable[SceneChange]) -> None:
@@ -765,7 +765,7 @@ class _Generation:
         for change in changes:
             change.check(self._store)
         for change in changes:
-            change.accept(self._store, self._job.setup.scratch)
+            change.accept(self._store, self._job.setup.scratch_dir)
 
     def _finished_rows(self) -> pa.Table | None:
         """Return the manifest's rows of the images that are finished on this machine.
@@ -837,7 +837,7 @@ class _Generation:
         )
         with self._bar:
             try:
-                workers.do(work, idle=self._merge_at_times)
+                workers.run(work, idle=self._merge_at_times)
             except KeyboardInterrupt:
                 workers.close()
                 self._merge(wait=True)
@@ -868,7 +868,7 @@ class _Generation:
                 status=FAILED,
                 message=message,
             )
-            for pictured in block.pictured(record)
+            for pictured in block.list_images(record)
         ]
         claim = try_claim(self._store, block.claim)
         if claim is not None:  # otherwise another process renders it, and publishes its rows
@@ -921,7 +921,7 @@ def _trust_notes(blocks: Sequence[Block], records: Mapping[str, SceneRecord]) ->
 
 def _plan(
     job: GenerateJob, store: Store, workers: Workers, progress: bool, *, keep: bool
-) -> tuple[Plan, list[SceneChange]]:
+) -> tuple[JobPlan, list[SceneChange]]:
     """Return the job's plan, and the scenes that changed since the output's records were made.
 
     Args:
@@ -930,7 +930,7 @@ def _plan(
     known_records, changes = _read_scene_records(job, store, keep=keep)
     changed_paths = {change.record_path for change in changes}
     scene_records: dict[tuple[str, str | None], SceneRecord | str] = (
-        {} if job.rescan else {**known_records}
+        {} if job.reopens_scenes else {**known_records}
     )
     tasks = [IndexTask(e.uri, e.name) for e in job.scenes if (e.uri, e.name) not in scene_records]
     with ProgressBar(
@@ -944,12 +944,14 @@ def _plan(
                 store.write(path, record.to_json())
             bar.update()
 
-        scene_work = SceneWork(dict.fromkeys(tasks), on_result, "opening the scene", workers.opened)
-        workers.do(scene_work)
+        scene_work = SceneWork(
+            dict.fromkeys(tasks), on_result, "opening the scene", workers.scene_of_slot
+        )
+        workers.run(scene_work)
     resolved_recipes = resolve_recipes(
         job, store, workers, scene_records, progress=progress, keep=keep
     )
-    return make_plan(
+    return make_job_plan(
         job.recipes, job.scenes, scene_records, job.setup.backend, resolved_recipes
     ), changes
 
@@ -961,7 +963,7 @@ def _read_scene_records(
 
     def look_up(entry: JobScene) -> tuple[SceneRecord | None, str | None]:
         record = _read_scene_record(store, entry)
-        digest_of = job.setup.digest_of
+        digest_of = job.setup.scene_digest
         return record, None if record is None or digest_of is None else digest_of(entry.uri)
 
     records: dict[tuple[str, str | None], SceneRecord] = {}
@@ -1008,7 +1010,7 @@ def _record_path(uri: str, name: str | None) -> str:
     return f"{SCENES}/{digest[:20]}.json"
 
 
-def _check_not_mixed(store: Store, plan: Plan, blocks: Sequence[Block]) -> None:
+def _check_not_mixed(store: Store, plan: JobPlan, blocks: Sequence[Block]) -> None:
     """Refuse to put images beside images of the same name that were made otherwise."""
     try:
         table = read_manifest_rows(store)

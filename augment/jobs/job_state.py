@@ -42,7 +42,7 @@ from augment.jobs.files import SceneIndex, box_tables, calibration_bytes, frame_
 from augment.jobs.layout import (
     MANIFEST_FILE,
     STATE_FOLDER,
-    SWEEPS,
+    SWEEP_FOLDER,
     FileListing,
     box_weather_files,
     folder_name,
@@ -64,12 +64,12 @@ from augment.jobs.manifest import (
     merge_rows,
     read_manifest,
     recipe_columns,
-    rows_of,
+    select_variant_rows,
     write_manifest,
 )
 from augment.jobs.store import open_store
 from augment.jobs.tables import FrameBoxes, boxes_bytes, read_boxes
-from augment.jobs.worker import Chunk, Outcome, describe
+from augment.jobs.worker import Chunk, Outcome, describe_error
 from recipes.schema import Recipe
 
 _log = logging.getLogger(__name__)
@@ -182,7 +182,7 @@ class VariantState:
         self.identity = identity
         self.name = variant_name(recipe)
         self.folder = variant_folder(index.name, self.name)
-        self.place = out_dir / self.folder
+        self.path = out_dir / self.folder
         self.progress_log = ProgressLog(out_dir, index.name, self.name)
         self.rows: dict[Item, dict[str, Any]] = {}
         self.box_weather: dict[str, dict[Item, BoxNumbers]] = {kind: {} for kind in box_tables()}
@@ -206,14 +206,14 @@ class VariantState:
         """
         self._listing = listing
         logged_identity, logged_rows = self.progress_log.load()
-        rows = [] if table is None else rows_of(table, {self.key})
+        rows = [] if table is None else select_variant_rows(table, {self.key})
         identities = {Identity.of_row(row) for row in rows} | (
             {logged_identity} if logged_identity else set()
         )
         if overwrite and identities:
             return True
         for stored_identity in sorted(identities, key=repr):
-            self.identity.check(stored_identity, str(self.place))
+            self.identity.check(stored_identity, str(self.path))
         if self.identity.source_digest is not None:
             self._adopts_rows = any(
                 stored_identity.source_digest is None for stored_identity in identities
@@ -222,12 +222,12 @@ class VariantState:
                 _log.warning(
                     "note: %s is of an older version, which did not note the content of its "
                     "scene; it is taken to be the scene as it is now",
-                    self.place,
+                    self.path,
                 )
         self._is_logged = logged_identity is not None
         for kind, file in box_weather_files(self.recipe).items():
             if any(row.get(f"{kind}_path") for row in rows):
-                self.box_weather[kind] = _read_table(kind, self.place / file)
+                self.box_weather[kind] = _read_table(kind, self.path / file)
         with self.progress_log.reading():
             # Logged rows also hold the boxes' numbers, which are no columns of the manifest.
             for row in logged_rows:
@@ -260,7 +260,7 @@ class VariantState:
             return False
         if "box_2d" in measured_kinds:
             numbers = self.box_weather["box_2d"][item]
-            if not self.index.instances.agree(numbers.track_ids, numbers["instance"]):
+            if not self.index.instances.has_same_numbers(numbers.track_ids, numbers["instance"]):
                 return False
         variant_kinds = {"labels", "calibration", *box_tables()}
         paths = [row[f"{kind}_path"] for kind in path_kinds() if kind not in variant_kinds]
@@ -298,15 +298,15 @@ class VariantState:
         Tables of boxes that came with a later version than the one that rendered the images are
         left out: only rendering again would tell their content.
         """
-        files = {"calibration": self.place / "calibration.json"}
+        files = {"calibration": self.path / "calibration.json"}
         if self.recipe.output.labels and self.index.labels is not None:
-            files["labels"] = self.place / "labels" / "boxes.parquet"
+            files["labels"] = self.path / "labels" / "boxes.parquet"
             labelled_rows = [row for row in self.rows.values() if row["labels_path"] is not None]
             for kind, file in box_weather_files(self.recipe).items():
                 if not labelled_rows or any(
                     row[f"{kind}_path"] is not None for row in labelled_rows
                 ):
-                    files[kind] = self.place / file
+                    files[kind] = self.path / file
         return files
 
     def write_files(self, boxes: BoxCache, trajectory: str) -> None:
@@ -345,7 +345,7 @@ class VariantState:
             with contextlib.suppress(OutputError):  # a damaged file: the scene still has the boxes
                 stored_boxes = {n: boxes for n, boxes in read_boxes(path).items() if n in frames}
         boxes_of_frame = stored_boxes | cache.get(sorted(frames - stored_boxes.keys()))
-        number_of = self.index.instances.of
+        number_of = self.index.instances.numbers_of
         return boxes_bytes(
             {
                 n: replace(b, instances=number_of(b.boxes.track_ids))
@@ -379,7 +379,7 @@ class VariantState:
         paths = path_columns(item_paths(index.name, recipe, outcome.camera, frame.index))
         absent_kinds = box_tables().keys() - outcome.box_weather.keys()
         absent_kinds |= set() if outcome.lidar else {"lidar"}
-        absent_kinds |= set() if frame.index in index.labelled else {"labels"}
+        absent_kinds |= set() if frame.index in index.labelled_frames else {"labels"}
         return image_row(
             index.name,
             recipe,
@@ -409,7 +409,7 @@ class BoxCache:
 
     def get(self, frames: Iterable[int]) -> dict[int, FrameBoxes]:
         """Return the boxes of those frames that have labels and can be read."""
-        labelled_frames = [f for f in frames if f in self._index.labelled]
+        labelled_frames = [f for f in frames if f in self._index.labelled_frames]
         labels = self._index.labels
         for number in labelled_frames:
             if labels is None or number in self._boxes_of_frame or number in self.errors:
@@ -420,7 +420,7 @@ class BoxCache:
                 # Boxes that cannot be stored exactly fail here, frame by frame.
                 boxes_bytes({number: boxes})
             except Exception as error:
-                self.errors[number] = describe(error, f"reading the boxes of frame {number}")
+                self.errors[number] = describe_error(error, f"reading the boxes of frame {number}")
             else:
                 self._boxes_of_frame[number] = boxes
         return {
@@ -493,11 +493,11 @@ class JobState:
         """
         trash_dir = self.out_dir / STATE_FOLDER / "trash"
         for number, variant in enumerate(variants):
-            if variant.place.is_dir():
-                with raise_output_error(variant.place):
+            if variant.path.is_dir():
+                with raise_output_error(variant.path):
                     make_folder(trash_dir)
-                    variant.place.rename(trash_dir / str(number))
-                    flush_folder(variant.place.parent)
+                    variant.path.rename(trash_dir / str(number))
+                    flush_folder(variant.path.parent)
         if self._table is not None:
             self._replace_rows([], variants)
         for variant in variants:
@@ -516,7 +516,7 @@ class JobState:
             return
         assert self._table is not None, "the manifest has just been written"
         listed_paths = set(self._table["lidar_path"].to_pylist())
-        folder = self.out_dir / folder_name(self.index.name) / SWEEPS
+        folder = self.out_dir / folder_name(self.index.name) / SWEEP_FOLDER
         with raise_output_error(folder):
             for path in folder.glob("*.parquet"):
                 if path.relative_to(self.out_dir).as_posix() not in listed_paths:
@@ -543,7 +543,7 @@ class JobState:
         remove_temporaries(state_dir / PROGRESS_LOGS)
         _remove_tree(state_dir / "trash")
         job_folders = {variant.folder for variant in self.variants}
-        sweeps = f"{folder_name(self.index.name)}/{SWEEPS}"
+        sweeps = f"{folder_name(self.index.name)}/{SWEEP_FOLDER}"
         for folder in sorted({sweeps, *job_folders, *logged_variants(self.out_dir)}):
             remove_temporaries(self.out_dir / folder)
 

@@ -27,7 +27,7 @@ MANIFEST_FILE = "manifest.parquet"
 # Folder of the jobs' state.
 STATE_FOLDER = ".climategs"
 # Folder of LiDAR sweeps, inside a variant's folder; inside the scene's for sweeps without weather.
-SWEEPS = "lidar"
+SWEEP_FOLDER = "lidar"
 
 # Names that stay as they are.
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -69,7 +69,7 @@ def path_kinds() -> tuple[str, ...]:
 
     The column of the kind `image` is `image_path`.
     """
-    tables = [e.table.name for e in reversed(effects.EFFECTS) if e.table]
+    tables = [e.box_table.name for e in reversed(effects.EFFECTS) if e.box_table]
     return (
         *_IMAGE_KINDS,
         *mask_names(),
@@ -83,12 +83,12 @@ def path_kinds() -> tuple[str, ...]:
 
 def mask_names() -> tuple[str, ...]:
     """Return the names of the mask images: masks of effects, and TRUST."""
-    return (*(e.mask for e in reversed(effects.EFFECTS) if e.mask), TRUST)
+    return (*(e.mask_name for e in reversed(effects.EFFECTS) if e.mask_name), TRUST)
 
 
 def mask_share_columns() -> dict[str, str]:
     """Return the manifest's column for the marked share of pixels, by mask name."""
-    shares = ((e.mask, e.share_column) for e in reversed(effects.EFFECTS))
+    shares = ((e.mask_name, e.share_column) for e in reversed(effects.EFFECTS))
     return {**{m: column for m, column in shares if m and column}, TRUST: "trusted_fraction"}
 
 
@@ -111,7 +111,9 @@ def box_weather_files(recipe: Recipe) -> dict[str, str]:
     if not recipe.output.labels:
         return {}
     effect_tables = [
-        e.table for e in reversed(effects.EFFECTS) if e.table and e.of(recipe) is not None
+        e.box_table
+        for e in reversed(effects.EFFECTS)
+        if e.box_table and e.section_of(recipe) is not None
     ]
     masks = [MASKS] if recipe.output.label_formats else []
     return {table.name: table.file for table in (BOXES_2D, *masks, *effect_tables)}
@@ -132,7 +134,9 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> dict[str,
     output = recipe.output
     variant_dir = variant_folder(scene, variant_name(recipe))
     stem = f"{folder_name(camera)}/{frame:06d}"
-    masks = {e.mask for e in effects.EFFECTS if e.mask and e.of(recipe) is not None}
+    masks = {
+        e.mask_name for e in effects.EFFECTS if e.mask_name and e.section_of(recipe) is not None
+    }
     masks |= {TRUST} if output.trust else set()
     path_of_kind = {
         "image": f"{variant_dir}/images/{stem}.{output.image}",
@@ -148,7 +152,7 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> dict[str,
     if recipe.lidar:
         # The variants of a scene share the sweeps that no weather changes.
         folder = variant_dir if recipe.lidar == "weather" else folder_name(scene)
-        path_of_kind["lidar"] = f"{folder}/{SWEEPS}/{frame:06d}.parquet"
+        path_of_kind["lidar"] = f"{folder}/{SWEEP_FOLDER}/{frame:06d}.parquet"
     if output.labels:
         path_of_kind["labels"] = f"{variant_dir}/labels/boxes.parquet"
     return {kind: path_of_kind.get(kind) for kind in path_kinds()}

@@ -107,7 +107,7 @@ def weather_columns(table: pa.Table) -> list[str]:
 def _default_number(name: str) -> float | None:
     """Return the number that a row stands for which lacks this column."""
     column = columns_of_effects().get(name)
-    return math.nan if column is None else column.absent
+    return math.nan if column is None else column.value_if_absent
 
 
 def effect_masks(numbers: Mapping[str, np.ndarray], rows: int) -> dict[str, np.ndarray]:
@@ -124,11 +124,11 @@ def effect_masks(numbers: Mapping[str, np.ndarray], rows: int) -> dict[str, np.n
     for path, model in SECTIONS.items():
         is_present, is_absent = np.zeros((2, rows), bool)
         for column in model.columns:
-            if column.shows is not None and column.name in numbers:
+            if column.presence_values is not None and column.name in numbers:
                 values = numbers[column.name].astype(np.float64)
                 has_effect = column.is_present(values)
                 is_present |= has_effect
-                is_absent |= ~has_effect & ~np.isnan(values) & column.refutes
+                is_absent |= ~has_effect & ~np.isnan(values) & column.decides_absence
         masks[path.rpartition(".")[2]] = is_present & ~is_absent
     other_mask = np.zeros(rows, bool)
     effect_columns = columns_of_effects()
@@ -339,7 +339,7 @@ def latest_rows(tables: Sequence[pa.Table]) -> pa.Table:
     return table if is_first.all() else table.filter(pa.array(is_first)).combine_chunks()
 
 
-def rows_of(table: pa.Table, variants: set[tuple[str, str]]) -> list[dict[str, Any]]:
+def select_variant_rows(table: pa.Table, variants: set[tuple[str, str]]) -> list[dict[str, Any]]:
     """Return the rows of some (scene, variant) pairs as dictionaries."""
     return table.filter(pa.array(_in_variants(table, variants))).to_pylist()
 
@@ -489,7 +489,7 @@ def publish_part(store: Store, key: str, rows: pa.Table) -> Part:
     return part
 
 
-def read_manifest_rows(store: Store, without: Collection[str] = ()) -> pa.Table:
+def read_manifest_rows(store: Store, excluded_columns: Collection[str] = ()) -> pa.Table:
     """Return the rows of all finished and failed images, sorted by `manifest.KEY`.
 
     Args:
@@ -498,7 +498,7 @@ def read_manifest_rows(store: Store, without: Collection[str] = ()) -> pa.Table:
     Raises:
         OutputError: Nothing is finished yet, or a file is damaged.
     """
-    table = _merge_parts(store, without)[0]
+    table = _merge_parts(store, excluded_columns)[0]
     if table is None:
         raise OutputError(
             f"{store.uri} holds neither {MANIFEST_FILE} nor finished blocks: it is no output folder, or "
@@ -726,10 +726,12 @@ def recipe_columns(recipe: Recipe) -> dict[str, str | float | None]:
     The column `settings` is JSON of the knobs that a quality may set (recipes.schema) and that have
     an effect, by dotted path; None where the recipe has no quality.
     """
-    quality_words = recipe.quality.words
+    quality_words = recipe.quality.summary
     settings = None
     if quality_words is not None:
-        knob_values = {path: v for path, v in settings_of(recipe).items() if KNOBS[path].chosen}
+        knob_values = {
+            path: v for path, v in settings_of(recipe).items() if KNOBS[path].is_selectable
+        }
         settings = json.dumps(knob_values, separators=(",", ":"))
     return {
         "base": recipe.render.base,

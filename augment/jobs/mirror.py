@@ -73,7 +73,7 @@ class DatasetFolder:
     """Regular expression that matches the complete paths of camera images, relative to root."""
     entries: tuple[str, ...] | None = None
     """Names in root that belong to the dataset; None for all."""
-    sweeps: str = r"(?!)"  # matches no path
+    sweep_pattern: str = r"(?!)"  # matches no path
     """Regular expression that matches the complete paths of LiDAR sweeps, relative to root."""
 
     @cached_property
@@ -110,7 +110,7 @@ class DatasetFolder:
             bases.append((real_path, name))
         return tuple(bases)
 
-    def relative(self, path: str | Path) -> str | None:
+    def place_of(self, path: str | Path) -> str | None:
         """Return the place of a file or folder relative to root, links followed; None outside."""
         real_path = os.path.realpath(path)
         for base, name in self.bases:
@@ -127,7 +127,7 @@ class DatasetFolder:
 
     def is_sweep(self, relative: str) -> bool:
         """Return True for the path of a LiDAR sweep."""
-        return re.fullmatch(self.sweeps, relative) is not None
+        return re.fullmatch(self.sweep_pattern, relative) is not None
 
     def has(self, name: str) -> bool:
         """Return True if this entry of root belongs to the dataset."""
@@ -217,7 +217,7 @@ def is_within(path: str, folder: str) -> bool:
 
 def _link_text(tree: DatasetFolder, place: str, path: str) -> str:
     """Return the text of the copy's link that leads to the same part of the copy."""
-    target = tree.relative(path)
+    target = tree.place_of(path)
     if target is None:
         raise AdapterError(
             f"{path} is a link to {os.path.realpath(path)}, outside {tree.root}. A copy of the "
@@ -310,7 +310,7 @@ MIRROR_FOLDER = "source"
 Links = Literal["hard", "copy"]
 
 
-class Shown(BaseModel):
+class ReplacementRecord(BaseModel):
     """Image or weathered sweep of a scene that stands in a recorded file's place."""
 
     scene: str
@@ -336,9 +336,9 @@ class MirrorRecord(BaseModel):
     """Number of files by kind."""
     bytes: dict[str, int] = {}
     """Number of bytes by kind."""
-    replaced: dict[str, Shown] = {}
+    replaced: dict[str, ReplacementRecord] = {}
     """Images in the place of recorded ones, by place in the dataset."""
-    replaced_sweeps: dict[str, Shown] = {}
+    replaced_sweeps: dict[str, ReplacementRecord] = {}
     """Sweeps in the place of recorded ones, by place in the dataset."""
 
 
@@ -394,7 +394,7 @@ class Replacement(NamedTuple):
 
     path: Path
     """Our file."""
-    shown: Shown
+    record: ReplacementRecord
     """Its entry in the record."""
     form: ImageForm | None = None
     """Form of an image; an image is encoded again where the recorded one has another form."""
@@ -408,7 +408,7 @@ class Replacement(NamedTuple):
         """Return the replacement from a manifest's row of a finished image."""
         name = row["image_path"]
         form = ImageForm("jpg" if name.endswith(".jpg") else "png", (row["width"], row["height"]))
-        shown = Shown(scene=row["scene"], image=name, sha256=row["checksum"])
+        shown = ReplacementRecord(scene=row["scene"], image=name, sha256=row["checksum"])
         return Replacement(resolve_inside(out_dir, name), shown, form)
 
     @staticmethod
@@ -421,7 +421,7 @@ class Replacement(NamedTuple):
             content: Makes the bytes of the file in this place from the sweep.
         """
         path = resolve_inside(out_dir, row["lidar_path"])
-        shown = Shown(scene=row["scene"], sweep=row["lidar_path"])
+        shown = ReplacementRecord(scene=row["scene"], sweep=row["lidar_path"])
         return Replacement(path, shown, content=content and partial(content, path))
 
 
@@ -447,7 +447,7 @@ def weathered_images(
         if row["status"] != OK:
             continue
         path = recorded_paths.get(row["frame"], {}).get(row["camera"])
-        place = None if path is None else tree.relative(path)
+        place = None if path is None else tree.place_of(path)
         if place is None:
             unplaced_images.append(f"frame {row['frame']}, camera {row['camera']}")
             continue
@@ -487,7 +487,7 @@ def weathered_sweeps(
     for frame, row in sorted(row_of_frame.items()):
         lidar_labels = labels if isinstance(labels, StoresLidar) else None
         source_files = [] if lidar_labels is None else lidar_labels.lidar_files(frame)
-        file_of_place = {tree.relative(file): file for file in source_files}
+        file_of_place = {tree.place_of(file): file for file in source_files}
         if lidar_labels is None or not file_of_place or None in file_of_place:
             unplaced_frames.append(frame)
             continue
@@ -615,7 +615,7 @@ class MirrorResult:
 
 def check_disjoint(tree: DatasetFolder, out_dir: Path) -> None:
     """Raise OutputError where the output folder lies in the dataset: copies would hold copies."""
-    if tree.relative(out_dir) is not None:
+    if tree.place_of(out_dir) is not None:
         raise OutputError(
             f"{out_dir} lies in the dataset's own folder {tree.root}; a copy of the dataset cannot "
             f"be made there, choose an output folder elsewhere"
@@ -831,7 +831,7 @@ class _Mirroring:
             if not self._write_sweep(file, rendered_facts.st_mtime_ns, replacement.content):
                 result.outdated.append(file.relative)
                 return False
-            result.record.replaced_sweeps[file.relative] = replacement.shown
+            result.record.replaced_sweeps[file.relative] = replacement.record
             return True
         if replacement.form != recorded_form:
             if _is_written(target, rendered_facts.st_mtime_ns, recorded_form):
@@ -849,7 +849,7 @@ class _Mirroring:
             self.bytes["new_images"] += rendered_facts.st_size
         if replacement.form.size != recorded_form.size:
             result.resized.append((replacement.form.size, recorded_form.size))
-        result.record.replaced[file.relative] = replacement.shown
+        result.record.replaced[file.relative] = replacement.record
         return True
 
     def _put_file(self, original: str, facts: os.stat_result, name: str) -> str:

@@ -21,10 +21,10 @@ from augment.effects import JobContext, precompute_effects
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.layout import STATE_FOLDER, SWEEPS, item_paths, variant_folder
+from augment.jobs.layout import STATE_FOLDER, SWEEP_FOLDER, item_paths, variant_folder
 from augment.jobs.manifest import OK
 from augment.jobs.tables import lidar_bytes, read_lidar_note
-from augment.jobs.worker import describe
+from augment.jobs.worker import describe_error
 from augment.labels import StoresLidar
 from augment.scene import Scene
 from recipes.schema import Recipe
@@ -35,12 +35,12 @@ class SweepResult(NamedTuple):
 
     rows: list[dict[str, Any]]
     """Entries of the sweeps, as in the manifest's rows."""
-    faults: dict[int, str]
+    errors: dict[int, str]
     """Reasons why sweeps stay clear, by frame number."""
 
 
 def find_span_frames(
-    frames: Sequence[Frame], rendered: Collection[int], cameras: Collection[str]
+    frames: Sequence[Frame], rendered_frames: Collection[int], cameras: Collection[str]
 ) -> list[int]:
     """Return the numbers of the rendered frames and of the frames between them.
 
@@ -59,7 +59,7 @@ def find_span_frames(
         if frame.cameras.keys().isdisjoint(cameras):
             frames_between.append(frame.index)
             continue
-        is_rendered = frame.index in rendered
+        is_rendered = frame.index in rendered_frames
         span += frames_between if follows_rendered and is_rendered else []
         span += [frame.index] if is_rendered else []
         frames_between = []
@@ -115,11 +115,11 @@ def weather_sweeps_between(
                 raise ValueError("its file cannot be read")
             data = lidar_bytes(weathered_sweep(scene, recipe, number, sweep))
         except Exception as error:  # concerns one sweep: the other ones get their weather
-            sweeps_between.faults[number] = describe(error, "no weather on this sweep")
+            sweeps_between.errors[number] = describe_error(error, "no weather on this sweep")
             continue
         write_atomic(out_dir / path_of_frame[number], data, clear=False)
     for number, path in path_of_frame.items():
-        if number not in sweeps_between.faults:
+        if number not in sweeps_between.errors:
             facts = {"scene": scene.name, "frame": number, "status": OK}
             sweeps_between.rows.append({**facts, "lidar": "weather", "lidar_path": path})
     return sweeps_between
@@ -131,7 +131,7 @@ def is_sweep_between(out_dir: Path, variant: str, scene: str, path: str) -> bool
     The manifest need not name the sweep, because it may have no image.
     """
     folder, _, name = path.rpartition("/")
-    is_sweep_path = folder == f"{variant_folder(scene, variant)}/{SWEEPS}" and name.endswith(
+    is_sweep_path = folder == f"{variant_folder(scene, variant)}/{SWEEP_FOLDER}" and name.endswith(
         ".parquet"
     )
     return is_sweep_path and _is_weathered(out_dir / path)

@@ -81,16 +81,16 @@ class Finished:
 
 
 @dataclass(frozen=True)
-class Lost:
+class WorkerLost:
     """Event: a worker died at its task, and another one takes its place."""
 
     slot: int
     """Slot of the worker."""
-    how: str
+    ending: str
     """Ending of the worker: "was killed by SIGKILL", say."""
 
 
-Event = Finished | Lost
+Event = Finished | WorkerLost
 
 
 @runtime_checkable
@@ -199,10 +199,10 @@ def run_tasks(
             failure = result if isinstance(result, TaskFailed) else None
             if failure and failure.is_output:  # nothing can be written any more
                 raise OutputError(failure.text)
-            if isinstance(event, Lost) and is_trial:
-                work.lost(slot, task, event.how)
-            elif isinstance(event, Lost):
-                trials += work.retry(slot, task, f"its worker {event.how}")
+            if isinstance(event, WorkerLost) and is_trial:
+                work.lost(slot, task, event.ending)
+            elif isinstance(event, WorkerLost):
+                trials += work.retry(slot, task, f"its worker {event.ending}")
             elif failure and failure.of_memory and not is_trial:
                 trials += work.retry(slot, task, failure.text)
             else:
@@ -311,7 +311,7 @@ class ProcessPool:
             del self._workers[worker.slot]
             if not self._has_started:
                 raise failed_start(message.how)
-            return Lost(worker.slot, message.how) if worker.has_task else None
+            return WorkerLost(worker.slot, message.how) if worker.has_task else None
         if isinstance(message, Outcome):
             self.tick(worker.slot, message)
             return None
@@ -559,7 +559,7 @@ class RayPool:
             self._ray.kill(worker.actor)
             self._workers[slot] = None
             if worker.starting is None:
-                return Lost(slot, _ending(error))
+                return WorkerLost(slot, _ending(error))
             self._failed_start(error)
             self._workers[slot] = self._start()
             return None
@@ -570,7 +570,7 @@ class RayPool:
         if message is None:
             self._ray.kill(worker.actor)
             self._workers[slot] = None
-            return Lost(slot, "ended in the midst of its work")
+            return WorkerLost(slot, "ended in the midst of its work")
         return Finished(slot, message)
 
     def _welcome(self, worker: _ActorHandle, version: str) -> None:

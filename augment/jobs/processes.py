@@ -306,15 +306,15 @@ def block_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, old_mask)
 
 
-def uninterrupted(call: Callable[[], Result]) -> Result:
+def run_uninterrupted(call: Callable[[], Result]) -> Result:
     """Run a call where no signal's exception can come between two steps: not in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return call()
     with ThreadPoolExecutor(1) as pool:
-        return awaited(pool.submit(call))
+        return wait_for_result(pool.submit(call))
 
 
-def awaited(future: Future[Result]) -> Result:
+def wait_for_result(future: Future[Result]) -> Result:
     """Return the future's result.
 
     An interrupt in `future.result()` can end as a RuntimeError of its lock, if it comes when the
@@ -355,7 +355,7 @@ MAX_SHARING_S = 3600.0
 
 
 @contextlib.contextmanager
-def file_lock(path: Path, doing: str) -> Iterator[None]:
+def file_lock(path: Path, activity: str) -> Iterator[None]:
     """Context manager that only one process of this machine enters at a time.
 
     Args:
@@ -366,7 +366,7 @@ def file_lock(path: Path, doing: str) -> Iterator[None]:
     """
     descriptor = open_lock(path)
     try:
-        wait_for_lock(path, descriptor, patience_s=MAX_SHARING_S, doing=doing)
+        wait_for_lock(path, descriptor, patience_s=MAX_SHARING_S, activity=activity)
         yield
     finally:
         os.close(descriptor)

@@ -34,7 +34,7 @@ from augment.memo import memo_of
 from augment.metrics.image import flip
 from augment.progress import ProgressBar
 from augment.scene import Scene
-from recipes.fields import replaced
+from recipes.fields import with_unchecked_field
 from recipes.schema import KNOBS, Recipe, Value, free_knobs, with_settings
 
 # ---- One picture, to measure its time and its error at the size of its reference -----------------
@@ -44,7 +44,7 @@ from recipes.schema import KNOBS, Recipe, Value, free_knobs, with_settings
 class Trial:
     """A rendered view, enlarged or reduced to the size of the reference."""
 
-    picture: np.ndarray
+    rgb: np.ndarray
     """Display-encoded colours, uint8 [H, W, 3]."""
     depth: np.ndarray | None
     """Depth in metres, float32 [H, W], 0 = none; None where the recipe writes none."""
@@ -99,7 +99,7 @@ def resize_picture(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(picture, (width, height), interpolation=interpolation)
 
 
-class View(NamedTuple):
+class CalibrationView(NamedTuple):
     """Image that is rendered to measure the cost of settings."""
 
     frame: int
@@ -110,7 +110,7 @@ class View(NamedTuple):
     """The camera."""
 
 
-def calibration_views(frames: Sequence[Frame], count: int = 3) -> tuple[View, ...]:
+def calibration_views(frames: Sequence[Frame], count: int = 3) -> tuple[CalibrationView, ...]:
     """Return images spread over the frames and over each frame's cameras.
 
     There are at most `count`, and at least one.
@@ -122,12 +122,14 @@ def calibration_views(frames: Sequence[Frame], count: int = 3) -> tuple[View, ..
     frames_with_cameras = sorted((f for f in frames if f.cameras), key=lambda frame: frame.index)
     if not frames_with_cameras:
         raise ValueError(f"none of the {len(frames)} frames has a camera")
-    views: dict[tuple[int, str], View] = {}
+    views: dict[tuple[int, str], CalibrationView] = {}
     for number in range(count):
         frame = frames_with_cameras[(2 * number + 1) * len(frames_with_cameras) // (2 * count)]
         names = sorted(frame.cameras)
         name = names[number * len(names) // count]
-        views.setdefault((frame.index, name), View(frame.index, name, frame.cameras[name]))
+        views.setdefault(
+            (frame.index, name), CalibrationView(frame.index, name, frame.cameras[name])
+        )
     return tuple(views.values())
 
 
@@ -147,8 +149,8 @@ def first_settings(ladders: Ladders) -> Settings:
     return {path: values[-1] for path, values in ladders.items()}
 
 
-def search(
-    ladders: Ladders, keeps: Callable[[Settings], bool], steps: Iterable[Step] | None = None
+def search_settings(
+    ladders: Ladders, keeps_bound: Callable[[Settings], bool], steps: Iterable[Step] | None = None
 ) -> Settings:
     """Return settings that keep a bound of error or of time.
 
@@ -168,7 +170,7 @@ def search(
     for path, value in steps:
         rank_of = ladders[path].index
         trial_settings = settings | {path: value}
-        if rank_of(value) < rank_of(settings[path]) and keeps(trial_settings):
+        if rank_of(value) < rank_of(settings[path]) and keeps_bound(trial_settings):
             settings = trial_settings
     return settings
 
@@ -239,7 +241,7 @@ class SettingsBench:
     """The recipe."""
     scene: Scene
     """Open scene."""
-    views: Sequence[View]
+    views: Sequence[CalibrationView]
     """Images to render."""
     reference: Settings
     """Settings of the reference."""
@@ -255,16 +257,14 @@ class SettingsBench:
     def __post_init__(self) -> None:
         self._flips: dict[tuple[bytes, ...], float] = {}
         self._ms: dict[frozenset[Step], float] = {}
-        self._reference_pictures = [
-            self._trial(view, self.reference).picture for view in self.views
-        ]
+        self._reference_pictures = [self._trial(view, self.reference).rgb for view in self.views]
 
     def flip(self, settings: Settings, max_flip: float = 1.0) -> float:
         """Return the mean FLIP of the worst view; stops at the first view above `max_flip`."""
         worst_flip = 0.0
         for view, reference_picture in zip(self.views, self._reference_pictures, strict=True):
             worst_flip = max(
-                worst_flip, self._flip(self._trial(view, settings).picture, reference_picture)
+                worst_flip, self._flip(self._trial(view, settings).rgb, reference_picture)
             )
             if worst_flip > max_flip:
                 break
@@ -287,9 +287,7 @@ class SettingsBench:
         than rendering.
         """
         trials = self._time_views(self.reference | {path: value})
-        picture_pairs = zip(
-            (trial.picture for trial in trials), self._reference_pictures, strict=True
-        )
+        picture_pairs = zip((trial.rgb for trial in trials), self._reference_pictures, strict=True)
         worst_flip = max(
             self._flip(_cut_columns(picture), _cut_columns(reference_picture))
             for picture, reference_picture in picture_pairs
@@ -300,10 +298,12 @@ class SettingsBench:
         """Render all views, after a first picture that does not count."""
         return [self._trial(view, settings) for view in (self.views[0], *self.views)][1:]
 
-    def _trial(self, view: View, settings: Settings) -> Trial:
+    def _trial(self, view: CalibrationView, settings: Settings) -> Trial:
         """Render one view under the settings."""
         recipe = apply_settings(self.recipe, settings)
-        recipe = replaced(recipe, "camera.noise", 0.0)  # noise of another image size differs
+        recipe = with_unchecked_field(
+            recipe, "camera.noise", 0.0
+        )  # noise of another image size differs
         if self.cameras is not None and self.renderer is None:
             # Otherwise pictures would compute shared data for the scene's own cameras.
             precompute_effects(JobContext(self.scene, [recipe], self.cameras, backend=self.backend))
@@ -401,7 +401,7 @@ def resolve_quality(
         SceneError: The scene cannot be rendered under the recipe.
     """
     quality = recipe.quality
-    if not quality.is_open:
+    if not quality.has_open_choice:
         return SettingsChoice(recipe)
     start_s = perf_counter()
     views = calibration_views(scene.frames if camera_path is None else camera_path)
@@ -427,7 +427,7 @@ def resolve_quality(
                 values_of_knob[_SNOW_CELL_KNOB] = values_of_knob[_SNOW_CELL_KNOB][:-1]
         ms = reference_ms = None
         if (bound := quality.max_flip) is not None:
-            settings = search(
+            settings = search_settings(
                 values_of_knob, lambda trial_settings: bench.flip(trial_settings, bound) <= bound
             )
         else:
@@ -439,7 +439,7 @@ def resolve_quality(
     chosen_recipe = apply_settings(recipe, settings)
     if cameras is None and renderer is None:  # keep the images' shared data
         precompute_effects(JobContext(trial_scene, [chosen_recipe], backend=backend))
-        memo_of(scene).update(memo_of(trial_scene).shared())
+        memo_of(scene).take_shared(memo_of(trial_scene).shared())
     is_met = ms is None or ms <= (quality.budget_ms or 0)
     if not is_met:
         _log.warning(
@@ -473,7 +473,7 @@ def _within_budget(bench: SettingsBench, values_of_knob: Ladders, budget_ms: flo
         }
     )
     fastest = first_settings(ladders)
-    return search(ladders, keeps, steps) if keeps(fastest) else fastest
+    return search_settings(ladders, keeps, steps) if keeps(fastest) else fastest
 
 
 def apply_settings(recipe: Recipe, settings: Settings) -> Recipe:
@@ -497,7 +497,7 @@ def recipes_to_try(recipe: Recipe) -> list[Recipe]:
     Kernels are compiled for these recipes. A recipe without anything to choose is returned as it
     is.
     """
-    if not recipe.quality.is_open:
+    if not recipe.quality.has_open_choice:
         return [recipe]
     values_of_knob = _allowed_values(recipe)
     reference = first_settings(values_of_knob)
@@ -530,7 +530,7 @@ def _allowed_values(recipe: Recipe) -> dict[str, tuple[Value, ...]]:
 # would otherwise differ between machines, and so would the images.
 
 # Folder of the choices.
-FOLDER = f"{STATE_FOLDER}/quality"
+CHOICES_FOLDER = f"{STATE_FOLDER}/quality"
 # Version of the file's format.
 _FORMAT = 1
 # Longest wait for a choice that another process is making, seconds.
@@ -576,7 +576,7 @@ class Question:
     @property
     def path(self) -> str:
         """Path of the choice's file in the output."""
-        return f"{FOLDER}/{self.digest}.json"
+        return f"{CHOICES_FOLDER}/{self.digest}.json"
 
 
 def choose_settings(
@@ -587,8 +587,8 @@ def choose_settings(
     backend: str,
     camera_path: Sequence[Frame] | None = None,
     renderer: Renderer | None = None,
-    anew: bool = False,
-    keep: bool = True,
+    choose_again: bool = False,
+    keep_choice: bool = True,
     progress: bool = False,
 ) -> Recipe:
     """Return the recipe with the settings that the output holds for it, or that are chosen now.
@@ -601,7 +601,7 @@ def choose_settings(
         anew: If True, choose again, and keep the new choice in place of the old one.
         keep: If True, the output keeps a new choice.
     """
-    if not recipe.quality.is_open:
+    if not recipe.quality.has_open_choice:
         return recipe
     question = Question(recipe, scene.name, scene.source, trajectory_id(camera_path), backend)
 
@@ -609,14 +609,14 @@ def choose_settings(
         options = {"backend": backend, "renderer": renderer, "progress": progress}
         return resolve_quality(recipe, scene, camera_path=camera_path, **options)
 
-    if not anew and (stored_recipe := recorded(store, question)):
+    if not choose_again and (stored_recipe := read_choice(store, question)):
         return stored_recipe
-    if not keep:
+    if not keep_choice:
         return choose().recipe
     claim_name = f"quality.{question.digest}"
     activity = "is choosing the same settings"
     with hold_claim(store, claim_name, MAX_CHOOSING_S, activity) as claim:
-        if not anew and (stored_recipe := recorded(store, question)):
+        if not choose_again and (stored_recipe := read_choice(store, question)):
             return stored_recipe
         result = choose()
         claim.check()
@@ -624,7 +624,7 @@ def choose_settings(
         return result.recipe
 
 
-def recorded(store: Store, question: Question) -> Recipe | None:
+def read_choice(store: Store, question: Question) -> Recipe | None:
     """Return the resolved recipe that the output holds; None where nothing was chosen yet."""
     try:
         data = store.read(question.path)

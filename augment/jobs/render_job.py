@@ -54,7 +54,7 @@ from augment.jobs.worker import (
 from augment.memo import memo_of
 from augment.progress import ProgressBar
 from augment.scene import Scene
-from recipes.fields import found, replaced
+from recipes.fields import section_at, with_unchecked_field
 from recipes.files import read_files, with_digest
 from recipes.load import dump_recipe
 from recipes.schema import SECTIONS, Recipe
@@ -100,14 +100,14 @@ def portable_recipe(recipe: Recipe) -> Recipe:
     Its hash is the same.
     """
     for path, name in stored_names(recipe).items():
-        recipe = replaced(recipe, path, name)
+        recipe = with_unchecked_field(recipe, path, name)
     return recipe
 
 
 def check_not_overwritten(recipe: Recipe, folders: Collection[Path]) -> None:
     """Refuse to overwrite `folders` where the recipe needs files in them."""
     for path in stored_names(recipe):
-        real_path = Path(found(recipe, path)).resolve()
+        real_path = Path(section_at(recipe, path)).resolve()
         for folder in folders:
             if real_path.is_relative_to(folder.resolve()):
                 raise OutputError(
@@ -205,7 +205,7 @@ class RenderJob:
     """If True, the variants' folders are replaced, finished or not, and their settings are chosen
     again.
     """
-    shared_dir: Path | None = None
+    shared_files_dir: Path | None = None
     """Folder that keeps the files that images share (where snow can lie) for later jobs; the state
     folder of the output if None.
     """
@@ -402,7 +402,7 @@ class _Run:
         self.total = len(self.recipes) * sum(len(names) for _, names in self.selection)
         with OutputLock(self.out_dir) as lock:
             if self.job.overwrite:  # may fail, so it comes before anything is deleted
-                folders = [variant.place for variant in self.job_state.variants]
+                folders = [variant.path for variant in self.job_state.variants]
                 for recipe in self.recipes:
                     check_not_overwritten(recipe, folders)
                 self._prepare(self.recipes)
@@ -433,8 +433,8 @@ class _Run:
     def _restore_recipes(self) -> None:
         """Write the missing recipes of begun variants, and the missing files that they name."""
         for variant in self.job_state.variants:
-            if variant.rows and lacks_recipe(variant.recipe, variant.place):
-                write_recipe(variant.recipe, variant.place)
+            if variant.rows and lacks_recipe(variant.recipe, variant.path):
+                write_recipe(variant.recipe, variant.path)
 
     def _render(self, chunks: list[Chunk], lock: OutputLock) -> None:
         """Render the chunks in this process, or in worker processes."""
@@ -446,7 +446,7 @@ class _Run:
             out_dir=str(self.out_dir),
             recipes=self.recipes,
             backend=self.backend,
-            labelled=self.index.labelled,
+            labelled=self.index.labelled_frames,
             instances=self.index.instances,
             memo=memo_of(self.scene).shared(),
             overwrite=self.job.overwrite,
@@ -456,7 +456,7 @@ class _Run:
         shared_scene = None
         if self.job.workers > 1:
             check_sendable(self.renderer)
-            with self.times.spent("share"):
+            with self.times.measure("share"):
                 shared_scene = share_scene(
                     self.scene, self.index.frames, self.out_dir / STATE_FOLDER
                 )
@@ -483,10 +483,10 @@ class _Run:
 
     def _resolve_quality(self, recipe: Recipe) -> Recipe:
         """Return the recipe with the settings that its quality chooses, or has chosen before."""
-        if not recipe.quality.is_open:
+        if not recipe.quality.has_open_choice:
             return recipe
         assert self.scene is not None
-        with self.times.spent("settle"):
+        with self.times.measure("settle"):
             return choose_settings(
                 open_store(self.out_dir),
                 recipe,
@@ -494,7 +494,7 @@ class _Run:
                 backend=self.backend,
                 camera_path=self.job.camera_path,
                 renderer=self.renderer,
-                anew=self.job.overwrite,
+                choose_again=self.job.overwrite,
                 progress=self.progress,
             )
 
@@ -521,8 +521,8 @@ class _Run:
             # A copy: the caller's scene must not remember data of this path.
             self.scene = copy.copy(self.scene)
             cameras = [camera for frame in path for camera in frame.cameras.values()]
-        with self.times.spent("prepare"):
-            folder = self.job.shared_dir or self.out_dir / STATE_FOLDER
+        with self.times.measure("prepare"):
+            folder = self.job.shared_files_dir or self.out_dir / STATE_FOLDER
             arguments = (self.scene, recipes, cameras, folder, self.backend, self.progress)
             precompute_effects(JobContext(*arguments))
 
@@ -532,11 +532,11 @@ class _Run:
             variant = self.job_state.variants[number]
             variant.check_folders(n for c in chunks if c.variant == number for n in c.cameras)
             variant.progress_log.begin(variant.identity)
-            write_recipe(variant.recipe, variant.place)
+            write_recipe(variant.recipe, variant.path)
 
     def _fail_unlabelled(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Record the images of frames with unreadable boxes as failed; return the other chunks."""
-        with self.times.spent("labels"):
+        with self.times.measure("labels"):
             labelled_frames = {c.frame for c in chunks if uses_boxes(self.recipes[c.variant])}
             self.boxes.get(sorted(labelled_frames))
             if labelled_frames:
@@ -567,5 +567,5 @@ class _Run:
 
     def _finish(self) -> None:
         """Write labels, calibration and manifest."""
-        with self.times.spent("finish"):
+        with self.times.measure("finish"):
             self.job_state.finish(self.boxes)

@@ -207,7 +207,7 @@ def read_note(path: Path) -> dict[str, Any]:
     return _note(schema, path)
 
 
-def is_ours(path: Path) -> bool:
+def has_climategs_metadata(path: Path) -> bool:
     """Return True if a Parquet file has metadata as `parquet_bytes` writes them."""
     with open_parquet(path, str(path)) as (_, file):
         return METADATA_KEY in (file.schema_arrow.metadata or {})

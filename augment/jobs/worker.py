@@ -27,7 +27,7 @@ from augment.errors import GpuLost, OutputError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.files import (
     BoxWeather,
-    View,
+    ViewResult,
     WritePump,
     check_view,
     label_view,
@@ -99,7 +99,7 @@ class WorkTimes:
             self._seconds[kind] += seconds
 
     @contextmanager
-    def spent(self, *kinds: str) -> Iterator[None]:
+    def measure(self, *kinds: str) -> Iterator[None]:
         """Context manager that adds the time inside it to each of these kinds.
 
         The time counts also where the block ends with an exception.
@@ -123,16 +123,16 @@ class WorkTimes:
 
 
 @dataclass(frozen=True)
-class Shares:
+class TimeShares:
     """Parts of a job's time, 0 to 1."""
 
     rendering: float
     """Part of the workers' time in which they render."""
-    awaiting: float
+    waiting_for_views: float
     """Part of the workers' time in which they wait for views in flight; included in `rendering`."""
-    held: float
+    waiting_for_files: float
     """Part of the workers' time in which they wait for files to be written."""
-    beside: float
+    other_work: float
     """Part of the workers' time for all other work."""
     beside_by: str
     """Label of the greatest part of `beside`."""
@@ -142,24 +142,30 @@ class Shares:
     @property
     def bound_by(self) -> str:
         """Label of the work that bounds the job."""
-        if sum(self.writing.values()) > self.rendering + self.beside:
+        if sum(self.writing.values()) > self.rendering + self.other_work:
             return max(self.writing, key=self.writing.__getitem__)
-        return "rendering" if self.rendering >= self.beside else self.beside_by
+        return "rendering" if self.rendering >= self.other_work else self.beside_by
 
     @property
     def sentence(self) -> str:
         """All shares in one line, for people."""
-        wait = f" ({_percent(self.awaiting)} for views in flight)" if self.awaiting else ""
-        beside = f"other work {_percent(self.beside)}, first of all {self.beside_by}"
+        wait = (
+            f" ({_percent(self.waiting_for_views)} for views in flight)"
+            if self.waiting_for_views
+            else ""
+        )
+        beside = f"other work {_percent(self.other_work)}, first of all {self.beside_by}"
         kinds = ", ".join(f"{kind} {_percent(share)}" for kind, share in self.writing.items())
         return (
             f"bound by {self.bound_by}: rendering {_percent(self.rendering)} of the time{wait}, "
-            f"waiting for files {_percent(self.held)}, {beside}; "
+            f"waiting for files {_percent(self.waiting_for_files)}, {beside}; "
             f"writing threads {_percent(sum(self.writing.values()))} busy ({kinds})"
         )
 
 
-def compute_time_shares(seconds: Mapping[str, float], held_up: int = 1) -> Shares | None:
+def compute_time_shares(
+    seconds: Mapping[str, float], num_waiting_workers: int = 1
+) -> TimeShares | None:
     """Return the shares of a job's seconds by kind of work; None where nothing was rendered.
 
     Args:
@@ -176,16 +182,17 @@ def compute_time_shares(seconds: Mapping[str, float], held_up: int = 1) -> Share
     held_share = seconds.get(HELD, 0.0) / workers_s
     other_share = max(0.0, 1 - rendering_share - held_share)
     share_of_label = {
-        label: held_up * seconds.get(k, 0.0) / workers_s for k, label in _OTHER_LABELS.items()
+        label: num_waiting_workers * seconds.get(k, 0.0) / workers_s
+        for k, label in _OTHER_LABELS.items()
     }
     share_of_label["workers that start or have nothing to do"] = other_share - sum(
         share_of_label.values()
     )
-    return Shares(
+    return TimeShares(
         rendering=rendering_share,
-        awaiting=seconds.get(AWAIT, 0.0) / workers_s,
-        held=held_share,
-        beside=other_share,
+        waiting_for_views=seconds.get(AWAIT, 0.0) / workers_s,
+        waiting_for_files=held_share,
+        other_work=other_share,
         beside_by=max(share_of_label, key=share_of_label.__getitem__),
         writing={
             label: seconds.get(kind, 0.0) / writers_s for kind, label in _WRITING_LABELS.items()
@@ -288,7 +295,7 @@ class TaskFailed:
     """Reason, for people."""
     is_output: bool = False
     """True if nothing can be written, so that every other task would fail too."""
-    of_scene: bool = False
+    is_scene_error: bool = False
     """True if the scene could not be opened, so that its other blocks would fail too."""
     of_memory: bool = False
     """True if memory ran out: the task may succeed while no other worker uses any."""
@@ -303,7 +310,7 @@ class PassedLidar(NamedTuple):
     """As of Recipe.lidar_note."""
 
 
-def describe(error: BaseException, activity: str) -> str:
+def describe_error(error: BaseException, activity: str) -> str:
     """Return one line for the manifest: the activity, the error's type and its text.
 
     Args:
@@ -376,7 +383,7 @@ class FrameRunner:
             self._views = ViewPool(scene, setup.backend)
             renderer = self._views.begin
         self._renderer: Renderer = renderer
-        self._ahead = 1 if self._views is None else self._views.ahead
+        self._ahead = 1 if self._views is None else self._views.num_in_flight
         self._deliver = deliver
         self._pump = pump
         self._boxes: dict[int, Boxes] = {}  # by number of the frames read so far
@@ -397,7 +404,7 @@ class FrameRunner:
         """Wait for the oldest view in flight and queue the writing of its files."""
         rendered, pending_view = self._in_flight[0]
         try:
-            with self._times.spent(RENDER, AWAIT):
+            with self._times.measure(RENDER, AWAIT):
                 view = pending_view.result()
         except Exception as error:
             self._in_flight.popleft()
@@ -419,7 +426,7 @@ class FrameRunner:
         finally:
             if self._views is not None:
                 self._views.close()
-            with self._times.spent(HELD):
+            with self._times.measure(HELD):
                 self._pump.close()
         seconds = time.perf_counter() - self._start_s
         self._times.add(RENDERERS, seconds)
@@ -430,7 +437,7 @@ class FrameRunner:
         """Render or begin one image; queue the writing of finished ones."""
         camera = self._cameras[chunk.frame][name]
         try:
-            with self._times.spent(RENDER):
+            with self._times.measure(RENDER):
                 view = self._renderer(self._scene, camera, recipe, backend=self._setup.backend)
         except Exception as error:
             self._fail(chunk, name, error)
@@ -443,7 +450,7 @@ class FrameRunner:
         else:
             self._queue_writes(rendered, view)
 
-    def _queue_writes(self, rendered: _RenderedView, view: View) -> None:
+    def _queue_writes(self, rendered: _RenderedView, view: ViewResult) -> None:
         """Queue the writing of a view's files."""
         try:
             check_view(view, rendered.camera, rendered.recipe)
@@ -455,7 +462,7 @@ class FrameRunner:
     def _fail(self, chunk: Chunk, name: str, error: Exception) -> None:
         """Queue the failure of one image; raise GpuLost where the GPU no longer answers."""
         _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=error)
-        message = describe(error, "rendering")
+        message = describe_error(error, "rendering")
         if gpu_is_lost(self._setup.backend):
             self._in_flight.clear()
             raise GpuLost(
@@ -467,10 +474,10 @@ class FrameRunner:
 
     def _submit(self, task: Callable[[], Any]) -> Future:
         """Queue a task of the writing threads; the wait for a free place counts as HELD."""
-        with self._times.spent(HELD):
+        with self._times.measure(HELD):
             return self._pump.submit(task)
 
-    def _write(self, rendered: _RenderedView, view: View) -> None:
+    def _write(self, rendered: _RenderedView, view: ViewResult) -> None:
         """Write the files of a view; it is delivered once its frame's sweep is written too."""
         chunk = rendered.chunk
         recipe = rendered.recipe
@@ -479,7 +486,7 @@ class FrameRunner:
         failed_outcome = Outcome(chunk.variant, chunk.frame, name, FAILED)
         activity = "measuring the boxes"
         try:
-            with self._times.spent(MEASURE):
+            with self._times.measure(MEASURE):
                 view, box_weather = self._label(chunk.frame, recipe, rendered.camera, view)
             activity = "encoding"
             written_files = write_view(Path(self._setup.out_dir), paths, view, recipe)
@@ -487,7 +494,7 @@ class FrameRunner:
             raise
         except Exception as error:
             _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=True)
-            self._deliver(replace(failed_outcome, message=describe(error, activity)))
+            self._deliver(replace(failed_outcome, message=describe_error(error, activity)))
             return
         self._times.add(ENCODE, written_files.encode_s)
         self._times.add(WRITE, written_files.write_s)
@@ -511,12 +518,12 @@ class FrameRunner:
             outcome = Outcome(outcome.variant, outcome.frame, outcome.camera, FAILED, sweep_result)
         else:
             outcome = replace(outcome, lidar=sweep_result.lidar, lidar_note=sweep_result.note)
-        with self._times.spent(WRITE):
+        with self._times.measure(WRITE):
             self._deliver(outcome)
 
     def _label(
-        self, frame: int, recipe: Recipe, camera: Camera, view: View
-    ) -> tuple[View, BoxWeather]:
+        self, frame: int, recipe: Recipe, camera: Camera, view: ViewResult
+    ) -> tuple[ViewResult, BoxWeather]:
         """Return the view with its frame's boxes and their numbers, where the recipe asks
         for them.
         """
@@ -550,7 +557,7 @@ class FrameRunner:
         if target.exists() and not self._setup.overwrite:
             with contextlib.suppress(OutputError):  # a damaged file is written again
                 return _lidar_entries(recipe, read_lidar_note(target))
-        with self._times.spent(LIDAR):
+        with self._times.measure(LIDAR):
             try:
                 sweep = self._scene.lidar(chunk.frame)
                 if sweep is None:
@@ -558,7 +565,7 @@ class FrameRunner:
                 sweep, fault = self._weathered(sweep, chunk.frame, recipe)
                 data = lidar_bytes(sweep, note=fault)
             except Exception as error:
-                return describe(error, "reading the LiDAR sweep")
+                return describe_error(error, "reading the LiDAR sweep")
             write_atomic(target, data, clear=False)
             return _lidar_entries(recipe, fault)
 
@@ -578,7 +585,7 @@ class FrameRunner:
         except Exception as error:
             if recipe.output.lidar != "auto":
                 raise
-            fault = describe(error, "no weather on this sweep")
+            fault = describe_error(error, "no weather on this sweep")
             variant = variant_name(recipe)
             if variant not in self._warned:  # the manifest notes its other frames
                 self._warned.add(variant)
@@ -653,7 +660,7 @@ class SceneWorker:
         on_gpu = renders_on_gpu(self._setup.backend)
         if self._opened is None:
             self._opened = scene_setup.scene()
-            memo_of(self._opened[0]).update(scene_setup.setup.memo)
+            memo_of(self._opened[0]).take_shared(scene_setup.setup.memo)
         if scene_setup.workers == 1 or on_gpu:
             pump = WritePump.beside(
                 scene_setup.backend, max(1, available_cores() // scene_setup.workers)

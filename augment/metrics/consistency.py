@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from augment.boxes import CORNERS, WorldBoxes, shown_pixels
+from augment.boxes import CORNERS, WorldBoxes, pixels_of_boxes
 from augment.cameras import Camera
 from augment.geometry import invert_rigid, quat_from_rotmat, rigid
 from augment.jobs.tables import FrameBoxes
@@ -90,7 +90,7 @@ class Consistency:
 class Warp:
     """Places in view B of the pixels of view A."""
 
-    counts: np.ndarray
+    is_counted: np.ndarray
     """Pixels of A that count, bool [H, W]."""
     columns: np.ndarray
     """Columns in B of these K pixels, float64 [K], in A's order, pixels from the centre of B's
@@ -111,8 +111,8 @@ class Warp:
         for dr, dc in _NEIGHBOURS:
             weight = (fr if dr else 1 - fr) * (fc if dc else 1 - fc)
             values += weight * image[r0 + dr, c0 + dc]
-        warped = np.zeros((*self.counts.shape, image.shape[2]))
-        warped[self.counts] = values
+        warped = np.zeros((*self.is_counted.shape, image.shape[2]))
+        warped[self.is_counted] = values
         return warped
 
 
@@ -153,7 +153,7 @@ def warp_view(a: DepthView, b: DepthView) -> tuple[np.ndarray, np.ndarray]:
         ValueError: a camera is orthographic.
     """
     warp = find_warp(a, b)
-    return warp.sample(b.picture), warp.counts
+    return warp.sample(b.picture), warp.is_counted
 
 
 def find_warp(a: DepthView, b: DepthView, points_m: np.ndarray | None = None) -> Warp:
@@ -248,9 +248,9 @@ class PosedBox:
     """Pose, float64 [4, 4]."""
     size_m: np.ndarray
     """Length, width and height, float64 [3]."""
-    known: bool
+    is_from_track: bool
     """False where the pose is that of the label nearest in time."""
-    restless: bool
+    is_moving: bool
     """True if the box moves between that label and the next one; False where the pose is known."""
 
 
@@ -283,7 +283,7 @@ class ActorPaths:
             for name, track_poses in self._poses.items()
         }
 
-    def at(self, timestamp_ns: int) -> dict[str, PosedBox]:
+    def boxes_at(self, timestamp_ns: int) -> dict[str, PosedBox]:
         """Return the boxes at a time, by their track ids."""
         boxes = {}
         for name, track in self._tracks.items():
@@ -294,12 +294,12 @@ class ActorPaths:
             pose = track.pose_at(timestamp_ns)
             size = self._sizes[name]
             if pose is not None:
-                boxes[name] = PosedBox(pose.numpy(), size, known=True, restless=False)
+                boxes[name] = PosedBox(pose.numpy(), size, is_from_track=True, is_moving=False)
                 continue
             poses = self._poses[name]
             neighbour = nearest - 1 if nearest else min(1, len(poses) - 1)
             restless = _distance(poses[nearest], poses[neighbour], size) > STILL_M
-            boxes[name] = PosedBox(poses[nearest], size, known=False, restless=restless)
+            boxes[name] = PosedBox(poses[nearest], size, is_from_track=False, is_moving=restless)
         return boxes
 
 
@@ -309,9 +309,9 @@ class MovedSurfaces:
 
     points_m: np.ndarray
     """Positions, float64 [H, W, 3], world; NaN where not known."""
-    moved: np.ndarray
+    is_moved: np.ndarray
     """Pixels of A that go along with a box, bool [H, W]."""
-    unclear_b: np.ndarray
+    is_unclear_in_b: np.ndarray
     """Pixels of B that are left out, bool [H, W]."""
 
 
@@ -334,8 +334,8 @@ def move_surfaces(
         ValueError: a camera is orthographic.
     """
     points = world_points(a)
-    at_a = paths.at(a.camera.timestamp_ns)
-    at_b = paths.at(b.camera.timestamp_ns)
+    at_a = paths.boxes_at(a.camera.timestamp_ns)
+    at_b = paths.boxes_at(b.camera.timestamp_ns)
     moving = [n for n in {**at_a, **at_b} if _moves(at_a.get(n), at_b.get(n))]
     unclear_a, unclear_b = (
         _around([at[n] for n in moving if n in at], view) for at, view in ((at_a, a), (at_b, b))
@@ -345,7 +345,7 @@ def move_surfaces(
     for number, rows, columns in _shown([at_a[n] for n in track_ids], a):
         box_a = at_a[track_ids[number]]
         box_b = at_b.get(track_ids[number])
-        if box_b is None or not (box_a.known and box_b.known):
+        if box_b is None or not (box_a.is_from_track and box_b.is_from_track):
             claims[rows, columns] += 2
             continue
         claims[rows, columns] += 1
@@ -361,9 +361,9 @@ def _moves(a: PosedBox | None, b: PosedBox | None) -> bool:
     """Return True unless the box is known to stand still between the two times."""
     if a is None or b is None:
         return True
-    if a.known and b.known:
+    if a.is_from_track and b.is_from_track:
         return _distance(a.world_from_box, b.world_from_box, a.size_m) > STILL_M
-    return a.restless or b.restless
+    return a.is_moving or b.is_moving
 
 
 def _distance(a: np.ndarray, b: np.ndarray, size_m: np.ndarray) -> float:
@@ -395,7 +395,7 @@ def _shown(
     if not boxes:
         return iter(())
     poses = torch.from_numpy(np.stack([box.world_from_box for box in boxes]))
-    placed_boxes = WorldBoxes.of(
+    placed_boxes = WorldBoxes.from_labels(
         Boxes(
             ("",) * len(boxes),
             ("",) * len(boxes),
@@ -409,12 +409,12 @@ def _shown(
     high = placed_boxes.high_m + margin_m
     wide_boxes = dataclasses.replace(placed_boxes, low_m=low, high_m=high)
     depth = np.where(np.isfinite(view.depth_m), view.depth_m, 0.0).astype(np.float32)
-    return shown_pixels(wide_boxes, view.camera, depth)
+    return pixels_of_boxes(wide_boxes, view.camera, depth)
 
 
 def _finite_boxes(boxes: Boxes) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield track, size [3] and world_from_box [4, 4] of every box whose numbers are usable."""
-    placed_boxes = WorldBoxes.of(boxes, np.zeros(3))
+    placed_boxes = WorldBoxes.from_labels(boxes, np.zeros(3))
     poses = rigid(
         torch.from_numpy(placed_boxes.rotations), torch.from_numpy(placed_boxes.centres_m)
     ).numpy()

@@ -79,7 +79,7 @@ class LearningRates:
 class Growth:
     """Rounds that add and remove splats."""
 
-    every: int = 200  # steps between two rounds
+    steps_per_round: int = 200  # steps between two rounds
     start: float = 0.05  # fraction of the run before the first round
     stop: float = 0.6  # fraction of the run after which no round follows
     prune_opacity: float = 0.02  # fainter splats are removed

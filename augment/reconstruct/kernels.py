@@ -24,11 +24,11 @@ from augment.render.cpu.backward_kernels import (
     G_SCALE,
     NUM_GRADIENTS,
 )
-from augment.render.cpu.geometry import from_eye
-from augment.render.cpu.jit import inner, kernel, serial_kernel
+from augment.render.cpu.geometry import offsets_from_eye
+from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
 from augment.render.cpu.project import write_basis
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at
-from augment.render.layout import BLOCK, LANES, U
+from augment.render.layout import BLOCK_SIZE, NUM_LANES, Index
 
 # ---- The learnt sky: a cube map's colours behind a view, and their gradient ----------------------
 # The lookup is `augment.sky.sample_within_faces`, bilinear and clamped at the edge of a face. Its
@@ -276,39 +276,39 @@ _WINDOW_SUM = _WINDOW[0] + 2 * sum(_WINDOW[1:])
 W0, W1, W2, W3, W4, W5 = (np.float32(value / _WINDOW_SUM) for value in _WINDOW)
 
 
-@inner()
+@kernel_function()
 def _blur_row(row, at):
     """Return eight values blurred along a row with margins; at: index of the first in the row."""
-    value = v8.load(row, at) * v8.splat(W0)
-    pair = v8.load(row, at - U(1)) + v8.load(row, at + U(1))
-    value = v8.fmuladd(pair, v8.splat(W1), value)
-    pair = v8.load(row, at - U(2)) + v8.load(row, at + U(2))
-    value = v8.fmuladd(pair, v8.splat(W2), value)
-    pair = v8.load(row, at - U(3)) + v8.load(row, at + U(3))
-    value = v8.fmuladd(pair, v8.splat(W3), value)
-    pair = v8.load(row, at - U(4)) + v8.load(row, at + U(4))
-    value = v8.fmuladd(pair, v8.splat(W4), value)
-    pair = v8.load(row, at - U(5)) + v8.load(row, at + U(5))
-    return v8.fmuladd(pair, v8.splat(W5), value)
+    value = v8.load(row, at) * v8.broadcast(W0)
+    pair = v8.load(row, at - Index(1)) + v8.load(row, at + Index(1))
+    value = v8.fmuladd(pair, v8.broadcast(W1), value)
+    pair = v8.load(row, at - Index(2)) + v8.load(row, at + Index(2))
+    value = v8.fmuladd(pair, v8.broadcast(W2), value)
+    pair = v8.load(row, at - Index(3)) + v8.load(row, at + Index(3))
+    value = v8.fmuladd(pair, v8.broadcast(W3), value)
+    pair = v8.load(row, at - Index(4)) + v8.load(row, at + Index(4))
+    value = v8.fmuladd(pair, v8.broadcast(W4), value)
+    pair = v8.load(row, at - Index(5)) + v8.load(row, at + Index(5))
+    return v8.fmuladd(pair, v8.broadcast(W5), value)
 
 
-@inner()
+@kernel_function()
 def _blur_column(plane, at, stride):
     """Return eight values blurred over the rows; at: index of the first, PAD rows above them."""
-    value = v8.load(plane, at + U(5) * stride) * v8.splat(W0)
-    pair = v8.load(plane, at + U(4) * stride) + v8.load(plane, at + U(6) * stride)
-    value = v8.fmuladd(pair, v8.splat(W1), value)
-    pair = v8.load(plane, at + U(3) * stride) + v8.load(plane, at + U(7) * stride)
-    value = v8.fmuladd(pair, v8.splat(W2), value)
-    pair = v8.load(plane, at + U(2) * stride) + v8.load(plane, at + U(8) * stride)
-    value = v8.fmuladd(pair, v8.splat(W3), value)
-    pair = v8.load(plane, at + stride) + v8.load(plane, at + U(9) * stride)
-    value = v8.fmuladd(pair, v8.splat(W4), value)
-    pair = v8.load(plane, at) + v8.load(plane, at + U(10) * stride)
-    return v8.fmuladd(pair, v8.splat(W5), value)
+    value = v8.load(plane, at + Index(5) * stride) * v8.broadcast(W0)
+    pair = v8.load(plane, at + Index(4) * stride) + v8.load(plane, at + Index(6) * stride)
+    value = v8.fmuladd(pair, v8.broadcast(W1), value)
+    pair = v8.load(plane, at + Index(3) * stride) + v8.load(plane, at + Index(7) * stride)
+    value = v8.fmuladd(pair, v8.broadcast(W2), value)
+    pair = v8.load(plane, at + Index(2) * stride) + v8.load(plane, at + Index(8) * stride)
+    value = v8.fmuladd(pair, v8.broadcast(W3), value)
+    pair = v8.load(plane, at + stride) + v8.load(plane, at + Index(9) * stride)
+    value = v8.fmuladd(pair, v8.broadcast(W4), value)
+    pair = v8.load(plane, at) + v8.load(plane, at + Index(10) * stride)
+    return v8.fmuladd(pair, v8.broadcast(W5), value)
 
 
-@inner()
+@kernel_function()
 def _pair_of_moments(plane, upper, lower, weight, first, second):
     """Return first + weight (a + b) and second + weight (a^2 + b^2), a and b from two rows."""
     a = v8.load(plane, upper)
@@ -317,62 +317,70 @@ def _pair_of_moments(plane, upper, lower, weight, first, second):
     return first, v8.fmuladd(v8.fmuladd(a, a, b * b), weight, second)
 
 
-@inner()
+@kernel_function()
 def _column_moments(plane, at, stride, rows, first_at, second_at):
     """Blur the values and their squares over the rows, as `_blur_column`, into two rows."""
-    a = v8.load(plane, at + U(5) * stride)
-    first = a * v8.splat(W0)
+    a = v8.load(plane, at + Index(5) * stride)
+    first = a * v8.broadcast(W0)
     second = a * first
     first, second = _pair_of_moments(
-        plane, at + U(4) * stride, at + U(6) * stride, v8.splat(W1), first, second
+        plane, at + Index(4) * stride, at + Index(6) * stride, v8.broadcast(W1), first, second
     )
     first, second = _pair_of_moments(
-        plane, at + U(3) * stride, at + U(7) * stride, v8.splat(W2), first, second
+        plane, at + Index(3) * stride, at + Index(7) * stride, v8.broadcast(W2), first, second
     )
     first, second = _pair_of_moments(
-        plane, at + U(2) * stride, at + U(8) * stride, v8.splat(W3), first, second
+        plane, at + Index(2) * stride, at + Index(8) * stride, v8.broadcast(W3), first, second
     )
     first, second = _pair_of_moments(
-        plane, at + stride, at + U(9) * stride, v8.splat(W4), first, second
+        plane, at + stride, at + Index(9) * stride, v8.broadcast(W4), first, second
     )
-    first, second = _pair_of_moments(plane, at, at + U(10) * stride, v8.splat(W5), first, second)
+    first, second = _pair_of_moments(
+        plane, at, at + Index(10) * stride, v8.broadcast(W5), first, second
+    )
     v8.store(rows, first_at, first)
     v8.store(rows, second_at, second)
 
 
-@inner()
+@kernel_function()
 def _composite_row(rgb, alpha, sky, row, size, rows, out, first, plane):
     """Write rgb + (1 - alpha) sky of one image row into three planes of `out` from `first` on.
 
     rows: work space of four rows, zero beyond the image's width.
     """
-    height = U(size[0])
-    width = U(size[1])
-    stride = U(size[2])
-    for j in range(U(0), width):
+    height = Index(size[0])
+    width = Index(size[1])
+    stride = Index(size[2])
+    for j in range(Index(0), width):
         at = row * width + j
-        rows[j] = rgb[at * U(3)]
-        rows[stride + j] = rgb[at * U(3) + U(1)]
-        rows[U(2) * stride + j] = rgb[at * U(3) + U(2)]
-        rows[U(3) * stride + j] = alpha[at]
-    one = v8.splat(np.float32(1))
-    for j in range(U(0), stride, U(LANES)):
-        transmittance = one - v8.load(rows, U(3) * stride + j)
-        for c in range(U(0), U(3)):
+        rows[j] = rgb[at * Index(3)]
+        rows[stride + j] = rgb[at * Index(3) + Index(1)]
+        rows[Index(2) * stride + j] = rgb[at * Index(3) + Index(2)]
+        rows[Index(3) * stride + j] = alpha[at]
+    one = v8.broadcast(np.float32(1))
+    for j in range(Index(0), stride, Index(NUM_LANES)):
+        transmittance = one - v8.load(rows, Index(3) * stride + j)
+        for c in range(Index(0), Index(3)):
             behind = v8.load(sky, (c * height + row) * stride + j)
             value = v8.fmuladd(transmittance, behind, v8.load(rows, c * stride + j))
             v8.store(out, first + c * plane + j, value)
 
 
-@inner()
+@kernel_function()
 def _mapped(planes, at, plane, color_map, channel):
     """Return one channel of the colour map, applied to three planes of composited colour."""
-    entry = U(4) * channel
+    entry = Index(4) * channel
     value = v8.fmuladd(
-        v8.load(planes, at), v8.splat(color_map[entry]), v8.splat(color_map[entry + U(3)])
+        v8.load(planes, at),
+        v8.broadcast(color_map[entry]),
+        v8.broadcast(color_map[entry + Index(3)]),
     )
-    value = v8.fmuladd(v8.load(planes, at + plane), v8.splat(color_map[entry + U(1)]), value)
-    return v8.fmuladd(v8.load(planes, at + plane + plane), v8.splat(color_map[entry + U(2)]), value)
+    value = v8.fmuladd(
+        v8.load(planes, at + plane), v8.broadcast(color_map[entry + Index(1)]), value
+    )
+    return v8.fmuladd(
+        v8.load(planes, at + plane + plane), v8.broadcast(color_map[entry + Index(2)]), value
+    )
 
 
 @kernel
@@ -400,48 +408,48 @@ def compare(rgb, alpha, sky, color_map, recorded, weight, is_sky, size, written)
     weights = written[2]
     sums = written[3]
     covered = written[4]
-    height = U(size[0])
-    width = U(size[1])
-    stride = U(size[2])
-    plane = U(size[0] + 2 * PAD) * stride
-    to_unit = v8.splat(np.float32(1 / 255))
+    height = Index(size[0])
+    width = Index(size[1])
+    stride = Index(size[2])
+    plane = Index(size[0] + 2 * PAD) * stride
+    to_unit = v8.broadcast(np.float32(1 / 255))
     for band in prange((size[0] + BAND - 1) // BAND):
-        rows = np.zeros(U(4) * stride, np.float32)
+        rows = np.zeros(Index(4) * stride, np.float32)
         for i in range(band * BAND, min((band + 1) * BAND, size[0])):
-            row = U(i)
+            row = Index(i)
             row_start = row * stride
             _composite_row(rgb, alpha, sky, row, size, rows, behind, row_start, height * stride)
             opacity = 0.0
-            for j in range(U(0), width):
+            for j in range(Index(0), width):
                 at = row * width + j
                 weights[row_start + j] = weight[at]
                 if is_sky[at]:
                     opacity += alpha[at]
-                rows[j] = np.float32(recorded[at * U(3)])
-                rows[stride + j] = np.float32(recorded[at * U(3) + U(1)])
-                rows[U(2) * stride + j] = np.float32(recorded[at * U(3) + U(2)])
+                rows[j] = np.float32(recorded[at * Index(3)])
+                rows[stride + j] = np.float32(recorded[at * Index(3) + Index(1)])
+                rows[Index(2) * stride + j] = np.float32(recorded[at * Index(3) + Index(2)])
             for j in range(width, stride):
                 weights[row_start + j] = np.float32(0)
-            zero = v8.splat(np.float32(0))
+            zero = v8.broadcast(np.float32(0))
             error = zero
             weight_sum = zero
-            first = (row + U(PAD)) * stride
-            for j in range(U(0), stride, U(LANES)):
+            first = (row + Index(PAD)) * stride
+            for j in range(Index(0), stride, Index(NUM_LANES)):
                 w = v8.load(weights, row_start + j)
                 is_used = v8.greater(w, zero)
                 weight_sum = weight_sum + w
-                for c in range(U(0), U(3)):
+                for c in range(Index(0), Index(3)):
                     x = _mapped(behind, row_start + j, height * stride, color_map, c)
                     y = v8.select(is_used, v8.load(rows, c * stride + j) * to_unit, x)
                     v8.store(pairs, c * plane + first + j, x + y)
-                    v8.store(pairs, (U(3) + c) * plane + first + j, x - y)
+                    v8.store(pairs, (Index(3) + c) * plane + first + j, x - y)
                     error = v8.fmuladd(v8.absolute(x - y), w, error)
             # Beyond the image both are zero, like the window's padding.
-            for c in range(U(0), U(6)):
+            for c in range(Index(0), Index(6)):
                 for j in range(width, stride):
                     pairs[c * plane + first + j] = np.float32(0)
-            v8.store(sums, row * U(2 * LANES), error)
-            v8.store(sums, row * U(2 * LANES) + U(LANES), weight_sum)
+            v8.store(sums, row * Index(2 * NUM_LANES), error)
+            v8.store(sums, row * Index(2 * NUM_LANES) + Index(NUM_LANES), weight_sum)
             covered[i] = opacity
 
 
@@ -456,38 +464,45 @@ def compare_windows(pairs, weights, size, slopes, sums):
             green, then blue.
         sums: written, flat [H, LANES].
     """
-    stride = U(size[2])
-    plane = U(size[0] + 2 * PAD) * stride
-    length = stride + U(2 * MARGIN)
+    stride = Index(size[2])
+    plane = Index(size[0] + 2 * PAD) * stride
+    length = stride + Index(2 * MARGIN)
     for band in prange((size[0] + BAND - 1) // BAND):
-        rows = np.zeros(U(4) * length, np.float32)
+        rows = np.zeros(Index(4) * length, np.float32)
         for i in range(band * BAND, min((band + 1) * BAND, size[0])):
-            row = U(i)
-            half = v8.splat(np.float32(0.5))
-            one = v8.splat(np.float32(1))
-            ssim_sum = v8.splat(np.float32(0))
-            for c in range(U(0), U(3)):
-                for j in range(U(0), stride, U(LANES)):
+            row = Index(i)
+            half = v8.broadcast(np.float32(0.5))
+            one = v8.broadcast(np.float32(1))
+            ssim_sum = v8.broadcast(np.float32(0))
+            for c in range(Index(0), Index(3)):
+                for j in range(Index(0), stride, Index(NUM_LANES)):
                     top = c * plane + row * stride + j
-                    at = j + U(MARGIN)
-                    _column_moments(pairs, top, stride, rows, at, at + U(2) * length)
+                    at = j + Index(MARGIN)
+                    _column_moments(pairs, top, stride, rows, at, at + Index(2) * length)
                     _column_moments(
-                        pairs, top + U(3) * plane, stride, rows, at + length, at + U(3) * length
+                        pairs,
+                        top + Index(3) * plane,
+                        stride,
+                        rows,
+                        at + length,
+                        at + Index(3) * length,
                     )
-                centre = U(3) * c * plane + (row + U(PAD)) * stride
-                for j in range(U(0), stride, U(LANES)):
-                    at = j + U(MARGIN)
+                centre = Index(3) * c * plane + (row + Index(PAD)) * stride
+                for j in range(Index(0), stride, Index(NUM_LANES)):
+                    at = j + Index(MARGIN)
                     p = _blur_row(rows, at)
                     n = _blur_row(rows, at + length)
                     pp = p * p
                     nn = n * n
-                    over_p = _blur_row(rows, at + U(2) * length) - pp
-                    over_n = _blur_row(rows, at + U(3) * length) - nn
-                    a1 = v8.fmuladd(pp - nn, half, v8.splat(C1))
-                    b1 = v8.fmuladd(pp + nn, half, v8.splat(C1))
-                    a2 = v8.fmuladd(over_p - over_n, half, v8.splat(C2))
-                    b2 = v8.fmuladd(over_p + over_n, half, v8.splat(C2))
-                    b2 = v8.maximum(b2, v8.splat(C2))  # a variance; rounding may make it negative
+                    over_p = _blur_row(rows, at + Index(2) * length) - pp
+                    over_n = _blur_row(rows, at + Index(3) * length) - nn
+                    a1 = v8.fmuladd(pp - nn, half, v8.broadcast(C1))
+                    b1 = v8.fmuladd(pp + nn, half, v8.broadcast(C1))
+                    a2 = v8.fmuladd(over_p - over_n, half, v8.broadcast(C2))
+                    b2 = v8.fmuladd(over_p + over_n, half, v8.broadcast(C2))
+                    b2 = v8.maximum(
+                        b2, v8.broadcast(C2)
+                    )  # a variance; rounding may make it negative
                     w = v8.load(weights, row * stride + j)
                     inverse = one / (b1 * b2)
                     ssim = a1 * a2 * inverse
@@ -503,46 +518,46 @@ def compare_windows(pairs, weights, size, slopes, sums):
                     v8.store(slopes, centre + j, a)
                     v8.store(slopes, centre + plane + j, by_b2 + by_a2)
                     v8.store(slopes, centre + plane + plane + j, by_b2 - by_a2)
-            v8.store(sums, row * U(LANES), ssim_sum)
+            v8.store(sums, row * Index(NUM_LANES), ssim_sum)
 
 
-@inner()
+@kernel_function()
 def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
     """Write the loss's derivatives by the finished picture, one image row, into three rows."""
-    stride = U(size[2])
-    plane = U(size[0] + 2 * PAD) * stride
-    length = stride + U(2 * MARGIN)
-    zero = v8.splat(np.float32(0))
-    one = v8.splat(np.float32(1))
-    for c in range(U(0), U(3)):
-        top = U(3) * c * plane + row * stride
-        for k in range(U(0), U(3)):
-            for j in range(U(0), stride, U(LANES)):
+    stride = Index(size[2])
+    plane = Index(size[0] + 2 * PAD) * stride
+    length = stride + Index(2 * MARGIN)
+    zero = v8.broadcast(np.float32(0))
+    one = v8.broadcast(np.float32(1))
+    for c in range(Index(0), Index(3)):
+        top = Index(3) * c * plane + row * stride
+        for k in range(Index(0), Index(3)):
+            for j in range(Index(0), stride, Index(NUM_LANES)):
                 value = _blur_column(slopes, top + k * plane + j, stride)
-                v8.store(work, k * length + U(MARGIN) + j, value)
-        centre = c * plane + (row + U(PAD)) * stride
-        for j in range(U(0), stride, U(LANES)):
-            at = j + U(MARGIN)
+                v8.store(work, k * length + Index(MARGIN) + j, value)
+        centre = c * plane + (row + Index(PAD)) * stride
+        for j in range(Index(0), stride, Index(NUM_LANES)):
+            at = j + Index(MARGIN)
             w = v8.load(weights, row * stride + j)
             plus = v8.load(pairs, centre + j)
-            minus = v8.load(pairs, centre + U(3) * plane + j)
+            minus = v8.load(pairs, centre + Index(3) * plane + j)
             slope = v8.fmuladd(_blur_row(work, at + length), plus, _blur_row(work, at))
             slope = v8.fmuladd(_blur_row(work, at + length + length), minus, slope)
             sign = v8.select(v8.greater(minus, zero), one, zero)
             sign = v8.select(v8.greater(zero, minus), v8.negate(one), sign)
-            slope = v8.fmuladd(slope, v8.splat(factors[1]), sign * w * v8.splat(factors[0]))
+            slope = v8.fmuladd(slope, v8.broadcast(factors[1]), sign * w * v8.broadcast(factors[0]))
             v8.store(rows, c * stride + j, v8.select(v8.greater(w, zero), slope, zero))
 
 
-@inner()
+@kernel_function()
 def _map_slopes(rows, channel, behind, row_start, plane, stride, sums, first):
     """Write the row's derivative by one channel of the colour map, LANES sums an entry."""
-    zero = v8.splat(np.float32(0))
+    zero = v8.broadcast(np.float32(0))
     red = zero
     green = zero
     blue = zero
     offset = zero
-    for j in range(U(0), stride, U(LANES)):
+    for j in range(Index(0), stride, Index(NUM_LANES)):
         slope = v8.load(rows, channel * stride + j)
         at = row_start + j
         red = v8.fmuladd(slope, v8.load(behind, at), red)
@@ -550,17 +565,19 @@ def _map_slopes(rows, channel, behind, row_start, plane, stride, sums, first):
         blue = v8.fmuladd(slope, v8.load(behind, at + plane + plane), blue)
         offset = offset + slope
     v8.store(sums, first, red)
-    v8.store(sums, first + U(LANES), green)
-    v8.store(sums, first + U(2 * LANES), blue)
-    v8.store(sums, first + U(3 * LANES), offset)
+    v8.store(sums, first + Index(NUM_LANES), green)
+    v8.store(sums, first + Index(2 * NUM_LANES), blue)
+    v8.store(sums, first + Index(3 * NUM_LANES), offset)
 
 
-@inner()
+@kernel_function()
 def _times_transposed(rows, at, stride, color_map, k):
     """Return the derivative by channel k of the composited colour, from those by the picture."""
-    value = v8.load(rows, at) * v8.splat(color_map[k])
-    value = v8.fmuladd(v8.load(rows, at + stride), v8.splat(color_map[U(4) + k]), value)
-    return v8.fmuladd(v8.load(rows, at + stride + stride), v8.splat(color_map[U(8) + k]), value)
+    value = v8.load(rows, at) * v8.broadcast(color_map[k])
+    value = v8.fmuladd(v8.load(rows, at + stride), v8.broadcast(color_map[Index(4) + k]), value)
+    return v8.fmuladd(
+        v8.load(rows, at + stride + stride), v8.broadcast(color_map[Index(8) + k]), value
+    )
 
 
 @kernel
@@ -578,36 +595,36 @@ def differentiate(
         d_alpha: written, flat [H, W].
         sums: written, flat [H, 3, 4, LANES], the row's part of the colour map's derivative.
     """
-    height = U(size[0])
-    width = U(size[1])
-    stride = U(size[2])
-    length = stride + U(2 * MARGIN)
+    height = Index(size[0])
+    width = Index(size[1])
+    stride = Index(size[2])
+    length = stride + Index(2 * MARGIN)
     plane = height * stride
     for band in prange((size[0] + BAND - 1) // BAND):
-        rows = np.zeros(U(7) * stride, np.float32)
-        work = np.zeros(U(3) * length, np.float32)
+        rows = np.zeros(Index(7) * stride, np.float32)
+        work = np.zeros(Index(3) * length, np.float32)
         for i in range(band * BAND, min((band + 1) * BAND, size[0])):
-            row = U(i)
+            row = Index(i)
             row_start = row * stride
             _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows)
-            for c in range(U(0), U(3)):
-                first = (row * U(3) + c) * U(4 * LANES)
+            for c in range(Index(0), Index(3)):
+                first = (row * Index(3) + c) * Index(4 * NUM_LANES)
                 _map_slopes(rows, c, behind, row_start, plane, stride, sums, first)
-            for j in range(U(0), stride, U(LANES)):
-                negative_d_alpha = v8.splat(np.float32(0))
-                for k in range(U(0), U(3)):
+            for j in range(Index(0), stride, Index(NUM_LANES)):
+                negative_d_alpha = v8.broadcast(np.float32(0))
+                for k in range(Index(0), Index(3)):
                     slope = _times_transposed(rows, j, stride, color_map, k)
-                    v8.store(rows, (U(3) + k) * stride + j, slope)
+                    v8.store(rows, (Index(3) + k) * stride + j, slope)
                     negative_d_alpha = v8.fmuladd(
                         slope, v8.load(sky, k * plane + row_start + j), negative_d_alpha
                     )
-                v8.store(rows, U(6) * stride + j, v8.negate(negative_d_alpha))
-            for j in range(U(0), width):
+                v8.store(rows, Index(6) * stride + j, v8.negate(negative_d_alpha))
+            for j in range(Index(0), width):
                 at = row * width + j
-                d_rgb[at * U(3)] = rows[U(3) * stride + j]
-                d_rgb[at * U(3) + U(1)] = rows[U(4) * stride + j]
-                d_rgb[at * U(3) + U(2)] = rows[U(5) * stride + j]
-                slope = rows[U(6) * stride + j]
+                d_rgb[at * Index(3)] = rows[Index(3) * stride + j]
+                d_rgb[at * Index(3) + Index(1)] = rows[Index(4) * stride + j]
+                d_rgb[at * Index(3) + Index(2)] = rows[Index(5) * stride + j]
+                slope = rows[Index(6) * stride + j]
                 d_alpha[at] = slope + factors[2] if is_sky[at] else slope
 
 
@@ -635,18 +652,18 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
         quats = floats_at(addresses[part, 1], sizes[part, 0] * 4)
         for i in range(MOMENTS):
             moments[block, i] = 0.0
-        for at in range(U(block * BLOCK), U(block * BLOCK + counts[block])):
-            row = at * U(NUM_GRADIENTS)
-            splat = U(ids[at])
-            p = U(3) * splat
-            q = U(4) * splat
-            gx, gy, gz = _three(rows, row + U(G_MEAN))
+        for at in range(Index(block * BLOCK_SIZE), Index(block * BLOCK_SIZE + counts[block])):
+            row = at * Index(NUM_GRADIENTS)
+            splat = Index(ids[at])
+            p = Index(3) * splat
+            q = Index(4) * splat
+            gx, gy, gz = _three(rows, row + Index(G_MEAN))
             px, py, pz = _three(means, p)
             # A rotation by w changes q to q + (0, w) q / 2.
-            hw = np.float64(rows[row + U(G_QUAT)])
-            hx, hy, hz = _three(rows, row + U(G_QUAT + 1))
+            hw = np.float64(rows[row + Index(G_QUAT)])
+            hx, hy, hz = _three(rows, row + Index(G_QUAT + 1))
             w = np.float64(quats[q])
-            x, y, z = _three(quats, q + U(1))
+            x, y, z = _three(quats, q + Index(1))
             if not math.isfinite(gx + gy + gz + hw + hx + hy + hz):
                 continue
             moments[block, 0] += gx
@@ -657,10 +674,10 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
             moments[block, 5] += px * gy - py * gx + 0.5 * (w * hz - hw * z + x * hy - y * hx)
 
 
-@inner()
+@kernel_function()
 def _three(array, at):
     """Return three numbers in float64."""
-    return np.float64(array[at]), np.float64(array[at + U(1)]), np.float64(array[at + U(2)])
+    return np.float64(array[at]), np.float64(array[at + Index(1)]), np.float64(array[at + Index(2)])
 
 
 # ---- Numba kernel: pixels per metre, visibility and sky of each splat in one view ----------------
@@ -672,7 +689,7 @@ _SKY_MARGIN_PX = 2  # pixels of sky around a splat's centre; masks are accurate 
 
 
 @kernel
-def sight(means, pose, intrinsics, sky, px_per_m, num_views, num_in_sky):
+def update_sightings(means, pose, intrinsics, sky, px_per_m, num_views, num_in_sky):
     """Add one view to the sightings of a part's splats.
 
     Args:
@@ -809,75 +826,77 @@ def update_splats(
         opacities = floats_at(addresses[part, 3], num_splats)
         sh = floats_at(addresses[part, 4], num_splats * num_sh * 3)
         view = views[part]
-        basis = np.empty((_MAX_SH + 2) * LANES, np.float32)
+        basis = np.empty((_MAX_SH + 2) * NUM_LANES, np.float32)
         work = np.zeros(4 * _SH_NUMBERS, np.float32)
-        base = U(block * BLOCK)
-        for at in range(U(0), U(counts[block]), U(LANES)):
-            _write_bases(means, ids, base + at, U(counts[block]) - at, view, functions, basis)
-            for lane in range(min(U(LANES), U(counts[block]) - at)):
-                row = (base + at + lane) * U(NUM_GRADIENTS)
-                splat = U(ids[base + at + lane])
-                moment_row = U(firsts[part]) + splat
+        base = Index(block * BLOCK_SIZE)
+        for at in range(Index(0), Index(counts[block]), Index(NUM_LANES)):
+            _write_bases(means, ids, base + at, Index(counts[block]) - at, view, functions, basis)
+            for lane in range(min(Index(NUM_LANES), Index(counts[block]) - at)):
+                row = (base + at + lane) * Index(NUM_GRADIENTS)
+                splat = Index(ids[base + at + lane])
+                moment_row = Index(firsts[part]) + splat
                 if not math.isfinite(_row_power(rows, row)):
                     continue
                 age[moment_row] += 1
-                grads[U(3) * moment_row] += rows[row + U(G_ABS_MEAN)] * rates[R_ABS_UNIT]
-                grads[U(3) * moment_row + U(1)] += np.float32(1)
-                radius = rows[row + U(G_MAX_SIGMA)] * rates[R_RADIUS_UNIT]
-                grads[U(3) * moment_row + U(2)] = max(grads[U(3) * moment_row + U(2)], radius)
-                n = U(min(age[moment_row], MAX_CORRECTED_UPDATES))
-                first = corrections[U(2) * n]
-                second = corrections[U(2) * n + U(1)]
+                grads[Index(3) * moment_row] += rows[row + Index(G_ABS_MEAN)] * rates[R_ABS_UNIT]
+                grads[Index(3) * moment_row + Index(1)] += np.float32(1)
+                radius = rows[row + Index(G_MAX_SIGMA)] * rates[R_RADIUS_UNIT]
+                grads[Index(3) * moment_row + Index(2)] = max(
+                    grads[Index(3) * moment_row + Index(2)], radius
+                )
+                n = Index(min(age[moment_row], MAX_CORRECTED_UPDATES))
+                first = corrections[Index(2) * n]
+                second = corrections[Index(2) * n + Index(1)]
                 _update_geometry(
                     (means, quats, scales, opacities), splat, rows, row,
-                    basis[U(_MAX_SH * LANES) + lane], rates, smallest[moment_row], (first, second),
-                    (state.geometry_m, state.geometry_v), moment_row * U(GEOMETRY), work,
+                    basis[Index(_MAX_SH * NUM_LANES) + lane], rates, smallest[moment_row], (first, second),
+                    (state.geometry_m, state.geometry_v), moment_row * Index(GEOMETRY), work,
                 )  # fmt: skip
                 _update_sh(
-                    sh, splat * U(num_sh) * U(3), rows, row, basis, lane, U(functions), rates,
-                    (first, second), (state.sh_m, state.sh_v), moment_row * U(num_sh) * U(3), work,
+                    sh, splat * Index(num_sh) * Index(3), rows, row, basis, lane, Index(functions), rates,
+                    (first, second), (state.sh_m, state.sh_v), moment_row * Index(num_sh) * Index(3), work,
                 )  # fmt: skip
 
 
-@inner()
+@kernel_function()
 def _row_power(rows, row):
     """Return the sum of squares: not finite if a number or its second moment is not finite."""
     total = np.float32(0)
-    for i in range(U(NUM_GRADIENTS)):
+    for i in range(Index(NUM_GRADIENTS)):
         total += rows[row + i] * rows[row + i]
     return total
 
 
-@inner()
+@kernel_function()
 def _write_bases(means, ids, at, left, view, functions, basis):
     """Write SH functions of eight splats, and a pixel's width at each of them, metres."""
-    lane_ids = np.empty(LANES, np.int32)
-    for lane in range(U(LANES)):
-        lane_ids[lane] = ids[at + min(lane, left - U(1))]
-    dx, dy, dz = from_eye(means, lane_ids, U(0), view)
-    inverse = v8.splat(np.float32(1)) / v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
+    lane_ids = np.empty(NUM_LANES, np.int32)
+    for lane in range(Index(NUM_LANES)):
+        lane_ids[lane] = ids[at + min(lane, left - Index(1))]
+    dx, dy, dz = offsets_from_eye(means, lane_ids, Index(0), view)
+    inverse = v8.broadcast(np.float32(1)) / v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
     write_basis(dx * inverse, dy * inverse, dz * inverse, functions, basis)
-    row = U(L.V_ROTATION + 6)
-    z = v8.fmuladd(v8.splat(view[row]), dx, v8.splat(view[row + U(1)]) * dy)
-    z = v8.fmuladd(v8.splat(view[row + U(2)]), dz, z)
-    v8.store(basis, U(_MAX_SH * LANES), z * v8.splat(np.float32(1) / view[L.V_FOCAL]))
+    row = Index(L.V_ROTATION + 6)
+    z = v8.fmuladd(v8.broadcast(view[row]), dx, v8.broadcast(view[row + Index(1)]) * dy)
+    z = v8.fmuladd(v8.broadcast(view[row + Index(2)]), dz, z)
+    v8.store(basis, Index(_MAX_SH * NUM_LANES), z * v8.broadcast(np.float32(1) / view[L.V_FOCAL]))
 
 
-@inner()
+@kernel_function()
 def _adam8(g, rates, first, second, m, m_at, v, v_at):
     """Update eight moments; return the factor of the step size."""
     one = np.float32(1)
     beta1 = rates[R_BETA1]
     beta2 = rates[R_BETA2]
-    new_m = v8.fmuladd(v8.splat(beta1), v8.load(m, m_at), v8.splat(one - beta1) * g)
-    new_v = v8.fmuladd(v8.splat(beta2), v8.load(v, v_at), v8.splat(one - beta2) * g * g)
+    new_m = v8.fmuladd(v8.broadcast(beta1), v8.load(m, m_at), v8.broadcast(one - beta1) * g)
+    new_v = v8.fmuladd(v8.broadcast(beta2), v8.load(v, v_at), v8.broadcast(one - beta2) * g * g)
     v8.store(m, m_at, new_m)
     v8.store(v, v_at, new_v)
-    root = v8.sqrt(new_v * v8.splat(second)) + v8.splat(_EPS)
-    return new_m * v8.splat(first) / root
+    root = v8.sqrt(new_v * v8.broadcast(second)) + v8.broadcast(_EPS)
+    return new_m * v8.broadcast(first) / root
 
 
-@inner()
+@kernel_function()
 def _update_geometry(splats, splat, rows, row, pixel_m, rates, smallest, bias, moments, at, work):
     """Update a splat's mean, rotation, scales and opacity."""
     means, quats, scales, opacities = splats
@@ -885,67 +904,69 @@ def _update_geometry(splats, splat, rows, row, pixel_m, rates, smallest, bias, m
     (m, v) = moments
     one = np.float32(1)
     o = min(max(opacities[splat], _MIN_OPACITY), _MAX_OPACITY)
-    rows[row + U(G_OPACITY)] *= one - o
+    rows[row + Index(G_OPACITY)] *= one - o
     low = _adam8(v8.load(rows, row), rates, first, second, m, at, v, at)
-    v8.store(work, U(0), low * v8.load(rates, U(R_ROW)))
-    high = _adam8(v8.load(rows, row + U(8)), rates, first, second, m, at + U(8), v, at + U(8))
-    factors = exp2_fine(v8.splat(-LOG2_E) * high * v8.load(rates, U(R_ROW + 8)))
-    v8.store(work, U(8), factors)
-    for i in range(U(3)):
-        means[U(3) * splat + i] -= pixel_m * work[i]
+    v8.store(work, Index(0), low * v8.load(rates, Index(R_ROW)))
+    high = _adam8(
+        v8.load(rows, row + Index(8)), rates, first, second, m, at + Index(8), v, at + Index(8)
+    )
+    factors = exp2_fine(v8.broadcast(-LOG2_E) * high * v8.load(rates, Index(R_ROW + 8)))
+    v8.store(work, Index(8), factors)
+    for i in range(Index(3)):
+        means[Index(3) * splat + i] -= pixel_m * work[i]
     min_scale = max(smallest, rates[R_SMALLEST])
     norm = np.float32(0)
-    for i in range(U(4)):
-        q = quats[U(4) * splat + i] - work[U(G_QUAT) + i]
-        quats[U(4) * splat + i] = q
+    for i in range(Index(4)):
+        q = quats[Index(4) * splat + i] - work[Index(G_QUAT) + i]
+        quats[Index(4) * splat + i] = q
         norm += q * q
     norm = one / np.float32(math.sqrt(norm))
-    for i in range(U(4)):
-        quats[U(4) * splat + i] *= norm
-    for i in range(U(3)):
-        s = scales[U(3) * splat + i] * work[U(G_SCALE) + i]
-        scales[U(3) * splat + i] = min(max(s, min_scale), rates[R_LARGEST])
-    odds = (one - o) / o * work[U(G_OPACITY)]
+    for i in range(Index(4)):
+        quats[Index(4) * splat + i] *= norm
+    for i in range(Index(3)):
+        s = scales[Index(3) * splat + i] * work[Index(G_SCALE) + i]
+        scales[Index(3) * splat + i] = min(max(s, min_scale), rates[R_LARGEST])
+    odds = (one - o) / o * work[Index(G_OPACITY)]
     opacities[splat] = min(max(one / (one + odds), _MIN_OPACITY), _MAX_OPACITY)
 
 
-@inner()
+@kernel_function()
 def _update_sh(sh, start, rows, row, basis, lane, functions, rates, bias, moments, at, work):
     """Update a splat's colours."""
     (first, second) = bias
     (m, v) = moments
-    red = rows[row + U(G_COLOR)]
-    green = rows[row + U(G_COLOR + 1)]
-    blue = rows[row + U(G_COLOR + 2)]
-    count = U(3) * functions
+    red = rows[row + Index(G_COLOR)]
+    green = rows[row + Index(G_COLOR + 1)]
+    blue = rows[row + Index(G_COLOR + 2)]
+    count = Index(3) * functions
     # The moments are copied: eight at a time would reach into the next splat's moments.
     for k in range(functions):
-        value = basis[k * U(LANES) + lane]
-        work[U(3) * k] = value * red
-        work[U(3) * k + U(1)] = value * green
-        work[U(3) * k + U(2)] = value * blue
+        value = basis[k * Index(NUM_LANES) + lane]
+        work[Index(3) * k] = value * red
+        work[Index(3) * k + Index(1)] = value * green
+        work[Index(3) * k + Index(2)] = value * blue
     for i in range(count):
-        work[U(_SH_NUMBERS) + i] = m[at + i]
-        work[U(2 * _SH_NUMBERS) + i] = v[at + i]
-    for i in range(U(0), count, U(LANES)):
+        work[Index(_SH_NUMBERS) + i] = m[at + i]
+        work[Index(2 * _SH_NUMBERS) + i] = v[at + i]
+    for i in range(Index(0), count, Index(NUM_LANES)):
         steps = _adam8(
             v8.load(work, i),
             rates,
             first,
             second,
             work,
-            U(_SH_NUMBERS) + i,
+            Index(_SH_NUMBERS) + i,
             work,
-            U(2 * _SH_NUMBERS) + i,
+            Index(2 * _SH_NUMBERS) + i,
         )
-        v8.store(work, U(3 * _SH_NUMBERS) + i, steps)
+        v8.store(work, Index(3 * _SH_NUMBERS) + i, steps)
     for i in range(count):
-        m[at + i] = work[U(_SH_NUMBERS) + i]
-        v[at + i] = work[U(2 * _SH_NUMBERS) + i]
-    for i in range(U(3)):
-        sh[start + i] -= rates[R_SH_DC] * work[U(3 * _SH_NUMBERS) + i]
-    for i in range(U(3), count):
-        sh[start + i] -= rates[R_SH_REST] * work[U(3 * _SH_NUMBERS) + i]
+        m[at + i] = work[Index(_SH_NUMBERS) + i]
+        v[at + i] = work[Index(2 * _SH_NUMBERS) + i]
+    for i in range(Index(3)):
+        sh[start + i] -= rates[R_SH_DC] * work[Index(3 * _SH_NUMBERS) + i]
+    for i in range(Index(3), count):
+        sh[start + i] -= rates[R_SH_REST] * work[Index(3 * _SH_NUMBERS) + i]
 
 
 @kernel
@@ -963,14 +984,16 @@ def update_rows(values, m, v, age, rows, grads, rate, betas, corrections):
     """
     for run in prange((rows.size + _ROWS_AT_ONCE - 1) // _ROWS_AT_ONCE):
         one = np.float32(1)
-        for i in range(U(run * _ROWS_AT_ONCE), U(min((run + 1) * _ROWS_AT_ONCE, rows.size))):
-            row = U(rows[i])
+        for i in range(
+            Index(run * _ROWS_AT_ONCE), Index(min((run + 1) * _ROWS_AT_ONCE, rows.size))
+        ):
+            row = Index(rows[i])
             age[row] += 1
-            n = U(min(age[row], MAX_CORRECTED_UPDATES))
-            first = corrections[U(2) * n]
-            second = corrections[U(2) * n + U(1)]
-            for channel in range(U(3)):
-                at = U(3) * row + channel
+            n = Index(min(age[row], MAX_CORRECTED_UPDATES))
+            first = corrections[Index(2) * n]
+            second = corrections[Index(2) * n + Index(1)]
+            for channel in range(Index(3)):
+                at = Index(3) * row + channel
                 g = grads[i, channel]
                 m[at] = betas[0] * m[at] + (one - betas[0]) * g
                 v[at] = betas[1] * v[at] + (one - betas[1]) * g * g

@@ -49,7 +49,7 @@ class ImageBuffers:
     """Buffers of an image's size; the kernels describe each one."""
 
     def __init__(self, height: int, width: int) -> None:
-        lanes = kernels.LANES
+        lanes = kernels.NUM_LANES
         pad = kernels.PAD
         stride = -(-width // lanes) * lanes
         padded = (height + 2 * pad) * stride
@@ -61,7 +61,7 @@ class ImageBuffers:
         self.slopes = np.zeros(9 * padded, np.float32)
         self.weights = np.empty(height * stride, np.float32)
         self.sums = np.empty((height, 2, lanes), np.float32)
-        self.covered = np.empty(height)
+        self.alpha_in_sky = np.empty(height)
         self.ssim_sums = np.empty((height, lanes), np.float32)
         self.map_sums = np.empty((height, 3, 4, lanes), np.float32)
         self.behind = np.empty(3 * height * stride, np.float32)
@@ -237,10 +237,10 @@ def _compare(
     weight_plane = buffers.weights
     kernels.compare(
         rgb.reshape(-1), alpha.reshape(-1), sky, flat_map, recorded, weight, is_sky, size,
-        (buffers.behind, pairs, weight_plane, buffers.sums.reshape(-1), buffers.covered),
+        (buffers.behind, pairs, weight_plane, buffers.sums.reshape(-1), buffers.alpha_in_sky),
     )  # fmt: skip
     error_sum, weight_sum = buffers.sums.sum(axis=(0, 2), dtype=np.float64).tolist()
-    alpha_in_sky = float(buffers.covered.sum())
+    alpha_in_sky = float(buffers.alpha_in_sky.sum())
     num_values = 3 * weight_sum
     ssim = 1.0
     ssim_factor = 0.0

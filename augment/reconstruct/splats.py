@@ -45,7 +45,7 @@ class Splats:
     # image's width and height normalised to [-1, 1]), the count of the views that show the splat,
     # and its largest radius in them as a fraction of the image's larger side.
     grads: np.ndarray
-    smallest: np.ndarray  # [N], the least scale, metres, see `bound_sizes`
+    min_scale_m: np.ndarray  # [N], the least scale, metres, see `bound_sizes`
 
     def __len__(self) -> int:
         return len(self.means)
@@ -87,7 +87,7 @@ class Splats:
             semantic=semantic, geometry_m=np.zeros((total, GEOMETRY), np.float32),
             geometry_v=np.zeros((total, GEOMETRY), np.float32), sh_m=np.zeros_like(sh),
             sh_v=np.zeros_like(sh), age=np.zeros(total, np.int32),
-            grads=np.zeros((total, 3), np.float32), smallest=np.zeros(total, np.float32),
+            grads=np.zeros((total, 3), np.float32), min_scale_m=np.zeros(total, np.float32),
         )  # fmt: skip
 
     def gaussians(self, part: int) -> Gaussians:
@@ -138,13 +138,13 @@ def rebuild(splats: Splats, source: np.ndarray) -> Splats:
     )
 
 
-def rest(splats: Splats, rows: np.ndarray) -> None:
+def reset_adam(splats: Splats, rows: np.ndarray) -> None:
     """Reset Adam's moments and ages of the rows to zero, in place."""
     for moments in (splats.geometry_m, splats.geometry_v, splats.sh_m, splats.sh_v, splats.age):
         moments[rows] = 0
 
 
-def usable(splats: Splats, extent_m: float) -> np.ndarray:
+def usable_rows(splats: Splats, extent_m: float) -> np.ndarray:
     """Return the rows that can be rendered and learnt, bool [N].
 
     A row is not usable with a number that is not finite, an opacity outside [0, 1], a scale of 0 or
@@ -200,7 +200,7 @@ OFFSET = float(np.sqrt(1 - 1 / SHRINK**2))  # sigmas: the pair keeps the parent'
 def densify_due(growth: Growth, step: int, steps: int) -> bool:
     """Return True if a round is due after `step` of `steps` steps."""
     is_growing = growth.start * steps <= step <= growth.stop * steps
-    return is_growing and step > 0 and step % growth.every == 0
+    return is_growing and step > 0 and step % growth.steps_per_round == 0
 
 
 def densify(
@@ -229,7 +229,7 @@ def densify(
     Raises:
         SceneError: no splat is usable any more.
     """
-    is_usable = usable(splats, extent_m)
+    is_usable = usable_rows(splats, extent_m)
     if len(splats) and not is_usable.any():
         raise SceneError(
             f"none of the {len(splats)} splats is finite and of sensible size: the fit has "
@@ -256,7 +256,7 @@ def densify(
     new_splats.opacities[first_rows + 1] = opacities[chosen_rows]
     # A clone's original keeps its momentum, while the copy starts with a whole step of Adam: two
     # equal splats at the same position would otherwise stay together for many steps.
-    rest(new_splats, first_rows + 1)
+    reset_adam(new_splats, first_rows + 1)
     _split_rows(new_splats, first_rows[is_large[chosen_rows]])
     bound_sizes(new_splats)
     return new_splats
@@ -312,7 +312,7 @@ def _split_rows(splats: Splats, first_rows: np.ndarray) -> None:
     splats.means[first_rows] += offset
     splats.means[first_rows + 1] -= offset
     splats.scales[first_rows] = splats.scales[first_rows + 1] = scales / divisors
-    rest(splats, first_rows)
+    reset_adam(splats, first_rows)
 
 
 # ---- Limits from the recorded images: how small a splat may be, and where none can be ------------
@@ -360,7 +360,7 @@ class Sightings:
         camera_from_part = camera.camera_from_world.numpy() @ world_from_part
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
         with kernel_threads():
-            kernels.sight(
+            kernels.update_sightings(
                 splats.means[rows], camera_from_part.astype(np.float32), intrinsics, sky,
                 self.px_per_m[rows], self.num_views[rows], self.num_in_sky[rows],
             )  # fmt: skip
@@ -384,7 +384,7 @@ def bound_sizes(splats: Splats) -> None:
     splats on measured surfaces may be opaque, which that ratio forbids. The scene stores the learnt
     sizes, so that no frame pays for a filter.
     """
-    np.maximum(splats.scales, splats.smallest[:, None], out=splats.scales)
+    np.maximum(splats.scales, splats.min_scale_m[:, None], out=splats.scales)
 
 
 # ---- Step sizes of one update, as the kernel takes them ------------------------------------------

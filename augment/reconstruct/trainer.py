@@ -50,12 +50,12 @@ from augment.reconstruct.view import ViewKey, ViewSource
 from augment.render import layout
 from augment.render.constants import RasterSettings
 from augment.render.cpu import backward_kernels
-from augment.render.cpu.backward import SplatGradients, Tape, record
+from augment.render.cpu.backward import SplatGradients, Tape, record_render
 from augment.render.cpu.driver import Inputs, Scratch
 from augment.render.cuda import runtime
 from augment.render.gsplat_backend import GsplatImages, import_gsplat, render_with_gsplat
-from augment.render.layout import BLOCK, M_NUM_SH_FUNCTIONS
-from augment.render.part_views import part_views, raster_modes, stack_poses
+from augment.render.layout import BLOCK_SIZE, M_NUM_SH_FUNCTIONS
+from augment.render.part_views import raster_modes, stack_poses, view_numbers
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
@@ -357,20 +357,20 @@ def splat_inputs(
         addresses=np.concatenate([addresses, no_addresses], 1),
         sizes=np.stack([counts, np.full_like(counts, num_sh)], 1),
         first_ids=starts.copy(),
-        views=part_views(poses, camera, settings, None),
+        views=view_numbers(poses, camera, settings, None),
         blocks=_blocks(counts),
         modes=raster_modes(settings, None, with_color=True),
-        kept_alive=[getattr(splats, name) for name in _FIELDS],
+        array_owners=[getattr(splats, name) for name in _FIELDS],
     )
 
 
 def _blocks(counts: np.ndarray) -> np.ndarray:
     """Return part, first and last + 1 of every block, int64 [B, 3]."""
-    per_part = -(-counts // layout.BLOCK)
+    per_part = -(-counts // layout.BLOCK_SIZE)
     part = np.repeat(np.arange(len(counts)), per_part)
     first_block = np.repeat(np.cumsum(per_part) - per_part, per_part)
-    first = (np.arange(len(part)) - first_block) * layout.BLOCK
-    last = np.minimum(first + layout.BLOCK, counts[part])
+    first = (np.arange(len(part)) - first_block) * layout.BLOCK_SIZE
+    last = np.minimum(first + layout.BLOCK_SIZE, counts[part])
     return np.stack([part, first, last], 1).astype(np.int64)
 
 
@@ -402,7 +402,7 @@ class CpuRenderer:
             camera: the view's camera.
             with_depth: whether to render the expected depth.
         """
-        return record(inputs, camera, SETTINGS, self._scratch, with_depth=with_depth)
+        return record_render(inputs, camera, SETTINGS, self._scratch, with_depth=with_depth)
 
 
 # The GPU holds a copy of all splats. Before each render it receives the rows that the last step has
@@ -449,8 +449,8 @@ class GsplatRenderer:
             camera,
             SETTINGS,
             with_depth=with_depth,
-            functions=int(inputs.modes[M_NUM_SH_FUNCTIONS]),
-            keep_color_slopes=True,
+            num_sh_functions=int(inputs.modes[M_NUM_SH_FUNCTIONS]),
+            keeps_color_gradients=True,
         )
         depth = None if images.expected_depth is None else _array(images.expected_depth)
         return GsplatTape(
@@ -491,19 +491,19 @@ class GsplatRenderer:
         part_of_row = np.searchsorted(part_ends, positions, side="right")
         ids = positions - (part_ends - counts)[part_of_row]
         self._changed = inputs.first_ids[part_of_row] + ids
-        blocks = -(-counts // BLOCK)
-        block_of_row = (np.cumsum(blocks) - blocks)[part_of_row] + ids // BLOCK
+        blocks = -(-counts // BLOCK_SIZE)
+        block_of_row = (np.cumsum(blocks) - blocks)[part_of_row] + ids // BLOCK_SIZE
         num_blocks = len(inputs.blocks)
         rows_per_block = np.bincount(block_of_row, minlength=num_blocks)
         row_slots = (
-            block_of_row * BLOCK
+            block_of_row * BLOCK_SIZE
             + np.arange(len(positions))
             - (np.cumsum(rows_per_block) - rows_per_block)[block_of_row]
         )
         all_rows = self._scratch.array(
-            "rows", (num_blocks * BLOCK, backward_kernels.NUM_GRADIENTS), np.float32
+            "rows", (num_blocks * BLOCK_SIZE, backward_kernels.NUM_GRADIENTS), np.float32
         )
-        all_ids = self._scratch.array("ids", (num_blocks * BLOCK,), np.int32)
+        all_ids = self._scratch.array("ids", (num_blocks * BLOCK_SIZE,), np.int32)
         all_rows[row_slots] = rows
         all_ids[row_slots] = ids
         return SplatGradients(all_rows, all_ids, rows_per_block.astype(np.int64), inputs.blocks)
@@ -881,7 +881,7 @@ class Trainer:
             for part, pose in zip(parts.numbers, parts.poses, strict=True):
                 sightings.add(self.splats, part, pose, camera, sky)
         is_shown = sightings.px_per_m > 0
-        self.splats.smallest[is_shown] = FILTER_PX / sightings.px_per_m[is_shown]
+        self.splats.min_scale_m[is_shown] = FILTER_PX / sightings.px_per_m[is_shown]
         return sightings.is_refuted & (self.splats.part_of == 0)
 
 

@@ -87,13 +87,13 @@ def signatures_in_use() -> set[str]:
 
 
 @contextlib.contextmanager
-def compile_ahead(parts: Iterable[str]) -> Iterator[None]:
+def compile_ahead(module_prefixes: Iterable[str]) -> Iterator[None]:
     """Let other processes compile kernels meanwhile: one for each thread of this process but one.
 
     parts: prefixes of the names of the modules whose kernels are compiled.
     """
     spawn = multiprocessing.get_context("spawn")
-    arguments = (tuple(parts),)
+    arguments = (tuple(module_prefixes),)
     processes = [
         spawn.Process(target=compile_listed, args=arguments, daemon=True)
         for _ in range(num_kernel_threads() - 1)

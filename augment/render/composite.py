@@ -39,7 +39,7 @@ from augment.sky import (
 )
 
 # Image rows that a thread takes at a time.
-ROWS = 32
+ROWS_PER_CHUNK = 32
 # Number of coefficients of the airlight's growth with the slope; it then errs by 1e-6.
 NUM_GAINS = 8
 # Texels along a face of the airlight by elevation; it then errs by 1e-4.
@@ -52,7 +52,7 @@ def simplify_sky(sky: Sky, fog: Fog | None) -> tuple[Sky, Fog | None]:
     Uniform fog hides the sky altogether (infinite distance), so only its airlight is left. Fog
     without density changes nothing.
     """
-    if fog is None or fog.sigma_per_m == 0:
+    if fog is None or fog.extinction_per_m == 0:
         return sky, None
     if fog.scale_height_m is None:
         return _airlight(fog), None
@@ -62,8 +62,8 @@ def simplify_sky(sky: Sky, fog: Fog | None) -> tuple[Sky, Fog | None]:
 @functools.lru_cache(maxsize=16)
 def _airlight(fog: Fog) -> Sky:
     """Return the airlight of endless fog in every direction, as a sky."""
-    horizon = torch.tensor(fog.rgb, dtype=torch.float32)
-    if fog.overcast == 0:
+    horizon = torch.tensor(fog.airlight_rgb, dtype=torch.float32)
+    if fog.elevation_gain == 0:
         return ConstantSky(horizon)
     slopes = directions_of_cubemap(AIRLIGHT_SIZE)[..., 2]
     return CubemapSky(horizon + airlight_gain(fog, slopes))
@@ -79,7 +79,7 @@ def _gains(overcast: float) -> np.ndarray:
 
     def per_slope(slopes: np.ndarray) -> np.ndarray:
         """Return the growth of the airlight at slopes, over the slope."""
-        fog = Fog(0.0, (1.0, 1.0, 1.0), overcast=overcast)
+        fog = Fog(0.0, (1.0, 1.0, 1.0), elevation_gain=overcast)
         return airlight_gain(fog, torch.from_numpy(slopes))[:, 0].numpy() / slopes
 
     series = Chebyshev.interpolate(per_slope, NUM_GAINS - 1, [0, 1]).convert(kind=Polynomial)
@@ -95,8 +95,13 @@ def unit_depth_coordinates(
     return u.astype(np.float32), v.astype(np.float32)
 
 
-def add_elevation(
-    raster: RenderOutput, camera: Camera, fog: Fog, *, behind: bool = False, backend: str = CPU
+def add_airlight_elevation(
+    raster: RenderOutput,
+    camera: Camera,
+    fog: Fog,
+    *,
+    has_fog_behind: bool = False,
+    backend: str = CPU,
 ) -> Float[Tensor, "H W 3"]:
     """Return colours whose airlight is that of their rays, from colours with the airlight of the
     horizon.
@@ -121,22 +126,24 @@ def add_elevation(
         gain = airlight_gain(fog, rays[..., 2] / rays.norm(dim=-1))
         colors = rgb + (alpha * -torch.expm1(-tau))[..., None] * gain
         return (
-            colors + (1 - alpha)[..., None] * (rgb.new_tensor(fog.rgb) + gain) if behind else colors
+            colors + (1 - alpha)[..., None] * (rgb.new_tensor(fog.airlight_rgb) + gain)
+            if has_fog_behind
+            else colors
         )
     eye_above_base_m = 0.0
     per_height = 0.0
     if fog.scale_height_m is not None:
         eye_above_base_m = float(camera.centre[2]) - fog.base_z_m
         per_height = 1 / fog.scale_height_m
-    fog_numbers = fog.sigma_per_m, eye_above_base_m * per_height, per_height
-    kernel_inputs = camera.world_from_camera[2, :3].numpy(), fog_numbers, _gains(fog.overcast)
+    fog_numbers = fog.extinction_per_m, eye_above_base_m * per_height, per_height
+    kernel_inputs = camera.world_from_camera[2, :3].numpy(), fog_numbers, _gains(fog.elevation_gain)
     kernel_inputs = (
         *unit_depth_coordinates(camera),
         *kernel_inputs,
-        fog.varying_rgb or fog.rgb,
-        fog.rgb if behind else (),
+        fog.varying_airlight_rgb or fog.airlight_rgb,
+        fog.airlight_rgb if has_fog_behind else (),
     )
-    with kernel_threads(ROWS):
+    with kernel_threads(ROWS_PER_CHUNK):
         picture_kernels.add_elevation(
             rgb.detach().numpy(),
             alpha.detach().contiguous().numpy(),
@@ -195,7 +202,7 @@ def _composite_constant(rgb: Tensor, alpha: Tensor, sky: ConstantSky) -> Tensor:
     """Return the image over a constant sky, by a kernel."""
     out = np.empty((*alpha.shape, 3), np.float32)
     color = sky.rgb.detach().to(torch.float32).numpy()
-    with kernel_threads(ROWS):
+    with kernel_threads(ROWS_PER_CHUNK):
         composite_kernels.composite_constant(
             rgb.detach().contiguous().numpy(), alpha.detach().contiguous().numpy(), color, out
         )
@@ -213,10 +220,10 @@ def _composite_cubemap(
     varying = None
     if fog is not None:
         strength = vertical_optical_depth(fog, float(camera.centre[2]))
-        gains = _gains(fog.overcast)
-        airlight = fog.rgb
-        varying = fog.varying_rgb
-    with kernel_threads(ROWS):
+        gains = _gains(fog.elevation_gain)
+        airlight = fog.airlight_rgb
+        varying = fog.varying_airlight_rgb
+    with kernel_threads(ROWS_PER_CHUNK):
         composite_kernels.composite_cubemap(
             rgb.detach().contiguous().numpy(),
             alpha.detach().contiguous().numpy(),
@@ -235,7 +242,7 @@ def _composite_cubemap(
     return torch.from_numpy(out)
 
 
-def map_colors(
+def apply_color_map(
     rgb: Float[Tensor, "H W 3"], color_map: Float[Tensor, "3 4"], *, backend: str = CPU
 ) -> Float[Tensor, "H W 3"]:
     """Return M[:, :3] @ rgb + M[:, 3] at every pixel, not clamped.
@@ -247,7 +254,7 @@ def map_colors(
     if choose_kernels(backend, rgb, color_map) != CPU or not rgb.is_contiguous():
         color_map = color_map.to(rgb.device, rgb.dtype)
         return rgb @ color_map[:, :3].T + color_map[:, 3]
-    with kernel_threads(ROWS):
+    with kernel_threads(ROWS_PER_CHUNK):
         composite_kernels.map_colors(rgb.detach().numpy(), color_map.detach().contiguous().numpy())
     return rgb
 
@@ -259,11 +266,11 @@ def to_bytes(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
         return (rgb.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
     out = np.empty(tuple(rgb.shape), np.uint8)
     rows = rgb.contiguous().numpy()
-    with kernel_threads(ROWS):
+    with kernel_threads(ROWS_PER_CHUNK):
         composite_kernels.quantise(rows.reshape(len(rows), -1), out.reshape(len(rows), -1))
     return torch.from_numpy(out)
 
 
-def quantise(rgb: Float[Tensor, "H W 3"]) -> np.ndarray:
+def to_byte_array(rgb: Float[Tensor, "H W 3"]) -> np.ndarray:
     """Return `to_bytes` as an array."""
     return to_bytes(rgb).cpu().numpy()

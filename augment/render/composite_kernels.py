@@ -11,10 +11,10 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from augment.render.cpu import simd as v8
-from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.fog import MAX_EXPONENT
-from augment.render.layout import LANES, U
-from augment.render.sh import BLACK, NUM_FOLDED
+from augment.render.layout import NUM_LANES, Index
+from augment.render.sh import BLACK_SH_00, NUM_FOLDED
 
 # ---- Numba kernel: finished pixels become opaque (see augment.render.rasterize) ------------------
 
@@ -46,7 +46,7 @@ def renormalise_alpha(alpha, rgb, overlay, min_alpha):
                     overlay[pixel] *= scale
 
 
-@inner()
+@kernel_function()
 def airlight_gain(slope, gains):
     """Return the factor of varying airlight, minus 1.
 
@@ -62,7 +62,7 @@ def airlight_gain(slope, gains):
     return p if slope >= 0 else -p / (one_f32 + p)
 
 
-@inner()
+@kernel_function()
 def layered_distance(distance, eye, climb):
     """Return the length of a ray in fog of the base's density that holds as much fog
     (augment.render.fog).
@@ -121,7 +121,7 @@ def composite_cubemap(
     half = np.float32(0.5)
     one_f32 = np.float32(1)
     texels = faces.reshape(-1)
-    row_stride = U(3 * faces.shape[1])
+    row_stride = Index(3 * faces.shape[1])
     scale = np.float32(faces.shape[1] - 2) * half
     for i in prange(height):
         texel_places = np.empty(4 * _AHEAD, np.float32)
@@ -134,25 +134,25 @@ def composite_cubemap(
         alphas = alpha[i]
         target = out[i]
         # Pixels in runs: runs without sky are copied.
-        for first in range(U(0), U(width), U(_AHEAD)):
-            if not _shows_sky(alphas, first, min(first + U(_AHEAD), U(width))):
-                for j in range(first, min(first + U(_AHEAD), U(width))):
-                    for c in range(U(3)):
+        for first in range(Index(0), Index(width), Index(_AHEAD)):
+            if not _shows_sky(alphas, first, min(first + Index(_AHEAD), Index(width))):
+                for j in range(first, min(first + Index(_AHEAD), Index(width))):
+                    for c in range(Index(3)):
                         target[j, c] = colors[j, c]
                 continue
             # Directions of the run's pixels, and their texels.
-            for k in range(U(0), U(_AHEAD), U(LANES)):
-                u = v8.splat(np.float32(first + k)) + v8.lane_numbers()
-                u = (u + v8.splat(half) - v8.splat(cx)) * v8.splat(ifx)
-                x = v8.splat(rotation[0, 0]) * u + v8.splat(bx)
-                y = v8.splat(rotation[1, 0]) * u + v8.splat(by)
-                z = v8.splat(rotation[2, 0]) * u + v8.splat(bz)
+            for k in range(Index(0), Index(_AHEAD), Index(NUM_LANES)):
+                u = v8.broadcast(np.float32(first + k)) + v8.lane_numbers()
+                u = (u + v8.broadcast(half) - v8.broadcast(cx)) * v8.broadcast(ifx)
+                x = v8.broadcast(rotation[0, 0]) * u + v8.broadcast(bx)
+                y = v8.broadcast(rotation[1, 0]) * u + v8.broadcast(by)
+                z = v8.broadcast(rotation[2, 0]) * u + v8.broadcast(bz)
                 _place_eight(x, y, z, scale, np.float32(faces.shape[1]), texel_places, k)
-            count = min(U(_AHEAD), U(width) - first)
+            count = min(Index(_AHEAD), Index(width) - first)
             # Fetch the texels: a row of pixels crosses many rows of texels, each far in memory.
             for k in range(count):
-                texel = U(np.int32(texel_places[k])) * row_stride + U(3) * U(
-                    np.int32(texel_places[k + U(_AHEAD)])
+                texel = Index(np.int32(texel_places[k])) * row_stride + Index(3) * Index(
+                    np.int32(texel_places[k + Index(_AHEAD)])
                 )
                 v8.prefetch(texels, texel)
                 v8.prefetch(texels, texel + row_stride)
@@ -161,8 +161,8 @@ def composite_cubemap(
             for k in range(count):
                 j = first + k
                 texel = first_texels[k]
-                fraction_x = texel_places[k + U(2 * _AHEAD)]
-                fraction_y = texel_places[k + U(3 * _AHEAD)]
+                fraction_x = texel_places[k + Index(2 * _AHEAD)]
+                fraction_y = texel_places[k + Index(3 * _AHEAD)]
                 transmittance = one_f32 - alphas[j]
                 sky_transmittance = one_f32
                 gain = np.float32(0)
@@ -176,14 +176,15 @@ def composite_cubemap(
                     if z > 0:
                         sky_transmittance = math.exp(-vertical_depth / slope)
                     gain = airlight_gain(slope, gains)
-                for c in range(U(3)):
+                for c in range(Index(3)):
                     top = (
                         texels[texel + c] * (one_f32 - fraction_x)
-                        + texels[texel + U(3) + c] * fraction_x
+                        + texels[texel + Index(3) + c] * fraction_x
                     )
                     below = texel + row_stride + c
                     bottom = (
-                        texels[below] * (one_f32 - fraction_x) + texels[below + U(3)] * fraction_x
+                        texels[below] * (one_f32 - fraction_x)
+                        + texels[below + Index(3)] * fraction_x
                     )
                     color = top * (one_f32 - fraction_y) + bottom * fraction_y
                     if vertical_depth >= 0:
@@ -192,7 +193,7 @@ def composite_cubemap(
                     target[j, c] = colors[j, c] + transmittance * color
 
 
-@inner()
+@kernel_function()
 def _shows_sky(alphas, first, end):
     """Return True if a pixel lets light from behind through, or may: its alpha is NaN."""
     has_sky = False
@@ -205,7 +206,7 @@ def _shows_sky(alphas, first, end):
 _AHEAD = 64
 
 
-@inner()
+@kernel_function()
 def _place_eight(x, y, z, scale, side, places, start):
     """Write the texels and fractions at which eight directions meet a cube map with a border.
 
@@ -220,12 +221,12 @@ def _place_eight(x, y, z, scale, side, places, start):
         texel_places: the rows, flat.
         start: position in each row.
     """
-    zeros = v8.splat(np.float32(0))
-    half = v8.splat(np.float32(0.5))
+    zeros = v8.broadcast(np.float32(0))
+    half = v8.broadcast(np.float32(0.5))
     ax = v8.absolute(x)
     ay = v8.absolute(y)
     az = v8.absolute(z)
-    is_x_face = v8.both(v8.at_least(ax, ay), v8.at_least(ax, az))
+    is_x_face = v8.mask_and(v8.at_least(ax, ay), v8.at_least(ax, az))
     is_y_face = v8.at_least(ay, az)
     is_x_positive = v8.at_least(x, zeros)
     is_y_positive = v8.at_least(y, zeros)
@@ -239,21 +240,21 @@ def _place_eight(x, y, z, scale, side, places, start):
         is_y_face, _select_number(is_y_positive, 2, 3), _select_number(is_z_positive, 4, 5)
     )
     face = v8.select(is_x_face, _select_number(is_x_positive, 0, 1), face)
-    inverse = v8.splat(scale) / major
-    middle = v8.splat(scale) + half
+    inverse = v8.broadcast(scale) / major
+    middle = v8.broadcast(scale) + half
     column = s * inverse + middle
     row = t * inverse + middle
     left_column = v8.floor(column)
     row_above = v8.floor(row)
-    v8.store(places, start, face * v8.splat(side) + row_above)
-    v8.store(places, start + U(_AHEAD), left_column)
-    v8.store(places, start + U(2 * _AHEAD), column - left_column)
-    v8.store(places, start + U(3 * _AHEAD), row - row_above)
+    v8.store(places, start, face * v8.broadcast(side) + row_above)
+    v8.store(places, start + Index(_AHEAD), left_column)
+    v8.store(places, start + Index(2 * _AHEAD), column - left_column)
+    v8.store(places, start + Index(3 * _AHEAD), row - row_above)
 
 
-@inner()
+@kernel_function()
 def _select_number(mask, a, b):
-    return v8.select(mask, v8.splat(np.float32(a)), v8.splat(np.float32(b)))
+    return v8.select(mask, v8.broadcast(np.float32(a)), v8.broadcast(np.float32(b)))
 
 
 @kernel
@@ -284,13 +285,13 @@ def map_colors(rgb, matrix):
     m23 = matrix[2, 3]
     for i in prange(rgb.shape[0]):
         row = rgb[i].reshape(-1)
-        for j in range(U(0), U(row.size), U(3)):
+        for j in range(Index(0), Index(row.size), Index(3)):
             r = row[j]
-            g = row[j + U(1)]
-            b = row[j + U(2)]
+            g = row[j + Index(1)]
+            b = row[j + Index(2)]
             row[j] = m00 * r + m01 * g + m02 * b + m03
-            row[j + U(1)] = m10 * r + m11 * g + m12 * b + m13
-            row[j + U(2)] = m20 * r + m21 * g + m22 * b + m23
+            row[j + Index(1)] = m10 * r + m11 * g + m12 * b + m13
+            row[j + Index(2)] = m20 * r + m21 * g + m22 * b + m23
 
 
 # ---- Numba kernel: colour maps folded into spherical harmonics -----------------------------------
@@ -302,7 +303,7 @@ SPLATS = 2048
 # Splats that are mapped at a time; their results (24 KB at degree 3) stay in the first cache.
 SPLAT_RUN = 128
 # Bytes to which the target is aligned.
-ALIGNMENT = 4 * LANES
+ALIGNMENT_BYTES = 4 * NUM_LANES
 
 
 @intrinsic
@@ -313,14 +314,14 @@ def _stream(typingctx, source, source_start, target, target_start):
     """
 
     def codegen(context, builder, sig, args):
-        vector = ir.VectorType(ir.FloatType(), LANES)
+        vector = ir.VectorType(ir.FloatType(), NUM_LANES)
 
         def pointer(kind, array, index):
             data = context.make_array(kind)(context, builder, array).data
             return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
         value = builder.load(pointer(sig.args[0], args[0], args[1]), align=4)
-        stored = builder.store(value, pointer(sig.args[2], args[2], args[3]), align=ALIGNMENT)
+        stored = builder.store(value, pointer(sig.args[2], args[2], args[3]), align=ALIGNMENT_BYTES)
         one_i32 = ir.Constant(ir.IntType(32), 1)
         stored.set_metadata("nontemporal", builder.module.add_metadata([one_i32]))
         return context.get_dummy_value()
@@ -339,14 +340,14 @@ def _fence(typingctx):
     return types.void(), codegen
 
 
-@inner()
+@kernel_function()
 def _map_splats(source, source_start, work, target_start, count, functions, folded):
     """Map `count` splats by one map, from source[source_start:] to work[target_start:].
 
     A splat of degree 0 whose colour is below 0 is mapped as the black that it shows (see `map_sh`
     of augment.effects.style.color_maps).
     """
-    min_value = BLACK if functions == U(1) else np.float32(-np.inf)
+    min_value = BLACK_SH_00 if functions == Index(1) else np.float32(-np.inf)
     a0 = folded[0]
     a1 = folded[1]
     a2 = folded[2]
@@ -357,35 +358,35 @@ def _map_splats(source, source_start, work, target_start, count, functions, fold
     c1 = folded[7]
     c2 = folded[8]
     for i in range(count * functions):
-        j = source_start + U(3) * i
-        k = target_start + U(3) * i
+        j = source_start + Index(3) * i
+        k = target_start + Index(3) * i
         red = max(source[j], min_value)
-        green = max(source[j + U(1)], min_value)
-        blue = max(source[j + U(2)], min_value)
+        green = max(source[j + Index(1)], min_value)
+        blue = max(source[j + Index(2)], min_value)
         work[k] = a0 * red + a1 * green + a2 * blue
-        work[k + U(1)] = b0 * red + b1 * green + b2 * blue
-        work[k + U(2)] = c0 * red + c1 * green + c2 * blue
-    row = U(3) * functions
+        work[k + Index(1)] = b0 * red + b1 * green + b2 * blue
+        work[k + Index(2)] = c0 * red + c1 * green + c2 * blue
+    row = Index(3) * functions
     for splat in range(count):
-        for channel in range(U(3)):
-            work[target_start + splat * row + channel] += folded[U(9) + channel]
+        for channel in range(Index(3)):
+            work[target_start + splat * row + channel] += folded[Index(9) + channel]
 
 
-@inner()
+@kernel_function()
 def _map_run(source, first, end, work, functions, classes, folded):
     """Map the splats `first` to `end` into work, neighbours of one class together."""
-    row = U(3) * functions
+    row = Index(3) * functions
     splat = first
     while splat < end:
         class_end = end
-        map_index = U(0)
+        map_index = Index(0)
         if classes.size:
-            map_index = U(classes[splat])
-            class_end = splat + U(1)
-            while class_end < end and U(classes[class_end]) == map_index:
-                class_end += U(1)
+            map_index = Index(classes[splat])
+            class_end = splat + Index(1)
+            while class_end < end and Index(classes[class_end]) == map_index:
+                class_end += Index(1)
         target_start = (splat - first) * row
-        if folded[map_index, U(NUM_FOLDED - 1)] != np.float32(0):
+        if folded[map_index, Index(NUM_FOLDED - 1)] != np.float32(0):
             _map_splats(
                 source,
                 splat * row,
@@ -402,7 +403,7 @@ def _map_run(source, first, end, work, functions, classes, folded):
 
 
 @kernel
-def map_sh(source, target, functions, classes, folded):
+def apply_color_maps(source, target, functions, classes, folded):
     """Write target = source with every splat's functions mapped.
 
     Args:
@@ -413,17 +414,17 @@ def map_sh(source, target, functions, classes, folded):
         folded: float32 [C, FOLDED]. A last number of 0 says that the map changes nothing; then the
             splat's bits are copied.
     """
-    row = U(3 * functions)
+    row = Index(3 * functions)
     count = source.size // (3 * functions)
     for block in prange((count + SPLATS - 1) // SPLATS):
         work = np.empty(SPLAT_RUN * 3 * functions, np.float32)
-        end = U(min((block + 1) * SPLATS, count))
-        for first in range(U(block * SPLATS), end, U(SPLAT_RUN)):
-            last = min(first + U(SPLAT_RUN), end)
-            _map_run(source, first, last, work, U(functions), classes, folded)
+        end = Index(min((block + 1) * SPLATS, count))
+        for first in range(Index(block * SPLATS), end, Index(SPLAT_RUN)):
+            last = min(first + Index(SPLAT_RUN), end)
+            _map_run(source, first, last, work, Index(functions), classes, folded)
             size = (last - first) * row
-            vector_end = size - size % U(LANES)
-            for i in range(U(0), vector_end, U(LANES)):
+            vector_end = size - size % Index(NUM_LANES)
+            for i in range(Index(0), vector_end, Index(NUM_LANES)):
                 _stream(work, i, target, first * row + i)
             for i in range(vector_end, size):
                 target[first * row + i] = work[i]

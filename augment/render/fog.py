@@ -55,16 +55,16 @@ class Fog:
     varying_rgb: the share of `rgb` that g multiplies; None for all of it.
     """
 
-    sigma_per_m: float
-    rgb: tuple[float, float, float]
+    extinction_per_m: float
+    airlight_rgb: tuple[float, float, float]
     scale_height_m: float | None = None
     base_z_m: float = 0.0
-    overcast: float = 0.0
-    varying_rgb: tuple[float, float, float] | None = None
+    elevation_gain: float = 0.0
+    varying_airlight_rgb: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.sigma_per_m) and self.sigma_per_m >= 0):
-            raise ValueError(f"sigma_per_m must be finite and >= 0; got {self.sigma_per_m}")
+        if not (math.isfinite(self.extinction_per_m) and self.extinction_per_m >= 0):
+            raise ValueError(f"sigma_per_m must be finite and >= 0; got {self.extinction_per_m}")
         if self.scale_height_m is not None and not (
             math.isfinite(self.scale_height_m) and self.scale_height_m > 0
         ):
@@ -88,7 +88,7 @@ def optical_depth(
     Raises:
         ValueError: the fog has a scale height and point_z_m is missing.
     """
-    uniform_depth = fog.sigma_per_m * ray_distance
+    uniform_depth = fog.extinction_per_m * ray_distance
     if fog.scale_height_m is None:
         return uniform_depth
     if point_z_m is None:
@@ -119,7 +119,7 @@ def sky_optical_depth(fog: Fog, slope: Float[Tensor, "*B"], eye_z_m: float) -> F
         eye_z_m: world height of the eye, metres.
     """
     infinite_depth = torch.full_like(slope, math.inf)
-    if fog.sigma_per_m == 0:
+    if fog.extinction_per_m == 0:
         return torch.zeros_like(slope)
     if fog.scale_height_m is None:
         return infinite_depth
@@ -135,7 +135,7 @@ def vertical_optical_depth(fog: Fog, eye_z_m: float) -> float:
     if fog.scale_height_m is None:
         raise ValueError("uniform fog has no top: its vertical optical depth is infinite")
     a = (eye_z_m - fog.base_z_m) / fog.scale_height_m
-    return fog.sigma_per_m * fog.scale_height_m * math.exp(min(-a, MAX_EXPONENT))
+    return fog.extinction_per_m * fog.scale_height_m * math.exp(min(-a, MAX_EXPONENT))
 
 
 def blend_airlight(
@@ -149,8 +149,8 @@ def blend_airlight(
     slope: vertical part of the unit direction; None for the airlight of the horizon.
     """
     t = torch.exp(-tau)[..., None]
-    airlight = torch.tensor(fog.rgb, dtype=rgb.dtype, device=rgb.device)
-    if slope is not None and fog.overcast > 0:
+    airlight = torch.tensor(fog.airlight_rgb, dtype=rgb.dtype, device=rgb.device)
+    if slope is not None and fog.elevation_gain > 0:
         airlight = airlight + airlight_gain(fog, slope)
     return t * rgb + (1 - t) * airlight
 
@@ -159,8 +159,8 @@ def airlight_gain(fog: Fog, slope: Float[Tensor, "*B"]) -> Float[Tensor, "*B 3"]
     """Return the airlight in a direction minus the airlight at the horizon; slope as in
     `blend_airlight`.
     """
-    growth = torch.log1p(2 * fog.overcast * slope.abs()) / ENCODING * slope.sign()
-    varying_rgb = fog.rgb if fog.varying_rgb is None else fog.varying_rgb
+    growth = torch.log1p(2 * fog.elevation_gain * slope.abs()) / ENCODING * slope.sign()
+    varying_rgb = fog.airlight_rgb if fog.varying_airlight_rgb is None else fog.varying_airlight_rgb
     return torch.expm1(growth)[..., None] * growth.new_tensor(varying_rgb)
 
 
@@ -187,7 +187,7 @@ def apply_deferred_fog(
     """
     tau = optical_depth(fog, ray_distance, eye_z_m, point_z_m)
     t = torch.exp(-tau)[..., None]
-    airlight = torch.tensor(fog.rgb, dtype=rgb.dtype, device=rgb.device)
+    airlight = torch.tensor(fog.airlight_rgb, dtype=rgb.dtype, device=rgb.device)
     return t * rgb + (1 - t) * alpha[..., None] * airlight
 
 
@@ -233,7 +233,7 @@ def optical_depth_numpy(
 
     series_below: height difference, in scale heights, below which a series replaces the quotient.
     """
-    uniform_depth = fog.sigma_per_m * ray_distance
+    uniform_depth = fog.extinction_per_m * ray_distance
     if fog.scale_height_m is None:
         return uniform_depth
     a = (eye_z_m - fog.base_z_m) / fog.scale_height_m

@@ -111,8 +111,8 @@ def render_with_gsplat(
     settings: RasterSettings,
     *,
     with_depth: bool,
-    functions: int | None = None,
-    keep_color_slopes: bool = False,
+    num_sh_functions: int | None = None,
+    keeps_color_gradients: bool = False,
 ) -> GsplatImages:
     """Return images of the parts that are differentiable in all their float tensors.
 
@@ -139,11 +139,11 @@ def render_with_gsplat(
     means, quats, scales, opacities, colors = (
         torch.cat(values)
         for values in zip(
-            *(_gsplat_inputs(gsplat, p, camera, settings, functions, device) for p in parts),
+            *(_gsplat_inputs(gsplat, p, camera, settings, num_sh_functions, device) for p in parts),
             strict=True,
         )
     )
-    if keep_color_slopes:
+    if keeps_color_gradients:
         colors = colors if colors.requires_grad else colors.requires_grad_()
         colors.retain_grad()
     view = torch.eye(4, dtype=torch.float64)

@@ -67,48 +67,48 @@ class HeightClip:
     """
 
     z_m: float
-    keep: Literal["above", "below"]
-    reach_m: float = math.inf
-    overlaps: bool = False
+    kept_side: Literal["above", "below"]
+    max_distance_m: float = math.inf
+    has_overlap: bool = False
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        if self.keep not in SIGNS or not math.isfinite(self.z_m):
+        if self.kept_side not in SIGNS or not math.isfinite(self.z_m):
             raise ValueError(
                 f"a clip keeps 'above' or 'below' a finite height; "
-                f"got {self.keep!r}, z_m = {self.z_m}"
+                f"got {self.kept_side!r}, z_m = {self.z_m}"
             )
-        if not self.reach_m >= 0:
-            raise ValueError(f"a clip's reach_m must be >= 0 metres; got {self.reach_m}")
+        if not self.max_distance_m >= 0:
+            raise ValueError(f"a clip's reach_m must be >= 0 metres; got {self.max_distance_m}")
 
     @property
     def sign(self) -> float:
         """1 where heights above the plane are kept, -1 where heights below it are kept."""
-        return SIGNS[self.keep]
+        return SIGNS[self.kept_side]
 
-    def height_of(self, point: Sequence[float]) -> float:
+    def height_above(self, point: Sequence[float]) -> float:
         """Return the height of a point (world) above the plane, metres."""
         return sum(a * b for a, b in zip(self.up, point, strict=True)) - self.z_m
 
     @property
     def edge_px(self) -> float:
         """Pixels that are added to the distance from the cut."""
-        return EDGE_PX + OVERLAP_PX * self.overlaps
+        return EDGE_PX + OVERLAP_PX * self.has_overlap
 
 
 # A clip that cuts nothing: images have the same bits as without a clip, except for the depths,
 # which are those of the splats' surfaces.
-SURFACE_DEPTHS_ONLY = HeightClip(z_m=-1e9, keep="above")
+SURFACE_DEPTHS_ONLY = HeightClip(z_m=-1e9, kept_side="above")
 
 
 # Type of every index in the CPU kernels.
-U = np.uint64
+Index = np.uint64
 # Pixels or splats in one register.
-LANES = 8
+NUM_LANES = 8
 
 # Gaussians in a block. A block is one piece of work for a thread; its results (128 KB) stay in the
 # thread's cache.
-BLOCK = 2048
+BLOCK_SIZE = 2048
 # Low bits of z's float32 pattern that a bin of z leaves out: a bin is 3 % wide.
 BIN_SHIFT = 18
 # Number of bins of z: all positive finite float32 numbers.
@@ -121,9 +121,9 @@ TILE_H = 16
 # Pixels of a tile.
 PIXELS = TILE_W * TILE_H
 # Strips of a tile, each one register wide.
-STRIPS = TILE_W // LANES
+STRIPS = TILE_W // NUM_LANES
 # Pixels of a strip.
-STRIP = TILE_H * LANES
+STRIP = TILE_H * NUM_LANES
 
 # ---- A splat's record: RECORD float32, one cache line --------------------------------------------
 # With u = x - MEAN_X - LEAN_X (y - MEAN_Y), pixels, the log2 of its alpha is

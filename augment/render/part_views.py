@@ -36,7 +36,7 @@ def views_of(
 ) -> np.ndarray:
     """Return views float32 [P, VIEW] of posed parts, with their light and colour maps."""
     poses = stack_poses([part.world_from_part for part in parts])
-    views = part_views(poses, camera, settings, fog, clip)
+    views = view_numbers(poses, camera, settings, fog, clip)
     views[:, layout.V_OVERLAY] = [part.is_overlay for part in parts]
     views[:, layout.V_MAPS] = [_map_count(part) for part in parts]
     for view, part, pose in zip(views, parts, poses, strict=True):
@@ -52,10 +52,10 @@ def _map_count(part: PosedGaussians) -> int:
     """Return the number of a part's colour maps; 1 if its splats have no rows to choose by."""
     if part.color_maps is None:
         return 0
-    return 1 if part.map_rows is None else len(part.color_maps)
+    return 1 if part.color_map_rows is None else len(part.color_maps)
 
 
-def part_views(
+def view_numbers(
     poses: np.ndarray,
     camera: Camera,
     settings: RasterSettings,
@@ -101,15 +101,15 @@ def part_views(
     views[:, layout.V_ALPHA_MIN] = ALPHA_MIN
     views[:, layout.V_LOG_CUT] = math.log2(ALPHA_MIN)
     if fog is not None:
-        views[:, layout.V_EXTINCTION] = fog.sigma_per_m
-        views[:, layout.V_AIRLIGHT :][:, :3] = fog.rgb
+        views[:, layout.V_EXTINCTION] = fog.extinction_per_m
+        views[:, layout.V_AIRLIGHT :][:, :3] = fog.airlight_rgb
         if fog.scale_height_m is not None:
             eye_above_base_m = float(camera.centre[2]) - fog.base_z_m
             views[:, layout.V_EYE_HEIGHT] = eye_above_base_m / fog.scale_height_m
             views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / fog.scale_height_m
     views[:, layout.V_FOG_FAR] = _NO_FAR
     if fog is not None and fog.scale_height_m is None and settings.fog_cut > 0:
-        fog_far_m = -math.log(settings.fog_cut) / max(fog.sigma_per_m, 1 / _NO_FAR)
+        fog_far_m = -math.log(settings.fog_cut) / max(fog.extinction_per_m, 1 / _NO_FAR)
         views[:, layout.V_FOG_FAR] = min(fog_far_m, _NO_FAR)
     views[:, layout.V_PARALLEL] = camera.is_orthographic
     views[:, layout.V_RADIUS_CLIP] = settings.radius_clip_px or _NO_RADIUS_CLIP
@@ -117,7 +117,7 @@ def part_views(
     views[:, layout.V_CLIP_EYE] = views[:, layout.V_CLIP_REACH] = _NO_CLIP
     if clip is not None:
         clip_up = np.array(clip.up)
-        eye_height_m = clip.height_of(camera.centre.tolist())
+        eye_height_m = clip.height_above(camera.centre.tolist())
         views[:, layout.V_CLIP_EYE] = clip.sign * eye_height_m
         views[:, layout.V_CLIP_PART :][:, :3] = clip.sign * (clip_up @ poses[:, :3, :3])
         clip_up_in_camera = camera.camera_from_world.numpy()[:3, :3] @ clip_up
@@ -128,7 +128,7 @@ def part_views(
             views[:, layout.V_CLIP_FALL] = -clip.sign * clip_up_in_camera[2]
             views[:, layout.V_CLIP_LONGEST] = _NO_CLIP
         views[:, layout.V_CLIP_EDGE] = clip.edge_px
-        views[:, layout.V_CLIP_REACH] = min(clip.reach_m, _NO_CLIP)
+        views[:, layout.V_CLIP_REACH] = min(clip.max_distance_m, _NO_CLIP)
     return views.astype(np.float32)
 
 

@@ -10,7 +10,7 @@ from numba import prange
 from augment.render.composite_kernels import layered_distance
 from augment.render.cpu.jit import kernel
 from augment.render.fog import MAX_EXPONENT
-from augment.render.layout import U
+from augment.render.layout import Index
 
 
 @kernel
@@ -68,14 +68,14 @@ def map_photo_colors_with_sky(pixels, land, sky, share, out):
             g = np.float32(pixels[i, j, 1]) / max_level
             b = np.float32(pixels[i, j, 2]) / max_level
             w = share[i, j]
-            for c in range(U(3)):
+            for c in range(Index(3)):
                 land_color = land[c, 0] * r + land[c, 1] * g + land[c, 2] * b + land[c, 3]
                 sky_color = sky[c, 0] * r + sky[c, 1] * g + sky[c, 2] * b + sky[c, 3]
                 out[i, j, c] = (one_f32 - w) * max(land_color, zero) + w * max(sky_color, zero)
 
 
 @kernel
-def sky_share(alpha, sky_marks, alpha_limits, u, v, fall, out):
+def compute_sky_share(alpha, sky_marks, alpha_limits, u, v, fall, out):
     """Write the share of sky in every pixel of a photo, 1 - a (1 - sky), and 0 where the ray sees
     the road.
 
@@ -103,7 +103,7 @@ def sky_share(alpha, sky_marks, alpha_limits, u, v, fall, out):
 
 
 @kernel
-def mix(rgb, other, weight, out):
+def blend_images(rgb, other, weight, out):
     """Write out = (1 - weight) rgb + weight other.
 
     rgb: [H, W, 3]. other: [H, W, 3] or [1, 1, 3].
@@ -121,7 +121,7 @@ def mix(rgb, other, weight, out):
 
 
 @kernel
-def add_faded(base, rgb, weight, out):
+def add_weighted(base, rgb, weight, out):
     """Write out = base + weight rgb."""
     height, width, _ = rgb.shape
     for i in prange(height):
@@ -131,7 +131,7 @@ def add_faded(base, rgb, weight, out):
 
 
 @kernel
-def transmittance(alpha, depth, lens, fall, fog_numbers, road, out):
+def compute_transmittance(alpha, depth, lens, fall, fog_numbers, road, out):
     """Write the transmittance of a photo's pixels: `transmittance` of augment.base_photo.
 
     Args:

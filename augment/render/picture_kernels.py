@@ -12,12 +12,12 @@ import numpy as np
 from numba import prange
 
 from augment.render.composite_kernels import airlight_gain, layered_distance
-from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.fog import MAX_EXPONENT
-from augment.render.layout import U
+from augment.render.layout import Index
 
 
-@inner()
+@kernel_function()
 def decay(y):
     """Return exp(-y) for |y| <= 80, within 5e-6 of 1, by plain sums that LLVM vectorises."""
     z = y * np.float32(-1 / 64)
@@ -75,7 +75,7 @@ def add_elevation(rgb, alpha, depth, u, v, rise, fog_numbers, gains, varying, be
             fog_share += has_background * (one_f32 - alpha[i, j])
             share[j] = fog_share * airlight_gain(slope, gains)
         for j in range(width):
-            for c in range(U(3)):
+            for c in range(Index(3)):
                 rgb[i, j, c] += share[j] * varying[c]
                 if has_background > 0:
                     rgb[i, j, c] += (one_f32 - alpha[i, j]) * behind[c]

@@ -201,7 +201,7 @@ def _project_part(
     colors = None
     if with_color:
         view_directions = rotation[2].expand_as(offsets) if camera.is_orthographic else offsets
-        rows = None if part.map_rows is None else part.map_rows[index]
+        rows = None if part.color_map_rows is None else part.color_map_rows[index]
         colors = _colors(gaussians, rows, view_directions, part, camera, settings, fog)
     splats = Splats(
         ids=index + first_id,
@@ -248,7 +248,7 @@ def _heights(
     rise = torch.tensor(clip.up, dtype=torch.float64)
     if part.world_from_part is not None:
         rise = rise @ part.world_from_part[:3, :3]
-    return offsets @ rise.to(offsets.dtype) + clip.height_of(camera.centre.tolist())
+    return offsets @ rise.to(offsets.dtype) + clip.height_above(camera.centre.tolist())
 
 
 def _cut(
@@ -267,7 +267,7 @@ def _cut(
     reach = MAX_EXTENT_SIGMAS * (up @ axes).norm(dim=-1)
     gx, gy = _depth_slope(*_image_axes(points, axes, camera), axes[:, 2])
     divisors = _divisors(points, camera)
-    fall = clip.sign * clip.height_of(camera.centre.tolist()) / divisors**2
+    fall = clip.sign * clip.height_above(camera.centre.tolist()) / divisors**2
     max_growth = MAX_DEPTH_GROWTH
     if camera.is_orthographic:
         fall = -up[2]
@@ -282,7 +282,7 @@ def _cut(
     cuts = torch.cat(
         [offset[:, None], slope, torch.stack([gx / divisors, gy / divisors, growth_limit], -1)], 1
     )
-    return cuts, (heights >= -reach) & (heights - reach <= clip.reach_m)
+    return cuts, (heights >= -reach) & (heights - reach <= clip.max_distance_m)
 
 
 def _depth_slope(

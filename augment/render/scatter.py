@@ -46,7 +46,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render import picture_kernels
 from augment.render.buffers import AUTO, CPU, choose_kernels
-from augment.render.composite import ROWS, unit_depth_coordinates
+from augment.render.composite import ROWS_PER_CHUNK, unit_depth_coordinates
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
 
@@ -74,7 +74,7 @@ def scatter_forward(
     alpha: Float[Tensor, "H W"],
     depth: Float[Tensor, "H W"],
     camera: Camera,
-    medium: Fog,
+    fog: Fog,
     strength: float,
     *,
     backend: str = AUTO,
@@ -96,9 +96,9 @@ def scatter_forward(
     levels = max(0, min(NUM_LEVELS, int(math.log2(min(size))) - 1))
     shares = level_shares(DIFFRACTION_RAD * camera.fx / factor)[: levels + 1]
     if choose_kernels(backend, rgb, alpha, depth) == CPU:
-        weight = _scattered_share(alpha, depth, camera, medium, strength)
+        weight = _scattered_share(alpha, depth, camera, fog, strength)
         return _exchange_light(rgb, weight, size, shares)
-    weight = _scattered_share_by_torch(alpha, depth, camera, medium, strength)[..., None]
+    weight = _scattered_share_by_torch(alpha, depth, camera, fog, strength)[..., None]
     small_rgb = _resize(rgb, size)
     small_weight = _resize(weight, size)
     neighbourhood_scale = (1 / (_blur_by_pyramid(small_weight, shares) + _MIN_WEIGHT)).sqrt()
@@ -128,7 +128,7 @@ def _exchange_light(
     small_weight = _resize(weight[..., None], size)
     neighbourhood_weight = _blur_by_pyramid(small_weight, shares)[..., 0]
     weighted_rgb = np.empty((*size, 4), np.float32)
-    with kernel_threads(ROWS):
+    with kernel_threads(ROWS_PER_CHUNK):
         picture_kernels.weight_pixels(
             _resize(sharp_rgb, size),
             small_weight[..., 0],
@@ -147,12 +147,12 @@ def _scattered_share(
 ) -> Float32[np.ndarray, "H W"]:
     """Return `_scattered_share_by_torch`, by a kernel."""
     scale_height_m = fog.scale_height_m
-    extinction_per_m = fog.sigma_per_m
+    extinction_per_m = fog.extinction_per_m
     if scale_height_m is not None:
         a = (float(camera.centre[2]) - fog.base_z_m) / scale_height_m
         extinction_per_m *= math.exp(min(-a, MAX_EXPONENT))
     out = np.empty((camera.height, camera.width), np.float32)
-    with kernel_threads(ROWS):
+    with kernel_threads(ROWS_PER_CHUNK):
         picture_kernels.scattered_share(
             alpha.contiguous().numpy(),
             depth.contiguous().numpy(),

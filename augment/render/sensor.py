@@ -28,7 +28,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render import picture_kernels
 from augment.render.buffers import AUTO, CPU, choose_kernels
-from augment.render.composite import ROWS
+from augment.render.composite import ROWS_PER_CHUNK
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 
@@ -65,7 +65,7 @@ def blur_lens(rgb: Float[Tensor, "H W 3"], psf_px: float) -> Float[Tensor, "H W 
 
 def add_noise(
     rgb: Float[Tensor, "H W 3"],
-    noise: float,
+    mid_grey_sigma: float,
     camera: Camera,
     *,
     seed: int,
@@ -83,10 +83,10 @@ def add_noise(
         backend: backend of the render. The noise is drawn on the CPU for every backend.
     """
     draws = draw_noise(camera, seed=seed, scene=scene)
-    sigmas = noise_sigmas() * np.float32(noise / (_LEVEL_SD * _DEMOSAICED_SD))
+    sigmas = noise_sigmas() * np.float32(mid_grey_sigma / (_LEVEL_SD * _DEMOSAICED_SD))
     if choose_kernels(backend, rgb) == CPU:
         noisy_rgb = rgb.detach().contiguous().numpy()
-        with kernel_threads(ROWS):
+        with kernel_threads(ROWS_PER_CHUNK):
             rows = noisy_rgb.reshape(len(noisy_rgb), -1), draws.reshape(len(noisy_rgb), -1)
             picture_kernels.add_noise(*rows, sigmas)
         return torch.from_numpy(noisy_rgb)

@@ -134,4 +134,4 @@ def _sphere_samples(count: int) -> Float[Tensor, "S 3"]:
 # one that is not 0 if the map changes anything.
 NUM_FOLDED = 13
 # First coefficient of a colour of 0.
-BLACK = np.float32(-0.5 / SH_C0)
+BLACK_SH_00 = np.float32(-0.5 / SH_C0)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pandaset_folder import write_sequence
 from splat_scenes import street
 
-from adapters.base import detect_scheme_of_path, open_scene, scenes_of
+from adapters.base import detect_scheme_of_path, expand_job_scenes, open_scene
 from adapters.camera_files.camera_files import read_views
 from adapters.detect_format import FILES, FOLDERS, describe_unrecognised, detect_scheme
 from adapters.drivestudio.drive import read_config as drivestudio_config
@@ -281,7 +281,7 @@ def test_an_unknown_folder_is_told_what_it_lacks(tmp_path, files, said):
 
 def uris(folder: Path, *entries: str | JobScene) -> list[str]:
     given = [JobScene(uri=e) if isinstance(e, str) else e for e in entries]
-    return [scene.uri for scene in scenes_of(given, folder)]
+    return [scene.uri for scene in expand_job_scenes(given, folder)]
 
 
 @pytest.fixture(params=["plain", "odd [1] *"])
@@ -304,7 +304,7 @@ def test_patterns_stand_for_all_that_match_in_order(folder: Path) -> None:
 
 def test_each_keeps_what_the_entry_says(folder: Path) -> None:
     entry = JobScene(uri="runs/*", frames="::5", cameras=("front",), recipes=("fog",))
-    for scene in scenes_of([entry], folder):
+    for scene in expand_job_scenes([entry], folder):
         assert (scene.frames, scene.cameras, scene.recipes) == ("::5", ("front",), ("fog",))
 
 

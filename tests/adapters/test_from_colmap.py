@@ -110,7 +110,7 @@ def poses(out: Path) -> np.ndarray:
 def test_a_cameras_height_gives_metres_and_the_road_says_what_is_level(project, tmp_path):
     out = tmp_path / "drive"
     made = record(project, out, camera_height_m=1.51)
-    assert (made.frames, made.images, made.left_out) == (FRAMES, FRAMES, 1)
+    assert (made.frames, made.images, made.num_images_without_pose) == (FRAMES, FRAMES, 1)
     assert made.metres == pytest.approx(1 / SCALE, rel=0.01)
     found, known = poses(out), np.stack([world_from_camera(f) for f in range(FRAMES)])
     # The world begins under the first camera, which looks along x: it was turned by nothing.

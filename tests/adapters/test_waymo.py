@@ -21,7 +21,7 @@ from adapters.base import detect_scheme_of_path, open_scene
 from adapters.raw_drive import IncompleteDrive, RawDrive
 from adapters.waymo.adapter import WaymoOptions, read_waymo, waymo_labels
 from adapters.waymo.tables import Rows, SegmentFiles
-from augment.effects.lidar.beam import reflectances
+from augment.effects.lidar.beam import find_reflectances
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, decode_image, has_image, is_whole_jpeg
 from augment.recorded_sky import lidar_top_rad
@@ -104,7 +104,7 @@ def test_a_sweeps_columns_and_classes(written: Path) -> None:
     assert raw.max() > 1000 and np.isclose(np.median(raw), 0.3)
     np.testing.assert_allclose(sweep.columns["intensity"], np.tanh(raw))
     assert np.isclose(
-        np.median(reflectances(sweep)), np.tanh(0.3)
+        np.median(find_reflectances(sweep)), np.tanh(0.3)
     )  # weather takes them for fractions
     classes = labels.lidar_classes(sweep)
     is_top, points = sweep.columns["sensor"] == 1, sweep.points_m

@@ -235,14 +235,14 @@ def make_bed(x_m: float) -> ExposedSurface:
         centers_m=torch.tensor([[x_m, 0.0, 0.0]]),
         normals=torch.tensor([[0.0, 0.0, 1.0]]),
         sizes_m=torch.ones(1),
-        edge_m=torch.ones(1),
+        edge_distance_m=torch.ones(1),
         neighbours=torch.full((1, 4), OPEN_EDGE, dtype=torch.int32),
-        light=torch.ones(1),
-        tracks=torch.zeros(1),
-        banks=torch.zeros(1, 2),
+        relative_light=torch.ones(1),
+        track_share=torch.zeros(1),
+        obstacle_vectors=torch.zeros(1, 2),
         semantic=torch.zeros(1, dtype=torch.int16),
-        buried=torch.zeros(0, dtype=torch.int32),
-        buried_by=torch.zeros(0, 5, dtype=torch.int32),
+        hideable_ids=torch.zeros(0, dtype=torch.int32),
+        covering_cells=torch.zeros(0, 5, dtype=torch.int32),
     )
     return ExposedSurface(cells, {})
 

@@ -23,7 +23,7 @@ def make_boxes(*boxes: tuple, origin: np.ndarray = ORIGIN_M) -> Boxes:
 
 
 def placed(boxes: Boxes) -> WorldBoxes:
-    return WorldBoxes.of(boxes, ORIGIN_M)
+    return WorldBoxes.from_labels(boxes, ORIGIN_M)
 
 
 def make_camera(width: int = 160, height: int = 106, pitch: float = 0.0) -> Camera:

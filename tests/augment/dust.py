@@ -41,7 +41,12 @@ class Dust(EffectModel):
     knobs = (Knob("distance", ("depth", "ray"), "how far dust is looked through", 11),)
     columns = (
         Column(
-            "dust_half_m", lambda dust: dust.half_m, "Half tinted", "m", shows="all", label="dust"
+            "dust_half_m",
+            lambda dust: dust.half_m,
+            "Half tinted",
+            "m",
+            presence_values="all",
+            label="dust",
         ),
     )
 
@@ -63,19 +68,19 @@ class DustEffect(Effect):
         file="labels/dust.parquet",
         kind="box dust",
         columns={"clear_fraction": np.float64},
-        sampled=("clear_fraction",),
-        visible="clear_fraction",
+        sample_columns=("clear_fraction",),
+        visible_column="clear_fraction",
     )
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
-        dust = self.of(recipe)
+        dust = self.section_of(recipe)
         if dust is None:
             return EffectPlan(None, skipped((TINT,), "the recipe has no dust", PICTURE))
         step = Step(TINT, True, f"half of what stands {dust.half_m:g} m away is dust", PICTURE)
         return EffectPlan(dust, (step,), buffers=frozenset({EXPECTED_DEPTH}))
 
     def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
-        raster, dust = drawn.raster, own.data
+        raster, dust = drawn.raster, own.settings
         assert raster.expected_depth is not None and raster.alpha is not None
         with timed(TINT):
             metres = raster.expected_depth
@@ -91,7 +96,7 @@ class DustEffect(Effect):
         self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
         away_m = np.linalg.norm(placed.centres_m - camera.centre.numpy(), axis=1)
-        return {"clear_fraction": np.exp2(-away_m / view.placed.data.half_m)}
+        return {"clear_fraction": np.exp2(-away_m / view.plan.data.half_m)}
 
     def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
-        echoes.gain *= np.exp2(-2 * echoes.air_m / own.data.half_m)  # there and back
+        echoes.gain *= np.exp2(-2 * echoes.air_path_m / own.settings.half_m)  # there and back

@@ -24,7 +24,7 @@ from augment.effects.snow.support import exposed_surface_of
 from augment.geometry import rigid
 from augment.memo import memo_of
 from augment.plan import make_plan
-from augment.render.composite import quantise
+from augment.render.composite import to_byte_array
 from augment.scene import Actor, Gaussians, Ground, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
@@ -455,7 +455,7 @@ def rendered(scene: Scene, camera: Camera, recipe: Recipe) -> WeatheredView:
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan)
     check_buffers(buffers, recipe)
     check_view(view, scene, recipe)
-    assert np.array_equal(quantise(buffers.rgb), view.rgb), "two renders of one frame differ"
+    assert np.array_equal(to_byte_array(buffers.rgb), view.rgb), "two renders of one frame differ"
     return view
 
 
@@ -464,7 +464,9 @@ def check_buffers(buffers: WeatheredBuffers, recipe: Recipe) -> None:
     size = (buffers.camera.height, buffers.camera.width)
     assert tuple(buffers.rgb.shape) == (*size, 3)
     assert bool(torch.isfinite(buffers.rgb).all()), "a colour is not finite"
-    rasters = [buffers.raster] + ([] if buffers.bare is None else [buffers.bare.raster])
+    rasters = [buffers.raster] + (
+        [] if buffers.bare_buffers is None else [buffers.bare_buffers.raster]
+    )
     for raster in rasters:
         alpha = raster.alpha
         if alpha is None:  # of a view with water, of which nothing but the picture was asked
@@ -494,7 +496,9 @@ def check_view(view: WeatheredView, scene: Scene, recipe: Recipe) -> None:
     if view.depth_m is not None:
         assert view.depth_m.dtype == np.float32 and view.depth_m.shape == size
         assert np.isfinite(view.depth_m).all() and (view.depth_m >= 0).all()
-    masks = {e.mask for e in effects.EFFECTS if e.mask and e.of(recipe) is not None}
+    masks = {
+        e.mask_name for e in effects.EFFECTS if e.mask_name and e.section_of(recipe) is not None
+    }
     assert view.masks.keys() == masks
     for mask in view.masks.values():
         assert mask.dtype == np.uint8 and mask.shape == size

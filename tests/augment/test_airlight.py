@@ -11,7 +11,7 @@ from augment.cameras import Camera
 from augment.effects.smog import fog_before_color_map
 from augment.plan import make_plan
 from augment.render.buffers import RenderOutput
-from augment.render.composite import add_elevation, composite_sky, simplify_sky
+from augment.render.composite import add_airlight_elevation, composite_sky, simplify_sky
 from augment.render.fog import Fog, airlight_gain
 from augment.scene import Ground, Scene
 from augment.sky import CubemapSky
@@ -125,12 +125,12 @@ def test_a_camera_that_is_blind_to_a_channel_does_not_blow_up():
     nothing, faint = torch.zeros(3, 4), 1e-20 * torch.eye(3, 4)
     mixed = torch.tensor([[1.0, 1, 1, 0], [1, 1, 1, 0], [1, 1, 1.001, 0]])  # all but singular
     for color_map in (blind, nothing, faint, mixed, 0.01 * mixed, 1e6 * mixed):
-        found = np.array(fog_before_color_map(fog, color_map, common).rgb)
+        found = np.array(fog_before_color_map(fog, color_map, common).airlight_rgb)
         # No residual counts for more than 1 / (2 sqrt(1e-4)) = 50 times itself.
         residual = (common - color_map)[:, :3] @ torch.tensor(AIR).double() + common[:, 3]
         assert np.linalg.norm(found - AIR) <= 50.01 * float(residual.norm())
-    assert fog_before_color_map(fog, nothing, common).rgb == pytest.approx(AIR)
-    red, green, _ = fog_before_color_map(fog, blind, common).rgb
+    assert fog_before_color_map(fog, nothing, common).airlight_rgb == pytest.approx(AIR)
+    red, green, _ = fog_before_color_map(fog, blind, common).airlight_rgb
     assert red == pytest.approx(AIR[0]) and green == pytest.approx(1.05 * AIR[1] + 0.0575, abs=1e-3)
 
 
@@ -139,13 +139,13 @@ def test_a_camera_that_is_blind_to_a_channel_does_not_blow_up():
 
 def test_an_overcast_zenith_has_three_times_the_horizons_luminance():
     """Moon and Spencer 1942; below, its reciprocal. In luminance: display values to the 2.2."""
-    fog = Fog(0.1, AIR, overcast=1.0)
+    fog = Fog(0.1, AIR, elevation_gain=1.0)
     slopes = torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0])
     airlight = torch.tensor(AIR) + airlight_gain(fog, slopes)
     luminance = (airlight / torch.tensor(AIR)) ** 2.2
     for channel in range(3):
         assert luminance[:, channel].tolist() == pytest.approx([1 / 3, 1 / 2, 1, 2, 3], rel=1e-5)
-    none = airlight_gain(dataclasses.replace(fog, overcast=0.0), slopes)
+    none = airlight_gain(dataclasses.replace(fog, elevation_gain=0.0), slopes)
     assert torch.equal(none, torch.zeros(5, 3))
 
 
@@ -160,7 +160,7 @@ def test_pixels_show_the_airlight_of_their_rays(road, smog):
     share = picture(road, "left", of((1.0, 1.0, 1.0))) - picture(road, "left", of((0.0, 0.0, 0.0)))
     rays = camera().ray_directions()
     slope = rays[..., 2] / rays.norm(dim=-1)
-    expected = plain + share * airlight_gain(Fog(0.03, AIR, overcast=0.5), slope)
+    expected = plain + share * airlight_gain(Fog(0.03, AIR, elevation_gain=0.5), slope)
     # The fog's share of a pixel of many splats is judged by their mean depth: half a grey level,
     # but two along silhouettes.
     error = (bent - expected).abs()
@@ -171,7 +171,7 @@ def test_pixels_show_the_airlight_of_their_rays(road, smog):
     common = torch.stack(list(MAPS.values())).mean(0)
     own = {name: picture(mapped, name, of(AIR, 0.5)) for name in CAMERAS}
     flat = {name: picture(mapped, name, of(AIR)) for name in CAMERAS}
-    added = share * (airlight_gain(Fog(0.03, AIR, overcast=0.5), slope) @ common[:, :3].T)
+    added = share * (airlight_gain(Fog(0.03, AIR, elevation_gain=0.5), slope) @ common[:, :3].T)
     for name in CAMERAS:  # the same to all cameras
         assert float((own[name] - flat[name] - added).abs().max()) < 0.01
 
@@ -194,7 +194,7 @@ def test_without_overcast_no_bit_changes_and_no_depth_is_drawn(road):
 @pytest.mark.parametrize("height", [None, 12.0])
 @pytest.mark.parametrize("eye_z", [1.5, -40.0])  # the latter far below the fog's base
 def test_the_kernels_are_the_definition(height, eye_z):
-    fog = Fog(0.04, AIR, height, 0.0, overcast=0.7, varying_rgb=(0.6, 0.7, 0.9))
+    fog = Fog(0.04, AIR, height, 0.0, elevation_gain=0.7, varying_airlight_rgb=(0.6, 0.7, 0.9))
     view = camera_ahead(53, 37, 20.0, position=(0.0, 0.0, eye_z), yaw=0.4)
     generator = torch.Generator().manual_seed(1)
     rgb, alpha = torch.rand(37, 53, 3, generator=generator), torch.rand(37, 53, generator=generator)
@@ -207,7 +207,7 @@ def test_the_kernels_are_the_definition(height, eye_z):
 
     def bent(backend, **options):
         raster = RenderOutput(rgb=rgb.clone(), alpha=alpha, expected_depth=depth)
-        return add_elevation(raster, view, fog, backend=backend, **options)
+        return add_airlight_elevation(raster, view, fog, backend=backend, **options)
 
     fast, slow = both(lambda on: bent(on, behind=True))
     assert torch.allclose(fast, slow, atol=2e-5)
@@ -221,7 +221,7 @@ def test_the_kernels_are_the_definition(height, eye_z):
 
 def test_endless_fog_is_a_sky_of_its_airlight(road):
     """Which water mirrors, too."""
-    fog = Fog(0.05, AIR, overcast=1.0)
+    fog = Fog(0.05, AIR, elevation_gain=1.0)
     sky, before = simplify_sky(road.sky, fog)
     assert before is None
     rays = torch.randn(500, 3, generator=torch.Generator().manual_seed(2))

@@ -266,9 +266,9 @@ def test_a_lock_held_for_ever_is_waited_for_no_longer_than_said(tmp_path):
     waiter = open_lock(path)
     fcntl.flock(holder, fcntl.LOCK_EX)
     with pytest.raises(OutputError, match=r"has held this lock for 0 s \(builds\); end it"):
-        wait_for_lock(path, waiter, patience_s=0.1, doing="builds")
+        wait_for_lock(path, waiter, patience_s=0.1, activity="builds")
     fcntl.flock(holder, fcntl.LOCK_UN)
-    wait_for_lock(path, waiter, patience_s=0.1, doing="builds")
+    wait_for_lock(path, waiter, patience_s=0.1, activity="builds")
     os.close(holder)
     os.close(waiter)
 

@@ -196,7 +196,7 @@ def test_a_close_thing_ends_where_the_photo_shows_its_end():
             assert bool((row_transmittance[170:] < 0.3).all())
         else:
             values = torch.where(depth < 10, 0.9, 0.1)
-            assert torch.equal(photo.aligned(values, torch.ones(180, 320), depth), values)
+            assert torch.equal(photo.align_edges(values, torch.ones(180, 320), depth), values)
 
 
 STREET = "procedural:street?seed=3&frames=1"
@@ -257,24 +257,32 @@ def test_splats_say_by_marks_what_a_style_does_to_them(scene):
 
     def shown(style, dtype=torch.float32):
         photo = dataclasses.replace(open_photo(scene, camera, None, backend="cpu"), style=style)
-        parts, buffers = photo.prepare(scene.parts_for(camera))
+        parts, buffers = photo.prepare_parts(scene.parts_for(camera))
         raster = rasterize(parts, camera, buffers=buffers | {"alpha"})
         moved = {name: getattr(raster, name) for name in ("rgb", "alpha")}
         moved = {name: None if own is None else own.to(dtype) for name, own in moved.items()}
         return photo.clear_picture(dataclasses.replace(raster, **moved), parts)
 
-    by_marks, by_ids = shown(full_style), shown(dataclasses.replace(full_style, marks=None))
+    by_marks, by_ids = shown(full_style), shown(dataclasses.replace(full_style, mark_maps=None))
     assert float((by_marks - by_ids).abs().quantile(0.9)) < 0.01
     torch.testing.assert_close(
         by_marks, shown(full_style, torch.float64).float(), rtol=0, atol=1e-5
     )
     single_style = dataclasses.replace(
-        full_style, splats=maps[:1], others=None, marks=full_style.marks[:: len(maps)]
+        full_style,
+        surface_maps=maps[:1],
+        other_splat_maps=None,
+        mark_maps=full_style.mark_maps[:: len(maps)],
     )
-    single_style = dataclasses.replace(single_style, rows=levels)  # one map for all takes a kernel
-    fast, slow = shown(single_style), shown(dataclasses.replace(single_style, others=maps[:0]))
+    single_style = dataclasses.replace(
+        single_style, mark_rows=levels
+    )  # one map for all takes a kernel
+    fast, slow = (
+        shown(single_style),
+        shown(dataclasses.replace(single_style, other_splat_maps=maps[:0])),
+    )
     torch.testing.assert_close(fast, slow, rtol=0, atol=1e-6)
-    by_ids = shown(dataclasses.replace(single_style, marks=None))
+    by_ids = shown(dataclasses.replace(single_style, mark_maps=None))
     assert float((fast - by_ids).abs().quantile(0.9)) < 0.01
 
 

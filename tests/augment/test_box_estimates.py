@@ -54,8 +54,8 @@ def label(
     view = WeatheredView(CAMERA, np.zeros((*size, 3), np.uint8), None, None, none, surface=surface)
     labelled = make_boxes(*(boxes or (CAR,)))
     evidence = Evidence(
-        SortedPoints.of(np.array(returns, np.float64).reshape(-1, 3)),
-        SortedPoints.of(np.array(splats)) if splats else NO_POINTS,
+        SortedPoints.from_points(np.array(returns, np.float64).reshape(-1, 3)),
+        SortedPoints.from_points(np.array(splats)) if splats else NO_POINTS,
         frozenset(),
     )
     recipe = Recipe(
@@ -85,7 +85,7 @@ class _Labels:
 
 
 def amodal_of(*boxes: tuple) -> np.ndarray:
-    world_boxes = WorldBoxes.of(make_boxes(*boxes), ORIGIN_M)
+    world_boxes = WorldBoxes.from_labels(make_boxes(*boxes), ORIGIN_M)
     return outline_world_boxes(world_boxes, CAMERA).xyxy
 
 
@@ -144,9 +144,9 @@ def test_a_rendered_picture_shows_only_what_has_splats(splats: list, is_drawn: b
 
 
 def test_what_snow_buries_of_an_object_is_not_estimated() -> None:
-    world_boxes = WorldBoxes.of(make_boxes(CAR), ORIGIN_M)
+    world_boxes = WorldBoxes.from_labels(make_boxes(CAR), ORIGIN_M)
     depth_m = np.full((CAMERA.height, CAMERA.width), 100, np.float32)
-    evidence = Evidence(SortedPoints.of(np.array(ON_CAR)), NO_POINTS, frozenset())
+    evidence = Evidence(SortedPoints.from_points(np.array(ON_CAR)), NO_POINTS, frozenset())
     bottoms = []
     for buried_m in (0.0, 0.4):
         estimates = estimate_boxes(

@@ -319,7 +319,7 @@ def test_objects_beyond_sixteen_bits_have_no_instance(caplog) -> None:
             return Boxes(names, names, zeros, zeros, np.zeros((MAX_INSTANCE, 4)))
 
     many = Instances(("car",), (0, 1), Many())
-    assert many.of(("car", "0-0", f"0-{MAX_INSTANCE - 2}", f"0-{MAX_INSTANCE - 1}", "1-0", "no")
+    assert many.numbers_of(("car", "0-0", f"0-{MAX_INSTANCE - 2}", f"0-{MAX_INSTANCE - 1}", "1-0", "no")
                    ).tolist() == [1, 2, MAX_INSTANCE, 0, 0, 0]  # fmt: skip
     assert "instance images number 65535 of them" in caplog.text
 
@@ -369,7 +369,7 @@ def test_parked_cars_of_a_recorded_drive_have_an_instance(shared_dir) -> None:
     for sample in SceneDataset(scene, recipe, cameras=["front_camera", "left_camera"]):
         boxes = sample["boxes"]
         counts = np.bincount(sample["instance"].flatten(), minlength=MAX_INSTANCE)
-        assert boxes["instance"].tolist() == numbers.of(tuple(boxes["track_ids"])).tolist()
+        assert boxes["instance"].tolist() == numbers.numbers_of(tuple(boxes["track_ids"])).tolist()
         fractions, xyxy = boxes["visible_fraction"].numpy(), boxes["modal_xyxy"].numpy()
         area = (xyxy[:, 2] - xyxy[:, 0]) * (xyxy[:, 3] - xyxy[:, 1])
         for k in np.flatnonzero((fractions > 0.5) & (area > 500)):

@@ -70,15 +70,15 @@ def found(scene: Scene) -> CastShadows:
 
 def test_the_sun_is_where_shadows_say():
     shadows = found(street(in_sun()))
-    assert shadows.certainty == 1 and shadows.explained.max() > 0.6
+    assert shadows.certainty == 1 and shadows.explained_share.max() > 0.6
     assert abs(shadows.azimuth_deg - SUN_DEG[0]) <= 50  # a long wall's shadow tells little of it
-    np.testing.assert_allclose(shadows.ratio, RATIO, atol=0.03)
+    np.testing.assert_allclose(shadows.shade_ratio, RATIO, atol=0.03)
     spots = places()
-    lit, known_share, height_m = shadows.at(spots[:, 0], spots[:, 1])
+    lit, known_share, height_m = shadows.sample(spots[:, 0], spots[:, 1])
     inner = known_share > 0.99
     assert inner.mean() > 0.7 and np.abs(height_m[inner]).max() < 0.02
     assert ((lit > 0.5) == (in_sun() > 0.5))[inner].mean() > 0.95
-    beyond = shadows.at(np.array([1e6, np.nan]), np.array([0.0, 0.0]))
+    beyond = shadows.sample(np.array([1e6, np.nan]), np.array([0.0, 0.0]))
     assert beyond[1].tolist() == [0, 0]
 
 
@@ -174,7 +174,7 @@ def test_fading_comes_before_a_style():
     classes = torch.arange(len(scene.background)).remainder(5).to(torch.int16) - 1
     for style_maps, rows in ((maps[:1], None), (maps, classes)):
         styled = dataclasses.replace(part, color_maps=style_maps, color_rows=rows)
-        both = faded.on(styled)
+        both = faded.apply_to(styled)
         assert both.color_maps is not None and both.color_rows is not None
         found_maps = both.color_maps[both.color_rows.long()]
         row = (
@@ -218,5 +218,5 @@ def test_the_streets_shadows_are_its_suns():
     spots = scene.background.means.double().numpy()[road][::7]
     spots = spots[np.abs(spots[:, 0]) < 30]
     is_lit = ~body.tree.occluded(spots + np.array([0, 0, 0.02]), body.lighting.to_sun)
-    lit, known_share, _ = shadows.at(spots[:, 0], spots[:, 1])
+    lit, known_share, _ = shadows.sample(spots[:, 0], spots[:, 1])
     assert ((lit > 0.5) == is_lit)[known_share > 0.99].mean() > 0.9

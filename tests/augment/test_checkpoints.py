@@ -16,7 +16,13 @@ import torch
 from torch import nn
 
 from augment.errors import AdapterError
-from augment.files.checkpoints import load_checkpoint, release, section, taken, tensor
+from augment.files.checkpoints import (
+    checked_tensor,
+    copy_mapped_tensor,
+    dictionary_in,
+    load_checkpoint,
+    release,
+)
 
 
 class Hostile:
@@ -36,7 +42,7 @@ def test_tensors_and_parameters_arrive(tmp_path):
     xyz = torch.randn(1000, 3)
     path = saved(tmp_path, {"part": {"xyz": nn.Parameter(xyz), "degree": 1}, "iter": 5})
     content = load_checkpoint(path)
-    found = tensor(section(content, "part", "model"), "xyz", (None, 3), "model, part")
+    found = checked_tensor(dictionary_in(content, "part", "model"), "xyz", (None, 3), "model, part")
     assert torch.equal(found, xyz) and not found.requires_grad and content["iter"] == 5
 
 
@@ -69,27 +75,27 @@ def test_damaged_files_are_named(tmp_path):
 def test_what_is_missing_or_of_another_shape_is_named():
     content = {"xyz": torch.zeros(4, 2), "part": {}, "ids": torch.zeros(4, dtype=torch.int64)}
     with pytest.raises(AdapterError, match=r"model lacks the tensor 'scale'; it holds xyz, part"):
-        tensor(content, "scale", (None, 3), "model")
+        checked_tensor(content, "scale", (None, 3), "model")
     with pytest.raises(AdapterError, match=r"xyz must be float32 \[any, 3\]; got float32 \[4, 2\]"):
-        tensor(content, "xyz", (None, 3), "model")
+        checked_tensor(content, "xyz", (None, 3), "model")
     with pytest.raises(AdapterError, match=r"ids must be float32 \[4\]; got int64 \[4\]"):
-        tensor(content, "ids", (4,), "model")
-    assert tensor(content, "ids", (4,), "model", dtype=None).dtype == torch.int64
+        checked_tensor(content, "ids", (4,), "model")
+    assert checked_tensor(content, "ids", (4,), "model", dtype=None).dtype == torch.int64
     with pytest.raises(AdapterError, match="model holds no dictionary 'xyz'"):
-        section(content, "xyz", "model")
+        dictionary_in(content, "xyz", "model")
 
 
 def test_copies_are_whole_and_released_pages_come_back(tmp_path):
     source = torch.randn(300_000, 3)
     found = load_checkpoint(saved(tmp_path, {"xyz": source}))["xyz"]
-    assert torch.equal(taken(found), source)
+    assert torch.equal(copy_mapped_tensor(found), source)
     into = torch.zeros(300_000, 4)
-    assert taken(found, into[:, :3]).data_ptr() == into.data_ptr()
+    assert copy_mapped_tensor(found, into[:, :3]).data_ptr() == into.data_ptr()
     assert torch.equal(into[:, :3], source) and float(into[:, 3].abs().max()) == 0
     release(found)
     assert torch.equal(found, source)
     few = load_checkpoint(saved(tmp_path, {"a": torch.tensor(3.0), "b": torch.zeros(0, 3)}))
-    assert float(taken(few["a"])) == 3 and taken(few["b"]).shape == (0, 3)
+    assert float(copy_mapped_tensor(few["a"])) == 3 and copy_mapped_tensor(few["b"]).shape == (0, 3)
 
 
 def test_a_file_of_before_torch_1_6_gives_the_same(tmp_path):

@@ -57,7 +57,7 @@ def elementary(which, x, out):
         elif which == 4:
             v8.store(out, at, v8.minus_abs(value))
         else:
-            v8.store(out, at, v8.sqrt(v8.maximum(value, v8.splat(np.float32(2)))) / value)
+            v8.store(out, at, v8.sqrt(v8.maximum(value, v8.broadcast(np.float32(2)))) / value)
 
 
 def apply(which, x):
@@ -241,7 +241,9 @@ def turned(rows, table, out):
         if part == 0:
             kind = v8.lane_numbers()
             v8.transpose_rows(kind, table, rows, U(3), U(9), out, U(0))
-            v8.store(out, U(512), v8.exp2_where(v8.at_least(kind, v8.splat(np.float32(3))), kind))
+            v8.store(
+                out, U(512), v8.exp2_where(v8.at_least(kind, v8.broadcast(np.float32(3))), kind)
+            )
         else:
             kind = v8.wide_columns()
             v8.transpose_rows(kind, table, rows, U(3), U(9), out, U(16))

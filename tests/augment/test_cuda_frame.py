@@ -25,7 +25,7 @@ from augment.effects.snow.placement import ExposureSettings, find_exposed_surfac
 from augment.geometry import rigid, rotmat_from_quat
 from augment.labels import Boxes
 from augment.render.buffers import CUDA, RenderOutput, available_backends
-from augment.render.composite import composite_sky, map_colors, quantise
+from augment.render.composite import apply_color_map, composite_sky, to_byte_array
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.runtime import upload
 from augment.render.fog import Fog, apply_fog_to_render
@@ -124,10 +124,10 @@ def test_smog_on_buffers(away, medium):
 def test_colour_maps(away):
     matrix = torch.tensor([[1.1, 0.05, 0, 0.02], [-0.1, 0.9, 0.1, 0], [0, 0.2, 1.2, -0.05]])
     rgb = images().rgb
-    expected = map_colors(rgb, matrix, backend="reference")
-    got = map_colors(upload(rgb), matrix, backend="cuda")
+    expected = apply_color_map(rgb, matrix, backend="reference")
+    got = apply_color_map(upload(rgb), matrix, backend="cuda")
     torch.testing.assert_close(got.cpu(), expected, atol=1e-6, rtol=0)
-    double = map_colors(upload(rgb.double()), matrix, backend="cuda")  # left to torch
+    double = apply_color_map(upload(rgb.double()), matrix, backend="cuda")  # left to torch
     torch.testing.assert_close(double.cpu(), expected.double(), atol=1e-6, rtol=0)
 
 
@@ -145,7 +145,7 @@ def test_finished_pixels_become_opaque(away, without):
 
 def test_eight_bits_of_an_image_on_the_gpu(away):
     rgb = 1.4 * images().rgb - 0.2
-    assert (quantise(upload(rgb)) == quantise(rgb)).all()
+    assert (to_byte_array(upload(rgb)) == to_byte_array(rgb)).all()
 
 
 # --- whole views --------------------------------------------------------------------------------
@@ -311,10 +311,10 @@ def test_a_copy_lives_as_long_as_its_tensor_and_follows_its_changes(monkeypatch)
     with pretended_gpu(monkeypatch):
         before = len(gpu._copies)
         tensor = torch.arange(6.0)
-        copy = gpu.resident(tensor)
-        assert isinstance(copy, AwayTensor) and gpu.resident(tensor) is copy
+        copy = gpu.gpu_copy(tensor)
+        assert isinstance(copy, AwayTensor) and gpu.gpu_copy(tensor) is copy
         tensor[0] = 9
-        assert float(gpu.resident(tensor)[0]) == 9
+        assert float(gpu.gpu_copy(tensor)[0]) == 9
         del tensor, copy
         gc.collect()
         assert len(gpu._copies) == before

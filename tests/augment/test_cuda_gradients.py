@@ -216,7 +216,7 @@ def test_what_is_compiled_into_gsplat_cannot_be_set(monkeypatch, settings, messa
 def test_gradients_that_no_kernel_has_are_refused():
     camera = camera_ahead(9, 9, 9.0)
     colour, shape = (tracked(PosedGaussians(one_gaussian()), name) for name in ("sh", "means"))
-    smog = Fog(sigma_per_m=0.1, rgb=(0.5, 0.5, 0.5))
+    smog = Fog(extinction_per_m=0.1, airlight_rgb=(0.5, 0.5, 0.5))
     with pytest.raises(ValueError, match=r"gradients through fog.* 'reference', on the CPU"):
         rasterize([colour], camera, fog=smog, backend="cuda")
     with pytest.raises(ValueError, match="gradients of median_depth"):

@@ -255,8 +255,8 @@ def test_all_kinds_of_parts():
     [
         pytest.param(SURFACE_DEPTHS_ONLY, False, marks=LONG),
         pytest.param(HeightClip(0.1, "above"), False, marks=LONG),
-        pytest.param(HeightClip(0.1, "below", reach_m=0.5), False, marks=LONG),
-        (HeightClip(0.2, "below", overlaps=True), True),
+        pytest.param(HeightClip(0.1, "below", max_distance_m=0.5), False, marks=LONG),
+        (HeightClip(0.2, "below", has_overlap=True), True),
     ],
 )
 def test_clips_and_parallel_rays(clip, is_orthographic):

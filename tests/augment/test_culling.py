@@ -64,7 +64,7 @@ def assert_same_bits(a: RenderOutput, b: RenderOutput, buffers=PICTURE):
 
 def places_read(gaussians: Gaussians, camera: Camera, settings=PLAIN, fog=None, clip=None) -> int:
     inputs = gather_inputs(
-        [PosedGaussians(gaussians)], camera, settings, fog, clip, with_color=True, culled=True
+        [PosedGaussians(gaussians)], camera, settings, fog, clip, with_color=True, is_culled=True
     )
     return int((inputs.blocks[:, 2] - inputs.blocks[:, 1]).sum())
 
@@ -83,7 +83,7 @@ def test_blocks_change_no_bit(kind: str):
     away = wide_camera(70, (61, 43), at=(9.0, 7.0, 3.0), turn=-1.0)
     pose = random_pose(1)
     for view in (camera, away, dataclasses.replace(camera, is_orthographic=True)):
-        for clip in (None, HeightClip(0.1, "above"), HeightClip(0.4, "below", reach_m=0.5)):
+        for clip in (None, HeightClip(0.1, "above"), HeightClip(0.4, "below", max_distance_m=0.5)):
             fresh = [PosedGaussians(copy_of(scene)), PosedGaussians(copy_of(scene), pose)]
             known = [PosedGaussians(drawn(scene)), PosedGaussians(scene, pose)]
             expected = draw(fresh, view, BUFFERS, clip=clip)
@@ -126,7 +126,7 @@ def test_rows_go_with_their_order():
     scene = random_gaussians(COUNT)
     own = spatial_order(drawn(scene))
     assert own is not None
-    another = own.without(scene.opacities.numpy() < 0.5, scene.means.numpy())
+    another = own.without_faint(scene.opacities.numpy() < 0.5, scene.means.numpy())
     rows = weakref.ref(another.sorted(scene.scales).rows)
     gc.disable()
     try:

@@ -470,10 +470,10 @@ def test_columns_are_the_manifests(folder: Path, checksum: str | None) -> None:
         "snow_depth_m": pa.array([float("nan")] * count),
     }
     table = pa.concat_tables([pa.table(columns).slice(0, 9), pa.table(columns).slice(9)])
-    rows = pickle.loads(pickle.dumps(Rows.of(table)))
+    rows = pickle.loads(pickle.dumps(Rows.from_table(table)))
     assert same_tables(rows.to_arrow(), table)
     assert all(same_row(rows.row(k), table, k) for k in (0, 1, 2, count - 1))
-    assert same_tables(Rows.of(table.slice(0, 0)).to_arrow(), table.slice(0, 0))
+    assert same_tables(Rows.from_table(table.slice(0, 0)).to_arrow(), table.slice(0, 0))
 
 
 def same_row(row: dict, table: pa.Table, number: int) -> bool:

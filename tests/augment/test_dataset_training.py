@@ -157,14 +157,14 @@ def test_clips_never_span_a_pause(written: Path) -> None:
     late_ns = 300_000_000 * (table["frame"].to_numpy() >= 4)
     times = pa.array(table["timestamp_ns"].to_numpy() + late_ns)
     place = table.column_names.index("timestamp_ns")
-    alley.rows = Rows.of(table.set_column(place, "timestamp_ns", times))
+    alley.rows = Rows.from_table(table.set_column(place, "timestamp_ns", times))
     assert frames_of(ClipDataset(alley, 2)) == [[0, 1], [1, 2], [2, 3], [4, 5]]
 
 
 def test_pairs_show_the_same_moment(written: Path) -> None:
     dataset = WeatherDataset(written)
     pairs = PairedDataset.of(dataset)
-    assert len(pairs) == 24 and pairs.unpaired == 0
+    assert len(pairs) == 24 and pairs.num_unpaired == 0
     moments = set()
     for index in range(len(pairs)):
         clean, weathered = pairs[index]["clean"], pairs[index]["weathered"]
@@ -176,7 +176,7 @@ def test_pairs_show_the_same_moment(written: Path) -> None:
     assert moments == {"fog-000", "clear-009"}
     fog_pairs = PairedDataset.of(dataset, clean_variant="fog-000")
     assert len(fog_pairs) == 24 and fog_pairs[0]["clean"]["variant"] == "fog-000"
-    assert fog_pairs.unpaired == 12  # alley has no fog
+    assert fog_pairs.num_unpaired == 12  # alley has no fog
 
 
 def test_what_is_clean(written: Path, tmp_path: Path) -> None:
@@ -244,7 +244,7 @@ def test_mixtures_depend_on_seed_epoch_and_index_only(written: Path) -> None:
 def test_every_sample_once_over_all_ranks(uneven) -> None:
     for count, ranks in ((0, 1), (0, 3), (1, 5), (7, 2), (7, 3), (24, 1), (24, 3), (24, 5)):
         samplers = [
-            ShardedSampler(count, rank=rank, ranks=ranks, seed=5, uneven=uneven)
+            ShardedSampler(count, rank=rank, ranks=ranks, seed=5, remainder=uneven)
             for rank in range(ranks)
         ]
         shares = [list(sampler) for sampler in samplers]
@@ -274,7 +274,7 @@ def test_an_epoch_goes_on_after_an_interruption(ranks_after: int) -> None:
     for sampler in before:
         sampler.set_epoch(6)
     trained = [index for sampler in before for index in list(sampler)[:5]]
-    state = json.loads(json.dumps(before[1].state_dict(given=5)))
+    state = json.loads(json.dumps(before[1].state_dict(num_trained=5)))
     after = [ShardedSampler(23, rank=r, ranks=ranks_after, seed=4) for r in range(ranks_after)]
     for sampler in after:
         sampler.load_state_dict(state)
@@ -284,7 +284,7 @@ def test_an_epoch_goes_on_after_an_interruption(ranks_after: int) -> None:
     assert sum(map(len, after)) == 13
     # Stopped again, three samples of each rank later.
     again = ShardedSampler(23, seed=4)
-    again.load_state_dict(after[0].state_dict(given=3))
+    again.load_state_dict(after[0].state_dict(num_trained=3))
     assert len(again) == 13 - 3 * ranks_after
     again.set_epoch(7)
     assert len(again) == 23
@@ -303,7 +303,7 @@ def test_a_sampler_knows_what_it_gave_out(unchecked) -> None:
     with pytest.raises(ValueError, match="rank must be 0 to 1 of 2; got 2"):
         ShardedSampler(4, rank=2, ranks=2)
     with pytest.raises(ValueError, match="uneven must be one of exact, pad, drop; got 'cut'"):
-        ShardedSampler(4, uneven="cut")
+        ShardedSampler(4, remainder="cut")
 
 
 def test_ranks_and_workers_share_an_epoch(written: Path) -> None:

@@ -16,7 +16,7 @@ from scenes import camera_ahead, random_gaussians, slight_pose
 from adapters.base import open_scene
 from augment.errors import OutputError, SceneError
 from augment.files.export import (
-    baked,
+    bake_scene,
     export_cameras,
     export_glb,
     export_losses,
@@ -88,18 +88,18 @@ def test_a_baked_scene_renders_as_the_scene(offset_ns):
     scene, time_ns = drive(), START_NS + offset_ns
     ours, theirs = (
         image(tuple(scene.parts_at(time_ns))),
-        image([PosedGaussians(baked(scene, time_ns))]),
+        image([PosedGaussians(bake_scene(scene, time_ns))]),
     )
     assert np.quantile(differences(ours, theirs), 0.999) < 0.05  # rounding; cut-offs may flip
     bare = image([PosedGaussians(scene.background)])
     assert differences(ours, bare).max() > 20  # the actors are in view
-    later = image([PosedGaussians(baked(scene, time_ns + 60_000_000))])
+    later = image([PosedGaussians(bake_scene(scene, time_ns + 60_000_000))])
     assert differences(ours, later).max() > 10  # and are not the same at another moment
 
 
 def test_what_baked_gaussians_are():
     scene = drive()
-    gaussians = baked(scene, NOW)
+    gaussians = bake_scene(scene, NOW)
     assert len(gaussians) == 300 + 60 + 40 and gaussians.sh_degree == 3
     for name in ("means", "quats", "scales", "opacities", "semantic"):
         ours, theirs = getattr(gaussians, name), getattr(scene.background, name)
@@ -116,13 +116,13 @@ def test_what_baked_gaussians_are():
 
 def test_scenes_with_less_in_them():
     alone = drive(actors=())
-    assert baked(alone, NOW) is alone.background
+    assert bake_scene(alone, NOW) is alone.background
     gone = drive(background=Gaussians.empty(3), actors=drive().actors[2:])
-    assert len(baked(gone, NOW)) == 0
+    assert len(bake_scene(gone, NOW)) == 0
     plain = drive(background=random_gaussians(5, sh_degree=0), actors=drive().actors[1:2])
-    assert baked(plain, NOW).sh_degree == 0
+    assert bake_scene(plain, NOW).sh_degree == 0
     bare = dataclasses.replace(drive().actors[0], color_waves=None)
-    assert baked(drive(background=random_gaussians(5), actors=(bare,)), NOW).semantic is None
+    assert bake_scene(drive(background=random_gaussians(5), actors=(bare,)), NOW).semantic is None
 
 
 UNIT = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for v in q) > 0.1)
@@ -163,7 +163,7 @@ def test_a_ply_keeps_all_but_rounding(tmp_path):
     scene = drive(background=with_classes(random_gaussians(20_000, seed=9, sh_degree=3)))
     export_ply(scene, tmp_path / "a.ply", NOW)
     file = read_ply(tmp_path / "a.ply")
-    written, read = baked(scene, NOW), file.gaussians
+    written, read = bake_scene(scene, NOW), file.gaussians
     for name in ("means", "sh", "semantic"):
         assert torch.equal(getattr(read, name), getattr(written, name)), name
     assert 0 < ulps(read.scales, written.scales) <= 5

@@ -210,7 +210,7 @@ def surface(cells: ExposedCells, snow: Snow, seed: int) -> np.ndarray:
     rng = rng_for(seed=seed, scene="extremes", effect="snow")
     profile = make_depth_profile(snow, rng, on_ground=True)
     depths = find_depths(cells, profile, rng.integers(0, 2**64, dtype=np.uint64))
-    return find_snow_tops(cells, depths.heights)
+    return find_snow_tops(cells, depths.depths_m)
 
 
 @pytest.mark.long

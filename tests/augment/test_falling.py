@@ -269,7 +269,7 @@ def test_nothing_falls_at_rate_0():
     weather = Weather(rain=Rain(rate_mm_h=0.0), snowfall=Snowfall(rate_mm_h=0.0))
     clean, dry = (render_view(scene, camera, r) for r in (Recipe(), Recipe(weather=weather)))
     assert (clean.rgb == dry.rgb).all()
-    placed = make_plan(Recipe(weather=weather), scene).placed
+    placed = make_plan(Recipe(weather=weather), scene).effect_plans
     assert not any(s.runs for name in ("rain", "snowfall") for s in placed[name].steps)
 
 
@@ -344,7 +344,7 @@ def test_a_turning_camera_turns_while_the_shutter_is_open():
 def test_without_times_cameras_stand():
     scene = drive(seconds=0.0)
     assert motion_of(scene, scene.frames[0].cameras["front"]) is STANDING
-    (step,) = make_plan(rain(5.0), scene).placed["rain"].steps
+    (step,) = make_plan(rain(5.0), scene).effect_plans["rain"].steps
     assert "so they stand" in step.why
 
 

@@ -30,10 +30,10 @@ from augment.effects.lidar import ATTENUATED, LOST, MOVED, PRECIPITATION, UNCHAN
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import fog_echoes
-from augment.effects.wet.ground import CELL_M, WetGround
-from augment.effects.wet.kernels import NUM_CHANNELS, OPEN, PUDDLE_ORDER
+from augment.effects.wet.ground import GROUND_CELL_M, WetGround
+from augment.effects.wet.kernels import EXPOSURE, NUM_CHANNELS, PUDDLE_ORDER
 from augment.effects.wet.lidar import dim_wet_echoes, wet_echo_ratio
-from augment.jobs.files import box_tables, visibility
+from augment.jobs.files import box_tables, combine_visibility
 from augment.jobs.manifest import effect_masks, read_manifest
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import lidar_bytes
@@ -62,7 +62,7 @@ def rain(rate_mm_h: float) -> Scatterers:
 
 def echoes_of(points: np.ndarray, intensity: float | np.ndarray = 0.3) -> Echoes:
     origins = np.tile(SENSOR_M + WORLD_ORIGIN_M, (len(points), 1))
-    return Echoes.of(sweep_of(points, intensity), origins, WORLD_ORIGIN_M, MODEL)
+    return Echoes.from_sweep(sweep_of(points, intensity), origins, WORLD_ORIGIN_M, MODEL)
 
 
 @pytest.mark.parametrize(
@@ -79,8 +79,8 @@ def echoes_of(points: np.ndarray, intensity: float | np.ndarray = 0.3) -> Echoes
 def test_no_echo_is_brighter_than_the_sensor_reports(recorded: np.ndarray, highest: float) -> None:
     echoes = echoes_of(some_points(3), recorded)
     echoes.source.columns["intensity"] = recorded
-    echoes.replace(np.array([2]), np.array([2.0]), np.array([1e4]), PRECIPITATION)
-    found = echoes.sweep().columns["intensity"]
+    echoes.replace_echoes(np.array([2]), np.array([2.0]), np.array([1e4]), PRECIPITATION)
+    found = echoes.to_sweep().columns["intensity"]
     assert found.dtype == recorded.dtype and found[2] == highest
     np.testing.assert_array_equal(found[:2], recorded[:2])
 
@@ -156,7 +156,7 @@ def test_rain_takes_and_adds_by_its_rate() -> None:
         clear = echoes.ranges_m.copy()
         precipitation_echoes(echoes, rain(rate), np.random.default_rng(1))
         echoes.drop_faint()
-        sweep = echoes.sweep()
+        sweep = echoes.to_sweep()
         codes = sweep.columns["weather_code"]
         hard = codes == ATTENUATED
         assert not (codes == UNCHANGED).any()
@@ -218,7 +218,7 @@ def test_precipitation_of_every_density_stays_finite() -> None:
         echoes = echoes_of(points)
         precipitation_echoes(echoes, kind, np.random.default_rng(0))
         echoes.drop_faint()
-        found = echoes.sweep()
+        found = echoes.to_sweep()
         assert np.isfinite(echoes.ranges_m).all() and np.isfinite(echoes.gain).all()
         assert (found.columns["weather_code"][-2:] == UNCHANGED).all()
         assert np.isfinite(found.columns["intensity"][:-2]).all()
@@ -229,9 +229,9 @@ def test_precipitation_of_every_density_stays_finite() -> None:
 
 def ground_of(open_: float = 1.0, hollow: float = 0.0) -> WetGround:
     """Level ground at z = 0, 60 m about the origin."""
-    side = round(120 / CELL_M)
+    side = round(120 / GROUND_CELL_M)
     channels = torch.zeros(side, side, NUM_CHANNELS)
-    channels[..., OPEN], channels[..., PUDDLE_ORDER] = open_, hollow
+    channels[..., EXPOSURE], channels[..., PUDDLE_ORDER] = open_, hollow
     flat = torch.zeros(side, side)
     return WetGround(-60.0, -60.0, channels, flat, flat + 1, np.array([-1.0, 0.0, 1.0], np.float32))
 
@@ -316,7 +316,10 @@ def test_flakes_end_more_beams_than_drops_of_the_same_rate() -> None:
         ranges.append(ranges_of(out)[drops])
     assert shares[0] < 0.01 < 0.1 < shares[1]
     assert 2 < np.median(ranges[1]) < 15
-    assert box_tables()["box_snowfall"].sampled == ("snowfall_transmittance", "flake_fraction")
+    assert box_tables()["box_snowfall"].sample_columns == (
+        "snowfall_transmittance",
+        "flake_fraction",
+    )
 
 
 def test_manifests_know_rain_by_what_falls_or_lies() -> None:
@@ -347,11 +350,11 @@ def test_boxes_say_what_rain_leaves_of_them() -> None:
         np.full((3, 3), 4.0),
         np.tile([1.0, 0, 0, 0], (3, 1)),
     )
-    placed = WorldBoxes.of(boxes, np.zeros(3))
+    placed = WorldBoxes.from_labels(boxes, np.zeros(3))
     scene = street()
-    plan = make_plan(wet(100.0), scene).placed["rain"]
-    found = effect.measure(placed, camera, LabelInputs(plan, depth, mask, None))
-    numbers = effect.table.numbers(boxes.track_ids, **found)
+    plan = make_plan(wet(100.0), scene).effect_plans["rain"]
+    found = effect.measure_boxes(placed, camera, LabelInputs(plan, depth, mask, None))
+    numbers = effect.box_table.make_numbers(boxes.track_ids, **found)
     sigma = rain(100.0).extinction_per_m
     assert numbers["rain_transmittance"][0] == pytest.approx(math.exp(-20 * sigma), abs=1e-3)
     far = math.exp(-math.hypot(20, 300) * sigma)
@@ -359,12 +362,12 @@ def test_boxes_say_what_rain_leaves_of_them() -> None:
     assert np.isnan(numbers["rain_transmittance"][2])
     assert numbers["pixels"][0] > 50 and numbers["pixels"][1] == 0
     assert numbers["streak_fraction"][0] == numbers["streak_pixels"][0] / numbers["pixels"][0] > 0
-    left = visibility({"box_rain": numbers}, 3)
+    left = combine_visibility({"box_rain": numbers}, 3)
     np.testing.assert_array_equal(left[:2], numbers["rain_transmittance"][:2])
-    unseen = effect.measure(placed, camera, LabelInputs(plan, None, None, None))
+    unseen = effect.measure_boxes(placed, camera, LabelInputs(plan, None, None, None))
     assert (unseen["pixels"] == NOT_COUNTED).all() and (unseen["streak_pixels"] == 0).all()
-    dry = make_plan(wet(0.0), scene).placed["rain"]
-    clear = effect.measure(placed, camera, LabelInputs(dry, None, None, None))
+    dry = make_plan(wet(0.0), scene).effect_plans["rain"]
+    clear = effect.measure_boxes(placed, camera, LabelInputs(dry, None, None, None))
     np.testing.assert_array_equal(clear["rain_transmittance"], [1, 1, np.nan])
 
 

@@ -25,8 +25,8 @@ from adapters.procedural import open_truth
 from augment import drawing
 from augment.boxes import BOTTOM_MARGIN_M, SIDE_MARGIN_M
 from augment.cameras import Camera, Frame
-from augment.effects.flood.effect import flood_of_recipe, hidden_pixels, submerged_fraction
-from augment.effects.flood.flood import exact, schlick
+from augment.effects.flood.effect import count_hidden_pixels, flood_of_recipe, submerged_fraction
+from augment.effects.flood.flood import fresnel_reflectance, schlick_reflectance
 from augment.effects.flood.flood_view import visible_depth_m
 from augment.geometry import rigid
 from augment.labels import Boxes
@@ -389,11 +389,11 @@ def test_labels_take_the_depth_under_water_and_only_where_there_is_water(scene):
     wet = view_of(labelled, flood(), view, depth="none")
     assert wet.depth_m is None
     seen = wet.effects["flood"]
-    assert seen.placed.water_level_z_m == pytest.approx(ROAD_Z + 0.4)
+    assert seen.plan.water_level_z_m == pytest.approx(ROAD_Z + 0.4)
     road = view.fy * 1.5 / (np.arange(60) + 0.5 - view.cy)  # 1.5 m below the camera
     assert np.abs(seen.depth_m[40:, :20] / road[40:, None] - 1).max() < 0.03
     up = view_of(labelled, flood(), camera(pitch=-1.0), depth="none")
-    assert up.effects["flood"].placed.water_level_z_m == seen.placed.water_level_z_m
+    assert up.effects["flood"].plan.water_level_z_m == seen.plan.water_level_z_m
     assert up.effects["flood"].depth_m is None
     unlabelled = view_of(scene, flood(), view, depth="none")
     assert unlabelled.effects["flood"].depth_m is None
@@ -469,7 +469,7 @@ def test_pixels_are_those_counted_one_by_one() -> None:
     # Surfaces everywhere in the boxes' space, with holes.
     depth = rng.uniform(-1, 25, (106, 160)).clip(0).astype(np.float32)
     water = np.where(rng.random((106, 160)) < 0.4, 255, 0).astype(np.uint8)
-    got = hidden_pixels(placed(boxes), camera, depth, water)
+    got = count_hidden_pixels(placed(boxes), camera, depth, water)
     extents = []
     for size in boxes.sizes_m:
         low, high = -size / 2 - SIDE_MARGIN_M, size / 2 + SIDE_MARGIN_M
@@ -478,8 +478,8 @@ def test_pixels_are_those_counted_one_by_one() -> None:
     pixels, hidden = count_by_hand(boxes, extents, camera, depth, water)
     assert sum(p > 0 for p in pixels) > 30 and sum(p == 0 for p in pixels) > 5
     assert pixels[-2] > 0  # the camera stands inside that one
-    np.testing.assert_array_equal(got.pixels, pixels)
-    np.testing.assert_array_equal(got.marked, hidden)
+    np.testing.assert_array_equal(got.num_pixels, pixels)
+    np.testing.assert_array_equal(got.num_marked, hidden)
 
 
 def test_the_road_under_a_car_is_not_the_car() -> None:
@@ -487,9 +487,15 @@ def test_the_road_under_a_car_is_not_the_car() -> None:
     camera = make_camera(pitch=0.2)
     boxes = make_boxes(((8, 0, 0.72), CAR_M, UPRIGHT))  # its bottom is 3 cm under the road
     none = np.zeros((106, 160), np.uint8)
-    assert hidden_pixels(placed(boxes), camera, plane_depth(camera, 0.0), none).pixels[0] == 0
+    assert (
+        count_hidden_pixels(placed(boxes), camera, plane_depth(camera, 0.0), none).num_pixels[0]
+        == 0
+    )
     # A bonnet or sill at 15 cm is.
-    assert hidden_pixels(placed(boxes), camera, plane_depth(camera, 0.15), none).pixels[0] > 100
+    assert (
+        count_hidden_pixels(placed(boxes), camera, plane_depth(camera, 0.15), none).num_pixels[0]
+        > 100
+    )
 
 
 def cosines(*degrees: float) -> torch.Tensor:
@@ -498,7 +504,7 @@ def cosines(*degrees: float) -> torch.Tensor:
 
 def test_head_on_both_give_the_textbook_value():
     expected = (0.333 / 2.333) ** 2
-    for model in (exact, schlick):
+    for model in (fresnel_reflectance, schlick_reflectance):
         assert float(model(cosines(0.0), 1.333)[0]) == pytest.approx(expected, rel=1e-12)
 
 
@@ -507,7 +513,9 @@ def test_brewsters_angle_leaves_only_the_perpendicular_part():
     brewster = math.degrees(math.atan(index))
     c, t = math.cos(math.radians(brewster)), math.sin(math.radians(brewster))
     rs = (c - index * t) / (c + index * t)  # refracted and reflected ray stand at right angles
-    assert float(exact(cosines(brewster), index)[0]) == pytest.approx(rs * rs / 2, rel=1e-12)
+    assert float(fresnel_reflectance(cosines(brewster), index)[0]) == pytest.approx(
+        rs * rs / 2, rel=1e-12
+    )
 
 
 def test_both_sides_of_the_surface_reflect_alike():
@@ -515,20 +523,22 @@ def test_both_sides_of_the_surface_reflect_alike():
     index, angles = 1.333, torch.linspace(0, 89, 90, dtype=torch.float64)
     c = torch.cos(torch.deg2rad(angles))
     t = torch.sqrt(1 - (1 - c * c) / index**2)
-    assert torch.allclose(exact(c, index), exact(t, 1 / index), atol=1e-12)
+    assert torch.allclose(
+        fresnel_reflectance(c, index), fresnel_reflectance(t, 1 / index), atol=1e-12
+    )
 
 
 def test_light_under_water_is_totally_reflected_beyond_the_critical_angle():
     critical = math.degrees(math.asin(1 / 1.333))
     beyond = cosines(critical + 1e-6, 60.0, 89.0, 90.0)
-    assert torch.equal(exact(beyond, 1 / 1.333), torch.ones(4, dtype=torch.float64))
-    assert float(exact(cosines(critical - 1), 1 / 1.333)[0]) < 0.7
+    assert torch.equal(fresnel_reflectance(beyond, 1 / 1.333), torch.ones(4, dtype=torch.float64))
+    assert float(fresnel_reflectance(cosines(critical - 1), 1 / 1.333)[0]) < 0.7
 
 
 def test_what_schlick_misses():
     angles = torch.linspace(0, 90, 9001, dtype=torch.float64)
     c = torch.cos(torch.deg2rad(angles))
-    miss = (schlick(c, 1.333) - exact(c, 1.333)).abs()
+    miss = (schlick_reflectance(c, 1.333) - fresnel_reflectance(c, 1.333)).abs()
     # Half a unit of the last digit of the figures in schlick's docstring.
     assert float(miss[angles <= 70].max()) == pytest.approx(0.009, abs=5e-4)
     assert float(miss[7500]) == pytest.approx(0.027, abs=5e-4)

@@ -44,7 +44,7 @@ def camera(width: int = 480, height: int = 272, *, fx: float = 490.0, pitch: flo
 
 def at_depth(view: Camera, tau: float, medium: Fog) -> torch.Tensor:
     """z at which every pixel stands behind this optical depth of uniform fog."""
-    return tau / medium.sigma_per_m / view.ray_lengths()
+    return tau / medium.extinction_per_m / view.ray_lengths()
 
 
 FOG = Fog(0.05, GREY)

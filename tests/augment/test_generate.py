@@ -367,7 +367,7 @@ def test_a_dataset_job_measures_what_bound_it(tmp_path: Path) -> None:
     assert timings["publish"] > 0
     shares = compute_time_shares(timings)
     assert shares is not None
-    assert shares.rendering + shares.held + shares.beside == pytest.approx(1)
+    assert shares.rendering + shares.waiting_for_files + shares.other_work == pytest.approx(1)
     assert compute_time_shares(run(job_of(tmp_path, "auto")).timings) is None
 
 
@@ -433,7 +433,7 @@ def digested_job(out: Path, digest: str | None, **options) -> GenerateJob:
     job = small_job(out, **options)
     digests = {"fake:a?frames=2": digest, "fake:b?frames=1": "content of b"}
     digest_of = None if digest is None else digests.get
-    return replace(job, setup=replace(job.setup, digest_of=digest_of))
+    return replace(job, setup=replace(job.setup, scene_digest=digest_of))
 
 
 @pytest.mark.parametrize("executor", ["serial", "rescan", "without records"])

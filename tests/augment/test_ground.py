@@ -148,7 +148,7 @@ def test_a_car_that_stands_finds_the_road_it_does_not_see_below_itself() -> None
     ring = points[np.hypot(points[:, 0] - 20, points[:, 1]) > 5]
     rng = np.random.default_rng(0)
     standing = np.array([20.0, 0, 0]) + rng.normal(0, 0.01, (300, 3))
-    assert len(Stretches.of(standing)) == 1
+    assert len(Stretches.along_path(standing)) == 1
     ground = measure_ground(ring, standing, "lidar labels")
     assert ground is not None and ground.lowest_z_m == ground.median_z_m
     assert ground.lowest_z_m == pytest.approx(0, abs=HEIGHT_M)

@@ -485,7 +485,9 @@ def test_splats_and_poses_are_finite_after_a_step(kind, seed, fov_deg, steepness
     knots = Knots([np.array([0, 10])], 6)
     rng, scratch = np.random.default_rng(seed), Scratch()
     for step in range(2):
-        tape = cpu_backward.record(inputs, camera, RasterSettings(), scratch, with_depth=True)
+        tape = cpu_backward.record_render(
+            inputs, camera, RasterSettings(), scratch, with_depth=True
+        )
         images = [
             (steepness * rng.normal(size=image.shape)).astype(np.float32)
             for image in (tape.rgb, tape.alpha, tape.expected_depth)

@@ -30,12 +30,12 @@ from batch_scenes import (
 from augment.boxes import WorldBoxes
 from augment.cameras import Camera
 from augment.dataset import WeatherDataset
-from augment.effects.flood.effect import hidden_pixels, submerged_fraction
+from augment.effects.flood.effect import count_hidden_pixels, submerged_fraction
 from augment.effects.smog import box_transmittance
 from augment.effects.snow.snow import count_snow_pixels
 from augment.effects.style import style as scene_maps
 from augment.errors import OutputError, StyleError
-from augment.jobs.files import box_tables, visibility
+from augment.jobs.files import box_tables, combine_visibility
 from augment.jobs.manifest import later_columns, read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job, stored_names
 from augment.labels import Boxes
@@ -105,13 +105,13 @@ def test_masks_hold_what_was_rendered(finished_dir: Path, recipe: Recipe, kind: 
 
 def expected_numbers(kind: str, boxes: Boxes, camera: Camera, view: FakeView) -> dict:
     """Of what the file has of each box, without what follows from it."""
-    world_boxes = WorldBoxes.of(boxes, ORIGIN_M)
+    world_boxes = WorldBoxes.from_labels(boxes, ORIGIN_M)
     if kind == "smog":
         effect_view = view.effects["smog"]
         columns = box_transmittance(
-            world_boxes, camera, effect_view.placed.data.fog, effect_view.depth_m
+            world_boxes, camera, effect_view.plan.data.fog, effect_view.depth_m
         )
-        return {"transmittance": columns.transmittance, "pixels": columns.pixels}
+        return {"transmittance": columns.transmittance, "pixels": columns.num_pixels}
     effect_view = view.effects["flood" if kind == "water" else kind]
     if kind == "snow":
         if effect_view.depth_m is None:
@@ -119,11 +119,11 @@ def expected_numbers(kind: str, boxes: Boxes, camera: Camera, view: FakeView) ->
         counted = count_snow_pixels(
             world_boxes, camera, effect_view.depth_m, view.masks["snow"], THICKNESS_M
         )
-        return {"pixels": counted.pixels, "snow_pixels": counted.marked}
+        return {"pixels": counted.num_pixels, "snow_pixels": counted.num_marked}
     columns = {"submerged_fraction": submerged_fraction(world_boxes, LEVEL_Z_M)}
     if effect_view.depth_m is not None:
-        counted = hidden_pixels(world_boxes, camera, effect_view.depth_m, view.masks["water"])
-        columns |= {"pixels": counted.pixels, "hidden_pixels": counted.marked}
+        counted = count_hidden_pixels(world_boxes, camera, effect_view.depth_m, view.masks["water"])
+        columns |= {"pixels": counted.num_pixels, "hidden_pixels": counted.num_marked}
     return columns
 
 
@@ -358,12 +358,14 @@ def test_visibility_is_what_all_effects_leave(finished_dir: Path) -> None:
         ({"box_rain": rain}, [0.5] * 4),
         (everything, [0.125, 0.125, 0, 0.5]),
     ):
-        np.testing.assert_array_equal(visibility(effects, 4), expected)
-    assert visibility({}, 0).shape == (0,) and visibility({}, 0).dtype == np.float64
+        np.testing.assert_array_equal(combine_visibility(effects, 4), expected)
+    assert combine_visibility({}, 0).shape == (0,) and combine_visibility({}, 0).dtype == np.float64
     tables = {f"box_{k}": box_tables()[f"box_{k}"].read(finished_dir / LABELS / f"{k}.parquet")
               for k in ("smog", "water", "snow")}  # fmt: skip
     for item, numbers in tables["box_smog"].items():
-        left = visibility({k: table[item] for k, table in tables.items()}, len(numbers.track_ids))
+        left = combine_visibility(
+            {k: table[item] for k, table in tables.items()}, len(numbers.track_ids)
+        )
         assert ((left >= 0) & (left <= 1) & (left <= numbers["transmittance"])).all()
 
 

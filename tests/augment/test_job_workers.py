@@ -36,7 +36,7 @@ from augment.errors import ClimateGSError, GpuLost, OutputError
 from augment.jobs import worker as runner
 from augment.jobs.files import WritePump
 from augment.jobs.manifest import read_manifest
-from augment.jobs.processes import available_cores, awaited, share_scene, thread_limits
+from augment.jobs.processes import available_cores, share_scene, thread_limits, wait_for_result
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.worker import compute_time_shares
 from augment.scene import Actor, Track
@@ -315,10 +315,10 @@ def test_an_interrupt_of_a_wait_is_an_interrupt_and_the_result_still_comes() -> 
     other = threading.Thread(target=interrupt)
     other.start()
     with pytest.raises(KeyboardInterrupt):
-        awaited(future)
+        wait_for_result(future)
     other.join()
     future.set_result(3)
-    assert awaited(future) == 3
+    assert wait_for_result(future) == 3
 
 
 def test_who_is_busiest_bounds_the_job() -> None:
@@ -348,8 +348,8 @@ def test_who_is_busiest_bounds_the_job() -> None:
         assert shares(**seconds).bound_by == bound_by
     both = {"workers": 20.0, "renderers": 16.0, "writers": 32.0, "render": 12.0, "held": 2.0}
     time_shares = shares(**both, encode=20.0)
-    assert time_shares.rendering == 0.6 and time_shares.held == 0.1
-    assert time_shares.beside == pytest.approx(0.3)
+    assert time_shares.rendering == 0.6 and time_shares.waiting_for_files == 0.1
+    assert time_shares.other_work == pytest.approx(0.3)
     assert time_shares.writing["encoding"] == 0.5  # of four threads' 10 s
 
 

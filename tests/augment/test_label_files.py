@@ -119,7 +119,7 @@ def test_a_pixel_by_depth_shows_the_smallest_box_that_has_its_surface() -> None:
     boxes, camera = scene.boxes(0), scene.frames[0].cameras["ahead"].scaled(0.25)
     rng = np.random.default_rng(1)
     depth = rng.uniform(0, 20, (camera.height, camera.width)).astype(np.float32)
-    world_boxes = WorldBoxes.of(boxes, np.asarray(scene.world_origin_m))
+    world_boxes = WorldBoxes.from_labels(boxes, np.asarray(scene.world_origin_m))
     sizes = [world_boxes.sizes_m, world_boxes.sizes_m * [[3], [1], [2]]]
     tight = [replace(world_boxes, sizes_m=s, low_m=-s / 2, high_m=s / 2) for s in sizes]
     points = depth[..., None] * camera.ray_directions(torch.float64).numpy()
@@ -130,7 +130,7 @@ def test_a_pixel_by_depth_shows_the_smallest_box_that_has_its_surface() -> None:
             along = (points - sized_boxes.centres_m[box]) @ sized_boxes.rotations[box]
             inside = (abs(along) <= sized_boxes.sizes_m[box] / 2).all(axis=-1) & (depth > 0)
             owners[inside] = box + 1
-        box_owners = find_occlusion(sized_boxes, camera, depth, with_owners=True).owners
+        box_owners = find_occlusion(sized_boxes, camera, depth, with_owners=True).owner_boxes
         assert box_owners is not None and (owners > 0).sum() > 20
         # Rays that graze a side: rounding decides, in one pixel of a thousand at most.
         assert (box_owners != owners).mean() < 1e-3
@@ -367,7 +367,7 @@ def test_categories_can_be_changed_without_rendering(output: Path, tmp_path: Pat
     changes = (f"output.categories={rows}", "output.labels=[kitti, coco]")
     try:
         done = write_labels(output, LabelOptions(changes=changes))
-        assert done.unused == ("Tr*",) and not done.unmapped
+        assert done.unused_rows == ("Tr*",) and not done.unmapped
         names = [c["name"] for c in coco_of(output)["categories"]]
         assert names == ["Truck", "Big car"] and not (output / "labels/yolo").exists()
         assert all(a["category_id"] == 2 for a in coco_of(output)["annotations"])
@@ -391,7 +391,7 @@ def test_the_files_do_not_depend_on_how_the_job_went(tmp_path: Path) -> None:
     recipes = make_recipes(("fog",), texts=LABELLED)
     run_generate(make_job(tmp_path / "blocks", recipes=recipes), progress=False)
     scene_recipes = {
-        s.uri: recipes.of_scene(s, s.uri[5]) for s in make_job("x", recipes=recipes).scenes
+        s.uri: recipes.resolve_for_scene(s, s.uri[5]) for s in make_job("x", recipes=recipes).scenes
     }
     for uri, resolved in scene_recipes.items():
         for frames in ((0, 2), None):

@@ -14,7 +14,12 @@ from augment.cameras import Camera, Frame
 from augment.dataset import WeatherDataset
 from augment.drawing import LayerRenderer
 from augment.effects.lens_drops.drops import Drops, LensDropsPlan, drops_at
-from augment.effects.lens_drops.optics import COVERED, blend_drops, draw_drops, map_surroundings
+from augment.effects.lens_drops.optics import (
+    MIN_MASK_SHARE,
+    blend_drops,
+    draw_drops,
+    map_surroundings,
+)
 from augment.geometry import rigid
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
@@ -124,7 +129,7 @@ def make_layers(scene: Scene, own: Camera, recipe: Recipe):
     plan = make_plan(recipe, scene)
     layers = LayerRenderer((), scene.sky, None, False, plan.settings, CPU)
     for active in plan_view(plan, scene, own).effects:
-        layers = active.effect.edit_scene(active, layers, own)
+        layers = active.hooks.edit_scene(active, layers, own)
     return layers
 
 
@@ -251,7 +256,7 @@ def test_a_job_writes_the_mask_and_its_share(tmp_path):
     (row,) = read_manifest(tmp_path).to_pylist()
     mask = cv2.imread(str(tmp_path / row["lens_drops_path"]), cv2.IMREAD_UNCHANGED)
     assert row["lens_drops_fraction"] == (mask == 255).mean() > 0
-    assert row["lens_drops_count"] == 60 and COVERED < 0.5
+    assert row["lens_drops_count"] == 60 and MIN_MASK_SHARE < 0.5
     np.testing.assert_array_equal(WeatherDataset(tmp_path)[0]["lens_drops"].numpy(), mask == 255)
 
 

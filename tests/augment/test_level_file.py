@@ -54,7 +54,7 @@ def test_a_large_scene_is_drawn_as_the_same_scene_in_memory(scene, folder):
     opened = load_scene_parts(folder)
     assert len(opened.background) == len(scene.background)
     levels = lod.levels_of(opened.background)
-    assert levels.levels[0].unchecked is not None  # those of the file, none made anew
+    assert levels.levels[0].unchecked_file is not None  # those of the file, none made anew
     assert torch.equal(draw(opened.background), draw(scene.background))
 
 

@@ -25,7 +25,7 @@ from augment.effects.lidar.beam import LidarModel, find_beam_origins
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import soft_echo, soft_response, wavelength_factor
 from augment.effects.snow.cells import ExposedCells, ExposedSurface
-from augment.effects.snow.effect import snow_layers_of
+from augment.effects.snow.effect import build_snow_layers
 from augment.effects.snow.lidar import (
     GROUND_SLACK_M,
     LidarSnow,
@@ -384,7 +384,7 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
 def test_the_layer_is_that_of_the_images(scene) -> None:
     recipe_snow = SnowPlan(SNOW, seed=0)
     top = find_lidar_snow(scene, recipe_snow).ground.top
-    means = snow_layers_of(scene, recipe_snow).ground.gaussians.means.numpy()
+    means = build_snow_layers(scene, recipe_snow).ground.gaussians.means.numpy()
     covered = np.isfinite(top)
     # A splat's middle lies a centimetre inside the layer whose surface it shows.
     assert np.median(top[covered]) == pytest.approx(np.median(means[:, 2]), abs=0.02)

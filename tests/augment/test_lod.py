@@ -123,7 +123,7 @@ def test_only_splats_of_nearly_one_colour_are_merged_in_wider_cells():
     g = one_gaussian((0.0, 0.0, 0.0), 0.05)
     g = g.select(torch.zeros(4, dtype=torch.int64))
     g = dataclasses.replace(g, means=torch.from_numpy(means))
-    for differs, left in ((0.9 * lod.ALIKE, 1), (1.1 * lod.ALIKE, 4)):
+    for differs, left in ((0.9 * lod.MAX_COLOR_DIFFERENCE, 1), (1.1 * lod.MAX_COLOR_DIFFERENCE, 4)):
         rgb = np.full((4, 3), 0.5)
         rgb[0, 1] += differs
         colored = dataclasses.replace(g, sh=sh_of(rgb))
@@ -224,10 +224,13 @@ def test_a_fade_keeps_what_an_opaque_surface_hides():
     for opacity in (0.2, 0.9, 2.0):
         o = torch.tensor([opacity])
         low = o.clamp(max=0.99)
-        both = lod.faded(o, 0.3).clamp(max=0.999), lod.faded(o, 0.7).clamp(max=0.999)
+        both = (
+            lod.fade_opacities(o, 0.3).clamp(max=0.999),
+            lod.fade_opacities(o, 0.7).clamp(max=0.999),
+        )
         left = (1 - both[0]) * (1 - both[1])
         assert float(left) <= float(1 - low) + 1e-6
-        assert float(lod.faded(o, 1.0)) == pytest.approx(opacity)
+        assert float(lod.fade_opacities(o, 1.0)) == pytest.approx(opacity)
 
 
 def test_numbers_of_splats_are_the_parts_own_and_actors_keep_theirs(part):

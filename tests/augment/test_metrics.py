@@ -271,11 +271,11 @@ FRAMES = 9
 def compared(paths, a, b, **kwargs):
     """(consistency over the pixels that moved, over all, what moved and counts)."""
     carried = move_surfaces(paths, a, b, **kwargs)
-    clear = dataclasses.replace(b, alpha=np.where(carried.unclear_b, 0.0, b.alpha))
+    clear = dataclasses.replace(b, alpha=np.where(carried.is_unclear_in_b, 0.0, b.alpha))
     warp = find_warp(a, clear, carried.points_m)
     warped = warp.sample(b.picture)
-    moved = warp.counts & carried.moved
-    return consistency_of(a, warped, moved), consistency_of(a, warped, warp.counts), moved
+    moved = warp.is_counted & carried.is_moved
+    return consistency_of(a, warped, moved), consistency_of(a, warped, warp.is_counted), moved
 
 
 @pytest.mark.parametrize("num_frames_between", [1, 7])
@@ -288,7 +288,7 @@ def test_a_board_goes_along_with_its_box(num_frames_between):
     # As if it stood the board agrees in depth, and its paint does not.
     standing = find_warp(a, b)
     apart_m = num_frames_between * FRAME_NS * 1e-9 * 2.0
-    wrong = consistency_of(a, standing.sample(b.picture), standing.counts & on_board)
+    wrong = consistency_of(a, standing.sample(b.picture), standing.is_counted & on_board)
     assert wrong.rmse == pytest.approx(0.2 * apart_m * np.sqrt(2 / 3), rel=0.05)
 
 

@@ -90,13 +90,13 @@ def test_instance_images_need_the_depth_and_class_of_boxes_without_an_actor():
     recipe = Recipe(output=Output(depth="none", instance=True, labels=False))
     plan = make_plan(recipe, scene(labels=Labels()))
     assert plan.buffers == {"rgb", "alpha", "splat_ids", "expected_depth"}
-    assert plan.finds_boxes and not plan.semantic
+    assert plan.finds_boxes and not plan.has_semantic
     assert make_plan(recipe, scene()).buffers == {"rgb", "alpha", "splat_ids"}
 
 
 def test_smog_stands_on_the_road():
     plan = plan_of(Smog(visibility_m=100, scale_height_m=30, base_height_m=2))
-    fog = plan.placed["smog"].data.fog
+    fog = plan.effect_plans["smog"].data.fog
     assert fog.base_z_m == 2.25
     assert fog.sigma_per_m == pytest.approx(0.03912)
 

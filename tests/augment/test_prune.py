@@ -34,7 +34,7 @@ def scene_of(gaussians: Gaussians, *cameras: Camera) -> Scene:
         Frame(n, camera.timestamp_ns, torch.eye(4, dtype=torch.float64), {camera.name: camera})
         for n, camera in enumerate(cameras)
     )
-    sky = ConstantSky(torch.full((3,), prune.SKY))
+    sky = ConstantSky(torch.full((3,), prune.SKY_LUMA))
     return Scene("pruned", "test:pruned", gaussians, actors=(), frames=frames, sky=sky)
 
 
@@ -46,7 +46,7 @@ def buffers(scene: Scene, camera: Camera, error: float):
 def luma(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     out = rasterize([PosedGaussians(gaussians)], camera, backend="cpu")
     assert out.rgb is not None and out.alpha is not None
-    rgb = out.rgb + (1 - out.alpha)[..., None] * prune.SKY
+    rgb = out.rgb + (1 - out.alpha)[..., None] * prune.SKY_LUMA
     return rgb.double() @ torch.tensor(prune.LUMA, dtype=torch.float64)
 
 
@@ -120,7 +120,7 @@ def test_a_front_of_small_splats_does_not_go_as_a_whole(monkeypatch):
     places = zip(x.flat, y.flat, z.flat, strict=True)
     front = stack(*(one_gaussian(at, 0.08, 0.6) for at in places))
     camera, error, changes, stay = camera_ahead(64, 48, 50.0), 3e-3, list[float](), list[bool]()
-    for rounds in ((np.inf,), prune.ROUNDS):
+    for rounds in ((np.inf,), prune.ROUND_ERRORS):
         monkeypatch.setattr(prune, "ROUNDS", rounds)
         stays = torch.from_numpy(prune.errors_of(scene_of(front, camera)) > error)
         left = dataclasses.replace(front, opacities=torch.where(stays, 0.6, 0.0))
@@ -186,7 +186,7 @@ def test_other_processes_take_the_changes_over():
     recipe = Recipe(render=Render(prune=HIDDEN))
     precompute_effects(JobContext(scene, [recipe]))
     other = dataclasses.replace(scene)
-    memo_of(other).update(pickle.loads(pickle.dumps(memo_of(scene).shared())))
+    memo_of(other).take_shared(pickle.loads(pickle.dumps(memo_of(scene).shared())))
     np.testing.assert_array_equal(prune.errors_of(other), prune.errors_of(scene))
     alone = dataclasses.replace(scene)
     assert torch.equal(

@@ -25,12 +25,12 @@ from augment.jobs.quality import (
     apply_settings,
     calibration_views,
     choose_settings,
+    read_choice,
     recipes_to_try,
-    recorded,
     render_trial,
     resize_picture,
     resolve_quality,
-    search,
+    search_settings,
     select_useful_values,
     steps_back,
 )
@@ -40,7 +40,7 @@ from augment.metrics.image import flip
 from augment.plan import make_plan
 from augment.views import render_view
 from recipes.errors import RecipeError
-from recipes.fields import found
+from recipes.fields import section_at
 from recipes.load import load_recipe, parse_recipe
 from recipes.schema import Recipe, with_reference_settings
 
@@ -57,7 +57,7 @@ def total(table: dict, settings: dict) -> float:
 
 
 def chosen_by_error(errors: dict, bound: float, synergy: float = 1.0) -> dict:
-    return search(LADDERS, lambda settings: synergy * total(errors, settings) <= bound)
+    return search_settings(LADDERS, lambda settings: synergy * total(errors, settings) <= bound)
 
 
 def chosen_by_time(errors: dict, saved: dict, budget_ms: float) -> dict:
@@ -68,7 +68,9 @@ def chosen_by_time(errors: dict, saved: dict, budget_ms: float) -> dict:
         for path, values in LADDERS.items()
     }  # fmt: skip
     ladders, steps = steps_back(costs)
-    return search(ladders, lambda settings: 100 - total(saved, settings) <= budget_ms, steps)
+    return search_settings(
+        ladders, lambda settings: 100 - total(saved, settings) <= budget_ms, steps
+    )
 
 
 def test_each_knob_takes_its_fastest_value_within_the_bound() -> None:
@@ -164,7 +166,7 @@ def test_small_pictures_are_enlarged_and_depths_are_not_mixed() -> None:
     trial = render_trial(*arguments, renderer=render, size=(4, 4))
     assert trial.depth is not None and trial.depth[3].tolist() == [1, 1, 9, 9]
     own_size = render_trial(*arguments, renderer=render)
-    assert own_size.picture.shape == (16, 24, 3)
+    assert own_size.rgb.shape == (16, 24, 3)
 
 
 # ---- The choice in a scene -----------------------------------------------------------------------
@@ -219,8 +221,8 @@ def test_a_choice_by_error_is_within_the_bound_and_the_same_again() -> None:
     chosen = resolve_quality(recipe, scene)
     assert resolve_quality(recipe, scene).recipe == chosen.recipe
     assert chosen.is_met and chosen.ms is None
-    assert chosen.recipe.quality.settled and not chosen.recipe.quality.is_open
-    assert chosen.recipe.quality.words == "max_flip 0.06"
+    assert chosen.recipe.quality.settled and not chosen.recipe.quality.has_open_choice
+    assert chosen.recipe.quality.summary == "max_flip 0.06"
     errors = []
     for view in calibration_views(scene.frames):
         truth = render_view(scene, view.camera, with_reference_settings(chosen.recipe)).rgb
@@ -273,7 +275,7 @@ def test_snow_that_a_scene_cannot_have_so_fine_is_coarser() -> None:
 
     recipe = open_recipe("budget_ms: 1e6", "weather: {snow: {depth_m: 0}}\nrender: {scale: 1}\n")
     chosen = resolve_quality(recipe, open_fake("fake:a"), renderer=render)
-    assert found(chosen.recipe, "weather.snow.cell_m") == 0.1
+    assert section_at(chosen.recipe, "weather.snow.cell_m") == 0.1
     quality_recipe = open_recipe("max_flip: 0.1", "weather: {snow: {depth_m: 0, cell_m: 0.05}}\n")
     with pytest.raises(SceneError, match="too many cells"):
         resolve_quality(quality_recipe, open_fake("fake:a"), renderer=render)
@@ -285,7 +287,7 @@ def test_what_has_not_chosen_is_not_rendered() -> None:
     with pytest.raises(RecipeError, match=r"fog, variant 0: quality max_flip 0\.1 has still to"):
         render_view(scene, make_camera("front", 0, 0.0), recipe)
     tried = recipes_to_try(recipe)
-    assert len(tried) > 8 and not any(r.quality.is_open for r in tried)
+    assert len(tried) > 8 and not any(r.quality.has_open_choice for r in tried)
     assert recipes_to_try(tried[0]) == [tried[0]]
     assert resolve_quality(tried[0], scene).recipe is tried[0]
     with pytest.raises(ValueError, match="leaves free render"):
@@ -344,7 +346,7 @@ def test_a_damaged_choice_is_told(bench: Workbench, tmp_path: Path) -> None:
     arguments = (store, recipe, scene)
     chosen = choose_settings(*arguments, backend="cpu", renderer=bench.render)
     question = Question(recipe, scene.name, scene.source, "recorded", "cpu")
-    assert recorded(store, question) == chosen
+    assert read_choice(store, question) == chosen
     document = json.loads(store.read(question.path))
     settings = document["choice"]["settings"]
     wrong = [("render.scale", "1"), ("render.near_m", 1.0), ("render.scale", 77.0)]

@@ -26,7 +26,7 @@ from augment.render.buffers import (
     SPLAT_IDS,
     RenderOutput,
 )
-from augment.render.composite import composite_sky, map_colors, quantise
+from augment.render.composite import apply_color_map, composite_sky, to_byte_array
 from augment.render.constants import RasterSettings
 from augment.render.cpu import driver as cpu
 from augment.render.cpu.driver import rasterize_cpu
@@ -247,8 +247,8 @@ def test_eight_bits_round_to_nearest_and_clamp():
     values = torch.tensor([-0.2, 0.0, 0.4 / 255, 0.6 / 255, 127.5 / 255, 1.0, 7.0])
     image = values[:, None, None].expand(7, 1, 3).contiguous()
     expected = np.array([0, 0, 0, 1, 128, 255, 255], np.uint8)
-    assert np.array_equal(quantise(image)[:, 0, 0], expected)
-    assert np.array_equal(quantise(image.double())[:, 0, 0], expected)
+    assert np.array_equal(to_byte_array(image)[:, 0, 0], expected)
+    assert np.array_equal(to_byte_array(image.double())[:, 0, 0], expected)
 
 
 COLOR_MAP = torch.tensor([[1.1, 0.05, 0.0, 0.02], [-0.1, 0.9, 0.1, 0.0], [0.0, 0.2, 1.2, -0.05]])
@@ -258,17 +258,17 @@ COLOR_MAP = torch.tensor([[1.1, 0.05, 0.0, 0.02], [-0.1, 0.9, 0.1, 0.0], [0.0, 0
 def test_colour_maps_match_their_definition(size):
     rgb = torch.rand(*size, 3) * 1.5 - 0.2  # pictures are not clamped before
     expected = rgb.double() @ COLOR_MAP[:, :3].double().T + COLOR_MAP[:, 3].double()
-    slow = map_colors(rgb, COLOR_MAP, backend="reference")
-    fast = map_colors(rgb.clone(), COLOR_MAP)
+    slow = apply_color_map(rgb, COLOR_MAP, backend="reference")
+    fast = apply_color_map(rgb.clone(), COLOR_MAP)
     # Sums of four float32 products below 2.
     torch.testing.assert_close(slow.double(), expected, atol=1e-6, rtol=0)
     torch.testing.assert_close(fast.double(), expected, atol=1e-6, rtol=0)
-    assert torch.equal(map_colors(rgb.double(), COLOR_MAP), expected)
+    assert torch.equal(apply_color_map(rgb.double(), COLOR_MAP), expected)
 
 
 def test_gradients_pass_through_colour_maps():
     rgb = torch.rand(5, 4, 3, requires_grad=True)
-    map_colors(rgb, COLOR_MAP).sum().backward()
+    apply_color_map(rgb, COLOR_MAP).sum().backward()
     torch.testing.assert_close(rgb.grad, COLOR_MAP[:, :3].sum(0).expand(5, 4, 3))
 
 

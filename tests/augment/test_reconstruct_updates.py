@@ -42,7 +42,7 @@ from augment.render.cpu.backward_kernels import (
     G_SCALE,
     NUM_GRADIENTS,
 )
-from augment.render.layout import BLOCK
+from augment.render.layout import BLOCK_SIZE
 from augment.render.part_views import stack_poses
 from augment.render.sh import sh_basis
 from augment.render.threads import kernel_threads, limit_threads
@@ -375,15 +375,15 @@ def apply_update(splats: Splats, update: Update, rates: LearningRates = FASTER) 
     poses = stack_poses([pose for _, pose in update.present])
     inputs = splat_inputs(splats, parts, poses, update.camera, RasterSettings())
     rows = np.full(
-        (inputs.slots, NUM_GRADIENTS), np.nan, np.float32
+        (inputs.num_slots, NUM_GRADIENTS), np.nan, np.float32
     )  # what is not counted is not read
-    ids = np.full(inputs.slots, -1, np.int32)
+    ids = np.full(inputs.num_slots, -1, np.int32)
     counts = np.zeros(len(inputs.blocks), np.int64)
     for block, (number, first, last) in enumerate(inputs.blocks):
         part = parts[number]
         inside = (update.touched[part] >= first) & (update.touched[part] < last)
         counts[block] = inside.sum()
-        own = slice(block * BLOCK, block * BLOCK + int(counts[block]))
+        own = slice(block * BLOCK_SIZE, block * BLOCK_SIZE + int(counts[block]))
         rows[own], ids[own] = update.gradients[part][inside], update.touched[part][inside]
     with kernel_threads():
         kernels.update_splats(
@@ -579,7 +579,7 @@ def test_values_are_clamped():
 
 def test_no_splat_gets_smaller_than_images_resolve():
     splats = some_splats()
-    splats.smallest[::2] = 0.03
+    splats.min_scale_m[::2] = 0.03
     rates = dataclasses.replace(FASTER, scales=5.0)
     update = random_update(splats, 0, present=BOTH[:1])
     at, g = update.touched[0], update.gradients[0]
@@ -685,7 +685,7 @@ def splats_of(*counts: int, opacity: float | None = None, seed: int = 0) -> Spla
         sh_v=normal(4, 3) ** 2,
         age=rng.integers(1, 1000, total).astype(np.int32),
         grads=np.zeros((total, 3), np.float32),
-        smallest=np.zeros(total, np.float32),
+        min_scale_m=np.zeros(total, np.float32),
     )
 
 
@@ -803,11 +803,11 @@ def test_faint_and_unusable_ones_are_removed() -> None:
 
 def test_children_are_no_smaller_than_images_resolve() -> None:
     splats = pulled(splats_of(*PARTS), [3, 35], radius=0.2)
-    splats.smallest[:] = 0.9 * splats.scales.min(1)
+    splats.min_scale_m[:] = 0.9 * splats.scales.min(1)
     grown = round_of(splats, fraction=0.1)
     assert len(grown) == 52
-    assert (grown.scales >= grown.smallest[:, None]).all()
-    assert (grown.scales.min(1) == grown.smallest).sum() == 4
+    assert (grown.scales >= grown.min_scale_m[:, None]).all()
+    assert (grown.scales.min(1) == grown.min_scale_m).sum() == 4
 
 
 def test_the_refuted_are_removed() -> None:
@@ -865,7 +865,7 @@ def test_a_part_may_become_empty_but_not_the_scene() -> None:
 
 
 def test_rounds_are_due_every_so_many_steps_while_splats_are_added() -> None:
-    growth = Growth(every=200, start=0.1, stop=0.6)
+    growth = Growth(steps_per_round=200, start=0.1, stop=0.6)
     due = [step for step in range(0, 2001, 50) if densify_due(growth, step, 2000)]
     assert due == list(range(200, 1201, 200))
     assert not densify_due(Growth(start=0.0), 0, 2000)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from augment.render.buffers import ALPHA, DIFFERENTIABLE, EXPECTED_DEPTH, OVERLAY, RGB
-from augment.render.composite import composite_sky, map_colors
+from augment.render.composite import apply_color_map, composite_sky
 from augment.render.constants import ALPHA_MIN, RasterSettings
 from augment.render.fog import Fog
 from augment.render.layout import HeightClip
@@ -432,7 +432,7 @@ def test_gradients_through_sky_and_colour_map():
         dtype = torch.float32 if backend == "cpu" else torch.float64
         tracked = leaves(posed(random_gaussians(150, seed=2)), dtype)
         out = rasterize(tracked, camera, backend=backend)
-        rgb = map_colors(composite_sky(out.rgb, out.alpha, camera, sky()), color_map)
+        rgb = apply_color_map(composite_sky(out.rgb, out.alpha, camera, sky()), color_map)
         (rgb * weights).sum().backward()
         found.append({n: getattr(tracked[0].gaussians, n).grad.double() for n in FIELDS})
     for name in FIELDS:

@@ -104,7 +104,7 @@ def test_a_wall_is_cut_along_its_waterline(backend, z_m=-0.52):
     camera = camera_ahead(40, 60, 60.0)
     row = camera.cy - camera.fy * z_m / 5.0
     above = render(wall(), camera, HeightClip(z_m, "above"), backend).alpha
-    behind = HeightClip(z_m, "below", overlaps=True)
+    behind = HeightClip(z_m, "below", has_overlap=True)
     below = render(wall(), camera, behind, backend).alpha
     centres = torch.arange(60) + 0.5
     # Row by row the kept share is clamp(pixels above the line + 0.5, 0, 1) of an opaque wall's
@@ -122,7 +122,7 @@ def test_both_sides_together_are_the_whole():
     gaussians = stack(wall(9.0), floor(-1.5), one_gaussian((4.0, 0.3, -0.9), 0.4, 0.999))
     plain = render(gaussians, camera)
     above = render(gaussians, camera, HeightClip(-0.9, "above"))
-    below = render(gaussians, camera, HeightClip(-0.9, "below", overlaps=True))
+    below = render(gaussians, camera, HeightClip(-0.9, "below", has_overlap=True))
     both = above.rgb + (1 - above.alpha)[..., None] * below.rgb
     error = (both - plain.rgb).abs().amax(-1)
     # At the edge of the cut a splat's two sides are blended as two splats, which covers a little
@@ -333,7 +333,7 @@ def test_training_refuses_it():
     camera, parts = map_camera(), [PosedGaussians(one_gaussian())]
     inputs = gather_inputs(parts, camera, RasterSettings(), None, with_color=True)
     with pytest.raises(ValueError, match="gradients are of pinhole cameras only"):
-        cpu_backward.record(inputs, camera, RasterSettings(), Scratch(), with_depth=False)
+        cpu_backward.record_render(inputs, camera, RasterSettings(), Scratch(), with_depth=False)
 
 
 # ---- modes of depth ------------------------------------------------------------------------------

@@ -108,11 +108,11 @@ def test_scenes_of_too_many_splats_are_drawn_one_by_one(scene) -> None:
     columns = (one.means, one.quats, one.scales, one.opacities, one.sh)
     many = Gaussians(*(column.expand(count, *column.shape[1:]) for column in columns))
     with ViewPool(dataclasses.replace(scene, background=many), "cpu") as pool:
-        assert pool.ahead == 0
+        assert pool.num_in_flight == 0
     with ViewPool(scene, "cpu") as pool:
-        assert pool.ahead == num_kernel_threads()
+        assert pool.num_in_flight == num_kernel_threads()
     with ViewPool(scene, "reference") as pool:
-        assert pool.ahead == 0
+        assert pool.num_in_flight == 0
 
 
 # ---- Threads -------------------------------------------------------------------------------------

@@ -372,8 +372,8 @@ def test_what_is_shared_is_found_by_another_process_memo():
     parent_memo.put(("own",), 1)
     parent_memo.put(("plain",), 2, shared=True)
     parent_memo.put(("stored",), InFile(3), shared=True)
-    worker_memo.update(pickle.loads(pickle.dumps(parent_memo.shared())))
-    assert worker_memo.known(("plain",)) and not worker_memo.known(("own",))
+    worker_memo.take_shared(pickle.loads(pickle.dumps(parent_memo.shared())))
+    assert worker_memo.has(("plain",)) and not worker_memo.has(("own",))
 
     def refuse() -> None:
         raise AssertionError("it was handed over")

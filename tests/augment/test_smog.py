@@ -40,7 +40,7 @@ def quadrature(medium: Fog, distance: float, eye: float, point: float) -> float:
     steps = torch.linspace(0, 1, 20_001, dtype=torch.float64)
     z = eye + (point - eye) * (steps[1:] + steps[:-1]) / 2
     assert medium.scale_height_m is not None
-    density = medium.sigma_per_m * torch.exp(-(z - medium.base_z_m) / medium.scale_height_m)
+    density = medium.extinction_per_m * torch.exp(-(z - medium.base_z_m) / medium.scale_height_m)
     return float(density.mean()) * distance
 
 
@@ -152,12 +152,12 @@ def test_a_box_at_a_known_distance() -> None:
     got = measure(boxes)
     # The origin, 4e6 m away, costs 5e-10 m of the box's coordinates.
     np.testing.assert_allclose(got.transmittance, [math.exp(-2), math.exp(-1.5)], rtol=1e-8)
-    assert got.pixels.tolist() == [NOT_COUNTED] * 2
+    assert got.num_pixels.tolist() == [NOT_COUNTED] * 2
     far_off = measure(boxes, depth_m=wall(20))
     np.testing.assert_array_equal(far_off.transmittance, got.transmittance)
-    assert far_off.pixels.tolist() == [0, 0]
+    assert far_off.num_pixels.tolist() == [0, 0]
     seen = measure(make_boxes(((40, 0, EYE_Z_M), CAR_M, UPRIGHT)), depth_m=wall(38))
-    assert seen.pixels[0] > 20
+    assert seen.num_pixels[0] > 20
     # 4 m of width at 38 m: rays are longer than their depth by 2 cm at most, a thousandth of tau.
     assert seen.transmittance[0] == pytest.approx(math.exp(-0.05 * 38), rel=2e-3)
     assert seen.transmittance[0] < math.exp(-0.05 * 38)
@@ -181,7 +181,7 @@ def test_the_mean_is_that_over_the_pixels_that_show_the_box(medium: Fog) -> None
         points = camera.centre.numpy() + depth[..., None].astype(np.float64) * rays.numpy()
         along = (points - (boxes.centers_m[k] - ORIGIN_M)) @ rotation
         shows = ((along >= low) & (along <= high)).all(axis=-1) & (depth > 0)
-        assert got.pixels[k] == shows.sum()
+        assert got.num_pixels[k] == shows.sum()
         if shows.any():
             assert got.transmittance[k] == pytest.approx(through[shows].mean(), rel=1e-12)
             continue
@@ -194,7 +194,7 @@ def test_the_mean_is_that_over_the_pixels_that_show_the_box(medium: Fog) -> None
         )
         # The origin costs 5e-10 m, as above.
         assert got.transmittance[k] == pytest.approx(torch.exp(-tau).mean().item(), rel=1e-8)
-    assert (got.pixels > 0).sum() > 30 and (got.pixels == 0).sum() > 5
+    assert (got.num_pixels > 0).sum() > 30 and (got.num_pixels == 0).sum() > 5
 
 
 @pytest.mark.parametrize("medium", [THICK, LAYERED, Fog(100.0, GREY_SMOG, 0.1, -50.0)])
@@ -214,13 +214,13 @@ def test_denser_smog_lets_less_through_and_none_all() -> None:
     depth = np.random.default_rng(8).uniform(0, 20, SHAPE).astype(np.float32)
     for medium in (THICK, LAYERED):
         densities = [0.0, 1e-9, 1e-3, 0.02, 0.5, 10.0, 1e4]
-        media = [dataclasses.replace(medium, sigma_per_m=sigma) for sigma in densities]
+        media = [dataclasses.replace(medium, extinction_per_m=sigma) for sigma in densities]
         rows = np.stack([measure(boxes, m, depth, camera).transmittance for m in media])
         assert (rows[0] == 1).all() and (np.diff(rows, axis=0) <= 0).all()
         assert (rows >= 0).all() and (rows[-1] < 0.2).all()  # a pixel of a box around the eye
         assert (np.diff(rows[2:5], axis=0) < 0).all()
     clear = measure(boxes, None, depth, camera)
-    assert (clear.transmittance == 1).all() and (clear.pixels == NOT_COUNTED).all()
+    assert (clear.transmittance == 1).all() and (clear.num_pixels == NOT_COUNTED).all()
 
 
 def test_smog_is_in_the_air_alone_for_an_eye_in_the_water() -> None:

@@ -59,7 +59,7 @@ def _lay(bed, scene=FAR_AWAY, *, seed=3, water=None, light=LIGHT, **options) -> 
 def _depths(cells, *, seed=3, water=None, **options) -> np.ndarray:
     rng = np.random.default_rng(seed)
     profile = make_depth_profile(Snow(**options), rng, on_ground=True, water_level_z_m=water)
-    return find_depths(cells, profile, np.uint64(seed)).heights
+    return find_depths(cells, profile, np.uint64(seed)).depths_m
 
 
 def _alpha(cover, camera) -> torch.Tensor:
@@ -91,7 +91,7 @@ def test_layer_is_rounded_at_open_edges_and_nowhere_else():
     z[38:42, 38:42] = np.nan
     cells = cells_on_grid(z, CELL_M)
     heights = _depths(cells, depth_m=depth_m, **CALM)
-    t = np.minimum(cells.edge_m.numpy() / depth_m, 1)
+    t = np.minimum(cells.edge_distance_m.numpy() / depth_m, 1)
     ratio = heights / (depth_m * np.sqrt(1 - (1 - t) ** 2))
     assert abs(np.median(ratio) - 1) < 0.03 and ratio.std() < 0.05
     flush = _depths(cells_on_grid(z, CELL_M, holes=FLUSH), depth_m=depth_m, **CALM)
@@ -133,7 +133,7 @@ def _rutted():
 
 def test_tracks_are_pressed_where_the_recipe_says():
     cells = _rutted()
-    rut = cells.tracks.numpy() == 1
+    rut = cells.track_share.numpy() == 1
     for depth_m, tracks, has_tracks in (
         (0.3, "auto", True),
         (0.31, "auto", False),
@@ -214,12 +214,16 @@ def test_two_shadings_agree_where_normals_do():
     bed = level_bed(4.0)
     baked = _lay(bed, depth_m=0.1).ground
     per_pixel = _lay(bed, depth_m=0.1, shading="per_pixel").ground
-    assert baked.slopes is None and per_pixel.slopes is not None and per_pixel.normals is None
+    assert (
+        baked.sunlight_rgb is None
+        and per_pixel.sunlight_rgb is not None
+        and per_pixel.normals is None
+    )
     share = (SUN[2] + LIGHT.wrap) / (1 + LIGHT.wrap)  # of a level surface
-    lit = _colors(per_pixel.gaussians) + share * per_pixel.slopes
+    lit = _colors(per_pixel.gaussians) + share * per_pixel.sunlight_rgb
     assert torch.equal(baked.gaussians.means, per_pixel.gaussians.means)
     assert (lit.mean(0) - _colors(baked.gaussians).mean(0)).abs().max() < 0.01
-    assert (per_pixel.slopes >= 0).all()
+    assert (per_pixel.sunlight_rgb >= 0).all()
     part = _lay(bed, depth_m=0.1, shading="per_pixel").parts_for(
         FAR_AWAY, looking((2, 2, 3), (2, 2, 0))
     )[-1]
@@ -320,7 +324,7 @@ def _rugged_cells(corner_m=(0.0, 0.0)):
     banks = torch.from_numpy(rng.uniform(-1, 1, (count, 2)).astype(np.float32))
     sizes = torch.from_numpy(rng.choice([0.05, 0.1, 0.4], count).astype(np.float32))
     semantic = torch.where(torch.arange(count) % 3 == 0, int(SemanticClass.VEGETATION), 1).short()
-    return dataclasses.replace(cells, banks=banks, sizes_m=sizes, semantic=semantic)
+    return dataclasses.replace(cells, obstacle_vectors=banks, sizes_m=sizes, semantic=semantic)
 
 
 @pytest.mark.parametrize(
@@ -344,7 +348,7 @@ def test_kernel_computes_what_the_definition_says(options, corner_m, water):
     expected = define_depths(cells, profile)
     open_m = expected[cells.semantic.numpy() != SemanticClass.VEGETATION]
     assert (open_m == 0).any() == (water is not None or options["depth_m"] < 0.2)
-    np.testing.assert_allclose(depths.heights, expected, rtol=2e-6, atol=1e-12)
+    np.testing.assert_allclose(depths.depths_m, expected, rtol=2e-6, atol=1e-12)
     covered = expected > 0
     np.testing.assert_allclose(
         depths.mottle[covered], mottle_noise(cells, profile)[covered], rtol=1e-6, atol=1e-6

@@ -69,19 +69,21 @@ def check_cells(cells: ExposedCells, gaussians: int) -> None:
             assert len(values) == count, field.name
     np.testing.assert_allclose(cells.normals.norm(dim=1), 1, atol=1e-5)
     assert bool((cells.normals[:, 2] > 0).all())
-    assert bool((cells.edge_m >= 0.499 * cells.sizes_m).all())
+    assert bool((cells.edge_distance_m >= 0.499 * cells.sizes_m).all())
     assert bool(
-        (cells.edge_m <= torch.clamp(cells.sizes_m / 2, min=MAX_EDGE_DISTANCE_M) + 1e-5).all()
+        (
+            cells.edge_distance_m <= torch.clamp(cells.sizes_m / 2, min=MAX_EDGE_DISTANCE_M) + 1e-5
+        ).all()
     )
-    assert bool(((cells.light >= 0.25) & (cells.light <= 1.5)).all())
-    assert bool(((cells.tracks >= 0) & (cells.tracks <= 1)).all())
-    assert bool((cells.banks.norm(dim=1) <= 1 + 1e-5).all())
+    assert bool(((cells.relative_light >= 0.25) & (cells.relative_light <= 1.5)).all())
+    assert bool(((cells.track_share >= 0) & (cells.track_share <= 1)).all())
+    assert bool((cells.obstacle_vectors.norm(dim=1) <= 1 + 1e-5).all())
     check_neighbours(cells)
-    assert tuple(cells.buried_by.shape) == (len(cells.buried), 5)
-    if len(cells.buried):
-        assert 0 <= int(cells.buried.min()) <= int(cells.buried.max()) < gaussians
-        assert 0 <= int(cells.buried_by.min()) <= int(cells.buried_by.max()) < count
-        assert len(cells.buried.unique()) == len(cells.buried)
+    assert tuple(cells.covering_cells.shape) == (len(cells.hideable_ids), 5)
+    if len(cells.hideable_ids):
+        assert 0 <= int(cells.hideable_ids.min()) <= int(cells.hideable_ids.max()) < gaussians
+        assert 0 <= int(cells.covering_cells.min()) <= int(cells.covering_cells.max()) < count
+        assert len(cells.hideable_ids.unique()) == len(cells.hideable_ids)
 
 
 def check_neighbours(cells: ExposedCells) -> None:
@@ -137,8 +139,8 @@ def test_bits_do_not_depend_on_threads_or_on_who_watches(flat_ground) -> None:
     with watched(told.append):
         together = find_exposed_surface(scene, cameras_of(scene), COARSE)
     assert_equal_cells(together.ground, bed.ground)
-    total = told[0].total
-    assert [progress.done for progress in told] == [*range(total + 1)] and total > 1
+    total = told[0].num_steps
+    assert [progress.num_done for progress in told] == [*range(total + 1)] and total > 1
     assert {progress.name for progress in told} == {"placing snow"}
 
 
@@ -150,16 +152,16 @@ def test_a_platform_has_open_edges_and_the_ground_beside_it_none() -> None:
     top, foot = under(cells, 7.0, 0.05), under(cells, 5.65, 0.05)
     assert float(cells.centers_m[top, 2]) == pytest.approx(0.6, abs=0.01)
     # Splats reach half their size beyond the edge that their centres end at.
-    assert float(cells.edge_m[top]) == pytest.approx(1.0, abs=0.25)
-    assert float(cells.edge_m[foot]) > 1.5
+    assert float(cells.edge_distance_m[top]) == pytest.approx(1.0, abs=0.25)
+    assert float(cells.edge_distance_m[foot]) > 1.5
     raised = torch.nonzero(cells.centers_m[:, 2] > 0.5)[:, 0]
     borders = (cells.neighbours[raised] == OPEN_EDGE).any(1)
     assert bool(borders.any())
-    assert float(cells.edge_m[raised][borders].max()) <= 0.5 * 0.1 + 1e-5
-    assert bool((cells.banks[raised] == 0).all())
-    bank = cells.banks[foot]
+    assert float(cells.edge_distance_m[raised][borders].max()) <= 0.5 * 0.1 + 1e-5
+    assert bool((cells.obstacle_vectors[raised] == 0).all())
+    bank = cells.obstacle_vectors[foot]
     assert float(bank[0]) > 0.3 and abs(float(bank[1])) < 0.1  # towards +x, where it stands
-    assert float(cells.banks[under(cells, 3.5, 0.05)].norm()) < 0.01
+    assert float(cells.obstacle_vectors[under(cells, 3.5, 0.05)].norm()) < 0.01
     low = torch.nonzero(within(cells, (5.2, 6.2), (-0.7, 0.7)) & (cells.centers_m[:, 2] < 0.1))
     assert not bool((cells.neighbours[low[:, 0], RIGHT] == OPEN_EDGE).any())
 
@@ -229,7 +231,7 @@ def test_holes_under_the_path_and_small_ones_are_closed(
         np.testing.assert_allclose(cells.centers_m[inside, 2], rise, atol=0.03)
         area = float((cells.sizes_m[inside] ** 2).sum())
         assert area == pytest.approx((x + size - max(x - size, 2.5)) * 2 * size, rel=0.15)
-        np.testing.assert_allclose(cells.light[inside], 1, atol=0.1)
+        np.testing.assert_allclose(cells.relative_light[inside], 1, atol=0.1)
 
 
 @pytest.mark.long
@@ -302,7 +304,7 @@ def test_the_ground_is_buried_and_walls_are_not() -> None:
     scene = drive(GROUND, platform, front)
     cells = place(scene).ground
     hidden = torch.zeros(len(scene.background), dtype=torch.bool)
-    hidden[cells.buried.long()] = True
+    hidden[cells.hideable_ids.long()] = True
     first_wall = len(GROUND) + len(platform)
     assert not bool(hidden[first_wall:].any())
     means = scene.background.means
@@ -322,7 +324,7 @@ def test_wheel_tracks_are_those_of_a_recorded_drive() -> None:
     assert len(y_m) == 1
     invented = dataclasses.replace(recorded, seen_frames=())
     assert find_wheel_paths(invented) == ()
-    assert len(find_wheel_paths(invented, with_invented=True)) == 1
+    assert len(find_wheel_paths(invented, has_invented_path=True)) == 1
     aside = torch.eye(4, dtype=torch.float64)
     aside[1, 3] = 3.0
     frames = tuple(
@@ -343,10 +345,10 @@ def test_wheels_leave_tracks_beside_the_path() -> None:
     wheels = WHEEL_OFFSET_SHARE * EGO_WIDTH_M
     for x in (6.0, 12.0):
         for y in (wheels, -wheels):
-            assert float(cells.tracks[under(cells, x, y)]) > 0.6
+            assert float(cells.track_share[under(cells, x, y)]) > 0.6
         for y in (0.0, 0.4, 1.3, -1.3):
-            assert float(cells.tracks[under(cells, x, y)]) < 0.05
-    assert float(cells.tracks.max()) > 0.95
+            assert float(cells.track_share[under(cells, x, y)]) < 0.05
+    assert float(cells.track_share.max()) > 0.95
 
 
 def test_shade_on_the_ground_is_kept_and_markings_are_no_light() -> None:
@@ -362,10 +364,10 @@ def test_shade_on_the_ground_is_kept_and_markings_are_no_light() -> None:
     lit = within(cells, (2.5, 8), (-2, 2)) & ~marked
     shade = within(cells, (10, 13), (-2, 2))
     expected = ((0.3 + 0.055) / 1.055) ** 2.4 / ((0.5 + 0.055) / 1.055) ** 2.4
-    ratio = float(cells.light[shade].median() / cells.light[lit].median())
+    ratio = float(cells.relative_light[shade].median() / cells.relative_light[lit].median())
     assert ratio == pytest.approx(expected, rel=0.05)
-    assert float(cells.light[marked].median()) == pytest.approx(
-        float(cells.light[lit].median()), rel=0.25
+    assert float(cells.relative_light[marked].median()) == pytest.approx(
+        float(cells.relative_light[lit].median()), rel=0.25
     )
 
 
@@ -377,9 +379,9 @@ def test_vehicles_carry_their_own_cells() -> None:
     assert area == pytest.approx(4.0 * 1.8, rel=0.2)
     np.testing.assert_allclose(cells.centers_m[:, 2], 0.75, atol=0.02)
     assert not bool((cells.neighbours == FLUSH).any())
-    assert float(cells.edge_m.max()) == pytest.approx(0.9, abs=0.2)
+    assert float(cells.edge_distance_m.max()) == pytest.approx(0.9, abs=0.2)
     roof = len(sheet((-2, 2), (-0.9, 0.9), 0.75))
-    assert len(cells.buried) > roof / 2 and int(cells.buried.max()) < roof
+    assert len(cells.hideable_ids) > roof / 2 and int(cells.hideable_ids.max()) < roof
     assert bool(within(bed.ground, (4, 8), (2.5, 3.5)).any())  # it drives on: ground is ground
 
 
@@ -443,7 +445,7 @@ def test_the_same_support_is_the_same_bytes(support: ExposedSurface, tmp_path: P
     for name in "ab":
         save_exposed_surface(tmp_path / name, support, "k")
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-    ground = dataclasses.replace(support.ground, light=support.ground.tracks)
+    ground = dataclasses.replace(support.ground, relative_light=support.ground.track_share)
     shared = ExposedSurface(ground, {"a": support.actors["car"], "b": support.actors["car"]})
     save_exposed_surface(tmp_path / "support", shared, "k")
     assert_equal(load_exposed_surface(tmp_path / "support", "k"), shared)

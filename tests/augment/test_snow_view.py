@@ -39,12 +39,12 @@ from tools.bench.snow import (
     SHADINGS,
     camera_from_above,
     cells_over,
-    pixel_places,
+    pixel_positions,
     snow_accuracy,
     snow_masks,
-    still,
     support_heights,
     true_points,
+    without_movers,
 )
 
 ROAD, BUILDING, CAR = (int(SemanticClass[name]) for name in ("ROAD", "BUILDING", "VEHICLE"))
@@ -227,8 +227,8 @@ def test_pixels_are_those_counted_one_by_one(thickness_m: float) -> None:
     got = count_snow_pixels(placed(boxes), camera, depth, snow, thickness_m)
     pixels, marked = count_by_hand(boxes, extents, camera, depth, snow)
     assert sum(p > 0 for p in pixels) > 30 and sum(marked) > 0
-    np.testing.assert_array_equal(got.pixels, pixels)
-    np.testing.assert_array_equal(got.marked, marked)
+    np.testing.assert_array_equal(got.num_pixels, pixels)
+    np.testing.assert_array_equal(got.num_marked, marked)
 
 
 @pytest.mark.parametrize("thickness_m", [0.02, 0.1, 0.3])
@@ -237,12 +237,12 @@ def test_snow_on_the_roof_is_the_cars_and_snow_around_its_wheels_is_not(thicknes
     high = dataclasses.replace(make_camera(pitch=0.5), camera_from_world=raised(4.0, 0.5))
     roof = plane_depth(high, 1.5 + thickness_m)
     got = count_snow_pixels(placed(boxes), high, roof, ALL, thickness_m)
-    assert got.pixels[0] == got.marked[0] > 300
+    assert got.num_pixels[0] == got.num_marked[0] > 300
     # Drifts on the roof are half as deep again.
     drift = plane_depth(high, 1.5 + 1.5 * thickness_m)
-    assert count_snow_pixels(placed(boxes), high, drift, ALL, thickness_m).pixels[0] > 300
+    assert count_snow_pixels(placed(boxes), high, drift, ALL, thickness_m).num_pixels[0] > 300
     ground = plane_depth(high, thickness_m)
-    assert count_snow_pixels(placed(boxes), high, ground, ALL, thickness_m).pixels[0] == 0
+    assert count_snow_pixels(placed(boxes), high, ground, ALL, thickness_m).num_pixels[0] == 0
 
 
 @pytest.mark.parametrize("resolution", [0.5, 1.0, 2.0])
@@ -257,7 +257,7 @@ def test_the_snowy_part_is_that_of_the_cap(resolution: float) -> None:
     got = count_snow_pixels(placed(boxes), camera, depth, snow, 0.4)
     expected = 0.4 / (2.4 - 0.45)  # the lowest 45 cm stand in snow
     # Each edge is off by half a pixel, of the 20 that the face has at resolution 1.
-    assert got.marked[0] / got.pixels[0] == pytest.approx(expected, abs=1 / 20 / resolution)
+    assert got.num_marked[0] / got.num_pixels[0] == pytest.approx(expected, abs=1 / 20 / resolution)
 
 
 def raised(height_m: float, pitch: float) -> torch.Tensor:
@@ -304,8 +304,8 @@ def mode(found):
 @pytest.fixture(scope="module")
 def points(true_street, truth):
     above = camera_from_above(all_cameras(true_street), reach_m=REACH_M, pixel_m=0.3)
-    xy = pixel_places(above).reshape(-1, 2)
-    return true_points(still(truth), all_cameras(true_street), xy, reach_m=REACH_M)
+    xy = pixel_positions(above).reshape(-1, 2)
+    return true_points(without_movers(truth), all_cameras(true_street), xy, reach_m=REACH_M)
 
 
 def covered_by(scene, points):

@@ -200,7 +200,7 @@ def test_dense_spray_gives_echoes_of_its_own_and_dims_what_stands_behind():
     origins = np.tile(np.array([0.0, 0, 1.5]), (4, 1))
     world = sweep.points_m[0] - points[0]
     for extinction, scattered in ((0.6, True), (0.02, False)):
-        echoes = Echoes.of(sweep, origins + world, world, DEFAULT_MODEL)
+        echoes = Echoes.from_sweep(sweep, origins + world, world, DEFAULT_MODEL)
         spray_echoes(echoes, one_puff(12.0, extinction), np.random.default_rng(0))
         assert (echoes.codes[0] == SCATTERED) == scattered
         tau = extinction * math.sqrt(2 * math.pi)

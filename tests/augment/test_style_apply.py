@@ -10,7 +10,7 @@ from fitted_scenes import fitted_scene
 from scenes import camera_ahead, random_gaussians
 
 from augment.cameras import Frame
-from augment.effects.snow.effect import snow_layers_of
+from augment.effects.snow.effect import build_snow_layers
 from augment.effects.style import network as checkpoint
 from augment.effects.style.color_maps import (
     CLASSES,
@@ -32,7 +32,7 @@ from augment.effects.style.style import scene_style_of, style_maps
 from augment.errors import StyleError
 from augment.memo import memo_of
 from augment.plan import make_plan
-from augment.render.composite import composite_sky, map_colors
+from augment.render.composite import apply_color_map, composite_sky
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0, evaluate_sh
@@ -150,7 +150,7 @@ def test_a_styled_scene_shows_the_mapped_picture():
     ):
         seen = rasterize([PosedGaussians(splats)], camera)
         pictures.append(composite_sky(seen.rgb, seen.alpha, camera, behind))
-    expected = map_colors(pictures[0], color_map, backend="reference")
+    expected = apply_color_map(pictures[0], color_map, backend="reference")
     torch.testing.assert_close(pictures[1], expected, rtol=0, atol=2e-5)  # blends of 200 splats
     assert (pictures[1] - pictures[0]).abs().max() > 0.01
 
@@ -292,7 +292,7 @@ def test_every_class_takes_its_map(scene):
 def test_no_strength_is_no_style_to_the_bit(scene, weather):
     none = Style(preset="dusk", strength=0)
     plan = make_plan(recipe_of(none, **weather), scene)
-    assert plan.placed["style"].data is None
+    assert plan.effect_plans["style"].data is None
     assert not any(runs for name, runs in ran(scene, recipe_of(none)).items() if "style" in name)
     clean, same = (render_view(scene, camera_of(scene), recipe_of(s, **weather))
                    for s in (None, none))  # fmt: skip
@@ -322,8 +322,8 @@ def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
     recipe = recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1, tracks="never"))
     plan = make_plan(recipe, scene)
     look = scene_style_of(scene, STYLE)
-    snow = plan.placed["snow"].data
-    styled, plain = (snow_layers_of(scene, snow, light) for light in (look.lighting_scene, None))
+    snow = plan.effect_plans["snow"].data
+    styled, plain = (build_snow_layers(scene, snow, light) for light in (look.lighting_scene, None))
     parts = look.on(styled.parts_for(scene, camera_of(scene)))
     assert any(part.is_overlay for part in parts)
     assert all((part.color_maps is None) == part.is_overlay for part in parts)

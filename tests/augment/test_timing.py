@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from augment.timing import PassProgress, counted, stopwatch, timed, watched
+from augment.timing import PassProgress, counted_steps, stopwatch, timed, watched
 
 
 def work() -> None:
     with timed("view plan"):
-        with counted("placing snow", 2) as advance:
+        with counted_steps("placing snow", 2) as advance:
             advance()
             advance()
         with timed("sky"):
@@ -40,9 +40,9 @@ def test_what_a_watcher_raises_gives_up_what_runs(last):
 
     def tell(progress: PassProgress) -> None:
         reports.append(progress)
-        if (progress.name, progress.done) == last:
+        if (progress.name, progress.num_done) == last:
             raise KeyError("nobody waits")
 
     with pytest.raises(KeyError, match="nobody waits"), watched(tell):
         work()
-    assert (reports[-1].name, reports[-1].done) == last
+    assert (reports[-1].name, reports[-1].num_done) == last

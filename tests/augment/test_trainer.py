@@ -30,13 +30,13 @@ from augment.reconstruct.trainer import (
     splat_inputs,
 )
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
-from augment.render.composite import quantise
+from augment.render.composite import to_byte_array
 from augment.render.constants import RasterSettings
 from augment.render.cpu import backward as cpu_backward
 from augment.render.cpu import backward_kernels as columns
 from augment.render.cpu.backward import Tape
 from augment.render.cpu.driver import Scratch
-from augment.render.layout import BLOCK
+from augment.render.layout import BLOCK_SIZE
 from augment.render.threads import limit_threads
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.sky import CubemapSky, cubemap_coordinates
@@ -55,7 +55,7 @@ GAIN = {"left": 1.0, "right": 0.9}  # the right camera records everything darker
 PLAN = Recipe(output=Output(depth="expected"))
 ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 STEPS = 120
-QUICK = Tuning(steps_per_sh_band=30, growth=Growth(every=20, start=0.1, stop=0.8))
+QUICK = Tuning(steps_per_sh_band=30, growth=Growth(steps_per_round=20, start=0.1, stop=0.8))
 
 
 # ---- a truth, what is recorded of it, and where a fit starts -----------------------------------
@@ -199,7 +199,7 @@ def record(scene: Scene) -> Recorded:
             pixels = np.flatnonzero(alpha.reshape(-1) > 0.9)[::5].astype(np.int32)
             views[ViewKey(frame.index, name)] = RecordedView(
                 camera=camera,
-                rgb=quantise(seen.rgb),
+                rgb=to_byte_array(seen.rgb),
                 weight=np.ones((HEIGHT, WIDTH), np.float32),
                 sky=alpha < 0.02,
                 depth_pixels=pixels,
@@ -287,7 +287,7 @@ def test_labelled_boxes_move_to_where_the_images_show_them(recorded):
     names = ("means", "means_end", "quats", "scales", "opacities", "sh_dc", "sh_rest", "sky")
     still = LearningRates(color_map=0.0, **dict.fromkeys(names, 0.0))
     labelled = truth(actors=(car(shift=(0.0, 0.03, -0.02), turn_rad=0.03),))
-    trainer = quick(labelled, recorded, 200, rates=still, growth=Growth(every=1000))
+    trainer = quick(labelled, recorded, 200, rates=still, growth=Growth(steps_per_round=1000))
     run(trainer, 200)
 
     def errors(scene: Scene) -> list[float]:
@@ -465,7 +465,7 @@ def test_forces_are_the_slopes_of_the_loss():
 
     def render(poses, camera):
         inputs = splat_inputs(splats, [0, 1], poses, camera, settings)
-        return cpu_backward.record(inputs, camera, settings, scratch, with_depth=False)
+        return cpu_backward.record_render(inputs, camera, settings, scratch, with_depth=False)
 
     def loss(poses, camera):
         return float((render(poses, camera).rgb.astype(np.float64) * weights).sum())
@@ -503,7 +503,7 @@ def test_a_camera_is_found_again():
 
     def render(camera):
         inputs = splat_inputs(splats, [0], poses, camera, settings)
-        return cpu_backward.record(inputs, camera, settings, scratch, with_depth=False)
+        return cpu_backward.record_render(inputs, camera, settings, scratch, with_depth=False)
 
     target = render(truth).rgb.copy()
 
@@ -553,7 +553,7 @@ def test_an_actor_is_pushed_along_its_forces_in_the_world():
 # ---- with gsplat ---------------------------------------------------------------------------------
 
 CONFIG = FitConfig(max_splats=600)
-TUNING = Tuning(steps_per_sh_band=1, growth=Growth(every=3, start=0.1, stop=0.6))
+TUNING = Tuning(steps_per_sh_band=1, growth=Growth(steps_per_round=3, start=0.1, stop=0.6))
 
 
 def trainer_on(device: str, source) -> Trainer:
@@ -577,7 +577,7 @@ def dense_rows(trainer: Trainer, grads, inputs) -> np.ndarray:
     """A row for each of the trainer's splats."""
     rows = np.zeros((len(trainer.splats), columns.NUM_GRADIENTS))
     for block, (part, _, _) in enumerate(inputs.blocks):
-        own = slice(block * BLOCK, block * BLOCK + grads.counts[block])
+        own = slice(block * BLOCK_SIZE, block * BLOCK_SIZE + grads.counts[block])
         ids = grads.ids[own]
         assert (np.diff(ids) > 0).all()
         rows[inputs.first_ids[part] + ids] = grads.rows[own]

@@ -179,17 +179,17 @@ def test_sky_ends_at_lidar_returns_and_below_the_horizon():
     rgb[20:, 80:] = (60, 40, 30)  # a house that ends below the top
     image_sky = find_sky(rgb, elevation_rad(camera))
     assert (
-        image_sky.sky[:15].all()
-        and not image_sky.sky[46:].any()
-        and not image_sky.sky[25:, 85:].any()
+        image_sky.is_sky[:15].all()
+        and not image_sky.is_sky[46:].any()
+        and not image_sky.is_sky[25:, 85:].any()
     )
-    assert image_sky.solid[46:].all()
+    assert image_sky.is_solid[46:].all()
     hits = np.zeros((80, 120), bool)
     hits[5:45:4, 10:40] = True  # a wall as bright as the sky, up to where the LiDAR sees
     top_rad = float(elevation_rad(camera)[5, 20])
     image_sky = find_sky(rgb, elevation_rad(camera), hits, top_rad)
-    assert not image_sky.sky[:40, 10:40].any() and not image_sky.solid[:2, 15:35].any()
-    assert image_sky.sky[:15, 60:].all()
+    assert not image_sky.is_sky[:40, 10:40].any() and not image_sky.is_solid[:2, 15:35].any()
+    assert image_sky.is_sky[:15, 60:].all()
     assert find_sky(np.zeros((80, 120, 3), np.uint8), elevation_rad(camera)) is None  # night
 
 

@@ -238,8 +238,8 @@ def test_what_is_left_out_changes_no_bit(surrounded, monkeypatch, name):
         view = plan_view(plan, surrounded, camera)
         num_left_out += (
             len(surrounded.actors)
-            - len(view.actors)
-            + (name == "snow" and "snow" not in view.names)
+            - len(view.actor_ids)
+            + (name == "snow" and "snow" not in view.effect_names)
         )
         lean = render_view(surrounded, camera, recipe)
         with monkeypatch.context() as patched:
@@ -255,9 +255,9 @@ def test_actors_keep_their_numbers(surrounded):
     """The car ahead is the first; looking back, the second is seen and the first is not."""
     plan = make_plan(Recipe(output=Output(depth="none")), surrounded)
     front, back = (camera_ahead(80, 46, 40.0, position=(0, 0, 1.5), yaw=yaw) for yaw in (0, np.pi))
-    assert plan_view(plan, surrounded, front).actors == (1,)
+    assert plan_view(plan, surrounded, front).actor_ids == (1,)
     view = render_buffers(surrounded, back, plan)
-    assert view.plan.actors == (2,) and [part.instance_id for part in view.parts] == [0, 2]
+    assert view.plan.actor_ids == (2,) and [part.instance_id for part in view.parts] == [0, 2]
     [step] = [s for s in view.plan.steps if s.name == "rasterise"]
     assert "1 of 4 actors (0 absent at this time, 3 out of view)" in step.why
 

@@ -23,14 +23,14 @@ from augment.effects.wet.darkening import (
 )
 from augment.effects.wet.effect import DARKENING_PASS, MIRROR_PASS, REFLECTION_PASS
 from augment.effects.wet.ground import (
-    CELL_M,
+    GROUND_CELL_M,
     NO_PUDDLES,
     PLACEMENT_SETTINGS,
     WetGround,
     wet_ground,
     wet_splats,
 )
-from augment.effects.wet.kernels import HEIGHT, NUM_CHANNELS, OPEN, PUDDLE_ORDER, SLOPE_X
+from augment.effects.wet.kernels import EXPOSURE, HEIGHT, NUM_CHANNELS, PUDDLE_ORDER, SLOPE_X
 from augment.effects.wet.reflection import (
     Film,
     Mirror,
@@ -68,11 +68,11 @@ QUIET = Output(depth="none", semantic=False, labels=False)
 
 def flat_map(size_m: float = 60.0, rise: float = 0.0, hollow: float = 0.0) -> WetGround:
     """Open ground about the origin that climbs towards +x."""
-    count = round(size_m / CELL_M)
-    x = (np.arange(count) + 0.5) * CELL_M - size_m / 2
+    count = round(size_m / GROUND_CELL_M)
+    x = (np.arange(count) + 0.5) * GROUND_CELL_M - size_m / 2
     channels = torch.zeros(count, count, NUM_CHANNELS)
     channels[..., HEIGHT] = torch.from_numpy(rise * x).float()
-    channels[..., OPEN], channels[..., SLOPE_X], channels[..., PUDDLE_ORDER] = 1.0, rise, hollow
+    channels[..., EXPOSURE], channels[..., SLOPE_X], channels[..., PUDDLE_ORDER] = 1.0, rise, hollow
     tops = channels[..., HEIGHT].clone()
     return WetGround(
         *(-size_m / 2, -size_m / 2, channels, tops, torch.ones_like(tops)), np.zeros(16, np.float32)
@@ -144,7 +144,7 @@ def test_what_is_sheltered_stays_dry_with_a_soft_edge():
     scene = scene_with(z)
     ground = wet_ground(scene, 0)
     x = torch.tensor([5.0, 7.5, 8.0, 8.5, 10.0, 15.0], dtype=torch.float64)
-    open_ = ground.at(x, torch.full_like(x, 6.0))[:, OPEN]
+    open_ = ground.interpolate(x, torch.full_like(x, 6.0))[:, EXPOSURE]
     assert float(open_[0]) > 0.95 and float(open_[-1]) > 0.95
     assert float(open_[4]) == 0 and 0.05 < float(open_[2]) < 0.95
     splats = wet_splats(scene, ground)
@@ -164,12 +164,12 @@ def test_water_stands_in_hollows_first_and_never_on_a_slope():
     for share in (0.05, 0.3):
         level = ground.find_puddle_threshold(share)
         channels = ground.channels
-        is_open = channels[..., OPEN] > 0.5
+        is_open = channels[..., EXPOSURE] > 0.5
         wet = channels[..., PUDDLE_ORDER] > level
         assert float((wet & is_open).sum() / is_open.sum()) == pytest.approx(share, abs=0.01)
-        at = ground.at(*torch.tensor([[20.0], [7.0]], dtype=torch.float64))
+        at = ground.interpolate(*torch.tensor([[20.0], [7.0]], dtype=torch.float64))
         assert float(at[0, PUDDLE_ORDER]) > level
-        columns = ground.left_m + (torch.arange(channels.shape[1]) + 0.5) * CELL_M
+        columns = ground.left_m + (torch.arange(channels.shape[1]) + 0.5) * GROUND_CELL_M
         assert not bool(wet[:, columns < 6].any())
     assert ground.find_puddle_threshold(0.0) == NO_PUDDLES
 
@@ -353,7 +353,7 @@ def test_slopes_of_rings_have_the_variance_that_stands_for_them():
     rings = make_rings(3.0, 0, 77)
     sx, sy, _ = ring_slopes(rings, x, y, torch.full((60_000,), 1e-4))
     measured = float((sx**2 + sy**2).mean())
-    assert measured == pytest.approx(rings.variance - rings.unseen, rel=0.25)
+    assert measured == pytest.approx(rings.variance - rings.undrawn_variance, rel=0.25)
     assert make_rings(300.0, 0, 0).variance < 0.1 and RING_M2 > 0
 
 

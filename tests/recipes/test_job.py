@@ -119,11 +119,11 @@ def test_recipes_come_from_presets_and_files(tmp_path: Path) -> None:
     (tmp_path / "files" / "fog.yaml").write_text(text)
     recipes = load_job_recipes(parse(WHOLE), tmp_path)
     assert list(recipes.templates) == ["dense-fog", "fog"]
-    named = recipes.of_scene(recipes.job.scenes[1], "x")
+    named = recipes.resolve_for_scene(recipes.job.scenes[1], "x")
     assert [(r.name, r.variant, r.render.scale) for r in named] == [
         ("fog", k, 0.5) for k in range(4)
     ]
-    assert recipes.of_scene(recipes.job.scenes[1], "y") == named  # draws: shared
+    assert recipes.resolve_for_scene(recipes.job.scenes[1], "y") == named  # draws: shared
     with pytest.raises(RecipeError, match=r"fog\.yaml"):
         load_job_recipes(parse(WHOLE), tmp_path / "files")
 
@@ -142,7 +142,7 @@ def test_a_scale_beyond_the_limits(tmp_path: Path) -> None:
     (tmp_path / "fog.yaml").write_text("render: {scale: 4}\n")
     job = parse(SCENES + "recipes: [fog.yaml]\nscale: 4\n")
     with pytest.raises(RecipeError, match=r"a scale of 4\.0 times the recipe's render\.scale 4"):
-        load_job_recipes(job, tmp_path).of_scene(job.scenes[0], "x")
+        load_job_recipes(job, tmp_path).resolve_for_scene(job.scenes[0], "x")
 
 
 def test_scenes_have_seeds_of_their_own() -> None:

@@ -47,8 +47,14 @@ class Dust(EffectModel):
         ),
     )
     columns = (
-        Column("dust_density", lambda it: it.density, "Dust", absent=0.0, shows="nonzero"),
-        Column("dust_kind", lambda it: it.light, absent=None),
+        Column(
+            "dust_density",
+            lambda it: it.density,
+            "Dust",
+            value_if_absent=0.0,
+            presence_values="nonzero",
+        ),
+        Column("dust_kind", lambda it: it.light, value_if_absent=None),
     )
 
     density: Unit

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from recipes import schema as knobs
 from recipes.errors import RecipeError
-from recipes.fields import changed, found, is_given, replaced
+from recipes.fields import changed, is_given, section_at, with_unchecked_field
 from recipes.flood import Flood, Wave, Waves
 from recipes.job import scaled_recipe
 from recipes.load import dump_recipe, parse_recipe
@@ -33,25 +33,25 @@ def test_tiers_set_knobs_to_values_of_the_table() -> None:
     assert set(TIERS) == {"draft", "balanced"}
     for settings in TIERS.values():
         for path, value in settings.items():
-            assert value in knobs.KNOBS[path].values and knobs.KNOBS[path].chosen
+            assert value in knobs.KNOBS[path].values and knobs.KNOBS[path].is_selectable
 
 
 def test_without_a_wish_nothing_changes() -> None:
     assert resolved("quality:\n") == resolved("{}") == Recipe(name="test")
-    assert Recipe().quality.words is None
+    assert Recipe().quality.summary is None
     assert '"quality"' not in Recipe().canonical_json()
 
 
 def test_a_word_is_short_for_its_mapping() -> None:
     assert resolved("quality: draft") == resolved("quality: {tier: draft}")
-    assert resolved("quality: draft").quality.words == "draft"
+    assert resolved("quality: draft").quality.summary == "draft"
 
 
 def test_reference_sets_every_knob_of_what_the_recipe_has() -> None:
     recipe = resolved(f"quality: reference\n{SNOW_AND_FLOOD}")
     for knob in knobs.knobs_of(recipe):
-        if knob.chosen:
-            assert found(recipe, knob.path) == knob.reference, knob.path
+        if knob.is_selectable:
+            assert section_at(recipe, knob.path) == knob.reference, knob.path
     assert recipe.weather.snow is not None and recipe.weather.snow.shading == "per_pixel"
     assert recipe.weather.smog is None and recipe.style is None
 
@@ -75,7 +75,7 @@ def test_a_tier_is_numbers_once_resolved(tier: str) -> None:
 
 def test_a_target_is_open_until_it_is_settled() -> None:
     recipe = resolved(f"quality: {{max_flip: 0.03}}\nrender: {{sh_degree: 2}}\n{SNOW_AND_FLOOD}")
-    assert recipe.quality.is_open and recipe.quality.words == "max_flip 0.03"
+    assert recipe.quality.has_open_choice and recipe.quality.summary == "max_flip 0.03"
     free = {knob.path for knob in knobs.free_knobs(recipe)}
     assert "render.sh_degree" not in free and "render.scale" in free
     assert "weather.smog.model" not in free and not any(p.startswith("output") for p in free)
@@ -88,7 +88,7 @@ def test_settings_count_as_given() -> None:
     recipe = resolved(f"quality: {{budget_ms: 150}}\n{SNOW_AND_FLOOD}")
     chosen = {"render.scale": 0.5, "weather.flood.waves.count": 6, "quality.settled": True}
     settled = knobs.with_settings(recipe, chosen)
-    assert not settled.quality.is_open and settled.quality.words == "budget_ms 150"
+    assert not settled.quality.has_open_choice and settled.quality.summary == "budget_ms 150"
     assert settled.render.scale == 0.5 and settled.weather.flood is not None
     assert settled.weather.flood.waves.count == 6
     assert "render.scale" not in {knob.path for knob in knobs.free_knobs(settled)}
@@ -149,7 +149,9 @@ def test_fields_are_changed_in_a_copy() -> None:
     assert (recipe.render.scale, other.render.scale, other.render.near_m) == (1.0, 2.0, 0.5)
     assert is_given(other, "render.near_m") and is_given(other, "render.scale")
     assert not is_given(other, "render.sh_degree") and not is_given(recipe, "render.scale")
-    assert found(recipe, "weather.smog.model") is None
+    assert section_at(recipe, "weather.smog.model") is None
     with pytest.raises(ValidationError):
         changed(recipe, {"render.scale": -1.0})
-    assert replaced(recipe, "render.scale", -1.0).render.scale == -1  # nothing is checked
+    assert (
+        with_unchecked_field(recipe, "render.scale", -1.0).render.scale == -1
+    )  # nothing is checked

@@ -239,7 +239,7 @@ def test_every_field_changes_the_hash() -> None:
         for section in sections:
             key = section.removesuffix("[]")
             inner = inner[key] if key == section else inner[key][0]
-        accepted = (value for value in (*spec.words, *CANDIDATES) if spec.accepts(value))
+        accepted = (value for value in (*spec.allowed_words, *CANDIDATES) if spec.accepts(value))
         inner[name] = next(value for value in accepted if value != inner[name])
         hashes.add(Recipe.model_validate(data).hash)
     assert len(hashes) == len(changed) + 7
@@ -464,7 +464,9 @@ def field_table() -> str:
             known = "" if default is None else f"`{format_value(default)}`"
             default = "`null`" if spec.nullable else known
             default = "required" if spec.info.is_required() else default
-            rows.append(f"| `{spec.path}` | {spec.allowed()} | {default} | {spec.description} |\n")
+            rows.append(
+                f"| `{spec.path}` | {spec.describe_allowed_values()} | {default} | {spec.description} |\n"
+            )
     return "".join(rows)
 
 

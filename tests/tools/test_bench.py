@@ -38,9 +38,9 @@ from tools.bench.harness import WallClock, rounds, run_in_subprocess
 from tools.bench.pictures import DUSK, SHOWN, SWEEPS, recipe_of
 from tools.bench.scenes import EffectCase, RasterCase, measure_effect
 from tools.bench.trade import (
+    ALL_KNOBS,
     DEPTH,
     JPEG,
-    WHOLE,
     Standard,
     Unmeasured,
     depth_figures,
@@ -304,7 +304,7 @@ def table(**recipes):
 
 
 def whole(worst_flip, stop=1e-4, clip=0.0):
-    return row(WHOLE, "some name", 0.5, worst_flip, {STOP: stop, CLIP: clip})
+    return row(ALL_KNOBS, "some name", 0.5, worst_flip, {STOP: stop, CLIP: clip})
 
 
 SINGLE = [
@@ -402,7 +402,7 @@ def test_errors_of_settings_grow_away_from_the_reference(monkeypatch):
     rows = {(row["knob"], row["value"]): row for row in trade.rows_of([found.figures])}
     tables = trade.printable(found.figures)["tables"]
     assert sum(len(table["rows"]) for table in tables) == len(rows)
-    best = rows[WHOLE, trade.REFERENCE]
+    best = rows[ALL_KNOBS, trade.REFERENCE]
     assert (best["flip"], best["psnr"], best["ssim"], best["flicker"]) == (0, None, 1, 0)
     assert (best["off_5cm"], best["abs_rel"], best["over_reference"]) == (0, 0, 1)
     coarse, finer = rows["render.scale", 0.25], rows["render.scale", 0.75]

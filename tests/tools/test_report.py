@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from augment.errors import OutputError
-from augment.jobs.files import box_tables, visibility
+from augment.jobs.files import box_tables, combine_visibility
 from augment.jobs.layout import MANIFEST_FILE
 from augment.jobs.manifest import publish_part, rows_to_table, write_manifest
 from augment.jobs.store import LocalStore
@@ -332,7 +332,7 @@ def test_visibility_is_that_of_the_labels(tmp_path) -> None:
     paths = {kind: rows[0][f"{kind}_path"] for kind in box_tables() if kind != "box_2d"}
     there = {kind: tmp_path / path for kind, path in paths.items() if path}
     weather = {kind: box_tables()[kind].read(path)[0, "front"] for kind, path in there.items()}
-    expected = visibility(weather, 3)[:2]  # no pixel shows the third box
+    expected = combine_visibility(weather, 3)[:2]  # no pixel shows the third box
     assert expected.tolist() == pytest.approx([0.9 * 0.5 * 0.5, 0.0])
     assert shares is not None
     assert shares["rows"] == [("wet", [("s0", "0–5 %", 1), ("s2", "20–50 %", 1)])]

@@ -33,10 +33,10 @@ from augment.errors import ClimateGSError, OutputError
 from augment.geometry import invert_rigid
 from augment.jobs.manifest import rows_to_table, write_manifest
 from augment.jobs.store import open_store
-from augment.timing import PassProgress, counted
+from augment.timing import PassProgress, counted_steps
 from augment.views import render_view
 from recipes.errors import RecipeError
-from recipes.fields import found, replaced
+from recipes.fields import section_at, with_unchecked_field
 from recipes.load import load_recipe, preset_names
 from recipes.recipe_file import recipe_file
 from recipes.schema import SECTIONS
@@ -115,8 +115,8 @@ def test_every_field_of_every_effect_has_a_control_whose_ends_its_model_takes(du
 def test_an_effect_that_is_switched_on_starts_from_values_its_model_takes(dust):
     for section in SECTIONS:
         edits = Edits("clear").with_section(section)
-        assert found(edits.recipe(), section).changes, start_of_section(section)
-        assert found(edits.without_section(section).recipe(), section) is None
+        assert section_at(edits.recipe(), section).changes, start_of_section(section)
+        assert section_at(edits.without_section(section).recipe(), section) is None
 
 
 def sliders() -> list[Control]:
@@ -130,7 +130,11 @@ def test_sliders_reach_what_presets_draw_and_boxes_all_that_a_recipe_takes():
     for control in sliders():
         section = control.path.rpartition(".")[0]
         for recipe in recipes:
-            value = found(recipe, control.path) if found(recipe, section) is not None else None
+            value = (
+                section_at(recipe, control.path)
+                if section_at(recipe, section) is not None
+                else None
+            )
             if value is not None and value != control.default:
                 assert control.low <= value <= control.high, control.path
         least, most = control.valid
@@ -208,7 +212,7 @@ def test_what_is_drawn_at_rest_has_the_bits_of_a_rendered_image_whatever_else_is
     camera = scene.frames[0].cameras["front"]
     recipe = Edits("light-haze", SCALE).recipe()
     for path, value in (("output.depth", "median"), ("output.semantic", True)):
-        recipe = replaced(recipe, path, value)
+        recipe = with_unchecked_field(recipe, path, value)
         asked = recipe_to_show(recipe, PICTURE, with_depth=False, factor=1.0)
         rgb = render_view(scene, camera, recipe).rgb
         assert np.array_equal(draw(scene, camera, asked, PICTURE).rgb, rgb)
@@ -447,7 +451,7 @@ class SettlingDust(DustEffect):
 
     def edit_scene(self, own, layers, camera):
         self.begun += 1
-        with counted("settling dust", 2) as advance:
+        with counted_steps("settling dust", 2) as advance:
             for _ in range(2):
                 assert self.steps.acquire(timeout=60)
                 advance()

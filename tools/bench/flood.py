@@ -193,7 +193,7 @@ def mirror_parts(parts: Sequence[PosedGaussians], level_z_m: float) -> list[Pose
 def mirrored_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Float[Tensor, "H W 3"]:
     """The flooded view, not clamped, of an eye above still, opaque water."""
     plan = make_plan(recipe, scene)
-    medium = plan.placed["flood"].data
+    medium = plan.effect_plans["flood"].data
     assert medium.waves.is_flat
 
     def layer(parts: Sequence[PosedGaussians], clip: HeightClip) -> tuple[Tensor, Tensor]:
@@ -205,7 +205,9 @@ def mirrored_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Float[Tens
     parts = scene.parts_for(camera)
     level_z_m = medium.level_z_m
     front, alpha_above = layer(parts, HeightClip(level_z_m, ABOVE))
-    rgb, alpha = layer(mirror_parts(parts, level_z_m), HeightClip(level_z_m, BELOW, overlaps=True))
+    rgb, alpha = layer(
+        mirror_parts(parts, level_z_m), HeightClip(level_z_m, BELOW, has_overlap=True)
+    )
     rays = camera.ray_directions(torch.float64)
     mirrored_sky = scene.sky.sample((rays * MIRROR.diagonal()[:3]).float()).double()
     reflected = rgb + (1 - alpha) * mirrored_sky

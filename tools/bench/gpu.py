@@ -96,7 +96,7 @@ from tools.output import write_json
 BACKEND = "cuda"
 BUFFERS = frozenset({RGB, ALPHA})
 SETTINGS = RasterSettings()
-MEDIUM = Fog(sigma_per_m=0.03, rgb=(0.7, 0.72, 0.75))
+MEDIUM = Fog(extinction_per_m=0.03, airlight_rgb=(0.7, 0.72, 0.75))
 STAGES = ("project", "list", "blend")
 PLACEMENTS = PASSES = 3  # that count
 START = "<!-- gpu: made by climategs bench gpu --table docs/performance.md -->"
@@ -376,7 +376,7 @@ def frame_recipes(cell_m: float = 0.05) -> dict[str, Recipe]:
 def balanced(recipe: Recipe, *kept: str) -> Recipe:
     """The recipe as `quality: balanced` would set it, all it gives itself too, but for `kept`."""
     tier = TIERS["balanced"]
-    knobs = (knob for knob in knobs_of(recipe) if knob.chosen and knob.path not in kept)
+    knobs = (knob for knob in knobs_of(recipe) if knob.is_selectable and knob.path not in kept)
     return with_settings(recipe, {knob.path: tier.get(knob.path, knob.reference) for knob in knobs})
 
 

@@ -160,7 +160,7 @@ def _bare(uri: str, recipes: JobRecipes, out: Path) -> float:
     scene = open_scene(uri)
     views = [
         (recipe, camera, out / variant_name(recipe) / f"{name.replace('/', '_')}-{frame.index}")
-        for recipe in recipes.of_scene(recipes.job.scenes[0], scene.name)
+        for recipe in recipes.resolve_for_scene(recipes.job.scenes[0], scene.name)
         for frame in scene.frames
         for name, camera in frame.cameras.items()
     ]
@@ -186,12 +186,12 @@ def _generate(job: GenerateJob, executor: str, workers: int, out: Path) -> float
     plan = plan_job(run, progress=False)
     with contextlib.closing(Workers(run)) as own:
         first, rest = (
-            BlockWork(blocks, plan.names, own.opened, _refuse_failure)
+            BlockWork(blocks, plan.names, own.scene_of_slot, _refuse_failure)
             for blocks in (plan.blocks[:workers], plan.blocks[workers:])
         )
-        own.do(first)
+        own.run(first)
         started = time.perf_counter()
-        own.do(rest)
+        own.run(rest)
         compact(open_store(out))
         took = time.perf_counter() - started
     if first.tally.written + rest.tally.written != plan.images:

@@ -39,7 +39,7 @@ from tools.bench.scenes import LARGE_CASE, SMALL_CASE, RasterCase, random_scene
 STAGES = ("project", "sort", "bin", "raster")
 BUFFERS = frozenset({RGB, ALPHA})
 SETTINGS = RasterSettings()
-FOG = Fog(sigma_per_m=0.03, rgb=(0.7, 0.72, 0.75))
+FOG = Fog(extinction_per_m=0.03, airlight_rgb=(0.7, 0.72, 0.75))
 COLUMNS = ("scene", "smog / clear", "splats used", "pairs", "pairs listed", "M pairs/s",
            "scene MiB", "frame MiB")  # fmt: skip
 REFERENCE_COLUMNS = ("reference ms", "cpu ms", "speed-up", "99.9 % within", "max", "flipped",

@@ -88,7 +88,7 @@ def truth_view(scene: Scene, truth: StreetTruth, camera: Camera) -> TruthView:
 
 def smog_error(recipe: Recipe, scene: Scene, view: TruthView) -> np.ndarray:
     """Largest channel error [H, W] of the fogged splats against exact smog, in 1/255."""
-    fog = make_plan(recipe, scene).placed["smog"].data.fog
+    fog = make_plan(recipe, scene).effect_plans["smog"].data.fog
     camera = view.camera
     fogged = frame_of(scene, camera, recipe)().rgb
     z = torch.from_numpy(np.where(np.isfinite(view.exact.depth), view.exact.depth, 1.0))

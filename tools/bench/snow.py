@@ -160,7 +160,7 @@ class TruePoints:
         return TruePoints(*(getattr(self, f.name)[mask] for f in dataclasses.fields(self)))
 
 
-def still(truth: StreetTruth) -> StreetTruth:
+def without_movers(truth: StreetTruth) -> StreetTruth:
     """Return the street without moving objects."""
     return StreetTruth(dataclasses.replace(truth.street, movers=()))
 
@@ -182,7 +182,7 @@ def camera_from_above(cameras: Sequence[Camera], *, reach_m: float, pixel_m: flo
     )
 
 
-def pixel_places(camera: Camera) -> np.ndarray:
+def pixel_positions(camera: Camera) -> np.ndarray:
     """x and y [H, W, 2] of the pixels of a camera from above."""
     centre = camera.centre.numpy()
     x = centre[0] + (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
@@ -267,10 +267,10 @@ def snow_accuracy(
     each axis is a point.
     """
     cameras = all_cameras(scene)
-    street = still(truth)
+    street = without_movers(truth)
     above = camera_from_above(cameras, reach_m=reach_m, pixel_m=pixel_m)
     points = true_points(
-        street, cameras, pixel_places(above)[1::2, 1::2].reshape(-1, 2), reach_m=reach_m
+        street, cameras, pixel_positions(above)[1::2, 1::2].reshape(-1, 2), reach_m=reach_m
     )
     max_slope = math.radians(ExposureSettings(cell_m=cell_m).max_slope_deg)
     flat = points.chosen(points.is_seen & (points.slope < max_slope))
@@ -415,7 +415,7 @@ def _drawn(
     """
     snow = recipe_of({"snow": {"depth_m": depth_m}}).weather.snow
     layer = lay_snow(support, scene, snow, find_snow_light(scene, snow), seed=0).ground
-    without_snow = dataclasses.replace(scene.background, opacities=layer.opacities)
+    without_snow = dataclasses.replace(scene.background, opacities=layer.visible_opacities)
     parts = [PosedGaussians(without_snow), PosedGaussians(layer.gaussians, is_overlay=True)]
     settings = RasterSettings(sh_degree=0)
     out = rasterize(parts, above, buffers=BUFFERS, settings=settings, clip=SURFACE_DEPTHS_ONLY)
@@ -426,7 +426,7 @@ def _drawn(
     on_it = shows_snow_there & (np.abs(z - depth_m - flat.z) <= OVER_M + 0.5 * depth_m)
     off = np.where(on_it, z - flat.z - depth_m, np.nan)
     step = max(1, int(shows_snow.sum()) // 400_000)
-    places = pixel_places(above)[shows_snow][::step]
+    places = pixel_positions(above)[shows_snow][::step]
     heights = height[shows_snow][::step]
     sunk = heights < surface_below(truth, places) - OVER_M
     return {
@@ -501,12 +501,12 @@ def mask_agreement(
         (first_view, first_mask) = view_of(first)
         (second_view, second_mask) = view_of(second)
         warp = find_warp(first_view, second_view)
-        ours = first_mask[warp.counts]
+        ours = first_mask[warp.is_counted]
         images = np.concatenate([second_view.picture, second_mask[..., None]], -1)
-        theirs = warp.sample(images)[warp.counts]
+        theirs = warp.sample(images)[warp.is_counted]
         same = ours == (theirs[:, 3] > 0.5)
         both = ours & same
-        squares = float(((first_view.picture[warp.counts][both] - theirs[both, :3]) ** 2).sum())
+        squares = float(((first_view.picture[warp.is_counted][both] - theirs[both, :3]) ** 2).sum())
         counts = (len(ours), int(same.sum()), squares, int(both.sum()))
         counts_by_kind.setdefault(kind, []).append(counts)
     rows: list[list[Cell]] = []

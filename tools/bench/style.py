@@ -29,7 +29,7 @@ from augment.effects.style.pairs import (
 from augment.effects.style.statistics import closed_maps, reinhard_map
 from augment.effects.style.train import read_photos
 from augment.metrics.image import psnr
-from augment.render.composite import quantise
+from augment.render.composite import to_byte_array
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from recipes.schema import Recipe
@@ -124,7 +124,7 @@ def _map_table(scene: Scene, repeats: int) -> Table:
     rgb = frame_of(scene, front_camera(scene, 1920), CLEAN)().rgb
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "style.jpg"
-        cv2.imwrite(str(path), quantise(rgb * torch.tensor([1.0, 0.8, 0.6]))[..., ::-1])
+        cv2.imwrite(str(path), to_byte_array(rgb * torch.tensor([1.0, 0.8, 0.6]))[..., ::-1])
         image = read_style_image(path)
         reading = rounds({"reading the image": lambda: read_style_image(path)}, repeats)
     content = content_statistics(scene, per_region=True)

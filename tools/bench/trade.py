@@ -44,7 +44,14 @@ from augment.cameras import Camera
 from augment.errors import ClimateGSError, SceneError
 from augment.ground import ground_of
 from augment.jobs.files import decode_image, encode_image
-from augment.jobs.quality import Cost, Settings, Trial, render_trial, search, select_useful_values
+from augment.jobs.quality import (
+    Cost,
+    Settings,
+    Trial,
+    render_trial,
+    search_settings,
+    select_useful_values,
+)
 from augment.jobs.worker import default_renderer
 from augment.memo import memo_of
 from augment.metrics.consistency import DepthView, warp_view
@@ -75,7 +82,7 @@ from tools.bench.scenes import frame_of, front_name, recipe_of
 from tools.drawing import captioned, strip, write_rgb
 from tools.render import warm_up
 
-WHOLE = "whole"  # stands for a knob where several are set
+ALL_KNOBS = "whole"  # stands for a knob where several are set
 DEPTH = "output.depth"
 JPEG = "output.jpeg_quality"
 REFERENCE = "reference"
@@ -162,16 +169,16 @@ def settings_of_trade(recipe: Recipe, wholes: Wholes | None = None) -> list[tupl
     """
     best = with_reference_settings(recipe)
     knobs = knobs_of(recipe)
-    references = {knob.path: knob.reference for knob in knobs if knob.chosen}
+    references = {knob.path: knob.reference for knob in knobs if knob.is_selectable}
     single: list[tuple[Row, Recipe]] = []
     if wholes is None:
         pairs = [(knob.path, value) for knob in knobs for value in measured_values(knob, recipe)]
         single = [({"knob": p, "value": v}, with_settings(best, {p: v})) for p, v in pairs]
-        single.append(({"knob": WHOLE, "value": DEFAULTS}, recipe))
+        single.append(({"knob": ALL_KNOBS, "value": DEFAULTS}, recipe))
     whole_rows: list[tuple[Row, Recipe]] = []
     for name, settings in {REFERENCE: {}, **(TIERS if wholes is None else wholes)}.items():
         all_settings = {path: settings.get(path, value) for path, value in references.items()}
-        row = {"knob": WHOLE, "value": name, "settings": all_settings}
+        row = {"knob": ALL_KNOBS, "value": name, "settings": all_settings}
         whole_rows.append((row, with_settings(best, all_settings)))
     return [whole_rows[0], *single, *whole_rows[1:]]
 
@@ -220,10 +227,10 @@ class Standard:
     def region(self, knob: str) -> np.ndarray:
         """Return the pixels of a knob's depth errors: its effect's, or else all surfaces."""
         effect = next((e for e in effects.EFFECTS if knob.startswith(f"{e.section}.")), None)
-        if effect is None or effect.mask is None:
+        if effect is None or effect.mask_name is None:
             return self.surfaces
-        covered = self.masks.get(effect.mask, np.zeros_like(self.surfaces))
-        return covered if effect.lies_on_scene else covered & self.surfaces
+        covered = self.masks.get(effect.mask_name, np.zeros_like(self.surfaces))
+        return covered if effect.adds_overlays else covered & self.surfaces
 
 
 def render_standard(
@@ -278,9 +285,9 @@ def errors_of(knob: str, trials: Sequence[Trial], standards: Sequence[Standard])
             region & (depth > 0) for region, depth in zip(regions, expected_depths, strict=True)
         ]
     depths = [trial.depth if depth_reference else None for trial in trials]
-    pictures = [trial.picture for trial in trials]
+    pictures = [trial.rgb for trial in trials]
     return {
-        **picture_figures(pictures, [standard.best.picture for standard in standards]),
+        **picture_figures(pictures, [standard.best.rgb for standard in standards]),
         **depth_figures(depths, expected_depths, regions),
         "depth_against": depth_reference,
         "flicker": flicker(standards[:2], pictures[:2]),
@@ -330,7 +337,7 @@ def flicker(standards: Sequence[Standard], pictures: Sequence[np.ndarray]) -> fl
     first, second = (
         DepthView(
             standard.camera,
-            (picture.astype(np.float32) - standard.best.picture) / np.float32(255),
+            (picture.astype(np.float32) - standard.best.rgb) / np.float32(255),
             standard.first_m,
             standard.alpha,
         )
@@ -383,7 +390,7 @@ def bench_trade(
     entries = []
     for recipe in tqdm(resolved_recipes, unit="recipe"):
         recipe_scene = dataclasses.replace(scene)  # its memo holds nothing of other recipes
-        memo_of(recipe_scene).update(memo_of(scene).shared())
+        memo_of(recipe_scene).take_shared(memo_of(scene).shared())
         settings = settings_of_trade(recipe, wholes)
         standards = [
             render_standard(recipe_scene, camera, settings[0][1], true, backend)
@@ -392,10 +399,10 @@ def bench_trade(
         rows: list[Row] = []
         for row, picture in setting_rows(recipe_scene, recipe, settings, standards, case, backend):
             rows.append(row)
-            if row["knob"] == WHOLE:
+            if row["knob"] == ALL_KNOBS:
                 pictures[recipe.name][row["value"]] = picture
         if wholes is None:
-            rows += jpeg_rows([standard.best.picture for standard in standards])
+            rows += jpeg_rows([standard.best.rgb for standard in standards])
         rows = [{name: _rounded(value) for name, value in row.items()} for row in rows]
         entries.append({"recipe": recipe.name, "rows": rows})
     trade_figures = {
@@ -452,9 +459,9 @@ def setting_rows(
             row["over_reference"] = harness.spread_ratio(seconds[n], seconds[1])["median"]
             row["over_clean"] = harness.spread_ratio(seconds[n], seconds[0])["median"]
             row |= errors_of(row["knob"], trials[n], standards)
-            if case.memory and row["knob"] == WHOLE:
+            if case.memory and row["knob"] == ALL_KNOBS:
                 row["mib"] = frame_mib(frame(trial_recipe, cameras[0]), backend)
-            yield row, trials[n][0].picture
+            yield row, trials[n][0].rgb
 
 
 def frame_mib(frame: harness.Action, backend: str) -> float | None:
@@ -510,7 +517,7 @@ def printable(trade: Mapping[str, Any]) -> Figures:
     """Tables in the form that all subjects are printed in: of every recipe the settings, wholes
     first, and the files; columns of which something is known.
     """
-    order = [WHOLE, *KNOBS]
+    order = [ALL_KNOBS, *KNOBS]
     tables = []
     for entry in trade["recipes"]:
         rows = sorted(entry["rows"], key=lambda row: order.index(row["knob"]))
@@ -562,7 +569,7 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
     rows = rows_of(tables)
     ladders = {}
     for path, knob in KNOBS.items():
-        if knob.chosen:
+        if knob.is_selectable:
             costs = [value_cost(rows, path, value) for value in knob.values[:-1]]
             known_costs = [cost for cost in costs if cost is not None]
             fast_first = select_useful_values([*known_costs, Cost(knob.reference, 100.0, 0.0)])[
@@ -571,7 +578,7 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
             # What is beyond the bound alone need not be rendered with others.
             ladders[path] = [cost for cost in fast_first if cost.flip <= bound]
     by_time = sorted(ladders, key=lambda path: _saved(rows, path, ladders[path]), reverse=True)
-    chosen = search(
+    chosen = search_settings(
         {path: [cost.value for cost in ladders[path]] for path in by_time},
         lambda settings: whole_flip(rows, settings) <= bound,
     )
@@ -619,7 +626,7 @@ def whole_flip(rows: Sequence[Row], settings: Settings) -> float:
 
 
 def _settings(row: Row) -> Mapping[str, Value]:
-    single = {} if row["knob"] == WHOLE else {row["knob"]: row["value"]}
+    single = {} if row["knob"] == ALL_KNOBS else {row["knob"]: row["value"]}
     return row.get("settings", single)
 
 
@@ -656,7 +663,7 @@ def measure_wholes(table: dict[str, Any], uri: str, wholes: Wholes, case: TradeC
     trade = bench_trade(uri, names, case, wholes=wholes)
     for entry, new in zip(table["recipes"], trade.figures["recipes"], strict=True):
         other_rows = [
-            row for row in entry["rows"] if row["knob"] != WHOLE or row["value"] not in wholes
+            row for row in entry["rows"] if row["knob"] != ALL_KNOBS or row["value"] not in wholes
         ]
         entry["rows"] = other_rows + [row for row in new["rows"] if row["value"] in wholes]
     return trade
@@ -705,7 +712,9 @@ def _tier_lines() -> list[str]:
     rows = []
     for path, knob in KNOBS.items():
         values = [TIERS[name].get(path, knob.reference) for name in BOUNDS]
-        rows += [[f"`{path}`", knob.what, *map(_text, [*values, knob.reference])]] * knob.chosen
+        rows += [
+            [f"`{path}`", knob.description, *map(_text, [*values, knob.reference])]
+        ] * knob.is_selectable
     return _lines(["knob", "what it is", *BOUNDS, REFERENCE], rows)
 
 
@@ -713,7 +722,7 @@ def _whole_lines(tables: Tables) -> list[str]:
     """Settings as a whole, a row a recipe: time over the reference's, and the worst view's FLIP."""
     names = (DEFAULTS, *BOUNDS)
     lines = []
-    whole_rows = [row for row in rows_of(tables) if row["knob"] == WHOLE]
+    whole_rows = [row for row in rows_of(tables) if row["knob"] == ALL_KNOBS]
     row_of = {(row["scene"], row["recipe"], row["value"]): row for row in whole_rows}
     for scene, recipe in dict.fromkeys(key[:2] for key in row_of):
         of = [row_of[scene, recipe, name] for name in names]
@@ -791,7 +800,7 @@ def draw_chart(path: Path, figures: Mapping[str, Any]) -> None:
         points: dict[str, list[tuple[float, float]]] = {}
         for row in entry["rows"]:
             if row["knob"] not in (DEPTH, JPEG) and not str(row["value"]).startswith("candidate"):
-                is_whole = row["knob"] == WHOLE
+                is_whole = row["knob"] == ALL_KNOBS
                 name = row["value"] if is_whole else row["knob"].removeprefix("weather.")
                 curve = points.setdefault(name, [] if is_whole else [(1.0, 0.0)])
                 curve.insert(-1, (row["over_reference"], row["flip"]))
@@ -812,7 +821,7 @@ def draw_tiers(path: Path, trade: Trade) -> None:
     """
     lines = []
     for entry in trade.figures["recipes"]:
-        whole_rows = {row["value"]: row for row in entry["rows"] if row["knob"] == WHOLE}
+        whole_rows = {row["value"]: row for row in entry["rows"] if row["knob"] == ALL_KNOBS}
         panels = []
         for name in (REFERENCE, *list(BOUNDS)[::-1]):
             picture = trade.pictures[entry["recipe"]][name]

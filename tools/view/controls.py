@@ -367,9 +367,9 @@ def _control(leaf: Leaf) -> Control:
         return Control(kind="colour" if high == 1 else "rates", high=high, **attributes)
     if leaf.annotation == FilePath:
         return Control(kind="file", **attributes)
-    if leaf.words:
+    if leaf.allowed_words:
         boolean = ("true", "false") if leaf.accepts(True) else ()
-        return Control(kind="words", words=(*boolean, *leaf.words), **attributes)
+        return Control(kind="words", words=(*boolean, *leaf.allowed_words), **attributes)
     return Control(kind="text", **attributes)
 
 
@@ -441,6 +441,6 @@ def start_of_model(section: str) -> dict[str, Any]:
             effect = model.model_validate(required_values | extra_values)
         except ValidationError:
             continue
-        if effect.changes:
+        if effect.has_effect:
             return required_values | extra_values
     return required_values

@@ -17,7 +17,7 @@ from augment.errors import OutputError
 from augment.jobs.atomic import write_new_file
 from augment.jobs.render_job import copy_files, portable_recipe
 from recipes.errors import RecipeError, short
-from recipes.fields import found, replaced
+from recipes.fields import section_at, with_unchecked_field
 from recipes.job import scaled_recipe
 from recipes.load import dump_recipe, load_recipe, preset_names, read_overrides
 from recipes.schema import Recipe, Sensor
@@ -56,7 +56,7 @@ class Edits:
     def with_section(self, section: str) -> Edits:
         """Return edits with the effect: as it was, as the source has it, or with start values."""
         edits = replace(self, absent=self.absent - {section})
-        if found(replace(edits, values={}).recipe(), section) is not None:
+        if section_at(replace(edits, values={}).recipe(), section) is not None:
             return edits
         start = as_yaml(start_of_section(section))
         return replace(edits, added={**self.added, section: start})
@@ -112,7 +112,7 @@ def start_of_section(section: str) -> dict[str, Any]:
     candidates = []
     for name in preset_names():
         recipe = load_recipe(name).resolve(0)
-        effect = found(recipe, section)
+        effect = section_at(recipe, section)
         if effect is not None and effect.changes:
             start = effect.model_dump(mode="json", exclude_defaults=True)
             candidates.append((len(recipe.sections()), len(start), name, start))
@@ -133,7 +133,7 @@ def _short(value: Any) -> Any:
 def without_weather(recipe: Recipe) -> Recipe:
     """Return the recipe of the same picture without effects, through a clean camera."""
     for section in recipe.sections():
-        recipe = replaced(recipe, section, None)
+        recipe = with_unchecked_field(recipe, section, None)
     return recipe.model_copy(update={"camera": Sensor()})
 
 
@@ -164,7 +164,9 @@ def save_recipe(recipe: Recipe, path: Path) -> None:
     portable = portable_recipe(recipe)
     for section, effect in portable.sections().items():
         for name, file in effect.files.items():
-            portable = replaced(portable, f"{section}.{name}", f"{files_dir.name}/{file}")
+            portable = with_unchecked_field(
+                portable, f"{section}.{name}", f"{files_dir.name}/{file}"
+            )
     write_new_file(path, dump_recipe(portable).encode())
     try:
         copy_files(recipe, files_dir)

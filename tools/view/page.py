@@ -21,7 +21,7 @@ from augment.geometry import quat_from_rotmat
 from augment.scene import Scene
 from augment.trust import unfitted_cameras
 from recipes.errors import RecipeError
-from recipes.fields import found
+from recipes.fields import section_at
 from recipes.load import describe_preset, preset_names
 from recipes.schema import TIERS, Recipe
 from tools.view.browser import page_style
@@ -567,10 +567,10 @@ class Page:
             self.show_error(str(error))
             return
         for path, (switch, below) in self._effects.items():
-            switch.value = below.visible = found(recipe, path) is not None
+            switch.value = below.visible = section_at(recipe, path) is not None
         for path, recipe_field in self._fields.items():
-            if found(recipe, path.rpartition(".")[0]) is not None:
-                recipe_field.show(found(recipe, path))
+            if section_at(recipe, path.rpartition(".")[0]) is not None:
+                recipe_field.show(section_at(recipe, path))
         source = self.wish.edits.source
         about = describe_preset(source) if source in preset_names() else "Your recipe."
         self._about.content = paragraph(about, style="padding-bottom:0.6em")

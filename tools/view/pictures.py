@@ -25,7 +25,7 @@ from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.trust import MAX_ANGLE_RAD, MAX_DISTANCE_M, nearest_view, source_views
 from augment.views import render_buffers, render_view
-from recipes.fields import replaced
+from recipes.fields import with_unchecked_field
 from recipes.schema import Recipe
 
 FAR_M = 167.0  # The largest depth that the page can be sent, metres.
@@ -136,7 +136,7 @@ class Shown:
 
 
 def what_can_be_shown() -> tuple[str, ...]:
-    masks = (f"mask of {e.mask}" for e in effects.EFFECTS if e.mask is not None)
+    masks = (f"mask of {e.mask_name}" for e in effects.EFFECTS if e.mask_name is not None)
     return (PICTURE, DEPTH, CLASSES, INSTANCES, SPLATS, *masks, f"mask of {TRUST}")
 
 
@@ -159,7 +159,7 @@ def recipe_to_show(recipe: Recipe, shows: str, *, with_depth: bool, factor: floa
         }
     )
     recipe = recipe.model_copy(update={"output": output})
-    return replaced(recipe, "render.scale", recipe.render.scale * factor)
+    return with_unchecked_field(recipe, "render.scale", recipe.render.scale * factor)
 
 
 def coarse(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
@@ -171,7 +171,7 @@ def coarse(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
         recipe = recipe.model_copy(update={"output": recipe.output.model_copy(update=changes)})
     for name, value in MOVING.items():
         value = max(value, getattr(recipe.render, name))
-        recipe = replaced(recipe, f"render.{name}", value)
+        recipe = with_unchecked_field(recipe, f"render.{name}", value)
     return recipe
 
 
@@ -194,7 +194,7 @@ def draw(scene: Scene, camera: Camera, recipe: Recipe, shows: str, *, backend: s
 
 
 def _draw_splat_ids(scene: Scene, camera: Camera, recipe: Recipe, backend: str) -> Shown:
-    plan = make_plan(replaced(recipe, "output.semantic", True), scene)
+    plan = make_plan(with_unchecked_field(recipe, "output.semantic", True), scene)
     view = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     ids = getattr(view.raster, SPLAT_IDS).cpu().numpy()
     rgb = np.where(ids[..., None] >= 0, color_numbers(ids), 0).astype(np.uint8)
@@ -275,7 +275,7 @@ _CODE_COLORS = np.array(
 def box_lines(scene: Scene, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Edges of the frame's labelled boxes in the scene's world, [N, 2, 3], and their colours."""
     boxes = scene.boxes(frame.index)
-    world_boxes = WorldBoxes.of(boxes, np.asarray(scene.world_origin_m))
+    world_boxes = WorldBoxes.from_labels(boxes, np.asarray(scene.world_origin_m))
     lines = world_boxes.corners_m[world_boxes.is_usable][:, EDGES].reshape(-1, 2, 3)
     labels = np.array([sum(map(ord, label)) for label in boxes.labels], np.uint32)
     colors = color_numbers(labels[world_boxes.is_usable])

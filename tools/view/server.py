@@ -440,7 +440,7 @@ class Viewer:
                 raise _Outdated
             if page.wish is wish:
                 return
-            if progress.total:  # most of what follows needs it, too: a depth that is dragged
+            if progress.num_steps:  # most of what follows needs it, too: a depth that is dragged
                 if _lacks_effect_of(page, recipe):
                     raise _Outdated
             elif not moving:

@@ -72,8 +72,8 @@ def describe_activity(activity: Activity | None) -> str:
     if activity is None:
         return "waiting for the picture of another page"
     progress = activity.progress
-    if progress is not None and progress.total and not activity.compiling:
-        return f"{progress.name}, step {progress.done} of {progress.total}"
+    if progress is not None and progress.num_steps and not activity.compiling:
+        return f"{progress.name}, step {progress.num_done} of {progress.num_steps}"
     if activity.compiling or activity.compiled:  # or another process compiles what is wanted next
         so_far = f", {activity.compiled} done" if activity.compiled else ""
         return f"compiling kernels (only the first time{so_far})"
@@ -116,8 +116,8 @@ def page_status(
         work += f", {waited_s:.0f} s"
     share = None
     if activity is not None and activity.progress is not None and not activity.compiling:
-        total = activity.progress.total
-        share = activity.progress.done / total if total else None
+        total = activity.progress.num_steps
+        share = activity.progress.num_done / total if total else None
     text = f"{_what_is_shown(picture, wish)}: {work}"
     return Status(text, is_current, share, waited_s >= BUSY_S)
 

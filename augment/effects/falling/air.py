@@ -36,7 +36,7 @@ from augment.effects.snow.light import display_from_linear, find_scene_light
 from augment.memo import memo_of
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.fog import MAX_EXPONENT, Fog
-from augment.render.layout import LANES
+from augment.render.layout import NUM_LANES
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Scene
@@ -131,8 +131,8 @@ def _in_fog(glow: Glow, fog: Fog | None, eye_z_m: float, extinction_per_m: float
     """Return the light of drops in fog, which is around them and behind them."""
     if fog is None:
         return glow
-    sigma = fog.sigma_per_m
-    color = np.asarray(fog.rgb, np.float64) ** 2
+    sigma = fog.extinction_per_m
+    color = np.asarray(fog.airlight_rgb, np.float64) ** 2
     if fog.scale_height_m is not None:
         climb = (eye_z_m - fog.base_z_m) / fog.scale_height_m
         sigma *= math.exp(min(max(-climb, -MAX_EXPONENT), MAX_EXPONENT))
@@ -312,7 +312,7 @@ def compute_clear_share(
 
 def _padded(image: np.ndarray) -> np.ndarray:
     """Return the image, contiguous and padded to the width that kernels need."""
-    missing = max(0, LANES - image.shape[1])
+    missing = max(0, NUM_LANES - image.shape[1])
     if missing:
         image = np.pad(image, [(0, 0), (0, missing)] + [(0, 0)] * (image.ndim - 2))
     return np.ascontiguousarray(image)

@@ -59,7 +59,7 @@ class FallingEffect(Effect):
         return section.changes or None
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
-        section: Rain | Snowfall | None = self.of(recipe)
+        section: Rain | Snowfall | None = self.section_of(recipe)
         if section is None or not section.changes:
             why = f"the recipe has no {self.name}"
             if section is not None:
@@ -78,18 +78,18 @@ class FallingEffect(Effect):
         return _plan_of(falling, self.step, scene)
 
     def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
-        assert self.mask is not None
-        return _draw_over(own, drawn, camera, self.step, self.mask)
+        assert self.mask_name is not None
+        return _draw_over(own, drawn, camera, self.step, self.mask_name)
 
     def measure(
         self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
-        assert self.table is not None
-        return measure_falling(self.table, placed, camera, view)
+        assert self.box_table is not None
+        return measure_falling(self.box_table, placed, camera, view)
 
     def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
-        kind = own.data.kind
-        rate = float(own.data.rate_mm_h)
+        kind = own.settings.kind
+        rate = float(own.settings.rate_mm_h)
         precipitation_echoes(echoes, scatterers_of(kind, rate), rng)
 
 
@@ -159,8 +159,8 @@ def _draw_over(
             alpha,
             depth,
             camera,
-            own.data,
-            scene=own.light,
+            own.settings,
+            scene=own.lit_scene,
             fog=drawn.layers.fog,
             motion=motion_of(own.scene, camera),
             splats=_surfaces_of(drawn),

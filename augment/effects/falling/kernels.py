@@ -10,10 +10,10 @@ from numba import prange
 from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL, NUM_CLASSES
 from augment.kernels import mix
 from augment.render.cpu import simd as v8
-from augment.render.cpu.jit import inner, kernel, serial_kernel
+from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
 from augment.render.cpu.simd import LOG2_E, exp2_fine
 from augment.render.fog import MAX_EXPONENT
-from augment.render.layout import LANES, U
+from augment.render.layout import NUM_LANES, Index
 from augment.rng import STEP_X
 
 ROWS = 16  # image rows of a band, which a thread draws at a time
@@ -27,13 +27,13 @@ _CELL_X, _CELL_Y, _CELL_Z = (np.uint64(f) for f in CELL_FACTORS)
 _STEP = np.uint64(STEP_X)
 
 
-@inner()
+@kernel_function()
 def _unit(bits, shift):
     """Return 21 of the bits as a number in [0, 1)."""
     return np.float64((bits >> np.uint64(shift)) & np.uint64(0x1FFFFF)) * _HALF
 
 
-@inner()
+@kernel_function()
 def _cosine(turns):
     """Return cos(2 pi turns), within 1e-9, without a branch (no processor could predict it)."""
     x = 2 * math.pi * (0.25 - abs(turns - math.floor(turns + 0.5)))  # the result is the sine of x
@@ -43,7 +43,7 @@ def _cosine(turns):
     return x * (1 - q * (1 / 6) * p)
 
 
-@inner()
+@kernel_function()
 def _sway(x, y, z, sways, flutter):
     """Return how far the air's eddies and a flake's own flutter move it, along x, y and z.
 
@@ -290,25 +290,25 @@ def list_drops(drops, bands, begins, listed):
     return begins[bands]
 
 
-@inner()
+@kernel_function()
 def _nearest_in_row(row, width, alpha, depth, eight):
     """Return the depth of the nearest surface in an image row. eight: scratch."""
-    zeros = v8.splat(np.float32(0))
-    no_surface = v8.splat(np.float32(np.inf))
+    zeros = v8.broadcast(np.float32(0))
+    no_surface = v8.broadcast(np.float32(np.inf))
     nearest_z = no_surface
-    for j in range(0, width, LANES):
-        pixel = U(row * width + min(j, width - LANES))
+    for j in range(0, width, NUM_LANES):
+        pixel = Index(row * width + min(j, width - NUM_LANES))
         z = v8.load(depth, pixel)
-        has_surface = v8.both(v8.greater(z, zeros), v8.greater(v8.load(alpha, pixel), zeros))
+        has_surface = v8.mask_and(v8.greater(z, zeros), v8.greater(v8.load(alpha, pixel), zeros))
         nearest_z = v8.minimum(nearest_z, v8.select(has_surface, z, no_surface))
-    v8.store(eight, U(0), nearest_z)
+    v8.store(eight, Index(0), nearest_z)
     nearest = eight[0]
-    for lane in range(1, LANES):
+    for lane in range(1, NUM_LANES):
         nearest = min(nearest, eight[lane])
     return nearest
 
 
-@inner()
+@kernel_function()
 def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, clear):
     """Write the share of each pixel of image rows top to bottom that no drop covers into clear.
 
@@ -318,11 +318,11 @@ def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, cle
     half = np.float32(0.5)
     unit = np.float32(1)
     image_end = np.float32(width)
-    last_block = width - LANES
-    zeros = v8.splat(zero)
-    ones = v8.splat(unit)
-    soft = v8.splat(np.float32(1 / SOFT))
-    for i in range(U((bottom - top) * width)):
+    last_block = width - NUM_LANES
+    zeros = v8.broadcast(zero)
+    ones = v8.broadcast(unit)
+    soft = v8.broadcast(np.float32(1 / SOFT))
+    for i in range(Index((bottom - top) * width)):
         clear[i] = unit
     for position in range(first, end):
         drop = drops[listed[position]]
@@ -338,7 +338,7 @@ def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, cle
         beyond = outside * outside
         ramp = share / (beyond - drop[6] * drop[6])
         # In all rows a nearly upright streak is evaluated over its full width.
-        is_slanted = abs(du) > np.float32(LANES / 2) and abs(dv) > np.float32(1e-3)
+        is_slanted = abs(du) > np.float32(NUM_LANES / 2) and abs(dv) > np.float32(1e-3)
         per_row = unit / dv if is_slanted else zero
         begin = max(top, np.int64(min(v0, drop[3]) - outside + np.float32(ROWS)) - ROWS)
         last = min(bottom, np.int64(max(max(v0, drop[3]) + outside, zero)) + 1)
@@ -353,28 +353,28 @@ def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, cle
                 ub = u0 + min(max(middle + reach, zero), unit) * du
                 left = np.int64(max(min(ua, ub) - outside, zero))
                 right = np.int64(min(max(max(ua, ub) + outside + unit, zero), image_end))
-            ax = v8.splat(du * per_length)
-            base = v8.splat(v * dv * per_length)
-            for j in range(left, right, LANES):
+            ax = v8.broadcast(du * per_length)
+            base = v8.broadcast(v * dv * per_length)
+            for j in range(left, right, NUM_LANES):
                 at = min(j, last_block)  # the last eight pixels of a row take those before them
-                x = v8.splat(np.float32(at) + half - u0) + v8.lane_numbers()
+                x = v8.broadcast(np.float32(at) + half - u0) + v8.lane_numbers()
                 along = v8.minimum(v8.maximum(v8.fmuladd(x, ax, base), zeros), ones)
-                x = v8.fmuladd(along, v8.splat(-du), x)
-                y = v8.fmuladd(along, v8.splat(-dv), v8.splat(v))
+                x = v8.fmuladd(along, v8.broadcast(-du), x)
+                y = v8.fmuladd(along, v8.broadcast(-dv), v8.broadcast(v))
                 distance2 = v8.fmuladd(x, x, y * y)
-                covered = (v8.splat(beyond) - distance2) * v8.splat(ramp)
-                covered = v8.minimum(v8.maximum(covered, zeros), v8.splat(share))
-                pixel = U(row * width + at)
+                covered = (v8.broadcast(beyond) - distance2) * v8.broadcast(ramp)
+                covered = v8.minimum(v8.maximum(covered, zeros), v8.broadcast(share))
+                pixel = Index(row * width + at)
                 surface = v8.load(depth, pixel)
-                per_z = v8.fmuladd(along, v8.splat(farther), v8.splat(near))
+                per_z = v8.fmuladd(along, v8.broadcast(farther), v8.broadcast(near))
                 behind = (ones - surface * per_z) * soft
                 hidden_share = v8.load(alpha, pixel) * v8.minimum(v8.maximum(behind, zeros), ones)
                 hidden_share = v8.select(v8.greater(surface, zeros), hidden_share, zeros)
                 covered = covered * (ones - hidden_share)
                 if at < j:
-                    numbers = v8.lane_numbers() + v8.splat(np.float32(at - j))
+                    numbers = v8.lane_numbers() + v8.broadcast(np.float32(at - j))
                     covered = v8.select(v8.at_least(numbers, zeros), covered, zeros)
-                band_pixel = U((row - top) * width + at)
+                band_pixel = Index((row - top) * width + at)
                 v8.store(clear, band_pixel, v8.load(clear, band_pixel) * (ones - covered))
 
 
@@ -408,11 +408,11 @@ def cover_pixels(drops, listed, begins, alpha, depth, clear):
             band_clear,
         )
         for row in range(top, bottom):
-            for j in range(U(width)):
-                clear[U(row), j] = band_clear[U((row - top) * width) + j]
+            for j in range(Index(width)):
+                clear[Index(row), j] = band_clear[Index((row - top) * width) + j]
 
 
-@inner()
+@kernel_function()
 def _classes_in_row(nearest, bands, partial):
     """Sort the classes of blend_falling's bands for one image row.
 
@@ -437,14 +437,16 @@ def _classes_in_row(nearest, bands, partial):
     return count, slope, offset
 
 
-@inner()
+@kernel_function()
 def _decay(x):
     """Return exp(-x) for x >= 0; larger x than MAX_EXPONENT count as MAX_EXPONENT."""
-    x = v8.minimum(v8.maximum(x, v8.splat(np.float32(0))), v8.splat(np.float32(MAX_EXPONENT)))
-    return exp2_fine(x * v8.splat(-LOG2_E))
+    x = v8.minimum(
+        v8.maximum(x, v8.broadcast(np.float32(0))), v8.broadcast(np.float32(MAX_EXPONENT))
+    )
+    return exp2_fine(x * v8.broadcast(-LOG2_E))
 
 
-@inner()
+@kernel_function()
 def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, tau, sky, light):
     """Blend eight pixels with the veil and the drops, in place.
 
@@ -452,19 +454,19 @@ def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, tau, sk
     transmittance up to the sky. light [3, 4]: airlight; mean light of a drop; its change to the
     right; its change ahead.
     """
-    zeros = v8.splat(np.float32(0))
-    ones = v8.splat(np.float32(1))
+    zeros = v8.broadcast(np.float32(0))
+    ones = v8.broadcast(np.float32(1))
     surface_transmittance = _decay(tau * lengths)
     per_length = ones / lengths
     red, green, blue = v8.load_colours(pixels, at)
     r = red
     g = green
     b = blue
-    edge = v8.minimum(opacity, ones - opacity) - v8.splat(np.float32(EDGE))
+    edge = v8.minimum(opacity, ones - opacity) - v8.broadcast(np.float32(EDGE))
     is_mixed = False
     if splats.size > 0 and v8.has_nonnegative_lane(edge):
-        r, g, b = v8.load_colours(splats, U(3) * pixel)
-        edge = v8.minimum(edge, green - g - v8.splat(np.float32(EDGE)))
+        r, g, b = v8.load_colours(splats, Index(3) * pixel)
+        edge = v8.minimum(edge, green - g - v8.broadcast(np.float32(EDGE)))
         is_mixed = v8.has_nonnegative_lane(edge)
     edge = v8.at_least(edge, zeros)
     red = _veil(
@@ -482,21 +484,21 @@ def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, tau, sk
     v8.store_colours(pixels, at, red, green, blue)
 
 
-@inner()
+@kernel_function()
 def _veil(color, splats, is_mixed, edge, light, opacity, surface_transmittance, sky):
     """Return the square of a colour behind the veil.
 
     edge: lanes whose pixels show both surfaces and sky, each behind its own veil, if is_mixed.
     surface_transmittance: transmittance up to the surfaces.
     """
-    zeros = v8.splat(np.float32(0))
-    air = v8.splat(light[0])
+    zeros = v8.broadcast(np.float32(0))
+    air = v8.broadcast(light[0])
     veiled = air + (sky + opacity * (surface_transmittance - sky)) * (color * color - air)
     if is_mixed:
-        sky_share = v8.splat(np.float32(1)) - opacity
+        sky_share = v8.broadcast(np.float32(1)) - opacity
         behind = v8.minimum(v8.maximum(color - splats, zeros), sky_share)
-        ahead = (color - behind) / v8.maximum(opacity, v8.splat(np.float32(EDGE)))
-        behind = behind / v8.maximum(sky_share, v8.splat(np.float32(EDGE)))
+        ahead = (color - behind) / v8.maximum(opacity, v8.broadcast(np.float32(EDGE)))
+        behind = behind / v8.maximum(sky_share, v8.broadcast(np.float32(EDGE)))
         ahead = opacity * v8.sqrt(
             v8.maximum(air + surface_transmittance * (ahead * ahead - air), zeros)
         )
@@ -505,15 +507,17 @@ def _veil(color, splats, is_mixed, edge, light, opacity, surface_transmittance, 
     return veiled
 
 
-@inner()
+@kernel_function()
 def _blend_colour(veiled, light, u, clear, per_length):
     """Return the colour whose square is `veiled`, behind the drops."""
-    glow = v8.splat(light[1]) + (v8.splat(light[2]) * u + v8.splat(light[3])) * per_length
+    glow = (
+        v8.broadcast(light[1]) + (v8.broadcast(light[2]) * u + v8.broadcast(light[3])) * per_length
+    )
     out = glow + clear * (veiled - glow)
-    return v8.sqrt(v8.maximum(out, v8.splat(np.float32(0))))
+    return v8.sqrt(v8.maximum(out, v8.broadcast(np.float32(0))))
 
 
-@inner()
+@kernel_function()
 def _blend_row(
     row,
     width,
@@ -533,50 +537,60 @@ def _blend_row(
     pixels,
 ):
     """Blend a row of blend_falling. clear: from index `first` on. partial, pixels: scratch."""
-    zeros = v8.splat(np.float32(0))
+    zeros = v8.broadcast(np.float32(0))
     half = np.float32(0.5)
     least = np.float32(1e-6)
     count, slope, offset = _classes_in_row(nearest, bands, partial)
     v = (np.float32(row) + half - rays[3]) * rays[1]
-    flat = v8.splat(np.float32(1) + v * v)
+    flat = v8.broadcast(np.float32(1) + v * v)
     level = climb[1] * v + climb[2]
     left = (half - rays[2]) * rays[0]
     right = (np.float32(width) - rays[2]) * rays[0]
     shows_sky = max(climb[0] * left, climb[0] * right) + level > least
-    for j in range(0, width, LANES):
+    for j in range(0, width, NUM_LANES):
         # The last eight pixels of a row include earlier ones, which are not written.
-        at = min(j, width - LANES)
-        pixel = U(row * width + at)
-        u = v8.splat(np.float32(at) + half - rays[2]) + v8.lane_numbers()
-        u = u * v8.splat(rays[0])
+        at = min(j, width - NUM_LANES)
+        pixel = Index(row * width + at)
+        u = v8.broadcast(np.float32(at) + half - rays[2]) + v8.lane_numbers()
+        u = u * v8.broadcast(rays[0])
         lengths = v8.sqrt(flat + u * u)
         z = v8.load(depth, pixel)
-        tau = v8.splat(slope) * z + v8.splat(offset)
-        for b in range(U(count)):
-            inside = v8.maximum(z - v8.splat(partial[b, 1]), zeros)
-            inside = v8.minimum(inside, v8.splat(partial[b, 2]))
-            beyond = v8.maximum(z - v8.splat(partial[b, 4]), zeros)
-            tau = tau + v8.splat(partial[b, 0]) * (
-                inside * inside * v8.splat(partial[b, 3]) + beyond
+        tau = v8.broadcast(slope) * z + v8.broadcast(offset)
+        for b in range(Index(count)):
+            inside = v8.maximum(z - v8.broadcast(partial[b, 1]), zeros)
+            inside = v8.minimum(inside, v8.broadcast(partial[b, 2]))
+            beyond = v8.maximum(z - v8.broadcast(partial[b, 4]), zeros)
+            tau = tau + v8.broadcast(partial[b, 0]) * (
+                inside * inside * v8.broadcast(partial[b, 3]) + beyond
             )
         sky = zeros
         if shows_sky:  # below the horizon nothing is visible through so much veil
-            steep = v8.splat(climb[0]) * u + v8.splat(level)
-            sky = _decay(v8.splat(upwards) * lengths / v8.maximum(steep, v8.splat(least)))
+            steep = v8.broadcast(climb[0]) * u + v8.broadcast(level)
+            sky = _decay(v8.broadcast(upwards) * lengths / v8.maximum(steep, v8.broadcast(least)))
         opacity = v8.select(v8.greater(z, zeros), v8.load(alpha, pixel), zeros)
-        clear_share = v8.load(clear, first + U(at))
+        clear_share = v8.load(clear, first + Index(at))
         if at == j:
             _blend_pixels(
-                rgb, U(3) * pixel, splats, pixel, u, lengths, opacity, clear_share, tau, sky, light
+                rgb,
+                Index(3) * pixel,
+                splats,
+                pixel,
+                u,
+                lengths,
+                opacity,
+                clear_share,
+                tau,
+                sky,
+                light,
             )
         else:
-            for k in range(U(3 * LANES)):
-                pixels[k] = rgb[U(3) * pixel + k]
+            for k in range(Index(3 * NUM_LANES)):
+                pixels[k] = rgb[Index(3) * pixel + k]
             _blend_pixels(
-                pixels, U(0), splats, pixel, u, lengths, opacity, clear_share, tau, sky, light
+                pixels, Index(0), splats, pixel, u, lengths, opacity, clear_share, tau, sky, light
             )
-            for k in range(U(3 * (j - at)), U(3 * LANES)):
-                rgb[U(3) * pixel + k] = pixels[k]
+            for k in range(Index(3 * (j - at)), Index(3 * NUM_LANES)):
+                rgb[Index(3) * pixel + k] = pixels[k]
 
 
 @kernel
@@ -629,16 +643,16 @@ def blend_falling(
         nearest = np.empty(ROWS, np.float32)
         light = np.empty((3, 4), np.float32)
         partial = np.empty((NUM_CLASSES, 5), np.float32)
-        pixels = np.empty(3 * LANES, np.float32)
+        pixels = np.empty(3 * NUM_LANES, np.float32)
         for row in range(top, bottom):  # this also brings the surfaces into the cache, in order
             nearest[row - top] = _nearest_in_row(row, width, alpha, depth, pixels)
         _cover_band(
             drops, listed, begins[band], begins[band + 1], top, bottom, width, alpha, depth, clear
         )
         for row in range(top, bottom):
-            first = U((row - top) * width)
-            for j in range(U(width)):
-                mask[U(row), j] = clear[first + j] < least
+            first = Index((row - top) * width)
+            for j in range(Index(width)):
+                mask[Index(row), j] = clear[first + j] < least
             v = (np.float32(row) + np.float32(0.5) - rays[3]) * rays[1]
             for c in range(3):
                 light[c, 0], light[c, 1], light[c, 2] = airlight[c], glow[c, 3], glow[c, 0]

@@ -29,9 +29,9 @@ def falling_table(name: str, drop: str) -> BoxTable:
         file=f"labels/{name}.parquet",
         kind=f"box {name}",
         columns={through: np.float64, "pixels": np.int64, marked: np.int64, share: np.float64},
-        sampled=(through, share),
-        derived={share: pixel_fraction(marked)},
-        visible=through,
+        sample_columns=(through, share),
+        derived_columns={share: pixel_fraction(marked)},
+        visible_column=through,
     )
 
 
@@ -42,8 +42,8 @@ def measure_falling(
 
     The transmittance is the mean by distance, as in the veil. Drawn drops take as much on average.
     """
-    through, _, marked = table.stored
-    data = view.placed.data
+    through, _, marked = table.stored_columns
+    data = view.plan.data
     fog = None if data is None else Fog(data.sizes.extinction_per_m, (0.0, 0.0, 0.0))
     estimate = box_transmittance(placed, camera, fog, view.depth_m, view.water_level_z_m)
     stored = {
@@ -53,5 +53,5 @@ def measure_falling(
     }
     if data is not None and view.depth_m is not None and view.mask is not None:
         counted = count_pixels(placed, camera, view.depth_m, view.mask)
-        stored |= {"pixels": counted.pixels, marked: counted.marked}
+        stored |= {"pixels": counted.num_pixels, marked: counted.num_marked}
     return stored

@@ -191,14 +191,14 @@ def strongest_drops(
 def precipitation_echoes(echoes: Echoes, scatterers: Scatterers, rng: np.random.Generator) -> None:
     """Weaken echoes by precipitation, add range noise, and replace those that a drop exceeds."""
     model = echoes.model
-    air = echoes.air_m
+    air = echoes.air_path_m
     before = echoes.gain.copy()
     echoes.gain *= np.exp(-2 * scatterers.extinction_per_m * air)
     echoes.add_range_noise(before, rng.standard_normal(len(air)))
     strength, ranges = strongest_drops(echo_table(scatterers, model), air, rng)
     # The fog between sensor and drop is taken as dense as at the sensor.
-    strength *= np.exp(-2 * np.minimum(echoes.haze_per_m * ranges, 300.0))
-    echoes.haze_per_m += scatterers.extinction_per_m
+    strength *= np.exp(-2 * np.minimum(echoes.extinction_per_m * ranges, 300.0))
+    echoes.extinction_per_m += scatterers.extinction_per_m
     candidates = np.flatnonzero((strength > 0) & (echoes.ranges_m > 0) & (echoes.codes != LOST))
     surface = signal(echoes.reflectance * echoes.gain, np.maximum(echoes.ranges_m, 1e-3))[
         candidates
@@ -207,4 +207,4 @@ def precipitation_echoes(echoes: Echoes, scatterers: Scatterers, rng: np.random.
     reflectance = strength[candidates] / signal(np.ones(len(candidates)), ranges[candidates])
     wins = (strength[candidates] > surface) & (reflectance >= noise)
     rows = candidates[wins]
-    echoes.replace(rows, ranges[rows], reflectance[wins], PRECIPITATION)
+    echoes.replace_echoes(rows, ranges[rows], reflectance[wins], PRECIPITATION)

@@ -75,9 +75,9 @@ class FloodEffect(Effect):
             "hidden_pixels": np.int64,
             "hidden_fraction": np.float64,
         },
-        sampled=("submerged_fraction", "hidden_fraction"),
-        derived={"hidden_fraction": pixel_fraction("hidden_pixels")},
-        hidden="hidden_fraction",
+        sample_columns=("submerged_fraction", "hidden_fraction"),
+        derived_columns={"hidden_fraction": pixel_fraction("hidden_pixels")},
+        hidden_column="hidden_fraction",
     )
 
     def kernels(self, section: Flood) -> Hashable:
@@ -85,12 +85,12 @@ class FloodEffect(Effect):
 
     def share(self, job: JobContext) -> None:
         """Precompute the height of the road."""
-        if any(self.of(recipe) is not None for recipe in job.recipes):
+        if any(self.section_of(recipe) is not None for recipe in job.recipes):
             with suppress(SceneError):  # every image reports the error itself
                 memo_of(job.scene).put(("ground",), ground_of(job.scene), shared=True)
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
-        flood = self.of(recipe)
+        flood = self.section_of(recipe)
         if flood is None:
             return EffectPlan(
                 None, tuple(Step(name, False, "the recipe has no flood") for name in PASSES)
@@ -105,15 +105,15 @@ class FloodEffect(Effect):
         return EffectPlan(medium, _steps(medium, reason), water_level_z_m=level_z_m)
 
     def cameras(self, own: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
-        is_drawn = _is_under(own.data, camera) or plane_window(camera, own.data.level_z_m)
-        return layer_cameras(own.data, camera) if is_drawn else None
+        is_drawn = _is_under(own.settings, camera) or plane_window(camera, own.settings.level_z_m)
+        return layer_cameras(own.settings, camera) if is_drawn else None
 
     def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
         camera = sight.camera
-        if _is_under(own.data, camera):
+        if _is_under(own.settings, camera):
             why = "the camera is under water: it sees what lies below and what lies above"
-            return Visibility(skipped=dict.fromkeys(PASSES, why))
-        if plane_window(camera, own.data.level_z_m) is None:
+            return Visibility(skip_reasons=dict.fromkeys(PASSES, why))
+        if plane_window(camera, own.settings.level_z_m) is None:
             why = "no ray of this camera meets the water's plane"
             return Visibility(False, dict.fromkeys(PASSES, why))
         return Visibility()
@@ -121,7 +121,7 @@ class FloodEffect(Effect):
     def draw(
         self, own: EffectInScene, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
     ) -> RenderedView | None:
-        image = render_flooded(layers, camera, own.data, buffers)
+        image = render_flooded(layers, camera, own.settings, buffers)
         if image is None:
             return None
         why = "what stands before the water hides all of it"
@@ -129,26 +129,26 @@ class FloodEffect(Effect):
         return RenderedView(image.rgb, image.scene, layers, {"water": image.water}, skip_reasons)
 
     def front_surface(self, own: EffectInScene, camera: Camera) -> FrontSurface | None:
-        if _is_under(own.data, camera):  # from below, the surface has no depth
+        if _is_under(own.settings, camera):  # from below, the surface has no depth
             return FrontSurface(int(SemanticClass.WATER), None)
-        return FrontSurface(int(SemanticClass.WATER), plane_depth(camera, own.data.level_z_m))
+        return FrontSurface(int(SemanticClass.WATER), plane_depth(camera, own.settings.level_z_m))
 
     def measure(
         self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
-        level_z_m = view.placed.water_level_z_m
+        level_z_m = view.plan.water_level_z_m
         assert level_z_m is not None
         pixels = np.full(len(placed), NOT_COUNTED)
         num_hidden = np.zeros(len(placed), np.int64)
         if view.depth_m is not None and view.mask is not None:
-            counted = hidden_pixels(placed, camera, view.depth_m, view.mask)
-            pixels = counted.pixels
-            num_hidden = counted.marked
+            counted = count_hidden_pixels(placed, camera, view.depth_m, view.mask)
+            pixels = counted.num_pixels
+            num_hidden = counted.num_marked
         submerged = submerged_fraction(placed, level_z_m)
         return {"submerged_fraction": submerged, "pixels": pixels, "hidden_pixels": num_hidden}
 
     def meet(self, own: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
-        meet_flood(echoes, own.data)
+        meet_flood(echoes, own.settings)
 
 
 def _is_under(medium: FloodMedium, camera: Camera) -> bool:
@@ -249,7 +249,7 @@ def submerged_fraction(placed: WorldBoxes, level_z_m: float) -> Float64[np.ndarr
     return np.where(placed.is_usable, fraction, np.nan)
 
 
-def hidden_pixels(
+def count_hidden_pixels(
     placed: WorldBoxes,
     camera: Camera,
     scene_depth_m: Float32[np.ndarray, "H W"],

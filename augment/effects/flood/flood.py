@@ -79,7 +79,7 @@ class Layer:
 # index behind the surface over the index before it; an index of 1 reflects nothing.
 
 
-def exact(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:
+def fresnel_reflectance(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:
     """Return (Rs + Rp) / 2 of Fresnel's equations; 1 beyond the critical angle if index < 1.
 
     With c and t the cosines on both sides: Rs = ((c - n t) / (c + n t))^2 and
@@ -97,7 +97,7 @@ def exact(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:
     return torch.where(is_grazing, torch.ones_like(c), (rs * rs + rp * rp) / 2)
 
 
-def schlick(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:
+def schlick_reflectance(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:
     """Return Schlick's approximation (1994), F0 + (1 - F0) (1 - cosine)^5.
 
     F0 = ((n - 1) / (n + 1))^2. It holds for n >= 1 only, because it has no total reflection. At
@@ -114,4 +114,8 @@ def reflectance(
     cosine: Float[Tensor, "*B"], index: float, model: FresnelModel
 ) -> Float[Tensor, "*B"]:
     """Return the reflected share of the light by the model that a recipe names."""
-    return exact(cosine, index) if model == "exact" else schlick(cosine, index)
+    return (
+        fresnel_reflectance(cosine, index)
+        if model == "exact"
+        else schlick_reflectance(cosine, index)
+    )

@@ -26,7 +26,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
 from augment.effects.flood import water_kernels
-from augment.effects.flood.flood import FloodMedium, Layer, exact
+from augment.effects.flood.flood import FloodMedium, Layer, fresnel_reflectance
 from augment.effects.flood.screen_space import trace_screen
 from augment.effects.flood.water import is_smooth, shade_water
 from augment.effects.flood.water_kernels import HIDDEN_COVER
@@ -219,7 +219,7 @@ def view_from_below(
     directions = camera.ray_directions(rgb.dtype, device)
     up = directions[..., 2] / lengths
     air_directions = _into_air(directions / lengths[..., None], medium.refraction_index)
-    reflected = exact(up.clamp_min(0), 1 / medium.refraction_index)[..., None]
+    reflected = fresnel_reflectance(up.clamp_min(0), 1 / medium.refraction_index)[..., None]
     behind, fog = simplify_sky(sky, fog)
     sky_rgb = sample_at(behind, air_directions)
     if fog is not None:
@@ -316,7 +316,7 @@ def render_flooded(
     if medium.reflection == "screen_space":
         requested = requested | {EXPECTED_DEPTH}
     with timed("rasterise"):
-        front = renderer.draw(camera, above, requested)
+        front = renderer.render_layer(camera, above, requested)
     assert front.rgb is not None and front.alpha is not None
     sky = renderer.sky
     fog = renderer.fog
@@ -391,14 +391,14 @@ def _draw_bed(
     the water hides are left out too, and the camera's pixels may be wider.
     """
     reach = math.inf if scene_buffers else visible_depth_m(medium, camera)
-    below = HeightClip(medium.level_z_m, BELOW, reach, overlaps=True)
+    below = HeightClip(medium.level_z_m, BELOW, reach, has_overlap=True)
     requested = scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}
     pixel_mask = margins.around(shows_water, margins)
     if medium.layers_px > 1 and not scene_buffers and bed_share is None:
         camera = camera.scaled(1 / medium.layers_px)
         pixel_mask = resized(pixel_mask, camera)
         renderer = renderer.for_scale(1 / medium.layers_px)
-    return camera, renderer.draw(camera, below, requested, pixel_mask, bed_share)
+    return camera, renderer.render_layer(camera, below, requested, pixel_mask, bed_share)
 
 
 def visible_depth_m(medium: FloodMedium, camera: Camera) -> float:
@@ -439,9 +439,9 @@ def _mirror_layer(
         view = view.scaled(scale)
         pixel_mask = resized(pixel_mask, view)
         renderer = renderer.for_scale(scale)
-    above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
+    above = HeightClip(medium.level_z_m, ABOVE, has_overlap=True)
     buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH})
-    return as_layer(view, renderer.draw(view, above, buffers, pixel_mask))
+    return as_layer(view, renderer.render_layer(view, above, buffers, pixel_mask))
 
 
 def _mirror_margins(camera: Camera, medium: FloodMedium) -> Margins:
@@ -482,9 +482,11 @@ def _from_below(
     """Render the view of an eye under the water or exactly at its surface."""
     requested = buffers | {RGB, ALPHA, EXPECTED_DEPTH}
     with timed("rasterise"):
-        front = renderer.without_fog().draw(camera, HeightClip(medium.level_z_m, BELOW), requested)
-        above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
-        air = renderer.draw(camera, above, requested)
+        front = renderer.without_fog().render_layer(
+            camera, HeightClip(medium.level_z_m, BELOW), requested
+        )
+        above = HeightClip(medium.level_z_m, ABOVE, has_overlap=True)
+        air = renderer.render_layer(camera, above, requested)
     layers = as_layer(camera, front), as_layer(camera, air)
     image = view_from_below(*layers, medium, renderer.sky, renderer.fog)
     water = torch.ones((camera.height, camera.width), dtype=torch.bool, device=image.device)

@@ -11,7 +11,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from augment.render.cpu import simd as v8
-from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.jit import kernel, kernel_function
 
 # pyright: reportCallIssue=false, reportGeneralTypeIssues=false
 # (of numba's intrinsics it sees the compiler's first argument as well, and no result)
@@ -42,36 +42,36 @@ _S0, _S1, _S2, _S3, _S4 = (np.float32(c) for c in SINE)
 _C0, _C1, _C2, _C3, _C4 = (np.float32(c) for c in COSINE)
 
 
-@inner()
+@kernel_function()
 def _sin_cos(turns):
     """Return sin and cos of 2 pi turns. Their error beyond that of `turns` is below 4e-7."""
-    r = turns - v8.floor(turns + v8.splat(_HALF))
+    r = turns - v8.floor(turns + v8.broadcast(_HALF))
     z = r * r
-    s = v8.fmuladd(v8.splat(_S4), z, v8.splat(_S3))
-    s = v8.fmuladd(s, z, v8.splat(_S2))
-    s = v8.fmuladd(s, z, v8.splat(_S1))
-    s = v8.fmuladd(s, z, v8.splat(_S0)) * r
-    c = v8.fmuladd(v8.splat(_C4), z, v8.splat(_C3))
-    c = v8.fmuladd(c, z, v8.splat(_C2))
-    c = v8.fmuladd(c, z, v8.splat(_C1))
-    c = v8.fmuladd(c, z, v8.splat(_C0))
+    s = v8.fmuladd(v8.broadcast(_S4), z, v8.broadcast(_S3))
+    s = v8.fmuladd(s, z, v8.broadcast(_S2))
+    s = v8.fmuladd(s, z, v8.broadcast(_S1))
+    s = v8.fmuladd(s, z, v8.broadcast(_S0)) * r
+    c = v8.fmuladd(v8.broadcast(_C4), z, v8.broadcast(_C3))
+    c = v8.fmuladd(c, z, v8.broadcast(_C2))
+    c = v8.fmuladd(c, z, v8.broadcast(_C1))
+    c = v8.fmuladd(c, z, v8.broadcast(_C0))
     twice = s + s
-    return twice * c, v8.fmuladd(v8.negate(twice), s, v8.splat(_ONE))
+    return twice * c, v8.fmuladd(v8.negate(twice), s, v8.broadcast(_ONE))
 
 
-@inner()
+@kernel_function()
 def _ray_z(column, row_z, rotation, lens):
     """Return the world z of a pixel's ray, with the same roundings as Camera.ray_directions."""
     return (column + 0.5 - lens[2]) / lens[0] * rotation[2, 0] + row_z + rotation[2, 2]
 
 
-@inner()
+@kernel_function()
 def _meets(column, row_z, rotation, lens, height, farthest):
     away = -height / _ray_z(column, row_z, rotation, lens)
     return away > 0.0 and away <= farthest
 
 
-@inner()
+@kernel_function()
 def _columns_that_meet(width, row_z, rotation, lens, height, farthest):
     """Return the first and one past the last of the columns, an interval, that meet the plane."""
     first = 0
@@ -89,7 +89,7 @@ def _columns_that_meet(width, row_z, rotation, lens, height, farthest):
     return (0, last) if meets_first else (last, width)
 
 
-@inner()
+@kernel_function()
 def _sort_waves(
     waves, terms, place, step, z, drop, bend, columns, spacing, full_waves, fading_waves, faded
 ):
@@ -148,7 +148,7 @@ def _sort_waves(
     return num_full, num_fading
 
 
-@inner()
+@kernel_function()
 def _put(values, at, turns, along, terms, i):
     values[at] = np.float32(turns)
     values[at + np.uint64(1)] = np.float32(along)
@@ -156,15 +156,15 @@ def _put(values, at, turns, along, terms, i):
         values[at + np.uint64(2 + k)] = terms[i, k]
 
 
-@inner()
+@kernel_function()
 def _term(values, at, k):
-    return v8.splat(values[at + np.uint64(k)])
+    return v8.broadcast(values[at + np.uint64(k)])
 
 
-@inner()
+@kernel_function()
 def _add_full(full_waves, count, distance):
     """Return the sums over waves of the tangents' five terms. distance: s n of 8 pixels."""
-    xx = xy = yy = gx = gy = v8.splat(_ZERO)
+    xx = xy = yy = gx = gy = v8.broadcast(_ZERO)
     for i in range(count):
         offset = i * np.uint64(FULL_SIZE)
         sine, cosine = _sin_cos(
@@ -178,7 +178,7 @@ def _add_full(full_waves, count, distance):
     return xx, xy, yy, gx, gy
 
 
-@inner()
+@kernel_function()
 def _add_fading(fading_waves, count, distance, n, spacing, limits, view, sums):
     """Add waves as `_add_full` does, with weights; the part they leave out adds to `lost`.
 
@@ -192,9 +192,9 @@ def _add_fading(fading_waves, count, distance, n, spacing, limits, view, sums):
         offset = i * np.uint64(FADING_SIZE)
         down = v8.fmuladd(_term(fading_waves, offset, 9), n, _term(fading_waves, offset, 8))
         per_pixel = spacing * v8.sqrt(v8.fmuladd(down, down, _term(fading_waves, offset, 7)))
-        t = (v8.splat(_ONE) / per_pixel - v8.splat(faded_px)) * v8.splat(rise)
-        t = v8.minimum(v8.maximum(t, v8.splat(_ZERO)), v8.splat(_ONE))
-        weight = t * t * (v8.splat(_THREE) - t - t)
+        t = (v8.broadcast(_ONE) / per_pixel - v8.broadcast(faded_px)) * v8.broadcast(rise)
+        t = v8.minimum(v8.maximum(t, v8.broadcast(_ZERO)), v8.broadcast(_ONE))
+        weight = t * t * (v8.broadcast(_THREE) - t - t)
         sine, cosine = _sin_cos(
             v8.fmuladd(_term(fading_waves, offset, 1), distance, _term(fading_waves, offset, 0))
         )
@@ -208,12 +208,12 @@ def _add_fading(fading_waves, count, distance, n, spacing, limits, view, sums):
         gx = v8.fmuladd(slope_x, cosine, gx)
         gy = v8.fmuladd(slope_y, cosine, gy)
         slope = slope_x * vx + slope_y * vy
-        share = v8.splat(_HALF) * (v8.splat(_ONE) - weight * weight)
+        share = v8.broadcast(_HALF) * (v8.broadcast(_ONE) - weight * weight)
         lost = v8.fmuladd(share * slope, slope, lost)
     return lost, xx, xy, yy, gx, gy
 
 
-@inner()
+@kernel_function()
 def _shade_chunk(
     full_waves, num_full, fading_waves, num_fading, faded, ray, height, limits, begin, end, out
 ):
@@ -222,23 +222,23 @@ def _shade_chunk(
     begin, end: the columns, from the anchor. ray: d0 and a, their x, y and z. limits [3]: as in
     `fill_field`.
     """
-    zero = v8.splat(_ZERO)
-    ones = v8.splat(_ONE)
+    zero = v8.broadcast(_ZERO)
+    ones = v8.broadcast(_ONE)
     x0, y0, z0, ax, ay, az = ray
     for block in range((end - begin + 7) // 8):
-        n = v8.splat(np.float32(begin + 8 * block)) + v8.lane_numbers()
-        inverse = ones / v8.fmuladd(v8.splat(az), n, v8.splat(z0))
-        away = v8.splat(-height) * inverse
+        n = v8.broadcast(np.float32(begin + 8 * block)) + v8.lane_numbers()
+        inverse = ones / v8.fmuladd(v8.broadcast(az), n, v8.broadcast(z0))
+        away = v8.broadcast(-height) * inverse
         spacing = v8.absolute(away * inverse)
-        dx = v8.fmuladd(v8.splat(ax), n, v8.splat(x0))
-        dy = v8.fmuladd(v8.splat(ay), n, v8.splat(y0))
+        dx = v8.fmuladd(v8.broadcast(ax), n, v8.broadcast(x0))
+        dy = v8.fmuladd(v8.broadcast(ay), n, v8.broadcast(y0))
         length = v8.sqrt(v8.fmuladd(dx, dx, dy * dy))
-        slanted = v8.at_least(length, v8.splat(limits[0]))
+        slanted = v8.at_least(length, v8.broadcast(limits[0]))
         vx = v8.select(slanted, dx / length, ones)
         vy = v8.select(slanted, dy / length, zero)
-        lost = v8.splat(faded[0]) * vx * vx
-        lost = v8.fmuladd(v8.splat(faded[1] + faded[1]) * vx, vy, lost)
-        lost = v8.fmuladd(v8.splat(faded[2]) * vy, vy, lost)
+        lost = v8.broadcast(faded[0]) * vx * vx
+        lost = v8.fmuladd(v8.broadcast(faded[1] + faded[1]) * vx, vy, lost)
+        lost = v8.fmuladd(v8.broadcast(faded[2]) * vy, vy, lost)
         distance = away * n
         xx, xy, yy, gx, gy = _add_full(full_waves, num_full, distance)
         lost, xx, xy, yy, gx, gy = _add_fading(
@@ -257,14 +257,14 @@ def _shade_chunk(
         ny = v8.negate(v8.fmuladd(xy, gx, wide * gy))
         nz = v8.maximum(wide * deep - xy * xy, zero)
         square = v8.fmuladd(nx, nx, v8.fmuladd(ny, ny, nz * nz))
-        scale = ones / v8.sqrt(v8.maximum(square, v8.splat(TINY)))
+        scale = ones / v8.sqrt(v8.maximum(square, v8.broadcast(TINY)))
         offset = np.uint64(8 * block)
         v8.store(out, offset, nx * scale)
         v8.store(out, offset + np.uint64(CHUNK), ny * scale)
         v8.store(out, offset + np.uint64(2 * CHUNK), v8.maximum(lost, zero))
 
 
-@inner()
+@kernel_function()
 def _anchor(begin, end, row_z, rotation, lens):
     """Return the middle column, or the end with the nearer plane if distances differ much.
 
@@ -310,7 +310,7 @@ def fill_field(
         _fill_row(np.int64(i), rotation, eye, height, lens, farthest, limits, waves, terms, images)
 
 
-@inner()
+@kernel_function()
 def _fill_row(i, rotation, eye, height, lens, farthest, limits, waves, terms, images):
     normal_x, normal_y, slope_variance = images
     width = normal_x.shape[1]
@@ -485,7 +485,7 @@ def _fetch(typingctx, array, row, column):
     return v8.float8(array, v8.float8, v8.float8), codegen
 
 
-@inner()
+@kernel_function()
 def _difference(before, center, after, has_before, has_after):
     """Return the change of the inverse depth per pixel, by neighbours on the same surface."""
     total = _ZERO
@@ -499,7 +499,7 @@ def _difference(before, center, after, has_before, has_after):
     return total / max(count, _ONE)
 
 
-@inner()
+@kernel_function()
 def _edge_weight(x, y, width, height):
     fx = min(max(min(x, width - x) / (EDGE * width), _ZERO), _ONE)
     fy = min(max(min(y, height - y) / (EDGE * height), _ZERO), _ONE)
@@ -508,40 +508,41 @@ def _edge_weight(x, y, width, height):
     return fx * fx * (three - two * fx) * fy * fy * (three - two * fy)
 
 
-@inner()
+@kernel_function()
 def _set_up(view, xs, ys, first):
     """Return the numbers of eight mirrored rays (see `screen_space._Rays`) and their start."""
     width = view[11]
     height = view[12]
     x0 = v8.load(xs, first)
     y0 = v8.load(ys, first)
-    ones = v8.splat(_ONE)
-    zero = v8.splat(_ZERO)
-    nx = v8.splat(view[0])
-    ny = v8.splat(view[1])
-    nz = v8.splat(view[2])
-    u = (x0 - v8.splat(view[8])) / v8.splat(view[6])
-    v = (y0 - v8.splat(view[9])) / v8.splat(view[7])
+    ones = v8.broadcast(_ONE)
+    zero = v8.broadcast(_ZERO)
+    nx = v8.broadcast(view[0])
+    ny = v8.broadcast(view[1])
+    nz = v8.broadcast(view[2])
+    u = (x0 - v8.broadcast(view[8])) / v8.broadcast(view[6])
+    v = (y0 - v8.broadcast(view[9])) / v8.broadcast(view[7])
     slope = u * nx + v * ny + nz
-    gx = v8.splat(view[3]) - x0 * nz
-    gy = v8.splat(view[4]) - y0 * nz
-    g = v8.maximum(v8.maximum(v8.absolute(gx), v8.absolute(gy)), v8.splat(np.float32(1e-9)))
-    rise = slope * v8.splat(np.float32(-2))
+    gx = v8.broadcast(view[3]) - x0 * nz
+    gy = v8.broadcast(view[4]) - y0 * nz
+    g = v8.maximum(v8.maximum(v8.absolute(gx), v8.absolute(gy)), v8.broadcast(np.float32(1e-9)))
+    rise = slope * v8.broadcast(np.float32(-2))
     scale = rise * g
     bend = (ones + rise * nz) / scale
-    near = v8.negate(slope) / v8.splat(view[10])
+    near = v8.negate(slope) / v8.broadcast(view[10])
     dx = gx / g
     dy = gy / g
     # A ray along an axis never gets to the other axis's next border.
-    tiny = v8.splat(np.float32(1e-30))
+    tiny = v8.broadcast(np.float32(1e-30))
     inverse_x = ones / v8.select(v8.greater(v8.absolute(dx), tiny), dx, tiny)
     inverse_y = ones / v8.select(v8.greater(v8.absolute(dy), tiny), dy, tiny)
     ahead_x = v8.select(v8.at_least(inverse_x, zero), ones, zero)
     ahead_y = v8.select(v8.at_least(inverse_y, zero), ones, zero)
     end = v8.minimum(
-        (ahead_x * v8.splat(width) - x0) * inverse_x, (ahead_y * v8.splat(height) - y0) * inverse_y
+        (ahead_x * v8.broadcast(width) - x0) * inverse_x,
+        (ahead_y * v8.broadcast(height) - y0) * inverse_y,
     )
-    back = (ones - ones / (near * v8.splat(NEAR_M))) / bend
+    back = (ones - ones / (near * v8.broadcast(NEAR_M))) / bend
     returns = v8.greater(zero, bend)
     end = v8.select(returns, v8.minimum(end, back), end)
     far = v8.at_least(bend * end, ones)
@@ -549,13 +550,13 @@ def _set_up(view, xs, ys, first):
     to_sky = v8.select(far, ones, zero)
     ray = (x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, bend * near, end)
     # A ray meets nothing in its first pixel.
-    t = v8.splat(_HALF) * v8.minimum(v8.absolute(inverse_x), v8.absolute(inverse_y))
-    size = v8.splat(np.float32(4))
-    state = (t + v8.splat(NUDGE), end, size, ones / size, zero, ones, zero)
+    t = v8.broadcast(_HALF) * v8.minimum(v8.absolute(inverse_x), v8.absolute(inverse_y))
+    size = v8.broadcast(np.float32(4))
+    state = (t + v8.broadcast(NUDGE), end, size, ones / size, zero, ones, zero)
     return ray, state, to_sky, scale
 
 
-@inner()
+@kernel_function()
 def _step(pyramid, ray, state):
     """Move eight rays through one cell each, or down into its parts.
 
@@ -564,13 +565,13 @@ def _step(pyramid, ray, state):
     """
     x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, change, end = ray
     t, stop, size, inverse, hidden_px, clean, has_hit = state
-    zero = v8.splat(_ZERO)
-    half = v8.splat(_HALF)
-    ones = v8.splat(_ONE)
-    four = v8.splat(np.float32(4))
-    quarter = v8.splat(np.float32(0.25))
-    rows = v8.splat(np.float32(pyramid.shape[0]))
-    columns = v8.splat(np.float32(pyramid.shape[1] // 5 * 4))
+    zero = v8.broadcast(_ZERO)
+    half = v8.broadcast(_HALF)
+    ones = v8.broadcast(_ONE)
+    four = v8.broadcast(np.float32(4))
+    quarter = v8.broadcast(np.float32(0.25))
+    rows = v8.broadcast(np.float32(pyramid.shape[0]))
+    columns = v8.broadcast(np.float32(pyramid.shape[1] // 5 * 4))
     going = v8.greater(stop, t)
     cell_x = v8.floor(v8.fmuladd(t, dx, x0) * inverse)
     cell_y = v8.floor(v8.fmuladd(t, dy, y0) * inverse)
@@ -580,28 +581,28 @@ def _step(pyramid, ray, state):
     leave_x = ((cell_x + ahead_x) * size - x0) * inverse_x
     leave_y = ((cell_y + ahead_y) * size - y0) * inverse_y
     leave = v8.maximum(v8.minimum(v8.minimum(leave_x, leave_y), end), t)
-    beyond = leave + v8.splat(NUDGE)
+    beyond = leave + v8.broadcast(NUDGE)
     # A ray goes up only when it leaves the parent cell, which it has tested already.
     above = inverse * quarter
     parent_step_x = v8.floor(v8.fmuladd(beyond, dx, x0) * above) - v8.floor(cell_x * quarter)
     parent_step_y = v8.floor(v8.fmuladd(beyond, dy, y0) * above) - v8.floor(cell_y * quarter)
-    climbs = v8.both(
-        v8.greater(v8.splat(np.float32(BLOCK)), size),
+    climbs = v8.mask_and(
+        v8.greater(v8.broadcast(np.float32(BLOCK)), size),
         v8.greater(v8.absolute(parent_step_x) + v8.absolute(parent_step_y), half),
     )
     k0 = near - change * t
     k1 = near - change * leave
-    nearest = v8.maximum(v8.minimum(k0, k1), v8.splat(FARTHEST))
-    reached = v8.both(going, v8.at_least(surface, nearest))
-    thick = v8.maximum(v8.splat(THICKNESS), v8.splat(THICKNESS_M) * surface)
+    nearest = v8.maximum(v8.minimum(k0, k1), v8.broadcast(FARTHEST))
+    reached = v8.mask_and(going, v8.at_least(surface, nearest))
+    thick = v8.maximum(v8.broadcast(THICKNESS), v8.broadcast(THICKNESS_M) * surface)
     entered = v8.at_least(v8.maximum(k0, k1) * (ones + thick), surface)
-    pixel = v8.both(reached, v8.at_least(ones, size))
-    hit = v8.both(pixel, entered)
+    pixel = v8.mask_and(reached, v8.at_least(ones, size))
+    hit = v8.mask_and(pixel, entered)
     has_hit = v8.select(hit, ones, has_hit)
     clean = v8.select(pixel, v8.select(entered, clean, zero), clean)
     hidden_px = v8.select(pixel, hidden_px + (leave - t), v8.select(reached, hidden_px, zero))
     stop = v8.select(hit, v8.negate(ones), stop)
-    stop = v8.select(v8.greater(hidden_px, v8.splat(HIDDEN_PX)), v8.negate(ones), stop)
+    stop = v8.select(v8.greater(hidden_px, v8.broadcast(HIDDEN_PX)), v8.negate(ones), stop)
     next_t = v8.select(pixel, beyond, v8.select(reached, t, beyond))
     t = v8.select(hit, t, v8.select(going, next_t, t))
     up = v8.select(climbs, four, ones)
@@ -611,13 +612,13 @@ def _step(pyramid, ray, state):
     return t, stop, size, inverse, hidden_px, clean, has_hit
 
 
-@inner()
+@kernel_function()
 def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, lengths, trusts):
     """Write the results of eight rays that have ended."""
     x0, y0, dx, dy, _, _, _, _, near, change, end = ray
     t, stop, _, _, _, clean, has_hit = state
-    half = v8.splat(_HALF)
-    zero = v8.splat(_ZERO)
+    half = v8.broadcast(_HALF)
+    zero = v8.broadcast(_ZERO)
     sky = v8.select(v8.at_least(t, stop), clean * to_sky, zero)
     t = v8.select(v8.greater(has_hit, half), t, end)
     v8.store(lanes, np.uint64(0), has_hit)
@@ -655,7 +656,7 @@ def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, lengths, tru
         trusts[first + np.uint64(lane)] = trust
 
 
-@inner()
+@kernel_function()
 def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
     """Return t / k and t where the ray meets the plane through the surface in the pixel at t.
 
@@ -684,7 +685,7 @@ def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
     return t_meet / max(near - change * t_meet, back), t_meet
 
 
-@inner()
+@kernel_function()
 def _run(pyramid, view, lanes, xs, ys, count, lengths, trusts):
     """Trace the mirrored rays of the first `count` pixels of a list, which has room for 8 more.
 
@@ -705,7 +706,7 @@ def _run(pyramid, view, lanes, xs, ys, count, lengths, trusts):
         _finish(pyramid, view, lanes, ray, state, to_sky, scale, at, lengths, trusts)
 
 
-@inner()
+@kernel_function()
 def _sees_water(view, alpha, column, row):
     """Return True if the pixel's ray falls and the front does not cover the water."""
     if 0 <= row < alpha.shape[0] and 0 <= column < alpha.shape[1] and alpha[row, column] >= COVERED:
@@ -715,7 +716,7 @@ def _sees_water(view, alpha, column, row):
     return u * view[0] + v * view[1] + view[2] < _ZERO
 
 
-@inner()
+@kernel_function()
 def _inside(alpha, column, row):
     return 0 <= row < alpha.shape[0] and 0 <= column < alpha.shape[1]
 
@@ -746,7 +747,7 @@ def trace(pyramid, view, alpha, needed, left, top, stride, lengths, weights):
             weights[i, j] = lists[3, n]
 
 
-@inner()
+@kernel_function()
 def _to_metres(view, alpha, needed, column, row, distance, weight):
     """Convert a row of ray lengths from |x| to metres; zero the weights of other pixels.
 

@@ -120,6 +120,6 @@ def meet_flood(echoes: Echoes, medium: FloodMedium) -> None:
         water.surface_m[has_bed],
         water.bed_gain[has_bed],
     )
-    echoes.replace(
+    echoes.replace_echoes(
         water.rows[has_mud], water.surface_m[has_mud], water.reflectance[has_mud], SCATTERED
     )

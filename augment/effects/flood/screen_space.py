@@ -35,7 +35,7 @@ from augment.render.buffers import CPU, choose_kernels
 from augment.render.threads import kernel_threads
 
 # The kernels' thresholds as Python floats, which torch accepts.
-COVERED, THICKNESS_M, THICKNESS = map(
+MIN_COVERED_ALPHA, THICKNESS_M, THICKNESS = map(
     float, (kernels.COVERED, kernels.THICKNESS_M, kernels.THICKNESS)
 )
 HIDDEN_PX = float(kernels.HIDDEN_PX)
@@ -219,7 +219,7 @@ def _trace(
     cover = torch.ones(camera.height, camera.width, dtype=alpha.dtype, device=device)
     image_slices, window_slices = window.overlap(alpha)
     cover[window_slices] = alpha[image_slices]
-    traced = needed & (cover < COVERED) & falling(camera, device)
+    traced = needed & (cover < MIN_COVERED_ALPHA) & falling(camera, device)
     row, column = torch.nonzero(traced, as_tuple=True)
     x = (column + (left + 0.5)).double()
     y = (row + (top + 0.5)).double()

@@ -101,7 +101,7 @@ def shade_water(
     Raises:
         ValueError: the bed's camera and this one are not windows of one image.
     """
-    if fog is not None and fog.sigma_per_m == 0:
+    if fog is not None and fog.extinction_per_m == 0:
         fog = None
     water = Water(camera, cover, medium, field, bed, mirror, screen, sky, fog)
     layers = (bed, mirror, None if screen is None else screen.layer)
@@ -126,7 +126,7 @@ def shade_water(
         share = weights * reflectance(cosine, medium.refraction_index, medium.fresnel)
         color = before_sky(reflected, reflect_sky(surface, rays, water))
         out = below + (share[..., None] * (color - below)).sum(0)
-    plain_color = _tensor(medium.rgb if fog is None else fog.rgb, out)
+    plain_color = _tensor(medium.rgb if fog is None else fog.airlight_rgb, out)
     out = torch.where((cover <= HIDDEN_COVER)[..., None], out, plain_color)
     return torch.where(surface.meets[..., None], out, 0)
 
@@ -683,7 +683,7 @@ def _medium_numbers(water: Water, layered: Fog | None) -> np.ndarray:
     if water.fog is not None:
         metre, height = torch.tensor([1.0, level], dtype=torch.float64)
         per_m = float(optical_depth(water.fog, metre, eye_z, height))
-        airlight = water.fog.rgb
+        airlight = water.fog.airlight_rgb
     if layered is not None:
         above = vertical_optical_depth(layered, level)
     numbers = [eye_z - level, medium.refraction_index, medium.fresnel == "schlick"]

@@ -19,9 +19,9 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from augment.render.cpu import simd as v8
-from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.cpu.simd import LOG2_E, exp2_fine, log2
-from augment.render.layout import U
+from augment.render.layout import Index
 
 # pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 # (of numba's intrinsics it sees the compiler's first argument as well, and no result)
@@ -77,7 +77,7 @@ def halve_mip(image, out):
 # ---- Layers of a flooded view --------------------------------------------------------------------
 
 
-@inner()
+@kernel_function()
 def _falls(u, v, rise):
     """Return the vertical part of a pixel's ray, summed in the order of Camera.ray_directions."""
     return (u * rise[0] + v * rise[1]) + rise[2]
@@ -109,13 +109,13 @@ def composite_water(u, v, rise, top, left, alpha, color, rgb):
     unit depth of the columns and rows of color.
     """
     for i in prange(color.shape[0]):
-        row = U(top + i)
+        row = Index(top + i)
         for j in range(color.shape[1]):
             if _falls(u[j], v[i], rise) < 0.0:
-                column = U(left + j)
+                column = Index(left + j)
                 transmittance = np.float32(1) - alpha[row, column]
-                for c in range(U(3)):
-                    rgb[row, column, c] += transmittance * color[U(i), U(j), c]
+                for c in range(Index(3)):
+                    rgb[row, column, c] += transmittance * color[Index(i), Index(j), c]
 
 
 @kernel
@@ -157,28 +157,28 @@ ONE = F(1)
 SOLID = F(SOLID_ALPHA)
 TINY = F(1e-7)
 STRIP = 64  # pixels of a list that are shaded at a time
-LANES = U(8)
-EIGHTS = ~U(7)  # bit mask that rounds down to a multiple of eight
+LANES = Index(8)
+EIGHTS = ~Index(7)  # bit mask that rounds down to a multiple of eight
 
 # Offsets of the lines of a list, one number a pixel: the ray and the distance to the water along
 # it, the surface's normal and slope variance, the depth of the bed straight behind (-1: none), the
 # screen-space ray's length and weight.
 DX, DY, DZ, ALONG, NX, NY, ROUGH, STRAIGHT_DEPTH, DISTANCE, RAY_WEIGHT = (
-    U(STRIP * k) for k in range(10)
+    Index(STRIP * k) for k in range(10)
 )
-LIST = U(STRIP * 10)
+LIST = Index(STRIP * 10)
 
 # Offsets of the lines of the scratch memory: a colour; is the bed found, and its depth; two mip
 # levels; for each of three slopes the mirrored ray, its share of the light and its coordinates in
 # the mirror.
-R, G, B, A, FOUND, DEPTH, SHARE_ABOVE = (U(8 * k) for k in range(7))
-LOW, WIDE, HIGH, SCALE = (U(56 + 16 * k) for k in range(4))
-RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(120 + 24 * k) for k in range(6))
+R, G, B, A, FOUND, DEPTH, SHARE_ABOVE = (Index(8 * k) for k in range(7))
+LOW, WIDE, HIGH, SCALE = (Index(56 + 16 * k) for k in range(4))
+RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (Index(120 + 24 * k) for k in range(6))
 SCRATCH = 120 + 24 * 6
 # Offsets in the list of first texels, of eight pixels each: two mip levels, and 0 for whole images.
-LOWER = U(0)
-UPPER = U(8)
-WHOLE_IMAGE = U(16)
+LOWER = Index(0)
+UPPER = Index(8)
+WHOLE_IMAGE = Index(16)
 
 
 class View(NamedTuple):
@@ -212,16 +212,16 @@ class Medium(NamedTuple):
     min_extinction: np.float32  # the smallest of the three
 
 
-@inner()
+@kernel_function()
 def _view(n):
     project = (n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])
     rays = (n[9], n[10], n[11], n[12], n[13], n[14], n[15], n[16], n[17])
-    width = U(np.int32(n[20]))
-    height = U(np.int32(n[21]))
+    width = Index(np.int32(n[20]))
+    height = Index(np.int32(n[21]))
     return View(project, rays, n[18], n[19], n[20], n[21], width, height)
 
 
-@inner()
+@kernel_function()
 def _medium(n):
     extinction = (n[3], n[4], n[5])
     rgb = (n[6], n[7], n[8])
@@ -385,100 +385,108 @@ def _pixels(typingctx, alpha, depth, row, column, width):
     return result(alpha, depth, v8.float8, v8.float8, types.uint64), codegen
 
 
-@inner()
+@kernel_function()
 def _clamp(x, low, high):
-    return v8.minimum(v8.maximum(x, v8.splat(low)), v8.splat(high))
+    return v8.minimum(v8.maximum(x, v8.broadcast(low)), v8.broadcast(high))
 
 
-@inner()
+@kernel_function()
 def _splat3(c):
-    return v8.splat(c[0]), v8.splat(c[1]), v8.splat(c[2])
+    return v8.broadcast(c[0]), v8.broadcast(c[1]), v8.broadcast(c[2])
 
 
-@inner()
+@kernel_function()
 def _blend3(t, a, b):
     """Return t a + (1 - t) b of two colours."""
-    complement = v8.splat(ONE) - t
+    complement = v8.broadcast(ONE) - t
     return t * a[0] + complement * b[0], t * a[1] + complement * b[1], t * a[2] + complement * b[2]
 
 
-@inner()
+@kernel_function()
 def _blend4(t, a, b):
     red, green, blue = _blend3(t, (a[0], a[1], a[2]), (b[0], b[1], b[2]))
-    return red, green, blue, t * a[3] + (v8.splat(ONE) - t) * b[3]
+    return red, green, blue, t * a[3] + (v8.broadcast(ONE) - t) * b[3]
 
 
-@inner()
+@kernel_function()
 def _select3(mask, a, b):
     return v8.select(mask, a[0], b[0]), v8.select(mask, a[1], b[1]), v8.select(mask, a[2], b[2])
 
 
-@inner()
+@kernel_function()
 def _load3(s, x, y, z):
     return v8.load(s, x), v8.load(s, y), v8.load(s, z)
 
 
-@inner()
+@kernel_function()
 def _norm(x, y, z):
     return v8.sqrt(x * x + y * y + z * z)
 
 
-@inner()
+@kernel_function()
 def _any(mask):
-    return v8.has_nonnegative_lane(v8.select(mask, v8.splat(ONE), v8.splat(-ONE)))
+    return v8.has_nonnegative_lane(v8.select(mask, v8.broadcast(ONE), v8.broadcast(-ONE)))
 
 
-@inner()
+@kernel_function()
 def _exponential(x):
     """Return exp(-x) for x >= 0."""
-    return exp2_fine(v8.maximum(x * v8.splat(-LOG2_E), v8.splat(F(-126))))
+    return exp2_fine(v8.maximum(x * v8.broadcast(-LOG2_E), v8.broadcast(F(-126))))
 
 
-@inner()
+@kernel_function()
 def _dot(m, first, p):
-    return v8.splat(m[first]) * p[0] + v8.splat(m[first + 1]) * p[1] + v8.splat(m[first + 2]) * p[2]
+    return (
+        v8.broadcast(m[first]) * p[0]
+        + v8.broadcast(m[first + 1]) * p[1]
+        + v8.broadcast(m[first + 2]) * p[2]
+    )
 
 
-@inner()
+@kernel_function()
 def _project(view, p):
     m = view.project
-    depth = v8.maximum(_dot(m, 6, p), v8.splat(F(MIN_DEPTH)))
-    inverse = v8.splat(ONE) / depth
-    column = _dot(m, 0, p) * inverse + v8.splat(view.cx)
-    return column, _dot(m, 3, p) * inverse + v8.splat(view.cy)
+    depth = v8.maximum(_dot(m, 6, p), v8.broadcast(F(MIN_DEPTH)))
+    inverse = v8.broadcast(ONE) / depth
+    column = _dot(m, 0, p) * inverse + v8.broadcast(view.cx)
+    return column, _dot(m, 3, p) * inverse + v8.broadcast(view.cy)
 
 
-@inner()
+@kernel_function()
 def _clamp_to(view, column, row):
     column = _clamp(column, HALF, view.columns - HALF)
     return column, _clamp(row, HALF, view.rows - HALF)
 
 
-@inner()
+@kernel_function()
 def _is_inside(view, column, row):
-    zero = v8.splat(ZERO)
-    across = v8.both(v8.at_least(column, zero), v8.greater(v8.splat(view.columns), column))
-    down = v8.both(v8.at_least(row, zero), v8.greater(v8.splat(view.rows), row))
-    return v8.both(across, down)
+    zero = v8.broadcast(ZERO)
+    across = v8.mask_and(v8.at_least(column, zero), v8.greater(v8.broadcast(view.columns), column))
+    down = v8.mask_and(v8.at_least(row, zero), v8.greater(v8.broadcast(view.rows), row))
+    return v8.mask_and(across, down)
 
 
-@inner()
+@kernel_function()
 def _look(alpha, depth, view, column, row):
     """Return alpha and depth of the nearest pixels inside, and their centres."""
     column = v8.floor(_clamp(column, ZERO, view.columns - ONE))
     row = v8.floor(_clamp(row, ZERO, view.rows - ONE))
     a, z = _pixels(alpha, depth, row, column, view.width)
-    half = v8.splat(HALF)
+    half = v8.broadcast(HALF)
     return a, z, column + half, row + half
 
 
-@inner()
+@kernel_function()
 def _ray_part(view, first, column, row):
     m = view.rays
-    return v8.splat(m[first]) * column + v8.splat(m[first + 1]) * row + v8.splat(m[first + 2])
+    return (
+        v8.broadcast(m[first]) * column
+        + v8.broadcast(m[first + 1]) * row
+        + v8.broadcast(m[first + 2])
+    )
 
 
-@inner()
+@kernel_function()
 def _distance_to_surface(view, z, column, row, p):
     """Return the distance from points p (relative to the layer's eye) to the pixels' surfaces."""
     x = z * _ray_part(view, 0, column, row) - p[0]
@@ -487,24 +495,24 @@ def _distance_to_surface(view, z, column, row, p):
     return _norm(x, y, z)
 
 
-@inner()
+@kernel_function()
 def _end(p, distance, ray):
     """Return the ends of rays; their directions where they have no end (a distance < 0)."""
-    has_end = v8.at_least(distance, v8.splat(ZERO))
+    has_end = v8.at_least(distance, v8.broadcast(ZERO))
     ends = p[0] + distance * ray[0], p[1] + distance * ray[1], p[2] + distance * ray[2]
     return _select3(has_end, ends, ray)
 
 
-@inner()
+@kernel_function()
 def _place(column, row, columns, rows):
     """Return row and column of the first of the four pixels around coordinates, and the weights.
 
     columns, rows: the image's sides, vectors. On the last pixels the weight of the next one is 1.
     """
-    half = v8.splat(HALF)
-    ones = v8.splat(ONE)
-    two = v8.splat(F(2))
-    zero = v8.splat(ZERO)
+    half = v8.broadcast(HALF)
+    ones = v8.broadcast(ONE)
+    two = v8.broadcast(F(2))
+    zero = v8.broadcast(ZERO)
     x = v8.minimum(v8.maximum(column - half, zero), columns - ones)
     y = v8.minimum(v8.maximum(row - half, zero), rows - ones)
     c0 = v8.maximum(v8.minimum(v8.floor(x), columns - two), zero)
@@ -512,27 +520,27 @@ def _place(column, row, columns, rows):
     return r0, c0, x - c0, y - r0
 
 
-@inner()
+@kernel_function()
 def _pixel(x):
-    return U(np.int32(x))
+    return Index(np.int32(x))
 
 
-@inner()
+@kernel_function()
 def _fetch(starts, column, row, rgb, alpha, view):
-    columns = v8.splat(view.columns)
-    r0, c0, across, down = _place(column, row, columns, v8.splat(view.rows))
+    columns = v8.broadcast(view.columns)
+    r0, c0, across, down = _place(column, row, columns, v8.broadcast(view.rows))
     return _colors(rgb, alpha, starts, WHOLE_IMAGE, r0, c0, columns, across, down)
 
 
-@inner()
+@kernel_function()
 def _choose_levels(s, starts, level, sizes):
     """Store the two mip levels around real ones: first pixels, sizes, scales of coordinates."""
     low = v8.floor(level)
-    top = v8.splat(F(np.int32(sizes.shape[0] - 1)))
+    top = v8.broadcast(F(np.int32(sizes.shape[0] - 1)))
     v8.store(s, SHARE_ABOVE, level - low)
     v8.store(s, LOW, low)
-    v8.store(s, LOW + LANES, v8.minimum(low + v8.splat(ONE), top))
-    for k in range(U(2) * LANES):
+    v8.store(s, LOW + LANES, v8.minimum(low + v8.broadcast(ONE), top))
+    for k in range(Index(2) * LANES):
         n = _pixel(s[LOW + k])
         starts[k] = sizes[n, 0]
         s[WIDE + k] = F(np.int32(sizes[n, 1]))
@@ -540,7 +548,7 @@ def _choose_levels(s, starts, level, sizes):
         s[SCALE + k] = ONE / F(np.int32(1) << np.int32(n))
 
 
-@inner()
+@kernel_function()
 def _fetch_level(s, starts, second, column, row, mips):
     """Look up one of the chosen levels. second: 0 for the lower level, LANES for the upper one."""
     scale = v8.load(s, SCALE + second)
@@ -550,39 +558,41 @@ def _fetch_level(s, starts, second, column, row, mips):
     return _texels(mips, starts, second, r0, c0, wide, across, down)
 
 
-@inner()
+@kernel_function()
 def _sky(starts, faces, size, x, y, z, near, medium):
     """Return colours of a flat, bordered cube map in rising directions, behind fog."""
-    zero = v8.splat(ZERO)
+    zero = v8.broadcast(ZERO)
     ax = v8.absolute(x)
     ay = v8.absolute(y)
-    by_x = v8.both(v8.at_least(ax, ay), v8.at_least(ax, z))
+    by_x = v8.mask_and(v8.at_least(ax, ay), v8.at_least(ax, z))
     by_y = v8.at_least(ay, z)
     major = v8.select(by_x, ax, v8.select(by_y, ay, z))
     right = v8.at_least(x, zero)
     ahead = v8.at_least(y, zero)
     across = v8.select(by_x, v8.select(right, v8.negate(z), z), x)
-    turned = v8.select(v8.both(by_y, ahead), z, v8.select(by_y, v8.negate(z), v8.negate(y)))
+    turned = v8.select(v8.mask_and(by_y, ahead), z, v8.select(by_y, v8.negate(z), v8.negate(y)))
     down = v8.select(by_x, v8.negate(y), turned)
-    face = v8.select(by_y, v8.select(ahead, v8.splat(F(2)), v8.splat(F(3))), v8.splat(F(4)))
-    face = v8.select(by_x, v8.select(right, zero, v8.splat(ONE)), face)
-    side = v8.splat(F(np.int32(size)))
-    middle = v8.splat(HALF) * side
-    inverse = (middle - v8.splat(ONE)) / major
+    face = v8.select(
+        by_y, v8.select(ahead, v8.broadcast(F(2)), v8.broadcast(F(3))), v8.broadcast(F(4))
+    )
+    face = v8.select(by_x, v8.select(right, zero, v8.broadcast(ONE)), face)
+    side = v8.broadcast(F(np.int32(size)))
+    middle = v8.broadcast(HALF) * side
+    inverse = (middle - v8.broadcast(ONE)) / major
     r0, c0, across, down = _place(across * inverse + middle, down * inverse + middle, side, side)
     r, g, b, _ = _texels(faces, starts, WHOLE_IMAGE, r0 + face * side, c0, side, across, down)
     color = r, g, b
     if medium.fog_above >= ZERO:
-        t = _exponential(near + v8.splat(medium.fog_above) / z)
+        t = _exponential(near + v8.broadcast(medium.fog_above) / z)
         color = _blend3(t, color, _splat3(medium.airlight))
     return color
 
 
-@inner()
+@kernel_function()
 def _reflectance(c, inside, medium):
     """Return the share of reflected light. c, inside: cosines in the air and in the water."""
-    ones = v8.splat(ONE)
-    n = v8.splat(medium.index)
+    ones = v8.broadcast(ONE)
+    n = v8.broadcast(medium.index)
     if medium.schlick:
         base = (n - ones) / (n + ones)
         base = base * base
@@ -595,25 +605,25 @@ def _reflectance(c, inside, medium):
     quotient = ones / (b * e)
     rs = a * e * quotient
     rp = d * b * quotient
-    return v8.splat(HALF) * (rs * rs + rp * rp)
+    return v8.broadcast(HALF) * (rs * rs + rp * rp)
 
 
-@inner()
+@kernel_function()
 def _facet(sx, sy, view, medium):
     """Return (normals, cosines in air and water, reflected share, mirrored rays) of facets.
 
     sx, sy: their slopes. view: unit vectors to the eye.
     """
-    ones = v8.splat(ONE)
-    min_cosine = v8.splat(F(MIN_COSINE))
+    ones = v8.broadcast(ONE)
+    min_cosine = v8.broadcast(F(MIN_COSINE))
     vx, vy, vz = view
     nz = ones / v8.sqrt(sx * sx + sy * sy + ones)
     nx = sx * nz
     ny = sy * nz
     cosine = nx * vx + ny * vy + nz * vz
     c = v8.minimum(v8.maximum(cosine, min_cosine), ones)
-    inverse = v8.splat(ONE / medium.index)
-    inside = v8.sqrt(v8.maximum(ones - (ones - c * c) * inverse * inverse, v8.splat(ZERO)))
+    inverse = v8.broadcast(ONE / medium.index)
+    inside = v8.sqrt(v8.maximum(ones - (ones - c * c) * inverse * inverse, v8.broadcast(ZERO)))
     twice = cosine + cosine
     x = twice * nx - vx
     y = twice * ny - vy
@@ -623,31 +633,31 @@ def _facet(sx, sy, view, medium):
     return (nx, ny, nz), c, inside, share, (x * unit, y * unit, z * unit)
 
 
-@inner()
+@kernel_function()
 def _refract(normal, c, inside, view, medium):
     """Return refracted rays per metre of depth, and their length per metre."""
-    ones = v8.splat(ONE)
-    ratio = v8.splat(ONE / medium.index)
+    ones = v8.broadcast(ONE)
+    ratio = v8.broadcast(ONE / medium.index)
     bend = c * ratio - inside
     x = bend * normal[0] - view[0] * ratio
     y = bend * normal[1] - view[1] * ratio
-    z = v8.maximum(view[2] * ratio - bend * normal[2], v8.splat(F(MIN_COSINE)))
+    z = v8.maximum(view[2] * ratio - bend * normal[2], v8.broadcast(F(MIN_COSINE)))
     steep = ones / z
     return x * steep, y * steep, _norm(x, y, z) * steep
 
 
-@inner()
+@kernel_function()
 def _place_on_bed(px, py, tx, ty, depth, bed, medium):
-    below = px + depth * tx, py + depth * ty, v8.splat(-medium.height) - depth
+    below = px + depth * tx, py + depth * ty, v8.broadcast(-medium.height) - depth
     column, row = _project(bed, below)
     return column, row, _is_inside(bed, column, row)
 
 
-@inner()
+@kernel_function()
 def _search_bed(is_found, depth, px, py, tx, ty, alpha, depths, bed, medium):
     """Return where refracted rays meet the bed: depth, column and row; 1 where they do, else 0."""
-    zero = v8.splat(ZERO)
-    ones = v8.splat(ONE)
+    zero = v8.broadcast(ZERO)
+    ones = v8.broadcast(ONE)
     is_moving = is_found
     for _ in range(BED_STEPS):
         moves = v8.greater(is_moving, zero)
@@ -655,19 +665,19 @@ def _search_bed(is_found, depth, px, py, tx, ty, alpha, depths, bed, medium):
             break
         column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium)
         a, z, column, row = _look(alpha, depths, bed, column, row)
-        has_bed = v8.select(v8.both(inside, v8.at_least(a, v8.splat(SOLID))), ones, zero)
+        has_bed = v8.select(v8.mask_and(inside, v8.at_least(a, v8.broadcast(SOLID))), ones, zero)
         is_found = v8.select(moves, v8.minimum(is_found, has_bed), is_found)
         is_moving = v8.minimum(is_moving, has_bed)
-        new_depth = v8.splat(-medium.height) - z * _ray_part(bed, 6, column, row)
+        new_depth = v8.broadcast(-medium.height) - z * _ray_part(bed, 6, column, row)
         new_depth = v8.select(v8.greater(is_moving, zero), v8.maximum(new_depth, zero), depth)
-        is_large = v8.greater(v8.absolute(new_depth - depth), v8.splat(F(CONVERGED_M)))
+        is_large = v8.greater(v8.absolute(new_depth - depth), v8.broadcast(F(CONVERGED_M)))
         is_moving = v8.select(is_large, is_moving, zero)
         depth = new_depth
     column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium)
     return depth, column, row, v8.select(inside, is_found, zero)
 
 
-@inner()
+@kernel_function()
 def _use_straight_bed(s, q, straight_pixels, place, at, depth, colors, rgb, alpha):
     """Replace depth and colour by the bed straight behind the pixel where FOUND is 0."""
     r, g, b, a = colors
@@ -678,34 +688,34 @@ def _use_straight_bed(s, q, straight_pixels, place, at, depth, colors, rgb, alph
     v8.store(s, A, a)
     for k in range(LANES):
         if s[FOUND + k] == ZERO:
-            pixel = U(straight_pixels[place + k])
-            s[R + k] = rgb[U(3) * pixel]
-            s[G + k] = rgb[U(3) * pixel + U(1)]
-            s[B + k] = rgb[U(3) * pixel + U(2)]
+            pixel = Index(straight_pixels[place + k])
+            s[R + k] = rgb[Index(3) * pixel]
+            s[G + k] = rgb[Index(3) * pixel + Index(1)]
+            s[B + k] = rgb[Index(3) * pixel + Index(2)]
             s[A + k] = alpha[pixel]
             s[DEPTH + k] = q[STRAIGHT_DEPTH + at + k]
     return v8.load(s, DEPTH), v8.load(s, R), v8.load(s, G), v8.load(s, B), v8.load(s, A)
 
 
-@inner()
+@kernel_function()
 def _absorb(bed_color, alpha, water, length, extinction):
-    ones = v8.splat(ONE)
-    t = _exponential(length * v8.splat(extinction))
+    ones = v8.broadcast(ONE)
+    t = _exponential(length * v8.broadcast(extinction))
     return t * (bed_color + (ones - alpha) * water) + (ones - t) * water
 
 
-@inner()
+@kernel_function()
 def _mirror_distance(alpha, depth, mirror, column, row, p):
     """Return the distance from the water to the mirrored layer's surface; -1 without a surface."""
     a, z, column, row = _look(alpha, depth, mirror, column, row)
     distance = _distance_to_surface(mirror, z, column, row, p)
-    return v8.select(v8.at_least(a, v8.splat(SOLID)), distance, v8.splat(-ONE))
+    return v8.select(v8.at_least(a, v8.broadcast(SOLID)), distance, v8.broadcast(-ONE))
 
 
-@inner()
+@kernel_function()
 def _find_in_mirror(s, count, dx, dy, dz, px, py, alpha, depth, mirror, medium):
     """Store in MIRROR_C and MIRROR_R where the reflected rays end in the mirrored layer."""
-    p = px, py, v8.splat(medium.height)
+    p = px, py, v8.broadcast(medium.height)
     column, row = _project(mirror, (dx, dy, v8.negate(dz)))
     column, row = _clamp_to(mirror, column, row)
     d = _mirror_distance(alpha, depth, mirror, column, row, p)
@@ -720,28 +730,28 @@ def _find_in_mirror(s, count, dx, dy, dz, px, py, alpha, depth, mirror, medium):
         v8.store(s, MIRROR_R + t, row)
 
 
-@inner()
+@kernel_function()
 def _level(s, sizes):
     """Return the mip level whose pixels are as wide as the spacing of a pixel's three look-ups."""
     c = v8.load(s, MIRROR_C)
     r = v8.load(s, MIRROR_R)
-    x1 = v8.load(s, MIRROR_C + U(8)) - c
-    y1 = v8.load(s, MIRROR_R + U(8)) - r
-    x2 = v8.load(s, MIRROR_C + U(16)) - c
-    y2 = v8.load(s, MIRROR_R + U(16)) - r
+    x1 = v8.load(s, MIRROR_C + Index(8)) - c
+    y1 = v8.load(s, MIRROR_R + Index(8)) - r
+    x2 = v8.load(s, MIRROR_C + Index(16)) - c
+    y2 = v8.load(s, MIRROR_R + Index(16)) - r
     total_spacing = v8.sqrt(x1 * x1 + y1 * y1) + v8.sqrt(x2 * x2 + y2 * y2)
-    spacing = v8.maximum(v8.splat(HALF) * total_spacing, v8.splat(ONE))
+    spacing = v8.maximum(v8.broadcast(HALF) * total_spacing, v8.broadcast(ONE))
     top = F(np.int32(sizes.shape[0] - 1))
-    return v8.maximum(v8.minimum(log2(spacing), v8.splat(top)), v8.splat(ZERO))
+    return v8.maximum(v8.minimum(log2(spacing), v8.broadcast(top)), v8.broadcast(ZERO))
 
 
-@inner()
+@kernel_function()
 def _find_in_image(s, d, trust, px, py, alpha, depth, front, medium):
     """Return (column, row, weight) of the image's pixels in which the first ray ends."""
-    zero = v8.splat(ZERO)
-    ones = v8.splat(ONE)
-    solid = v8.splat(SOLID)
-    p = (px, py, v8.splat(-medium.height))
+    zero = v8.broadcast(ZERO)
+    ones = v8.broadcast(ONE)
+    solid = v8.broadcast(SOLID)
+    p = (px, py, v8.broadcast(-medium.height))
     ray = _load3(s, RX, RY, RZ)
     column, row = _project(front, _end(p, d, ray))
     a, z, c, r = _look(alpha, depth, front, column, row)
@@ -751,21 +761,21 @@ def _find_in_image(s, d, trust, px, py, alpha, depth, front, medium):
     column, row = _project(front, end)
     a, z, _, _ = _look(alpha, depth, front, column, row)
     ahead = _dot(front.project, 6, end)
-    allowed = v8.maximum(v8.splat(F(MATCH_SHARE)) * ahead, v8.splat(F(MATCH_M)))
-    is_near = v8.both(v8.at_least(a, solid), v8.greater(allowed, v8.absolute(z - ahead)))
+    allowed = v8.maximum(v8.broadcast(F(MATCH_SHARE)) * ahead, v8.broadcast(F(MATCH_M)))
+    is_near = v8.mask_and(v8.at_least(a, solid), v8.greater(allowed, v8.absolute(z - ahead)))
     on_sky = v8.select(v8.at_least(a, solid), zero, ones)
     matches = v8.select(finite, v8.select(is_near, ones, zero), on_sky)
-    columns = v8.splat(front.columns)
-    rows = v8.splat(front.rows)
+    columns = v8.broadcast(front.columns)
+    rows = v8.broadcast(front.rows)
     across = v8.minimum(column, columns - column) / columns
     border = v8.minimum(across, v8.minimum(row, rows - row) / rows)
-    fade = _clamp(border / v8.splat(F(EDGE)), ZERO, ONE)
-    weight = trust * (fade * fade * (v8.splat(F(3)) - (fade + fade)))
+    fade = _clamp(border / v8.broadcast(F(EDGE)), ZERO, ONE)
+    weight = trust * (fade * fade * (v8.broadcast(F(3)) - (fade + fade)))
     column, row = _clamp_to(front, column, row)
     return column, row, matches * weight
 
 
-@inner()
+@kernel_function()
 def _store_tap(s, tap, share, ray):
     """Store the mirrored ray of one of a pixel's slopes, and its share of the light."""
     t = tap * LANES
@@ -826,7 +836,7 @@ class Faces(NamedTuple):
     size: np.uint64  # texels along a face
 
 
-@inner()
+@kernel_function()
 def _shade_row(
     i, pixels, normals, bed_image, mirror_image, mips, front_image, rays, sky, water, out
 ):
@@ -854,8 +864,8 @@ def _shade_row(
     pixel_columns = np.zeros(2 * STRIP, np.int64)
     straight_pixels = np.zeros(2 * STRIP, np.int64)
     starts = np.zeros(24, np.int64)
-    smooth_count = U(0)
-    rough_count = U(0)
+    smooth_count = Index(0)
+    rough_count = Index(0)
     j = 0
     bx = v[i] * axes[0, 1]
     by = v[i] * axes[1, 1]
@@ -864,7 +874,7 @@ def _shade_row(
     row_inside = straight_row >= 0 and straight_row < np.int64(bed.height)
     max_depth = np.float64(F(FARTHEST))
     while True:
-        while j < width and smooth_count < U(STRIP) and rough_count < U(STRIP):
+        while j < width and smooth_count < Index(STRIP) and rough_count < Index(STRIP):
             # The order of these sums is that of Camera.ray_directions: the sign has to agree.
             fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
             if not (fall < 0.0 and cover[i, j] <= F(HIDDEN_COVER)):
@@ -877,11 +887,11 @@ def _shade_row(
             spread = variance[i, j]
             if spread >= smooth_variance:
                 item = LIST + rough_count
-                slot = U(STRIP) + rough_count
-                rough_count += U(1)
+                slot = Index(STRIP) + rough_count
+                rough_count += Index(1)
             else:
                 item = slot = smooth_count
-                smooth_count += U(1)
+                smooth_count += Index(1)
             q[DX + item] = F((u[j] * axes[0, 0] + bx) + axes[0, 2])
             q[DY + item] = F((u[j] * axes[1, 0] + by) + axes[1, 2])
             q[DZ + item] = F(fall)
@@ -893,7 +903,7 @@ def _shade_row(
             straight_pixels[slot] = 0
             column = np.int64(np.floor((np.float64(j) + 0.5) * bed_right + bed_left))
             if row_inside and column >= 0 and column < np.int64(bed.width):
-                pixel = U(straight_row) * bed.width + U(column)
+                pixel = Index(straight_row) * bed.width + Index(column)
                 if bed_alpha[pixel] >= SOLID:
                     straight_pixels[slot] = np.int64(pixel)
                     q[STRAIGHT_DEPTH + item] = max(
@@ -908,27 +918,27 @@ def _shade_row(
         # The fuller list comes first, so that lists are short only at a row's end.
         is_rough = rough_count > smooth_count
         count = rough_count if is_rough else smooth_count
-        if count == U(0):
+        if count == Index(0):
             break
-        base = U(0)
-        start = U(0)
-        taps = U(1)
+        base = Index(0)
+        start = Index(0)
+        taps = Index(1)
         if is_rough:
             base = LIST
-            start = U(STRIP)
-            taps = U(3)
-            rough_count = U(0)
+            start = Index(STRIP)
+            taps = Index(3)
+            rough_count = Index(0)
         else:
-            smooth_count = U(0)
-        for last in range(count, (count + U(7)) & EIGHTS):  # spare lanes repeat the last pixel
-            straight_pixels[start + last] = straight_pixels[start + count - U(1)]
-            for line in range(U(10)):
-                at = base + line * U(STRIP)
-                q[at + last] = q[at + count - U(1)]
-        for first in range(U(0), count, LANES):
+            smooth_count = Index(0)
+        for last in range(count, (count + Index(7)) & EIGHTS):  # spare lanes repeat the last pixel
+            straight_pixels[start + last] = straight_pixels[start + count - Index(1)]
+            for line in range(Index(10)):
+                at = base + line * Index(STRIP)
+                q[at + last] = q[at + count - Index(1)]
+        for first in range(Index(0), count, LANES):
             at = base + first
-            ones = v8.splat(ONE)
-            zero = v8.splat(ZERO)
+            ones = v8.broadcast(ONE)
+            zero = v8.broadcast(ZERO)
             dx = v8.load(q, DX + at)
             dy = v8.load(q, DY + at)
             dz = v8.load(q, DZ + at)
@@ -940,10 +950,10 @@ def _shade_row(
             vx = v8.negate(dx) * inverse
             vy = v8.negate(dy) * inverse
             view = vx, vy, v8.negate(dz) * inverse
-            near = v8.splat(medium.fog_per_m) * along * length
+            near = v8.broadcast(medium.fog_per_m) * along * length
             nx = v8.load(q, NX + at)
             ny = v8.load(q, NY + at)
-            upright = v8.maximum(ones - nx * nx - ny * ny, v8.splat(F(MIN_NORMAL_Z2)))
+            upright = v8.maximum(ones - nx * nx - ny * ny, v8.broadcast(F(MIN_NORMAL_Z2)))
             upright = ones / v8.sqrt(upright)
             sx = nx * upright
             sy = ny * upright
@@ -960,10 +970,10 @@ def _shade_row(
             steep = ones / view[2]
             if bends:
                 tx, ty, steep = _refract(normal, c, inside, view, medium)
-            thick = straight_depth * steep * v8.splat(medium.min_extinction)
-            shows_bed = v8.both(
+            thick = straight_depth * steep * v8.broadcast(medium.min_extinction)
+            shows_bed = v8.mask_and(
                 v8.at_least(straight_depth, zero),
-                v8.greater(v8.splat(medium.max_optical_depth), thick),
+                v8.greater(v8.broadcast(medium.max_optical_depth), thick),
             )
             if _any(shows_bed):
                 is_found = zero
@@ -983,10 +993,12 @@ def _shade_row(
                         medium,
                     )
                     colors = _fetch(starts, column, row, bed_rgb, bed_alpha, bed)
-                    is_found = v8.select(v8.at_least(colors[3], v8.splat(SOLID)), is_found, zero)
+                    is_found = v8.select(
+                        v8.at_least(colors[3], v8.broadcast(SOLID)), is_found, zero
+                    )
                 v8.store(s, FOUND, is_found)
                 r, g, b, a = colors
-                if _any(v8.both(shows_bed, v8.greater(v8.splat(HALF), is_found))):
+                if _any(v8.mask_and(shows_bed, v8.greater(v8.broadcast(HALF), is_found))):
                     depth, r, g, b, a = _use_straight_bed(
                         s, q, straight_pixels, start + first, at, depth, colors, bed_rgb, bed_alpha
                     )
@@ -1001,18 +1013,18 @@ def _shade_row(
             if bends:
                 # Mirrored rays and shares of the slopes.
                 if is_rough:
-                    share = v8.splat(F(2 / 3)) * share
-                _store_tap(s, U(0), share, ray)
+                    share = v8.broadcast(F(2 / 3)) * share
+                _store_tap(s, Index(0), share, ray)
                 if is_rough:
-                    flat = v8.maximum(v8.sqrt(vx * vx + vy * vy), v8.splat(F(1e-12)))
-                    spread8 = v8.sqrt(v8.splat(F(3)) * v8.load(q, ROUGH + at)) / flat
-                    for tap in range(U(1), U(3)):
-                        sign = ONE if tap == U(1) else -ONE
-                        offset8 = v8.splat(sign) * spread8
+                    flat = v8.maximum(v8.sqrt(vx * vx + vy * vy), v8.broadcast(F(1e-12)))
+                    spread8 = v8.sqrt(v8.broadcast(F(3)) * v8.load(q, ROUGH + at)) / flat
+                    for tap in range(Index(1), Index(3)):
+                        sign = ONE if tap == Index(1) else -ONE
+                        offset8 = v8.broadcast(sign) * spread8
                         _, _, _, share, ray = _facet(
                             sx + offset8 * vx, sy + offset8 * vy, view, medium
                         )
-                        _store_tap(s, tap, v8.splat(F(1 / 6)) * share, ray)
+                        _store_tap(s, tap, v8.broadcast(F(1 / 6)) * share, ray)
                 # Reflection of the scene above the water, where the image shows it.
                 image = (zero, zero, zero, zero)
                 weight = zero
@@ -1031,7 +1043,7 @@ def _shade_row(
                     )
                     if _any(v8.greater(weight, zero)):
                         image = _fetch(starts, column, row, front_rgb, front_alpha, front)
-                    needs_rest = _any(v8.greater(ones - weight, v8.splat(TINY)))
+                    needs_rest = _any(v8.greater(ones - weight, v8.broadcast(TINY)))
                     needs_mirror = has_mirror and needs_rest
                 if needs_mirror:
                     _find_in_mirror(
@@ -1057,8 +1069,8 @@ def _shade_row(
                         reflected = _blend4(weight, image, reflected)
                     r, g, b, a = reflected
                     transmittance = ones - a
-                    shines = v8.greater(transmittance, v8.splat(F(FAINT)))
-                    inverse_alpha = ones / v8.maximum(a, v8.splat(HALF))
+                    shines = v8.greater(transmittance, v8.broadcast(F(FAINT)))
+                    inverse_alpha = ones / v8.maximum(a, v8.broadcast(HALF))
                     color = r * inverse_alpha, g * inverse_alpha, b * inverse_alpha
                     if _any(shines):
                         rx, ry, rz = _load3(s, RX + t8, RY + t8, RZ + t8)

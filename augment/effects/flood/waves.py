@@ -234,8 +234,8 @@ def _draw(spectrum: _Spectrum, recipe: Waves, rng: np.random.Generator, depth_m:
 # becomes slope variance along the view: (k A)^2 (1 - w^2) (D.v)^2 / 2, where v is the ray's
 # horizontal direction. Bruneton et al. 2010 split a sea into normals and a variance like this.
 
-FADED_PX = 2.0  # wavelength in pixels below which a wave is gone
-FULL_PX = 4.0  # wavelength in pixels from which a wave has its full height
+GONE_WAVELENGTH_PX = 2.0  # wavelength in pixels below which a wave is gone
+FULL_WAVELENGTH_PX = 4.0  # wavelength in pixels from which a wave has its full height
 FARTHEST_M = 1e7  # depth beyond which a ray counts as parallel to the plane
 TOUCHING_M = 1e-9  # an eye closer to the plane than this lies in it and sees nothing of it
 # Horizontal part of a ray, at unit z, below which world x is taken as its horizontal direction.
@@ -292,7 +292,9 @@ def wave_field(
         length_px = torch.from_numpy(wave_part.wavelengths_m).to(rays.device) / rate.clamp_min(
             1e-300
         )
-        t = ((length_px - FADED_PX) / (FULL_PX - FADED_PX)).clamp(0, 1)
+        t = ((length_px - GONE_WAVELENGTH_PX) / (FULL_WAVELENGTH_PX - GONE_WAVELENGTH_PX)).clamp(
+            0, 1
+        )
         weight = t * t * (3 - 2 * t)
         tangents = tangents + tangents_of(wave_part, theta, weight)
         slopes = torch.from_numpy(wave_part.wavenumbers * wave_part.amplitudes_m).to(rays.device)
@@ -326,7 +328,7 @@ def _run_kernel(waves: WaveSet, camera: Camera, height: float) -> WaveField:
             height,
             np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64),
             FARTHEST_M,
-            np.array([UPRIGHT, FADED_PX, FULL_PX], np.float32),
+            np.array([UPRIGHT, GONE_WAVELENGTH_PX, FULL_WAVELENGTH_PX], np.float32),
             np.stack(phases, axis=1),
             np.stack(waves.tangent_factors, axis=1).astype(np.float32),
             *fields,

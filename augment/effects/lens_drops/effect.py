@@ -19,7 +19,7 @@ from augment.effects.lens_drops.drops import LensDropsPlan, drops_at
 from augment.effects.lens_drops.optics import blend_drops, draw_drops, map_surroundings
 from augment.scene import Scene
 from augment.timing import timed
-from recipes.fields import found
+from recipes.fields import section_at
 from recipes.lens_drops import LensDrops
 from recipes.schema import Recipe
 
@@ -43,8 +43,8 @@ class LensDropsEffect(Effect):
         return section.changes or None
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
-        drops = self.of(recipe)
-        rate_mm_h = found(recipe, "weather.rain.rate_mm_h") or 0.0
+        drops = self.section_of(recipe)
+        rate_mm_h = section_at(recipe, "weather.rain.rate_mm_h") or 0.0
         why = ""
         if drops is None or not drops.changes:
             absent = "the recipe has no drops on the lens"
@@ -67,8 +67,8 @@ class LensDropsEffect(Effect):
         if camera.is_orthographic:
             return drawn
         with timed(ON_GLASS):
-            drops = drops_at(own.data, own.scene, camera)
-            lens = own.data.drops
+            drops = drops_at(own.settings, own.scene, camera)
+            lens = own.settings.drops
             if len(drops.radii_m) == 0:
                 return drawn
             around = map_surroundings(
@@ -78,4 +78,4 @@ class LensDropsEffect(Effect):
                 drops, around, camera, glass_m=lens.glass_m, aperture_m=lens.aperture_m
             )
             rgb, mask = blend_drops(drawn.rgb, layer, step, margin, backend=own.backend)
-        return replace(drawn, rgb=rgb, masks={**drawn.masks, self.mask: mask})
+        return replace(drawn, rgb=rgb, masks={**drawn.masks, self.mask_name: mask})

@@ -27,13 +27,13 @@ from augment.drawing import LayerRenderer
 from augment.effects.lens_drops import kernels
 from augment.effects.lens_drops.drops import Drops
 from augment.render.buffers import CPU, choose_kernels
-from augment.render.composite import ROWS, simplify_sky
+from augment.render.composite import ROWS_PER_CHUNK, simplify_sky
 from augment.render.fog import blend_airlight, sky_optical_depth
 from augment.render.threads import kernel_threads
 from augment.sky import is_unknown_sky
 
 WATER = 1.33  # refractive index
-COVERED = 0.1  # share of a pixel's light from drops from which the mask holds the pixel
+MIN_MASK_SHARE = 0.1  # share of a pixel's light from drops from which the mask holds the pixel
 MIN_SHARE = 1e-3  # share of a pixel's light from drops from which the pixel changes
 _MAP_DEG = 0.75  # size of a cell in the map of the surroundings
 _MAP_REACH_DEG = 81.0  # largest angle from the axis in that map
@@ -272,8 +272,8 @@ def blend_drops(
     height, width, _ = rgb.shape
     if choose_kernels(backend, rgb) == CPU and rgb.is_contiguous():
         mask = np.empty((height, width), np.bool_)
-        numbers = np.float32(step), margin, np.float32(MIN_SHARE), np.float32(COVERED)
-        with kernel_threads(ROWS):
+        numbers = np.float32(step), margin, np.float32(MIN_SHARE), np.float32(MIN_MASK_SHARE)
+        with kernel_threads(ROWS_PER_CHUNK):
             kernels.blend_drops(rgb.detach().numpy(), layer, *numbers, mask)
         return rgb, torch.from_numpy(mask)
     cells = torch.from_numpy(layer).to(rgb.device, rgb.dtype)
@@ -287,4 +287,4 @@ def blend_drops(
     cover = drop_layer[3]
     behind = (1 - cover).clamp_min(0)[..., None] * rgb.clamp_min(0).square()
     blended = torch.where((cover >= MIN_SHARE)[..., None], (behind + light).sqrt(), rgb)
-    return blended, cover >= COVERED
+    return blended, cover >= MIN_MASK_SHARE

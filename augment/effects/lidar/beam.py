@@ -111,7 +111,7 @@ def highest_intensity(intensity: np.ndarray) -> float:
     return max(top, float(np.max(values, initial=top, where=np.isfinite(values))))
 
 
-def reflectances(sweep: LidarSweep) -> np.ndarray:
+def find_reflectances(sweep: LidarSweep) -> np.ndarray:
     """Return the reflectance of each return's surface, float64 [N], MIN_REFLECTANCE at least.
 
     It includes the cosine of incidence, since sensors do not divide by it.
@@ -172,20 +172,20 @@ class Echoes:
     directions: np.ndarray  # [N, 3], unit, scene world
     # [N], as reported; 0 where the source has no point: such rows are never touched.
     ranges_m: np.ndarray
-    air_m: np.ndarray  # [N], length of the beam's path through the air
+    air_path_m: np.ndarray  # [N], length of the beam's path through the air
     # [N], reflectance of the surface that gives the echo, incidence included, relative to a white
     # surface met head on.
     reflectance: np.ndarray
     gain: np.ndarray  # [N], share of the echo that the weather leaves
     # [N], extinction about the sensor, of the weather that has dimmed echoes so far.
-    haze_per_m: np.ndarray
+    extinction_per_m: np.ndarray
     codes: np.ndarray  # [N], uint8, see codes
     # [N], True if the echo is not the source's, so that its intensity follows from reflectance.
     is_new: np.ndarray
     is_moved: np.ndarray  # [N], True if it lies elsewhere than in the source
 
     @staticmethod
-    def of(
+    def from_sweep(
         sweep: LidarSweep, origins: np.ndarray, world_origin_m: np.ndarray, model: LidarModel
     ) -> Echoes:
         """Return the echoes as recorded in clear air; origins: float64 [N, 3], dataset world.
@@ -206,20 +206,20 @@ class Echoes:
             origins=scene_origins,
             directions=directions,
             ranges_m=ranges,
-            air_m=ranges.copy(),
-            reflectance=np.maximum(reflectances(sweep), model.noise_reflectance(ranges)),
+            air_path_m=ranges.copy(),
+            reflectance=np.maximum(find_reflectances(sweep), model.noise_reflectance(ranges)),
             gain=np.ones(count),
-            haze_per_m=np.zeros(count),
+            extinction_per_m=np.zeros(count),
             codes=np.full(count, UNCHANGED, np.uint8),
             is_new=np.zeros(count, bool),
             is_moved=np.zeros(count, bool),
         )
 
-    def replace(
+    def replace_echoes(
         self, rows: np.ndarray, ranges_m: np.ndarray, reflectance: np.ndarray, code: int
     ) -> None:
         """Replace the echoes of rows [M] by echoes of something else, met in the air."""
-        self.ranges_m[rows] = self.air_m[rows] = ranges_m
+        self.ranges_m[rows] = self.air_path_m[rows] = ranges_m
         self.reflectance[rows] = reflectance
         self.gain[rows] = 1.0
         self.codes[rows] = code
@@ -233,7 +233,7 @@ class Echoes:
         self.codes[rows[has_moved]] = MOVED
         self.is_moved[rows[has_moved]] = True
         self.ranges_m[rows[has_moved]] = ranges_m[has_moved]
-        self.air_m[rows] = air_m
+        self.air_path_m[rows] = air_m
         self.gain[rows] *= transmittance
 
     def add_range_noise(self, gain_before: np.ndarray, normal: np.ndarray) -> None:
@@ -258,7 +258,7 @@ class Echoes:
         is_faint = self.reflectance * self.gain < self.model.noise_reflectance(self.ranges_m)
         self.codes[is_faint & (self.ranges_m > 0)] = LOST
 
-    def sweep(self) -> LidarSweep:
+    def to_sweep(self) -> LidarSweep:
         """Return the weathered sweep, as `weathered_sweep` does."""
         columns = {name: np.asarray(column) for name, column in self.source.columns.items()}
         columns |= self._coordinates(columns)

@@ -57,13 +57,15 @@ def weathered_sweep(
             )
     plan = make_plan(recipe, scene)
     origins = find_beam_origins(scene, frame_index, sweep)
-    echoes = Echoes.of(sweep, origins, np.asarray(scene.world_origin_m), model)
-    active_effects = plan.active(scene)
+    echoes = Echoes.from_sweep(sweep, origins, np.asarray(scene.world_origin_m), model)
+    active_effects = plan.active_effects(scene)
     for active_effect in active_effects:
-        active_effect.effect.meet(active_effect, echoes, scene.frame(frame_index).timestamp_ns)
+        active_effect.hooks.intersect_beams(
+            active_effect, echoes, scene.frame(frame_index).timestamp_ns
+        )
     for active_effect in active_effects:
-        rng_key = f"lidar.{active_effect.effect.name}"
+        rng_key = f"lidar.{active_effect.hooks.name}"
         rng = rng_for(seed=recipe.seed, scene=scene.name, frame=frame_index, effect=rng_key)
-        active_effect.effect.attenuate(active_effect, echoes, rng)
+        active_effect.hooks.attenuate_beams(active_effect, echoes, rng)
     echoes.drop_faint()
-    return echoes.sweep()
+    return echoes.to_sweep()

@@ -36,23 +36,23 @@ class ExposedCells:
     sizes_m: Float32[Tensor, "C"]
     # Level distance from the middle to the nearest open edge (OPEN_EDGE): half a cell at least,
     # MAX_EDGE_DISTANCE_M at most.
-    edge_m: Float32[Tensor, "C"]
+    edge_distance_m: Float32[Tensor, "C"]
     # Indices of the cells to the -x, +x, -y and +y side, or OPEN_EDGE or FLUSH.
     neighbours: Int32[Tensor, "C 4"]
     # Brightness of the bare surface relative to what is usual for its class nearby, 1 = usual;
     # shadows that the recording holds show in it.
-    light: Float32[Tensor, "C"]
+    relative_light: Float32[Tensor, "C"]
     # How much of a wheel track the cell is, 0 to 1.
-    tracks: Float32[Tensor, "C"]
+    track_share: Float32[Tensor, "C"]
     # Level vector towards obstacles beside the cell: 0 far from any, about 1 long at their foot.
-    banks: Float32[Tensor, "C 2"]
+    obstacle_vectors: Float32[Tensor, "C 2"]
     # Class of the surface; VEGETATION is foliage, not grass.
     semantic: Int16[Tensor, "C"]
     # Indices of the Gaussians that snow can hide.
-    buried: Int32[Tensor, "B"]
+    hideable_ids: Int32[Tensor, "B"]
     # Cells over each of these Gaussians: at its middle, and at 1.5 standard deviations along its
     # two longest axes. Snow on all of these cells hides the Gaussian; -1 (no cell) means never.
-    buried_by: Int32[Tensor, "B 5"]
+    covering_cells: Int32[Tensor, "B 5"]
 
     def __len__(self) -> int:
         return self.centers_m.shape[0]

@@ -81,16 +81,16 @@ class SnowEffect(Effect):
         file="labels/snow.parquet",
         kind="box snow",
         columns={"pixels": np.int64, "snow_pixels": np.int64, "snow_fraction": np.float64},
-        sampled=("snow_fraction",),
-        derived={"snow_fraction": pixel_fraction("snow_pixels")},
-        hidden="snow_fraction",
+        sample_columns=("snow_fraction",),
+        derived_columns={"snow_fraction": pixel_fraction("snow_pixels")},
+        hidden_column="snow_fraction",
     )
 
     def kernels(self, section: Snow) -> Hashable:
         return section.shading
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
-        snow = self.of(recipe)
+        snow = self.section_of(recipe)
         if snow is None or not snow.changes:
             reason = "the recipe has no snow"
             if snow is not None:
@@ -119,11 +119,11 @@ class SnowEffect(Effect):
         return EffectPlan(SnowPlan(snow, seed, level_z_m), steps, frozenset(buffers))
 
     def prepare(self, own: EffectInScene) -> SnowLayers:
-        return snow_layers_of(own.scene, own.data, own.light, backend=own.backend)
+        return build_snow_layers(own.scene, own.settings, own.lit_scene, backend=own.backend)
 
     def share(self, job: JobContext) -> None:
         """Find where snow can lie, once for all recipes of the job."""
-        sections = (self.of(recipe) for recipe in job.recipes)
+        sections = (self.section_of(recipe) for recipe in job.recipes)
         distinct = dict.fromkeys(
             exposure_settings(snow, job.scene) for snow in sections if snow and snow.changes
         )
@@ -132,9 +132,9 @@ class SnowEffect(Effect):
             share_exposed_surface(job, settings)
 
     def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
-        layers = own.prepared
+        layers = own.prepared_data
         boxes = memo_of(layers).get(("boxes of snow",), lambda: _bound_layers(own.scene, layers))
-        owners = find_visible_owners(boxes, sight.poses, sight.cameras, sight.near_m)
+        owners = find_visible_owners(boxes, sight.world_from_parts, sight.cameras, sight.near_m)
         if not owners:
             why = "neither snow nor what it buries can be in view"
             return Visibility(False, dict.fromkeys((*PASSES, GRAIN_PASS), why))
@@ -142,23 +142,25 @@ class SnowEffect(Effect):
         why = (
             {} if is_lit_per_pixel else {LIGHT_PASS: "no snow that is lit per pixel can be in view"}
         )
-        return Visibility(skipped=why, owners=frozenset(owners - {0}), seen=frozenset(owners))
+        return Visibility(
+            skip_reasons=why, instance_ids=frozenset(owners - {0}), view_data=frozenset(owners)
+        )
 
     def edit_scene(
         self, own: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
         with timed(LAYER_PASS):
-            parts = own.prepared.parts_for(
-                own.scene, camera, layers.parts, own.seen, backend=own.backend
+            parts = own.prepared_data.parts_for(
+                own.scene, camera, layers.parts, own.view_data, backend=own.backend
             )
         return replace(layers, parts=parts)
 
     def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         snow = drawn.raster.overlay
         depth = drawn.raster.expected_depth
-        if own.data.snow.grain == 0 or camera.is_orthographic or snow is None or depth is None:
+        if own.settings.snow.grain == 0 or camera.is_orthographic or snow is None or depth is None:
             return drawn
-        layers = own.prepared
+        layers = own.prepared_data
         masks_before_snow = list(drawn.masks.values())  # water lies before the snow beneath it
         with timed(GRAIN_PASS):
             rgb = add_grain(
@@ -183,24 +185,24 @@ class SnowEffect(Effect):
         self, placed: WorldBoxes, camera: Camera, view: LabelInputs
     ) -> dict[str, np.ndarray]:
         if _shows_snow(view) and view.depth_m is not None and view.mask is not None:
-            thickness_m = view.placed.data.snow.depth_m
+            thickness_m = view.plan.data.snow.depth_m
             counted = count_snow_pixels(placed, camera, view.depth_m, view.mask, thickness_m)
-            return {"pixels": counted.pixels, "snow_pixels": counted.marked}
+            return {"pixels": counted.num_pixels, "snow_pixels": counted.num_marked}
         no_pixels = np.zeros(len(placed), np.int64)
         return {"pixels": np.full(len(placed), NOT_COUNTED), "snow_pixels": no_pixels}
 
     def grow_boxes(self, placed: WorldBoxes, view: LabelInputs) -> WorldBoxes:
         shows_snow = _shows_snow(view)
-        return extend_boxes_by_snow(placed, view.placed.data.snow.depth_m) if shows_snow else placed
+        return extend_boxes_by_snow(placed, view.plan.data.snow.depth_m) if shows_snow else placed
 
     def meet(self, own: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
-        intersect_snow(echoes, own.scene, own.data, echoes.source, frame_ns)
+        intersect_snow(echoes, own.scene, own.settings, echoes.source, frame_ns)
 
 
 def _find_carriers(snow_effect: EffectInScene, camera: Camera) -> list[Carrier]:
     """Return the vehicles close to the camera that snow lies on."""
     carriers = list[Carrier]()
-    for number in sorted(snow_effect.seen - {0}):
+    for number in sorted(snow_effect.view_data - {0}):
         actor = snow_effect.scene.actors[number - 1]
         world_from_actor = actor.track.pose_at(camera.timestamp_ns)
         half_size_m = np.array(actor.size_m) / 2 + _BOX_MARGIN_M
@@ -210,7 +212,7 @@ def _find_carriers(snow_effect: EffectInScene, camera: Camera) -> list[Carrier]:
             (world_from_actor[:3, 3] - camera.centre).norm()
         ) > MAX_GRAIN_DISTANCE_M + np.linalg.norm(half_size_m):
             continue
-        high_corner = half_size_m + np.array([0, 0, 2 * snow_effect.data.snow.depth_m])
+        high_corner = half_size_m + np.array([0, 0, 2 * snow_effect.settings.snow.depth_m])
         # Snow below this height is the snow that the vehicle stands in.
         low_corner = np.array([-half_size_m[0], -half_size_m[1], -half_size_m[2] / 3])
         carriers.append(
@@ -229,10 +231,10 @@ def _extinction_at(camera: Camera, fog: Fog | None) -> float:
 
 def _shows_snow(view: LabelInputs) -> bool:
     """Tell if the view shows snow."""
-    return view.placed.data is not None and view.mask is not None and bool(view.mask.any())
+    return view.plan.data is not None and view.mask is not None and bool(view.mask.any())
 
 
-def snow_layers_of(
+def build_snow_layers(
     scene: Scene, recipe_snow: SnowPlan, light: Scene | None = None, *, backend: str = "auto"
 ) -> SnowLayers:
     """Return the snow in the scene.
@@ -278,7 +280,7 @@ def _bound_layer(layer: Layer, gaussians: Gaussians, owner: int) -> Bounds:
 
     Where none of these is in view, the part looks as it does without snow.
     """
-    is_buried = (layer.opacities.numpy() == 0) & (gaussians.opacities.numpy() > 0)
+    is_buried = (layer.visible_opacities.numpy() == 0) & (gaussians.opacities.numpy() > 0)
     everywhere = np.ones(len(layer.gaussians), bool)
     snow = bound_squares(layer.gaussians, everywhere, _CHUNK_M, owner)
     bounds = [snow, bound_squares(gaussians, is_buried, _CHUNK_M, owner)]
@@ -290,4 +292,4 @@ def _bound_layer(layer: Layer, gaussians: Gaussians, owner: int) -> Bounds:
 
 def _is_lit_per_pixel(layer: Layer | None) -> bool:
     """Tell if a layer is lit pixel by pixel."""
-    return layer is not None and layer.slopes is not None and layer.normals is None
+    return layer is not None and layer.sunlight_rgb is not None and layer.normals is None

@@ -18,7 +18,7 @@ from numba import prange
 
 from augment.effects.snow.cells import OPEN_EDGE
 from augment.kernels import mix
-from augment.render.cpu.jit import inner, kernel, serial_kernel
+from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
 from augment.render.sh import SH_C0
 from augment.rng import STEP_X, STEP_Y
 from augment.semantics import SemanticClass
@@ -36,7 +36,7 @@ _SHIFT_11 = np.uint64(11)  # shift to the upper 53 bits
 _SHIFT_32 = np.uint64(32)  # shift to the upper 32 bits
 
 
-@inner()
+@kernel_function()
 def _uniform(bits, number):
     """Return the number-th random number of these bits, in [-1, 1)."""
     bits = mix(bits + np.uint64(number + 1) * _COLUMN_STEP)
@@ -117,7 +117,7 @@ def find_tops(centers, heights, relaxed_z, tops):
         tops[i] = z + h + (smoothing if h > 0 else 0.0)
 
 
-@inner()
+@kernel_function()
 def _side_surface(i, side, neighbours, size, centers, tops):
     """Return z of the surface on one side of a covered cell, and the level distance to it.
 
@@ -135,7 +135,7 @@ def _side_surface(i, side, neighbours, size, centers, tops):
     return tops[neighbour], size
 
 
-@inner()
+@kernel_function()
 def _count_walls(i, side, neighbours, sizes, centers, tops):
     """Return the number of discs that close the wall on one side of a cell, and its height."""
     size = np.float64(sizes[i])
@@ -158,7 +158,7 @@ def count_splats(neighbours, sizes, centers, heights, tops, counts):
         counts[i] = count
 
 
-@inner()
+@kernel_function()
 def _surface_slope(i, axis, neighbours, size, ground_slope, centers, tops):
     """Return the rise of the surface per metre along x (axis 0) or y (1)."""
     before, run_before = _side_surface(i, 2 * axis, neighbours, size, centers, tops)
@@ -176,7 +176,7 @@ def _surface_slope(i, axis, neighbours, size, ground_slope, centers, tops):
     return (after - before) / (run_before + run_after)
 
 
-@inner()
+@kernel_function()
 def _surface_bend(i, neighbours, size, tops):
     """Return the upward bend of the surface around a cell, as slope over a cell; 0 = level."""
     bend = 0.0
@@ -189,7 +189,7 @@ def _surface_bend(i, neighbours, size, tops):
     return bend / size if count == 4 else 0.0
 
 
-@inner()
+@kernel_function()
 def _direction_inwards(i, axis, neighbours, heights):
     """Return -1, 0 or 1 along x (axis 0) or y (1), away from bare ground; 2 between two."""
     before_id = neighbours[i, 2 * axis]
@@ -201,7 +201,7 @@ def _direction_inwards(i, axis, neighbours, heights):
     return 1 if is_bare_before else (-1 if is_bare_after else 0)
 
 
-@inner()
+@kernel_function()
 def _write_quaternion(nx, ny, nz, s, quats):
     """Write the quaternion wxyz that turns z to the unit normal and x to the fall line.
 
@@ -239,7 +239,7 @@ class CellArrays(NamedTuple):
 class CellDepths(NamedTuple):
     """Snow on C cells."""
 
-    heights: np.ndarray  # depth in metres, 0 where there is no snow
+    depths_m: np.ndarray  # depth in metres, 0 where there is no snow
     mottle: np.ndarray  # noise that the snow's colour follows
     random_bits: np.ndarray  # uint64, random bits for the grain
 
@@ -255,7 +255,7 @@ class SplatArrays(NamedTuple):
     slopes: np.ndarray  # [S, 3], or empty if not asked for
 
 
-@inner()
+@kernel_function()
 def _write_colour(s, normal, tints, packed, sun_share, lights, colors, sh, normals, slopes):
     """Write the colour of Gaussian s: lit by its normal, or in shade with the slope of light.
 
@@ -276,7 +276,7 @@ def _write_colour(s, normal, tints, packed, sun_share, lights, colors, sh, norma
             normals[s, c] = np.float32(normal[c])
 
 
-@inner()
+@kernel_function()
 def _rough_normal(normal, amount, bits, number):
     """Return the normal, tilted at random by about `amount` radians."""
     x = normal[0] + amount * _uniform(bits, number)
@@ -297,7 +297,7 @@ def fill_splats(cells, depths, tops, firsts, lights, colors, splats):
         _fill_cell(np.int64(i), cells, depths, tops, firsts, lights, colors, splats)
 
 
-@inner()
+@kernel_function()
 def _fill_cell(i, cells, depths, tops, firsts, lights, colors, splats):
     """Write the disc of cell i, and the upright discs of the walls below it."""
     centers = cells.centers
@@ -456,7 +456,7 @@ def add_grain(rgb, depth, snow, hidden_mask, view, noise):
         _grain_row(np.int64(i), rgb, depth, snow, hidden_mask, view, noise)
 
 
-@inner()
+@kernel_function()
 def _grain_row(i, rgb, depth, snow, hidden_mask, view, noise):
     """Add grain to one row of the image."""
     lens = view.lens
@@ -505,13 +505,13 @@ def _grain_row(i, rgb, depth, snow, hidden_mask, view, noise):
             rgb[i, j, channel] *= factor
 
 
-@inner()
+@kernel_function()
 def _larger_magnitude(a, b):
     """Return the number of larger magnitude."""
     return a if abs(a) > abs(b) else b
 
 
-@inner()
+@kernel_function()
 def _pixel_on_snow(i, j, depth, ray, length, lens, pose):
     """Return the size of a pixel on the surface, metres.
 
@@ -538,7 +538,7 @@ def _pixel_on_snow(i, j, depth, ray, length, lens, pose):
     )
 
 
-@inner()
+@kernel_function()
 def _grain_at(x, y, z, dx, dy, pixel_m, relief, mottle, noise):
     """Return the change of brightness at a point x, y, z (metres), for a pixel of a size in metres.
 
@@ -606,7 +606,7 @@ MAX_FOLIAGE_DEPTH_M = 0.04  # largest depth on foliage
 MAX_LOG_DRIFT = 1.4
 
 
-@inner()
+@kernel_function()
 def _corner_noise(column_bits, row_bits, seed, x, y):
     """Return the contribution of one lattice corner to gradient noise."""
     bits = mix((column_bits + row_bits) ^ seed)
@@ -615,7 +615,7 @@ def _corner_noise(column_bits, row_bits, seed, x, y):
     return gx * x + gy * y
 
 
-@inner()
+@kernel_function()
 def _noise(u, v, seed):
     """Return gradient noise at lattice coordinates, as `layer.gradient_noise` defines it."""
     column = math.floor(u)
@@ -638,7 +638,7 @@ def _noise(u, v, seed):
     return (lower + fade_y * (upper - lower)) / DEVIATION
 
 
-@inner()
+@kernel_function()
 def _octave_sum(x, y, size, turns, amplitudes, lengths, seeds):
     """Return the sum of octaves at a point, as `layer.sum_octaves` defines it."""
     total = 0.0
@@ -651,7 +651,7 @@ def _octave_sum(x, y, size, turns, amplitudes, lengths, seeds):
     return total
 
 
-@inner()
+@kernel_function()
 def _is_fleck(x, y, turns, seeds):
     """Tell if snow lies on foliage at a point; the last two octaves of turns and seeds count."""
     total = 0.0
@@ -663,7 +663,7 @@ def _is_fleck(x, y, turns, seeds):
     return total > FOLIAGE_THRESHOLD
 
 
-@inner()
+@kernel_function()
 def _pillow(t):
     """Quarter of a circle from (0, 0) up to (1, 1), then 1."""
     t = min(max(t, 0.0), 1.0)
@@ -835,7 +835,7 @@ def intersect_layer(
                 t = cell_exit
 
 
-@inner()
+@kernel_function()
 def _enters_circle(origin, direction, end, circle):
     """Tell if a beam, seen from above, comes within a circle."""
     if circle[2] == np.inf:
@@ -851,7 +851,7 @@ def _enters_circle(origin, direction, end, circle):
     return x * x + y * y <= circle[2] * circle[2]
 
 
-@inner()
+@kernel_function()
 def _clip_beam(o, d, size, first, last):
     """Return the part of a beam from first to last that lies between 0 and size along an axis."""
     if d == 0.0:
@@ -861,7 +861,7 @@ def _clip_beam(o, d, size, first, last):
     return max(first, min(a, b)), min(last, max(a, b))
 
 
-@inner()
+@kernel_function()
 def _exit_distance(o, inverse_d, low, size):
     """Return where a beam leaves the stretch from low to low + size along an axis."""
     if inverse_d == np.inf:

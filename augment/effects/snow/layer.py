@@ -271,7 +271,7 @@ def define_depths(cells: ExposedCells, profile: DepthProfile) -> np.ndarray:
     x_m, y_m, z_m = (cells.centers_m[:, i].numpy().astype(np.float64) for i in range(3))
     sizes_m, edge_m, tracks, banks = (
         t.numpy().astype(np.float64)
-        for t in (cells.sizes_m, cells.edge_m, cells.tracks, cells.banks)
+        for t in (cells.sizes_m, cells.edge_distance_m, cells.track_share, cells.obstacle_vectors)
     )
     bank_along_wind = banks[:, 0] * settings.wind_x + banks[:, 1] * settings.wind_y
     pile_factor = (
@@ -456,8 +456,8 @@ def _build_part_layer(
         crystals = draw_crystals(snow_gaussians, normals, sun_contrast, snow.sparkle, rng)
     return Layer(
         gaussians=snow_gaussians,
-        opacities=_hide_buried(cells, gaussians, depths.heights),
-        slopes=slopes,
+        visible_opacities=_hide_buried(cells, gaussians, depths.depths_m),
+        sunlight_rgb=slopes,
         normals=normals if moves and not per_pixel else None,
         crystals=crystals,
     )
@@ -470,11 +470,11 @@ def cell_arrays(cells: ExposedCells) -> CellArrays:
         c.centers_m,
         c.normals,
         c.sizes_m,
-        c.edge_m,
+        c.edge_distance_m,
         c.neighbours,
-        c.light,
-        c.tracks,
-        c.banks,
+        c.relative_light,
+        c.track_share,
+        c.obstacle_vectors,
         c.semantic,
     )
     return CellArrays(*_as_arrays(*tensors))
@@ -510,8 +510,8 @@ def _make_splats(
     keep_slopes: bool,
 ) -> tuple[Gaussians, Tensor | None, Tensor | None]:
     """Make the Gaussians of the snow, with their normals and slopes if asked for."""
-    depths_m = depths.heights
-    arrays = cell_arrays(cells)._replace(light=_soften_light(cells, depths_m, depth_m))
+    depths_m = depths.depths_m
+    arrays = cell_arrays(cells)._replace(relative_light=_soften_light(cells, depths_m, depth_m))
     tops = find_snow_tops(cells, depths_m)
     counts = np.empty(len(cells), np.int64)
     with kernel_threads(CELLS_PER_TASK):
@@ -556,7 +556,7 @@ def _soften_light(cells: ExposedCells, depths_m: np.ndarray, depth_m: float) -> 
 
     The deeper the snow, the fewer spots it shows.
     """
-    sizes, neighbours, light = _as_arrays(cells.sizes_m, cells.neighbours, cells.light)
+    sizes, neighbours, light = _as_arrays(cells.sizes_m, cells.neighbours, cells.relative_light)
     finest = float(sizes.min()) if len(sizes) else 1.0
     steps = min(max(math.ceil(2 * depth_m / finest), MIN_SMOOTHING_STEPS), MAX_SMOOTHING_STEPS)
     with kernel_threads(CELLS_PER_TASK):
@@ -569,11 +569,13 @@ def _soften_light(cells: ExposedCells, depths_m: np.ndarray, depth_m: float) -> 
 
 def _hide_buried(cells: ExposedCells, gaussians: Gaussians, depths_m: np.ndarray) -> Tensor:
     """Return opacities of a part's own Gaussians, 0 for those that the snow buries."""
-    if len(cells.buried) == 0 or not depths_m.any():
+    if len(cells.hideable_ids) == 0 or not depths_m.any():
         return gaussians.opacities
     opacities = gaussians.opacities.detach().clone()
     with kernel_threads(CELLS_PER_TASK):
-        kernels.hide_buried(*_as_arrays(cells.buried, cells.buried_by), depths_m, opacities.numpy())
+        kernels.hide_buried(
+            *_as_arrays(cells.hideable_ids, cells.covering_cells), depths_m, opacities.numpy()
+        )
     return opacities
 
 

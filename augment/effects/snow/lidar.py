@@ -76,7 +76,7 @@ def intersect_snow(
     rows = np.flatnonzero(hits < ranges)
     # The layer counts as level, but its grains stand out: no beam slides over it unreflected.
     facing = np.maximum(np.abs(echoes.directions[rows, 2]), MIN_FACING_COSINE)
-    echoes.replace(rows, hits[rows], snow.reflectance * np.clip(facing, 0.0, 1.0), MOVED)
+    echoes.replace_echoes(rows, hits[rows], snow.reflectance * np.clip(facing, 0.0, 1.0), MOVED)
 
 
 def make_snow_grid(
@@ -207,7 +207,7 @@ def _build_grids(support: ExposedSurface, scene: Scene, recipe_snow: SnowPlan) -
         profile, rng = profile_on_part(track_id, scene, *snow_settings)
         seed = rng.integers(0, 2**64, dtype=np.uint64)
         grid_m = GRID_M if track_id is None else min(GRID_M, recipe_snow.snow.cell_m)
-        return make_snow_grid(cells, find_depths(cells, profile, seed).heights, grid_m=grid_m)
+        return make_snow_grid(cells, find_depths(cells, profile, seed).depths_m, grid_m=grid_m)
 
     actors = {track_id: layer(cells, track_id) for track_id, cells in support.actors.items()}
     return LidarSnow(

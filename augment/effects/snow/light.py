@@ -211,7 +211,7 @@ def _find_light(scene: Scene) -> SceneLight:
         share = min(max(1 - ratio, _OVERCAST_SHARE), _CLEAR_SHARE)
         if shadows.certainty > 0:
             rgb = rgb ** (1 - shadows.certainty) * np.array(shadows.lit_rgb) ** shadows.certainty
-        explained_share = shadows.certainty * float(shadows.explained.max())
+        explained_share = shadows.certainty * float(shadows.explained_share.max())
         if (
             explained_share >= _MIN_EXPLAINED
             and shadows.explained_by(azimuth_deg, elevation_deg) < _MIN_AGREEMENT

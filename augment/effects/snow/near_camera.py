@@ -99,7 +99,7 @@ class Crystals:
         if backend == CUDA and len(near_ids):
             rows = gpu.upload(near_ids)
             view = gpu.upload(np.stack([towards_sun, eye]))
-            places, mirrors = (gpu.resident(t)[rows] for t in (self.places_m, self.mirrors))
+            places, mirrors = (gpu.gpu_copy(t)[rows] for t in (self.places_m, self.mirrors))
             power = glint_power(places, mirrors, self.strength, view[0], view[1])
             power, index = power.topk(
                 min(len(near_ids), 64 + len(near_ids) // CRYSTALS_PER_GLINT), sorted=False
@@ -199,9 +199,9 @@ class Layer:
     # Gaussians of the snow, in the part's frame, with semantic SNOW.
     gaussians: Gaussians
     # Opacities of the part's own Gaussians, 0 for those that the snow buries.
-    opacities: Float[Tensor, "N"]
+    visible_opacities: Float[Tensor, "N"]
     # Colour that full sun adds to each Gaussian, see SplatShading; None where the colours are lit.
-    slopes: Float[Tensor, "S 3"] | None = None
+    sunlight_rgb: Float[Tensor, "S 3"] | None = None
     # Unit normals. Given for a part that moves and is lit splat by splat, since its light changes
     # as it turns; None otherwise.
     normals: Float[Tensor, "S 3"] | None = None
@@ -273,7 +273,7 @@ class SnowLayers:
             sun = world_from_part[:3, :3].T @ sun
             eye_m = world_from_part[:3, :3].T @ (eye_m - world_from_part[:3, 3])
         gaussians = layer.gaussians
-        slopes = layer.slopes
+        slopes = layer.sunlight_rgb
         if layer.normals is not None:
             assert slopes is not None
             sun_direction = sun.tolist()
@@ -307,7 +307,9 @@ def _hide_buried(layer: Layer, gaussians: Gaussians) -> Gaussians:
         ("left visible by snow",), WeakKeyDictionary[Layer, Gaussians]
     )
     if layer not in gaussians_by_layer:
-        gaussians_by_layer[layer] = dataclasses.replace(gaussians, opacities=layer.opacities)
+        gaussians_by_layer[layer] = dataclasses.replace(
+            gaussians, opacities=layer.visible_opacities
+        )
     return gaussians_by_layer[layer]
 
 
@@ -331,7 +333,7 @@ def _light_per_splat(
     """
     # numpy, since starting threads would take longer than the arithmetic on one part's snow
     sh, slope_values, normal_values = (
-        gpu.resident(t) if backend == CUDA else t.numpy() for t in (gaussians.sh, slopes, normals)
+        gpu.gpu_copy(t) if backend == CUDA else t.numpy() for t in (gaussians.sh, slopes, normals)
     )
     facing = (
         normal_values[:, 0] * sun[0] + normal_values[:, 1] * sun[1] + normal_values[:, 2] * sun[2]

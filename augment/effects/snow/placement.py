@@ -64,7 +64,7 @@ from augment.progress import ProgressBar
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.semantics import SemanticClass
-from augment.timing import counted
+from augment.timing import counted_steps
 
 # ---- Tiles about the cameras' path, their cell sizes, and the index of every cell ----------------
 
@@ -667,7 +667,7 @@ def has_invented_drive(scene: Scene) -> bool:
     return scene.seen_frames is not None and not scene.seen_frames
 
 
-def find_wheel_paths(scene: Scene, *, with_invented: bool = False) -> tuple[WheelPath, ...]:
+def find_wheel_paths(scene: Scene, *, has_invented_path: bool = False) -> tuple[WheelPath, ...]:
     """Find the paths of the ego and of the vehicles that move, each longer than what was recorded.
 
     Args:
@@ -676,7 +676,7 @@ def find_wheel_paths(scene: Scene, *, with_invented: bool = False) -> tuple[Whee
     """
     paths = []
     frames = scene.seen_frames or scene.frames
-    if frames and (with_invented or not has_invented_drive(scene)):
+    if frames and (has_invented_path or not has_invented_drive(scene)):
         poses = np.stack([frame.world_from_ego.numpy() for frame in frames])
         ego = _extended_path(poses, EGO_EXTENSION_M)
         ego[:, 2] += _ground_below(scene.background, poses[:, :3, 3])
@@ -937,7 +937,7 @@ def find_exposed_surface(
     steps = len(views) + len(squares) + len(vehicles)
     with (
         ProgressBar(total=steps, desc=PROGRESS_LABEL, disable=not progress, unit="step") as bar,
-        counted(PROGRESS_LABEL, steps) as advance,
+        counted_steps(PROGRESS_LABEL, steps) as advance,
     ):
 
         def after_each() -> None:
@@ -946,7 +946,7 @@ def find_exposed_surface(
 
         visible_parts = [PosedGaussians(background), *parked_actors]
         visible_depths = draw_views(views, visible_parts, backend=backend, after_each=after_each)
-        paths = find_wheel_paths(scene, with_invented=settings.has_invented_tracks)
+        paths = find_wheel_paths(scene, has_invented_path=settings.has_invented_tracks)
         search = _GroundSearch(
             background,
             parked_actors,

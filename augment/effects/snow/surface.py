@@ -581,9 +581,9 @@ def make_cells(
         **{name: torch.from_numpy(getattr(cells, name)) for name in copied_names},
         centers_m=torch.from_numpy(cells.centers_m.astype(np.float32)),
         neighbours=torch.from_numpy(neighbours),
-        light=torch.from_numpy(light),
-        buried=torch.from_numpy(buried),
-        buried_by=torch.from_numpy(buried_by),
+        relative_light=torch.from_numpy(light),
+        hideable_ids=torch.from_numpy(buried),
+        covering_cells=torch.from_numpy(buried_by),
     )
 
 
@@ -699,7 +699,7 @@ def find_actor_cells(
     sides = np.where(surface.sides == RISES, FLUSH, surface.sides)
     cells = cells_at(surface, rows, columns, sides=sides, classes=cell_classes.astype(np.int16))
     actor_cells = make_cells(cells, np.ones(len(rows), np.float32), lookup, body)
-    actor_cells.buried.copy_(_index_tensor(body_ids)[actor_cells.buried.long()])
+    actor_cells.hideable_ids.copy_(_index_tensor(body_ids)[actor_cells.hideable_ids.long()])
     return actor_cells
 
 

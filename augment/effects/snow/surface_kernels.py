@@ -12,12 +12,12 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.render.cpu.jit import inner, kernel, serial_kernel
+from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
 
 # ---- Points of the ground that some camera sees --------------------------------------------------
 
 
-@inner()
+@kernel_function()
 def _project(view, x, y, z):
     """Return column, row and depth of a world point; depth 0 where it is behind the camera."""
     x = x - view[12]
@@ -34,7 +34,7 @@ def _project(view, x, y, z):
     return u * view[9] + view[10], v * view[11] + view[16], depth
 
 
-@inner()
+@kernel_function()
 def _max_depth_nearby(depths, size, column, row):
     """Return the largest depth of three by three pixels."""
     width, height, start = size
@@ -45,7 +45,7 @@ def _max_depth_nearby(depths, size, column, row):
     return deepest
 
 
-@inner()
+@kernel_function()
 def _vote_for_point(view, depths, size, point, tolerances):
     """Return 1 if the view shows something at the point, -1 if it looks through it, else 0."""
     width, height, start = size
@@ -62,7 +62,7 @@ def _vote_for_point(view, depths, size, point, tolerances):
     return -1 if depths[start + row * width + column] > depth else 0
 
 
-@inner()
+@kernel_function()
 def _is_visible(view, depths, size, point, normal, lifts, tolerances):
     """Tell if a view sees a point at one of the lifts over it."""
     depth_share, depth_m, below_share, facing_sine, margin = tolerances
@@ -417,7 +417,7 @@ def _find_links(can_carry, sides, links, offsets):
                 links[i, j] |= _UP
 
 
-@inner()
+@kernel_function()
 def _is_diagonal_link(links, i, j, side, vertical):
     """Tell if a cell is linked to a diagonal neighbour through a cell between them."""
     dx = -1 if side == _LEFT else 1
@@ -446,7 +446,7 @@ def _find_diagonal_links(links, neighbour_bits):
             neighbour_bits[i, j] = bits
 
 
-@inner()
+@kernel_function()
 def _nearer_edge(offsets, k, m, dx, dy, x, y, square):
     """Return the nearer of two edges and its distance squared.
 
@@ -463,7 +463,7 @@ def _nearer_edge(offsets, k, m, dx, dy, x, y, square):
     return x, y, square
 
 
-@inner()
+@kernel_function()
 def _take_nearest_edge(offsets, neighbour_bits, i, j, straight, beside, dx, before, after, dy):
     """Let cell (i, j) take the nearest edge that its neighbours know.
 
@@ -493,7 +493,7 @@ def _take_nearest_edge(offsets, neighbour_bits, i, j, straight, beside, dx, befo
         offsets[i, j, 1] = y
 
 
-@inner()
+@kernel_function()
 def _sweep_edges(neighbour_bits, offsets):
     """Pass offsets on from row to row, up and down again, and along each row both ways."""
     rows, columns = neighbour_bits.shape

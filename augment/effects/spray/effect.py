@@ -71,7 +71,7 @@ class SprayEffect(Effect):
         return (section.changes and section.spray) or None
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
-        rain = self.of(recipe)
+        rain = self.section_of(recipe)
         why = ""
         if rain is None or not rain.changes:
             why = "the recipe has no rain" if rain is None else "weather.rain.rate_mm_h is 0"
@@ -95,12 +95,12 @@ class SprayEffect(Effect):
         )
 
     def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
-        puffs = own.data.puffs(own.scene, sight.camera.timestamp_ns)
+        puffs = own.settings.puffs(own.scene, sight.camera.timestamp_ns)
         camera = sight.camera
         windows = windows_of(puffs, camera)
         if not ((windows[:, 0] < windows[:, 1]) & (windows[:, 2] < windows[:, 3])).any():
             return Visibility(False, {SPRAY: "no spray can be in view"})
-        return Visibility(seen=puffs)
+        return Visibility(view_data=puffs)
 
     def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
         raster = drawn.raster
@@ -111,8 +111,8 @@ class SprayEffect(Effect):
                 raster.alpha,
                 raster.expected_depth,
                 camera,
-                own.seen,
-                glow_of(own.light).mean,
+                own.view_data,
+                glow_of(own.lit_scene).mean,
                 fog=drawn.layers.fog,
                 backend=own.backend,
             )
@@ -120,5 +120,5 @@ class SprayEffect(Effect):
 
     def meet(self, own: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
         key = f"lidar.spray at {frame_ns} ns"
-        rng = rng_for(seed=own.data.seed, scene=own.scene.name, effect=key)
-        spray_echoes(echoes, own.data.puffs(own.scene, frame_ns), rng)
+        rng = rng_for(seed=own.settings.seed, scene=own.scene.name, effect=key)
+        spray_echoes(echoes, own.settings.puffs(own.scene, frame_ns), rng)

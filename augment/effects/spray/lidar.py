@@ -30,7 +30,7 @@ def spray_echoes(echoes: Echoes, puffs: Puffs, rng: np.random.Generator) -> None
         return
     origins = echoes.origins[rows]
     directions = echoes.directions[rows]
-    ends_m = echoes.air_m[rows]
+    ends_m = echoes.air_path_m[rows]
     tau, at_m = look_through(puffs, origins, directions, ends_m)
     before, _ = look_through(puffs, origins, directions, at_m)
     extinction = extinction_at(puffs, origins + at_m[:, None] * directions)
@@ -42,7 +42,7 @@ def spray_echoes(echoes: Echoes, puffs: Puffs, rng: np.random.Generator) -> None
     ranges_m = np.clip(at_m + 0.3 * jitter[rows], model.overlap_from_m, ends_m)
     wins = (signal(soft, np.maximum(ranges_m, 1e-3)) > hard) & (at_m > model.overlap_from_m)
     wins &= (soft > model.noise_reflectance(ranges_m)) & (echoes.codes[rows] != LOST)
-    echoes.replace(rows[wins], ranges_m[wins], soft[wins], SCATTERED)
+    echoes.replace_echoes(rows[wins], ranges_m[wins], soft[wins], SCATTERED)
 
 
 def beams_near(echoes: Echoes, puffs: Puffs) -> np.ndarray:
@@ -57,7 +57,7 @@ def beams_near(echoes: Echoes, puffs: Puffs) -> np.ndarray:
         offsets = middle - echoes.origins
         along = (offsets * echoes.directions).sum(1)
         distance2 = (offsets * offsets).sum(1) - along * along
-        near |= (distance2 < reach**2) & (along > -reach) & (along < echoes.air_m + reach)
+        near |= (distance2 < reach**2) & (along > -reach) & (along < echoes.air_path_m + reach)
     return near & (echoes.ranges_m > 0)
 
 

@@ -23,7 +23,7 @@ from augment.cameras import Camera
 from augment.effects.spray import kernels
 from augment.effects.spray.puffs import CUT, Puffs
 from augment.render.buffers import CPU, choose_kernels
-from augment.render.composite import ROWS
+from augment.render.composite import ROWS_PER_CHUNK
 from augment.render.fog import Fog, optical_depth_numpy
 from augment.render.threads import kernel_threads
 
@@ -115,13 +115,13 @@ def blend_puffs(
     numbers = _numbers(puffs, camera, fog)
     fog_light = np.zeros(3)
     if fog is not None:
-        fog_light = np.square(np.asarray(fog.rgb, np.float64))
+        fog_light = np.square(np.asarray(fog.airlight_rgb, np.float64))
     if choose_kernels(backend, rgb, depth) == CPU and rgb.is_contiguous():
         # By numpy: torch's threads would wait for more work, on the cores that the kernel needs.
         z = depth.contiguous().numpy()
         surfaces = np.where((alpha.detach().numpy() >= 0.5) & (z > 0), z, np.float32(np.inf))
         rays = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        with kernel_threads(ROWS):
+        with kernel_threads(ROWS_PER_CHUNK):
             kernels.blend_puffs(
                 rgb.detach().numpy(),
                 surfaces,

@@ -196,7 +196,7 @@ def style_gaussians(
     kernels = choose_kernels(backend, sh)
     if kernels == CPU:
         return dataclasses.replace(gaussians, sh=_on_cpu(sh, out, classes, fold_maps(splats)))
-    sh = runtime.resident(sh) if kernels == CUDA else sh
+    sh = runtime.gpu_copy(sh) if kernels == CUDA else sh
     if out is not None and out.device != sh.device:
         raise ValueError(f"out must lie on {sh.device}, as what is mapped; got {out.device}")
     mapped = map_sh(sh, splats, classes)
@@ -210,10 +210,12 @@ def _on_cpu(
     folded: Float[Tensor, "C 13"],
 ) -> Float[Tensor, "N K 3"]:
     target = _new_memory(sh.shape) if out is None else out
-    aligned = target.data_ptr() % composite_kernels.ALIGNMENT == 0  # a view may begin anywhere
+    aligned = (
+        target.data_ptr() % composite_kernels.ALIGNMENT_BYTES == 0
+    )  # a view may begin anywhere
     written = target if aligned else _new_memory(sh.shape)
     with kernel_threads(BLOCKS):
-        composite_kernels.map_sh(
+        composite_kernels.apply_color_maps(
             sh.detach().contiguous().numpy().reshape(-1),
             written.detach().numpy().reshape(-1),
             sh.shape[1],
@@ -252,7 +254,7 @@ def map_sh(
         rows = folded[:1].expand(len(sh), sh_layout.NUM_FOLDED)
     else:
         rows = folded[classes.long().to(sh.device)]
-    shown = sh.clamp_min(float(sh_layout.BLACK)) if sh.shape[1] == 1 else sh
+    shown = sh.clamp_min(float(sh_layout.BLACK_SH_00)) if sh.shape[1] == 1 else sh
     mapped = torch.einsum("nij,nkj->nki", rows[:, :9].reshape(-1, 3, 3), shown)
     first = mapped[:, :1] + rows[:, None, 9:12]
     mapped = torch.cat([first, mapped[:, 1:]], 1)
@@ -313,9 +315,9 @@ def _new_memory(shape: tuple[int, ...]) -> Tensor:
     pages: the first touch of memory from torch takes several times as long as the mapping.
     """
     count = math.prod(shape)
-    spare = composite_kernels.ALIGNMENT // 4
+    spare = composite_kernels.ALIGNMENT_BYTES // 4
     memory = np.empty(count + spare, np.float32)
-    first = -memory.ctypes.data % composite_kernels.ALIGNMENT // 4
+    first = -memory.ctypes.data % composite_kernels.ALIGNMENT_BYTES // 4
     return torch.from_numpy(memory[first : first + count]).view(tuple(shape))
 
 

@@ -24,7 +24,7 @@ from augment.effects.effect import (
 from augment.effects.style.color_maps import StyleMaps
 from augment.effects.style.style import SceneStyle, scene_style_of, style_maps
 from augment.memo import memo_of
-from augment.render.composite import map_colors
+from augment.render.composite import apply_color_map
 from augment.scene import Scene
 from augment.timing import timed
 from recipes.schema import Recipe
@@ -65,7 +65,7 @@ class StyleEffect(Effect):
         return (section.applied_to, section.method) if section.changes else None
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
-        style = self.of(recipe)
+        style = self.section_of(recipe)
         if style is None or not style.changes:
             why = "the recipe has no style"
             if style is not None:
@@ -91,14 +91,14 @@ class StyleEffect(Effect):
         return EffectPlan(style, steps)
 
     def prepare(self, own: EffectInScene) -> SceneStyle:
-        return scene_style_of(own.scene, own.data)
+        return scene_style_of(own.scene, own.settings)
 
     def relight(self, own: EffectInScene) -> Scene | None:
-        return own.prepared.lighting_scene if own.data.applied_to == "scene" else None
+        return own.prepared_data.lighting_scene if own.settings.applied_to == "scene" else None
 
     def share(self, job: JobContext) -> None:
         """Precompute the maps, so that other processes render no content and read no files."""
-        styles = (self.of(recipe) for recipe in job.recipes)
+        styles = (self.section_of(recipe) for recipe in job.recipes)
         for style in dict.fromkeys(s for s in styles if s and s.changes):
             maps = style_maps(job.scene, style, cameras=job.cameras)
             memo = memo_of(job.scene)
@@ -108,9 +108,9 @@ class StyleEffect(Effect):
     def edit_scene(
         self, own: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
-        if own.data.applied_to == "picture":
+        if own.settings.applied_to == "picture":
             return layers
-        style = own.prepared
+        style = own.prepared_data
         photo = layers.photo
         if photo is not None:
             photo = replace(photo, style=style.on_photo)
@@ -118,8 +118,8 @@ class StyleEffect(Effect):
         return replace(layers, parts=parts, sky=style.sky, photo=photo)
 
     def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
-        if own.data.applied_to != "picture":
+        if own.settings.applied_to != "picture":
             return drawn
         with timed(ON_PICTURE):
-            rgb = map_colors(drawn.rgb, own.prepared.maps.picture, backend=own.backend)
+            rgb = apply_color_map(drawn.rgb, own.prepared_data.maps.picture, backend=own.backend)
         return replace(drawn, rgb=rgb)

@@ -50,7 +50,7 @@ from augment.render.buffers import AUTO, CUDA
 from augment.scene import PosedGaussians, Scene
 from augment.sky import Sky
 from recipes.errors import RecipeError
-from recipes.fields import Closed, Number, Unit
+from recipes.fields import ClosedModel, Number, Unit
 from recipes.style import Style, style_preset_text
 from recipes.template import readable
 from recipes.yaml_tree import read_plain
@@ -78,7 +78,7 @@ def style_maps(scene: Scene, style: Style, *, cameras: Sequence[Camera] | None =
         return memo.get(key, lambda: _find_maps(scene, style, cameras))
 
     shared = ("style maps", style)
-    return memo.get(shared, compute) if memo.known(shared) else compute()
+    return memo.get(shared, compute) if memo.has(shared) else compute()
 
 
 def _find_maps(scene: Scene, style: Style, cameras: Sequence[Camera] | None) -> StyleMaps:
@@ -176,7 +176,7 @@ SHARES: Mapping[str, float] = {LAND: 0.75, SKY: 0.25}
 _Triple = tuple[Number, Number, Number]
 
 
-class _Moments(Closed):
+class _Moments(ClosedModel):
     mean: tuple[Unit, Unit, Unit]
     covariance: tuple[_Triple, _Triple, _Triple]
 
@@ -192,7 +192,7 @@ class _Moments(Closed):
         return rows
 
 
-class _Preset(Closed):
+class _Preset(ClosedModel):
     land: _Moments
     sky: _Moments
 

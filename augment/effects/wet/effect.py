@@ -81,7 +81,7 @@ class WetGroundPlan:
 
     seed: int  # seed of the puddles' noise
     wetness: float  # 0 to 1
-    puddles: float  # share of the ground under puddles, 0 to 1
+    puddle_share: float  # share of the ground under puddles, 0 to 1
     rate_mm_h: float  # rate of the rain
     mirror_px: float  # width of a pixel of the mirrored view, in pixels of the picture
 
@@ -96,11 +96,11 @@ class WetEffect(Effect):
     shares_files = True
 
     def reads_splats(self, recipe: Recipe) -> bool:
-        rain = self.of(recipe)
+        rain = self.section_of(recipe)
         return rain is not None and rain.ground_wetness > 0
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
-        rain = self.of(recipe)
+        rain = self.section_of(recipe)
         reason = ""
         if rain is None or rain.ground_wetness == 0:
             reason = "the recipe has no rain" if rain is None else "the rain leaves the ground dry"
@@ -129,11 +129,11 @@ class WetEffect(Effect):
         return EffectPlan(data, steps, frozenset({EXPECTED_DEPTH}))
 
     def prepare(self, own: EffectInScene) -> WetGround:
-        return wet_ground(own.scene, own.data.seed, backend=own.backend)
+        return wet_ground(own.scene, own.settings.seed, backend=own.backend)
 
     def share(self, job: JobContext) -> None:
         """Find where rain can fall, once for the job."""
-        rains = (self.of(recipe) for recipe in job.recipes)
+        rains = (self.section_of(recipe) for recipe in job.recipes)
         if any(rain and rain.ground_wetness > 0 for rain in rains):
             share_exposed_surface(job, PLACEMENT_SETTINGS)
 
@@ -147,12 +147,12 @@ class WetEffect(Effect):
         if _find_plane(own, sight.camera) is not None:
             return Visibility()
         reason = "no open ground is in view"
-        return Visibility(skipped=dict.fromkeys((MIRROR_PASS, REFLECTION_PASS), reason))
+        return Visibility(skip_reasons=dict.fromkeys((MIRROR_PASS, REFLECTION_PASS), reason))
 
     def edit_scene(
         self, own: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
-        splats = wet_splats(own.scene, own.prepared)
+        splats = wet_splats(own.scene, own.prepared_data)
         with timed(DARKENING_PASS):
             parts = [
                 replace(part, gaussians=_darken_part(part.gaussians, splats, own))
@@ -173,12 +173,13 @@ class WetEffect(Effect):
             visible_alpha = torch.where(mask, 0.0, visible_alpha)
         with timed(REFLECTION_PASS):
             share, rows = find_ground(
-                camera, depth, visible_alpha, own.prepared, backend=own.backend
+                camera, depth, visible_alpha, own.prepared_data, backend=own.backend
             )
         if rows == (0, 0):
             reason = "no open ground is seen"
             return replace(
-                drawn, skipped={**drawn.skipped, MIRROR_PASS: reason, REFLECTION_PASS: reason}
+                drawn,
+                skip_reasons={**drawn.skip_reasons, MIRROR_PASS: reason, REFLECTION_PASS: reason},
             )
         rgb = drawn.rgb
         if drawn.layers.photo is not None:
@@ -187,22 +188,23 @@ class WetEffect(Effect):
         with timed(MIRROR_PASS):
             mirror = _render_mirror(own, drawn.layers, camera, plane, rows)
         with timed(REFLECTION_PASS):
-            data = own.data
+            data = own.settings
             rings = make_rings(data.rate_mm_h, data.seed, camera.timestamp_ns)
-            film = Film(data.wetness, own.prepared.find_puddle_threshold(data.puddles), rings)
+            film = Film(data.wetness, own.prepared_data.find_puddle_threshold(data.puddles), rings)
             rgb = shade_wet(
-                rgb, camera, depth, share, own.prepared, film, mirror, backend=own.backend
+                rgb, camera, depth, share, own.prepared_data, film, mirror, backend=own.backend
             )
         return replace(drawn, rgb=rgb)
 
     def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
-        dim_wet_echoes(echoes, own.prepared, own.data.wetness, own.data.puddles)
+        dim_wet_echoes(echoes, own.prepared_data, own.settings.wetness, own.settings.puddles)
 
 
 def _find_plane(wet_effect: EffectInScene, camera: Camera) -> Plane | None:
     """Return the plane of the ground in view, remembered with the camera."""
     return memo_of(camera).get(
-        ("wet plane", wet_effect.prepared), lambda: plane_in_view(camera, wet_effect.prepared)
+        ("wet plane", wet_effect.prepared_data),
+        lambda: plane_in_view(camera, wet_effect.prepared_data),
     )
 
 
@@ -223,20 +225,22 @@ def _render_mirror(
     rows: tuple[int, int],
 ) -> Mirror:
     """Render the mirrored view."""
-    view = _mirror_camera(camera, plane, rows).scaled(1 / wet_effect.data.mirror_px)
-    splats = wet_splats(wet_effect.scene, wet_effect.prepared)
+    view = _mirror_camera(camera, plane, rows).scaled(1 / wet_effect.settings.mirror_px)
+    splats = wet_splats(wet_effect.scene, wet_effect.prepared_data)
     parts = [
         replace(part, gaussians=_remove_ground(part.gaussians, splats))
         if part.instance_id == 0
         else part
-        for part in layers.unpruned
+        for part in layers.unpruned_parts
         or layers.parts  # the pruned parts are for views with the ground in them
         if not part.is_overlay
     ]
     stop = max(MIRROR_TRANSMITTANCE_STOP, layers.settings.transmittance_stop)
     settings = replace(layers.settings, transmittance_stop=stop)
     layers = replace(layers, parts=parts, photo=None, settings=settings)
-    raster = layers.draw(view, plane.above(CLIP_DEPTH_M), frozenset({RGB, ALPHA, EXPECTED_DEPTH}))
+    raster = layers.render_layer(
+        view, plane.above(CLIP_DEPTH_M), frozenset({RGB, ALPHA, EXPECTED_DEPTH})
+    )
     assert raster.rgb is not None and raster.alpha is not None
     assert raster.expected_depth is not None
     rgb = layers.add_sky(raster.rgb, raster.alpha, view)
@@ -271,15 +275,15 @@ def _darken_photo(
         clear_rgb = (rgb - (1 - transmittance)[..., None] * airlight) / transmittance.clamp_min(
             MIN_PHOTO_TRANSMITTANCE
         )[..., None]
-    white = white_level(find_scene_light(wet_effect.light))
-    ratio = wet_ratio(clear_rgb.clamp_min(0), white, wet_effect.data.wetness * share)
+    white = white_level(find_scene_light(wet_effect.lit_scene))
+    ratio = wet_ratio(clear_rgb.clamp_min(0), white, wet_effect.settings.wetness * share)
     return rgb + transmittance[..., None] * clear_rgb * (ratio - 1)
 
 
 def _darken_part(gaussians: Gaussians, splats: WetSplats, wet_effect: EffectInScene) -> Gaussians:
     """Return a part's Gaussians, darkened by water; remembered with them."""
-    wetness = wet_effect.data.wetness
-    white = white_level(find_scene_light(wet_effect.light))
+    wetness = wet_effect.settings.wetness
+    white = white_level(find_scene_light(wet_effect.lit_scene))
     return memo_of(gaussians).get(
         ("wetted", wetness, white, splats),
         lambda: darken_gaussians(gaussians, wetness * splats.wet, white),

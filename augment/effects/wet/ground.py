@@ -22,7 +22,7 @@ from augment.effects.snow.cells import ExposedCells
 from augment.effects.snow.layer import draw_octaves, sum_octaves
 from augment.effects.snow.placement import ExposureSettings
 from augment.effects.snow.support import exposed_surface_of
-from augment.effects.wet.kernels import HEIGHT, NUM_CHANNELS, OPEN
+from augment.effects.wet.kernels import EXPOSURE, HEIGHT, NUM_CHANNELS
 from augment.geometry import rotmat_from_quat
 from augment.memo import memo_of
 from augment.rng import rng_for
@@ -31,7 +31,7 @@ from augment.semantics import SemanticClass
 
 # Settings of the cells. They equal those of snow by default, so that both share one search.
 PLACEMENT_SETTINGS = ExposureSettings()
-CELL_M = 0.2  # side of the map's cells; the ground's water is less finely patched
+GROUND_CELL_M = 0.2  # side of the map's cells; the ground's water is less finely patched
 
 # Share of a wet surface that a film of water covers: asphalt and concrete hold a film, soil and
 # grass let it seep.
@@ -84,23 +84,23 @@ class WetGround:
     # Height of the highest surface that can be wet, ground or roof; NaN where there is none.
     tops_m: Float[Tensor, "Y X"]
     # How open that surface is to the rain, 0 to 1.
-    exposed: Float[Tensor, "Y X"]
+    surface_exposure: Float[Tensor, "Y X"]
     # Values of HOLLOW on open ground, in rising order.
     sorted_puddle_order: np.ndarray
 
     @property
     def is_empty(self) -> bool:
         """True if no ground is open to the sky."""
-        return not bool((self.channels[..., OPEN] > 0).any())
+        return not bool((self.channels[..., EXPOSURE] > 0).any())
 
-    def at(self, x_m: Tensor, y_m: Tensor) -> Float[Tensor, "*B C"]:
+    def interpolate(self, x_m: Tensor, y_m: Tensor) -> Float[Tensor, "*B C"]:
         """Return the channels between the cells' middles.
 
         Beyond the map they are those of its border, but not open.
         """
         rows, columns = self.channels.shape[:2]
-        x = (x_m - self.left_m) / CELL_M - 0.5
-        y = (y_m - self.bottom_m) / CELL_M - 0.5
+        x = (x_m - self.left_m) / GROUND_CELL_M - 0.5
+        y = (y_m - self.bottom_m) / GROUND_CELL_M - 0.5
         is_inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
         x = x.clamp(0, columns - 1)
         y = y.clamp(0, rows - 1)
@@ -114,17 +114,17 @@ class WetGround:
         below = flat[j * columns + i] * (1 - u) + flat[j * columns + i1] * u
         above = flat[j1 * columns + i] * (1 - u) + flat[j1 * columns + i1] * u
         values = below * (1 - v) + above * v
-        values[..., OPEN] *= is_inside
+        values[..., EXPOSURE] *= is_inside
         return values
 
     def nearest(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Return the channels of the cells about points; beyond the map, see `at`."""
         rows, columns = self.channels.shape[:2]
-        i = np.floor((x_m - self.left_m) / CELL_M).astype(np.int64)
-        j = np.floor((y_m - self.bottom_m) / CELL_M).astype(np.int64)
+        i = np.floor((x_m - self.left_m) / GROUND_CELL_M).astype(np.int64)
+        j = np.floor((y_m - self.bottom_m) / GROUND_CELL_M).astype(np.int64)
         is_inside = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
         values = self.channels.numpy()[np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)]
-        values[..., OPEN] *= is_inside
+        values[..., EXPOSURE] *= is_inside
         return values
 
     def find_puddle_threshold(self, share: float) -> float:
@@ -161,9 +161,9 @@ def _make_ground(cells: ExposedCells, path: np.ndarray, seed: int) -> WetGround:
     centres = cells.centers_m.double().numpy()[is_kept]
     sizes = cells.sizes_m.double().numpy()[is_kept]
     classes = classes[is_kept]
-    tracks = cells.tracks.numpy()[is_kept]
-    low_cell = np.floor((centres[:, :2] - sizes[:, None] / 2).min(0) / CELL_M) - 2
-    high_cell = np.ceil((centres[:, :2] + sizes[:, None] / 2).max(0) / CELL_M) + 2
+    tracks = cells.track_share.numpy()[is_kept]
+    low_cell = np.floor((centres[:, :2] - sizes[:, None] / 2).min(0) / GROUND_CELL_M) - 2
+    high_cell = np.ceil((centres[:, :2] + sizes[:, None] / 2).max(0) / GROUND_CELL_M) + 2
     columns, rows = (high_cell - low_cell).astype(np.int64)
     painter = _Painter(low_cell, int(columns), int(rows), centres[:, :2], sizes)
     tops = painter.mean(centres[:, 2])
@@ -182,13 +182,13 @@ def _make_ground(cells: ExposedCells, path: np.ndarray, seed: int) -> WetGround:
     openness = _blur(openness, _SHELTER_SIGMA_M / 2)
     heights = _smooth_heights(tops, is_ground, _HEIGHT_BLUR_M)
     level = _smooth_heights(tops, is_ground, _SLOPE_BLUR_M)
-    rise_y, rise_x = np.gradient(level, CELL_M)
+    rise_y, rise_x = np.gradient(level, GROUND_CELL_M)
     puddle_order = _puddle_order(
         heights, np.hypot(rise_x, rise_y), is_ground, track, low_cell, seed
     )
     channels = np.stack([heights, openness, rise_x, rise_y, puddle_order, _blur(track, 0.15)], -1)
     ordered = np.sort(puddle_order[openness > 0.5]).astype(np.float32)
-    left_m, bottom_m = (low_cell * CELL_M).tolist()
+    left_m, bottom_m = (low_cell * GROUND_CELL_M).tolist()
     return WetGround(
         left_m,
         bottom_m,
@@ -210,11 +210,13 @@ class _Painter:
         cell_ids = []
         for size in np.unique(sizes):
             index = np.flatnonzero(sizes == size)
-            num_steps = max(1, round(float(size) / CELL_M))
+            num_steps = max(1, round(float(size) / GROUND_CELL_M))
             steps = (np.arange(num_steps) + 0.5) * (size / num_steps) - size / 2
             for dx in steps:
                 for dy in steps:
-                    columns_rows = np.floor((xy[index] + (dx, dy)) / CELL_M - low).astype(np.int64)
+                    columns_rows = np.floor((xy[index] + (dx, dy)) / GROUND_CELL_M - low).astype(
+                        np.int64
+                    )
                     map_ids.append(columns_rows[:, 1] * columns + columns_rows[:, 0])
                     cell_ids.append(index)
         self._map_ids = np.concatenate(map_ids)
@@ -237,11 +239,11 @@ def _is_ground_by_path(tops: np.ndarray, path: np.ndarray, low: np.ndarray) -> n
     lowest = cv2.erode(np.where(is_surface, heights, np.float32(1e6)), kernel)
     labels = np.zeros(tops.shape, np.int32)
     ndimage.label(is_surface & (highest - lowest < _MAX_GROUND_STEP_M), output=labels)
-    places = np.floor(path[:, :2] / CELL_M - low).astype(np.int64)
+    places = np.floor(path[:, :2] / GROUND_CELL_M - low).astype(np.int64)
     near_path = np.zeros(tops.shape, np.uint8)
     is_inside = ((places >= 0) & (places < np.array(tops.shape[::-1]))).all(1)
     near_path[places[is_inside, 1], places[is_inside, 0]] = 1
-    reach = 2 * round(_PATH_RADIUS_M / CELL_M) + 1
+    reach = 2 * round(_PATH_RADIUS_M / GROUND_CELL_M) + 1
     near_path = (
         cv2.dilate(near_path, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))) > 0
     )
@@ -259,7 +261,7 @@ def _soften_mask(mask: np.ndarray) -> np.ndarray:
 
 def _blur(values: np.ndarray, sigma_m: float) -> np.ndarray:
     """Blur values of the map."""
-    sigma = sigma_m / CELL_M
+    sigma = sigma_m / GROUND_CELL_M
     return cv2.GaussianBlur(
         values.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE
     ).astype(np.float64)
@@ -294,15 +296,15 @@ def _puddle_order(
     It adds up the depth of a hollow, which a closing of the heights fills, ruts, and noise. It is
     less on slopes.
     """
-    width = 2 * round(_MAX_HOLLOW_WIDTH_M / CELL_M / 2) + 1
+    width = 2 * round(_MAX_HOLLOW_WIDTH_M / GROUND_CELL_M / 2) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
     heights_m = heights.astype(np.float32)
     closed = cv2.morphologyEx(heights_m, cv2.MORPH_CLOSE, disc)
     depth_cm = _blur(np.clip(closed - heights_m, 0, _MAX_WATER_DEPTH_M) * 100, 0.2)
     rng = rng_for(seed=seed, scene="", effect="puddles")
     rows, columns = (-(-n // _NOISE_STRIDE) + 1 for n in heights.shape)
-    x = (low[0] + (np.arange(columns) + 0.5) * _NOISE_STRIDE) * CELL_M
-    y = (low[1] + (np.arange(rows) + 0.5) * _NOISE_STRIDE) * CELL_M
+    x = (low[0] + (np.arange(columns) + 0.5) * _NOISE_STRIDE) * GROUND_CELL_M
+    y = (low[1] + (np.arange(rows) + 0.5) * _NOISE_STRIDE) * GROUND_CELL_M
     grid_x, grid_y = np.meshgrid(x, y)
     noise = sum_octaves(draw_octaves(_PUDDLE_OCTAVES, rng), grid_x.ravel(), grid_y.ravel()).reshape(
         rows, columns
@@ -344,18 +346,18 @@ def _find_splats(gaussians: Gaussians, ground: WetGround) -> WetSplats:
         else gaussians.semantic.numpy()
     )
     x, y, z = gaussians.means.double().numpy().T.reshape(3, -1)
-    channels = ground.at(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+    channels = ground.interpolate(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     is_near = np.abs(z - channels[:, HEIGHT]) < 2 * _SURFACE_DISTANCE_M
     is_ground = np.isin(classes, GROUND_CLASSES) | (np.isin(classes, _UNSURE_CLASSES) & is_near)
-    i = np.floor((x - ground.left_m) / CELL_M).astype(np.int64)
-    j = np.floor((y - ground.bottom_m) / CELL_M).astype(np.int64)
+    i = np.floor((x - ground.left_m) / GROUND_CELL_M).astype(np.int64)
+    j = np.floor((y - ground.bottom_m) / GROUND_CELL_M).astype(np.int64)
     rows, columns = ground.tops_m.shape
     is_inside = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
     i = np.clip(i, 0, columns - 1)
     j = np.clip(j, 0, rows - 1)
     surface_distance = np.abs(z - ground.tops_m.numpy()[j, i])
     wetness = np.clip(2 - surface_distance / _SURFACE_DISTANCE_M, 0, 1) * is_inside
-    wetness = np.nan_to_num(wetness) * ground.exposed.numpy()[j, i]
+    wetness = np.nan_to_num(wetness) * ground.surface_exposure.numpy()[j, i]
     thinnest = gaussians.scales.argmin(1)
     thin_axis_z = (
         rotmat_from_quat(gaussians.quats)[:, 2][torch.arange(len(gaussians)), thinnest]

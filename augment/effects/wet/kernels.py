@@ -13,13 +13,13 @@ from numba import prange
 
 from augment.kernels import mix
 from augment.render.cpu import simd as v8
-from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.cpu.simd import LOG2_E, exp2_fine, log2
-from augment.render.layout import LANES, U
+from augment.render.layout import NUM_LANES, Index
 from augment.rng import STEP_X, STEP_Y
 
 # Channels of the ground's map, see ground.WetGround; CHANNELS is their number.
-HEIGHT, OPEN, SLOPE_X, SLOPE_Y, PUDDLE_ORDER, WHEEL_TRACK, NUM_CHANNELS = range(7)
+HEIGHT, EXPOSURE, SLOPE_X, SLOPE_Y, PUDDLE_ORDER, WHEEL_TRACK, NUM_CHANNELS = range(7)
 
 # ---- Rings of drops ------------------------------------------------------------------------------
 
@@ -46,7 +46,7 @@ _LIFE_NS_UINT = np.uint64(LIFE_NS)
 _UNIT = 2.0**-20  # size of one step of those bits
 
 
-@inner()
+@kernel_function()
 def _find_drops(column, row, rings, seed, timestamp_ns, drops):
     """Enter the rings that may reach a square: how many, and x, y, radius and slope of each."""
     reach = SPEED_MPS * LIFE_NS * 1e-9
@@ -75,7 +75,7 @@ def _find_drops(column, row, rings, seed, timestamp_ns, drops):
     drops[MAX_NEARBY_DROPS, 2] = num_found
 
 
-@inner()
+@kernel_function()
 def rings_at(x, y, footprint, rings, seed, timestamp_ns, drops):
     """Return the rings' slopes towards x and y at a point, and the variance of the rest.
 
@@ -110,63 +110,63 @@ def rings_at(x, y, footprint, rings, seed, timestamp_ns, drops):
 # ---- Eight pixels at a time ----------------------------------------------------------------------
 
 
-@inner()
+@kernel_function()
 def _splat(number):
     """Return eight copies of a number."""
-    return v8.splat(np.float32(number))
+    return v8.broadcast(np.float32(number))
 
 
-@inner()
+@kernel_function()
 def _clamp(value, low, high):
     """Clamp values; the result is low where they are NaN."""
     return v8.minimum(v8.maximum(value, _splat(low)), _splat(high))
 
 
-@inner()
+@kernel_function()
 def _linear(value, slope, offset):
     """Return value * slope + offset."""
     return v8.fmuladd(value, _splat(slope), _splat(offset))
 
 
-@inner()
+@kernel_function()
 def _smoothstep(t):
     """Smooth step from 0 at t = 0 to 1 at t = 1."""
     t = _clamp(t, 0.0, 1.0)
     return t * t * _linear(t, -2.0, 3.0)
 
 
-@inner()
+@kernel_function()
 def _dot(x, y, z, a, b, c):
     """Return the dot product of (x, y, z) and (a, b, c)."""
     return v8.fmuladd(x, a, v8.fmuladd(y, b, z * c))
 
 
-@inner()
+@kernel_function()
 def _rotate(row, x, y, z):
     """Return a row of a matrix times vectors."""
-    return _dot(x, y, z, v8.splat(row[0]), v8.splat(row[1]), v8.splat(row[2]))
+    return _dot(x, y, z, v8.broadcast(row[0]), v8.broadcast(row[1]), v8.broadcast(row[2]))
 
 
-@inner()
+@kernel_function()
 def _ray_x(first, lens):
     """Return x at unit depth of the pixels from column `first` on; lens: 1 / fx, 1 / fy, cx, cy."""
-    middle = v8.splat(np.float32(first) + np.float32(0.5) - lens[2])
-    return (middle + v8.lane_numbers()) * v8.splat(lens[0])
+    middle = v8.broadcast(np.float32(first) + np.float32(0.5) - lens[2])
+    return (middle + v8.lane_numbers()) * v8.broadcast(lens[0])
 
 
-@inner()
+@kernel_function()
 def _any(mask):
     """Tell if any lane of a mask is set."""
-    return v8.mask_bits(mask) != U(0)
+    return v8.mask_bits(mask) != Index(0)
 
 
-@inner()
+@kernel_function()
 def _store_texels(texels, spare, u, v, i, j):
     """Store texels of float coordinates (column, row), and shares of the way to the next texels."""
-    v8.store_integers(texels, U(0), i)
-    v8.store_integers(texels, U(LANES), j)
-    v8.store(spare, U(0), u - i)
-    v8.store(spare, U(LANES), v - j)
+    v8.store_integers(texels, Index(0), i)
+    v8.store_integers(texels, Index(NUM_LANES), j)
+    v8.store(spare, Index(0), u - i)
+    v8.store(spare, Index(NUM_LANES), v - j)
 
 
 # ---- Pixels that show open ground ----------------------------------------------------------------
@@ -182,8 +182,8 @@ GROUND_TOLERANCE_PER_M = 0.003
 MAX_GROUND_OFFSET_M = 0.2
 MAX_GROUND_OFFSET_PER_M = 0.008
 MIN_GROUND_SHARE = 0.004  # smaller shares of ground count as 0
-RESULTS_START = 2 * LANES  # index of the results in `spare`
-SPARE_SIZE = 8 * LANES  # size of `spare`
+RESULTS_START = 2 * NUM_LANES  # index of the results in `spare`
+SPARE_SIZE = 8 * NUM_LANES  # size of `spare`
 
 
 class MapView(NamedTuple):
@@ -199,7 +199,7 @@ class MapView(NamedTuple):
     columns: Any  # columns of the map, 2 at least
 
 
-@inner()
+@kernel_function()
 def _read_view(view):
     """Return the view with tuples in place of arrays."""
     lens = view.lens
@@ -214,89 +214,97 @@ def _read_view(view):
     )
 
 
-@inner()
+@kernel_function()
 def _read_matrix(m):
     """Return a 3 x 3 matrix as tuples."""
     return ((m[0, 0], m[0, 1], m[0, 2]), (m[1, 0], m[1, 1], m[1, 2]), (m[2, 0], m[2, 1], m[2, 2]))
 
 
-@inner()
+@kernel_function()
 def _find_cells(px, py, view, texels, spare):
     """Tell if points from the eye lie on the map, and find the cells below left of them."""
     eye = view.eye
     zero = _splat(0)
-    per_m = v8.splat(view.eye[2])
-    u = v8.fmuladd(px, per_m, v8.splat(eye[0]))
-    v = v8.fmuladd(py, per_m, v8.splat(eye[1]))
-    is_inside = v8.both(v8.at_least(u, zero), v8.at_least(_splat(view.columns - 1), u))
-    is_inside = v8.both(is_inside, v8.at_least(v, zero))
-    is_inside = v8.both(is_inside, v8.at_least(_splat(view.rows - 1), v))
+    per_m = v8.broadcast(view.eye[2])
+    u = v8.fmuladd(px, per_m, v8.broadcast(eye[0]))
+    v = v8.fmuladd(py, per_m, v8.broadcast(eye[1]))
+    is_inside = v8.mask_and(v8.at_least(u, zero), v8.at_least(_splat(view.columns - 1), u))
+    is_inside = v8.mask_and(is_inside, v8.at_least(v, zero))
+    is_inside = v8.mask_and(is_inside, v8.at_least(_splat(view.rows - 1), v))
     i = v8.floor(_clamp(u, 0, view.columns - 2))
     j = v8.floor(_clamp(v, 0, view.rows - 2))
     _store_texels(texels, spare, u, v, i, j)
     return is_inside
 
 
-@inner()
+@kernel_function()
 def _interpolate_channels(cells, columns, channel, count, texels, spare):
     """Interpolate `count` channels from `channel` on between the map's cells.
 
     The results go to spare[RESULTS_START + k LANES + lane].
     """
-    step = U(NUM_CHANNELS)
-    down = U(columns * NUM_CHANNELS)
-    for lane in range(U(LANES)):
-        start = U(texels[lane + U(LANES)]) * down + U(texels[lane]) * step + U(channel)
+    step = Index(NUM_CHANNELS)
+    down = Index(columns * NUM_CHANNELS)
+    for lane in range(Index(NUM_LANES)):
+        start = (
+            Index(texels[lane + Index(NUM_LANES)]) * down
+            + Index(texels[lane]) * step
+            + Index(channel)
+        )
         u = spare[lane]
-        v = spare[lane + U(LANES)]
-        for k in range(U(count)):
+        v = spare[lane + Index(NUM_LANES)]
+        for k in range(Index(count)):
             index = start + k
             a = cells[index] + (cells[index + step] - cells[index]) * u
             index += down
             b = cells[index] + (cells[index + step] - cells[index]) * u
-            spare[U(RESULTS_START) + k * U(LANES) + lane] = a + (b - a) * v
+            spare[Index(RESULTS_START) + k * Index(NUM_LANES) + lane] = a + (b - a) * v
 
 
-@inner()
+@kernel_function()
 def _find_ground_in_row(row, width, view, cells, depth, visible_share, share):
     """Find the open ground in one row of the image; return the row's largest share."""
     view = _read_view(view)
     lens = view.lens
     axes = view.axes
-    texels = np.empty(2 * LANES, np.int32)
+    texels = np.empty(2 * NUM_LANES, np.int32)
     spare = np.empty(SPARE_SIZE, np.float32)
     zero = _splat(0)
     ones = _splat(1)
     half = np.float32(0.5)
     down = (np.float32(row) + half - lens[3]) * lens[1]
-    b = v8.splat(down)
+    b = v8.broadcast(down)
     max_share = zero
-    for x in range(U(row * width), U((row + 1) * width)):
+    for x in range(Index(row * width), Index((row + 1) * width)):
         share[x] = np.float32(0)
     left = (half - lens[2]) * lens[0]
     right = (np.float32(width) - half - lens[2]) * lens[0]
     level = axes[2][1] * down + axes[2][2]
     if min(axes[2][0] * left, axes[2][0] * right) + level >= np.float32(0):
         return np.float32(0)
-    for j in range(0, width, LANES):
-        first = min(j, width - LANES)  # the last eight pixels of a row overlap those before them
-        pixel = U(row * width + first)
+    for j in range(0, width, NUM_LANES):
+        first = min(
+            j, width - NUM_LANES
+        )  # the last eight pixels of a row overlap those before them
+        pixel = Index(row * width + first)
         z = v8.load(depth, pixel)
         ground_share = v8.load(visible_share, pixel)
         a = _ray_x(first, lens)
         ray_z = _rotate(axes[2], a, b, ones)
-        is_ground = v8.both(v8.greater(z, zero), v8.greater(ground_share, zero))
-        is_ground = v8.both(is_ground, v8.greater(zero, ray_z))
+        is_ground = v8.mask_and(v8.greater(z, zero), v8.greater(ground_share, zero))
+        is_ground = v8.mask_and(is_ground, v8.greater(zero, ray_z))
         if not _any(is_ground):
             continue
         px = z * _rotate(axes[0], a, b, ones)
         py = z * _rotate(axes[1], a, b, ones)
         pz = z * ray_z
-        is_ground = v8.both(is_ground, _find_cells(px, py, view, texels, spare))
+        is_ground = v8.mask_and(is_ground, _find_cells(px, py, view, texels, spare))
         if not _any(is_ground):
             continue
         _interpolate_channels(cells, view.columns, HEIGHT, 2, texels, spare)
-        height_gap = v8.absolute(pz + v8.splat(view.eye[3]) - v8.load(spare, U(RESULTS_START)))
+        height_gap = v8.absolute(
+            pz + v8.broadcast(view.eye[3]) - v8.load(spare, Index(RESULTS_START))
+        )
         distance = z * v8.sqrt(_dot(a, b, ones, a, b, ones))
         tolerance_m = _linear(distance, GROUND_TOLERANCE_PER_M, GROUND_TOLERANCE_M)
         gap = _linear(
@@ -306,19 +314,19 @@ def _find_ground_in_row(row, width, view, cells, depth, visible_share, share):
         )
         ground_share = (
             ground_share
-            * v8.load(spare, U(RESULTS_START + LANES))
+            * v8.load(spare, Index(RESULTS_START + NUM_LANES))
             * (ones - _smoothstep((height_gap - tolerance_m) / gap))
         )
         ground_share = v8.select(
-            v8.both(is_ground, v8.greater(ground_share, _splat(MIN_GROUND_SHARE))),
+            v8.mask_and(is_ground, v8.greater(ground_share, _splat(MIN_GROUND_SHARE))),
             ground_share,
             zero,
         )
         v8.store(share, pixel, ground_share)
         max_share = v8.maximum(max_share, ground_share)
-    v8.store(spare, U(0), max_share)
+    v8.store(spare, Index(0), max_share)
     row_max = spare[0]
-    for lane in range(1, LANES):
+    for lane in range(1, NUM_LANES):
         row_max = max(row_max, spare[lane])
     return row_max
 
@@ -370,7 +378,7 @@ class MirrorView(NamedTuple):
     rows: Any  # number of rows of the first level
 
 
-@inner()
+@kernel_function()
 def _read_mirror(mirror):
     """Return the mirror with tuples in place of arrays."""
     lens = mirror.lens
@@ -394,7 +402,7 @@ class WaterOnGround(NamedTuple):
     timestamp_ns: Any
 
 
-@inner()
+@kernel_function()
 def _read_water(water):
     """Return the water with tuples in place of arrays."""
     rings = water.rings[0], water.rings[1], water.rings[2]
@@ -403,66 +411,68 @@ def _read_water(water):
     )
 
 
-@inner()
+@kernel_function()
 def _lanes_if(condition):
     """Return the number of turns of a loop over lanes: all or none.
 
     Numba prunes references of arrays that a loop uses, but not of those that a branch uses.
     """
-    return U(LANES) if condition else U(0)
+    return Index(NUM_LANES) if condition else Index(0)
 
 
-@inner()
+@kernel_function()
 def _mottle(noise, px, py, weight, per_texel, column, row, texels, spare):
     """Return weighted noise at points from the eye; column, row: the eye's, in texels."""
-    u = v8.fmuladd(px, _splat(per_texel), v8.splat(column))
-    v = v8.fmuladd(py, _splat(per_texel), v8.splat(row))
+    u = v8.fmuladd(px, _splat(per_texel), v8.broadcast(column))
+    v = v8.fmuladd(py, _splat(per_texel), v8.broadcast(row))
     _store_texels(texels, spare, u, v, v8.floor(u), v8.floor(v))
-    side = U(MOTTLE_SIDE)
+    side = Index(MOTTLE_SIDE)
     wrap = np.int32(MOTTLE_SIDE - 1)
     has_weight = v8.greater(weight, _splat(0))
     for lane in range(_lanes_if(_any(has_weight))):
         i = texels[lane]
-        j = texels[lane + U(LANES)]
-        left = U(i & wrap)
-        right = U((i + np.int32(1)) & wrap)
-        low = U(j & wrap) * side
-        high = U((j + np.int32(1)) & wrap) * side
+        j = texels[lane + Index(NUM_LANES)]
+        left = Index(i & wrap)
+        right = Index((i + np.int32(1)) & wrap)
+        low = Index(j & wrap) * side
+        high = Index((j + np.int32(1)) & wrap) * side
         a = noise[low + left] + (noise[low + right] - noise[low + left]) * spare[lane]
         b = noise[high + left] + (noise[high + right] - noise[high + left]) * spare[lane]
-        spare[U(RESULTS_START) + lane] = a + (b - a) * spare[lane + U(LANES)]
-    return v8.select(has_weight, weight * v8.load(spare, U(RESULTS_START)), _splat(0))
+        spare[Index(RESULTS_START) + lane] = a + (b - a) * spare[lane + Index(NUM_LANES)]
+    return v8.select(has_weight, weight * v8.load(spare, Index(RESULTS_START)), _splat(0))
 
 
-@inner()
+@kernel_function()
 def _ring_lanes(px, py, footprint, puddle, eye_xy, water, spare, drops):
     """Compute `rings_at` for the lanes with puddles."""
-    is_visible = v8.both(
+    is_visible = v8.mask_and(
         v8.greater(puddle, _splat(0)), v8.greater(_splat(RING_WAVE_M / FADED_PX), footprint)
     )
-    v8.store(spare, U(0), px)
-    v8.store(spare, U(LANES), py)
-    v8.store(spare, U(RESULTS_START), _splat(0))
-    v8.store(spare, U(RESULTS_START + LANES), _splat(0))
-    v8.store(spare, U(RESULTS_START + 2 * LANES), _splat(water.rings[1]))
-    v8.store(spare, U(RESULTS_START + 3 * LANES), v8.select(is_visible, footprint, _splat(0)))
+    v8.store(spare, Index(0), px)
+    v8.store(spare, Index(NUM_LANES), py)
+    v8.store(spare, Index(RESULTS_START), _splat(0))
+    v8.store(spare, Index(RESULTS_START + NUM_LANES), _splat(0))
+    v8.store(spare, Index(RESULTS_START + 2 * NUM_LANES), _splat(water.rings[1]))
+    v8.store(
+        spare, Index(RESULTS_START + 3 * NUM_LANES), v8.select(is_visible, footprint, _splat(0))
+    )
     for lane in range(_lanes_if(water.rings[0] > 0 and _any(is_visible))):
-        index = U(RESULTS_START) + lane
-        footprint_m = spare[index + U(3 * LANES)]
+        index = Index(RESULTS_START) + lane
+        footprint_m = spare[index + Index(3 * NUM_LANES)]
         if footprint_m > np.float32(0):
             x = eye_xy[0] + spare[lane]
-            y = eye_xy[1] + spare[lane + U(LANES)]
+            y = eye_xy[1] + spare[lane + Index(NUM_LANES)]
             sx, sy, rest_variance = rings_at(
                 x, y, np.float64(footprint_m), water.rings, water.seed, water.timestamp_ns, drops
             )
             spare[index] = np.float32(sx)
-            spare[index + U(LANES)] = np.float32(sy)
-            spare[index + U(2 * LANES)] = np.float32(rest_variance)
-    slopes = v8.load(spare, U(RESULTS_START)), v8.load(spare, U(RESULTS_START + LANES))
-    return slopes[0], slopes[1], v8.load(spare, U(RESULTS_START + 2 * LANES))
+            spare[index + Index(NUM_LANES)] = np.float32(sy)
+            spare[index + Index(2 * NUM_LANES)] = np.float32(rest_variance)
+    slopes = v8.load(spare, Index(RESULTS_START)), v8.load(spare, Index(RESULTS_START + NUM_LANES))
+    return slopes[0], slopes[1], v8.load(spare, Index(RESULTS_START + 2 * NUM_LANES))
 
 
-@inner()
+@kernel_function()
 def _reflectance(cosine, roughness):
     """Return the mean reflectance, as reflection.mean_reflectance defines it."""
     ones = _splat(1)
@@ -473,7 +483,7 @@ def _reflectance(cosine, roughness):
     return _linear(schlick_term, 1 - R0, R0)
 
 
-@inner()
+@kernel_function()
 def _to_linear(value):
     """Convert display-encoded values to linear light."""
     value = v8.maximum(value, _splat(0))
@@ -482,7 +492,7 @@ def _to_linear(value):
     return v8.select(v8.greater(value, _splat(0.04045)), high, low)
 
 
-@inner()
+@kernel_function()
 def _to_display(linear):
     """Convert linear light to display-encoded values; light below 0 counts as 0."""
     high = exp2_fine(_splat(1 / 2.4) * log2(v8.maximum(linear, _splat(0.0031308))))
@@ -490,7 +500,7 @@ def _to_display(linear):
     return v8.select(v8.greater(linear, _splat(0.0031308)), _linear(high, 1.055, -0.055), low)
 
 
-@inner()
+@kernel_function()
 def _project(mirror, x, y, z):
     """Return column and row of points from the mirrored eye."""
     lens = mirror.lens
@@ -498,36 +508,36 @@ def _project(mirror, x, y, z):
     per_z = _splat(1) / v8.maximum(_rotate(rotation[2], x, y, z), _splat(1e-3))
     column = _rotate(rotation[0], x, y, z) * per_z
     row = _rotate(rotation[1], x, y, z) * per_z
-    column = v8.fmuladd(v8.splat(lens[0]), column, v8.splat(lens[2]))
-    return column, v8.fmuladd(v8.splat(lens[1]), row, v8.splat(lens[3]))
+    column = v8.fmuladd(v8.broadcast(lens[0]), column, v8.broadcast(lens[2]))
+    return column, v8.fmuladd(v8.broadcast(lens[1]), row, v8.broadcast(lens[3]))
 
 
-@inner()
+@kernel_function()
 def _distance_at(mirror, depth, column, row, px, py, pz, texels, spare):
     """Return the distance from points of the ground to what the mirrored picture shows, metres."""
     lens = mirror.lens
     m = mirror.rotation
     offset = mirror.offset
-    width = U(mirror.width)
+    width = Index(mirror.width)
     i = v8.floor(_clamp(column, 0, mirror.width - 1))
     j = v8.floor(_clamp(row, 0, mirror.rows - 1))
-    v8.store_integers(texels, U(0), i)
-    v8.store_integers(texels, U(LANES), j)
-    for lane in range(U(LANES)):
-        spare[lane] = depth[U(texels[lane + U(LANES)]) * width + U(texels[lane])]
-    z = v8.load(spare, U(0))
+    v8.store_integers(texels, Index(0), i)
+    v8.store_integers(texels, Index(NUM_LANES), j)
+    for lane in range(Index(NUM_LANES)):
+        spare[lane] = depth[Index(texels[lane + Index(NUM_LANES)]) * width + Index(texels[lane])]
+    z = v8.load(spare, Index(0))
     half = np.float32(0.5)
     unit = np.float32(1)
-    a = (i + v8.splat(half - lens[2])) * v8.splat(unit / lens[0]) * z
-    b = (j + v8.splat(half - lens[3])) * v8.splat(unit / lens[1]) * z
-    x = _rotate((m[0][0], m[1][0], m[2][0]), a, b, z) + v8.splat(offset[0]) - px
-    y = _rotate((m[0][1], m[1][1], m[2][1]), a, b, z) + v8.splat(offset[1]) - py
-    up = _rotate((m[0][2], m[1][2], m[2][2]), a, b, z) + v8.splat(offset[2]) - pz
+    a = (i + v8.broadcast(half - lens[2])) * v8.broadcast(unit / lens[0]) * z
+    b = (j + v8.broadcast(half - lens[3])) * v8.broadcast(unit / lens[1]) * z
+    x = _rotate((m[0][0], m[1][0], m[2][0]), a, b, z) + v8.broadcast(offset[0]) - px
+    y = _rotate((m[0][1], m[1][1], m[2][1]), a, b, z) + v8.broadcast(offset[1]) - py
+    up = _rotate((m[0][2], m[1][2], m[2][2]), a, b, z) + v8.broadcast(offset[2]) - pz
     distances = v8.sqrt(_dot(x, y, up, x, y, up))
     return v8.select(v8.greater(z, _splat(0)), distances, _splat(SKY_DISTANCE_M))
 
 
-@inner()
+@kernel_function()
 def _look_up_mirror(mirror, colors, levels, column, row, sigma, texels, spare):
     """Return linear light of the mirrored picture at points, blurred upright by sigma pixels.
 
@@ -538,56 +548,69 @@ def _look_up_mirror(mirror, colors, levels, column, row, sigma, texels, spare):
     x = _clamp(column - _splat(0.5), 0, mirror.width - 1)
     i = v8.minimum(v8.floor(x), _splat(mirror.width - 2))
     _store_texels(texels, spare, x, upper_share + lower_level, i, lower_level)
-    v8.store(spare, U(RESULTS_START), _clamp(row, -1e6, 1e6))
-    pixel = U(3)
-    row_stride = U(3 * mirror.width)
-    red = U(RESULTS_START + 2 * LANES)
-    green = U(RESULTS_START + 3 * LANES)
-    blue = U(RESULTS_START + 4 * LANES)
-    for lane in range(U(LANES)):
-        level = U(texels[lane + U(LANES)])
-        y = spare[U(RESULTS_START) + lane]
+    v8.store(spare, Index(RESULTS_START), _clamp(row, -1e6, 1e6))
+    pixel = Index(3)
+    row_stride = Index(3 * mirror.width)
+    red = Index(RESULTS_START + 2 * NUM_LANES)
+    green = Index(RESULTS_START + 3 * NUM_LANES)
+    blue = Index(RESULTS_START + 4 * NUM_LANES)
+    for lane in range(Index(NUM_LANES)):
+        level = Index(texels[lane + Index(NUM_LANES)])
+        y = spare[Index(RESULTS_START) + lane]
         color = _splat(0)
-        for k in range(U(2)):
-            last = np.int64(levels[U(1), level]) - 1
+        for k in range(Index(2)):
+            last = np.int64(levels[Index(1), level]) - 1
             v = y * _ROW_SCALES[level] - np.float32(0.5)
             v = min(max(v, np.float32(0)), np.float32(last))
             j = np.int64(v)
-            index = pixel * (U(levels[U(0), level]) + U(texels[lane])) + U(j) * row_stride
+            index = (
+                pixel * (Index(levels[Index(0), level]) + Index(texels[lane]))
+                + Index(j) * row_stride
+            )
             above = v8.load(colors, index)
-            below = v8.load(colors, index + (row_stride if j < last else U(0)))
-            between = v8.fmuladd(v8.splat(v - np.float32(j)), below - above, above)
-            weight = spare[lane + U(LANES)] if k else np.float32(1) - spare[lane + U(LANES)]
-            color = v8.fmuladd(v8.splat(weight), between, color)
-            level += U(1)
-        v8.store(spare, U(RESULTS_START + LANES), color)  # colours of two texels side by side
-        index = U(RESULTS_START + LANES)
+            below = v8.load(colors, index + (row_stride if j < last else Index(0)))
+            between = v8.fmuladd(v8.broadcast(v - np.float32(j)), below - above, above)
+            weight = (
+                spare[lane + Index(NUM_LANES)]
+                if k
+                else np.float32(1) - spare[lane + Index(NUM_LANES)]
+            )
+            color = v8.fmuladd(v8.broadcast(weight), between, color)
+            level += Index(1)
+        v8.store(
+            spare, Index(RESULTS_START + NUM_LANES), color
+        )  # colours of two texels side by side
+        index = Index(RESULTS_START + NUM_LANES)
         u = spare[lane]
-        spare[red + lane] = spare[index] + (spare[index + U(3)] - spare[index]) * u
-        spare[green + lane] = spare[index + U(1)] + (spare[index + U(4)] - spare[index + U(1)]) * u
-        spare[blue + lane] = spare[index + U(2)] + (spare[index + U(5)] - spare[index + U(2)]) * u
+        spare[red + lane] = spare[index] + (spare[index + Index(3)] - spare[index]) * u
+        spare[green + lane] = (
+            spare[index + Index(1)] + (spare[index + Index(4)] - spare[index + Index(1)]) * u
+        )
+        spare[blue + lane] = (
+            spare[index + Index(2)] + (spare[index + Index(5)] - spare[index + Index(2)]) * u
+        )
     return v8.load(spare, red), v8.load(spare, green), v8.load(spare, blue)
 
 
-@inner()
+@kernel_function()
 def _film_on_ground(track, puddle, uneven, variance, wetness):
     """Return the deviation of slopes, and the share of the ground that the film covers."""
     ones = _splat(1)
     roughness = _splat(ASPHALT_ROUGHNESS) * _linear(track, -TRACK_SMOOTHING, 1.0) * (ones - uneven)
     puddle_roughness = v8.sqrt(_linear(variance, 0.5, PUDDLE_ROUGHNESS * PUDDLE_ROUGHNESS))
     film_share = _clamp(_linear(track, 0.1, FILM_SHARE) + uneven, 0.0, 1.0)
-    covered_share = v8.splat(wetness) * v8.fmuladd(ones - film_share, puddle, film_share)
+    covered_share = v8.broadcast(wetness) * v8.fmuladd(ones - film_share, puddle, film_share)
     return v8.fmuladd(puddle, puddle_roughness - roughness, roughness), covered_share
 
 
-@inner()
+@kernel_function()
 def _mix_light(encoded, reflected, strength):
     """Mix display-encoded values with reflected linear light by a strength."""
     linear = _to_linear(encoded)
     return _to_display(v8.fmuladd(strength, reflected - linear, linear))
 
 
-@inner()
+@kernel_function()
 def _shade_row(
     line, width, view, cells, depth, share, mirror, colors, levels, mirror_depth, water, noise, rgb
 ):
@@ -599,17 +622,17 @@ def _shade_row(
     axes = view.axes
     eye = view.eye
     offset = mirror.offset
-    texels = np.empty(2 * LANES, np.int32)
+    texels = np.empty(2 * NUM_LANES, np.int32)
     spare = np.empty(SPARE_SIZE, np.float32)
     drops = np.full((MAX_NEARBY_DROPS + 1, 4), np.nan)
     ones = _splat(1)
-    b = v8.splat((np.float32(line) + np.float32(0.5) - lens[3]) * lens[1])
-    for j in range(0, width, LANES):
+    b = v8.broadcast((np.float32(line) + np.float32(0.5) - lens[3]) * lens[1])
+    for j in range(0, width, NUM_LANES):
         # The last eight pixels of a row overlap those before them, which stay as they are.
-        first = min(j, width - LANES)
-        pixel = U(line * width + first)
+        first = min(j, width - NUM_LANES)
+        pixel = Index(line * width + first)
         ground_share = v8.load(share, pixel)
-        is_ground = v8.both(
+        is_ground = v8.mask_and(
             v8.greater(ground_share, _splat(0)), v8.at_least(v8.lane_numbers(), _splat(j - first))
         )
         if not _any(is_ground):
@@ -621,18 +644,18 @@ def _shade_row(
         pz = z * _rotate(axes[2], a, b, ones)
         _find_cells(px, py, view, texels, spare)
         _interpolate_channels(cells, view.columns, SLOPE_X, 4, texels, spare)
-        slope_x = v8.load(spare, U(RESULTS_START))
-        slope_y = v8.load(spare, U(RESULTS_START + LANES))
-        puddle_order = v8.load(spare, U(RESULTS_START + 2 * LANES))
-        track = v8.load(spare, U(RESULTS_START + 3 * LANES))
+        slope_x = v8.load(spare, Index(RESULTS_START))
+        slope_y = v8.load(spare, Index(RESULTS_START + NUM_LANES))
+        puddle_order = v8.load(spare, Index(RESULTS_START + 2 * NUM_LANES))
+        track = v8.load(spare, Index(RESULTS_START + 3 * NUM_LANES))
         puddle = _smoothstep(
-            _linear(puddle_order - v8.splat(water.puddle_threshold), 0.5 / PUDDLE_RIM, 0.5)
+            _linear(puddle_order - v8.broadcast(water.puddle_threshold), 0.5 / PUDDLE_RIM, 0.5)
         )
-        puddle = v8.select(is_ground, puddle * v8.splat(water.wetness), _splat(0))
+        puddle = v8.select(is_ground, puddle * v8.broadcast(water.wetness), _splat(0))
         distance = v8.sqrt(_dot(px, py, pz, px, py, pz))
         inverse_distance = ones / distance
         footprint = v8.maximum(v8.negate(pz * inverse_distance), _splat(MIN_FOOTPRINT_SINE))
-        footprint = distance * v8.splat(lens[1]) / footprint
+        footprint = distance * v8.broadcast(lens[1]) / footprint
         coarse = _splat(COARSE_AMPLITUDE) * _clamp(
             _linear(footprint, -1 / COARSE_TEXEL_M, 2.0), 0.0, 1.0
         )
@@ -650,9 +673,9 @@ def _shade_row(
         cosine = v8.negate(_dot(nx, ny, nz, px, py, pz) * inverse_distance)
         cosine = _clamp(cosine, 0.005, 1.0)
         # The mirrored ray is 2 cosine normal - direction to the eye; find the point that it meets.
-        mx = px - v8.splat(offset[0])
-        my = py - v8.splat(offset[1])
-        mz = pz - v8.splat(offset[2])
+        mx = px - v8.broadcast(offset[0])
+        my = py - v8.broadcast(offset[1])
+        mz = pz - v8.broadcast(offset[2])
         column, row = _project(mirror, mx, my, mz)
         mirror_distance = _distance_at(mirror, mirror_depth, column, row, px, py, pz, texels, spare)
         double_cosine = cosine + cosine
@@ -663,22 +686,22 @@ def _shade_row(
             v8.fmuladd(mirror_distance, v8.fmuladd(pz, inverse_distance, double_cosine * nz), mz),
         )
         sigma = (
-            v8.splat(np.float32(2) / lens[1])
+            v8.broadcast(np.float32(2) / lens[1])
             * roughness
             * mirror_distance
             / (mirror_distance + distance)
         )
         sigma = sigma * sigma / (sigma + _splat(MIN_BLUR_PX))
-        sigma = v8.maximum(sigma * v8.splat(mirror.lens[1] * lens[1]), ones)
+        sigma = v8.maximum(sigma * v8.broadcast(mirror.lens[1] * lens[1]), ones)
         red, green, blue = _look_up_mirror(
             mirror, colors, levels, column, row, sigma, texels, spare
         )
         strength = ground_share * cover * _reflectance(cosine, roughness)
-        r, g, b_ = v8.load_colours(rgb, U(3) * pixel)
+        r, g, b_ = v8.load_colours(rgb, Index(3) * pixel)
         red = v8.select(is_ground, _mix_light(r, red, strength), r)
         green = v8.select(is_ground, _mix_light(g, green, strength), g)
         blue = v8.select(is_ground, _mix_light(b_, blue, strength), b_)
-        v8.store_colours(rgb, U(3) * pixel, red, green, blue)
+        v8.store_colours(rgb, Index(3) * pixel, red, green, blue)
 
 
 @kernel
@@ -715,15 +738,15 @@ def decode_srgb(rgb, linear):
     count = rgb.size
     for run in prange((count + VALUES_PER_TASK - 1) // VALUES_PER_TASK):
         start = np.int64(run) * VALUES_PER_TASK
-        for i in range(start, min(start + VALUES_PER_TASK, count), LANES):
-            at = U(min(i, count - LANES))
+        for i in range(start, min(start + VALUES_PER_TASK, count), NUM_LANES):
+            at = Index(min(i, count - NUM_LANES))
             v8.store(linear, at, _to_linear(v8.load(rgb, at)))
 
 
 # ---- Rings on a flood ----------------------------------------------------------------------------
 
 
-@inner()
+@kernel_function()
 def _add_rings_in_row(
     line, axes, centre, height, lens, rings, seed, timestamp_ns, nxs, nys, variance
 ):

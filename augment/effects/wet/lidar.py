@@ -22,16 +22,16 @@ import functools
 import numpy as np
 import torch
 
-from augment.effects.flood.flood import exact
+from augment.effects.flood.flood import fresnel_reflectance
 from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import ATTENUATED, UNCHANGED
 from augment.effects.wet.darkening import INNER_REFLECTANCE, REFRACTION_INDEX
 from augment.effects.wet.ground import WetGround
 from augment.effects.wet.kernels import (
     ASPHALT_ROUGHNESS,
+    EXPOSURE,
     FILM_SHARE,
     HEIGHT,
-    OPEN,
     PUDDLE_ORDER,
     PUDDLE_ROUGHNESS,
     SLOPE_X,
@@ -55,7 +55,9 @@ def mean_transmission(slope: float) -> np.ndarray:
     slopes = nodes * slope
     visible_area = cosines[:, None] + slopes * np.sqrt(1 - cosines[:, None] ** 2)
     incidence_cosine = np.clip(visible_area / np.sqrt(1 + slopes**2), 0, 1)
-    transmission = (1 - exact(torch.from_numpy(incidence_cosine), REFRACTION_INDEX).numpy()) ** 2
+    transmission = (
+        1 - fresnel_reflectance(torch.from_numpy(incidence_cosine), REFRACTION_INDEX).numpy()
+    ) ** 2
     weights = weights * np.maximum(visible_area, 0)
     return (weights * transmission).sum(1) / weights.sum(1)
 
@@ -90,9 +92,9 @@ def dim_wet_echoes(echoes: Echoes, ground: WetGround, wetness: float, puddles: f
     rows = np.flatnonzero(is_dry_surface & (echoes.ranges_m > 0))
     directions = echoes.directions[rows]
     x, y, z = (echoes.origins[rows] + echoes.ranges_m[rows, None] * directions).T
-    channels = ground.at(torch.from_numpy(x), torch.from_numpy(y)).double().numpy()
+    channels = ground.interpolate(torch.from_numpy(x), torch.from_numpy(y)).double().numpy()
     is_near = np.abs(z - channels[:, HEIGHT]) < MAX_GROUND_DISTANCE_M
-    local_wetness = wetness * np.where(is_near, channels[:, OPEN], 0.0)
+    local_wetness = wetness * np.where(is_near, channels[:, EXPOSURE], 0.0)
     slope = channels[:, [SLOPE_X, SLOPE_Y]]
     cosine = (slope * directions[:, :2]).sum(1) - directions[:, 2]
     cosine = np.clip(cosine / np.sqrt(1 + (slope**2).sum(1)), 0.0, 1.0)

@@ -37,11 +37,12 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.effects.wet import kernels
 from augment.effects.wet.darkening import to_display, to_linear
-from augment.effects.wet.ground import CELL_M, WetGround
+from augment.effects.wet.ground import GROUND_CELL_M, WetGround
 from augment.effects.wet.kernels import (
     ASPHALT_ROUGHNESS,
     COARSE_AMPLITUDE,
     COARSE_TEXEL_M,
+    EXPOSURE,
     FILM_SHARE,
     FINE_AMPLITUDE,
     FINE_TEXEL_M,
@@ -55,7 +56,6 @@ from augment.effects.wet.kernels import (
     MIN_GROUND_SHARE,
     MOTTLE_SIDE,
     NUM_LEVELS,
-    OPEN,
     PUDDLE_ORDER,
     PUDDLE_RIM,
     PUDDLE_ROUGHNESS,
@@ -69,7 +69,7 @@ from augment.effects.wet.kernels import (
 from augment.effects.wet.ripples import Rings, ring_arrays, ring_slopes
 from augment.geometry import rigid
 from augment.render.buffers import AUTO, CPU, choose_kernels
-from augment.render.layout import ABOVE, LANES, HeightClip
+from augment.render.layout import ABOVE, NUM_LANES, HeightClip
 from augment.render.threads import kernel_threads
 
 # ---- The plane and its mirrored camera -----------------------------------------------------------
@@ -142,7 +142,7 @@ def _sample_ground(camera: Camera, ground: WetGround) -> tuple[np.ndarray, np.nd
     points = points_on_rays[np.arange(len(rays)), first_step]
     channels = ground.nearest(points[:, 0], points[:, 1])
     points[:, 2] = channels[:, HEIGHT]
-    weights = np.where(is_hit, channels[:, OPEN], 0) / (1 + distances[first_step] / 10)
+    weights = np.where(is_hit, channels[:, EXPOSURE], 0) / (1 + distances[first_step] / 10)
     return points, weights
 
 
@@ -183,7 +183,7 @@ def blur_upright(
 
     backend: on the CPU OpenCV blurs, equal to the definition within float rounding.
     """
-    if choose_kernels(backend, rgb) == CPU and rgb.numel() >= LANES:
+    if choose_kernels(backend, rgb) == CPU and rgb.numel() >= NUM_LANES:
         linear = np.empty(tuple(rgb.shape), np.float32)
         with kernel_threads():
             kernels.decode_srgb(_flat_array(rgb), linear.reshape(-1))
@@ -307,7 +307,7 @@ def find_ground(
     Returns:
         The shares [H, W]; the first row with open ground, and one past the last.
     """
-    if choose_kernels(backend, depth, visible_share) == CPU and camera.width >= LANES:
+    if choose_kernels(backend, depth, visible_share) == CPU and camera.width >= NUM_LANES:
         share = np.empty(tuple(depth.shape), np.float32)
         row_max = np.empty(len(share), np.float32)
         flat_share = share.reshape(-1)
@@ -333,7 +333,7 @@ def find_ground(
     max_offset_m = MAX_GROUND_OFFSET_M + MAX_GROUND_OFFSET_PER_M * distance
     share = (
         visible_share
-        * channels[..., OPEN]
+        * channels[..., EXPOSURE]
         * (1 - _smoothstep(tolerance_m, max_offset_m, height_gap))
     )
     is_ground = (depth > 0) & depth.isfinite() & (points[..., 2] < 0) & (share > MIN_GROUND_SHARE)
@@ -349,7 +349,7 @@ def _ground_points(
     finite_depth = torch.where(depth.isfinite(), depth, 0.0).double()
     points = camera.ray_directions(torch.float64, depth.device) * finite_depth[..., None]
     eye = camera.centre.to(depth.device)
-    channels = ground.at(points[..., 0] + eye[0], points[..., 1] + eye[1])
+    channels = ground.interpolate(points[..., 0] + eye[0], points[..., 1] + eye[1])
     return points.float(), points.norm(dim=-1).float(), channels
 
 
@@ -376,7 +376,7 @@ def shade_wet(
         mirror: mirrored picture.
         backend: the CPU's kernel equals the definition within float rounding.
     """
-    is_wide_enough = camera.width >= LANES and mirror.camera.width >= 2
+    is_wide_enough = camera.width >= NUM_LANES and mirror.camera.width >= 2
     if choose_kernels(backend, rgb, depth, share) == CPU and rgb.is_contiguous() and is_wide_enough:
         with kernel_threads(ROWS_PER_TASK):
             kernels.shade_wet(
@@ -524,12 +524,12 @@ def _map_view(camera: Camera, ground: WetGround) -> tuple[kernels.MapView, np.nd
     """Return the view on the map, and the map, as kernels take them."""
     pose = camera.world_from_camera.numpy()
     place = np.ascontiguousarray(pose[:2, 3])
-    cells = (place - (ground.left_m, ground.bottom_m)) / CELL_M - 0.5
+    cells = (place - (ground.left_m, ground.bottom_m)) / GROUND_CELL_M - 0.5
     turns = [place / texel_m % MOTTLE_SIDE for texel_m in (COARSE_TEXEL_M, FINE_TEXEL_M)]
     view = kernels.MapView(
         _float_array(1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy),
         np.ascontiguousarray(pose[:3, :3], np.float32),
-        _float_array(*cells, 1 / CELL_M, pose[2, 3], *turns[0], *turns[1]),
+        _float_array(*cells, 1 / GROUND_CELL_M, pose[2, 3], *turns[0], *turns[1]),
         place,
         *ground.channels.shape[:2],
     )

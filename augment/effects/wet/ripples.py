@@ -60,7 +60,7 @@ class Rings(NamedTuple):
 
     share: float  # share of the squares' drops that fall
     variance: float  # variance of all slopes
-    unseen: float  # variance of the slopes of drops that are not drawn
+    undrawn_variance: float  # variance of the slopes of drops that are not drawn
     seed: int  # seed of the drops
     timestamp_ns: int  # the moment
 
@@ -134,7 +134,7 @@ def ring_slopes(
                 s = torch.where(crest_distance.abs() > RING_END_WIDTHS * RING_WIDTH_M, 0.0, s)
                 slope_x = slope_x + s * dx
                 slope_y = slope_y + s * dy
-    variance = rings.variance + (rings.unseen - rings.variance) * visible_share**2
+    variance = rings.variance + (rings.undrawn_variance - rings.variance) * visible_share**2
     return (slope_x * visible_share).float(), (slope_y * visible_share).float(), variance.float()
 
 
@@ -229,5 +229,5 @@ def add_ring_waves(
 
 def ring_arrays(rings: Rings) -> tuple[np.ndarray, np.uint64, np.int64]:
     """Return rings as kernels take them."""
-    numbers = np.array([rings.share, rings.variance, rings.unseen])
+    numbers = np.array([rings.share, rings.variance, rings.undrawn_variance])
     return numbers, np.uint64(rings.seed * 8 % 2**64), np.int64(rings.timestamp_ns)

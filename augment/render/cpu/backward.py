@@ -36,7 +36,7 @@ from augment.render.cpu.driver import (
     sort,
 )
 from augment.render.cpu.project import Splats
-from augment.render.layout import BLOCK, RECORD, SPLAT_ID, V_EYE
+from augment.render.layout import BLOCK_SIZE, RECORD, SPLAT_ID, V_EYE
 from augment.render.sh import sh_basis
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians
@@ -103,7 +103,7 @@ class Tape:
             d_alpha = d_alpha - np.where(is_covered, d_depth * self.expected_depth, np.float32(0))
         scratch = self.scratch
         inputs = self.inputs
-        slots = inputs.slots
+        slots = inputs.num_slots
         blocks = len(inputs.blocks)
         rows = scratch.array("grads", (slots, backward_kernels.NUM_GRADIENTS), np.float32)
         ids = scratch.array("grad_ids", (slots,), np.int32)
@@ -131,7 +131,7 @@ class Tape:
         slopes = backward_kernels.Slopes(*(None if i is None else i.reshape(-1) for i in images))
         with kernel_threads():
             sums, is_touched = self._sum_shares(slopes, StageTimer(None))
-        is_filled = np.arange(BLOCK) < self.splats.splat_counts[:, None]  # [B, BLOCK]
+        is_filled = np.arange(BLOCK_SIZE) < self.splats.splat_counts[:, None]  # [B, BLOCK]
         is_filled = is_filled.reshape(-1)
         records = self.splats.records.reshape(-1, RECORD)
         ids = records[is_filled, SPLAT_ID].view(np.int32)
@@ -146,7 +146,7 @@ class Tape:
         """Return the sums of all tiles' shares for every slot, and the slots that light reached."""
         scratch = self.scratch
         tile_splats = self.tile_splats
-        slots = self.inputs.slots
+        slots = self.inputs.num_slots
         entries = len(tile_splats.tile_splat_ids)
         shares = scratch.array("shares", (entries * backward_kernels.SHARE,), np.float32)
         num_reached = scratch.array("reached", (len(tile_splats.tile_offsets) - 1,), np.int64)
@@ -167,7 +167,7 @@ class Tape:
         return sums, is_touched
 
 
-def record(
+def record_render(
     inputs: Inputs,
     camera: Camera,
     settings: RasterSettings,
@@ -268,7 +268,7 @@ class _Rasterize(torch.autograd.Function):
             for part, part_tensors in zip(arguments.parts, _group_by_part(tensors), strict=True)
         ]
         inputs = gather_inputs(parts, arguments.camera, arguments.settings, None, with_color=True)
-        tape = record(
+        tape = record_render(
             inputs, arguments.camera, arguments.settings, Scratch(), with_depth=arguments.with_depth
         )
         ctx.tape = tape
@@ -317,7 +317,7 @@ def _part_gradients(
     show.
     """
     blocks = np.flatnonzero(grads.blocks[:, 0] == number)
-    block_rows = [np.arange(b * BLOCK, b * BLOCK + grads.counts[b]) for b in blocks]
+    block_rows = [np.arange(b * BLOCK_SIZE, b * BLOCK_SIZE + grads.counts[b]) for b in blocks]
     rows = np.concatenate(block_rows) if block_rows else np.zeros(0, np.int64)
     index = torch.from_numpy(grads.ids[rows].astype(np.int64))
     gradient_rows = torch.from_numpy(grads.rows[rows].copy())

@@ -41,17 +41,27 @@ from augment.render.cpu.geometry import (
     STARTS,
     dot,
     find_spans,
-    from_eye,
     list_items,
+    offsets_from_eye,
     rotation_row,
     semi_axes,
     stage,
     to_camera,
 )
-from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.cpu.project import add_direction_slopes
 from augment.render.cpu.simd import LOG2_E, floats_at
-from augment.render.layout import BLOCK, LANES, PIXELS, RECORD, STRIP, STRIPS, TILE_H, TILE_W, U
+from augment.render.layout import (
+    BLOCK_SIZE,
+    NUM_LANES,
+    PIXELS,
+    RECORD,
+    STRIP,
+    STRIPS,
+    TILE_H,
+    TILE_W,
+    Index,
+)
 
 # Sums of a list entry, one cache line: of g, g off, g off^2, g dy, g off dy, g dy^2, and of
 # |dL/d mean| along x (over 2 sharp) and y (over 2); then dL/d colour (3) and dL/d z.
@@ -59,7 +69,9 @@ SHARE = 16
 S_0, S_X, S_XX, S_Y, S_XY, S_YY, S_ABS_X, S_ABS_Y, S_RED, S_GREEN, S_BLUE, S_DEPTH = range(12)
 
 # Planes of a tile: transmittance as in blend, `behind`, and the pixel's gradients.
-TRANSMITTANCE, BEHIND, G_RED, G_GREEN, G_BLUE, G_ALPHA, G_DEPTH = (U(i * PIXELS) for i in range(7))
+TRANSMITTANCE, BEHIND, G_RED, G_GREEN, G_BLUE, G_ALPHA, G_DEPTH = (
+    Index(i * PIXELS) for i in range(7)
+)
 PLANES = 7 * PIXELS
 # Tiles that a thread takes at a time.
 GROUP = 4
@@ -127,23 +139,23 @@ def blend_backward(splats, frame, slopes, shares, num_reached):
             )
 
 
-@inner()
+@kernel_function()
 def _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_depth):
     """Load the gradients of a tile's pixels, and the sums that lie behind their first splat."""
-    for pixel in range(U(PIXELS)):
-        x = left + np.int64(pixel // U(STRIP) * U(LANES) + pixel % U(LANES))
-        y = top + np.int64(pixel % U(STRIP) // U(LANES))
+    for pixel in range(Index(PIXELS)):
+        x = left + np.int64(pixel // Index(STRIP) * Index(NUM_LANES) + pixel % Index(NUM_LANES))
+        y = top + np.int64(pixel % Index(STRIP) // Index(NUM_LANES))
         if x >= size[0] or y >= size[1]:
             state[pixel] = np.float32(-1)
-            for plane in range(U(1), U(7)):
-                state[plane * U(PIXELS) + pixel] = np.float32(0)
+            for plane in range(Index(1), Index(7)):
+                state[plane * Index(PIXELS) + pixel] = np.float32(0)
             continue
-        at = U(y * size[0] + x)
-        first = U(3) * at
+        at = Index(y * size[0] + x)
+        first = Index(3) * at
         red = d_rgb[first]
-        green = d_rgb[first + U(1)]
-        blue = d_rgb[first + U(2)]
-        behind = red * rgb[first] + green * rgb[first + U(1)] + blue * rgb[first + U(2)]
+        green = d_rgb[first + Index(1)]
+        blue = d_rgb[first + Index(2)]
+        behind = red * rgb[first] + green * rgb[first + Index(1)] + blue * rgb[first + Index(2)]
         behind += d_alpha[at] * alpha[at]
         state[pixel] = np.float32(1)
         state[G_RED + pixel] = red
@@ -156,7 +168,7 @@ def _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_dept
         state[BEHIND + pixel] = behind
 
 
-@inner()
+@kernel_function()
 def _replay_list(splats, first, last, corner, limits, work, d_depth, shares):
     """Fill the shares of a tile's list as far as light reaches, and return how far that is."""
     state = work.state
@@ -177,54 +189,56 @@ def _replay_list(splats, first, last, corner, limits, work, d_depth, shares):
     for at in range(first, last, BATCH):
         if is_closed(rows):
             return at - first
-        count = U(min(BATCH, last - at))
-        for k in range(U(at) + count, U(min(at + 2 * BATCH, last))):
-            v8.prefetch(records, U(ids[k]) * U(RECORD))
-        stage(records, ids, U(at), count, corner, staged)
-        for i in range(U(at) * U(SHARE), (U(at) + count) * U(SHARE)):
+        count = Index(min(BATCH, last - at))
+        for k in range(Index(at) + count, Index(min(at + 2 * BATCH, last))):
+            v8.prefetch(records, Index(ids[k]) * Index(RECORD))
+        stage(records, ids, Index(at), count, corner, staged)
+        for i in range(Index(at) * Index(SHARE), (Index(at) + count) * Index(SHARE)):
             shares[i] = np.float32(0)
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
             span_bits = find_spans(staged, count, strip, rows, limits[1], spans, starts)
-            list_items(staged, span_bits, U(strip), spans, starts, columns, values, places)
-            item = U(0)
-            while span_bits != U(0):
+            list_items(staged, span_bits, Index(strip), spans, starts, columns, values, places)
+            item = Index(0)
+            while span_bits != Index(0):
                 k = v8.lowest_bit(span_bits)
-                span_bits &= span_bits - U(1)
-                end = item + U(spans[U(BATCH) + k] - spans[k])
-                _add_share(work, k, item, end, limits, d_depth, shares, (U(at) + k) * U(SHARE))
+                span_bits &= span_bits - Index(1)
+                end = item + Index(spans[Index(BATCH) + k] - spans[k])
+                _add_share(
+                    work, k, item, end, limits, d_depth, shares, (Index(at) + k) * Index(SHARE)
+                )
                 item = end
             shrink(state, strip, rows, columns)
     return last - first
 
 
-@inner()
+@kernel_function()
 def _add_share(work, k, item, end, limits, d_depth, shares, share):
     """Blend one splat into its rows of a strip, and add its pixels' gradients to its share."""
     state = work.state
     staged = work.staged
     values = work.values
     places = work.places
-    n = U(BATCH)
-    alpha_max = v8.splat(limits[0])
-    log_cut = v8.splat(limits[1])
-    min_transmittance = v8.splat(limits[2])
-    stop = v8.splat(limits[7])
-    zeros = v8.splat(np.float32(0))
-    ones = v8.splat(np.float32(1))
+    n = Index(BATCH)
+    alpha_max = v8.broadcast(limits[0])
+    log_cut = v8.broadcast(limits[1])
+    min_transmittance = v8.broadcast(limits[2])
+    stop = v8.broadcast(limits[7])
+    zeros = v8.broadcast(np.float32(0))
+    ones = v8.broadcast(np.float32(1))
     # Shape and colour of the splat in all lanes.
-    sharp = staged[U(L.SHARP_X) * n + k]
-    fall = v8.splat(staged[U(L.FALL_Y) * n + k])
-    tilt = v8.splat(-sharp * staged[U(L.LEAN_X) * n + k])
-    steps = v8.splat(sharp)
-    ln2 = v8.splat(_LN2)
-    red = v8.splat(staged[U(L.RED) * n + k])
-    green = v8.splat(staged[U(L.GREEN) * n + k])
-    blue = v8.splat(staged[U(L.BLUE) * n + k])
+    sharp = staged[Index(L.SHARP_X) * n + k]
+    fall = v8.broadcast(staged[Index(L.FALL_Y) * n + k])
+    tilt = v8.broadcast(-sharp * staged[Index(L.LEAN_X) * n + k])
+    steps = v8.broadcast(sharp)
+    ln2 = v8.broadcast(_LN2)
+    red = v8.broadcast(staged[Index(L.RED) * n + k])
+    green = v8.broadcast(staged[Index(L.GREEN) * n + k])
+    blue = v8.broadcast(staged[Index(L.BLUE) * n + k])
     z = zeros
     if d_depth is not None:
-        z = v8.splat(staged[U(L.DEPTH) * n + k])
+        z = v8.broadcast(staged[Index(L.DEPTH) * n + k])
     # Sums over the pixels: of g and its products, of colour and depth, of |dL/d mean|.
     s0 = zeros
     sx = zeros
@@ -240,11 +254,11 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
     ay = zeros
     for i in range(item, end):
         # Alpha, weight and transmittance, as in the forward blend.
-        pixel = U(places[i]) % U(PLACES) * U(LANES)
-        row = np.float32(pixel % U(STRIP) // U(LANES)) + np.float32(0.5)
-        dy = v8.splat(row - staged[U(L.MEAN_Y) * n + k])
-        off = v8.fmuladd(steps, v8.lane_numbers(), v8.splat(values[i + U(ITEMS)]))
-        log_alpha = v8.fmuladd(v8.negate(off), off, v8.splat(values[i]))
+        pixel = Index(places[i]) % Index(PLACES) * Index(NUM_LANES)
+        row = np.float32(pixel % Index(STRIP) // Index(NUM_LANES)) + np.float32(0.5)
+        dy = v8.broadcast(row - staged[Index(L.MEAN_Y) * n + k])
+        off = v8.fmuladd(steps, v8.lane_numbers(), v8.broadcast(values[i + Index(ITEMS)]))
+        log_alpha = v8.fmuladd(v8.negate(off), off, v8.broadcast(values[i]))
         alpha = alpha_of(log_alpha, alpha_max, log_cut)
         transmittance = v8.load(state, pixel)
         weight = alpha * transmittance
@@ -272,8 +286,8 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
         # g = dL/de.
         by_alpha = transmittance * q - behind / (ones - alpha)
         # An alpha that is cut off, clamped or behind the stop has no gradient.
-        is_free = v8.both(
-            v8.both(v8.at_least(log_alpha, log_cut), is_blended), v8.greater(alpha_max, alpha)
+        is_free = v8.mask_and(
+            v8.mask_and(v8.at_least(log_alpha, log_cut), is_blended), v8.greater(alpha_max, alpha)
         )
         g = v8.select(is_free, by_alpha * alpha * ln2, zeros)
         g_off = g * off
@@ -291,7 +305,7 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
     shape = v8.totals(s0, sx, sxx, sy, sxy, syy, ax, ay)
     v8.store(shares, share, v8.load(shares, share) + shape)
     color = v8.totals(sr, sg, sb, sz, zeros, zeros, zeros, zeros)
-    v8.store(shares, share + U(8), v8.load(shares, share + U(8)) + color)
+    v8.store(shares, share + Index(8), v8.load(shares, share + Index(8)) + color)
 
 
 @kernel
@@ -306,23 +320,25 @@ def sum_shares(tile_splat_ids, tile_offsets, num_reached, shares, ranges, sums, 
     """
     slots = is_touched.size
     for run in prange(ranges):
-        low = U(slots * run // ranges)
-        high = U(slots * (run + 1) // ranges)
+        low = Index(slots * run // ranges)
+        high = Index(slots * (run + 1) // ranges)
         for slot in range(low, high):
             is_touched[slot] = 0
         for tile in range(num_reached.size):
-            for entry in range(U(tile_offsets[tile]), U(tile_offsets[tile] + num_reached[tile])):
-                slot = U(tile_splat_ids[entry])
+            for entry in range(
+                Index(tile_offsets[tile]), Index(tile_offsets[tile] + num_reached[tile])
+            ):
+                slot = Index(tile_splat_ids[entry])
                 if slot < low or slot >= high:
                     continue
-                at = slot * U(SHARE)
-                share = entry * U(SHARE)
+                at = slot * Index(SHARE)
+                share = entry * Index(SHARE)
                 if is_touched[slot] == 0:
                     is_touched[slot] = 1
-                    for i in range(U(0), U(SHARE), U(LANES)):
+                    for i in range(Index(0), Index(SHARE), Index(NUM_LANES)):
                         v8.store(sums, at + i, v8.load(shares, share + i))
                 else:
-                    for i in range(U(0), U(SHARE), U(LANES)):
+                    for i in range(Index(0), Index(SHARE), Index(NUM_LANES)):
                         total = v8.load(sums, at + i) + v8.load(shares, share + i)
                         v8.store(sums, at + i, total)
 
@@ -366,25 +382,25 @@ def project_backward(inputs, splats, is_touched, sums, grads, ids, counts):
         view = inputs.views[part]
         modes = inputs.modes
         addresses = inputs.addresses
-        slots = np.empty(BLOCK + LANES, np.int32)
-        gaussian_ids = np.empty(BLOCK + LANES, np.int32)
-        rows = np.empty((_SLOPES + NUM_GRADIENTS) * LANES, np.float32)
-        base = block * BLOCK
-        num_touched = U(0)
+        slots = np.empty(BLOCK_SIZE + NUM_LANES, np.int32)
+        gaussian_ids = np.empty(BLOCK_SIZE + NUM_LANES, np.int32)
+        rows = np.empty((_SLOPES + NUM_GRADIENTS) * NUM_LANES, np.float32)
+        base = block * BLOCK_SIZE
+        num_touched = Index(0)
         # Touched splats of the block, filled up to a whole group of eight.
         for slot in range(base, base + splats.splat_counts[block]):
             if is_touched[slot] != 0:
                 number = np.float32(records[slot * RECORD + L.SPLAT_ID]).view(np.int32)
                 slots[num_touched] = np.int32(slot)
                 gaussian_ids[num_touched] = number - np.int32(inputs.first_ids[part])
-                ids[U(base) + num_touched] = gaussian_ids[num_touched]
-                num_touched += U(1)
+                ids[Index(base) + num_touched] = gaussian_ids[num_touched]
+                num_touched += Index(1)
         counts[block] = num_touched
-        if num_touched == U(0):
+        if num_touched == Index(0):
             continue
-        for lane in range(U(LANES)):
-            slots[num_touched + lane] = slots[num_touched - U(1)]
-            gaussian_ids[num_touched + lane] = gaussian_ids[num_touched - U(1)]
+        for lane in range(Index(NUM_LANES)):
+            slots[num_touched + lane] = slots[num_touched - Index(1)]
+            gaussian_ids[num_touched + lane] = gaussian_ids[num_touched - Index(1)]
         # Arrays of the block's part.
         count, functions = inputs.sizes[part]
         means = floats_at(addresses[part, L.A_MEANS], count * 3)
@@ -393,11 +409,11 @@ def project_backward(inputs, splats, is_touched, sums, grads, ids, counts):
         sh = floats_at(addresses[part, L.A_SH], count * functions * 3)
         num_functions = min(modes[L.M_NUM_SH_FUNCTIONS], functions)
         # Gradients of eight Gaussians, then their rows.
-        for group in range(U(0), num_touched, U(LANES)):
+        for group in range(Index(0), num_touched, Index(NUM_LANES)):
             _color_backward(
                 sh,
-                U(functions),
-                U(num_functions),
+                Index(functions),
+                Index(num_functions),
                 means,
                 view,
                 slots,
@@ -410,45 +426,47 @@ def project_backward(inputs, splats, is_touched, sums, grads, ids, counts):
             _geometry_backward(
                 means, quats, scales, view, slots, gaussian_ids, group, modes, records, sums, rows
             )
-            for lane in range(min(U(LANES), num_touched - group)):
-                row = (U(base) + group + lane) * U(NUM_GRADIENTS)
-                for field in range(U(NUM_GRADIENTS)):
-                    grads[row + field] = rows[(U(_SLOPES) + field) * U(LANES) + lane]
+            for lane in range(min(Index(NUM_LANES), num_touched - group)):
+                row = (Index(base) + group + lane) * Index(NUM_GRADIENTS)
+                for field in range(Index(NUM_GRADIENTS)):
+                    grads[row + field] = rows[(Index(_SLOPES) + field) * Index(NUM_LANES) + lane]
 
 
-@inner()
+@kernel_function()
 def _write(rows, field, value):
-    v8.store(rows, U(_SLOPES + field) * U(LANES), value)
+    v8.store(rows, Index(_SLOPES + field) * Index(NUM_LANES), value)
 
 
-@inner()
+@kernel_function()
 def _color_backward(
     sh, functions, num_functions, means, view, slots, gaussian_ids, group, records, sums, rows
 ):
     """Write the rows of colour, and of the mean as far as the direction changes the colour."""
-    for lane in range(U(LANES)):
-        slot = U(slots[group + lane])
-        splat = U(gaussian_ids[group + lane])
-        share = slot * U(SHARE)
-        record = slot * U(RECORD)
+    for lane in range(Index(NUM_LANES)):
+        slot = Index(slots[group + lane])
+        splat = Index(gaussian_ids[group + lane])
+        share = slot * Index(SHARE)
+        record = slot * Index(RECORD)
         zeros = np.float32(0)
-        red = sums[share + U(S_RED)] if records[record + U(L.RED)] > zeros else zeros
-        green = sums[share + U(S_GREEN)] if records[record + U(L.GREEN)] > zeros else zeros
-        blue = sums[share + U(S_BLUE)] if records[record + U(L.BLUE)] > zeros else zeros
-        rows[U(_SLOPES + G_COLOR) * U(LANES) + lane] = red
-        rows[U(_SLOPES + G_COLOR + 1) * U(LANES) + lane] = green
-        rows[U(_SLOPES + G_COLOR + 2) * U(LANES) + lane] = blue
-        first = splat * functions * U(3)
-        for k in range(U(1), num_functions):
-            c = first + k * U(3)
-            rows[k * U(LANES) + lane] = red * sh[c] + green * sh[c + U(1)] + blue * sh[c + U(2)]
-    zeros = v8.splat(np.float32(0))
-    if num_functions == U(1):
+        red = sums[share + Index(S_RED)] if records[record + Index(L.RED)] > zeros else zeros
+        green = sums[share + Index(S_GREEN)] if records[record + Index(L.GREEN)] > zeros else zeros
+        blue = sums[share + Index(S_BLUE)] if records[record + Index(L.BLUE)] > zeros else zeros
+        rows[Index(_SLOPES + G_COLOR) * Index(NUM_LANES) + lane] = red
+        rows[Index(_SLOPES + G_COLOR + 1) * Index(NUM_LANES) + lane] = green
+        rows[Index(_SLOPES + G_COLOR + 2) * Index(NUM_LANES) + lane] = blue
+        first = splat * functions * Index(3)
+        for k in range(Index(1), num_functions):
+            c = first + k * Index(3)
+            rows[k * Index(NUM_LANES) + lane] = (
+                red * sh[c] + green * sh[c + Index(1)] + blue * sh[c + Index(2)]
+            )
+    zeros = v8.broadcast(np.float32(0))
+    if num_functions == Index(1):
         for axis in range(3):
             _write(rows, G_MEAN + axis, zeros)
         return
-    dx, dy, dz = from_eye(means, gaussian_ids, group, view)
-    inverse = v8.splat(np.float32(1)) / v8.sqrt(dot(dx, dy, dz, dx, dy, dz))
+    dx, dy, dz = offsets_from_eye(means, gaussian_ids, group, view)
+    inverse = v8.broadcast(np.float32(1)) / v8.sqrt(dot(dx, dy, dz, dx, dy, dz))
     x = dx * inverse
     y = dy * inverse
     z = dz * inverse
@@ -459,21 +477,21 @@ def _color_backward(
     _write(rows, G_MEAN + 2, (gz - radial * z) * inverse)
 
 
-@inner()
+@kernel_function()
 def _share(sums, slots, at, field):
     """Return one sum of eight splats."""
-    return v8.gather(sums, slots, at, U(SHARE), U(field))
+    return v8.gather(sums, slots, at, Index(SHARE), Index(field))
 
 
-@inner()
+@kernel_function()
 def _geometry_backward(
     means, quats, scales, view, slots, gaussian_ids, group, modes, records, sums, rows
 ):
     """Write the rows of mean, quaternion, scales and opacity, and those for densification."""
-    ones = v8.splat(np.float32(1))
-    two = v8.splat(np.float32(2))
-    k = v8.splat(np.float32(0.5) * LOG2_E)
-    x, y, z = to_camera(from_eye(means, gaussian_ids, group, view), view)
+    ones = v8.broadcast(np.float32(1))
+    two = v8.broadcast(np.float32(2))
+    k = v8.broadcast(np.float32(0.5) * LOG2_E)
+    x, y, z = to_camera(offsets_from_eye(means, gaussian_ids, group, view), view)
     inverse = ones / z
     right, down, sizes, jx, jy, m = semi_axes(
         quats, scales, gaussian_ids, group, x, y, inverse, view
@@ -481,13 +499,13 @@ def _geometry_backward(
     x0, x1, x2 = right
     y0, y1, y2 = down
     s0, s1, s2 = sizes
-    blur = v8.splat(view[L.V_BLUR])
+    blur = v8.broadcast(view[L.V_BLUR])
     xx = dot(x0, x1, x2, x0, x1, x2)
     yy = dot(y0, y1, y2, y0, y1, y2)
     cxx = xx + blur
     cyy = yy + blur
-    sharp_x = v8.gather(records, slots, group, U(RECORD), U(L.SHARP_X))
-    lean_x = v8.gather(records, slots, group, U(RECORD), U(L.LEAN_X))
+    sharp_x = v8.gather(records, slots, group, Index(RECORD), Index(L.SHARP_X))
+    lean_x = v8.gather(records, slots, group, Index(RECORD), Index(L.LEAN_X))
     variance_along_row = k / (sharp_x * sharp_x)
 
     # The conic: e = ... - sharp^2 (dx - lean dy)^2 - k / cyy dy^2, sharp^2 = k / along.
@@ -502,11 +520,11 @@ def _geometry_backward(
     g_yy = lean_x * lean_x * g_along - lean_x * g_lean + g_fall
     if modes[L.M_ANTIALIASED]:
         # log2 of opacity holds half of log2(det / det_blurred), det = |x cross y|^2.
-        half = v8.splat(np.float32(0.5) * _INVERSE_LN2) * sum_0
+        half = v8.broadcast(np.float32(0.5) * _INVERSE_LN2) * sum_0
         c0 = x1 * y2 - x2 * y1
         c1 = x2 * y0 - x0 * y2
         c2 = x0 * y1 - x1 * y0
-        tiny = v8.splat(np.float32(1e-30))
+        tiny = v8.broadcast(np.float32(1e-30))
         inverse_det = half / v8.maximum(dot(c0, c1, c2, c0, c1, c2), tiny)
         inverse_blurred = half / v8.maximum(variance_along_row * cyy, tiny)
         xy = lean_x * cyy
@@ -521,7 +539,7 @@ def _geometry_backward(
     abs_y = two * _share(sums, slots, group, S_ABS_Y)
     _write(rows, G_ABS_MEAN, v8.sqrt(v8.fmuladd(abs_x, abs_x, abs_y * abs_y)))
     _write(rows, G_MAX_SIGMA, v8.sqrt(v8.maximum(cxx, cyy)))
-    _write(rows, G_OPACITY, v8.splat(_INVERSE_LN2) * sum_0)
+    _write(rows, G_OPACITY, v8.broadcast(_INVERSE_LN2) * sum_0)
 
     # Semi-axes: xx = sum x_j^2, xy = sum x_j y_j, yy = sum y_j^2.
     two_xx = two * g_xx
@@ -566,42 +584,42 @@ def _geometry_backward(
     q0 = dot(b0, b1, b2, m[0], m[1], m[2])
     q1 = dot(b0, b1, b2, m[3], m[4], m[5])
     q2 = dot(b0, b1, b2, m[6], m[7], m[8])
-    zeros = v8.splat(np.float32(0))
-    t = rotation_row(view, U(2))
-    fx = v8.splat(view[L.V_FOCAL]) * inverse
-    fy = v8.splat(view[L.V_FOCAL + 1]) * inverse
-    u_low = v8.splat(view[L.V_LOW])
-    u_high = v8.splat(view[L.V_HIGH])
-    v_low = v8.splat(view[L.V_LOW + 1])
-    v_high = v8.splat(view[L.V_HIGH + 1])
+    zeros = v8.broadcast(np.float32(0))
+    t = rotation_row(view, Index(2))
+    fx = v8.broadcast(view[L.V_FOCAL]) * inverse
+    fy = v8.broadcast(view[L.V_FOCAL + 1]) * inverse
+    u_low = v8.broadcast(view[L.V_LOW])
+    u_high = v8.broadcast(view[L.V_HIGH])
+    v_low = v8.broadcast(view[L.V_LOW + 1])
+    v_high = v8.broadcast(view[L.V_HIGH + 1])
     raw_u = x * inverse
     raw_v = y * inverse
-    free_u = v8.both(v8.at_least(raw_u, u_low), v8.at_least(u_high, raw_u))
-    free_v = v8.both(v8.at_least(raw_v, v_low), v8.at_least(v_high, raw_v))
+    free_u = v8.mask_and(v8.at_least(raw_u, u_low), v8.at_least(u_high, raw_u))
+    free_v = v8.mask_and(v8.at_least(raw_v, v_low), v8.at_least(v_high, raw_v))
     g_u = v8.select(free_u, zeros - fx * dot(p0, p1, p2, t[0], t[1], t[2]), zeros)
     g_v = v8.select(free_v, zeros - fy * dot(q0, q1, q2, t[0], t[1], t[2]), zeros)
-    g_x = (g_u + g_px * v8.splat(view[L.V_FOCAL])) * inverse
-    g_y = (g_v + g_py * v8.splat(view[L.V_FOCAL + 1])) * inverse
+    g_x = (g_u + g_px * v8.broadcast(view[L.V_FOCAL])) * inverse
+    g_y = (g_v + g_py * v8.broadcast(view[L.V_FOCAL + 1])) * inverse
     g_z = dot(p0, p1, p2, jx[0], jx[1], jx[2]) + dot(q0, q1, q2, jy[0], jy[1], jy[2])
     g_z = _share(sums, slots, group, S_DEPTH) - g_z * inverse - g_x * raw_u - g_y * raw_v
     for axis in range(3):
-        at_axis = U(_SLOPES + G_MEAN + axis) * U(LANES)
+        at_axis = Index(_SLOPES + G_MEAN + axis) * Index(NUM_LANES)
         from_color = v8.load(rows, at_axis)
-        g = g_x * v8.splat(view[axis]) + g_y * v8.splat(view[3 + axis])
-        v8.store(rows, at_axis, from_color + v8.fmuladd(g_z, v8.splat(view[6 + axis]), g))
+        g = g_x * v8.broadcast(view[axis]) + g_y * v8.broadcast(view[3 + axis])
+        v8.store(rows, at_axis, from_color + v8.fmuladd(g_z, v8.broadcast(view[6 + axis]), g))
 
 
-@inner()
+@kernel_function()
 def _write_quats(quats, gaussian_ids, group, rows, g):
     """Write dL by the unit quaternion, without its radial part.
 
     g: dL by its rotation matrix, row by row.
     """
-    two = v8.splat(np.float32(2))
-    w = v8.gather(quats, gaussian_ids, group, U(4), U(0))
-    x = v8.gather(quats, gaussian_ids, group, U(4), U(1))
-    y = v8.gather(quats, gaussian_ids, group, U(4), U(2))
-    z = v8.gather(quats, gaussian_ids, group, U(4), U(3))
+    two = v8.broadcast(np.float32(2))
+    w = v8.gather(quats, gaussian_ids, group, Index(4), Index(0))
+    x = v8.gather(quats, gaussian_ids, group, Index(4), Index(1))
+    y = v8.gather(quats, gaussian_ids, group, Index(4), Index(2))
+    z = v8.gather(quats, gaussian_ids, group, Index(4), Index(3))
     g_w = two * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
     g_x = two * (
         w * (g[7] - g[5]) + y * (g[1] + g[3]) + z * (g[2] + g[6]) - two * x * (g[4] + g[8])

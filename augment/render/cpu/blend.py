@@ -41,19 +41,19 @@ from augment.render.cpu.geometry import (
     stage_lights,
     surface_depth,
 )
-from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.cpu.simd import ROWS, WIDE
 from augment.render.layout import (
     BIN_SHIFT,
-    BLOCK,
-    LANES,
+    BLOCK_SIZE,
+    NUM_LANES,
     PIXELS,
     RECORD,
     STRIP,
     STRIPS,
     TILE_H,
     TILE_W,
-    U,
+    Index,
 )
 from augment.render.mode_depth import BETA_PER_SIGMA, FARTHER, GAMMA, NEARER
 
@@ -82,7 +82,7 @@ def scatter_to_bins(keys, splat_counts, first_bin, heads, binned_keys, binned_sl
     """
     for block in prange(splat_counts.size):
         for i in range(splat_counts[block]):
-            slot = block * BLOCK + i
+            slot = block * BLOCK_SIZE + i
             key = keys[slot]
             z_bin = np.int64(key >> np.uint32(BIN_SHIFT)) - first_bin
             position = heads[block, z_bin]
@@ -105,11 +105,11 @@ def sort_bins(bin_starts, keys, slots, rects, spare_keys, spare_slots, sorted_re
             heads = np.empty(_DIGITS, np.int64)
             _sort_digit(keys, slots, spare_keys, spare_slots, first, last, 0, heads)
             _sort_digit(spare_keys, spare_slots, keys, slots, first, last, _DIGIT_BITS, heads)
-        for i in range(U(first), U(last)):
-            sorted_rects[i] = rects[U(slots[i])]
+        for i in range(Index(first), Index(last)):
+            sorted_rects[i] = rects[Index(slots[i])]
 
 
-@inner()
+@kernel_function()
 def _sort_few(keys, slots, first, last):
     """Sort a few splats by insertion."""
     for i in range(first + 1, last):
@@ -123,32 +123,32 @@ def _sort_few(keys, slots, first, last):
         slots[j] = slot
 
 
-@inner()
+@kernel_function()
 def _sort_digit(keys, slots, to_keys, to_slots, first, last, shift, heads):
     """Run one stable counting sort by a digit of the key."""
-    mask = U(_DIGITS - 1)
+    mask = Index(_DIGITS - 1)
     for digit in range(_DIGITS):
         heads[digit] = 0
-    for i in range(U(first), U(last)):
-        heads[(U(keys[i]) >> U(shift)) & mask] += 1
+    for i in range(Index(first), Index(last)):
+        heads[(Index(keys[i]) >> Index(shift)) & mask] += 1
     at = first
     for digit in range(_DIGITS):
         count = heads[digit]
         heads[digit] = at
         at += count
-    for i in range(U(first), U(last)):
-        digit = (U(keys[i]) >> U(shift)) & mask
+    for i in range(Index(first), Index(last)):
+        digit = (Index(keys[i]) >> Index(shift)) & mask
         at = heads[digit]
         heads[digit] = at + 1
-        to_keys[U(at)] = keys[i]
-        to_slots[U(at)] = slots[i]
+        to_keys[Index(at)] = keys[i]
+        to_slots[Index(at)] = slots[i]
 
 
-@inner()
+@kernel_function()
 def _unpack_rect(rect):
     """Return first column and row, last column and row of a splat's tiles."""
-    mask = U(0xFFFF)
-    return rect & mask, (rect >> U(16)) & mask, (rect >> U(32)) & mask, rect >> U(48)
+    mask = Index(0xFFFF)
+    return rect & mask, (rect >> Index(16)) & mask, (rect >> Index(32)) & mask, rect >> Index(48)
 
 
 @kernel
@@ -161,20 +161,20 @@ def count_corners(sorted_rects, first, last, columns, corners):
     corners: int32 [C, (rows + 1) (columns + 1)], written; each of C runs of splats has its own.
     """
     num_runs = corners.shape[0]
-    width = U(columns + 1)
+    width = Index(columns + 1)
     for run in prange(num_runs):
         for i in range(corners.shape[1]):
             corners[run, i] = 0
         run_corners = corners[run]
         start = first + (last - first) * run // num_runs
-        for i in range(U(start), U(first + (last - first) * (run + 1) // num_runs)):
+        for i in range(Index(start), Index(first + (last - first) * (run + 1) // num_runs)):
             c0, r0, c1, r1 = _unpack_rect(sorted_rects[i])
             top = r0 * width
-            bottom = (r1 + U(1)) * width
+            bottom = (r1 + Index(1)) * width
             run_corners[top + c0] += 1
-            run_corners[top + c1 + U(1)] -= 1
+            run_corners[top + c1 + Index(1)] -= 1
             run_corners[bottom + c0] -= 1
-            run_corners[bottom + c1 + U(1)] += 1
+            run_corners[bottom + c1 + Index(1)] += 1
 
 
 @kernel
@@ -192,14 +192,14 @@ def fill_lists(slots, sorted_rects, first, last, columns, heads, tile_splat_ids,
     for band in prange(bands):
         top = rows * band // bands
         bottom = rows * (band + 1) // bands - 1
-        for i in range(U(first), U(last)):
+        for i in range(Index(first), Index(last)):
             c0, r0, c1, r1 = _unpack_rect(sorted_rects[i])
-            for row in range(max(r0, U(top)), min(r1, U(bottom)) + U(1)):
-                base = row * U(columns)
-                for tile in range(base + c0, base + c1 + U(1)):
+            for row in range(max(r0, Index(top)), min(r1, Index(bottom)) + Index(1)):
+                base = row * Index(columns)
+                for tile in range(base + c0, base + c1 + Index(1)):
                     at = heads[tile]
                     if at >= 0:
-                        tile_splat_ids[U(at)] = slots[i]
+                        tile_splat_ids[Index(at)] = slots[i]
                         heads[tile] = at + 1
 
 
@@ -210,7 +210,7 @@ def fill_lists(slots, sorted_rects, first, last, columns, heads, tile_splat_ids,
 # Planes of a tile, from the caller's position on. For the running cluster: the depth with which it
 # began, and the sums of w, w (z - first) and w (z - first)^2. For the heaviest cluster: its weight
 # and its mode.
-FIRST, MASS, MOMENT, SQUARE, HEAVIEST, MODE = (U(i * PIXELS) for i in range(6))
+FIRST, MASS, MOMENT, SQUARE, HEAVIEST, MODE = (Index(i * PIXELS) for i in range(6))
 MODE_PLANES = 6
 
 # Limits of mode_depth, over the spread in beta and over its square.
@@ -224,7 +224,7 @@ _MODE_SHIFT = np.float32(GAMMA * BETA_PER_SIGMA)
 _SLACK = np.float32(1e-4)
 
 
-@inner()
+@kernel_function()
 def add_sample(state, at, depth, weight, floor):
     """Add the next samples of an item's pixels to their clusters.
 
@@ -253,7 +253,7 @@ def add_sample(state, at, depth, weight, floor):
     if v8.has_nonnegative_lane(new_cluster_sign):
         is_new = v8.at_least(new_cluster_sign, zeros)
         best = v8.load_as(depth, state, at + HEAVIEST)
-        is_heavier = v8.both(is_new, v8.greater(mass, best))
+        is_heavier = v8.mask_and(is_new, v8.greater(mass, best))
         mode = v8.select(
             is_heavier,
             _mode(first_depth, mass, moment, spread),
@@ -272,7 +272,7 @@ def add_sample(state, at, depth, weight, floor):
     v8.store(state, at + SQUARE, v8.fmuladd(weighted, depth_offset, square))
 
 
-@inner()
+@kernel_function()
 def can_grow(state, at, transmittance):
     """Return numbers that are not negative where the running cluster is the heaviest or may become
     it.
@@ -290,11 +290,11 @@ def can_grow(state, at, transmittance):
     )
 
 
-@inner()
+@kernel_function()
 def close_clusters(state, start):
     """Compare the last cluster, too, and leave the result in the plane MODE."""
-    for i in range(U(0), U(PIXELS), U(LANES)):
-        at = U(start) + i
+    for i in range(Index(0), Index(PIXELS), Index(NUM_LANES)):
+        at = Index(start) + i
         first_depth = v8.load(state, at + FIRST)
         mass = v8.load(state, at + MASS)
         moment = v8.load(state, at + MOMENT)
@@ -304,14 +304,14 @@ def close_clusters(state, start):
         v8.store(state, at + MODE, v8.select(is_heavier, mode, v8.load(state, at + MODE)))
 
 
-@inner()
+@kernel_function()
 def _spread(mass, moment, square):
     """Return mass^2 times the variance."""
     spread = v8.fmuladd(mass, square, v8.negate(moment * moment))
     return v8.maximum(spread, v8.broadcast_as(spread, np.float32(0)))
 
 
-@inner()
+@kernel_function()
 def _mode(first, mass, moment, spread):
     """Return the mode of a cluster."""
     return first + (moment - v8.broadcast_as(first, _MODE_SHIFT) * v8.sqrt(spread)) / mass
@@ -325,8 +325,8 @@ LINE = 16
 # Planes of a tile's state, PIXELS float32 each, strip after strip, row after row. The transmittance
 # is negative where blending has stopped; its absolute value is then the final one. An image needs
 # its plane and all planes before it, so the most expensive ones come last.
-TRANSMITTANCE, P_RED, P_GREEN, P_BLUE, P_OVERLAY = (U(i * PIXELS) for i in range(5))
-P_DEPTH, P_MEDIAN, P_BEST, P_ID, P_MODE = (U(i * PIXELS) for i in range(5, 10))
+TRANSMITTANCE, P_RED, P_GREEN, P_BLUE, P_OVERLAY = (Index(i * PIXELS) for i in range(5))
+P_DEPTH, P_MEDIAN, P_BEST, P_ID, P_MODE = (Index(i * PIXELS) for i in range(5, 10))
 # Numbers of a state for colour and alpha, for overlay besides, for all but mode depth, and for all.
 COLOR_STATE = 4 * PIXELS
 OVERLAY_STATE = 5 * PIXELS
@@ -426,7 +426,7 @@ def blend_tiles(splats, tiles, states, is_last, frame, images, buffer_bits):
         _blend_group(np.int64(group), splats, tiles, states, is_last, frame, images, buffer_bits)
 
 
-@inner()
+@kernel_function()
 def _blend_group(group, splats, tiles, states, is_last, frame, images, buffer_bits):
     """Blend the tiles of one group."""
     size = frame.size
@@ -457,19 +457,19 @@ def _blend_group(group, splats, tiles, states, is_last, frame, images, buffer_bi
         if tiles[tile] == FRESH:
             _clear(state, state_size, size[0] - left, size[1] - top)
         else:
-            _copy(states, U(tile * state_size), state, U(0), U(state_size))
+            _copy(states, Index(tile * state_size), state, Index(0), Index(state_size))
         # Fetch the pixels' cache lines for writing.
         for y in range(min(TILE_H, size[1] - top)):
-            at = U((top + y) * size[0] + left)
+            at = Index((top + y) * size[0] + left)
             v8.prefetch_to_write(images.alpha, at)
             if buffer_bits is None or buffer_bits & RGB:
-                for line in range(U(0), U(3 * TILE_W), U(LINE)):
-                    v8.prefetch_to_write(images.rgb, U(3) * at + line)
+                for line in range(Index(0), Index(3 * TILE_W), Index(LINE)):
+                    v8.prefetch_to_write(images.rgb, Index(3) * at + line)
         corner = (np.float32(left), np.float32(top))
         is_open = _blend_list(splats, first, last, corner, frame.limits, buffer_bits, work)
         # Keep the state for the next slice, or write the pixels.
         if is_open and not is_last:
-            _copy(state, U(0), states, U(tile * state_size), U(state_size))
+            _copy(state, Index(0), states, Index(tile * state_size), Index(state_size))
             tiles[tile] = OPEN
         else:
             if buffer_bits is not None and buffer_bits & MODES:
@@ -478,28 +478,28 @@ def _blend_group(group, splats, tiles, states, is_last, frame, images, buffer_bi
             tiles[tile] = CLOSED
 
 
-@inner()
+@kernel_function()
 def aligned_floats(count):
     """Return `count` float32 numbers that begin at a cache line."""
     buffer = np.empty(count + LINE, np.float32)
-    start_offset = (U(buffer.ctypes.data) // U(buffer.itemsize)) % U(LINE)
+    start_offset = (Index(buffer.ctypes.data) // Index(buffer.itemsize)) % Index(LINE)
     return buffer[LINE - np.int64(start_offset) :][:count]
 
 
-@inner()
+@kernel_function()
 def _copy(source, source_at, target, target_at, count):
-    for i in range(U(0), count, U(LANES)):
+    for i in range(Index(0), count, Index(NUM_LANES)):
         v8.store(target, target_at + i, v8.load(source, source_at + i))
 
 
-@inner()
+@kernel_function()
 def _clear(state, state_size, width, height):
     """Set a tile to its state before the first splat; pixels beyond the image count as finished."""
     no_splat_id = np.int32(-1).view(np.float32)
-    for i in range(U(0), U(state_size), U(LANES)):
+    for i in range(Index(0), Index(state_size), Index(NUM_LANES)):
         value = np.float32(1) if i < P_RED else np.float32(0)
         value = no_splat_id if P_ID <= i < P_MODE else value
-        v8.store(state, i, v8.splat(value))
+        v8.store(state, i, v8.broadcast(value))
     if width < TILE_W or height < TILE_H:
         for y in range(TILE_H):
             for x in range(TILE_W):
@@ -507,14 +507,14 @@ def _clear(state, state_size, width, height):
                     state[_place_of(x, y)] = np.float32(-1)
 
 
-@inner()
+@kernel_function()
 def _place_of(x, y):
     """Return the position of a tile's pixel in a plane of its state."""
-    row = x // LANES * TILE_H + y
-    return row // ROWS * WIDE + x % LANES * ROWS + row % ROWS
+    row = x // NUM_LANES * TILE_H + y
+    return row // ROWS * WIDE + x % NUM_LANES * ROWS + row % ROWS
 
 
-@inner()
+@kernel_function()
 def _blend_list(splats, first, last, corner, limits, buffer_bits, work):
     """Blend a tile's list into its state. Return True if any pixel still lets light through."""
     state = work.state
@@ -532,38 +532,47 @@ def _blend_list(splats, first, last, corner, limits, buffer_bits, work):
     for at in range(first, last, BATCH):
         if is_closed(rows):
             return False
-        count = U(min(BATCH, last - at))
+        count = Index(min(BATCH, last - at))
         # Fetch the next batch's records, then transpose this batch's records, lights and cuts.
-        for k in range(U(at) + count, U(min(at + 2 * BATCH, last))):
-            v8.prefetch(records, U(ids[k]) * U(RECORD))
-        stage(records, ids, U(at), count, corner, staged)
+        for k in range(Index(at) + count, Index(min(at + 2 * BATCH, last))):
+            v8.prefetch(records, Index(ids[k]) * Index(RECORD))
+        stage(records, ids, Index(at), count, corner, staged)
         any_cut = False
         if buffer_bits is not None:
             if buffer_bits & LIT_RGB:
-                stage_lights(splats.lights, ids, U(at), count, work.staged_lights)
+                stage_lights(splats.lights, ids, Index(at), count, work.staged_lights)
             if buffer_bits & CLIP:
                 has_surfaces = buffer_bits & SURFACES != 0
                 any_cut = stage_cuts(
-                    splats.cuts, ids, U(at), count, staged, has_surfaces, work.lines
+                    splats.cuts, ids, Index(at), count, staged, has_surfaces, work.lines
                 )
         # Strip by strip, list the items of the batch and blend them.
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
             span_bits = find_spans(staged, count, strip, rows, limits[1], spans, work.starts)
-            if span_bits == U(0):
+            if span_bits == Index(0):
                 continue
             items = list_items(
-                staged, span_bits, U(strip), spans, work.starts, columns, work.values, work.places
+                staged,
+                span_bits,
+                Index(strip),
+                spans,
+                work.starts,
+                columns,
+                work.values,
+                work.places,
             )
             batch_bits = buffer_bits
             if buffer_bits is not None:
                 if buffer_bits & CLIP and buffer_bits & SURFACES:
                     list_lines(
-                        work.lines, SURFACE, span_bits, spans, U(strip), columns, work.surfaces
+                        work.lines, SURFACE, span_bits, spans, Index(strip), columns, work.surfaces
                     )
                 if any_cut:
-                    list_lines(work.lines, SHARE, span_bits, spans, U(strip), columns, work.edges)
+                    list_lines(
+                        work.lines, SHARE, span_bits, spans, Index(strip), columns, work.edges
+                    )
                     batch_bits = buffer_bits | CUT
                 elif buffer_bits & ORDERED and not _can_change(
                     state, strip, rows, buffer_bits, columns
@@ -574,7 +583,7 @@ def _blend_list(splats, first, last, corner, limits, buffer_bits, work):
     return not is_closed(rows)
 
 
-@inner()
+@kernel_function()
 def _can_change(state, strip, rows, buffer_bits, columns):
     """Return True if a pixel of the strip may still find its median depth or a heavier splat or
     cluster.
@@ -585,7 +594,7 @@ def _can_change(state, strip, rows, buffer_bits, columns):
     possible_gain = v8.broadcast_as(columns, np.float32(-1))
     half = v8.broadcast_as(columns, np.float32(0.5))
     for row in range(rows[2 * strip] // ROWS * ROWS, rows[2 * strip + 1], ROWS):
-        at = U(strip * STRIP + row * LANES)
+        at = Index(strip * STRIP + row * NUM_LANES)
         transmittance = v8.load_as(columns, state, at)
         if buffer_bits & MEDIAN:
             possible_gain = v8.maximum(possible_gain, transmittance - half)
@@ -598,7 +607,7 @@ def _can_change(state, strip, rows, buffer_bits, columns):
     return v8.has_nonnegative_lane(possible_gain)
 
 
-@inner()
+@kernel_function()
 def is_closed(rows):
     """Return True if no strip has an open row."""
     has_no_open_row = True
@@ -607,7 +616,7 @@ def is_closed(rows):
     return has_no_open_row
 
 
-@inner()
+@kernel_function()
 def shrink(state, strip, rows, columns):
     """Leave out a strip's first and last rows while none of their pixels is open."""
     low = rows[2 * strip]
@@ -620,23 +629,23 @@ def shrink(state, strip, rows, columns):
     rows[2 * strip + 1] = high
 
 
-@inner()
+@kernel_function()
 def _is_open(state, strip, row, columns):
     """Return True if a pixel of the row lets light through."""
     rows_per_item = v8.rows_in(columns)
-    first = U(row) - U(row) % rows_per_item
-    transmittance = v8.load_as(columns, state, U(strip * STRIP) + first * U(LANES))
-    if rows_per_item == U(1):
+    first = Index(row) - Index(row) % rows_per_item
+    transmittance = v8.load_as(columns, state, Index(strip * STRIP) + first * Index(NUM_LANES))
+    if rows_per_item == Index(1):
         return v8.has_nonnegative_lane(transmittance)
     row_numbers = v8.row_numbers(columns)
-    is_row = v8.broadcast_as(columns, np.float32(U(row) - first))
-    is_row = v8.both(v8.at_least(row_numbers, is_row), v8.at_least(is_row, row_numbers))
+    is_row = v8.broadcast_as(columns, np.float32(Index(row) - first))
+    is_row = v8.mask_and(v8.at_least(row_numbers, is_row), v8.at_least(is_row, row_numbers))
     return v8.has_nonnegative_lane(
         v8.select(is_row, transmittance, v8.broadcast_as(columns, np.float32(-1)))
     )
 
 
-@inner()
+@kernel_function()
 def _blend_items(work, items, columns, limits, buffer_bits):
     """Blend all items in turn. The next item's alpha is begun before an item is blended."""
     state = work.state
@@ -650,25 +659,27 @@ def _blend_items(work, items, columns, limits, buffer_bits):
     min_transmittance = v8.broadcast_as(columns, limits[2])
     stop = v8.broadcast_as(columns, limits[7])
     zeros = v8.broadcast_as(columns, np.float32(0))
-    n = U(BATCH)
+    n = Index(BATCH)
     ends_early = limits[7] > limits[2]
     places[items] = 0  # one item is read beyond the last
-    item_code = U(places[0])
-    next_log_alpha = log2_alpha(staged, values, item_code // U(PLACES), U(0), columns)
+    item_code = Index(places[0])
+    next_log_alpha = log2_alpha(staged, values, item_code // Index(PLACES), Index(0), columns)
     next_alpha = alpha_of(next_log_alpha, alpha_max, log_cut)
     for item in range(items):
         # Take this item's alpha, and begin the next item's.
-        splat = item_code // U(PLACES)
-        place = item_code % U(PLACES)
+        splat = item_code // Index(PLACES)
+        place = item_code % Index(PLACES)
         log_alpha = next_log_alpha
         alpha = next_alpha
-        item_code = U(places[item + U(1)])
-        next_log_alpha = log2_alpha(staged, values, item_code // U(PLACES), item + U(1), columns)
+        item_code = Index(places[item + Index(1)])
+        next_log_alpha = log2_alpha(
+            staged, values, item_code // Index(PLACES), item + Index(1), columns
+        )
         next_alpha = alpha_of(next_log_alpha, alpha_max, log_cut)
         if buffer_bits is not None and buffer_bits & CUT:
             alpha = alpha * kept_share(lines, work.edges, splat, item, columns)
         # Weight of the splat, and the transmittance that remains.
-        at = place * U(WIDE)
+        at = place * Index(WIDE)
         transmittance = v8.load_as(columns, state, at)
         weight = alpha * transmittance
         transmittance_behind = transmittance - weight
@@ -682,21 +693,21 @@ def _blend_items(work, items, columns, limits, buffer_bits):
         weight = v8.select(is_blended, weight, zeros)
         # Sums of the images that are asked for.
         if buffer_bits is None or buffer_bits & RGB:
-            _add(state, at + P_RED, weight, staged[U(L.RED) * n + splat])
-            _add(state, at + P_GREEN, weight, staged[U(L.GREEN) * n + splat])
-            _add(state, at + P_BLUE, weight, staged[U(L.BLUE) * n + splat])
+            _add(state, at + P_RED, weight, staged[Index(L.RED) * n + splat])
+            _add(state, at + P_GREEN, weight, staged[Index(L.GREEN) * n + splat])
+            _add(state, at + P_BLUE, weight, staged[Index(L.BLUE) * n + splat])
         if buffer_bits is not None:
             if buffer_bits & LIT_RGB and is_lit(staged_lights, splat):
                 share = weight * light_share(
                     staged_lights, staged, splat, log_alpha, place, columns, limits
                 )
-                _add(state, at + P_RED, share, staged_lights[U(L_RED) * n + splat])
-                _add(state, at + P_GREEN, share, staged_lights[U(L_GREEN) * n + splat])
-                _add(state, at + P_BLUE, share, staged_lights[U(L_BLUE) * n + splat])
+                _add(state, at + P_RED, share, staged_lights[Index(L_RED) * n + splat])
+                _add(state, at + P_GREEN, share, staged_lights[Index(L_GREEN) * n + splat])
+                _add(state, at + P_BLUE, share, staged_lights[Index(L_BLUE) * n + splat])
             if buffer_bits & OVERLAY:
-                _add(state, at + P_OVERLAY, weight, staged[U(L.IS_OVERLAY) * n + splat])
+                _add(state, at + P_OVERLAY, weight, staged[Index(L.IS_OVERLAY) * n + splat])
             if buffer_bits & SURFACES:
-                centre = staged[U(L.DEPTH) * n + splat]
+                centre = staged[Index(L.DEPTH) * n + splat]
                 depth = v8.broadcast_as(columns, centre)
                 if buffer_bits & CLIP:
                     depth = surface_depth(
@@ -709,41 +720,41 @@ def _blend_items(work, items, columns, limits, buffer_bits):
                     add_sample(state, at + P_MODE, depth, weight, limits[4])
             if buffer_bits & MEDIAN:
                 half = v8.broadcast_as(columns, np.float32(0.5))
-                has_crossed = v8.both(
+                has_crossed = v8.mask_and(
                     v8.at_least(transmittance, half), v8.greater(half, transmittance_behind)
                 )
-                depth = v8.broadcast_as(columns, staged[U(L.DEPTH) * n + splat])
+                depth = v8.broadcast_as(columns, staged[Index(L.DEPTH) * n + splat])
                 previous = v8.load_as(columns, state, at + P_MEDIAN)
                 v8.store(
                     state,
                     at + P_MEDIAN,
-                    v8.select(v8.both(has_crossed, is_blended), depth, previous),
+                    v8.select(v8.mask_and(has_crossed, is_blended), depth, previous),
                 )
             if buffer_bits & IDS:
                 best = v8.load_as(columns, state, at + P_BEST)
                 is_heavier = v8.greater(weight, best)
                 v8.store(state, at + P_BEST, v8.select(is_heavier, weight, best))
-                number = v8.broadcast_as(columns, staged[U(L.SPLAT_ID) * n + splat])
+                number = v8.broadcast_as(columns, staged[Index(L.SPLAT_ID) * n + splat])
                 previous = v8.load_as(columns, state, at + P_ID)
                 v8.store(state, at + P_ID, v8.select(is_heavier, number, previous))
 
 
-@inner()
+@kernel_function()
 def log2_alpha(staged, values, splat, item, columns):
     """Return the log2 of a splat's alpha at an item's pixels (see augment.render.layout)."""
-    sharp = v8.broadcast_as(columns, staged[U(L.SHARP_X) * U(BATCH) + splat])
-    rows = U(ITEMS) // v8.rows_in(columns)
+    sharp = v8.broadcast_as(columns, staged[Index(L.SHARP_X) * Index(BATCH) + splat])
+    rows = Index(ITEMS) // v8.rows_in(columns)
     off = v8.fmuladd(sharp, columns, v8.by_row(columns, values, item + rows))
     return v8.fmuladd(v8.negate(off), off, v8.by_row(columns, values, item))
 
 
-@inner()
+@kernel_function()
 def alpha_of(log_alpha, alpha_max, log_cut):
     """Return alpha from its log2: 0 below the cut, at most alpha_max."""
     return v8.minimum(v8.exp2_where(v8.at_least(log_alpha, log_cut), log_alpha), alpha_max)
 
 
-@inner()
+@kernel_function()
 def remaining_transmittance(transmittance, transmittance_behind, is_blended, stop):
     """Return the transmittance behind a splat, negative where the pixel is finished.
 
@@ -753,38 +764,38 @@ def remaining_transmittance(transmittance, transmittance_behind, is_blended, sto
     return v8.select(v8.greater(transmittance_behind, stop), transmittance_behind, final)
 
 
-@inner()
+@kernel_function()
 def _add(state, at, weight, value):
     before = v8.load_as(weight, state, at)
     v8.store(state, at, v8.fmuladd(weight, v8.broadcast_as(weight, value), before))
 
 
-@inner()
+@kernel_function()
 def _write_pixels(state, left, top, size, images, buffer_bits):
     """Write the pixels of a finished tile to the images."""
     columns = v8.wide_columns()
-    ones = v8.splat(np.float32(1))
-    min_weight = v8.splat(np.float32(DEPTH_EPS))
-    for y in range(U(min(TILE_H, size[1] - top))):
-        for strip in range(U(STRIPS)):
-            column = left + np.int64(strip) * LANES
-            at = U(_place_of(np.int64(strip) * LANES, np.int64(y)))
-            pixel = U((top + np.int64(y)) * size[0] + column)
-            count = min(LANES, size[0] - column)
+    ones = v8.broadcast(np.float32(1))
+    min_weight = v8.broadcast(np.float32(DEPTH_EPS))
+    for y in range(Index(min(TILE_H, size[1] - top))):
+        for strip in range(Index(STRIPS)):
+            column = left + np.int64(strip) * NUM_LANES
+            at = Index(_place_of(np.int64(strip) * NUM_LANES, np.int64(y)))
+            pixel = Index((top + np.int64(y)) * size[0] + column)
+            count = min(NUM_LANES, size[0] - column)
             opacity = ones - v8.absolute(v8.load_row(columns, state, at))
             _write(images.alpha, pixel, opacity, count)
             if buffer_bits is None or buffer_bits & RGB:
                 red = v8.load_row(columns, state, at + P_RED)
                 green = v8.load_row(columns, state, at + P_GREEN)
                 blue = v8.load_row(columns, state, at + P_BLUE)
-                if count >= LANES:
-                    v8.store_colours(images.rgb, U(3) * pixel, red, green, blue)
+                if count >= NUM_LANES:
+                    v8.store_colours(images.rgb, Index(3) * pixel, red, green, blue)
                 else:
-                    for k in range(U(count)):
-                        first = U(3) * (pixel + k)
+                    for k in range(Index(count)):
+                        first = Index(3) * (pixel + k)
                         images.rgb[first] = v8.lane(red, k)
-                        images.rgb[first + U(1)] = v8.lane(green, k)
-                        images.rgb[first + U(2)] = v8.lane(blue, k)
+                        images.rgb[first + Index(1)] = v8.lane(green, k)
+                        images.rgb[first + Index(2)] = v8.lane(blue, k)
             if buffer_bits is not None:
                 if buffer_bits & EXPECTED:
                     weighted = v8.load_row(columns, state, at + P_DEPTH)
@@ -804,11 +815,11 @@ def _write_pixels(state, left, top, size, images, buffer_bits):
                     _write(images.overlay, pixel, value, count)
 
 
-@inner()
+@kernel_function()
 def _write(image, at, values, count):
     """Write the first of eight values, as many as lie in the image."""
-    if count >= LANES:
+    if count >= NUM_LANES:
         v8.store(image, at, values)
     else:
         for k in range(count):
-            image[at + U(k)] = v8.lane(values, U(k))
+            image[at + Index(k)] = v8.lane(values, Index(k))

@@ -74,7 +74,7 @@ class Inputs:
     views: np.ndarray
     blocks: np.ndarray
     modes: np.ndarray
-    kept_alive: list[Any]
+    array_owners: list[Any]
     orders: np.ndarray | None = None
 
     @property
@@ -91,9 +91,9 @@ class Inputs:
         return self.orders is not None and bool(self.orders.any())
 
     @property
-    def slots(self) -> int:
+    def num_slots(self) -> int:
         """Number of slots: room for every Gaussian, block by block."""
-        return len(self.blocks) * layout.BLOCK
+        return len(self.blocks) * layout.BLOCK_SIZE
 
 
 def gather_inputs(
@@ -104,7 +104,7 @@ def gather_inputs(
     clip: HeightClip | None = None,
     *,
     with_color: bool,
-    culled: bool = False,
+    is_culled: bool = False,
 ) -> Inputs:
     """Return addresses and numbers of all parts. Contiguous tensors are not copied.
 
@@ -124,11 +124,13 @@ def gather_inputs(
     for number, part in enumerate(parts):
         gaussians = part.gaussians
         count = len(part.gaussians)
-        order = spatial_order(gaussians) if culled and part.rows is None else None
+        order = spatial_order(gaussians) if is_culled and part.rows is None else None
         if order is None:
             rows = np.array([[0, count]]) if part.rows is None else part.rows
             block_rows = (
-                _split_into_blocks(rows) if count > layout.BLOCK or part.rows is not None else rows
+                _split_into_blocks(rows)
+                if count > layout.BLOCK_SIZE or part.rows is not None
+                else rows
             )
             geometry_arrays = [
                 gaussians.means,
@@ -165,17 +167,19 @@ def gather_inputs(
         views=views_of(parts, camera, settings, fog, clip),
         blocks=np.array(blocks, np.int64).reshape(-1, 3),
         modes=modes,
-        kept_alive=kept_alive,
+        array_owners=kept_alive,
         orders=np.array(orders, np.uint64),
     )
 
 
 def _split_into_blocks(rows: np.ndarray) -> np.ndarray:
     """Return runs of rows (first, last + 1) in pieces of at most a block, int64 [B, 2]."""
-    counts = -(-(rows[:, 1] - rows[:, 0]) // layout.BLOCK)
+    counts = -(-(rows[:, 1] - rows[:, 0]) // layout.BLOCK_SIZE)
     run = np.repeat(np.arange(len(rows)), counts)
-    first = rows[run, 0] + layout.BLOCK * (np.arange(len(run)) - (counts.cumsum() - counts)[run])
-    return np.stack([first, np.minimum(first + layout.BLOCK, rows[run, 1])], 1)
+    first = rows[run, 0] + layout.BLOCK_SIZE * (
+        np.arange(len(run)) - (counts.cumsum() - counts)[run]
+    )
+    return np.stack([first, np.minimum(first + layout.BLOCK_SIZE, rows[run, 1])], 1)
 
 
 _KERNEL_DTYPES = (torch.float32, torch.int16)
@@ -193,7 +197,7 @@ def _appearance_arrays(part: PosedGaussians) -> tuple[torch.Tensor, torch.Tensor
         slopes = part.shading.slopes
     if part.color_maps is not None:
         maps = part.color_maps
-    return slopes, maps, map_rows if part.map_rows is None else part.map_rows
+    return slopes, maps, map_rows if part.color_map_rows is None else part.color_map_rows
 
 
 def _as_kernel_array(array: Any) -> Any:
@@ -301,7 +305,7 @@ def rasterize_cpu(
     timer = StageTimer(stage_times)
     settings = cut_in_fog(settings, fog, clip, buffers)
     inputs = gather_inputs(
-        parts, camera, settings, fog, clip, with_color=RGB in buffers, culled=True
+        parts, camera, settings, fog, clip, with_color=RGB in buffers, is_culled=True
     )
     images = image_arrays(camera, buffers)
     with borrowed_scratch() as scratch, kernel_threads():
@@ -368,7 +372,7 @@ def rank(inputs: Inputs, camera: Camera, scratch: Scratch) -> tuple[np.ndarray, 
         z [slots], 0 for a Gaussian that cannot be seen, and the bins of z where the slices begin
         and end.
     """
-    depths = scratch.array("depths", (inputs.slots,), np.float32)
+    depths = scratch.array("depths", (inputs.num_slots,), np.float32)
     histograms = scratch.array("histograms", (_RANK_RUNS, 2, layout.BINS), np.float64)
     project_kernels.rank_splats(inputs.read, depths, histograms)
     cover, counts = histograms.sum(0)
@@ -409,12 +413,12 @@ def project(
 ) -> project_kernels.Splats:
     """Return the slice's splats. Cuts and lights are empty if no part needs them."""
     blocks = len(inputs.blocks)
-    cuts = geometry.CUT * inputs.slots if inputs.modes[layout.M_CLIP] else 0
-    lights = geometry.SHADING_LINES * inputs.slots if inputs.modes[layout.M_LIGHT] else 0
+    cuts = geometry.CUT * inputs.num_slots if inputs.modes[layout.M_CLIP] else 0
+    lights = geometry.SHADING_LINES * inputs.num_slots if inputs.modes[layout.M_LIGHT] else 0
     splats = project_kernels.Splats(
-        scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
-        scratch.array("rects", (inputs.slots,), np.uint64),
-        scratch.array("keys", (inputs.slots,), np.uint32),
+        scratch.array("records", (inputs.num_slots * layout.RECORD,), np.float32),
+        scratch.array("rects", (inputs.num_slots,), np.uint64),
+        scratch.array("keys", (inputs.num_slots,), np.uint32),
         scratch.array("splat_counts", (blocks,), np.int64),
         scratch.array("bin_counts", (blocks, bins[1] - bins[0]), np.int32),
         scratch.array("cuts", (cuts,), np.float32),

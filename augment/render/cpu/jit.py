@@ -34,7 +34,9 @@ _COMMON = {"nogil": True, "error_model": "numpy"}
 KERNELS: dict[str, Any] = {}
 
 # Decorator of a function that kernels call; they keep its code in their own cache files.
-inner = functools.partial(numba.njit, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_COMMON)
+kernel_function = functools.partial(
+    numba.njit, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_COMMON
+)
 
 
 def _hash_sources() -> str:

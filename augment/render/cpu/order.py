@@ -31,7 +31,7 @@ from augment.scene import Gaussians, PosedGaussians
 # Gaussians of a cell.
 CELL_SIZE = 512
 # Cells of a block.
-_CELLS_PER_BLOCK = layout.BLOCK // CELL_SIZE
+_CELLS_PER_BLOCK = layout.BLOCK_SIZE // CELL_SIZE
 # Smallest number of Gaussians for which an order is made: fewer are read as quickly as their boxes.
 _MIN_COUNT = 32 * CELL_SIZE
 # Smallest share of Gaussians too faint for any view at which leaving them out pays.
@@ -145,7 +145,7 @@ class Order(NamedTuple):
         is_visible &= ~(self.sorted(gaussians.opacities).largest < np.float32(ALPHA_MIN))
         return _blocks_of(is_visible, len(self.ids))
 
-    def without(self, faint: np.ndarray, means: np.ndarray) -> Order:
+    def without_faint(self, faint: np.ndarray, means: np.ndarray) -> Order:
         """Return the order of the other Gaussians.
 
         Args:
@@ -205,7 +205,9 @@ def _order_of_visible(gaussians: Gaussians, mean_uses: _Uses) -> Order | None:
         opacity_uses.parent_order = opacity_uses.order = mean_uses.order
         is_faint = gaussians.opacities.detach().numpy() < np.float32(ALPHA_MIN)
         if _MIN_FAINT_SHARE * len(is_faint) < np.count_nonzero(is_faint) < len(is_faint):
-            opacity_uses.order = mean_uses.order.without(is_faint, gaussians.means.detach().numpy())
+            opacity_uses.order = mean_uses.order.without_faint(
+                is_faint, gaussians.means.detach().numpy()
+            )
     return opacity_uses.order
 
 
@@ -265,7 +267,7 @@ def cut_in_fog(
     """Return the settings. Their fog_cut is 0 unless only colour and alpha of a whole image are
     asked for.
     """
-    is_hidden = fog is not None and fog.sigma_per_m > 0
+    is_hidden = fog is not None and fog.extinction_per_m > 0
     if is_hidden and clip is None and buffers <= {RGB, ALPHA}:
         return settings
     return replace(settings, fog_cut=0.0)
@@ -297,7 +299,7 @@ def find_visible_boxes(
         nearest, farthest = (
             (low_heights, high_heights) if clip.sign > 0 else (-high_heights, -low_heights)
         )
-        is_visible &= ~((farthest < 0) | (nearest > clip.reach_m))
+        is_visible &= ~((farthest < 0) | (nearest > clip.max_distance_m))
     if fog is not None and settings.fog_cut > 0:
         depths = _min_optical_depth(bounds, pose, camera, fog)
         is_visible &= ~(depths > -math.log(settings.fog_cut))
@@ -313,7 +315,7 @@ def _heights(
         shift = float(up @ pose[:3, 3])
         up = up @ pose[:3, :3]
     middle = bounds.centres @ up + shift
-    extent = bounds.halves @ np.abs(up) + MAX_EXTENT_SIGMAS * bounds.longest
+    extent = bounds.halves @ np.abs(up) + MAX_EXTENT_SIGMAS * bounds.max_scales
     extent += _ROUNDING * (np.abs(middle) + extent)
     return middle - extent, middle + extent
 
@@ -332,11 +334,11 @@ def _min_optical_depth(
     is_layered = fog.scale_height_m is not None
     halves = bounds.halves
     if is_layered:  # rays must not climb out: the sky shows where splats are left out
-        halves = halves + (MAX_EXTENT_SIGMAS * bounds.longest)[:, None]
+        halves = halves + (MAX_EXTENT_SIGMAS * bounds.max_scales)[:, None]
     offsets = np.maximum(np.abs(eye - bounds.centres) - halves, 0)
     distance = np.linalg.norm(offsets, axis=1) * (1 - _ROUNDING)
     if not is_layered:
-        return fog.sigma_per_m * distance
+        return fog.extinction_per_m * distance
     blur = _BLUR_PX * distance / min(camera.fx, camera.fy)
     highest_z_m = _heights(bounds, pose, np.array([0.0, 0.0, 1.0]))[1] + blur
     return optical_depth_numpy(fog, distance, float(camera.centre[2]), highest_z_m)

@@ -25,7 +25,7 @@ from numba.core import codegen, config, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-from augment.render.cpu.jit import inner
+from augment.render.cpu.jit import kernel_function
 
 # Lanes of float8.
 LANES = 8
@@ -326,7 +326,7 @@ _ternary = _operation(_Floats, *[_Floats] * 3)
 _comparison = _operation(_Masks, _Floats, _Floats)
 
 # The same number in all lanes, of eight or of the vector's; 0, 1, ... 7; a b + c, rounded once.
-splat = _operation(float8, types.float32)(lambda b, value: _broadcast(b, value, LANES))
+broadcast = _operation(float8, types.float32)(lambda b, value: _broadcast(b, value, LANES))
 broadcast_as = _operation(_Floats, _Floats, types.float32)(
     lambda b, vector, value: _broadcast(b, value, vector.type.count)
 )
@@ -343,7 +343,7 @@ maximum = _binary(lambda b, *args: b.select(b.fcmp_ordered(">", *args), *args))
 # Masks of the lanes where a > b, or a >= b (not where either is NaN), and of lanes in both masks.
 greater = _comparison(lambda b, *args: b.fcmp_ordered(">", *args))
 at_least = _comparison(lambda b, *args: b.fcmp_ordered(">=", *args))
-both = _operation(_Masks, _Masks, _Masks)(lambda b, *masks: b.and_(*masks))
+mask_and = _operation(_Masks, _Masks, _Masks)(lambda b, *masks: b.and_(*masks))
 # a in the lanes of the mask, b in the others: select(mask, a, b).
 select = _operation(_Floats, _Masks, _Floats, _Floats)(lambda b, *args: b.select(*args))
 # One bit for each lane of a mask.
@@ -623,16 +623,16 @@ exp2_where = _operation(_Floats, _Masks, _Floats)(
 exp2_fine = _unary(lambda b, x: _emit_exp2(b, _FINE, x))
 
 
-@inner()
+@kernel_function()
 def log2(x):
     """Return the base-2 logarithm of eight normal x > 0; error below 2e-7 (1 + |result|)."""
-    ones = splat(np.float32(1))
+    ones = broadcast(np.float32(1))
     m = mantissa(x)
     s = (m - ones) / (m + ones)
     ss = s * s
-    p = fmuladd(splat(_LOG7), ss, splat(_LOG5))
-    p = fmuladd(p, ss, splat(_LOG3))
-    p = fmuladd(p, ss, splat(_LOG1))
+    p = fmuladd(broadcast(_LOG7), ss, broadcast(_LOG5))
+    p = fmuladd(p, ss, broadcast(_LOG3))
+    p = fmuladd(p, ss, broadcast(_LOG1))
     return fmuladd(p, s, exponent(x))
 
 
@@ -653,13 +653,13 @@ _float_pointer = _pointer_to(types.float32, ir.FloatType())
 _short_pointer = _pointer_to(types.int16, ir.IntType(16))
 
 
-@inner()
+@kernel_function()
 def shorts_at(address, count):
     """Return the int16 array of `count` numbers at an address; the caller keeps it alive."""
     return numba.carray(_short_pointer(address), (count,))
 
 
-@inner()
+@kernel_function()
 def floats_at(address, count):
     """Return the float32 array of `count` numbers at an address; the caller keeps it alive.
 

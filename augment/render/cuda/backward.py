@@ -21,7 +21,7 @@ from augment.render.buffers import EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.cuda import blend_kernels as kernels
 from augment.render.cuda.driver import blend, limits_of, list_tiles, project
-from augment.render.cuda.runtime import launch, resident
+from augment.render.cuda.runtime import gpu_copy, launch
 from augment.render.cuda.splats import CudaSplats, CudaTiles, gather_inputs
 from augment.render.gsplat_backend import render_with_gsplat, tracked_geometry
 from augment.render.layout import M_NUM_SH_FUNCTIONS, VIEW
@@ -183,7 +183,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.max_functions = int(inputs.modes[M_NUM_SH_FUNCTIONS])
         ctx.sh_layouts = [(sh.device, sh.shape[1]) for sh in shs]
         # Kept by autograd, so that a change in place before backward is noticed.
-        ctx.save_for_backward(*[resident(part.gaussians.means) for part in parts])
+        ctx.save_for_backward(*[gpu_copy(part.gaussians.means) for part in parts])
         ctx.mark_non_differentiable(*[images[n] for n in arguments.buffers if n != RGB])
         return tuple(images[name] for name in arguments.buffers)
 

@@ -106,7 +106,7 @@ def upload(array: np.ndarray | Tensor) -> Tensor:
 _copies: dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Tensor]] = {}
 
 
-def resident(tensor: Tensor) -> Tensor:
+def gpu_copy(tensor: Tensor) -> Tensor:
     """Return the tensor on the GPU, detached and contiguous; it is copied once for as long as it
     lives.
 

@@ -15,7 +15,7 @@ from augment.cameras import Camera
 from augment.memo import memo_of
 from augment.render import layout
 from augment.render.constants import RasterSettings
-from augment.render.cuda.runtime import address_of, gpu_device, resident, upload, version_of
+from augment.render.cuda.runtime import address_of, gpu_copy, gpu_device, upload, version_of
 from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
@@ -148,14 +148,14 @@ def _resident_gaussians(gaussians: Gaussians, device: torch.device) -> _Resident
 def _appearance_tensors(part: PosedGaussians) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
     """Return the arrays of a part besides its Gaussians, as `layout` lists them."""
     slopes = None if part.shading is None else part.shading.slopes
-    return slopes, part.color_maps, part.map_rows
+    return slopes, part.color_maps, part.color_map_rows
 
 
 def _as_kernel_tensor(tensor: Tensor) -> Tensor:
     """Return the tensor on the GPU: float32, or int16 if it is."""
     if tensor.is_floating_point() and tensor.dtype != torch.float32:
         tensor = tensor.to(torch.float32)
-    return resident(tensor)
+    return gpu_copy(tensor)
 
 
 # Key of Gaussians that are not drawn: the bits of infinity, behind all other keys.
