@@ -375,7 +375,7 @@ def test_kernels_of_views_compile_into_what_they_should():
 def test_kernels_of_all_views_compile_into_what_they_should():
     """In a process in which they are interpreted, since here they run on the GPU."""
     code = (
-        "from tests.augment.test_cuda_compiles import *\n"
+        "from tests.augment.test_cuda_frame import *\n"
         "assert not (wrong := complaints(compile_launches(record_views()))), wrong"
     )
     environment = {**os.environ, "TRITON_INTERPRET": "1"}

@@ -100,7 +100,8 @@ def test_a_colour_held_by_its_clamp_has_no_gradient():
 
 @pytest.mark.gpu
 def test_many_splats_on_a_real_gpu():
-    parts, camera = [PosedGaussians(random_gaussians(20000, size=0.1))], camera_ahead(320, 180, 300)
+    parts = [PosedGaussians(random_gaussians(20000, size=0.1))]
+    camera = camera_ahead(320, 180, 300.0)
     expected = sh_gradients(parts, camera, "cpu", buffers=(RGB, ALPHA))
     found = sh_gradients(parts, camera, "cuda")
     assert_close(found, expected, 1e-3)  # some splats flip at a threshold
