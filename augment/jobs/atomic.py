@@ -1,12 +1,15 @@
-"""Files that are complete under their final name, or not there at all.
+"""Atomic files and folders: complete under their final name, or absent; and lock files.
 
-A file is written under a temporary name in its own folder, flushed to the disk, and renamed; then
+In: a path and bytes, or a block that writes. Out: the file or folder. All code that writes files of
+an output, of scenes or of caches calls it.
+
+A file is written under a temporary name in its own folder, flushed to the disk, and renamed. Then
 the folder is flushed, so that the name survives a power cut too.
 
-Temporary names are random: in containers every run has the same process numbers. Who writes a
-temporary file holds the kernel's lock of it (flock), which ends with the process, however that
-ends. So whoever comes next can tell what a dead one left from what a living one is writing, on
-other machines too where the file system has locks among them.
+Temporary names are random, because in containers every run has the same process numbers. The writer
+of a temporary file holds the kernel's lock of it (flock), which ends with the process, however the
+process ends. So a later process can tell the files of a dead writer from those of a living one.
+This holds across machines too, where the file system shares its locks.
 """
 
 from __future__ import annotations
@@ -31,14 +34,18 @@ from recipes.files import open_file
 
 _log = logging.getLogger(__name__)
 
+# End of all temporary names.
 TEMPORARY_SUFFIX = ".climategs-tmp"
-_MAX_SHOWN = 200  # bytes of the final name in the temporary one, which may have 255
-_MAX_WRITING_S = 86400.0  # where the file system has no locks, older files count as left behind
+# Most bytes of the final name in the temporary one, which may have 255.
+_MAX_NAME_BYTES = 200
+# Age from which a temporary file counts as left behind where the file system has no locks, seconds.
+_MAX_WRITING_S = 86400.0
 
 _NOT_WRITABLE = (
     "the folder is not writable for this user: change its permissions or choose another output "
     "folder"
 )
+# Advice by the system's error number.
 _HINTS = {
     errno.ENOSPC: "the disk is full: free some space and run the same command again",
     errno.EDQUOT: "the disk quota is used up: free some space and run the same command again",
@@ -52,7 +59,7 @@ _HINTS = {
 
 
 def write_atomic(path: Path, data: bytes, *, clear: bool = True) -> None:
-    """Put `data` at `path`, replacing what was there in one step; see replaced_file."""
+    """Put `data` at `path`, replacing an earlier file in one step; see replaced_file."""
     with replaced_file(path, clear=clear) as file:
         file.write(data)
 
@@ -61,10 +68,17 @@ def write_atomic(path: Path, data: bytes, *, clear: bool = True) -> None:
 def replaced_file(
     path: Path, *, clear: bool = True, flush: bool = True, ending: str = ""
 ) -> Iterator[BinaryIO]:
-    """A file that takes its name only once it is whole and on the disk; makes missing folders.
-    clear: delete what killed writers of this file left. flush: make the name durable too. ending:
-    of the temporary name, for libraries that go by it. Raises OutputError: the system refused (disk
-    full, no permission ...); `path` is then as it was.
+    """Context manager of a new file that takes its name once it is complete and on the disk.
+
+    Missing folders are made.
+
+    Args:
+        clear: If True, delete temporary files that killed writers of this file left.
+        flush: If True, make the name durable too.
+        ending: End of the temporary name, for libraries that choose a format by it.
+
+    Raises:
+        OutputError: The system refuses (disk full, no permission ...); `path` is then as it was.
     """
     with refusals_of(path):
         make_folder(path.parent)
@@ -88,16 +102,16 @@ def replaced_file(
             flush_folder(path.parent)
 
 
-# The error numbers of a file system that has no hard links.
+# Error numbers of a file system without hard links.
 _NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
 
 
 def write_new(path: Path, data: bytes) -> None:
-    """Write a file where nothing is, in one step; nothing is replaced, and no link is followed.
+    """Write a file at an unused path in one step; replaces nothing, and follows no link.
 
     Raises:
-        FileExistsError: there is something at the path, be it a link to nothing.
-        OutputError: the system refuses.
+        FileExistsError: The path is in use, possibly by a link to nothing.
+        OutputError: The system refuses.
     """
     with refusals_of(path):
         make_folder(path.parent)
@@ -105,7 +119,7 @@ def write_new(path: Path, data: bytes) -> None:
     try:
         try:
             _create_new(temporary, data)
-            os.link(temporary, path, follow_symlinks=False)  # where a rename would replace
+            os.link(temporary, path, follow_symlinks=False)  # a rename would replace a file
         except OSError as error:
             if error.errno not in _NO_LINKS:
                 raise
@@ -119,7 +133,7 @@ def write_new(path: Path, data: bytes) -> None:
 
 
 def _create_new(path: Path, data: bytes) -> None:
-    """Write a file that must be new; it goes again where it cannot be written whole."""
+    """Write a file that must be new; it is deleted where it cannot be written completely."""
     with path.open("xb") as file:
         try:
             file.write(data)
@@ -131,33 +145,41 @@ def _create_new(path: Path, data: bytes) -> None:
 
 
 def read_file(path: Path) -> bytes:
-    """Return the bytes of a regular file. Raises OSError: there is none, or it is a folder, a pipe
-    (which might be waited for without end) or a device.
+    """Return the bytes of a regular file.
+
+    Raises:
+        OSError: The file does not exist, or is a folder, a device, or a pipe, whose reader could
+            wait without end.
     """
     with open_file(path) as file:
         return file.read()
 
 
 def path_below(root: Path, parts: tuple[str, ...]) -> Path:
-    """The path of these components, which no link leads out of the root."""
+    """Return the path of these components below the root.
+
+    Raises:
+        OutputError: A link leads out of the root.
+    """
     path = root.joinpath(*parts)
-    # Not Path.resolve, which raises RuntimeError where links lead round in circles.
-    real, real_root = os.path.realpath(path), os.path.realpath(root)
-    if not Path(real).is_relative_to(real_root):
+    # Path.resolve would raise RuntimeError where links form a circle.
+    real_path = os.path.realpath(path)
+    real_root = os.path.realpath(root)
+    if not Path(real_path).is_relative_to(real_root):
         raise OutputError(
-            f"{path} leads through a link to {real}, outside {real_root}; "
+            f"{path} leads through a link to {real_path}, outside {real_root}; "
             f"put the files themselves under the output folder"
         )
     return path
 
 
 def temporary_beside(path: Path) -> Path:
-    """A new name in the folder of `path`."""
-    return path.with_name(f".{_shown(path.name)}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
+    """Return a new temporary name in the folder of `path`."""
+    return path.with_name(f".{_shorten_name(path.name)}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
 
 
 def is_named(path: Path, descriptor: int) -> bool:
-    """Whether the path is the name of this open file."""
+    """Return True if the path is the name of this open file."""
     try:
         return os.path.samestat(os.stat(path, follow_symlinks=False), os.fstat(descriptor))
     except FileNotFoundError:
@@ -174,7 +196,7 @@ def make_folder(folder: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Make the names inside the folder durable; of a file, its bytes."""
+    """Make the names inside the folder durable; for a file, make its bytes durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -186,12 +208,14 @@ def flush_folder(folder: Path) -> None:
 
 
 def remove_temporaries(folder: Path, *, name: str = "", recursive: bool = True) -> None:
-    """Delete what killed processes left under temporary names; what a living one writes stays.
-    name: of the file that they were to become; of any if empty.
+    """Delete temporary files of killed processes; files that a living process writes stay.
+
+    Args:
+        name: Name of the file that they were to become; of any file if empty.
     """
-    for place, _, names in os.walk(folder):  # passes over folders that vanish meanwhile
-        for found in temporary_names(names, name):
-            path = Path(place, found)
+    for folder_path, _, names in os.walk(folder):  # skips folders that vanish meanwhile
+        for temporary_name in temporary_names(names, name):
+            path = Path(folder_path, temporary_name)
             with refusals_of(path):
                 _clear_abandoned(
                     path, os.O_NONBLOCK, lambda path=path: path.unlink(missing_ok=True)
@@ -201,15 +225,15 @@ def remove_temporaries(folder: Path, *, name: str = "", recursive: bool = True) 
 
 
 def temporary_names(names: Iterable[str], name: str = "") -> list[str]:
-    """Those of the names that `temporary_beside` has made, for the file `name` if it is given."""
-    middle = rf"{re.escape(_shown(name))}\.[^.]+(\.old)?" if name else ".*"
+    """Return the names that `temporary_beside` has made, for the file `name` if it is given."""
+    middle = rf"{re.escape(_shorten_name(name))}\.[^.]+(\.old)?" if name else ".*"
     pattern = re.compile(rf"\.{middle}{re.escape(TEMPORARY_SUFFIX)}(\.[^.]+)?", re.DOTALL)
-    return [found for found in names if pattern.fullmatch(found)]
+    return [other_name for other_name in names if pattern.fullmatch(other_name)]
 
 
 @contextlib.contextmanager
 def refusals_of(path: Path) -> Iterator[None]:
-    """What the system refuses inside is raised as an OutputError that names the path."""
+    """Context manager that turns refusals of the system into an OutputError that names the path."""
     try:
         yield
     except OSError as error:
@@ -217,17 +241,18 @@ def refusals_of(path: Path) -> Iterator[None]:
 
 
 def output_error(path: Path, error: OSError) -> OutputError:
-    """An OutputError that names the file and says what to do."""
+    """Return an OutputError that names the file and says what to do."""
     hint = _HINTS.get(error.errno or 0, "check the disk, then run the same command again")
     return OutputError(f"cannot write {path}: {error.strerror}; {hint}")
 
 
-def _shown(name: str) -> str:
-    return os.fsdecode(os.fsencode(name)[:_MAX_SHOWN])
+def _shorten_name(name: str) -> str:
+    """Return the part of a file's name that its temporary name repeats."""
+    return os.fsdecode(os.fsencode(name)[:_MAX_NAME_BYTES])
 
 
 def _lock_new(temporary: Path, descriptor: int) -> bool:
-    """Lock a file or folder that was just made; False where it is taken for left behind already."""
+    """Lock a new file or folder; False where another process took it for left behind already."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -238,15 +263,20 @@ def _lock_new(temporary: Path, descriptor: int) -> bool:
 
 
 def _clear_abandoned(path: Path, flags: int, clear: Callable[[], object]) -> None:
-    """Clear a temporary file or folder unless a living process writes it. It is locked meanwhile,
-    for a process that has just made it to notice. flags: to open it with.
+    """Clear a temporary file or folder unless a living process writes it.
+
+    It is locked meanwhile, so that a process that has just made it notices.
+
+    Args:
+        flags: Flags to open it with.
+        clear: Deletes it.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | flags)
-    except (FileNotFoundError, PermissionError, NotADirectoryError):  # or of another user
+    except (FileNotFoundError, PermissionError, NotADirectoryError):  # gone, or of another user
         return
     except OSError as error:
-        if error.errno != errno.ELOOP:  # a link, which is not written but made
+        if error.errno != errno.ELOOP:  # anything but a link, which has no writer
             raise
         return path.unlink(missing_ok=True)
     try:
@@ -263,20 +293,28 @@ def _clear_abandoned(path: Path, flags: int, clear: Callable[[], object]) -> Non
         os.close(descriptor)
 
 
-# ---- Lock files: whatever else has the name of one stays as it is --------------------------------
-# A folder may come from somebody else, and a link in it lead anywhere. Nothing but a mark of who
-# holds the lock is ever written into one, and only where nothing else is in it.
+# ---- Lock files: any other file with such a name stays as it is ----------------------------------
+# A folder may come from another person, and a link in it may lead anywhere. Nothing but a mark of
+# the lock's holder is ever written into a lock file, and only where the file holds nothing else.
 
+# Longest mark of a lock's holder, bytes.
 MAX_MARK_BYTES = 64
-_MARK = re.compile(rb"\d{0,20}( \d{0,20})?\s*")  # as processes.process_mark, cut short by a kill
+# Mark as processes.process_mark makes it, possibly cut short by a kill.
+_MARK = re.compile(rb"\d{0,20}( \d{0,20})?\s*")
+# Time between two tries to lock, seconds.
 _POLL_S = 0.05
-_SAY_AFTER_S = 2.0  # of waiting
+# Wait after which a message says so, seconds.
+_LOG_AFTER_S = 2.0
 
 
 def open_lock(path: Path) -> int:
-    """Descriptor of a lock file, open for reading and writing; the file and its folder are made if
-    missing. Raises OutputError: the name is that of a link, a pipe, a folder or a device, or the
-    file holds something else than a lock's mark; nothing has been changed then.
+    """Open a lock file for reading and writing, and return its descriptor.
+
+    The file and its folder are made if missing.
+
+    Raises:
+        OutputError: The name belongs to a link, a pipe, a folder or a device, or the file holds
+            something else than a lock's mark; nothing has been changed then.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     with refusals_of(path):
@@ -286,7 +324,7 @@ def open_lock(path: Path) -> int:
         except OSError as error:
             if error.errno not in _KINDS:
                 raise
-            raise _no_lock(path, _KINDS[error.errno]) from error
+            raise _not_a_lock_error(path, _KINDS[error.errno]) from error
         facts = os.fstat(descriptor)
         kind = "" if stat.S_ISREG(facts.st_mode) else "a pipe or device"
         if not kind and facts.st_size:
@@ -295,44 +333,49 @@ def open_lock(path: Path) -> int:
             kind = "" if is_ours and facts.st_nlink <= 1 else "a file with other content"
         if kind:
             os.close(descriptor)
-            raise _no_lock(path, kind)
+            raise _not_a_lock_error(path, kind)
     return descriptor
 
 
 def wait_for_lock(path: Path, descriptor: int, *, patience_s: float, doing: str) -> None:
-    """Lock the open file; says so once where that takes a while.
+    """Lock the open file; logs a message once where the wait takes a while.
 
     Args:
-        path: the file's name, for messages.
-        patience_s: how long to wait at most, seconds.
-        doing: what the holder does, after "another process".
+        path: Name of the file, for messages.
+        patience_s: Longest wait, seconds.
+        doing: What the holder does, after "another process".
 
     Raises:
-        OutputError: another process has held it for that long.
+        OutputError: Another process has held the lock for that long.
     """
-    started, is_said = time.monotonic(), False
+    start_s = time.monotonic()
+    is_logged = False
     while True:
         try:
             return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            waited_s = time.monotonic() - started
+            waited_s = time.monotonic() - start_s
         if waited_s > patience_s:
             raise OutputError(
                 f"{path}: another process{lock_holder(descriptor)} has held this lock for "
                 f"{patience_s:.0f} s ({doing}); end it, then run the same command again"
             )
-        if waited_s > _SAY_AFTER_S and not is_said:
-            is_said = True
+        if waited_s > _LOG_AFTER_S and not is_logged:
+            is_logged = True
             _log.info(
                 "another process%s %s; waiting for it at most %.0f min (%s)",
-                *(lock_holder(descriptor), doing, patience_s / 60, path),
+                lock_holder(descriptor),
+                doing,
+                patience_s / 60,
+                path,
             )
         time.sleep(_POLL_S)
 
 
 def lock_holder(descriptor: int) -> str:
-    """` (process 1234)`: who holds the kernel's lock of an open file; empty where the system does
-    not tell, as of other machines.
+    """Return the holder of the kernel's lock of an open file, as ` (process 1234)`.
+
+    Empty where the system does not tell, as for processes of other machines.
     """
     inode = os.fstat(descriptor).st_ino
     with contextlib.suppress(OSError, ValueError, IndexError):
@@ -344,6 +387,7 @@ def lock_holder(descriptor: int) -> str:
     return ""
 
 
+# Kinds of things that are no lock file, by the error number of opening one.
 _KINDS = {
     errno.ELOOP: "a link",
     errno.EISDIR: "a folder",
@@ -352,7 +396,8 @@ _KINDS = {
 }
 
 
-def _no_lock(path: Path, kind: str) -> OutputError:
+def _not_a_lock_error(path: Path, kind: str) -> OutputError:
+    """Return the error of a path that is not a lock file."""
     return OutputError(
         f"{path} is {kind}, where a lock of climategs was expected: a small file that nothing else "
         f"is kept in. Nothing has been changed. See where it comes from, then delete it, or choose "
@@ -360,99 +405,120 @@ def _no_lock(path: Path, kind: str) -> OutputError:
     )
 
 
-# ---- Folders replaced as a whole: readers find the old one or the new one ------------------------
-# The new folder is written beside the old under a temporary name, flushed to the disk, and changes
-# places with it in one step. What else the old folder held moves over afterwards.
+# ---- Folders replaced in one step: readers find the old one or the new one -----------------------
+# The new folder is written beside the old one under a temporary name, flushed to the disk, and
+# exchanged with it in one step. Foreign files of the old folder move over afterwards.
 
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
+# Descriptor that stands for the current folder (linux/fcntl.h).
+_AT_FDCWD = -100
+# Flag of renameat2 that swaps two names (linux/fs.h).
+_RENAME_EXCHANGE = 2
+# Error numbers of systems and file systems that cannot swap names.
 _CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTTY, errno.EPERM)
 
 
 @contextlib.contextmanager
-def replaced_folder(target: Path, own: Collection[str]) -> Iterator[Path]:
-    """A new, empty folder that takes the place of `target` when the block ends without an error.
-    own: names of the files and folders that make up such a folder; anything else in the old folder
-    is kept. Raises OutputError: the system refused; `target` is then as it was.
+def replaced_folder(target: Path, own_names: Collection[str]) -> Iterator[Path]:
+    """Context manager of a new folder that replaces `target` when the block ends without error.
+
+    Args:
+        own_names: Names of the files and folders that make up such a folder; anything else in the
+            old folder is kept.
+
+    Raises:
+        OutputError: The system refuses; `target` is then as it was.
     """
     target = target.resolve()  # a link to a folder stays a link
     with refusals_of(target):
         make_folder(target.parent)
-        new, descriptor = _locked_folder(target)
+        new_folder, descriptor = _locked_folder(target)
         try:
-            yield new
-            for path in [*new.rglob("*"), new]:
+            yield new_folder
+            for path in [*new_folder.rglob("*"), new_folder]:
                 flush_folder(path)
-            _put_in_place(new, target)
+            _put_in_place(new_folder, target)
             flush_folder(target.parent)
             for name in temporary_names(os.listdir(target.parent), target.name):
-                old = target.with_name(name)
-                _clear_abandoned(old, os.O_DIRECTORY, lambda old=old: _clear(old, target, own))
+                old_folder = target.with_name(name)
+                _clear_abandoned(
+                    old_folder,
+                    os.O_DIRECTORY,
+                    lambda old_folder=old_folder: _clear(old_folder, target, own_names),
+                )
         finally:
-            _clear(new, target, own)
+            _clear(new_folder, target, own_names)
             os.close(descriptor)
 
 
 def _locked_folder(target: Path) -> tuple[Path, int]:
+    """Make a new folder beside the target; return it and the descriptor that holds its lock."""
     while True:
-        new = temporary_beside(target)
-        new.mkdir()
-        with contextlib.suppress(FileNotFoundError):  # taken for left behind
-            descriptor = os.open(new, os.O_RDONLY)
-            if _lock_new(new, descriptor):
-                return new, descriptor
+        new_folder = temporary_beside(target)
+        new_folder.mkdir()
+        with contextlib.suppress(FileNotFoundError):  # another process took it for left behind
+            descriptor = os.open(new_folder, os.O_RDONLY)
+            if _lock_new(new_folder, descriptor):
+                return new_folder, descriptor
             os.close(descriptor)
 
 
-def _put_in_place(new: Path, target: Path) -> None:
+def _put_in_place(new_folder: Path, target: Path) -> None:
+    """Give the new folder the target's name, and the old folder the new one's."""
     if not target.exists() or not any(target.iterdir()):
-        os.rename(new, target)  # also over an empty folder
+        os.rename(new_folder, target)  # also over an empty folder
         return
-    if _exchange(new, target):
+    if _exchange(new_folder, target):
         return
-    # A file system that cannot exchange: for an instant the old folder has its temporary name only.
-    old = new.with_name(new.name.removesuffix(TEMPORARY_SUFFIX) + ".old" + TEMPORARY_SUFFIX)
-    os.rename(target, old)
+    # The file system cannot exchange names: for an instant the old folder has only a temporary
+    # name.
+    old_folder = new_folder.with_name(
+        new_folder.name.removesuffix(TEMPORARY_SUFFIX) + ".old" + TEMPORARY_SUFFIX
+    )
+    os.rename(target, old_folder)
     try:
-        os.rename(new, target)
+        os.rename(new_folder, target)
     except BaseException:
-        os.rename(old, target)
+        os.rename(old_folder, target)
         raise
-    os.rename(old, new)
+    os.rename(old_folder, new_folder)
 
 
-def _exchange(one: Path, other: Path) -> bool:
+def _exchange(path: Path, other_path: Path) -> bool:
     """Swap two names in one step (renameat2); False where the system or file system cannot."""
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None:
         return False
-    paths = os.fsencode(one), os.fsencode(other)
+    paths = os.fsencode(path), os.fsencode(other_path)
     if rename(_AT_FDCWD, paths[0], _AT_FDCWD, paths[1], _RENAME_EXCHANGE) == 0:
         return True
     number = ctypes.get_errno()
     if number in _CANNOT_EXCHANGE:
         return False
-    raise OSError(number, os.strerror(number), str(other))
+    raise OSError(number, os.strerror(number), str(other_path))
 
 
-def _clear(old: Path, target: Path, own: Collection[str]) -> None:
-    """Delete a temporary folder. Entries that are not ours move to `target`; where they cannot,
-    they and the folder stay, since nobody here may decide to delete them.
+def _clear(old_folder: Path, target: Path, own_names: Collection[str]) -> None:
+    """Delete a temporary folder.
+
+    Foreign entries move to `target`. Where they cannot move, they and the folder stay, since this
+    code must not decide to delete them.
     """
-    with contextlib.suppress(FileNotFoundError):  # somebody else who saves there clears it too
-        for entry in list(old.iterdir()):
-            if entry.name in own and entry.is_dir():
+    # Another process that saves there may clear the folder too.
+    with contextlib.suppress(FileNotFoundError):
+        for entry in list(old_folder.iterdir()):
+            if entry.name in own_names and entry.is_dir():
                 shutil.rmtree(entry)
-            elif entry.name in own:
+            elif entry.name in own_names:
                 entry.unlink()
             elif target.is_dir() and not (target / entry.name).exists():
                 os.rename(entry, target / entry.name)
-        if not any(old.iterdir()):
-            old.rmdir()
+        if not any(old_folder.iterdir()):
+            old_folder.rmdir()
 
 
-# ---- A file of the disk under another name -----------------------------------------------------
+# ---- Links and copies of files -------------------------------------------------------------------
 
-# Another disk, another user's file, too many links to it, a file system without hard links.
+# Error numbers for another disk, another user's file, too many links, or no hard links at all.
 _CANNOT_LINK = {errno.EXDEV, errno.EPERM, errno.EMLINK}
 _CANNOT_LINK |= {errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS}
 
@@ -474,7 +540,7 @@ def link_file(original: str, target: str) -> bool:
 
 
 def copy_file(original: str, target: str) -> None:
-    """Copy bytes and time of change."""
+    """Copy a file's bytes and its time of change."""
     with replaced_file(Path(target), clear=False, flush=False) as file:
         shutil.copyfile(original, file.name)
         facts = os.stat(original)
@@ -482,6 +548,7 @@ def copy_file(original: str, target: str) -> None:
 
 
 def move_temporary(temporary: Path, target: str) -> None:
+    """Give a temporary file its final name."""
     try:
         os.replace(temporary, target)
     finally:

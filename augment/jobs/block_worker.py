@@ -1,6 +1,8 @@
-"""What a worker does, wherever it runs: open scenes, render blocks, publish them.
+"""Worker of a dataset job: opens scenes, renders blocks of images, and publishes them.
 
-A worker keeps one scene and no more: the last that it opened.
+In: tasks of `generate` (`IndexTask`, `ResolveTask`, `BlockTask`). Out: their results, and files in
+the output. The pools run it, in this process or in others. A worker keeps only one scene, the last
+that it opened.
 """
 
 from __future__ import annotations
@@ -55,27 +57,37 @@ from augment.jobs.worker import Outcome, Renderer, TaskFailed, WorkTimes, descri
 from augment.scene import Scene
 from recipes.schema import Recipe
 
-# ---- Takes a block from the folder it was rendered in to the output, where it appears at once ----
-# Its files go there first, to an object store those of an image as soon as it is finished; nobody
-# sees them before the block's rows follow in one step. What belongs to several images lies by
-# blocks, so that no two write one file: `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
+# ---- Publishing: moves a block from the folder it was rendered in to the output ------------------
+# The files go there first; to an object store, an image's files go as soon as it is finished.
+# Readers see no image of the block before its rows follow in one step. Files that belong to several
+# images are named by blocks, so that no two workers write one file:
+# `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
 
 
-def _of_block() -> set[str]:
-    """Kinds of files that belong to several images."""
+def _shared_kinds() -> set[str]:
+    """Return the kinds of files that belong to several images."""
     return {"labels", "calibration", *box_tables()}
 
 
-REMOTE_UPLOADS = 8  # at a time: most of the time of one is waiting
+# Uploads at a time: an upload spends most of its time waiting.
+NUM_UPLOADS = 8
 
 
 class Publisher:
-    """Publishes one block. folder: where `run_job` renders it. Use as a context manager."""
+    """Publishes one block. Use as a context manager.
+
+    Attributes:
+        store: The output.
+        block: The block.
+        folder: Folder where `run_job` renders the block.
+    """
 
     def __init__(self, store: Store, folder: Path, block: Block) -> None:
-        self._store, self._folder, self._block = store, folder, block
-        self._pool = ThreadPoolExecutor(REMOTE_UPLOADS, thread_name_prefix="publish")
-        self._sent: dict[str, Future[None]] = {}
+        self._store = store
+        self._folder = folder
+        self._block = block
+        self._pool = ThreadPoolExecutor(NUM_UPLOADS, thread_name_prefix="publish")
+        self._uploads: dict[str, Future[None]] = {}
 
     def __enter__(self) -> Publisher:
         return self
@@ -84,50 +96,62 @@ class Publisher:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def image_done(self, outcome: Outcome) -> None:
-        """Send the files of a finished image on their way; on this disk they only get a name."""
+        """Begin to upload the files of a finished image.
+
+        Does nothing for an output on this disk.
+        """
         if outcome.status != OK or isinstance(self._store, LocalStore):
             return
         recipe = self._block.recipe
         paths = item_paths(self._block.scene, recipe, outcome.camera, outcome.frame)
-        for kind in paths.keys() - _of_block():
+        for kind in paths.keys() - _shared_kinds():
             path = paths[kind]
-            if path is None or path in self._sent:  # cameras of a frame share its sweep
+            if path is None or path in self._uploads:  # the cameras of a frame share its sweep
                 continue
             if kind != "lidar" or outcome.lidar:
-                self._send(path, path)
+                self._start_upload(path, path)
 
     def finish(self) -> Part:
-        """Send what is left, then make the block visible."""
+        """Publish the remaining files, then make the block visible."""
         rows = read_manifest(self._folder)
         stem = self._block.file_stem  # `labels/boxes.parquet` becomes `labels/boxes/<stem>.parquet`
-        new = _renamed(rows, lambda path: path.with_suffix("") / f"{stem}{path.suffix}")
-        # The recipe, and the files that it names: every block of a variant has the same.
+        published_rows = _rename_shared_files(
+            rows, lambda path: path.with_suffix("") / f"{stem}{path.suffix}"
+        )
+        # The recipe and the files that it names are the same in every block of a variant.
         globs = ("*/*/recipe.yaml", *(f"*/*/{folder}/*" for folder in file_folders()))
-        of_variant = [p for glob in globs for p in sorted(self._folder.glob(glob))]
-        left = {p: p for p in (p.relative_to(self._folder).as_posix() for p in of_variant)}
+        recipe_files = [p for glob in globs for p in sorted(self._folder.glob(glob))]
+        source_of_target = {
+            p: p for p in (p.relative_to(self._folder).as_posix() for p in recipe_files)
+        }
         for kind in path_kinds():
-            there, here = new[f"{kind}_path"].to_pylist(), rows[f"{kind}_path"].to_pylist()
-            left |= {t: h for t, h in zip(there, here, strict=True) if h is not None}
+            targets = published_rows[f"{kind}_path"].to_pylist()
+            sources = rows[f"{kind}_path"].to_pylist()
+            source_of_target |= {
+                t: s for t, s in zip(targets, sources, strict=True) if s is not None
+            }
         if isinstance(self._store, LocalStore):
-            self._store.put_files({target: self._folder / left[target] for target in left})
+            self._store.put_files(
+                {target: self._folder / source_of_target[target] for target in source_of_target}
+            )
         else:
-            for target in left.keys() - self._sent.keys():
-                self._send(left[target], target)
-            for future in self._sent.values():
+            for target in source_of_target.keys() - self._uploads.keys():
+                self._start_upload(source_of_target[target], target)
+            for future in self._uploads.values():
                 future.result()
-        return publish_part(self._store, self._block.key, new)
+        return publish_part(self._store, self._block.key, published_rows)
 
-    def _send(self, source: str, target: str) -> None:
-        self._sent[target] = self._pool.submit(self._put, self._folder / source, target)
+    def _start_upload(self, source: str, target: str) -> None:
+        self._uploads[target] = self._pool.submit(self._upload, self._folder / source, target)
 
-    def _put(self, source: Path, target: str) -> None:
+    def _upload(self, source: Path, target: str) -> None:
         is_shared = target.startswith(f"{folder_name(self._block.scene)}/{SWEEPS}/")
         if not (is_shared and self._store.exists(target)):
             self._store.put_file(target, source)
 
 
-def take_sweeps(store: Store, folder: Path, block: Block) -> None:
-    """Give the folder, by links, the sweeps that the scene's other variants have published."""
+def link_published_sweeps(store: Store, folder: Path, block: Block) -> None:
+    """Link the sweeps that the scene's other variants have published into the folder."""
     if store.local_dir is None or block.recipe.lidar != "clean":
         return
     for frame in block.frames:
@@ -138,31 +162,37 @@ def take_sweeps(store: Store, folder: Path, block: Block) -> None:
                 link_file(str(store.local_dir / path), str(folder / path))
 
 
-def take_published(store: Store, folder: Path, block: Block, part: Part) -> None:
-    """Give the folder, by links, what is left of a published block that has lost files: `run_job`
-    then makes there what is missing, and nothing else.
+def link_published_files(store: Store, folder: Path, block: Block, part: Part) -> None:
+    """Link the remaining files of a published block with lost files into the folder.
+
+    `run_job` then makes the missing files there, and nothing else.
     """
     if store.local_dir is None or (folder / MANIFEST).is_file():
         return
     rows = parse_manifest(store.read(part.path), f"{store.uri}/{part.path}")
-    staged = _renamed(rows, lambda path: path.parent.with_suffix(path.suffix))
-    names: dict[str, str] = {}
+    staged_rows = _rename_shared_files(rows, lambda path: path.parent.with_suffix(path.suffix))
+    staged_path_of: dict[str, str] = {}
     for column in (f"{kind}_path" for kind in path_kinds()):
-        pairs = zip(rows[column].to_pylist(), staged[column].to_pylist(), strict=True)
-        names |= {there: here for there, here in pairs if there is not None}
+        pairs = zip(rows[column].to_pylist(), staged_rows[column].to_pylist(), strict=True)
+        staged_path_of |= {
+            stored_path: staged_path
+            for stored_path, staged_path in pairs
+            if stored_path is not None
+        }
     listing = FileListing(store.local_dir)
-    for there, here in names.items():
-        if listing.has(there):
-            with refusals_of(folder / here):
-                make_folder((folder / here).parent)
-                if not link_file(str(store.local_dir / there), str(folder / here)):
-                    copy_file(str(store.local_dir / there), str(folder / here))
-    write_manifest(folder, staged)
+    for stored_path, staged_path in staged_path_of.items():
+        if listing.has(stored_path):
+            with refusals_of(folder / staged_path):
+                make_folder((folder / staged_path).parent)
+                if not link_file(str(store.local_dir / stored_path), str(folder / staged_path)):
+                    copy_file(str(store.local_dir / stored_path), str(folder / staged_path))
+    write_manifest(folder, staged_rows)
 
 
 def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
-    """Where a block is rendered: on the output's own disk, else in `scratch`. There a killed job
-    finds again what it had finished of the block.
+    """Return the folder where a block is rendered: on the output's own disk, else in `scratch`.
+
+    A restarted job finds there the images of the block that it had finished.
     """
     if store.local_dir is not None:
         return store.local_dir / STATE_FOLDER / "blocks" / block.claim
@@ -170,48 +200,55 @@ def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
     return scratch / "blocks" / block.claim
 
 
-def _renamed(rows: pa.Table, rename: Callable[[PurePosixPath], PurePosixPath]) -> pa.Table:
-    """The rows with other names of the files that belong to several images."""
-    for name in (f"{kind}_path" for kind in _of_block()):
+def _rename_shared_files(
+    rows: pa.Table, rename: Callable[[PurePosixPath], PurePosixPath]
+) -> pa.Table:
+    """Return the rows with renamed paths of the files that belong to several images."""
+    for name in (f"{kind}_path" for kind in _shared_kinds()):
         files = [None if p is None else PurePosixPath(p) for p in rows[name].to_pylist()]
         paths = [None if file is None else str(rename(file)) for file in files]
-        place = rows.column_names.index(name)
-        rows = rows.set_column(place, rows.schema.field(place), pa.array(paths, pa.string()))
+        position = rows.column_names.index(name)
+        rows = rows.set_column(position, rows.schema.field(position), pa.array(paths, pa.string()))
     return rows.combine_chunks()
 
 
-# ---- What the images of a variant are made from, kept in the output before the first of them -----
-# Two jobs that call different recipes the same can start at one moment, when neither sees images of
-# the other. Whoever comes second is refused here.
+# ---- Identity of a variant's images, kept in the output before the first image -------------------
+# Two jobs whose different recipes have the same name can start at one moment, when neither sees
+# images of the other. The second one is refused here.
 
+# Folder of the variants' identities.
 VARIANTS = f"{STATE_FOLDER}/variants"
 
 
 def enter_variant(store: Store, scene: str, variant: str, identity: Identity) -> None:
-    """Make sure that the variant's images are all made from the same."""
+    """Make sure that all images of the variant are made from the same scene and recipe."""
     folder = variant_folder(scene, variant)
     path = f"{VARIANTS}/{folder}.json"
     try:
-        found = store.read(path)
+        data = store.read(path)
     except StoredFileMissing:
         with hold(store, folder_name(f"variant.{folder.replace('/', '.')}")):
             if not store.exists(path):
                 store.write(path, json.dumps(vars(identity), sort_keys=True).encode())
-            found = store.read(path)
+            data = store.read(path)
     with reading_back(f"{store.uri}/{path}", "Delete it and start the job again"):
-        other = Identity(**json.loads(found))
-    identity.check(other, f"{store.uri}/{folder}")
+        stored_identity = Identity(**json.loads(data))
+    identity.check(stored_identity, f"{store.uri}/{folder}")
 
 
-# ---- What killed processes have left in an output ------------------------------------------------
-# Temporary files of processes that have ended, the folders that published blocks were rendered in,
-# and the claims' files of the dead. What live processes hold stays; should one on another machine
-# lose a temporary file all the same, because locks do not reach there, its store writes it again.
+# ---- Leftovers of killed processes in an output --------------------------------------------------
+# These are temporary files of processes that have ended, the folders in which published blocks were
+# rendered, and claim files of dead processes. Files that live processes hold stay. Locks may not
+# reach another machine; if a process there loses a temporary file, its store writes the file again.
 
 
-def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Block]) -> None:
-    """published: blocks that need no further work."""
-    for block in published:
+def clear_leftovers(store: Store, scratch: Path | None, published_blocks: Iterable[Block]) -> None:
+    """Delete what killed processes have left in the output.
+
+    Args:
+        published_blocks: Blocks that need no further work.
+    """
+    for block in published_blocks:
         if staging_folder(store, scratch, block).is_dir():
             claim = try_claim(store, block.claim)
             if claim is not None:
@@ -219,15 +256,15 @@ def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Bloc
                     clear_block(store, scratch, block)
     if store.local_dir is None:
         return
-    state = store.local_dir / STATE_FOLDER
+    state_dir = store.local_dir / STATE_FOLDER
     remove_temporaries(store.local_dir, recursive=False)
-    for folder in (state / "jobs", state / "scenes"):
+    for folder in (state_dir / "jobs", state_dir / "scenes"):
         remove_temporaries(folder)
-    for kept in (PARTS, VARIANTS, QUALITY):
-        remove_temporaries(store.local_dir / kept)
+    for state_folder in (PARTS, VARIANTS, QUALITY):
+        remove_temporaries(store.local_dir / state_folder)
     for path in store.list(CLAIMS_FOLDER):
         name = path.removeprefix(f"{CLAIMS_FOLDER}/").removesuffix(".lock")
-        if folder_name(name) != name:  # not a claim's file: somebody else has put it there
+        if folder_name(name) != name:  # not a claim's file: another program has put it there
             continue
         claim = try_claim(store, name)
         if claim is not None:
@@ -235,9 +272,7 @@ def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Bloc
 
 
 def clear_staged(store: Store, scratch: Path | None, scene_folder: str) -> None:
-    """Delete the folders that blocks of a scene are rendered in, but for those that live processes
-    are at.
-    """
+    """Delete the folders in which a scene's blocks are rendered, except those of live processes."""
     root = store.local_dir / STATE_FOLDER if store.local_dir is not None else scratch
     for folder in sorted(root.glob(f"blocks/{scene_folder}.*")) if root is not None else ():
         claim = try_claim(store, folder_name(folder.name))
@@ -247,12 +282,13 @@ def clear_staged(store: Store, scratch: Path | None, scene_folder: str) -> None:
 
 
 def clear_block(store: Store, scratch: Path | None, block: Block) -> None:
-    """Delete the folder that a block was rendered in; who calls holds its claim."""
+    """Delete the folder in which a block was rendered; the caller holds the block's claim."""
     clear_files_of(store, block)
     _remove_tree(staging_folder(store, scratch, block))
 
 
 def _remove_tree(folder: Path) -> None:
+    """Delete a folder with everything in it, if it exists."""
     try:
         shutil.rmtree(folder)
     except FileNotFoundError:
@@ -262,7 +298,7 @@ def _remove_tree(folder: Path) -> None:
 
 
 def clear_files_of(store: Store, block: Block) -> None:
-    """Delete what was half-way into the output when a worker at this block was killed."""
+    """Delete files that were half-written to the output when a worker at this block was killed."""
     if store.local_dir is not None:
         remove_temporaries(store.local_dir / variant_folder(block.scene, block.variant))
         remove_temporaries(store.local_dir / folder_name(block.scene) / SWEEPS)
@@ -275,57 +311,69 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class WorkSetup:
-    """What all workers of a job share; picklable. store_uri: the output. scratch: where blocks are
-    rendered on their way to an output that is not on this machine. open_scene, renderer, digest_of:
-    importable functions; None renders with the library's, and notes no digest of a scene's content.
-    """
+    """Everything that all workers of a job share; picklable."""
 
     store_uri: str
+    """URI of the output."""
     scratch: Path | None
+    """Folder where blocks are rendered on their way to an output that is not on this machine."""
     backend: str
+    """Name of the rasteriser's backend."""
     open_scene: SceneLoader
+    """Opens a scene by its URI; an importable function."""
     renderer: Renderer | None = None
+    """Importable function that renders an image; None for the library's own."""
     digest_of: Callable[[str], str | None] | None = None
+    """Importable function that returns the digest of a scene's content; None notes no digest."""
 
     @property
     def output(self) -> str:
+        """URI of the output, for messages."""
         return self.store_uri
 
     def worker(self, on_outcome: OnOutcome) -> BlockWorker:
+        """Return a worker for this process."""
         return BlockWorker(self, on_outcome)
 
 
 @dataclass(frozen=True)
 class IndexTask:
-    """Open a scene and say what is in it. name: to be called so, or None for its own name."""
+    """Task to open a scene and return its record."""
 
     uri: str
+    """URI of the scene."""
     name: str | None
+    """Name of the scene in the output; None for its own name."""
 
 
 @dataclass(frozen=True)
 class BlockTask:
-    """Render a block. is_trial: its worker died before, so each image is rendered in a process of
-    its own, and one that ends it is the only one lost. is_damaged: it is published, and has lost
-    files since.
-    """
+    """Task to render a block."""
 
     block: Block
+    """The block."""
     name: str | None
+    """As of an IndexTask."""
     is_trial: bool = False
+    """True if a worker died at the block before. Each image is then rendered in a process of its
+    own, so that only the image is lost that ends its process.
+    """
     is_damaged: bool = False
+    """True if the block is published and has lost files since."""
 
 
 @dataclass(frozen=True)
 class ResolveTask:
-    """Let the qualities of recipes choose their settings in a scene, or find what they have chosen.
-    name: as of an IndexTask. keep: whether a new choice is kept in the output.
-    """
+    """Task to choose the open settings of recipes in a scene, or to find earlier choices."""
 
     uri: str
+    """URI of the scene."""
     name: str | None
+    """As of an IndexTask."""
     recipes: tuple[Recipe, ...]
+    """Recipes whose quality leaves settings open."""
     keep: bool = True
+    """If True, the output keeps new choices."""
 
 
 Task = IndexTask | ResolveTask | BlockTask
@@ -333,42 +381,54 @@ Task = IndexTask | ResolveTask | BlockTask
 
 @dataclass(frozen=True)
 class BlockDone:
-    """What became of a block. skipped: images that were finished before, here or elsewhere.
-    is_elsewhere: another process is at it; nothing was done. seconds: by kind of work, as of
-    `worker.WorkTimes`.
-    """
+    """Counts of a block's images."""
 
     written: int = 0
+    """Images rendered now."""
     skipped: int = 0
+    """Images that were finished before, here or by another process."""
     failed: int = 0
+    """Images that could not be rendered."""
     failures: tuple[str, ...] = ()
+    """One line for each failure."""
     is_elsewhere: bool = False
+    """True if another process has claimed the block; nothing was done."""
     seconds: dict[str, float] | None = None
+    """Seconds by kind of work, as of `worker.WorkTimes`."""
 
 
 @dataclass(frozen=True)
 class ResolvedRecipes:
-    """The recipes of a ResolveTask, in its order."""
+    """Result of a ResolveTask: its recipes, resolved, in its order."""
 
     recipes: tuple[Recipe, ...]
+    """Resolved recipes."""
 
 
 Result = SceneRecord | ResolvedRecipes | BlockDone | TaskFailed
 
 
 class BlockWorker:
-    """Does one task after the other. tell: hears of every image, from several threads."""
+    """Does one task after the other.
+
+    Attributes:
+        setup: Output, backend and scene loader.
+        on_outcome: Called with every image's Outcome, from several threads.
+    """
 
     def __init__(self, setup: WorkSetup, on_outcome: OnOutcome) -> None:
-        self._setup, self._on_outcome = setup, on_outcome
+        self._setup = setup
+        self._on_outcome = on_outcome
         self._store: Store = open_store(setup.store_uri)
         self._scene: Scene | None = None
-        self._opened: tuple[str, str | None] | None = None
-        self._entered: set[tuple[str, str]] = set()
+        self._scene_key: tuple[str, str | None] | None = None
+        self._entered_variants: set[tuple[str, str]] = set()
 
     def do(self, task: Task) -> Result:
-        """The task's result; errors that concern the task alone are results too. Raises GpuLost:
-        this process can do no other task either.
+        """Do a task; errors that concern only the task are results too.
+
+        Raises:
+            GpuLost: This process cannot do any other task either.
         """
         try:
             if isinstance(task, IndexTask):
@@ -390,13 +450,16 @@ class BlockWorker:
             return TaskFailed(_message_of(error), of_memory=isinstance(error, MemoryError))
 
     def _index(self, task: IndexTask) -> SceneRecord:
-        started = time.perf_counter()
-        scene = self._scene_of(task.uri, task.name)
+        """Open a scene and return its record."""
+        start_s = time.perf_counter()
+        scene = self._open_scene(task.uri, task.name)
         digest = self._setup.digest_of(task.uri) if self._setup.digest_of is not None else None
-        return SceneRecord.of(scene, task.uri, time.perf_counter() - started, digest)
+        return SceneRecord.of(scene, task.uri, time.perf_counter() - start_s, digest)
 
     def _resolve(self, task: ResolveTask, recipe: Recipe) -> Recipe:
-        scene, setup = self._scene_of(task.uri, task.name), self._setup
+        """Return the recipe with the settings that its quality chooses in the scene."""
+        scene = self._open_scene(task.uri, task.name)
+        setup = self._setup
         try:
             return resolve_quality_for(
                 self._store,
@@ -412,9 +475,10 @@ class BlockWorker:
                 f"cannot choose its settings: {error}"
             ) from error
 
-    def _scene_of(self, uri: str, name: str | None) -> Scene:
-        if self._opened != (uri, name) or self._scene is None:
-            self._forget()
+    def _open_scene(self, uri: str, name: str | None) -> Scene:
+        """Return the opened scene; opens it unless it is the one at hand."""
+        if self._scene_key != (uri, name) or self._scene is None:
+            self._drop_scene()
             try:
                 scene = self._setup.open_scene(uri)
             except OutputError:
@@ -423,15 +487,16 @@ class BlockWorker:
                 _log.debug("%s", uri, exc_info=True)
                 raise _SceneFailed(_message_of(error)) from error
             self._scene = scene if name is None else replace(scene, name=name)
-            self._opened = (uri, name)
+            self._scene_key = (uri, name)
         return self._scene
 
-    def _forget(self) -> None:
-        """Let go of the scene before another one is opened: never two at a time."""
-        self._scene = self._opened = None
+    def _drop_scene(self) -> None:
+        """Drop the scene before another one is opened, so that two are never in memory."""
+        self._scene = self._scene_key = None
         gc.collect()
 
     def _render(self, task: BlockTask) -> BlockDone:
+        """Claim a block and render it, unless it is finished already."""
         block = task.block
         claim = try_claim(self._store, block.claim)
         if claim is None:
@@ -439,26 +504,29 @@ class BlockWorker:
         with claim:
             part = list_parts(self._store, folder_name(block.scene)).get(block.key)
             if part is not None and not part.has_failures and not task.is_damaged:
-                clear_block(self._store, self._setup.scratch, block)  # killed just before it did
+                # A killed process may have left the folder.
+                clear_block(self._store, self._setup.scratch, block)
                 return BlockDone(skipped=block.images)
             return self._render_claimed(task, part if task.is_damaged else None)
 
-    def _render_claimed(self, task: BlockTask, damaged: Part | None) -> BlockDone:
-        block, times = task.block, WorkTimes()
-        if task.is_trial:  # its processes share a scene of their own: not two at a time
-            self._forget()
+    def _render_claimed(self, task: BlockTask, damaged_part: Part | None) -> BlockDone:
+        """Render and publish a block whose claim this process holds."""
+        block = task.block
+        times = WorkTimes()
+        if task.is_trial:  # its processes open the scene themselves: never two in memory
+            self._drop_scene()
         else:
             with times.spent("open"):
-                scene = self._scene_of(block.uri, task.name)
+                scene = self._open_scene(block.uri, task.name)
             with times.spent("prepare"):
-                self._share(block, scene)
-        self._enter(block)
+                self._share_files(block, scene)
+        self._enter_variant(block)
         folder = staging_folder(self._store, self._setup.scratch, block)
         if folder.is_dir():
             clear_files_of(self._store, block)
-        if damaged is not None:
-            take_published(self._store, folder, block, damaged)
-        take_sweeps(self._store, folder, block)
+        if damaged_part is not None:
+            link_published_files(self._store, folder, block, damaged_part)
+        link_published_sweeps(self._store, folder, block)
         job = RenderJob(
             scene_uri=block.uri,
             recipes=[block.recipe],
@@ -478,7 +546,7 @@ class BlockWorker:
 
             result = run_job(
                 job,
-                scene_loader=lambda uri: self._scene_of(uri, task.name),
+                scene_loader=lambda uri: self._open_scene(uri, task.name),
                 renderer=self._setup.renderer,
                 progress=False,
                 on_outcome=on_outcome,
@@ -491,35 +559,41 @@ class BlockWorker:
         counts = result.written, result.skipped, result.failed, result.failures
         return BlockDone(*counts, seconds=times.so_far())
 
-    def _enter(self, block: Block) -> None:
+    def _enter_variant(self, block: Block) -> None:
+        """Make sure that the images of the block's variant have one identity; once per variant."""
         variant = (block.scene, block.variant)
-        if variant not in self._entered:
+        if variant not in self._entered_variants:
             enter_variant(self._store, *variant, block.identity(self._setup.backend))
-            self._entered.add(variant)
+            self._entered_variants.add(variant)
 
     def _shared_dir(self) -> Path:
+        """Return the folder for files that images share."""
         if self._store.local_dir is not None:
             return self._store.local_dir / STATE_FOLDER
         assert self._setup.scratch is not None
         return self._setup.scratch
 
-    def _share(self, block: Block, scene: Scene) -> None:
-        """Let one process find what lies in files, and the others on this disk wait for it."""
-        recipe, backend = block.recipe, self._setup.backend
+    def _share_files(self, block: Block, scene: Scene) -> None:
+        """Let one process compute the files that images share.
+
+        The other processes on this disk wait for it.
+        """
+        recipe = block.recipe
+        backend = self._setup.backend
         if any(e.shares_files and e.of(recipe) is not None for e in effects.EFFECTS):
             folder = self._shared_dir()
             lock = folder / f"beds-{folder_name(block.scene)}.lock"
             with file_lock(lock, "finds where snow can lie"):
-                job = effects.Sharing(scene, [recipe], folder=folder, backend=backend)
-                effects.share_effects(job, only_files=True)
+                sharing = effects.Sharing(scene, [recipe], folder=folder, backend=backend)
+                effects.share_effects(sharing, only_files=True)
 
 
 class _SceneFailed(ClimateGSError):
-    """A scene could not be opened."""
+    """Error of a scene that could not be opened."""
 
 
 def _message_of(error: Exception) -> str:
-    """Our own errors say what to do; of others the kind matters too."""
+    """Return an error's message; the type is added unless the error is one of this package."""
     if isinstance(error, MemoryError):
         return f"memory ran out ({error}); use fewer workers, or a machine with more"
     return str(error) if isinstance(error, ClimateGSError) else describe(error, "in a worker")

@@ -1,7 +1,8 @@
-"""A job resolved: every scene's recipes in numbers, cut into blocks; as data and as a file.
+"""Plan of a dataset job: every scene's images under every resolved recipe, cut into blocks.
 
-The plan lies in the output as `.climategs/jobs/<name>.json`, so that progress can be read from the
-output alone.
+In: recipes of a job and records of its scenes. Out: a `Plan` for `generate`, and the status of a
+job for `climategs status`. The plan is stored in the output as `.climategs/jobs/<name>.json`, so
+that progress can be read from the output alone.
 """
 
 from __future__ import annotations
@@ -32,41 +33,52 @@ from augment.trust import judge_scene, seen_views, unfitted_cameras
 from recipes.job import ALL, JobRecipes, JobScene
 from recipes.schema import Recipe, parse_frames
 
-# ---- What a job knows of a scene without keeping it open, and the blocks of images it is cut into
+# ---- Record of a scene that is not open, and the blocks of images it is cut into -----------------
 
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """cameras: by name, width and height in pixels and the time of the image."""
+    """Cameras of one frame."""
 
     number: int
+    """Frame number."""
     timestamp_ns: int
+    """Time of the frame."""
     cameras: dict[str, tuple[int, int, int]]
+    """Width and height in pixels and the time of the image, by camera name."""
 
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """A scene's frames and cameras. uri: as the job names it. source: as the scene does itself.
-    has_lidar: whether there is any. open_s: how long opening it took. unfitted: cameras that it was
-    never fitted to. learnt_scale: of the images that it was made from over the cameras. problems:
-    what is not fit for weather, as of augment.trust.SceneTrust. digest: of its content, None where
-    nobody knows it.
-    """
+    """Frames and cameras of a scene."""
 
     uri: str
+    """URI of the scene, as the job names it."""
     name: str
+    """Name of the scene in the output."""
     source: str
+    """The scene's own statement of its origin."""
     has_lidar: bool
+    """True if a frame has a LiDAR sweep."""
     open_s: float
+    """Seconds that opening the scene took."""
     frames: tuple[FrameRecord, ...]
+    """Frames in order of number."""
     unfitted: tuple[str, ...] = ()
+    """Names of the cameras that the scene was never fitted to."""
     learnt_scale: float | None = None
+    """Size of the images that the scene was made from, divided by the size of the cameras'
+    images.
+    """
     problems: tuple[str, ...] = ()
+    """Reasons why the scene is not fit for weather, as of augment.trust.SceneTrust."""
     digest: str | None = None
+    """Digest of the scene's content; None where it is not known."""
 
     @staticmethod
     def of(scene: Scene, uri: str, open_s: float, digest: str | None = None) -> SceneRecord:
-        select_frames(SceneIndex.of(scene), None, None)  # or it holds no image at all
+        """Return the record of an open scene."""
+        select_frames(SceneIndex.of(scene), None, None)  # raises where the scene has no image
         frames = [
             FrameRecord(
                 frame.index,
@@ -79,7 +91,12 @@ class SceneRecord:
         unfitted = unfitted_cameras(scene)
         cameras = [name for name in scene.camera_names if name not in unfitted]
         return SceneRecord(
-            *(uri, scene.name, scene.source, lidar, open_s, tuple(frames)),
+            uri,
+            scene.name,
+            scene.source,
+            lidar,
+            open_s,
+            tuple(frames),
             unfitted=unfitted,
             learnt_scale=seen_views(scene).scale,
             problems=judge_scene(scene, cameras=cameras, scale=None, count=1).problems,
@@ -87,12 +104,17 @@ class SceneRecord:
         )
 
     def to_json(self) -> bytes:
+        """Return the record as JSON."""
         return _RECORD.dump_json(self)
 
     @staticmethod
-    def from_json(data: bytes, where: str) -> SceneRecord:
-        """What `to_json` made bytes of."""
-        with reading_back(where, "Delete it; the scene is opened again"):
+    def from_json(data: bytes, source_name: str) -> SceneRecord:
+        """Return the record that `to_json` has written.
+
+        Args:
+            source_name: Name of the file, for errors.
+        """
+        with reading_back(source_name, "Delete it; the scene is opened again"):
             return _RECORD.validate_json(data, strict=True)
 
 
@@ -101,56 +123,71 @@ _RECORD = TypeAdapter(SceneRecord)
 
 @dataclass(frozen=True)
 class Block:
-    """Images that one worker renders in a row and that appear in the output at once. key:
-    `<scene>/<variant>-<first frame>-<digest>`, the digest of all that decides the block's images,
-    whatever else is in the job. uri: what opens the scene. source: the scene's own word for that.
-    scene: its name in the output. images: how many it has. digest: of the scene's content; no part
-    of the key, so that outputs of before it was noted are gone on with.
-    """
+    """Images that one worker renders in a row and that appear in the output in one step."""
 
     key: str
+    """`<scene>/<variant>-<first frame>-<digest>`. The digest is of all that decides the block's
+    images; the rest of the job does not change it.
+    """
     uri: str
+    """URI that opens the scene."""
     source: str
+    """The scene's own statement of its origin."""
     scene: str
+    """Name of the scene in the output."""
     recipe: Recipe
+    """Resolved recipe."""
     frames: tuple[int, ...]
+    """Frame numbers."""
     cameras: tuple[str, ...]
+    """Camera names."""
     images: int
+    """Number of images."""
     digest: str | None = None
+    """Digest of the scene's content. It is no part of the key, so that jobs go on with outputs that
+    were begun before the digest was noted.
+    """
 
     @property
     def variant(self) -> str:
+        """Name of the block's variant."""
         return variant_name(self.recipe)
 
     @property
     def claim(self) -> str:
-        """Its name among the claims, and that of the folder it is rendered in."""
+        """Name of the block's claim, and of the folder in which it is rendered."""
         return claim_name(self.key)
 
     @property
     def file_stem(self) -> str:
-        """What its files are called that belong to several images: `000016-3fc0a1b2`."""
+        """Stem of the block's files that belong to several images: `000016-3fc0a1b2`."""
         return self.key.rsplit("/", 1)[-1].removeprefix(folder_name(self.variant) + "-")
 
     def identity(self, backend: str) -> Identity:
-        """What its images are made from. backend: as named, or as chosen where that is known."""
+        """Return the identity of the block's images.
+
+        Args:
+            backend: Name of the backend, or the chosen one where it is known.
+        """
         version = augment.__version__
         return Identity(self.source, self.recipe.hash, RECORDED, version, backend, self.digest)
 
     def pictured(self, record: SceneRecord) -> list[Pictured]:
-        """All images of the block, by frame and camera."""
-        requested, cameras, scale = set(self.frames), set(self.cameras), self.recipe.render.scale
+        """Return all images of the block, by frame and camera."""
+        frame_numbers = set(self.frames)
+        camera_names = set(self.cameras)
+        scale = self.recipe.render.scale
         return [
-            Pictured(frame.number, name, time, *scaled_size(width, height, scale))
+            Pictured(frame.number, name, time_ns, *scaled_size(width, height, scale))
             for frame in record.frames
-            if frame.number in requested
-            for name, (width, height, time) in frame.cameras.items()
-            if name in cameras
+            if frame.number in frame_numbers
+            for name, (width, height, time_ns) in frame.cameras.items()
+            if name in camera_names
         ]
 
 
 def claim_name(key: str) -> str:
-    """A block's key as a name that is a single part of a path."""
+    """Return a block's key as a single component of a path."""
     return folder_name(key.replace("/", "."))
 
 
@@ -163,45 +200,71 @@ def cut_into_blocks(
     block_images: int = 64,
     backend: str = "auto",
 ) -> list[Block]:
-    """The scene's blocks, variant by variant, in the order of the frames. frames: as
-    `recipes.schema` reads them; ranges end with the scene. cameras: names; None for all but those
-    that were never fitted, and `all` for these too. block_images: about how many images one
-    has. Blocks begin at fixed frames, so that most stay the same when the selection grows.
+    """Return the scene's blocks, variant by variant, in the order of the frames.
+
+    Blocks begin at fixed frames, so that most blocks stay the same when the selection grows.
+
+    Args:
+        record: Record of the scene.
+        recipes: Resolved recipes.
+        frames: Selection of frames, as `recipes.schema` reads it; ranges end with the scene.
+        cameras: Camera names. None: all cameras that the scene was fitted to; `all`: every camera.
+        block_images: Approximate number of images in a block.
+        backend: Name of the rasteriser's backend.
     """
-    known = {name for frame in record.frames for name in frame.cameras}
+    camera_names = {name for frame in record.frames for name in frame.cameras}
     if cameras is None:
-        cameras = tuple(sorted(known - set(record.unfitted))) if record.unfitted else None
+        cameras = tuple(sorted(camera_names - set(record.unfitted))) if record.unfitted else None
     elif tuple(cameras) == ALL:
         cameras = None
-    if cameras is not None and (unknown := sorted(set(cameras) - known)):
+    if cameras is not None and (unknown_cameras := sorted(set(cameras) - camera_names)):
         raise SceneError(
-            f"scene {record.name!r} has no camera {', '.join(unknown)}; it has "
-            f"{', '.join(sorted(known))}"
+            f"scene {record.name!r} has no camera {', '.join(unknown_cameras)}; it has "
+            f"{', '.join(sorted(camera_names))}"
         )
-    selected_cameras = known if cameras is None else set(cameras)
-    numbers = [frame.number for frame in record.frames]
-    chosen = parse_frames(frames).select(numbers, clip=True)
-    requested = set(numbers if chosen is None else chosen)
-    if unknown_frames := sorted(requested - set(numbers)):
+    selected_cameras = camera_names if cameras is None else set(cameras)
+    scene_frames = [frame.number for frame in record.frames]
+    selected_frames = parse_frames(frames).select(scene_frames, clip=True)
+    requested_frames = set(scene_frames if selected_frames is None else selected_frames)
+    if unknown_frames := sorted(requested_frames - set(scene_frames)):
         raise SceneError(
             f"scene {record.name!r} has no frame {', '.join(map(str, unknown_frames))}; its frames "
-            f"are {numbers[0]} to {numbers[-1]}"
+            f"are {scene_frames[0]} to {scene_frames[-1]}"
         )
-    span = max(1, block_images // max(len(selected_cameras), 1))
+    block_frames = max(1, block_images // max(len(selected_cameras), 1))
     origin = record.uri, record.source, record.name
     blocks: list[Block] = []
     for recipe in recipes:
         stem = f"{folder_name(record.name)}/{folder_name(variant_name(recipe))}"
-        for start in range(0, len(record.frames), span):
-            run = [f for f in record.frames[start : start + span] if f.number in requested]
-            counts = [len(selected_cameras & f.cameras.keys()) for f in run]
-            held = tuple(f.number for f, count in zip(run, counts, strict=True) if count)
-            if held:
-                names = tuple(sorted(selected_cameras & {n for f in run for n in f.cameras}))
-                decides = [record.source, recipe.hash, held, names, augment.__version__, backend]
-                digest = hashlib.sha256(json.dumps(decides).encode()).hexdigest()[:12]
-                key = f"{stem}-{run[0].number:06d}-{digest}"
-                blocks.append(Block(key, *origin, recipe, held, names, sum(counts), record.digest))
+        for start in range(0, len(record.frames), block_frames):
+            block_records = [
+                f
+                for f in record.frames[start : start + block_frames]
+                if f.number in requested_frames
+            ]
+            num_images = [len(selected_cameras & f.cameras.keys()) for f in block_records]
+            frame_numbers = tuple(
+                f.number for f, count in zip(block_records, num_images, strict=True) if count
+            )
+            if frame_numbers:
+                names = tuple(
+                    sorted(selected_cameras & {n for f in block_records for n in f.cameras})
+                )
+                key_facts = [
+                    record.source,
+                    recipe.hash,
+                    frame_numbers,
+                    names,
+                    augment.__version__,
+                    backend,
+                ]
+                digest = hashlib.sha256(json.dumps(key_facts).encode()).hexdigest()[:12]
+                key = f"{stem}-{block_records[0].number:06d}-{digest}"
+                blocks.append(
+                    Block(
+                        key, *origin, recipe, frame_numbers, names, sum(num_images), record.digest
+                    )
+                )
     if not blocks:
         raise SceneError(
             f"scene {record.name!r} ({record.uri}): frames {frames!r} and cameras "
@@ -212,57 +275,72 @@ def cut_into_blocks(
 
 # ---- The plan ------------------------------------------------------------------------------------
 
+# Folder of the plans.
 JOBS = f"{STATE_FOLDER}/jobs"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """blocks: in order, scene by scene. records: by scene. names: what a scene is called where the
-    job says so. unusable: URI -> why the scene cannot be opened, or not as the job wants it.
-    """
+    """Blocks of a whole job."""
 
     job: str
+    """Name of the job."""
     backend: str
+    """Name of the rasteriser's backend."""
     blocks: tuple[Block, ...]
+    """Blocks in order, scene by scene."""
     records: Mapping[str, SceneRecord]
+    """Records by scene name."""
     names: Mapping[str, str | None]
+    """Name that the job gives a scene, or None, by scene name."""
     unusable: Mapping[str, str]
+    """Reasons why a scene cannot be opened, or not as the job asks for it, by URI."""
 
     @property
     def images(self) -> int:
+        """Number of images."""
         return sum(block.images for block in self.blocks)
 
 
 def make_plan(
     recipes: JobRecipes,
     scenes: Sequence[JobScene],
-    found: Mapping[tuple[str, str | None], SceneRecord | str],
+    scene_records: Mapping[tuple[str, str | None], SceneRecord | str],
     backend: str,
     resolved: Mapping[tuple[str, str], Recipe | str] = MappingProxyType({}),
 ) -> Plan:
-    """The plan of a job. scenes: without patterns. found: the scene of every URI and name, or why
-    it cannot be opened. resolved: by scene and variant, recipes whose quality had to choose, or why
-    it could not: then no recipe of that scene is rendered. Raises ClimateGSError: two scenes would
-    share a folder, or none can be used. RecipeError: a draw breaks a rule.
+    """Return the plan of a job.
+
+    Args:
+        scenes: Scenes of the job, with patterns already expanded.
+        scene_records: Record of every scene, or why it cannot be opened, by URI and name.
+        resolved: Recipes whose quality had to choose settings, or why it could not, by scene and
+            variant. In the second case no recipe of that scene is rendered.
+
+    Raises:
+        ClimateGSError: Two scenes would share a folder, or no scene can be used.
+        RecipeError: A draw breaks a rule.
     """
     blocks: list[Block] = []
     records: dict[str, SceneRecord] = {}
     unusable: dict[str, str] = {}
     for entry in scenes:
-        record = found[entry.uri, entry.name]
+        record = scene_records[entry.uri, entry.name]
         if isinstance(record, str):
             unusable[entry.uri] = record
             continue
         _check_folder(records, record)
-        drawn = recipes.of_scene(entry, record.name)
-        chosen = [resolved.get((record.name, variant_name(recipe)), recipe) for recipe in drawn]
-        if failed := [why for why in chosen if isinstance(why, str)]:
-            unusable[entry.uri] = failed[0]
+        recipe_draws = recipes.of_scene(entry, record.name)
+        resolved_recipes = [
+            resolved.get((record.name, variant_name(recipe)), recipe) for recipe in recipe_draws
+        ]
+        if failures := [why for why in resolved_recipes if isinstance(why, str)]:
+            unusable[entry.uri] = failures[0]
             continue
         try:
-            cut = cut_into_blocks(
+            scene_blocks = cut_into_blocks(
                 record,
-                [recipe for recipe in chosen if isinstance(recipe, Recipe)],
+                [recipe for recipe in resolved_recipes if isinstance(recipe, Recipe)],
                 frames=entry.frames,
                 cameras=entry.cameras,
                 block_images=recipes.job.block_images,
@@ -272,148 +350,181 @@ def make_plan(
             unusable[entry.uri] = str(error)
             continue
         records[record.name] = record
-        blocks += cut
+        blocks += scene_blocks
     if not records:
         reasons = "".join(f"\n  {uri}: {why}" for uri, why in list(unusable.items())[:5])
         raise ClimateGSError(f"job {recipes.job.name}: none of its scenes can be used:{reasons}")
-    pairs = [(entry, found[entry.uri, entry.name]) for entry in scenes]
+    pairs = [(entry, scene_records[entry.uri, entry.name]) for entry in scenes]
     names = {record.name: e.name for e, record in pairs if isinstance(record, SceneRecord)}
     return Plan(recipes.job.name, backend, tuple(blocks), records, names, unusable)
 
 
 def shard_of(blocks: Sequence[Block], number: int, count: int) -> list[Block]:
-    """The blocks of shard `number` (counted from 1) of `count`: a run of about as many images as
-    every other's, so that most scenes are opened by one shard only.
+    """Return the blocks of shard `number` of `count`, counted from 1.
+
+    Each shard is a run of about as many images as every other one, so that most scenes are opened
+    by only one shard.
     """
-    total, before = sum(block.images for block in blocks), 0
-    mine = []
+    total_images = sum(block.images for block in blocks)
+    images_before = 0
+    shard_blocks = []
     for block in blocks:
-        if (before + block.images / 2) * count // max(total, 1) == number - 1:
-            mine.append(block)
-        before += block.images
-    return mine
+        if (images_before + block.images / 2) * count // max(total_images, 1) == number - 1:
+            shard_blocks.append(block)
+        images_before += block.images
+    return shard_blocks
 
 
 @dataclass(frozen=True)
 class PlannedBlock:
-    """A block as the plan's file has it. key: of the block. images: how many."""
+    """Block in the plan's file."""
 
     key: str
+    """Key of the block."""
     scene: str
+    """Name of the scene in the output."""
     variant: str
+    """Name of the variant."""
     recipe: str
+    """Name of the recipe."""
     images: Annotated[int, Field(ge=1)]
+    """Number of images."""
 
     @property
     def claim(self) -> str:
-        """As `Block.claim`."""
+        """Name of the block's claim, as of `Block.claim`."""
         return claim_name(self.key)
 
 
 @dataclass(frozen=True)
 class StoredPlan:
-    """What the output says of a job."""
+    """File of a job's plan."""
 
     job: str
+    """Name of the job."""
     version: str
+    """Version of this package that planned the job."""
     blocks: tuple[PlannedBlock, ...]
+    """Blocks in order."""
     unusable: dict[str, str]
+    """Reasons why scenes cannot be used, by URI."""
     format: Literal[2] = 2
+    """Version of the file's format."""
 
 
 _STORED_PLAN = TypeAdapter(StoredPlan)
 
 
 def store_plan(store: Store, plan: Plan) -> None:
-    """Write the plan's file; the same for every shard and every time."""
+    """Write the plan's file; it is the same for every shard and every run."""
     blocks = [PlannedBlock(b.key, b.scene, b.variant, b.recipe.name, b.images) for b in plan.blocks]
-    stored = StoredPlan(plan.job, augment.__version__, tuple(blocks), dict(plan.unusable))
-    data = _STORED_PLAN.dump_json(stored)
+    stored_plan = StoredPlan(plan.job, augment.__version__, tuple(blocks), dict(plan.unusable))
+    data = _STORED_PLAN.dump_json(stored_plan)
     path = f"{JOBS}/{plan.job}.json"
     if not (store.exists(path) and store.read(path) == data):
         store.write(path, data)
 
 
 def stored_plans(store: Store) -> list[StoredPlan]:
-    """The plans of all jobs in the output, by name."""
+    """Return the plans of all jobs in the output, by name."""
     paths = [path for path in store.list(JOBS) if path.endswith(".json")]
     return [_from_json(store.read(path), f"{store.uri}/{path}") for path in sorted(paths)]
 
 
 def _check_folder(records: Mapping[str, SceneRecord], record: SceneRecord) -> None:
-    for other in records.values():
-        if folder_name(other.name).casefold() == folder_name(record.name).casefold():
+    """Raise ClimateGSError where two scenes would share a folder."""
+    for other_record in records.values():
+        if folder_name(other_record.name).casefold() == folder_name(record.name).casefold():
             raise ClimateGSError(
-                f"the scenes {other.uri} and {record.uri} are both called {record.name!r}, so they "
-                f"would share a folder; give one of them a name in the job: "
+                f"the scenes {other_record.uri} and {record.uri} are both called {record.name!r}, "
+                f"so they would share a folder; give one of them a name in the job: "
                 f"{{uri: {record.uri!r}, name: ...}}"
             )
 
 
-def _from_json(data: bytes, where: str) -> StoredPlan:
-    with reading_back(where, "Start the job again, which writes it anew"):
+def _from_json(data: bytes, source_name: str) -> StoredPlan:
+    """Return the plan in a file's bytes."""
+    with reading_back(source_name, "Start the job again, which writes it anew"):
         return _STORED_PLAN.validate_json(data, strict=True)
 
 
-# ---- How far a job has come, read from its output alone ------------------------------------------
+# ---- Status of a job, read from its output alone -------------------------------------------------
 
-_RECENT = 20  # blocks whose times tell how fast it goes
+# Number of the last blocks whose times give the job's speed.
+_NUM_RECENT = 20
 
 
 @dataclass
 class Progress:
-    """Images of a group. in_failed_blocks: all those of blocks of which some image failed."""
+    """Counts of the images of a group."""
 
     planned: int = 0
+    """Images of the plan."""
     published: int = 0
+    """Images of published blocks."""
     in_failed_blocks: int = 0
+    """All images of blocks in which some image failed."""
 
 
 @dataclass(frozen=True)
 class JobStatus:
-    """staged: images that are finished in blocks that are not published, on this machine.
-    images_per_s: of the last blocks together, None where too few tell. claims: blocks that somebody
-    works on.
-    """
+    """Status of a job."""
 
     job: str
+    """Name of the job."""
     version: str
+    """Version of this package that planned the job."""
     total: Progress
+    """Counts of all images."""
     by_scene: dict[str, Progress]
+    """Counts by scene name."""
     by_recipe: dict[str, Progress]
+    """Counts by recipe name."""
     unusable: dict[str, str]
+    """Reasons why scenes cannot be used, by URI."""
     blocks: int
+    """Number of blocks."""
     blocks_published: int
+    """Number of published blocks."""
     staged: int
+    """Finished images of blocks that are not published yet, on this machine."""
     images_per_s: float | None
+    """Speed of the last blocks; None where there are too few of them."""
     claims: int
+    """Number of blocks that a process has claimed."""
 
     @property
     def left_s(self) -> float | None:
-        """How long the rest takes at that pace, seconds."""
+        """Seconds that the remaining images take at that speed; None where it is not known."""
         if not self.images_per_s:
             return None
         return (self.total.planned - self.total.published) / self.images_per_s
 
 
 def read_status(store: Store) -> list[JobStatus]:
-    """The status of every job in the output, by name; empty where none was ever started."""
+    """Return the status of every job in the output, by name.
+
+    The list is empty where no job was ever started.
+    """
     plans = stored_plans(store)
     if not plans:
         return []
     parts = list_parts(store)
-    staged = _staged(store)
-    claims = _claims(store)
-    return [_status(plan, parts, staged, claims) for plan in plans]
+    staged_images = _count_staged_images(store)
+    claim_names = _claims(store)
+    return [_status(plan, parts, staged_images, claim_names) for plan in plans]
 
 
 def _status(
-    plan: StoredPlan, parts: dict[str, Part], staged: dict[str, int], claims: set[str]
+    plan: StoredPlan, parts: dict[str, Part], staged_images: dict[str, int], claim_names: set[str]
 ) -> JobStatus:
+    """Return the status of one job."""
     total = Progress()
     scenes: defaultdict[str, Progress] = defaultdict(Progress)
     recipes: defaultdict[str, Progress] = defaultdict(Progress)
-    published, in_stage, claimed = 0, 0, 0
+    num_published = 0
+    num_staged = 0
+    num_claimed = 0
     times: list[tuple[float, int]] = []
     for block in plan.blocks:
         part = parts.get(block.key)
@@ -422,11 +533,11 @@ def _status(
             if part is not None:
                 group.published += block.images
                 group.in_failed_blocks += block.images if part.has_failures else 0
-        claimed += block.claim in claims
+        num_claimed += block.claim in claim_names
         if part is None:
-            in_stage += min(staged.get(block.claim, 0), block.images)
+            num_staged += min(staged_images.get(block.claim, 0), block.images)
         else:
-            published += 1
+            num_published += 1
             times.append((part.modified_s, block.images))
     return JobStatus(
         plan.job,
@@ -436,28 +547,29 @@ def _status(
         dict(recipes),
         dict(plan.unusable),
         len(plan.blocks),
-        published,
-        in_stage,
+        num_published,
+        num_staged,
         _pace(times),
-        claimed,
+        num_claimed,
     )
 
 
 def _pace(times: list[tuple[float, int]]) -> float | None:
-    recent = sorted(times)[-_RECENT:]
-    if len(recent) < 2 or time.time() - recent[-1][0] > 3600:
+    """Return images per second of the last blocks; None where it is not known."""
+    recent_times = sorted(times)[-_NUM_RECENT:]
+    if len(recent_times) < 2 or time.time() - recent_times[-1][0] > 3600:
         return None
-    seconds = recent[-1][0] - recent[0][0]
-    return sum(images for _, images in recent[1:]) / seconds if seconds > 0 else None
+    seconds = recent_times[-1][0] - recent_times[0][0]
+    return sum(images for _, images in recent_times[1:]) / seconds if seconds > 0 else None
 
 
-def _staged(store: Store) -> dict[str, int]:
-    """Finished images by block that is being rendered on this machine's disk into this output."""
+def _count_staged_images(store: Store) -> dict[str, int]:
+    """Return the number of finished images by block that is rendered on this machine."""
     if store.local_dir is None:
         return {}
     counts: dict[str, int] = {}
     for folder in (store.local_dir / STATE_FOLDER / "blocks").glob("*"):
-        with contextlib.suppress(OSError, OutputError):  # published meanwhile
+        with contextlib.suppress(OSError, OutputError):  # another process has published it
             progress_logs = list(folder.glob(f"{STATE_FOLDER}/journal/*/*.jsonl"))
             finished = sum(read_file(j).count(b'"status":"ok"') for j in progress_logs)
             if (folder / MANIFEST).is_file():  # a run that was stopped, or had failures
@@ -467,17 +579,17 @@ def _staged(store: Store) -> dict[str, int]:
 
 
 def _claims(store: Store) -> set[str]:
-    """Names of what is claimed; elsewhere also by a process that was killed some seconds ago."""
+    """Return the names of claims; on a remote store also of processes that died moments ago."""
     paths = store.list(CLAIMS_FOLDER)
     names = {p.removeprefix(f"{CLAIMS_FOLDER}/").split("/")[0].removesuffix(".lock") for p in paths}
     return names if store.local_dir is None else {name for name in names if _is_held(store, name)}
 
 
 def _is_held(store: Store, name: str) -> bool:
-    """Whether the claim's holder lives; a dead one's is cleared away."""
+    """Return True if the claim's holder lives; the claim of a dead holder is deleted."""
     try:
         claim = try_claim(store, name)
-    except OutputError:  # somebody else's output, which can be read and no more
+    except OutputError:  # an output of another user, which can only be read
         return True
     if claim is not None:
         claim.release()

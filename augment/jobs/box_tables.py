@@ -1,8 +1,9 @@
-"""Tables of what is measured of a frame's boxes in each image: a row per box and image.
+"""Tables of the numbers measured for a frame's boxes in each image: one row per box and image.
 
-The numbers are measured where the image is rendered, travel in the line of its progress log, and go
-to the variant's files (`labels/boxes_2d.parquet` ...) when the job ends. Files that are missing,
-damaged or of another kind raise OutputError.
+In: numbers of boxes (`files.measure_boxes`). Out: lines of a job's progress log, and the variant's
+files (`labels/boxes_2d.parquet` ...). The numbers are measured where the image is rendered, are
+stored in the image's line of the progress log, and go to the variant's files when the job ends.
+Files that are missing, damaged or of another kind raise OutputError.
 """
 
 from __future__ import annotations
@@ -20,129 +21,150 @@ from augment.errors import OutputError
 from augment.jobs.tables import (
     as_described,
     check_count,
+    checked_int,
     parquet_bytes,
     read_parquet,
     texts_of,
-    whole,
 )
 
-Item = tuple[int, str]  # frame number and camera name
+# Frame number and camera name of an image.
+Item = tuple[int, str]
 
 
 @dataclass(frozen=True, eq=False)
 class BoxNumbers:
-    """A frame's boxes in one image, in the labels' order. columns: [B] each, by name."""
+    """Numbers of a frame's boxes in one image, in the labels' order."""
 
     track_ids: tuple[str, ...]
+    """Track of each box."""
     columns: Mapping[str, np.ndarray]
+    """Values [B] by column name."""
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.columns[name]
 
 
-# By the manifest's kind of path: what is seen of a view's boxes, and what each effect does to them.
+# Numbers of a view's boxes by the manifest's kind of path: visibility, and the influence of
+# effects.
 BoxWeather = Mapping[str, BoxNumbers]
 
 
 @dataclass(frozen=True)
 class BoxTable:
-    """How the numbers of one kind are stored. name: as of the manifest's column of paths,
-    without `_path`. file: inside a variant's folder. kind: what the file says that it holds.
-    columns: the file's, with their types, `object` for texts. derived: what follows from the
-    others; those that are columns are there for other readers. later: columns, the last ones, that
-    files of older versions lack, with the value that these mean. sampled: those that samples of
-    the datasets have. visible, hidden: the column that says how much of a box the effect leaves
-    to be seen, or takes; 0 to 1, NaN where it says nothing.
-    """
+    """Storage format of one kind of numbers."""
 
     name: str
+    """Name of the manifest's column of paths, without `_path`."""
     file: str
+    """Path of the file inside a variant's folder."""
     kind: str
+    """Kind of content that the file states."""
     columns: Mapping[str, type]
+    """Types of the file's columns by name; `object` for texts."""
     sampled: tuple[str, ...]
+    """Columns that samples of the datasets have."""
     derived: Mapping[str, Callable[[Mapping[str, Any]], np.ndarray]] = field(default_factory=dict)
+    """Functions that compute columns from the stored ones, by name; those in `columns` are written
+    for other readers.
+    """
     visible: str = ""
+    """Column with the fraction of each box that the effect leaves visible, 0 to 1; NaN where
+    unknown. Empty if there is none.
+    """
     hidden: str = ""
+    """Column with the fraction of each box that the effect hides, 0 to 1; NaN where unknown. Empty
+    if there is none.
+    """
     later: Mapping[str, Any] = field(default_factory=dict)
+    """The last columns, which files of older versions lack, with the values to assume."""
 
     @property
     def stored(self) -> tuple[str, ...]:
+        """Names of the columns that are stored and not derived."""
         return tuple(name for name in self.columns if name not in self.derived)
 
     def left(self, columns: Any) -> np.ndarray | None:
-        """What the effect leaves of each box, float64 [B]; None where the table does not say."""
+        """Return the fraction of each box that the effect leaves visible, float64 [B].
+
+        None where the table does not say.
+        """
         if self.hidden:
             return 1 - columns[self.hidden]
         return columns[self.visible] if self.visible else None
 
     def numbers(self, track_ids: Sequence[str], **stored: np.ndarray) -> BoxNumbers:
-        """The numbers of an image, with what follows from them."""
+        """Return the numbers of an image, with the derived columns."""
         derived = {name: derive(stored) for name, derive in self.derived.items()}
         return BoxNumbers(tuple(track_ids), stored | derived)
 
     def to_json(self, numbers: BoxNumbers) -> list[list[Any]]:
-        """For the progress log; floats keep all their digits."""
+        """Return the numbers as lists for the progress log; floats keep all their digits."""
         return [list(numbers.track_ids), *(numbers[name].tolist() for name in self.stored)]
 
     def from_json(self, columns: Sequence[Sequence[Any]]) -> BoxNumbers:
-        """What `to_json` made a list of."""
+        """Return the numbers that `to_json` made lists of."""
         track_ids, *arrays = columns
         names = self.stored
-        if len(arrays) == len(names) - len(self.later):  # of an older version's log
+        if len(arrays) == len(names) - len(self.later):  # log of an older version
             arrays += [[value] * len(track_ids) for value in self.later.values()]
         pairs = zip(names, arrays, strict=True)
         return self.numbers(track_ids, **{n: np.array(a, self.columns[n]) for n, a in pairs})
 
     def to_bytes(self, items: Mapping[Item, BoxNumbers]) -> bytes:
-        """All images' boxes as one Parquet file, ordered by frame, camera and place in the labels.
-        A note in the metadata lists every image, so that one without boxes differs from one that
-        was not measured.
+        """Return all images' boxes as one Parquet file, by frame, camera and order in the labels.
+
+        A note in the metadata lists every image, so that an image without boxes differs from one
+        that was not measured.
         """
         order = sorted(items)
-        listed = [items[item] for item in order]
-        counts = [len(numbers.track_ids) for numbers in listed]
+        image_numbers = [items[item] for item in order]
+        counts = [len(numbers.track_ids) for numbers in image_numbers]
         cameras = [camera for (_, camera), n in zip(order, counts, strict=True) for _ in range(n)]
         columns: dict[str, Any] = {
             "frame": np.repeat(np.array([frame for frame, _ in order], np.int64), counts),
             "camera": pa.array(cameras, pa.string()),
-            "track_id": pa.array([i for one in listed for i in one.track_ids], pa.string()),
+            "track_id": pa.array(
+                [name for image in image_numbers for name in image.track_ids], pa.string()
+            ),
             "box": _joined([np.arange(n) for n in counts], np.int64),
         }
         for name, kind in self.columns.items():
-            joined = _joined([numbers[name] for numbers in listed], kind)
+            values = _joined([numbers[name] for numbers in image_numbers], kind)
             if kind is object:
-                columns[name] = pa.array(joined, pa.string())
+                columns[name] = pa.array(values, pa.string())
             else:
                 is_count = kind is np.int64
-                columns[name] = pa.array(joined, mask=joined == NOT_COUNTED) if is_count else joined
+                columns[name] = pa.array(values, mask=values == NOT_COUNTED) if is_count else values
         images = [[*item, count] for item, count in zip(order, counts, strict=True)]
         return parquet_bytes(pa.table(columns), {"kind": self.kind, "images": images})
 
     def read(self, path: Path) -> dict[Item, BoxNumbers]:
-        """The file's numbers by frame and camera."""
+        """Return the file's numbers by frame and camera."""
         table, note = read_parquet(path)
         if note.get("kind") != self.kind:
             raise OutputError(f"{path} holds {note.get('kind')!r} data; expected {self.kind!r}")
         with as_described(path):
             track_ids = texts_of(table["track_id"])
-            absent = self.later.keys() - set(table.column_names)
+            absent_columns = self.later.keys() - set(table.column_names)
             columns = {
                 name: np.full(len(table), self.later[name], self.columns[name])
-                if name in absent
+                if name in absent_columns
                 else self._column(table[name], name)
                 for name in self.stored
             }
-            items, start = {}, 0
+            items = {}
+            start = 0
             for frame, camera, count in note["images"]:
                 rows = slice(start, start + count)
                 # Copies: Arrow's own memory is read-only, which torch.from_numpy warns about.
                 values = {name: column[rows].copy() for name, column in columns.items()}
-                items[whole(frame), camera] = self.numbers(track_ids[rows], **values)
+                items[checked_int(frame), camera] = self.numbers(track_ids[rows], **values)
                 start += count
             check_count(table, start)
         return items
 
     def _column(self, data: pa.ChunkedArray, name: str) -> np.ndarray:
+        """Return a column as an array of its type."""
         if self.columns[name] is object:
             return np.array(texts_of(data), object)
         if self.columns[name] is np.int64:
@@ -154,32 +176,42 @@ def _joined(arrays: list[np.ndarray], dtype: type) -> np.ndarray:
     return np.concatenate([np.zeros(0, dtype), *arrays])
 
 
-def share_of_pixels(marked: str) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
-    """A derived column, float64 [B]: that part of the box's `pixels`; 0 where they were not
-    counted, NaN of none.
+def share_of_pixels(column_name: str) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
+    """Return a function that divides a column by the box's `pixels`, float64 [B].
+
+    The result is 0 where the column was not counted, and NaN for a box without pixels.
+
+    Args:
+        column_name: Column with a number of pixels.
     """
-    return lambda columns: fraction_of(columns[marked], columns["pixels"])
+    return lambda columns: fraction_of(columns[column_name], columns["pixels"])
 
 
 def _visible_fraction(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """float64 [B]: the box's pixels of those and of what hides it; NaN where there are neither."""
-    both = columns["pixels"] + columns["hidden_pixels"]
-    return np.where(both == 0, np.nan, columns["pixels"] / np.maximum(both, 1))
+    """Return the box's visible pixels, divided by visible and hidden ones, float64 [B].
+
+    NaN where there are neither.
+    """
+    all_pixels = columns["pixels"] + columns["hidden_pixels"]
+    return np.where(all_pixels == 0, np.nan, columns["pixels"] / np.maximum(all_pixels, 1))
 
 
 def _modal_xyxy(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """float32 [B, 4]."""
+    """Return the bounds of the visible pixels, float32 [B, 4]."""
     return np.stack([columns[name] for name in MODAL_SIDES], axis=1).astype(np.float32)
 
 
 SIDES = ("x0", "y0", "x1", "y1")
 MODAL_SIDES = ("modal_x0", "modal_y0", "modal_x1", "modal_y1")
-# The boxes in 2D. instance: the object's number (`augment.boxes`). x0 ... y1: pixels, bounds of the
-# part inside the image, hidden or not; zeros out of view. modal_x0 ... modal_y1: bounds of the
-# pixels that show the box; NaN where none does. pixels, hidden_pixels: those, and those inside its
-# outline that show what stands before it. truncated_fraction: of the outline's area, outside the
-# image. is_estimated: depth does not resolve the box, and its pixels are those that its projection,
-# other boxes and LiDAR returns tell (`augment.box_estimates`).
+# The boxes in 2D. Its columns are:
+#   instance: number of the object (`augment.boxes`).
+#   x0 ... y1: bounds of the part inside the image, hidden or not, pixels; zeros out of view.
+#   modal_x0 ... modal_y1: bounds of the pixels that show the box; NaN where none does.
+#   pixels: number of pixels that show the box.
+#   hidden_pixels: number of pixels inside its outline that show something in front of it.
+#   truncated_fraction: fraction of the outline's area that lies outside the image.
+#   is_estimated: True if depth does not resolve the box; its pixels are then estimated from its
+#     projection, other boxes and LiDAR returns (`augment.box_estimates`).
 BOXES_2D = BoxTable(
     name="box_2d",
     file="labels/boxes_2d.parquet",
@@ -197,10 +229,11 @@ BOXES_2D = BoxTable(
     later={"is_estimated": False},
     derived={"visible_fraction": _visible_fraction, "modal_xyxy": _modal_xyxy},
 )
-# Which pixels show each box: in the instance image, where the recipe has one, else by depth, the
-# smallest box that has the surface. Their bounds, from the first pixel's edge to the last one's,
-# how many they are, and COCO's run lengths; zeros and an empty text where there are none.
+# Bounds of a mask, from the first pixel's edge to the last one's.
 MASK_SIDES = ("left", "top", "right", "bottom")
+# Pixels that show each box: those of the instance image, where the recipe has one; otherwise by
+# depth, the smallest box that has the surface. Columns: bounds, number of pixels, and COCO's run
+# lengths; zeros and an empty text where there are none.
 MASKS = BoxTable(
     name="box_mask",
     file="labels/masks.parquet",

@@ -1,9 +1,12 @@
-"""A dataset job: many scenes under many recipes into one output, by any number of workers.
+"""Dataset job: renders many scenes under many recipes into one output, by any number of workers.
 
-What is finished shows in the output alone, so a job that was killed, wherever and however, goes on
-when it is started again, and any number of processes on any number of machines can be at the same
-job: blocks of images are claimed, rendered, and published one by one. The files do not depend on
-who rendered what, nor on how often that was interrupted.
+In: a `GenerateJob` (recipes, scenes, output, executor). Out: images, labels and the manifest in the
+output, and a `GenerateResult`. Called by `climategs generate` (`tools/render.py`).
+
+The output alone says which images are finished. Therefore a job that was killed at any moment goes
+on when it is started again, and any number of processes on any number of machines can work on the
+same job: they claim, render and publish blocks of images one by one. The files do not depend on
+which process rendered which block, nor on how often the job was interrupted.
 """
 
 from __future__ import annotations
@@ -78,12 +81,14 @@ from recipes.files import with_digest
 from recipes.job import JobRecipes, JobScene
 from recipes.schema import Recipe, columns_of_effects
 
-# ---- Which block a worker gets next: one of the scene it has open, as long as there are any ------
+# ---- The order of blocks: a worker gets blocks of its open scene as long as there are any --------
 
 
 class BlockQueue:
-    """Blocks by scene, in order. A worker stays with a scene; a new scene goes to one worker. Where
-    no scene is left that nobody works on, a worker joins the one with most images left.
+    """Queue of blocks by scene, in order.
+
+    A worker stays with its open scene, and a new scene goes to one worker. Where every scene left
+    has a worker already, a further worker joins the scene with the most images left.
     """
 
     def __init__(self, blocks: Iterable[Block]) -> None:
@@ -97,13 +102,22 @@ class BlockQueue:
         return sum(map(len, self._scenes.values()))
 
     def take(self, scene: str | None, elsewhere: Iterable[str]) -> Block | None:
-        """The next block for a worker that has `scene` open, while others have `elsewhere`."""
+        """Return the next block for a worker, or None where no block is left.
+
+        Args:
+            scene: Name of the scene that the worker has open.
+            elsewhere: Names of the scenes that other workers have open.
+        """
         if not self._scenes:
             return None
         if scene not in self._scenes:
-            busy = set(elsewhere)
-            free = [name for name in self._scenes if name not in busy]
-            scene = free[0] if free else max(self._scenes, key=lambda name: self._images[name])
+            busy_scenes = set(elsewhere)
+            free_scenes = [name for name in self._scenes if name not in busy_scenes]
+            scene = (
+                free_scenes[0]
+                if free_scenes
+                else max(self._scenes, key=lambda name: self._images[name])
+            )
         block = self._scenes[scene].popleft()
         self._images[scene] -= block.images
         if not self._scenes[scene]:
@@ -111,36 +125,45 @@ class BlockQueue:
         return block
 
     def take_all(self, scene: str) -> list[Block]:
-        """All blocks of a scene that cannot be opened."""
+        """Remove and return all blocks of a scene that cannot be opened."""
         self._images.pop(scene, None)
         return list(self._scenes.pop(scene, ()))
 
     def put_back(self, block: Block) -> None:
-        """To be tried again, after the others of its scene."""
+        """Queue a block once more, after the other blocks of its scene."""
         self._scenes.setdefault(block.scene, deque()).append(block)
         self._images[block.scene] = self._images.get(block.scene, 0) + block.images
 
 
-# ---- Blocks and what comes before them, as work for a pool ---------------------------------------
+# ---- Opening scenes and rendering blocks, as work for a pool of workers --------------------------
 
-MAX_LOST = 3  # blocks of a scene whose workers die even alone, before the scene is given up
-ELSEWHERE_S = 2.0  # how long to leave a block alone that another process is at
+# Blocks of one scene that may kill even a worker that works alone; then the scene is given up.
+MAX_LOST = 3
+# Wait before a block is tried again that another process has claimed, seconds.
+ELSEWHERE_S = 2.0
 _log = logging.getLogger(__name__)
 
+# Records all images of a block as failed, with a message.
 FailBlock = Callable[[Block, str], None]
 
 
 @dataclass
 class Tally:
-    """Images of the blocks done so far. skipped: finished before. failures: a line each."""
+    """Counts of the images of the blocks that are done so far."""
 
     written: int = 0
+    """Images rendered by this call."""
     skipped: int = 0
+    """Images that were finished before."""
     failed: int = 0
+    """Images that could not be rendered."""
     failures: list[str] = field(default_factory=list)
+    """One line for each failure."""
     seconds: Counter[str] = field(default_factory=Counter)
+    """Seconds by kind of work."""
 
     def add(self, done: BlockDone) -> None:
+        """Add the counts of a finished block."""
         self.written += done.written
         self.skipped += done.skipped
         self.failed += done.failed
@@ -149,58 +172,74 @@ class Tally:
 
 
 class SceneWork(Work):
-    """Tasks that open scenes, before there are blocks; `each` gets a task's result, or a text that
-    says why there is none. doing: what they do. opened: the scene that each slot has open.
+    """Tasks that open scenes, before there are blocks.
+
+    Attributes:
+        tasks: Tasks for the workers.
+        on_result: Called with a task and its result, or with a text that says why there is no
+            result.
+        activity: What the tasks do, after "while", for messages.
+        scene_of_slot: Name of the scene that each slot has open; kept up to date here.
     """
 
     def __init__(
         self,
         tasks: Iterable[Any],
-        each: Callable[[Any, Any], None],
-        doing: str,
-        opened: dict[int, str],
+        on_result: Callable[[Any, Any], None],
+        activity: str,
+        scene_of_slot: dict[int, str],
     ) -> None:
-        self._tasks, self._each, self._doing = deque(tasks), each, doing
-        self._opened = opened
+        self._tasks = deque(tasks)
+        self._on_result = on_result
+        self._activity = activity
+        self._scene_of_slot = scene_of_slot
 
     def take(self, slot: int) -> Any:
         return self._tasks.popleft() if self._tasks else None
 
     def done(self, slot: int, task: Any, result: Any) -> None:
         if isinstance(result, SceneRecord):
-            self._opened[slot] = result.name
-        self._each(task, result.text if isinstance(result, TaskFailed) else result)
+            self._scene_of_slot[slot] = result.name
+        self._on_result(task, result.text if isinstance(result, TaskFailed) else result)
 
     def lost(self, slot: int, task: Any, how: str) -> None:
-        self._each(task, f"the worker {how} while {self._doing}, alone too")
+        self._on_result(task, f"the worker {how} while {self._activity}, alone too")
 
 
 class BlockWork(Work):
-    """Renders and publishes blocks. names: by scene, what the job calls it. opened: the scene that
-    each slot has open. fail: records all images of a block as failed. on_image: told how many
-    images are done, and how many of them failed. damaged: keys of published blocks that have lost
-    files. A block whose worker dies is tried once more, each
-    of its images in a process of its own.
+    """Work that renders and publishes blocks.
+
+    A block whose worker dies is tried once more, each of its images in a process of its own.
+
+    Attributes:
+        names: Name that the job gives each scene, by scene.
+        fail: Records all images of a block as failed.
+        on_image: Called with the number of images done and the number of failed ones.
+        scene_of_slot: Name of the scene that each slot has open; kept up to date here.
+        damaged_keys: Keys of published blocks that have lost files.
     """
 
     def __init__(
         self,
         blocks: Sequence[Block],
         names: Mapping[str, str | None],
-        opened: dict[int, str],
+        scene_of_slot: dict[int, str],
         fail: FailBlock,
         on_image: Callable[[int, int], None] = lambda done, failed: None,
-        damaged: Collection[str] = (),
+        damaged_keys: Collection[str] = (),
     ) -> None:
         self.tally = Tally()
-        self._damaged = frozenset(damaged)
-        self._queue, self._names = BlockQueue(blocks), names
-        self._fail, self._on_image = fail, on_image
+        self._damaged_block_keys = frozenset(damaged_keys)
+        self._queue = BlockQueue(blocks)
+        self._names = names
+        self._fail = fail
+        self._on_image = on_image
         self._partial: dict[int, list[int]] = defaultdict(lambda: [0, 0])  # by slot: done, failed
-        self._opened = opened
-        self._busy: set[int] = set()
-        self._lost_alone: Counter[str] = Counter()  # blocks of a scene that nobody survived
-        self._later: list[tuple[float, Block]] = []  # another process is at them
+        self._scene_of_slot = scene_of_slot
+        self._busy_slots: set[int] = set()
+        self._lone_losses: Counter[str] = Counter()  # blocks by scene that killed a lone worker
+        # Times (monotonic) and blocks to try again: another process has claimed them.
+        self._postponed: list[tuple[float, Block]] = []
 
     def tick(self, slot: int, outcome: Outcome) -> None:
         partial = self._partial[slot]
@@ -209,61 +248,65 @@ class BlockWork(Work):
         self._report()
 
     def take(self, slot: int) -> BlockTask | None:
-        now = time.monotonic()
-        for when, block in list(self._later):
-            if when <= now:
-                self._later.remove((when, block))
+        now_s = time.monotonic()
+        for retry_s, block in list(self._postponed):
+            if retry_s <= now_s:
+                self._postponed.remove((retry_s, block))
                 self._queue.put_back(block)
-        block = self._queue.take(self._opened.get(slot), {self._opened[s] for s in self._busy})
+        block = self._queue.take(
+            self._scene_of_slot.get(slot), {self._scene_of_slot[s] for s in self._busy_slots}
+        )
         if block is None:
             return None
-        self._opened[slot] = block.scene
-        self._busy.add(slot)
-        is_damaged = block.key in self._damaged
+        self._scene_of_slot[slot] = block.scene
+        self._busy_slots.add(slot)
+        is_damaged = block.key in self._damaged_block_keys
         return BlockTask(block, self._names.get(block.scene), is_damaged=is_damaged)
 
     def later_s(self) -> float | None:
-        return max(0.0, self._later[0][0] - time.monotonic()) if self._later else None
+        return max(0.0, self._postponed[0][0] - time.monotonic()) if self._postponed else None
 
-    def retry(self, slot: int, task: BlockTask, why: str) -> list[BlockTask]:
-        _log.warning("%s is tried once more, alone: %s", task.block.key, why)
-        self._free(slot)
+    def retry(self, slot: int, task: BlockTask, reason: str) -> list[BlockTask]:
+        _log.warning("%s is tried once more, alone: %s", task.block.key, reason)
+        self._free_slot(slot)
         return [replace(task, is_trial=True)]
 
     def done(self, slot: int, task: BlockTask, result: BlockDone | TaskFailed) -> None:
-        self._free(slot)
+        self._free_slot(slot)
         if isinstance(result, TaskFailed):
-            others = self._queue.take_all(task.block.scene) if result.of_scene else []
-            self._give_up([task.block, *others], result.text)
+            other_blocks = self._queue.take_all(task.block.scene) if result.of_scene else []
+            self._give_up([task.block, *other_blocks], result.text)
         elif result.is_elsewhere:
-            self._later.append((time.monotonic() + ELSEWHERE_S, task.block))
+            self._postponed.append((time.monotonic() + ELSEWHERE_S, task.block))
         else:
             self.tally.add(result)
         self._report()
 
     def lost(self, slot: int, task: BlockTask, how: str) -> None:
-        self._free(slot)
+        self._free_slot(slot)
         scene = task.block.scene
-        self._opened.pop(slot, None)
-        self._lost_alone[scene] += 1
-        others = self._queue.take_all(scene) if self._lost_alone[scene] == MAX_LOST else []
+        self._scene_of_slot.pop(slot, None)
+        self._lone_losses[scene] += 1
+        other_blocks = self._queue.take_all(scene) if self._lone_losses[scene] == MAX_LOST else []
         self._give_up(
-            [task.block, *others],
+            [task.block, *other_blocks],
             f"the worker {how} while at this block of images, and again when it was tried alone; "
             f"if memory ran out, use fewer workers or a machine with more",
         )
         self._report()
 
-    def _free(self, slot: int) -> None:
-        self._busy.discard(slot)
+    def _free_slot(self, slot: int) -> None:
+        self._busy_slots.discard(slot)
         self._partial.pop(slot, None)
 
     def _report(self) -> None:
-        tally, partial = self.tally, list(self._partial.values())
-        done = tally.written + tally.skipped + tally.failed + sum(p[0] for p in partial)
-        self._on_image(done, tally.failed + sum(p[1] for p in partial))
+        tally = self.tally
+        partial_counts = list(self._partial.values())
+        num_done = tally.written + tally.skipped + tally.failed + sum(p[0] for p in partial_counts)
+        self._on_image(num_done, tally.failed + sum(p[1] for p in partial_counts))
 
     def _give_up(self, blocks: Sequence[Block], message: str) -> None:
+        """Record all images of the blocks as failed."""
         for block in blocks:
             self._fail(block, message)
             self.tally.failed += block.images
@@ -271,178 +314,234 @@ class BlockWork(Work):
             self.tally.failures.append(f"{name}: {message}")
 
 
-# ---- What the qualities of a job's recipes choose in its scenes, before there is a plan ----------
-# A choice is kept in the output: the scenes in which everything was chosen are not opened again.
+# ---- Settings that recipe qualities choose in each scene, before there is a plan -----------------
+# The output keeps every choice: scenes without an open choice are not opened again.
 
-_READS = 16  # at a time: most of the time of one is waiting
+# Reads from the store at a time: a read spends most of its time waiting.
+_NUM_READS = 16
 
-Found = Mapping[tuple[str, str | None], SceneRecord | str]
+# Record of a scene, or why it cannot be opened, by URI and name.
+SceneRecords = Mapping[tuple[str, str | None], SceneRecord | str]
+# Resolved recipe, or why it could not choose its settings, by scene and variant.
 Choices = dict[tuple[str, str], Recipe | str]
 
 
 def resolve_recipes(
-    job: GenerateJob, store: Store, workers: Workers, found: Found, *, progress: bool, keep: bool
+    job: GenerateJob,
+    store: Store,
+    workers: Workers,
+    scene_records: SceneRecords,
+    *,
+    progress: bool,
+    keep: bool,
 ) -> Choices:
-    """By scene and variant: the recipes that had to choose, resolved, or why they could not. found:
-    the scene of every URI and name. keep: whether new choices are kept in the output.
+    """Return the recipes that had to choose settings, by scene and variant.
+
+    Args:
+        scene_records: Record of every scene, or why it cannot be opened, by URI and name.
+        keep: If True, the output keeps new choices.
+
+    Returns:
+        Resolved recipe, or a text that says why it could not choose.
     """
-    asked = [
+    questions = [
         (Question(recipe, record.name, record.source, RECORDED, job.setup.backend), entry)
         for entry in job.scenes
-        if isinstance(record := found[entry.uri, entry.name], SceneRecord)
+        if isinstance(record := scene_records[entry.uri, entry.name], SceneRecord)
         for recipe in job.recipes.of_scene(entry, record.name)
         if recipe.quality.is_open
     ]
-    with ThreadPoolExecutor(_READS, thread_name_prefix="choices") as pool:
-        answers = list(pool.map(lambda pair: recorded(store, pair[0]), asked))
+    with ThreadPoolExecutor(_NUM_READS, thread_name_prefix="choices") as pool:
+        answers = list(pool.map(lambda pair: recorded(store, pair[0]), questions))
     choices: Choices = {}
-    left: defaultdict[tuple[str, str | None, str], list[Recipe]] = defaultdict(list)
-    for (question, entry), answer in zip(asked, answers, strict=True):
+    open_recipes: defaultdict[tuple[str, str | None, str], list[Recipe]] = defaultdict(list)
+    for (question, entry), answer in zip(questions, answers, strict=True):
         if answer is None:
-            left[entry.uri, entry.name, question.scene].append(question.recipe)
+            open_recipes[entry.uri, entry.name, question.scene].append(question.recipe)
         else:
             choices[question.scene, variant_name(question.recipe)] = answer
     tasks = {
         ResolveTask(uri, name, tuple(dict.fromkeys(recipes)), keep): scene
-        for (uri, name, scene), recipes in left.items()
+        for (uri, name, scene), recipes in open_recipes.items()
     }
     bar = ProgressBar(
         total=len(tasks), unit="scene", desc="choosing settings", disable=not progress or not tasks
     )
 
-    def each(task: ResolveTask, resolved: ResolvedRecipes | str) -> None:
+    def on_result(task: ResolveTask, resolved: ResolvedRecipes | str) -> None:
         for number, recipe in enumerate(task.recipes):
             outcome = resolved if isinstance(resolved, str) else resolved.recipes[number]
             choices[tasks[task], variant_name(recipe)] = outcome
         bar.update()
 
     with bar:
-        timed = any(r.quality.budget_ms is not None for task in tasks for r in task.recipes)
-        # Each shard begins elsewhere, so that those that start together do not wait for each other.
+        is_timed = any(r.quality.budget_ms is not None for task in tasks for r in task.recipes)
+        # Each shard begins at another task, so that shards that start together do not wait for each
+        # other's choices.
         number, count = job.shard
         start = (number - 1) * len(tasks) // count
-        turned = [*tasks][start:] + [*tasks][:start]
-        doing = "choosing the settings of its recipes"
-        # Timed ones one by one, so that none disturbs another's frame times.
-        workers.do(SceneWork(turned, each, doing, workers.opened), slots=1 if timed else None)
+        ordered_tasks = [*tasks][start:] + [*tasks][:start]
+        activity = "choosing the settings of its recipes"
+        # Choices that measure frame times run one by one, so that none disturbs another's times.
+        workers.do(
+            SceneWork(ordered_tasks, on_result, activity, workers.opened),
+            slots=1 if is_timed else None,
+        )
     return choices
 
 
-# ---- How long a job will take and how large its output gets, from a few pictures -----------------
+# ---- Estimate of a job's time and of its output's size, from a few pictures ----------------------
 
-MAX_SAMPLED = 8  # recipes whose pictures are made; the others take their mean
+# Recipes for which pictures are rendered; other recipes take the mean of these.
+MAX_SAMPLED = 8
 
 
 class Sample(NamedTuple):
-    """What a recipe's images cost. per megapixel: seconds of rendering and writing, and bytes."""
+    """Cost of a recipe's images."""
 
     seconds_per_mpx: float
+    """Seconds of rendering and writing for one million pixels."""
     bytes_per_mpx: float
+    """Bytes of the files for one million pixels."""
     prepare_s: float
+    """Seconds that each scene takes once, before its first image."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """samples: by recipe. seconds: of one worker alone, its scenes' opening included. bytes: of
-    all files. unsampled: recipes that were not tried.
-    """
+    """Estimated time and size of a job."""
 
     samples: dict[str, Sample]
+    """Measured cost by recipe name."""
     seconds: float
+    """Seconds of a single worker, including the time to open its scenes."""
     bytes: float
+    """Bytes of all files."""
     unsampled: tuple[str, ...]
+    """Names of the recipes that were not tried."""
 
 
 def estimate(
     plan: Plan, open_scene: SceneLoader, *, each: Callable[[str], None] = lambda name: None
 ) -> Estimate:
-    """Render a frame under each recipe, and scale what it takes by the pixels of the job; right to
-    within a factor of two or so. The pictures are the middle frame of the recipe's first scene in
-    one camera, twice: what the first takes beyond the second (snow placement, style maps,
-    compiling) counts once a scene. each: called before every recipe.
+    """Estimate time and size of a job from two pictures of each recipe.
+
+    The estimate is right to within a factor of about two. Both pictures show the middle frame of
+    the recipe's first scene in one camera, and their cost is scaled by the pixels of the job. The
+    time that the first picture takes beyond the second (snow placement, style maps, compiling)
+    counts once for each scene.
+
+    Args:
+        open_scene: Opens a scene by its URI.
+        each: Called with a recipe's name before its pictures.
     """
-    firsts: dict[str, Block] = {}
+    first_blocks: dict[str, Block] = {}
     for block in plan.blocks:
-        firsts.setdefault(block.recipe.name, block)
-    tried = dict(list(firsts.items())[:MAX_SAMPLED])
+        first_blocks.setdefault(block.recipe.name, block)
+    sampled_blocks = dict(list(first_blocks.items())[:MAX_SAMPLED])
     samples: dict[str, Sample] = {}
-    opened: dict[str, Scene] = {}  # never more than one
-    for name, block in tried.items():
+    scene_by_uri: dict[str, Scene] = {}  # at most one scene at a time
+    for name, block in sampled_blocks.items():
         each(name)
-        if block.uri not in opened:
-            opened.clear()
-            opened[block.uri] = open_scene(block.uri)
-        samples[name] = _sample(block, opened.__getitem__, plan)
-    mean = Sample(*(sum(each) / len(samples) for each in zip(*samples.values(), strict=True)))
-    pixels, scenes = _megapixels(plan)
-    costs = {name: samples.get(name, mean) for name in firsts}
-    opening = sum(record.open_s for record in plan.records.values())
-    seconds = sum(pixels[n] * c.seconds_per_mpx + scenes[n] * c.prepare_s for n, c in costs.items())
-    size = sum(pixels[name] * cost.bytes_per_mpx for name, cost in costs.items())
-    return Estimate(samples, opening + seconds, size, tuple(sorted(firsts.keys() - tried.keys())))
+        if block.uri not in scene_by_uri:
+            scene_by_uri.clear()
+            scene_by_uri[block.uri] = open_scene(block.uri)
+        samples[name] = _sample(block, scene_by_uri.__getitem__, plan)
+    mean = Sample(*(sum(costs) / len(samples) for costs in zip(*samples.values(), strict=True)))
+    megapixels, num_scenes = _megapixels(plan)
+    costs = {name: samples.get(name, mean) for name in first_blocks}
+    opening_s = sum(record.open_s for record in plan.records.values())
+    seconds = sum(
+        megapixels[n] * c.seconds_per_mpx + num_scenes[n] * c.prepare_s for n, c in costs.items()
+    )
+    size = sum(megapixels[name] * cost.bytes_per_mpx for name, cost in costs.items())
+    return Estimate(
+        samples,
+        opening_s + seconds,
+        size,
+        tuple(sorted(first_blocks.keys() - sampled_blocks.keys())),
+    )
 
 
 def _megapixels(plan: Plan) -> tuple[dict[str, float], dict[str, int]]:
-    """By recipe: pixels of all its images, in millions, and how many scenes have it."""
-    pixels: defaultdict[str, float] = defaultdict(float)
+    """Return the millions of pixels of all images and the number of scenes, by recipe."""
+    megapixels: defaultdict[str, float] = defaultdict(float)
     scenes: defaultdict[str, set[str]] = defaultdict(set)
     for block in plan.blocks:
         pictured = block.pictured(plan.records[block.scene])
-        pixels[block.recipe.name] += sum(p.width * p.height for p in pictured) / 1e6
+        megapixels[block.recipe.name] += sum(p.width * p.height for p in pictured) / 1e6
         scenes[block.recipe.name].add(block.scene)
-    return dict(pixels), {name: len(held) for name, held in scenes.items()}
+    return dict(megapixels), {name: len(scene_names) for name, scene_names in scenes.items()}
 
 
 def _sample(block: Block, loader: SceneLoader, plan: Plan) -> Sample:
-    record, camera = plan.records[block.scene], block.cameras[0]
-    having = [f.number for f in record.frames if camera in f.cameras]
+    """Render the block's middle frame twice and return its cost."""
+    record = plan.records[block.scene]
+    camera = block.cameras[0]
+    frame_numbers = [f.number for f in record.frames if camera in f.cameras]
     pictured = next(p for p in block.pictured(record) if p.camera == camera)
-    mpx = pictured.width * pictured.height / 1e6
-    took, size = [], 0
+    megapixels = pictured.width * pictured.height / 1e6
+    picture_times_s = []
+    num_bytes = 0
     with tempfile.TemporaryDirectory(prefix="climategs-estimate-") as folder:
-        for out in (Path(folder) / "0", Path(folder) / "1"):
+        for output_dir in (Path(folder) / "0", Path(folder) / "1"):
             job = RenderJob(
                 block.uri,
                 [block.recipe],
-                out,
-                frames=[having[len(having) // 2]],
+                output_dir,
+                frames=[frame_numbers[len(frame_numbers) // 2]],
                 cameras=[camera],
                 backend=plan.backend,
                 shared_dir=Path(folder) / "beds",
             )
-            started = time.perf_counter()
+            start_s = time.perf_counter()
             run_job(job, scene_loader=loader, progress=False)
-            took.append(time.perf_counter() - started)
-            files = [p for p in out.rglob("*") if p.is_file()]
-            size = sum(p.stat().st_size for p in files if STATE_FOLDER not in p.parts)
-    return Sample(took[1] / mpx, size / mpx, max(0.0, took[0] - took[1]))
+            picture_times_s.append(time.perf_counter() - start_s)
+            files = [p for p in output_dir.rglob("*") if p.is_file()]
+            num_bytes = sum(p.stat().st_size for p in files if STATE_FOLDER not in p.parts)
+    return Sample(
+        picture_times_s[1] / megapixels,
+        num_bytes / megapixels,
+        max(0.0, picture_times_s[0] - picture_times_s[1]),
+    )
 
 
 # ---- The job -------------------------------------------------------------------------------------
 
+# Folder of the output's records of scenes.
 SCENES = f"{STATE_FOLDER}/scenes"
+# Kinds of workers, as `GenerateJob.executor` names them.
 EXECUTORS = ("serial", "processes", "ray")
-_COMPACT_S = 60.0
-_CLAIM_S = 30.0
+# Least time between two merges of the manifest while the job runs, seconds.
+_MERGE_INTERVAL_S = 60.0
+# Longest wait at the job's end for another process that is merging the manifest, seconds.
+_MERGE_PATIENCE_S = 30.0
+# Notes about the scenes that are logged one by one.
 _MAX_NOTES = 20
 
 
 @dataclass(frozen=True)
 class GenerateJob:
-    """recipes: of the job, loaded. scenes: the job's, without patterns. executor: `serial` renders
-    in this process, `processes` in several of this machine, `ray` in actors on a cluster. workers:
-    how many; None for one a core, where a GPU renders one process, or an actor for each GPU of the
-    cluster. shard: which part of the job is done here, from 1, and how many there are. rescan: open
-    all scenes anew, in case they have changed.
-    """
+    """A dataset job: recipes, scenes and output, and the workers that render it."""
 
     recipes: JobRecipes
+    """Loaded recipes of the job."""
     scenes: Sequence[JobScene]
+    """Scenes of the job, with patterns already expanded."""
     setup: WorkSetup
+    """Output, backend and scene loader of the workers."""
     executor: str = "processes"
+    """`serial` renders in this process, `processes` in several processes of this machine, `ray` in
+    actors on a cluster.
+    """
     workers: int | None = None
+    """Number of workers. None: one for each core; one process where a GPU renders; one actor for
+    each GPU of the cluster.
+    """
     shard: tuple[int, int] = (1, 1)
+    """Part of the job that is done here, counted from 1, and the number of parts."""
     rescan: bool = False
+    """If True, all scenes are opened again, in case they have changed."""
 
     def __post_init__(self) -> None:
         if self.executor not in EXECUTORS:
@@ -456,18 +555,24 @@ class GenerateJob:
 
 @dataclass(frozen=True)
 class GenerateResult:
-    """Images of this shard. skipped: finished before, here or elsewhere. unusable: scenes by URI.
-    timings: seconds by kind of work, summed over threads and workers (see `worker.shares_of`); and
-    by the clock: `plan`, `scan` of what is finished, and `render_wall`, all else.
-    """
+    """Counts of the images of this shard, and where the time went."""
 
     written: int
+    """Images rendered by this call."""
     skipped: int
+    """Images that were finished before, here or by another process."""
     failed: int
+    """Images that could not be rendered."""
     unusable: dict[str, str]
+    """Reasons why scenes cannot be used, by URI."""
     failures: tuple[str, ...]
+    """One line for each failure."""
     seconds: float
+    """Wall-clock time of the call, seconds."""
     timings: dict[str, float] = field(default_factory=dict)
+    """Seconds by kind of work, summed over threads and workers (see `worker.shares_of`). Measured
+    by the clock: `plan`, `scan` of what is finished, and `render_wall`, everything else.
+    """
 
 
 def run_generate(
@@ -477,19 +582,29 @@ def run_generate(
     prepare: Callable[[list[Recipe]], None] = lambda recipes: None,
     on_image: Callable[[int, int], None] = lambda done, failed: None,
 ) -> GenerateResult:
-    """Render and publish what of the job is not finished yet. progress: bars on stderr. prepare:
-    called before the first image is rendered, with one recipe of each name, to compile kernels once
-    and not in every worker, say. on_image: told how many images are done and how many of them
-    failed, from several threads. A KeyboardInterrupt lets workers finish the images at hand, merges
-    what is published into the manifest, and is raised again. Raises OutputError: the output cannot
-    be written, or holds images of another kind under the same names, and none was written.
-    ClimateGSError: no scene can be used. RecipeError: a recipe cannot be used.
+    """Render and publish the images of the job that are not finished yet.
+
+    A KeyboardInterrupt lets workers finish the images at hand, merges the published images into the
+    manifest, and is raised again.
+
+    Args:
+        progress: If True, show bars on stderr.
+        prepare: Called before the first image is rendered, with one recipe of each name; compiles
+            kernels once instead of in every worker, for example.
+        on_image: Called with the number of images done and the number of failed ones, from several
+            threads.
+
+    Raises:
+        OutputError: The output cannot be written, or it holds images of another kind under the same
+            names; no image was written in the second case.
+        ClimateGSError: No scene can be used.
+        RecipeError: A recipe cannot be used.
     """
-    return _Generation(_with_backend(job), progress, prepare, on_image).go()
+    return _Generation(_with_backend(job), progress, prepare, on_image).run()
 
 
 def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
-    """The job's plan, for which its scenes are opened that have not been; writes nothing."""
+    """Return the job's plan; opens scenes that have no record yet, and writes nothing."""
     job = _with_backend(job)
     store = open_store(job.setup.store_uri)
     with contextlib.closing(Workers(job)) as workers:
@@ -500,39 +615,52 @@ def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
 
 
 class Workers:
-    """The workers that a job asks for. opened: the scene that each has open, by slot."""
+    """The workers that a job asks for.
+
+    Attributes:
+        opened: Name of the scene that each slot has open.
+    """
 
     def __init__(self, job: GenerateJob) -> None:
-        self.pool, self.opened = _make_pool(job), dict[int, str]()
-        self.slots, self.close = self.pool.slots, self.pool.close
+        self.pool = _make_pool(job)
+        self.opened = dict[int, str]()
+        self.slots = self.pool.slots
+        self.close = self.pool.close
 
     def do(self, work: Work, **options: Any) -> None:
+        """Do all of the work; options as of `run_tasks`."""
         run_tasks(self.pool, work, **options)
 
 
 def _make_pool(job: GenerateJob) -> WorkerPool:
+    """Return the pool of workers of the job's executor."""
     if job.executor == "serial":
         return SerialPool(job.setup)
     if job.executor == "ray":
         return RayPool(job.setup, job.workers)
-    # Several processes would share one GPU, and each have a copy of its scene there.
+    # Several processes would share one GPU, and each would keep a copy of its scene there.
     default = 1 if renders_on_gpu(job.setup.backend) else available_cores()
     return ProcessPool(job.setup, job.workers or default)
 
 
 def _with_backend(job: GenerateJob) -> GenerateJob:
-    """`auto` gets its name where this machine's GPU renders, so that others which share the work or
-    go on with it cannot add pictures of a CPU. Ray's machines differ: there `auto` is a CPU.
+    """Return the job with `auto` resolved where this machine's GPU renders.
+
+    Other processes that share the job, or go on with it, can then add no pictures of a CPU. The
+    machines of a Ray cluster differ: there `auto` means a CPU.
     """
     setup = job.setup
-    is_open = setup.backend == AUTO and setup.renderer is None and job.executor != "ray"
-    if not (is_open and renders_on_gpu(AUTO)):
+    is_unresolved = setup.backend == AUTO and setup.renderer is None and job.executor != "ray"
+    if not (is_unresolved and renders_on_gpu(AUTO)):
         return job
     return replace(job, setup=replace(setup, backend=CUDA))
 
 
 def default_scratch(store_uri: str) -> Path | None:
-    """A folder of this user's for blocks on their way to that output; None for a local one."""
+    """Return a folder of this user for blocks on their way to a remote output.
+
+    None for a local output.
+    """
     store = open_store(store_uri)
     if store.local_dir is not None:
         return None
@@ -546,7 +674,7 @@ def default_scratch(store_uri: str) -> Path | None:
 
 
 class _Generation:
-    """One call of run_generate."""
+    """State of one call of run_generate."""
 
     def __init__(
         self,
@@ -555,30 +683,39 @@ class _Generation:
         prepare: Callable[[list[Recipe]], None],
         on_image: Callable[[int, int], None],
     ) -> None:
-        self._job, self._progress = job, progress
-        self._prepare, self._on_image = prepare, on_image
+        self._job = job
+        self._progress = progress
+        self._prepare = prepare
+        self._on_image = on_image
         self._store = open_store(job.setup.store_uri)
-        self._merged_at, self._merge_s = time.monotonic(), 0.0
+        self._merged_at = time.monotonic()
+        self._merge_s = 0.0
         self._timings: dict[str, float] = {}
 
-    def go(self) -> GenerateResult:
-        started = time.perf_counter()
+    def run(self) -> GenerateResult:
+        """Plan the job, render what is missing, and merge the manifest."""
+        start_s = time.perf_counter()
         with contextlib.closing(Workers(self._job)) as workers:
             plan, changes = _plan(self._job, self._store, workers, self._progress, keep=True)
             self._plan = plan
-            self._accept(changes)
-            self._timings["plan"] = time.perf_counter() - started
+            self._accept_changes(changes)
+            self._timings["plan"] = time.perf_counter() - start_s
             blocks = shard_of(plan.blocks, *self._job.shard)
-            pending = self._pending(blocks)
-            self._timings["scan"] = time.perf_counter() - started - self._timings["plan"]
+            pending_blocks = self._find_pending_blocks(blocks)
+            self._timings["scan"] = time.perf_counter() - start_s - self._timings["plan"]
             work = BlockWork(
-                pending, plan.names, workers.opened, self._fail, self._show, self._damaged_keys
+                pending_blocks,
+                plan.names,
+                workers.opened,
+                self._publish_failure,
+                self._show_progress,
+                self._damaged_keys,
             )
-            total = sum(block.images for block in blocks)
-            work.tally.skipped = total - sum(block.images for block in pending)
-            begun = time.perf_counter()
-            self._render(workers, work, pending, total)
-            self._timings["render_wall"] = time.perf_counter() - begun
+            num_images = sum(block.images for block in blocks)
+            work.tally.skipped = num_images - sum(block.images for block in pending_blocks)
+            render_start_s = time.perf_counter()
+            self._render(workers, work, pending_blocks, num_images)
+            self._timings["render_wall"] = time.perf_counter() - render_start_s
         self._merge(wait=True)
         tally = work.tally
         return GenerateResult(
@@ -587,39 +724,43 @@ class _Generation:
             tally.failed,
             dict(plan.unusable),
             tuple(tally.failures),
-            time.perf_counter() - started,
+            time.perf_counter() - start_s,
             {**tally.seconds, **self._timings},
         )
 
-    def _pending(self, blocks: Sequence[Block]) -> list[Block]:
-        """What is not published, or with failures that are tried again; refuses a mixed output."""
+    def _find_pending_blocks(self, blocks: Sequence[Block]) -> list[Block]:
+        """Return the blocks that are not published, have lost files, or have failures to try again.
+
+        Refuses an output that holds images of another kind.
+        """
         table = self._finished_rows()
         if table is not None and (changes := changes_in(table, blocks)):
             # A record that says otherwise would hide the change from the next run.
             names = self._plan.names
             paths = [_record_path(change.uri, names.get(change.scene)) for change in changes]
             self._store.delete(paths)
-            self._accept(changes)
+            self._accept_changes(changes)
             table = self._finished_rows()
         parts = list_parts(self._store)
-        published = [block for block in blocks if block.key in parts]
-        damaged = [] if table is None else self._damaged(table, published)
-        self._restore_recipes(published)
-        pending = [b for b in blocks if b.key not in parts or parts[b.key].has_failures]
-        pending += [block for block in damaged if not parts[block.key].has_failures]
-        self._damaged_keys = {block.key for block in damaged}
-        new = [block for block in pending if block.key not in parts]
-        if new:
-            _check_not_mixed(self._store, self._plan, new)
+        published_blocks = [block for block in blocks if block.key in parts]
+        damaged_blocks = [] if table is None else self._find_damaged_blocks(table, published_blocks)
+        self._restore_recipes(published_blocks)
+        pending_blocks = [b for b in blocks if b.key not in parts or parts[b.key].has_failures]
+        pending_blocks += [block for block in damaged_blocks if not parts[block.key].has_failures]
+        self._damaged_keys = {block.key for block in damaged_blocks}
+        new_blocks = [block for block in pending_blocks if block.key not in parts]
+        if new_blocks:
+            _check_not_mixed(self._store, self._plan, new_blocks)
         store_plan(self._store, self._plan)
-        left = {block.key for block in pending}
-        published = [block for block in blocks if block.key not in left]
-        clear_leftovers(self._store, self._job.setup.scratch, published)
-        return pending
+        pending_keys = {block.key for block in pending_blocks}
+        published_blocks = [block for block in blocks if block.key not in pending_keys]
+        clear_leftovers(self._store, self._job.setup.scratch, published_blocks)
+        return pending_blocks
 
-    def _accept(self, changes: Iterable[SceneChange]) -> None:
-        """Refuse to mix images of changed scenes with those of before; what is left of deleted ones
-        is forgotten.
+    def _accept_changes(self, changes: Iterable[SceneChange]) -> None:
+        """Refuse to mix images of changed scenes with their earlier images.
+
+        Where the earlier images were deleted, the output's records of them are deleted too.
         """
         for change in changes:
             change.check(self._store)
@@ -627,29 +768,35 @@ class _Generation:
             change.accept(self._store, self._job.setup.scratch)
 
     def _finished_rows(self) -> pa.Table | None:
-        """What an output on this machine has of finished images: their files, and what they were
-        made from; None where nothing is finished, or the output is elsewhere.
+        """Return the manifest's rows of the images that are finished on this machine.
+
+        The table has the columns of files and of the scenes' content. None where nothing is
+        finished, or where the output is remote.
         """
         if self._store.local_dir is None:
             return None
-        known = (*leading_columns(), *columns_of_effects(), *TRAILING)
+        column_names = (*leading_columns(), *columns_of_effects(), *TRAILING)
         columns = {*KEY, "status", "source_digest", *(f"{kind}_path" for kind in path_kinds())}
         try:
-            return read_finished(self._store, [name for name in known if name not in columns])
+            return read_finished(
+                self._store, [name for name in column_names if name not in columns]
+            )
         except OutputError:
             if self._store.exists(MANIFEST):
                 raise
             return None
 
-    def _damaged(self, table: pa.Table, published: Sequence[Block]) -> list[Block]:
-        """The blocks of which a file is gone."""
+    def _find_damaged_blocks(
+        self, table: pa.Table, published_blocks: Sequence[Block]
+    ) -> list[Block]:
+        """Return the blocks of which a file is missing."""
         assert self._store.local_dir is not None, "the files of others are not looked at"
         images = rows_without_files(table, FileListing(self._store.local_dir))
         if not images:
             return []
         return [
             block
-            for block in published
+            for block in published_blocks
             if any(
                 (block.scene, block.variant, frame, camera) in images
                 for frame in block.frames
@@ -657,32 +804,36 @@ class _Generation:
             )
         ]
 
-    def _restore_recipes(self, published: Sequence[Block]) -> None:
-        """Write what is missing of the recipes in the folders of variants."""
-        out = self._store.local_dir
-        if out is None:
+    def _restore_recipes(self, published_blocks: Sequence[Block]) -> None:
+        """Write the missing recipes into the folders of variants."""
+        output_dir = self._store.local_dir
+        if output_dir is None:
             return
-        for block in {(block.scene, block.variant): block for block in published}.values():
-            folder = out / variant_folder(block.scene, block.variant)
+        for block in {(block.scene, block.variant): block for block in published_blocks}.values():
+            folder = output_dir / variant_folder(block.scene, block.variant)
             if lacks_recipe(block.recipe, folder):
                 write_recipe(with_digest(block.recipe), folder)
 
     def _render(
-        self, workers: Workers, work: BlockWork, pending: Sequence[Block], total: int
+        self, workers: Workers, work: BlockWork, pending_blocks: Sequence[Block], num_images: int
     ) -> None:
-        if pending:
+        """Log notes about the scenes, then render the pending blocks."""
+        if pending_blocks:
             records = self._plan.records
-            with_lidar = [block for block in pending if records[block.scene].has_lidar]
-            notes = lidar_notes({b.variant: b.recipe for b in with_lidar}.values())
-            notes += _trust_notes(pending, records)
+            lidar_blocks = [block for block in pending_blocks if records[block.scene].has_lidar]
+            notes = lidar_notes({b.variant: b.recipe for b in lidar_blocks}.values())
+            notes += _trust_notes(pending_blocks, records)
             for note in notes[:_MAX_NOTES]:
                 _log.warning("note: %s", note)
             if more := notes[_MAX_NOTES:]:
                 _log.warning("note: and %d more; `climategs inspect` says them", len(more))
-            self._prepare(list({block.recipe.name: block.recipe for block in pending}.values()))
-        skipped, started = work.tally.skipped, time.perf_counter()
+            self._prepare(
+                list({block.recipe.name: block.recipe for block in pending_blocks}.values())
+            )
+        num_skipped = work.tally.skipped
+        start_s = time.perf_counter()
         self._bar = ProgressBar(
-            total=total, initial=skipped, unit="image", disable=not self._progress
+            total=num_images, initial=num_skipped, unit="image", disable=not self._progress
         )
         with self._bar:
             try:
@@ -693,68 +844,76 @@ class _Generation:
                 raise KeyboardInterrupt(
                     "stopped; start the same job again to go on from there"
                 ) from None
-        self._timings[WORKERS] = (time.perf_counter() - started) * workers.slots
+        self._timings[WORKERS] = (time.perf_counter() - start_s) * workers.slots
 
-    def _show(self, done: int, failed: int) -> None:
-        if failed:
-            self._bar.set_postfix(failed=failed, refresh=False)
-        self._bar.update(done - self._bar.n)
-        self._on_image(done, failed)
+    def _show_progress(self, num_done: int, num_failed: int) -> None:
+        """Update the progress bar and call `on_image`."""
+        if num_failed:
+            self._bar.set_postfix(failed=num_failed, refresh=False)
+        self._bar.update(num_done - self._bar.n)
+        self._on_image(num_done, num_failed)
 
-    def _fail(self, block: Block, message: str) -> None:
-        """Publish a block whose images have all failed, unless others have finished it."""
+    def _publish_failure(self, block: Block, message: str) -> None:
+        """Publish a block whose images have all failed, unless another process has finished it."""
         record = self._plan.records[block.scene]
         identity = block.identity(self._plan.backend)
-        nowhere = {f"{kind}_path": None for kind in path_kinds()}
+        empty_paths = {f"{kind}_path": None for kind in path_kinds()}
         rows = [
             image_row(
                 block.scene,
                 block.recipe,
                 identity,
                 pictured,
-                paths=nowhere,
+                paths=empty_paths,
                 status=FAILED,
                 message=message,
             )
             for pictured in block.pictured(record)
         ]
         claim = try_claim(self._store, block.claim)
-        if claim is not None:  # else another process is at it, and will say
+        if claim is not None:  # otherwise another process renders it, and publishes its rows
             with claim:
                 publish_part(self._store, block.key, rows_to_table(rows))
 
     def _merge_at_times(self) -> None:
-        """Keep the manifest fresh, for at most a twentieth of the time."""
-        if time.monotonic() - self._merged_at > max(_COMPACT_S, 20 * self._merge_s):
+        """Merge new parts into the manifest, using at most a twentieth of the time."""
+        if time.monotonic() - self._merged_at > max(_MERGE_INTERVAL_S, 20 * self._merge_s):
             self._merge(wait=False)
 
     def _merge(self, *, wait: bool) -> None:
-        """Merge the parts into the manifest; left to others where they are just doing so."""
-        started = time.monotonic()
+        """Merge the parts into the manifest, unless another process is doing so.
+
+        Args:
+            wait: If True, wait for that process for a while.
+        """
+        start_s = time.monotonic()
         while parts_to_merge(self._store):
             claim = try_claim(self._store, "manifest")
             if claim is not None:
                 with claim:
                     compact(self._store)
                 break
-            if not wait or time.monotonic() - started > _CLAIM_S:
+            if not wait or time.monotonic() - start_s > _MERGE_PATIENCE_S:
                 _log.info("%s is being written by another process", MANIFEST)
                 break
             time.sleep(0.2)
         self._merged_at = time.monotonic()
-        self._merge_s = self._merged_at - started
+        self._merge_s = self._merged_at - start_s
 
 
 def _trust_notes(blocks: Sequence[Block], records: Mapping[str, SceneRecord]) -> list[str]:
-    """What of the scenes to be rendered is left out, or not fit for weather."""
+    """Return notes on cameras that are left out and on scenes that are not fit for weather."""
     notes = []
     for name in dict.fromkeys(block.scene for block in blocks):
-        record, own = records[name], [block for block in blocks if block.scene == name]
-        cameras = {camera for block in own for camera in block.cameras}
-        if left_out := [camera for camera in record.unfitted if camera not in cameras]:
-            notes.append(f"{name}: {left_out_sentence(left_out, '`cameras: all` in the job')}")
+        record = records[name]
+        scene_blocks = [block for block in blocks if block.scene == name]
+        cameras = {camera for block in scene_blocks for camera in block.cameras}
+        if omitted_cameras := [camera for camera in record.unfitted if camera not in cameras]:
+            notes.append(
+                f"{name}: {left_out_sentence(omitted_cameras, '`cameras: all` in the job')}"
+            )
         notes += [f"{name}: {text}" for text in record.problems]
-        scale = max(block.recipe.render.scale for block in own)
+        scale = max(block.recipe.render.scale for block in scene_blocks)
         if sentence := magnified_sentence(record.learnt_scale, scale):
             notes.append(f"{name}: {sentence}")
     return notes
@@ -763,42 +922,51 @@ def _trust_notes(blocks: Sequence[Block], records: Mapping[str, SceneRecord]) ->
 def _plan(
     job: GenerateJob, store: Store, workers: Workers, progress: bool, *, keep: bool
 ) -> tuple[Plan, list[SceneChange]]:
-    """The plan, and the scenes that have changed since the output's record of them was made. keep:
-    whether records of other scenes are written.
+    """Return the job's plan, and the scenes that changed since the output's records were made.
+
+    Args:
+        keep: If True, records of other scenes are written.
     """
-    known, changes = _known_scenes(job, store, keep=keep)
-    changed = {change.record_path for change in changes}
-    found: dict[tuple[str, str | None], SceneRecord | str] = {} if job.rescan else {**known}
-    tasks = [IndexTask(e.uri, e.name) for e in job.scenes if (e.uri, e.name) not in found]
+    known_records, changes = _read_scene_records(job, store, keep=keep)
+    changed_paths = {change.record_path for change in changes}
+    scene_records: dict[tuple[str, str | None], SceneRecord | str] = (
+        {} if job.rescan else {**known_records}
+    )
+    tasks = [IndexTask(e.uri, e.name) for e in job.scenes if (e.uri, e.name) not in scene_records]
     with ProgressBar(
         total=len(tasks), unit="scene", desc="opening", disable=not progress or not tasks
     ) as bar:
 
-        def each(task: IndexTask, record: SceneRecord | str) -> None:
-            found[task.uri, task.name] = record
+        def on_result(task: IndexTask, record: SceneRecord | str) -> None:
+            scene_records[task.uri, task.name] = record
             path = _record_path(task.uri, task.name)
-            if keep and isinstance(record, SceneRecord) and path not in changed:
+            if keep and isinstance(record, SceneRecord) and path not in changed_paths:
                 store.write(path, record.to_json())
             bar.update()
 
-        opening = SceneWork(dict.fromkeys(tasks), each, "opening the scene", workers.opened)
-        workers.do(opening)
-    resolved = resolve_recipes(job, store, workers, found, progress=progress, keep=keep)
-    return make_plan(job.recipes, job.scenes, found, job.setup.backend, resolved), changes
+        scene_work = SceneWork(dict.fromkeys(tasks), on_result, "opening the scene", workers.opened)
+        workers.do(scene_work)
+    resolved_recipes = resolve_recipes(
+        job, store, workers, scene_records, progress=progress, keep=keep
+    )
+    return make_plan(
+        job.recipes, job.scenes, scene_records, job.setup.backend, resolved_recipes
+    ), changes
 
 
-def _known_scenes(
+def _read_scene_records(
     job: GenerateJob, store: Store, *, keep: bool
 ) -> tuple[dict[tuple[str, str | None], SceneRecord], list[SceneChange]]:
-    """The records of the job's scenes by URI and name, and those of scenes that have changed."""
+    """Return the output's records of the job's scenes by URI and name, and the changed scenes."""
 
     def look_up(entry: JobScene) -> tuple[SceneRecord | None, str | None]:
-        record, digest_of = _known(store, entry), job.setup.digest_of
+        record = _read_scene_record(store, entry)
+        digest_of = job.setup.digest_of
         return record, None if record is None or digest_of is None else digest_of(entry.uri)
 
-    known: dict[tuple[str, str | None], SceneRecord] = {}
+    records: dict[tuple[str, str | None], SceneRecord] = {}
     changes: list[SceneChange] = []
-    with ThreadPoolExecutor(_READS, thread_name_prefix="scenes") as pool:
+    with ThreadPoolExecutor(_NUM_READS, thread_name_prefix="scenes") as pool:
         pairs = list(pool.map(look_up, job.scenes))
     for entry, (record, digest) in zip(job.scenes, pairs, strict=True):
         path = _record_path(entry.uri, entry.name)
@@ -815,14 +983,15 @@ def _known_scenes(
             if keep:
                 store.write(path, record.to_json())
         if digest in (None, record.digest):
-            known[entry.uri, entry.name] = record
+            records[entry.uri, entry.name] = record
         else:
             digests = str(record.digest), str(digest)
             changes.append(SceneChange(record.name, entry.uri, *digests, record_path=path))
-    return known, changes
+    return records, changes
 
 
-def _known(store: Store, entry: JobScene) -> SceneRecord | None:
+def _read_scene_record(store: Store, entry: JobScene) -> SceneRecord | None:
+    """Return the output's record of a scene; None where it has no readable one."""
     path = _record_path(entry.uri, entry.name)
     try:
         return SceneRecord.from_json(store.read(path), f"{store.uri}/{path}")
@@ -834,29 +1003,30 @@ def _known(store: Store, entry: JobScene) -> SceneRecord | None:
 
 
 def _record_path(uri: str, name: str | None) -> str:
+    """Return the path of a scene's record in the output."""
     digest = hashlib.sha256(f"{augment.__version__}\n{uri}\n{name or ''}".encode()).hexdigest()
     return f"{SCENES}/{digest[:20]}.json"
 
 
 def _check_not_mixed(store: Store, plan: Plan, blocks: Sequence[Block]) -> None:
-    """Refuse to put images beside others of the same name that were made otherwise."""
+    """Refuse to put images beside images of the same name that were made otherwise."""
     try:
         table = read_finished(store)
     except OutputError:
         if store.exists(MANIFEST):
             raise
         return
-    planned = {(block.scene, block.variant): block for block in blocks}
+    block_of_variant = {(block.scene, block.variant): block for block in blocks}
     for scene, variant, identity in _identities(table):
-        block = planned.get((scene, variant))
+        block = block_of_variant.get((scene, variant))
         if block is not None:
-            is_chosen = plan.backend == AUTO and identity.backend != CUDA
-            backend = identity.backend if is_chosen else plan.backend
+            adopts_backend = plan.backend == AUTO and identity.backend != CUDA
+            backend = identity.backend if adopts_backend else plan.backend
             block.identity(backend).check(identity, f"{store.uri}/{scene}/{variant}")
 
 
 def _identities(table: pa.Table) -> list[tuple[str, str, Identity]]:
-    """The kinds of finished images there are, each once."""
+    """Return the distinct kinds of finished images."""
     names = ["scene", "variant", *Identity.__dataclass_fields__]
     kinds = table.filter(pa.array([status == OK for status in table["status"].to_pylist()]))
     rows = kinds.select(names).group_by(names, use_threads=False).aggregate([]).to_pylist()

@@ -1,6 +1,8 @@
-"""Where everything lies under an output folder, and which names are safe there.
+"""Paths of all files under an output folder, and names that are safe there.
 
-Paths in the manifest are relative to the output folder, with forward slashes.
+In: names of scenes, variants and cameras, and recipes. Out: relative paths. Jobs write there;
+readers of an output find files by it. Paths in the manifest are relative to the output folder, with
+forward slashes.
 """
 
 from __future__ import annotations
@@ -20,21 +22,27 @@ from augment.jobs.atomic import path_below
 from augment.jobs.box_tables import BOXES_2D, MASKS
 from recipes.schema import Recipe
 
+# File of the table of all images.
 MANIFEST = "manifest.parquet"
+# Folder of the jobs' state.
 STATE_FOLDER = ".climategs"
-SWEEPS = "lidar"  # the folder of sweeps, of a variant or, untouched by weather, of its scene
+# Folder of LiDAR sweeps, inside a variant's folder; inside the scene's for sweeps without weather.
+SWEEPS = "lidar"
 
-_SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+# Names that stay as they are.
+_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]+")
 
 
 def folder_name(name: str) -> str:
-    """A name of a scene or camera as one safe path component. Letters, digits, `.`, `_`, `-`, at
-    most 100 of them and the first a letter or digit, stay as they are. Any other name has the rest
-    replaced by `_` and eight hex digits of its SHA-256 added, so that two names never share a
-    folder and nothing leaves the output folder.
+    """Return the name of a scene or camera as one safe path component.
+
+    A name of at most 100 letters, digits, `.`, `_` and `-`, the first a letter or digit, stays as
+    it is. In any other name the other characters are replaced by `_`, and eight hex digits of the
+    name's SHA-256 are added. Therefore two names never share a folder, and no name leads out of the
+    output folder.
     """
-    if _SAFE.fullmatch(name) and name != MANIFEST:
+    if _SAFE_NAME.fullmatch(name) and name != MANIFEST:
         return name
     digest = hashlib.sha256(name.encode()).hexdigest()[:8]
     readable = _UNSAFE_CHARACTERS.sub("_", name).lstrip("._-")[:80]
@@ -42,87 +50,115 @@ def folder_name(name: str) -> str:
 
 
 def variant_name(recipe: Recipe) -> str:
-    """The folder of a recipe's draw: `fog-003`."""
+    """Return the folder's name of one draw of a recipe, such as `fog-003`."""
     return f"{recipe.name}-{recipe.variant:03d}"
 
 
-# Kinds of files whose paths a row of the manifest has, but for those of effects.
-_IMAGES, _LABELS = ("image", "depth", "semantic", "instance"), ("lidar", "labels")
-_LAST = "calibration"
-TRUST = "trust"  # the mask of how far a picture can be believed, 0 to 255, see augment.trust
+# Kinds of image files in the manifest, without masks.
+_IMAGE_KINDS = ("image", "depth", "semantic", "instance")
+# Kinds of label files in the manifest, without tables of boxes in images.
+_LABEL_KINDS = ("lidar", "labels")
+# Kind of the calibration file, the last in the manifest.
+_CALIBRATION = "calibration"
+# Mask that says how far a picture can be believed, 0 to 255, see augment.trust.
+TRUST = "trust"
 
 
 def path_kinds() -> tuple[str, ...]:
-    """In the order of the manifest's columns: `image` and so on, its column being `image_path`."""
+    """Return the kinds of files in the order of the manifest's columns.
+
+    The column of the kind `image` is `image_path`.
+    """
     tables = [e.table.name for e in reversed(effects.EFFECTS) if e.table]
-    return (*_IMAGES, *mask_names(), *_LABELS, BOXES_2D.name, MASKS.name, *tables, _LAST)
+    return (
+        *_IMAGE_KINDS,
+        *mask_names(),
+        *_LABEL_KINDS,
+        BOXES_2D.name,
+        MASKS.name,
+        *tables,
+        _CALIBRATION,
+    )
 
 
 def mask_names() -> tuple[str, ...]:
-    """Of the mask images: of effects, and of what can be believed."""
+    """Return the names of the mask images: masks of effects, and TRUST."""
     return (*(e.mask for e in reversed(effects.EFFECTS) if e.mask), TRUST)
 
 
 def share_columns() -> dict[str, str]:
-    """The manifest's columns that say how many of an image's pixels a mask marks, by the mask."""
+    """Return the manifest's column for the marked share of pixels, by mask name."""
     shares = ((e.mask, e.share_column) for e in reversed(effects.EFFECTS))
     return {**{m: column for m, column in shares if m and column}, TRUST: "trusted_fraction"}
 
 
 def path_columns(paths: Mapping[str, str | None]) -> dict[str, str | None]:
-    """Paths by kind as the manifest's columns."""
+    """Return paths by the manifest's columns instead of by kind."""
     return {f"{kind}_path": path for kind, path in paths.items()}
 
 
 def variant_folder(scene: str, variant: str) -> str:
-    """The folder of one variant of a scene."""
+    """Return the folder of one variant of a scene."""
     return f"{folder_name(scene)}/{folder_name(variant)}"
 
 
 def box_weather_files(recipe: Recipe) -> dict[str, str]:
-    """Files inside the variant's folder that say what is seen of the boxes, and what the weather
-    does to them, by kind.
+    """Return the files that hold measured numbers of boxes, by kind.
+
+    The numbers say what is seen of the boxes, and what the weather does to them. Paths are relative
+    to the variant's folder.
     """
     if not recipe.output.labels:
         return {}
-    own = [e.table for e in reversed(effects.EFFECTS) if e.table and e.of(recipe) is not None]
+    effect_tables = [
+        e.table for e in reversed(effects.EFFECTS) if e.table and e.of(recipe) is not None
+    ]
     masks = [MASKS] if recipe.output.label_formats else []
-    return {table.name: table.file for table in (BOXES_2D, *masks, *own)}
+    return {table.name: table.file for table in (BOXES_2D, *masks, *effect_tables)}
 
 
 def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> dict[str, str | None]:
-    """Where the image of one camera in one frame lies, and what else the recipe asks for, by kind:
-    relative to the output folder; None if unused.
+    """Return the paths of an image and of the other files that the recipe asks for, by kind.
+
+    Paths are relative to the output folder; None for kinds that are not used.
+
+    Args:
+        scene: Name of the scene.
+        camera: Camera name.
+        frame: Frame number.
     """
     if frame < 0:
         raise ValueError(f"frame numbers in an output folder are >= 0; got {frame}")
-    output, base = recipe.output, variant_folder(scene, variant_name(recipe))
+    output = recipe.output
+    variant_dir = variant_folder(scene, variant_name(recipe))
     stem = f"{folder_name(camera)}/{frame:06d}"
     masks = {e.mask for e in effects.EFFECTS if e.mask and e.of(recipe) is not None}
     masks |= {TRUST} if output.trust else set()
-    used = {
-        "image": f"{base}/images/{stem}.{output.image}",
-        **{mask: f"{base}/{mask}/{stem}.png" for mask in masks},
-        **{name: f"{base}/{file}" for name, file in box_weather_files(recipe).items()},
-        _LAST: f"{base}/calibration.json",
+    path_of_kind = {
+        "image": f"{variant_dir}/images/{stem}.{output.image}",
+        **{mask: f"{variant_dir}/{mask}/{stem}.png" for mask in masks},
+        **{name: f"{variant_dir}/{file}" for name, file in box_weather_files(recipe).items()},
+        _CALIBRATION: f"{variant_dir}/calibration.json",
     }
     if output.depth != "none":
-        used["depth"] = f"{base}/depth/{stem}.png"
+        path_of_kind["depth"] = f"{variant_dir}/depth/{stem}.png"
     for name in ("semantic", "instance"):
         if getattr(output, name):
-            used[name] = f"{base}/{name}/{stem}.png"
+            path_of_kind[name] = f"{variant_dir}/{name}/{stem}.png"
     if recipe.lidar:
-        # What no weather changes, the variants of a scene share.
-        place = base if recipe.lidar == "weather" else folder_name(scene)
-        used["lidar"] = f"{place}/{SWEEPS}/{frame:06d}.parquet"
+        # The variants of a scene share the sweeps that no weather changes.
+        folder = variant_dir if recipe.lidar == "weather" else folder_name(scene)
+        path_of_kind["lidar"] = f"{folder}/{SWEEPS}/{frame:06d}.parquet"
     if output.labels:
-        used["labels"] = f"{base}/labels/boxes.parquet"
-    return {kind: used.get(kind) for kind in path_kinds()}
+        path_of_kind["labels"] = f"{variant_dir}/labels/boxes.parquet"
+    return {kind: path_of_kind.get(kind) for kind in path_kinds()}
 
 
 class FileListing:
-    """Which files an output folder on this machine has. A folder is looked at once, when it is
-    first asked for: tens of thousands of single looks would take longer than all else of a resume.
+    """Listing of the files of an output folder on this machine.
+
+    A folder is listed once, at the first question about it: tens of thousands of single questions
+    to the system would take longer than everything else of a resumed job.
     """
 
     def __init__(self, out_dir: Path) -> None:
@@ -130,8 +166,10 @@ class FileListing:
         self._names: dict[str, frozenset[str]] = {}
 
     def has(self, path: str) -> bool:
-        """Whether there is a file of this path, which is relative to the output folder. Raises
-        OutputError: a link leads out of the output folder.
+        """Return True if a file has this path, relative to the output folder.
+
+        Raises:
+            OutputError: A link leads out of the output folder.
         """
         folder, _, name = path.rpartition("/")
         if folder not in self._names:
@@ -139,18 +177,22 @@ class FileListing:
         return name in self._names[folder]
 
     def _names_in(self, folder: str) -> frozenset[str]:
-        place = path_below(self._out_dir, tuple(folder.split("/")) if folder else ())
+        """Return the names of the files in a folder."""
+        folder_path = path_below(self._out_dir, tuple(folder.split("/")) if folder else ())
         try:
-            with os.scandir(place) as entries:
+            with os.scandir(folder_path) as entries:
                 return frozenset(entry.name for entry in entries if entry.is_file())
-        except OSError:  # missing, or what is no folder
+        except OSError:  # missing, or not a folder
             return frozenset()
 
 
 @contextlib.contextmanager
-def reading_back(where: str, advice: str) -> Iterator[None]:
-    """While JSON of the output is taken apart as it was put together, what goes wrong is an
-    OutputError. advice: what to do, a sentence without its full stop.
+def reading_back(source_name: str, advice: str) -> Iterator[None]:
+    """Context manager that turns errors of reading the output's own JSON into an OutputError.
+
+    Args:
+        source_name: Name of the file.
+        advice: What to do, a sentence without its full stop.
     """
     try:
         yield
@@ -163,14 +205,17 @@ def reading_back(where: str, advice: str) -> Iterator[None]:
         ValueError,
     ) as e:
         problem = f"{e} is missing" if isinstance(e, KeyError) else " ".join(str(e).split())
-        if isinstance(e, ValidationError):  # of all that differs, the first
+        if isinstance(e, ValidationError):  # names the first of all differences
             first = e.errors(include_url=False)[0]
             problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise OutputError(f"{where} is damaged: {problem}. {advice}") from e
+        raise OutputError(f"{source_name} is damaged: {problem}. {advice}") from e
 
 
 def relative_parts(path: str) -> tuple[str, ...] | None:
-    """The components of a path that stays below its root; None: empty, absolute, or it climbs."""
+    """Return the components of a path that stays below its root; None for any other path.
+
+    Other paths are empty, absolute, or lead upwards.
+    """
     parts = PurePosixPath(path).parts
     if not parts or parts[0].startswith("/") or ".." in parts or "\\" in path or "\0" in path:
         return None
@@ -178,7 +223,11 @@ def relative_parts(path: str) -> tuple[str, ...] | None:
 
 
 def resolve_inside(root: Path, relative: str) -> Path:
-    """The file that a manifest's path names."""
+    """Return the file that a path in a manifest names.
+
+    Raises:
+        OutputError: The path leads out of the output folder.
+    """
     parts = relative_parts(relative)
     if parts is None:
         raise OutputError(

@@ -1,13 +1,16 @@
-"""A dataset's folder once more, with a variant's images and weathered sweeps in place of its own.
+"""Copy of a dataset's folder in which images and sweeps of a variant replace the recorded ones.
 
-    <out>/source/<variant>/<dataset's folder>/...                   what the dataset's tools read
-    <out>/source/<variant>/climategs-mirror-<dataset's folder>.json what it is; once it is complete
-    <out>/source/<variant>/climategs-mirror-<dataset's folder>.files what was put there
+In: the dataset's folder (`SourceTree`), and the files to put in place (`Weathered`). Out: the copy,
+and a record of it. Called by `climategs export` (`tools/export.py`).
 
-All that is not replaced is the source's own file under a second name (a hard link), or a copy of it
-where links cannot be had. Building again goes on after a kill, and brings an older copy up to date;
-what others have edited there stops it. A dataset of many scenes has one copy, to which each scene
-adds its images.
+    <out>/source/<variant>/<dataset's folder>/...                    files for the dataset's tools
+    <out>/source/<variant>/climategs-mirror-<dataset's folder>.json  record of the complete copy
+    <out>/source/<variant>/climategs-mirror-<dataset's folder>.files list of the files put there
+
+Every file that is not replaced is the source's own file under a second name (a hard link), or a
+copy of it where links are not possible. A second build goes on after a kill, and brings an older
+copy up to date; it stops where other programs have edited the copy. A dataset of many scenes has
+one copy, to which each scene adds its images.
 """
 
 from __future__ import annotations
@@ -52,29 +55,32 @@ from augment.labels import LabelSource, StoresLidar
 from recipes.load import load_recipe
 from recipes.schema import Output
 
-# ---- The files of a dataset, as a copy of it in another place has to have them -------------------
+# ---- The files of a dataset, with their places in a copy of it -----------------------------------
 # A dataset's own entries (`samples`, `camera` ...) may be links to other disks. Links below them
-# must stay within the dataset, and stay links in the copy; others would lead it to files that
-# nobody meant.
+# must stay within the dataset, and stay links in the copy; other links would lead the copy to
+# foreign files.
 
 
 @dataclass(frozen=True)
 class SourceTree:
-    """A dataset in a folder. root: absolute; its name is the copy's name too. uri: what it was
-    opened by. images, sweeps: regular expressions that the paths of its camera images and LiDAR
-    sweeps, relative to root, match in full. entries: what in root belongs to it; None for all.
-    """
+    """A dataset in a folder."""
 
     uri: str
+    """URI that the dataset was opened by."""
     root: Path
+    """Absolute path of the folder; its name is the copy's name too."""
     images: str
+    """Regular expression that matches the complete paths of camera images, relative to root."""
     entries: tuple[str, ...] | None = None
-    sweeps: str = r"(?!)"  # none
+    """Names in root that belong to the dataset; None for all."""
+    sweeps: str = r"(?!)"  # matches no path
+    """Regular expression that matches the complete paths of LiDAR sweeps, relative to root."""
 
     @cached_property
     def bases(self) -> tuple[tuple[str, str], ...]:
-        """Real paths of the folders and files that make up the dataset, and where each belongs
-        relative to root: root itself, then what its own entries lead to elsewhere.
+        """Real paths of the dataset's folders and files, each with its place relative to root.
+
+        The first is root itself; the others are the targets of its entries that lead elsewhere.
         """
         real_root = os.path.realpath(self.root)
         try:
@@ -83,120 +89,134 @@ class SourceTree:
             raise AdapterError(f"{self.root} cannot be listed: {error.strerror}") from error
         if not self.root.name:
             raise AdapterError(f"{self.root} has no name; a dataset must lie in a folder")
-        found = [(real_root, "")]
+        bases = [(real_root, "")]
         for name in names:
             path = os.path.join(real_root, name)
             if not self.has(name) or not os.path.islink(path):
                 continue
-            real = os.path.realpath(path)
-            if is_within(real, real_root):
+            real_path = os.path.realpath(path)
+            if is_within(real_path, real_root):
                 continue
-            if not os.path.exists(real):
+            if not os.path.exists(real_path):
                 raise AdapterError(
-                    f"{path} is a link to {real}, which does not exist; put it there, or delete "
-                    f"the link"
+                    f"{path} is a link to {real_path}, which does not exist; put it there, or "
+                    f"delete the link"
                 )
-            if is_within(real_root, real):
+            if is_within(real_root, real_path):
                 raise AdapterError(
-                    f"{path} is a link to {real}, which holds the dataset itself; delete the link"
+                    f"{path} is a link to {real_path}, which holds the dataset itself; delete the "
+                    f"link"
                 )
-            found.append((real, name))
-        return tuple(found)
+            bases.append((real_path, name))
+        return tuple(bases)
 
     def relative(self, path: str | Path) -> str | None:
-        """Where a file or folder belongs relative to root, links followed; None outside."""
-        real = os.path.realpath(path)
+        """Return the place of a file or folder relative to root, links followed; None outside."""
+        real_path = os.path.realpath(path)
         for base, name in self.bases:
-            if is_within(real, base):
-                inner = os.path.relpath(real, base)
-                parts = [part for part in (name, inner) if part not in ("", ".")]
-                within = "/".join(parts)
-                return within if not within or self.has(within.split("/")[0]) else None
+            if is_within(real_path, base):
+                inner_path = os.path.relpath(real_path, base)
+                parts = [part for part in (name, inner_path) if part not in ("", ".")]
+                place = "/".join(parts)
+                return place if not place or self.has(place.split("/")[0]) else None
         return None
 
     def is_image(self, relative: str) -> bool:
-        """Whether this is the path of a camera image."""
+        """Return True for the path of a camera image."""
         return re.fullmatch(self.images, relative) is not None
 
     def is_sweep(self, relative: str) -> bool:
-        """Whether this is the path of a LiDAR sweep."""
+        """Return True for the path of a LiDAR sweep."""
         return re.fullmatch(self.sweeps, relative) is not None
 
     def has(self, name: str) -> bool:
-        """Whether this entry of root belongs to the dataset."""
+        """Return True if this entry of root belongs to the dataset."""
         return self.entries is None or name in self.entries
 
 
 class SourceFile(NamedTuple):
-    """relative: to the dataset's root. path: where its bytes are. facts: as os.lstat of that."""
+    """A file of the dataset."""
 
     relative: str
+    """Path relative to the dataset's root."""
     path: str
+    """Real path of the file."""
     facts: os.stat_result
+    """Result of os.lstat for that path."""
 
 
 class SourceFolder(NamedTuple):
-    """What is directly in one folder, by paths relative to the root, "" for itself. folders: with
-    their real paths. links: with what the link says, which leads to another part of the dataset.
-    """
+    """Direct contents of one folder."""
 
     relative: str
+    """Path relative to the root; "" for the root itself."""
     files: list[SourceFile]
+    """Files of the folder."""
     folders: list[tuple[str, str]]
+    """Relative and real path of each folder in it."""
     links: list[tuple[str, str]]
+    """Relative path and text of each link in it; links lead to other parts of the dataset."""
 
 
 class Survey(NamedTuple):
-    """How many files a dataset has, and how many of them are camera images and LiDAR sweeps."""
+    """Counts of a dataset's files."""
 
     files: int
+    """Number of all files."""
     images: int
+    """Number of camera images."""
     sweeps: int = 0
+    """Number of LiDAR sweeps."""
 
 
 def survey(tree: SourceTree) -> Survey:
-    """Look at all that belongs to a dataset, reading no file."""
+    """Count the files of a dataset without reading them."""
     names = [file.relative for folder in walk(tree) for file in folder.files]
     return Survey(len(names), sum(map(tree.is_image, names)), sum(map(tree.is_sweep, names)))
 
 
 def walk(tree: SourceTree, relative: str = "", path: str = "") -> Iterator[SourceFolder]:
-    """The folders of a dataset, each before those in it, in order of name."""
+    """Yield the folders of a dataset, each before those in it, in order of name.
+
+    Args:
+        relative: Folder to begin with, relative to the root.
+        path: Real path of that folder.
+    """
     path = path or os.path.realpath(tree.root)
-    elsewhere = {} if relative else {name: real for real, name in tree.bases}
-    found = SourceFolder(relative, [], [], [])
+    linked_paths = {} if relative else {name: real_path for real_path, name in tree.bases}
+    contents = SourceFolder(relative, [], [], [])
     try:
         for name in sorted(os.listdir(path)):
             if not relative and not tree.has(name):
                 continue
-            within = f"{relative}/{name}".lstrip("/")
-            real = elsewhere.get(name, os.path.join(path, name))
-            facts = os.lstat(real)
+            place = f"{relative}/{name}".lstrip("/")
+            real_path = linked_paths.get(name, os.path.join(path, name))
+            facts = os.lstat(real_path)
             if stat.S_ISREG(facts.st_mode):
-                found.files.append(SourceFile(within, real, facts))
+                contents.files.append(SourceFile(place, real_path, facts))
             elif stat.S_ISDIR(facts.st_mode):
-                found.folders.append((within, real))
+                contents.folders.append((place, real_path))
             elif stat.S_ISLNK(facts.st_mode):
-                found.links.append((within, _link_text(tree, within, real)))
+                contents.links.append((place, _link_text(tree, place, real_path)))
             else:
                 raise AdapterError(
-                    f"{real} is neither a file nor a folder nor a link; a dataset's copy cannot "
-                    f"have it, move it elsewhere"
+                    f"{real_path} is neither a file nor a folder nor a link; a dataset's copy "
+                    f"cannot have it, move it elsewhere"
                 )
     except OSError as error:
         raise AdapterError(f"{error.filename or path} cannot be read: {error.strerror}") from error
-    yield found
-    for inner, real in found.folders:
-        yield from walk(tree, inner, real)
+    yield contents
+    for inner_place, real_path in contents.folders:
+        yield from walk(tree, inner_place, real_path)
 
 
 def is_within(path: str, folder: str) -> bool:
-    """Whether a real path is a folder's or of something in it."""
+    """Return True if a real path is the folder, or in it."""
     return path == folder or path.startswith(folder.rstrip("/") + "/")
 
 
-def _link_text(tree: SourceTree, within: str, path: str) -> str:
-    """What the copy's link has to say to lead to the same part of the dataset's copy."""
+def _link_text(tree: SourceTree, place: str, path: str) -> str:
+    """Return the text of the copy's link that leads to the same part of the copy."""
     target = tree.relative(path)
     if target is None:
         raise AdapterError(
@@ -204,23 +224,29 @@ def _link_text(tree: SourceTree, within: str, path: str) -> str:
             f"dataset can have links within it, and {tree.root}'s own entries may be links to "
             f"other places: put the file itself there, or the link higher up"
         )
-    return os.path.relpath(target or ".", os.path.dirname(within) or ".")
+    return os.path.relpath(target or ".", os.path.dirname(place) or ".")
 
 
-# ---- Files and links put in place ----------------------------------------------------------------
+# ---- Putting files and links in place ------------------------------------------------------------
 
-LINKED, COPIED = "linked", "copied"
+# A file of the copy is a hard link of the original.
+LINKED = "linked"
+# A file of the copy has the same size and time as the original.
+COPIED = "copied"
 
 
-def found_as(target: str, original: os.stat_result) -> str | None:
-    """How the original is in place: LINKED, COPIED (same size and time), or None: it is not."""
+def find_placement(target: str, original: os.stat_result) -> str | None:
+    """Return how the original is in place: LINKED, COPIED, or None if it is not.
+
+    COPIED means the same size and time.
+    """
     facts = _facts(target)
     if facts is None or not stat.S_ISREG(facts.st_mode):
         return None
     if (facts.st_dev, facts.st_ino) == (original.st_dev, original.st_ino):
         return LINKED
-    same = (facts.st_size, facts.st_mtime_ns) == (original.st_size, original.st_mtime_ns)
-    return COPIED if same else None
+    is_same = (facts.st_size, facts.st_mtime_ns) == (original.st_size, original.st_mtime_ns)
+    return COPIED if is_same else None
 
 
 def write_file(data: bytes, target: str, mtime_ns: int) -> None:
@@ -232,7 +258,7 @@ def write_file(data: bytes, target: str, mtime_ns: int) -> None:
 
 
 def put_link(text: str, target: str) -> bool:
-    """A symbolic link that says `text`; False where it is there already."""
+    """Make a symbolic link with this text; return False where it exists already."""
     with refusals_of(Path(target)):
         if os.path.islink(target) and os.readlink(target) == text:
             return False
@@ -242,8 +268,8 @@ def put_link(text: str, target: str) -> bool:
     return True
 
 
-def own_folder(folder: str) -> bool:
-    """Make sure that a folder of the copy is a real one; True where it had to be made."""
+def make_real_folder(folder: str) -> bool:
+    """Make sure that a folder of the copy is a real one; return True where it had to be made."""
     facts = _facts(folder)
     if facts is None:
         with refusals_of(Path(folder)):
@@ -258,68 +284,79 @@ def own_folder(folder: str) -> bool:
     return False
 
 
-def others_in(folder: str, expected: set[str]) -> list[str]:
-    """Names in a folder of the copy that are not expected; what a killed run left is deleted."""
+def find_foreign_names(folder: str, expected_names: set[str]) -> list[str]:
+    """Return foreign names in a folder of the copy; leftovers of a killed run are deleted."""
     with refusals_of(Path(folder)):
-        found = set(os.listdir(folder)) - expected
-        left = set(temporary_names(found))
-        for name in left:
+        unexpected_names = set(os.listdir(folder)) - expected_names
+        temporary_leftovers = set(temporary_names(unexpected_names))
+        for name in temporary_leftovers:
             os.unlink(os.path.join(folder, name))
-    return sorted(found - left)
+    return sorted(unexpected_names - temporary_leftovers)
 
 
 def _facts(path: str) -> os.stat_result | None:
+    """Return the facts of a file, folder or link; None where there is none."""
     try:
         return os.lstat(path)
     except FileNotFoundError:
         return None
 
 
-# ---- Where the copy of a dataset lies, and the file beside it that says what stands in it --------
+# ---- The place of a dataset's copy, and the record beside it -------------------------------------
 
+# Folder of the copies in the output folder.
 MIRROR_FOLDER = "source"
+# Kind of the links to files that are not replaced.
 Links = Literal["hard", "copy"]
 
 
 class Shown(BaseModel):
-    """What of a scene stands in a recorded file's place: an image or a weathered sweep, by its path
-    relative to the output folder. sha256: of the image.
-    """
+    """Image or weathered sweep of a scene that stands in a recorded file's place."""
 
     scene: str
+    """Name of the scene."""
     image: str | None = None
+    """Path of the image relative to the output folder."""
     sha256: str | None = None
+    """SHA-256 of the image."""
     sweep: str | None = None
+    """Path of the sweep relative to the output folder."""
 
 
 class MirrorRecord(BaseModel):
-    """folder: the dataset's. scenes: facts by name. files, bytes: how many there are of a kind.
-    replaced, replaced_sweeps: what stands in the place of recorded files, by place in the dataset.
-    """
+    """Record of a dataset's copy."""
 
     folder: str
+    """Folder of the dataset."""
     links: Links = "hard"
+    """Kind of the links to files that are not replaced."""
     scenes: dict[str, dict[str, Any]] = {}
+    """Facts by scene name."""
     files: dict[str, int] = {}
+    """Number of files by kind."""
     bytes: dict[str, int] = {}
+    """Number of bytes by kind."""
     replaced: dict[str, Shown] = {}
+    """Images in the place of recorded ones, by place in the dataset."""
     replaced_sweeps: dict[str, Shown] = {}
+    """Sweeps in the place of recorded ones, by place in the dataset."""
 
 
 def mirror_folder(out_dir: Path, variant: str) -> Path:
-    """Where the copies of datasets in a variant's weather lie."""
+    """Return the folder of the copies of datasets in a variant's weather."""
     return out_dir / MIRROR_FOLDER / folder_name(variant)
 
 
 def record_names(tree: SourceTree, folder: Path) -> tuple[Path, Path]:
-    """The record of a complete copy, and its name while the copy is being changed."""
+    """Return the paths of a complete copy's record, and of the record while the copy is changed."""
     record = folder / f"climategs-mirror-{tree.root.name}.json"
     return record, record.with_name(record.name + ".begun")
 
 
 def read_record(tree: SourceTree, folder: Path) -> MirrorRecord:
-    """What is known of the dataset's copy in a folder, also of one that was stopped while it was
-    being changed; empty where there is none.
+    """Return the record of the dataset's copy in a folder; it is empty where there is none.
+
+    The record of a copy that was stopped while it was being changed counts too.
     """
     path = next((path for path in record_names(tree, folder) if path.is_file()), None)
     if path is None:
@@ -335,33 +372,40 @@ def read_record(tree: SourceTree, folder: Path) -> MirrorRecord:
     return record
 
 
-# ---- What stands in the place of recorded files: images and sweeps in their form -----------------
+# ---- Replacements of recorded files: images and sweeps in the form of the recorded ones ----------
 
-FORMATS = {"PNG": "png", "JPEG": "jpg"}  # of ImageHeader, and of recipes
+# Formats of recipes by those of ImageHeader.
+FORMATS = {"PNG": "png", "JPEG": "jpg"}
 
 
 class ImageForm(NamedTuple):
-    """format: png or jpg. size: width and height. is_grey: one channel (told of PNG only)."""
+    """Form of an image file."""
 
     format: str
+    """`png` or `jpg`."""
     size: tuple[int, int]
+    """Width and height, pixels."""
     is_grey: bool = False
+    """True for one channel; known only of PNG."""
 
 
 class Weathered(NamedTuple):
-    """What shall stand in a recorded file's place. path: our file. form: of an image; of another
-    than the recorded one it is encoded anew. content: of a sweep, makes the bytes of the file in
-    this place; None where only its scene's labels could.
-    """
+    """File that shall stand in a recorded file's place."""
 
     path: Path
+    """Our file."""
     shown: Shown
+    """Its entry in the record."""
     form: ImageForm | None = None
+    """Form of an image; an image is encoded again where the recorded one has another form."""
     content: Callable[[], bytes] | None = None
+    """For a sweep, makes the bytes of the file in this place; None where only its scene's labels
+    could.
+    """
 
     @staticmethod
     def image(out_dir: Path, row: Mapping[str, Any]) -> Weathered:
-        """The finished image of a manifest's row."""
+        """Return the replacement from a manifest's row of a finished image."""
         name = row["image_path"]
         form = ImageForm("jpg" if name.endswith(".jpg") else "png", (row["width"], row["height"]))
         shown = Shown(scene=row["scene"], image=name, sha256=row["checksum"])
@@ -371,85 +415,106 @@ class Weathered(NamedTuple):
     def sweep(
         out_dir: Path, row: Mapping[str, Any], content: Callable[[Path], bytes] | None = None
     ) -> Weathered:
-        """The weathered sweep of a manifest's row. content: of the place's file, from the sweep."""
+        """Return the replacement from a manifest's row with a weathered sweep.
+
+        Args:
+            content: Makes the bytes of the file in this place from the sweep.
+        """
         path = resolve_inside(out_dir, row["lidar_path"])
         shown = Shown(scene=row["scene"], sweep=row["lidar_path"])
         return Weathered(path, shown, content=content and partial(content, path))
 
 
 def is_weathered(row: Mapping[str, Any]) -> bool:
-    """Whether the row of an image names a sweep that has met the weather."""
+    """Return True if an image's row names a sweep that has met the weather."""
     return row["lidar"] == "weather" and row["lidar_path"] is not None
 
 
 def weathered_images(
     out_dir: Path, rows: Sequence[Mapping[str, Any]], frames: Sequence[Frame], tree: SourceTree
 ) -> tuple[dict[str, Weathered], list[str]]:
-    """The finished images of a variant's rows by their place in the dataset, and a sentence for
-    those that have none.
+    """Return the finished images of a variant's rows by their place in the dataset.
+
+    Returns:
+        The images, and notes on those without a place of their own.
     """
-    recorded = {frame.index: frame.image_paths for frame in frames}
-    found: dict[str, Weathered] = {}
-    unplaced, doubled, notes = [], [], []
+    recorded_paths = {frame.index: frame.image_paths for frame in frames}
+    images: dict[str, Weathered] = {}
+    unplaced_images = []
+    shared_places = []
+    notes = []
     for row in rows:
         if row["status"] != OK:
             continue
-        path = recorded.get(row["frame"], {}).get(row["camera"])
+        path = recorded_paths.get(row["frame"], {}).get(row["camera"])
         place = None if path is None else tree.relative(path)
         if place is None:
-            unplaced.append(f"frame {row['frame']}, camera {row['camera']}")
+            unplaced_images.append(f"frame {row['frame']}, camera {row['camera']}")
             continue
-        if place in found:
-            doubled.append(place)
-        found[place] = Weathered.image(out_dir, row)
-    if unplaced:
+        if place in images:
+            shared_places.append(place)
+        images[place] = Weathered.image(out_dir, row)
+    if unplaced_images:
         notes.append(
-            f"{len(unplaced)} rendered images, such as {unplaced[0]}, have no recorded image in "
-            f"the dataset: they are not in its copy"
+            f"{len(unplaced_images)} rendered images, such as {unplaced_images[0]}, have no "
+            f"recorded image in the dataset: they are not in its copy"
         )
-    if doubled:
+    if shared_places:
         notes.append(
-            f"{len(doubled)} recorded images, such as {doubled[0]}, belong to several frames: the "
-            f"copy shows the last of them"
+            f"{len(shared_places)} recorded images, such as {shared_places[0]}, belong to several "
+            f"frames: the copy shows the last of them"
         )
-    return found, notes
+    return images, notes
 
 
 def weathered_sweeps(
     out_dir: Path, rows: Sequence[Mapping[str, Any]], labels: LabelSource | None, tree: SourceTree
 ) -> tuple[dict[str, Weathered], list[str]]:
-    """As `weathered_images`, of the sweeps, of which a dataset may have several files each. Lost
-    returns are left out.
+    """Return the weathered sweeps of a variant's rows by their place in the dataset.
+
+    A dataset may have several files for one sweep. Lost returns are left out.
+
+    Returns:
+        The sweeps, and notes on those without a place.
     """
-    frames = {row["frame"]: row for row in rows if row["status"] == OK and is_weathered(row)}
-    found: dict[str, Weathered] = {}
-    unplaced, notes = [], []
-    for frame, row in sorted(frames.items()):
-        stored = labels if isinstance(labels, StoresLidar) else None
-        files = [] if stored is None else stored.lidar_files(frame)
-        places = {tree.relative(file): file for file in files}
-        if stored is None or not places or None in places:
-            unplaced.append(frame)
+    row_of_frame = {row["frame"]: row for row in rows if row["status"] == OK and is_weathered(row)}
+    sweeps: dict[str, Weathered] = {}
+    unplaced_frames = []
+    notes = []
+    for frame, row in sorted(row_of_frame.items()):
+        lidar_labels = labels if isinstance(labels, StoresLidar) else None
+        source_files = [] if lidar_labels is None else lidar_labels.lidar_files(frame)
+        file_of_place = {tree.relative(file): file for file in source_files}
+        if lidar_labels is None or not file_of_place or None in file_of_place:
+            unplaced_frames.append(frame)
             continue
-        for place, file in places.items():
-            content = partial(_returns, stored, frame, file)
-            found[str(place)] = Weathered.sweep(out_dir, row, content)
-    if unplaced:
+        for place, file in file_of_place.items():
+            content = partial(_encode_sweep, lidar_labels, frame, file)
+            sweeps[str(place)] = Weathered.sweep(out_dir, row, content)
+    if unplaced_frames:
         notes.append(
-            f"{len(unplaced)} weathered LiDAR sweeps, the first of frame {unplaced[0]}, have no "
+            f"{len(unplaced_frames)} weathered LiDAR sweeps, the first of frame "
+            f"{unplaced_frames[0]}, have no "
             f"file of their own in the dataset: its copy keeps the recorded ones, and {out_dir} "
             f"has these"
         )
-    return found, notes
+    return sweeps, notes
 
 
-def _returns(labels: StoresLidar, frame: int, file: Path, sweep: Path) -> bytes:
+def _encode_sweep(labels: StoresLidar, frame: int, file: Path, sweep: Path) -> bytes:
+    """Return the bytes of a recorded file's replacement, without lost returns."""
     return labels.lidar_content(frame, file, drop_lost(read_lidar(sweep)))
 
 
-def _fitted(image: Path, recorded: ImageForm, jpeg_quality: Callable[[Path], int]) -> bytes:
-    """Our image as a file of the recorded one's form: smaller by area, larger by cubic splines.
-    jpeg_quality: of a variant's folder.
+def _encode_fitted_image(
+    image: Path, recorded: ImageForm, jpeg_quality: Callable[[Path], int]
+) -> bytes:
+    """Return our image as a file of the recorded one's form.
+
+    It is made smaller by area, and larger by cubic splines.
+
+    Args:
+        jpeg_quality: Returns the JPEG quality of a variant's folder.
     """
     try:
         rgb = decode_image(image.read_bytes())
@@ -457,25 +522,30 @@ def _fitted(image: Path, recorded: ImageForm, jpeg_quality: Callable[[Path], int
         raise output_error(image, error) from error
     except ValueError as error:
         raise OutputError(f"{image} is damaged ({error}); delete it and render again") from error
-    size, (height, width) = recorded.size, rgb.shape[:2]
+    size = recorded.size
+    (height, width) = rgb.shape[:2]
     if (width, height) != size:
         is_smaller = size[0] < width and size[1] < height
-        method = cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC
-        rgb = np.asarray(cv2.resize(rgb, size, interpolation=method), np.uint8)
+        interpolation = cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC
+        rgb = np.asarray(cv2.resize(rgb, size, interpolation=interpolation), np.uint8)
     if recorded.is_grey:
-        done, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
-        assert done
+        is_encoded, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+        assert is_encoded
         return data.tobytes()
     settings = {"image": recorded.format, "jpeg_quality": jpeg_quality(image.parents[2])}
     return encode_image(rgb, Output.model_validate(settings))
 
 
 def _jpeg_quality(variant: Path) -> int:
+    """Return the JPEG quality of the recipe in a variant's folder."""
     return load_recipe(variant / "recipe.yaml").resolve(0).output.jpeg_quality
 
 
 def image_form(path: str | Path) -> ImageForm | None:
-    """Of an image file by its first bytes; None where it is neither PNG nor JPEG."""
+    """Return the form of an image file by its first bytes.
+
+    None where it is neither PNG nor JPEG.
+    """
     header = read_image_header(path)
     if header is None or header.format not in FORMATS:
         return None
@@ -483,8 +553,9 @@ def image_form(path: str | Path) -> ImageForm | None:
 
 
 def dataset_format(frames: Sequence[Frame]) -> str:
-    """The format in which to render so that the dataset's images are of it: that of the recorded
-    ones, png where they are of several.
+    """Return the image format to render in, so that the copy's images keep their format.
+
+    It is that of the recorded images; png where they have several formats.
     """
     suffixes = {Path(path).suffix.lower() for f in frames for path in f.image_paths.values()}
     formats = {{".png": "png", ".jpg": "jpg", ".jpeg": "jpg"}.get(suffix) for suffix in suffixes}
@@ -499,31 +570,44 @@ def dataset_format(frames: Sequence[Frame]) -> str:
 
 # ---- The copy ------------------------------------------------------------------------------------
 
-# What a record counts.
-_FILES: tuple[str, ...] = (LINKED, COPIED, "symbolic_links", "camera_images", "replaced_images",
-                           "lidar_sweeps", "replaced_lidar_files")  # fmt: skip
-_BYTES: tuple[str, ...] = (LINKED, COPIED, "new_images")
+# Kinds of files that a record counts.
+_FILE_KINDS: tuple[str, ...] = (
+    LINKED,
+    COPIED,
+    "symbolic_links",
+    "camera_images",
+    "replaced_images",
+    "lidar_sweeps",
+    "replaced_lidar_files",
+)
+# Kinds of files whose bytes a record counts.
+_BYTE_KINDS: tuple[str, ...] = (LINKED, COPIED, "new_images")
 
 
 @dataclass
 class Mirrored:
-    """What was made of a copy. record: what it is made of. changed: how many files and links this
-    call has put in place. new: weathered images that are files of their own and no links to the
-    rendered ones. resized: rendered and recorded sizes of those that differ. unusable: recorded
-    images that are neither PNG nor JPEG, which stay. outdated: files of sweeps that another scene
-    has rendered anew, where the source's own stand. missing: recorded images that the source has
-    no longer. others: files that the source does not have.
-    """
+    """Result of building a copy."""
 
     folder: Path
+    """Folder of the copy."""
     record: MirrorRecord
+    """Record of the copy."""
     changed: int = 0
+    """Number of files and links that this call has put in place."""
     new: int = 0
+    """Number of weathered images that are files of their own and not links to the rendered ones."""
     resized: list[tuple[tuple[int, int], tuple[int, int]]] = field(default_factory=list)
+    """Rendered and recorded sizes of the images whose sizes differ."""
     unusable: list[str] = field(default_factory=list)
+    """Recorded images that are neither PNG nor JPEG, and stay."""
     outdated: list[str] = field(default_factory=list)
+    """Files of sweeps that another scene has rendered again; the source's own files stand in their
+    place.
+    """
     missing: list[str] = field(default_factory=list)
+    """Recorded images that the source no longer has."""
     others: list[str] = field(default_factory=list)
+    """Files of the copy that the source does not have."""
 
 
 def check_disjoint(tree: SourceTree, out_dir: Path) -> None:
@@ -545,53 +629,76 @@ def mirror_dataset(
     links: Links = "hard",
     progress: bool = True,
 ) -> Mirrored:
-    """Build the copy of a dataset in a folder, or bring it up to date; needs the lock of the output
-    folder. weathered: by place in the dataset, all that shall stand in the copy. scenes: facts of
-    those that it is of, in JSON's types, for the record. extent: `survey(tree)`. links: hard, or
-    copy for a copy that shares nothing with source and images. Raises AdapterError: a file of the
-    source cannot be read, or a link leads out of it. OutputError: the system refused, a link is in
-    the way, or files were edited or were there before; no file is left half-written.
+    """Build the copy of a dataset in a folder, or bring it up to date.
+
+    The caller holds the lock of the output folder.
+
+    Args:
+        tree: The dataset.
+        folder: Folder of the copy.
+        weathered: All files that shall stand in the copy, by place in the dataset.
+        scenes: Facts of the copy's scenes, in JSON's types, for the record.
+        extent: Result of `survey(tree)`.
+        links: `hard`, or `copy` for a copy that shares nothing with source and images.
+        progress: If True, show a bar on stderr.
+
+    Raises:
+        AdapterError: A file of the source cannot be read, or a link leads out of it.
+        OutputError: The system refuses, a link is in the way, or files were edited or existed
+            before; no file is left half-written.
     """
     check_disjoint(tree, folder)
-    files, sizes = dict.fromkeys(_FILES, 0), dict.fromkeys(_BYTES, 0)
+    files_by_kind = dict.fromkeys(_FILE_KINDS, 0)
+    bytes_by_kind = dict.fromkeys(_BYTE_KINDS, 0)
     record = MirrorRecord(
-        folder=str(tree.root), links=links, scenes=dict(scenes), files=files, bytes=sizes
+        folder=str(tree.root),
+        links=links,
+        scenes=dict(scenes),
+        files=files_by_kind,
+        bytes=bytes_by_kind,
     )
-    run = _Mirroring(tree, folder, weathered, Mirrored(folder / tree.root.name, record))
+    mirroring = _Mirroring(tree, folder, weathered, Mirrored(folder / tree.root.name, record))
     with tqdm(total=extent.files, unit="file", desc="copy", disable=not progress) as bar:
-        run.go(bar)
-    run.finish()
-    return run.done
+        mirroring.fill_copy(bar)
+    mirroring.finish()
+    return mirroring.result
 
 
 @dataclass(eq=False)
 class _Mirroring:
-    """One call of mirror_dataset."""
+    """State of one call of mirror_dataset."""
 
     tree: SourceTree
+    """The dataset."""
     folder: Path
+    """Folder of the copies."""
     weathered: Mapping[str, Weathered]
-    done: Mirrored
+    """Files that shall stand in the copy, by place in the dataset."""
+    result: Mirrored
+    """Result so far."""
     changed_folders: set[str] = field(default_factory=set)
-    encoded: list[str] = field(default_factory=list)  # images of another form than ours
+    """Folders with new names, to be made durable."""
+    encoded: list[str] = field(default_factory=list)
+    """Paths of images that are encoded again."""
 
     def __post_init__(self) -> None:
-        self.files, self.bytes = self.done.record.files, self.done.record.bytes
-        self.record, self.begun = record_names(self.tree, self.folder)
+        self.files = self.result.record.files
+        self.bytes = self.result.record.bytes
+        self.record, self.unfinished_record = record_names(self.tree, self.folder)
         self.placed = PlacedFiles(self.record.with_suffix(".files"))
-        self.root = str(self.done.folder)
+        self.root = str(self.result.folder)
         self.jpeg_quality = cache(_jpeg_quality)
 
-    def go(self, bar: tqdm) -> None:
-        """Take back that the copy is complete, and make it so."""
+    def fill_copy(self, bar: tqdm) -> None:
+        """Mark the copy as incomplete, and put all files in place."""
         self._check_untouched()
         for folder in (self.folder.parent, self.folder):
-            self._own(str(folder))
+            self._make_folder(str(folder))
         with refusals_of(self.record):
             if self.record.exists():
-                os.replace(self.record, self.begun)
+                os.replace(self.record, self.unfinished_record)
                 flush_folder(self.folder)
-        self._own(self.root)
+        self._make_folder(self.root)
         self.placed.begin()
         self.pump = WritePump()
         try:
@@ -601,66 +708,71 @@ class _Mirroring:
         finally:
             self.placed.close()
             self.pump.close()
-        self.done.new += len(self.encoded)
+        self.result.new += len(self.encoded)
         self.bytes["new_images"] += sum(os.lstat(path).st_size for path in self.encoded)
 
     def finish(self) -> None:
-        """Make the names durable, then say that the copy is complete."""
-        record, known = self.done.record, {*self.done.record.replaced, *self.done.unusable}
-        images = {place for place, ours in self.weathered.items() if ours.form is not None}
-        self.done.missing = sorted(images - known)
+        """Make the names durable, then mark the copy as complete."""
+        record = self.result.record
+        known_places = {*self.result.record.replaced, *self.result.unusable}
+        images = {
+            place for place, replacement in self.weathered.items() if replacement.form is not None
+        }
+        self.result.missing = sorted(images - known_places)
         self.files["replaced_images"] = len(record.replaced)
         self.files["replaced_lidar_files"] = len(record.replaced_sweeps)
         text = (json.dumps(record.model_dump(exclude_none=True), indent=1) + "\n").encode()
         with refusals_of(self.folder):
             for folder in sorted(self.changed_folders):
                 flush_folder(Path(folder))
-            if self.begun.is_file() and self.begun.read_bytes() == text:
-                os.replace(self.begun, self.record)
+            if self.unfinished_record.is_file() and self.unfinished_record.read_bytes() == text:
+                os.replace(self.unfinished_record, self.record)
         self.placed.finish()
         if not self.record.exists():
             write_atomic(self.record, text)
-        with refusals_of(self.begun):
-            self.begun.unlink(missing_ok=True)
+        with refusals_of(self.unfinished_record):
+            self.unfinished_record.unlink(missing_ok=True)
 
     def _check_untouched(self) -> None:
-        """Refuse to replace what others have put in the copy: edited labels, files of their own.
-        Copies of earlier versions say nothing of their files; those are taken as they are.
+        """Refuse to replace files that other programs have edited in the copy, or put there.
+
+        Copies of earlier versions have no list of files; their files are taken as they are.
         """
         if not os.path.isdir(self.root):
             return
-        is_new = not (self.record.exists() or self.begun.exists())
-        adopts = not (is_new or self.placed.is_there)
-        adopted: dict[str, PlacedFile] = {}
-        others: list[str] = []
+        is_new = not (self.record.exists() or self.unfinished_record.exists())
+        adopts_files = not (is_new or self.placed.exists)
+        placed_files: dict[str, PlacedFile] = {}
+        foreign_files: list[str] = []
         for folder in walk(self.tree):
             for file in folder.files:
                 target = self._target(file.relative)
                 facts = _facts(target)
                 if facts is None or not stat.S_ISREG(facts.st_mode):
                     continue
-                if adopts:
-                    adopted[file.relative] = PlacedFile(facts.st_size, facts.st_mtime_ns)
+                if adopts_files:
+                    placed_files[file.relative] = PlacedFile(facts.st_size, facts.st_mtime_ns)
                 elif not self._is_known(file, target, facts):
-                    others.append(file.relative)
+                    foreign_files.append(file.relative)
             for name, _ in folder.links:
                 facts = _facts(self._target(name))
                 if facts is not None and stat.S_ISREG(facts.st_mode):
-                    others.append(name)
-        if others:
-            raise self._edited(others)
-        if adopts:
-            self.placed.adopt(adopted)
+                    foreign_files.append(name)
+        if foreign_files:
+            raise self._edited_files_error(foreign_files)
+        if adopts_files:
+            self.placed.adopt(placed_files)
 
     def _is_known(self, file: SourceFile, target: str, facts: os.stat_result) -> bool:
-        """Whether a file of the copy is what was put there, or is about to be."""
-        if self.placed.known(file.relative, facts) or found_as(target, file.facts):
+        """Return True if a file of the copy was put there by this package, or is about to be."""
+        if self.placed.find(file.relative, facts) or find_placement(target, file.facts):
             return True
-        ours = self.weathered.get(file.relative)
-        rendered = None if ours is None else _facts(str(ours.path))
-        return rendered is not None and rendered.st_mtime_ns == facts.st_mtime_ns
+        replacement = self.weathered.get(file.relative)
+        rendered_facts = None if replacement is None else _facts(str(replacement.path))
+        return rendered_facts is not None and rendered_facts.st_mtime_ns == facts.st_mtime_ns
 
-    def _edited(self, names: list[str]) -> OutputError:
+    def _edited_files_error(self, names: list[str]) -> OutputError:
+        """Return the error of files that other programs have edited."""
         is_are = "file is" if len(names) == 1 else "files are"
         return OutputError(
             f"{len(names)} {is_are} not what was put in the copy {self.root}, such as {names[0]}: "
@@ -670,149 +782,173 @@ class _Mirroring:
         )
 
     def _fill(self, folder: SourceFolder) -> None:
+        """Put the contents of one folder in place."""
         path = self._target(folder.relative)
         entries = [*folder.files, *folder.folders, *folder.links]
-        others = others_in(path, {os.path.basename(entry[0]) for entry in entries})
-        if not folder.relative:  # other drives, which the copy has from other scenes
-            others = [name for name in others if not os.path.lexists(self.tree.root / name)]
-        self.done.others += [f"{folder.relative}/{name}".lstrip("/") for name in others]
-        for inner, _ in folder.folders:
-            self._own(self._target(inner))
+        foreign_names = find_foreign_names(path, {os.path.basename(entry[0]) for entry in entries})
+        if not folder.relative:  # other drives, which other scenes have put into the copy
+            foreign_names = [
+                name for name in foreign_names if not os.path.lexists(self.tree.root / name)
+            ]
+        self.result.others += [f"{folder.relative}/{name}".lstrip("/") for name in foreign_names]
+        for inner_place, _ in folder.folders:
+            self._make_folder(self._target(inner_place))
         for file in folder.files:
             self.files["camera_images"] += self.tree.is_image(file.relative)
             self.files["lidar_sweeps"] += self.tree.is_sweep(file.relative)
-            ours = self.weathered.get(file.relative)
-            if ours is None or not self._replace(file, ours):
-                how = self._place(file.path, file.facts, file.relative)
-                self.files[how] += 1
-                self.bytes[how] += file.facts.st_size
+            replacement = self.weathered.get(file.relative)
+            if replacement is None or not self._replace(file, replacement):
+                placement = self._put_file(file.path, file.facts, file.relative)
+                self.files[placement] += 1
+                self.bytes[placement] += file.facts.st_size
         for name, text in folder.links:
             self.files["symbolic_links"] += 1
             if put_link(text, self._target(name)):
-                self._changed(path)
+                self._note_change(path)
 
-    def _replace(self, file: SourceFile, ours: Weathered) -> bool:
-        """Put what is weathered in place; False where the recorded file has to stay: an image that
-        is none that we write, or a sweep that only another scene could write.
+    def _replace(self, file: SourceFile, replacement: Weathered) -> bool:
+        """Put a weathered file in place; return False where the recorded file has to stay.
+
+        It stays where an image has a format that this package does not write, or where only another
+        scene could write a sweep.
         """
-        done, target, recorded = self.done, self._target(file.relative), None
-        if ours.form is not None:
+        result = self.result
+        target = self._target(file.relative)
+        recorded_form = None
+        if replacement.form is not None:
             try:
-                recorded = image_form(file.path)
+                recorded_form = image_form(file.path)
             except OSError as error:
                 raise AdapterError(f"{file.path} cannot be read: {error.strerror}") from error
-            if recorded is None:
-                done.unusable.append(file.relative)
+            if recorded_form is None:
+                result.unusable.append(file.relative)
                 return False
-        rendered = _facts_of(ours.path)
-        if ours.form is None or recorded is None:
-            if not self._write_sweep(file, rendered.st_mtime_ns, ours.content):
-                done.outdated.append(file.relative)
+        rendered_facts = _facts_of(replacement.path)
+        if replacement.form is None or recorded_form is None:
+            if not self._write_sweep(file, rendered_facts.st_mtime_ns, replacement.content):
+                result.outdated.append(file.relative)
                 return False
-            done.record.replaced_sweeps[file.relative] = ours.shown
+            result.record.replaced_sweeps[file.relative] = replacement.shown
             return True
-        if ours.form != recorded:
-            if _is_written(target, rendered.st_mtime_ns, recorded):
-                self.placed.keep(file.relative, PlacedFile(ANY_SIZE, rendered.st_mtime_ns))
+        if replacement.form != recorded_form:
+            if _is_written(target, rendered_facts.st_mtime_ns, recorded_form):
+                self.placed.keep(file.relative, PlacedFile(ANY_SIZE, rendered_facts.st_mtime_ns))
             else:
-                content = partial(_fitted, ours.path, recorded, self.jpeg_quality)
-                self._write(file.relative, PlacedFile(ANY_SIZE, rendered.st_mtime_ns), content)
+                content = partial(
+                    _encode_fitted_image, replacement.path, recorded_form, self.jpeg_quality
+                )
+                self._write(
+                    file.relative, PlacedFile(ANY_SIZE, rendered_facts.st_mtime_ns), content
+                )
             self.encoded.append(target)
-        elif self._place(str(ours.path), rendered, file.relative) == COPIED:
-            done.new += 1
-            self.bytes["new_images"] += rendered.st_size
-        if ours.form.size != recorded.size:
-            done.resized.append((ours.form.size, recorded.size))
-        done.record.replaced[file.relative] = ours.shown
+        elif self._put_file(str(replacement.path), rendered_facts, file.relative) == COPIED:
+            result.new += 1
+            self.bytes["new_images"] += rendered_facts.st_size
+        if replacement.form.size != recorded_form.size:
+            result.resized.append((replacement.form.size, recorded_form.size))
+        result.record.replaced[file.relative] = replacement.shown
         return True
 
-    def _place(self, original: str, facts: os.stat_result, name: str) -> str:
-        """Link or copy, where that has not been done; says which."""
+    def _put_file(self, original: str, facts: os.stat_result, name: str) -> str:
+        """Link or copy a file, where that has not been done; return LINKED or COPIED."""
         target = self._target(name)
-        may_link = self.done.record.links == "hard"
-        placed = PlacedFile(facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns)
-        found = found_as(target, facts)
-        if found == LINKED and may_link:
-            # A link changes the original's time of change: the line stays as it was.
-            self.placed.keep(name, self.placed.known(name, facts) or placed)
+        may_link = self.result.record.links == "hard"
+        placed_file = PlacedFile(facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns)
+        placement = find_placement(target, facts)
+        if placement == LINKED and may_link:
+            # A link changes the original's ctime, so the line stays as it was.
+            self.placed.keep(name, self.placed.find(name, facts) or placed_file)
             return LINKED
-        if found == COPIED and self._is_copy(original, target, name, placed):
-            self.placed.keep(name, placed)
+        if placement == COPIED and self._is_copy(original, target, name, placed_file):
+            self.placed.keep(name, placed_file)
             return COPIED
-        self.placed.add(name, placed)
+        self.placed.add(name, placed_file)
         is_linked = may_link and link_file(original, target)
         if not is_linked:
             self.pump.submit(lambda: copy_file(original, target))
-        self._changed(os.path.dirname(target))
+        self._note_change(os.path.dirname(target))
         return LINKED if is_linked else COPIED
 
-    def _is_copy(self, original: str, target: str, name: str, placed: PlacedFile) -> bool:
-        """Whether a file of the original's size and time holds the same too: an edit may have kept
-        both. Raises OutputError: it does not, and was not put there.
+    def _is_copy(self, original: str, target: str, name: str, placed_file: PlacedFile) -> bool:
+        """Return True if a file of the original's size and time has the same content.
+
+        An edit may have kept size and time.
+
+        Raises:
+            OutputError: The content differs, and the file was not put there by this package.
         """
-        known = self.placed.known(name, os.lstat(target))
-        if known is not None and known.source_ctime_ns == placed.source_ctime_ns:
+        known_file = self.placed.find(name, os.lstat(target))
+        if known_file is not None and known_file.source_ctime_ns == placed_file.source_ctime_ns:
             return True
         with refusals_of(Path(target)):
             is_same = digest_of(original) == digest_of(target)
-        if not is_same and known is None:
-            raise self._edited([name])
+        if not is_same and known_file is None:
+            raise self._edited_files_error([name])
         return is_same
 
     def _write_sweep(
         self, file: SourceFile, mtime_ns: int, content: Callable[[], bytes] | None
     ) -> bool:
-        """Write a file of a weathered sweep, of that time, where there is none yet or the source's
-        has changed; False where that would take what we do not have.
+        """Write a file of a weathered sweep with that time, unless it is up to date.
+
+        Returns:
+            False where only another scene could write the file.
         """
-        target, name, ctime_ns = self._target(file.relative), file.relative, file.facts.st_ctime_ns
+        target = self._target(file.relative)
+        name = file.relative
+        ctime_ns = file.facts.st_ctime_ns
         is_written = _is_written(target, mtime_ns, None)
-        known = self.placed.known(name, os.lstat(target)) if is_written else None
-        if known is not None and known.source_ctime_ns == ctime_ns:
-            self.placed.keep(name, known)
+        known_file = self.placed.find(name, os.lstat(target)) if is_written else None
+        if known_file is not None and known_file.source_ctime_ns == ctime_ns:
+            self.placed.keep(name, known_file)
             return True
         try:
             digest = digest_of(file.path)
         except OSError as error:
             raise AdapterError(f"{file.path} cannot be read: {error.strerror}") from error
-        placed = PlacedFile(ANY_SIZE, mtime_ns, ctime_ns, digest)
-        # Links elsewhere change the source's time too, and not what it holds.
-        if known is not None and known.source_digest == digest:
-            self.placed.keep(name, placed)
+        placed_file = PlacedFile(ANY_SIZE, mtime_ns, ctime_ns, digest)
+        # Links elsewhere change the source's ctime too, but not its content.
+        if known_file is not None and known_file.source_digest == digest:
+            self.placed.keep(name, placed_file)
             return True
-        if content is None:  # with what an earlier version wrote is not known
-            is_taken = is_written and not (known and known.source_digest)
-            if is_taken and known is not None:
-                self.placed.keep(name, known)
-            return is_taken
+        if content is None:  # the content that an earlier version wrote is not known
+            keeps_file = is_written and not (known_file and known_file.source_digest)
+            if keeps_file and known_file is not None:
+                self.placed.keep(name, known_file)
+            return keeps_file
         if is_written:
             data = content()
             if Path(target).read_bytes() == data:
-                self.placed.keep(name, placed)
+                self.placed.keep(name, placed_file)
                 return True
             content = partial(bytes, data)
-        self._write(name, placed, content)
+        self._write(name, placed_file, content)
         return True
 
-    def _write(self, name: str, placed: PlacedFile, content: Callable[[], bytes]) -> None:
+    def _write(self, name: str, placed_file: PlacedFile, content: Callable[[], bytes]) -> None:
+        """Write a file on a thread of the pump."""
         target = self._target(name)
-        self.placed.add(name, placed)
-        self.pump.submit(lambda: write_file(content(), target, placed.mtime_ns))
-        self._changed(os.path.dirname(target))
+        self.placed.add(name, placed_file)
+        self.pump.submit(lambda: write_file(content(), target, placed_file.mtime_ns))
+        self._note_change(os.path.dirname(target))
 
-    def _own(self, folder: str) -> None:
-        if own_folder(folder):
+    def _make_folder(self, folder: str) -> None:
+        """Make sure that a folder of the copy is a real one."""
+        if make_real_folder(folder):
             self.changed_folders.add(os.path.dirname(folder))
 
-    def _changed(self, folder: str) -> None:
-        self.done.changed += 1
+    def _note_change(self, folder: str) -> None:
+        """Count a change, and note its folder."""
+        self.result.changed += 1
         self.changed_folders.add(folder)
 
     def _target(self, relative: str) -> str:
+        """Return the path in the copy."""
         return os.path.join(self.root, relative) if relative else self.root
 
 
 def _facts_of(path: Path) -> os.stat_result:
+    """Return the facts of a file that the manifest names."""
     try:
         return os.stat(path)
     except OSError as error:
@@ -822,7 +958,7 @@ def _facts_of(path: Path) -> os.stat_result:
 
 
 def _is_written(target: str, mtime_ns: int, form: ImageForm | None) -> bool:
-    """Whether a file of ours stands there: of that time, and of that form, if it is an image."""
+    """Return True if a file of ours with that time, and form of an image, is in place."""
     try:
         is_ours = os.lstat(target).st_mtime_ns == mtime_ns
         return is_ours and (form is None or image_form(target) == form)

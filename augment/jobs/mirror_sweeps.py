@@ -1,8 +1,11 @@
-"""Weather for the LiDAR sweeps of a copied drive that no image was rendered with.
+"""Weather for the LiDAR sweeps of a copied drive between the sweeps of its rendered images.
 
-A LiDAR turns more often than cameras look: nuScenes has 20 sweeps a second and 12 images. A job
-weathers the sweeps of its images' frames; the others of the same span get theirs here, into the
-same folder, so that clouds of several sweeps show one weather.
+In: a scene, a recipe, and the manifest's rows of its images. Out: sweeps in the variant's folder.
+Called by `climategs export`.
+
+A LiDAR turns more often than cameras take images: nuScenes has 20 sweeps a second and 12 images. A
+job weathers the sweeps of its images' frames. This module weathers the other sweeps of the same
+time span, into the same folder, so that point clouds of several sweeps show one weather.
 """
 
 from __future__ import annotations
@@ -28,41 +31,40 @@ from recipes.schema import Recipe
 
 
 class SweepsBetween(NamedTuple):
-    """Sweeps that were weathered without an image.
-
-    rows: for each, what the manifest's rows say of sweeps. faults: why a sweep stays clear, by
-    frame number.
-    """
+    """Sweeps that were weathered without an image."""
 
     rows: list[dict[str, Any]]
+    """Entries of the sweeps, as in the manifest's rows."""
     faults: dict[int, str]
+    """Reasons why sweeps stay clear, by frame number."""
 
 
 def frames_of_span(
     frames: Sequence[Frame], rendered: Collection[int], cameras: Collection[str]
 ) -> list[int]:
-    """Numbers of the frames that were rendered, and of those between them.
+    """Return the numbers of the rendered frames and of the frames between them.
 
     A frame without an image of these cameras belongs to the span where the frames with one before
     and after it were rendered; so do such frames at the ends of the drive.
 
     Args:
-        frames: of the scene, in order of time.
-        rendered: numbers of the frames of which there are images.
-        cameras: that were rendered.
+        frames: Frames of the scene, in order of time.
+        rendered: Numbers of the frames that have images.
+        cameras: Names of the cameras that were rendered.
     """
     span: list[int] = []
-    waiting: list[int] = []
-    is_after_rendered = True
+    frames_between: list[int] = []
+    follows_rendered = True
     for frame in frames:
         if frame.cameras.keys().isdisjoint(cameras):
-            waiting.append(frame.index)
+            frames_between.append(frame.index)
             continue
         is_rendered = frame.index in rendered
-        span += waiting if is_after_rendered and is_rendered else []
+        span += frames_between if follows_rendered and is_rendered else []
         span += [frame.index] if is_rendered else []
-        waiting, is_after_rendered = [], is_rendered
-    return span + (waiting if is_after_rendered else [])
+        frames_between = []
+        follows_rendered = is_rendered
+    return span + (frames_between if follows_rendered else [])
 
 
 def weather_sweeps_between(
@@ -73,59 +75,68 @@ def weather_sweeps_between(
     *,
     progress: bool = True,
 ) -> SweepsBetween:
-    """Write the weathered sweeps of the span that no finished image has, where they are not there.
+    """Write the missing weathered sweeps of the span that belong to no finished image.
 
     Args:
-        scene: that the images were rendered from.
-        recipe: of the variant, resolved.
-        rows: the variant's rows of the manifest.
-        out_dir: the output folder, whose lock the caller holds.
+        scene: Scene that the images were rendered from.
+        recipe: Resolved recipe of the variant.
+        rows: The variant's rows of the manifest.
+        out_dir: Output folder, whose lock the caller holds.
     """
-    between = SweepsBetween([], {})
+    sweeps_between = SweepsBetween([], {})
     if recipe.lidar != "weather" or not isinstance(scene.labels, StoresLidar):
-        return between
+        return sweeps_between
     cameras = {row["camera"] for row in rows}
-    span = frames_of_span(scene.frames, {row["frame"] for row in rows}, cameras)
-    finished = {row["frame"] for row in rows if row["status"] == OK}
-    places = {
+    span_frames = frames_of_span(scene.frames, {row["frame"] for row in rows}, cameras)
+    finished_frames = {row["frame"] for row in rows if row["status"] == OK}
+    path_of_frame = {
         number: str(item_paths(scene.name, recipe, "", number)["lidar"])
-        for number in span
-        if number not in finished and scene.labels.lidar_files(number)
+        for number in span_frames
+        if number not in finished_frames and scene.labels.lidar_files(number)
     }
-    missing = [number for number, place in places.items() if not _is_weathered(out_dir / place)]
-    if missing:
-        folder, backend = out_dir / STATE_FOLDER, rows[0]["backend"]
+    missing_frames = [
+        number for number, path in path_of_frame.items() if not _is_weathered(out_dir / path)
+    ]
+    if missing_frames:
+        folder = out_dir / STATE_FOLDER
+        backend = rows[0]["backend"]
         share_effects(Sharing(scene, [recipe], folder=folder, backend=backend, progress=progress))
     for number in tqdm(
-        missing, desc="LiDAR between images", unit="sweep", disable=not (progress and missing)
+        missing_frames,
+        desc="LiDAR between images",
+        unit="sweep",
+        disable=not (progress and missing_frames),
     ):
         try:
             sweep = scene.lidar(number)
             if sweep is None:
                 raise ValueError("its file cannot be read")
             data = lidar_bytes(weathered_sweep(scene, recipe, number, sweep))
-        except Exception as error:  # of one sweep: the others have their weather
-            between.faults[number] = describe(error, "no weather on this sweep")
+        except Exception as error:  # concerns one sweep: the other ones get their weather
+            sweeps_between.faults[number] = describe(error, "no weather on this sweep")
             continue
-        write_atomic(out_dir / places[number], data, clear=False)
-    for number, place in places.items():
-        if number not in between.faults:
+        write_atomic(out_dir / path_of_frame[number], data, clear=False)
+    for number, path in path_of_frame.items():
+        if number not in sweeps_between.faults:
             facts = {"scene": scene.name, "frame": number, "status": OK}
-            between.rows.append({**facts, "lidar": "weather", "lidar_path": place})
-    return between
+            sweeps_between.rows.append({**facts, "lidar": "weather", "lidar_path": path})
+    return sweeps_between
 
 
 def is_sweep_between(out_dir: Path, variant: str, scene: str, path: str) -> bool:
-    """Return True for the path of a weathered sweep in the folder of a scene's variant, which the
-    manifest need not name: it may have no image.
+    """Return True for the path of a weathered sweep in the folder of a scene's variant.
+
+    The manifest need not name the sweep, because it may have no image.
     """
     folder, _, name = path.rpartition("/")
-    is_place = folder == f"{variant_folder(scene, variant)}/{SWEEPS}" and name.endswith(".parquet")
-    return is_place and _is_weathered(out_dir / path)
+    is_sweep_path = folder == f"{variant_folder(scene, variant)}/{SWEEPS}" and name.endswith(
+        ".parquet"
+    )
+    return is_sweep_path and _is_weathered(out_dir / path)
 
 
 def _is_weathered(path: Path) -> bool:
     try:
         return path.is_file() and read_lidar_note(path) is None
-    except OutputError:  # a damaged one is written anew
+    except OutputError:  # a damaged file is written again
         return False

@@ -1,8 +1,9 @@
-"""What the files of a dataset's copy were when they were put there, so that nobody's work is lost.
+"""List of the files that were put into a copy of a dataset, so that edited files are not replaced.
 
-A file that is no longer what was put there has been edited, or was there before: it is not
-replaced. The list lies beside the copy, a JSON array a line; each line is written before its file
-is put in place, so that a killed run's files are known too.
+In: facts of each file as it is put in place. Out: whether a file of the copy is still the one that
+was put there. Any other file has been edited, or was there before; `mirror` does not replace it.
+The list lies beside the copy, one JSON array on a line. Each line is written before its file is put
+in place, so that the files of a killed run are in the list too.
 """
 
 from __future__ import annotations
@@ -19,23 +20,23 @@ from augment.jobs.atomic import refusals_of, write_atomic
 from augment.jobs.layout import reading_back
 from recipes.files import open_file
 
+# Size of a file whose contents are encoded after its line is written.
 ANY_SIZE = -1
 
 
 class PlacedFile(NamedTuple):
-    """A file of the copy as it was put there.
-
-    size: bytes; ANY_SIZE where contents are encoded after the line is written.
-    mtime_ns: time of change of its contents.
-    source_ctime_ns: time of change of the source file and its facts, which no program can set; 0
-        where that is not known.
-    source_digest: of the source file's contents, where ours were made with them; else empty.
-    """
+    """A file of the copy as it was put there."""
 
     size: int
+    """Size in bytes; ANY_SIZE where contents are encoded after the line is written."""
     mtime_ns: int
+    """Time at which the contents changed, nanoseconds since 1970."""
     source_ctime_ns: int = 0
+    """Time at which the source file or its facts changed, which no program can set; 0 where it is
+    not find.
+    """
     source_digest: str = ""
+    """Digest of the source file's contents, where ours were made with them; empty otherwise."""
 
     def is_of(self, facts: os.stat_result) -> bool:
         """Return True for a file of this size and time."""
@@ -46,63 +47,71 @@ _LINE = TypeAdapter(tuple[str, PlacedFile])
 
 
 class PlacedFiles:
-    """The list of one copy. path: its file. Lines of one name add up until `finish`."""
+    """The list of one copy.
+
+    Several lines may have one name, until `finish` leaves the last one.
+
+    Attributes:
+        path: File of the list.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file: BinaryIO | None = None
-        self._earlier: dict[str, list[PlacedFile]] = {}
-        self._now: dict[str, PlacedFile] = {}
-        self.is_there = path.is_file()
-        self._text = b""
-        self._is_longer = False
-        if not self.is_there:
+        self._old_lines: dict[str, list[PlacedFile]] = {}
+        self._new_lines: dict[str, PlacedFile] = {}
+        self.exists = path.is_file()
+        self._file_text = b""
+        self._has_new_lines = False
+        if not self.exists:
             return
         with refusals_of(path), open_file(path) as file:
-            self._text = file.read()
+            self._file_text = file.read()
         advice = "Delete it and run again; edits in the copy are not noticed then"
         with reading_back(str(path), advice):
             # A line without its end was being written when the power went.
-            for line in self._text[: self._text.rfind(b"\n") + 1].splitlines():
-                name, placed = _LINE.validate_json(line)
-                self._earlier.setdefault(name, []).append(placed)
+            for line in self._file_text[: self._file_text.rfind(b"\n") + 1].splitlines():
+                name, placed_file = _LINE.validate_json(line)
+                self._old_lines.setdefault(name, []).append(placed_file)
 
-    def known(self, name: str, facts: os.stat_result) -> PlacedFile | None:
-        """The latest line that the file in the copy fits; None where it is not what was put there.
+    def find(self, name: str, facts: os.stat_result) -> PlacedFile | None:
+        """Return the latest line that fits the file in the copy; None where no line fits.
 
         Args:
-            name: path relative to the dataset's folder.
-            facts: of the file in the copy.
+            name: Path relative to the dataset's folder.
+            facts: Facts of the file in the copy.
         """
-        lines = self._earlier.get(name, [])
-        return next((placed for placed in reversed(lines) if placed.is_of(facts)), None)
+        lines = self._old_lines.get(name, [])
+        return next(
+            (placed_file for placed_file in reversed(lines) if placed_file.is_of(facts)), None
+        )
 
     def adopt(self, files: dict[str, PlacedFile]) -> None:
-        """Begin the list of a copy that has none with the files that are there."""
-        self._earlier = {name: [placed] for name, placed in files.items()}
-        self._text = _text(files)
-        write_atomic(self._path, self._text)
+        """Begin the list of a copy without a list, with the files that are in the copy."""
+        self._old_lines = {name: [placed_file] for name, placed_file in files.items()}
+        self._file_text = _file_text(files)
+        write_atomic(self._path, self._file_text)
 
     def begin(self) -> None:
         """Open the list for further lines."""
         with refusals_of(self._path):
-            if self._text and not self._text.endswith(b"\n"):
-                self._text = self._text[: self._text.rfind(b"\n") + 1]
-                write_atomic(self._path, self._text)
+            if self._file_text and not self._file_text.endswith(b"\n"):
+                self._file_text = self._file_text[: self._file_text.rfind(b"\n") + 1]
+                write_atomic(self._path, self._file_text)
             flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW
             self._file = os.fdopen(os.open(self._path, flags, 0o666), "ab", buffering=0)
 
-    def add(self, name: str, placed: PlacedFile) -> None:
+    def add(self, name: str, placed_file: PlacedFile) -> None:
         """Add the line of a file that is about to be put in place."""
         assert self._file is not None, "begin() comes before"
-        self._now[name] = placed
+        self._new_lines[name] = placed_file
         with refusals_of(self._path):
-            self._file.write(_text({name: placed}))
-        self._is_longer = True
+            self._file.write(_file_text({name: placed_file}))
+        self._has_new_lines = True
 
-    def keep(self, name: str, placed: PlacedFile) -> None:
-        """Go on with the line of a file that is in place already."""
-        self._now[name] = placed
+    def keep(self, name: str, placed_file: PlacedFile) -> None:
+        """Keep the line of a file that is in place already."""
+        self._new_lines[name] = placed_file
 
     def close(self) -> None:
         """Close the list as it is."""
@@ -110,18 +119,20 @@ class PlacedFiles:
             self._file.close()
 
     def finish(self) -> None:
-        """Leave one line of each file, those included that the source does not have any more."""
-        text = _text({name: lines[-1] for name, lines in self._earlier.items()} | self._now)
-        if self._is_longer or text != self._text:
+        """Leave one line for each file, including files that the source no longer has."""
+        text = _file_text(
+            {name: lines[-1] for name, lines in self._old_lines.items()} | self._new_lines
+        )
+        if self._has_new_lines or text != self._file_text:
             write_atomic(self._path, text)
 
 
 def digest_of(path: str) -> str:
-    """Digest of a file's contents."""
+    """Return the SHA-256 of a file's contents, hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _text(files: dict[str, PlacedFile]) -> bytes:
+def _file_text(files: dict[str, PlacedFile]) -> bytes:
     lines = [json.dumps([name, list(files[name])]) + "\n" for name in sorted(files)]
     return "".join(lines).encode()

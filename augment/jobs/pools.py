@@ -1,7 +1,8 @@
-"""Workers that do one task each at a time: in this process, in several, or on a Ray cluster; and
-the loop that gives them work.
+"""Pools of workers in this process, in several processes or on a Ray cluster, and their work loop.
 
-What a job's workers do is its setup's: `setup.worker(on_outcome)` makes one, where it runs.
+In: a setup, whose `setup.worker(on_outcome)` makes a worker where it runs, and `Work`, which gives
+tasks. Out: results of tasks and outcomes of images. `render_job` and `generate` call it. Each
+worker does one task at a time.
 """
 
 from __future__ import annotations
@@ -39,13 +40,16 @@ from augment.jobs.worker import Outcome, TaskFailed
 from augment.render.buffers import CUDA
 
 OnOutcome = Callable[[Outcome], None]
-Tick = Callable[[int, Outcome], None]  # the slot, and an image that its worker is done with
+# Called with a slot and the outcome of an image that its worker has finished.
+Tick = Callable[[int, Outcome], None]
 
 
 @runtime_checkable
 class Worker(Protocol):
-    """Does one task after the other. An error that concerns the task alone is its result, a
-    TaskFailed; one that is raised ends the process.
+    """Does one task after the other.
+
+    An error that concerns only the task is returned as a TaskFailed; a raised error ends the
+    process.
     """
 
     def do(self, task: Any) -> Any: ...
@@ -53,16 +57,14 @@ class Worker(Protocol):
 
 @runtime_checkable
 class WorkerSetup(Protocol):
-    """What all workers of a job share; picklable. on_outcome: hears of every image, from several
-    threads.
-    """
+    """Everything that all workers of a job share; picklable."""
 
     @property
     def backend(self) -> str: ...
 
     @property
     def output(self) -> str:
-        """The output, to name it."""
+        """Name of the output, for messages."""
         ...
 
     def worker(self, on_outcome: OnOutcome) -> Worker: ...
@@ -70,18 +72,22 @@ class WorkerSetup(Protocol):
 
 @dataclass(frozen=True)
 class Finished:
-    """The worker has done its task."""
+    """Event: a worker has done its task."""
 
     slot: int
+    """Slot of the worker."""
     result: Any
+    """Result of its task."""
 
 
 @dataclass(frozen=True)
 class Lost:
-    """The worker died at its task; another takes its place. how: "was killed by SIGKILL", say."""
+    """Event: a worker died at its task, and another one takes its place."""
 
     slot: int
+    """Slot of the worker."""
     how: str
+    """Ending of the worker: "was killed by SIGKILL", say."""
 
 
 Event = Finished | Lost
@@ -89,55 +95,64 @@ Event = Finished | Lost
 
 @runtime_checkable
 class WorkerPool(Protocol):
-    """Workers are numbered 0 to slots - 1; each has at most one task. A pool tells `tick` of
-    finished images, in the thread that waits; a SerialPool in several threads.
+    """Workers numbered 0 to slots - 1, each with at most one task.
+
+    A pool calls `tick` for every finished image, in the thread that waits; a SerialPool calls it
+    from several threads.
     """
 
     slots: int
+    """Number of workers."""
     tick: Tick
+    """Called with a slot and the outcome of each finished image."""
 
     def give(self, slot: int, task: Any) -> None:
         """Start a task in a worker that has none."""
 
     def wait(self, timeout_s: float) -> list[Event]:
-        """What has happened, at least one thing unless the time ran out first."""
+        """Return the events that have happened, at least one unless the time runs out first."""
         ...
 
     def close(self) -> None:
-        """End all workers: each finishes the images it has at hand, and what they hold is free."""
+        """End all workers: each finishes the images at hand, and releases what it holds."""
 
 
 # ---- Tasks given to the workers of a pool, and tried once more where a worker died ---------------
 
+# Longest wait for an event, seconds.
 WAIT_S = 1.0
 
 
 class Work:
-    """Tasks for `run_tasks`, and what becomes of them."""
+    """Tasks for `run_tasks`, with the handling of their results."""
 
     def tick(self, slot: int, outcome: Outcome) -> None:
-        """Hear of an image that a worker is done with."""
+        """Handle an image that a worker has finished."""
 
     def take(self, slot: int) -> Any:
-        """The next task for an idle worker; None where there is none for now."""
+        """Return the next task for an idle worker; None where there is none for now."""
         raise NotImplementedError
 
     def later_s(self) -> float | None:
-        """In how many seconds to ask again although no worker is busy; None: all is done."""
+        """Return in how many seconds to ask again although no worker is busy.
+
+        None when all is done.
+        """
         return None
 
-    def retry(self, slot: int, task: Any, why: str) -> Sequence[Any]:
-        """What to try, each while no other worker is busy, after the task's worker died or memory
-        ran out.
+    def retry(self, slot: int, task: Any, reason: str) -> Sequence[Any]:
+        """Return the tasks to try after the task's worker died or memory ran out.
+
+        Each runs while no other worker is busy.
         """
         return [task]
 
     def done(self, slot: int, task: Any, result: Any) -> None:
-        """The task's result, or a TaskFailed."""
+        """Handle the task's result, or a TaskFailed."""
         raise NotImplementedError
 
     def lost(self, slot: int, task: Any, how: str) -> None:
-        """The task's worker died when it was tried alone, too."""
+        """Handle that the task's worker died also when it was tried alone."""
         raise NotImplementedError
 
 
@@ -148,60 +163,68 @@ def run_tasks(
     slots: int | None = None,
     idle: Callable[[], None] = lambda: None,
 ) -> None:
-    """Do all of the work. slots: of so many workers only. idle: called now and then between events.
-    Raises OutputError: a worker could not write.
+    """Do all of the work.
+
+    Args:
+        slots: Number of workers to use; all if None.
+        idle: Called now and then between events.
+
+    Raises:
+        OutputError: A worker could not write.
     """
     pool.tick = work.tick
     trials: deque[Any] = deque()
-    busy: dict[int, Any] = {}  # by slot
-    is_trial = False  # the one task that is being done
+    task_of_slot: dict[int, Any] = {}
+    is_trial = False  # True while the only running task is a trial
     while True:
-        if trials and not busy:  # alone: memory may be what it died of
-            busy[0], is_trial = trials.popleft(), True
-            pool.give(0, busy[0])
+        if trials and not task_of_slot:  # alone: its worker may have died of too little memory
+            task_of_slot[0] = trials.popleft()
+            is_trial = True
+            pool.give(0, task_of_slot[0])
         for slot in range(slots or pool.slots):
             if trials or is_trial:
                 break
-            if slot not in busy and (task := work.take(slot)) is not None:
-                busy[slot] = task
+            if slot not in task_of_slot and (task := work.take(slot)) is not None:
+                task_of_slot[slot] = task
                 pool.give(slot, task)
-        if not busy:
+        if not task_of_slot:
             later_s = work.later_s()
             if later_s is None:
                 return
             time.sleep(min(WAIT_S, later_s))
-        for event in pool.wait(WAIT_S) if busy else ():
-            slot, task = event.slot, busy.pop(event.slot)
+        for event in pool.wait(WAIT_S) if task_of_slot else ():
+            slot = event.slot
+            task = task_of_slot.pop(event.slot)
             result = event.result if isinstance(event, Finished) else None
-            failed = result if isinstance(result, TaskFailed) else None
-            if failed and failed.is_output:  # nothing can be written any more
-                raise OutputError(failed.text)
+            failure = result if isinstance(result, TaskFailed) else None
+            if failure and failure.is_output:  # nothing can be written any more
+                raise OutputError(failure.text)
             if isinstance(event, Lost) and is_trial:
                 work.lost(slot, task, event.how)
             elif isinstance(event, Lost):
                 trials += work.retry(slot, task, f"its worker {event.how}")
-            elif failed and failed.of_memory and not is_trial:
-                trials += work.retry(slot, task, failed.text)
+            elif failure and failure.of_memory and not is_trial:
+                trials += work.retry(slot, task, failure.text)
             else:
                 work.done(slot, task, result)
-        is_trial = is_trial and bool(busy)
+        is_trial = is_trial and bool(task_of_slot)
         idle()
 
 
-def _untold(slot: int, outcome: Outcome) -> None:
-    """For a pool that does no work yet."""
+def _ignore_outcome(slot: int, outcome: Outcome) -> None:
+    """Do nothing; for a pool without work."""
 
 
 # ---- This process alone --------------------------------------------------------------------------
 
 
 class SerialPool:
-    """One worker, which is this process; it works while it is waited for."""
+    """Pool of one worker, which is this process; it works while it is waited for."""
 
     slots = 1
 
     def __init__(self, setup: WorkerSetup) -> None:
-        self.tick: Tick = _untold
+        self.tick: Tick = _ignore_outcome
         self._worker = setup.worker(lambda outcome: self.tick(0, outcome))
         self._task: Any = None
 
@@ -209,7 +232,8 @@ class SerialPool:
         self._task = task
 
     def wait(self, timeout_s: float) -> list[Event]:
-        task, self._task = self._task, None
+        task = self._task
+        self._task = None
         return [] if task is None else [Finished(0, self._worker.do(task))]
 
     def close(self) -> None:
@@ -217,9 +241,10 @@ class SerialPool:
 
 
 # ---- A pool of worker processes on this machine, each with a scene of its own --------------------
-# One that dies is replaced; all end when this process does.
+# A process that dies is replaced; all end when this process does.
 
-STOP_S = 60.0  # how long a worker may take to finish the images it has at hand
+# Longest time for a worker to finish the images at hand, seconds.
+STOP_S = 60.0
 
 
 class _Worker(ChildProcess):
@@ -228,21 +253,24 @@ class _Worker(ChildProcess):
 
 
 class ProcessPool:
-    """`slots` worker processes that share the cores. Raises ClimateGSError: from wait: a process
-    ended while starting, and none has ever started.
+    """Pool of `slots` worker processes that share the cores.
+
+    Raises:
+        ClimateGSError: From wait: a process ended while starting, and none has ever started.
     """
 
     def __init__(self, setup: WorkerSetup, slots: int) -> None:
-        self.slots, self.tick = slots, _untold
+        self.slots = slots
+        self.tick = _ignore_outcome
         self._setup = setup
         self._threads = max(1, available_cores() // slots)
         self._workers: dict[int, _Worker] = {}  # by slot
-        self._has_started = False  # any of them
+        self._has_started = False  # True once any of them has started
 
     def give(self, slot: int, task: Any) -> None:
         worker = self._workers.get(slot)
         if worker is None:
-            # No daemon: on trial it has processes of its own. It ends when the connection does.
+            # No daemon: on trial it has child processes itself. It ends when the connection ends.
             arguments = (self._setup, self._threads)
             worker = _Worker(_main, *arguments, threads=self._threads, daemon=False)
             self._workers[slot] = worker
@@ -253,29 +281,32 @@ class ProcessPool:
     def wait(self, timeout_s: float) -> list[Event]:
         deadline = time.monotonic() + timeout_s
         while True:
-            left = deadline - time.monotonic()
-            messages = list(receive(self._workers.values(), max(0.0, left)))
+            left_s = deadline - time.monotonic()
+            messages = list(receive(self._workers.values(), max(0.0, left_s)))
             self._has_started |= any(worker.is_ready for worker in self._workers.values())
             events = [event for w, message in messages if (event := self._event_of(w, message))]
-            if events or left <= 0:
+            if events or left_s <= 0:
                 return events
 
     def close(self) -> None:
-        workers, self._workers = list(self._workers.values()), {}
+        workers = list(self._workers.values())
+        self._workers = {}
         try:
             for worker in workers:
                 worker.send(None)
             deadline = time.monotonic() + STOP_S
-            for worker in workers:  # what one still sends is taken in, or it would block on it
-                source = worker.connection
+            for worker in workers:
+                # Late messages are received, or the worker would block on sending them.
+                connection = worker.connection
                 with contextlib.suppress(EOFError, OSError):
-                    while (left := deadline - time.monotonic()) > 0 and source.poll(left):
-                        self._event_of(worker, source.recv())
+                    while (left_s := deadline - time.monotonic()) > 0 and connection.poll(left_s):
+                        self._event_of(worker, connection.recv())
         finally:
             for worker in workers:
                 worker.kill()
 
     def _event_of(self, worker: _Worker, message: Any) -> Event | None:
+        """Return the event of a worker's message; None for an image."""
         if isinstance(message, Ended):
             del self._workers[worker.slot]
             if not self._has_started:
@@ -289,6 +320,7 @@ class ProcessPool:
 
 
 def _main(connection: Connection, setup: WorkerSetup, threads: int) -> None:
+    """Run a worker process: do tasks until the connection sends None."""
     limit_threads(threads)
     send = sender(connection)
     # A shell's background job ignores Ctrl-C, and so would `interrupt_main`.
@@ -297,7 +329,7 @@ def _main(connection: Connection, setup: WorkerSetup, threads: int) -> None:
     working = threading.Event()
     inbox = inbox_of(connection, lambda: _thread.interrupt_main() if working.is_set() else None)
     send(READY)
-    with contextlib.suppress(KeyboardInterrupt):  # asked to stop in the midst of a block
+    with contextlib.suppress(KeyboardInterrupt):  # stopped in the middle of a block
         while (task := inbox.get()) is not None:
             working.set()
             try:
@@ -308,17 +340,27 @@ def _main(connection: Connection, setup: WorkerSetup, threads: int) -> None:
 
 
 # ---- A pool of actors on a Ray cluster, each with a scene of its own -----------------------------
-# What is rendered goes straight from the actors to the output; through Ray pass the tasks, and word
-# of every image. Ray is an optional extra, imported only when such a pool is made.
+# Images go straight from the actors to the output; only tasks and outcomes of images pass through
+# Ray. Ray is an optional extra, imported only when such a pool is made.
 
-_OBJECTS_BYTES = 100 << 20  # for objects of Ray's; tasks and results are far smaller
-_STARTS = 3  # in a row that may be lost, with their machines say, before the job ends
-_PATIENCE_S = 60.0  # without a worker, before the log says so
-_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# Memory for Ray's objects, bytes; tasks and results are far smaller.
+_OBJECT_STORE_BYTES = 100 << 20
+# Starts in a row that may fail, for example with their machines, before the job ends.
+_MAX_LOST_STARTS = 3
+# Time without a worker after which a message says so, seconds.
+_LOG_AFTER_S = 60.0
+# Environment variables that limit the threads of libraries.
+_THREAD_VARIABLES = (
+    "NUMBA_NUM_THREADS",
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+)
 _log = logging.getLogger(__name__)
 
 
 def import_ray() -> Any:
+    """Import Ray, or raise ClimateGSError that says how to install it."""
     try:
         import ray
         import ray.exceptions
@@ -330,7 +372,11 @@ def import_ray() -> Any:
 
 
 def connect(ray: Any, slots: int | None) -> bool:
-    """Connect to a cluster unless this process is. Returns whether it was started here."""
+    """Connect to a cluster unless this process is connected.
+
+    Returns:
+        True if the cluster was started here.
+    """
     if ray.is_initialized():
         return False
     address = os.environ.get("RAY_ADDRESS", "")
@@ -346,15 +392,15 @@ def connect(ray: Any, slots: int | None) -> bool:
             "address": "local",
             "num_cpus": slots or available_cores(),
             "include_dashboard": False,
-            "object_store_memory": _OBJECTS_BYTES,
-            # Workers import from where this process does, as those of other executors.
+            "object_store_memory": _OBJECT_STORE_BYTES,
+            # Workers import from the same folders as this process, as with other executors.
             "runtime_env": {
                 "env_vars": {"PYTHONPATH": os.pathsep.join(p or "." for p in sys.path)}
             },
         }
-    # What Ray starts sends nothing home, unless the user has said that it may.
+    # Ray sends no usage statistics, unless the user has allowed it.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    with _own_sigterm():
+    with _keep_sigterm_handler():
         try:
             ray.init(**options)
         except (ConnectionError, RuntimeError, ValueError) as error:
@@ -364,50 +410,58 @@ def connect(ray: Any, slots: int | None) -> bool:
 
 
 @contextlib.contextmanager
-def _own_sigterm() -> Iterator[None]:
-    """Ray sets a handler for SIGTERM when it connects: put back the one there was."""
+def _keep_sigterm_handler() -> Iterator[None]:
+    """Context manager that restores the handler for SIGTERM.
+
+    Ray replaces it when it connects.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.getsignal(signal.SIGTERM)
+    old_handler = signal.getsignal(signal.SIGTERM)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, old_handler)
 
 
 def last_line(error: Exception) -> str:
-    """The end of an error's text, where a remote traceback says what happened."""
+    """Return the last line of an error's text, where a remote traceback says what happened."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1][:300] if lines else type(error).__name__
 
 
 class RayPool:
-    """`slots` actors of one CPU each, as many as the cluster has CPUs if None; where the backend is
-    `cuda`, of a GPU and its share of the CPUs, as many as there are GPUs. They run on the cluster
-    that this process is connected to, else on the one that RAY_ADDRESS names, else on one that is
-    started here and ends with the pool. One that dies is replaced; where the cluster has no room
-    for all, those that run do the work of the others. Raises ClimateGSError: Ray is missing, or the
-    cluster cannot be reached; from wait: actors cannot start, or no machine of the cluster has a
-    GPU.
+    """Pool of `slots` actors of one CPU each, as many as the cluster has CPUs if None.
+
+    Where the backend is `cuda`, each actor has a GPU and its share of the CPUs, and there are as
+    many actors as GPUs. They run on the cluster that this process is connected to, otherwise on the
+    one that RAY_ADDRESS names, otherwise on one that is started here and ends with the pool. An
+    actor that dies is replaced. Where the cluster has no room for all actors, those that run do the
+    work of the others.
+
+    Raises:
+        ClimateGSError: Ray is missing, or the cluster cannot be reached. From wait: actors cannot
+            start, or no machine of the cluster has a GPU.
     """
 
     def __init__(self, setup: WorkerSetup, slots: int | None) -> None:
         self._ray = import_ray()
-        self._setup, self.tick = setup, _untold
+        self._setup = setup
+        self.tick = _ignore_outcome
         on_gpu = setup.backend == CUDA
         self._is_ours = connect(self._ray, None if on_gpu else slots)
         self._cpus, self._gpus = (_cpus_of_a_gpu(self._ray), 1) if on_gpu else (1, 0)
-        of_all = self._ray.cluster_resources().get("GPU" if on_gpu else "CPU", 1)
-        self.slots = slots or max(1, int(of_all))
+        num_units = self._ray.cluster_resources().get("GPU" if on_gpu else "CPU", 1)
+        self.slots = slots or max(1, int(num_units))
         self._workers: list[_ActorHandle | None] = [None] * self.slots
-        self._given: dict[int, Any] = {}  # by slot, for want of a worker that is ready
+        self._waiting_tasks: dict[int, Any] = {}  # by slot, waiting for a worker that is ready
         self._lost_starts = 0
-        self._quiet_since = time.monotonic()
+        self._idle_since_s = time.monotonic()
         self._warn_of_local_output()
 
     def give(self, slot: int, task: Any) -> None:
-        self._given[slot] = task
+        self._waiting_tasks[slot] = task
         if self._workers[slot] is None:
             self._workers[slot] = self._start()
         self._dispatch()
@@ -416,21 +470,24 @@ class RayPool:
         deadline = time.monotonic() + timeout_s
         while True:
             self._dispatch()
-            sources = {w.source: slot for slot, w in enumerate(self._workers) if w and w.source}
-            if not sources:
+            slot_of_source = {
+                w.source: slot for slot, w in enumerate(self._workers) if w and w.source
+            }
+            if not slot_of_source:
                 return []
-            left = deadline - time.monotonic()
-            for source in self._ray.wait(list(sources), timeout=max(0.0, left))[0]:
-                event = self._read(sources[source])
+            left_s = deadline - time.monotonic()
+            for source in self._ray.wait(list(slot_of_source), timeout=max(0.0, left_s))[0]:
+                event = self._read(slot_of_source[source])
                 if event is not None:
                     return [event]
-            if left <= 0:
-                self._complain()
+            if left_s <= 0:
+                self._warn_when_idle()
                 return []
 
     def close(self) -> None:
         workers = [worker for worker in self._workers if worker is not None]
-        self._workers, self._given = [None] * self.slots, {}
+        self._workers = [None] * self.slots
+        self._waiting_tasks = {}
         if not self._ray.is_initialized():
             return
         try:
@@ -442,12 +499,13 @@ class RayPool:
                 self._ray.shutdown()
 
     def _start(self) -> _ActorHandle:
+        """Start an actor."""
         options = {
             "num_cpus": self._cpus,
             "num_gpus": self._gpus,
-            "max_restarts": 0,  # the pool sees every death, and the block is tried alone
+            "max_restarts": 0,  # the pool notices every death, and tries the block alone
             "max_task_retries": 0,
-            "max_concurrency": 2,  # a stop comes in beside the work
+            "max_concurrency": 2,  # a stop arrives beside the work
             "scheduling_strategy": "SPREAD",
             "runtime_env": {"env_vars": self._environment()},
         }
@@ -455,29 +513,39 @@ class RayPool:
         return _ActorHandle(actor, actor.version.remote())
 
     def _environment(self) -> dict[str, str]:
-        limits: dict[str, str] = dict.fromkeys(_THREADS, str(self._cpus))
+        """Return the actors' environment variables."""
+        limits: dict[str, str] = dict.fromkeys(_THREAD_VARIABLES, str(self._cpus))
         return limits if self._gpus else {**limits, "CUDA_VISIBLE_DEVICES": ""}
 
     def _dispatch(self) -> None:
-        """Send tasks to workers that are ready; a slot whose own is not swaps with an idle one."""
-        for slot, task in list(self._given.items()):
+        """Send tasks to workers that are ready.
+
+        A slot whose worker is not ready swaps with an idle one.
+        """
+        for slot, task in list(self._waiting_tasks.items()):
             if not self._is_idle(slot):
-                others = (s for s in range(self.slots) if s not in self._given and self._is_idle(s))
-                other = next(others, None)
-                if other is None:
+                idle_slots = (
+                    s
+                    for s in range(self.slots)
+                    if s not in self._waiting_tasks and self._is_idle(s)
+                )
+                idle_slot = next(idle_slots, None)
+                if idle_slot is None:
                     continue
                 workers = self._workers
-                workers[slot], workers[other] = workers[other], workers[slot]
+                workers[slot], workers[idle_slot] = workers[idle_slot], workers[slot]
             worker = self._workers[slot]
             assert worker is not None
             worker.stream = worker.actor.do.remote(task)
-            del self._given[slot]
+            del self._waiting_tasks[slot]
 
     def _is_idle(self, slot: int) -> bool:
+        """Return True if the slot's worker is ready and has no task."""
         worker = self._workers[slot]
         return worker is not None and worker.starting is None and worker.stream is None
 
     def _read(self, slot: int) -> Event | None:
+        """Return the event of a worker's next message; None for an image or a start."""
         worker = self._workers[slot]
         assert worker is not None
         try:
@@ -506,6 +574,7 @@ class RayPool:
         return Finished(slot, message)
 
     def _welcome(self, worker: _ActorHandle, version: str) -> None:
+        """Note that an actor has started; refuse another version of this package."""
         if version != augment.__version__:
             raise ClimateGSError(
                 f"a machine of the Ray cluster has climategs {version}, this one "
@@ -515,38 +584,41 @@ class RayPool:
         self._lost_starts = 0
 
     def _failed_start(self, error: Exception) -> None:
-        """Raise, unless it may be that only a machine was lost."""
+        """Raise ClimateGSError, unless perhaps only a machine was lost."""
         self._lost_starts += 1
-        failed = getattr(error, "actor_init_failed", False)
-        failed = failed or isinstance(error, self._ray.exceptions.RuntimeEnvSetupError)
-        if failed or self._lost_starts >= _STARTS:
+        is_setup_failure = getattr(error, "actor_init_failed", False)
+        is_setup_failure = is_setup_failure or isinstance(
+            error, self._ray.exceptions.RuntimeEnvSetupError
+        )
+        if is_setup_failure or self._lost_starts >= _MAX_LOST_STARTS:
             raise ClimateGSError(
                 f"a Ray actor failed while starting: {last_line(error)}. Every machine of the "
                 f"cluster needs climategs, and whatever opens the scenes, installed in the same "
                 f"version; if memory ran out, use fewer workers"
             ) from error
 
-    def _finish(self, busy: list[_ActorHandle]) -> None:
+    def _finish(self, busy_workers: list[_ActorHandle]) -> None:
         """Let actors finish the images at hand."""
-        for worker in busy:
+        for worker in busy_workers:
             worker.actor.stop.remote()
         deadline = time.monotonic() + STOP_S
-        for worker in busy:
+        for worker in busy_workers:
             with contextlib.suppress(self._ray.exceptions.RayError, StopIteration):
-                while (left := deadline - time.monotonic()) > 0:
-                    if self._ray.wait([worker.stream], timeout=left)[0]:
+                while (left_s := deadline - time.monotonic()) > 0:
+                    if self._ray.wait([worker.stream], timeout=left_s)[0]:
                         self._ray.get(next(worker.stream))
 
-    def _complain(self) -> None:
-        """Say so when nobody has been at work for long."""
-        now = time.monotonic()
-        if not self._given or any(worker and worker.stream for worker in self._workers):
-            self._quiet_since = now
-        elif now - self._quiet_since > _PATIENCE_S:
-            self._quiet_since = now
+    def _warn_when_idle(self) -> None:
+        """Log a warning when no actor has worked for a long time."""
+        now_s = time.monotonic()
+        if not self._waiting_tasks or any(worker and worker.stream for worker in self._workers):
+            self._idle_since_s = now_s
+        elif now_s - self._idle_since_s > _LOG_AFTER_S:
+            self._idle_since_s = now_s
             _log.warning("no CPU of the Ray cluster is free for a worker; waiting for one")
 
     def _warn_of_local_output(self) -> None:
+        """Log a warning where several machines write to a local folder."""
         nodes = [node for node in self._ray.nodes() if node["Alive"]]
         if len(nodes) > 1 and "://" not in self._setup.output:
             _log.warning(
@@ -559,23 +631,25 @@ class RayPool:
 
 @dataclass
 class _ActorHandle:
-    """An actor as the pool sees it. starting: its first answer, until that has come. stream: of
-    the messages about the task that it is at.
-    """
+    """The pool's side of an actor."""
 
     actor: Any
+    """Handle of Ray."""
     starting: Any
+    """Future of its first answer, until the answer has come."""
     stream: Any = None
+    """Stream of the messages about its current task."""
 
     @property
     def source(self) -> Any:
-        """What to wait for, if anything."""
+        """Future or stream to wait for; None if there is none."""
         return self.stream if self.starting is None else self.starting
 
 
 class _Actor:
-    """The worker's own side, in a process somewhere on the cluster. Tasks are done in a thread of
-    its own, which can be interrupted: Ray's main thread cannot.
+    """The worker's side of an actor, in a process on the cluster.
+
+    Tasks are done in a separate thread, which can be interrupted; Ray's main thread cannot.
     """
 
     def __init__(self, setup: WorkerSetup, threads: int) -> None:
@@ -587,10 +661,14 @@ class _Actor:
         self._thread.start()
 
     def version(self) -> str:
+        """Return the version of this package on the actor's machine."""
         return augment.__version__
 
     def do(self, task: Any) -> Iterator[Any]:
-        """Images as they are finished, then the result; that is missing where it was stopped."""
+        """Yield outcomes of images as they are finished, then the result.
+
+        There is no result if the task was stopped.
+        """
         self._inbox.put(task)
         while (message := self._outbox.get()) is not None:
             yield message
@@ -598,7 +676,7 @@ class _Actor:
                 return
 
     def stop(self) -> None:
-        """As Ctrl-C: finish the images at hand, let go of the block, and do no more."""
+        """Finish the images at hand, release the block, and do no more, as with Ctrl-C."""
         thread = ctypes.c_ulong(self._thread.ident or 0)
         ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(KeyboardInterrupt))
 
@@ -613,7 +691,7 @@ class _Actor:
 
 
 def _cpus_of_a_gpu(ray: Any) -> int:
-    """How many CPUs come to a GPU on the machine that has the fewest."""
+    """Return the number of CPUs for each GPU on the machine that has the fewest."""
     machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     shares = [int(m.get("CPU", 0) / m["GPU"]) for m in machines if m.get("GPU", 0)]
     if not shares:
@@ -624,7 +702,7 @@ def _cpus_of_a_gpu(ray: Any) -> int:
 
 
 def _ending(error: Exception) -> str:
-    """How an actor ended, after "the worker ..."; Ray's account is long, and guesses."""
+    """Return how an actor ended, after "the worker ..."; Ray's own account is long, and guesses."""
     text = str(error)
     if "OutOfMemoryError" in type(error).__name__ or "low on memory" in text:
         return "was ended by Ray because memory ran out"

@@ -1,4 +1,8 @@
-"""What jobs run on: a backend, worker processes, the lock of the output, a shared scene."""
+"""Processes of jobs: choice of the backend, child processes, the output's lock, a shared scene.
+
+`pools` starts worker processes with it, and `render_job` shares an open scene with them. `augment`
+and `tools` ask it for cores and backends.
+"""
 
 from __future__ import annotations
 
@@ -42,39 +46,47 @@ from augment.jobs.layout import STATE_FOLDER
 from augment.render.buffers import AUTO, BACKENDS, CPU, CUDA, REFERENCE, import_cpu, import_cuda
 from augment.scene import Scene
 
-# ---- Which rasteriser backend a job renders with -------------------------------------------------
+# ---- Choice of the rasteriser's backend ----------------------------------------------------------
 
 
 def choose_backend(backend: str, scene: Scene, *, gpu: bool = True) -> str:
-    """The backend that will render the scene: `auto` resolved, any other name checked. `auto` takes
-    the GPU where there is one, unless `gpu` says that it must not. Resolved once for the whole job,
-    so that a resumed job cannot mix backends in one folder. Raises ValueError: no such backend.
-    BackendUnavailable: it cannot run on this machine.
+    """Return the backend that will render the scene: `auto` resolved, any other name checked.
+
+    It is resolved once for the whole job, so that a resumed job cannot mix backends in one folder.
+
+    Args:
+        backend: Name of a backend, or `auto`, which takes the GPU where there is one.
+        gpu: If False, `auto` never takes the GPU.
+
+    Raises:
+        ValueError: There is no such backend.
+        BackendUnavailable: It cannot run on this machine.
     """
     from augment.render.cuda.runtime import has_gpu
 
-    if backend == AUTO:  # asks for no more than it takes: nothing of triton without a GPU
+    if backend == AUTO:  # imports only what it uses: no triton without a GPU
         means = [scene.background.means, *(actor.gaussians.means for actor in scene.actors)]
-        plain = all(m.dtype == torch.float32 and not m.requires_grad for m in means)
-        if plain and gpu and has_gpu():
+        is_plain = all(m.dtype == torch.float32 and not m.requires_grad for m in means)
+        if is_plain and gpu and has_gpu():
             return CUDA
         try:
             import_cpu()
         except BackendUnavailable:
             return REFERENCE
-        return CPU if plain else REFERENCE
+        return CPU if is_plain else REFERENCE
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
     if backend == CPU:
         import_cpu()
-    if backend == CUDA:  # only who names the GPU wakes it
+    if backend == CUDA:  # only this name initialises the GPU
         import_cuda()
     return backend
 
 
 def gpu_is_lost(backend: str) -> bool:
-    """Whether the GPU no longer answers this process, as after a kernel that went astray: then
-    nothing succeeds that is asked of it later. Waits for the GPU.
+    """Return True if the GPU no longer answers this process, as after a faulty kernel.
+
+    Every later call to the GPU fails then. Waits for the GPU.
     """
     if backend != CUDA or not torch.cuda.is_initialized():
         return False
@@ -86,7 +98,10 @@ def gpu_is_lost(backend: str) -> bool:
 
 
 def renders_on_gpu(backend: str) -> bool:
-    """Whether a job that names this backend draws on a GPU: `auto` does where there is one."""
+    """Return True if a job that names this backend renders on a GPU.
+
+    `auto` does so where there is one.
+    """
     if backend == AUTO:
         from augment.render.cuda.runtime import has_gpu
 
@@ -95,59 +110,69 @@ def renders_on_gpu(backend: str) -> bool:
 
 
 Result = TypeVar("Result")
+# Longest turn of a thread at Python beside a thread that launches kernels, seconds.
 _TURN_S = 0.0005
 
 
 def process_mark(process: int) -> str:
-    """The number of a living process and when it began, else "": numbers return, in containers
-    with every run.
+    """Return the number of a living process and its start time; empty if it does not live.
+
+    Process numbers are used again, in containers in every run.
     """
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return ""
-    except PermissionError:  # it lives, and belongs to another user
+    except PermissionError:  # the process lives, and belongs to another user
         pass
     try:
-        facts = Path(f"/proc/{process}/stat").read_text(errors="replace")
+        stat_text = Path(f"/proc/{process}/stat").read_text(errors="replace")
     except OSError:  # no Linux
         return str(process)
-    return f"{process} {facts.rpartition(')')[2].split()[19]}"  # proc(5): starttime
+    return f"{process} {stat_text.rpartition(')')[2].split()[19]}"  # proc(5): starttime
 
 
 def available_cores() -> int:
-    """Cores this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-READY = "ready"  # the first message of a child that can work
+# First message of a child that can work.
+READY = "ready"
 
 
 class ChildProcess:
-    """A process that is started afresh (`spawn`), at the other end of a connection."""
+    """Process that is started afresh (`spawn`), at the other end of a connection."""
 
     is_ready = False
 
     def __init__(
         self, target: Callable[..., None], *arguments: Any, threads: int, daemon: bool
     ) -> None:
-        """target: called with the child's connection and the arguments. threads: it may use."""
+        """Start the process.
+
+        Args:
+            target: Called with the child's connection and the arguments.
+            threads: Number of threads that the child may use.
+        """
         context = multiprocessing.get_context("spawn")
-        self.connection, child = context.Pipe()
-        self._process = context.Process(target=target, args=(child, *arguments), daemon=daemon)
+        self.connection, child_connection = context.Pipe()
+        self._process = context.Process(
+            target=target, args=(child_connection, *arguments), daemon=daemon
+        )
         with thread_limits(threads), interrupts_blocked():
             self._process.start()
-        child.close()
+        child_connection.close()
 
     def send(self, message: Any) -> None:
-        """One that has just died shows itself when its connection is read."""
+        """Send a message; that a child has just died shows when its connection is read."""
         with contextlib.suppress(OSError):
             self.connection.send(message)
 
     def reap(self) -> str:
-        """Wait for its end and say how it ended: "was killed by SIGKILL", say."""
+        """Wait for the process to end, and return how it ended: "was killed by SIGKILL", say."""
         self._process.join()
         self.connection.close()
         code = self._process.exitcode
@@ -162,18 +187,22 @@ class ChildProcess:
 
 @dataclass(frozen=True)
 class Ended:
-    """In place of a child's message: how it ended, after "the worker ..."."""
+    """Stands in place of a child's message: the child has ended."""
 
     how: str
+    """Ending of the child, after "the worker ..."."""
 
 
 _Child = TypeVar("_Child", bound=ChildProcess)
 
 
 def receive(children: Collection[_Child], timeout_s: float | None) -> Iterator[tuple[_Child, Any]]:
-    """The next message of each child that has sent one, or Ended; READY is noted and left out."""
-    ready = wait([child.connection for child in children], timeout_s)
-    for child in [child for child in children if child.connection in ready]:
+    """Yield the next message of each child that has sent one, or Ended.
+
+    READY is noted and left out.
+    """
+    ready_connections = wait([child.connection for child in children], timeout_s)
+    for child in [child for child in children if child.connection in ready_connections]:
         try:
             message = child.connection.recv()
         except (EOFError, OSError):
@@ -185,8 +214,13 @@ def receive(children: Collection[_Child], timeout_s: float | None) -> Iterator[t
 
 
 def inbox_of(connection: Connection, on_stop: Callable[[], object]) -> SimpleQueue:
-    """In a child: what the parent sends, received in a thread beside the work, so that a stop
-    (None) or the parent's end is noticed at once; the parent's end is the child's.
+    """Return the queue of the parent's messages, in a child.
+
+    A thread beside the work receives them, so that a stop (None) or the parent's end is noticed at
+    once. When the parent ends, the child ends too.
+
+    Args:
+        on_stop: Called at a stop.
     """
     inbox = SimpleQueue()
 
@@ -205,7 +239,7 @@ def inbox_of(connection: Connection, on_stop: Callable[[], object]) -> SimpleQue
 
 
 def failed_start(ending: str) -> ClimateGSError:
-    """The error of a worker that ended before it was ready."""
+    """Return the error of a worker that ended before it was ready."""
     return ClimateGSError(
         f"a worker process {ending} while starting; what it printed says more. A script that "
         f"starts workers needs `if __name__ == '__main__':` around its jobs; if memory ran out, "
@@ -214,7 +248,7 @@ def failed_start(ending: str) -> ClimateGSError:
 
 
 def limit_threads(threads: int) -> None:
-    """In a worker: what it may use, OpenCV none beside this one."""
+    """Limit the threads of a worker's libraries; OpenCV gets only the calling thread."""
     import cv2
 
     torch.set_num_threads(threads)
@@ -223,16 +257,19 @@ def limit_threads(threads: int) -> None:
 
 @contextlib.contextmanager
 def thread_limits(threads: int) -> Iterator[None]:
-    """Environment that makes a child's libraries share the cores; they read it when loaded."""
+    """Context manager of an environment that makes a child's libraries share the cores.
+
+    The libraries read it when they are loaded.
+    """
     names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    for name, value in before.items():
+    old_values = {name: os.environ.get(name) for name in names}
+    for name, value in old_values.items():
         limit = min(threads, int(value)) if value and value.isdigit() else threads
         os.environ[name] = str(max(1, limit))
     try:
         yield
     finally:
-        for name, value in before.items():
+        for name, value in old_values.items():
             if value is None:
                 os.environ.pop(name, None)
             else:
@@ -240,32 +277,37 @@ def thread_limits(threads: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def quick_turns(requested: bool) -> Iterator[None]:
-    """If wanted, a thread waits half a millisecond for its turn at Python and not five: one that
-    launches kernels gives its turn away with each, and the GPU would wait for whoever encodes.
+def quick_turns(is_enabled: bool) -> Iterator[None]:
+    """Context manager that shortens a thread's wait for Python from five milliseconds to 0.5.
+
+    A thread that launches kernels gives its turn away with each kernel, and the GPU would wait for
+    the thread that encodes.
+
+    Args:
+        is_enabled: If False, nothing changes.
     """
-    before = sys.getswitchinterval()
-    if requested:
-        sys.setswitchinterval(min(before, _TURN_S))
+    old_interval_s = sys.getswitchinterval()
+    if is_enabled:
+        sys.setswitchinterval(min(old_interval_s, _TURN_S))
     try:
         yield
     finally:
-        sys.setswitchinterval(before)
+        sys.setswitchinterval(old_interval_s)
 
 
 @contextlib.contextmanager
 def interrupts_blocked() -> Iterator[None]:
-    """A child started inside never sees Ctrl-C: the parent tells it to stop instead."""
+    """Context manager in which started children never see Ctrl-C; the parent stops them instead."""
     resource_tracker.ensure_running()  # starting it later, with the child, would lift the block
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, old_mask)
 
 
 def uninterrupted(call: Callable[[], Result]) -> Result:
-    """Run where no signal's exception can come between two steps: not in the main thread."""
+    """Run a call where no signal's exception can come between two steps: not in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return call()
     with ThreadPoolExecutor(1) as pool:
@@ -273,17 +315,22 @@ def uninterrupted(call: Callable[[], Result]) -> Result:
 
 
 def awaited(future: Future[Result]) -> Result:
-    """The future's result. An interrupt in `future.result()` can end as a RuntimeError of its lock,
-    if it comes when that has just been let go; a SimpleQueue has no such moment.
+    """Return the future's result.
+
+    An interrupt in `future.result()` can end as a RuntimeError of its lock, if it comes when the
+    lock has just been released; a SimpleQueue has no such moment.
     """
-    done = SimpleQueue()
-    future.add_done_callback(done.put)
-    done.get()
+    queue = SimpleQueue()
+    future.add_done_callback(queue.put)
+    queue.get()
     return future.result()
 
 
 def sender(connection: Connection) -> Callable[[Any], None]:
-    """In a worker: a send that several threads may call; ends the process if nobody listens."""
+    """Return a send function that several threads of a worker may call.
+
+    It ends the process if the parent has gone.
+    """
     lock = threading.Lock()
 
     def send(message: Any) -> None:
@@ -298,17 +345,24 @@ def sender(connection: Connection) -> Callable[[Any], None]:
 
 # ---- One job at a time in an output folder -------------------------------------------------------
 # The lock is the kernel's (flock on `.climategs/lock`), so it ends with the processes that hold it,
-# however they end. Workers inherit it: after a job is killed, the folder stays locked until the
-# last of them has gone. flock does not reach across machines on every network file system.
+# however they end. Workers inherit it: after a job is killed, the folder stays locked until its
+# last worker has ended. flock does not reach across machines on every network file system.
 
-ORPHANS_S = 30.0  # how long to wait for the workers of a killed job to notice
-MAX_SHARING_S = 3600.0  # how long to wait for what another process is making for all of them
+# Longest wait for the workers of a killed job to end, seconds.
+ORPHANS_S = 30.0
+# Longest wait for a file that another process makes for all of them, seconds.
+MAX_SHARING_S = 3600.0
 
 
 @contextlib.contextmanager
 def file_lock(path: Path, doing: str) -> Iterator[None]:
-    """Be the only process of this machine inside; waits for the one that is, however it ends.
-    doing: what is done inside, after "another process". Raises OutputError: it takes too long.
+    """Context manager that only one process of this machine enters at a time.
+
+    Args:
+        doing: What is done inside, after "another process".
+
+    Raises:
+        OutputError: The wait takes too long.
     """
     descriptor = open_lock(path)
     try:
@@ -319,7 +373,7 @@ def file_lock(path: Path, doing: str) -> Iterator[None]:
 
 
 class OutputLock:
-    """Holds an output folder for this process while entered."""
+    """Lock of an output folder, which this process holds while it is entered."""
 
     def __init__(self, out_dir: Path) -> None:
         self._path = out_dir / STATE_FOLDER / "lock"
@@ -337,13 +391,17 @@ class OutputLock:
 
     def __exit__(self, *_: object) -> None:
         os.ftruncate(self._descriptor, 0)
-        os.close(self._descriptor)  # not unlocked: a child that still lives keeps its share
+        os.close(self._descriptor)  # without unlocking: a child that still lives keeps its share
 
     def inherited(self) -> InheritedLock:
-        """A share of the lock for a child process started with `multiprocessing`."""
+        """Return a share of the lock for a child process started with `multiprocessing`."""
         return InheritedLock(self._descriptor)
 
     def _acquire(self) -> None:
+        """Lock the file, and write this process's mark into it.
+
+        Waits for workers of a killed job.
+        """
         deadline = time.monotonic() + ORPHANS_S
         while True:
             try:
@@ -365,7 +423,7 @@ class OutputLock:
 
 
 class InheritedLock:
-    """Keeps the lock's file open in a child process for as long as the child lives."""
+    """Share of the lock that keeps its file open for as long as the child process lives."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -375,32 +433,41 @@ class InheritedLock:
 
 
 def _inherit(duplicate: Any) -> InheritedLock:
+    """Return the lock from a duplicated descriptor."""
     return InheritedLock(duplicate.detach())
 
 
 def _is_held_by(holder: str) -> bool:
-    """Whether the process that took the lock lives; False while its number is being written."""
+    """Return True if the process that took the lock lives.
+
+    Returns False while its number is being written.
+    """
     number = holder.partition(" ")[0]
     return number.isdigit() and process_mark(int(number)) == holder
 
 
 # ---- An open scene in worker processes, neither opened again nor held in memory twice ------------
-# All its tensors are laid into one temporary file, which workers map into their memory. The rest of
-# the scene is small, and travels through the pipe that starts the process.
+# All its tensors are written into one temporary file, which workers map into their memory. The
+# other parts of the scene are small, and go through the pipe that starts the process.
 
-ALIGNMENT = 64  # bytes: a cache line, and any vector register
+# Alignment of tensors in the file, bytes: a cache line, and any vector register.
+ALIGNMENT = 64
 
 
 @dataclass(frozen=True)
 class SharedScene:
-    """A scene and frames to render of it, whose tensors lie in a file. Valid until `remove`."""
+    """A scene and frames to render of it, with their tensors in a file; valid until `remove`."""
 
     path: str
+    """Path of the file."""
     skeleton: bytes
+    """Pickle of the scene without its tensors."""
 
     def open(self) -> tuple[Scene, Sequence[Frame]]:
-        """Their tensors are mapped from the file; writes to them stay in this process. The skeleton
-        is a pickle that comes from the parent through the pipe, never from a file.
+        """Return the scene and frames, with tensors mapped from the file.
+
+        Writes to the tensors stay in this process. The skeleton is a pickle that comes from the
+        parent through the pipe, never from a file.
         """
         load = ForkingPickler.loads  # pyright: ignore[reportAttributeAccessIssue]
         return load(self.skeleton)
@@ -411,9 +478,14 @@ class SharedScene:
 
 
 def share_scene(scene: Scene, frames: Sequence[Frame], folder: Path) -> SharedScene:
-    """Lay the tensors into a temporary file of `folder`, which a later job clears away once
-    it holds the folder. Raises OutputError: the file cannot be written. ValueError: a part of the
-    scene, such as its label source, cannot be sent to another process.
+    """Write the tensors into a temporary file of `folder`.
+
+    A later job that holds the folder deletes leftovers.
+
+    Raises:
+        OutputError: The file cannot be written.
+        ValueError: A part of the scene, such as its label source, cannot be sent to another
+            process.
     """
     path = temporary_beside(folder / "scene")
     try:
@@ -439,7 +511,7 @@ def share_scene(scene: Scene, frames: Sequence[Frame], folder: Path) -> SharedSc
 
 
 def check_sendable(renderer: object) -> None:
-    """Raise ValueError where other processes cannot be sent a job's renderer."""
+    """Raise ValueError where a job's renderer cannot be sent to other processes."""
     try:
         ForkingPickler.dumps(renderer)
     except (AttributeError, TypeError, pickle.PicklingError) as error:
@@ -450,11 +522,12 @@ def check_sendable(renderer: object) -> None:
 
 
 class _ScenePickler(pickle.Pickler):
-    """Writes tensors to a file and keeps only where they lie."""
+    """Pickler that writes tensors to a file and keeps only their places."""
 
     def __init__(self, skeleton: io.BytesIO, file: BinaryIO, path: str) -> None:
         super().__init__(skeleton, protocol=pickle.HIGHEST_PROTOCOL)
-        self._file, self._path = file, path
+        self._file = file
+        self._path = path
 
     def reducer_override(self, obj: Any) -> Any:
         if not isinstance(obj, torch.Tensor):
@@ -467,9 +540,11 @@ class _ScenePickler(pickle.Pickler):
 
 
 def _map_tensor(path: str, offset: int, dtype: str, shape: tuple[int, ...]) -> torch.Tensor:
+    """Return a tensor mapped from the file."""
     return torch.from_numpy(np.ndarray(shape, dtype, buffer=_mapping(path), offset=offset))
 
 
 @functools.lru_cache(maxsize=1)
 def _mapping(path: str) -> np.memmap:
+    """Return the file mapped into memory."""
     return np.memmap(path, np.uint8, mode="c")  # copy on write

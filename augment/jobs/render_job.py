@@ -1,7 +1,10 @@
-"""A batch job: one scene, any number of recipes, images and labels into one output folder.
+"""Batch job: renders one scene under any number of recipes into one output folder.
 
-A job can be killed at any moment and run again: it goes on with what is missing. The files it
-leaves do not depend on how often that happened, nor on the number of workers.
+In: a `RenderJob` and a function that opens scenes. Out: images, labels, calibration and the
+manifest, and a `JobResult`. Called by `climategs render` and by the workers of `generate`.
+
+A job can be killed at any moment and run again: it goes on with the missing images. Its files do
+not depend on how often that happened, nor on the number of workers.
 """
 
 from __future__ import annotations
@@ -56,58 +59,71 @@ from recipes.files import read_files, with_digest
 from recipes.load import dump_recipe
 from recipes.schema import SECTIONS, Recipe
 
-# ---- The files that a recipe names, beside the images: those of a style in `<variant>/style/` ----
-# With them a variant's `recipe.yaml` renders it again wherever the folder is taken.
+# ---- Copies of the files that a recipe names: those of a style in `<variant>/style/` -------------
+# With these copies a variant's `recipe.yaml` renders it again wherever the folder is moved.
 
+# Name of the recipe in a variant's folder.
 RECIPE_FILE = "recipe.yaml"
+# Suffixes of file names that are safe on every system.
 _SUFFIX = re.compile(r"\.[A-Za-z0-9]{1,16}")
 
 
 def file_folders() -> tuple[str, ...]:
-    """Folders inside a variant's that hold files which recipes name."""
+    """Return the folders inside a variant's folder that hold files which recipes name."""
     return tuple(path.split(".")[-1] for path, model in SECTIONS.items() if model.file_fields)
 
 
 def stored_names(recipe: Recipe) -> dict[str, str]:
-    """The name of each of the recipe's files inside the variant's folder, by dotted path of its
-    field. It is the file's own where that is safe; another file of the same name gets its field's
-    name before its own.
+    """Return the name of each of the recipe's files in the variant's folder, by dotted field path.
+
+    A file keeps its own name where that is safe. A second file of the same name gets its field's
+    name in front.
     """
-    found: dict[str, str] = {}
+    name_of_field: dict[str, str] = {}
     for section_path, section in recipe.sections().items():
         names: dict[str, str] = {}
         for key, path in section.files.items():
             name = _safe_name(path)
-            while name.casefold() in {taken.casefold() for taken in names.values()}:
+            while name.casefold() in {other_name.casefold() for other_name in names.values()}:
                 name = f"{key}-{name}"
             names[key] = name
         folder = section_path.split(".")[-1]
-        found |= {f"{section_path}.{key}": f"{folder}/{name}" for key, name in names.items()}
-    return found
+        name_of_field |= {
+            f"{section_path}.{key}": f"{folder}/{name}" for key, name in names.items()
+        }
+    return name_of_field
 
 
 def portable_recipe(recipe: Recipe) -> Recipe:
-    """The recipe with its files named from the variant's folder; its hash is the same."""
+    """Return the recipe with its files named relative to the variant's folder.
+
+    Its hash is the same.
+    """
     for path, name in stored_names(recipe).items():
         recipe = replaced(recipe, path, name)
     return recipe
 
 
-def check_kept(recipe: Recipe, folders: Collection[Path]) -> None:
-    """Refuse to overwrite (`folders`) files that the recipe is about to need."""
+def check_not_overwritten(recipe: Recipe, folders: Collection[Path]) -> None:
+    """Refuse to overwrite `folders` where the recipe needs files in them."""
     for path in stored_names(recipe):
-        real = Path(found(recipe, path)).resolve()
+        real_path = Path(found(recipe, path)).resolve()
         for folder in folders:
-            if real.is_relative_to(folder.resolve()):
+            if real_path.is_relative_to(folder.resolve()):
                 raise OutputError(
-                    f"{path} of recipe {recipe.name} is {real}, in the folder {folder}, "
+                    f"{path} of recipe {recipe.name} is {real_path}, in the folder {folder}, "
                     f"which is to be overwritten: copy the recipe and its files out of it first"
                 )
 
 
 def copy_files(recipe: Recipe, folder: Path) -> None:
-    """Put the recipe's files where `portable_recipe` names them. folder: the variant's. Raises
-    RecipeError: they are unreadable or not those of the recipe's digest.
+    """Put the recipe's files where `portable_recipe` names them.
+
+    Args:
+        folder: Folder of the variant.
+
+    Raises:
+        RecipeError: A file is unreadable, or is not the one of the recipe's digest.
     """
     names = stored_names(recipe)
     for section_path, section in recipe.sections().items():
@@ -118,62 +134,85 @@ def copy_files(recipe: Recipe, folder: Path) -> None:
 
 
 def write_recipe(recipe: Recipe, folder: Path) -> None:
-    """Write `recipe.yaml`, and the files that it names. folder: the variant's. Raises RecipeError:
-    as copy_files. OutputError: the system refused, or a link leads out of the output.
+    """Write `recipe.yaml` and the files that it names.
+
+    Args:
+        folder: Folder of the variant.
+
+    Raises:
+        RecipeError: As of copy_files.
+        OutputError: The system refuses, or a link leads out of the output.
     """
-    place = folder.parent.name, folder.name
+    variant_parts = folder.parent.name, folder.name
     for name in stored_names(recipe).values():
-        path_below(folder.parents[1], (*place, *PurePath(name).parts[:-1]))
+        path_below(folder.parents[1], (*variant_parts, *PurePath(name).parts[:-1]))
     copy_files(recipe, folder)
     write_atomic(folder / RECIPE_FILE, dump_recipe(portable_recipe(recipe)).encode())
 
 
 def lacks_recipe(recipe: Recipe, folder: Path) -> bool:
-    """Whether `recipe.yaml` or a file that it names is missing. folder: the variant's."""
+    """Return True if `recipe.yaml` or a file that it names is missing.
+
+    Args:
+        folder: Folder of the variant.
+    """
     names = (RECIPE_FILE, *stored_names(recipe).values())
     return not all((folder / name).is_file() for name in names)
 
 
 def _safe_name(path: str) -> str:
-    """The file's name as `folder_name` has it, with its suffix still at the end."""
-    name = PurePath(path)
-    if _SUFFIX.fullmatch(name.suffix):
-        return folder_name(name.stem) + name.suffix
-    return folder_name(name.name)
+    """Return the file's name as `folder_name` makes it, with its suffix still at the end."""
+    file_path = PurePath(path)
+    if _SUFFIX.fullmatch(file_path.suffix):
+        return folder_name(file_path.stem) + file_path.suffix
+    return folder_name(file_path.name)
 
 
 # ---- The job -------------------------------------------------------------------------------------
 
 _log = logging.getLogger(__name__)
 SceneLoader = Callable[[str], Scene]
-TASK_IMAGES = 32  # at most that a worker process gets at a time: between, its threads have no work
+# Most images that a worker process gets at a time; between two tasks its threads have no work.
+MAX_TASK_IMAGES = 32
 
 
 @dataclass(frozen=True, eq=False)
 class RenderJob:
-    """What to render, and where to. recipes: resolved, one a variant; their `name` and `variant`
-    number make the folder. Missing digests of style files are filled in; settings that a quality
-    leaves open are chosen once and kept in the output. frames: the dataset's frame numbers, or None
-    for all. cameras: names, or None for all. camera_path: frames to render in place of the scene's
-    own, poses in the scene's world; labels and LiDAR pass through where a frame of the scene has
-    the same number and timestamp. workers: 1 renders in this process. overwrite: replace the
-    variants' folders, finished or not, and choose their settings anew. shared_dir: keeps
-    what lies in files of what images share (where snow can lie) for later jobs; the output folder's
-    state if None. source_digest: of the scene's content (adapters.scene_cache.scene_digest); images
-    of other content in the output are then refused.
-    """
+    """The images to render, and the folder for them."""
 
     scene_uri: str
+    """URI of the scene, as the scene loader takes it."""
     recipes: Sequence[Recipe]
+    """Resolved recipes, one for each variant; their `name` and `variant` number make the folder's
+    name. Missing digests of style files are filled in. Settings that a quality leaves open are
+    chosen once and kept in the output.
+    """
     out_dir: Path | str
+    """Output folder."""
     frames: Sequence[int] | None = None
+    """Frame numbers of the dataset; None for all."""
     cameras: Sequence[str] | None = None
+    """Camera names; None for all."""
     camera_path: Sequence[Frame] | None = None
+    """Frames to render in place of the scene's own, with poses in the scene's world. Labels and
+    LiDAR pass through where a frame of the scene has the same number and timestamp.
+    """
     workers: int = 1
+    """Number of worker processes; 1 renders in this process."""
     backend: str = "auto"
+    """Name of the rasteriser's backend."""
     overwrite: bool = False
+    """If True, the variants' folders are replaced, finished or not, and their settings are chosen
+    again.
+    """
     shared_dir: Path | None = None
+    """Folder that keeps the files that images share (where snow can lie) for later jobs; the state
+    folder of the output if None.
+    """
     source_digest: str | None = None
+    """Digest of the scene's content (adapters.scene_cache.scene_digest). Images of other content in
+    the output are then refused.
+    """
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -190,19 +229,24 @@ class RenderJob:
 
 @dataclass(frozen=True)
 class JobResult:
-    """Counts of images of this job. skipped: finished by earlier runs. failures: a line each.
-    seconds: wall clock. timings: seconds by kind of work, summed over threads and workers, or of
-    the job itself (open, settle, prepare, labels, share, finish); `worker.shares_of` says what
-    bound it.
-    """
+    """Counts of this job's images, and where the time went."""
 
     written: int
+    """Images rendered by this call."""
     skipped: int
+    """Images finished by earlier runs."""
     failed: int
+    """Images that could not be rendered."""
     manifest: Path
+    """Path of the manifest."""
     seconds: float
+    """Wall-clock time, seconds."""
     failures: tuple[str, ...] = ()
+    """One line for each failure."""
     timings: dict[str, float] = field(default_factory=dict)
+    """Seconds by kind of work, summed over threads and workers, or of the job itself (open, settle,
+    prepare, labels, share, finish). `worker.shares_of` says what bound the job.
+    """
 
 
 def run_job(
@@ -213,38 +257,49 @@ def run_job(
     progress: bool = True,
     on_outcome: Callable[[Outcome], None] | None = None,
 ) -> JobResult:
-    """Render what is missing, then write labels, calibration and manifest. scene_loader: called
-    once with `job.scene_uri`. renderer: `augment.views.render_view` if None; with several workers
-    an importable function, and the scene's labels and sky of importable classes. progress: a bar on
-    stderr. on_outcome: called after each image, from several threads, one at a time. An image that
-    fails is recorded in the manifest and the rest goes on. A KeyboardInterrupt finishes the images
-    at hand, writes the manifest of what there is, and is raised again. Raises SceneError: the scene
-    cannot be opened, lacks a requested frame, camera or photo, or cannot have a recipe's snow;
-    StyleError, RecipeError: a style or one of its files cannot be used; no file of a variant has
-    been written or replaced then. OutputError: the folder cannot be written, is in use, or holds
-    something else.
+    """Render the missing images, then write labels, calibration and manifest.
+
+    An image that fails is recorded in the manifest, and the job goes on with the other images. A
+    KeyboardInterrupt finishes the images at hand, writes the manifest of the finished images, and
+    is raised again.
+
+    Args:
+        scene_loader: Called once with `job.scene_uri`.
+        renderer: `augment.views.render_view` if None. With several workers it must be an importable
+            function, and the scene's labels and sky must be of importable classes.
+        progress: If True, show a bar on stderr.
+        on_outcome: Called after each image, from several threads, one call at a time.
+
+    Raises:
+        SceneError: The scene cannot be opened, lacks a requested frame, camera or photo, or cannot
+            have a recipe's snow.
+        StyleError, RecipeError: A style or one of its files cannot be used; no file of a variant
+            has been written or replaced then.
+        OutputError: The folder cannot be written, is in use, or holds something else.
     """
-    started = time.perf_counter()
-    run = _Run(job, scene_loader(job.scene_uri), renderer, on_outcome, progress)
-    opening = time.perf_counter() - started
-    run.times.add("open", opening - run.times.so_far().get("settle", 0.0))
-    run.go()
-    seconds = time.perf_counter() - started
-    run.times.add(WORKERS, job.workers * seconds)
+    start_s = time.perf_counter()
+    job_run = _Run(job, scene_loader(job.scene_uri), renderer, on_outcome, progress)
+    opening_s = time.perf_counter() - start_s
+    job_run.times.add("open", opening_s - job_run.times.so_far().get("settle", 0.0))
+    job_run.execute()
+    seconds = time.perf_counter() - start_s
+    job_run.times.add(WORKERS, job.workers * seconds)
     return JobResult(
-        written=run.counts[OK],
-        skipped=run.skipped,
-        failed=run.counts[FAILED],
-        manifest=run.out_dir / MANIFEST,
+        written=job_run.counts[OK],
+        skipped=job_run.skipped,
+        failed=job_run.counts[FAILED],
+        manifest=job_run.out_dir / MANIFEST,
         seconds=seconds,
-        failures=tuple(sorted(run.failures)),
-        timings=run.times.so_far(),
+        failures=tuple(sorted(job_run.failures)),
+        timings=job_run.times.so_far(),
     )
 
 
 class _ImageWork(Work):
-    """The images of a job as tasks: all of them for one worker, else a few frames at a time. Where
-    a worker dies, what it had in hand is tried once more, each image alone.
+    """Tasks that render the images of a job.
+
+    One worker gets all images as one task; several workers get a few frames at a time. Where a
+    worker dies, the images it had in hand are tried once more, each image alone.
     """
 
     def __init__(
@@ -254,10 +309,15 @@ class _ImageWork(Work):
         deliver: Callable[[Outcome], None],
         times: WorkTimes,
     ) -> None:
-        images = sum(len(chunk.cameras) for chunk in chunks)
-        most = images if workers == 1 else max(1, min(TASK_IMAGES, images // (4 * workers)))
-        self._tasks: deque[tuple[Chunk, ...]] = deque(_tasks(chunks, most))
-        self._deliver, self._times = deliver, times
+        num_images = sum(len(chunk.cameras) for chunk in chunks)
+        max_images = (
+            num_images
+            if workers == 1
+            else max(1, min(MAX_TASK_IMAGES, num_images // (4 * workers)))
+        )
+        self._tasks: deque[tuple[Chunk, ...]] = deque(_tasks(chunks, max_images))
+        self._deliver = deliver
+        self._times = times
         self._done: set[tuple[int, int, str]] = set()
 
     def tick(self, slot: int, outcome: Outcome) -> None:
@@ -267,10 +327,10 @@ class _ImageWork(Work):
     def take(self, slot: int) -> tuple[Chunk, ...] | None:
         return self._tasks.popleft() if self._tasks else None
 
-    def retry(self, slot: int, task: tuple[Chunk, ...], why: str) -> list[tuple[Chunk, ...]]:
-        left = self._left(task)
-        _log.warning("%d images are tried once more, alone: %s", len(left), why)
-        return [(image,) for image in left]
+    def retry(self, slot: int, task: tuple[Chunk, ...], reason: str) -> list[tuple[Chunk, ...]]:
+        chunks = self._undelivered(task)
+        _log.warning("%d images are tried once more, alone: %s", len(chunks), reason)
+        return [(image,) for image in chunks]
 
     def done(self, slot: int, task: tuple[Chunk, ...], result: Any) -> None:
         if isinstance(result, TaskFailed):
@@ -282,22 +342,22 @@ class _ImageWork(Work):
             f"the worker process {how} while rendering this image, and again when it was tried "
             f"alone; if memory ran out, use fewer workers"
         )
-        for image in self._left(task):
+        for image in self._undelivered(task):
             name = image.cameras[0]
             self._deliver(Outcome(image.variant, image.frame, name, FAILED, message))
 
-    def _left(self, task: tuple[Chunk, ...]) -> list[Chunk]:
-        """A chunk for each image that has not been delivered."""
+    def _undelivered(self, task: tuple[Chunk, ...]) -> list[Chunk]:
+        """Return a chunk for each image that has not been delivered."""
         images = [replace(chunk, cameras=(name,)) for chunk in task for name in chunk.cameras]
         return [i for i in images if (i.variant, i.frame, i.cameras[0]) not in self._done]
 
 
-def _tasks(chunks: Sequence[Chunk], most: int) -> Iterator[tuple[Chunk, ...]]:
-    """Runs of chunks, each of about so many images."""
+def _tasks(chunks: Sequence[Chunk], max_images: int) -> Iterator[tuple[Chunk, ...]]:
+    """Yield runs of chunks, each of about `max_images` images."""
     run: list[Chunk] = []
     for chunk in chunks:
         run.append(chunk)
-        if sum(len(own.cameras) for own in run) >= most:
+        if sum(len(run_chunk.cameras) for run_chunk in run) >= max_images:
             yield tuple(run)
             run = []
     if run:
@@ -305,7 +365,7 @@ def _tasks(chunks: Sequence[Chunk], most: int) -> Iterator[tuple[Chunk, ...]]:
 
 
 class _Run:
-    """One call of run_job."""
+    """State of one call of run_job."""
 
     def __init__(
         self,
@@ -315,10 +375,13 @@ class _Run:
         on_outcome: Callable[[Outcome], None] | None,
         progress: bool,
     ) -> None:
-        self.job, self.renderer, self.on_outcome = job, renderer, on_outcome
-        self.progress, self.times = progress, WorkTimes()
+        self.job = job
+        self.renderer = renderer
+        self.on_outcome = on_outcome
+        self.progress = progress
+        self.times = WorkTimes()
         self.scene: Scene | None = scene  # None once workers have it
-        # A stand-in has its own idea of backends.
+        # A stand-in renderer decides on backends itself.
         self.backend = job.backend if renderer else choose_backend(job.backend, scene)
         self.index = SceneIndex.of(scene, job.camera_path)
         self.selection = select_frames(self.index, job.frames, job.cameras)
@@ -326,7 +389,7 @@ class _Run:
         check_photos(job.recipes, scene.name, self.selection, is_path=is_path)
         self.out_dir = Path(job.out_dir).absolute()
         self.trajectory = trajectory_id(job.camera_path)
-        self.recipes = tuple(self._resolved(with_digest(r)) for r in job.recipes)
+        self.recipes = tuple(self._resolve_quality(with_digest(r)) for r in job.recipes)
         identities = [self._identity(recipe) for recipe in self.recipes]
         self.job_state = JobState(self.out_dir, self.index, self.recipes, identities)
         self.boxes = BoxCache(self.index)
@@ -334,13 +397,14 @@ class _Run:
         self.failures: list[str] = []
         self.counting = threading.Lock()  # outcomes arrive from several threads
 
-    def go(self) -> None:
+    def execute(self) -> None:
+        """Render what is missing under the output folder's lock, and write the tables."""
         self.total = len(self.recipes) * sum(len(names) for _, names in self.selection)
         with OutputLock(self.out_dir) as lock:
-            if self.job.overwrite:  # this may fail, so it comes before anything is given up
+            if self.job.overwrite:  # may fail, so it comes before anything is deleted
                 folders = [variant.place for variant in self.job_state.variants]
                 for recipe in self.recipes:
-                    check_kept(recipe, folders)
+                    check_not_overwritten(recipe, folders)
                 self._prepare(self.recipes)
             self.job_state.open(overwrite=self.job.overwrite)
             self._restore_recipes()
@@ -348,8 +412,8 @@ class _Run:
             self.skipped = self.total - sum(len(chunk.cameras) for chunk in chunks)
             try:
                 if not self.job.overwrite:
-                    pending = sorted({chunk.variant for chunk in chunks})
-                    self._prepare([self.recipes[number] for number in pending])
+                    pending_variants = sorted({chunk.variant for chunk in chunks})
+                    self._prepare([self.recipes[number] for number in pending_variants])
                 self.bar = ProgressBar(
                     total=self.total, initial=self.skipped, unit="image", disable=not self.progress
                 )
@@ -367,15 +431,16 @@ class _Run:
                 self.job_state.close()
 
     def _restore_recipes(self) -> None:
-        """Write the recipes of begun variants, and files that they name, where they are missing."""
+        """Write the missing recipes of begun variants, and the missing files that they name."""
         for variant in self.job_state.variants:
             if variant.rows and lacks_recipe(variant.recipe, variant.place):
                 write_recipe(variant.recipe, variant.place)
 
     def _render(self, chunks: list[Chunk], lock: OutputLock) -> None:
+        """Render the chunks in this process, or in worker processes."""
         if chunks:
             self._begin(chunks)
-            chunks = self._leave_unlabelled(chunks)
+            chunks = self._fail_unlabelled(chunks)
         assert self.scene is not None
         setup = Setup(
             out_dir=str(self.out_dir),
@@ -388,32 +453,34 @@ class _Run:
         )
         if not chunks:
             return
-        shared = None
+        shared_scene = None
         if self.job.workers > 1:
             check_sendable(self.renderer)
             with self.times.spent("share"):
-                shared = share_scene(self.scene, self.index.frames, self.out_dir / STATE_FOLDER)
-            self.scene = None  # this process needs no more of it than the index
+                shared_scene = share_scene(
+                    self.scene, self.index.frames, self.out_dir / STATE_FOLDER
+                )
+            self.scene = None  # this process needs only the index from now on
         work = _ImageWork(chunks, self.job.workers, self._deliver, self.times)
         try:
-            with contextlib.closing(self._pool(setup, shared, lock)) as pool:
+            with contextlib.closing(self._pool(setup, shared_scene, lock)) as pool:
                 run_tasks(pool, work)
         finally:
-            if shared is not None:
-                shared.remove()
+            if shared_scene is not None:
+                shared_scene.remove()
 
-    def _pool(self, setup: Setup, shared: SharedScene | None, lock: OutputLock) -> WorkerPool:
-        """This process, or several that open the shared scene."""
+    def _pool(self, setup: Setup, shared_scene: SharedScene | None, lock: OutputLock) -> WorkerPool:
+        """Return a pool of this process, or of several processes that open the shared scene."""
         workers = self.job.workers
-        if shared is None:
+        if shared_scene is None:
             assert self.scene is not None
-            opened = (self.scene, self.index.frames)
-            return SerialPool(SceneSetup(setup, lambda: opened, self.renderer))
-        own = SceneSetup(setup, shared.open, self.renderer, lock.inherited(), workers)
-        return ProcessPool(own, workers)
+            opened_scene = (self.scene, self.index.frames)
+            return SerialPool(SceneSetup(setup, lambda: opened_scene, self.renderer))
+        scene_setup = SceneSetup(setup, shared_scene.open, self.renderer, lock.inherited(), workers)
+        return ProcessPool(scene_setup, workers)
 
-    def _resolved(self, recipe: Recipe) -> Recipe:
-        """The recipe with the settings that its quality chooses here, or has chosen before."""
+    def _resolve_quality(self, recipe: Recipe) -> Recipe:
+        """Return the recipe with the settings that its quality chooses, or has chosen before."""
         if not recipe.quality.is_open:
             return recipe
         assert self.scene is not None
@@ -430,6 +497,7 @@ class _Run:
             )
 
     def _identity(self, recipe: Recipe) -> Identity:
+        """Return the identity of the recipe's images."""
         return Identity(
             self.index.source,
             recipe.hash,
@@ -440,44 +508,49 @@ class _Run:
         )
 
     def _prepare(self, recipes: Sequence[Recipe]) -> None:
-        """Find what images of these recipes share, for all cameras of the scene or the path."""
+        """Compute the data that images of these recipes share.
+
+        The data cover all cameras of the scene or of the path.
+        """
         assert self.scene is not None
-        cameras, path = None, self.job.camera_path
+        cameras = None
+        path = self.job.camera_path
         if path is not None and any(recipe.sections() for recipe in recipes):
-            # An object of its own, or the caller's would remember what was found for this path.
+            # A copy: the caller's scene must not remember data of this path.
             self.scene = copy.copy(self.scene)
             cameras = [camera for frame in path for camera in frame.cameras.values()]
         with self.times.spent("prepare"):
             folder = self.job.shared_dir or self.out_dir / STATE_FOLDER
-            given = (self.scene, recipes, cameras, folder, self.backend, self.progress)
-            share_effects(Sharing(*given))
+            arguments = (self.scene, recipes, cameras, folder, self.backend, self.progress)
+            share_effects(Sharing(*arguments))
 
     def _begin(self, chunks: Sequence[Chunk]) -> None:
-        """Announce the variants that will be written, before their first file."""
+        """Note the variants that will be written, before their first file."""
         for number in sorted({chunk.variant for chunk in chunks}):
             variant = self.job_state.variants[number]
             variant.check_folders(n for c in chunks if c.variant == number for n in c.cameras)
             variant.progress_log.begin(variant.identity)
             write_recipe(variant.recipe, variant.place)
 
-    def _leave_unlabelled(self, chunks: Sequence[Chunk]) -> list[Chunk]:
-        """Record as failed what belongs to frames whose boxes cannot be read; return the rest."""
+    def _fail_unlabelled(self, chunks: Sequence[Chunk]) -> list[Chunk]:
+        """Record the images of frames with unreadable boxes as failed; return the other chunks."""
         with self.times.spent("labels"):
-            labelled = {c.frame for c in chunks if uses_boxes(self.recipes[c.variant])}
-            self.boxes.get(sorted(labelled))
-            if labelled:
-                _ = self.index.instances.by_track  # read once, and not by every worker
-        rest = []
+            labelled_frames = {c.frame for c in chunks if uses_boxes(self.recipes[c.variant])}
+            self.boxes.get(sorted(labelled_frames))
+            if labelled_frames:
+                _ = self.index.instances.by_track  # read once here, and not by every worker
+        remaining_chunks = []
         for chunk in chunks:
             message = self.boxes.errors.get(chunk.frame)
             if message is None or not uses_boxes(self.recipes[chunk.variant]):
-                rest.append(chunk)
+                remaining_chunks.append(chunk)
                 continue
             for name in chunk.cameras:
                 self._deliver(Outcome(chunk.variant, chunk.frame, name, FAILED, message))
-        return rest
+        return remaining_chunks
 
     def _deliver(self, outcome: Outcome) -> None:
+        """Record an image's outcome, and count it."""
         variant = self.job_state.variants[outcome.variant]
         variant.record(outcome, self.index.frames_by_number[outcome.frame])
         with self.counting:
@@ -491,5 +564,6 @@ class _Run:
                 self.on_outcome(outcome)
 
     def _finish(self) -> None:
+        """Write labels, calibration and manifest."""
         with self.times.spent("finish"):
             self.job_state.finish(self.boxes)

@@ -1,7 +1,9 @@
 """Scenes whose files have changed since images of them were published.
 
-The manifest's column `source_digest` says what content an image was made from, and so does the
-record of a scene in `.climategs/scenes`, for images of older versions too, which lack the column.
+In: the manifest's rows and the blocks of a job. Out: a `SceneChange` for each changed scene, which
+`generate` refuses or accepts. The manifest's column `source_digest` says which content an image was
+made from. The record of a scene in `.climategs/scenes` says so too, also for images of older
+versions, which lack the column.
 """
 
 from __future__ import annotations
@@ -27,38 +29,43 @@ pc: Any = pyarrow.compute  # type checkers do not see the functions that it make
 
 @dataclass(frozen=True)
 class SceneChange:
-    """A scene of which an output has other content than its files have now.
-
-    scene: its name in the output.
-    uri: what opens it.
-    before: digest of the content that the output was made from.
-    now: digest of the content of its files.
-    record_path: of the output's record of the scene.
-    """
+    """Scene whose files have other content now than when the output's images were made."""
 
     scene: str
+    """Name of the scene in the output."""
     uri: str
-    before: str
-    now: str
+    """URI that opens the scene."""
+    old_digest: str
+    """Digest of the content that the output's images were made from."""
+    new_digest: str
+    """Digest of the content of the scene's files."""
     record_path: str | None = None
+    """Path of the output's record of the scene."""
 
     def check(self, store: Store) -> None:
-        """Raise OutputError where images of the content of before are there."""
-        folder, out = folder_name(self.scene), store.local_dir
-        if out is None and not list_parts(store, folder):
+        """Raise OutputError where images of the old content are in the output."""
+        folder = folder_name(self.scene)
+        output_dir = store.local_dir
+        if output_dir is None and not list_parts(store, folder):
             return
-        if out is not None and not (out / folder).exists():
+        if output_dir is not None and not (output_dir / folder).exists():
             return
-        anew = "" if out is None else f", or delete {out / folder} to have its images made anew"
+        advice = (
+            ""
+            if output_dir is None
+            else f", or delete {output_dir / folder} to have its images made anew"
+        )
         raise OutputError(
             f"{store.uri} holds images of the scene {self.scene} as it was before: the files of "
-            f"{self.uri} have changed since (digest of their content there {self.before}, here "
-            f"{self.now}). Choose another output (--out){anew}"
+            f"{self.uri} have changed since (digest of their content there {self.old_digest}, here "
+            f"{self.new_digest}). Choose another output (--out){advice}"
         )
 
     def accept(self, store: Store, scratch: Path | None) -> None:
-        """Forget what the output knows of the images of before, whose files are gone. scratch: the
-        folder of `block_worker.WorkSetup`.
+        """Delete the output's records of the old images, whose files have been deleted.
+
+        Args:
+            scratch: Folder of `block_worker.WorkSetup`.
         """
         folder = folder_name(self.scene)
         store.delete([part.path for part in list_parts(store, folder).values()])
@@ -73,11 +80,11 @@ class SceneChange:
 
 
 def changes_in(table: pa.Table, blocks: Iterable[Block]) -> list[SceneChange]:
-    """The blocks' scenes of which the manifest names other content than they have now.
+    """Return the blocks' scenes whose content differs from the one that the manifest names.
 
     Args:
-        table: the manifest's columns scene, status and source_digest.
-        blocks: of which the content may be unknown; then nothing is said of their scene.
+        table: Columns scene, status and source_digest of the manifest.
+        blocks: Blocks of the job; scenes of unknown content are left out.
     """
     scenes = {block.scene: block for block in blocks if block.digest is not None}
     pairs = table.select(["scene", "source_digest"]).group_by(
@@ -85,7 +92,8 @@ def changes_in(table: pa.Table, blocks: Iterable[Block]) -> list[SceneChange]:
     )
     changes: dict[str, SceneChange] = {}
     for row in pairs.aggregate([]).to_pylist():
-        name, digest = row["scene"], row["source_digest"]
+        name = row["scene"]
+        digest = row["source_digest"]
         block = scenes.get(name)
         if block is not None and digest not in (None, block.digest):
             changes[name] = SceneChange(name, block.uri, digest, str(block.digest))

@@ -1,6 +1,8 @@
-"""An output folder as a store of whole files: a folder of this machine, or a place in the cloud.
+"""Store of an output's files: a folder of this machine, or a place in an object store.
 
-Paths are relative to the folder, with forward slashes. A file is there whole or not at all.
+In: a path or URI (`open_store`). Out: a `Store` that reads and writes complete files. Jobs, readers
+of outputs and `tools` use it. Paths are relative to the output folder, with forward slashes. A file
+is complete or absent.
 """
 
 from __future__ import annotations
@@ -35,67 +37,78 @@ from augment.jobs.atomic import (
 )
 from augment.jobs.layout import relative_parts
 
-_UNSAFE = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")  # control characters, bytes that are no text
+# Control characters, and bytes that are not text.
+_UNSAFE_CHARACTERS = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")
 
 
 class StoredFileMissing(OutputError):
-    """A store has no file of this path."""
+    """Error of a store that has no file of this path."""
 
 
 @dataclass(frozen=True)
 class StoredFile:
-    """Size in bytes, and time of the last change by the store's own clock, seconds since 1970."""
+    """Facts of a stored file."""
 
     size: int
+    """Size in bytes."""
     modified_s: float
+    """Time of the last change by the store's own clock, seconds since 1970."""
 
 
 @runtime_checkable
 class Store(Protocol):
-    """Files below one folder. All methods raise OutputError, and may be called by any thread. A
-    store can be pickled and used after a fork: each process opens its own connections.
+    """Files below one folder.
+
+    All methods raise OutputError, and may be called by any thread. A store can be pickled and used
+    after a fork, because each process opens its own connections.
     """
 
     @property
     def uri(self) -> str:
-        """What open_store takes, without credentials; a local folder's absolute path."""
+        """URI for open_store, without credentials; the absolute path of a local folder."""
         ...
 
     @property
     def local_dir(self) -> Path | None:
-        """The folder, where it is on this machine."""
+        """Folder of the store, if it is on this machine; None otherwise."""
         ...
 
     def read(self, path: str) -> bytes:
-        """The file's bytes; StoredFileMissing where there is none."""
+        """Return the file's bytes; raise StoredFileMissing where there is none."""
         ...
 
     def write(self, path: str, data: bytes) -> None:
-        """Put the bytes there, durably, in one step that replaces what was there."""
+        """Write the bytes durably, replacing an earlier file in one step."""
         ...
 
     def put_file(self, path: str, source: Path) -> None:
-        """As write, with the bytes of a local file; a local store may share its disk blocks."""
+        """Write the bytes of a local file; a local store may share its disk blocks."""
         ...
 
     def list(self, folder: str) -> dict[str, StoredFile]:
-        """Every file beneath the folder ("" for all), by path relative to the root, sorted."""
+        """Return every file beneath the folder, by path relative to the root, sorted.
+
+        The folder "" stands for all.
+        """
         ...
 
     def exists(self, path: str) -> bool:
-        """Whether there is a file of this path."""
+        """Return True if there is a file of this path."""
         ...
 
     def delete(self, paths: Iterable[str]) -> None:
-        """Delete files; those that are missing already are fine."""
+        """Delete files; missing ones are no error."""
         ...
 
 
 def open_store(uri: str | Path) -> Store:
-    """The store at a path, `file://`, `s3://bucket/path?region=...`, `gs://` or the like. A folder
-    appears with its first file, a bucket must exist. S3 takes the options _S3_OPTIONS in the URI,
-    and credentials from the environment. Raises OutputError: no such kind of store, or options that
-    it does not know.
+    """Return the store at a path, `file://`, `s3://bucket/path?region=...`, `gs://` or the like.
+
+    A folder appears with its first file; a bucket must exist. S3 takes the options _S3_OPTIONS in
+    the URI, and credentials from the environment.
+
+    Raises:
+        OutputError: There is no such kind of store, or it does not know an option.
     """
 
     if isinstance(uri, Path) or "://" not in uri:
@@ -110,9 +123,13 @@ def open_store(uri: str | Path) -> Store:
 
 
 def stored_path(path: str, uri: str) -> str:
-    """The path with single slashes between its components."""
+    """Return the path with single slashes between its components.
+
+    Raises:
+        OutputError: The path is not one below the root.
+    """
     parts = relative_parts(path)
-    if parts is None or _UNSAFE.search(path):
+    if parts is None or _UNSAFE_CHARACTERS.search(path):
         raise OutputError(
             f"{uri}: {path!r} is no path of a file there; paths must be relative to it, with "
             f"forward slashes and without '..' or control characters. Where a manifest names "
@@ -122,17 +139,19 @@ def stored_path(path: str, uri: str) -> str:
 
 
 # ---- An output folder on this machine, or on a file system that it has mounted -------------------
-# obstore's local store flushes nothing to the disk, makes no hard links of files elsewhere, and its
-# temporary names cannot be told from a dead process's; so files are written by `atomic`.
+# obstore's local store flushes nothing to the disk, makes no hard links of files elsewhere, and
+# does not show whether a temporary file belongs to a dead process; so `atomic` writes the files.
 
-_MAX_RACES = 100  # times that others delete a folder in which a file is just being made
+# Times that other processes may delete a folder in which a file is just being made.
+_MAX_RACES = 100
 
 
 @dataclass(frozen=True)
 class LocalStore:
-    """Files below the folder `root`, an absolute path; see Store."""
+    """Files below a folder; see Store."""
 
     root: Path
+    """Absolute path of the folder."""
 
     @property
     def uri(self) -> str:
@@ -152,40 +171,42 @@ class LocalStore:
 
     def write(self, path: str, data: bytes) -> None:
         file = self._file(path)
-        _with_folder(lambda: write_atomic(file, data, clear=False))
+        _retry_write(lambda: write_atomic(file, data, clear=False))
 
     def put_file(self, path: str, source: Path) -> None:
-        """A hard link where the system can, else a copy; either way flushed to the disk."""
+        """Make a hard link where the system can, otherwise a copy; flush it to the disk."""
         self._file(path)
         with _reading(source):
             original = source.resolve(strict=True)
-            flush_folder(original)  # or a file
+            flush_folder(original)  # flushes a file's bytes too
         self.put_files({path: original})
 
     def put_files(self, files: Mapping[str, Path]) -> None:
-        """As put_file, for files that are durable already; each folder is flushed once, at the end.
-        files: the local file by its path here.
+        """Put files that are durable already; each folder is flushed once, at the end.
+
+        Args:
+            files: Local file by its path in the store.
         """
-        placed = {self._file(path): source for path, source in files.items()}
-        for file, source in placed.items():
-            _with_folder(lambda file=file, source=source: _link_or_copy(source, file))
-        for folder in sorted({file.parent for file in placed}):
+        source_of_target = {self._file(path): source for path, source in files.items()}
+        for file, source in source_of_target.items():
+            _retry_write(lambda file=file, source=source: _link_or_copy(source, file))
+        for folder in sorted({file.parent for file in source_of_target}):
             with refusals_of(folder):
                 flush_folder(folder)
 
     def list(self, folder: str) -> dict[str, StoredFile]:
-        top = self.root if folder == "" else self._file(folder)
-        found: dict[str, StoredFile] = {}
-        with _reading(top):
-            for place, _, names in os.walk(top, onerror=_unless_missing):
+        top_dir = self.root if folder == "" else self._file(folder)
+        files: dict[str, StoredFile] = {}
+        with _reading(top_dir):
+            for folder_path, _, names in os.walk(top_dir, onerror=_unless_missing):
                 for name in names:
-                    file = f"{place}/{name}"
-                    with contextlib.suppress(FileNotFoundError):  # deleted since
+                    file = f"{folder_path}/{name}"
+                    with contextlib.suppress(FileNotFoundError):  # deleted meanwhile
                         facts = os.stat(file)
                         if stat.S_ISREG(facts.st_mode) and not name.endswith(TEMPORARY_SUFFIX):
                             path = file[len(self.uri) :].lstrip("/")
-                            found[path] = StoredFile(facts.st_size, facts.st_mtime)
-        return dict(sorted(found.items()))
+                            files[path] = StoredFile(facts.st_size, facts.st_mtime)
+        return dict(sorted(files.items()))
 
     def exists(self, path: str) -> bool:
         file = self._file(path)
@@ -193,7 +214,7 @@ class LocalStore:
             return file.is_file()
 
     def delete(self, paths: Iterable[str]) -> None:
-        """Folders that become empty go too, up to the root, which stays."""
+        """Delete files, and folders that become empty, except the root."""
         for path in paths:
             file = self._file(path)
             try:
@@ -217,12 +238,13 @@ class LocalStore:
 
 
 def _unless_missing(error: OSError) -> None:
+    """Raise an error, unless it says that a file or folder is missing."""
     if not isinstance(error, FileNotFoundError | NotADirectoryError):
         raise error
 
 
-def _with_folder(write: Callable[[], None]) -> None:
-    """Write again where the file's folder, empty until then, was deleted by others meanwhile."""
+def _retry_write(write: Callable[[], None]) -> None:
+    """Write again where another process deleted the file's folder, empty until then, meanwhile."""
     for attempt in range(_MAX_RACES):
         try:
             return write()
@@ -232,6 +254,7 @@ def _with_folder(write: Callable[[], None]) -> None:
 
 
 def _link_or_copy(original: Path, file: Path) -> None:
+    """Link or copy a file into the store."""
     with refusals_of(file):
         make_folder(file.parent)
         if not link_file(str(original), str(file)):
@@ -240,6 +263,7 @@ def _link_or_copy(original: Path, file: Path) -> None:
 
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[None]:
+    """Context manager that turns errors of reading a file into an OutputError."""
     try:
         yield
     except OSError as error:
@@ -248,59 +272,82 @@ def _reading(path: Path) -> Iterator[None]:
         ) from error
 
 
-# ---- An output folder in the cloud, by obstore ---------------------------------------------------
+# ---- An output folder in an object store, by obstore ---------------------------------------------
 
-_GOOGLE, _AZURE = ("gs", "gcs"), ("az", "abfs", "abfss")
-_KINDS = ("s3", *_GOOGLE, *_AZURE)
-_S3_OPTIONS = ("endpoint_override", "scheme", "region",
-               "force_virtual_addressing", "tls_ca_file_path")  # fmt: skip
-_ANONYMOUS = "anonymous"  # as the user: requests are not signed
+# Schemes of Google Cloud Storage.
+_GOOGLE_SCHEMES = ("gs", "gcs")
+# Schemes of Azure Blob Storage.
+_AZURE_SCHEMES = ("az", "abfs", "abfss")
+# Schemes of all stores.
+_SCHEMES = ("s3", *_GOOGLE_SCHEMES, *_AZURE_SCHEMES)
+# Options of an S3 URI.
+_S3_OPTIONS = (
+    "endpoint_override",
+    "scheme",
+    "region",
+    "force_virtual_addressing",
+    "tls_ca_file_path",
+)
+# User whose requests are not signed.
+_ANONYMOUS = "anonymous"
 _T = TypeVar("_T")
 
 
 class _Place(NamedTuple):
-    """A URI in parts. public: the URI without its credentials. host: the bucket."""
+    """Parts of a URI."""
 
     public: str
+    """The URI without its credentials."""
     scheme: str
+    """Kind of store."""
     host: str
+    """Name of the bucket."""
     folder: str
+    """Folder in the bucket."""
     options: dict[str, str]
+    """Options of the URI."""
     user: str
+    """User, or access key; may be empty."""
     password: str
+    """Password, or secret key; may be empty."""
 
 
 def _parse(uri: str) -> _Place:
+    """Return the parts of a URI; raise OutputError where it is wrong."""
     try:
         parsed = urllib.parse.urlsplit(uri)
         options = dict(urllib.parse.parse_qsl(parsed.query, strict_parsing=bool(parsed.query)))
-    except ValueError:  # whose text may hold a password
+    except ValueError:  # its text may hold a password
         scheme = uri.partition(":")[0]
         raise OutputError(f"{scheme}://... is no URI of the form kind://bucket/folder") from None
-    scheme, (user, _, host) = parsed.scheme, parsed.netloc.rpartition("@")
+    scheme = parsed.scheme
+    (user, _, host) = parsed.netloc.rpartition("@")
     user, colon, password = map(urllib.parse.unquote, user.partition(":"))
-    if scheme in _AZURE and not colon:  # a container of an account
-        user, host = "", parsed.netloc
-    at = f"{_ANONYMOUS}@" if user == _ANONYMOUS else ""
+    if scheme in _AZURE_SCHEMES and not colon:  # the URI names a container of an account
+        user = ""
+        host = parsed.netloc
+    user_prefix = f"{_ANONYMOUS}@" if user == _ANONYMOUS else ""
     path = parsed.path.rstrip("/")
-    public = urllib.parse.urlunsplit((scheme, at + host, path, "", ""))
+    public = urllib.parse.urlunsplit((scheme, user_prefix + host, path, "", ""))
     folder = urllib.parse.unquote(path).removeprefix("/")
-    known = _S3_OPTIONS if scheme == "s3" else ()
-    unknown = [name for name in options if name not in known]
-    unknown += ["user@"] if user and not at and scheme != "s3" else []
-    is_clean = "/".join(relative_parts(folder) or ()) == folder and not _UNSAFE.search(folder)
+    known_options = _S3_OPTIONS if scheme == "s3" else ()
+    unknown_options = [name for name in options if name not in known_options]
+    unknown_options += ["user@"] if user and not user_prefix and scheme != "s3" else []
+    is_clean = "/".join(relative_parts(folder) or ()) == folder and not _UNSAFE_CHARACTERS.search(
+        folder
+    )
     problem = ""
-    if scheme not in _KINDS:
+    if scheme not in _SCHEMES:
         problem = (
             f"there are no stores of the kind {scheme!r}; use a path of this machine, or one of "
-            f"{', '.join(_KINDS)}"
+            f"{', '.join(_SCHEMES)}"
         )
     elif not host:
         problem = f"the URI names no bucket; expected {scheme}://bucket/folder"
-    elif unknown:
+    elif unknown_options:
         problem = (
-            f"there is no option {unknown[0]!r} here; the options are "
-            f"{', '.join(known) or 'none'}. Credentials come from the environment "
+            f"there is no option {unknown_options[0]!r} here; the options are "
+            f"{', '.join(known_options) or 'none'}. Credentials come from the environment "
             f"({_CREDENTIALS[scheme]})"
         )
     elif parsed.fragment or not is_clean:
@@ -311,36 +358,43 @@ def _parse(uri: str) -> _Place:
     if problem:
         raise OutputError(f"{public}: {problem}")
     query = urllib.parse.urlencode(options)
-    return _Place(f"{public}?{query}" if query else public, scheme, host, folder, options,
-                  user, password)  # fmt: skip
+    return _Place(
+        f"{public}?{query}" if query else public, scheme, host, folder, options, user, password
+    )
 
 
 @dataclass(frozen=True)
 class Patience:
-    """How failures that pass (timeouts, lost connections, 500, 503) are waited out: so many times,
-    each after a longer random wait, for three minutes at most. A request may stand still for
-    timeout_s.
+    """How passing failures (timeouts, lost connections, 500, 503) are waited out.
+
+    Each retry comes after a longer random wait; all of them end after three minutes at most.
     """
 
     retries: int = 6
+    """Number of retries."""
     first_wait_s: float = 0.5
+    """Wait before the first retry, seconds."""
     timeout_s: float = 30.0
+    """Longest time for which a request may stand still, seconds."""
 
 
 @dataclass(frozen=True)
 class StoredVersion:
-    """What an object holds at one moment. mark: tells it from the object's other versions.
-    modified_s: see StoredFile; 0 where it is not known.
-    """
+    """Content of an object at one moment."""
 
     data: bytes
+    """Bytes of the object."""
     mark: dict[str, str]
+    """Marks that differ between the object's versions."""
     modified_s: float = 0.0
+    """As of StoredFile; 0 where it is not known."""
 
 
 class RemoteStore:
-    """Files below a place that a URI names; see Store. An upload is there whole or not at all, and
-    its bytes are signed, so a store refuses those that were cut short.
+    """Files below a place that a URI names; see Store.
+
+    An upload is complete or absent. Its bytes are signed, so a store refuses uploads that were cut
+    short.
     """
 
     local_dir = None
@@ -350,8 +404,8 @@ class RemoteStore:
         self.uri = self._place.public
         self.patience = patience
         self._uri = uri
-        # By process: what a parent opened is kept, since closing it in a child is not safe.
-        self._opened: dict[tuple[int, Patience], Any] = {}
+        # Connections by process: a parent's are kept, because closing them in a child is not safe.
+        self._connections: dict[tuple[int, Patience], Any] = {}
 
     def __repr__(self) -> str:
         return f"RemoteStore({self.uri!r})"
@@ -361,14 +415,23 @@ class RemoteStore:
 
     def read(self, path: str) -> bytes:
         path = stored_path(path, self.uri)
-        return self._call("read", path, lambda obs, at: bytes(obs.get(at, path).bytes()))
+        return self._call(
+            "read", path, lambda obs, connection: bytes(obs.get(connection, path).bytes())
+        )
 
     def write(self, path: str, data: bytes) -> None:
         path = stored_path(path, self.uri)
-        self._call("write", path, lambda obs, at: obs.put(at, path, data, max_concurrency=4))
+        self._call(
+            "write",
+            path,
+            lambda obs, connection: obs.put(connection, path, data, max_concurrency=4),
+        )
 
     def put_file(self, path: str, source: Path) -> None:
-        """The file is read into memory first: one that fails to be read must not be uploaded."""
+        """Write the bytes of a local file.
+
+        The file is read into memory first, so that no file is uploaded that cannot be read.
+        """
         stored_path(path, self.uri)
         with _reading(source):
             data = read_file(source)
@@ -376,22 +439,24 @@ class RemoteStore:
 
     def list(self, folder: str) -> dict[str, StoredFile]:
         path = "" if folder == "" else stored_path(folder, self.uri)
-        objects = self._call("list", path, lambda obs, at: obs.list(at, path or None).collect())
-        found = {}
-        for meta in objects:
-            name = meta["path"]
-            # Whoever else writes there: what cannot be a path of ours cannot be read either.
+        objects = self._call(
+            "list", path, lambda obs, connection: obs.list(connection, path or None).collect()
+        )
+        files = {}
+        for facts in objects:
+            name = facts["path"]
+            # Other programs may write there; a name that cannot be our path cannot be read either.
             with contextlib.suppress(OutputError):
                 if name != path and stored_path(name, self.uri) == name:
-                    found[name] = StoredFile(meta["size"], meta["last_modified"].timestamp())
-        folders = {name.rpartition("/")[0] for name in found}
-        markers = {name for name in folders & found.keys() if found[name].size == 0}
-        return {name: found[name] for name in sorted(found.keys() - markers)}
+                    files[name] = StoredFile(facts["size"], facts["last_modified"].timestamp())
+        folders = {name.rpartition("/")[0] for name in files}
+        markers = {name for name in folders & files.keys() if files[name].size == 0}
+        return {name: files[name] for name in sorted(files.keys() - markers)}
 
     def exists(self, path: str) -> bool:
         path = stored_path(path, self.uri)
         try:
-            self._call("look up", path, lambda obs, at: obs.head(at, path))
+            self._call("look up", path, lambda obs, connection: obs.head(connection, path))
         except StoredFileMissing:
             return False
         return True
@@ -400,22 +465,24 @@ class RemoteStore:
         names = [stored_path(path, self.uri) for path in paths]
         try:
             if names:
-                self._call("delete", names[0], lambda obs, at: obs.delete(at, names))
-        except StoredFileMissing:  # not of S3: one that is missing hides the others
+                self._call(
+                    "delete", names[0], lambda obs, connection: obs.delete(connection, names)
+                )
+        except StoredFileMissing:  # stores other than S3: a missing object hides the others
             for name in names:
                 self.delete_once(name)
 
     def delete_once(self, path: str) -> None:
-        """Delete without trying again: of two requests, the second might hit a later object."""
+        """Delete an object without retries: a second request might hit a later object."""
         with contextlib.suppress(StoredFileMissing):
             once = replace(self.patience, retries=0)
-            self._call("delete", path, lambda obs, at: obs.delete(at, path), once)
+            self._call("delete", path, lambda obs, connection: obs.delete(connection, path), once)
 
     def read_version(self, path: str) -> StoredVersion | None:
-        """What the object holds now; None where there is none."""
+        """Return the object's current version; None where there is no object."""
 
-        def read(obs: Any, at: Any) -> StoredVersion:
-            result = obs.get(at, path)
+        def read(obs: Any, connection: Any) -> StoredVersion:
+            result = obs.get(connection, path)
             modified_s = result.meta["last_modified"].timestamp()
             return StoredVersion(bytes(result.bytes()), _mark(result.meta), modified_s)
 
@@ -424,25 +491,34 @@ class RemoteStore:
         except StoredFileMissing:
             return None
 
-    def put_if(self, path: str, data: bytes, there: StoredVersion | None) -> StoredVersion | None:
-        """Put the bytes in place of the version `there`, or where there is nothing. Returns what is
-        there now: `data`, or what another one has put or deleted meanwhile. data: unlike any that
-        were ever there, so that a request whose answer was lost is told from another one's.
+    def put_if(
+        self, path: str, data: bytes, old_version: StoredVersion | None
+    ) -> StoredVersion | None:
+        """Put the bytes in place of an old version, or where no object exists.
+
+        Args:
+            data: Bytes unlike any earlier ones, so that a request whose answer was lost can be told
+                from another process's.
+            old_version: Version to replace; None to create the object.
+
+        Returns:
+            The current version: ours, or what another process has put; None if it has deleted the
+            object.
         """
-        mode = "create" if there is None else there.mark
+        mode = "create" if old_version is None else old_version.mark
         for attempts_left in (2, 1, 0):
             is_refused = False
             try:
-                put = lambda obs, at: obs.put(at, path, data, mode=mode)  # noqa: E731
+                put = lambda obs, connection: obs.put(connection, path, data, mode=mode)  # noqa: E731
                 return StoredVersion(data, _mark(self._call("write", path, put)))
             except (_OtherVersionError, StoredFileMissing):
                 is_refused = True
-            except OutputError:  # obstore does not know whether it arrived
+            except OutputError:  # obstore does not know whether the request arrived
                 if attempts_left == 0:
                     raise
-            found = self.read_version(path)
-            if is_refused or (found is not None and found.data == data):
-                return found
+            current_version = self.read_version(path)
+            if is_refused or (current_version is not None and current_version.data == data):
+                return current_version
         raise AssertionError
 
     def _call(
@@ -452,16 +528,18 @@ class RemoteStore:
         call: Callable[[Any, Any], _T],
         patience: Patience | None = None,
     ) -> _T:
-        """What the call of obstore returns, at this process's connections."""
-        obs, key = _load_obstore(), (os.getpid(), patience or self.patience)
+        """Return the result of a call of obstore, with this process's connection."""
+        obs = _load_obstore()
+        key = (os.getpid(), patience or self.patience)
         try:
-            if key not in self._opened:
-                self._opened[key] = _open(obs, self._place, key[1])
-            return call(obs, self._opened[key])
-        except OutputError:  # of a file that the URI names
+            if key not in self._connections:
+                self._connections[key] = _open(obs, self._place, key[1])
+            return call(obs, self._connections[key])
+        except OutputError:  # concerns a file that the URI names
             raise
         except Exception as error:
-            cause, base = _cause(error), self.uri.partition("?")[0]
+            cause = _cause(error)
+            base = self.uri.partition("?")[0]
             where = f"{base}/{path}" if path else base
             if isinstance(error, FileNotFoundError) and not _NO_BUCKET.search(cause):
                 raise StoredFileMissing(f"{where} is missing") from None
@@ -469,35 +547,36 @@ class RemoteStore:
                 raise _OtherVersionError from None
             for secret in (self._place.user, self._place.password):
                 cause = cause.replace(secret, "***") if secret else cause
-            # Without its cause, whose text may hold credentials.
+            # The cause is left out, because its text may hold credentials.
             raise OutputError(
                 f"cannot {operation} {where}: {cause}; {_advice(error, cause, self._place.scheme)}"
             ) from None
 
 
 class _OtherVersionError(OutputError):
-    """The object is no longer the version that was to be replaced."""
+    """Error: the object is no longer the version that was to be replaced."""
 
 
 def _mark(facts: Mapping[str, Any]) -> dict[str, str]:
+    """Return the marks of an object's version."""
     return {name: facts[name] for name in ("e_tag", "version") if facts[name] is not None}
 
 
 def _open(obs: Any, place: _Place, patience: Patience) -> Any:
-    """obstore's store of the place."""
-    wait = {"init_backoff": timedelta(seconds=patience.first_wait_s)}
-    retry = {"max_retries": patience.retries, "backoff": wait}
-    client: dict[str, Any] = {
+    """Return obstore's store of the place."""
+    backoff = {"init_backoff": timedelta(seconds=patience.first_wait_s)}
+    retry = {"max_retries": patience.retries, "backoff": backoff}
+    client_options: dict[str, Any] = {
         "read_timeout": timedelta(seconds=patience.timeout_s),
-        "timeout": timedelta(days=1),  # of a whole download
+        "timeout": timedelta(days=1),  # limit of a complete download
     }
-    settings: dict[str, Any] = {"client_options": client, "retry_config": retry}
-    if place.scheme in _AZURE:
+    settings: dict[str, Any] = {"client_options": client_options, "retry_config": retry}
+    if place.scheme in _AZURE_SCHEMES:
         return obs.store.AzureStore.from_url(place.public, **settings)
     settings["prefix"] = place.folder
     if place.user == _ANONYMOUS:
         settings["skip_signature"] = True
-    if place.scheme in _GOOGLE:
+    if place.scheme in _GOOGLE_SCHEMES:
         return obs.store.GCSStore(place.host, **settings)
     if place.user not in ("", _ANONYMOUS):
         settings |= {"access_key_id": place.user, "secret_access_key": place.password}
@@ -507,7 +586,7 @@ def _open(obs: Any, place: _Place, patience: Patience) -> Any:
     if "tls_ca_file_path" in options:
         file = Path(options["tls_ca_file_path"])
         with _reading(file):
-            client["root_certificate"] = file.read_bytes()
+            client_options["root_certificate"] = file.read_bytes()
     is_virtual = options.get("force_virtual_addressing", "").lower() in ("true", "1")
     settings["virtual_hosted_style_request"] = is_virtual
     endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL", "")
@@ -515,25 +594,29 @@ def _open(obs: Any, place: _Place, patience: Patience) -> Any:
         scheme, _, host = options["endpoint_override"].rpartition("://")
         bucket = f"{place.host}." if is_virtual else ""
         endpoint = f"{scheme or options.get('scheme', 'https')}://{bucket}{host}"
-        settings["aws_endpoint_url_s3"] = endpoint  # which goes before the environment's
-    client["allow_http"] = endpoint.startswith("http://")
-    # Not every server knows requests that delete many.
+        settings["aws_endpoint_url_s3"] = endpoint  # overrides the environment's
+    client_options["allow_http"] = endpoint.startswith("http://")
+    # Not every server knows requests that delete many objects.
     return obs.store.S3Store(place.host, disable_bulk_delete=True, **settings)
 
 
-_loading = threading.Lock()
-_release = _loading.release  # no thread is loading while a process forks
-os.register_at_fork(before=_loading.acquire, after_in_parent=_release, after_in_child=_release)
-_loaded_by = 0  # this process, or the one that it was forked from
+_load_lock = threading.Lock()
+# No thread loads obstore while the process forks.
+_release = _load_lock.release
+os.register_at_fork(before=_load_lock.acquire, after_in_parent=_release, after_in_child=_release)
+# Number of the process that loaded obstore: this one, or the one that it was forked from.
+_loaded_by = 0
 _obstore_folder = ""
 
 
 def _load_obstore() -> Any:
-    """obstore, whose threads do not survive a fork (in a child its calls never return), and which
-    it cannot start again: a forked process loads a copy of it under another path.
+    """Return the module obstore.
+
+    Its threads do not survive a fork (in a child its calls never return), and it cannot start them
+    again. So a forked process loads a copy of it under another path.
     """
     global _loaded_by, _obstore_folder
-    with _loading:
+    with _load_lock:
         if _loaded_by == 0:
             _obstore_folder = str(Path(importlib.import_module("obstore").__file__ or "").parent)
         elif _loaded_by != os.getpid():
@@ -549,15 +632,18 @@ def _load_obstore() -> Any:
     return sys.modules["obstore"]
 
 
-# ---- What obstore's failures mean, and what to do ------------------------------------------------
+# ---- Advice on obstore's failures ----------------------------------------------------------------
 
 _NO_BUCKET = re.compile("NoSuchBucket|bucket does not exist|ContainerNotFound")
+# Variables of the environment with credentials, by scheme.
 _CREDENTIALS = {
     "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION",
-    **dict.fromkeys(_GOOGLE, "GOOGLE_APPLICATION_CREDENTIALS"),
-    **dict.fromkeys(_AZURE, "AZURE_STORAGE_ACCOUNT_NAME, AZURE_STORAGE_ACCOUNT_KEY"),
+    **dict.fromkeys(_GOOGLE_SCHEMES, "GOOGLE_APPLICATION_CREDENTIALS"),
+    **dict.fromkeys(_AZURE_SCHEMES, "AZURE_STORAGE_ACCOUNT_NAME, AZURE_STORAGE_ACCOUNT_KEY"),
 }
+# Further advice, by scheme.
 _ENDPOINT = {"s3": ", the region, and the endpoint (endpoint_override or AWS_ENDPOINT_URL)"}
+# Advice by a pattern of the error's type and text; the first match counts.
 _ADVICE = {
     "PermissionDenied|Unauthenticated|(?i:credential)|169\\.254\\.|AuthorizationHeaderMalformed"
     "|Account must": ("check {credentials}, and that they may read, write, list and delete there"),
@@ -576,7 +662,7 @@ _ADVICE = {
 
 
 def _cause(error: Exception) -> str:
-    """The failure without obstore's debugging output; of an answer in XML, its code."""
+    """Return the failure without obstore's debugging output; for an answer in XML, its code."""
     text, _, details = str(error).partition("\n\nDebug source")
     text = re.sub(r"<\?xml.*<Code>(.*?)</Code>.*", r"\1", text, flags=re.DOTALL)
     kind = re.search(r"HttpError \{\s*kind: (\w+)", details)
@@ -584,6 +670,7 @@ def _cause(error: Exception) -> str:
 
 
 def _advice(error: Exception, cause: str, scheme: str) -> str:
+    """Return what to do about a failure."""
     text = f"{type(error).__name__} {cause}"
     advice = next(advice for pattern, advice in _ADVICE.items() if re.search(pattern, text))
     return advice.format(credentials=_CREDENTIALS[scheme], endpoint=_ENDPOINT.get(scheme, ""))

@@ -1,8 +1,10 @@
-"""NumPy columns in Parquet files, and back with the same bits and the same dtypes.
+"""Parquet files of NumPy columns, read back with the same bits and the same dtypes.
 
-Parquet has fewer types than NumPy: `<U5` becomes a string, an object column a string or JSON. Each
-column's NumPy dtype is therefore kept in the file's metadata and restored by `unpack_column`.
-Writing fails for a column that could not be restored exactly.
+In: NumPy columns, boxes of frames, LiDAR sweeps. Out: bytes of Parquet files, and the columns
+again. Jobs write with it; readers of outputs and recordings read with it. Parquet has fewer types
+than NumPy: `<U5` becomes a string, an object column a string or JSON. Each column's NumPy dtype is
+therefore kept in the file's metadata and restored by `unpack_column`. Writing fails for a column
+that could not be restored exactly.
 """
 
 from __future__ import annotations
@@ -26,93 +28,120 @@ from augment.files.stated_sizes import StatedSizeError, check_table, check_texts
 from augment.labels import Boxes, LidarSweep
 from recipes.files import open_file
 
+# Key of our metadata in a Parquet file.
 METADATA_KEY = b"climategs"
 
+# Errors of reading columns that differ from what their metadata describe.
 _UNLIKE_METADATA = (
     *(ArithmeticError, AttributeError, LookupError, RecursionError),
     *(SyntaxError, TypeError, ValueError, pa.ArrowException),
 )
+# Runs of base64 text, in which a Parquet file stores its Arrow schema.
 _BASE64 = re.compile(rb"[A-Za-z0-9+/]{24,}")
+# Metadata key of Arrow extension types.
 _EXTENSION = b"ARROW:extension:name"
 
 
 @dataclass(frozen=True)
 class PackedColumn:
-    """An Arrow column of several NumPy pieces joined. encoding: `plain`, or `json` texts."""
+    """Arrow column of several joined NumPy pieces."""
 
     data: pa.ChunkedArray
+    """The column, one chunk for each piece."""
     encoding: str
+    """`plain`, or `json` for texts of JSON."""
 
 
 def column_type(column: np.ndarray) -> str:
-    """What `unpack_column` needs to know: `<f4`, `|O`, `(3,)<f8` for a column of [n, 3]."""
+    """Return the type for `unpack_column`: `<f4`, `|O`, `(3,)<f8` for a column of [n, 3]."""
     return "".join(f"({k},)" for k in column.shape[1:]) + column.dtype.str
 
 
-def pack_column(pieces: Sequence[np.ndarray], *, where: str) -> PackedColumn:
-    """Join columns of one meaning (one per frame, say) into one Arrow column, a chunk a piece.
-    pieces: each [n] or [n, k]. where: names the column in errors. Pieces of different Arrow types
-    are all stored as JSON, one text an entry. Raises ValueError: a value cannot be stored such that
-    reading gives it back exactly.
+def pack_column(pieces: Sequence[np.ndarray], *, source_name: str) -> PackedColumn:
+    """Join columns of one meaning, such as one per frame, into one Arrow column.
+
+    Each piece becomes a chunk. Pieces of different Arrow types are all stored as JSON, one text for
+    each entry.
+
+    Args:
+        pieces: Columns, each [n] or [n, k].
+        source_name: Name of the column, for errors.
+
+    Raises:
+        ValueError: A value cannot be stored such that reading returns it exactly.
     """
-    plain = [_to_arrow(piece) for piece in pieces]
-    # Empty pieces have no say: a frame without boxes often has columns of another dtype.
-    filled = [array for array, piece in zip(plain, pieces, strict=True) if len(piece)]
-    types = {None if array is None else array.type for array in filled}
+    arrays = [_to_arrow(piece) for piece in pieces]
+    # Empty pieces do not count: a frame without boxes often has columns of another dtype.
+    filled_arrays = [array for array, piece in zip(arrays, pieces, strict=True) if len(piece)]
+    types = {None if array is None else array.type for array in filled_arrays}
     if None not in types and len(types) <= 1:
         kind = next(iter(types), pa.null())
-        chunks = [a if a is not None and len(a) else pa.array([], kind) for a in plain]
+        chunks = [a if a is not None and len(a) else pa.array([], kind) for a in arrays]
         return PackedColumn(pa.chunked_array(chunks, type=kind), "plain")
-    texts = [pa.array(_to_json(piece, where), pa.string()) for piece in pieces]
+    texts = [pa.array(_to_json(piece, source_name), pa.string()) for piece in pieces]
     return PackedColumn(pa.chunked_array(texts, type=pa.string()), "json")
 
 
 def check_count(table: pa.Table, described: int) -> None:
-    """Raise ValueError where a table has other than the described number of rows."""
+    """Raise ValueError where a table has another number of rows than described."""
     if table.num_rows != described:
         raise ValueError(f"it has {table.num_rows} rows, its metadata describe {described}")
 
 
-def whole(value: object) -> int:
-    """A number of JSON that int64 holds. Raises ValueError: it is anything else."""
+def checked_int(value: object) -> int:
+    """Return a number of JSON as an int that int64 holds.
+
+    Raises:
+        ValueError: The value is anything else.
+    """
     if type(value) is not int or not -(2**63) <= value < 2**63:
         raise ValueError(f"expected a whole number; got {value!r:.80}")
     return value
 
 
 def texts_of(data: pa.ChunkedArray) -> list[str]:
-    """The texts of a column without gaps. Raises ValueError: it holds anything else."""
+    """Return the texts of a column without gaps.
+
+    Raises:
+        ValueError: The column holds anything else.
+    """
     if not pa.types.is_string(data.type) or data.null_count:
         raise ValueError(f"expected texts; got {data.type} with {data.null_count} nulls")
     return data.to_pylist()
 
 
 def unpack_column(data: pa.ChunkedArray, kind: str, encoding: str) -> np.ndarray:
-    """The NumPy column that was packed. kind: its `column_type`."""
-    described = np.dtype(kind)
-    wanted, width = described.base, described.shape
+    """Return the NumPy column that was packed.
+
+    Args:
+        kind: Its `column_type`.
+        encoding: Its encoding, as of PackedColumn.
+    """
+    packed_dtype = np.dtype(kind)
+    dtype = packed_dtype.base
+    row_shape = packed_dtype.shape
     if len(data) == 0:
-        return np.empty((0, *width), wanted)
+        return np.empty((0, *row_shape), dtype)
     if encoding == "json":
-        return _filled([json.loads(text) for text in data.to_pylist()], wanted)
+        return _make_array([json.loads(text) for text in data.to_pylist()], dtype)
     if data.null_count:
         raise ValueError(f"a column of {kind} has {data.null_count} gaps")
     array = pa.concat_arrays(data.chunks)
     if pa.types.is_fixed_size_list(array.type):
         flat = array.flatten().to_numpy(zero_copy_only=False)
-        return flat.reshape(len(array), *width).astype(wanted)
-    if wanted.kind == "O":
-        return _filled(array.to_pylist(), wanted)
+        return flat.reshape(len(array), *row_shape).astype(dtype)
+    if dtype.kind == "O":
+        return _make_array(array.to_pylist(), dtype)
     # A copy: Arrow's own memory is read-only, which torch.from_numpy warns about.
-    return np.array(array.to_numpy(zero_copy_only=False), dtype=wanted)
+    return np.array(array.to_numpy(zero_copy_only=False), dtype=dtype)
 
 
 def parquet_bytes(table: pa.Table, metadata: dict[str, object]) -> bytes:
-    """The table as a Parquet file, always the same bytes for the same table."""
+    """Return the table as a Parquet file; the same table gives the same bytes."""
     note = json.dumps(metadata, separators=(",", ":")).encode()
     sink = pa.BufferOutputStream()
-    # An eighth smaller for coordinates, and no slower.
-    split = {f.name: "BYTE_STREAM_SPLIT" for f in table.schema if pa.types.is_floating(f.type)}
+    # Files of coordinates are an eighth smaller with it, and writing is no slower.
+    encodings = {f.name: "BYTE_STREAM_SPLIT" for f in table.schema if pa.types.is_floating(f.type)}
     pq.write_table(
         table.replace_schema_metadata({METADATA_KEY: note}),
         sink,
@@ -120,7 +149,7 @@ def parquet_bytes(table: pa.Table, metadata: dict[str, object]) -> bytes:
         compression="zstd",
         compression_level=1,
         use_dictionary=False,  # dictionaries compare values, which would merge unlike NaNs
-        column_encoding=split,
+        column_encoding=encodings,
         write_statistics=False,
     )
     return sink.getvalue().to_pybytes()
@@ -128,29 +157,33 @@ def parquet_bytes(table: pa.Table, metadata: dict[str, object]) -> bytes:
 
 def read_table(
     source: Path | bytes,
-    where: str,
+    source_name: str,
     columns: Sequence[str] | None = None,
     without: Collection[str] = (),
 ) -> pa.Table:
-    """The table in a Parquet file from anybody: columns of Arrow's own types, valid throughout.
-    where: the file, for errors. columns: only those of these that it has. without: none of these.
+    """Return the table in a Parquet file of any origin, with valid columns of Arrow's own types.
+
+    Args:
+        source_name: Name of the file, for errors.
+        columns: If given, only those of these columns that the file has.
+        without: Columns to leave out.
     """
-    with opened_parquet(source, where) as (content, file):
-        there = Counter(file.schema_arrow.names)
-        if repeated := [name for name, count in there.items() if count > 1]:
-            raise OutputError(f"{where} has several columns {repeated[0]!r}; leave one")
-        wanted = [n for n in columns or there if n in there and n not in without]
-        long_texts = check_table(content, file, wanted)
+    with opened_parquet(source, source_name) as (content, file):
+        name_counts = Counter(file.schema_arrow.names)
+        if repeated_names := [name for name, count in name_counts.items() if count > 1]:
+            raise OutputError(f"{source_name} has several columns {repeated_names[0]!r}; leave one")
+        column_names = [n for n in columns or name_counts if n in name_counts and n not in without]
+        long_texts = check_table(content, file, column_names)
         if long_texts:
             file = pq.ParquetFile(content, read_dictionary=long_texts)
         # One thread: this runs in DataLoader workers, which bring their own parallelism.
-        table = file.read(wanted, use_threads=False)
-        table.validate(full=True)  # Arrow does not look at texts as it reads
+        table = file.read(column_names, use_threads=False)
+        table.validate(full=True)  # Arrow does not check texts while it reads
         return _with_plain_texts(table) if long_texts else table
 
 
 def _with_plain_texts(table: pa.Table) -> pa.Table:
-    """The table with plain texts in place of dictionaries of texts."""
+    """Return the table with plain texts in place of dictionaries of texts."""
     for number, name in enumerate(table.column_names):
         column = table[name]
         if pa.types.is_dictionary(column.type):
@@ -162,25 +195,26 @@ def _with_plain_texts(table: pa.Table) -> pa.Table:
 
 
 def read_parquet(path: Path) -> tuple[pa.Table, dict[str, Any]]:
-    """A table and the metadata that `parquet_bytes` put beside it."""
+    """Return a table and the metadata that `parquet_bytes` stored with it."""
     table = read_table(path, str(path))
     return table, _note(table.schema, path)
 
 
 def read_note(path: Path) -> dict[str, Any]:
-    """The metadata alone, without reading a column."""
+    """Return the metadata without reading a column."""
     with opened_parquet(path, str(path)) as (_, file):
         schema = file.schema_arrow
     return _note(schema, path)
 
 
 def is_ours(path: Path) -> bool:
-    """Whether a Parquet file has metadata as `parquet_bytes` writes it."""
+    """Return True if a Parquet file has metadata as `parquet_bytes` writes them."""
     with opened_parquet(path, str(path)) as (_, file):
         return METADATA_KEY in (file.schema_arrow.metadata or {})
 
 
 def _note(schema: pa.Schema, path: Path) -> dict[str, Any]:
+    """Return our metadata in a schema."""
     try:
         note = json.loads((schema.metadata or {}).get(METADATA_KEY, b"null"))
     except (ValueError, RecursionError):
@@ -194,7 +228,7 @@ def _note(schema: pa.Schema, path: Path) -> dict[str, Any]:
 
 @contextmanager
 def as_described(path: Path) -> Iterator[None]:
-    """While a file's columns are taken as its metadata say, what goes wrong is an OutputError."""
+    """Context manager for reading columns by their metadata; errors become an OutputError."""
     try:
         yield
     except _UNLIKE_METADATA as error:
@@ -206,75 +240,87 @@ def as_described(path: Path) -> Iterator[None]:
 
 @contextmanager
 def opened_parquet(
-    source: Path | bytes, where: str
+    source: Path | bytes, source_name: str
 ) -> Iterator[tuple[pa.NativeFile, pq.ParquetFile]]:
-    """The file's content and its reader, for as long as it is read; what Arrow then raises becomes
-    an OutputError. A reader takes all the memory that the file asks for: what is read is checked
-    by `augment.files.stated_sizes` before.
+    """Context manager of a file's content and its reader; errors of Arrow become an OutputError.
+
+    A reader takes all the memory that the file asks for, so `augment.files.stated_sizes` checks the
+    columns before they are read.
     """
     try:
         if not isinstance(source, bytes):
-            open_file(source).close()  # refuses pipes, at which Arrow would wait without end
-        with pa.BufferReader(source) if isinstance(source, bytes) else pa.OSFile(str(source)) as at:
-            if _has_extension_types(at):
+            open_file(source).close()  # refuses pipes, which Arrow would wait for without end
+        with (
+            pa.BufferReader(source)
+            if isinstance(source, bytes)
+            else pa.OSFile(str(source)) as content
+        ):
+            if _has_extension_types(content):
                 raise OutputError(
-                    f"{where} has a column of an Arrow extension type, which is not read, for it "
-                    f"could run code; write plain numbers and texts instead"
+                    f"{source_name} has a column of an Arrow extension type, which is not read, "
+                    f"for it could run code; write plain numbers and texts instead"
                 )
-            yield at, pq.ParquetFile(at)
+            yield content, pq.ParquetFile(content)
     except (OSError, pa.ArrowException, UnicodeDecodeError, StatedSizeError) as error:
-        raise OutputError(f"{where} is missing or not a readable Parquet file: {error}") from error
+        raise OutputError(
+            f"{source_name} is missing or not a readable Parquet file: {error}"
+        ) from error
 
 
 def _has_extension_types(file: pa.NativeFile) -> bool:
-    """Whether the Arrow schema in a Parquet file's footer names an extension type, to whose
-    registered class Arrow would hand what the file says (pyarrow's own unpickled it up to 14.0.0).
-    The footer is searched beforehand, unparsed: the schema is base64, and bytes before it may look
-    as if they belonged to it.
+    """Return True if the Arrow schema in a Parquet file's footer names an extension type.
+
+    Arrow would hand the file's data to the type's registered class (pyarrow's own unpickled it up
+    to 14.0.0). The footer is searched beforehand, unparsed: the schema is base64, and bytes before
+    it may look as if they belonged to it.
     """
     size = file.size()
     file.seek(max(0, size - 8))
-    footer = min(int.from_bytes(file.read(4), "little"), max(0, size - 8))
-    file.seek(max(0, size - 8) - footer)
-    runs = [run[start:] for run in _BASE64.findall(file.read(footer)) for start in range(4)]
+    footer_bytes = min(int.from_bytes(file.read(4), "little"), max(0, size - 8))
+    file.seek(max(0, size - 8) - footer_bytes)
+    base64_runs = [
+        run[start:] for run in _BASE64.findall(file.read(footer_bytes)) for start in range(4)
+    ]
     file.seek(0)
-    return any(_EXTENSION in base64.b64decode(run[: len(run) // 4 * 4]) for run in runs)
+    return any(_EXTENSION in base64.b64decode(run[: len(run) // 4 * 4]) for run in base64_runs)
 
 
 def _to_arrow(piece: np.ndarray) -> pa.Array | None:
-    """The column in a native Arrow type, or None where only JSON may hold it."""
+    """Return the column in a native Arrow type, or None where only JSON can hold it."""
     if piece.dtype.kind == "O":
-        strings = piece.ndim == 1 and all(isinstance(value, str) for value in piece)
-        return pa.array(piece.tolist(), pa.string()) if strings else None
+        are_texts = piece.ndim == 1 and all(isinstance(value, str) for value in piece)
+        return pa.array(piece.tolist(), pa.string()) if are_texts else None
     if piece.dtype.kind in "US" and piece.ndim == 1:
         # From Python values: Arrow's reader of fixed-width text stops at a zero character.
         return pa.array(piece.tolist(), pa.string() if piece.dtype.kind == "U" else pa.binary())
     if piece.dtype.kind not in "biufMm" or piece.ndim not in (1, 2):
         return None
-    flat = np.ascontiguousarray(piece).reshape(-1)
-    flat = flat.astype(flat.dtype.newbyteorder("="), copy=False)
+    values = np.ascontiguousarray(piece).reshape(-1)
+    values = values.astype(values.dtype.newbyteorder("="), copy=False)
     try:
-        array = pa.array(flat, from_pandas=False)
+        array = pa.array(values, from_pandas=False)
     except pa.ArrowException:  # times in hours and the like
         return None
     return array if piece.ndim == 1 else pa.FixedSizeListArray.from_arrays(array, piece.shape[1])
 
 
-def _to_json(piece: np.ndarray, where: str) -> list[str]:
+def _to_json(piece: np.ndarray, source_name: str) -> list[str]:
+    """Return a text of JSON for each value of the column."""
     if piece.ndim > (1 if piece.dtype.kind == "O" else 2):
-        raise ValueError(f"{where} has shape {list(piece.shape)}; columns are [n] or [n, k]")
+        raise ValueError(f"{source_name} has shape {list(piece.shape)}; columns are [n] or [n, k]")
     # NumPy scalars inside an object column come back as the Python value they stand for.
     values = [v.item() if isinstance(v, np.generic) else v for v in piece.tolist()]
     texts = []
     for value in values:
         try:
             text = json.dumps(value, ensure_ascii=False)
-            exact = _same(json.loads(text), value)
+            is_exact = _is_same(json.loads(text), value)
         except (TypeError, ValueError):
-            text, exact = "", False
-        if not exact:
+            text = ""
+            is_exact = False
+        if not is_exact:
             raise ValueError(
-                f"{where} holds {value!r} ({type(value).__name__}) in a column of dtype "
+                f"{source_name} holds {value!r} ({type(value).__name__}) in a column of dtype "
                 f"{piece.dtype}, which cannot be stored exactly; use numbers, strings, None, or "
                 f"lists of them"
             )
@@ -282,18 +328,19 @@ def _to_json(piece: np.ndarray, where: str) -> list[str]:
     return texts
 
 
-def _same(a: object, b: object) -> bool:
-    """Equal in value and type all the way down; NaN equals NaN."""
+def _is_same(a: object, b: object) -> bool:
+    """Return True for equal values of equal types, at every level; NaN equals NaN."""
     if type(a) is not type(b):
         return False
     if isinstance(a, list) and isinstance(b, list):
-        return len(a) == len(b) and all(map(_same, a, b))
+        return len(a) == len(b) and all(map(_is_same, a, b))
     if isinstance(a, dict) and isinstance(b, dict):
-        return list(a) == list(b) and all(_same(a[key], b[key]) for key in a)
+        return list(a) == list(b) and all(_is_same(a[key], b[key]) for key in a)
     return a == b or (a != a and b != b)
 
 
-def _filled(values: list, dtype: np.dtype) -> np.ndarray:
+def _make_array(values: list, dtype: np.dtype) -> np.ndarray:
+    """Return values as an array of that type."""
     if dtype.kind != "O":
         return np.array(values, dtype)
     column = np.empty(len(values), object)  # np.array would turn lists of lists into a matrix
@@ -303,7 +350,9 @@ def _filled(values: list, dtype: np.dtype) -> np.ndarray:
 
 # ---- Boxes and LiDAR sweeps as Parquet files, read back exactly as the dataset gave them ---------
 
-ATTRIBUTE_PREFIX = "attribute_"  # keeps a dataset's own columns apart from ours
+# Prefix that keeps a dataset's own columns apart from ours.
+ATTRIBUTE_PREFIX = "attribute_"
+# Columns of the boxes' vectors, by field of Boxes.
 _VECTORS = {
     "centers_m": ("center_x_m", "center_y_m", "center_z_m"),
     "sizes_m": ("length_m", "width_m", "height_m"),
@@ -313,38 +362,42 @@ _VECTORS = {
 
 @dataclass(frozen=True, eq=False)
 class FrameBoxes:
-    """The boxes of one frame and the frame's reference time. instances: uint16 [B], the objects'
-    numbers (`augment.boxes`); None in older files.
-    """
+    """Boxes of one frame."""
 
     timestamp_ns: int
+    """Reference time of the frame."""
     boxes: Boxes
+    """The boxes."""
     instances: np.ndarray | None = None
+    """Numbers of the objects (`augment.boxes`), uint16 [B]; None in older files."""
 
 
 def lidar_bytes(sweep: LidarSweep, *, note: str | None = None) -> bytes:
-    """The sweep as a Parquet file: the source's columns, in its order. note: kept beside them for
-    `read_lidar_note`.
+    """Return the sweep as a Parquet file, with the source's columns in their order.
+
+    Args:
+        note: Text that `read_lidar_note` returns.
     """
-    columns, kinds = {}, {}
+    columns = {}
+    kinds = {}
     for name, column in sweep.columns.items():
-        packed = pack_column([column], where=f"LiDAR column {name!r}")
-        columns[name] = packed.data
-        kinds[name] = [column_type(column), packed.encoding]
-    extra = {} if note is None else {"note": note}
-    return parquet_bytes(pa.table(columns), {"kind": "lidar", "columns": kinds, **extra})
+        packed_column = pack_column([column], source_name=f"LiDAR column {name!r}")
+        columns[name] = packed_column.data
+        kinds[name] = [column_type(column), packed_column.encoding]
+    note_entries = {} if note is None else {"note": note}
+    return parquet_bytes(pa.table(columns), {"kind": "lidar", "columns": kinds, **note_entries})
 
 
 def read_lidar(path: Path) -> LidarSweep:
-    """The sweep that was written, dtypes included."""
-    table, note = _read(Path(path), "lidar")
+    """Return the sweep that was written, including its dtypes."""
+    table, note = _read_kind(Path(path), "lidar")
     with as_described(path):
         kinds = note["columns"]
         return LidarSweep({name: unpack_column(table[name], *kinds[name]) for name in kinds})
 
 
 def read_lidar_note(path: Path) -> str | None:
-    """The note that a sweep was written with; its returns are not read."""
+    """Return the note that a sweep was written with, without reading its returns."""
     note = read_note(path)
     if note.get("kind") != "lidar":
         raise OutputError(f"{path} holds {note.get('kind')!r} data; expected 'lidar'")
@@ -353,48 +406,62 @@ def read_lidar_note(path: Path) -> str | None:
 
 
 def boxes_bytes(frames: Mapping[int, FrameBoxes]) -> bytes:
-    """All boxes of the frames as one Parquet file, one row a box, ordered by frame. The dataset's
-    further columns are `attribute_<name>`, null in frames that lack them. A note in the metadata
-    lists every frame, so that one without boxes differs from one that was not asked.
+    """Return all boxes of the frames as one Parquet file, one row for each box, ordered by frame.
+
+    The dataset's further columns are `attribute_<name>`, null in frames that lack them. A note in
+    the metadata lists every frame, so that a frame without boxes differs from one that is not in
+    the file.
     """
-    order = sorted(frames)
-    listed = [frames[index].boxes for index in order]
-    counts = [len(boxes) for boxes in listed]
-    times = [frames[index].timestamp_ns for index in order]
+    frame_numbers = sorted(frames)
+    boxes_of_frames = [frames[index].boxes for index in frame_numbers]
+    counts = [len(boxes) for boxes in boxes_of_frames]
+    times = [frames[index].timestamp_ns for index in frame_numbers]
     columns: dict[str, Any] = {
-        "frame": np.repeat(np.array(order, np.int64), counts),
+        "frame": np.repeat(np.array(frame_numbers, np.int64), counts),
         "timestamp_ns": np.repeat(np.array(times, np.int64), counts),
-        "track_id": pa.array([i for boxes in listed for i in boxes.track_ids], pa.string()),
-        "label": pa.array([name for boxes in listed for name in boxes.labels], pa.string()),
+        "track_id": pa.array(
+            [i for boxes in boxes_of_frames for i in boxes.track_ids], pa.string()
+        ),
+        "label": pa.array(
+            [name for boxes in boxes_of_frames for name in boxes.labels], pa.string()
+        ),
     }
     for field, names in _VECTORS.items():
-        joined = np.concatenate([np.zeros((0, len(names)))] + [getattr(b, field) for b in listed])
-        columns |= {name: joined[:, k].copy() for k, name in enumerate(names)}
+        vectors = np.concatenate(
+            [np.zeros((0, len(names)))] + [getattr(b, field) for b in boxes_of_frames]
+        )
+        columns |= {name: vectors[:, k].copy() for k, name in enumerate(names)}
     if any(frame.instances is not None for frame in frames.values()):
-        columns["instance"] = pa.chunked_array([_instances(frames[n]) for n in order], pa.uint16())
+        columns["instance"] = pa.chunked_array(
+            [_instances(frames[n]) for n in frame_numbers], pa.uint16()
+        )
     encodings = {}
-    for name in dict.fromkeys(name for boxes in listed for name in boxes.attributes):
-        columns[ATTRIBUTE_PREFIX + name], encodings[name] = _attribute(name, listed)
-    kinds = [{name: column_type(a) for name, a in boxes.attributes.items()} for boxes in listed]
+    for name in dict.fromkeys(name for boxes in boxes_of_frames for name in boxes.attributes):
+        columns[ATTRIBUTE_PREFIX + name], encodings[name] = _attribute(name, boxes_of_frames)
+    kinds = [
+        {name: column_type(a) for name, a in boxes.attributes.items()} for boxes in boxes_of_frames
+    ]
     note = {
         "kind": "boxes",
-        "frames": [list(row) for row in zip(order, times, counts, kinds, strict=True)],
+        "frames": [list(row) for row in zip(frame_numbers, times, counts, kinds, strict=True)],
         "encodings": encodings,
     }
     return parquet_bytes(pa.table(columns), note)
 
 
 def read_boxes(path: Path) -> dict[int, FrameBoxes]:
-    """The boxes of every frame in the file, dtypes of the attributes included."""
-    table, note = _read(Path(path), "boxes")
+    """Return the boxes of every frame in the file, including the dtypes of the attributes."""
+    table, note = _read_kind(Path(path), "boxes")
     with as_described(path):
-        track_ids, labels = texts_of(table["track_id"]), texts_of(table["label"])
+        track_ids = texts_of(table["track_id"])
+        labels = texts_of(table["label"])
         vectors = {
             field: np.stack([table[name].to_numpy() for name in names], axis=1)
             for field, names in _VECTORS.items()
         }
         names = set(table.column_names)
-        frames, start = {}, 0
+        frames = {}
+        start = 0
         for index, timestamp_ns, count, kinds in note["frames"]:
             rows = slice(start, start + count)
             attributes = {
@@ -413,30 +480,36 @@ def read_boxes(path: Path) -> dict[int, FrameBoxes]:
             )
             numbers = table["instance"].slice(start, count) if "instance" in names else None
             instances = None if numbers is None or numbers.null_count else numbers.to_numpy().copy()
-            frames[whole(index)] = FrameBoxes(whole(timestamp_ns), boxes, instances)
+            frames[checked_int(index)] = FrameBoxes(checked_int(timestamp_ns), boxes, instances)
             start += count
         check_count(table, start)
     return frames
 
 
 def _instances(frame: FrameBoxes) -> pa.Array:
+    """Return the numbers of a frame's objects, null where they are not known."""
     if frame.instances is None:
         return pa.nulls(len(frame.boxes), pa.uint16())
     return pa.array(frame.instances, pa.uint16())
 
 
-def _attribute(name: str, listed: list[Boxes]) -> tuple[pa.ChunkedArray, str]:
-    having = [boxes.attributes[name] for boxes in listed if name in boxes.attributes]
-    packed = pack_column(having, where=f"box attribute {name!r}")
-    chunks = iter(packed.data.chunks)
-    filled = [
-        next(chunks) if name in boxes.attributes else pa.nulls(len(boxes), packed.data.type)
-        for boxes in listed
+def _attribute(name: str, boxes_of_frames: list[Boxes]) -> tuple[pa.ChunkedArray, str]:
+    """Return a further column of the dataset, and its encoding.
+
+    It has gaps in frames that lack it.
+    """
+    columns = [boxes.attributes[name] for boxes in boxes_of_frames if name in boxes.attributes]
+    packed_column = pack_column(columns, source_name=f"box attribute {name!r}")
+    chunks = iter(packed_column.data.chunks)
+    filled_chunks = [
+        next(chunks) if name in boxes.attributes else pa.nulls(len(boxes), packed_column.data.type)
+        for boxes in boxes_of_frames
     ]
-    return pa.chunked_array(filled, type=packed.data.type), packed.encoding
+    return pa.chunked_array(filled_chunks, type=packed_column.data.type), packed_column.encoding
 
 
-def _read(path: Path, kind: str) -> tuple[pa.Table, dict[str, Any]]:
+def _read_kind(path: Path, kind: str) -> tuple[pa.Table, dict[str, Any]]:
+    """Return the table and metadata of a file of that kind."""
     table, note = read_parquet(path)
     if note.get("kind") != kind:
         raise OutputError(f"{path} holds {note.get('kind')!r} data; expected {kind!r}")

@@ -1,6 +1,7 @@
-"""Renders the items of an opened scene, one frame of one variant at a time, and writes them.
+"""Rendering of an opened scene's images, one frame of one variant at a time, and their writing.
 
-The same code runs in the job's own process and in its workers.
+In: a scene, its frames and a `Setup`. Out: files in the output folder, and an `Outcome` for each
+image. `render_job` calls it. The same code runs in the job's own process and in its workers.
 """
 
 from __future__ import annotations
@@ -48,19 +49,33 @@ from augment.memo import memo_of
 from augment.scene import Scene
 from recipes.schema import Recipe
 
-# ---- Where a job's time goes: seconds by kind of work, and what the job was bound by -------------
+# ---- Where a job's time goes: seconds by kind of work, and the kind that bounds the job ----------
 # In every worker one thread renders and hands finished views to threads that encode and write them.
-# The rendering thread waits (is *held*) when these have too much in hand, and at the end for what
-# they still have. Whoever is busiest bounds the job: what others do beside it costs nothing.
+# The rendering thread waits (is *held*) while the writing threads have too many views in hand, and
+# at the end until they have written the last ones. The busiest threads bound the job: the work of
+# the other threads runs beside it and costs nothing.
 
-# Of the threads that render. `render` holds `await`: for the view in flight to be done.
-RENDER, AWAIT, HELD, RENDERERS = "render", "await", "held", "renderers"
-# Of the threads that write.
-ENCODE, WRITE, MEASURE, LIDAR, WRITERS = "encode", "write", "measure", "lidar", "writers"
-WORKERS = "workers"  # all of a job's workers, from its begin to its end
+# Kinds of work of the rendering threads. `render` includes `await`: waiting for the view in flight.
+RENDER = "render"
+AWAIT = "await"
+# Waiting for the writing threads.
+HELD = "held"
+# All time of the rendering threads.
+RENDERERS = "renderers"
+# Kinds of work of the writing threads.
+ENCODE = "encode"
+WRITE = "write"
+MEASURE = "measure"
+LIDAR = "lidar"
+# All time of the writing threads.
+WRITERS = "writers"
+# All time of the job's workers, from its begin to its end.
+WORKERS = "workers"
 
-_WRITING = {ENCODE: "encoding", WRITE: "writing to disk", MEASURE: "boxes", LIDAR: "LiDAR"}
-_BESIDE = {
+# Labels of the writing threads' kinds of work, for people.
+_WRITING_LABELS = {ENCODE: "encoding", WRITE: "writing to disk", MEASURE: "boxes", LIDAR: "LiDAR"}
+# Labels of the work beside rendering and writing, for people.
+_OTHER_LABELS = {
     "open": "opening scenes",
     "settle": "choosing settings",
     "prepare": "preparing effects",
@@ -79,51 +94,61 @@ class WorkTimes:
         self._lock = threading.Lock()
 
     def add(self, kind: str, seconds: float) -> None:
+        """Add seconds to a kind of work."""
         with self._lock:
             self._seconds[kind] += seconds
 
     @contextmanager
     def spent(self, *kinds: str) -> Iterator[None]:
-        """The time within is added to each of these kinds, also if it ends with an exception."""
-        started = time.perf_counter()
+        """Context manager that adds the time inside it to each of these kinds.
+
+        The time counts also where the block ends with an exception.
+        """
+        start_s = time.perf_counter()
         try:
             yield
         finally:
             for kind in kinds:
-                self.add(kind, time.perf_counter() - started)
+                self.add(kind, time.perf_counter() - start_s)
 
     def update(self, seconds: Mapping[str, float]) -> None:
-        for kind, spent in seconds.items():
-            self.add(kind, spent)
+        """Add seconds by kind."""
+        for kind, kind_seconds in seconds.items():
+            self.add(kind, kind_seconds)
 
     def so_far(self) -> dict[str, float]:
+        """Return a copy of the seconds by kind."""
         with self._lock:
             return dict(self._seconds)
 
 
 @dataclass(frozen=True)
 class Shares:
-    """Parts of a job's time, 0 to 1. Of the workers' time: rendering, of that awaiting views in
-    flight; held, waiting for files; beside, all else, and its greatest part. Of the writing
-    threads' time: writing, by kind.
-    """
+    """Parts of a job's time, 0 to 1."""
 
     rendering: float
+    """Part of the workers' time in which they render."""
     awaiting: float
+    """Part of the workers' time in which they wait for views in flight; included in `rendering`."""
     held: float
+    """Part of the workers' time in which they wait for files to be written."""
     beside: float
+    """Part of the workers' time for all other work."""
     beside_by: str
+    """Label of the greatest part of `beside`."""
     writing: Mapping[str, float]
+    """Parts of the writing threads' time, by label of the kind of work."""
 
     @property
     def bound_by(self) -> str:
+        """Label of the work that bounds the job."""
         if sum(self.writing.values()) > self.rendering + self.beside:
             return max(self.writing, key=self.writing.__getitem__)
         return "rendering" if self.rendering >= self.beside else self.beside_by
 
     @property
     def sentence(self) -> str:
-        """All of it in one line."""
+        """All shares in one line, for people."""
         wait = f" ({_percent(self.awaiting)} for views in flight)" if self.awaiting else ""
         beside = f"other work {_percent(self.beside)}, first of all {self.beside_by}"
         kinds = ", ".join(f"{kind} {_percent(share)}" for kind, share in self.writing.items())
@@ -135,25 +160,36 @@ class Shares:
 
 
 def shares_of(seconds: Mapping[str, float], held_up: int = 1) -> Shares | None:
-    """The shares of a job's seconds by kind of work; None where nothing was rendered. held_up: how
-    many workers there are while the job itself does other work than rendering.
+    """Return the shares of a job's seconds by kind of work; None where nothing was rendered.
+
+    Args:
+        seconds: Seconds by kind of work.
+        held_up: Number of workers that wait while the job itself does other work than rendering.
     """
-    whole, writers = seconds.get(WORKERS, 0.0), seconds.get(WRITERS, 0.0)
-    if not (seconds.get(RENDER) and whole and writers):
+    workers_s = seconds.get(WORKERS, 0.0)
+    writers_s = seconds.get(WRITERS, 0.0)
+    if not (seconds.get(RENDER) and workers_s and writers_s):
         return None
-    # A worker's writing threads are there as long as the worker is, at work or not.
-    writers *= whole / seconds[RENDERERS]
-    rendering, held = seconds[RENDER] / whole, seconds.get(HELD, 0.0) / whole
-    rest = max(0.0, 1 - rendering - held)
-    beside = {label: held_up * seconds.get(k, 0.0) / whole for k, label in _BESIDE.items()}
-    beside["workers that start or have nothing to do"] = rest - sum(beside.values())
+    # A worker's writing threads exist as long as the worker does, at work or not.
+    writers_s *= workers_s / seconds[RENDERERS]
+    rendering_share = seconds[RENDER] / workers_s
+    held_share = seconds.get(HELD, 0.0) / workers_s
+    other_share = max(0.0, 1 - rendering_share - held_share)
+    share_of_label = {
+        label: held_up * seconds.get(k, 0.0) / workers_s for k, label in _OTHER_LABELS.items()
+    }
+    share_of_label["workers that start or have nothing to do"] = other_share - sum(
+        share_of_label.values()
+    )
     return Shares(
-        rendering=rendering,
-        awaiting=seconds.get(AWAIT, 0.0) / whole,
-        held=held,
-        beside=rest,
-        beside_by=max(beside, key=beside.__getitem__),
-        writing={label: seconds.get(kind, 0.0) / writers for kind, label in _WRITING.items()},
+        rendering=rendering_share,
+        awaiting=seconds.get(AWAIT, 0.0) / workers_s,
+        held=held_share,
+        beside=other_share,
+        beside_by=max(share_of_label, key=share_of_label.__getitem__),
+        writing={
+            label: seconds.get(kind, 0.0) / writers_s for kind, label in _WRITING_LABELS.items()
+        },
     )
 
 
@@ -163,14 +199,17 @@ def _percent(share: float) -> str:
 
 # ---- Frames rendered, labelled and written -------------------------------------------------------
 
+# Longest message of a failure in the manifest, characters.
 MESSAGE_LENGTH = 500
 _log = logging.getLogger(__name__)
 
 
 @runtime_checkable
 class Renderer(Protocol):
-    """`augment.views.render_view`, `begin_view`, or a stand-in: makes a View, or a Pending one; a
-    job then begins the next before it waits.
+    """Function that renders an image: `augment.views.render_view`, `begin_view`, or a stand-in.
+
+    It returns a View, or a Pending one; in the second case a job begins the next view before it
+    waits.
     """
 
     def __call__(self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> Any: ...
@@ -178,103 +217,144 @@ class Renderer(Protocol):
 
 @runtime_checkable
 class Pending(Protocol):
-    """A view that is begun; `augment.views.PendingView` is one."""
+    """View whose rendering has begun; `augment.views.PendingView` is one."""
 
     def result(self) -> Any: ...
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What rendering needs besides scene and frames; small, and picklable. labelled: numbers of the
-    frames whose labels and LiDAR pass through. instances: of the scene's objects. memo: what
-    the recipes' images share; the scene to render takes it over. overwrite: sweeps that are there.
-    """
+    """Everything that rendering needs besides scene and frames; small and picklable."""
 
     out_dir: str
+    """Output folder."""
     recipes: tuple[Recipe, ...]
+    """Resolved recipes, one for each variant."""
     backend: str
+    """Name of the rasteriser's backend."""
     labelled: frozenset[int]
+    """Numbers of the frames whose labels and LiDAR pass through."""
     instances: Instances
+    """Numbers of the scene's objects."""
     memo: Mapping[Hashable, Any] = field(default_factory=dict)
+    """Data that the recipes' images share; the memo of the scene to render takes it over."""
     overwrite: bool = False
+    """If True, LiDAR sweeps that exist already are written again."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Images of one frame under one recipe. variant: position in Setup.recipes."""
+    """Images of one frame under one recipe."""
 
     variant: int
+    """Position in Setup.recipes."""
     frame: int
+    """Frame number."""
     cameras: tuple[str, ...]
+    """Camera names."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one image. lidar, lidar_note: as of PassedLidar. box_weather: of its boxes.
-    shares: as of Written.
-    """
+    """Result of one image."""
 
     variant: int
+    """Position in Setup.recipes."""
     frame: int
+    """Frame number."""
     camera: str
+    """Camera name."""
     status: str
+    """`manifest.OK` or `manifest.FAILED`."""
     message: str = ""
+    """Reason of a failure."""
     checksum: str = ""
+    """SHA-256 of the image file, hexadecimal."""
     lidar: str | None = None
+    """As of PassedLidar."""
     lidar_note: str | None = None
+    """As `note` of PassedLidar."""
     box_weather: BoxWeather = field(default_factory=dict)
+    """Measured numbers of the image's boxes."""
     shares: Mapping[str, float] = field(default_factory=dict)
+    """Shares of the image's pixels, as of Written."""
 
 
 @dataclass(frozen=True)
 class TaskFailed:
-    """A worker's task could not be done. is_output: nothing can be written, so that all others
-    would fail. of_scene: the scene could not be opened, so that its other blocks would fail too.
-    of_memory: it may succeed while no other worker takes any.
-    """
+    """Result of a worker's task that could not be done."""
 
     text: str
+    """Reason, for people."""
     is_output: bool = False
+    """True if nothing can be written, so that every other task would fail too."""
     of_scene: bool = False
+    """True if the scene could not be opened, so that its other blocks would fail too."""
     of_memory: bool = False
+    """True if memory ran out: the task may succeed while no other worker uses any."""
 
 
 class PassedLidar(NamedTuple):
-    """A frame's sweep. lidar: weather or clean, None without one. note: as of Recipe.lidar_note."""
+    """LiDAR sweep of a frame in the output."""
 
     lidar: str | None = None
+    """`weather` or `clean`; None where the frame has no sweep."""
     note: str | None = None
+    """As of Recipe.lidar_note."""
 
 
-def describe(error: BaseException, doing: str) -> str:
-    """One line for the manifest: what was being done, the error's type and what it says."""
-    text = " ".join(f"{doing}: {type(error).__name__}: {error}".split())
+def describe(error: BaseException, activity: str) -> str:
+    """Return one line for the manifest: the activity, the error's type and its text.
+
+    Args:
+        activity: Activity that failed.
+    """
+    text = " ".join(f"{activity}: {type(error).__name__}: {error}".split())
     return text if len(text) <= MESSAGE_LENGTH else text[: MESSAGE_LENGTH - 3] + "..."
 
 
 def default_renderer() -> Renderer:
-    """The library's own; imported only here, for it brings the rasteriser."""
+    """Return the library's renderer.
+
+    It is imported only here, because it imports the rasteriser.
+    """
     from augment.views import render_view
 
     return render_view
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn:
-    """An image that is drawn, or begun. camera: as written. lidar: of `_pass_lidar`."""
+class _RenderedView:
+    """Image whose rendering is done, or has begun."""
 
     chunk: Chunk
+    """Chunk that the image belongs to."""
     recipe: Recipe
+    """Recipe of the image."""
     camera: Camera
+    """Camera at the written resolution."""
     lidar: Future
+    """Result of `_pass_lidar` for the frame."""
 
 
 class FrameRunner:
-    """Renders chunks, writes on other threads, and gives `deliver` each image from the writing
-    threads, once its files are on the disk. The library's own renderer draws several views at once
-    (`augment.views.ViewPool`), handed over in their order. Where another returns pending views, the
-    next is begun before the last is waited for, so that a GPU has work while pictures come back. An
-    error of the scene or the renderer concerns one image; an OutputError or GpuLost ends the run.
+    """Renders chunks, and writes their files on other threads.
+
+    The library's own renderer renders several views at once (`augment.views.ViewPool`) and hands
+    them over in their order. Where another renderer returns pending views, the next view is begun
+    before the last one is waited for, so that a GPU has work while pictures come back.
+
+    An error of the scene or of the renderer fails one image; an OutputError or GpuLost ends the
+    run.
+
+    Attributes:
+        deliver: Called with each image's Outcome by the writing threads, once its files are on the
+            disk.
+        pump: Threads that write.
+        renderer: Renderer of the images; the library's own if None.
+        frames: Frames to render; may hold more.
+        scene: Opened scene.
+        setup: Recipes, output and backend.
     """
 
     def __init__(
@@ -287,21 +367,24 @@ class FrameRunner:
         pump: WritePump,
     ) -> None:
         self._cameras = {f.index: f.cameras for f in frames}
-        self._scene, self._setup = scene, setup
+        self._scene = scene
+        self._setup = setup
         self._views = None
         if renderer is None:
-            from augment.views import ViewPool  # which brings the rasteriser
+            from augment.views import ViewPool  # imports the rasteriser
 
             self._views = ViewPool(scene, setup.backend)
             renderer = self._views.begin
         self._renderer: Renderer = renderer
         self._ahead = 1 if self._views is None else self._views.ahead
-        self._deliver, self._pump = deliver, pump
-        self._boxes: dict[int, Boxes] = {}  # of the frames so far
+        self._deliver = deliver
+        self._pump = pump
+        self._boxes: dict[int, Boxes] = {}  # by number of the frames read so far
         self._reading_boxes = threading.Lock()
-        self._warned: set[str] = set()  # variants of which a sweep could not be weathered
-        self._in_flight: deque[tuple[_Drawn, Pending]] = deque()
-        self._times, self._started = WorkTimes(), time.perf_counter()
+        self._warned: set[str] = set()  # variants with a sweep that stayed clear
+        self._in_flight: deque[tuple[_RenderedView, Pending]] = deque()
+        self._times = WorkTimes()
+        self._start_s = time.perf_counter()
 
     def run(self, chunk: Chunk) -> None:
         """Render the chunk's images. The last may stay in flight until `close` or later ones."""
@@ -310,35 +393,41 @@ class FrameRunner:
         for name in chunk.cameras:
             self._render(chunk, recipe, name, lidar)
 
-    def _land(self) -> None:
-        """Wait for the first view in flight and hand it over."""
-        drawn, pending = self._in_flight[0]
+    def _finish_oldest_view(self) -> None:
+        """Wait for the oldest view in flight and queue the writing of its files."""
+        rendered, pending_view = self._in_flight[0]
         try:
             with self._times.spent(RENDER, AWAIT):
-                view = pending.result()
+                view = pending_view.result()
         except Exception as error:
             self._in_flight.popleft()
-            self._fail(drawn.chunk, drawn.camera.name, error)
+            self._fail(rendered.chunk, rendered.camera.name, error)
             return
-        self._in_flight.popleft()  # no sooner: what an interrupt finds in flight is left to `close`
-        self._hand_over(drawn, view)
+        # Not earlier: after an interrupt, `close` still finishes the views in flight.
+        self._in_flight.popleft()
+        self._queue_writes(rendered, view)
 
     def close(self) -> dict[str, float]:
-        """Wait for the writes; raises what stopped them. Returns the seconds by `times`' kinds."""
+        """Wait for the writes, and raise the error that stopped them.
+
+        Returns:
+            Seconds by kind of work.
+        """
         try:
             while self._in_flight:
-                self._land()
+                self._finish_oldest_view()
         finally:
             if self._views is not None:
                 self._views.close()
             with self._times.spent(HELD):
                 self._pump.close()
-        seconds = time.perf_counter() - self._started
+        seconds = time.perf_counter() - self._start_s
         self._times.add(RENDERERS, seconds)
         self._times.add(WRITERS, seconds * self._pump.threads)
         return self._times.so_far()
 
     def _render(self, chunk: Chunk, recipe: Recipe, name: str, lidar: Future) -> None:
+        """Render or begin one image; queue the writing of finished ones."""
         camera = self._cameras[chunk.frame][name]
         try:
             with self._times.spent(RENDER):
@@ -346,24 +435,25 @@ class FrameRunner:
         except Exception as error:
             self._fail(chunk, name, error)
             return
-        drawn = _Drawn(chunk, recipe, camera.scaled(recipe.render.scale), lidar)
+        rendered = _RenderedView(chunk, recipe, camera.scaled(recipe.render.scale), lidar)
         if isinstance(view, Pending):
-            self._in_flight.append((drawn, view))
+            self._in_flight.append((rendered, view))
             while len(self._in_flight) > self._ahead:
-                self._land()
+                self._finish_oldest_view()
         else:
-            self._hand_over(drawn, view)
+            self._queue_writes(rendered, view)
 
-    def _hand_over(self, drawn: _Drawn, view: View) -> None:
-        """Give a view to the writing threads."""
+    def _queue_writes(self, rendered: _RenderedView, view: View) -> None:
+        """Queue the writing of a view's files."""
         try:
-            check_view(view, drawn.camera, drawn.recipe)
+            check_view(view, rendered.camera, rendered.recipe)
         except Exception as error:
-            self._fail(drawn.chunk, drawn.camera.name, error)
+            self._fail(rendered.chunk, rendered.camera.name, error)
             return
-        self._submit(lambda: self._write(drawn, view))
+        self._submit(lambda: self._write(rendered, view))
 
     def _fail(self, chunk: Chunk, name: str, error: Exception) -> None:
+        """Queue the failure of one image; raise GpuLost where the GPU no longer answers."""
         _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=error)
         message = describe(error, "rendering")
         if gpu_is_lost(self._setup.backend):
@@ -376,53 +466,60 @@ class FrameRunner:
         self._submit(lambda: self._deliver(outcome))
 
     def _submit(self, task: Callable[[], Any]) -> Future:
+        """Queue a task of the writing threads; the wait for a free place counts as HELD."""
         with self._times.spent(HELD):
             return self._pump.submit(task)
 
-    def _write(self, drawn: _Drawn, view: View) -> None:
-        """Write the files of a view; it is delivered when its frame's sweep is there too."""
-        chunk, recipe, name = drawn.chunk, drawn.recipe, drawn.camera.name
+    def _write(self, rendered: _RenderedView, view: View) -> None:
+        """Write the files of a view; it is delivered once its frame's sweep is written too."""
+        chunk = rendered.chunk
+        recipe = rendered.recipe
+        name = rendered.camera.name
         paths = item_paths(self._scene.name, recipe, name, chunk.frame)
-        failed = Outcome(chunk.variant, chunk.frame, name, FAILED)
-        doing = "measuring the boxes"
+        failed_outcome = Outcome(chunk.variant, chunk.frame, name, FAILED)
+        activity = "measuring the boxes"
         try:
             with self._times.spent(MEASURE):
-                view, box_weather = self._label(chunk.frame, recipe, drawn.camera, view)
-            doing = "encoding"
-            written = write_view(Path(self._setup.out_dir), paths, view, recipe)
+                view, box_weather = self._label(chunk.frame, recipe, rendered.camera, view)
+            activity = "encoding"
+            written_files = write_view(Path(self._setup.out_dir), paths, view, recipe)
         except OutputError:
             raise
         except Exception as error:
             _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=True)
-            self._deliver(replace(failed, message=describe(error, doing)))
+            self._deliver(replace(failed_outcome, message=describe(error, activity)))
             return
-        self._times.add(ENCODE, written.encode_s)
-        self._times.add(WRITE, written.write_s)
-        done = replace(
-            failed,
+        self._times.add(ENCODE, written_files.encode_s)
+        self._times.add(WRITE, written_files.write_s)
+        outcome = replace(
+            failed_outcome,
             status=OK,
-            checksum=written.checksum,
+            checksum=written_files.checksum,
             box_weather=box_weather,
-            shares=written.shares,
+            shares=written_files.shares,
         )
-        self._pump.after(drawn.lidar, lambda: self._complete(done, drawn.lidar, written.files))
+        self._pump.after(
+            rendered.lidar, lambda: self._complete(outcome, rendered.lidar, written_files.files)
+        )
 
-    def _complete(self, done: Outcome, lidar: Future, files: tuple[str, ...]) -> None:
-        """Deliver an image whose files are there, or a failure where its sweep has failed."""
-        passed = lidar.result()
-        if isinstance(passed, str):
+    def _complete(self, outcome: Outcome, lidar: Future, files: tuple[str, ...]) -> None:
+        """Deliver an image whose files are written, or a failure where its sweep has failed."""
+        sweep_result = lidar.result()
+        if isinstance(sweep_result, str):
             for file in files:
                 (Path(self._setup.out_dir) / file).unlink(missing_ok=True)
-            done = Outcome(done.variant, done.frame, done.camera, FAILED, passed)
+            outcome = Outcome(outcome.variant, outcome.frame, outcome.camera, FAILED, sweep_result)
         else:
-            done = replace(done, lidar=passed.lidar, lidar_note=passed.note)
+            outcome = replace(outcome, lidar=sweep_result.lidar, lidar_note=sweep_result.note)
         with self._times.spent(WRITE):
-            self._deliver(done)
+            self._deliver(outcome)
 
     def _label(
         self, frame: int, recipe: Recipe, camera: Camera, view: View
     ) -> tuple[View, BoxWeather]:
-        """The view with the frame's boxes, and what is measured of them, where they are wanted."""
+        """Return the view with its frame's boxes and their numbers, where the recipe asks
+        for them.
+        """
         if not uses_boxes(recipe) or frame not in self._setup.labelled:
             return view, {}
         with self._reading_boxes:
@@ -431,21 +528,28 @@ class FrameRunner:
         origin = np.asarray(self._scene.world_origin_m, np.float64)
         boxes = self._boxes[frame]
         return label_view(
-            boxes, self._setup.instances, origin, camera, view, recipe,
+            boxes,
+            self._setup.instances,
+            origin,
+            camera,
+            view,
+            recipe,
             evidence=lambda: evidence_of(self._scene, frame),
-        )  # fmt: skip
+        )
 
     def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> PassedLidar | str:
-        """Write the frame's sweep, in the weather or as it is, unless it is there already; what
-        became of it, or a message where it cannot be read.
+        """Write the frame's sweep, in the weather or clean, unless it exists already.
+
+        Returns:
+            State of the sweep, or a message where it cannot be read.
         """
         if recipe.lidar is None or chunk.frame not in self._setup.labelled:
             return PassedLidar()
         paths = item_paths(self._scene.name, recipe, "", chunk.frame)
         target = Path(self._setup.out_dir) / (paths["lidar"] or "")
         if target.exists() and not self._setup.overwrite:
-            with contextlib.suppress(OutputError):  # a damaged one is written anew
-                return _passed(recipe, read_lidar_note(target))
+            with contextlib.suppress(OutputError):  # a damaged file is written again
+                return _lidar_entries(recipe, read_lidar_note(target))
         with self._times.spent(LIDAR):
             try:
                 sweep = self._scene.lidar(chunk.frame)
@@ -456,13 +560,15 @@ class FrameRunner:
             except Exception as error:
                 return describe(error, "reading the LiDAR sweep")
             write_atomic(target, data, clear=False)
-            return _passed(recipe, fault)
+            return _lidar_entries(recipe, fault)
 
     def _weathered(
         self, sweep: LidarSweep, frame: int, recipe: Recipe
     ) -> tuple[LidarSweep, str | None]:
-        """The sweep as the recipe wants it. Where only `auto` asks for weather, one that cannot
-        have it is passed through, with the reason."""
+        """Return the sweep as the recipe asks for it, and why it has no weather although it should.
+
+        Where only `auto` asks for weather, a sweep that cannot have it passes through clean.
+        """
         if recipe.lidar != "weather":
             return sweep, None
         from augment.effects.lidar.sweep import weathered_sweep
@@ -474,69 +580,89 @@ class FrameRunner:
                 raise
             fault = describe(error, "no weather on this sweep")
             variant = variant_name(recipe)
-            if variant not in self._warned:  # of its other frames the manifest tells
+            if variant not in self._warned:  # the manifest notes its other frames
                 self._warned.add(variant)
                 _log.warning("%s, frame %d: LiDAR passes through: %s", variant, frame, fault)
             return sweep, fault
 
 
-def _passed(recipe: Recipe, fault: str | None) -> PassedLidar:
-    """What the manifest says of a sweep. fault: why it has no weather, where it should have."""
+def _lidar_entries(recipe: Recipe, fault: str | None) -> PassedLidar:
+    """Return the manifest's entries of a sweep.
+
+    Args:
+        fault: Reason why it has no weather although it should; None otherwise.
+    """
     if fault is None:
         return PassedLidar(recipe.lidar, recipe.lidar_note(recipe.lidar))
     return PassedLidar("clean", f"{recipe.lidar_note('clean')}: {fault}")
 
 
-# ---- What a worker of one open scene does --------------------------------------------------------
+# ---- The worker of one open scene ----------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class SceneSetup:
-    """What workers of one scene share. scene: opens it, with its frames, in the worker's process.
-    lock: only held: the output stays the job's until its last worker ends. workers: how many.
-    """
+    """Everything that the workers of one scene share."""
 
     setup: Setup
+    """Recipes, output and backend."""
     scene: Callable[[], tuple[Scene, Sequence[Frame]]]
+    """Opens the scene, with its frames, in the worker's process."""
     renderer: Renderer | None
+    """Renderer of the images; the library's own if None."""
     lock: InheritedLock | None = None
+    """Held only: the output stays locked for the job until its last worker ends."""
     workers: int = 1
+    """Number of workers."""
 
     @property
     def backend(self) -> str:
+        """Name of the rasteriser's backend."""
         return self.setup.backend
 
     @property
     def output(self) -> str:
+        """Output folder."""
         return self.setup.out_dir
 
     def worker(self, on_outcome: Callable[[Outcome], None]) -> SceneWorker:
+        """Return a worker for this process."""
         return SceneWorker(self, on_outcome)
 
 
 class SceneWorker:
-    """Renders chunks: a task is a tuple of them, its result the seconds by kind of work."""
+    """Worker that renders chunks.
+
+    A task is a tuple of chunks; its result is the seconds by kind of work.
+    """
 
     def __init__(self, setup: SceneSetup, on_outcome: Callable[[Outcome], None]) -> None:
-        self._setup, self._on_outcome = setup, on_outcome
+        self._setup = setup
+        self._on_outcome = on_outcome
         self._opened: tuple[Scene, Sequence[Frame]] | None = None
 
     def do(self, task: tuple[Chunk, ...]) -> dict[str, float] | TaskFailed:
+        """Render the task's chunks."""
         try:
             return self._render(task)
         except OutputError as error:
             return TaskFailed(str(error), is_output=True)
 
     def _render(self, task: tuple[Chunk, ...]) -> dict[str, float]:
-        own, on_gpu = self._setup, renders_on_gpu(self._setup.backend)
+        scene_setup = self._setup
+        on_gpu = renders_on_gpu(self._setup.backend)
         if self._opened is None:
-            self._opened = own.scene()
-            memo_of(self._opened[0]).update(own.setup.memo)
-        if own.workers == 1 or on_gpu:
-            pump = WritePump.beside(own.backend, max(1, available_cores() // own.workers))
-        else:  # one thread and little waiting: the memory of a view counts once per worker
+            self._opened = scene_setup.scene()
+            memo_of(self._opened[0]).update(scene_setup.setup.memo)
+        if scene_setup.workers == 1 or on_gpu:
+            pump = WritePump.beside(
+                scene_setup.backend, max(1, available_cores() // scene_setup.workers)
+            )
+        else:  # one thread and a short queue: the memory of waiting views counts once per worker
             pump = WritePump(threads=1, waiting=2)
-        runner = FrameRunner(*self._opened, own.setup, own.renderer, self._on_outcome, pump)
+        runner = FrameRunner(
+            *self._opened, scene_setup.setup, scene_setup.renderer, self._on_outcome, pump
+        )
         with quick_turns(on_gpu):
             try:
                 for chunk in task:

@@ -29,7 +29,8 @@ def placed(boxes: Boxes) -> PlacedBoxes:
 def make_camera(width: int = 160, height: int = 106, pitch: float = 0.0) -> Camera:
     """At (0, 0, 1.6), looking along +x; pitch in radians, downwards."""
     level = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
-    c, s = np.cos(pitch), np.sin(pitch)
+    c = np.cos(pitch)
+    s = np.sin(pitch)
     down = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=torch.float64)
     rotation = down @ level
     pose = torch.eye(4, dtype=torch.float64)
@@ -55,7 +56,8 @@ def count_by_hand(
     """
     rays = camera.ray_directions(torch.float64).numpy()
     points = camera.centre.numpy() + depth_m[..., None].astype(np.float64) * rays
-    pixels, marked = [], []
+    pixels = []
+    marked = []
     for centre, quat, (low, high) in zip(boxes.centers_m, boxes.quats, extents_m, strict=True):
         rotation = rotmat_from_quat(torch.from_numpy(quat)).numpy()
         along = (points - (centre - ORIGIN_M)) @ rotation  # [H, W, 3]

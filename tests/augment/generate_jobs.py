@@ -141,7 +141,9 @@ def take_notes(path: Path) -> None:
 
 def read_notes(path: Path) -> tuple[list[str], Counter[str]]:
     """Images rendered again after they had been finished, and how often each was rendered."""
-    finished, again, rendered = set(), [], Counter()
+    finished = set()
+    again = []
+    rendered = Counter()
     for line in path.read_text().splitlines() if path.exists() else []:
         kind, _, name = line.partition(" ")
         if kind == "A":
@@ -181,14 +183,15 @@ def leftovers(out: Path) -> list[str]:
     state = out / STATE_FOLDER
     staged = [p for p in (state / "blocks").rglob("*")] if (state / "blocks").exists() else []
     claims = [p for p in (state / "claims").rglob("*")] if (state / "claims").exists() else []
-    found = staged + claims + list(out.rglob("*.climategs-tmp"))
-    return sorted(str(path.relative_to(out)) for path in found)
+    paths = staged + claims + list(out.rglob("*.climategs-tmp"))
+    return sorted(str(path.relative_to(out)) for path in paths)
 
 
-def check_reader(out: Path, whole: dict[str, str], *, may_fail: bool = False) -> int:
+def check_reader(out: Path, reference_digests: dict[str, str], *, may_fail: bool = False) -> int:
     """What a reader sees is finished and valid, at any time; returns how many images that is.
 
-    whole: digests of the uninterrupted job's files. may_fail: rows of failures are no surprise.
+    reference_digests: digests of the uninterrupted job's files. may_fail: rows of failures are
+    expected.
     """
     try:
         table = read_finished(open_store(out))
@@ -201,5 +204,5 @@ def check_reader(out: Path, whole: dict[str, str], *, may_fail: bool = False) ->
         for kind, path in row.items():
             if kind.endswith("_path") and path is not None:
                 data = (out / path).read_bytes()
-                assert hashlib.sha256(data).hexdigest() == whole[path], path
+                assert hashlib.sha256(data).hexdigest() == reference_digests[path], path
     return len(rows)

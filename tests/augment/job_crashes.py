@@ -55,7 +55,9 @@ from recipes.snow import Snow
 
 Work = Callable[[], object]
 CHANGES = ("fsync", "replace", "unlink", "rename", "rmdir", "link", "mkdir")
-DISK_FULL, INTERRUPTED, KILLED = 28, 130, -signal.SIGKILL
+DISK_FULL = 28
+INTERRUPTED = 130
+KILLED = -signal.SIGKILL
 
 
 def main(folder: Path, names: list[str]) -> None:
@@ -72,13 +74,13 @@ def main(folder: Path, names: list[str]) -> None:
         work(folder / f"warm-{number}")()  # imports what is imported late
     gc.collect()
     gc.freeze()  # or every fork looks through all that was imported
-    found = {}
+    results = {}
     for scenario in SCENARIOS:
         if scenario.__name__ in (names or [each.__name__ for each in SCENARIOS]):
             place = folder / scenario.__name__
             place.mkdir()
-            found[scenario.__name__] = scenario(place)
-    print(json.dumps(found))
+            results[scenario.__name__] = scenario(place)
+    print(json.dumps(results))
 
 
 # ---- Jobs in forks ------------------------------------------------------------------------------
@@ -155,15 +157,15 @@ def at_change(number: int) -> Work:
     """Makes a fork kill itself around its n-th change of the disk: odd before it, even after it."""
 
     def prepare() -> None:
-        met = [0]
+        num_changes = [0]
 
         def watched(call: Callable) -> Callable:
             def wrapper(*arguments, **options):
-                met[0] += 1
-                if met[0] >= (number + 1) // 2 and number % 2:
+                num_changes[0] += 1
+                if num_changes[0] >= (number + 1) // 2 and number % 2:
                     os.kill(os.getpid(), signal.SIGKILL)
                 result = call(*arguments, **options)
-                if met[0] >= number // 2 and not number % 2:
+                if num_changes[0] >= number // 2 and not number % 2:
                     os.kill(os.getpid(), signal.SIGKILL)
                 return result
 
@@ -226,20 +228,27 @@ def rendered_images() -> tuple[list[str], dict[str, int]]:
     return read_notes(Path(os.environ[jobs.NOTES]))
 
 
-def check_whole_files(out: Path, whole: dict[str, str], when: str) -> None:
+def check_whole_files(out: Path, reference_digests: dict[str, str], when: str) -> None:
     """Every file under a final name is the one of the uninterrupted run; readers see only such."""
     for name, digest in tree_digest(out).items():
         # A reader takes the manifest and the tables as they are: parts of the whole ones.
-        hidden = name.startswith(STATE_FOLDER) or name.endswith(TEMPORARY_SUFFIX)
+        is_hidden = name.startswith(STATE_FOLDER) or name.endswith(TEMPORARY_SUFFIX)
         is_growing = name == "manifest.parquet"
-        require(hidden or is_growing or whole.get(name) == digest, f"{when}: {name} is not whole")
-    check_reader(out, whole, may_fail=True)
+        require(
+            is_hidden or is_growing or reference_digests.get(name) == digest,
+            f"{when}: {name} is not whole",
+        )
+    check_reader(out, reference_digests, may_fail=True)
 
 
-def check_ended(out: Path, whole: dict[str, str], when: str, most: int = 10**9) -> None:
+def check_ended(out: Path, reference_digests: dict[str, str], when: str, most: int = 10**9) -> None:
     """All promises about a job that has got through. most: times that an image was rendered."""
     after = digests_of(out)
-    different = sorted(k for k in whole.keys() | after.keys() if whole.get(k) != after.get(k))
+    different = sorted(
+        k
+        for k in reference_digests.keys() | after.keys()
+        if reference_digests.get(k) != after.get(k)
+    )
     require(not different, f"{when}: these differ: {different}")
     require(not leftovers(out), f"{when}: left behind are {leftovers(out)}")
     again, rendered = rendered_images()
@@ -255,8 +264,9 @@ def notes_of(kind: str) -> set[str]:
 
 def wait_for_notes(more: int) -> None:
     """Until so many more images are finished."""
-    wanted, deadline = len(notes_of("A")) + more, time.monotonic() + 150
-    while len(notes_of("A")) < wanted:
+    num_notes = len(notes_of("A")) + more
+    deadline = time.monotonic() + 150
+    while len(notes_of("A")) < num_notes:
         require(time.monotonic() < deadline, "nothing is rendered")
         time.sleep(0.005)
 
@@ -264,7 +274,7 @@ def wait_for_notes(more: int) -> None:
 def workers_of_server() -> list[int]:
     """Worker processes: those that the fork server has started and that live."""
     server = server_process()
-    found = []
+    processes = []
     for entry in os.listdir("/proc"):
         if entry.isdigit():
             try:
@@ -272,8 +282,8 @@ def workers_of_server() -> list[int]:
             except OSError:
                 continue
             if int(facts[1]) == server and facts[0] != "Z":
-                found.append(int(entry))
-    return found
+                processes.append(int(entry))
+    return processes
 
 
 def wait_for_workers(limit_s: float = 20) -> None:
@@ -289,7 +299,9 @@ def wait_for_workers(limit_s: float = 20) -> None:
 
 def kill_until_through(folder: Path, job: Callable[..., Work], rounds: int, changes: int) -> dict:
     """Kill a job around four changes of the disk, one after the other, and let it get through."""
-    rng, kills, whole = random.Random(3), 0, whole_of(folder, job)
+    rng = random.Random(3)
+    kills = 0
+    reference_digests = whole_of(folder, job)
     for number in range(rounds):
         out = folder / f"killed-{number}"
         forget_notes()
@@ -297,10 +309,10 @@ def kill_until_through(folder: Path, job: Callable[..., Work], rounds: int, chan
             at = rng.randrange(1, changes)
             code = end_of(fork(job(out), at_change(at)))
             require(code in (0, KILLED), f"killed at {at}: exit code {code}")
-            check_whole_files(out, whole, f"killed at {at}")
+            check_whole_files(out, reference_digests, f"killed at {at}")
             kills += code == KILLED
         finish(job(out), f"round {number}")
-        check_ended(out, whole, f"round {number}")
+        check_ended(out, reference_digests, f"round {number}")
     return {"kills": kills}
 
 
@@ -309,11 +321,11 @@ def kill_a_few_times(folder: Path) -> dict:
     for name in ("render", "generate"):
         (folder / name).mkdir()
     small = {"scenes": ("fake:a?frames=2",)}
-    found = (
+    results = (
         kill_until_through(folder / "render", rendering, 1, 150),
         kill_until_through(folder / "generate", lambda out: generating(out, **small), 1, 120),
     )
-    return {"kills": sum(each["kills"] for each in found)}
+    return {"kills": sum(result["kills"] for result in results)}
 
 
 def kill_render_jobs(folder: Path) -> dict:
@@ -333,13 +345,17 @@ def kill_while_overwriting(folder: Path) -> dict:
         return lambda: run_job(job, scene_loader=open_fake, renderer=noting_render, progress=False)
 
     finish(old_job(folder / "old"), "the old job")
-    old, whole, kills = digests_of(folder / "old"), whole_of(folder, rendering), 0
+    old = digests_of(folder / "old")
+    reference_digests = whole_of(folder, rendering)
+    kills = 0
     # All that an overwriting run does before it renders is within its first 30 changes.
     for number in [*range(1, 60, 13), 100]:
         out = Path(shutil.copytree(folder / "old", folder / f"killed-{number}"))
         kills += end_of(fork(rendering(out, overwrite=True), at_change(number))) == KILLED
         if end_of(fork(rendering(out))) == 0:
-            require(digests_of(out) == whole, f"killed at {number}: the new tree differs")
+            require(
+                digests_of(out) == reference_digests, f"killed at {number}: the new tree differs"
+            )
         else:  # killed before the old content was given up
             finish(old_job(out), f"killed at {number}, neither job can go on")
             require(digests_of(out) == old, f"killed at {number}: the old tree differs")
@@ -355,7 +371,8 @@ def stop_jobs_with_workers(folder: Path) -> dict:
     for job in (rendering, generating):
         place = folder / job.__name__
         place.mkdir()
-        whole, out = whole_of(place, lambda out, job=job: job(out, workers=1)), place / "stopped"
+        reference_digests = whole_of(place, lambda out, job=job: job(out, workers=1))
+        out = place / "stopped"
 
         def work(job=job, out=out) -> None:
             with ended_by_sigterm():
@@ -369,34 +386,38 @@ def stop_jobs_with_workers(folder: Path) -> dict:
             code = end_of(child)
             require(code in (INTERRUPTED, KILLED), f"{how!r}: exit code {code}")
             wait_for_workers()
-            started, ended = notes_of("R"), notes_of("A")
+            started = notes_of("R")
+            ended = notes_of("A")
             require(how == signal.SIGKILL or started == ended, f"{how!r}: {started - ended}")
             stops.append(len(ended))
-            check_reader(out, whole) if job is generating else None
+            check_reader(out, reference_digests) if job is generating else None
         finish(job(out, workers=1), f"{job.__name__} does not go on")
-        check_ended(out, whole, "stopped", most=2)
+        check_ended(out, reference_digests, "stopped", most=2)
     return {"finished": stops}
 
 
 def fill_the_disk(folder: Path) -> dict:
     """Let the disk be full after ever more writes; free it, and go on."""
-    whole, failures, out = whole_of(folder, generating), 0, folder / "full"
+    reference_digests = whole_of(folder, generating)
+    failures = 0
+    out = folder / "full"
     for calls in range(0, 1000, 60):
         code = end_of(fork(generating(out), full_disk(calls)))
         require(code in (0, DISK_FULL), f"full after {calls} calls: exit code {code}")
-        check_reader(out, whole)
+        check_reader(out, reference_digests)
         failures += code == DISK_FULL
         forget_notes()
         if code == 0:
             break
     finish(generating(out), "after a full disk")
-    check_ended(out, whole, "after a full disk")
+    check_ended(out, reference_digests, "after a full disk")
     return {"failures": failures}
 
 
 def run_several_drivers(folder: Path) -> dict:
     """Shards and whole jobs at once on one output; they share the work, and one is killed."""
-    whole, out = whole_of(folder, generating), folder / "at-once"
+    reference_digests = whole_of(folder, generating)
+    out = folder / "at-once"
     job = make_job(out, renderer=slow_noting_render)
     shards = [lambda s=s: generate(replace(job, shard=(s, 3))) for s in (1, 2, 3)]
     children = [fork(work) for work in (*shards, lambda: generate(job), lambda: generate(job))]
@@ -404,7 +425,7 @@ def run_several_drivers(folder: Path) -> dict:
     os.kill(children[3], signal.SIGKILL)
     codes = [end_of(child) for child in children]
     require(codes[:3] + codes[4:] == [0] * 4, f"drivers at once: {codes}")
-    check_ended(out, whole, "drivers at once", most=2)
+    check_ended(out, reference_digests, "drivers at once", most=2)
     again = sum(count > 1 for count in rendered_images()[1].values())
     require(again <= 4, f"drivers at once: {again} images were rendered twice")
     return {"rendered_twice": again}
@@ -412,20 +433,24 @@ def run_several_drivers(folder: Path) -> dict:
 
 def die_at_one_image(folder: Path) -> dict:
     """A worker dies at one image each time; a later run renders that image alone."""
-    whole, out, results = whole_of(folder, generating), folder / "dying", folder / "results"
+    reference_digests = whole_of(folder, generating)
+    out = folder / "dying"
+    results = folder / "results"
     job = make_job(out, renderer=dying_render, executor="processes", workers=2)
     finish(lambda: results.write_text(json.dumps(vars(generate(job)), default=str)), "dying")
-    found = json.loads(results.read_text())
-    require(found["written"] + found["skipped"] == 27 and found["failed"] == 1, f"dying: {found}")
+    counts = json.loads(results.read_text())
     require(
-        "was killed by SIGKILL while rendering this image" in str(found["failures"]), f"{found}"
+        counts["written"] + counts["skipped"] == 27 and counts["failed"] == 1, f"dying: {counts}"
+    )
+    require(
+        "was killed by SIGKILL while rendering this image" in str(counts["failures"]), f"{counts}"
     )
     rows = read_finished(open_store(out)).to_pylist()
     failed = [(r["variant"], r["frame"], r["camera"]) for r in rows if r["status"] == "failed"]
     require(failed == [("fog-000", 1, "front")] and len(rows) == 28, f"dying: {failed}")
     before = sum(rendered_images()[1].values())
     finish(generating(out), "again")
-    check_ended(out, whole, "died at one image")
+    check_ended(out, reference_digests, "died at one image")
     again = sum(rendered_images()[1].values()) - before
     require(again == 1, f"dying: {again} rendered again")
     return {}
@@ -433,7 +458,9 @@ def die_at_one_image(folder: Path) -> dict:
 
 def die_while_opening(folder: Path) -> dict:
     """A worker dies whenever it opens one of the scenes; the other one is rendered."""
-    whole, out, results = whole_of(folder, generating), folder / "dying", folder / "results"
+    reference_digests = whole_of(folder, generating)
+    out = folder / "dying"
+    results = folder / "results"
     dying = make_job(out, opener=open_dying, executor="processes", workers=2)
 
     def render_dying() -> dict:
@@ -442,21 +469,21 @@ def die_while_opening(folder: Path) -> dict:
         )
         return json.loads(results.read_text())
 
-    found = render_dying()
-    require((found["written"], found["failed"]) == (16, 0), f"opening: {found}")
+    counts = render_dying()
+    require((counts["written"], counts["failed"]) == (16, 0), f"opening: {counts}")
     why = "the worker was killed by SIGKILL while opening the scene, alone too"
-    require(found["unusable"] == {"fake:b?frames=3": why}, f"opening: {found}")
+    require(counts["unusable"] == {"fake:b?frames=3": why}, f"opening: {counts}")
     # Known from before, it is found out only when its blocks are rendered.
     shutil.rmtree(out)
     forget_notes()
     finish(generating(out, shard=(1, 2)), "half")
-    found = render_dying()
-    require(found["skipped"] + found["written"] == 16 and found["failed"] == 12, f"{found}")
+    counts = render_dying()
+    require(counts["skipped"] + counts["written"] == 16 and counts["failed"] == 12, f"{counts}")
     rows = read_finished(open_store(out)).to_pylist()
     failed = {row["scene"] for row in rows if row["status"] == "failed"}
     require(failed == {"b"} and len(rows) == 28, f"opening later: {failed}")
     finish(generating(out), "opening later: it goes on")
-    check_ended(out, whole, "opening later")
+    check_ended(out, reference_digests, "opening later")
     return {}
 
 

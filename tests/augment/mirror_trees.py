@@ -61,19 +61,20 @@ def scene_of(root: Path, name: str = "street") -> Scene:
     scene = _open(f"fake:{name}")
     frames = []
     for frame in scene.frames:
-        found = {
+        image_paths = {
             camera: str(path)
             for camera, folder in CAMERAS.items()
             for path in (root / "camera" / folder).glob(f"{frame.index:02d}.*")
         }
-        frames.append(dataclasses.replace(frame, image_paths=found))
+        frames.append(dataclasses.replace(frame, image_paths=image_paths))
     return dataclasses.replace(scene, frames=tuple(frames), labels=FakeLabels())
 
 
 def render(root: Path, out: Path, *, scale: float = 1.0, name: str = "fog", **options) -> None:
     """Images of the dataset's scene under a recipe, as small as can be. options: of the job, and
     `image`, their format."""
-    image, renderer = options.pop("image", "png"), options.pop("renderer", fake_render)
+    image = options.pop("image", "png")
+    renderer = options.pop("renderer", fake_render)
     recipe = make_recipe(
         name, semantic=False, instance=False, depth="none", lidar=False, image=image
     )
@@ -107,14 +108,14 @@ def listing(root: Path) -> list[str]:
 
 def snapshot(root: Path) -> dict[str, tuple]:
     """All that must not change of a source: kinds, modes, times of change, inodes, contents."""
-    found = {}
+    file_states = {}
     for path in [root, *root.rglob("*")]:
         facts = path.lstat()
         content = path.read_bytes() if path.is_file() else None
         text = os.readlink(path) if path.is_symlink() else None
         key = (facts.st_mode, facts.st_mtime_ns, facts.st_ino, facts.st_size, content, text)
-        found[str(path)] = key
-    return found
+        file_states[str(path)] = key
+    return file_states
 
 
 def contents(root: Path) -> dict[str, bytes]:

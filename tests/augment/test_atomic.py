@@ -99,7 +99,8 @@ def test_a_run_with_the_number_of_a_killed_one_writes_the_same_and_leaves_nothin
 @pytest.mark.parametrize("kind", ["file", "folder"])
 def test_what_a_living_process_writes_stays(tmp_path, kind):
     path = tmp_path / "scene"
-    go_on, begun = os.pipe(), os.pipe()
+    go_on = os.pipe()
+    begun = os.pipe()
 
     def slowly() -> None:
         write = replaced_file(path) if kind == "file" else replaced_folder(path, ("mine",))
@@ -132,16 +133,21 @@ def test_what_a_living_process_writes_stays(tmp_path, kind):
 def test_what_is_cleared_and_what_is_not(tmp_path):
     (tmp_path / "original").write_bytes(b"keep")
     dead = [f".x.99-0{TEMPORARY_SUFFIX}", f".x.0123456789abcdef{TEMPORARY_SUFFIX}"]
-    others = [f".x.y.12-3{TEMPORARY_SUFFIX}", ".x.tmp", f"x{TEMPORARY_SUFFIX}", ".x.12.partial"]
-    for name in (*dead, *others):
+    foreign_names = [
+        f".x.y.12-3{TEMPORARY_SUFFIX}",
+        ".x.tmp",
+        f"x{TEMPORARY_SUFFIX}",
+        ".x.12.partial",
+    ]
+    for name in (*dead, *foreign_names):
         (tmp_path / name).write_bytes(b"half")
     (tmp_path / f".x.1{TEMPORARY_SUFFIX}").symlink_to("original")
     os.link(tmp_path / "original", tmp_path / f".x.2{TEMPORARY_SUFFIX}")
     os.mkfifo(tmp_path / f".x.3{TEMPORARY_SUFFIX}")
     write_atomic(tmp_path / "x", DATA)
-    assert sorted(os.listdir(tmp_path)) == sorted([*others, "original", "x"])
+    assert sorted(os.listdir(tmp_path)) == sorted([*foreign_names, "original", "x"])
     remove_temporaries(tmp_path)
-    assert sorted(os.listdir(tmp_path)) == sorted([*others[1:], "original", "x"])
+    assert sorted(os.listdir(tmp_path)) == sorted([*foreign_names[1:], "original", "x"])
     assert (tmp_path / "original").read_bytes() == b"keep"
 
 
@@ -160,18 +166,19 @@ def test_a_folders_leftovers_give_back_what_was_not_ours(tmp_path):
 
 
 def test_a_file_taken_for_left_behind_before_it_is_locked_is_made_anew(tmp_path, monkeypatch):
-    lock, taken = fcntl.flock, []
+    lock = fcntl.flock
+    removed_files = []
 
     def late(descriptor, operation):
-        if len(taken) < 3 and operation & fcntl.LOCK_EX:
-            taken.append(descriptor)
+        if len(removed_files) < 3 and operation & fcntl.LOCK_EX:
+            removed_files.append(descriptor)
             for path in temporaries(tmp_path):
                 path.unlink()
         lock(descriptor, operation)
 
     monkeypatch.setattr(fcntl, "flock", late)
     write_atomic(tmp_path / "x", DATA)
-    assert len(taken) == 3 and os.listdir(tmp_path) == ["x"]
+    assert len(removed_files) == 3 and os.listdir(tmp_path) == ["x"]
     assert (tmp_path / "x").read_bytes() == DATA
 
 
@@ -251,7 +258,8 @@ def test_a_state_folder_that_leads_out_of_the_output_is_refused(tmp_path):
 
 def test_a_lock_held_for_ever_is_waited_for_no_longer_than_said(tmp_path):
     path = tmp_path / "lock"
-    holder, waiter = open_lock(path), open_lock(path)
+    holder = open_lock(path)
+    waiter = open_lock(path)
     fcntl.flock(holder, fcntl.LOCK_EX)
     with pytest.raises(OutputError, match=r"has held this lock for 0 s \(builds\); end it"):
         wait_for_lock(path, waiter, patience_s=0.1, doing="builds")

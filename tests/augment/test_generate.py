@@ -68,9 +68,9 @@ def rendered(job: GenerateJob) -> list[str]:
     return names
 
 
-def rows_of(out: Path, **wanted) -> list[dict]:
+def rows_of(out: Path, **values) -> list[dict]:
     rows = read_finished(open_store(out)).to_pylist()
-    return [r for r in rows if all(r[key] == value for key, value in wanted.items())]
+    return [r for r in rows if all(r[key] == value for key, value in values.items())]
 
 
 @pytest.fixture(scope="module")
@@ -82,16 +82,20 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def whole(finished: Path) -> dict[str, str]:
+def reference_digests(finished: Path) -> dict[str, str]:
     return outputs(finished)
 
 
-def test_every_image_once_and_nothing_but_them_left(finished: Path, whole: dict) -> None:
+def test_every_image_once_and_nothing_but_them_left(
+    finished: Path, reference_digests: dict
+) -> None:
     rows = read_manifest(finished).to_pylist()
-    assert len(rows) == 12 and check_reader(finished, whole) == 12
-    named = {row[k] for row in rows for k in row if k.endswith("_path") and row[k] is not None}
+    assert len(rows) == 12 and check_reader(finished, reference_digests) == 12
+    listed_paths = {
+        row[k] for row in rows for k in row if k.endswith("_path") and row[k] is not None
+    }
     recipes = {f"{s}/{v}-000/recipe.yaml" for s in "ab" for v in ("fog", "wet")}
-    assert whole.keys() == named | recipes | {"manifest.parquet"}
+    assert reference_digests.keys() == listed_paths | recipes | {"manifest.parquet"}
     assert leftovers(finished) == []
     boxes = sorted(path.name[:7] for path in (finished / "a/fog-000/labels/boxes").iterdir())
     assert boxes == ["000000-", "000001-"]
@@ -114,15 +118,20 @@ def test_files_of_others_among_the_claims_stay(finished: Path, tmp_path: Path) -
     assert foreign.read_text() == "not a claim"
 
 
-def test_any_file_that_was_deleted_is_made_again(finished, whole, tmp_path: Path) -> None:
+def test_any_file_that_was_deleted_is_made_again(
+    finished, reference_digests, tmp_path: Path
+) -> None:
     """One of every folder; nothing but what is missing is rendered."""
     out = Path(shutil.copytree(finished, tmp_path / "out"))
-    firsts = {path.rpartition("/")[0]: path for path in whole}
-    names = {*firsts.values(), *(path for path in whole if path.endswith("recipe.yaml"))}
+    firsts = {path.rpartition("/")[0]: path for path in reference_digests}
+    names = {
+        *firsts.values(),
+        *(path for path in reference_digests if path.endswith("recipe.yaml")),
+    }
     for path in sorted(path for path in names if "/" in path):
         (out / path).unlink()
         images = rendered(small_job(out))
-        assert outputs(out) == whole, path
+        assert outputs(out) == reference_digests, path
         assert leftovers(out) == []
         if "/images/" in path or "/depth/" in path:
             assert len(images) == 1
@@ -130,20 +139,23 @@ def test_any_file_that_was_deleted_is_made_again(finished, whole, tmp_path: Path
             assert images == []
     shutil.rmtree(out / "a")
     assert len(rendered(small_job(out))) == 8
-    assert outputs(out) == whole and leftovers(out) == []
+    assert outputs(out) == reference_digests and leftovers(out) == []
 
 
-def test_shards_in_any_order_give_the_files_of_one_run(tmp_path: Path, whole: dict) -> None:
+def test_shards_in_any_order_give_the_files_of_one_run(
+    tmp_path: Path, reference_digests: dict
+) -> None:
     results = [run(small_job(tmp_path, shard=(k, 5))) for k in (4, 1, 5, 2, 3)]
     assert sum(result.written for result in results) == 12
-    assert outputs(tmp_path) == whole
+    assert outputs(tmp_path) == reference_digests
     assert run(small_job(tmp_path, shard=(2, 2), renderer=must_not_render)).written == 0
 
 
 @pytest.mark.long
 def test_only_what_is_new_is_rendered(tmp_path: Path) -> None:
     """More frames, scenes, recipes and variants, one after the other."""
-    dry, both = make_recipes(["dry"]), make_recipes(["dry", "wet"])
+    dry = make_recipes(["dry"])
+    both = make_recipes(["dry", "wet"])
     doubled = make_recipes(["dry", "wet"], variants=2)
     small = [JobScene(uri="fake:a?frames=3", frames="0:2")]
     assert len(rendered(make_job(tmp_path, small, dry))) == 4
@@ -165,9 +177,9 @@ def test_draws_differ_from_scene_to_scene_unless_they_are_shared(tmp_path: Path)
     scenes = ["fake:a?frames=1", "fake:b?frames=1"]
     run(make_job(tmp_path / "own", scenes, make_recipes(["fog"])))
     run(make_job(tmp_path / "shared", scenes, make_recipes(["fog"], draws="shared")))
-    own = {row["recipe_hash"] for row in rows_of(tmp_path / "own")}
+    scene_hashes = {row["recipe_hash"] for row in rows_of(tmp_path / "own")}
     shared = {row["recipe_hash"] for row in rows_of(tmp_path / "shared")}
-    assert (len(own), len(shared)) == (2, 1)
+    assert (len(scene_hashes), len(shared)) == (2, 1)
 
 
 def test_another_recipe_of_the_same_name_is_refused(finished: Path) -> None:
@@ -182,7 +194,9 @@ def test_another_recipe_of_the_same_name_is_refused(finished: Path) -> None:
     assert stored_plans(open_store(finished)) == plans
 
 
-def test_an_image_that_fails_costs_itself_and_is_tried_again(tmp_path: Path, whole: dict) -> None:
+def test_an_image_that_fails_costs_itself_and_is_tried_again(
+    tmp_path: Path, reference_digests: dict
+) -> None:
     result = run(small_job(tmp_path, renderer=raising_render))
     assert (result.written, result.failed) == (11, 1)
     assert "rendering: ValueError: the picture is cut short" in result.failures[0]
@@ -193,10 +207,10 @@ def test_an_image_that_fails_costs_itself_and_is_tried_again(tmp_path: Path, who
     assert read_manifest(tmp_path).num_rows == 12
     assert rendered(small_job(tmp_path, renderer=raising_render)) == ["a/fog-000/1/front"]
     assert rendered(small_job(tmp_path)) == ["a/fog-000/1/front"]
-    assert outputs(tmp_path) == whole and leftovers(tmp_path) == []
+    assert outputs(tmp_path) == reference_digests and leftovers(tmp_path) == []
 
 
-def test_a_scene_that_memory_does_not_suffice_for(tmp_path: Path, whole: dict) -> None:
+def test_a_scene_that_memory_does_not_suffice_for(tmp_path: Path, reference_digests: dict) -> None:
     """Unusable where it was never opened; else all its images are failed rows, and tried again."""
     result = run(small_job(tmp_path, opener=open_without_memory))
     assert (result.written, result.failed) == (8, 0)
@@ -209,14 +223,14 @@ def test_a_scene_that_memory_does_not_suffice_for(tmp_path: Path, whole: dict) -
     assert {row["scene"] for row in rows_of(out, status="failed")} == {"b"}
     assert len(rows_of(out)) == 12
     assert run(small_job(out)).failed == 0
-    assert outputs(out) == whole and leftovers(out) == []
+    assert outputs(out) == reference_digests and leftovers(out) == []
 
 
 def test_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ClimateGSError, match=r"both called 'a', so they would share a folder"):
         run(make_job(tmp_path, ["fake:a?frames=1", "fake:a?frames=2"]))
-    named = [JobScene(uri="fake:a?frames=1"), JobScene(uri="fake:a?frames=2", name="second")]
-    assert run(make_job(tmp_path, named, make_recipes(["dry"]))).written == 6
+    named_scenes = [JobScene(uri="fake:a?frames=1"), JobScene(uri="fake:a?frames=2", name="second")]
+    assert run(make_job(tmp_path, named_scenes, make_recipes(["dry"]))).written == 6
     assert (tmp_path / "second" / "dry-000").is_dir()
 
 
@@ -247,8 +261,8 @@ def test_a_damaged_record_of_a_scene_is_made_again(tmp_path: Path) -> None:
     job = make_job(tmp_path, ["fake:a?frames=1"], make_recipes(["dry"]))
     run(job)
     (record,) = (tmp_path / ".climategs" / "scenes").iterdir()
-    whole = record.read_bytes()
-    facts = json.loads(whole)
+    record_bytes = record.read_bytes()
+    facts = json.loads(record_bytes)
     for damaged in (b"", b"{}", b"[1]", json.dumps({**facts, "frames": [[1]]}).encode(),
                     json.dumps({**facts, "extra": 1}).encode()):  # fmt: skip
         record.write_bytes(damaged)
@@ -302,8 +316,8 @@ def test_sweeps_that_show_another_world_are_told_of_once(tmp_path: Path, caplog)
     recipes = make_recipes(("snowy",), variants=2, texts={"snowy": snowy}, block_images=2)
     scenes = ("fake:a?frames=2", "fake:b?frames=2&unlabelled=1")
     run(make_job(tmp_path / "out", scenes, recipes))
-    told = [record.message for record in caplog.records if "LiDAR passes" in record.message]
-    assert told == [
+    messages = [record.message for record in caplog.records if "LiDAR passes" in record.message]
+    assert messages == [
         "note: snowy-000: LiDAR passes through clean: snow 0.1 m deep in images, not in sweeps "
         "(output: {lidar: true, surface: solid}), and 1 more likewise"
     ]
@@ -325,9 +339,9 @@ def job_of(out: Path, backend: str, **options) -> GenerateJob:
 def test_a_gpu_has_one_process_and_a_name_and_mixes_with_no_cpu(tmp_path, monkeypatch) -> None:
     def slots_of(backend: str, workers: int = 0) -> int:
         options = {"workers": workers} if workers else {}
-        found = Workers(job_of(tmp_path, backend, executor="processes", **options))
-        found.close()
-        return found.slots
+        job_workers = Workers(job_of(tmp_path, backend, executor="processes", **options))
+        job_workers.close()
+        return job_workers.slots
 
     def planned(backend: str) -> str:
         return plan_job(job_of(tmp_path, backend, renderer=None), progress=False).backend
@@ -403,12 +417,12 @@ def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
 
 @pytest.mark.long
 def test_jobs_that_are_killed_stopped_or_starved_of_disk_go_on(quick_folder: Path) -> None:
-    found = found_by(quick_folder)
-    assert found["kill_render_jobs"]["kills"] + found["kill_generate_jobs"]["kills"] >= 30
-    assert found["kill_while_overwriting"]["kills"] >= 4
-    assert found["fill_the_disk"]["failures"] >= 2
-    assert len(found["stop_jobs_with_workers"]["finished"]) == 6
-    assert {"run_several_drivers", "die_at_one_image", "die_while_opening"} <= found.keys()
+    counts = found_by(quick_folder)
+    assert counts["kill_render_jobs"]["kills"] + counts["kill_generate_jobs"]["kills"] >= 30
+    assert counts["kill_while_overwriting"]["kills"] >= 4
+    assert counts["fill_the_disk"]["failures"] >= 2
+    assert len(counts["stop_jobs_with_workers"]["finished"]) == 6
+    assert {"run_several_drivers", "die_at_one_image", "die_while_opening"} <= counts.keys()
 
 
 # ---- Scenes whose files change between two runs --------------------------------------------------

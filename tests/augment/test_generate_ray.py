@@ -68,19 +68,24 @@ def dying_once(
 @pytest.mark.usefixtures("cluster")
 def test_job_gives_the_serial_bytes_with_too_few_cpus_and_an_actor_killed(tmp_path):
     """Two promises in one test, for every start of an actor imports torch anew."""
-    marker, seen = tmp_path / "killed", []
+    marker = tmp_path / "killed"
+    image_counts = []
     job = make_job(
         tmp_path / "out",
         executor="ray",
         workers=CPUS + 1,  # one finds no place
         renderer=partial(dying_once, marker=marker),
     )
-    result = run_generate(job, progress=False, on_image=lambda done, failed: seen.append(done))
+    result = run_generate(
+        job, progress=False, on_image=lambda done, failed: image_counts.append(done)
+    )
     assert marker.exists()
     assert result.failed == 0, result.failures
     assert outputs(tmp_path / "out") == serial(tmp_path / "serial")
     assert not leftovers(tmp_path / "out")
-    assert len(set(seen)) > 8, f"images are told of one by one, not in blocks: {seen}"
+    assert len(set(image_counts)) > 8, (
+        f"images are told of one by one, not in blocks: {image_counts}"
+    )
 
 
 @pytest.mark.long
@@ -93,8 +98,8 @@ def test_interrupt_lets_actors_finish_their_images(tmp_path):
     job = make_job(tmp_path / "out", executor="ray", workers=1, renderer=slow_render)
     with pytest.raises(KeyboardInterrupt, match="stopped"):
         run_generate(job, progress=False, on_image=interrupt)
-    held = [path for path in leftovers(tmp_path / "out") if "claims" in path]
-    assert not held, "a killed actor would have left its claim"
+    claim_files = [path for path in leftovers(tmp_path / "out") if "claims" in path]
+    assert not claim_files, "a killed actor would have left its claim"
     result = run_generate(make_job(tmp_path / "out"), progress=False)
     assert result.written < 28, "what was finished is not rendered again"
     assert outputs(tmp_path / "out") == serial(tmp_path / "serial")

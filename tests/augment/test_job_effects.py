@@ -48,7 +48,8 @@ from recipes.snow import Snow
 from recipes.style import Style
 
 # Snow of no depth is not laid, so no place is looked for; the stand-in draws some all the same.
-SNOW, FLOOD = Snow(depth_m=0), Flood(level_m=0.3)
+SNOW = Snow(depth_m=0)
+FLOOD = Flood(level_m=0.3)
 FOLDER = Path("street") / "fog-000"
 LABELS = FOLDER / "labels"
 CLEAR = make_recipe("clear")
@@ -66,7 +67,7 @@ def recipe() -> Recipe:
 
 
 @pytest.fixture(scope="module")
-def whole(recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished_dir(recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of one uninterrupted run; shared, so nobody writes to it."""
     out = tmp_path_factory.mktemp("effects") / "out"
     assert run(RenderJob("fake:street", [recipe], out)).failed == 0
@@ -74,8 +75,8 @@ def whole(recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copied(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "copied"))
+def copied_dir(finished_dir: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished_dir, tmp_path / "copied"))
 
 
 def rows_of(out: Path) -> list[dict]:
@@ -89,14 +90,14 @@ def camera_and_view(row: dict, recipe: Recipe) -> tuple[Camera, FakeView]:
 
 
 @pytest.mark.parametrize("kind", ["water", "snow"])
-def test_masks_hold_what_was_rendered(whole: Path, recipe: Recipe, kind: str) -> None:
-    assert {row[f"{kind}_path"] for row in rows_of(whole)} == {
+def test_masks_hold_what_was_rendered(finished_dir: Path, recipe: Recipe, kind: str) -> None:
+    assert {row[f"{kind}_path"] for row in rows_of(finished_dir)} == {
         f"street/fog-000/{kind}/{camera}/00000{frame}.png"
         for camera in ("front", "rear_left-16c859cb")
         for frame in range(4)
     }
-    for row in rows_of(whole):
-        mask = cv2.imread(str(whole / row[f"{kind}_path"]), cv2.IMREAD_UNCHANGED)
+    for row in rows_of(finished_dir):
+        mask = cv2.imread(str(finished_dir / row[f"{kind}_path"]), cv2.IMREAD_UNCHANGED)
         assert mask.dtype == np.uint8
         np.testing.assert_array_equal(mask, camera_and_view(row, recipe)[1].masks[kind])
         assert (row["snow_depth_m"], row["surface"]) == (0.0, "solid")
@@ -104,22 +105,26 @@ def test_masks_hold_what_was_rendered(whole: Path, recipe: Recipe, kind: str) ->
 
 def expected_numbers(kind: str, boxes: Boxes, camera: Camera, view: FakeView) -> dict:
     """Of what the file has of each box, without what follows from it."""
-    placed = PlacedBoxes.of(boxes, ORIGIN_M)
+    world_boxes = PlacedBoxes.of(boxes, ORIGIN_M)
     if kind == "smog":
-        seen = view.effects["smog"]
-        found = box_transmittance(placed, camera, seen.placed.data.fog, seen.depth_m)
-        return {"transmittance": found.transmittance, "pixels": found.pixels}
-    seen = view.effects["flood" if kind == "water" else kind]
+        effect_view = view.effects["smog"]
+        columns = box_transmittance(
+            world_boxes, camera, effect_view.placed.data.fog, effect_view.depth_m
+        )
+        return {"transmittance": columns.transmittance, "pixels": columns.pixels}
+    effect_view = view.effects["flood" if kind == "water" else kind]
     if kind == "snow":
-        if seen.depth_m is None:
+        if effect_view.depth_m is None:
             return {}
-        counted = snow_pixels(placed, camera, seen.depth_m, view.masks["snow"], THICKNESS_M)
+        counted = snow_pixels(
+            world_boxes, camera, effect_view.depth_m, view.masks["snow"], THICKNESS_M
+        )
         return {"pixels": counted.pixels, "snow_pixels": counted.marked}
-    found = {"submerged_fraction": submerged_fraction(placed, LEVEL_Z_M)}
-    if seen.depth_m is not None:
-        counted = hidden_pixels(placed, camera, seen.depth_m, view.masks["water"])
-        found |= {"pixels": counted.pixels, "hidden_pixels": counted.marked}
-    return found
+    columns = {"submerged_fraction": submerged_fraction(world_boxes, LEVEL_Z_M)}
+    if effect_view.depth_m is not None:
+        counted = hidden_pixels(world_boxes, camera, effect_view.depth_m, view.masks["water"])
+        columns |= {"pixels": counted.pixels, "hidden_pixels": counted.marked}
+    return columns
 
 
 @pytest.mark.parametrize(
@@ -131,10 +136,10 @@ def expected_numbers(kind: str, boxes: Boxes, camera: Camera, view: FakeView) ->
     ],
 )
 def test_boxes_have_their_numbers_beside_the_labels(
-    whole: Path, recipe: Recipe, kind, marked, fraction
+    finished_dir: Path, recipe: Recipe, kind, marked, fraction
 ) -> None:
     """Read with any Parquet reader, a row per frame, camera and box."""
-    path = whole / LABELS / f"{kind}.parquet"
+    path = finished_dir / LABELS / f"{kind}.parquet"
     rows = pq.read_table(path).to_pylist()
     assert [(row["frame"], row["camera"], row["box"]) for row in rows] == [
         (frame, camera, box)
@@ -143,7 +148,8 @@ def test_boxes_have_their_numbers_beside_the_labels(
         for box in range(frame % 4)
     ]
     for row in rows:
-        boxes, k = FakeLabels().boxes(row["frame"]), row["box"]
+        boxes = FakeLabels().boxes(row["frame"])
+        k = row["box"]
         assert row["track_id"] == boxes.track_ids[k]
         expected = expected_numbers(kind, boxes, *camera_and_view(row, recipe))
         assert {name: row[name] for name in expected} == {n: v[k] for n, v in expected.items()}
@@ -157,18 +163,20 @@ def test_boxes_have_their_numbers_beside_the_labels(
     pixels = [row["pixels"] or 0 for row in rows]
     assert 0 in pixels and max(pixels) > 0
     assert marked is None or sum(pixels) > sum(row[marked] for row in rows) > 0
-    assert all(whole / row[f"box_{kind}_path"] == path for row in rows_of(whole))
+    assert all(finished_dir / row[f"box_{kind}_path"] == path for row in rows_of(finished_dir))
 
 
-def test_a_clear_day_has_the_same_labels_and_no_tables(whole: Path, tmp_path: Path) -> None:
+def test_a_clear_day_has_the_same_labels_and_no_tables(finished_dir: Path, tmp_path: Path) -> None:
     names = ["boxes", "boxes_2d", "smog", "snow", "water"]
-    assert sorted(p.name for p in (whole / LABELS).iterdir()) == [f"{n}.parquet" for n in names]
+    assert sorted(p.name for p in (finished_dir / LABELS).iterdir()) == [
+        f"{n}.parquet" for n in names
+    ]
     run(RenderJob("fake:street", [CLEAR], tmp_path))
     clear = tmp_path / "street/clear-000"
     assert sorted(p.name for p in (clear / "labels").iterdir()) == [
         f"{n}.parquet" for n in names[:2]
     ]
-    boxes = (whole / LABELS / "boxes.parquet").read_bytes()
+    boxes = (finished_dir / LABELS / "boxes.parquet").read_bytes()
     assert (clear / "labels/boxes.parquet").read_bytes() == boxes
     assert not (clear / "snow").exists() and not (clear / "water").exists()
     for row in rows_of(tmp_path):
@@ -194,10 +202,12 @@ def test_a_view_that_breaks_its_contract_is_recorded(tmp_path, recipe, unchecked
     def without(name: str):
         return lambda images: {key: image for key, image in images.items() if key != name}
 
-    small, ones = np.zeros((8, 12), np.uint8), np.ones((16, 24), np.uint8)
-    foggy, flooded = make_recipe(instance=False), make_recipe(instance=False, flood=FLOOD)
+    small = np.zeros((8, 12), np.uint8)
+    ones = np.ones((16, 24), np.uint8)
+    foggy = make_recipe(instance=False)
+    flooded = make_recipe(instance=False, flood=FLOOD)
     as_asked = lambda image: image  # noqa: E731
-    for number, (asked, given, field, change, message) in enumerate([
+    for number, (requested_recipe, rendered_recipe, field, change, message) in enumerate([
         (recipe, recipe, "rgb", lambda _: np.zeros((16, 24, 3), np.float32), "rgb must be uint8"),
         (recipe, recipe, "rgb", lambda rgb: rgb[:8, :12], r"rgb of \[8, 12, 3\].*16 rows"),
         (recipe, recipe, "depth_m", lambda _: None, "returned no depth_m buffer"),
@@ -211,44 +221,59 @@ def test_a_view_that_breaks_its_contract_is_recorded(tmp_path, recipe, unchecked
         (foggy, make_recipe(), "rgb", as_asked, "a instance buffer, which the recipe does not ask"),
     ]):  # fmt: skip
 
-        def render(scene, camera, _, *, backend, given=given, field=field, change=change):
-            view = fake_render(scene, camera, given, backend=backend)
+        def render(
+            scene,
+            camera,
+            _,
+            *,
+            backend,
+            rendered_recipe=rendered_recipe,
+            field=field,
+            change=change,
+        ):
+            view = fake_render(scene, camera, rendered_recipe, backend=backend)
             return dataclasses.replace(view, **{field: change(getattr(view, field))})
 
         out = tmp_path / str(number)
-        result = run(RenderJob("fake:s", [asked], out, frames=[1], cameras=["front"]), render)
+        result = run(
+            RenderJob("fake:s", [requested_recipe], out, frames=[1], cameras=["front"]), render
+        )
         assert result.failed == 1 and re.search(message, result.failures[0]), result.failures
-        for kind in ("water", "snow") if asked is recipe else ():
+        for kind in ("water", "snow") if requested_recipe is recipe else ():
             table = box_tables()[f"box_{kind}"]
             assert not table.read(out / "s/fog-000/labels" / f"{kind}.parquet")
 
 
-def test_what_is_lost_or_damaged_is_made_again(whole: Path, recipe, copied: Path, caplog) -> None:
+def test_what_is_lost_or_damaged_is_made_again(
+    finished_dir: Path, recipe, copied_dir: Path, caplog
+) -> None:
     for lost, rendered in (
         (["snow/front/000001.png", "water/front/000002.png"], 2),
         (["labels/snow.parquet", "labels/water.parquet", "labels/smog.parquet"], 8),
         (["labels/boxes.parquet"], 0),  # which the scene still has
     ):
         for name in lost:
-            (copied / FOLDER / name).unlink()
-        assert run(RenderJob("fake:street", [recipe], copied)).written == rendered
-        assert tree_digest(copied) == tree_digest(whole)
-    table = copied / LABELS / "water.parquet"
+            (copied_dir / FOLDER / name).unlink()
+        assert run(RenderJob("fake:street", [recipe], copied_dir)).written == rendered
+        assert tree_digest(copied_dir) == tree_digest(finished_dir)
+    table = copied_dir / LABELS / "water.parquet"
     table.write_bytes(table.read_bytes()[:100])
-    assert run(RenderJob("fake:street", [recipe], copied)).written == 8
+    assert run(RenderJob("fake:street", [recipe], copied_dir)).written == 8
     assert "water.parquet is missing or not a readable" in caplog.text
-    assert tree_digest(copied) == tree_digest(whole)
+    assert tree_digest(copied_dir) == tree_digest(finished_dir)
 
 
-def test_parts_in_any_order_give_the_files_of_one_run(whole: Path, recipe, tmp_path: Path) -> None:
+def test_parts_in_any_order_give_the_files_of_one_run(
+    finished_dir: Path, recipe, tmp_path: Path
+) -> None:
     run(RenderJob("fake:street", [recipe], tmp_path, frames=[3, 1], cameras=["rear/left"]))
     assert len(box_tables()["box_snow"].read(tmp_path / LABELS / "snow.parquet")) == 2
     run(RenderJob("fake:street", [recipe], tmp_path, cameras=["front"]))
     assert run(RenderJob("fake:street", [recipe], tmp_path)).skipped == 6
-    assert tree_digest(tmp_path) == tree_digest(whole)
+    assert tree_digest(tmp_path) == tree_digest(finished_dir)
 
 
-def test_a_progress_log_carries_the_numbers(whole: Path, recipe, tmp_path: Path) -> None:
+def test_a_progress_log_carries_the_numbers(finished_dir: Path, recipe, tmp_path: Path) -> None:
     """As a kill leaves a folder: a log, and neither tables nor manifest."""
 
     def stops(scene, camera, recipe, *, backend):
@@ -261,30 +286,35 @@ def test_a_progress_log_carries_the_numbers(whole: Path, recipe, tmp_path: Path)
     assert not (tmp_path / "manifest.parquet").exists() and not (tmp_path / LABELS).exists()
     result = run(RenderJob("fake:street", [recipe], tmp_path))
     assert (result.skipped, result.written) == (4, 4)
-    assert tree_digest(tmp_path) == tree_digest(whole)
+    assert tree_digest(tmp_path) == tree_digest(finished_dir)
 
 
-def test_a_finished_folder_of_an_older_version_stays_as_it_is(whole, recipe, copied: Path) -> None:
+def test_a_finished_folder_of_an_older_version_stays_as_it_is(
+    finished_dir, recipe, copied_dir: Path
+) -> None:
     """Rendering all of it again would be the only way to the numbers: nobody asked for that. What
     is rendered anew has them.
     """
-    (copied / LABELS / "smog.parquet").unlink()
-    manifest = copied / "manifest.parquet"
+    (copied_dir / LABELS / "smog.parquet").unlink()
+    manifest = copied_dir / "manifest.parquet"
     pq.write_table(pq.read_table(manifest).drop_columns(["box_smog_path"]), manifest)
-    before, job = tree_digest(copied), RenderJob("fake:street", [recipe], copied)
+    before = tree_digest(copied_dir)
+    job = RenderJob("fake:street", [recipe], copied_dir)
     assert run(job, must_not_render).skipped == 8
-    assert tree_digest(copied) == before
-    sample = WeatherDataset(copied)[5]
+    assert tree_digest(copied_dir) == before
+    sample = WeatherDataset(copied_dir)[5]
     assert sample["paths"]["box_smog"] is None and sample["boxes"]["transmittance"] is None
     for lost in ("labels/boxes.parquet", "calibration.json"):  # comes back without rendering
-        (copied / FOLDER / lost).unlink()
+        (copied_dir / FOLDER / lost).unlink()
         assert run(job, must_not_render).skipped == 8
-        assert (copied / FOLDER / lost).read_bytes() == (whole / FOLDER / lost).read_bytes()
+        assert (copied_dir / FOLDER / lost).read_bytes() == (
+            finished_dir / FOLDER / lost
+        ).read_bytes()
     for frame in (0, 2):
-        (copied / FOLDER / "images" / "front" / f"{frame:06d}.png").unlink()
+        (copied_dir / FOLDER / "images" / "front" / f"{frame:06d}.png").unlink()
     assert run(job).written == 2
-    table = box_tables()["box_smog"].read(copied / LABELS / "smog.parquet")
-    has = {(r["frame"], r["camera"]) for r in rows_of(copied) if r["box_smog_path"]}
+    table = box_tables()["box_smog"].read(copied_dir / LABELS / "smog.parquet")
+    has = {(r["frame"], r["camera"]) for r in rows_of(copied_dir) if r["box_smog_path"]}
     assert has == set(table) == {(0, "front"), (2, "front")}
     assert run(job, must_not_render).skipped == 8
 
@@ -310,7 +340,7 @@ def test_all_comes_through_smog_without_density(tmp_path: Path) -> None:
     assert {(row["transmittance"], row["pixels"]) for row in rows} == {(1.0, None)}
 
 
-def test_visibility_is_what_all_effects_leave(whole: Path) -> None:
+def test_visibility_is_what_all_effects_leave(finished_dir: Path) -> None:
     names = ("a", "b", "c", "d")
     smog = box_tables()["box_smog"].from_json([names, [0.5, 0.25, 1.0, np.nan], [9, 0, 9, -1]])
     water = box_tables()["box_water"].from_json([names, [0.0] * 4, [10, 0, 4, 0], [5, 0, 4, 0]])
@@ -330,7 +360,7 @@ def test_visibility_is_what_all_effects_leave(whole: Path) -> None:
     ):
         np.testing.assert_array_equal(visibility(effects, 4), expected)
     assert visibility({}, 0).shape == (0,) and visibility({}, 0).dtype == np.float64
-    tables = {f"box_{k}": box_tables()[f"box_{k}"].read(whole / LABELS / f"{k}.parquet")
+    tables = {f"box_{k}": box_tables()[f"box_{k}"].read(finished_dir / LABELS / f"{k}.parquet")
               for k in ("smog", "water", "snow")}  # fmt: skip
     for item, numbers in tables["box_smog"].items():
         left = visibility({k: table[item] for k, table in tables.items()}, len(numbers.track_ids))
@@ -342,9 +372,10 @@ def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path)
     """Real beds and real pictures: whole, by two workers, and in parts that search anew. Another
     depth finds the bed in its file.
     """
-    recipe, uri = make_recipe(snow=Snow(depth_m=0.15, cell_m=0.2)), "fake:street?frames=2"
-    whole, shared, parts = (tmp_path / name for name in ("whole", "shared", "parts"))
-    result = run(RenderJob(uri, [recipe], whole), None)
+    recipe = make_recipe(snow=Snow(depth_m=0.15, cell_m=0.2))
+    uri = "fake:street?frames=2"
+    one_run_dir, shared, parts = (tmp_path / name for name in ("whole", "shared", "parts"))
+    result = run(RenderJob(uri, [recipe], one_run_dir), None)
     assert (result.written, result.failures) == (4, ())
     assert run(RenderJob(uri, [recipe], shared, workers=2), None).failures == ()
     run(RenderJob(uri, [recipe], parts, frames=[1], cameras=["front"]), None)
@@ -352,15 +383,19 @@ def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path)
         bed.unlink()
     assert run(RenderJob(uri, [recipe], parts), None).skipped == 1
     for out in (shared, parts):
-        assert tree_digest(out / "street") == tree_digest(whole / "street")
-        assert (out / "manifest.parquet").read_bytes() == (whole / "manifest.parquet").read_bytes()
-    masks = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in whole.rglob("snow/*/*.png")]
+        assert tree_digest(out / "street") == tree_digest(one_run_dir / "street")
+        assert (out / "manifest.parquet").read_bytes() == (
+            one_run_dir / "manifest.parquet"
+        ).read_bytes()
+    masks = [
+        cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in one_run_dir.rglob("snow/*/*.png")
+    ]
     assert len(masks) == 4 and max(mask.mean() for mask in masks) > 0
-    (bed,) = (whole / ".climategs").glob("snow-*")
+    (bed,) = (one_run_dir / ".climategs").glob("snow-*")
     before = bed.stat().st_mtime_ns
     deeper = make_recipe(variant=1, snow=Snow(depth_m=0.3, cell_m=0.2))
-    assert run(RenderJob(uri, [deeper], whole), None).failures == ()
-    assert [p.stat().st_mtime_ns for p in (whole / ".climategs").glob("snow-*")] == [before]
+    assert run(RenderJob(uri, [deeper], one_run_dir), None).failures == ()
+    assert [p.stat().st_mtime_ns for p in (one_run_dir / ".climategs").glob("snow-*")] == [before]
 
 
 # ---- Maps of styles: found once a job, and what renders its images again -------------------------
@@ -442,8 +477,8 @@ def test_the_recipe_in_the_folder_renders_it_again(searches, tmp_path: Path) -> 
     for path in images:
         path.unlink()
     folder = tmp_path / "taken" / "street" / "fog-002"
-    kept = sorted((folder / "style").iterdir())
-    assert len(kept) == 2 and {p.read_bytes() for p in kept} == contents
+    style_files = sorted((folder / "style").iterdir())
+    assert len(style_files) == 2 and {p.read_bytes() for p in style_files} == contents
     again = load_recipe(folder / "recipe.yaml").resolve(0)
     assert again.hash == recipe.hash and again.style is not None
     assert Path(again.style.image or "").parent == folder / "style"
@@ -509,16 +544,17 @@ def test_a_picture_under_another_name_is_the_same_style(searches, tmp_path: Path
 @pytest.mark.long
 def test_the_librarys_own_style_does_not_depend_on_how_a_job_went(tmp_path: Path) -> None:
     """Real maps and real pictures, whole and in parts that search anew."""
-    image, uri = image_at(tmp_path / "sunset.png", 150), "fake:street?frames=2"
+    image = image_at(tmp_path / "sunset.png", 150)
+    uri = "fake:street?frames=2"
     recipes = [styled(1, 0, image=image), styled(1, 1, image=image, applied_to="picture")]
-    whole, parts, plain = (tmp_path / name for name in ("whole", "parts", "plain"))
-    result = run_styled(RenderJob(uri, recipes, whole), None)
+    one_run_dir, parts, plain = (tmp_path / name for name in ("whole", "parts", "plain"))
+    result = run_styled(RenderJob(uri, recipes, one_run_dir), None)
     assert (result.written, result.failures) == (8, ())
     run_styled(RenderJob(uri, recipes, parts, frames=[1], cameras=["front"]), None)
     assert run_styled(RenderJob(uri, recipes, parts), None).skipped == 2
-    assert tree_digest(parts) == tree_digest(whole)
+    assert tree_digest(parts) == tree_digest(one_run_dir)
     run_styled(RenderJob(uri, [make_recipe()], plain), None)
     unstyled = tree_digest(plain / "street" / "fog-000" / "images")
     for variant in ("fog-000", "fog-001"):
-        pictures = tree_digest(whole / "street" / variant / "images")
+        pictures = tree_digest(one_run_dir / "street" / variant / "images")
         assert not set(pictures.values()) & set(unstyled.values())

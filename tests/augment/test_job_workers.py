@@ -59,7 +59,7 @@ def fog_job(out: Path, **options) -> RenderJob:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> dict[str, str]:
+def reference_digests(tmp_path_factory) -> dict[str, str]:
     """Digests of what a renderer that waits gives."""
     out = tmp_path_factory.mktemp("whole")
     run(fog_job(out))
@@ -77,7 +77,8 @@ class Gpu:
     count: int = 0
 
     def __call__(self, scene, camera, recipe, *, backend: str):
-        number, self.count = self.count, self.count + 1
+        number = self.count
+        self.count = self.count + 1
         self.began(number)
 
         def finish():
@@ -93,17 +94,19 @@ class Gpu:
         self.notes.append(("await", number))
 
 
-def test_the_next_view_is_begun_before_the_last_is_waited_for(tmp_path: Path, whole) -> None:
+def test_the_next_view_is_begun_before_the_last_is_waited_for(
+    tmp_path: Path, reference_digests
+) -> None:
     gpu = Gpu()
     assert run(fog_job(tmp_path), gpu).written == 8
     expected = [("begin", 0)]
     for number in range(1, 8):
         expected += [("begin", number), ("await", number - 1)]
     assert gpu.notes == [*expected, ("await", 7)]
-    assert tree_digest(tmp_path) == whole
+    assert tree_digest(tmp_path) == reference_digests
 
 
-def test_failures_are_those_of_the_view_they_happen_to(tmp_path: Path, whole) -> None:
+def test_failures_are_those_of_the_view_they_happen_to(tmp_path: Path, reference_digests) -> None:
     class Failing(Gpu):
         def began(self, number: int) -> None:
             super().began(number)
@@ -127,10 +130,12 @@ def test_failures_are_those_of_the_view_they_happen_to(tmp_path: Path, whole) ->
     }
     assert [n for kind, n in gpu.notes if kind == "await"] == [0, 1, 2, 4, 5, 6, 7]
     run(fog_job(tmp_path))
-    assert tree_digest(tmp_path) == whole
+    assert tree_digest(tmp_path) == reference_digests
 
 
-def test_a_lost_gpu_ends_the_run_and_fails_no_image(tmp_path: Path, monkeypatch, whole) -> None:
+def test_a_lost_gpu_ends_the_run_and_fails_no_image(
+    tmp_path: Path, monkeypatch, reference_digests
+) -> None:
     class Lost(Gpu):
         def awaited(self, number: int) -> None:
             if number >= 3:
@@ -142,10 +147,10 @@ def test_a_lost_gpu_ends_the_run_and_fails_no_image(tmp_path: Path, monkeypatch,
             run(fog_job(tmp_path), Lost())
     result = run(fog_job(tmp_path))
     assert (result.written, result.skipped, result.failed) == (5, 3, 0)
-    assert tree_digest(tmp_path) == whole
+    assert tree_digest(tmp_path) == reference_digests
 
 
-def test_an_interrupt_lands_what_is_in_flight(tmp_path: Path, whole) -> None:
+def test_an_interrupt_lands_what_is_in_flight(tmp_path: Path, reference_digests) -> None:
     class Interrupted(Gpu):
         waits = 0
 
@@ -161,7 +166,7 @@ def test_an_interrupt_lands_what_is_in_flight(tmp_path: Path, whole) -> None:
     assert gpu.notes[-2:] == [("await", 2), ("await", 3)]
     result = run(fog_job(tmp_path))
     assert (result.written, result.skipped) == (4, 4)
-    assert tree_digest(tmp_path) == whole
+    assert tree_digest(tmp_path) == reference_digests
 
 
 @pytest.mark.long
@@ -207,11 +212,12 @@ class SlowSweeps(FakeLabels):
         return super().lidar(frame_index)
 
 
-def test_pictures_do_not_wait_for_their_sweep(tmp_path: Path, whole) -> None:
+def test_pictures_do_not_wait_for_their_sweep(tmp_path: Path, reference_digests) -> None:
     """With one thread for the sweep and one for pictures: both of the frame are written, and none
     is told of before the sweep is there.
     """
-    labels, told = SlowSweeps(), []
+    labels = SlowSweeps()
+    outcomes = []
     scene = dataclasses.replace(open_fake("fake:street"), labels=labels)
 
     def let_come() -> None:
@@ -219,19 +225,22 @@ def test_pictures_do_not_wait_for_their_sweep(tmp_path: Path, whole) -> None:
         while len(list(tmp_path.rglob("images/*/*.png"))) < 2 and time.monotonic() < deadline:
             time.sleep(0.01)
         written.append(len(list(tmp_path.rglob("images/*/*.png"))))
-        assert not told
+        assert not outcomes
         labels.come.set()
 
     written: list[int] = []
     watcher = threading.Thread(target=let_come)
     watcher.start()
     job = fog_job(tmp_path, frames=[0])
-    result = run(job, scene_loader=lambda _uri: scene, on_outcome=told.append)
+    result = run(job, scene_loader=lambda _uri: scene, on_outcome=outcomes.append)
     watcher.join()
-    assert written == [2] and result.written == len(told) == 2
-    found = tree_digest(tmp_path / "street/fog-000/images")
+    assert written == [2] and result.written == len(outcomes) == 2
+    image_digests = tree_digest(tmp_path / "street/fog-000/images")
     stem = "street/fog-000/images/"
-    assert found == {k: whole[stem + k] for k in found} and len(found) == 2
+    assert (
+        image_digests == {k: reference_digests[stem + k] for k in image_digests}
+        and len(image_digests) == 2
+    )
 
 
 def test_pictures_of_a_sweep_that_fails_are_taken_back(tmp_path: Path) -> None:
@@ -251,20 +260,22 @@ def test_pictures_of_a_sweep_that_fails_are_taken_back(tmp_path: Path) -> None:
 
 
 def test_a_pump_takes_no_more_than_it_may_hold_and_stops_at_a_failure() -> None:
-    pump, go_on, taken = WritePump(threads=1, waiting=2), threading.Event(), []
+    pump = WritePump(threads=1, waiting=2)
+    go_on = threading.Event()
+    started_tasks = []
 
     def feed() -> None:
         for number in range(9):
             pump.submit(lambda: go_on.wait(SOON_S))
-            taken.append(number)
+            started_tasks.append(number)
 
     feeder = threading.Thread(target=feed)
     feeder.start()
     feeder.join(0.2)
-    assert len(taken) <= 2  # one waits, and one is at work
+    assert len(started_tasks) <= 2  # one waits, and one is at work
     go_on.set()
     feeder.join(SOON_S)
-    assert len(taken) == 9
+    assert len(started_tasks) == 9
 
     def fail() -> None:
         raise OutputError("the disk is full")
@@ -278,7 +289,8 @@ def test_a_pump_takes_no_more_than_it_may_hold_and_stops_at_a_failure() -> None:
 
 
 def test_an_interrupt_waits_for_what_is_being_written() -> None:
-    pump, written = WritePump(), []
+    pump = WritePump()
+    written = []
 
     def write() -> None:
         time.sleep(0.2)
@@ -293,7 +305,8 @@ def test_an_interrupt_waits_for_what_is_being_written() -> None:
 
 
 def test_an_interrupt_of_a_wait_is_an_interrupt_and_the_result_still_comes() -> None:
-    future, waiter = Future(), threading.get_ident()
+    future = Future()
+    waiter = threading.get_ident()
 
     def interrupt() -> None:
         time.sleep(0.1)
@@ -310,12 +323,18 @@ def test_an_interrupt_of_a_wait_is_an_interrupt_and_the_result_still_comes() -> 
 
 def test_who_is_busiest_bounds_the_job() -> None:
     """10 s of one worker with two writing threads; then of two workers."""
-    one = {"workers": 10.0, "renderers": 10.0, "writers": 20.0, "render": 9.0, "held": 0.5}
+    common_seconds = {
+        "workers": 10.0,
+        "renderers": 10.0,
+        "writers": 20.0,
+        "render": 9.0,
+        "held": 0.5,
+    }
 
     def shares(**seconds: float):
-        found = shares_of({**one, **seconds})
-        assert found is not None
-        return found
+        time_shares = shares_of({**common_seconds, **seconds})
+        assert time_shares is not None
+        return time_shares
 
     for bound_by, seconds in (
         ("rendering", {"encode": 8.0, "write": 1.0}),
@@ -328,10 +347,10 @@ def test_who_is_busiest_bounds_the_job() -> None:
     ):
         assert shares(**seconds).bound_by == bound_by
     both = {"workers": 20.0, "renderers": 16.0, "writers": 32.0, "render": 12.0, "held": 2.0}
-    found = shares(**both, encode=20.0)
-    assert found.rendering == 0.6 and found.held == 0.1
-    assert found.beside == pytest.approx(0.3)
-    assert found.writing["encoding"] == 0.5  # of four threads' 10 s
+    time_shares = shares(**both, encode=20.0)
+    assert time_shares.rendering == 0.6 and time_shares.held == 0.1
+    assert time_shares.beside == pytest.approx(0.3)
+    assert time_shares.writing["encoding"] == 0.5  # of four threads' 10 s
 
 
 # ---- Worker processes ----------------------------------------------------------------------------
@@ -356,8 +375,8 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     monkeypatch.setattr("augment.effects.style.style._find_maps", lambda *_: make_maps(0.4))
     style = Style(preset="dusk")
     recipes = [make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0.1), style=style)]
-    one = tmp_path / "one"
-    run(RenderJob("fake:street", recipes, one), bed_render)
+    one_worker_dir = tmp_path / "one"
+    run(RenderJob("fake:street", recipes, one_worker_dir), bed_render)
     job = RenderJob("fake:street", recipes, tmp_path / "two", workers=2)
     result = run(job, render_dying_at_frame_2)
     assert (result.written, result.failed) == (7, 1)
@@ -368,18 +387,18 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
 
     result = run(dataclasses.replace(job, workers=1), bed_render)
     assert (result.written, result.skipped, result.failed) == (1, 7, 0)
-    assert tree_digest(tmp_path / "two" / "street") == tree_digest(one / "street")
+    assert tree_digest(tmp_path / "two" / "street") == tree_digest(one_worker_dir / "street")
     manifest = (tmp_path / "two" / "manifest.parquet").read_bytes()
-    assert manifest == (one / "manifest.parquet").read_bytes()
+    assert manifest == (one_worker_dir / "manifest.parquet").read_bytes()
 
 
 @pytest.mark.usefixtures("quick_workers")
-def test_workers_finish_a_view_that_nothing_follows(tmp_path: Path, whole) -> None:
+def test_workers_finish_a_view_that_nothing_follows(tmp_path: Path, reference_digests) -> None:
     """They have it in flight when they have no more to do, and the job waits for it."""
     result = run(fog_job(tmp_path, workers=2), begin_fake)
     assert result.written == 8 and result.timings["await"] > 0
     assert 0 < result.timings["renderers"] < result.timings["workers"]
-    assert tree_digest(tmp_path) == whole
+    assert tree_digest(tmp_path) == reference_digests
 
 
 def test_what_cannot_be_sent_to_workers_is_refused(tmp_path: Path) -> None:

@@ -230,13 +230,13 @@ def some_tables(draw: st.DrawFn) -> list[dict[int, bool]]:
 @given(some_tables())
 @settings(max_examples=40, deadline=None)
 def test_latest_rows_are_those_of_the_first_table(frames: list[dict[int, bool]]) -> None:
-    tables = [table(given, str(number)) for number, given in enumerate(frames)]
-    wanted: dict[tuple[str, int], tuple[bool, str]] = {}
+    tables = [table(statuses, str(number)) for number, statuses in enumerate(frames)]
+    expected_rows: dict[tuple[str, int], tuple[bool, str]] = {}
     for number, given_frames in reversed(list(enumerate(frames))):
-        wanted |= {("a", f): (done, str(number)) for f, done in given_frames.items()}
-    found = latest_rows(tables)
-    assert seen(found) == wanted
-    assert found["frame"].to_pylist() == sorted({frame for _, frame in wanted})
+        expected_rows |= {("a", f): (done, str(number)) for f, done in given_frames.items()}
+    latest_table = latest_rows(tables)
+    assert seen(latest_table) == expected_rows
+    assert latest_table["frame"].to_pylist() == sorted({frame for _, frame in expected_rows})
 
 
 def test_of_two_rows_in_one_table_the_finished_one_counts() -> None:
@@ -285,8 +285,8 @@ def test_what_is_published_is_seen_whatever_is_merged_when(steps: list[tuple]) -
 
 def test_a_finished_block_is_not_replaced_by_a_failed_one(tmp_path: Path) -> None:
     store = open_store(tmp_path)
-    whole = publish_part(store, "a/b", table({0: True}))
-    assert publish_part(store, "a/b", table({0: False}, "died")).name == whole.name
+    complete_part = publish_part(store, "a/b", table({0: True}))
+    assert publish_part(store, "a/b", table({0: False}, "died")).name == complete_part.name
     assert frames_of(store) == {0: (True, "")}
 
 
@@ -307,13 +307,14 @@ def test_a_part_that_is_replaced_while_it_is_read(
 ) -> None:
     store = open_store(tmp_path)
     publish_part(store, "a/b", table({0: False}, "died"))
-    read, done = type(store).read, []
+    read_file = type(store).read
+    done = []
 
     def replaced(self: Store, path: str) -> bytes:
         if path.endswith(".failed.parquet") and not done:
             done.append(path)
             publish_part(store, "a/b", table({0: True}))
-        return read(self, path)
+        return read_file(self, path)
 
     monkeypatch.setattr(type(store), "read", replaced)
     assert frames_of(store) == {0: (True, "")} and done

@@ -42,8 +42,8 @@ def out(rendered, tmp_path) -> Path:
 
 def image_of(out: Path, camera: str, frame: int, variant: str = "fog-000") -> Path:
     folder = {"front": "front", "rear": "rear_left-" + "*"}[camera]
-    (found,) = (out / "street" / variant / "images").glob(f"{folder}/{frame:06d}.*")
-    return found
+    (path,) = (out / "street" / variant / "images").glob(f"{folder}/{frame:06d}.*")
+    return path
 
 
 def places(suffix: str = "png") -> set[str]:
@@ -56,8 +56,9 @@ def test_the_copy_is_the_source_in_all_but_the_images(source, out):
     copy = out / "source/fog-000/drive"
     assert done.folder == copy
     assert trees.listing(copy) == trees.listing(source)
-    recorded, shown = trees.contents(source), trees.contents(copy)
-    assert {name for name in recorded if recorded[name] != shown[name]} == places()
+    recorded = trees.contents(source)
+    copied_files = trees.contents(copy)
+    assert {name for name in recorded if recorded[name] != copied_files[name]} == places()
     for camera in ("front", "rear"):
         for frame in range(4):
             rendered = image_of(out, camera, frame)
@@ -65,7 +66,8 @@ def test_the_copy_is_the_source_in_all_but_the_images(source, out):
     for name in recorded.keys() - places():
         assert (copy / name).samefile(source / name)
     assert trees.snapshot(source) == before
-    files, sizes = done.record.files, done.record.bytes
+    files = done.record.files
+    sizes = done.record.bytes
     assert files["linked"] == len(recorded) - 8 and files["copied"] == done.new == 0
     assert sizes["linked"] == sum(len(recorded[name]) for name in recorded.keys() - places())
     assert (files["camera_images"], set(done.record.replaced)) == (8, places())
@@ -122,12 +124,14 @@ def test_more_images_come_in(source, tmp_path):
 @pytest.mark.long
 def test_going_on_after_a_kill_at_any_point(tmp_path, monkeypatch):
     """Stopped before or after each change of the disk: no half file, and the rest is done later."""
-    source, out = trees.write_dataset(tmp_path / "drive", frames=1), tmp_path / "out"
+    source = trees.write_dataset(tmp_path / "drive", frames=1)
+    out = tmp_path / "out"
     trees.render(source, out, frames=[0])
     (source / "camera" / "also").symlink_to("front")
     copy = out / "source/fog-000"
     uninterrupted = trees.mirror(source, out, links="copy")
-    whole, before = trees.contents(copy), trees.snapshot(source)
+    complete_files = trees.contents(copy)
+    before = trees.snapshot(source)
     assert uninterrupted.record.files["copied"] > 0
     for calls in itertools.count(1, 5):  # odd, so that stops come before and after changes
         shutil.rmtree(copy)
@@ -142,24 +146,24 @@ def test_going_on_after_a_kill_at_any_point(tmp_path, monkeypatch):
             break
         half = trees.contents(copy) if copy.is_dir() else {}
         final = {n: half[n] for n in half if not n.endswith((TEMPORARY_SUFFIX, ".files"))}
-        assert all(whole.get(name) == final[name] for name in final), f"stopped at {calls}"
+        assert all(complete_files.get(name) == final[name] for name in final), f"stopped at {calls}"
         trees.mirror(source, out, links="copy")
-        assert trees.contents(copy) == whole, f"stopped at {calls}"
+        assert trees.contents(copy) == complete_files, f"stopped at {calls}"
         assert trees.snapshot(source) == before
     assert calls > 20
 
 
-def stop_at(patch, wanted: int) -> None:
+def stop_at(patch, call_number: int) -> None:
     """Raise around the given change of the disk: odd before it, even after it."""
-    met = itertools.count(1)
+    call_counter = itertools.count(1)
 
     def watched(call):
         def wrapper(*arguments, **options):
-            mine = next(met)
-            if 2 * mine - 1 == wanted:
+            mine = next(call_counter)
+            if 2 * mine - 1 == call_number:
                 raise KeyboardInterrupt
             result = call(*arguments, **options)
-            if 2 * mine == wanted:
+            if 2 * mine == call_number:
                 raise KeyboardInterrupt
             return result
 
@@ -181,8 +185,8 @@ def test_a_stopped_update_does_not_say_that_it_is_complete(source, tmp_path, mon
     record = out / "source/fog-000/climategs-mirror-drive.json"
     assert not record.exists()
     # What stood in the copy is still known, for images of other scenes.
-    known = read_record(trees.tree_of(source), record.parent)
-    assert set(known.replaced) == {"camera/front/00.png", "camera/rear/00.png"}
+    stopped_record = read_record(trees.tree_of(source), record.parent)
+    assert set(stopped_record.replaced) == {"camera/front/00.png", "camera/rear/00.png"}
     trees.mirror(source, out)
     names = {p.name for p in record.parent.iterdir() if p.is_file()}
     assert names == {record.name, "climategs-mirror-drive.files"}
@@ -190,7 +194,8 @@ def test_a_stopped_update_does_not_say_that_it_is_complete(source, tmp_path, mon
 
 
 def test_a_full_disk_leaves_no_half_file(source, out, monkeypatch):
-    whole, before = trees.contents(source), trees.snapshot(source)
+    source_files = trees.contents(source)
+    before = trees.snapshot(source)
 
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -202,7 +207,7 @@ def test_a_full_disk_leaves_no_half_file(source, out, monkeypatch):
     copy = out / "source/fog-000"
     assert not any(p.name.endswith(TEMPORARY_SUFFIX) for p in copy.rglob("*"))
     for name, data in trees.contents(copy / "drive").items():
-        assert data == whole[name]
+        assert data == source_files[name]
     assert not (copy / "climategs-mirror-drive.json").exists()
     assert trees.snapshot(source) == before
 
@@ -220,16 +225,17 @@ def test_files_are_copied_where_they_cannot_be_linked(source, out, monkeypatch):
     assert trees.listing(done.folder) == trees.listing(source)
     for name in trees.contents(source):
         assert not (done.folder / name).samefile(source / name)
-    kept, again = source / "lidar/raw/00.bin", done.folder / "lidar/raw/00.bin"
-    assert again.read_bytes() == kept.read_bytes()
-    assert again.stat().st_mtime_ns == kept.stat().st_mtime_ns
+    source_file = source / "lidar/raw/00.bin"
+    again = done.folder / "lidar/raw/00.bin"
+    assert again.read_bytes() == source_file.read_bytes()
+    assert again.stat().st_mtime_ns == source_file.stat().st_mtime_ns
     assert trees.mirror(source, out).changed == 0
-    kept.write_bytes(b"of another length")
+    source_file.write_bytes(b"of another length")
     assert trees.mirror(source, out).changed == 1
     assert again.read_bytes() == b"of another length"
-    time_ns = kept.stat().st_mtime_ns
-    kept.write_bytes(b"of another length, at that time")
-    os.utime(kept, ns=(time_ns, time_ns))
+    time_ns = source_file.stat().st_mtime_ns
+    source_file.write_bytes(b"of another length, at that time")
+    os.utime(source_file, ns=(time_ns, time_ns))
     assert trees.mirror(source, out).changed == 1
 
 
@@ -255,7 +261,8 @@ def edit(path: Path, links: str) -> None:
 @pytest.mark.parametrize("links", ["hard", "copy"])
 def test_edits_in_the_copy_stop_it_before_anything_changes(source, out, links):
     done = trees.mirror(source, out, links=links)
-    label, image = done.folder / "lidar/raw/00.bin", done.folder / "camera/front/01.png"
+    label = done.folder / "lidar/raw/00.bin"
+    image = done.folder / "camera/front/01.png"
     edit(label, links)
     edit(image, links)
     (source / "README.md").unlink()
@@ -277,7 +284,8 @@ def test_files_that_were_there_before_stop_it(source, out):
     """Also where the dataset has a link, and of the same size and time as the dataset's."""
     (source / "camera/also").symlink_to("front")
     copy = out / "source/fog-000/drive"
-    content, time_ns = b"other" * 1000, (source / "lidar/raw/00.bin").stat().st_mtime_ns
+    content = b"other" * 1000
+    time_ns = (source / "lidar/raw/00.bin").stat().st_mtime_ns
     for place in ("README.md", "camera/also", "camera/front/00.png", "lidar/raw/00.bin"):
         (copy / place).parent.mkdir(parents=True, exist_ok=True)
         (copy / place).write_bytes(content)
@@ -295,7 +303,8 @@ def test_files_that_were_there_before_stop_it(source, out):
 def test_a_source_of_the_same_size_and_time_is_looked_into(source, out, links):
     trees.mirror(source, out, links=links)
     label = source / "lidar/raw/00.bin"
-    time_ns, content = label.stat().st_mtime_ns, bytes(5000)
+    time_ns = label.stat().st_mtime_ns
+    content = bytes(5000)
     if links == "hard":
         label.unlink()
     label.write_bytes(content)
@@ -309,8 +318,8 @@ def test_a_source_of_the_same_size_and_time_is_looked_into(source, out, links):
 def test_copies_of_earlier_versions_are_taken_as_they_are(source, out, monkeypatch):
     """They have no list of what was put there; from then on they have one."""
     done = trees.mirror(source, out, links="copy")
-    placed = out / "source/fog-000/climategs-mirror-drive.files"
-    placed.unlink()
+    list_path = out / "source/fog-000/climategs-mirror-drive.files"
+    list_path.unlink()
     (done.folder / "README.md").write_text("edited")
     (done.folder / "lidar/raw/00.bin").write_text("edited")
     with monkeypatch.context() as patch:
@@ -318,22 +327,24 @@ def test_copies_of_earlier_versions_are_taken_as_they_are(source, out, monkeypat
         with pytest.raises(KeyboardInterrupt):
             trees.mirror(source, out, links="copy")
     assert trees.mirror(source, out, links="copy").changed > 0
-    recorded, shown = trees.contents(source), trees.contents(done.folder)
-    assert all(shown[name] == recorded[name] for name in recorded.keys() - places())
+    recorded = trees.contents(source)
+    copied_files = trees.contents(done.folder)
+    assert all(copied_files[name] == recorded[name] for name in recorded.keys() - places())
     (done.folder / "README.md").write_text("edited")
     with pytest.raises(OutputError, match="not what was put in the copy"):
         trees.mirror(source, out, links="copy")
-    placed.write_text(placed.read_text() + '["half a li')  # when the power went
+    list_path.write_text(list_path.read_text() + '["half a li')  # when the power went
     with pytest.raises(OutputError, match="not what was put in the copy"):
         trees.mirror(source, out, links="copy")
-    placed.write_text("[1]\n")
+    list_path.write_text("[1]\n")
     with pytest.raises(OutputError, match=r"drive\.files is damaged: .* Delete it and run again"):
         trees.mirror(source, out, links="copy")
 
 
 def test_a_changed_source_is_noticed(source, out):
     done = trees.mirror(source, out)
-    table, new = source / "README.md", source / "camera/front/poses2.json"
+    table = source / "README.md"
+    new = source / "camera/front/poses2.json"
     table.unlink()
     table.write_text("Another dataset.\n")
     new.write_text("[]")
@@ -470,19 +481,20 @@ def test_a_source_that_cannot_be_written(source, out):
     ("scale", "method", "suffix"), [(0.5, cv2.INTER_CUBIC, "png"), (2.0, cv2.INTER_AREA, "jpg")]
 )
 def test_images_of_another_size_are_resized(tmp_path, scale, method, suffix):
-    source, out = trees.write_dataset(tmp_path / "drive", suffix=suffix), tmp_path / "out"
+    source = trees.write_dataset(tmp_path / "drive", suffix=suffix)
+    out = tmp_path / "out"
     trees.render(source, out, scale=scale, image=suffix)
     done = trees.mirror(source, out)
     width, height = batch_scenes.SIZE
     rendered = (round(width * scale), round(height * scale))
     assert done.resized == [(rendered, (width, height))] * 8
     file = done.folder / f"camera/front/01.{suffix}"
-    shown = decode_image(file.read_bytes()).astype(int)
-    assert shown.shape == (height, width, 3)
+    resized_image = decode_image(file.read_bytes()).astype(int)
+    assert resized_image.shape == (height, width, 3)
     image = decode_image(image_of(out, "front", 1).read_bytes())
     expected = cv2.resize(image, (width, height), interpolation=method).astype(int)
     # Noise of half the image's frequency, at quality 92: JPEG alone is off by some levels.
-    assert np.abs(shown - expected).mean() <= (0 if suffix == "png" else 8)
+    assert np.abs(resized_image - expected).mean() <= (0 if suffix == "png" else 8)
     assert done.new == 8 and done.record.bytes["new_images"] == sum(
         p.stat().st_size for p in (done.folder / "camera").glob(f"*/*.{suffix}")
     )
@@ -492,14 +504,15 @@ def test_images_of_another_size_are_resized(tmp_path, scale, method, suffix):
 
 
 def test_grey_images_stay_grey(source, tmp_path):
-    path, out = source / "camera/front/00.png", tmp_path / "out"
+    path = source / "camera/front/00.png"
+    out = tmp_path / "out"
     cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
     trees.render(source, out, frames=[0])
     done = trees.mirror(source, out)
-    shown = cv2.imread(str(done.folder / "camera/front/00.png"), cv2.IMREAD_UNCHANGED)
-    assert shown.ndim == 2
+    image = cv2.imread(str(done.folder / "camera/front/00.png"), cv2.IMREAD_UNCHANGED)
+    assert image.ndim == 2
     rgb = decode_image(image_of(out, "front", 0).read_bytes())
-    assert np.abs(shown - rgb @ [0.299, 0.587, 0.114]).max() < 1
+    assert np.abs(image - rgb @ [0.299, 0.587, 0.114]).max() < 1
     assert trees.mirror(source, out).changed == 0
 
 
@@ -524,15 +537,16 @@ def test_recorded_images_that_are_none_stay(source, out):
 
 
 def test_images_of_another_format_are_encoded_anew(tmp_path):
-    source, out = trees.write_dataset(tmp_path / "drive", suffix="jpg"), tmp_path / "out"
+    source = trees.write_dataset(tmp_path / "drive", suffix="jpg")
+    out = tmp_path / "out"
     frame = batch_scenes.make_frame(0)
-    for names, found in (
+    for names, image_format in (
         (("a.jpg", "b.JPEG"), "jpg"),
         (("a.png",), "png"),
         (("a.png", "b.jpg"), "png"),
     ):
         paths = {str(number): name for number, name in enumerate(names)}
-        assert dataset_format([dataclasses.replace(frame, image_paths=paths)]) == found
+        assert dataset_format([dataclasses.replace(frame, image_paths=paths)]) == image_format
     with pytest.raises(AdapterError, match="knows no recorded image"):
         dataset_format([frame])
     trees.render(source, out, image="png")

@@ -111,9 +111,14 @@ def test_a_budget_is_kept_where_the_fastest_keeps_it(errors, saved, budget_ms: f
 
 
 def test_values_that_save_nothing_are_left_out() -> None:
-    reference, noise, slower = Cost("exact", 100, 0), Cost("noise", 99, 0.01), Cost("s", 120, 0.02)
-    good, worse, equal = Cost("good", 80, 0.03), Cost("worse", 85, 0.05), Cost("equal", 90, 0.03)
-    fastest, free = Cost("fastest", 50, 0.2), Cost("free", 80, 0)
+    reference = Cost("exact", 100, 0)
+    noise = Cost("noise", 99, 0.01)
+    slower = Cost("s", 120, 0.02)
+    good = Cost("good", 80, 0.03)
+    worse = Cost("worse", 85, 0.05)
+    equal = Cost("equal", 90, 0.03)
+    fastest = Cost("fastest", 50, 0.2)
+    free = Cost("free", 80, 0)
     costs = [fastest, worse, equal, good, slower, noise, reference]
     assert useful(costs) == [reference, good, fastest]
     assert useful([free, reference]) == [reference, free]  # as accurate as reference, and faster
@@ -123,11 +128,11 @@ def test_values_that_save_nothing_are_left_out() -> None:
 
 
 def picked(frames: int, cameras: int, count: int = 3) -> list[tuple[int, str]]:
-    held = {f"c{number}": make_camera(f"c{number}", 0, 0.0) for number in range(cameras)}
+    camera_of_name = {f"c{number}": make_camera(f"c{number}", 0, 0.0) for number in range(cameras)}
     eye = torch.eye(4, dtype=torch.float64)
-    each = [Frame(index, index, eye, dict(held)) for index in range(frames)]
-    views = calibration_views(each, count)
-    assert calibration_views(each[::-1], count) == views
+    frame_list = [Frame(index, index, eye, dict(camera_of_name)) for index in range(frames)]
+    views = calibration_views(frame_list, count)
+    assert calibration_views(frame_list[::-1], count) == views
     return [(view.frame, view.name) for view in views]
 
 
@@ -152,10 +157,10 @@ def test_small_pictures_are_enlarged_and_depths_are_not_mixed() -> None:
     def render(scene, camera, recipe, *, backend: str) -> FakeView:
         return FakeView(picture, np.array([[1, 9], [1, 9]], np.float32))
 
-    given = (open_fake("fake:a"), make_camera("front", 0, 0.0), Recipe())
-    trial = render_trial(*given, renderer=render, size=(4, 4))
+    arguments = (open_fake("fake:a"), make_camera("front", 0, 0.0), Recipe())
+    trial = render_trial(*arguments, renderer=render, size=(4, 4))
     assert trial.depth is not None and trial.depth[3].tolist() == [1, 1, 9, 9]
-    own_size = render_trial(*given, renderer=render)
+    own_size = render_trial(*arguments, renderer=render)
     assert own_size.picture.shape == (16, 24, 3)
 
 
@@ -173,7 +178,9 @@ class Workbench:
     """A renderer whose pictures and times depend on the settings in a known way; a fake clock."""
 
     def __init__(self) -> None:
-        self.now_s, self.rendered, self.slowness = 0.0, 0, 1.0
+        self.now_s = 0.0
+        self.rendered = 0
+        self.slowness = 1.0
 
     def render(self, scene, camera, recipe: Recipe, *, backend: str) -> FakeView:
         make_plan(recipe, scene)  # as the real one, refuses what is not settled
@@ -204,7 +211,8 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Workbench:
 
 
 def test_a_choice_by_error_is_within_the_bound_and_the_same_again() -> None:
-    recipe, scene = open_recipe("max_flip: 0.06"), open_fake("fake:street")
+    recipe = open_recipe("max_flip: 0.06")
+    scene = open_fake("fake:street")
     chosen = resolve_quality(recipe, scene)
     assert resolve_quality(recipe, scene).recipe == chosen.recipe
     assert chosen.is_met and chosen.ms is None
@@ -235,7 +243,8 @@ def test_a_budget_takes_as_little_as_it_needs(bench: Workbench) -> None:
         recipe = open_recipe(f"budget_ms: {budget_ms}")
         return resolve_quality(recipe, open_fake("fake:street"), renderer=bench.render)
 
-    enough, half = chosen(150), chosen(70)
+    enough = chosen(150)
+    half = chosen(70)
     assert (enough.recipe.render.scale, enough.recipe.render.sh_degree) == (1.0, None)
     assert enough.ms == enough.reference_ms == pytest.approx(120) and enough.flip == 0
     render = half.recipe.render
@@ -262,13 +271,14 @@ def test_snow_that_a_scene_cannot_have_so_fine_is_coarser() -> None:
     recipe = open_recipe("budget_ms: 1e6", "weather: {snow: {depth_m: 0}}\nrender: {scale: 1}\n")
     chosen = resolve_quality(recipe, open_fake("fake:a"), renderer=render)
     assert found(chosen.recipe, "weather.snow.cell_m") == 0.1
-    given = open_recipe("max_flip: 0.1", "weather: {snow: {depth_m: 0, cell_m: 0.05}}\n")
+    quality_recipe = open_recipe("max_flip: 0.1", "weather: {snow: {depth_m: 0, cell_m: 0.05}}\n")
     with pytest.raises(SceneError, match="too many cells"):
-        resolve_quality(given, open_fake("fake:a"), renderer=render)
+        resolve_quality(quality_recipe, open_fake("fake:a"), renderer=render)
 
 
 def test_what_has_not_chosen_is_not_rendered() -> None:
-    scene, recipe = open_fake("fake:street"), open_recipe("max_flip: 0.1")
+    scene = open_fake("fake:street")
+    recipe = open_recipe("max_flip: 0.1")
     with pytest.raises(RecipeError, match=r"fog, variant 0: quality max_flip 0\.1 has still to"):
         render_view(scene, make_camera("front", 0, 0.0), recipe)
     tried = recipes_to_try(recipe)
@@ -303,8 +313,8 @@ def test_a_job_goes_on_with_its_choice_whatever_the_clock_says(
     assert {r["render_scale"] for r in rows} == {0.75} and {r["width"] for r in rows} == {18}
     assert {r["quality"] for r in rows} == {"budget_ms 70"}
     assert json.loads(rows[0]["settings"])["render.scale"] == 0.75
-    (kept,) = (tmp_path / "a/.climategs/quality").iterdir()
-    choice, machine = (json.loads(kept.read_bytes())[k] for k in ("choice", "this_machine"))
+    (choice_file,) = (tmp_path / "a/.climategs/quality").iterdir()
+    choice, machine = (json.loads(choice_file.read_bytes())[k] for k in ("choice", "this_machine"))
     assert choice["is_met"] and machine["reference_ms"] == pytest.approx(120)
 
     # Elsewhere the recipe that the job leaves gives the same images, and chooses nothing.
@@ -325,9 +335,11 @@ def changed(document: dict, part: str, key: str, value) -> bytes:
 
 
 def test_a_damaged_choice_is_told(bench: Workbench, tmp_path: Path) -> None:
-    store, recipe, scene = open_store(tmp_path), open_recipe("max_flip: 0.5"), open_fake("fake:a")
-    given = (store, recipe, scene)
-    chosen = resolve_quality_for(*given, backend="cpu", renderer=bench.render)
+    store = open_store(tmp_path)
+    recipe = open_recipe("max_flip: 0.5")
+    scene = open_fake("fake:a")
+    arguments = (store, recipe, scene)
+    chosen = resolve_quality_for(*arguments, backend="cpu", renderer=bench.render)
     question = Question(recipe, scene.name, scene.source, "recorded", "cpu")
     assert recorded(store, question) == chosen
     document = json.loads(store.read(question.path))
@@ -342,7 +354,7 @@ def test_a_damaged_choice_is_told(bench: Workbench, tmp_path: Path) -> None:
         store.write(question.path, data)
         message = r"recipe fog in scene a, is damaged: .*Delete it"
         with pytest.raises(OutputError, match=message):
-            resolve_quality_for(*given, backend="cpu", renderer=bench.render)
+            resolve_quality_for(*arguments, backend="cpu", renderer=bench.render)
 
 
 def test_what_a_recipe_leaves_free_is_part_of_the_question() -> None:
@@ -362,13 +374,15 @@ def _choose_slowly(folder: str, worst_scale: float, answers) -> None:
         shade = 0 if recipe.render.scale < worst_scale else 255
         return FakeView(np.full((size.height, size.width, 3), shade, np.uint8))
 
-    recipe, store = open_recipe("max_flip: 0.5"), open_store(folder)
-    given = {"backend": "cpu", "renderer": render}
-    answers.put(resolve_quality_for(store, recipe, open_fake("fake:a"), **given).render.scale)
+    recipe = open_recipe("max_flip: 0.5")
+    store = open_store(folder)
+    options = {"backend": "cpu", "renderer": render}
+    answers.put(resolve_quality_for(store, recipe, open_fake("fake:a"), **options).render.scale)
 
 
 def test_two_processes_agree(tmp_path: Path) -> None:
-    context, scales = multiprocessing.get_context("fork"), (0.25, 0.5)
+    context = multiprocessing.get_context("fork")
+    scales = (0.25, 0.5)
     answers = context.Queue()
     children = [
         context.Process(target=_choose_slowly, args=(str(tmp_path), s, answers)) for s in scales

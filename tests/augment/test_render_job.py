@@ -53,7 +53,7 @@ def fog_job(out: Path, uri: str = "fake:street", **options) -> RenderJob:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of one uninterrupted run; shared, so nobody writes to it."""
     out = tmp_path_factory.mktemp("whole") / "out"
     result = run(fog_job(out))
@@ -62,8 +62,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copied(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "copied"))
+def copied_dir(finished_dir: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished_dir, tmp_path / "copied"))
 
 
 # ---- Files ---------------------------------------------------------------------------------------
@@ -77,15 +77,16 @@ def assert_same_column(got: np.ndarray, expected: np.ndarray) -> None:
         assert got.tobytes() == expected.tobytes()
 
 
-def test_files_hold_what_was_rendered(whole: Path) -> None:
-    recipe, scene = make_recipe(), open_fake("fake:street")
+def test_files_hold_what_was_rendered(finished_dir: Path) -> None:
+    recipe = make_recipe()
+    scene = open_fake("fake:street")
     for frame in scene.frames:
         for name, camera in frame.cameras.items():
             paths = item_paths("street", recipe, name, frame.index)
             view = fake_render(scene, camera, recipe, backend="auto")
-            image = cv2.imread(str(whole / paths["image"]), cv2.IMREAD_COLOR_RGB)
+            image = cv2.imread(str(finished_dir / paths["image"]), cv2.IMREAD_COLOR_RGB)
             np.testing.assert_array_equal(image, view.rgb)
-            depth = cv2.imread(str(whole / paths["depth"]), cv2.IMREAD_UNCHANGED)
+            depth = cv2.imread(str(finished_dir / paths["depth"]), cv2.IMREAD_UNCHANGED)
             assert depth.dtype == np.uint16
             none = (view.depth_m < 1 / 512) | (view.depth_m > 65535.5 / 256)
             assert none.any() and not none.all()
@@ -93,7 +94,7 @@ def test_files_hold_what_was_rendered(whole: Path) -> None:
             # Half a step of 1/256 m.
             assert np.abs(depth / 256 - view.depth_m)[~none].max() <= 1 / 512
             for kind, ids in (("semantic", view.semantic), ("instance", view.instance)):
-                written = cv2.imread(str(whole / paths[kind]), cv2.IMREAD_UNCHANGED)
+                written = cv2.imread(str(finished_dir / paths[kind]), cv2.IMREAD_UNCHANGED)
                 np.testing.assert_array_equal(written, ids)
 
 
@@ -144,12 +145,13 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
     assert len(files) == 9 and all((tmp_path / file).is_file() for file in files)
 
 
-def test_labels_and_lidar_pass_through_to_the_bit(whole: Path) -> None:
-    folder = whole / FOLDER
+def test_labels_and_lidar_pass_through_to_the_bit(finished_dir: Path) -> None:
+    folder = finished_dir / FOLDER
     written = read_boxes(folder / "labels" / "boxes.parquet")
     assert list(written) == [0, 1, 2, 3]
     for number in range(4):
-        expected, got = FakeLabels().boxes(number), written[number].boxes
+        expected = FakeLabels().boxes(number)
+        got = written[number].boxes
         assert written[number].timestamp_ns == make_frame(number).timestamp_ns
         assert (got.track_ids, got.labels) == (expected.track_ids, expected.labels)
         for name in ("centers_m", "sizes_m", "quats"):
@@ -187,7 +189,7 @@ def test_calibration_is_in_the_datasets_world(tmp_path: Path) -> None:
     assert again == recipe and again.hash == recipe.hash
 
 
-def test_a_bad_frame_is_recorded_and_the_rest_goes_on(whole: Path, tmp_path: Path) -> None:
+def test_a_bad_frame_is_recorded_and_the_rest_goes_on(finished_dir: Path, tmp_path: Path) -> None:
     def render(scene, camera, recipe, *, backend):
         if camera.timestamp_ns == make_frame(2).cameras["rear/left"].timestamp_ns:
             raise RuntimeError("the covariance of splat 7\nis singular")
@@ -211,7 +213,7 @@ def test_a_bad_frame_is_recorded_and_the_rest_goes_on(whole: Path, tmp_path: Pat
     # Mended, only those are tried again, and the result is that of a run without failures.
     result = run(fog_job(tmp_path))
     assert (result.written, result.skipped, result.failed) == (3, 5, 0)
-    assert tree_digest(tmp_path) == tree_digest(whole)
+    assert tree_digest(tmp_path) == tree_digest(finished_dir)
 
 
 def test_an_unreadable_sweep_fails_its_frame(tmp_path: Path) -> None:
@@ -229,7 +231,8 @@ def test_an_unreadable_sweep_fails_its_frame(tmp_path: Path) -> None:
 
 
 def test_jobs_that_cannot_be_are_refused_before_anything_is_written(tmp_path: Path) -> None:
-    out, recipe = tmp_path / "out", make_recipe()
+    out = tmp_path / "out"
+    recipe = make_recipe()
     for error, message, recipes, options in (
         (SceneError, r"no frame 9, 11; it has 0-3", [recipe], {"frames": [2, 9, 11]}),
         (SceneError, r"no camera back; it has front, rear/left", [recipe], {"cameras": ["back"]}),
@@ -265,7 +268,8 @@ def test_a_camera_path_replaces_the_frames(tmp_path: Path) -> None:
 
 
 def test_a_second_job_on_the_same_folder_is_refused(tmp_path: Path) -> None:
-    begun, go_on = threading.Event(), threading.Event()
+    begun = threading.Event()
+    go_on = threading.Event()
 
     def render(scene, camera, recipe, *, backend):
         begun.set()
@@ -294,7 +298,8 @@ def test_the_lock_of_a_dead_process_does_not_last(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_stops_the_job_and_says_what_to_do(tmp_path, monkeypatch) -> None:
-    real, left = os.fsync, [80]
+    real = os.fsync
+    left = [80]
 
     def flush(descriptor):
         left[0] -= 1
@@ -339,11 +344,11 @@ def test_the_librarys_own_renderer(tmp_path: Path) -> None:
 # ---- Going on ------------------------------------------------------------------------------------
 
 
-def test_a_complete_job_renders_nothing_and_touches_nothing(copied: Path) -> None:
-    before = {path: path.stat().st_mtime_ns for path in copied.rglob("*") if path.is_file()}
-    result = run(fog_job(copied), must_not_render)
+def test_a_complete_job_renders_nothing_and_touches_nothing(copied_dir: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in copied_dir.rglob("*") if path.is_file()}
+    result = run(fog_job(copied_dir), must_not_render)
     assert (result.written, result.skipped, result.failed) == (0, 8, 0)
-    lock = copied / ".climategs" / "lock"
+    lock = copied_dir / ".climategs" / "lock"
     after = {path: path.stat().st_mtime_ns for path in before}
     assert {p for p in before if before[p] != after[p]} <= {lock}
 
@@ -359,39 +364,40 @@ def test_selections_in_any_order_give_the_tree_of_one_run(tmp_path: Path) -> Non
 
 
 def test_a_missing_file_is_rendered_again_and_leftovers_of_a_killed_run_go(
-    whole: Path, copied: Path
+    finished_dir: Path, copied_dir: Path
 ) -> None:
-    for place in (copied / FOLDER / "images" / "front", copied, copied / ".climategs"):
+    for place in (copied_dir / FOLDER / "images" / "front", copied_dir, copied_dir / ".climategs"):
         (place / ".000001.png.99-0.climategs-tmp").write_bytes(b"half")
-    assert run(fog_job(copied), must_not_render).skipped == 8
-    assert tree_digest(copied) == tree_digest(whole)
+    assert run(fog_job(copied_dir), must_not_render).skipped == 8
+    assert tree_digest(copied_dir) == tree_digest(finished_dir)
     for name in ("images/front/000001.png", "depth/front/000002.png", "labels/boxes.parquet"):
-        (copied / FOLDER / name).unlink()
-    assert run(fog_job(copied)).written == 2
-    assert tree_digest(copied) == tree_digest(whole)
+        (copied_dir / FOLDER / name).unlink()
+    assert run(fog_job(copied_dir)).written == 2
+    assert tree_digest(copied_dir) == tree_digest(finished_dir)
 
 
 def test_any_file_that_was_deleted_is_made_again(tmp_path: Path) -> None:
     """One of every folder: images, masks, labels, sweeps, calibration, recipe."""
     job = fog_job(tmp_path, uri="fake:street?frames=2")
     run(job)
-    whole = tree_digest(tmp_path)
-    firsts = {path.rpartition("/")[0]: path for path in whole}
+    digests = tree_digest(tmp_path)
+    firsts = {path.rpartition("/")[0]: path for path in digests}
     singles = ("recipe.yaml", "calibration.json", "boxes.parquet", "boxes_2d.parquet")
-    names = {*firsts.values(), *(path for path in whole if path.endswith(singles))}
+    names = {*firsts.values(), *(path for path in digests if path.endswith(singles))}
     deleted = {path for path in names if "/" in path and not path.startswith(".climategs")}
     assert {"images", "depth", "labels"} <= {path.split("/")[2] for path in deleted}
     for path in sorted(deleted):
         (tmp_path / path).unlink()
         run(job)
-        assert tree_digest(tmp_path) == whole, path
+        assert tree_digest(tmp_path) == digests, path
 
 
 def test_folders_that_lead_out_of_the_output_are_not_written_to(tmp_path: Path) -> None:
     for number, inner in enumerate(
         ("street", "street/fog-000", "street/fog-000/images", "street/fog-000/depth/front")
     ):
-        out, elsewhere = tmp_path / f"out{number}", tmp_path / f"elsewhere{number}"
+        out = tmp_path / f"out{number}"
+        elsewhere = tmp_path / f"elsewhere{number}"
         elsewhere.mkdir()
         (out / inner).parent.mkdir(parents=True)
         (out / inner).symlink_to(elsewhere)
@@ -506,9 +512,9 @@ def test_overwriting_replaces_the_variant_and_no_other(tmp_path: Path) -> None:
     assert (result.written, result.skipped) == (2, 0)
     run(RenderJob("fake:street", [changed], tmp_path / "new", frames=[0]))
     fog = "street/fog-000/"
-    here = {k: v for k, v in tree_digest(tmp_path).items() if k.startswith(fog)}
+    fog_digests = {k: v for k, v in tree_digest(tmp_path).items() if k.startswith(fog)}
     new = {k: v for k, v in tree_digest(tmp_path / "new").items() if k.startswith(fog)}
-    assert here == new
+    assert fog_digests == new
     assert (
         read_manifest(tmp_path).column("variant").to_pylist() == ["fog-000"] * 2 + ["fog-001"] * 8
     )
@@ -543,19 +549,19 @@ def test_an_output_without_a_digest_is_taken_for_the_scene_as_it_is_once(
     else:
         calls = []
 
-        def killed(*given, backend):
-            calls.append(given)
+        def killed(*arguments, backend):
+            calls.append(arguments)
             if len(calls) == 3:
                 raise SystemExit("killed")
-            return fake_render(*given, backend=backend)
+            return fake_render(*arguments, backend=backend)
 
         with pytest.raises(SystemExit, match="killed"):
             run(old, killed)
-    known = dataclasses.replace(old, source_digest="content1")
-    run(known)
+    new_job = dataclasses.replace(old, source_digest="content1")
+    run(new_job)
     assert caplog.text.count("of an older version") == 1
     assert set(read_manifest(tmp_path)["source_digest"].to_pylist()) == {"content1"}
-    run(known, must_not_render)
+    run(new_job, must_not_render)
     assert caplog.text.count("of an older version") == 1
     with pytest.raises(OutputError, match="have changed since"):
         run(dataclasses.replace(old, source_digest="content2"))

@@ -132,7 +132,8 @@ def shared_server() -> Iterator[S3Server]:
         def log(self, type: str, message: str, *args: object) -> None:
             pass
 
-    application, server = DomainDispatcherApplication(create_backend_app), S3Server()
+    application = DomainDispatcherApplication(create_backend_app)
+    server = S3Server()
 
     def answer(environ: dict[str, Any], start_response: Any) -> Iterable[bytes]:
         return answer_or_fail(server, application, environ, start_response)
@@ -288,7 +289,8 @@ def test_local_places(tmp_path, monkeypatch):
 
 
 def test_local_files_are_linked_or_else_copied(tmp_path, monkeypatch):
-    store, source = LocalStore(tmp_path / "out"), tmp_path / "source"
+    store = LocalStore(tmp_path / "out")
+    source = tmp_path / "source"
     source.write_bytes(b"1")
     link = tmp_path / "link"
     link.symlink_to(source)
@@ -499,9 +501,10 @@ def test_a_remote_output_has_the_files_of_a_local_one(server, tmp_path, monkeypa
     lazy = SimpleNamespace(collect=lambda: None)
     monkeypatch.setattr("augment.jobs.block_worker.gc", lazy)
     monkeypatch.setattr("augment.jobs.claims.CLAIM_TIMES", ClaimTimes(0.2))
-    scenes, recipes = ["fake:a?frames=3"], make_recipes(["fog"], block_images=2)
+    scenes = ["fake:a?frames=3"]
+    recipes = make_recipes(["fog"], block_images=2)
     run_generate(make_job(tmp_path / "local", scenes, recipes), progress=False)
-    whole = outputs(tmp_path / "local")
+    local_files = outputs(tmp_path / "local")
     rendered: list[str] = []
     stop_at = [2, 5, -1]
 
@@ -524,16 +527,18 @@ def test_a_remote_output_has_the_files_of_a_local_one(server, tmp_path, monkeypa
         stop_at.pop(0)
     assert len(rendered) == len(set(rendered)) == 6
     store = open_store(uri)
-    there = {path for path in store.list("") if not path.startswith(".climategs")}
-    assert there == whole.keys()
-    assert {p: hashlib.sha256(store.read(p)).hexdigest() for p in there} == whole
+    remote_paths = {path for path in store.list("") if not path.startswith(".climategs")}
+    assert remote_paths == local_files.keys()
+    assert {p: hashlib.sha256(store.read(p)).hexdigest() for p in remote_paths} == local_files
     assert not store.list(CLAIMS_FOLDER)
     assert not any((tmp_path / "scratch" / "blocks").iterdir())
     (status,) = read_status(store)
     assert (status.total.published, status.claims) == (6, 0)
-    shown, local = (find_output(str(at)) for at in (uri, tmp_path / "local"))
-    assert shown is not None and local is not None and find_output(server.uri("other")) is None
-    viewers = OutputViewer(shown), OutputViewer(local)
+    remote_viewer, local = (find_output(str(at)) for at in (uri, tmp_path / "local"))
+    assert (
+        remote_viewer is not None and local is not None and find_output(server.uri("other")) is None
+    )
+    viewers = OutputViewer(remote_viewer), OutputViewer(local)
     remote_image, image = (viewer.picture(viewer.rows[0], "image") for viewer in viewers)
     assert np.array_equal(remote_image, image)
 
@@ -632,18 +637,20 @@ def test_deleted_claims_are_lost(store):
 
 def test_a_lock_file_that_changes_hands_while_it_is_opened(tmp_path, monkeypatch):
     """Its holder deletes it, and another one makes and locks the next file of that name."""
-    path, flock, others = tmp_path / "a.lock", fcntl.flock, []
+    path = tmp_path / "a.lock"
+    flock = fcntl.flock
+    other_locks = []
 
     def flock_too_late(descriptor, operation):
         monkeypatch.setattr(fcntl, "flock", flock)
         path.unlink()
-        others.append(try_lock(path))
+        other_locks.append(try_lock(path))
         flock(descriptor, operation)
 
     monkeypatch.setattr(fcntl, "flock", flock_too_late)
     assert try_lock(path) is None
-    others[0].check()
-    others[0].release()
+    other_locks[0].check()
+    other_locks[0].release()
     with try_lock(path) as claim:
         claim.check()
 
@@ -691,8 +698,8 @@ def test_of_two_who_find_a_dead_claim_one_takes_it_over(server, remote):
 @pytest.mark.long
 def test_claims_are_renewed_until_they_are_lost(server, remote):
     with try_claim(remote, "a", OFTEN) as claim:
-        seen = len(server.requests)
-        wait_for(lambda: str(server.requests[seen:]).count("claims/a") > 2)
+        num_requests = len(server.requests)
+        wait_for(lambda: str(server.requests[num_requests:]).count("claims/a") > 2)
         claim.check()
         remote.delete(remote.list(CLAIMS_FOLDER))
         time.sleep(0.3)
