@@ -1,9 +1,9 @@
-"""Scenes by URI: `open_scene("scheme:path?key=value&…")`.
+"""Open scenes by URI: `open_scene("scheme:path?key=value&…")`.
 
-Schemes and syntax are those of adapters.uri; a path without a scheme is recognised by what it
-holds. Two keys work with every scheme: `camera_path=FILE` replaces the scene's cameras (see
-adapters.camera_files.paths), and `ground_z=HEIGHT` says how high the road is (scene world, metres)
-where the scene does not know or is wrong.
+Schemes and syntax are those of adapters.uri. A path without a scheme is recognised by its contents.
+Two keys work with every scheme: `camera_path=FILE` replaces the scene's cameras (see
+adapters.camera_files.paths); `ground_z=HEIGHT` gives the height of the road (scene world, metres)
+if the scene does not know it or is wrong.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from adapters.camera_files.paths import with_camera_path
-from adapters.detect_format import looked_for, recognised
+from adapters.detect_format import describe_unrecognised, detect_scheme
 from adapters.scene_cache import cached_scene
 from adapters.uri import (
     CAMERA_PATH_KEY,
@@ -41,8 +41,9 @@ def open_scene(uri: str) -> Scene:
     """Open a scene.
 
     Raises:
-        AdapterError: an unknown scheme (lists the known ones), a missing path, a path that no
-            adapter recognises, or a dataset that its adapter cannot use."""
+        AdapterError: the scheme is unknown (the message lists the known ones), the path is missing,
+            no adapter recognises it, or its adapter cannot use the dataset.
+    """
     scheme, path, query = parse_uri(uri)
     camera_path = query.pop(CAMERA_PATH_KEY, None)
     ground_z = query.pop(GROUND_KEY, None)
@@ -91,12 +92,12 @@ def _with_ground(scene: Scene, text: str) -> Scene:
 
 
 def recognise(path: Path) -> str:
-    """The scheme of a path by its contents."""
+    """Return the scheme of a path by its contents."""
     _check_there(path)
-    scheme = recognised(path)
+    scheme = detect_scheme(path)
     if scheme is None:
         raise AdapterError(
-            f"{path}: not recognised as a scene. {looked_for(path)}. "
+            f"{path}: not recognised as a scene. {describe_unrecognised(path)}. "
             f"Or name the scheme: {known_schemes()}"
         )
     return scheme
@@ -120,10 +121,15 @@ MAX_ENTRIES = 200_000  # files and folders, for one pattern: a second or two
 
 
 def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
-    """Every scene once, in the order of the job; those of a pattern in the order of their paths.
+    """Return every scene of a job once, in the job's order.
 
-    An entry whose path has `*`, `**` or `[...]` stands for all that match (a `?` begins the query),
-    each with the entry's query, frames, cameras and recipes. folder: where relative paths start."""
+    An entry whose path has `*`, `**` or `[...]` stands for all paths that match (a `?` begins the
+    query), in their order. Each of them has the entry's query, frames, cameras and recipes.
+
+    Args:
+        entries: the job's entries.
+        folder: folder from which relative paths start.
+    """
     scenes: dict[str, JobScene] = {}
     for entry in entries:
         entry_scenes = _expanded(entry, folder)
@@ -168,8 +174,16 @@ def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
 
 
 def _matches(top: Path, parts: tuple[str, ...], what: str) -> list[str]:
-    """Paths that match, in order. parts: of the pattern below `top`. As glob.glob, but that `**`
-    follows no links, which may lead round in circles, and that there is an end to it."""
+    """Return the paths that match a pattern, in order.
+
+    It works as glob.glob, but `**` follows no links, which may be circular, and the number of paths
+    is limited.
+
+    Args:
+        top: folder below which paths are searched.
+        parts: parts of the pattern below `top`.
+        what: the pattern, for messages.
+    """
     entry_count = itertools.count()
 
     def names(folder: str) -> Iterator[os.DirEntry[str]]:
@@ -206,7 +220,7 @@ def _matches(top: Path, parts: tuple[str, ...], what: str) -> list[str]:
 
 
 def _from(folder: Path, value: str) -> str:
-    """A value of the query that names a file beside the job, as an absolute path."""
+    """Return a value of the query that names a file beside the job as an absolute path."""
     beside = folder.absolute() / value
     names_a_file = ("/" in value or "." in value) and beside.exists()
     return str(beside) if names_a_file else value

@@ -1,4 +1,8 @@
-"""Which kind of scene a path holds, told by a few names in it and the first bytes of files."""
+"""Detect the kind of scene that a path holds, from names in folders and the first bytes of files.
+
+`detect_scheme` returns the scheme, `describe_unrecognised` explains a failure, `source_tree` finds
+the dataset behind a scene. The callers are `adapters.base` and `tools`.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +33,9 @@ _KITTI_CAMERA = r"image_\d\d/data/\d+\.(?i:png|jpg)"
 
 
 def source_tree(scene: Scene) -> SourceTree:
-    """The dataset that the scene was made from: the one it was opened from, or recorded in."""
+    """Return the dataset from which the scene was made: the opened one, or the one that recorded
+    it.
+    """
     uri = scene.recorded_source or scene.source
     for part in (scene.source, uri):
         if CAMERA_PATH_KEY in parse_uri(part)[2]:
@@ -59,7 +65,7 @@ _NONE = r"(?!)"  # matches nothing
 
 
 class _Found(NamedTuple):
-    """As of SourceTree."""
+    """Folders of a dataset, as in SourceTree."""
 
     root: Path
     images: str
@@ -68,7 +74,9 @@ class _Found(NamedTuple):
 
 
 def _kitti(folder: Path, _query: dict[str, str]) -> _Found:
-    """A drive with the calibration beside it, in the folder of its date; or the folder itself."""
+    """Return the files of a drive with the calibration beside it, in the folder of its date, or
+    the folder itself.
+    """
     from adapters.kitti.files import VELODYNE, kitti_root
 
     if not (folder / VELODYNE).is_dir():
@@ -85,7 +93,7 @@ def _kitti(folder: Path, _query: dict[str, str]) -> _Found:
 
 
 def _drivestudio(path: Path, query: dict[str, str]) -> _Found:
-    """The processed data that a run was trained on."""
+    """Return the processed data on which a run was trained."""
     from adapters.drivestudio.drive import RunOptions, find_run
 
     data = find_run(path, RunOptions.from_query("drivestudio", query)).data
@@ -118,15 +126,15 @@ _MULTI_PART = b"element vertex_"  # how a Street Gaussians .ply names its parts
 
 @dataclass(frozen=True)
 class Signature:
-    """How one kind of scene looks. what: that in words, for messages."""
+    """Signs of one kind of scene. what: the kind in words, for messages."""
 
     scheme: str
     is_here: Callable[[Path], bool]
     what: str
 
 
-def recognised(path: Path) -> str | None:
-    """The scheme of what lies at a path; None for what is not known."""
+def detect_scheme(path: Path) -> str | None:
+    """Return the scheme of a path's contents, or None if they are not known."""
     signatures = FILES if path.is_file() else FOLDERS
     try:
         return next((s.scheme for s in signatures if s.is_here(path)), None)
@@ -134,9 +142,11 @@ def recognised(path: Path) -> str | None:
         raise AdapterError(f"{path}: cannot be read: {error}") from error
 
 
-def looked_for(path: Path) -> str:
-    """Sentences: what lies at a path that is not recognised, or below it, what it lacks, and what
-    was looked for."""
+def describe_unrecognised(path: Path) -> str:
+    """Return sentences on a path that is not recognised.
+
+    They say what lies at the path or below it, what it lacks, and what was looked for.
+    """
     signatures = FILES if path.is_file() else FOLDERS
     *most, last = (s.what for s in signatures)
     text = f"{', '.join(most)}, or {last}"
@@ -188,7 +198,9 @@ _MOST_KINDS = 6  # that are named
 
 
 def _advice(folder: Path) -> str:
-    """Say what an unknown folder holds, what it nearly is, and how to make it a recording."""
+    """Return what an unknown folder holds, which kind it nearly is, and how to make it a
+    recording.
+    """
     from adapters.camera_files.camera_files import find_colmap_model
 
     places: dict[str, Counter[str]] = {}
@@ -234,7 +246,7 @@ def _scenes_below(folder: Path) -> Iterator[Path]:
     for level in ("*", "*/*"):
         for entry in sorted(itertools.islice(folder.glob(level), _MAX_ENTRIES)):
             with contextlib.suppress(OSError, AdapterError):  # another user's
-                if entry.is_dir() and recognised(entry) is not None:
+                if entry.is_dir() and detect_scheme(entry) is not None:
                     yield entry
 
 

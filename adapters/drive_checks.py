@@ -1,7 +1,8 @@
-"""Whether a raw drive's cameras and LiDAR returns can be in the frames that they should be in.
+"""Check that a raw drive's cameras and LiDAR returns are in plausible frames of reference.
 
-Poses and returns in other axes make no error by themselves: the scene is a blur, or empty. These
-checks say it, and what to do, where it is plain; they say nothing where it is not.
+Poses and returns in other axes raise no error by themselves: the scene is a blur, or empty. If the
+mistake is plain, these checks return a sentence that says what to do; otherwise they return
+nothing. The caller is `adapters.raw_drive`.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ _MIN_OVERLAP = 0.4
 
 
 class _Pair(NamedTuple):
-    """Two sweeps. step_m: how far the car drove between them."""
+    """Two sweeps. step_m: distance that the car drove between them."""
 
     first: np.ndarray
     second: np.ndarray
@@ -122,7 +123,7 @@ def lidar_problems(
 
 
 def _pairs(frames: Sequence[Frame], sweeps: Sequence[tuple[int, np.ndarray]]) -> list[_Pair]:
-    """Some pairs of sweeps between which the car drove about _STEP_M without a turn."""
+    """Return some pairs of sweeps between which the car drove about _STEP_M without a turn."""
     if len(sweeps) < 2:
         return []
     times = np.array([frame.timestamp_ns for frame in frames], np.int64)
@@ -143,8 +144,10 @@ def _pairs(frames: Sequence[Frame], sweeps: Sequence[tuple[int, np.ndarray]]) ->
 
 
 def _best_offset(pair: _Pair) -> float | None:
-    """How far apart the sweeps fit each other best, metres; None where nothing fits much better
-    than they lie."""
+    """Return the offset at which two sweeps fit each other best, metres.
+
+    The result is None if no offset fits much better than none.
+    """
     if not len(pair.first) or not len(pair.second):
         return None
     corner = np.median(pair.first[:, :2], axis=0) - _REACH_M
@@ -165,7 +168,7 @@ def _best_offset(pair: _Pair) -> float | None:
 
 
 def _upright_cells(points: np.ndarray, corner: np.ndarray) -> np.ndarray:
-    """Cells of a square of the plan in which something upright stands, uint8 [S, S]."""
+    """Return the cells of a square of the plan that hold something upright, uint8 [S, S]."""
     side = round(2 * _REACH_M / _CELL_M)
     cells = np.floor((points[:, :2] - corner) / _CELL_M)
     inside = ((cells >= 0) & (cells < side)).all(axis=1)

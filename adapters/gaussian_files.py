@@ -1,18 +1,17 @@
-"""Scenes from plain splat files, such as a .ply, alone or in a trained 3DGS model's folder.
+"""Scenes of plain splat files, such as a .ply, alone or in a trained 3DGS model's folder.
 
     gaussians:PATH?up=-y&scale=1&cameras=FILE
     gaussians:FOLDER?files=a.ply,b.ply
 
 Several files of a folder are parts of one scene: those that `files` lists, else all of them, which
-must then be of one kind. A folder with a lod-meta.json is one streamed scene, of which `lod` picks
-the level of detail.
+must then be of one kind. A folder with a lod-meta.json is one streamed scene; `lod` selects its
+level of detail.
 
 Cameras are looked for beside the file (cameras.json, transforms.json, a COLMAP model in sparse/0)
-and above it in a model's folder; `adapters.camera_files.paths` says how images become frames, and
-makes a path where there are none. Coordinates and cameras of the file are turned so that `up`
-points to +z, scaled to metres, and recentred where they lie beyond a kilometre from zero. What
-neither the URI nor the file says of up and scale is estimated; a file whose ground is not clear
-gets no path.
+and above it in a model's folder. `adapters.camera_files.paths` groups images into frames, and makes
+a path if there are none. Coordinates and cameras of the file are turned so that `up` points to +z,
+scaled to metres, and recentred if they lie beyond a kilometre from zero. If neither the URI nor the
+file gives up or scale, they are estimated. A file whose ground is not clear gets no path.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from adapters.camera_files.paths import (
     PathKind,
     frames_from_views,
     ground_under,
-    in_bulk,
+    is_in_bulk,
     lowest_ground,
     make_default_path,
     road_heights,
@@ -158,10 +157,16 @@ _MIN_POINTS = 100
 
 
 @dataclass(frozen=True, eq=False)
-class GroundFound:
-    """up: unit [3], in the file's world. share, below, above: parts of the scene's surface in the
-    ground's plane, under it, and in the fullest parallel plane over it. lead: how many times better
-    than the best plane of another direction it is."""
+class GroundPlane:
+    """Ground plane of a splat file.
+
+    Attributes:
+        up: float64 [3], unit vector in the file's world.
+        share: fraction of the scene's surface in the plane.
+        below: fraction under it.
+        above: fraction in the fullest parallel plane over it.
+        lead: ratio of its score to that of the best plane in another direction.
+    """
 
     up: np.ndarray
     share: float
@@ -184,11 +189,15 @@ class GroundFound:
         )
 
 
-def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> GroundFound | None:
-    """The plane that is most like a ground; None where nothing is flat. near: a unit vector within
-    45 degrees of which up must be, such as the cameras' mean."""
+def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> GroundPlane | None:
+    """Return the plane that is most like a ground. None if nothing is flat.
+
+    Args:
+        gaussians: the scene.
+        near: unit vector within 45 degrees of which up must be, such as the mean of the cameras'.
+    """
     points = solid_points(gaussians)
-    points = points[in_bulk(points, 3.0)]
+    points = points[is_in_bulk(points, 3.0)]
     if len(points) < _MIN_POINTS:
         return None
     surface = _Surface.of(points - points.mean(axis=0))
@@ -209,15 +218,20 @@ def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> Grou
     best = int(scores.argmax())
     other_scores = scores[ups @ ups[best] < _OTHER_WAY]
     rival = max(float(other_scores.max(initial=0.0)), 1e-6)
-    up, at = surface.refined(ups[best], places[best])
-    return GroundFound(_snapped(up), *surface.judge(up, at), float(scores[best]) / rival)
+    up, at = surface.refine_plane(ups[best], places[best])
+    return GroundPlane(_snap_to_axis(up), *surface.judge(up, at), float(scores[best]) / rival)
 
 
 def scale_from_cameras(points: np.ndarray, poses: np.ndarray) -> tuple[float, str] | None:
-    """Metres per unit by the height of level cameras above the ground, and a sentence about it;
-    None where they do not stand as on a car or in a hand.
+    """Estimate metres per unit from the height of level cameras above the ground, and describe
+    it.
 
-    points: [N, 3], and poses: world_from_camera [C, 4, 4], in a world whose +z is up."""
+    The result is None if the cameras do not stand as on a car or in a hand.
+
+    Args:
+        points: float64 [N, 3], in a world whose +z is up.
+        poses: world_from_camera, float64 [C, 4, 4].
+    """
     eyes = poses[:, :3, 3]
     looks = poses[:, 2, 2]
     if np.median(np.abs(looks)) > math.sin(math.radians(_STEEPEST_LOOK_DEG)):
@@ -244,9 +258,13 @@ def scale_from_cameras(points: np.ndarray, poses: np.ndarray) -> tuple[float, st
 
 
 def doubt_about_metres(points: np.ndarray, scales: Tensor) -> str | None:
-    """Why these solid points [N, 3] (+z up) and the scales of all Gaussians cannot be of a street
-    in metres; None where they may be."""
-    points = points[in_bulk(points, BULK_REACH)]
+    """Return why points and scales cannot be those of a street in metres. None if they may be.
+
+    Args:
+        points: float64 [N, 3], solid points, +z up.
+        scales: scales of all Gaussians.
+    """
+    points = points[is_in_bulk(points, BULK_REACH)]
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     measures = {
         "wide": (float(np.hypot(*(high - low)[:2])), _WIDE_M),
@@ -263,7 +281,13 @@ def doubt_about_metres(points: np.ndarray, scales: Tensor) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """A scene's surface as voxels: places [V, 3] and normals [V, 3] of either sign. size: edge."""
+    """A scene's surface as voxels.
+
+    Attributes:
+        places: float64 [V, 3].
+        normals: float64 [V, 3], of either sign.
+        size: edge of a voxel.
+    """
 
     places: np.ndarray
     normals: np.ndarray
@@ -272,7 +296,7 @@ class _Surface:
 
     @staticmethod
     def of(points: np.ndarray) -> _Surface | None:
-        """None where the points are in too few places to have a surface."""
+        """Return the surface of points, or None if they are in too few places to have one."""
         size = float(np.linalg.norm(points, axis=1).max()) / 8 + 1e-9
         places = _voxel_means(points, size)
         for _ in range(_FINER_STEPS):
@@ -292,7 +316,9 @@ class _Surface:
         return _Surface(places, axes[:, :, 0], thickness < _FLAT, size)
 
     def judge(self, up: np.ndarray, at: np.ndarray) -> tuple[float, float, float]:
-        """Shares of the surface: in the plane, under it, and in the fullest parallel one above."""
+        """Return the fractions of the surface in the plane, under it, and in the fullest
+        parallel one above.
+        """
         height = (self.places - at) @ up
         parallel = self.is_flat & (np.abs(self.normals @ up) > _SAME_WAY)
         share = float((parallel & (np.abs(height) < 0.75 * self.size)).mean())
@@ -305,8 +331,10 @@ class _Surface:
         share, below, above = self.judge(up, at)
         return (share - _COUNTERPART * above) * math.exp(-below / _MUCH_BELOW)
 
-    def refined(self, up: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The plane through the surface near it, by least squares, ever closer."""
+    def refine_plane(self, up: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the plane through the nearby surface, by least squares in ever closer
+        surroundings.
+        """
         for reach in (1.0, 0.7, 0.5, 0.4):
             near = self.is_flat & (np.abs(self.normals @ up) > _SAME_WAY)
             near &= np.abs((self.places - at) @ up) < reach * self.size
@@ -320,8 +348,11 @@ class _Surface:
 
 
 def _voxel_means(points: np.ndarray, size: float) -> np.ndarray:
-    """Mean of the points in every voxel that has not far fewer of them than a point's usually has:
-    stray ones fill many voxels."""
+    """Return the mean of the points in every voxel.
+
+    Voxels with far fewer points than a point's voxel usually has are left out: stray points fill
+    many voxels.
+    """
     index = np.floor(points / size).astype(np.int64)
     index -= index.min(axis=0)
     _, y, z = index.max(axis=0) + 1
@@ -332,7 +363,7 @@ def _voxel_means(points: np.ndarray, size: float) -> np.ndarray:
     return (sums / count[:, None])[count >= 0.05 * np.median(count[voxel])]
 
 
-def _snapped(up: np.ndarray) -> np.ndarray:
+def _snap_to_axis(up: np.ndarray) -> np.ndarray:
     axis = np.zeros(3)
     index = int(np.abs(up).argmax())
     axis[index] = math.copysign(1.0, up[index])
@@ -351,14 +382,15 @@ _MIN_SEEN = 0.001  # least part of the points that the median camera must see
 
 
 def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
-    """A scene of a splat file or of a trained model's folder.
+    """Open a scene of a splat file or of a trained model's folder.
 
-    has_metric_scale and has_known_gravity are True where URI or file say scale and up, where the
-    cameras are upright, and where they could be estimated, which the scene's problems say.
+    has_metric_scale and has_known_gravity are True if URI or file give scale and up, if the cameras
+    are upright, and if they could be estimated, which the scene's problems say.
 
     Raises:
-        AdapterError: a query key or value, or a camera file, that cannot be used.
-        SceneError: the splat file is missing, damaged, or something else."""
+        AdapterError: a query key or value, or a camera file, cannot be used.
+        SceneError: the splat file is missing, damaged, or something else.
+    """
     options = GaussianOptions.from_query("gaussians", query)
     files = find_splat_files(Path(path), options)
     file = files[0]
@@ -388,8 +420,11 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
 
 
 def find_splat_files(path: Path, options: GaussianOptions) -> tuple[Path, ...]:
-    """The splat file itself; of a folder the files that `files` lists, the newest (or given)
-    iteration of a model, the lod-meta.json, or all its splat files, which must be of one kind.
+    """Return the splat files of a path.
+
+    For a file it is the file itself. For a folder it is one of: the files that `files` lists, the
+    newest (or given) iteration of a model, the lod-meta.json, or all its splat files, which must be
+    of one kind.
     """
     if options.files is not None:
         return _listed_files(path, options.files)
@@ -427,7 +462,7 @@ def find_splat_files(path: Path, options: GaussianOptions) -> tuple[Path, ...]:
 
 
 def splat_files_of(folder: Path) -> tuple[Path, ...]:
-    """The folder's splat files by their suffixes, in the order of their names."""
+    """Return the folder's splat files by their suffixes, in the order of their names."""
     return tuple(sorted(file for file in folder.iterdir() if file.suffix.lower() in SPLAT_SUFFIXES))
 
 
@@ -445,10 +480,12 @@ def _listed_files(folder: Path, names: Sequence[str]) -> tuple[Path, ...]:
 
 
 def _read_parts(files: Sequence[Path], options: GaussianOptions) -> SplatFile:
-    """The Gaussians of all files as one, with a sentence about which they are.
+    """Read the Gaussians of all files as one, with a sentence that names the files.
 
     Raises:
-        AdapterError: they say different things of up or unit. SceneError: one is damaged."""
+        AdapterError: they give different up or units.
+        SceneError: a file is damaged.
+    """
     parts = [read_splats(f, activated=options.activated, level=options.lod) for f in files]
     if len(parts) == 1:
         return parts[0]
@@ -489,8 +526,11 @@ def _read_parts(files: Sequence[Path], options: GaussianOptions) -> SplatFile:
 
 
 def _stand_in_sky(path: Path) -> tuple[float, float, float]:
-    """An overcast sky, whose light tints nothing; white where the model's cfg_args say that it was
-    trained in front of white. (What was trained in front of black would stand in a black night.)"""
+    """Return an overcast sky, whose light tints nothing, or a white one.
+
+    The sky is white if the model's cfg_args say that it was trained in front of white. (A model
+    that was trained in front of black would stand in a black night.)
+    """
     arguments = path / "cfg_args"
     if arguments.is_file() and "white_background=True" in arguments.read_text(errors="replace"):
         return COLOURS["white"]
@@ -521,14 +561,19 @@ def _find_views(file: Path, path: Path, options: GaussianOptions) -> ViewSet | N
 
 @dataclass(frozen=True, eq=False)
 class _World:
-    """change: from the file's world to the scene's. problems: what is estimated or in doubt.
-    lacking: what of up and scale is not known; empty where both are."""
+    """World of a splat file's scene.
+
+    Attributes:
+        change: from the file's world to the scene's.
+        problems: sentences on what is estimated or in doubt.
+        unknown_facts: words for what of up and scale is not known; empty if both are.
+    """
 
     change: WorldChange
     knows_up: bool
     is_metric: bool
     problems: tuple[str, ...]
-    lacking: str
+    unknown_facts: str
 
 
 def _find_world(
@@ -547,7 +592,7 @@ def _find_world(
             f"Give scale=METRES_PER_UNIT (scale=1 if it is in metres); {about_scale}"
         )
     facts = ((knows_up, "which way is up"), (is_metric, "how long a unit is"))
-    lacking = " and ".join(what for is_known, what in facts if not is_known)
+    unknown_facts = " and ".join(what for is_known, what in facts if not is_known)
     problems = [f"{file}: {sentence}" for sentence in (about_scale, about_up) if sentence]
     means = splats.gaussians.means
     sample = means[:: 1 + len(means) // 100_000].double().numpy() + splats.origin
@@ -560,13 +605,13 @@ def _find_world(
             "before is lost"
         )
     change = WorldChange(turned.rotation, scale, origin)
-    return _World(change, knows_up, is_metric, tuple(problems), lacking)
+    return _World(change, knows_up, is_metric, tuple(problems), unknown_facts)
 
 
 def _find_up(
     splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions
 ) -> tuple[np.ndarray, bool, str]:
-    """Up in the file's world, whether it is known, and what there is to say about it."""
+    """Return up in the file's world, whether it is known, and sentences about it."""
     cameras_up = None
     if views:  # the mean direction of the images' top edges; cameras may point everywhere
         mean = np.mean([-view.world_from_camera[:3, 1] for view in views], axis=0)
@@ -605,8 +650,10 @@ def _find_up(
 def _find_scale(
     splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions, turned: WorldChange
 ) -> tuple[float, bool, str]:
-    """Metres per unit, whether that is known, and what there is to say about it. turned: to a world
-    whose +z is up."""
+    """Return metres per unit, whether they are known, and sentences about it.
+
+    turned: change to a world whose +z is up.
+    """
     if options.scale is not None:
         return options.scale, True, ""
     if splats.notes.get("unit") in ("metre", "metres", "m"):
@@ -633,11 +680,12 @@ def _frames_and_ground(
     change = world.change
     is_metric = world.is_metric
     if not views:
-        if options.path == "auto" and world.lacking:
+        if options.path == "auto" and world.unknown_facts:
             note = (
-                f"{NO_CAMERAS}, and no path is made where it is not known {world.lacking}; add "
-                "?up=+z&scale=1 to the file's name (its axis that points up, metres per unit), "
-                "path=orbit to circle it as it lies, or camera_path=FILE"
+                f"{NO_CAMERAS}, and no path is made where it is not known "
+                f"{world.unknown_facts}; add ?up=+z&scale=1 to the file's name (its axis that "
+                "points up, metres per unit), path=orbit to circle it as it lies, or "
+                "camera_path=FILE"
             )
             return (), None, [note]
         default_path = make_default_path(gaussians, is_metric=is_metric, kind=options.path)
@@ -653,7 +701,7 @@ def _frames_and_ground(
 
 
 def _check_views_see(points: np.ndarray, frames: tuple[Frame, ...]) -> list[str]:
-    """A sentence if the cameras see next to nothing: they are then in another world."""
+    """Return a sentence if the cameras see next to nothing: they are then in another world."""
     cameras = [camera for frame in frames for camera in frame.cameras.values()]
     points = points[:: 1 + len(points) // _SAMPLED_POINTS]
     shares = []
@@ -675,8 +723,11 @@ def _check_views_see(points: np.ndarray, frames: tuple[Frame, ...]) -> list[str]
 
 
 def _scene_name(files: Sequence[Path], path: Path) -> str:
-    """The folder's name for several files, and for a trained model or a streamed scene, whose files
-    are always called the same."""
+    """Return the name of the scene.
+
+    It is the folder's name for several files, for a trained model and for a streamed scene, whose
+    files always have the same name.
+    """
     file = files[0]
     if len(files) > 1 or file.name == LOD_META:
         return file.parent.resolve().name or file.stem

@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field
 from tqdm import tqdm
 
 from adapters.lidar_scene.split import indices_between, inside_box
-from adapters.plain_files import Number, check_image, read_json, validated
+from adapters.plain_files import Number, check_image, read_json, validate_content
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
@@ -48,7 +48,7 @@ from adapters.raw_drive import (
     find_objects,
     is_usable,
     names_in,
-    recentred,
+    recenter_pose,
     scene_of_drive,
     usable_images,
     world_classes,
@@ -76,20 +76,25 @@ LIDAR_POSE_FROM_EGO = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0,
 
 
 def open_pandaset(path: str, query: dict[str, str]) -> Scene:
-    """The scene of one PandaSet sequence folder, such as `pandaset/002`.
+    """Open the scene of one PandaSet sequence folder, such as `pandaset/002`.
 
-    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
     Opening is deterministic: the same files and options give the same bits.
 
+    Args:
+        path: the folder.
+        query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
+
     Raises:
-        AdapterError: a wrong option, missing or damaged calibration, a damaged table, or no LiDAR.
-            Missing LiDAR or annotation files and images of single frames are Scene.problems."""
+        AdapterError: an option is wrong, calibration is missing or damaged, a table is damaged, or
+            there is no LiDAR. Missing LiDAR or annotation files and images of single frames are
+            listed in Scene.problems.
+    """
     options = DriveOptions.from_query("pandaset", query)
     return scene_of_drive(read_pandaset(path, query, options), options)
 
 
 def read_pandaset(path: str, query: dict[str, str], options: DriveOptions) -> RawDrive:
-    """The frames of the sequence that the options ask for, with their sweeps and boxes."""
+    """Read the frames of the sequence that the options select, with their sweeps and boxes."""
     root = Path(path)
     frames, chosen, origin, problems = read_frames(root, options)
     sweeps, boxes, more = read_sweeps(root, frames, chosen.held_out, origin)
@@ -138,8 +143,13 @@ class _Lens(BaseModel):
 
 
 class _CameraTrack(NamedTuple):
-    """One camera over the sequence: its lens and size (width, height), pixels; world_from_camera
-    float64 [F, 4, 4] in the dataset's world, and the times int64 [F] of its images."""
+    """One camera over the sequence.
+
+    Attributes:
+        lens, size: intrinsics, and (width, height), in pixels.
+        world_from_camera: float64 [F, 4, 4] in the dataset's world.
+        timestamps_ns: int64 [F], times of its images.
+    """
 
     lens: _Lens
     size: tuple[int, int]
@@ -150,8 +160,12 @@ class _CameraTrack(NamedTuple):
 def read_frames(
     root: Path, options: DriveOptions
 ) -> tuple[tuple[Frame, ...], DriveFrames, np.ndarray, tuple[str, ...]]:
-    """The frames that the options ask for with their usable images, in the scene's world; which
-    they are; the world's origin in the dataset's; and a sentence for each unusable image."""
+    """Read the frames that the options select, with their usable images, in the scene's world.
+
+    Returns:
+        The frames; their numbers; the world's origin in the dataset's; and a sentence for each
+        unusable image.
+    """
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a PandaSet sequence such as .../002")
     world_from_ego, times_ns = read_ego_track(root)
@@ -171,13 +185,15 @@ def read_frames(
         Frame(
             index=n,
             timestamp_ns=int(times_ns[n]),
-            world_from_ego=recentred(world_from_ego[n], origin),
+            world_from_ego=recenter_pose(world_from_ego[n], origin),
             cameras={
                 name: Camera(
                     name,
                     *camera.size,
                     **camera.lens.model_dump(),
-                    camera_from_world=invert_rigid(recentred(camera.world_from_camera[n], origin)),
+                    camera_from_world=invert_rigid(
+                        recenter_pose(camera.world_from_camera[n], origin)
+                    ),
                     timestamp_ns=int(camera.timestamps_ns[n]),
                 )
                 for name, camera in cameras.items()
@@ -190,8 +206,11 @@ def read_frames(
 
 
 def read_ego_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
-    """world_from_ego [F, 4, 4] in the dataset's own world and the times [F] of the sweeps' ends,
-    remembered as long as the files stay as they are."""
+    """Read world_from_ego [F, 4, 4] in the dataset's own world, and the times [F] of the sweeps'
+    ends.
+
+    The result is cached as long as the files stay unchanged.
+    """
     files = [root / "lidar" / name for name in ("poses.json", "timestamps.json")]
     state = tuple((f.stat().st_mtime_ns, f.stat().st_size) if f.exists() else None for f in files)
     return _ego_track(root, state)
@@ -205,7 +224,7 @@ def _ego_track(root: Path, state: object) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_camera(folder: Path, frames: int) -> _CameraTrack:
     path = folder / "intrinsics.json"
-    lens = validated(_Lens, read_json(path), str(path))
+    lens = validate_content(_Lens, read_json(path), str(path))
     poses = _read_poses(folder / "poses.json")
     if len(poses) != frames:
         raise AdapterError(
@@ -227,9 +246,11 @@ def _read_camera(folder: Path, frames: int) -> _CameraTrack:
 
 
 def _read_times(path: Path, expected: int) -> np.ndarray:
-    """Nanoseconds, int64 [expected]."""
+    """Read times in nanoseconds, int64 [expected]."""
     entries = enumerate(read_json(path, list))
-    times = np.array([validated(_Seconds, t, f"{path}, frame {n}, seconds") for n, t in entries])
+    times = np.array(
+        [validate_content(_Seconds, t, f"{path}, frame {n}, seconds") for n, t in entries]
+    )
     if len(times) != expected:
         raise AdapterError(f"{path} has {len(times)} entries; there are {expected} LiDAR poses")
     if not (np.diff(times) > 0).all():
@@ -242,8 +263,11 @@ def _read_times(path: Path, expected: int) -> np.ndarray:
 
 
 def _read_poses(path: Path) -> np.ndarray:
-    """Rigid transforms, float64 [F, 4, 4]."""
-    poses = [validated(_Pose, p, f"{path}, frame {n}") for n, p in enumerate(read_json(path, list))]
+    """Read rigid transforms, float64 [F, 4, 4]."""
+    poses = [
+        validate_content(_Pose, p, f"{path}, frame {n}")
+        for n, p in enumerate(read_json(path, list))
+    ]
     if not poses:
         raise AdapterError(f"{path} holds no poses")
     headings = np.array([(p.heading.w, p.heading.x, p.heading.y, p.heading.z) for p in poses])
@@ -263,18 +287,21 @@ def _read_poses(path: Path) -> np.ndarray:
 
 
 def frame_file(root: Path, folder: str, frame: int) -> Path:
-    """The path of a frame's table: `folder` is lidar, annotations/cuboids or annotations/semseg."""
+    """Return the path of a frame's table.
+
+    folder: lidar, annotations/cuboids or annotations/semseg.
+    """
     return root / folder / f"{frame:02d}.pkl.gz"
 
 
 def read_lidar(root: Path, frame: int) -> pd.DataFrame | None:
-    """The returns of a frame, columns x y z i t d as in the file, or None without a file."""
+    """Read the returns of a frame, columns x y z i t d as in the file, or None without a file."""
     path = frame_file(root, "lidar", frame)
     return _read_table(path, LIDAR_COLUMNS) if path.exists() else None
 
 
 def read_semantics(root: Path, frame: int, rows: int) -> np.ndarray | None:
-    """The class number of each return of the frame, int64 [rows], or None without a file."""
+    """Read the class number of each return of the frame, int64 [rows], or None without a file."""
     path = frame_file(root, "annotations/semseg", frame)
     if not path.exists():
         return None
@@ -288,7 +315,7 @@ def read_semantics(root: Path, frame: int, rows: int) -> np.ndarray | None:
 
 
 def read_cuboids(root: Path, frame: int) -> pd.DataFrame | None:
-    """The boxes of a frame with all their columns, or None without a file."""
+    """Read the boxes of a frame with all their columns, or None without a file."""
     path = frame_file(root, "annotations/cuboids", frame)
     needed = ("uuid", "label", "yaw", "stationary")
     needed += tuple(f"{group}.{axis}" for group in ("position", "dimensions") for axis in "xyz")
@@ -309,9 +336,13 @@ def _read_table(path: Path, needed: tuple[str, ...]) -> pd.DataFrame:
 def read_sweeps(
     root: Path, frames: Sequence[Frame], held_out: frozenset[int], origin: np.ndarray
 ) -> tuple[tuple[Sweep, ...], tuple[BoxSample, ...], tuple[str, ...]]:
-    """Usable sweeps of the frames that are not held out, boxes of what moves in all of them, and a
-    sentence for each missing file. Left out are returns of smoke, exhaust, spray, mirror images and
-    the recording car. Held-out sweeps only tell when their boxes were seen."""
+    """Read usable sweeps of frames that are not held out, the boxes of moving objects, and
+    problems.
+
+    Returns of smoke, exhaust, spray, mirror images and the recording car are left out. The boxes
+    are those of all frames; held-out sweeps only give the times at which their boxes were seen.
+    Problems are a sentence for each missing file.
+    """
     meaning = class_meanings(root)
     cuboids = {frame.index: read_cuboids(root, frame.index) for frame in frames}
     moving = _moving_boxes(root, frames, cuboids, origin)
@@ -362,7 +393,9 @@ def _moving_boxes(
     cuboids: Mapping[int, pd.DataFrame | None],
     origin: np.ndarray,
 ) -> Mapping[int, list[BoxSample]]:
-    """By frame the boxes of the objects that move, both sensors' under the object's name."""
+    """Return the boxes of moving objects by frame, those of both sensors under the object's
+    name.
+    """
     names = read_objects(root).names
 
     def timed(frame: Frame, table: pd.DataFrame) -> TimedBoxes:
@@ -377,7 +410,7 @@ def _moving_boxes(
         (timed(frame, table) for frame, table in tables if table is not None), origin, several=True
     )
     by_frame: dict[int, list[BoxSample]] = defaultdict(list)
-    for box in objects.moving:
+    for box in objects.moving_boxes:
         by_frame[box.frame].append(box)
     return by_frame
 
@@ -385,9 +418,18 @@ def _moving_boxes(
 def _when_seen(
     box: BoxSample, sensor_number: int, sweep: Sweep, sensor: np.ndarray, frame: Frame
 ) -> BoxSample:
-    """The box at the time when its own sensor saw it, as boxes were drawn around returns of 0.1 s:
-    the median time of its returns in the box, else the time of the return of nearest bearing from
-    the car. sensor: [N], that of each of the sweep's returns."""
+    """Return the box at the time when its own sensor saw it.
+
+    Boxes were drawn around returns of 0.1 s. The time is the median of its returns' times, or,
+    without returns in the box, the time of the return of nearest bearing from the car.
+
+    Args:
+        box: the box.
+        sensor_number: number of the box's sensor.
+        sweep: the frame's sweep.
+        sensor: int [N], sensor of each of the sweep's returns.
+        frame: the frame.
+    """
     points = sweep.points
     times = sweep.timestamps_ns
     pose = box.world_from_box
@@ -454,15 +496,19 @@ _CLASSES: tuple[tuple[str, int], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Objects:
-    """names: by uuid, the object's name: that of its best box, the one with boxes in most frames,
-    then the spinning sensor's, then the first in the files. ranks: by uuid; of an object's boxes in
-    one frame the lowest is kept."""
+    """Objects of a sequence.
+
+    Attributes:
+        names: the object's name by uuid. It is the uuid of its best box: the one with boxes in most
+            frames, then the spinning sensor's, then the first in the files.
+        ranks: rank by uuid. Of an object's boxes in one frame the lowest is kept.
+    """
 
     names: Mapping[str, str]
     ranks: Mapping[str, int]
 
-    def kept(self, uuids: Iterable[str]) -> np.ndarray:
-        """bool: the boxes of one frame to keep, one an object, by their uuids."""
+    def is_best_box(self, uuids: Iterable[str]) -> np.ndarray:
+        """Return a mask of the boxes of one frame to keep, one per object, by their uuids."""
         uuids = list(uuids)
         best: dict[str, str] = {}
         for uuid in sorted(uuids, key=self.ranks.__getitem__):
@@ -471,14 +517,16 @@ class Objects:
 
 
 def sensors_of(table: pd.DataFrame) -> list[int]:
-    """Each box's sensor: 0, 1, or -1 where it has none or the table does not say."""
+    """Return each box's sensor: 0, 1, or -1 if it has none or the table does not say."""
     column = table.get("cuboids.sensor_id", pd.Series([_NO_SENSOR] * len(table)))
     return [int(value) if value in (0, 1) else _NO_SENSOR for value in column]
 
 
 def read_objects(root: Path) -> Objects:
-    """The objects of all frames, remembered as long as the files stay as they are. A table that
-    cannot be read is an error of its own frame, not here."""
+    """Read the objects of all frames. They are cached as long as the files stay unchanged.
+
+    A table that cannot be read is an error of its own frame, not here.
+    """
     paths = sorted((root / "annotations" / "cuboids").glob("*.pkl.gz"))
     frames = [(int(path.name[:-7]), path.stat()) for path in paths if path.name[:-7].isdecimal()]
     return _read_objects(root, tuple((n, s.st_mtime_ns, s.st_size) for n, s in frames))
@@ -498,9 +546,12 @@ def _read_objects(root: Path, state: tuple[tuple[int, int, int], ...]) -> Object
 
 
 def tie_boxes(tables: Mapping[int, pd.DataFrame]) -> Objects:
-    """The objects in the cuboids of some frames: tied by links in both directions, then in one,
-    then, without a partner, by overlap: boxes of one class and both sensors that share MIN_OVERLAP
-    on average. No tie makes two boxes of one sensor in one frame the same object."""
+    """Identify the objects in the cuboids of some frames.
+
+    Boxes are tied by links in both directions, then by links in one, then, without a partner, by
+    overlap: boxes of one class and both sensors with an overlap of MIN_OVERLAP on average. No tie
+    makes two boxes of one sensor in one frame the same object.
+    """
     boxes = _Boxes(defaultdict(set), {}, {})
     uuid_pairs: dict[tuple[str, str], None] = {}
     for frame, table in tables.items():
@@ -533,16 +584,20 @@ def tie_boxes(tables: Mapping[int, pd.DataFrame]) -> Objects:
 
 
 class _Boxes(NamedTuple):
-    """Facts of the tables about each uuid, in order of first appearance: its frames, its sensor,
-    and its class, or where that is not known its label."""
+    """Facts of the tables about each uuid, in order of first appearance.
+
+    They are its frames, its sensor, and its class, or its label if the class is not known.
+    """
 
     frames: dict[str, set[int]]
     sensors: dict[str, int]
     kinds: dict[str, str]
 
     def are_one(self, a: list[str], b: list[str], tie: tuple[str, str]) -> bool:
-        """True if all these uuids, two of which are tied, can be one object: an object has at most
-        one box of each sensor in a frame."""
+        """Return True if all these uuids, two of which are tied, can be one object.
+
+        An object has at most one box of each sensor in a frame.
+        """
         return all(
             self.frames[first].isdisjoint(self.frames[second])
             or ((first, second) == tie and not self.same_sensor(first, second))
@@ -555,7 +610,7 @@ class _Boxes(NamedTuple):
 
 
 def _overlaps(table: pd.DataFrame, boxes: _Boxes) -> Iterator[tuple[tuple[str, str], float]]:
-    """Pairs of a frame that may be siblings, with their areas' intersection over union."""
+    """Return pairs of a frame that may be siblings, with their areas' intersection over union."""
     uuids = [str(uuid) for uuid in table["uuid"]]
     columns = [f"{name}.{axis}" for name in ("position", "dimensions") for axis in "xyz"]
     values = table[[*columns, "yaw"]].to_numpy(dtype=np.float64)
@@ -587,8 +642,10 @@ def _intersection_over_union(a: _Rectangle, b: _Rectangle) -> float:
 
 
 def class_names(root: Path) -> dict[int, str]:
-    """The sequence's classes by number: those of annotations/semseg/classes.json, or of the
-    published list."""
+    """Return the sequence's classes by number.
+
+    They are those of annotations/semseg/classes.json, or of the published list.
+    """
     path = root / "annotations" / "semseg" / "classes.json"
     if not path.exists():
         return {number: name for number, (name, _) in enumerate(_CLASSES, start=1)}
@@ -602,7 +659,7 @@ def class_names(root: Path) -> dict[int, str]:
 
 
 def class_meanings(root: Path) -> dict[int, int]:
-    """SemanticClass (or NO_SURFACE) by the sequence's class number; unknown names are UNKNOWN."""
+    """Return the SemanticClass (or NO_SURFACE) by class number. Unknown names are UNKNOWN."""
     meaning = dict(_CLASSES)
     return {n: meaning.get(name, SemanticClass.UNKNOWN) for n, name in class_names(root).items()}
 
@@ -612,14 +669,15 @@ def class_meanings(root: Path) -> dict[int, int]:
 
 @dataclass(frozen=True)
 class PandaSetLabels:
-    """Labels of one sequence, read when asked.
+    """Labels of one sequence, read on demand.
 
-    Boxes: one an object; where both sensors' cuboids of it are in the file, the one that
-    `Objects` ranks first. A track_id is the uuid of the object's best box, the same in all
-    frames; attributes hold every column of the file under its own name (None where a text is
-    missing), the box's own uuid, yaw and sibling included. Sweeps: columns x y z (metres), i
-    (intensity 0 to 255), t (seconds), d (0: the spinning sensor, 1: the forward one) exactly as in
-    the file, and semantic (the dataset's own class numbers) where the frame has them."""
+    Boxes: one per object. If the file has both sensors' cuboids of it, the one that `Objects` ranks
+    first is used. A track_id is the uuid of the object's best box, the same in all frames.
+    Attributes hold every column of the file under its own name (None for a missing text), including
+    the box's own uuid, yaw and sibling. Sweeps: columns x y z (metres), i (intensity 0 to 255), t
+    (seconds), d (0: the spinning sensor, 1: the forward one) exactly as in the file, and semantic
+    (the dataset's own class numbers) if the frame has them.
+    """
 
     root: Path
 
@@ -628,17 +686,23 @@ class PandaSetLabels:
         if table is None:
             return Boxes.empty()
         objects = read_objects(self.root)
-        boxes = boxes_of_cuboids(table[objects.kept(table["uuid"].astype(str))])
+        boxes = boxes_of_cuboids(table[objects.is_best_box(table["uuid"].astype(str))])
         return replace(boxes, track_ids=tuple(objects.names[uuid] for uuid in boxes.track_ids))
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        """The SemanticClass of each return, or NO_SURFACE; None for a sweep without classes."""
+        """Return the SemanticClass of each return, or NO_SURFACE.
+
+        The result is None for a sweep without classes.
+        """
         numbers = sweep.columns.get("semantic")
         return None if numbers is None else world_classes(numbers, class_meanings(self.root))
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
-        """Position of each return's sensor at the return's time: the car is on a straight line
-        between its poses at the ends of the sweeps, and turned as at the end of this one."""
+        """Return the position of each return's sensor at the return's time, float64 [N, 3].
+
+        The car is on a straight line between its poses at the ends of the sweeps, and turned as at
+        the end of this one.
+        """
         world_from_ego, times_ns = read_ego_track(self.root)
         if not 0 <= frame_index < len(times_ns):
             return None
@@ -664,7 +728,10 @@ class PandaSetLabels:
         return tuple(file for file in files if file.exists()) if files[0].exists() else ()
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
-        """Tables of those rows under their own index: rows of both files still name each other."""
+        """Return tables of the sweep's rows under their own index.
+
+        Rows of both files still name each other.
+        """
         table = read_frame(file).iloc[sweep.columns[INDEX_COLUMN]].copy()
         if file == frame_file(self.root, "lidar", frame_index):
             for name in "xyzi":
@@ -678,8 +745,18 @@ class PandaSetLabels:
 
 
 def places_at(places_m: np.ndarray, times_s: np.ndarray, wanted_s: np.ndarray) -> np.ndarray:
-    """Positions [N, 3] at times [N] on the straight lines through places [F, 3] at rising times
-    [F], the first of which goes on to before it and the last to after it."""
+    """Interpolate positions linearly in time.
+
+    Before the first and after the last place the outer lines continue.
+
+    Args:
+        places_m: float64 [F, 3].
+        times_s: float64 [F], rising.
+        wanted_s: float64 [N].
+
+    Returns:
+        Positions, float64 [N, 3].
+    """
     if len(times_s) == 1:
         return np.broadcast_to(places_m[0], (len(wanted_s), 3))
     after = np.clip(np.searchsorted(times_s, wanted_s), 1, len(times_s) - 1)
@@ -689,8 +766,11 @@ def places_at(places_m: np.ndarray, times_s: np.ndarray, wanted_s: np.ndarray) -
 
 
 def boxes_of_cuboids(table: pd.DataFrame) -> Boxes:
-    """A frame's cuboids as boxes. PandaSet's have their length along y and their width along x: the
-    heading is a quarter turn more than yaw and the first two sizes swap."""
+    """Return a frame's cuboids as boxes.
+
+    PandaSet's cuboids have their length along y and their width along x: the heading is a quarter
+    turn more than yaw, and the first two sizes swap.
+    """
     half = (table["yaw"].to_numpy(dtype=np.float64) + np.pi / 2) / 2
     zero = np.zeros_like(half)
     dimensions = [table[f"dimensions.{axis}"].to_numpy(dtype=np.float64) for axis in "yxz"]
@@ -706,7 +786,7 @@ def boxes_of_cuboids(table: pd.DataFrame) -> Boxes:
 
 
 def _plain(column: pd.Series) -> np.ndarray:
-    """The column's values; NaN among texts, pandas' mark of a missing one, becomes None."""
+    """Return the column's values. NaN among texts, pandas' mark of a missing one, becomes None."""
     values = column.to_numpy()
     if values.dtype != object:
         return values
@@ -714,5 +794,5 @@ def _plain(column: pd.Series) -> np.ndarray:
 
 
 def pandaset_labels(path: str, query: dict[str, str]) -> PandaSetLabels:
-    """The labels of a folder; whatever the query, they are those of all its frames."""
+    """Return the labels of a folder. They cover all its frames, whatever the query."""
     return PandaSetLabels(Path(path))

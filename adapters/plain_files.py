@@ -36,8 +36,10 @@ Value = TypeVar("Value")
 
 
 def read_text(path: Path, *, if_missing: str = _FROM_DATASET) -> str:
-    """A UTF-8 file, without the byte order mark that some editors begin it with. if_missing: what
-    to do then, for the message."""
+    """Read a UTF-8 file, without the byte order mark that some editors write.
+
+    if_missing: advice for the message about a missing file.
+    """
     try:
         with open_file(path) as file:
             data = file.read(_MAX_BYTES + 1)
@@ -51,8 +53,10 @@ def read_text(path: Path, *, if_missing: str = _FROM_DATASET) -> str:
 
 
 def read_yaml(path: Path, *, if_missing: str = _FROM_DATASET) -> dict[str, Any]:
-    """The mapping in a YAML file, read as recipes are (see recipes.yaml_tree): without tags and
-    merge keys, and with a bound on what aliases multiply."""
+    """Read the mapping in a YAML file as recipes are read (see recipes.yaml_tree).
+
+    Tags and merge keys are refused, and the expansion of aliases is limited.
+    """
     text = read_text(path, if_missing=if_missing)
     if len(text) > _MAX_YAML:
         raise AdapterError(f"{path} must have at most {_MAX_YAML} characters; it has {len(text)}")
@@ -66,10 +70,12 @@ def read_yaml(path: Path, *, if_missing: str = _FROM_DATASET) -> dict[str, Any]:
 
 
 def read_json(path: Path, kind: type = dict, *, if_missing: str = _FROM_DATASET) -> Any:
-    """The contents of a JSON file, a `kind` (dict, list, or object for either) at its top.
+    """Read the contents of a JSON file with a `kind` (dict, list, or object for either) at its
+    top.
 
     Python reads NaN, Infinity and whole numbers of any length from JSON; `Number` and `array_of`
-    tell them apart."""
+    tell them apart.
+    """
     text = read_text(path, if_missing=if_missing)
     try:
         content = json.loads(text, object_pairs_hook=_unique)
@@ -119,10 +125,15 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def validated(kind: type[Value], content: object, where: str, *, hint: str = _MEND) -> Value:
-    """Content of a file as a pydantic model, or as another type that pydantic validates.
+def validate_content(kind: type[Value], content: object, where: str, *, hint: str = _MEND) -> Value:
+    """Validate the content of a file as a pydantic model, or as another type that pydantic
+    validates.
 
-    where: file and place in it. hint: what to do where the content is invalid; both for messages.
+    Args:
+        kind: the model or type.
+        content: the content.
+        where: file and place in it, for messages.
+        hint: advice for the message about invalid content.
     """
     try:
         return _adapter(kind).validate_python(content)
@@ -137,8 +148,11 @@ def validated(kind: type[Value], content: object, where: str, *, hint: str = _ME
 
 
 def array_of(value: object) -> np.ndarray | None:
-    """JSON's lists of numbers as float64, NaN and infinity included; None where there is anything
-    else in them (a text, true, a number beyond float64), or lists of unequal length."""
+    """Return JSON's lists of numbers as float64, NaN and infinity included.
+
+    The result is None if anything else is in them (a text, true, a number beyond float64), or if
+    lists have unequal length.
+    """
     flat = [value]
     while any(isinstance(v, list) for v in flat):
         flat = [w for v in flat for w in (v if isinstance(v, list) else [v])]
@@ -156,11 +170,13 @@ MISSING = "does not exist"
 
 
 def check_image(path: Path, *, decode: bool = True) -> ImageHeader | str:
-    """The header of a PNG or JPEG, or what is wrong with the image as the end of a sentence.
+    """Return the header of a PNG or JPEG, or the fault of the image as the end of a sentence.
 
     Args:
-        decode: decode it once to be sure of it, a JPEG at an eighth of its size. Without, its
-            header counts; images of 16 bits are decoded all the same, their values tell.
+        path: the image's file.
+        decode: if True, the image is decoded to be sure of it, a JPEG at an eighth of its size. If
+            False, its header counts; images of 16 bits are decoded all the same, since their values
+            decide.
     """
     try:
         with open_file(path) as file:
@@ -190,12 +206,15 @@ def check_image(path: Path, *, decode: bool = True) -> ImageHeader | str:
 
 
 def read_numbers(path: Path, shape: Sequence[int] | None = None) -> np.ndarray:
-    """The finite numbers of a text file, float64 in that shape, or flat; see `parse_numbers`."""
+    """Read the finite numbers of a text file, float64 in that shape, or flat.
+
+    See `parse_numbers`.
+    """
     return parse_numbers(read_text(path).replace(",", " "), str(path), shape)
 
 
 def parse_numbers(text: str, where: str, shape: Sequence[int] | None = None) -> np.ndarray:
-    """The finite numbers of a text, float64 in that shape, or flat."""
+    """Return the finite numbers of a text, float64 in that shape, or flat."""
     try:
         values = np.array([float(word) for word in text.split()], np.float64)
     except ValueError as error:
@@ -211,7 +230,7 @@ def parse_numbers(text: str, where: str, shape: Sequence[int] | None = None) -> 
 
 
 def read_pose(path: Path) -> np.ndarray:
-    """A rigid transform from a file of 4 x 4 or 3 x 4 numbers, float64 [4, 4]."""
+    """Read a rigid transform from a file of 4 x 4 or 3 x 4 numbers, float64 [4, 4]."""
     values = read_numbers(path)
     if values.size not in (12, 16):
         raise AdapterError(f"{path} must hold 4 x 4 numbers, a pose; it holds {values.size}")
@@ -219,7 +238,7 @@ def read_pose(path: Path) -> np.ndarray:
 
 
 def checked_pose(matrix: np.ndarray, where: str) -> np.ndarray:
-    """A matrix [3, 4] or [4, 4] as float64 [4, 4] with an exactly orthonormal rotation."""
+    """Return a matrix [3, 4] or [4, 4] as float64 [4, 4] with an exactly orthonormal rotation."""
     pose = np.eye(4)
     pose[: len(matrix)] = matrix
     rotation = pose[:3, :3]
@@ -237,12 +256,13 @@ def checked_pose(matrix: np.ndarray, where: str) -> np.ndarray:
     return pose
 
 
-def inside(root: Path, name: str, where: str) -> Path:
-    """The file of a dataset that a table names relative to the dataset's folder; where: the table
-    and row, for messages. Absolute names and '..' are refused.
+def resolve_inside(root: Path, name: str, where: str) -> Path:
+    """Return the path of a dataset's file that a table names relative to the dataset's folder.
 
-    Links are followed as long as they stay in the folder; so are the folder's own entries, which
-    people link to where their disks are."""
+    Absolute names and '..' are refused. Links are followed as long as they stay in the folder; the
+    folder's own entries are followed too, since people link them to their disks. where: the table
+    and row, for messages.
+    """
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or parts[0] == "/" or ".." in parts or "\\" in name or "\0" in name:
         raise AdapterError(

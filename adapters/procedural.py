@@ -1,8 +1,8 @@
-"""A street made from a seed: the embedded default scene, and the tests' ground truth.
+"""A street made from a seed: the built-in default scene, and the ground truth of tests.
 
 `procedural:street?seed=3&frames=20` is a drive down a street with houses, trees, parked and moving
-cars and people, six cameras and a LiDAR. `adapters.procedural.open_truth` answers exactly, for
-the same query, what any ray through it meets.
+cars and people, six cameras and a LiDAR. `open_procedural` makes the scene. For the same query,
+`open_truth` says exactly what any ray through it meets.
 """
 
 from __future__ import annotations
@@ -54,11 +54,12 @@ MAX_EYES = 40
 
 
 def open_procedural(query: Mapping[str, str]) -> Scene:
-    """The scene of a procedural street's query (keys as StreetParameters' fields): Gaussians,
-    actors, sky, cameras and labels. Equal parameters, equal bits.
+    """Open the scene of a procedural street: Gaussians, actors, sky, cameras and labels.
+
+    Equal parameters give equal bits. query: its keys are the fields of StreetParameters.
 
     Raises:
-        AdapterError: unknown keys or values outside their limits.
+        AdapterError: keys are unknown or values outside their limits.
     """
     parameters = parse_parameters(query)
     start_s = time.perf_counter()
@@ -93,7 +94,9 @@ def open_procedural(query: Mapping[str, str]) -> Scene:
 
 
 def _eyes(parameters: StreetParameters) -> tuple[np.ndarray, np.ndarray]:
-    """Places [E, 3] of the cameras along the drive, and the times [E] they are there."""
+    """Return the places [E, 3] of the cameras along the drive, and the times [E] at which they
+    are there.
+    """
     first = frame_time_ns(0)
     last = frame_time_ns(parameters.frames - 1)
     length = parameters.speed_mps * (last - first) * 1e-9
@@ -103,7 +106,7 @@ def _eyes(parameters: StreetParameters) -> tuple[np.ndarray, np.ndarray]:
 
 
 def procedural_labels(path: str, query: Mapping[str, str]) -> StreetLabels:
-    """The labels of a street's query; raises as open_procedural does."""
+    """Return the labels of a street's query. It raises as open_procedural does."""
     return StreetLabels(parse_parameters(query))
 
 
@@ -113,10 +116,13 @@ def procedural_labels(path: str, query: Mapping[str, str]) -> StreetLabels:
 class RayHits(NamedTuple):
     """Surfaces that N rays hit.
 
-    distance [N]: metres, infinite for sky. normal [N, 3]: world, unit, towards the ray's origin;
-    zero for sky. semantic [N] int16, instance [N] int32: 0 or 1 + the actor's index. rgb [N, 3]:
-    display-encoded, with baked light, zero for sky; None unless asked for. shape [N]: of the body
-    that was hit, -1 for sky.
+    Attributes:
+        distance: float64 [N], metres, infinite for sky.
+        normal: float64 [N, 3], world, unit, towards the ray's origin; zero for sky.
+        semantic: int16 [N].
+        instance: int32 [N], 0 or 1 + the actor's index.
+        shape: int64 [N], shape of the body that was hit, -1 for sky.
+        rgb: float [N, 3], display-encoded, with baked light, zero for sky. None unless requested.
     """
 
     distance: np.ndarray
@@ -128,8 +134,15 @@ class RayHits(NamedTuple):
 
 
 class TrueView(NamedTuple):
-    """A camera's image as it should be. rgb float32 [H, W, 3] with sky; depth float64 [H, W]: z,
-    infinite for sky; normal [H, W, 3]; semantic int16 [H, W]; instance int32 [H, W]."""
+    """Exact image of a camera.
+
+    Attributes:
+        rgb: float32 [H, W, 3], with sky.
+        depth: float64 [H, W], z, infinite for sky.
+        normal: float [H, W, 3].
+        semantic: int16 [H, W].
+        instance: int32 [H, W].
+    """
 
     rgb: np.ndarray
     depth: np.ndarray
@@ -225,14 +238,17 @@ class StreetTruth:
 
 
 def _turn(yaw: float) -> np.ndarray:
-    """world_from_actor rotation; `world @ turn` takes row vectors into the actor's frame."""
+    """Return the rotation world_from_actor.
+
+    `world @ turn` takes row vectors into the actor's frame.
+    """
     c = np.cos(yaw)
     s = np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def open_truth(query: Mapping[str, str]) -> StreetTruth:
-    """Truth of the street that `open_procedural` opens for the same query.
+    """Return the truth of the street that `open_procedural` opens for the same query.
 
     Raises:
         AdapterError: as open_procedural.
@@ -266,7 +282,8 @@ REFLECTIVITY = {
 def lidar_rays(
     parameters: StreetParameters, frame_index: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Origins [C, 3], unit directions [C, R, 3] and times [C] of a sweep of C columns, R rings.
+    """Return origins [C, 3], unit directions [C, R, 3] and times [C] of a sweep of C columns, R
+    rings.
 
     The beam starts behind the car half a frame early, turns clockwise, and looks ahead at the
     frame's time. Ring 0 is the lowest.
@@ -283,7 +300,7 @@ def lidar_rays(
 
 
 def sensor_origins(parameters: StreetParameters, timestamps_ns: np.ndarray) -> np.ndarray:
-    """Positions of the sensor at times [N], float64 [N, 3]."""
+    """Return the positions of the sensor at times [N], float64 [N, 3]."""
     positions, yaws = ego_pose(parameters, timestamps_ns)
     forward, left, up = SENSOR_M
     c = np.cos(yaws)
@@ -293,12 +310,14 @@ def sensor_origins(parameters: StreetParameters, timestamps_ns: np.ndarray) -> n
 
 @dataclass(frozen=True)
 class StreetLabels:
-    """Labels of a street; holds only its parameters, so it is cheap to pickle."""
+    """Labels of a street. They hold only its parameters, so they are cheap to pickle."""
 
     parameters: StreetParameters
 
     def boxes(self, frame_index: int) -> Boxes:
-        """Moving things first, in the order of the scene's actors, then parked cars."""
+        """Return the boxes of a frame: moving ones in the order of the scene's actors, then
+        parked cars.
+        """
         time = np.array([self._time_ns(frame_index)])
         street = build_street(self.parameters)
         rows = []
@@ -324,9 +343,11 @@ class StreetLabels:
         )
 
     def lidar(self, frame_index: int) -> LidarSweep:
-        """One turn's returns. Columns: x, y, z float64 metres; intensity float32 in [0, 1];
-        timestamp_ns int64; ring uint8; semantic uint8 (SemanticClass); instance uint16 (as
-        images')."""
+        """Return the returns of one turn.
+
+        Columns: x, y, z float64 metres; intensity float32 in [0, 1]; timestamp_ns int64; ring
+        uint8; semantic uint8 (SemanticClass); instance uint16 (as in images).
+        """
         self._time_ns(frame_index)
         origins, directions, times = lidar_rays(self.parameters, frame_index)
         rings = directions.shape[1]
@@ -354,11 +375,11 @@ class StreetLabels:
         })  # fmt: skip
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray:
-        """The SemanticClass of each return: the sweeps' own numbers."""
+        """Return the SemanticClass of each return: the sweep's own numbers."""
         return np.asarray(sweep.columns["semantic"], np.int16)
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray:
-        """Exact position of the sensor at the time of each return."""
+        """Return the exact position of the sensor at the time of each return."""
         self._time_ns(frame_index)
         return sensor_origins(self.parameters, np.asarray(sweep.columns["timestamp_ns"], np.int64))
 

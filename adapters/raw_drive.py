@@ -1,7 +1,7 @@
-"""One drive as any raw dataset has it, and the scene that is made of it.
+"""One drive in the form that all raw datasets share, and the scene that is made of it.
 
-An adapter fills a `RawDrive` from its dataset's files; `scene_of_drive` turns that into Gaussians.
-Between them stands what datasets have in common: options of URIs, held-out frames, the origin,
+An adapter fills a `RawDrive` from its dataset's files; `scene_of_drive` turns it into Gaussians.
+This module holds what datasets have in common: options of URIs, held-out frames, the origin,
 images, sweeps, boxes, classes, and weathered sweeps in the form of the dataset's files.
 """
 
@@ -68,7 +68,7 @@ class DriveFrames:
 
     @property
     def used(self) -> tuple[int, ...]:
-        """The numbers of the frames that the scene is built from."""
+        """Return the numbers of the frames from which the scene is built."""
         return tuple(number for number in self.numbers if number not in self.held_out)
 
 
@@ -118,7 +118,7 @@ class DriveOptions(UriOptions):
     )
 
     def select(self, numbers: Sequence[int], *, where: str) -> DriveFrames:
-        """The scene's frames out of the dataset's, which ascend. where: for messages."""
+        """Select the scene's frames from the dataset's, which ascend. where: for messages."""
         selection = tuple(number for number in numbers if number in self.frames)
         if not selection:
             raise AdapterError(
@@ -139,23 +139,25 @@ class DriveOptions(UriOptions):
         return DriveFrames(selection, held_out, () if held_out else (problem,))
 
 
-def some(numbers: Sequence[int]) -> str:
-    """How many frames and the first of them, for messages."""
+def describe_frames(numbers: Sequence[int]) -> str:
+    """Return the number of frames and the first of them, for messages."""
     first_numbers = ", ".join(map(str, numbers[:_MAX_NAMED]))
     more = ", ..." if len(numbers) > _MAX_NAMED else ""
     return f"{len(numbers)} frame{'' if len(numbers) == 1 else 's'} ({first_numbers}{more})"
 
 
 def drive_origin(positions_m: np.ndarray) -> np.ndarray:
-    """Offset to subtract from the dataset's coordinates so that float32 keeps its digits, float64
-    [3]: zero near the dataset's origin, else whole metres near the first of the car's positions [F,
-    3]."""
+    """Return the offset to subtract from the dataset's coordinates, float64 [3].
+
+    It lets float32 keep its digits. It is zero near the dataset's origin, else whole metres near
+    the first of the car's positions [F, 3].
+    """
     far = np.linalg.norm(positions_m, axis=1).max() > FAR_FROM_ORIGIN_M
     return np.round(positions_m[0]) if far else np.zeros(3)
 
 
-def recentred(world_from_thing: np.ndarray, world_origin_m: np.ndarray) -> torch.Tensor:
-    """A pose [4, 4] of the dataset's world in the scene's."""
+def recenter_pose(world_from_thing: np.ndarray, world_origin_m: np.ndarray) -> torch.Tensor:
+    """Return a pose [4, 4] of the dataset's world in the scene's."""
     pose = world_from_thing.copy()
     pose[:3, 3] -= world_origin_m
     return torch.from_numpy(pose)
@@ -165,8 +167,13 @@ def recentred(world_from_thing: np.ndarray, world_origin_m: np.ndarray) -> torch
 
 
 class Picture(NamedTuple):
-    """One camera's image of one frame. path: None where there is none. size: width and height as
-    the calibration says; without it, that of most of the camera's images."""
+    """One camera's image of one frame.
+
+    Attributes:
+        camera, frame: name and number.
+        path: None without an image.
+        size: width and height in the calibration. Without it, those of most of the camera's images.
+    """
 
     camera: str
     frame: int
@@ -176,8 +183,13 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DriveImages:
-    """paths: of the images that can be used, by frame and camera. sizes: width and height of the
-    cameras' images. problems: a sentence for each image that cannot be used."""
+    """Images of a drive.
+
+    Attributes:
+        paths: usable images by frame and camera.
+        sizes: width and height of the cameras' images.
+        problems: a sentence for each unusable image.
+    """
 
     paths: Mapping[int, Mapping[str, str]]
     sizes: Mapping[str, tuple[int, int]]
@@ -185,12 +197,15 @@ class DriveImages:
 
 
 def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> DriveImages:
-    """The images that are whole and of their camera's size. Up to _MAX_DECODED are decoded once to
-    be sure of it; of more, headers and ends are looked at.
+    """Return the images that are whole and of their camera's size.
+
+    Up to _MAX_DECODED images are decoded to be sure of them; if there are more, only headers and
+    ends are checked.
 
     Raises:
         AdapterError: a camera's size is known from no calibration and no image; or, for
-            every_camera, none of the images that it has can be used."""
+            every_camera, none of its images can be used.
+    """
     with ThreadPoolExecutor(_READERS) as pool:
         look = partial(_header_or_fault, decode=len(pictures) <= _MAX_DECODED)
         header_or_fault = dict(zip(pictures, pool.map(look, pictures), strict=True))
@@ -256,7 +271,7 @@ def _fault(
 
 
 def image_notes(images: Sequence[tuple[Picture, ImageHeader]]) -> list[str]:
-    """A sentence where usable images have an EXIF orientation, and where they have 16 bits."""
+    """Return a sentence if usable images have an EXIF orientation, and one if they have 16 bits."""
     notes = []
     turned = [(picture, header) for picture, header in images if header.orientation != 1]
     if turned:
@@ -280,8 +295,13 @@ def image_notes(images: Sequence[tuple[Picture, ImageHeader]]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """The usable returns of one frame: points float32 [N, 3] in the scene's world, timestamps_ns
-    int64 [N], semantic int16 [N], SemanticClass values."""
+    """Usable returns of one frame.
+
+    Attributes:
+        points: float32 [N, 3] in the scene's world.
+        timestamps_ns: int64 [N].
+        semantic: int16 [N], SemanticClass values.
+    """
 
     points: np.ndarray
     timestamps_ns: np.ndarray
@@ -292,7 +312,7 @@ class Sweep:
 
     @staticmethod
     def of_unknown_class(points: np.ndarray, timestamp_ns: int) -> Sweep:
-        """Points [N, 3] of one time."""
+        """Return a sweep of points [N, 3] of one time."""
         return Sweep(
             points.astype(np.float32),
             np.full(len(points), timestamp_ns, np.int64),
@@ -304,15 +324,24 @@ class Sweep:
 
 
 def is_in_box(points: np.ndarray, low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
-    """Mask of the points [N, 3] strictly inside an axis-aligned box, such as the recording car."""
+    """Return True for points [N, 3] strictly inside an axis-aligned box, such as the recording
+    car.
+    """
     return ((points > low_m) & (points < high_m)).all(axis=1)
 
 
 def is_usable(
     sweep: Sweep, points_m: np.ndarray, world_from_ego: np.ndarray, ego_m: np.ndarray
 ) -> np.ndarray:
-    """Mask of the returns that are finite, of a surface, and not in the recording car's box ego_m
-    [2, 3] in its own axes, bool [N]. points_m: the sweep's in float64."""
+    """Return True for returns that are finite, of a surface, and not in the recording car's box,
+    bool [N].
+
+    Args:
+        sweep: the sweep.
+        points_m: float64 [N, 3], its points.
+        world_from_ego: the car's pose.
+        ego_m: [2, 3], the car's box in its own axes.
+    """
     with np.errstate(all="ignore"):
         ego = (points_m - world_from_ego[:3, 3]) @ world_from_ego[:3, :3]
     keep = ~is_in_box(ego, *ego_m) & (sweep.semantic != NO_SURFACE)
@@ -320,8 +349,10 @@ def is_usable(
 
 
 def world_classes(numbers: np.ndarray, meaning: Mapping[int, int]) -> np.ndarray:
-    """The SemanticClass, or NO_SURFACE, of class numbers [N] of a dataset, int16; UNKNOWN for
-    numbers without a meaning."""
+    """Return the SemanticClass, or NO_SURFACE, of a dataset's class numbers [N], int16.
+
+    Numbers without a meaning are UNKNOWN.
+    """
     if not meaning:
         return np.full(len(numbers), SemanticClass.UNKNOWN, np.int16)
     class_numbers = np.array(sorted(meaning), np.int64)
@@ -331,10 +362,16 @@ def world_classes(numbers: np.ndarray, meaning: Mapping[int, int]) -> np.ndarray
 
 
 def class_of_air(meaning: Mapping[int, int], names: Mapping[int, str], name: str) -> int:
-    """The dataset's class number for returns that drops, flakes or fog made: that of the name, else
-    the lowest that stands for no surface, else the lowest of unknown meaning.
+    """Return the dataset's class number for returns that drops, flakes or fog made.
 
-    meaning, names: SemanticClass or NO_SURFACE, and the dataset's word, by class number."""
+    It is that of the name, else the lowest that stands for no surface, else the lowest of unknown
+    meaning.
+
+    Args:
+        meaning: SemanticClass or NO_SURFACE by class number.
+        names: the dataset's word by class number.
+        name: the preferred word.
+    """
     number = next((number for number, word in names.items() if word == name), None)
     if number is not None:
         return number
@@ -351,12 +388,19 @@ def stored_records(
     world_from_file: np.ndarray,
     air: Mapping[str, float] = MappingProxyType({}),
 ) -> bytes:
-    """Records float32 [N, C] of a file with a weathered sweep of them in their place.
+    """Return the records of a file, float32 [N, C], with those of a weathered sweep instead.
 
-    columns: x, y, z, intensity and others, in the file's order. air: values of columns that say
-    what a return's surface is, for returns that drops, flakes or fog made. Returns that did not
-    move keep their coordinates to the bit; the others are carried back in float64, so that only
-    float32's rounding is left: less than 0.01 mm within 100 m of the sensor."""
+    Returns that did not move keep their coordinates to the bit. The others are carried back in
+    float64, so that only float32's rounding is left: less than 0.01 mm within 100 m of the sensor.
+
+    Args:
+        records: float32 [M, C], the recorded records.
+        columns: x, y, z, intensity and others, in the file's order.
+        sweep: the weathered sweep.
+        world_from_file: pose of the file's coordinates.
+        air: values of the columns that describe a return's surface, for returns that drops, flakes
+            or fog made.
+    """
     out = records[sweep.columns[INDEX_COLUMN]]
     changed = np.flatnonzero(sweep.columns[CODE_COLUMN] != UNCHANGED)
     offsets = sweep.points_m[changed] - world_from_file[:3, 3]
@@ -376,12 +420,18 @@ def stored_records(
 
 @dataclass(frozen=True, eq=False)
 class BoxSample:
-    """One box of a moving object: where it stood at one moment.
+    """One box of a moving object: its place at one moment.
 
-    object_id: the dataset's name of the object. sibling_id: the name that another sensor's box of
-    the same object goes by, or None. frame: the dataset's frame number. world_from_box: float64
-    [4, 4] in the scene's world, box x forward. size_m: length, width, height. row: its number among
-    the frame's boxes."""
+    Attributes:
+        object_id: the dataset's name of the object.
+        sibling_id: name of another sensor's box of the same object, or None.
+        label: class.
+        frame: the dataset's frame number.
+        timestamp_ns: the moment.
+        world_from_box: float64 [4, 4] in the scene's world, box x forward.
+        size_m: length, width, height.
+        row: number among the frame's boxes.
+    """
 
     object_id: str
     sibling_id: str | None
@@ -395,9 +445,16 @@ class BoxSample:
 
 @dataclass(frozen=True, eq=False)
 class TimedBoxes:
-    """Boxes of one frame, by its number. timestamps_ns: int64 [B], when each stood there, or one
-    time for all. moves: bool [B], which are labelled as moving; None: as their attributes say.
-    rotations: float64 [B, 3, 3], where they are known better than from the quaternions."""
+    """Boxes of one frame with the times at which they stood there.
+
+    Attributes:
+        frame: number of the frame.
+        boxes: the boxes.
+        timestamps_ns: int64 [B], or one time for all.
+        moves: bool [B], True for boxes that are labelled as moving. None if their attributes say
+            it.
+        rotations: float64 [B, 3, 3], if they are known better than from the quaternions.
+    """
 
     frame: int
     boxes: Boxes
@@ -406,7 +463,7 @@ class TimedBoxes:
     rotations: np.ndarray | None = None
 
     def samples(self, world_origin_m: np.ndarray) -> Iterator[tuple[BoxSample | None, bool]]:
-        """Each box, None where it can stand nowhere, and whether it is labelled as moving."""
+        """Yield each box, None for an impossible one, and whether it is labelled as moving."""
         boxes = self.boxes
         values = np.concatenate([boxes.centers_m, boxes.sizes_m, boxes.quats], axis=1)
         good = np.isfinite(values).all(1) & (boxes.sizes_m > 0).all(1)
@@ -437,7 +494,7 @@ class TimedBoxes:
 
 
 def names_in(values: Iterable[object]) -> tuple[str, ...]:
-    """The texts of a dataset's column of names; "" of what is missing (None or NaN)."""
+    """Return the texts of a dataset's column of names; "" for missing ones (None or NaN)."""
     return tuple(
         "" if value is None or (isinstance(value, float) and math.isnan(value)) else str(value)
         for value in values
@@ -449,27 +506,34 @@ def _attribute(boxes: Boxes, names: Sequence[str]) -> np.ndarray | None:
 
 
 def _is_false(value: object) -> bool:
-    """False or 0; a missing value says nothing."""
+    """Return True for False or 0. A missing value says nothing."""
     return isinstance(value, bool | int | np.bool_ | np.integer) and not value
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedObjects:
-    """moving: samples of the objects that move, in order of frames. still: one sample of each
-    object that does not. problems: one sentence each."""
+    """Objects of a drive.
 
-    moving: tuple[BoxSample, ...]
-    still: tuple[BoxSample, ...]
+    Attributes:
+        moving_boxes: samples of the objects that move, in order of frames.
+        static_boxes: one sample of each object that does not.
+        problems: one sentence each.
+    """
+
+    moving_boxes: tuple[BoxSample, ...]
+    static_boxes: tuple[BoxSample, ...]
     problems: tuple[str, ...]
 
 
 def find_objects(
     frames: Iterable[TimedBoxes], world_origin_m: np.ndarray, *, several: bool = False
 ) -> RecordedObjects:
-    """The objects of the frames. An object moves if a box is labelled so or if its boxes lie
-    further apart than MOVED_M; others stay part of the static world.
+    """Find the objects in the boxes of frames.
 
-    several: an object may have several boxes in a frame; else the first one counts."""
+    An object moves if a box is labelled so, or if its boxes lie further apart than MOVED_M. Others
+    stay part of the static world. several: True if an object may have several boxes in a frame;
+    else the first one counts.
+    """
     samples: list[BoxSample] = []
     labelled: set[str] = set()
     bad = []
@@ -515,8 +579,10 @@ def find_objects(
 
 
 def objects_that_travel(places: Iterable[tuple[str, np.ndarray]]) -> set[str]:
-    """The objects of which two boxes are further apart in plan than MOVED_M. places: the name of
-    each box's object and its centre, metres."""
+    """Return the objects of which two boxes are further apart in plan than MOVED_M.
+
+    places: name of each box's object, and its centre in metres.
+    """
     by_name: dict[str, list[np.ndarray]] = defaultdict(list)
     for name, centre in places:
         by_name[name].append(centre[:2])
@@ -528,7 +594,7 @@ def objects_that_travel(places: Iterable[tuple[str, np.ndarray]]) -> set[str]:
 
 
 def colour_every(images: int) -> int:
-    """Step between the frames that give colours, in a drive with so many images."""
+    """Return the step between the frames that give colours, in a drive with so many images."""
     return max(1, -(-images // _MAX_COLOUR_IMAGES))
 
 
@@ -536,14 +602,19 @@ def colour_every(images: int) -> int:
 class RawDrive:
     """One drive of a dataset, in the scene's world: the dataset's less world_origin_m.
 
-    frames: those asked for, in order of time, with cameras and the images that can be used.
-    held_out: numbers of those that the scene is built without. sweeps: usable returns, one sweep a
-    frame that is used and has any. boxes: of the objects that move, in order of frames. labels: of
-    all frames, in the dataset's world, with the meaning of the sweeps' classes. lidar_top_deg: the
-    highest elevation that the LiDAR looks at. problems: what is missing or damaged, a sentence
-    each. used_rows: by camera, the part of the rows from the top that does not show the car.
-    grey_cameras: those whose images say nothing of colour. colour_every: of the frames that are
-    used, every such one gives colours and sky."""
+    Attributes:
+        frames: selected frames, in order of time, with cameras and usable images.
+        held_out: numbers of the frames without which the scene is built.
+        sweeps: usable returns, one sweep for each used frame that has any.
+        boxes: boxes of moving objects, in order of frames.
+        labels: labels of all frames, in the dataset's world, with the meaning of the sweeps'
+            classes.
+        lidar_top_deg: highest elevation that the LiDAR measures.
+        problems: a sentence for each thing that is missing or damaged.
+        used_rows: fraction of the rows from the top that does not show the car, by camera.
+        grey_cameras: cameras without colours.
+        colour_every: step between the used frames that give colours and sky.
+    """
 
     name: str
     source: str
@@ -578,19 +649,20 @@ class RawDrive:
 
     @property
     def path(self) -> np.ndarray:
-        """The car's places in the frames, float64 [F, 3]."""
+        """Return the car's places in the frames, float64 [F, 3]."""
         return np.stack([frame.world_from_ego[:3, 3].numpy() for frame in self.frames])
 
     @property
     def used(self) -> tuple[Frame, ...]:
-        """The frames that the scene is built from."""
+        """Return the frames from which the scene is built."""
         return tuple(frame for frame in self.frames if frame.index not in self.held_out)
 
 
 class IncompleteDrive(AdapterError):
-    """A drive of which no scene can be built, for it has no images or no LiDAR returns.
+    """Raised for a drive without images or LiDAR returns, of which no scene can be built.
 
-    drive: what it has. ground: the road, where it is known from elsewhere."""
+    drive: its data. ground: the road, if it is known from elsewhere.
+    """
 
     def __init__(self, message: str, drive: RawDrive, ground: Ground | None) -> None:
         super().__init__(message)
@@ -605,17 +677,23 @@ def scene_of_drive(
     added: Gaussians | None = None,
     ground: Ground | None = None,
 ) -> Scene:
-    """The scene of a drive: accumulated returns, coloured by the images. added, ground: of the
-    background, and of the road, from elsewhere.
+    """Build the scene of a drive: accumulated returns, coloured by the images.
+
+    Args:
+        drive: the drive.
+        options: options of the opening.
+        added: Gaussians of the background from elsewhere.
+        ground: the road, if it is known from elsewhere.
 
     Raises:
-        IncompleteDrive: there is no return or no image to build from.
-        AdapterError: no image shows a return."""
+        IncompleteDrive: there is no return or no image.
+        AdapterError: no image shows a return.
+    """
     # Labels are read without the kernels that scenes are built by.
     from adapters.lidar_scene.scene import build_lidar_scene
 
-    drive = _checked(drive)
-    numbers = some([frame.index for frame in drive.used])
+    drive = _check_frames_of_reference(drive)
+    numbers = describe_frames([frame.index for frame in drive.used])
     held_out = " that are not held out" if drive.held_out else ""
     first = "".join(f"; {problem}" for problem in drive.problems[:_MAX_FAULTS])
     if not any(frame.image_paths for frame in drive.used):
@@ -635,9 +713,10 @@ def scene_of_drive(
     return build_lidar_scene(drive, options, added=added, ground=ground)
 
 
-def _checked(drive: RawDrive) -> RawDrive:
-    """The drive without returns that lie beyond any LiDAR's reach, and with a sentence for what
-    seems to be in another frame."""
+def _check_frames_of_reference(drive: RawDrive) -> RawDrive:
+    """Return the drive without returns beyond any LiDAR's reach, and with sentences on wrong
+    frames.
+    """
     low = drive.path.min(axis=0)
     high = drive.path.max(axis=0)
     is_near = [

@@ -1,4 +1,8 @@
-"""Pickled tables and dictionaries of arrays from strangers (`augment.files.pickles`)."""
+"""Safe reading of pickled tables and dictionaries of arrays (see `augment.files.pickles`).
+
+The files come from strangers: nothing in them is run. The callers are the adapters of PandaSet and
+Street Gaussians.
+"""
 
 from __future__ import annotations
 
@@ -33,14 +37,15 @@ _GZIP_MAGIC = b"\x1f\x8b"
 
 
 def read_frame(path: Path, *, max_bytes: int = MAX_BYTES) -> pd.DataFrame:
-    """The pandas table pickled in a file, gzipped or not.
+    """Read the pandas table pickled in a file, gzipped or not.
 
-    Numbers, booleans and object columns (strings, None, NaN) of pandas 0.25 to 3; pandas' own
-    string columns, dates and categories are refused.
+    Numbers, booleans and object columns (strings, None, NaN) of pandas 0.25 to 3 are read. pandas'
+    own string columns, dates and categories are refused.
 
     Raises:
         AdapterError: the file is missing, truncated, larger than max_bytes when unpacked, asks for
-            anything but tables and arrays, or holds no table."""
+            anything but tables and arrays, or holds no table.
+    """
     stream = io.BytesIO(_read_bounded(path, max_bytes))
     try:
         content = Pickle(stream, _TABLE_NAMES).value()
@@ -56,7 +61,7 @@ def read_frame(path: Path, *, max_bytes: int = MAX_BYTES) -> pd.DataFrame:
 
 
 def read_array(path: Path, *, max_bytes: int = MAX_BYTES) -> np.ndarray:
-    """The numbers of a .npy file."""
+    """Read the numbers of a .npy file."""
     try:
         return read_npy(io.BytesIO(_read_bounded(path, max_bytes)))
     except PickleError as error:
@@ -64,7 +69,7 @@ def read_array(path: Path, *, max_bytes: int = MAX_BYTES) -> np.ndarray:
 
 
 def read_array_dict(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, np.ndarray]:
-    """The arrays by name that `np.save` wrote as one dictionary into a .npy file."""
+    """Read the arrays by name that `np.save` wrote as one dictionary into a .npy file."""
     stream = io.BytesIO(_read_bounded(path, max_bytes))
     try:
         check_holds_object(stream)
@@ -95,14 +100,16 @@ def check_holds_object(file: BufferedIOBase) -> None:
 
 
 def stream_arrays(file: BufferedIOBase) -> Iterator[tuple[int, np.ndarray]]:
-    """Number and array of every entry of a pickled dictionary, in the pickle's order.
+    """Yield number and array of every entry of a pickled dictionary, in the pickle's order.
 
-    file: read forward from its position to the pickle's end. The pickle is a dictionary, bare or
-    the only object of an array without axes, as `np.save` has it. Each array is handed over and
-    forgotten before the next is read: a file of many gigabytes passes through little memory.
+    The pickle is a dictionary, bare or the only object of an array without axes, as `np.save`
+    writes it. Each array is handed over and forgotten before the next is read: a file of many
+    gigabytes passes through little memory. file: read forward from its position to the pickle's
+    end.
 
     Raises:
-        PickleError: anything else is in it, or it is cut short."""
+        PickleError: anything else is in it, or it is cut short.
+    """
     pickle = Pickle(file, ARRAY_NAMES, is_streamed=True)
     count = 0
     for record in pickle.steps():
@@ -132,7 +139,10 @@ def _unwrapped(content: Any) -> dict[Any, Any]:
 
 
 class _Frame(Record):
-    """A DataFrame. Its state is a dictionary: `_mgr` (before pandas 1.1 `_data`) holds it all."""
+    """Stand-in for a DataFrame.
+
+    Its state is a dictionary whose `_mgr` (before pandas 1.1 `_data`) holds all.
+    """
 
     def __init__(self) -> None:
         self.manager: Any = None
@@ -166,7 +176,7 @@ class _Frame(Record):
 
 
 class _Manager(Record):
-    """The columns of a table in blocks of one type. blocks: (values [columns, rows], places)."""
+    """Columns of a table in blocks of one type. blocks: (values [columns, rows], places)."""
 
     def __init__(self, blocks: Any = (), axes: Any = (), *_: Any) -> None:
         self.blocks = blocks
@@ -175,7 +185,7 @@ class _Manager(Record):
             self.blocks = [(block.values, block.places) for block in blocks]
 
     def build(self, state: Any) -> None:
-        """As pandas before 1.3 has it: the last of the state is what counts."""
+        """Take the state of pandas before 1.3, whose last entry counts."""
         content = state[-1]["0.14.1"]
         self.axes = content["axes"]
         self.blocks = [(block["values"], block["mgr_locs"]) for block in content["blocks"]]
@@ -196,7 +206,7 @@ class _Slice:
 
 
 class _IndexClass:
-    """Stands for pandas' Index and what it was called by kind of number."""
+    """Stand-in for pandas' Index and its older classes by kind of number."""
 
 
 @dataclass(frozen=True)
@@ -243,7 +253,7 @@ def _index(record: Any) -> pd.Index:
 
 
 def _columns(block: Any, count: int, rows: int) -> Iterator[tuple[int, np.ndarray]]:
-    """(place, values [rows]) of the columns of a block."""
+    """Return (place, values [rows]) of the columns of a block."""
     record, places = block
     if not isinstance(record, ArrayRecord):
         raise PickleError("it holds columns of another kind than numbers and objects")
@@ -291,7 +301,7 @@ _TABLE_NAMES = _table_names()
 
 
 def _read_bounded(path: Path, max_bytes: int) -> bytes:
-    """The file's bytes, unpacked if gzipped, never more than max_bytes of them."""
+    """Read a file's bytes, unpacked if gzipped, never more than max_bytes of them."""
     try:
         with open_file(path) as raw:
             zipped = raw.read(2) == _GZIP_MAGIC

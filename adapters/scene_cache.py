@@ -1,19 +1,19 @@
-"""Raw scenes as they were built last, kept in the user's cache folder.
+"""Cache of raw scenes in the user's cache folder.
 
-A raw scene takes a minute of a processor to build, and an instant to open again. An entry is a
-scene file (augment.files.scene_file), named by what it was made from and by its own bytes:
+A raw scene takes a minute of a processor to build, and an instant to open from the cache. An entry
+is a scene file (augment.files.scene_file), named by its sources and by its own bytes:
 
     $XDG_CACHE_HOME or ~/.cache, climategs/scenes/KEY-DIGEST.climategs
 
 KEY is a digest of path and options, of the code and the libraries that build the scene, and of
 path, size and time of change of every file that the adapter reads. A file that is replaced by one
 of the same size and time goes unnoticed; to read all bytes of a drive would take seconds. Labels
-are no part of an entry: they are read from the recording, as ever.
+are no part of an entry: they are read from the recording.
 
-CLIMATEGS_SCENE_CACHE_GB says how large the folder may grow (10 by default), what was not used for
-longest goes first; with 0 the cache is neither read nor written. Beside it, in images/NAME-KEY/,
-lie images that a dataset has in no files of their own; they may take as much, or all that was used
-within a day, which a running job may need.
+CLIMATEGS_SCENE_CACHE_GB limits the folder's size (10 by default); the entries that were not used
+for longest are removed first. With 0 the cache is neither read nor written. Beside it,
+images/NAME-KEY/ holds images that a dataset does not have in files of their own. They may take as
+much, or all that was used within a day, which a running job may need.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from typing import Any
 from llvmlite.binding import get_host_cpu_name
 
 import augment
-from adapters.detect_format import recognised
+from adapters.detect_format import detect_scheme
 from adapters.scene_folder import with_images_in
 from adapters.uri import SCHEMES, format_uri, parse_uri
 from augment.errors import AdapterError, ClimateGSError, OutputError, SceneError
@@ -83,7 +83,7 @@ _LIBRARIES = (
 def cached_scene(
     scheme: str, path: str, query: Mapping[str, str], build: Callable[[], Scene]
 ) -> Scene:
-    """The scene that `build` would make of this URI, from the cache if it is there."""
+    """Return the scene that `build` would make of this URI, from the cache if it is there."""
     limit_bytes = _limit_bytes()
     open_labels = functools.cache(partial(SCHEMES[scheme].open_labels, path, query))
     key = _scene_key(scheme, path, query, open_labels) if limit_bytes else None
@@ -92,7 +92,7 @@ def cached_scene(
         return build()
     stored_scene = _read(folder, key)
     if stored_scene is None or not _has_images(stored_scene, folder):
-        with _alone(folder, key) as can_write:
+        with _lock_entry(folder, key) as can_write:
             stored_scene = _read(folder, key) if can_write else None  # by another process meanwhile
             if stored_scene is None or not _has_images(stored_scene, folder):
                 scene = build()
@@ -111,8 +111,11 @@ def cached_scene(
 
 
 def image_folder(name: str, sources: Sequence[Path]) -> Path:
-    """The folder for images that are made of these files, named by the files' paths, sizes and
-    times. Others make room that were not used for longest, and not within a day."""
+    """Return the folder for images that are made of these files.
+
+    Its name follows from the files' paths, sizes and times. Folders that were not used for longest,
+    and not within a day, are removed to make room.
+    """
     scenes = _cache_folder()
     if scenes is None:
         raise AdapterError(
@@ -145,12 +148,12 @@ def _has_images(scene: Scene, folder: Path) -> bool:
 
 
 def leave_out_cache() -> None:
-    """Neither read nor write it, in this process and those that it starts."""
+    """Disable the cache in this process and those that it starts."""
     os.environ[LIMIT_KEY] = "0"
 
 
 def _cache_folder() -> Path | None:
-    """Folder of the entries; None where the user has no home."""
+    """Return the folder of the entries, or None if the user has no home."""
     folder = user_cache_folder()
     return None if folder is None else folder / "scenes"
 
@@ -174,8 +177,11 @@ def _limit_bytes() -> float:
 def _scene_key(
     scheme: str, path: str, query: Mapping[str, str], open_labels: Callable[[], LabelSource | None]
 ) -> str | None:
-    """The KEY of a scene, hexadecimal; None where the scene's files cannot be listed, which the
-    adapter has better words for."""
+    """Return the KEY of a scene, hexadecimal.
+
+    The result is None if the scene's files cannot be listed; the adapter then gives a better
+    message.
+    """
     try:
         files = list(_facts_of(_files_of(scheme, path, query, open_labels)))
     except (OSError, ClimateGSError):
@@ -187,8 +193,11 @@ def _scene_key(
 def _files_of(
     scheme: str, path: str, query: Mapping[str, str], open_labels: Callable[[], LabelSource | None]
 ) -> Iterator[Path]:
-    """The files that the adapter reads, those too that it would read if they were there; a folder
-    stands for all that is in it."""
+    """Return the files that the adapter reads, including those that it would read if they
+    existed.
+
+    A folder stands for everything in it.
+    """
     yield from (Path(value) for value in query.values() if Path(value).is_file())
     root = Path(path)
     if scheme == "nuscenes":  # a folder of hundreds of scenes
@@ -219,7 +228,10 @@ def _files_of(
 
 
 def _facts_of(paths: Iterable[Path]) -> Iterator[tuple[str, int, int]]:
-    """Path, size and time of change of files and of all files in folders; of missing ones, that."""
+    """Return path, size and time of change of files and of all files in folders.
+
+    Missing ones are marked.
+    """
     count = 0
     for path in paths:
         names: Iterable[str] = [str(path)]
@@ -240,8 +252,11 @@ def _facts_of(paths: Iterable[Path]) -> Iterator[tuple[str, int, int]]:
 
 @functools.cache
 def _builder() -> tuple[str, ...]:
-    """The code that builds scenes, the libraries that it calculates with, and the processor, whose
-    instructions they choose from."""
+    """Return facts on the code that builds scenes.
+
+    They are its own, those of the libraries with which it calculates, and the processor, whose
+    instructions the libraries choose from.
+    """
     code = hashlib.sha256()
     for package in _CODE:
         top = Path(__file__).parents[1] / package
@@ -274,24 +289,26 @@ _SETTLED_S = 2.0  # a file changed later may change again within one tick of its
 
 
 def scene_digest(uri: str) -> str | None:
-    """Digest of a scene's content, 32 hexadecimal digits: other content, another digest. Of a
-    procedural scene, it is of its options and the package's version. None where the scene's files
-    cannot be listed or read, of which opening it tells more.
+    """Return a digest of a scene's content, 32 hexadecimal digits: other content, another
+    digest.
+
+    For a procedural scene it is of its options and the package's version. The result is None if the
+    scene's files cannot be listed or read; opening the scene then gives the reason.
     """
     try:
         scheme, path, query = parse_uri(uri)
-        scheme = scheme or recognised(Path(path))
+        scheme = scheme or detect_scheme(Path(path))
         entry = SCHEMES[scheme or ""]
         if path in entry.builtin:
             return _sha256([_DIGEST_FORMAT, scheme, sorted(query.items()), augment.__version__])
         files = _digest_files(str(scheme), path, query)
-        return _remembered([scheme, os.path.abspath(path), sorted(query.items())], files)
+        return _cached_digest([scheme, os.path.abspath(path), sorted(query.items())], files)
     except (KeyError, OSError, ClimateGSError):
         return None
 
 
 def _digest_files(scheme: str, path: str, query: Mapping[str, str]) -> dict[str, tuple[Path, bool]]:
-    """The scene's files by name: where each lies, and whether it is read whole."""
+    """Return the scene's files by name: the path of each, and whether it is read whole."""
     root = Path(path)
     places: list[Path] = [root]
     if scheme == "nuscenes":
@@ -316,7 +333,9 @@ def _digest_files(scheme: str, path: str, query: Mapping[str, str]) -> dict[str,
 
 
 def _visible_files(folder: Path) -> Iterator[Path]:
-    """Files below a folder, without hidden ones and those of outputs that were written there."""
+    """Return the files below a folder, without hidden ones and those of outputs that were
+    written there.
+    """
     for place, folders, names in os.walk(folder, followlinks=True):
         folders[:] = [
             name
@@ -326,8 +345,8 @@ def _visible_files(folder: Path) -> Iterator[Path]:
         yield from (Path(place, name) for name in names if name[0] != ".")
 
 
-def _remembered(names: list[Any], files: Mapping[str, tuple[Path, bool]]) -> str:
-    """The digest of the files, from the user's cache folder where none has changed since."""
+def _cached_digest(names: list[Any], files: Mapping[str, tuple[Path, bool]]) -> str:
+    """Return the digest of the files, from the user's cache folder if none has changed since."""
     stats = {name: file.stat() for name, (file, _) in sorted(files.items()) if file.is_file()}
     if not stats:
         raise FileNotFoundError(str(names))
@@ -371,7 +390,7 @@ def _sha256(facts: object) -> str:
 
 
 def _read(folder: Path, key: str) -> Scene | None:
-    """The scene of a whole entry, which is marked as used."""
+    """Read the scene of a whole entry, and mark the entry as used."""
     for entry in folder.glob(f"{key}-*{SCENE_SUFFIX}"):
         try:
             if entry.stem != f"{key}-{_digest_of(entry)}":
@@ -400,11 +419,11 @@ def _store(scene: Scene, folder: Path, key: str, limit_bytes: float) -> None:
         os.replace(new, new.with_name(f"{key}-{_digest_of(new)}{SCENE_SUFFIX}"))
         _make_room(folder, limit_bytes)
     except (OSError, ClimateGSError) as error:
-        _complain(folder, error)
+        _warn_once(folder, error)
 
 
 def _make_room(folder: Path, limit_bytes: float) -> None:
-    """Remove what was not used for longest, and what killed processes have left."""
+    """Remove entries that were not used for longest, and files that killed processes have left."""
     remove_temporaries(folder, recursive=False)
     used = []
     for entry in folder.glob(f"*{SCENE_SUFFIX}"):
@@ -419,16 +438,19 @@ def _make_room(folder: Path, limit_bytes: float) -> None:
 
 
 @contextlib.contextmanager
-def _alone(folder: Path, key: str) -> Iterator[bool]:
-    """Let one process build a scene while others that want the same wait; whether the folder can be
-    written. Where the system has no locks, each builds its own."""
+def _lock_entry(folder: Path, key: str) -> Iterator[bool]:
+    """Let one process build a scene while others that want the same wait.
+
+    It yields True if the folder can be written. Without the system's locks, each process builds its
+    own.
+    """
     path = folder / f"{key}.lock"
     with contextlib.ExitStack() as stack:
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             lock = open_lock(path)
         except (OSError, OutputError) as error:
-            _complain(folder, error)
+            _warn_once(folder, error)
             yield False
             return
         stack.callback(os.close, lock)
@@ -452,8 +474,8 @@ def _digest_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()[:32]
 
 
-def _complain(folder: Path, error: Exception) -> None:
-    """Say once in a process that scenes cannot be kept."""
+def _warn_once(folder: Path, error: Exception) -> None:
+    """Log once per process that scenes cannot be cached."""
     if folder not in _complained:
         logger.warning("scenes are not kept in %s for the next command: %s", folder, error)
     _complained.add(folder)

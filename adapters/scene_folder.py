@@ -1,10 +1,10 @@
-"""Scenes in files of our own, a folder (`climategs fit` writes them) or a single .climategs file,
-with the labels of their recording.
+"""Scenes in files of our own, with the labels of their recording.
 
     scene:PATH?data=pandaset:PATH/002
 
-Such files hold no labels: boxes and LiDAR are read, when asked for, from the recording that
-the scene was fitted to. `data` says where that is now, if it has moved.
+PATH is a folder (`climategs fit` writes them) or a single .climategs file. Such files hold no
+labels: boxes and LiDAR are read on demand from the recording to which the scene was fitted. `data`
+gives its place, if it has moved.
 """
 
 from __future__ import annotations
@@ -42,13 +42,15 @@ class Recording:
 
 
 def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
-    """The scene of a scene folder or a scene file.
+    """Open the scene of a scene folder or a scene file.
 
-    query: data, the URI or path of the recording, where it has moved.
+    query: data, the URI or path of the recording, if it has moved.
 
     Raises:
-        AdapterError: an unknown key, or nothing where `data` says. SceneError: a file is missing or
-            damaged. A recording that is gone is a sentence in Scene.problems."""
+        AdapterError: a key is unknown, or `data` leads nowhere.
+        SceneError: a file is missing or damaged. A missing recording is a sentence in
+            Scene.problems.
+    """
     unknown = sorted(set(query) - {_DATA_KEY})
     if unknown:
         raise AdapterError(
@@ -59,7 +61,7 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
     assert scene.recorded_source is not None
     recorded = _recording(scene.recorded_source, saved.working_folder)
     if _DATA_KEY in query:
-        new_recording = _given(query[_DATA_KEY])
+        new_recording = _recording_of_query(query[_DATA_KEY])
         if recorded is not None:
             moved = (
                 with_images_in(new_recording.path, frame, recorded.path) for frame in scene.frames
@@ -81,8 +83,11 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
 
 
 def storable(scene: Scene) -> Scene:
-    """An opened scene as it belongs into another saved scene: a recording that is not found today
-    is no fact about the scene, and a relative path to it still leads there."""
+    """Return an opened scene in the form in which it belongs into another saved scene.
+
+    A recording that is missing today is no fact about the scene, and a relative path to it stays
+    valid.
+    """
     scheme, path, _ = parse_uri(scene.source)
     if scheme != "scene" or scene.labels is not None or scene.recorded_source is None:
         return scene
@@ -94,16 +99,18 @@ def storable(scene: Scene) -> Scene:
 
 
 def recorded_labels(recording: Recording) -> LabelSource | None:
-    """The labels of a recording without its Gaussians, which take long to build; None where a scene
-    of this URI has none."""
+    """Return the labels of a recording without its Gaussians, which take long to build.
+
+    The result is None if a scene of this URI has no labels.
+    """
     if CAMERA_PATH_KEY in recording.query:  # the frames are not the recorded ones
         return None
     query = {key: value for key, value in recording.query.items() if key != GROUND_KEY}
     return SCHEMES[recording.scheme].open_labels(recording.path, query)
 
 
-def _given(uri: str) -> Recording:
-    """The recording of the `data` key."""
+def _recording_of_query(uri: str) -> Recording:
+    """Return the recording of the `data` key."""
     from adapters.base import recognise
 
     recording = _recording(uri, Path.cwd())
@@ -118,7 +125,7 @@ def _given(uri: str) -> Recording:
 
 
 def _recording(uri: str, working_folder: Path) -> Recording | None:
-    """A URI with its path made absolute; None for what names no recording."""
+    """Return a URI with its path made absolute, or None if it names no recording."""
     try:
         scheme, path, query = parse_uri(uri)
     except AdapterError:
@@ -131,7 +138,7 @@ def _recording(uri: str, working_folder: Path) -> Recording | None:
 
 
 def with_images_in(new: str, frame: Frame, old: str) -> Frame:
-    """The frame with the image paths that lay in one folder in another."""
+    """Return the frame with image paths moved from the folder `old` to the folder `new`."""
     paths = {
         name: str(Path(new, os.path.relpath(path, old))) if path.startswith(old + "/") else path
         for name, path in frame.image_paths.items()

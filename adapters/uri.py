@@ -1,6 +1,6 @@
-"""The text that names a scene: `scheme:path?key=value&…`, taken apart and put together.
+"""The URI of a scene, `scheme:path?key=value&…`, parsed and formatted.
 
-Special characters in paths and values (% ? & and, in values, = too) may be percent-encoded; a path
+Special characters in paths and values (% ? & and, in values, = too) may be percent-encoded. A path
 that exists as written is taken as written. `+` stands for itself.
 """
 
@@ -35,13 +35,17 @@ _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_+.-]*):(?!\\)")
 
 @dataclass(frozen=True)
 class Scheme:
-    """Openers of one kind of scene; functions as module:name, imported when used.
+    """Openers of one kind of scene. Functions are given as module:name, and imported when used.
 
-    opener: from path and query to a Scene whose `source` is `format_uri(scheme, path, query)`, with
-    an AdapterError for unknown keys. builtin: names that the path may be where it is no file; the
-    opener takes the query alone then. labels: from path and query to the labels alone (None where
-    there are none), which a scene fitted to such data needs. is_raw: whether opening builds the
-    scene from raw data, which takes long (see adapters.scene_cache)."""
+    Attributes:
+        opener: function from path and query to a Scene whose `source` is `format_uri(scheme, path,
+            query)`. It raises an AdapterError for unknown keys.
+        builtin: names that the path may be if it is no file. The opener then takes the query alone.
+        labels: function from path and query to the labels alone (None without any), which a scene
+            fitted to such data needs.
+        is_raw: True if opening builds the scene from raw data, which takes long (see
+            adapters.scene_cache).
+    """
 
     opener: str
     example: str
@@ -122,7 +126,7 @@ SCHEMES = {
 
 
 def parse_uri(uri: str) -> tuple[str | None, str, dict[str, str]]:
-    """Scheme (None where there is none), path and query of a scene's URI, decoded."""
+    """Return scheme (None without one), path and query of a scene's URI, decoded."""
     if Path(uri).exists() and uri:
         return None, uri, {}
     match = _SCHEME.match(uri)
@@ -138,20 +142,25 @@ def parse_uri(uri: str) -> tuple[str | None, str, dict[str, str]]:
 
 
 def format_uri(scheme: str, path: str | Path, query: Mapping[str, str]) -> str:
-    """The URI that `parse_uri` takes apart into these, with keys in the order given."""
+    """Return the URI of scheme, path and query, with keys in the order given. parse_uri is the
+    inverse.
+    """
     encoded = "&".join(f"{key}={quote(value, safe='/+,:.~-')}" for key, value in query.items())
     return f"{scheme}:{quote(str(path), safe='/+,:=&@ ')}" + (f"?{encoded}" if encoded else "")
 
 
 def add_to_uri(uri: str, key: str, value: str) -> str:
-    """A URI that names its scheme, with one more key, which replaces what it said before."""
+    """Return a URI, which names its scheme, with one more key.
+
+    It replaces an earlier value of the key.
+    """
     scheme, path, query = parse_uri(uri)
     assert scheme is not None, f"a scene's source names its scheme; got {uri!r}"
     return format_uri(scheme, path, {**query, key: value})
 
 
 def known_schemes() -> str:
-    """Every scheme with an example, for messages."""
+    """Return every scheme with an example, for messages."""
     return ", ".join(f"{name} ({entry.example})" for name, entry in SCHEMES.items())
 
 
@@ -182,8 +191,11 @@ def check_query(scheme: str, query: Mapping[str, str], meanings: Mapping[str, st
 
 
 def _split_query(text: str, uri: str) -> tuple[str, dict[str, str]]:
-    """Path and query. A path may hold '?': the shortest beginning that exists is the path, and
-    where none does, all before the first '?'."""
+    """Return path and query.
+
+    A path may hold '?': the shortest beginning that exists is the path. If none exists, it is all
+    before the first '?'.
+    """
     marks = [i for i, character in enumerate(text) if character == "?"]
     if not marks or Path(text).exists():
         return text, {}

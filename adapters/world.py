@@ -1,4 +1,4 @@
-"""From a file's world to the scene's: axes, unit of length, origin."""
+"""Conversion from a file's world to the scene's: axes, unit of length, origin."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from augment.semantics import class_of_label
 
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
-    """All parts in one. Parts have one degree of spherical harmonics, and classes unless empty."""
+    """Join parts. They have one degree of spherical harmonics, and classes unless empty."""
     names = ("means", "quats", "scales", "opacities", "sh")
     joined = {name: torch.cat([getattr(p, name) for p in parts]) for name in names}
     semantic = torch.cat([p.semantic for p in parts if p.semantic is not None])
@@ -26,7 +26,7 @@ def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def with_class_of(label: str, gaussians: Gaussians) -> Gaussians:
-    """The Gaussians of an object of which no more is known than its label."""
+    """Return the Gaussians of an object with the class of its label, if nothing more is known."""
     classes = torch.full((len(gaussians),), int(class_of_label(label)), dtype=torch.int16)
     return dataclasses.replace(gaussians, semantic=classes)
 
@@ -38,30 +38,40 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 @dataclass(frozen=True, eq=False)
 class WorldChange:
-    """scene = scale * rotation @ source - origin_m, in float64.
+    """Change of world: scene = scale * rotation @ source - origin_m, in float64.
 
-    rotation: [3, 3], proper. scale: metres per unit of the source. origin_m: [3], metres along the
-    scene's axes."""
+    Attributes:
+        rotation: float64 [3, 3], proper.
+        scale: metres per unit of the source.
+        origin_m: float64 [3], metres along the scene's axes.
+    """
 
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     scale: float = 1.0
     origin_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def points(self, points: np.ndarray) -> np.ndarray:
-        """float64 [N, 3] of the scene."""
+        """Return points in the scene's world, float64 [N, 3]."""
         return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) - self.origin_m
 
     def pose(self, world_from_camera: np.ndarray) -> np.ndarray:
-        """world_from_camera of the scene; stays rigid, the scale moves its position only."""
+        """Return world_from_camera of the scene.
+
+        It stays rigid: the scale changes its position only.
+        """
         pose = np.eye(4)
         pose[:3, :3] = self.rotation @ world_from_camera[:3, :3]
         pose[:3, 3] = self.points(world_from_camera[None, :3, 3])[0]
         return pose
 
     def gaussians(self, gaussians: Gaussians, source_origin: np.ndarray) -> Gaussians:
-        """Gaussians of the scene: means, quats, scales, and SH of degree 1 and above are turned.
+        """Return Gaussians in the scene's world.
 
-        source_origin: [3], what was already subtracted from their means, in the source's world."""
+        Means, quats, scales, and SH of degree 1 and above change.
+
+        source_origin: [3], offset that was already subtracted from their means, in the source's
+        world.
+        """
         shift = self.points(source_origin[None])[0]
         turned = not np.array_equal(self.rotation, np.eye(3))
         if not turned and self.scale == 1.0 and not shift.any():
@@ -71,7 +81,9 @@ class WorldChange:
 
 
 def parse_up(text: str) -> np.ndarray:
-    """Unit vector of `up`: an axis such as +z, -y or x, or three numbers such as 0.1,-0.9,0.2."""
+    """Return the unit vector of `up`: an axis such as +z, -y or x, or three numbers such as
+    0.1,-0.9,0.2.
+    """
     name = text.strip().lower()
     if name.lstrip("+-") in _AXES and len(name) <= 2:
         axis = np.array(_AXES[name[-1]])
@@ -90,7 +102,7 @@ def parse_up(text: str) -> np.ndarray:
 
 
 def rotation_to_z_up(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation that takes the unit vector `up` to +z; about x where up is -z."""
+    """Return the smallest rotation that takes the unit vector `up` to +z; about x if up is -z."""
     middle = up + np.array([0.0, 0.0, 1.0])
     if np.linalg.norm(middle) < 1e-9:
         return np.diag([1.0, -1.0, -1.0])
@@ -103,7 +115,7 @@ def rotation_to_z_up(up: np.ndarray) -> np.ndarray:
 
 
 def invert_pose(pose: np.ndarray) -> np.ndarray:
-    """The inverse of a rigid transform, float64 [4, 4]."""
+    """Return the inverse of a rigid transform, float64 [4, 4]."""
     out = np.eye(4)
     out[:3, :3] = pose[:3, :3].T
     out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
@@ -111,6 +123,6 @@ def invert_pose(pose: np.ndarray) -> np.ndarray:
 
 
 def nearest_axis(vector: np.ndarray) -> str:
-    """The name of the axis closest to a vector: +x, -x, … -z."""
+    """Return the name of the axis closest to a vector: +x, -x, … -z."""
     index = int(np.abs(vector).argmax())
     return f"{'-' if vector[index] < 0 else '+'}{'xyz'[index]}"

@@ -1,20 +1,25 @@
-"""The recorded image as the picture, to which the scene supplies the weather.
+"""Pictures on recorded images: the photo stays the picture, and the scene supplies the weather.
 
-P is the photo in the scene's colours, mapped where a style asks for it; alpha, depth and the share
-o and colours S of what lies on the scene (snow) are rendered. Then
+In: a scene with recorded images, and one of its cameras (`open_photo`). Out: a `Photo`, whose
+methods give `augment.drawing.LayerRenderer` the colours of surfaces and sky and the transmittance
+of smog. `check_photos` and `check_base` refuse recipes that need images which were not recorded.
+
+P is the photo in the scene's colours, mapped where a style asks for it. The scene is rendered for
+alpha, depth, and the share o and colours S of what lies on the scene (snow). T is the transmittance
+of the smog. Then
 
     clear = (1 - o) P + S
     picture = T clear + (1 - T) airlight         T = alpha T(depth) + (1 - alpha) T(sky)
 
-A layer of a flooded scene shows (alpha - o) P + S in place of its splats' colours, so what stands
-in the water, what is seen through it and what the screen reflects are the photo's. Only views that
-the photo is not, as the mirrored one, show splats.
+A layer of a flooded scene shows (alpha - o) P + S in place of its splats' colours. So what stands
+in the water, what lies under it and what the water reflects has the photo's colours. Only views
+that the photo does not hold, as the mirrored one, show splats.
 
-T and the sky's share are those of splats, whose edges lie pixels beside the photo's: a guided
-filter (He, Sun and Tang 2013, "Guided Image Filtering") moves them there. Things close to the
-camera lie further off: beside edges that the photo does not show, T is told by what is around, as
-far as the photo shows no edge between (Min et al. 2014, "Fast Global Image Smoothing Based on
-Weighted Least Squares").
+T and the sky's share are those of splats, whose edges lie pixels beside the photo's. A guided
+filter (He, Sun and Tang 2013, "Guided Image Filtering") moves them to the photo's. Things close to
+the camera lie further off. Beside edges that the photo does not show, T is therefore taken from its
+surroundings, as far as the photo shows no edge between (Min et al. 2014, "Fast Global Image
+Smoothing Based on Weighted Least Squares").
 """
 
 from __future__ import annotations
@@ -56,31 +61,53 @@ from augment.render.threads import kernel_threads
 from augment.scene import PosedGaussians, Scene
 from recipes.schema import Recipe
 
+# Value of recipe.render.base for pictures on recorded images.
 RECORDED = "recorded"
-# What a photo shows is opaque, while reconstructed surfaces let some light through: the alphas that
-# are taken for nothing and for all.
-CLEAR_ALPHA, OPAQUE_ALPHA = 0.04, 0.96
-# Of the guided filter: its radius over the image's width, and the variance of display-encoded
-# colour that counts as an edge.
-RADIUS, EDGE = 1 / 320, 0.05**2
-WIDER = 4  # times as wide for the sky's share: splats of sky and of pale walls are told apart badly
-# Splats lie OFF_M beside what the photo shows, which is many pixels where that is close: edges of T
-# between surfaces, by at least EDGE_OF_T, that may be off by FEWEST_PX or more, at most a WIDEST of
-# the image's width, in a copy ALIGNED_PX wide. An edge of the photo has a contrast of PLAIN of 255
-# or more; where most of T's edges nearby (a NEARBY of the width) are on such, they are where they
-# belong. The further from the others, the more T counts, and everywhere a little, for what is
-# nothing but edge. REACH, ALIKE: of the smoothing, squared pixels and colours of 255.
-OFF_M, EDGE_OF_T, FEWEST_PX, WIDEST, ALIGNED_PX = 0.12, 0.1, 2, 1 / 30, 480
-PLAIN, NEARBY = 26, 1 / 20
-LITTLE, REACH, ALIKE = 0.02, 1000.0, 5.0
-# Where nothing is rendered, rays that fall by more than this (metres a metre) see the road, no sky.
+# Alpha of reconstructed surfaces up to which a pixel counts as empty. What a photo shows is opaque,
+# while reconstructed surfaces let some light through.
+CLEAR_ALPHA = 0.04
+# Alpha of reconstructed surfaces from which a pixel counts as opaque.
+OPAQUE_ALPHA = 0.96
+# Radius of the guided filter, as a part of the image's width.
+RADIUS = 1 / 320
+# Variance of display-encoded colour that the guided filter counts as an edge.
+EDGE = 0.05**2
+# Radius for the sky's share, in radii: splats of sky and of pale walls are told apart badly.
+WIDER = 4
+# Distance by which splats lie beside what the photo shows, metres: many pixels for close things.
+OFF_M = 0.12
+# Least contrast of an edge of T between surfaces that may have to be moved.
+EDGE_OF_T = 0.1
+# Offset of an edge below which it stays, pixels.
+FEWEST_PX = 2
+# Largest offset of an edge, as a part of the image's width.
+WIDEST = 1 / 30
+# Width of the copy in which edges are moved, pixels.
+ALIGNED_PX = 480
+# Least contrast of an edge of the photo, of 255.
+PLAIN = 26
+# Size of the neighbourhood in which most of T's edges must lie on edges of the photo to be where
+# they belong, as a part of the image's width.
+NEARBY = 1 / 20
+# Least weight of T in the smoothing, for what is nothing but edge; T counts more far from edges.
+LITTLE = 0.02
+# Strength of the smoothing (lambda of Min et al. 2014), squared pixels.
+REACH = 1000.0
+# Colour difference that stops the smoothing (sigma of Min et al. 2014), of 255.
+ALIKE = 5.0
+# Fall of a ray, metres a metre, from which it meets the road, not the sky, where nothing is
+# rendered.
 LEVEL = 0.02
-MAX_CONDITION = 1e3  # of a colour map that is undone: 8 bits come back exactly
-HIGHEST_M = 4.0  # a camera above the road; more is a hill's
-ROWS = 32  # image rows a thread takes at a time
-_NO_COLOR = torch.zeros(1, 3, 4)  # a colour map that leaves black
+# Largest condition number of a colour map that is undone: 8 bits come back exactly.
+MAX_CONDITION = 1e3
+# Largest height of a camera above the road, metres; more is a hill's.
+HIGHEST_M = 4.0
+# Image rows that a thread takes at a time.
+ROWS = 32
+# Colour map that leaves black.
+_NO_COLOR = torch.zeros(1, 3, 4)
 
-# ---- Which image a camera recorded ---------------------------------------------------------------
+# ---- The recorded image of a camera --------------------------------------------------------------
 
 
 def check_photos(
@@ -92,30 +119,34 @@ def check_photos(
 ) -> None:
     """Refuse recipes on recorded images where one of the selected images was not recorded.
 
-    selection: frames and the names of their cameras. is_path: they are of a camera path.
+    Args:
+        recipes: the recipes of the job.
+        scene_name: names the scene in the message.
+        selection: frames and the names of their cameras.
+        is_path: if True, the frames are of a camera path.
 
     Raises:
-        SceneError: says which image is missing, and what to do.
+        SceneError: names the missing image, and says what to do.
     """
     names = sorted({recipe.name for recipe in recipes if recipe.render.base == RECORDED})
     if not names:
         return
-    wanted = f"recipe {', '.join(names)}: render.base is 'recorded'"
+    request = f"recipe {', '.join(names)}: render.base is 'recorded'"
     if is_path:
         raise SceneError(
-            f"{wanted}, and a camera path shows what no camera of scene {scene_name!r} recorded; "
+            f"{request}, and a camera path shows what no camera of scene {scene_name!r} recorded; "
             f"render it with base: splats"
         )
     views = [(frame, name) for frame, cameras in selection for name in cameras]
-    missing = [v for v in views if not has_image(Path(v[0].image_paths.get(v[1], "")))]
-    if missing:
-        frame, name = missing[0]
+    missing_views = [v for v in views if not has_image(Path(v[0].image_paths.get(v[1], "")))]
+    if missing_views:
+        frame, name = missing_views[0]
         path = frame.image_paths.get(name)
-        where = "none is known" if path is None else f"{path} is not there"
+        reason = "none is known" if path is None else f"{path} is not there"
         raise SceneError(
-            f"{wanted}, but {len(missing)} of {len(views)} selected images of scene "
+            f"{request}, but {len(missing_views)} of {len(views)} selected images of scene "
             f"{scene_name!r} have no recorded one; the first is camera {name!r} of frame "
-            f"{frame.index}: {where}. Select other cameras or frames, say where the recording has "
+            f"{frame.index}: {reason}. Select other cameras or frames, say where the recording has "
             f"moved (data=URI of a fitted scene), or render with base: splats"
         )
 
@@ -128,40 +159,44 @@ def check_base(recipe: Recipe, scene: Scene) -> None:
     """
     if recipe.render.base != RECORDED:
         return
-    wanted = f"recipe {recipe.name}: render.base is 'recorded'"
+    request = f"recipe {recipe.name}: render.base is 'recorded'"
     if recipe.render.scale > 1:
         raise SceneError(
-            f"{wanted}, which holds no more pixels than were recorded; render.scale must be <= 1, "
+            f"{request}, which holds no more pixels than were recorded; render.scale must be <= 1, "
             f"got {recipe.render.scale:g}"
         )
     if not any(frame.image_paths for frame in scene.frames):
         raise SceneError(
-            f"{wanted}, but scene {scene.name!r} ({scene.source}) has no recorded images; open the "
-            f"recording or a scene fitted to it, or render with base: splats"
+            f"{request}, but scene {scene.name!r} ({scene.source}) has no recorded images; open "
+            f"the recording or a scene fitted to it, or render with base: splats"
         )
 
 
 def find_recorded(scene: Scene, camera: Camera) -> tuple[Path, Camera]:
-    """The image that a camera recorded, and that camera at the image's own size.
+    """Return the path of the image that a camera recorded, and that camera at the image's own size.
 
-    camera: of the scene, at any scale; found by name, time and pose.
+    Args:
+        scene: the scene.
+        camera: a camera of the scene, at any scale; found by name, time and pose.
 
     Raises:
-        SceneError: there is none.
+        SceneError: the camera has no recorded image.
     """
 
     def index() -> dict[tuple[str, int], list[tuple[Path, Camera]]]:
-        found = defaultdict(list)
+        images_by_key = defaultdict(list)
         for frame in scene.frames:
             for name, path in frame.image_paths.items():
-                if (own := frame.cameras.get(name)) is not None:
-                    found[name, own.timestamp_ns].append((Path(path), own))
-        return dict(found)
+                if (recorded_camera := frame.cameras.get(name)) is not None:
+                    images_by_key[name, recorded_camera.timestamp_ns].append(
+                        (Path(path), recorded_camera)
+                    )
+        return dict(images_by_key)
 
     images = memo_of(scene).get(("recorded images",), index)
-    for path, own in images.get((camera.name, camera.timestamp_ns), ()):
-        if _is_window(own.resized(camera.width, camera.height), camera):
-            return path, own
+    for path, recorded_camera in images.get((camera.name, camera.timestamp_ns), ()):
+        if _is_window(recorded_camera.resized(camera.width, camera.height), camera):
+            return path, recorded_camera
     raise SceneError(
         f"scene {scene.name!r} has no recorded image of camera {camera.name!r} at "
         f"{camera.timestamp_ns} ns, this pose and this focal length; with render.base 'recorded' "
@@ -170,9 +205,9 @@ def find_recorded(scene: Scene, camera: Camera) -> tuple[Path, Camera]:
 
 
 def _is_window(outer: Camera, inner: Camera) -> bool:
-    """Whether both look through one lens at one moment, at one size of a pixel."""
-    focal = max(abs(outer.fx / inner.fx - 1), abs(outer.fy / inner.fy - 1))
-    return focal < 1e-9 and torch.equal(outer.camera_from_world, inner.camera_from_world)
+    """Return True if both look through one lens at one moment, with pixels of one size."""
+    focal_difference = max(abs(outer.fx / inner.fx - 1), abs(outer.fy / inner.fy - 1))
+    return focal_difference < 1e-9 and torch.equal(outer.camera_from_world, inner.camera_from_world)
 
 
 # ---- The photo in place of the scene's colours ---------------------------------------------------
@@ -180,29 +215,30 @@ def _is_window(outer: Camera, inner: Camera) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PhotoStyle:
-    """A style's colour maps. splats [C, 3, 4]: one, or one a class. sky [3, 4]. levels [M]: the sky
-    in each of the background's M - 2 splats, 0 to 1, between zeros that stand for no splat and for
-    actors'; None where there is none in any.
-
-    others [K, 3, 4]: of the splats' maps, those that differ from the first. marks [R, 3, 4]: what a
-    map makes of any colour: the sky in a splat, and in how far it takes each of the others; by rows
-    of the background's splats, or by classes where `rows` is None. None where there is nothing to
-    mark, or others are more than two.
-    """
+    """A style's colour maps for a photo."""
 
     splats: Float[Tensor, "C 3 4"]
+    """Maps of surfaces, [C, 3, 4]: one, or one a class."""
     sky: Float[Tensor, "3 4"]
+    """Map of the sky."""
     levels: Float[Tensor, " M"] | None = None
+    """Share of sky in each of the background's M - 2 splats, 0 to 1, between a zero for no splat
+    and a zero for actors' splats; None where no splat shows sky."""
     others: Float[Tensor, "K 3 4"] | None = None
+    """Those of the splats' maps that differ from the first; None where there are none."""
     marks: Float[Tensor, "R 3 4"] | None = None
+    """Maps that turn any colour into marks: the share of sky in a splat, and how far it takes each
+    of `others`; [R, 3, 4], by rows of the background's splats, or by classes where `rows` is None.
+    None where there is nothing to mark, or where `others` are more than two."""
     rows: Int16[Tensor, " N"] | None = None
+    """Row of `marks` of each splat of the background; None where `marks` go by classes."""
 
     def marked(self, parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
-        """The parts in the colours of their marks."""
+        """Return the parts in the colours of their marks."""
         assert self.marks is not None
-        own = self.marks[: len(self.splats)].contiguous()
+        class_marks = self.marks[: len(self.splats)].contiguous()
         return tuple(
-            replace(part, color_maps=own, color_rows=None)
+            replace(part, color_maps=class_marks, color_rows=None)
             if part.instance_id > 0 or self.rows is None
             else replace(part, color_maps=self.marks, color_rows=self.rows)
             for part in parts
@@ -211,43 +247,48 @@ class PhotoStyle:
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A recorded image. camera: that took it, at its size. pixels: as recorded. backend: that
-    draws. undone: the map from recorded colours to the scene's, which the camera's colour map turns
-    back in the finished picture; None where these are the same. height_m: of the camera above the
-    road; None where unknown. faded: the ground's shadows, in smog.
-    """
+    """A recorded image in place of the scene's colours."""
 
     camera: Camera
+    """Camera that took the image, at the photo's size."""
     pixels: UInt8[np.ndarray, "H W 3"]
+    """The image as recorded."""
     backend: str
+    """Backend that draws."""
     undone: Float[Tensor, "3 4"] | None = None
+    """Map from recorded colours to the scene's, which the camera's colour map turns back in the
+    finished picture; None where they are the same."""
     height_m: float | None = None
+    """Height of the camera above the road, metres; None where unknown."""
     style: PhotoStyle | None = None
+    """Colour maps of a style; None without a style."""
     faded: FadedShadows | None = None
+    """Shadows on the ground that fade in smog; None where none fade."""
 
     def is_seen_by(self, camera: Camera) -> bool:
-        """Whether the camera is a window of the photo's."""
+        """Return True if the camera is a window of the photo's."""
         return _is_window(self.camera, camera)
 
     def buffers_for(self, parts: Sequence[PosedGaussians]) -> frozenset[str]:
-        """That painting layers of these parts takes."""
-        own = {RGB, OVERLAY} if any(part.is_overlay for part in parts) else set[str]()
+        """Return the buffers that painting layers of these parts needs."""
+        buffers = {RGB, OVERLAY} if any(part.is_overlay for part in parts) else set[str]()
         if self.style is not None and (len(self.style.splats) > 1 or self.style.levels is not None):
-            own.add(SPLAT_IDS)
-        return frozenset(own)
+            buffers.add(SPLAT_IDS)
+        return frozenset(buffers)
 
     def prepare(
         self, parts: Sequence[PosedGaussians]
     ) -> tuple[tuple[PosedGaussians, ...], frozenset[str]]:
-        """The parts and the buffers that `clear_picture` takes."""
+        """Return the parts and the buffers that `clear_picture` needs."""
         if self._takes_marks(parts):
             assert self.style is not None
             return self.style.marked(parts), frozenset({RGB})
         return blackened(parts), self.buffers_for(parts)
 
     def _takes_marks(self, parts: Sequence[PosedGaussians]) -> bool:
-        """Whether splats say in place of their colours what a style does to them, which takes half
-        as long as knowing the heaviest one of each pixel.
+        """Return True if splats show marks of the style in place of their colours.
+
+        This takes half as long as finding the heaviest splat of each pixel.
         """
         marks = None if self.style is None else self.style.marks
         return marks is not None and not any(part.is_overlay for part in parts)
@@ -257,32 +298,40 @@ class Photo:
         raster: RenderOutput,
         parts: Sequence[PosedGaussians],
         camera: Camera,
-        shown: Float[Tensor, "H W"] | None = None,
+        photo_share: Float[Tensor, "H W"] | None = None,
     ) -> RenderOutput:
-        """A layer that shows the photo in place of its splats.
+        """Return a layer that shows the photo in place of its splats.
 
-        raster: of `blackened` parts, or, with `shown`, of the parts in their own colours, which
-        stay where the photo shows the layer in no share of a pixel.
+        Args:
+            raster: buffers of `blackened` parts; with `photo_share`, of the parts in their own
+                colours.
+            parts: the parts of the layer.
+            camera: the view, a window of the photo's camera.
+            photo_share: share of each pixel of the photo that shows the layer; the rest keeps the
+                parts' colours. None means 1 everywhere.
         """
         assert raster.rgb is not None and raster.alpha is not None
-        land, sky, level = self.colors(raster, parts, camera)
-        surface = land if level is None else mix(land, sky, level)
+        surface_rgb, sky_rgb, sky_share = self.colors(raster, parts, camera)
+        surface = surface_rgb if sky_share is None else mix(surface_rgb, sky_rgb, sky_share)
         surface = self._without_sun(surface, raster, camera)
-        if shown is not None:
-            weight = shown if camera is self.camera else shown * self._inside(camera)
-            own = (1 - weight)[..., None] * raster.rgb
-            return replace(raster, rgb=add_faded(own, surface, weight * raster.alpha))
-        alpha = share = opaque_alpha(raster.alpha)
+        if photo_share is not None:
+            weight = photo_share if camera is self.camera else photo_share * self._inside(camera)
+            rest_rgb = (1 - weight)[..., None] * raster.rgb
+            return replace(raster, rgb=add_faded(rest_rgb, surface, weight * raster.alpha))
+        alpha = photo_alpha = opaque_alpha(raster.alpha)
         if raster.overlay is not None:
             alpha = torch.maximum(alpha, raster.overlay)
-            share = alpha - raster.overlay
-        return replace(raster, rgb=add_faded(raster.rgb, surface, share), alpha=alpha)
+            photo_alpha = alpha - raster.overlay
+        return replace(raster, rgb=add_faded(raster.rgb, surface, photo_alpha), alpha=alpha)
 
     def clear_picture(
         self, raster: RenderOutput, parts: Sequence[PosedGaussians]
     ) -> Float[Tensor, "H W 3"]:
-        """The photo with what lies on the scene, before any smog. raster: of the parts that
-        `prepare` gives.
+        """Return the photo with what lies on the scene, before any smog.
+
+        Args:
+            raster: buffers of the parts that `prepare` gives.
+            parts: those parts.
         """
         rgb = self._land if self.style is None else self._styled(self.style, raster, parts)
         rgb = self._without_sun(rgb, raster, self.camera)
@@ -294,11 +343,15 @@ class Photo:
     def _styled(
         self, style: PhotoStyle, raster: RenderOutput, parts: Sequence[PosedGaussians]
     ) -> Float[Tensor, "H W 3"]:
+        """Return the photo in the colours of a style."""
         assert raster.alpha is not None
         if not self._takes_marks(parts):
-            land, sky, level = self.colors(raster, parts, self.camera)
-            return mix(land, sky, self.sharpen(self._sky_share(raster.alpha, level), WIDER))
-        alpha, marks = raster.alpha, raster.rgb
+            surface_rgb, sky_rgb, level = self.colors(raster, parts, self.camera)
+            return mix(
+                surface_rgb, sky_rgb, self.sharpen(self._sky_share(raster.alpha, level), WIDER)
+            )
+        alpha = raster.alpha
+        marks = raster.rgb
         assert marks is not None
         if kernels_for(self.backend, alpha, marks) == CPU:
             share = self.sharpen(self._marked_share_on_cpu(alpha, marks), WIDER)
@@ -307,16 +360,16 @@ class Photo:
             share = self.sharpen(self._sky_share(alpha, level), WIDER)
         if style.others is None and self.backend == CPU:
             return self._in_both_on_cpu(style, share)
-        land = self._land
+        surface_rgb = self._land
         for number, other in enumerate(() if style.others is None else style.others):
             weight = (marks[..., 1 + number] / alpha.clamp_min(1e-6)).clamp_max(1)
-            land = mix(land, self._in_colors(other), weight)
-        return mix(land, self._sky, share)
+            surface_rgb = mix(surface_rgb, self._in_colors(other), weight)
+        return mix(surface_rgb, self._sky, share)
 
     def _sky_share(
         self, alpha: Float[Tensor, "H W"], level: Float[Tensor, "H W"] | None
     ) -> Float[Tensor, "H W"]:
-        """How much of each pixel is sky: beside the surfaces, and painted on them."""
+        """Return the share of sky in each pixel: beside the surfaces, and painted on them."""
         alpha = opaque_alpha(alpha)
         share = 1 - alpha if level is None else 1 - alpha * (1 - level)
         if self.height_m is not None:
@@ -324,6 +377,7 @@ class Photo:
         return share
 
     def _marked_share_on_cpu(self, alpha: Tensor, marks: Tensor) -> Tensor:
+        """Return the share of sky in each pixel, from marks, by the CPU kernel."""
         out = np.empty(tuple(alpha.shape), np.float32)
         fall = (-self.camera.world_from_camera[2, :3]).tolist()
         numbers = (CLEAR_ALPHA, OPAQUE_ALPHA), *pixels_at_unit_depth(self.camera)
@@ -336,7 +390,10 @@ class Photo:
         return torch.from_numpy(out)
 
     def _in_both_on_cpu(self, style: PhotoStyle, share: Tensor) -> Tensor:
-        maps = (_composed(own, self.undone).numpy() for own in (style.splats[0], style.sky))
+        """Return the photo in the style's maps of surfaces and sky, mixed by the share of sky."""
+        maps = (
+            _composed(style_map, self.undone).numpy() for style_map in (style.splats[0], style.sky)
+        )
         out = np.empty(self.pixels.shape, np.float32)
         with kernel_threads(ROWS):
             kernels.styled_colors(self.pixels, *maps, share.numpy(), out)
@@ -345,171 +402,214 @@ class Photo:
     def colors(
         self, raster: RenderOutput, parts: Sequence[PosedGaussians], camera: Camera
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """What surfaces show [H, W, 3], what the sky shows, and how much of a surface is sky
-        [H, W], None for nothing of any; at the pixels of a window. In the scene's colours, not
-        clamped.
+        """Return colours of surfaces [H, W, 3] and of the sky, and the share of sky in surfaces [H,
+        W].
+
+        Colours are the scene's, not clamped, at the pixels of a window. The share is None where no
+        surface shows sky.
         """
-        land, style, level = self._cut(self._land, camera), self.style, None
+        surface_rgb = self._cut(self._land, camera)
+        style = self.style
+        sky_share = None
         if style is None:
-            return land, self.sky_colors(camera), None
+            return surface_rgb, self.sky_colors(camera), None
         if len(style.splats) > 1:
             assert raster.splat_ids is not None
-            there = raster.splat_ids >= 0
-            table = _classes(parts, land.device)
-            classes = torch.where(there, table[raster.splat_ids.clamp_min(0)], 0)
-            for value in torch.unique(classes).tolist():
-                if value and not torch.equal(style.splats[value], style.splats[0]):
-                    own = self._cut(self._in_colors(style.splats[value]), camera)
-                    land = torch.where((classes == value)[..., None], own, land)
+            has_splat = raster.splat_ids >= 0
+            table = _classes(parts, surface_rgb.device)
+            classes = torch.where(has_splat, table[raster.splat_ids.clamp_min(0)], 0)
+            for class_number in torch.unique(classes).tolist():
+                if class_number and not torch.equal(style.splats[class_number], style.splats[0]):
+                    class_rgb = self._cut(self._in_colors(style.splats[class_number]), camera)
+                    surface_rgb = torch.where(
+                        (classes == class_number)[..., None], class_rgb, surface_rgb
+                    )
         if style.levels is not None:
             assert raster.splat_ids is not None
-            levels = style.levels.to(land.device)
-            level = levels[(raster.splat_ids + 1).clamp_max(len(levels) - 1)]
-        return land, self.sky_colors(camera), level
+            levels = style.levels.to(surface_rgb.device)
+            sky_share = levels[(raster.splat_ids + 1).clamp_max(len(levels) - 1)]
+        return surface_rgb, self.sky_colors(camera), sky_share
 
     def _without_sun(
         self, rgb: Float[Tensor, "H W 3"], raster: RenderOutput, camera: Camera
     ) -> Float[Tensor, "H W 3"]:
-        """What surfaces show, with the shadows on the ground faded."""
-        depth, alpha = raster.expected_depth, raster.alpha
+        """Return the colours of surfaces with the shadows on the ground faded."""
+        depth = raster.expected_depth
+        alpha = raster.alpha
         if self.faded is None or depth is None or alpha is None:
             return rgb
-        small = camera.resized(*_at_most(camera, ALIGNED_PX))
-        z, shown = (
+        small_camera = camera.resized(*_at_most(camera, ALIGNED_PX))
+        z, small_alpha = (
             cv2.resize(
-                v.detach().cpu().float().contiguous().numpy(),
-                (small.width, small.height),
+                buffer.detach().cpu().float().contiguous().numpy(),
+                (small_camera.width, small_camera.height),
                 interpolation=cv2.INTER_NEAREST,
             )
-            for v in (depth, alpha)
+            for buffer in (depth, alpha)
         )
-        points = z[..., None] * small.ray_directions().numpy() + camera.centre.numpy()
-        points[shown < 0.5] = math.inf
-        lit, factors = self.faded.gains(points.astype(np.float32))
-        lit = cv2.resize(lit, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        points = z[..., None] * small_camera.ray_directions().numpy() + camera.centre.numpy()
+        points[small_alpha < 0.5] = math.inf
+        lit_share, factors = self.faded.gains(points.astype(np.float32))
+        lit_share = cv2.resize(
+            lit_share, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR
+        )
         if camera is self.camera:
-            lit = self.sharpen(torch.from_numpy(lit), WIDER).numpy()
-        steps = cv2.merge([np.rint(lit * 255).astype(np.uint8)] * 3)
-        return rgb * torch.from_numpy(cv2.LUT(steps, factors[None])).to(rgb.device)
+            lit_share = self.sharpen(torch.from_numpy(lit_share), WIDER).numpy()
+        lit_steps = cv2.merge([np.rint(lit_share * 255).astype(np.uint8)] * 3)
+        return rgb * torch.from_numpy(cv2.LUT(lit_steps, factors[None])).to(rgb.device)
 
     def sky_colors(self, camera: Camera) -> Float[Tensor, "H W 3"]:
-        """What the sky shows at the pixels of a window."""
+        """Return the sky's colours at the pixels of a window."""
         return self._cut(self._land if self.style is None else self._sky, camera)
 
     @cached_property
     def _land(self) -> Float[Tensor, "H W 3"]:
+        """Return the photo in the colours of surfaces."""
         return self._in_colors(None if self.style is None else self.style.splats[0])
 
     @cached_property
     def _sky(self) -> Float[Tensor, "H W 3"]:
+        """Return the photo in the colours of the sky."""
         assert self.style is not None
         return self._in_colors(self.style.sky)
 
     def _in_colors(self, style_map: Float[Tensor, "3 4"] | None) -> Float[Tensor, "H W 3"]:
-        """The photo in the scene's colours, or under a style's map of them, which ends at 0."""
-        color_map, least = self.undone, -math.inf
+        """Return the photo in the scene's colours, or in a style's map of them, which ends at 0."""
+        color_map = self.undone
+        min_value = -math.inf
         if style_map is not None:
-            color_map, least = _composed(style_map, self.undone), 0.0
+            color_map = _composed(style_map, self.undone)
+            min_value = 0.0
         if self.backend == CPU:
             out = np.empty(self.pixels.shape, np.float32)
-            given = np.eye(3, 4, dtype=np.float32) if color_map is None else color_map.numpy()
+            matrix = np.eye(3, 4, dtype=np.float32) if color_map is None else color_map.numpy()
             with kernel_threads(ROWS):
-                kernels.scene_colors(self.pixels, given, np.float32(least), out)
+                kernels.scene_colors(self.pixels, matrix, np.float32(min_value), out)
             return torch.from_numpy(out)
         pixels = torch.from_numpy(self.pixels)
         rgb = (gpu.upload(pixels) if self.backend == CUDA else pixels).float() / 255
         if color_map is None:
             return rgb
-        return map_colors(rgb, color_map, backend=self.backend).clamp_min(least)
+        return map_colors(rgb, color_map, backend=self.backend).clamp_min(min_value)
 
     def sharpen(self, values: Float[Tensor, "H W"], times: int = 1) -> Float[Tensor, "H W"]:
-        """Values of 0 to 1 whose edges move to the photo's. times: RADIUS."""
+        """Return values of 0 to 1 with their edges moved to the photo's.
+
+        Args:
+            values: the values.
+            times: radius of the guided filter, in RADIUS.
+        """
         radius = max(2, round(RADIUS * times * self.camera.width))
         source = np.ascontiguousarray(values.detach().cpu().float().numpy())
-        there = np.flatnonzero(source.max(1) > 0)
-        if not len(there):
+        rows_with_values = np.flatnonzero(source.max(1) > 0)
+        if not len(rows_with_values):
             return values
         # No window of the other rows holds a value.
-        rows = slice(max(0, there[0] - 2 * radius), there[-1] + 1 + 2 * radius)
-        guide = cv2.cvtColor(
-            self.pixels[rows], cv2.COLOR_RGB2GRAY
-        )  # in colour it takes twice as long
-        found = np.zeros_like(source)
-        found[rows] = cv2.ximgproc.guidedFilter(guide, source[rows], radius, EDGE * 255**2)
-        return torch.from_numpy(np.clip(found, 0, 1, out=found)).to(values.device)
+        rows = slice(
+            max(0, rows_with_values[0] - 2 * radius), rows_with_values[-1] + 1 + 2 * radius
+        )
+        # A guide in colour would take twice as long.
+        guide = cv2.cvtColor(self.pixels[rows], cv2.COLOR_RGB2GRAY)
+        sharpened = np.zeros_like(source)
+        sharpened[rows] = cv2.ximgproc.guidedFilter(guide, source[rows], radius, EDGE * 255**2)
+        return torch.from_numpy(np.clip(sharpened, 0, 1, out=sharpened)).to(values.device)
 
     def transmittance(self, raster: RenderOutput, fog: Fog) -> Float[Tensor, "H W"]:
-        """T of what the photo shows, up to the rendered depth; where nothing is rendered up to the
-        road or the sky. Its edges are the photo's.
+        """Return T of what the photo shows, up to the rendered depth, with the photo's edges.
+
+        Where nothing is rendered, T is that of the way to the road or to the sky.
         """
         assert raster.alpha is not None and raster.expected_depth is not None
-        alpha, depth = opaque_alpha(raster.alpha), raster.expected_depth
+        alpha = opaque_alpha(raster.alpha)
+        depth = raster.expected_depth
         if kernels_for(self.backend, alpha, depth) == CPU:
-            found = self._transmittance_on_cpu(alpha, depth, fog)
-            return self.sharpen(self.aligned(found, alpha, depth))
-        camera, device, fall = self.camera, alpha.device, self.fall
-        lengths, eye_z_m = camera.ray_lengths(device=device), float(camera.centre[2])
-        seen = torch.exp(-optical_depth(fog, depth * lengths, eye_z_m, eye_z_m - depth * fall))
-        tau = sky_optical_depth(fog, -fall / lengths, eye_z_m)
+            transmittance = self._transmittance_on_cpu(alpha, depth, fog)
+            return self.sharpen(self.aligned(transmittance, alpha, depth))
+        camera = self.camera
+        device = alpha.device
+        fall = self.fall
+        lengths = camera.ray_lengths(device=device)
+        eye_z_m = float(camera.centre[2])
+        surface_transmittance = torch.exp(
+            -optical_depth(fog, depth * lengths, eye_z_m, eye_z_m - depth * fall)
+        )
+        background_depth = sky_optical_depth(fog, -fall / lengths, eye_z_m)
         if self.height_m is not None:
             distance = self.height_m / fall.clamp_min(LEVEL) * lengths
             road_z_m = torch.full_like(fall, eye_z_m - self.height_m)
-            to_road = optical_depth(fog, distance, eye_z_m, road_z_m)
-            tau = torch.where(fall > LEVEL, to_road, tau)
-        found = alpha * seen + (1 - alpha) * torch.exp(-tau)
-        return self.sharpen(self.aligned(found, alpha, depth))
+            road_depth = optical_depth(fog, distance, eye_z_m, road_z_m)
+            background_depth = torch.where(fall > LEVEL, road_depth, background_depth)
+        transmittance = alpha * surface_transmittance + (1 - alpha) * torch.exp(-background_depth)
+        return self.sharpen(self.aligned(transmittance, alpha, depth))
 
     def aligned(
         self, values: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"], depth: Float[Tensor, "H W"]
     ) -> Float[Tensor, "H W"]:
-        """Values of about 0 to 1, beside edges of close things those of what is around there."""
+        """Return values of about 0 to 1, replaced beside edges of close things by those around.
+
+        Args:
+            values: the values, such as T.
+            alpha: alpha of the surfaces.
+            depth: z of the surfaces, metres.
+        """
         size = _at_most(self.camera, ALIGNED_PX)
         factor = self.camera.width / size[0]
-        full, shown, z = (v.detach().cpu().float().numpy() for v in (values, alpha, depth))
-        own = cv2.resize(full, size, interpolation=cv2.INTER_AREA)
-        shown, z = (cv2.resize(v, size, interpolation=cv2.INTER_NEAREST) for v in (shown, z))
-        z = np.where(shown > 0.5, z, np.float32(math.inf))
-        around = np.ones((5, 5), np.uint8)
-        whole = cv2.medianBlur(own, 5)  # without what a reconstruction has of dots
-        edges = (_contrast(whole) > EDGE_OF_T) & np.isfinite(cv2.dilate(z, around))
-        nearest_m = np.maximum(cv2.erode(z, around), 1e-3)
-        off_px = np.where(edges, self.camera.fx / factor * OFF_M / nearest_m, 0)
-        if off_px.max() < FEWEST_PX:
+        full_values, small_alpha, z = (
+            image.detach().cpu().float().numpy() for image in (values, alpha, depth)
+        )
+        small_values = cv2.resize(full_values, size, interpolation=cv2.INTER_AREA)
+        small_alpha, z = (
+            cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in (small_alpha, z)
+        )
+        z = np.where(small_alpha > 0.5, z, np.float32(math.inf))
+        square = np.ones((5, 5), np.uint8)
+        clean_values = cv2.medianBlur(small_values, 5)  # without the dots of a reconstruction
+        edges = (_contrast(clean_values) > EDGE_OF_T) & np.isfinite(cv2.dilate(z, square))
+        nearest_m = np.maximum(cv2.erode(z, square), 1e-3)
+        offset_px = np.where(edges, self.camera.fx / factor * OFF_M / nearest_m, 0)
+        if offset_px.max() < FEWEST_PX:
             return values
         guide = cv2.resize(self.pixels, size, interpolation=cv2.INTER_AREA)
-        nearby = (max(3, round(NEARBY * size[0])),) * 2
-        asked = (off_px >= FEWEST_PX).astype(np.float32)
-        unseen = asked * (_contrast(guide).max(-1) < PLAIN)
-        off_px[cv2.blur(unseen, nearby) < 0.5 * cv2.blur(asked, nearby)] = 0
-        trust, radius = np.ones(own.shape, np.float32), FEWEST_PX
+        window_px = (max(3, round(NEARBY * size[0])),) * 2
+        is_movable = (offset_px >= FEWEST_PX).astype(np.float32)
+        is_unseen = is_movable * (_contrast(guide).max(-1) < PLAIN)
+        offset_px[cv2.blur(is_unseen, window_px) < 0.5 * cv2.blur(is_movable, window_px)] = 0
+        trust = np.ones(small_values.shape, np.float32)
+        radius = FEWEST_PX
         while radius <= WIDEST * size[0]:
-            beside = off_px >= radius
-            if beside.any():
-                away = cv2.distanceTransform((~beside).astype(np.uint8), cv2.DIST_L2, 3)
-                np.minimum(trust, (2 * away / radius - 1).clip(0, 1), out=trust)
+            is_beside = offset_px >= radius
+            if is_beside.any():
+                distance_px = cv2.distanceTransform((~is_beside).astype(np.uint8), cv2.DIST_L2, 3)
+                np.minimum(trust, (2 * distance_px / radius - 1).clip(0, 1), out=trust)
             radius *= 2
         if trust.min() == 1:
             return values
-        smooth = cv2.ximgproc.createFastGlobalSmootherFilter(guide, REACH, ALIKE)
+        smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, REACH, ALIKE)
         weight = np.maximum(trust, np.float32(LITTLE))
-        told = smooth.filter(weight * own) / np.maximum(smooth.filter(weight), 1e-6)
-        shape = (self.camera.width, self.camera.height)
-        change = cv2.resize((1 - trust) * (told - own), shape, interpolation=cv2.INTER_LINEAR)
-        return torch.from_numpy(cv2.add(full, change)).to(values)
+        smoothed = smoother.filter(weight * small_values) / np.maximum(
+            smoother.filter(weight), 1e-6
+        )
+        full_size = (self.camera.width, self.camera.height)
+        change = cv2.resize(
+            (1 - trust) * (smoothed - small_values), full_size, interpolation=cv2.INTER_LINEAR
+        )
+        return torch.from_numpy(cv2.add(full_values, change)).to(values)
 
     def airlight(self, fog: Fog) -> Float[Tensor, "#H #W 3"]:
-        """The fog's colour at each pixel; of one pixel where it is one."""
+        """Return the fog's colour at each pixel; [1, 1, 3] where all pixels have the same."""
         if fog.overcast == 0:
             return torch.tensor(fog.rgb, device=self._device)[None, None]
         size = (self.camera.height, self.camera.width)
-        nothing = torch.zeros(size, device=self._device)
+        zeros = torch.zeros(size, device=self._device)
         raster = RenderOutput(
-            rgb=torch.zeros(*size, 3, device=self._device), alpha=nothing, expected_depth=nothing
+            rgb=torch.zeros(*size, 3, device=self._device), alpha=zeros, expected_depth=zeros
         )
         return add_elevation(raster, self.camera, fog, behind=True, backend=self.backend)
 
     def _transmittance_on_cpu(self, alpha: Tensor, depth: Tensor, fog: Fog) -> Tensor:
-        camera, out = self.camera, np.empty(tuple(alpha.shape), np.float32)
+        """Return T up to the rendered depth, by the CPU kernel."""
+        camera = self.camera
+        out = np.empty(tuple(alpha.shape), np.float32)
         inverse_m = 0.0 if fog.scale_height_m is None else 1 / fog.scale_height_m
         lens = (1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy)
         over_base_m = float(camera.centre[2]) - fog.base_z_m
@@ -518,22 +618,23 @@ class Photo:
             (fog.sigma_per_m, inverse_m, over_base_m),
             (self.height_m or 0.0, LEVEL),
         )
-        arrays = [np.array(own, np.float32) for own in numbers]
+        arrays = [np.array(values, np.float32) for values in numbers]
         with kernel_threads(ROWS):
             kernels.transmittance(alpha.numpy(), depth.detach().numpy(), *arrays, out)
         return torch.from_numpy(out)
 
     @cached_property
     def fall(self) -> Float[Tensor, "H W"]:
-        """By how much each pixel's ray falls per metre of depth."""
-        camera, device = self.camera, self._device
+        """Return the metres by which each pixel's ray falls per metre of depth."""
+        camera = self.camera
+        device = self._device
         x, y, z = (-camera.world_from_camera[2, :3]).tolist()
         u = (torch.arange(camera.width, device=device) + 0.5 - camera.cx) / camera.fx
         v = (torch.arange(camera.height, device=device) + 0.5 - camera.cy) / camera.fy
         return (x * u + z) + (y * v)[:, None]
 
     def _cut(self, rgb: Float[Tensor, "H W 3"], camera: Camera) -> Float[Tensor, "h w 3"]:
-        """The photo's image at a window's pixels; its border's colours beyond it."""
+        """Return the photo's image at a window's pixels; beyond its border the border's colours."""
         if camera is self.camera:
             return rgb
         rows, columns = self._places(camera)
@@ -541,6 +642,7 @@ class Photo:
         return rgb[rows][:, columns.clamp(0, self.camera.width - 1)]
 
     def _inside(self, camera: Camera) -> Tensor:
+        """Return the mask of a window's pixels that lie inside the photo."""
         rows, columns = self._places(camera)
         down = (rows >= 0) & (rows < self.camera.height)
         across = (columns >= 0) & (columns < self.camera.width)
@@ -548,12 +650,14 @@ class Photo:
 
     @property
     def _device(self) -> torch.device:
+        """Return the device of the backend."""
         return gpu.gpu_device() if self.backend == CUDA else torch.device("cpu")
 
     def _places(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """The photo's rows and columns of a window's."""
+        """Return the photo's rows and columns of a window's pixels."""
         device = self._device
-        top, left = round(self.camera.cy - camera.cy), round(self.camera.cx - camera.cx)
+        top = round(self.camera.cy - camera.cy)
+        left = round(self.camera.cx - camera.cx)
         rows = torch.arange(top, top + camera.height, device=device)
         return rows, torch.arange(left, left + camera.width, device=device)
 
@@ -561,21 +665,26 @@ class Photo:
 def open_photo(
     scene: Scene, camera: Camera, color_map: Float[Tensor, "3 4"] | None, *, backend: str
 ) -> Photo:
-    """The photo of a camera of the scene, at its size, before any style.
+    """Return the photo of a camera of the scene, at the camera's size, before any style.
 
-    color_map: that the finished picture takes.
+    Args:
+        scene: the scene.
+        camera: one of its cameras, at any scale.
+        color_map: colour map that the finished picture gets; None without one.
+        backend: backend that draws.
 
     Raises:
-        SceneError: there is none, it cannot be read, or the colour map has no inverse.
+        SceneError: there is no photo, it cannot be read, or the colour map has no inverse.
     """
-    path, full = find_recorded(scene, camera)
+    path, recorded_camera = find_recorded(scene, camera)
     try:
-        pixels = read_scaled(path, full, camera)
+        pixels = read_scaled(path, recorded_camera, camera)
     except ImageFault as fault:
         raise SceneError(f"camera {camera.name}: recorded image {path} {fault}") from None
     undone = None
     if color_map is not None:
-        matrix, offset = color_map[:, :3].double(), color_map[:, 3].double()
+        matrix = color_map[:, :3].double()
+        offset = color_map[:, 3].double()
         if float(torch.linalg.cond(matrix)) > MAX_CONDITION:
             raise SceneError(
                 f"scene {scene.name!r}: the colour map of camera {camera.name!r} has no inverse "
@@ -586,25 +695,28 @@ def open_photo(
         undone = torch.cat([inverse, -(inverse @ offset)[:, None]], 1).float()
     height_m = None
     if scene.has_known_gravity and scene.ground_z_m is not None:
-        above = float(camera.centre[2]) - scene.ground_z_m
-        height_m = min(above, HIGHEST_M) if above > 0 else None
+        camera_height_m = float(camera.centre[2]) - scene.ground_z_m
+        height_m = min(camera_height_m, HIGHEST_M) if camera_height_m > 0 else None
     return Photo(camera, pixels, backend, undone, height_m)
 
 
 def _at_most(camera: Camera, width_px: int) -> tuple[int, int]:
-    """Width and height of a copy of the camera's image."""
+    """Return width and height of a copy of the camera's image, at most `width_px` wide."""
     factor = max(1.0, camera.width / width_px)
     return max(1, round(camera.width / factor)), max(1, round(camera.height / factor))
 
 
 def _contrast(image: np.ndarray) -> np.ndarray:
-    """Between the highest and the lowest of each pixel and its neighbours."""
-    around = np.ones((3, 3), np.uint8)
-    return cv2.dilate(image, around) - cv2.erode(image, around)
+    """Return the difference of the highest and lowest value of each pixel and its neighbours."""
+    square = np.ones((3, 3), np.uint8)
+    return cv2.dilate(image, square) - cv2.erode(image, square)
 
 
 def blackened(parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
-    """The parts in black, but for what lies on the scene: their colours come from the photo."""
+    """Return the parts in black, except those that lie on the scene.
+
+    The colours of black parts come from the photo.
+    """
     return tuple(
         part if part.is_overlay else replace(part, color_maps=_NO_COLOR, color_rows=None)
         for part in parts
@@ -612,14 +724,17 @@ def blackened(parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
 
 
 def opaque_alpha(alpha: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-    """The alpha of what the photo shows there, 0 to 1."""
+    """Return the alpha of what the photo shows, 0 to 1, from the alpha of splats."""
     return ((alpha - CLEAR_ALPHA) / (OPAQUE_ALPHA - CLEAR_ALPHA)).clamp(0, 1)
 
 
 def mix(
     rgb: Float[Tensor, "H W 3"], other: Float[Tensor, "#H #W 3"], weight: Float[Tensor, "H W"]
 ) -> Float[Tensor, "H W 3"]:
-    """(1 - weight) rgb + weight other: each to the bit where the other's weight is 0."""
+    """Return (1 - weight) rgb + weight other.
+
+    The result equals `rgb` to the bit where the weight is 0, and `other` where it is 1.
+    """
     if kernels_for(AUTO, rgb, other, weight) != CPU:
         return (1 - weight)[..., None] * rgb + weight[..., None] * other
     return _run(kernels.mix, rgb, other, weight)
@@ -628,13 +743,14 @@ def mix(
 def add_faded(
     base: Float[Tensor, "H W 3"], rgb: Float[Tensor, "H W 3"], weight: Float[Tensor, "H W"]
 ) -> Float[Tensor, "H W 3"]:
-    """base + weight rgb."""
+    """Return base + weight rgb."""
     if kernels_for(AUTO, base, rgb, weight) != CPU:
         return base + weight[..., None] * rgb
     return _run(kernels.add_faded, base, rgb, weight)
 
 
 def _run(kernel: Any, *images: Tensor) -> Tensor:
+    """Return the image that a CPU kernel makes of some images."""
     out = np.empty(tuple(images[0].shape), np.float32)
     with kernel_threads(ROWS):
         kernel(*(image.detach().contiguous().numpy() for image in images), out)
@@ -644,21 +760,29 @@ def _run(kernel: Any, *images: Tensor) -> Tensor:
 def _composed(
     outer: Float[Tensor, "3 4"], inner: Float[Tensor, "3 4"] | None
 ) -> Float[Tensor, "3 4"]:
-    """The map of what `inner` gives, float32."""
+    """Return the map `outer` after `inner`, float32."""
     if inner is None:
         return outer.contiguous()
-    matrix, first = outer[:, :3].double(), inner.double()
-    found = matrix @ first
-    found[:, 3] += outer[:, 3]
-    return found.float()
+    matrix = outer[:, :3].double()
+    inner_map = inner.double()
+    composed = matrix @ inner_map
+    composed[:, 3] += outer[:, 3]
+    return composed.float()
 
 
 def _classes(parts: Sequence[PosedGaussians], device: torch.device) -> Int16[Tensor, "N"]:
-    """Of every splat, in the order in which buffers count them; 0 where unknown."""
-    own = [
+    """Return the class of every splat, in the order in which buffers count them; 0 where
+    unknown.
+    """
+    classes = [
         torch.zeros(len(p.gaussians), dtype=torch.int16)
         if p.gaussians.semantic is None
         else p.gaussians.semantic
         for p in parts
     ]
-    return torch.cat([o if o.device == device else gpu.resident(o) for o in own])
+    return torch.cat(
+        [
+            part_classes if part_classes.device == device else gpu.resident(part_classes)
+            for part_classes in classes
+        ]
+    )

@@ -1,11 +1,16 @@
-"""Where the ground of a scene lies in the sun and where in the shade, as its colours show it.
+"""Sun and shade on the ground of a scene, as its colours show them.
 
-A dark ground is a shadow or dark asphalt. Things that stand on it tell which: from every direction
-of a coarse grid they are let cast shadows on the ground, and the direction whose shadows differ
-most from the rest in brightness is the sun's. If even those are hardly darker, or half as bright
-without being bluer, there is no sun.
-How dark shadows are comes from the ground's two modes of luminance (Otsu 1979), where modes and
-cast shadows agree, since what stands higher than a recording reaches casts shadows as well.
+In: a scene's background. Out: `CastShadows` (by `shadows_of`): the sun's direction, how dark its
+shadows are, and a map of lit ground. Smog fades these shadows (`faded_shadows`), and snow takes the
+sun from here.
+
+A dark ground is a shadow or dark asphalt. The things that stand on it tell which. They cast shadows
+on the ground from every direction of a coarse grid, and the direction whose shadows differ most in
+brightness from the other ground is the sun's. If even those shadows are hardly darker, or half as
+bright without being bluer, there is no sun.
+
+The darkness of shadows comes from the ground's two modes of luminance (Otsu 1979), where modes and
+cast shadows agree, since things that stand higher than a recording reaches cast shadows as well.
 """
 
 from __future__ import annotations
@@ -27,104 +32,146 @@ from augment.render.sh import SH_C0
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.semantics import SemanticClass
 
-# The first tells; paint is left out.
+# Classes of ground whose shadows count; the first decides the sun's direction. Paint is left out.
 _GROUNDS = (SemanticClass.ROAD, SemanticClass.SIDEWALK, SemanticClass.TERRAIN)
+# Opacity from which a splat casts a shadow.
 SOLID_OPACITY = 0.5
-_LEVEL_COSINE = 0.9  # of a splat that may be ground where no class says so
+# Cosine to +z from which a splat may be ground where no class says so.
+_LEVEL_COSINE = 0.9
+# Weights of linear red, green and blue in luminance.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
-_CELL_M, _MAX_CELLS, _AROUND_M = 0.25, 1024, 40.0
-_SPREAD_CELLS = 1.0  # of the blur that closes gaps between splats
-_MEDIAN_CELLS = 5  # paint, manholes and cracks are narrower
-_MIN_CELLS = 400  # 25 m2: less ground tells nothing
+# Side of a cell of the map, metres.
+_CELL_M = 0.25
+# Cells along the map's longer side; a larger map has larger cells.
+_MAX_CELLS = 1024
+# Margin of the map around the cameras, metres.
+_AROUND_M = 40.0
+# Standard deviation of the blur that closes gaps between splats, cells.
+_SPREAD_CELLS = 1.0
+# Side of the median filter, cells; paint, manholes and cracks are narrower.
+_MEDIAN_CELLS = 5
+# Cells of ground below which nothing can be told: 25 m2.
+_MIN_CELLS = 400
 
-# Of the sun's directions. Nearer than _FROM_M every thing keeps sky light off the ground, too.
+# Azimuths that the sun is looked for in, radians.
 _AZIMUTHS = np.radians(np.arange(0, 360, 10.0))
+# Elevations that the sun is looked for in, radians.
 _ELEVATIONS = np.radians([6.0, 9, 12, 16, 20, 25, 30, 36, 43, 50, 58, 66])
-_FROM_M, _REACH_M, _STEP = 0.8, 27.0, 1.07
-_OVER_M = 0.1  # what stands no higher casts no shadow
+# Distance from which things count as casting shadows, metres. Nearer things also keep sky light off
+# the ground.
+_FROM_M = 0.8
+# Distance up to which things count, metres.
+_REACH_M = 27.0
+# Factor from one distance to the next.
+_STEP = 1.07
+# Height above the ground that casts no shadow, metres.
+_OVER_M = 0.1
+# Height above the ground from which things are no buildings, metres.
 _HIGHEST_M = 60.0
-_LARGEST_M = 1.5  # standard deviation; larger splats are sky or haze
-_MAX_ASKED = 8000  # cells of ground, of all
-_MIN_SHARE = 0.02  # of them in the shade of a direction, for it to tell anything
-# Shaded over lit luminance of a direction's shadows: at most the first is a sun, at least the
-# second is none, if they are as blue as the sky that lights them, and if they are grey, as asphalt
-# is, half as bright where it is new. (Nothing casts shadows in PandaSet 002, whose sun is behind
-# clouds: the darkest direction has 0.84.)
-_BLUE, _GREY = (0.65, 0.8), (0.4, 0.5)
-_BLUENESS = (1.03, 1.12)  # their blue over red, beside what is lit
-ON_GROUND_M = 0.3  # off the ground's height
-_DARKEST = 0.15  # of a shadow in clear air, whatever a camera's contrast makes of it
+# Standard deviation from which splats are sky or haze, metres.
+_LARGEST_M = 1.5
+# Cells of ground that are tested at most.
+_MAX_ASKED = 8000
+# Share of these cells that a direction must shade to tell anything.
+_MIN_SHARE = 0.02
+# Shaded over lit luminance of a direction's shadows as blue as the sky that lights them: at most
+# the first is a sun, at least the second is none. (Nothing casts shadows in PandaSet 002, whose sun
+# is behind clouds: the darkest direction has 0.84.)
+_BLUE = (0.65, 0.8)
+# The same for grey shadows: asphalt is grey, and half as bright where it is new.
+_GREY = (0.4, 0.5)
+# Blue over red of shadows, over that of lit ground: at most the first is grey, at least the second
+# is blue.
+_BLUENESS = (1.03, 1.12)
+# Distance from the ground's height within which a place lies on the ground, metres.
+ON_GROUND_M = 0.3
+# Shaded over lit luminance in clear air, at least, whatever a camera's contrast makes of it.
+_DARKEST = 0.15
 
 
 @dataclass(frozen=True, eq=False)
 class CastShadows:
-    """What the ground shows of the sun's light.
-
-    certainty: 0 without any shadow, 1 where they are plain. ratio: shaded over lit, linear red,
-    green and blue. lit_rgb: of the road, linear; its median without shadows. lit_share: of the
-    ground. azimuth_deg, elevation_deg: of the sun, by its
-    shadows, 0 degrees azimuth is world +x. explained: share of the variance of log luminance that
-    these explain, -1 to 1, by azimuth and elevation of the grid.
-
-    lit, known: by place, float32 [H, W], 0 to 1; the first axis is x. height_m: of the ground
-    there. corner_m: x and y of the first cell's corner.
-    """
+    """Light of the sun on the ground of a scene."""
 
     certainty: float
+    """0 without any shadow, 1 where shadows are plain."""
     ratio: tuple[float, float, float]
+    """Shaded over lit ground, linear red, green and blue."""
     lit_rgb: tuple[float, float, float]
+    """Colour of the lit road, linear; its median without shadows."""
     lit_share: float
+    """Share of the ground that is lit."""
     azimuth_deg: float
+    """Azimuth of the sun by its shadows; 0 degrees is world +x."""
     elevation_deg: float
+    """Elevation of the sun by its shadows."""
     explained: Float32[np.ndarray, "A E"]
+    """Share of the variance of log luminance that shadows explain, -1 to 1, by azimuth and
+    elevation of the grid."""
     lit: Float32[np.ndarray, "H W"]
+    """Share of the sun that each cell sees, 0 to 1; the first axis is x."""
     known: Float32[np.ndarray, "H W"]
+    """1 for cells of known ground, else 0."""
     height_m: Float32[np.ndarray, "H W"]
+    """Height of the ground in each cell."""
     corner_m: tuple[float, float]
+    """x and y of the first cell's corner."""
     cell_m: float
+    """Side of a cell."""
 
     @property
     def luminance_ratio(self) -> float:
+        """Return shaded over lit luminance."""
         return float(np.dot(self.ratio, _LUMINANCE))
 
     def explained_by(self, azimuth_deg: float, elevation_deg: float) -> float:
-        """Share of the variance that a sun near this direction explains, of the best one's."""
+        """Return the variance that a sun near a direction explains, over that of the best
+        direction.
+        """
         best = float(self.explained.max())
         if best <= 0:
             return 0.0
-        a = round(azimuth_deg / 10) % len(_AZIMUTHS)
-        e = int(np.abs(_ELEVATIONS - math.radians(elevation_deg)).argmin())
-        around = np.take(self.explained, [a - 1, a, (a + 1) % len(_AZIMUTHS)], axis=0)
-        return float(around[:, max(e - 1, 0) : e + 2].max()) / best
+        azimuth_index = round(azimuth_deg / 10) % len(_AZIMUTHS)
+        elevation_index = int(np.abs(_ELEVATIONS - math.radians(elevation_deg)).argmin())
+        neighbours = np.take(
+            self.explained,
+            [azimuth_index - 1, azimuth_index, (azimuth_index + 1) % len(_AZIMUTHS)],
+            axis=0,
+        )
+        return float(neighbours[:, max(elevation_index - 1, 0) : elevation_index + 2].max()) / best
 
     def light_at(self, places_m: np.ndarray) -> np.ndarray:
-        """Luminance at places [N, 3] over what it is in the sun, [N]; NaN off the known ground."""
-        lit, known, height_m = self.at(places_m[:, 0], places_m[:, 1])
-        q = self.luminance_ratio
-        on_ground = (known > 0.5) & (np.abs(places_m[:, 2] - height_m) < ON_GROUND_M)
-        light = q + (1 - q) * lit / np.maximum(known, 0.5)
+        """Return luminance over that in the sun at places [N, 3], [N]; NaN off the known ground."""
+        lit, known_share, height_m = self.at(places_m[:, 0], places_m[:, 1])
+        ratio = self.luminance_ratio
+        on_ground = (known_share > 0.5) & (np.abs(places_m[:, 2] - height_m) < ON_GROUND_M)
+        light = ratio + (1 - ratio) * lit / np.maximum(known_share, 0.5)
         return np.where(on_ground, light, np.nan)
 
     def at(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """lit, known and height_m at places of any shape, float32; known is 0 beyond the map."""
+        """Return lit, known and height_m at places of any shape, float32, interpolated.
+
+        `known` is 0 beyond the map.
+        """
         # OpenCV's pixels are centred at whole numbers.
         rows = ((x_m - self.corner_m[0]) / self.cell_m - 0.5).astype(np.float32)
         columns = ((y_m - self.corner_m[1]) / self.cell_m - 0.5).astype(np.float32)
         shape = rows.shape
         rows, columns = (np.atleast_2d(np.nan_to_num(c, nan=-9.0)) for c in (rows, columns))
-        rows, columns = _wrapped(rows), _wrapped(columns)
+        rows = _wrapped(rows)
+        columns = _wrapped(columns)
         maps = (self.lit, self.known, self.height_m)
-        found = (
+        map_values = (
             cv2.remap(m, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
             for m in maps
         )
-        lit, known, height = (_unwrapped(f, shape) for f in found)
-        return lit, known, height
+        lit, known_share, height = (_unwrapped(values, shape) for values in map_values)
+        return lit, known_share, height
 
 
 def _wrapped(values: np.ndarray) -> np.ndarray:
-    """OpenCV takes no more than 32767 of a row: a list becomes an image."""
+    """Return a long row as an image: OpenCV takes no more than 32767 values of a row."""
     if values.shape[0] > 1 or values.shape[1] < 32_000:
         return np.ascontiguousarray(values)
     rows = -(-values.size // 16_384)
@@ -134,16 +181,20 @@ def _wrapped(values: np.ndarray) -> np.ndarray:
 
 
 def _unwrapped(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the values of an image of `_wrapped` in their own shape."""
     return values.ravel()[: math.prod(shape)].reshape(shape)
 
 
 def linear_from_display(rgb: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    """Return linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
     return np.where(rgb <= 0.04045, rgb / 12.92, ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4)
 
 
 def is_low_and_level(g: Gaussians, scene: Scene) -> np.ndarray:
-    """Splats that may be ground: flat, and below the cameras, or in the scene's lower half."""
+    """Return the mask of splats that may be ground.
+
+    They are flat, and below the cameras, or in the scene's lower half without cameras.
+    """
     if len(g) == 0:
         return np.zeros(0, bool)
     up = rotmat_from_quat(g.quats)[:, 2].double().numpy()  # the world's z along each splat's axes
@@ -154,12 +205,14 @@ def is_low_and_level(g: Gaussians, scene: Scene) -> np.ndarray:
     return is_level & (z < (float(eyes[:, 2].min()) if len(eyes) else float(np.median(z))))
 
 
+# Key of the shadows in a scene's memo.
 _MEMO = ("cast shadows",)
 
 
 def shadows_of(scene: Scene) -> CastShadows | None:
-    """What the scene's ground shows of the sun, worked out once a scene; None where it has too
-    little ground, or nothing that could cast a shadow on it.
+    """Return the sun's light on the scene's ground, computed once a scene.
+
+    None where the scene has too little ground, or nothing that could cast a shadow on it.
     """
 
     def find() -> tuple[CastShadows | None]:  # a value that is None would be made again
@@ -169,278 +222,351 @@ def shadows_of(scene: Scene) -> CastShadows | None:
 
 
 def share_shadows(scene: Scene) -> None:
-    """Find them before a job's processes would."""
+    """Compute the shadows now, so that a job's processes need not."""
     memo_of(scene).put(_MEMO, (shadows_of(scene),), shared=True)
 
 
 def _eyes(scene: Scene) -> np.ndarray:
-    """Where the cameras stood, [P, 3]."""
+    """Return the places of the cameras, [P, 3]."""
     cameras = [c for frame in scene.frames for c in frame.cameras.values()]
     return np.array([c.centre.numpy() for c in cameras]).reshape(-1, 3)
 
 
 def _find_shadows(scene: Scene) -> CastShadows | None:
+    """Return the sun's light on the scene's ground, as `shadows_of`."""
     g = scene.background
-    solid = (g.opacities > SOLID_OPACITY).numpy() & g.means.isfinite().all(1).numpy()
-    grounds = _ground_splats(g, scene, solid)
-    if not grounds:
+    is_solid = (g.opacities > SOLID_OPACITY).numpy() & g.means.isfinite().all(1).numpy()
+    ground_masks = _ground_splats(g, scene, is_solid)
+    if not ground_masks:
         return None
-    grid = _Grid.of(scene, g.means.double().numpy(), grounds[0])
-    road = grid.surface(g, grounds[0], np.ones(len(g)))
-    rows, columns = np.nonzero(road.known)
+    grid = _Grid.of(scene, g.means.double().numpy(), ground_masks[0])
+    # Explain the road's brightness by the shadows of every direction; the best one is the sun's.
+    road = grid.surface(g, ground_masks[0], np.ones(len(g)))
+    rows, columns = np.nonzero(road.is_known)
     if len(rows) < _MIN_CELLS:
         return None
-    tops = grid.tops(g, solid & (g.scales.max(1).values < _LARGEST_M).numpy())
-    asked = slice(None, None, 1 + len(rows) // _MAX_ASKED)
-    rows, columns = rows[asked], columns[asked]
+    tops = grid.tops(g, is_solid & (g.scales.max(1).values < _LARGEST_M).numpy())
+    sampling = slice(None, None, 1 + len(rows) // _MAX_ASKED)
+    rows = rows[sampling]
+    columns = columns[sampling]
     horizons = grid.horizons(tops, road.height_m, rows, columns, _AZIMUTHS)
-    own = road.log_luminance[rows, columns]
-    own = own.clip(*np.quantile(own, [0.01, 0.99]))
-    explained = _explained(horizons, own)
+    log_luminance = road.log_luminance[rows, columns]
+    log_luminance = log_luminance.clip(*np.quantile(log_luminance, [0.01, 0.99]))
+    explained = _explain_variance(horizons, log_luminance)
     if not np.isfinite(explained).any():
         return None
     explained = np.where(np.isfinite(explained), explained, 0.0)
-    a, e = np.unravel_index(explained.argmax(), explained.shape)
-    slope = math.tan(_ELEVATIONS[e])
-    shaded = horizons[a] > slope
+    azimuth_index, elevation_index = np.unravel_index(explained.argmax(), explained.shape)
+    slope = math.tan(_ELEVATIONS[elevation_index])
+    is_shaded = horizons[azimuth_index] > slope
     log_rgb = np.log(np.maximum(road.linear[rows, columns], 1e-4))
-    change = np.median(log_rgb[shaded], 0) - np.median(log_rgb[~shaded], 0)
-    blue = _ramp(math.exp(change[2] - change[0]), *_BLUENESS)
-    sunny, sunless = (g + blue * (b - g) for g, b in zip(_GREY, _BLUE, strict=True))
-    by_direction = math.exp(np.median(own[shaded]) - np.median(own[~shaded]))
-    certainty = 1 - _ramp(by_direction, sunny, sunless)
-    dark = own <= _between(own)
-    both = (shaded & dark, ~shaded & ~dark)
-    if min(both[0].sum(), both[1].sum()) < _MIN_SHARE * len(dark):
-        certainty, both = 0.0, (dark, ~dark)
-    modes = [np.median(log_rgb[chosen], 0) if chosen.any() else log_rgb[0] for chosen in both]
+    change = np.median(log_rgb[is_shaded], 0) - np.median(log_rgb[~is_shaded], 0)
+    blueness = _ramp(math.exp(change[2] - change[0]), *_BLUENESS)
+    sunny, sunless = (g + blueness * (b - g) for g, b in zip(_GREY, _BLUE, strict=True))
+    direction_ratio = math.exp(
+        np.median(log_luminance[is_shaded]) - np.median(log_luminance[~is_shaded])
+    )
+    certainty = 1 - _ramp(direction_ratio, sunny, sunless)
+    is_dark = log_luminance <= _otsu_threshold(log_luminance)
+    dark_and_lit = (is_shaded & is_dark, ~is_shaded & ~is_dark)
+    if min(dark_and_lit[0].sum(), dark_and_lit[1].sum()) < _MIN_SHARE * len(is_dark):
+        certainty = 0.0
+        dark_and_lit = (is_dark, ~is_dark)
+    modes = [
+        np.median(log_rgb[chosen], 0) if chosen.any() else log_rgb[0] for chosen in dark_and_lit
+    ]
     change = (modes[0] - modes[1]).clip(math.log(_DARKEST), 0)
     ratio = np.exp(certainty * change)
 
+    # Other ground: its albedo over the road's, then the map of lit ground.
     albedos = np.ones(len(g))
-    for ground in grounds[1:]:
-        part = grid.surface(g, ground, albedos)
-        there = np.nonzero(part.known)
-        if len(there[0]) == 0:
+    for ground_mask in ground_masks[1:]:
+        part = grid.surface(g, ground_mask, albedos)
+        known_cells = np.nonzero(part.is_known)
+        if len(known_cells[0]) == 0:
             continue
-        horizon = grid.horizons(tops, part.height_m, there[0], there[1], _AZIMUTHS[a : a + 1])[0]
+        horizon = grid.horizons(
+            tops,
+            part.height_m,
+            known_cells[0],
+            known_cells[1],
+            _AZIMUTHS[azimuth_index : azimuth_index + 1],
+        )[0]
         light = np.where(horizon > slope, float(np.exp(change) @ _LUMINANCE), 1.0)
         lit_road = float(np.exp(modes[1]) @ _LUMINANCE)
-        albedos[ground] = np.median(np.exp(part.log_luminance[there]) / light) / lit_road
-    whole = grid.surface(g, np.logical_or.reduce(grounds), albedos)
+        albedos[ground_mask] = np.median(np.exp(part.log_luminance[known_cells]) / light) / lit_road
+    all_ground = grid.surface(g, np.logical_or.reduce(ground_masks), albedos)
     dark_level, lit_level = (float(np.exp(mode) @ _LUMINANCE) for mode in modes)
-    lit = np.exp(whole.log_luminance) - dark_level
+    lit = np.exp(all_ground.log_luminance) - dark_level
     lit = (lit / max(lit_level - dark_level, 1e-3 * lit_level)).clip(0, 1)
     return CastShadows(
         certainty=certainty,
         ratio=_triple(ratio),
         lit_rgb=_triple(np.exp(modes[1] if certainty > 0 else np.median(log_rgb, 0))),
-        lit_share=float(lit[whole.known].mean()),
-        azimuth_deg=math.degrees(_AZIMUTHS[a]),
-        elevation_deg=math.degrees(_ELEVATIONS[e]),
+        lit_share=float(lit[all_ground.is_known].mean()),
+        azimuth_deg=math.degrees(_AZIMUTHS[azimuth_index]),
+        elevation_deg=math.degrees(_ELEVATIONS[elevation_index]),
         explained=explained.astype(np.float32),
-        lit=np.where(whole.known, lit, 0).astype(np.float32),
-        known=whole.known.astype(np.float32),
-        height_m=np.where(whole.known, whole.height_m, 0).astype(np.float32),
+        lit=np.where(all_ground.is_known, lit, 0).astype(np.float32),
+        known=all_ground.is_known.astype(np.float32),
+        height_m=np.where(all_ground.is_known, all_ground.height_m, 0).astype(np.float32),
         corner_m=(float(grid.corner[0]), float(grid.corner[1])),
         cell_m=grid.cell_m,
     )
 
 
-def _ground_splats(g: Gaussians, scene: Scene, solid: np.ndarray) -> list[np.ndarray]:
-    """Which splats are ground, bool [N], a kind at a time; the road, or all that may be, first."""
+def _ground_splats(g: Gaussians, scene: Scene, is_solid: np.ndarray) -> list[np.ndarray]:
+    """Return masks of the splats that are ground, bool [N], one for each kind of ground.
+
+    The road comes first, or all splats that may be ground where no class is known.
+    """
     if g.semantic is not None:
         classes = g.semantic.numpy()
-        found = [solid & (classes == int(semantic)) for semantic in _GROUNDS]
-        if found[0].sum() >= _MIN_CELLS:
-            return found
-    low = solid & is_low_and_level(g, scene)
-    return [low] if low.sum() >= _MIN_CELLS else []
+        masks = [is_solid & (classes == int(semantic)) for semantic in _GROUNDS]
+        if masks[0].sum() >= _MIN_CELLS:
+            return masks
+    is_low = is_solid & is_low_and_level(g, scene)
+    return [is_low] if is_low.sum() >= _MIN_CELLS else []
 
 
 class _Surface(NamedTuple):
-    """Without what is narrow. linear [H, W, 3]. log_luminance, height_m [H, W]. known: bool."""
+    """Ground seen from above, without what is narrow."""
 
     linear: np.ndarray
+    """Linear colour, [H, W, 3]."""
     log_luminance: np.ndarray
+    """Logarithm of luminance, [H, W]."""
     height_m: np.ndarray
-    known: np.ndarray
+    """Height, [H, W]."""
+    is_known: np.ndarray
+    """Mask of cells with ground, [H, W]."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Cells seen from above, the first axis x. places [N, 3]: of a part's splats."""
+    """Cells seen from above; the first axis is x."""
 
     corner: np.ndarray
+    """x and y of the first cell's corner, metres."""
     cell_m: float
+    """Side of a cell."""
     size: tuple[int, int]
+    """Number of cells along x and y."""
     places: np.ndarray
+    """Centres of the splats, [N, 3], metres."""
 
     @staticmethod
     def of(scene: Scene, places: np.ndarray, ground: np.ndarray) -> _Grid:
-        """Around the cameras, or around the middle of the ground."""
+        """Return the grid around the cameras, or around the middle of the ground."""
         eyes = _eyes(scene)[:, :2]
         eyes = eyes if len(eyes) else np.median(places[ground, :2], 0)[None]
-        corner, ends = eyes.min(0) - _AROUND_M, eyes.max(0) + _AROUND_M
+        corner = eyes.min(0) - _AROUND_M
+        ends = eyes.max(0) + _AROUND_M
         cell_m = max(_CELL_M, float((ends - corner).max()) / _MAX_CELLS)
         height, width = (int(n) for n in np.ceil((ends - corner) / cell_m))
         return _Grid(corner, cell_m, (height, width), places)
 
-    def cells_of(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flat numbers of the cells of chosen splats, and the numbers of those within the grid."""
-        splats = np.flatnonzero(chosen)
+    def cells_of(self, is_chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return flat numbers of the cells of chosen splats, and the splats within the grid."""
+        splats = np.flatnonzero(is_chosen)
         index = np.floor((self.places[splats, :2] - self.corner) / self.cell_m)
-        inside = ((index >= 0) & (index < self.size)).all(1)
-        index = index[inside].astype(np.int64)
-        return index[:, 0] * self.size[1] + index[:, 1], splats[inside]
+        is_inside = ((index >= 0) & (index < self.size)).all(1)
+        index = index[is_inside].astype(np.int64)
+        return index[:, 0] * self.size[1] + index[:, 1], splats[is_inside]
 
-    def surface(self, g: Gaussians, chosen: np.ndarray, albedos: np.ndarray) -> _Surface:
-        """What the chosen splats show over their albedos [N]."""
-        where, splats = self.cells_of(chosen)
+    def surface(self, g: Gaussians, is_chosen: np.ndarray, albedos: np.ndarray) -> _Surface:
+        """Return the ground that chosen splats show.
+
+        Args:
+            g: the N splats.
+            is_chosen: mask of the splats, [N].
+            albedos: albedo of each splat, by which its colour is divided, [N].
+        """
+        cells, splats = self.cells_of(is_chosen)
         scales = g.scales.double().numpy()[splats]
         areas = np.minimum(scales.prod(1) / np.maximum(scales.min(1), 1e-12), self.cell_m**2)
         rgb = 0.5 + SH_C0 * g.sh[:, 0].double().numpy()[splats]
         linear = linear_from_display(np.clip(np.nan_to_num(rgb), 0, 1)) / albedos[splats, None]
 
         def blurred(values: np.ndarray) -> np.ndarray:
-            sums = np.bincount(where, areas * values, math.prod(self.size)).reshape(self.size)
+            sums = np.bincount(cells, areas * values, math.prod(self.size)).reshape(self.size)
             return cv2.GaussianBlur(sums.astype(np.float32), (0, 0), _SPREAD_CELLS)
 
         weight = blurred(np.ones(len(splats)))
-        known = weight > 0.02 * self.cell_m**2
-        safe = np.where(known, weight, 1)
+        is_known = weight > 0.02 * self.cell_m**2
+        safe_weight = np.where(is_known, weight, 1)
         means = [
             cv2.medianBlur(
-                np.where(known, blurred(own) / safe, 0).astype(np.float32), _MEDIAN_CELLS
+                np.where(is_known, blurred(values) / safe_weight, 0).astype(np.float32),
+                _MEDIAN_CELLS,
             )
-            for own in (*linear.T, self.places[splats, 2])
+            for values in (*linear.T, self.places[splats, 2])
         ]
-        known = cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        is_known = cv2.erode(is_known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         rgb = np.stack(means[:3], -1)
-        return _Surface(rgb, np.log(np.maximum(rgb @ _LUMINANCE, 1e-4)), means[3], known)
+        return _Surface(rgb, np.log(np.maximum(rgb @ _LUMINANCE, 1e-4)), means[3], is_known)
 
-    def tops(self, g: Gaussians, chosen: np.ndarray) -> np.ndarray:
-        """Height of the highest of the chosen splats in each cell, [H, W]; -inf without any."""
-        where, splats = self.cells_of(chosen)
+    def tops(self, g: Gaussians, is_chosen: np.ndarray) -> np.ndarray:
+        """Return the height of the highest chosen splat in each cell, [H, W]; -inf without any."""
+        cells, splats = self.cells_of(is_chosen)
         out = np.full(math.prod(self.size), -np.inf)
-        np.maximum.at(out, where, self.places[splats, 2])
+        np.maximum.at(out, cells, self.places[splats, 2])
         return out.reshape(self.size)
 
     def horizons(
-        self, tops: np.ndarray, ground_m: np.ndarray, rows: np.ndarray, columns: np.ndarray,
+        self,
+        tops: np.ndarray,
+        ground_m: np.ndarray,
+        rows: np.ndarray,
+        columns: np.ndarray,
         azimuths: np.ndarray,
-    ) -> np.ndarray:  # fmt: skip
-        """Slope from K cells of ground to the highest thing in each direction, [A, K]."""
+    ) -> np.ndarray:
+        """Return the slope from K cells of ground to the highest thing in each direction, [A, K].
+
+        Args:
+            tops: height of the highest splat in each cell, [H, W].
+            ground_m: height of the ground, [H, W].
+            rows: rows of the cells of ground, [K].
+            columns: their columns, [K].
+            azimuths: the directions, radians, [A].
+        """
         height, width = self.size
         z = ground_m[rows, columns] + _OVER_M
         out = np.full((len(azimuths), len(rows)), -np.inf)
-        for own, azimuth in zip(out, azimuths, strict=True):
+        for slopes, azimuth in zip(out, azimuths, strict=True):
             distance_m = _FROM_M
             while distance_m < _REACH_M:
                 i = rows + round(math.cos(azimuth) * distance_m / self.cell_m)
                 j = columns + round(math.sin(azimuth) * distance_m / self.cell_m)
-                inside = (i >= 0) & (i < height) & (j >= 0) & (j < width)
-                over = tops[i.clip(0, height - 1), j.clip(0, width - 1)] - z
-                over = np.where(inside & (over < _HIGHEST_M), over, -np.inf)
-                np.maximum(own, over / distance_m, out=own)
+                is_inside = (i >= 0) & (i < height) & (j >= 0) & (j < width)
+                height_over = tops[i.clip(0, height - 1), j.clip(0, width - 1)] - z
+                height_over = np.where(is_inside & (height_over < _HIGHEST_M), height_over, -np.inf)
+                np.maximum(slopes, height_over / distance_m, out=slopes)
                 distance_m = max(distance_m + self.cell_m, distance_m * _STEP)
         return out
 
 
-def _explained(horizons: np.ndarray, log_luminance: np.ndarray) -> np.ndarray:
-    """Of the variance of K values, by the shadows of each direction, [A, E]; negative where shadows
-    are brighter, -inf where there are too few.
+def _explain_variance(horizons: np.ndarray, log_luminance: np.ndarray) -> np.ndarray:
+    """Return the share of the variance of K values that each direction's shadows explain, [A, E].
+
+    It is negative where shadows are brighter, and -inf where there are too few.
     """
     out = np.full((len(_AZIMUTHS), len(_ELEVATIONS)), -np.inf)
-    total, variance = log_luminance.sum(), max(float(log_luminance.var()), 1e-6)
-    count = len(log_luminance)
-    for row, own in zip(out, horizons, strict=True):
-        for e, slope in enumerate(np.tan(_ELEVATIONS)):
-            shaded = own > slope
-            number = int(shaded.sum())
-            share = number / count
-            if _MIN_SHARE <= share <= 1 - _MIN_SHARE:
-                dark = log_luminance[shaded].sum()
-                apart = (total - dark) / (count - number) - dark / number
-                row[e] = share * (1 - share) * apart * abs(apart) / variance
+    total = log_luminance.sum()
+    variance = max(float(log_luminance.var()), 1e-6)
+    num_values = len(log_luminance)
+    for row, direction_horizons in zip(out, horizons, strict=True):
+        for elevation_index, slope in enumerate(np.tan(_ELEVATIONS)):
+            is_shaded = direction_horizons > slope
+            num_shaded = int(is_shaded.sum())
+            shaded_share = num_shaded / num_values
+            if _MIN_SHARE <= shaded_share <= 1 - _MIN_SHARE:
+                shaded_sum = log_luminance[is_shaded].sum()
+                contrast = (total - shaded_sum) / (
+                    num_values - num_shaded
+                ) - shaded_sum / num_shaded
+                row[elevation_index] = (
+                    shaded_share * (1 - shaded_share) * contrast * abs(contrast) / variance
+                )
     return out
 
 
 def _ramp(value: float, low: float, high: float) -> float:
-    """0 below low, 1 above high, straight between."""
+    """Return 0 below low, 1 above high, and a straight line between."""
     return min(1.0, max(0.0, (value - low) / (high - low)))
 
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    """Return three values as floats."""
     red, green, blue = (float(value) for value in values)
     return red, green, blue
 
 
-def _between(values: np.ndarray) -> float:
-    """Otsu's threshold between two modes."""
-    low, high = float(values.min()), float(values.max())
+def _otsu_threshold(values: np.ndarray) -> float:
+    """Return Otsu's threshold between two modes of values."""
+    low = float(values.min())
+    high = float(values.max())
     scaled = (255 * (values - low) / max(high - low, 1e-6)).astype(np.uint8)
     threshold, _ = cv2.threshold(scaled, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     return low + (threshold + 0.5) / 255 * (high - low)
 
 
 # ---- Shadows in smog -----------------------------------------------------------------------------
-# Of the light on lit ground, q comes from the sky and 1 - q from the sun. Smog lets T of the sun's
-# through; the rest arrives scattered, everywhere alike, so that the ground's mean stays: with a
-# share s of the sun seen from a place, and f of it in the mean,
+# Of the light on lit ground, q comes from the sky and 1 - q from the sun. Smog transmits T of the
+# sun's light. The rest arrives scattered, the same everywhere, so that the ground's mean stays. A
+# place sees a share s of the sun, and f is the mean of s over the ground:
 #
 #     before  E = q + (1 - q) s          after  E' = q + (1 - q) (T s + (1 - T) f)
 #
 # which multiplies linear colours by E' / E, and encoded ones by its 1/2.2th power.
 
-SMOG_DEEP_M = 200.0  # uniform smog has no top: fog lies 50 to 300 m deep
-_LOWEST_SUN = math.sin(math.radians(10.0))  # whatever its shadows look like
-NUM_FADES = 32  # from shaded to lit
+# Depth of uniform smog, which has no top, metres: fog lies 50 to 300 m deep.
+SMOG_DEEP_M = 200.0
+# Sine of the sun's elevation, at least, whatever its shadows look like.
+_LOWEST_SUN = math.sin(math.radians(10.0))
+# Steps from shaded to lit.
+NUM_FADES = 32
+# Exponent of encoded colours.
 _ENCODING = 2.2
+# Classes of ground whose shadows fade.
 _GROUND_CLASSES = (*_GROUNDS, SemanticClass.LANE_MARKING)
 
 
 @dataclass(frozen=True, eq=False)
 class FadedShadows:
-    """The ground of a scene under a sun that smog has dimmed. transmittance: T, 0 to 1. rows int16
-    [N]: of the background's splats among `maps` [NUM_FADES + 1, 3, 4]; the first changes nothing.
-    """
+    """The ground of a scene under a sun that smog has dimmed."""
 
     shadows: CastShadows
+    """The sun's light on the ground."""
     transmittance: float
+    """T, 0 to 1."""
     rows: Int16[Tensor, "N"]
+    """Row of `maps` for each splat of the background, int16 [N]."""
     maps: Float[Tensor, "K 3 4"]
+    """Colour maps, [NUM_FADES + 1, 3, 4]; the first changes nothing."""
 
     def on(self, part: PosedGaussians) -> PosedGaussians:
-        """The background with its shadows faded, before any maps that it has."""
+        """Return the background with its shadows faded, before any maps that it has."""
         if part.color_maps is None:
             return replace(part, color_maps=self.maps, color_rows=self.rows)
-        outer, rows = part.color_maps.to(self.maps), part.map_rows
-        maps = outer[:, None, :, :3] @ self.maps[None, :, :, :3]
-        maps = torch.cat([maps, outer[:, None, :, 3:].expand(-1, len(self.maps), -1, -1)], -1)
-        if rows is None:
+        outer_maps = part.color_maps.to(self.maps)
+        outer_rows = part.map_rows
+        maps = outer_maps[:, None, :, :3] @ self.maps[None, :, :, :3]
+        maps = torch.cat([maps, outer_maps[:, None, :, 3:].expand(-1, len(self.maps), -1, -1)], -1)
+        if outer_rows is None:
             return replace(part, color_maps=maps.flatten(0, 1), color_rows=self.rows)
-        known = torch.where((rows >= 0) & (rows < len(outer)), rows, 0)
+        safe_rows = torch.where((outer_rows >= 0) & (outer_rows < len(outer_maps)), outer_rows, 0)
         return replace(
             part,
             color_maps=maps.flatten(0, 1),
-            color_rows=(known * len(self.maps) + self.rows).to(torch.int16),
+            color_rows=(safe_rows * len(self.maps) + self.rows).to(torch.int16),
         )
 
     def gains(
         self, points_m: Float32[np.ndarray, "H W 3"]
     ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "K 3"]]:
-        """Of points in the world: the share of the sun that they see, where they are no ground the
-        mean, which changes nothing; and factors of encoded colours by steps of that share.
+        """Return what fades the colours of points in the world.
+
+        Args:
+            points_m: the points.
+
+        Returns:
+            The share of the sun that each point sees (the mean for points that are no ground, which
+            changes nothing), and factors of encoded colours by steps of that share.
         """
         lit = _lit_near(self.shadows, *np.moveaxis(points_m, -1, 0))
-        factors = _factors(self.shadows, self.transmittance, np.linspace(0, 1, 256))
+        factors = _fade_factors(self.shadows, self.transmittance, np.linspace(0, 1, 256))
         factors[round(255 * self.shadows.lit_share)] = 1
         return lit.astype(np.float32), factors
 
 
 def faded_shadows(scene: Scene, transmittance: float) -> FadedShadows | None:
-    """The scene's shadows under a sun of which this arrives; None where it shows none."""
+    """Return the scene's shadows under a dimmed sun; None where it shows no shadows.
+
+    Args:
+        scene: the scene.
+        transmittance: share of the sun's light that arrives.
+    """
     shadows = shadows_of(scene)
     if shadows is None or shadows.certainty == 0 or transmittance >= 1:
         return None
@@ -449,13 +575,15 @@ def faded_shadows(scene: Scene, transmittance: float) -> FadedShadows | None:
         g = scene.background
         lit = _lit_near(shadows, *g.means.double().numpy().T)
         rows = 1 + np.rint(lit * (NUM_FADES - 1))
-        off = np.abs(lit - shadows.lit_share) < 1e-6
+        is_unchanged = np.abs(lit - shadows.lit_share) < 1e-6
         if g.semantic is not None:
-            off |= ~np.isin(g.semantic.numpy(), [int(own) for own in _GROUND_CLASSES])
-        return torch.from_numpy(np.where(off, 0, rows).astype(np.int16))
+            is_unchanged |= ~np.isin(
+                g.semantic.numpy(), [int(semantic) for semantic in _GROUND_CLASSES]
+            )
+        return torch.from_numpy(np.where(is_unchanged, 0, rows).astype(np.int16))
 
     def scale() -> Tensor:
-        factors = _factors(shadows, transmittance, np.linspace(0, 1, NUM_FADES))
+        factors = _fade_factors(shadows, transmittance, np.linspace(0, 1, NUM_FADES))
         maps = torch.zeros(NUM_FADES + 1, 3, 4)
         maps[:, :, :3] = torch.diag_embed(torch.from_numpy(np.vstack([np.ones(3), factors])))
         return maps
@@ -468,26 +596,27 @@ def faded_shadows(scene: Scene, transmittance: float) -> FadedShadows | None:
 
 
 def sun_transmittance(fog: Fog, shadows: CastShadows, ground_z_m: float) -> float:
-    """T of the sun's light, down to the ground."""
-    climb = max(math.sin(math.radians(shadows.elevation_deg)), _LOWEST_SUN)
+    """Return T of the sun's light, down to the ground."""
+    sun_sine = max(math.sin(math.radians(shadows.elevation_deg)), _LOWEST_SUN)
     if fog.scale_height_m is None:
-        return math.exp(-fog.sigma_per_m * SMOG_DEEP_M / climb)
-    return math.exp(-vertical_optical_depth(fog, ground_z_m) / climb)
+        return math.exp(-fog.sigma_per_m * SMOG_DEEP_M / sun_sine)
+    return math.exp(-vertical_optical_depth(fog, ground_z_m) / sun_sine)
 
 
 def _lit_near(
     shadows: CastShadows, x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray
 ) -> np.ndarray:
-    """Share of the sun that places see, drawn to the mean off the ground."""
-    lit, known, height_m = shadows.at(x_m, y_m)
-    over = np.abs(z_m - height_m / np.maximum(known, 1e-6)) / ON_GROUND_M
-    weight = known * (2 - 2 * over).clip(0, 1)
-    return shadows.lit_share + weight * (lit / np.maximum(known, 1e-6) - shadows.lit_share)
+    """Return the share of the sun that places see, blended to the mean off the ground."""
+    lit, known_share, height_m = shadows.at(x_m, y_m)
+    relative_height = np.abs(z_m - height_m / np.maximum(known_share, 1e-6)) / ON_GROUND_M
+    weight = known_share * (2 - 2 * relative_height).clip(0, 1)
+    return shadows.lit_share + weight * (lit / np.maximum(known_share, 1e-6) - shadows.lit_share)
 
 
-def _factors(shadows: CastShadows, transmittance: float, lit: np.ndarray) -> np.ndarray:
-    """(E' / E)^(1/2.2) of shares of the sun [K], float32 [K, 3]."""
+def _fade_factors(shadows: CastShadows, transmittance: float, lit: np.ndarray) -> np.ndarray:
+    """Return (E' / E)^(1/2.2) for shares of the sun [K], float32 [K, 3]."""
     q = np.array(shadows.ratio)
-    seen, mean = lit[:, None], shadows.lit_share
-    after = q + (1 - q) * (transmittance * seen + (1 - transmittance) * mean)
-    return ((after / (q + (1 - q) * seen)) ** (1 / _ENCODING)).astype(np.float32)
+    sun_share = lit[:, None]
+    mean_share = shadows.lit_share
+    faded_light = q + (1 - q) * (transmittance * sun_share + (1 - transmittance) * mean_share)
+    return ((faded_light / (q + (1 - q) * sun_share)) ** (1 / _ENCODING)).astype(np.float32)

@@ -1,4 +1,9 @@
-"""The scene drawn in layers, with the fog that is in front of them."""
+"""Rendering of a scene's parts and sky, through the fog that lies before them.
+
+In: posed Gaussians, a sky, fog and a camera. Out: the rasteriser's buffers, and colours with the
+sky behind them. `augment.views` renders a whole picture with one `LayerRenderer`; effects that need
+several layers (what stands above the water, below it, mirrored in it) call it once a layer.
+"""
 
 from __future__ import annotations
 
@@ -23,27 +28,40 @@ from augment.timing import timed
 
 @dataclass(frozen=True, eq=False)
 class LayerRenderer:
-    """Draws the parts of a scene, all of them or those on one side of a level plane.
-
-    fog: in front of parts and sky. fog_on_buffers: whether it is applied to finished layers, and
-    not blended per Gaussian. photo: what cameras that took it see in place of the splats' colours.
-    unpruned: the parts where `parts` lack what no recorded view would miss.
-    """
+    """Renders the parts of a scene: all of them, or those on one side of a level plane."""
 
     parts: Sequence[PosedGaussians]
+    """The posed Gaussians of the layer."""
     sky: Sky
+    """The sky behind all parts."""
     fog: Fog | None
+    """The fog before parts and sky; None for clear air."""
     fog_on_buffers: bool
+    """If True, fog is applied to finished buffers, by their depth; else it is blended Gaussian by
+    Gaussian while rasterising."""
     settings: RasterSettings
+    """The rasteriser's settings."""
     backend: str
+    """The rasteriser's backend, as `rasterize` takes it."""
     photo: Photo | None = None
+    """The recorded image that replaces the splats' colours in views of the camera that took it;
+    None to show the splats."""
     unpruned: Sequence[PosedGaussians] | None = None
+    """The parts before pruning, if `parts` have been pruned (`augment.prune`); else None."""
 
     def without_fog(self) -> LayerRenderer:
+        """Return the same renderer in clear air."""
         return replace(self, fog=None)
 
     def for_scale(self, scale: float) -> LayerRenderer:
-        """Of layers with this many times as many pixels a side as the picture: splats as wide."""
+        """Return the renderer for layers of another resolution than the picture.
+
+        The rasteriser's blur grows with the resolution, so that splats stay as wide as in the
+        picture.
+
+        Args:
+            scale: pixels along a side of the layer over pixels along that side of the picture.
+        """
         settings = replace(self.settings, blur_px2=self.settings.blur_px2 * scale * scale)
         return replace(self, settings=settings)
 
@@ -53,13 +71,19 @@ class LayerRenderer:
         clip: HeightClip | None,
         buffers: frozenset[str],
         pixel_mask: Bool[Tensor, "H W"] | None = None,
-        shown: Float[Tensor, "H W"] | None = None,
+        photo_share: Float[Tensor, "H W"] | None = None,
     ) -> RenderOutput:
-        """The layer's buffers, without sky; its colours are seen through the fog.
+        """Return the buffers of the layer, without sky, with colours as seen through the fog.
 
-        shown: how much of each pixel of a photo shows this layer; None for all of it.
+        Args:
+            camera: the view, or a window of it.
+            clip: the level plane and the side of it to render; None renders both sides.
+            buffers: names of the buffers to compute.
+            pixel_mask: pixels to render; None renders all.
+            photo_share: share of each pixel of a photo that shows this layer, 0 to 1; None means 1
+                everywhere.
         """
-        raster = self._draw_level(camera, clip, buffers, pixel_mask, shown)
+        raster = self._draw_level(camera, clip, buffers, pixel_mask, photo_share)
         if self.fog is None or self.fog.overcast == 0:
             return raster
         with timed("airlight by elevation"):
@@ -72,20 +96,20 @@ class LayerRenderer:
         clip: HeightClip | None,
         buffers: frozenset[str],
         pixel_mask: Bool[Tensor, "H W"] | None = None,
-        shown: Float[Tensor, "H W"] | None = None,
+        photo_share: Float[Tensor, "H W"] | None = None,
     ) -> RenderOutput:
-        """As `draw`, in the airlight of the horizon."""
-        later = self.fog if self.fog_on_buffers else None
+        """Return what `draw` returns, with the airlight of the horizon at every elevation."""
+        buffer_fog = self.fog if self.fog_on_buffers else None
         photo = self.photo if self.photo is not None and self.photo.is_seen_by(camera) else None
         parts = self.parts
         if photo is not None:
             buffers = buffers | photo.buffers_for(parts)
-            parts = blackened(parts) if shown is None else parts
-        tilted = self.fog is not None and self.fog.overcast > 0
+            parts = blackened(parts) if photo_share is None else parts
+        has_elevation_airlight = self.fog is not None and self.fog.overcast > 0
         raster = rasterize(
             parts,
             camera,
-            buffers=buffers | {EXPECTED_DEPTH} if later or tilted else buffers,
+            buffers=buffers | {EXPECTED_DEPTH} if buffer_fog or has_elevation_airlight else buffers,
             settings=self.settings,
             fog=None if self.fog_on_buffers else self.fog,
             clip=clip,
@@ -94,16 +118,21 @@ class LayerRenderer:
         )
         if photo is not None:
             with timed("photo"):
-                raster = photo.paint(raster, parts, camera, shown)
-        if later is not None:
+                raster = photo.paint(raster, parts, camera, photo_share)
+        if buffer_fog is not None:
             with timed("smog on buffers"):
-                raster = replace(raster, rgb=fog_raster(raster, camera, later))
+                raster = replace(raster, rgb=fog_raster(raster, camera, buffer_fog))
         return raster
 
     def draw_whole(
         self, camera: Camera, buffers: frozenset[str]
     ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
-        """The picture with its sky, not clamped, and the scene's buffers."""
+        """Return the picture with its sky, not clamped, and the buffers of the scene.
+
+        Args:
+            camera: the view.
+            buffers: names of the buffers to compute.
+        """
         if self.photo is not None:
             return self._draw_on_photo(self.photo, camera, buffers)
         fog = self.fog if self.fog is not None and self.fog.scale_height_m is None else None
@@ -121,31 +150,38 @@ class LayerRenderer:
     def add_sky(
         self, rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"], camera: Camera
     ) -> Float[Tensor, "H W 3"]:
-        """A layer's colours before the sky, seen through the fog. camera: the view's, or a window
-        of it.
+        """Return a layer's colours with the sky behind them, seen through the fog.
+
+        Args:
+            rgb: colours of the layer without sky, display-encoded.
+            alpha: opacity of the layer.
+            camera: the view that was rendered, or a window of it.
         """
         if self.photo is None:
             return composite_sky(rgb, alpha, camera, self.sky, fog=self.fog, backend=self.backend)
         sky = self.photo.sky_colors(camera)
         if self.fog is not None:
-            slope = camera.ray_directions(rgb.dtype, rgb.device)[..., 2]
-            slope = slope / camera.ray_lengths(rgb.dtype, rgb.device)
-            tau = sky_optical_depth(self.fog, slope, float(camera.centre[2]))
-            sky = blend_airlight(sky, tau, self.fog, slope)
+            ray_slope = camera.ray_directions(rgb.dtype, rgb.device)[..., 2]
+            ray_slope = ray_slope / camera.ray_lengths(rgb.dtype, rgb.device)
+            optical_depth = sky_optical_depth(self.fog, ray_slope, float(camera.centre[2]))
+            sky = blend_airlight(sky, optical_depth, self.fog, ray_slope)
         return rgb + (1 - alpha)[..., None] * sky
 
     def _draw_on_photo(
         self, photo: Photo, camera: Camera, buffers: frozenset[str]
     ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
-        """The photo with what lies on the scene, through the smog up to each pixel's depth."""
-        parts, own = photo.prepare(self.parts)
-        requested = (buffers - {RGB}) | own | {ALPHA}
+        """Return the photo with what lies on the scene, seen through the smog up to each pixel's
+        depth,
+        and the buffers of the scene.
+        """
+        parts, photo_buffers = photo.prepare(self.parts)
+        requested_buffers = (buffers - {RGB}) | photo_buffers | {ALPHA}
         if self.fog is not None:
-            requested = requested | {EXPECTED_DEPTH}
+            requested_buffers = requested_buffers | {EXPECTED_DEPTH}
         with timed("rasterise"):
             settings = replace(self.settings, sh_degree=0)  # one colour in all bands
             raster = rasterize(
-                parts, camera, buffers=requested, settings=settings, backend=self.backend
+                parts, camera, buffers=requested_buffers, settings=settings, backend=self.backend
             )
         with timed("photo"):
             rgb = photo.clear_picture(raster, parts)

@@ -1,5 +1,9 @@
-"""Kernels of the records themselves: boxes against depth images, poses and colours over time,
-hashes.
+"""Numba kernels for the records themselves: poses and colours over time, merged splats, boxes
+against depth images, hashes.
+
+`augment.scene` (poses_at, colors_at), `augment.lod` (covered_plane) and `augment.boxes`
+(count_occlusion) prepare the arrays and call these. Kernels of effects call `mix`. Every other
+kernel fills its last arguments in place.
 """
 
 from __future__ import annotations
@@ -12,91 +16,130 @@ from numba import prange
 from augment.render.cpu.jit import inner, kernel, serial_kernel
 from augment.rng import MIX_A, MIX_B
 
-BLOCK = 2048  # splats a thread takes at a time
-_A, _B = np.uint64(MIX_A), np.uint64(MIX_B)
+BLOCK = 2048  # splats that a thread takes at a time
+_A = np.uint64(MIX_A)
+_B = np.uint64(MIX_B)
 _S27, _S30, _S31 = (np.uint64(s) for s in (27, 30, 31))
 
 
 @inner()
 def mix(bits):
-    """As augment.rng.mix."""
+    """Return the mixed bits of `augment.rng.mix`, for one uint64."""
     bits = (bits ^ (bits >> _S30)) * _A
     bits = (bits ^ (bits >> _S27)) * _B
     return bits ^ (bits >> _S31)
 
 
 @serial_kernel
-def poses_at(timestamp_ns, straight_rad, tracks, found, out):
-    """scene.Track.pose_at of A tracks, to the same bits: out [A, 4, 4] where found [A] is not 0.
+def poses_at(timestamp_ns, straight_rad, tracks, is_present, out):
+    """Compute `scene.Track.pose_at` of A tracks, to the same bits.
 
-    tracks: scene.PackedTracks. straight_rad: sines of smaller angles have lost their digits.
+    Args:
+        timestamp_ns: the time.
+        straight_rad: angle below which sines lose their digits, and the straight line is exact.
+        tracks: scene.PackedTracks.
+        is_present: uint8 [A], set to 1 for actors that exist at the time, else 0.
+        out: float64 [A, 4, 4], set to world_from_actor of the actors that exist.
     """
-    for actor in range(found.size):
-        first, last = tracks.starts[actor], tracks.starts[actor + 1] - 1
-        times, hold = tracks.times_ns, tracks.holds_ns[actor]
-        found[actor] = 0
-        if timestamp_ns < times[first] - hold or timestamp_ns > times[last] + hold:
+    for actor in range(is_present.size):
+        first = tracks.starts[actor]
+        last = tracks.starts[actor + 1] - 1
+        times = tracks.times_ns
+        hold_ns = tracks.holds_ns[actor]
+        is_present[actor] = 0
+        if timestamp_ns < times[first] - hold_ns or timestamp_ns > times[last] + hold_ns:
             continue
-        low, high = first, last  # samples beside the moment
-        while high - low > 1:
-            middle = (low + high) // 2
+        # Samples beside the time, by bisection.
+        before = first
+        after = last
+        while after - before > 1:
+            middle = (before + after) // 2
             if times[middle] <= timestamp_ns:
-                low = middle
+                before = middle
             else:
-                high = middle
-        at = low if timestamp_ns <= times[first] else high
+                after = middle
+        sample = before if timestamp_ns <= times[first] else after
         is_between = times[first] < timestamp_ns < times[last]
-        gap = tracks.gaps_ns[actor]
-        if is_between and 0 <= gap < times[high] - times[low]:
+        max_gap_ns = tracks.gaps_ns[actor]
+        if is_between and 0 <= max_gap_ns < times[after] - times[before]:
             is_between = False
-            at = low if timestamp_ns - times[low] <= hold else high
-            if at == high and times[high] - timestamp_ns > hold:
+            sample = before if timestamp_ns - times[before] <= hold_ns else after
+            if sample == after and times[after] - timestamp_ns > hold_ns:
                 continue
-        found[actor] = 1
+        is_present[actor] = 1
         if is_between:
-            share = np.float64(timestamp_ns - times[low]) / np.float64(times[high] - times[low])
-            _interpolate(tracks, low, high, share, straight_rad, out[actor])
+            fraction = np.float64(timestamp_ns - times[before]) / np.float64(
+                times[after] - times[before]
+            )
+            _interpolate(tracks, before, after, fraction, straight_rad, out[actor])
         else:
             for k in range(16):
-                out[actor, k // 4, k % 4] = tracks.poses[at, k // 4, k % 4]
+                out[actor, k // 4, k % 4] = tracks.poses[sample, k // 4, k % 4]
 
 
 @inner()
-def _interpolate(tracks, low, high, share, straight_rad, out):
-    a, b = tracks.quats[low], tracks.quats[high]
+def _interpolate(tracks, before, after, fraction, straight_rad, out):
+    """Set `out` [4, 4] to the pose between two samples: slerp in rotation, linear in position.
+
+    Args:
+        tracks: scene.PackedTracks.
+        before: index of the sample before the time.
+        after: index of the sample after the time.
+        fraction: part of the time between the samples that has passed, 0 to 1.
+        straight_rad: as for `poses_at`.
+        out: float64 [4, 4].
+    """
+    a = tracks.quats[before]
+    b = tracks.quats[after]
     dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     angle = math.acos(min(abs(dot), 1.0))
-    of_a, of_b = 1 - share, share
+    weight_a = 1 - fraction
+    weight_b = fraction
     if angle >= straight_rad:
         sine = math.sin(angle)
-        of_a, of_b = math.sin(of_a * angle) / sine, math.sin(of_b * angle) / sine
+        weight_a = math.sin(weight_a * angle) / sine
+        weight_b = math.sin(weight_b * angle) / sine
     if dot < 0:  # the shorter way round
-        of_b = -of_b
-    w, x, y, z = (
-        of_a * a[0] + of_b * b[0],
-        of_a * a[1] + of_b * b[1],
-        of_a * a[2] + of_b * b[2],
-        of_a * a[3] + of_b * b[3],
-    )
+        weight_b = -weight_b
+    w = weight_a * a[0] + weight_b * b[0]
+    x = weight_a * a[1] + weight_b * b[1]
+    y = weight_a * a[2] + weight_b * b[2]
+    z = weight_a * a[3] + weight_b * b[3]
     length = math.sqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w / length, x / length, y / length, z / length
-    out[0, 0], out[0, 1] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z)
-    out[1, 0], out[1, 1] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z)
-    out[2, 0], out[2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
-    out[0, 2], out[1, 2] = 2 * (x * z + w * y), 2 * (y * z - w * x)
-    out[2, 2], out[3, 3] = 1 - 2 * (x * x + y * y), 1.0
+    w = w / length
+    x = x / length
+    y = y / length
+    z = z / length
+    out[0, 0] = 1 - 2 * (y * y + z * z)
+    out[0, 1] = 2 * (x * y - w * z)
+    out[1, 0] = 2 * (x * y + w * z)
+    out[1, 1] = 1 - 2 * (x * x + z * z)
+    out[2, 0] = 2 * (x * z - w * y)
+    out[2, 1] = 2 * (y * z + w * x)
+    out[0, 2] = 2 * (x * z + w * y)
+    out[1, 2] = 2 * (y * z - w * x)
+    out[2, 2] = 1 - 2 * (x * x + y * y)
+    out[3, 3] = 1.0
     for k in range(3):
-        p, q = tracks.centres[low, k], tracks.centres[high, k]
-        out[k, 3] = p + share * (q - p) if share < 0.5 else q - (q - p) * (1 - share)
+        p = tracks.centres[before, k]
+        q = tracks.centres[after, k]
+        out[k, 3] = p + fraction * (q - p) if fraction < 0.5 else q - (q - p) * (1 - fraction)
         out[3, k] = 0.0
 
 
 @kernel
 def colors_at(sh, coefficients, weights, turn, out):
-    """out [N, K, 3]: sh with sum_t weights[t] coefficients[:, t] added to its first row, and bands
-    turned by the blocks of turn [K, K]; an empty turn leaves them.
+    """Compute the SH of N splats at a time, turned by a rotation.
 
-    coefficients [N, T, 3]. weights [T]. All float32.
+    The first row of each splat's SH gets sum_t weights[t] coefficients[:, t] added; the bands above
+    are multiplied by the blocks of `turn`. All arrays are float32.
+
+    Args:
+        sh: [N, K, 3].
+        coefficients: [N, T, 3], of the colour waves.
+        weights: [T], the waves' values at the time.
+        turn: [K, K], block-diagonal; [0, 0] turns nothing.
+        out: [N, K, 3].
     """
     count, rows, _ = sh.shape
     zero = np.float32(0)
@@ -114,39 +157,55 @@ def colors_at(sh, coefficients, weights, turn, out):
                 continue
             first = 1
             while first < rows:
-                after = first + 3 if first == 1 else first + 5 if first == 4 else first + 7
-                for row in range(first, after):
+                end = first + 3 if first == 1 else first + 5 if first == 4 else first + 7
+                for row in range(first, end):
                     red = green = blue = zero
-                    for k in range(first, after):
-                        share = turn[row, k]
-                        red += share * sh[i, k, 0]
-                        green += share * sh[i, k, 1]
-                        blue += share * sh[i, k, 2]
-                    out[i, row, 0], out[i, row, 1], out[i, row, 2] = red, green, blue
-                first = after
+                    for k in range(first, end):
+                        weight = turn[row, k]
+                        red += weight * sh[i, k, 0]
+                        green += weight * sh[i, k, 1]
+                        blue += weight * sh[i, k, 2]
+                    out[i, row, 0] = red
+                    out[i, row, 1] = green
+                    out[i, row, 2] = blue
+                first = end
 
 
 @kernel
 def covered_plane(starts, opacities, places, covariances, out):
-    """out [G]: the integral of 1 - prod_i (1 - alpha_i) over a plane, of the splats in rows
-    starts[g] to starts[g + 1]: places [N, 2] and covariances [N, 2, 2] in units in which the group
-    has a standard deviation of 1. By 49 places within 3.15 deviations. All float64.
+    """Compute the area that each of G groups of splats covers in a plane.
+
+    The area is the integral of 1 - prod_i (1 - alpha_i), taken at 49 places within 3.15 standard
+    deviations of the group. Lengths are in units in which a group has a standard deviation of 1.
+    All arrays but `starts` are float64.
+
+    Args:
+        starts: int64 [G + 1]; group g has the splats in rows starts[g] to starts[g + 1].
+        opacities: [N].
+        places: [N, 2], the splats' means in the plane.
+        covariances: [N, 2, 2], the splats' covariances in the plane.
+        out: [G].
     """
     for g in prange(len(out)):
-        total = 0.0
+        covered = 0.0
         for column in range(7):
             for row in range(7):
-                x, y, passed = 0.9 * (column - 3), 0.9 * (row - 3), 1.0
+                x = 0.9 * (column - 3)
+                y = 0.9 * (row - 3)
+                transmittance = 1.0
                 for i in range(starts[g], starts[g + 1]):
-                    a, b, c = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
-                    dx, dy = x - places[i, 0], y - places[i, 1]
+                    a = covariances[i, 0, 0]
+                    b = covariances[i, 0, 1]
+                    c = covariances[i, 1, 1]
+                    dx = x - places[i, 0]
+                    dy = y - places[i, 1]
                     sigma = 0.5 * (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / (a * c - b * b)
-                    passed *= 1 - min(opacities[i] * np.exp(-sigma), 0.999)
-                total += 1 - passed
-        out[g] = 0.81 * total
+                    transmittance *= 1 - min(opacities[i] * np.exp(-sigma), 0.999)
+                covered += 1 - transmittance
+        out[g] = 0.81 * covered
 
 
-# Of one thread: it runs beside the renderer, on those that write files.
+# This kernel takes one thread: it runs beside the renderer, on threads that write files.
 @serial_kernel
 def count_occlusion(
     depth,
@@ -161,31 +220,48 @@ def count_occlusion(
     owned,
     labelled,
     near_m,
-    found,
+    counts,
     owners,
 ):
-    """found [B, 6]: pixels that show each box, pixels that show what stands before it, and left,
-    top, right, bottom of the former, right and bottom excluded. owners [H, W]: 1 + the smallest of
-    the boxes that each pixel shows by its depth, 0 = none; or [0, 0] where nobody asks.
+    """Count the pixels that show each of B boxes, and those that show what hides it.
 
-    depth [H, W]: z, 0 = none. instance [H, W]: actors' numbers, or [0, 0] where they are not known.
-    scenery [H, W]: of a class that no object is of, or [0, 0] where classes are not known. actors
-    [B]: of the boxes, 0 = none. windows [B, 4]: left, top, right, bottom of where a box can
-    be. across [W], down [H]: x / z and y / z of the pixels' rays. axes [B, 3, 3]: columns, the
-    camera's axes in the box. eyes [B, 3]: the camera's centre there. owned, labelled [B, 2, 3]:
-    lowest and highest of the part that owns surfaces, and of the labelled box. near_m: what of a
-    box is nearer is not seen.
+    A pixel shows a box if the surface there lies in the part of the box that owns surfaces. It
+    shows what hides the box if its ray meets the labelled box and the surface lies before that
+    part.
+
+    Args:
+        depth: float32 [H, W], z of the surfaces, metres, 0 = none.
+        instance: uint16 [H, W], the actors' numbers; [0, 0] where they are not known.
+        scenery: bool [H, W], surfaces of a class that no object has; [0, 0] where classes are not
+            known.
+        actors: int64 [B], the boxes' actors, 0 = none.
+        windows: int64 [B, 4], left, top, right, bottom of the pixels that can show a box.
+        across: float64 [W], x / z of the pixels' rays.
+        down: float64 [H], y / z of the pixels' rays.
+        axes: float64 [B, 3, 3], columns are the camera's axes in the box's frame.
+        eyes: float64 [B, 3], the camera's centre in the box's frame, metres.
+        owned: float64 [B, 2, 3], lowest and highest corner of the part that owns surfaces, metres.
+        labelled: float64 [B, 2, 3], lowest and highest corner of the labelled box, metres.
+        near_m: z below which a box is not seen.
+        counts: int64 [B, 6], set to the pixels that show the box, the pixels that show what hides
+            it, and left, top, right, bottom of the former, right and bottom excluded.
+        owners: uint16 [H, W], set to 1 + the smallest of the boxes that a pixel shows by its depth,
+            0 = none; [0, 0] where nobody asks.
     """
-    knows_actors, knows_classes = instance.size > 0, scenery.size > 0
-    volumes = np.empty(len(found), np.float64)
-    for box in range(len(found)):
-        low, high = labelled[box, 0], labelled[box, 1]
+    knows_actors = instance.size > 0
+    knows_classes = scenery.size > 0
+    volumes = np.empty(len(counts), np.float64)
+    for box in range(len(counts)):
+        low = labelled[box, 0]
+        high = labelled[box, 1]
         volumes[box] = (high[0] - low[0]) * (high[1] - low[1]) * (high[2] - low[2])
+    # Pixels of known actors: they show the actor's boxes wherever they are.
     boxes_of = np.empty(65536, np.int64)  # the first box of each actor
     for actor in range(len(boxes_of)):
         boxes_of[actor] = -1
-    for box in range(len(found)):
-        found[box, 2], found[box, 3] = depth.shape[1], depth.shape[0]
+    for box in range(len(counts)):
+        counts[box, 2] = depth.shape[1]
+        counts[box, 3] = depth.shape[0]
         if actors[box] > 0 and boxes_of[actors[box]] < 0:
             boxes_of[actors[box]] = box
     if knows_actors:
@@ -194,26 +270,29 @@ def count_occlusion(
                 if instance[row, column] > 0:
                     box = boxes_of[instance[row, column]]
                     if box >= 0:
-                        _add(found[box], row, column)
-        for box in range(len(found)):  # a second box of an actor shows what the first one does
+                        _add(counts[box], row, column)
+        for box in range(len(counts)):  # a second box of an actor shows what the first one does
             if actors[box] > 0:
-                for k in range(found.shape[1]):
-                    found[box, k] = found[boxes_of[actors[box]], k]
-    for box in range(len(found)):
+                for k in range(counts.shape[1]):
+                    counts[box, k] = counts[boxes_of[actors[box]], k]
+    for box in range(len(counts)):
         left, top, right, bottom = windows[box]
-        own = actors[box]
+        actor_number = actors[box]
         for row in range(top, bottom):
             for column in range(left, right):
                 z = depth[row, column]
                 if not z > 0:
                     continue
-                number = np.int64(0)
+                pixel_actor = np.int64(0)
                 if knows_actors:
-                    number = np.int64(instance[row, column])
-                    if own > 0 and number == own:
+                    pixel_actor = np.int64(instance[row, column])
+                    if actor_number > 0 and pixel_actor == actor_number:
                         continue  # counted above
-                enter, leave = near_m, np.inf  # of the labelled box, by depth
-                nearest, farthest = near_m, np.inf  # of what owns surfaces
+                # Depths at which the ray enters and leaves the labelled box, then the owning part.
+                enter = near_m
+                leave = np.inf
+                nearest = near_m
+                farthest = np.inf
                 for axis in range(3):
                     slope = (
                         axes[box, axis, 0] * across[column]
@@ -223,31 +302,34 @@ def count_occlusion(
                     eye = eyes[box, axis]
                     a = (labelled[box, 0, axis] - eye) / slope
                     b = (labelled[box, 1, axis] - eye) / slope
-                    enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+                    enter = max(enter, min(a, b))
+                    leave = min(leave, max(a, b))
                     a = (owned[box, 0, axis] - eye) / slope
                     b = (owned[box, 1, axis] - eye) / slope
-                    nearest, farthest = max(nearest, min(a, b)), min(farthest, max(a, b))
+                    nearest = max(nearest, min(a, b))
+                    farthest = min(farthest, max(a, b))
                 if nearest <= z and z <= farthest:
-                    if own == 0 and number == 0:
+                    if actor_number == 0 and pixel_actor == 0:
                         if knows_classes and scenery[row, column]:
                             continue
-                        _add(found[box], row, column)
+                        _add(counts[box], row, column)
                         if owners.size > 0:
-                            other = np.int64(owners[row, column]) - 1
-                            if other < 0 or volumes[box] < volumes[other]:
+                            owner = np.int64(owners[row, column]) - 1
+                            if owner < 0 or volumes[box] < volumes[owner]:
                                 owners[row, column] = box + 1
-                    elif number > 0 and enter <= leave:
-                        found[box, 1] += 1  # another actor, in this box
+                    elif pixel_actor > 0 and enter <= leave:
+                        counts[box, 1] += 1  # another actor, in this box
                 elif z < nearest and enter <= leave:
-                    found[box, 1] += 1
-    for box in range(len(found)):
-        if found[box, 0] == 0:
-            for k in range(2, found.shape[1]):
-                found[box, k] = 0
+                    counts[box, 1] += 1
+    for box in range(len(counts)):
+        if counts[box, 0] == 0:
+            for k in range(2, counts.shape[1]):
+                counts[box, k] = 0
 
 
 @inner()
-def _add(found, row, column):
-    found[0] += 1
-    found[2], found[3] = min(found[2], column), min(found[3], row)
-    found[4], found[5] = max(found[4], column + 1), max(found[5], row + 1)
+def _add(counts, row, column):
+    """Add one pixel to a box's counts (a row of `count_occlusion`'s)."""
+    counts[0] += 1
+    counts[2], counts[3] = min(counts[2], column), min(counts[3], row)
+    counts[4], counts[5] = max(counts[4], column + 1), max(counts[5], row + 1)

@@ -1,7 +1,8 @@
-"""3D boxes and LiDAR sweeps, kept exactly as the dataset gave them.
+"""Records of 3D boxes and LiDAR sweeps, and protocols of what can read them.
 
-Coordinates here are the dataset's own world in float64, before the recentring that rendering
-needs: `scene = dataset - Scene.world_origin_m`. That is what lets them pass through unchanged.
+Coordinates here are the dataset's own world in float64, before the recentring that rendering needs:
+`scene = dataset - Scene.world_origin_m`. So they pass through to the output unchanged. Adapters
+implement `LabelSource`, and the further protocols where their datasets know more.
 """
 
 from __future__ import annotations
@@ -13,26 +14,27 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-# The label of an actor that is the recording car itself, as one camera sees it: no dataset labels
-# it, no box stands for it, and no LiDAR return is its own.
+# Label of an actor that is the recording car itself, as one camera sees it: no dataset labels it,
+# no box stands for it, and no LiDAR return is its own.
 EGO_VEHICLE = "ego_vehicle"
 
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """The labelled boxes of one frame.
-
-    track_ids, labels: one string a box. centers_m: float64 [B, 3], dataset world.
-    sizes_m: float64 [B, 3] as length (box x), width (y), height (z). quats: float64 [B, 4] wxyz,
-    world_from_box. attributes: the dataset's further columns, each with B entries.
-    """
+    """The B labelled boxes of one frame."""
 
     track_ids: tuple[str, ...]
+    """Track of each box."""
     labels: tuple[str, ...]
+    """Dataset's name for the kind of each box."""
     centers_m: np.ndarray
+    """Centres, float64 [B, 3], dataset world."""
     sizes_m: np.ndarray
+    """Length (box x), width (y) and height (z), float64 [B, 3]."""
     quats: np.ndarray
+    """Rotations world_from_box, float64 [B, 4] wxyz."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Further columns of the dataset, each with B entries."""
 
     def __post_init__(self) -> None:
         count = len(self.track_ids)
@@ -53,18 +55,18 @@ class Boxes:
 
     @staticmethod
     def empty() -> Boxes:
+        """Return no boxes."""
         return Boxes((), (), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)))
 
 
 @dataclass(frozen=True, eq=False)
 class LidarSweep:
-    """One frame's LiDAR returns as named columns of equal length, in the dataset's order.
-
-    Always holds x, y, z (metres, dataset world); usually intensity, timestamp_ns, sensor, semantic
-    (dataset's own class numbers) under the names its adapter documents.
-    """
+    """One frame's LiDAR returns, in the dataset's order."""
 
     columns: Mapping[str, np.ndarray]
+    """Columns of equal length by name. There are always x, y, z (metres, dataset world); usually
+    also intensity, timestamp_ns, sensor, semantic (the dataset's own class numbers), under the
+    names that the adapter documents."""
 
     def __post_init__(self) -> None:
         missing = [name for name in "xyz" if name not in self.columns]
@@ -79,7 +81,7 @@ class LidarSweep:
 
     @property
     def points_m(self) -> np.ndarray:
-        """float64 [N, 3], dataset world."""
+        """Return the returns' places, float64 [N, 3], dataset world."""
         return np.stack([np.asarray(self.columns[c], dtype=np.float64) for c in "xyz"], axis=1)
 
 
@@ -91,31 +93,34 @@ class LabelSource(Protocol):
     """
 
     def boxes(self, frame_index: int) -> Boxes:
-        """Boxes of the frame; empty where the dataset has none."""
+        """Return the boxes of a frame; empty where the dataset has none."""
         ...
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
-        """The sweep of the frame, or None where the dataset has no file for it."""
+        """Return the sweep of a frame, or None where the dataset has no file for it."""
         ...
 
 
 @runtime_checkable
 class ClassifiesLidar(Protocol):
-    """A LabelSource that also knows what the class numbers of its sweeps mean."""
+    """A LabelSource that also knows the meaning of its sweeps' class numbers."""
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        """The SemanticClass of each of the sweep's returns, int16 [N], negative where no surface
-        made it; None where the sweep has no classes, or they are not known to mean anything.
+        """Return the SemanticClass of each return, int16 [N].
+
+        It is negative where no surface made the return. None where the sweep has no classes, or
+        their meaning is not known.
         """
         ...
 
 
 @runtime_checkable
 class KnowsLidarOrigins(Protocol):
-    """A LabelSource that also knows where its sensors were, for weather along the beams."""
+    """A LabelSource that also knows the places of its sensors, for weather along the beams."""
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
-        """Where the beam of each of the sweep's returns started, float64 [N, 3], dataset world;
+        """Return where the beam of each return started, float64 [N, 3], dataset world.
+
         None where it is not known for this frame.
         """
         ...
@@ -123,12 +128,14 @@ class KnowsLidarOrigins(Protocol):
 
 @runtime_checkable
 class KnowsLidarTop(Protocol):
-    """A LabelSource with lasers of several reaches, of which the near ones see higher. Else the
-    returns tell."""
+    """A LabelSource with lasers of several reaches, of which the near ones see higher.
+
+    For other sources the returns themselves show how high the LiDAR sees.
+    """
 
     @property
     def lidar_top_rad(self) -> float:
-        """The highest elevation that the laser of the longest reach looks at."""
+        """Return the highest elevation that the laser of the longest reach looks at."""
         ...
 
 
@@ -137,14 +144,21 @@ class StoresLidar(Protocol):
     """A LabelSource whose sweeps lie in files of their own, which can be written anew."""
 
     def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
-        """The file of the frame's returns, and those that say something of each of them in the
-        same order; none where the frame has no sweep.
+        """Return the file of a frame's returns, and files with a row for each of them in the same
+        order.
+
+        Empty where the frame has no sweep.
         """
         ...
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
-        """What one of those files holds when the sensor has seen `sweep` in place of the frame's
-        own: returns of that, some moved, as `source_index` names them, in that order. Returns that
-        the weather in the air made (see codes) have the dataset's class for that, or none.
+        """Return the bytes of one of those files for a changed sweep.
+
+        Args:
+            frame_index: number of the frame.
+            file: the file.
+            sweep: what the sensor has seen in place of the frame's own sweep: returns of that, some
+                moved, as `source_index` names them, in that order. Returns that the weather in the
+                air made (see codes) get the dataset's class for that, or none.
         """
         ...

@@ -1,28 +1,36 @@
-"""Levels of detail: far splats merged once a scene, and which of them a camera takes.
+"""Levels of detail: splats merged once a scene, and the choice of levels for one camera.
 
-The ground is cut into squares. Level 0 of a square holds its own splats; level k holds, for a
-square of twice the side, what is left when the splats of level k - 1 that share a cell of
-c_k = c_1 2^(k-1) are merged. So a square of any level holds about as many splats, and squares are
-the nodes of a quadtree. Of a camera of focal length f, level k serves what lies at least
+In: the Gaussians of a large background (`levels_of` builds `Levels`, once). Out: `choose_parts`
+gives the parts that a camera needs, in place of the whole background. `rasterize` calls it where
+recipe.render.lod_px > 0; `augment.files.level_file` stores levels beside a scene.
 
-    d_k = f c_k / lod_px
+The ground is cut into squares. Level 0 of a square holds its own splats. Level k holds, for a
+square of twice the side, the splats of level k - 1, with those merged that share a cell of side
 
-away: a cell is no larger than lod_px pixels there. From d_k to (1 + BAND) d_k a square fades into
-the one that holds it: of shares w and 1 - w, a splat of opacity o has 1 - (1 - o)^w, so that
-transmittances, which multiply, stay those of one level. Distances are Euclidean, and a square's is
-never below that of the square that holds it: shares add up to 1, follow the camera's place without
-a step, and stay as they are when it turns.
+    c_k = c_1 2^(k-1).
+
+So a square of any level holds about as many splats, and the squares are the nodes of a quadtree.
+For a camera of focal length f, level k serves squares at a distance of at least
+
+    d_k = f c_k / lod_px,
+
+where a cell is no larger than lod_px pixels. From d_k to (1 + BAND) d_k a square fades into the
+square that holds it. The two have shares w and 1 - w, and a splat of opacity o is drawn with 1 - (1
+- o)^w, so that transmittances, which multiply, stay those of one level. Distances are Euclidean,
+and a square's is never below that of the square that holds it. So shares add up to 1, change
+without a step as the camera moves, and stay the same when it turns.
 
 Splats whose colours differ by less than ALIKE are merged in cells of 2 c_k. Merging keeps the
-moments of the mixture (weights: opacity times surface; splats that are larger than the cell stay as
-they are), its mean colour,
+moments of the mixture and its mean colour:
 
-    mu = sum w_i mu_i,    Sigma = sum w_i (Sigma_i + (mu_i - mu)(mu_i - mu)^T),
+    mu = sum w_i mu_i,    Sigma = sum w_i (Sigma_i + (mu_i - mu)(mu_i - mu)^T).
 
-and what its splats cover together of the plane that they lie in, as wide as the rasteriser's blur
-makes them where the level serves. Where this takes a flat top, the opacity is above 1: alpha is
-min(alpha_max, o exp(-sigma)). (Kerbl et al. 2024, "A Hierarchical 3D Gaussian Representation for
-Real-Time Rendering of Very Large Datasets", section 4.1, weighs so, and has such opacities.)
+The weights w_i are opacity times surface; splats larger than the cell stay as they are. Merging
+also keeps the area that the splats cover together in the plane that they lie in, at the width that
+the rasteriser's blur gives them where the level serves. Where this takes a flat top, the opacity is
+above 1: alpha is min(alpha_max, o exp(-sigma)). (Kerbl et al. 2024, "A Hierarchical 3D Gaussian
+Representation for Real-Time Rendering of Very Large Datasets", section 4.1, weighs so, and has such
+opacities.)
 """
 
 from __future__ import annotations
@@ -55,103 +63,151 @@ from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians, is_drawable
 from augment.semantics import SemanticClass
 
-MIN_SPLATS = 20_000  # a part with fewer is drawn as it is
-CELLS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # c_1: the first whose cells leave at most
-MOST_LEFT = 0.6  # of the splats
-CELLS_ACROSS = 64  # of c_1 along a square of level 0
-MAX_LEVELS, FEW_SQUARES = 12, 4  # no further level where so few are left
+# Splats of a part below which it is drawn as it is.
+MIN_SPLATS = 20_000
+# Candidates of c_1, metres: the first is taken whose cells leave at most MOST_LEFT of the splats.
+CELLS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+# Share of the splats that merging in the finest cells may leave.
+MOST_LEFT = 0.6
+# Cells of c_1 along a square of level 0.
+CELLS_ACROSS = 64
+# Levels that a part has at most, above level 0.
+MAX_LEVELS = 12
+# Squares of a level from which no further level is made.
+FEW_SQUARES = 4
+# Width of the band in which levels fade, as a part of d_k.
 BAND = 0.12
-ALIKE = 0.03  # of 1, in each channel of the encoded colours
-# A pixel is 1 to 2 cells where a level serves with lod_px = 1. The blur's deviation, in cells:
+# Largest difference of alike colours, of 1, in each channel of the encoded colours.
+ALIKE = 0.03
+# Standard deviation of the rasteriser's blur, in cells. A pixel is 1 to 2 cells where a level
+# serves with lod_px = 1.
 BLUR_CELLS = math.sqrt(2 * COV2D_BLUR)
-FLAT_TOP = 2.0  # a flat top covers this many times what the deviations say; beyond it they grow
+# Area that a flat top covers at most, over the area by its standard deviations; beyond it the
+# deviations grow.
+FLAT_TOP = 2.0
+# Largest opacity of a merged splat.
 MAX_OPACITY = math.exp(FLAT_TOP - 1)
+# Smallest standard deviation of a merged splat, metres.
 THINNEST_M = 1e-4
-FEW_TESTED = 1024  # squares whose splats are tested as quickly as they are
-BATCH = 1 << 18  # splats merged at once
-OFF_GRID = (0.37, 0.37, 0.5)  # of a cell: walls and ground at round numbers lie within one
+# Number of squares up to which testing their splats takes no longer than testing the squares.
+FEW_TESTED = 1024
+# Splats that are merged at once.
+BATCH = 1 << 18
+# Offset of the cells' grid, in cells: walls and ground at round numbers then lie inside one cell.
+OFF_GRID = (0.37, 0.37, 0.5)
+# Odd factor that mixes the bits of cell numbers.
 _ODD = np.uint64(0x9E3779B97F4A7C15)
-_BIAS = 1 << 21  # half the squares that keys can tell apart along an axis
-_SPREAD = ((16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F),
-           (2, 0x3333333333333333), (1, 0x5555555555555555))  # fmt: skip
+# Half the number of squares that keys can tell apart along an axis.
+_BIAS = 1 << 21
+# Shifts and masks that spread the bits of a number to every second bit.
+_SPREAD = (
+    (16, 0x0000FFFF0000FFFF),
+    (8, 0x00FF00FF00FF00FF),
+    (4, 0x0F0F0F0F0F0F0F0F),
+    (2, 0x3333333333333333),
+    (1, 0x5555555555555555),
+)
+# Shifts and masks that spread the bits of a number to every third bit.
 _SPREAD_BY_TWO = (
-    (32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249))  # fmt: skip
-_LEVELS = ("levels of detail",)  # where a memo has them
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+# Key of the levels in a memo; `antialiased` follows.
+_LEVELS = ("levels of detail",)
+# Key of the levels that may lie in a file.
 _STORED = (*_LEVELS, False)
+# Fields of Gaussians that merged splats have.
 _COLUMNS = ("means", "quats", "scales", "opacities", "sh")
 
 
-# ---- What levels are -----------------------------------------------------------------------------
+# ---- Records of levels ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Squares:
-    """S squares of a level, along a Z-curve.
-
-    keys [S]: increasing; those of the next level are these without their last two bits. starts
-    [S + 1]: the splats of each. lows, highs [S, 3]: around the means of level 0 in it, metres.
-    longest [S]: the largest standard deviation of its splats.
-    """
+    """S squares of a level, along a Z-curve."""
 
     keys: Int64[np.ndarray, "S"]
+    """Numbers of the squares along the curve, increasing; those of the next level are these without
+    their last two bits."""
     starts: Int64[np.ndarray, "_"]
+    """First splat of each square, and the number of all splats, [S + 1]."""
     lows: Float[np.ndarray, "S 3"]
+    """Lowest corner of the means of level 0 in each square, metres."""
     highs: Float[np.ndarray, "S 3"]
+    """Highest corner of the means of level 0 in each square, metres."""
     longest: Float[np.ndarray, "S"]
+    """Largest standard deviation of each square's splats, metres."""
 
     def __len__(self) -> int:
         return len(self.keys)
 
 
 class Boxes(NamedTuple):
-    """Around the means of every CELL splats of a level, [C, 3], and their largest standard
-    deviations [C].
-    """
+    """Boxes around the means of every CELL splats of a level."""
 
     lows: Float[np.ndarray, "C 3"]
+    """Lowest corners, metres."""
     highs: Float[np.ndarray, "C 3"]
+    """Highest corners, metres."""
     longest: Float[np.ndarray, "C"]
+    """Largest standard deviation of the splats in each box, metres."""
 
     @staticmethod
     def around(g: Gaussians, starts: np.ndarray) -> Boxes:
-        """Of the splats from each start to the next."""
-        means, longest = g.means.numpy(), g.scales.numpy().max(1)
+        """Return boxes around the splats from each start to the next."""
+        means = g.means.numpy()
+        longest = g.scales.numpy().max(1)
         lows, highs = (f.reduceat(means, starts) for f in (np.minimum, np.maximum))
         return Boxes(lows, highs, np.maximum.reduceat(longest, starts))
 
     @staticmethod
     def join(boxes: Sequence[Boxes]) -> Boxes:
+        """Return all boxes, in their order."""
         return Boxes(*map(np.concatenate, zip(*boxes, strict=True)))
 
     def bounds(self, rows: np.ndarray) -> Bounds:
-        lows, highs = self.lows[rows].astype(np.float64), self.highs[rows].astype(np.float64)
+        """Return some of the boxes as bounds of the background."""
+        lows = self.lows[rows].astype(np.float64)
+        highs = self.highs[rows].astype(np.float64)
         owners = np.zeros(len(rows), np.int64)
         return Bounds((lows + highs) / 2, (highs - lows) / 2, self.longest[rows], owners)
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Splats, square after square, neighbours together. stands_for [N]: the part's own splat whose
-    number and class each has. unchecked: the file that they come from, whose numbers are looked at
-    when they are taken. splats: of the part, where it is unchecked. parents [N]: the splat of the
-    next level that each is merged into, -1 for none.
-    """
+    """Splats of one level, square after square, neighbours together."""
 
     gaussians: Gaussians
+    """The N splats."""
     stands_for: Int32[np.ndarray, "N"]
+    """Index of the part's own splat that gives each its number and class, [N]."""
     squares: Squares
+    """The squares of the level."""
     boxes: Boxes
+    """Boxes around every CELL splats."""
     parents: Int32[np.ndarray, "N"]
+    """Splat of the next level that each splat is merged into, [N]; -1 for none."""
     unchecked: str | None = None
+    """Name of the file that the splats come from, whose numbers are checked when they are taken;
+    None where they need no check."""
     splats: int = 0
+    """Number of the part's splats, where `unchecked` is set."""
     _checked: Bool[np.ndarray, "C"] = field(init=False)
+    """Mask of the boxes whose splats have been checked."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_checked", np.zeros(len(self.boxes.longest), bool))
 
     def check(self, cells: Int64[np.ndarray, "_"]) -> None:
-        """Look at the numbers of these CELLs of splats, once."""
+        """Check the numbers of the splats in some boxes, once.
+
+        Args:
+            cells: indices of the boxes of CELL splats.
+        """
         if self.unchecked is None:
             return
         cells = np.unique(cells[~self._checked[cells]])
@@ -166,65 +222,83 @@ class Level:
 
 
 class Tree(NamedTuple):
-    """The squares of all levels, [S], those of level 0 first. numbers: their levels. parents: the
-    square that holds each, -1 for none. firsts, ends: of their splats. cells_m: c_k; 0 of level 0.
-    cells: the Boxes of all levels; cell_starts: where each level's begin.
-    """
+    """The S squares of all levels, those of level 0 first."""
 
     boxes: Boxes
+    """Boxes around the squares."""
     numbers: Int64[np.ndarray, "S"]
+    """Level of each square."""
     parents: Int64[np.ndarray, "S"]
+    """Square that holds each square; -1 for none."""
     firsts: Int64[np.ndarray, "S"]
+    """First splat of each square, in its level."""
     ends: Int64[np.ndarray, "S"]
+    """Last splat of each square, plus 1."""
     cells_m: Float[np.ndarray, "S"]
+    """c_k of each square's level, metres; 0 at level 0."""
     cells: Boxes
+    """Boxes around every CELL splats, of all levels."""
     cell_starts: Int64[np.ndarray, "_"]
+    """First of `cells` of each level."""
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Of a part, the finest first. finest_m: c_1."""
+    """Levels of a part, the finest first."""
 
     finest_m: float
+    """c_1, metres."""
     levels: tuple[Level, ...]
+    """The levels; levels[k] is level k."""
 
     @cached_property
     def tree(self) -> Tree:
-        squares, cells = [own.squares for own in self.levels], [own.boxes for own in self.levels]
-        counts = [len(own) for own in squares]
+        """Return the squares of all levels as one tree."""
+        level_squares = [level.squares for level in self.levels]
+        cells = [level.boxes for level in self.levels]
+        counts = [len(level) for level in level_squares]
         numbers = np.repeat(np.arange(len(counts)), counts)
-        starts, parents = np.cumsum([0, *counts]), np.full(sum(counts), -1)
-        for number, (finer, own) in enumerate(itertools.pairwise(squares)):
-            above = starts[number + 1] + np.searchsorted(own.keys, finer.keys >> 2)
-            parents[starts[number] : starts[number + 1]] = above
+        starts = np.cumsum([0, *counts])
+        parents = np.full(sum(counts), -1)
+        for number, (finer, level) in enumerate(itertools.pairwise(level_squares)):
+            coarse_squares = starts[number + 1] + np.searchsorted(level.keys, finer.keys >> 2)
+            parents[starts[number] : starts[number + 1]] = coarse_squares
         return Tree(
-            Boxes.join([Boxes(own.lows, own.highs, own.longest) for own in squares]),
+            Boxes.join([Boxes(level.lows, level.highs, level.longest) for level in level_squares]),
             numbers,
             parents,
-            np.concatenate([own.starts[:-1] for own in squares]),
-            np.concatenate([own.starts[1:] for own in squares]),
+            np.concatenate([level.starts[:-1] for level in level_squares]),
+            np.concatenate([level.starts[1:] for level in level_squares]),
             np.where(numbers > 0, self.finest_m * 2.0 ** (numbers - 1), 0),
             Boxes.join(cells),
-            np.cumsum([0, *(len(own.longest) for own in cells)]),
+            np.cumsum([0, *(len(level.longest) for level in cells)]),
         )
 
     def cell_m(self, number: int) -> float:
+        """Return c_k of level k = `number`, metres."""
         return self.finest_m * 2.0 ** (number - 1)
 
 
 def rows_of(g: Gaussians, rows: slice) -> Gaussians:
-    """A piece of the Gaussians that copies nothing."""
+    """Return a run of the Gaussians, without a copy."""
     means, quats, scales, opacities, sh = (getattr(g, name).detach()[rows] for name in _COLUMNS)
     semantic = None if g.semantic is None else g.semantic[rows]
     return Gaussians(means, quats, scales, opacities, sh, semantic)
 
 
 def _check(g: Gaussians, is_numbered: bool, where: str) -> None:
-    usual = replace(g, opacities=g.opacities.clamp(max=1))
+    """Raise SceneError if Gaussians cannot be drawn.
+
+    Args:
+        g: the Gaussians, with opacities of merged splats.
+        is_numbered: if False, `stands_for` names splats that do not exist.
+        where: names the Gaussians in the message.
+    """
+    clamped = replace(g, opacities=g.opacities.clamp(max=1))
     classes = [0] if g.semantic is None else [int(g.semantic.min()), int(g.semantic.max())]
-    is_classed = min(SemanticClass) <= min(classes) and max(classes) <= max(SemanticClass)
-    is_clear = float(g.opacities.max()) <= MAX_OPACITY * (1 + 1e-6)
-    if not (is_numbered and is_classed and is_clear and is_drawable(usual)):
+    has_valid_classes = min(SemanticClass) <= min(classes) and max(classes) <= max(SemanticClass)
+    has_valid_opacities = float(g.opacities.max()) <= MAX_OPACITY * (1 + 1e-6)
+    if not (is_numbered and has_valid_classes and has_valid_opacities and is_drawable(clamped)):
         raise SceneError(
             f"{where} holds Gaussians that cannot be drawn: NaN or infinite values, quaternions "
             f"that are not of length 1, scales <= 0, opacities outside [0, {MAX_OPACITY:.4g}], "
@@ -234,7 +308,7 @@ def _check(g: Gaussians, is_numbered: bool, where: str) -> None:
 
 
 def check_background(gaussians: Gaussians) -> None:
-    """Look at all numbers of a background that lies in a file with its levels, once.
+    """Check all numbers of a background that lies in a file with its levels, once.
 
     Raises:
         SceneError: some cannot be drawn.
@@ -248,15 +322,23 @@ def check_background(gaussians: Gaussians) -> None:
 
 
 class Piece(NamedTuple):
-    """Splats of some squares, what each stands for, and the key of its square."""
+    """Splats of some squares."""
 
     gaussians: Gaussians
+    """The splats."""
     stands_for: Int32[np.ndarray, "N"]
+    """Index of the part's own splat that gives each its number and class."""
     keys: Int64[np.ndarray, "N"]
+    """Key of each splat's square."""
 
 
 def levels_of(gaussians: Gaussians, *, antialiased: bool = False) -> Levels:
-    """The levels of a part, made once for these Gaussians."""
+    """Return the levels of a part, made once for these Gaussians.
+
+    Args:
+        gaussians: the part's Gaussians.
+        antialiased: as for `build_levels`.
+    """
 
     def make() -> Levels:
         stored = known_of(gaussians.means, "levels", lambda: None)
@@ -268,78 +350,102 @@ def levels_of(gaussians: Gaussians, *, antialiased: bool = False) -> Levels:
 
 
 def keep_levels(gaussians: Gaussians, levels: Levels) -> None:
-    """Let `levels_of` know levels that lie in a file. levels: must not hold this object, or its
-    means.
+    """Let `levels_of` know levels that lie in a file.
+
+    Args:
+        gaussians: the part's Gaussians.
+        levels: their levels, which must not hold this object or its means.
     """
     memo_of(gaussians).put(_STORED, levels, shared=True)
     known_of(gaussians.means, "levels", lambda: levels)
 
 
 def _has_shapes(g: Gaussians, other: Gaussians) -> bool:
+    """Return True if both share the memory of means, quats and scales."""
     return all(getattr(g, n).data_ptr() == getattr(other, n).data_ptr() for n in _COLUMNS[:3])
 
 
 def edited_levels(levels: Levels, g: Gaussians) -> Levels:
-    """The levels of Gaussians that have other colours, or let more through: mean colours and sums
-    of opacities are taken anew, where nothing moves.
+    """Return the levels of Gaussians with other colours or lower opacities.
+
+    Nothing moves: mean colours and sums of opacities are computed anew.
+
+    Args:
+        levels: the levels of the Gaussians before the edit.
+        g: the Gaussians after it.
 
     Raises:
         SceneError: the levels' file is damaged.
     """
-    edited = [replace(levels.levels[0], gaussians=rows_of(g, slice(None)), unchecked=None)]
-    for finer, own in itertools.pairwise(levels.levels):
+    new_levels = [replace(levels.levels[0], gaussians=rows_of(g, slice(None)), unchecked=None)]
+    for finer, level in itertools.pairwise(levels.levels):
         if len(finer.parents) and not -1 <= finer.parents.min() <= finer.parents.max() < len(
-            own.gaussians
+            level.gaussians
         ):
-            raise SceneError(f"{own.unchecked}: parents must be splats of the next level")
-        edited.append(replace(own, gaussians=_reweighed(finer, edited[-1].gaussians, own)))
-    return replace(levels, levels=tuple(edited))
+            raise SceneError(f"{level.unchecked}: parents must be splats of the next level")
+        new_levels.append(
+            replace(level, gaussians=_reweigh(finer, new_levels[-1].gaussians, level))
+        )
+    return replace(levels, levels=tuple(new_levels))
 
 
-def _reweighed(finer: Level, g: Gaussians, own: Level) -> Gaussians:
-    """The splats of a level as the finer ones' new opacities and colours make them."""
-    count, functions = len(own.gaussians), g.sh.shape[1]
-    before, after, sh = np.zeros(count), np.zeros(count), np.zeros((count, functions * 3))
+def _reweigh(finer: Level, g: Gaussians, level: Level) -> Gaussians:
+    """Return the splats of a level, by the edited opacities and colours of the finer level.
+
+    Args:
+        finer: the finer level before the edit.
+        g: the finer level's Gaussians after it.
+        level: the level before the edit.
+    """
+    count = len(level.gaussians)
+    functions = g.sh.shape[1]
+    old_weights = np.zeros(count)
+    new_weights = np.zeros(count)
+    sh = np.zeros((count, functions * 3))
     for rows in batches(len(g)):
-        into = finer.parents[rows]
-        merged = np.flatnonzero(into >= 0)
-        if not len(merged):
+        targets = finer.parents[rows]
+        merged_rows = np.flatnonzero(targets >= 0)
+        if not len(merged_rows):
             continue
-        into = into[merged]
-        first, end = int(into.min()), int(into.max()) + 1
-        a, b, c = g.scales[rows].double().numpy()[merged].T
-        area, size = a * b + b * c + c * a, end - first
-        weights = area * g.opacities[rows].numpy()[merged]
-        whole = area * finer.gaussians.opacities[rows].numpy()[merged]
-        before[first:end] += np.bincount(into - first, whole, size)
-        after[first:end] += np.bincount(into - first, weights, size)
-        values = g.sh[rows].reshape(-1, functions * 3).numpy()[merged]
+        targets = targets[merged_rows]
+        first = int(targets.min())
+        end = int(targets.max()) + 1
+        a, b, c = g.scales[rows].double().numpy()[merged_rows].T
+        area = a * b + b * c + c * a
+        size = end - first
+        row_weights = area * g.opacities[rows].numpy()[merged_rows]
+        old_row_weights = area * finer.gaussians.opacities[rows].numpy()[merged_rows]
+        old_weights[first:end] += np.bincount(targets - first, old_row_weights, size)
+        new_weights[first:end] += np.bincount(targets - first, row_weights, size)
+        values = g.sh[rows].reshape(-1, functions * 3).numpy()[merged_rows]
         for column in range(functions * 3):
-            own_sum = np.bincount(into - first, weights * values[:, column], size)
-            sh[first:end, column] += own_sum
-    is_left = (after > 0) & (before > 0)
-    left = np.where(is_left, after / np.where(is_left, before, 1), 0)
-    known = np.where(is_left, after, 1)[:, None]
-    mean = np.where(is_left[:, None], sh / known, own.gaussians.sh.reshape(count, -1).numpy())
+            channel_sum = np.bincount(targets - first, row_weights * values[:, column], size)
+            sh[first:end, column] += channel_sum
+    has_weight = (new_weights > 0) & (old_weights > 0)
+    opacity_ratio = np.where(has_weight, new_weights / np.where(has_weight, old_weights, 1), 0)
+    safe_weights = np.where(has_weight, new_weights, 1)[:, None]
+    mean_sh = np.where(
+        has_weight[:, None], sh / safe_weights, level.gaussians.sh.reshape(count, -1).numpy()
+    )
     return replace(
-        own.gaussians,
-        opacities=own.gaussians.opacities * torch.from_numpy(left).clamp(max=1).float(),
-        sh=torch.from_numpy(mean.astype(np.float32)).reshape(own.gaussians.sh.shape),
+        level.gaussians,
+        opacities=level.gaussians.opacities * torch.from_numpy(opacity_ratio).clamp(max=1).float(),
+        sh=torch.from_numpy(mean_sh.astype(np.float32)).reshape(level.gaussians.sh.shape),
     )
 
 
 def keeps_levels(gaussians: Gaussians) -> bool:
-    """Whether levels lie in a file with these Gaussians."""
+    """Return True if levels lie in a file with these Gaussians."""
     is_known = memo_of(gaussians).known(_STORED)
     return is_known and levels_of(gaussians).levels[0].unchecked is not None
 
 
 def join_pieces(pieces: Iterable[Piece]) -> Piece:
-    """All pieces in memory."""
+    """Return all pieces as one, in memory."""
     gaussians, stands_for, keys = zip(*pieces, strict=True)
-    own = {name: torch.cat([getattr(g, name) for g in gaussians]) for name in _COLUMNS}
+    columns = {name: torch.cat([getattr(g, name) for g in gaussians]) for name in _COLUMNS}
     classes = [g.semantic for g in gaussians if g.semantic is not None]
-    joined = Gaussians(**own, semantic=torch.cat(classes) if classes else None)
+    joined = Gaussians(**columns, semantic=torch.cat(classes) if classes else None)
     return Piece(joined, np.concatenate(stands_for), np.concatenate(keys))
 
 
@@ -349,58 +455,69 @@ def build_levels(
     antialiased: bool = False,
     keep: Callable[[Iterable[Piece]], Piece] = join_pieces,
 ) -> Levels:
-    """The levels of one Gaussian or more. Level 0 is a copy, unless they lie square after square
-    already.
+    """Build the levels of one Gaussian or more.
 
-    antialiased: for a rasteriser whose blur takes no more of the image. keep: where a level lies.
+    Level 0 is a copy, unless the Gaussians lie square after square already.
+
+    Args:
+        gaussians: the Gaussians.
+        antialiased: if True, the levels are for a rasteriser whose blur covers no more of the
+            image.
+        keep: puts the pieces of a level where the level is to lie.
     """
-    own = rows_of(gaussians, slice(None))
-    finest_m, order, keys = square_order(own)
-    found = Piece(own, order.astype(np.int32), keys)
-    if not (np.diff(found.stands_for) == 1).all():
-        found = keep(
-            Piece(own.select(torch.from_numpy(order[rows])), *(v[rows] for v in found[1:]))
+    detached = rows_of(gaussians, slice(None))
+    finest_m, order, keys = square_order(detached)
+    piece = Piece(detached, order.astype(np.int32), keys)
+    if not (np.diff(piece.stands_for) == 1).all():
+        piece = keep(
+            Piece(detached.select(torch.from_numpy(order[rows])), *(v[rows] for v in piece[1:]))
             for rows in batches(len(order))
         )
-    levels = [level_of(found)]
+    levels = [level_of(piece)]
     while len(levels[-1].squares) > FEW_SQUARES and len(levels) <= MAX_LEVELS:
         cell_m = finest_m * 2.0 ** (len(levels) - 1)
-        found = keep(coarser(levels[-1], cell_m, antialiased=antialiased))
-        levels.append(level_of(found, levels[-1].squares))
+        piece = keep(coarser(levels[-1], cell_m, antialiased=antialiased))
+        levels.append(level_of(piece, levels[-1].squares))
     return Levels(finest_m, tuple(levels))
 
 
 def square_order(g: Gaussians) -> tuple[float, Int64[np.ndarray, "N"], Int64[np.ndarray, "N"]]:
-    """c_1; the splats square after square of level 0, neighbours together; their squares."""
+    """Return c_1, the order of the splats, and their squares.
+
+    In this order splats lie square after square of level 0, neighbours together.
+    """
     finest_m = finest_cell_m(g.means)
     side_m = finest_m * CELLS_ACROSS
     keys = square_keys(g.means, side_m)
     for rows in batches(len(keys)):
-        within = np.floor(g.means[rows].double().numpy() / (side_m / 32)).astype(np.int64) & 31
-        keys[rows] = (keys[rows] << 15) | _along_curve(within)
+        fine_cells = np.floor(g.means[rows].double().numpy() / (side_m / 32)).astype(np.int64) & 31
+        keys[rows] = (keys[rows] << 15) | _along_curve(fine_cells)
     order = np.argsort(keys, kind="stable")
     return finest_m, order, keys[order] >> 15
 
 
 def batches(count: int) -> Iterator[slice]:
+    """Return slices that cut `count` rows into runs of BATCH."""
     return (slice(first, min(first + BATCH, count)) for first in range(0, count, BATCH))
 
 
 def finest_cell_m(means: Float[Tensor, "N 3"]) -> float:
-    """c_1: by a sixteenth of the cells and all splats in them."""
+    """Return c_1, chosen by a sixteenth of the cells and all splats in them."""
     for cell_m in CELLS_M:
-        sampled = []
+        sampled_numbers = []
         for rows in batches(len(means)):
             numbers = _cells(means[rows], cell_m)
-            sampled.append(numbers[(numbers.astype(np.uint64) * _ODD) >> np.uint64(60) == 0])
-        numbers = np.concatenate(sampled)
+            sampled_numbers.append(
+                numbers[(numbers.astype(np.uint64) * _ODD) >> np.uint64(60) == 0]
+            )
+        numbers = np.concatenate(sampled_numbers)
         if len(np.unique(numbers)) <= MOST_LEFT * len(numbers):
             return cell_m
     return CELLS_M[-1]
 
 
 def square_keys(means: Float[Tensor, "N 3"], side_m: float) -> Int64[np.ndarray, "N"]:
-    """The square of each mean, along a Z-curve."""
+    """Return the square of each mean, as its number along a Z-curve."""
     keys = np.empty(len(means), np.int64)
     for rows in batches(len(means)):
         xy = np.floor(means[rows, :2].double().numpy() / side_m)
@@ -412,13 +529,13 @@ def square_keys(means: Float[Tensor, "N 3"], side_m: float) -> Int64[np.ndarray,
 
 
 def _cells(means: Float[Tensor, "N 3"], cell_m: float) -> Int64[np.ndarray, "N"]:
-    """The cell of each mean, along a Morton curve."""
+    """Return the cell of each mean, as its number along a Morton curve."""
     places = np.floor(means.double().numpy() / cell_m + OFF_GRID).astype(np.int64)
     return _along_curve(places & (_BIAS - 1))
 
 
 def _along_curve(places: Int64[np.ndarray, "N 3"]) -> Int64[np.ndarray, "N"]:
-    """Places of 21 bits along a Morton curve."""
+    """Return the numbers of cells along a Morton curve, from indices of 21 bits an axis."""
     bits = places.astype(np.uint64)
     for shift, mask in _SPREAD_BY_TWO:
         bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
@@ -426,106 +543,156 @@ def _along_curve(places: Int64[np.ndarray, "N 3"]) -> Int64[np.ndarray, "N"]:
     return (x | (y << np.uint64(1)) | (z << np.uint64(2))).astype(np.int64)
 
 
-def level_of(found: Piece, finer: Squares | None = None) -> Level:
-    """found: square after square. finer: of the level before; None for level 0."""
-    g = found.gaussians
-    firsts = np.flatnonzero(np.diff(found.keys, prepend=-1))
-    own, starts = found.keys[firsts], np.append(firsts, len(found.keys))
+def level_of(piece: Piece, finer: Squares | None = None) -> Level:
+    """Return one level.
+
+    Args:
+        piece: the level's splats, square after square.
+        finer: squares of the finer level; None at level 0.
+    """
+    g = piece.gaussians
+    firsts = np.flatnonzero(np.diff(piece.keys, prepend=-1))
+    keys = piece.keys[firsts]
+    starts = np.append(firsts, len(piece.keys))
     lows, highs, longest = Boxes.around(g, firsts)
     if finer is not None:
-        firsts = np.searchsorted(finer.keys >> 2, own)
+        firsts = np.searchsorted(finer.keys >> 2, keys)
         lows = np.minimum.reduceat(finer.lows, firsts)
         highs = np.maximum.reduceat(finer.highs, firsts)
     boxes = Boxes.around(g, np.arange(0, len(g), CELL))
     parents = np.full(len(g), -1, np.int32)
-    return Level(g, found.stands_for, Squares(own, starts, lows, highs, longest), boxes, parents)
+    return Level(g, piece.stands_for, Squares(keys, starts, lows, highs, longest), boxes, parents)
 
 
 def coarser(finer: Level, cell_m: float, *, antialiased: bool = False) -> Iterator[Piece]:
-    """The next level, a few squares at a time; `finer` learns its parents. cell_m: its cells."""
+    """Yield the next level, a few squares at a time, and note its splats as parents in `finer`.
+
+    Args:
+        finer: the level below.
+        cell_m: side of the next level's cells, metres.
+        antialiased: as for `build_levels`.
+    """
     keys = finer.squares.keys >> 2
     firsts = np.append(np.flatnonzero(np.diff(keys, prepend=-1)), len(keys))
     starts = finer.squares.starts[firsts]
     blur_m = 0.0 if antialiased else BLUR_CELLS * cell_m
-    first, count = 0, 0
-    while first < len(starts) - 1:
-        end = max(int(np.searchsorted(starts, starts[first] + BATCH, "right")) - 1, first + 1)
-        rows = slice(int(starts[first]), int(starts[end]))
-        squares = np.repeat(keys[firsts[first:end]], np.diff(starts[first : end + 1]))
-        merged, leads, into = merge_cells(rows_of(finer.gaussians, rows), squares, cell_m, blur_m)
-        finer.parents[rows] = np.where(into < 0, -1, into + count)
+    first_square = 0
+    count = 0
+    while first_square < len(starts) - 1:
+        end_square = max(
+            int(np.searchsorted(starts, starts[first_square] + BATCH, "right")) - 1,
+            first_square + 1,
+        )
+        rows = slice(int(starts[first_square]), int(starts[end_square]))
+        squares = np.repeat(
+            keys[firsts[first_square:end_square]], np.diff(starts[first_square : end_square + 1])
+        )
+        merged, leads, targets = merge_cells(
+            rows_of(finer.gaussians, rows), squares, cell_m, blur_m
+        )
+        finer.parents[rows] = np.where(targets < 0, -1, targets + count)
         count += len(leads)
         yield Piece(merged, finer.stands_for[rows][leads], squares[leads])
-        first = end
+        first_square = end_square
 
 
 def merge_cells(
     g: Gaussians, squares: Int64[np.ndarray, "N"], cell_m: float, blur_m: float
 ) -> tuple[Gaussians, Int64[np.ndarray, "M"], Int64[np.ndarray, "N"]]:
-    """The splats of each cell merged into one, square after square.
+    """Merge the splats of each cell into one, square after square.
 
-    squares [N]: the number of each splat's square, increasing. blur_m: standard deviation of the
-    rasteriser's blur. Splats that are too clear to be drawn are left out. Returns also the splat
-    that stands for each merged one, the heaviest of the class that weighs most; and which one each
-    is merged into, -1 for none.
+    Splats that are too transparent to be drawn are left out.
+
+    Args:
+        g: N splats.
+        squares: number of each splat's square, increasing.
+        cell_m: side of the cells, metres.
+        blur_m: standard deviation of the rasteriser's blur, metres.
+
+    Returns:
+        The M splats after merging; the row of `g` that stands for each (the heaviest one of the
+        class that weighs most); and the merged splat of each row of `g`, -1 for none.
     """
-    kept = np.flatnonzero(g.opacities.numpy() >= ALPHA_MIN)
-    longest, squares = g.scales.numpy().max(1)[kept], squares[kept]
-    cells, is_large = _cells(g.means, cell_m)[kept], longest > cell_m
-    wide = _cells(g.means, 2 * cell_m)[kept]
-    alike = _alike(g.sh.numpy()[kept, 0], longest > 2 * cell_m, wide, squares)
-    cells, is_large = np.where(alike, ~wide, cells), is_large & ~alike
-    order, begins = _grouped(is_large, cells, squares)
-    begins |= is_large[order]
-    order, starts = kept[order], np.flatnonzero(begins)
+    visible_rows = np.flatnonzero(g.opacities.numpy() >= ALPHA_MIN)
+    longest = g.scales.numpy().max(1)[visible_rows]
+    squares = squares[visible_rows]
+    cells = _cells(g.means, cell_m)[visible_rows]
+    is_large = longest > cell_m
+    wide_cells = _cells(g.means, 2 * cell_m)[visible_rows]
+    is_alike = _find_alike(g.sh.numpy()[visible_rows, 0], longest > 2 * cell_m, wide_cells, squares)
+    cells = np.where(is_alike, ~wide_cells, cells)
+    is_large = is_large & ~is_alike
+    order, is_first = _group_by_cell(is_large, cells, squares)
+    is_first |= is_large[order]
+    order = visible_rows[order]
+    starts = np.flatnonzero(is_first)
     counts = np.diff(starts, append=len(order))
-    leads, several = order[starts], counts > 1
-    into = np.full(len(g), -1)
-    into[order] = np.repeat(np.arange(len(starts)), counts)
-    at = np.flatnonzero(several)
-    if not len(at):
-        return g.select(torch.from_numpy(leads)), leads, into
-    rows = order[np.repeat(several, counts)]
-    firsts = np.cumsum(counts[at]) - counts[at]
+    leads = order[starts]
+    is_merged = counts > 1
+    targets = np.full(len(g), -1)
+    targets[order] = np.repeat(np.arange(len(starts)), counts)
+    merged_indices = np.flatnonzero(is_merged)
+    if not len(merged_indices):
+        return g.select(torch.from_numpy(leads)), leads, targets
+    rows = order[np.repeat(is_merged, counts)]
+    firsts = np.cumsum(counts[merged_indices]) - counts[merged_indices]
     merged, heaviest = merge_groups(g.select(torch.from_numpy(rows)), firsts, blur_m)
-    leads[at] = rows[heaviest]
+    leads[merged_indices] = rows[heaviest]
     out = g.select(torch.from_numpy(leads))
     for name in _COLUMNS:
-        getattr(out, name)[torch.from_numpy(at)] = getattr(merged, name).to(g.means.dtype)
-    return out, leads, into
+        getattr(out, name)[torch.from_numpy(merged_indices)] = getattr(merged, name).to(
+            g.means.dtype
+        )
+    return out, leads, targets
 
 
-def _grouped(is_apart: np.ndarray, cells: np.ndarray, squares: np.ndarray) -> tuple:
-    """An order in which the splats of a square's cell stand together, and where such groups begin;
-    those that stand apart are not among them.
+def _group_by_cell(is_separate: np.ndarray, cells: np.ndarray, squares: np.ndarray) -> tuple:
+    """Return an order in which the splats of a square's cell stand together, and a mask of the
+    first splat of each group in that order.
+
+    Splats of `is_separate` form no group with others.
     """
-    order = np.lexsort((is_apart, cells, squares))
-    begins = np.ones(len(order), bool)
-    begins[1:] = np.diff(is_apart[order]) != 0
+    order = np.lexsort((is_separate, cells, squares))
+    is_first = np.ones(len(order), bool)
+    is_first[1:] = np.diff(is_separate[order]) != 0
     for column in (cells, squares):
-        begins[1:] |= np.diff(column[order]) != 0
-    return order, begins
+        is_first[1:] |= np.diff(column[order]) != 0
+    return order, is_first
 
 
-def _alike(
+def _find_alike(
     sh: Float[np.ndarray, "N 3"], is_large: np.ndarray, cells: np.ndarray, squares: np.ndarray
 ) -> Bool[np.ndarray, "N"]:
-    """Which splats share a cell with others, all of nearly one colour. sh: of degree 0."""
-    order, begins = _grouped(is_large, cells, squares)
-    starts = np.flatnonzero(begins)
+    """Return the mask of splats that share a cell with others, all of nearly one colour.
+
+    Args:
+        sh: coefficients of degree 0.
+        is_large: splats that are merged with none.
+        cells: cell of each splat.
+        squares: square of each splat.
+    """
+    order, is_first = _group_by_cell(is_large, cells, squares)
+    starts = np.flatnonzero(is_first)
     counts = np.diff(starts, append=len(order))
     lows, highs = (f.reduceat(sh[order], starts) for f in (np.minimum, np.maximum))
-    is_one = (SH_C0 * (highs - lows).max(1) <= ALIKE) & (counts > 1)
-    found = np.zeros(len(order), bool)
-    found[order] = np.repeat(is_one, counts)
-    return found & ~is_large
+    has_one_color = (SH_C0 * (highs - lows).max(1) <= ALIKE) & (counts > 1)
+    is_alike = np.zeros(len(order), bool)
+    is_alike[order] = np.repeat(has_one_color, counts)
+    return is_alike & ~is_large
 
 
 def merge_groups(
     g: Gaussians, firsts: Int64[np.ndarray, "M"], blur_m: float
 ) -> tuple[Gaussians, Int64[np.ndarray, "M"]]:
-    """One Gaussian for each group of rows, float64, and the row that stands for it. firsts: the
-    first row of each group.
+    """Merge each group of rows into one Gaussian of float64.
+
+    Args:
+        g: the splats, group after group.
+        firsts: first row of each of the M groups.
+        blur_m: standard deviation of the rasteriser's blur, metres.
+
+    Returns:
+        The M Gaussians, and the row that stands for each.
     """
     groups = np.repeat(np.arange(len(firsts)), np.diff(firsts, append=len(g)))
     a, b, c = (scales := g.scales.double().numpy()).T
@@ -538,71 +705,85 @@ def merge_groups(
 
     means = g.means.double().numpy()
     centres = mean(means)
-    off = means - centres[groups]
-    halves = rotmat_from_quat(g.quats.double()).numpy() * scales[:, None]
-    own = halves @ halves.transpose(0, 2, 1)
-    variances, axes = np.linalg.eigh(mean(own + off[:, :, None] * off[:, None]))
+    offsets = means - centres[groups]
+    half_axes = rotmat_from_quat(g.quats.double()).numpy() * scales[:, None]
+    covariances = half_axes @ half_axes.transpose(0, 2, 1)
+    variances, axes = np.linalg.eigh(mean(covariances + offsets[:, :, None] * offsets[:, None]))
     axes[np.linalg.det(axes) < 0, :, 0] *= -1
-    # The plane that the group lies in, its deviations as units.
+    # Axes of the plane that the group lies in, in units of its standard deviations.
     units = np.sqrt(np.maximum(variances[:, 1:], THINNEST_M**2) + blur_m**2)
     plane = (axes[:, :, 1:] / units[:, None])[groups]
-    flat = plane.transpose(0, 2, 1) @ own @ plane
-    flat[:, [0, 1], [0, 1]] += (blur_m / units[groups]) ** 2
-    covered = np.empty(len(firsts))
+    plane_covariances = plane.transpose(0, 2, 1) @ covariances @ plane
+    plane_covariances[:, [0, 1], [0, 1]] += (blur_m / units[groups]) ** 2
+    covered_areas = np.empty(len(firsts))
     with kernel_threads():
         kernels.covered_plane(
-            *(np.append(firsts, len(g)), opacities, (off[:, None] @ plane)[:, 0], flat, covered)
+            np.append(firsts, len(g)),
+            opacities,
+            (offsets[:, None] @ plane)[:, 0],
+            plane_covariances,
+            covered_areas,
         )
-    ratio = covered / (2 * math.pi)  # of what a Gaussian of opacity 1 covers
-    flat_top = np.exp(np.minimum(ratio, FLAT_TOP) - 1)
-    variances[:, 1:] += (np.maximum(ratio / FLAT_TOP, 1) - 1)[:, None] * units**2
+    area_ratio = covered_areas / (2 * math.pi)  # of what a Gaussian of opacity 1 covers
+    flat_top = np.exp(np.minimum(area_ratio, FLAT_TOP) - 1)
+    variances[:, 1:] += (np.maximum(area_ratio / FLAT_TOP, 1) - 1)[:, None] * units**2
     merged = (
         centres,
         quat_from_rotmat(torch.from_numpy(axes)).numpy(),
         np.sqrt(np.maximum(variances, THINNEST_M**2)),
-        np.where(ratio <= 1, ratio, flat_top),
+        np.where(area_ratio <= 1, area_ratio, flat_top),
         mean(g.sh.double().numpy()),
     )
-    return Gaussians(*map(torch.from_numpy, merged)), _heaviest(g, weights, groups)
+    return Gaussians(*map(torch.from_numpy, merged)), _find_heaviest(g, weights, groups)
 
 
-def _heaviest(g: Gaussians, weights: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """The heaviest row of the heaviest class of each group."""
+def _find_heaviest(g: Gaussians, weights: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Return the heaviest row of the heaviest class of each group."""
     classes = np.zeros(len(g), np.int16) if g.semantic is None else g.semantic.numpy()
     order = np.lexsort((-weights, classes, groups))
-    group, kind = groups[order], classes[order]
-    runs = np.flatnonzero(
-        (np.diff(group, prepend=-1) != 0) | (np.diff(kind, prepend=kind[:1]) != 0)
+    sorted_groups = groups[order]
+    sorted_classes = classes[order]
+    run_starts = np.flatnonzero(
+        (np.diff(sorted_groups, prepend=-1) != 0)
+        | (np.diff(sorted_classes, prepend=sorted_classes[:1]) != 0)
     )
-    sums = np.add.reduceat(weights[order], runs)
-    best = np.lexsort((-sums, group[runs]))
-    return order[runs[best[np.flatnonzero(np.diff(group[runs][best], prepend=-1))]]]
+    run_weights = np.add.reduceat(weights[order], run_starts)
+    run_order = np.lexsort((-run_weights, sorted_groups[run_starts]))
+    return order[
+        run_starts[
+            run_order[np.flatnonzero(np.diff(sorted_groups[run_starts][run_order], prepend=-1))]
+        ]
+    ]
 
 
-# ---- Which of them a camera takes ----------------------------------------------------------------
+# ---- The choice of levels for a camera -----------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """Parts to draw in place of `parts`. pieces: of each, what its splats stand for among those of
-    all parts: a first number, and numbers that are added to it (None: 0, 1, ...).
-    """
+    """Parts to draw in place of other parts."""
 
     parts: tuple[PosedGaussians, ...]
+    """The parts to draw."""
     pieces: tuple[tuple[int, Int32[np.ndarray, "_"] | None], ...]
+    """For each part, the splats of the replaced parts that its splats stand for: a first number,
+    and numbers that are added to it (None: 0, 1, ...)."""
 
-    def restore_ids(self, drawn: RenderOutput) -> RenderOutput:
-        """The buffers with splat_ids that count through the parts which these stand for."""
-        if drawn.splat_ids is None:
-            return drawn
-        ids = drawn.splat_ids.cpu().numpy()
+    def restore_ids(self, raster: RenderOutput) -> RenderOutput:
+        """Return the buffers with splat_ids that count through the replaced parts."""
+        if raster.splat_ids is None:
+            return raster
+        ids = raster.splat_ids.cpu().numpy()
         starts = np.cumsum([0, *(len(part.gaussians) for part in self.parts)])
-        pieces, found = np.searchsorted(starts, ids, "right") - 1, np.full_like(ids, -1)
+        piece_numbers = np.searchsorted(starts, ids, "right") - 1
+        restored_ids = np.full_like(ids, -1)
         for number, (first, stands_for) in enumerate(self.pieces):
-            shown = pieces == number
-            own = ids[shown] - starts[number]
-            found[shown] = first + (own if stands_for is None else stands_for[own])
-        return replace(drawn, **{SPLAT_IDS: torch.from_numpy(found).to(drawn.splat_ids)})
+            is_of_piece = piece_numbers == number
+            local_ids = ids[is_of_piece] - starts[number]
+            restored_ids[is_of_piece] = first + (
+                local_ids if stands_for is None else stands_for[local_ids]
+            )
+        return replace(raster, **{SPLAT_IDS: torch.from_numpy(restored_ids).to(raster.splat_ids)})
 
 
 def choose_parts(
@@ -614,62 +795,88 @@ def choose_parts(
     *,
     whole: bool = True,
 ) -> Chosen:
-    """What the camera takes of large backgrounds at settings.lod_px, and all other parts.
+    """Return the parts that a camera needs of large backgrounds, and all other parts.
 
-    whole: take levels whole, and say which rows are drawn; else a part for every run of rows.
+    Args:
+        parts: the parts of the scene.
+        camera: the view.
+        settings: the rasteriser's settings, with lod_px > 0.
+        fog: hides what is far away; None for clear air.
+        clip: the level plane and the side of it that is drawn; None for both sides.
+        whole: if True, take levels whole and name the rows to draw; else make a part of every run
+            of rows.
     """
-    chosen, pieces, first = list[PosedGaussians](), list[tuple[int, np.ndarray | None]](), 0
+    chosen_parts = list[PosedGaussians]()
+    stood_for = list[tuple[int, np.ndarray | None]]()
+    first_splat = 0
     for part in parts:
-        own = [(part, None)]
+        replacements = [(part, None)]
         if has_levels(part):
             levels = levels_of(part.gaussians, antialiased=settings.antialiased)
-            taken = [*_taken(levels, part, camera, settings, fog, clip)]
-            if _is_merged(levels, taken):
-                own = (piece for t in taken for piece in _pieces(t, part, whole=whole))
-        for piece, stands_for in own:
-            chosen.append(piece)
-            pieces.append((first, stands_for))
-        first += len(part.gaussians)
-    if not chosen:  # a rasteriser wants to know at least the parts' type
-        nothing = rows_of(parts[0].gaussians, slice(0))
-        chosen.append(replace(parts[0], gaussians=nothing, color_maps=None, color_rows=None))
-        pieces.append((0, None))
-    return Chosen(tuple(chosen), tuple(pieces))
+            taken_runs = [*_select_runs(levels, part, camera, settings, fog, clip)]
+            if _is_merged(levels, taken_runs):
+                replacements = (
+                    piece for t in taken_runs for piece in _pieces(t, part, is_whole=whole)
+                )
+        for piece, stands_for in replacements:
+            chosen_parts.append(piece)
+            stood_for.append((first_splat, stands_for))
+        first_splat += len(part.gaussians)
+    if not chosen_parts:  # a rasteriser wants to know at least the parts' type
+        no_gaussians = rows_of(parts[0].gaussians, slice(0))
+        chosen_parts.append(
+            replace(parts[0], gaussians=no_gaussians, color_maps=None, color_rows=None)
+        )
+        stood_for.append((0, None))
+    return Chosen(tuple(chosen_parts), tuple(stood_for))
 
 
 def has_levels(part: PosedGaussians) -> bool:
-    """Whether a part is drawn in levels: actors and what lies on the scene are not."""
+    """Return True if a part is drawn in levels.
+
+    Actors and what lies on the scene are not, nor are small parts.
+    """
     is_plain = part.instance_id == 0 and not part.is_overlay and part.shading is None
     g = part.gaussians
     return is_plain and len(g) >= MIN_SPLATS and g.means.device.type == "cpu"
 
 
-class _Taken(NamedTuple):
-    """Runs of a level's splats, [R, 2], and the share of each, [R]."""
+class _LevelRuns(NamedTuple):
+    """Runs of one level's splats that a camera takes."""
 
     level: Level
+    """The level."""
     rows: Int64[np.ndarray, "R 2"]
+    """Runs (first, last + 1)."""
     shares: Float[np.ndarray, "R"]
+    """Share of each run, 0 to 1."""
 
 
-def _is_merged(levels: Levels, taken: Sequence[_Taken]) -> bool:
-    """Whether levels are drawn: where all splats are those of level 0, the part is as it is."""
-    is_open = levels.levels[0].unchecked is None
-    return not is_open or any(t.level is not levels.levels[0] for t in taken)
+def _is_merged(levels: Levels, level_runs: Sequence[_LevelRuns]) -> bool:
+    """Return True if merged splats are drawn.
+
+    Where all splats are those of level 0, the part stays as it is.
+    """
+    is_checked = levels.levels[0].unchecked is None
+    return not is_checked or any(runs.level is not levels.levels[0] for runs in level_runs)
 
 
 def _pieces(
-    taken: _Taken, part: PosedGaussians, *, whole: bool
+    runs: _LevelRuns, part: PosedGaussians, *, is_whole: bool
 ) -> Iterator[tuple[PosedGaussians, np.ndarray]]:
-    level, is_faded = taken.level, taken.shares < 1
-    is_small = len(level.gaussians) <= BATCH  # then a copy costs less than another part
-    for chosen in [np.ones_like(is_faded)] if is_small else [~is_faded, is_faded]:
-        rows, shares, g = taken.rows[chosen], taken.shares[chosen], level.gaussians
+    """Yield the parts of one level's runs, each with the numbers that its splats stand for."""
+    level = runs.level
+    is_faded = runs.shares < 1
+    is_small = len(level.gaussians) <= BATCH  # then a copy costs less than a second part
+    for is_chosen in [np.ones_like(is_faded)] if is_small else [~is_faded, is_faded]:
+        rows = runs.rows[is_chosen]
+        shares = runs.shares[is_chosen]
+        g = level.gaussians
         if not len(rows):
             continue
         if shares.min() < 1:
-            own = g.opacities.numpy()  # NumPy wakes no threads
-            opacities = torch.from_numpy(own.copy() if is_small else np.empty_like(own))
+            run_rows = g.opacities.numpy()  # NumPy wakes no threads
+            opacities = torch.from_numpy(run_rows.copy() if is_small else np.empty_like(run_rows))
             for (first, last), share in zip(rows.tolist(), shares.tolist(), strict=True):
                 if share < 1:
                     opacities[first:last] = faded(g.opacities[first:last], share)
@@ -677,80 +884,107 @@ def _pieces(
         color_rows = None
         if part.color_rows is not None:
             color_rows = torch.empty(len(g), dtype=torch.int16)
-            for own in itertools.starmap(slice, rows.tolist()):
-                color_rows[own] = part.color_rows[torch.from_numpy(level.stands_for[own]).long()]
+            for run_rows in itertools.starmap(slice, rows.tolist()):
+                color_rows[run_rows] = part.color_rows[
+                    torch.from_numpy(level.stands_for[run_rows]).long()
+                ]
         piece = replace(part, gaussians=g, color_rows=color_rows, rows=rows)
-        if whole:
+        if is_whole:
             yield piece, level.stands_for
             continue
-        for own in itertools.starmap(slice, rows.tolist()):
-            of_run = None if color_rows is None else color_rows[own]
-            run = replace(piece, gaussians=rows_of(g, own), color_rows=of_run, rows=None)
-            yield run, level.stands_for[own]
+        for run_rows in itertools.starmap(slice, rows.tolist()):
+            run_color_rows = None if color_rows is None else color_rows[run_rows]
+            run_part = replace(
+                piece, gaussians=rows_of(g, run_rows), color_rows=run_color_rows, rows=None
+            )
+            yield run_part, level.stands_for[run_rows]
 
 
 def faded(opacities: Float[Tensor, "N"], share: float) -> Float[Tensor, "N"]:
-    """Of splats that are drawn for a share of what they hide."""
-    own = opacities.numpy()
-    low = np.clip(own, 1e-6, 0.99)  # flat tops, which have more, fade in proportion
-    return torch.from_numpy(own * (-np.expm1(share * np.log1p(-low)) / low))
+    """Return the opacities of splats that are drawn for a share of what they hide.
+
+    Args:
+        opacities: opacities of the splats.
+        share: 0 to 1.
+    """
+    values = opacities.numpy()
+    clipped = np.clip(values, 1e-6, 0.99)  # flat tops, which have more, fade in proportion
+    return torch.from_numpy(values * (-np.expm1(share * np.log1p(-clipped)) / clipped))
 
 
-def _taken(
+def _select_runs(
     levels: Levels,
     part: PosedGaussians,
     camera: Camera,
     settings: RasterSettings,
     fog: Fog | None,
     clip: HeightClip | None,
-) -> Iterator[_Taken]:
-    """Of each level, what may be seen of the squares that the camera takes."""
+) -> Iterator[_LevelRuns]:
+    """Yield, for each level, the runs of splats that may be seen in squares that the camera
+    takes.
+    """
     pose = None if part.world_from_part is None else part.world_from_part.numpy()
     tree = levels.tree
-    taken, shares = squares_taken(levels, part, camera, settings)
-    if len(taken) > FEW_TESTED:
-        seen = may_be_drawn(tree.boxes.bounds(taken), pose, camera, settings, fog, clip)
-        taken, shares = taken[seen], shares[seen]
-    low = tree.firsts[taken] // CELL
-    counts = -(-tree.ends[taken] // CELL) - low
-    owner = np.repeat(np.arange(len(taken)), counts)
-    cells = np.arange(len(owner)) + (low - counts.cumsum() + counts)[owner]
-    inside = tree.cells.bounds(cells + tree.cell_starts[tree.numbers[taken]][owner])
-    seen = may_be_drawn(inside, pose, camera, settings, fog, clip)
-    cells, owner = cells[seen], owner[seen]
-    square = taken[owner]
-    first = np.maximum(tree.firsts[square], cells * CELL)
-    end = np.minimum(tree.ends[square], (cells + 1) * CELL)
-    begins = np.ones(len(first), bool)
-    begins[1:] = (first[1:] != end[:-1]) | (np.diff(shares[owner]) != 0)
-    begins[1:] |= np.diff(tree.numbers[square]) != 0
-    heads = np.flatnonzero(begins)
-    rows = np.stack([first[heads], end[np.append(heads[1:], len(first))[: len(heads)] - 1]], 1)
-    number_of, share_of = tree.numbers[square[heads]], shares[owner[heads]]
+    squares, shares = squares_taken(levels, part, camera, settings)
+    if len(squares) > FEW_TESTED:
+        may_be_seen = may_be_drawn(tree.boxes.bounds(squares), pose, camera, settings, fog, clip)
+        squares = squares[may_be_seen]
+        shares = shares[may_be_seen]
+    first_cells = tree.firsts[squares] // CELL
+    num_cells = -(-tree.ends[squares] // CELL) - first_cells
+    square_of_cell = np.repeat(np.arange(len(squares)), num_cells)
+    cells = (
+        np.arange(len(square_of_cell))
+        + (first_cells - num_cells.cumsum() + num_cells)[square_of_cell]
+    )
+    cell_bounds = tree.cells.bounds(cells + tree.cell_starts[tree.numbers[squares]][square_of_cell])
+    may_be_seen = may_be_drawn(cell_bounds, pose, camera, settings, fog, clip)
+    cells = cells[may_be_seen]
+    square_of_cell = square_of_cell[may_be_seen]
+    square = squares[square_of_cell]
+    firsts = np.maximum(tree.firsts[square], cells * CELL)
+    ends = np.minimum(tree.ends[square], (cells + 1) * CELL)
+    is_first = np.ones(len(firsts), bool)
+    is_first[1:] = (firsts[1:] != ends[:-1]) | (np.diff(shares[square_of_cell]) != 0)
+    is_first[1:] |= np.diff(tree.numbers[square]) != 0
+    run_starts = np.flatnonzero(is_first)
+    rows = np.stack(
+        [firsts[run_starts], ends[np.append(run_starts[1:], len(firsts))[: len(run_starts)] - 1]], 1
+    )
+    run_levels = tree.numbers[square[run_starts]]
+    run_shares = shares[square_of_cell[run_starts]]
     for number, level in enumerate(levels.levels):
-        own = number_of == number
-        if own.any():
+        is_of_level = run_levels == number
+        if is_of_level.any():
             level.check(cells[tree.numbers[square] == number])
-            yield _Taken(level, rows[own], share_of[own])
+            yield _LevelRuns(level, rows[is_of_level], run_shares[is_of_level])
 
 
 def squares_taken(
     levels: Levels, part: PosedGaussians, camera: Camera, settings: RasterSettings
 ) -> tuple[Int64[np.ndarray, "T"], Float[np.ndarray, "T"]]:
-    """The tree's squares that the camera takes, wherever it looks, and their shares."""
+    """Return the tree's squares that a camera takes, wherever it looks, and their shares.
+
+    Args:
+        levels: levels of the part.
+        part: the part, for its pose.
+        camera: the view.
+        settings: the rasteriser's settings, with lod_px > 0.
+    """
     eye_m = camera.centre.numpy()
     if part.world_from_part is not None:
         eye_m = np.linalg.solve(part.world_from_part.numpy(), np.append(eye_m, 1.0))[:3]
     tree = levels.tree
     cell_px = max(camera.fx, camera.fy) * tree.cells_m / settings.lod_px
     if camera.is_orthographic:
-        refined = (cell_px > 1).astype(np.float64)
+        refined_share = (cell_px > 1).astype(np.float64)
     else:
-        beside_m = np.maximum(tree.boxes.lows - eye_m, eye_m - tree.boxes.highs)
-        away_m = np.linalg.norm(np.maximum(beside_m, 0), axis=1)
-        refined = np.clip((1 + BAND - away_m / np.maximum(cell_px, 1e-9)) / BAND, 0, 1)
-    refined[tree.numbers == 0] = 0
-    # Whatever holds a square that is refined at all is refined wholly: d_k doubles.
-    shares = (1 - refined) * np.append(refined, 1)[tree.parents]
-    taken = np.flatnonzero(shares > 0)
-    return taken, shares[taken]
+        axis_distances_m = np.maximum(tree.boxes.lows - eye_m, eye_m - tree.boxes.highs)
+        distance_m = np.linalg.norm(np.maximum(axis_distances_m, 0), axis=1)
+        refined_share = np.clip((1 + BAND - distance_m / np.maximum(cell_px, 1e-9)) / BAND, 0, 1)
+    refined_share[tree.numbers == 0] = 0
+    # A square that holds a partly refined one is refined wholly, because d_k doubles from level to
+    # level.
+    shares = (1 - refined_share) * np.append(refined_share, 1)[tree.parents]
+    squares = np.flatnonzero(shares > 0)
+    return squares, shares[squares]

@@ -1,9 +1,9 @@
-"""What has been worked out once for a scene, or for another object that cannot change.
+"""Memo of values that are computed once for a scene, or for another object that cannot change.
 
-`memo_of(scene).get(key, make)` makes a value at its first use and keeps it while its owner lives,
-at most MAX_BYTES an owner beside the largest value: those unused for longest go first. Values that
-a job's worker processes need, too, are `put` with `shared=True`: `shared()` gives them, `update`
-takes them over.
+`memo_of(scene).get(key, make)` makes a value at its first use and keeps it while its owner lives.
+An owner keeps at most MAX_BYTES beside its largest value; values that have not been used for
+longest go first. Values that a job's worker processes also need are `put` with `shared=True`:
+`shared()` returns them, and `update` takes them over.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from torch import Tensor
 
+# Bytes that an owner keeps, beside its largest value.
 MAX_BYTES = 1 << 29
 Value = TypeVar("Value")
 
@@ -26,11 +27,16 @@ Value = TypeVar("Value")
 class Stored(Protocol):
     """A value that lies in a file, in place of the value itself; picklable."""
 
-    def load(self) -> Any: ...
+    def load(self) -> Any:
+        """Return the value."""
+        ...
 
 
 class SceneMemo:
-    """Values by key, of one owner. Threads may share it: one makes a value, the others wait."""
+    """Values of one owner, by key.
+
+    Threads may share a memo: one makes a value, the others wait for it.
+    """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
         self._max_bytes = max_bytes
@@ -38,37 +44,47 @@ class SceneMemo:
         self._sizes: dict[Hashable, int] = {}
         self._shared: dict[Hashable, Any] = {}
         self._lock = threading.Lock()
-        self._making: dict[Hashable, threading.RLock] = {}  # keys hold objects: only while made
+        self._making: dict[
+            Hashable, threading.RLock
+        ] = {}  # only while made, since keys hold objects
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """The key's value; made, and kept, where it is not known. It must not refer to its owner,
-        which it would keep alive.
+        """Return the key's value; make and keep it where it is not known.
+
+        Args:
+            key: the key.
+            make: makes the value, which must not refer to its owner: it would keep the owner alive.
         """
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)
                 return self._values[key]
-            making = self._making.setdefault(key, threading.RLock())
-        with making:
+            key_lock = self._making.setdefault(key, threading.RLock())
+        with key_lock:
             with self._lock:
                 if key in self._values:  # made while this thread waited
                     return self._values[key]
-                given = self._shared.get(key)
+                shared_value = self._shared.get(key)
             try:
-                value = given.load() if isinstance(given, Stored) else given
+                value = shared_value.load() if isinstance(shared_value, Stored) else shared_value
                 return self._keep(key, make() if value is None else value)
             finally:
                 with self._lock:
                     self._making.pop(key, None)
 
     def known(self, key: Hashable) -> bool:
-        """Whether `get` would make nothing."""
+        """Return True if `get` would make nothing."""
         with self._lock:
             return key in self._values or key in self._shared
 
     def put(self, key: Hashable, value: Any, *, shared: bool = False) -> None:
-        """Keep a value in place of what the key had. shared: hand it, or the file it is Stored in,
-        to worker processes; it is kept whatever its size.
+        """Keep a value in place of the key's earlier one.
+
+        Args:
+            key: the key.
+            value: the value, or a Stored that loads it.
+            shared: if True, hand the value, or the file it is Stored in, to worker processes; it is
+                kept whatever its size.
         """
         with self._lock:
             self._values.pop(key, None)
@@ -78,48 +94,57 @@ class SceneMemo:
             self._keep(key, value)
 
     def shared(self) -> dict[Hashable, Any]:
-        """What was put as shared; picklable if its values are."""
+        """Return the values that were put as shared; picklable if the values are."""
         with self._lock:
             return dict(self._shared)
 
     def update(self, shared: Mapping[Hashable, Any]) -> None:
-        """Take over what another process's memo shares."""
+        """Take over the values that another process's memo shares."""
         for key, value in shared.items():
             self.put(key, value, shared=True)
 
     def _keep(self, key: Hashable, value: Value) -> Value:
+        """Keep a value, and drop unused values beyond the limit."""
         size = size_of(value)
         with self._lock:
-            self._values[key], self._sizes[key] = value, size
+            self._values[key] = value
+            self._sizes[key] = size
             self._values.move_to_end(key)
             sizes = {k: self._sizes[k] for k in self._values}
-            # The largest counts nothing: one that is beyond the limit would drive out all others,
-            # and they it, frame after frame.
-            left = sum(sizes.values()) - max(sizes.values()) - self._max_bytes
-            for old in [k for k, bytes_ in sizes.items() if bytes_ and k != key]:
-                if left <= 0:
+            # The largest value is not counted: one beyond the limit would drive out all others, and
+            # they would drive it out, frame after frame.
+            excess_bytes = sum(sizes.values()) - max(sizes.values()) - self._max_bytes
+            for old_key in [k for k, num_bytes in sizes.items() if num_bytes and k != key]:
+                if excess_bytes <= 0:
                     break
-                del self._values[old]
-                left -= self._sizes.pop(old)
+                del self._values[old_key]
+                excess_bytes -= self._sizes.pop(old_key)
         return value
 
 
 class Latest:
-    """The value of the last key that was asked for. Threads may share it: one makes the value."""
+    """The value of the last key that was asked for.
+
+    Threads may share it: one makes the value.
+    """
 
     def __init__(self) -> None:
-        self._kept: tuple[Hashable, Any] | None = None
+        self._entry: tuple[Hashable, Any] | None = None
         self._making = threading.Lock()
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
+        """Return the key's value; make it where another key was the last."""
         with self._making:
-            if self._kept is None or self._kept[0] != key:
-                self._kept = key, make()
-            return self._kept[1]
+            if self._entry is None or self._entry[0] != key:
+                self._entry = key, make()
+            return self._entry[1]
 
 
 def memo_of(owner: Any) -> SceneMemo:
-    """The memo of a scene, or of any object that is hashed by identity; it goes when that goes."""
+    """Return the memo of a scene, or of any object that is hashed by identity.
+
+    It goes when its owner goes.
+    """
     with _lock:
         memo = _memos.get(owner)
         if memo is None:
@@ -132,8 +157,9 @@ _lock = threading.Lock()
 
 
 def size_of(value: Any) -> int:
-    """Bytes of the arrays and tensors in a value: in records, tuples and mappings, too. One that
-    holds what is its owner's says what it adds to that by an attribute `own_bytes`.
+    """Return the bytes of arrays and tensors in a value, also inside records, tuples and mappings.
+
+    A value that holds parts of its owner states in an attribute `own_bytes` what it adds to them.
     """
     own_bytes = getattr(value, "own_bytes", None)
     if isinstance(own_bytes, int):

@@ -1,7 +1,9 @@
-"""Recipe + scene -> exactly the passes and buffers that the picture requires, before rendering.
+"""Plan of the passes and buffers that a picture requires, made before rendering.
 
-A plan is made of plain facts, so it can be printed, compared and tested. `plan_view` leaves out
-what one camera cannot see, without changing a bit of what is written; `views` carries it out.
+In: a recipe and a scene. Out: a `Plan` for all views, and for each camera a `ViewPlan` that leaves
+out what the camera cannot see, without changing a bit of what is written. Both are made of plain
+facts, so they can be printed, compared and tested. `augment.views` carries them out; `climategs
+explain` prints their steps.
 """
 
 from __future__ import annotations
@@ -24,63 +26,84 @@ from augment.scene import Scene
 from recipes.errors import RecipeError
 from recipes.schema import Recipe, Sensor
 
-LENS, NOISE = "lens blur", "sensor noise"  # the last passes of all
-BARE = "bare surface"  # the pass that draws the scene without what lies on it
+# Name of the pass that blurs the finished picture as a lens does.
+LENS = "lens blur"
+# Name of the pass that adds sensor noise, the last one of all.
+NOISE = "sensor noise"
+# Name of the pass that renders the scene without what lies on it.
+BARE = "bare surface"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What rendering one view under a recipe takes.
-
-    placed: every effect in the scene, by name. buffers: asked of the rasteriser, by all effects
-    together; image_buffers: of them, those for the picture, the images and the boxes. bare_buffers:
-    what depth, semantic and instance images take from a render of the scene without what lies on
-    it; empty where they show it. depth_buffer: written as depth. shows_first: these images show
-    what a ray meets first, such as water, not the scene under it. finds_boxes: labels or instance
-    images need the depth of the solid surfaces. recorded_exposure: cameras' colour maps apply to
-    the finished picture. on_photo: the recorded image stays the picture, and the scene supplies the
-    weather. sensor, seed: of the recipe. steps: every pass considered, in order.
-    """
+    """Passes and buffers of one recipe in one scene, for all views."""
 
     placed: Mapping[str, Placed]
+    """Plan of every effect in the scene, by effect name."""
     settings: RasterSettings
+    """Settings of the rasteriser."""
     prune: float
+    """Share of white by which a recorded view may change when splats are left out
+    (`augment.prune`); 0 leaves none out."""
     buffers: frozenset[str]
+    """Buffers that the rasteriser computes, for all effects together."""
     image_buffers: frozenset[str]
+    """Those of `buffers` that the picture, the images and the boxes need."""
     bare_buffers: frozenset[str]
+    """Buffers of the scene without what lies on it, for depth, semantic and instance images; empty
+    where these show what lies on it."""
     depth_buffer: str | None
+    """Name of the buffer that is written as depth; None without a depth image."""
     semantic: bool
+    """If True, a semantic image is written."""
     instance: bool
+    """If True, an instance image is written."""
     shows_first: bool
+    """If True, those images show the first thing that a ray meets, such as water; else the scene
+    under it."""
     finds_boxes: bool
+    """If True, labels or instance images need the depth of the solid surfaces."""
     recorded_exposure: bool
+    """If True, the cameras' colour maps are applied to the finished picture."""
     on_photo: bool
+    """If True, the recorded image stays the picture, and the scene supplies the weather."""
     sensor: Sensor
+    """Lens and sensor of the recipe."""
     seed: int
+    """Seed of the recipe."""
     steps: tuple[Step, ...]
+    """Every pass considered, in order."""
 
     @property
     def water_level_z_m(self) -> float | None:
-        """Of water that is drawn, scene world."""
+        """Return the height of the water that is drawn, scene world; None without water."""
         levels = (p.water_level_z_m for p in self.placed.values() if p.data is not None)
         return next((level for level in levels if level is not None), None)
 
     def active(self, scene: Scene, *, backend: str = AUTO) -> tuple[Active, ...]:
-        """The effects that change anything, in the order in which they are applied."""
-        found: tuple[Active, ...] = ()
+        """Return the effects that change anything, in the order in which they are applied.
+
+        Args:
+            scene: the scene.
+            backend: the rasteriser's backend.
+        """
+        active_effects: tuple[Active, ...] = ()
         for effect in effects.EFFECTS:
             data = self.placed[effect.name].data
             if data is not None:
-                found = (*found, Active(effect, data, scene, backend, found))
-        return found
+                active_effects = (
+                    *active_effects,
+                    Active(effect, data, scene, backend, active_effects),
+                )
+        return active_effects
 
     def without(self, names: Iterable[str]) -> Plan:
-        """The plan as if these effects changed nothing."""
-        left_out = {name: replace(self.placed[name], data=None) for name in names}
-        return replace(self, placed={**self.placed, **left_out})
+        """Return the plan as if the named effects changed nothing."""
+        idle_plans = {name: replace(self.placed[name], data=None) for name in names}
+        return replace(self, placed={**self.placed, **idle_plans})
 
     def as_dict(self) -> dict[str, object]:
-        """For machines: buffers sorted, one entry a step."""
+        """Return the plan for machines: buffers sorted, one entry a step."""
         return {
             "buffers": sorted(self.buffers),
             "bare_buffers": sorted(self.bare_buffers),
@@ -89,7 +112,7 @@ class Plan:
 
 
 def make_plan(recipe: Recipe, scene: Scene) -> Plan:
-    """The passes that `recipe` requires of `scene`.
+    """Return the passes that `recipe` requires of `scene`.
 
     Raises:
         SceneError: the recipe needs what the scene does not have (the road's height, photos).
@@ -104,28 +127,31 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     check_base(recipe, scene)
     if any(effect.reads_splats(recipe) for effect in effects.EFFECTS):
         check_background(scene.background)
-    placed = dict[str, Placed]()
-    for effect in reversed(effects.EFFECTS):  # what comes later may cover what comes before
-        placed[effect.name] = effect.place(recipe, scene, placed)
-    placed = {effect.name: placed[effect.name] for effect in effects.EFFECTS}
-    output, render = recipe.output, recipe.render
+    effect_plans = dict[str, Placed]()
+    for effect in reversed(effects.EFFECTS):  # later effects may cover earlier ones
+        effect_plans[effect.name] = effect.place(recipe, scene, effect_plans)
+    effect_plans = {effect.name: effect_plans[effect.name] for effect in effects.EFFECTS}
+    output = recipe.output
+    render = recipe.render
     depth_buffer = DEPTH_ESTIMATORS.get(output.depth)
     finds_boxes = bool(output.labels or output.instance) and scene.labels is not None
-    for_images = {ALPHA, depth_buffer} if depth_buffer else set[str]()
+    label_buffers = {ALPHA, depth_buffer} if depth_buffer else set[str]()
     if output.semantic or output.instance:
-        for_images |= {ALPHA, SPLAT_IDS}
+        label_buffers |= {ALPHA, SPLAT_IDS}
     if output.instance and finds_boxes and not depth_buffer:
-        for_images.add(EXPECTED_DEPTH)
-    image_buffers, bare_buffers = {RGB, ALPHA} | for_images, set[str]()
-    if output.surface == "scene" and _is_covered(effects.EFFECTS, placed):
-        image_buffers, bare_buffers = {RGB, ALPHA}, for_images
+        label_buffers.add(EXPECTED_DEPTH)
+    image_buffers = {RGB, ALPHA} | label_buffers
+    bare_buffers = set[str]()
+    if output.surface == "scene" and _is_covered(effects.EFFECTS, effect_plans):
+        image_buffers = {RGB, ALPHA}
+        bare_buffers = label_buffers
     if finds_boxes and depth_buffer not in image_buffers:
         image_buffers.add(EXPECTED_DEPTH)
-    own = (p.buffers for p in placed.values() if p.data is not None)
-    buffers = frozenset(image_buffers).union(*own)
+    effect_buffers = (p.buffers for p in effect_plans.values() if p.data is not None)
+    buffers = frozenset(image_buffers).union(*effect_buffers)
     exposure = _exposure_step(recipe, scene)
     return Plan(
-        placed=placed,
+        placed=effect_plans,
         settings=RasterSettings(
             near_m=render.near_m,
             alpha_max=render.alpha_max,
@@ -149,53 +175,56 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         on_photo=recipe.render.base == RECORDED,
         sensor=recipe.camera,
         seed=recipe.seed,
-        steps=_all_steps(recipe, scene, placed, buffers, bare_buffers, exposure),
+        steps=_all_steps(recipe, scene, effect_plans, buffers, bare_buffers, exposure),
     )
 
 
 def _all_steps(
     recipe: Recipe,
     scene: Scene,
-    placed: Mapping[str, Placed],
+    effect_plans: Mapping[str, Placed],
     buffers: Iterable[str],
     bare_buffers: Iterable[str],
     exposure: Step,
 ) -> tuple[Step, ...]:
-    """The effects' passes among those that there are without them."""
+    """Return the effects' passes among the passes that every recipe has, in order."""
 
-    def of_effects(stage: str) -> list[Step]:
-        return [step for p in placed.values() for step in p.steps if step.stage == stage]
+    def steps_of_effects(stage: str) -> list[Step]:
+        return [step for p in effect_plans.values() for step in p.steps if step.stage == stage]
 
-    output, bare = recipe.output, ", ".join(sorted(bare_buffers))
-    actors = f"background and {len(scene.actors)} actors posed at the camera's timestamp"
-    drawing = of_effects(DRAWING)
-    if not any(step.name == "sky" for step in drawing):
-        drawing.append(Step("sky", True, "sampled behind the splats"))
-    without = "no image shows the scene without what lies on it"
+    output = recipe.output
+    bare = ", ".join(sorted(bare_buffers))
+    raster_reason = f"background and {len(scene.actors)} actors posed at the camera's timestamp"
+    drawing_steps = steps_of_effects(DRAWING)
+    if not any(step.name == "sky" for step in drawing_steps):
+        drawing_steps.append(Step("sky", True, "sampled behind the splats"))
+    bare_reason = "no image shows the scene without what lies on it"
     if bare:
-        without = f"output.surface is 'scene': {bare} of the scene without what lies on it"
+        bare_reason = f"output.surface is 'scene': {bare} of the scene without what lies on it"
     return (
-        *of_effects(SCENE),
-        Step("rasterise", True, f"{actors}; buffers {', '.join(sorted(buffers))}"),
+        *steps_of_effects(SCENE),
+        Step("rasterise", True, f"{raster_reason}; buffers {', '.join(sorted(buffers))}"),
         _photo_step(recipe),
-        *drawing,
-        Step(BARE, bool(bare), without),
-        *of_effects(PICTURE),
+        *drawing_steps,
+        Step(BARE, bool(bare), bare_reason),
+        *steps_of_effects(PICTURE),
         exposure,
         Step(LENS, recipe.camera.psf_px > 0, f"camera.psf_px is {recipe.camera.psf_px:g}"),
         Step(NOISE, recipe.camera.noise > 0, f"camera.noise is {recipe.camera.noise:g}"),
         Step("depth image", output.depth != "none", f"output.depth is {output.depth!r}"),
-        Step("semantic image", output.semantic, _asked("semantic", recipe)),
-        Step("instance image", output.instance, _asked("instance", recipe)),
-        Step("trust mask", output.trust, _asked("trust", recipe)),
+        Step("semantic image", output.semantic, _output_reason("semantic", recipe)),
+        Step("instance image", output.instance, _output_reason("instance", recipe)),
+        Step("trust mask", output.trust, _output_reason("trust", recipe)),
     )
 
 
-def _is_covered(listed: Iterable[Effect], placed: Mapping[str, Placed]) -> bool:
-    return any(e.lies_on_scene and placed[e.name].data is not None for e in listed)
+def _is_covered(candidates: Iterable[Effect], effect_plans: Mapping[str, Placed]) -> bool:
+    """Return True if an effect lies on the scene."""
+    return any(e.lies_on_scene and effect_plans[e.name].data is not None for e in candidates)
 
 
 def _photo_step(recipe: Recipe) -> Step:
+    """Return the pass that keeps the recorded image as the picture."""
     base = recipe.render.base
     why = f"render.base is {base!r}"
     if base == RECORDED:
@@ -204,17 +233,19 @@ def _photo_step(recipe: Recipe) -> Step:
 
 
 def _exposure_step(recipe: Recipe, scene: Scene) -> Step:
+    """Return the pass that applies the cameras' colour maps."""
     name = "camera colour map"
-    mapped = scene.mapped_cameras
-    if not mapped:
+    names = scene.mapped_cameras
+    if not names:
         return Step(name, False, "the scene's cameras record the scene's own colours")
     if recipe.render.exposure == "neutral":
         return Step(name, False, "render.exposure is 'neutral'")
-    why = f"{len(mapped)} of {len(scene.camera_names)} cameras have one, applied after the weather"
+    why = f"{len(names)} of {len(scene.camera_names)} cameras have one, applied after the weather"
     return Step(name, True, why)
 
 
-def _asked(name: str, recipe: Recipe) -> str:
+def _output_reason(name: str, recipe: Recipe) -> str:
+    """Return the reason of a pass that an output of the recipe asks for."""
     return f"output.{name} is {str(getattr(recipe.output, name)).lower()}"
 
 
@@ -223,75 +254,98 @@ def _asked(name: str, recipe: Recipe) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ViewPlan:
-    """What rendering one camera's image takes.
-
-    actors: instance ids (1 + index in the scene) of those drawn. effects: that can be seen, in the
-    order in which they are applied. buffers, bare_buffers: as those of Plan. steps: the plan's,
-    each with this camera's reason.
-    """
+    """Passes and buffers of one camera's image."""
 
     actors: tuple[int, ...]
+    """Instance ids (1 + index in the scene) of the actors to render."""
     effects: tuple[Active, ...]
+    """Effects that can be seen, in the order in which they are applied."""
     buffers: frozenset[str]
+    """Buffers that the rasteriser computes, as those of `Plan`."""
     bare_buffers: frozenset[str]
+    """Buffers of the scene without what lies on it, as those of `Plan`."""
     steps: tuple[Step, ...]
+    """Steps of the plan, each with this camera's reason."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the effects."""
-        return tuple(own.effect.name for own in self.effects)
+        """Return the names of the effects."""
+        return tuple(effect.effect.name for effect in self.effects)
 
     def skipping(self, reasons: Mapping[str, str]) -> ViewPlan:
-        """The same view, of which drawing has shown that some passes are needless."""
+        """Return the plan without passes that rendering has shown to be needless.
+
+        Args:
+            reasons: why each such pass is needless, by its name.
+        """
         return replace(self, steps=_skip(self.steps, reasons)) if reasons else self
 
 
 def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) -> ViewPlan:
-    """The parts, passes and buffers of the plan that the camera's image can show.
+    """Return the parts, passes and buffers of the plan that the camera's image can show.
 
     The first call for a scene bounds its actors, and prepares the effects that ask what of them a
     camera can see.
 
+    Args:
+        plan: the plan of all views.
+        scene: the scene.
+        camera: the view, at the resolution to render.
+        backend: the rasteriser's backend.
+
     Raises:
         SceneError: an effect cannot be placed in this scene.
     """
-    active = plan.active(scene, backend=backend)
-    looking = [c for own in active for c in own.effect.cameras(own, camera) or ()]
-    cameras = tuple(looking) or (camera,)
+    active_effects = plan.active(scene, backend=backend)
+    effect_cameras = [
+        effect_camera
+        for effect in active_effects
+        for effect_camera in effect.effect.cameras(effect, camera) or ()
+    ]
+    cameras = tuple(effect_cameras) or (camera,)
     poses = scene.poses_at(camera.timestamp_ns)
-    sight = Sight(camera, cameras, {0: np.eye(4), **poses}, plan.settings.near_m)
-    drawn = owners_seen(actor_boxes(scene), poses, cameras, plan.settings.near_m)
-    seen, skipped = list[Active](), dict[str, str]()
-    for own in active:
-        found = own.effect.in_view(own, sight)
-        skipped |= found.skipped
-        if found.is_seen:
-            drawn |= found.owners
-            seen.append(replace(own, seen=found.seen))
-    own_buffers = (plan.placed[own.effect.name].buffers for own in seen)
-    buffers, bare_buffers = plan.image_buffers.union(*own_buffers), plan.bare_buffers
-    layered = cameras != (camera,)  # then even the picture of the bare scene is another one
-    if bare_buffers and not layered and not any(own.effect.lies_on_scene for own in seen):
-        buffers, bare_buffers = buffers | bare_buffers, frozenset[str]()
-        skipped[BARE] = "nothing that lies on the scene can be in view"
-    actors = (
-        f"background and {len(drawn)} of {len(scene.actors)} actors "
+    query = Sight(camera, cameras, {0: np.eye(4), **poses}, plan.settings.near_m)
+    owners = owners_seen(actor_boxes(scene), poses, cameras, plan.settings.near_m)
+    effects_in_view = list[Active]()
+    skip_reasons = dict[str, str]()
+    for effect in active_effects:
+        visibility = effect.effect.in_view(effect, query)
+        skip_reasons |= visibility.skipped
+        if visibility.is_seen:
+            owners |= visibility.owners
+            effects_in_view.append(replace(effect, seen=visibility.seen))
+    effect_buffers = (plan.placed[effect.effect.name].buffers for effect in effects_in_view)
+    buffers = plan.image_buffers.union(*effect_buffers)
+    bare_buffers = plan.bare_buffers
+    is_layered = cameras != (camera,)  # then the picture differs even for a bare scene
+    if (
+        bare_buffers
+        and not is_layered
+        and not any(effect.effect.lies_on_scene for effect in effects_in_view)
+    ):
+        buffers = buffers | bare_buffers
+        bare_buffers = frozenset[str]()
+        skip_reasons[BARE] = "nothing that lies on the scene can be in view"
+    raster_reason = (
+        f"background and {len(owners)} of {len(scene.actors)} actors "
         f"({len(scene.actors) - len(poses)} absent at this time, "
-        f"{len(poses) - len(drawn)} out of view); buffers {', '.join(sorted(buffers))}"
+        f"{len(poses) - len(owners)} out of view); buffers {', '.join(sorted(buffers))}"
     )
-    steps = _skip(plan.steps, skipped)
+    steps = _skip(plan.steps, skip_reasons)
     return ViewPlan(
-        actors=tuple(sorted(drawn)),
-        effects=tuple(seen),
+        actors=tuple(sorted(owners)),
+        effects=tuple(effects_in_view),
         buffers=buffers,
         bare_buffers=bare_buffers,
-        steps=tuple(replace(s, why=actors) if s.name == "rasterise" else s for s in steps),
+        steps=tuple(replace(s, why=raster_reason) if s.name == "rasterise" else s for s in steps),
     )
 
 
-def _skip(steps: Iterable[Step], skipped: Mapping[str, str]) -> tuple[Step, ...]:
-    """The steps; those that would run but are skipped have that reason."""
+def _skip(steps: Iterable[Step], skip_reasons: Mapping[str, str]) -> tuple[Step, ...]:
+    """Return the steps; steps that would run but have a reason to skip are skipped."""
     return tuple(
-        replace(s, runs=False, why=skipped[s.name]) if s.runs and s.name in skipped else s
-        for s in steps
+        replace(step, runs=False, why=skip_reasons[step.name])
+        if step.runs and step.name in skip_reasons
+        else step
+        for step in steps
     )

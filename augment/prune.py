@@ -1,17 +1,22 @@
-"""Splats of the background that no recorded view would miss, left out of views from nearby.
+"""Pruning: splats of the background that no recorded view would miss, left out of near views.
+
+In: the parts of a view, a scene and an error (`prune_parts`, called by `augment.views`). Out: the
+parts with the opacities of such splats set to 0. `share_errors` finds the errors of all splats
+once, before a job's processes would.
 
 Without splat i, of colour c_i and weight w_i = alpha_i T_i at a pixel, the pixel shows more of what
-is behind it, B_i, and changes by w_i (B_i - c_i): to first order alpha_i dL/dalpha_i, which the
-rasteriser's backward pass adds up over a view. A splat's change in a view is
+is behind it, B_i, and changes by w_i (B_i - c_i). To first order this is alpha_i dL/dalpha_i, which
+the rasteriser's backward pass adds up over a view. A splat's change in a view is
 
     max(|sum of w_i L(B_i - c_i)|, LEAST_CONTRAST sum of w_i) / pixels,    L: luma,
 
-and counts by the view that would change most. LEAST_CONTRAST stands for what changes of both signs
-hide, and for the changes that neighbours make when they go together. Those that change least go
-first, until what they change adds up to the error that is allowed in some view. After each of the
-ROUNDS the views are looked at without what has gone, since what it covered counts more then: a far
-front of many small splats would go as a whole. (Fan et al. 2024, "LightGaussian", and Niemeyer et
-al. 2024, "RadSplat", leave out by weight alone, which at the same error leaves out less.)
+and the view that would change most counts. LEAST_CONTRAST stands for what changes of both signs
+hide, and for the changes that neighbours make when they go together. Splats that change least go
+first, until their changes add up to the error that is allowed in some view. After each of the
+ROUNDS the views are rendered again without the splats that have gone, since what these covered
+counts more then: a far front of many small splats would go as a whole otherwise. (Fan et al. 2024,
+"LightGaussian", and Niemeyer et al. 2024, "RadSplat", leave out by weight alone, which at the same
+error leaves out less.)
 """
 
 from __future__ import annotations
@@ -39,178 +44,234 @@ from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.timing import counted
 from recipes.schema import Render
 
-MIN_VIEWS, MAX_VIEWS, MAX_WIDTH_PX = 8, 24, 320  # that are looked at
-MAX_NUMBERS = 200_000_000  # of views and splats: fewer views of larger backgrounds
-# From farther away than this from all recorded cameras, a view may show what none of them did.
+# Recorded views that are rendered, at least, where there are as many.
+MIN_VIEWS = 8
+# Recorded views that are rendered, at most.
+MAX_VIEWS = 24
+# Width of these views, at most, pixels.
+MAX_WIDTH_PX = 320
+# Product of views and splats, at most: larger backgrounds are rendered in fewer views.
+MAX_NUMBERS = 200_000_000
+# Distance from all recorded cameras beyond which a view may show what none of them did, metres.
 FARTHEST_M = 2.0
+# Weights of red, green and blue in luma.
 LUMA = (0.299, 0.587, 0.114)
-SKY = 0.7  # luma behind all splats
+# Luma behind all splats.
+SKY = 0.7
+# Contrast that a splat has at least, of 1.
 LEAST_CONTRAST = 0.05
-# The errors up to which splats go in each.
+# Errors up to which splats go in each round, shares of white.
 ROUNDS = (0.0002, 0.0004, 0.0008, 0.0016, 0.0032, math.inf)
-_ALPHA_MAX = 0.9999  # nothing is known of what is behind a splat whose alpha is clamped
+# Alpha that is not clamped: nothing is known of what is behind a splat whose alpha is clamped.
+_ALPHA_MAX = 0.9999
+# Key of the errors in a scene's memo.
 _ERRORS = ("errors without splats",)
-_finding = threading.RLock()  # views drawn at once want the same
+# Lock for the search: views that are rendered at once need the same errors.
+_search_lock = threading.RLock()
 
-Changes = tuple[Int32[np.ndarray, "_"], Float[np.ndarray, "_"]]  # which splats, what each changes
+# Indices of splats, and the change that each makes.
+Changes = tuple[Int32[np.ndarray, "_"], Float[np.ndarray, "_"]]
 
 
 def pruned_share(render: Render) -> float:
-    """The recipe's, or 0 where nothing is pruned: of merged splats and on recorded images."""
+    """Return the recipe's error, or 0 where nothing is pruned: merged splats, recorded images."""
     return 0.0 if render.base == RECORDED or render.lod_px > 0 else render.prune
 
 
 def prune_parts(
     parts: Sequence[PosedGaussians], scene: Scene, camera: Camera, error: float
 ) -> tuple[PosedGaussians, ...]:
-    """The parts as `camera` needs them: opacities of splats are 0 of which each alone changes the
-    mean of a recorded view so little that it adds up to no more than this share of white. parts: as
-    the effects have left them.
+    """Return the parts as a camera needs them, with the opacities of pruned splats set to 0.
+
+    Splats are left out whose changes of the mean of any recorded view add up to no more than
+    `error`.
+
+    Args:
+        parts: the parts, as the effects have left them.
+        scene: the scene.
+        camera: the view.
+        error: allowed error, share of white.
     """
     if error <= 0 or not _is_near(camera, scene):
         return tuple(parts)
     return tuple(
-        _pruned(part, scene, error) if _is_background(part, scene) else part for part in parts
+        _prune_part(part, scene, error) if _is_background(part, scene) else part for part in parts
     )
 
 
 def share_errors(scene: Scene, most: float = math.inf, *, progress: bool = False) -> None:
-    """Find the errors up to `most` now, so that other processes take them over."""
+    """Find the errors up to `most` now, so that other processes take them over.
+
+    Args:
+        scene: the scene.
+        most: largest error that is needed, share of white.
+        progress: if True, show a bar on stderr.
+    """
     if not keeps_levels(scene.background):
         errors_of(scene, most, progress=progress)
-        memo_of(scene).put(_ERRORS, _found_of(scene), shared=True)
+        memo_of(scene).put(_ERRORS, _search_of(scene), shared=True)
 
 
 def errors_of(
     scene: Scene, most: float = math.inf, *, progress: bool = False
 ) -> Float[np.ndarray, "N"]:
-    """The changes by each splat of the background and all that change less, added up in the worst
-    recorded view, share of white, float32; infinite where no view has it in its frame, and where
-    the sum is beyond `most`, as far as nobody has asked for more. Found once a scene. progress: a
-    bar on stderr.
+    """Return the error that leaving out each splat of the background makes, share of white,
+    float32.
+
+    It adds up the changes by the splat and by all splats that change less, in the worst recorded
+    view. It is infinite for splats that no view has in its frame, and beyond `most` unless somebody
+    has asked for more. Errors are found once a scene.
+
+    Args:
+        scene: the scene.
+        most: largest error that is needed, share of white.
+        progress: if True, show a bar on stderr.
     """
-    found, rounds = _found_of(scene), min(bisect_left(ROUNDS, most) + 1, len(ROUNDS))
-    with _finding:
-        if found.rounds < rounds:
-            _find_errors(scene, found, rounds, progress)
-    return found.errors
+    search = _search_of(scene)
+    num_rounds = min(bisect_left(ROUNDS, most) + 1, len(ROUNDS))
+    with _search_lock:
+        if search.rounds < num_rounds:
+            _find_errors(scene, search, num_rounds, progress)
+    return search.errors
 
 
 def _is_background(part: PosedGaussians, scene: Scene) -> bool:
+    """Return True if a part is the scene's background, without levels in a file."""
     g = part.gaussians
     is_plain = part.instance_id == 0 and not part.is_overlay and len(g) == len(scene.background)
     return is_plain and not keeps_levels(scene.background)
 
 
 def _is_near(camera: Camera, scene: Scene) -> bool:
+    """Return True if a camera is near a recorded one."""
     centres = memo_of(scene).get(("camera centres",), lambda: _centres_of(scene))
-    away_m = np.linalg.norm(centres - camera.centre.numpy(), axis=1)
-    return bool(away_m.min(initial=np.inf) <= FARTHEST_M)
+    distances_m = np.linalg.norm(centres - camera.centre.numpy(), axis=1)
+    return bool(distances_m.min(initial=np.inf) <= FARTHEST_M)
 
 
 def _centres_of(scene: Scene) -> Float[np.ndarray, "C 3"]:
-    return np.array([camera.centre.numpy() for camera in _recorded(scene)]).reshape(-1, 3)
+    """Return the centres of the recorded cameras."""
+    return np.array([camera.centre.numpy() for camera in _recorded_cameras(scene)]).reshape(-1, 3)
 
 
-def _pruned(part: PosedGaussians, scene: Scene, error: float) -> PosedGaussians:
-    own, errors = part.gaussians.opacities, errors_of(scene, error)
+def _prune_part(part: PosedGaussians, scene: Scene, error: float) -> PosedGaussians:
+    """Return the background with the opacities of pruned splats set to 0."""
+    opacities = part.gaussians.opacities
+    errors = errors_of(scene, error)
 
     def prune() -> tuple[np.ndarray, torch.Tensor]:
-        is_missed = torch.from_numpy(errors > error).to(own.device)
-        return errors, torch.where(is_missed, own, 0.0)
+        is_pruned = torch.from_numpy(errors > error).to(opacities.device)
+        return errors, torch.where(is_pruned, opacities, 0.0)
 
-    # Of the same tensor as long as that lives, so that the rasteriser knows it again.
-    by, opacities = known_of(own, f"pruned at {error}", prune)
-    if by is not errors:  # the same tensor in a scene of other views
-        opacities = prune()[1]
-    return replace(part, gaussians=replace(part.gaussians, opacities=opacities))
+    # One pruned tensor for one tensor of opacities, so that the rasteriser knows it again.
+    known_errors, pruned_opacities = known_of(opacities, f"pruned at {error}", prune)
+    if known_errors is not errors:  # the same tensor in a scene of other views
+        pruned_opacities = prune()[1]
+    return replace(part, gaussians=replace(part.gaussians, opacities=pruned_opacities))
 
 
 @dataclass(eq=False)
-class _Found:
-    """errors, as of `errors_of`, finite of what has gone; gone: what that changes in each view;
-    rounds: how many there have been.
-    """
+class _ErrorSearch:
+    """State of the search for errors."""
 
     errors: np.ndarray
+    """Errors, as of `errors_of`; finite for splats that have gone."""
     gone: np.ndarray
+    """Change of each view by the splats that have gone."""
     rounds: int = 0
+    """Number of rounds that there have been."""
 
     def leave_out(self, views: Sequence[Changes]) -> None:
-        """One more round, by what each splat that is left changes in each view."""
+        """Do one more round, by the changes that each remaining splat makes in each view."""
         count = len(self.errors)
-        order = _least_first(views, np.isinf(self.errors))
+        order = _order_by_change(views, np.isinf(self.errors))
         sums = np.zeros(len(order))
-        for view, gone in zip(views, self.gone, strict=True):
-            np.maximum(sums, gone + _of_all(view, count)[order].cumsum(), out=sums)
-        goes = order[: np.searchsorted(sums, ROUNDS[self.rounds], side="right")]
-        self.errors[goes] = sums[: len(goes)]
-        self.gone += [_of_all(view, count)[goes].sum() for view in views]
+        for view, view_change in zip(views, self.gone, strict=True):
+            np.maximum(sums, view_change + _changes_of_all(view, count)[order].cumsum(), out=sums)
+        leaving = order[: np.searchsorted(sums, ROUNDS[self.rounds], side="right")]
+        self.errors[leaving] = sums[: len(leaving)]
+        self.gone += [_changes_of_all(view, count)[leaving].sum() for view in views]
         self.rounds += 1
 
 
-def _found_of(scene: Scene) -> _Found:
-    def begin() -> _Found:
+def _search_of(scene: Scene) -> _ErrorSearch:
+    """Return the state of the search for errors in a scene."""
+
+    def begin() -> _ErrorSearch:
         errors = np.full(len(scene.background), np.inf, np.float32)
-        return _Found(errors, np.zeros(len(_views(scene))))
+        return _ErrorSearch(errors, np.zeros(len(_recorded_views(scene))))
 
     return memo_of(scene).get(_ERRORS, begin)
 
 
-def _find_errors(scene: Scene, found: _Found, rounds: int, progress: bool) -> None:
-    """Until there have been so many rounds."""
+def _find_errors(scene: Scene, search: _ErrorSearch, num_rounds: int, progress: bool) -> None:
+    """Search until there have been `num_rounds` rounds."""
     from augment.render.cpu.driver import Scratch
 
-    cameras, spaces = _views(scene), threading.local()
+    cameras = _recorded_views(scene)
+    spaces = threading.local()
     opacities = scene.background.opacities.detach().cpu()
-    opaque = opacities.numpy() >= _ALPHA_MAX
-    steps, told = (rounds - found.rounds) * len(cameras), "finding splats to leave out"
-    count = min(views_at_once(len(opaque)), len(cameras))
+    is_opaque = opacities.numpy() >= _ALPHA_MAX
+    num_steps = (num_rounds - search.rounds) * len(cameras)
+    title = "finding splats to leave out"
+    count = min(views_at_once(len(is_opaque)), len(cameras))
     pool = divided_threads(count) if count > 1 else None
     with (
-        ProgressBar(desc=told, total=steps, unit="view", disable=not progress) as bar,
-        counted(told, steps) as advance,
+        ProgressBar(desc=title, total=num_steps, unit="view", disable=not progress) as bar,
+        counted(title, num_steps) as advance,
     ):
 
-        def look(camera: Camera) -> Changes:
+        def find_changes(camera: Camera) -> Changes:
             if not hasattr(spaces, "scratch"):
                 spaces.scratch = Scratch()
-            return _changes_in(rest, camera, opaque, spaces.scratch)
+            return _find_changes(remaining_scene, camera, is_opaque, spaces.scratch)
 
         try:
-            while found.rounds < rounds:
-                left = torch.where(torch.from_numpy(np.isinf(found.errors)), opacities, 0.0)
-                own = replace(scene.background, opacities=left)
-                rest, views = replace(scene, background=own), list[Changes]()
-                for view in (pool.map if pool else map)(look, cameras):
+            while search.rounds < num_rounds:
+                opacities_left = torch.where(
+                    torch.from_numpy(np.isinf(search.errors)), opacities, 0.0
+                )
+                background = replace(scene.background, opacities=opacities_left)
+                remaining_scene = replace(scene, background=background)
+                views = list[Changes]()
+                for view in (pool.map if pool else map)(find_changes, cameras):
                     views.append(view)
                     bar.update()
                     advance()
-                found.leave_out(views)
+                search.leave_out(views)
         finally:
             if pool:
                 pool.shutdown(cancel_futures=True)
 
 
-def _of_all(view: Changes, count: int) -> Float[np.ndarray, "N"]:
-    """What each of all splats changes, float64; 0 where it is not in the frame."""
+def _changes_of_all(view: Changes, count: int) -> Float[np.ndarray, "N"]:
+    """Return the change by every splat, float64; 0 where it is not in the frame."""
     ids, changes = view
-    own = np.zeros(count)
-    own[ids] = changes
-    return own
+    all_changes = np.zeros(count)
+    all_changes[ids] = changes
+    return all_changes
 
 
-def _least_first(views: Sequence[Changes], which: Bool[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
-    """Those of `which` that a view has in its frame, by the most that they change in any."""
-    most = np.full(len(which), -1, np.float32)
+def _order_by_change(
+    views: Sequence[Changes], is_candidate: Bool[np.ndarray, "N"]
+) -> Int[np.ndarray, "M"]:
+    """Return the indices of splats in a view's frame, by the largest change that they make in any.
+
+    Args:
+        views: changes by view.
+        is_candidate: mask of the splats that count.
+    """
+    largest = np.full(len(is_candidate), -1, np.float32)
     for ids, changes in views:
-        most[ids] = np.maximum(most[ids], changes)
-    framed = np.flatnonzero(which & (most >= 0))
-    return framed[np.argsort(most[framed], kind="stable")]
+        largest[ids] = np.maximum(largest[ids], changes)
+    framed = np.flatnonzero(is_candidate & (largest >= 0))
+    return framed[np.argsort(largest[framed], kind="stable")]
 
 
-def _changes_in(scene: Scene, camera: Camera, opaque: np.ndarray, scratch: Any) -> Changes:
-    """The background's splats in the camera's frame, and each one's change of the view's mean."""
+def _find_changes(scene: Scene, camera: Camera, is_opaque: np.ndarray, scratch: Any) -> Changes:
+    """Return the background's splats in a camera's frame, and each one's change of the view's
+    mean.
+    """
     from augment.render.cpu.backward import record
     from augment.render.cpu.driver import gather_inputs
 
@@ -220,28 +281,33 @@ def _changes_in(scene: Scene, camera: Camera, opaque: np.ndarray, scratch: Any) 
     tape = record(inputs, camera, settings, scratch, with_depth=False)
     d_rgb = np.broadcast_to(np.array(LUMA, np.float32), tape.rgb.shape).copy()
     ids, weights, effects = tape.splat_effects(d_rgb, np.full_like(tape.alpha, -SKY))
-    own = (ids >= 0) & (ids < len(opaque))
-    ids, weights = ids[own], weights[own] / np.float32(LUMA[0])
-    least = np.where(opaque[ids], np.float32(1), np.float32(LEAST_CONTRAST)) * weights
-    return ids, np.maximum(np.abs(effects[own]), least) / np.float32(tape.alpha.size)
+    is_background = (ids >= 0) & (ids < len(is_opaque))
+    ids = ids[is_background]
+    weights = weights[is_background] / np.float32(LUMA[0])
+    min_changes = np.where(is_opaque[ids], np.float32(1), np.float32(LEAST_CONTRAST)) * weights
+    return ids, np.maximum(np.abs(effects[is_background]), min_changes) / np.float32(
+        tape.alpha.size
+    )
 
 
-def _recorded(scene: Scene) -> list[Camera]:
-    frames = scene.seen_frames or scene.frames  # those of a camera path may see less
+def _recorded_cameras(scene: Scene) -> list[Camera]:
+    """Return all cameras of the frames that the scene was made from."""
+    frames = scene.seen_frames or scene.frames  # frames of a camera path may see less
     return [camera for frame in frames for camera in frame.cameras.values()]
 
 
-def _views(scene: Scene) -> list[Camera]:
-    """Spread over all recorded images, small."""
-    cameras = _recorded(scene)
-    room = max(MIN_VIEWS, MAX_NUMBERS // max(len(scene.background), 1))
-    count = min(MAX_VIEWS, room, len(cameras))
-    places = np.linspace(0, len(cameras) - 1, count).round().astype(int)
-    chosen = [cameras[place] for place in places if not cameras[place].is_orthographic]
-    return [camera.scaled(min(1.0, MAX_WIDTH_PX / camera.width)) for camera in chosen]
+def _recorded_views(scene: Scene) -> list[Camera]:
+    """Return small cameras spread over all recorded images."""
+    cameras = _recorded_cameras(scene)
+    max_views = max(MIN_VIEWS, MAX_NUMBERS // max(len(scene.background), 1))
+    count = min(MAX_VIEWS, max_views, len(cameras))
+    indices = np.linspace(0, len(cameras) - 1, count).round().astype(int)
+    chosen_cameras = [cameras[index] for index in indices if not cameras[index].is_orthographic]
+    return [camera.scaled(min(1.0, MAX_WIDTH_PX / camera.width)) for camera in chosen_cameras]
 
 
 def _on_cpu(part: PosedGaussians) -> PosedGaussians:
+    """Return a part with its Gaussians on the CPU."""
     g = part.gaussians
     if g.means.device.type == "cpu":
         return part

@@ -1,10 +1,14 @@
-"""Which pixels of a recorded image show sky: by brightness, place and graph cut.
+"""Sky masks of recorded images, by brightness, place and graph cut.
 
-Bright smooth regions are sky; what lies below the horizon, or where the LiDAR had a return, is not;
+In: a recorded image, its camera, and LiDAR returns where there are any. Out: a bool mask, or two
+(`RecordedSky`). `augment.trust` judges views by it, and training views learn their sky from it.
+
+Bright smooth regions are sky. Regions below the horizon, or where the LiDAR had a return, are not.
 GrabCut (Rother et al. 2004, OpenCV's) draws the line between them. `find_sky` needs the image alone
-and says where it cannot tell. `sky_mask` decides everywhere by what a raw scene draws: a column of
-the image is known where the surfaces drawn in it end below the LiDAR's highest view, since the
-LiDAR looked over them and met nothing. Where they reach that view, a wall may go on above.
+and says where it cannot tell. `sky_mask` decides everywhere, by the surfaces that a scene from
+LiDAR renders. A column of the image is known where its surfaces end below the LiDAR's highest view,
+since the LiDAR looked over them and met nothing. Where they reach that view, a wall may go on
+above.
 """
 
 from __future__ import annotations
@@ -26,34 +30,60 @@ from augment.render.buffers import ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene import Scene
 
-WORK_WIDTH = 256  # columns of the image that is cut: 0.1 s; finer lines than a twig's do not matter
-_MAX_SQUEEZE = 0.05  # of its sides' ratio: beyond it is another camera's
-_SMOOTH_LEVELS = 6.0  # of 255: standard deviation in a window; clouds pass, foliage does not
-_DARK_LEVELS = 70.0  # of 255: this much darker than the brightest tenth of what may be sky is none
+# Columns of the image that is cut, which takes 0.1 s; finer lines than a twig's do not matter.
+WORK_WIDTH = 256
+# Difference of the image's proportions from the camera's beyond which it is another camera's.
+_MAX_SQUEEZE = 0.05
+# Standard deviation in a window below which it is smooth, of 255; clouds pass, foliage does not.
+_SMOOTH_LEVELS = 6.0
+# Difference from the brightest tenth of the candidates beyond which a pixel is no sky, of 255.
+_DARK_LEVELS = 70.0
+# Luma below which a pixel is no sky, of 255.
 _MIN_LUMA = 90.0
-_MIN_PART = 0.005  # of the image: a smaller bright region is a window or a lamp
-_HIT_PX = 3  # pixels around a LiDAR return that are its surface's
-TOP_MARGIN_RAD = math.radians(4.0)  # cameras are not where the LiDAR is
-_BESIDE_PX = 9  # columns beside one whose surface goes on may show the same, leaning
-_TOP_FROM_M = 10.0  # from here on LiDAR and cameras see a return at nearly the same elevation
-_TOP_QUANTILE = 0.999  # a few returns are stray
+# Share of the image below which a bright region is a window or a lamp.
+_MIN_PART = 0.005
+# Side of the square around a LiDAR return that is its surface's, pixels.
+_HIT_PX = 3
+# Margin below the LiDAR's highest view, since cameras are not where the LiDAR is.
+TOP_MARGIN_RAD = math.radians(4.0)
+# Columns beside one whose surface goes on that may show the same surface, leaning.
+_BESIDE_PX = 9
+# Distance from which LiDAR and cameras see a return at nearly the same elevation, metres.
+_TOP_FROM_M = 10.0
+# Quantile of the returns' elevations that is the highest view; a few returns are stray.
+_TOP_QUANTILE = 0.999
+# Returns that the highest view is measured from, at least.
 _ENOUGH_RETURNS = 5000
+# Side of the window in which contrast is measured, pixels of the small image.
 _WINDOW_PX = 5
-_CUTS = 2  # rounds; the line hardly moves after
-# Of `sky_mask`:
+# Rounds of the graph cut; the line hardly moves after these.
+_CUTS = 2
+
+# ---- Constants of `sky_mask`
+# Alpha from which a pixel shows a surface.
 _DRAWN_ALPHA = 0.05
-_DRAWN_PIXELS = 3  # fewer covered pixels one above another are no surface's edge
-_BORDER_PART = 0.008  # of the image's width, that surfaces are grown by: splats end a little early
-_WINDOW_PART = 0.01  # of the image's width
-_MASK_WIDTH = 240  # columns of the image that the graph cut works on, at most
+# Covered pixels one above another that a surface has at least.
+_DRAWN_PIXELS = 3
+# Width by which surfaces are grown, as a part of the image's width: splats end a little early.
+_BORDER_PART = 0.008
+# Side of the window in which contrast is measured, as a part of the image's width.
+_WINDOW_PART = 0.01
+# Columns of the image that the graph cut works on, at most.
+_MASK_WIDTH = 240
+# Rounds of the graph cut.
 _MASK_CUTS = 3
-_EDGE_PART = 0.015  # of the image's width: radius of the guided filter
-_EDGE_LEVELS = 8.0  # of 255: smaller steps of the image are no edges to it
-_THIN_PART = 0.04  # of the image's width: poles and wires are thinner
-_THIN_LEVELS = 30.0  # of 255, darker than the sky around
+# Radius of the guided filter, as a part of the image's width.
+_EDGE_PART = 0.015
+# Steps of the image below which the guided filter sees no edge, of 255.
+_EDGE_LEVELS = 8.0
+# Width of poles and wires, at most, as a part of the image's width.
+_THIN_PART = 0.04
+# Difference of poles and wires from the sky around them, at least, of 255.
+_THIN_LEVELS = 30.0
 
 
 def _luma(rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+    """Return the luma of an image, 0 to 255."""
     return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 
@@ -62,45 +92,60 @@ def looks_like_sky(
     candidates: Bool[np.ndarray, "H W"],
     window_px: int | None = None,
 ) -> Bool[np.ndarray, "H W"]:
-    """Pixels as smooth and about as bright as the bright part of the candidates: clouds pass;
-    walls, foliage and wires seldom do. window_px: in which contrast is measured, by default a
-    hundredth of the width.
+    """Return the mask of pixels as smooth and about as bright as the bright part of the candidates.
+
+    Clouds pass; walls, foliage and wires seldom do.
+
+    Args:
+        rgb: the image.
+        candidates: pixels that may be sky.
+        window_px: side of the window in which contrast is measured; None takes a hundredth of the
+            width.
     """
     if not candidates.any():
         return np.zeros_like(candidates)
-    side = window_px or 2 * max(1, round(_WINDOW_PART * rgb.shape[1] / 2)) + 1
-    luma, window = _luma(rgb), (side, side)
+    side_px = window_px or 2 * max(1, round(_WINDOW_PART * rgb.shape[1] / 2)) + 1
+    luma = _luma(rgb)
+    window = (side_px, side_px)
     mean = cv2.blur(luma, window)
-    smooth = cv2.blur(luma * luma, window) - mean * mean < _SMOOTH_LEVELS**2
-    bright = float(np.quantile(luma[candidates], 0.9))
-    return smooth & (mean > max(bright - _DARK_LEVELS, _MIN_LUMA))
+    is_smooth = cv2.blur(luma * luma, window) - mean * mean < _SMOOTH_LEVELS**2
+    bright_luma = float(np.quantile(luma[candidates], 0.9))
+    return is_smooth & (mean > max(bright_luma - _DARK_LEVELS, _MIN_LUMA))
 
 
-def _cut(
+def _cut_sky(
     image: UInt8[np.ndarray, "H W 3"], labels: UInt8[np.ndarray, "H W"], rounds: int
 ) -> Bool[np.ndarray, "H W"]:
-    """The graph cut's sky. labels: OpenCV's, of which the cut's take the place."""
+    """Return the sky of a graph cut.
+
+    Args:
+        image: the image, as OpenCV has it.
+        labels: OpenCV's labels of the pixels, which the cut's replace in place.
+        rounds: rounds of the cut.
+    """
     is_sky = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
     if not is_sky.any() or is_sky.all():
         return is_sky
-    cv2.setRNGSeed(0)  # this thread's: the colours' first clusters are drawn from it
+    # The colours' first clusters are drawn from the generator of this thread.
+    cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(image, labels, (0, 0, 1, 1), *models, rounds, cv2.GC_INIT_WITH_MASK)
     return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
 
 
-def _grown(mask: np.ndarray, rows: int, columns: int) -> np.ndarray:
+def _grow_mask(mask: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Return a mask grown by a window of so many rows and columns."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((rows, columns), np.uint8)) > 0
 
 
 def elevation_rad(camera: Camera) -> Float[np.ndarray, "H W"]:
-    """Of every pixel's ray above the world's horizontal plane."""
+    """Return the elevation of every pixel's ray above the world's horizontal plane."""
     rays = camera.ray_directions().numpy()
     return np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
 
 
 def _sweep_points(scene: Scene, frame: int, dtype: type[np.floating]) -> np.ndarray | None:
-    """Finite points [N, 3] of a frame's sweep in the scene's world; None without a sweep."""
+    """Return the finite points [N, 3] of a frame's sweep, scene world; None without a sweep."""
     sweep = scene.lidar(frame)
     if sweep is None:
         return None
@@ -108,28 +153,35 @@ def _sweep_points(scene: Scene, frame: int, dtype: type[np.floating]) -> np.ndar
     return points[np.isfinite(points).all(1)]
 
 
-def _top_rad(points: np.ndarray, centre: np.ndarray, least: int = 1) -> float | None:
-    """The highest elevation of returns that are not close, a few stray ones left out; None of fewer
-    than `least`.
+def _top_rad(points: np.ndarray, centre: np.ndarray, min_returns: int = 1) -> float | None:
+    """Return the highest elevation of returns that are not close, without a few stray ones.
+
+    Args:
+        points: the returns, [N, 3].
+        centre: where they are seen from, [3].
+        min_returns: number of returns below which the result is None.
     """
     offset = points - centre
     distance_m = np.hypot(offset[:, 0], offset[:, 1])
-    far = distance_m > _TOP_FROM_M
-    if far.sum() < least:
+    is_far = distance_m > _TOP_FROM_M
+    if is_far.sum() < min_returns:
         return None
-    return float(np.quantile(np.arctan2(offset[far, 2], distance_m[far]), _TOP_QUANTILE))
+    return float(np.quantile(np.arctan2(offset[is_far, 2], distance_m[is_far]), _TOP_QUANTILE))
 
 
-# ---- By the image alone --------------------------------------------------------------------------
+# ---- Sky by the image alone ----------------------------------------------------------------------
 
 
 class RecordedSky(NamedTuple):
-    """Of an image: pixels that surely show sky, and that surely show none; what is neither cannot
-    be told.
+    """Sky of one image.
+
+    Pixels in neither mask cannot be told.
     """
 
     sky: Bool[np.ndarray, "H W"]
+    """Pixels that surely show sky."""
     solid: Bool[np.ndarray, "H W"]
+    """Pixels that surely show no sky."""
 
 
 def find_sky(
@@ -138,39 +190,47 @@ def find_sky(
     hits: Bool[np.ndarray, "H W"] | None = None,
     lidar_top_rad: float = math.inf,
 ) -> RecordedSky | None:
-    """What an image shows of the sky; None where nothing is bright and smooth enough to begin with:
-    night, or no sky in view.
+    """Return the sky of an image; None at night, or with no sky in view.
 
-    elevation_rad: of the pixels' rays above the horizon. hits: pixels with a LiDAR return.
-    lidar_top_rad: where the LiDAR's view ends; above a surface that reaches it, a wall may go on.
+    In these cases nothing is bright and smooth enough to begin with.
+
+    Args:
+        rgb: the image.
+        elevation_rad: elevation of the pixels' rays above the horizon.
+        hits: pixels with a LiDAR return; None without LiDAR.
+        lidar_top_rad: elevation at which the LiDAR's view ends; above a surface that reaches it, a
+            wall may go on.
     """
-    above = elevation_rad > 0
-    if not above.any():
-        return RecordedSky(above, ~above)
-    solid = unknown = np.zeros(above.shape, bool)
+    is_above_horizon = elevation_rad > 0
+    if not is_above_horizon.any():
+        return RecordedSky(is_above_horizon, ~is_above_horizon)
+    is_solid = is_unknown = np.zeros(is_above_horizon.shape, bool)
     if hits is not None:
-        solid = _grown(hits, _HIT_PX, _HIT_PX)
-        reaches = np.any(hits & (elevation_rad > lidar_top_rad - TOP_MARGIN_RAD), axis=0)[None]
-        over = np.cumsum(solid, axis=0) == 0  # above all returns of its column
-        unknown = over & above & _grown(reaches, 1, _BESIDE_PX)
-    bright = looks_like_sky(rgb, above, _WINDOW_PX)
-    first = _reaching_top(bright & above & ~solid & ~unknown)
-    if first.mean() < _MIN_PART:
+        is_solid = _grow_mask(hits, _HIT_PX, _HIT_PX)
+        reaches_top = np.any(hits & (elevation_rad > lidar_top_rad - TOP_MARGIN_RAD), axis=0)[None]
+        is_above_returns = np.cumsum(is_solid, axis=0) == 0  # above all returns of the column
+        is_unknown = is_above_returns & is_above_horizon & _grow_mask(reaches_top, 1, _BESIDE_PX)
+    is_bright = looks_like_sky(rgb, is_above_horizon, _WINDOW_PX)
+    sky_seed = _regions_at_top(is_bright & is_above_horizon & ~is_solid & ~is_unknown)
+    if sky_seed.mean() < _MIN_PART:
         return None
     luma = _luma(rgb)
-    shines = above & ~solid & ~unknown & (luma > np.median(luma[first]))  # lit clouds
-    mask = np.full(above.shape, cv2.GC_PR_BGD, np.uint8)
-    mask[~above | solid] = cv2.GC_BGD
-    mask[first | shines] = cv2.GC_PR_FGD
-    mask[cv2.erode(first.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0] = cv2.GC_FGD
-    sky = first
-    if (mask == cv2.GC_FGD).any() and (mask == cv2.GC_BGD).any():
+    is_shining = (
+        is_above_horizon & ~is_solid & ~is_unknown & (luma > np.median(luma[sky_seed]))
+    )  # lit clouds
+    labels = np.full(is_above_horizon.shape, cv2.GC_PR_BGD, np.uint8)
+    labels[~is_above_horizon | is_solid] = cv2.GC_BGD
+    labels[sky_seed | is_shining] = cv2.GC_PR_FGD
+    labels[cv2.erode(sky_seed.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0] = cv2.GC_FGD
+    sky = sky_seed
+    if (labels == cv2.GC_FGD).any() and (labels == cv2.GC_BGD).any():
         bgr = np.ascontiguousarray(rgb[..., ::-1])
-        sky = _cut(bgr, mask, _CUTS) & above & ~unknown
-    return RecordedSky(sky, ~(sky | unknown | shines))
+        sky = _cut_sky(bgr, labels, _CUTS) & is_above_horizon & ~is_unknown
+    return RecordedSky(sky, ~(sky | is_unknown | is_shining))
 
 
-def _reaching_top(region: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+def _regions_at_top(region: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Return the connected regions that reach the image's first row."""
     labels = cv2.connectedComponents(region.astype(np.uint8))[1]
     top = np.unique(labels[0])
     return np.isin(labels, top[top > 0])
@@ -179,16 +239,24 @@ def _reaching_top(region: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
 def recorded_sky(
     scene: Scene, frame: Frame, name: str, width: int = WORK_WIDTH
 ) -> RecordedSky | None:
-    """`find_sky` of the recorded image of a camera in a frame, `width` columns wide at most; None
-    where there is no image that can be read, or it tells nothing.
+    """Return the sky of a camera's recorded image in a frame, as `find_sky`.
+
+    None where there is no image that can be read, or where it tells nothing.
+
+    Args:
+        scene: the scene.
+        frame: one of its frames.
+        name: name of the camera.
+        width: columns of the image, at most.
     """
-    full = frame.cameras[name]
-    camera = full.scaled(min(1.0, width / full.width))
+    full_camera = frame.cameras[name]
+    camera = full_camera.scaled(min(1.0, width / full_camera.width))
     key = "recorded sky", frame.index, name, camera.width
     return memo_of(scene).get(key, lambda: (_recorded_sky(scene, frame, camera),))[0]
 
 
 def _recorded_sky(scene: Scene, frame: Frame, camera: Camera) -> RecordedSky | None:
+    """Return the sky of a frame's image at the camera's size, as `recorded_sky`."""
     path = frame.image_paths.get(camera.name)
     rgb = None if path is None else read_small_image(Path(path), camera)
     if rgb is None:
@@ -206,7 +274,7 @@ def _recorded_sky(scene: Scene, frame: Frame, camera: Camera) -> RecordedSky | N
 
 
 def read_small_image(path: Path, camera: Camera) -> np.ndarray | None:
-    """RGB of an image at the camera's size; None for what is no image of its proportions."""
+    """Return an image at the camera's size, RGB; None for what is no image of its proportions."""
     image = decode_image(path, cv2.IMREAD_REDUCED_COLOR_2)
     if image is None:
         return None
@@ -218,6 +286,7 @@ def read_small_image(path: Path, camera: Camera) -> np.ndarray | None:
 
 
 def _sweep(scene: Scene, frame: Frame) -> np.ndarray | None:
+    """Return the points of a frame's sweep; None without one that can be read."""
     try:
         return _sweep_points(scene, frame.index, np.float32)
     except Exception:  # a damaged sweep is its own frame's matter, and not that of the sky
@@ -225,24 +294,26 @@ def _sweep(scene: Scene, frame: Frame) -> np.ndarray | None:
 
 
 def _hits(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels with a return."""
+    """Return the mask of pixels with a LiDAR return."""
     pose = camera.camera_from_world.numpy().astype(np.float32)
     local = points @ pose[:3, :3].T + pose[:3, 3]
     local = local[local[:, 2] > 0.5]
     u = np.floor(camera.fx * local[:, 0] / local[:, 2] + camera.cx)
     v = np.floor(camera.fy * local[:, 1] / local[:, 2] + camera.cy)
-    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    is_inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     hits = np.zeros((camera.height, camera.width), bool)
-    hits[v[inside].astype(int), u[inside].astype(int)] = True
+    hits[v[is_inside].astype(int), u[is_inside].astype(int)] = True
     return hits
 
 
-# ---- By a raw scene, for those that learn from images --------------------------------------------
+# ---- Sky by the surfaces of a scene from LiDAR, for training views -------------------------------
 
 
 def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
-    """Highest elevation that the LiDAR looks at, as cameras see it: what the labels know, or from
-    the frames' returns (too low where nothing tall stood near); None without enough of them.
+    """Return the highest elevation that the LiDAR looks at, as cameras see it.
+
+    It is known from the labels, or measured from the returns of some frames (too low where nothing
+    tall stood near). None where there are not enough of them.
     """
     if isinstance(scene.labels, KnowsLidarTop):
         return scene.labels.lidar_top_rad
@@ -266,93 +337,121 @@ def sky_mask(
     returns: Int[np.ndarray, " M"],
     lidar_top_rad: float | None,
 ) -> Bool[np.ndarray, "H W"]:
-    """Pixels of the view that show sky; none where nothing can be known. scene: as initialised from
-    LiDAR. returns: pixels with a LiDAR return.
+    """Return the mask of the view's pixels that show sky; empty where nothing can be known.
+
+    Args:
+        scene: the scene, as initialised from LiDAR.
+        camera: the view.
+        rgb: the recorded image.
+        returns: flat indices of pixels with a LiDAR return.
+        lidar_top_rad: highest elevation that the LiDAR looks at; None where unknown.
     """
-    none = np.zeros((camera.height, camera.width), np.bool_)
+    empty_mask = np.zeros((camera.height, camera.width), np.bool_)
     if lidar_top_rad is None:
-        return none
+        return empty_mask
     alpha = rasterize(scene.parts_for(camera), camera, buffers=(ALPHA,)).alpha
     assert alpha is not None
-    drawn = alpha.numpy() > _DRAWN_ALPHA
-    hit = none.copy()
-    hit.reshape(-1)[returns] = True  # also thin things that are not in the scene: wires, twigs
-    free = _above_surfaces(camera, drawn | hit, lidar_top_rad)
-    sure = free & looks_like_sky(rgb, free)
-    rise = camera.ray_directions().numpy()[..., 2]
-    above = (rise > 0) & ~hit
-    likely = above & ~drawn & _as_bright_as_sky(rgb, free if free.any() else above)
-    if not likely.any():
-        return none
-    labels = np.full(none.shape, cv2.GC_PR_BGD, np.uint8)
-    labels[likely] = cv2.GC_PR_FGD
-    labels[sure] = cv2.GC_FGD
-    labels[~above] = cv2.GC_BGD
-    small = _small(rgb, cv2.INTER_AREA), _small(labels, cv2.INTER_NEAREST)
-    sky = _refined(rgb, _cut(*small, _MASK_CUTS)) & above & ~_grown(hit, 3, 3)
-    return _joined_to(sky, sure) & ~_thin(rgb, sky)
+    is_covered = alpha.numpy() > _DRAWN_ALPHA
+    has_return = empty_mask.copy()
+    has_return.reshape(-1)[returns] = (
+        True  # also thin things that are not in the scene: wires, twigs
+    )
+    is_open = _find_open_pixels(camera, is_covered | has_return, lidar_top_rad)
+    is_sure = is_open & looks_like_sky(rgb, is_open)
+    ray_rise = camera.ray_directions().numpy()[..., 2]
+    is_above_horizon = (ray_rise > 0) & ~has_return
+    is_likely = (
+        is_above_horizon
+        & ~is_covered
+        & _as_bright_as_sky(rgb, is_open if is_open.any() else is_above_horizon)
+    )
+    if not is_likely.any():
+        return empty_mask
+    labels = np.full(empty_mask.shape, cv2.GC_PR_BGD, np.uint8)
+    labels[is_likely] = cv2.GC_PR_FGD
+    labels[is_sure] = cv2.GC_FGD
+    labels[~is_above_horizon] = cv2.GC_BGD
+    small = _shrink(rgb, cv2.INTER_AREA), _shrink(labels, cv2.INTER_NEAREST)
+    sky = (
+        _refine_mask(rgb, _cut_sky(*small, _MASK_CUTS))
+        & is_above_horizon
+        & ~_grow_mask(has_return, 3, 3)
+    )
+    return _keep_sure_pieces(sky, is_sure) & ~_find_thin_things(rgb, sky)
 
 
 def _as_bright_as_sky(rgb: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """What `looks_like_sky`, and clouds' edges: brighter than most of the candidates."""
+    """Return the pixels of `looks_like_sky`, and those brighter than most of the candidates."""
     luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     if not candidates.any():
         return candidates
-    bright = max(float(np.quantile(luma[candidates], 0.9)), _MIN_LUMA)
-    return looks_like_sky(rgb, candidates) | (luma > bright)
+    bright_luma = max(float(np.quantile(luma[candidates], 0.9)), _MIN_LUMA)
+    return looks_like_sky(rgb, candidates) | (luma > bright_luma)
 
 
-def _small(image: np.ndarray, how: int) -> np.ndarray:
-    """An image [H, W, ...] as the graph cut takes it."""
+def _shrink(image: np.ndarray, interpolation: int) -> np.ndarray:
+    """Return an image [H, W, ...] at the size that the graph cut works on."""
     height, width = image.shape[:2]
-    across = min(_MASK_WIDTH, width)
-    return cv2.resize(image, (across, max(1, round(height * across / width))), interpolation=how)
+    num_columns = min(_MASK_WIDTH, width)
+    return cv2.resize(
+        image,
+        (num_columns, max(1, round(height * num_columns / width))),
+        interpolation=interpolation,
+    )
 
 
-def _refined(rgb: np.ndarray, small: np.ndarray) -> np.ndarray:
-    """The small mask at the image's size, along its edges."""
+def _refine_mask(rgb: np.ndarray, small_mask: np.ndarray) -> np.ndarray:
+    """Return a small mask at the image's size, along the image's edges."""
     height, width = rgb.shape[:2]
-    mask = cv2.resize(small.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    mask = cv2.resize(
+        small_mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR
+    )
     radius = max(2, round(_EDGE_PART * width))
     return cv2.ximgproc.guidedFilter(rgb, mask, radius, _EDGE_LEVELS**2) > 0.5
 
 
-def _joined_to(sky: np.ndarray, sure: np.ndarray) -> np.ndarray:
-    """The sky's connected pieces that are sure in part or reach the image's upper border: a bright
-    window is neither. Wires part nothing.
+def _keep_sure_pieces(sky: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
+    """Return the connected pieces of sky that are sure in part or reach the image's first row.
+
+    A bright window is neither. Wires do not divide pieces.
     """
     border = max(2, round(_BORDER_PART * sky.shape[1]))
-    grown = _grown(sky, 2 * border + 1, 2 * border + 1).astype(np.uint8)
-    pieces = np.asarray(cv2.connectedComponents(grown, connectivity=4)[1], np.int32)
-    kept = np.zeros(int(pieces.max()) + 1, np.bool_)
-    kept[pieces[sure & sky]] = True
-    kept[pieces[0][sky[0]]] = True
-    return kept[pieces] & sky
+    grown_sky = _grow_mask(sky, 2 * border + 1, 2 * border + 1).astype(np.uint8)
+    pieces = np.asarray(cv2.connectedComponents(grown_sky, connectivity=4)[1], np.int32)
+    is_kept = np.zeros(int(pieces.max()) + 1, np.bool_)
+    is_kept[pieces[is_sure & sky]] = True
+    is_kept[pieces[0][sky[0]]] = True
+    return is_kept[pieces] & sky
 
 
-def _thin(rgb: np.ndarray, sky: np.ndarray) -> np.ndarray:
-    """Pixels clearly darker than the sky around them: poles, wires and twigs, which are too thin
-    for the cut.
+def _find_thin_things(rgb: np.ndarray, sky: np.ndarray) -> np.ndarray:
+    """Return the pixels clearly darker than the sky around them.
+
+    They are poles, wires and twigs, which are too thin for the cut.
     """
     luma = _luma(rgb)
-    side = (2 * round(_THIN_PART * rgb.shape[1] / 2) + 1,) * 2
-    share = sky.astype(np.float32)
-    mean = cv2.blur(luma * share, side) / np.maximum(cv2.blur(share, side), 1e-3)
+    window = (2 * round(_THIN_PART * rgb.shape[1] / 2) + 1,) * 2
+    sky_weight = sky.astype(np.float32)
+    mean = cv2.blur(luma * sky_weight, window) / np.maximum(cv2.blur(sky_weight, window), 1e-3)
     return luma < mean - _THIN_LEVELS
 
 
-def _above_surfaces(camera: Camera, drawn: np.ndarray, lidar_top_rad: float) -> np.ndarray:
-    """What lies above the top-most surface of its column, where that is sure to be its end."""
+def _find_open_pixels(camera: Camera, is_covered: np.ndarray, lidar_top_rad: float) -> np.ndarray:
+    """Return the pixels above the highest surface of their column, where it surely ends there."""
     border = max(2, round(_BORDER_PART * camera.width))
-    solid = cv2.morphologyEx(
-        drawn.astype(np.uint8), cv2.MORPH_OPEN, np.ones((_DRAWN_PIXELS, 1), np.uint8)
+    is_solid = cv2.morphologyEx(
+        is_covered.astype(np.uint8), cv2.MORPH_OPEN, np.ones((_DRAWN_PIXELS, 1), np.uint8)
     )
     rays = camera.ray_directions().numpy()
-    rise = rays[..., 2] / np.linalg.norm(rays, axis=2)
-    last = len(drawn) - 1
-    top = np.where(solid.any(axis=0), solid.argmax(axis=0), last)
-    known = rise[top, np.arange(camera.width)] < math.sin(lidar_top_rad - TOP_MARGIN_RAD)
+    ray_rise = rays[..., 2] / np.linalg.norm(rays, axis=2)
+    last_row = len(is_covered) - 1
+    top_row = np.where(is_solid.any(axis=0), is_solid.argmax(axis=0), last_row)
+    is_known = ray_rise[top_row, np.arange(camera.width)] < math.sin(lidar_top_rad - TOP_MARGIN_RAD)
     # A column beside one whose surface goes on may show the same surface, leaning.
-    known = cv2.erode(known.astype(np.uint8)[None], np.ones((1, 2 * border + 1), np.uint8))[0] > 0
-    covered = np.maximum.accumulate(_grown(drawn, 2 * border + 1, 2 * border + 1), axis=0)
-    return known[None] & ~covered
+    is_known = (
+        cv2.erode(is_known.astype(np.uint8)[None], np.ones((1, 2 * border + 1), np.uint8))[0] > 0
+    )
+    is_shadowed = np.maximum.accumulate(
+        _grow_mask(is_covered, 2 * border + 1, 2 * border + 1), axis=0
+    )
+    return is_known[None] & ~is_shadowed

@@ -13,11 +13,17 @@ from typing import SupportsIndex
 
 import numpy as np
 
-# SplitMix64 (Steele, Lea and Flood 2014, "Fast Splittable Pseudorandom Number Generators"), and odd
-# factors, far apart in all their bits, for the numbers that are mixed.
-MIX_A, MIX_B = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
-STEP_X, STEP_Y = 0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F
-_DOMAIN = "climategs effect 1"  # a change of the scheme changes this, never silently a number
+# First factor of SplitMix64 (Steele, Lea and Flood 2014, "Fast Splittable Pseudorandom Number
+# Generators").
+MIX_A = 0xBF58476D1CE4E5B9
+# Second factor of SplitMix64.
+MIX_B = 0x94D049BB133111EB
+# Odd factor of the first number that is mixed.
+STEP_X = 0x9E3779B97F4A7C15
+# Odd factor of the second number that is mixed, far from STEP_X in all its bits.
+STEP_Y = 0xC2B2AE3D27D4EB4F
+# Name of the scheme in every key: a change of the scheme changes this, never silently a number.
+_DOMAIN = "climategs effect 1"
 
 
 def rng_for(
@@ -28,12 +34,18 @@ def rng_for(
     frame: SupportsIndex | None = None,
     camera: str | None = None,
 ) -> np.random.Generator:
-    """A generator for one effect, keyed by a SHA-256 of the arguments.
+    """Return a generator for one effect, keyed by a SHA-256 of the arguments.
 
-    seed: the recipe's, >= 0. scene: the scene's name. effect: which use this is, "snow.flakes" say;
-    two uses of the same key draw the same numbers. frame: index; camera: name. Leave out frame
-    where the result must persist over time, camera where all views must agree: None is a key of
-    its own.
+    Leave out `frame` where the result must persist over time, and `camera` where all views must
+    agree: None is a key of its own.
+
+    Args:
+        seed: the recipe's seed, >= 0.
+        scene: name of the scene.
+        effect: name of the use, "snow.flakes" for example; two uses of one key draw the same
+            numbers.
+        frame: index of the frame.
+        camera: name of the camera.
 
     Raises:
         ValueError: seed or frame is negative, or effect is empty.
@@ -51,7 +63,10 @@ def rng_for(
 
 
 def mix(bits: np.ndarray) -> np.ndarray:
-    """uint64 of which every bit hangs on every bit given; `augment.kernels.mix` in kernels."""
+    """Return uint64 of which every bit depends on every bit of the argument.
+
+    `augment.kernels.mix` is the same in kernels.
+    """
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(MIX_A)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(MIX_B)
     return bits ^ (bits >> np.uint64(31))

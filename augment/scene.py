@@ -1,4 +1,9 @@
-"""A driving scene: Gaussians, moving actors, sky, cameras over time, labels."""
+"""Records of a driving scene: Gaussians, moving actors, sky, cameras over time, labels.
+
+Adapters build a `Scene`; planning, effects, rendering and jobs read it. All records are frozen; a
+changed scene is a `dataclasses.replace` of the old one. Symbols: N Gaussians, T samples of time, K
+spherical harmonics, terms of a Fourier series, R runs of rows.
+"""
 
 from __future__ import annotations
 
@@ -25,25 +30,26 @@ from augment.render.sh import rotate_sh, sh_turn
 from augment.render.threads import kernel_threads
 from augment.sky import Sky
 
-# ---- Where an actor is over time -----------------------------------------------------------------
+# ---- Poses of an actor over time -----------------------------------------------------------------
 
-_STRAIGHT_RAD = 1e-6  # sin of a smaller angle loses its digits; the straight line is exact there
+# Angle below which sin loses its digits; the straight line is exact there.
+_STRAIGHT_RAD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Where an actor is over time. Linear in position, slerp in rotation, between samples.
-
-    timestamps_ns: int64 [T], strictly increasing. world_from_actor: float64 [T, 4, 4].
-    hold_ns: how long the actor stays at a pose before the first and after the last sample, and at
-    both ends of a gap longer than max_gap_ns (None: always interpolated); beyond it the actor is
-    absent. (Cameras of a frame fire at slightly different moments.)
-    """
+    """Poses of an actor over time: between samples linear in position, slerp in rotation."""
 
     timestamps_ns: Tensor
+    """Times of the samples, int64 [T], strictly increasing."""
     world_from_actor: Float[Tensor, "T 4 4"]
+    """Poses of the samples, float64 [T, 4, 4]."""
     hold_ns: int = 100_000_000
+    """How long the actor stays at a pose before the first and after the last sample, and at both
+    ends of a gap longer than max_gap_ns; beyond that it is absent. (Cameras of one frame fire at
+    slightly different moments.)"""
     max_gap_ns: int | None = None
+    """Longest time between two samples that is interpolated; None interpolates all."""
 
     def __post_init__(self) -> None:
         count = self.timestamps_ns.shape[0]
@@ -56,7 +62,7 @@ class Track:
             raise ValueError("track timestamps must be strictly increasing")
 
     def pose_at(self, timestamp_ns: int) -> Float[Tensor, "4 4"] | None:
-        """world_from_actor at a time, float64, or None where the actor does not exist."""
+        """Return world_from_actor at a time, float64; None where the actor does not exist."""
         knots = self._knots
         times = knots.times_ns
         if not times[0] - self.hold_ns <= timestamp_ns <= times[-1] + self.hold_ns:
@@ -70,16 +76,21 @@ class Track:
         if self.max_gap_ns is not None and times[after] - times[before] > self.max_gap_ns:
             if timestamp_ns - times[before] <= self.hold_ns:
                 return self.world_from_actor[before]
-            is_near = times[after] - timestamp_ns <= self.hold_ns
-            return self.world_from_actor[after] if is_near else None
+            is_held = times[after] - timestamp_ns <= self.hold_ns
+            return self.world_from_actor[after] if is_held else None
         fraction = (timestamp_ns - times[before]) / (times[after] - times[before])
         rows = _rotation(_slerp(knots.quats[before], knots.quats[after], fraction))
-        for row, a, b in zip(rows, knots.centres[before], knots.centres[after], strict=True):
-            row.append(a + fraction * (b - a) if fraction < 0.5 else b - (b - a) * (1 - fraction))
+        for row, start, end in zip(rows, knots.centres[before], knots.centres[after], strict=True):
+            row.append(
+                start + fraction * (end - start)
+                if fraction < 0.5
+                else end - (end - start) * (1 - fraction)
+            )
         return torch.tensor([*rows, [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
 
     @cached_property
     def _knots(self) -> _Knots:
+        """Return the samples in Python's own numbers."""
         poses = self.world_from_actor.detach()
         return _Knots(
             self.timestamps_ns.tolist(),
@@ -88,66 +99,81 @@ class Track:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is cached, which is made anew in less time than it travels."""
+        """Return the fields only: what is cached is made anew in less time than it travels."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
 class _Knots(NamedTuple):
-    """A track in Python's own numbers: for a single pose, torch's and NumPy's calls take a hundred
-    times as long as the arithmetic. quats: wxyz, T of 4. centres: T of 3.
+    """Samples of a track in Python's own numbers.
+
+    For a single pose, calls of torch and NumPy take a hundred times as long as the arithmetic.
     """
 
     times_ns: list[int]
+    """Times, T of them."""
     quats: list[list[float]]
+    """Rotations as wxyz, T of 4."""
     centres: list[list[float]]
+    """Positions, metres, T of 3."""
 
 
 class PackedTracks(NamedTuple):
-    """All tracks of a scene for kernels.poses_at. starts int64 [A + 1]: the samples of each.
-    times_ns, quats [K, 4], centres [K, 3], poses [K, 4, 4]: of all samples. holds_ns, gaps_ns
-    int64 [A]: -1 where a track has no max_gap_ns.
-    """
+    """All A tracks of a scene, one after the other, for `kernels.poses_at`."""
 
     starts: np.ndarray
+    """First sample of each track, and the number of all samples K, int64 [A + 1]."""
     times_ns: np.ndarray
+    """Times of all samples, int64 [K]."""
     quats: np.ndarray
+    """Rotations of all samples as wxyz, float64 [K, 4]."""
     centres: np.ndarray
+    """Positions of all samples, metres, float64 [K, 3]."""
     poses: np.ndarray
+    """world_from_actor of all samples, float64 [K, 4, 4]."""
     holds_ns: np.ndarray
+    """hold_ns of each track, int64 [A]."""
     gaps_ns: np.ndarray
+    """max_gap_ns of each track, int64 [A]; -1 where it has none."""
 
     @staticmethod
     def of(tracks: Sequence[Track]) -> PackedTracks:
+        """Return the tracks packed, in their order."""
         knots = [track._knots for track in tracks]
-        starts = np.cumsum([0, *(len(own.times_ns) for own in knots)])
+        starts = np.cumsum([0, *(len(track_knots.times_ns) for track_knots in knots)])
         poses = [track.world_from_actor.detach().double().numpy() for track in tracks]
-        gaps = [-1 if track.max_gap_ns is None else track.max_gap_ns for track in tracks]
+        gaps_ns = [-1 if track.max_gap_ns is None else track.max_gap_ns for track in tracks]
         return PackedTracks(
             starts.astype(np.int64),
-            np.concatenate([np.array(own.times_ns, np.int64) for own in knots]),
-            np.concatenate([np.array(own.quats, np.float64) for own in knots]),
-            np.concatenate([np.array(own.centres, np.float64) for own in knots]),
+            np.concatenate([np.array(track_knots.times_ns, np.int64) for track_knots in knots]),
+            np.concatenate([np.array(track_knots.quats, np.float64) for track_knots in knots]),
+            np.concatenate([np.array(track_knots.centres, np.float64) for track_knots in knots]),
             np.ascontiguousarray(np.concatenate(poses)),
             np.array([track.hold_ns for track in tracks], np.int64),
-            np.array(gaps, np.int64),
+            np.array(gaps_ns, np.int64),
         )
 
 
 def _slerp(a: Sequence[float], b: Sequence[float], fraction: float) -> list[float]:
-    """As augment.geometry.slerp."""
+    """Return what `augment.geometry.slerp` gives, not normalised, of two unit quaternions."""
     dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     angle = math.acos(min(abs(dot), 1.0))
-    weight_a, weight_b = 1 - fraction, fraction
+    weight_a = 1 - fraction
+    weight_b = fraction
     if angle >= _STRAIGHT_RAD:
         sin = math.sin(angle)
-        weight_a, weight_b = math.sin(weight_a * angle) / sin, math.sin(weight_b * angle) / sin
+        weight_a = math.sin(weight_a * angle) / sin
+        weight_b = math.sin(weight_b * angle) / sin
     if dot < 0:  # the shorter way round
         weight_b = -weight_b
     return [weight_a * p + weight_b * q for p, q in zip(a, b, strict=True)]
 
 
 def _rotation(quat: Sequence[float]) -> list[list[float]]:
-    """Rows of the rotation of a wxyz quaternion of any length, as geometry.rotmat_from_quat."""
+    """Return the rows of a rotation matrix, as `geometry.rotmat_from_quat`.
+
+    Args:
+        quat: wxyz, of any length but zero.
+    """
     length = math.sqrt(sum(v * v for v in quat))
     w, x, y, z = (v / length for v in quat)
     return [
@@ -157,22 +183,25 @@ def _rotation(quat: Sequence[float]) -> list[list[float]]:
     ]
 
 
-# ---- Colours that change over time: a Fourier series of every splat's view-independent colour ----
-# Yan et al. 2024 (Street Gaussians), section 3.1, "4D spherical harmonics": sh_00(t) = sum_k c_k
-# b_k(t) with b_k = cos(pi k t) for even k, sin(pi (k + 1) t) for odd k.
+# ---- Colours that change over time ---------------------------------------------------------------
+# Every splat's view-independent colour is a Fourier series of time (Yan et al. 2024, "Street
+# Gaussians", section 3.1, "4D spherical harmonics"): sh_00(t) = sum_k c_k b_k(t), with b_k =
+# cos(pi k t) for even k and sin(pi (k + 1) t) for odd k.
 
 
 @dataclass(frozen=True, eq=False)
 class ColorWaves:
-    """What is added to sh[:, 0] of N Gaussians over time; c_0 is sh[:, 0] itself, as b_0 is 1.
+    """Change of sh[:, 0] of N Gaussians over time, as a Fourier series.
 
-    coefficients [N, F - 1, 3]: c_1 to c_{F-1}, of the Gaussians' dtype. timestamps_ns [T]: strictly
-    increasing. phases: float64 [T], t at these times; linear between them, held beyond them.
+    c_0 is sh[:, 0] itself, as b_0 is 1.
     """
 
     coefficients: Float[Tensor, "N terms 3"]
+    """c_1 to c_{F-1}, [N, F - 1, 3], of the Gaussians' dtype."""
     timestamps_ns: Int64[Tensor, "T"]
+    """Times at which `phases` are known, int64 [T], strictly increasing."""
     phases: Float[Tensor, "T"]
+    """Value of t at these times, float64 [T]; linear between them, held beyond them."""
 
     def __post_init__(self) -> None:
         count = self.timestamps_ns.shape[0]
@@ -188,24 +217,27 @@ class ColorWaves:
 
     @property
     def nbytes(self) -> int:
+        """Return the bytes of the coefficients."""
         return self.coefficients.numel() * self.coefficients.element_size()
 
     def phase_at(self, timestamp_ns: int) -> float:
-        times, phases = self.timestamps_ns.tolist(), self.phases.tolist()
+        """Return t of the series at a time."""
+        times = self.timestamps_ns.tolist()
+        phases = self.phases.tolist()
         after = bisect_right(times, timestamp_ns)
         if after == 0:
             return phases[0]
         if after == len(times):
             return phases[-1]
-        share = (timestamp_ns - times[after - 1]) / (times[after] - times[after - 1])
-        return phases[after - 1] + share * (phases[after] - phases[after - 1])
+        fraction = (timestamp_ns - times[after - 1]) / (times[after] - times[after - 1])
+        return phases[after - 1] + fraction * (phases[after] - phases[after - 1])
 
     def weights_at(self, timestamp_ns: int) -> list[float]:
-        """b_1 to b_{F-1} at a time."""
+        """Return b_1 to b_{F-1} at a time."""
         return basis(self.phase_at(timestamp_ns), self.coefficients.shape[1] + 1)[1:]
 
     def change_at(self, timestamp_ns: int) -> Float[Tensor, "N 3"]:
-        """What is added to sh[:, 0] at a time."""
+        """Return the colours to add to sh[:, 0] at a time."""
         weights = self.weights_at(timestamp_ns)
         change = torch.zeros_like(self.coefficients[:, 0])
         for term, weight in enumerate(weights):
@@ -214,7 +246,7 @@ class ColorWaves:
 
 
 def basis(phase: float, terms: int) -> list[float]:
-    """b_0 to b_{terms-1} at a phase."""
+    """Return b_0 to b_{terms-1} at a phase."""
     return [
         math.cos(math.pi * k * phase) if k % 2 == 0 else math.sin(math.pi * (k + 1) * phase)
         for k in range(terms)
@@ -229,61 +261,77 @@ def colors_at(
     *,
     fast: bool = True,
 ) -> Float[Tensor, "N K 3"]:
-    """SH in the colours of a time, and turned by a rotation, where there are such.
+    """Return SH in the colours of a time, turned by a rotation.
 
-    fast: float32 goes through the CPU kernel, equal to the definition here within float rounding.
+    Args:
+        sh: spherical harmonics of N Gaussians.
+        waves: their change over time; None leaves the colours.
+        timestamp_ns: the time.
+        turn: the rotation; None turns nothing.
+        fast: send float32 through the CPU kernel, which equals the definition here within float
+            rounding.
     """
     if fast and sh.dtype == torch.float32 and not sh.requires_grad:
         return _colors_by_kernel(sh, waves, timestamp_ns, turn)
     if waves is not None:
-        first = sh[:, :1] + waves.change_at(timestamp_ns)[:, None]
-        sh = torch.cat([first, sh[:, 1:]], 1)
+        base_colors = sh[:, :1] + waves.change_at(timestamp_ns)[:, None]
+        sh = torch.cat([base_colors, sh[:, 1:]], 1)
     return sh if turn is None or sh.shape[1] == 1 else rotate_sh(sh, turn)
 
 
 def _colors_by_kernel(
     sh: Tensor, waves: ColorWaves | None, timestamp_ns: int, turn: Tensor | None
 ) -> Tensor:
-    coefficients, weights = np.zeros((len(sh), 0, 3), np.float32), []
+    """Return `colors_at` of float32 values, by the CPU kernel."""
+    coefficients = np.zeros((len(sh), 0, 3), np.float32)
+    weights = []
     if waves is not None:
         coefficients = waves.coefficients.detach().contiguous().numpy()
         weights = waves.weights_at(timestamp_ns)
-    matrix = np.zeros((0, 0), np.float32)
+    turn_matrix = np.zeros((0, 0), np.float32)
     if turn is not None and sh.shape[1] > 1:
-        matrix = sh_turn(turn, math.isqrt(sh.shape[1]) - 1).numpy().astype(np.float32)
+        turn_matrix = sh_turn(turn, math.isqrt(sh.shape[1]) - 1).numpy().astype(np.float32)
     out = np.empty(tuple(sh.shape), np.float32)
-    rows, terms = sh.detach().contiguous().numpy(), np.asarray(weights, np.float32)
+    sh_rows = sh.detach().contiguous().numpy()
+    term_weights = np.asarray(weights, np.float32)
     with kernel_threads(1):
-        kernels.colors_at(rows, coefficients, terms, matrix, out)
+        kernels.colors_at(sh_rows, coefficients, term_weights, turn_matrix, out)
     return torch.from_numpy(out)
 
 
-MAX_EXTENT_M = 1e7  # float32 tells metres apart there, and squares and cells are still numbers
-SH_COUNTS = (1, 4, 9, 16)  # K = (degree + 1)^2 for degrees 0 to 3
+# Largest coordinate or scale of a usable Gaussian, metres. Float32 still tells metres apart there,
+# and squares and cells are still numbers.
+MAX_EXTENT_M = 1e7
+# Numbers K of spherical harmonics that Gaussians may have: (degree + 1)^2 for degrees 0 to 3.
+SH_COUNTS = (1, 4, 9, 16)
 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
     """N Gaussians with activated values.
 
-    means [N, 3]: metres. quats [N, 4]: unit wxyz. scales [N, 3]: metres, > 0 along the rotated
-    axes. opacities [N]: in [0, 1]. sh [N, K, 3]: spherical harmonics, colour = 0.5 + sum sh Y.
-    semantic [N]: SemanticClass values, or None where unknown.
     All float tensors share one dtype (float32; float64 for the reference rasteriser).
     """
 
     means: Float[Tensor, "N 3"]
+    """Centres, metres, [N, 3]."""
     quats: Float[Tensor, "N 4"]
+    """Rotations, unit wxyz, [N, 4]."""
     scales: Float[Tensor, "N 3"]
+    """Standard deviations along the rotated axes, metres, > 0, [N, 3]."""
     opacities: Float[Tensor, "N"]
+    """Opacities, 0 to 1, [N]."""
     sh: Float[Tensor, "N K 3"]
+    """Spherical harmonics, [N, K, 3]; colour = 0.5 + sum sh Y."""
     semantic: Int16[Tensor, "N"] | None = None
+    """SemanticClass values, [N]; None where unknown."""
 
     def __post_init__(self) -> None:
         count = self.means.shape[0]
         columns = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
-        for name, own in columns.items():
-            value, shape = getattr(self, name), (count, *own)
+        for name, suffix in columns.items():
+            value = getattr(self, name)
+            shape = (count, *suffix)
             if tuple(value.shape) != shape:
                 raise ValueError(
                     f"{name} must be {list(shape)} with N={count} (from means); "
@@ -308,43 +356,49 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
+        """Return the degree of the spherical harmonics, 0 to 3."""
         return SH_COUNTS.index(self.sh.shape[1])
 
     @property
     def nbytes(self) -> int:
+        """Return the bytes of all tensors."""
         return sum(t.numel() * t.element_size() for t in self._tensors().values())
 
     def _tensors(self) -> dict[str, Tensor]:
+        """Return the tensors by field name, without those that are None."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return {name: value for name, value in values.items() if value is not None}
 
     def select(self, index: Tensor) -> Gaussians:
-        """The Gaussians at the given indices or mask, in that order."""
+        """Return the Gaussians at the given indices or mask, in that order."""
         return Gaussians(**{name: tensor[index] for name, tensor in self._tensors().items()})
 
     @staticmethod
     def empty(sh_degree: int = 0) -> Gaussians:
+        """Return no Gaussians, of float32."""
         shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, SH_COUNTS[sh_degree], 3))
         return Gaussians(*(torch.zeros(shape) for shape in shapes))
 
 
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """A rigid moving object: its Gaussians in its own frame (x forward, y left, z up, origin at the
-    box centre), its track, and its box size (length, width, height in metres).
-
-    color_waves: how its colours change over time; None where they do not. It has a row for each of
-    the Gaussians. colors_in_world: its SH are for directions of the world, whichever way it is
-    turned, as Street Gaussians and drivestudio train them, and not for those of its own frame.
-    """
+    """A rigid moving object."""
 
     track_id: str
+    """Name of the actor, unique in its scene."""
     label: str
+    """Name of the object's kind in the dataset."""
     gaussians: Gaussians
+    """Gaussians in the actor's own frame: x forward, y left, z up, origin at the box centre."""
     track: Track
+    """Poses over time."""
     size_m: tuple[float, float, float]
+    """Length, width and height of the box, metres."""
     color_waves: ColorWaves | None = None
+    """Change of the colours over time, a row for each Gaussian; None where there is none."""
     colors_in_world: bool = False
+    """If True, SH are for directions of the world, however the actor is turned, as Street Gaussians
+    and drivestudio train them; else for directions of its own frame."""
 
     def __post_init__(self) -> None:
         waves = self.color_waves
@@ -355,65 +409,75 @@ class Actor:
             )
 
     def gaussians_at(self, timestamp_ns: int) -> Gaussians:
-        """Its Gaussians in the colours they have at a time, SH for directions in its own frame. The
-        last moment's are kept, for other cameras that look at it.
+        """Return the Gaussians in the colours of a time, SH for directions in the actor's own
+        frame.
+
+        The colours of the last moment are kept, for other cameras that look at it.
         """
         pose = self.track.pose_at(timestamp_ns) if self.colors_in_world else None
         turn = None if pose is None or self.gaussians.sh_degree == 0 else pose[:3, :3].T
         if self.color_waves is None and turn is None:
             return self.gaussians
-        own, waves = self.gaussians, self.color_waves
+        gaussians = self.gaussians
+        waves = self.color_waves
 
         def color() -> Gaussians:
-            return replace(own, sh=colors_at(own.sh, waves, timestamp_ns, turn))
+            return replace(gaussians, sh=colors_at(gaussians.sh, waves, timestamp_ns, turn))
 
-        read = [own.sh, *([] if waves is None else [waves.coefficients])]
-        if any(tensor.requires_grad or tensor.is_inference() for tensor in read):
+        inputs = [gaussians.sh, *([] if waves is None else [waves.coefficients])]
+        if any(tensor.requires_grad or tensor.is_inference() for tensor in inputs):
             return color()
-        moment = timestamp_ns, *(tensor._version for tensor in read)
+        moment = timestamp_ns, *(tensor._version for tensor in inputs)
         return memo_of(self).get(("colours of a moment",), Latest).get(moment, color)
 
 
 @dataclass(frozen=True, eq=False)
 class SplatShading:
-    """Light that falls on every pixel of a splat by its own normal (see augment.render.shading).
+    """Light that falls on every pixel of a splat by its own normal n (`augment.render.shading`).
 
-    A splat's colour at a pixel is that of its SH plus slopes [N, 3] times the wrapped share of the
-    light, clamp((n . sun + wrap) / (1 + wrap), 0, 1). sun: unit, towards the light, in the part's
-    frame.
+    A splat's colour at a pixel is that of its SH, plus slopes times the wrapped share of the light,
+    clamp((n . sun + wrap) / (1 + wrap), 0, 1).
     """
 
     slopes: Float[Tensor, "N 3"]
+    """Colour that full light adds, [N, 3]."""
     sun: tuple[float, float, float]
+    """Unit vector towards the light, in the part's frame."""
     wrap: float
+    """How far light reaches round a splat; 0 for a plain cosine."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedGaussians:
-    """Gaussians placed in the world: what a rasteriser takes, so that nothing is concatenated.
+    """Gaussians in the world: the input of a rasteriser, which concatenates nothing.
 
-    world_from_part: float64 [4, 4], or None for the identity. instance_id: 0 for the background,
-    1 + the actor's index otherwise. is_overlay: whether they lie on
-    the scene, as snow does: the buffer "overlay" counts them, and styles leave their colours.
-    rows int64 [R, 2]: the runs (first, last + 1) that are drawn, None for all: of the backend cpu.
-    shading: None for splats of one colour each. color_maps [C, 3, 4]: of what every splat shows,
-    c' = max(M[:, :3] @ c + M[:, 3], 0): the map in the row of color_rows int16 [N], without them of
-    its class, the first where there is none such; None leaves the colours. A part has either
-    shading or maps.
+    A part has either `shading` or `color_maps`.
     """
 
     gaussians: Gaussians
+    """The Gaussians, in the part's frame."""
     world_from_part: Float[Tensor, "4 4"] | None = None
+    """Pose, float64 [4, 4]; None for the identity."""
     instance_id: int = 0
+    """0 for the background, else 1 + the actor's index."""
     is_overlay: bool = False
+    """If True, the part lies on the scene, as snow does: the buffer "overlay" counts it, and styles
+    leave its colours."""
     shading: SplatShading | None = None
+    """Light by the splats' normals; None for splats of one colour each."""
     color_maps: Float[Tensor, "C 3 4"] | None = None
+    """Maps of the colour c that a splat shows, [C, 3, 4]: c' = max(M[:, :3] @ c + M[:, 3], 0); None
+    leaves the colours."""
     color_rows: Int16[Tensor, "N"] | None = None
+    """Row of each splat's map, int16 [N]; None takes the row of its class, or the first where there
+    is no such row."""
     rows: Int64[np.ndarray, "R 2"] | None = None
+    """Runs (first, last + 1) of splats to render, int64 [R, 2], backend "cpu" only; None renders
+    all."""
 
     @property
     def map_rows(self) -> Int16[Tensor, "N"] | None:
-        """Of every splat among the colour maps; None where all take the first."""
+        """Return the row of each splat's colour map; None where all take the first."""
         if self.color_maps is None or len(self.color_maps) == 1:
             return None
         return self.gaussians.semantic if self.color_rows is None else self.color_rows
@@ -424,19 +488,21 @@ GroundSource = Literal["map", "lidar labels", "road splats", "ransac", "ego path
 
 @dataclass(frozen=True)
 class Ground:
-    """Where the road under the ego path is, scene world, and how that is known.
-
-    lowest_z_m, median_z_m: over the stretches of the path. residual_m: median distance of the
-    `points` used from the planes of their stretches, None without any. tilt_deg: angle between the
-    road's normal and +z (a road that slopes, or a gravity that is off); None where unknown.
-    """
+    """Heights of the road under the ego path, scene world, and how they are known."""
 
     lowest_z_m: float
+    """Lowest height of the path's stretches."""
     median_z_m: float
+    """Median height of the path's stretches."""
     source: GroundSource
+    """Origin of the heights."""
     residual_m: float | None = None
+    """Median distance of the `points` from the planes of their stretches; None without points."""
     points: int = 0
+    """Number of points that the planes were fitted to."""
     tilt_deg: float | None = None
+    """Angle between the road's normal and +z (a road that slopes, or a gravity that is off); None
+    where unknown."""
 
     def __post_init__(self) -> None:
         if not self.lowest_z_m <= self.median_z_m:  # also catches NaN
@@ -448,47 +514,50 @@ class Ground:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything that is known of a drive, in one world: metres, right-handed, +z up.
-
-    world_origin_m: what was subtracted from the dataset's coordinates, float64 [3].
-    ground_z_m: height of the road under the ego path (lowest), scene world; None where unknown.
-    has_metric_scale: False where one unit is not known to be one metre.
-    ground: the road's heights under the path and how they are known, where the adapter has measured
-    them or was told; None where `augment.ground.ground_of` has to measure. Where it is set,
-    ground_z_m is its lowest.
-    has_known_gravity: False where +z is not known to point up.
-    frames: in order of time, each with the scene's cameras. labels: boxes and LiDAR on demand.
-    problems: what the adapter found wrong and went on without, one sentence each.
-    source: the URI the scene was opened from; open_scene(source) opens it again.
-    color_maps: how a camera's recorded colours differ from the scene's, by camera name: float32
-    [3, 4], recorded = M[:, :3] @ rgb + M[:, 3], display-encoded. A camera without one records the
-    scene's own colours. image_color_maps: the same for single images, by camera name and
-    timestamp_ns; they go before color_maps.
-    recorded_source: the URI of the recording that a fitted scene was made from, for its labels;
-    None where `source` itself is the recording. made_by: how the Gaussians came about, facts for
-    people and reports in JSON's own types.
-    seen_frames: those that the scene was made from where `frames` are others (a camera path's,
-    invented ones); empty where they are not known.
-    """
+    """All facts about a drive, in one world: metres, right-handed, +z up."""
 
     name: str
+    """Name of the scene."""
     source: str
+    """URI that the scene was opened from; open_scene(source) opens it again."""
     background: Gaussians
+    """Gaussians of everything that does not move, in the world."""
     actors: tuple[Actor, ...]
+    """Moving objects."""
     sky: Sky
+    """Colour by direction, infinitely far away."""
     frames: tuple[Frame, ...]
+    """Frames in order of time, each with the scene's cameras."""
     labels: LabelSource | None = None
+    """Reader of boxes and LiDAR on demand; None without labels."""
     world_origin_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """Offset that was subtracted from the dataset's coordinates, float64 [3]."""
     ground_z_m: float | None = None
+    """Lowest height of the road under the ego path, scene world; None where unknown."""
     has_metric_scale: bool = True
+    """False where one unit is not known to be one metre."""
     problems: tuple[str, ...] = ()
+    """Faults that the adapter found and went on without, one sentence each."""
     color_maps: Mapping[str, Float[Tensor, "3 4"]] = field(default_factory=dict)
+    """Difference of a camera's recorded colours from the scene's, by camera name: float32 [3, 4],
+    recorded = M[:, :3] @ rgb + M[:, 3], display-encoded. A camera without one records the scene's
+    own colours."""
     recorded_source: str | None = None
+    """URI of the recording that a fitted scene was made from, for its labels; None where `source`
+    itself is the recording."""
     made_by: Mapping[str, Any] = field(default_factory=dict)
+    """Origin of the Gaussians: facts for people and reports, in JSON's own types."""
     ground: Ground | None = None
+    """Heights of the road under the path, where the adapter has measured them or was told; its
+    lowest is then `ground_z_m`. None where `augment.ground.ground_of` has to measure."""
     has_known_gravity: bool = True
+    """False where +z is not known to point up."""
     image_color_maps: Mapping[tuple[str, int], Float[Tensor, "3 4"]] = field(default_factory=dict)
+    """The same maps for single images, by camera name and timestamp_ns; they go before
+    `color_maps`."""
     seen_frames: tuple[Frame, ...] | None = None
+    """Frames that the scene was made from, where `frames` are others (those of a camera path, or
+    invented ones); empty where they are not known, None where they are `frames`."""
 
     def __post_init__(self) -> None:
         for name, color_map in self.color_maps.items():
@@ -506,23 +575,23 @@ class Scene:
 
     @property
     def camera_names(self) -> tuple[str, ...]:
-        """Names of all cameras, in the order they first appear."""
+        """Return the names of all cameras, in the order in which they first appear."""
         return tuple(dict.fromkeys(name for frame in self.frames for name in frame.cameras))
 
     @property
     def all_gaussians(self) -> tuple[Gaussians, ...]:
-        """The background's, then each actor's in its own frame."""
+        """Return the background's Gaussians, then each actor's in its own frame."""
         return (self.background, *(actor.gaussians for actor in self.actors))
 
     @property
     def gaussian_bytes(self) -> int:
-        """Of all Gaussians, their colours over time among them."""
+        """Return the bytes of all Gaussians and of their colours over time."""
         waves = (actor.color_waves for actor in self.actors)
-        own = sum(gaussians.nbytes for gaussians in self.all_gaussians)
-        return own + sum(wave.nbytes for wave in waves if wave is not None)
+        num_bytes = sum(gaussians.nbytes for gaussians in self.all_gaussians)
+        return num_bytes + sum(wave.nbytes for wave in waves if wave is not None)
 
     def with_gaussians(self, change: Callable[[Gaussians], Gaussians]) -> Scene:
-        """The scene with every part's Gaussians changed."""
+        """Return the scene with every part's Gaussians changed by a function."""
         return replace(
             self,
             background=change(self.background),
@@ -530,21 +599,24 @@ class Scene:
         )
 
     def frame(self, index: int) -> Frame:
-        """The frame with the dataset's number `index`."""
+        """Return the frame with the dataset's number `index`."""
         for frame in self.frames:
             if frame.index == index:
                 return frame
-        known = [f.index for f in self.frames]
+        indices = [f.index for f in self.frames]
         raise SceneError(
             f"scene {self.name!r} has no frame {index}; it has "
-            + (f"{known[0]} to {known[-1]} ({len(known)} frames)" if known else "none")
+            + (f"{indices[0]} to {indices[-1]} ({len(indices)} frames)" if indices else "none")
         )
 
     def parts_at(
         self, timestamp_ns: int, only: Collection[int] | None = None
     ) -> Iterator[PosedGaussians]:
-        """Background and every actor that exists at this time, posed. only: instance_ids of the
-        actors to take; None for all.
+        """Yield the background and every actor that exists at a time, posed.
+
+        Args:
+            timestamp_ns: the time.
+            only: instance_ids of the actors to take; None for all.
         """
         yield PosedGaussians(self.background)
         for number, actor in enumerate(self.actors, start=1):
@@ -556,26 +628,29 @@ class Scene:
                 yield PosedGaussians(posed, pose, instance_id=number)
 
     def poses_at(self, timestamp_ns: int) -> dict[int, np.ndarray]:
-        """world_from_actor, float64 [4, 4], of the actors that exist at a time, by instance id."""
+        """Return world_from_actor, float64 [4, 4], by instance id, of actors that exist at a
+        time.
+        """
         if not self.actors:
             return {}
         tracks = memo_of(self).get(
             ("tracks",), lambda: PackedTracks.of([actor.track for actor in self.actors])
         )
-        found = np.empty(len(self.actors), np.uint8)
-        poses = np.empty((len(found), 4, 4))
-        kernels.poses_at(timestamp_ns, _STRAIGHT_RAD, tracks, found, poses)
-        return {int(n) + 1: poses[n] for n in np.flatnonzero(found)}
+        is_present = np.empty(len(self.actors), np.uint8)
+        poses = np.empty((len(is_present), 4, 4))
+        kernels.poses_at(timestamp_ns, _STRAIGHT_RAD, tracks, is_present, poses)
+        return {int(n) + 1: poses[n] for n in np.flatnonzero(is_present)}
 
     def parts_for(
         self, camera: Camera, only: Collection[int] | None = None
     ) -> tuple[PosedGaussians, ...]:
-        """The parts at the moment the camera took its image. only: as for parts_at."""
+        """Return the parts at the moment of the camera's image, as `parts_at` yields them."""
         return tuple(self.parts_at(camera.timestamp_ns, only))
 
     def color_map(self, camera: Camera) -> Float[Tensor, "3 4"] | None:
-        """The image's colour map, or else the camera's; None where there is none, or one that
-        changes nothing.
+        """Return the image's colour map, or else the camera's.
+
+        None where there is none, or where it changes nothing.
         """
         color_map = self.image_color_maps.get((camera.name, camera.timestamp_ns))
         if color_map is None:
@@ -586,26 +661,29 @@ class Scene:
 
     @property
     def mapped_cameras(self) -> tuple[str, ...]:
-        """Names of the cameras that have a colour map, or whose images have, in their order."""
+        """Return the names of cameras with a colour map, for all or for single images, in order."""
         maps = [*self.color_maps.items(), *((n, m) for (n, _), m in self.image_color_maps.items())]
         identity = torch.eye(3, 4)
-        changing = {name for name, color_map in maps if not torch.equal(color_map, identity)}
-        return tuple(name for name in self.camera_names if name in changing)
+        mapped_names = {name for name, color_map in maps if not torch.equal(color_map, identity)}
+        return tuple(name for name in self.camera_names if name in mapped_names)
 
     @cached_property
     def common_color_map(self) -> Float[Tensor, "3 4"] | None:
-        """Mean of all colour maps, float64; None where none changes anything."""
+        """Return the mean of all colour maps, float64; None where none changes anything."""
         maps = [*self.color_maps.values(), *self.image_color_maps.values()]
         return torch.stack(maps).double().mean(0) if self.mapped_cameras else None
 
     def boxes(self, frame_index: int) -> Boxes:
+        """Return the labelled boxes of a frame."""
         return Boxes.empty() if self.labels is None else self.labels.boxes(frame_index)
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
+        """Return the LiDAR sweep of a frame; None where there is none."""
         return None if self.labels is None else self.labels.lidar(frame_index)
 
 
 def _check_color_map(scene: str, camera: str, color_map: Tensor) -> None:
+    """Raise ValueError unless a colour map is finite float32 [3, 4]."""
     if color_map.dtype != torch.float32 or tuple(color_map.shape) != (3, 4):
         raise ValueError(
             f"scene {scene!r}: the colour map of camera {camera!r} must be float32 [3, 4]; "
@@ -619,10 +697,14 @@ def _check_color_map(scene: str, camera: str, color_map: Tensor) -> None:
 
 
 def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tuple[str, ...]]:
-    """Gaussians without those no rasteriser can draw, and a sentence for each kind left out.
+    """Return the Gaussians that a rasteriser can render, and a sentence for each kind left out.
 
-    Left out: NaN or infinite values, zero quaternions, scales <= 0, coordinates and scales beyond
-    MAX_EXTENT_M. Quaternions are normalised.
+    Left out are NaN or infinite values, zero quaternions, scales <= 0, and coordinates and scales
+    beyond MAX_EXTENT_M. Quaternions are normalised, opacities clamped to 0 to 1.
+
+    Args:
+        gaussians: the Gaussians.
+        where: names the Gaussians in the sentences.
 
     Raises:
         SceneError: nothing usable remains.
@@ -631,22 +713,23 @@ def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tup
     norms = quat_lengths(gaussians.quats)
     largest = torch.maximum(gaussians.means.abs().amax(1), gaussians.scales.amax(1))
     is_far = finite & (norms > 0) & (gaussians.scales.amin(1) > 0) & (largest > MAX_EXTENT_M)
-    first = f"; the first is number {int(is_far.int().argmax())}" if bool(is_far.any()) else ""
-    # In order: each count names what the earlier checks did not already leave out.
-    bad = {
+    first_far = f"; the first is number {int(is_far.int().argmax())}" if bool(is_far.any()) else ""
+    # The order matters: each count leaves out what earlier checks have counted.
+    faults = {
         "with NaN or infinite values": ~finite,
         "with a zero quaternion": finite & (norms == 0),
         "with a scale <= 0": finite & (norms > 0) & (gaussians.scales.amin(1) <= 0),
-        f"with coordinates or scales beyond {MAX_EXTENT_M:.0e} m{first}": is_far,
+        f"with coordinates or scales beyond {MAX_EXTENT_M:.0e} m{first_far}": is_far,
     }
     problems = tuple(
-        f"{where}: left out {int(mask.sum())} of {len(gaussians)} Gaussians {what}"
-        for what, mask in bad.items()
+        f"{where}: left out {int(mask.sum())} of {len(gaussians)} Gaussians {fault}"
+        for fault, mask in faults.items()
         if bool(mask.any())
     )
     if problems:
-        keep = ~torch.stack(list(bad.values())).any(0)
-        gaussians, norms = gaussians.select(keep), norms[keep]
+        is_usable = ~torch.stack(list(faults.values())).any(0)
+        gaussians = gaussians.select(is_usable)
+        norms = norms[is_usable]
     if len(gaussians) == 0:
         raise SceneError(f"{where} holds no usable Gaussians. " + " ".join(problems))
     quats = (gaussians.quats / norms[:, None]).to(gaussians.quats.dtype)
@@ -654,6 +737,7 @@ def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tup
 
 
 def _finite_rows(gaussians: Gaussians) -> Bool[Tensor, "N"]:
+    """Return the mask of Gaussians whose numbers are all finite."""
     finite = torch.isfinite(gaussians.opacities)
     for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh):
         finite &= torch.isfinite(tensor.reshape(len(gaussians), -1).sum(1))
@@ -661,8 +745,10 @@ def _finite_rows(gaussians: Gaussians) -> Bool[Tensor, "N"]:
 
 
 def quat_lengths(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N"]:
-    """Lengths of quaternions, in float64 where the squares of some leave float32's range: 1e-30 is
-    no zero, and 1e20 has an end.
+    """Return the lengths of quaternions.
+
+    They are in float64 where the squares of some leave float32's range: 1e-30 is no zero, and 1e20
+    has an end.
     """
     lengths = quats.norm(dim=1)
     if bool(((lengths > 1e-15) & (lengths < 1e15)).all()):
@@ -670,14 +756,19 @@ def quat_lengths(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N"]:
     return quats.double().norm(dim=1)
 
 
-# ---- Whether `check_gaussians` has anything to do, and of which rows: without its copies ---------
+# ---- The checks of `check_gaussians` without its copies ------------------------------------------
 
-_QUAT_TOLERANCE = 1e-4  # of unit length; what is further off is to be normalised
-_ROWS = 1 << 16  # looked at together: temporaries stay in the cache
+# Error of a unit quaternion's length beyond which it has to be normalised.
+_QUAT_TOLERANCE = 1e-4
+# Gaussians that are checked together: temporaries stay in the cache.
+_ROWS = 1 << 16
 
 
 def is_drawable(gaussians: Gaussians) -> bool:
-    """Whether `check_gaussians` would leave them as they are, told in one look at each number."""
+    """Return True if `check_gaussians` would change nothing.
+
+    Each number is read once.
+    """
     return all(
         _piece_is_drawable(gaussians, slice(start, start + _ROWS))
         for start in range(0, len(gaussians), _ROWS)
@@ -685,16 +776,20 @@ def is_drawable(gaussians: Gaussians) -> bool:
 
 
 def drawable_rows(gaussians: Gaussians) -> Bool[Tensor, "N"]:
-    """The Gaussians that `check_gaussians` keeps."""
-    keep = _finite_rows(gaussians)
+    """Return the mask of Gaussians that `check_gaussians` keeps."""
+    is_usable = _finite_rows(gaussians)
     for tensor in (gaussians.means, gaussians.scales):
-        keep &= tensor.abs().amax(1) <= MAX_EXTENT_M
-    return keep & (quat_lengths(gaussians.quats) > 0) & (gaussians.scales.amin(1) > 0)
+        is_usable &= tensor.abs().amax(1) <= MAX_EXTENT_M
+    return is_usable & (quat_lengths(gaussians.quats) > 0) & (gaussians.scales.amin(1) > 0)
 
 
 def _piece_is_drawable(gaussians: Gaussians, rows: slice) -> bool:
-    means, quats, sh = gaussians.means[rows], gaussians.quats[rows], gaussians.sh[rows]
-    scales, opacities = gaussians.scales[rows], gaussians.opacities[rows]
+    """Return `is_drawable` of some rows."""
+    means = gaussians.means[rows]
+    quats = gaussians.quats[rows]
+    sh = gaussians.sh[rows]
+    scales = gaussians.scales[rows]
+    opacities = gaussians.opacities[rows]
     ranges = [_range(tensor) for tensor in (means, quats, scales, opacities, sh)]
     with np.errstate(over="ignore", invalid="ignore"):
         shortest, longest = _range((quats.numpy() ** 2).sum(1) ** 0.5)
@@ -710,7 +805,7 @@ def _piece_is_drawable(gaussians: Gaussians, rows: slice) -> bool:
 
 
 def _range(values: Tensor | np.ndarray) -> tuple[float, float]:
-    """Lowest and highest value; NaN where there is one. By NumPy, which wakes no threads."""
+    """Return the lowest and highest value, NaN if there is one. NumPy wakes no threads for it."""
     array = values.numpy() if isinstance(values, Tensor) else values
     with np.errstate(invalid="ignore"):
         return float(array.min()), float(array.max())

@@ -26,8 +26,9 @@ class SemanticClass(IntEnum):
     SNOW = 16
 
 
+# Words in a dataset's name for an object that tell its class.
 _WORDS: dict[SemanticClass, frozenset[str]] = {
-    SemanticClass.SIGN: frozenset({"sign"}),  # of a pedestrian crossing too
+    SemanticClass.SIGN: frozenset({"sign"}),  # first, for the sign of a pedestrian crossing
     SemanticClass.TWO_WHEELER: frozenset(
         {"bicycle", "bicyclist", "bike", "cyclist", "motorbike", "motorcycle", "motorcyclist"}
         | {"moped", "rider", "scooter"}
@@ -41,10 +42,12 @@ _WORDS: dict[SemanticClass, frozenset[str]] = {
 
 
 def class_of_label(label: str) -> SemanticClass:
-    """What a dataset's name for an object means, such as vehicle.bus.rigid or Cyclist; UNKNOWN for
-    words that are not known.
+    """Return the class of a dataset's name for an object, such as vehicle.bus.rigid or Cyclist.
+
+    UNKNOWN for words that are not known.
     """
     words = set(re.findall("[a-z]+", label.lower()))
     return next(
-        (c for c, own in _WORDS.items() if not own.isdisjoint(words)), SemanticClass.UNKNOWN
+        (c for c, class_words in _WORDS.items() if not class_words.isdisjoint(words)),
+        SemanticClass.UNKNOWN,
     )

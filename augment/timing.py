@@ -1,10 +1,10 @@
-"""Times and progress of passes.
+"""Times and progress of the passes of a picture.
 
-`with timed("flood: bed"):` stands in a pass and costs two look-ups where nobody listens.
-`with stopwatch() as seconds:` around it measures: the GPU is waited for at both ends of a pass,
-which makes the whole slower and each time its own. `with watched(tell):` around it tells which pass
-has begun, and of long preparations (`counted`) each step; it changes no picture and waits for
-nothing. What the watcher raises gives up what runs inside.
+`with timed("flood: bed"):` stands in a pass and costs two look-ups where nobody listens. `with
+stopwatch() as seconds:` around it measures. The GPU is then waited for at both ends of a pass,
+which makes the whole slower and each time its own. `with watched(report):` around it reports which
+pass has begun, and each step of long preparations (`counted`). It changes no picture and waits for
+nothing. An exception that the watcher raises gives up the work inside.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ import torch
 
 
 class StageTimer:
-    """seconds: by name, without those of passes inside the pass."""
+    """Measures the time of passes, one inside the other.
+
+    `seconds` holds the time of each pass by name, without that of passes inside it.
+    """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -27,15 +30,17 @@ class StageTimer:
         self._since = time.perf_counter()
 
     def start(self, name: str) -> None:
+        """Begin a pass."""
         self._close()
         self._open.append(name)
 
     def stop(self) -> None:
+        """End the innermost pass."""
         self._close()
         self._open.pop()
 
     def _close(self) -> None:
-        """Give the time since the last change to the innermost open pass."""
+        """Add the time since the last change to the innermost open pass."""
         if torch.cuda.is_initialized():
             torch.cuda.synchronize()
         now = time.perf_counter()
@@ -47,7 +52,7 @@ class StageTimer:
 
 @dataclass(frozen=True)
 class PassProgress:
-    """Which pass runs, and how far it has got."""
+    """Progress of the pass that runs."""
 
     name: str
     """The pass's name, as plans have it: "rasterise"; or a preparation's: "placing snow"."""
@@ -58,27 +63,29 @@ class PassProgress:
 
 
 class PassWatch:
-    """Tells a function of the passes that run, one inside the other."""
+    """Reports the passes that run, one inside the other, to a function."""
 
-    def __init__(self, tell: Callable[[PassProgress], None]) -> None:
-        self._tell = tell
+    def __init__(self, report: Callable[[PassProgress], None]) -> None:
+        self._report = report
         self._open: list[PassProgress] = []
 
     def start(self, name: str, total: int = 0) -> None:
+        """Report that a pass begins."""
         progress = PassProgress(name, 0, total)
-        self._tell(progress)
+        self._report(progress)
         self._open.append(progress)
 
     def advance(self) -> None:
-        """One step more of the innermost pass."""
+        """Report one step more of the innermost pass."""
         last = self._open[-1]
         self._open[-1] = PassProgress(last.name, last.done + 1, last.total)
-        self._tell(self._open[-1])
+        self._report(self._open[-1])
 
     def stop(self, *, has_failed: bool) -> None:
+        """End the innermost pass, and report the pass around it."""
         self._open.pop()
         if self._open and not has_failed:  # the pass around it goes on
-            self._tell(self._open[-1])
+            self._report(self._open[-1])
 
 
 _listening: ContextVar[StageTimer | None] = ContextVar("stopwatch", default=None)
@@ -86,7 +93,7 @@ _watching: ContextVar[PassWatch | None] = ContextVar("watch", default=None)
 
 
 class timed:
-    """Counts what runs inside under a name, where a stopwatch runs, and tells a watcher of it."""
+    """Times the work inside under a name, if a stopwatch runs, and reports it to a watcher."""
 
     __slots__ = ("_name", "_timer", "_watch")
 
@@ -110,11 +117,13 @@ class timed:
 
 @contextmanager
 def counted(name: str, total: int) -> Iterator[Callable[[], None]]:
-    """Tell a watcher of a preparation that takes many steps. Yields what is called after each.
+    """Report a preparation that takes many steps to a watcher.
+
+    Yields a function, which is to be called after each step.
 
     Args:
-        name: What is prepared, as people are told: "placing snow".
-        total: Steps that there are.
+        name: what is prepared, for people: "placing snow".
+        total: number of steps.
     """
     watch = _watching.get()
     if watch is None:
@@ -130,14 +139,14 @@ def counted(name: str, total: int) -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def watched(tell: Callable[[PassProgress], None]) -> Iterator[None]:
+def watched(report: Callable[[PassProgress], None]) -> Iterator[None]:
     """Have a function told of the passes that run inside, in this thread or task.
 
     Args:
-        tell: Called at the start of each pass, after each step of one, and when one that lay inside
-            another ends. What it raises ends what runs inside.
+        report: called at the start of each pass, after each step of one, and when a pass inside
+            another ends. An exception that it raises ends the work inside.
     """
-    outer = _watching.set(PassWatch(tell))
+    outer = _watching.set(PassWatch(report))
     try:
         yield
     finally:
@@ -146,7 +155,7 @@ def watched(tell: Callable[[PassProgress], None]) -> Iterator[None]:
 
 @contextmanager
 def stopwatch() -> Iterator[dict[str, float]]:
-    """Seconds of the passes that run inside, in this thread or task, by name."""
+    """Yield the seconds of the passes that run inside, in this thread or task, by name."""
     timer = StageTimer()
     outer = _listening.set(timer)
     try:

@@ -1,15 +1,17 @@
-"""Whether the pictures of a scene can be believed: from where it was seen, and what it lacks there.
+"""Trust in the pictures of a scene: from where it was seen, and what it lacks there.
+
+In: a scene and its cameras. Out: `trust_mask`, a number for every pixel of a view, which jobs write
+beside the picture; and `judge_scene`, figures and sentences from a few small views, for `climategs`
+commands and the checks before a job.
 
 A clear render hides what weather shows: fog fills a hole in the road, and a sheet of sky 15 m away
 is a bright pane in it. So a view is judged by the scene itself:
 
     sky       pixels that the recording shows as sky and that have a surface nearer than 200 m
     ground    pixels below the horizon without a surface (alpha < 0.5), or that let light through
-    pose      how far the camera is from those that the scene was made from; never fitted ones
+    pose      distance of the camera from those that the scene was made from; never fitted ones
     detail    pixels per metre of the picture over those that the scene was made from
     support   colours that recorded images from other places show at the same points
-
-`trust_mask` says it of every pixel, `judge_scene` of a few small views, in figures and sentences.
 """
 
 from __future__ import annotations
@@ -45,56 +47,85 @@ from augment.render.rasterize import rasterize
 from augment.scene import Scene
 from augment.view_images import SURFACE_ALPHA
 
-SKY_FROM_M = 200.0  # a surface this far fades in any fog and casts no pane
-MAX_TRANSMITTANCE = 0.02  # below the horizon: 5/255 of a white fog shine through
-MIN_GROUND_ALPHA = 0.9  # of a pixel that can be believed: a tenth of white fog is 20/255 and shows
-# 1 % of the sky or the ground of a 480x270 picture is a patch of 25x25 pixels: a car 40 m away.
-MAX_SKY_COVERED = MAX_GROUND_OPEN = 0.01
-MIN_SKY_SHARE = 0.05  # of an image: where it shows less sky, pale walls are taken for it
-HORIZON_RAD = math.radians(1.5)  # roads slope, and poses are off by as much
-MAX_MAGNIFICATION = 1.5  # nothing finer was learnt; thin splats become needles
-NO_TRUST_MAGNIFICATION = 4.0  # from here on a pixel's detail is invented; trust falls from 1.0 on
-MAX_DISTANCE_M = 2.0  # half a lane and more: the sides of parked cars appear that nobody has seen
-MAX_ANGLE_RAD = math.radians(15)  # a quarter of a camera 60 degrees wide looks past what it saw
+# Distance from which a surface before the sky fades in any fog and casts no pane, metres.
+SKY_FROM_M = 200.0
+# Transmittance of ground below the horizon, at most: 5/255 of a white fog shine through.
+MAX_TRANSMITTANCE = 0.02
+# Alpha of ground in a pixel that can be trusted: a tenth of white fog is 20/255 and shows.
+MIN_GROUND_ALPHA = 0.9
+# Share of the sky that may be covered by near surfaces: 1 % of the sky or the ground of a 480x270
+# picture is a patch of 25x25 pixels, a car 40 m away.
+MAX_SKY_COVERED = 0.01
+# Share of the ground that may be without a surface.
+MAX_GROUND_OPEN = 0.01
+# Share of sky in an image below which pale walls are taken for it.
+MIN_SKY_SHARE = 0.05
+# Elevation below zero from which a ray counts as below the horizon: roads slope, and poses are off
+# by as much.
+HORIZON_RAD = math.radians(1.5)
+# Magnification up to which pictures are sharp: nothing finer was learnt, and thin splats become
+# needles.
+MAX_MAGNIFICATION = 1.5
+# Magnification from which a pixel's detail is invented; trust falls from 1.0 on.
+NO_TRUST_MAGNIFICATION = 4.0
+# Distance from the nearest seen view up to which a view is trusted, metres: half a lane and more.
+# Beyond it the sides of parked cars appear that nobody has seen.
+MAX_DISTANCE_M = 2.0
+# Angle to the nearest seen view up to which a view is trusted: beyond it, a quarter of a camera 60
+# degrees wide looks past what it saw.
+MAX_ANGLE_RAD = math.radians(15)
 
-_GRID_WIDTH = 320  # columns of the points that are looked for in the views of the scene
-_DEPTH_WIDTH = 240  # and of these views' depths
+# Columns of the points that are looked for in the views of the scene.
+_GRID_WIDTH = 320
+# Columns of these views' depths.
+_DEPTH_WIDTH = 240
+# Depth of points of the sky, metres.
 _SKY_POINT_M = 1e4
-_DEPTH_SHARE, _DEPTH_M = 0.05, 0.5  # a point so little behind what a view shows is seen by it
-_NUM_VIEWS = 24  # the nearest are asked: what they have not seen, those farther away saw worse
-_MIN_POINTS = 0.001  # of all: for fewer, a view's depths are not drawn
-_MIN_GAIN = 0.1  # of a point's trust, for which one more view is asked
-# Images whose colours are compared: of the same camera, from elsewhere, the nearest of them.
-_PARALLAX_M = 1.0  # a floating splat 5 m away moves by 50 pixels of 240 against what is behind it
+# Depth behind what a view shows up to which it has seen a point, as a part of the depth.
+_DEPTH_SHARE = 0.05
+# The same in metres; both are added.
+_DEPTH_M = 0.5
+# Nearest views that are searched: what they have not seen, views farther away saw worse.
+_NUM_VIEWS = 24
+# Share of all points for which a view's depths are drawn, at least.
+_MIN_POINTS = 0.001
+# Gain in a point's trust for which one more view is searched.
+_MIN_GAIN = 0.1
+# Distance from which an image of the same camera is compared, metres: a floating splat 5 m away
+# then moves by 50 pixels of 240 against what is behind it.
+_PARALLAX_M = 1.0
+# Nearest images that are compared.
 _NUM_WITNESSES = 4
-# Of 255: colours that differ by less are the same, by more are another thing's.
+# Difference below which colours are the same, of 255.
 _SAME_COLOR = 24.0
+# Difference from which colours are another thing's, of 255.
 _OTHER_COLOR = 64.0
 
 
-# ---- From where a scene was seen -----------------------------------------------------------------
+# ---- Views that a scene was made from ------------------------------------------------------------
 
 
 class FitRecord(BaseModel):
-    """`Scene.made_by["fitted"]`: what a scene was fitted to. scale: of the images learnt from over
-    the recorded ones. views: frame numbers by camera, those held out left out.
-    """
+    """Record of a fit: the value of `Scene.made_by["fitted"]`."""
 
     model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
 
     scale: Annotated[float, Field(gt=0, le=1)]
+    """Size of the images learnt from over the recorded ones."""
     views: dict[str, list[int]]
+    """Frame numbers learnt from, by camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenView:
-    """An image that the scene was made from. camera: at the size that was learnt from, which is
-    `scale` of the recorded one.
-    """
+    """An image that the scene was made from."""
 
     frame: int
+    """Number of the frame."""
     camera: Camera
+    """Camera at the size that was learnt from."""
     scale: float = 1.0
+    """That size over the recorded one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,30 +133,34 @@ class Seen:
     """The images that a scene was made from; none where they are not known."""
 
     views: tuple[SeenView, ...]
+    """The images."""
     is_fit: bool
+    """If True, the scene was fitted to the images; else made from a recording."""
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Return the names of the cameras, in the order in which they first appear."""
         return tuple(dict.fromkeys(view.camera.name for view in self.views))
 
     def of(self, name: str) -> tuple[SeenView, ...]:
+        """Return the views of one camera."""
         return tuple(view for view in self.views if view.camera.name == name)
 
     @functools.cached_property
     def scale(self) -> float | None:
-        """Of the smallest of the images over its camera; None where no view is known."""
+        """Return the smallest scale of the images; None where no view is known."""
         return min((view.scale for view in self.views), default=None)
 
     @functools.cached_property
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres and optical axes, float64 [V, 3] each."""
+        """Return centres and optical axes, float64 [V, 3] each."""
         cameras = [view.camera for view in self.views]
         centres = np.array([c.centre.numpy() for c in cameras]).reshape(-1, 3)
         axes = np.array([c.camera_from_world.numpy()[2, :3] for c in cameras]).reshape(-1, 3)
         return centres, axes
 
     def away(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """How far a camera is from each view: metres and radians, [V] each."""
+        """Return the distance of a camera from each view: metres and radians, [V] each."""
         centres, axes = self.poses
         cosine = axes @ camera.camera_from_world.numpy()[2, :3]
         distance_m = np.linalg.norm(centres - camera.centre.numpy(), axis=1)
@@ -133,35 +168,46 @@ class Seen:
 
 
 class Nearest(NamedTuple):
-    """The seen view nearest to a camera. magnification: pixels of the camera for one of its own, of
-    the same thing.
-    """
+    """The seen view nearest to a camera."""
 
     distance_m: float
+    """Distance between the cameras' centres."""
     angle_rad: float
+    """Angle between their optical axes."""
     magnification: float
+    """Pixels of the camera for one pixel of the view, of the same thing."""
 
 
 def seen_views(scene: Scene) -> Seen:
-    """Of a fitted scene what it was fitted to, as its files say; else all that was recorded."""
-    return memo_of(scene).get("seen views", lambda: _find_seen(scene))
+    """Return the views that a scene was made from.
+
+    For a fitted scene they are those that it was fitted to, as its files say; else all that was
+    recorded.
+    """
+    return memo_of(scene).get("seen views", lambda: _find_seen_views(scene))
 
 
 def unfitted_cameras(scene: Scene) -> tuple[str, ...]:
-    """The recorded cameras that a fit has never learnt from."""
-    seen = seen_views(scene)
-    if not seen.is_fit or not seen.views:
+    """Return the recorded cameras that a fit has never learnt from."""
+    sources = seen_views(scene)
+    if not sources.is_fit or not sources.views:
         return ()
-    known = dict.fromkeys(name for frame in _made_from(scene) for name in frame.cameras)
-    return tuple(name for name in known if name not in seen.names)
+    recorded_names = dict.fromkeys(name for frame in _made_from(scene) for name in frame.cameras)
+    return tuple(name for name in recorded_names if name not in sources.names)
 
 
 def _made_from(scene: Scene) -> tuple[Frame, ...]:
+    """Return the frames that the scene was made from."""
     return scene.frames if scene.seen_frames is None else scene.seen_frames
 
 
 def left_out_sentence(names: Sequence[str], how: str) -> str:
-    """What a job says of cameras that it leaves out. how: what renders them all the same."""
+    """Return a job's sentence about cameras that it leaves out.
+
+    Args:
+        names: names of the cameras.
+        how: option that renders them all the same.
+    """
     return (
         f"left out: {', '.join(names)}, to whose images the scene was never fitted; {how} renders "
         f"them too"
@@ -169,7 +215,12 @@ def left_out_sentence(names: Sequence[str], how: str) -> str:
 
 
 def magnified_sentence(learnt_scale: float | None, scale: float) -> str | None:
-    """What is wrong with pictures at a scale; None where nothing is."""
+    """Return a sentence on pictures that are too large; None where they are not.
+
+    Args:
+        learnt_scale: scale of the images learnt from; None where unknown.
+        scale: scale of the pictures.
+    """
     if learnt_scale is None or scale <= MAX_MAGNIFICATION * learnt_scale:
         return None
     return (
@@ -179,21 +230,26 @@ def magnified_sentence(learnt_scale: float | None, scale: float) -> str | None:
     )
 
 
-def nearest_view(seen: Seen, camera: Camera) -> Nearest | None:
-    """By distance, with a metre for every 7.5 degrees; None where no view is known."""
-    if not seen.views:
+def nearest_view(sources: Seen, camera: Camera) -> Nearest | None:
+    """Return the seen view nearest to a camera; None where no view is known.
+
+    A metre of distance counts as much as 7.5 degrees.
+    """
+    if not sources.views:
         return None
-    distance_m, angle_rad = seen.away(camera)
-    best = int(np.argmin(_away(distance_m, angle_rad)))
-    magnification = camera.fx / seen.views[best].camera.fx
+    distance_m, angle_rad = sources.away(camera)
+    best = int(np.argmin(_pose_difference(distance_m, angle_rad)))
+    magnification = camera.fx / sources.views[best].camera.fx
     return Nearest(float(distance_m[best]), float(angle_rad[best]), magnification)
 
 
-def _away(distance_m: Any, angle_rad: Any) -> Any:
+def _pose_difference(distance_m: Any, angle_rad: Any) -> Any:
+    """Return the difference of two poses, 1 at each limit alone."""
     return distance_m / MAX_DISTANCE_M + angle_rad / MAX_ANGLE_RAD
 
 
-def _find_seen(scene: Scene) -> Seen:
+def _find_seen_views(scene: Scene) -> Seen:
+    """Return the views that a scene was made from, as `seen_views`."""
     frames = _made_from(scene)
     fit = _fit_record(scene.made_by, frames)
     has_images = any(frame.image_paths for frame in frames)
@@ -211,23 +267,30 @@ def _find_seen(scene: Scene) -> Seen:
 
 
 def _fit_record(made_by: Mapping[str, Any], frames: Sequence[Frame]) -> FitRecord | None:
-    """None of a scene that was not fitted, or that says nothing usable of it. Scenes of before
-    there was a record tell by the settings of their fit.
+    """Return the record of a scene's fit; None for a scene that was not fitted, or has no usable
+    one.
+
+    Scenes from before there was a record are read by the settings of their fit.
     """
-    given = made_by.get("fitted")
-    if given is None and isinstance(settings := made_by.get("settings"), dict):
-        cameras, scale = settings.get("cameras"), settings.get("scale")
-        held_out = re.fullmatch(r"every-(\d{1,6})(st|nd|rd|th)", str(settings.get("holdout")))
-        step = int(held_out[1]) if held_out else 0
-        left_out = {frame.index for frame in frames[step - 1 :: step]} if step else set()
+    record = made_by.get("fitted")
+    if record is None and isinstance(settings := made_by.get("settings"), dict):
+        cameras = settings.get("cameras")
+        scale = settings.get("scale")
+        holdout_match = re.fullmatch(r"every-(\d{1,6})(st|nd|rd|th)", str(settings.get("holdout")))
+        holdout_step = int(holdout_match[1]) if holdout_match else 0
+        held_out_frames = (
+            {frame.index for frame in frames[holdout_step - 1 :: holdout_step]}
+            if holdout_step
+            else set()
+        )
         names = {name for frame in frames for name in frame.cameras}
         if cameras != "all":
             names &= set(str(cameras).split(","))
-        learnt = [frame for frame in frames if frame.index not in left_out]
-        views = {n: [f.index for f in learnt if n in f.cameras] for n in sorted(names)}
-        given = {"scale": scale, "views": views}
+        learnt_frames = [frame for frame in frames if frame.index not in held_out_frames]
+        views = {n: [f.index for f in learnt_frames if n in f.cameras] for n in sorted(names)}
+        record = {"scale": scale, "views": views}
     try:
-        return None if given is None else FitRecord.model_validate(given)
+        return None if record is None else FitRecord.model_validate(record)
     except ValidationError:
         return None
 
@@ -235,47 +298,52 @@ def _fit_record(made_by: Mapping[str, Any], frames: Sequence[Frame]) -> FitRecor
 # ---- One view, pixel by pixel --------------------------------------------------------------------
 
 
-class _Look(NamedTuple):
-    """A view of the scene without weather. alpha, z_m [H, W]: z of its surfaces. owner: instance of
-    the heaviest splat, 0 for the background. is_own_car: where that is the recording car.
-    elevation_rad: of the rays. sky: what the recording shows as sky, None where that is unknown.
-    rgb: of the surfaces [H, W, 3], 0 to 1 in the scene's colours; None where nobody asked.
-    """
+class _ClearView(NamedTuple):
+    """A view of the scene without weather."""
 
     alpha: Float[np.ndarray, "H W"]
+    """Alpha of the view."""
     z_m: Float[np.ndarray, "H W"]
+    """z of its surfaces."""
     owner: Int[np.ndarray, "H W"]
+    """Instance of the heaviest splat, 0 for the background."""
     is_own_car: Bool[np.ndarray, "H W"]
+    """Pixels that show the recording car."""
     elevation_rad: Float[np.ndarray, "H W"]
+    """Elevation of the rays."""
     sky: RecordedSky | None
+    """Sky of the recorded image; None where that is unknown."""
     rgb: Float[np.ndarray, "H W 3"] | None
+    """Colours of the surfaces, 0 to 1, the scene's; None where nobody asks."""
 
     @property
     def sky_share(self) -> float:
-        """The share of the image that the recording shows as sky; 0 where that is unknown."""
+        """Return the share of the image that the recording shows as sky; 0 where unknown."""
         return 0.0 if self.sky is None else float(self.sky.sky.mean())
 
     @property
     def has_surface(self) -> Bool[np.ndarray, "H W"]:
+        """Return the mask of pixels that show a surface."""
         return self.alpha >= SURFACE_ALPHA
 
 
 def trust_mask(scene: Scene, camera: Camera, *, backend: str = AUTO) -> UInt8[np.ndarray, "H W"]:
-    """How far each pixel of a view can be believed, from 0, not at all, to 255.
+    """Return the trust in each pixel of a view, from 0, none, to 255.
 
-    The product of three parts:
+    It is the product of three parts:
 
     - 1 where the pixel shows a surface or the sky, in the right place, and below the horizon a
-      surface of MIN_GROUND_ALPHA; else 0;
-    - by the image that has seen the same unhidden at most pixels a metre: 1 where those are as many
-      as are drawn, 0 from NO_TRUST_MAGNIFICATION times fewer on, smooth between;
+    surface of MIN_GROUND_ALPHA; else 0;
+    - by the image that has seen the same thing unhidden at most pixels a metre: 1 where those are
+    as many as are drawn, 0 from NO_TRUST_MAGNIFICATION times fewer on, smooth between;
     - the share of images that show the surface's colour at its place: of this view and of up to
-      _NUM_WITNESSES of the same camera, at least _PARALLAX_M away, that see it. Splats that stand
-      where nothing is, fitted to one image, are contradicted by the others.
+    _NUM_WITNESSES of the same camera, at least _PARALLAX_M away, that see it. Splats that stand
+    where nothing is, fitted to one image, are contradicted by the others.
 
     Args:
-        scene: weather does not count. Of a scene whose views are not known no pixel is seen.
-        camera: as rendered. In an orthographic camera no pixel is seen.
+        scene: the scene; weather does not count. If its views are not known, no pixel is trusted.
+        camera: the view, as rendered. In an orthographic camera no pixel is trusted.
+        backend: the rasteriser's backend.
     """
     if camera.is_orthographic:
         return np.zeros((camera.height, camera.width), np.uint8)
@@ -283,11 +351,17 @@ def trust_mask(scene: Scene, camera: Camera, *, backend: str = AUTO) -> UInt8[np
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     key = "trust", camera.name, camera.timestamp_ns, camera.width, camera.height, intrinsics, pose
     return memo_of(scene).get(
-        key, lambda: _trusted(scene, camera, _look(scene, camera, backend, True), backend)
+        key,
+        lambda: _measure_trust(
+            scene, camera, _render_clear_view(scene, camera, backend, True), backend
+        ),
     )
 
 
-def _look(scene: Scene, camera: Camera, backend: str, with_rgb: bool = False) -> _Look:
+def _render_clear_view(
+    scene: Scene, camera: Camera, backend: str, with_rgb: bool = False
+) -> _ClearView:
+    """Return a view of the scene without weather."""
     parts = scene.parts_for(camera)
     buffers = (ALPHA, MEDIAN_DEPTH, SPLAT_IDS, *((RGB,) if with_rgb else ()))
     raster = rasterize(parts, camera, buffers=buffers, backend=backend)
@@ -297,179 +371,201 @@ def _look(scene: Scene, camera: Camera, backend: str, with_rgb: bool = False) ->
     part_of = np.searchsorted(ends, raster.splat_ids.cpu().numpy(), side="right")  # -1: the first
     instances = np.array([part.instance_id for part in parts])
     own_car = [1 + i for i, actor in enumerate(scene.actors) if actor.label == EGO_VEHICLE]
-    alpha, owner = raster.alpha.cpu().numpy(), instances[part_of]
-    return _Look(
+    alpha = raster.alpha.cpu().numpy()
+    owner = instances[part_of]
+    return _ClearView(
         alpha=alpha,
         z_m=raster.median_depth.cpu().numpy(),
         owner=owner,
         is_own_car=np.isin(owner, own_car) & (alpha >= SURFACE_ALPHA),
         elevation_rad=elevation_rad(camera),
-        sky=_sky_of(scene, camera),
-        rgb=None if raster.rgb is None else _opaque(raster.rgb.cpu().numpy(), alpha),
+        sky=_find_recorded_sky(scene, camera),
+        rgb=None if raster.rgb is None else _unweight_colors(raster.rgb.cpu().numpy(), alpha),
     )
 
 
-def _opaque(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """The colours of surfaces from those weighted by their alpha."""
+def _unweight_colors(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Return the colours of surfaces from colours weighted by their alpha."""
     return rgb / np.maximum(alpha, SURFACE_ALPHA)[..., None]
 
 
-def _sky_of(scene: Scene, camera: Camera) -> RecordedSky | None:
-    """By the recorded image that was taken there and then."""
+def _find_recorded_sky(scene: Scene, camera: Camera) -> RecordedSky | None:
+    """Return the sky of the image that was recorded at the camera's place and time."""
     for frame in _made_from(scene):
-        own = frame.cameras.get(camera.name)
-        if own is not None and own.timestamp_ns == camera.timestamp_ns and _same_pose(own, camera):
+        recorded_camera = frame.cameras.get(camera.name)
+        if (
+            recorded_camera is not None
+            and recorded_camera.timestamp_ns == camera.timestamp_ns
+            and _same_pose(recorded_camera, camera)
+        ):
             sky = recorded_sky(scene, frame, camera.name)
             if sky is None:
                 return None
-            return RecordedSky(*(_enlarged(mask, camera) for mask in sky))
+            return RecordedSky(*(_enlarge(mask, camera) for mask in sky))
     return None
 
 
-def _enlarged(mask: np.ndarray, camera: Camera) -> np.ndarray:
+def _enlarge(mask: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return a mask at the camera's size."""
     size = camera.width, camera.height
     return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
-def _inner(mask: np.ndarray) -> np.ndarray:
-    """Without its border, which was cut in a small image."""
+def _erode_border(mask: np.ndarray) -> np.ndarray:
+    """Return a mask without its border, which was cut in a small image."""
     side = 1 + 2 * max(1, round(mask.shape[1] / WORK_WIDTH))
     return cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
 
 def _same_pose(a: Camera, b: Camera) -> bool:
+    """Return True if two cameras have one pose."""
     return torch.allclose(a.camera_from_world, b.camera_from_world, rtol=0, atol=1e-6)
 
 
-def _trusted(scene: Scene, camera: Camera, look: _Look, backend: str) -> np.ndarray:
-    surface, below = look.has_surface, look.elevation_rad < -HORIZON_RAD
-    open_sky = look.elevation_rad > 0
-    solid = surface & ~(below & (look.alpha < MIN_GROUND_ALPHA))
-    if look.sky is not None:
-        open_sky &= ~_inner(look.sky.solid)
-        if look.sky_share >= MIN_SKY_SHARE:
-            solid &= ~_pane(scene, camera, look)
-    is_fit = np.where(surface, solid, open_sky)
-    points = _points(camera, look)
-    trust = _seen_detail(scene, camera, points, backend)
-    trust *= _support(scene, camera, look, points, backend)
+def _measure_trust(scene: Scene, camera: Camera, view: _ClearView, backend: str) -> np.ndarray:
+    """Return the trust in each pixel of a view, as `trust_mask`."""
+    has_surface = view.has_surface
+    is_below_horizon = view.elevation_rad < -HORIZON_RAD
+    is_open_sky = view.elevation_rad > 0
+    is_solid = has_surface & ~(is_below_horizon & (view.alpha < MIN_GROUND_ALPHA))
+    if view.sky is not None:
+        is_open_sky &= ~_erode_border(view.sky.solid)
+        if view.sky_share >= MIN_SKY_SHARE:
+            is_solid &= ~_find_panes(scene, camera, view)
+    is_fit = np.where(has_surface, is_solid, is_open_sky)
+    points = _view_points(camera, view)
+    trust = _measure_detail(scene, camera, points, backend)
+    trust *= _measure_support(scene, camera, view, points, backend)
     steps = np.rint(255 * trust.reshape(points.grid.height, points.grid.width)).astype(np.uint8)
     size = camera.width, camera.height
     return cv2.resize(steps, size, interpolation=cv2.INTER_NEAREST) * is_fit
 
 
-def _pane(scene: Scene, camera: Camera, look: _Look) -> np.ndarray:
-    """Where a surface stands before the sky."""
-    assert look.sky is not None
-    distance_m = look.z_m * camera.ray_lengths().numpy()
+def _find_panes(scene: Scene, camera: Camera, view: _ClearView) -> np.ndarray:
+    """Return the mask of surfaces that stand before the sky."""
+    assert view.sky is not None
+    distance_m = view.z_m * camera.ray_lengths().numpy()
     is_near = distance_m < (SKY_FROM_M if scene.has_metric_scale else math.inf)
-    return _inner(look.sky.sky) & look.has_surface & is_near
+    return _erode_border(view.sky.sky) & view.has_surface & is_near
 
 
-class _Points(NamedTuple):
-    """What the pixels of a grid show, P points. grid: the camera at the grid's size. world [P, 3]:
-    metres. owner [P]: instance whose point it is, 0 for the background. density [P]: pixels a metre
-    that are drawn. has_surface [P]: others are sky, far away.
-    """
+class _ViewPoints(NamedTuple):
+    """P points that the pixels of a grid show."""
 
     grid: Camera
+    """Camera at the grid's size."""
     world: np.ndarray
+    """Places, metres, [P, 3]."""
     owner: np.ndarray
+    """Instance that each point belongs to, 0 for the background, [P]."""
     density: np.ndarray
+    """Pixels a metre that are drawn, [P]."""
     has_surface: np.ndarray
+    """True for points of surfaces; others are sky, far away, [P]."""
 
 
-def _points(camera: Camera, look: _Look) -> _Points:
+def _view_points(camera: Camera, view: _ClearView) -> _ViewPoints:
+    """Return the points that a view shows."""
     columns = min(_GRID_WIDTH, camera.width)
     grid = camera.resized(columns, max(1, round(camera.height * columns / camera.width)))
     rows_of = ((np.arange(grid.height) + 0.5) * camera.height / grid.height).astype(int)
     columns_of = ((np.arange(grid.width) + 0.5) * camera.width / grid.width).astype(int)
-    at = np.ix_(rows_of, columns_of)
-    surface, owner = look.has_surface[at].ravel(), look.owner[at].ravel()
-    rays = camera.ray_directions(torch.float64).numpy()[at].reshape(-1, 3)
-    z_m = np.where(surface, look.z_m[at].ravel(), _SKY_POINT_M)
-    return _Points(
+    grid_pixels = np.ix_(rows_of, columns_of)
+    has_surface = view.has_surface[grid_pixels].ravel()
+    owner = view.owner[grid_pixels].ravel()
+    rays = camera.ray_directions(torch.float64).numpy()[grid_pixels].reshape(-1, 3)
+    z_m = np.where(has_surface, view.z_m[grid_pixels].ravel(), _SKY_POINT_M)
+    return _ViewPoints(
         grid=grid,
         world=camera.centre.numpy() + z_m[:, None] * rays,
-        owner=np.where(surface, owner, 0),
+        owner=np.where(has_surface, owner, 0),
         density=camera.fx / np.maximum(z_m, 1e-6),
-        has_surface=surface,
+        has_surface=has_surface,
     )
 
 
-def _seen_detail(scene: Scene, camera: Camera, points: _Points, backend: str) -> np.ndarray:
-    """How finely some view of the scene has seen each point unhidden, 0 to 1, [P]."""
+def _measure_detail(scene: Scene, camera: Camera, points: _ViewPoints, backend: str) -> np.ndarray:
+    """Return how finely some view of the scene has seen each point unhidden, 0 to 1, [P]."""
     trust = np.zeros(len(points.world))
-    all_seen = seen_views(scene)
-    for number, view in _nearest_views(all_seen, camera):
-        left = np.flatnonzero(trust < 1 - _MIN_GAIN)
-        if len(left) == 0:
+    sources = seen_views(scene)
+    for number, view in _nearest_views(sources, camera):
+        remaining = np.flatnonzero(trust < 1 - _MIN_GAIN)
+        if len(remaining) == 0:
             break
-        local = _seen_from(scene, camera, points, left, view.camera)
-        detail = _detail(view.camera, local, points.density[left])
-        gains = detail > trust[left] + _MIN_GAIN
+        view_points = _points_in_view(scene, camera, points, remaining, view.camera)
+        detail = _detail_of_points(view.camera, view_points, points.density[remaining])
+        has_gain = detail > trust[remaining] + _MIN_GAIN
         if not (
             camera.timestamp_ns == view.camera.timestamp_ns and _same_pose(view.camera, camera)
         ):
-            if gains.sum() < _MIN_POINTS * len(trust):
+            if has_gain.sum() < _MIN_POINTS * len(trust):
                 continue
-            gains &= ~_hidden(view.camera, local, _depths(scene, number, view.camera, backend))
-        trust[left[gains]] = detail[gains]
+            has_gain &= ~_find_hidden(
+                view.camera, view_points, _depths(scene, number, view.camera, backend)
+            )
+        trust[remaining[has_gain]] = detail[has_gain]
     return trust
 
 
-def _support(
-    scene: Scene, camera: Camera, look: _Look, points: _Points, backend: str
+def _measure_support(
+    scene: Scene, camera: Camera, view: _ClearView, points: _ViewPoints, backend: str
 ) -> np.ndarray:
-    """The share of images that show each point's colour at its place, [P]: of those that see it,
-    and of this view, which counts as one that does.
+    """Return the share of images that show each point's colour at its place, [P].
+
+    It counts images that see the point, and this view, which counts as one that does.
     """
-    assert look.rgb is not None
+    assert view.rgb is not None
     size = points.grid.width, points.grid.height
-    rgb = cv2.resize(look.rgb, size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
-    agreeing, asked = np.ones(len(rgb)), np.ones(len(rgb))
-    surface = np.flatnonzero(points.has_surface)
-    for number, view in _witnesses(scene, camera):
-        image = _recorded_range(scene, number, view)
+    rgb = cv2.resize(view.rgb, size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    num_agreeing = np.ones(len(rgb))
+    num_images = np.ones(len(rgb))
+    surface_points = np.flatnonzero(points.has_surface)
+    for number, witness in _witnesses(scene, camera):
+        image = _recorded_range(scene, number, witness)
         if image is None:
             continue
-        local = _seen_from(scene, camera, points, surface, view.camera)
-        sees = _detail(view.camera, local, points.density[surface]) > 0
-        sees &= ~_hidden(view.camera, local, _depths(scene, number, view.camera, backend))
-        colors = rgb[surface[sees]]
-        color_map = scene.color_map(view.camera)
+        view_points = _points_in_view(scene, camera, points, surface_points, witness.camera)
+        is_seen = _detail_of_points(witness.camera, view_points, points.density[surface_points]) > 0
+        is_seen &= ~_find_hidden(
+            witness.camera, view_points, _depths(scene, number, witness.camera, backend)
+        )
+        colors = rgb[surface_points[is_seen]]
+        color_map = scene.color_map(witness.camera)
         if color_map is not None:
             colors = colors @ color_map[:, :3].numpy().T + color_map[:, 3].numpy()
-        row, column = _pixels(view.camera, local[sees], image.lowest.shape[:2])
-        steps = 255 * np.clip(colors, 0, 1)
-        below, above = image.lowest[row, column] - steps, steps - image.highest[row, column]
-        apart = np.maximum(below, above).max(axis=1)
-        share = (_OTHER_COLOR - apart) / (_OTHER_COLOR - _SAME_COLOR)
-        agreeing[surface[sees]] += np.clip(share, 0, 1)
-        asked[surface[sees]] += 1
-    return agreeing / asked
+        row, column = _pixels(witness.camera, view_points[is_seen], image.lowest.shape[:2])
+        color_levels = 255 * np.clip(colors, 0, 1)
+        below_range = image.lowest[row, column] - color_levels
+        above_range = color_levels - image.highest[row, column]
+        difference = np.maximum(below_range, above_range).max(axis=1)
+        agreement = (_OTHER_COLOR - difference) / (_OTHER_COLOR - _SAME_COLOR)
+        num_agreeing[surface_points[is_seen]] += np.clip(agreement, 0, 1)
+        num_images[surface_points[is_seen]] += 1
+    return num_agreeing / num_images
 
 
 def _witnesses(scene: Scene, camera: Camera) -> list[tuple[int, SeenView]]:
-    """The nearest views of the same camera from another place, with their numbers."""
-    seen = seen_views(scene)
-    distance_m, angle_rad = seen.away(camera) if seen.views else (np.zeros(0), np.zeros(0))
-    order = np.argsort(_away(distance_m, angle_rad), kind="stable").tolist()
-    names = {camera.name} if camera.name in seen.names else set(seen.names)
-    found = [n for n in order if distance_m[n] >= _PARALLAX_M]
-    found = [n for n in found if seen.views[n].camera.name in names][:_NUM_WITNESSES]
-    return [(n, seen.views[n]) for n in found]
+    """Return the nearest views of the same camera from another place, with their numbers."""
+    sources = seen_views(scene)
+    distance_m, angle_rad = sources.away(camera) if sources.views else (np.zeros(0), np.zeros(0))
+    order = np.argsort(_pose_difference(distance_m, angle_rad), kind="stable").tolist()
+    names = {camera.name} if camera.name in sources.names else set(sources.names)
+    numbers = [n for n in order if distance_m[n] >= _PARALLAX_M]
+    numbers = [n for n in numbers if sources.views[n].camera.name in names][:_NUM_WITNESSES]
+    return [(n, sources.views[n]) for n in numbers]
 
 
 class _RecordedRange(NamedTuple):
-    """The lowest and highest values of 3x3 pixels of a small recorded image, float32 [h, w, 3]."""
+    """Range of values of 3x3 pixels of a small recorded image."""
 
     lowest: np.ndarray
+    """Lowest values, float32 [h, w, 3]."""
     highest: np.ndarray
+    """Highest values, float32 [h, w, 3]."""
 
 
 def _recorded_range(scene: Scene, number: int, view: SeenView) -> _RecordedRange | None:
-    """Of the recorded image of a view; None where there is none that can be read."""
+    """Return the ranges of a view's recorded image; None where there is none that can be read."""
 
     def make() -> tuple[_RecordedRange | None]:
         frames = (frame for frame in _made_from(scene) if frame.index == view.frame)
@@ -478,72 +574,98 @@ def _recorded_range(scene: Scene, number: int, view: SeenView) -> _RecordedRange
         rgb = None if path is None else read_small_image(Path(path), small)
         if rgb is None:
             return (None,)
-        around = np.ones((3, 3), np.uint8)
-        lowest, highest = cv2.erode(rgb, around), cv2.dilate(rgb, around)
+        square = np.ones((3, 3), np.uint8)
+        lowest = cv2.erode(rgb, square)
+        highest = cv2.dilate(rgb, square)
         return (_RecordedRange(lowest.astype(np.float32), highest.astype(np.float32)),)
 
     return memo_of(scene).get(("trust colours", number), make)[0]
 
 
-def _seen_from(
-    scene: Scene, camera: Camera, points: _Points, chosen: np.ndarray, view: Camera
+def _points_in_view(
+    scene: Scene, camera: Camera, points: _ViewPoints, indices: np.ndarray, view: Camera
 ) -> np.ndarray:
-    """Column, row and z in a view of some points [C] of those that a camera sees, [C, 3]."""
-    world, owner = points.world[chosen], points.owner[chosen]
-    then = _moved(scene, world, owner, camera.timestamp_ns, view.timestamp_ns)
-    return _in_camera(view, then)
+    """Return column, row and z in a view, [C, 3], of some points that a camera sees.
+
+    Args:
+        scene: the scene.
+        camera: the camera that sees the points.
+        points: the points.
+        indices: indices of the points to take, [C].
+        view: camera of the view.
+    """
+    world = points.world[indices]
+    owner = points.owner[indices]
+    moved_world = _move_with_actors(scene, world, owner, camera.timestamp_ns, view.timestamp_ns)
+    return _project_points(view, moved_world)
 
 
-def _nearest_views(seen: Seen, camera: Camera) -> list[tuple[int, SeenView]]:
-    """The nearest views with their numbers."""
-    order = np.argsort(_away(*seen.away(camera)), kind="stable")[:_NUM_VIEWS]
-    return [(n, seen.views[n]) for n in order.tolist()]
+def _nearest_views(sources: Seen, camera: Camera) -> list[tuple[int, SeenView]]:
+    """Return the nearest views with their numbers."""
+    order = np.argsort(_pose_difference(*sources.away(camera)), kind="stable")[:_NUM_VIEWS]
+    return [(n, sources.views[n]) for n in order.tolist()]
 
 
-def _moved(
+def _move_with_actors(
     scene: Scene, points: np.ndarray, owner: np.ndarray, from_ns: int, to_ns: int
 ) -> np.ndarray:
-    """Points of the world [P, 3] of actors at another time; NaN where their actor is not there."""
-    moved = points.copy()
+    """Return points of the world [P, 3] at another time, moved with their actors.
+
+    Points are NaN where their actor is absent at one of the times.
+
+    Args:
+        scene: the scene.
+        points: the points.
+        owner: instance of each point, 0 for the background.
+        from_ns: time of the points.
+        to_ns: time of the result.
+    """
+    moved_points = points.copy()
     for instance in np.unique(owner[owner > 0]):
-        track, own = scene.actors[instance - 1].track, owner == instance
-        before, after = track.pose_at(from_ns), track.pose_at(to_ns)
-        if before is None or after is None:
-            moved[own] = np.nan
+        track = scene.actors[instance - 1].track
+        is_owned = owner == instance
+        pose_before = track.pose_at(from_ns)
+        pose_after = track.pose_at(to_ns)
+        if pose_before is None or pose_after is None:
+            moved_points[is_owned] = np.nan
             continue
-        turn = (after @ torch.linalg.inv(before)).numpy()
-        moved[own] = points[own] @ turn[:3, :3].T + turn[:3, 3]
-    return moved
+        turn = (pose_after @ torch.linalg.inv(pose_before)).numpy()
+        moved_points[is_owned] = points[is_owned] @ turn[:3, :3].T + turn[:3, 3]
+    return moved_points
 
 
-def _in_camera(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Column and row in pixels, and z, of points [P, 3] of the world; infinite or NaN behind it."""
+def _project_points(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return column and row in pixels, and z, of world points [P, 3]; infinite or NaN behind."""
     pose = camera.camera_from_world.numpy()
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
     z = np.where(z > 0, z, np.nan)
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, z], 1)
 
 
-def _detail(camera: Camera, local: np.ndarray, density: np.ndarray) -> np.ndarray:
-    """How finely a view shows points, 0 to 1; 0 of those outside its image. density: pixels a metre
-    that are drawn.
+def _detail_of_points(camera: Camera, local: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """Return how finely a view shows points, 0 to 1; 0 for points outside its image.
+
+    Args:
+        camera: camera of the view.
+        local: column, row and z of the points in the view, [P, 3].
+        density: pixels a metre that are drawn, [P].
     """
     u, v, z = local.T
-    # Half a pixel more: rays of the same camera at another size end at the border itself.
-    inside = (np.abs(u - camera.width / 2) <= camera.width / 2 + 0.5) & (
+    # Half a pixel more, because rays of the same camera at another size end at the border itself.
+    is_inside = (np.abs(u - camera.width / 2) <= camera.width / 2 + 0.5) & (
         np.abs(v - camera.height / 2) <= camera.height / 2 + 0.5
     )
-    magnification = np.where(inside, density * z / camera.fx, math.inf)
+    magnification = np.where(is_inside, density * z / camera.fx, math.inf)
     # Rounding aside, a view of the same size is no magnification.
     magnification = np.maximum(magnification / (1 + 1e-6), 1)
-    part = np.clip(1 - np.log(magnification) / math.log(NO_TRUST_MAGNIFICATION), 0, 1)
-    return part * part * (3 - 2 * part)
+    sharpness = np.clip(1 - np.log(magnification) / math.log(NO_TRUST_MAGNIFICATION), 0, 1)
+    return sharpness * sharpness * (3 - 2 * sharpness)
 
 
 def _pixels(
     camera: Camera, local: np.ndarray, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of points in an image of a view at another size, inside of it."""
+    """Return rows and columns of points in an image of a view at another size, inside of it."""
     height, width = shape
     u, v, _ = np.nan_to_num(local).T
     column = np.clip(u * width / camera.width, 0, width - 1).astype(int)
@@ -551,15 +673,21 @@ def _pixels(
     return row, column
 
 
-def _hidden(camera: Camera, local: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Which points something stands before. depths: of `_depths`."""
+def _find_hidden(camera: Camera, local: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Return the mask of points that something stands before.
+
+    Args:
+        camera: camera of the view.
+        local: column, row and z of the points in the view, [P, 3].
+        depths: depths of the view, as `_depths`.
+    """
     row, column = _pixels(camera, local, depths.shape)
     z = np.nan_to_num(local[:, 2])
     return z > depths[row, column] * (1 + _DEPTH_SHARE) + _DEPTH_M
 
 
 def _depths(scene: Scene, number: int, camera: Camera, backend: str) -> np.ndarray:
-    """What a view shows at most: the farthest z of 3x3 pixels; infinite where there is none."""
+    """Return the farthest z of 3x3 pixels of a view; infinite where there is no surface."""
 
     def make() -> np.ndarray:
         small = camera.scaled(min(1.0, _DEPTH_WIDTH / camera.width))
@@ -573,96 +701,115 @@ def _depths(scene: Scene, number: int, camera: Camera, backend: str) -> np.ndarr
     return memo_of(scene).get(("trust depths", number), make)
 
 
-# ---- A few views in figures, and a scene in sentences --------------------------------------------
+# ---- Figures of a few views, and sentences on a scene --------------------------------------------
 
 
 @dataclass(frozen=True)
 class ViewTrust:
-    """Shares of one judged view, 0 to 1. sky: of all pixels, what the recording shows as sky; None
-    where that is unknown. sky_covered: of the sky, what has a surface nearer than SKY_FROM_M; None
-    where the sky is unknown or absent. ground_open, ground_leaks: of what lies
-    below the horizon, the recording car left out, what has no surface, and what lets more than
-    MAX_TRANSMITTANCE of the light through; None where nothing lies there or up is unknown.
-    own_car: of all pixels. reach_m: distance within which 95 % of the surfaces lie; None without
-    any.
-    """
+    """Shares of one judged view, 0 to 1."""
 
     frame: int
+    """Number of the frame."""
     sky: float | None
+    """Share of all pixels that the recording shows as sky; None where unknown."""
     sky_covered: float | None
+    """Share of the sky with a surface nearer than SKY_FROM_M; None where the sky is unknown or
+    absent."""
     ground_open: float | None
+    """Share without a surface of the pixels below the horizon, the recording car left out; None
+    where there are no such pixels, or up is unknown."""
     ground_leaks: float | None
+    """Share of the same pixels that let more than MAX_TRANSMITTANCE of the light through."""
     own_car: float
+    """Share of all pixels that show the recording car."""
     reach_m: float | None
+    """Distance within which 95 % of the surfaces lie; None without any."""
 
 
 @dataclass(frozen=True)
 class CameraTrust:
-    """What is known of a camera's pictures. seen_images, seen_width_px, seen_path_m: of its images
-    that the scene was made from. nearest: of the frame that is farthest from any of them. away:
-    frames whose poses are. views: that were judged. problems: sentences, none where it is fit.
-    """
+    """Facts about the pictures of one camera."""
 
     name: str
+    """Name of the camera."""
     seen_images: int
+    """Number of its images that the scene was made from."""
     seen_width_px: int | None
+    """Width of the largest of them; None without any."""
     seen_path_m: float
+    """Length of the path between them."""
     nearest: Nearest | None
+    """Nearest view to the frame that is farthest from any view; None without any."""
     away: tuple[int, ...]
+    """Numbers of frames that stand away from all views."""
     views: tuple[ViewTrust, ...]
+    """Views that were judged."""
     problems: tuple[str, ...]
+    """Sentences; none where the camera is fit."""
 
 
 @dataclass(frozen=True)
 class SceneTrust:
-    """cameras: all that were asked for. problems: of all, with the cameras' names; and what could
-    not be judged.
-    """
+    """Facts about the pictures of a scene."""
 
     cameras: tuple[CameraTrust, ...]
+    """All cameras that were asked for."""
     unknown: tuple[str, ...]
+    """Sentences on what could not be judged."""
 
     @property
     def problems(self) -> tuple[str, ...]:
-        cameras = dict[str, list[str]]()  # by sentence: the same of all is said once
-        for own in self.cameras:
-            for text in own.problems:
-                cameras.setdefault(text, []).append(own.name)
-        return tuple(f"{', '.join(names)}: {text}" for text, names in cameras.items())
+        """Return the sentences of all cameras, with the cameras' names."""
+        names_by_sentence = dict[
+            str, list[str]
+        ]()  # the same sentence is said once for all its cameras
+        for camera in self.cameras:
+            for text in camera.problems:
+                names_by_sentence.setdefault(text, []).append(camera.name)
+        return tuple(f"{', '.join(names)}: {text}" for text, names in names_by_sentence.items())
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        cameras = [dataclasses.asdict(own) for own in self.cameras]
-        for entry, own in zip(cameras, self.cameras, strict=True):
-            entry["nearest"] = None if own.nearest is None else own.nearest._asdict()
+        """Return the facts for JSON."""
+        cameras = [dataclasses.asdict(camera) for camera in self.cameras]
+        for entry, camera in zip(cameras, self.cameras, strict=True):
+            entry["nearest"] = None if camera.nearest is None else camera.nearest._asdict()
         return {"cameras": cameras, "unknown": list(self.unknown), "problems": list(self.problems)}
 
 
 def judge_view(scene: Scene, camera: Camera, frame_index: int, *, backend: str = AUTO) -> ViewTrust:
-    """The figures of a view, at the camera's own size."""
-    look = _look(scene, camera, backend)
-    below = (look.elevation_rad < -HORIZON_RAD) & ~look.is_own_car
+    """Return the figures of a view, at the camera's own size.
+
+    Args:
+        scene: the scene; weather does not count.
+        camera: the view.
+        frame_index: number of its frame.
+        backend: the rasteriser's backend.
+    """
+    view = _render_clear_view(scene, camera, backend)
+    is_below_horizon = (view.elevation_rad < -HORIZON_RAD) & ~view.is_own_car
     if not scene.has_known_gravity:
-        below &= False
-    surface, covered = look.has_surface, None
-    if look.sky is not None:
-        inner = _inner(look.sky.sky) & ~look.is_own_car
-        covered = _share(_pane(scene, camera, look), inner)
-    distances_m = (look.z_m * camera.ray_lengths().numpy())[surface]
+        is_below_horizon &= False
+    has_surface = view.has_surface
+    sky_covered = None
+    if view.sky is not None:
+        is_sky = _erode_border(view.sky.sky) & ~view.is_own_car
+        sky_covered = _share_within(_find_panes(scene, camera, view), is_sky)
+    distances_m = (view.z_m * camera.ray_lengths().numpy())[has_surface]
     return ViewTrust(
         frame=frame_index,
-        sky=None if look.sky is None else look.sky_share,
-        sky_covered=covered,
-        ground_open=_share(~surface, below),
-        ground_leaks=_share(look.alpha < 1 - MAX_TRANSMITTANCE, below),
-        own_car=float(look.is_own_car.mean()),
+        sky=None if view.sky is None else view.sky_share,
+        sky_covered=sky_covered,
+        ground_open=_share_within(~has_surface, is_below_horizon),
+        ground_leaks=_share_within(view.alpha < 1 - MAX_TRANSMITTANCE, is_below_horizon),
+        own_car=float(view.is_own_car.mean()),
         reach_m=float(np.quantile(distances_m, 0.95)) if len(distances_m) else None,
     )
 
 
-def _share(what: np.ndarray, within: np.ndarray) -> float | None:
+def _share_within(mask: np.ndarray, within: np.ndarray) -> float | None:
+    """Return the share of the pixels in `within` that `mask` marks; None without such pixels."""
     count = int(within.sum())
-    return float((what & within).sum() / count) if count else None
+    return float((mask & within).sum() / count) if count else None
 
 
 def judge_scene(
@@ -674,76 +821,98 @@ def judge_scene(
     count: int = 3,
     backend: str = AUTO,
 ) -> SceneTrust:
-    """The scene as some frames and cameras of it show it; all, where these are None.
+    """Judge the scene as some frames and cameras of it show it.
 
-    scale: of the pictures over the cameras; None leaves magnification out. count: how many frames
-    of each camera are drawn, small; those of cameras that were never fitted are not. The poses of
-    all frames count.
+    The poses of all the frames count.
+
+    Args:
+        scene: the scene.
+        frames: the frames; None for all.
+        cameras: names of the cameras; None for all.
+        scale: size of the pictures over that of the cameras; None leaves magnification out.
+        count: frames of each camera that are drawn, small; those of cameras that were never fitted
+            are not drawn.
+        backend: the rasteriser's backend.
     """
     frames = scene.frames if frames is None else frames
     names = dict.fromkeys(name for frame in frames for name in frame.cameras)
-    chosen = [name for name in names if cameras is None or name in cameras]
-    judged = tuple(_judge_camera(scene, frames, name, scale, count, backend) for name in chosen)
+    chosen_names = [name for name in names if cameras is None or name in cameras]
+    judged_cameras = tuple(
+        _judge_camera(scene, frames, name, scale, count, backend) for name in chosen_names
+    )
     unknown = []
-    drawn = [view for own in judged for view in own.views]
+    judged_views = [view for camera in judged_cameras for view in camera.views]
     if not seen_views(scene).views:
         unknown.append("from where the scene was seen: no camera that it was made from is known")
-    if drawn and all(view.sky_covered is None for view in drawn):
+    if judged_views and all(view.sky_covered is None for view in judged_views):
         unknown.append("whether the sky is empty: no recorded image tells where it is")
-    if drawn and not scene.has_known_gravity:
+    if judged_views and not scene.has_known_gravity:
         unknown.append("whether the ground is closed: it is not known which way is up")
-    return SceneTrust(judged, tuple(unknown))
+    return SceneTrust(judged_cameras, tuple(unknown))
 
 
 def _judge_camera(
     scene: Scene, frames: Sequence[Frame], name: str, scale: float | None, count: int, backend: str
 ) -> CameraTrust:
-    seen = seen_views(scene)
-    own = seen.of(name)
-    held = [f for f in frames if name in f.cameras and not f.cameras[name].is_orthographic]
-    poses = {f.index: nearest_view(seen, f.cameras[name].scaled(scale or 1.0)) for f in held}
-    known = {index: near for index, near in poses.items() if near is not None}
-    farthest = max(known.values(), key=lambda n: _away(*n[:2])) if known else None
-    is_unfitted = name in unfitted_cameras(scene)
-    away = tuple(
-        index for index, near in known.items() if scene.has_metric_scale and _is_away(near)
+    """Judge one camera; the arguments are those of `judge_scene`."""
+    sources = seen_views(scene)
+    seen_by_camera = sources.of(name)
+    camera_frames = [f for f in frames if name in f.cameras and not f.cameras[name].is_orthographic]
+    nearest_views = {
+        f.index: nearest_view(sources, f.cameras[name].scaled(scale or 1.0)) for f in camera_frames
+    }
+    known_views = {index: near for index, near in nearest_views.items() if near is not None}
+    farthest_view = (
+        max(known_views.values(), key=lambda n: _pose_difference(*n[:2])) if known_views else None
     )
-    middles = [held[(2 * k + 1) * len(held) // (2 * count)] for k in range(count)] if held else []
-    drawn = {} if is_unfitted else {f.index: f.cameras[name] for f in middles}
-    views, failed = list[ViewTrust](), list[str]()
-    for index, camera in drawn.items():
+    is_unfitted = name in unfitted_cameras(scene)
+    frames_away = tuple(
+        index for index, near in known_views.items() if scene.has_metric_scale and _is_away(near)
+    )
+    drawn_frames = (
+        [camera_frames[(2 * k + 1) * len(camera_frames) // (2 * count)] for k in range(count)]
+        if camera_frames
+        else []
+    )
+    drawn_cameras = {} if is_unfitted else {f.index: f.cameras[name] for f in drawn_frames}
+    views = list[ViewTrust]()
+    failures = list[str]()
+    for index, camera in drawn_cameras.items():
         try:
-            views.append(judge_view(scene, _small(camera), index, backend=backend))
+            views.append(judge_view(scene, _shrink_camera(camera), index, backend=backend))
         except Exception as error:  # as in a job: one bad frame is named, and the others go on
-            failed.append(f"frame {index} cannot be drawn: {error}")
-    centres = [view.camera.centre for view in own]
+            failures.append(f"frame {index} cannot be drawn: {error}")
+    centres = [view.camera.centre for view in seen_by_camera]
     steps = [float((b - a).norm()) for a, b in itertools.pairwise(centres)]
-    found = CameraTrust(
+    camera_trust = CameraTrust(
         name=name,
-        seen_images=len(own),
-        seen_width_px=max((view.camera.width for view in own), default=None),
+        seen_images=len(seen_by_camera),
+        seen_width_px=max((view.camera.width for view in seen_by_camera), default=None),
         seen_path_m=sum(steps, 0.0),
-        nearest=farthest,
-        away=away,
+        nearest=farthest_view,
+        away=frames_away,
         views=tuple(views),
         problems=(),
     )
-    problems = failed + _problems(found, is_unfitted, len(held))
-    if farthest is not None and scale is not None and not is_unfitted:
-        magnified = magnified_sentence(1 / farthest.magnification, 1.0)
-        problems += [] if magnified is None else [magnified]
-    return dataclasses.replace(found, problems=tuple(problems))
+    problems = failures + _find_problems(camera_trust, is_unfitted, len(camera_frames))
+    if farthest_view is not None and scale is not None and not is_unfitted:
+        sentence = magnified_sentence(1 / farthest_view.magnification, 1.0)
+        problems += [] if sentence is None else [sentence]
+    return dataclasses.replace(camera_trust, problems=tuple(problems))
 
 
-def _small(camera: Camera) -> Camera:
+def _shrink_camera(camera: Camera) -> Camera:
+    """Return the camera at the size at which views are judged."""
     return camera.scaled(min(1.0, WORK_WIDTH / camera.width))
 
 
 def _is_away(nearest: Nearest) -> bool:
+    """Return True if a view is beyond the limits of distance or angle."""
     return nearest.distance_m > MAX_DISTANCE_M or nearest.angle_rad > MAX_ANGLE_RAD
 
 
-_LACKS = {  # by figure of ViewTrust
+# Sentences on figures that are beyond their limit, by field of ViewTrust.
+_FIGURE_SENTENCES = {
     "ground_open": "{share} of the ground has no surface{where}: fog and water stand in the holes",
     "ground_leaks": f"{{share}} of the ground lets more than {100 * MAX_TRANSMITTANCE:g} % of the "
     "light behind it through{where}",
@@ -752,47 +921,61 @@ _LACKS = {  # by figure of ViewTrust
 }
 
 
-def _problems(own: CameraTrust, is_unfitted: bool, frames: int) -> list[str]:
-    found = []
-    if own.nearest is not None and (is_unfitted or own.away):
-        where = f"{own.nearest.distance_m:.1f} m and {math.degrees(own.nearest.angle_rad):.0f} deg"
+def _find_problems(trust: CameraTrust, is_unfitted: bool, num_frames: int) -> list[str]:
+    """Return the sentences on what is wrong with a camera's pictures.
+
+    Args:
+        trust: facts about the pictures.
+        is_unfitted: if True, the scene was never fitted to the camera.
+        num_frames: number of the camera's frames.
+    """
+    sentences = []
+    if trust.nearest is not None and (is_unfitted or trust.away):
+        where = (
+            f"{trust.nearest.distance_m:.1f} m and {math.degrees(trust.nearest.angle_rad):.0f} deg"
+        )
         limits = f"{MAX_DISTANCE_M:g} m, {math.degrees(MAX_ANGLE_RAD):.0f} deg"
         if is_unfitted:
-            found.append(f"never fitted; up to {where} from the nearest image learnt from")
+            sentences.append(f"never fitted; up to {where} from the nearest image learnt from")
         else:
-            found.append(
-                f"{len(own.away)} of {frames} frames stand away from all images that the scene was "
-                f"made from, up to {where} (limit {limits}): {_listed(own.away)}"
+            sentences.append(
+                f"{len(trust.away)} of {num_frames} frames stand away from all images that the "
+                f"scene was made from, up to {where} (limit {limits}): {_list_numbers(trust.away)}"
             )
-    with_sky = [view for view in own.views if view.sky is None or view.sky >= MIN_SKY_SHARE]
-    worst = {
-        figure: _worst(with_sky if figure == "sky_covered" else own.views, figure)
-        for figure in _LACKS
+    with_sky = [view for view in trust.views if view.sky is None or view.sky >= MIN_SKY_SHARE]
+    worst_views = {
+        figure: _find_worst(with_sky if figure == "sky_covered" else trust.views, figure)
+        for figure in _FIGURE_SENTENCES
     }
-    sky = {view.frame: _percent(view.sky or 0.0) for view in own.views}
-    hole, leak = worst["ground_open"], worst["ground_leaks"]
-    if hole is not None and leak is not None and leak[1] < 2 * hole[1]:
-        del worst["ground_leaks"]  # it is mostly the holes
-    for figure, largest in worst.items():
+    sky = {view.frame: _percent(view.sky or 0.0) for view in trust.views}
+    worst_open = worst_views["ground_open"]
+    worst_leaks = worst_views["ground_leaks"]
+    if worst_open is not None and worst_leaks is not None and worst_leaks[1] < 2 * worst_open[1]:
+        del worst_views["ground_leaks"]  # the light comes mostly through the holes
+    for figure, largest in worst_views.items():
         limit = MAX_SKY_COVERED if figure == "sky_covered" else MAX_GROUND_OPEN
         if largest is not None and largest[1] > limit:
-            where = f" in frame {largest[0]}, the worst of {len(own.views)}"
+            where = f" in frame {largest[0]}, the worst of {len(trust.views)}"
             where += f" (limit {_percent(limit)})"
             shares = {"share": _percent(largest[1]), "sky": sky[largest[0]]}
-            found.append(_LACKS[figure].format(**shares, where=where))
-    return found
+            sentences.append(_FIGURE_SENTENCES[figure].format(**shares, where=where))
+    return sentences
 
 
-def _worst(views: Sequence[ViewTrust], figure: str) -> tuple[int, float] | None:
-    """Frame and value of the largest."""
-    known = [(view.frame, getattr(view, figure)) for view in views]
-    return max(((f, v) for f, v in known if v is not None), key=lambda pair: pair[1], default=None)
+def _find_worst(views: Sequence[ViewTrust], figure: str) -> tuple[int, float] | None:
+    """Return frame and value of the view with the largest figure; None without a figure."""
+    figures = [(view.frame, getattr(view, figure)) for view in views]
+    return max(
+        ((f, v) for f, v in figures if v is not None), key=lambda pair: pair[1], default=None
+    )
 
 
 def _percent(share: float) -> str:
+    """Return a share as a text in percent."""
     return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 
-def _listed(numbers: Sequence[int]) -> str:
-    shown = ", ".join(map(str, numbers[:8]))
-    return shown + (f" and {len(numbers) - 8} more" if len(numbers) > 8 else "")
+def _list_numbers(numbers: Sequence[int]) -> str:
+    """Return the first eight of some numbers as a text."""
+    text = ", ".join(map(str, numbers[:8]))
+    return text + (f" and {len(numbers) - 8} more" if len(numbers) > 8 else "")

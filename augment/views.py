@@ -1,4 +1,10 @@
-"""One view of a scene in its weather: buffers in floats, and the images that are written."""
+"""Rendering of one view of a scene in its weather, as float buffers and as 8-bit images.
+
+In: a scene, a camera, a recipe. Out: `WeatheredBuffers` (tensors, by `render_buffers`) or
+`WeatheredView` (arrays as files hold them, by `render_view`). Jobs, the viewer and the tools call
+`begin_view` or a `ViewPool`, so that the next view begins before the last one has left the GPU.
+`augment.plan` decides which passes a view needs; this module runs them in the order of `EFFECTS`.
+"""
 
 from __future__ import annotations
 
@@ -33,28 +39,37 @@ from augment.trust import trust_mask
 from augment.view_images import SURFACE_ALPHA, ViewImages, begin_images
 from recipes.schema import Recipe
 
-# ---- A plan carried out: the order of the effects in plain sight ---------------------------------
+# ---- The passes of one view, in the order in which they run --------------------------------------
 
 
 def render_view(
     scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO
 ) -> WeatheredView:
-    """The view of `camera` (before recipe.render.scale) under the recipe's weather, in 8 bits.
+    """Render one view under the recipe's weather, in 8 bits.
 
-    backend: as for `rasterize`, but "auto" takes the GPU where there is one.
+    Args:
+        scene: the scene.
+        camera: the view, before recipe.render.scale.
+        recipe: the weather and the outputs.
+        backend: as for `rasterize`, but "auto" takes the GPU where there is one.
     """
     return begin_view(scene, camera, recipe, backend=backend).result()
 
 
 def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO) -> PendingView:
-    """The view of `render_view`, begun: its `result` waits for the GPU; another can be begun."""
+    """Begin the view of `render_view`; its `result` waits for the GPU.
+
+    Another view can be begun before this one's result is asked for. The arguments are those of
+    `render_view`.
+    """
     if backend == AUTO:
         backend = choose_backend(backend, scene)
     with timed("plan"):
         plan = make_plan(recipe, scene)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     images = begin_images(buffers, plan)
-    camera = buffers.camera  # and not the buffers, which the images may long outlive
+    # The closure below holds the camera and not the buffers, which the images may long outlive.
+    camera = buffers.camera
     trust = dict[str, np.ndarray]()
     if recipe.output.trust:
         with timed("trust mask"):
@@ -69,7 +84,14 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
 def render_buffers(
     scene: Scene, camera: Camera, plan: Plan, *, backend: str = AUTO
 ) -> WeatheredBuffers:
-    """The view of `camera` at its own resolution, as floats."""
+    """Render one view as floats.
+
+    Args:
+        scene: the scene.
+        camera: the view, at the resolution to render.
+        plan: the passes that the recipe requires (`augment.plan.make_plan`).
+        backend: as for `rasterize`.
+    """
     with timed("view plan"):
         view = plan_view(plan, scene, camera, backend=backend)
     with timed("parts"):
@@ -80,16 +102,16 @@ def render_buffers(
         with timed("photo"):
             photo = open_photo(scene, camera, color_map, backend=backend)
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
-    for own in view.effects:
-        layers = own.effect.edit_scene(own, layers, camera)
+    for effect in view.effects:
+        layers = effect.effect.edit_scene(effect, layers, camera)
     if plan.prune > 0:
         with timed("prune"):
             parts = prune_parts(layers.parts, scene, camera, plan.prune)
             layers = replace(layers, parts=parts, unpruned=layers.parts)
-    drawn = _draw(view, layers, camera)
-    for own in view.effects:
-        drawn = own.effect.edit_image(own, drawn, camera)
-    rgb = drawn.rgb
+    rendered = _draw(view, layers, camera)
+    for effect in view.effects:
+        rendered = effect.effect.edit_image(effect, rendered, camera)
+    rgb = rendered.rgb
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         with timed("camera colour map"):
             rgb = map_colors(rgb, color_map, backend=backend)
@@ -98,50 +120,63 @@ def render_buffers(
             rgb = blur_lens(rgb, plan.sensor.psf_px)
     if plan.sensor.noise > 0:
         with timed(NOISE):
-            noise, seed = plan.sensor.noise, plan.seed
-            rgb = add_noise(rgb, noise, camera, seed=seed, scene=scene.name, backend=backend)
+            noise_sigma = plan.sensor.noise
+            noise_seed = plan.seed
+            rgb = add_noise(
+                rgb, noise_sigma, camera, seed=noise_seed, scene=scene.name, backend=backend
+            )
     with timed("depth of surfaces"):
-        depth_m = _surface_depth(drawn.raster, plan, plan.image_buffers)
+        depth_m = _surface_depth(rendered.raster, plan, plan.image_buffers)
     return WeatheredBuffers(
         camera=camera,
         rgb=rgb,
-        raster=drawn.raster,
+        raster=rendered.raster,
         depth_m=depth_m,
         parts=tuple(layers.parts),
-        plan=view.skipping(drawn.skipped),
-        masks=_masks(view, drawn),
-        bare=_bare(drawn.raster, bare_parts, camera, plan, view, backend),
+        plan=view.skipping(rendered.skipped),
+        masks=_masks(view, rendered),
+        bare=_bare(rendered.raster, bare_parts, camera, plan, view, backend),
     )
 
 
 def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> Drawn:
-    """By the last effect that draws the scene in layers of its own; else whole, before its sky."""
-    for own in reversed(view.effects):
-        drawn = own.effect.draw(own, layers, camera, view.buffers)
-        if drawn is not None:
-            return drawn
+    """Return the view as rendered by the last effect that draws the scene in layers of its own, or,
+    without such an effect, as one layer with its sky.
+    """
+    for effect in reversed(view.effects):
+        rendered = effect.effect.draw(effect, layers, camera, view.buffers)
+        if rendered is not None:
+            return rendered
     return Drawn(*layers.draw_whole(camera, view.buffers), layers)
 
 
-def _masks(view: ViewPlan, drawn: Drawn) -> dict[str, Tensor]:
-    """Where each effect is what a pixel shows: the last one where there are several."""
-    masks, opaque = dict[str, Tensor](), list[Tensor]()
-    for own in reversed(view.effects):
-        mask = own.effect.mask_of(own, drawn)
-        if mask is not None and own.effect.mask is not None:
-            for later in opaque:
-                mask = mask & ~later
-            masks[own.effect.mask] = mask
-            opaque += [] if own.effect.is_see_through else [mask]
+def _masks(view: ViewPlan, rendered: Drawn) -> dict[str, Tensor]:
+    """Return a bool mask for each effect in view: the pixels that show the effect.
+
+    A pixel that several opaque effects cover belongs to the one that is applied last.
+    """
+    masks = dict[str, Tensor]()
+    opaque_masks = list[Tensor]()
+    for effect in reversed(view.effects):
+        mask = effect.effect.mask_of(effect, rendered)
+        if mask is not None and effect.effect.mask is not None:
+            for opaque_mask in opaque_masks:
+                mask = mask & ~opaque_mask
+            masks[effect.effect.mask] = mask
+            opaque_masks += [] if effect.effect.is_see_through else [mask]
     return masks
 
 
 def _surface_depth(raster: RenderOutput, plan: Plan, buffers: frozenset[str]) -> Tensor | None:
-    """z of the surfaces by the planned estimator if among the buffers, else by the labels'."""
+    """Return z of the surfaces, metres, 0 where there is none; None unless the plan needs it.
+
+    The planned depth estimator is taken if it is among `buffers`, else the expected depth, which
+    labels are measured from.
+    """
     if plan.depth_buffer is None and not plan.finds_boxes:
         return None
-    by = plan.depth_buffer if plan.depth_buffer in buffers else None
-    z = getattr(raster, by or EXPECTED_DEPTH)
+    estimator = plan.depth_buffer if plan.depth_buffer in buffers else None
+    z = getattr(raster, estimator or EXPECTED_DEPTH)
     if z is None or raster.alpha is None:
         return None
     if z.device.type == "cpu" and not (z.requires_grad or raster.alpha.requires_grad):
@@ -157,7 +192,17 @@ def _bare(
     view: ViewPlan,
     backend: str,
 ) -> BareBuffers | None:
-    """raster: of the picture, which is the bare scene where the view has no pass for it."""
+    """Return the buffers of the scene without what lies on it; None unless planned.
+
+    Args:
+        raster: buffers of the picture, which shows the bare scene where the view has no pass for
+            it.
+        parts: the scene's parts, without what effects laid on them.
+        camera: the view.
+        plan: the plan of all views.
+        view: the plan of this view.
+        backend: as for `rasterize`.
+    """
     if not plan.bare_buffers:
         return None
     if view.bare_buffers:
@@ -176,18 +221,20 @@ def _weathered(
     trust: Mapping[str, np.ndarray],
     own_car: np.ndarray | None,
 ) -> WeatheredView:
-    """The images with what labels are measured from."""
-    masks, views = dict(trust), dict[str, EffectView]()
+    """Return the finished view: the images, and what labels are measured from."""
+    masks = dict(trust)
+    views = dict[str, EffectView]()
     for effect in effects.EFFECTS:
         if effect.of(recipe) is None:
             continue
-        placed, mask = plan.placed[effect.name], images.masks.get(effect.mask or "")
-        is_seen = placed.data is not None and (effect.mask is None or mask is not None)
-        depth = images.scene_depth_m if is_seen else None
-        views[effect.name] = EffectView(placed, depth, mask, plan.water_level_z_m)
+        effect_plan = plan.placed[effect.name]
+        mask = images.masks.get(effect.mask or "")
+        is_in_view = effect_plan.data is not None and (effect.mask is None or mask is not None)
+        depth = images.scene_depth_m if is_in_view else None
+        views[effect.name] = EffectView(effect_plan, depth, mask, plan.water_level_z_m)
         if effect.mask is not None:
-            nowhere = np.zeros((camera.height, camera.width), np.uint8)
-            masks[effect.mask] = nowhere if mask is None else mask
+            empty_mask = np.zeros((camera.height, camera.width), np.uint8)
+            masks[effect.mask] = empty_mask if mask is None else mask
     return WeatheredView(
         camera=camera,
         rgb=images.rgb,
@@ -201,11 +248,14 @@ def _weathered(
 
 
 def _surface_view(images: ViewImages, plan: Plan, own_car: np.ndarray | None) -> SurfaceView | None:
-    depth, is_bare = images.scene_depth_m, bool(plan.bare_buffers)
+    """Return the surfaces that labels are measured from; None where nobody asks for boxes."""
+    depth = images.scene_depth_m
+    is_bare = bool(plan.bare_buffers)
     if depth is None:
         return None
     shows_first = plan.shows_first and plan.water_level_z_m is not None
-    is_of_depth = not (is_bare or shows_first)  # what the other images show
+    # The other images show the surfaces of this depth, unless they are bare or show the water.
+    is_of_depth = not (is_bare or shows_first)
     return SurfaceView(
         depth_m=depth,
         actors=images.instance if is_of_depth else None,
@@ -222,124 +272,152 @@ def _surface_view(images: ViewImages, plan: Plan, own_car: np.ndarray | None) ->
 
 @dataclass(frozen=True, eq=False)
 class BareBuffers:
-    """The scene without what lies on it: see the same fields of WeatheredBuffers."""
+    """Buffers of the scene without what effects laid on it (snow, for example)."""
 
     raster: RenderOutput
+    """Buffers of the bare surfaces, without colours."""
     depth_m: Float[Tensor, "H W"] | None
+    """z of the bare surfaces, metres, 0 where there is none; None unless planned."""
     parts: tuple[PosedGaussians, ...]
+    """The rendered parts, in the order in which splat_ids count their splats."""
 
 
 @dataclass(frozen=True, eq=False)
 class WeatheredBuffers:
-    """One finished view in floats. rgb: display-encoded, not clamped, sky included.
-
-    raster: buffers of the scene's surfaces, snow included, with water in view also those under it,
-    without colours. depth_m: z of the scene's surface, 0 where there is none; None unless planned.
-    parts: those drawn, by which splat_ids count. plan: what of it was carried out. masks: where an
-    effect is what a pixel shows, by name; of those that can be in view. bare: the scene without
-    what lies on it, if planned.
-    """
+    """One finished view as float tensors."""
 
     camera: Camera
+    """The camera of the view, at the rendered resolution."""
     rgb: Float[Tensor, "H W 3"]
+    """The picture: display-encoded, not clamped, sky included."""
     raster: RenderOutput
+    """Buffers of the scene's surfaces, snow included. With water in view they are those under the
+    water, too, and without colours."""
     depth_m: Float[Tensor, "H W"] | None
+    """z of the scene's surface, metres, 0 where there is none; None unless planned."""
     parts: tuple[PosedGaussians, ...]
+    """The rendered parts, in the order in which splat_ids count their splats."""
     plan: ViewPlan
+    """The passes that were carried out."""
     masks: Mapping[str, Bool[Tensor, "H W"]] = field(default_factory=dict)
+    """Pixels that show an effect, by the effect's mask name; only effects that can be in view."""
     bare: BareBuffers | None = None
+    """Buffers of the scene without what lies on it; None unless planned."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceView:
-    """What labels are measured from; depths are float32 [H, W], z in metres, 0 = none.
+    """Surfaces of one view that labels are measured from.
 
-    depth_m: of the first solid surface, snow included and water not. actors: uint16 [H, W], the
-    instance image of those surfaces, which knows of actors only; None where there is none.
-    shown_depth_m, shown_classes: of the surfaces that the view's instance image shows; None without
-    one. is_bare: these are without what lies on the scene. classes: uint8 [H, W], of the surfaces
-    of depth_m; None where no image shows them. own_car: bool [H, W], where a recorded picture shows
-    the recording car, of which the scene has no surfaces; None where it shows none.
+    Depths are float32 [H, W], z in metres, 0 = none.
     """
 
     depth_m: np.ndarray
+    """Depth of the first solid surface: snow counts, water does not."""
     actors: np.ndarray | None
+    """Instance image of those surfaces, uint16 [H, W], actors only; None where there is none."""
     shown_depth_m: np.ndarray | None
+    """Depth of the surfaces that the view's instance image shows; None without one."""
     shown_classes: np.ndarray | None
+    """Classes of the surfaces that the view's instance image shows; None without one."""
     is_bare: bool
+    """If True, `shown_depth_m` and `shown_classes` are without what lies on the scene."""
     classes: np.ndarray | None = None
+    """Classes of the surfaces of `depth_m`, uint8 [H, W]; None where no image shows them."""
     own_car: np.ndarray | None = None
+    """Pixels of a recorded picture that show the recording car, of which the scene has no surfaces,
+    bool [H, W]; None where it shows none."""
 
 
 @dataclass(frozen=True, eq=False)
 class WeatheredView:
-    """One finished view as it is written to files.
-
-    rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
-    instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene
-    (`augment.jobs.files.label_view` adds boxes without an actor). masks: uint8 [H, W], by name: 255
-    where an effect is what the pixel shows, else 0; and of TRUST, 0 to 255. effects: what their
-    labels are measured from; of all effects that the recipe has. surface: None where nobody asks
-    for boxes.
-    """
+    """One finished view as it is written to files."""
 
     camera: Camera
+    """The camera of the view, at the rendered resolution."""
     rgb: np.ndarray
+    """The picture, uint8 [H, W, 3]."""
     depth_m: np.ndarray | None
+    """Depth, float32 [H, W], metres, 0 = none; None unless planned."""
     semantic: np.ndarray | None
+    """SemanticClass of each pixel, uint8 [H, W]; None unless planned."""
     instance: np.ndarray | None
+    """Instance of each pixel, uint16 [H, W]: 0 = background or sky, else 1 + the actor's index in
+    the scene (`augment.jobs.files.label_view` adds boxes without an actor)."""
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Masks by name, uint8 [H, W]: 255 where the pixel shows the effect, else 0; TRUST holds 0 to
+    255."""
     effects: Mapping[str, EffectView] = field(default_factory=dict)
+    """Inputs of the effects' own labels, for every effect that the recipe has, by name."""
     surface: SurfaceView | None = None
+    """Surfaces that boxes are measured from; None where nobody asks for boxes."""
 
 
 class PendingView:
-    """A view that was begun: on a GPU it may still be computed, other backends have finished it."""
+    """A view that was begun.
+
+    On a GPU it may still be computed; other backends have finished it.
+    """
 
     def __init__(self, finish: Callable[[], WeatheredView]) -> None:
         self._finish: Callable[[], WeatheredView] | None = finish
         self._view: WeatheredView | None = None
 
     def result(self) -> WeatheredView:
-        """The view, once it is there; the same one every time. Of one thread at a time."""
+        """Return the finished view, the same one at every call, and wait for it where needed.
+
+        Only one thread at a time may call this.
+        """
         if self._finish is not None:
-            self._view, self._finish = self._finish(), None
+            self._view = self._finish()
+            self._finish = None
         assert self._view is not None
         return self._view
 
 
 # ---- Several views at once -----------------------------------------------------------------------
 # On the CPU some work of a view cannot be divided, and threads that share a view wait for each
-# other: where each has a view of its own, all cores are busy. Every thread has its work space then.
+# other. All cores are busy only if each thread renders a view of its own, in its own work space.
 
 
 class ViewPool:
-    """Begins views of a scene, several at once on threads of their own; on a GPU, or where there is
-    one thread, one after the other. ahead: how many may be in flight while more are begun.
-    views: how many there will be at most. Close it, or use it as a context manager.
+    """Begins views of a scene, several at once on threads of their own.
+
+    On a GPU, or where there is only one thread, views are rendered one after the other. Close the
+    pool, or use it as a context manager. `ahead` is how many views may be in flight while another
+    is begun.
+
+    Args:
+        scene: the scene, whose size decides how many threads pay off.
+        backend: as for `render_view`.
+        views: the largest number of views that will be begun.
     """
 
     def __init__(self, scene: Scene, backend: str = AUTO, views: int = sys.maxsize) -> None:
         backend = choose_backend(backend, scene) if backend == AUTO else backend
-        self.ahead, self._threads = int(renders_on_gpu(backend)), None
+        self.ahead = int(renders_on_gpu(backend))
+        self._threads = None
         if backend == CPU:
             count = min(views, views_at_once(sum(map(len, scene.all_gaussians))))
             if count > 1:
-                self.ahead, self._threads = count, divided_threads(count)
+                self.ahead = count
+                self._threads = divided_threads(count)
 
     def begin(
         self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO
     ) -> PendingView:
-        """As the function `begin_view`."""
+        """Begin a view, as the function `begin_view` does."""
         if self._threads is None:
             return begin_view(scene, camera, recipe, backend=backend)
-        drawn = self._threads.submit(
+        future = self._threads.submit(
             lambda: begin_view(scene, camera, recipe, backend=backend).result()
         )
-        return PendingView(lambda: awaited(drawn))
+        return PendingView(lambda: awaited(future))
 
     def close(self) -> None:
-        """Begin nothing more; what is being drawn is finished without being waited for."""
+        """Begin no further view; views that are being rendered are finished, and nobody waits for
+        them.
+        """
         if self._threads is not None:
             self._threads.shutdown(wait=False, cancel_futures=True)
 
@@ -353,22 +431,30 @@ class ViewPool:
 def render_views(
     scene: Scene, cameras: Sequence[Camera], recipe: Recipe, *, backend: str = AUTO
 ) -> Iterator[WeatheredView]:
-    """`render_view` of each of the cameras, in their order and to the same bits; several are drawn
-    at once. The error of a view has a note that names its camera.
+    """Yield `render_view` of each camera, in order and to the same bits.
+
+    Several views are rendered at once. The exception of a view has a note that names its camera.
+
+    Args:
+        scene: the scene.
+        cameras: the views, before recipe.render.scale.
+        recipe: the weather and the outputs.
+        backend: as for `render_view`.
     """
     with ViewPool(scene, backend, len(cameras)) as pool:
-        begun = deque[tuple[Camera, PendingView]]()
+        pending_views = deque[tuple[Camera, PendingView]]()
         for camera in cameras:
-            begun.append((camera, pool.begin(scene, camera, recipe, backend=backend)))
-            if len(begun) > pool.ahead:
-                yield _finished(*begun.popleft())
-        for one in begun:
-            yield _finished(*one)
+            pending_views.append((camera, pool.begin(scene, camera, recipe, backend=backend)))
+            if len(pending_views) > pool.ahead:
+                yield _finish_view(*pending_views.popleft())
+        for pending_view in pending_views:
+            yield _finish_view(*pending_view)
 
 
-def _finished(camera: Camera, begun: PendingView) -> WeatheredView:
+def _finish_view(camera: Camera, pending: PendingView) -> WeatheredView:
+    """Return the result of a view; an exception gets a note that names its camera."""
     try:
-        return begun.result()
+        return pending.result()
     except Exception as error:
         error.add_note(f"in the view of camera {camera.name!r} at {camera.timestamp_ns} ns")
         raise

@@ -18,17 +18,20 @@ Value = float | int | str | bool | None
 
 @dataclass(frozen=True)
 class Knob:
-    """A field that trades speed for accuracy; `climategs bench trade` measures each value.
+    """Field of a recipe that trades speed for accuracy. `climategs bench trade` measures each
+    value.
 
-    path: dotted path of the field; in a model, from the model's section.
-    values: from the fastest to the most accurate, which is the reference.
-    what: the setting in a few words, for tables.
-    rank: order in which knobs use up an error that is allowed; those that save most are lowest.
-    chosen: if True, a tier or a target may set the knob. If False, it is only measured: the field
-        says what is written, or none of its values saves time.
-    tiers: value by tier, where that is not the reference.
-    works: function of a section, True if the knob changes anything there.
-    section: dotted path of the section.
+    Attributes:
+        path: dotted path of the field; in a model, from the model's section.
+        values: from the fastest to the most accurate, which is the reference.
+        what: the setting in a few words, for tables.
+        rank: order in which knobs use up an allowed error; knobs that save most have the lowest
+            ranks.
+        chosen: if True, a tier or a target may set the knob. If False, it is only measured: the
+            field says what is written, or none of its values saves time.
+        tiers: value by tier, if it is not the reference.
+        applies_to: function of a section that returns True if the knob changes anything there.
+        section: dotted path of the section.
     """
 
     path: str
@@ -37,7 +40,7 @@ class Knob:
     rank: float
     chosen: bool = True
     tiers: Mapping[str, Value] = field(default_factory=dict, hash=False)
-    works: Callable[[Any], bool] = lambda section: True
+    applies_to: Callable[[Any], bool] = lambda section: True
     section: str = ""
 
     @property
@@ -47,18 +50,20 @@ class Knob:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of manifests, and how people are told what it holds.
+    """Column of manifests, with the words that describe its content.
 
-    value: function of a section; NaN and None mean that there is no value.
-    absent: value where the recipe has no such section; None for a column of words.
-    shows: numbers that mean that the effect is present: "all", or all but 0 ("nonzero"); None if
-        the column says nothing about that.
-    refutes: if True, any other number means that the effect is absent, whatever other columns say.
-    title: title of the number on an axis.
-    unit: unit of that number, which is `factor` times the column's, or `over` divided by it.
-    linear: if True, the axis is never logarithmic.
-    label: words before the number where a few words tell an image's weather.
-    caption: template of a contact sheet's caption; takes the shown number of every column by name.
+    Attributes:
+        value: function of a section; NaN and None mean that there is no value.
+        absent: value if the recipe has no such section; None for a column of words.
+        shows: numbers that mean that the effect is present: "all", or all but 0 ("nonzero"). None
+            if the column says nothing about that.
+        refutes: if True, any other number means that the effect is absent, whatever other columns
+            say.
+        title: title of the number on an axis.
+        unit: unit of that number, which is `factor` times the column's, or `over` divided by it.
+        linear: if True, the axis is never logarithmic.
+        label: words before the number in a short description of an image's weather.
+        caption: template of a contact sheet's caption; it takes the number of every column by name.
     """
 
     name: str
@@ -97,10 +102,10 @@ class Column:
 
 
 class Section(Closed):
-    """A part of a recipe.
+    """Part of a recipe.
 
-    knobs: the knobs among its fields.
-    later_fields: fields that are younger than the section. Hashes leave them out at their defaults.
+    knobs: the knobs among its fields. later_fields: fields that are younger than the section.
+    Hashes leave them out at their defaults.
     """
 
     knobs: ClassVar[tuple[Knob, ...]] = ()
@@ -108,34 +113,36 @@ class Section(Closed):
 
 
 class EffectModel(Section):
-    """A section that is null where its effect is absent.
+    """Section of an effect, which is null if the effect is absent.
 
-    columns: its columns of manifests.
-    in_first_release: if True, hashes of recipes without the effect contain its null; the hashes
-        leave out later effects that are absent.
-    file_fields: fields that name files. The field `digest` covers the contents of these files.
-    meant_by: pairs of a field and its synonyms, separated by spaces.
+    Attributes:
+        columns: its columns of manifests.
+        in_first_release: if True, hashes of recipes without the effect contain its null. Hashes
+            leave out later effects that are absent.
+        file_fields: fields that name files. The field `digest` covers the contents of these files.
+        synonyms: pairs of a field and its synonyms, separated by spaces.
     """
 
     columns: ClassVar[tuple[Column, ...]] = ()
     in_first_release: ClassVar[bool] = False
     file_fields: ClassVar[tuple[str, ...]] = ()
-    meant_by: ClassVar[tuple[tuple[str, str], ...]] = ()
+    synonyms: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     @property
     def changes(self) -> bool:
-        """True if the effect changes anything with these settings."""
+        """Return True if the effect changes anything with these settings."""
         return True
 
     @property
     def files(self) -> dict[str, str]:
-        """Paths of the files that the section names, by field."""
+        """Return the paths of the files that the section names, by field."""
         paths = {name: getattr(self, name) for name in self.file_fields}
         return {name: path for name, path in paths.items() if path is not None}
 
-    def surface(self, shown: str) -> tuple[str, bool] | None:
+    def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:
         """Return the surface on which a LiDAR beam can end, and whether depth images show it.
 
-        None if the effect has no such surface. shown: the recipe's output.surface.
+        The result is None if the effect has no such surface. output_surface: the recipe's
+        output.surface.
         """
         return None

@@ -1,4 +1,4 @@
-"""The one error of this package, where it points to, and how it words guesses."""
+"""The error of this package, the places to which it points, and the words of its guesses."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-MAX_SHOWN = 40  # beyond this many lines the first cause is elsewhere
+# Largest number of lines of an error. If there are more, their cause is elsewhere.
+MAX_SHOWN = 40
 
 
 class RecipeError(Exception):
-    """A recipe cannot be used.
+    """Raised if a recipe cannot be used.
 
-    One line a problem: file and line, dotted field, value, and what is allowed.
+    It has one line per problem: file and line, dotted field, value, and the allowed values.
     """
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """The lines, without the newlines between them."""
+        """Return the lines, without the newlines between them."""
         return tuple(str(problem) for problem in self.args)
 
     def __str__(self) -> str:
@@ -31,8 +32,10 @@ class RecipeError(Exception):
 class Place:
     """Source, line and folder of a piece of text, for messages.
 
-    source: a file, a preset or an option of the command line. line: counted from 1; None where
-    there are no lines. folder: where the files lie that are named there; None: none can be.
+    Attributes:
+        source: a file, a preset or an option of the command line.
+        line: counted from 1. None without lines.
+        folder: folder of the files that the text names. None if it can name none.
     """
 
     source: str
@@ -48,7 +51,7 @@ class Place:
 
 
 class Problems:
-    """Collects what is wrong, so that all of it is reported at once."""
+    """Collects problems, so that all of them are reported at once."""
 
     def __init__(self) -> None:
         self._entries: list[tuple[Place, str]] = []
@@ -77,7 +80,7 @@ class Problems:
 
 
 def nearest_word(word: str, words: Iterable[str]) -> str | None:
-    """The option that is most like `word`, if any is."""
+    """Return the option that is most like `word`, or None."""
     matches = difflib.get_close_matches(word.lower(), words, n=1, cutoff=0.6)
     return matches[0] if matches else None
 
@@ -89,24 +92,24 @@ def did_you_mean(word: str, words: Iterable[str]) -> str:
 
 
 def short(text: str, limit: int = 60) -> str:
-    """One printable line of at most `limit` characters."""
+    """Return one printable line of at most `limit` characters."""
     printable = text if text.isprintable() else repr(text)[1:-1]
     return printable if len(printable) <= limit else printable[: limit - 1] + "…"
 
 
 def join(path: str, name: str) -> str:
-    """The dotted path of a key in a section; '' is the top."""
+    """Return the dotted path of a key in a section; '' is the top."""
     return f"{path}.{name}" if path else name
 
 
 def dotted(location: Iterable[int | str]) -> str:
-    """pydantic's location of an error as a path: `waves.components[1].steepness`."""
+    """Return pydantic's location of an error as a path: `waves.components[1].steepness`."""
     parts = (f"[{part}]" if isinstance(part, int) else f".{short(part)}" for part in location)
     return "".join(parts).removeprefix(".")
 
 
 def readable(error: ValidationError) -> list[str]:
-    """pydantic's problems, one line each: the field, then what is wrong."""
+    """Return pydantic's problems, one line each: the field, then the problem."""
     lines = []
     for item in error.errors(include_url=False):
         path = dotted(item["loc"])

@@ -1,5 +1,5 @@
-"""Parts of recipe models: types of fields, models that refuse unknown keys, and functions that read
-and change fields by dotted path.
+"""Parts of recipe models: types of fields, models that refuse unknown keys, access by dotted
+path.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from pydantic_core import CoreSchema, core_schema
 
 from recipes.errors import did_you_mean
 
-MAX_PER_M = 1e6  # largest extinction, 1/metre: a micrometre is opaque
+# Largest extinction, 1/metre: a micrometre is opaque.
+MAX_PER_M = 1e6
 
 Number = Annotated[float, Strict()]
 Whole = Annotated[int, Strict()]
@@ -80,7 +81,7 @@ class OneOf:
 
 
 class Closed(BaseModel):
-    """Frozen, and an unknown key is an error: what every section of a recipe derives from.
+    """Base of every section of a recipe: frozen, and an unknown key is an error.
 
     The text below a field is its description.
     """
@@ -96,7 +97,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def found(model: BaseModel, path: str) -> Any:
-    """The value at a dotted path; None where a section on the way is absent."""
+    """Return the value at a dotted path, or None if a section on the path is absent."""
     value: Any = model
     for name in path.split("."):
         if value is None:
@@ -116,7 +117,11 @@ def is_given(model: BaseModel, path: str) -> bool:
 
 
 def replaced(model: Model, path: str, value: object) -> Model:
-    """A copy with one field set, unchecked, and given; KeyError where a section is absent."""
+    """Return a copy with one field set, unchecked. The field then counts as given.
+
+    Raises:
+        KeyError: a section on the path is absent.
+    """
     name, _, inner_path = path.partition(".")
     if inner_path:
         section = getattr(model, name)
@@ -127,11 +132,11 @@ def replaced(model: Model, path: str, value: object) -> Model:
 
 
 def changed(model: Model, values: Mapping[str, object]) -> Model:
-    """A copy with fields set by their dotted paths; what else is given stays so.
+    """Return a copy with fields set by their dotted paths. Other given fields stay given.
 
     Raises:
-        ValueError: what comes out breaks a rule of the model.
-        KeyError: a section on the way is absent.
+        ValueError: the result breaks a rule of the model.
+        KeyError: a section on the path is absent.
     """
     for path, value in values.items():
         model = replaced(model, path, value)
@@ -143,7 +148,7 @@ PRESENT: JsonDict = {"not": {"type": "null"}}
 
 
 def one_of(*names: str) -> JsonDict:
-    """In words of JSON Schema: exactly one of the fields is present and not null."""
+    """Return the JSON Schema of "exactly one of the fields is present and not null"."""
     return {"oneOf": [{"required": [name], "properties": {name: PRESENT}} for name in names]}
 
 
@@ -151,8 +156,8 @@ def one_of(*names: str) -> JsonDict:
 
 
 @functools.cache
-def packaged(folder: str) -> tuple[str, ...]:
-    """The stems of the YAML files in a folder of this package, in alphabetical order."""
+def packaged_names(folder: str) -> tuple[str, ...]:
+    """Return the stems of the YAML files in a folder of this package, in alphabetical order."""
     names = (Path(entry.name) for entry in resources.files("recipes").joinpath(folder).iterdir())
     return tuple(sorted(path.stem for path in names if path.suffix == ".yaml"))
 

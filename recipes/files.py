@@ -1,6 +1,7 @@
-"""The files that a recipe names: where they may lie, and the digest of what they hold.
+"""Files that a recipe names: their allowed places, and the digest of their contents.
 
-A recipe file names them from its own folder and none outside: one from elsewhere reads no others.
+A recipe file names files in its own folder or below, and none outside: a recipe from a stranger
+reads no other files.
 """
 
 from __future__ import annotations
@@ -18,23 +19,26 @@ from recipes.errors import RecipeError, nearest_word, short
 from recipes.fields import found, replaced
 from recipes.schema import SECTIONS, Recipe
 
-MAX_MIB = 512  # largest size of a file that is read, MiB
-MAX_NAMES = 1000  # most names of a folder among which a misspelt one is looked for
+# Largest file that is read, MiB.
+MAX_MIB = 512
+# Largest number of names in a folder that are compared with a misspelt one.
+MAX_NAMES = 1000
 
 
 def with_digest(recipe: Recipe) -> Recipe:
-    """The recipe with the digests of the files that its sections name; the same object where there
-    are none.
+    """Return the recipe with the digests of the files that its sections name.
+
+    Without files it is the same object.
 
     Raises:
-        RecipeError: a file is missing, unreadable or too large, or is not that of a given digest.
+        RecipeError: a file is missing, unreadable or too large, or has another digest than given.
     """
     for path, section in recipe.sections().items():
         if not section.files:
             continue
         try:
             hashes = {name: _hash(section, name) for name in section.files}
-            recipe = replaced(recipe, f"{path}.digest", _checked_digest(section, hashes))
+            recipe = replaced(recipe, f"{path}.digest", _check_digest(section, hashes))
         except ValueError as error:
             raise RecipeError(f"recipe {recipe.name}, variant {recipe.variant}: {error}") from None
     return recipe
@@ -52,23 +56,25 @@ def read_files(section: EffectModel) -> dict[str, bytes]:
             with _open(section, name) as file:
                 contents[name] = file.read()
         hashes = {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
-        _checked_digest(section, hashes)
+        _check_digest(section, hashes)
     except (ValueError, OSError) as error:
         raise RecipeError(str(error)) from None
     return contents
 
 
 def digest_of(hashes: Mapping[str, str]) -> str:
-    """The SHA-256 of a line `FIELD HASH` for each file, in the order of the section's fields."""
+    """Return the SHA-256 of a line `FIELD HASH` for each file, in the order of the section's
+    fields.
+    """
     lines = [f"{name} {digest}\n" for name, digest in hashes.items()]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def file_below(folder: Path, written: str) -> Path:
-    """The file that a recipe in `folder` names, as an absolute path.
+    """Return the absolute path of the file that a recipe in `folder` names.
 
     Raises:
-        ValueError: it leads out of the folder, or is no file that can be read.
+        ValueError: the path leads out of the folder, or is no file that can be read.
     """
     folder_text = short(str(folder.absolute()), 200)
     advice = f"put the file beside the recipe, in {folder_text} or below it"
@@ -103,7 +109,8 @@ def open_file(path: str | Path) -> BufferedReader:
     """Open a file that a user has named, for reading.
 
     Raises:
-        OSError: it cannot be opened, or is a folder, a pipe (might wait for ever) or a device.
+        OSError: it cannot be opened, or is a folder, a pipe (which might block for ever) or a
+            device.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
@@ -117,7 +124,12 @@ def open_file(path: str | Path) -> BufferedReader:
 
 
 def _open_checked(path: str | Path) -> BufferedReader:
-    """A file of no more than MAX_MIB; FileNotFoundError, or a ValueError that says why not."""
+    """Open a file of no more than MAX_MIB.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the file cannot be read. The message says why.
+    """
     try:
         file = open_file(path)
     except (FileNotFoundError, NotADirectoryError):
@@ -156,7 +168,7 @@ def _hash(section: EffectModel, name: str) -> str:
             raise ValueError(f"{_field_in_words(section, name)}: cannot be read: {error}") from None
 
 
-def _checked_digest(section: EffectModel, hashes: Mapping[str, str]) -> str:
+def _check_digest(section: EffectModel, hashes: Mapping[str, str]) -> str:
     digest = digest_of(hashes)
     recipe_digest: str | None = found(section, "digest")
     if recipe_digest not in (None, digest):

@@ -82,7 +82,7 @@ class Waves(Closed):
 
     @property
     def is_drawn(self) -> bool:
-        """True if waves are drawn from a spectrum."""
+        """Return True if waves are drawn from a spectrum."""
         return self.components is None and self.preset != "still" and self.height > 0
 
 
@@ -91,7 +91,7 @@ class Flood(EffectModel):
 
     model_config = ConfigDict(json_schema_extra=_ONE_CLARITY)
     later_fields = ("bed_cut", "layers_px")
-    meant_by = (
+    synonyms = (
         ("flood", "water puddle puddles"),
         ("level_m", "depth depth_m"),
         ("turbidity_ntu", "clarity"),
@@ -111,7 +111,7 @@ class Flood(EffectModel):
             (6, 12, 24),
             "waves that make up the surface",
             7,
-            works=lambda flood: flood.waves.is_drawn,
+            applies_to=lambda flood: flood.waves.is_drawn,
         ),
         Knob("bed_cut", (0.03, 0.006, 0.001), "bed that hardly shows through water", 6),
         Knob(
@@ -188,21 +188,23 @@ class Flood(EffectModel):
             raise ValueError(f"{both}: keep one of them")
         return self
 
-    def surface(self, shown: str) -> tuple[str, bool] | None:
-        return "water", shown == "first"
+    def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:
+        return "water", output_surface == "first"
 
     @property
     def effective_turbidity_ntu(self) -> float | None:
-        """The turbidity that the water is drawn with; None where its extinction is given."""
+        """Return the turbidity with which the water is drawn, or None if its extinction is
+        given.
+        """
         if self.absorption_per_m is not None:
             return None
         return DEFAULT_TURBIDITY_NTU if self.turbidity_ntu is None else self.turbidity_ntu
 
     @property
     def extinction_per_m_rgb(self) -> tuple[float, float, float]:
-        """Extinction of red, green and blue light in the water, 1/metre.
+        """Return the extinction of red, green and blue light in the water, 1/metre.
 
-        The recipe's, or that of pure water and grey particles.
+        It is the recipe's, or that of pure water and grey particles.
         """
         if self.absorption_per_m is not None:
             return self.absorption_per_m
@@ -213,6 +215,8 @@ class Flood(EffectModel):
 
 
 def _rounded_down(number: float) -> str:
-    """Four digits that are at most the number: what a message allows must be allowed."""
+    """Return four digits that are at most the number: the limit in a message must itself be
+    allowed.
+    """
     step = 10.0 ** (math.floor(math.log10(number)) - 3)
     return f"{math.floor(number / step) * step:.4g}"

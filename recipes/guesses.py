@@ -1,4 +1,4 @@
-"""Parts of messages about a recipe: a value as it was written, and a guess of what was meant."""
+"""Parts of messages about a recipe: a value as it was written, and a guess at its meaning."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _UNIT = re.compile(
 
 
 def show(node: Node) -> str:
-    """The node as written, on one short line; text that is no number in quotes."""
+    """Return the node as written, on one short line. Text that is no number is quoted."""
     if isinstance(node, ScalarNode):
         if node.value is None:
             return "null"
@@ -173,11 +173,11 @@ def _nearest_key(key: str, section: type[Section], root: type[Section]) -> str |
 
 
 def _synonyms() -> dict[str, str]:
-    """Return the field that each synonym stands for, from the models' `meant_by`."""
-    pairs = (pair for model in SECTIONS.values() for pair in model.meant_by)
+    """Return the field that each synonym stands for, from the models' `synonyms`."""
+    pairs = (pair for model in SECTIONS.values() for pair in model.synonyms)
     return {word: key for key, words in pairs for word in words.split()}
 
 
 def _base(name: str) -> str:
-    """The name without its unit."""
+    """Return the name without its unit."""
     return _UNIT.sub("", name) or name

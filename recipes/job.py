@@ -1,4 +1,4 @@
-"""A job file: which scenes, under which recipes, how many variants of each (docs/generate.md).
+"""Job files: scenes, recipes, and the number of variants of each recipe (docs/generate.md).
 
 Every scene is rendered under every recipe, or under those that it names itself.
 """
@@ -25,14 +25,14 @@ Text = Annotated[str, Field(min_length=1, max_length=4096, strict=True)]
 Name = Annotated[str, Field(pattern=_NAME, strict=True)]
 
 
-def _in_full(key: str) -> BeforeValidator:
+def _expand_text(key: str) -> BeforeValidator:
     return BeforeValidator(lambda value: {key: value} if isinstance(value, str) else value)
 
 
 ALL = ("all",)
 
 
-def _all_by_word(value: Any) -> Any:
+def _parse_all(value: Any) -> Any:
     return ALL if value == "all" else value
 
 
@@ -45,7 +45,7 @@ class JobScene(Closed):
     """Its folder in the output, where the scene's own will not do."""
     frames: Text = "all"
     """Frame numbers: all, 4, 0,5,9, 0:20:2 or ::5; ranges end with the scene."""
-    cameras: Annotated[tuple[Text, ...] | None, BeforeValidator(_all_by_word)] = Field(
+    cameras: Annotated[tuple[Text, ...] | None, BeforeValidator(_parse_all)] = Field(
         default=None, min_length=1
     )
     """Names of cameras; null for all, but of a fitted scene those that it was fitted to; `all` for
@@ -80,9 +80,9 @@ class Job(Closed):
     """Version of the format."""
     name: Name = "job"
     """The file's name if absent."""
-    scenes: tuple[Annotated[JobScene, _in_full("uri")], ...] = Field(min_length=1)
+    scenes: tuple[Annotated[JobScene, _expand_text("uri")], ...] = Field(min_length=1)
     """URIs, or mappings with a uri."""
-    recipes: tuple[Annotated[JobRecipe, _in_full("recipe")], ...] = Field(min_length=1)
+    recipes: tuple[Annotated[JobRecipe, _expand_text("recipe")], ...] = Field(min_length=1)
     """Presets and files, or mappings with a recipe."""
     draws: Literal["per_scene", "shared"] = "per_scene"
     """per_scene draws a recipe's ranges anew for every scene; shared gives variant k of a recipe
@@ -95,7 +95,7 @@ class Job(Closed):
     @model_validator(mode="after")
     def _names_known_recipes(self) -> Job:
         names = [entry.name or Path(entry.recipe).stem for entry in self.recipes]
-        if repeated := _repeated(names):
+        if repeated := _repeated_names(names):
             raise ValueError(f"recipes are called the same: {repeated}; give one of them a name")
         for scene in self.scenes:
             for name in scene.recipes or ():
@@ -108,13 +108,13 @@ class Job(Closed):
         return self
 
 
-def _repeated(names: list[str]) -> str:
+def _repeated_names(names: list[str]) -> str:
     return ", ".join(sorted({name for name in names if names.count(name) > 1}))
 
 
 @dataclasses.dataclass(frozen=True)
 class JobRecipes:
-    """The job's recipes, loaded. templates: by their names in the job, in its order."""
+    """Loaded recipes of a job. templates: by their names in the job, in its order."""
 
     job: Job
     templates: dict[str, RecipeTemplate]
@@ -133,10 +133,10 @@ class JobRecipes:
 
 
 def load_job(path: Path) -> Job:
-    """The job in a YAML file.
+    """Read the job in a YAML file.
 
     Raises:
-        RecipeError: there is no such file, or it is no valid job; one line for each problem.
+        RecipeError: the file does not exist, or is no valid job; one line for each problem.
     """
     missing = "no such file; a job is a YAML file"
     too_large = "name scenes by a pattern (*)"
@@ -145,8 +145,13 @@ def load_job(path: Path) -> Job:
 
 
 def parse_job(text: str, *, source: str, name: str = "job", folder: Path | None = None) -> Job:
-    """The job in YAML `text`. source: stands before the line in messages. name: the default.
-    folder: where the files lie that its `set` names.
+    """Read the job in YAML `text`.
+
+    Args:
+        text: the YAML.
+        source: words before the line number in messages.
+        name: default of the job's name.
+        folder: folder of the files that its `set` names.
 
     Raises:
         RecipeError: it is no valid job; one line for each problem.
@@ -177,7 +182,7 @@ def parse_job(text: str, *, source: str, name: str = "job", folder: Path | None 
 
 
 def load_job_recipes(job: Job, folder: Path) -> JobRecipes:
-    """The job's recipes from their presets and files. folder: where relative paths start.
+    """Load the job's recipes from their presets and files. folder: where relative paths start.
 
     Raises:
         RecipeError: a recipe is missing or invalid.
@@ -196,7 +201,7 @@ def load_job_recipes(job: Job, folder: Path) -> JobRecipes:
         if entry.variants is not None:
             template = dataclasses.replace(template, variants=entry.variants)
         templates[name] = template
-    if repeated := _repeated([template.name for template in templates.values()]):
+    if repeated := _repeated_names([template.name for template in templates.values()]):
         raise RecipeError(
             f"job {job.name}: recipes write to the same folders: {repeated}; give one of them a "
             "name in the job"
@@ -211,7 +216,11 @@ def seed_for_scene(seed: int, scene_name: str) -> int:
 
 
 def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
-    """The recipe at another resolution, its render.scale; RecipeError beyond the limits."""
+    """Return the recipe at another resolution, its render.scale.
+
+    Raises:
+        RecipeError: the scale is beyond the limits.
+    """
     if scale == 1:
         return recipe
     try:

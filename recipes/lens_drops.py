@@ -11,7 +11,7 @@ from recipes.fields import Number, Whole
 class LensDrops(EffectModel):
     """Drops of water on the glass before the lens, out of its focus."""
 
-    meant_by = (
+    synonyms = (
         ("lens_drops", "drops raindrops droplets water_drops"),
         ("glass_m", "distance distance_m windshield_m"),
         ("wiper_s", "wiper wipers wiper_period_s"),
@@ -51,5 +51,5 @@ class LensDrops(EffectModel):
 
     @property
     def aperture_m(self) -> float:
-        """Radius of the aperture."""
+        """Return the radius of the aperture."""
         return self.focal_mm / self.f_number / 2000

@@ -1,4 +1,4 @@
-"""Recipes from files and presets, with every problem reported at once."""
+"""Loading of recipes from files and presets, with every problem reported at once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ruamel.yaml.nodes import Node as YamlNode
 from ruamel.yaml.representer import SafeRepresenter
 
 from recipes.errors import Place, Problems, RecipeError, did_you_mean, short
-from recipes.fields import packaged, packaged_text
+from recipes.fields import packaged_names, packaged_text
 from recipes.files import file_below, open_file
 from recipes.guesses import show
 from recipes.ranges import is_number
@@ -24,7 +24,9 @@ from recipes.yaml_tree import MapNode, Node, ScalarNode, check_text, read_tree
 
 _LOG = logging.getLogger(__name__)
 
-MAX_BYTES = 65_536  # a recipe is a page of text; a bigger file is something else
+# Largest recipe file, bytes. A recipe is a page of text; a bigger file is something else.
+MAX_BYTES = 65_536
+# Message about an empty file.
 EMPTY = "the file is empty; a recipe is a mapping such as 'weather: {smog: {visibility_m: 300}}'"
 
 Overrides = Mapping[str, object]  # dotted path -> what replaces the field: a Node, or plain YAML
@@ -36,22 +38,26 @@ Overrides = Mapping[str, object]  # dotted path -> what replaces the field: a No
 def load_recipe(
     path_or_preset_name: str | Path, overrides: Overrides | None = None
 ) -> RecipeTemplate:
-    """The template in a file, or the preset of that name.
+    """Return the template in a file, or the preset of that name.
 
-    A text that names a preset is the preset (write ./NAME for a file of that name); anything else,
+    A text that names a preset is the preset (write ./NAME for a file of that name). Any other text,
     and every Path, is a file. A file's stem is the recipe's name unless the file gives one.
     overrides: fields that replace those of the file.
 
     Raises:
-        RecipeError: there is no such file or preset, it holds no valid recipe, or it names a
-            file that cannot be read.
+        RecipeError: the file or preset does not exist, holds no valid recipe, or names a file that
+            cannot be read.
     """
     text, place, name = _read(path_or_preset_name)
     return _template(text, place, name, overrides)
 
 
 def recipe_text(path_or_preset_name: str | Path) -> str:
-    """The YAML of a file or a preset, a start for one's own; RecipeError if there is none."""
+    """Return the YAML of a file or a preset, as a start for a user's own.
+
+    Raises:
+        RecipeError: there is no such file or preset.
+    """
     return _read(path_or_preset_name)[0]
 
 
@@ -63,13 +69,17 @@ def parse_recipe(
     folder: Path | None = None,
     overrides: Overrides | None = None,
 ) -> RecipeTemplate:
-    """The template in YAML `text`.
+    """Return the template in YAML `text`.
 
-    source: stands before the line number in messages. name: the recipe's, where the text gives
-    none. folder: where the files that the text names lie; without it, it can name none.
+    Args:
+        text: the YAML.
+        source: words before the line number in messages.
+        name: name of the recipe if the text gives none.
+        folder: folder of the files that the text names. Without it, it can name none.
+        overrides: fields that replace those of the text.
 
     Raises:
-        RecipeError: anything is wrong with the text; one line for each problem.
+        RecipeError: the text has faults; one line for each problem.
     """
     return _template(text, Place(source, folder=folder), name, overrides)
 
@@ -96,8 +106,8 @@ def read_overrides(
 
 
 def preset_names() -> tuple[str, ...]:
-    """The recipes that come with the package, in alphabetical order."""
-    return packaged("presets")
+    """Return the names of the recipes that come with the package, in alphabetical order."""
+    return packaged_names("presets")
 
 
 def describe_preset(name: str) -> str:
@@ -106,7 +116,7 @@ def describe_preset(name: str) -> str:
 
 
 def _read(path_or_preset_name: str | Path) -> tuple[str, Place, str]:
-    """The text of a file or preset, its place, and the name that it gives the recipe."""
+    """Return the text of a file or preset, its place, and the name that it gives the recipe."""
     source = str(path_or_preset_name)
     if path_or_preset_name in preset_names():
         return packaged_text("presets", source), Place(f"preset {source}"), source
@@ -119,10 +129,10 @@ def _read(path_or_preset_name: str | Path) -> tuple[str, Place, str]:
 
 
 def read_text(path: Path, max_bytes: int, *, missing: str, too_large: str) -> str:
-    """A file's text. missing, too_large: what to say then.
+    """Read a file's text. missing, too_large: messages for these cases.
 
     Raises:
-        RecipeError: there is none, or it cannot be read as text.
+        RecipeError: the file does not exist, or cannot be read as text.
     """
     source = str(path)
     try:
@@ -153,7 +163,7 @@ def _template(
     problems = Problems()
     tree = _read_mapping(text, place, problems)
     for path, value in (overrides or {}).items():
-        tree = _merged(tree, _override(path, value), recipe_file())
+        tree = _merge_trees(tree, _override(path, value), recipe_file())
     _check_version(tree)
     if name is not None and "name" not in tree:
         tree["name"] = ScalarNode(place, name, name)
@@ -175,7 +185,7 @@ def _template(
         seed=top["seed"],
         variants=top["variants"],
         first_variant=top["variant"],
-        given=fields,
+        field_values=fields,
     )
     if template.variants > 1 and not template.describe_ranges():
         text = "%s: variants = %d, but no field has a range: all have the same numbers"
@@ -193,7 +203,9 @@ def _read_mapping(text: str, place: Place, problems: Problems) -> MapNode:
 
 
 def _check_version(tree: MapNode) -> None:
-    """A later format may well rename fields, so nothing else is said about such a file."""
+    """Refuse another version of the format. A later one may rename fields, so nothing else is
+    checked.
+    """
     version = tree.get("version")
     value = version.value if isinstance(version, ScalarNode) else None
     if version is not None and (type(value) is not int or value != VERSION):
@@ -202,7 +214,9 @@ def _check_version(tree: MapNode) -> None:
 
 
 def _with_parents(tree: MapNode, place: Place, problems: Problems) -> MapNode:
-    """The tree over the one that it extends, which is over its own, and so on."""
+    """Return the tree merged over the one that it extends, which is merged over its own, and so
+    on.
+    """
     chain = [_identity(place)]
     while (parent := tree.pop("extends", None)) is not None:
         if isinstance(parent, ScalarNode) and parent.value is None:
@@ -215,7 +229,7 @@ def _with_parents(tree: MapNode, place: Place, problems: Problems) -> MapNode:
         parent_tree = _read_mapping(text, place, problems)
         _check_version(parent_tree)
         parent_tree.pop("name", None)
-        tree = _merged(parent_tree, tree, recipe_file())
+        tree = _merge_trees(parent_tree, tree, recipe_file())
     return tree
 
 
@@ -243,7 +257,7 @@ def _read_parent(parent: Node) -> tuple[str, Place]:
         raise place.error(f"extends = {show(parent)}: {text}") from None
 
 
-def _merged(base: MapNode, changes: MapNode, section: type[Section]) -> MapNode:
+def _merge_trees(base: MapNode, changes: MapNode, section: type[Section]) -> MapNode:
     """Return `base` with the fields of `changes` in place of its own; sections merge."""
     entries = dict(base)
     for name, node in changes.items():
@@ -254,7 +268,7 @@ def _merged(base: MapNode, changes: MapNode, section: type[Section]) -> MapNode:
             and isinstance(base_node, MapNode)
             and isinstance(node, MapNode)
         ):
-            entries[name] = _merged(base_node, node, inner_section)
+            entries[name] = _merge_trees(base_node, node, inner_section)
         else:
             entries[name] = node
     return MapNode(changes.place, entries)
@@ -284,7 +298,7 @@ def _value_node(text: str, place: Place) -> Node:
 
 
 class _Representer(SafeRepresenter):
-    """Colours and rates on one line; no anchors."""
+    """Writes colours and rates on one line, without anchors."""
 
     def ignore_aliases(self, data: object) -> bool:
         return True
@@ -299,11 +313,11 @@ _Representer.add_representer(tuple, _represent_tuple)
 
 
 def dump_recipe(recipe: Recipe) -> str:
-    """YAML with every field written out, defaults included, and the hash in a comment.
+    """Return YAML with every field written out, defaults included, and the hash in a comment.
 
     `parse_recipe(dump_recipe(r), ...).resolve(0)` equals r, to the bit. Paths of files are written
-    as they are: give them names from the recipe's folder first, as a job does. Settings that an
-    open quality has still to choose are left out.
+    unchanged: make them relative to the recipe's folder first, as a job does. Settings that an open
+    quality has still to choose are left out.
     """
     data = recipe.model_dump()
     for knob in free_knobs(recipe) if recipe.quality.is_open else ():

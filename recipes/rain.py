@@ -9,22 +9,24 @@ from pydantic import Field
 from recipes.effect import Column, EffectModel, Knob
 from recipes.fields import Angle, Colour, Flag, Number, Unit
 
-MAX_RATE_MM_H = 300.0  # the hour's record of most cities is below
+# Largest rate of rain. The hour's record of most cities is below.
+MAX_RATE_MM_H = 300.0
+# Largest speed of wind.
 MAX_WIND_MPS = 60.0
 # Wetness of the ground grows with the rain's rate as 1 - exp(-rate / WET_THROUGH_MM_H), mm/h.
 WET_THROUGH_MM_H = 1.5
 # Share of the open ground on which water stands at 1 mm/h, 0 to 1.
-PUDDLES_AT_1_MM_H = 0.03
+PUDDLE_SHARE_AT_1_MM_H = 0.03
 # Power of the rate with which that share grows, about a square root; no unit.
-PUDDLES_POWER = 0.55
+PUDDLE_EXPONENT = 0.55
 # Largest share that follows from a rate, 0 to 1.
-MOST_PUDDLES = 0.35
+MAX_PUDDLE_SHARE = 0.35
 
 
 class Rain(EffectModel):
     """Rain: drops that streak near the camera and veil what is far, and the wet ground below."""
 
-    meant_by = (
+    synonyms = (
         ("rate_mm_h", "rain_rate mm_h mm_per_hour"),
         ("wind_mps", "wind_speed"),
         ("wind_from_deg", "wind_direction wind_deg"),
@@ -45,7 +47,7 @@ class Rain(EffectModel):
             "resolution of what wet ground mirrors",
             6.5,
             tiers={"draft": 4.0},
-            works=lambda rain: rain.ground_wetness > 0,
+            applies_to=lambda rain: rain.ground_wetness > 0,
         ),
     )
     columns = (
@@ -97,22 +99,24 @@ class Rain(EffectModel):
 
     @property
     def changes(self) -> bool:
-        """Rain without a rate changes nothing in the air."""
+        """Return False for rain without a rate, which changes nothing in the air."""
         return self.rate_mm_h > 0
 
     @property
     def ground_wetness(self) -> float:
-        """Wetness of the ground, 0 to 1; follows from the rate where the recipe gives none."""
+        """Return the wetness of the ground, 0 to 1. It follows from the rate if the recipe gives
+        none.
+        """
         if self.wetness is not None:
             return self.wetness
         return -math.expm1(-self.rate_mm_h / WET_THROUGH_MM_H)
 
     @property
     def puddle_share(self) -> float:
-        """Share of the open ground on which water stands, 0 to 1.
+        """Return the share of the open ground on which water stands, 0 to 1.
 
-        Follows from the rate where the recipe gives none.
+        It follows from the rate if the recipe gives none.
         """
         if self.puddles is not None:
             return self.puddles
-        return min(MOST_PUDDLES, PUDDLES_AT_1_MM_H * self.rate_mm_h**PUDDLES_POWER)
+        return min(MAX_PUDDLE_SHARE, PUDDLE_SHARE_AT_1_MM_H * self.rate_mm_h**PUDDLE_EXPONENT)

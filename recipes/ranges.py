@@ -1,8 +1,8 @@
-"""How one field of a recipe gets its value: a fixed one, or a draw from a range.
+"""Values of a recipe's fields: fixed ones, and draws from ranges.
 
-The random numbers are pure functions of (seed, variant, path of the field): no generator hands its
-state from draw to draw, so a new field or variant leaves all others alone. Drawn floats have 10
-significant digits: exp, log and erf differ in the last bit by platform.
+The random numbers are pure functions of (seed, variant, path of the field). No generator carries
+its state from draw to draw, so a new field or variant leaves all others unchanged. Drawn floats
+have 10 significant digits: exp, log and erf differ in the last bit by platform.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from typing import TypeGuard
 
 from recipes.files import file_below
 
-_DOMAIN = "climategs recipe draw 1"  # a change of the scheme changes this, never silently a number
+# Domain of the hashes. A change of the scheme changes it, so that no number changes silently.
+_DOMAIN = "climategs recipe draw 1"
 
 Triple = tuple[float, float, float]  # a colour, or three rates
 Plain = bool | int | float | str | Triple | tuple[str, ...] | None
@@ -26,13 +27,13 @@ Plain = bool | int | float | str | Triple | tuple[str, ...] | None
 
 @dataclass(frozen=True)
 class Draws:
-    """The random numbers of one variant."""
+    """Random numbers of one variant."""
 
     seed: int
     variant: int
 
     def unit(self, path: str) -> float:
-        """The number in [0, 1) that belongs to `path`: 53 bits of a SHA-256."""
+        """Return the number in [0, 1) that belongs to `path`: 53 bits of a SHA-256."""
         key = json.dumps([_DOMAIN, self.seed, self.variant, path])
         digest = hashlib.sha256(key.encode()).digest()
         return (int.from_bytes(digest[:8], "big") >> 11) * 2.0**-53
@@ -55,12 +56,12 @@ class Fixed:
         return (self.value,)
 
     def describe(self) -> str:
-        return words(self.value)
+        return format_value(self.value)
 
 
 @dataclass(frozen=True)
 class NamedFile(Fixed):
-    """The name of a file as it is written; a draw has its absolute path."""
+    """Name of a file as it is written. A draw has its absolute path."""
 
     value: str
     folder: Path
@@ -74,9 +75,10 @@ class NamedFile(Fixed):
 
 @dataclass(frozen=True)
 class Uniform:
-    """Every value from low to high alike; both ends included where they are whole numbers.
+    """Uniform range from low to high. Both ends are included if they are whole numbers.
 
-    log: of the logarithm, as often between 10 and 20 as between 100 and 200; 0 < low.
+    log: if True, the logarithm is uniform, as often between 10 and 20 as between 100 and 200; then
+    0 < low.
     """
 
     low: float
@@ -98,21 +100,24 @@ class Uniform:
             number = low + unit * (high - low + 1)
         else:
             number = low + unit * (high - low)
-        return _floor(number, low, high) if is_whole else _rounded(number, low, high)
+        return (
+            _floor_to_range(number, low, high) if is_whole else _round_to_range(number, low, high)
+        )
 
     def probes(self) -> tuple[float, ...]:
         return (self.low, self.high)
 
     def describe(self) -> str:
         kind = "log-uniform" if self.log else "uniform"
-        return f"{kind} from {words(self.low)} to {words(self.high)}"
+        return f"{kind} from {format_value(self.low)} to {format_value(self.high)}"
 
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal, cut off at low and high, by the inverse of its distribution. low <= mean <= high.
+    """Normal range cut off at low and high, drawn by the inverse of its distribution.
 
-    Draws are whole where low and high are, which the mean and the deviation need not be.
+    low <= mean <= high. Draws are whole if low and high are; the mean and the deviation need not
+    be.
     """
 
     mean: float
@@ -131,22 +136,24 @@ class Normal:
         probability = min(max(below + draws.unit(path) * inside, 1e-300), 1 - 2.0**-53)
         number = normal.inv_cdf(probability)
         if is_whole:
-            return _floor(number + 0.5, self.low, self.high)
-        return _rounded(number, self.low, self.high)
+            return _floor_to_range(number + 0.5, self.low, self.high)
+        return _round_to_range(number, self.low, self.high)
 
     def probes(self) -> tuple[float, ...]:
         return (self.low, self.high)
 
     def describe(self) -> str:
         return (
-            f"normal with mean {words(self.mean)} and deviation {words(self.std)}, "
-            f"from {words(self.low)} to {words(self.high)}"
+            f"normal with mean {format_value(self.mean)} and deviation {format_value(self.std)}, "
+            f"from {format_value(self.low)} to {format_value(self.high)}"
         )
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One of the options, which may be ranges themselves. weights: >= 0, their sum > 0."""
+    """Choice of one of the options, which may be ranges themselves. weights: >= 0, their sum >
+    0.
+    """
 
     options: tuple[Value, ...]
     weights: tuple[float, ...]
@@ -178,7 +185,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class TripleLine:
-    """On the straight line from one to another: one random number, so no odd mixtures."""
+    """Range on the straight line between two colours. One random number makes no odd mixtures."""
 
     start: Triple
     end: Triple
@@ -187,13 +194,13 @@ class TripleLine:
     def draw(self, draws: Draws, path: str) -> Triple:
         unit = draws.unit(path)
         ends = zip(self.start, self.end, strict=True)
-        return as_triple(_rounded(a + unit * (b - a), min(a, b), max(a, b)) for a, b in ends)
+        return as_triple(_round_to_range(a + unit * (b - a), min(a, b), max(a, b)) for a, b in ends)
 
     def probes(self) -> tuple[Triple, ...]:
         return (self.start, self.end)
 
     def describe(self) -> str:
-        return f"uniform from {words(self.start)} to {words(self.end)}"
+        return f"uniform from {format_value(self.start)} to {format_value(self.end)}"
 
 
 @dataclass(frozen=True)
@@ -217,11 +224,11 @@ class Channels:
 Value = Fixed | Uniform | Normal | Choice | TripleLine | Channels
 
 
-def _rounded(number: float, low: float, high: float) -> float:
+def _round_to_range(number: float, low: float, high: float) -> float:
     return min(max(float(f"{number:.10g}"), low), high)
 
 
-def _floor(number: float, low: float, high: float) -> int:
+def _floor_to_range(number: float, low: float, high: float) -> int:
     return min(max(math.floor(number), int(low)), int(high))
 
 
@@ -231,23 +238,23 @@ def is_number(value: object) -> TypeGuard[int | float]:
 
 
 def as_number(value: Plain) -> float:
-    """The value of a field that was checked to hold a number."""
+    """Return the value of a field that was checked to hold a number."""
     assert is_number(value), value
     return value
 
 
 def as_triple(values: Iterable[Plain]) -> Triple:
-    """The three channels of a field that was checked to hold a colour or rates."""
+    """Return the three channels of a field that was checked to hold a colour or rates."""
     red, green, blue = map(as_number, values)
     return (red, green, blue)
 
 
-def words(value: Plain) -> str:
-    """A value as it would be written in a recipe, floats shortened."""
+def format_value(value: Plain) -> str:
+    """Return a value as it would be written in a recipe, floats shortened."""
     if value is None:
         return "null"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
-        return f"[{', '.join(words(channel) for channel in value)}]"
+        return f"[{', '.join(format_value(channel) for channel in value)}]"
     return f"{value:g}" if isinstance(value, float) else str(value)

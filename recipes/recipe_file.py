@@ -53,13 +53,15 @@ from recipes.ranges import (
     Value,
     as_number,
     as_triple,
+    format_value,
     is_number,
-    words,
 )
 from recipes.schema import SECTIONS, Recipe
 from recipes.yaml_tree import MAX_NODES, ListNode, MapNode, Node, ScalarNode
 
-MAX_STD_PER_WIDTH = 1000  # a wider normal is uniform for all purposes, and loses digits
+# Largest standard deviation of a normal range over its width. A wider normal is uniform for all
+# purposes, and loses digits.
+MAX_STD_PER_WIDTH = 1000
 
 # Units in words, by the end of a field's name.
 UNITS = {
@@ -73,7 +75,8 @@ UNITS = {
 # Signs of the limits in messages, by their keywords in JSON Schema.
 _LIMITS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 
-Given = dict[str, Any]  # of a section: a Value for a field, Given for a section, list of Given
+# Fields of a section: a Value for a field, SectionFields for a section, or a list of them.
+SectionFields = dict[str, Any]
 
 
 _TAGS = [f"<{form}>" for form in ("value", *RANGE_KINDS)]  # in pydantic's locations of errors
@@ -84,10 +87,14 @@ _TAGS = [f"<{form}>" for form in ("value", *RANGE_KINDS)]  # in pydantic's locat
 
 @dataclass(frozen=True)
 class Leaf:
-    """A field that holds a value. Its `type`, in a model, reads a node into a `ranges.Value`.
+    """Field that holds a value. Its `type`, in a model, reads a node into a `ranges.Value`.
 
-    path: as in a file, with [] for the items of a list. annotation: of the value where it is not
-    null. info: what else pydantic knows of the field.
+    Attributes:
+        path: as in a file, with [] for the items of a list.
+        annotation: type of a value that is not null.
+        nullable: True if null is allowed.
+        rangeable: True if a range is allowed.
+        info: further facts that pydantic has on the field.
     """
 
     path: str
@@ -109,12 +116,14 @@ class Leaf:
 
     @cached_property
     def type(self) -> Any:
-        """For annotations: a type with a name, since an option of a choice is of the same type."""
+        """Return a named type for annotations. An option of a choice is of the same type."""
         return TypeAliasType(self.path, Annotated[Any, self])  # pyright: ignore
 
     @cached_property
     def kind(self) -> Any:
-        """float, int, bool, str, tuple (a colour or three rates), Literal, or a union of these."""
+        """Return float, int, bool, str, tuple (a colour or three rates), Literal, or a union of
+        these.
+        """
         kind = self.annotation
         while get_origin(kind) is Annotated:
             kind = get_args(kind)[0]
@@ -125,21 +134,23 @@ class Leaf:
         return self.kind in (int, float)
 
     @cached_property
-    def listed(self) -> tuple[str, ...]:
-        """The words that a list in its place may hold; none where it takes no list."""
+    def list_words(self) -> tuple[str, ...]:
+        """Return the words that a list in the field's place may hold; none if it takes no list."""
         items = [part.get("items", {}) for part in self._schema.get("anyOf", ())]
         return tuple(str(word) for item in items for word in item.get("enum", ()))
 
     @cached_property
     def channel(self) -> Leaf | None:
-        """Leaf of one of the three numbers of a colour or rates; None for any other field."""
+        """Return the leaf of one of the three numbers of a colour or rates, or None for any
+        other field.
+        """
         if self.kind is not tuple:
             return None
         return Leaf(f"{self.path}[]", get_args(self.annotation)[0], rangeable=self.rangeable)
 
     @property
     def unit(self) -> str | None:
-        """The unit in words; None for a pure number."""
+        """Return the unit in words, or None for a pure number."""
         name = self.path.removesuffix("[]")
         return next((unit for end, unit in UNITS.items() if name.endswith(end)), None)
 
@@ -155,12 +166,14 @@ class Leaf:
 
     @property
     def limits(self) -> tuple[tuple[str, float], ...]:
-        """Pairs such as (">", 0.0)."""
+        """Return pairs such as (">", 0.0)."""
         return tuple((sign, self._schema[k]) for k, sign in _LIMITS.items() if k in self._schema)
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Words that the field takes besides true and false; empty where they cannot be listed."""
+        """Return the words that the field takes besides true and false; empty if they cannot be
+        listed.
+        """
         parts = (self._schema, *self._schema.get("anyOf", ()))
         enums = [part.get("enum", [part["const"]] if "const" in part else []) for part in parts]
         return tuple(str(word) for enum in enums for word in enum)
@@ -184,8 +197,8 @@ class Leaf:
             text = f"[red, green, blue], each {self.channel.allowed()}"
         elif self.is_number:
             text = self._allowed_number(value) + (f" ({self.unit})" if self.unit else "")
-        elif self.listed:
-            text = f"true, false or a list of {', '.join(self.listed)}"
+        elif self.list_words:
+            text = f"true, false or a list of {', '.join(self.list_words)}"
         elif self.kind is bool or "anyOf" in self._schema:
             *first, last = ("true", "false", *self.words)
             text = f"{', '.join(first)} or {last}"
@@ -235,7 +248,7 @@ class Leaf:
             channels = handler(node)
             numbers = [channel.value for channel in channels if isinstance(channel, Fixed)]
             return Fixed(as_triple(numbers)) if len(numbers) == 3 else Channels(channels)
-        if self.listed and isinstance(node, ListNode):
+        if self.list_words and isinstance(node, ListNode):
             value: Any = tuple(getattr(item, "value", None) for item in node)
         elif isinstance(node, ListNode):
             raise refusal(f"must be {self.allowed()}{guess_value(node, self)}")
@@ -255,7 +268,7 @@ def refusal(text: str) -> PydanticCustomError:
 
 
 def _named_file(node: ScalarNode) -> NamedFile:
-    """The name of a file as it is written, where that file can be read."""
+    """Return the name of a file as it is written, if that file can be read."""
     folder = node.place.folder
     if folder is None:
         text = "this text is in no file, so there is no folder to look in; save it as one"
@@ -304,7 +317,7 @@ def _range_schemas(leaf: Leaf, handler: GetCoreSchemaHandler) -> dict[str, CoreS
     return schemas
 
 
-def _mapping_schema(build: Callable[[Given], Any], **fields: CoreSchema) -> CoreSchema:
+def _mapping_schema(build: Callable[[SectionFields], Any], **fields: CoreSchema) -> CoreSchema:
     keys = {
         name: cs.typed_dict_field(schema, required=name != "weights")
         for name, schema in fields.items()
@@ -314,7 +327,7 @@ def _mapping_schema(build: Callable[[Given], Any], **fields: CoreSchema) -> Core
 
 
 def _list_schema(schema: CoreSchema, counts: Container[int], text: str) -> CoreSchema:
-    """text: what must stand there, said of what is no list of so many items."""
+    """Return the schema of a list. text: expected list, for the message about anything else."""
 
     def check(node: Node) -> Node:
         if not isinstance(node, ListNode) or len(node) not in counts:
@@ -324,7 +337,7 @@ def _list_schema(schema: CoreSchema, counts: Container[int], text: str) -> CoreS
     return cs.no_info_before_validator_function(check, schema)
 
 
-def _interval(fields: Given) -> Uniform:
+def _interval(fields: SectionFields) -> Uniform:
     ((kind, ends),) = fields.items()
     low, high = (as_number(end.value) for end in ends)
     if low > high:
@@ -332,7 +345,7 @@ def _interval(fields: Given) -> Uniform:
     return Uniform(low, high, log=kind == "log_uniform")
 
 
-def _normal(fields: Given) -> Normal:
+def _normal(fields: SectionFields) -> Normal:
     parts = fields["normal"]
     mean, std, low, high = (as_number(parts[name].value) for name in ("mean", "std", "min", "max"))
     if not low < high:
@@ -344,7 +357,7 @@ def _normal(fields: Given) -> Normal:
     return Normal(mean, std, low, high)
 
 
-def _choice(fields: Given) -> Choice:
+def _choice(fields: SectionFields) -> Choice:
     options = tuple(fields["choice"])
     weights = [as_number(weight.value) for weight in fields.get("weights", ())]
     if "weights" in fields and len(weights) != len(options):
@@ -355,7 +368,7 @@ def _choice(fields: Given) -> Choice:
     return Choice(options, tuple(weights) or (1.0,) * len(options))
 
 
-def _line(fields: Given) -> TripleLine:
+def _line(fields: SectionFields) -> TripleLine:
     start, end = fields["uniform"]
     return TripleLine(start.value, end.value)
 
@@ -364,11 +377,11 @@ def _line(fields: Given) -> TripleLine:
 
 
 class Section(Closed):
-    """The base of the models of a file's mappings. What one reads is a dict of what is given.
+    """Base of the models of a file's mappings. Reading one gives a dict of the given fields.
 
-    PATH: dotted, with [] for the items of a list. MODEL: the one of `schema`, which draws are
-    checked against. LEAVES, INNER: its fields and sections. MAX_ITEMS: set where a list of up to so
-    many such mappings stands, which LIST_DESCRIPTION describes.
+    PATH: dotted, with [] for the items of a list. MODEL: the model of `schema` that checks draws.
+    LEAVES, INNER: its fields and sections. MAX_ITEMS: largest number of such mappings in a list, if
+    there is one, which LIST_DESCRIPTION describes.
     """
 
     PATH: ClassVar[str] = ""
@@ -380,7 +393,7 @@ class Section(Closed):
 
     @classmethod
     def walk(cls) -> Iterator[type[Section]]:
-        """This section, then all below it."""
+        """Yield this section, then all below it."""
         yield cls
         for section in cls.INNER.values():
             yield from section.walk()
@@ -417,17 +430,17 @@ class Section(Closed):
 
 
 def recipe_file() -> type[Section]:
-    """The model of a recipe file, which holds those of all its sections."""
+    """Return the model of a recipe file, which holds those of all its sections."""
     return _recipe_file(tuple(SECTIONS.items()))
 
 
 @functools.lru_cache(2)
 def _recipe_file(sections: tuple[tuple[str, type[BaseModel]], ...]) -> type[Section]:
-    """sections: those of Recipe at the time."""
+    """Return the model for the present sections of Recipe, which are the key of the cache."""
     return _section("", Recipe, _FileFields)
 
 
-def read_file(tree: MapNode, problems: Problems) -> Given:
+def read_file(tree: MapNode, problems: Problems) -> SectionFields:
     """Return the fields that a tree gives; add everything that is wrong with it to `problems`."""
     try:
         return recipe_file().model_validate(tree)  # type: ignore[return-value]
@@ -484,7 +497,9 @@ class _EffectFields(Closed):
 
 
 def _section(path: str, model: type[BaseModel], extra: type[Closed] = Closed) -> type[Section]:
-    """extra: its fields may be given besides those of the model, and take no ranges."""
+    """Return the model of a section. extra: further fields besides those of the model, without
+    ranges.
+    """
     leaves: dict[str, Leaf] = {}
     inner: dict[str, type[Section]] = {}
     fields: dict[str, Any] = {}
@@ -538,7 +553,7 @@ def _one_line(text: str | None) -> str:
 
 
 def _plain(number: float) -> str:
-    """A number without exponent or trailing zeros where it is short so."""
+    """Return a number without exponent or trailing zeros if it is short so."""
     is_whole = isinstance(number, int) or (number.is_integer() and abs(number) < 1e15)
     return str(int(number)) if is_whole else repr(number)
 
@@ -546,12 +561,12 @@ def _plain(number: float) -> str:
 # ---- Rules between the fields of a section, tried at the ends of their ranges before any draw ----
 
 
-def broken_rules(section: type[Section], given: Given) -> Iterator[str]:
+def broken_rules(section: type[Section], fields: SectionFields) -> Iterator[str]:
     """Yield every error of the section's model at a combination of the ranges' ends, once."""
     known_texts: set[str] = set()
     ends = [
         _ends(name, value, section.LEAVES.get(name))
-        for name, value in given.items()
+        for name, value in fields.items()
         if name in section.MODEL.model_fields and not isinstance(value, dict)
     ]
     for corner in itertools.product(*ends):
@@ -565,7 +580,9 @@ def broken_rules(section: type[Section], given: Given) -> Iterator[str]:
             known_texts.update(texts)
 
 
-def _ends(name: str, value: Value | list[Given], leaf: Leaf | None) -> list[tuple[str, Any, str]]:
+def _ends(
+    name: str, value: Value | list[SectionFields], leaf: Leaf | None
+) -> list[tuple[str, Any, str]]:
     """Return the values of a field that a rule between fields can depend on.
 
     They are the extreme numbers, null, and every word. Each comes as (name of the field, value,
@@ -587,10 +604,10 @@ def _ends(name: str, value: Value | list[Given], leaf: Leaf | None) -> list[tupl
     triples = [p for p in probes if isinstance(p, tuple)]
     extremes: list[Plain] = [min(numbers), max(numbers)] if numbers else []
     ends: dict[Plain, None] = dict.fromkeys([*extremes, *triples[:1], *options])
-    return [(name, end, f"{name} = {words(end)}" if value.is_range else "") for end in ends]
+    return [(name, end, f"{name} = {format_value(end)}" if value.is_range else "") for end in ends]
 
 
-def _extremes(item: Given, pick: Callable[[Any], Any]) -> dict[str, Any]:
+def _extremes(item: SectionFields, pick: Callable[[Any], Any]) -> dict[str, Any]:
     """Return a mapping of a list with all its numbers at one end. pick: min or max.
 
     Not every combination, of which there may be 2^300: no rule over a list's items trades one
@@ -607,16 +624,20 @@ def _extremes(item: Given, pick: Callable[[Any], Any]) -> dict[str, Any]:
 
 
 class _FileSchema(GenerateJsonSchema):
-    """Text may stand in a file without quotes, though it looks like a number."""
+    """Generator of a schema in which text may stand without quotes, even if it looks like a
+    number.
+    """
 
     def str_schema(self, schema: cs.StringSchema) -> JsonSchemaValue:
         return {**super().str_schema(schema), "type": ["string", "number", "boolean"]}
 
 
 def recipe_json_schema() -> JsonSchemaValue:
-    """JSON Schema (draft 2020-12) of a recipe file, for editors that complete and check YAML.
+    """Return the JSON Schema (draft 2020-12) of a recipe file, for editors that complete and
+    check YAML.
 
-    What JSON Schema cannot say (which end is the lower, rules between draws) is left to loading.
+    Rules that JSON Schema cannot express (the order of two ends, rules between draws) are left to
+    loading.
     """
     schema = recipe_file().model_json_schema(schema_generator=_FileSchema)
     return {"$schema": _FileSchema.schema_dialect, **schema}

@@ -80,12 +80,14 @@ class Quality(Closed):
 
     @property
     def is_open(self) -> bool:
-        """True while settings have still to be chosen, in view of a scene."""
+        """Return True while settings have still to be chosen for a scene."""
         return self.has_target and not self.settled
 
     @property
     def words(self) -> str | None:
-        """For the manifest: `balanced`, `max_flip 0.03`, `budget_ms 150`; None without a wish."""
+        """Return the target for the manifest: `balanced`, `max_flip 0.03`, `budget_ms 150`, or
+        None.
+        """
         for name in TARGETS:
             if getattr(self, name) is not None:
                 return f"{name} {getattr(self, name):g}"
@@ -105,11 +107,12 @@ class FramePattern:
     pieces: tuple[int | slice, ...] | None
 
     def select(self, numbers: Sequence[int], *, clip: bool = False) -> tuple[int, ...] | None:
-        """The selected numbers, each once, in the order written; None for all.
+        """Return the selected numbers, each once, in the order written, or None for all.
 
-        numbers: the frames that exist; an open range ends with the last of them. clip: leave out
-        numbers of a range that do not exist. A number that stands alone is never left out: the code
-        that looks it up refuses it.
+        Args:
+            numbers: the frames that exist. An open range ends with the last of them.
+            clip: if True, numbers of a range that do not exist are left out. A single number is
+                never left out: the code that looks it up refuses it.
         """
         if self.pieces is None:
             return None
@@ -129,7 +132,11 @@ class FramePattern:
 
 
 def parse_frames(text: str) -> FramePattern:
-    """The pattern in a text; ValueError, which says what is one, where the text is none."""
+    """Return the pattern in a text.
+
+    Raises:
+        ValueError: the text is no pattern. The message says what is one.
+    """
     if text.strip() == "all":
         return FramePattern(text, None)
     try:
@@ -159,7 +166,7 @@ VERSION = 1
 
 
 class Weather(Closed):
-    """The effects of a recipe; null where one is absent."""
+    """The effects of a recipe; null if one is absent."""
 
     smog: Smog | None = None
     flood: Flood | None = None
@@ -260,8 +267,8 @@ class Render(Section):
 
 
 class Sensor(Section):
-    """What the camera adds to what reaches it, after all weather; depth, classes, masks and labels
-    know nothing of it.
+    """Effects of the camera on the light that reaches it, after all weather. Depth, classes,
+    masks and labels do not have them.
     """
 
     later_fields = ("exposure_ms",)
@@ -297,7 +304,7 @@ class Category(Closed):
 
 
 class Output(Section):
-    """What is written for each image."""
+    """Files that are written for each image."""
 
     later_fields = ("surface", "trust", "categories", "min_visibility", "on_hidden")
     knobs = (
@@ -308,7 +315,7 @@ class Output(Section):
             "size and error of jpg files",
             12,
             chosen=False,
-            works=lambda output: output.image == "jpg",
+            applies_to=lambda output: output.image == "jpg",
         ),
     )
 
@@ -347,7 +354,7 @@ class Output(Section):
 
     @property
     def label_formats(self) -> tuple[LabelFormat, ...]:
-        """Formats in which labels are written, besides their tables."""
+        """Return the formats in which labels are written, besides their tables."""
         return () if isinstance(self.labels, bool) else tuple(sorted(set(self.labels)))
 
 
@@ -375,7 +382,7 @@ class Recipe(Closed):
 
     @model_validator(mode="after")
     def _settings_of_tier(self) -> Recipe:
-        """A tier stands for numbers: it is resolved once, here, and stays as a word beside them."""
+        """Replace a tier by its numbers. This happens once; the tier's name stays beside them."""
         if self.quality.tier is not None:
             for path, value in tier_settings(self, self.quality.tier).items():
                 name, _, inner_path = path.partition(".")
@@ -385,11 +392,12 @@ class Recipe(Closed):
         return self
 
     def canonical_json(self) -> str:
-        """One text per recipe: sorted keys, no spaces, floats that read back to the same bits.
+        """Return one text per recipe: sorted keys, no spaces, floats that read back to the same
+        bits.
 
-        Fields younger than the first release are left out at their defaults, which mean what
-        recipes without them meant, so that hashes stay; sweeps that auto passes through are those
-        of `lidar: true`. Where files lie is left out: their digest says what they hold.
+        Fields that are younger than the first release are left out at their defaults, which mean
+        what recipes without them meant, so that hashes stay. Sweeps that auto passes through are
+        those of `lidar: true`. Paths of files are left out: their digest identifies their contents.
         """
         data = self.model_dump(mode="json")
         effects = self.sections()
@@ -423,12 +431,12 @@ class Recipe(Closed):
 
     @property
     def hash(self) -> str:
-        """First 16 hex digits of the SHA-256 of canonical_json()."""
+        """Return the first 16 hex digits of the SHA-256 of canonical_json()."""
         return hashlib.sha256(self.canonical_json().encode()).hexdigest()[:16]
 
     @property
     def lidar(self) -> Literal["weather", "clean"] | None:
-        """Kind of the LiDAR sweeps that are written; None for none.
+        """Return the kind of the LiDAR sweeps that are written, or None for none.
 
         `auto` becomes the kind that agrees with the depth images.
         """
@@ -441,7 +449,7 @@ class Recipe(Closed):
     def lidar_note(self, lidar: Literal["weather", "clean"] | None) -> str | None:
         """Return a note on the surfaces in which images, depth and sweeps differ.
 
-        None where they agree, or there are no sweeps. lidar: the kind of the sweeps.
+        The result is None if they agree, or there are no sweeps. lidar: the kind of the sweeps.
         """
         output = self.output
         has_depth = output.depth != "none" or output.semantic or output.instance
@@ -460,8 +468,12 @@ class Recipe(Closed):
         return f"{'; '.join(notes)} {settings}" if notes else None
 
     def _surfaces(self) -> dict[str, bool]:
-        """Surfaces of the weather on which a beam can end -> whether depth images show them."""
-        surfaces = [section.surface(self.output.surface) for section in self.sections().values()]
+        """Return the weather's surfaces on which a beam can end, and whether depth images show
+        each.
+        """
+        surfaces = [
+            section.beam_surface(self.output.surface) for section in self.sections().values()
+        ]
         return dict(sorted(surface for surface in surfaces if surface is not None))
 
     def sections(self) -> dict[str, EffectModel]:
@@ -497,7 +509,7 @@ TIERS: dict[str, dict[str, Value]] = {"draft": {}, "balanced": {}}
 
 
 def add_section(path: str, model: type[EffectModel]) -> None:
-    """Another effect in the recipes that are made from now on. path: `weather.dust`, or `dust`."""
+    """Add an effect to all recipes that are made from now on. path: `weather.dust`, or `dust`."""
     holder, name = _place(path)
     annotation: Any = model | None
     holder.model_fields[name] = FieldInfo.from_annotated_attribute(annotation, None)
@@ -542,7 +554,7 @@ _collect_knobs()
 
 
 def columns_of_effects() -> dict[str, Column]:
-    """The columns of manifests that effects fill, by name."""
+    """Return the columns of manifests that effects fill, by name."""
     return {column.name: column for model in SECTIONS.values() for column in model.columns}
 
 
@@ -550,9 +562,11 @@ def columns_of_effects() -> dict[str, Column]:
 
 
 def knobs_of(recipe: Recipe) -> tuple[Knob, ...]:
-    """The knobs that have an effect on the recipe's pictures or files."""
+    """Return the knobs that have an effect on the recipe's pictures or files."""
     sections = ((knob, found(recipe, knob.section)) for knob in KNOBS.values())
-    return tuple(knob for knob, section in sections if section is not None and knob.works(section))
+    return tuple(
+        knob for knob, section in sections if section is not None and knob.applies_to(section)
+    )
 
 
 def free_knobs(recipe: Recipe) -> tuple[Knob, ...]:
@@ -561,12 +575,16 @@ def free_knobs(recipe: Recipe) -> tuple[Knob, ...]:
 
 
 def settings_of(recipe: Recipe) -> dict[str, Value]:
-    """The values of its knobs, by path."""
+    """Return the values of the recipe's knobs, by path."""
     return {knob.path: found(recipe, knob.path) for knob in knobs_of(recipe)}
 
 
 def with_settings(recipe: Recipe, settings: Mapping[str, Value]) -> Recipe:
-    """The recipe with some knobs set, which then count as given; ValueError if one is refused."""
+    """Return the recipe with some knobs set, which then count as given.
+
+    Raises:
+        ValueError: a value is refused.
+    """
     return changed(recipe, settings)
 
 
@@ -577,5 +595,5 @@ def tier_settings(recipe: Recipe, tier: str) -> dict[str, Value]:
 
 
 def as_reference(recipe: Recipe) -> Recipe:
-    """The recipe with all its knobs that a tier may set at reference, given or not."""
+    """Return the recipe with every knob that a tier may set at its reference, given or not."""
     return with_settings(recipe, {k.path: k.reference for k in knobs_of(recipe) if k.chosen})

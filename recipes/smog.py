@@ -9,8 +9,10 @@ from pydantic import ConfigDict, Field, model_validator
 from recipes.effect import Column, EffectModel, Knob
 from recipes.fields import Colour, Number, Unit, one_of
 
-KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
-MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
+# Optical depth of the visibility, -ln(0.02): contrast has fallen to 2 % there. No unit.
+KOSCHMIEDER = 3.912
+# Largest extinction: nothing is visible through 10 cm of it.
+MAX_EXTINCTION_PER_M = 100.0
 
 
 class Smog(EffectModel):
@@ -19,7 +21,7 @@ class Smog(EffectModel):
     model_config = ConfigDict(json_schema_extra=one_of("visibility_m", "extinction_per_m"))
     in_first_release = True
     later_fields = ("overcast", "scatter", "shadow_fade")
-    meant_by = (
+    synonyms = (
         ("smog", "fog haze mist"),
         ("extinction_per_m", "beta density sigma"),
         ("color", "airlight"),
@@ -83,7 +85,7 @@ class Smog(EffectModel):
 
     @property
     def sigma_per_m(self) -> float:
-        """Extinction coefficient at the base height, 1/metre."""
+        """Return the extinction coefficient at the base height, 1/metre."""
         if self.extinction_per_m is not None:
             return self.extinction_per_m
         assert self.visibility_m is not None

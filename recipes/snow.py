@@ -38,7 +38,7 @@ class SnowWind(Closed):
 class Snow(EffectModel):
     """Snow lying on what is open to the sky: ground, roofs, vehicles."""
 
-    meant_by = (
+    synonyms = (
         ("depth_m", "level level_m height height_m thickness thickness_m"),
         ("coverage", "cover"),
         ("max_slope_deg", "slope_deg"),
@@ -99,8 +99,10 @@ class Snow(EffectModel):
 
     @property
     def changes(self) -> bool:
-        """Snow without depth or coverage changes nothing."""
+        """Return False for snow without depth or coverage, which changes nothing."""
         return self.depth_m > 0 and self.coverage > 0
 
-    def surface(self, shown: str) -> tuple[str, bool] | None:
-        return (f"snow {self.depth_m:.3g} m deep", shown != "scene") if self.changes else None
+    def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:
+        return (
+            (f"snow {self.depth_m:.3g} m deep", output_surface != "scene") if self.changes else None
+        )

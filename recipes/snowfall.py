@@ -8,13 +8,14 @@ from recipes.effect import Column, EffectModel, Knob
 from recipes.fields import Angle, Colour, Number
 from recipes.rain import MAX_WIND_MPS
 
-MAX_SNOWFALL_MM_H = 50.0  # of water: more than half a metre of snow an hour
+# Largest rate of snowfall, as water: more than half a metre of snow an hour.
+MAX_SNOWFALL_MM_H = 50.0
 
 
 class Snowfall(EffectModel):
     """Snow in the air: flakes near the camera, a white veil beyond; what lies is `snow`."""
 
-    meant_by = (("rate_mm_h", "snow_rate snowfall_rate"), ("turbulence_mps", "turbulence gusts"))
+    synonyms = (("rate_mm_h", "snow_rate snowfall_rate"), ("turbulence_mps", "turbulence gusts"))
     knobs = (
         Knob(
             "min_width_px",
@@ -54,5 +55,5 @@ class Snowfall(EffectModel):
 
     @property
     def changes(self) -> bool:
-        """Snowfall without a rate changes nothing."""
+        """Return False for snowfall without a rate, which changes nothing."""
         return self.rate_mm_h > 0

@@ -1,6 +1,6 @@
-"""The recipe section of style: the colour mood of a photograph, or of a preset.
+"""Recipe section of style: the colour mood of a photograph, or of a preset.
 
-The presets come with the package: statistics of colours, in YAML, and no picture.
+The presets come with the package: statistics of colours, in YAML, without pictures.
 """
 
 from __future__ import annotations
@@ -12,12 +12,21 @@ from pydantic import ConfigDict, Field, Strict, model_validator
 
 from recipes.effect import Column, EffectModel, Knob
 from recipes.errors import RecipeError
-from recipes.fields import Digest, FilePath, Flag, Number, OneOf, one_of, packaged, packaged_text
+from recipes.fields import (
+    Digest,
+    FilePath,
+    Flag,
+    Number,
+    OneOf,
+    one_of,
+    packaged_names,
+    packaged_text,
+)
 
 
 def style_preset_names() -> tuple[str, ...]:
     """Return the names of the style presets, in alphabetical order."""
-    return packaged("styles")
+    return packaged_names("styles")
 
 
 STYLES = OneOf("style", style_preset_names)
@@ -25,7 +34,7 @@ StyleName = Annotated[str, Strict(), STYLES]
 
 
 def style_preset_text(name: str) -> str:
-    """The YAML of a style: mean and covariance of the colours of land and of sky.
+    """Return the YAML of a style: mean and covariance of the colours of land and of sky.
 
     Raises:
         RecipeError: there is no style of that name.
@@ -41,7 +50,7 @@ class Style(EffectModel):
     model_config = ConfigDict(json_schema_extra=one_of("image", "preset"))
     later_fields = ("evaluated",)
     file_fields = ("image", "mask", "checkpoint")
-    meant_by = (
+    synonyms = (
         ("style", "mood look"),
         ("image", "photo picture file path"),
         ("mask", "sky_mask"),
@@ -57,7 +66,7 @@ class Style(EffectModel):
             ("sh", "color"),
             "map folded into the scene or put on each colour",
             9,
-            works=lambda style: style.applied_to == "scene",
+            applies_to=lambda style: style.applied_to == "scene",
         ),
     )
     columns = (
@@ -126,10 +135,10 @@ class Style(EffectModel):
 
     @property
     def changes(self) -> bool:
-        """A style of no strength changes nothing."""
+        """Return False for a style without strength, which changes nothing."""
         return self.strength > 0
 
     @property
     def name(self) -> str:
-        """Name of the preset, or of the image's file without its folders."""
+        """Return the name of the preset, or of the image's file without its folders."""
         return self.preset or PurePath(self.image or "").name

@@ -1,4 +1,4 @@
-"""A recipe as it is written, with its ranges, and the recipes in numbers that it stands for."""
+"""A recipe as it is written, with its ranges, and the recipes in numbers that are drawn from it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from recipes.errors import RecipeError, join, readable
 from recipes.files import with_digest
-from recipes.ranges import Draws, Fixed, Value, as_number, words
+from recipes.ranges import Draws, Fixed, Value, as_number, format_value
 from recipes.recipe_file import recipe_file
 from recipes.schema import VERSION, Recipe
 
@@ -23,10 +23,14 @@ _SHARE = ".probability"
 class RecipeTemplate:
     """A loaded recipe file.
 
-    source: where it was read from, for messages. variants: how many recipes a run draws from it;
-    first_variant: the number of the first. given: what the file gives, by section; a Value for a
-    field, a list for a list of mappings. An effect's `probability` is the share of variants that
-    have it.
+    Attributes:
+        name: name of the recipe.
+        source: file or preset, for messages.
+        seed: seed of the draws.
+        variants: number of recipes that a run draws from it.
+        first_variant: number of the first one.
+        field_values: given fields, by section: a Value for a field, a list for a list of mappings.
+            An effect's `probability` is the share of variants that have it.
     """
 
     name: str
@@ -34,18 +38,18 @@ class RecipeTemplate:
     seed: int = 0
     variants: int = 1
     first_variant: int = 0
-    given: Mapping[str, Any] = field(default_factory=dict)
+    field_values: Mapping[str, Any] = field(default_factory=dict)
 
     def resolve(self, variant: int) -> Recipe:
-        """The recipe number `variant`, counted from 0.
+        """Draw the recipe number `variant`, counted from 0.
 
-        Its numbers depend on the seed, on first_variant + variant and on each field's own path
-        only, so there is no end to the variants. Files that it names are found and read: the recipe
-        has their absolute paths, and a digest of what they hold.
+        Its numbers depend only on the seed, on first_variant + variant and on each field's own
+        path, so there is no end to the variants. Files that it names are searched and read: the
+        recipe has their absolute paths, and a digest of their contents.
 
         Raises:
-            RecipeError: variant is negative or too large, what was drawn breaks a rule, or a file
-                cannot be read or is not the one of which the recipe gives the digest.
+            RecipeError: variant is negative or too large, the draw breaks a rule, or a file cannot
+                be read or has another digest than the recipe gives.
         """
         number = self.first_variant + variant
         leaf = recipe_file().LEAVES["variant"]
@@ -55,7 +59,7 @@ class RecipeTemplate:
         prefix = f"{self.source}: variant {number}"
         names = {"version": VERSION, "name": self.name, "seed": self.seed, "variant": number}
         try:
-            fields = _draw(self.given, Draws(self.seed, number), "")
+            fields = _draw(self.field_values, Draws(self.seed, number), "")
             return with_digest(Recipe.model_validate(names | fields))
         except ValidationError as error:
             raise RecipeError(*(f"{prefix}: {text}" for text in readable(error))) from None
@@ -66,15 +70,19 @@ class RecipeTemplate:
 
     @property
     def values(self) -> dict[str, Value]:
-        """Dotted path -> how the field gets its value, of every field that the file gives."""
-        return {path: value for path, value in _walk(self.given) if not path.endswith(_SHARE)}
+        """Return the value or range of every given field, by dotted path."""
+        return {
+            path: value for path, value in _walk(self.field_values) if not path.endswith(_SHARE)
+        }
 
     def describe_ranges(self) -> dict[str, str]:
-        """Dotted path -> its range in words, with the unit; only what differs between variants."""
+        """Return the range in words, with the unit, of every field that differs between
+        variants, by path.
+        """
         units = {leaf.path: leaf.unit for s in recipe_file().walk() for leaf in s.LEAVES.values()}
         ranges = {
             path.removesuffix(_SHARE): f"present with probability {share.describe()}"
-            for path, share in _walk(self.given)
+            for path, share in _walk(self.field_values)
             if path.endswith(_SHARE) and share != Fixed(1.0)
         }
         for path, value in self.values.items():
@@ -84,25 +92,25 @@ class RecipeTemplate:
         return ranges
 
     def describe_draws(self) -> str:
-        """The ranges, then a line for every variant: its number, its hash and what it draws."""
+        """Return the ranges, then a line for every variant: its number, its hash and its draws."""
         lines = [f"{path}: {text}" for path, text in self.describe_ranges().items()]
         for variant in range(self.variants):
             recipe = self.resolve(variant)
             draws = Draws(self.seed, recipe.variant)
             absent_paths = tuple[str, ...]()
-            for path, share in _walk(self.given):
+            for path, share in _walk(self.field_values):
                 if path.endswith(_SHARE) and draws.unit(path) >= as_number(share.draw(draws, path)):
                     absent_paths += (path.removesuffix("probability"),)
             parts = [f"{path.removesuffix('.')} absent" for path in absent_paths]
             for path, value in self.values.items():
                 if value.is_range and not path.startswith(absent_paths):
-                    parts.append(f"{path} = {words(value.draw(draws, path))}")
+                    parts.append(f"{path} = {format_value(value.draw(draws, path))}")
             lines.append(f"{recipe.name}-{recipe.variant:03d} {recipe.hash}  {', '.join(parts)}")
         return "\n".join(lines)
 
 
 def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Value]]:
-    """Yield the dotted path and value of every field below a node of `given`."""
+    """Yield the dotted path and value of every field below a node of `field_values`."""
     if isinstance(node, Mapping):
         for name, inner_node in node.items():
             yield from _walk(inner_node, join(path, name))
@@ -114,7 +122,7 @@ def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Value]]:
 
 
 def _draw(node: Any, draws: Draws, path: str) -> Any:
-    """Return a node of `given` in numbers; None for an effect that the variant has not."""
+    """Return a node of `field_values` in numbers; None for an effect that the variant has not."""
     if isinstance(node, list):
         return [_draw(item, draws, f"{path}[{index}]") for index, item in enumerate(node)]
     if not isinstance(node, Mapping):

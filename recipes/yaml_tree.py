@@ -1,6 +1,6 @@
-"""YAML text -> mappings, lists and scalars that know where they were written.
+"""YAML text as mappings, lists and scalars that know where they were written.
 
-No object of YAML's choice is ever built, and depth and size are bounded whatever the text. Scalars
+No object of YAML's choice is ever built, and depth and size are limited whatever the text. Scalars
 follow YAML 1.2's core schema; keys are always text.
 """
 
@@ -26,9 +26,13 @@ from ruamel.yaml.reader import ReaderError
 
 from recipes.errors import Place, Problems, short
 
-MAX_DEPTH = 32  # most levels of nesting
-MAX_NODES = 20_000  # counted after aliases are expanded, so nested aliases cannot multiply
-MAX_DIGITS = 400  # a longer run of digits is no number that any field takes
+# Largest depth of nesting.
+MAX_DEPTH = 32
+# Largest number of nodes, counted after aliases are expanded, so that nested aliases cannot
+# multiply.
+MAX_NODES = 20_000
+# A longer run of digits is no number that any field takes.
+MAX_DIGITS = 400
 
 _WHOLE = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
@@ -47,7 +51,7 @@ PlainValue = ScalarValue | list["PlainValue"] | dict[str, "PlainValue"]
 
 @dataclass(frozen=True, eq=False)
 class ScalarNode:
-    """text: as written, without quotes. value: what it means."""
+    """Scalar of a tree. text: as written, without quotes. value: its meaning."""
 
     place: Place
     text: str
@@ -61,7 +65,7 @@ class ListNode(list["Node"]):
 
 
 class MapNode(dict[str, "Node"]):
-    """A mapping; the value of a key has the place of that key."""
+    """Mapping of a tree. The value of a key has the place of that key."""
 
     def __init__(self, place: Place, entries: dict[str, Node] | None = None) -> None:
         super().__init__(entries or {})
@@ -72,12 +76,13 @@ Node = ScalarNode | ListNode | MapNode
 
 
 def read_tree(text: str, place: Place, problems: Problems, *, empty: str) -> Node:
-    """The tree of the one document in `text`; duplicate keys are added to `problems`.
+    """Return the tree of the one document in `text`. Duplicate keys are added to `problems`.
 
-    place: of the text's first line.
+    place: place of the text's first line.
 
     Raises:
-        RecipeError: not YAML, YAML that a recipe may not use, or nothing (`empty` says so).
+        RecipeError: the text is not YAML, is YAML that a recipe may not use, or is empty (`empty`
+            is the message).
     """
     tree = None
     events = _events(text, place)
@@ -100,7 +105,7 @@ def read_plain(text: str, *, source: str) -> PlainValue:
 
 
 def plain(node: Node) -> PlainValue:
-    """A tree without its lines."""
+    """Return a tree without its lines."""
     if isinstance(node, MapNode):
         return {key: plain(value) for key, value in node.items()}
     if isinstance(node, ListNode):
@@ -122,7 +127,7 @@ def plain_value(text: str) -> ScalarValue:
 
 
 class _Reader:
-    """Recursive, at most MAX_DEPTH deep."""
+    """Recursive reader of a tree, at most MAX_DEPTH deep."""
 
     def __init__(self, events: Iterator[Event], place: Place, problems: Problems) -> None:
         self._events = events
@@ -198,8 +203,12 @@ class _Reader:
 
 
 def check_text(text: str, place: Place) -> None:
-    """Raise RecipeError for what no file can hold as UTF-8: an escape of half a surrogate, or bytes
-    of a command line in another encoding.
+    """Refuse text that no file can hold as UTF-8.
+
+    This is an escape of half a surrogate, or bytes of a command line in another encoding.
+
+    Raises:
+        RecipeError: the text is such.
     """
     try:
         text.encode()
@@ -210,14 +219,14 @@ def check_text(text: str, place: Place) -> None:
 
 
 def _place(place: Place, event: Event) -> Place:
-    """place: of the text's first line."""
+    """Return the place of an event. place: place of the text's first line."""
     if place.line is None:
         return place
     return replace(place, line=place.line + event.start_mark.line)
 
 
 def _events(text: str, place: Place) -> Iterator[Event]:
-    """The parser's events, its errors turned into ours."""
+    """Yield the parser's events, with its errors turned into ours."""
     try:
         yield from YAML(typ="safe", pure=True).parse(text)
     except ReaderError as error:

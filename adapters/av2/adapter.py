@@ -1,9 +1,12 @@
-"""An Argoverse 2 sensor log: Gaussians from accumulated, image-coloured LiDAR.
+"""Scenes of Argoverse 2 sensor logs: Gaussians from accumulated, image-coloured LiDAR.
 
-World: the city's, less whole metres. Ego: Argoverse's (x forward, y left, z up, origin at the rear
-axle, some 0.3 m above the road), as it stood at the sweep's time. Frame numbers count the sweeps
-from 0 in order of time; each camera adds its nearest image, from where the car was at that image's
-own time. Images are undistorted as published: the coefficients k1, k2, k3 describe the raw lens.
+`open_av2` makes the scene of a log's folder, `av2_labels` its labels.
+
+World: the city's frame, less whole metres. Ego: Argoverse's frame (x forward, y left, z up, origin
+at the rear axle, some 0.3 m above the road), as it stood at the sweep's time. Frame numbers count
+the sweeps from 0 in order of time. Each camera adds its nearest image, from where the car was at
+that image's own time. Images are undistorted as published: the coefficients k1, k2, k3 describe the
+raw lens.
 """
 
 from __future__ import annotations
@@ -40,7 +43,7 @@ from adapters.av2.files import (
     sensor_of_laser,
 )
 from adapters.lidar_scene.image_views import read_image
-from adapters.plain_files import inside
+from adapters.plain_files import resolve_inside
 from adapters.raw_drive import (
     BoxSample,
     DriveImages,
@@ -50,12 +53,12 @@ from adapters.raw_drive import (
     Sweep,
     TimedBoxes,
     colour_every,
+    describe_frames,
     drive_origin,
     find_objects,
     is_usable,
-    recentred,
+    recenter_pose,
     scene_of_drive,
-    some,
     usable_images,
 )
 from adapters.uri import format_uri
@@ -70,12 +73,18 @@ from augment.semantics import SemanticClass
 
 # ---- A log, and its labels -----------------------------------------------------------------------
 
-_RETURN = ("x", "y", "z")
+# Columns of a sweep's table that hold a return's place.
+_XYZ_COLUMNS = ("x", "y", "z")
 
 
 class Lens(NamedTuple):
-    """Of one camera. size: width, height. intrinsic: fx, fy, cx, cy, pixels, centres at +0.5.
-    ego_from_camera: float64 [4, 4], x right, y down, z forward."""
+    """Calibration of one camera.
+
+    Attributes:
+        size: width and height in pixels.
+        intrinsic: fx, fy, cx, cy in pixels, with pixel centres at +0.5.
+        ego_from_camera: float64 [4, 4]; the camera's x is right, y down, z forward.
+    """
 
     size: tuple[int, int]
     intrinsic: tuple[float, float, float, float]
@@ -83,8 +92,14 @@ class Lens(NamedTuple):
 
 
 class Returns(NamedTuple):
-    """One sweep. points: float64 [N, 3], ego at the stamp. offsets_ns: int64 [N], after the stamp.
-    intensity, lasers: as in the file."""
+    """Returns of one sweep.
+
+    Attributes:
+        points: float64 [N, 3], ego frame at the sweep's stamp.
+        offsets_ns: int64 [N], times after the stamp.
+        intensity: [N], as in the file.
+        lasers: [N], laser numbers as in the file.
+    """
 
     points: np.ndarray
     offsets_ns: np.ndarray
@@ -94,8 +109,16 @@ class Returns(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Annotations:
-    """All boxes of a log in the city's world. timestamps_ns: int64 [B]. world_from_box: float64
-    [B, 4, 4]. sizes_m: [B, 3]. track_ids, labels: objects [B]. counts: int64 [B], returns in it."""
+    """All boxes of a log in the city's world.
+
+    Attributes:
+        timestamps_ns: int64 [B].
+        world_from_box: float64 [B, 4, 4].
+        sizes_m: float64 [B, 3].
+        track_ids: objects [B], track_uuid of the file.
+        labels: objects [B], category of the file.
+        counts: int64 [B], returns in the box.
+    """
 
     timestamps_ns: np.ndarray
     world_from_box: np.ndarray
@@ -106,6 +129,7 @@ class Annotations:
 
     @staticmethod
     def read(root: Path, city: CityPath) -> Annotations:
+        """Read the boxes of the log at root, and place them in the city."""
         columns = read_columns(root, ANNOTATIONS)
         times = columns.integers("timestamp_ns").astype(np.int64)
         world_from_box = city.at(times) @ columns.poses()
@@ -120,10 +144,11 @@ class Annotations:
 
     @cached_property
     def stamps(self) -> np.ndarray:
-        """The different times, ascending."""
+        """Return the different times of the boxes, ascending."""
         return np.unique(self.timestamps_ns)
 
     def at(self, timestamp_ns: int) -> Boxes:
+        """Return the boxes of one time."""
         rows = np.flatnonzero(self.timestamps_ns == timestamp_ns)
         poses = self.world_from_box[rows]
         return Boxes(
@@ -138,14 +163,23 @@ class Annotations:
 
 @dataclass(frozen=True, eq=False)
 class Av2Log:
-    """A log, and labels of its frames: boxes from memory, sweeps read when asked.
+    """A log, and the labels of its frames: boxes in memory, sweeps that are read on demand.
 
-    Boxes: track_ids are track_uuid, labels the category; the attribute num_interior_pts. Sweeps:
+    Boxes: track_ids are track_uuid, labels the category; the attribute is num_interior_pts. Sweeps:
     columns x y z (float64, city), intensity (0 to 255), laser_number, both as in the file, and
-    timestamp_ns, each return's own. Its classes are the map's: ROAD and TERRAIN.
+    timestamp_ns, the time of each return. The sweep's classes are the map's: ROAD and TERRAIN.
 
-    stamps_ns: of the sweeps, in order. lenses: by camera. ego_from_sensor: of both LiDARs. step:
-    from one sweep's frame number to the next; those between are frames of images alone.
+    Attributes:
+        root: the log's folder.
+        city: the car's poses.
+        stamps_ns: times of the sweeps, ascending.
+        lenses: calibration by camera.
+        ego_from_sensor: poses of both LiDARs, float64 [4, 4].
+        annotations: the boxes. None if the log has none.
+        ground: the map. None if the log has none.
+        problems: one sentence for each thing that is missing.
+        step: difference of the frame numbers of consecutive sweeps. Frames between them have images
+            only.
     """
 
     root: Path
@@ -160,53 +194,69 @@ class Av2Log:
 
     @staticmethod
     def read(path: str) -> Av2Log:
-        """
+        """Read a log's tables. Sweeps and images are only listed.
+
         Raises:
-            AdapterError: no log, or its path, calibration, boxes or map are missing or damaged."""
+            AdapterError: the folder is no log, or its path, calibration, boxes or map are missing
+                or damaged.
+        """
         root = Path(path)
         if not (root / POSES).is_file():
-            below = next((p.parent for p in sorted(root.glob(f"*/{POSES}"))), None)
-            hint = "" if below is None else f"; it holds logs, give one: av2:{below}"
+            log_folder = next((p.parent for p in sorted(root.glob(f"*/{POSES}"))), None)
+            hint = "" if log_folder is None else f"; it holds logs, give one: av2:{log_folder}"
             raise AdapterError(
                 f"{root} is not a log of Argoverse 2's sensor dataset: it has no {POSES}{hint}"
             )
         city = CityPath.read(root)
         sensors = read_columns(root, SENSORS)
-        ego_from = dict(zip(sensors.texts("sensor_name"), sensors.poses(), strict=True))
+        ego_from_sensor = dict(zip(sensors.texts("sensor_name"), sensors.poses(), strict=True))
         for name in (UP, DOWN):
-            if name not in ego_from:
-                raise AdapterError(f"{root / SENSORS} has no row {name}; it has {sorted(ego_from)}")
-        lenses = _read_lenses(root, ego_from)
-        known = _stamps(root / "sensors/lidar", ".feather")
-        stamps = tuple(stamp for stamp in known if city.covers(stamp))
+            if name not in ego_from_sensor:
+                raise AdapterError(
+                    f"{root / SENSORS} has no row {name}; it has {sorted(ego_from_sensor)}"
+                )
+        lenses = _read_lenses(root, ego_from_sensor)
+        sweep_stamps = _stamps(root / "sensors/lidar", ".feather")
+        stamps = tuple(stamp for stamp in sweep_stamps if city.covers(stamp))
         if not stamps:
-            what = f"only sweeps of times that {POSES} lacks" if known else "no <ns>.feather"
+            fault = (
+                f"only sweeps of times that {POSES} lacks" if sweep_stamps else "no <ns>.feather"
+            )
             raise AdapterError(
-                f"{root / 'sensors/lidar'} holds {what}; a scene cannot be built without sweeps, "
+                f"{root / 'sensors/lidar'} holds {fault}; a scene cannot be built without sweeps, "
                 f"copy them from the dataset"
             )
         problems = []
-        if len(stamps) < len(known):
-            problems.append(f"left out {len(known) - len(stamps)} sweeps before or after all poses")
+        if len(stamps) < len(sweep_stamps):
+            problems.append(
+                f"left out {len(sweep_stamps) - len(stamps)} sweeps before or after all poses"
+            )
         annotations = None
         if (root / ANNOTATIONS).exists():
             annotations = Annotations.read(root, city)
         else:
             problems.append(f"{root} has no {ANNOTATIONS}: no boxes are known")
         ground = GroundMap.read(root)
-        lidars = {name: ego_from[name] for name in (UP, DOWN)}
-        return Av2Log(root, city, stamps, lenses, lidars, annotations, ground, tuple(problems))
+        ego_from_lidar = {name: ego_from_sensor[name] for name in (UP, DOWN)}
+        return Av2Log(
+            root, city, stamps, lenses, ego_from_lidar, annotations, ground, tuple(problems)
+        )
 
     # As labels.
 
     def boxes(self, frame_index: int) -> Boxes:
+        """Return the boxes of a frame; none for frames between sweeps."""
         stamp = self._stamp(frame_index)
         if stamp is None or self.annotations is None:
             return Boxes.empty()
         return self.annotations.at(stamp)
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
-        """None for other frames, and where the file is damaged, which the scene's problems say."""
+        """Return a frame's sweep in the city's world.
+
+        The result is None for frames between sweeps, and if the file is damaged; then the scene's
+        problems say so.
+        """
         stamp = self._stamp(frame_index)
         try:
             returns = None if stamp is None else self.returns(stamp)
@@ -215,80 +265,99 @@ class Av2Log:
         if stamp is None or returns is None:
             return None
         points = self.in_city(returns.points, stamp)
-        columns = {name: np.ascontiguousarray(points[:, i]) for i, name in enumerate(_RETURN)}
+        columns = {name: np.ascontiguousarray(points[:, i]) for i, name in enumerate(_XYZ_COLUMNS)}
         columns |= {"intensity": returns.intensity, "laser_number": returns.lasers}
         return LidarSweep(columns | {"timestamp_ns": stamp + returns.offsets_ns})
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
+        """Return the map's semantic class of each return, or None if the map is missing."""
         if self.ground is None or self.ground.is_road is None:
             return None
         return self.ground.classes(sweep.points_m)
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
-        """Where the sensor was that made each return, at the return's own time."""
+        """Return the position of each return's sensor at the return's own time, float64 [N, 3]."""
         stamp = self._stamp(frame_index)
         if stamp is None:
             return None
         pose = self.city.at(np.array([stamp]))[0]
-        local = np.nan_to_num((sweep.points_m - pose[:3, 3]) @ pose[:3, :3])
+        ego_points = np.nan_to_num((sweep.points_m - pose[:3, 3]) @ pose[:3, :3])
         lasers = np.asarray(sweep.columns["laser_number"])
-        sensors = sensor_of_laser(lasers, local, self.ego_from_sensor)
-        places = np.stack([self.ego_from_sensor[name][:3, 3] for name in (UP, DOWN)])[sensors]
-        times, at = np.unique(sweep.columns["timestamp_ns"], return_inverse=True)
-        poses = self.city.at(times)[at]
-        return np.einsum("nij,nj->ni", poses[:, :3, :3], places) + poses[:, :3, 3]
+        sensors = sensor_of_laser(lasers, ego_points, self.ego_from_sensor)
+        sensor_positions = np.stack([self.ego_from_sensor[name][:3, 3] for name in (UP, DOWN)])[
+            sensors
+        ]
+        times, pose_index = np.unique(sweep.columns["timestamp_ns"], return_inverse=True)
+        poses = self.city.at(times)[pose_index]
+        return np.einsum("nij,nj->ni", poses[:, :3, :3], sensor_positions) + poses[:, :3, 3]
 
     def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        """Return the file of a frame's sweep."""
         stamp = self._stamp(frame_index)
-        return () if stamp is None else (inside(self.root, _sweep_name(stamp), str(self.root)),)
+        return (
+            ()
+            if stamp is None
+            else (resolve_inside(self.root, _sweep_name(stamp), str(self.root)),)
+        )
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
-        """The same columns, types and notes. Returns that moved are rounded as the dataset's own
-        are, to 16 bits: 3 cm at 50 m."""
+        """Return the content of a file that holds the sweep.
+
+        The columns, types and notes are those of the original. Returns that moved are rounded as
+        the dataset's returns are, to 16 bits: 3 cm at 50 m.
+        """
         table = read_columns(self.root, str(file.relative_to(self.root))).table
         table = table.take(pa.array(sweep.columns[INDEX_COLUMN]))
         columns = Columns(table, file)
         pose = self.city.at(np.array([self._stamp(frame_index)]))[0]
-        places = (sweep.points_m - pose[:3, 3]) @ pose[:3, :3]
-        changed = np.asarray(sweep.columns[CODE_COLUMN]) != UNCHANGED
-        was = np.stack([columns.floats(name).astype(np.float64) for name in _RETURN], axis=1)
-        moved = changed & (np.abs(places - was) > _STILL_M).any(axis=1)
+        ego_points = (sweep.points_m - pose[:3, 3]) @ pose[:3, :3]
+        is_changed = np.asarray(sweep.columns[CODE_COLUMN]) != UNCHANGED
+        recorded_points = np.stack(
+            [columns.floats(name).astype(np.float64) for name in _XYZ_COLUMNS], axis=1
+        )
+        has_moved = is_changed & (np.abs(ego_points - recorded_points) > _MAX_ROUNDING_M).any(
+            axis=1
+        )
         values = {}
-        for axis, name in enumerate(_RETURN):
+        for axis, name in enumerate(_XYZ_COLUMNS):
             values[name] = columns.floats(name)
-            values[name][moved] = places[moved, axis]
-        kind = columns.integers("intensity").dtype
-        values["intensity"] = np.rint(np.asarray(sweep.columns["intensity"])).astype(kind)
+            values[name][has_moved] = ego_points[has_moved, axis]
+        intensity_type = columns.integers("intensity").dtype
+        values["intensity"] = np.rint(np.asarray(sweep.columns["intensity"])).astype(intensity_type)
         for name, column in values.items():
-            at = table.schema.get_field_index(name)
-            table = table.set_column(at, table.schema.field(at), pa.array(column))
-        sink = io.BytesIO()
-        feather.write_feather(table, sink, compression="lz4")
-        return sink.getvalue()
+            column_index = table.schema.get_field_index(name)
+            table = table.set_column(
+                column_index, table.schema.field(column_index), pa.array(column)
+            )
+        buffer = io.BytesIO()
+        feather.write_feather(table, buffer, compression="lz4")
+        return buffer.getvalue()
 
     # As a drive.
 
     def returns(self, stamp_ns: int) -> Returns:
-        """
+        """Read the returns of the sweep at a stamp.
+
         Raises:
-            AdapterError: the file is missing or damaged."""
+            AdapterError: the file is missing or damaged.
+        """
         columns = read_columns(self.root, _sweep_name(stamp_ns))
         return Returns(
-            np.stack([columns.floats(name).astype(np.float64) for name in _RETURN], axis=1),
+            np.stack([columns.floats(name).astype(np.float64) for name in _XYZ_COLUMNS], axis=1),
             columns.integers("offset_ns").astype(np.int64),
             columns.integers("intensity"),
             columns.integers("laser_number"),
         )
 
     def in_city(self, points: np.ndarray, stamp_ns: int) -> np.ndarray:
-        """Points [N, 3] of a sweep in the city's world."""
+        """Transform points [N, 3] of a sweep to the city's world."""
         pose = self.city.at(np.array([stamp_ns]))[0]
         with np.errstate(all="ignore"):  # returns that are no numbers stay none
             return points @ pose[:3, :3].T + pose[:3, 3]
 
     def _stamp(self, frame_index: int) -> int | None:
-        number, between = divmod(frame_index, self.step)
-        is_sweep = not between and 0 <= number < len(self.stamps_ns)
+        number, remainder = divmod(frame_index, self.step)
+        is_sweep = not remainder and 0 <= number < len(self.stamps_ns)
         return self.stamps_ns[number] if is_sweep else None
 
 
@@ -296,11 +365,15 @@ def _sweep_name(stamp_ns: int) -> str:
     return f"sensors/lidar/{stamp_ns}.feather"
 
 
-_STILL_M = 1e-4  # a return that is no further from its record has not moved
+# A return that is at most this far from its record has not moved.
+_MAX_ROUNDING_M = 1e-4
 
 
 def _stamps(folder: Path, suffix: str) -> list[int]:
-    """The nanoseconds that the files of a folder are named by, ascending; none without a folder."""
+    """Return the nanoseconds in the names of a folder's files, ascending.
+
+    It is empty without a folder.
+    """
     names = (path.stem for path in folder.glob(f"*{suffix}"))
     return sorted(int(n) for n in names if n.isascii() and n.isdigit() and 0 < len(n) < 19)
 
@@ -329,25 +402,34 @@ def _read_lenses(root: Path, ego_from: Mapping[str, np.ndarray]) -> dict[str, Le
 
 
 def av2_labels(path: str, query: dict[str, str]) -> Av2Log:
-    """The labels of a log; whatever frames= says, they are those of all its frames."""
+    """Return the labels of a log. They cover all its frames, whatever frames= says."""
     options = Av2Options.from_query("av2", query)
     return replace(Av2Log.read(path), step=options.step)
 
 
 # ---- The scene -----------------------------------------------------------------------------------
 
-_LIDAR_TOP_DEG = 25.0  # down_lidar's uppermost laser: it hangs upside down
-_NEAR_NS = 25_000_000  # images come every 50 ms
-# The car (4.9 m by 1.9 m, origin at the rear axle). Published sweeps hold no return in it.
-_EGO_M = np.array([[-1.3, -1.1, -0.5], [4.0, 1.1, 1.9]])
-_MAX_RETURNS = 8_000_000  # of a whole log: a voxel is hit more than once
-_THREADS = 4  # NumPy and Arrow release the interpreter
-_GREY_LEVELS = 6  # apart, colours of a grey image are the JPEG's rounding
+# Elevation of down_lidar's uppermost laser: this LiDAR hangs upside down.
+_LIDAR_TOP_DEG = 25.0
+# Largest time between a sweep and the image that is taken with it. Images come every 50 ms.
+_MAX_TIME_DIFFERENCE_NS = 25_000_000
+# Least and greatest corner of the car, ego frame: it is 4.9 m by 1.9 m, with its origin at the rear
+# axle. Published sweeps hold no return in it.
+_EGO_BOX_M = np.array([[-1.3, -1.1, -0.5], [4.0, 1.1, 1.9]])
+# Largest number of returns that a whole log contributes. A voxel is hit more than once.
+_MAX_RETURNS = 8_000_000
+# Threads that read sweeps. NumPy and Arrow release the interpreter.
+_NUM_THREADS = 4
+# Largest difference of the channels, 0 to 255, in a grey image: the rounding of JPEG.
+_MAX_GREY_DIFFERENCE = 6
 
 
 class Av2Options(DriveOptions):
-    """images: nearest, or all for frames between the sweeps too, of the images that no sweep has.
-    The scene's surfaces and colours are the same."""
+    """Options of an Argoverse 2 scene.
+
+    images: nearest, or all for frames between the sweeps too, made of the images that no sweep has.
+    The scene's surfaces and colours are the same.
+    """
 
     images: Literal["nearest", "all"] = Field(
         "nearest",
@@ -357,20 +439,26 @@ class Av2Options(DriveOptions):
 
     @property
     def step(self) -> int:
-        """From one sweep's frame number to the next."""
+        """Return the difference of the frame numbers of consecutive sweeps."""
         return 2 if self.images == "all" else 1
 
 
 def open_av2(path: str, query: dict[str, str]) -> Scene:
-    """The scene of a log's folder, such as `sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede`.
+    """Open the scene of a log's folder, such as
+    `sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede`.
 
-    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out, see DriveOptions;
-    images, see Av2Options. Opening is deterministic: the same files and options give the same bits.
+    Opening is deterministic: the same files and options give the same bits.
+
+    Args:
+        path: the log's folder.
+        query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out, see DriveOptions;
+            images, see Av2Options.
 
     Raises:
-        AdapterError: a wrong option; tables or maps that are missing or damaged; no usable sweep or
-            image; a camera all of whose images are damaged. What single frames lack is in
-            Scene.problems."""
+        AdapterError: an option is wrong; tables or maps are missing or damaged; no sweep or image
+            is usable; all images of a camera are damaged. What single frames lack is listed in
+            Scene.problems.
+    """
     options = Av2Options.from_query("av2", query)
     log = Av2Log.read(path)
     drive = read_av2(log, format_uri("av2", path, query), options)
@@ -379,8 +467,11 @@ def open_av2(path: str, query: dict[str, str]) -> Scene:
 
 
 def _with_images_between(scene: Scene, log: Av2Log, step: int) -> Scene:
-    """The scene with frames between sweeps, of the images that no sweep has: each camera's nearest
-    to the middle. They have neither a sweep nor boxes."""
+    """Return the scene with added frames between sweeps.
+
+    They are made of the images that no sweep has: those of each camera nearest to the middle. They
+    have neither a sweep nor boxes.
+    """
     stamps_of = {name: _image_stamps(log, name)[0] for name in log.lenses}
     times: dict[tuple[int, str], int] = {}
     for first, second in zip(scene.frames, scene.frames[1:], strict=False):
@@ -388,11 +479,17 @@ def _with_images_between(scene: Scene, log: Av2Log, step: int) -> Scene:
             continue
         middle_ns = (first.timestamp_ns + second.timestamp_ns) // 2
         for name, stamps in stamps_of.items():
-            used = [f.cameras[name].timestamp_ns for f in (first, second) if name in f.cameras]
-            free = stamps[~np.isin(stamps, used)]
-            free = free[(free > first.timestamp_ns) & (free < second.timestamp_ns)]
-            if len(free):
-                times[first.index, name] = int(free[np.abs(free - middle_ns).argmin()])
+            used_stamps = [
+                f.cameras[name].timestamp_ns for f in (first, second) if name in f.cameras
+            ]
+            free_stamps = stamps[~np.isin(stamps, used_stamps)]
+            free_stamps = free_stamps[
+                (free_stamps > first.timestamp_ns) & (free_stamps < second.timestamp_ns)
+            ]
+            if len(free_stamps):
+                times[first.index, name] = int(
+                    free_stamps[np.abs(free_stamps - middle_ns).argmin()]
+                )
     pictures = [
         Picture(name, number, _image_file(log, name, time), log.lenses[name].size)
         for (number, name), time in times.items()
@@ -401,11 +498,14 @@ def _with_images_between(scene: Scene, log: Av2Log, step: int) -> Scene:
     frames: list[Frame] = []
     for frame in scene.frames:
         frames.append(replace(frame, index=step * frame.index))
-        own = [time for (number, _), time in times.items() if number == frame.index]
-        if own:
-            stamp = round(sum(time - own[0] for time in own) / len(own)) + own[0]
-            between = _frame(log, frame.index, stamp, times, images, scene.world_origin_m)
-            frames.append(replace(between, index=step * frame.index + 1))
+        image_times = [time for (number, _), time in times.items() if number == frame.index]
+        if image_times:
+            stamp = (
+                round(sum(time - image_times[0] for time in image_times) / len(image_times))
+                + image_times[0]
+            )
+            frame_between = _frame(log, frame.index, stamp, times, images, scene.world_origin_m)
+            frames.append(replace(frame_between, index=step * frame.index + 1))
     return replace(
         scene,
         frames=tuple(frames),
@@ -415,21 +515,25 @@ def _with_images_between(scene: Scene, log: Av2Log, step: int) -> Scene:
 
 
 def _image_stamps(log: Av2Log, camera: str) -> tuple[np.ndarray, int]:
-    """The times of a camera's images that poses cover, int64, ascending, and how many others."""
+    """Return the times of a camera's images within the car's poses, and the number of other
+    images.
+
+    The times are int64, ascending.
+    """
     stamps = np.array(_stamps(log.root / "sensors/cameras" / camera, ".jpg"), np.int64)
     covered = np.array([log.city.covers(stamp) for stamp in stamps], bool)
     return stamps[covered], int((~covered).sum())
 
 
 def _image_file(log: Av2Log, camera: str, stamp_ns: int) -> Path:
-    return inside(log.root, f"sensors/cameras/{camera}/{stamp_ns}.jpg", str(log.root))
+    return resolve_inside(log.root, f"sensors/cameras/{camera}/{stamp_ns}.jpg", str(log.root))
 
 
 def read_av2(log: Av2Log, source: str, options: DriveOptions) -> RawDrive:
-    """The frames that the options ask for, with their images, sweeps and boxes."""
-    chosen = options.select(range(len(log.stamps_ns)), where=source)
+    """Read the frames that the options select, with their images, sweeps and boxes."""
+    selection = options.select(range(len(log.stamps_ns)), where=source)
     origin = drive_origin(log.city.poses[:, :3, 3])
-    times, image_problems = _image_times(log, chosen.numbers)
+    times, image_problems = _image_times(log, selection.numbers)
     files = {
         (number, camera): _image_file(log, camera, time) for (number, camera), time in times.items()
     }
@@ -439,41 +543,41 @@ def read_av2(log: Av2Log, source: str, options: DriveOptions) -> RawDrive:
     ]
     images = usable_images(pictures) if pictures else DriveImages({}, {}, ())
     grey = _grey_cameras(images)
-    coloured = sum(len(images.paths.get(n, {}).keys() - grey) for n in chosen.used)
+    num_colored = sum(len(images.paths.get(n, {}).keys() - grey) for n in selection.used)
     frames = tuple(
         _frame(log, number, log.stamps_ns[number], times, images, origin)
-        for number in chosen.numbers
+        for number in selection.numbers
     )
-    sweeps, spin, sweep_problems = _read_sweeps(log, chosen.used, origin)
-    moving, box_problems = _moving_boxes(log, spin, frames, origin)
+    sweeps, spin, sweep_problems = _read_sweeps(log, selection.used, origin)
+    moving_boxes, box_problems = _moving_boxes(log, spin, frames, origin)
     return RawDrive(
         name=log.root.absolute().name,
         source=source,
         frames=frames,
-        held_out=chosen.held_out,
+        held_out=selection.held_out,
         sweeps=sweeps,
-        boxes=moving,
+        boxes=moving_boxes,
         labels=log,
         world_origin_m=origin,
         lidar_top_deg=_LIDAR_TOP_DEG,
         problems=(
             *log.problems,
-            *chosen.problems,
+            *selection.problems,
             *image_problems,
             *images.problems,
             *sweep_problems,
             *box_problems,
         ),
         grey_cameras=grey,
-        colour_every=colour_every(coloured),
+        colour_every=colour_every(num_colored),
     )
 
 
 def _image_times(
     log: Av2Log, numbers: Sequence[int]
 ) -> tuple[dict[tuple[int, str], int], tuple[str, ...]]:
-    """The time of the image that each frame takes of each camera, and what is missing."""
-    found: dict[tuple[int, str], int] = {}
+    """Return the time of each camera's image in each frame, and a sentence for what is missing."""
+    image_times: dict[tuple[int, str], int] = {}
     problems = []
     for camera in sorted(log.lenses):
         folder = log.root / "sensors/cameras" / camera
@@ -482,20 +586,21 @@ def _image_times(
             problems.append(
                 f"camera {camera}: left out {num_others} images before or after all poses"
             )
-        missing = []
+        missing_frames = []
         for number in numbers:
-            apart = np.abs(stamps - log.stamps_ns[number])
-            if len(apart) and apart.min() <= _NEAR_NS:
-                found[number, camera] = int(stamps[apart.argmin()])
+            time_differences = np.abs(stamps - log.stamps_ns[number])
+            if len(time_differences) and time_differences.min() <= _MAX_TIME_DIFFERENCE_NS:
+                image_times[number, camera] = int(stamps[time_differences.argmin()])
             else:
-                missing.append(number)
-        if len(missing) == len(numbers):
+                missing_frames.append(number)
+        if len(missing_frames) == len(numbers):
             problems.append(f"camera {camera}: {folder} has no image of the frames")
-        elif missing:
+        elif missing_frames:
             problems.append(
-                f"camera {camera}: no image within {_NEAR_NS // 10**6} ms of {some(missing)}"
+                f"camera {camera}: no image within {_MAX_TIME_DIFFERENCE_NS // 10**6} ms of "
+                f"{describe_frames(missing_frames)}"
             )
-    return found, tuple(problems)
+    return image_times, tuple(problems)
 
 
 def _frame(
@@ -506,12 +611,13 @@ def _frame(
     images: DriveImages,
     origin: np.ndarray,
 ) -> Frame:
-    own = {camera: time for (n, camera), time in times.items() if n == number}
-    poses = log.city.at(np.array([stamp, *own.values()], np.int64))
+    """Return a frame with the cameras of its images, each where it was at the image's time."""
+    image_times = {camera: time for (n, camera), time in times.items() if n == number}
+    poses = log.city.at(np.array([stamp, *image_times.values()], np.int64))
     cameras = {}
-    for (name, time), city_from_ego in zip(own.items(), poses[1:], strict=True):
+    for (name, time), city_from_ego in zip(image_times.items(), poses[1:], strict=True):
         lens = log.lenses[name]
-        pose = recentred(city_from_ego @ lens.ego_from_camera, origin)
+        pose = recenter_pose(city_from_ego @ lens.ego_from_camera, origin)
         cameras[name] = Camera(
             name,
             *lens.size,
@@ -522,29 +628,34 @@ def _frame(
     return Frame(
         index=number,
         timestamp_ns=stamp,
-        world_from_ego=recentred(poses[0], origin),
+        world_from_ego=recenter_pose(poses[0], origin),
         cameras=cameras,
         image_paths=images.paths.get(number, {}),
     )
 
 
 def _grey_cameras(images: DriveImages) -> frozenset[str]:
-    """The cameras whose first image is grey, as the stereo pair's are."""
-    first = {
-        name: path for own in reversed(list(images.paths.values())) for name, path in own.items()
+    """Return the cameras whose first image is grey, as the images of the stereo pair are."""
+    first_paths = {
+        name: path
+        for paths in reversed(list(images.paths.values()))
+        for name, path in paths.items()
     }
-    grey = set()
-    for name, path in first.items():
+    grey_cameras = set()
+    for name, path in first_paths.items():
         image = read_image(Path(path), 0.125)
-        if image is not None and np.ptp(image.astype(np.int16), axis=2).max() <= _GREY_LEVELS:
-            grey.add(name)
-    return frozenset(grey)
+        if (
+            image is not None
+            and np.ptp(image.astype(np.int16), axis=2).max() <= _MAX_GREY_DIFFERENCE
+        ):
+            grey_cameras.add(name)
+    return frozenset(grey_cameras)
 
 
 def _read_sweeps(
     log: Av2Log, numbers: Sequence[int], origin: np.ndarray
 ) -> tuple[tuple[Sweep, ...], Spin, tuple[str, ...]]:
-    """The usable returns of the frames in the scene's world, and how the first sweep turned."""
+    """Read the usable returns of frames in the scene's world, and the timing of the first sweep."""
     spin = _first_spin(log, numbers)
 
     def read(number: int) -> Sweep | str:
@@ -553,37 +664,39 @@ def _read_sweeps(
             returns = log.returns(stamp)
         except AdapterError as error:
             return f"frame {number}: {error}"
-        city = log.in_city(returns.points, stamp)
-        classes = np.full(len(city), SemanticClass.UNKNOWN, np.int16)
+        city_points = log.in_city(returns.points, stamp)
+        classes = np.full(len(city_points), SemanticClass.UNKNOWN, np.int16)
         if log.ground is not None:
-            classes = log.ground.classes(city)
+            classes = log.ground.classes(city_points)
         with np.errstate(over="ignore"):  # of returns that are no numbers
-            points = (city - origin).astype(np.float32)
+            points = (city_points - origin).astype(np.float32)
         sweep = Sweep(points, stamp + returns.offsets_ns, classes)
         pose = log.city.at(np.array([stamp]))[0]
-        return sweep.select(is_usable(sweep, city, pose, _EGO_M))
+        return sweep.select(is_usable(sweep, city_points, pose, _EGO_BOX_M))
 
-    with ThreadPoolExecutor(_THREADS) as pool:
-        read_on = tqdm(pool.map(read, numbers), "LiDAR", len(numbers), unit="sweep", disable=None)
-        found = list(read_on)
-    problems = [sweep for sweep in found if isinstance(sweep, str)]
-    sweeps = [sweep for sweep in found if isinstance(sweep, Sweep)]
-    part = _MAX_RETURNS / max(_MAX_RETURNS, sum(map(len, sweeps)))
-    if part < 1:  # rows go by lasers in turn: every other one would be half of the lasers
+    with ThreadPoolExecutor(_NUM_THREADS) as pool:
+        reading = tqdm(pool.map(read, numbers), "LiDAR", len(numbers), unit="sweep", disable=None)
+        sweeps_or_problems = list(reading)
+    problems = [sweep for sweep in sweeps_or_problems if isinstance(sweep, str)]
+    sweeps = [sweep for sweep in sweeps_or_problems if isinstance(sweep, Sweep)]
+    kept_fraction = _MAX_RETURNS / max(_MAX_RETURNS, sum(map(len, sweeps)))
+    if kept_fraction < 1:  # rows go by lasers in turn: every other one would be half of the lasers
         rng = np.random.default_rng(len(sweeps))
-        sweeps = [sweep.select(rng.random(len(sweep)) < part) for sweep in sweeps]
+        sweeps = [sweep.select(rng.random(len(sweep)) < kept_fraction) for sweep in sweeps]
     return tuple(sweeps), spin, tuple(problems)
 
 
 def _first_spin(log: Av2Log, numbers: Sequence[int]) -> Spin:
-    """How the first sweep turned of which it can be told."""
-    middle = np.mean([pose[:3, 3] for pose in log.ego_from_sensor.values()], axis=0)
+    """Return the timing of the first sweep from which it can be estimated."""
+    lidar_center = np.mean([pose[:3, 3] for pose in log.ego_from_sensor.values()], axis=0)
     spin = Spin()
     for number in numbers:
         with contextlib.suppress(AdapterError):
             returns = log.returns(log.stamps_ns[number])
-            finite = np.isfinite(returns.points).all(axis=1)
-            spin = Spin.of_returns(returns.points[finite] - middle, returns.offsets_ns[finite])
+            is_finite = np.isfinite(returns.points).all(axis=1)
+            spin = Spin.of_returns(
+                returns.points[is_finite] - lidar_center, returns.offsets_ns[is_finite]
+            )
         if spin.begin_rad is not None:
             break
     return spin
@@ -592,25 +705,30 @@ def _first_spin(log: Av2Log, numbers: Sequence[int]) -> Spin:
 def _moving_boxes(
     log: Av2Log, spin: Spin, frames: Sequence[Frame], origin: np.ndarray
 ) -> tuple[tuple[BoxSample, ...], tuple[str, ...]]:
-    """The boxes of moving objects around the frames, in the scene's world, each at the time that
-    the LiDARs met it. An object moves if it travels within the log."""
+    """Return the boxes of moving objects around the frames in the scene's world.
+
+    Each box is given at the time when the LiDARs met it. An object moves if it travels within the
+    log.
+    """
     if log.annotations is None:
         return (), ()
     stamps = log.annotations.stamps
-    timed = []
+    timed_boxes = []
     for number, (stamp, pose) in enumerate(zip(stamps, log.city.at(stamps), strict=True)):
         boxes = log.annotations.at(int(stamp))
-        local = (boxes.centers_m - pose[:3, 3]) @ pose[:3, :3]
-        met_ns = spin.met_ns(local - log.ego_from_sensor[UP][:3, 3])
-        timed.append(TimedBoxes(number, boxes, stamp + met_ns))
-    found = find_objects(timed, origin)
-    first = np.searchsorted(stamps, frames[0].timestamp_ns, side="right") - 1
-    last = np.searchsorted(stamps, frames[-1].timestamp_ns)
-    return tuple(box for box in found.moving if first - 1 <= box.frame <= last + 1), found.problems
+        ego_centers = (boxes.centers_m - pose[:3, 3]) @ pose[:3, :3]
+        met_ns = spin.met_ns(ego_centers - log.ego_from_sensor[UP][:3, 3])
+        timed_boxes.append(TimedBoxes(number, boxes, stamp + met_ns))
+    objects = find_objects(timed_boxes, origin)
+    first_sweep = np.searchsorted(stamps, frames[0].timestamp_ns, side="right") - 1
+    last_sweep = np.searchsorted(stamps, frames[-1].timestamp_ns)
+    return tuple(
+        box for box in objects.moving_boxes if first_sweep - 1 <= box.frame <= last_sweep + 1
+    ), objects.problems
 
 
 def _ground(log: Av2Log, drive: RawDrive) -> Ground | None:
-    """The map's heights under the drive; None where it has none there."""
+    """Return the map's heights under the drive, or None if the map has no heights there."""
     if log.ground is None:
         return None
     path = np.stack([frame.world_from_ego[:3, 3].numpy() for frame in drive.frames])

@@ -1,7 +1,8 @@
-"""Camera files: which there are, which lies beside a scene, and their views.
+"""Camera files: their formats, where they lie beside a scene, and their views.
 
-Read are INRIA's cameras.json, nerfstudio's transforms.json, this project's camera paths
-(`adapters.camera_files.camera_files`) and COLMAP sparse models, all told apart by their contents.
+The formats are INRIA's cameras.json, nerfstudio's transforms.json, this project's camera paths
+(described below) and COLMAP sparse models. They are told apart by their contents. `read_views`
+reads any of them; the callers are `adapters.camera_files.paths` and `adapters.gaussian_files`.
 """
 
 from __future__ import annotations
@@ -23,16 +24,23 @@ from adapters.world import invert_pose
 from augment.errors import AdapterError
 from augment.jobs.manifest import MAX_SIDE_PX
 
-_ORTHONORMAL_TOLERANCE = 1e-4  # as in Camera: poses written with four decimals or fewer fail
+# Largest error of a rotation, as in Camera. Poses written with four decimals or fewer fail.
+_ORTHONORMAL_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class PosedView:
-    """One posed image in the file's own world (its axes, its unit of length); fx, fy, cx, cy in
-    pixels.
+    """One posed image in the file's own world (its axes, its unit of length).
 
-    world_from_camera: float64 [4, 4], OpenCV axes. camera, frame: where the file says, both or
-    neither. timestamp_ns: since the scene's first frame; None where the file has no times."""
+    Attributes:
+        name: name of the image.
+        width, height: pixels.
+        fx, fy, cx, cy: pixels.
+        world_from_camera: float64 [4, 4], OpenCV axes.
+        image_path: the image's file. None if it does not exist.
+        camera, frame: name and number. Both are None if the file does not say them.
+        timestamp_ns: since the scene's first frame. None if the file has no times.
+    """
 
     name: str
     width: int
@@ -48,27 +56,33 @@ class PosedView:
     timestamp_ns: int | None = None
 
 
-Lens = tuple[int, int, float, float, float, float]  # width, height, fx, fy, cx, cy: pixels
+# Width, height, fx, fy, cx, cy of a pinhole camera in pixels.
+Lens = tuple[int, int, float, float, float, float]
 
 
 def lens_of(
     width: int, height: int, fx: float, fy: float | None, cx: float | None, cy: float | None
 ) -> Lens:
-    """A pinhole; fy is fx and the principal point the middle where they are not said."""
-    fy, cx = fx if fy is None else fy, width / 2 if cx is None else cx
+    """Return a pinhole. A missing fy is fx, a missing principal point the image's middle."""
+    fy = fx if fy is None else fy
+    cx = width / 2 if cx is None else cx
     return width, height, fx, fy, cx, height / 2 if cy is None else cy
 
 
 @dataclass(frozen=True, eq=False)
 class ViewSet:
-    """All views of a camera file, and what was wrong in it, a sentence each."""
+    """All views of a camera file, and one sentence for each problem in it."""
 
     views: tuple[PosedView, ...]
     problems: tuple[str, ...] = ()
 
 
 def check_pose(world_from_camera: np.ndarray, *, where: str) -> np.ndarray:
-    """The pose as float64 [4, 4] with an exact last row, once it is known to be rigid."""
+    """Return a pose as float64 [4, 4] with an exact last row.
+
+    Raises:
+        AdapterError: the pose is not finite or not rigid.
+    """
     pose = np.asarray(world_from_camera, dtype=np.float64)
     if not (np.abs(pose) <= LARGEST).all():  # NaN included
         raise AdapterError(
@@ -95,9 +109,12 @@ def check_pose(world_from_camera: np.ndarray, *, where: str) -> np.ndarray:
 def look_at_pose(
     position: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray, *, where: str
 ) -> np.ndarray:
-    """world_from_camera of an upright camera (world +z up) that looks at `target`; straight up or
-    down, the top of its image points to world +y."""
-    eye, forward = np.asarray(position, np.float64), np.subtract(target, position, dtype=np.float64)
+    """Return world_from_camera of an upright camera (world +z up) that looks at `target`.
+
+    If it looks straight up or down, the top of its image points to world +y.
+    """
+    eye = np.asarray(position, np.float64)
+    forward = np.subtract(target, position, dtype=np.float64)
     length = np.linalg.norm(forward)
     if not (np.isfinite(length) and length > 1e-9):
         raise AdapterError(
@@ -108,7 +125,9 @@ def look_at_pose(
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2] = right, np.cross(forward, right), forward
+    pose[:3, 0] = right
+    pose[:3, 1] = np.cross(forward, right)
+    pose[:3, 2] = forward
     pose[:3, 3] = eye
     return pose
 
@@ -122,16 +141,16 @@ Pose = Annotated[list[Row], Field(min_length=3, max_length=4)]
 Pixels = Annotated[Number, Field(ge=1, le=MAX_SIDE_PX, multiple_of=1), AfterValidator(int)]
 Focal = Annotated[Number, Field(gt=0)]
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_ERRORS_SHOWN = 5
+_MAX_LISTED_ERRORS = 5
 
 
-class _Foreign(BaseModel):
-    """Other tools' formats carry more keys than are needed here."""
+class _ForeignModel(BaseModel):
+    """Base of other tools' formats, which carry more keys than are needed here."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class _InriaCamera(_Foreign):
+class _InriaCamera(_ForeignModel):
     img_name: str
     width: Pixels
     height: Pixels
@@ -143,12 +162,15 @@ class _InriaCamera(_Foreign):
     rotation: tuple[Vector, Vector, Vector]
 
 
-class _InriaFile(_Foreign):
+class _InriaFile(_ForeignModel):
     cameras: Annotated[list[_InriaCamera], Field(min_length=1)]
 
 
-class _Intrinsics(_Foreign):
-    """nerfstudio's, which stand at the top, in a frame, or divided between both."""
+class _Intrinsics(_ForeignModel):
+    """Intrinsics of nerfstudio's format.
+
+    They stand at the top, in a frame, or divided between both.
+    """
 
     w: Pixels | None = None
     h: Pixels | None = None
@@ -176,28 +198,38 @@ class _NerfstudioFile(_Intrinsics):
 
 
 def validate(model: type[Model], content: object, path: Path | str, kind: str) -> Model:
-    """`content` as the model."""
+    """Return `content` as the model.
+
+    Raises:
+        AdapterError: the content does not fit.
+    """
     try:
         return model.model_validate(content)
     except ValidationError as error:
         lines = [
             f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']} (got {str(e['input'])[:60]})"
-            for e in error.errors()[:_ERRORS_SHOWN]
+            for e in error.errors()[:_MAX_LISTED_ERRORS]
         ]
-        more = error.error_count() - len(lines)
+        num_more = error.error_count() - len(lines)
         raise AdapterError(
-            f"{path}: not a valid {kind}: " + "; ".join(lines) + (f"; {more} more" if more else "")
+            f"{path}: not a valid {kind}: "
+            + "; ".join(lines)
+            + (f"; {num_more} more" if num_more else "")
         ) from error
 
 
 def inria_views(content: list[object], path: Path) -> ViewSet:
-    """Views of INRIA's list. Its cameras have no principal point, which is the middle then; our own
-    exports add cx and cy."""
+    """Return the views of INRIA's list.
+
+    Its cameras have no principal point, which then is the image's middle. Our own exports add cx
+    and cy.
+    """
     file = validate(_InriaFile, {"cameras": content}, path, "INRIA cameras.json")
     views = []
     for number, camera in enumerate(file.cameras):
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = camera.rotation, camera.position
+        pose[:3, :3] = camera.rotation
+        pose[:3, 3] = camera.position
         pose = check_pose(pose, where=f"{path}: {number} ({camera.img_name})")
         lens = lens_of(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         views.append(PosedView(camera.img_name, *lens, pose))
@@ -205,32 +237,34 @@ def inria_views(content: list[object], path: Path) -> ViewSet:
 
 
 def nerfstudio_views(content: object, path: Path) -> ViewSet:
-    """Views of nerfstudio's frames: OpenGL axes turned to OpenCV's, lens distortion left out."""
+    """Return the views of nerfstudio's frames, in OpenCV's axes. Lens distortion is left out."""
     file = validate(_NerfstudioFile, content, path, "nerfstudio transforms.json")
     views = []
-    distorted: Counter[str] = Counter()
-    shared = file.model_dump(exclude={"frames"}, exclude_none=True)
+    num_distorted: Counter[str] = Counter()
+    shared_intrinsics = file.model_dump(exclude={"frames"}, exclude_none=True)
     for number, frame in enumerate(file.frames):
         where = f"{path}: frames.{number} ({frame.file_path})"
-        own = frame.model_dump(exclude={"file_path", "transform_matrix"}, exclude_none=True)
-        lens = _Intrinsics(**(shared | own))
+        own_intrinsics = frame.model_dump(
+            exclude={"file_path", "transform_matrix"}, exclude_none=True
+        )
+        lens = _Intrinsics(**(shared_intrinsics | own_intrinsics))
         model = (lens.camera_model or "OPENCV").upper()
         if model.startswith(("EQUIRECT", "ORTHO")):
             raise AdapterError(f"{where}: camera_model {model} has no pinhole camera near it")
         if "FISHEYE" in model or any(getattr(lens, name) for name in _DISTORTION):
-            distorted[model] += 1
+            num_distorted[model] += 1
         opencv_from_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
         pose = np.asarray(frame.transform_matrix, dtype=np.float64)
         pose = check_pose(np.vstack([pose[:3], [0, 0, 0, 1]]) @ opencv_from_opengl, where=where)
         image = path.parent / frame.file_path
         image_path = str(image) if image.is_file() else None
         views.append(PosedView(frame.file_path, *_pinhole(lens, where), pose, image_path))
-    problems = [distortion_problem(str(path), n, m) for m, n in distorted.items()]
+    problems = [distortion_problem(str(path), n, m) for m, n in num_distorted.items()]
     return ViewSet(tuple(views), tuple(problems))
 
 
 def distortion_problem(where: str, count: int, model: str) -> str:
-    """The sentence for images whose lens is not a pinhole."""
+    """Return the sentence on images whose lens is not a pinhole."""
     return (
         f"{where}: {count} images have lens distortion (model {model}), which is left out; they "
         "are rendered as pinhole cameras and will not line up with the distorted images"
@@ -238,6 +272,7 @@ def distortion_problem(where: str, count: int, model: str) -> str:
 
 
 def _pinhole(lens: _Intrinsics, where: str) -> Lens:
+    """Return the pinhole of nerfstudio's intrinsics."""
     if lens.w is None or lens.h is None:
         raise AdapterError(f"{where}: w and h (image size, pixels) are missing; add them")
     fl_x = lens.fl_x
@@ -254,7 +289,7 @@ _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 
 
 def find_colmap_model(folder: Path) -> Path | None:
-    """The folder of the sparse model in or below `folder`, or None."""
+    """Return the folder of the sparse model in or below `folder`, or None if there is none."""
     for name, suffix in itertools.product(_MODEL_FOLDERS, (".bin", ".txt")):
         model = folder / name
         if all((model / f"{table}{suffix}").is_file() for table in ("cameras", "images")):
@@ -263,7 +298,7 @@ def find_colmap_model(folder: Path) -> Path | None:
 
 
 def open_colmap_model(model: Path) -> Any:
-    """pycolmap's Reconstruction of the model in a folder."""
+    """Return pycolmap's Reconstruction of the model in a folder."""
     try:
         import pycolmap  # a large native library: only those who have COLMAP models need it
     except ImportError:
@@ -285,14 +320,17 @@ def open_colmap_model(model: Path) -> Any:
 
 
 def _check_colmap_camera(camera: Any, where: str) -> None:
-    """Refuse what pycolmap takes as it is; asking for a focal length that is not there ends the
-    process."""
+    """Refuse cameras that pycolmap accepts unchecked.
+
+    A request for a missing focal length would end the process.
+    """
     if not len(camera.focal_length_idxs()):
         raise AdapterError(
             f"{where} is of the model {camera.model_name}, which has no focal length: its images "
             f"are no pinhole camera's; run COLMAP with another camera model"
         )
-    size, params = (camera.width, camera.height), np.asarray(camera.params, np.float64)
+    size = (camera.width, camera.height)
+    params = np.asarray(camera.params, np.float64)
     focals = params[list(camera.focal_length_idxs())]
     if not (1 <= min(size) <= max(size) <= MAX_SIDE_PX):
         raise AdapterError(f"{where} must be 1 to {MAX_SIDE_PX} pixels wide and high; got {size}")
@@ -304,30 +342,31 @@ def _check_colmap_camera(camera: Any, where: str) -> None:
 
 
 def read_colmap_views(model: Path) -> ViewSet:
-    """Views of the registered images. Lens distortion is left out, and said so."""
+    """Read the views of the registered images. Lens distortion is left out and reported."""
     reconstruction = open_colmap_model(model)
     # Images of a model in project/sparse/0, project/sparse or project.
     folders = [parent / "images" for parent in (model, model.parent, model.parent.parent)]
     folder = next((f for f in folders if f.is_dir()), None)
     views = []
-    distorted: Counter[str] = Counter()
+    num_distorted: Counter[str] = Counter()
     for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
         if not image.has_pose:
             continue
         camera = reconstruction.cameras[image.camera_id]
         if not camera.is_undistorted():
-            distorted[camera.model_name] += 1
+            num_distorted[camera.model_name] += 1
         where = f"{model}: image {image.name}"
         camera_from_world = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
         path = folder / image.name if folder else None
-        size, focal = (camera.width, camera.height), (camera.focal_length_x, camera.focal_length_y)
-        middle = (camera.principal_point_x, camera.principal_point_y)
+        image_size = (camera.width, camera.height)
+        focal = (camera.focal_length_x, camera.focal_length_y)
+        principal_point = (camera.principal_point_x, camera.principal_point_y)
         pose = invert_pose(check_pose(camera_from_world, where=where))
         image_path = str(path) if path and path.is_file() else None
-        views.append(PosedView(image.name, *size, *focal, *middle, pose, image_path))
+        views.append(PosedView(image.name, *image_size, *focal, *principal_point, pose, image_path))
     if not views:
         raise AdapterError(f"{model}: this COLMAP model holds no image with a pose")
-    problems = [distortion_problem(str(model), n, m) for m, n in distorted.items()]
+    problems = [distortion_problem(str(model), n, m) for m, n in num_distorted.items()]
     return ViewSet(tuple(views), tuple(problems))
 
 
@@ -356,7 +395,7 @@ class _PathFrame(BaseModel):
     world_from_camera: Pose | None = None
 
     @model_validator(mode="after")
-    def _has_one_pose(self) -> _PathFrame:
+    def _check_pose_fields(self) -> _PathFrame:
         pair = (self.position is not None, self.look_at is not None)
         if pair != ((self.world_from_camera is None),) * 2:
             raise ValueError("give either position and look_at, or world_from_camera")
@@ -374,26 +413,29 @@ class _PathFile(BaseModel):
     frames: Annotated[list[_PathFrame], Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _times_are_whole(self) -> _PathFile:
-        timed = [f.timestamp_s is not None for f in self.frames]
-        if any(timed) and not all(timed):
+    def _check_times(self) -> _PathFile:
+        has_time = [f.timestamp_s is not None for f in self.frames]
+        if any(has_time) and not all(has_time):
             raise ValueError(
-                f"timestamp_s must be in all frames or in none; it is in {sum(timed)} of "
-                f"{len(timed)} (missing first in frames.{timed.index(False)})"
+                f"timestamp_s must be in all frames or in none; it is in {sum(has_time)} of "
+                f"{len(has_time)} (missing first in frames.{has_time.index(False)})"
             )
         keys = Counter((f.timestamp_s, f.camera) for f in self.frames)
-        key, most = keys.most_common(1)[0]
-        if all(timed) and most > 1:
-            raise ValueError(f"camera {key[1]!r} stands {most} times at timestamp_s {key[0]}")
+        repeated_key, num_entries = keys.most_common(1)[0]
+        if all(has_time) and num_entries > 1:
+            raise ValueError(
+                f"camera {repeated_key[1]!r} stands {num_entries} times at timestamp_s "
+                f"{repeated_key[0]}"
+            )
         return self
 
 
 def path_views(content: object, path: Path) -> ViewSet:
-    """Views of a camera path."""
+    """Return the views of a camera path."""
     file = validate(_PathFile, content, path, "camera path")
     times = sorted({f.timestamp_s for f in file.frames if f.timestamp_s is not None})
-    rank = {time: number for number, time in enumerate(times)}
-    seen: Counter[str] = Counter()
+    frame_of_time = {time: number for number, time in enumerate(times)}
+    num_views_of_camera: Counter[str] = Counter()
     views = []
     for number, frame in enumerate(file.frames):
         where = f"{path}: frames.{number}"
@@ -408,11 +450,11 @@ def path_views(content: object, path: Path) -> ViewSet:
                 *lens_of(file.width, file.height, file.fx, file.fy, file.cx, file.cy),
                 pose,
                 camera=frame.camera,
-                frame=seen[frame.camera] if time is None else rank[time],
+                frame=num_views_of_camera[frame.camera] if time is None else frame_of_time[time],
                 timestamp_ns=None if time is None else round(time * 1e9),
             )
         )
-        seen[frame.camera] += 1
+        num_views_of_camera[frame.camera] += 1
     return ViewSet(tuple(views))
 
 
@@ -422,23 +464,28 @@ _JSON_NAMES = ("cameras.json", "transforms.json")
 
 
 def read_views(path: Path) -> ViewSet:
-    """Views of a camera file, or of a folder with a COLMAP model or a JSON of a known name."""
+    """Read the views of a camera file, or of a folder with a COLMAP model or a JSON of a known
+    name.
+    """
     if not path.exists():
         raise AdapterError(
             f"{path}: no such file; expected an INRIA cameras.json, a nerfstudio transforms.json, "
             "a camera path (JSON) or a COLMAP sparse model"
         )
-    found = find_camera_file(path) if path.is_dir() else path
-    if found is None:
+    camera_file = find_camera_file(path) if path.is_dir() else path
+    if camera_file is None:
         raise AdapterError(
             f"{path}: no cameras in this folder; looked for {', '.join(_JSON_NAMES)} and a COLMAP "
             "sparse model (cameras and images, .bin or .txt) in it, sparse/0 and sparse"
         )
-    return read_colmap_views(found) if found.is_dir() else read_camera_json(found)
+    return read_colmap_views(camera_file) if camera_file.is_dir() else read_camera_json(camera_file)
 
 
 def find_camera_file(folder: Path) -> Path | None:
-    """The camera file of a folder (a COLMAP model is itself a folder), or None."""
+    """Return the camera file of a folder (a COLMAP model is itself a folder).
+
+    The result is None if there is none.
+    """
     for name in _JSON_NAMES:
         if (folder / name).is_file():
             return folder / name
@@ -451,16 +498,16 @@ def read_camera_json(path: Path) -> ViewSet:
     if isinstance(content, list):
         return inria_views(content, path)
     frames = content.get("frames") if isinstance(content, dict) else None
-    first = frames[0] if isinstance(frames, list) and frames else None
-    if isinstance(first, dict) and "transform_matrix" in first:
+    first_frame = frames[0] if isinstance(frames, list) and frames else None
+    if isinstance(first_frame, dict) and "transform_matrix" in first_frame:
         return nerfstudio_views(content, path)
     if isinstance(content, dict) and "frames" in content:
         return path_views(content, path)
-    found = f"a {type(content).__name__}"
+    description = f"a {type(content).__name__}"
     if isinstance(content, dict):
-        found = f"an object with keys {sorted(content)[:8]}"
+        description = f"an object with keys {sorted(content)[:8]}"
     raise AdapterError(
         f"{path}: expected a list of cameras (INRIA cameras.json), 'frames' with "
         "'transform_matrix' (nerfstudio transforms.json), or 'frames' with 'position' and "
-        f"'look_at' or 'world_from_camera' (a camera path); got {found}"
+        f"'look_at' or 'world_from_camera' (a camera path); got {description}"
     )

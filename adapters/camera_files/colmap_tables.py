@@ -1,8 +1,9 @@
-"""Whether the tables of a COLMAP model are whole, before pycolmap reads them.
+"""Check that the tables of a COLMAP model are whole, before pycolmap reads them.
 
-pycolmap does not look at the end of a file: behind it, numbers are whatever was in memory. The
-layouts are COLMAP's (src/colmap/scene/reconstruction_io_*.cc): a binary table begins with the
-number of its entries; a text that COLMAP wrote says it in a comment.
+pycolmap does not notice the end of a file: numbers beyond it are random memory. The layouts are
+COLMAP's (src/colmap/scene/reconstruction_io_*.cc): a binary table begins with the number of its
+entries; a text that COLMAP wrote says it in a comment. The caller is
+`adapters.camera_files.camera_files`.
 """
 
 from __future__ import annotations
@@ -21,21 +22,24 @@ _CAMERA_PARAMETERS = {
     **{0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5},
     **{10: 12, 11: 16, 12: 4, 13: 5, 14: 3, 15: 4, 16: 6, 17: 2},
 }
-_MAX_BYTES = 1 << 33  # of a table; the largest models have some gigabytes
+# Largest table. The largest models have some gigabytes.
+_MAX_BYTES = 1 << 33
+# Size of a pose: a quaternion and a translation.
 _POSE_BYTES = 7 * 8
+# Longest name of an image.
 _MAX_NAME_BYTES = 4096
 _ADVICE = "copy the model again, or save it again from COLMAP"
 
 
 class _CutShort(Exception):
-    """A table ends within an entry."""
+    """Raised if a table ends within an entry."""
 
 
 def check_colmap_tables(model: Path) -> None:
-    """Raise where a table of the model in this folder is not whole.
+    """Check all tables of the model in a folder.
 
     Raises:
-        AdapterError: a table ends before its last entry, or says what no table can.
+        AdapterError: a table ends before its last entry, or holds a value that no table can hold.
     """
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
     for name, (entry_end, word) in _TABLES.items():
@@ -62,13 +66,13 @@ def _check_binary(
     if len(data) < 8:
         raise AdapterError(f"{path} is cut short: it has {len(data)} bytes; {_ADVICE}")
     (count,) = struct.unpack_from("<Q", data)
-    at = 8
+    position = 8
     for number in range(1, count + 1):
         try:
-            at = entry_end(data, at, f"{path}: {word} {number} of {count}")
+            position = entry_end(data, position, f"{path}: {word} {number} of {count}")
         except (struct.error, _CutShort):
-            at = len(data) + 1
-        if at > len(data):
+            position = len(data) + 1
+        if position > len(data):
             raise AdapterError(
                 f"{path.name} is cut short at {word} {number} of {count}: {path} has {len(data)} "
                 f"bytes; {_ADVICE}"
@@ -80,7 +84,7 @@ def _check_text(data: bytes, path: Path, word: str) -> None:
         lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise AdapterError(f"{path} is no UTF-8 text ({error}); {_ADVICE}") from None
-    stated = next(
+    stated_count = next(
         (int(m[1]) for line in lines if (m := re.match(r"# Number of \w+: (\d{1,18})\b", line))),
         None,
     )
@@ -88,48 +92,52 @@ def _check_text(data: bytes, path: Path, word: str) -> None:
     if word == "image":  # its second line, of points, may be empty
         entries = [line for line in entries[::2] if line.strip()]
     count = sum(bool(line.strip()) for line in entries)
-    if count == 0 and word in _NEEDED:
+    if count == 0 and word in _REQUIRED_ENTRIES:
         raise AdapterError(f"{path} holds no {word}; {_ADVICE}")
     # COLMAP ends the last line, too.
-    is_cut = stated is not None and (count < stated or not data.endswith(b"\n"))
+    is_cut = stated_count is not None and (count < stated_count or not data.endswith(b"\n"))
     if is_cut:
-        number = count + (count < stated)
+        number = count + (count < stated_count)
         raise AdapterError(
-            f"{path.name} is cut short at {word} {number} of {stated}: {path} has {len(lines)} "
-            f"lines; {_ADVICE}"
+            f"{path.name} is cut short at {word} {number} of {stated_count}: {path} has "
+            f"{len(lines)} lines; {_ADVICE}"
         )
 
 
 # ---- Where an entry of a binary table ends -------------------------------------------------------
 
 
-def _camera_end(data: bytes, at: int, where: str) -> int:
-    (model,) = struct.unpack_from("<i", data, at + 4)
-    if model not in _CAMERA_PARAMETERS:
+def _camera_end(data: bytes, start: int, where: str) -> int:
+    """Return the position behind a camera's entry."""
+    (model_number,) = struct.unpack_from("<i", data, start + 4)
+    if model_number not in _CAMERA_PARAMETERS:
         raise AdapterError(
-            f"{where} is of the model number {model}, which is not known; {_ADVICE} in a version "
-            f"that is"
+            f"{where} is of the model number {model_number}, which is not known; {_ADVICE} in a "
+            f"version that is"
         )
-    return at + 24 + 8 * _CAMERA_PARAMETERS[model]
+    return start + 24 + 8 * _CAMERA_PARAMETERS[model_number]
 
 
-def _image_end(data: bytes, at: int, where: str) -> int:
-    start = at + 4 + _POSE_BYTES + 4
-    end = data.find(b"\0", start, start + _MAX_NAME_BYTES)
+def _image_end(data: bytes, start: int, where: str) -> int:
+    """Return the position behind an image's entry."""
+    name_start = start + 4 + _POSE_BYTES + 4
+    end = data.find(b"\0", name_start, name_start + _MAX_NAME_BYTES)
     if end < 0:
-        if start + _MAX_NAME_BYTES < len(data):
+        if name_start + _MAX_NAME_BYTES < len(data):
             raise AdapterError(f"{where} has a name without an end; {_ADVICE}")
         raise _CutShort
-    (points,) = struct.unpack_from("<Q", data, end + 1)
-    return end + 9 + 24 * points
+    (num_points,) = struct.unpack_from("<Q", data, end + 1)
+    return end + 9 + 24 * num_points
 
 
-def _point_end(data: bytes, at: int, where: str) -> int:
-    (length,) = struct.unpack_from("<Q", data, at + 43)
-    return at + 51 + 8 * length
+def _point_end(data: bytes, start: int, where: str) -> int:
+    """Return the position behind a point's entry."""
+    (num_entries,) = struct.unpack_from("<Q", data, start + 43)
+    return start + 51 + 8 * num_entries
 
 
 def _rig_end(data: bytes, at: int, where: str) -> int:
+    """Return the position behind a rig's entry."""
     (sensors,) = struct.unpack_from("<I", data, at + 4)
     at += 8 + 8 * (sensors > 0)
     for _ in range(sensors - 1):
@@ -138,12 +146,13 @@ def _rig_end(data: bytes, at: int, where: str) -> int:
     return at
 
 
-def _frame_end(data: bytes, at: int, where: str) -> int:
-    (images,) = struct.unpack_from("<I", data, at + 8 + _POSE_BYTES)
-    return at + 12 + _POSE_BYTES + 16 * images
+def _frame_end(data: bytes, start: int, where: str) -> int:
+    """Return the position behind a frame's entry."""
+    (num_images,) = struct.unpack_from("<I", data, start + 8 + _POSE_BYTES)
+    return start + 12 + _POSE_BYTES + 16 * num_images
 
 
-_NEEDED = ("camera", "rig", "frame")  # of which a model has at least one
+_REQUIRED_ENTRIES = ("camera", "rig", "frame")  # of which a model has at least one
 # The word for an entry stands in messages.
 _TABLES = {
     "cameras": (_camera_end, "camera"),

@@ -1,9 +1,14 @@
-"""The drive that a run was trained on, from its processed data: where car and cameras were.
+"""The drive that a drivestudio run was trained on, from its processed data: poses of car and
+cameras.
 
-The scene's world is the model's, whose origin and axes are the first frame's car (nuScenes: front
-camera), turned until z is up as in the dataset's world: a car stands on a slope, and its brakes
-tip it. Frame t is at t tenths of a second: the data hold no times, and all cameras of a frame were
-trained as one moment.
+`find_run` finds the run's files, `read_drive` reads the frames, `read_corrections` what training
+changed for each image, `DriveStudioLabels` boxes and LiDAR. The caller is
+`adapters.drivestudio.adapter`.
+
+The scene's world is the model's, turned until z is up as in the dataset's world. The model's world
+has the origin and axes of the first frame's car (nuScenes: front camera), which stands on a slope
+and is tipped by its brakes. Frame t is at t tenths of a second: the data hold no times, and all
+cameras of a frame were trained as one moment.
 """
 
 from __future__ import annotations
@@ -34,11 +39,11 @@ from adapters.camera_files.camera_files import validate
 from adapters.plain_files import (
     Number,
     array_of,
-    inside,
     read_json,
     read_numbers,
     read_pose,
     read_yaml,
+    resolve_inside,
 )
 from adapters.raw_drive import DriveOptions, stored_records
 from adapters.uri import UriOptions
@@ -54,13 +59,14 @@ from augment.labels import Boxes, LidarSweep
 
 
 def read_config(path: Path) -> Mapping[str, Any]:
+    """Read a run's config.yaml."""
     return read_yaml(
         path, if_missing="a drivestudio run is a folder with config.yaml and checkpoint_*.pth"
     )
 
 
 def lookup(config: Mapping[str, Any], key: str) -> Any:
-    """The value of a dotted key; None where there is none."""
+    """Return the value of a dotted key, or None if there is none."""
     value: Any = config
     for name in key.split("."):
         value = value.get(name) if isinstance(value, Mapping) else None
@@ -74,8 +80,11 @@ def lookup(config: Mapping[str, Any], key: str) -> Any:
 
 
 class RunConfig(BaseModel):
-    """What of config.yaml must be there and fit. end_timestep: included; -1 for the data's last.
-    test_image_stride: every how manyeth frame was held out; 0 for none."""
+    """Checked part of config.yaml.
+
+    end_timestep: included; -1 for the data's last. test_image_stride: step between held-out frames;
+    0 for none.
+    """
 
     model_config = ConfigDict(frozen=True, strict=True)
 
@@ -98,12 +107,14 @@ class RunConfig(BaseModel):
         return name.lower()
 
     @model_validator(mode="after")
-    def _fits(self) -> RunConfig:
-        known = range(len(CONVENTIONS[self.dataset].cameras))
-        if len(set(self.cameras)) != len(self.cameras) or not set(self.cameras) <= set(known):
+    def _check_consistency(self) -> RunConfig:
+        known_cameras = range(len(CONVENTIONS[self.dataset].cameras))
+        if len(set(self.cameras)) != len(self.cameras) or not set(self.cameras) <= set(
+            known_cameras
+        ):
             raise ValueError(
-                f"data.pixel_source.cameras must be camera numbers, 0 to {known[-1]}, each once; "
-                f"got {self.cameras}"
+                f"data.pixel_source.cameras must be camera numbers, 0 to {known_cameras[-1]}, each "
+                f"once; got {self.cameras}"
             )
         if len(self.downscale) < len(self.cameras):
             raise ValueError(
@@ -115,18 +126,19 @@ class RunConfig(BaseModel):
 
 # ---- What a drivestudio URI may ask for, as in `drivestudio:<run>?data=DIR&frames=0:50` ----------
 
-_DATA = "the processed scene's folder, such as data/waymo/processed/training/023"
+_DATA_DESCRIPTION = "the processed scene's folder, such as data/waymo/processed/training/023"
 _Text = Annotated[str, Field(min_length=1)]
 
 
 def _frames_option(text: object) -> DriveOptions:
+    """Return the drive options of a range of frames."""
     return DriveOptions.from_query("drivestudio", {"frames": str(text)})
 
 
 class RunOptions(UriOptions):
-    """Options of one opening; None where the run decides."""
+    """Options of one opening. None if the run decides."""
 
-    data: _Text | None = Field(None, description=_DATA)
+    data: _Text | None = Field(None, description=_DATA_DESCRIPTION)
     checkpoint: _Text | None = Field(
         None, description="the name of a checkpoint in the run, such as checkpoint_15000.pth"
     )
@@ -148,7 +160,7 @@ _RIGHT_FORWARD_FROM_FLAT = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 @dataclass(frozen=True)
 class CameraKind:
-    """A camera as the dataset has it. width, height: pixels that its intrinsics are given for."""
+    """A camera as the dataset has it. width, height: pixels for which its intrinsics are given."""
 
     name: str
     width: int
@@ -157,15 +169,21 @@ class CameraKind:
 
 @dataclass(frozen=True, eq=False)
 class Convention:
-    """How one dataset's processed data is to be read.
+    """Format of one dataset's processed data.
 
-    cameras: by number. lidar_columns: of lidar/{frame}.bin, float32. poses_per_frame:
-    extrinsics/{frame}_{camera}.txt is world_from_camera; else extrinsics/{camera}.txt is
-    ego_from_camera. world_of_front_camera: the model's world is camera 0's first frame, else the
-    first ego_pose. The rest are axes, [3, 3]. camera_from_opencv: of the extrinsics.
-    scene_from_model: a permutation that turns the model's world z up, as far as the car stands
-    level. pose_from_ego: ego axes (x forward, y left, z up) in those of ego_pose, or of camera 0
-    where that is the world's. object_from_actor: x forward, y left, z up in those of its boxes.
+    Attributes:
+        cameras: by number.
+        lidar_columns: columns of lidar/{frame}.bin, float32.
+        poses_per_frame: if True, extrinsics/{frame}_{camera}.txt is world_from_camera; else
+            extrinsics/{camera}.txt is ego_from_camera.
+        world_of_front_camera: if True, the model's world is camera 0's first frame, else the first
+            ego_pose.
+        camera_from_opencv: axes of the extrinsics, [3, 3].
+        scene_from_model: [3, 3], a permutation that turns the model's world z up, as far as the car
+            stands level.
+        pose_from_ego: [3, 3], ego axes (x forward, y left, z up) in those of ego_pose, or of camera
+            0 if that is the world's.
+        object_from_actor: [3, 3], x forward, y left, z up in the axes of the data's boxes.
     """
 
     cameras: tuple[CameraKind, ...]
@@ -179,6 +197,7 @@ class Convention:
 
 
 def _cameras(width: int, height: int, names: str) -> tuple[CameraKind, ...]:
+    """Return camera kinds of one size."""
     return tuple(CameraKind(name, width, height) for name in names.split())
 
 
@@ -235,22 +254,31 @@ CONVENTIONS = {
 
 # ---- A run's folder: its checkpoint, config and data ---------------------------------------------
 
-_CHECKPOINT = re.compile(r"checkpoint_(\d+)\.pth", re.ASCII)
-_FINAL = "checkpoint_final.pth"
-_POSE = re.compile(r"\d{3,}\.txt", re.ASCII)
-_SH_INTERVAL = 1000  # steps after which the project adds a degree, unless a config says otherwise
+_CHECKPOINT_NAME = re.compile(r"checkpoint_(\d+)\.pth", re.ASCII)
+_FINAL_CHECKPOINT = "checkpoint_final.pth"
+_POSE_NAME = re.compile(r"\d{3,}\.txt", re.ASCII)
+# Steps after which the project adds a degree, unless a config says otherwise.
+_DEFAULT_SH_INTERVAL = 1000
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A trained run and the data it was trained on. frames: numbers of all its frames. config: the
-    whole file, of which `known` is what is checked."""
+    """A trained run, and the data on which it was trained.
+
+    Attributes:
+        folder: the run's folder.
+        checkpoint: the checkpoint's file.
+        data: the processed scene's folder.
+        frames: numbers of all its frames.
+        settings: the checked part of the configuration.
+        config: the whole configuration.
+    """
 
     folder: Path
     checkpoint: Path
     data: Path
     frames: range
-    known: RunConfig
+    settings: RunConfig
     config: Mapping[str, Any]
 
     @property
@@ -259,44 +287,51 @@ class Run:
 
     @property
     def convention(self) -> Convention:
-        return CONVENTIONS[self.known.dataset]
+        return CONVENTIONS[self.settings.dataset]
 
     @property
     def cameras(self) -> list[int]:
-        """Numbers, in the model's order."""
-        return self.known.cameras
+        """Return the numbers of the cameras, in the model's order."""
+        return self.settings.cameras
 
     def is_set(self, key: str) -> bool:
+        """Return True if a key of the configuration is true."""
         return lookup(self.config, key) is True
 
     def sh_interval(self, node: str) -> int:
-        """Steps of training for each degree of a node's spherical harmonics."""
+        """Return the steps of training for each degree of a node's spherical harmonics."""
         for name in (f"model.{node}.ctrl", "trainer.gaussian_ctrl_general_cfg"):
             value = lookup(self.config, f"{name}.sh_degree_interval")
             if isinstance(value, int) and value > 0:
                 return value
-        return _SH_INTERVAL
+        return _DEFAULT_SH_INTERVAL
 
     def is_held_out(self, frame: int) -> bool:
-        """Whether a frame was not trained on: every stride-th from the stride-th of the run on."""
-        position, stride = frame - self.frames.start, self.known.test_image_stride
+        """Return True if a frame was not trained on: every stride-th from the stride-th of the
+        run on.
+        """
+        position = frame - self.frames.start
+        stride = self.settings.test_image_stride
         return stride > 0 and position > 0 and position % stride == 0
 
 
 def find_run(path: Path, options: RunOptions) -> Run:
-    """The run of a folder or of a checkpoint in one."""
+    """Return the run of a folder, or of a checkpoint in one."""
     folder = path if path.is_dir() else path.parent
     config_file = folder / "config.yaml"
     config = read_config(config_file)
     keys = [str(entry.alias) for entry in RunConfig.model_fields.values()]
-    given = {key: value for key in keys if (value := lookup(config, key)) is not None}
-    known = validate(RunConfig, given, config_file, "config that drivestudio saved")
+    values = {key: value for key in keys if (value := lookup(config, key)) is not None}
+    settings = validate(RunConfig, values, config_file, "config that drivestudio saved")
     checkpoint = _find_checkpoint(path, folder, options)
     data = _find_data(config, folder, options)
-    return Run(folder, checkpoint, data, _frames(known, data, config_file), known, config)
+    return Run(
+        folder, checkpoint, data, _frame_range(settings, data, config_file), settings, config
+    )
 
 
 def _find_checkpoint(path: Path, folder: Path, options: RunOptions) -> Path:
+    """Return the selected checkpoint, else the final one, else the newest."""
     if not path.is_dir():
         if options.checkpoint is not None:
             raise AdapterError(
@@ -305,35 +340,40 @@ def _find_checkpoint(path: Path, folder: Path, options: RunOptions) -> Path:
             )
         return path
     if options.checkpoint is not None:
-        found = inside(folder, options.checkpoint, "checkpoint=")
-        if not found.is_file():
+        checkpoint = resolve_inside(folder, options.checkpoint, "checkpoint=")
+        if not checkpoint.is_file():
             names = ", ".join(sorted(p.name for p in folder.glob("checkpoint_*.pth"))) or "none"
-            raise AdapterError(f"{found} does not exist; the run has {names}")
-        return found
-    if (folder / _FINAL).is_file():
-        return folder / _FINAL
+            raise AdapterError(f"{checkpoint} does not exist; the run has {names}")
+        return checkpoint
+    if (folder / _FINAL_CHECKPOINT).is_file():
+        return folder / _FINAL_CHECKPOINT
     files = folder.glob("checkpoint_*.pth")
-    steps = {int(match[1]): file for file in files if (match := _CHECKPOINT.fullmatch(file.name))}
+    steps = {
+        int(match[1]): file for file in files if (match := _CHECKPOINT_NAME.fullmatch(file.name))
+    }
     if not steps:
         raise AdapterError(
-            f"{folder} holds no {_FINAL} and no checkpoint_NNNNN.pth; give a run that was saved"
+            f"{folder} holds no {_FINAL_CHECKPOINT} and no checkpoint_NNNNN.pth; give a run that "
+            f"was saved"
         )
     return steps[max(steps)]
 
 
 def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions) -> Path:
+    """Return the folder of the processed scene."""
     if options.data is not None:
         data = Path(options.data).expanduser()
         if not data.is_dir():
-            raise AdapterError(f"data={options.data}: no such folder; give {_DATA}")
+            raise AdapterError(f"data={options.data}: no such folder; give {_DATA_DESCRIPTION}")
         return data
-    root, scene = lookup(config, "data.data_root"), lookup(config, "data.scene_idx")
+    root = lookup(config, "data.data_root")
+    scene = lookup(config, "data.scene_idx")
     reason = "its config.yaml does not say where the data is"
     if isinstance(root, str) and isinstance(scene, int | str):
         name = f"{int(scene):03d}" if str(scene).isdecimal() else str(scene)
         # A relative root is one from where training was started, often a folder above the run.
-        for start in (Path.cwd(), *folder.absolute().parents):
-            data = start / root / name
+        for parent in (Path.cwd(), *folder.absolute().parents):
+            data = parent / root / name
             if data.is_dir():
                 return data
         reason = f"{Path(root) / name} of its config.yaml is not here"
@@ -343,8 +383,10 @@ def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions) -> 
     )
 
 
-def _frames(config: RunConfig, data: Path, config_file: Path) -> range:
-    start, end = config.start_timestep, config.end_timestep
+def _frame_range(config: RunConfig, data: Path, config_file: Path) -> range:
+    """Return the numbers of the run's frames."""
+    start = config.start_timestep
+    end = config.end_timestep
     if end == -1:
         folders = [data / name for name in ("ego_pose", "lidar_pose") if (data / name).is_dir()]
         if not folders:
@@ -352,7 +394,7 @@ def _frames(config: RunConfig, data: Path, config_file: Path) -> range:
                 f"{data} holds neither ego_pose nor lidar_pose; expected a processed scene, with "
                 f"a pose for each frame"
             )
-        end = sum(1 for p in folders[0].iterdir() if _POSE.fullmatch(p.name)) - 1
+        end = sum(1 for p in folders[0].iterdir() if _POSE_NAME.fullmatch(p.name)) - 1
     if not 0 <= start <= end:
         raise AdapterError(
             f"{config_file}: frames data.start_timestep {start} to data.end_timestep {end} of "
@@ -364,14 +406,20 @@ def _frames(config: RunConfig, data: Path, config_file: Path) -> range:
 # ---- What a run learnt for each image: its colours' affine map and its camera's pose -------------
 # Image i of a run is frame * cameras + camera, both counted from 0 as the run has them.
 
-_POSES = ("CamPosePerturb", "CamPose")  # in the order in which they apply
+_POSE_MODELS = ("CamPosePerturb", "CamPose")  # in the order in which they apply
 
 
 @dataclass(frozen=True, eq=False)
 class ImageCorrections:
-    """color_maps: float32 [n, 3, 4] of each image, mean_color_map: [3, 4] of images that were not
-    trained on; both None without any. pose_changes: float64 [n, 4, 4], what world_from_camera is
-    multiplied by on its right; None for no change."""
+    """Corrections that training learnt for each image.
+
+    Attributes:
+        color_maps: float32 [n, 3, 4] of each image. None without any.
+        mean_color_map: float32 [3, 4], for images that were not trained on. None without any.
+        pose_changes: float64 [n, 4, 4], by which world_from_camera is multiplied on its right. None
+            for no change.
+        problems: one sentence each.
+    """
 
     color_maps: np.ndarray | None = None
     mean_color_map: np.ndarray | None = None
@@ -381,7 +429,7 @@ class ImageCorrections:
     def maps_of(
         self, run: Run, frames: tuple[Frame, ...]
     ) -> tuple[dict[str, torch.Tensor], dict[tuple[str, int], torch.Tensor]]:
-        """Colour maps by camera name, and of images that were trained on by name and time."""
+        """Return colour maps by camera name, and those of trained images by name and time."""
         if self.color_maps is None or self.mean_color_map is None:
             return {}, {}
         names = [run.convention.cameras[number].name for number in run.cameras]
@@ -396,57 +444,63 @@ class ImageCorrections:
 
 
 def read_corrections(models: Mapping[str, Any], run: Run, where: str) -> ImageCorrections:
-    """The corrections of a checkpoint's models."""
+    """Read the corrections in a checkpoint's models."""
     count = len(run.frames) * len(run.cameras)
-    found = ImageCorrections()
+    corrections = ImageCorrections()
     if "Affine" in models:
-        found = _read_color_maps(section(models, "Affine", where), count, f"{where} Affine")
-    changes = None
-    for name in _POSES:
+        corrections = _read_color_maps(section(models, "Affine", where), count, f"{where} Affine")
+    pose_changes = None
+    for name in _POSE_MODELS:
         if name in models:
-            change = _pose_changes(section(models, name, where), count, f"{where} {name}")
-            changes = change if changes is None else changes @ change
-    return dataclasses.replace(found, pose_changes=changes)
+            pose_change = _pose_changes(section(models, name, where), count, f"{where} {name}")
+            pose_changes = pose_change if pose_changes is None else pose_changes @ pose_change
+    return dataclasses.replace(corrections, pose_changes=pose_changes)
 
 
 def _read_color_maps(content: Mapping[str, Any], count: int, where: str) -> ImageCorrections:
+    """Compute the colour maps from an embedding and a network of two layers."""
     embedding = finite_numbers(content, "embedding.weight", (count, None), where)
-    hidden = finite_numbers(content, "decoder.0.weight", (None, None), where)
-    width, inputs = hidden.shape
-    if inputs == embedding.shape[1] + 2:
+    hidden_weights = finite_numbers(content, "decoder.0.weight", (None, None), where)
+    num_hidden, num_inputs = hidden_weights.shape
+    if num_inputs == embedding.shape[1] + 2:
         problem = (
             f"{where}: the colour corrections differ over the image (pixel_affine); they are "
             f"left out, so images have the model's own colours"
         )
         return ImageCorrections(problems=(problem,))
-    if inputs != embedding.shape[1]:
+    if num_inputs != embedding.shape[1]:
         raise AdapterError(
             f"{where}: decoder.0.weight must take the {embedding.shape[1]} numbers of "
-            f"embedding.weight; it takes {inputs}"
+            f"embedding.weight; it takes {num_inputs}"
         )
-    hidden_bias = finite_numbers(content, "decoder.0.bias", (width,), where)
-    output = finite_numbers(content, "decoder.2.weight", (12, width), where)
+    hidden_bias = finite_numbers(content, "decoder.0.bias", (num_hidden,), where)
+    output_weights = finite_numbers(content, "decoder.2.weight", (12, num_hidden), where)
     output_bias = finite_numbers(content, "decoder.2.bias", (12,), where)
 
-    def decoded(embedding: np.ndarray) -> np.ndarray:
-        values = np.maximum(embedding @ hidden.T + hidden_bias, 0) @ output.T + output_bias
+    def decode(embedding: np.ndarray) -> np.ndarray:
+        values = (
+            np.maximum(embedding @ hidden_weights.T + hidden_bias, 0) @ output_weights.T
+            + output_bias
+        )
         return (values.reshape(-1, 3, 4) + np.eye(3, 4)).astype(np.float32)
 
-    return ImageCorrections(decoded(embedding), decoded(embedding.mean(0, keepdims=True))[0])
+    return ImageCorrections(decode(embedding), decode(embedding.mean(0, keepdims=True))[0])
 
 
 def _pose_changes(content: Mapping[str, Any], count: int, where: str) -> np.ndarray:
-    """float64 [n, 4, 4] of 3 numbers of a shift and 6 of a rotation each.
+    """Return rigid transforms, float64 [n, 4, 4], from 3 numbers of a shift and 6 of a rotation
+    each.
 
-    The 6, of which the identity's were taken off, are its first two rows before Gram and Schmidt
-    (Zhou et al. 2019, "On the Continuity of Rotation Representations in Neural Networks", sec. B).
+    The 6 numbers, from which those of the identity were subtracted, are the rotation's first two
+    rows before Gram and Schmidt (Zhou et al. 2019, "On the Continuity of Rotation Representations
+    in Neural Networks", sec. B).
     """
     values = finite_numbers(content, "embeds.weight", (count, 9), where)
-    first = values[:, 3:6] + [1.0, 0, 0]
-    second = values[:, 6:9] + [0, 1.0, 0]
+    first_row = values[:, 3:6] + [1.0, 0, 0]
+    second_row = values[:, 6:9] + [0, 1.0, 0]
     with np.errstate(all="ignore"):
-        x = first / np.linalg.norm(first, axis=1, keepdims=True)
-        y = second - (x * second).sum(1, keepdims=True) * x
+        x = first_row / np.linalg.norm(first_row, axis=1, keepdims=True)
+        y = second_row - (x * second_row).sum(1, keepdims=True) * x
         y = y / np.linalg.norm(y, axis=1, keepdims=True)
     changes = np.tile(np.eye(4), (count, 1, 1))
     changes[:, :3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
@@ -458,102 +512,126 @@ def _pose_changes(content: Mapping[str, Any], count: int, where: str) -> np.ndar
 
 # ---- Where car and cameras were ------------------------------------------------------------------
 
+# Time between frames.
 FRAME_NS = 100_000_000
-_LEVEL = 1e-4  # slope that is none: a centimetre in 100 m
-_STEEPEST_UP = 0.9  # cosine of a slope that no road has
+# Largest slope that counts as level: a centimetre in 100 m.
+_MAX_LEVEL_SLOPE = 1e-4
+# Cosine of a slope that no road has.
+_MIN_UP_COSINE = 0.9
 
 
 def model_from_dataset(run: Run) -> np.ndarray:
-    """The rigid transform from the dataset's world to the model's, float64 [4, 4]."""
+    """Return the rigid transform from the dataset's world to the model's, float64 [4, 4]."""
     return np.linalg.inv(_world_pose(run, run.frames.start))
 
 
 def scene_from_model(run: Run) -> np.ndarray:
-    """The rotation from the model's world to the scene's, float64 [3, 3]: a permutation of axes
-    where that leaves z as good as up, or where the dataset's z cannot be what is up."""
-    axes, up = run.convention.scene_from_model, _up(run)
-    if up[2] < _STEEPEST_UP or np.hypot(up[0], up[1]) < _LEVEL:
+    """Return the rotation from the model's world to the scene's, float64 [3, 3].
+
+    It is a permutation of axes if that leaves z practically up, or if the dataset's z cannot be up.
+    """
+    axes = run.convention.scene_from_model
+    up = _up_of_dataset(run)
+    if up[2] < _MIN_UP_COSINE or np.hypot(up[0], up[1]) < _MAX_LEVEL_SLOPE:
         return axes
     return rotation_to_z_up(up) @ axes
 
 
-def _up(run: Run) -> np.ndarray:
-    """The dataset's z axis, of length 1, as the first frame's car has it (x forward, y left, z
-    up)."""
+def _up_of_dataset(run: Run) -> np.ndarray:
+    """Return the dataset's z axis, a unit vector in the first frame's car (x forward, y left, z
+    up).
+    """
     up = run.convention.scene_from_model @ model_from_dataset(run)[:3, 2]
     return up / np.linalg.norm(up)
 
 
 def scene_from_dataset(run: Run) -> np.ndarray:
-    """The rigid transform from the dataset's world to the scene's, float64 [4, 4]."""
-    return _rigid(scene_from_model(run)) @ model_from_dataset(run)
+    """Return the rigid transform from the dataset's world to the scene's, float64 [4, 4]."""
+    return _rigid_transform(scene_from_model(run)) @ model_from_dataset(run)
 
 
 def read_drive(
     run: Run, numbers: tuple[int, ...], corrections: ImageCorrections
 ) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
-    """Frames of the given numbers, their cameras as the model corrects them, and a sentence for
-    each kind of thing gone on without."""
-    scene = scene_from_dataset(run)
+    """Read frames, with the cameras as the model corrects them.
+
+    A sentence is returned for each kind of thing that is missing.
+    """
+    scene_from_dataset_matrix = scene_from_dataset(run)
     problems: list[str] = []
-    if _up(run)[2] < _STEEPEST_UP:
+    if _up_of_dataset(run)[2] < _MIN_UP_COSINE:
         problems.append(
             f"{run.data}: z of its world is not what is up for the first frame's car, which is "
             f"therefore taken to stand level"
         )
     cameras = [_read_camera(run, position, problems) for position in range(len(run.cameras))]
-    frames, missing = [], []
+    frames = []
+    missing_images = []
     for number in numbers:
-        shown, paths = {}, {}
+        frame_cameras = {}
+        paths = {}
         for position, camera in enumerate(cameras):
             file = run.data / "images" / f"{number:03d}_{run.cameras[position]}.jpg"
             if file.is_file():
                 paths[camera.name] = str(file)
             else:
-                missing.append(file.name)
-            world_from_camera = scene @ _dataset_from_camera(run, number, position)
+                missing_images.append(file.name)
+            world_from_camera = scene_from_dataset_matrix @ _dataset_from_camera(
+                run, number, position
+            )
             if corrections.pose_changes is not None:
                 image = (number - run.frames.start) * len(cameras) + position
                 world_from_camera = world_from_camera @ corrections.pose_changes[image]
             pose = torch.from_numpy(world_from_camera)
-            shown[camera.name] = dataclasses.replace(
+            frame_cameras[camera.name] = dataclasses.replace(
                 camera, camera_from_world=invert_rigid(pose), timestamp_ns=number * FRAME_NS
             )
-        ego = scene @ _world_pose(run, number) @ _rigid(run.convention.pose_from_ego)
-        frames.append(Frame(number, number * FRAME_NS, torch.from_numpy(ego), shown, paths))
-    if missing:
+        world_from_ego = (
+            scene_from_dataset_matrix
+            @ _world_pose(run, number)
+            @ _rigid_transform(run.convention.pose_from_ego)
+        )
+        frames.append(
+            Frame(number, number * FRAME_NS, torch.from_numpy(world_from_ego), frame_cameras, paths)
+        )
+    if missing_images:
         problems.append(
-            f"{run.data / 'images'}: {len(missing)} of {len(numbers) * len(cameras)} images are "
-            f"missing, the first {missing[0]}; their cameras are there without them"
+            f"{run.data / 'images'}: {len(missing_images)} of {len(numbers) * len(cameras)} images "
+            f"are missing, the first {missing_images[0]}; their cameras are there without them"
         )
     return tuple(frames), tuple(problems)
 
 
 def dataset_from_lidar(run: Run, number: int) -> np.ndarray:
-    """Pose of a frame's returns in the dataset's world: the car's, or lidar_pose's of nuScenes."""
+    """Return the pose of a frame's returns in the dataset's world: the car's, or lidar_pose of
+    nuScenes.
+    """
     folder = "lidar_pose" if run.convention.world_of_front_camera else "ego_pose"
     return read_pose(run.data / folder / f"{number:03d}.txt")
 
 
 def _world_pose(run: Run, number: int) -> np.ndarray:
-    """dataset_from_ego of a frame, or dataset_from_front_camera where that is the world's."""
+    """Return dataset_from_ego of a frame, or dataset_from_front_camera if that is the world's."""
     if run.convention.world_of_front_camera:
         return read_pose(run.data / "extrinsics" / f"{number:03d}_0.txt")
     return read_pose(run.data / "ego_pose" / f"{number:03d}.txt")
 
 
 def _dataset_from_camera(run: Run, number: int, position: int) -> np.ndarray:
-    folder, camera = run.data / "extrinsics", run.cameras[position]
-    axes = _rigid(run.convention.camera_from_opencv)
+    """Return dataset_from_camera of a frame, in OpenCV's axes, float64 [4, 4]."""
+    folder = run.data / "extrinsics"
+    camera = run.cameras[position]
+    axes = _rigid_transform(run.convention.camera_from_opencv)
     if run.convention.poses_per_frame:
         return read_pose(folder / f"{number:03d}_{camera}.txt") @ axes
     return _world_pose(run, number) @ read_pose(folder / f"{camera}.txt") @ axes
 
 
 def _read_camera(run: Run, position: int, problems: list[str]) -> Camera:
-    """A camera at no place yet."""
-    number, downscale = run.cameras[position], run.known.downscale[position]
-    kind = run.convention.cameras[number]
+    """Read a camera's intrinsics. Its pose is the identity."""
+    number = run.cameras[position]
+    downscale = run.settings.downscale[position]
+    camera_kind = run.convention.cameras[number]
     file = run.data / "intrinsics" / f"{number}.txt"
     values = read_numbers(file)
     if values.size < 4 or not (values[:2] > 0).all():
@@ -561,39 +639,48 @@ def _read_camera(run: Run, position: int, problems: list[str]) -> Camera:
             f"{file} must hold fx fy cx cy k1 k2 p1 p2 k3 with fx, fy > 0; got {values.tolist()}"
         )
     if values[4:].any():
-        how = "as if it had none (undistort is off)"
+        training_kind = "as if it had none (undistort is off)"
         if run.is_set("data.pixel_source.undistort"):
-            how = "on images without it; the recorded images still have it"
+            training_kind = "on images without it; the recorded images still have it"
         problems.append(
-            f"camera {kind.name}: its lens distortion is left out, as the model was trained {how}"
+            f"camera {camera_kind.name}: its lens distortion is left out, as the model was trained "
+            f"{training_kind}"
         )
-    first = min((run.data / "images").glob(f"*_{number}.jpg"), default=None)
-    header = None if first is None else read_image_header(first)
+    first_image = min((run.data / "images").glob(f"*_{number}.jpg"), default=None)
+    header = None if first_image is None else read_image_header(first_image)
     if header is not None and header.orientation != 1:
         problems.append(
-            f"images of camera {kind.name} have an EXIF orientation, such as {header.orientation} "
-            f"in {first}; it is ignored: poses and intrinsics are of the pixels as they are stored"
+            f"images of camera {camera_kind.name} have an EXIF orientation, such as "
+            f"{header.orientation} in {first_image}; it is ignored: poses and intrinsics are of "
+            f"the pixels as they are stored"
         )
-    if header is not None and (header.width, header.height) != (kind.width, kind.height):
+    if header is not None and (header.width, header.height) != (
+        camera_kind.width,
+        camera_kind.height,
+    ):
         problems.append(
-            f"{first} is of {header.width}x{header.height} pixels; drivestudio takes the "
-            f"intrinsics of {kind.name} to be for {kind.width}x{kind.height}, and so does the scene"
+            f"{first_image} is of {header.width}x{header.height} pixels; drivestudio takes the "
+            f"intrinsics of {camera_kind.name} to be for {camera_kind.width}x{camera_kind.height}, "
+            f"and so does the scene"
         )
-    width, height = (int(side / downscale) for side in (kind.width, kind.height))
+    width, height = (int(side / downscale) for side in (camera_kind.width, camera_kind.height))
     if min(width, height) < 1:
         raise AdapterError(
-            f"{run.config_file}: data.pixel_source.downscale_when_loading of {kind.name} is "
-            f"{downscale:g}, which leaves no pixel of {kind.width}x{kind.height}"
+            f"{run.config_file}: data.pixel_source.downscale_when_loading of {camera_kind.name} is "
+            f"{downscale:g}, which leaves no pixel of {camera_kind.width}x{camera_kind.height}"
         )
-    nowhere = torch.eye(4, dtype=torch.float64)
-    camera = Camera(kind.name, kind.width, kind.height, *values[:4].tolist(), nowhere)
+    identity = torch.eye(4, dtype=torch.float64)
+    camera = Camera(
+        camera_kind.name, camera_kind.width, camera_kind.height, *values[:4].tolist(), identity
+    )
     return camera.resized(width, height)
 
 
-def _rigid(rotation: np.ndarray) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, :3] = rotation
-    return out
+def _rigid_transform(rotation: np.ndarray) -> np.ndarray:
+    """Return a rotation as a rigid transform [4, 4]."""
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    return transform
 
 
 # ---- Labelled objects of the processed data: instances/instances_info.json -----------------------
@@ -601,8 +688,8 @@ def _rigid(rotation: np.ndarray) -> np.ndarray:
 #     {"frame_idx": [...], "obj_to_world": [4 x 4, ...], "box_size": [[x, y, z], ...]}}, ...}
 
 
-def _rows(*shape: int) -> BeforeValidator:
-    """JSON's numbers as float64 [T, *shape]; rows may be flat."""
+def _rows_validator(*shape: int) -> BeforeValidator:
+    """Return a validator that reads JSON's numbers as float64 [T, *shape]. Rows may be flat."""
 
     def parse(value: object) -> np.ndarray:
         values = array_of(value)
@@ -615,7 +702,7 @@ def _rows(*shape: int) -> BeforeValidator:
     return BeforeValidator(parse)
 
 
-def _in_file(name: str) -> Any:
+def _annotation_field(name: str) -> Any:
     return Field(validation_alias=AliasPath("frame_annotations", name))
 
 
@@ -630,12 +717,12 @@ class Instance(BaseModel):
 
     track_id: Annotated[str, BeforeValidator(str)] = Field(alias="id")
     label: Any = Field(None, alias="class_name")
-    frames: Annotated[np.ndarray, _rows()] = _in_file("frame_idx")
-    poses: Annotated[np.ndarray, _rows(4, 4)] = _in_file("obj_to_world")
-    sizes_m: Annotated[np.ndarray, _rows(3)] = _in_file("box_size")
+    frames: Annotated[np.ndarray, _rows_validator()] = _annotation_field("frame_idx")
+    poses: Annotated[np.ndarray, _rows_validator(4, 4)] = _annotation_field("obj_to_world")
+    sizes_m: Annotated[np.ndarray, _rows_validator(3)] = _annotation_field("box_size")
 
     @model_validator(mode="after")
-    def _fits(self) -> Instance:
+    def _check_consistency(self) -> Instance:
         counts = len(self.frames), len(self.poses), len(self.sizes_m)
         if len(set(counts)) != 1:
             raise ValueError(
@@ -662,7 +749,10 @@ class _Instances(RootModel[dict[Annotated[int, Field(ge=0, lt=10**9)], Instance]
 
 
 def read_instances(data: Path) -> dict[int, Instance]:
-    """All objects by their numbers, which are their keys in the file; none without the file."""
+    """Read all objects by their numbers, which are their keys in the file.
+
+    It is empty without the file.
+    """
     path = data / "instances" / "instances_info.json"
     return _read_instances(path, path.stat().st_mtime_ns) if path.is_file() else {}
 
@@ -670,42 +760,43 @@ def read_instances(data: Path) -> dict[int, Instance]:
 @functools.lru_cache(maxsize=2)  # labels ask for one frame after the other
 def _read_instances(path: Path, _written_ns: int) -> dict[int, Instance]:
     instances = validate(_Instances, read_json(path), path, "table of objects").root
-    if len({found.track_id for found in instances.values()}) != len(instances):
+    if len({instance.track_id for instance in instances.values()}) != len(instances):
         raise AdapterError(f"{path}: ids of objects repeat; process the data again")
     return dict(sorted(instances.items()))
 
 
 # ---- Boxes and LiDAR of the processed data a run was trained on, in the scene's world ------------
 
-_MOVED = (("x", "y", "z"), ("origin_x", "origin_y", "origin_z"))
-_TURNED = ("flow_x", "flow_y", "flow_z")
+_POINT_COLUMNS = (("x", "y", "z"), ("origin_x", "origin_y", "origin_z"))
+_VECTOR_COLUMNS = ("flow_x", "flow_y", "flow_z")
 # Returns that drops, flakes or fog made: not the ground, and without flow, as Waymo marks those.
-_OF_AIR = {**dict.fromkeys(_TURNED, 0.0), "flow_class": -1.0, "ground": 0.0}
+_AIR_VALUES = {**dict.fromkeys(_VECTOR_COLUMNS, 0.0), "flow_class": -1.0, "ground": 0.0}
 
 
 @dataclass(frozen=True, eq=False)
 class DriveStudioLabels:
-    """Labels of a run's data, read when asked.
+    """Labels of a run's data, read on demand.
 
-    Boxes: x forward; track_ids are the data's ids; `instance` is their number in
-    instances_info.json. Sweeps: Convention.lidar_columns; points, and Waymo's origins and flows,
-    are taken to be in the frame of the car (nuScenes: lidar_pose) at that moment, as the project
+    Boxes: x forward; track_ids are the data's ids; `instance` is the number in instances_info.json.
+    Sweeps have the columns of Convention.lidar_columns. Points, and Waymo's origins and flows, are
+    assumed to be in the frame of the car (nuScenes: lidar_pose) at that moment, as the project
     does.
     """
 
     run: Run
 
     def boxes(self, frame_index: int) -> Boxes:
+        """Return the boxes of a frame in the scene's world."""
         scene = scene_from_dataset(self.run)
         object_from_actor = self.run.convention.object_from_actor
-        found = [
-            (number, instance, int(at[0]))
+        matches = [
+            (number, instance, int(match_rows[0]))
             for number, instance in read_instances(self.run.data).items()
-            if len(at := np.flatnonzero(instance.frames == frame_index))
+            if len(match_rows := np.flatnonzero(instance.frames == frame_index))
         ]
-        if not found:
+        if not matches:
             return Boxes.empty()
-        numbers, instances, rows = zip(*found, strict=True)
+        numbers, instances, rows = zip(*matches, strict=True)
         poses = scene @ np.stack([i.poses[row] for i, row in zip(instances, rows, strict=True)])
         rotations = poses[:, :3, :3] @ object_from_actor
         sizes = np.stack([i.sizes_m[row] for i, row in zip(instances, rows, strict=True)])
@@ -719,6 +810,7 @@ class DriveStudioLabels:
         )
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
+        """Return the sweep of a frame in the scene's world, or None without a file."""
         file = self._lidar_file(frame_index)
         if not file.is_file():
             return None
@@ -731,18 +823,22 @@ class DriveStudioLabels:
         table = np.fromfile(file, "<f4").reshape(-1, len(names))
         pose = self._world_from_lidar(frame_index)
         columns = {name: table[:, i].copy() for i, name in enumerate(names)}
-        for group in (*_MOVED, _TURNED):
+        for group in (*_POINT_COLUMNS, _VECTOR_COLUMNS):
             if group[0] not in columns:
                 continue
             values = np.stack([columns[name] for name in group], axis=1).astype(np.float64)
-            values = values @ pose[:3, :3].T + (0 if group == _TURNED else pose[:3, 3])
+            values = values @ pose[:3, :3].T + (0 if group == _VECTOR_COLUMNS else pose[:3, 3])
             columns |= {name: values[:, i].copy() for i, name in enumerate(group)}
         return LidarSweep(columns)
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
-        """Waymo's own origins, return by return; nuScenes' sensor in lidar_pose. The other
-        datasets' files have returns in the car's frame and do not say where the sensor is on it."""
-        names = _MOVED[1]
+        """Return the sensor's position for each return, float64 [N, 3].
+
+        Waymo's files have an origin for each return; nuScenes' sensor is in lidar_pose. The other
+        datasets' files have returns in the car's frame and do not say where the sensor is on it:
+        the result is None.
+        """
+        names = _POINT_COLUMNS[1]
         if all(name in sweep.columns for name in names):
             return np.stack([np.asarray(sweep.columns[name], np.float64) for name in names], axis=1)
         if not self.run.convention.world_of_front_camera:
@@ -750,14 +846,18 @@ class DriveStudioLabels:
         return np.broadcast_to(self._world_from_lidar(frame_index)[:3, 3], (len(sweep), 3))
 
     def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        """Return the file of a frame's sweep."""
         file = self._lidar_file(frame_index)
         return (file,) if file.is_file() else ()
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        """Return the content of a file that holds a weathered sweep."""
         names = self.run.convention.lidar_columns
         records = np.fromfile(file, "<f4").reshape(-1, len(names))
-        air = {name: value for name, value in _OF_AIR.items() if name in names}
-        return stored_records(records, names, sweep, self._world_from_lidar(frame_index), air)
+        air_values = {name: value for name, value in _AIR_VALUES.items() if name in names}
+        return stored_records(
+            records, names, sweep, self._world_from_lidar(frame_index), air_values
+        )
 
     def _lidar_file(self, frame: int) -> Path:
         return self.run.data / "lidar" / f"{frame:03d}.bin"

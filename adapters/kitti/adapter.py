@@ -1,11 +1,13 @@
-"""A raw KITTI drive, or a frame of its object benchmark, as a scene: Gaussians from accumulated,
-image-coloured LiDAR.
+"""Scenes of raw KITTI drives and of single frames of KITTI's object benchmark.
 
-World: of a raw drive that of its poses (GPS/IMU: Mercator metres, x east, y north; a file or
-registered sweeps: that of the first frame), recentred where it is far; of a single frame without
-poses, and of an object frame, the Velodyne's. Ego: the Velodyne, x forward, y left, z up, 1.73 m
-above the road. Tracklets that move are actors. The Velodyne looks 2 degrees up at most, so what
-rises above is in the sky.
+A scene is made of Gaussians from accumulated, image-coloured LiDAR. `open_kitti` makes the scene of
+a folder, `kitti_labels` its labels.
+
+World: for a raw drive that of its poses, recentred if it is far. GPS/IMU poses have Mercator
+metres, x east, y north; a file or registered sweeps have the world of the first frame. The world of
+a single frame without poses, and of an object frame, is the Velodyne's frame. Ego: the Velodyne, x
+forward, y left, z up, 1.73 m above the road. Tracklets that move are actors. The Velodyne looks 2
+degrees up at most, so anything higher is part of the sky.
 """
 
 from __future__ import annotations
@@ -32,11 +34,10 @@ from adapters.kitti.files import (
     VELODYNE,
     Calibration,
     Poses,
-    file_in,
     frame_times,
     is_object_folder,
     kitti_root,
-    numbered,
+    list_numbered_files,
     odometry_poses,
     oxts_poses,
     read_object_calibration,
@@ -45,6 +46,7 @@ from adapters.kitti.files import (
     read_times,
     read_velodyne_from_imu,
     registered_poses,
+    resolve_file,
     rotation_about,
 )
 from adapters.plain_files import parse_numbers, read_text
@@ -56,12 +58,12 @@ from adapters.raw_drive import (
     RawDrive,
     Sweep,
     TimedBoxes,
+    describe_frames,
     drive_origin,
     find_objects,
     is_in_box,
-    recentred,
+    recenter_pose,
     scene_of_drive,
-    some,
     stored_records,
     usable_images,
 )
@@ -84,27 +86,46 @@ ATTRIBUTES = (
     "state", "occlusion", "occlusion_kf", "truncation", "amt_occlusion", "amt_occlusion_kf",
     "amt_border_l", "amt_border_r", "amt_border_kf",
 )  # fmt: skip
-_SIZE, _POSE = ("l", "w", "h"), ("tx", "ty", "tz", "rx", "ry", "rz")
-_TRACKLET_COLUMNS = ("number", "label", "frame", *_SIZE, *_POSE, *ATTRIBUTES)
-_MAX_BYTES, _MAX_TAGS = 64 * 2**20, 8_000_000
-_OWN_DOCTYPE = re.compile(r"<!DOCTYPE\s+boost_serialization\s*>")  # declares nothing
-_LAST_FRAME = 10**9
+# Elements of a tracklet that hold its box's size.
+_SIZE_COLUMNS = ("l", "w", "h")
+# Elements of a pose: the middle of the box's bottom, and rotations about x, y, z.
+_POSE_COLUMNS = ("tx", "ty", "tz", "rx", "ry", "rz")
+# Columns of the table of tracklets.
+_TRACKLET_COLUMNS = ("number", "label", "frame", *_SIZE_COLUMNS, *_POSE_COLUMNS, *ATTRIBUTES)
+# Largest file of tracklets.
+_MAX_BYTES = 64 * 2**20
+# Largest number of tags in it.
+_MAX_TAGS = 8_000_000
+# The document type of KITTI's files. It declares nothing.
+_ALLOWED_DOCTYPE = re.compile(r"<!DOCTYPE\s+boost_serialization\s*>")
+# Largest frame number that a tracklet may have.
+_MAX_FRAME_NUMBER = 10**9
+# Columns of a label file of the object benchmark.
 _OBJECT_COLUMNS = (
     "type", "truncated", "occluded", "alpha", "bbox_left", "bbox_top", "bbox_right", "bbox_bottom",
     "h", "w", "l", "x", "y", "z", "rotation_y", "score",
 )  # fmt: skip
-_RECORD = ("x", "y", "z", "intensity")  # of a sweep's file
+# Columns of a sweep's file.
+_RECORD_COLUMNS = ("x", "y", "z", "intensity")
 
 
 @dataclass(frozen=True, eq=False)
 class KittiLabels:
     """Labels of a raw drive, or of one frame of the object benchmark.
 
-    sweeps: files relative to the root, by frame. world_from_velodyne: float64 [4, 4] in the
-    dataset's world, by frame; frames without one have no labels. tracklets: of a raw drive.
-    velodyne_from_rectified: of an object folder, where boxes are in label_2/. Sweeps have the
-    columns x y z (float64 metres), intensity (the file's reflectance, 0 to 1) and timestamp_ns (the
-    frame's: the file has none), in the file's order."""
+    Sweeps have the columns x y z (float64 metres), intensity (the file's reflectance, 0 to 1) and
+    timestamp_ns (the frame's: the file has none), in the file's order.
+
+    Attributes:
+        root: the folder.
+        sweeps: files relative to the root, by frame.
+        timestamps_ns: times by frame.
+        world_from_velodyne: float64 [4, 4] in the dataset's world, by frame. Frames without one
+            have no labels.
+        tracklets: boxes of a raw drive, as `read_tracklets` returns them.
+        velodyne_from_rectified: float64 [4, 4] of an object folder, whose boxes are in label_2/.
+            None for a raw drive.
+    """
 
     root: Path
     sweeps: Mapping[int, str]
@@ -114,6 +135,7 @@ class KittiLabels:
     velodyne_from_rectified: np.ndarray | None = None
 
     def boxes(self, frame_index: int) -> Boxes:
+        """Return the boxes of a frame."""
         pose = self.world_from_velodyne.get(frame_index)
         if pose is None:
             return Boxes.empty()
@@ -125,8 +147,11 @@ class KittiLabels:
         return boxes_of_lines(read_object_lines(path), self.velodyne_from_rectified)
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
-        """None without a file or a pose, or where the file is damaged, which the scene's problems
-        say."""
+        """Return a frame's sweep in the world.
+
+        The result is None without a file or a pose, and if the file is damaged; then the scene's
+        problems say so.
+        """
         pose = self.world_from_velodyne.get(frame_index)
         if pose is None or frame_index not in self.sweeps:
             return None
@@ -135,61 +160,74 @@ class KittiLabels:
         except AdapterError:
             return None
         with np.errstate(invalid="ignore", over="ignore"):  # of returns that are not finite
-            world = returns[:, :3].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-        columns = {axis: np.ascontiguousarray(world[:, i]) for i, axis in enumerate("xyz")}
+            world_points = returns[:, :3].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+        columns = {axis: np.ascontiguousarray(world_points[:, i]) for i, axis in enumerate("xyz")}
         columns["intensity"] = returns[:, 3].copy()
-        columns["timestamp_ns"] = np.full(len(world), self.timestamps_ns[frame_index], np.int64)
+        columns["timestamp_ns"] = np.full(
+            len(world_points), self.timestamps_ns[frame_index], np.int64
+        )
         return LidarSweep(columns)
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
-        """The Velodyne's place in its pose of the frame; what the car drives within the turn of
-        0.1 s is left out, as it is left in the returns."""
+        """Return the Velodyne's position in the frame's pose, once per return, float64 [N, 3].
+
+        The car's motion within the turn of 0.1 s is ignored here, as it is in the returns.
+        """
         pose = self.world_from_velodyne.get(frame_index)
         return None if pose is None else np.broadcast_to(pose[:3, 3], (len(sweep), 3))
 
     def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
-        """The frame's file, where it is there and has a pose."""
+        """Return the frame's file, if it exists and the frame has a pose."""
         if frame_index not in self.sweeps or frame_index not in self.world_from_velodyne:
             return ()
-        file = file_in(self.root, self.sweeps[frame_index])
+        file = resolve_file(self.root, self.sweeps[frame_index])
         return (file,) if file.exists() else ()
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
-        """That file with a weathered sweep in place of its own."""
+        """Return the content of a file that holds a weathered sweep instead of the recorded one."""
         records = read_returns(self.root, self.sweeps[frame_index])
-        return stored_records(records, _RECORD, sweep, self.world_from_velodyne[frame_index])
+        return stored_records(
+            records, _RECORD_COLUMNS, sweep, self.world_from_velodyne[frame_index]
+        )
 
 
 def object_label_file(root: Path, frame: int) -> Path:
-    """The label file of a frame, there or not."""
-    return file_in(root, f"label_2/{frame:0{OBJECT_DIGITS}d}.txt")
+    """Return the path of a frame's label file, which need not exist."""
+    return resolve_file(root, f"label_2/{frame:0{OBJECT_DIGITS}d}.txt")
 
 
 def read_tracklets(root: Path) -> pd.DataFrame | None:
-    """The boxes of the drive's tracklets, a row each: number of the tracklet in the file from 0,
-    label, frame, size, pose of the middle of the bottom, and ATTRIBUTES, NaN where there is none.
-    None without the file."""
-    path = file_in(root, TRACKLETS)
+    """Read the boxes of the drive's tracklets, one a row.
+
+    The columns are the number of the tracklet in the file from 0, label, frame, size, pose of the
+    middle of the bottom, and ATTRIBUTES, NaN where the file has none. Without the file the result
+    is None.
+    """
+    path = resolve_file(root, TRACKLETS)
     if not path.exists():
         return None
     rows = []
-    for number, item in enumerate(_parsed(path).findall("./tracklets/item")):
+    for number, item in enumerate(_parse_xml(path).findall("./tracklets/item")):
         where = f"{path}: tracklet {number}"
-        *size_m, first = (_number(item, name, where) for name in ("l", "w", "h", "first_frame"))
+        *size_m, first_frame = (
+            _number(item, name, where) for name in ("l", "w", "h", "first_frame")
+        )
         if min(size_m) <= 0:
             raise AdapterError(f"{where}: l, w, h must be metres > 0; got {size_m}")
-        if first % 1 or not 0 <= first <= _LAST_FRAME:
-            raise AdapterError(f"{where}: first_frame must be a frame's number; got {first:g}")
+        if first_frame % 1 or not 0 <= first_frame <= _MAX_FRAME_NUMBER:
+            raise AdapterError(
+                f"{where}: first_frame must be a frame's number; got {first_frame:g}"
+            )
         label = (item.findtext("objectType") or "").strip() or "unknown"
-        for frame, pose in enumerate(item.findall("./poses/item"), start=int(first)):
-            numbers = [_number(pose, name, where) for name in _POSE]
-            extra = [_number(pose, name, where, otherwise=np.nan) for name in ATTRIBUTES]
-            rows.append((number, label, frame, *size_m, *numbers, *extra))
+        for frame, pose in enumerate(item.findall("./poses/item"), start=int(first_frame)):
+            numbers = [_number(pose, name, where) for name in _POSE_COLUMNS]
+            attributes = [_number(pose, name, where, otherwise=np.nan) for name in ATTRIBUTES]
+            rows.append((number, label, frame, *size_m, *numbers, *attributes))
     return pd.DataFrame(rows, columns=_TRACKLET_COLUMNS)
 
 
 def _number(element: ET.Element, name: str, where: str, *, otherwise: float | None = None) -> float:
-    """The finite number in an element. otherwise: where there is no such element."""
+    """Return the finite number in an element. otherwise: the value if there is no such element."""
     text = element.findtext(name)
     if text is None and otherwise is not None:
         return otherwise
@@ -203,31 +241,33 @@ def _number(element: ET.Element, name: str, where: str, *, otherwise: float | No
 
 
 def boxes_at(tracklets: pd.DataFrame, frame: int, world_from_velodyne: np.ndarray) -> Boxes:
-    """The boxes of a frame in the world of the pose. A track_id is the tracklet's number in the
-    file; attributes are ATTRIBUTES, float64."""
-    here = tracklets[tracklets["frame"] == frame]
-    sizes_m = here[[*_SIZE]].to_numpy(np.float64)
-    world = np.empty((len(here), 4, 4))
-    for i, (x, y, z, rx, ry, rz) in enumerate(here[[*_POSE]].to_numpy(np.float64)):
+    """Return the boxes of a frame in the world of the pose.
+
+    A track_id is the tracklet's number in the file. The attributes are ATTRIBUTES, float64.
+    """
+    rows = tracklets[tracklets["frame"] == frame]
+    sizes_m = rows[[*_SIZE_COLUMNS]].to_numpy(np.float64)
+    world_from_box = np.empty((len(rows), 4, 4))
+    for i, (x, y, z, rx, ry, rz) in enumerate(rows[[*_POSE_COLUMNS]].to_numpy(np.float64)):
         pose = np.eye(4)
         pose[:3, :3] = rotation_about(2, rz) @ rotation_about(1, ry) @ rotation_about(0, rx)
         pose[:3, 3] = [x, y, z] + pose[:3, 2] * sizes_m[i, 2] / 2  # of the middle
-        world[i] = world_from_velodyne @ pose
+        world_from_box[i] = world_from_velodyne @ pose
     return Boxes(
-        track_ids=tuple(map(str, here["number"])),
-        labels=tuple(here["label"]),
-        centers_m=np.ascontiguousarray(world[:, :3, 3]),
+        track_ids=tuple(map(str, rows["number"])),
+        labels=tuple(rows["label"]),
+        centers_m=np.ascontiguousarray(world_from_box[:, :3, 3]),
         sizes_m=np.ascontiguousarray(sizes_m),
-        quats=quat_from_rotmat(torch.from_numpy(world[:, :3, :3].copy())).numpy(),
-        attributes={name: here[name].to_numpy(np.float64, copy=True) for name in ATTRIBUTES},
+        quats=quat_from_rotmat(torch.from_numpy(world_from_box[:, :3, :3].copy())).numpy(),
+        attributes={name: rows[name].to_numpy(np.float64, copy=True) for name in ATTRIBUTES},
     )
 
 
-def _parsed(path: Path) -> ET.Element:
-    """The file's root element; nothing in it is expanded or fetched, and it is of bounded size."""
+def _parse_xml(path: Path) -> ET.Element:
+    """Return the root element of a file of bounded size. Nothing in it is expanded or fetched."""
     if path.stat().st_size > _MAX_BYTES:
         raise AdapterError(f"{path} is larger than {_MAX_BYTES // 2**20} MiB; no drive has that")
-    text = _OWN_DOCTYPE.sub("", read_text(path), count=1)
+    text = _ALLOWED_DOCTYPE.sub("", read_text(path), count=1)
     # A parser takes text with NUL characters for UTF-16, in which declarations look otherwise.
     if "\0" in text or "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise AdapterError(
@@ -246,11 +286,15 @@ def _parsed(path: Path) -> ET.Element:
 
 
 def read_object_lines(path: Path) -> pd.DataFrame:
-    """The objects of a label file: `type` and numbers by column (score NaN without one), indexed by
-    the lines' numbers from 0; DontCare lines too, of which only the type is read."""
+    """Read the objects of a label file, indexed by the lines' numbers from 0.
+
+    The columns are `type` and numbers; score is NaN for lines without one. DontCare lines are
+    included, but only their type is read.
+    """
     rows = {}
     for number, line in enumerate(read_text(path).splitlines()):
-        words, where = line.split(), f"{path}, line {number + 1}"
+        words = line.split()
+        where = f"{path}, line {number + 1}"
         if not words:
             continue
         if words[0] == "DontCare":
@@ -269,41 +313,50 @@ def read_object_lines(path: Path) -> pd.DataFrame:
 
 
 def boxes_of_lines(lines: pd.DataFrame, velodyne_from_rectified: np.ndarray) -> Boxes:
-    """The objects as boxes in the Velodyne's frame. A track_id is the line's number from 0.
-    Attributes: truncated, occluded, alpha, bbox_left, bbox_top, bbox_right, bbox_bottom as in the
-    file, and score where a line has one, float64."""
+    """Return the objects of a label file as boxes in the Velodyne's frame.
+
+    A track_id is the line's number from 0. Attributes, float64: truncated, occluded, alpha,
+    bbox_left, bbox_top, bbox_right, bbox_bottom as in the file, and score if a line has one.
+    """
     lines = lines[lines["type"] != "DontCare"]
     values = lines.drop(columns="type").to_numpy(np.float64)
     height, width, length = values[:, 7:10].T
     heading = values[:, 13]
-    zero, one = np.zeros_like(heading), np.ones_like(heading)
-    forward = np.stack([np.cos(heading), zero, -np.sin(heading)], axis=1)
-    up = np.stack([zero, -one, zero], axis=1)
+    zeros = np.zeros_like(heading)
+    ones = np.ones_like(heading)
+    forward = np.stack([np.cos(heading), zeros, -np.sin(heading)], axis=1)
+    up = np.stack([zeros, -ones, zeros], axis=1)
     rectified_from_box = np.stack([forward, np.cross(up, forward), up], axis=2)
     centres = values[:, 10:13] + up * height[:, None] / 2
-    turn = velodyne_from_rectified[:3, :3]
+    rotation = velodyne_from_rectified[:3, :3]
     names = _OBJECT_COLUMNS[1:8] + (("score",) if lines["score"].notna().any() else ())
     return Boxes(
         track_ids=tuple(map(str, lines.index)),
         labels=tuple(lines["type"]),
-        centers_m=centres @ turn.T + velodyne_from_rectified[:3, 3],
+        centers_m=centres @ rotation.T + velodyne_from_rectified[:3, 3],
         sizes_m=np.stack([length, width, height], axis=1),
-        quats=quat_from_rotmat(torch.from_numpy(turn @ rectified_from_box)).numpy(),
+        quats=quat_from_rotmat(torch.from_numpy(rotation @ rectified_from_box)).numpy(),
         attributes={name: lines[name].to_numpy(np.float64, copy=True) for name in names},
     )
 
 
 # ---- The scene -----------------------------------------------------------------------------------
 
+# Value of poses= that asks for registration of the sweeps.
 ICP = "icp"
-_LIDAR_TOP_DEG = 2.0  # the HDL-64E's uppermost channel
-# The recording car around its Velodyne: in measured sweeps all returns within 2.6 m of it that no
-# neighbour made.
-_EGO_M = np.array([[-2.0, -1.35, -1.5], [2.6, 1.35, 0.5]])
+# Elevation of the HDL-64E's uppermost channel.
+_LIDAR_TOP_DEG = 2.0
+# Least and greatest corner of the recording car around its Velodyne. In measured sweeps it encloses
+# all returns within 2.6 m that no neighbouring object made.
+_EGO_BOX_M = np.array([[-2.0, -1.35, -1.5], [2.6, 1.35, 0.5]])
 
 
 class KittiOptions(DriveOptions):
-    """poses: the drive's own GPS/IMU without it. frame: of an object folder; else its only one."""
+    """Options of a KITTI scene.
+
+    poses: where poses come from; the drive's GPS/IMU if it is missing. frame: the frame of an
+    object folder; if it is missing the folder must have one frame only.
+    """
 
     poses: str | None = Field(
         None,
@@ -314,32 +367,38 @@ class KittiOptions(DriveOptions):
 
 
 def open_kitti(path: str, query: dict[str, str]) -> Scene:
-    """The scene of a raw drive such as `2011_09_26/2011_09_26_drive_0001_sync`, or of one frame of
-    an object folder.
+    """Open the scene of a raw drive such as `2011_09_26/2011_09_26_drive_0001_sync`, or of an
+    object frame.
 
-    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out (see DriveOptions);
-    of a drive poses=icp or poses=FILE, of an object folder frame=NUMBER.
     Opening is deterministic: the same files and options give the same bits.
 
+    Args:
+        path: the folder.
+        query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out (see DriveOptions);
+            for a drive poses=icp or poses=FILE, for an object folder frame=NUMBER.
+
     Raises:
-        AdapterError: a wrong option; missing or damaged calibration, poses, times or labels; no
-            usable sweep or image. What single frames lack is in Scene.problems."""
+        AdapterError: an option is wrong; calibration, poses, times or labels are missing or
+            damaged; no sweep or image is usable. What single frames lack is listed in
+            Scene.problems.
+    """
     source, options = find_source(path, query)
     return scene_of_drive(read_kitti(path, query, source), options)
 
 
-def read_kitti(path: str, query: dict[str, str], source: Source) -> RawDrive:
-    """The source's frames with their images, sweeps and boxes."""
-    labels, calibration = source.labels, source.calibration
+def read_kitti(path: str, query: dict[str, str], source: DriveSource) -> RawDrive:
+    """Read the source's frames with their images, sweeps and boxes."""
+    labels = source.labels
+    calibration = source.calibration
     pictures = [
-        Picture(name, n, file_in(labels.root, files[n]) if n in files else None, camera.size)
+        Picture(name, n, resolve_file(labels.root, files[n]) if n in files else None, camera.size)
         for name, camera in calibration.cameras.items()
-        for n in source.chosen.numbers
+        for n in source.selection.numbers
         for files in [source.images[name]]
     ]
     images = usable_images(pictures)
-    frames = tuple(_frame(source, images, number) for number in source.chosen.numbers)
-    used = [frame for frame in frames if frame.index not in source.chosen.held_out]
+    frames = tuple(_frame(source, images, number) for number in source.selection.numbers)
+    used = [frame for frame in frames if frame.index not in source.selection.held_out]
     sweeps, sweep_problems = _read_sweeps(labels, used)
     objects = find_objects(
         (TimedBoxes(f.index, labels.boxes(f.index), f.timestamp_ns) for f in frames),
@@ -349,9 +408,9 @@ def read_kitti(path: str, query: dict[str, str], source: Source) -> RawDrive:
         name=source.name,
         source=format_uri("kitti", path, query),
         frames=frames,
-        held_out=source.chosen.held_out,
+        held_out=source.selection.held_out,
         sweeps=sweeps,
-        boxes=objects.moving,
+        boxes=objects.moving_boxes,
         labels=labels,
         world_origin_m=source.world_origin_m,
         lidar_top_deg=_LIDAR_TOP_DEG,
@@ -360,16 +419,18 @@ def read_kitti(path: str, query: dict[str, str], source: Source) -> RawDrive:
 
 
 def kitti_labels(path: str, query: dict[str, str]) -> KittiLabels:
-    """The labels alone, in the world that `open_kitti` with this query has before recentring."""
+    """Return the labels alone, in the world that `open_kitti` with this query has before
+    recentring.
+    """
     return find_source(path, query)[0].labels
 
 
 def _read_sweeps(
     labels: KittiLabels, frames: Sequence[Frame]
 ) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
-    """The usable returns of the frames in the scene's world."""
+    """Read the usable returns of the frames in the scene's world."""
     missing = [frame.index for frame in frames if frame.index not in labels.sweeps]
-    problems = [f"{some(missing)} without a sweep"] if missing else []
+    problems = [f"{describe_frames(missing)} without a sweep"] if missing else []
     sweeps = []
     for frame in tqdm(frames, desc="LiDAR", unit="frame", disable=None):
         if frame.index not in labels.sweeps:
@@ -379,20 +440,23 @@ def _read_sweeps(
         except AdapterError as error:
             problems.append(f"frame {frame.index}: {error}")
             continue
-        finite = np.isfinite(points).all(axis=1)
-        bad = int((~finite).sum())
-        if bad:
-            problems.append(f"frame {frame.index}: left out {bad} returns that are not finite")
-        points = points[finite & ~is_in_box(points, *_EGO_M)]
+        is_finite = np.isfinite(points).all(axis=1)
+        num_not_finite = int((~is_finite).sum())
+        if num_not_finite:
+            problems.append(
+                f"frame {frame.index}: left out {num_not_finite} returns that are not finite"
+            )
+        points = points[is_finite & ~is_in_box(points, *_EGO_BOX_M)]
         pose = frame.world_from_ego.numpy()
         with np.errstate(over="ignore"):
-            world = points @ pose[:3, :3].T + pose[:3, 3]
-            sweeps.append(Sweep.of_unknown_class(world, frame.timestamp_ns))
+            world_points = points @ pose[:3, :3].T + pose[:3, 3]
+            sweeps.append(Sweep.of_unknown_class(world_points, frame.timestamp_ns))
     return tuple(sweeps), tuple(problems)
 
 
-def _frame(source: Source, images: DriveImages, number: int) -> Frame:
-    pose = recentred(source.labels.world_from_velodyne[number], source.world_origin_m)
+def _frame(source: DriveSource, images: DriveImages, number: int) -> Frame:
+    """Return a frame with all cameras of the calibration."""
+    pose = recenter_pose(source.labels.world_from_velodyne[number], source.world_origin_m)
     ego_from_world = invert_rigid(pose)
     time = source.labels.timestamps_ns[number]
     return Frame(
@@ -414,15 +478,22 @@ def _frame(source: Source, images: DriveImages, number: int) -> Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
-    """What a folder holds of the frames asked for, before images are decoded.
+class DriveSource:
+    """Contents of a folder for the selected frames, before images are decoded.
 
-    chosen: the scene's frames, all with a pose. images: names of the files by camera and frame.
-    image_times_ns: by camera and frame, where the camera has its own. labels: of all frames with
-    poses, in the dataset's world. world_origin_m: float64 [3]."""
+    Attributes:
+        name: name of the scene.
+        selection: the scene's frames, all with a pose.
+        calibration: calibration of the cameras.
+        images: names of the files by camera and frame.
+        image_times_ns: times by camera and frame, if the camera has its own.
+        labels: labels of all frames with poses, in the dataset's world.
+        world_origin_m: float64 [3], subtracted from the dataset's coordinates.
+        problems: one sentence each.
+    """
 
     name: str
-    chosen: DriveFrames
+    selection: DriveFrames
     calibration: Calibration
     images: Mapping[str, Mapping[int, str]]
     image_times_ns: Mapping[str, Mapping[int, int]]
@@ -431,20 +502,23 @@ class Source:
     problems: tuple[str, ...]
 
 
-def find_source(path: str, query: dict[str, str]) -> tuple[Source, KittiOptions]:
-    """What the URI names, and its options."""
+def find_source(path: str, query: dict[str, str]) -> tuple[DriveSource, KittiOptions]:
+    """Return the contents of the folder that the URI names, and its options."""
     root, calibration = kitti_root(path)
     is_object = is_object_folder(root)
     options = KittiOptions.from_query("kitti", query)
-    if (wrong := "poses" if is_object else "frame") in query:
-        what = "an object folder, whose frames are unrelated" if is_object else "a raw drive"
-        meaning = KittiOptions.model_fields[wrong].description
-        raise AdapterError(f"kitti: {wrong}= means nothing for {what}; it is {meaning}")
+    if (unsupported_option := "poses" if is_object else "frame") in query:
+        data_kind = "an object folder, whose frames are unrelated" if is_object else "a raw drive"
+        meaning = KittiOptions.model_fields[unsupported_option].description
+        raise AdapterError(
+            f"kitti: {unsupported_option}= means nothing for {data_kind}; it is {meaning}"
+        )
     return (_object_source if is_object else _raw_source)(root, calibration, options), options
 
 
-def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> Source:
-    sweeps = numbered(root, f"{VELODYNE}/data", (".bin",), RAW_DIGITS)
+def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> DriveSource:
+    """Return the contents of a raw drive."""
+    sweeps = list_numbered_files(root, f"{VELODYNE}/data", (".bin",), RAW_DIGITS)
     images, problems = _raw_images(root)
     numbers = sorted(set(sweeps).union(*images.values()))
     if not sweeps:
@@ -452,54 +526,63 @@ def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> 
             f"{root / VELODYNE / 'data'} holds no sweep NNNNNNNNNN.bin; a scene cannot be built "
             f"without them, unpack the drive again"
         )
-    chosen = options.select(numbers, where=f"kitti:{root}")
+    selection = options.select(numbers, where=f"kitti:{root}")
     calibration = read_raw_calibration(calibration_folder, images)
     image_times = {name: read_times(root, name) for name in images}
-    known = read_times(root, VELODYNE) or next(filter(None, image_times.values()), {})
-    times, time_problems = frame_times(root, known, numbers)
-    poses = _raw_poses(root, calibration_folder, calibration, options, numbers, chosen, sweeps)
-    located = poses.world_from_velodyne
+    known_times = read_times(root, VELODYNE) or next(filter(None, image_times.values()), {})
+    times, time_problems = frame_times(root, known_times, numbers)
+    poses = _raw_poses(root, calibration_folder, calibration, options, numbers, selection, sweeps)
+    world_from_velodyne = poses.world_from_velodyne
     tracklets = read_tracklets(root)
-    labels = KittiLabels(root, sweeps, times, located)
+    labels = KittiLabels(root, sweeps, times, world_from_velodyne)
     if tracklets is not None:
         labels = replace(labels, tracklets=tracklets)
-    missing = [number for number in chosen.numbers if number not in located]
+    missing_frames = [number for number in selection.numbers if number not in world_from_velodyne]
     problems = (
         *problems,
-        *chosen.problems,
+        *selection.problems,
         *time_problems,
         *poses.problems,
-        *((f"left out {some(missing)}: no pose is known",) if missing else ()),
+        *(
+            (f"left out {describe_frames(missing_frames)}: no pose is known",)
+            if missing_frames
+            else ()
+        ),
         *(() if tracklets is not None else (f"{root} has no {TRACKLETS}: no boxes are known",)),
     )
-    with_pose = DriveFrames(tuple(n for n in chosen.numbers if n in located), chosen.held_out)
-    if not with_pose.used:
+    frames_with_pose = DriveFrames(
+        tuple(n for n in selection.numbers if n in world_from_velodyne), selection.held_out
+    )
+    if not frames_with_pose.used:
         raise AdapterError(
-            f"{root}: no pose is known of any of {some(chosen.used)}"
+            f"{root}: no pose is known of any of {describe_frames(selection.used)}"
             + "".join(f"; {problem}" for problem in poses.problems[:3])
         )
-    return Source(
+    return DriveSource(
         root.absolute().name,
-        with_pose,
+        frames_with_pose,
         calibration,
         images,
         image_times,
         labels,
-        drive_origin(np.stack([pose[:3, 3] for _, pose in sorted(located.items())])),
+        drive_origin(np.stack([pose[:3, 3] for _, pose in sorted(world_from_velodyne.items())])),
         problems,
     )
 
 
 def _raw_images(root: Path) -> tuple[dict[str, dict[int, str]], tuple[str, ...]]:
-    """The files of the colour cameras, or else of the grey ones, by camera and frame."""
+    """Return the files of the colour cameras, or else of the grey ones, by camera and frame."""
     for cameras in (COLOUR_CAMERAS, GREY_CAMERAS):
-        found = {
-            name: numbered(root, f"{name}/data", IMAGE_SUFFIXES, RAW_DIGITS) for name in cameras
+        files_by_camera = {
+            name: list_numbered_files(root, f"{name}/data", IMAGE_SUFFIXES, RAW_DIGITS)
+            for name in cameras
         }
-        images = {name: files for name, files in found.items() if files}
+        images = {name: files for name, files in files_by_camera.items() if files}
         if images:
-            empty = [n for n in cameras if (root / n).is_dir() and n not in images]
-            return images, tuple(f"camera {n}: {root / n / 'data'} holds no image" for n in empty)
+            empty_cameras = [n for n in cameras if (root / n).is_dir() and n not in images]
+            return images, tuple(
+                f"camera {n}: {root / n / 'data'} holds no image" for n in empty_cameras
+            )
     return {}, (
         f"{root} holds no images: expected image_02/data/NNNNNNNNNN.png, or image_03/, or the grey "
         f"image_00/ or image_01/",
@@ -512,31 +595,35 @@ def _raw_poses(
     calibration: Calibration,
     options: KittiOptions,
     numbers: list[int],
-    chosen: DriveFrames,
+    selection: DriveFrames,
     sweeps: Mapping[int, str],
 ) -> Poses:
+    """Return the poses that the options ask for."""
     if options.poses == ICP:
-        return _registered(root, chosen, sweeps)
+        return _register_sweeps(root, selection, sweeps)
     if options.poses is not None:
         path = Path(options.poses).expanduser()
         return odometry_poses(path, numbers, calibration.rectified_from_velodyne)
-    oxts = numbered(root, "oxts/data", (".txt",), RAW_DIGITS)
+    oxts = list_numbered_files(root, "oxts/data", (".txt",), RAW_DIGITS)
     if oxts:
         return oxts_poses(root, oxts, read_velodyne_from_imu(calibration_folder))
-    if len(chosen.numbers) == 1:
-        return Poses({chosen.numbers[0]: np.eye(4)})
+    if len(selection.numbers) == 1:
+        return Poses({selection.numbers[0]: np.eye(4)})
     raise AdapterError(
-        f"{root} has no poses (oxts/data/NNNNNNNNNN.txt) for {some(chosen.numbers)}. Copy the "
-        f"drive's oxts/ there; or give ?poses=FILE, a line of 12 numbers a frame as of KITTI's "
-        f"odometry; or ?poses=icp, which registers the sweeps; or one frame, "
-        f"?frames={chosen.numbers[0]}:{chosen.numbers[0] + 1}, which needs none"
+        f"{root} has no poses (oxts/data/NNNNNNNNNN.txt) for {describe_frames(selection.numbers)}. "
+        f"Copy the drive's oxts/ there; or give ?poses=FILE, a line of 12 numbers a frame as of "
+        f"KITTI's odometry; or ?poses=icp, which registers the sweeps; or one frame, "
+        f"?frames={selection.numbers[0]}:{selection.numbers[0] + 1}, which needs none"
     )
 
 
-def _registered(root: Path, chosen: DriveFrames, sweeps: Mapping[int, str]) -> Poses:
+def _register_sweeps(root: Path, selection: DriveFrames, sweeps: Mapping[int, str]) -> Poses:
+    """Return poses from registering the sweeps, with a sentence for each sweep that cannot be
+    read.
+    """
     problems: list[str] = []
 
-    def read(number: int) -> np.ndarray | None:
+    def read_sweep(number: int) -> np.ndarray | None:
         if number not in sweeps:
             return None
         try:
@@ -545,14 +632,17 @@ def _registered(root: Path, chosen: DriveFrames, sweeps: Mapping[int, str]) -> P
             problems.append(f"frame {number}: {error}")
             return None
 
-    poses = registered_poses(chosen.numbers, read)
+    poses = registered_poses(selection.numbers, read_sweep)
     return Poses(poses.world_from_velodyne, (*problems, *poses.problems))
 
 
-def _object_source(root: Path, calibration_folder: Path, options: KittiOptions) -> Source:
-    sweeps = numbered(root, "velodyne", (".bin",), OBJECT_DIGITS)
-    images = {n: numbered(root, n, IMAGE_SUFFIXES, OBJECT_DIGITS) for n in OBJECT_CAMERAS}
-    number = _object_frame(root, options.frame, sorted(set(sweeps).union(*images.values())))
+def _object_source(root: Path, calibration_folder: Path, options: KittiOptions) -> DriveSource:
+    """Return the contents of an object folder for one frame."""
+    sweeps = list_numbered_files(root, "velodyne", (".bin",), OBJECT_DIGITS)
+    images = {
+        n: list_numbered_files(root, n, IMAGE_SUFFIXES, OBJECT_DIGITS) for n in OBJECT_CAMERAS
+    }
+    number = _choose_object_frame(root, options.frame, sorted(set(sweeps).union(*images.values())))
     digits = f"{number:0{OBJECT_DIGITS}d}"
     images = {name: {number: files[number]} for name, files in images.items() if number in files}
     problems = []
@@ -560,7 +650,7 @@ def _object_source(root: Path, calibration_folder: Path, options: KittiOptions) 
         problems.append(f"{root / 'velodyne' / digits}.bin does not exist")
     if not images:
         problems.append(f"{root / 'image_2' / digits}.png does not exist, nor in image_3/")
-    chosen = options.select([number], where=f"kitti:{root}, frame {number}")
+    selection = options.select([number], where=f"kitti:{root}, frame {number}")
     calibration = read_object_calibration(calibration_folder, digits, images)
     labels = KittiLabels(
         root,
@@ -570,28 +660,31 @@ def _object_source(root: Path, calibration_folder: Path, options: KittiOptions) 
         velodyne_from_rectified=np.linalg.inv(calibration.rectified_from_velodyne),
     )
     path = object_label_file(root, number)
-    problems += chosen.problems
+    problems += selection.problems
     if not path.exists():
         problems.append(f"{path} does not exist: no boxes are known")
-    elif ignored := int((read_object_lines(path)["type"] == "DontCare").sum()):
+    elif num_ignored := int((read_object_lines(path)["type"] == "DontCare").sum()):
         problems.append(
-            f"{path}: {ignored} regions marked DontCare have no 3D box; boxes are without them"
+            f"{path}: {num_ignored} regions marked DontCare have no 3D box; boxes are without them"
         )
-    return Source(digits, chosen, calibration, images, {}, labels, np.zeros(3), tuple(problems))
+    return DriveSource(
+        digits, selection, calibration, images, {}, labels, np.zeros(3), tuple(problems)
+    )
 
 
-def _object_frame(root: Path, asked: int | None, numbers: list[int]) -> int:
+def _choose_object_frame(root: Path, frame: int | None, numbers: list[int]) -> int:
+    """Return the selected frame, or the only one, of an object folder."""
     digits = [f"{n:0{OBJECT_DIGITS}d}" for n in numbers]
     examples = ", ".join(digits[:3]) + (", ..." if len(digits) > 3 else "")
     if not numbers:
         raise AdapterError(f"{root} holds neither velodyne/NNNNNN.bin nor image_2/NNNNNN.png")
-    if asked is None and len(numbers) > 1:
+    if frame is None and len(numbers) > 1:
         raise AdapterError(
             f"{root} holds {len(numbers)} unrelated frames ({examples}); a scene is one of them, "
             f"give ?frame={digits[0]}"
         )
-    if asked is not None and asked not in numbers:
+    if frame is not None and frame not in numbers:
         raise AdapterError(
-            f"{root} has no frame {asked:0{OBJECT_DIGITS}d}; it has {len(numbers)}: {examples}"
+            f"{root} has no frame {frame:0{OBJECT_DIGITS}d}; it has {len(numbers)}: {examples}"
         )
-    return numbers[0] if asked is None else asked
+    return numbers[0] if frame is None else frame

@@ -1,5 +1,7 @@
-"""The files of a KITTI folder: calibration, times, sweeps, and poses from GPS/IMU, from a file, or
-from registering the sweeps.
+"""Files of a KITTI folder: calibration, times, sweeps, and poses.
+
+Poses come from GPS/IMU, from a file, or from registering the sweeps. The caller is
+`adapters.kitti.adapter`.
 
     raw     <drive>/image_0X/data/NNNNNNNNNN.png      timestamps.txt beside data/
             <drive>/velodyne_points/data/NNNNNNNNNN.bin
@@ -8,11 +10,11 @@ from registering the sweeps.
     object  calib/NNNNNN.txt  image_2/NNNNNN.png  velodyne/NNNNNN.bin  label_2/NNNNNN.txt
 
 Images may be .jpg too. A frame's number is that of its files. A point of the Velodyne is at
-`P_rect_0X @ R_rect_00 @ [R T]` in the image of camera X: P's first three columns are its intrinsics
-K, and K^-1 times the fourth is what to add to a point of the rectified camera 0 to have it in
-camera X. The ego frame is the Velodyne's: x forward, y left, z up, its origin 1.73 m above the
-road. Times have no zone; they are read as UTC, nanoseconds since 1970. Errors are AdapterErrors
-that name the file.
+`P_rect_0X @ R_rect_00 @ [R T]` in the image of camera X. P's first three columns are the intrinsics
+K of camera X. K^-1 times the fourth column is the offset that takes a point from the rectified
+camera 0 to camera X. The ego frame is the Velodyne's: x forward, y left, z up, its origin 1.73 m
+above the road. Times have no zone; they are read as UTC, nanoseconds since 1970. Errors are
+AdapterErrors that name the file.
 """
 
 from __future__ import annotations
@@ -29,100 +31,146 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from adapters.plain_files import checked_pose, inside, parse_numbers, read_numbers, read_text
-from adapters.raw_drive import some
+from adapters.plain_files import (
+    checked_pose,
+    parse_numbers,
+    read_numbers,
+    read_text,
+    resolve_inside,
+)
+from adapters.raw_drive import describe_frames
 from augment.errors import AdapterError
 
 CAM_TO_CAM = "calib_cam_to_cam.txt"
 VELODYNE = "velodyne_points"
-COLOUR_CAMERAS, GREY_CAMERAS = ("image_02", "image_03"), ("image_00", "image_01")
+COLOUR_CAMERAS = ("image_02", "image_03")
+GREY_CAMERAS = ("image_00", "image_01")
 OBJECT_CAMERAS = ("image_2", "image_3")
-IMAGE_SUFFIXES = (".jpg", ".png")  # the later wins where a frame has both
-RAW_DIGITS, OBJECT_DIGITS = 10, 6
-_MAX_DRIVES = 3  # that a message names
-FRAME_NS = 100_000_000  # the Velodyne turns ten times a second and triggers the cameras
-_TIME = re.compile(r"(19[7-9]\d|20\d\d|21\d\d)-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
+# Endings of image files. The later one is used if a frame has both.
+IMAGE_SUFFIXES = (".jpg", ".png")
+RAW_DIGITS = 10
+OBJECT_DIGITS = 6
+# Drives that a message names.
+_MAX_LISTED_DRIVES = 3
+# Time between frames: the Velodyne turns ten times a second and triggers the cameras.
+FRAME_NS = 100_000_000
+# A time in timestamps.txt.
+_TIME_PATTERN = re.compile(r"(19[7-9]\d|20\d\d|21\d\d)-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
+# Size of a return in a sweep's file: four float32.
 _RETURN_BYTES = 16
-_MAX_BYTES = 512 * 2**20  # a turn of the sensor is 2 MB
+# Largest file of a sweep. A turn of the sensor is 2 MB.
+_MAX_BYTES = 512 * 2**20
 
+# Radius of KITTI's Mercator projection.
 EARTH_RADIUS_M = 6378137.0
-_OXTS_NUMBERS = 30
-_MAX_LATITUDE_DEG = 85.0  # Mercator's scale goes to infinity at the poles
+# Numbers in a GPS/IMU file.
+_NUM_OXTS_VALUES = 30
+# Largest absolute latitude that is accepted. Mercator's scale goes to infinity at the poles.
+_MAX_LATITUDE_DEG = 85.0
 # Rows: a z-up world's x (camera's forward), y (its left), z (its up) in a camera's axes.
 _UP_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 # Registration of sweeps is NumPy on one thread: the parallel sums of libraries for point clouds
 # change the last bits from run to run.
+
+# Edge of the voxels in which a sweep's points are averaged.
 _VOXEL_M = 0.25
-_NEAR_M, _FAR_M = 2.6, 60.0  # nearer is the recording car, further is sparse
-_NEIGHBOURS = 12
-_FLAT = 0.05  # a normal is believed where its variance is less than this of the next
-_STAGES = ((4.0, 12), (1.5, 12), (0.5, 15))  # reach of a match in metres, iterations
-_LOOSE_M = 0.2  # of a residual, in the last stage, where its weight has fallen to half
-_SETTLED = 1e-6  # metres and radians that a step still changes
+# Points nearer to the Velodyne than this are of the recording car.
+_MIN_RANGE_M = 2.6
+# Points further from the Velodyne than this are too sparse.
+_MAX_RANGE_M = 60.0
+# Points from which a normal is estimated.
+_NUM_NEIGHBOURS = 12
+# A point is on a surface if the variance along its normal is below this part of the next one.
+_MAX_FLAT_RATIO = 0.05
+# Stages of the registration: largest distance of a match in metres, number of iterations.
+_STAGES = ((4.0, 12), (1.5, 12), (0.5, 15))
+# Residual whose weight is one half in the last stage.
+_HALF_WEIGHT_RESIDUAL_M = 0.2
+# Iterations end if a step changes the pose by less than this, in metres and radians.
+_MIN_STEP_CHANGE = 1e-6
+# A sweep with fewer points on surfaces cannot be registered.
 _MIN_SURFACE_POINTS = 200
-_POOR_FITNESS = 0.5
+# Matches of lower fitness are reported.
+_MIN_GOOD_FITNESS = 0.5
 
 
 def kitti_root(path: str | Path) -> tuple[Path, Path]:
-    """The folder of a raw drive and that of its calibration (the same or the one above); or a
-    folder of the object benchmark, given itself or above its training/, and its calib/."""
+    """Return the folder of the data and the folder of its calibration.
+
+    The folder of a raw drive has its calibration inside or in the folder above. A folder of the
+    object benchmark, or the folder above its training/, has its calibration in calib/.
+    """
     root = Path(path)
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a KITTI drive or object folder")
     if (root / VELODYNE).is_dir():
-        for place in (root, root.absolute().parent):
-            if (place / CAM_TO_CAM).is_file():
-                return root, place
+        for folder in (root, root.absolute().parent):
+            if (folder / CAM_TO_CAM).is_file():
+                return root, folder
         raise AdapterError(
             f"{root} holds {VELODYNE}/ but there is no {CAM_TO_CAM} in it or in "
             f"{root.absolute().parent}; unpack the day's calibration there (KITTI's "
             f"<date>_calib.zip)"
         )
-    for place in (root, root / "training"):
-        if is_object_folder(place):
-            return place, place / "calib"
+    for folder in (root, root / "training"):
+        if is_object_folder(folder):
+            return folder, folder / "calib"
     drives = sorted(p.parent for p in root.glob(f"*/{VELODYNE}"))
     if drives:
-        rest = len(drives) - _MAX_DRIVES
-        few = ", ".join(map(str, drives[:_MAX_DRIVES])) + (f" and {rest} more" if rest > 0 else "")
-        raise AdapterError(f"{root} holds drives, it is none itself; give one: {few}")
+        num_others = len(drives) - _MAX_LISTED_DRIVES
+        drive_names = ", ".join(map(str, drives[:_MAX_LISTED_DRIVES])) + (
+            f" and {num_others} more" if num_others > 0 else ""
+        )
+        raise AdapterError(f"{root} holds drives, it is none itself; give one: {drive_names}")
     parents = root.absolute().parents[:2]
-    above = next((p for p in parents if (p / VELODYNE).is_dir() or is_object_folder(p)), None)
+    parent_root = next((p for p in parents if (p / VELODYNE).is_dir() or is_object_folder(p)), None)
     raise AdapterError(
         f"{root} is no KITTI folder: expected {VELODYNE}/ (a raw drive), or calib/ beside "
         f"velodyne/ or image_2/ (the object benchmark)"
-        + (f"; {above}, above it, is one" if above else "")
+        + (f"; {parent_root}, above it, is one" if parent_root else "")
     )
 
 
 def is_object_folder(root: Path) -> bool:
-    """Whether a folder is one of the object benchmark."""
+    """Return True if a folder is one of the object benchmark."""
     data = (root / "velodyne", root / "image_2")
     return (root / "calib").is_dir() and any(folder.is_dir() for folder in data)
 
 
-def numbered(root: Path, folder: str, suffixes: Sequence[str], digits: int) -> dict[int, str]:
-    """The files of a folder that are named by so many digits, relative to the root, by number."""
-    where = root / folder
-    if not where.is_dir():
+def list_numbered_files(
+    root: Path, folder: str, suffixes: Sequence[str], digits: int
+) -> dict[int, str]:
+    """Return the files of a folder whose names are `digits` digits, by number, relative to the
+    root.
+    """
+    directory = root / folder
+    if not directory.is_dir():
         return {}
-    found: dict[int, str] = {}
-    for name in sorted(entry.name for entry in where.iterdir()):
+    files_by_number: dict[int, str] = {}
+    for name in sorted(entry.name for entry in directory.iterdir()):
         stem, dot, ending = name.partition(".")
         if re.fullmatch(rf"[0-9]{{{digits}}}", stem) and dot + ending.lower() in suffixes:
-            found[int(stem)] = f"{folder}/{name}"
-    return found
+            files_by_number[int(stem)] = f"{folder}/{name}"
+    return files_by_number
 
 
-def file_in(root: Path, name: str) -> Path:
-    """A file of the folder, there or not, but no link that leads out of it."""
-    return inside(root, name, str(root))
+def resolve_file(root: Path, name: str) -> Path:
+    """Return the path of a file in the folder, which need not exist.
+
+    A link out of the folder raises.
+    """
+    return resolve_inside(root, name, str(root))
 
 
 class RectifiedCamera(NamedTuple):
-    """lens: fx, fy, cx, cy, pixels. camera_from_velodyne: float64 [4, 4]. size: width and height in
-    pixels where the calibration says so."""
+    """Calibration of one camera.
+
+    Attributes:
+        lens: fx, fy, cx, cy in pixels.
+        camera_from_velodyne: float64 [4, 4].
+        size: width and height in pixels. None if the calibration does not state them.
+    """
 
     lens: tuple[float, float, float, float]
     camera_from_velodyne: np.ndarray
@@ -130,8 +178,12 @@ class RectifiedCamera(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """cameras: by name. rectified_from_velodyne: float64 [4, 4], into camera 0 after
-    rectification."""
+    """Calibration of a folder.
+
+    Attributes:
+        cameras: calibration by camera.
+        rectified_from_velodyne: float64 [4, 4], into camera 0 after rectification.
+    """
 
     cameras: Mapping[str, RectifiedCamera]
     rectified_from_velodyne: np.ndarray
@@ -139,14 +191,15 @@ class Calibration(NamedTuple):
 
 @dataclass(frozen=True)
 class KeyedLines:
-    """A file of lines `key: words`; keys that nobody asks for may hold anything."""
+    """Lines `key: words` of a file. Keys that are not read may hold anything."""
 
     path: Path
     lines: dict[str, str]
 
     @staticmethod
     def read(folder: Path, name: str) -> KeyedLines:
-        path = file_in(folder, name)
+        """Read the lines of a file."""
+        path = resolve_file(folder, name)
         lines: dict[str, str] = {}
         for number, line in enumerate(read_text(path).splitlines(), start=1):
             key, colon, words = line.partition(":")
@@ -165,7 +218,7 @@ class KeyedLines:
         return KeyedLines(path, lines)
 
     def numbers(self, key: str, *shape: int) -> np.ndarray:
-        """A key's finite numbers, float64 in that shape."""
+        """Return a key's finite numbers, float64 of the given shape."""
         if key not in self.lines:
             raise AdapterError(
                 f"{self.path} has no {key!r}; it has {', '.join(self.lines) or 'nothing'}. Copy it "
@@ -174,70 +227,102 @@ class KeyedLines:
         return parse_numbers(self.lines[key], f"{self.path}: {key}", shape)
 
     def pose(self, rotation: str, translation: str | None = None) -> np.ndarray:
-        """A rigid transform from two keys, or a rotation from one, float64 [4, 4]."""
-        place = np.zeros(3) if translation is None else self.numbers(translation, 3)
+        """Return a rigid transform from two keys, or a rotation from one, float64 [4, 4]."""
+        position = np.zeros(3) if translation is None else self.numbers(translation, 3)
         keys = rotation if translation is None else f"{rotation} and {translation}"
-        matrix = np.column_stack([self.numbers(rotation, 3, 3), place])
+        matrix = np.column_stack([self.numbers(rotation, 3, 3), position])
         return checked_pose(matrix, f"{self.path}: {keys}")
 
 
 def read_raw_calibration(folder: Path, names: Iterable[str]) -> Calibration:
-    """The calibration of a day's drives. names: of the cameras, such as image_02."""
-    keyed = KeyedLines.read(folder, CAM_TO_CAM)
-    velodyne = KeyedLines.read(folder, "calib_velo_to_cam.txt").pose("R", "T")
-    rectified = keyed.pose("R_rect_00") @ velodyne
+    """Read the calibration of a day's drives.
+
+    Args:
+        folder: the folder of the calibration files.
+        names: the cameras, such as image_02.
+    """
+    calibration_lines = KeyedLines.read(folder, CAM_TO_CAM)
+    camera_from_velodyne = KeyedLines.read(folder, "calib_velo_to_cam.txt").pose("R", "T")
+    rectified_from_velodyne = calibration_lines.pose("R_rect_00") @ camera_from_velodyne
     return Calibration(
-        {n: _camera(keyed, n.replace("image", "P_rect"), rectified) for n in names}, rectified
+        {
+            n: _read_camera(
+                calibration_lines, n.replace("image", "P_rect"), rectified_from_velodyne
+            )
+            for n in names
+        },
+        rectified_from_velodyne,
     )
 
 
 def read_object_calibration(folder: Path, frame: str, names: Iterable[str]) -> Calibration:
-    """The calibration of one frame of the object benchmark. frame: its digits. names: of the
-    cameras, such as image_2."""
-    keyed = KeyedLines.read(folder, f"{frame}.txt")
-    velodyne = checked_pose(keyed.numbers("Tr_velo_to_cam", 3, 4), f"{keyed.path}: Tr_velo_to_cam")
-    rectified = keyed.pose("R0_rect") @ velodyne
+    """Read the calibration of one frame of the object benchmark.
+
+    Args:
+        folder: the folder of the calibration files.
+        frame: the digits of the frame's number.
+        names: the cameras, such as image_2.
+    """
+    calibration_lines = KeyedLines.read(folder, f"{frame}.txt")
+    camera_from_velodyne = checked_pose(
+        calibration_lines.numbers("Tr_velo_to_cam", 3, 4),
+        f"{calibration_lines.path}: Tr_velo_to_cam",
+    )
+    rectified_from_velodyne = calibration_lines.pose("R0_rect") @ camera_from_velodyne
     return Calibration(
-        {n: _camera(keyed, n.replace("image_", "P"), rectified) for n in names}, rectified
+        {
+            n: _read_camera(calibration_lines, n.replace("image_", "P"), rectified_from_velodyne)
+            for n in names
+        },
+        rectified_from_velodyne,
     )
 
 
 def read_velodyne_from_imu(folder: Path) -> np.ndarray:
-    """Where the Velodyne is to the GPS/IMU unit that drives are located by, float64 [4, 4]."""
+    """Read velodyne_from_imu, float64 [4, 4]. The GPS/IMU unit is what drives are located by."""
     return KeyedLines.read(folder, "calib_imu_to_velo.txt").pose("R", "T")
 
 
-def _camera(keyed: KeyedLines, key: str, rectified_from_velodyne: np.ndarray) -> RectifiedCamera:
-    projection = keyed.numbers(key, 3, 4)
+def _read_camera(
+    calibration_lines: KeyedLines, key: str, rectified_from_velodyne: np.ndarray
+) -> RectifiedCamera:
+    """Return the camera whose projection matrix P is stored under a key."""
+    projection = calibration_lines.numbers(key, 3, 4)
     k = projection[:, :3]
     pinhole = np.array([[k[0, 0], 0, k[0, 2]], [0, k[1, 1], k[1, 2]], [0, 0, 1]])
     if not (np.allclose(k, pinhole, atol=1e-6) and k[0, 0] > 0 and k[1, 1] > 0):
         raise AdapterError(
-            f"{keyed.path}: {key} must be a rectified pinhole: fx 0 cx . 0 fy cy . 0 0 1 . with "
-            f"fx, fy > 0; got {projection.tolist()}"
+            f"{calibration_lines.path}: {key} must be a rectified pinhole: fx 0 cx . 0 fy cy . 0 0 "
+            f"1 . with fx, fy > 0; got {projection.tolist()}"
         )
     camera_from_rectified = np.eye(4)
     camera_from_rectified[:3, 3] = np.linalg.solve(pinhole, projection[:, 3])
     lens = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
     pose = camera_from_rectified @ rectified_from_velodyne
-    return RectifiedCamera(lens, pose, _size(keyed, key.replace("P_rect", "S_rect")))
+    return RectifiedCamera(
+        lens, pose, _read_image_size(calibration_lines, key.replace("P_rect", "S_rect"))
+    )
 
 
-def _size(keyed: KeyedLines, key: str) -> tuple[int, int] | None:
-    if not key.startswith("S_rect") or key not in keyed.lines:
+def _read_image_size(calibration_lines: KeyedLines, key: str) -> tuple[int, int] | None:
+    """Return the width and height of a camera's image in the calibration, or None without them."""
+    if not key.startswith("S_rect") or key not in calibration_lines.lines:
         return None
-    width, height = keyed.numbers(key, 2)
+    width, height = calibration_lines.numbers(key, 2)
     if not (1 <= width <= 1e5 and 1 <= height <= 1e5 and width % 1 == 0 and height % 1 == 0):
         raise AdapterError(
-            f"{keyed.path}: {key} must be a width and a height in pixels; got {width:g} {height:g}"
+            f"{calibration_lines.path}: {key} must be a width and a height in pixels; got "
+            f"{width:g} {height:g}"
         )
     return int(width), int(height)
 
 
 def read_times(root: Path, folder: str) -> dict[int, int]:
-    """Nanoseconds by frame number from a folder's timestamps.txt, without the frames whose line is
-    empty; nothing without the file."""
-    path = file_in(root, f"{folder}/timestamps.txt")
+    """Read a folder's timestamps.txt: nanoseconds by frame number.
+
+    Frames whose line is empty are left out. Without the file the result is empty.
+    """
+    path = resolve_file(root, f"{folder}/timestamps.txt")
     if not path.exists():
         return {}
     times = {}
@@ -246,7 +331,7 @@ def read_times(root: Path, folder: str) -> dict[int, int]:
         if not text:
             continue
         try:
-            if not _TIME.fullmatch(text):
+            if not _TIME_PATTERN.fullmatch(text):
                 raise ValueError(text)
             times[number] = int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64))
         except ValueError:
@@ -258,16 +343,19 @@ def read_times(root: Path, folder: str) -> dict[int, int]:
 
 
 def frame_times(
-    root: Path, known: Mapping[int, int], numbers: Sequence[int]
+    root: Path, known_times: Mapping[int, int], numbers: Sequence[int]
 ) -> tuple[dict[int, int], tuple[str, ...]]:
-    """The time of every frame, and a sentence where it had to be assumed: ten frames a second from
-    the nearest frame whose time is known, or from 0 at frame 0."""
-    missing = [number for number in numbers if number not in known]
-    anchors = np.array(sorted(known) or [0])
+    """Return the time of every frame, and a sentence if times had to be assumed.
+
+    An assumed time counts ten frames a second from the nearest frame whose time is known, or from 0
+    at frame 0.
+    """
+    missing = [number for number in numbers if number not in known_times]
+    known_frames = np.array(sorted(known_times) or [0])
     times = {}
     for number in numbers:
-        anchor = int(anchors[np.abs(anchors - number).argmin()])
-        times[number] = known.get(anchor, 0) + (number - anchor) * FRAME_NS
+        known_frame = int(known_frames[np.abs(known_frames - number).argmin()])
+        times[number] = known_times.get(known_frame, 0) + (number - known_frame) * FRAME_NS
     for before, after in itertools.pairwise(numbers):
         if times[after] <= times[before]:
             raise AdapterError(
@@ -277,14 +365,19 @@ def frame_times(
             )
     if not missing:
         return times, ()
-    what = "its timestamps.txt has no times" if not known else "timestamps.txt has no line"
-    return times, (f"{root}: {what} for {some(missing)}; ten frames a second are assumed",)
+    fault = "its timestamps.txt has no times" if not known_times else "timestamps.txt has no line"
+    return times, (
+        f"{root}: {fault} for {describe_frames(missing)}; ten frames a second are assumed",
+    )
 
 
 def read_returns(root: Path, name: str) -> np.ndarray:
-    """A sweep's returns as stored, float32 [N, 4]: x y z (metres, the Velodyne's frame) and
-    reflectance. A turn takes 0.1 s; what the car's motion displaces its points by stays."""
-    path = file_in(root, name)
+    """Read a sweep's returns as stored, float32 [N, 4]: x y z and reflectance.
+
+    x y z are metres in the Velodyne's frame. A turn takes 0.1 s; the displacement of the points by
+    the car's motion during the turn is not corrected.
+    """
+    path = resolve_file(root, name)
     try:
         size = path.stat().st_size
         if size == 0 or size % _RETURN_BYTES or size > _MAX_BYTES:
@@ -298,20 +391,28 @@ def read_returns(root: Path, name: str) -> np.ndarray:
 
 
 class Poses(NamedTuple):
-    """world_from_velodyne: float64 [4, 4] by frame number, in the dataset's world, z up. problems:
-    one sentence each."""
+    """Poses of a drive's frames.
+
+    Attributes:
+        world_from_velodyne: float64 [4, 4] by frame number, in the dataset's world, z up.
+        problems: one sentence each.
+    """
 
     world_from_velodyne: Mapping[int, np.ndarray]
     problems: tuple[str, ...] = ()
 
 
 def oxts_poses(root: Path, names: Mapping[int, str], velodyne_from_imu: np.ndarray) -> Poses:
-    """Poses from the GPS/IMU files `names`, in KITTI's Mercator world: x east, y north, z the
-    altitude, metres, scaled by the cosine of the first file's latitude."""
-    packets, problems = {}, []
+    """Read the poses in the GPS/IMU files `names`, in KITTI's Mercator world.
+
+    Its x is east, y north and z the altitude, in metres, scaled by the cosine of the first file's
+    latitude.
+    """
+    packets = {}
+    problems = []
     for number, name in sorted(names.items()):
         try:
-            packets[number] = _read_packet(file_in(root, name))
+            packets[number] = _read_packet(resolve_file(root, name))
         except AdapterError as error:
             problems.append(f"frame {number} has no pose: {error}")
     if not packets:
@@ -325,21 +426,27 @@ def oxts_poses(root: Path, names: Mapping[int, str], velodyne_from_imu: np.ndarr
 def odometry_poses(
     path: Path, numbers: Sequence[int], rectified_from_velodyne: np.ndarray
 ) -> Poses:
-    """Poses from a file as of KITTI's odometry benchmark: a line of 12 numbers a frame, the rows of
-    world_from_camera for the rectified left grey camera 0, whose world is turned to z up here.
+    """Read poses from a file in the format of KITTI's odometry benchmark.
 
-    Lines are the frames in their order if there are as many, else line n (from 0) is frame n.
-    numbers: the drive's frames."""
+    Each line has 12 numbers: the rows of world_from_camera for the rectified left grey camera 0.
+    Its world is turned to z up here. If there are as many lines as frames, they are the frames in
+    their order; else line n (from 0) is frame n.
+
+    Args:
+        path: the file.
+        numbers: the drive's frames.
+        rectified_from_velodyne: float64 [4, 4].
+    """
     if not path.is_file():
         raise AdapterError(
             f"kitti: poses must be icp or a file of poses; got {str(path)!r}, and there is no file "
             f"{path.absolute()}"
         )
     lines = [line for line in read_text(path).splitlines() if line.strip()]
-    in_order = len(lines) == len(numbers)
+    is_in_order = len(lines) == len(numbers)
     poses = {}
     for row, line in enumerate(lines):
-        number = numbers[row] if in_order else row
+        number = numbers[row] if is_in_order else row
         where = f"{path}, line {row + 1}"
         world_from_rectified = checked_pose(parse_numbers(line, where, (3, 4)), where)
         poses[number] = _UP_FROM_CAMERA @ world_from_rectified @ rectified_from_velodyne
@@ -351,9 +458,12 @@ def odometry_poses(
 
 
 def _read_packet(path: Path) -> np.ndarray:
-    """The numbers of a GPS/IMU file: latitude and longitude (degrees), altitude (metres), roll,
-    pitch and yaw (radians), and 24 that are not used."""
-    values = read_numbers(path, (_OXTS_NUMBERS,))
+    """Read the 30 numbers of a GPS/IMU file.
+
+    They are latitude and longitude (degrees), altitude (metres), roll, pitch and yaw (radians), and
+    24 that are not used.
+    """
+    values = read_numbers(path, (_NUM_OXTS_VALUES,))
     latitude, longitude, altitude = values[:3]
     if abs(latitude) > _MAX_LATITUDE_DEG or abs(longitude) > 180 or abs(altitude) > 1e4:
         raise AdapterError(
@@ -364,7 +474,7 @@ def _read_packet(path: Path) -> np.ndarray:
 
 
 def _mercator_pose(packet: np.ndarray, scale: float) -> np.ndarray:
-    """world_from_imu, float64 [4, 4]."""
+    """Return world_from_imu, float64 [4, 4]."""
     latitude, longitude, altitude, roll, pitch, yaw = packet[:6]
     pose = np.eye(4)
     pose[:3, :3] = rotation_about(2, yaw) @ rotation_about(1, pitch) @ rotation_about(0, roll)
@@ -375,114 +485,158 @@ def _mercator_pose(packet: np.ndarray, scale: float) -> np.ndarray:
 
 
 def rotation_about(axis: int, angle: float) -> np.ndarray:
-    """Rotation about x, y or z (0, 1, 2), float64 [3, 3]."""
-    cos, sin = np.cos(angle), np.sin(angle)
+    """Return the rotation about x, y or z (axis 0, 1, 2), float64 [3, 3]."""
+    cos = np.cos(angle)
+    sin = np.sin(angle)
     matrix = np.eye(3)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
+    i = (axis + 1) % 3
+    j = (axis + 2) % 3
     matrix[i, i] = matrix[j, j] = cos
-    matrix[i, j], matrix[j, i] = -sin, sin
+    matrix[i, j] = -sin
+    matrix[j, i] = sin
     return matrix
 
 
 class _Surface(NamedTuple):
-    """Thinned points [N, 3] of a sweep, those of them on surfaces [M, 3], and normals [M, 3]."""
+    """Thinned points of a sweep.
+
+    Attributes:
+        points: float64 [N, 3].
+        surface_points: float64 [M, 3], the points that lie on surfaces.
+        normals: float64 [M, 3], normals of the surface points.
+    """
 
     points: np.ndarray
-    flat: np.ndarray
+    surface_points: np.ndarray
     normals: np.ndarray
 
 
 class Match(NamedTuple):
-    """before_from_after: float64 [4, 4]. fitness: part of the points with a surface within half a
-    metre. rmse_m: of their distances from it."""
+    """Registration of a sweep with the one before.
+
+    Attributes:
+        before_from_after: float64 [4, 4].
+        fitness: fraction of the points that have a surface within half a metre.
+        rmse_m: root mean square of these points' distances to the surface.
+    """
 
     before_from_after: np.ndarray
     fitness: float
     rmse_m: float
 
 
-def registered_poses(numbers: Sequence[int], read: Callable[[int], np.ndarray | None]) -> Poses:
-    """Poses of the frames with a sweep, in the Velodyne's frame of the first.
+def registered_poses(
+    numbers: Sequence[int], read_sweep: Callable[[int], np.ndarray | None]
+) -> Poses:
+    """Return poses of the frames with a sweep, in the Velodyne's frame of the first one.
 
-    read: the returns [N, 3 or more] of a frame in the Velodyne's frame, or None.
-    Each sweep is matched with the one before, starting from the motion between the two before."""
-    pose, step = np.eye(4), np.eye(4)
+    Each sweep is matched with the one before. The first guess is the motion between the two sweeps
+    before.
+
+    Args:
+        numbers: frames, ascending.
+        read_sweep: function that returns the returns [N, 3 or more] of a frame in the Velodyne's
+            frame, or None.
+    """
+    pose = np.eye(4)
+    step = np.eye(4)
     poses: dict[int, np.ndarray] = {}
     matches: dict[int, Match] = {}
-    before: _Surface | None = None
+    previous_surface: _Surface | None = None
     for number in tqdm(numbers, desc="registration", unit="sweep", disable=None):
-        returns = read(number)
+        returns = read_sweep(number)
         if returns is None:
             continue
-        after = _surface(returns[:, :3].astype(np.float64), number)
-        if before is not None:
-            match = _match(after, before, step)
+        surface = _build_surface(returns[:, :3].astype(np.float64), number)
+        if previous_surface is not None:
+            match = _register(surface, previous_surface, step)
             matches[number] = match
             step = match.before_from_after
             pose = pose @ step
         poses[number] = pose
-        before = after
+        previous_surface = surface
     if not poses:
         raise AdapterError(
             f"poses=icp: frames {numbers[0]} to {numbers[-1]} have no sweep to find poses from"
         )
-    return Poses(poses, _described(matches))
+    return Poses(poses, _registration_problems(matches))
 
 
-def _described(matches: dict[int, Match]) -> tuple[str, ...]:
+def _registration_problems(matches: dict[int, Match]) -> tuple[str, ...]:
+    """Return sentences on the quality of the registration."""
     if not matches:
         return ()
     fitness = np.mean([m.fitness for m in matches.values()])
     rmse = np.mean([m.rmse_m for m in matches.values()])
-    measured = (
+    summary = (
         f"poses are from registering {len(matches) + 1} sweeps one after the other (poses=icp): "
         f"mean fitness {fitness:.3f}, inlier RMSE {rmse:.3f} m; they drift over long drives"
     )
-    poor = [number for number, m in matches.items() if m.fitness < _POOR_FITNESS]
-    if not poor:
-        return (measured,)
+    poor_frames = [number for number, m in matches.items() if m.fitness < _MIN_GOOD_FITNESS]
+    if not poor_frames:
+        return (summary,)
     return (
-        measured,
-        f"the sweep of frame {poor[0]} and {len(poor) - 1} others hardly match the one before",
+        summary,
+        f"the sweep of frame {poor_frames[0]} and {len(poor_frames) - 1} others hardly match the "
+        f"one before",
     )
 
 
-def _match(after: _Surface, before: _Surface, guess: np.ndarray) -> Match:
-    tree = cKDTree(before.flat)
+def _register(source: _Surface, target: _Surface, guess: np.ndarray) -> Match:
+    """Register a sweep with the one before: point-to-plane ICP with robust weights, coarse to
+    fine.
+
+    Args:
+        source: the later sweep.
+        target: the earlier sweep.
+        guess: target_from_source, float64 [4, 4], to start from.
+    """
+    tree = cKDTree(target.surface_points)
     transform = guess
-    for reach_m, iterations in _STAGES:
-        loose = _LOOSE_M * reach_m / _STAGES[-1][0]
+    for max_distance_m, iterations in _STAGES:
+        half_weight_residual_m = _HALF_WEIGHT_RESIDUAL_M * max_distance_m / _STAGES[-1][0]
         for _ in range(iterations):
-            moved, index, near = _nearest(tree, after, transform, reach_m)
-            residual = _residuals(moved[near], before, index[near])
-            step = _step(moved[near], before.normals[index[near]], residual, loose)
+            moved_points, index, is_near = _find_nearest(tree, source, transform, max_distance_m)
+            residual = _residuals(moved_points[is_near], target, index[is_near])
+            step = _solve_step(
+                moved_points[is_near],
+                target.normals[index[is_near]],
+                residual,
+                half_weight_residual_m,
+            )
             transform = step @ transform
-            if np.abs(step - np.eye(4)).max() < _SETTLED:
+            if np.abs(step - np.eye(4)).max() < _MIN_STEP_CHANGE:
                 break
-    moved, index, near = _nearest(tree, after, transform, _STAGES[-1][0])
-    residual = _residuals(moved[near], before, index[near])
-    rmse = float(np.sqrt(np.mean(residual**2))) if near.any() else float("inf")
-    return Match(transform, float(near.mean()), rmse)
+    moved_points, index, is_near = _find_nearest(tree, source, transform, _STAGES[-1][0])
+    residual = _residuals(moved_points[is_near], target, index[is_near])
+    rmse = float(np.sqrt(np.mean(residual**2))) if is_near.any() else float("inf")
+    return Match(transform, float(is_near.mean()), rmse)
 
 
-def _nearest(
-    tree: cKDTree, after: _Surface, transform: np.ndarray, reach_m: float
+def _find_nearest(
+    tree: cKDTree, source: _Surface, transform: np.ndarray, max_distance_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points moved [N, 3], the nearest surface point of each [N], and whether it is in reach."""
-    moved = after.points @ transform[:3, :3].T + transform[:3, 3]
-    distance, index = tree.query(moved, distance_upper_bound=reach_m)
-    return moved, index, np.isfinite(distance)
+    """Return the moved points [N, 3], the nearest surface point of each [N], and a mask of
+    matches [N].
+    """
+    moved_points = source.points @ transform[:3, :3].T + transform[:3, 3]
+    distance, index = tree.query(moved_points, distance_upper_bound=max_distance_m)
+    return moved_points, index, np.isfinite(distance)
 
 
 def _residuals(points: np.ndarray, surface: _Surface, index: np.ndarray) -> np.ndarray:
-    return np.einsum("ij,ij->i", points - surface.flat[index], surface.normals[index])
+    """Return the signed distances of points to the planes of their surface points, metres [N]."""
+    return np.einsum("ij,ij->i", points - surface.surface_points[index], surface.normals[index])
 
 
-def _step(
-    points: np.ndarray, normals: np.ndarray, residual: np.ndarray, loose_m: float
+def _solve_step(
+    points: np.ndarray, normals: np.ndarray, residual: np.ndarray, half_weight_residual_m: float
 ) -> np.ndarray:
-    """The Gauss-Newton step as a rigid transform; far residuals, as of what moves, weigh little."""
-    weight = 1 / (1 + (residual / loose_m) ** 2)
+    """Return the Gauss-Newton step as a rigid transform, float64 [4, 4].
+
+    Large residuals, such as those of moving objects, weigh little.
+    """
+    weight = 1 / (1 + (residual / half_weight_residual_m) ** 2)
     jacobian = np.concatenate([np.cross(points, normals), normals], axis=1)  # [N, 6]
     hessian = np.einsum("n,ni,nj->ij", weight, jacobian, jacobian)
     gradient = np.einsum("n,n,ni->i", weight, residual, jacobian)
@@ -494,32 +648,36 @@ def _step(
     return step
 
 
-def _surface(points: np.ndarray, number: int) -> _Surface:
+def _build_surface(points: np.ndarray, number: int) -> _Surface:
+    """Return a sweep's thinned points and surfaces. number: its frame, for messages."""
     distance = np.linalg.norm(points, axis=1)
-    points = points[(distance > _NEAR_M) & (distance < _FAR_M)]  # False for NaN too
-    thin = _thinned(points)
-    if len(thin) >= _MIN_SURFACE_POINTS:
-        normals, flat = _normals(thin)
-        if flat.sum() >= _MIN_SURFACE_POINTS:
-            return _Surface(thin, thin[flat], normals[flat])
+    points = points[(distance > _MIN_RANGE_M) & (distance < _MAX_RANGE_M)]  # False for NaN too
+    thinned_points = _average_voxels(points)
+    if len(thinned_points) >= _MIN_SURFACE_POINTS:
+        normals, is_flat = _estimate_normals(thinned_points)
+        if is_flat.sum() >= _MIN_SURFACE_POINTS:
+            return _Surface(thinned_points, thinned_points[is_flat], normals[is_flat])
     raise AdapterError(
-        f"poses=icp: the sweep of frame {number} has too few surfaces ({len(thin)} points) to be "
-        f"registered; give poses=FILE, or frames without it"
+        f"poses=icp: the sweep of frame {number} has too few surfaces ({len(thinned_points)} "
+        f"points) to be registered; give poses=FILE, or frames without it"
     )
 
 
-def _thinned(points: np.ndarray) -> np.ndarray:
-    """The mean of the points of each voxel."""
-    x, y, z = np.floor((points + _FAR_M) / _VOXEL_M).astype(np.int64).T
-    side = int(2 * _FAR_M / _VOXEL_M) + 1
+def _average_voxels(points: np.ndarray) -> np.ndarray:
+    """Return the mean of the points of each voxel, float64 [M, 3]."""
+    x, y, z = np.floor((points + _MAX_RANGE_M) / _VOXEL_M).astype(np.int64).T
+    side = int(2 * _MAX_RANGE_M / _VOXEL_M) + 1
     _, cell, counts = np.unique((x * side + y) * side + z, return_inverse=True, return_counts=True)
     sums = [np.bincount(cell, points[:, i], len(counts)) for i in range(3)]
     return np.stack(sums, axis=1) / counts[:, None]
 
 
-def _normals(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The direction of least spread around each point [N, 3]; whether that is flat, bool [N]."""
-    _, index = cKDTree(points).query(points, _NEIGHBOURS)
-    offset = points[index] - points[index].mean(axis=1, keepdims=True)
-    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))
-    return axes[:, :, 0], variance[:, 0] < _FLAT * variance[:, 1]
+def _estimate_normals(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal of each point's neighbourhood [N, 3], and a mask of the flat ones [N].
+
+    The normal is the direction of least spread of the nearest points.
+    """
+    _, index = cKDTree(points).query(points, _NUM_NEIGHBOURS)
+    offsets = points[index] - points[index].mean(axis=1, keepdims=True)
+    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+    return axes[:, :, 0], variance[:, 0] < _MAX_FLAT_RATIO * variance[:, 1]

@@ -1,19 +1,19 @@
-"""What images show below the horizon and no LiDAR return stands for, closed with opaque splats.
+"""Opaque splats that close places below the horizon where the LiDAR has no return.
 
-A LiDAR sees neither the road beside its own car nor much of dark paint and glass, and between its
-returns splats leak. What nothing covers is the sky's, and so flat fog and a hollow in a flood. One
-recorded image after another is compared with what has been drawn so far: where light comes through
-below the horizon, a disc in the photo's colour is put
+A LiDAR sees neither the road beside its own car nor much of dark paint and glass, and splats
+between its returns leak. An uncovered place would belong to the sky, with flat fog and a hollow in
+a flood. One recorded image after another is compared with the Gaussians so far: where light comes
+through below the horizon, a disc in the photo's colour is placed
 
     behind a surface that leaks       a little further than it, of its class and object;
     into a labelled box               where the ray passes through it: paint and glass; of vehicles
                                       also where they are looked through, from roof to sill;
     on the ground                     where the surface around is ground;
-    else as far as what is around     of the surfaces nearest in place and colour, and never below
+    else as far as the surroundings   of the surfaces nearest in place and colour, and never below
                                       the ground.
 
-"Around" takes place and colour together (as a joint bilateral filter does), so that a depth ends
-where the photo has an edge.
+The surroundings combine place and colour (as a joint bilateral filter does), so that a depth ends
+where the photo has an edge. The caller is `adapters.lidar_scene.scene`.
 """
 
 from __future__ import annotations
@@ -81,12 +81,18 @@ def close_parts(
     *,
     max_gaussians: int,
 ) -> list[Gaussians]:
-    """The Gaussians of the world and of each track's object, with discs added until few pixels of
-    the images are open below the horizon.
+    """Return the Gaussians with discs added until few pixels of the images are open below the
+    horizon.
 
-    parts: the world's, then those of the tracks, in their frames. still: boxes of objects that are
-    part of the world. points: of the world, the ground among them. max_gaussians: of all parts;
-    where they come near it, discs are larger, and those far away are left out."""
+    Args:
+        parts: Gaussians of the world, then those of the tracks, in their frames.
+        tracks: moving objects.
+        still: boxes of objects that are part of the world.
+        views: recorded images.
+        points: points of the world, the ground among them.
+        max_gaussians: largest number for all parts. Near it discs are larger, and far ones are left
+            out.
+    """
     parts = list(parts)
     ground = _GroundMap.of(points)
     still_boxes = [
@@ -129,7 +135,7 @@ def close_parts(
 
 
 def _spread_views(views: Sequence[View]) -> list[View]:
-    """Those of frames _STEP_M apart, the first and the last among them."""
+    """Return the views of frames _STEP_M apart, the first and the last among them."""
     by_frame: dict[int, list[View]] = {}
     for view in views:
         by_frame.setdefault(view.frame, []).append(view)
@@ -152,8 +158,13 @@ def _spread_views(views: Sequence[View]) -> list[View]:
 
 @dataclass(frozen=True, eq=False)
 class _GroundMap:
-    """The ground in squares seen from above: of each the height, float64 [X, Y], and class, int16
-    [X, Y], of the nearest that holds ground. corner: of the first, float64 [2]."""
+    """The ground in squares seen from above.
+
+    Attributes:
+        corner: float64 [2], corner of the first square.
+        heights: float64 [X, Y], of the nearest square that holds ground.
+        semantic: int16 [X, Y], class of the same square.
+    """
 
     corner: np.ndarray
     heights: np.ndarray
@@ -161,7 +172,7 @@ class _GroundMap:
 
     @staticmethod
     def of(points: PointSet) -> _GroundMap | None:
-        """None without ground."""
+        """Return the map of points, or None without ground."""
         flat = ground_points(points) if len(points) else np.zeros(0, np.bool_)
         if not flat.any():
             return None
@@ -182,14 +193,14 @@ class _GroundMap:
         )
 
     def square(self, xy: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Indices of the squares nearest to places [..., 2]."""
+        """Return the indices of the squares nearest to places [..., 2]."""
         index = np.floor((xy - self.corner) / _SQUARE_M).astype(np.int64)
         index = np.clip(index, 0, np.array(self.heights.shape) - 1)
         return index[..., 0], index[..., 1]
 
 
 def _from_nearest(image: np.ndarray, is_known: np.ndarray) -> np.ndarray:
-    """The image [H, W] with each unknown pixel's value from the known one nearest to it."""
+    """Return the image [H, W] with each unknown pixel's value from the known one nearest to it."""
     _, labels = cv2.distanceTransformWithLabels(
         (~is_known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -201,10 +212,13 @@ def _from_nearest(image: np.ndarray, is_known: np.ndarray) -> np.ndarray:
 def _meet_ground(
     ground: _GroundMap | None, centre: np.ndarray, rays: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How often each ray [..., 3] goes from the centre to the ground, _FURTHEST_M at most, infinite
-    where no ground is met; and the class there. The height at the place that was found last is
-    taken for the next, which settles on roads. Where ground rises above the eye it may not settle,
-    and end before the lens: that is no place on the ground."""
+    """Return the multiple of each ray [..., 3] from the centre to the ground, and the class
+    there.
+
+    The multiple is infinite without ground within _FURTHEST_M. The height at the last place is
+    taken for the next iteration, which converges on roads. If the ground rises above the eye, it
+    may not converge, and may end before the lens: that is no place on the ground.
+    """
     shape = rays.shape[:-1]
     if ground is None:
         return np.full(shape, np.inf), np.zeros(shape, np.int16)
@@ -220,11 +234,17 @@ def _meet_ground(
 
 
 class _Cells(NamedTuple):
-    """A view drawn, by square cells of pixels: of each what its most open pixel has.
+    """A rendered view in square cells of pixels.
 
-    camera: whose pixels are the cells. is_open: bool [h, w], light comes through below the horizon.
-    has_surface: bool [h, w]. depth: float64 [h, w]. part, semantic: of the splat that counts most,
-    int [h, w]."""
+    Each cell has the values of its most open pixel.
+
+    Attributes:
+        camera: camera whose pixels are the cells.
+        is_open: bool [h, w], True where light comes through below the horizon.
+        has_surface: bool [h, w].
+        depth: float64 [h, w].
+        part, semantic: int [h, w], of the splat of largest weight.
+    """
 
     camera: Camera
     is_open: np.ndarray
@@ -235,8 +255,12 @@ class _Cells(NamedTuple):
 
 
 class _RenderedView(NamedTuple):
-    """A view drawn: alpha, depth [H, W], float32; part, semantic: of the splat that counts most,
-    int [H, W], at pixels with a surface."""
+    """A rendered view.
+
+    Attributes:
+        alpha, depth: float32 [H, W].
+        part, semantic: int [H, W], of the splat of largest weight, at pixels with a surface.
+    """
 
     camera: Camera
     alpha: np.ndarray
@@ -259,7 +283,7 @@ class _RenderedView(NamedTuple):
         )
 
         def blocks(image: np.ndarray) -> np.ndarray:
-            """[h, w, side_px^2]; those at the border repeat its pixels."""
+            """Return blocks of pixels [h, w, side_px^2]. Those at the border repeat its pixels."""
             beyond = ((0, rows * side_px - camera.height), (0, columns * side_px - camera.width))
             padded = np.pad(image, beyond, mode="edge")
             split = padded.reshape(rows, side_px, columns, side_px).swapaxes(1, 2)
@@ -305,8 +329,10 @@ def _draw(
 class _Photo(NamedTuple):
     """One recorded image at the size of the cells.
 
-    image: RGB uint8 [h, w, 3]; the recording car's pixels are filled from around it. still: the
-    same, with the moving objects' pixels filled too."""
+    Attributes:
+        image: RGB uint8 [h, w, 3]. The recording car's pixels are filled from around it.
+        still: the same, with the moving objects' pixels filled too.
+    """
 
     image: np.ndarray
     still: np.ndarray
@@ -317,7 +343,7 @@ class _Photo(NamedTuple):
 
 
 def _read_photo(view: View, camera: Camera, boxes: Sequence[_Box]) -> _Photo | None:
-    """The photo at about half the camera's size; None if it cannot be decoded."""
+    """Read the photo at about half the camera's size, or None if it cannot be decoded."""
     scale = camera.width / view.camera.width
     image = read_image(view.path, next(s for s in _IMAGE_SCALES if s >= scale))
     if image is None:
@@ -341,9 +367,17 @@ def _filled(image: np.ndarray, unknown: np.ndarray) -> np.ndarray:
 
 
 class _Discs(NamedTuple):
-    """New discs, M of them. part: of whom. points, rays: float64 [M, 3], world, the rays with unit
-    z in the camera; depth [M]. lies: bool [M], on the ground. semantic: int16 [M]. colours: float32
-    [M, 3]."""
+    """M new discs.
+
+    Attributes:
+        part: int [M], part that gets the disc.
+        points: float64 [M, 3], world.
+        rays: float64 [M, 3], world, with unit z in the camera.
+        depth: float64 [M].
+        lies: bool [M], True on the ground.
+        semantic: int16 [M].
+        colours: float32 [M, 3].
+    """
 
     part: np.ndarray
     points: np.ndarray
@@ -357,7 +391,10 @@ class _Discs(NamedTuple):
         return _Discs(*(column[keep] for column in self))
 
     def gaussians(self, camera: Camera, world_from_part: np.ndarray) -> Gaussians:
-        """Level on the ground, else facing the camera; as large as one of its pixels."""
+        """Return the discs as Gaussians: level on the ground, else facing the camera.
+
+        As large as a pixel.
+        """
         lengths = np.linalg.norm(self.rays, axis=1, keepdims=True)
         up = np.array([0.0, 0.0, 1.0])
         normals = np.where(self.lies[:, None], up, self.rays / lengths)
@@ -378,7 +415,9 @@ class _Discs(NamedTuple):
 def _discs(
     cells: _Cells, photo: _Photo, ground: _GroundMap | None, boxes: Sequence[_Box]
 ) -> _Discs:
-    """A disc for each open cell, and for those where a vehicle's box is seen through."""
+    """Return a disc for each open cell, and for cells that show something through a vehicle's
+    box.
+    """
     centre = cells.camera.centre.numpy()
     rays = cells.camera.ray_directions(torch.float64).numpy()
     ground_depth, ground_class = _meet_ground(ground, centre, rays)
@@ -436,10 +475,11 @@ def _discs(
 
 
 def _nearest_surfaces(cells: _Cells, image: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Flat index of the cell whose depth each hole takes, int64 [holes].
+    """Return the flat index of the cell whose depth each hole takes, int64 [holes].
 
-    The cells with a surface that are nearest to the hole in place and colour are compared; the one
-    at _FAR_QUANTILE of their depths is taken: a near object is the less likely to go on."""
+    The cells with a surface that are nearest to the hole in place and colour are compared. The one
+    at _FAR_QUANTILE of their depths is taken: a near object is the less likely to go on.
+    """
     surface_cells = np.flatnonzero(cells.has_surface & (cells.depth < _FURTHEST_M))
     if not len(surface_cells):
         return np.flatnonzero(holes)  # themselves, at no depth
@@ -455,8 +495,14 @@ def _nearest_surfaces(cells: _Cells, image: np.ndarray, holes: np.ndarray) -> np
 
 
 class _Box(NamedTuple):
-    """A labelled box. part: whose discs are its own, 0 for an object that stands. world_from_box:
-    float64 [4, 4]. size_m: [3]. semantic: its class."""
+    """A labelled box.
+
+    Attributes:
+        part: part that gets its discs, 0 for an object that stands still.
+        world_from_box: float64 [4, 4].
+        size_m: float64 [3].
+        semantic: its class.
+    """
 
     part: int
     world_from_box: np.ndarray
@@ -464,12 +510,12 @@ class _Box(NamedTuple):
     semantic: SemanticClass
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """Mask of the points [..., 3] that lie in the box grown by SKIN_M, bool [...]."""
+        """Return True for points [..., 3] in the box grown by SKIN_M, bool [...]."""
         local = (points - self.world_from_box[:3, 3]) @ self.world_from_box[:3, :3]
         return (np.abs(local) <= self.size_m / 2 + SKIN_M).all(axis=-1)
 
     def window(self, camera: Camera) -> tuple[slice, slice] | None:
-        """Rows and columns of the image that may show it; None where none does."""
+        """Return the rows and columns of the image that may show the box, or None if none does."""
         corners = _CORNERS * self.size_m @ self.world_from_box[:3, :3].T
         pose = camera.camera_from_world.numpy()
         x, y, z = ((corners + self.world_from_box[:3, 3]) @ pose[:3, :3].T + pose[:3, 3]).T
@@ -493,11 +539,13 @@ def _fill_box(
     height_m: np.ndarray,
     disc_depth: np.ndarray,
 ) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
-    """Cells that show what is in the box and have no surface of it: their window in the image,
-    which of it they are, and their depths.
+    """Return the cells that show a box without a surface: their window, a mask in it, and their
+    depths.
 
-    A vehicle has no holes: below the highest of its surface in a column of cells it goes on to the
-    sill, as far behind the box's side as the nearest of it. Of all else open cells are closed."""
+    A vehicle has no holes: below the highest of its surface in a column of cells it continues to
+    the sill, as far behind the box's side as its nearest surface. Of other objects only open cells
+    are closed.
+    """
     nothing = (slice(0, 0), slice(0, 0)), np.zeros((0, 0), np.bool_), np.zeros((0, 0))
     window = box.window(cells.camera)
     if window is None:

@@ -1,4 +1,7 @@
-"""What a LiDAR sweep says of the depth at an image's pixels, and when each return was measured."""
+"""Depth of image pixels from a LiDAR sweep, and the time of each return.
+
+The callers are `adapters.training_views` and `adapters.recording`.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,11 @@ _SAME_DRIVE_NS = 10_000_000_000
 
 
 def sweep_times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
-    """int64 [N] nanoseconds from the column timestamp_ns, or t in seconds; None without either,
-    with gaps in t, or where the times are not of the drive of frame_ns (as those from a sweep's
-    start).
+    """Return the time of each return in nanoseconds, int64 [N].
+
+    It is read from the column timestamp_ns, or t in seconds. The result is None without either,
+    with gaps in t, or if the times do not belong to the drive of frame_ns (such as times from a
+    sweep's start).
 
     Raises:
         ValueError: timestamp_ns holds anything but whole numbers or dates.
@@ -38,8 +43,11 @@ def sweep_times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
 
 
 def whole_numbers(column: np.ndarray, name: str) -> np.ndarray:
-    """A column of whole numbers, or of dates (nanoseconds since 1970), as int64; ValueError for
-    anything else, or gaps."""
+    """Return a column of whole numbers, or of dates (nanoseconds since 1970), as int64.
+
+    Raises:
+        ValueError: the column holds anything else, or gaps.
+    """
     if len(column) == 0:  # Arrow's type of an empty column may be anything
         return np.zeros(0, np.int64)
     if column.dtype.kind == "M" and not np.isnat(column).any():
@@ -61,9 +69,13 @@ def whole_numbers(column: np.ndarray, name: str) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class DepthPixels:
-    """Measured depth at M pixels of one image. pixels: int32 [M], flat indices (row W + column),
-    increasing. depth_m: float32 [M], along the optical axis. weight: float32 [M], how much
-    it is trusted."""
+    """Measured depth at M pixels of one image.
+
+    Attributes:
+        pixels: int32 [M], flat indices (row W + column), increasing.
+        depth_m: float32 [M], along the optical axis.
+        weight: float32 [M], how much each depth is trusted.
+    """
 
     pixels: np.ndarray
     depth_m: np.ndarray
@@ -74,7 +86,10 @@ class DepthPixels:
 
     @staticmethod
     def of(pixels: np.ndarray, depth_m: np.ndarray, weight: float = 1.0) -> DepthPixels:
-        """Depths of pixels in any order; of a pixel that comes several times, the nearest."""
+        """Return the depths of pixels in any order.
+
+        Of a pixel that comes several times, the nearest counts.
+        """
         return DepthPixels._at(_nearest_of_each(pixels, depth_m), pixels, depth_m, weight)
 
     @staticmethod
@@ -91,14 +106,17 @@ class DepthPixels:
         return DepthPixels(self.pixels[keep], self.depth_m[keep], self.weight[keep])
 
     def image(self, camera: Camera) -> np.ndarray:
-        """float32 [H, W], 0 where nothing is known."""
+        """Return the depths as an image, float32 [H, W], 0 where unknown."""
         out = np.zeros((camera.height, camera.width), np.float32)
         out.reshape(-1)[self.pixels] = self.depth_m
         return out
 
 
 def _nearest_of_each(pixels: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
-    """Indices of the nearest of each pixel, in order of pixels; of equal depths the first."""
+    """Return the indices of the nearest depth of each pixel, in order of pixels.
+
+    Of equal ones the first.
+    """
     order = np.lexsort((depth_m, pixels))
     first = np.ones(len(order), dtype=bool)
     first[1:] = np.diff(pixels[order]) > 0
@@ -108,9 +126,11 @@ def _nearest_of_each(pixels: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
 def project_points(
     points: np.ndarray, camera: Camera, *, near_m: float, margin_px: int = 0
 ) -> tuple[DepthPixels, np.ndarray]:
-    """The points [N, 3] beyond near_m as the camera sees them, the nearest of each pixel, none
-    within margin_px of the image's border; and their indices, int64 [M]. A pixel may show the depth
-    of something that a nearer object hides from the camera."""
+    """Project points [N, 3] beyond near_m into the camera, and return their depths and indices.
+
+    Of each pixel the nearest point is kept; none within margin_px of the image's border. A pixel
+    may show the depth of something that a nearer object hides from the camera.
+    """
     transform = camera.camera_from_world.numpy()
     local = points @ transform[:3, :3].T + transform[:3, 3]
     index = np.flatnonzero(local[:, 2] > near_m)
@@ -130,20 +150,25 @@ def project_points(
 
 @dataclass(frozen=True, eq=False)
 class FrameReturns:
-    """A frame's sweep, ready to be seen by any camera of the frame.
+    """A frame's sweep, prepared for all cameras of the frame.
 
-    points: float64 [N, 3], scene world, as the LiDAR saw them. timestamps_ns: int64 [N].
-    carried: for each actor that has any, its motion, the indices of its returns, and their places
-    in its own frame."""
+    Attributes:
+        points: float64 [N, 3], scene world, as the LiDAR saw them.
+        timestamps_ns: int64 [N].
+        carried: for each actor with returns, its motion, the indices of its returns, and their
+            places in its own frame.
+    """
 
     points: np.ndarray
     timestamps_ns: np.ndarray
     carried: tuple[tuple[Motion, np.ndarray, np.ndarray], ...]
 
     def seen_by(self, camera: Camera) -> DepthPixels:
-        """The sweep as the camera would see it: returns on a moving object are carried along its
-        track to the camera's time, and left out if it is not there then; the lowest FLOOR_M of its
-        box counts as ground."""
+        """Return the sweep as the camera would see it.
+
+        Returns on a moving object are carried along its track to the camera's time, and left out if
+        it does not exist then. The lowest FLOOR_M of its box counts as ground.
+        """
         points = self.points.copy()
         present = np.ones(len(points), dtype=bool)
         for motion, index, local in self.carried:
@@ -158,8 +183,11 @@ class FrameReturns:
 def read_returns(
     scene: Scene, frame_index: int, *, of_surfaces: bool = False
 ) -> FrameReturns | None:
-    """The frame's sweep; None without one. of_surfaces: without returns that no surface made, such
-    as mirror images, where the labels tell."""
+    """Read the frame's sweep. None without one.
+
+    of_surfaces: if True, returns that no surface made, such as mirror images, are left out, if the
+    labels tell them.
+    """
     sweep = scene.lidar(frame_index)
     if sweep is None:
         return None

@@ -1,4 +1,8 @@
-"""What the recorded images show of surfels and sky: one pass over all images of a drive."""
+"""Colours of surfels and of the sky from the recorded images, in one pass over all images of a
+drive.
+
+The caller is `adapters.lidar_scene.scene`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.lidar_scene import kernels
-from adapters.lidar_scene.kernels import SkyGatherer, parts_of
+from adapters.lidar_scene.kernels import SkyGatherer, row_slices
 from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import Surfels
 from adapters.plain_files import decode_image
@@ -38,9 +42,15 @@ _REDUCED = {
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A recorded image. used_rows: the part of its rows, from the top, that does not show the
-    recording car; own_car: its pixels, bool [h, w] at any size, where they are known. frame: for
-    messages."""
+    """A recorded image.
+
+    Attributes:
+        camera: its camera.
+        path: its file.
+        used_rows: fraction of its rows, from the top, that does not show the recording car.
+        own_car: pixels of the recording car, bool [h, w] at any size, if they are known.
+        frame: number of the frame, for messages.
+    """
 
     camera: Camera
     path: Path
@@ -49,7 +59,9 @@ class View:
     own_car: np.ndarray | None = None
 
     def shows_car(self, width: int, height: int) -> np.ndarray:
-        """The pixels of the recording car in the image at another size, bool [height, width]."""
+        """Return the pixels of the recording car in the image at another size, bool [height,
+        width].
+        """
         car_mask = np.zeros((height, width), np.bool_)
         if self.own_car is not None:
             mask = self.own_car.astype(np.uint8)
@@ -66,16 +78,26 @@ class Body:
     track: ObjectTrack | None = None
 
 
-class Seen(NamedTuple):
-    """colours: float32 [N, 3] in [0, 1]. seen: bool [N], whether any image shows the surfel."""
+class SurfelColours(NamedTuple):
+    """Colours of N surfels from the images.
+
+    Attributes:
+        colours: float32 [N, 3] in [0, 1].
+        is_observed: bool [N], True if some image shows the surfel.
+    """
 
     colours: np.ndarray
-    seen: np.ndarray
+    is_observed: np.ndarray
 
 
 class _Observations(NamedTuple):
-    """The best KEPT observations of N surfels. scores: float32 [N, KEPT], 0 where there is none.
-    colours: uint8 [N, KEPT, 3]. cameras: uint8 [N, KEPT], numbers of cameras."""
+    """Best observations of N surfels, K = NUM_OBSERVATIONS of each.
+
+    Attributes:
+        scores: float32 [N, K], 0 where there is no observation.
+        colours: uint8 [N, K, 3].
+        cameras: uint8 [N, K], numbers of the cameras.
+    """
 
     scores: np.ndarray
     colours: np.ndarray
@@ -84,18 +106,20 @@ class _Observations(NamedTuple):
 
 def observe_views(
     bodies: Sequence[Body], views: Sequence[View], sky: SkyGatherer, *, image_scale: float = 0.5
-) -> tuple[tuple[Seen, ...], tuple[str, ...]]:
-    """The colour of every body's surfels, and a sentence for each image that cannot be decoded.
+) -> tuple[tuple[SurfelColours, ...], tuple[str, ...]]:
+    """Return the colours of every body's surfels, and a sentence for each image that cannot be
+    decoded.
 
-    In each image the bodies as they stood then are drawn into a z-buffer; a surfel at its front
-    takes the image's colour there. A camera's best observations count by their median; cameras are
-    averaged with weights that fall towards the border. What nothing covers goes to the sky."""
+    In each image the bodies are drawn into a z-buffer as they stood then. A surfel at its front
+    takes the image's colour there. A camera's best observations count by their median. Cameras are
+    averaged with weights that fall towards the border. Uncovered pixels go to the sky.
+    """
     names = list(dict.fromkeys(view.camera.name for view in views))
     stores = [
         _Observations(
             np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
         )
-        for shape in ((len(body.surfels), kernels.KEPT) for body in bodies)
+        for shape in ((len(body.surfels), kernels.NUM_OBSERVATIONS) for body in bodies)
     ]
     problems: list[str] = []
     with ThreadPoolExecutor(available_cores()) as pool:
@@ -113,13 +137,13 @@ def observe_views(
                 _observe_one(bodies, stores, view, number, image, sky, pool)
     # A camera's observations by their median, cameras averaged.
     blended = (kernels.blended_colours(*store, _KEEP_SCORE, _CAMERA_POWER) for store in stores)
-    return tuple(Seen(*columns) for columns in blended), tuple(problems)
+    return tuple(SurfelColours(*columns) for columns in blended), tuple(problems)
 
 
 def read_ahead(
     pool: Executor, views: Sequence[View], image_scale: float
 ) -> Iterator[np.ndarray | None]:
-    """`read_image` of each view, decoded while what came before is worked on."""
+    """Yield `read_image` of each view. The next images are decoded meanwhile."""
     waiting: deque[Future[np.ndarray | None]] = deque()
     for view in views:
         waiting.append(pool.submit(read_image, view.path, image_scale))
@@ -130,15 +154,25 @@ def read_ahead(
 
 
 def read_image(path: Path, image_scale: float) -> np.ndarray | None:
-    """RGB uint8 [H, W, 3] at a fraction (1, 1/2, 1/4, 1/8) of its size; None if not decodable."""
+    """Read an image at a fraction (1, 1/2, 1/4, 1/8) of its size, RGB uint8 [H, W, 3].
+
+    The result is None if it cannot be decoded.
+    """
     image = decode_image(path, _REDUCED[image_scale])
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 class _Part(NamedTuple):
-    """Some surfels of a body, where it stood in one image. extent: float32 [N, 2], half axes.
-    pose: of the body in the camera's frame. moves: it is no part of the world. rows: those of the
-    body's surfels that the part holds."""
+    """Some surfels of a body, as it stood in one image.
+
+    Attributes:
+        surfels: surfels of the body.
+        store: observations of the body.
+        extent: float32 [N, 2], half axes.
+        pose: rotation and translation of the body in the camera's frame.
+        moves: True if it is no part of the world.
+        rows: rows of the body's surfels that the part holds.
+    """
 
     surfels: Surfels
     store: _Observations
@@ -157,7 +191,10 @@ def _observe_one(
     sky: SkyGatherer,
     pool: Executor,
 ) -> None:
-    """Surfels are taken in parts, by threads, which gives the same bits as in one."""
+    """Store what one image shows.
+
+    Surfels are processed in slices by threads, with the bits of one pass.
+    """
     camera = view.camera.scaled(DEPTH_WIDTH / view.camera.width)
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
@@ -176,7 +213,7 @@ def _observe_one(
         part_pose = transform[:3, :3].copy(), transform[:3, 3].copy()
         parts += [
             _Part(body.surfels, store, extent, part_pose, body.track is not None, rows)
-            for rows in parts_of(len(body.surfels))
+            for rows in row_slices(len(body.surfels))
         ]
 
     def draw(part: _Part) -> np.ndarray:
@@ -224,7 +261,10 @@ def _observe_one(
 
 
 def _pyramid(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The image halved again and again, in one array with its corners filled; rows and columns."""
+    """Return the image halved again and again, in one array with its corners filled.
+
+    Rows and columns.
+    """
     levels = np.zeros((_LEVELS, *image.shape), np.uint8)
     sizes = np.zeros((_LEVELS, 2), np.int64)
     for i in range(_LEVELS):

@@ -1,4 +1,7 @@
-"""A raw drive into Gaussians, actors and sky: the same steps for any dataset."""
+"""Gaussians, actors and sky of a raw drive: the same steps for any dataset.
+
+The caller is `adapters.raw_drive`.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +62,10 @@ _LOW_QUANTILE = 0.02  # quantile of heights that is low, yet not decided by a si
 def views_of(
     frames: Iterable[Frame], used_rows: Mapping[str, float] = MappingProxyType({})
 ) -> tuple[View, ...]:
-    """The recorded images of frames. used_rows: see View, by camera name; 1 for the others."""
+    """Return the recorded images of frames.
+
+    used_rows: fraction of usable rows by camera name, see View; 1 for other cameras.
+    """
     return tuple(
         View(frame.cameras[name], Path(path), frame.index, used_rows.get(name, 1.0))
         for frame in frames
@@ -68,7 +74,7 @@ def views_of(
 
 
 def with_own_car(views: Sequence[View]) -> tuple[View, ...]:
-    """The images with what they show of the recording car, where it moved enough to be told."""
+    """Return the images with their pixels of the recording car, if it moved enough to find them."""
     by_camera: dict[str, list[View]] = {}
     for view in views:
         by_camera.setdefault(view.camera.name, []).append(view)
@@ -92,12 +98,17 @@ def build_lidar_scene(
     added: Gaussians | None = None,
     ground: Ground | None = None,
 ) -> Scene:
-    """Accumulate a drive's returns, thin them, find surfaces, colour them from the images, and turn
-    them into Gaussians.
+    """Build a drive's scene: accumulate its returns, thin them, find surfaces, and colour them.
 
-    Surfels that no image shows take the colour of a near seen one, or are left out; so are points
-    without neighbours, and actors of which nothing is left. added: Gaussians of the background from
-    elsewhere. ground: measured unless given; where it is not found, ground_z_m is a low height."""
+    Surfels that no image shows take the colour of a near observed one, or are left out. Points
+    without neighbours are left out, and actors without Gaussians.
+
+    Args:
+        drive: the drive.
+        options: options of the opening.
+        added: Gaussians of the background from elsewhere.
+        ground: the road; measured unless given. If none is found, ground_z_m is a low height.
+    """
     path = np.stack([frame.world_from_ego[:3, 3].numpy() for frame in drive.frames])
     times_ns = np.array([frame.timestamp_ns for frame in drive.frames], np.int64)
     tracks = join_tracks(drive.boxes)
@@ -155,7 +166,7 @@ def build_lidar_scene(
 
 
 def _still_boxes(drive: RawDrive) -> list[BoxSample]:
-    """One labelled box of each object that does not move."""
+    """Return one labelled box of each object that does not move."""
     boxes: dict[str, BoxSample | None] = {sample.object_id: None for sample in drive.boxes}
     for frame in drive.used:
         for sample, _ in TimedBoxes(
@@ -167,7 +178,7 @@ def _still_boxes(drive: RawDrive) -> list[BoxSample]:
 
 
 def without_points(tracks: Sequence[ObjectTrack], scene: Scene) -> tuple[str, ...]:
-    """A sentence for the moving objects of which nothing was measured, or that no image shows."""
+    """Return a sentence on moving objects without returns, or that no image shows."""
     track_ids = {actor.track_id for actor in scene.actors}
     missing = [track.track_id for track in tracks if track.track_id not in track_ids]
     if not missing:
@@ -179,9 +190,11 @@ def without_points(tracks: Sequence[ObjectTrack], scene: Scene) -> tuple[str, ..
 
 
 def low_height(points: PointSet, path: np.ndarray) -> float | None:
-    """The lowest height under the path [P, 3] where no road was found, metres: a low quantile of
-    the returns around each position. The reach widens until there are enough to trust: what is
-    nearest is the recording car and spray."""
+    """Return the lowest height under the path [P, 3] if no road was found, metres.
+
+    It is a low quantile of the returns around each position. The reach widens until there are
+    enough returns to trust: the nearest ones are of the recording car and spray.
+    """
     widest = _REACHES_M[-1]
     low = path.min(axis=0) - widest
     high = path.max(axis=0) + widest
@@ -200,9 +213,16 @@ def low_height(points: PointSet, path: np.ndarray) -> float | None:
 def _sample_all(
     point_sets: Sequence[PointSet], paths: Sequence[np.ndarray], finest_m: float, max_points: int
 ) -> list[tuple[PointSet, np.ndarray]]:
-    """Every point set thinned and its gaps filled with one voxel size: the smallest from finest_m
-    on that gives max_points at most. point_sets: the world first. paths: the driven path in each
-    set's frame."""
+    """Thin every point set and fill its gaps with one voxel size.
+
+    The size is the smallest from finest_m on that gives max_points at most.
+
+    Args:
+        point_sets: the world first.
+        paths: the driven path in each set's frame.
+        finest_m: smallest voxel size.
+        max_points: largest number of points.
+    """
 
     levels = [
         levels_at(point_set.points, path) for point_set, path in zip(point_sets, paths, strict=True)
@@ -244,7 +264,10 @@ def _sample(
 
 
 def _path_in(track: ObjectTrack, path: np.ndarray, times_ns: np.ndarray) -> np.ndarray:
-    """The path as seen from the moving object, which decides how finely it needs to be sampled."""
+    """Return the path as seen from the moving object.
+
+    It decides how finely the object is sampled.
+    """
     present = track.motion.exists_at(times_ns)
     if not present.any():
         return np.full((1, 3), 1e3)

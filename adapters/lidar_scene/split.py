@@ -1,4 +1,7 @@
-"""Sweeps taken apart: the static world, and every moving object in its own frame."""
+"""Separation of sweeps into the static world and every moving object in its own frame.
+
+The callers are `adapters.lidar_scene.scene` and the adapters of datasets.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +34,15 @@ _FLAT = np.array(
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A track as arrays, for points carried along it, each at its own time: `Track.pose_at`,
-    compiled. knots_ns: int64 [T]. quats: float64 [T, 4] wxyz. centres: float64 [T, 3]."""
+    """A track as arrays, which carry points along it, each at its own time.
+
+    Compiled `Track.pose_at`.
+
+    Attributes:
+        knots_ns: int64 [T].
+        quats: float64 [T, 4], wxyz.
+        centres: float64 [T, 3].
+    """
 
     knots_ns: np.ndarray
     quats: np.ndarray
@@ -50,13 +60,13 @@ class Motion:
         )
 
     def exists_at(self, timestamps_ns: np.ndarray) -> np.ndarray:
-        """Mask of the times at which the actor exists, bool [N]."""
+        """Return True for times at which the actor exists, bool [N]."""
         first = self.knots_ns[0] - self.hold_ns
         last = self.knots_ns[-1] + self.hold_ns
         return (timestamps_ns >= first) & (timestamps_ns <= last)
 
     def pose_at(self, timestamp_ns: int) -> np.ndarray | None:
-        """world_from_actor, float64 [4, 4], or None where the actor does not exist."""
+        """Return world_from_actor, float64 [4, 4], or None if the actor does not exist then."""
         if not self.exists_at(np.array([timestamp_ns]))[0]:
             return None
         pose = np.eye(4)
@@ -64,16 +74,20 @@ class Motion:
         return pose
 
     def into_actor(self, points: np.ndarray, timestamps_ns: np.ndarray) -> np.ndarray:
-        """World points [N, 3], each seen at its own time, in the actor's frame; float64 [N, 3].
+        """Return world points [N, 3], each seen at its own time, in the actor's frame, float64
+        [N, 3].
 
-        Callers leave out times at which the actor does not exist."""
+        Callers leave out times at which the actor does not exist.
+        """
         out = np.empty((len(points), 3))
         _into(self.knots_ns, self.quats, self.centres, points, timestamps_ns, out)
         return out
 
     def near(self, points: np.ndarray, timestamps_ns: np.ndarray, size_m: np.ndarray) -> np.ndarray:
-        """Indices of the world points [N, 3] that could lie in the actor's box of that size, or
-        within HALO_M of it, at their own times; int64, ascending."""
+        """Return the indices of world points [N, 3] near the actor's box, int64, ascending.
+
+        These points could lie in the box of that size, or within HALO_M of it, at their own times.
+        """
         if len(points) == 0:
             return np.zeros(0, dtype=np.int64)
         low, high = self.span(int(timestamps_ns.min()), int(timestamps_ns.max()))
@@ -82,7 +96,9 @@ class Motion:
         return index[self.exists_at(timestamps_ns[index])]
 
     def span(self, first_ns: int, last_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest coordinates of the centre over a time span, two float64 [3]."""
+        """Return the lowest and highest coordinates of the centre over a time span, two float64
+        [3].
+        """
         # Every pose in the span lies between the knots just before and just after it.
         low = max(0, int(np.searchsorted(self.knots_ns, first_ns, side="right")) - 1)
         high = min(len(self.knots_ns) - 1, int(np.searchsorted(self.knots_ns, last_ns)))
@@ -91,12 +107,12 @@ class Motion:
 
 
 def inside_box(local: np.ndarray, size_m: np.ndarray, margin_m: float) -> np.ndarray:
-    """Mask of the points (in the box's frame) that lie in the box grown by margin_m, bool [N]."""
+    """Return True for points (in the box's frame) in the box grown by margin_m, bool [N]."""
     return (np.abs(local) <= size_m / 2 + margin_m).all(axis=1)
 
 
 def indices_between(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Indices of the points [N, 3] strictly inside an axis-aligned box, int64, ascending."""
+    """Return the indices of points [N, 3] strictly inside an axis-aligned box, int64, ascending."""
     # One column first: it leaves few points for the others, and this runs once a box and sweep.
     x = points[:, 0]
     index = np.flatnonzero((x > low[0]) & (x < high[0]))
@@ -119,10 +135,12 @@ class ObjectTrack:
 
 
 def join_tracks(samples: Sequence[BoxSample]) -> tuple[ObjectTrack, ...]:
-    """One track an object, siblings taken together, in order of first appearance.
+    """Return one track per object, siblings taken together, in order of first appearance.
 
-    The boxes that one frame holds of an object (one a sensor, at its own moment) become one sample
-    of mean time and pose: on a straight path that lies on it, and disagreement makes no jerks."""
+    If a frame holds several boxes of an object (one per sensor, at its own moment), they become one
+    sample of mean time and pose. On a straight path it lies on the path, and disagreement makes no
+    jerks.
+    """
     names = _unite(samples)
     groups: dict[str, list[BoxSample]] = defaultdict(list)
     for sample in samples:
@@ -131,7 +149,7 @@ def join_tracks(samples: Sequence[BoxSample]) -> tuple[ObjectTrack, ...]:
 
 
 def _unite(samples: Sequence[BoxSample]) -> dict[str, str]:
-    """Every object's name to the name of its group: that of its first box."""
+    """Return the group of every object's name: the name of the group's first box."""
     parent: dict[str, str] = {}
 
     def root(name: str) -> str:
@@ -178,7 +196,7 @@ def _mean_pose(boxes: list[BoxSample]) -> tuple[int, torch.Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class PointSet:
-    """Points of one rigid thing. points: float32 [N, 3] in its frame. semantic: int16 [N]."""
+    """Points of one rigid body. points: float32 [N, 3] in its frame. semantic: int16 [N]."""
 
     points: np.ndarray
     semantic: np.ndarray
@@ -196,15 +214,18 @@ class PointSet:
 
 
 def is_flat(semantic: np.ndarray) -> np.ndarray:
-    """Mask of the classes that are ground to drive or walk on, bool [N]."""
+    """Return True for classes that are ground to drive or walk on, bool [N]."""
     return np.isin(semantic, _FLAT)
 
 
 def split_sweeps(
     sweeps: Sequence[Sweep], tracks: Sequence[ObjectTrack]
 ) -> tuple[PointSet, tuple[PointSet, ...]]:
-    """The static world, and one set a track in the actor's frame, by the box as it stood at each
-    return's own time. Ground in a box is ground; without classes the lowest FLOOR_M is nobody's."""
+    """Return the points of the static world, and one set per track in the actor's frame.
+
+    Each return is assigned by the box as it stood at the return's own time. Ground in a box stays
+    ground; without classes the lowest FLOOR_M of a box belongs to the world.
+    """
     static: list[PointSet] = []
     actors: list[list[PointSet]] = [[] for _ in tracks]
     for sweep in sweeps:
@@ -226,7 +247,9 @@ def split_sweeps(
 
 @cached_njit()
 def _pose(knots, quats, centres, time, out):  # pragma: no cover - compiled
-    """Linear in position, slerp in rotation, held before the first and after the last knot."""
+    """Interpolate a pose: linear in position, slerp in rotation, held before the first and after
+    the last knot.
+    """
     last = len(knots) - 1
     i = min(max(np.searchsorted(knots, time, side="right") - 1, 0), max(last - 1, 0))
     f = 0.0

@@ -1,9 +1,10 @@
-"""Points to surfels: a tangent plane, and an extent along two axes of it that closes the surface.
+"""Surfels from points: a tangent plane, and an extent along two of its axes that closes the
+surface.
 
-LiDAR points lie dense along a ring and sparse across rings, so a round splat either leaves gaps or
-smears. Each point's extent is measured apart along its two tangent axes, from the nearest
-neighbours to either side. Before, accumulated points are thinned to one a voxel, finer near the
-path that was driven.
+LiDAR points are dense along a ring and sparse across rings, so a round splat either leaves gaps or
+smears. Each point's extent is therefore measured separately along its two tangent axes, from the
+nearest neighbours to either side. Before that, accumulated points are thinned to one per voxel,
+finer near the driven path. The caller is `adapters.lidar_scene.scene`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import torch
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from adapters.lidar_scene.kernels import in_parts
+from adapters.lidar_scene.kernels import for_row_slices
 from adapters.lidar_scene.split import PointSet, is_flat
 from augment.geometry import quat_from_rotmat
 from augment.render.cpu.jit import cached_njit
@@ -45,9 +46,18 @@ _MIN_THICKNESS_M = 0.005  # smallest standard deviation along the normal
 def thin_points(
     points: PointSet, path: np.ndarray, *, voxel_m: float, level: np.ndarray | None = None
 ) -> tuple[PointSet, np.ndarray]:
-    """The mean point and commonest class of every occupied voxel, and the voxels' edges in metres:
-    voxel_m within NEAR_M of the path (float [P, 3]), beyond it growing with the power GROWTH of the
-    distance. level: `levels_at` the points, where it is known."""
+    """Return the mean point and commonest class of every occupied voxel, and the voxels' edges
+    in metres.
+
+    The edge is voxel_m within NEAR_M of the path. Beyond, it grows with the power GROWTH of the
+    distance.
+
+    Args:
+        points: the points.
+        path: float [P, 3].
+        voxel_m: smallest edge.
+        level: `levels_at` the points, if it is known.
+    """
     if len(points) == 0:
         return points, np.zeros(0, np.float32)
     level = levels_at(points.points, path) if level is None else level
@@ -59,20 +69,23 @@ def thin_points(
 
 
 def levels_at(points: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """How far each position is from the path, in steps of voxels' sizes, uint8 [N]."""
+    """Return the distance of each position from the path, in steps of voxels' sizes, uint8 [N]."""
     points, path = (np.ascontiguousarray(a, np.float32) for a in (points, path))
     out = np.empty(len(points), np.uint8)
-    in_parts(lambda rows: _levels(points[rows], path, out[rows]), len(points))
+    for_row_slices(lambda rows: _levels(points[rows], path, out[rows]), len(points))
     return out
 
 
 def edges_at(points: np.ndarray, path: np.ndarray, *, voxel_m: float) -> np.ndarray:
-    """The edge that `thin_points` uses at each position, metres, float32 [N]."""
+    """Return the edge that `thin_points` uses at each position, metres, float32 [N]."""
     return _edges(voxel_m)[levels_at(points, path)].astype(np.float32)
 
 
 def coarse_sample(points: np.ndarray, cell_m: np.ndarray) -> np.ndarray:
-    """Indices of one point a cell of about the given size at it (float32 [N]); int64, ascending."""
+    """Return the indices of one point per cell, int64, ascending.
+
+    cell_m: float32 [N], approximate size of the cell at each point.
+    """
     level = np.clip(np.round(2 * np.log2(cell_m / cell_m.min())), 0, _MAX_LEVEL).astype(np.uint8)
     sizes = cell_m.min() * 2.0 ** (0.5 * np.arange(_MAX_LEVEL + 1))
     _, first = np.unique(_keys(points, level, sizes.astype(np.float64)), return_index=True)
@@ -97,9 +110,13 @@ def _levels(points, path, out):  # pragma: no cover - compiled
 
 
 def _keys(points: np.ndarray, level: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """4 bits of level, then 20 a coordinate: 20 km each way at the finest edge."""
+    """Return keys of voxels: 4 bits of level, then 20 per coordinate, 20 km each way at the
+    finest edge.
+    """
     out = np.empty(len(points), np.uint64)
-    in_parts(lambda rows: _fill_keys(points[rows], level[rows], edges, out[rows]), len(points))
+    for_row_slices(
+        lambda rows: _fill_keys(points[rows], level[rows], edges, out[rows]), len(points)
+    )
     return out
 
 
@@ -115,7 +132,7 @@ def _fill_keys(points, level, edges, out):  # pragma: no cover - compiled
 
 @cached_njit()
 def _reduce(points, semantic, keys, level, order):  # pragma: no cover - compiled
-    """Runs of equal keys to their mean, commonest class (the lower of equals) and level."""
+    """Reduce runs of equal keys to their mean, commonest class (the lower of equals) and level."""
     runs = 1
     for i in range(1, len(keys)):
         runs += keys[order[i]] != keys[order[i - 1]]
@@ -150,10 +167,15 @@ def _reduce(points, semantic, keys, level, order):  # pragma: no cover - compile
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """N discs. centres, normals, major: float32 [N, 3]; normals and major are unit and orthogonal,
-    major is the first tangent axis and normals x major the second. spacing: float32 [N, 2], metres
-    to the neighbours along the tangent axes. isolated: bool [N], too few neighbours for a surface.
-    neighbours: int [N, K], see `find_neighbours`."""
+    """N discs.
+
+    Attributes:
+        centres, normals, major: float32 [N, 3]. Normals and major are unit and orthogonal. `major`
+            is the first tangent axis, normals x major the second.
+        spacing: float32 [N, 2], metres to the neighbours along the tangent axes.
+        isolated: bool [N], True with too few neighbours for a surface.
+        neighbours: int [N, K], see `find_neighbours`.
+    """
 
     centres: np.ndarray
     normals: np.ndarray
@@ -169,25 +191,28 @@ class Surfels:
     def discs(
         centres: np.ndarray, normals: np.ndarray, major: np.ndarray, spacing_m: np.ndarray
     ) -> Surfels:
-        """Round surfels of any float type, spacing [N], without neighbours."""
+        """Return round surfels of any float type, spacing [N], without neighbours."""
         spacing = np.repeat(spacing_m[:, None], 2, axis=1)
         floats = [a.astype(np.float32) for a in (centres, normals, major, spacing)]
         count = len(centres)
         return Surfels(*floats, np.zeros(count, np.bool_), np.zeros((count, 0), np.int64))
 
     def select(self, index: np.ndarray) -> Surfels:
-        """The surfels at the given indices; neighbours still count through all."""
+        """Return the surfels at the given indices. Neighbours still count through all."""
         return Surfels(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))
 
 
 def surfels_from_points(
     points: np.ndarray, edge_m: np.ndarray, *, semantic: np.ndarray | None = None
 ) -> Surfels:
-    """A surfel for every point float32 [N, 3], thinned to the distance edge_m [N]; normals are
-    principal axes of the nearest points.
+    """Return a surfel for every point. Normals are principal axes of the nearest points.
 
-    semantic: int16 [N]: says how wide a gap may be closed, that ground has no rim, and which way a
-    lone ring faces: up on the ground, sideways on a building."""
+    Args:
+        points: float32 [N, 3].
+        edge_m: float32 [N], distance to which the points were thinned.
+        semantic: int16 [N]. It decides how wide a gap may be closed, that ground has no rim, and
+            the direction of a lone ring: up on the ground, sideways on a building.
+    """
     count = len(points)
     if count < 4:
         frame = np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
@@ -209,8 +234,11 @@ def surfels_from_points(
 
 
 def find_neighbours(points: np.ndarray, edge_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Neighbours of each point near and further away, int [N, K], and the distances of the near
-    ones, float [N, K / 2]. Points may come twice, and come first themselves."""
+    """Return near and further neighbours of each point, int [N, K], and the distances of the
+    near ones.
+
+    The distances are float [N, K / 2]. Points may come twice, and come first themselves.
+    """
     k = min(NEIGHBOURS, len(points))
     distance, near = cKDTree(points).query(points, k=k, workers=-1)
     sample = coarse_sample(points, edge_m * np.float32(_COARSE))
@@ -220,7 +248,9 @@ def find_neighbours(points: np.ndarray, edge_m: np.ndarray) -> tuple[np.ndarray,
 
 
 def _principal_axes(points: np.ndarray, index: np.ndarray, semantic: np.ndarray) -> np.ndarray:
-    """Axis of largest variance, middle one, and normal of every point, float32 [N, 3 axes, 3]."""
+    """Return the axis of largest variance, the middle one, and the normal of every point,
+    float32 [N, 3, 3].
+    """
     values, vectors = np.linalg.eigh(_covariances(points, index))
     major = vectors[:, :, 2]
     normal = vectors[:, :, 0]
@@ -257,8 +287,11 @@ def _covariances(points, index):  # pragma: no cover - compiled
 
 @cached_njit()
 def _tangent(offset, e1, n):  # pragma: no cover - compiled
-    """An offset along e1, along n x e1 and along n; and which half axis it lies nearest to:
-    e1, -e1, n x e1 or its opposite."""
+    """Return an offset along e1, along n x e1 and along n, and the number of the nearest half
+    axis.
+
+    Half axes are e1, -e1, n x e1 and its opposite.
+    """
     e2x = n[1] * e1[2] - n[2] * e1[1]
     e2y = n[2] * e1[0] - n[0] * e1[2]
     e2z = n[0] * e1[1] - n[1] * e1[0]
@@ -277,10 +310,13 @@ def _offset(points, i, j):  # pragma: no cover - compiled
 
 @cached_njit()
 def _spacing(points, index, major, normals, edge_m, widest, endless):  # pragma: no cover - compiled
-    """Mean over both sides of the gap to the nearest neighbour on the plane within 45 degrees of
-    each tangent half axis. With one side far emptier this is the surface's rim, or one of two
-    wires: it is not stretched that way. Where the surface is endless (ground) the larger gap
-    counts."""
+    """Return the mean over both sides of the gap to the nearest neighbour along each tangent
+    axis.
+
+    Neighbours count on the plane, within 45 degrees of a tangent half axis. If one side is far
+    emptier, it is the surface's rim, or one of two wires: the surfel is not stretched that way. If
+    the surface is endless (ground), the larger gap counts.
+    """
     out = np.empty((len(points), 2), np.float32)
     gaps = np.empty(4)
     for i in range(len(points)):
@@ -312,8 +348,13 @@ def _spacing(points, index, major, normals, edge_m, widest, endless):  # pragma:
 
 @dataclass(frozen=True)
 class SplatShape:
-    """sigma_per_spacing: standard deviation along a tangent axis over the spacing there; 0.4 leaves
-    a lattice visible, 0.6 blurs. opacity: high, so that a surface hides what lies behind it."""
+    """Shape of the splats.
+
+    Attributes:
+        sigma_per_spacing: standard deviation along a tangent axis over the spacing there. 0.4
+            leaves a lattice visible, 0.6 blurs.
+        opacity: high, so that a surface hides everything behind it.
+    """
 
     sigma_per_spacing: float = 0.5
     opacity: float = 0.95
@@ -322,9 +363,14 @@ class SplatShape:
 def gaussians_from_surfels(
     surfels: Surfels, colours: np.ndarray, semantic: np.ndarray, shape: SplatShape = SplatShape()
 ) -> Gaussians:
-    """Degree-0 Gaussians flattened along the surfels' normals.
+    """Return degree-0 Gaussians flattened along the surfels' normals.
 
-    colours: float32 [N, 3] in [0, 1]. semantic: int16 [N]."""
+    Args:
+        surfels: the surfels.
+        colours: float32 [N, 3] in [0, 1].
+        semantic: int16 [N].
+        shape: shape of the splats.
+    """
     second = np.cross(surfels.normals, surfels.major)
     axes = np.stack([surfels.major, second, surfels.normals], axis=2)  # columns
     sigma = np.full(len(surfels), shape.sigma_per_spacing, np.float32)
@@ -345,8 +391,10 @@ def gaussians_from_surfels(
 def borrow_colours(
     points: np.ndarray, colours: np.ndarray, has_colour: np.ndarray, reach_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The colours [N, 3], where a point without one takes that of the nearest point that has one
-    within reach_m [N]; and the mask of the points that have a colour now, bool [N]."""
+    """Return the colours [N, 3], and a mask of the points that have a colour now, bool [N].
+
+    A point without a colour takes that of the nearest point that has one within reach_m [N].
+    """
     if has_colour.all() or not has_colour.any():
         return colours, has_colour
     unseen = np.flatnonzero(~has_colour)
@@ -389,8 +437,10 @@ _STEEP = 0.35  # height over distance that ground can have from one cell to the 
 
 
 def fill_walls(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointSet:
-    """The new points only, on walls, fences and boards, or without classes on any upright surface.
-    edge_m: float32 [N], distance that the points were thinned to."""
+    """Return new points on walls, fences and boards, or without classes on any upright surface.
+
+    edge_m: float32 [N], distance to which the points were thinned.
+    """
     wall = np.isin(points.semantic, (Class.BUILDING, Class.BARRIER, Class.SIGN, Class.UNKNOWN))
     wall &= np.abs(surfels.normals[:, 2]) < _MAX_UPWARD
     wall_points = points.points[wall]
@@ -415,8 +465,13 @@ def fill_walls(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointS
 
 
 def _cuts(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cuts of the segments between pairs of points into equal pieces, pieces int64 [P] a pair: the
-    pair of each cut, int64 [M], and its place as a fraction of the segment, float32 [M, 1]."""
+    """Cut the segments between pairs of points into equal pieces.
+
+    pieces: int64 [P], pieces per pair.
+
+    Returns:
+        The pair of each cut, int64 [M], and its place as a fraction of the segment, float32 [M, 1].
+    """
     inner = np.maximum(pieces - 1, 0)
     pair = np.repeat(np.arange(len(pieces)), inner)
     step = np.arange(len(pair)) - np.repeat(np.cumsum(inner) - inner, inner) + 1
@@ -424,7 +479,7 @@ def _cuts(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _columns(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """A number for the column that each point stands in, int64 [N]."""
+    """Return a number for the column in which each point stands, int64 [N]."""
     size = np.maximum(_CELL_M, _CELL_EDGES * edges.astype(np.float64))
     level = np.round(4 * np.log2(size)).astype(np.int64) + 64
     cell = np.floor(points[:, :2] / size[:, None]).astype(np.int64) + (1 << 23)
@@ -432,7 +487,7 @@ def _columns(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def bridge_gaps(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointSet:
-    """The new points only. edge_m: float32 [N], distance that the points were thinned to."""
+    """Return new points in gaps. edge_m: float32 [N], distance to which the points were thinned."""
     widest = np.full(64, _MAX_OTHER_GAP_M, np.float32)
     for semantic, width in _MAX_GAP_M.items():
         widest[semantic] = width
@@ -455,7 +510,9 @@ def bridge_gaps(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> Point
 def _find_bridges(
     points, semantic, normals, major, index, edge_m, widest
 ):  # pragma: no cover - compiled
-    """Pairs to join: a's nearest neighbour b to one side, where a has one on the other side too."""
+    """Return pairs to join: a point's nearest neighbour to one side, if it has one on the other
+    side too.
+    """
     first = np.empty(4 * len(points), np.int64)
     second = np.empty(4 * len(points), np.int64)
     count = 0
@@ -487,8 +544,11 @@ def _find_bridges(
 
 
 def ground_points(points: PointSet) -> np.ndarray:
-    """Mask of the points that are ground, bool [N]: by class where any has one, else the lowest of
-    their square metre where its height agrees with the squares around it."""
+    """Return True for points that are ground, bool [N].
+
+    They are found by class if any point has one. Else they are the lowest of their square metre
+    where its height agrees with the squares around it.
+    """
     flat = is_flat(points.semantic)
     if flat.any() or (points.semantic != Class.UNKNOWN).any():
         return flat
@@ -496,7 +556,9 @@ def ground_points(points: PointSet) -> np.ndarray:
 
 
 def fill_ground(points: PointSet, path: np.ndarray, *, voxel_m: float) -> PointSet:
-    """New ground points only, a little sparser than `thin_points`; class of the nearest point."""
+    """Return new ground points, a little sparser than `thin_points`, with the class of the
+    nearest point.
+    """
     is_ground = ground_points(points)
     ground = points.points[is_ground]
     classes = points.semantic[is_ground]
@@ -512,8 +574,8 @@ def fill_ground(points: PointSet, path: np.ndarray, *, voxel_m: float) -> PointS
     radius = round(CLOSE_M / CELL_M)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     inside = cv2.morphologyEx(has_ground.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
-    inside |= _beside(path, origin, shape)
-    heights = _spread(heights, has_ground)
+    inside |= _is_near_path(path, origin, shape)
+    heights = _fill_holes(heights, has_ground)
     voxel_m = voxel_m * _SPARSER
     new = _candidates(heights, inside, origin, path, voxel_m)
     distance, nearest = cKDTree(ground[:, :2]).query(new[:, :2], workers=-1)
@@ -521,8 +583,8 @@ def fill_ground(points: PointSet, path: np.ndarray, *, voxel_m: float) -> PointS
     return PointSet(new[missing], classes[nearest[missing]])
 
 
-def _beside(path: np.ndarray, origin: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Cells within BESIDE_M of the path, bool [X, Y]: its car stood or drove there on something."""
+def _is_near_path(path: np.ndarray, origin: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Return the cells within BESIDE_M of the path, bool [X, Y]: its car stood or drove there."""
     cells = np.floor((path[:, :2] - origin) / CELL_M).astype(np.int64)
     cells = cells[((cells >= 0) & (cells < shape)).all(axis=1)]
     away = np.ones(shape, np.uint8)
@@ -535,7 +597,7 @@ def _beside(path: np.ndarray, origin: np.ndarray, shape: np.ndarray) -> np.ndarr
 def _height_grid(
     ground: np.ndarray, origin: np.ndarray, shape: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean height [X, Y] of every cell that holds ground, and which do."""
+    """Return the mean height [X, Y] of every cell that holds ground, and a mask of these cells."""
     cell = ((ground[:, :2] - origin) / CELL_M).astype(np.int64)
     flat = cell[:, 0] * shape[1] + cell[:, 1]
     count = np.bincount(flat, minlength=shape[0] * shape[1])
@@ -544,9 +606,12 @@ def _height_grid(
     return heights, (count > 0).reshape(shape)
 
 
-def _spread(heights: np.ndarray, has_ground: np.ndarray) -> np.ndarray:
-    """Heights for every cell: in holes the smoothest surface that joins their rim (Laplace's
-    equation, relaxed from averages over ever wider surroundings)."""
+def _fill_holes(heights: np.ndarray, has_ground: np.ndarray) -> np.ndarray:
+    """Return heights for every cell.
+
+    Holes get the smoothest surface that joins their rim (Laplace's equation, relaxed from averages
+    over ever wider surroundings).
+    """
     fixed = np.where(has_ground, heights, 0.0).astype(np.float32)
     out = fixed.copy()
     has_height = has_ground.copy()
@@ -565,7 +630,7 @@ def _spread(heights: np.ndarray, has_ground: np.ndarray) -> np.ndarray:
 def _candidates(
     heights: np.ndarray, inside: np.ndarray, origin: np.ndarray, path: np.ndarray, voxel_m: float
 ) -> np.ndarray:
-    """Points over all inside cells, as dense as the voxels are there, float32 [M, 3]."""
+    """Return points over all inside cells, as dense as the voxels are there, float32 [M, 3]."""
     cells = np.argwhere(inside)
     centres = np.column_stack([(cells + 0.5) * CELL_M + origin, heights[inside]])
     edges = edges_at(centres, path, voxel_m=voxel_m)

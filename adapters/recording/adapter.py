@@ -1,12 +1,12 @@
-"""A folder of raw data in this project's own layout as a scene: one's own recording, or what
-`climategs render` wrote.
+"""Scenes of folders of raw data in this project's own layout: recordings, or outputs of
+`climategs render`.
 
     images/<camera>/<frame>.png|jpg    required, with calibration.json
     lidar/<frame>.parquet              columns x y z (metres, world); timestamp_ns or t, semantic
-    depth/<camera>/<frame>.png         where there is no LiDAR: 16 bits, metres x 256, 0 = none
+    depth/<camera>/<frame>.png         without LiDAR: 16 bits, metres x 256, 0 = none
     labels/boxes.parquet               boxes; those that move become actors
 
-Everything is in one world, as calibration.json has it: metres, z up. docs/scenes.md has examples.
+Everything is in one world, that of calibration.json: metres, z up. docs/scenes.md has examples.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from adapters.raw_drive import (
     Sweep,
     TimedBoxes,
     class_of_air,
+    describe_frames,
     find_objects,
     is_in_box,
     names_in,
     scene_of_drive,
-    some,
     world_classes,
 )
 from adapters.recording.files import (
@@ -54,10 +54,10 @@ from adapters.recording.files import (
     Calibration,
     block_files,
     find_images,
-    inside,
     numbered_files,
     read_calibration,
     read_lidar_classes,
+    resolve_inside,
     unlisted_images,
 )
 from adapters.uri import format_uri
@@ -94,7 +94,10 @@ _TOP_DEG = (2.0, 60.0)
 
 
 class FrameBoxes(NamedTuple):
-    """Boxes of one frame. timestamps_ns: int64 [B], when each stood there; None: the frame's."""
+    """Boxes of one frame. timestamps_ns: int64 [B], when each stood there.
+
+    The result is None for the frame's time.
+    """
 
     boxes: Boxes
     timestamps_ns: np.ndarray | None
@@ -102,7 +105,7 @@ class FrameBoxes(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordingLabels:
-    """Labels of one recording, read when asked, in the recording's own world."""
+    """Labels of one recording, read on demand, in the recording's own world."""
 
     root: Path
 
@@ -149,8 +152,10 @@ class RecordingLabels:
         return np.where(is_in_air(sweep), class_of_air(meaning, {}, ""), classes)
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        """The SemanticClass of each return, or NO_SURFACE; None where the numbers are not known to
-        mean anything."""
+        """Return the SemanticClass of each return, or NO_SURFACE.
+
+        The result is None if the numbers have no known meaning.
+        """
         column = sweep.columns.get(_CLASS)
         if column is None or len(column) == 0:
             return None
@@ -159,8 +164,9 @@ class RecordingLabels:
         return None if meaning is None else world_classes(numbers, meaning)
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
-        """The columns origin_x, origin_y, origin_z, in the world of the returns, where all three
-        hold numbers."""
+        """Return the columns origin_x, origin_y, origin_z, in the world of the returns, if all
+        hold numbers.
+        """
         columns = [sweep.columns.get(f"origin_{axis}") for axis in "xyz"]
         if any(c is None or np.asarray(c).dtype.kind not in "fiu" for c in columns):
             return None
@@ -168,7 +174,7 @@ class RecordingLabels:
 
 
 def recording_labels(path: str, query: dict[str, str]) -> RecordingLabels:
-    """The labels of a folder; whatever the query, they are those of all its frames."""
+    """Return the labels of a folder. They cover all its frames, whatever the query."""
     return RecordingLabels(Path(path))
 
 
@@ -187,7 +193,7 @@ def all_boxes(root: Path) -> dict[int, FrameBoxes]:
     They are read from labels/boxes.parquet, or else from a job's blocks, each of which has all
     boxes of its frames."""
     path = root / "labels" / "boxes.parquet"
-    single_file = [inside(root, path)] if path.exists() else None
+    single_file = [resolve_inside(root, path)] if path.exists() else None
     boxes_by_frame: dict[int, FrameBoxes] = {}
     for path in single_file or block_files(root, "labels/boxes", ".parquet"):
         boxes_by_frame = read_frame_boxes(path) | boxes_by_frame
@@ -195,7 +201,7 @@ def all_boxes(root: Path) -> dict[int, FrameBoxes]:
 
 
 def read_sweep(path: Path) -> LidarSweep:
-    """The sweep in a file, every column under its own name."""
+    """Read the sweep in a file, every column under its own name."""
     with _reading(path, _LIDAR_FILE):
         if is_ours(path):
             sweep = read_lidar(path)
@@ -207,7 +213,7 @@ def read_sweep(path: Path) -> LidarSweep:
 
 
 def read_frame_boxes(path: Path) -> dict[int, FrameBoxes]:
-    """The boxes of every frame that has any."""
+    """Read the boxes of every frame that has any."""
     with _reading(path, f"a table of boxes with columns {', '.join(_REQUIRED)}"):
         state = path.stat()
         return _read_boxes(path, state.st_mtime_ns, state.st_size)
@@ -269,7 +275,7 @@ def _reading(path: Path, expected: str) -> Iterator[None]:
 
 
 def class_numbers(path: Path, column: np.ndarray) -> np.ndarray:
-    """The column `semantic` as int64 [N]. path: its file or folder, for messages."""
+    """Return the column `semantic` as int64 [N]. path: its file or folder, for messages."""
     try:
         return whole_numbers(column, "semantic")
     except ValueError as error:
@@ -298,8 +304,13 @@ def class_meanings(
 
 
 class LidarDrive(NamedTuple):
-    """sweeps: one a frame that has a file, scene world. top_deg: about the highest elevation that
-    the LiDAR looks at. problems: one sentence each."""
+    """LiDAR of a drive.
+
+    Attributes:
+        sweeps: one for each frame that has a file, scene world.
+        top_deg: approximate highest elevation that the LiDAR measures.
+        problems: one sentence each.
+    """
 
     sweeps: tuple[Sweep, ...]
     top_deg: float
@@ -307,14 +318,18 @@ class LidarDrive(NamedTuple):
 
 
 def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Frame]) -> LidarDrive:
-    """The sweeps of the given frames, without returns that are not finite, of no surface, or of the
-    recording car (ego_box_m)."""
+    """Read the sweeps of the given frames.
+
+    Returns that are not finite, of no surface, or of the recording car (ego_box_m) are left out.
+    """
     files = lidar_files(root)
     lidar_frames = [frame for frame in frames if frame.index in files]
     missing = [frame.index for frame in frames if frame.index not in files] if files else []
     problems = []
     if missing:
-        problems.append(f"lidar/: the files of {some(missing)} are missing, their points too")
+        problems.append(
+            f"lidar/: the files of {describe_frames(missing)} are missing, their points too"
+        )
     raws = []
     timeless = []
     for frame in tqdm(lidar_frames, desc="LiDAR", unit="frame", disable=None):
@@ -392,7 +407,7 @@ def _own_returns(sweeps: Sequence[Sweep], frames: Sequence[Frame]) -> list[str]:
 
 
 def _middle(frame: Frame) -> np.ndarray:
-    """The middle of a frame's cameras, float64 [3]."""
+    """Return the middle of a frame's cameras, float64 [3]."""
     return np.mean([camera.centre.numpy() for camera in frame.cameras.values()], axis=0)
 
 
@@ -449,15 +464,20 @@ _NEVER_NS = -(2**62)  # a time at which no object exists: these points belong to
 
 
 def open_recording(path: str, query: dict[str, str]) -> Scene:
-    """The scene of a recording's folder, such as `out/street-seed3/clear-000`.
+    """Open the scene of a recording's folder, such as `out/street-seed3/clear-000`.
 
-    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
-    Opening is deterministic: the same files and options give the same bits. Without LiDAR the
-    scene starts from depth images, or else from guesses; Scene.problems says which.
+    Opening is deterministic: the same files and options give the same bits. Without LiDAR the scene
+    starts from depth images, or else from guesses; Scene.problems says which.
+
+    Args:
+        path: the folder.
+        query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
 
     Raises:
-        AdapterError: a wrong option; calibration that is missing, damaged or not finite; no usable
-            image; a damaged LiDAR file or table of boxes; a file outside the folder."""
+        AdapterError: an option is wrong; calibration is missing, damaged or not finite; there is no
+            usable image; a LiDAR file or the table of boxes is damaged; a file is outside the
+            folder.
+    """
     options = DriveOptions.from_query("recording", query)
     drive, calibration = read_recording(path, query, options)
     scene = _best_scene(Path(path), drive, calibration, options)
@@ -486,7 +506,7 @@ def read_recording(
         frames=frames,
         held_out=chosen.held_out,
         sweeps=lidar.sweeps,
-        boxes=objects.moving,
+        boxes=objects.moving_boxes,
         labels=RecordingLabels(root),
         world_origin_m=calibration.world_origin_m,
         lidar_top_deg=lidar.top_deg,
@@ -503,7 +523,7 @@ def read_recording(
 
 
 def read_objects(root: Path, frames: Sequence[Frame], origin: np.ndarray) -> RecordedObjects:
-    """The objects that the frames have boxes of, in the scene's world."""
+    """Read the objects in the boxes of the frames, in the scene's world."""
     boxes = all_boxes(root)
     timed = (
         TimedBoxes(f.index, frame_boxes.boxes, f.timestamp_ns if times is None else times)
@@ -517,7 +537,7 @@ def read_objects(root: Path, frames: Sequence[Frame], origin: np.ndarray) -> Rec
 def _best_scene(
     root: Path, drive: RawDrive, calibration: Calibration, options: DriveOptions
 ) -> Scene:
-    """The scene from LiDAR, else from depth images, else from guesses."""
+    """Return the scene from LiDAR, else from depth images, else from guesses."""
     count = sum(map(len, drive.sweeps))
     if count >= _MIN_RETURNS or not any(frame.image_paths for frame in drive.used):
         return scene_of_drive(drive, options)
@@ -545,7 +565,7 @@ def _best_scene(
     objects = read_objects(root, drive.frames, drive.world_origin_m)
     guessed_drive = dataclasses.replace(
         drive,
-        sweeps=guess_surfaces(road, objects.moving, objects.still),
+        sweeps=guess_surfaces(road, objects.moving_boxes, objects.static_boxes),
         lidar_top_deg=_SKY_ABOVE_DEG,
         problems=(*drive.problems, *problems, start),
     )
@@ -555,8 +575,11 @@ def _best_scene(
 
 
 def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
-    """One sweep for each depth image of the frames' cameras, and a sentence for each image that
-    cannot be used. Each point has its camera's time."""
+    """Return one sweep per depth image of the frames' cameras, and a sentence for each unusable
+    image.
+
+    Each point has its camera's time.
+    """
     sweeps = []
     problems = []
     names = dict.fromkeys(name for frame in frames for name in frame.cameras)
@@ -582,8 +605,11 @@ def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...]
 
 
 def back_project(depth_m: np.ndarray, camera: Camera) -> Sweep:
-    """Points of a depth image [H, W], about _POINTS_PER_IMAGE at most, on a regular grid of pixels;
-    none without depth, far away, or on edges between near and far."""
+    """Return points of a depth image [H, W], about _POINTS_PER_IMAGE at most, on a regular grid
+    of pixels.
+
+    Pixels without depth, far away, or on edges between near and far give no point.
+    """
     inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, 1e-3), 0).astype(np.float32)
     usable = (depth_m > 0) & (depth_m < _MAX_DEPTH_M)
     usable[1:-1] &= _is_straight(inverse[:-2], inverse[1:-1], inverse[2:])
@@ -606,7 +632,7 @@ def _is_straight(before: np.ndarray, middle: np.ndarray, after: np.ndarray) -> n
 
 
 def ground_heights(frames: Sequence[Frame], ego_above_ground_m: float) -> np.ndarray:
-    """Points of the road under the ego origins, float64 [F, 3]."""
+    """Return points of the road under the ego origins, float64 [F, 3]."""
     poses = np.stack([frame.world_from_ego.numpy() for frame in frames])
     return poses[:, :3, 3] - ego_above_ground_m * poses[:, :3, 2]
 
@@ -627,8 +653,10 @@ def check_cameras_above(path: Path, frames: Sequence[Frame], road: np.ndarray) -
 def guess_surfaces(
     road: np.ndarray, moving: Sequence[BoxSample], still: Sequence[BoxSample]
 ) -> tuple[Sweep, ...]:
-    """Points on the ground around the path (road: float64 [F, 3], the nearest pose's height counts)
-    and on the sides and tops of all boxes."""
+    """Return points on the ground around the path, and on the sides and tops of all boxes.
+
+    road: float64 [F, 3]; the nearest pose's height counts.
+    """
     box_of_object = {box.object_id: box for box in reversed(moving)}
     point_sets = [(_ground(road), _NEVER_NS)]
     point_sets += [(_box_surface(box), _NEVER_NS) for box in still]
@@ -637,8 +665,11 @@ def guess_surfaces(
 
 
 def guess_shells(views: Sequence[View], road: np.ndarray, count: int) -> Gaussians:
-    """About `count` Gaussians at the distances _SHELLS_M along rays of the images, neighbours at
-    different ones; none where the car drove, under the ground, or without an image."""
+    """Return about `count` Gaussians at the distances _SHELLS_M along rays of the images.
+
+    Neighbours are at different distances. There are none where the car drove, under the ground, or
+    without an image.
+    """
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _MAX_VIEWS).astype(int))]
     tree = cKDTree(road[:, :2])
     parts = []
@@ -666,7 +697,7 @@ def _ground(road: np.ndarray) -> np.ndarray:
 
 
 def _box_surface(box: BoxSample) -> np.ndarray:
-    """A grid on the five faces of a box that can be seen from the street, world, [N, 3]."""
+    """Return a grid on the five faces of a box that can be seen from the street, world, [N, 3]."""
     half = box.size_m / 2
     faces = []
     for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1), (2, 1)):
@@ -689,7 +720,9 @@ def _box_surface(box: BoxSample) -> np.ndarray:
 def _shell_points(
     camera: Camera, image: np.ndarray, number: int, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points, unit directions back to the camera, spacings (metres) and colours of one image."""
+    """Return points, unit directions back to the camera, spacings (metres) and colours of one
+    image.
+    """
     columns = max(1, round((count * camera.width / camera.height) ** 0.5))
     rows = max(1, round(count / columns))
     colours = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)

@@ -35,7 +35,7 @@ import numpy as np
 import torch
 from pydantic import AfterValidator, BaseModel, Field
 
-from adapters.plain_files import Number, read_json, validated
+from adapters.plain_files import Number, read_json, validate_content
 from adapters.raw_drive import NO_SURFACE, Picture, drive_origin, usable_images
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError, SceneError
@@ -52,7 +52,10 @@ _RIGID = 1e-4  # rotations written with six digits are off by a few millionths
 
 
 def numbered_files(root: Path, folder: str, suffixes: Sequence[str]) -> dict[int, Path]:
-    """The files of a folder that are named by a number, by that number; none without the folder."""
+    """Return the files of a folder that are named by a number, by that number.
+
+    It is empty without the folder.
+    """
     where = root / folder
     if not where.is_dir():
         return {}
@@ -65,16 +68,18 @@ def numbered_files(root: Path, folder: str, suffixes: Sequence[str]) -> dict[int
             raise AdapterError(
                 f"{paths[number]} and {path} are both of frame {number}; delete one of them"
             )
-        paths[number] = inside(root, path)
+        paths[number] = resolve_inside(root, path)
     return paths
 
 
 def block_files(root: Path, folder: str, suffix: str) -> list[Path]:
-    """The files of a folder by blocks of frames, as a `generate` job writes them, in order."""
-    return [inside(root, path) for path in sorted((root / folder).glob(f"*{suffix}"))]
+    """Return the files of a folder by blocks of frames, as a `generate` job writes them, in
+    order.
+    """
+    return [resolve_inside(root, path) for path in sorted((root / folder).glob(f"*{suffix}"))]
 
 
-def inside(root: Path, path: Path) -> Path:
+def resolve_inside(root: Path, path: Path) -> Path:
     """Return the path; raise AdapterError where a link in it leads out of `root`.
 
     A folder from elsewhere must not make this machine read its other files."""
@@ -89,8 +94,10 @@ def inside(root: Path, path: Path) -> Path:
 
 
 def find_images(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
-    """The frames with the paths of their usable images, and a sentence for what is missing,
-    damaged, or not of the size that the calibration says."""
+    """Return the frames with the paths of their usable images, and sentences on other images.
+
+    These are missing, damaged, or of another size than the calibration's.
+    """
     names = list(dict.fromkeys(name for frame in frames for name in frame.cameras))
     files = {n: numbered_files(root, f"images/{folder_name(n)}", IMAGE_SUFFIXES) for n in names}
     problems = [
@@ -112,8 +119,11 @@ def find_images(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Frame, ...],
 
 
 def unlisted_images(root: Path, frames: Sequence[Frame]) -> tuple[str, ...]:
-    """A sentence for each folder of images that no camera of the calibration has, and for each
-    camera with images of frames that the calibration does not list for it."""
+    """Return sentences on images that the calibration does not list.
+
+    There is one for each folder of images that belongs to no camera of the calibration, and one for
+    each camera with images of frames that are not listed for it.
+    """
     if not (root / "images").is_dir():
         return ()
     names = dict.fromkeys(name for frame in frames for name in frame.cameras)
@@ -143,7 +153,7 @@ _Pixels = Annotated[int, Field(strict=True, ge=1, le=MAX_SIDE_PX)]
 
 
 def _rigid(rows: tuple[_Row, _Row, _Row, _Row]) -> torch.Tensor:
-    """float64 [4, 4]."""
+    """Return a rigid transform, float64 [4, 4]."""
     matrix = np.array(rows, np.float64)
     rotation = matrix[:3, :3].clip(-2, 2)  # larger entries are wrong anyway, and would overflow
     error = max(
@@ -183,7 +193,7 @@ _Pose = Annotated[tuple[_Row, _Row, _Row, _Row], AfterValidator(_rigid)]
 
 
 class _CameraEntry(BaseModel):
-    """One camera in one frame of calibration.json. timestamp_ns: the frame's where it is None."""
+    """One camera in one frame of calibration.json. timestamp_ns: None for the frame's time."""
 
     width: _Pixels
     height: _Pixels
@@ -203,7 +213,7 @@ class _FrameEntry(BaseModel):
 
 
 class _Settings(BaseModel):
-    """All of a calibration but the frames themselves."""
+    """All of a calibration except the frames."""
 
     frames: Annotated[list[Any], Field(min_length=1)]
     has_metric_scale: Any = True
@@ -216,9 +226,12 @@ class _Settings(BaseModel):
 class Calibration:
     """A recording's cameras over time, in the scene's world: the file's minus world_origin_m.
 
-    frames: in order of number and time, without image paths. lidar_classes: SemanticClass, or
-    NO_SURFACE, by the LiDAR's own number; None where numbers are those of SemanticClass. ego_box_m:
-    float64 [2, 3] or None."""
+    Attributes:
+        frames: in order of number and time, without image paths.
+        lidar_classes: SemanticClass, or NO_SURFACE, by the LiDAR's own number. None if the numbers
+            are those of SemanticClass.
+        ego_box_m: float64 [2, 3], or None.
+    """
 
     name: str
     frames: tuple[Frame, ...]
@@ -230,9 +243,9 @@ class Calibration:
 
 
 def read_calibration(root: Path) -> Calibration:
-    """The calibration of the recording in a folder."""
+    """Read the calibration of the recording in a folder."""
     path, content = _content(root)
-    settings = validated(_Settings, content, str(path), hint=_HINT)
+    settings = validate_content(_Settings, content, str(path), hint=_HINT)
     frames = sorted((_frame(path, entry) for entry in settings.frames), key=lambda f: f.index)
     for before, after in itertools.pairwise(frames):
         if after.index == before.index:
@@ -256,13 +269,13 @@ def read_calibration(root: Path) -> Calibration:
 
 
 def read_lidar_classes(root: Path) -> Mapping[int, int] | None:
-    """The calibration's lidar_classes alone."""
+    """Read the calibration's lidar_classes alone."""
     path, content = _content(root)
-    return validated(_Settings, content, str(path), hint=_HINT).lidar_classes
+    return validate_content(_Settings, content, str(path), hint=_HINT).lidar_classes
 
 
 def _content(root: Path) -> tuple[Path, dict[str, Any]]:
-    """The calibration's file, or the folder of a job's blocks, and what it holds."""
+    """Return the calibration's file, or the folder of a job's blocks, and its content."""
     path = root / CALIBRATION
     blocks = [] if path.exists() else block_files(root, "calibration", ".json")
     if not blocks:
@@ -296,11 +309,11 @@ def _content(root: Path) -> tuple[Path, dict[str, Any]]:
 def _frame(path: Path, content: Any) -> Frame:
     number = content.get("frame") if isinstance(content, dict) else None
     where = f"{path}, frame {number!r:.20}"
-    entry = validated(_FrameEntry, content, where, hint=_HINT)
+    entry = validate_content(_FrameEntry, content, where, hint=_HINT)
     cameras = {}
     for name, values in entry.cameras.items():
         camera_where = f"{where}, camera {name!r:.80}"
-        camera = validated(_CameraEntry, values, camera_where, hint=_HINT)
+        camera = validate_content(_CameraEntry, values, camera_where, hint=_HINT)
         lens = camera.model_dump(exclude={"world_from_camera", "timestamp_ns"})
         pose = invert_rigid(camera.world_from_camera)
         time = entry.timestamp_ns if camera.timestamp_ns is None else camera.timestamp_ns

@@ -1,9 +1,10 @@
-"""A COLMAP reconstruction of a video as a recording: undistorted images, poses in metres with z up,
-and depth between the points that were found.
+"""A recording from a COLMAP reconstruction of a video.
 
-COLMAP knows neither metres nor which way is up. Both come from the road: the plane under the
-cameras that most of the low points lie on is taken for level, and a camera's height above it, or
-GPS, says how long a unit is. Without moving boxes all that moves by itself is part of the street.
+`record_colmap` writes undistorted images, poses in metres with z up, and depth between the
+reconstructed points. COLMAP knows neither metres nor up. Both come from the road: the plane under
+the cameras on which most of the low points lie is taken as level; a camera's height above it, or
+GPS, gives the length of a unit. Without moving boxes everything that moves by itself is part of the
+street.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from scipy.interpolate import LinearNDInterpolator
 from tqdm import tqdm
 
 from adapters.camera_files.camera_files import find_colmap_model, open_colmap_model
-from adapters.plain_files import LARGEST, decode_image, inside, read_text
+from adapters.plain_files import LARGEST, decode_image, read_text, resolve_inside
 from adapters.recording.files import CALIBRATION, IMAGE_SUFFIXES
 from adapters.world import invert_pose
 from augment.errors import AdapterError
@@ -56,9 +57,14 @@ _MIN_PATH_M = 5.0  # GPS is wrong by metres
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """An image with a pose. name: in the model, which is its path below the images' folder. lens:
-    pycolmap's camera. model_from_camera: float64 [4, 4]. points: float64 [N, 3], those that it
-    shows, in the model's world."""
+    """An image with a pose.
+
+    Attributes:
+        name: in the model, which is its path below the images' folder.
+        lens: pycolmap's camera.
+        model_from_camera: float64 [4, 4].
+        points: float64 [N, 3], points that the image shows, in the model's world.
+    """
 
     name: str
     camera: str
@@ -69,9 +75,15 @@ class Shot:
 
 
 class Road(NamedTuple):
-    """The plane normal @ p + offset = 0 under the cameras, its unit normal upwards, in the model's
-    world. height: the cameras' median one above it, in the model's unit. points: how many lie on
-    it; residual: their median distance from it over the height."""
+    """The plane normal @ p + offset = 0 under the cameras, in the model's world.
+
+    Attributes:
+        normal: unit vector upwards.
+        offset: see the equation.
+        height: median height of the cameras above the plane, in the model's unit.
+        points: number of points on it.
+        residual: their median distance from it, over the height.
+    """
 
     normal: np.ndarray
     offset: float
@@ -83,9 +95,13 @@ class Road(NamedTuple):
 class Recorded(NamedTuple):
     """Summary of a recording that `record_colmap` wrote.
 
-    frames, images: how many it has. left_out: how many images of the folder have no pose. metres:
-    length of the model's unit, None where that is not known. residual_m: median distance of the
-    cameras from their given positions, None without positions."""
+    Attributes:
+        frames, images: their numbers.
+        left_out: number of the folder's images without a pose.
+        metres: length of the model's unit. None if it is not known.
+        residual_m: median distance of the cameras from their given positions. None without
+            positions.
+    """
 
     frames: int
     images: int
@@ -104,22 +120,29 @@ def record_colmap(
     camera_height_m: float | None = None,
     positions: Path | None = None,
 ) -> Recorded:
-    """Writes the recording of a COLMAP model to the folder `out`.
+    """Write the recording of a COLMAP model to the folder `out`.
 
-    images: the folder of its images; one in a subfolder is of a camera of that name. An image's
-    last digits are its frame, taken at frame / fps seconds. camera_height_m: of the cameras' middle
-    above the road. positions: a table of where images were taken, see `read_positions`; it also
-    says which way is north.
+    Args:
+        model: folder of the model.
+        images: folder of its images. An image in a subfolder is of a camera of that name. An
+            image's last digits are its frame.
+        out: folder of the recording.
+        fps: frames per second; an image is taken at frame / fps seconds.
+        camera_height_m: height of the cameras' middle above the road.
+        positions: table of the places where images were taken, see `read_positions`. It also gives
+            the north.
 
     Raises:
-        AdapterError: no model or images; no road under the cameras; positions that say nothing."""
+        AdapterError: there is no model, image or road under the cameras, or the positions tell
+            nothing.
+    """
     if out.exists() and any(out.iterdir()):
         raise AdapterError(f"{out} is not empty; give a new folder")
     shots = read_shots(model)
     road = find_road(shots)
     _check_path(shots, road, model)
     metres = None if camera_height_m is None else camera_height_m / road.height
-    world_from_model = _levelled(shots[0], road)
+    world_from_model = _level_pose(shots[0], road)
     residual_m = None
     if positions is not None:
         position_of_image = read_positions(positions)
@@ -161,7 +184,7 @@ def record_colmap(
 
 
 def read_shots(model: Path) -> list[Shot]:
-    """The images that have poses, by frame and camera."""
+    """Read the images that have poses, by frame and camera."""
     model_dir = find_colmap_model(model)
     if model_dir is None:
         raise AdapterError(
@@ -203,10 +226,13 @@ def read_shots(model: Path) -> list[Shot]:
 
 
 def find_road(shots: Sequence[Shot]) -> Road:
-    """The plane under the cameras that most low points lie on and few below; the same every time.
+    """Return the plane under the cameras with most low points on it and few below.
+
+    It is deterministic.
 
     Raises:
-        AdapterError: too few points lie on any."""
+        AdapterError: too few points lie on any plane.
+    """
     centres = np.stack([shot.model_from_camera[:3, 3] for shot in shots])
     up = -np.mean([shot.model_from_camera[:3, 1] for shot in shots], axis=0)
     up /= np.linalg.norm(up)
@@ -279,7 +305,7 @@ def _plane_under(
 
 
 def _check_path(shots: Sequence[Shot], road: Road, model: Path) -> None:
-    """Refuse cameras that hardly moved: all that COLMAP found rests on that base."""
+    """Refuse cameras that hardly moved: the whole reconstruction rests on that base."""
     centres = np.stack([shot.model_from_camera[:3, 3] for shot in shots])
     heights = float(np.linalg.norm(np.ptp(centres, axis=0))) / road.height
     if heights < _MIN_PATH_HEIGHTS:
@@ -290,9 +316,11 @@ def _check_path(shots: Sequence[Shot], road: Road, model: Path) -> None:
         )
 
 
-def _levelled(shot: Shot, road: Road) -> np.ndarray:
-    """world_from_model in the model's unit: z up, the road at 0, the shot at x = y = 0 looking
-    along x."""
+def _level_pose(shot: Shot, road: Road) -> np.ndarray:
+    """Return world_from_model in the model's unit: z up, the road at 0.
+
+    The shot stands at x = y = 0 and looks along x.
+    """
     forward = shot.model_from_camera[:3, 2]
     forward = forward - (forward @ road.normal) * road.normal
     if np.linalg.norm(forward) < 1e-6:
@@ -316,8 +344,9 @@ def _scaled(pose: np.ndarray, scale: float) -> np.ndarray:
 def _egos(
     shots: Sequence[Shot], poses: Mapping[str, np.ndarray], height_m: float
 ) -> dict[int, np.ndarray]:
-    """world_from_ego by frame: on the road under the frame's first camera, level, x where that
-    looks."""
+    """Return world_from_ego by frame: on the road under the frame's first camera, level, x along
+    its view.
+    """
     egos: dict[int, np.ndarray] = {}
     for shot in shots:
         pose = poses[shot.name]
@@ -333,8 +362,11 @@ def _egos(
 
 
 def read_positions(path: Path) -> dict[str, np.ndarray]:
-    """Metres east and north [2] by image: a table (CSV) with the columns image, lat, lon (degrees),
-    or image, x, y (metres). image: its path below the images' folder, or its name."""
+    """Read metres east and north [2] by image from a table (CSV).
+
+    Its columns are image, lat, lon (degrees), or image, x, y (metres). image: its path below the
+    images' folder, or its name.
+    """
     rows = list(
         csv.DictReader(io.StringIO(read_text(path, if_missing="give a table of positions")))
     )
@@ -400,10 +432,10 @@ def _fit_positions(
 
 
 def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
-    """The image without its lens's distortion; returns width, height, fx, fy, cx, cy."""
+    """Write the image without its lens's distortion, and return width, height, fx, fy, cx, cy."""
     import pycolmap
 
-    source = inside(images, shot.name, "the model")
+    source = resolve_inside(images, shot.name, "the model")
     target = out / "images" / shot.camera / f"{shot.frame:06d}.jpg"
     target.parent.mkdir(parents=True, exist_ok=True)
     lens = shot.lens
@@ -440,7 +472,9 @@ def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
 
 
 def _lane(egos: Sequence[np.ndarray]) -> np.ndarray:
-    """Points of the road that the cameras drove over and a little beyond its end, [N, 3]."""
+    """Return points of the road that the cameras drove over, and a little beyond its end, [N,
+    3].
+    """
     steps = np.arange(0, _LANE_REACH_M / 2, _LANE_STEP_M)
     across = np.arange(-_LANE_M, _LANE_M + 1e-6, _LANE_STEP_M)
     local = [[0.0, y, 0.0, 1.0] for y in across]

@@ -1,6 +1,9 @@
-"""Where things stand: the street's plan, drawn from the seed. x runs along it, y to the left.
+"""Plan of the procedural street, drawn from the seed: positions of everything, the ego car's
+path, its cameras, and the motion of moving actors.
 
-Each kind of thing draws from its own stream, so that one more car moves no tree.
+x runs along the street, y to the left, z up; metres. Each kind of thing draws from its own stream
+of random numbers, so that one more car moves no tree. The callers are `adapters.street.world` and
+`adapters.procedural`.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from augment.scene import Track
 
 
 class StreetParameters(BaseModel):
-    """What a URI may ask for, all that decides a street: equal parameters give equal bits."""
+    """Parameters of a street's URI. Equal parameters give equal bits."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -45,47 +48,71 @@ class StreetParameters(BaseModel):
 
     @property
     def name(self) -> str:
+        """Return the name of the scene."""
         return f"street-seed{self.seed}"
 
     @property
     def path_length_m(self) -> float:
-        """How far the ego car drives."""
+        """Return the length of the ego car's drive."""
         return self.speed_mps * (self.frames - 1) * FRAME_NS * 1e-9
 
     @property
     def uri(self) -> str:
-        """Canonical: the seed, then whatever differs from its default, in the order above."""
-        changed = self.model_dump(exclude_defaults=True) | {"seed": self.seed}
-        shown = [f"{key}={changed[key]}" for key in StreetParameters.model_fields if key in changed]
-        return "procedural:street?" + "&".join(shown)
+        """Return the canonical URI: the seed, then all parameters that differ from their
+        defaults, in order.
+        """
+        changed_values = self.model_dump(exclude_defaults=True) | {"seed": self.seed}
+        terms = [
+            f"{key}={changed_values[key]}"
+            for key in StreetParameters.model_fields
+            if key in changed_values
+        ]
+        return "procedural:street?" + "&".join(terms)
 
 
 def parse_parameters(query: Mapping[str, str]) -> StreetParameters:
-    """Parameters of a URI's query."""
-    known = {key: str(field.description) for key, field in StreetParameters.model_fields.items()}
-    check_query("procedural:street", query, known)
+    """Return the parameters of a URI's query."""
+    descriptions = {
+        key: str(field.description) for key, field in StreetParameters.model_fields.items()
+    }
+    check_query("procedural:street", query, descriptions)
     return validate(StreetParameters, dict(query), "procedural:street", "query")
 
 
+# Time between two frames.
 FRAME_NS = 100_000_000
+# Time of the first frame.
 START_NS = 1_700_000_000_000_000_000
+# Width of a driving lane.
 LANE_M = 3.4
-ROAD_HALF_M = 5.6  # a driving lane and a parking lane
-KERB_TOP_M = 0.15  # the kerb stone's width
+# Half of the carriageway's width: a driving lane and a parking lane.
+ROAD_HALF_M = 5.6
+# Width of the kerb stone.
+KERB_TOP_M = 0.15
+# Distance of the house fronts from the street's middle.
 FACADE_M = 9.4
+# Slope of the carriageway from its crown to the kerbs.
 CAMBER = 0.02
+# Height of the kerb above the carriageway.
 KERB_RISE_M = 0.13
+# Slope of the pavements from kerb to wall.
 PAVEMENT_SLOPE = 0.012
+# y of the ego car.
 EGO_Y_M = -1.7
+# Distance of parked cars from the street's middle.
 PARKED_Y_M = 4.52
+# Distance of trees from the street's middle.
 TREE_Y_M = 6.75
-CROSS_STREET_M = 10.0  # width of the streets that end ours
+# Width of the cross streets at both ends.
+CROSS_STREET_M = 10.0
+# The land reaches this far beyond the street.
 TERRAIN_REACH_M = 230.0
+# Height of the land.
 TERRAIN_Z_M = 0.03
 
 
 class Mover(NamedTuple):
-    """Something that goes straight along x at a steady speed (negative: towards -x)."""
+    """An actor that goes straight along x at a steady speed (negative: towards -x)."""
 
     name: str  # car-0, pedestrian-1
     x_m: float  # at the first frame
@@ -96,9 +123,17 @@ class Mover(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """The plan. x0, x1: where the street's carriageway begins and ends, metres. plots: where each
-    building or garden begins and ends, its side (+1 left, -1 right), seed, and whether it is a
-    garden."""
+    """Plan of a street.
+
+    Attributes:
+        parameters: the street's parameters.
+        x0, x1: beginning and end of the carriageway, metres.
+        zebra_x: middle of the zebra crossing.
+        plots: beginning and end of each building or garden, its side (+1 left, -1 right), seed, and
+            True for a garden.
+        trees, lamps, signs, parked: positions (x, y).
+        movers: moving actors.
+    """
 
     parameters: StreetParameters
     x0: float
@@ -113,87 +148,96 @@ class Layout:
 
 
 def road_z(y: np.ndarray | float) -> np.ndarray | float:
-    """Height of the carriageway: 0 at its crown, falling to both kerbs."""
+    """Return the height of the carriageway: 0 at its crown, falling to both kerbs."""
     return -CAMBER * np.abs(y)
 
 
 def pavement_z(y: np.ndarray | float) -> np.ndarray | float:
-    """Height of the pavements, from kerb to wall."""
+    """Return the height of the pavements, from kerb to wall."""
     kerb = -CAMBER * ROAD_HALF_M + KERB_RISE_M
     return kerb + PAVEMENT_SLOPE * (np.abs(y) - ROAD_HALF_M)
 
 
-def stream(parameters: StreetParameters, *key: int) -> np.random.Generator:
-    """Random numbers of one kind of thing."""
+def rng_of(parameters: StreetParameters, *key: int) -> np.random.Generator:
+    """Return the random numbers of one kind of thing."""
     return np.random.default_rng([parameters.seed, *key])
 
 
 def draw_layout(parameters: StreetParameters) -> Layout:
-    """The plan of a street."""
+    """Draw the plan of a street."""
     length = parameters.path_length_m
-    x0, x1, zebra_x = -62.0, length + 86.0, length + 15.0
+    x0 = -62.0
+    x1 = length + 86.0
+    zebra_x = length + 15.0
     y = ROAD_HALF_M + 0.55
-    rows = (np.arange(x0 + 10.0, x1 - 4.0, 26.0), y), (np.arange(x0 + 23.0, x1 - 4.0, 26.0), -y)
-    lamps = np.concatenate([np.stack([x, np.full_like(x, side)], 1) for x, side in rows])
+    lamp_rows = (
+        (np.arange(x0 + 10.0, x1 - 4.0, 26.0), y),
+        (np.arange(x0 + 23.0, x1 - 4.0, 26.0), -y),
+    )
+    lamps = np.concatenate([np.stack([x, np.full_like(x, side)], 1) for x, side in lamp_rows])
     return Layout(
         parameters,
         x0,
         x1,
         zebra_x,
-        plots=_plots(stream(parameters, 1), x0, x1),
-        trees=_trees(stream(parameters, 2), x0, x1, lamps, zebra_x),
+        plots=_draw_plots(rng_of(parameters, 1), x0, x1),
+        trees=_draw_trees(rng_of(parameters, 2), x0, x1, lamps, zebra_x),
         lamps=lamps,
-        signs=_signs(stream(parameters, 3), zebra_x, length),
-        parked=_parked(stream(parameters, 4), parameters.parked, length, zebra_x),
-        movers=_movers(stream(parameters, 5), parameters),
+        signs=_place_signs(rng_of(parameters, 3), zebra_x, length),
+        parked=_draw_parked_cars(rng_of(parameters, 4), parameters.parked, length, zebra_x),
+        movers=_draw_movers(rng_of(parameters, 5), parameters),
     )
 
 
-def _plots(rng: np.random.Generator, x0: float, x1: float) -> list[tuple]:
+def _draw_plots(rng: np.random.Generator, x0: float, x1: float) -> list[tuple]:
     plots = []
     for side in (1, -1):
-        x, garden = x0 - 2.0, True
+        x = x0 - 2.0
+        is_garden = True
         while x < x1 - 3.0:
-            garden = not garden and x < x1 - 20 and rng.random() < 0.13  # never two in a row
-            end = x + (rng.uniform(4.5, 7.5) if garden else rng.uniform(7.5, 13.0))
+            is_garden = not is_garden and x < x1 - 20 and rng.random() < 0.13  # never two in a row
+            end = x + (rng.uniform(4.5, 7.5) if is_garden else rng.uniform(7.5, 13.0))
             if x1 + 1.0 - end < 7.0:
-                end, garden = x1 + 1.0, False
-            plots.append((x, end, side, int(rng.integers(2**31)), garden))
+                end = x1 + 1.0
+                is_garden = False
+            plots.append((x, end, side, int(rng.integers(2**31)), is_garden))
             x = end
     return plots
 
 
-def _trees(
+def _draw_trees(
     rng: np.random.Generator, x0: float, x1: float, lamps: np.ndarray, zebra_x: float
 ) -> np.ndarray:
     trees = []
     for side in (1, -1):
         x = x0 + rng.uniform(2, 9)
         while x < x1 - 3:
-            place = np.array([x, side * TREE_Y_M])
-            clear = np.abs(lamps - place).sum(1).min() > 3.0 and abs(x - zebra_x) > 4.5
-            if clear and rng.random() > 0.25:
-                trees.append(place)
+            position = np.array([x, side * TREE_Y_M])
+            is_clear = np.abs(lamps - position).sum(1).min() > 3.0 and abs(x - zebra_x) > 4.5
+            if is_clear and rng.random() > 0.25:
+                trees.append(position)
             x += rng.uniform(8.0, 12.5)
     return np.array(trees).reshape(-1, 2)
 
 
-def _signs(rng: np.random.Generator, zebra_x: float, length: float) -> np.ndarray:
+def _place_signs(rng: np.random.Generator, zebra_x: float, length: float) -> np.ndarray:
     y = ROAD_HALF_M + 0.45
-    places = [(zebra_x - 2.6, -y), (zebra_x + 2.6, y), (rng.uniform(6, 9), -y)]
-    places += [(length + rng.uniform(36, 40), -y), (-rng.uniform(16, 20), y)]
-    return np.array(places)
+    positions = [(zebra_x - 2.6, -y), (zebra_x + 2.6, y), (rng.uniform(6, 9), -y)]
+    positions += [(length + rng.uniform(36, 40), -y), (-rng.uniform(16, 20), y)]
+    return np.array(positions)
 
 
-def _parked(rng: np.random.Generator, count: int, length: float, zebra_x: float) -> np.ndarray:
+def _draw_parked_cars(
+    rng: np.random.Generator, count: int, length: float, zebra_x: float
+) -> np.ndarray:
     slots = [
         (x + rng.uniform(-0.4, 0.4), side * PARKED_Y_M)
         for side in (1, -1)
         for x in np.arange(-26.0, length + 58.0, 6.1)
         if abs(x - zebra_x) > 5.5
     ]
-    chosen = rng.permutation(len(slots))[:count]
-    return np.array([slots[i] for i in sorted(chosen)]).reshape(-1, 2)
+    slot_numbers = rng.permutation(len(slots))[:count]
+    return np.array([slots[i] for i in sorted(slot_numbers)]).reshape(-1, 2)
 
 
 # x at the first frame, side of the road, speed; of the ego car's where it drives the same way.
@@ -203,23 +247,30 @@ CARS = (
 )  # fmt: skip
 
 
-def _movers(rng: np.random.Generator, parameters: StreetParameters) -> list[Mover]:
+def _draw_movers(rng: np.random.Generator, parameters: StreetParameters) -> list[Mover]:
     movers = []
     for i, (x, side, speed) in enumerate(CARS[: parameters.moving]):
         speed += parameters.speed_mps if side < 0 else 0.0
         movers.append(Mover(f"car-{i}", x, side * LANE_M / 2, speed, int(rng.integers(2**31))))
     for i in range(parameters.pedestrians):
-        side, direction = (-1, 1)[i % 2], (1, -1)[(i // 2 + i) % 2]
+        side = (-1, 1)[i % 2]
+        direction = (1, -1)[(i // 2 + i) % 2]
         x = rng.uniform(7, 10) + 4.5 * i + parameters.path_length_m * 0.25
-        y, speed = side * rng.uniform(7.7, 8.5), direction * rng.uniform(1.2, 1.6)
+        y = side * rng.uniform(7.7, 8.5)
+        speed = direction * rng.uniform(1.2, 1.6)
         movers.append(Mover(f"pedestrian-{i}", x, y, speed, int(rng.integers(2**31))))
     return movers
 
 
 # ---- The ego car's path, its six cameras, and where moving actors are at any time ----------------
 
+# Horizontal field of view of every camera.
 FIELD_OF_VIEW_DEG = 72.0
-SWAY_M, SWAY_LENGTH_M = 0.10, 55.0
+# Amplitude of the ego car's sway in its lane.
+SWAY_M = 0.10
+# Length of one sway along the street.
+SWAY_LENGTH_M = 55.0
+# Height of the cameras above the road.
 CAMERA_Z_M = 1.6
 # name: (forward, left) of the ego origin in metres, yaw in degrees to the left. Each fires when the
 # LiDAR's beam, which turns clockwise once a frame and looks ahead at the frame's time, passes it.
@@ -236,8 +287,10 @@ MOUNTS = {
 def ego_pose(
     parameters: StreetParameters, timestamps_ns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The ego car, swaying about its lane's middle, at times [N]: positions [N, 3] of its ground
-    point and yaws [N]."""
+    """Return the ego car's ground points, float [N, 3], and yaws, float [N], at times [N].
+
+    The car sways about its lane's middle.
+    """
     seconds = (np.asarray(timestamps_ns, np.int64) - START_NS) * 1e-9
     x = parameters.speed_mps * seconds
     phase = 2 * np.pi * x / SWAY_LENGTH_M
@@ -247,16 +300,17 @@ def ego_pose(
 
 
 def camera_path(parameters: StreetParameters, timestamps_ns: np.ndarray) -> np.ndarray:
-    """Where the cameras are at times [N], taken together: above the ego car's middle, [N, 3]."""
+    """Return the cameras' common place at times [N], above the ego car's middle, [N, 3]."""
     return ego_pose(parameters, timestamps_ns)[0] + np.array([0.0, 0.0, CAMERA_Z_M])
 
 
 def frame_time_ns(index: int) -> int:
+    """Return the time of a frame."""
     return START_NS + index * FRAME_NS
 
 
 def build_frames(parameters: StreetParameters) -> tuple[Frame, ...]:
-    """All frames with their six cameras."""
+    """Return all frames with their six cameras."""
     frames = []
     for index in range(parameters.frames):
         time = frame_time_ns(index)
@@ -267,34 +321,42 @@ def build_frames(parameters: StreetParameters) -> tuple[Frame, ...]:
 
 
 def _world_from_ego(parameters: StreetParameters, timestamp_ns: int) -> np.ndarray:
-    """float64 [4, 4]: ego x forward, y left, z up, origin on the road."""
+    """Return world_from_ego, float64 [4, 4]: ego x forward, y left, z up, origin on the road."""
     positions, yaws = ego_pose(parameters, np.array([timestamp_ns]))
-    return _rigid(positions[0], float(yaws[0]))
+    return _rigid_transform(positions[0], float(yaws[0]))
 
 
 def camera_offset_ns(name: str) -> int:
-    """How long after the frame's time a camera fires."""
+    """Return the time from the frame's time to the moment when a camera fires."""
     yaw_deg = MOUNTS[name][2]
-    before = FRAME_NS if yaw_deg > 0 and name != "back" else 0
-    return round(-yaw_deg / 360 * FRAME_NS) % FRAME_NS - before
+    shift_ns = FRAME_NS if yaw_deg > 0 and name != "back" else 0
+    return round(-yaw_deg / 360 * FRAME_NS) % FRAME_NS - shift_ns
 
 
 def _camera(parameters: StreetParameters, name: str, frame_ns: int) -> Camera:
-    forward, left, yaw_deg = MOUNTS[name]
-    time, width, height = frame_ns + camera_offset_ns(name), parameters.width, parameters.height
-    mount = _rigid(np.array([forward, left, CAMERA_Z_M]), math.radians(yaw_deg))
-    mount[:3, :3] = mount[:3, :3] @ np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
-    pose = torch.from_numpy(invert_pose(_world_from_ego(parameters, time) @ mount))
+    forward_m, left_m, yaw_deg = MOUNTS[name]
+    time = frame_ns + camera_offset_ns(name)
+    width = parameters.width
+    height = parameters.height
+    ego_from_camera = _rigid_transform(
+        np.array([forward_m, left_m, CAMERA_Z_M]), math.radians(yaw_deg)
+    )
+    ego_from_camera[:3, :3] = ego_from_camera[:3, :3] @ np.array(
+        [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64
+    )
+    pose = torch.from_numpy(invert_pose(_world_from_ego(parameters, time) @ ego_from_camera))
     focal_px = width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG) / 2)
     return Camera(name, width, height, focal_px, focal_px, width / 2, height / 2, pose, time)
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A mover's box centre over time; its heading never changes.
+    """Motion of a mover's box centre over time. Its heading never changes.
 
-    times_ns: int64 [T], one frame beyond the drive on both sides, as far as the street goes.
-    centres: float64 [T, 3].
+    Attributes:
+        times_ns: int64 [T], one frame beyond the drive on both sides, as far as the street goes.
+        centres: float64 [T, 3].
+        yaw: heading, radians.
     """
 
     times_ns: np.ndarray
@@ -303,37 +365,45 @@ class Motion:
 
     @property
     def track(self) -> Track:
-        poses = np.stack([_rigid(centre, self.yaw) for centre in self.centres])
+        """Return the motion as a track."""
+        poses = np.stack([_rigid_transform(centre, self.yaw) for centre in self.centres])
         return Track(torch.from_numpy(self.times_ns.copy()), torch.from_numpy(poses))
 
     def at(self, timestamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Centres [N, 3] at times [N], and whether the mover is there at all: as Track.pose_at."""
-        start, hold = int(self.times_ns[0]), Track.hold_ns
+        """Return the centres [N, 3] at times [N], and a mask of the times at which the mover
+        exists.
+
+        The mask agrees with Track.pose_at.
+        """
+        start = int(self.times_ns[0])
+        hold_ns = Track.hold_ns
         seconds = (timestamps_ns - start) * 1e-9
         samples = (self.times_ns - start) * 1e-9
         centres = np.stack([np.interp(seconds, samples, c) for c in self.centres.T], -1)
         last = int(self.times_ns[-1])
-        return centres, (timestamps_ns >= start - hold) & (timestamps_ns <= last + hold)
+        return centres, (timestamps_ns >= start - hold_ns) & (timestamps_ns <= last + hold_ns)
 
 
 def motion_of(mover: Mover, layout: Layout, height_m: float, ground_z: float) -> Motion:
-    """Where a mover of this height goes while it is on the street."""
+    """Return the motion of a mover of this height while it is on the street."""
     frames = np.arange(-1, layout.parameters.frames + 1)
     x = mover.x_m + mover.speed_mps * frames * FRAME_NS * 1e-9
-    on_street = (x > layout.x0 + 3) & (x < layout.x1 - 3)
-    if not on_street.any():
-        on_street[0] = True
+    is_on_street = (x > layout.x0 + 3) & (x < layout.x1 - 3)
+    if not is_on_street.any():
+        is_on_street[0] = True
     y, z = np.full((2, len(x)), [[mover.y_m], [ground_z + height_m / 2]])
     yaw = 0.0 if mover.speed_mps >= 0 else math.pi
-    times = START_NS + frames[on_street].astype(np.int64) * FRAME_NS
-    return Motion(times, np.stack([x, y, z], -1)[on_street], yaw)
+    times = START_NS + frames[is_on_street].astype(np.int64) * FRAME_NS
+    return Motion(times, np.stack([x, y, z], -1)[is_on_street], yaw)
 
 
-def _rigid(translation: np.ndarray, yaw_rad: float) -> np.ndarray:
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+def _rigid_transform(translation: np.ndarray, yaw_rad: float) -> np.ndarray:
+    """Return the transform [4, 4] that turns about z, then shifts."""
+    c = math.cos(yaw_rad)
+    s = math.sin(yaw_rad)
     if abs(s) < 1e-15:
         s = 0.0
-    out = np.eye(4)
-    out[:2, :2] = [[c, -s], [s, c]]
-    out[:3, 3] = translation
-    return out
+    transform = np.eye(4)
+    transform[:2, :2] = [[c, -s], [s, c]]
+    transform[:3, 3] = translation
+    return transform

@@ -1,4 +1,7 @@
-"""A procedural street as long as one likes, out of stretches that are made one after the other."""
+"""A procedural street of any length, made of stretches that are built one after the other.
+
+The caller is `tools/bench/lod.py`.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,14 @@ from adapters.uri import CAMERA_PATH_KEY, add_to_uri
 from augment.files.level_file import save_large_scene
 from augment.scene import Gaussians, Scene
 
-STRETCH_M, SPEED_MPS = 100.0, 20.0
-FRAMES = round(STRETCH_M / SPEED_MPS / (FRAME_NS * 1e-9))  # of one stretch
-BESIDE = 1.35  # splats of a street over those of the stretch that its cameras drive along
+# Length of a stretch.
+STRETCH_M = 100.0
+# Speed of the ego car.
+SPEED_MPS = 20.0
+# Frames of one stretch.
+FRAMES = round(STRETCH_M / SPEED_MPS / (FRAME_NS * 1e-9))
+# Ratio of a street's splats to those of the stretch that its cameras drive along.
+SPLATS_PER_STRETCH_SPLAT = 1.35
 
 
 def write_long_street(
@@ -27,28 +35,36 @@ def write_long_street(
     gaussians: int = 2_000_000,
     seeds: tuple[int, ...] = (3, 4),
 ) -> None:
-    """Write `stretches` of STRETCH_M as a large scene: a drive along all of them, without actors.
+    """Write `stretches` of STRETCH_M as a large scene: a drive along all of them, without
+    actors.
 
-    gaussians: how many a stretch has, nearly. seeds: of the streets that the stretches are taken
-    from, in turns; as many are in memory at once.
+    Args:
+        folder: where the scene is written.
+        stretches: number of stretches.
+        gaussians: number of Gaussians of a stretch, nearly.
+        seeds: seeds of the streets that the stretches are taken from, in turns. As many streets are
+            in memory at once.
     """
 
     @functools.cache
     def street(seed: int) -> Scene:
-        return open_procedural(_query(seed, round(BESIDE * gaussians)))
+        return open_procedural(_query(seed, round(SPLATS_PER_STRETCH_SPLAT * gaussians)))
 
     def pieces() -> Iterator[Gaussians]:
         for number in range(stretches):
-            own = street(seeds[number % len(seeds)]).background
-            x = own.means[:, 0]
-            first, last = number == 0, number == stretches - 1  # which have the street's ends
-            piece = own.select(((x >= 0) | first) & ((x < STRETCH_M) | last))
-            along = torch.tensor([number * STRETCH_M, 0.0, 0.0])
-            yield dataclasses.replace(piece, means=piece.means + along)
+            background = street(seeds[number % len(seeds)]).background
+            x = background.means[:, 0]
+            is_first = number == 0
+            is_last = number == stretches - 1  # which have the street's ends
+            piece = background.select(((x >= 0) | is_first) & ((x < STRETCH_M) | is_last))
+            translation = torch.tensor([number * STRETCH_M, 0.0, 0.0])
+            yield dataclasses.replace(piece, means=piece.means + translation)
 
     scene = street(seeds[0])
-    whole = parse_parameters(_query(seeds[0], gaussians))
-    whole = whole.model_copy(update={"frames": stretches * FRAMES + 1})  # more than a URI may ask
+    parameters = parse_parameters(_query(seeds[0], gaussians))
+    parameters = parameters.model_copy(
+        update={"frames": stretches * FRAMES + 1}
+    )  # more than a URI may ask
     save_large_scene(
         dataclasses.replace(
             scene,
@@ -57,7 +73,7 @@ def write_long_street(
             labels=None,
             # A drive of its own: the street's boxes and LiDAR are not along it.
             source=add_to_uri(scene.source, CAMERA_PATH_KEY, "along"),
-            frames=build_frames(whole),
+            frames=build_frames(parameters),
             made_by={"stretches": stretches, "seeds": list(seeds), "gaussians": gaussians},
         ),
         pieces(),

@@ -1,4 +1,9 @@
-"""Exact ray casting against shapes: the street's ground truth."""
+"""Exact ray casting against shapes, which gives the street's ground truth.
+
+`build_tree` makes a tree of boxes over shapes; `Tree.cast` finds the nearest shape along rays,
+`Tree.occluded` tells only if there is one. The callers are `adapters.street.world`,
+`adapters.street.light` and `adapters.procedural`.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +21,14 @@ from augment.render.cpu.jit import inner, serial_kernel
 # second child (the first child follows it); count [M] int64: shapes in a leaf, 0 for an inner node;
 # order [P] int64: shapes as the leaves list them.
 
-STACK = 512  # far deeper than the trees of any street
+# Entries of the traversal's stack: far more than the depth of any street's tree.
+STACK = 512
+# Bins of the surface-area heuristic along an axis.
 BINS = 16
+# Largest number of shapes in a leaf.
 LEAF_SHAPES = 4
-NEAREST_M = 1e-7  # hits nearer than this are the surface the ray starts on
+# Hits nearer than this are on the surface where the ray starts.
+MIN_HIT_DISTANCE_M = 1e-7
 
 
 @serial_kernel
@@ -35,47 +44,66 @@ def trace(
     hit_shape,  # out [N] int64: -1 there
     hit_local,  # out [N, 3] float64
 ):
+    """Find the nearest shape, or any, along each ray. The hit_* arrays are written."""
     boxes, first, count, order = tree
     kind, shape_origin, inverse = shapes
     stack = np.empty(STACK, np.int64)
     for ray in range(origins.shape[0]):
         o = origins[ray, 0], origins[ray, 1], origins[ray, 2]
         d = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        best, shape, local = limit, -1, (0.0, 0.0, 0.0)
-        stack[0], top = 0, 1
+        nearest = limit
+        shape = -1
+        local = (0.0, 0.0, 0.0)
+        stack[0] = 0
+        top = 1
         while top > 0:
             top -= 1
             node = stack[top]
             if count[node] == 0:
-                near, far = node + 1, first[node]
-                t0, t1 = _enter(boxes[near], o, d, best), _enter(boxes[far], o, d, best)
-                if t1 < t0:
-                    near, far, t0, t1 = far, near, t1, t0
-                if t1 < math.inf:
-                    stack[top] = far
+                first_child = node + 1
+                second_child = first[node]
+                first_entry = _box_entry_distance(boxes[first_child], o, d, nearest)
+                second_entry = _box_entry_distance(boxes[second_child], o, d, nearest)
+                if second_entry < first_entry:
+                    first_child, second_child, first_entry, second_entry = (
+                        second_child,
+                        first_child,
+                        second_entry,
+                        first_entry,
+                    )
+                if second_entry < math.inf:
+                    stack[top] = second_child
                     top += 1
-                if t0 < math.inf:
-                    stack[top] = near
+                if first_entry < math.inf:
+                    stack[top] = first_child
                     top += 1
                 continue
             for entry in range(first[node], first[node] + count[node]):
                 p = order[entry]
-                at = shape_origin[p]
-                a, b, c = _turn(inverse[p], o[0] - at[0], o[1] - at[1], o[2] - at[2])
-                da, db, dc = _turn(inverse[p], d[0], d[1], d[2])
-                t = _meet(kind[p], a, b, c, da, db, dc, best)
-                if t < best:
-                    best, shape, local = t, p, (a + t * da, b + t * db, c + t * dc)
+                shape_center = shape_origin[p]
+                a, b, c = _rotate(
+                    inverse[p],
+                    o[0] - shape_center[0],
+                    o[1] - shape_center[1],
+                    o[2] - shape_center[2],
+                )
+                da, db, dc = _rotate(inverse[p], d[0], d[1], d[2])
+                t = _shape_distance(kind[p], a, b, c, da, db, dc, nearest)
+                if t < nearest:
+                    nearest = t
+                    shape = p
+                    local = (a + t * da, b + t * db, c + t * dc)
                     if any_hit:
                         top = 0
                         break
         hit_shape[ray] = shape
-        hit_distance[ray] = best if shape >= 0 else math.inf
+        hit_distance[ray] = nearest if shape >= 0 else math.inf
         hit_local[ray, 0], hit_local[ray, 1], hit_local[ray, 2] = local
 
 
 @inner()
-def _turn(m, x, y, z):
+def _rotate(m, x, y, z):
+    """Return the product of a matrix [3, 3] and a vector (x, y, z)."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
         m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
@@ -84,38 +112,46 @@ def _turn(m, x, y, z):
 
 
 @inner()
-def _enter(box, origin, direction, limit):
-    """Distance at which a ray enters a box, infinite where it misses or starts too late."""
-    low, high = 0.0, limit
+def _box_entry_distance(box, origin, direction, limit):
+    """Return the distance at which a ray enters a box; infinite if it misses or starts too late."""
+    entry_distance = 0.0
+    exit_distance = limit
     for axis in range(3):
-        o, d = origin[axis], direction[axis]
-        a, b = -box[axis], box[3 + axis]
+        o = origin[axis]
+        d = direction[axis]
+        a = -box[axis]
+        b = box[3 + axis]
         if d == 0.0:
             if o < a or o > b:
                 return math.inf
         else:
-            t0, t1 = (a - o) * (1.0 / d), (b - o) * (1.0 / d)
-            low = max(low, min(t0, t1))
-            high = min(high, max(t0, t1))
-    return low if low <= high else math.inf
+            t0 = (a - o) * (1.0 / d)
+            t1 = (b - o) * (1.0 / d)
+            entry_distance = max(entry_distance, min(t0, t1))
+            exit_distance = min(exit_distance, max(t0, t1))
+    return entry_distance if entry_distance <= exit_distance else math.inf
 
 
 @inner()
-def _meet(kind, a, b, c, da, db, dc, limit):
-    """Distance at which a ray, in a shape's own frame, meets it; infinite where it does not."""
+def _shape_distance(kind, a, b, c, da, db, dc, limit):
+    """Return the distance at which a ray, in a shape's own frame, meets it.
+
+    It is infinite if it does not.
+    """
     if kind <= 2:  # flat
         if dc == 0.0:
             return math.inf
         t = -c / dc
-        if t < NEAREST_M or t >= limit:
+        if t < MIN_HIT_DISTANCE_M or t >= limit:
             return math.inf
-        u, v = a + t * da, b + t * db
+        u = a + t * da
+        v = b + t * db
         if kind == 2:
             return t if u * u + v * v <= 1.0 else math.inf
         if u < 0.0 or v < 0.0:
             return math.inf
-        inside = (u <= 1.0 and v <= 1.0) if kind == 0 else u + v <= 1.0
-        return t if inside else math.inf
+        is_inside = (u <= 1.0 and v <= 1.0) if kind == 0 else u + v <= 1.0
+        return t if is_inside else math.inf
     qa = da * da + db * db
     qb = a * da + b * db
     qc = a * a + b * b - 1.0
@@ -129,7 +165,7 @@ def _meet(kind, a, b, c, da, db, dc, limit):
     root = math.sqrt(root)
     for side in range(2):
         t = (-qb - root) / qa if side == 0 else (-qb + root) / qa
-        if NEAREST_M <= t < limit and (kind == 3 or abs(c + t * dc) <= 1.0):
+        if MIN_HIT_DISTANCE_M <= t < limit and (kind == 3 or abs(c + t * dc) <= 1.0):
             return t
     return math.inf
 
@@ -142,106 +178,143 @@ def build(
     count,  # out
     order,  # in: any order of the shapes; out: as the leaves list them
 ):
-    """Fill a tree, depth first; returns how many nodes it has."""
-    todo = np.empty((STACK, 3), np.int64)  # range of order, and the parent whose second child it is
-    todo[0, 0], todo[0, 1], todo[0, 2] = 0, len(order), -1
-    top, nodes = 1, 0
+    """Fill a tree, depth first, and return its number of nodes."""
+    ranges = np.empty(
+        (STACK, 3), np.int64
+    )  # range of order, and the parent whose second child it is
+    ranges[0, 0] = 0
+    ranges[0, 1] = len(order)
+    ranges[0, 2] = -1
+    num_ranges = 1
+    num_nodes = 0
     scratch = np.empty(len(order), np.int64)
     boxes.fill(-math.inf)
-    while top > 0:
-        top -= 1
-        start, stop, parent = todo[top, 0], todo[top, 1], todo[top, 2]
-        node = nodes
-        nodes += 1
+    while num_ranges > 0:
+        num_ranges -= 1
+        start = ranges[num_ranges, 0]
+        stop = ranges[num_ranges, 1]
+        parent = ranges[num_ranges, 2]
+        node = num_nodes
+        num_nodes += 1
         if parent >= 0:
             first[parent] = node
         for entry in range(start, stop):
-            _grow(boxes[node], shape_boxes[order[entry]])
-        first[node], count[node] = start, stop - start
+            _grow_box(boxes[node], shape_boxes[order[entry]])
+        first[node] = start
+        count[node] = stop - start
         if stop - start > LEAF_SHAPES:
             count[node] = 0
             middle = _split(shape_boxes, order, start, stop, scratch)
-            todo[top, 0], todo[top, 1], todo[top, 2] = middle, stop, node
-            todo[top + 1, 0], todo[top + 1, 1], todo[top + 1, 2] = start, middle, -1
-            top += 2
-    return nodes
+            ranges[num_ranges, 0] = middle
+            ranges[num_ranges, 1] = stop
+            ranges[num_ranges, 2] = node
+            ranges[num_ranges + 1, 0] = start
+            ranges[num_ranges + 1, 1] = middle
+            ranges[num_ranges + 1, 2] = -1
+            num_ranges += 2
+    return num_nodes
 
 
 @inner()
-def _grow(box, other):
+def _grow_box(box, other):
+    """Grow a box so that it encloses another one, in place."""
     # Element by element: assignments to slices, whose shapes numba checks, take long to compile.
     for side in range(6):
         box[side] = max(box[side], other[side])
 
 
 @inner()
-def _area(box):
-    x, y, z = box[3] + box[0], box[4] + box[1], box[5] + box[2]
+def _half_box_area(box):
+    """Return half of a box's surface area."""
+    x = box[3] + box[0]
+    y = box[4] + box[1]
+    z = box[5] + box[2]
     return x * y + y * z + z * x
 
 
 @inner()
-def _bin(box, axis, low, high):
-    """Which of the equal parts between low and high holds twice the box's centre."""
+def _bin_of_box(box, axis, low, high):
+    """Return the number of the bin between low and high that holds twice the box's centre."""
     return min(BINS - 1, int((box[3 + axis] - box[axis] - low) / (high - low) * BINS))
 
 
 @inner()
 def _split(boxes, order, start, stop, scratch):
-    """Reorder a range so that its halves cost least by the surface-area heuristic, over bins."""
-    best, best_axis, best_bin, best_low, best_high = math.inf, -1, 0, 0.0, 0.0
-    bins, counts, right = np.empty((BINS, 6)), np.empty(BINS, np.int64), np.empty(BINS)
-    running = np.empty(6)
+    """Reorder a range so that its halves cost least by the binned surface-area heuristic.
+
+    Returns the position in `order` at which the second half begins.
+    """
+    best_cost = math.inf
+    best_axis = -1
+    best_bin = 0
+    best_low = 0.0
+    best_high = 0.0
+    bins = np.empty((BINS, 6))
+    counts = np.empty(BINS, np.int64)
+    right_costs = np.empty(BINS)
+    running_box = np.empty(6)
     for axis in range(3):
-        low, high = math.inf, -math.inf
+        low = math.inf
+        high = -math.inf
         for entry in range(start, stop):
             box = boxes[order[entry]]
-            low, high = min(low, box[3 + axis] - box[axis]), max(high, box[3 + axis] - box[axis])
+            low = min(low, box[3 + axis] - box[axis])
+            high = max(high, box[3 + axis] - box[axis])
         if high <= low:
             continue
         bins.fill(-math.inf)
         counts.fill(0)
         for entry in range(start, stop):
-            b = _bin(boxes[order[entry]], axis, low, high)
+            b = _bin_of_box(boxes[order[entry]], axis, low, high)
             counts[b] += 1
-            _grow(bins[b], boxes[order[entry]])
-        running.fill(-math.inf)
-        total = 0
+            _grow_box(bins[b], boxes[order[entry]])
+        running_box.fill(-math.inf)
+        num_shapes = 0
         for b in range(BINS - 1, 0, -1):
-            total += counts[b]
-            _grow(running, bins[b])
-            right[b] = total * _area(running) if total > 0 else 0.0
-        running.fill(-math.inf)
-        total = 0
+            num_shapes += counts[b]
+            _grow_box(running_box, bins[b])
+            right_costs[b] = num_shapes * _half_box_area(running_box) if num_shapes > 0 else 0.0
+        running_box.fill(-math.inf)
+        num_shapes = 0
         for b in range(BINS - 1):
-            total += counts[b]
-            _grow(running, bins[b])
-            if total > 0 and right[b + 1] > 0:
-                cost = total * _area(running) + right[b + 1]
-                if cost < best:
-                    best, best_axis, best_bin, best_low, best_high = cost, axis, b, low, high
+            num_shapes += counts[b]
+            _grow_box(running_box, bins[b])
+            if num_shapes > 0 and right_costs[b + 1] > 0:
+                cost = num_shapes * _half_box_area(running_box) + right_costs[b + 1]
+                if cost < best_cost:
+                    best_cost = cost
+                    best_axis = axis
+                    best_bin = b
+                    best_low = low
+                    best_high = high
     if best_axis < 0:  # all centres in one place
         return (start + stop) // 2
-    left, kept = start, 0
+    left_stop = start
+    num_scratch = 0
     for entry in range(start, stop):
         p = order[entry]
-        if _bin(boxes[p], best_axis, best_low, best_high) <= best_bin:
-            order[left] = p
-            left += 1
+        if _bin_of_box(boxes[p], best_axis, best_low, best_high) <= best_bin:
+            order[left_stop] = p
+            left_stop += 1
         else:
-            scratch[kept] = p
-            kept += 1
-    for entry in range(kept):
-        order[left + entry] = scratch[entry]
-    return left
+            scratch[num_scratch] = p
+            num_scratch += 1
+    for entry in range(num_scratch):
+        order[left_stop + entry] = scratch[entry]
+    return left_stop
 
 
 # ---- The tree ------------------------------------------------------------------------------------
 
 
 class Hits(NamedTuple):
-    """What N rays met. distance [N]: in lengths of the ray's direction, infinite where nothing was
-    met. shape [N]: -1 there. local [N, 3]: coordinates on the shape."""
+    """Hits of N rays.
+
+    Attributes:
+        distance: float [N], in lengths of the ray's direction, infinite without a hit.
+        shape: int [N], number of the shape, -1 without a hit.
+        local: float [N, 3], local coordinates on the shape.
+    """
 
     distance: np.ndarray
     shape: np.ndarray
@@ -249,7 +322,7 @@ class Hits(NamedTuple):
 
 
 class Tree(NamedTuple):
-    """A bounding volume hierarchy over shapes, as `trace` takes it."""
+    """A bounding volume hierarchy over shapes, in the form that `trace` takes."""
 
     nodes: tuple[np.ndarray, ...]
     shapes: tuple[np.ndarray, ...]
@@ -257,42 +330,48 @@ class Tree(NamedTuple):
     def cast(
         self, origins: np.ndarray, directions: np.ndarray, limit: float = np.inf, any_hit=False
     ) -> Hits:
-        """Nearest shape, or any, along each ray; origins and directions [N, 3] or, one of them,
-        [3]."""
-        rays = np.broadcast_shapes(np.shape(origins), np.shape(directions))[0]
-        hits = Hits(np.empty(rays), np.empty(rays, np.int64), np.empty((rays, 3)))
+        """Return the nearest shape, or any, along each ray.
+
+        Args:
+            origins, directions: float [N, 3]; one of them may be [3].
+            limit: largest distance, in lengths of the ray's direction.
+            any_hit: True for any shape instead of the nearest.
+        """
+        num_rays = np.broadcast_shapes(np.shape(origins), np.shape(directions))[0]
+        hits = Hits(np.empty(num_rays), np.empty(num_rays, np.int64), np.empty((num_rays, 3)))
         # Copies, as `trace` would be compiled once more for arrays that cannot be written.
-        start, ahead = (
-            np.array(np.broadcast_to(v, (rays, 3)), np.float64, order="C")
+        ray_origins, ray_directions = (
+            np.array(np.broadcast_to(v, (num_rays, 3)), np.float64, order="C")
             for v in (origins, directions)
         )
-        trace(start, ahead, float(limit), any_hit, self.nodes, self.shapes, *hits)
+        trace(ray_origins, ray_directions, float(limit), any_hit, self.nodes, self.shapes, *hits)
         return hits
 
     def occluded(
         self, origins: np.ndarray, directions: np.ndarray, limit: float = np.inf
     ) -> np.ndarray:
-        """Whether anything stands within `limit` direction lengths of each ray's origin, [N]."""
+        """Return True for rays that meet something within `limit` direction lengths, bool [N]."""
         return self.cast(origins, directions, limit, any_hit=True).shape >= 0
 
 
 def build_tree(shapes: Shapes) -> Tree:
-    """A tree split by the surface-area heuristic, down to a few shapes a leaf."""
+    """Build a tree split by the surface-area heuristic, down to a few shapes per leaf."""
     u, v, w = shapes.axes.transpose(1, 0, 2)
     kind = shapes.kind[:, None]
-    round_flat = np.sqrt(u**2 + v**2)
-    reach = np.where(kind == Kind.DISC, round_flat, 0.0)
-    reach = np.where(kind == Kind.CYLINDER, round_flat + np.abs(w), reach)
+    radius = np.sqrt(u**2 + v**2)
+    reach = np.where(kind == Kind.DISC, radius, 0.0)
+    reach = np.where(kind == Kind.CYLINDER, radius + np.abs(w), reach)
     reach = np.where(kind == Kind.ELLIPSOID, np.sqrt(u**2 + v**2 + w**2), reach)
-    straight = kind <= Kind.TRIANGLE
-    corners = [np.zeros_like(u), np.where(straight, u, 0), np.where(straight, v, 0)]
+    is_straight = kind <= Kind.TRIANGLE
+    corners = [np.zeros_like(u), np.where(is_straight, u, 0), np.where(is_straight, v, 0)]
     corners.append(np.where(kind == Kind.PARALLELOGRAM, u + v, 0))
-    pad = 1e-6  # flat shapes have boxes without thickness, which rounding could miss
-    low = shapes.origin + np.min(corners, axis=0) - reach - pad
-    high = shapes.origin + np.max(corners, axis=0) + reach + pad
-    size, order = 2 * len(shapes), np.arange(len(shapes))
-    nodes = np.empty((size, 6)), np.empty(size, np.int64), np.empty(size, np.int64)
-    used = build(np.concatenate([-low, high], 1), *nodes, order)
+    padding_m = 1e-6  # flat shapes have boxes without thickness, which rounding could miss
+    low = shapes.origin + np.min(corners, axis=0) - reach - padding_m
+    high = shapes.origin + np.max(corners, axis=0) + reach + padding_m
+    max_nodes = 2 * len(shapes)
+    order = np.arange(len(shapes))
+    nodes = np.empty((max_nodes, 6)), np.empty(max_nodes, np.int64), np.empty(max_nodes, np.int64)
+    num_nodes = build(np.concatenate([-low, high], 1), *nodes, order)
     inverse = np.ascontiguousarray(np.linalg.inv(shapes.axes).transpose(0, 2, 1))
     arrays = np.ascontiguousarray(shapes.kind), np.ascontiguousarray(shapes.origin), inverse
-    return Tree((*(values[:used].copy() for values in nodes), order), arrays)
+    return Tree((*(values[:num_nodes].copy() for values in nodes), order), arrays)

@@ -1,5 +1,10 @@
-"""The assembled street: houses, ground and what stands on it as one static body, and the bodies
-that move, each with its light."""
+"""Bodies of the procedural street: houses, ground and furniture as one static body, and moving
+bodies.
+
+`build_street` returns all of them, each with its light. Builders return arrays of shapes in the
+frame that their section describes. The callers are `adapters.procedural` and
+`adapters.street.splats`.
+"""
 
 from __future__ import annotations
 
@@ -58,8 +63,8 @@ from adapters.street.layout import (
     frame_time_ns,
     motion_of,
     pavement_z,
+    rng_of,
     road_z,
-    stream,
 )
 from adapters.street.light import Body, Lighting, direction_to_sun
 from adapters.street.raycast import build_tree
@@ -69,14 +74,21 @@ from augment.semantics import SemanticClass as Class
 # A front has its own frame: x along the wall, y into the house, z up; its outer face is the plane
 # y = 0, seen from y < 0. `holes` collects what stands in the wall, as (x, z) rectangles.
 
-REVEAL_M = 0.14  # how deep windows stand in the wall
+# Depth of windows in the wall.
+REVEAL_M = 0.14
+# Width of the surround of windows.
 SURROUND_M = 0.13
 GLASS = Look((0.022, 0.026, 0.03), Class.BUILDING, Material.GLASS, backed=True)
 SHOP_GLASS = GLASS._replace(material=Material.SHOP)
-_FRONT, _LEDGE = ("-y", "+x", "-x", "+z", "-z"), ("-y", "+z", "-z", "+x", "-x")
+# Visible faces of a box on a front.
+_FRONT_FACES = ("-y", "+x", "-x", "+z", "-z")
+# Visible faces of a ledge.
+_LEDGE_FACES = ("-y", "+z", "-z", "+x", "-x")
 
 
 class Facade(NamedTuple):
+    """Looks and measures of a house's front."""
+
     wall: Look
     base: Look
     trim: Look
@@ -92,19 +104,25 @@ class Facade(NamedTuple):
 def panels(
     rectangles, depth_m: float, look: Look, edges: np.ndarray | int = ALL_EDGES
 ) -> Shapes:  # fmt: skip
-    """Upright panels over (x, z) rectangles [R, 4] at y = depth_m, seen from the street."""
+    """Return upright panels over (x, z) rectangles [R, 4] at y = depth_m. They face the street."""
     x0, z0, x1, z1 = np.asarray(rectangles, np.float64).reshape(-1, 4).T
-    u, v = xyz(x1 - x0, 0, 0), xyz(0, 0, z1 - z0)
+    u = xyz(x1 - x0, 0, 0)
+    v = xyz(0, 0, z1 - z0)
     return parallelograms(xyz(x0, depth_m, z0), u, v, look, edges=edges)
 
 
 def reveals(opening: Rectangle, depth_m: float, look: Look) -> Shapes:
-    """The four inner faces of an opening, from the wall's face to depth_m."""
+    """Return the four inner faces of an opening, from the wall's face to depth_m."""
     x0, z0, x1, z1 = opening
-    into, up, along = (0, depth_m, 0), (0, 0, z1 - z0), (x1 - x0, 0, 0)
+    inwards = (0, depth_m, 0)
+    up = (0, 0, z1 - z0)
+    along = (x1 - x0, 0, 0)
     corners = [(x0, 0, z0), (x1, 0, z0), (x0, 0, z0), (x0, 0, z1)]
-    us, vs = [into, up, along, into], [up, into, into, along]
-    return parallelograms(corners, us, vs, look._replace(ambient=0.75, backed=False))
+    first_sides = [inwards, up, along, inwards]
+    second_sides = [up, inwards, inwards, along]
+    return parallelograms(
+        corners, first_sides, second_sides, look._replace(ambient=0.75, backed=False)
+    )
 
 
 @joined
@@ -112,15 +130,15 @@ def glazing(
     opening: Rectangle, columns: int, rows: int, depth_m: float, frame: Look,
     bar_m: float = 0.07, pane: Look = GLASS,
 ) -> Iterator[Shapes]:  # fmt: skip
-    """Panes with a frame and bars, filling an opening."""
+    """Build panes with a frame and bars that fill an opening."""
     x0, z0, x1, z1 = opening
-    half = bar_m / 2
-    xs = np.linspace(x0 + half, x1 - half, columns + 1)
-    zs = np.linspace(z0 + half, z1 - half, rows + 1)
+    half_bar_m = bar_m / 2
+    xs = np.linspace(x0 + half_bar_m, x1 - half_bar_m, columns + 1)
+    zs = np.linspace(z0 + half_bar_m, z1 - half_bar_m, rows + 1)
     if rows == 2:
         zs[1] = zs[0] + 0.68 * (zs[2] - zs[0])  # a fanlight above
     panes = [
-        (a + half, low + half, b - half, high - half)
+        (a + half_bar_m, low + half_bar_m, b - half_bar_m, high - half_bar_m)
         for a, b in itertools.pairwise(xs)
         for low, high in itertools.pairwise(zs)
     ]
@@ -131,84 +149,109 @@ def glazing(
     yield glass
 
 
-def windows(corners: list, facade: Facade, fine: bool, holes: list[Rectangle]) -> Shapes:
-    """Windows with reveals, sills and surrounds, the lower left corners of their openings at
-    (x, z)."""
+def windows(corners: list, facade: Facade, is_fine: bool, holes: list[Rectangle]) -> Shapes:
+    """Build windows with reveals, sills and surrounds.
+
+    Args:
+        corners: (x, z) of the lower left corners of the openings.
+        facade: the front's looks and measures.
+        is_fine: True for windows with several panes.
+        holes: rectangles in the wall, extended by those of the windows.
+    """
     width, height = facade.window_m
-    band, over = (SURROUND_M, 0.2) if facade.has_surround else (0.0, 0.0)
+    band_m, lintel_m = (SURROUND_M, 0.2) if facade.has_surround else (0.0, 0.0)
     opening = (0.0, 0.0, width, height)
-    columns, rows = ((2, 2) if height > 1.7 else (2, 1)) if fine else (1, 1)
+    columns, rows = ((2, 2) if height > 1.7 else (2, 1)) if is_fine else (1, 1)
     parts = [
         glazing(opening, columns, rows, REVEAL_M, facade.frame),
         reveals(opening, REVEAL_M, facade.trim if facade.has_surround else facade.wall),
-        boxes((-0.08, -0.09, -0.08), (width + 0.08, 0.02, 0.0), facade.trim, faces=_FRONT),
+        boxes((-0.08, -0.09, -0.08), (width + 0.08, 0.02, 0.0), facade.trim, faces=_FRONT_FACES),
     ]
     if facade.has_surround:
-        low = [(-band, -0.035, 0.0), (width, -0.035, 0.0), (-band, -0.06, height)]
-        high = [(0.0, 0, height), (width + band, 0, height), (width + band, 0, height + over)]
-        parts.append(boxes(low, high, facade.trim, faces=_FRONT))
+        low_corners = [(-band_m, -0.035, 0.0), (width, -0.035, 0.0), (-band_m, -0.06, height)]
+        high_corners = [
+            (0.0, 0, height),
+            (width + band_m, 0, height),
+            (width + band_m, 0, height + lintel_m),
+        ]
+        parts.append(boxes(low_corners, high_corners, facade.trim, faces=_FRONT_FACES))
     for x, z in corners:
         holes += [(x - 0.08, z - 0.08, x + width + 0.08, z), (x, z, x + width, z + height)]
         if facade.has_surround:
-            holes += [(x - band, z, x + width + band, z + height)]
-            holes += [(x - band, z + height, x + width + band, z + height + over)]
+            holes += [(x - band_m, z, x + width + band_m, z + height)]
+            holes += [(x - band_m, z + height, x + width + band_m, z + height + lintel_m)]
     return join(parts).repeated(np.array([(x, 0.0, z) for x, z in corners]))
 
 
 @joined
 def door(opening: Rectangle, facade: Facade) -> Iterator[Shapes]:
-    """A panelled door with a fanlight and a step."""
+    """Build a panelled door with a fanlight and a step."""
     x0, z0, x1, z1 = opening
-    split = z1 - 0.55
-    leaf, light = (x0 + 0.06, z0, x1 - 0.06, split), (x0 + 0.06, split + 0.06, x1 - 0.06, z1 - 0.06)
-    low, high = leaf[0] + 0.14, leaf[2] - 0.14
-    fields = [(low, z0 + 0.25, high, z0 + 0.95), (low, z0 + 1.1, high, split - 0.16)]
-    frames, edges = cut(opening, [leaf, light])
-    stiles, stile_edges = cut(leaf, fields)
+    fanlight_z = z1 - 0.55
+    leaf_opening = (x0 + 0.06, z0, x1 - 0.06, fanlight_z)
+    fanlight = (x0 + 0.06, fanlight_z + 0.06, x1 - 0.06, z1 - 0.06)
+    field_x0 = leaf_opening[0] + 0.14
+    field_x1 = leaf_opening[2] - 0.14
+    fields = [
+        (field_x0, z0 + 0.25, field_x1, z0 + 0.95),
+        (field_x0, z0 + 1.1, field_x1, fanlight_z - 0.16),
+    ]
+    frames, edges = cut(opening, [leaf_opening, fanlight])
+    stiles, stile_edges = cut(leaf_opening, fields)
     yield panels(frames, REVEAL_M - 0.02, facade.frame, edges)
     yield panels(stiles, REVEAL_M, facade.accent, stile_edges)
-    dark = facade.accent.tinted(np.array(facade.accent.rgb) * 0.7)
-    yield panels(fields, REVEAL_M + 0.015, dark)
-    yield panels(light, REVEAL_M, GLASS)
+    dark_accent = facade.accent.tinted(np.array(facade.accent.rgb) * 0.7)
+    yield panels(fields, REVEAL_M + 0.015, dark_accent)
+    yield panels(fanlight, REVEAL_M, GLASS)
     yield reveals(opening, REVEAL_M, facade.wall)
     yield boxes((x0 - 0.1, -0.35, -0.3), (x1 + 0.1, REVEAL_M, z0), facade.base)
 
 
 @joined
-def shop_front(opening: Rectangle, facade: Facade, awning: bool) -> Iterator[Shapes]:
-    """A shop: plinth, large panes, a glass door, a sign above and perhaps an awning."""
+def shop_front(opening: Rectangle, facade: Facade, has_awning: bool) -> Iterator[Shapes]:
+    """Build a shop: plinth, large panes, a glass door, a sign above and perhaps an awning."""
     x0, z0, x1, z1 = opening
-    accent, depth, door_x, sign_z = facade.accent, 0.18, x1 - 1.25, z1 + 0.08
+    accent = facade.accent
+    depth = 0.18
+    door_x = x1 - 1.25
+    sign_z = z1 + 0.08
     yield panels((x0, z0, door_x, z0 + 0.5), depth - 0.04, accent)
     columns = max(1, round((door_x - x0) / 1.7))
     yield glazing((x0, z0 + 0.5, door_x, z1), columns, 1, depth, accent, 0.09, SHOP_GLASS)
     yield glazing((door_x, z0, x1, z1), 1, 2, depth, accent, 0.11)
     yield reveals(opening, depth, accent)
-    low, high = (x0 - 0.1, -0.12, sign_z), (x1 + 0.1, 0.02, sign_z + 0.62)
-    yield boxes(low, high, accent, faces=_FRONT)
+    low_corner = (x0 - 0.1, -0.12, sign_z)
+    high_corner = (x1 + 0.1, 0.02, sign_z + 0.62)
+    yield boxes(low_corner, high_corner, accent, faces=_FRONT_FACES)
     # Light blocks on the sign that read as letters from afar.
     number = np.arange(int(min(12, (x1 - x0 - 0.8) / 0.32)))
     starts = (x0 + x1) / 2 + (number - len(number) / 2) * 0.32
-    tall = 0.18 + 0.10 * ((number * 5) % 3 == 0)
+    letter_heights = 0.18 + 0.10 * ((number * 5) % 3 == 0)
     z = sign_z + 0.17
-    letters = np.stack(np.broadcast_arrays(starts, z, starts + 0.2, z + tall), 1)
+    letters = np.stack(np.broadcast_arrays(starts, z, starts + 0.2, z + letter_heights), 1)
     yield panels(letters[number % 5 != 3], -0.135, facade.trim)
-    if awning:  # striped cloth, sloping out over the pavement, with a hem
+    if has_awning:  # striped cloth, sloping out over the pavement, with a hem
         count = max(4, round((x1 - x0) / 0.45))
-        edges, u = np.linspace(x0, x1, count + 1)[:-1], ((x1 - x0) / count, 0.0, 0.0)
-        slope, hem = np.array([0.0, 1.2, 0.55]), np.array([0.0, 0.0, -0.2])
+        edges = np.linspace(x0, x1, count + 1)[:-1]
+        u = ((x1 - x0) / count, 0.0, 0.0)
+        slope = np.array([0.0, 1.2, 0.55])
+        hem_drop = np.array([0.0, 0.0, -0.2])
         for start, look in ((0, accent), (1, facade.trim)):
             top = xyz(edges[start::2], -1.25, z1 + 0.05 - 0.55)
             yield parallelograms(top, u, slope, look)
-            yield parallelograms(top + hem, u, -hem, look)
+            yield parallelograms(top + hem_drop, u, -hem_drop, look)
 
 
 # ---- Houses and gardens --------------------------------------------------------------------------
 
+# Depth of a house.
 DEPTH_M = 10.5
-BASE_M = -0.25  # walls reach below the pavement
-# Nobody sees it: it stops what little shines through the front's splats from showing the back wall.
+# Lower end of the walls, below the pavement.
+BASE_M = -0.25
+# Depth of a hidden inner wall behind the front. Where the front's splats let a little light
+# through, it keeps the back wall from showing.
 INNER_WALL_M = 0.45
+# Linear colours and materials of house fronts.
 WALLS = (
     *[((0.72, 0.66, 0.54), Material.PLASTER), ((0.66, 0.50, 0.36), Material.PLASTER)],
     *[((0.58, 0.57, 0.54), Material.PLASTER), ((0.70, 0.56, 0.50), Material.PLASTER)],
@@ -226,20 +269,20 @@ _PANE = Look((0.10, 0.12, 0.14), Class.BUILDING)
 _ZINC = Look((0.22, 0.22, 0.215), Class.BUILDING)
 _CHIMNEY = Look((0.33, 0.16, 0.11), Class.BUILDING, Material.BRICK)
 _GRAVEL = Look((0.30, 0.29, 0.27), Class.BUILDING, Material.ASPHALT, spacing=1.6)
-_UPRIGHT = ("-y", "+y", "+x", "-x")
+_UPRIGHT_FACES = ("-y", "+y", "+x", "-x")
 
 
 @joined
 def build_buildings(layout: Layout) -> Iterator[Shapes]:
-    """Both rows of houses, those that close the street's ends, and some behind."""
+    """Build both rows of houses, those that close the street's ends, and some behind."""
     middle = layout.parameters.path_length_m / 2
     for x0, x1, side, seed, is_garden in layout.plots:
-        is_near = abs((x0 + x1) / 2 - middle) - middle < 32
-        built = _garden(x1 - x0) if is_garden else _house(seed, x1 - x0, is_near)
-        yield _beside(built, side, x0, x1, FACADE_M)
-    reach = CROSS_STREET_M + 4.6
-    for number, (x, turn) in enumerate(((layout.x1 + reach, -1), (layout.x0 - reach, 1))):
-        rng = stream(layout.parameters, 20, number)
+        has_fine_windows = abs((x0 + x1) / 2 - middle) - middle < 32
+        shapes = _garden(x1 - x0) if is_garden else _house(seed, x1 - x0, has_fine_windows)
+        yield _place_beside_street(shapes, side, x0, x1, FACADE_M)
+    distance = CROSS_STREET_M + 4.6
+    for number, (x, turn) in enumerate(((layout.x1 + distance, -1), (layout.x0 - distance, 1))):
+        rng = rng_of(layout.parameters, 20, number)
         start = -56.0
         while start < 56.0:
             width = rng.uniform(9.0, 14.0)
@@ -249,20 +292,20 @@ def build_buildings(layout: Layout) -> Iterator[Shapes]:
     yield _second_row(layout)
 
 
-def _beside(built: Shapes, side: int, x0: float, x1: float, y: float) -> Shapes:
-    """What is built at the origin, from x0 to x1 on the street's left (1) or right side (-1)."""
-    return built.moved((x0 if side > 0 else x1, side * y, 0.0), 0.0 if side > 0 else np.pi)
+def _place_beside_street(shapes: Shapes, side: int, x0: float, x1: float, y: float) -> Shapes:
+    """Move shapes from the origin to x0 ... x1 on the street's left (side 1) or right side (-1)."""
+    return shapes.moved((x0 if side > 0 else x1, side * y, 0.0), 0.0 if side > 0 else np.pi)
 
 
 def draw_facade(rng: np.random.Generator) -> Facade:
-    """Colours and measures of one house."""
+    """Draw the looks and measures of one house."""
     rgb, material = WALLS[rng.integers(len(WALLS))]
     rgb = np.array(rgb) * rng.uniform(0.88, 1.06)
-    white = rng.random() < 0.7 or material == Material.BRICK
+    is_white_trim = rng.random() < 0.7 or material == Material.BRICK
     return Facade(
         wall=Look(rgb, Class.BUILDING, material, backed=True),
         base=Look(rgb * 0.35 + 0.10, Class.BUILDING, Material.STONE),
-        trim=STONE.tinted((0.74, 0.72, 0.67)) if white else STONE,
+        trim=STONE.tinted((0.74, 0.72, 0.67)) if is_white_trim else STONE,
         frame=STONE.tinted((0.78, 0.77, 0.75) if rng.random() < 0.7 else (0.07, 0.065, 0.06)),
         accent=Look(ACCENTS[rng.integers(len(ACCENTS))], Class.BUILDING),
         window_m=(float(rng.uniform(1.05, 1.4)), float(rng.uniform(1.55, 1.95))),
@@ -274,55 +317,55 @@ def draw_facade(rng: np.random.Generator) -> Facade:
 
 
 @joined
-def _house(seed: int, width: float, fine: bool) -> Iterator[Shapes]:
-    """A house on x in [0, width], its front at y = 0."""
+def _house(seed: int, width: float, is_fine: bool) -> Iterator[Shapes]:
+    """Build a house on x in [0, width], with its front at y = 0."""
     rng = np.random.default_rng(seed)
     facade = draw_facade(rng)
-    floors = int(rng.integers(2, 4))
-    eaves = facade.ground_m + floors * facade.floor_m + 0.35
-    count = max(2, round(width / rng.uniform(2.5, 3.1)))
-    middles = [(i + 0.5) * (width / count) for i in range(count)]
+    num_floors = int(rng.integers(2, 4))
+    eaves = facade.ground_m + num_floors * facade.floor_m + 0.35
+    num_columns = max(2, round(width / rng.uniform(2.5, 3.1)))
+    window_centers = [(i + 0.5) * (width / num_columns) for i in range(num_columns)]
     holes: list[Rectangle] = []
-    yield from _ground_floor(rng, facade, width, middles, holes, fine)
-    sills = [facade.ground_m + j * facade.floor_m + 0.75 for j in range(floors)]
-    corners = [(x - facade.window_m[0] / 2, z) for z in sills for x in middles]
-    yield windows(corners, facade, fine, holes)
-    ledge = (facade.ground_m + 0.12, facade.ground_m + 0.3, 0.09)
-    for z0, z1, reach in (ledge, (eaves - 0.32, eaves, 0.28)):
+    yield from _ground_floor(rng, facade, width, window_centers, holes, is_fine)
+    sills = [facade.ground_m + j * facade.floor_m + 0.75 for j in range(num_floors)]
+    corners = [(x - facade.window_m[0] / 2, z) for z in sills for x in window_centers]
+    yield windows(corners, facade, is_fine, holes)
+    ledge_span = (facade.ground_m + 0.12, facade.ground_m + 0.3, 0.09)
+    for z0, z1, reach in (ledge_span, (eaves - 0.32, eaves, 0.28)):
         holes.append((0.0, z0, width, z1))
-        yield boxes((0.0, -reach, z0), (width, 0.0, z1), facade.trim, faces=_LEDGE)
+        yield boxes((0.0, -reach, z0), (width, 0.0, z1), facade.trim, faces=_LEDGE_FACES)
     base, edges = cut((0.0, BASE_M, width, 0.5), [h for h in holes if h[1] < 0.5])
     yield panels(base, -0.0, facade.base, edges)
     wall, edges = cut((0.0, 0.5, width, eaves), holes)
     yield panels(wall, 0.0, facade.wall, edges)
     yield _back(facade, width, eaves)
     yield _roof(rng, facade, width, eaves)
-    inner = facade.wall._replace(material=Material.PLAIN, backed=False)
-    yield panels((0.0, BASE_M, width, eaves), INNER_WALL_M, inner)
+    inner_wall = facade.wall._replace(material=Material.PLAIN, backed=False)
+    yield panels((0.0, BASE_M, width, eaves), INNER_WALL_M, inner_wall)
     yield tube((0.12, -0.09, 0.0), (0.12, -0.09, eaves - 0.2), 0.05, _ZINC)  # a rainpipe
 
 
 def _ground_floor(
-    rng: np.random.Generator, facade: Facade, width: float, middles: list[float],
-    holes: list[Rectangle], fine: bool,
+    rng: np.random.Generator, facade: Facade, width: float, window_centers: list[float],
+    holes: list[Rectangle], is_fine: bool,
 ) -> Iterator[Shapes]:  # fmt: skip
-    """Shop, or a door between windows."""
+    """Build a shop, or a door between windows."""
     floor = float(pavement_z(FACADE_M)) + 0.02
     if facade.has_shop:
         opening = (0.45, floor, width - 0.45, floor + 2.75)
         holes += [opening, (0.35, opening[3] + 0.08, width - 0.35, opening[3] + 0.70)]
         yield shop_front(opening, facade, bool(rng.random() < 0.45))
         return
-    entry = middles[int(rng.integers(len(middles)))]
-    opening = (entry - 0.58, floor + 0.12, entry + 0.58, floor + 2.95)
+    door_x = window_centers[int(rng.integers(len(window_centers)))]
+    opening = (door_x - 0.58, floor + 0.12, door_x + 0.58, floor + 2.95)
     holes += [opening, (opening[0] - 0.1, BASE_M, opening[2] + 0.1, opening[1])]
     yield door(opening, facade)
-    corners = [(x - facade.window_m[0] / 2, 1.15) for x in middles if x != entry]
-    yield windows(corners, facade, fine, holes)
+    corners = [(x - facade.window_m[0] / 2, 1.15) for x in window_centers if x != door_x]
+    yield windows(corners, facade, is_fine, holes)
 
 
 def _back(facade: Facade, width: float, eaves: float) -> Shapes:
-    """Side and back walls, plain."""
+    """Build the plain side and back walls."""
     wall = facade.wall._replace(spacing=1.6, backed=False)
     return boxes((0.0, 0.0, BASE_M), (width, DEPTH_M, eaves), wall, faces=("+x", "-x", "+y"))
 
@@ -331,68 +374,79 @@ def _back(facade: Facade, width: float, eaves: float) -> Shapes:
 def _roof(
     rng: np.random.Generator, facade: Facade, width: float, eaves: float
 ) -> Iterator[Shapes]:  # fmt: skip
-    """A ridge along the street, or a flat roof behind a parapet."""
-    wall, trim = facade.wall._replace(backed=False), facade.trim
+    """Build a ridged roof along the street, or a flat roof behind a parapet."""
+    wall = facade.wall._replace(backed=False)
+    trim = facade.trim
     if rng.random() < 0.35:
         top = eaves + 0.75
         yield parallelograms((0, 0.3, eaves), (width, 0, 0), (0, DEPTH_M - 0.3, 0), _GRAVEL)
-        yield boxes((0, 0, eaves), (width, 0.3, top), wall, faces=_UPRIGHT)
-        yield boxes((-0.0, -0.07, top), (width, 0.37, top + 0.1), trim, faces=_LEDGE)
+        yield boxes((0, 0, eaves), (width, 0.3, top), wall, faces=_UPRIGHT_FACES)
+        yield boxes((-0.0, -0.07, top), (width, 0.37, top + 0.1), trim, faces=_LEDGE_FACES)
         return
     tiles = Look(ROOFS[rng.integers(len(ROOFS))], Class.BUILDING, Material.TILES, spacing=1.3)
-    half, over = DEPTH_M / 2, 0.35
-    rise = half * float(np.tan(np.radians(rng.uniform(30, 40))))
-    drop = over * rise / half
+    half_depth = DEPTH_M / 2
+    overhang = 0.35
+    rise = half_depth * float(np.tan(np.radians(rng.uniform(30, 40))))
+    drop = overhang * rise / half_depth
     edge_z = eaves - drop + 0.12
-    slope = np.array([0.0, half + over, rise + drop])
-    yield parallelograms((0.0, -over, edge_z), (width, 0, 0), slope, tiles)
-    back = (width, DEPTH_M + over, edge_z)
-    yield parallelograms(back, (-width, 0, 0), slope * [1, -1, 1], tiles)
-    low, high = (0.0, -over - 0.12, edge_z - 0.14), (width, -over + 0.02, edge_z + 0.0)
-    yield boxes(low, high, trim.tinted((0.25, 0.24, 0.23)), faces=_LEDGE, edges=0)  # a gutter
-    yield parallelograms((0, -over, edge_z - 0.02), (0, over, 0), (width, 0, 0), trim, edges=0)
+    slope = np.array([0.0, half_depth + overhang, rise + drop])
+    yield parallelograms((0.0, -overhang, edge_z), (width, 0, 0), slope, tiles)
+    far_corner = (width, DEPTH_M + overhang, edge_z)
+    yield parallelograms(far_corner, (-width, 0, 0), slope * [1, -1, 1], tiles)
+    low_corner = (0.0, -overhang - 0.12, edge_z - 0.14)
+    high_corner = (width, -overhang + 0.02, edge_z + 0.0)
+    yield boxes(
+        low_corner, high_corner, trim.tinted((0.25, 0.24, 0.23)), faces=_LEDGE_FACES, edges=0
+    )  # a gutter
+    yield parallelograms(
+        (0, -overhang, edge_z - 0.02), (0, overhang, 0), (width, 0, 0), trim, edges=0
+    )
     for x, order in ((0.0, (0, 2, 1)), (width, (0, 1, 2))):
-        gable = np.array([(x, 0.0, eaves), (x, DEPTH_M, eaves), (x, half, eaves + rise + 0.1)])
-        yield triangles(*gable[list(order)], wall._replace(spacing=0.8))
+        gable_corners = np.array(
+            [(x, 0.0, eaves), (x, DEPTH_M, eaves), (x, half_depth, eaves + rise + 0.1)]
+        )
+        yield triangles(*gable_corners[list(order)], wall._replace(spacing=0.8))
     for x in (0.7, width - 1.5)[: int(rng.integers(1, 3))]:
-        low, high = (x, half - 0.9, eaves + rise * 0.6), (x + 0.8, half - 0.3, eaves + rise + 0.9)
-        yield boxes(low, high, _CHIMNEY)
+        low_corner = (x, half_depth - 0.9, eaves + rise * 0.6)
+        high_corner = (x + 0.8, half_depth - 0.3, eaves + rise + 0.9)
+        yield boxes(low_corner, high_corner, _CHIMNEY)
 
 
 def _garden(width: float) -> Shapes:
-    """A low wall with a hedge behind it, across a gap between two houses."""
+    """Build a low wall with a hedge behind it, across a gap between two houses."""
     brick = Look((0.34, 0.17, 0.12), Class.BARRIER, Material.BRICK)
     hedge = Look((0.075, 0.13, 0.03), Class.VEGETATION, Material.LEAVES)
     stone = Look((0.52, 0.50, 0.46), Class.BARRIER)
     return join([
-        boxes((0, 0.0, BASE_M), (width, 0.3, 0.95), brick, faces=_UPRIGHT),
-        boxes((0, -0.05, 0.95), (width, 0.35, 1.03), stone, faces=_LEDGE),
+        boxes((0, 0.0, BASE_M), (width, 0.3, 0.95), brick, faces=_UPRIGHT_FACES),
+        boxes((0, -0.05, 0.95), (width, 0.35, 1.03), stone, faces=_LEDGE_FACES),
         boxes((0.05, 0.5, 0.0), (width - 0.05, 1.5, 1.75), hedge, edges=0),
     ])  # fmt: skip
 
 
 @joined
 def _second_row(layout: Layout) -> Iterator[Shapes]:
-    """Plain houses behind the gardens, which close the view through the gaps."""
-    rng = stream(layout.parameters, 21)
+    """Build plain houses behind the gardens. They close the view through the gaps."""
+    rng = rng_of(layout.parameters, 21)
     for side in (1, -1):
         x = layout.x0 - 4.0
         while x < layout.x1 + 4.0:
-            width, height = rng.uniform(9, 15), rng.uniform(6.5, 9.5)
+            width = rng.uniform(9, 15)
+            height = rng.uniform(6.5, 9.5)
             facade = draw_facade(rng)
             y = rng.uniform(36, 44)
             wall = facade.wall._replace(backed=False)
             columns = np.arange(1.2, width - 1.6, 2.6)
             holes = [(w, z, w + 1.2, z + 1.5) for z in (1.2, 4.2) for w in columns]
             front, edges = cut((0.0, BASE_M, width, height), holes)
-            built = join([
+            shapes = join([
                 panels(front, 0.0, wall, edges & np.uint8(U0 | U1 | V1)),
                 panels(holes, 0.1, _PANE),
                 *[reveals(h, 0.1, wall) for h in holes],
                 _back(facade, width, height),
                 _roof(rng, facade, width, height),
             ])  # fmt: skip
-            yield _beside(built, side, x, x + width, y)
+            yield _place_beside_street(shapes, side, x, x + width, y)
             x += width + rng.uniform(4, 12)
 
 
@@ -406,128 +460,158 @@ PAVING = Look((0.34, 0.325, 0.30), Class.SIDEWALK, Material.PAVING, spacing=1.2,
 KERB = Look((0.44, 0.43, 0.41), Class.SIDEWALK)
 GRASS = Look((0.13, 0.19, 0.05), Class.TERRAIN, Material.GRASS, spacing=2.5)
 
+# Length of a section of the carriageway.
 SECTION_M = 6.0
-ZEBRA_CLEAR_M = 3.6  # of a zebra crossing's middle, where no other mark may lie
-PAVEMENT_M, CROSS_HALF_M = 4.6, 70.0  # of the cross streets: their far pavement, half their length
-EDGE_M = FACADE_M + 0.6  # where the pavements end, under the walls
+# Around the middle of the zebra crossing, no other mark lies within this distance.
+ZEBRA_CLEAR_M = 3.6
+# Width of the cross streets' far pavement.
+PAVEMENT_M = 4.6
+# Half of the cross streets' length.
+CROSS_HALF_M = 70.0
+# Distance of the pavements' end, under the walls, from the street's middle.
+EDGE_M = FACADE_M + 0.6
 
 
 @joined
 def build_ground(layout: Layout) -> Iterator[Shapes]:
-    """Everything that lies on the ground."""
+    """Build the ground: carriageway, markings, kerbs, pavements, cross streets and the land
+    around.
+    """
     yield from _carriageway(layout)
     yield from _pavements(layout)
     yield from _cross_streets(layout)
-    west, east = layout.x0 - CROSS_STREET_M, layout.x1 + CROSS_STREET_M
+    west = layout.x0 - CROSS_STREET_M
+    east = layout.x1 + CROSS_STREET_M
     holes: list[Rectangle] = [
         (layout.x0, -EDGE_M, layout.x1, EDGE_M),
         (west - PAVEMENT_M, -CROSS_HALF_M, layout.x0, CROSS_HALF_M),
         (layout.x1, -CROSS_HALF_M, east + PAVEMENT_M, CROSS_HALF_M),
     ]
-    reach = TERRAIN_REACH_M
-    pieces, edges = cut((west - reach, -reach, east + reach, reach), holes)
+    margin = TERRAIN_REACH_M
+    pieces, edges = cut((west - margin, -margin, east + margin, margin), holes)
     # Only the rims that border something else need to be crisp.
-    yield _sloped(pieces, 0.0, TERRAIN_Z_M, GRASS, edges & np.uint8(V0 | V1))
+    yield _sloped_panels(pieces, 0.0, TERRAIN_Z_M, GRASS, edges & np.uint8(V0 | V1))
 
 
-def _sloped(
+def _sloped_panels(
     rectangles, slope: float, z0: float, look: Look, edges: np.ndarray | int = ALL_EDGES
 ) -> Shapes:  # fmt: skip
-    """Panels over rectangles [R, 4] on the plane z = z0 + slope y, facing up."""
+    """Return panels over rectangles [R, 4] on the plane z = z0 + slope y, facing up."""
     x0, y0, x1, y1 = np.reshape(rectangles, (-1, 4)).T
-    u, v = xyz(x1 - x0, 0, 0), xyz(0, y1 - y0, slope * (y1 - y0))
+    u = xyz(x1 - x0, 0, 0)
+    v = xyz(0, y1 - y0, slope * (y1 - y0))
     return parallelograms(xyz(x0, y0, z0 + slope * y0), u, v, look, edges=edges)
 
 
-def _markings(layout: Layout) -> list[Rectangle]:
-    """Painted rectangles of both halves of the road; none crosses the crown y = 0."""
-    marks: list[Rectangle] = []
-    zebra, x0, x1 = layout.zebra_x, layout.x0, layout.x1
+def _marking_rectangles(layout: Layout) -> list[Rectangle]:
+    """Return the painted rectangles of both halves of the road. None crosses the crown y = 0."""
+    rectangles: list[Rectangle] = []
+    zebra = layout.zebra_x
+    x0 = layout.x0
+    x1 = layout.x1
     for x in np.arange(x0 + 2, x1 - 8, 6.0):
         if abs(x + 1.5 - zebra) > 6.5:
-            marks += [(x, 0.0, x + 3.0, 0.07), (x, -0.07, x + 3.0, 0.0)]
+            rectangles += [(x, 0.0, x + 3.0, 0.07), (x, -0.07, x + 3.0, 0.0)]
     for side in (1, -1):
-        low, high = sorted((side * (LANE_M - 0.06), side * (LANE_M + 0.06)))
+        low_y, high_y = sorted((side * (LANE_M - 0.06), side * (LANE_M + 0.06)))
         for x in np.arange(x0 + 2, x1 - 8, 6.1):  # parking bays: a corner line and its end
             if abs(x + 3.0 - zebra) > 8.0:
-                marks.append((x, low, x + 4.9, high))
+                rectangles.append((x, low_y, x + 4.9, high_y))
         for y in np.arange(0.25, LANE_M + 1.6, 1.0):
-            near, far = sorted((side * y, side * (y + 0.5)))
-            marks.append((zebra - 1.5, near, zebra + 1.5, far))
+            near_y, far_y = sorted((side * y, side * (y + 0.5)))
+            rectangles.append((zebra - 1.5, near_y, zebra + 1.5, far_y))
         stop = zebra + side * 3.0  # each lane stops before it
-        near, far = sorted((side * 0.12, side * (LANE_M - 0.12)))
-        marks.append((stop - 0.15, near, stop + 0.15, far))
-    return marks
+        near_y, far_y = sorted((side * 0.12, side * (LANE_M - 0.12)))
+        rectangles.append((stop - 0.15, near_y, stop + 0.15, far_y))
+    return rectangles
 
 
-def _patches(layout: Layout, taken: list[Rectangle]) -> tuple[list[Rectangle], list[Rectangle]]:
-    """Repaired asphalt and iron covers, clear of the markings and of each other."""
-    rng = stream(layout.parameters, 10)
-    found: tuple[list[Rectangle], list[Rectangle]] = [], []
+def _draw_patches(
+    layout: Layout, occupied: list[Rectangle]
+) -> tuple[list[Rectangle], list[Rectangle]]:
+    """Draw repaired asphalt and iron covers, clear of the markings and of each other."""
+    rng = rng_of(layout.parameters, 10)
+    patches: tuple[list[Rectangle], list[Rectangle]] = [], []
     for x in np.arange(layout.x0 + 4, layout.x1 - 6, 7.0):
         kind = int(rng.random() < 0.45)
         side = rng.choice([-1, 1])
-        half = (rng.uniform(0.8, 2.6), rng.uniform(0.3, 0.6)) if kind == 0 else (0.3, 0.3)
-        middle = (x + rng.uniform(0, 4), side * rng.uniform(0.9, 2.4))
-        spot = (middle[0] - half[0], middle[1] - half[1], middle[0] + half[0], middle[1] + half[1])
-        left, near, right, far = spot[0] - 0.1, spot[1] - 0.1, spot[2] + 0.1, spot[3] + 0.1
-        others = [*taken, *found[0], *found[1]]
-        if all(right < a[0] or a[2] < left or far < a[1] or a[3] < near for a in others):
-            found[kind].append(spot)
-    return found
+        half_size = (rng.uniform(0.8, 2.6), rng.uniform(0.3, 0.6)) if kind == 0 else (0.3, 0.3)
+        center = (x + rng.uniform(0, 4), side * rng.uniform(0.9, 2.4))
+        rectangle = (
+            center[0] - half_size[0],
+            center[1] - half_size[1],
+            center[0] + half_size[0],
+            center[1] + half_size[1],
+        )
+        low_x = rectangle[0] - 0.1
+        low_y = rectangle[1] - 0.1
+        high_x = rectangle[2] + 0.1
+        high_y = rectangle[3] + 0.1
+        other_rectangles = [*occupied, *patches[0], *patches[1]]
+        if all(
+            high_x < a[0] or a[2] < low_x or high_y < a[1] or a[3] < low_y for a in other_rectangles
+        ):
+            patches[kind].append(rectangle)
+    return patches
 
 
 def _carriageway(layout: Layout) -> Iterator[Shapes]:
-    """Both halves of the road, in sections along x: a mark cuts only the asphalt beside it."""
-    marks = _markings(layout)
-    repairs, covers = _patches(layout, marks)
+    """Build both halves of the road in sections along x. A mark cuts only the asphalt beside it."""
+    marks = _marking_rectangles(layout)
+    repairs, covers = _draw_patches(layout, marks)
     crossing = (layout.zebra_x - ZEBRA_CLEAR_M, layout.zebra_x + ZEBRA_CLEAR_M)
     bounds = np.arange(layout.x0, layout.x1 - SECTION_M / 2, SECTION_M)
     bounds = bounds[(bounds < crossing[0] - 1) | (bounds > crossing[1] + 1)]
     bounds = np.sort([*bounds, *crossing, layout.x1])
     for side, kerb in ((1, V1), (-1, V0)):
-        low, high = sorted((0.0, side * ROAD_HALF_M))
+        low_y, high_y = sorted((0.0, side * ROAD_HALF_M))
         holes = []
         for rectangles, look in ((marks, MARKING), (repairs, REPAIR), (covers, IRON)):
-            here = [r for r in rectangles if low <= r[1] and r[3] <= high]
-            holes += here
-            yield _sloped(here, -side * CAMBER, 0.0, look)
+            side_rectangles = [r for r in rectangles if low_y <= r[1] and r[3] <= high_y]
+            holes += side_rectangles
+            yield _sloped_panels(side_rectangles, -side * CAMBER, 0.0, look)
         for start, stop in itertools.pairwise(bounds):
-            near = [h for h in holes if h[0] < stop and h[2] > start]
-            pieces, edges = cut((start, low, stop, high), near, rim=kerb)
-            yield _sloped(pieces, -side * CAMBER, 0.0, ASPHALT, edges)
+            section_holes = [h for h in holes if h[0] < stop and h[2] > start]
+            pieces, edges = cut((start, low_y, stop, high_y), section_holes, rim=kerb)
+            yield _sloped_panels(pieces, -side * CAMBER, 0.0, ASPHALT, edges)
 
 
-def _kerb(start: Vectors, along: Vectors, left: bool) -> Shapes:
-    """A kerb's face, which looks to the left or the right of the way along it."""
+def _kerb_face(start: Vectors, along: Vectors, left: bool) -> Shapes:
+    """Return a kerb's face, which looks to the left or the right of the direction along it."""
     up = (0, 0, KERB_RISE_M)
     return parallelograms(start, *((along, up) if not left else (up, along)), KERB)
 
 
 def _pavements(layout: Layout) -> Iterator[Shapes]:
-    low_z, inner = float(road_z(ROAD_HALF_M)), ROAD_HALF_M + KERB_TOP_M
+    low_z = float(road_z(ROAD_HALF_M))
+    inner_y = ROAD_HALF_M + KERB_TOP_M
     z0 = low_z + KERB_RISE_M - PAVEMENT_SLOPE * ROAD_HALF_M
     for side in (1, -1):
         start = (layout.x0, side * ROAD_HALF_M, low_z)
-        yield _kerb(start, (layout.x1 - layout.x0, 0, 0), side < 0)
-        for near, far, look in ((ROAD_HALF_M, inner, KERB), (inner, EDGE_M, PAVING)):
-            low, high = sorted((side * near, side * far))
-            yield _sloped((layout.x0, low, layout.x1, high), side * PAVEMENT_SLOPE, z0, look)
+        yield _kerb_face(start, (layout.x1 - layout.x0, 0, 0), side < 0)
+        for near_y, far_y, look in ((ROAD_HALF_M, inner_y, KERB), (inner_y, EDGE_M, PAVING)):
+            low_y, high_y = sorted((side * near_y, side * far_y))
+            yield _sloped_panels(
+                (layout.x0, low_y, layout.x1, high_y), side * PAVEMENT_SLOPE, z0, look
+            )
 
 
 def _cross_streets(layout: Layout) -> Iterator[Shapes]:
-    """The streets that ours runs into, with the pavement beyond."""
-    z, half = float(road_z(ROAD_HALF_M)), CROSS_HALF_M
+    """Build the streets at both ends, with the pavement beyond."""
+    z = float(road_z(ROAD_HALF_M))
+    half_length = CROSS_HALF_M
     for x, direction in ((layout.x0, -1), (layout.x1, 1)):
         kerb = x + direction * CROSS_STREET_M
-        near, far = sorted((x, kerb))
-        yield _sloped((near, -half, far, half), 0.0, z, ASPHALT)
-        yield _kerb((kerb, -half, z), (0, 2 * half, 0), direction > 0)
-        near, far = sorted((kerb, kerb + direction * PAVEMENT_M))
-        yield _sloped((near, -half, far, half), 0.0, z + KERB_RISE_M, PAVING)
+        near_x, far_x = sorted((x, kerb))
+        yield _sloped_panels((near_x, -half_length, far_x, half_length), 0.0, z, ASPHALT)
+        yield _kerb_face((kerb, -half_length, z), (0, 2 * half_length, 0), direction > 0)
+        near_x, far_x = sorted((kerb, kerb + direction * PAVEMENT_M))
+        yield _sloped_panels(
+            (near_x, -half_length, far_x, half_length), 0.0, z + KERB_RISE_M, PAVING
+        )
         for side in (1, -1):  # the near pavement's edge, left and right of our street
             is_left = (side > 0) != (direction < 0)
-            yield _kerb((x, side * ROAD_HALF_M, z), side * np.array([0, 60.0, 0]), is_left)
+            yield _kerb_face((x, side * ROAD_HALF_M, z), side * np.array([0, 60.0, 0]), is_left)
 
 
 # ---- A person in mid-stride: tubes and ellipsoids, one rigid body --------------------------------
@@ -541,12 +625,13 @@ TROUSERS = ((0.035, 0.045, 0.08), (0.05, 0.05, 0.05), (0.20, 0.17, 0.12))
 
 @joined
 def draw_person(seed: int) -> Iterator[Shapes]:
-    """A person with clothes drawn from the seed."""
+    """Draw a person with clothes from the seed."""
     rng = np.random.default_rng(seed)
-    drawn = [colours[rng.integers(len(colours))] for colours in (SKIN, COATS, TROUSERS)]
-    drawn += [np.array((0.03, 0.02, 0.015)) * rng.uniform(1, 4), (0.03, 0.028, 0.025)]
-    skin, coat, legs, hair, shoes = (Look(rgb, Class.PEDESTRIAN, spacing=0.7) for rgb in drawn)
-    c, s = np.cos(0.06), np.sin(0.06)  # the trunk leans forward
+    colors = [colours[rng.integers(len(colours))] for colours in (SKIN, COATS, TROUSERS)]
+    colors += [np.array((0.03, 0.02, 0.015)) * rng.uniform(1, 4), (0.03, 0.028, 0.025)]
+    skin, coat, legs, hair, shoes = (Look(rgb, Class.PEDESTRIAN, spacing=0.7) for rgb in colors)
+    c = np.cos(0.06)
+    s = np.sin(0.06)  # the trunk leans forward
     lean = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
     radii = np.array([[0.125], [0.20], [0.33]])
     yield ellipsoids((0.01, 0, 1.20), (lean * radii)[None], coat)
@@ -558,7 +643,8 @@ def draw_person(seed: int) -> Iterator[Shapes]:
         y = side * 0.095
         knee = (0.10 * side + 0.06, y, 0.50)
         foot = np.array([0.27 * side - 0.06 * (side < 0), y, 0.10 + 0.03 * (side < 0)])
-        shoulder, elbow = (0.0, side * 0.19, 1.41), (-0.13 * side, side * 0.255, 1.15)
+        shoulder = (0.0, side * 0.19, 1.41)
+        elbow = (-0.13 * side, side * 0.255, 1.15)
         hand = (-0.20 * side + 0.12, side * 0.245, 0.93)
         yield tube((0, y, 0.93), knee, 0.085, legs)
         yield tube(knee, foot, 0.062, legs)
@@ -577,24 +663,38 @@ BARK = Look((0.13, 0.10, 0.075), Class.VEGETATION, Material.BARK)
 LEAF = Look((0.12, 0.21, 0.04), Class.VEGETATION, Material.LEAF)
 CORE = Look((0.045, 0.08, 0.02), Class.VEGETATION, Material.LEAVES, ambient=0.4, spacing=3.0)
 WOOD = Look((0.07, 0.12, 0.035), Class.VEGETATION, Material.LEAVES, spacing=2.2)
-NEAR_LEAVES, MIDDLE_LEAVES, FAR_LEAVES, GARDEN_LEAVES = 2600, 1200, 300, 80
+# Leaf tufts of a street tree near the drive.
+NEAR_LEAVES = 2600
+# Leaf tufts of a street tree at a middle distance.
+MIDDLE_LEAVES = 1200
+# Leaf tufts of a street tree far from the drive.
+FAR_LEAVES = 300
+# Leaf tufts of a garden tree.
+GARDEN_LEAVES = 80
 
 
 @joined
 def build_vegetation(layout: Layout) -> Iterator[Shapes]:
-    """Street trees, garden trees behind the houses, and woods far out."""
-    rng = stream(layout.parameters, 30)
+    """Build street trees, garden trees behind the houses, and woods far out."""
+    rng = rng_of(layout.parameters, 30)
     middle = layout.parameters.path_length_m / 2
     for x, y in layout.trees:
-        beyond = max(abs(x - middle) - middle, 0.0)  # along the street from the drive
-        leaves = NEAR_LEAVES if beyond < 10 else (MIDDLE_LEAVES if beyond < 28 else FAR_LEAVES)
+        distance_beyond_drive = max(
+            abs(x - middle) - middle, 0.0
+        )  # along the street from the drive
+        leaves = (
+            NEAR_LEAVES
+            if distance_beyond_drive < 10
+            else (MIDDLE_LEAVES if distance_beyond_drive < 28 else FAR_LEAVES)
+        )
         yield _tree(rng, 1.0, leaves).moved((x, y, float(pavement_z(y)) - 0.03))
     for _ in range(24):
         x = rng.uniform(layout.x0 - 8, layout.x1 + 8)
         y = rng.choice([-1, 1]) * rng.uniform(24, 33)
         yield _tree(rng, rng.uniform(1.1, 1.5), GARDEN_LEAVES).moved((x, y, 0.0))
     # Big loose crowns at the edge of the land, which hide where it ends.
-    angle, radius = rng.uniform(0, 2 * np.pi, 130), rng.uniform(150, 215, 130)
+    angle = rng.uniform(0, 2 * np.pi, 130)
+    radius = rng.uniform(150, 215, 130)
     size = rng.uniform(5.0, 9.0, 130)
     x = (layout.x0 + layout.x1) / 2
     x = x + (1 + (layout.x1 - layout.x0) / 2 / 200) * radius * np.cos(angle)
@@ -605,8 +705,8 @@ def build_vegetation(layout: Layout) -> Iterator[Shapes]:
 
 
 @joined
-def _tree(rng: np.random.Generator, size: float, leaves: int) -> Iterator[Shapes]:
-    """One tree at the origin; leaves: how many tufts its crown has."""
+def _tree(rng: np.random.Generator, size: float, num_leaves: int) -> Iterator[Shapes]:
+    """Build one tree at the origin. num_leaves: number of tufts of its crown."""
     height = size * rng.uniform(3.9, 4.6)  # of the crown's middle
     radii = size * np.array([1.0, 1.0, 1.15]) * rng.uniform(1.55, 1.95)
     top = np.array([*rng.uniform(-0.12, 0.12, 2), height])
@@ -615,38 +715,47 @@ def _tree(rng: np.random.Generator, size: float, leaves: int) -> Iterator[Shapes
     yield tube(fork * 0.48, fork, 0.115 * size, BARK)
     for k in range(4):
         angle = rng.uniform(0, 0.8) + k * np.pi / 2
-        reach = np.array([np.cos(angle), np.sin(angle), 0.9]) * radii * 0.62
-        yield tube(fork * 0.98, fork + reach, 0.055 * size, BARK)
+        branch = np.array([np.cos(angle), np.sin(angle), 0.9]) * radii * 0.62
+        yield tube(fork * 0.98, fork + branch, 0.055 * size, BARK)
     yield ball(top, radii * 0.62, CORE)
-    yield _crown(rng, top, radii, leaves)
+    yield _crown(rng, top, radii, num_leaves)
 
 
-def _crown(rng: np.random.Generator, centre: np.ndarray, radii: np.ndarray, leaves: int) -> Shapes:
-    """Tufts of leaves on boughs: round lumps around a core, lighter towards the outside and top."""
-    lumps = 34
-    step = np.arange(lumps)
-    height = 1 - (2 * step + 1) / lumps * 0.93  # the underside stays open around the trunk
+def _crown(
+    rng: np.random.Generator, centre: np.ndarray, radii: np.ndarray, num_leaves: int
+) -> Shapes:
+    """Return tufts of leaves on boughs: round lumps around a core, lighter towards the outside
+    and top.
+    """
+    num_lumps = 34
+    step = np.arange(num_lumps)
+    height = 1 - (2 * step + 1) / num_lumps * 0.93  # the underside stays open around the trunk
     angle = step * 2.39996 + rng.uniform(0, 6)
-    flat = np.sqrt(1 - height**2)
-    lump = xyz(flat * np.cos(angle), flat * np.sin(angle), height)
-    lump = unit(lump + rng.normal(size=(lumps, 3)) * 0.12)
-    lump_centre = lump * rng.uniform(0.60, 0.80, (lumps, 1))
-    lump_radius = rng.uniform(0.32, 0.44, lumps)
-    owner = rng.integers(lumps, size=leaves)
+    horizontal = np.sqrt(1 - height**2)
+    lump_directions = xyz(horizontal * np.cos(angle), horizontal * np.sin(angle), height)
+    lump_directions = unit(lump_directions + rng.normal(size=(num_lumps, 3)) * 0.12)
+    lump_centre = lump_directions * rng.uniform(0.60, 0.80, (num_lumps, 1))
+    lump_radius = rng.uniform(0.32, 0.44, num_lumps)
+    lump_of_leaf = rng.integers(num_lumps, size=num_leaves)
     # More of them on a lump's outside.
-    local = unit(unit(rng.normal(size=(leaves, 3))) + 0.75 * lump[owner])
-    reach = lump_radius[owner] * rng.uniform(0.7, 1.08, leaves)
-    spot = lump_centre[owner] + local * reach[:, None]
-    outward = unit(spot)
-    normal = unit(local + 0.5 * outward + 0.45 * rng.normal(size=(leaves, 3)))
-    size = 2.6 * radii.mean() / np.sqrt(leaves) * rng.uniform(0.75, 1.3, leaves)
-    u = unit(cross(normal, rng.normal(size=(leaves, 3))))
-    axes = np.stack([u, cross(normal, u) * 0.72, normal * 0.22], 1) * size[:, None, None]
-    shapes = ellipsoids(centre + spot * radii, axes, LEAF)
-    shapes.shading[:, 0] = normal
-    depth = np.clip((np.linalg.norm(spot, axis=1) - 0.6) / 0.45, 0, 1)
-    shapes.ambient[:] = 0.42 + 0.38 * depth + 0.22 * np.clip(outward[:, 2], -0.4, 1)
-    shapes.variation[:] = rng.random(leaves)
+    leaf_directions = unit(
+        unit(rng.normal(size=(num_leaves, 3))) + 0.75 * lump_directions[lump_of_leaf]
+    )
+    leaf_distances = lump_radius[lump_of_leaf] * rng.uniform(0.7, 1.08, num_leaves)
+    leaf_positions = lump_centre[lump_of_leaf] + leaf_directions * leaf_distances[:, None]
+    outwards = unit(leaf_positions)
+    leaf_normals = unit(leaf_directions + 0.5 * outwards + 0.45 * rng.normal(size=(num_leaves, 3)))
+    leaf_sizes = 2.6 * radii.mean() / np.sqrt(num_leaves) * rng.uniform(0.75, 1.3, num_leaves)
+    u = unit(cross(leaf_normals, rng.normal(size=(num_leaves, 3))))
+    axes = (
+        np.stack([u, cross(leaf_normals, u) * 0.72, leaf_normals * 0.22], 1)
+        * leaf_sizes[:, None, None]
+    )
+    shapes = ellipsoids(centre + leaf_positions * radii, axes, LEAF)
+    shapes.shading[:, 0] = leaf_normals
+    depth = np.clip((np.linalg.norm(leaf_positions, axis=1) - 0.6) / 0.45, 0, 1)
+    shapes.ambient[:] = 0.42 + 0.38 * depth + 0.22 * np.clip(outwards[:, 2], -0.4, 1)
+    shapes.variation[:] = rng.random(num_leaves)
     return shapes
 
 
@@ -658,8 +767,10 @@ PAINTS = (
     (0.30, 0.02, 0.02), (0.03, 0.07, 0.20), (0.16, 0.17, 0.18),
     (0.05, 0.13, 0.09), (0.36, 0.26, 0.06), (0.20, 0.29, 0.36),
 )  # fmt: skip
-CAR_SPACING = 0.6  # cars draw the eye
-PAINT = Look((-1.0, -1.0, -1.0), Class.VEHICLE, Material.PAINT, spacing=CAR_SPACING)  # not yet any
+# Relative spacing of the splats of cars, which draw the eye.
+CAR_SPACING = 0.6
+# Paint of unpainted cars. `draw_car` replaces its negative colour.
+PAINT = Look((-1.0, -1.0, -1.0), Class.VEHICLE, Material.PAINT, spacing=CAR_SPACING)
 CAR_GLASS = PAINT._replace(rgb=(0.012, 0.014, 0.016), ambient=0.8)
 TYRE = Look((0.022, 0.022, 0.023), Class.VEHICLE, spacing=CAR_SPACING)
 ARCH = TYRE.tinted((0.008, 0.008, 0.008))
@@ -672,7 +783,9 @@ WHEEL_RADIUS_M = 0.32
 
 
 class CarModel(NamedTuple):
-    """Measures in metres. hood, tail: where windscreen and rear window start, from the middle."""
+    """Measures of a car in metres. hood, tail: x of the lower ends of windscreen and rear
+    window.
+    """
 
     length: float
     width: float
@@ -685,6 +798,7 @@ class CarModel(NamedTuple):
 
     @property
     def size_m(self) -> tuple[float, float, float]:
+        """Return length, width and height of the car's box."""
         return (self.length + 0.08, self.width + 0.08, self.roof + 0.02 + 0.04)
 
 
@@ -696,7 +810,7 @@ CAR_MODELS = (
 
 
 def draw_car(seed: int) -> tuple[CarModel, Shapes]:
-    """A car of some model and paint."""
+    """Draw a car of some model and paint from the seed."""
     rng = np.random.default_rng(seed)
     model = CAR_MODELS[rng.integers(len(CAR_MODELS))]
     shapes = _unpainted(model).copy()
@@ -707,6 +821,7 @@ def draw_car(seed: int) -> tuple[CarModel, Shapes]:
 @lru_cache(maxsize=len(CAR_MODELS))
 @joined
 def _unpainted(model: CarModel) -> Iterator[Shapes]:
+    """Build a car whose paint has no colour yet."""
     yield from _body(model)
     yield from _glasshouse(model)
     yield from _wheels(model)
@@ -714,7 +829,7 @@ def _unpainted(model: CarModel) -> Iterator[Shapes]:
 
 
 def _body(model: CarModel) -> Iterator[Shapes]:
-    """The lower body, lofted along x through rounded cross sections."""
+    """Build the lower body, lofted along x through rounded cross sections."""
     half = model.length / 2
     s = np.concatenate([[-1, -0.985, -0.94], np.linspace(-0.82, 0.80, 11), [0.93, 0.982, 1]])
     x = s * half
@@ -727,101 +842,146 @@ def _body(model: CarModel) -> Iterator[Shapes]:
     # (share of the half width, share of the height) around one side of a section, from the sill up.
     lower = ((0.90, 0), (0.97, 0.10), (1.0, 0.42), (0.985, 0.72))
     profile = np.array([*lower, (0.94, 0.91), (0.86, 0.985), (0.45, 1.03)])
-    y, z = width[:, None] * profile[:, 0], low[:, None] + (top - low)[:, None] * profile[:, 1]
+    y = width[:, None] * profile[:, 0]
+    z = low[:, None] + (top - low)[:, None] * profile[:, 1]
     left = xyz(x[:, None], y, z)
     right = left * [1, -1, 1]
     yield _loft(np.concatenate([right, left[:, ::-1]], 1))  # from sill over to sill
     for index, turn in ((0, -1), (-1, 1)):  # both ends
-        a, b = right[index], left[index]
+        a = right[index]
+        b = left[index]
         yield quads(np.stack([a[:-1], b[:-1], b[1:], a[1:]], 1)[:, ::turn], PAINT)
 
 
 def _loft(rings: np.ndarray) -> Shapes:
-    """A smooth surface through rings [X, M, 3], facing outwards if rings run right to left."""
+    """Return a smooth surface through rings [X, M, 3].
+
+    It faces outwards if rings run right to left.
+    """
     normals = np.cross(np.gradient(rings, axis=0), np.gradient(rings, axis=1))
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    corners, bent = (
+    corners, corner_normals = (
         np.stack([g[:-1, :-1], g[1:, :-1], g[1:, 1:], g[:-1, 1:]], 2).reshape(-1, 4, 3)
         for g in (rings, normals)
     )
-    return quads(corners, PAINT, normals=bent)
+    return quads(corners, PAINT, normals=corner_normals)
 
 
 def _glasshouse(model: CarModel) -> Iterator[Shapes]:
-    """Windscreen, side windows with pillars, rear window and roof."""
-    base, top = model.width / 2 * 0.89, model.width / 2 * 0.70
-    z0, z1 = model.belt - 0.02, model.roof
+    """Build windscreen, side windows with pillars, rear window and roof."""
+    base = model.width / 2 * 0.89
+    top = model.width / 2 * 0.70
+    z0 = model.belt - 0.02
+    z1 = model.roof
 
     def side_point(s: float, t: float, sign: int) -> np.ndarray:
-        """s from rear to front, t from belt to roof."""
+        """Return the point at s from rear to front and t from belt to roof."""
         rear = model.tail + (model.roof_rear - model.tail) * t
         front = model.hood + (model.roof_front - model.hood) * t
         y = sign * (base + (top - base) * t**1.3 + 0.05 * t * (1 - t) * 4)  # bulging
         return np.array([rear + (front - rear) * s, y, z0 + (z1 - z0) * t])
 
     levels = (0.0, 0.09, 0.50, 0.86, 1.0)
-    cuts = (0.0, 0.06, 0.30, 0.36, 0.53, 0.58, 0.78, 0.93, 1.0)
-    cells = list(itertools.product(range(len(cuts) - 1), range(len(levels) - 1), (1, -1)))
+    side_cuts = (0.0, 0.06, 0.30, 0.36, 0.53, 0.58, 0.78, 0.93, 1.0)
+    cells = list(itertools.product(range(len(side_cuts) - 1), range(len(levels) - 1), (1, -1)))
     for look, is_clear in ((CAR_GLASS, True), (PAINT, False)):
         corners = []
         for i, j, sign in cells:
             if (i in (1, 3, 5, 6) and j in (1, 2)) == is_clear:
                 loop = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)][::-sign]
-                corners.append([side_point(cuts[k], levels[n], sign) for k, n in loop])
+                corners.append([side_point(side_cuts[k], levels[n], sign) for k, n in loop])
         yield quads(corners, look)
     for s, sign in ((1.0, 1), (0.0, -1)):  # windscreen, rear window
         ends = [[side_point(s, t, side) for t in levels] for side in (-1, 1)]
-        for look, (u0, u1), chosen in (
+        for look, (u0, u1), rows in (
             (CAR_GLASS, (0.06, 0.94), (1, 2)),
             (PAINT, (0.06, 0.94), (0, 3)),
             (PAINT, (0.0, 0.06), (0, 1, 2, 3)),
             (PAINT, (0.94, 1.0), (0, 1, 2, 3)),
         ):
             corners = []
-            for j in chosen:
+            for j in rows:
                 loop = [(u0, j), (u1, j), (u1, j + 1), (u0, j + 1)][::sign]
                 corners.append([ends[0][k] + (ends[1][k] - ends[0][k]) * u for u, k in loop])
             yield quads(corners, look)
     # A gently domed roof.
-    x, share = np.linspace(model.roof_rear, model.roof_front, 7)[:, None], np.linspace(-1, 1, 7)
-    dome = 0.03 * (1 - share[None, :] ** 2) * np.sin(np.linspace(0, np.pi, 7))[:, None] ** 0.5
-    yield _loft(xyz(x, share * top, model.roof + dome * 0.6))
+    x = np.linspace(model.roof_rear, model.roof_front, 7)[:, None]
+    lateral = np.linspace(-1, 1, 7)
+    dome = 0.03 * (1 - lateral[None, :] ** 2) * np.sin(np.linspace(0, np.pi, 7))[:, None] ** 0.5
+    yield _loft(xyz(x, lateral * top, model.roof + dome * 0.6))
 
 
 def _wheels(model: CarModel) -> Iterator[Shapes]:
-    radius, reach = WHEEL_RADIUS_M, model.width / 2
+    radius = WHEEL_RADIUS_M
+    half_width = model.width / 2
     for x in (model.length * 0.305, -model.length * 0.295):
         for side in (1, -1):
-            y, out = side * (reach - 0.005), (0.0, float(side), 0.0)
-            inner, outer = (x, side * (reach - 0.24), radius), (x, y + side * 0.028, radius)
-            yield disc((x, side * (reach + 0.012), radius + 0.03), out, radius + 0.065, ARCH)
+            y = side * (half_width - 0.005)
+            outwards = (0.0, float(side), 0.0)
+            inner = (x, side * (half_width - 0.24), radius)
+            outer = (x, y + side * 0.028, radius)
+            yield disc(
+                (x, side * (half_width + 0.012), radius + 0.03), outwards, radius + 0.065, ARCH
+            )
             yield tube(inner, outer, radius, TYRE)
-            yield disc(outer, out, radius, TYRE)
-            yield disc((x, y + side * 0.036, radius), out, radius * 0.68, RIM)
+            yield disc(outer, outwards, radius, TYRE)
+            yield disc((x, y + side * 0.036, radius), outwards, radius * 0.68, RIM)
 
 
 def _details(model: CarModel) -> Iterator[Shapes]:
-    """Lamps, mirrors, grille, number plates and bumpers."""
-    half, width = model.length / 2, model.width / 2
-    front_z, rear_z = model.belt - 0.35, model.belt - 0.20
+    """Build lamps, mirrors, grille, number plates and bumpers."""
+    half_length = model.length / 2
+    half_width = model.width / 2
+    front_z = model.belt - 0.35
+    rear_z = model.belt - 0.20
     for side in (1, -1):
-        for look, faces, x0, x1, z0, z1, share, over in (
-            (HEADLIGHT, "+x +z +y -y -z", half - 0.16, half + 0.012, front_z - 0.06, front_z + 0.07,
-             0.48, width * 0.80),
-            (TAILLIGHT, "-x +z +y -y -z", -half - 0.012, -half + 0.16, rear_z - 0.10, rear_z + 0.07,
-             0.48, width * 0.80),
-            (TRIM, "+x -x +y -y +z -z", model.hood - 0.42, model.hood - 0.30, model.belt,
-             model.belt + 0.13, 0.93, width + 0.035),
-        ):  # fmt: skip
-            y0, y1 = sorted((side * width * share, side * over))
+        for look, faces, x0, x1, z0, z1, inner_fraction, outer_y in (
+            (
+                HEADLIGHT,
+                "+x +z +y -y -z",
+                half_length - 0.16,
+                half_length + 0.012,
+                front_z - 0.06,
+                front_z + 0.07,
+                0.48,
+                half_width * 0.80,
+            ),
+            (
+                TAILLIGHT,
+                "-x +z +y -y -z",
+                -half_length - 0.012,
+                -half_length + 0.16,
+                rear_z - 0.10,
+                rear_z + 0.07,
+                0.48,
+                half_width * 0.80,
+            ),
+            (
+                TRIM,
+                "+x -x +y -y +z -z",
+                model.hood - 0.42,
+                model.hood - 0.30,
+                model.belt,
+                model.belt + 0.13,
+                0.93,
+                half_width + 0.035,
+            ),
+        ):
+            y0, y1 = sorted((side * half_width * inner_fraction, side * outer_y))
             yield boxes((x0, y0, z0), (x1, y1, z1), look, faces=faces.split())
-    front, back = half + 0.010, -half - 0.010
+    front_x = half_length + 0.010
+    rear_x = -half_length - 0.010
     for plate in (
-        ((front, -width * 0.42, front_z - 0.07), (0, width * 0.84, 0), (0, 0, 0.11), TRIM),
-        ((front, -width * 0.6, 0.36), (0, width * 1.2, 0), (0, 0, 0.12), TRIM),
-        ((half + 0.016, -0.26, 0.40), (0, 0.52, 0), (0, 0, 0.11), PLATE),
-        ((-half - 0.016, -0.26, rear_z - 0.22), (0, 0, 0.11), (0, 0.52, 0), PLATE),
-        ((back, -width * 0.7, 0.34), (0, 0, 0.13), (0, width * 1.4, 0), TRIM),
+        (
+            (front_x, -half_width * 0.42, front_z - 0.07),
+            (0, half_width * 0.84, 0),
+            (0, 0, 0.11),
+            TRIM,
+        ),
+        ((front_x, -half_width * 0.6, 0.36), (0, half_width * 1.2, 0), (0, 0, 0.12), TRIM),
+        ((half_length + 0.016, -0.26, 0.40), (0, 0.52, 0), (0, 0, 0.11), PLATE),
+        ((-half_length - 0.016, -0.26, rear_z - 0.22), (0, 0, 0.11), (0, 0.52, 0), PLATE),
+        ((rear_x, -half_width * 0.7, 0.34), (0, 0, 0.13), (0, half_width * 1.4, 0), TRIM),
     ):
         yield parallelograms(*plate)
 
@@ -839,17 +999,17 @@ GREEN = Look((0.05, 0.10, 0.07), Class.OTHER)
 CAST_IRON = Look((0.10, 0.10, 0.105), Class.BARRIER)
 
 
-def _pole(height: float) -> tuple:
+def _sign_pole(height: float) -> tuple:
     return (tube, (-0.03, 0, -0.05), (-0.03, 0, height), 0.032, STEEL)
 
 
-def _plate(z: float, width: float, height: float, look: Look, x=0.012, y=0.0) -> tuple:
-    """An upright rectangle facing +x."""
+def _sign_plate(z: float, width: float, height: float, look: Look, x=0.012, y=0.0) -> tuple:
+    """Return the builder and arguments of an upright rectangle facing +x."""
     corner = (x, -width / 2 + y, z - height / 2)
     return (parallelograms, corner, (0, width, 0), (0, 0, height), look)
 
 
-def _rear(z: float, size: float) -> tuple:
+def _sign_back(z: float, size: float) -> tuple:
     return (parallelograms, (0.0, -size / 2, z - size / 2), (0, 0, size), (0, size, 0), GREY)
 
 
@@ -873,53 +1033,55 @@ BOLLARD = (
     (ball, (0, 0, 0.85), (0.06, 0.06, 0.05), CAST_IRON),
 )
 CROSSING_SIGN = (
-    _pole(2.75),
-    _rear(2.45, 0.62),
-    _plate(2.45, 0.64, 0.64, BLUE),
+    _sign_pole(2.75),
+    _sign_back(2.45, 0.62),
+    _sign_plate(2.45, 0.64, 0.64, BLUE),
     (triangles, (0.022, -0.2, 2.3), np.array([0.022, 0.2, 2.3]), (0.022, 0.0, 2.66), WHITE),
-    _plate(2.40, 0.09, 0.18, BLACK, 0.032),
+    _sign_plate(2.40, 0.09, 0.18, BLACK, 0.032),
 )
 LIMIT_SIGN = (
-    _pole(2.85),
+    _sign_pole(2.85),
     (disc, (0.010, 0, 2.5), (1, 0, 0), 0.31, RED),
     (disc, (0.018, 0, 2.5), (1, 0, 0), 0.235, WHITE),
     (disc, (0, 0, 2.5), (-1, 0, 0), 0.31, GREY),
-    _plate(2.5, 0.13, 0.24, BLACK, 0.024, -0.1),
-    _plate(2.5, 0.045, 0.14, WHITE, 0.030, -0.1),
-    _plate(2.5, 0.13, 0.24, BLACK, 0.024, 0.1),
-    _plate(2.5, 0.045, 0.14, WHITE, 0.030, 0.1),
+    _sign_plate(2.5, 0.13, 0.24, BLACK, 0.024, -0.1),
+    _sign_plate(2.5, 0.045, 0.14, WHITE, 0.030, -0.1),
+    _sign_plate(2.5, 0.13, 0.24, BLACK, 0.024, 0.1),
+    _sign_plate(2.5, 0.045, 0.14, WHITE, 0.030, 0.1),
 )
 PARKING_SIGN = (
-    _pole(2.7),
-    _rear(2.4, 0.5),
-    _plate(2.4, 0.52, 0.52, BLUE),
-    _plate(2.4, 0.07, 0.36, WHITE, 0.02, -0.09),  # the letter P
-    _plate(2.54, 0.18, 0.07, WHITE, 0.02, 0.02),
-    _plate(2.4, 0.18, 0.07, WHITE, 0.02, 0.02),
-    _plate(2.47, 0.07, 0.2, WHITE, 0.02, 0.11),
+    _sign_pole(2.7),
+    _sign_back(2.4, 0.5),
+    _sign_plate(2.4, 0.52, 0.52, BLUE),
+    _sign_plate(2.4, 0.07, 0.36, WHITE, 0.02, -0.09),  # the letter P
+    _sign_plate(2.54, 0.18, 0.07, WHITE, 0.02, 0.02),
+    _sign_plate(2.4, 0.18, 0.07, WHITE, 0.02, 0.02),
+    _sign_plate(2.47, 0.07, 0.2, WHITE, 0.02, 0.11),
 )
 SIGNS = (CROSSING_SIGN, CROSSING_SIGN, LIMIT_SIGN, LIMIT_SIGN, PARKING_SIGN)
 
 
 @joined
 def build_furniture(layout: Layout) -> Iterator[Shapes]:
-    """Everything man-made that stands on the pavements."""
-    rng = stream(layout.parameters, 40)
-    places = [(LAMP, x, y, 0.0 if y < 0 else np.pi) for x, y in layout.lamps]
+    """Build everything man-made that stands on the pavements."""
+    rng = rng_of(layout.parameters, 40)
+    placements = [(LAMP, x, y, 0.0 if y < 0 else np.pi) for x, y in layout.lamps]
     for form, (x, y) in zip(SIGNS, layout.signs, strict=True):
-        places.append((form, x, y, np.pi if y < 0 else 0.0))  # facing the traffic on its side
-    places += [(LITTER_BIN, x + rng.uniform(1.2, 2.0), y, 0.0) for x, y in layout.lamps[::2]]
+        placements.append((form, x, y, np.pi if y < 0 else 0.0))  # facing the traffic on its side
+    placements += [(LITTER_BIN, x + rng.uniform(1.2, 2.0), y, 0.0) for x, y in layout.lamps[::2]]
     for y in (ROAD_HALF_M + 0.4, -ROAD_HALF_M - 0.4):
-        places += [(BOLLARD, layout.zebra_x + dx, y, 0.0) for dx in (-3.4, 3.4, -4.6, 4.6)]
-    for form, x, y, yaw in places:
+        placements += [(BOLLARD, layout.zebra_x + dx, y, 0.0) for dx in (-3.4, 3.4, -4.6, 4.6)]
+    for form, x, y, yaw in placements:
         shapes = join([build(*arguments) for build, *arguments in form])
         yield shapes.moved((x, y, float(pavement_z(y))), yaw)
 
 
 # ---- The whole -----------------------------------------------------------------------------------
 
-ROOF_Z_M = 11.5  # of a typical house, for sky light between the fronts
-SINK_M = 0.008  # tyres sit this far in the road, as on their contact patch
+# Height of a typical house, for sky light between the fronts.
+ROOF_Z_M = 11.5
+# Depth of tyres in the road, as on their contact patch.
+SINK_M = 0.008
 
 
 @dataclass(frozen=True, eq=False)
@@ -935,7 +1097,15 @@ class MovingBody:
 
 @dataclass(frozen=True, eq=False)
 class Street:
-    """Everything that is known of a street. parked: name, centre, size and yaw of each car."""
+    """A built street.
+
+    Attributes:
+        parameters: its parameters.
+        layout: its plan.
+        static: the body of everything that does not move.
+        movers: the moving bodies.
+        parked: name, centre, size and yaw of each parked car.
+    """
 
     parameters: StreetParameters
     layout: Layout
@@ -946,52 +1116,61 @@ class Street:
 
 @lru_cache(maxsize=2)
 def build_street(parameters: StreetParameters) -> Street:
-    """The street of these parameters; the last two are kept."""
+    """Build the street of these parameters. The last two are cached."""
     layout = draw_layout(parameters)
-    ends = np.array([frame_time_ns(0), frame_time_ns(parameters.frames - 1)])
-    rng = stream(parameters, 7)
+    drive_ends_ns = np.array([frame_time_ns(0), frame_time_ns(parameters.frames - 1)])
+    rng = rng_of(parameters, 7)
     builders = (build_ground, build_buildings, build_vegetation, build_furniture)
     parts = [build(layout) for build in builders]
-    parked = []
+    parked_cars = []
     for number, (x, y) in enumerate(layout.parked):  # each faces its side's traffic
         model, car = draw_car(int(rng.integers(2**31)))
-        yaw, ground = 0.0 if y < 0 else np.pi, float(road_z(PARKED_Y_M)) - SINK_M
+        yaw = 0.0 if y < 0 else np.pi
+        ground = float(road_z(PARKED_Y_M)) - SINK_M
         parts.append(car.moved((x, y, ground), yaw))
         centre = (float(x), float(y), ground + model.size_m[2] / 2)
-        parked.append((f"parked-{number}", centre, model.size_m, yaw))
+        parked_cars.append((f"parked-{number}", centre, model.size_m, yaw))
     shapes = join(parts)
-    footprints = [(*at[:2], size[0] / 2, size[1] / 2) for _, at, size, _ in parked]
+    footprints = [(*center[:2], size[0] / 2, size[1] / 2) for _, center, size, _ in parked_cars]
     lighting = Lighting(
         to_sun=direction_to_sun(parameters.seed),
-        eye_path=camera_path(parameters, ends),
+        eye_path=camera_path(parameters, drive_ends_ns),
         canyon=(-FACADE_M, FACADE_M, ROOF_Z_M),
         footprints=np.array(footprints).reshape(-1, 4),
     )
     static = Body(shapes, build_tree(shapes), lighting)
-    movers = tuple(_moving_body(mover, layout, static, ends) for mover in layout.movers)
-    return Street(parameters, layout, static, movers, tuple(parked))
+    movers = tuple(_moving_body(mover, layout, static, drive_ends_ns) for mover in layout.movers)
+    return Street(parameters, layout, static, movers, tuple(parked_cars))
 
 
-def _moving_body(mover: Mover, layout: Layout, static: Body, ends: np.ndarray) -> MovingBody:
+def _moving_body(
+    mover: Mover, layout: Layout, static: Body, drive_ends_ns: np.ndarray
+) -> MovingBody:
+    """Build the body of a mover, with its light and motion."""
     if mover.name.startswith("car"):
         model, shapes = draw_car(mover.seed)
-        size, ground, label = model.size_m, float(road_z(mover.y_m)) - SINK_M, "Car"
+        size = model.size_m
+        ground = float(road_z(mover.y_m)) - SINK_M
+        label = "Car"
     else:
-        shapes, size = draw_person(mover.seed), PERSON_SIZE_M
-        ground, label = float(pavement_z(mover.y_m)), "Pedestrian"
+        shapes = draw_person(mover.seed)
+        size = PERSON_SIZE_M
+        ground = float(pavement_z(mover.y_m))
+        label = "Pedestrian"
     shapes = shapes.moved((0, 0, -size[2] / 2))
     motion = motion_of(mover, layout, size[2], ground)
-    turn = 1.0 if motion.yaw == 0 else -1.0  # the heading is along +x or -x
-    flip, centre = np.array([turn, turn, 1.0]), motion.centres[0]
-    walls = sorted(turn * (side * FACADE_M - centre[1]) for side in (-1, 1))
+    heading_sign = 1.0 if motion.yaw == 0 else -1.0  # the heading is along +x or -x
+    axis_signs = np.array([heading_sign, heading_sign, 1.0])
+    centre = motion.centres[0]
+    walls = sorted(heading_sign * (side * FACADE_M - centre[1]) for side in (-1, 1))
     directions = static.lighting.sun_directions()
     origins = np.repeat(motion.centres, len(directions), axis=0)
-    shaded = static.tree.occluded(origins, np.tile(directions, (len(motion.centres), 1)))
+    is_shaded = static.tree.occluded(origins, np.tile(directions, (len(motion.centres), 1)))
     lighting = Lighting(
-        to_sun=static.lighting.to_sun * flip,
-        eye_path=(static.lighting.eye_path - motion.at(ends)[0]) * flip,
+        to_sun=static.lighting.to_sun * axis_signs,
+        eye_path=(static.lighting.eye_path - motion.at(drive_ends_ns)[0]) * axis_signs,
         canyon=(walls[0], walls[1], ROOF_Z_M - centre[2]),
         ground_z=-size[2] / 2,
-        sunlit=1 - float(shaded.mean()),
+        sunlit=1 - float(is_shaded.mean()),
     )
     return MovingBody(mover.name, label, size, Body(shapes, build_tree(shapes), lighting), motion)

@@ -6,8 +6,9 @@
     ego_pose/<frame>_<cam>.txt    the same at the camera's
     timestamps.json               seconds by FRAME or camera name, then by frame
 
-World: the dataset's, minus the mean position of the car over all its frames, as the models are
-trained. Vehicle frame: x forward, y left, z up. Times are seconds as the dataset has them.
+`read_data` reads all of it. World: the dataset's, minus the mean position of the car over all its
+frames, as the models are trained. Vehicle frame: x forward, y left, z up. Times are seconds as the
+dataset has them. The callers are `adapters.street_gaussians.adapter` and `.model`.
 """
 
 from __future__ import annotations
@@ -48,11 +49,11 @@ Number = Annotated[int, Field(ge=0, lt=10**9)]  # of a frame or object
 
 
 class ModelConfig(BaseModel):
-    """What of a model's configuration decides how it is read, by its keys there; the defaults are
-    the project's own.
+    """The part of a model's configuration that decides how the model is read, by its keys there.
 
-    cameras: numbers in CAMERA_NAMES. selected_frames: first and last, both included; None for all.
-    split_test, split_train: every how manyeth frame is held out or trained on; -1 where unused.
+    The defaults are the project's. cameras: numbers in CAMERA_NAMES. selected_frames: first and
+    last, both included; None for all. split_test, split_train: step between frames that are held
+    out or trained on; -1 if unused.
     """
 
     model_config = ConfigDict(frozen=True, populate_by_name=True)
@@ -82,9 +83,13 @@ class ModelConfig(BaseModel):
     @field_validator("cameras")
     @classmethod
     def _are_known(cls, cameras: tuple[int, ...]) -> tuple[int, ...]:
-        known = range(len(CAMERA_NAMES))
-        if not cameras or len(set(cameras)) != len(cameras) or not set(cameras) <= set(known):
-            raise ValueError(f"must be different camera numbers from 0 to {known[-1]}")
+        known_cameras = range(len(CAMERA_NAMES))
+        if (
+            not cameras
+            or len(set(cameras)) != len(cameras)
+            or not set(cameras) <= set(known_cameras)
+        ):
+            raise ValueError(f"must be different camera numbers from 0 to {known_cameras[-1]}")
         return cameras
 
     @field_validator("selected_frames")
@@ -96,7 +101,9 @@ class ModelConfig(BaseModel):
 
 
 class Lens(NamedTuple):
-    """camera_from_ego: float64 [4, 4], OpenCV axes."""
+    """Calibration of a camera: intrinsics in pixels, and camera_from_ego, float64 [4, 4], OpenCV
+    axes.
+    """
 
     fx: float
     fy: float
@@ -107,11 +114,18 @@ class Lens(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StreetImage:
-    """One image, or a camera without its image. cam: number in CAMERA_NAMES.
+    """One image, or a camera without its image.
 
-    world_from_ego: float64 [4, 4], at the moment of the image. is_held_out: not trained on.
-    number: its position among all images of the selected frames and cameras, by frame, then camera,
-    left out or not: the index of per-image corrections.
+    Attributes:
+        frame: number of the frame.
+        cam: number in CAMERA_NAMES.
+        path: the image's file. None without an image.
+        timestamp_s: time of the image.
+        world_from_ego: float64 [4, 4], at the moment of the image.
+        camera: the camera.
+        is_held_out: True if the image was not trained on.
+        number: position among all images of the selected frames and cameras, by frame, then camera,
+            including left-out ones. It is the index of per-image corrections.
     """
 
     frame: int
@@ -136,8 +150,13 @@ class StreetImage:
 class TrackedObject:
     """A moving object of the model: `obj_{track_id:03d}`.
 
-    size_m: length, width, height; training kept splats in a box that was wider and longer by
-    data.box_scale. start_frame, end_frame: of its track. start_s, end_s: when it is drawn.
+    Attributes:
+        track_id: its number.
+        label: its class.
+        size_m: length, width, height. Training kept splats in a box that was wider and longer by
+            data.box_scale.
+        start_frame, end_frame: first and last frame of its track.
+        start_s, end_s: time span in which it is drawn.
     """
 
     track_id: int
@@ -151,10 +170,12 @@ class TrackedObject:
 
 @dataclass(frozen=True, eq=False)
 class Tracklets:
-    """Where objects are in each of F selected frames, in the columns that the model has them in.
+    """Places of objects in each of F selected frames, in the columns of the model.
 
-    ids: int64 [F, M], -1 for none. positions: float64 [F, M, 3], metres, vehicle frame at the
-    frame's time. quats: float64 [F, M, 4] wxyz.
+    Attributes:
+        ids: int64 [F, M], -1 for none.
+        positions: float64 [F, M, 3], metres, vehicle frame at the frame's time.
+        quats: float64 [F, M, 4], wxyz.
     """
 
     ids: np.ndarray
@@ -166,9 +187,17 @@ class Tracklets:
 class StreetData:
     """A dataset directory as a model sees it.
 
-    frames: selected numbers, ascending. world_from_ego: float64 [F, 4, 4]; between its neighbours'
-    where the file is missing, so that the rows stay those of the model, but such a frame has no
-    images. images: by frame, then camera. objects: moving ones, in the track file's order.
+    Attributes:
+        root: the directory.
+        world_origin_m: float64 [3], subtracted from the dataset's world.
+        frames: selected numbers, ascending.
+        frame_times_s: float64 [F].
+        world_from_ego: float64 [F, 4, 4]. If the file is missing, the pose lies between its
+            neighbours', so that the rows stay those of the model; such a frame has no images.
+        images: by frame, then camera.
+        objects: moving objects, in the track file's order.
+        tracklets: places of the objects.
+        problems: one sentence each.
     """
 
     root: Path
@@ -184,9 +213,12 @@ class StreetData:
 
 # ---- Cameras, poses and times --------------------------------------------------------------------
 
+# Name of the file of times.
 TIMES = "timestamps.json"
+# Name of a file with the pose of a frame.
 _FRAME_POSE = re.compile(r"([0-9]{1,9})\.txt")
-_MAX_GAPS = 1000  # numbers between the first frame and the last that nothing is known of
+# Largest number of frames between the first and the last of which nothing is known.
+_MAX_GAPS = 1000
 _Seconds = dict[Number, Annotated[float, Field(strict=True, ge=0, lt=9e9, allow_inf_nan=False)]]
 
 
@@ -200,17 +232,22 @@ class _Times(BaseModel):
 
 
 def read_times(root: Path) -> dict[str, dict[int, float]]:
-    """Seconds by FRAME or camera name, then frame number."""
+    """Read seconds by FRAME or camera name, then frame number."""
     path = root / TIMES
     return validate(_Times, read_json(path), path, "table of seconds by frame").model_dump()
 
 
 @dataclass(frozen=True, eq=False)
 class EgoPath:
-    """The car at every frame of the drive (numbers: consecutive), in the dataset's world.
+    """The car at every frame of the drive, in the dataset's world.
 
-    world_from_ego: float64 [N, 4, 4]. is_known: bool [N], False where the pose is missing and was
-    put between its neighbours. camera_times_s: by camera name, then frame number.
+    Attributes:
+        numbers: consecutive frame numbers.
+        times_s: float64 [N].
+        world_from_ego: float64 [N, 4, 4].
+        is_known: bool [N], False if the pose is missing and was interpolated.
+        camera_times_s: by camera name, then frame number.
+        problems: one sentence each.
     """
 
     numbers: range
@@ -222,12 +259,12 @@ class EgoPath:
 
 
 def calibrated_cameras(root: Path) -> tuple[int, ...]:
-    """The numbers of the cameras that have extrinsics."""
+    """Return the numbers of the cameras that have extrinsics."""
     return tuple(c for c in range(len(CAMERA_NAMES)) if (root / f"extrinsics/{c}.txt").exists())
 
 
 def read_lens(root: Path, cam: int) -> Lens:
-    """A camera's calibration."""
+    """Read a camera's calibration."""
     path = root / "intrinsics" / f"{cam}.txt"
     values = read_numbers(path)
     if values.size < 4 or min(values[:2]) <= 0:
@@ -239,82 +276,94 @@ def read_lens(root: Path, cam: int) -> Lens:
 
 
 def read_ego_path(root: Path) -> EgoPath:
-    """Every frame's pose and time."""
+    """Read every frame's pose and time."""
     folder = root / "ego_pose"
     if not folder.is_dir():
         raise AdapterError(
             f"{folder} does not exist; expected a drive in Street Gaussians' layout, with "
             f"ego_pose/, extrinsics/, intrinsics/, track/ and {TIMES}"
         )
-    found = {int(m[1]): p for p in folder.iterdir() if (m := _FRAME_POSE.fullmatch(p.name))}
-    if not found:
+    pose_files = {int(m[1]): p for p in folder.iterdir() if (m := _FRAME_POSE.fullmatch(p.name))}
+    if not pose_files:
         raise AdapterError(f"{folder} holds no pose NNNNNN.txt; copy the folder from the dataset")
     times = read_times(root)
-    timed = dict(sorted(times["FRAME"].items()))
-    if untimed := sorted(set(found) - set(timed)):
+    frame_times_s = dict(sorted(times["FRAME"].items()))
+    if frames_without_time := sorted(set(pose_files) - set(frame_times_s)):
         raise AdapterError(
-            f"{root / TIMES}: FRAME lacks frame {untimed[0]:06d}, of which there is "
-            f"{found[untimed[0]]}; both must be of one conversion"
+            f"{root / TIMES}: FRAME lacks frame {frames_without_time[0]:06d}, of which there is "
+            f"{pose_files[frames_without_time[0]]}; both must be of one conversion"
         )
-    numbers = range(min(timed), max(timed) + 1)
-    if len(numbers) - len(timed) > _MAX_GAPS:
+    numbers = range(min(frame_times_s), max(frame_times_s) + 1)
+    if len(numbers) - len(frame_times_s) > _MAX_GAPS:
         raise AdapterError(
-            f"{root / TIMES}: FRAME must hold consecutive frames; it holds {len(timed)} from "
-            f"{numbers[0]} to {numbers[-1]}"
+            f"{root / TIMES}: FRAME must hold consecutive frames; it holds {len(frame_times_s)} "
+            f"from {numbers[0]} to {numbers[-1]}"
         )
-    known = np.array([number in found for number in numbers])
-    times_s = np.interp(numbers, list(timed), list(timed.values()))
+    has_pose = np.array([number in pose_files for number in numbers])
+    times_s = np.interp(numbers, list(frame_times_s), list(frame_times_s.values()))
     if not (np.diff(times_s) > 0).all():
         raise AdapterError(f"{root / TIMES}: the seconds of FRAME must increase with the frames")
-    poses = _fill(times_s, known, np.stack([read_pose(found[n]) for n in sorted(found)]))
+    poses = _fill_missing_poses(
+        times_s, has_pose, np.stack([read_pose(pose_files[n]) for n in sorted(pose_files)])
+    )
     problems = ()
-    if missing := [numbers[i] for i in np.flatnonzero(~known)]:
+    if frames_without_pose := [numbers[i] for i in np.flatnonzero(~has_pose)]:
         problems = (
-            f"{folder} lacks the poses of {len(missing)} of {len(numbers)} frames, such as "
-            f"{missing[0]:06d}: these frames are left out, and the middle of the drive, on which "
-            f"the world of trained models is centred, is guessed from the frames beside them",
+            f"{folder} lacks the poses of {len(frames_without_pose)} of {len(numbers)} frames, "
+            f"such as {frames_without_pose[0]:06d}: these frames are left out, and the middle of "
+            f"the drive, on which the world of trained models is centred, is guessed from the "
+            f"frames beside them",
         )
-    return EgoPath(numbers, times_s, poses, known, times, problems)
+    return EgoPath(numbers, times_s, poses, has_pose, times, problems)
 
 
-def _fill(times_s: np.ndarray, known: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """The poses of all times, float64 [N, 4, 4], from those of the known ones: on the straight line
-    through the two nearest in time, turned as far as between them and no further."""
-    filled = np.empty((len(times_s), 4, 4))
-    filled[known] = poses
-    known_s = times_s[known]
-    for i in np.flatnonzero(~known):
+def _fill_missing_poses(times_s: np.ndarray, has_pose: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Return the poses of all times, float64 [N, 4, 4], from those that are known.
+
+    A missing pose is on the straight line through the two nearest in time. Its rotation is between
+    theirs, and never beyond.
+    """
+    all_poses = np.empty((len(times_s), 4, 4))
+    all_poses[has_pose] = poses
+    known_s = times_s[has_pose]
+    for i in np.flatnonzero(~has_pose):
         if len(poses) == 1:
-            filled[i] = poses[0]
+            all_poses[i] = poses[0]
             continue
         after = int(np.clip(np.searchsorted(known_s, times_s[i]), 1, len(poses) - 1))
-        a, b = poses[after - 1], poses[after]
-        share = (times_s[i] - known_s[after - 1]) / (known_s[after] - known_s[after - 1])
-        filled[i] = a + share * (b - a)
+        a = poses[after - 1]
+        b = poses[after]
+        fraction = (times_s[i] - known_s[after - 1]) / (known_s[after] - known_s[after - 1])
+        all_poses[i] = a + fraction * (b - a)
         quats = quat_from_rotmat(torch.from_numpy(np.stack([a[:3, :3], b[:3, :3]])))
-        share = torch.tensor(min(max(share, 0.0), 1.0), dtype=torch.float64)
-        filled[i, :3, :3] = rotmat_from_quat(slerp(quats[0], quats[1], share)).numpy()
-    return filled
+        fraction = torch.tensor(min(max(fraction, 0.0), 1.0), dtype=torch.float64)
+        all_poses[i, :3, :3] = rotmat_from_quat(slerp(quats[0], quats[1], fraction)).numpy()
+    return all_poses
 
 
 # ---- Images and their sizes, told by their first bytes -------------------------------------------
 
-_NAME = re.compile(r"([0-9]{1,9})_([0-9])\.(png|jpg|jpeg)", re.IGNORECASE)
-_FULL_SIZE, _SIDE_SIZE = (1920, 1280), (1920, 886)  # of Waymo's front cameras and side cameras
+# Name of an image's file: frame and camera.
+_IMAGE_NAME = re.compile(r"([0-9]{1,9})_([0-9])\.(png|jpg|jpeg)", re.IGNORECASE)
+# Width and height of the images of Waymo's front cameras.
+_FRONT_IMAGE_SIZE = (1920, 1280)
+# Width and height of the images of Waymo's side cameras.
+_SIDE_IMAGE_SIZE = (1920, 886)
 
 
 def find_images(
     root: Path, frames: range, lenses: Mapping[int, Lens]
 ) -> tuple[dict[tuple[int, int], Path], dict[int, tuple[int, int]], list[str]]:
-    """Usable images by frame and camera, each camera's image size, and sentences on the rest.
+    """Return usable images by frame and camera, each camera's image size, and sentences on the
+    rest.
 
-    Where a camera has no image, its size is Waymo's.
+    The size of a camera without images is Waymo's.
     """
     folder = root / "images"
-    listed: dict[tuple[int, int], Path] = {}
+    listed_paths: dict[tuple[int, int], Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if match := _NAME.fullmatch(path.name):
-            other = listed.setdefault((int(match[1]), int(match[2])), path)
+        if match := _IMAGE_NAME.fullmatch(path.name):
+            other = listed_paths.setdefault((int(match[1]), int(match[2])), path)
             if other != path:
                 raise AdapterError(f"{other} and {path} are one image; delete one of them")
     paths: dict[tuple[int, int], Path] = {}
@@ -324,30 +373,30 @@ def find_images(
     without_images = []
     for cam, lens in lenses.items():
         name = CAMERA_NAMES[cam]
-        keys = [key for key in sorted(listed) if key[0] in frames and key[1] == cam]
-        seen = {key: _image_header(listed[key]) for key in keys}
-        counts = Counter(header.size for header in seen.values() if header is not None)
-        waymo_size = _SIDE_SIZE if name.startswith("SIDE") else _FULL_SIZE
+        keys = [key for key in sorted(listed_paths) if key[0] in frames and key[1] == cam]
+        headers = {key: _image_header(listed_paths[key]) for key in keys}
+        counts = Counter(header.size for header in headers.values() if header is not None)
+        waymo_size = _SIDE_IMAGE_SIZE if name.startswith("SIDE") else _FRONT_IMAGE_SIZE
         sizes[cam] = width, height = counts.most_common(1)[0][0] if counts else waymo_size
         if not counts:
             without_images.append(f"{width}x{height} for {name}")
-        for key, header in seen.items():
+        for key, header in headers.items():
             if header is None:
-                problems.append(f"{listed[key]} is no image, or a damaged one; left out")
+                problems.append(f"{listed_paths[key]} is no image, or a damaged one; left out")
             elif header.size != sizes[cam]:
                 problems.append(
-                    f"{listed[key]} is {header.width}x{header.height} pixels, most images of "
+                    f"{listed_paths[key]} is {header.width}x{header.height} pixels, most images of "
                     f"{name} are {width}x{height}; left out{exif_hint(header, sizes[cam])}"
                 )
             else:
-                paths[key] = listed[key]
-                used.append((Picture(name, key[0], listed[key]), header))
+                paths[key] = listed_paths[key]
+                used.append((Picture(name, key[0], listed_paths[key]), header))
         if not (0 < lens.cx < width and 0 < lens.cy < height):
-            whose = "as its images are" if counts else "assumed for want of images"
+            reason = "as its images are" if counts else "assumed for want of images"
             raise AdapterError(
                 f"{root}/intrinsics/{cam}.txt: cx, cy (its third and fourth number) must lie in "
-                f"the {width}x{height} pixels of {name}, {whose}; got {lens.cx:g}, {lens.cy:g}. If "
-                f"the images were resized, scale fx fy cx cy with them"
+                f"the {width}x{height} pixels of {name}, {reason}; got {lens.cx:g}, {lens.cy:g}. "
+                f"If the images were resized, scale fx fy cx cy with them"
             )
     if without_images:
         problems.append(
@@ -358,7 +407,7 @@ def find_images(
 
 
 def _image_header(path: Path) -> ImageHeader | None:
-    """The header of an image; None for what is none."""
+    """Return the header of an image, or None if the file is no image."""
     try:
         return read_image_header(path)
     except OSError:
@@ -366,19 +415,23 @@ def _image_header(path: Path) -> ImageHeader | None:
 
 
 # ---- The tracked objects of a drive, in the columns in which a trained model has them ------------
-# Nothing in a model says which column of its actors' poses is whose. The columns are had again by
-# going over the track file as training did: rows in the file's order, each into the first free
-# column of its frame; objects that hardly move are then taken out.
+# Nothing in a model says which column of its actors' poses belongs to which object. The columns are
+# reconstructed by reading the track file as training did: rows in the file's order, each into the
+# first free column of its frame. Then objects that hardly move are removed.
 
-NOT_TRACKED = ("sign", "misc")  # classes
-_SPREAD_M = 0.5  # standard deviation along an axis of the world above which an object moves
-_TRAVEL_M = 2.0  # or distance between its first place and its last
-_HOLD_S = 0.1  # an object is drawn so long before its first frame and after its last
+# Classes whose objects are not tracked.
+NOT_TRACKED = ("sign", "misc")
+# An object moves if the standard deviation of its places along a world axis is above this,
+_MIN_SPREAD_M = 0.5
+# or if the distance between its first place and its last is above this.
+_MIN_TRAVEL_M = 2.0
+# An object is drawn this long before its first frame and after its last.
+_HOLD_S = 0.1
 _Metres = Annotated[FiniteFloat, Field(gt=0)]
 
 
 class _TrackRow(BaseModel):
-    """The columns of a track file, in their order."""
+    """Columns of a track file, in their order."""
 
     frame_id: Number
     track_id: Number
@@ -396,11 +449,21 @@ class _TrackRow(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class TrackTable:
-    """A track file of N rows in its order. All in the vehicle's frame at the frame's time.
+    """A track file of N rows in its order.
 
-    lines: int64 [N], for messages. frames, ids: int64 [N]. sizes_m: float64 [N, 3], length, width,
-    height. centers_m: float64 [N, 3]. headings: float64 [N], about z. speeds_mps: None where the
-    file has none.
+    Everything is in the vehicle's frame at the frame's time.
+
+    Attributes:
+        path: the file.
+        lines: int64 [N], for messages.
+        frames, ids: int64 [N].
+        labels: classes.
+        alphas: float64 [N], as in the file.
+        sizes_m: float64 [N, 3], length, width, height.
+        centers_m: float64 [N, 3].
+        headings: float64 [N], about z.
+        speeds_mps: float64 [N]. None if the file has none.
+        problems: one sentence each.
     """
 
     path: Path
@@ -420,13 +483,13 @@ class TrackTable:
 
 
 def track_files(root: Path, *, use_tracker: bool) -> tuple[Path, Path]:
-    """The track file and the one that says which cameras see its objects."""
+    """Return the track file, and the file of the cameras that see its objects."""
     suffix = "_castrack" if use_tracker else ""
     return root / f"track/track_info{suffix}.txt", root / f"track/track_camera_vis{suffix}.json"
 
 
 def read_track_table(path: Path) -> TrackTable:
-    """A track file, of which the first line names the columns and is not read."""
+    """Read a track file. Its first line names the columns and is not read."""
     texts = read_text(path).splitlines()
     names = list(_TrackRow.model_fields)
     rows: dict[int, _TrackRow] = {}
@@ -435,17 +498,19 @@ def read_track_table(path: Path) -> TrackTable:
         if not (words := dict(zip(names, text.split(), strict=False))):
             continue
         row = rows[line] = validate(_TrackRow, words, f"{path}, line {line}", "row of a track file")
-        before = first_lines.setdefault((row.frame_id, row.track_id), line)
-        if before != line:
+        first_line = first_lines.setdefault((row.frame_id, row.track_id), line)
+        if first_line != line:
             raise AdapterError(
                 f"{path}, line {line}: object {row.track_id} is already in frame {row.frame_id} by "
-                f"line {before}; delete one of them"
+                f"line {first_line}; delete one of them"
             )
     has_speed = bool(rows) and next(iter(rows.values())).speed is not None
-    if odd := [line for line, row in rows.items() if (row.speed is not None) != has_speed]:
+    if deviating_lines := [
+        line for line, row in rows.items() if (row.speed is not None) != has_speed
+    ]:
         raise AdapterError(
-            f"{path}, line {odd[0]}: all rows must hold a speed in column {len(names)}, or none; "
-            f"it differs from the first row"
+            f"{path}, line {deviating_lines[0]}: all rows must hold a speed in column "
+            f"{len(names)}, or none; it differs from the first row"
         )
     header = texts[0].split() if texts else []
     problems = ()
@@ -474,77 +539,87 @@ def read_track_table(path: Path) -> TrackTable:
 
 
 class _Visibility(RootModel[dict[Number, dict[Number, frozenset[StrictInt]]]]):
-    """The cameras that see an object, by object and frame."""
+    """Cameras that see an object, by object and frame."""
 
 
-def seen_rows(table: TrackTable, visible_path: Path, cams: Sequence[int]) -> np.ndarray:
-    """Indices of the rows of tracked classes that one of the cameras sees, int64 [R]."""
-    content, kind = read_json(visible_path), "list of camera numbers by object and frame"
+def find_visible_rows(table: TrackTable, visible_path: Path, cams: Sequence[int]) -> np.ndarray:
+    """Return the indices of the rows of tracked classes that one of the cameras sees, int64 [R]."""
+    content = read_json(visible_path)
+    kind = "list of camera numbers by object and frame"
     visible = validate(_Visibility, content, visible_path, kind)
-    kept = []
+    visible_rows = []
     for row, label in enumerate(table.labels):
         if label in NOT_TRACKED:
             continue
-        track_id, frame = int(table.ids[row]), int(table.frames[row])
-        seen_by = visible.root.get(track_id, {}).get(frame)
-        if seen_by is None:
+        track_id = int(table.ids[row])
+        frame = int(table.frames[row])
+        cameras = visible.root.get(track_id, {}).get(frame)
+        if cameras is None:
             raise AdapterError(
                 f"{table.path}, line {table.lines[row]}: {visible_path} does not say which cameras "
                 f"see object {track_id} in frame {frame}; both must be of one conversion"
             )
-        if not seen_by.isdisjoint(cams):
-            kept.append(row)
-    return np.array(kept, np.int64)
+        if not cameras.isdisjoint(cams):
+            visible_rows.append(row)
+    return np.array(visible_rows, np.int64)
 
 
-def place_rows(
+def assign_columns(
     table: TrackTable, rows: np.ndarray, frames: Sequence[int], world_from_ego: np.ndarray
 ) -> np.ndarray:
-    """The row of the table in every frame and column, int64 [F, M], -1 for none.
+    """Return the row of the table in every frame and column, int64 [F, M], -1 for none.
 
-    rows: those that were seen. frames: consecutive. world_from_ego: float64 [F, 4, 4].
+    Args:
+        table: the track file.
+        rows: visible rows.
+        frames: consecutive frames.
+        world_from_ego: float64 [F, 4, 4].
     """
     by_frame = [rows[table.frames[rows] == frame] for frame in frames]
     moving = _moving_ids(table, by_frame, world_from_ego)
-    kept = [[row if table.ids[row] in moving else -1 for row in column] for column in by_frame]
-    compact = [[row for row in column if row >= 0] for column in kept]
+    columns_by_frame = [
+        [row if table.ids[row] in moving else -1 for row in column] for column in by_frame
+    ]
+    compacted = [[row for row in column if row >= 0] for column in columns_by_frame]
     # Training compacts only where that leaves fewer columns.
-    if max(map(len, compact)) < max(map(len, kept)):
-        kept = compact
-    placed = np.full((len(frames), max(1, *map(len, kept))), -1, np.int64)
-    for step, column in enumerate(kept):
-        placed[step, : len(column)] = column
-    return placed
+    if max(map(len, compacted)) < max(map(len, columns_by_frame)):
+        columns_by_frame = compacted
+    placements = np.full((len(frames), max(1, *map(len, columns_by_frame))), -1, np.int64)
+    for step, column in enumerate(columns_by_frame):
+        placements[step, : len(column)] = column
+    return placements
 
 
 def _moving_ids(
     table: TrackTable, by_frame: Sequence[np.ndarray], world_from_ego: np.ndarray
 ) -> set[int]:
-    """The objects that move."""
+    """Return the numbers of the objects that move."""
     rows = np.concatenate(by_frame)
     poses = np.repeat(world_from_ego, list(map(len, by_frame)), axis=0)
-    world = np.einsum("nij,nj->ni", poses[:, :3, :3], table.centers_m[rows]) + poses[:, :3, 3]
-    moving = set()
+    world_positions = (
+        np.einsum("nij,nj->ni", poses[:, :3, :3], table.centers_m[rows]) + poses[:, :3, 3]
+    )
+    moving_ids = set()
     for track_id in np.unique(table.ids[rows]):
-        places = world[table.ids[rows] == track_id]
-        travel = np.linalg.norm(places[-1] - places[0])
-        if places.std(axis=0).max() > _SPREAD_M or travel > _TRAVEL_M:
-            moving.add(int(track_id))
-    return moving
+        positions = world_positions[table.ids[rows] == track_id]
+        travel = np.linalg.norm(positions[-1] - positions[0])
+        if positions.std(axis=0).max() > _MIN_SPREAD_M or travel > _MIN_TRAVEL_M:
+            moving_ids.add(int(track_id))
+    return moving_ids
 
 
-def tracklets_of(table: TrackTable, placed: np.ndarray) -> Tracklets:
-    """What the placed rows say, zeros and no rotation in empty places."""
-    there = placed >= 0
+def tracklets_of(table: TrackTable, placements: np.ndarray) -> Tracklets:
+    """Return the tracklets of the placed rows. Empty places have zeros and no rotation."""
+    is_placed = placements >= 0
     if not len(table):
-        empty = np.zeros((*placed.shape, 3))
-        return Tracklets(placed, empty, np.tile([1.0, 0, 0, 0], (*placed.shape, 1)))
-    half = np.where(there, table.headings[placed], 0.0) / 2
-    zero = np.zeros_like(half)
+        empty = np.zeros((*placements.shape, 3))
+        return Tracklets(placements, empty, np.tile([1.0, 0, 0, 0], (*placements.shape, 1)))
+    half_angles = np.where(is_placed, table.headings[placements], 0.0) / 2
+    zeros = np.zeros_like(half_angles)
     return Tracklets(
-        ids=np.where(there, table.ids[placed], -1),
-        positions=np.where(there[..., None], table.centers_m[placed], 0.0),
-        quats=np.stack([np.cos(half), zero, zero, np.sin(half)], -1),
+        ids=np.where(is_placed, table.ids[placements], -1),
+        positions=np.where(is_placed[..., None], table.centers_m[placements], 0.0),
+        quats=np.stack([np.cos(half_angles), zeros, zeros, np.sin(half_angles)], -1),
     )
 
 
@@ -554,30 +629,36 @@ def tracked_objects(
     ids: np.ndarray,
     frames: Sequence[int],
     frame_times_s: np.ndarray,
-    drawn_s: tuple[float, float],
+    visible_span_s: tuple[float, float],
 ) -> tuple[TrackedObject, ...]:
-    """The objects that have a column, in the order of the rows.
+    """Return the objects that have a column, in the order of the rows.
 
-    rows: those that were seen, in all frames of the file; sizes are the largest of them. ids:
-    int64 [F, M]. drawn_s: the first and last moment of any image or frame.
+    Args:
+        table: the track file.
+        rows: visible rows of all frames of the file. An object's size is the largest of its rows.
+        ids: int64 [F, M].
+        frames: selected frames.
+        frame_times_s: float64 [F].
+        visible_span_s: first and last moment of any image or frame.
     """
     objects = []
     for track_id in dict.fromkeys(table.ids[rows].tolist()):
         steps = np.flatnonzero((ids == track_id).any(axis=1))
         if len(steps) == 0:
             continue
-        own = rows[table.ids[rows] == track_id]
-        length, width, height = (table.sizes_m[own].max(axis=0)).tolist()
-        start, end = frame_times_s[steps[0]] - _HOLD_S, frame_times_s[steps[-1]] + _HOLD_S
+        object_rows = rows[table.ids[rows] == track_id]
+        length, width, height = (table.sizes_m[object_rows].max(axis=0)).tolist()
+        start = frame_times_s[steps[0]] - _HOLD_S
+        end = frame_times_s[steps[-1]] + _HOLD_S
         objects.append(
             TrackedObject(
                 track_id=track_id,
-                label=table.labels[own[0]],
+                label=table.labels[object_rows[0]],
                 size_m=(length, width, height),
                 start_frame=frames[steps[0]],
                 end_frame=frames[steps[-1]],
-                start_s=float(np.clip(start, *drawn_s)),
-                end_s=float(np.clip(end, *drawn_s)),
+                start_s=float(np.clip(start, *visible_span_s)),
+                end_s=float(np.clip(end, *visible_span_s)),
             )
         )
     return tuple(objects)
@@ -587,17 +668,19 @@ def tracked_objects(
 
 
 def read_data(root: Path, config: ModelConfig) -> StreetData:
-    """The frames, cameras and moving objects that the configuration selects.
+    """Read the frames, cameras and moving objects that the configuration selects.
 
-    Images may be missing: what a camera sees is then told by its calibration and Waymo's sizes.
+    Images may be missing. A camera's field of view then follows from its calibration and Waymo's
+    sizes.
     """
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a drive in Street Gaussians' layout")
     cams = sorted(config.cameras)
-    if absent := sorted(set(cams) - set(calibrated_cameras(root))):
+    if missing_cameras := sorted(set(cams) - set(calibrated_cameras(root))):
         raise AdapterError(
-            f"{root / 'extrinsics' / f'{absent[0]}.txt'} does not exist, but camera {absent[0]} "
-            f"({CAMERA_NAMES[absent[0]]}) is used; copy it from the dataset"
+            f"{root / 'extrinsics' / f'{missing_cameras[0]}.txt'} does not exist, but camera "
+            f"{missing_cameras[0]} ({CAMERA_NAMES[missing_cameras[0]]}) is used; copy it from the "
+            f"dataset"
         )
     path = read_ego_path(root)
     frames, problems = _select_frames(root, path.numbers, config)
@@ -605,15 +688,16 @@ def read_data(root: Path, config: ModelConfig) -> StreetData:
     origin = poses[:, :3, 3].mean(axis=0)
     poses[:, :3, 3] -= origin
     rows = slice(frames[0] - path.numbers[0], frames[-1] + 1 - path.numbers[0])
-    times, world_from_ego = path.times_s[rows], poses[rows]
-    images, image_problems = _images(root, path, frames, config, origin)
+    times = path.times_s[rows]
+    world_from_ego = poses[rows]
+    images, image_problems = _read_images(root, path, frames, config, origin)
 
     track_path, visible_path = track_files(root, use_tracker=config.use_tracker)
     table = read_track_table(track_path)
-    seen = seen_rows(table, visible_path, cams)
-    tracklets = tracklets_of(table, place_rows(table, seen, frames, world_from_ego))
+    visible_rows = find_visible_rows(table, visible_path, cams)
+    tracklets = tracklets_of(table, assign_columns(table, visible_rows, frames, world_from_ego))
     moments = [*times, *(image.timestamp_s for image in images)]
-    drawn_s = min(moments), max(moments)
+    visible_span_s = min(moments), max(moments)
     return StreetData(
         root=root,
         world_origin_m=origin,
@@ -621,14 +705,14 @@ def read_data(root: Path, config: ModelConfig) -> StreetData:
         frame_times_s=times,
         world_from_ego=world_from_ego,
         images=images,
-        objects=tracked_objects(table, seen, tracklets.ids, frames, times, drawn_s),
+        objects=tracked_objects(table, visible_rows, tracklets.ids, frames, times, visible_span_s),
         tracklets=tracklets,
         problems=(*path.problems, *problems, *image_problems, *table.problems),
     )
 
 
 def frames_of(data: StreetData) -> tuple[Frame, ...]:
-    """The frames that have images or could have, with cameras as they recorded."""
+    """Return the frames that have images or could have them, with the recorded cameras."""
     by_frame: dict[int, list[StreetImage]] = {}
     for image in data.images:
         by_frame.setdefault(image.frame, []).append(image)
@@ -648,7 +732,7 @@ def frames_of(data: StreetData) -> tuple[Frame, ...]:
 
 
 def held_out_steps(count: int, config: ModelConfig) -> frozenset[int]:
-    """Which of so many selected frames are not trained on, by their position among them."""
+    """Return the positions, among the selected frames, of those that are not trained on."""
     steps = range(count)
     if config.split_test > 0:
         return frozenset(steps[config.split_test :: config.split_test])
@@ -657,39 +741,46 @@ def held_out_steps(count: int, config: ModelConfig) -> frozenset[int]:
     return frozenset()
 
 
-def _select_frames(root: Path, there: range, config: ModelConfig) -> tuple[range, tuple[str, ...]]:
-    """The selected frames' numbers, and a sentence where the dataset has fewer."""
-    first, last = config.selected_frames or (there[0], there[-1])
-    frames = range(max(first, there[0]), min(last, there[-1]) + 1)
+def _select_frames(
+    root: Path, dataset_frames: range, config: ModelConfig
+) -> tuple[range, tuple[str, ...]]:
+    """Return the selected frames' numbers, and a sentence if the dataset has fewer."""
+    first, last = config.selected_frames or (dataset_frames[0], dataset_frames[-1])
+    frames = range(max(first, dataset_frames[0]), min(last, dataset_frames[-1]) + 1)
     if not frames:
         raise AdapterError(
             f"{root}: the configuration's data.selected_frames are {first} to {last}; the dataset "
-            f"has {there[0]} to {there[-1]}, so it is another drive's, or not whole"
+            f"has {dataset_frames[0]} to {dataset_frames[-1]}, so it is another drive's, or not "
+            f"whole"
         )
     if (frames[0], frames[-1]) == (first, last):
         return frames, ()
     return frames, (
-        f"{root} has frames {there[0]} to {there[-1]} of the {first} to {last} that the "
-        f"configuration selects",
+        f"{root} has frames {dataset_frames[0]} to {dataset_frames[-1]} of the {first} to {last} "
+        f"that the configuration selects",
     )
 
 
-def _images(
+def _read_images(
     root: Path, path: EgoPath, frames: range, config: ModelConfig, origin: np.ndarray
 ) -> tuple[tuple[StreetImage, ...], list[str]]:
-    """All images of the frames with a pose, by frame, then camera, and sentences on the rest."""
+    """Return all images of the frames with a pose, by frame, then camera, and sentences on the
+    rest.
+    """
     cams = sorted(config.cameras)
     lenses = {cam: read_lens(root, cam) for cam in cams}
     paths, sizes, problems = find_images(root, frames, lenses)
     held_out = held_out_steps(len(frames), config)
-    images, missing = [], []
+    images = []
+    missing_files = []
     for number, (frame, cam) in enumerate(itertools.product(frames, cams)):
-        name, lens = CAMERA_NAMES[cam], lenses[cam]
+        name = CAMERA_NAMES[cam]
+        lens = lenses[cam]
         file = root / "ego_pose" / f"{frame:06d}_{cam}.txt"
         if not path.is_known[path.numbers.index(frame)]:
             continue
         if not file.exists():
-            missing.append(file)
+            missing_files.append(file)
             continue
         timestamp_s = path.camera_times_s[name].get(frame)
         if timestamp_s is None:
@@ -718,9 +809,9 @@ def _images(
             f"{root / 'ego_pose'} lacks poses NNNNNN_{cams[0]}.txt at the cameras' times for all "
             f"frames from {frames[0]} to {frames[-1]}; copy the whole folder from the dataset"
         )
-    if missing:
+    if missing_files:
         problems.append(
-            f"{len(missing)} images are left out for want of the car's pose at their time, such as "
-            f"{missing[0]}"
+            f"{len(missing_files)} images are left out for want of the car's pose at their time, "
+            f"such as {missing_files[0]}"
         )
     return tuple(images), problems

@@ -1,4 +1,8 @@
-"""A trained model: its options, configuration and files, and what they hold."""
+"""Trained Street Gaussians models: options of the URI, configuration, files and their contents.
+
+`find_model` finds the files, `read_checkpoint` and `read_ply_model` read the weights. The caller is
+`adapters.street_gaussians.adapter`.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +41,8 @@ SCHEME = "street_gaussians"
 DEFAULT_WIDTH = 1600
 
 
-def _frames(text: object) -> DriveOptions:
+def _parse_frames(text: object) -> DriveOptions:
+    """Return the drive options of a range of frames."""
     return DriveOptions.from_query(SCHEME, {"frames": str(text)})
 
 
@@ -58,7 +63,7 @@ class ModelOptions(UriOptions):
         description=f"a whole number of pixels, which images are at most wide, {DEFAULT_WIDTH} "
         f"without it; 0 as recorded",
     )
-    frames: Annotated[DriveOptions, BeforeValidator(_frames)] = Field(
+    frames: Annotated[DriveOptions, BeforeValidator(_parse_frames)] = Field(
         DriveOptions(),
         description="first:stop, frame numbers with stop excluded, either side may be empty",
     )
@@ -71,34 +76,37 @@ class ModelOptions(UriOptions):
 
 
 def newest_config(model: Path) -> Path:
-    """The configuration of a model's folder; of several the one of the latest iteration."""
+    """Return the configuration in a model's folder; of several the one of the latest iteration."""
     files = (model / "configs").glob("config_*.yaml")
-    found = {int(m[1]): p for p in files if (m := re.fullmatch(r"config_(\d+)\.yaml", p.name))}
-    if not found:
+    configs = {int(m[1]): p for p in files if (m := re.fullmatch(r"config_(\d+)\.yaml", p.name))}
+    if not configs:
         raise AdapterError(
             f"{model / 'configs'} holds no config_*.yaml; which column of the actors' poses "
             f"belongs to which object depends on it. Copy the folder configs/ of the training's "
             f"output to {model}"
         )
-    return found[max(found)]
+    return configs[max(configs)]
 
 
 def read_config(path: Path) -> ModelConfig:
-    """What of a configuration decides how its model is read; keys that it lacks or has as null
-    have the project's defaults."""
-    tree, given = read_yaml(path), {}
+    """Read the part of a configuration that decides how its model is read.
+
+    Keys that are missing or null have the project's defaults.
+    """
+    tree = read_yaml(path)
+    values = {}
     for field_name, entry in ModelConfig.model_fields.items():
         key = entry.alias or field_name
-        found: Any = tree
+        value: Any = tree
         for name in key.split("."):
-            if found is not None and not isinstance(found, Mapping):
+            if value is not None and not isinstance(value, Mapping):
                 raise AdapterError(
-                    f"{path}: {key} must be a key inside a section; got {str(found)[:80]!r}"
+                    f"{path}: {key} must be a key inside a section; got {str(value)[:80]!r}"
                 )
-            found = None if found is None else found.get(name)
-        if found is not None:
-            given[key] = found
-    return validate(ModelConfig, given, path, "configuration of a Street Gaussians training")
+            value = None if value is None else value.get(name)
+        if value is not None:
+            values[key] = value
+    return validate(ModelConfig, values, path, "configuration of a Street Gaussians training")
 
 
 # ---- Where the files of a trained model are ------------------------------------------------------
@@ -108,7 +116,16 @@ _DATA_FOLDERS = ("ego_pose", "extrinsics", "track")
 
 @dataclass(frozen=True)
 class ModelFiles:
-    """weights: a .pth or .ply. data: the folder of the dataset."""
+    """Files of a model.
+
+    Attributes:
+        folder: the model's folder.
+        weights: a .pth or .ply.
+        iteration: iteration of the weights. None if their name does not say it.
+        config_file: the configuration's file.
+        config: the configuration.
+        data: folder of the dataset.
+    """
 
     folder: Path
     weights: Path
@@ -119,12 +136,12 @@ class ModelFiles:
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether a path is a dataset's folder and no model's."""
-    return all((path / name).is_dir() for name in _DATA_FOLDERS) and not _saved(path)
+    """Return True if a path is a dataset's folder and not a model's."""
+    return all((path / name).is_dir() for name in _DATA_FOLDERS) and not _find_saved_weights(path)
 
 
 def find_model(path: Path, options: ModelOptions) -> ModelFiles:
-    """The files of a model, given its folder or its weights."""
+    """Return the files of a model, given its folder or its weights."""
     find_weights = _weights_of_file if path.is_file() else _weights_of_folder
     folder, weights, iteration = find_weights(path, options)
     config_file = newest_config(folder)
@@ -141,7 +158,7 @@ def find_model(path: Path, options: ModelOptions) -> ModelFiles:
 
 
 def _weights_of_file(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]:
-    """The model's folder, its weights and their iteration, where their name says it."""
+    """Return the model's folder, its weights and their iteration, if their name says it."""
     if options.iteration is not None or options.weights is not None:
         raise AdapterError(
             f"{path} is one file, so iteration= and weights= say nothing; give the model's "
@@ -155,7 +172,8 @@ def _weights_of_file(path: Path, options: ModelOptions) -> tuple[Path, Path, int
 
 
 def _weights_of_folder(path: Path, options: ModelOptions) -> tuple[Path, Path, int]:
-    saved = _saved(path)
+    """Return the model's folder, and the weights and iteration that the options select."""
+    saved = _find_saved_weights(path)
     if not saved:
         raise AdapterError(
             f"{path} is no Street Gaussians model and no dataset of one: expected "
@@ -167,13 +185,13 @@ def _weights_of_folder(path: Path, options: ModelOptions) -> tuple[Path, Path, i
         raise AdapterError(f"{path} holds no .{kind} of a saved iteration; give the other weights=")
     iteration = max(saved[kind]) if options.iteration is None else options.iteration
     if iteration not in saved[kind]:
-        known = ", ".join(map(str, sorted(saved[kind])))
-        raise AdapterError(f"{path} has no .{kind} of iteration {iteration}; it has {known}")
+        iterations = ", ".join(map(str, sorted(saved[kind])))
+        raise AdapterError(f"{path} has no .{kind} of iteration {iteration}; it has {iterations}")
     return path, saved[kind][iteration], iteration
 
 
-def _saved(folder: Path) -> dict[str, dict[int, Path]]:
-    """Weights by kind, then iteration."""
+def _find_saved_weights(folder: Path) -> dict[str, dict[int, Path]]:
+    """Return the weights by kind, then iteration."""
     saved: dict[str, dict[int, Path]] = {}
     for pattern in ("trained_model/iteration_*.pth", "point_cloud/iteration_*/point_cloud.ply"):
         for file in folder.glob(pattern):
@@ -183,53 +201,69 @@ def _saved(folder: Path) -> dict[str, dict[int, Path]]:
 
 
 def _iteration_of(weights: Path) -> int | None:
-    named = weights.stem if weights.suffix.lower() == ".pth" else weights.parent.name
-    match = re.fullmatch(r"iteration_(\d+)", named)
+    """Return the iteration in the name of a file or its folder, or None if there is none."""
+    name = weights.stem if weights.suffix.lower() == ".pth" else weights.parent.name
+    match = re.fullmatch(r"iteration_(\d+)", name)
     return int(match[1]) if match else None
 
 
 # ---- One trained part, the background or an actor: from the numbers in a file to Gaussians -------
 
-_ROWS = 1 << 15  # Gaussians changed at a time: temporaries of a few megabytes
-_BACKGROUND = "background"
-_ACTOR = re.compile(r"obj_(\d{3,9})")
+# Gaussians that are converted at a time. Temporaries have a few megabytes.
+_CHUNK_GAUSSIANS = 1 << 15
+# Name of the background's part.
+_BACKGROUND_PART = "background"
+_ACTOR_NAME = re.compile(r"obj_(\d{3,9})")
 
 
 def actor_id(name: str) -> int | None:
-    """The track id in a part's name, such as obj_003; None for other names."""
-    match = _ACTOR.fullmatch(name)
+    """Return the track id in a part's name, such as obj_003, or None for other names."""
+    match = _ACTOR_NAME.fullmatch(name)
     number = int(match[1]) if match else None
     return number if number is not None and name == f"obj_{number:03d}" else None
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """terms [N, F - 1, 3]: further Fourier terms of the colours; None where F is 1."""
+    """A trained part: the background or an actor.
+
+    Attributes:
+        gaussians: its Gaussians.
+        terms: further Fourier terms of the colours, [N, F - 1, 3]. None if F is 1.
+    """
 
     gaussians: Gaussians
     terms: Tensor | None
 
 
-def check_counts(where: str, rest: int, terms: int, *, is_background: bool) -> None:
-    """rest: SH coefficients above the constant one. terms: F."""
-    if rest + 1 not in SH_COUNTS:
-        known = ", ".join(str(count - 1) for count in SH_COUNTS)
+def check_counts(where: str, num_rest: int, num_terms: int, *, is_background: bool) -> None:
+    """Check the number of colour coefficients.
+
+    Args:
+        where: the part, for messages.
+        num_rest: number of SH coefficients above the constant one.
+        num_terms: number F of Fourier terms.
+        is_background: True for the background.
+    """
+    if num_rest + 1 not in SH_COUNTS:
+        counts = ", ".join(str(count - 1) for count in SH_COUNTS)
         raise AdapterError(
-            f"{where}: feature_rest must have {known} coefficients a channel (SH degrees 0 to 3); "
-            f"got {rest}"
+            f"{where}: feature_rest must have {counts} coefficients a channel (SH degrees 0 to 3); "
+            f"got {num_rest}"
         )
-    if terms < 1 or (is_background and terms > 1):
+    if num_terms < 1 or (is_background and num_terms > 1):
         expected = "1 colour term" if is_background else "1 colour term or more"
-        raise AdapterError(f"{where}: feature_dc must have {expected}; got {terms}")
+        raise AdapterError(f"{where}: feature_dc must have {expected}; got {num_terms}")
 
 
 def make_part(
     arrays: dict[str, Tensor], where: str, problems: list[str], *, is_background: bool
 ) -> Part | None:
-    """Activate the numbers of a file in place (log scales, opacity logits, quaternions of any
-    length, and further `terms` of the colours) and leave out what cannot be drawn.
+    """Activate the numbers of a file in place, and leave out Gaussians that cannot be drawn.
 
-    None for an actor of which nothing usable remains; of a background that is an error.
+    The numbers are log scales, opacity logits, quaternions of any length, and further `terms` of
+    the colours. The result is None for an actor without usable Gaussians; for a background that is
+    an error.
     """
     terms = arrays.pop("terms")
     if len(terms) == 0 and not is_background:
@@ -237,44 +271,48 @@ def make_part(
         return None
     arrays["scales"].exp_()
     arrays["opacities"].sigmoid_()
-    means, quats = arrays["means"].numpy(), arrays["quats"].numpy()
-    for start in range(0, len(quats), _ROWS):
-        rows = slice(start, start + _ROWS)
+    means = arrays["means"].numpy()
+    quats = arrays["quats"].numpy()
+    for start in range(0, len(quats), _CHUNK_GAUSSIANS):
+        rows = slice(start, start + _CHUNK_GAUSSIANS)
         # In float64, where lengths of any float32 neither overflow nor vanish.
         lengths = np.sqrt(np.einsum("ni,ni->n", quats[rows], quats[rows], dtype=np.float64))
         lengths[lengths == 0] = 1  # such a quaternion is left out later
         quats[rows] /= lengths[:, None]
         # Colours that are not numbers at some time cannot be drawn.
         means[rows][~np.isfinite(terms[rows].numpy()).all((1, 2))] = np.nan
-    gaussians, has_terms = Gaussians(**arrays), terms.shape[1] > 0
+    gaussians = Gaussians(**arrays)
+    has_terms = terms.shape[1] > 0
     if len(gaussians) and is_drawable(gaussians):
         return Part(gaussians, terms if has_terms else None)
     try:
-        kept, found = check_gaussians(gaussians, where=where)
+        drawable, part_problems = check_gaussians(gaussians, where=where)
     except SceneError as error:
         if is_background:
             raise AdapterError(str(error)) from None
         problems.append(f"{error} It is left out")
         return None
-    problems += found
-    return Part(kept, terms[drawable_rows(gaussians)] if has_terms else None)
+    problems += part_problems
+    return Part(drawable, terms[drawable_rows(gaussians)] if has_terms else None)
 
 
 # ---- trained_model/iteration_N.pth ---------------------------------------------------------------
 
-_TENSORS = ("xyz", "feature_dc", "feature_rest", "scaling", "rotation", "opacity", "semantic")
-_TRAINING = (
+_PART_TENSORS = ("xyz", "feature_dc", "feature_rest", "scaling", "rotation", "opacity", "semantic")
+_TRAINING_KEYS = (
     "spatial_lr_scale", "denom", "max_radii2D", "xyz_gradient_accum", "active_sh_degree",
     "optimizer",
 )  # fmt: skip
-_PIECE = 1 << 18  # numbers copied at a time
+# Numbers that are copied at a time.
+_CHUNK_NUMBERS = 1 << 18
 
 
 class PoseChanges(NamedTuple):
-    """What training added to the poses of each frame and column of the tracklets.
+    """Changes of the poses of each frame and column of the tracklets by training.
 
-    positions: float64 [F, M, 3], metres, vehicle frame. half_turns: float64 [F, M], radians about
-    the object's z; it turns by twice as much.
+    Attributes:
+        positions: float64 [F, M, 3], metres, vehicle frame.
+        half_turns: float64 [F, M], radians about the object's z. The object turns by twice as much.
     """
 
     positions: np.ndarray
@@ -283,11 +321,17 @@ class PoseChanges(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """A model as its file has it. None and empty stand for what it lacks or what is not used.
+    """Contents of a model's file. None and empty stand for parts that are missing or not used.
 
-    actors: by track id. sky: faces of a cube map, float32 [6, R, R, 3]. color_maps: float32
-    [n, 3, 4]. camera_changes: float64 [n, 4, 4], rigid: what the background is moved by. problems:
-    a sentence each.
+    Attributes:
+        file: the file.
+        background: the background.
+        actors: by track id.
+        pose_changes: changes of the actors' poses.
+        sky: faces of a cube map, float32 [6, R, R, 3].
+        color_maps: float32 [n, 3, 4].
+        camera_changes: float64 [n, 4, 4], rigid motions of the background.
+        problems: one sentence each.
     """
 
     file: Path
@@ -301,9 +345,9 @@ class TrainedModel:
 
 
 def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
-    """Read a .pth. Nothing in it is run; the optimiser's state is not looked at."""
+    """Read a .pth. Nothing in it is run; the optimiser's state is not read."""
     content = load_checkpoint(path)
-    if _BACKGROUND not in content:
+    if _BACKGROUND_PART not in content:
         keys = ", ".join(map(str, list(content)[:12])) or "nothing"
         raise AdapterError(
             f"{path} lacks 'background', so it is no Street Gaussians model of a known version; it "
@@ -311,12 +355,13 @@ def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
         )
     problems: list[str] = []
     parts = {}
-    for name in (_BACKGROUND, *(name for name in content if actor_id(str(name)) is not None)):
-        where, is_background = f"{path}, {name}", name == _BACKGROUND
+    for name in (_BACKGROUND_PART, *(name for name in content if actor_id(str(name)) is not None)):
+        where = f"{path}, {name}"
+        is_background = name == _BACKGROUND_PART
         entry = section(content, name, str(path))
         arrays = _part_arrays(entry, where, problems, is_background=is_background)
         parts[name] = make_part(arrays, where, problems, is_background=is_background)
-    background, actors = _told_apart(parts)
+    background, actors = _separate_background(parts)
     tables = _Tables(content, path, config, problems)
     model = TrainedModel(
         file=path,
@@ -332,9 +377,9 @@ def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
     return model
 
 
-def _told_apart(parts: dict[str, Part | None]) -> tuple[Part, dict[int, Part]]:
-    """Background, and the actors that are left by number."""
-    background = parts.pop(_BACKGROUND)
+def _separate_background(parts: dict[str, Part | None]) -> tuple[Part, dict[int, Part]]:
+    """Return the background, and the remaining actors by number."""
+    background = parts.pop(_BACKGROUND_PART)
     assert background is not None
     return background, {
         int(name.removeprefix("obj_")): part for name, part in parts.items() if part is not None
@@ -344,31 +389,34 @@ def _told_apart(parts: dict[str, Part | None]) -> tuple[Part, dict[int, Part]]:
 def _part_arrays(
     content: Mapping[str, Any], where: str, problems: list[str], *, is_background: bool
 ) -> dict[str, Tensor]:
-    """Copies of a part's tensors, as `make_part` takes them."""
+    """Return copies of a part's tensors in the form that `make_part` takes."""
     means = tensor(content, "xyz", (None, 3), where)
     count = len(means)
     colours = tensor(content, "feature_dc", (count, None, 3), where)
-    rest = tensor(content, "feature_rest", (count, None, 3), where)
+    sh_rest = tensor(content, "feature_rest", (count, None, 3), where)
     scales = tensor(content, "scaling", (count, 3), where)
     quats = tensor(content, "rotation", (count, 4), where)
     logits = tensor(content, "opacity", (count, 1), where)
-    check_counts(where, rest.shape[1], colours.shape[1], is_background=is_background)
+    check_counts(where, sh_rest.shape[1], colours.shape[1], is_background=is_background)
     semantic = content.get("semantic")
     if isinstance(semantic, Tensor) and semantic.dim() == 2 and semantic.shape[1] > 0:
         problems.append(f"{where}: its semantic features are not used")
-    if unknown := [str(key) for key in content if key not in (*_TENSORS, *_TRAINING)]:
-        problems.append(f"{where}: it also holds {', '.join(unknown[:8])}, which is not used")
-    sh, terms = torch.empty(count, 1 + rest.shape[1], 3), torch.empty_like(colours[:, 1:])
+    if unknown_keys := [
+        str(key) for key in content if key not in (*_PART_TENSORS, *_TRAINING_KEYS)
+    ]:
+        problems.append(f"{where}: it also holds {', '.join(unknown_keys[:8])}, which is not used")
+    sh = torch.empty(count, 1 + sh_rest.shape[1], 3)
+    terms = torch.empty_like(colours[:, 1:])
     arrays = {"means": taken(means), "quats": taken(quats), "scales": taken(scales)}
     arrays["opacities"] = taken(logits)[:, 0]
-    taken(rest, sh[:, 1:])
-    rows = max(1, _PIECE // max(1, colours[:1].numel()))
+    taken(sh_rest, sh[:, 1:])
+    rows = max(1, _CHUNK_NUMBERS // max(1, colours[:1].numel()))
     for start in range(0, count, rows):  # memory is given back as it goes
-        piece = colours[start : start + rows]
-        sh[start : start + rows, :1] = piece[:, :1]
-        terms[start : start + rows] = piece[:, 1:]
-        if piece.is_contiguous():
-            release(piece)
+        chunk = colours[start : start + rows]
+        sh[start : start + rows, :1] = chunk[:, :1]
+        terms[start : start + rows] = chunk[:, 1:]
+        if chunk.is_contiguous():
+            release(chunk)
     return arrays | {"sh": sh, "terms": terms}
 
 
@@ -376,18 +424,22 @@ def _part_arrays(
 
 
 class _Tables:
-    """Networks and tables of a checkpoint, with sentences about them."""
+    """Networks and tables of a checkpoint. Sentences about them go to `problems`."""
 
     def __init__(
         self, content: Mapping[str, Any], path: Path, config: ModelConfig, problems: list[str]
     ) -> None:
-        self.path, self.config, self.problems = path, config, problems
+        self.path = path
+        self.config = config
+        self.problems = problems
         self._content = content
-        self.seen = {_BACKGROUND, "iter"}
+        self.read_names = {_BACKGROUND_PART, "iter"}
 
     def of(self, name: str, switch: str) -> Mapping[str, Any] | None:
-        """The table `params` of an entry. switch: what of the configuration says if it is used."""
-        self.seen.add(name)
+        """Return the table `params` of an entry. switch: field of the configuration that enables
+        it.
+        """
+        self.read_names.add(name)
         key = ModelConfig.model_fields[switch].alias
         if not getattr(self.config, switch):
             if self._content.get(name):
@@ -404,10 +456,12 @@ class _Tables:
         return section(section(self._content, name, str(self.path)), "params", self.where(name))
 
     def where(self, name: str) -> str:
+        """Return the name of an entry's table, for messages."""
         return f"{self.path}, {name}.params"
 
     def report_unknown(self) -> None:
-        names = [str(name) for name in self._content if name not in self.seen]
+        """Add a sentence about entries that were not read."""
+        names = [str(name) for name in self._content if name not in self.read_names]
         if names := [name for name in names if actor_id(name) is None]:
             self.problems.append(
                 f"{self.path} also holds {', '.join(names[:8])}, which is not used: expected "
@@ -417,9 +471,9 @@ class _Tables:
 
 
 def _read_pose_changes(tables: _Tables, *, has_actors: bool) -> PoseChanges | None:
-    """What training added to the actors' poses; None where it left them."""
+    """Return the changes of the actors' poses by training, or None if they were not trained."""
     if not has_actors:
-        tables.seen.add("actor_pose")
+        tables.read_names.add("actor_pose")
         return None
     params = tables.of("actor_pose", "opt_track")
     if params is None:
@@ -432,10 +486,12 @@ def _read_pose_changes(tables: _Tables, *, has_actors: bool) -> PoseChanges | No
 
 
 def _read_sky(tables: _Tables) -> Tensor | None:
-    """Faces of the sky, float32 [6, R, R, 3] in [0, 1]; None where there is none that can be used.
+    """Return the faces of the sky, float32 [6, R, R, 3] in [0, 1].
 
-    The project clamps what it looks up; clamped texels are the same but between texels of which
-    only some are out of range.
+    The result is None if there is no usable sky.
+
+    The project clamps looked-up colours. Clamped texels give the same, except between texels of
+    which only some are out of range.
     """
     params = tables.of("sky_cubemap", "include_sky")
     if params is None:
@@ -459,7 +515,7 @@ def _read_sky(tables: _Tables) -> Tensor | None:
 
 
 def _read_color_maps(tables: _Tables) -> Tensor | None:
-    """Colour maps float32 [n, 3, 4]; None where there are none that can be used."""
+    """Return the colour maps, float32 [n, 3, 4], or None if there are no usable ones."""
     name = "color_correction"
     params = tables.of(name, "use_color_correction")
     if params is None:
@@ -476,7 +532,7 @@ def _read_color_maps(tables: _Tables) -> Tensor | None:
 
 
 def _read_camera_changes(tables: _Tables) -> np.ndarray | None:
-    """What the background is moved by before an image is taken, float64 [n, 4, 4]."""
+    """Return the rigid motions of the background before images are taken, float64 [n, 4, 4]."""
     name = "pose_correction"
     params = tables.of(name, "use_pose_correction")
     if params is None:
@@ -503,11 +559,11 @@ def read_ply_model(path: Path, config: ModelConfig) -> TrainedModel:
         header = read_ply_header(path)
         names = {e.name: e.name.removeprefix("vertex_") for e in header.elements}
         elements = {
-            name: header.element(full)
-            for full, name in names.items()
-            if full != name and (name == _BACKGROUND or actor_id(name) is not None)
+            name: header.element(full_name)
+            for full_name, name in names.items()
+            if full_name != name and (name == _BACKGROUND_PART or actor_id(name) is not None)
         }
-        if _BACKGROUND not in elements:
+        if _BACKGROUND_PART not in elements:
             hint = ""
             if "vertex" in names:
                 hint = f". A .ply with one element 'vertex' opens as gaussians:{path}"
@@ -516,41 +572,50 @@ def read_ply_model(path: Path, config: ModelConfig) -> TrainedModel:
                 f"one such as vertex_obj_003 for each actor; found "
                 f"{', '.join(list(names)[:12]) or 'none'}{hint}"
             )
-        problems = _lost_in_ply(path, config)
-        if others := [full for full, name in names.items() if name not in elements]:
-            problems.append(f"{path} also holds {', '.join(others[:8])}, which is not used")
+        problems = _ply_problems(path, config)
+        if other_names := [full_name for full_name, name in names.items() if name not in elements]:
+            problems.append(f"{path} also holds {', '.join(other_names[:8])}, which is not used")
         parts = {
-            name: _read_ply_part(header, element, problems, is_background=name == _BACKGROUND)
+            name: _read_ply_part(header, element, problems, is_background=name == _BACKGROUND_PART)
             for name, element in elements.items()
         }
     except SceneError as error:
         raise AdapterError(str(error)) from None
-    background, actors = _told_apart(parts)
+    background, actors = _separate_background(parts)
     return TrainedModel(path, background, actors, problems=[*problems, *header.surplus_problems()])
 
 
-def _lost_in_ply(path: Path, config: ModelConfig) -> list[str]:
-    trained = {
+def _ply_problems(path: Path, config: ModelConfig) -> list[str]:
+    """Return a sentence on trained parts that a .ply does not hold."""
+    is_trained_by_name = {
         "the actors' learnt poses": config.opt_track,
         "the sky": config.include_sky,
         "the colour correction": config.use_color_correction,
         "the pose correction": config.use_pose_correction,
     }
-    lost = ", ".join(name for name, was_trained in trained.items() if was_trained)
-    where_else = f"; left out: {lost}. They are in trained_model/iteration_N.pth" if lost else ""
-    return [f"{path}: a .ply holds Gaussians only{where_else}"]
+    missing_parts = ", ".join(
+        name for name, was_trained in is_trained_by_name.items() if was_trained
+    )
+    advice = (
+        f"; left out: {missing_parts}. They are in trained_model/iteration_N.pth"
+        if missing_parts
+        else ""
+    )
+    return [f"{path}: a .ply holds Gaussians only{advice}"]
 
 
 def _read_ply_part(
     header: PlyHeader, element: PlyElement, problems: list[str], *, is_background: bool
 ) -> Part | None:
+    """Read one element of a .ply."""
     where = f"{header.path}, {element.name}"
     if any(name.startswith("semantic_") for name in element.columns):
         problems.append(f"{where}: its semantic features are not used")
     columns = read_columns(header, element, has_terms=True)
     columns.pop(SEMANTIC, None)
-    rest, terms = columns["sh"].shape[1] - 1, 1 + columns["terms"].shape[1]
-    check_counts(where, rest, terms, is_background=is_background)
+    num_rest = columns["sh"].shape[1] - 1
+    num_terms = 1 + columns["terms"].shape[1]
+    check_counts(where, num_rest, num_terms, is_background=is_background)
     with np.errstate(over="ignore"):  # doubles beyond float32 become infinite
         arrays = {
             name: torch.from_numpy(values.astype(np.float32, copy=False))

@@ -1,10 +1,11 @@
-"""What to know of a drive before learning from it: does the calibration fit, is exposure steady.
+"""Checks of a drive before training: whether the calibration fits, and whether exposure is
+steady.
 
 Paint, signs and edges differ in reflectance as they do in brightness. Over a range of shifts of the
-projected returns the information that intensity and grey value share is measured; it is highest
-where they lie on each other (Pandey et al. 2012, here with shifts for rotations). Rolling shutters,
-exposure and transport leave time stamps some tens of milliseconds beside the moment that an image
-shows, and a car at 15 m/s moves 30 cm in 20 ms: the same measure tells which time fits best.
+projected returns, the mutual information of intensity and grey value is measured. It is highest
+where they coincide (Pandey et al. 2012, here with shifts for rotations). Rolling shutters, exposure
+and transport leave time stamps some tens of milliseconds beside the moment that an image shows, and
+a car at 15 m/s moves 30 cm in 20 ms: the same measure tells which time fits best.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 import torch
 
 from adapters.lidar_scene.depth import project_points
-from adapters.training_views.depth_priors import visible
+from adapters.training_views.depth_priors import is_visible_return
 from adapters.training_views.views import RecordedViews
 from augment.cameras import Camera
 from augment.geometry import (
@@ -67,8 +68,11 @@ _SENSOR = ("sensor", "d")  # names that a sweep's column of sensor numbers may h
 class CameraOffset:
     """Shift of one camera's images against the LiDAR's returns.
 
-    right_px, down_px: pixels of an image of `width_px` columns. is_sure: the shift stands out, lies
-    within the range searched, and two halves of the frames agree."""
+    Attributes:
+        right_px, down_px: pixels of an image of `width_px` columns.
+        is_sure: True if the shift stands out, lies within the searched range, and two halves of the
+            frames agree.
+    """
 
     camera: str
     right_px: float
@@ -79,7 +83,7 @@ class CameraOffset:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """A sentence where the shift is beyond what rolling shutters and pixels explain."""
+        """Return a sentence if the shift is beyond that of rolling shutters and pixels."""
         shift_px = float(np.hypot(self.right_px, self.down_px))
         if not self.is_sure or self.angle_deg < _MAX_SHIFT_DEG or shift_px < _MAX_SHIFT_PX:
             return ()
@@ -92,7 +96,7 @@ class CameraOffset:
 
 
 class Returns(NamedTuple):
-    """A sweep's returns with intensity. points: float64 [N, 3], scene world. intensity: [N]."""
+    """Returns of a sweep with intensity. points: float64 [N, 3], scene world. intensity: [N]."""
 
     points: np.ndarray
     intensity: np.ndarray
@@ -195,7 +199,7 @@ def project_returns(
         grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         points, intensity = returns[key.frame]
         depth_pixels, index = project_points(points, camera, near_m=near_m, margin_px=reach)
-        is_visible = visible(depth_pixels, camera)
+        is_visible = is_visible_return(depth_pixels, camera)
         rows, columns = np.divmod(depth_pixels.pixels[is_visible], camera.width)
         out.append(Points(columns, rows, intensity[index[is_visible]], grey))
     return out
@@ -212,7 +216,7 @@ def shared_information(points_by_view: Sequence[Points], reach: int) -> np.ndarr
     images = np.repeat(
         np.arange(len(points_by_view)), [len(p.rows[::stride]) for p in points_by_view]
     )
-    grey = _stacked([points.grey for points in points_by_view])
+    grey = _pad_and_stack([points.grey for points in points_by_view])
     ranks = np.linspace(0, 1, _BINS + 1)[1:-1]
     a = np.searchsorted(np.quantile(intensity, ranks), intensity) * _BINS
     bins = np.quantile(grey[images, rows, columns], ranks)
@@ -229,8 +233,8 @@ def shared_information(points_by_view: Sequence[Points], reach: int) -> np.ndarr
     return out
 
 
-def _stacked(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Grey images uint8 [I, H, W], smaller ones filled up to the largest to the right and below."""
+def _pad_and_stack(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Return grey images uint8 [I, H, W]. Smaller ones are padded to the right and below."""
     size = np.max([image.shape for image in images], axis=0)
     out = np.zeros((len(images), *size), np.uint8)
     for place, image in zip(out, images, strict=True):
@@ -244,7 +248,7 @@ def _entropy(p: np.ndarray) -> float:
 
 
 def _peak(score: np.ndarray) -> tuple[float, float]:
-    """Shift to the right and down of the highest score, to fractions of a pixel by parabolas."""
+    """Return the shift to the right and down of the highest score, refined by parabolas."""
     reach = len(score) // 2
     i, j = np.unravel_index(int(score.argmax()), score.shape)
     down = float(i) - reach
@@ -262,9 +266,11 @@ def _vertex(before: float, middle: float, after: float) -> float:
 
 
 def with_camera_times(scene: Scene, offset_s: float) -> Scene:
-    """The scene with every image taken offset_s later than stamped: poses and times of cameras.
+    """Return the scene with every image taken offset_s later than stamped: poses and times of
+    cameras.
 
-    Positions and rotations follow the camera's own path, straight on at its ends."""
+    Positions and rotations follow the camera's own path, which continues straight at its ends.
+    """
     paths = {name: _path(scene, name) for name in scene.camera_names}
     frames = []
     for frame in scene.frames:
@@ -278,9 +284,10 @@ def _path(scene: Scene, name: str) -> list[Camera]:
 
 
 def camera_at(path: Sequence[Camera], camera: Camera, offset_s: float) -> Camera:
-    """The camera offset_s later, moving as its neighbours in the path say.
+    """Return the camera offset_s later, with the motion of its neighbours in the path.
 
-    path: the same camera over time, in order, this one among them."""
+    path: the same camera over time, in order, this one among them.
+    """
     times = [other.timestamp_ns for other in path]
     place = times.index(camera.timestamp_ns)
     before = path[max(place - 1, 0)]
@@ -310,11 +317,18 @@ def measure_time_offset(
     views: RecordedViews,
     keys: Mapping[str, Sequence[ViewKey]],
 ) -> float | None:
-    """Seconds after their stamps at which images fit the LiDAR best, one number for all cameras.
+    """Return the seconds after their stamps at which images fit the LiDAR best, for all cameras
+    together.
 
-    returns: by frame. keys: views by camera, in order of time. Cameras count by how clearly they
-    show a time: those that look sideways do. None where the car hardly moves, sweeps have no
-    intensity, or no time within 50 ms stands out."""
+    Cameras count by how clearly they show a time: those that look sideways do. The result is None
+    if the car hardly moves, sweeps have no intensity, or no time within 50 ms stands out.
+
+    Args:
+        scene: the scene.
+        returns: by frame.
+        views: the recorded views.
+        keys: views by camera, in order of time.
+    """
     returns = {
         frame: Returns(
             frame_returns.points[::_RETURN_STRIDE], frame_returns.intensity[::_RETURN_STRIDE]
@@ -367,9 +381,12 @@ def _speed_mps(path: Sequence[Camera], scene: Scene, key: ViewKey) -> float:
 class Checks:
     """Results of `check_views`.
 
-    problems: one sentence each. time_offset_s: seconds after their stamps at which images fit the
-    LiDAR best; None where unknown. offsets: the shift of each camera, measured at the corrected
-    times."""
+    Attributes:
+        problems: one sentence each.
+        time_offset_s: seconds after their stamps at which images fit the LiDAR best. None if
+            unknown.
+        offsets: the shift of each camera, measured at the corrected times.
+    """
 
     problems: tuple[str, ...]
     time_offset_s: float | None
@@ -377,7 +394,9 @@ class Checks:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """JSON-able, for reports: pixels of the image compared, to the right and down."""
+        """Return JSON-able facts for reports: pixels of the compared image, to the right and
+        down.
+        """
         offset_s = self.time_offset_s
         names = ("right_px", "down_px", "angle_deg", "is_sure")
         offsets = {o.camera: {name: getattr(o, name) for name in names} for o in self.offsets}
@@ -431,8 +450,12 @@ def check_views(scene: Scene, views: RecordedViews) -> Checks:
 
 
 def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:
-    """A sentence for each sudden change of brightness between neighbouring images of a camera: the
-    median, over blocks, of the logarithm of their ratio, so that what moves hardly counts."""
+    """Return a sentence for each sudden change of brightness between neighbouring images of a
+    camera.
+
+    The change is the median, over blocks, of the logarithm of their ratio, so that moving objects
+    hardly count.
+    """
     if len(keys) < 3:
         return []
     cameras = [views.camera(key) for key in keys]

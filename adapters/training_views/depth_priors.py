@@ -1,6 +1,8 @@
-"""Depth priors of every view from whatever is there: LiDAR sweeps, and folders of depth maps.
+"""Depth priors of every view from all available sources: LiDAR sweeps, and folders of depth
+maps.
 
-Files that are not what they should be are AdapterErrors that name them; the view goes without.
+Faulty files raise AdapterErrors that name them; the view then has no prior from them. The caller is
+`adapters.training_views.views`.
 """
 
 from __future__ import annotations
@@ -80,8 +82,10 @@ def find_maps(
 def find_sparse(
     folder: Path, keys: Collection[ViewKey], camera_names: Sequence[str]
 ) -> dict[ViewKey, Path]:
-    """The file DIR/<frame>_<camera>.npy of each view that has one. <camera> is a camera's name, or
-    its number in the scene's order as Street Gaussians counts them."""
+    """Return the file DIR/<frame>_<camera>.npy of each view that has one.
+
+    <camera> is a camera's name, or its number in the scene's order as Street Gaussians counts them.
+    """
     _check_folder(folder)
     requested = set(keys)
     paths: dict[ViewKey, Path] = {}
@@ -167,7 +171,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def join_priors(priors: Sequence[DepthPixels]) -> DepthPixels:
-    """Join one or more priors; where several have a pixel, the first in the sequence counts."""
+    """Join one or more priors. If several have a pixel, the first in the sequence counts."""
     names = ("pixels", "depth_m", "weight")
     parts = [np.concatenate([getattr(prior, name) for prior in priors]) for name in names]
     _, first = np.unique(parts[0], return_index=True)  # the first occurrence, in order
@@ -175,13 +179,16 @@ def join_priors(priors: Sequence[DepthPixels]) -> DepthPixels:
 
 
 class Alignment(NamedTuple):
-    """1 / z = scale relative + shift, in 1/m."""
+    """Alignment of a relative map: 1 / z = scale relative + shift, in 1/m."""
 
     scale: float
     shift: float
 
     def depth_m(self, relative: np.ndarray) -> np.ndarray:
-        """Depth of relative values, float32; NaN where it is too near or far to be believed."""
+        """Return the depth of relative values, float32.
+
+        NaN if it is too near or far to be believed.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = 1.0 / (self.scale * relative.astype(np.float64) + self.shift)
             depth[~((depth >= _NEAREST_M) & (depth <= _FURTHEST_M))] = np.nan
@@ -189,11 +196,12 @@ class Alignment(NamedTuple):
 
 
 def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
-    """Robust least squares of inverse depth over known pixels, both [M]; None where it fails.
+    """Fit inverse depth by robust least squares over known pixels, both [M]. None if it fails.
 
-    Iteratively reweighted with Cauchy's weights, whose spread follows the median residual (Holland
-    and Welsch 1977), from a line through the quartiles. It fails with fewer than 30 known pixels,
-    without contrast, or where larger values are not clearly nearer."""
+    The fit is iteratively reweighted with Cauchy's weights, whose spread follows the median
+    residual (Holland and Welsch 1977). It starts from a line through the quartiles. It fails with
+    fewer than 30 known pixels, without contrast, or if larger values are not clearly nearer.
+    """
     x = relative.astype(np.float64)
     y = 1.0 / depth_m.astype(np.float64)
     is_finite = np.isfinite(x) & np.isfinite(y)
@@ -231,7 +239,7 @@ def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
 
 
 def sparse_prior(path: Path, camera: Camera) -> DepthPixels:
-    """Street Gaussians' depth, of a larger image, at the pixels it falls on."""
+    """Return Street Gaussians' depth, of a larger image, at the pixels on which it falls."""
     mask, value = read_sparse(path)
     check_aspect(path, mask.shape, camera)
     rows, columns = np.nonzero(mask)
@@ -243,7 +251,7 @@ def sparse_prior(path: Path, camera: Camera) -> DepthPixels:
 
 
 def metric_prior(path: Path, camera: Camera, sky: np.ndarray) -> DepthPixels:
-    """A dense map in metres at the pixels of a grid, 0 and sky left out."""
+    """Return a dense map in metres at the pixels of a grid, without zeros and sky."""
     depth = read_metric(path)
     check_aspect(path, depth.shape, camera)
     rows, columns = _grid(camera)
@@ -258,8 +266,10 @@ def metric_prior(path: Path, camera: Camera, sky: np.ndarray) -> DepthPixels:
 def relative_prior(
     path: Path, camera: Camera, reference: np.ndarray, sky: np.ndarray
 ) -> DepthPixels:
-    """A dense inverse depth map, aligned to the reference depth [H, W] (0 where unknown), at the
-    pixels of a grid."""
+    """Return a dense inverse depth map at the pixels of a grid, aligned to the reference depth.
+
+    reference: [H, W], 0 where unknown.
+    """
     relative = read_relative(path)
     check_aspect(path, relative.shape, camera)
     size = (camera.width, camera.height)
@@ -295,7 +305,7 @@ def beside(dense: DepthPixels, trusted_prior: DepthPixels, camera: Camera) -> De
 
 
 def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [R, 1] and columns [1, C] in the middles of the grid's cells."""
+    """Return rows [R, 1] and columns [1, C] in the middles of the grid's cells."""
     rows = np.arange(min(_GRID_PX // 2, camera.height - 1), camera.height, _GRID_PX)
     columns = np.arange(min(_GRID_PX // 2, camera.width - 1), camera.width, _GRID_PX)
     return rows[:, None], columns[None]
@@ -305,13 +315,21 @@ def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 def hidden_returns(
     pixels, depth_m, grid, enough, most_radius, ratio, margin_m
 ):  # pragma: no cover - compiled
-    """Mask of the returns that lie behind nearer ones on all sides, bool [M].
+    """Return True for returns that lie behind nearer ones on all sides, bool [M].
 
-    pixels: int32 [M], flat indices into grid; grid: float32 [H, W], depth at them, 0 elsewhere.
     The square window around a return grows until it holds `enough` others or has the radius
     `most_radius` (pixels). The return is hidden if at least three of the window's four quadrants
-    hold a return nearer than z / ratio - margin_m: in front of it passes a surface, not just an
-    edge beside it."""
+    hold a return nearer than z / ratio - margin_m: then a surface passes in front of it, not just
+    an edge beside it.
+
+    Args:
+        pixels: int32 [M], flat indices into grid.
+        depth_m: float32 [M], depths of the returns.
+        grid: float32 [H, W], depth at the pixels, 0 elsewhere.
+        enough: number of others that ends the growth.
+        most_radius: largest radius, pixels.
+        ratio, margin_m: see above.
+    """
     height, width = grid.shape
     out = np.zeros(len(pixels), np.bool_)
     for i in numba.prange(len(pixels)):
@@ -350,11 +368,12 @@ def hidden_returns(
     return out
 
 
-def visible(returns: DepthPixels, camera: Camera) -> np.ndarray:
-    """Mask of the LiDAR's returns that the camera sees too, bool [M].
+def is_visible_return(returns: DepthPixels, camera: Camera) -> np.ndarray:
+    """Return True for the LiDAR's returns that the camera sees too, bool [M].
 
     A return is hidden if clearly nearer ones lie among its neighbours on three sides. One that is
-    hidden just behind an edge counts as visible."""
+    hidden just behind an edge counts as visible.
+    """
     with kernel_threads():
         is_hidden = hidden_returns(
             returns.pixels,
@@ -370,12 +389,16 @@ def visible(returns: DepthPixels, camera: Camera) -> np.ndarray:
 
 @dataclass(frozen=True)
 class DepthPriors:
-    """The depth priors to use; where several have a pixel, the first in the fields' order counts.
+    """Sources of depth priors. If several have a pixel, the first in the fields' order counts.
 
-    lidar: the scene's sweeps. sparse_dir: Street Gaussians' lidar_depth folder. metric_dir: dense
-    depth in metres, DIR/<camera>/<frame>.png of uint16 metres x 256, 0 where unknown, as `climategs
-    render` writes. relative_dir: dense inverse depth up to scale and shift, as monocular networks
-    give, DIR/<camera>/<frame>.npy or .png."""
+    Attributes:
+        lidar: True for the scene's sweeps.
+        sparse_dir: Street Gaussians' lidar_depth folder.
+        metric_dir: dense depth in metres, DIR/<camera>/<frame>.png of uint16 metres x 256, 0 where
+            unknown, as `climategs render` writes.
+        relative_dir: dense inverse depth up to scale and shift, as monocular networks give,
+            DIR/<camera>/<frame>.npy or .png.
+    """
 
     lidar: bool = True
     sparse_dir: Path | None = None
@@ -384,7 +407,7 @@ class DepthPriors:
 
 
 class DepthSource:
-    """The priors of all views, made when first asked for and remembered in a bounded memory."""
+    """The priors of all views, made on first use and cached in a bounded memory."""
 
     def __init__(
         self,
@@ -395,8 +418,16 @@ class DepthSource:
         cache_bytes: int,
         reference: ReferenceDepth | None = None,
     ) -> None:
-        """cameras: every view, at the training resolution. reference: distances that relative
-        maps are brought to metres by where the frame has no LiDAR."""
+        """Prepare the sources.
+
+        Args:
+            scene: the scene.
+            cameras: every view, at the training resolution.
+            options: the sources to use.
+            cache_bytes: memory for priors.
+            reference: distances by which relative maps are brought to metres if the frame has no
+                LiDAR.
+        """
         self.problems: list[str] = []
         self._scene = scene
         self._cameras = cameras
@@ -426,7 +457,9 @@ class DepthSource:
             return dict.fromkeys(cameras, no_pixels)
         pixels_by_camera = {name: returns.seen_by(camera) for name, camera in cameras.items()}
         return {
-            name: pixels_by_camera[name].select(visible(pixels_by_camera[name], cameras[name]))
+            name: pixels_by_camera[name].select(
+                is_visible_return(pixels_by_camera[name], cameras[name])
+            )
             for name in cameras
         }
 

@@ -1,4 +1,4 @@
-"""Masks of the recording car that a user gives, in place of those that `augment.own_car` finds."""
+"""Masks of the recording car from a user, instead of those that `augment.own_car` finds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _WHITE = 128  # levels from which a pixel of a mask is white
 
 
 def read_ego_mask(path: Path, camera: Camera) -> np.ndarray:
-    """A mask image, white where the camera sees the recording car, at the camera's size."""
+    """Read a mask image, white where the camera sees the recording car, at the camera's size."""
     image = decode_image(path, cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise AdapterError(f"{path} cannot be decoded; expected an image, white on the own car")

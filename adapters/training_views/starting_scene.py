@@ -1,13 +1,14 @@
-"""What reconstruction starts from: the scene of a recording, and what its LiDAR left out.
+"""Starting point of reconstruction: the scene of a recording, completed where LiDAR sees
+nothing.
 
-Walls and crowns go on above the LiDAR's view, and behind glass: what images show there, and what is
-no sky, stands straight over the surface below it. Else it would be learnt into the sky, where fog
-swallows it.
+Walls and crowns continue above the LiDAR's view, and behind glass. Where images show neither sky
+nor a surface there, new surface stands straight over the surface below. Otherwise it would be
+learnt into the sky, where fog swallows it.
 
 The recording car's own bonnet or roof stands before some cameras. It becomes an actor that travels
-with the camera: else it would be learnt into the road below, anew in every frame. It stands still
-in the image, so its true distance cannot be told from the images, and need not be: it is put near
-the camera, where nothing else is and other cameras do not look.
+with the camera; otherwise it would be learnt into the road below, anew in every frame. It stands
+still in the image, so its true distance cannot be told from the images, and need not be: it is
+placed near the camera, where nothing else is and other cameras do not look.
 """
 
 from __future__ import annotations
@@ -65,8 +66,12 @@ _ACTOR_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.
 
 
 def starting_scene(scene: Scene, views: RecordedViews) -> Scene:
-    """The scene with the upper walls that the LiDAR does not see, and a body of the recording car
-    for every camera that sees it, from training views alone."""
+    """Return the scene with upper walls and with a body of the recording car, from training
+    views alone.
+
+    The upper walls are those that the LiDAR does not see. A body is added for every camera that
+    sees the car.
+    """
     scene = dataclasses.replace(scene, background=continue_walls(scene, views))
     bodies = [ego_body(scene, name, mask, views) for name, mask in views.ego_masks.items()]
     actors = (*scene.actors, *(body for body in bodies if body is not None))
@@ -74,8 +79,11 @@ def starting_scene(scene: Scene, views: RecordedViews) -> Scene:
 
 
 def continue_walls(scene: Scene, views: RecordedViews) -> Gaussians:
-    """The background with discs where training views show neither sky nor a surface, straight over
-    a wall or a crown that reaches the LiDAR's highest view, or that goes on above them."""
+    """Return the background with discs where training views show neither sky nor a surface.
+
+    They stand straight over a wall or a crown that reaches the LiDAR's highest view, or that
+    continues above them.
+    """
     background = scene.background
     if views.lidar_top_rad is None or background.semantic is None:
         return background
@@ -126,8 +134,10 @@ def continue_walls(scene: Scene, views: RecordedViews) -> Gaussians:
 class _AboveWalls(NamedTuple):
     """Surface that is added above walls.
 
-    depth: float64 [H, W], z of the new surface, 0 where there is none. base: int64 [H, W], the row
-    of the surface below."""
+    Attributes:
+        depth: float64 [H, W], z of the new surface, 0 without one.
+        base: int64 [H, W], row of the surface below.
+    """
 
     depth: np.ndarray
     base: np.ndarray
@@ -168,13 +178,18 @@ def _above_walls(
 
 
 def ego_body(scene: Scene, camera_name: str, mask: np.ndarray, source: ViewSource) -> Actor | None:
-    """The part of the recording car that a camera sees; None without a mask or images.
+    """Return the part of the recording car that a camera sees. None without a mask or images.
 
-    mask: bool [H, W] of that camera's images at any scale, True where they show the car. source:
-    recorded views; the median over time of those of the camera that are trained on gives the
-    colours. The actor's frame is the camera's own, turned to x forward, y left, z up and
-    moved to the box's centre; its track are the camera's poses at its own times, so that the body
-    stands still in every image. Its label is EGO_VEHICLE and its class OTHER: it has no box.
+    The actor's frame is the camera's own, turned to x forward, y left, z up and moved to the box's
+    centre. Its track are the camera's poses at its own times, so that the body stands still in
+    every image. Its label is EGO_VEHICLE and its class OTHER: it has no box.
+
+    Args:
+        scene: the scene.
+        camera_name: the camera.
+        mask: bool [H, W] of that camera's images at any scale, True where they show the car.
+        source: recorded views. The median over time of the camera's training views gives the
+            colours.
     """
     cameras = [frame.cameras[camera_name] for frame in scene.frames if camera_name in frame.cameras]
     first = cameras[0]
@@ -207,7 +222,7 @@ def _median_colours(
     rows: np.ndarray,
     columns: np.ndarray,
 ) -> np.ndarray | None:
-    """Median over the images, float32 [N, 3] in [0, 1], or None without any."""
+    """Return the median over the images, float32 [N, 3] in [0, 1], or None without any."""
     camera_keys = [k for k in source.train if k.camera == camera_name]
     stride = max(1, math.ceil(len(camera_keys) / _MAX_IMAGES))
     samples = []

@@ -1,4 +1,4 @@
-"""The recorded images of a scene's frames as views to learn from."""
+"""Training views from the recorded images of a scene's frames."""
 
 from __future__ import annotations
 
@@ -47,13 +47,16 @@ def holdout_step(holdout: str) -> int | None:
 
 
 class RecordedViews:
-    """A `ViewSource`: the views of a scene that was opened from recordings. `load` may be called
-    from several threads.
+    """A `ViewSource` of a scene that was opened from recordings.
+
+    `load` may be called from several threads.
 
     Every image is decoded once at the start. Unusable ones are left out and named in `problems`.
-    ego_masks: for each camera that sees the recording car, where, bool [H, W] at the training
-    resolution. No depth priors are given there: the LiDAR looks past the car at the road behind.
-    lidar_top_rad: highest elevation that the LiDAR looks at; None where that is unknown."""
+
+    ego_masks: bool [H, W] at the training resolution, for each camera that sees the recording car.
+    There are no depth priors in it: the LiDAR looks past the car at the road behind. lidar_top_rad:
+    highest elevation that the LiDAR measures; None if it is unknown.
+    """
 
     def __init__(
         self,
@@ -67,14 +70,21 @@ class RecordedViews:
         reference_depth: ReferenceDepth | None = None,
         masks_dir: Path | None = None,
     ) -> None:
-        """scene: as initialised, before any optimisation; its Gaussians tell where sky must be.
-        scale: training resolution over recorded resolution, in (0, 1]. cameras: names, all by
-        default. holdout: "none" or "every-Nth": of the scene's frames the last of every N is held
-        out. cache_bytes: memory for decoded images, and half as much for depth priors; what does
-        not fit is read again. reference_depth: what relative depth maps are brought to metres by
-        where there is no LiDAR. masks_dir: DIR/<camera>.png, white where the image shows the
-        recording car; a camera without a file does not see it. By default such pixels are found by
-        their standing still."""
+        """Read the headers and pixels of all images.
+
+        Args:
+            scene: as initialised, before any optimisation. Its Gaussians decide where sky must be.
+            scale: training resolution over recorded resolution, in (0, 1].
+            cameras: names, all by default.
+            holdout: "none" or "every-Nth": of the scene's frames the last of every N is held out.
+            cache_bytes: memory for decoded images, and half as much for depth priors. Other images
+                are read again.
+            depth: sources of depth priors.
+            reference_depth: depth by which relative maps are brought to metres without LiDAR.
+            masks_dir: folder of DIR/<camera>.png, white where the image shows the recording car. A
+                camera without a file does not see it. By default such pixels are found because they
+                stand still.
+        """
         if not 0 < scale <= 1:
             raise ValueError(f"scale must be > 0 and <= 1; got {scale}")
         names = _camera_names(scene, cameras)
@@ -110,7 +120,7 @@ class RecordedViews:
             ) from None
 
     def image(self, key: ViewKey) -> np.ndarray:
-        """The view's image alone, uint8 [H, W, 3]; callers do not write into it."""
+        """Return the view's image alone, uint8 [H, W, 3]. Callers must not write into it."""
         scaled = self.camera(key)
         frame = self._scene.frame(key.frame)
         path = Path(frame.image_paths[key.camera])
@@ -136,13 +146,16 @@ class RecordedViews:
         return RecordedView(camera, rgb, weight, sky, prior.pixels, prior.depth_m, prior.weight)
 
     def own_car(self, key: ViewKey) -> np.ndarray:
-        """Mask of the recording car in a view, bool [H, W]."""
+        """Return the pixels of the recording car in a view, bool [H, W]."""
         camera = self.camera(key)
         mask = self._ego(camera)
         return np.zeros((camera.height, camera.width), np.bool_) if mask is None else mask
 
     def _ego(self, camera: Camera) -> np.ndarray | None:
-        """Mask of the recording car in the camera's images, bool [H, W]; None without one."""
+        """Return the pixels of the recording car in the camera's images, bool [H, W].
+
+        The result is None without one.
+        """
         mask = self.ego_masks.get(camera.name)
         if mask is None or not _is_about(mask.shape[::-1], camera):
             return None
@@ -162,7 +175,9 @@ class RecordedViews:
         return bits.view(np.bool_).reshape(size)
 
     def _read_all(self, names: Sequence[str], scale: float) -> dict[ViewKey, Camera]:
-        """The training camera of every view with a usable image, in order of frame and camera."""
+        """Return the training camera of every view with a usable image, in order of frame and
+        camera.
+        """
         scene = self._scene
         expected = [
             (ViewKey(frame.index, name), frame.cameras[name], frame.image_paths.get(name))

@@ -1,11 +1,11 @@
-"""A segment of the Waymo Open Dataset v2 as a scene: Gaussians from accumulated, coloured LiDAR.
+"""Scenes of segments of the Waymo Open Dataset v2: Gaussians from accumulated, coloured LiDAR.
 
-World: the dataset's (metres, z up), less whole metres where the drive is further than a kilometre
-from its origin. Ego: the dataset's vehicle (x forward, y left, z up, origin on the ground below
-the rear axle). A frame's time is that of its vehicle pose, about the middle of the TOP laser's
-turn. Images are undistorted; each stands where the car was in the middle of its readout, so that
-columns near its borders, which were taken up to half of the readout earlier or later, are off by
-what the car drove meanwhile.
+World: the dataset's (metres, z up), less whole metres if the drive is further than a kilometre from
+its origin. Ego: the dataset's vehicle (x forward, y left, z up, origin on the ground below the rear
+axle). A frame's time is that of its vehicle pose, about the middle of the TOP laser's turn. Images
+are undistorted. Each stands where the car was in the middle of its readout. Columns near its
+borders were taken up to half of the readout earlier or later, and are off by the car's motion
+meanwhile.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from adapters.raw_drive import (
     Sweep,
     TimedBoxes,
     colour_every,
+    describe_frames,
     drive_origin,
     find_objects,
     is_usable,
-    recentred,
+    recenter_pose,
     scene_of_drive,
-    some,
     world_classes,
 )
 from adapters.uri import format_uri
@@ -87,14 +87,21 @@ _Columns = tuple[tuple[str, ColumnKind], ...]
 
 
 class Returns(NamedTuple):
-    """All returns of a frame. points_m, origins_m: float64 [N, 3], the dataset's world; where each
-    return lies, and where its laser was then. timestamps_ns: int64 [N]. intensity, elongation:
-    float32 [N], as recorded. sensor: uint8 [N], 1 TOP, 2 FRONT, 3 SIDE_LEFT, 4 SIDE_RIGHT, 5 REAR.
-    number: uint8 [N], 1 or 2, which of its beam's returns. in_no_label_zone: bool [N]. classes,
-    objects: int32 [N], the dataset's numbers, 0 of lasers but TOP; None where the frame has no
-    LiDAR segmentation. camera_classes: uint8 [N], what the camera segmentation has at the pixel
-    that the dataset projects a return to, its numbers, 0 where no camera sees it; None where the
-    frame has none."""
+    """All returns of a frame.
+
+    Attributes:
+        points_m: float64 [N, 3], places of the returns in the dataset's world.
+        origins_m: float64 [N, 3], places of their lasers then.
+        timestamps_ns: int64 [N].
+        intensity, elongation: float32 [N], as recorded.
+        sensor: uint8 [N], 1 TOP, 2 FRONT, 3 SIDE_LEFT, 4 SIDE_RIGHT, 5 REAR.
+        number: uint8 [N], 1 or 2, first or second return of its beam.
+        in_no_label_zone: bool [N].
+        classes, objects: int32 [N], the dataset's numbers, 0 for lasers except TOP. None if the
+            frame has no LiDAR segmentation.
+        camera_classes: uint8 [N], number of the camera segmentation at the pixel to which the
+            dataset projects a return, 0 if no camera sees it. None if the frame has none.
+    """
 
     points_m: np.ndarray
     origins_m: np.ndarray
@@ -118,11 +125,15 @@ def frame_returns(segment: Segment, frame: int) -> Returns | None:
 
 
 class _Scans(NamedTuple):
-    """Range images, poses and labels of one frame, as the tables have them.
+    """Range images, poses and labels of one frame, as in the tables.
 
-    images: range images of both returns, by laser. poses: the car's pose at each pixel of the TOP
-    laser's image. labels: objects and classes of the LiDAR segmentation, as `images`. projections:
-    the camera pixels that see each return, as `images`. pictures: classes [h, w] by camera."""
+    Attributes:
+        images: range images of both returns, by laser.
+        poses: the car's pose at each pixel of the TOP laser's image.
+        labels: objects and classes of the LiDAR segmentation, as `images`.
+        projections: the camera pixels that see each return, as `images`.
+        pictures: classes [h, w] by camera.
+    """
 
     segment: Segment
     frame: int
@@ -170,7 +181,8 @@ def _read_scans(segment: Segment, frame: int) -> _Scans | None:
 class _Beams(NamedTuple):
     """The beams of one laser in one frame.
 
-    poses: [H, W, 6], the car's pose at each pixel of the TOP laser's image."""
+    poses: [H, W, 6], the car's pose at each pixel of the TOP laser's image.
+    """
 
     segment: Segment
     frame: int
@@ -329,7 +341,7 @@ def _range_image(cells: dict[str, Any], name: str, channels: int, where: str) ->
 
 
 def _label_images(segment: Segment, frame: int) -> dict[int, np.ndarray]:
-    """The classes of the recorded images' pixels, uint8 [H, W], by the camera's number."""
+    """Return the classes of the recorded images' pixels, uint8 [H, W], by the camera's number."""
     component = "camera_segmentation"
     if not (segment.files.has(component) and segment.files.has("lidar_camera_projection")):
         return {}
@@ -378,7 +390,7 @@ def _reader_of(segment: Segment, component: str, columns: _Columns, _pid: int) -
 def _index(
     segment: Segment, component: str, key: str, words: tuple[str, ...]
 ) -> dict[int, dict[int, int]]:
-    """Row numbers by frame and by laser or camera."""
+    """Return row numbers by frame and by laser or camera."""
     rows = Rows(segment.files, component, [STAMP, key])
     frames = segment.frames_of(rows.stamps(), rows.path)
     rows_by_frame: dict[int, dict[int, int]] = {}
@@ -445,25 +457,29 @@ _ATTRIBUTES = {
 
 @dataclass(frozen=True, eq=False)
 class WaymoLabels:
-    """Labels of one segment, read when asked.
+    """Labels of one segment, read on demand.
 
     Boxes: track_ids are laser_object_ids, labels Vehicle, Pedestrian, Sign, Cyclist or Unknown.
     Attributes, as far as the table has them: num_lidar_points_in_box, num_top_lidar_points_in_box,
     speed_{x,y,z} and acceleration_{x,y,z} (SI, world axes), difficulty_level_{detection,tracking}.
 
     Sweeps: columns x y z (metres, float64, the dataset's world), intensity (the hyperbolic tangent
-    of what was recorded, which has no upper limit), raw_intensity, elongation, sensor,
-    return_number and in_no_label_zone (see Returns), timestamp_ns (of the TOP laser by column,
-    which the dataset does not state; of the others that of the vehicle pose), and where the frame
-    has LiDAR segmentation semantic and instance (0 of lasers but TOP), and where it has camera
-    segmentation and lidar_camera_projection camera_class. All returns are among them, also of the
-    recording car."""
+    of the recorded value, which has no upper limit), raw_intensity, elongation, sensor,
+    return_number and in_no_label_zone (see Returns), and timestamp_ns. The time is derived from the
+    column for the TOP laser, since the dataset does not state it, and is that of the vehicle pose
+    for the others. If the frame has LiDAR segmentation, there are semantic and instance (0 for
+    lasers except TOP); if it has camera segmentation and lidar_camera_projection, there is
+    camera_class. All returns are among them, also those of the recording car.
+    """
 
     segment: Segment
 
     @property
     def lidar_top_rad(self) -> float:
-        """Highest elevation of the TOP laser; the other lasers look 30 degrees up, but 20 m far."""
+        """Return the highest elevation of the TOP laser.
+
+        The others look 30 degrees up, but 20 m far.
+        """
         top = self.segment.lasers.get("TOP")
         return 0.0 if top is None else float(top.highest_rad)
 
@@ -517,7 +533,7 @@ def _last_returns(segment: Segment, frame: int) -> Returns | None:
 
 @lru_cache(maxsize=2)
 def _all_boxes(segment: Segment) -> dict[int, Boxes]:
-    """The boxes by frame, in the dataset's world."""
+    """Return the boxes by frame, in the dataset's world."""
     if not segment.files.has("lidar_box"):
         return {}
     key = "key.laser_object_id"
@@ -566,14 +582,14 @@ def moving_boxes(
         times = segment.stamps_us[n] * 1000 + np.nan_to_num(share * _SPIN_NS).astype(np.int64)
         timed.append(TimedBoxes(n, boxes, times))
     objects = find_objects(timed, origin)
-    return objects.moving, objects.problems
+    return objects.moving_boxes, objects.problems
 
 
 # ---- The scene -----------------------------------------------------------------------------------
 
 
 class WaymoOptions(DriveOptions):
-    """segment: its name, or the first part of it."""
+    """Options of a Waymo scene. segment: its name, or the first part of it."""
 
     segment: str | None = Field(
         None, min_length=1, description="a segment's name, or its number before the first '_'"
@@ -581,23 +597,27 @@ class WaymoOptions(DriveOptions):
 
 
 def open_waymo(path: str, query: dict[str, str]) -> Scene:
-    """One segment of the Waymo Open Dataset v2; path: a folder with its components' folders, that
-    of a split or the one above, or one with a segment's files (vehicle_pose.parquet and so on).
+    """Open one segment of the Waymo Open Dataset v2.
 
-    query: segment, needed where there are several; and frames, voxel_m, max_gaussians, image_scale,
-    sky_size, held_out, see DriveOptions. Opening is deterministic: the same files and options give
-    the same bits.
+    Opening is deterministic: the same files and options give the same bits.
+
+    Args:
+        path: a folder with its components' folders (that of a split or the one above), or one with
+            a segment's files (vehicle_pose.parquet and so on).
+        query: segment, needed if there are several; frames, voxel_m, max_gaussians, image_scale,
+            sky_size, held_out, see DriveOptions.
 
     Raises:
-        AdapterError: a wrong option, a missing component, a table that is damaged or contradicts
-            another, no LiDAR, no image. Single images and sweeps that are missing or damaged are
-            Scene.problems."""
+        AdapterError: an option is wrong, a component is missing, a table is damaged or contradicts
+            another, there is no LiDAR or no image. Single images and sweeps that are missing or
+            damaged are listed in Scene.problems.
+    """
     options = WaymoOptions.from_query("waymo", query)
     return scene_of_drive(read_waymo(path, query, options), options)
 
 
 def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDrive:
-    """The frames of the segment that the options ask for, with their sweeps and boxes."""
+    """Read the frames of the segment that the options select, with their sweeps and boxes."""
     segment = read_segment(find_segment(Path(path), options.segment))
     where = f"waymo:{path}, segment {segment.files.name}"
     chosen = options.select(range(len(segment.stamps_us)), where=where)
@@ -634,7 +654,7 @@ def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDr
 
 
 def waymo_labels(path: str, query: dict[str, str]) -> WaymoLabels:
-    """The labels of a segment; whatever frames= says, they are those of all its frames."""
+    """Return the labels of a segment. They cover all its frames, whatever frames= says."""
     options = WaymoOptions.from_query("waymo", query)
     return WaymoLabels(read_segment(find_segment(Path(path), options.segment)))
 
@@ -675,7 +695,7 @@ def _frame(segment: Segment, n: int, origin: np.ndarray, paths: dict[str, str]) 
         shot = segment.shots.get(n, {}).get(name)
         if shot is None:
             continue
-        pose = recentred(shot.world_from_vehicle @ mount.vehicle_from_camera, origin)
+        pose = recenter_pose(shot.world_from_vehicle @ mount.vehicle_from_camera, origin)
         cameras[name] = Camera(
             name,
             mount.lens.width,
@@ -687,7 +707,7 @@ def _frame(segment: Segment, n: int, origin: np.ndarray, paths: dict[str, str]) 
     return Frame(
         index=n,
         timestamp_ns=int(segment.pose_times_ns[n]),
-        world_from_ego=recentred(segment.world_from_vehicle[n], origin),
+        world_from_ego=recenter_pose(segment.world_from_vehicle[n], origin),
         cameras=cameras,
         image_paths=paths,
     )
@@ -742,7 +762,7 @@ def read_sweeps(
     if len(problems) > _MAX_FAULTS:
         problems[_MAX_FAULTS:] = [f"so are those of {len(problems) - _MAX_FAULTS} more frames"]
     if missing:
-        problems.append(f"the LiDAR has no row of {some(sorted(missing))}")
+        problems.append(f"the LiDAR has no row of {describe_frames(sorted(missing))}")
     if step > 1:
         problems.append(
             f"the scene is built from one return in {step}, of {len(numbers)} frames; fewer "

@@ -21,7 +21,7 @@ import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
 from adapters.plain_files import LARGEST, checked_pose
-from adapters.raw_drive import some
+from adapters.raw_drive import describe_frames
 from adapters.scene_cache import image_folder
 from adapters.uri import WAYMO_REQUIRED, WAYMO_SPLITS
 from augment.errors import AdapterError
@@ -60,7 +60,7 @@ _ADVICE = "write it as the dataset does, or copy the dataset's own file"
 
 @dataclass(frozen=True)
 class SegmentFiles:
-    """The tables of one segment. is_alone: its folder holds the files themselves."""
+    """Tables of one segment. is_alone: True if its folder holds the files themselves."""
 
     name: str
     root: Path
@@ -120,7 +120,7 @@ def find_segment(path: Path, segment_name: str | None) -> SegmentFiles:
 
 
 def _segment_names(table: pa.Table, path: Path) -> list[str]:
-    """The segment of each row."""
+    """Return the segment of each row."""
     if SEGMENT not in table.column_names:
         raise AdapterError(f"{path}: column {SEGMENT} is missing; {_ADVICE}")
     kind = table[SEGMENT].type
@@ -133,9 +133,10 @@ def _segment_names(table: pa.Table, path: Path) -> list[str]:
 
 
 class Rows:
-    """The rows of one segment in one component.
+    """Rows of one segment in one component.
 
-    A column is named by its field, such as `type`, or by its key, such as `key.laser_name`."""
+    A column is named by its field, such as `type`, or by its key, such as `key.laser_name`.
+    """
 
     def __init__(self, files: SegmentFiles, component: str, fields: Sequence[str]) -> None:
         self.path = files.path(component)
@@ -156,7 +157,7 @@ class Rows:
 
     @property
     def numbers(self) -> np.ndarray:
-        """The rows' numbers in the file."""
+        """Return the rows' numbers in the file."""
         return self._table["row"].to_numpy()
 
     def name(self, field: str) -> str:
@@ -193,7 +194,7 @@ class Rows:
         return column.to_numpy(zero_copy_only=False)
 
     def finite(self, field: str, largest: float = LARGEST) -> np.ndarray:
-        """As `values` in float64, all finite and none beyond the largest in size."""
+        """Return a column in float64, all finite and none beyond `largest` in size."""
         values = self.values(field).astype(np.float64)
         if not (np.abs(values) <= largest).all():
             bad = values[~(np.abs(values) <= largest)][0]
@@ -235,14 +236,14 @@ class Rows:
         return [word_of.get(value, "Unknown") for value in self._words(field)]
 
     def _words(self, field: str) -> list[Any]:
-        """Numbers, texts or None."""
+        """Return a column of numbers, texts or None."""
         column = self.column(field)
         if not (is_number(column.type) or _is_text(column.type) or pa.types.is_null(column.type)):
             raise self.fault(field, f"must hold whole numbers or texts; it holds {column.type}")
         return column.to_pylist()
 
     def poses(self, field: str) -> np.ndarray:
-        """Rigid transforms, float64 [N, 4, 4]."""
+        """Return rigid transforms, float64 [N, 4, 4]."""
         flat = self.lists(field)
         if any(values is None or values.shape != (16,) for values in flat):
             raise self.fault(field, "must hold 16 numbers in every row")
@@ -255,7 +256,7 @@ class Rows:
         )
 
     def lists(self, field: str) -> list[np.ndarray | None]:
-        """Float64 numbers of each row's list, None for null."""
+        """Return the float64 numbers of each row's list, None for null."""
         column = self.column(field)
         if not NUMBER_LISTS.matches(column.type):
             raise self.fault(field, f"must hold {NUMBER_LISTS.words}; it holds {column.type}")
@@ -288,8 +289,13 @@ class Mount(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Laser:
-    """vehicle_from_laser: float64 [4, 4]. inclinations_rad: of the range image's rows from its last
-    to its first; or their lowest and highest limit, where rows are evenly spread."""
+    """A laser on the car.
+
+    Attributes:
+        vehicle_from_laser: float64 [4, 4].
+        inclinations_rad: those of the range image's rows from the last to the first; or their
+            lowest and highest limit, if rows are evenly spread.
+    """
 
     name: str
     vehicle_from_laser: np.ndarray
@@ -301,7 +307,9 @@ class Laser:
         return self.limits_rad[1] if self.inclinations_rad is None else self.inclinations_rad.max()
 
     def directions(self, rows: int, columns: int) -> np.ndarray:
-        """Unit vectors [rows, columns, 3] of a range image's beams, vehicle axes, float64."""
+        """Return unit vectors [rows, columns, 3] of a range image's beams, vehicle axes,
+        float64.
+        """
         low, high = self.limits_rad
         up = low + (np.arange(rows) + 0.5) / rows * (high - low)
         if self.inclinations_rad is not None:
@@ -317,9 +325,13 @@ class Laser:
 
 
 class Shot(NamedTuple):
-    """When a camera took its image of a frame, the middle of its readout, and where the vehicle
-    was then. pose_ns: the time of the pose that the dataset gives. readout_s: how long the readout
-    took, 0 where that is not known. row: of the image in camera_image."""
+    """Time and vehicle pose of a camera's image of a frame, at the middle of its readout.
+
+    Attributes:
+        pose_ns: time of the pose that the dataset gives.
+        readout_s: duration of the readout, 0 if it is not known.
+        row: row of the image in camera_image.
+    """
 
     timestamp_ns: int
     world_from_vehicle: np.ndarray
@@ -333,12 +345,18 @@ class Shot(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Calibration, poses and image times of one segment. Frames are numbered from 0 in order of
-    time.
+    """Calibration, poses and image times of one segment.
 
-    stamps_us: int64 [F], the frames' keys: when the TOP laser begins its turn. world_from_vehicle:
-    float64 [F, 4, 4], at pose_times_ns, int64 [F], about the middle of that turn. cameras, lasers:
-    by name. shots: by frame and camera. problems: a sentence each."""
+    Frames are numbered from 0 in order of time.
+
+    Attributes:
+        stamps_us: int64 [F], the frames' keys: when the TOP laser begins its turn.
+        world_from_vehicle: float64 [F, 4, 4], at pose_times_ns.
+        pose_times_ns: int64 [F], about the middle of that turn.
+        cameras, lasers: by name.
+        shots: by frame and camera.
+        problems: one sentence each.
+    """
 
     files: SegmentFiles
     stamps_us: np.ndarray
@@ -350,7 +368,7 @@ class Segment:
     problems: tuple[str, ...]
 
     def frames_of(self, stamps_us: np.ndarray, path: Path) -> np.ndarray:
-        """The frames' numbers of a table's rows, int64."""
+        """Return the frame numbers of a table's rows, int64."""
         frames = np.clip(np.searchsorted(self.stamps_us, stamps_us), 0, len(self.stamps_us) - 1)
         if (is_unknown := self.stamps_us[frames] != stamps_us).any():
             raise AdapterError(
@@ -544,7 +562,7 @@ def extract_images(
             paths[n][name] = str(folder / file)
     for name in segment.cameras:
         if without := [n for n in numbers if name not in segment.shots.get(n, {})]:
-            problems.append(f"camera {name}: no image of {some(without)}")
+            problems.append(f"camera {name}: no image of {describe_frames(without)}")
     ordered = {
         n: {name: frame_paths[name] for name in CAMERAS if name in frame_paths}
         for n, frame_paths in paths.items()

@@ -1,4 +1,8 @@
-"""Boxes as images show them, and samples in the shape that detectors are trained on."""
+"""Boxes as images show them, and samples in the shape that detectors are trained on.
+
+In: samples of a dataset (`augment.dataset.samples`). Out: 2D boxes, masks, and (image, target)
+pairs for torchvision.
+"""
 
 from __future__ import annotations
 
@@ -19,20 +23,24 @@ from augment.semantics import class_of_label
 
 @dataclass(frozen=True, eq=False)
 class Boxes2d:
-    """Boxes in the image. xyxy: float32 [B, 4], pixels, left, top, right, bottom, inside the image
-    (0 to its width and height; the first pixel's centre is at 0.5); zeros of boxes out of view.
-    in_view: bool [B], whether any of the box lies in the image, hidden by others or not.
-    """
+    """Boxes in the image."""
 
     xyxy: torch.Tensor
+    """Left, top, right, bottom, float32 [B, 4], pixels, inside the image (0 to its width and
+    height; the first pixel's centre is at 0.5); zeros for boxes out of view."""
     in_view: torch.Tensor
+    """True for boxes with a part inside the image, hidden by others or not, bool [B]."""
 
 
 def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
-    """Return the tight bounds of a sample's boxes in the image. The bounds enclose the projected
-    box, cut off at the image's borders. (Bounds of the projected corners would be wider for a box
-    that a border cuts.) Weather and objects that hide a box do not change them. A box whose numbers
-    are not finite is out of view. Raises ValueError: the sample has no boxes.
+    """Return the tight bounds of a sample's boxes in the image.
+
+    The bounds enclose the projected box, cut off at the image's borders. (Bounds of the projected
+    corners would be wider for a box that a border cuts.) Weather and objects that hide a box do not
+    change them. A box whose numbers are not finite is out of view.
+
+    Raises:
+        ValueError: the sample has no boxes.
     """
     boxes = sample["boxes"]
     camera = sample["camera"]
@@ -56,7 +64,12 @@ def boxes_in_camera(
     boxes: Mapping[str, Any], camera: Mapping[str, Any]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return centers_m [B, 3] and quats [B, 4], float64, of a sample's boxes in its camera's frame.
+
     The sample's boxes may be in any frame.
+
+    Args:
+        boxes: `boxes` of the sample.
+        camera: `camera` of the sample.
     """
     centers_m = boxes["centers_m"].numpy()
     quats = boxes["quats"].numpy()
@@ -92,19 +105,28 @@ def torchvision_sample(
                           the whole box (`boxes_2d`), or modal, of the pixels that show it
         labels            int64 [N], by label_ids: `SemanticClass` by default (vehicles are 10);
                           boxes of labels that a mapping lacks are left out
-        visible_fraction  float64 [N], of each what nothing before it hides (NaN: not known), if the
-                          sample has it
-        visibility        float64 [N], what the weather leaves of each
+        visible_fraction  float64 [N], part that nothing before the box hides (NaN: not known), if
+                          the sample has it
+        visibility        float64 [N], part that the weather leaves visible
         track_ids         list of N
         masks             bool [N, H, W], if asked for: the pixels that show each box, by depth
         depth, semantic, instance, water, snow   [H, W], those that the sample has
         frame, scene, variant
 
-    Kept are boxes in view with sides of min_side_px at least, of which min_visible_fraction at
-    least is not hidden by other things and min_visibility not by weather; with modal bounds, those
-    that a pixel shows; with masks, those that min_pixels at least show. Where torchvision is
-    installed, image, boxes and masks are its `tv_tensors`, so that its transforms move them
-    together; depth too is a `Mask`, which transforms never blend. Else they are plain tensors.
+    Where torchvision is installed, image, boxes and masks are its `tv_tensors`, so that its
+    transforms move them together; depth, too, is a `Mask`, which transforms never blend. Else they
+    are plain tensors.
+
+    Args:
+        sample: a sample with an image and boxes.
+        label_ids: number of each label: a mapping, or a function that returns None for none.
+        masks: if True, the target has masks, and boxes that fewer than min_pixels show are left
+            out.
+        bounds: amodal or modal; modal bounds leave out boxes that no pixel shows.
+        min_visible_fraction: part of a box that other things must leave visible.
+        min_visibility: part of a box that the weather must leave visible.
+        min_side_px: shortest side of a box in the image.
+        min_pixels: pixels that must show a box, with masks.
 
     Raises:
         ValueError: the sample has no image or boxes, or lacks the depth that masks need, or what
@@ -152,11 +174,14 @@ def torchvision_sample(
 
 
 def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
-    """Return the pixels that show each of a sample's boxes, bool [B, H, W]. A pixel shows a box if
-    its surface, by the depth image, lies inside the box without its lowest centimetres and with the
-    other sides 10 cm wider (`augment.boxes`). An object in front of a box is therefore not in the
-    mask of the box. Where boxes overlap, a pixel is in both masks. Raises ValueError: the sample
-    has no boxes or no depth.
+    """Return the pixels that show each of a sample's boxes, bool [B, H, W].
+
+    A pixel shows a box if its surface, by the depth image, lies inside the box without its lowest
+    centimetres and with the other sides 10 cm wider (`augment.boxes`). An object in front of a box
+    is therefore not in the mask of the box. Where boxes overlap, a pixel is in both masks.
+
+    Raises:
+        ValueError: the sample has no boxes or no depth.
     """
     boxes = sample["boxes"]
     depth = sample["depth"]
@@ -189,8 +214,12 @@ def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
 
 
 def _wrappers(size: tuple[int, ...]) -> dict[str, Callable[[torch.Tensor], torch.Tensor]]:
-    """Return functions that make torchvision's kinds of tensors; without torchvision they return
-    the tensor unchanged. size: (H, W) of the image.
+    """Return functions that make torchvision's kinds of tensors.
+
+    Without torchvision they return the tensor unchanged.
+
+    Args:
+        size: (H, W) of the image.
     """
     try:
         from torchvision import tv_tensors  # pyright: ignore[reportMissingImports]

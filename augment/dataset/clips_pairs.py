@@ -1,4 +1,7 @@
-"""Clips: consecutive frames of all cameras, for models that look at time or around the car."""
+"""Datasets made of other datasets: shards, splits, clean and weathered pairs, and clips.
+
+Clips are consecutive frames of all cameras, for models that look at time or around the car.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from augment.dataset.samples import (
 from augment.dataset.weather_dataset import Rows, WeatherDataset, number_groups
 from augment.jobs.manifest import effect_masks
 
-# ---- Who trains on which sample: dealt to all processes, the same again after an interruption ----
+# ---- Samples dealt to all processes, the same again after an interruption ------------------------
 
 Uneven = Literal["exact", "pad", "drop"]
 
@@ -36,10 +39,16 @@ class ShardedSampler(Sampler[int]):
     workers: a DataLoader deals what its sampler gives out to its workers. The order depends on the
     seed and the epoch only, and rank r of R has its places r, r + R, r + 2 R, ...
 
-    samples: the dataset, or how many there are. ranks, rank: of torch.distributed where it runs,
-    else 1 and 0. uneven: what happens where the count is no multiple of the ranks': `exact`, some
-    ranks have one sample more; `pad`, the first places come again, so that all ranks have as many
-    (collective operations wait for each other); `drop`, the last places are left out this epoch.
+    Args:
+        samples: the dataset, or the number of samples.
+        rank: number of this process; None takes torch.distributed's where it runs, else 0.
+        ranks: number of processes; None takes torch.distributed's where it runs, else 1.
+        shuffle: if False, the order is that of the samples.
+        seed: seed of the order.
+        uneven: what happens where the number of samples is no multiple of the ranks. `exact`: some
+            ranks have one sample more. `pad`: the first places come again, so that all ranks have
+            as many (collective operations wait for each other). `drop`: the last places are left
+            out this epoch.
 
     To go on after an interruption, keep `state_dict(given)` and load it into a sampler of the same
     samples and seed; the number of ranks may then be another. A DataLoader asks its sampler ahead
@@ -86,7 +95,7 @@ class ShardedSampler(Sampler[int]):
             yield sample
 
     def __len__(self) -> int:
-        """Samples of this rank that the epoch still has."""
+        """Return the number of samples of this rank that the epoch still has."""
         num_remaining = max(self.count - self._num_done, 0)
         if self.uneven == "exact":
             return len(range(self.rank, num_remaining, self.ranks))
@@ -95,10 +104,13 @@ class ShardedSampler(Sampler[int]):
         )
 
     def state_dict(self, given: int | None = None) -> dict[str, Any]:
-        """Return the place in the epoch, in plain numbers that JSON holds. given: number of samples
-        of this rank that were trained on since the epoch began or the last state was loaded:
-        batches times their size. None takes the number that this sampler yielded, which is right if
-        no worker reads ahead. Every rank must have trained on the same number.
+        """Return the place in the epoch, in plain numbers that JSON holds.
+
+        Args:
+            given: number of samples of this rank that were trained on since the epoch began or the
+                last state was loaded: batches times their size. Every rank must have trained on the
+                same number. None takes the number that this sampler yielded, which is right if no
+                worker reads ahead.
         """
         ahead = (self._num_yielded if given is None else given) * self.ranks
         return {
@@ -110,8 +122,10 @@ class ShardedSampler(Sampler[int]):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where `state_dict` stood. Raises ValueError: the state is of another seed, order or
-        number of samples.
+        """Go on where `state_dict` stood.
+
+        Raises:
+            ValueError: the state is of another seed, order or number of samples.
         """
         expected_state = {"seed": self.seed, "shuffle": self.shuffle, "count": self.count}
         if wrong := {k: (state.get(k), v) for k, v in expected_state.items() if state.get(k) != v}:
@@ -127,6 +141,7 @@ class ShardedSampler(Sampler[int]):
         self._num_yielded = 0
 
     def _share(self) -> list[int]:
+        """Return the samples of this rank that the epoch still has."""
         order = np.arange(self.count)
         if self.shuffle:
             np.random.default_rng([self.seed, self.epoch]).shuffle(order)
@@ -138,12 +153,13 @@ class ShardedSampler(Sampler[int]):
 
 
 def _process_rank() -> tuple[int, int]:
+    """Return rank and number of processes of torch.distributed, or 0 and 1."""
     if distributed.is_available() and distributed.is_initialized():
         return distributed.get_rank(), distributed.get_world_size()
     return 0, 1
 
 
-# ---- splits --------------------------------------------------------------------------------------
+# ---- Splits --------------------------------------------------------------------------------------
 
 _MOMENT = ("scene", "frame", "camera")  # columns that name the moment of an image
 Splittable = TypeVar("Splittable", WeatherDataset, pa.Table)
@@ -157,14 +173,22 @@ def split_by_scene(
     *,
     exact: bool = False,
 ) -> dict[str, Splittable]:
-    """The parts of a dataset, or of a manifest's table, by name; each scene is in one of them. All
-    variants, frames and cameras of a scene stay together. Which part a scene belongs to follows
-    from its name and the seed: it does not change when other scenes are added or filtered out, when
-    a part is renamed, or between machines. The price is that fractions hold on average only: of ten
-    scenes, 0.2 is often none or four. fractions: of the scenes, in order; they add up to 1. exact:
-    deal the scenes that there are such that each part's number is off by less than one; a scene's
-    part then depends on the others. Raises ValueError: fractions that are negative or do not add up
-    to 1.
+    """Split a dataset, or a manifest's table, by scenes; returns the parts by name.
+
+    All variants, frames and cameras of a scene stay together. The part of a scene follows from its
+    name and the seed. It does not change when other scenes are added or filtered out, when a part
+    is renamed, or between machines. The price is that fractions hold on average only: of ten
+    scenes, 0.2 is often none or four.
+
+    Args:
+        whole: the dataset or table.
+        fractions: parts of the scenes by name, in order; they add up to 1.
+        seed: seed of the split.
+        exact: if True, deal the scenes such that each part's number is off by less than one; a
+            scene's part then depends on the others.
+
+    Raises:
+        ValueError: fractions are negative or do not add up to 1.
     """
     shares = list(fractions.values())
     if not shares or min(shares) < 0 or not math.isclose(sum(shares), 1, abs_tol=1e-9):
@@ -191,15 +215,25 @@ def _place(scene: str, seed: int) -> float:
 
 
 def clean_frames(dataset: WeatherDataset, variant: str | None = None) -> WeatherDataset:
-    """Select the images without weather and style, or those of one variant. Without a variant's
-    name: images whose manifest lists no effect, and whose other weather numbers are all zero or
-    absent. Raises ValueError: the variant does not exist.
+    """Select the images without weather and style, or those of one variant.
+
+    Args:
+        dataset: the dataset.
+        variant: name of the variant; None selects images whose manifest lists no effect, and whose
+            other weather numbers are all zero or absent.
+
+    Raises:
+        ValueError: the variant does not exist.
     """
     return dataset.select(clean_mask(dataset.rows, variant))
 
 
 def clean_mask(rows: Rows, variant: str | None = None) -> np.ndarray:
-    """Return the rows that `clean_frames` selects, bool [N]. Raises ValueError likewise."""
+    """Return the mask of rows that `clean_frames` selects, bool [N].
+
+    Raises:
+        ValueError: the variant does not exist.
+    """
     if variant is None:
         return ~np.logical_or.reduce(list(masks_of(rows).values()))
     codes, names = rows.codes("variant")
@@ -209,7 +243,7 @@ def clean_mask(rows: Rows, variant: str | None = None) -> np.ndarray:
 
 
 def masks_of(rows: Rows) -> dict[str, np.ndarray]:
-    """Return by the effects' names the mask of rows, bool [N], that have the effect."""
+    """Return, by the effects' names, the mask of rows that have the effect, bool [N]."""
     return effect_masks({name: rows.numbers(name) for name in rows.weather}, len(rows))
 
 
@@ -243,7 +277,7 @@ class PairedDataset(Dataset):
 
     @staticmethod
     def of(dataset: WeatherDataset, clean_variant: str | None = None) -> PairedDataset:
-        """The pairs within one dataset: its clean images (`clean_frames`) and all others."""
+        """Return the pairs within one dataset: its clean images (`clean_frames`) and all others."""
         clean = clean_mask(dataset.rows, clean_variant)
         return PairedDataset(dataset.select(clean), dataset.select(~clean))
 
@@ -257,13 +291,21 @@ class PairedDataset(Dataset):
 
 
 class MixedDataset(Dataset):
-    """The clean images, a part of them exchanged for weathered ones of the same moment. As long as
-    `clean`. fraction: the probability of an exchange, where there is a weathered image; which of
-    several is drawn too, each as likely. What an index yields depends on the seed, the epoch and
-    the index only: not on the worker, nor on what was asked before. Both datasets need the same
-    `image_type` and `transform`, or their samples do not stack. Raises ValueError: a fraction
-    outside 0 to 1, two clean images of one moment, or one dataset's samples have what the other's
-    lack (masks of water and snow excepted).
+    """The clean images, a part of them exchanged for weathered ones of the same moment.
+
+    It is as long as `clean`. The sample of an index depends on the seed, the epoch and the index
+    only: not on the worker, nor on earlier samples. Both datasets need the same `image_type` and
+    `transform`, or their samples do not stack.
+
+    Args:
+        clean: the clean images.
+        weathered: the weathered images; of several for one moment, each is as likely.
+        fraction: probability of an exchange, where there is a weathered image.
+        seed: seed of the exchanges.
+
+    Raises:
+        ValueError: a fraction outside 0 to 1, two clean images of one moment, or one dataset's
+            samples have what the other's lack (masks of water and snow excepted).
     """
 
     def __init__(
@@ -340,7 +382,7 @@ def _partners(clean: Rows, weathered: Rows) -> np.ndarray:
     return row_of[moments[len(clean) :]]
 
 
-# ---- clips ---------------------------------------------------------------------------------------
+# ---- Clips ---------------------------------------------------------------------------------------
 
 MAX_LATE = 1.5  # longest time between frames without a gap, in usual intervals
 _PER_FRAME = ("sizes_m", "labels", "track_ids", "attributes", "frame")  # keys equal for all cameras
@@ -350,9 +392,13 @@ _POSES = ("centers_m", "quats")  # keys equal for all cameras unless in the came
 class ClipDataset(Dataset):
     """Clips of `length` frames of one scene under one variant, each with all cameras.
 
-    length: frames a clip, T. step: of how many recorded frames each is taken. stride: recorded
-    frames from one clip's first to the next's. cameras: names in the order of the samples, None for
-    all that a variant has. transform: called with every clip.
+    Args:
+        frames: the dataset of the frames, which is used without its own `transform`.
+        length: frames a clip, T.
+        step: recorded frames from one frame of a clip to the next.
+        stride: recorded frames from one clip's first frame to the next clip's.
+        cameras: names in the order of the samples; None for all that a variant has.
+        transform: called with every clip.
 
     Frames follow each other where their numbers do (by the smallest distance that the variant's
     numbers have) and their times: one that comes later than 1.5 of the usual intervals, or lacks a
@@ -372,8 +418,6 @@ class ClipDataset(Dataset):
         paths             a list of T lists of C
         frame             int64 [T]
         scene, variant, weather, recipe_hash, surface: as in a sample
-
-    The frames' dataset is asked without its own `transform`.
 
     Raises:
         ValueError: numbers below 1, or a camera that no variant has.
@@ -408,15 +452,20 @@ class ClipDataset(Dataset):
         return len(self._starts)
 
     def __getitem__(self, index: int) -> Any:
-        clip = join_clip([
-            # All cameras see the same sweep.
-            [self.frames.sample(row, without=("lidar",) if c else ()) for c, row in enumerate(rows)]
-            for rows in self.row_numbers(index).tolist()
-        ])  # fmt: skip
+        clip = join_clip(
+            [
+                # All cameras see the same sweep.
+                [
+                    self.frames.sample(row, without=("lidar",) if camera else ())
+                    for camera, row in enumerate(rows)
+                ]
+                for rows in self.row_numbers(index).tolist()
+            ]
+        )
         return clip if self.transform is None else self.transform(clip)
 
     def row_numbers(self, index: int) -> np.ndarray:
-        """int64 [T, C]: the numbers of the clip's images in `frames`."""
+        """Return the numbers of the clip's images in `frames`, int64 [T, C]."""
         run, start = self._starts[check_index(index, len(self), "clip")]
         return self._runs[run][start + self._steps]
 
@@ -438,7 +487,11 @@ def join_clip(frames: Sequence[Sequence[Sample]]) -> dict[str, Any]:
 
 
 def _joined(values: list[list[Any]]) -> Any:
-    """Stack tensors [T][C]. Returns None if all are None, and the lists if they differ in shape."""
+    """Stack tensors [T][C].
+
+    Returns:
+        The stack; None if all are None; the lists if they differ in shape.
+    """
     stack = stack_alike([value for frame in values for value in frame])
     if isinstance(stack, torch.Tensor):
         return stack.unflatten(0, (len(values), -1))
@@ -457,13 +510,14 @@ def _boxes(camera_boxes: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _cameras(cameras: list[list[Mapping[str, Any]]]) -> dict[str, Any]:
+    """Stack cameras [T][C]."""
     stack = stack_cameras([stack_cameras(frame, torch.stack) for frame in cameras], torch.stack)
     ego = stack["world_from_ego"][:, 0]
     return {**stack, "name": stack["name"][0], "world_from_ego": ego}
 
 
 def _runs(rows: Rows, cameras: Sequence[str] | None) -> Iterator[np.ndarray]:
-    """Row numbers int64 [F, C] of frames that follow each other without a gap."""
+    """Yield row numbers int64 [F, C] of frames that follow each other without a gap."""
     camera, names = rows.codes("camera")
     frames = rows.numbers("frame")
     times = rows.numbers("timestamp_ns")
@@ -493,14 +547,18 @@ def _runs(rows: Rows, cameras: Sequence[str] | None) -> Iterator[np.ndarray]:
 
 
 def _by_variant(rows: Rows) -> Iterator[np.ndarray]:
-    """The numbers of the rows of each scene under each variant, in the order of the rows."""
+    """Yield the numbers of the rows of each scene under each variant, in the order of the rows."""
     group = rows.groups()[1]
     order = np.argsort(group, kind="stable")
     yield from np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if len(order) else ()
 
 
 def _late(clock_ns: np.ndarray) -> np.ndarray:
-    """Return True where any camera's next image is late, bool [F - 1]. clock_ns: int64 [F, C]."""
+    """Return the mask of frames before which any camera's image is late, bool [F - 1].
+
+    Args:
+        clock_ns: times of the images, int64 [F, C].
+    """
     waits_ns = np.diff(clock_ns, axis=0)
     interval_ns = np.median(waits_ns, axis=0) if len(waits_ns) else np.zeros(clock_ns.shape[1])
     is_late = (waits_ns > MAX_LATE * interval_ns) | (waits_ns < 0)

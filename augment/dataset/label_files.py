@@ -1,15 +1,16 @@
-"""An output's labels as trainers read them: COCO, KITTI and YOLO, in `labels/` of the output.
+"""Label files of an output for trainers, COCO, KITTI and YOLO, in `labels/` of the output.
 
-    labels/index.csv                              which image each number is
+    labels/index.csv                              image of each number
     labels/coco/instances_train.json              images by their path in the output
     labels/kitti/training/{image_2,label_2,calib}/000000.*, ImageSets/train.txt
     labels/yolo/{data.yaml, images/train/000000.png, labels/train/000000.txt}
 
-They follow from the manifest, the label tables and the recipes alone, and are written whole or not
-at all. Images are the output's own under a second name, or copies where links cannot be had.
+In: the manifest, the label tables and the recipes of an output. Out: the files above, by
+`write_labels`, whole or not at all. Images are the output's own under a second name, or copies
+where links cannot be had.
 
-Labelled are the objects that at least one pixel shows. Pixels count from the image's upper left
-corner: the first one's centre is at 0.5.
+Objects that at least one pixel shows are labelled. Pixels count from the image's upper left corner:
+the first one's centre is at 0.5.
 """
 
 from __future__ import annotations
@@ -77,52 +78,68 @@ class NothingLabelled(OutputError):
 
 
 class LabelsAsked(BaseModel, frozen=True, extra="forbid"):
-    """How labels are written. split: shares of the scenes by part (`split_by_scene`). changes:
-    changes of the recipes' fields, written as for `--set`.
-    """
+    """Options of `write_labels`."""
 
     split: dict[str, float] = WHOLE
+    """Shares of the scenes by part (`split_by_scene`)."""
     seed: int = 0
+    """Seed of the split."""
     changes: tuple[str, ...] = ()
+    """Changes of the recipes' fields, written as for `--set`."""
 
 
 class LabelsRecord(BaseModel, frozen=True, extra="forbid"):
-    """Content of the file RECORD of an output; fields as in LabelsAsked and LabelsWritten."""
+    """Content of the file RECORD of an output."""
 
     asked: LabelsAsked
+    """Options of the labels."""
     categories: tuple[str, ...]
+    """Names of the categories, in the order of their numbers."""
     images: dict[LabelFormat, NonNegativeInt]
+    """Number of images by format."""
     objects: dict[LabelFormat, NonNegativeInt]
+    """Number of objects by format."""
     hidden: dict[LabelFormat, NonNegativeInt]
+    """Number of objects that the weather hides, by format."""
     unmapped: dict[str, NonNegativeInt]
+    """Number of boxes by label, for labels without a category."""
 
 
 @dataclass(frozen=True)
 class LabelsWritten:
-    """Labels that one call of `write_labels` has written. images, objects, hidden: counts by
-    format; hidden counts the objects that the weather hides, whether they are marked or left out.
-    parts: number of images by part. unmapped: number of boxes by label, for labels without a
-    category ("" where the dataset gives no label). unused: rows of category tables that match no
-    label. without_numbers: number of kitti objects that are DontCare because a number of their 3D
-    box is not usable.
-    """
+    """Labels that one call of `write_labels` has written."""
 
     folder: Path
+    """Folder of the labels."""
     images: Mapping[str, int]
+    """Number of images by format."""
     objects: Mapping[str, int]
+    """Number of objects by format."""
     hidden: Mapping[str, int]
+    """Number of objects that the weather hides by format, whether they are marked or left out."""
     parts: Mapping[str, int]
+    """Number of images by part."""
     unmapped: Mapping[str, int]
+    """Number of boxes by label, for labels without a category ("" where the dataset gives no
+    label)."""
     unused: tuple[str, ...]
+    """Rows of category tables that match no label."""
     without_numbers: int = 0
+    """Number of kitti objects that are DontCare because a number of their 3D box is not usable."""
 
 
 def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWritten:
-    """Write the labels of an output on this machine; they replace the labels that it has. asked:
-    None takes the options of the last call, or the recipes' options if there was none. Raises
-    NothingLabelled: no variant has both masks and a recipe that asks for a format. OutputError: no
-    label has a category, or a file of the output is damaged. RecipeError: a change is not valid.
-    ValueError: the shares of a split do not add up to 1, or the name of a part is no file name.
+    """Write the labels of an output on this machine; they replace the labels that it has.
+
+    Args:
+        out: folder of the output.
+        asked: options; None takes those of the last call, or the recipes' if there was none.
+
+    Raises:
+        NothingLabelled: no variant has both masks and a recipe that asks for a format.
+        OutputError: no label has a category, or a file of the output is damaged.
+        RecipeError: a change is not valid.
+        ValueError: the shares of a split do not add up to 1, or the name of a part is no file name.
     """
     out = Path(out).absolute()
     folder = path_below(out, (LABELS,))
@@ -158,14 +175,14 @@ def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWri
 
 
 def _last_request(folder: Path) -> LabelsAsked:
-    """Return how the labels of the folder were written; the defaults if that cannot be read."""
+    """Return the options of the folder's labels; the defaults if they cannot be read."""
     try:
         return LabelsAsked.model_validate(json.loads(read_file(folder / RECORD))["asked"])
     except (OSError, LookupError, TypeError, ValueError, RecursionError):
         return LabelsAsked()
 
 
-# ---- Which categories the labels are of ----------------------------------------------------------
+# ---- Categories of the labels --------------------------------------------------------------------
 
 Variant = tuple[str, str]  # scene and name
 
@@ -189,8 +206,13 @@ def _policies(
 
 
 def category_of(label: str, table: Sequence[Category] | None) -> str | None:
-    """Return the name of the first row that matches the label; None if no row does, or if the
-    dataset gives no label (""). table: None makes every label its own category.
+    """Return the name of the first row that matches the label.
+
+    None if no row does, or if the dataset gives no label ("").
+
+    Args:
+        label: label of an object.
+        table: the recipe's categories; None makes every label its own category.
     """
     if not label:
         return None
@@ -200,10 +222,14 @@ def category_of(label: str, table: Sequence[Category] | None) -> str | None:
 
 
 def planned_labels(scene: Scene, output: Output) -> dict[str, Any] | None:
-    """Forecast of the labels that a job will write for a scene; None if the recipe asks for no
-    format. files: paths of the files in the output. categories: by name, the numbers of boxes and
-    of objects in the scene's frames (images get only the boxes that a pixel shows). unmapped:
-    number of boxes by label, for labels without a category.
+    """Return a forecast of the labels that a job will write for a scene.
+
+    None if the recipe asks for no format.
+
+    Returns:
+        files: paths of the files in the output. categories: by name, the numbers of boxes and of
+            objects in the scene's frames (images get only the boxes that a pixel shows). unmapped:
+            number of boxes by label, for labels without a category.
     """
     if not output.label_formats:
         return None
@@ -231,19 +257,20 @@ def planned_labels(scene: Scene, output: Output) -> dict[str, Any] | None:
 
 
 class _Categories(NamedTuple):
-    """Categories of an output. names: all names, in the order of their numbers. unmapped and
-    unused: as in LabelsWritten.
-    """
+    """Categories of an output."""
 
     names: tuple[str, ...]
+    """All names, in the order of their numbers."""
     unmapped: Mapping[str, int]
+    """As in LabelsWritten."""
     unused: tuple[str, ...]
+    """As in LabelsWritten."""
 
 
 def _categories(
     out: Path, rows: Sequence[Mapping[str, Any]], policies: Mapping[Variant, Output]
 ) -> _Categories:
-    """The tables' names in their order; then labels without a table, sorted."""
+    """Return the tables' names in their order, then labels without a table, sorted."""
     labels: dict[Variant, Counter[str]] = {key: Counter() for key in policies}
     label_paths: dict[tuple[Variant, str], None] = dict.fromkeys(
         ((row["scene"], row["variant"]), row["labels_path"]) for row in rows
@@ -260,11 +287,13 @@ def _categories(
         if output.categories is None:
             free_labels.update(label for label in labels[key] if label)
         table_names |= dict.fromkeys(row.name for row in output.categories or ())
-        unmapped.update({
-            label: count
-            for label, count in labels[key].items()
-            if category_of(label, output.categories) is None
-        })  # fmt: skip
+        unmapped.update(
+            {
+                label: count
+                for label, count in labels[key].items()
+                if category_of(label, output.categories) is None
+            }
+        )
     tables = (output.categories or () for output in policies.values())
     table_rows = dict.fromkeys(row for table in tables for row in table)
     unused = tuple(row.label for row in table_rows if not any(map(row.takes, label_counts)))
@@ -285,34 +314,43 @@ def _categories(
 
 @dataclass(frozen=True, eq=False)
 class LabelledObject:
-    """One object that an image shows. is_hidden: the weather hides it, by the recipe's threshold.
-    amodal: left, top, right, bottom of its projected box inside the image, hidden or not; the same
-    as `visible` if the box has no projection there. visible: left, top, right, bottom of the pixels
-    that show it. rle: those pixels as COCO's run lengths. visibility: fraction that the weather
-    leaves visible. visible_fraction: fraction that other objects leave visible; both are NaN if not
-    known. is_estimated: the pixels follow from its 3D box (`box_estimates`). centre_m, size_m
-    (length, width, height), camera_from_box: position, size and rotation of its 3D box.
-    """
+    """One object that an image shows."""
 
     category: str
+    """Name of its category."""
     track_id: str
+    """Its track."""
     instance: int
+    """Its number in instance images."""
     is_hidden: bool
+    """If True, the weather hides it, by the recipe's threshold."""
     amodal: np.ndarray
+    """Left, top, right, bottom of its projected box inside the image, hidden or not; the same as
+    `visible` if the box has no projection there."""
     visible: np.ndarray
+    """Left, top, right, bottom of the pixels that show it."""
     pixels: int
+    """Number of these pixels."""
     rle: str
+    """These pixels as COCO's run lengths."""
     visibility: float
+    """Fraction that the weather leaves visible; NaN if not known."""
     visible_fraction: float
+    """Fraction that other objects leave visible; NaN if not known."""
     truncated_fraction: float
+    """Fraction of the projected box outside the image."""
     is_estimated: bool
+    """If True, the pixels follow from its 3D box (`box_estimates`)."""
     centre_m: np.ndarray
+    """Centre of its 3D box, in the camera's frame."""
     size_m: np.ndarray
+    """Length, width and height of its 3D box."""
     camera_from_box: np.ndarray
+    """Rotation of its 3D box."""
 
     @property
     def has_numbers(self) -> bool:
-        """True if the position, size and heading of the 3D box are usable numbers."""
+        """Return True if position, size and heading of the 3D box are usable numbers."""
         numbers = np.concatenate([self.centre_m, self.size_m, self.camera_from_box[:, 0]])
         return bool(are_usable(numbers[None], self.size_m[None])[0])
 

@@ -58,15 +58,23 @@ class SceneDataset(Dataset):
     The pixels are those of the files: depth is in steps of 1/256 m, and where the recipe writes
     JPEG the image passes through JPEG in memory. `paths` holds only None.
 
-    What all images share (where snow can lie, the maps of a style) is found here, once for all
-    samples and worker processes. So are the settings of a recipe whose quality has still to choose
-    them: `recipe` has them in numbers.
+    Data that all images share (where snow can lie, the maps of a style) is computed here, once for
+    all samples and worker processes. So are the settings of a recipe whose quality has still to
+    choose them: `recipe` has them in numbers.
 
-    scene: an open scene. frames, cameras: what to keep, None for all. backend: as in `rasterize`;
-    "auto" never takes a GPU, which processes that a DataLoader forks could not use. "cuda" is for
-    samples of this process, or of workers that are started afresh (`spawn`).
-    renderer: `augment.views.render_view` if None. load, box_frame, transform: as for
-    `WeatherDataset`; a live scene passes no sweeps on.
+    Args:
+        scene: an open scene.
+        recipe: the weather and the outputs.
+        frames: numbers of the frames to keep; None for all.
+        cameras: names of the cameras to keep; None for all.
+        backend: as in `rasterize`; "auto" never takes a GPU, which processes that a DataLoader
+            forks could not use. "cuda" is for samples of this process, or of workers that are
+            started afresh (`spawn`).
+        image_type: as for `WeatherDataset`.
+        renderer: renders a view; None takes `augment.views.render_view`.
+        load: as for `WeatherDataset`; a live scene passes no sweeps on.
+        box_frame: as for `WeatherDataset`.
+        transform: as for `WeatherDataset`.
 
     Raises:
         SceneError: an unknown frame or camera, or the scene cannot have the recipe's snow or base.
@@ -134,6 +142,7 @@ class SceneDataset(Dataset):
         ]
 
     def _views(self, cameras: Sequence[Camera]) -> Iterator[Any]:
+        """Return the views of some cameras, rendered as they are asked for."""
         if self._backend == CUDA and self._process != os.getpid():  # not unpickled: forked
             raise BackendUnavailable(_FORKED)
         if self._renderer is None:
@@ -144,6 +153,7 @@ class SceneDataset(Dataset):
         return (self._renderer(self.scene, camera, self.recipe, **options) for camera in cameras)
 
     def _sample(self, frame: Frame, name: str, view: View) -> Sample:
+        """Return the sample of one view."""
         recipe = self.recipe
         origin_m = self._index.world_origin_m
         camera = frame.cameras[name].scaled(recipe.render.scale)
@@ -180,8 +190,14 @@ class SceneDataset(Dataset):
         return {k: v for k, v in images.items() if k in self.options.load and v is not None}
 
     def _label(self, frame: Frame, camera: Camera, view: View) -> tuple[View, Labels]:
-        """Return the view with the frame's boxes in its instance image, and the frame's labels as
-        the files of a job would hold them. camera: the camera that a job would write.
+        """Return the view with the frame's boxes in its instance image, and the frame's labels.
+
+        The labels are those that the files of a job would hold.
+
+        Args:
+            frame: the frame.
+            camera: the camera that a job would write.
+            view: the rendered view.
         """
         load = self.options.load
         recipe = self.recipe

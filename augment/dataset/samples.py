@@ -50,13 +50,14 @@ NAMES = ("scene", "variant", "frame", "recipe_hash", "surface")  # as in the man
 
 
 class Buffer(NamedTuple):
-    """An image beside the picture. stored: the type of its file's pixels, of which `tensor` makes
-    the sample's. in_all: whether a batch has it of all samples or of none.
-    """
+    """Form of an image beside the picture."""
 
     stored: type
+    """Type of the file's pixels."""
     tensor: Callable[[np.ndarray], torch.Tensor]
+    """Function that makes the sample's tensor of the file's pixels."""
     in_all: bool = True
+    """If True, a batch has the image of all samples or of none."""
 
 
 _BUFFERS = {
@@ -64,9 +65,10 @@ _BUFFERS = {
     "semantic": Buffer(np.uint8, torch.from_numpy),
     "instance": Buffer(np.uint16, lambda ids: torch.from_numpy(ids.astype(np.int32))),
 }
-# Only such weather has it, or who asked for it. uint8, 0 or 255.
+# Form of a mask, uint8, 0 or 255; only samples with such weather have it, or those asked for it.
 _MASK = Buffer(np.uint8, lambda mask: torch.from_numpy(mask == 255), in_all=False)
-_TRUST = Buffer(np.uint8, lambda mask: torch.from_numpy(mask).float() / 255, in_all=False)  # graded
+# Form of the trust mask, whose values are graded.
+_TRUST = Buffer(np.uint8, lambda mask: torch.from_numpy(mask).float() / 255, in_all=False)
 
 
 def buffers() -> dict[str, Buffer]:
@@ -81,20 +83,29 @@ def loadable() -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class SampleOptions:
-    """Content and form of samples. load: some names of `loadable`. box_frame: the frame of boxes
-    and LiDAR points.
-    """
+    """Content and form of samples."""
 
     image_type: ImageType
+    """Type of the image's values."""
     load: frozenset[str]
+    """Names of `loadable` that samples hold."""
     box_frame: BoxFrame
+    """Frame of boxes and LiDAR points."""
 
     @staticmethod
     def checked(
         image_type: str = "float32", load: Collection[str] | None = None, box_frame: str = "world"
     ) -> SampleOptions:
-        """Return checked options. load: None takes all but sweeps, which are large and which few
-        users train on together with images. Raises ValueError: a value that does not exist.
+        """Return checked options.
+
+        Args:
+            image_type: type of the image's values.
+            load: names of `loadable`; None takes all but sweeps, which are large and which few
+                users train on together with images.
+            box_frame: frame of boxes and LiDAR points.
+
+        Raises:
+            ValueError: a value does not exist.
         """
         if load is None:
             load = set(loadable()) - {"lidar"}
@@ -112,23 +123,29 @@ def check_choice(name: str, value: str, choices: Any) -> None:
         raise ValueError(f"{name} must be one of {', '.join(get_args(choices))}; got {value!r}")
 
 
-def check_index(index: int, count: int, what: str = "sample") -> int:
-    """Return the index counted from 0, as a list counts it. Raises IndexError: it is outside."""
+def check_index(index: int, count: int, item_name: str = "sample") -> int:
+    """Return the index counted from 0, as a list counts it.
+
+    Raises:
+        IndexError: the index is outside.
+    """
     if not -count <= index < count:
-        raise IndexError(f"{what} {index} of a dataset of {count}")
+        raise IndexError(f"{item_name} {index} of a dataset of {count}")
     return index % count
 
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Labels of a frame, in the dataset's world. box_weather: numbers of the weather at each box.
-    instances: uint16 [B], the boxes' numbers in instance images.
-    """
+    """Labels of a frame, in the dataset's world."""
 
     boxes: Boxes | None = None
+    """Labelled boxes; None without any."""
     box_weather: BoxWeather | None = None
+    """Numbers of the weather at each box."""
     lidar: LidarSweep | None = None
+    """The frame's sweep; None without one."""
     instances: np.ndarray | None = None
+    """Numbers of the boxes in instance images, uint16 [B]."""
 
 
 def make_sample(
@@ -140,9 +157,16 @@ def make_sample(
     labels: Labels,
     described: Mapping[str, Any],
 ) -> Sample:
-    """Return one sample, a dictionary as the head of this module lists it. images: by the names of
-    `load`, RGB [H, W, 3] or [H, W], with the pixels that files store. described: weather, paths and
-    NAMES.
+    """Return one sample, a dictionary as the head of this module lists it.
+
+    Args:
+        options: content and form of the sample.
+        images: images by the names of `load`, RGB [H, W, 3] or [H, W], with the pixels that files
+            store.
+        camera: the camera of the image.
+        world_from_ego: pose of the car, float64 [4, 4].
+        labels: labels of the frame.
+        described: weather, paths and NAMES.
     """
     sample: Sample = dict.fromkeys(loadable())
     for name, image in images.items():
@@ -180,27 +204,41 @@ def box_tensors(
     *,
     instances: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """centers_m [B, 3], sizes_m [B, 3] (length, width, height), quats [B, 4] (wxyz,
-    frame_from_box): float64 tensors in `frame`, which is `box_frame`. labels, track_ids: lists of
-    strings. attributes: the dataset's further columns, NumPy arrays by name.
+    """Return the boxes of a sample, a dictionary of float64 tensors and lists.
 
-    instance: int32 [B], the objects' numbers in instance images. modal_xyxy: float32 [B, 4], as
-    `Boxes2d.xyxy`, but of the pixels that show a box; NaN where none does. visible_fraction:
-    float64 [B], of the pixels that show a box or what stands before it; NaN where there are
-    neither. truncated_fraction: float64 [B], of the projected box's area, outside the image. All
-    four None where the output is older than they.
+        centers_m         [B, 3], in `frame`
+        sizes_m           [B, 3], length, width, height
+        quats             [B, 4], wxyz, frame_from_box
+        frame             `box_frame`
+        labels, track_ids lists of strings
+        attributes        the dataset's further columns, NumPy arrays by name
+        instance          int32 [B], the objects' numbers in instance images
+        modal_xyxy        float32 [B, 4], as `Boxes2d.xyxy`, but of the pixels that show a box; NaN
+                          where none does
+        visible_fraction  [B], of the pixels that show a box or what stands before it; NaN where
+        there
+                          are neither
+        truncated_fraction [B], part of the projected box's area outside the image
+        submerged_fraction [B], part of a box's height under water
+        hidden_fraction   [B], part of its pixels behind water; NaN where the image shows none
+        snow_fraction     [B], part of its pixels that is snow; NaN as above
+        transmittance, rain_transmittance, snowfall_transmittance
+                          [B], of the smog, rain or snowfall before the box, 0 to 1
+        streak_fraction, flake_fraction
+                          [B], part of its pixels that shows a streak or a flake; NaN as above
+        visibility        [B], part of the box that all of this leaves visible, 0 to 1
+                          (`augment.jobs.files.visibility`)
 
-    submerged_fraction, hidden_fraction: float64 [B], how much of a box's height is under water,
-    and of its pixels behind water (NaN where the image shows none); None where there is no flood.
-    snow_fraction: float64 [B], how much of its pixels is snow (as above); None without snow.
-    transmittance, rain_transmittance, snowfall_transmittance: float64 [B], of the smog, rain or
-    snowfall before the box, 0 to 1; streak_fraction, flake_fraction: float64 [B], how much of its
-    pixels shows a streak or a flake (as above); None without such weather.
-    visibility: float64 [B], what all of that leaves of the box, 0 to 1
-    (`augment.jobs.files.visibility`).
+    Values are None without the weather that they measure. instance, modal_xyxy, visible_fraction
+    and truncated_fraction are None where the output is older than they.
 
-    world_from_frame: float64 [4, 4]; unused where the frame is the world, whose numbers keep their
-    bits.
+    Args:
+        boxes: the boxes, in the dataset's world.
+        weather: numbers of the weather at each box.
+        box_frame: frame of the result.
+        world_from_frame: pose of that frame, float64 [4, 4]; unused where the frame is the world,
+            whose numbers keep their bits.
+        instances: numbers of the boxes in instance images; None where not known.
     """
     centers_m = boxes.centers_m.copy()
     quats = boxes.quats.copy()
@@ -228,7 +266,7 @@ def box_tensors(
 
 def moved_points(points_m: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
     """Return points of the world [N, 3] in the coordinates of another frame."""
-    with np.errstate(invalid="ignore"):  # of points that are not finite, and stay so
+    with np.errstate(invalid="ignore"):  # points that are not finite stay so
         return (points_m - world_from_frame[:3, 3]) @ world_from_frame[:3, :3]
 
 
@@ -243,9 +281,16 @@ def turned_quats(quats: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
 def lidar_tensors(
     sweep: LidarSweep, frame: BoxFrame, world_from_frame: np.ndarray
 ) -> dict[str, Any]:
-    """points_m: float64 [N, 3] in the frame of the boxes. The dataset's further columns under their
+    """Return a sweep as tensors.
+
+    points_m is float64 [N, 3] in the frame of the boxes. The dataset's further columns keep their
     names (intensity, timestamp_ns, weather_code, ...) as tensors of their own types; text stays a
     NumPy array.
+
+    Args:
+        sweep: the sweep, in the dataset's world.
+        frame: frame of the result.
+        world_from_frame: pose of that frame, float64 [4, 4].
     """
     points_m = sweep.points_m
     if frame != "world":
@@ -264,14 +309,18 @@ def lidar_tensors(
 
 
 def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A batch of samples, for `DataLoader(collate_fn=collate_frames)`. Images and buffers of one
-    size are stacked to [N, ...]; of unlike sizes they stay a list, as do masks of water and snow
-    where a sample has none. camera: K [N, 3, 3], world_from_camera and world_from_ego [N, 4, 4] and
-    int64 [N] tensors, name a list. weather: float64 [N] per number, NaN where a sample lacks it.
-    Everything else, boxes above all, is a list with one entry a sample. Clips gain the same
-    dimension in front: image [N, T, C, 3, H, W], K [N, T, C, 3, 3], frame [N, T]. Pairs become a
-    dictionary of two batches. Raises ValueError: some samples have an image or buffer that others
-    lack, masks excepted: datasets of unlike outputs or `load` are mixed.
+    """Return a batch of samples, for `DataLoader(collate_fn=collate_frames)`.
+
+    Images and buffers of one size are stacked to [N, ...]. Of unlike sizes they stay a list, as do
+    masks of water and snow where a sample has none. Cameras have K [N, 3, 3], world_from_camera and
+    world_from_ego [N, 4, 4], int64 [N] tensors, and a list of names. Weather is float64 [N] per
+    number, NaN where a sample lacks it. Everything else, boxes above all, is a list with one entry
+    a sample. Clips gain the same dimension in front: image [N, T, C, 3, H, W], K [N, T, C, 3, 3],
+    frame [N, T]. Pairs become a dictionary of two batches.
+
+    Raises:
+        ValueError: some samples have an image or buffer that others lack, masks excepted: datasets
+            of unlike outputs or `load` are mixed.
     """
     first = samples[0]
     if "weathered" in first and "clean" in first:
@@ -292,6 +341,7 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _check_in_all(key: str, samples: Sequence[Mapping[str, Any]]) -> None:
+    """Raise ValueError if some samples lack a value that others have."""
     gaps = [sample for sample in samples if sample[key] is None]
     if 0 < len(gaps) < len(samples):
         names = dict.fromkeys(f"{sample['scene']}/{sample['variant']}" for sample in gaps)
@@ -306,7 +356,11 @@ Stack = Callable[[list[torch.Tensor]], torch.Tensor]
 
 
 def stack_alike(values: list[Any], stack: Stack = torch.stack) -> Any:
-    """Stack tensors of one shape. Returns None if all values are None, the list if they differ."""
+    """Stack tensors of one shape.
+
+    Returns:
+        The stack; None if all values are None; the list if their shapes differ.
+    """
     shapes = {None if value is None else value.shape for value in values}
     if shapes == {None}:
         return None
@@ -314,8 +368,10 @@ def stack_alike(values: list[Any], stack: Stack = torch.stack) -> Any:
 
 
 def _stack_shared(tensors: list[torch.Tensor]) -> torch.Tensor:
-    """Stack tensors in memory that a worker process shares with its parent. Otherwise the queue to
-    the parent would copy the batch once more; torch's own collate function does the same.
+    """Stack tensors in memory that a worker process shares with its parent.
+
+    Otherwise the queue to the parent would copy the batch once more; torch's own collate function
+    does the same.
     """
     if get_worker_info() is None:
         return torch.stack(tensors)
@@ -328,8 +384,9 @@ def _stack_shared(tensors: list[torch.Tensor]) -> torch.Tensor:
 
 
 def stack_cameras(cameras: Sequence[Mapping[str, Any]], stack: Stack) -> dict[str, Any]:
-    """Stack the matrices and numbers of cameras. Names become a list; so do matrices and numbers
-    of clips that differ in shape.
+    """Stack the matrices and numbers of cameras.
+
+    Names become a list; so do matrices and numbers of clips that differ in shape.
     """
     values = {key: [camera[key] for camera in cameras] for key in cameras[0]}
     return {k: v if k == "name" else _stack_numbers(v, stack) for k, v in values.items()}

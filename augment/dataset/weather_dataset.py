@@ -1,4 +1,8 @@
-"""The dataset over the files that jobs have written."""
+"""Dataset over the files that jobs have written.
+
+In: output folders or stores. Out: samples (`augment.dataset.samples`). Only the manifest is held in
+memory; files are read when a sample is asked for.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +57,7 @@ from augment.jobs.tables import read_boxes, read_lidar
 
 pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import
 
-# ---- A manifest's rows in a quarter of its memory, with quick access to single ones --------------
+# ---- Rows of a manifest in a quarter of its memory, with quick access to single ones -------------
 # Most of a row in the manifest's table (440 bytes with short names, 110 here) are paths and names
 # that repeat. Here every column is dictionary-encoded with the smallest codes; paths are split into
 # folder and file name, of which there are few. Arrow's buffers are shared by forked workers.
@@ -70,23 +74,25 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """The rows of a manifest. batch: its columns, encoded. weather: names of the columns that hold
-    weather numbers.
-    """
+    """The rows of a manifest."""
 
     batch: pa.RecordBatch
+    """Columns of the manifest, encoded."""
     weather: tuple[str, ...]
+    """Names of the columns that hold weather numbers."""
 
     @staticmethod
     def of(table: pa.Table) -> Rows:
-        """The rows of a manifest; its columns ending in `_path` hold paths."""
+        """Return the rows of a manifest's table; columns ending in `_path` hold paths."""
         encoded: dict[str, pa.Array] = {}
         for name, column in zip(table.column_names, table.columns, strict=True):
             if name.endswith("_path"):
                 folders, column = pc.extract_regex(column, _PATH).combine_chunks().flatten()
-                encoded[name + _FOLDERS] = _encoded(pa.chunked_array([folders]))
+                encoded[name + _FOLDERS] = _encode_column(pa.chunked_array([folders]))
                 column = pa.chunked_array([column])
-            encoded[name] = _digests(column) if name == "checksum" else _encoded(column)
+            encoded[name] = (
+                _encode_digests(column) if name == "checksum" else _encode_column(column)
+            )
         weather = (name for name in weather_columns(table) if name != _OUTPUT)
         return Rows(pa.RecordBatch.from_pydict(encoded), tuple(weather))
 
@@ -98,11 +104,11 @@ class Rows:
 
     @property
     def names(self) -> list[str]:
-        """Names of the manifest's columns."""
+        """Return the names of the manifest's columns."""
         return [name for name in self.batch.schema.names if not name.endswith(_FOLDERS)]
 
     def __getitem__(self, name: str) -> pa.Array:
-        """A column as the manifest has it."""
+        """Return a column as the manifest has it."""
         column = self.batch.column(name)
         if pa.types.is_dictionary(column.type):
             column = column.dictionary_decode()
@@ -113,18 +119,18 @@ class Rows:
         return column
 
     def numbers(self, name: str) -> np.ndarray:
-        """A column as an array [N]; null is NaN in numbers."""
+        """Return a column as an array [N]; null is NaN in numbers."""
         return self[name].to_numpy(zero_copy_only=False)
 
     def codes(self, name: str) -> tuple[np.ndarray, list[Any]]:
-        """Return a column's code of every row, [N], and the values; a code is a place in them."""
+        """Return every row's code in a column, [N], and the values; a code is an index of them."""
         column = self.batch.column(name)
         if not pa.types.is_dictionary(column.type):
             column = column.dictionary_encode("encode")
         return column.indices.to_numpy(), column.dictionary.to_pylist()
 
     def row(self, index: int) -> dict[str, Any]:
-        """A row as the manifest has it, by columns."""
+        """Return a row as the manifest has it, by columns."""
         object_columns, arrow_columns = self._lookups
         row = {name: values[codes[index]] for name, codes, values in object_columns}
         for name, codes, values in arrow_columns:
@@ -138,9 +144,11 @@ class Rows:
 
     @cached_property
     def _lookups(self) -> tuple[list[tuple[str, Any, Any]], list[tuple[str, Any, Any]]]:
-        """Name, codes of the rows and values of every column, in two lists. In the first list the
-        values are Python objects, which are ten times as fast. Columns of the second list have too
-        many values for that, as each worker has its own objects: they stay Arrow's.
+        """Return name, codes of the rows, and values of every column, in two lists.
+
+        In the first list the values are Python objects, which are ten times as fast. Columns of the
+        second list have too many values for that, as each worker has its own objects: they stay
+        Arrow's.
         """
         object_columns = []
         arrow_columns = []
@@ -159,34 +167,38 @@ class Rows:
 
     @cached_property
     def _paths(self) -> list[str]:
+        """Return the names of the columns that hold paths."""
         return [name for name in self.names if name.endswith("_path")]
 
     def take(self, rows: np.ndarray) -> Rows:
-        """The rows of these numbers, or where a mask is true."""
+        """Return the rows of these numbers, or those where a mask is true."""
         return Rows(self.batch.take(pa.array(np.arange(len(self))[rows])), self.weather)
 
     def groups(self) -> tuple[np.ndarray, np.ndarray]:
-        """Group the rows by output, scene and variant. Returns the first row of every group, int64
-        [G], and the group's number of every row, int64 [N].
+        """Group the rows by output, scene and variant.
+
+        Returns:
+            The first row of every group, int64 [G], and the group of every row, int64 [N].
         """
         names = [n for n in (_OUTPUT, "scene", "variant") if n in self.batch.schema.names]
         group = number_groups([self.codes(name)[0] for name in names])
         return np.unique(group, return_index=True)[1], group
 
     def has(self, kind: str) -> np.ndarray:
-        """Return the rows that name a file of a kind of `samples.loadable`, bool [N]."""
+        """Return the mask of rows that name a file of a kind of `samples.loadable`, bool [N]."""
         codes, names = self.codes(f"{'labels' if kind == 'boxes' else kind}_path")
         is_file = np.array([name is not None for name in names], bool)
         return is_file[codes] if len(is_file) else np.zeros(len(self), bool)
 
     def to_arrow(self) -> pa.Table:
-        """The manifest's rows again."""
+        """Return the manifest's rows as a table again."""
         return pa.table({name: self[name] for name in self.names})
 
 
 def number_groups(columns: Sequence[np.ndarray]) -> np.ndarray:
-    """Number the combinations of values that rows have in all columns, int64 [N]. Numbers go from 0
-    without gaps, in the order of the first column, then of the second, and so on.
+    """Number the combinations of values that rows have in all columns, int64 [N].
+
+    Numbers go from 0 without gaps, in the order of the first column, then of the second, and so on.
     """
     group = np.zeros(len(columns[0]), np.int64)
     for codes in columns:
@@ -195,7 +207,7 @@ def number_groups(columns: Sequence[np.ndarray]) -> np.ndarray:
     return group
 
 
-def _encoded(column: pa.ChunkedArray) -> pa.Array:
+def _encode_column(column: pa.ChunkedArray) -> pa.Array:
     """Encode a column by its distinct values. Numbers that hardly repeat stay as they are."""
     is_coded = pa.types.is_dictionary(column.type)
     encoding: Any = (column if is_coded else column.dictionary_encode("encode")).combine_chunks()
@@ -211,7 +223,7 @@ def _encoded(column: pa.ChunkedArray) -> pa.Array:
     return pa.DictionaryArray.from_arrays(encoding.indices.cast(code_type), encoding.dictionary)
 
 
-def _digests(column: pa.ChunkedArray) -> pa.Array:
+def _encode_digests(column: pa.ChunkedArray) -> pa.Array:
     """Return SHA-256 digests in lower-case digits as bytes; a column with other texts unchanged."""
     if column.null_count or not pc.all(pc.match_substring_regex(column, "^[0-9a-f]{64}$")).as_py():
         return column.combine_chunks()
@@ -219,17 +231,21 @@ def _digests(column: pa.ChunkedArray) -> pa.Array:
     return pa.Array.from_buffers(_DIGEST, len(column), [None, digests])
 
 
-# ---- What the files of a manifest's rows hold, on this machine or in an object store -------------
+# ---- Contents of the files of a manifest's rows, on this machine or in an object store -----------
 # A manifest may come from anybody, so no path leaves the output folder, by `..` or through a link.
-# Checking that takes longer than opening a file, so a folder's way is checked once, and a file
+# Checking that takes longer than opening a file, so a folder's path is checked once, and a file
 # itself is opened such that it cannot be a link.
 
-CACHED_ENTRIES = 4096  # of parsed files, each a frame's or an image's: tens of megabytes
+# Entries of parsed files that are kept, each a frame's or an image's: tens of megabytes.
+CACHED_ENTRIES = 4096
 
 
 class RowReader:
-    """Reader of the files that rows of a manifest name, from one store; picklable. verify: compare
-    images with their checksums.
+    """Reader of the files that rows of a manifest name, from one store; picklable.
+
+    Args:
+        store: the store.
+        verify: if True, compare images with their checksums.
     """
 
     def __init__(self, store: Store, *, verify: bool) -> None:
@@ -253,7 +269,7 @@ class RowReader:
         return f"{self._name_head}{path}{self._name_tail}"
 
     def images(self, row: Row, load: Collection[str]) -> dict[str, np.ndarray]:
-        """The row's image and buffers, those of `load`, as files store them: RGB and [H, W]."""
+        """Return the row's image and buffers of `load`, as files store them: RGB and [H, W]."""
         images = {}
         for kind in ("image", *buffers()):
             path = row[f"{kind}_path"]
@@ -270,7 +286,7 @@ class RowReader:
         return images
 
     def camera(self, row: Row) -> tuple[CameraRecord, torch.Tensor]:
-        """The row's camera, and world_from_ego, float64 [4, 4]."""
+        """Return the row's camera, and world_from_ego, float64 [4, 4]."""
         path = row["calibration_path"]
         if path is None:
             raise OutputError(
@@ -305,6 +321,9 @@ class RowReader:
         return Labels(**box_fields, lidar=sweep)
 
     def _box_weather(self, row: Row, count: int) -> Iterator[tuple[str, BoxNumbers]]:
+        """Yield the kind and the numbers of each table of weather at the boxes of the row's
+        image.
+        """
         for kind, table in box_tables().items():
             if (path := row[f"{kind}_path"]) is None or not table.sampled:
                 continue
@@ -319,8 +338,10 @@ class RowReader:
             yield kind, numbers
 
     def parsed(self, kind: str, path: str, parse_file: Callable[[Path], Any]) -> Any:
-        """Return the result of `parse_file` for a file of a kind. Results are cached for each kind:
-        the last used one, and more of them while they have at most CACHED_ENTRIES together.
+        """Return the result of `parse_file` for a file of a kind.
+
+        Results are cached for each kind: the last used one, and more of them while they have at
+        most CACHED_ENTRIES together.
         """
         parsed_files = self._parsed[kind]
         if path not in parsed_files:
@@ -332,6 +353,7 @@ class RowReader:
         return parsed_files[path]
 
     def _parse(self, path: str, parse_file: Callable[[Path], Any]) -> Any:
+        """Return the result of `parse_file`; a file of an object store is parsed from a copy."""
         if self.store.local_dir is not None:
             return parse_file(resolve_inside(self.store.local_dir, path))
         data = self._read(path)
@@ -344,6 +366,11 @@ class RowReader:
                 raise OutputError(str(error).replace(str(copy), self.name(path))) from error
 
     def _read(self, path: str) -> bytes:
+        """Return the bytes of a file.
+
+        Raises:
+            OutputError: the file cannot be read.
+        """
         try:
             if self.store.local_dir is None:
                 return self.store.read(path)
@@ -357,12 +384,13 @@ class RowReader:
             ) from error
 
     def _read_here(self, root: Path, path: str) -> bytes:
+        """Return the bytes of a file below `root`, which no link may lead out of."""
         folder, _, name = path.rpartition("/")
         if folder not in self._folders:
             self._folders[folder] = f"{resolve_inside(root, folder) if folder else root}/"
         try:
             flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
-            flags |= os.O_NONBLOCK  # or a pipe would be waited for
+            flags |= os.O_NONBLOCK  # without it, opening a pipe would wait
             descriptor = os.open(self._folders[folder] + name, flags)
         except OSError as error:
             if error.errno != errno.ELOOP:
@@ -377,19 +405,21 @@ class RowReader:
         try:
             yield
         except (ArithmeticError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            what = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+            fault = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
             raise OutputError(
-                f"{self.name(path)} is damaged: {what}{where}. Delete it and run the job again, "
+                f"{self.name(path)} is damaged: {fault}{where}. Delete it and run the job again, "
                 f"which renders it anew"
             ) from error
 
 
 def _check_digest(data: bytes, checksum: str) -> None:
+    """Raise ValueError unless the data have the checksum."""
     if hashlib.sha256(data).hexdigest() != checksum:
         raise ValueError(f"its SHA-256 is not the manifest's {checksum}")
 
 
 def _check_size(image: np.ndarray, row: Row) -> None:
+    """Raise ValueError unless the image has the row's size."""
     height, width = image.shape[:2]
     expected_width = row["width"]
     expected_height = row["height"]
@@ -400,6 +430,7 @@ def _check_size(image: np.ndarray, row: Row) -> None:
 
 
 def _item_text(row: Row) -> str:
+    """Return the frame and camera of a row as a text."""
     return f"frame {row['frame']}, camera {row['camera']!r}"
 
 
@@ -409,18 +440,25 @@ def _item_text(row: Row) -> str:
 class WeatherDataset(Dataset):
     """The finished images of output folders, with depth, boxes, camera and weather.
 
-    root: where jobs have written or are writing: a path, a URI (`s3://bucket/fog`), or an open
-    store; or a list of them. where: an Arrow expression over the manifest's columns, such as
-    `pyarrow.compute.field("smog_extinction_per_m") > 0.02`. scenes, variants, cameras, frames: what
-    to keep, None for all. image_type: `float32` in [0, 1] or `uint8`. verify: compare every image
-    with its checksum, about 1 ms a megabyte. load: what to read, of image, depth, semantic,
-    instance, water, snow, trust, boxes and lidar; all but lidar by default, others are None.
-    box_frame: whose axes boxes and LiDAR points are in: `world`, the dataset's own, unchanged to
-    the bit; `ego`, x forward, y left, z up; or `camera` (OpenCV), x right, y down, z forward.
-    transform: called with every sample; what it returns is the sample.
-
-    Holds the manifest only, in about a hundred bytes an image; files are read when asked for.
+    It holds the manifest only, in about a hundred bytes an image; files are read when asked for.
     Samples come in the manifest's order: scene, variant, frame, camera; output after output.
+
+    Args:
+        root: where jobs have written or are writing: a path, a URI (`s3://bucket/fog`), or an open
+            store; or a list of them.
+        where: Arrow expression over the manifest's columns, such as
+            `pyarrow.compute.field("smog_extinction_per_m") > 0.02`.
+        scenes: names of the scenes to keep; None for all.
+        variants: names of the variants to keep; None for all.
+        cameras: names of the cameras to keep; None for all.
+        frames: numbers of the frames to keep; None for all.
+        image_type: `float32` in [0, 1] or `uint8`.
+        verify: if True, compare every image with its checksum, about 1 ms a megabyte.
+        load: what to read, of image, depth, semantic, instance, water, snow, trust, boxes and
+            lidar; others are None. None reads all but lidar.
+        box_frame: axes of boxes and LiDAR points: `world`, the dataset's own, unchanged to the
+            bit; `ego`, x forward, y left, z up; or `camera` (OpenCV), x right, y down, z forward.
+        transform: called with every sample; its result is the sample.
 
     Raises:
         OutputError: no finished output folder; later, from indexing, a file that is missing,
@@ -464,7 +502,9 @@ class WeatherDataset(Dataset):
 
     @property
     def table(self) -> pa.Table:
-        """The manifest's rows behind the samples, in their order; put together anew each time."""
+        """Return the manifest's rows behind the samples, in their order, as a new table each
+        time.
+        """
         return self.rows.to_arrow()
 
     def __len__(self) -> int:
@@ -475,7 +515,12 @@ class WeatherDataset(Dataset):
         return sample if self.transform is None else self.transform(sample)
 
     def sample(self, index: int, *, without: Collection[str] = ()) -> Sample:
-        """Return one sample before `transform`. without: names of `load` to leave out."""
+        """Return one sample before `transform`.
+
+        Args:
+            index: number of the sample.
+            without: names of `load` to leave out.
+        """
         row = self.rows.row(check_index(index, len(self)))
         if get_worker_info() is not None:
             # The workers are the parallelism. Not 1: a worker forked after its parent used OpenCV's
@@ -499,7 +544,7 @@ class WeatherDataset(Dataset):
         )
 
     def select(self, rows: np.ndarray) -> WeatherDataset:
-        """The dataset of some samples: their numbers int64 [K], or a mask bool [N]."""
+        """Return the dataset of some samples, by numbers int64 [K], or by a mask bool [N]."""
         selection = object.__new__(WeatherDataset)
         selection.__dict__.update(self.__dict__, rows=self.rows.take(rows))
         return selection
@@ -508,7 +553,7 @@ class WeatherDataset(Dataset):
 def _read_rows(
     stores: Sequence[Store], where: Expression | None, requested: dict[str, Collection | None]
 ) -> Rows:
-    """The finished rows of the stores that a filter keeps."""
+    """Return the finished rows of the stores that a filter keeps."""
     tables = [read_finished(store) for store in stores]
     uris = [store.uri for store in stores]
     table = tables[0]
@@ -537,15 +582,16 @@ def _read_rows(
 
 
 def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
-    """Raise ValueError if a kind of file to load exists for some variants and not for others. A
-    single frame without labels or a sweep is no fault, as the recording may lack it.
+    """Raise ValueError if a kind of file to load exists for some variants and not for others.
+
+    A single frame without labels or a sweep is no fault, as the recording may lack it.
     """
     first, group = rows.groups()
     variants_without_kind = {}
     for kind in sorted(set(load).difference(mask_names(), ["image"])):
         has_kind = np.bincount(group[rows.has(kind)], minlength=len(first)) > 0
         if has_kind.any() and not has_kind.all():
-            variants_without_kind[kind] = _listed(
+            variants_without_kind[kind] = _list_variants(
                 [rows.row(int(row)) for row in first[~has_kind]], uris[0]
             )
     if not variants_without_kind:
@@ -561,8 +607,13 @@ def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
     )
 
 
-def _listed(variants: list[dict[str, Any]], uri: str) -> str:
-    """Return a text that lists variants by output, three of each. uri: the only output."""
+def _list_variants(variants: list[dict[str, Any]], uri: str) -> str:
+    """Return a text that lists variants by output, three of each.
+
+    Args:
+        variants: a row of each variant.
+        uri: the only output.
+    """
     names = defaultdict(list)
     for row in variants:
         names[row.get(_OUTPUT, uri)].append(f"{row['scene']}/{row['variant']}")

@@ -1,7 +1,7 @@
-"""Scenes as plain splat files: baked at a moment, or part by part; with cameras for viewers.
+"""Writes scenes as plain splat files: baked at one moment, or part by part; with viewers' cameras.
 
-`augment.files.export` says what such files cannot keep. Scales and opacities are stored as
-logs and logits, so that they read back to rounding, not to the bit.
+The command `export` calls it. `export_losses` lists what such files cannot keep. Scales and
+opacities are stored as logarithms and logits, so they read back to rounding, not to the bit.
 """
 
 from __future__ import annotations
@@ -33,25 +33,34 @@ from augment.render.sh import rotate_sh
 from augment.scene import SH_COUNTS, Gaussians, Scene
 from augment.semantics import SemanticClass
 
-# ---- What of a scene an exported file cannot keep, a sentence each, for people -------------------
+# ---- What an exported file cannot keep of a scene: one sentence each, for people -----------------
 
-_SEEN_PX = 0.1
+_VISIBLE_OFFSET_PX = 0.1  # a smaller offset of the principal point goes unmentioned
 ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz", "sog", "glb", "usd"]
 
 
 def export_losses(
     scene: Scene, kind: ExportKind, timestamp_ns: int | None = None, *, half: bool = False
 ) -> tuple[str, ...]:
-    """What is lost, or has to be known, of a scene in a file of that kind. timestamp_ns: the moment
-    at which ply and splat are baked.
+    """List what a file of one kind loses of a scene, and what its users have to know.
+
+    Args:
+        scene: the scene.
+        kind: the kind of file.
+        timestamp_ns: the moment at which ply and splat files are baked.
+        half: whether a scene file stores float16.
+
+    Returns:
+        One sentence a loss.
     """
     if kind in ("scene", "file"):
-        return tuple(_of_saved(scene, kind, half=half))
-    found = [*_of_places(scene, kind, timestamp_ns), *_of_colours(scene, kind)]
-    return (*found, *_of_facts(scene, kind))
+        return tuple(_saved_losses(scene, kind, half=half))
+    losses = [*_place_losses(scene, kind, timestamp_ns), *_colour_losses(scene, kind)]
+    return (*losses, *_fact_losses(scene, kind))
 
 
-def _of_saved(scene: Scene, kind: ExportKind, *, half: bool) -> Iterator[str]:
+def _saved_losses(scene: Scene, kind: ExportKind, *, half: bool) -> Iterator[str]:
+    """Losses of a saved scene: a scene folder or a scene file."""
     has_images = any(frame.image_paths for frame in scene.frames)
     if scene.labels is not None or scene.recorded_source is not None or has_images:
         yield (
@@ -67,21 +76,22 @@ def _of_saved(scene: Scene, kind: ExportKind, *, half: bool) -> Iterator[str]:
         )
 
 
-def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iterator[str]:
+def _place_losses(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iterator[str]:
+    """Losses in positions, poses, units and axes."""
     if kind == "ply-parts":
         if any(len(part) == 0 for part in scene.all_gaussians):
             yield "parts without Gaussians have no file"
     elif scene.actors:
         assert timestamp_ns is not None
-        there = sum(actor.track.pose_at(timestamp_ns) is not None for actor in scene.actors)
+        num_actors = sum(actor.track.pose_at(timestamp_ns) is not None for actor in scene.actors)
         number = next((f.index for f in scene.frames if f.timestamp_ns == timestamp_ns), None)
         moment = f"at {timestamp_ns} ns" if number is None else f"in frame {number}"
-        yield f"actors ({there}) stand still where they are {moment}"
-        if there < len(scene.actors):
-            yield f"actors ({len(scene.actors) - there}) that are not there then are left out"
-        if off_ns := _greatest_delay_ns(scene, timestamp_ns):
+        yield f"actors ({num_actors}) stand still where they are {moment}"
+        if num_actors < len(scene.actors):
+            yield f"actors ({len(scene.actors) - num_actors}) that are not there then are left out"
+        if delay_ns := _greatest_delay_ns(scene, timestamp_ns):
             yield (
-                f"the frame's cameras took their images up to {off_ns / 1e6:.0f} ms from that "
+                f"the frame's cameras took their images up to {delay_ns / 1e6:.0f} ms from that "
                 f"moment, so that moving actors are a little off in them"
             )
     if kind in ("splat", "spz", "sog", "glb", "usd") and scene.world_origin_m.any():
@@ -100,7 +110,8 @@ def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iter
         )
 
 
-def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
+def _colour_losses(scene: Scene, kind: ExportKind) -> Iterator[str]:
+    """Losses in colours, sky and classes."""
     yield "the sky is left out"
     if scene.mapped_cameras:
         yield (
@@ -138,22 +149,23 @@ def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
         yield "semantic classes are left out"
 
 
-def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
+def _fact_losses(scene: Scene, kind: ExportKind) -> Iterator[str]:
+    """Losses in labels, cameras and other facts."""
     if scene.labels is not None:
         yield f"boxes and LiDAR stay with {scene.recorded_source or scene.source}"
     if scene.ground_z_m is not None:
         yield f"the road's height is left out: open it with ?ground_z={scene.ground_z_m:.3f}"
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
     if cameras and kind not in ("spz", "sog", "glb", "usd"):
-        off = max(
+        offset_px = max(
             max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
             for camera in cameras
         )
         yield "times of images are left out of cameras.json"
-        if off >= _SEEN_PX:
+        if offset_px >= _VISIBLE_OFFSET_PX:
             yield (
                 f"viewers take the principal points of cameras.json to be in the middle of the "
-                f"image; they lie up to {off:.1f} px off"
+                f"image; they lie up to {offset_px:.1f} px off"
             )
     if any(camera.is_orthographic for camera in cameras):
         yield "orthographic cameras are left out"
@@ -162,7 +174,7 @@ def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
 
 
 def _greatest_delay_ns(scene: Scene, timestamp_ns: int) -> int:
-    """How far from a frame's own time its cameras took their images; 0 of another time."""
+    """Return the largest time between a frame and its images; 0 at a time without a frame."""
     delays = [
         abs(camera.timestamp_ns - timestamp_ns)
         for frame in scene.frames
@@ -172,9 +184,9 @@ def _greatest_delay_ns(scene: Scene, timestamp_ns: int) -> int:
     return max(delays, default=0)
 
 
-# ---- Gaussians moved into another frame, and a whole scene in one set of them at a moment --------
+# ---- Gaussians in another frame, and all Gaussians of a scene at one moment ----------------------
 
-_PIECE = 65536  # Gaussians whose colours are turned together
+_ROWS_AT_ONCE = 65536  # Gaussians whose colours are rotated together
 
 
 def moved_gaussians(
@@ -183,8 +195,15 @@ def moved_gaussians(
     shift: Float[Tensor, "3"],
     scale: float = 1.0,
 ) -> Gaussians:
-    """The Gaussians at scale * rotation @ mean + shift: quaternions and SH are turned with them.
-    rotation, shift: float64; places are computed in float64 and rounded once.
+    """Return the Gaussians at scale * rotation @ mean + shift.
+
+    Quaternions and SH are rotated too. Positions are computed in float64 and rounded once.
+
+    Args:
+        gaussians: the Gaussians.
+        rotation: float64 [3, 3].
+        shift: float64 [3].
+        scale: a factor of positions and sizes.
     """
     means = scale * (gaussians.means.double() @ rotation.T) + shift
     moved = dataclasses.replace(
@@ -195,28 +214,35 @@ def moved_gaussians(
     if torch.equal(rotation, torch.eye(3, dtype=rotation.dtype)):
         return moved
     quat = quat_from_rotmat(rotation).to(gaussians.quats.dtype).expand_as(gaussians.quats)
-    sh = gaussians.sh if gaussians.sh_degree == 0 else _turned_sh(gaussians.sh, rotation)
+    sh = gaussians.sh if gaussians.sh_degree == 0 else _rotate_sh_in_pieces(gaussians.sh, rotation)
     return dataclasses.replace(moved, quats=multiply_quats(quat, gaussians.quats), sh=sh)
 
 
 def transformed_gaussians(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians:
-    """The Gaussians under a linear map without mirrors, float64: exact for their shapes; SH turn by
-    the rotation nearest to it.
+    """Return the Gaussians under a linear map without mirrors; their shapes are exact.
+
+    SH rotate by the rotation that is nearest to the map.
+
+    Args:
+        gaussians: the Gaussians.
+        matrix: float64 [3, 3], with a positive determinant.
     """
     u, stretch, vh = torch.linalg.svd(matrix)
-    rotation, scale, still = u @ vh, float(stretch.mean()), torch.zeros(3, dtype=torch.float64)
+    rotation = u @ vh
+    scale = float(stretch.mean())
+    no_shift = torch.zeros(3, dtype=torch.float64)
     if float(stretch[0] - stretch[2]) <= 1e-6 * scale:
         if torch.allclose(rotation, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12):
-            rotation = torch.eye(3, dtype=torch.float64)  # turns nothing, to the bit
-        return moved_gaussians(gaussians, rotation, still, scale)
+            rotation = torch.eye(3, dtype=torch.float64)  # changes no bit
+        return moved_gaussians(gaussians, rotation, no_shift, scale)
     quats = torch.nn.functional.normalize(gaussians.quats.double(), dim=1)
     axes = matrix @ rotmat_from_quat(quats) * gaussians.scales.double()[:, None]
-    usable = axes.isfinite().all(2).all(1)
-    axes = torch.where(usable[:, None, None], axes, torch.eye(3, dtype=torch.float64))
+    is_usable = axes.isfinite().all(2).all(1)
+    axes = torch.where(is_usable[:, None, None], axes, torch.eye(3, dtype=torch.float64))
     axes, scales, _ = torch.linalg.svd(axes)  # covariance = axes scales^2 axes^T
-    scales = torch.where(usable[:, None], scales, torch.nan)
+    scales = torch.where(is_usable[:, None], scales, torch.nan)
     axes = axes * torch.linalg.det(axes)[:, None, None]
-    moved = moved_gaussians(gaussians, rotation, still)
+    moved = moved_gaussians(gaussians, rotation, no_shift)
     return dataclasses.replace(
         moved,
         means=(gaussians.means.double() @ matrix.T).to(gaussians.means.dtype),
@@ -226,22 +252,25 @@ def transformed_gaussians(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) ->
 
 
 def baked(scene: Scene, timestamp_ns: int) -> Gaussians:
-    """Background and the actors that are there at a moment as Gaussians of the scene's world, in
-    the colours they have then; in the order of `Scene.parts_at`. Colours of a lower degree are
-    filled up with zero bands, unknown classes with UNKNOWN.
+    """Return the background and the actors of one moment as Gaussians of the scene's world.
+
+    They have the colours of that moment, and the order of `Scene.parts_at`. Colours of a lower
+    degree are filled up with zero bands, unknown classes with UNKNOWN.
     """
-    placed = []
+    parts = []
     for part in scene.parts_at(timestamp_ns):
-        gaussians, pose = part.gaussians, part.world_from_part
+        gaussians = part.gaussians
+        pose = part.world_from_part
         if pose is not None:
             gaussians = moved_gaussians(gaussians, pose[:3, :3], pose[:3, 3])
-        placed.append(gaussians)
-    return joined_gaussians(placed)
+        parts.append(gaussians)
+    return joined_gaussians(parts)
 
 
 def joined_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
-    """The Gaussians of all parts, one part after another. Colours of a lower degree are filled up
-    with zero bands, unknown classes with UNKNOWN.
+    """Return the Gaussians of all parts, one part after another.
+
+    Colours of a lower degree are filled up with zero bands, unknown classes with UNKNOWN.
     """
     if len(parts) == 1:
         return parts[0]
@@ -262,61 +291,72 @@ def joined_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians(**columns, sh=sh, semantic=semantic if has_classes else None)
 
 
-def _turned_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Tensor:
-    """rotate_sh without temporaries as large as the coefficients of a large scene."""
-    turned = torch.empty_like(sh)
-    for start in range(0, len(sh), _PIECE):
-        turned[start : start + _PIECE] = rotate_sh(sh[start : start + _PIECE], rotation)
-    return turned
+def _rotate_sh_in_pieces(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Tensor:
+    """Rotate SH without temporaries as large as the coefficients of a large scene."""
+    rotated = torch.empty_like(sh)
+    for start in range(0, len(sh), _ROWS_AT_ONCE):
+        rotated[start : start + _ROWS_AT_ONCE] = rotate_sh(
+            sh[start : start + _ROWS_AT_ONCE], rotation
+        )
+    return rotated
 
 
 # ---- Files ---------------------------------------------------------------------------------------
 
-BACKGROUND, CAMERAS, PARTS, ACTORS = "background.ply", "cameras.json", "parts.json", "actors"
-_FORMAT = "climategs-parts"
-_MARK = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + _FORMAT.encode() + rb'"')
+BACKGROUND = "background.ply"  # the Gaussians that do not move
+CAMERAS = "cameras.json"  # all images' cameras, for viewers
+PARTS = "parts.json"  # tracks, labels and sizes of actors
+ACTORS = "actors"  # the folder of the actors' .ply files
+_FORMAT = "climategs-parts"  # the format that parts.json names
+_FORMAT_PATTERN = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + _FORMAT.encode() + rb'"')
 
 
 def export_ply(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene as it is at a moment into an INRIA .ply. Its comments say `up: +z` where
-    gravity is known, `unit: metre` where the scale is.
+    """Write the scene at one moment into an INRIA .ply.
+
+    Its comments say `up: +z` where gravity is known, and `unit: metre` where the scale is.
     """
-    write_ply(path, _something(scene, timestamp_ns), notes=_notes(scene))
+    write_ply(path, _baked_or_error(scene, timestamp_ns), notes=_notes(scene))
 
 
 def export_splat(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene as it is at a moment into a .splat."""
-    gaussians = _something(scene, timestamp_ns)
+    """Write the scene at one moment into a .splat."""
+    gaussians = _baked_or_error(scene, timestamp_ns)
     write_splat(path, replace(gaussians, sh=gaussians.sh[:, :1]))  # export_losses says so
 
 
 def export_spz(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene as it is at a moment into a .spz, y up."""
-    write_spz(path, _y_up(_something(scene, timestamp_ns)))
+    """Write the scene at one moment into a .spz, y up."""
+    write_spz(path, _y_up(_baked_or_error(scene, timestamp_ns)))
 
 
 def export_glb(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene as it is at a moment into a .glb with KHR_gaussian_splatting, y up."""
-    write_glb(path, _y_up(_something(scene, timestamp_ns)))
+    """Write the scene at one moment into a .glb with KHR_gaussian_splatting, y up."""
+    write_glb(path, _y_up(_baked_or_error(scene, timestamp_ns)))
 
 
 def export_usd(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene as it is at a moment into a .usdc, in the scene's axes."""
-    upright, metric = scene.has_known_gravity, scene.has_metric_scale
-    write_usd(path, _something(scene, timestamp_ns), is_upright=upright, is_metric=metric)
+    """Write the scene at one moment into a .usdc, in the scene's axes."""
+    has_gravity = scene.has_known_gravity
+    has_scale = scene.has_metric_scale
+    write_usd(
+        path, _baked_or_error(scene, timestamp_ns), is_upright=has_gravity, is_metric=has_scale
+    )
 
 
 def _y_up(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians with z up as Gaussians with y up."""
     z_to_y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
     return moved_gaussians(gaussians, z_to_y, torch.zeros(3, dtype=torch.float64))
 
 
 def export_sog(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene as it is at a moment into a .sog, y down: viewers turn it as they turn a
-    .ply. Its meta.json says `up` and `unit` as the .ply's comments do.
+    """Write the scene at one moment into a .sog, y down: viewers turn it as they turn a .ply.
+
+    Its meta.json says `up` and `unit` as the .ply's comments do.
     """
     z_to_minus_y = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
-    gaussians = _something(scene, timestamp_ns)
+    gaussians = _baked_or_error(scene, timestamp_ns)
     notes = {key: note for key, note in _notes(scene).items() if key in ("up", "unit")}
     if "up" in notes:
         notes["up"] = "-y"
@@ -325,10 +365,13 @@ def export_sog(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
 
 
 def export_cameras(scene: Scene, folder: str | Path) -> bool:
-    """Write `cameras.json` beside splat files; a file that is there already stays as it is. Returns
-    whether the folder's cameras.json is now this scene's; without frames there is none.
+    """Write `cameras.json` beside splat files; a file that exists stays as it is.
+
+    Returns:
+        Whether the folder's cameras.json is now this scene's; a scene without frames has none.
     """
-    path, text = Path(folder) / CAMERAS, inria_cameras(scene)
+    path = Path(folder) / CAMERAS
+    text = inria_cameras(scene)
     if text is None:
         return not path.exists()
     if path.exists():
@@ -341,11 +384,12 @@ def export_cameras(scene: Scene, folder: str | Path) -> bool:
 
 
 def inria_cameras(scene: Scene) -> bytes | None:
-    """All images' cameras in the form of INRIA's cameras.json, named CAMERA/FRAME; None without.
-    Principal points, which the form does not know, stand beside it as cx and cy.
+    """Return all images' cameras in the form of INRIA's cameras.json, or None without cameras.
+
+    They are named CAMERA/FRAME. The form has no principal points; they are added as cx and cy.
     """
     views = [
-        _view(camera, frame.index)
+        _camera_entry(camera, frame.index)
         for frame in scene.frames
         for camera in frame.cameras.values()
         if not camera.is_orthographic
@@ -357,10 +401,11 @@ def inria_cameras(scene: Scene) -> bytes | None:
 
 
 def export_ply_parts(scene: Scene, folder: str | Path) -> None:
-    """Write background.ply, actors/NAME.ply in each actor's own frame, cameras.json, and parts.json
-    with tracks, labels and sizes; as a whole or not at all. Colours that change over time are
-    written as their constant part. Parts without Gaussians have no file. An earlier export in the
-    folder is replaced.
+    """Write a folder with a .ply of the background and one of every actor, or change nothing.
+
+    It holds background.ply, actors/NAME.ply in each actor's own frame, cameras.json, and parts.json
+    with tracks, labels and sizes. Colours that change over time are written as their constant part.
+    Parts without Gaussians have no file. An earlier export in the folder is replaced.
     """
     folder = Path(folder).resolve()
     with refusals_of(folder):
@@ -375,7 +420,7 @@ def export_ply_parts(scene: Scene, folder: str | Path) -> None:
 
 
 def is_parts_folder(folder: Path) -> bool:
-    """Whether a folder is empty or holds what `export_ply_parts` writes and nothing else."""
+    """Return True for a folder that is empty or holds only files of `export_ply_parts`."""
     if not folder.is_dir():
         return False
     names = {entry.name for entry in folder.iterdir()}
@@ -384,14 +429,15 @@ def is_parts_folder(folder: Path) -> bool:
     if PARTS not in names or not names <= {BACKGROUND, CAMERAS, PARTS, ACTORS}:
         return False
     with (folder / PARTS).open("rb") as file:
-        is_ours = _MARK.match(file.read(200)) is not None
+        is_parts_file = _FORMAT_PATTERN.match(file.read(200)) is not None
     actors = folder / ACTORS
-    return is_ours and (
+    return is_parts_file and (
         not actors.is_dir() or all(file.suffix == ".ply" for file in actors.iterdir())
     )
 
 
 def _write_parts(scene: Scene, folder: Path) -> None:
+    """Write the files of `export_ply_parts` into a new folder."""
     notes = _notes(scene)
 
     def write(gaussians: Gaussians, name: str) -> str | None:
@@ -425,7 +471,12 @@ def _write_parts(scene: Scene, folder: Path) -> None:
     write_atomic(folder / PARTS, document_text(facts).encode())
 
 
-def _something(scene: Scene, timestamp_ns: int) -> Gaussians:
+def _baked_or_error(scene: Scene, timestamp_ns: int) -> Gaussians:
+    """Bake the scene at one moment.
+
+    Raises:
+        SceneError: it shows no Gaussians then.
+    """
     gaussians = baked(scene, timestamp_ns)
     if len(gaussians) == 0:
         raise SceneError(f"scene {scene.name!r} shows no Gaussians at {timestamp_ns} ns")
@@ -433,6 +484,7 @@ def _something(scene: Scene, timestamp_ns: int) -> Gaussians:
 
 
 def _notes(scene: Scene) -> dict[str, str]:
+    """Return the facts of a scene that a file's comments keep."""
     notes = {}
     if scene.has_known_gravity:
         notes["up"] = "+z"
@@ -443,7 +495,8 @@ def _notes(scene: Scene) -> dict[str, str]:
     return notes
 
 
-def _view(camera: Camera, frame: int) -> dict[str, Any]:
+def _camera_entry(camera: Camera, frame: int) -> dict[str, Any]:
+    """Return one entry of cameras.json."""
     pose = camera.world_from_camera
     return {
         "img_name": f"{folder_name(camera.name)}/{frame:06d}",

@@ -1,13 +1,14 @@
-"""Gaussians in glTF 2.0 files, .glb and .gltf, by KHR_gaussian_splatting as Khronos ratified it.
+"""Reads and writes Gaussians in glTF 2.0 files, .glb and .gltf, by Khronos' KHR_gaussian_splatting.
 
 A primitive of points has POSITION, and after the extension's name and a colon ROTATION (xyzw),
 SCALE (linear), OPACITY and SH_DEGREE_l_COEF_n. Nodes place its mesh in the scene, y up, metres.
-Facts by the glTF 2.0 specification and the extension's README (KhronosGroup/glTF). Until 2026 its
-drafts stored logarithms of scales: where a scale is negative, which is forbidden now, they are read
-as such, and it is said. Compressed splats (SPZ, meshopt) and linear colours are refused.
+Sources: the glTF 2.0 specification and the extension's README (KhronosGroup/glTF) as ratified.
+Until 2026 its drafts stored logarithms of scales. The ratified extension forbids negative scales:
+where a scale is negative, all are read as logarithms, and a problem is reported. Compressed splats
+(SPZ, meshopt) and linear colours are refused.
 
-A file is not trusted: counts are compared with the bytes that are there, placed copies with the
-file's size, and buffers lie in the file, in its text, or beside it.
+A file is not trusted: counts are compared with the bytes that exist, placed copies with the file's
+size, and buffers must lie in the file, in its text, or beside it.
 """
 
 from __future__ import annotations
@@ -40,37 +41,49 @@ from augment.geometry import rotmat_from_quat
 from augment.jobs.atomic import replaced_file
 from augment.scene import SH_COUNTS, Gaussians
 
-EXTENSION = "KHR_gaussian_splatting"
-GLB = b"glTF"
-NOTES = {"up": "+y", "unit": "metre"}
-_CHUNKS = struct.Struct("<4sIIII"), struct.Struct("<II")  # with the first chunk's; of the second
-_JSON, _BIN = 0x4E4F534A, 0x004E4942
-_MAX_JSON = 256 << 20  # bytes of text, with buffers in it
-_MAX_VALUES = 2_000_000  # in the JSON, buffers left out
-_MAX_NODES = 20_000
-_MAX_ATTRIBUTES = 1000  # of a primitive
-_MAX_PLACED = 10_000  # primitives in the scene, copies among them
-_KNOWN = {EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"}
-_COLOURS = (None, "srgb_rec709_display", "BT.709-sRGB", "BT.709")  # the drafts' names are the rest
+EXTENSION = "KHR_gaussian_splatting"  # the extension's name
+GLB = b"glTF"  # first bytes of a .glb
+NOTES = {"up": "+y", "unit": "metre"}  # facts that hold for every glTF file
+_HEADERS = (
+    struct.Struct("<4sIIII"),  # the file's header and that of its first chunk
+    struct.Struct("<II"),  # the header of the second chunk
+)
+_JSON_CHUNK = 0x4E4F534A  # type of a chunk of JSON
+_BINARY_CHUNK = 0x004E4942  # type of a chunk of bytes
+_MAX_JSON_BYTES = 256 << 20  # bytes of text, including buffers inside it
+_MAX_VALUES = 2_000_000  # values in the JSON, without buffers
+_MAX_NODES = 20_000  # nodes of a file
+_MAX_ATTRIBUTES = 1000  # attributes of a primitive
+_MAX_PRIMITIVES = 10_000  # primitives in the scene, copies included
+_READ_EXTENSIONS = {EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"}
+# Accepted colour spaces: none stated, the ratified name, and two names of the drafts.
+_COLOUR_SPACES = (None, "srgb_rec709_display", "BT.709-sRGB", "BT.709")
+# numpy's type codes of glTF's component types.
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_IS_COLOUR = ":SH_DEGREE_"  # in the names of attributes
-_LEAST_ROW = 12  # bytes of a Gaussian, whose first coefficients are floats
-_MAX_COPIES = 16  # of all Gaussians that the file has room for
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}  # numbers of each type of accessor
+_SH_INFIX = ":SH_DEGREE_"  # part of the names of colour attributes
+_MIN_ROW_BYTES = 12  # bytes of a Gaussian: at least its first coefficients are floats
+_MAX_COPIES = 16  # copies of all Gaussians that the file has room for
 
 # ---- The document, as far as it is used ----------------------------------------------------------
 
 
 class _Entry(BaseModel):
+    """Base of the JSON document's objects."""
+
     model_config = ConfigDict(frozen=True)
 
 
 class _Buffer(_Entry):
+    """Bytes in the file, in a data URI, or in another file."""
+
     byteLength: NonNegativeInt
     uri: str | None = None
 
 
 class _View(_Entry):
+    """A part of a buffer."""
+
     buffer: NonNegativeInt
     byteLength: NonNegativeInt
     byteOffset: NonNegativeInt = 0
@@ -79,6 +92,8 @@ class _View(_Entry):
 
 
 class _Accessor(_Entry):
+    """The type and the count of the numbers in a view."""
+
     componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]
     count: int = Field(ge=1)
     type: str
@@ -89,37 +104,48 @@ class _Accessor(_Entry):
 
 
 class _Splatting(_Entry):
+    """The object KHR_gaussian_splatting of a primitive."""
+
     kernel: str | None = None
     colorSpace: str | None = None
     extensions: dict[str, Any] = {}
 
 
 class _PrimitiveExtensions(_Entry):
+    """Extensions of a primitive."""
+
     KHR_gaussian_splatting: _Splatting | None = None
 
 
-def _of_few_keys(value: object) -> object:
+def _check_num_attributes(value: object) -> object:
+    """Refuse a primitive with too many attributes, before each is checked."""
     if isinstance(value, dict) and len(value) > _MAX_ATTRIBUTES:
         raise ValueError(f"it has {len(value)} attributes; at most {_MAX_ATTRIBUTES} are read")
     return value
 
 
 class _Primitive(_Entry):
-    attributes: Annotated[dict[str, NonNegativeInt], BeforeValidator(_of_few_keys)] = {}
+    """Points, triangles or Gaussians of a mesh."""
+
+    attributes: Annotated[dict[str, NonNegativeInt], BeforeValidator(_check_num_attributes)] = {}
     mode: int = 4
     extensions: _PrimitiveExtensions = _PrimitiveExtensions()
 
 
 class _Mesh(_Entry):
+    """A list of primitives."""
+
     primitives: Annotated[tuple[_Primitive, ...], Field(fail_fast=True)]
 
 
-# A list with a wrong item is not looked at to its end: of millions of errors each costs a kilobyte.
+# Checks of a list stop at its first wrong item: each of millions of errors would cost a kilobyte.
 _Numbers = Annotated[tuple[FiniteFloat, ...], Field(fail_fast=True)]
 _Indices = Annotated[tuple[NonNegativeInt, ...], Field(fail_fast=True)]
 
 
 class _Node(_Entry):
+    """A node of the scene's tree, with its mesh and children."""
+
     mesh: NonNegativeInt | None = None
     children: _Indices = ()
     matrix: _Numbers | None = Field(None, min_length=16, max_length=16)
@@ -129,24 +155,28 @@ class _Node(_Entry):
 
     @property
     def parent_from_node(self) -> np.ndarray:
-        """float64 [4, 4]."""
-        if self.matrix is not None:  # column after column
+        """Return the node's transform, float64 [4, 4]."""
+        if self.matrix is not None:  # stored column by column
             return np.array(self.matrix, np.float64).reshape(4, 4).T
         x, y, z, w = self.rotation
-        out = np.eye(4)
-        turn = np.eye(3)
+        transform = np.eye(4)
+        rotation = np.eye(3)
         if self.rotation != (0, 0, 0, 1):
-            turn = rotmat_from_quat(torch.tensor([w, x, y, z], dtype=torch.float64)).numpy()
-        out[:3, :3] = turn * np.array(self.scale)
-        out[:3, 3] = self.translation
-        return out
+            rotation = rotmat_from_quat(torch.tensor([w, x, y, z], dtype=torch.float64)).numpy()
+        transform[:3, :3] = rotation * np.array(self.scale)
+        transform[:3, 3] = self.translation
+        return transform
 
 
 class _Scene(_Entry):
+    """The roots of the scene's tree."""
+
     nodes: _Indices = ()
 
 
 class _Document(_Entry):
+    """The whole JSON document."""
+
     asset: dict[str, Any]
     extensionsRequired: Annotated[tuple[str, ...], Field(fail_fast=True)] = ()
     buffers: Annotated[tuple[_Buffer, ...], Field(fail_fast=True)] = ()
@@ -159,22 +189,24 @@ class _Document(_Entry):
 
 
 class _Columns(NamedTuple):
-    """Of one primitive, in its own axes. is_log: of a draft whose scales were logarithms."""
+    """Gaussians of one primitive, in its own axes; float32."""
 
-    means: np.ndarray
-    quats: np.ndarray
-    scales: np.ndarray
-    opacities: np.ndarray
-    sh: np.ndarray
-    is_log: bool
+    means: np.ndarray  # [N, 3]
+    quats: np.ndarray  # [N, 4], wxyz
+    scales: np.ndarray  # [N, 3]
+    opacities: np.ndarray  # [N]
+    sh: np.ndarray  # [N, K, 3]
+    is_log: bool  # True where the file, by an earlier draft, stored logarithms of the scales
 
 
 # ---- Reading -------------------------------------------------------------------------------------
 
 
 def read_gltf(path: str | Path) -> SplatFile:
-    """Read all Gaussians of the file's scene, in its axes. Raises SceneError: damaged, without
-    Gaussians, or with extensions that are not read.
+    """Read all Gaussians of the file's scene, in its axes.
+
+    Raises:
+        SceneError: the file is damaged, has no Gaussians, or has extensions that are not read.
     """
     path = Path(path)
     try:
@@ -190,34 +222,38 @@ def read_gltf(path: str | Path) -> SplatFile:
 
 
 class _File:
+    """An opened glTF file."""
+
     def __init__(self, path: Path) -> None:
         self.path = path
-        text, self.chunk = _parts(path)
+        text, self.chunk = _read_chunks(path)
         document = parsed_json(text, str(path), max_values=_MAX_VALUES)
         self.document = _Document.model_validate(document)
         self.buffers: dict[int, np.ndarray] = {}
         self.problems: list[str] = []
-        unknown = sorted(set(self.document.extensionsRequired) - _KNOWN)
+        unknown = sorted(set(self.document.extensionsRequired) - _READ_EXTENSIONS)
         if unknown:
             raise self.error(f"it requires {', '.join(unknown)}, which is not read; export without")
         if not str(self.document.asset.get("version", "")).startswith("2."):
             raise self.error(f"expected glTF 2; its asset says {self.document.asset}")
 
-    def error(self, what: str) -> SceneError:
-        return SceneError(f"{self.path}: {what}")
+    def error(self, reason: str) -> SceneError:
+        """Return an error that names the file."""
+        return SceneError(f"{self.path}: {reason}")
 
     def read(self) -> SplatFile:
-        placed = list(self.placed_primitives())
-        if not placed:
+        """Read the Gaussians of all nodes."""
+        primitives = list(self.placed_primitives())
+        if not primitives:
             raise self.error(f"its scene has no primitive with {EXTENSION}; splats are needed")
-        self.check_rows([primitive for primitive, _ in placed])
-        read: dict[int, _Columns] = {}
+        self.check_rows([primitive for primitive, _ in primitives])
+        columns_by_primitive: dict[int, _Columns] = {}
         parts = []
-        for primitive, matrix in placed:
-            if id(primitive) not in read:
-                read[id(primitive)] = self.columns(primitive)
-            parts.append(_placed(read[id(primitive)], matrix))
-        if any(columns.is_log for columns in read.values()):
+        for primitive, matrix in primitives:
+            if id(primitive) not in columns_by_primitive:
+                columns_by_primitive[id(primitive)] = self.columns(primitive)
+            parts.append(_place_columns(columns_by_primitive[id(primitive)], matrix))
+        if any(columns.is_log for columns in columns_by_primitive.values()):
             self.problems.append(
                 f"{self.path}: negative scales are taken as logarithms, as an earlier draft of "
                 f"{EXTENSION} stored all scales"
@@ -225,39 +261,44 @@ class _File:
         return join_placed(parts, self.path, NOTES, self.problems)
 
     def check_rows(self, primitives: Sequence[_Primitive]) -> None:
-        """Refuse more Gaussians, or copies of them, than the buffers that are there can hold."""
+        """Refuse more Gaussians, or copies of them, than the buffers that exist can hold."""
         document = self.document
         accessors = [document.accessors[p.attributes.get("POSITION", 0)] for p in primitives]
-        rows = sum(accessor.count for accessor in accessors)
+        num_gaussians = sum(accessor.count for accessor in accessors)
         views = {a.bufferView for a in accessors if a.bufferView is not None}
-        numbers = {document.bufferViews[view].buffer for view in views}
-        sizes = {document.buffers[n].uri: len(self.buffer(n)) for n in numbers}  # once a file
-        room = sum(sizes.values()) // _LEAST_ROW
-        if rows > _MAX_COPIES * room:
+        buffer_numbers = {document.bufferViews[view].buffer for view in views}
+        sizes = {
+            document.buffers[n].uri: len(self.buffer(n)) for n in buffer_numbers
+        }  # each file once
+        max_gaussians = sum(sizes.values()) // _MIN_ROW_BYTES
+        if num_gaussians > _MAX_COPIES * max_gaussians:
             raise self.error(
-                f"it places {rows} Gaussians, more than {_MAX_COPIES} times the {room} that its "
-                "buffers have room for; place fewer copies"
+                f"it places {num_gaussians} Gaussians, more than {_MAX_COPIES} times the "
+                f"{max_gaussians} that its buffers have room for; place fewer copies"
             )
-        functions = max(sum(_IS_COLOUR in name for name in p.attributes) for p in primitives)
-        check_memory(str(self.path), rows, functions=functions, size=sum(sizes.values()))
+        num_sh = max(sum(_SH_INFIX in name for name in p.attributes) for p in primitives)
+        check_memory(str(self.path), num_gaussians, functions=num_sh, size=sum(sizes.values()))
 
     def placed_primitives(self) -> Iterator[tuple[_Primitive, np.ndarray]]:
-        """Primitives of Gaussians with world_from_node, in the order of the scene's nodes."""
-        document, seen, others = self.document, set(), 0
+        """Yield primitives of Gaussians with world_from_node, in the order of the scene's nodes."""
+        document = self.document
+        visited_nodes = set()
+        num_other = 0
         if len(document.nodes) > _MAX_NODES:
             raise self.error(f"it has {len(document.nodes)} nodes; at most {_MAX_NODES} are read")
-        count, roots = 0, tuple[int, ...]()
+        num_placed = 0
+        roots = tuple[int, ...]()
         if document.scenes:
             roots = document.scenes[document.scene].nodes
         else:
             children = {child for node in document.nodes for child in node.children}
             roots = tuple(n for n in range(len(document.nodes)) if n not in children)
-        waiting = [(number, np.eye(4)) for number in reversed(roots)]
-        while waiting:
-            number, world_from_parent = waiting.pop()
-            if number in seen:
+        pending_nodes = [(number, np.eye(4)) for number in reversed(roots)]
+        while pending_nodes:
+            number, world_from_parent = pending_nodes.pop()
+            if number in visited_nodes:
                 raise self.error(f"node {number} has two parents; nodes must be a tree")
-            seen.add(number)
+            visited_nodes.add(number)
             node = document.nodes[number]
             with np.errstate(over="ignore", invalid="ignore"):
                 matrix = world_from_parent @ node.parent_from_node
@@ -274,58 +315,63 @@ class _File:
                     if primitive.extensions.KHR_gaussian_splatting is not None:
                         if not volume > 0:
                             raise self.error(f"node {number} mirrors or flattens its Gaussians")
-                        count += 1
-                        if count > _MAX_PLACED:
+                        num_placed += 1
+                        if num_placed > _MAX_PRIMITIVES:
                             raise self.error(
-                                f"it places more than {_MAX_PLACED} primitives of Gaussians; join "
-                                "them, or place fewer copies"
+                                f"it places more than {_MAX_PRIMITIVES} primitives of Gaussians; "
+                                "join them, or place fewer copies"
                             )
                         yield primitive, matrix
                     else:
-                        others += 1
-            waiting += [(child, matrix) for child in reversed(node.children)]
-        if others:
-            self.problems.append(f"{self.path}: left out {others} meshes and points, not Gaussians")
+                        num_other += 1
+            pending_nodes += [(child, matrix) for child in reversed(node.children)]
+        if num_other:
+            self.problems.append(
+                f"{self.path}: left out {num_other} meshes and points, not Gaussians"
+            )
 
     def columns(self, primitive: _Primitive) -> _Columns:
+        """Read the columns of one primitive."""
         extension = primitive.extensions.KHR_gaussian_splatting
         assert extension is not None
         if extension.extensions:
             raise self.error(f"{', '.join(extension.extensions)} is not read; export without")
-        if extension.kernel not in (None, "ellipse") or extension.colorSpace not in _COLOURS:
+        if extension.kernel not in (None, "ellipse") or extension.colorSpace not in _COLOUR_SPACES:
             raise self.error(
                 f"expected the kernel ellipse and colours in srgb_rec709_display; it has "
                 f"{extension.kernel} and {extension.colorSpace}"
             )
-        found = {
+        accessors = {
             name.removeprefix(f"{EXTENSION}:"): accessor
             for name, accessor in primitive.attributes.items()
         }
-        lacking = [
-            n for n in ("POSITION", "ROTATION", "SCALE", "OPACITY", _sh(0, 0)) if n not in found
+        missing_names = [
+            n
+            for n in ("POSITION", "ROTATION", "SCALE", "OPACITY", _sh_name(0, 0))
+            if n not in accessors
         ]
-        if lacking:
+        if missing_names:
             raise self.error(
-                f"a primitive of Gaussians lacks {', '.join(lacking)}, which the ratified "
+                f"a primitive of Gaussians lacks {', '.join(missing_names)}, which the ratified "
                 f"{EXTENSION} requires; it has {', '.join(primitive.attributes) or 'nothing'}"
             )
-        names = [_sh(0, 0)]
+        names = [_sh_name(0, 0)]
         for degree in range(1, len(SH_COUNTS)):
-            band = [_sh(degree, n) for n in range(2 * degree + 1)]
-            if not any(name in found for name in band):
+            band_names = [_sh_name(degree, n) for n in range(2 * degree + 1)]
+            if not any(name in accessors for name in band_names):
                 break
-            names += band
-        lacking = [name for name in names if name not in found]
-        surplus = [name for name in found if name.startswith("SH_") and name not in names]
-        if lacking or surplus:
+            names += band_names
+        missing_names = [name for name in names if name not in accessors]
+        surplus_names = [name for name in accessors if name.startswith("SH_") and name not in names]
+        if missing_names or surplus_names:
             raise self.error(
                 f"spherical harmonics must be whole bands from 0 to 3: lacking "
-                f"{', '.join(lacking) or 'none'}, beyond {', '.join(surplus) or 'none'}"
+                f"{', '.join(missing_names) or 'none'}, beyond {', '.join(surplus_names) or 'none'}"
             )
-        count = self.document.accessors[found["POSITION"]].count
+        count = self.document.accessors[accessors["POSITION"]].count
 
         def column(name: str, kind: str) -> np.ndarray:
-            return self.column(name, found[name], kind, count)
+            return self.column(name, accessors[name], kind, count)
 
         scales = column("SCALE", "VEC3")
         is_log = bool((scales < 0).any())
@@ -342,7 +388,7 @@ class _File:
         )
 
     def column(self, name: str, number: int, kind: str, count: int) -> np.ndarray:
-        """float32 [N, width]."""
+        """Read one column as float32 [N, width]."""
         accessor = self.document.accessors[number]
         if accessor.type != kind or accessor.count != count:
             raise self.error(
@@ -353,7 +399,9 @@ class _File:
         view = self.document.bufferViews[accessor.bufferView]
         if view.extensions:
             raise self.error(f"{', '.join(view.extensions)} is not read; export without")
-        data, dtype, width = self.buffer(view.buffer), np.dtype(_TYPES[accessor.componentType]), 0
+        data = self.buffer(view.buffer)
+        dtype = np.dtype(_TYPES[accessor.componentType])
+        width = 0
         width = _WIDTHS[kind]
         size = width * dtype.itemsize
         stride = view.byteStride or size
@@ -371,19 +419,20 @@ class _File:
         return values
 
     def buffer(self, number: int) -> np.ndarray:
-        """Its bytes."""
+        """Return the bytes of a buffer."""
         if number not in self.buffers:
             entry = self.document.buffers[number]
             data = self.chunk if entry.uri is None and number == 0 else None
             if entry.uri is not None:
                 data = self.by_uri(entry.uri)
             if data is None or len(data) < entry.byteLength:
-                held = "none" if data is None else len(data)
-                raise self.error(f"buffer {number} has {entry.byteLength} bytes; found {held}")
+                num_bytes = "none" if data is None else len(data)
+                raise self.error(f"buffer {number} has {entry.byteLength} bytes; found {num_bytes}")
             self.buffers[number] = data[: entry.byteLength]
         return self.buffers[number]
 
     def by_uri(self, uri: str) -> np.ndarray:
+        """Return the bytes that a buffer's URI names."""
         if uri.startswith("data:"):
             head, _, text = uri.partition(",")
             try:
@@ -401,56 +450,69 @@ class _File:
         return np.memmap(file, np.uint8, "r")
 
 
-def _sh(degree: int, number: int) -> str:
+def _sh_name(degree: int, number: int) -> str:
+    """Return the name of an SH attribute."""
     return f"SH_DEGREE_{degree}_COEF_{number}"
 
 
-def _parts(path: Path) -> tuple[bytes, np.ndarray | None]:
-    """The JSON, and the binary chunk of a .glb."""
+def _read_chunks(path: Path) -> tuple[bytes, np.ndarray | None]:
+    """Return the JSON text, and the binary chunk of a .glb."""
     data = np.memmap(path, np.uint8, "r")
     if bytes(data[:4]) != GLB:
-        if len(data) > _MAX_JSON:
-            raise SceneError(f"{path}: a .gltf has at most {_MAX_JSON} bytes; save it as .glb")
+        if len(data) > _MAX_JSON_BYTES:
+            raise SceneError(
+                f"{path}: a .gltf has at most {_MAX_JSON_BYTES} bytes; save it as .glb"
+            )
         return data.tobytes(), None
-    first, second = _CHUNKS
-    if len(data) < first.size:
+    first_header, second_header = _HEADERS
+    if len(data) < first_header.size:
         raise SceneError(f"{path}: its header ends early; it is truncated: copy it again")
-    _, version, _, size, kind = first.unpack(data[: first.size].tobytes())
-    end = first.size + size
-    if version != 2 or kind != _JSON or size > _MAX_JSON or end > len(data):
+    _, version, _, size, kind = first_header.unpack(data[: first_header.size].tobytes())
+    end = first_header.size + size
+    if version != 2 or kind != _JSON_CHUNK or size > _MAX_JSON_BYTES or end > len(data):
         raise SceneError(
-            f"{path}: expected a .glb of version 2 that begins with JSON of at most {_MAX_JSON} "
-            f"bytes; got version {version}, a chunk {kind:#x} of {size} bytes in {len(data)}"
+            f"{path}: expected a .glb of version 2 that begins with JSON of at most "
+            f"{_MAX_JSON_BYTES} bytes; got version {version}, a chunk {kind:#x} of {size} bytes in "
+            f"{len(data)}"
         )
-    text, rest = data[first.size : end].tobytes(), data[end:]
-    if len(rest) < second.size:
+    text = data[first_header.size : end].tobytes()
+    chunk = data[end:]
+    if len(chunk) < second_header.size:
         return text, None
-    size, kind = second.unpack(rest[: second.size].tobytes())
-    return text, rest[second.size : second.size + size] if kind == _BIN else None
+    size, kind = second_header.unpack(chunk[: second_header.size].tobytes())
+    return text, chunk[
+        second_header.size : second_header.size + size
+    ] if kind == _BINARY_CHUNK else None
 
 
-def _placed(columns: _Columns, matrix: np.ndarray) -> tuple[np.ndarray, Gaussians]:
-    """Places in the scene, float64, and Gaussians that are turned and sized as there; their own
-    means are unused.
+def _place_columns(columns: _Columns, matrix: np.ndarray) -> tuple[np.ndarray, Gaussians]:
+    """Return positions in the scene, float64, and Gaussians rotated and scaled as there.
+
+    The means of these Gaussians are unused.
     """
-    from augment.files.export import transformed_gaussians  # which writes by this module
+    from augment.files.export import transformed_gaussians  # imported here: it imports this module
 
-    own = Gaussians(
+    gaussians = Gaussians(
         means=torch.zeros(len(columns.means), 3),
         **{
             name: torch.from_numpy(np.ascontiguousarray(getattr(columns, name), np.float32))
             for name in ("quats", "scales", "opacities", "sh")
         },
     )
-    places = columns.means.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    return places, transformed_gaussians(own, torch.from_numpy(matrix[:3, :3].copy()))
+    positions = columns.means.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    return positions, transformed_gaussians(gaussians, torch.from_numpy(matrix[:3, :3].copy()))
 
 
 # ---- Writing -------------------------------------------------------------------------------------
 
 
 def write_glb(path: str | Path, gaussians: Gaussians) -> None:
-    """Write a .glb, atomically, from Gaussians whose y points up: floats, one primitive."""
+    """Write a .glb of floats with one primitive, atomically.
+
+    Args:
+        path: the file.
+        gaussians: Gaussians whose y axis points up.
+    """
     columns = {
         "POSITION": gaussians.means,
         "ROTATION": torch.nn.functional.normalize(gaussians.quats, dim=1)[:, [1, 2, 3, 0]],
@@ -459,7 +521,7 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
     }
     for degree in range(gaussians.sh_degree + 1):
         for number in range(2 * degree + 1):
-            columns[_sh(degree, number)] = gaussians.sh[:, degree * degree + number]
+            columns[_sh_name(degree, number)] = gaussians.sh[:, degree * degree + number]
     arrays = [np.ascontiguousarray(c.detach().cpu().numpy(), "<f4") for c in columns.values()]
     ends = np.cumsum([array.nbytes for array in arrays]).tolist()
     kinds = {width: kind for kind, width in _WIDTHS.items()}
@@ -472,7 +534,7 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
     primitive = {
         "mode": 0,
         "attributes": {name: n for n, name in enumerate(names)},
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": _COLOURS[1]}},
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": _COLOUR_SPACES[1]}},
     }
     document = {
         "asset": {"version": "2.0", "generator": "ClimateGS"},
@@ -490,12 +552,12 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
     }
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    first, second = _CHUNKS
-    total = first.size + len(text) + second.size + ends[-1]
+    first_header, second_header = _HEADERS
+    total = first_header.size + len(text) + second_header.size + ends[-1]
     if total >= 1 << 32:
         raise SceneError(f"{path}: {total} bytes; a .glb ends at 4 GiB: export as .ply or .spz")
     with replaced_file(Path(path)) as file:
-        file.write(first.pack(GLB, 2, total, len(text), _JSON) + text)
-        file.write(second.pack(ends[-1], _BIN))
+        file.write(first_header.pack(GLB, 2, total, len(text), _JSON_CHUNK) + text)
+        file.write(second_header.pack(ends[-1], _BINARY_CHUNK))
         for array in arrays:
             file.write(array.tobytes())

@@ -1,4 +1,4 @@
-"""What an image file says of itself, read before a decoder allocates for its pixels."""
+"""Reads the header of an image file before a decoder allocates memory for its pixels."""
 
 from __future__ import annotations
 
@@ -11,47 +11,53 @@ from recipes.files import open_file
 
 FORMATS = "JPEG, PNG, WebP, TIFF or BMP"
 
-_FIRST_BYTES = 4096  # hold the header of nearly any image
-_MAX_BYTES = 1 << 22  # of a JPEG whose previews and profiles lie before its size
-_PNG_GREY = (b"\0", b"\4")  # colour types without and with alpha
-_PNG_BITS_AT = 24  # offset of the bits a channel
-_TURNED = 5  # from this EXIF orientation on, width and height change places
-_JPEG_EXIF = 0xE1  # APP1
-_EXIF_START = b"Exif\0\0"
-_EXIF_ORIENTATION = 0x112
-_TIFF_SIZE = (256, 257)  # ImageWidth, ImageLength
-_JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
-_JPEG_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0-15 less DHT, JPG, DAC
+_FIRST_BYTES = 4096  # bytes that hold the header of nearly any image
+_MAX_BYTES = 1 << 22  # bytes searched in a JPEG whose previews and profiles lie before its size
+_PNG_GREY_TYPES = (b"\0", b"\4")  # PNG's grey colour types, without and with alpha
+_PNG_BITS_OFFSET = 24  # byte offset of the bits a channel in a PNG
+_MIN_SIDEWAYS_ORIENTATION = 5  # from this EXIF orientation on, width and height change places
+_JPEG_EXIF_MARKER = 0xE1  # APP1
+_EXIF_START = b"Exif\0\0"  # first bytes of an EXIF segment
+_EXIF_ORIENTATION_TAG = 0x112  # EXIF's tag of the orientation
+_TIFF_SIZE_TAGS = (256, 257)  # ImageWidth, ImageLength
+_JPEG_LONE_MARKERS = {0x01, *range(0xD0, 0xD9)}  # JPEG markers without a length
+_JPEG_FRAME_MARKERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0-15 less DHT, JPG, DAC
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """format: one of FORMATS. width, height: as stored, before any turn that EXIF asks for.
-    is_grey: one channel (told of PNG only). bits: of a channel (told of PNG only, else 8).
-    orientation: EXIF's, 1 to 8, told of JPEG and PNG; 1 where there is none.
-    """
+    """The header of an image file."""
 
-    format: str
-    width: int
-    height: int
-    is_grey: bool = False
-    bits: int = 8
-    orientation: int = 1
+    format: str  # one of FORMATS
+    width: int  # pixels, as stored, before any rotation that EXIF asks for
+    height: int  # pixels, likewise
+    is_grey: bool = False  # True for a PNG of one channel; False for other formats
+    bits: int = 8  # bits a channel of a PNG; 8 for other formats
+    orientation: int = 1  # EXIF's orientation of a JPEG or PNG, 1 to 8; 1 where there is none
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height as stored."""
+        """Return width and height in pixels as stored."""
         return self.width, self.height
 
     @property
     def turned_size(self) -> tuple[int, int]:
-        """Width and height of the image turned as its EXIF orientation asks for."""
-        return (self.height, self.width) if self.orientation >= _TURNED else self.size
+        """Return width and height in pixels, rotated as the EXIF orientation asks for."""
+        return (
+            (self.height, self.width)
+            if self.orientation >= _MIN_SIDEWAYS_ORIENTATION
+            else self.size
+        )
 
 
 def read_image_header(path: str | Path) -> ImageHeader | None:
-    """Of a file by its first bytes; None as for `image_header`. Raises OSError: the file cannot be
-    read.
+    """Read the header of an image file from its first bytes.
+
+    Returns:
+        The header, or None as `image_header`.
+
+    Raises:
+        OSError: the file cannot be read.
     """
     with open_file(path) as file:
         data = file.read(_FIRST_BYTES)
@@ -59,7 +65,11 @@ def read_image_header(path: str | Path) -> ImageHeader | None:
 
 
 def image_header(data: bytes) -> ImageHeader | None:
-    """Of a file's content; None where it is not one of FORMATS, or ends within its header."""
+    """Return the header of an image file's content.
+
+    Returns:
+        None where the content is not one of FORMATS, or ends within its header.
+    """
     for head, name, size in (
         (b"\xff\xd8", "JPEG", _jpeg),
         (b"\x89PNG\r\n\x1a\n", "PNG", lambda data: struct.unpack_from(">II", data, 16)),
@@ -70,73 +80,77 @@ def image_header(data: bytes) -> ImageHeader | None:
     ):
         if data.startswith(head):
             try:
-                found = size(data)
+                image_size = size(data)
             except (struct.error, IndexError):
                 return None
-            if found is None or min(found) < 1:
+            if image_size is None or min(image_size) < 1:
                 return None
             orientation = _orientation(_exif(name, data))
             if name != "PNG":
-                return ImageHeader(name, *found, orientation=orientation)
-            is_grey = data[25:26] in _PNG_GREY
-            return ImageHeader(name, *found, is_grey, data[_PNG_BITS_AT], orientation)
+                return ImageHeader(name, *image_size, orientation=orientation)
+            is_grey = data[25:26] in _PNG_GREY_TYPES
+            return ImageHeader(name, *image_size, is_grey, data[_PNG_BITS_OFFSET], orientation)
     return None
 
 
 def _exif(format: str, data: bytes) -> bytes:
-    """EXIF's entries, a TIFF, in the part of a JPEG or PNG before its pixels; empty without any."""
+    """Return EXIF's entries (a TIFF) from a JPEG or PNG before its pixels; empty without EXIF."""
     if format == "JPEG":
-        for marker, at in _jpeg_segments(data):
-            end = at + int.from_bytes(data[at : at + 2], "big")
-            if marker == _JPEG_EXIF and data[at + 2 : end].startswith(_EXIF_START):
-                return data[at + 2 + len(_EXIF_START) : end]
+        for marker, offset in _jpeg_segments(data):
+            end = offset + int.from_bytes(data[offset : offset + 2], "big")
+            if marker == _JPEG_EXIF_MARKER and data[offset + 2 : end].startswith(_EXIF_START):
+                return data[offset + 2 + len(_EXIF_START) : end]
     if format == "PNG":
-        at = 8
-        while len(kind := data[at + 4 : at + 8]) == 4 and kind != b"IDAT":
-            end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        offset = 8
+        while len(kind := data[offset + 4 : offset + 8]) == 4 and kind != b"IDAT":
+            end = offset + 8 + int.from_bytes(data[offset : offset + 4], "big")
             if kind == b"eXIf":
-                return data[at + 8 : end]
-            at = end + 4  # behind the checksum
+                return data[offset + 8 : end]
+            offset = end + 4  # behind the checksum
     return b""
 
 
 def _orientation(exif: bytes) -> int:
-    """EXIF's orientation, 1 to 8; 1 where it is not said, or damaged."""
+    """Return EXIF's orientation, 1 to 8; 1 where it is missing or damaged."""
     try:
-        value = _tiff_numbers(exif, (_EXIF_ORIENTATION,)).get(_EXIF_ORIENTATION, 1)
+        value = _tiff_numbers(exif, (_EXIF_ORIENTATION_TAG,)).get(_EXIF_ORIENTATION_TAG, 1)
     except struct.error:
         return 1
     return value if 1 <= value <= 8 else 1
 
 
 def _bmp(data: bytes) -> tuple[int, int]:
+    """Return the width and height of a BMP in pixels."""
     width, height = struct.unpack_from("<ii", data, 18)
     return width, abs(height)  # negative: stored from the top down
 
 
 def _jpeg(data: bytes) -> tuple[int, int] | None:
-    for marker, at in _jpeg_segments(data):
-        if marker in _JPEG_FRAMES:
-            height, width = struct.unpack_from(">HH", data, at + 3)
+    """Return the width and height of a JPEG in pixels."""
+    for marker, offset in _jpeg_segments(data):
+        if marker in _JPEG_FRAME_MARKERS:
+            height, width = struct.unpack_from(">HH", data, offset + 3)
             return width, height
     return None
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
-    """The marker of every segment and the offset of its length, up to the frame's header."""
-    at, marker = 2, 0
-    while marker not in _JPEG_FRAMES and data[at] == 0xFF:
-        marker = data[at + 1]
+    """Yield the marker of every segment and the offset of its length, up to the frame's header."""
+    offset = 2
+    marker = 0
+    while marker not in _JPEG_FRAME_MARKERS and data[offset] == 0xFF:
+        marker = data[offset + 1]
         if marker == 0xFF:  # padding
-            at += 1
-        elif marker in _JPEG_ALONE:
-            at += 2
+            offset += 1
+        elif marker in _JPEG_LONE_MARKERS:
+            offset += 2
         else:
-            yield marker, at + 2
-            at += 2 + struct.unpack_from(">H", data, at + 2)[0]
+            yield marker, offset + 2
+            offset += 2 + struct.unpack_from(">H", data, offset + 2)[0]
 
 
 def _webp(data: bytes) -> tuple[int, int] | None:
+    """Return the width and height of a WebP in pixels."""
     kind = data[12:16]
     if kind == b"VP8 ":
         width, height = struct.unpack_from("<HH", data, 26)
@@ -145,25 +159,26 @@ def _webp(data: bytes) -> tuple[int, int] | None:
         (bits,) = struct.unpack_from("<I", data, 21)
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     if kind == b"VP8X":
-        width, height = (int.from_bytes(data[at : at + 3], "little") for at in (24, 27))
+        width, height = (int.from_bytes(data[offset : offset + 3], "little") for offset in (24, 27))
         return width + 1, height + 1
     return None
 
 
 def _tiff(data: bytes) -> tuple[int, int] | None:
-    size = _tiff_numbers(data, _TIFF_SIZE)
+    """Return the width and height of a TIFF in pixels."""
+    size = _tiff_numbers(data, _TIFF_SIZE_TAGS)
     return (size[256], size[257]) if len(size) == 2 else None
 
 
 def _tiff_numbers(data: bytes, tags: Sequence[int]) -> dict[int, int]:
-    """The numbers (SHORT or LONG) that the first directory of a TIFF has under some tags."""
-    order = "<" if data[:2] == b"II" else ">"
-    (at,) = struct.unpack_from(f"{order}I", data, 4)
-    (count,) = struct.unpack_from(f"{order}H", data, at)
+    """Return the numbers (SHORT or LONG) of the given tags in the first directory of a TIFF."""
+    byte_order = "<" if data[:2] == b"II" else ">"
+    (offset,) = struct.unpack_from(f"{byte_order}I", data, 4)
+    (count,) = struct.unpack_from(f"{byte_order}H", data, offset)
     numbers = {}
-    for entry in range(at + 2, at + 2 + 12 * count, 12):
-        tag, kind = struct.unpack_from(f"{order}HH", data, entry)
-        if tag in tags and kind in (3, 4):
-            code = f"{order}{'H' if kind == 3 else 'I'}"
-            (numbers[tag],) = struct.unpack_from(code, data, entry + 8)
+    for entry_offset in range(offset + 2, offset + 2 + 12 * count, 12):
+        tag, value_type = struct.unpack_from(f"{byte_order}HH", data, entry_offset)
+        if tag in tags and value_type in (3, 4):
+            number_format = f"{byte_order}{'H' if value_type == 3 else 'I'}"
+            (numbers[tag],) = struct.unpack_from(number_format, data, entry_offset + 8)
     return numbers

@@ -1,14 +1,14 @@
-"""Scenes too large for memory: scene folders that are opened without being read.
+"""Reads and writes scenes too large for memory: scene folders that open without being read.
 
-Beside the files of a scene folder, whose background then lies square after square (augment.lod),
+Beside the files of a scene folder, whose background is then sorted by squares (augment.lod),
 
     levels.safetensors    of each level k: k.keys, k.starts, k.lows, k.highs, k.longest (Squares),
                           k.boxes.lows, k.boxes.highs, k.boxes.longest (Boxes), k.parents; from
                           level 1 on also k.means, k.quats, ..., k.stands_for
 
-holds its levels of detail, and the metadata `finest_m`. All arrays are mapped: a view reads the
-squares that it takes. Their numbers are looked at then, and the whole background's before an effect
-works on it.
+holds the levels of detail, and the metadata `finest_m`. All arrays are mapped: a view reads the
+squares that it needs. Their numbers are checked then; those of the whole background are checked
+before an effect works on it.
 """
 
 from __future__ import annotations
@@ -42,15 +42,21 @@ from augment.lod import (
 from augment.render.cpu.order import CELL
 from augment.scene import SH_COUNTS, Gaussians, Scene
 
-_COLUMNS = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
-_BOXES = {"lows": (3,), "highs": (3,), "longest": ()}
+# Shapes of one row of the arrays, by name.
+_ROW_SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
+_BOX_SHAPES = {"lows": (3,), "highs": (3,), "longest": ()}
 
 
 def save_large_scene(scene: Scene, pieces: Iterable[Gaussians], folder: str | Path) -> None:
-    """Write a scene folder with levels, its background piece after piece, so that never more than a
-    piece and some 30 bytes a splat are in memory. The folder's disk must hold it twice for a while.
+    """Write a scene folder with levels of detail, its background piece by piece.
 
-    scene: everything else; its own background is not written.
+    Never more than one piece and some 30 bytes a splat are in memory. The folder's disk must hold
+    the scene twice for a while.
+
+    Args:
+        scene: everything else of the scene; its own background is not written.
+        pieces: the background.
+        folder: the folder to write.
 
     Raises:
         SceneError, OutputError: as augment.files.scene_file.save_scene.
@@ -59,65 +65,75 @@ def save_large_scene(scene: Scene, pieces: Iterable[Gaussians], folder: str | Pa
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".levels-", dir=folder.parent) as temporary:
         spool = _Spool(Path(temporary))
-        own = spool.keep(_numbered(pieces)).gaussians
-        order = square_order(own)[1]
-        pieces = (own.select(torch.from_numpy(order[rows])) for rows in batches(len(order)))
-        levels = build_levels(spool.keep(_numbered(pieces)).gaussians, keep=spool.keep)
-        whole = replace(scene, background=levels.levels[0].gaussians)
-        save_scene(whole, folder, levels=_arrays(levels), finest_m=levels.finest_m)
+        background = spool.keep(_pieces_of_level_0(pieces)).gaussians
+        order = square_order(background)[1]
+        pieces = (background.select(torch.from_numpy(order[rows])) for rows in batches(len(order)))
+        levels = build_levels(spool.keep(_pieces_of_level_0(pieces)).gaussians, keep=spool.keep)
+        complete_scene = replace(scene, background=levels.levels[0].gaussians)
+        save_scene(complete_scene, folder, levels=_arrays(levels), finest_m=levels.finest_m)
 
 
-def _numbered(pieces: Iterable[Gaussians]) -> Iterator[Piece]:
+def _pieces_of_level_0(pieces: Iterable[Gaussians]) -> Iterator[Piece]:
+    """Yield pieces without levels."""
     for piece in pieces:
         yield Piece(piece, np.zeros(0, np.int32), np.zeros(0, np.int64))
 
 
 class _Spool:
-    """Keeps the splats of pieces in files, one an array, and maps them into memory."""
+    """Stores the splats of pieces in files, one for each array, and maps them into memory."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._count = folder, itertools.count()
+        self._folder = folder
+        self._spool_numbers = itertools.count()
 
     def keep(self, pieces: Iterable[Piece]) -> Piece:
-        number, rest, kinds = next(self._count), list[tuple[np.ndarray, np.ndarray]](), {}
+        """Write pieces into files and return them as one mapped piece."""
+        spool_number = next(self._spool_numbers)
+        row_numbers = list[tuple[np.ndarray, np.ndarray]]()
+        array_types = {}
         for gaussians, *numbers in pieces:
-            for own in fields(Gaussians):
-                value: Tensor | None = getattr(gaussians, own.name)
+            for field in fields(Gaussians):
+                value: Tensor | None = getattr(gaussians, field.name)
                 if value is not None:
                     array = value.numpy()
-                    kinds[own.name] = (array.dtype, array.shape[1:])
-                    with (self._folder / f"{number}.{own.name}").open("ab") as file:
+                    array_types[field.name] = (array.dtype, array.shape[1:])
+                    with (self._folder / f"{spool_number}.{field.name}").open("ab") as file:
                         file.write(np.ascontiguousarray(array).data)
-            rest.append((numbers[0], numbers[1]))
-        if not kinds:
+            row_numbers.append((numbers[0], numbers[1]))
+        if not array_types:
             raise SceneError("a scene needs at least one piece of background to be written; got 0")
         mapped = {
             name: torch.from_numpy(
-                np.memmap(self._folder / f"{number}.{name}", dtype, "c").reshape(-1, *shape)
+                np.memmap(self._folder / f"{spool_number}.{name}", dtype, "c").reshape(-1, *shape)
             )
-            for name, (dtype, shape) in kinds.items()
+            for name, (dtype, shape) in array_types.items()
         }
-        stands_for, keys = (np.concatenate(each) for each in zip(*rest, strict=True))
+        stands_for, keys = (np.concatenate(arrays) for arrays in zip(*row_numbers, strict=True))
         return Piece(Gaussians(**mapped), stands_for, keys)
 
 
 def _arrays(levels: Levels) -> dict[str, np.ndarray]:
+    """Return the arrays of levels.safetensors."""
     arrays = dict[str, np.ndarray]()
     for number, level in enumerate(levels.levels):
-        own = {f.name: getattr(level.squares, f.name) for f in fields(Squares)}
-        own |= {f"boxes.{name}": box for name, box in level.boxes._asdict().items()}
-        own["parents"] = level.parents
+        level_arrays = {f.name: getattr(level.squares, f.name) for f in fields(Squares)}
+        level_arrays |= {f"boxes.{name}": box for name, box in level.boxes._asdict().items()}
+        level_arrays["parents"] = level.parents
         if number > 0:  # the background is level 0
-            g = level.gaussians
-            values = {f.name: getattr(g, f.name) for f in fields(g)}
-            own |= {name: value.numpy() for name, value in values.items() if value is not None}
-            own["stands_for"] = level.stands_for
-        arrays |= {f"{number}.{name}": np.ascontiguousarray(value) for name, value in own.items()}
+            gaussians = level.gaussians
+            values = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
+            level_arrays |= {
+                name: value.numpy() for name, value in values.items() if value is not None
+            }
+            level_arrays["stands_for"] = level.stands_for
+        arrays |= {
+            f"{number}.{name}": np.ascontiguousarray(value) for name, value in level_arrays.items()
+        }
     return arrays
 
 
 def read_levels(path: Path, background: Gaussians) -> Levels:
-    """The levels of a background whose numbers nobody has looked at.
+    """Read the levels of a background whose numbers nobody has checked yet.
 
     Raises:
         SceneError: the file is damaged, or belongs to another background.
@@ -133,16 +149,24 @@ def read_levels(path: Path, background: Gaussians) -> Levels:
         )
     levels = list[Level]()
     while f"{len(levels)}.keys" in tensors and len(levels) <= MAX_LEVELS:
-        number, count = len(levels), len(background)
-        own, stands_for = rows_of(background, slice(None)), np.arange(count, dtype=np.int32)
+        number = len(levels)
+        count = len(background)
+        gaussians = rows_of(background, slice(None))
+        stands_for = np.arange(count, dtype=np.int32)
         if number > 0:
-            own, stands_for = _splats(tensors, number, background, str(path))
-        squares = _squares(tensors, number, len(own), levels[-1].squares if levels else None, path)
-        cells = (-(-len(own) // CELL),)
-        found = _boxes(tensors, f"{number}.boxes.", cells, str(path))
-        boxes = Boxes(*(found[name] for name in Boxes._fields))
-        parents = _take(tensors, f"{number}.parents", (len(own),), str(path), torch.int32).numpy()
-        level = Level(own, stands_for, squares, boxes, parents, unchecked=str(path), splats=count)
+            gaussians, stands_for = _splats(tensors, number, background, str(path))
+        squares = _squares(
+            tensors, number, len(gaussians), levels[-1].squares if levels else None, path
+        )
+        cells_shape = (-(-len(gaussians) // CELL),)
+        box_arrays = _boxes(tensors, f"{number}.boxes.", cells_shape, str(path))
+        boxes = Boxes(*(box_arrays[name] for name in Boxes._fields))
+        parents = _take(
+            tensors, f"{number}.parents", (len(gaussians),), str(path), torch.int32
+        ).numpy()
+        level = Level(
+            gaussians, stands_for, squares, boxes, parents, unchecked=str(path), splats=count
+        )
         levels.append(level)
     if tensors or not levels:
         raise SceneError(f"{path} must hold levels 0, 1, ... alone; got {sorted(tensors)[:5]}")
@@ -150,42 +174,46 @@ def read_levels(path: Path, background: Gaussians) -> Levels:
 
 
 def _take(tensors: dict[str, Tensor], name: str, shape: tuple, where: str, dtype: torch.dtype):
-    found = tensor(tensors, name, shape, where, dtype=dtype, error=SceneError)
+    """Remove a checked tensor from the file's tensors and return it."""
+    values = tensor(tensors, name, shape, where, dtype=dtype, error=SceneError)
     del tensors[name]
-    return found
+    return values
 
 
 def _splats(
     tensors: dict[str, Tensor], number: int, background: Gaussians, where: str
 ) -> tuple[Gaussians, np.ndarray]:
+    """Return the splats of one level and the rows of the background that they stand for."""
     stands_for = _take(tensors, f"{number}.stands_for", (None,), where, torch.int32)
-    count, functions = len(stands_for), background.sh.shape[1]
-    assert functions in SH_COUNTS
-    shapes = _COLUMNS | {"sh": (functions, 3)}
-    own = {
+    count = len(stands_for)
+    num_sh = background.sh.shape[1]
+    assert num_sh in SH_COUNTS
+    shapes = _ROW_SHAPES | {"sh": (num_sh, 3)}
+    columns = {
         name: _take(tensors, f"{number}.{name}", (count, *shape), where, torch.float32)
         for name, shape in shapes.items()
     }
     if background.semantic is not None:
-        own["semantic"] = _take(tensors, f"{number}.semantic", (count,), where, torch.int16)
-    return Gaussians(**own), stands_for.numpy()
+        columns["semantic"] = _take(tensors, f"{number}.semantic", (count,), where, torch.int16)
+    return Gaussians(**columns), stands_for.numpy()
 
 
 def _squares(
-    tensors: dict[str, Tensor], number: int, splats: int, finer: Squares | None, path: Path
+    tensors: dict[str, Tensor], number: int, num_splats: int, finer: Squares | None, path: Path
 ) -> Squares:
+    """Return the checked squares of one level."""
     where = str(path)
     keys = _take(tensors, f"{number}.keys", (None,), where, torch.int64).numpy()
     starts = _take(tensors, f"{number}.starts", (len(keys) + 1,), where, torch.int64).numpy()
     squares = Squares(keys, starts, **_boxes(tensors, f"{number}.", (len(keys),), where))
     ends = (int(starts[0]), int(starts[-1]))
-    known = finer is None or bool(np.isin(keys, finer.keys >> 2).all())
-    is_good = len(keys) > 0 and keys[0] >= 0 and (np.diff(keys) > 0).all() and known
-    is_good &= ends == (0, splats) and (np.diff(starts) >= 0).all()
+    has_known_parents = finer is None or bool(np.isin(keys, finer.keys >> 2).all())
+    is_good = len(keys) > 0 and keys[0] >= 0 and (np.diff(keys) > 0).all() and has_known_parents
+    is_good &= ends == (0, num_splats) and (np.diff(starts) >= 0).all()
     if not is_good:
         raise SceneError(
             f"{path}: the squares of level {number} must have increasing keys, those of the level "
-            f"before without their last two bits, and starts from 0 to {splats}; got keys "
+            f"before without their last two bits, and starts from 0 to {num_splats}; got keys "
             f"{keys[:3]}..., starts {starts[:2]}...{starts[-1:]}; write the scene again"
         )
     return squares
@@ -194,14 +222,17 @@ def _squares(
 def _boxes(
     tensors: dict[str, Tensor], prefix: str, shape: tuple[int], where: str
 ) -> dict[str, np.ndarray]:
-    found = {
-        name: _take(tensors, prefix + name, (*shape, *own), where, torch.float32).numpy()
-        for name, own in _BOXES.items()
+    """Return the checked arrays of boxes."""
+    arrays = {
+        name: _take(tensors, prefix + name, (*shape, *box_shape), where, torch.float32).numpy()
+        for name, box_shape in _BOX_SHAPES.items()
     }
-    is_good = all(np.isfinite(box).all() for box in found.values())
-    if not (is_good and (found["lows"] <= found["highs"]).all() and (found["longest"] > 0).all()):
+    is_good = all(np.isfinite(box).all() for box in arrays.values())
+    if not (
+        is_good and (arrays["lows"] <= arrays["highs"]).all() and (arrays["longest"] > 0).all()
+    ):
         raise SceneError(
             f"{where}: {prefix}lows, highs and longest must be boxes of positive standard "
             f"deviations; write the scene again"
         )
-    return found
+    return arrays

@@ -1,8 +1,8 @@
-"""What a splat file from anywhere may cost: memory by its size, and values in its JSON.
+"""Limits of what a splat file from anywhere may cost: memory by its size, and values in its JSON.
 
-A file of some megabytes can announce, or be unpacked to, more than any machine holds. Its readers
-ask here before they allocate. Scenes of cities keep 5 to 60 bytes a Gaussian and stay far below
-these limits.
+A file of some megabytes can announce, or be unpacked to, more than any machine holds. Readers of
+such files call these checks before they allocate. Scenes of cities need 5 to 60 bytes of file a
+Gaussian and stay far below these limits.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any
 from augment.errors import SceneError
 from recipes.files import open_file
 
-FREE_BYTES = 512 << 20  # of Gaussians in memory, whatever the size of their file
-BYTES_PER_BYTE = 32  # of Gaussians in memory beyond that, for each byte of their file
-_ROW_BYTES = 44  # place, rotation, scale and opacity of a Gaussian in float32
-_COLOUR_BYTES = 12  # one spherical harmonic of three channels in float32
-_ROWS = 1 << 18  # Gaussians that are decoded together, so that temporaries stay small
+FREE_BYTES = 512 << 20  # bytes of Gaussians in memory that a file of any size may take
+BYTES_PER_BYTE = 32  # further bytes of Gaussians in memory for each byte of their file
+_ROW_BYTES = 44  # bytes of a Gaussian's mean, rotation, scale and opacity in float32
+_COLOUR_BYTES = 12  # bytes of one spherical harmonic of three channels in float32
+_ROWS_AT_ONCE = 1 << 18  # Gaussians that are decoded together, so that temporaries stay small
 
-MAX_VALUES = 16_000_000  # of a JSON text, counted by its commas and brackets
+MAX_VALUES = 16_000_000  # values of a JSON text, counted by its commas and brackets
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 
 
@@ -31,35 +31,41 @@ def check_memory(where: str, rows: int, *, functions: int, size: int) -> None:
 
     Args:
         where: the file, for the message.
-        rows: how many Gaussians it announces.
+        rows: the number of Gaussians that the file announces.
         functions: spherical harmonics a Gaussian, 1 to 16.
         size: bytes of the file, or of all files that hold the Gaussians.
 
     Raises:
         SceneError: they take more than FREE_BYTES and BYTES_PER_BYTE for each byte of the file.
     """
-    each = _ROW_BYTES + _COLOUR_BYTES * functions
-    most = (FREE_BYTES + BYTES_PER_BYTE * size) // each
-    if rows > most:
+    row_bytes = _ROW_BYTES + _COLOUR_BYTES * functions
+    max_rows = (FREE_BYTES + BYTES_PER_BYTE * size) // row_bytes
+    if rows > max_rows:
         raise SceneError(
-            f"{where} announces {rows} Gaussians of {each} bytes in memory each; at most {most} "
-            f"are taken from its {size} bytes ({FREE_BYTES >> 20} MiB, and {BYTES_PER_BYTE} bytes "
-            f"for each of the file's): it is damaged, or made to fill the memory. If it is whole, "
+            f"{where} announces {rows} Gaussians of {row_bytes} bytes in memory each; at most "
+            f"{max_rows} are taken from its {size} bytes ({FREE_BYTES >> 20} MiB, and "
+            f"{BYTES_PER_BYTE} bytes for each of the file's): it is damaged, or made to fill the "
+            "memory. If it is whole, "
             f"export it as .ply"
         )
 
 
 def row_slices(count: int) -> Iterator[slice]:
-    """Slices of the rows 0 to `count`, to decode large columns piece by piece."""
-    for start in range(0, count, _ROWS):
-        yield slice(start, min(start + _ROWS, count))
+    """Yield slices of the rows 0 to `count`, to decode large columns piece by piece."""
+    for start in range(0, count, _ROWS_AT_ONCE):
+        yield slice(start, min(start + _ROWS_AT_ONCE, count))
 
 
 def read_json(path: Path, most: int) -> dict[str, Any]:
-    """The object that a JSON file of at most `most` bytes holds; see `parsed_json`.
+    """Read a JSON file that holds an object; see `parsed_json`.
+
+    Args:
+        path: the file.
+        most: the largest size that is read, bytes.
 
     Raises:
-        SceneError: the file is larger, or its text cannot be used. OSError: it cannot be read.
+        SceneError: the file is larger, or its text cannot be used.
+        OSError: the file cannot be read.
     """
     with open_file(path) as file:
         text = file.read(most + 1)
@@ -69,14 +75,14 @@ def read_json(path: Path, most: int) -> dict[str, Any]:
 
 
 def check_values(text: bytes, where: str, *, max_values: int = MAX_VALUES) -> None:
-    """Refuse a JSON text with more commas and opening brackets than so many."""
+    """Refuse a JSON text with more than `max_values` commas and opening brackets."""
     values = sum(text.count(mark) for mark in (b",", b"[", b"{"))
     if values > max_values:
         raise SceneError(f"{where}: its JSON holds {values} values; at most {max_values} are read")
 
 
 def parsed_json(text: bytes, where: str, *, max_values: int = MAX_VALUES) -> dict[str, Any]:
-    """The object of a JSON text.
+    """Return the object of a JSON text.
 
     Args:
         text: UTF-8.
@@ -84,8 +90,8 @@ def parsed_json(text: bytes, where: str, *, max_values: int = MAX_VALUES) -> dic
         max_values: how many commas and brackets the text may have; every value costs some 60 bytes.
 
     Raises:
-        SceneError: no JSON, no object, too many values, nested too deeply, a number of thousands
-            of digits, or text with half a character (an unpaired surrogate).
+        SceneError: the text is no JSON or no object, has too many values, is nested too deeply, or
+            holds a number of thousands of digits or half a character (an unpaired surrogate).
     """
     check_values(text, where, max_values=max_values)
     try:

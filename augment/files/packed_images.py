@@ -1,11 +1,10 @@
-"""Images that a dataset keeps in Parquet tables, written as files without lens distortion once they
-are read.
+"""Writes images that a dataset stores in Parquet tables as undistorted files, once they are read.
 
-    FOLDER/packed.json          the table, its column, and of each image its row and lens
-    FOLDER/CAMERA/NAME.jpg      there once it was asked for
+    FOLDER/packed.json          the table, its column, and the row and the lens of each image
+    FOLDER/CAMERA/NAME.jpg      exists after the image was read once
 
-A drive has a thousand images, of which its opening needs some and most renders none; each costs a
-decoder and an encoder. `augment.files.recorded_images` asks for those that it finds missing.
+A drive has a thousand images; opening it needs a few, and most are never rendered. Each costs a
+decoder and an encoder. `augment.files.recorded_images` calls this module for missing images.
 """
 
 from __future__ import annotations
@@ -33,38 +32,40 @@ from augment.jobs.atomic import temporary_beside
 from augment.jobs.tables import opened_parquet
 from recipes.files import open_file
 
-PACKED = "packed.json"
-_MAX_PACKED = 1 << 26  # bytes of it
-_DAMAGED = (OutputError, OSError, pa.ArrowException, UnicodeDecodeError, StatedSizeError)
+PACKED = "packed.json"  # the file that describes a folder's images
+_MAX_PACKED_BYTES = 1 << 26  # bytes of that file
+_READ_ERRORS = (OutputError, OSError, pa.ArrowException, UnicodeDecodeError, StatedSizeError)
 _ADVICE = "write it as the dataset does, or copy the dataset's own file"
-_AT_ONCE = 16  # images: some 6 MB of JPEGs, decoded 0.1 GB
-_JPEG_QUALITY = 95
-_THREADS = 4  # decoders and encoders release the interpreter
+_IMAGES_AT_ONCE = 16  # images of a batch: some 6 MB of JPEGs, decoded 0.1 GB
+_JPEG_QUALITY = 95  # of the written images
+_NUM_THREADS = 4  # decoders and encoders release the interpreter
 
 # ---- Rows of large tables ------------------------------------------------------------------------
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Errors of Arrow and the system become AdapterErrors that name the file."""
+    """Turn errors of Arrow and the system into AdapterErrors that name the file."""
     try:
         yield
-    except _DAMAGED as error:
+    except _READ_ERRORS as error:
         raise AdapterError(f"{path} cannot be read as Parquet ({error}); {_ADVICE}") from error
 
 
 class ColumnKind(NamedTuple):
-    """What a column must hold. words: that, for messages."""
+    """A kind of values that a column must hold."""
 
-    words: str
-    matches: Callable[[pa.DataType], bool]
+    words: str  # its name, for messages
+    matches: Callable[[pa.DataType], bool]  # returns True for a type of that kind
 
 
 def is_number(kind: pa.DataType) -> bool:
+    """Return True for a type of numbers."""
     return pa.types.is_floating(kind) or pa.types.is_integer(kind)
 
 
 def is_list(kind: pa.DataType) -> bool:
+    """Return True for a type of lists."""
     return (
         pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)
     )
@@ -80,23 +81,30 @@ WHOLE_NUMBERS = ColumnKind("whole numbers", pa.types.is_integer)
 
 
 class RowReader:
-    """Rows of a large file by number. Cheapest in ascending order: a row group is decoded from its
-    start on, in pieces, and goes on from where it was left. Thread-safe.
+    """Reads rows of a large file by number. Thread-safe.
+
+    Ascending order is cheapest: a row group is decoded from its start on, in pieces, and decoding
+    goes on where it stopped.
 
     Args:
         path: a Parquet file.
-        columns: the columns to read, and what each must hold.
+        columns: the columns to read, and the kind of values of each.
         rows_at_once: how many rows are decoded together.
 
     Raises:
-        AdapterError: the file is no Parquet file, or lacks a column of that kind."""
+        AdapterError: the file is no Parquet file, or lacks a column of that kind.
+    """
 
     def __init__(self, path: Path, columns: Mapping[str, ColumnKind], rows_at_once: int) -> None:
-        self._path, self._columns, self._rows_at_once = path, list(columns), rows_at_once
-        self._stack, self._lock = ExitStack(), threading.Lock()
+        self._path = path
+        self._columns = list(columns)
+        self._rows_at_once = rows_at_once
+        self._stack = ExitStack()
+        self._lock = threading.Lock()
         with reading(path):
             self._content, self._file = self._stack.enter_context(opened_parquet(path, str(path)))
-            metadata, schema = self._file.metadata, self._file.schema_arrow
+            metadata = self._file.metadata
+            schema = self._file.schema_arrow
             sizes = [metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)]
         for name, kind in columns.items():
             if schema.names.count(name) != 1:
@@ -116,16 +124,17 @@ class RowReader:
         self._stack.close()
 
     def read(self, rows: Sequence[int]) -> dict[int, dict[str, Any]]:
-        """By row number, its cells by column, Arrow's scalars."""
-        found = {}
+        """Return the cells of rows, Arrow's scalars, by row number and column."""
+        cells_of_row = {}
         with self._lock, reading(self._path):
             for row in sorted(map(int, rows)):
                 batch = self._batch_of(row)
-                at = row - self._first
-                found[row] = {name: batch[name][at] for name in self._columns}
-        return found
+                index = row - self._first
+                cells_of_row[row] = {name: batch[name][index] for name in self._columns}
+        return cells_of_row
 
     def _batch_of(self, row: int) -> pa.RecordBatch:
+        """Decode the batch that holds a row."""
         group = int(np.searchsorted(self._starts, row, side="right")) - 1
         if self._batch is None or group != self._group or row < self._first:
             check_row_group(self._content, self._file, group, self._columns)
@@ -145,13 +154,16 @@ class RowReader:
 
 # ---- Lenses --------------------------------------------------------------------------------------
 
-_RADIAL = (0.8, 1.2)  # beyond, the polynomial is no lens any more
-_MAX_ZOOM = 2.0
+_RADIAL_RANGE = (0.8, 1.2)  # radial factors of a real lens; the polynomial is wrong beyond
+_MAX_ZOOM = 2.0  # the largest factor of the focal length
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Lens:
-    """A camera's image as recorded. Size and f, c: pixels; OpenCV's five coefficients."""
+    """A camera's recorded image: size, focal lengths f and principal point c in pixels.
+
+    k1 to k3 and p1, p2 are OpenCV's five distortion coefficients.
+    """
 
     width: int
     height: int
@@ -167,21 +179,29 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
+        """True for a lens without distortion."""
         return not any((self.k1, self.k2, self.p1, self.p2, self.k3))
 
     def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Recorded pixels of rays (x, y, 1), OpenCV axes, and where the lens model holds."""
+        """Project rays (x, y, 1), OpenCV axes, into recorded pixels.
+
+        Returns:
+            u and v in pixels, and True where the lens model holds.
+        """
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         u = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
         v = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
-        valid = (radial >= _RADIAL[0]) & (radial <= _RADIAL[1])
+        valid = (radial >= _RADIAL_RANGE[0]) & (radial <= _RADIAL_RANGE[1])
         return self.f_u * u + self.c_u, self.f_v * v + self.c_v, valid
 
     @cached_property
     def pinhole(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy of the image without distortion, of the same size: the recorded ones, or
-        a longer focal length where its border would show what was not recorded."""
+        """Return fx, fy, cx, cy of the image without distortion, of the same size, in pixels.
+
+        They are the recorded ones, or a longer focal length if the border would otherwise show
+        pixels that were not recorded.
+        """
 
         def fits(zoom: float) -> bool:
             columns = np.arange(self.width) + 0.5
@@ -192,7 +212,8 @@ class Lens:
             inside = (u >= 0) & (u <= self.width) & (v >= 0) & (v <= self.height)
             return bool((inside & valid).all())
 
-        low, high = 1.0, _MAX_ZOOM
+        low = 1.0
+        high = _MAX_ZOOM
         if fits(low):
             high = low
         elif not fits(high):
@@ -204,17 +225,22 @@ class Lens:
 
     @cached_property
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where each undistorted pixel lies in the recorded image, for cv2.remap, whose pixel
-        centres are whole numbers."""
+        """Return the recorded position of each undistorted pixel, as maps for cv2.remap.
+
+        Its pixel centres are whole numbers.
+        """
         u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         u, v, _ = self.project(*self._rays(u, v, self.pinhole[0] / self.f_u))
-        u, v = (u - 0.5).astype(np.float32), (v - 0.5).astype(np.float32)
+        u = (u - 0.5).astype(np.float32)
+        v = (v - 0.5).astype(np.float32)
         return cv2.convertMaps(u, v, cv2.CV_16SC2)
 
     def undistorted(self, image: np.ndarray) -> np.ndarray:
+        """Return the image without distortion."""
         return cv2.remap(image, *self.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
     def _rays(self, u: np.ndarray, v: np.ndarray, zoom: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return x and y of the rays of undistorted pixels."""
         return (u - self.c_u) / (zoom * self.f_u), (v - self.c_v) / (zoom * self.f_v)
 
 
@@ -222,70 +248,92 @@ class Lens:
 
 
 class PackedImages(BaseModel):
-    """What a folder's images are made of. rows: of the table, by CAMERA/NAME.jpg. lenses: by
-    camera."""
+    """The content of packed.json: the source of a folder's images."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    table: str
-    column: str
-    lenses: Mapping[str, Lens]
-    rows: Mapping[str, NonNegativeInt]
+    table: str  # path of the table
+    column: str  # its column of image files
+    lenses: Mapping[str, Lens]  # by camera
+    rows: Mapping[str, NonNegativeInt]  # row of the table by CAMERA/NAME.jpg
 
-    def put(self, folder: Path, asked: Sequence[str], now: Sequence[str]) -> dict[str, str]:
-        """Say in the folder what its images are made of, look at those asked for, and write some of
-        them at once, where they are not there. Returns what is wrong with images, by name, the end
-        of a sentence; that decoders refuse one is told of those alone that are written.
+    def put(
+        self, folder: Path, checked_names: Sequence[str], written_names: Sequence[str]
+    ) -> dict[str, str]:
+        """Write packed.json, check images, and write some of them at once if they are missing.
+
+        Args:
+            folder: the folder of the images.
+            checked_names: names of the images to check.
+            written_names: names of the images to write.
+
+        Returns:
+            The fault of each faulty image by name, as the end of a sentence. Only images that are
+            written are decoded, so only their decoding errors are reported.
 
         Raises:
-            AdapterError: the table is damaged, or the folder cannot be written."""
+            AdapterError: the table is damaged, or the folder cannot be written.
+        """
         _write(folder / PACKED, self.model_dump_json().encode())
         faults: dict[str, str] = {}
-        wanted = {name for name in now if not (folder / name).is_file()}
-        reader = RowReader(Path(self.table), {self.column: FILE_BYTES}, _AT_ONCE)
-        names = sorted(asked, key=self.rows.__getitem__)
-        with ThreadPoolExecutor(_THREADS) as pool:
-            for start in range(0, len(names), _AT_ONCE):
-                own = names[start : start + _AT_ONCE]
-                cells = self._read(reader, own)
+        missing_names = {name for name in written_names if not (folder / name).is_file()}
+        reader = RowReader(Path(self.table), {self.column: FILE_BYTES}, _IMAGES_AT_ONCE)
+        names = sorted(checked_names, key=self.rows.__getitem__)
+        with ThreadPoolExecutor(_NUM_THREADS) as pool:
+            for start in range(0, len(names), _IMAGES_AT_ONCE):
+                batch_names = names[start : start + _IMAGES_AT_ONCE]
+                cells = self._read(reader, batch_names)
                 jobs = [
-                    (folder / n if n in wanted else None, cells[n], self.lenses[n.split("/")[0]])
-                    for n in own
+                    (
+                        folder / n if n in missing_names else None,
+                        cells[n],
+                        self.lenses[n.split("/")[0]],
+                    )
+                    for n in batch_names
                 ]
-                found = pool.map(_unpack, jobs)
-                faults |= {n: fault for n, fault in zip(own, found, strict=True) if fault}
+                batch_faults = pool.map(_unpack, jobs)
+                faults |= {
+                    n: fault for n, fault in zip(batch_names, batch_faults, strict=True) if fault
+                }
         return faults
 
     def unpack(self, folder: Path, name: str) -> str:
-        """Write an image and those beside it in the table; what is wrong with it, or nothing."""
+        """Write an image and its neighbours in the table; return its fault, or ""."""
         names = sorted(self.rows, key=self.rows.__getitem__)
-        first = names.index(name) // _AT_ONCE * _AT_ONCE
-        own = [n for n in names[first : first + _AT_ONCE] if not (folder / n).is_file()]
-        cells = self._read(_reader(self.table, self.column, os.getpid()), own)
-        jobs = [(folder / n, cells[n], self.lenses[n.split("/")[0]]) for n in own]
-        with ThreadPoolExecutor(_THREADS) as pool:
-            faults = dict(zip(own, pool.map(_unpack, jobs), strict=True))
+        first = names.index(name) // _IMAGES_AT_ONCE * _IMAGES_AT_ONCE
+        batch_names = [
+            n for n in names[first : first + _IMAGES_AT_ONCE] if not (folder / n).is_file()
+        ]
+        cells = self._read(_reader(self.table, self.column, os.getpid()), batch_names)
+        jobs = [(folder / n, cells[n], self.lenses[n.split("/")[0]]) for n in batch_names]
+        with ThreadPoolExecutor(_NUM_THREADS) as pool:
+            faults = dict(zip(batch_names, pool.map(_unpack, jobs), strict=True))
         return faults.get(name, "")
 
     def _read(self, reader: RowReader, names: Sequence[str]) -> dict[str, Any]:
+        """Read the cells of images by name."""
         cells = reader.read([self.rows[name] for name in names])
         return {name: cells[self.rows[name]][self.column] for name in names}
 
 
 @lru_cache(maxsize=2)
 def _reader(table: str, column: str, _pid: int) -> RowReader:
-    # Another process must not go on with this one's file.
-    return RowReader(Path(table), {column: FILE_BYTES}, _AT_ONCE)
+    """Return the open table of this process."""
+    # A child process must not go on with its parent's file: _pid is a part of the cache's key.
+    return RowReader(Path(table), {column: FILE_BYTES}, _IMAGES_AT_ONCE)
 
 
 def is_packed(path: Path) -> bool:
-    """Whether the image can be written from a table; it may be there already."""
+    """Return True if the image can be written from a table; it may exist already."""
     packed = _packed_of(path)
     return packed is not None and _name(path) in packed.rows
 
 
 def unpack_image(path: Path) -> str:
-    """Write an image that is not there, if a table has it. Returns what is wrong, the end of a
-    sentence, or nothing: also where no table is known to have it."""
+    """Write a missing image if a table has it.
+
+    Returns:
+        The fault, as the end of a sentence; "" without a fault, and if no known table has it.
+    """
     packed = _packed_of(path)
     if packed is None or _name(path) not in packed.rows:
         return ""
@@ -296,10 +344,12 @@ def unpack_image(path: Path) -> str:
 
 
 def _name(path: Path) -> str:
+    """Return CAMERA/NAME of an image."""
     return f"{path.parent.name}/{path.name}"
 
 
 def _packed_of(path: Path) -> PackedImages | None:
+    """Return the content of packed.json in the image's folder, if there is one."""
     if len(path.parents) < 2:
         return None
     file = path.parents[1] / PACKED
@@ -311,13 +361,13 @@ def _packed_of(path: Path) -> PackedImages | None:
 
 @lru_cache(maxsize=4)
 def _read_packed(file: Path, _changed_ns: int) -> PackedImages:
+    """Read packed.json; the time of its last change is a part of the cache's key."""
     with open_file(file) as opened:
-        return PackedImages.model_validate_json(opened.read(_MAX_PACKED))
+        return PackedImages.model_validate_json(opened.read(_MAX_PACKED_BYTES))
 
 
 def _unpack(job: tuple[Path | None, Any, Lens]) -> str:
-    """Check an image and, given a path, write it without distortion. Returns what is wrong with it,
-    or nothing."""
+    """Check an image and, given a path, write it without distortion; return its fault, or ""."""
     path, cell, lens = job
     data = b"" if cell.as_buffer() is None else cell.as_buffer().to_pybytes()
     header = image_header(data)
@@ -339,6 +389,7 @@ def _unpack(job: tuple[Path | None, Any, Lens]) -> str:
 
 
 def _write(path: Path, data: bytes) -> None:
+    """Write a file atomically."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         new = temporary_beside(path)

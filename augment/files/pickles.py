@@ -1,10 +1,10 @@
-"""Pickles and .npy files from strangers, read without calling anything of numpy's or pandas'.
+"""Reads pickles and .npy files from strangers without calling numpy or pandas.
 
 A pickle is a program that names functions for the reader to call. Even numpy's own constructors run
 whatever a hostile file likes: `dtype.__setstate__` takes fields at negative offsets, and an array
-over them writes into other objects. So the program is followed step by step by `Pickle`: a name
-stands for a function of ours or is refused, what it makes are values of Python and the records
-below, and arrays are made of checked headers and of the bytes that are there.
+over them writes into other objects. So `Pickle` follows the program step by step. A name stands for
+one of our functions or is refused; the results are values of Python and the records below; arrays
+are made of checked headers and of the bytes that exist.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-MAX_VALUE_BYTES = 1 << 29  # of one value
-MAX_STEPS = 1 << 20  # of the program; a text in a table takes two
-MAX_STREAMED_BYTES = 1 << 27  # for one array; a sweep of 200,000 points takes 5 MB
-MAX_STREAMED_STEPS = 1 << 18  # a frame takes twenty
-MAX_INT_KEYS = 1 << 14  # of a dictionary: whole numbers can be chosen to collide
-_MAX_LINE = 1 << 12
-_LONG_BYTES = 1 << 10  # longer ones are an array's own: nothing refers back to them
+MAX_VALUE_BYTES = 1 << 29  # bytes of one value
+MAX_STEPS = 1 << 20  # steps of the program; a text in a table takes two
+MAX_STREAMED_BYTES = 1 << 27  # bytes for one array; a sweep of 200,000 points takes 5 MB
+MAX_STREAMED_STEPS = 1 << 18  # steps of a streamed program; a frame takes twenty
+MAX_INT_KEYS = 1 << 14  # whole-number keys of a dictionary: they can be chosen to collide
+_MAX_LINE_BYTES = 1 << 12  # bytes of a line, which holds a name
+# A memo keeps bytes up to this length. Longer ones are an array's: no program refers back to them.
+_MAX_MEMO_BYTES = 1 << 10
 _STEP_NAMES = {ord(opcode.code): opcode.name for opcode in pickletools.opcodes}
 _PLAIN_STEPS = (
     "PROTO", "STOP", "NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1",
@@ -38,8 +39,8 @@ _PLAIN_STEPS = (
     "GLOBAL", "STACK_GLOBAL", "REDUCE", "BINPERSID",
 )  # fmt: skip
 Order = Literal["C", "F"]
-_DTYPE = re.compile(r"[fiu][1248]|b1|O8?")
-_PLAIN_CELLS = (type(None), bool, int, float, str, np.generic)
+_DTYPE_CODE = re.compile(r"[fiu][1248]|b1|O8?")
+_CELL_TYPES = (type(None), bool, int, float, str, np.generic)
 _NPY_HEADER = re.compile(
     r"\{'descr': '([<>|=]?)([fiub][1248]|O)', 'fortran_order': (True|False), "
     r"'shape': \(((?:\d{1,15}L?,? ?)*)\), ?\}\s*"
@@ -51,25 +52,29 @@ class PickleError(ValueError):
 
 
 class Record(ABC):
-    """What a pickle makes and then fills with a state, in the words of pickle: builds."""
+    """An object that a pickle creates and then fills with a state (pickle's BUILD step)."""
 
     @abstractmethod
-    def build(self, state: Any) -> None: ...
+    def build(self, state: Any) -> None:
+        """Fill the object with the state of the pickle."""
+        ...
 
 
 @dataclass(frozen=True)
 class Name:
-    """A function or class that a pickle names. make: what stands for it here."""
+    """A function or class that a pickle names."""
 
-    make: Callable[..., Any]
+    make: Callable[..., Any]  # the function that replaces it
 
     def __call__(self, *arguments: Any) -> Any:
         return self.make(*arguments)
 
 
 class Pickle(pickle._Unpickler):
-    """One pickle, read step by step by Python's own reader, in Python (the one in C takes memory as
-    the file says), of which the steps that plain values need are left.
+    """One pickle, read step by step by Python's own reader in Python.
+
+    The reader in C would take as much memory as the file says. Only the steps that plain values
+    need are left.
     """
 
     def __init__(
@@ -80,36 +85,45 @@ class Pickle(pickle._Unpickler):
         storage: Callable[..., Any] | None = None,
         is_streamed: bool = False,
     ) -> None:
-        """names: what it may name, by module and name, and what stands for it. storage: makes what
-        a persistent id stands for, of the id. is_streamed: keep no long bytes once they are used,
-        for files larger than memory; then nothing may refer back to them.
+        """Prepare to read one pickle.
+
+        Args:
+            file: the file, at the start of the pickle.
+            names: the functions that replace the allowed names, by module and name.
+            storage: makes the value of a persistent id, given the id.
+            is_streamed: drop long bytes once they are used, for files larger than memory; then the
+                program may not refer back to them.
         """
-        self._source: Any = _Bounded(file, is_streamed)
+        self._source: Any = _BoundedFile(file, is_streamed)
         super().__init__(self._source, encoding="latin-1")
         self.read, self.readline = self._source.read, self._source.readline
-        self._names, self._storage, self._is_streamed = names, storage, is_streamed
-        self.memo: dict[int, Any] = _ShortMemo() if is_streamed else {}
+        self._names = names
+        self._storage = storage
+        self._is_streamed = is_streamed
+        self.memo: dict[int, Any] = _MemoWithoutLongBytes() if is_streamed else {}
         self.metastack: list[list[Any]] = []
         self.stack: list[Any] = []
         self.append = self.stack.append
         self._built: Record | None = None
 
     def value(self) -> Any:
-        """The value of the pickle that starts at the file's position; reads no further."""
+        """Return the value of the pickle that starts at the file's position; read no further."""
         for _ in self.steps():
             pass
         return self.stack[-1]
 
     def steps(self) -> Iterator[Record]:
-        """As `value`, but comes up with every record that has been built. The value is then the
-        last one on `stack`.
+        """Run the program and yield every record after it was built.
+
+        The value is the last item of `stack` at the end.
         """
-        most = MAX_STREAMED_STEPS if self._is_streamed else MAX_STEPS
-        count, code = 0, b""
+        max_steps = MAX_STREAMED_STEPS if self._is_streamed else MAX_STEPS
+        num_steps = 0
+        code = b""
         try:
             while code != pickle.STOP:
-                if (count := count + 1) > most:
-                    raise PickleError(f"it takes more than {most} steps")
+                if (num_steps := num_steps + 1) > max_steps:
+                    raise PickleError(f"it takes more than {max_steps} steps")
                 if not (code := self.read(1)) or code[0] not in _STEP_NAMES:
                     raise PickleError("it is cut short or damaged (no known step)")
                 if code[0] not in self.dispatch:
@@ -118,8 +132,8 @@ class Pickle(pickle._Unpickler):
                 if code != pickle.STOP:
                     self.dispatch[code[0]](self)
                 if self._built is not None:
-                    self._source.held_bytes, built, self._built = 0, self._built, None
-                    yield built
+                    self._source.held_bytes, record, self._built = 0, self._built, None
+                    yield record
             if len(self.stack) != 1 or self.metastack:
                 raise PickleError("it is cut short or damaged (no single value)")
         except PickleError:
@@ -129,29 +143,37 @@ class Pickle(pickle._Unpickler):
             raise PickleError(f"it is cut short or damaged ({error})") from error
 
     def find_class(self, module: str, name: str) -> Name:
+        """Return the replacement of a name."""
         if (module, name) not in self._names:
             raise PickleError(f"it asks for {module}.{name}, which is not needed")
         return Name(self._names[module, name])
 
     def persistent_load(self, pid: Any) -> Any:
+        """Return the value of a persistent id."""
         if self._storage is None:
             raise PickleError("it refers to values outside of it")
         return self._storage(pid)
 
     def _frame(self) -> None:
-        self.read(8)  # what a frame holds is read like the rest
+        """Skip the length of a frame."""
+        self.read(8)  # the content of a frame is read like everything else
 
     def _bytearray(self) -> None:
+        """Push bytes."""
         self.append(self.read(int.from_bytes(self.read(8), "little")))
 
     def _reduce(self) -> None:
-        arguments, function = self.stack.pop(), self.stack.pop()
+        """Call a function with its arguments."""
+        arguments = self.stack.pop()
+        function = self.stack.pop()
         if type(function) is not Name or type(arguments) is not tuple:
             raise PickleError("it calls something that is no name, or without arguments")
         self.append(function(*arguments))
 
     def _build(self) -> None:
-        state, target = self.stack.pop(), self.stack[-1]
+        """Fill the last object with its state."""
+        state = self.stack.pop()
+        target = self.stack[-1]
         if isinstance(target, Record):
             target.build(state)
             self._built = target
@@ -159,6 +181,7 @@ class Pickle(pickle._Unpickler):
             raise PickleError("it fills something that takes no state")
 
     def _store(self, pairs: list[Any]) -> None:
+        """Put entries into the last dictionary."""
         target = self.stack[-1]
         if type(target) is not dict or len(pairs) % 2:
             raise PickleError("it puts entries into something that is no dictionary")
@@ -171,6 +194,7 @@ class Pickle(pickle._Unpickler):
             target[key] = value
 
     def _extend(self, items: list[Any]) -> None:
+        """Add items to the last list."""
         if type(self.stack[-1]) is not list:
             raise PickleError("it adds items to something that is no list")
         self.stack[-1].extend(items)
@@ -193,31 +217,35 @@ class Pickle(pickle._Unpickler):
     }
 
 
-class _ShortMemo(dict[int, Any]):
-    """What a pickle refers back to, but for long bytes."""
+class _MemoWithoutLongBytes(dict[int, Any]):
+    """The values that a pickle may refer back to; long bytes are dropped."""
 
     def __setitem__(self, key: int, value: Any) -> None:
-        is_long = isinstance(value, bytes) and len(value) > _LONG_BYTES
-        super().__setitem__(key, _FORGOTTEN if is_long else value)
+        is_dropped = isinstance(value, bytes) and len(value) > _MAX_MEMO_BYTES
+        super().__setitem__(key, _DROPPED_BYTES if is_dropped else value)
 
     def __getitem__(self, key: int) -> Any:
-        if (value := super().__getitem__(key)) is _FORGOTTEN:
+        if (value := super().__getitem__(key)) is _DROPPED_BYTES:
             raise PickleError("it refers back to the bytes of an array")
         return value
 
 
-_FORGOTTEN = object()
+_DROPPED_BYTES = object()
 
 
-class _Bounded:
-    """A file that is read forward, in pieces of bounded size. held_bytes: read since a record was
-    last built; bounded in streamed files.
+class _BoundedFile:
+    """A file that is read forward, in pieces of bounded size.
+
+    `held_bytes` counts the bytes read since a record was last built; streamed files bound it.
     """
 
     def __init__(self, file: BufferedIOBase, is_streamed: bool) -> None:
-        self._file, self._is_streamed, self.held_bytes = file, is_streamed, 0
+        self._file = file
+        self._is_streamed = is_streamed
+        self.held_bytes = 0
 
     def read(self, count: int) -> bytes:
+        """Read exactly `count` bytes."""
         if not 0 <= count <= MAX_VALUE_BYTES:
             raise PickleError(f"it states {count} bytes for one value")
         self.held_bytes += count
@@ -229,7 +257,8 @@ class _Bounded:
         return data
 
     def readline(self) -> bytes:
-        line = self._file.readline(_MAX_LINE)
+        """Read a line without escapes."""
+        line = self._file.readline(_MAX_LINE_BYTES)
         if not line.endswith(b"\n") or b"\\" in line:
             raise PickleError("it holds a name without end or with escapes")
         return line
@@ -240,19 +269,20 @@ class _Bounded:
 
 @dataclass
 class DtypeRecord(Record):
-    """One of numpy's plain kinds of numbers, or objects. code: numpy's, without byte order."""
+    """One of numpy's plain kinds of numbers, or objects."""
 
-    code: str
-    order: str = "="
+    code: str  # numpy's code of the type, without byte order
+    order: str = "="  # numpy's character of the byte order
 
     @staticmethod
     def make(code: Any, align: Any = False, copy: Any = True) -> DtypeRecord:
-        if type(code) is not str or not _DTYPE.fullmatch(code) or align not in (False, 0):
+        """Check numpy's arguments of a dtype."""
+        if type(code) is not str or not _DTYPE_CODE.fullmatch(code) or align not in (False, 0):
             raise PickleError("it holds an array of something else than numbers or objects")
         return DtypeRecord(code)
 
     def build(self, state: Any) -> None:
-        """Takes the byte order; fields, sub-arrays, sizes and flags of one's own are refused."""
+        """Set the byte order; fields, sub-arrays and other sizes and flags are refused."""
         match state:
             case (3, "<" | ">" | "|" | "=" as order, None, None, None, -1, -1, 0 | 63 as flags):
                 if (flags == 63) == self.is_object:
@@ -262,10 +292,12 @@ class DtypeRecord(Record):
 
     @property
     def is_object(self) -> bool:
+        """True for an array of Python objects."""
         return self.code.startswith("O")
 
     @property
     def numpy(self) -> np.dtype:
+        """Return the dtype of plain numbers."""
         if self.is_object:
             raise PickleError("it holds objects where numbers are expected")
         # "|" is for single bytes, which have no order.
@@ -274,22 +306,23 @@ class DtypeRecord(Record):
 
 @dataclass(eq=False)
 class ArrayRecord(Record):
-    """An array that a pickle makes. values: None until it is filled, and once it was taken.
-    wrapped: instead of values, what is neither text nor number: `np.save` makes an array of one
-    object of whatever is no array.
-    """
+    """An array that a pickle creates."""
 
-    values: np.ndarray | None = None
+    values: np.ndarray | None = None  # None before it is filled, and after it was taken
+    # An object that is neither text nor number, in place of values: `np.save` wraps whatever is no
+    # array in an array of one object.
     wrapped: Any = None
-    is_filled: bool = False
+    is_filled: bool = False  # True after `build`
 
     @staticmethod
     def reconstruct(kind: Any, shape: Any, code: Any) -> ArrayRecord:
+        """Create an empty array, as numpy's `_reconstruct`."""
         if type(kind) is not Name or kind.make is not _ndarray:
             raise PickleError("it makes an array of a kind of its own")
         return ArrayRecord()
 
     def build(self, state: Any) -> None:
+        """Fill the array with its shape, type and numbers."""
         if self.is_filled:
             raise PickleError("it fills one array twice")
         _, shape, dtype, is_fortran, content = state
@@ -299,7 +332,15 @@ class ArrayRecord(Record):
     def from_buffer(
         content: Any, dtype: Any, shape: Any, order: Any, axes: Any = None
     ) -> ArrayRecord:
-        """As protocol 5 has it. axes: of an array in no plain order, which ones it runs along."""
+        """Create an array as protocol 5 stores it.
+
+        Args:
+            content: the bytes.
+            dtype: the type of the numbers.
+            shape: the lengths of the axes.
+            order: "C", "F", or "K" for an array in neither order.
+            axes: the order of the axes in memory, for "K".
+        """
         array = ArrayRecord()
         if order != "K":
             array._fill(shape, dtype, "F" if order == "F" else "C", content)
@@ -311,6 +352,7 @@ class ArrayRecord(Record):
         return array
 
     def _fill(self, shape: Any, dtype: Any, order: Order, content: Any) -> None:
+        """Check and set the values."""
         if type(dtype) is not DtypeRecord:
             raise PickleError("it holds an array without a type")
         sides = _checked_shape(shape)
@@ -321,29 +363,30 @@ class ArrayRecord(Record):
             self.values = numbers(sides, dtype.numpy, order, content)
 
     def take(self) -> np.ndarray:
-        """The array, once: a few bytes that refer to it often cannot fill the memory."""
+        """Return the array, once: a few bytes that refer to it often cannot fill the memory."""
         if self.values is None:
             raise PickleError("it holds one array twice, or one without values")
-        values, self.values = self.values, None
+        values = self.values
+        self.values = None
         return values
 
 
 def numbers(shape: tuple[int, ...], dtype: np.dtype, order: Order, content: Any) -> np.ndarray:
-    """An array of its own memory, in the machine's byte order."""
+    """Return an array with its own memory, in the machine's byte order."""
     if type(content) is not bytes or math.prod(shape) * dtype.itemsize != len(content):
-        held = f"{len(content)} bytes" if type(content) is bytes else "no bytes"
-        raise PickleError(f"it holds {held} for an array {list(shape)} of {dtype}")
+        content_text = f"{len(content)} bytes" if type(content) is bytes else "no bytes"
+        raise PickleError(f"it holds {content_text} for an array {list(shape)} of {dtype}")
     array = np.frombuffer(content, dtype).reshape(shape, order=order)
     return array.astype(dtype.newbyteorder("="), order="K")
 
 
 def _objects(shape: tuple[int, ...], order: Order, content: Any) -> tuple[np.ndarray | None, Any]:
-    """Texts, numbers and None; or, of a single object that is none of them, what it is."""
+    """Return an array of texts, numbers and None, or the single object that is none of them."""
     if type(content) is not list or math.prod(shape) != len(content):
         raise PickleError(f"it holds an array {list(shape)} of objects without as many")
-    if shape == () and not isinstance(content[0], _PLAIN_CELLS):
+    if shape == () and not isinstance(content[0], _CELL_TYPES):
         return None, content[0]
-    if not all(isinstance(cell, _PLAIN_CELLS) for cell in content):
+    if not all(isinstance(cell, _CELL_TYPES) for cell in content):
         raise PickleError("it holds a cell that is neither a text nor a number")
     flat = np.empty(len(content), dtype=object)
     flat[:] = content
@@ -351,6 +394,7 @@ def _objects(shape: tuple[int, ...], order: Order, content: Any) -> tuple[np.nda
 
 
 def _checked_shape(shape: Any) -> tuple[int, ...]:
+    """Check that a value is a shape of at most 8 axes."""
     is_shape = type(shape) is tuple and all(type(n) is int and 0 <= n < 1 << 48 for n in shape)
     if not is_shape or len(shape) > 8:
         raise PickleError("it holds an array without a shape")
@@ -358,17 +402,19 @@ def _checked_shape(shape: Any) -> tuple[int, ...]:
 
 
 def _scalar(dtype: Any, content: Any) -> np.generic:
+    """Return one number, as numpy's `scalar`."""
     if type(dtype) is not DtypeRecord:
         raise PickleError("it holds a number without a type")
     return numbers((1,), dtype.numpy, "C", content)[0]
 
 
 def _ndarray(*_: Any) -> None:
+    """Refuse an array without bytes; also stands for numpy's class."""
     raise PickleError("it makes an array without its bytes")
 
 
 def _encode_latin1(text: Any, encoding: Any = "utf-8") -> bytes:
-    """What protocol 2 carries bytes by; any other codec is refused."""
+    """Return the bytes of a text, as protocol 2 stores bytes; any other codec is refused."""
     if type(text) is not str or encoding not in ("latin1", "latin-1"):
         codec = encoding if type(encoding) is str else type(encoding).__name__
         raise PickleError(f"it decodes by {codec[:40]!r}, which is not needed")
@@ -376,7 +422,7 @@ def _encode_latin1(text: Any, encoding: Any = "utf-8") -> bytes:
 
 
 def _bytes(content: Any = b"", encoding: Any = None) -> bytes:
-    """Of a bytearray; protocol 2 spells it as text."""
+    """Return the bytes of a bytearray; protocol 2 spells them as text."""
     return content if type(content) is bytes else _encode_latin1(content, encoding)
 
 
@@ -396,15 +442,15 @@ ARRAY_NAMES: dict[tuple[str, str], Callable[..., Any]] = {
 
 @dataclass(frozen=True)
 class NpyHeader:
-    """What the bytes after the header are: numbers of `dtype`, or one pickled object."""
+    """Describes the bytes after the header of a .npy file."""
 
     shape: tuple[int, ...]
-    dtype: np.dtype | None
-    order: Order
+    dtype: np.dtype | None  # None where one pickled object follows
+    order: Order  # C: the last axis varies fastest; F: the first
 
 
 def read_npy_header(file: BufferedIOBase) -> NpyHeader:
-    """The header as `np.save` writes it; numpy's own reader would evaluate it as Python."""
+    """Read a header as `np.save` writes it; numpy's own reader would evaluate it as Python."""
     start = file.read(8)
     if len(start) < 8 or start[:6] != b"\x93NUMPY" or start[6] not in (1, 2, 3):
         raise PickleError("it does not start as a .npy file does")
@@ -421,7 +467,7 @@ def read_npy_header(file: BufferedIOBase) -> NpyHeader:
 
 
 def read_npy(file: BufferedIOBase) -> np.ndarray:
-    """The numbers of a .npy file."""
+    """Read the numbers of a .npy file."""
     header = read_npy_header(file)
     if header.dtype is None:
         raise PickleError("it holds objects where numbers are expected")

@@ -1,7 +1,8 @@
-"""Gaussians in plain files: INRIA's .ply (SH degree 0 to 3) and .splat (32-byte records).
+"""Reads and writes Gaussians in plain files: INRIA's .ply (SH degree 0 to 3) and .splat.
 
-A header is not trusted: counts are compared with the size of the file before anything is allocated,
-so a damaged or hostile file costs a message and no memory.
+`read_splats` reads every splat format; the other formats' modules return its record `SplatFile`. A
+.splat is a row of 32-byte records. A header is not trusted: counts are compared with the size of
+the file before anything is allocated, so a damaged or hostile file costs a message and no memory.
 """
 
 from __future__ import annotations
@@ -27,11 +28,14 @@ from augment.scene import SH_COUNTS, Gaussians, check_gaussians
 
 # ---- The container: a header, and tables of rows that are read in pieces -------------------------
 
-ROWS_PER_CHUNK = 16384  # about 4 MB of degree-3 rows: columns are picked out while in the cache
-_MAX_HEADER_BYTES = 1 << 20
-_MAX_LINE_BYTES = 1 << 16  # of a row of text
-_COUNT = re.compile(r"[0-9]{1,18}")  # more than any file holds, few enough for int64
+ROWS_PER_CHUNK = 16384  # rows read together: about 4 MB at degree 3, so columns stay in the cache
+_MAX_HEADER_BYTES = 1 << 20  # bytes of a header
+_MAX_LINE_BYTES = 1 << 16  # bytes of a row of text
+# The text of a count: more digits than any file needs, few enough for int64.
+_COUNT_PATTERN = re.compile(r"[0-9]{1,18}")
+# numpy's characters of the byte orders, and "ascii".
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "ascii"}
+# numpy's type codes of the property types.
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -42,47 +46,52 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class PlyElement:
-    """One table of the file. columns: numpy type codes without byte order, by name in the file's
-    order. lists: names of properties whose length varies by row; such rows have no fixed size.
-    """
+    """One table of the file."""
 
     name: str
-    count: int
+    count: int  # rows
+    # numpy's type codes, without byte order, by name in the file's order.
     columns: dict[str, str] = field(default_factory=dict)
+    # Names of properties whose length varies by row; such rows have no fixed size.
     lists: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a .ply says of itself. byte_order: '<', '>' or 'ascii'. body_offset: bytes."""
+    """The header of a .ply file."""
 
     path: Path
-    byte_order: str
+    byte_order: str  # '<', '>' or 'ascii'
     elements: tuple[PlyElement, ...]
-    comments: tuple[str, ...]
-    body_offset: int
+    comments: tuple[str, ...]  # texts of the lines `comment` and `obj_info`
+    body_offset: int  # bytes before the first row
 
     def element(self, name: str) -> PlyElement:
-        """The element of that name."""
+        """Return the element of that name.
+
+        Raises:
+            SceneError: there is none; the message lists the others.
+        """
         for element in self.elements:
             if element.name == name:
                 return element
-        found = ", ".join(repr(e.name) for e in self.elements) or "none"
-        raise SceneError(f"{self.path}: expected an element {name!r} in the .ply; found {found}")
+        names = ", ".join(repr(e.name) for e in self.elements) or "none"
+        raise SceneError(f"{self.path}: expected an element {name!r} in the .ply; found {names}")
 
     def row_dtype(self, element: PlyElement) -> np.dtype:
-        """Of the rows that `iterate_rows` gives."""
+        """Return the type of the rows that `iterate_rows` yields."""
         if self.byte_order == "ascii":
             return np.dtype([(name, "f8") for name in element.columns])
         return np.dtype([(name, self.byte_order + code) for name, code in element.columns.items()])
 
     def size_of(self, elements: tuple[PlyElement, ...]) -> int:
-        """Bytes of binary tables without lists."""
+        """Return the bytes of binary tables without lists."""
         return sum(element.count * self.row_dtype(element).itemsize for element in elements)
 
     def surplus_problems(self) -> tuple[str, ...]:
-        """A sentence where bytes follow the last row announced; in ascii, or after lists, that
-        cannot be known.
+        """Return a sentence if bytes follow the last announced row.
+
+        In ascii, and after lists, this cannot be known.
         """
         if self.byte_order == "ascii" or any(element.lists for element in self.elements):
             return ()
@@ -103,7 +112,9 @@ def read_ply_header(path: str | Path) -> PlyHeader:
     with path.open("rb") as file:
         lines = _header_lines(file, path)
         offset = file.tell()
-    byte_order, elements, comments = None, [], []
+    byte_order = None
+    elements = []
+    comments = []
     for number, line in enumerate(lines, start=2):
         match line.split():
             case []:
@@ -112,7 +123,7 @@ def read_ply_header(path: str | Path) -> PlyHeader:
                 comments.append(line.partition(" ")[2].strip())
             case ["format", kind, _] if kind in _BYTE_ORDERS:
                 byte_order = _BYTE_ORDERS[kind]
-            case ["element", name, count] if _COUNT.fullmatch(count):
+            case ["element", name, count] if _COUNT_PATTERN.fullmatch(count):
                 elements.append(PlyElement(name, int(count)))
             case ["property", *kind, name] if elements and _is_type(kind):
                 last = elements[-1]
@@ -139,11 +150,13 @@ def read_ply_header(path: str | Path) -> PlyHeader:
 
 
 def _is_type(words: list[str]) -> bool:
+    """Return True for the words of a scalar or list type."""
     types = words[1:] if len(words) == 3 and words[0] == "list" else words
     return len(types) in (1, 2) and len(words) != 2 and all(word in _TYPES for word in types)
 
 
 def _header_lines(file: BinaryIO, path: Path) -> list[str]:
+    """Read the lines between `ply` and `end_header`."""
     if file.readline(8).rstrip(b"\r\n") != b"ply":
         raise SceneError(f"{path}: not a .ply file: expected 'ply' as its first line")
     lines: list[str] = []
@@ -162,13 +175,14 @@ def _header_lines(file: BinaryIO, path: Path) -> list[str]:
 
 
 def iterate_rows(header: PlyHeader, name: str) -> Iterator[np.ndarray]:
-    """Structured arrays of at most ROWS_PER_CHUNK rows of one element, in order. Ascii values
-    arrive as float64, binary ones in the file's own types.
+    """Yield the rows of one element in order, as structured arrays of at most ROWS_PER_CHUNK rows.
+
+    Values of ascii files are float64, values of binary files have the file's own types.
     """
     element = header.element(name)
-    before = header.elements[: header.elements.index(element)]
+    earlier_elements = header.elements[: header.elements.index(element)]
     is_ascii = header.byte_order == "ascii"
-    for other in (*before, element):
+    for other in (*earlier_elements, element):
         if other.lists and (other is element or not is_ascii):
             raise SceneError(
                 f"{header.path}: cannot read element {name!r}: element {other.name!r} has list "
@@ -177,21 +191,25 @@ def iterate_rows(header: PlyHeader, name: str) -> Iterator[np.ndarray]:
             )
     if not element.columns:
         return
-    dtype, width = header.row_dtype(element), len(element.columns)
-    skipped = 0 if is_ascii else header.size_of(before)
-    available = header.path.stat().st_size - header.body_offset - skipped
-    # Of text, a digit and a separator a value are the least.
-    row_bytes, there = (2 * width, available + 1) if is_ascii else (dtype.itemsize, available)
-    if element.count * row_bytes > there:
+    dtype = header.row_dtype(element)
+    width = len(element.columns)
+    num_skipped_bytes = 0 if is_ascii else header.size_of(earlier_elements)
+    body_bytes = header.path.stat().st_size - header.body_offset - num_skipped_bytes
+    # A value in text takes at least two bytes: a digit and a separator.
+    row_bytes, available_bytes = (
+        (2 * width, body_bytes + 1) if is_ascii else (dtype.itemsize, body_bytes)
+    )
+    if element.count * row_bytes > available_bytes:
         raise SceneError(
             f"{header.path}: the header announces {element.count} rows of {name!r}, at least "
-            f"{row_bytes} bytes each, but the file ends after {max(0, there) // row_bytes} of "
+            f"{row_bytes} bytes each, but the file ends after "
+            f"{max(0, available_bytes) // row_bytes} of "
             "them; it is truncated or its header is wrong: copy or export it again"
         )
     with header.path.open("rb") as file:
-        file.seek(header.body_offset + skipped)
+        file.seek(header.body_offset + num_skipped_bytes)
         if is_ascii:
-            for _ in itertools.islice(file, sum(other.count for other in before)):
+            for _ in itertools.islice(file, sum(other.count for other in earlier_elements)):
                 pass
         for start in range(0, element.count, ROWS_PER_CHUNK):
             count = min(ROWS_PER_CHUNK, element.count - start)
@@ -208,15 +226,23 @@ def iterate_rows(header: PlyHeader, name: str) -> Iterator[np.ndarray]:
 
 
 def _parse_rows(file: BinaryIO, count: int, dtype: np.dtype, where: str, start: int) -> np.ndarray:
-    """The rows of `count` lines of text, fewer at the file's end. start: number of the first."""
+    """Parse `count` lines of text, or fewer at the file's end.
+
+    Args:
+        file: the file, at the first line.
+        count: how many lines to read.
+        dtype: the type of a row.
+        where: file and element, for messages.
+        start: number of the first row, for messages.
+    """
     lines = [line for _ in range(count) if (line := file.readline(_MAX_LINE_BYTES))]
     width = len(dtype.names or ())
     for number, line in enumerate(lines, start):
-        found = len(line.split(None, width))
-        if found != width or len(line) == _MAX_LINE_BYTES:
-            got = "more" if found > width else found
+        num_values = len(line.split(None, width))
+        if num_values != width or len(line) == _MAX_LINE_BYTES:
+            num_text = "more" if num_values > width else num_values
             raise SceneError(
-                f"{where}, row {number} must have {width} values (one per property); got {got}"
+                f"{where}, row {number} must have {width} values (one per property); got {num_text}"
             )
     try:
         values = np.loadtxt(lines, np.float64, comments=None, ndmin=2) if lines else np.empty(0)
@@ -226,58 +252,71 @@ def _parse_rows(file: BinaryIO, count: int, dtype: np.dtype, where: str, start: 
     return values.reshape(-1).view(dtype)
 
 
-# ---- Columns of the splat .ply: which there must be, and how they map to Gaussians ---------------
-# Scales are logs, opacities logits, quaternions of any length. f_dc may hold more than one term a
-# channel, as Street Gaussians' actors have; f_dc and f_rest are channel-major (all of red's, then
-# green's, then blue's).
+# ---- Columns of the splat .ply: which are required, and how they map to Gaussians ----------------
+# Scales are logarithms, opacities are logits, and quaternions have any length. f_dc may hold more
+# than one term a channel, as in Street Gaussians' actors. f_dc and f_rest are channel-major: all
+# values of red, then of green, then of blue.
 
-SEMANTIC = "semantic_class"
-_GEOMETRY = ("x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)),
+SEMANTIC = "semantic_class"  # the column of semantic classes
+_GEOMETRY_COLUMNS = ("x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)),
              *(f"rot_{i}" for i in range(4)))  # fmt: skip
-_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-_RGB = {"f_dc_0": "red", "f_dc_1": "green", "f_dc_2": "blue"}
+_DC_COLUMNS = ("f_dc_0", "f_dc_1", "f_dc_2")
+# Columns of 8-bit colour that replace f_dc.
+_RGB_COLUMNS = {"f_dc_0": "red", "f_dc_1": "green", "f_dc_2": "blue"}
 # Beyond these the float32 sigmoid is 0 or 1; a finite logit keeps other readers' sums finite.
-_LOGIT_MIN, _LOGIT_MAX = -110.0, 40.0
+_MIN_LOGIT = -110.0
+_MAX_LOGIT = 40.0
 
 
 def read_columns(
     header: PlyHeader, table: PlyElement, *, has_terms: bool = False
 ) -> dict[str, np.ndarray]:
-    """The columns of Gaussians as they stand in the file, gathered into contiguous arrays. means
-    [N, 3] (float64 where the file is wider than float32), quats [N, 4], scales [N, 3] (log),
-    opacities [N] (logit), sh [N, K, 3], semantic_class [N] where the file has it, and where
-    has_terms says that f_dc may hold them, terms [N, F - 1, 3] beyond the first.
+    """Read the columns of Gaussians as stored, gathered into contiguous arrays.
+
+    Args:
+        header: the file's header.
+        table: its element of Gaussians.
+        has_terms: whether f_dc may hold more than one term a channel.
+
+    Returns:
+        means [N, 3] (float64 where the file is wider than float32), quats [N, 4], scales [N, 3]
+        (logarithms), opacities [N] (logits), sh [N, K, 3], semantic_class [N] if the file has it,
+        and with has_terms the terms [N, F - 1, 3] beyond the first.
     """
     terms, bands = _check_columns(header, table, has_terms=has_terms)
     pieces = iterate_rows(header, table.name)
-    first = next(pieces, None)  # only now is the file known to be as long as its header says
+    first_piece = next(pieces, None)  # checks the file's length before arrays are allocated
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (1 + bands, 3)}
     types: dict[str, type] = {"means": np.float64 if _has_wide_means(header, table) else np.float32}
     if has_terms:
         shapes["terms"] = (terms - 1, 3)
     if SEMANTIC in table.columns:
-        shapes[SEMANTIC], types[SEMANTIC] = (), np.int16
+        shapes[SEMANTIC] = ()
+        types[SEMANTIC] = np.int16
     arrays = {n: np.empty((table.count, *s), types.get(n, np.float32)) for n, s in shapes.items()}
-    places, done = _columns_of(arrays), 0
-    for rows in () if first is None else itertools.chain([first], pieces):
+    destinations = _columns_of(arrays)
+    num_read = 0
+    for rows in () if first_piece is None else itertools.chain([first_piece], pieces):
         with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond float32 are infinite
-            for name, place in places.items():
+            for name, destination in destinations.items():
                 if name in table.columns:
                     values = rows[name]
                 else:
-                    values = (rows[_RGB[name]] / 255.0 - 0.5) / SH_C0
-                place[done : done + len(rows)] = values
-        done += len(rows)
+                    values = (rows[_RGB_COLUMNS[name]] / 255.0 - 0.5) / SH_C0
+                destination[num_read : num_read + len(rows)] = values
+        num_read += len(rows)
     return arrays
 
 
 def _columns_of(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Views of the arrays of `read_columns`, by the file's columns in INRIA's order."""
-    sh, terms = arrays["sh"], arrays.get("terms", np.empty((len(arrays["sh"]), 0, 3)))
+    """Return views of the arrays of `read_columns`, by the file's columns in INRIA's order."""
+    sh = arrays["sh"]
+    terms = arrays.get("terms", np.empty((len(arrays["sh"]), 0, 3)))
     columns = {axis: arrays["means"][:, i] for i, axis in enumerate("xyz")}
-    dc, bands = 1 + terms.shape[1], sh.shape[1] - 1
-    for number in range(3 * dc):
-        channel, term = divmod(number, dc)
+    num_terms = 1 + terms.shape[1]
+    bands = sh.shape[1] - 1
+    for number in range(3 * num_terms):
+        channel, term = divmod(number, num_terms)
         columns[f"f_dc_{number}"] = terms[:, term - 1, channel] if term else sh[:, 0, channel]
     for number in range(3 * bands):
         columns[f"f_rest_{number}"] = sh[:, 1 + number % bands, number // bands]
@@ -288,27 +327,30 @@ def _columns_of(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _check_columns(header: PlyHeader, table: PlyElement, *, has_terms: bool) -> tuple[int, int]:
-    """Colour terms and SH bands a channel, once the columns are known to be those of Gaussians."""
-    where, names = f"{header.path}, {table.name}", set(table.columns)
-    missing = [name for name in _GEOMETRY if name not in names]
-    if has_terms or not names.issuperset(_RGB.values()):
-        missing += [name for name in _DC[: 1 if has_terms else 3] if name not in names]
-    if missing:
+    """Check that the columns are those of Gaussians; return colour terms and SH bands a channel."""
+    where = f"{header.path}, {table.name}"
+    names = set(table.columns)
+    missing_names = [name for name in _GEOMETRY_COLUMNS if name not in names]
+    if has_terms or not names.issuperset(_RGB_COLUMNS.values()):
+        missing_names += [
+            name for name in _DC_COLUMNS[: 1 if has_terms else 3] if name not in names
+        ]
+    if missing_names:
         raise SceneError(
             f"{header.path}: not a Gaussian splat .ply: its element {table.name!r} misses "
-            f"{', '.join(missing)}; it has {', '.join(table.columns) or 'no properties'}. "
+            f"{', '.join(missing_names)}; it has {', '.join(table.columns) or 'no properties'}. "
             + _guess_content(header, names)
         )
     counts = {}
     for prefix in ("f_dc_", "f_rest_"):
-        found = [name for name in table.columns if name.startswith(prefix)]
-        counts[prefix] = len(found) // 3
+        prefix_columns = [name for name in table.columns if name.startswith(prefix)]
+        counts[prefix] = len(prefix_columns) // 3
         is_read = has_terms or prefix == "f_rest_"
-        are_all = set(found) == {f"{prefix}{i}" for i in range(len(found))}
-        if is_read and (len(found) % 3 or not are_all):
+        is_numbered = set(prefix_columns) == {f"{prefix}{i}" for i in range(len(prefix_columns))}
+        if is_read and (len(prefix_columns) % 3 or not is_numbered):
             raise SceneError(
                 f"{where}: {prefix}0, {prefix}1, … must be a multiple of 3 in number (a channel's "
-                f"values after the other's) and numbered without gaps; got {len(found)}"
+                f"values after the other's) and numbered without gaps; got {len(prefix_columns)}"
             )
     if 1 + counts["f_rest_"] not in SH_COUNTS:
         raise SceneError(
@@ -319,12 +361,13 @@ def _check_columns(header: PlyHeader, table: PlyElement, *, has_terms: bool) -> 
 
 
 def _has_wide_means(header: PlyHeader, table: PlyElement) -> bool:
-    """Whether coordinates come with more digits than float32 holds."""
-    wide = ("f8", "i4", "u4")
-    return header.byte_order == "ascii" or any(table.columns[axis] in wide for axis in "xyz")
+    """Return True if coordinates have more digits than float32 holds."""
+    wide_types = ("f8", "i4", "u4")
+    return header.byte_order == "ascii" or any(table.columns[axis] in wide_types for axis in "xyz")
 
 
 def _guess_content(header: PlyHeader, names: set[str]) -> str:
+    """Return a sentence about a .ply without the columns of Gaussians."""
     if "packed_position" in names:
         return "This is SuperSplat's compressed layout: export it as uncompressed .ply."
     if any(e.name in ("face", "tristrips") for e in header.elements):
@@ -338,8 +381,10 @@ def _guess_content(header: PlyHeader, names: set[str]) -> str:
 
 _USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb", ".gltf", *_USD_SUFFIXES)
-RECENTRE_BEYOND_M = 1000.0  # float32 keeps 0.06 mm at 1 km; 0.25 m at UTM's 4000 km
-_FAR_M = 1e15  # beyond, float64 has no decimetres
+# Distance from zero, metres, from which coordinates are recentred: float32 resolves 0.06 mm at
+# 1 km, and 0.25 m at UTM's 4000 km.
+RECENTRE_BEYOND_M = 1000.0
+_MAX_COORDINATE_M = 1e15  # beyond, float64 has no decimetres
 _SPLAT_RECORD = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)]
 )
@@ -349,31 +394,33 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class SplatFile:
-    """What a splat file held. gaussians: in the file's axes and unit. origin: float64 [3], what was
-    subtracted from its coordinates (not zero only for double-precision .ply far from the origin).
-    notes: the `key: value` comments of a .ply. problems: what was left out, a sentence each.
-    """
+    """The content of a splat file."""
 
-    gaussians: Gaussians
+    gaussians: Gaussians  # in the file's axes and unit
+    # float64 [3]: subtracted from the file's coordinates; zero except for double-precision .ply
+    # files far from the origin.
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    # The `key: value` comments of a .ply, and the same facts of other formats.
     notes: Mapping[str, str] = field(default_factory=dict)
-    problems: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()  # one sentence about each thing that was left out
 
 
 def read_splats(
     path: str | Path, *, activated: bool | None = None, level: int | None = None
 ) -> SplatFile:
-    """Read a .ply, .splat, .spz, .sog, glTF or USD file, told apart by its first bytes, the
+    """Read a splat file of any format that is supported.
+
+    Formats are recognised by the first bytes (.ply, .spz, .sog, glTF), the name (.splat, .usd), the
     meta.json of a SOG folder, or the lod-meta.json of a streamed one.
 
     Args:
         path: the file.
-        activated: of a .ply alone, as of `read_ply`.
-        level: of a lod-meta.json alone, the level of detail; 0, the finest, by default.
+        activated: for a .ply only, as in `read_ply`.
+        level: for a lod-meta.json only, the level of detail; 0, the finest, by default.
 
     Raises:
-        SceneError: no such file, an unknown format, damaged content, or Gaussians that need more
-            memory than there is; says what was expected.
+        SceneError: the file does not exist, has an unknown format or damaged content, or its
+            Gaussians need more memory than there is; the message says what was expected.
     """
     path = Path(path)
     try:
@@ -387,7 +434,8 @@ def read_splats(
 def _reader_of(
     path: Path, activated: bool | None, level: int | None
 ) -> Callable[[Path], SplatFile]:
-    from augment.files.gltf import GLB, read_gltf  # which take this module's records
+    """Return the function that reads a file."""
+    from augment.files.gltf import GLB, read_gltf  # imported here: they import this module
     from augment.files.sog import META, ZIP, read_sog
     from augment.files.spz import GZIP, read_spz, refuse_bare_spz
     from augment.files.streamed_sog import LOD_META, read_streamed_sog
@@ -429,32 +477,37 @@ def _reader_of(
 def read_ply(
     path: str | Path, element: str = "vertex", *, activated: bool | None = None
 ) -> SplatFile:
-    """Read Gaussians from one element of a .ply, binary of either byte order or ascii. Properties
-    may stand in any order; unknown ones are ignored. `red green blue` (uint8) serve as colour where
-    f_dc is missing. Reads in pieces: peak memory is the Gaussians plus a few MB.
+    """Read Gaussians from one element of a .ply, binary of either byte order or ascii.
+
+    Properties may have any order; unknown ones are ignored. `red green blue` (uint8) serve as
+    colour where f_dc is missing. The file is read in pieces: peak memory is the Gaussians plus a
+    few MB.
 
     Args:
         path: the file.
         element: the name of the table of Gaussians.
         activated: True where the file stores opacities from 0 to 1 and scales as lengths, False
-            where it stores logits and logarithms, as trainers do. None: the latter, unless the
-            numbers look like the former.
+            where it stores logits and logarithms, as trainers do. None: logits and logarithms,
+            unless the numbers look like opacities and lengths; then an error asks which they are.
 
     Raises:
-        SceneError: not a splat .ply (lists what is missing), truncated, empty, wrong f_rest count,
-            or values that look activated while nobody says whether they are.
+        SceneError: the file is no splat .ply (the message lists missing columns), is truncated or
+            empty, has a wrong count of f_rest, or holds values that look activated while
+            `activated` is None.
     """
     header = read_ply_header(path)
     table = header.element(element)
     columns = read_columns(header, table)
     if table.count == 0:
         raise SceneError(f"{header.path}: its {element!r} element has 0 rows; nothing to render")
-    means, origin = columns["means"], np.zeros(3)
+    means = columns["means"]
+    origin = np.zeros(3)
     if means.dtype == np.float64:
         origin = recentring_origin(means)
-        with np.errstate(over="ignore"):  # what overflows is left out as infinite, and reported
+        with np.errstate(over="ignore"):  # infinite values are left out later, and reported
             means = (means - origin).astype(np.float32)
-    scales, opacities = torch.from_numpy(columns["scales"]), torch.from_numpy(columns["opacities"])
+    scales = torch.from_numpy(columns["scales"])
+    opacities = torch.from_numpy(columns["opacities"])
     if activated is None and _looks_activated(scales, opacities):
         raise SceneError(
             f"{header.path}: all its opacities lie from {float(opacities.min()):.3g} to "
@@ -464,7 +517,8 @@ def read_ply(
             f"them as they stand, ?activated=false as logits and logarithms"
         )
     if not activated:
-        scales, opacities = scales.exp_(), opacities.sigmoid_()
+        scales = scales.exp_()
+        opacities = opacities.sigmoid_()
     semantic = columns.get(SEMANTIC)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
@@ -481,8 +535,10 @@ def read_ply(
 
 
 def _looks_activated(scales: Tensor, opacities: Tensor) -> bool:
-    """Whether every opacity is a fraction and every scale a length. Logits of trained scenes reach
-    from below 0 to above 1, and logarithms of scales are negative below one unit.
+    """Return True if every opacity is a fraction and every scale a length.
+
+    Logits of trained scenes reach from below 0 to above 1, and logarithms of scales are negative
+    below one unit.
     """
     is_fraction = bool(((opacities >= 0) & (opacities <= 1)).all())
     return is_fraction and bool((scales > 0).all())
@@ -499,18 +555,19 @@ def read_splat(path: str | Path) -> SplatFile:
         )
     records = np.fromfile(path, dtype=_SPLAT_RECORD)
     rgba = torch.from_numpy(np.ascontiguousarray(records["rgba"])).float() / 255
-    bytes_of_quat = torch.from_numpy(np.ascontiguousarray(records["quat"])).float()
-    raw = Gaussians(
+    quat_bytes = torch.from_numpy(np.ascontiguousarray(records["quat"])).float()
+    all_gaussians = Gaussians(
         means=torch.from_numpy(np.ascontiguousarray(records["mean"])),
-        quats=(bytes_of_quat - 128) / 128,
+        quats=(quat_bytes - 128) / 128,
         scales=torch.from_numpy(np.ascontiguousarray(records["scale"])),
         opacities=rgba[:, 3].contiguous(),
         sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None],
     )
-    gaussians, problems = check_gaussians(raw, where=str(path))
-    if len(gaussians) * 2 < len(raw):
+    gaussians, problems = check_gaussians(all_gaussians, where=str(path))
+    if len(gaussians) * 2 < len(all_gaussians):
         raise SceneError(
-            f"{path}: only {len(gaussians)} of {len(raw)} records hold usable numbers, so this is "
+            f"{path}: only {len(gaussians)} of {len(all_gaussians)} records hold usable numbers, "
+            "so this is "
             "probably no .splat file. " + " ".join(problems)
         )
     return SplatFile(gaussians, problems=problems)
@@ -519,9 +576,14 @@ def read_splat(path: str | Path) -> SplatFile:
 def write_ply(
     path: str | Path, gaussians: Gaussians, *, notes: Mapping[str, str] | None = None
 ) -> None:
-    """Write an INRIA .ply (binary little endian), atomically; normals are 0. notes: written as
-    `comment key: value` lines and given back by `read_ply`. A `semantic_class` column is added
-    where the Gaussians have classes; other readers ignore it.
+    """Write an INRIA .ply (binary little endian), atomically; normals are 0.
+
+    A `semantic_class` column is added if the Gaussians have classes; other readers ignore it.
+
+    Args:
+        path: the file.
+        gaussians: the Gaussians.
+        notes: facts that are written as `comment key: value` lines; `read_ply` returns them.
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     for key, value in (notes or {}).items():
@@ -544,9 +606,9 @@ def write_ply(
 
 
 def _file_columns(part: Gaussians) -> dict[str, np.ndarray]:
-    """Columns of Gaussians by the names of a .ply, activations inverted."""
+    """Return columns of Gaussians by the names of a .ply, activations inverted."""
     opacities = part.opacities.double()
-    logits = (opacities.log() - torch.log1p(-opacities)).clamp(_LOGIT_MIN, _LOGIT_MAX)
+    logits = (opacities.log() - torch.log1p(-opacities)).clamp(_MIN_LOGIT, _MAX_LOGIT)
     tensors = {"means": part.means, "quats": part.quats, "sh": part.sh, "opacities": logits}
     tensors["scales"] = part.scales.double().log()
     if part.semantic is not None:
@@ -555,8 +617,10 @@ def _file_columns(part: Gaussians) -> dict[str, np.ndarray]:
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> None:
-    """Write a .splat file, atomically. The format keeps 8 bits of colour, opacity and rotation. SH
-    bands above degree 0 cannot be kept; that they are dropped is logged as a warning.
+    """Write a .splat file, atomically.
+
+    The format stores 8 bits of colour, opacity and rotation. It has no SH bands above degree 0;
+    a warning is logged when they are dropped.
     """
     if gaussians.sh_degree > 0:
         _log.warning("%s: .splat holds no view dependence; SH bands above 0 are dropped", path)
@@ -573,13 +637,15 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def recentring_origin(points: Float[np.ndarray, "N 3"]) -> np.ndarray:
-    """Whole-metre origin to subtract from coordinates, float64 [3]: the median of the points within
-    _FAR_M where it lies more than RECENTRE_BEYOND_M from zero, else zero.
+    """Return the whole-metre origin to subtract from coordinates, float64 [3].
+
+    It is the median of the points within _MAX_COORDINATE_M if that lies more than RECENTRE_BEYOND_M
+    from zero; else zero.
     """
-    finite = points[(np.abs(points) < _FAR_M).all(1)]  # which NaN is not either
-    if len(finite) == 0:
+    usable_points = points[(np.abs(points) < _MAX_COORDINATE_M).all(1)]  # False for NaN, too
+    if len(usable_points) == 0:
         return np.zeros(3)
-    median = np.median(finite, axis=0).astype(np.float64)
+    median = np.median(usable_points, axis=0).astype(np.float64)
     return np.round(median) if np.linalg.norm(median) > RECENTRE_BEYOND_M else np.zeros(3)
 
 
@@ -589,22 +655,30 @@ def join_placed(
     notes: Mapping[str, str],
     problems: Sequence[str],
 ) -> SplatFile:
-    """What a file of several parts holds. parts: of each the places of its Gaussians in the file's
-    axes, float64 [N, 3], and all else of them; their own means do not count. Raises SceneError: no
-    Gaussian can be drawn.
+    """Join the parts of a file into one set of Gaussians.
+
+    Args:
+        parts: for each part the positions of its Gaussians in the file's axes, float64 [N, 3], and
+            its Gaussians, whose own means are ignored.
+        path: the file, for messages.
+        notes: the notes of the result.
+        problems: the problems found so far.
+
+    Raises:
+        SceneError: no Gaussian can be rendered.
     """
     means = np.concatenate([places for places, _ in parts])
     origin = recentring_origin(means)
     bands = max(part.sh.shape[1] for _, part in parts)
     sh = [torch.nn.functional.pad(p.sh, (0, 0, 0, bands - p.sh.shape[1])) for _, p in parts]
-    with np.errstate(over="ignore"):  # what overflows is left out as infinite, and reported
-        near = (means - origin).astype(np.float32)
-    raw = Gaussians(
-        means=torch.from_numpy(near),
+    with np.errstate(over="ignore"):  # infinite values are left out later, and reported
+        means_f32 = (means - origin).astype(np.float32)
+    all_gaussians = Gaussians(
+        means=torch.from_numpy(means_f32),
         quats=torch.cat([part.quats for _, part in parts]),
         scales=torch.cat([part.scales for _, part in parts]),
         opacities=torch.cat([part.opacities for _, part in parts]),
         sh=torch.cat(sh),
     )
-    gaussians, left_out = check_gaussians(raw, where=str(path))
-    return SplatFile(gaussians, origin, notes, (*problems, *left_out))
+    gaussians, new_problems = check_gaussians(all_gaussians, where=str(path))
+    return SplatFile(gaussians, origin, notes, (*problems, *new_problems))

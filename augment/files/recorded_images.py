@@ -1,7 +1,8 @@
-"""Recorded images read at the size of a camera, from files that may be missing or damaged.
+"""Reads recorded images at the size of a camera, from files that may be missing or damaged.
 
-Pixels are read as they are stored: poses and intrinsics are of these, so no image is turned as its
-EXIF orientation asks for.
+Datasets, base photos and training read images through this module. Pixels are read as they are
+stored: poses and intrinsics belong to the stored image, so no image is rotated as its EXIF
+orientation asks for.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from augment.cameras import Camera
 from augment.files.image_size import ImageHeader, read_image_header
 from recipes.files import open_file
 
-_MAX_BYTES = 1 << 30  # of a file
-# JPEG decoders can leave out the finest parts of each 8x8 block, which costs far less.
-_REDUCED = {
+_MAX_BYTES = 1 << 30  # bytes of an image file that are read
+# OpenCV's flags by the factor of reduction. JPEG decoders can leave out the finest parts of each
+# 8x8 block, which costs far less.
+_REDUCED_FLAGS = {
     8: cv2.IMREAD_REDUCED_COLOR_8,
     4: cv2.IMREAD_REDUCED_COLOR_4,
     2: cv2.IMREAD_REDUCED_COLOR_2,
@@ -26,22 +28,23 @@ _REDUCED = {
 }
 
 
-_LARGEST_OF_12_BITS = (1 << 12) - 1
+_MAX_12_BIT_VALUE = (1 << 12) - 1  # the largest number of 12 bits
+# The fault of an image whose values fit into 12 bits.
 TWELVE_BITS = (
-    f"has 16 bits a channel and no value above {_LARGEST_OF_12_BITS} of 65535, as files of a "
+    f"has 16 bits a channel and no value above {_MAX_12_BIT_VALUE} of 65535, as files of a "
     "sensor's 12 bits; it would be black: store 8 bits, or multiply its values by 16"
 )
 
 
 def decode_pixels(data: bytes | np.ndarray, flags: int) -> np.ndarray | None:
-    """The pixels of an image file's content as they are stored, whatever EXIF says of turning them.
+    """Return the pixels of an image file's content as they are stored; EXIF rotates nothing.
 
     Args:
         data: the file's bytes.
-        flags: of cv2.imdecode.
+        flags: flags of cv2.imdecode.
 
     Returns:
-        As of cv2.imdecode; None where the content cannot be decoded.
+        The array of cv2.imdecode; None where the content cannot be decoded.
     """
     data = np.frombuffer(data, np.uint8)
     try:
@@ -51,22 +54,22 @@ def decode_pixels(data: bytes | np.ndarray, flags: int) -> np.ndarray | None:
 
 
 def has_12_bits(data: bytes | np.ndarray) -> bool:
-    """True for the content of an image file of 16 bits a channel whose values fit into 12.
+    """Return True for an image file of 16 bits a channel whose values fit into 12.
 
     Such an image holds a sensor's own numbers and would be shown at a sixteenth of its brightness.
     """
     values = decode_pixels(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if values is None or values.dtype != np.uint16:
         return False
-    return int(values.max()) <= _LARGEST_OF_12_BITS
+    return int(values.max()) <= _MAX_12_BIT_VALUE
 
 
 def decode_image(path: Path, flags: int) -> np.ndarray | None:
-    """The stored pixels of an image file, see `decode_pixels`; None where it cannot be read.
+    """Return the stored pixels of an image file, see `decode_pixels`; None if it cannot be read.
 
     Only regular files are read: a pipe would keep the program waiting.
     """
-    if _unpacked(path):
+    if _unpack_fault(path):
         return None
     try:
         with open_file(path) as file:
@@ -76,16 +79,16 @@ def decode_image(path: Path, flags: int) -> np.ndarray | None:
 
 
 def has_image(path: Path) -> bool:
-    """Whether the image is there, or can be had from a table (see packed_images)."""
+    """Return True if the image exists, or can be written from a table (see packed_images)."""
     if path.is_file():
         return True
-    from augment.files.packed_images import is_packed  # pyarrow would be loaded with it
+    from augment.files.packed_images import is_packed  # imported here: it loads pyarrow
 
     return is_packed(path)
 
 
-def _unpacked(path: Path) -> str:
-    """Have the image written if it is missing and a table has it; what is wrong with it there."""
+def _unpack_fault(path: Path) -> str:
+    """Write the image if it is missing and a table has it; return what is wrong with it there."""
     if os.path.lexists(path):
         return ""
     from augment.files.packed_images import unpack_image
@@ -94,16 +97,17 @@ def _unpacked(path: Path) -> str:
 
 
 class ImageFault(Exception):
-    """What is wrong with an image file, as the end of a sentence that starts with its path."""
+    """A fault of an image file. Its text is the end of a sentence that starts with the path."""
 
 
 def is_whole_jpeg(path: Path) -> bool:
-    """Whether the file is a JPEG by its ends; no other kind is looked at further.
+    """Return True for a JPEG with both its ends, False for any other kind of file.
 
     Raises:
-        ImageFault: missing, unreadable, or a JPEG that is cut short: decoders fill that with grey.
+        ImageFault: the file is missing, unreadable, or a JPEG that is cut short: decoders would
+            fill the missing part with grey.
     """
-    if fault := _unpacked(path):
+    if fault := _unpack_fault(path):
         raise ImageFault(fault)
     try:
         with open_file(path) as file:
@@ -121,28 +125,34 @@ def is_whole_jpeg(path: Path) -> bool:
 
 
 def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
-    """The image of camera `full` at the size of camera `scaled`: RGB uint8 [H, W, 3].
+    """Read the image of camera `full` at the size of camera `scaled`.
 
-    Each pixel is the mean of the area it covers. Files may be any kind that OpenCV decodes; their
-    size may differ from the camera's by less than the reduction of the decoder (8 pixels at most).
+    Each pixel is the mean of the area it covers. Files may be of any kind that OpenCV decodes.
+    Their size may differ from the camera's by less than the reduction of the decoder (8 pixels at
+    most).
+
+    Returns:
+        RGB, uint8 [H, W, 3].
 
     Raises:
-        ImageFault: missing, cut short, not decodable, or not of the camera's size."""
+        ImageFault: the image is missing, cut short, not decodable, or not of the camera's size.
+    """
     is_jpeg = is_whole_jpeg(path)
     if fault := twelve_bits_fault(path):
         raise ImageFault(fault)
     step = 1
     while is_jpeg and step < 8 and _can_be_reduced(full, scaled, 2 * step):
         step *= 2
-    image = decode_image(path, _REDUCED[step])
+    image = decode_image(path, _REDUCED_FLAGS[step])
     if image is None:
         raise ImageFault("cannot be decoded")
     size = (-(-full.height // step), -(-full.width // step))
     if image.shape[:2] != size:
-        height, width = image.shape[0] * step, image.shape[1] * step
-        about = "about " if step > 1 else ""
+        height = image.shape[0] * step
+        width = image.shape[1] * step
+        qualifier = "about " if step > 1 else ""
         raise ImageFault(
-            f"is of {about}{width}x{height} pixels; its camera is of {full.width}x{full.height}"
+            f"is of {qualifier}{width}x{height} pixels; its camera is of {full.width}x{full.height}"
             f"{exif_hint(read_image_header(path), (full.width, full.height))}"
         )
     if (scaled.height, scaled.width) != size:
@@ -151,7 +161,7 @@ def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
 
 
 def twelve_bits_fault(path: Path) -> str:
-    """What is wrong with an image file of 16 bits a channel that holds 12, else nothing."""
+    """Return the fault of an image file of 16 bits a channel that holds 12; "" without."""
     header = read_image_header(path)
     if header is None or header.bits != 16:
         return ""
@@ -160,8 +170,9 @@ def twelve_bits_fault(path: Path) -> str:
 
 
 def exif_hint(header: ImageHeader | None, expected: tuple[int, int]) -> str:
-    """The end of a sentence on an image that is not of the expected width and height: EXIF, where
-    the image would be of them if it were turned; else nothing.
+    """Return the end of a sentence about an image that lacks the expected width and height.
+
+    The hint names EXIF's orientation if the image would fit after its rotation; else it is empty.
     """
     if header is None or header.size == expected or header.turned_size != expected:
         return ""
@@ -172,7 +183,11 @@ def exif_hint(header: ImageHeader | None, expected: tuple[int, int]) -> str:
 
 
 def _can_be_reduced(full: Camera, scaled: Camera, step: int) -> bool:
-    """Whether 1/step of the size is not below the size asked for, and divides both sides: an odd
-    remainder would shift pixels."""
-    divides = full.width % step == 0 and full.height % step == 0
-    return divides and full.width // step >= scaled.width and full.height // step >= scaled.height
+    """Return True if 1/step of the size is large enough, and step divides both sides.
+
+    An odd remainder would shift pixels.
+    """
+    is_divisor = full.width % step == 0 and full.height % step == 0
+    return (
+        is_divisor and full.width // step >= scaled.width and full.height // step >= scaled.height
+    )

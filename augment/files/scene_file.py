@@ -1,16 +1,16 @@
-"""Scenes in files of our own, opened in an instant: a folder, or a single file to share.
+"""Reads and writes scenes in files of our own format: a folder, or a single file to share.
 
 A folder holds
 
-    scene.json              what it is, cameras over time, tracks, colour maps (scene_document)
+    scene.json              facts, cameras over time, tracks, colour maps (scene_document)
     gaussians.safetensors   background.means, ..., actors.0.means, ... (scene_tensors)
     sky.safetensors         rgb, image or faces
 
 and NAME.climategs is one safetensors file with the arrays of both (the sky's as sky.rgb, ...) and
 the metadata `format`, `version` and `document`, the text of scene.json.
 
-Arrays hold activated values, as `Gaussians` does, and are mapped into memory, so that opening costs
-no copy; every number is looked at once, since the files may come from anywhere.
+Arrays hold activated values, as `Gaussians` does, and are mapped into memory, so that a scene opens
+in an instant without a copy. Every number is checked once, since the files may come from anywhere.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from recipes.files import open_file
 
-# ---- The arrays of a saved scene: their names, their shapes, and that every number can be drawn --
+# ---- The arrays of a saved scene: names, shapes, and the check that every number can be rendered -
 #
 #     background.means [n, 3], quats [n, 4], scales [n, 3], opacities [n], sh [n, K, 3]: float32
 #     background.semantic [n]: int16, where classes are known
@@ -70,52 +70,57 @@ from recipes.files import open_file
 #
 # At precision float16, quats, opacities, sh, waves and the sky are float16.
 
+# The name in scene.json of each class of sky.
 SKY_KINDS: dict[type, str] = {ConstantSky: "constant", LatLongSky: "latlong", CubemapSky: "cubemap"}
-MAX_WAVES = 1000  # terms; what is summed for every image must not take for ever
-_SKY_ARRAYS = {"constant": "rgb", "latlong": "image", "cubemap": "faces"}
-_ARRAYS = ("means", "quats", "scales", "opacities", "sh")
-_HALVED = ("quats", "opacities", "sh", "waves")
-_ROWS = {  # None: of any length
+MAX_WAVES = 1000  # terms of colour waves: they are summed for every image
+_SKY_ARRAYS = {"constant": "rgb", "latlong": "image", "cubemap": "faces"}  # the array of each sky
+_ARRAYS = ("means", "quats", "scales", "opacities", "sh")  # arrays of Gaussians
+_HALF_ARRAYS = ("quats", "opacities", "sh", "waves")  # arrays that float16 files store as float16
+_ROW_SHAPES = {  # shape of a row of each array; None stands for any length
     "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (None, 3),
     "waves": (None, 3), "rgb": (), "image": (None, 3), "faces": (None, None, 3),
 }  # fmt: skip
-_FLOAT16_END = 65520  # rounds to infinity
+_MIN_FLOAT16_OVERFLOW = 65520  # the smallest number that float16 rounds to infinity
 
 
 class SavedPart(NamedTuple):
-    """Gaussians, and the coefficients [n, F - 1, 3] of their colour waves where they have some."""
+    """The arrays of the background or of one actor."""
 
     gaussians: Gaussians
-    waves: Tensor | None = None
+    waves: Tensor | None = None  # coefficients [n, F - 1, 3] of the colour waves, if it has any
 
 
 def part_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
-    """The arrays of the scene's Gaussians."""
+    """Return the arrays of the scene's Gaussians.
+
+    Raises:
+        SceneError: the files cannot hold them.
+    """
     arrays = {}
     waves = [None, *(actor.color_waves for actor in scene.actors)]
     for number, gaussians in enumerate(scene.all_gaussians):
-        part = _part_name(number)
+        part_name = _part_name(number)
         tensors = {name: getattr(gaussians, name) for name in _ARRAYS}
-        if (colours := waves[number]) is not None:
-            tensors["waves"] = colours.coefficients
-            if colours.coefficients.shape[1] > MAX_WAVES:
+        if (color_waves := waves[number]) is not None:
+            tensors["waves"] = color_waves.coefficients
+            if color_waves.coefficients.shape[1] > MAX_WAVES:
                 raise SceneError(
-                    f"scene {scene.name!r}: {part} has colour waves of "
-                    f"{colours.coefficients.shape[1]} terms; saved scenes hold {MAX_WAVES}"
+                    f"scene {scene.name!r}: {part_name} has colour waves of "
+                    f"{color_waves.coefficients.shape[1]} terms; saved scenes hold {MAX_WAVES}"
                 )
         for name, values in tensors.items():
-            where = f"scene {scene.name!r}: {part}.{name}"
+            where = f"scene {scene.name!r}: {part_name}.{name}"
             if values.dtype != torch.float32:
                 raise SceneError(f"{where}: saved scenes hold float32; got {values.dtype}")
-            is_halved = precision == "float16" and name in _HALVED
-            arrays[f"{part}.{name}"] = _array(_half(values, where) if is_halved else values)
+            is_halved = precision == "float16" and name in _HALF_ARRAYS
+            arrays[f"{part_name}.{name}"] = _array(_half(values, where) if is_halved else values)
         if gaussians.semantic is not None:
-            arrays[f"{part}.semantic"] = _array(gaussians.semantic)
+            arrays[f"{part_name}.semantic"] = _array(gaussians.semantic)
     return arrays
 
 
 def sky_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
-    """The one array of the scene's sky, whose class is among SKY_KINDS."""
+    """Return the one array of the scene's sky, whose class is among SKY_KINDS."""
     name = _SKY_ARRAYS[SKY_KINDS[type(scene.sky)]]
     values = getattr(scene.sky, name)
     is_halved = precision == "float16"
@@ -125,12 +130,21 @@ def sky_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
 def take_parts(
     tensors: dict[str, Tensor], document: SceneDocument, where: str, *, unread: bool = False
 ) -> tuple[list[SavedPart], list[str]]:
-    """Background and actors, whose arrays are taken out of `tensors`, and what was left out.
-    unread: nobody looks at the background's numbers yet.
+    """Remove the arrays of background and actors from `tensors` and check them.
+
+    Args:
+        tensors: the arrays of the file.
+        document: the scene's document.
+        where: the file, for messages.
+        unread: if True, the background's numbers are not checked yet.
+
+    Returns:
+        The parts, and one sentence about each thing that was left out.
     """
     counts = [document.background_gaussians, *(actor.gaussians for actor in document.actors)]
     has_waves = [False, *(actor.color_waves is not None for actor in document.actors)]
-    parts, problems = [], []
+    parts = []
+    problems = []
     for number, count in enumerate(counts):
         name = _part_name(number)
         is_read = number > 0 or not unread
@@ -140,11 +154,11 @@ def take_parts(
         if not is_read:
             parts.append(part)
             continue
-        waves = part.waves  # one look at each number tells whether every bit can stay as it is
+        waves = part.waves  # one look at each number tells whether all of them are valid
         has_finite_waves = waves is None or bool(np.isfinite(_range(waves)).all())
         if not (has_finite_waves and is_drawable(part.gaussians)):
-            part, found = _drawable(part, f"{where}, {name}")
-            problems += found
+            part, part_problems = _drawable(part, f"{where}, {name}")
+            problems += part_problems
         parts.append(part)
     if tensors:
         raise SceneError(
@@ -154,7 +168,7 @@ def take_parts(
 
 
 def take_sky(tensors: dict[str, Tensor], kind: str, precision: Precision, where: str) -> Sky:
-    """The sky of its one array."""
+    """Return the sky that its one array describes."""
     sky_class = next(cls for cls, name in SKY_KINDS.items() if name == kind)
     name = _SKY_ARRAYS[kind]
     if list(tensors) != [name]:
@@ -171,16 +185,23 @@ def take_sky(tensors: dict[str, Tensor], kind: str, precision: Precision, where:
 
 
 def _part_name(number: int) -> str:
+    """Return the prefix of a part's arrays: part 0 is the background."""
     return "background" if number == 0 else f"actors.{number - 1}"
 
 
 def _array(values: Tensor) -> np.ndarray:
+    """Return a tensor as a contiguous array."""
     return np.ascontiguousarray(values.detach().cpu().numpy())
 
 
 def _half(values: Tensor, where: str) -> Tensor:
+    """Return float16 values.
+
+    Raises:
+        SceneError: a value is too large for float16.
+    """
     low, high = _range(values)
-    if not max(-low, high) < _FLOAT16_END:
+    if not max(-low, high) < _MIN_FLOAT16_OVERFLOW:
         raise SceneError(
             f"{where}: float16 holds numbers up to 65504; got {low} to {high}. Write it at full "
             f"precision"
@@ -192,21 +213,23 @@ def _take_part(
     tensors: dict[str, Tensor], part: str, count: int, precision: Precision, has_waves: bool,
     where: str, *, is_read: bool = True,
 ) -> SavedPart:  # fmt: skip
-    own = {
+    """Remove the arrays of one part from `tensors`; check shapes, types and classes."""
+    columns = {
         name: _take_array(tensors, f"{part}.{name}", name, count, precision, where)
         for name in (*_ARRAYS, *(["waves"] if has_waves else []))
     }
-    if own["sh"].shape[1] not in SH_COUNTS:
-        shape = list(own["sh"].shape)
+    if columns["sh"].shape[1] not in SH_COUNTS:
+        shape = list(columns["sh"].shape)
         raise SceneError(f"{where}: {part}.sh must be [N, K, 3] with K in {SH_COUNTS}; got {shape}")
-    waves = own.pop("waves", None)
+    waves = columns.pop("waves", None)
     if waves is not None and waves.shape[1] > MAX_WAVES:
         raise SceneError(
             f"{where}: {part}.waves must have at most {MAX_WAVES} terms; got {waves.shape[1]}"
         )
     if precision == "float16":
-        own["quats"] = torch.nn.functional.normalize(own["quats"], dim=1)
-    semantic, name = None, f"{part}.semantic"
+        columns["quats"] = torch.nn.functional.normalize(columns["quats"], dim=1)
+    semantic = None
+    name = f"{part}.semantic"
     if name in tensors:
         semantic = tensor(tensors, name, (count,), where, dtype=torch.int16, error=SceneError)
         del tensors[name]
@@ -216,37 +239,46 @@ def _take_part(
                 f"{where}: {name} must hold classes from {min(SemanticClass):d} to "
                 f"{max(SemanticClass):d}; got {low:.0f} to {high:.0f}"
             )
-    return SavedPart(Gaussians(**own, semantic=semantic), waves)
+    return SavedPart(Gaussians(**columns, semantic=semantic), waves)
 
 
 def _take_array(
     tensors: dict[str, Tensor], name: str, kind: str, count: int | None, precision: Precision,
     where: str,
 ) -> Tensor:  # fmt: skip
-    """An array of `count` rows of a kind in _ROWS, checked and taken out of the file's."""
-    is_halved = precision == "float16" and (kind in _HALVED or kind in _SKY_ARRAYS.values())
+    """Remove an array of `count` rows from `tensors` and check it.
+
+    Args:
+        kind: the array's name in _ROW_SHAPES.
+    """
+    is_halved = precision == "float16" and (kind in _HALF_ARRAYS or kind in _SKY_ARRAYS.values())
     dtype = torch.float16 if is_halved else torch.float32
-    found = tensor(tensors, name, (count, *_ROWS[kind]), where, dtype=dtype, error=SceneError)
+    values = tensor(
+        tensors, name, (count, *_ROW_SHAPES[kind]), where, dtype=dtype, error=SceneError
+    )
     del tensors[name]
-    return found.float() if is_halved else found
+    return values.float() if is_halved else values
 
 
 def _drawable(part: SavedPart, where: str) -> tuple[SavedPart, tuple[str, ...]]:
-    """As check_gaussians; colour waves follow their Gaussians."""
-    gaussians, waves = part.gaussians, part.waves
+    """Leave out Gaussians that cannot be rendered, as check_gaussians; waves follow them."""
+    gaussians = part.gaussians
+    waves = part.waves
     if waves is None:
         gaussians, problems = check_gaussians(gaussians, where=where)
         return SavedPart(gaussians), problems
-    finite = torch.isfinite(waves.sum((1, 2)))
-    unknown = torch.where(finite, 0.0, torch.nan)  # makes means that check_gaussians leaves out
-    gaussians = replace(gaussians, means=gaussians.means + unknown[:, None])
-    kept = drawable_rows(gaussians)
+    is_finite = torch.isfinite(waves.sum((1, 2)))
+    nan_offsets = torch.where(
+        is_finite, 0.0, torch.nan
+    )  # check_gaussians leaves out means that are NaN
+    gaussians = replace(gaussians, means=gaussians.means + nan_offsets[:, None])
+    drawable = drawable_rows(gaussians)
     gaussians, problems = check_gaussians(gaussians, where=where)
-    return SavedPart(gaussians, waves[kept]), problems
+    return SavedPart(gaussians, waves[drawable]), problems
 
 
 def _range(values: Tensor) -> tuple[float, float]:
-    """Lowest and highest value; NaN where there is one. By NumPy, which wakes no threads."""
+    """Return the lowest and the highest value; NaN if a value is NaN. NumPy starts no threads."""
     array = values.detach().cpu().numpy()
     if array.size == 0:
         return 0.0, 0.0
@@ -256,17 +288,18 @@ def _range(values: Tensor) -> tuple[float, float]:
 
 # ---- scene.json ----------------------------------------------------------------------------------
 
-FORMAT = "climategs-scene"
-VERSION = 2
-MAX_BYTES = 256 << 20  # of a scene.json; a drive of an hour has about 30 MB
-_MAX_PROBLEMS_SHOWN = 5
-_MAX_KEYS = 10_000  # of one object, such as a frame's cameras
-_ROTATION_TOLERANCE = 1e-3  # cameras are held to 1e-4 by their own class
+FORMAT = "climategs-scene"  # the format that a scene.json names
+VERSION = 2  # the version that is read and written
+MAX_BYTES = 256 << 20  # bytes of a scene.json; a drive of an hour has about 30 MB
+_MAX_PROBLEMS_SHOWN = 5  # problems that a message names
+_MAX_KEYS = 10_000  # keys of one object, such as a frame's cameras
+# Largest error of R R^T - I in a pose; the camera's own class allows 1e-4.
+_ROTATION_TOLERANCE = 1e-3
 Entry = TypeVar("Entry", bound=BaseModel)
 
 
 def _plain_text(text: str) -> str:
-    """Text that can be printed and, where it is a path, opened."""
+    """Check that a text can be printed and, if it is a path, opened."""
     if "\0" in text:
         raise ValueError("text must not hold a NUL character")
     try:
@@ -277,20 +310,22 @@ def _plain_text(text: str) -> str:
 
 
 def _as_list(value: object) -> object:
+    """Return an array as a list."""
     return value.tolist() if isinstance(value, Tensor | np.ndarray) else value
 
 
 def _pose_as_list(value: object) -> object:
+    """Return a float64 pose as a list."""
     if isinstance(value, Tensor) and value.dtype != torch.float64:
         raise ValueError(f"poses must be float64; got {value.dtype}")
     return _as_list(value)
 
 
-def _is_rigid(rows: list) -> list:
-    """Of poses [4, 4] or [N, 4, 4]."""
+def _check_rigid(rows: list) -> list:
+    """Check that poses [4, 4] or [N, 4, 4] are rotations and translations."""
     poses = np.array(rows, np.float64).reshape(-1, 4, 4)
     rotation = poses[:, :3, :3]
-    with np.errstate(all="ignore"):  # of numbers so large that their products overflow
+    with np.errstate(all="ignore"):  # products of very large numbers overflow
         error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3))
         determinant = np.linalg.det(rotation)
     is_rotation = (error < _ROTATION_TOLERANCE).all() and (determinant > 0).all()
@@ -302,28 +337,29 @@ def _is_rigid(rows: list) -> list:
 Precision = Literal["float32", "float16"]
 Text = Annotated[str, AfterValidator(_plain_text)]
 Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
-# A list with a wrong item is not looked at to its end: of millions of errors each costs a kilobyte.
+# Checks of a list stop at its first wrong item: each of millions of errors would cost a kilobyte.
 Times = Annotated[list[Int64], Field(fail_fast=True), BeforeValidator(_as_list)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
-Phase = Annotated[float, Field(ge=-1e9, le=1e9)]  # of which sine and cosine are known
+Phase = Annotated[float, Field(ge=-1e9, le=1e9)]  # radians, small enough for an exact sine
 Pixels = Annotated[int, Field(ge=1, le=100_000)]
 Row3 = Annotated[list[float], Field(min_length=3, max_length=3), BeforeValidator(_as_list)]
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 Matrix3x4 = Annotated[list[Row4], Field(min_length=3, max_length=3), BeforeValidator(_as_list)]
 _Matrix4x4 = Annotated[list[Row4], Field(min_length=4, max_length=4)]
-_POSE = BeforeValidator(_pose_as_list), AfterValidator(_is_rigid)
+_POSE = BeforeValidator(_pose_as_list), AfterValidator(_check_rigid)
 Pose = Annotated[_Matrix4x4, *_POSE]
 Poses = Annotated[list[_Matrix4x4], Field(fail_fast=True), *_POSE]
 
 
-def _of_few_keys(value: object) -> object:
+def _check_num_keys(value: object) -> object:
+    """Refuse an object with too many keys before each is checked."""
     if isinstance(value, Mapping) and len(value) > _MAX_KEYS:
         raise ValueError(f"it has {len(value)} keys; at most {_MAX_KEYS} are read")
     return value
 
 
 class _Closed(BaseModel):
-    """Made of JSON, or of the record that it stands for."""
+    """Base of the document's objects; made from JSON, or from the record that it describes."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, from_attributes=True
@@ -332,11 +368,11 @@ class _Closed(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _has_few_keys(cls, value: object) -> object:
-        return _of_few_keys(value)
+        return _check_num_keys(value)
 
 
 class CameraEntry(_Closed):
-    """A camera of a frame; its name is the key it stands under."""
+    """A camera of a frame. Its name is its key in FrameEntry.cameras."""
 
     width: Pixels
     height: Pixels
@@ -349,22 +385,25 @@ class CameraEntry(_Closed):
     is_orthographic: bool = False
 
     @model_serializer(mode="wrap")
-    def _without_what_is_usual(self, serialize: Callable[..., dict[str, Any]]) -> dict[str, Any]:
+    def _omit_defaults(self, serialize: Callable[..., dict[str, Any]]) -> dict[str, Any]:
         entry = serialize(self)
         return entry if self.is_orthographic else {k: entry[k] for k in list(entry)[:-1]}
 
 
 class FrameEntry(_Closed):
-    """A frame. image_paths: absolute, by camera."""
+    """A frame of the drive."""
 
     index: Int64
     timestamp_ns: Int64
     world_from_ego: Pose
-    cameras: Annotated[dict[Text, CameraEntry], BeforeValidator(_of_few_keys)]
-    image_paths: Annotated[dict[Text, Text], BeforeValidator(_of_few_keys)]
+    cameras: Annotated[dict[Text, CameraEntry], BeforeValidator(_check_num_keys)]
+    # Absolute paths, by camera.
+    image_paths: Annotated[dict[Text, Text], BeforeValidator(_check_num_keys)]
 
 
 class TrackEntry(_Closed):
+    """The poses of an actor over time."""
+
     hold_ns: Int64
     max_gap_ns: Int64 | None
     timestamps_ns: Times
@@ -378,18 +417,19 @@ class WavesEntry(_Closed):
     phases: Annotated[list[Phase], Field(fail_fast=True), BeforeValidator(_as_list)]
 
     @model_validator(mode="after")
-    def _belong_together(self) -> WavesEntry:
+    def _check_lengths(self) -> WavesEntry:
         if len(self.timestamps_ns) != len(self.phases):
             raise ValueError("there must be as many phases as timestamps")
         return self
 
 
 class ActorEntry(_Closed):
-    """An actor. gaussians: how many rows its arrays have."""
+    """An actor."""
 
     track_id: Text
     label: Text
     size_m: Annotated[Row3, BeforeValidator(lambda v: list(v) if type(v) is tuple else v)]
+    # The number of rows of its arrays.
     gaussians: Annotated[
         Count, BeforeValidator(lambda v: len(v) if isinstance(v, Gaussians) else v)
     ]
@@ -399,7 +439,7 @@ class ActorEntry(_Closed):
 
 
 class ImageColorMapEntry(_Closed):
-    """A colour map of a single image, which is known by its camera and its time."""
+    """A colour map of a single image, which its camera and its time identify."""
 
     camera: Text
     timestamp_ns: Int64
@@ -407,7 +447,7 @@ class ImageColorMapEntry(_Closed):
 
 
 class GroundEntry(_Closed):
-    """The record augment.ground.Ground."""
+    """The fields of the record augment.ground.Ground."""
 
     lowest_z_m: float
     median_z_m: float
@@ -418,16 +458,14 @@ class GroundEntry(_Closed):
 
 
 class SceneDocument(_Closed):
-    """The whole file. working_folder: what relative paths in recorded_source start from. precision:
-    what quaternions, opacities and colours are stored as.
-    """
+    """The content of scene.json."""
 
     format: Literal["climategs-scene"]
     version: Literal[2]
-    precision: Precision
+    precision: Precision  # the type that quaternions, opacities and colours are stored as
     name: Text
     recorded_source: Text
-    working_folder: Text
+    working_folder: Text  # the folder that relative paths in recorded_source start from
     world_origin_m: Row3
     ground_z_m: float | None
     has_metric_scale: bool
@@ -435,7 +473,7 @@ class SceneDocument(_Closed):
     has_known_gravity: bool
     sky: Literal["constant", "latlong", "cubemap"]
     background_gaussians: Count
-    color_maps: Annotated[dict[Text, Matrix3x4], BeforeValidator(_of_few_keys)]
+    color_maps: Annotated[dict[Text, Matrix3x4], BeforeValidator(_check_num_keys)]
     image_color_maps: Annotated[list[ImageColorMapEntry], Field(fail_fast=True)]
     made_by: dict[str, Any]
     problems: Annotated[list[Text], Field(fail_fast=True)]
@@ -444,7 +482,7 @@ class SceneDocument(_Closed):
     seen_frames: Annotated[list[FrameEntry], Field(fail_fast=True)] | None = None
 
     @model_serializer(mode="wrap")
-    def _without_what_is_usual(self, serialize: Callable[..., dict[str, Any]]) -> dict[str, Any]:
+    def _omit_defaults(self, serialize: Callable[..., dict[str, Any]]) -> dict[str, Any]:
         document = serialize(self)
         if self.seen_frames is None:  # so that older versions still read it
             del document["seen_frames"]
@@ -452,7 +490,7 @@ class SceneDocument(_Closed):
 
 
 def read_document(path: Path) -> SceneDocument:
-    """The checked contents of a scene.json."""
+    """Read and check a scene.json."""
     try:
         with open_file(path) as file:
             text = file.read(MAX_BYTES + 1)
@@ -464,7 +502,7 @@ def read_document(path: Path) -> SceneDocument:
 
 
 def parsed_document(text: bytes | str, where: str) -> SceneDocument:
-    """The checked contents of a scene's JSON text."""
+    """Check a scene's JSON text and return its content."""
     try:
         data = text if isinstance(text, bytes) else text.encode()
         check_values(data, where)
@@ -477,11 +515,11 @@ def parsed_document(text: bytes | str, where: str) -> SceneDocument:
     return checked(SceneDocument, raw, where)
 
 
-def check_format(found: object, version: object, where: str) -> None:
-    """That this is a scene, and of a version that is known."""
-    if found != FORMAT:
+def check_format(format_name: object, version: object, where: str) -> None:
+    """Check that a file is a scene, and of the version that is read."""
+    if format_name != FORMAT:
         raise SceneError(
-            f'{where} describes no scene: its "format" must be {FORMAT!r}; got {found!r:.80}'
+            f'{where} describes no scene: its "format" must be {FORMAT!r}; got {format_name!r:.80}'
         )
     if version != VERSION:
         raise SceneError(
@@ -491,32 +529,43 @@ def check_format(found: object, version: object, where: str) -> None:
 
 
 def checked(model: type[Entry], content: object, where: str) -> Entry:
-    """JSON, or a record, as the model."""
+    """Return JSON, or a record, as the model.
+
+    Raises:
+        SceneError: it does not fit; the message names the fields.
+    """
     try:
         return model.model_validate(content)
     except (RecursionError, OverflowError):
         raise SceneError(f"{where}: nested too deeply or numbers too large") from None
     except ValidationError as error:
         problems = error.errors(include_url=False, include_context=False)
-    shown = [
+    problem_texts = [
         f"{'.'.join(map(str, p['loc']))}: {p['msg']}; got {p['input']!r:.60}"
         for p in problems[:_MAX_PROBLEMS_SHOWN]
     ]
-    more = len(problems) - len(shown)
-    raise SceneError(f"{where}: " + "; ".join(shown) + (f"; and {more} more" if more else ""))
+    num_hidden = len(problems) - len(problem_texts)
+    raise SceneError(
+        f"{where}: " + "; ".join(problem_texts) + (f"; and {num_hidden} more" if num_hidden else "")
+    )
 
 
 def _no_constant(name: str) -> float:
+    """Refuse NaN and Infinity, which Python's reader would accept."""
     raise ValueError(f"{name} is no number of JSON")
 
 
 # ---- scene.json: everything of a saved scene but its arrays, in numbers that read back to the bit
 
-_LISTS = ("actors", "frames", "seen_frames", "problems", "image_color_maps")  # with a line an item
+# Lists that are written with one item a line.
+_LISTS = ("actors", "frames", "seen_frames", "problems", "image_color_maps")
 
 
 def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, Any]:
-    """The contents of scene.json. Where precision is not float32, made_by says so for good."""
+    """Return the content of scene.json.
+
+    Where precision is not float32, made_by records it permanently.
+    """
     kind = SKY_KINDS.get(type(scene.sky))
     if kind is None:
         raise SceneError(
@@ -524,9 +573,10 @@ def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, 
             f"only {', '.join(t.__name__ for t in SKY_KINDS)} can"
         )
     for frame in scene.frames:
-        if wrong := [name for name, camera in frame.cameras.items() if camera.name != name]:
+        if wrong_names := [name for name, camera in frame.cameras.items() if camera.name != name]:
             raise SceneError(
-                f"frame {frame.index}: cameras must stand under their own names; {wrong} do not"
+                f"frame {frame.index}: cameras must stand under their own names; {wrong_names} do "
+                "not"
             )
     made_by = _json_facts(scene) | ({} if precision == "float32" else {"precision": precision})
     content = {
@@ -558,7 +608,7 @@ def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, 
 
 
 def _stored_frames(frames: Sequence[Frame]) -> list[Frame]:
-    """With what may be any mapping as dictionaries, and absolute paths."""
+    """Return frames with plain dictionaries and absolute paths."""
     return [
         replace(
             frame,
@@ -570,7 +620,7 @@ def _stored_frames(frames: Sequence[Frame]) -> list[Frame]:
 
 
 def document_text(document: dict[str, Any]) -> str:
-    """JSON with a line a key, and a line an actor, frame, problem or image's colour map."""
+    """Return JSON, one key a line and one actor, frame, problem or image's colour map a line."""
 
     def text(value: Any) -> str:
         return json.dumps(value, ensure_ascii=False, allow_nan=False)
@@ -588,26 +638,42 @@ def document_text(document: dict[str, Any]) -> str:
 def scene_of(
     document: SceneDocument, parts: list[SavedPart], sky: Sky, *, source: str, where: str
 ) -> Scene:
-    """The scene of a document; parts: background first, then its actors. It has no labels."""
+    """Build the scene of a document. It has no labels.
+
+    Args:
+        document: the content of scene.json.
+        parts: the background first, then the actors.
+        sky: the sky.
+        source: the scene's URI.
+        where: the file, for messages.
+    """
     try:
         actors = tuple(
             _actor(entry, part) for entry, part in zip(document.actors, parts[1:], strict=True)
         )
         frames = tuple(_frame(entry) for entry in document.frames)
-        seen = document.seen_frames
-        seen_frames = None if seen is None else tuple(_frame(entry) for entry in seen)
-        repeated = len(frames) - len({frame.index for frame in frames})
-        if repeated:
-            raise ValueError(f"{repeated} frame numbers are given twice")
+        seen_entries = document.seen_frames
+        seen_frames = (
+            None if seen_entries is None else tuple(_frame(entry) for entry in seen_entries)
+        )
+        num_repeated = len(frames) - len({frame.index for frame in frames})
+        if num_repeated:
+            raise ValueError(f"{num_repeated} frame numbers are given twice")
         image_color_maps = {
             (entry.camera, entry.timestamp_ns): torch.tensor(entry.rows, dtype=torch.float32)
             for entry in document.image_color_maps
         }
-        repeated = len(document.image_color_maps) - len(image_color_maps)
-        if repeated:
-            raise ValueError(f"{repeated} images' colour maps are given twice")
-        same = ("name", "ground_z_m", "has_metric_scale", "has_known_gravity", "recorded_source",
-                "made_by")  # fmt: skip
+        num_repeated = len(document.image_color_maps) - len(image_color_maps)
+        if num_repeated:
+            raise ValueError(f"{num_repeated} images' colour maps are given twice")
+        shared_fields = (
+            "name",
+            "ground_z_m",
+            "has_metric_scale",
+            "has_known_gravity",
+            "recorded_source",
+            "made_by",
+        )
         return Scene(
             source=source,
             background=parts[0].gaussians,
@@ -623,18 +689,20 @@ def scene_of(
                 for name, rows in document.color_maps.items()
             },
             image_color_maps=image_color_maps,
-            **{name: getattr(document, name) for name in same},
+            **{name: getattr(document, name) for name in shared_fields},
         )
     except ValueError as error:
         raise SceneError(f"{where}: {error}") from error
 
 
 def track_entry(track: Track, where: str) -> dict[str, Any]:
-    """A track as JSON holds it."""
+    """Return a track as JSON stores it."""
     return checked(TrackEntry, track, where).model_dump()
 
 
 def _actor(entry: ActorEntry, part: SavedPart) -> Actor:
+    """Build an actor."""
+
     def times(entry: TrackEntry | WavesEntry) -> Tensor:
         return torch.tensor(entry.timestamps_ns, dtype=torch.int64)
 
@@ -656,6 +724,8 @@ def _actor(entry: ActorEntry, part: SavedPart) -> Actor:
 
 
 def _frame(entry: FrameEntry) -> Frame:
+    """Build a frame."""
+
     def pose(rows: list) -> Tensor:
         return torch.tensor(rows, dtype=torch.float64)
 
@@ -669,6 +739,7 @@ def _frame(entry: FrameEntry) -> Frame:
 
 
 def _json_facts(scene: Scene) -> dict[str, Any]:
+    """Return made_by as plain JSON types."""
     try:
         text = json.dumps(dict(scene.made_by), allow_nan=False, ensure_ascii=False)
         return json.loads(text.encode())  # unpaired surrogates cannot be written
@@ -680,7 +751,8 @@ def _json_facts(scene: Scene) -> dict[str, Any]:
 
 # ---- Safetensors files: written without a copy of the arrays, read mapped into memory ------------
 
-MAX_HEADER_BYTES = 100_000_000  # the format's own limit
+MAX_HEADER_BYTES = 100_000_000  # bytes of a header, the format's own limit
+# safetensors' names of numpy's types.
 _TYPES = {"<f4": "F32", "<f2": "F16", "<i2": "I16", "<i4": "I32", "<i8": "I64"}
 _ALIGNMENT = 64  # bytes: a cache line, and any vector register
 
@@ -688,13 +760,14 @@ _ALIGNMENT = 64  # bytes: a cache line, and any vector register
 def write_tensors(
     file: BinaryIO, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write contiguous arrays, the widest types first, so that every one is aligned."""
+    """Write contiguous arrays, the widest types first, so that each one is aligned."""
     header: dict[str, object] = {} if metadata is None else {"__metadata__": dict(metadata)}
-    order = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
+    names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
     end = 0
-    for name in order:
+    for name in names:
         array = arrays[name]
-        begin, end = end, end + array.nbytes
+        begin = end
+        end = end + array.nbytes
         code = _TYPES[array.dtype.newbyteorder("<").str]
         header[name] = {"dtype": code, "shape": array.shape, "data_offsets": [begin, end]}
     text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
@@ -706,15 +779,15 @@ def write_tensors(
         )
     file.write(len(text).to_bytes(8, "little"))
     file.write(text)
-    for name in order:
-        little = arrays[name].astype(arrays[name].dtype.newbyteorder("<"), copy=False)
-        file.write(little.reshape(-1).view(np.uint8).data)
+    for name in names:
+        little_endian = arrays[name].astype(arrays[name].dtype.newbyteorder("<"), copy=False)
+        file.write(little_endian.reshape(-1).view(np.uint8).data)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The arrays of a file, mapped: writes to them stay in memory; and its metadata."""
+    """Map the arrays of a file and read its metadata. Writes to the arrays stay in memory."""
     try:
-        open_file(path).close()  # to open a pipe would wait for ever
+        open_file(path).close()  # opening a pipe would wait for ever
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             return tensors, file.metadata() or {}
@@ -726,25 +799,27 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 # ---- Folders and single files --------------------------------------------------------------------
 
-DOCUMENT, GAUSSIANS, SKY = "scene.json", "gaussians.safetensors", "sky.safetensors"
-FILES = (DOCUMENT, GAUSSIANS, SKY)
-LEVELS = "levels.safetensors"  # of a large scene (augment.files.level_file)
-SCENE_SUFFIX = ".climategs"
-_SKY_PREFIX = "sky."
-_MARK = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + FORMAT.encode() + rb'"')
+DOCUMENT = "scene.json"  # everything but the arrays
+GAUSSIANS = "gaussians.safetensors"  # the arrays of background and actors
+SKY = "sky.safetensors"  # the array of the sky
+FILES = (DOCUMENT, GAUSSIANS, SKY)  # the files that a scene folder must have
+LEVELS = "levels.safetensors"  # levels of detail of a large scene (augment.files.level_file)
+SCENE_SUFFIX = ".climategs"  # the end of a scene file's name
+_SKY_PREFIX = "sky."  # start of the names of the sky's arrays in a scene file
+_FORMAT_PATTERN = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + FORMAT.encode() + rb'"')
 
 
 def is_scene_folder(folder: Path) -> bool:
-    """Whether a folder says that it is a scene folder; it may be damaged all the same."""
+    """Return True if a folder's scene.json names the format; it may still be damaged."""
     try:
         with open_file(folder / DOCUMENT) as file:
-            return _MARK.match(file.read(200)) is not None
+            return _FORMAT_PATTERN.match(file.read(200)) is not None
     except OSError:
         return False
 
 
 def is_scene_file(path: Path) -> bool:
-    """Whether a file is named as a scene in one file is; it may be damaged all the same."""
+    """Return True if a file's name ends as that of a scene file; it may still be damaged."""
     return path.suffix.lower() == SCENE_SUFFIX
 
 
@@ -755,14 +830,23 @@ def save_scene(
     levels: Mapping[str, np.ndarray] | None = None,
     finest_m: float = 0.0,
 ) -> None:
-    """Write a scene folder, as a whole or not at all; what `load_scene_parts` gives back is equal
-    to the bit, the labels excepted, which stay with the recording. A scene folder that is there
-    already is replaced in one step; other files in it are kept. Raises SceneError: the scene has
-    something the files cannot hold (a sky of another class, Gaussians that are not float32).
-    OutputError: the folder holds something else than a scene, or the system refused (disk full, no
-    permission ...); what was there before is then as it was.
+    """Write a scene folder, completely or not at all.
 
-    levels, finest_m: of `augment.files.level_file`, which writes large scenes.
+    `load_scene_parts` reads back an equal scene, to the bit, except for the labels, which stay with
+    the recording. An existing scene folder is replaced in one step; other files in it are kept.
+
+    Args:
+        scene: the scene.
+        folder: the folder.
+        levels: arrays of `augment.files.level_file`, which writes large scenes.
+        finest_m: their size of the finest squares, metres.
+
+    Raises:
+        SceneError: the files cannot hold a part of the scene (a sky of another class, Gaussians
+            that
+            are not float32).
+        OutputError: the folder holds something else than a scene, or the system refused (disk full,
+            no permission ...); the earlier content is then unchanged.
     """
     folder = Path(folder)
     document = scene_document(scene)
@@ -773,7 +857,8 @@ def save_scene(
         )
     facts: dict[str, dict[str, str] | None] = dict.fromkeys(arrays)
     if levels is not None:
-        arrays[LEVELS], facts[LEVELS] = dict(levels), {"finest_m": repr(finest_m)}
+        arrays[LEVELS] = dict(levels)
+        facts[LEVELS] = {"finest_m": repr(finest_m)}
     with replaced_folder(folder, (*FILES, LEVELS)) as new:
         (new / DOCUMENT).write_text(document_text(document), encoding="utf-8")
         for name, tensors in arrays.items():
@@ -782,15 +867,27 @@ def save_scene(
 
 
 def save_scene_file(scene: Scene, path: str | Path, *, half: bool = False) -> None:
-    """Write a scene into one file named *.climategs, as a whole or not at all; what was there is
-    replaced. What `load_scene_parts` gives back is equal to the bit, the labels excepted. half:
-    quaternions, opacities, colours, their waves and the sky as float16, for about half the size (55
-    % at SH degree 3). Measured: colours move by up to 0.09/255 at degree 3 and 0.04/255 at degree 0
-    (of colours from 0 to 1), rotations by up to 0.05 degrees, opacities by up to 0.00024; 99.9 % of
-    a street's pixels by less than 0.1/255. That it was done is in made_by for good. Raises
-    SceneError: the scene has something the file cannot hold: as for save_scene, text beyond 100 MB,
-    or, with half, numbers beyond 65504. OutputError: another name, or the system refused; what was
-    there before is as it was.
+    """Write a scene into one file named *.climategs, completely or not at all.
+
+    An existing file is replaced. `load_scene_parts` reads back an equal scene, to the bit, except
+    for the labels.
+
+    With `half`, quaternions, opacities, colours, their waves and the sky are stored as float16, for
+    about half the size (55 % at SH degree 3); made_by records it permanently. Measured: colours
+    move
+    by up to 0.09/255 at degree 3 and 0.04/255 at degree 0 (of colours from 0 to 1), rotations by up
+    to 0.05 degrees, opacities by up to 0.00024; 99.9 % of a street's pixels by less than 0.1/255.
+
+    Args:
+        scene: the scene.
+        path: the file.
+        half: whether to store float16.
+
+    Raises:
+        SceneError: the file cannot hold a part of the scene: as for save_scene, text beyond 100 MB,
+            or, with half, numbers beyond 65504.
+        OutputError: the file has another name, or the system refused; the earlier content is then
+            unchanged.
     """
     path = Path(path)
     if not is_scene_file(path):
@@ -806,34 +903,37 @@ def save_scene_file(scene: Scene, path: str | Path, *, half: bool = False) -> No
 
 @dataclass(frozen=True, eq=False)
 class SavedScene:
-    """What a scene folder or file held. scene: without labels. working_folder: where relative paths
-    in scene.recorded_source start from.
-    """
+    """The content of a scene folder or file."""
 
-    scene: Scene
-    working_folder: Path
+    scene: Scene  # without labels
+    working_folder: Path  # the folder that relative paths in scene.recorded_source start from
 
 
 def load_scene_parts(path: str | Path) -> Scene:
-    """The scene of `read_saved_scene` alone."""
+    """Return the scene of `read_saved_scene` without its working folder."""
     return read_saved_scene(path).scene
 
 
 def read_saved_scene(path: str | Path) -> SavedScene:
-    """Open a scene folder or a scene file. Its arrays are mapped: writes to them stay in memory.
-    Gaussians that no rasteriser can draw are left out with a sentence in `problems`. Raises
-    SceneError: a file is missing, damaged, of another version or format, or they do not belong
-    together.
+    """Open a scene folder or a scene file.
+
+    Its arrays are mapped: writes to them stay in memory. Gaussians that cannot be rendered are left
+    out, each group with a sentence in `problems`.
+
+    Raises:
+        SceneError: a file is missing, damaged, of another version or format, or the files do not
+            belong together.
     """
     path = Path(path)
     opened = _open_file(path) if path.is_file() else _open_folder(path)
-    document, (in_document, in_parts, in_sky) = opened.document, opened.places
+    document = opened.document
+    (in_document, in_parts, in_sky) = opened.sources
     levels = path / LEVELS
     is_large = levels.is_file()
     parts, problems = take_parts(opened.parts, document, in_parts, unread=is_large)
     if problems:
-        found = [*document.problems, *problems]
-        document = document.model_copy(update={"problems": found})
+        all_problems = [*document.problems, *problems]
+        document = document.model_copy(update={"problems": all_problems})
     sky = take_sky(opened.sky, document.sky, document.precision, in_sky)
     scene = scene_of(document, parts, sky, source=f"scene:{path}", where=in_document)
     if is_large:
@@ -844,29 +944,31 @@ def read_saved_scene(path: str | Path) -> SavedScene:
 
 
 class _Opened(NamedTuple):
-    """places: where document, parts and sky stand, for messages."""
+    """An opened folder or file whose arrays are not checked yet."""
 
     document: SceneDocument
-    parts: dict[str, Tensor]
-    sky: dict[str, Tensor]
-    places: tuple[str, str, str]
+    parts: dict[str, Tensor]  # arrays of background and actors
+    sky: dict[str, Tensor]  # the array of the sky
+    sources: tuple[str, str, str]  # the files of document, parts and sky, for messages
 
 
 def _open_folder(folder: Path) -> _Opened:
+    """Open the files of a scene folder."""
     for name in FILES:
         if not (folder / name).is_file():
             raise SceneError(f"{folder} is no scene folder: it has no {name}")
-    places = [folder / name for name in FILES]
-    document = read_document(places[0])
-    parts, sky = (read_tensors(place)[0] for place in places[1:])
-    return _Opened(document, parts, sky, (str(places[0]), str(places[1]), str(places[2])))
+    paths = [folder / name for name in FILES]
+    document = read_document(paths[0])
+    parts, sky = (read_tensors(path)[0] for path in paths[1:])
+    return _Opened(document, parts, sky, (str(paths[0]), str(paths[1]), str(paths[2])))
 
 
 def _open_file(path: Path) -> _Opened:
+    """Open a scene file."""
     tensors, metadata = read_tensors(path)
     version = metadata.get("version", "none")
-    known = VERSION if version == str(VERSION) else version
-    check_format(metadata.get("format"), known, str(path))
+    stated_version = VERSION if version == str(VERSION) else version
+    check_format(metadata.get("format"), stated_version, str(path))
     if "document" not in metadata:
         raise SceneError(f"{path} is damaged: its metadata has no 'document'")
     document = parsed_document(metadata["document"], f"{path}, document")

@@ -1,13 +1,15 @@
-"""Gaussians in .spz files (Niantic, versions 1 to 3): one gzip stream of quantised columns.
+"""Reads and writes Gaussians in .spz files (Niantic, versions 1 to 3).
 
-A 16-byte header, then column after column: places as half floats (version 1) or 24-bit fixed point,
-opacities, colours, logarithms of scales, rotations (three bytes; from version 3 the three smallest
-components in 32 bits), spherical harmonics. Axes are RUB: x right, y up, z back. There is no unit.
-Facts by github.com/nianticlabs/spz, README.md and src/cc/load-spz.cc (MIT).
+A file is one gzip stream: a 16-byte header, then column after column: positions as half floats
+(version 1) or 24-bit fixed point, opacities, colours, logarithms of scales, rotations (three bytes;
+from version 3 the three smallest components in 32 bits), spherical harmonics. Axes are RUB: x
+right,
+y up, z back. There is no unit. Source: github.com/nianticlabs/spz, README.md and src/cc/load-spz.cc
+(MIT).
 
-The header says how long the stream is, and deflate makes nothing more than 1032 times smaller: what
-a file cannot hold, or what is far more than its bytes (augment.files.limits), is refused before
-anything is allocated.
+The header says how long the stream is, and deflate shrinks nothing more than 1032 times. A file
+that announces more than it can hold, or far more than its bytes (augment.files.limits), is refused
+before anything is allocated.
 """
 
 from __future__ import annotations
@@ -28,74 +30,93 @@ from augment.files.ply import SplatFile
 from augment.jobs.atomic import replaced_file
 from augment.scene import SH_COUNTS, Gaussians, check_gaussians
 
-SUFFIX = ".spz"
-UP = "+y"
-GZIP = b"\x1f\x8b"
-_MAGIC, _HEADER = 0x5053474E, struct.Struct("<IIIBBBB")
-WRITTEN_VERSION = 3
-_EXTENDED = 0x2  # a flag: there are records of vendors, before the columns or after them
-_MAX_DEFLATED = 1032  # bytes out of one, at most (zlib's technical details)
-_PIECE = 1 << 22  # bytes that are unpacked together
-_BANDS = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}  # coefficients a channel beyond the first, by degree
-_COLOUR = 0.15  # of f_dc, so that colours beyond 0 and 1 are kept
+SUFFIX = ".spz"  # the end of the files' names
+UP = "+y"  # the axis that points up
+GZIP = b"\x1f\x8b"  # first bytes of a gzip stream
+_MAGIC = 0x5053474E  # first number of a header
+_HEADER = struct.Struct("<IIIBBBB")  # the fields of _Header
+WRITTEN_VERSION = 3  # the version that is written
+_EXTENSIONS_FLAG = 0x2  # set if there are records of vendors, before the columns or after them
+_MAX_DEFLATE_RATIO = 1032  # unpacked bytes for one packed byte (zlib's technical details)
+_PIECE_BYTES = 1 << 22  # bytes that are unpacked together
+_NUM_SH_REST = {
+    0: 0,
+    1: 3,
+    2: 8,
+    3: 15,
+    4: 24,
+}  # coefficients a channel beyond the first, by degree
+_COLOUR_SCALE = 0.15  # factor of f_dc, so that colours beyond 0 and 1 can be stored
 _MAX_FRACTION_BITS = 12  # a quarter of a millimetre, up to 2 km from the origin
-_FIXED_MAX = (1 << 23) - 1
-_SMALL = 511 * np.sqrt(2)  # steps of the smaller components of a quaternion, which end at sqrt(1/2)
+_MAX_FIXED_POINT = (1 << 23) - 1  # the largest fixed-point number
+# Steps a unit of a quaternion's smaller components, which lie from 0 to sqrt(1/2).
+_STEPS_PER_UNIT = 511 * np.sqrt(2)
 # Steps of 8-bit coefficients that the library writes: 5 bits for the first band, 4 for others.
-_STEP_1, _STEP_REST = 8, 16
+_STEP_OF_BAND_1 = 8
+_STEP_OF_OTHER_BANDS = 16
 
 
 class _Header(NamedTuple):
+    """The header of a .spz file."""
+
     magic: int
     version: int
-    num: int
-    degree: int
-    fraction_bits: int
-    flags: int
+    num: int  # Gaussians
+    degree: int  # of the spherical harmonics
+    fraction_bits: int  # of the fixed-point positions
+    flags: int  # bits, among them _EXTENSIONS_FLAG
     reserved: int
 
     @property
     def columns(self) -> dict[str, tuple[str, int]]:
-        """Type and width of each, in order."""
-        place = ("<f2", 3) if self.version == 1 else ("u1", 9)
-        turn = ("<u4", 1) if self.version >= 3 else ("u1", 3)
+        """Return the type and the width of each column, in the file's order."""
+        means_column = ("<f2", 3) if self.version == 1 else ("u1", 9)
+        quats_column = ("<u4", 1) if self.version >= 3 else ("u1", 3)
         return {
-            "means": place,
+            "means": means_column,
             "opacities": ("u1", 1),
             "colours": ("u1", 3),
             "scales": ("u1", 3),
-            "quats": turn,
-            "sh": ("u1", 3 * _BANDS[self.degree]),
+            "quats": quats_column,
+            "sh": ("u1", 3 * _NUM_SH_REST[self.degree]),
         }
 
 
 def read_spz(path: str | Path) -> SplatFile:
-    """Read a .spz file, its note `up` being +y. Raises SceneError: no such file, truncated, damaged
-    or of a version that is not known.
+    """Read a .spz file; its note `up` is +y.
+
+    Raises:
+        SceneError: the file does not exist, is truncated or damaged, or has an unknown version.
     """
     path = Path(path)
     try:
         with gzip.open(path) as stream:
-            header = _check(path, stream.read(_HEADER.size))
-            stored = {
-                name: _column(path, stream, header.num, *kind)
+            header = _unpack_header(path, stream.read(_HEADER.size))
+            columns = {
+                name: _read_column(path, stream, header.num, *kind)
                 for name, kind in header.columns.items()
             }
     except (OSError, EOFError, zlib.error) as error:
         raise SceneError(
             f"{path}: not a whole .spz file ({error}); copy or export it again"
         ) from error
-    raw = _gaussians(header, stored)
-    stored.clear()
-    gaussians, problems = check_gaussians(raw, where=str(path))
+    all_gaussians = _decode_gaussians(header, columns)
+    columns.clear()
+    gaussians, problems = check_gaussians(all_gaussians, where=str(path))
     if header.degree == 4:
         problems = (*problems, f"{path}: spherical harmonics of degree 4 are cut off at 3")
     return SplatFile(gaussians, notes={"up": UP}, problems=problems)
 
 
 def refuse_bare_spz(path: Path, start: bytes) -> None:
-    """Say what a file is that begins with the mark of .spz and not with that of gzip. start: its
-    first bytes. Raises SceneError: it is such a file.
+    """Refuse a file that begins with the mark of .spz and not with that of gzip.
+
+    Args:
+        path: the file.
+        start: its first bytes.
+
+    Raises:
+        SceneError: it is such a file.
     """
     if start[:4] != _MAGIC.to_bytes(4, "little"):
         return
@@ -111,21 +132,23 @@ def refuse_bare_spz(path: Path, start: bytes) -> None:
     )
 
 
-def _gaussians(header: _Header, stored: Mapping[str, np.ndarray]) -> Gaussians:
-    """The Gaussians of the file's columns, decoded piece by piece."""
+def _decode_gaussians(header: _Header, columns: Mapping[str, np.ndarray]) -> Gaussians:
+    """Decode the file's columns piece by piece."""
     count = header.num
-    bands = min(_BANDS[header.degree], SH_COUNTS[-1] - 1)
-    means, quats = np.empty((count, 3), np.float32), np.empty((count, 4), np.float32)
-    scales, opacities = np.empty((count, 3), np.float32), np.empty(count, np.float32)
-    sh = np.empty((count, 1 + bands, 3), np.float32)
+    num_rest = min(_NUM_SH_REST[header.degree], SH_COUNTS[-1] - 1)
+    means = np.empty((count, 3), np.float32)
+    quats = np.empty((count, 4), np.float32)
+    scales = np.empty((count, 3), np.float32)
+    opacities = np.empty(count, np.float32)
+    sh = np.empty((count, 1 + num_rest, 3), np.float32)
     for rows in row_slices(count):
-        means[rows] = _places(header, stored["means"][rows])
-        quats[rows] = _turns(header, stored["quats"][rows])
-        scales[rows] = np.exp(stored["scales"][rows] / 16.0 - 10)
-        opacities[rows] = stored["opacities"][rows, 0] / 255.0
-        sh[rows, 0] = (stored["colours"][rows] / 255.0 - 0.5) / _COLOUR
-        rest = stored["sh"][rows].reshape(rows.stop - rows.start, -1, 3)[:, :bands]
-        sh[rows, 1:] = (rest.astype(np.float32) - 128) / 128
+        means[rows] = _decode_means(header, columns["means"][rows])
+        quats[rows] = _decode_quats(header, columns["quats"][rows])
+        scales[rows] = np.exp(columns["scales"][rows] / 16.0 - 10)
+        opacities[rows] = columns["opacities"][rows, 0] / 255.0
+        sh[rows, 0] = (columns["colours"][rows] / 255.0 - 0.5) / _COLOUR_SCALE
+        sh_codes = columns["sh"][rows].reshape(rows.stop - rows.start, -1, 3)[:, :num_rest]
+        sh[rows, 1:] = (sh_codes.astype(np.float32) - 128) / 128
     return Gaussians(
         means=torch.from_numpy(means),
         quats=torch.from_numpy(quats),
@@ -135,7 +158,8 @@ def _gaussians(header: _Header, stored: Mapping[str, np.ndarray]) -> Gaussians:
     )
 
 
-def _check(path: Path, data: bytes) -> _Header:
+def _unpack_header(path: Path, data: bytes) -> _Header:
+    """Check a header."""
     if len(data) < _HEADER.size or data[:4] != _MAGIC.to_bytes(4, "little"):
         raise SceneError(f"{path}: not a .spz file: its stream does not begin with 'NGSP'")
     header = _Header(*_HEADER.unpack(data))
@@ -144,94 +168,109 @@ def _check(path: Path, data: bytes) -> _Header:
             f"{path}: version {header.version} of .spz is not read, only 1 to 3; save it as "
             f"version 3, or as .ply"
         )
-    if header.degree not in _BANDS or header.fraction_bits > 23:
+    if header.degree not in _NUM_SH_REST or header.fraction_bits > 23:
         raise SceneError(
             f"{path}: its header is damaged: spherical harmonics of degree {header.degree} (0 to "
             f"4), {header.fraction_bits} fractional bits (0 to 23)"
         )
-    if header.flags & _EXTENDED:
+    if header.flags & _EXTENSIONS_FLAG:
         raise SceneError(
             f"{path}: it has vendors' extensions, whose place differs by version; save it without"
         )
-    row = sum(np.dtype(kind).itemsize * width for kind, width in header.columns.values())
+    row_bytes = sum(np.dtype(kind).itemsize * width for kind, width in header.columns.values())
     size = path.stat().st_size
-    most = size * _MAX_DEFLATED
-    if header.num == 0 or header.num * row > most:
+    max_bytes = size * _MAX_DEFLATE_RATIO
+    if header.num == 0 or header.num * row_bytes > max_bytes:
         raise SceneError(
-            f"{path}: its header announces {header.num} Gaussians of {row} bytes each; the file "
-            f"holds 1 to {most // row} of them: truncated, or its header is wrong"
+            f"{path}: its header announces {header.num} Gaussians of {row_bytes} bytes each; the "
+            "file "
+            f"holds 1 to {max_bytes // row_bytes} of them: truncated, or its header is wrong"
         )
-    functions = 1 + min(_BANDS[header.degree], SH_COUNTS[-1] - 1)
-    check_memory(str(path), header.num, functions=functions, size=size)
+    num_sh = 1 + min(_NUM_SH_REST[header.degree], SH_COUNTS[-1] - 1)
+    check_memory(str(path), header.num, functions=num_sh, size=size)
     return header
 
 
-def _column(path: Path, stream: gzip.GzipFile, count: int, kind: str, width: int) -> np.ndarray:
-    """[N, width]."""
+def _read_column(
+    path: Path, stream: gzip.GzipFile, count: int, kind: str, width: int
+) -> np.ndarray:
+    """Read one column, [N, width]."""
     column = np.empty((count, width), kind)
     data = column.reshape(-1).view("u1")
-    for start in range(0, len(data), _PIECE):
-        piece = stream.read(min(_PIECE, len(data) - start))
+    for start in range(0, len(data), _PIECE_BYTES):
+        piece = stream.read(min(_PIECE_BYTES, len(data) - start))
         data[start : start + len(piece)] = np.frombuffer(piece, "u1")
-        if len(piece) < min(_PIECE, len(data) - start):
+        if len(piece) < min(_PIECE_BYTES, len(data) - start):
             raise SceneError(f"{path}: its columns end early; it is truncated: copy it again")
     return column
 
 
-def _places(header: _Header, column: np.ndarray) -> np.ndarray:
+def _decode_means(header: _Header, column: np.ndarray) -> np.ndarray:
+    """Decode positions, float32 [N, 3]."""
     if header.version == 1:
         return column.astype(np.float32)
     low, middle, high = column.reshape(-1, 3).astype(np.int32).T
     fixed = (low | middle << 8 | high << 16).reshape(-1, 3)
-    fixed = np.where(fixed > _FIXED_MAX, fixed - (1 << 24), fixed)
+    fixed = np.where(fixed > _MAX_FIXED_POINT, fixed - (1 << 24), fixed)
     return (fixed / float(1 << header.fraction_bits)).astype(np.float32)
 
 
-def _turns(header: _Header, column: np.ndarray) -> np.ndarray:
-    """float32 [N, 4], wxyz; the file's order is xyzw."""
+def _decode_quats(header: _Header, column: np.ndarray) -> np.ndarray:
+    """Decode rotations, float32 [N, 4], wxyz; the file's order is xyzw."""
     xyzw = np.zeros((len(column), 4))
     if header.version < 3:
         xyzw[:, :3] = column / 127.5 - 1
-        missing = np.full(len(column), 3)
+        omitted_index = np.full(len(column), 3)
     else:
         packed = column[:, 0]
-        missing = (packed >> 30).astype(np.int64)
-        for place, others in enumerate(_others(missing).T):
-            bits = packed >> np.uint32(20 - 10 * place)
-            size = (bits & 511) / _SMALL
-            xyzw[np.arange(len(column)), others] = np.where(bits & 512, -size, size)
-    rest = np.sqrt(np.maximum(0, 1 - (xyzw**2).sum(axis=1)))
-    xyzw[np.arange(len(column)), missing] = rest
+        omitted_index = (packed >> 30).astype(np.int64)
+        for slot, component in enumerate(_other_components(omitted_index).T):
+            slot_bits = packed >> np.uint32(20 - 10 * slot)
+            magnitude = (slot_bits & 511) / _STEPS_PER_UNIT
+            xyzw[np.arange(len(column)), component] = np.where(
+                slot_bits & 512, -magnitude, magnitude
+            )
+    omitted_value = np.sqrt(np.maximum(0, 1 - (xyzw**2).sum(axis=1)))
+    xyzw[np.arange(len(column)), omitted_index] = omitted_value
     return np.ascontiguousarray(xyzw[:, [3, 0, 1, 2]], np.float32)
 
 
-def _others(missing: np.ndarray) -> np.ndarray:
-    """The components beside those, [N, 3], in order."""
+def _other_components(component: np.ndarray) -> np.ndarray:
+    """Return the three other components of each given one, [N, 3], in order."""
     table = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-    return table[missing]
+    return table[component]
 
 
 def write_spz(path: str | Path, gaussians: Gaussians) -> None:
-    """Write a .spz file of version 3, atomically, from Gaussians whose y points up. Places keep as
-    many bits as their reach leaves, a quarter of a millimetre within 2 km.
+    """Write a .spz file of version 3, atomically.
+
+    Positions have as many fractional bits as their range leaves: a quarter of a millimetre within
+    2 km.
+
+    Args:
+        path: the file.
+        gaussians: Gaussians whose y axis points up.
     """
     means = gaussians.means.detach().cpu().numpy().astype(np.float64)
-    reach = float(np.abs(means).max(initial=1e-3))
-    bits = min(_MAX_FRACTION_BITS, int(np.floor(np.log2(_FIXED_MAX / reach))))
+    max_coordinate = float(np.abs(means).max(initial=1e-3))
+    bits = min(_MAX_FRACTION_BITS, int(np.floor(np.log2(_MAX_FIXED_POINT / max_coordinate))))
     if bits < 0:
-        raise SceneError(f"{path}: places reach {reach:.3g} from the origin; .spz ends at 8388607")
+        raise SceneError(
+            f"{path}: places reach {max_coordinate:.3g} from the origin; .spz ends at 8388607"
+        )
     fixed = np.rint(means * (1 << bits)).astype("<i4")
     scales = gaussians.scales.detach().cpu().double().log().numpy()
     sh = gaussians.sh.detach().cpu().numpy().astype(np.float64)
     columns = (
         fixed.reshape(-1, 1).view("u1")[:, :3],
-        _bytes(255 * gaussians.opacities.detach().cpu().numpy()),
-        _bytes(255 * (_COLOUR * sh[:, 0] + 0.5)),
-        _bytes(16 * (scales + 10)),
-        _packed_turns(gaussians.quats.detach().cpu().double().numpy()),
-        _coefficients(sh[:, 1:]),
+        _round_to_bytes(255 * gaussians.opacities.detach().cpu().numpy()),
+        _round_to_bytes(255 * (_COLOUR_SCALE * sh[:, 0] + 0.5)),
+        _round_to_bytes(16 * (scales + 10)),
+        _encode_quats(gaussians.quats.detach().cpu().double().numpy()),
+        _encode_sh(sh[:, 1:]),
     )
-    count, degree = len(gaussians), gaussians.sh_degree
+    count = len(gaussians)
+    degree = gaussians.sh_degree
     header = _HEADER.pack(_MAGIC, WRITTEN_VERSION, count, degree, bits, 0, 0)
     with replaced_file(Path(path)) as file, gzip.GzipFile("", "wb", 6, file, mtime=0) as stream:
         stream.write(header)
@@ -239,25 +278,30 @@ def write_spz(path: str | Path, gaussians: Gaussians) -> None:
             stream.write(np.ascontiguousarray(column).tobytes())
 
 
-def _bytes(values: np.ndarray) -> np.ndarray:
+def _round_to_bytes(values: np.ndarray) -> np.ndarray:
+    """Round to bytes."""
     return np.rint(values).clip(0, 255).astype(np.uint8)
 
 
-def _packed_turns(wxyz: np.ndarray) -> np.ndarray:
+def _encode_quats(wxyz: np.ndarray) -> np.ndarray:
+    """Encode rotations for version 3."""
     xyzw = wxyz[:, [1, 2, 3, 0]] / np.linalg.norm(wxyz, axis=1, keepdims=True)
-    rows, largest = np.arange(len(xyzw)), np.abs(xyzw).argmax(axis=1)
+    rows = np.arange(len(xyzw))
+    largest = np.abs(xyzw).argmax(axis=1)
     packed = largest.astype(np.uint32)
-    flipped = xyzw[rows, largest] < 0
-    for others in _others(largest).T:
-        value = xyzw[rows, others]
-        size = np.rint(_SMALL * np.abs(value)).clip(0, 511).astype(np.uint32)
-        negative = ((value < 0) ^ flipped).astype(np.uint32)
-        packed = packed << np.uint32(10) | negative << np.uint32(9) | size
+    is_flipped = xyzw[rows, largest] < 0
+    for component in _other_components(largest).T:
+        value = xyzw[rows, component]
+        magnitude = np.rint(_STEPS_PER_UNIT * np.abs(value)).clip(0, 511).astype(np.uint32)
+        is_negative = ((value < 0) ^ is_flipped).astype(np.uint32)
+        packed = packed << np.uint32(10) | is_negative << np.uint32(9) | magnitude
     return packed.astype("<u4")
 
 
-def _coefficients(sh: np.ndarray) -> np.ndarray:
-    """sh: [N, K, 3], beyond the first."""
-    steps = np.where(np.arange(sh.shape[1]) < _BANDS[1], _STEP_1, _STEP_REST)[:, None]
-    stored = np.rint((128 * sh + 128) / steps) * steps
-    return _bytes(stored)
+def _encode_sh(sh: np.ndarray) -> np.ndarray:
+    """Encode spherical harmonics beyond the first, [N, K, 3]."""
+    steps = np.where(
+        np.arange(sh.shape[1]) < _NUM_SH_REST[1], _STEP_OF_BAND_1, _STEP_OF_OTHER_BANDS
+    )[:, None]
+    codes = np.rint((128 * sh + 128) / steps) * steps
+    return _round_to_bytes(codes)

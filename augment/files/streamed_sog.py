@@ -1,10 +1,10 @@
-"""Gaussians in PlayCanvas's streamed SOG, version 1: a folder of `lod-meta.json` and SOG chunks.
+"""Reads PlayCanvas's streamed SOG, version 1: a folder of `lod-meta.json` and SOG chunks.
 
-A tree divides the scene; each of its leaves names, for each level of detail it has, a run of
-Gaussians in one of the chunks. Level 0 is the finest. All leaves of one level together are the
-scene. An environment, such as a dome of sky, stands beside the levels. Facts by
-github.com/playcanvas/splat-transform, guides/STREAMED_SOG_FORMAT.md (MIT); its chunks are folders,
-and chunks in one .sog each are read as well.
+A tree divides the scene. Each leaf names, for each of its levels of detail, a run of Gaussians in
+one of the chunks. Level 0 is the finest. All leaves of one level together are the scene. An
+environment, such as a dome of sky, is stored beside the levels. Source:
+github.com/playcanvas/splat-transform, guides/STREAMED_SOG_FORMAT.md (MIT). Its chunks are folders;
+chunks in one .sog each are read as well.
 """
 
 from __future__ import annotations
@@ -24,27 +24,31 @@ from augment.files.scene_file import checked
 from augment.files.sog import META, SUFFIX, read_stored_sog
 from augment.scene import SH_COUNTS, Gaussians, check_gaussians
 
-LOD_META = "lod-meta.json"
-_MAX_META_BYTES = 128 << 20  # a tree of a hundred thousand leaves has about 20 MB
-_VERSIONS = (None, 1)  # files before the first version say none
-_MAX_LEVELS = 64
+LOD_META = "lod-meta.json"  # the name of the file that describes the scene
+_MAX_META_BYTES = 128 << 20  # bytes of it; a tree of a hundred thousand leaves has about 20 MB
+_VERSIONS = (None, 1)  # versions that are read; files before the first version state none
+_MAX_LEVELS = 64  # levels of detail
 
 Count = Annotated[int, Field(ge=0)]
 
 
 class _Part(BaseModel):
+    """Base of the JSON objects."""
+
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
 
 
 class _Run(_Part):
-    """The Gaussians offset to offset + count of a chunk. file: its index in `filenames`."""
+    """A run of Gaussians in a chunk."""
 
-    file: Count
-    offset: Count
-    count: Count
+    file: Count  # the chunk's index in `filenames`
+    offset: Count  # the first Gaussian
+    count: Count  # how many follow
 
 
 class _Meta(_Part):
+    """The content of lod-meta.json without its tree."""
+
     lodLevels: int = Field(ge=1, le=_MAX_LEVELS)
     filenames: Annotated[
         list[str], Field(fail_fast=True)
@@ -53,8 +57,9 @@ class _Meta(_Part):
 
 
 def read_streamed_sog(path: str | Path, level: int = 0) -> SplatFile:
-    """Read one level of detail of the scene that a `lod-meta.json` describes; its environment is
-    left out, and said.
+    """Read one level of detail of the scene that a `lod-meta.json` describes.
+
+    Its environment is left out; a problem reports that.
 
     Args:
         path: the `lod-meta.json`.
@@ -84,35 +89,37 @@ def read_streamed_sog(path: str | Path, level: int = 0) -> SplatFile:
     runs = [run for run in runs if run.count > 0]
     if not runs:
         raise SceneError(f"{path}: its tree names no Gaussians of level {level}")
-    raw, notes = _gathered(path, meta, runs, _check_runs(path, meta, runs))
-    gaussians, problems = check_gaussians(raw, where=f"{path}, level {level}")
-    said = [_levels_sentence(path, meta, level), *problems]
+    all_gaussians, notes = _gather_gaussians(path, meta, runs, _check_runs(path, meta, runs))
+    gaussians, problems = check_gaussians(all_gaussians, where=f"{path}, level {level}")
+    sentences = [_levels_sentence(path, meta, level), *problems]
     if meta.environment:
-        said.append(
+        sentences.append(
             f"{path}: its environment, {meta.environment[:200]}, such as a dome of sky, is left "
             f"out; it opens by itself, as gaussians:{path.parent / meta.environment[:200]}"
         )
-    return SplatFile(gaussians, notes=notes, problems=tuple(said))
+    return SplatFile(gaussians, notes=notes, problems=tuple(sentences))
 
 
 def _levels_sentence(path: Path, meta: _Meta, level: int) -> str:
-    which = "the finest, " if level == 0 else ""
+    """Return the sentence that says which level was read."""
+    qualifier = "the finest, " if level == 0 else ""
     return (
-        f"{path}: {which}level {level} of {meta.lodLevels} is taken; lod=N takes another, "
+        f"{path}: {qualifier}level {level} of {meta.lodLevels} is taken; lod=N takes another, "
         f"0 to {meta.lodLevels - 1}"
     )
 
 
 def _runs(tree: object, level: int, where: str) -> Iterator[_Run]:
-    """The runs of all leaves that have the level."""
-    waiting = [tree]
-    while waiting:
-        node = waiting.pop()
+    """Yield the runs of all leaves that have the level."""
+    pending_nodes = [tree]
+    while pending_nodes:
+        node = pending_nodes.pop()
         if not isinstance(node, dict):
             raise SceneError(f"{where}: a node of its tree must be an object; got {node!r:.60}")
-        children, lods = node.get("children"), node.get("lods")
+        children = node.get("children")
+        lods = node.get("lods")
         if isinstance(children, list) and lods is None:
-            waiting += children
+            pending_nodes += children
         elif isinstance(lods, dict) and not children:
             if (run := lods.get(str(level))) is not None:
                 yield checked(_Run, run, f"{where}, lods of a leaf")
@@ -124,55 +131,72 @@ def _runs(tree: object, level: int, where: str) -> Iterator[_Run]:
 
 
 def _check_runs(path: Path, meta: _Meta, runs: list[_Run]) -> int:
-    """Refuse runs of chunks that are not named, that overlap, or that no chunk could hold. Returns
-    the bytes of all chunks.
+    """Refuse runs of unnamed chunks, runs that overlap, and runs that no chunk could hold.
+
+    Returns:
+        Bytes of all chunks.
     """
     if runs[-1].file >= len(meta.filenames):
         raise SceneError(
             f"{path}: a leaf names chunk {runs[-1].file} of {len(meta.filenames)} filenames"
         )
-    for before, run in itertools.pairwise(runs):
-        if before.file == run.file and before.offset + before.count > run.offset:
+    for previous_run, run in itertools.pairwise(runs):
+        if previous_run.file == run.file and previous_run.offset + previous_run.count > run.offset:
             raise SceneError(
                 f"{path}: two leaves share Gaussians of {meta.filenames[run.file]!r:.200}: "
-                f"{before.offset} to {before.offset + before.count} and from {run.offset} on"
+                f"{previous_run.offset} to {previous_run.offset + previous_run.count} and from "
+                f"{run.offset} on"
             )
     numbers = sorted({run.file for run in runs})
-    chunks = {_chunk(path, meta.filenames[number]).resolve() for number in numbers}
+    chunks = {_chunk_path(path, meta.filenames[number]).resolve() for number in numbers}
     if len(chunks) < len(numbers):
         raise SceneError(f"{path} names a chunk twice: its {len(numbers)} are {len(chunks)} files")
-    size = sum(map(_size_of, chunks))
+    size = sum(map(_chunk_bytes, chunks))
     check_memory(str(path), sum(run.count for run in runs), functions=1, size=size)
     return size
 
 
-def _gathered(
+def _gather_gaussians(
     path: Path, meta: _Meta, runs: list[_Run], size: int
 ) -> tuple[Gaussians, dict[str, str]]:
-    """The Gaussians of the runs, chunk after chunk, and what the first chunk says of up and unit;
-    colours of a lower degree are filled up with zeros. size: bytes of all chunks.
+    """Gather the Gaussians of the runs, chunk after chunk.
+
+    Colours of a lower degree are filled up with zeros.
+
+    Args:
+        path: the `lod-meta.json`.
+        meta: its content.
+        runs: the runs, sorted by chunk and offset.
+        size: bytes of all chunks.
+
+    Returns:
+        The Gaussians, and the first chunk's notes `up` and `unit`.
     """
     by_file: dict[int, list[_Run]] = {}
     for run in runs:
         by_file.setdefault(run.file, []).append(run)
-    parts, notes = list[Gaussians](), dict[str, str]()
-    for number, held in by_file.items():
-        file = _chunk(path, meta.filenames[number])
-        stored, said = read_stored_sog(file)
-        if parts and said != notes:
-            raise SceneError(f"{file} says {said} of up and unit; chunks before it say {notes}")
-        notes = said
-        end = held[-1].offset + held[-1].count
-        if end > len(stored):
+    parts = list[Gaussians]()
+    notes = dict[str, str]()
+    for number, chunk_runs in by_file.items():
+        file = _chunk_path(path, meta.filenames[number])
+        chunk_gaussians, chunk_notes = read_stored_sog(file)
+        if parts and chunk_notes != notes:
             raise SceneError(
-                f"{path} names Gaussians up to {end} of {file}, which holds {len(stored)}"
+                f"{file} says {chunk_notes} of up and unit; chunks before it say {notes}"
             )
-        if sum(run.count for run in held) < len(stored):
-            kept = [torch.arange(run.offset, run.offset + run.count) for run in held]
-            stored = stored.select(torch.cat(kept))
-        parts.append(stored)
-        rows, functions = sum(map(len, parts)), max(part.sh.shape[1] for part in parts)
-        check_memory(str(path), rows, functions=functions, size=size)
+        notes = chunk_notes
+        end = chunk_runs[-1].offset + chunk_runs[-1].count
+        if end > len(chunk_gaussians):
+            raise SceneError(
+                f"{path} names Gaussians up to {end} of {file}, which holds {len(chunk_gaussians)}"
+            )
+        if sum(run.count for run in chunk_runs) < len(chunk_gaussians):
+            row_ranges = [torch.arange(run.offset, run.offset + run.count) for run in chunk_runs]
+            chunk_gaussians = chunk_gaussians.select(torch.cat(row_ranges))
+        parts.append(chunk_gaussians)
+        num_rows = sum(map(len, parts))
+        num_sh = max(part.sh.shape[1] for part in parts)
+        check_memory(str(path), num_rows, functions=num_sh, size=size)
     bands = max(part.sh.shape[1] for part in parts)
     assert bands in SH_COUNTS
     sh = [torch.nn.functional.pad(p.sh, (0, 0, 0, bands - p.sh.shape[1])) for p in parts]
@@ -181,8 +205,8 @@ def _gathered(
     return Gaussians(**columns, sh=torch.cat(sh)), notes
 
 
-def _chunk(path: Path, name: str) -> Path:
-    """The meta.json or .sog of a chunk, which must lie in the folder."""
+def _chunk_path(path: Path, name: str) -> Path:
+    """Return the meta.json or .sog of a chunk, which must lie in the folder."""
     parts = PurePosixPath(name)
     is_plain = not parts.is_absolute() and ".." not in parts.parts and not set(name) & set("\\\0:")
     if not is_plain or not (parts.name == META or parts.suffix.lower() == SUFFIX):
@@ -198,8 +222,8 @@ def _chunk(path: Path, name: str) -> Path:
     return file
 
 
-def _size_of(chunk: Path) -> int:
-    """Bytes of a chunk: of the .sog, or of the files beside its meta.json."""
+def _chunk_bytes(chunk: Path) -> int:
+    """Return the bytes of a chunk: of the .sog, or of the files beside its meta.json."""
     if chunk.name != META:
         return chunk.stat().st_size
     return sum(file.stat().st_size for file in chunk.parent.iterdir() if file.is_file())

@@ -1,13 +1,14 @@
-"""Gaussians in OpenUSD files: prims ParticleField3DGaussianSplat, by usd-core from 26.3 on.
+"""Reads and writes Gaussians in OpenUSD files: prims ParticleField3DGaussianSplat of usd-core 26.3.
 
     pip install 'climategs[usd]'
 
-Scales and opacities are linear, spherical harmonics those of 3D Gaussian splatting, particle after
-particle; each attribute has a form in halves, whose name ends in h. What lacks, or is too short,
-has the schema's default, which is said. Facts by OpenUSD's usdVol/schema.usda.
+Scales and opacities are linear, spherical harmonics those of 3D Gaussian splatting, stored particle
+after particle. Each attribute has a form in half floats, whose name ends in h. An attribute that is
+missing or too short has the schema's default, which a problem reports. Source: OpenUSD's
+usdVol/schema.usda.
 
 A file has to hold all its layers: references to others are refused. OpenUSD's own parser, which is
-C++, reads it in a process of its own (`usd_stage.py`) with limits of memory and time.
+C++, reads it in a separate process (`usd_stage.py`) with limits of memory and time.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ from augment.files.usd_stage import ATTRIBUTES, COEFFICIENTS
 from augment.jobs.atomic import make_folder, refusals_of, replaced_file
 from augment.scene import SH_COUNTS, Gaussians
 
-_FREE_MEMORY = 2 << 30  # bytes of address space to read a file of any size
+_BASE_MEMORY_BYTES = 2 << 30  # bytes of address space to read a file of any size
 _MEMORY_PER_BYTE = 16  # bytes beyond that for each byte of the file
-_FREE_SECONDS = 45  # to read a file of any size
-_BYTES_PER_SECOND = 4 << 20  # of the file, read in each second beyond that
+_BASE_TIME_S = 45  # seconds to read a file of any size
+_BYTES_PER_SECOND = 4 << 20  # bytes of the file for each second beyond that
 
 
 def _pxr() -> Any:
-    """The modules of usd-core, as attributes."""
+    """Return the modules of usd-core as attributes."""
     try:
         import pxr
         from pxr import Sdf, Tf, Usd, UsdGeom, UsdVol, Vt  # noqa: F401 - attributes of pxr
@@ -54,15 +55,16 @@ def _pxr() -> Any:
 
 
 def read_usd(path: str | Path) -> SplatFile:
-    """Read all visible Gaussians of the stage, at the time of its first sample, in its axes, and in
-    metres where it says how long its unit is.
+    """Read all visible Gaussians of the stage at the time of its first sample.
+
+    They are in its axes, and in metres where it states the length of its unit.
 
     Raises:
-        SceneError: no usd-core; damaged, without Gaussians, or with layers in other files; or
-            OpenUSD crashes on it, or needs more memory or time than such a file may take.
+        SceneError: usd-core is missing; the file is damaged, without Gaussians, or has layers in
+            other files; or OpenUSD crashes on it, or needs more memory or time than the limits.
     """
     path = Path(path)
-    _pxr()  # without it the message says how to get it
+    _pxr()  # raises an error that says how to install it
     with tempfile.TemporaryFile() as output:
         _run_reader(path, output)
         output.seek(0)
@@ -73,10 +75,10 @@ def read_usd(path: str | Path) -> SplatFile:
 
 
 def _run_reader(path: Path, output: IO[bytes]) -> None:
-    """Let `usd_stage.py` read the file in a process of its own, whose crash is an error here."""
+    """Run `usd_stage.py` in a separate process, whose crash becomes an error here."""
     size = path.stat().st_size
-    memory = _FREE_MEMORY + _MEMORY_PER_BYTE * size
-    seconds = _FREE_SECONDS + size // _BYTES_PER_SECOND
+    memory = _BASE_MEMORY_BYTES + _MEMORY_PER_BYTE * size
+    seconds = _BASE_TIME_S + size // _BYTES_PER_SECOND
     program = Path(__file__).with_name("usd_stage.py")
     command = [sys.executable, "-P", str(program), str(path.absolute()), str(memory), str(seconds)]
     threads = ("PXR_WORK_THREAD_LIMIT", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
@@ -103,27 +105,35 @@ def _run_reader(path: Path, output: IO[bytes]) -> None:
         text = messages.read(1 << 16).decode(errors="replace").strip()
         if "bad_alloc" in text:
             raise SceneError(f"{path}: needs more than {memory >> 20} MiB of memory to be read")
-    last = text.splitlines()[-1][:300] if text else "it said nothing"
-    name = signal.Signals(-code).name if code < 0 else f"exit code {code} ({last})"
+    last_line = text.splitlines()[-1][:300] if text else "it said nothing"
+    ending = signal.Signals(-code).name if code < 0 else f"exit code {code} ({last_line})"
     raise SceneError(
-        f"{path}: OpenUSD's reader ended with {name}: the file is damaged, or nested too deeply; "
+        f"{path}: OpenUSD's reader ended with {ending}: the file is damaged, or nested too deeply; "
         "export it again"
     )
 
 
 def _splats(path: Path, facts: dict[str, Any], output: IO[bytes]) -> SplatFile:
-    """The Gaussians of all prims. facts, output: what `usd_stage.py` wrote."""
-    from augment.files.export import transformed_gaussians  # which writes by this module
+    """Return the Gaussians of all prims.
+
+    Args:
+        path: the file.
+        facts: the line of JSON that `usd_stage.py` wrote.
+        output: its output after that line.
+    """
+    from augment.files.export import transformed_gaussians  # imported here: it imports this module
 
     problems = [f"{path}: {sentence}" for sentence in facts["problems"]]
     prims = facts["prims"]
-    rows = sum(prim["columns"]["positions"][0] for prim in prims)
-    if rows == 0:
+    num_gaussians = sum(prim["columns"]["positions"][0] for prim in prims)
+    if num_gaussians == 0:
         raise SceneError(
             f"{path}: no visible ParticleField3DGaussianSplat with positions; splats are needed"
         )
-    highest = min(max(prim["degree"] for prim in prims), len(SH_COUNTS) - 1)
-    check_memory(str(path), rows, functions=SH_COUNTS[highest], size=path.stat().st_size)
+    max_degree = min(max(prim["degree"] for prim in prims), len(SH_COUNTS) - 1)
+    check_memory(
+        str(path), num_gaussians, functions=SH_COUNTS[max_degree], size=path.stat().st_size
+    )
     parts = []
     for prim in prims:
         columns = {
@@ -138,17 +148,20 @@ def _splats(path: Path, facts: dict[str, Any], output: IO[bytes]) -> SplatFile:
                 f"{path}: {prim['path']}: spherical harmonics of degree {prim['degree']} are cut "
                 f"off at {len(SH_COUNTS) - 1}"
             )
-        with np.errstate(over="ignore", invalid="ignore"):  # left out as infinite, and reported
-            places = columns["positions"].astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        turned = transformed_gaussians(gaussians, torch.from_numpy(matrix[:3, :3].copy()))
-        parts.append((places, turned))
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # infinite values are left out later, and reported
+            positions = columns["positions"].astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        placed_gaussians = transformed_gaussians(gaussians, torch.from_numpy(matrix[:3, :3].copy()))
+        parts.append((positions, placed_gaussians))
     return join_placed(parts, path, facts["notes"], problems)
 
 
 def _gaussians(columns: dict[str, np.ndarray], degree: int) -> Gaussians:
-    """The Gaussians of a prim in its axes, at 0; columns that it lacks have the default."""
-    count, each = len(columns["positions"]), (degree + 1) ** 2
-    kept = min(each, SH_COUNTS[-1])
+    """Return a prim's Gaussians in its axes with zero means; missing columns have the default."""
+    count = len(columns["positions"])
+    num_sh = (degree + 1) ** 2
+    num_kept_sh = min(num_sh, SH_COUNTS[-1])
 
     def values(name: str, rows: int) -> np.ndarray:
         if name in columns:
@@ -156,22 +169,27 @@ def _gaussians(columns: dict[str, np.ndarray], degree: int) -> Gaussians:
         return np.tile(np.array(ATTRIBUTES[name], np.float32), (rows, 1))
 
     if COEFFICIENTS in columns:
-        sh = columns[COEFFICIENTS].reshape(count, each, 3)[:, :kept]
+        sh = columns[COEFFICIENTS].reshape(count, num_sh, 3)[:, :num_kept_sh]
     else:
-        sh = values(COEFFICIENTS, count * kept).reshape(count, kept, 3)
-    ready = {
+        sh = values(COEFFICIENTS, count * num_kept_sh).reshape(count, num_kept_sh, 3)
+    arrays = {
         "quats": values("orientations", count)[:, [3, 0, 1, 2]],
         "scales": values("scales", count),
         "opacities": values("opacities", count).reshape(count),
         "sh": sh,
     }
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(v)) for name, v in ready.items()}
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(v)) for name, v in arrays.items()}
     return Gaussians(means=torch.zeros(count, 3), **tensors)
 
 
 def write_usd(path: str | Path, gaussians: Gaussians, *, is_upright: bool, is_metric: bool) -> None:
-    """Write a .usdc, atomically: one prim of floats. is_upright: z is up, which it then says.
-    is_metric: the unit is the metre, likewise.
+    """Write a .usdc with one prim of floats, atomically.
+
+    Args:
+        path: the file.
+        gaussians: the Gaussians.
+        is_upright: whether z is up; the file then says so.
+        is_metric: whether the unit is the metre; the file then says so.
     """
     pxr = _pxr()
     layer = pxr.Sdf.Layer.CreateAnonymous(".usdc")
@@ -186,24 +204,26 @@ def write_usd(path: str | Path, gaussians: Gaussians, *, is_upright: bool, is_me
     def numbers(tensor: torch.Tensor) -> np.ndarray:
         return np.ascontiguousarray(tensor.detach().cpu().numpy(), np.float32)
 
-    means, scales = numbers(gaussians.means), numbers(gaussians.scales)
-    turns = torch.nn.functional.normalize(gaussians.quats, dim=1)[:, [1, 2, 3, 0]]
-    reach = 3 * scales.max(axis=1, keepdims=True)  # of three standard deviations
-    extent = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
-    vectors, vt = pxr.Vt.Vec3fArray.FromNumpy, pxr.Vt
-    field.CreateExtentAttr(vectors(extent))
-    field.CreatePositionsAttr(vectors(means))
-    field.CreateScalesAttr(vectors(scales))
-    field.CreateOrientationsAttr(vt.QuatfArray.FromNumpy(numbers(turns)))
+    means = numbers(gaussians.means)
+    scales = numbers(gaussians.scales)
+    quats_xyzw = torch.nn.functional.normalize(gaussians.quats, dim=1)[:, [1, 2, 3, 0]]
+    radii = 3 * scales.max(axis=1, keepdims=True)  # three standard deviations
+    extent = np.stack([(means - radii).min(axis=0), (means + radii).max(axis=0)])
+    to_vectors = pxr.Vt.Vec3fArray.FromNumpy
+    vt = pxr.Vt
+    field.CreateExtentAttr(to_vectors(extent))
+    field.CreatePositionsAttr(to_vectors(means))
+    field.CreateScalesAttr(to_vectors(scales))
+    field.CreateOrientationsAttr(vt.QuatfArray.FromNumpy(numbers(quats_xyzw)))
     field.CreateOpacitiesAttr(vt.FloatArray.FromNumpy(numbers(gaussians.opacities)))
     field.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
     coefficients = numbers(gaussians.sh.reshape(-1, 3))
-    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vectors(coefficients))
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(to_vectors(coefficients))
     path = Path(path)
     with refusals_of(path):
         make_folder(path.parent)
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            made = Path(folder) / "a.usdc"
-            layer.Export(str(made))
-            with made.open("rb") as source, replaced_file(path) as file:
+            temporary_file = Path(folder) / "a.usdc"
+            layer.Export(str(temporary_file))
+            with temporary_file.open("rb") as source, replaced_file(path) as file:
                 shutil.copyfileobj(source, file)

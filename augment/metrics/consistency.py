@@ -1,16 +1,18 @@
-"""How well two views of one scene agree: the error of one warped into the other.
+"""Consistency of two views of one scene: the error of one warped into the other.
+
+In: two pictures with depth (`DepthView`). Out: `Consistency`. `climategs evaluate` calls it.
 
 Protocol. Every pixel of view A that the scene fills (alpha >= MIN_ALPHA) is a point of the world,
-by A's depth along the ray through the pixel's centre. The point is projected into view B. The
-pixel counts if all four pixels of B around that place are filled and have the point's depth within
-a tolerance: where they have not, something else stands before it, or the place lies on an edge,
-where depths are mixtures. B's colour there is bilinear. The error is the root of the mean square
-of the differences of display-encoded colours over all pixels that count and all three channels.
+by A's depth along the ray through the pixel's centre. The point is projected into view B. The pixel
+counts if all four pixels of B around that place are filled and have the point's depth within a
+tolerance. Where they have not, something else stands before it, or the place lies on an edge, where
+depths are mixtures. B's colour there is bilinear. The error is the root of the mean square of the
+differences of display-encoded colours over all pixels that count and all three channels.
 
 The world has to stand still between the two: render both at one time stamp, or say where A's points
 are when B is taken (`carry` computes it for the points of actors). The sky is not part of it.
-Warping is no exact inverse of rendering (bilinear colours, depths of blended surfaces, colours
-that truly depend on the direction), so the error of a perfect scene is small and not 0.
+Warping is no exact inverse of rendering (bilinear colours, depths of blended surfaces, colours that
+truly depend on the direction), so the error of a perfect scene is small and not 0.
 
 A linear map of colours scales the error with the contrast, consistent or not, which is why the
 error relative to the picture's own spread stands beside it. (Comparable figures of stylised scenes
@@ -43,15 +45,16 @@ _NEIGHBOURS = ((0, 0), (0, 1), (1, 0), (1, 1))  # offsets of the four pixels: ro
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """Picture and depth of a pinhole camera. picture: floats [H, W, 3], display-encoded, in [0, 1].
-    depth_m: z along the optical axis [H, W]. alpha [H, W]: in [0, 1]; depth counts where it is
-    high.
-    """
+    """Picture and depth of a pinhole camera."""
 
     camera: Camera
+    """The camera."""
     picture: np.ndarray
+    """Colours, floats [H, W, 3], display-encoded, 0 to 1."""
     depth_m: np.ndarray
+    """z along the optical axis, [H, W]."""
     alpha: np.ndarray
+    """Alpha, 0 to 1, [H, W]; depth counts where it is high."""
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)
@@ -66,37 +69,39 @@ class DepthView:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Agreement of two views. rmse: error over the pixels that count, NaN if none counts. spread:
-    standard deviation of A's colours over the same pixels, about each channel's mean. share:
-    fraction of A's pixels that count. noise: root mean square of the cameras' noise, which rmse and
-    spread do not include.
-    """
+    """Agreement of two views."""
 
     rmse: float
+    """Error over the pixels that count; NaN if none counts."""
     spread: float
+    """Standard deviation of A's colours over the same pixels, about each channel's mean."""
     share: float
+    """Fraction of A's pixels that count."""
     noise: float = 0.0
+    """Root mean square of the cameras' noise, which rmse and spread do not include."""
 
     @property
     def relative(self) -> float:
-        """Ratio of rmse to spread; NaN if the picture has one colour only."""
+        """Return the ratio of rmse to spread; NaN if the picture has one colour only."""
         return self.rmse / self.spread if self.spread > 0 else math.nan
 
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Places in view B of the pixels of view A. counts: bool [H, W], the pixels of A that count.
-    columns, rows: float64 [K], the places in B of these K pixels, in A's order, pixels from the
-    centre of B's first pixel.
-    """
+    """Places in view B of the pixels of view A."""
 
     counts: np.ndarray
+    """Pixels of A that count, bool [H, W]."""
     columns: np.ndarray
+    """Columns in B of these K pixels, float64 [K], in A's order, pixels from the centre of B's
+    first pixel."""
     rows: np.ndarray
+    """Rows in B of these pixels, float64 [K]."""
 
     def sample(self, image: np.ndarray) -> np.ndarray:
-        """An image of B's [Hb, Wb, C] as A would see it, float64 [H, W, C]: bilinear, and 0 where A
-        does not count.
+        """Return an image of B's [Hb, Wb, C] as A would see it, float64 [H, W, C].
+
+        It is bilinear, and 0 where A does not count.
         """
         c0 = np.floor(self.columns).astype(np.int64)
         r0 = np.floor(self.rows).astype(np.int64)
@@ -112,16 +117,20 @@ class Warp:
 
 
 def warped_consistency(a: DepthView, b: DepthView) -> Consistency:
-    """The error of view B warped into view A, by the module's protocol."""
+    """Return the error of view B warped into view A, by the module's protocol."""
     return consistency_of(a, *warp_view(a, b))
 
 
 def consistency_of(
     a: DepthView, warped: np.ndarray, counts: np.ndarray, noise: np.ndarray | None = None
 ) -> Consistency:
-    """The error of a warped picture [H, W, 3] against A's own over some pixels, bool [H, W].
+    """Return the error of a warped picture against A's own over some pixels.
 
-    noise: [H, W, 2], expected squares of independent noise in A and in the warped picture.
+    Args:
+        a: view A.
+        warped: the warped picture, [H, W, 3].
+        counts: pixels that count, bool [H, W].
+        noise: expected squares of independent noise in A and in the warped picture, [H, W, 2].
     """
     share = float(counts.mean())
     if not counts.any():
@@ -135,17 +144,29 @@ def consistency_of(
 
 
 def warp_view(a: DepthView, b: DepthView) -> tuple[np.ndarray, np.ndarray]:
-    """B's picture as A would see it, float64 [H, W, 3], and where it counts, bool [H, W]; 0 where
-    it does not. Raises ValueError: a camera is orthographic.
+    """Return B's picture as A would see it, float64 [H, W, 3], and the pixels that count, bool [H,
+    W].
+
+    The picture is 0 where pixels do not count.
+
+    Raises:
+        ValueError: a camera is orthographic.
     """
     warp = find_warp(a, b)
     return warp.sample(b.picture), warp.counts
 
 
 def find_warp(a: DepthView, b: DepthView, points_m: np.ndarray | None = None) -> Warp:
-    """Return the pixels of A that count and their places in B. points_m: float64 [H, W, 3],
-    positions in the world of A's surfaces when B is taken; NaN where not known (such pixels do not
-    count). None takes the positions when A is taken. Raises ValueError: a camera is orthographic.
+    """Return the pixels of A that count and their places in B.
+
+    Args:
+        a: view A.
+        b: view B.
+        points_m: positions in the world of A's surfaces when B is taken, float64 [H, W, 3]; NaN
+            where not known (such pixels do not count). None takes the positions when A is taken.
+
+    Raises:
+        ValueError: a camera is orthographic.
     """
     points = world_points(a) if points_m is None else points_m
     column, row, depth_m = _places(points, b.camera)
@@ -171,8 +192,12 @@ def find_warp(a: DepthView, b: DepthView, points_m: np.ndarray | None = None) ->
 
 
 def world_points(view: DepthView) -> np.ndarray:
-    """The surface that each pixel shows, float64 [H, W, 3], world; the camera's centre where depth
-    is not finite. Raises ValueError: the camera is orthographic.
+    """Return the surface that each pixel shows, float64 [H, W, 3], world.
+
+    It is the camera's centre where depth is not finite.
+
+    Raises:
+        ValueError: the camera is orthographic.
     """
     rays = view.camera.ray_directions(torch.float64).numpy()
     depth = np.where(np.isfinite(view.depth_m), view.depth_m, 0.0)[..., None]
@@ -180,8 +205,11 @@ def world_points(view: DepthView) -> np.ndarray:
 
 
 def _places(world: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project points [H, W, 3] of the world into a camera's picture. Returns column and row, pixels
-    from the first pixel's centre, and depth, metres; float64 [H, W] each.
+    """Project points [H, W, 3] of the world into a camera's picture.
+
+    Returns:
+        Column and row, pixels from the first pixel's centre, and depth, metres; float64 [H, W]
+        each.
     """
     pose = camera.camera_from_world.numpy()
     x, y, z = np.moveaxis(world @ pose[:3, :3].T + pose[:3, 3], -1, 0)
@@ -193,17 +221,17 @@ def _places(world: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, 
     )
 
 
-# ---- Where things inside labelled boxes go from the time of one picture to that of another -------
+# ---- Motion of things inside labelled boxes between the times of two pictures --------------------
 # A box is a rigid body. Its pose at a picture's own time is linear in position and slerp in
 # rotation between the labels before and after, as the renderer poses actors. A pixel shows a box by
 # the rule of `augment.boxes`. From picture A to picture B a pixel of a box that moves goes along
 # with it. Left out are: pixels of a moving box whose pose is not known at one of the two times;
-# pixels that show two of them; and, in both pictures, what else lies within MARGIN_M of a moving
-# box: the road under a car, which has its shadow, its own parts that reach beyond the label,
-# blurred edges. Boxes that move less than STILL_M between the two times stand, and what they hold
-# is the world's. A pose is known from HOLD_NS before a track's first label to as long after its
-# last, and not within gaps of more than MAX_GAP_NS. A box whose nearest label is further away than
-# that is not there.
+# pixels that show two moving boxes; and, in both pictures, other pixels within MARGIN_M of a moving
+# box: the road under a car, which has its shadow, parts of the car that reach beyond the label, and
+# blurred edges. Boxes that move less than STILL_M between the two times stand still, and their
+# content belongs to the world. A pose is known from HOLD_NS before a track's first label to as long
+# after its last, and not within gaps of more than MAX_GAP_NS. A box whose nearest label is further
+# away than that is not there.
 
 MARGIN_M = 0.5  # width of the strip around a moving box that is left out, metres
 # Labels of parked cars tremble, and the tolerance of depths is larger than this.
@@ -214,19 +242,23 @@ MAX_GAP_NS = 600_000_000  # longest time between labels, as some datasets label 
 
 @dataclass(frozen=True, eq=False)
 class PosedBox:
-    """A box at one time. world_from_box: float64 [4, 4]. size_m: float64 [3]. known: false where
-    the pose is that of the label nearest in time. restless: true if the box moves between that
-    label and the next one; false where the pose is known.
-    """
+    """A box at one time."""
 
     world_from_box: np.ndarray
+    """Pose, float64 [4, 4]."""
     size_m: np.ndarray
+    """Length, width and height, float64 [3]."""
     known: bool
+    """False where the pose is that of the label nearest in time."""
     restless: bool
+    """True if the box moves between that label and the next one; False where the pose is known."""
 
 
 class ActorPaths:
-    """Poses of a drive's boxes at any time. Boxes whose numbers are not finite are left out."""
+    """Poses of a drive's boxes at any time.
+
+    Boxes whose numbers are not finite are left out.
+    """
 
     def __init__(self, frames: Mapping[int, FrameBoxes]) -> None:
         times: dict[str, list[int]] = {}
@@ -252,7 +284,7 @@ class ActorPaths:
         }
 
     def at(self, timestamp_ns: int) -> dict[str, PosedBox]:
-        """Return the boxes of that time, by their track ids."""
+        """Return the boxes at a time, by their track ids."""
         boxes = {}
         for name, track in self._tracks.items():
             gaps_ns = np.abs(self._times[name] - timestamp_ns)
@@ -273,23 +305,33 @@ class ActorPaths:
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """Positions of A's surfaces when B is taken. points_m: float64 [H, W, 3], world, NaN where not
-    known. moved: bool [H, W], pixels of A that go along with a box. unclear_b: bool [H, W], pixels
-    of B that are left out.
-    """
+    """Positions of A's surfaces when B is taken."""
 
     points_m: np.ndarray
+    """Positions, float64 [H, W, 3], world; NaN where not known."""
     moved: np.ndarray
+    """Pixels of A that go along with a box, bool [H, W]."""
     unclear_b: np.ndarray
+    """Pixels of B that are left out, bool [H, W]."""
 
 
 def carry(
     paths: ActorPaths, a: DepthView, b: DepthView, is_actor: np.ndarray | None = None
 ) -> Carried:
-    """Return the positions of A's surfaces when B is taken. Cameras are in the world of the boxes.
-    is_actor: bool [H, W], pixels of A that are known to show an actor. Those outside of every box
-    are left out, as their motion is not known (the recording car's own bonnet, for example). Raises
-    ValueError: a camera is orthographic.
+    """Return the positions of A's surfaces when B is taken.
+
+    Cameras are in the world of the boxes.
+
+    Args:
+        paths: poses of the boxes.
+        a: view A.
+        b: view B.
+        is_actor: pixels of A that are known to show an actor, bool [H, W]. Those outside of every
+            box are left out, as their motion is not known (the recording car's own bonnet, for
+            example).
+
+    Raises:
+        ValueError: a camera is orthographic.
     """
     points = world_points(a)
     at_a = paths.at(a.camera.timestamp_ns)
@@ -331,7 +373,7 @@ def _distance(a: np.ndarray, b: np.ndarray, size_m: np.ndarray) -> float:
 
 
 def _around(boxes: Sequence[PosedBox], view: DepthView) -> np.ndarray:
-    """Return the pixels that lie within MARGIN_M of a box and outside of all, bool [H, W]."""
+    """Return the pixels within MARGIN_M of a box and outside of all boxes, bool [H, W]."""
     mask = np.zeros(view.depth_m.shape, bool)
     for _, rows, columns in _shown(boxes, view, MARGIN_M):
         mask[rows, columns] = True
@@ -349,7 +391,7 @@ def _inside(boxes: Sequence[PosedBox], view: DepthView) -> np.ndarray:
 def _shown(
     boxes: Sequence[PosedBox], view: DepthView, margin_m: float = 0.0
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Yield as `shown_pixels` the pixels of boxes that have a margin on all sides."""
+    """Yield the pixels of boxes as `shown_pixels`, with a margin on all sides."""
     if not boxes:
         return iter(())
     poses = torch.from_numpy(np.stack([box.world_from_box for box in boxes]))
@@ -371,7 +413,7 @@ def _shown(
 
 
 def _finite_boxes(boxes: Boxes) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Track, size [3] and world_from_box [4, 4] of every box whose numbers can be used."""
+    """Yield track, size [3] and world_from_box [4, 4] of every box whose numbers are usable."""
     placed_boxes = PlacedBoxes.of(boxes, np.zeros(3))
     poses = rigid(
         torch.from_numpy(placed_boxes.rotations), torch.from_numpy(placed_boxes.centres_m)
@@ -381,4 +423,5 @@ def _finite_boxes(boxes: Boxes) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _inverse(pose: np.ndarray) -> np.ndarray:
+    """Return the inverse of a pose."""
     return invert_rigid(torch.from_numpy(pose)).numpy()

@@ -1,8 +1,8 @@
-"""How far a picture is from the one it should be: PSNR, SSIM, FLIP; and errors of depth.
+"""Error of a picture against its reference (PSNR, SSIM, FLIP), and errors of depth.
 
 Pictures are display-encoded RGB [H, W, 3]: uint8, or floats in [0, 1]; both arguments may differ in
-that. `weight` [H, W], bool or >= 0, says how much a pixel counts; where it is 0 the picture is
-taken to be right, so that what is left out does not disturb its neighbours either.
+that. `weight` [H, W], bool or >= 0, is the weight of each pixel. Where it is 0, the picture is
+replaced by the reference, so that pixels that are left out do not disturb their neighbours either.
 """
 
 from __future__ import annotations
@@ -22,8 +22,12 @@ CLOSE_M = 0.05  # largest error of a depth that counts as close, metres
 
 
 def psnr(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio, dB: 10 log10(1 / mean squared error); infinite where equal.
-    Raises ValueError: shapes, types or values are not as this module says, or no pixel counts.
+    """Return the peak signal-to-noise ratio, dB: 10 log10(1 / mean squared error).
+
+    It is infinite for equal pictures.
+
+    Raises:
+        ValueError: shapes, types or values are not as this module says, or no pixel counts.
     """
     a, b, w = _pair(picture, reference, weight)
     error = ((a - b) ** 2).mean(axis=2)
@@ -32,19 +36,25 @@ def psnr(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None =
 
 
 def ssim(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Structural similarity (Wang et al. 2004), averaged over the picture and its channels. An
-    11x11 Gaussian window of sigma 1.5 on each colour channel, C1 = 0.01^2, C2 = 0.03^2, range 1. As
-    in 3D Gaussian Splatting (Kerbl et al. 2023) every pixel counts, and outside the picture all is
-    0. That lifts the score of pixels near the border slightly against Wang's valid windows. Raises
-    ValueError: as psnr.
+    """Return the structural similarity (Wang et al. 2004), averaged over the picture and its
+    channels.
+
+    An 11x11 Gaussian window of sigma 1.5 on each colour channel, C1 = 0.01^2, C2 = 0.03^2, range 1.
+    As in 3D Gaussian Splatting (Kerbl et al. 2023) every pixel counts, and outside the picture all
+    is 0. That lifts the score of pixels near the border slightly against Wang's valid windows.
+
+    Raises:
+        ValueError: as psnr.
     """
     a, b, w = _pair(picture, reference, weight)
     return float(np.average(_ssim_map(a, b), weights=w))
 
 
 def flip(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Mean of `flip_map`: 0 is the same picture, 1 as different as can be. Raises ValueError: as
-    psnr.
+    """Return the mean of `flip_map`: 0 for equal pictures, 1 for the largest difference.
+
+    Raises:
+        ValueError: as psnr.
     """
     w = None if weight is None else _checked_weight(weight, np.shape(reference)[:2])
     error = flip_map(picture, reference, weight).astype(np.float64)
@@ -54,8 +64,12 @@ def flip(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None =
 def flip_map(
     picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None
 ) -> np.ndarray:
-    """float32 [H, W]: the difference a person sees when the two alternate (Andersson et al. 2020).
-    LDR-FLIP of the authors' own package, seen at PIXELS_PER_DEGREE. Raises ValueError: as psnr.
+    """Return the difference a person sees when the two alternate, float32 [H, W].
+
+    This is LDR-FLIP (Andersson et al. 2020) by the authors' own package, at PIXELS_PER_DEGREE.
+
+    Raises:
+        ValueError: as psnr.
     """
     from flip_evaluator import evaluate
 
@@ -73,25 +87,36 @@ def flip_map(
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Errors of depth over a number of pixels; NaN where there are none. median_m, p90_m: quantiles
-    of |depth - true|, metres: the smallest error that at least this part of the weight does not
-    exceed. abs_rel: mean of |depth - true| / true. within_5cm: part of the weight whose error is at
-    most CLOSE_M, in [0, 1].
+    """Errors of depth over a number of pixels; NaN where there are none.
+
+    Quantiles are the smallest error that at least this part of the weight does not exceed.
     """
 
     pixels: int
+    """Number of pixels."""
     median_m: float
+    """Median of |depth - true|, metres."""
     p90_m: float
+    """90 % quantile of |depth - true|, metres."""
     abs_rel: float
+    """Mean of |depth - true| / true."""
     within_5cm: float
+    """Part of the weight whose error is at most CLOSE_M, 0 to 1."""
 
 
 def depth_errors(
     depth_m: np.ndarray, true_m: np.ndarray, weight: np.ndarray | None = None
 ) -> DepthErrors:
-    """Errors of depths against true ones, metres, arrays of one shape; weight >= 0 of that shape.
-    Pixels of weight 0 are left out, whatever they hold. Raises ValueError: shapes differ, or a
-    pixel that counts has no finite depth or no true depth > 0.
+    """Return errors of depths against true ones.
+
+    Args:
+        depth_m: depths, metres.
+        true_m: true depths, metres, of the same shape.
+        weight: weights >= 0 of that shape; pixels of weight 0 are left out, whatever they hold.
+            None gives all the same weight.
+
+    Raises:
+        ValueError: shapes differ, or a pixel that counts has no finite depth or no true depth > 0.
     """
     depth = np.asarray(depth_m, np.float64)
     true = np.asarray(true_m, np.float64)
@@ -121,6 +146,7 @@ def depth_errors(
 
 
 def _quantile(values: np.ndarray, weight: np.ndarray, part: float) -> float:
+    """Return the smallest value that at least a part of the weight does not exceed."""
     order = np.argsort(values, kind="stable")
     weight_sums = np.cumsum(weight[order])
     # Sums of weights round: an exact half must count as reached.
@@ -129,7 +155,7 @@ def _quantile(values: np.ndarray, weight: np.ndarray, part: float) -> float:
 
 
 def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """float64 [H, W]: mean over the channels of [H, W, 3]."""
+    """Return the mean of SSIM over the channels of pictures [H, W, 3], float64 [H, W]."""
     offsets = np.arange(WINDOW) - WINDOW // 2
     window = np.exp(-(offsets**2) / (2 * SIGMA**2))
     window /= window.sum()
@@ -153,8 +179,10 @@ def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _pair(
     picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return picture, reference and weight. Both pictures are float64 in [0, 1]; where the weight
-    is 0, the picture has the reference's colours.
+    """Return picture, reference and weight.
+
+    Both pictures are float64 in [0, 1]; where the weight is 0, the picture has the reference's
+    colours.
     """
     a = _unit("picture", picture)
     b = _unit("reference", reference)
@@ -169,6 +197,7 @@ def _pair(
 
 
 def _unit(name: str, image: np.ndarray) -> np.ndarray:
+    """Return a picture as float64 in [0, 1]; raises ValueError for other types and values."""
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise ValueError(f"{name} must be [H, W, 3] with H, W >= 1; got {list(image.shape)}")
@@ -184,6 +213,7 @@ def _unit(name: str, image: np.ndarray) -> np.ndarray:
 
 
 def _checked_weight(weight: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the weight as float64; raises ValueError unless it fits the image."""
     w = np.asarray(weight, np.float64)
     if w.shape != tuple(shape):
         raise ValueError(f"weight must be {list(shape)}, as the image; got {list(w.shape)}")

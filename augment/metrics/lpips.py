@@ -1,8 +1,8 @@
-"""LPIPS: how different two pictures look, by the features of a network (Zhang et al. 2018).
+"""LPIPS: perceptual difference of two pictures, by the features of a network (Zhang et al. 2018).
 
-Version 0.1 of the metric, on AlexNet or VGG-16. The networks are described here and their weights
-come from files that the user has: nothing is downloaded. Which network a file is for is told from
-its first convolution.
+This is version 0.1 of the metric, on AlexNet or VGG-16. The networks are described here, and their
+weights come from files that the user has: nothing is downloaded. The first convolution in a file
+shows which network it is for.
 
     heads v0.1     d = sum over layers of the mean over pixels of  w . (f(a) - f(b))^2
     f              the layer's features, each pixel's vector divided by its length
@@ -31,26 +31,34 @@ _MIN_LENGTH = 1e-10  # length added to that of a feature vector, so that a zero 
 
 @dataclass(frozen=True)
 class Conv:
-    """A convolution followed by a ReLU. index: its number among torchvision's `features`."""
+    """A convolution followed by a ReLU."""
 
     index: int
+    """Its number among torchvision's `features`."""
     channels: int
+    """Number of its outputs."""
     kernel: int = 3
+    """Side of its kernel."""
     stride: int = 1
+    """Its stride."""
     padding: int = 1
+    """Its padding."""
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """slices: convolutions whose last output is compared, one slice after the other. pools: the
-    slices that begin with a max pooling of `pool_px` and stride 2. min_px: the smallest side.
-    """
+    """Convolutions of a network."""
 
     name: str
+    """Name of the network."""
     slices: tuple[tuple[Conv, ...], ...]
+    """Convolutions whose last output is compared, one slice after the other."""
     pools: tuple[int, ...]
+    """Slices that begin with a max pooling of stride 2."""
     pool_px: int
+    """Side of these poolings."""
     min_px: int
+    """Smallest side of a picture."""
 
 
 ALEX = Architecture(
@@ -82,7 +90,12 @@ VGG16 = Architecture(
 
 
 class Lpips:
-    """LPIPS of one network. weights: by the names of `expected_shapes`, float32."""
+    """LPIPS of one network.
+
+    Args:
+        architecture: the network.
+        weights: tensors by the names of `expected_shapes`, float32.
+    """
 
     def __init__(self, architecture: Architecture, weights: Mapping[str, Tensor]) -> None:
         self.architecture = architecture
@@ -93,8 +106,10 @@ class Lpips:
     def __call__(
         self, a: Float[Tensor, "B 3 H W"], b: Float[Tensor, "B 3 H W"]
     ) -> Float[Tensor, " B"]:
-        """The distance of each pair of display-encoded pictures in [0, 1]; 0 for equal ones. Raises
-        ValueError: shapes differ, or the pictures are too small for the network.
+        """Return the distance of each pair of display-encoded pictures in [0, 1]; 0 for equal ones.
+
+        Raises:
+            ValueError: shapes differ, or the pictures are too small for the network.
         """
         min_px = self.architecture.min_px
         if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < min_px:
@@ -110,6 +125,7 @@ class Lpips:
         return total
 
     def _features(self, pictures: Tensor) -> list[Tensor]:
+        """Return the features of pictures, one tensor for each slice."""
         shift, scale = (torch.tensor(channels)[:, None, None] for channels in (SHIFT, SCALE))
         x = (2 * pictures.float() - 1 - shift) / scale
         features = []
@@ -126,9 +142,17 @@ class Lpips:
 def picture_lpips(
     network: Lpips, picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None
 ) -> float:
-    """The distance of two display-encoded pictures, floats [H, W, 3] in [0, 1]. weight: bool [H,
-    W]; where it is false the picture is taken to be the reference, so those pixels add nothing of
-    their own. The mean stays one over the whole picture. Raises ValueError: as Lpips.
+    """Return the distance of two display-encoded pictures.
+
+    Args:
+        network: the metric.
+        picture: floats [H, W, 3] in [0, 1].
+        reference: floats [H, W, 3] in [0, 1].
+        weight: bool [H, W]; where it is False the picture is replaced by the reference, so those
+            pixels add nothing of their own. The mean stays one over the whole picture.
+
+    Raises:
+        ValueError: as Lpips.
     """
     if weight is not None:
         picture = np.where(weight[..., None], picture, reference)
@@ -140,12 +164,18 @@ def picture_lpips(
 
 
 def load_lpips(weights: Path, heads: Path | None = None) -> Lpips:
-    """LPIPS with weights from files: `.safetensors`, or state dicts that torch saved (.pth).
-    weights: the state dict of a whole `lpips.LPIPS(net="alex")` or `"vgg"` (`net.slice1.0.weight`,
-    ..., `lin0.model.1.weight`, ...); or, with `heads`, torchvision's `alexnet` or `vgg16`
-    (`features.0.weight`, ...; its classifier is left out). heads: LPIPS's own file of linear heads
-    (`lin0.model.1.weight`, ...), version 0.1. Raises MetricError: no such file, not one of these
-    kinds, or tensors that are missing, of another shape or dtype, or not finite; says which.
+    """Return LPIPS with weights from files: `.safetensors`, or state dicts that torch saved (.pth).
+
+    Args:
+        weights: the state dict of a whole `lpips.LPIPS(net="alex")` or `"vgg"`
+            (`net.slice1.0.weight`, ..., `lin0.model.1.weight`, ...); or, with `heads`,
+            torchvision's `alexnet` or `vgg16` (`features.0.weight`, ...; its classifier is left
+            out).
+        heads: LPIPS's own file of linear heads (`lin0.model.1.weight`, ...), version 0.1.
+
+    Raises:
+        MetricError: no such file, not one of these kinds, or tensors that are missing, of another
+            shape or dtype, or not finite; says which.
     """
     tensors = read_state_dict(weights, MetricError)
     file_of_name = dict.fromkeys(tensors, weights)
@@ -174,7 +204,7 @@ def load_lpips(weights: Path, heads: Path | None = None) -> Lpips:
 
 
 def expected_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
-    """The tensors of the whole metric, by the names that `lpips.LPIPS` gives them."""
+    """Return the shapes of the metric's tensors, by the names that `lpips.LPIPS` gives them."""
     shapes: dict[str, tuple[int, ...]] = {}
     channels = 3
     for number, convs in enumerate(architecture.slices):
@@ -188,23 +218,32 @@ def expected_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
 
 
 def _names(number: int, conv: Conv) -> tuple[str, str]:
+    """Return the names of a convolution's weight and bias."""
     base = f"net.slice{number + 1}.{conv.index}"
     return f"{base}.weight", f"{base}.bias"
 
 
 def _head(number: int) -> str:
+    """Return the name of a slice's linear head."""
     return f"lin{number}.model.1.weight"
 
 
 def _torchvision_name(name: str) -> str:
+    """Return the name that torchvision gives a tensor."""
     return f"features.{name.split('.', 2)[2]}" if name.startswith("net.") else name
 
 
 def _normalised(features: Tensor) -> Tensor:
+    """Return features with each pixel's vector divided by its length."""
     return features / (features.square().sum(1, keepdim=True).sqrt() + _MIN_LENGTH)
 
 
 def _recognised(tensors: Mapping[str, Tensor], path: Path) -> Architecture:
+    """Return the architecture of the tensors of a file.
+
+    Raises:
+        MetricError: they are of no known network.
+    """
     first_conv = tensors.get("net.slice1.0.weight", tensors.get("features.0.weight"))
     for architecture in (ALEX, VGG16):
         expected_shape = expected_shapes(architecture)["net.slice1.0.weight"]
@@ -219,6 +258,11 @@ def _recognised(tensors: Mapping[str, Tensor], path: Path) -> Architecture:
 
 
 def _checked(tensor: Tensor | None, name: str, shape: tuple[int, ...], path: Path) -> Tensor:
+    """Return a tensor as float32.
+
+    Raises:
+        MetricError: it is missing, of another shape or dtype, or not finite.
+    """
     if tensor is None:
         hint = ". The linear heads have a file of their own: name it too" * name.startswith("lin")
         raise MetricError(f"{path} lacks {name}, a tensor {list(shape)}{hint}")

@@ -1,5 +1,7 @@
-"""Numba kernels of a fit: the image and depth loss with its derivatives, the sky's gradient, Adam
-on the splats that a view touched, and the forces on whole parts.
+"""Numba kernels of a fit, called by `loss`, `splats` and `trainer`.
+
+They compute the image and depth loss with its derivatives, the sky's gradient, Adam's step on the
+splats of a view, the forces on whole parts, and the pixels per metre at each splat.
 """
 
 from __future__ import annotations
@@ -28,64 +30,86 @@ from augment.render.cpu.project import write_basis
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at
 from augment.render.layout import BLOCK, LANES, U
 
-# ---- A sky that is learnt: a cube map's colours behind a view, and their gradient ----------------
-# The lookup is `augment.sky.sample_within_faces`, bilinear and clamped at the edge of a face. What
-# it found is kept (texel, fractions): the backward pass reuses it.
+# ---- The learnt sky: a cube map's colours behind a view, and their gradient ----------------------
+# The lookup is `augment.sky.sample_within_faces`, bilinear and clamped at the edge of a face. Its
+# texel and fractions are stored for the backward pass.
 
-PARTS = 4  # gradients are summed in as many copies of the cube map, whatever the threads
-BAND = 8  # image rows at a time; part p sums bands p, p + PARTS, ... so that all see as much sky
+PARTS = 4  # copies of the cube map in which gradients are summed, for any number of threads
+# Image rows of a band. Part p sums bands p, p + PARTS, ..., so that all have as much sky.
+BAND = 8
 UNSEEN = -1  # texel of a pixel whose sky was not looked up
 
 
 @kernel
-def sample_sky(alpha, faces, rotation, intrinsics, least, colors, texels, fractions):
-    """The sky's colour at every pixel through which at least `least` of it is seen, else black.
+def sample_sky(alpha, faces, rotation, intrinsics, min_transmittance, colors, texels, fractions):
+    """Look up the sky's colour at every pixel with a transmittance of at least a limit; else black.
 
-    alpha [H, W]. faces [6, R, R, 3]. rotation: world_from_camera [3, 3]. intrinsics: 1 / fx,
-    1 / fy, cx, cy. All float32. Written: colors [3, H, >= W], texels int32 [H, W] (flat index of
-    the upper left of four texels, or UNSEEN), fractions [2, H, W] (column, row).
+    All inputs are float32.
+
+    Args:
+        alpha: [H, W].
+        faces: [6, R, R, 3].
+        rotation: world_from_camera [3, 3].
+        intrinsics: 1 / fx, 1 / fy, cx, cy.
+        min_transmittance: the smallest 1 - alpha of a lookup.
+        colors: written, [3, H, >= W].
+        texels: written, int32 [H, W], flat index of the upper left of four texels, or UNSEEN.
+        fractions: written, [2, H, W], position between the texels (column, row).
     """
     height, width = alpha.shape
     size = faces.shape[1]
-    half, one, zero = np.float32(0.5), np.float32(1), np.float32(0)
+    half = np.float32(0.5)
+    one = np.float32(1)
+    zero = np.float32(0)
     last = np.float32(size - 1)
     scale = np.float32(size) * half
-    ifx, ify, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    inverse_fx = intrinsics[0]
+    inverse_fy = intrinsics[1]
+    cx = intrinsics[2]
+    cy = intrinsics[3]
     for band in prange((height + BAND - 1) // BAND):
         for i in range(band * BAND, min((band + 1) * BAND, height)):
-            v = (np.float32(i) + half - cy) * ify
+            v = (np.float32(i) + half - cy) * inverse_fy
             bx = rotation[0, 1] * v + rotation[0, 2]
             by = rotation[1, 1] * v + rotation[1, 2]
             bz = rotation[2, 1] * v + rotation[2, 2]
             for j in range(width):
-                if one - alpha[i, j] < least:
+                if one - alpha[i, j] < min_transmittance:
                     texels[i, j] = UNSEEN
                     for c in range(3):
                         colors[c, i, j] = zero
                     continue
-                u = (np.float32(j) + half - cx) * ifx
+                u = (np.float32(j) + half - cx) * inverse_fx
                 x = rotation[0, 0] * u + bx
                 y = rotation[1, 0] * u + by
                 z = rotation[2, 0] * u + bz
-                ax, ay, az = abs(x), abs(y), abs(z)
+                ax = abs(x)
+                ay = abs(y)
+                az = abs(z)
                 if ax >= ay and ax >= az:
-                    major, t = ax, -y
+                    major = ax
+                    t = -y
                     face = 0 if x >= 0 else 1
                     s = -z if x >= 0 else z
                 elif ay >= az:
-                    major, s = ay, x
+                    major = ay
+                    s = x
                     face = 2 if y >= 0 else 3
                     t = z if y >= 0 else -z
                 else:
-                    major, t = az, -y
+                    major = az
+                    t = -y
                     face = 4 if z >= 0 else 5
                     s = x if z >= 0 else -x
                 inverse = scale / major
                 column = min(max(s * inverse + scale - half, zero), last)
                 row = min(max(t * inverse + scale - half, zero), last)
-                c0, r0 = int(column), int(row)
-                c1, r1 = min(c0 + 1, size - 1), min(r0 + 1, size - 1)
-                fc, fr = column - np.float32(c0), row - np.float32(r0)
+                c0 = int(column)
+                r0 = int(row)
+                c1 = min(c0 + 1, size - 1)
+                r1 = min(r0 + 1, size - 1)
+                fc = column - np.float32(c0)
+                fr = row - np.float32(r0)
                 texels[i, j] = (face * size + r0) * size + c0
                 fractions[0, i, j] = fc
                 fractions[1, i, j] = fr
@@ -97,13 +121,19 @@ def sample_sky(alpha, faces, rotation, intrinsics, least, colors, texels, fracti
 
 @kernel
 def scatter_sky(d_rgb, alpha, texels, fractions, size, parts, touched):
-    """Add the gradient of every texel seen to the parts' sums.
+    """Add the gradient of every visible texel to the parts' sums.
 
-    d_rgb [H, W, 3]: gradient of the composited picture before the colour map. size: R. parts
-    float32 [PARTS, texels, 3] and touched uint8 [PARTS, >= texels]: zero before the first call.
+    Args:
+        d_rgb: [H, W, 3], gradient of the composited picture before the colour map.
+        alpha: [H, W].
+        texels, fractions: from `sample_sky`.
+        size: R.
+        parts: float32 [PARTS, texels, 3], zero before the first call.
+        touched: uint8 [PARTS, >= texels], zero before the first call.
     """
     height, width = alpha.shape
-    one, zero = np.float32(1), np.float32(0)
+    one = np.float32(1)
+    zero = np.float32(0)
     bands = (height + BAND - 1) // BAND
     for part in prange(PARTS):
         for band in range(part, bands, PARTS):
@@ -118,32 +148,40 @@ def scatter_sky(d_rgb, alpha, texels, fractions, size, parts, touched):
                     blue = transmittance * d_rgb[i, j, 2]
                     if red == zero and green == zero and blue == zero:
                         continue
-                    fc, fr = fractions[0, i, j], fractions[1, i, j]
+                    fc = fractions[0, i, j]
+                    fr = fractions[1, i, j]
                     for corner in range(4):
-                        right, below = corner & 1, corner >> 1
+                        right = corner & 1
+                        below = corner >> 1
                         weight = (fc if right else one - fc) * (fr if below else one - fr)
                         if weight == zero:  # also where the neighbour lies beyond the face
                             continue
-                        at = texel + right + below * size
-                        touched[part, at] = 1
-                        parts[part, at, 0] += weight * red
-                        parts[part, at, 1] += weight * green
-                        parts[part, at, 2] += weight * blue
+                        corner_texel = texel + right + below * size
+                        touched[part, corner_texel] = 1
+                        parts[part, corner_texel, 0] += weight * red
+                        parts[part, corner_texel, 1] += weight * green
+                        parts[part, corner_texel, 2] += weight * blue
 
 
 @serial_kernel
 def gather_sky(parts, touched, words, texels, grads):
     """Sum the parts, in order, into a list of the touched texels; clear what was touched.
 
-    words: `touched` seen as uint64 [PARTS, ...], to pass over what was not. Returns the count of
-    entries written to texels (increasing) and grads [..., 3].
+    Args:
+        parts, touched: from `scatter_sky`.
+        words: `touched` viewed as uint64 [PARTS, ...], to skip untouched texels quickly.
+        texels: written, int32, increasing.
+        grads: written, float32 [..., 3].
+
+    Returns:
+        The number of entries written.
     """
     count = 0
     for word in range(words.shape[1]):
-        anything = np.uint64(0)
+        touched_bits = np.uint64(0)
         for part in range(PARTS):
-            anything |= words[part, word]
-        if anything == np.uint64(0):
+            touched_bits |= words[part, word]
+        if touched_bits == np.uint64(0):
             continue
         for texel in range(word * 8, word * 8 + 8):
             is_touched = False
@@ -158,7 +196,9 @@ def gather_sky(parts, touched, words, texels, grads):
                         parts[part, texel, c] = np.float32(0)
             if is_touched:
                 texels[count] = texel
-                grads[count, 0], grads[count, 1], grads[count, 2] = red, green, blue
+                grads[count, 0] = red
+                grads[count, 1] = green
+                grads[count, 2] = blue
                 count += 1
         for part in range(PARTS):
             words[part, word] = np.uint64(0)
@@ -167,32 +207,40 @@ def gather_sky(parts, touched, words, texels, grads):
 
 # ---- Numba kernel of the loss against depth priors -----------------------------------------------
 
-CHUNK = 4096  # priors summed at a time
+CHUNK = 4096  # priors of one sum
 
 
 @kernel
 def compare_depth(expected, alpha, pixels, depth, weight, factor, min_alpha, d_expected, sums):
-    """Sum of weight |1/expected - 1/depth| over the priors, and its derivative.
+    """Sum weight |1/expected - 1/depth| over the priors, and compute its derivative.
 
-    expected, alpha, d_expected: flat [H, W]; d_expected must be 0 and gets factor times the
-    derivative. pixels, depth, weight: the priors. Pixels with alpha <= min_alpha count nothing.
-    sums: float64, one per CHUNK of priors; -1 where a pixel lies outside of the image or the order
-    does not increase.
+    Pixels with alpha <= min_alpha do not count.
+
+    Args:
+        expected, alpha: flat [H, W].
+        pixels, depth, weight: the priors, [M].
+        factor: factor of the derivative.
+        min_alpha: see above.
+        d_expected: written, flat [H, W]; must be 0.
+        sums: written, float64, one sum for each CHUNK of priors; -1 where a pixel lies outside of
+            the
+            image or the order does not increase.
     """
-    one, zero = np.float32(1), np.float32(0)
+    one = np.float32(1)
+    zero = np.float32(0)
     for chunk in prange(sums.size):
         total = 0.0
-        before = pixels[chunk * CHUNK - 1] if chunk else np.int32(-1)
+        previous_pixel = pixels[chunk * CHUNK - 1] if chunk else np.int32(-1)
         for k in range(chunk * CHUNK, min((chunk + 1) * CHUNK, pixels.size)):
             pixel = pixels[k]
-            if pixel <= before or pixel >= expected.size:
+            if pixel <= previous_pixel or pixel >= expected.size:
                 total = -1.0
                 break
-            before = pixel
-            value = expected[pixel]
-            if not (alpha[pixel] > min_alpha and value > zero and depth[k] > zero):
+            previous_pixel = pixel
+            expected_depth = expected[pixel]
+            if not (alpha[pixel] > min_alpha and expected_depth > zero and depth[k] > zero):
                 continue
-            inverse = one / value
+            inverse = one / expected_depth
             error = inverse - one / depth[k]
             total += weight[k] * abs(error)
             slope = factor * weight[k] * inverse * inverse
@@ -207,28 +255,30 @@ def compare_depth(expected, alpha, pixels, depth, weight, factor, min_alpha, d_e
 #     B1 = (P^2 + N^2)/2 + C1 = mu_x^2 + mu_y^2 + C1    B2 = sigma_x^2 + sigma_y^2 + C2,
 #     SSIM = A1 A2 / (B1 B2)                                 from G((x - y)^2)
 #
-# so that four blurs do instead of five, and the gradient takes three: with a, b, c the derivatives
+# so four blurs are enough instead of five. The gradient takes three: with a, b, c the derivatives
 # by P plus N, by G((x + y)^2) and by G((x - y)^2), each times the pixel's weight,
 #
 #     d/dx = G(a) + (x + y) G(2 b) + (x - y) G(2 c)
 #
-# Planes are rows of `stride` float32, a multiple of LANES; those that are blurred have PAD rows of
-# zeros above and below, and zeros from the image's width to the stride. Sums are left as LANES sums
-# of every row, to be added up in float64.
+# Planes are rows of `stride` float32, a multiple of LANES. Planes that are blurred have PAD rows of
+# zeros above and below, and zeros from the image's width to the stride. Kernels return LANES sums
+# of every row, which the caller adds up in float64.
 
 PAD = 5  # the window's radius
 MARGIN = 8  # zeros on either side of a row that is blurred, >= PAD
-SIGMA = 1.5
-C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
+SIGMA = 1.5  # pixels, of the window's Gaussian
+C1 = np.float32(0.01**2)  # SSIM's constant of the means
+C2 = np.float32(0.03**2)  # SSIM's constant of the variances
 
-_BELL = [math.exp(-(k**2) / (2 * SIGMA**2)) for k in range(PAD + 1)]
-_AREA = _BELL[0] + 2 * sum(_BELL[1:])
-W0, W1, W2, W3, W4, W5 = (np.float32(value / _AREA) for value in _BELL)
+# The window's weights from its centre outwards, and their sum over the whole window.
+_WINDOW = [math.exp(-(k**2) / (2 * SIGMA**2)) for k in range(PAD + 1)]
+_WINDOW_SUM = _WINDOW[0] + 2 * sum(_WINDOW[1:])
+W0, W1, W2, W3, W4, W5 = (np.float32(value / _WINDOW_SUM) for value in _WINDOW)
 
 
 @inner()
 def _blur_row(row, at):
-    """Eight blurred values of a row with margins; at: index of the first in the row."""
+    """Return eight values blurred along a row with margins; at: index of the first in the row."""
     value = v8.load(row, at) * v8.splat(W0)
     pair = v8.load(row, at - U(1)) + v8.load(row, at + U(1))
     value = v8.fmuladd(pair, v8.splat(W1), value)
@@ -244,7 +294,7 @@ def _blur_row(row, at):
 
 @inner()
 def _blur_column(plane, at, stride):
-    """Eight values blurred over the rows; at: index of the first, PAD rows above the centre."""
+    """Return eight values blurred over the rows; at: index of the first, PAD rows above them."""
     value = v8.load(plane, at + U(5) * stride) * v8.splat(W0)
     pair = v8.load(plane, at + U(4) * stride) + v8.load(plane, at + U(6) * stride)
     value = v8.fmuladd(pair, v8.splat(W1), value)
@@ -260,15 +310,16 @@ def _blur_column(plane, at, stride):
 
 @inner()
 def _pair_of_moments(plane, upper, lower, weight, first, second):
-    """first + weight (a + b) and second + weight (a^2 + b^2), a and b from two rows."""
-    a, b = v8.load(plane, upper), v8.load(plane, lower)
+    """Return first + weight (a + b) and second + weight (a^2 + b^2), a and b from two rows."""
+    a = v8.load(plane, upper)
+    b = v8.load(plane, lower)
     first = v8.fmuladd(a + b, weight, first)
     return first, v8.fmuladd(v8.fmuladd(a, a, b * b), weight, second)
 
 
 @inner()
 def _column_moments(plane, at, stride, rows, first_at, second_at):
-    """As `_blur_column`, of the values and of their squares, into two rows."""
+    """Blur the values and their squares over the rows, as `_blur_column`, into two rows."""
     a = v8.load(plane, at + U(5) * stride)
     first = a * v8.splat(W0)
     second = a * first
@@ -291,11 +342,13 @@ def _column_moments(plane, at, stride, rows, first_at, second_at):
 
 @inner()
 def _composite_row(rgb, alpha, sky, row, size, rows, out, first, plane):
-    """rgb + (1 - alpha) sky of one image row, into three planes of `out` from `first` on.
+    """Write rgb + (1 - alpha) sky of one image row into three planes of `out` from `first` on.
 
     rows: work space of four rows, zero beyond the image's width.
     """
-    height, width, stride = (U(size[0]), U(size[1]), U(size[2]))
+    height = U(size[0])
+    width = U(size[1])
+    stride = U(size[2])
     for j in range(U(0), width):
         at = row * width + j
         rows[j] = rgb[at * U(3)]
@@ -313,7 +366,7 @@ def _composite_row(rgb, alpha, sky, row, size, rows, out, first, plane):
 
 @inner()
 def _mapped(planes, at, plane, color_map, channel):
-    """One channel of the colour map, of three planes of composited colour."""
+    """Return one channel of the colour map, applied to three planes of composited colour."""
     entry = U(4) * channel
     value = v8.fmuladd(
         v8.load(planes, at), v8.splat(color_map[entry]), v8.splat(color_map[entry + U(3)])
@@ -324,51 +377,66 @@ def _mapped(planes, at, plane, color_map, channel):
 
 @kernel
 def compare(rgb, alpha, sky, color_map, recorded, weight, is_sky, size, written):
-    """x + y and x - y of the finished and the recorded picture, and the sums of the L1 loss.
+    """Compute x + y and x - y of rendered and recorded picture, and the sums of the L1 loss.
 
-    recorded: flat uint8 [H, W, 3]. weight, is_sky: flat [H, W]; the rest as `finish_picture`.
-    written: behind, the composited colour, flat planes [3, H, stride]; pairs, six flat planes
-    [H + 2 PAD, stride], red, green, blue of x + y, then of x - y; weights, a flat plane [H,
-    stride]; sums, flat [H, 2, LANES]: of weight |x - y| and of weight; covered, float64 [H]: of
-    alpha in the sky. Where the weight is 0, y is x.
+    Where the weight is 0, y is x.
+
+    Args:
+        rgb: flat [H, W, 3].
+        alpha: flat [H, W].
+        sky: flat planes [3, H, stride], the sky's colours.
+        color_map: flat [3, 4].
+        recorded: flat uint8 [H, W, 3].
+        weight, is_sky: flat [H, W].
+        size: height, width, stride.
+        written: five arrays that are written: `behind`, the composited colour, flat planes
+            [3, H, stride]; `pairs`, six flat planes [H + 2 PAD, stride], red, green, blue of x + y,
+            then of x - y; `weights`, a flat plane [H, stride]; `sums`, flat [H, 2, LANES], of
+            weight |x - y| and of weight; `covered`, float64 [H], of alpha in the sky.
     """
-    # One by one: unpacked, they are wrong in a parallel kernel (numba 0.68).
-    behind, pairs, weights = written[0], written[1], written[2]
-    sums, covered = written[3], written[4]
-    height, width, stride = (U(size[0]), U(size[1]), U(size[2]))
+    # Items are read one by one: unpacking gives wrong arrays in a parallel kernel (numba 0.68).
+    behind = written[0]
+    pairs = written[1]
+    weights = written[2]
+    sums = written[3]
+    covered = written[4]
+    height = U(size[0])
+    width = U(size[1])
+    stride = U(size[2])
     plane = U(size[0] + 2 * PAD) * stride
     to_unit = v8.splat(np.float32(1 / 255))
     for band in prange((size[0] + BAND - 1) // BAND):
         rows = np.zeros(U(4) * stride, np.float32)
         for i in range(band * BAND, min((band + 1) * BAND, size[0])):
             row = U(i)
-            own = row * stride
-            _composite_row(rgb, alpha, sky, row, size, rows, behind, own, height * stride)
+            row_start = row * stride
+            _composite_row(rgb, alpha, sky, row, size, rows, behind, row_start, height * stride)
             opacity = 0.0
             for j in range(U(0), width):
                 at = row * width + j
-                weights[own + j] = weight[at]
+                weights[row_start + j] = weight[at]
                 if is_sky[at]:
                     opacity += alpha[at]
                 rows[j] = np.float32(recorded[at * U(3)])
                 rows[stride + j] = np.float32(recorded[at * U(3) + U(1)])
                 rows[U(2) * stride + j] = np.float32(recorded[at * U(3) + U(2)])
             for j in range(width, stride):
-                weights[own + j] = np.float32(0)
+                weights[row_start + j] = np.float32(0)
             zero = v8.splat(np.float32(0))
-            error, weight_sum = zero, zero
+            error = zero
+            weight_sum = zero
             first = (row + U(PAD)) * stride
             for j in range(U(0), stride, U(LANES)):
-                w = v8.load(weights, own + j)
+                w = v8.load(weights, row_start + j)
                 is_used = v8.greater(w, zero)
                 weight_sum = weight_sum + w
                 for c in range(U(0), U(3)):
-                    x = _mapped(behind, own + j, height * stride, color_map, c)
+                    x = _mapped(behind, row_start + j, height * stride, color_map, c)
                     y = v8.select(is_used, v8.load(rows, c * stride + j) * to_unit, x)
                     v8.store(pairs, c * plane + first + j, x + y)
                     v8.store(pairs, (U(3) + c) * plane + first + j, x - y)
                     error = v8.fmuladd(v8.absolute(x - y), w, error)
-            # Beyond the image both are zero, as the window's padding is.
+            # Beyond the image both are zero, like the window's padding.
             for c in range(U(0), U(6)):
                 for j in range(width, stride):
                     pairs[c * plane + first + j] = np.float32(0)
@@ -379,10 +447,14 @@ def compare(rgb, alpha, sky, color_map, recorded, weight, is_sky, size, written)
 
 @kernel
 def compare_windows(pairs, weights, size, slopes, sums):
-    """SSIM's sum with the weights, and the three planes that its gradient is blurred from.
+    """Compute SSIM's weighted sum, and the three planes whose blur is its gradient.
 
-    pairs, weights: from `compare`. Written: slopes, nine flat planes [H + 2 PAD, stride], a, 2 b,
-    2 c (see above) for red, then green, then blue; sums, flat [H, LANES].
+    Args:
+        pairs, weights: from `compare`.
+        size: height, width, stride.
+        slopes: written, nine flat planes [H + 2 PAD, stride]: a, 2 b, 2 c (see above) for red, then
+            green, then blue.
+        sums: written, flat [H, LANES].
     """
     stride = U(size[2])
     plane = U(size[0] + 2 * PAD) * stride
@@ -391,11 +463,13 @@ def compare_windows(pairs, weights, size, slopes, sums):
         rows = np.zeros(U(4) * length, np.float32)
         for i in range(band * BAND, min((band + 1) * BAND, size[0])):
             row = U(i)
-            half, one = v8.splat(np.float32(0.5)), v8.splat(np.float32(1))
+            half = v8.splat(np.float32(0.5))
+            one = v8.splat(np.float32(1))
             ssim_sum = v8.splat(np.float32(0))
             for c in range(U(0), U(3)):
                 for j in range(U(0), stride, U(LANES)):
-                    top, at = c * plane + row * stride + j, j + U(MARGIN)
+                    top = c * plane + row * stride + j
+                    at = j + U(MARGIN)
                     _column_moments(pairs, top, stride, rows, at, at + U(2) * length)
                     _column_moments(
                         pairs, top + U(3) * plane, stride, rows, at + length, at + U(3) * length
@@ -403,8 +477,10 @@ def compare_windows(pairs, weights, size, slopes, sums):
                 centre = U(3) * c * plane + (row + U(PAD)) * stride
                 for j in range(U(0), stride, U(LANES)):
                     at = j + U(MARGIN)
-                    p, n = _blur_row(rows, at), _blur_row(rows, at + length)
-                    pp, nn = p * p, n * n
+                    p = _blur_row(rows, at)
+                    n = _blur_row(rows, at + length)
+                    pp = p * p
+                    nn = n * n
                     over_p = _blur_row(rows, at + U(2) * length) - pp
                     over_n = _blur_row(rows, at + U(3) * length) - nn
                     a1 = v8.fmuladd(pp - nn, half, v8.splat(C1))
@@ -417,8 +493,10 @@ def compare_windows(pairs, weights, size, slopes, sums):
                     ssim = a1 * a2 * inverse
                     ssim_sum = v8.fmuladd(ssim, w, ssim_sum)
                     w = w * inverse  # the derivatives by A1, A2, B1 and B2, times the weight
-                    by_a1, by_a2 = a2 * w, a1 * w
-                    by_b1, by_b2 = v8.negate(ssim * b2 * w), v8.negate(ssim * b1 * w)
+                    by_a1 = a2 * w
+                    by_a2 = a1 * w
+                    by_b1 = v8.negate(ssim * b2 * w)
+                    by_b2 = v8.negate(ssim * b1 * w)
                     along = by_a1 - by_a2
                     across = by_b1 - by_b2
                     a = v8.fmuladd(p, along + across, n * (across - along))
@@ -430,11 +508,12 @@ def compare_windows(pairs, weights, size, slopes, sums):
 
 @inner()
 def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
-    """The loss's derivatives by the finished picture, one image row, into three rows."""
+    """Write the loss's derivatives by the finished picture, one image row, into three rows."""
     stride = U(size[2])
     plane = U(size[0] + 2 * PAD) * stride
     length = stride + U(2 * MARGIN)
-    zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
+    zero = v8.splat(np.float32(0))
+    one = v8.splat(np.float32(1))
     for c in range(U(0), U(3)):
         top = U(3) * c * plane + row * stride
         for k in range(U(0), U(3)):
@@ -445,7 +524,8 @@ def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
         for j in range(U(0), stride, U(LANES)):
             at = j + U(MARGIN)
             w = v8.load(weights, row * stride + j)
-            plus, minus = (v8.load(pairs, centre + j), v8.load(pairs, centre + U(3) * plane + j))
+            plus = v8.load(pairs, centre + j)
+            minus = v8.load(pairs, centre + U(3) * plane + j)
             slope = v8.fmuladd(_blur_row(work, at + length), plus, _blur_row(work, at))
             slope = v8.fmuladd(_blur_row(work, at + length + length), minus, slope)
             sign = v8.select(v8.greater(minus, zero), one, zero)
@@ -455,13 +535,16 @@ def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
 
 
 @inner()
-def _map_slopes(rows, channel, behind, own, plane, stride, sums, first):
-    """The row's part of the derivative by one channel of the colour map, LANES sums an entry."""
+def _map_slopes(rows, channel, behind, row_start, plane, stride, sums, first):
+    """Write the row's derivative by one channel of the colour map, LANES sums an entry."""
     zero = v8.splat(np.float32(0))
-    red, green, blue, offset = zero, zero, zero, zero
+    red = zero
+    green = zero
+    blue = zero
+    offset = zero
     for j in range(U(0), stride, U(LANES)):
         slope = v8.load(rows, channel * stride + j)
-        at = own + j
+        at = row_start + j
         red = v8.fmuladd(slope, v8.load(behind, at), red)
         green = v8.fmuladd(slope, v8.load(behind, at + plane), green)
         blue = v8.fmuladd(slope, v8.load(behind, at + plane + plane), blue)
@@ -474,7 +557,7 @@ def _map_slopes(rows, channel, behind, own, plane, stride, sums, first):
 
 @inner()
 def _times_transposed(rows, at, stride, color_map, k):
-    """Derivative by channel k of the composited colour, from three rows of those by the picture."""
+    """Return the derivative by channel k of the composited colour, from those by the picture."""
     value = v8.load(rows, at) * v8.splat(color_map[k])
     value = v8.fmuladd(v8.load(rows, at + stride), v8.splat(color_map[U(4) + k]), value)
     return v8.fmuladd(v8.load(rows, at + stride + stride), v8.splat(color_map[U(8) + k]), value)
@@ -484,13 +567,20 @@ def _times_transposed(rows, at, stride, color_map, k):
 def differentiate(
     sky, color_map, is_sky, behind, pairs, slopes, weights, size, factors, d_rgb, d_alpha, sums
 ):
-    """The loss's derivatives by rgb, alpha and the colour map.
+    """Compute the loss's derivatives by rgb, alpha and the colour map.
 
-    factors: float32, of the L1 loss and of SSIM per unit of weight, and of alpha in the sky; the
-    rest as in the kernels above. Written: d_rgb flat [H, W, 3], d_alpha flat [H, W]; sums, flat
-    [H, 3, 4, LANES]: the row's part of the map's derivative.
+    Args:
+        sky, color_map, is_sky, size: as in `compare`.
+        behind, pairs, weights: from `compare`.
+        slopes: from `compare_windows`.
+        factors: float32, of the L1 loss and of SSIM per unit of weight, and of alpha in the sky.
+        d_rgb: written, flat [H, W, 3].
+        d_alpha: written, flat [H, W].
+        sums: written, flat [H, 3, 4, LANES], the row's part of the colour map's derivative.
     """
-    height, width, stride = (U(size[0]), U(size[1]), U(size[2]))
+    height = U(size[0])
+    width = U(size[1])
+    stride = U(size[2])
     length = stride + U(2 * MARGIN)
     plane = height * stride
     for band in prange((size[0] + BAND - 1) // BAND):
@@ -498,18 +588,20 @@ def differentiate(
         work = np.zeros(U(3) * length, np.float32)
         for i in range(band * BAND, min((band + 1) * BAND, size[0])):
             row = U(i)
-            own = row * stride
+            row_start = row * stride
             _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows)
             for c in range(U(0), U(3)):
                 first = (row * U(3) + c) * U(4 * LANES)
-                _map_slopes(rows, c, behind, own, plane, stride, sums, first)
+                _map_slopes(rows, c, behind, row_start, plane, stride, sums, first)
             for j in range(U(0), stride, U(LANES)):
-                toward_sky = v8.splat(np.float32(0))
+                negative_d_alpha = v8.splat(np.float32(0))
                 for k in range(U(0), U(3)):
                     slope = _times_transposed(rows, j, stride, color_map, k)
                     v8.store(rows, (U(3) + k) * stride + j, slope)
-                    toward_sky = v8.fmuladd(slope, v8.load(sky, k * plane + own + j), toward_sky)
-                v8.store(rows, U(6) * stride + j, v8.negate(toward_sky))
+                    negative_d_alpha = v8.fmuladd(
+                        slope, v8.load(sky, k * plane + row_start + j), negative_d_alpha
+                    )
+                v8.store(rows, U(6) * stride + j, v8.negate(negative_d_alpha))
             for j in range(U(0), width):
                 at = row * width + j
                 d_rgb[at * U(3)] = rows[U(3) * stride + j]
@@ -519,19 +611,23 @@ def differentiate(
                 d_alpha[at] = slope + factors[2] if is_sky[at] else slope
 
 
-# ---- Numba kernel: how the loss pulls at whole parts, from the gradients of their splats' means --
+# ---- Numba kernel: forces of the loss on whole parts, from the gradients of their splats ---------
 
-# Of a block, with g = dL/d mean and p the mean: sums of g (3) and p x g (3), to which is added what
-# turning the splats themselves does.
+# Sums of a block, with g = dL/d mean and p the mean: g (3) and p x g (3). The second includes the
+# effect of rotating the splats themselves.
 MOMENTS = 6
 
 
 @kernel
 def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
-    """moments: float64 [B, MOMENTS], filled, in each part's axes.
+    """Sum the forces on each block, in each part's axes.
 
-    addresses, sizes, blocks: as in project; rows (flat), ids, counts: as project_backward
-    wrote them. Splats whose gradient is not finite are left out, as they are of the update.
+    Splats whose gradient is not finite are left out, as in the update.
+
+    Args:
+        addresses, sizes, blocks: as in project.
+        rows, ids, counts: from project_backward; rows are flat.
+        moments: written, float64 [B, MOMENTS].
     """
     for block in prange(blocks.shape[0]):
         part = blocks[block, 0]
@@ -542,10 +638,11 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
         for at in range(U(block * BLOCK), U(block * BLOCK + counts[block])):
             row = at * U(GRAD)
             splat = U(ids[at])
-            p, q = U(3) * splat, U(4) * splat
+            p = U(3) * splat
+            q = U(4) * splat
             gx, gy, gz = _three(rows, row + U(G_MEAN))
             px, py, pz = _three(means, p)
-            # A turn by w takes q to q + (0, w) q / 2.
+            # A rotation by w changes q to q + (0, w) q / 2.
             hw = np.float64(rows[row + U(G_QUAT)])
             hx, hy, hz = _three(rows, row + U(G_QUAT + 1))
             w = np.float64(quats[q])
@@ -562,89 +659,114 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
 
 @inner()
 def _three(array, at):
+    """Return three numbers in float64."""
     return np.float64(array[at]), np.float64(array[at + U(1)]), np.float64(array[at + U(2)])
 
 
-# ---- Numba kernel: what one view can tell of where splats are
+# ---- Numba kernel: pixels per metre, visibility and sky of each splat in one view ----------------
 
-_NEAR_M = np.float32(0.2)
-_BEYOND = np.float32(0.15)  # of the image's size: centres this far outside still reach into it
-_SKY_PX = 2  # pixels of sky around a splat's centre: masks are good to one
+_MIN_DEPTH_M = np.float32(0.2)  # metres; nearer splats are ignored
+# Margin as a fraction of the image's size: splats with centres this far outside reach into it.
+_MARGIN_FRACTION = np.float32(0.15)
+_SKY_MARGIN_PX = 2  # pixels of sky around a splat's centre; masks are accurate to one pixel
 
 
 @kernel
-def sight(means, pose, intrinsics, sky, px_per_m, seen, in_sky):
-    """Brings up to date, for a part's splats, the most pixels per metre that a view has there, and
-    counts views that they are inside of, and those whose sky they lie in.
+def sight(means, pose, intrinsics, sky, px_per_m, num_views, num_in_sky):
+    """Add one view to the sightings of a part's splats.
 
-    means float32 [N, 3]. pose: camera_from_part, float32 [4, 4]. intrinsics: fx, fy, cx, cy. sky:
-    bool [H, W]. px_per_m float32 [N], seen, in_sky int32 [N].
+    Args:
+        means: float32 [N, 3].
+        pose: camera_from_part, float32 [4, 4].
+        intrinsics: fx, fy, cx, cy.
+        sky: bool [H, W].
+        px_per_m: float32 [N], raised to the view's pixels per metre at the splat.
+        num_views: int32 [N], counts views that the splat's centre is inside of.
+        num_in_sky: int32 [N], counts views in whose sky it lies.
     """
     height, width = sky.shape
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    left, right = -_BEYOND * width, (1 + _BEYOND) * width
-    top, bottom = -_BEYOND * height, (1 + _BEYOND) * height
+    fx = intrinsics[0]
+    fy = intrinsics[1]
+    cx = intrinsics[2]
+    cy = intrinsics[3]
+    left = -_MARGIN_FRACTION * width
+    right = (1 + _MARGIN_FRACTION) * width
+    top = -_MARGIN_FRACTION * height
+    bottom = (1 + _MARGIN_FRACTION) * height
     for i in prange(means.shape[0]):
-        x, y, z = means[i, 0], means[i, 1], means[i, 2]
+        x = means[i, 0]
+        y = means[i, 1]
+        z = means[i, 2]
         depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-        if not depth > _NEAR_M:
+        if not depth > _MIN_DEPTH_M:
             continue
         u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + cx
         v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + cy
         if not (left < u < right and top < v < bottom):
             continue
         px_per_m[i] = max(px_per_m[i], fx / depth)
-        column, row = math.floor(u), math.floor(v)
+        column = math.floor(u)
+        row = math.floor(v)
         if not (0 <= column < width and 0 <= row < height):
             continue
-        seen[i] += 1
-        up, down = max(row - _SKY_PX, 0), min(row + _SKY_PX, height - 1)
-        before, after = max(column - _SKY_PX, 0), min(column + _SKY_PX, width - 1)
-        if sky[row, column] and sky[up, column] and sky[down, column]:
-            in_sky[i] += sky[row, before] and sky[row, after]
+        num_views[i] += 1
+        upper_row = max(row - _SKY_MARGIN_PX, 0)
+        lower_row = min(row + _SKY_MARGIN_PX, height - 1)
+        left_column = max(column - _SKY_MARGIN_PX, 0)
+        right_column = min(column + _SKY_MARGIN_PX, width - 1)
+        if sky[row, column] and sky[upper_row, column] and sky[lower_row, column]:
+            num_in_sky[i] += sky[row, left_column] and sky[row, right_column]
 
 
-# ---- Adam on the splats that a view touched, in the arrays that the rasteriser reads -------------
-# Values are kept activated: a step on the logarithm of a scale multiplies it, a step on the logit
-# of an opacity divides its odds, quaternions are turned along the sphere and normalised. Kingma &
-# Ba 2015, with the bias correction counted per splat, since a view touches a few of them only.
+# ---- Adam on the splats of a view, in the arrays that the rasteriser reads -----------------------
+# Values stay activated: a step on the logarithm of a scale multiplies it, a step on the logit of an
+# opacity divides its odds, and quaternions move along the sphere and are normalised. The method is
+# that of Kingma & Ba 2015, with the bias correction counted per splat, since a view shows only a
+# few of them.
 
 # Columns of the geometry's moments, two registers: means 3, quats 4, one unused, logarithms of
 # scales 3, logit of opacity 1, four unused.
 GEOMETRY = 16
 # Numbers of an update, float32: step sizes of a row's first 16 columns as GRAD lists them (negative
 # for opacity, whose odds are divided), of the SH, and the rest.
-R_ROW, R_SH_DC, R_SH_REST, R_BETA1, R_BETA2 = 0, 16, 17, 18, 19
-R_SMALLEST, R_LARGEST = 20, 21
-R_ABS_UNIT, R_RADIUS_UNIT = 22, 23  # what turns 1/px and px into the units of Splats.grads
-RATES = 24
+R_ROW = 0  # step sizes of a row's first 16 columns
+R_SH_DC = 16  # step size of the SH of degree 0
+R_SH_REST = 17  # step size of the other SH
+R_BETA1 = 18  # Adam's decay of first moments
+R_BETA2 = 19  # Adam's decay of second moments
+R_SMALLEST = 20  # the least scale, metres
+R_LARGEST = 21  # the largest scale, metres
+R_ABS_UNIT = 22  # factor from 1/px to the unit of Splats.grads
+R_RADIUS_UNIT = 23  # factor from px to the unit of Splats.grads
+RATES = 24  # numbers of an update
 
-CORRECTED = 10_000  # updates after which Adam's bias is taken as gone
+CORRECTED = 10_000  # updates after which Adam's bias is neglected
 
-_EPS = np.float32(1e-15)
-_FAINTEST, _FULLEST = np.float32(1e-4), np.float32(0.9995)
-_FUNCTIONS = 16
-_ROWS = 1024
-_WORK = 48  # room for a splat's SH: gradients, moments, steps
+_EPS = np.float32(1e-15)  # added to the root of the second moment
+_MIN_OPACITY = np.float32(1e-4)
+_MAX_OPACITY = np.float32(0.9995)
+_MAX_SH = 16  # SH functions of degree 3
+_ROWS_AT_ONCE = 1024  # rows that a thread updates together
+_SH_NUMBERS = 48  # numbers of a splat's SH; the work space holds gradients, moments and steps
 
 
 def bias_corrections(beta1: float, beta2: float) -> np.ndarray:
-    """float32 [CORRECTED + 1, 2]: what moments are multiplied with after so many updates."""
+    """Return the moments' factors after each number of updates, float32 [CORRECTED + 1, 2]."""
     n = np.arange(CORRECTED + 1, dtype=np.float64)[:, None]
     n[0] = 1  # never read: a splat is updated before it is corrected
     return (1 / (1 - np.array([beta1, beta2]) ** n)).astype(np.float32)
 
 
 class GradientRows(NamedTuple):
-    """What project_backward wrote, flat."""
+    """The output of project_backward, flat."""
 
-    rows: np.ndarray
-    ids: np.ndarray
-    counts: np.ndarray
+    rows: np.ndarray  # float32, GRAD numbers for each splat
+    ids: np.ndarray  # int32, the splat of each row in its part
+    counts: np.ndarray  # int64, rows of each block
 
 
 class AdamState(NamedTuple):
-    """Arrays of `Splats`, flat."""
+    """Arrays of `Splats`, flat; see there."""
 
     geometry_m: np.ndarray
     geometry_v: np.ndarray
@@ -659,56 +781,67 @@ class AdamState(NamedTuple):
 def update_splats(
     addresses, sizes, views, blocks, firsts, gradients, functions, rates, corrections, state
 ):
-    """One step of Adam for every row of gradients; a splat whose row is not finite stays as it is.
+    """Apply one step of Adam to every row of gradients; splats with rows that are not finite stay.
 
-    addresses, sizes, views, blocks: as in project; the splats are changed in place. firsts:
-    int64 [P], index of each part's first splat in the arrays of moments. gradients: GradientRows.
-    functions: SH functions that are learnt by now. rates: float32 [RATES]. corrections: as
-    `bias_corrections` gives them, flat. state: AdamState.
+    The splats are changed in place.
+
+    Args:
+        addresses, sizes, views, blocks: as in project.
+        firsts: int64 [P], index of each part's first splat in the arrays of moments.
+        gradients: GradientRows.
+        functions: number of SH functions that are learnt now.
+        rates: float32 [RATES].
+        corrections: from `bias_corrections`, flat.
+        state: AdamState.
     """
-    rows, ids, counts = gradients.rows, gradients.ids, gradients.counts
-    age, grads, smallest = state.age, state.grads, state.smallest
+    rows = gradients.rows
+    ids = gradients.ids
+    counts = gradients.counts
+    age = state.age
+    grads = state.grads
+    smallest = state.smallest
     for block in prange(blocks.shape[0]):
         part = blocks[block, 0]
-        count, total = sizes[part]
-        means = floats_at(addresses[part, 0], count * 3)
-        quats = floats_at(addresses[part, 1], count * 4)
-        scales = floats_at(addresses[part, 2], count * 3)
-        opacities = floats_at(addresses[part, 3], count)
-        sh = floats_at(addresses[part, 4], count * total * 3)
+        num_splats, num_sh = sizes[part]
+        means = floats_at(addresses[part, 0], num_splats * 3)
+        quats = floats_at(addresses[part, 1], num_splats * 4)
+        scales = floats_at(addresses[part, 2], num_splats * 3)
+        opacities = floats_at(addresses[part, 3], num_splats)
+        sh = floats_at(addresses[part, 4], num_splats * num_sh * 3)
         view = views[part]
-        basis = np.empty((_FUNCTIONS + 2) * LANES, np.float32)
-        work = np.zeros(4 * _WORK, np.float32)
+        basis = np.empty((_MAX_SH + 2) * LANES, np.float32)
+        work = np.zeros(4 * _SH_NUMBERS, np.float32)
         base = U(block * BLOCK)
         for at in range(U(0), U(counts[block]), U(LANES)):
             _write_bases(means, ids, base + at, U(counts[block]) - at, view, functions, basis)
             for lane in range(min(U(LANES), U(counts[block]) - at)):
                 row = (base + at + lane) * U(GRAD)
                 splat = U(ids[base + at + lane])
-                one = U(firsts[part]) + splat
+                moment_row = U(firsts[part]) + splat
                 if not math.isfinite(_row_power(rows, row)):
                     continue
-                age[one] += 1
-                grads[U(3) * one] += rows[row + U(G_ABS)] * rates[R_ABS_UNIT]
-                grads[U(3) * one + U(1)] += np.float32(1)
+                age[moment_row] += 1
+                grads[U(3) * moment_row] += rows[row + U(G_ABS)] * rates[R_ABS_UNIT]
+                grads[U(3) * moment_row + U(1)] += np.float32(1)
                 radius = rows[row + U(G_RADIUS)] * rates[R_RADIUS_UNIT]
-                grads[U(3) * one + U(2)] = max(grads[U(3) * one + U(2)], radius)
-                n = U(min(age[one], CORRECTED))
-                first, second = corrections[U(2) * n], corrections[U(2) * n + U(1)]
+                grads[U(3) * moment_row + U(2)] = max(grads[U(3) * moment_row + U(2)], radius)
+                n = U(min(age[moment_row], CORRECTED))
+                first = corrections[U(2) * n]
+                second = corrections[U(2) * n + U(1)]
                 _update_geometry(
                     (means, quats, scales, opacities), splat, rows, row,
-                    basis[U(_FUNCTIONS * LANES) + lane], rates, smallest[one], (first, second),
-                    (state.geometry_m, state.geometry_v), one * U(GEOMETRY), work,
+                    basis[U(_MAX_SH * LANES) + lane], rates, smallest[moment_row], (first, second),
+                    (state.geometry_m, state.geometry_v), moment_row * U(GEOMETRY), work,
                 )  # fmt: skip
                 _update_sh(
-                    sh, splat * U(total) * U(3), rows, row, basis, lane, U(functions), rates,
-                    (first, second), (state.sh_m, state.sh_v), one * U(total) * U(3), work,
+                    sh, splat * U(num_sh) * U(3), rows, row, basis, lane, U(functions), rates,
+                    (first, second), (state.sh_m, state.sh_v), moment_row * U(num_sh) * U(3), work,
                 )  # fmt: skip
 
 
 @inner()
 def _row_power(rows, row):
-    """Sum of squares: not finite where a number is not, or its second moment would not be."""
+    """Return the sum of squares: not finite if a number or its second moment is not finite."""
     total = np.float32(0)
     for i in range(U(GRAD)):
         total += rows[row + i] * rows[row + i]
@@ -717,24 +850,25 @@ def _row_power(rows, row):
 
 @inner()
 def _write_bases(means, ids, at, left, view, functions, basis):
-    """SH functions of eight splats, and the width of a pixel where they are, metres."""
-    picked = np.empty(LANES, np.int32)
+    """Write SH functions of eight splats, and a pixel's width at each of them, metres."""
+    lane_ids = np.empty(LANES, np.int32)
     for lane in range(U(LANES)):
-        picked[lane] = ids[at + min(lane, left - U(1))]
-    dx, dy, dz = from_eye(means, picked, U(0), view)
+        lane_ids[lane] = ids[at + min(lane, left - U(1))]
+    dx, dy, dz = from_eye(means, lane_ids, U(0), view)
     inverse = v8.splat(np.float32(1)) / v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
     write_basis(dx * inverse, dy * inverse, dz * inverse, functions, basis)
     row = U(L.V_ROTATION + 6)
     z = v8.fmuladd(v8.splat(view[row]), dx, v8.splat(view[row + U(1)]) * dy)
     z = v8.fmuladd(v8.splat(view[row + U(2)]), dz, z)
-    v8.store(basis, U(_FUNCTIONS * LANES), z * v8.splat(np.float32(1) / view[L.V_FOCAL]))
+    v8.store(basis, U(_MAX_SH * LANES), z * v8.splat(np.float32(1) / view[L.V_FOCAL]))
 
 
 @inner()
 def _adam8(g, rates, first, second, m, m_at, v, v_at):
-    """Eight moments brought up to date; returns what a step size is multiplied with."""
+    """Update eight moments; return the factor of the step size."""
     one = np.float32(1)
-    beta1, beta2 = rates[R_BETA1], rates[R_BETA2]
+    beta1 = rates[R_BETA1]
+    beta2 = rates[R_BETA2]
     new_m = v8.fmuladd(v8.splat(beta1), v8.load(m, m_at), v8.splat(one - beta1) * g)
     new_v = v8.fmuladd(v8.splat(beta2), v8.load(v, v_at), v8.splat(one - beta2) * g * g)
     v8.store(m, m_at, new_m)
@@ -745,10 +879,12 @@ def _adam8(g, rates, first, second, m, m_at, v, v_at):
 
 @inner()
 def _update_geometry(splats, splat, rows, row, pixel_m, rates, smallest, bias, moments, at, work):
+    """Update a splat's mean, rotation, scales and opacity."""
     means, quats, scales, opacities = splats
-    (first, second), (m, v) = bias, moments
+    (first, second) = bias
+    (m, v) = moments
     one = np.float32(1)
-    o = min(max(opacities[splat], _FAINTEST), _FULLEST)
+    o = min(max(opacities[splat], _MIN_OPACITY), _MAX_OPACITY)
     rows[row + U(G_OPACITY)] *= one - o
     low = _adam8(v8.load(rows, row), rates, first, second, m, at, v, at)
     v8.store(work, U(0), low * v8.load(rates, U(R_ROW)))
@@ -757,7 +893,7 @@ def _update_geometry(splats, splat, rows, row, pixel_m, rates, smallest, bias, m
     v8.store(work, U(8), factors)
     for i in range(U(3)):
         means[U(3) * splat + i] -= pixel_m * work[i]
-    least = max(smallest, rates[R_SMALLEST])
+    min_scale = max(smallest, rates[R_SMALLEST])
     norm = np.float32(0)
     for i in range(U(4)):
         q = quats[U(4) * splat + i] - work[U(G_QUAT) + i]
@@ -768,54 +904,71 @@ def _update_geometry(splats, splat, rows, row, pixel_m, rates, smallest, bias, m
         quats[U(4) * splat + i] *= norm
     for i in range(U(3)):
         s = scales[U(3) * splat + i] * work[U(G_SCALE) + i]
-        scales[U(3) * splat + i] = min(max(s, least), rates[R_LARGEST])
+        scales[U(3) * splat + i] = min(max(s, min_scale), rates[R_LARGEST])
     odds = (one - o) / o * work[U(G_OPACITY)]
-    opacities[splat] = min(max(one / (one + odds), _FAINTEST), _FULLEST)
+    opacities[splat] = min(max(one / (one + odds), _MIN_OPACITY), _MAX_OPACITY)
 
 
 @inner()
 def _update_sh(sh, start, rows, row, basis, lane, functions, rates, bias, moments, at, work):
-    (first, second), (m, v) = bias, moments
-    red, green = rows[row + U(G_COLOR)], rows[row + U(G_COLOR + 1)]
+    """Update a splat's colours."""
+    (first, second) = bias
+    (m, v) = moments
+    red = rows[row + U(G_COLOR)]
+    green = rows[row + U(G_COLOR + 1)]
     blue = rows[row + U(G_COLOR + 2)]
     count = U(3) * functions
-    # A copy of its own, since eight at a time would reach into the next splat's moments.
+    # The moments are copied: eight at a time would reach into the next splat's moments.
     for k in range(functions):
         value = basis[k * U(LANES) + lane]
         work[U(3) * k] = value * red
         work[U(3) * k + U(1)] = value * green
         work[U(3) * k + U(2)] = value * blue
     for i in range(count):
-        work[U(_WORK) + i] = m[at + i]
-        work[U(2 * _WORK) + i] = v[at + i]
+        work[U(_SH_NUMBERS) + i] = m[at + i]
+        work[U(2 * _SH_NUMBERS) + i] = v[at + i]
     for i in range(U(0), count, U(LANES)):
         steps = _adam8(
-            v8.load(work, i), rates, first, second, work, U(_WORK) + i, work, U(2 * _WORK) + i
+            v8.load(work, i),
+            rates,
+            first,
+            second,
+            work,
+            U(_SH_NUMBERS) + i,
+            work,
+            U(2 * _SH_NUMBERS) + i,
         )
-        v8.store(work, U(3 * _WORK) + i, steps)
+        v8.store(work, U(3 * _SH_NUMBERS) + i, steps)
     for i in range(count):
-        m[at + i] = work[U(_WORK) + i]
-        v[at + i] = work[U(2 * _WORK) + i]
+        m[at + i] = work[U(_SH_NUMBERS) + i]
+        v[at + i] = work[U(2 * _SH_NUMBERS) + i]
     for i in range(U(3)):
-        sh[start + i] -= rates[R_SH_DC] * work[U(3 * _WORK) + i]
+        sh[start + i] -= rates[R_SH_DC] * work[U(3 * _SH_NUMBERS) + i]
     for i in range(U(3), count):
-        sh[start + i] -= rates[R_SH_REST] * work[U(3 * _WORK) + i]
+        sh[start + i] -= rates[R_SH_REST] * work[U(3 * _SH_NUMBERS) + i]
 
 
 @kernel
 def update_rows(values, m, v, age, rows, grads, rate, betas, corrections):
-    """One step of Adam for rows of three numbers, each row once; values stay within [0, 1].
+    """Apply one step of Adam to rows of three numbers; values stay within [0, 1].
 
-    values, m, v: float32 [N * 3]. age: int32 [N]. rows: int32 [T]. grads: float32 [T, 3]. betas:
-    float32 [2]. corrections: as for `update_splats`.
+    Args:
+        values, m, v: float32 [N * 3].
+        age: int32 [N].
+        rows: int32 [T], without repetitions.
+        grads: float32 [T, 3].
+        rate: the step size.
+        betas: float32 [2].
+        corrections: as for `update_splats`.
     """
-    for run in prange((rows.size + _ROWS - 1) // _ROWS):
+    for run in prange((rows.size + _ROWS_AT_ONCE - 1) // _ROWS_AT_ONCE):
         one = np.float32(1)
-        for i in range(U(run * _ROWS), U(min((run + 1) * _ROWS, rows.size))):
+        for i in range(U(run * _ROWS_AT_ONCE), U(min((run + 1) * _ROWS_AT_ONCE, rows.size))):
             row = U(rows[i])
             age[row] += 1
             n = U(min(age[row], CORRECTED))
-            first, second = corrections[U(2) * n], corrections[U(2) * n + U(1)]
+            first = corrections[U(2) * n]
+            second = corrections[U(2) * n + U(1)]
             for channel in range(U(3)):
                 at = U(3) * row + channel
                 g = grads[i, channel]

@@ -1,10 +1,10 @@
-"""The optimisation itself: one recorded view a step, all splats of the scene.
+"""The optimisation: each step fits all splats of the scene to one recorded view.
 
-    load → forward (record) → loss → backward → Adam on what the view touched → now and then densify
+    load → forward (record) → loss → backward → Adam on the splats of the view → at times densify
 
-Everything a step needs stays in arrays that the kernels read directly. A run is a function of
-(scene, views, config): bits do not depend on threads, and a state saved between two steps continues
-to the same bits.
+All data of a step stay in arrays that the kernels read directly. A run is a function of (scene,
+views, config): its bits do not depend on threads, and a run that continues from a state between two
+steps gives the same bits. The command `fit` drives it.
 """
 
 from __future__ import annotations
@@ -61,24 +61,26 @@ from augment.rng import rng_for
 from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
 from augment.sky import CubemapSky
 
-# ---- Small corrections of where actors and cameras are, learnt with the scene -------------------
+# ---- Small corrections of the poses of actors and cameras, learnt with the scene -----------------
 # Labelled boxes are centimetres off, and recorded poses some tenths of a pixel. Corrections are
-# given at knots and linear in time between them, so that what is not learnt from, held-out frames
-# above all, shares what its neighbours found.
+# stored at knots and linear in time between them, so that frames that are not learnt from (held-out
+# frames above all) share their neighbours' corrections.
 
-# Forces are some 1e-4 a metre: what is smaller than this is rounding, and must not be a direction.
+# Added to the root of Adam's second moment. Forces are some 1e-4 a metre: much smaller ones are
+# rounding errors and must not give a direction.
 _EPS = 1e-10
 
 
 class Knots:
-    """D numbers at the knots of several things, float64, all zero to begin with.
+    """Values of D numbers at the knots of several objects, float64, zero at first.
 
-    Before the first and after the last knot the nearest one holds. A thing without knots is never
-    corrected.
+    Before the first and after the last knot, the nearest knot's values hold. An object without
+    knots
+    is never corrected.
     """
 
     def __init__(self, times_ns: Sequence[np.ndarray], width: int) -> None:
-        """times_ns: int64 [K] a thing, increasing."""
+        """times_ns: for each object its knots, int64 [K], increasing. width: D."""
         self._times = list(times_ns)
         self._firsts = np.cumsum([0, *(len(times) for times in times_ns)])
         shape = (int(self._firsts[-1]), width)
@@ -86,63 +88,76 @@ class Knots:
         self._adam = DenseAdam(self.values, _EPS)
 
     def at(self, number: int, timestamp_ns: int) -> np.ndarray | None:
-        """The thing's correction, float64 [D], at a time; None where it has no knots."""
-        place = self._place(number, timestamp_ns)
-        return None if place is None else place[1] @ self.values[place[0]]
+        """Return an object's correction at a time, float64 [D]; None if it has no knots."""
+        weighted_rows = self._weighted_rows(number, timestamp_ns)
+        return None if weighted_rows is None else weighted_rows[1] @ self.values[weighted_rows[0]]
 
     def update(
         self, number: int, timestamp_ns: int, gradient: np.ndarray, rates: np.ndarray, pull: float
     ) -> None:
-        """A step of Adam for the knots around a time. gradient, rates: [D]. pull: towards 0."""
-        place = self._place(number, timestamp_ns)
-        if place is None:
+        """Apply a step of Adam to the knots around a time.
+
+        Args:
+            number: the object's index.
+            timestamp_ns: the time.
+            gradient: [D].
+            rates: step sizes, [D].
+            pull: strength of the pull towards 0.
+        """
+        weighted_rows = self._weighted_rows(number, timestamp_ns)
+        if weighted_rows is None:
             return
-        for row, weight in zip(*place, strict=True):
+        for row, weight in zip(*weighted_rows, strict=True):
             if weight > 0:
                 self._adam.update(weight * gradient + pull * self.values[row], rates, row)
 
     def arrays(self) -> dict[str, np.ndarray]:
+        """Return the values and Adam's arrays by name."""
         return {"values": self.values, **self._adam.arrays()}
 
-    def _place(self, number: int, timestamp_ns: int) -> tuple[list[int], np.ndarray] | None:
-        """Rows of `values` around a time, and their weights."""
+    def _weighted_rows(self, number: int, timestamp_ns: int) -> tuple[list[int], np.ndarray] | None:
+        """Return the rows of `values` around a time, and their weights."""
         times = self._times[number]
         if len(times) == 0:
             return None
-        first = int(self._firsts[number])
-        after = int(np.searchsorted(times, timestamp_ns, side="right"))
-        if after == 0 or after == len(times):
-            return [first + min(after, len(times) - 1)], np.ones(1)
-        span = int(times[after]) - int(times[after - 1])
-        part = (timestamp_ns - int(times[after - 1])) / span
-        return [first + after - 1, first + after], np.array([1 - part, part])
+        first_row = int(self._firsts[number])
+        next_knot = int(np.searchsorted(times, timestamp_ns, side="right"))
+        if next_knot == 0 or next_knot == len(times):
+            return [first_row + min(next_knot, len(times) - 1)], np.ones(1)
+        span_ns = int(times[next_knot]) - int(times[next_knot - 1])
+        fraction = (timestamp_ns - int(times[next_knot - 1])) / span_ns
+        return [first_row + next_knot - 1, first_row + next_knot], np.array(
+            [1 - fraction, fraction]
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Forces:
-    """Of P parts, in each part's own axes, float64. seen: bool [P], whether the view shows it.
+    """Derivatives of the loss by the poses of P parts, in each part's own axes, float64."""
 
-    shift [P, 3]: dL by a shift of the part. turn [P, 3]: dL by a turn about its origin (rad), of
-    means and ellipsoids; that view-dependent colours turn along is left out.
-    """
-
-    seen: np.ndarray
-    shift: np.ndarray
+    is_visible: np.ndarray  # bool [P], True for parts that the view shows
+    shift: np.ndarray  # [P, 3], dL by a translation of the part, 1/m
+    # [P, 3], dL by a rotation about the part's origin (rad), of means and ellipsoids; the rotation
+    # of view-dependent colours is neglected.
     turn: np.ndarray
 
     def on_camera(self, camera_from_parts: np.ndarray) -> np.ndarray:
-        """dL [6] by a turn, then a shift, of everything as the camera sees it, in camera axes.
+        """Return dL [6] by a rotation, then a translation, of everything that the camera sees.
 
-        camera_from_parts: float64 [P, 4, 4].
+        Both are in camera axes.
+
+        Args:
+            camera_from_parts: float64 [P, 4, 4].
         """
-        rotations, offsets = camera_from_parts[:, :3, :3], camera_from_parts[:, :3, 3]
+        rotations = camera_from_parts[:, :3, :3]
+        offsets = camera_from_parts[:, :3, 3]
         shift = (rotations @ self.shift[..., None])[..., 0]
         turn = (rotations @ self.turn[..., None])[..., 0] + np.cross(offsets, shift)
         return np.concatenate([turn.sum(0), shift.sum(0)])
 
 
 def part_forces(inputs: Inputs, grads: SplatGradients) -> Forces:
-    """The forces of one view's gradients, the same for any number of threads."""
+    """Return the forces of one view's gradients; they do not depend on the number of threads."""
     moments = np.empty((len(inputs.blocks), MOMENTS))
     with kernel_threads():
         sum_forces(
@@ -154,34 +169,47 @@ def part_forces(inputs: Inputs, grads: SplatGradients) -> Forces:
             grads.counts,
             moments,
         )
-    parts = len(inputs.sizes)
-    # Blocks of a part stand together; an empty part has none.
-    totals = np.zeros((parts, MOMENTS))
+    num_parts = len(inputs.sizes)
+    # Blocks of a part follow each other; an empty part has none.
+    totals = np.zeros((num_parts, MOMENTS))
     np.add.at(totals, inputs.blocks[:, 0], moments)
-    seen = np.bincount(inputs.blocks[:, 0], grads.counts, minlength=parts) > 0
-    return Forces(seen, totals[:, :3], totals[:, 3:])
+    is_visible = np.bincount(inputs.blocks[:, 0], grads.counts, minlength=num_parts) > 0
+    return Forces(is_visible, totals[:, :3], totals[:, 3:])
 
 
-KNOT_EVERY = 4  # track samples between an actor's knots
-_REACH_M = 2.0  # a turn moves an actor's points about this far from its origin as a shift does
-_DEPTH_M = 10.0  # and a camera's turn what it sees this far away
+SAMPLES_PER_KNOT = 4  # track samples between an actor's knots
+# Metres from an actor's origin to the arc that measures its rotation, so that a rotation moves its
+# points about as far as a translation of the same length.
+_ACTOR_ARC_M = 2.0
+_CAMERA_ARC_M = 10.0  # metres from a camera to the arc that measures its rotation
 
 
 class ActorPoses:
-    """A shift in the world (3, metres) and a turn about the vertical (its arc at 2 m)."""
+    """Corrections of actors: a translation in the world (3, metres), a rotation about the vertical.
+
+    The rotation is measured by its arc at 2 m.
+    """
 
     def __init__(self, actors: Sequence[Actor]) -> None:
         self.knots = Knots([_actor_knots(actor) for actor in actors], 4)
 
     def corrected(self, number: int, pose: np.ndarray, timestamp_ns: int) -> np.ndarray:
-        """world_from_actor, float64 [4, 4], of the actor with this index, moved and turned."""
-        shift = self.knots.at(number, timestamp_ns)
-        if shift is None:
+        """Return the corrected pose of an actor, float64 [4, 4].
+
+        Args:
+            number: the actor's index.
+            pose: world_from_actor, float64 [4, 4].
+            timestamp_ns: the time.
+        """
+        correction = self.knots.at(number, timestamp_ns)
+        if correction is None:
             return pose
-        out = pose.copy()
-        out[:3, :3] = _turn([0.0, 0.0, shift[3] / _REACH_M]) @ pose[:3, :3]
-        out[:3, 3] += shift[:3]
-        return out
+        corrected_pose = pose.copy()
+        corrected_pose[:3, :3] = (
+            _rotation_matrix([0.0, 0.0, correction[3] / _ACTOR_ARC_M]) @ pose[:3, :3]
+        )
+        corrected_pose[:3, 3] += correction[:3]
+        return corrected_pose
 
     def update(
         self,
@@ -193,18 +221,27 @@ class ActorPoses:
         rate_m: float,
         pull: float,
     ) -> None:
-        """One step for every actor that a view shows. parts, poses: those of its inputs."""
+        """Apply one step to every actor that a view shows.
+
+        Args:
+            parts: the numbers of the parts of the view's inputs.
+            poses: their world_from_part.
+            forces: the view's forces.
+            timestamp_ns: the view's time.
+            rate_m: the step size, metres.
+            pull: strength of the pull to the recorded pose.
+        """
         rates = np.full(4, rate_m)
-        for place in np.flatnonzero(forces.seen).tolist():
-            if parts[place] == 0:
+        for index in np.flatnonzero(forces.is_visible).tolist():
+            if parts[index] == 0:
                 continue
-            rotation = poses[place, :3, :3]
-            turn = (rotation @ forces.turn[place])[2] / _REACH_M
-            gradient = np.append(rotation @ forces.shift[place], turn)
-            self.knots.update(parts[place] - 1, timestamp_ns, gradient, rates, pull)
+            rotation = poses[index, :3, :3]
+            arc_gradient = (rotation @ forces.turn[index])[2] / _ACTOR_ARC_M
+            gradient = np.append(rotation @ forces.shift[index], arc_gradient)
+            self.knots.update(parts[index] - 1, timestamp_ns, gradient, rates, pull)
 
     def track(self, number: int, track: Track) -> Track:
-        """The actor's track with its corrections."""
+        """Return the actor's track with its corrections."""
         times = track.timestamps_ns.tolist()
         poses = [
             self.corrected(number, pose.numpy(), time)
@@ -214,7 +251,10 @@ class ActorPoses:
 
 
 class CameraPoses:
-    """A turn (3, arcs at 10 m) and a shift (3, metres) in camera axes of what a camera sees."""
+    """Corrections of cameras: a rotation (3, arcs at 10 m) and a translation (3, metres).
+
+    They move everything that the camera sees, in camera axes.
+    """
 
     def __init__(self, source: ViewSource) -> None:
         times: dict[str, list[int]] = {}
@@ -224,51 +264,62 @@ class CameraPoses:
         self.knots = Knots([np.unique(np.array(t, np.int64)) for t in times.values()], 6)
 
     def corrected(self, camera: Camera) -> Camera:
-        """The camera where it was found to be; itself where nothing is known of it."""
+        """Return the corrected camera; the camera itself where nothing was learnt."""
         number = self._names.get(camera.name)
-        change = None if number is None else self.knots.at(number, camera.timestamp_ns)
-        if change is None or not change.any():
+        correction = None if number is None else self.knots.at(number, camera.timestamp_ns)
+        if correction is None or not correction.any():
             return camera
-        moved = np.eye(4)
-        moved[:3, :3], moved[:3, 3] = _turn(change[:3] / _DEPTH_M), change[3:]
-        pose = torch.from_numpy(moved @ camera.camera_from_world.numpy())
+        corrected_from_recorded = np.eye(4)
+        corrected_from_recorded[:3, :3] = _rotation_matrix(correction[:3] / _CAMERA_ARC_M)
+        corrected_from_recorded[:3, 3] = correction[3:]
+        pose = torch.from_numpy(corrected_from_recorded @ camera.camera_from_world.numpy())
         return dataclasses.replace(camera, camera_from_world=pose)
 
     def update(
         self, camera: Camera, poses: np.ndarray, forces: Forces, *, rate_px: float, pull: float
     ) -> None:
-        """One step for a view's camera, as corrected. poses: world_from_part of its inputs."""
+        """Apply one step to a view's camera.
+
+        Args:
+            camera: the corrected camera.
+            poses: world_from_part of the view's inputs.
+            forces: the view's forces.
+            rate_px: the step size, pixels.
+            pull: strength of the pull to the recorded pose.
+        """
         number = self._names.get(camera.name)
         if number is None:
             return
         gradient = forces.on_camera(camera.camera_from_world.numpy() @ poses)
-        gradient[:3] /= _DEPTH_M
-        rates = np.full(6, rate_px * _DEPTH_M / camera.fx)
+        gradient[:3] /= _CAMERA_ARC_M
+        rates = np.full(6, rate_px * _CAMERA_ARC_M / camera.fx)
         self.knots.update(number, camera.timestamp_ns, gradient, rates, pull)
 
 
 def _actor_knots(actor: Actor) -> np.ndarray:
-    """int64 [K] times; none for the recording car's own body, whose track is exact."""
+    """Return an actor's knots, int64 [K]; the recording car's body, tracked exactly, has none."""
     times = actor.track.timestamps_ns.numpy()
     if actor.label == EGO_VEHICLE:
         return times[:0]
-    knots = times[::KNOT_EVERY]
+    knots = times[::SAMPLES_PER_KNOT]
     return knots if knots[-1] == times[-1] else np.append(knots, times[-1])
 
 
-def _turn(vector_rad: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Rotation matrix of a rotation vector (Rodrigues)."""
+def _rotation_matrix(vector_rad: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return the rotation matrix of a rotation vector (Rodrigues)."""
     x, y, z = (float(v) for v in vector_rad)
     angle = (x * x + y * y + z * z) ** 0.5
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross_matrix = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     if angle < 1e-12:
-        return np.eye(3) + cross
+        return np.eye(3) + cross_matrix
     return (
-        np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * (cross @ cross)
+        np.eye(3)
+        + np.sin(angle) / angle * cross_matrix
+        + (1 - np.cos(angle)) / angle**2 * (cross_matrix @ cross_matrix)
     )
 
 
-# ---- The splats of a view as the CPU kernels take them: addresses into the arrays being fitted ---
+# ---- Inputs of the CPU kernels: addresses into the arrays that are fitted ------------------------
 
 _FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -280,25 +331,31 @@ def splat_inputs(
     camera: Camera,
     settings: RasterSettings,
 ) -> Inputs:
-    """Inputs of the parts that exist now. parts: their numbers. poses: world_from_part, float64
-    [P, 4, 4]. Nothing is copied: kernels read, and Adam writes, the arrays of `splats`, which must
-    outlive the inputs.
+    """Return the kernels' inputs for the parts that a view shows.
 
-    first_ids are positions in the arrays of `splats`.
+    Nothing is copied: kernels read, and Adam writes, the arrays of `splats`, which must outlive the
+    inputs. first_ids are positions in the arrays of `splats`.
+
+    Args:
+        splats: the splats.
+        parts: the numbers of the parts that exist at the view's time.
+        poses: world_from_part, float64 [P, 4, 4].
+        camera: the view's camera.
+        settings: the rasteriser's settings.
     """
     starts = splats.starts[list(parts)]
     counts = splats.starts[np.asarray(parts) + 1] - starts
-    functions = splats.sh.shape[1]
+    num_sh = splats.sh.shape[1]
     strides = [getattr(splats, name)[:1].nbytes for name in _FIELDS]
-    bases = [getattr(splats, name).ctypes.data for name in _FIELDS]
-    addresses = np.array(bases, np.uint64) + starts[:, None].astype(np.uint64) * np.array(
+    base_addresses = [getattr(splats, name).ctypes.data for name in _FIELDS]
+    addresses = np.array(base_addresses, np.uint64) + starts[:, None].astype(np.uint64) * np.array(
         strides, np.uint64
     )
-    # no part has slopes of light, or colour maps
-    absent = np.zeros((len(starts), layout.ADDRESSES - len(_FIELDS)), np.uint64)
+    # no part has gradients of light, or colour maps
+    no_addresses = np.zeros((len(starts), layout.ADDRESSES - len(_FIELDS)), np.uint64)
     return Inputs(
-        addresses=np.concatenate([addresses, absent], 1),
-        sizes=np.stack([counts, np.full_like(counts, functions)], 1),
+        addresses=np.concatenate([addresses, no_addresses], 1),
+        sizes=np.stack([counts, np.full_like(counts, num_sh)], 1),
         first_ids=starts.copy(),
         views=part_views(poses, camera, settings, None),
         blocks=_blocks(counts),
@@ -308,7 +365,7 @@ def splat_inputs(
 
 
 def _blocks(counts: np.ndarray) -> np.ndarray:
-    """int64 [B, 3]: part, first and last + 1 of every block."""
+    """Return part, first and last + 1 of every block, int64 [B, 3]."""
     per_part = -(-counts // layout.BLOCK)
     part = np.repeat(np.arange(len(counts)), per_part)
     first_block = np.repeat(np.cumsum(per_part) - per_part, per_part)
@@ -317,18 +374,17 @@ def _blocks(counts: np.ndarray) -> np.ndarray:
     return np.stack([part, first, last], 1).astype(np.int64)
 
 
-# ---- What renders the views: the CPU's kernels, or gsplat on a GPU; all else is the same
+# ---- Renderers of the views: the CPU's kernels, or gsplat on a GPU; everything else is shared ----
 
-DEVICES = ("cpu", "cuda")
-SETTINGS = RasterSettings()
+DEVICES = ("cpu", "cuda")  # devices that render the views
+SETTINGS = RasterSettings()  # settings of all renders
 
 
 class CpuRenderer:
-    """Renders the splats that are fitted by the kernels of augment.render.cpu.backward; the same
-    bits for any number of threads.
+    """Renders the fitted splats by the kernels of augment.render.cpu.backward.
 
-    A tape holds until the next render. Splats may be changed in place between two renders, but only
-    those whose gradients the last tape told.
+    The bits do not depend on the number of threads. A tape is valid until the next render. Between
+    two renders, splats may be changed in place only where the last tape has gradients.
     """
 
     def __init__(self) -> None:
@@ -337,19 +393,27 @@ class CpuRenderer:
     def record(
         self, splats: Splats, inputs: Inputs, poses: np.ndarray, camera: Camera, *, with_depth: bool
     ) -> Tape:
-        """inputs: of these splats; poses: world_from_part of their parts, float64 [P, 4, 4]."""
+        """Render a view and keep what its gradients need.
+
+        Args:
+            splats: the splats.
+            inputs: the inputs of these splats.
+            poses: world_from_part of their parts, float64 [P, 4, 4].
+            camera: the view's camera.
+            with_depth: whether to render the expected depth.
+        """
         return record(inputs, camera, SETTINGS, self._scratch, with_depth=with_depth)
 
 
-# The GPU holds a copy of all splats; what a step changed on the CPU, it is sent: the rows of the
-# splats that the view showed. Back come the image and those splats' gradients. gsplat adds shares
-# up in no fixed order, so a fit's bits do not repeat.
+# The GPU holds a copy of all splats. Before each render it receives the rows that the last step has
+# changed on the CPU: the splats of the last view. It returns the image and the gradients of the
+# view's splats. gsplat adds contributions in no fixed order, so a fit's bits do not repeat.
 
-_MIN_DET = 1e-30  # of a conic, px^-4
+_MIN_DETERMINANT = 1e-30  # of a conic, px^-4
 
 
 class GsplatRenderer:
-    """As `CpuRenderer`, by gsplat.
+    """Renders as `CpuRenderer`, by gsplat.
 
     Raises:
         BackendUnavailable: there is no GPU, or no gsplat.
@@ -366,17 +430,20 @@ class GsplatRenderer:
     def record(
         self, splats: Splats, inputs: Inputs, poses: np.ndarray, camera: Camera, *, with_depth: bool
     ) -> GsplatTape:
+        """Render a view as `CpuRenderer.record`."""
         self._refresh(splats)
         # SH need no gradients of their own: they follow from the colours'.
         leaves = {name: copy.detach() for name, copy in self._copies.items()}
         for name in _FIELDS[:4]:
             leaves[name].requires_grad_()
         parts = []
-        for first, (count, _), pose in zip(inputs.first_ids, inputs.sizes, poses, strict=True):
-            own = {name: leaf[int(first) : int(first + count)] for name, leaf in leaves.items()}
+        for first_row, (count, _), pose in zip(inputs.first_ids, inputs.sizes, poses, strict=True):
+            part_leaves = {
+                name: leaf[int(first_row) : int(first_row + count)] for name, leaf in leaves.items()
+            }
             is_world = np.array_equal(pose, np.eye(4))
-            placed = None if is_world else torch.from_numpy(np.ascontiguousarray(pose))
-            parts.append(PosedGaussians(Gaussians(**own), placed))
+            world_from_part = None if is_world else torch.from_numpy(np.ascontiguousarray(pose))
+            parts.append(PosedGaussians(Gaussians(**part_leaves), world_from_part))
         images = draw_with_gsplat(
             parts,
             camera,
@@ -391,115 +458,145 @@ class GsplatRenderer:
         )
 
     def _refresh(self, splats: Splats) -> None:
-        """The copy on the GPU as the splats are now."""
+        """Bring the copy on the GPU up to date with the splats."""
         if splats is not self._splats:
             self._copies = {
                 name: runtime.upload(torch.from_numpy(getattr(splats, name))) for name in _FIELDS
             }
-            if runtime.gpu_device().type == "cpu":  # interpreted: a copy of its own all the same
+            if runtime.gpu_device().type == "cpu":  # interpreted: still needs separate memory
                 self._copies = {name: copy.clone() for name, copy in self._copies.items()}
         elif len(rows := self._changed):
-            flat = [getattr(splats, name)[rows].reshape(len(rows), -1) for name in _FIELDS]
-            sent = runtime.upload(np.concatenate(flat, 1))
-            index = runtime.upload(rows)
-            widths = [part.shape[1] for part in flat]
-            for name, part in zip(_FIELDS, sent.split(widths, 1), strict=True):
+            changed_arrays = [
+                getattr(splats, name)[rows].reshape(len(rows), -1) for name in _FIELDS
+            ]
+            changed_values = runtime.upload(np.concatenate(changed_arrays, 1))
+            row_index = runtime.upload(rows)
+            widths = [part.shape[1] for part in changed_arrays]
+            for name, part in zip(_FIELDS, changed_values.split(widths, 1), strict=True):
                 copy = self._copies[name]
-                copy.index_copy_(0, index, part.reshape(-1, *copy.shape[1:]))
-        self._splats, self._changed = splats, np.zeros(0, np.int64)
+                copy.index_copy_(0, row_index, part.reshape(-1, *copy.shape[1:]))
+        self._splats = splats
+        self._changed = np.zeros(0, np.int64)
 
-    def rows_of(self, inputs: Inputs, seen: np.ndarray, rows: np.ndarray) -> SplatGradients:
-        """Gradients block by block. seen: int64 [T], increasing positions in all parts one after
-        another; rows: float32 [T, GRAD].
+    def rows_of(self, inputs: Inputs, positions: np.ndarray, rows: np.ndarray) -> SplatGradients:
+        """Return gradients block by block.
+
+        Args:
+            inputs: the view's inputs.
+            positions: int64 [T], increasing positions in all parts one after another.
+            rows: float32 [T, GRAD], gradients of these splats.
         """
         counts = inputs.sizes[:, 0]
-        ends = np.cumsum(counts)
-        part = np.searchsorted(ends, seen, side="right")
-        ids = seen - (ends - counts)[part]
-        self._changed = inputs.first_ids[part] + ids
+        part_ends = np.cumsum(counts)
+        part_of_row = np.searchsorted(part_ends, positions, side="right")
+        ids = positions - (part_ends - counts)[part_of_row]
+        self._changed = inputs.first_ids[part_of_row] + ids
         blocks = -(-counts // BLOCK)
-        block = (np.cumsum(blocks) - blocks)[part] + ids // BLOCK
-        total = len(inputs.blocks)
-        found = np.bincount(block, minlength=total)
-        at = block * BLOCK + np.arange(len(seen)) - (np.cumsum(found) - found)[block]
-        all_rows = self._scratch.array("rows", (total * BLOCK, backward_kernels.GRAD), np.float32)
-        all_ids = self._scratch.array("ids", (total * BLOCK,), np.int32)
-        all_rows[at], all_ids[at] = rows, ids
-        return SplatGradients(all_rows, all_ids, found.astype(np.int64), inputs.blocks)
+        block_of_row = (np.cumsum(blocks) - blocks)[part_of_row] + ids // BLOCK
+        num_blocks = len(inputs.blocks)
+        rows_per_block = np.bincount(block_of_row, minlength=num_blocks)
+        row_slots = (
+            block_of_row * BLOCK
+            + np.arange(len(positions))
+            - (np.cumsum(rows_per_block) - rows_per_block)[block_of_row]
+        )
+        all_rows = self._scratch.array(
+            "rows", (num_blocks * BLOCK, backward_kernels.GRAD), np.float32
+        )
+        all_ids = self._scratch.array("ids", (num_blocks * BLOCK,), np.int32)
+        all_rows[row_slots] = rows
+        all_ids[row_slots] = ids
+        return SplatGradients(all_rows, all_ids, rows_per_block.astype(np.int64), inputs.blocks)
 
 
 @dataclass(frozen=True, eq=False)
 class GsplatTape:
-    """As cpu.backward.Tape. leaves: what gsplat was given, by name."""
+    """Holds a render by gsplat for its gradients, as cpu.backward.Tape."""
 
     inputs: Inputs
     rgb: np.ndarray
     alpha: np.ndarray
     expected_depth: np.ndarray | None
     images: GsplatImages
-    leaves: dict[str, Tensor]
+    leaves: dict[str, Tensor]  # the tensors that gsplat rendered, by name
     renderer: GsplatRenderer
 
     def backward(
         self, d_rgb: np.ndarray, d_alpha: np.ndarray, d_expected_depth: np.ndarray | None = None
     ) -> SplatGradients:
-        """Of the splats that a pixel shows; each once, in order."""
+        """Return the gradients of the splats that a pixel shows, each once, in order."""
         images = [self.images.rgb, self.images.alpha]
-        slopes = [runtime.upload(d_rgb), runtime.upload(d_alpha)]
+        image_gradients = [runtime.upload(d_rgb), runtime.upload(d_alpha)]
         if self.images.expected_depth is not None and d_expected_depth is not None:
             images.append(self.images.expected_depth)
-            slopes.append(runtime.upload(d_expected_depth))
+            image_gradients.append(runtime.upload(d_expected_depth))
         ids = self.images.ids
         if len(ids) == 0:
-            none = np.zeros(0, np.int64)
-            return self.renderer.rows_of(self.inputs, none, np.zeros((0, 16), np.float32))
-        torch.autograd.backward(images, slopes)
+            no_positions = np.zeros(0, np.int64)
+            return self.renderer.rows_of(self.inputs, no_positions, np.zeros((0, 16), np.float32))
+        torch.autograd.backward(images, image_gradients)
         with torch.no_grad():
             ids, order = torch.sort(ids.long())
             rows = self._rows(ids, order)
-            shown = torch.nonzero((rows[:, : backward_kernels.G_RADIUS] != 0).any(1))[:, 0]  # waits
-            return self.renderer.rows_of(self.inputs, _array(ids[shown]), _array(rows[shown]))
+            shown_rows = torch.nonzero((rows[:, : backward_kernels.G_RADIUS] != 0).any(1))[
+                :, 0
+            ]  # waits for the GPU
+            return self.renderer.rows_of(
+                self.inputs, _array(ids[shown_rows]), _array(rows[shown_rows])
+            )
 
     def _rows(self, ids: Tensor, order: Tensor) -> Tensor:
-        """Rows as augment.render.cpu.backward_kernels lists them, [M, GRAD], of splats drawn."""
+        """Return gradient rows [M, GRAD] of the rendered splats.
+
+        Their columns are those of augment.render.cpu.backward_kernels.
+        """
         counts = self.inputs.sizes[:, 0]
         ends = np.cumsum(counts)
-        shifts = runtime.upload(self.inputs.first_ids - (ends - counts))
+        id_shifts = runtime.upload(self.inputs.first_ids - (ends - counts))
         part = torch.searchsorted(runtime.upload(ends), ids, right=True)
-        own = ids + shifts[part]  # in the arrays of all splats
-        slopes = {name: _slope(leaf)[own] for name, leaf in self.leaves.items() if name != "sh"}
-        values = {name: self.leaves[name].detach()[own] for name in slopes}
+        splat_ids = ids + id_shifts[part]  # in the arrays of all splats
+        gradients = {
+            name: _gradient_of(leaf)[splat_ids]
+            for name, leaf in self.leaves.items()
+            if name != "sh"
+        }
+        values = {name: self.leaves[name].detach()[splat_ids] for name in gradients}
         quats = values["quats"]
-        radial = (slopes["quats"] * quats).sum(1, keepdim=True)
-        absolute = self.images.means2d.absgrad[order]
+        radial_gradient = (gradients["quats"] * quats).sum(1, keepdim=True)
+        absolute_gradients = self.images.means2d.absgrad[order]
         a, b, c = self.images.conics.detach()[order].unbind(1)
-        widest = torch.maximum(a, c) / (a * c - b * b).clamp_min(_MIN_DET)
+        variance = torch.maximum(a, c) / (a * c - b * b).clamp_min(_MIN_DETERMINANT)
         rows = {
-            backward_kernels.G_MEAN: slopes["means"],
-            backward_kernels.G_QUAT: slopes["quats"] - radial * quats,
-            backward_kernels.G_ABS: absolute.norm(dim=1, keepdim=True),
-            backward_kernels.G_SCALE: slopes["scales"] * values["scales"],
-            backward_kernels.G_OPACITY: (slopes["opacities"] * values["opacities"])[:, None],
-            backward_kernels.G_COLOR: _slope(self.images.colors)[ids],
-            backward_kernels.G_RADIUS: torch.sqrt(widest)[:, None],
+            backward_kernels.G_MEAN: gradients["means"],
+            backward_kernels.G_QUAT: gradients["quats"] - radial_gradient * quats,
+            backward_kernels.G_ABS: absolute_gradients.norm(dim=1, keepdim=True),
+            backward_kernels.G_SCALE: gradients["scales"] * values["scales"],
+            backward_kernels.G_OPACITY: (gradients["opacities"] * values["opacities"])[:, None],
+            backward_kernels.G_COLOR: _gradient_of(self.images.colors)[ids],
+            backward_kernels.G_RADIUS: torch.sqrt(variance)[:, None],
         }
         return torch.cat([rows[column] for column in sorted(rows)], 1)
 
 
-def _slope(tensor: Tensor) -> Tensor:
+def _gradient_of(tensor: Tensor) -> Tensor:
+    """Return the gradient of a tensor; zeros without one."""
     return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
 
 
 def _array(tensor: Tensor) -> np.ndarray:
+    """Copy a tensor into a contiguous array."""
     return np.ascontiguousarray(tensor.detach().cpu().numpy())
 
 
 def fit_renderer(device: str) -> CpuRenderer | GsplatRenderer:
-    """device: one of DEVICES.
+    """Return the renderer of a device.
+
+    Args:
+        device: one of DEVICES.
 
     Raises:
         BackendUnavailable: there is no such device, or gsplat is not installed.
-        ValueError: another name.
+        ValueError: the name is not one of DEVICES.
     """
     if device not in DEVICES:
         raise ValueError(f"device must be one of {', '.join(DEVICES)}; got {device!r}")
@@ -511,21 +608,21 @@ def fit_renderer(device: str) -> CpuRenderer | GsplatRenderer:
 
 @dataclass(frozen=True)
 class StepRecord:
-    """What one step did. stage_s: seconds of load, forward, loss, backward, optimise, densify."""
+    """The result of one step. The losses are those of `ViewLoss`."""
 
-    step: int
-    key: ViewKey
+    step: int  # steps so far, this one included
+    key: ViewKey  # the view
     loss: float
     l1: float
     ssim: float
     depth: float
     sky: float
-    splats: int
-    stage_s: dict[str, float]
+    splats: int  # splats after the step
+    stage_s: dict[str, float]  # seconds of load, forward, loss, backward, optimise, densify
 
 
 class Trainer:
-    """A scene while it is fitted to its recorded views."""
+    """Fits a scene to its recorded views."""
 
     def __init__(
         self,
@@ -537,14 +634,22 @@ class Trainer:
         tuning: Tuning = Tuning(),  # noqa: B008 - frozen, so sharing it is safe
         device: str = "cpu",
     ) -> None:
-        """scene: what is started from; it is not changed. source: at least one training view.
-        steps: of the whole run, one view each. device: where views are rendered; bits are those of
-        "cpu".
+        """Prepare a run.
+
+        Args:
+            scene: the scene to start from; it is not changed.
+            source: the recorded views, at least one of them for training.
+            config: the settings that users choose.
+            steps: the steps of the whole run, one view each.
+            tuning: the other settings.
+            device: the device that renders views; only "cpu" gives reproducible bits.
         """
         if not source.train:
             raise ValueError("the view source has no training views; nothing can be learnt")
         self.step = 0
-        self._config, self._steps, self._tuning = config, steps, tuning
+        self._config = config
+        self._steps = steps
+        self._tuning = tuning
         self._weights = LossWeights(depth=config.depth_weight)
         parts = scene.all_gaussians
         self.splats = Splats.of(parts, config.sh_degree)
@@ -562,13 +667,13 @@ class Trainer:
         self.camera_poses = CameraPoses(source)
         self._extent_m = _extent(source)
         self._skies = {key: np.packbits(source.load(key).sky) for key in source.train}
-        kept = ~self._look(with_actors=True)
-        self.splats = rebuild(self.splats, np.flatnonzero(kept | ~kept.any()))
+        is_kept = ~self._update_sightings(with_actors=True)
+        self.splats = rebuild(self.splats, np.flatnonzero(is_kept | ~is_kept.any()))
         bound_sizes(self.splats)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, np.int64))
 
     def run_step(self) -> StepRecord:
-        """One update of everything that one view shows."""
+        """Update everything that one view shows."""
         stages: dict[str, float] = {}
         key = self._next_key()
         with _timed(stages, "load"):
@@ -604,13 +709,13 @@ class Trainer:
         )  # fmt: skip
 
     def scene(self) -> Scene:
-        """The scene as fitted so far; it shares nothing with the trainer."""
+        """Return the scene as fitted so far; it shares nothing with the trainer."""
         actors = tuple(
             dataclasses.replace(
                 actor,
                 gaussians=self.splats.gaussians(number),
                 track=self.actor_poses.track(number - 1, actor.track),
-                color_waves=None,  # learnt colours are those of all times, in the actor's frame
+                color_waves=None,  # learnt colours hold at all times, in the actor's frame
                 colors_in_world=False,
             )
             for number, actor in enumerate(self._scene.actors, start=1)
@@ -627,20 +732,23 @@ class Trainer:
         )
 
     def _frame(self, frame: Frame) -> Frame:
+        """Return a frame with corrected cameras."""
         cameras = {n: self.camera_poses.corrected(c) for n, c in frame.cameras.items()}
         return dataclasses.replace(frame, cameras=cameras)
 
     def _learnt_arrays(self) -> dict[str, np.ndarray]:
-        """All that is learnt in place besides the splats, by the names of a state."""
+        """Return all arrays that are learnt in place besides the splats, by name in a state."""
         parts = {"sky_adam": self._sky_adam}
         parts |= {f"color_map_adam.{name}": adam for name, adam in self._map_adams.items()}
         parts |= {"actors": self.actor_poses.knots, "cameras": self.camera_poses.knots}
-        own = {f"{part}.{k}": a for part, adam in parts.items() for k, a in adam.arrays().items()}
+        adam_arrays = {
+            f"{part}.{k}": a for part, adam in parts.items() for k, a in adam.arrays().items()
+        }
         maps = {f"color_map.{name}": color_map for name, color_map in self.color_maps.items()}
-        return {"sky": self.sky_faces, **maps, **own}
+        return {"sky": self.sky_faces, **maps, **adam_arrays}
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """All that continuing to the same bits needs: arrays, and facts for JSON."""
+        """Return everything needed to continue to the same bits: arrays, and facts for JSON."""
         arrays = {f"splats.{name}": array for name, array in self.splats.arrays().items()}
         arrays |= self._learnt_arrays()
         return {name: array.copy() for name, array in arrays.items()}, {"step": self.step}
@@ -654,50 +762,53 @@ class Trainer:
         self.step = int(facts["step"])
 
     def _next_key(self) -> ViewKey:
-        """Every view once an epoch, in an order of its own."""
+        """Return the next view: every view once an epoch, in the epoch's own order."""
         train = self._source.train
-        epoch, place = divmod(self.step, len(train))
+        epoch, position = divmod(self.step, len(train))
         if self._order[0] != epoch:
             rng = rng_for(
                 seed=self._config.seed, scene=self._scene.name, effect="fit.order", frame=epoch
             )
             self._order = (epoch, rng.permutation(len(train)))
-        return train[int(self._order[1][place])]
+        return train[int(self._order[1][position])]
 
     def _posed(self, camera: Camera) -> _PosedParts:
-        """The world, and the actors that hold splats and exist when the view was taken, where they
-        are now taken to be."""
+        """Return the parts that a view may show, at their corrected poses.
+
+        These are the world, and the actors that have splats and exist at the view's time.
+        """
         starts = self.splats.starts
-        posed = [
+        posed_parts = [
             part
             for part in self._scene.parts_for(camera)
             if part.instance_id == 0 or starts[part.instance_id] < starts[part.instance_id + 1]
         ]
-        numbers = [part.instance_id for part in posed]
-        poses = part_poses([part.world_from_part for part in posed])
-        for place, number in enumerate(numbers):
+        numbers = [part.instance_id for part in posed_parts]
+        poses = part_poses([part.world_from_part for part in posed_parts])
+        for index, number in enumerate(numbers):
             if number > 0:
-                poses[place] = self.actor_poses.corrected(
-                    number - 1, poses[place], camera.timestamp_ns
+                poses[index] = self.actor_poses.corrected(
+                    number - 1, poses[index], camera.timestamp_ns
                 )
         return _PosedParts(numbers, poses)
 
     def _render(self, parts: _PosedParts, camera: Camera) -> Tape | GsplatTape:
+        """Render a view for its gradients."""
         inputs = splat_inputs(self.splats, parts.numbers, parts.poses, camera, SETTINGS)
-        inputs.modes[M_FUNCTIONS] = self._functions
+        inputs.modes[M_FUNCTIONS] = self._num_sh
         with_depth = self._weights.depth > 0
         return self._renderer.record(
             self.splats, inputs, parts.poses, camera, with_depth=with_depth
         )
 
     @property
-    def _done(self) -> float:
-        """The part of the run that lies behind."""
+    def _done_fraction(self) -> float:
+        """Return the fraction of the run that is over."""
         return min(1.0, self.step / self._steps)
 
     @property
-    def _functions(self) -> int:
-        """SH functions that are learnt by now."""
+    def _num_sh(self) -> int:
+        """Return the number of SH functions that are learnt now."""
         degree = min(self._config.sh_degree, self.step // self._tuning.sh_every)
         return (degree + 1) ** 2
 
@@ -709,78 +820,88 @@ class Trainer:
         camera: Camera,
         loss: ViewLoss,
     ) -> None:
-        splats, rates, tuning = self.splats, self._tuning.rates, self._tuning
-        done = self._done
-        late = rates.late**done
+        """Apply one step of Adam to splats, sky, colour map and poses."""
+        splats = self.splats
+        rates = self._tuning.rates
+        tuning = self._tuning
+        done_fraction = self._done_fraction
+        late_factor = rates.late**done_fraction
         forces = part_forces(inputs, grads)
         with kernel_threads():
             update_splats(
                 inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
-                GradientRows(grads.rows.reshape(-1), grads.ids, grads.counts), self._functions,
-                splat_rates(rates, done, camera, self._extent_m), CORRECTIONS.reshape(-1),
+                GradientRows(grads.rows.reshape(-1), grads.ids, grads.counts), self._num_sh,
+                splat_rates(rates, done_fraction, camera, self._extent_m), CORRECTIONS.reshape(-1),
                 splats.adam_state(),
             )  # fmt: skip
         if loss.d_sky is not None:
-            rate = decayed(rates.sky, rates.sky_end, done)
-            above = self._is_sky[loss.d_sky.texels]
-            self._sky_adam.update(loss.d_sky.texels[above], loss.d_sky.grads[above], rate)
+            rate = decayed(rates.sky, rates.sky_end, done_fraction)
+            is_sky = self._is_sky[loss.d_sky.texels]
+            self._sky_adam.update(loss.d_sky.texels[is_sky], loss.d_sky.grads[is_sky], rate)
         pull = tuning.exposure_pull * (self.color_maps[camera.name] - IDENTITY_MAP)
-        self._map_adams[camera.name].update(loss.d_color_map + pull, rates.color_map * late)
+        self._map_adams[camera.name].update(loss.d_color_map + pull, rates.color_map * late_factor)
         self.actor_poses.update(
             parts.numbers,
             parts.poses,
             forces,
             camera.timestamp_ns,
-            rate_m=rates.actors * late,
+            rate_m=rates.actors * late_factor,
             pull=tuning.pose_pull,
         )
         self.camera_poses.update(
-            camera, parts.poses, forces, rate_px=rates.cameras * late, pull=tuning.pose_pull
+            camera, parts.poses, forces, rate_px=rates.cameras * late_factor, pull=tuning.pose_pull
         )
 
     def _densify(self) -> None:
-        config, growth = self._config, self._tuning.growth
+        """Run a round of densification if one is due."""
+        config = self._config
+        growth = self._tuning.growth
         if config.densify != "none" and densify_due(growth, self.step, self._steps):
             self.splats = densify(
                 self.splats, growth, max_splats=config.max_splats, extent_m=self._extent_m,
-                refuted=self._look(with_actors=False),
+                refuted=self._update_sightings(with_actors=False),
             )  # fmt: skip
 
-    def _look(self, *, with_actors: bool) -> np.ndarray:
-        """Brings the least sizes up to date by all training views, of actors where asked for (they
-        hardly change: children inherit them). Returns which splats the sky refutes, bool [N]: of
-        the background alone, since boxes say that actors are there.
+    def _update_sightings(self, *, with_actors: bool) -> np.ndarray:
+        """Update least sizes from all training views; return the refuted splats, bool [N].
+
+        Only splats of the background are refuted, since boxes say where actors are.
+
+        Args:
+            with_actors: whether to update actors, too. Their least sizes hardly change: children
+                inherit them.
         """
-        found = Sightings(len(self.splats))
-        for key, bits in self._skies.items():
+        sightings = Sightings(len(self.splats))
+        for key, packed_sky in self._skies.items():
             camera = self.camera_poses.corrected(self._source.camera(key))
             count = camera.height * camera.width
-            sky = np.unpackbits(bits, count=count).view(np.bool_)
+            sky = np.unpackbits(packed_sky, count=count).view(np.bool_)
             sky = sky.reshape(camera.height, camera.width)
             parts = self._posed(camera) if with_actors else _PosedParts([0], np.eye(4)[None])
             for part, pose in zip(parts.numbers, parts.poses, strict=True):
-                found.add(self.splats, part, pose, camera, sky)
-        shown = found.px_per_m > 0
-        self.splats.smallest[shown] = FILTER_PX / found.px_per_m[shown]
-        return found.refuted & (self.splats.part_of == 0)
+                sightings.add(self.splats, part, pose, camera, sky)
+        is_shown = sightings.px_per_m > 0
+        self.splats.smallest[is_shown] = FILTER_PX / sightings.px_per_m[is_shown]
+        return sightings.is_refuted & (self.splats.part_of == 0)
 
 
 @dataclass(frozen=True, eq=False)
 class _PosedParts:
-    """What a view may show. numbers: of the parts. poses: world_from_part, float64 [P, 4, 4]."""
+    """The parts that a view may show."""
 
-    numbers: list[int]
-    poses: np.ndarray
+    numbers: list[int]  # 0 is the background
+    poses: np.ndarray  # world_from_part, float64 [P, 4, 4]
 
 
 @contextmanager
 def _timed(stages: dict[str, float], name: str) -> Iterator[None]:
+    """Record the seconds of a stage."""
     start = time.perf_counter()
     yield
     stages[name] = time.perf_counter() - start
 
 
 def _extent(source: ViewSource) -> float:
-    """How far the cameras move, and at least 10 m: what splats' sizes are bounded against."""
+    """Return the distance that the cameras cover, at least 10 m: the limit of splats' sizes."""
     centres = np.stack([source.camera(key).centre.numpy() for key in source.train])
     return max(10.0, float(np.linalg.norm(centres.max(0) - centres.min(0))))

@@ -1,4 +1,7 @@
-"""What reconstruction learns from: recorded images with their masks and depth priors, on demand."""
+"""Records that reconstruction learns from: recorded images with masks and depth priors.
+
+Adapters implement `ViewSource`, which loads the images on demand.
+"""
 
 from __future__ import annotations
 
@@ -12,30 +15,23 @@ from augment.cameras import Camera
 
 @dataclass(frozen=True)
 class ViewKey:
-    """Which image: the dataset's frame number and the camera's name."""
+    """Identifies an image."""
 
-    frame: int
-    camera: str
+    frame: int  # the dataset's frame number
+    camera: str  # the camera's name
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedView:
-    """One recorded image, ready to be compared with a render of `camera`.
+    """One recorded image, ready to be compared with a render of `camera`."""
 
-    camera: at the training resolution, H x W. rgb: uint8 [H, W, 3].
-    weight: float32 [H, W], how much a pixel counts; 0 where it must not be learnt from.
-    sky: bool [H, W], pixels that show sky: opacity is pulled to 0 there.
-    depth_pixels: int32 [M], flat indices (row W + column), increasing; depth_m: float32 [M], z of
-    the depth prior there; depth_weight: float32 [M], how much each is trusted.
-    """
-
-    camera: Camera
-    rgb: np.ndarray
-    weight: np.ndarray
-    sky: np.ndarray
-    depth_pixels: np.ndarray
-    depth_m: np.ndarray
-    depth_weight: np.ndarray
+    camera: Camera  # at the training resolution, H x W
+    rgb: np.ndarray  # uint8 [H, W, 3]
+    weight: np.ndarray  # float32 [H, W], each pixel's weight; 0 where nothing must be learnt
+    sky: np.ndarray  # bool [H, W], pixels that show sky: opacity is pulled to 0 there
+    depth_pixels: np.ndarray  # int32 [M], increasing flat indices (row W + column) of depth priors
+    depth_m: np.ndarray  # float32 [M], z of the depth priors
+    depth_weight: np.ndarray  # float32 [M], their weights
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -59,7 +55,10 @@ class RecordedView:
 
 @runtime_checkable
 class ViewSource(Protocol):
-    """The recorded views of a drive. Loading is deterministic; memory is the source's own care."""
+    """The recorded views of a drive.
+
+    Loading is deterministic; each source limits its own memory.
+    """
 
     @property
     def train(self) -> tuple[ViewKey, ...]:
@@ -75,4 +74,6 @@ class ViewSource(Protocol):
         """The view's camera at the training resolution, without loading its image."""
         ...
 
-    def load(self, key: ViewKey) -> RecordedView: ...
+    def load(self, key: ViewKey) -> RecordedView:
+        """Load the view's image, masks and depth priors."""
+        ...

@@ -1,4 +1,4 @@
-"""What a rasteriser returns, and the names of the buffers that can be asked for."""
+"""Image buffers that a rasteriser returns, their names, and the names of the backends."""
 
 from __future__ import annotations
 
@@ -11,25 +11,32 @@ from torch import Tensor
 
 from augment.errors import BackendUnavailable
 
-# ---- The rasteriser's backends by name, and which of them can run here ---------------------------
+# ---- The rasteriser's backends by name, and the check that they can run here ---------------------
 
-AUTO, REFERENCE, CPU, CUDA = "auto", "reference", "cpu", "cuda"
+AUTO = "auto"
+REFERENCE = "reference"
+CPU = "cpu"
+CUDA = "cuda"
 BACKENDS = (AUTO, REFERENCE, CPU, CUDA)
 
 
 def available_backends() -> dict[str, str | None]:
-    """Every backend but "auto", with None where it can run and else the reason why it cannot."""
+    """Return every backend but "auto": None if it can run here, else the reason why it cannot."""
     obstacles: dict[str, str | None] = {REFERENCE: None, CPU: None, CUDA: None}
-    for backend, import_it in ((CPU, import_cpu), (CUDA, import_cuda)):
+    for backend, import_backend in ((CPU, import_cpu), (CUDA, import_cuda)):
         try:
-            import_it()
+            import_backend()
         except BackendUnavailable as error:
             obstacles[backend] = str(error)
     return obstacles
 
 
 def import_cpu() -> ModuleType:
-    """The numba backend. Raises BackendUnavailable, which says what is missing."""
+    """Import the numba backend.
+
+    Raises:
+        BackendUnavailable: a package is missing; the message names it.
+    """
     try:
         from augment.render.cpu import driver as cpu
     except ImportError as error:
@@ -41,7 +48,11 @@ def import_cpu() -> ModuleType:
 
 
 def import_cuda() -> ModuleType:
-    """The Triton backend. Raises BackendUnavailable, which says what is missing."""
+    """Import the Triton backend.
+
+    Raises:
+        BackendUnavailable: a package or a GPU is missing; the message names it.
+    """
     from augment.render.cuda import runtime
 
     runtime.check_can_run()
@@ -51,43 +62,53 @@ def import_cuda() -> ModuleType:
 
 
 def kernels_for(backend: str, *images: Tensor | None) -> str:
-    """Which kernels a pass over finished images takes: REFERENCE (plain torch), CPU or CUDA.
+    """Return the kernels for a pass over finished images: REFERENCE (plain torch), CPU or CUDA.
 
-    Kernels are for float32 without gradients; all else is left to torch. AUTO follows the images:
-    CUDA where they lie on a GPU.
+    Kernels take float32 without gradients; torch does everything else. AUTO follows the images: it
+    means CUDA if any of them lies on a GPU.
     """
-    given = [image for image in images if image is not None]
-    tracking = torch.is_grad_enabled()
+    present_images = [image for image in images if image is not None]
+    is_recording = torch.is_grad_enabled()
     if backend == REFERENCE or not all(
-        image.dtype == torch.float32 and not (tracking and image.requires_grad) for image in given
+        image.dtype == torch.float32 and not (is_recording and image.requires_grad)
+        for image in present_images
     ):
         return REFERENCE
     if backend == AUTO:
-        return CUDA if any(image.device.type != "cpu" for image in given) else CPU
+        return CUDA if any(image.device.type != "cpu" for image in present_images) else CPU
     return backend
 
 
-RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH = "rgb", "alpha", "expected_depth", "median_depth"
-SPLAT_IDS, MODE_DEPTH, OVERLAY = "splat_ids", "mode_depth", "overlay"
+RGB = "rgb"
+ALPHA = "alpha"
+EXPECTED_DEPTH = "expected_depth"
+MEDIAN_DEPTH = "median_depth"
+SPLAT_IDS = "splat_ids"
+MODE_DEPTH = "mode_depth"
+OVERLAY = "overlay"
 BUFFERS = (RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, OVERLAY)
 # Depth estimators by the names that recipes and placement give them.
 DEPTH_ESTIMATORS = {"median": MEDIAN_DEPTH, "expected": EXPECTED_DEPTH, "mode": MODE_DEPTH}
-DIFFERENTIABLE = frozenset({RGB, ALPHA, EXPECTED_DEPTH})  # by every backend that has gradients
+# Buffers that every backend with gradients can differentiate.
+DIFFERENTIABLE = frozenset({RGB, ALPHA, EXPECTED_DEPTH})
 
 
 @dataclass(frozen=True, eq=False)
 class RenderOutput:
-    """Image buffers of one camera; None where not asked for.
+    """Image buffers of one camera; None for a buffer that was not asked for.
 
-    rgb: sum of weights times colour, without background. alpha: 1 - final transmittance.
-    expected_depth: sum(w z) / max(sum(w), 1e-10), metres; 0 where nothing was hit; z is that of a
-    splat's centre, or, with a clip, of its surface at the pixel (see augment.render.layout).
+    rgb: sum of weights times colour, without background.
+    alpha: 1 - final transmittance.
+    expected_depth: sum(w z) / max(sum(w), 1e-10), metres; 0 where nothing was hit. z is that of a
+        splat's centre, or, with a clip, of its surface at the pixel (see augment.render.layout).
     median_depth: z of the centre of the first splat that brings transmittance below 0.5, metres; 0
-    where none does. splat_ids: index of the splat with the largest weight, counted through the
-    parts in order; -1 where nothing was hit. The first of equal weights wins. mode_depth: mode of
-    the heaviest cluster of depths along the ray (augment.render.mode_depth), metres; 0 where
-    nothing was hit; z is that of expected_depth. overlay: sum of weights of the splats
-    of parts that lie on the scene (PosedGaussians.is_overlay), in [0, alpha].
+        where no splat does.
+    splat_ids: index of the splat with the largest weight, counted through the parts in order; -1
+        where nothing was hit. Of equal weights, the first one counts.
+    mode_depth: mode of the heaviest cluster of depths along the ray (augment.render.mode_depth),
+        metres; 0 where nothing was hit. z is that of expected_depth.
+    overlay: sum of weights of the splats of parts that lie on the scene
+        (PosedGaussians.is_overlay), in [0, alpha].
     """
 
     rgb: Float[Tensor, "H W 3"] | None = None

@@ -1,9 +1,9 @@
-"""Kernels compiled by several processes at a time, before they are wanted.
+"""Compilation of kernels by several processes at a time, before they are needed.
 
-numba compiles one kernel after another, when each is first called. `signatures.json` lists what
-the kernels are called with, those first that take longest to compile: other processes take from the
-list what nobody compiles yet, and leave it in numba's cache. The list only saves time: what is not
-in it is compiled when it is called.
+numba compiles one kernel after another, when each is first called. `signatures.json` lists the
+argument types that the kernels are called with; kernels that take longest to compile come first.
+Other processes take kernels from the list that no process compiles yet, and leave them in numba's
+cache. The list only saves time: a kernel that is not in it is compiled when it is called.
 """
 
 from __future__ import annotations
@@ -23,49 +23,62 @@ from numba import types
 from augment.render.cpu.jit import KERNELS, compiling
 from augment.render.threads import thread_count
 
-Form = str | list[Any]  # of a type, in JSON
+# A type as JSON holds it.
+Form = str | list[Any]
 
 
 def describe_type(kind: Any) -> Form:
-    """A type that JSON can hold: 'int64', 'float32[2]C', or a list of a tuple's class and parts."""
+    """Return a numba type in a form that JSON can hold.
+
+    It is a name such as 'int64' or 'float32[2]C', or a list of a tuple's class and its parts.
+    """
     if isinstance(kind, types.Array):
         return f"{kind.dtype}[{kind.ndim}]{kind.layout}{'' if kind.mutable else ' read-only'}"
     if isinstance(kind, types.BaseTuple):
-        named, parts = getattr(kind, "instance_class", tuple), list(cast("Iterable[Any]", kind))
-        name = "tuple" if named is tuple else f"{named.__module__}:{named.__qualname__}"
+        tuple_class = getattr(kind, "instance_class", tuple)
+        parts = list(cast("Iterable[Any]", kind))
+        name = (
+            "tuple"
+            if tuple_class is tuple
+            else f"{tuple_class.__module__}:{tuple_class.__qualname__}"
+        )
         return [name, *map(describe_type, parts)]
     return str(kind)
 
 
 def find_type(form: Form) -> Any:
-    """The type that `describe_type` described."""
+    """Return the type that `describe_type` described."""
     if not isinstance(form, str):
-        name, parts = form[0], [find_type(part) for part in form[1:]]
+        name = form[0]
+        parts = [find_type(part) for part in form[1:]]
         if name == "tuple":
             return types.Tuple(parts)
-        if len(set(parts)) == 1:  # which numba makes a type of its own
-            return types.NamedUniTuple(parts[0], len(parts), _find(name))
-        return types.NamedTuple(parts, _find(name))
-    text, _, constant = form.partition(" ")
+        if len(set(parts)) == 1:  # numba has a type of its own for these
+            return types.NamedUniTuple(parts[0], len(parts), _import_object(name))
+        return types.NamedTuple(parts, _import_object(name))
+    text, _, read_only_mark = form.partition(" ")
     if "[" not in text:
         return types.none if text == "none" else getattr(numba, text)
     dtype, _, shape = text.partition("[")
-    return types.Array(getattr(numba, dtype), int(shape[:-2]), shape[-1], readonly=bool(constant))
+    return types.Array(
+        getattr(numba, dtype), int(shape[:-2]), shape[-1], readonly=bool(read_only_mark)
+    )
 
 
-def _find(name: str) -> Any:
-    module, _, inside = name.partition(":")
-    return functools.reduce(getattr, inside.split("."), importlib.import_module(module))
+def _import_object(name: str) -> Any:
+    """Return the object named "module:name"."""
+    module, _, qualified_name = name.partition(":")
+    return functools.reduce(getattr, qualified_name.split("."), importlib.import_module(module))
 
 
 def read_signatures() -> list[tuple[str, list[Form]]]:
-    """The list, each a kernel as "module:function" and its arguments' types."""
+    """Return the list: for each kernel "module:function" and the types of its arguments."""
     text = resources.files("augment.render").joinpath("signatures.json").read_text()
     return [(name, forms) for name, forms in json.loads(text)]
 
 
 def signatures_in_use() -> set[str]:
-    """What this process has called kernels with, as lines of `signatures.json`."""
+    """Return the calls of kernels in this process, as lines of `signatures.json`."""
     return {
         json.dumps([name, [describe_type(kind) for kind in signature]])
         for name, compiled in KERNELS.items()
@@ -75,32 +88,34 @@ def signatures_in_use() -> set[str]:
 
 @contextlib.contextmanager
 def compile_ahead(parts: Iterable[str]) -> Iterator[None]:
-    """Meanwhile other processes compile: one for each thread that this process has, but for one.
+    """Let other processes compile kernels meanwhile: one for each thread of this process but one.
 
-    parts: of the list, kernels whose module's name begins so.
+    parts: prefixes of the names of the modules whose kernels are compiled.
     """
-    spawn, ways = multiprocessing.get_context("spawn"), (tuple(parts),)
-    beside = [
-        spawn.Process(target=compile_listed, args=ways, daemon=True)
+    spawn = multiprocessing.get_context("spawn")
+    arguments = (tuple(parts),)
+    processes = [
+        spawn.Process(target=compile_listed, args=arguments, daemon=True)
         for _ in range(thread_count() - 1)
     ]
-    for process in beside:
+    for process in processes:
         process.start()
     try:
         yield
-        for process in beside:
+        for process in processes:
             process.join()
     finally:
-        for process in beside:
+        for process in processes:
             process.kill()
 
 
 def compile_listed(parts: Iterable[str]) -> None:
-    """Compile what the list has of these parts and no other process is at."""
+    """Compile the listed kernels of these parts that no other process is compiling."""
     for name, forms in read_signatures():
         if name.startswith(tuple(parts)):
-            _find(name)
-            compiled, signature = KERNELS[name], tuple(map(find_type, forms))
+            _import_object(name)
+            compiled = KERNELS[name]
+            signature = tuple(map(find_type, forms))
             with compiling(name, signature, wait=False) as is_mine:
                 if is_mine:
                     compiled.compile(signature)

@@ -1,6 +1,9 @@
 """The sky behind the splats, a camera's colour map, and the step to 8 bits: the torch definition.
 
-out = rgb + (1 - alpha) sky(direction),   sky seen through the fog that lies before it
+    out = rgb + (1 - alpha) sky(direction),   with the sky seen through the fog that lies before it
+
+`views` and the effects call these functions on rendered images. On the CPU, float32 images go
+through the kernels of `composite_kernels` and `picture_kernels`.
 """
 
 from __future__ import annotations
@@ -21,9 +24,9 @@ from augment.render.fog import (
     airlight_gain,
     blend_airlight,
     optical_depth,
+    ray_distances,
     sky_optical_depth,
     vertical_optical_depth,
-    ways_of_raster,
 )
 from augment.render.threads import kernel_threads
 from augment.sky import (
@@ -35,15 +38,18 @@ from augment.sky import (
     sample_at,
 )
 
-ROWS = 32  # image rows a thread takes at a time
-NUM_GAINS = 8  # coefficients of airlight's growth with the slope, which then errs by 1e-6
-AIRLIGHT_SIZE = 64  # texels along a face of airlight by elevation, which then errs by 1e-4
+# Image rows that a thread takes at a time.
+ROWS = 32
+# Number of coefficients of the airlight's growth with the slope; it then errs by 1e-6.
+NUM_GAINS = 8
+# Texels along a face of the airlight by elevation; it then errs by 1e-4.
+AIRLIGHT_SIZE = 64
 
 
 def sky_behind(sky: Sky, fog: Fog | None) -> tuple[Sky, Fog | None]:
-    """What has to be evaluated per pixel: the sky and the fog before it, or less.
+    """Return the sky and the fog that have to be evaluated per pixel, simplified where possible.
 
-    Uniform fog hides the sky altogether (infinite distance), so only its airlight is left; fog
+    Uniform fog hides the sky altogether (infinite distance), so only its airlight is left. Fog
     without density changes nothing.
     """
     if fog is None or fog.sigma_per_m == 0:
@@ -55,7 +61,7 @@ def sky_behind(sky: Sky, fog: Fog | None) -> tuple[Sky, Fog | None]:
 
 @functools.lru_cache(maxsize=16)
 def _airlight(fog: Fog) -> Sky:
-    """The airlight of endless fog in every direction."""
+    """Return the airlight of endless fog in every direction, as a sky."""
     horizon = torch.tensor(fog.rgb, dtype=torch.float32)
     if fog.overcast == 0:
         return ConstantSky(horizon)
@@ -65,20 +71,23 @@ def _airlight(fog: Fog) -> Sky:
 
 @functools.lru_cache(maxsize=16)
 def _gains(overcast: float) -> np.ndarray:
-    """c of what varying airlight is multiplied by, less 1, at a slope s >= 0: s (c0 + c1 s + ...);
-    float32 [NUM_GAINS], zeros without overcast.
+    """Return coefficients c of the varying airlight's growth with the slope, float32 [NUM_GAINS].
+
+    At a slope s >= 0 the varying airlight is multiplied by 1 + s (c0 + c1 s + ...). The
+    coefficients are zeros without overcast.
     """
 
     def per_slope(slopes: np.ndarray) -> np.ndarray:
+        """Return the growth of the airlight at slopes, over the slope."""
         fog = Fog(0.0, (1.0, 1.0, 1.0), overcast=overcast)
         return airlight_gain(fog, torch.from_numpy(slopes))[:, 0].numpy() / slopes
 
-    found = Chebyshev.interpolate(per_slope, NUM_GAINS - 1, [0, 1]).convert(kind=Polynomial)
-    return np.resize(np.append(found.coef, np.zeros(NUM_GAINS)), NUM_GAINS).astype(np.float32)
+    series = Chebyshev.interpolate(per_slope, NUM_GAINS - 1, [0, 1]).convert(kind=Polynomial)
+    return np.resize(np.append(series.coef, np.zeros(NUM_GAINS)), NUM_GAINS).astype(np.float32)
 
 
 def pixels_at_unit_depth(camera: Camera) -> tuple[Float[np.ndarray, " W"], Float[np.ndarray, " H"]]:
-    """Where columns and rows lie in the plane at z = 1, float32."""
+    """Return the positions of columns and rows in the plane at z = 1, float32."""
     u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     return u.astype(np.float32), v.astype(np.float32)
@@ -87,37 +96,51 @@ def pixels_at_unit_depth(camera: Camera) -> tuple[Float[np.ndarray, " W"], Float
 def add_elevation(
     raster: RenderOutput, camera: Camera, fog: Fog, *, behind: bool = False, backend: str = CPU
 ) -> Float[Tensor, "H W 3"]:
-    """Colours in fog that were drawn with the airlight of the horizon, with that of their rays.
+    """Return colours whose airlight is that of their rays, from colours with the airlight of the
+    horizon.
 
-    raster: colour, alpha and expected depth, by which the fog's share of a pixel is judged, as
-    deferred fog does; hence exact for one surface a pixel. behind: with the endless fog behind
-    them, too. backend: as of `map_colors`.
+    The fog's share of a pixel is judged by its expected depth, as in deferred fog. So the result is
+    exact for one surface per pixel.
+
+    Args:
+        raster: render with colour, alpha and expected depth; on the CPU its colour is overwritten.
+        camera: camera of the render.
+        fog: fog of the render.
+        behind: if True, the endless fog behind the surfaces is added, too.
+        backend: as in `map_colors`.
     """
-    rgb, alpha, depth = raster.rgb, raster.alpha, raster.expected_depth
+    rgb = raster.rgb
+    alpha = raster.alpha
+    depth = raster.expected_depth
     assert rgb is not None and alpha is not None and depth is not None
     if kernels_for(backend, rgb, alpha) != CPU or not rgb.is_contiguous():
-        tau = optical_depth(fog, *ways_of_raster(raster, camera, fog))
+        tau = optical_depth(fog, *ray_distances(raster, camera, fog))
         rays = camera.ray_directions(rgb.dtype, rgb.device)
         gain = airlight_gain(fog, rays[..., 2] / rays.norm(dim=-1))
-        seen = rgb + (alpha * -torch.expm1(-tau))[..., None] * gain
-        return seen + (1 - alpha)[..., None] * (rgb.new_tensor(fog.rgb) + gain) if behind else seen
-    eye, per_height = 0.0, 0.0
+        colors = rgb + (alpha * -torch.expm1(-tau))[..., None] * gain
+        return (
+            colors + (1 - alpha)[..., None] * (rgb.new_tensor(fog.rgb) + gain) if behind else colors
+        )
+    eye_above_base_m = 0.0
+    per_height = 0.0
     if fog.scale_height_m is not None:
-        eye, per_height = float(camera.centre[2]) - fog.base_z_m, 1 / fog.scale_height_m
-    medium = fog.sigma_per_m, eye * per_height, per_height
-    numbers = camera.world_from_camera[2, :3].numpy(), medium, _gains(fog.overcast)
-    numbers = (
+        eye_above_base_m = float(camera.centre[2]) - fog.base_z_m
+        per_height = 1 / fog.scale_height_m
+    fog_numbers = fog.sigma_per_m, eye_above_base_m * per_height, per_height
+    kernel_inputs = camera.world_from_camera[2, :3].numpy(), fog_numbers, _gains(fog.overcast)
+    kernel_inputs = (
         *pixels_at_unit_depth(camera),
-        *numbers,
+        *kernel_inputs,
         fog.varying_rgb or fog.rgb,
         fog.rgb if behind else (),
     )
     with kernel_threads(ROWS):
         picture_kernels.add_elevation(
-            rgb.detach().numpy(), alpha.detach().contiguous().numpy(),
+            rgb.detach().numpy(),
+            alpha.detach().contiguous().numpy(),
             depth.detach().contiguous().numpy(),
-            *(np.ascontiguousarray(n, np.float32) for n in numbers),
-        )  # fmt: skip
+            *(np.ascontiguousarray(n, np.float32) for n in kernel_inputs),
+        )
     return rgb
 
 
@@ -130,14 +153,23 @@ def composite_sky(
     fog: Fog | None = None,
     backend: str = CPU,
 ) -> Float[Tensor, "H W 3"]:
-    """The finished display-encoded image, not clamped.
+    """Return the finished display-encoded image, not clamped.
 
-    fog: with it the sky is seen through the fog up to infinity. backend: on the CPU, cube maps in
-    float32 go through a kernel, equal to this definition within float rounding, unless gradients
-    are recorded, which it has none of.
+    Args:
+        rgb: premultiplied colour of the splats.
+        alpha: alpha of the splats.
+        camera: the camera.
+        sky: the sky behind the splats.
+        fog: fog through which the sky is seen, up to infinity; None for clear air.
+        backend: on the CPU, cube maps in float32 go through a kernel, equal to this definition
+            within float rounding. Kernels have no gradients, so torch does the work if any are
+            recorded.
+
+    Raises:
+        ValueError: the camera is orthographic and the sky depends on the direction.
     """
     sky, fog = sky_behind(sky, fog)
-    if isinstance(sky, ConstantSky) and fog is None:  # no direction matters
+    if isinstance(sky, ConstantSky) and fog is None:  # the sky is the same in all directions
         if kernels_for(backend, rgb, alpha) == CPU:
             return _composite_constant(rgb, alpha, sky)
         return rgb + (1 - alpha)[..., None] * sky.rgb.to(rgb.device, rgb.dtype)
@@ -158,6 +190,7 @@ def composite_sky(
 
 
 def _composite_constant(rgb: Tensor, alpha: Tensor, sky: ConstantSky) -> Tensor:
+    """Return the image over a constant sky, by a kernel."""
     out = np.empty((*alpha.shape, 3), np.float32)
     color = sky.rgb.detach().to(torch.float32).numpy()
     with kernel_threads(ROWS):
@@ -170,29 +203,43 @@ def _composite_constant(rgb: Tensor, alpha: Tensor, sky: ConstantSky) -> Tensor:
 def _composite_cubemap(
     rgb: Tensor, alpha: Tensor, camera: Camera, faces: Tensor, fog: Fog | None
 ) -> Tensor:
+    """Return the image over a cube map, through fog if there is any, by a kernel."""
     out = np.empty((camera.height, camera.width, 3), np.float32)
-    strength, gains, airlight, varying = -1.0, _gains(0.0), (0.0, 0.0, 0.0), None
+    strength = -1.0
+    gains = _gains(0.0)
+    airlight = (0.0, 0.0, 0.0)
+    varying = None
     if fog is not None:
         strength = vertical_optical_depth(fog, float(camera.centre[2]))
-        gains, airlight, varying = _gains(fog.overcast), fog.rgb, fog.varying_rgb
+        gains = _gains(fog.overcast)
+        airlight = fog.rgb
+        varying = fog.varying_rgb
     with kernel_threads(ROWS):
         composite_kernels.composite_cubemap(
-            rgb.detach().contiguous().numpy(), alpha.detach().contiguous().numpy(),
-            faces.contiguous().numpy(), camera.world_from_camera[:3, :3].numpy().astype(np.float32),
-            np.float32(1 / camera.fx), np.float32(1 / camera.fy), np.float32(camera.cx),
-            np.float32(camera.cy), np.float32(min(strength, 1e30)), gains,
-            np.asarray(airlight, np.float32), np.asarray(varying or airlight, np.float32), out,
-        )  # fmt: skip
+            rgb.detach().contiguous().numpy(),
+            alpha.detach().contiguous().numpy(),
+            faces.contiguous().numpy(),
+            camera.world_from_camera[:3, :3].numpy().astype(np.float32),
+            np.float32(1 / camera.fx),
+            np.float32(1 / camera.fy),
+            np.float32(camera.cx),
+            np.float32(camera.cy),
+            np.float32(min(strength, 1e30)),
+            gains,
+            np.asarray(airlight, np.float32),
+            np.asarray(varying or airlight, np.float32),
+            out,
+        )
     return torch.from_numpy(out)
 
 
 def map_colors(
     rgb: Float[Tensor, "H W 3"], color_map: Float[Tensor, "3 4"], *, backend: str = CPU
 ) -> Float[Tensor, "H W 3"]:
-    """M[:, :3] @ rgb + M[:, 3] at every pixel, not clamped.
+    """Return M[:, :3] @ rgb + M[:, 3] at every pixel, not clamped.
 
     backend: on the CPU, float32 without gradients goes through a kernel, equal to this definition
-    within float rounding, and `rgb` is overwritten: fresh memory would take as long as the
+    within float rounding. Then `rgb` is overwritten: fresh memory would take as long as the
     arithmetic.
     """
     if kernels_for(backend, rgb, color_map) != CPU or not rgb.is_contiguous():
@@ -204,16 +251,17 @@ def map_colors(
 
 
 def to_bytes(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
-    """Clamped to [0, 1], times 255, rounded to the nearest; where rgb lies."""
+    """Return the image clamped to [0, 1], times 255, rounded to the nearest, on the same device."""
     rgb = rgb.detach()
     if kernels_for(AUTO, rgb) != CPU:
         return (rgb.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
-    out, rows = np.empty(tuple(rgb.shape), np.uint8), rgb.contiguous().numpy()
+    out = np.empty(tuple(rgb.shape), np.uint8)
+    rows = rgb.contiguous().numpy()
     with kernel_threads(ROWS):
         composite_kernels.quantise(rows.reshape(len(rows), -1), out.reshape(len(rows), -1))
     return torch.from_numpy(out)
 
 
 def quantise(rgb: Float[Tensor, "H W 3"]) -> np.ndarray:
-    """`to_bytes` as an array."""
+    """Return `to_bytes` as an array."""
     return to_bytes(rgb).cpu().numpy()

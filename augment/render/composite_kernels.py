@@ -1,4 +1,4 @@
-"""Numba kernels for the sky behind the splats, for 8-bit images, and for colours under maps."""
+"""Numba kernels of `composite`: the sky behind the splats, 8-bit images, and colours under maps."""
 
 from __future__ import annotations
 
@@ -18,18 +18,26 @@ from augment.render.sh import BLACK, FOLDED
 
 # ---- Numba kernel: finished pixels become opaque (see augment.render.rasterize) ------------------
 
-RUN = 4096  # pixels of a piece of work
+# Pixels of a piece of work.
+RUN = 4096
 
 
 @kernel
-def renormalise_alpha(alpha, rgb, overlay, least):
-    """alpha, overlay: float32 [P]. rgb: [3 P]. rgb, overlay: may be empty. least: of finished."""
-    one = np.float32(1)
+def renormalise_alpha(alpha, rgb, overlay, min_alpha):
+    """Make pixels of alpha >= min_alpha opaque, in place (see `rasterize.renormalise_alpha`).
+
+    Args:
+        alpha: float32 [P].
+        rgb: float32 [3 P], or empty.
+        overlay: float32 [P], or empty.
+        min_alpha: smallest alpha of a finished pixel.
+    """
+    one_f32 = np.float32(1)
     for run in prange((alpha.size + RUN - 1) // RUN):
         for pixel in range(run * RUN, min((run + 1) * RUN, alpha.size)):
-            if alpha[pixel] >= least:
-                scale = one / alpha[pixel]
-                alpha[pixel] = one
+            if alpha[pixel] >= min_alpha:
+                scale = one_f32 / alpha[pixel]
+                alpha[pixel] = one_f32
                 if rgb.size > 0:
                     rgb[3 * pixel] *= scale
                     rgb[3 * pixel + 1] *= scale
@@ -40,30 +48,46 @@ def renormalise_alpha(alpha, rgb, overlay, least):
 
 @inner()
 def airlight_gain(slope, gains):
-    """What varying airlight is multiplied by, less 1. gains [8]: of augment.render.composite."""
-    s, one = abs(slope), np.float32(1)
-    p = gains[4] + s * (gains[5] + s * (gains[6] + s * gains[7]))
-    p = s * (gains[0] + s * (gains[1] + s * (gains[2] + s * (gains[3] + s * p))))
-    return p if slope >= 0 else -p / (one + p)
+    """Return the factor of varying airlight, minus 1.
+
+    gains [8]: coefficients of `composite._gains`.
+    """
+    steepness = abs(slope)
+    one_f32 = np.float32(1)
+    p = gains[4] + steepness * (gains[5] + steepness * (gains[6] + steepness * gains[7]))
+    p = steepness * (
+        gains[0]
+        + steepness * (gains[1] + steepness * (gains[2] + steepness * (gains[3] + steepness * p)))
+    )
+    return p if slope >= 0 else -p / (one_f32 + p)
 
 
 @inner()
-def layered_way(distance, eye, up):
-    """Length of fog as dense as at its base with as much in it as a way of this length, which
-    begins `eye` scale heights above the base and climbs by `up` (see augment.render.fog).
+def layered_distance(distance, eye, climb):
+    """Return the length of a ray in fog of the base's density that holds as much fog
+    (augment.render.fog).
+
+    Args:
+        distance: length of the ray, metres.
+        eye: height of its beginning above the base, scale heights.
+        climb: height that it climbs, scale heights.
     """
-    half, one, x = np.float32(0.5), np.float32(1), abs(up)
+    half = np.float32(0.5)
+    one_f32 = np.float32(1)
+    x = abs(climb)
     # Below 0.01 the difference 1 - exp(-x) would lose two digits.
-    series = one - half * x * (one - x * np.float32(1 / 3))
-    mean = series if x < np.float32(0.01) else (one - math.exp(-x)) / x
-    lowest = eye + min(up, np.float32(0))
+    series = one_f32 - half * x * (one_f32 - x * np.float32(1 / 3))
+    mean = series if x < np.float32(0.01) else (one_f32 - math.exp(-x)) / x
+    lowest = eye + min(climb, np.float32(0))
     return distance * math.exp(min(-lowest, np.float32(MAX_EXPONENT))) * mean
 
 
 @kernel
 def composite_constant(rgb, alpha, color, out):
-    """out = rgb + (1 - alpha) color [3]."""
-    red, green, blue = color[0], color[1], color[2]
+    """Write out = rgb + (1 - alpha) color [3]."""
+    red = color[0]
+    green = color[1]
+    blue = color[2]
     for i in prange(alpha.shape[0]):
         for j in range(alpha.shape[1]):
             share = np.float32(1) - alpha[i, j]
@@ -74,117 +98,169 @@ def composite_constant(rgb, alpha, color, out):
 
 @kernel
 def composite_cubemap(
-    rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, gains, airlight, varying, out
+    rgb, alpha, faces, rotation, ifx, ify, cx, cy, vertical_depth, gains, airlight, varying, out
 ):
-    """out = rgb + (1 - alpha) sky of a cube map, through fog where strength >= 0.
+    """Write out = rgb + (1 - alpha) sky of a cube map, through fog if vertical_depth >= 0.
 
-    faces: [6, R + 2, R + 2, 3], with a border (augment.sky.with_border). rotation:
-    world_from_camera. ifx, ify: 1 / focal length. strength: optical depth straight up. gains:
-    as of airlight_gain. airlight [3], varying [3]: of the fog.
+    Args:
+        rgb: float32 [H, W, 3].
+        alpha: float32 [H, W].
+        faces: [6, R + 2, R + 2, 3], with a border (augment.sky.with_border).
+        rotation: world_from_camera.
+        ifx: 1 / focal length along x, 1/px.
+        ify: 1 / focal length along y, 1/px.
+        cx: column of the principal point, px.
+        cy: row of the principal point, px.
+        vertical_depth: optical depth of the fog straight up; negative without fog.
+        gains: as in airlight_gain.
+        airlight: airlight of the fog at the horizon [3].
+        varying: the share of it that varies with elevation [3].
+        out: float32 [H, W, 3].
     """
     height, width = alpha.shape
-    half, one = np.float32(0.5), np.float32(1)
-    texels, line = faces.reshape(-1), U(3 * faces.shape[1])
+    half = np.float32(0.5)
+    one_f32 = np.float32(1)
+    texels = faces.reshape(-1)
+    row_stride = U(3 * faces.shape[1])
     scale = np.float32(faces.shape[1] - 2) * half
     for i in prange(height):
-        places, begins = np.empty(4 * _AHEAD, np.float32), np.empty(_AHEAD, np.uint64)
+        texel_places = np.empty(4 * _AHEAD, np.float32)
+        first_texels = np.empty(_AHEAD, np.uint64)
         v = (np.float32(i) + half - cy) * ify
         bx = rotation[0, 1] * v + rotation[0, 2]
         by = rotation[1, 1] * v + rotation[1, 2]
         bz = rotation[2, 1] * v + rotation[2, 2]
-        colors, alphas, target = rgb[i], alpha[i], out[i]
+        colors = rgb[i]
+        alphas = alpha[i]
+        target = out[i]
+        # Pixels in runs: runs without sky are copied.
         for first in range(U(0), U(width), U(_AHEAD)):
             if not _shows_sky(alphas, first, min(first + U(_AHEAD), U(width))):
                 for j in range(first, min(first + U(_AHEAD), U(width))):
                     for c in range(U(3)):
                         target[j, c] = colors[j, c]
                 continue
+            # Directions of the run's pixels, and their texels.
             for k in range(U(0), U(_AHEAD), U(LANES)):
                 u = v8.splat(np.float32(first + k)) + v8.lane_numbers()
                 u = (u + v8.splat(half) - v8.splat(cx)) * v8.splat(ifx)
                 x = v8.splat(rotation[0, 0]) * u + v8.splat(bx)
                 y = v8.splat(rotation[1, 0]) * u + v8.splat(by)
                 z = v8.splat(rotation[2, 0]) * u + v8.splat(bz)
-                _place_eight(x, y, z, scale, np.float32(faces.shape[1]), places, k)
+                _place_eight(x, y, z, scale, np.float32(faces.shape[1]), texel_places, k)
             count = min(U(_AHEAD), U(width) - first)
-            for k in range(count):  # a row of pixels crosses many of texels, each far in memory
-                at = U(np.int32(places[k])) * line + U(3) * U(np.int32(places[k + U(_AHEAD)]))
-                v8.prefetch(texels, at)
-                v8.prefetch(texels, at + line)
-                begins[k] = at
+            # Fetch the texels: a row of pixels crosses many rows of texels, each far in memory.
             for k in range(count):
-                j, at = first + k, begins[k]
-                fc, fr = places[k + U(2 * _AHEAD)], places[k + U(3 * _AHEAD)]
-                transmittance = one - alphas[j]
-                visible, gain = one, np.float32(0)
-                if strength >= 0:
+                texel = U(np.int32(texel_places[k])) * row_stride + U(3) * U(
+                    np.int32(texel_places[k + U(_AHEAD)])
+                )
+                v8.prefetch(texels, texel)
+                v8.prefetch(texels, texel + row_stride)
+                first_texels[k] = texel
+            # Fog before the sky, and the sky's colour between four texels.
+            for k in range(count):
+                j = first + k
+                texel = first_texels[k]
+                fraction_x = texel_places[k + U(2 * _AHEAD)]
+                fraction_y = texel_places[k + U(3 * _AHEAD)]
+                transmittance = one_f32 - alphas[j]
+                sky_transmittance = one_f32
+                gain = np.float32(0)
+                if vertical_depth >= 0:
                     u = (np.float32(j) + half - cx) * ifx
                     x = rotation[0, 0] * u + bx
                     y = rotation[1, 0] * u + by
                     z = rotation[2, 0] * u + bz
-                    visible = np.float32(0)
+                    sky_transmittance = np.float32(0)
                     slope = z / math.sqrt(x * x + y * y + z * z)
                     if z > 0:
-                        visible = math.exp(-strength / slope)
+                        sky_transmittance = math.exp(-vertical_depth / slope)
                     gain = airlight_gain(slope, gains)
                 for c in range(U(3)):
-                    top = texels[at + c] * (one - fc) + texels[at + U(3) + c] * fc
-                    below = at + line + c
-                    bottom = texels[below] * (one - fc) + texels[below + U(3)] * fc
-                    color = top * (one - fr) + bottom * fr
-                    if strength >= 0:
+                    top = (
+                        texels[texel + c] * (one_f32 - fraction_x)
+                        + texels[texel + U(3) + c] * fraction_x
+                    )
+                    below = texel + row_stride + c
+                    bottom = (
+                        texels[below] * (one_f32 - fraction_x) + texels[below + U(3)] * fraction_x
+                    )
+                    color = top * (one_f32 - fraction_y) + bottom * fraction_y
+                    if vertical_depth >= 0:
                         air = airlight[c] + gain * varying[c]
-                        color = visible * color + (one - visible) * air
+                        color = sky_transmittance * color + (one_f32 - sky_transmittance) * air
                     target[j, c] = colors[j, c] + transmittance * color
 
 
 @inner()
 def _shows_sky(alphas, first, end):
-    """Whether anything behind shines through one of the pixels, or might: alpha is NaN."""
-    shows = False
+    """Return True if a pixel lets light from behind through, or may: its alpha is NaN."""
+    has_sky = False
     for j in range(first, end):
-        shows = shows or alphas[j] != np.float32(1)
-    return shows
+        has_sky = has_sky or alphas[j] != np.float32(1)
+    return has_sky
 
 
-_AHEAD = 64  # pixels whose places in the cube map are found before they are read
+# Pixels whose texels are computed, and fetched into the cache, before they are read.
+_AHEAD = 64
 
 
 @inner()
-def _place_eight(x, y, z, scale, side, places, at):
-    """Where eight directions meet a cube map with a border: rows of _AHEAD each of the texel above
-    and to the left, its row counted through all faces and its column, and of the parts of a texel
-    to the right of its centre and below. scale: half a face in texels. side: with the border.
+def _place_eight(x, y, z, scale, side, places, start):
+    """Write the texels and fractions at which eight directions meet a cube map with a border.
+
+    texel_places gets four rows of _AHEAD numbers: the row of the texel above and to the left,
+    counted through all faces; its column; and the fractions of a texel to the right of its centre
+    and below it.
+
+    Args:
+        x, y, z: the directions, of any length.
+        scale: half a face, texels.
+        side: a face with its border, texels.
+        texel_places: the rows, flat.
+        start: position in each row.
     """
-    zero, half = v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
-    ax, ay, az = v8.absolute(x), v8.absolute(y), v8.absolute(z)
-    by_x, by_y = v8.both(v8.at_least(ax, ay), v8.at_least(ax, az)), v8.at_least(ay, az)
-    right, ahead, up = v8.at_least(x, zero), v8.at_least(y, zero), v8.at_least(z, zero)
-    major = v8.select(by_x, ax, v8.select(by_y, ay, az))
-    s = v8.select(by_y, x, v8.select(up, x, v8.negate(x)))
-    s = v8.select(by_x, v8.select(right, v8.negate(z), z), s)
-    t = v8.select(by_y, v8.select(ahead, z, v8.negate(z)), v8.negate(y))
-    t = v8.select(by_x, v8.negate(y), t)
-    face = v8.select(by_y, _one_of(ahead, 2, 3), _one_of(up, 4, 5))
-    face = v8.select(by_x, _one_of(right, 0, 1), face)
-    inverse, middle = v8.splat(scale) / major, v8.splat(scale) + half
-    column, row = s * inverse + middle, t * inverse + middle
-    left, above = v8.floor(column), v8.floor(row)
-    v8.store(places, at, face * v8.splat(side) + above)
-    v8.store(places, at + U(_AHEAD), left)
-    v8.store(places, at + U(2 * _AHEAD), column - left)
-    v8.store(places, at + U(3 * _AHEAD), row - above)
+    zeros = v8.splat(np.float32(0))
+    half = v8.splat(np.float32(0.5))
+    ax = v8.absolute(x)
+    ay = v8.absolute(y)
+    az = v8.absolute(z)
+    is_x_face = v8.both(v8.at_least(ax, ay), v8.at_least(ax, az))
+    is_y_face = v8.at_least(ay, az)
+    is_x_positive = v8.at_least(x, zeros)
+    is_y_positive = v8.at_least(y, zeros)
+    is_z_positive = v8.at_least(z, zeros)
+    major = v8.select(is_x_face, ax, v8.select(is_y_face, ay, az))
+    s = v8.select(is_y_face, x, v8.select(is_z_positive, x, v8.negate(x)))
+    s = v8.select(is_x_face, v8.select(is_x_positive, v8.negate(z), z), s)
+    t = v8.select(is_y_face, v8.select(is_y_positive, z, v8.negate(z)), v8.negate(y))
+    t = v8.select(is_x_face, v8.negate(y), t)
+    face = v8.select(
+        is_y_face, _select_number(is_y_positive, 2, 3), _select_number(is_z_positive, 4, 5)
+    )
+    face = v8.select(is_x_face, _select_number(is_x_positive, 0, 1), face)
+    inverse = v8.splat(scale) / major
+    middle = v8.splat(scale) + half
+    column = s * inverse + middle
+    row = t * inverse + middle
+    left_column = v8.floor(column)
+    row_above = v8.floor(row)
+    v8.store(places, start, face * v8.splat(side) + row_above)
+    v8.store(places, start + U(_AHEAD), left_column)
+    v8.store(places, start + U(2 * _AHEAD), column - left_column)
+    v8.store(places, start + U(3 * _AHEAD), row - row_above)
 
 
 @inner()
-def _one_of(mask, a, b):
+def _select_number(mask, a, b):
     return v8.select(mask, v8.splat(np.float32(a)), v8.splat(np.float32(b)))
 
 
 @kernel
 def quantise(values, out):
-    """uint8 of float32 rows: clamped to [0, 1], times 255, rounded to the nearest."""
-    half, top = np.float32(0.5), np.float32(255)
+    """Write uint8 of float32 rows: clamped to [0, 1], times 255, rounded to the nearest."""
+    half = np.float32(0.5)
+    top = np.float32(255)
     for i in prange(values.shape[0]):
         for j in range(values.shape[1]):
             value = values[i, j] * top + half
@@ -193,32 +269,48 @@ def quantise(values, out):
 
 @kernel
 def map_colors(rgb, matrix):
-    """Every colour of float32 [H, W, 3] becomes matrix[:, :3] @ colour + matrix[:, 3], in place."""
-    m00, m01, m02, m03 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
-    m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
-    m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
+    """Replace every colour of float32 [H, W, 3] by matrix[:, :3] @ colour + matrix[:, 3]."""
+    m00 = matrix[0, 0]
+    m01 = matrix[0, 1]
+    m02 = matrix[0, 2]
+    m03 = matrix[0, 3]
+    m10 = matrix[1, 0]
+    m11 = matrix[1, 1]
+    m12 = matrix[1, 2]
+    m13 = matrix[1, 3]
+    m20 = matrix[2, 0]
+    m21 = matrix[2, 1]
+    m22 = matrix[2, 2]
+    m23 = matrix[2, 3]
     for i in prange(rgb.shape[0]):
         row = rgb[i].reshape(-1)
         for j in range(U(0), U(row.size), U(3)):
-            r, g, b = row[j], row[j + U(1)], row[j + U(2)]
+            r = row[j]
+            g = row[j + U(1)]
+            b = row[j + U(2)]
             row[j] = m00 * r + m01 * g + m02 * b + m03
             row[j + U(1)] = m10 * r + m11 * g + m12 * b + m13
             row[j + U(2)] = m20 * r + m21 * g + m22 * b + m23
 
 
-# ---- Numba kernel: colour maps folded into spherical harmonics, as fast as memory gives and takes.
-# Results go past the cache: a line that is written as a whole need not be read before.
+# ---- Numba kernel: colour maps folded into spherical harmonics -----------------------------------
+# Memory limits its speed. Results go past the cache: a cache line that is written as a whole need
+# not be read first.
 
-SPLATS = 2048  # of a piece of work
-SPLAT_RUN = (
-    128  # splats mapped at a time, whose results (24 KB at degree 3) stay in the first cache
-)
-ALIGNMENT = 4 * LANES  # bytes, of the target
+# Splats of a piece of work.
+SPLATS = 2048
+# Splats that are mapped at a time; their results (24 KB at degree 3) stay in the first cache.
+SPLAT_RUN = 128
+# Bytes to which the target is aligned.
+ALIGNMENT = 4 * LANES
 
 
 @intrinsic
-def _stream(typingctx, source, at, target, to):
-    """target[to : to + 8] = source[at : at + 8] past the cache; target + to is aligned."""
+def _stream(typingctx, source, source_start, target, target_start):
+    """Store target[target_start : + 8] = source[source_start : + 8] past the cache.
+
+    The address of target[target_start] is aligned.
+    """
 
     def codegen(context, builder, sig, args):
         vector = ir.VectorType(ir.FloatType(), LANES)
@@ -229,8 +321,8 @@ def _stream(typingctx, source, at, target, to):
 
         value = builder.load(pointer(sig.args[0], args[0], args[1]), align=4)
         stored = builder.store(value, pointer(sig.args[2], args[2], args[3]), align=ALIGNMENT)
-        one = ir.Constant(ir.IntType(32), 1)
-        stored.set_metadata("nontemporal", builder.module.add_metadata([one]))
+        one_i32 = ir.Constant(ir.IntType(32), 1)
+        stored.set_metadata("nontemporal", builder.module.add_metadata([one_i32]))
         return context.get_dummy_value()
 
     return types.void(source, types.uint64, target, types.uint64), codegen
@@ -238,7 +330,7 @@ def _stream(typingctx, source, at, target, to):
 
 @intrinsic
 def _fence(typingctx):
-    """Other threads see what was streamed before."""
+    """Make streamed numbers visible to other threads."""
 
     def codegen(context, builder, sig, args):
         builder.fence("seq_cst")
@@ -248,53 +340,78 @@ def _fence(typingctx):
 
 
 @inner()
-def _map_splats(source, at, work, to, count, functions, folded):
-    """`count` splats, from source[at:] to work[to:], by one map; see apply.map_sh for `least`."""
-    least = BLACK if functions == U(1) else np.float32(-np.inf)
-    a0, a1, a2 = folded[0], folded[1], folded[2]
-    b0, b1, b2 = folded[3], folded[4], folded[5]
-    c0, c1, c2 = folded[6], folded[7], folded[8]
+def _map_splats(source, source_start, work, target_start, count, functions, folded):
+    """Map `count` splats by one map, from source[source_start:] to work[target_start:].
+
+    A splat of degree 0 whose colour is below 0 is mapped as the black that it shows (see `map_sh`
+    of augment.effects.style.color_maps).
+    """
+    min_value = BLACK if functions == U(1) else np.float32(-np.inf)
+    a0 = folded[0]
+    a1 = folded[1]
+    a2 = folded[2]
+    b0 = folded[3]
+    b1 = folded[4]
+    b2 = folded[5]
+    c0 = folded[6]
+    c1 = folded[7]
+    c2 = folded[8]
     for i in range(count * functions):
-        j, k = at + U(3) * i, to + U(3) * i
-        red, green = max(source[j], least), max(source[j + U(1)], least)
-        blue = max(source[j + U(2)], least)
+        j = source_start + U(3) * i
+        k = target_start + U(3) * i
+        red = max(source[j], min_value)
+        green = max(source[j + U(1)], min_value)
+        blue = max(source[j + U(2)], min_value)
         work[k] = a0 * red + a1 * green + a2 * blue
         work[k + U(1)] = b0 * red + b1 * green + b2 * blue
         work[k + U(2)] = c0 * red + c1 * green + c2 * blue
     row = U(3) * functions
     for splat in range(count):
         for channel in range(U(3)):
-            work[to + splat * row + channel] += folded[U(9) + channel]
+            work[target_start + splat * row + channel] += folded[U(9) + channel]
 
 
 @inner()
 def _map_run(source, first, end, work, functions, classes, folded):
-    """Splats `first` to `end` into work; neighbours of one class together."""
+    """Map the splats `first` to `end` into work, neighbours of one class together."""
     row = U(3) * functions
-    at = first
-    while at < end:
-        last, of = end, U(0)
+    splat = first
+    while splat < end:
+        class_end = end
+        map_index = U(0)
         if classes.size:
-            of = U(classes[at])
-            last = at + U(1)
-            while last < end and U(classes[last]) == of:
-                last += U(1)
-        to = (at - first) * row
-        if folded[of, U(FOLDED - 1)] != np.float32(0):
-            _map_splats(source, at * row, work, to, last - at, functions, folded[of])
+            map_index = U(classes[splat])
+            class_end = splat + U(1)
+            while class_end < end and U(classes[class_end]) == map_index:
+                class_end += U(1)
+        target_start = (splat - first) * row
+        if folded[map_index, U(FOLDED - 1)] != np.float32(0):
+            _map_splats(
+                source,
+                splat * row,
+                work,
+                target_start,
+                class_end - splat,
+                functions,
+                folded[map_index],
+            )
         else:
-            for i in range((last - at) * row):
-                work[to + i] = source[at * row + i]
-        at = last
+            for i in range((class_end - splat) * row):
+                work[target_start + i] = source[splat * row + i]
+        splat = class_end
 
 
 @kernel
 def map_sh(source, target, functions, classes, folded):
-    """target = source with every splat's functions mapped; both float32 [N * K * 3], or one array.
+    """Write target = source with every splat's functions mapped.
 
-    target: aligned to ALIGNMENT bytes. functions: K. classes: int16 [N], rows of folded, or [0]
-    where all splats take the first. folded: float32 [C, FOLDED]; a last number of 0 says that the
-    map changes nothing, and the splat's bits are copied.
+    Args:
+        source: float32 [N * K * 3]; it may be the target.
+        target: float32 [N * K * 3], aligned to ALIGNMENT bytes.
+        functions: K, SH functions of a splat.
+        classes: int16 [N], rows of folded; or [0] if all splats take the first.
+        folded: float32 [C, FOLDED]. A last number of 0 says that the map changes nothing; then the
+            splat's bits are copied.
     """
     row = U(3 * functions)
     count = source.size // (3 * functions)
@@ -305,9 +422,9 @@ def map_sh(source, target, functions, classes, folded):
             last = min(first + U(SPLAT_RUN), end)
             _map_run(source, first, last, work, U(functions), classes, folded)
             size = (last - first) * row
-            whole = size - size % U(LANES)
-            for i in range(U(0), whole, U(LANES)):
+            vector_end = size - size % U(LANES)
+            for i in range(U(0), vector_end, U(LANES)):
                 _stream(work, i, target, first * row + i)
-            for i in range(whole, size):
+            for i in range(vector_end, size):
                 target[first * row + i] = work[i]
         _fence()

@@ -1,54 +1,68 @@
-"""Thresholds of the image's definition, in one place; kernels receive them as arguments.
+"""Thresholds of the image's definition, in one place. Kernels receive them as arguments.
 
-Values are gsplat 1.5.3's, since users' scenes were trained with it or its parents.
+The values are those of gsplat 1.5.3, since users' scenes were trained with it or with its parents.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-ALPHA_MIN = 1.0 / 255.0  # a splat's contribution below this is skipped
-TRANSMITTANCE_STOP = 1e-4  # blending stops before the splat that would reach this
-# Median depth is where transmittance falls below one half, so blending must not stop sooner.
+# Alpha below which a splat's contribution to a pixel is skipped.
+ALPHA_MIN = 1.0 / 255.0
+# Transmittance at which blending stops, before the splat that would reach it.
+TRANSMITTANCE_STOP = 1e-4
+# Largest transmittance stop: median depth is where transmittance falls below one half, so blending
+# must not stop sooner.
 MAX_TRANSMITTANCE_STOP = 0.25
-COV2D_BLUR = 0.3  # px^2 added to the diagonal of the projected covariance
+# px^2 that are added to the diagonal of the projected covariance.
+COV2D_BLUR = 0.3
+# Sigmas beyond which a splat is not drawn.
 MAX_EXTENT_SIGMAS = 3.33
-TAN_FOV_MARGIN = 0.3  # the Jacobian's x/z, y/z are clamped to the image plus this part of it
-DEPTH_EPS = 1e-10  # floor of the weight that expected depth is divided by
+# Share of the image by which the range of the Jacobian's x/z and y/z exceeds the image.
+TAN_FOV_MARGIN = 0.3
+# Smallest weight that expected depth is divided by.
+DEPTH_EPS = 1e-10
 
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """What a rasteriser may be told beyond scene and camera.
+    """Settings of a rasteriser, besides scene and camera.
 
-    near_m: splats nearer than this along z are culled. alpha_max: 0.999 in gsplat 1.5.3, 0.99 in
-    the original 3DGS and gsplat's main branch. antialiased: opacity times sqrt(det/det_blurred).
-    sh_degree: highest band evaluated; None for all a splat has. mode_depth_floor_m: spread below
-    which depths are one cluster whatever they are, as the Gumbel distribution's beta: those up to
-    0.88 times as far behind a surface, and 1.56 times as far before it, belong to it.
+    near_m: splats with a smaller z are culled, metres.
 
-    transmittance_stop: a pixel is finished once no more than this share of the light behind it
-    shines through. A splat that would leave no more than min(transmittance_stop, 1e-4) is not
-    blended, which at 1e-4 and below is gsplat's rule; a greater stop blends the splat that reaches
-    it. (gsplat's rule with a greater stop would leave out whole surfaces: a wall of alpha 0.999
-    leaves 1e-3.) What is lost are weights behind the stop, together at most the stop; `rasterize`
-    lets what has been blended stand for them (augment.render.rasterize).
+    alpha_max: upper limit of alpha; 0.999 in gsplat 1.5.3, 0.99 in the original 3DGS and in
+    gsplat's main branch.
 
-    radius_clip_px: splats no larger than this are left out, by any camera; 0 leaves out none. A
-    splat's size is the larger half-extent of the box in which its alpha can reach 1/255,
-    sqrt(2 ln(255 opacity) max(xx, yy)), with the opacity after antialiasing and the blurred 2D
-    covariance, not rounded. As gsplat's `radius_clip`, which rounds the extent up first.
+    antialiased: if True, opacities are multiplied by sqrt(det / det_blurred).
 
-    fog_cut: where colour and alpha alone are asked for, a backend may leave out splats of which no
-    more light than this share comes through the fog, and finish a pixel once no more than this
-    share of the light behind would. Alpha then is that of the splats drawn: whoever sets this puts
-    the fog behind them, its airlight or the sky through it. 0 leaves out nothing.
+    sh_degree: highest band that is evaluated; None for all bands of a splat.
 
-    blur_px2: added to the diagonal of the projected covariance; less in an image that is shown
-    enlarged, where splats would grow.
+    mode_depth_floor_m: spread below which depths always form one cluster, as the beta of a Gumbel
+    distribution. Depths up to 0.88 times as far behind a surface, and up to 1.56 times as far
+    before it, belong to it.
 
-    lod_px: far splats of large backgrounds are drawn merged, in cells of this many pixels at most
-    (augment.lod); 0 draws all as they are.
+    transmittance_stop: a pixel is finished once at most this share of the light behind it shines
+    through. A splat that would leave at most min(transmittance_stop, 1e-4) is not blended, which is
+    gsplat's rule for stops up to 1e-4. A greater stop blends the splat that reaches it: gsplat's
+    rule would leave out whole surfaces, since a wall of alpha 0.999 leaves 1e-3. The weights behind
+    the stop are lost; their sum is at most the stop. `rasterize` lets the blended splats stand for
+    them (augment.render.rasterize).
+
+    radius_clip_px: splats up to this size are left out, for any camera; 0 leaves out none. The size
+    of a splat is the larger half-extent of the box in which its alpha can reach 1/255, sqrt(2
+    ln(255 opacity) max(xx, yy)), with the opacity after antialiasing and the blurred 2D covariance.
+    It is not rounded, while gsplat's `radius_clip` rounds the extent up first.
+
+    fog_cut: if only colour and alpha are asked for, a backend may leave out splats whose light
+    comes through the fog by at most this share. It may also finish a pixel once at most this share
+    of the light behind it would come through. Alpha then counts the drawn splats only, so the
+    caller puts the fog behind them: its airlight, or the sky through it. 0 leaves out nothing.
+
+    blur_px2: added to the diagonal of the projected covariance, px^2. A smaller blur is for an
+    image that is shown enlarged, where splats would grow.
+
+    lod_px: far splats of large backgrounds are drawn merged, in cells of at most this many pixels
+    (augment.lod); 0 draws all splats as they are.
     """
 
     near_m: float = 0.01

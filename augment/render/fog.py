@@ -2,19 +2,20 @@
 
     t = exp(-tau)          out = t c + (1 - t) c_air          tau = integral of sigma along the ray
 
-The paper's smog equation has t on the smog's colour; that is inverted, and this is the usual form.
-Uniform fog has tau = sigma d. With a scale height H the density is sigma0 exp(-(z - z0) / H) and
+The paper's smog equation puts t on the smog's colour. That is inverted; this is the usual form.
+sigma is the extinction, 1/m. Uniform fog has tau = sigma d. With a scale height H the extinction is
+sigma0 exp(-(z - z0) / H) and
 
     tau = sigma0 d exp(-min(a, b)) (1 - exp(-|b - a|)) / |b - a|,
     a = (z_eye - z0) / H,  b = (z - z0) / H,
 
 which is symmetric in its two ends and has no large factor that another must cancel.
 
-The airlight may depend on the elevation e of the ray. Of an overcast sky, 1 + 2 sin e times the
+The airlight may depend on the elevation e of the ray. For an overcast sky, 1 + 2 sin e times the
 horizon's luminance is measured and standard (Moon and Spencer 1942; ISO 15469, type 16). Inside
 thick fog Eddington's approximation has the same form, 1 + k sin e with k = 3/2 g (1 - a) / (1 + a):
-1.0 over asphalt of albedo a = 0.1 for droplets of asymmetry g = 0.85. Below the horizon, where that
-would end below zero, its reciprocal goes on with the same slope, which is a choice of ours:
+1.0 over asphalt of albedo a = 0.1 for droplets of asymmetry g = 0.85. Below the horizon this form
+would fall below zero. There its reciprocal continues with the same slope, which is our choice:
 
     c_air(e) = c_air g(e)      g = (1 + k sin e)^(1/2.2), e >= 0      g(-e) = 1 / g(e)
 
@@ -34,16 +35,24 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render.buffers import RenderOutput
 
-ENCODING = 2.2  # display-encoded colour is about this root of luminance
-MAX_EXPONENT = 80.0  # exp(80) is still finite in float32; fog that dense has t = 0 at any distance
+# Exponent of display encoding: display-encoded colour is about this root of luminance.
+ENCODING = 2.2
+# Largest exponent of density: exp(80) is still finite in float32. Fog that dense has t = 0 at any
+# distance.
+MAX_EXPONENT = 80.0
 
 
 @dataclass(frozen=True)
 class Fog:
-    """Fog in a scene, of any kind. sigma_per_m: extinction at height base_z_m (scene world). rgb:
-    airlight at the horizon, display-encoded. scale_height_m: None for uniform. overcast: k / 2, 0
-    for one airlight in all directions. varying_rgb: of `rgb`, what g multiplies; None for all of
-    it. The rasterisers draw `rgb`; `composite.add_elevation` adds the rest to their pictures.
+    """Fog in a scene.
+
+    sigma_per_m: extinction at height base_z_m, 1/m.
+    rgb: airlight at the horizon, display-encoded. The rasterisers draw this colour;
+        `composite.add_elevation` adds the dependence on elevation to their images.
+    scale_height_m: height over which the fog thins by a factor e, metres; None for uniform fog.
+    base_z_m: height of the base, metres, scene world.
+    overcast: k / 2 of the module's equation; 0 for the same airlight in all directions.
+    varying_rgb: the share of `rgb` that g multiplies; None for all of it.
     """
 
     sigma_per_m: float
@@ -63,137 +72,176 @@ class Fog:
 
 
 def optical_depth(
-    medium: Fog,
+    fog: Fog,
     ray_distance: Float[Tensor, "*B"],
     eye_z_m: float,
     point_z_m: Float[Tensor, "*B"] | None = None,
 ) -> Float[Tensor, "*B"]:
-    """tau from the eye to points at a finite Euclidean distance (metres).
+    """Return tau from the eye to points at a finite distance.
 
-    point_z_m: their world heights, needed only where the medium has a scale height.
+    Args:
+        fog: the fog.
+        ray_distance: Euclidean distance from the eye to each point, metres.
+        eye_z_m: world height of the eye, metres.
+        point_z_m: world heights of the points, metres; needed only for fog with a scale height.
+
+    Raises:
+        ValueError: the fog has a scale height and point_z_m is missing.
     """
-    uniform = medium.sigma_per_m * ray_distance
-    if medium.scale_height_m is None:
-        return uniform
+    uniform_depth = fog.sigma_per_m * ray_distance
+    if fog.scale_height_m is None:
+        return uniform_depth
     if point_z_m is None:
         raise ValueError("point_z_m is needed for fog with a scale height")
-    a = (eye_z_m - medium.base_z_m) / medium.scale_height_m
-    b = (point_z_m - medium.base_z_m) / medium.scale_height_m
+    a = (eye_z_m - fog.base_z_m) / fog.scale_height_m
+    b = (point_z_m - fog.base_z_m) / fog.scale_height_m
     difference = (b - a).abs()
-    small = difference < 1e-4  # there 1 - x/2 is exact to float32, and expm1(x)/x would be 0/0 at 0
-    safe = torch.where(small, torch.ones_like(difference), difference)
-    mean = torch.where(small, 1 - difference / 2, -torch.expm1(-safe) / safe)
-    lower = torch.minimum(b, torch.full_like(b, a))
-    return uniform * torch.exp((-lower).clamp(max=MAX_EXPONENT)) * mean
+    is_small = (
+        difference < 1e-4
+    )  # there 1 - x/2 is exact to float32, and expm1(x)/x would be 0/0 at 0
+    safe_difference = torch.where(is_small, torch.ones_like(difference), difference)
+    mean_density = torch.where(
+        is_small, 1 - difference / 2, -torch.expm1(-safe_difference) / safe_difference
+    )
+    lower_end = torch.minimum(b, torch.full_like(b, a))
+    return uniform_depth * torch.exp((-lower_end).clamp(max=MAX_EXPONENT)) * mean_density
 
 
-def sky_optical_depth(
-    medium: Fog, slope: Float[Tensor, "*B"], eye_z_m: float
-) -> Float[Tensor, "*B"]:
-    """tau along rays that never end. slope: vertical part of the unit direction.
+def sky_optical_depth(fog: Fog, slope: Float[Tensor, "*B"], eye_z_m: float) -> Float[Tensor, "*B"]:
+    """Return tau along rays that never end.
 
-    Infinite (t = 0) for uniform fog and for rays that do not climb; sigma0 exp(-a) H / slope else.
+    It is infinite (t = 0) for uniform fog and for rays that do not climb, else
+    sigma0 exp(-a) H / slope.
+
+    Args:
+        fog: the fog.
+        slope: vertical part of the unit direction of each ray.
+        eye_z_m: world height of the eye, metres.
     """
-    infinite = torch.full_like(slope, math.inf)
-    if medium.sigma_per_m == 0:
+    infinite_depth = torch.full_like(slope, math.inf)
+    if fog.sigma_per_m == 0:
         return torch.zeros_like(slope)
-    if medium.scale_height_m is None:
-        return infinite
-    vertical = vertical_optical_depth(medium, eye_z_m)
-    climbing = slope > 0
-    return torch.where(climbing, vertical / torch.where(climbing, slope, 1.0), infinite)
+    if fog.scale_height_m is None:
+        return infinite_depth
+    vertical_depth = vertical_optical_depth(fog, eye_z_m)
+    is_climbing = slope > 0
+    return torch.where(
+        is_climbing, vertical_depth / torch.where(is_climbing, slope, 1.0), infinite_depth
+    )
 
 
-def vertical_optical_depth(medium: Fog, eye_z_m: float) -> float:
-    """tau from the eye straight up to infinity: sigma0 H exp(-(z_eye - z0) / H)."""
-    if medium.scale_height_m is None:
+def vertical_optical_depth(fog: Fog, eye_z_m: float) -> float:
+    """Return tau from the eye straight up to infinity: sigma0 H exp(-(z_eye - z0) / H)."""
+    if fog.scale_height_m is None:
         raise ValueError("uniform fog has no top: its vertical optical depth is infinite")
-    a = (eye_z_m - medium.base_z_m) / medium.scale_height_m
-    return medium.sigma_per_m * medium.scale_height_m * math.exp(min(-a, MAX_EXPONENT))
+    a = (eye_z_m - fog.base_z_m) / fog.scale_height_m
+    return fog.sigma_per_m * fog.scale_height_m * math.exp(min(-a, MAX_EXPONENT))
 
 
 def blend_airlight(
     rgb: Float[Tensor, "*B 3"],
     tau: Float[Tensor, "*B"],
-    medium: Fog,
+    fog: Fog,
     slope: Float[Tensor, "*B"] | None = None,
 ) -> Float[Tensor, "*B 3"]:
-    """t rgb + (1 - t) airlight, with t = exp(-tau). tau = 0 returns rgb to the bit.
+    """Return t rgb + (1 - t) airlight, with t = exp(-tau). tau = 0 returns the bits of rgb.
 
     slope: vertical part of the unit direction; None for the airlight of the horizon.
     """
     t = torch.exp(-tau)[..., None]
-    airlight = torch.tensor(medium.rgb, dtype=rgb.dtype, device=rgb.device)
-    if slope is not None and medium.overcast > 0:
-        airlight = airlight + airlight_gain(medium, slope)
+    airlight = torch.tensor(fog.rgb, dtype=rgb.dtype, device=rgb.device)
+    if slope is not None and fog.overcast > 0:
+        airlight = airlight + airlight_gain(fog, slope)
     return t * rgb + (1 - t) * airlight
 
 
-def airlight_gain(medium: Fog, slope: Float[Tensor, "*B"]) -> Float[Tensor, "*B 3"]:
-    """Airlight in a direction less that at the horizon. slope: as of `blend_airlight`."""
-    growth = torch.log1p(2 * medium.overcast * slope.abs()) / ENCODING * slope.sign()
-    varying = medium.rgb if medium.varying_rgb is None else medium.varying_rgb
-    return torch.expm1(growth)[..., None] * growth.new_tensor(varying)
+def airlight_gain(fog: Fog, slope: Float[Tensor, "*B"]) -> Float[Tensor, "*B 3"]:
+    """Return the airlight in a direction minus the airlight at the horizon; slope as in
+    `blend_airlight`.
+    """
+    growth = torch.log1p(2 * fog.overcast * slope.abs()) / ENCODING * slope.sign()
+    varying_rgb = fog.rgb if fog.varying_rgb is None else fog.varying_rgb
+    return torch.expm1(growth)[..., None] * growth.new_tensor(varying_rgb)
 
 
 def fog_buffers(
     rgb: Float[Tensor, "H W 3"],
     alpha: Float[Tensor, "H W"],
     ray_distance: Float[Tensor, "H W"],
-    medium: Fog,
+    fog: Fog,
     eye_z_m: float,
     point_z_m: Float[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
-    """Deferred fog (the paper's way) on premultiplied colour, sky not included.
+    """Return premultiplied colour in deferred fog (the paper's way), sky not included.
 
-    ray_distance: of depth divided by alpha. Exact for one surface a pixel; translucent layers are
-    all fogged at their mean distance.
+    The result is exact for one surface per pixel. All translucent layers of a pixel are fogged at
+    their mean distance.
+
+    Args:
+        rgb: premultiplied colour.
+        alpha: alpha of the surfaces.
+        ray_distance: distance along the ray, from the depth divided by alpha, metres.
+        fog: the fog.
+        eye_z_m: world height of the eye, metres.
+        point_z_m: world heights of the surfaces, metres; needed for fog with a scale height.
     """
-    tau = optical_depth(medium, ray_distance, eye_z_m, point_z_m)
+    tau = optical_depth(fog, ray_distance, eye_z_m, point_z_m)
     t = torch.exp(-tau)[..., None]
-    airlight = torch.tensor(medium.rgb, dtype=rgb.dtype, device=rgb.device)
+    airlight = torch.tensor(fog.rgb, dtype=rgb.dtype, device=rgb.device)
     return t * rgb + (1 - t) * alpha[..., None] * airlight
 
 
-def fog_raster(raster: RenderOutput, camera: Camera, medium: Fog) -> Float[Tensor, "H W 3"]:
-    """Deferred fog on a render with colour, alpha and expected depth."""
+def fog_raster(raster: RenderOutput, camera: Camera, fog: Fog) -> Float[Tensor, "H W 3"]:
+    """Return the colours of a render in deferred fog. The render has colour, alpha and expected
+    depth.
+    """
     assert raster.rgb is not None and raster.alpha is not None
-    ways = ways_of_raster(raster, camera, medium)
-    return fog_buffers(raster.rgb, raster.alpha, ways[0], medium, *ways[1:])
+    distance_and_heights = ray_distances(raster, camera, fog)
+    return fog_buffers(
+        raster.rgb, raster.alpha, distance_and_heights[0], fog, *distance_and_heights[1:]
+    )
 
 
-def ways_of_raster(
-    raster: RenderOutput, camera: Camera, medium: Fog
+def ray_distances(
+    raster: RenderOutput, camera: Camera, fog: Fog
 ) -> tuple[Float[Tensor, "H W"], float, Float[Tensor, "H W"] | None]:
-    """Ray distance, the eye's height and the points' of expected depths, as `optical_depth` takes
-    them.
+    """Return what `optical_depth` takes for a render with expected depth.
+
+    Returns:
+        The ray distance of every pixel [H, W], the eye's world height, and the world heights of the
+        surfaces [H, W] (None for uniform fog), all in metres.
     """
     depth = raster.expected_depth
     assert depth is not None
     ray_distance = depth * camera.ray_lengths(depth.dtype, depth.device)
     eye_z_m = float(camera.centre[2])
     point_z_m = None
-    if medium.scale_height_m is not None:
+    if fog.scale_height_m is not None:
         point_z_m = eye_z_m + depth * camera.ray_directions(depth.dtype, depth.device)[..., 2]
     return ray_distance, eye_z_m, point_z_m
 
 
 def optical_depth_of_arrays(
-    medium: Fog,
-    distance_m: np.ndarray,
+    fog: Fog,
+    ray_distance: np.ndarray,
     eye_z_m: float | np.ndarray,
     point_z_m: np.ndarray,
     *,
     series_below: float = 1e-8,  # there 1 - x/2 is exact to float64
 ) -> np.ndarray:
-    """`optical_depth` of NumPy arrays, from one eye or an eye for each point."""
-    uniform = medium.sigma_per_m * distance_m
-    if medium.scale_height_m is None:
-        return uniform
-    a = (eye_z_m - medium.base_z_m) / medium.scale_height_m
-    b = (point_z_m - medium.base_z_m) / medium.scale_height_m
+    """Return `optical_depth` of NumPy arrays, from one eye or from an eye for each point.
+
+    series_below: height difference, in scale heights, below which a series replaces the quotient.
+    """
+    uniform_depth = fog.sigma_per_m * ray_distance
+    if fog.scale_height_m is None:
+        return uniform_depth
+    a = (eye_z_m - fog.base_z_m) / fog.scale_height_m
+    b = (point_z_m - fog.base_z_m) / fog.scale_height_m
     difference = np.abs(b - a)
-    small = difference < series_below
-    safe = np.where(small, 1.0, difference)
-    mean = np.where(small, 1 - difference / 2, -np.expm1(-safe) / safe)
-    return uniform * np.exp(np.minimum(-np.minimum(a, b), MAX_EXPONENT)) * mean
+    is_small = difference < series_below
+    safe_difference = np.where(is_small, 1.0, difference)
+    mean_density = np.where(
+        is_small, 1 - difference / 2, -np.expm1(-safe_difference) / safe_difference
+    )
+    return uniform_depth * np.exp(np.minimum(-np.minimum(a, b), MAX_EXPONENT)) * mean_density

@@ -1,9 +1,9 @@
-"""Gradients of geometry on the GPU, by gsplat 1.5 (Ye et al. 2025), which is an extra.
+"""Gradients of geometry on the GPU, by gsplat 1.5 (Ye et al. 2025), which is an optional extra.
 
-Its thresholds are those of the definition (augment.render.reference), so are its pictures and
-gradients, up to what it does another way: a radius clip is of whole pixels.
+Its thresholds are those of the definition (augment.render.reference), and so are its images and
+gradients, with one exception: it rounds a radius clip to whole pixels. The trainer calls it.
 
-    pip install 'climategs[gsplat]'        a toolkit of CUDA compiles it when it is first used
+    pip install 'climategs[gsplat]'        a CUDA toolkit compiles it when it is first used
 """
 
 from __future__ import annotations
@@ -26,19 +26,26 @@ from augment.render.constants import COV2D_BLUR, TRANSMITTANCE_STOP, RasterSetti
 from augment.render.cuda.runtime import gpu_device
 from augment.scene import PosedGaussians
 
+# Fields of Gaussians whose gradients are gsplat's on the GPU.
 GEOMETRY = ("means", "quats", "scales", "opacities")
-_ALPHA_MAX = 0.999  # its clamp, which is compiled in
-_VERSIONS = "1.5."  # later ones may have other thresholds
+# gsplat's upper limit of alpha, which is compiled in.
+_ALPHA_MAX = 0.999
+# Prefix of the versions that may be used; later ones may have other thresholds.
+_VERSIONS = "1.5."
 
 
 @dataclass(frozen=True, eq=False)
 class GsplatImages:
-    """One camera's images and what gsplat tells of the splats in them, recorded by autograd.
+    """Images of one camera and gsplat's data of the splats in them, recorded by autograd.
 
-    rgb [H, W, 3], alpha [H, W], expected_depth [H, W] or None. colors: [N, 3], of all splats before
-    their clamp at 0. means2d [M, 2], conics [M, 3] (inverse covariances: xx, xy, yy, px^-2) and ids
-    [M], of the splats that were drawn; after backward means2d.absgrad [M, 2] holds, x and y, the
-    sums over pixels of absolute gradients, 1/px.
+    rgb: colour without background.
+    alpha: 1 - final transmittance.
+    expected_depth: mean depth of the splats, metres; None if it was not asked for.
+    colors: colours of all splats before their clamp at 0.
+    means2d: [M, 2], image positions of the drawn splats, px. After backward, means2d.absgrad [M, 2]
+        holds the sums over pixels of absolute gradients by x and y, 1/px.
+    conics: [M, 3], inverse covariances of the drawn splats: xx, xy, yy, px^-2.
+    ids: [M], indices of the drawn splats.
     """
 
     rgb: Float32[Tensor, "H W 3"]
@@ -51,14 +58,18 @@ class GsplatImages:
 
 
 def tracked_geometry(parts: Sequence[PosedGaussians]) -> list[str]:
-    """Names of the fields other than sh that ask for gradients in any part."""
+    """Return the names of the fields other than sh that require gradients in any part."""
     return [
         name for name in GEOMETRY if any(getattr(p.gaussians, name).requires_grad for p in parts)
     ]
 
 
 def import_gsplat() -> ModuleType:
-    """gsplat. Raises BackendUnavailable, which says what is missing."""
+    """Import gsplat.
+
+    Raises:
+        BackendUnavailable: it cannot be used here; the message says what is missing.
+    """
     try:
         import gsplat  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -78,7 +89,7 @@ def import_gsplat() -> ModuleType:
 
 
 def _check_compiled() -> None:
-    """Its kernels are there; or they are compiled now, which takes minutes the first time."""
+    """Check that gsplat's kernels exist. Compiling them takes minutes the first time."""
     try:
         from gsplat.cuda import _backend  # pyright: ignore[reportMissingImports]
     except Exception as error:  # also of the compilers that it starts
@@ -103,24 +114,33 @@ def draw_with_gsplat(
     functions: int | None = None,
     keep_color_slopes: bool = False,
 ) -> GsplatImages:
-    """The parts in one picture, differentiable in all their float tensors, which may lie on either
-    side; the images lie on the GPU. functions: SH functions used, None for the settings'.
-    keep_color_slopes: after backward, colors.grad holds theirs, though sh asks for none.
+    """Return images of the parts that are differentiable in all their float tensors.
 
-    Everything is counted from the eye, so that float32 keeps its digits in scenes that are
-    kilometres wide, and colours are evaluated in each part's own axes.
+    The tensors may lie on either side; the images lie on the GPU. Positions are counted from the
+    eye, so that float32 keeps its digits in scenes that are kilometres wide. Colours are evaluated
+    in each part's own axes.
+
+    Args:
+        parts: Gaussians with their poses.
+        camera: a pinhole camera.
+        settings: thresholds of the image; they must be those that gsplat is compiled with.
+        with_depth: if True, expected depth is rendered, too.
+        functions: number of SH functions; None for the number that the settings say.
+        keep_color_slopes: if True, colors.grad holds the colours' gradients after backward, even if
+            sh requires none.
 
     Raises:
-        BackendUnavailable: gsplat is not there.
-        ValueError: the settings or the camera are none that it knows.
+        BackendUnavailable: gsplat is not installed, or cannot be used.
+        ValueError: gsplat cannot render with these settings or this camera.
     """
     gsplat = import_gsplat()
-    _check(camera, settings)
+    _check_settings(camera, settings)
     device = gpu_device()
     means, quats, scales, opacities, colors = (
         torch.cat(values)
         for values in zip(
-            *(_placed(gsplat, p, camera, settings, functions, device) for p in parts), strict=True
+            *(_gsplat_inputs(gsplat, p, camera, settings, functions, device) for p in parts),
+            strict=True,
         )
     )
     if keep_color_slopes:
@@ -158,7 +178,7 @@ def draw_with_gsplat(
     )
 
 
-def _placed(
+def _gsplat_inputs(
     gsplat: Any,
     part: PosedGaussians,
     camera: Camera,
@@ -166,46 +186,50 @@ def _placed(
     functions: int | None,
     device: torch.device,
 ) -> tuple[Tensor, ...]:
-    """Means from the eye and quats, both in the world's axes, scales, opacities and colours."""
-    own = part.gaussians
+    """Return means, quats, scales, opacities and colours of a part, as gsplat takes them.
+
+    Means are counted from the eye; means and quats are in the world's axes.
+    """
+    gaussians = part.gaussians
     means, quats, scales, opacities, sh = (
-        getattr(own, name).to(device) for name in (*GEOMETRY, "sh")
+        getattr(gaussians, name).to(device) for name in (*GEOMETRY, "sh")
     )
     pose = np.eye(4) if part.world_from_part is None else part.world_from_part.cpu().numpy()
-    from_part = camera.camera_from_world.numpy() @ pose
-    eye = np.linalg.solve(from_part[:3, :3], -from_part[:3, 3])  # in the part
-    coarse = eye.astype(np.float32)
-    offsets = means - torch.from_numpy(coarse).to(device)
-    offsets = offsets - torch.from_numpy((eye - coarse).astype(np.float32)).to(device)
+    camera_from_part = camera.camera_from_world.numpy() @ pose
+    eye = np.linalg.solve(camera_from_part[:3, :3], -camera_from_part[:3, 3])  # in the part
+    coarse_eye = eye.astype(np.float32)
+    offsets = means - torch.from_numpy(coarse_eye).to(device)
+    offsets = offsets - torch.from_numpy((eye - coarse_eye).astype(np.float32)).to(device)
     degree = math.isqrt(sh.shape[1] if functions is None else min(functions, sh.shape[1])) - 1
     if settings.sh_degree is not None:
         degree = min(degree, settings.sh_degree)
     colors = gsplat.spherical_harmonics(degree, offsets, sh) + 0.5
     if part.world_from_part is None:
         return offsets, quats, scales, opacities, colors
-    turn = torch.from_numpy(pose[:3, :3])
-    quat = quat_from_rotmat(turn).float().to(device)
+    world_rotation = torch.from_numpy(pose[:3, :3])
+    world_quat = quat_from_rotmat(world_rotation).float().to(device)
     return (
-        offsets @ turn.T.float().to(device),
-        multiply_quats(quat.expand_as(quats), quats),
+        offsets @ world_rotation.T.float().to(device),
+        multiply_quats(world_quat.expand_as(quats), quats),
         scales,
         opacities,
         colors,
     )
 
 
-def _check(camera: Camera, settings: RasterSettings) -> None:
+def _check_settings(camera: Camera, settings: RasterSettings) -> None:
+    """Check that gsplat can render with this camera and these settings."""
     if camera.is_orthographic:
         raise ValueError(
             f"camera {camera.name!r} is orthographic; gradients are of pinhole cameras"
         )
-    fixed = {
+    compiled_values = {
         "alpha_max": (settings.alpha_max, _ALPHA_MAX),
         "transmittance_stop": (settings.transmittance_stop, TRANSMITTANCE_STOP),
     }
-    for name, (value, known) in fixed.items():
-        if value != known:
+    for name, (value, compiled_value) in compiled_values.items():
+        if value != compiled_value:
             raise ValueError(
-                f"settings.{name} must be {known} where gsplat has the gradients, since that is "
-                f"compiled into it; got {value}. Use backend 'cpu' for another"
+                f"settings.{name} must be {compiled_value} where gsplat has the gradients, since "
+                f"that is compiled into it; got {value}. Use backend 'cpu' for another"
             )

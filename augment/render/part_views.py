@@ -1,4 +1,7 @@
-"""The numbers of a view that kernels read, part by part: formed in float64, rounded once."""
+"""The numbers of a view that kernels read, part by part, formed in float64 and rounded once.
+
+`cpu.driver`, `cuda.splats` and the trainer call these functions; `layout` names the numbers.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,16 @@ from augment.cameras import Camera
 from augment.render import layout
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, TAN_FOV_MARGIN, RasterSettings
 from augment.render.fog import Fog
-from augment.render.layout import LONGEST, HeightClip
+from augment.render.layout import MAX_DEPTH_GROWTH, HeightClip
 from augment.render.sh import MAX_DEGREE
 from augment.scene import PosedGaussians
 
-_NO_CLIP = 1e30  # a height at which everything is on the kept side
-_NO_FAR = 1e18  # metres; its square is still finite
-_NO_RADIUS_CLIP = -1.0  # no splat is as small, not even one of alpha 1/255 in its centre only
+# Height at which everything is on the kept side, metres.
+_NO_CLIP = 1e30
+# Distance that no splat exceeds, metres; its square is still finite.
+_NO_FAR = 1e18
+# Radius that every splat exceeds, pixels, even one of alpha 1/255 in its centre only.
+_NO_RADIUS_CLIP = -1.0
 
 
 def views_of(
@@ -28,7 +34,7 @@ def views_of(
     fog: Fog | None,
     clip: HeightClip | None,
 ) -> np.ndarray:
-    """float32 [P, VIEW] of parts as they are: posed, lit, with their colour maps."""
+    """Return views float32 [P, VIEW] of posed parts, with their light and colour maps."""
     poses = part_poses([part.world_from_part for part in parts])
     views = part_views(poses, camera, settings, fog, clip)
     views[:, layout.V_OVERLAY] = [part.is_overlay for part in parts]
@@ -36,13 +42,14 @@ def views_of(
     for view, part, pose in zip(views, parts, poses, strict=True):
         if part.shading is not None:
             sun = camera.camera_from_world.numpy()[:3, :3] @ pose[:3, :3] @ part.shading.sun
-            view[layout.V_SUN :][:3], view[layout.V_WRAP] = sun, part.shading.wrap
+            view[layout.V_SUN :][:3] = sun
+            view[layout.V_WRAP] = part.shading.wrap
             view[layout.V_LIT] = 1
     return views
 
 
 def _map_count(part: PosedGaussians) -> int:
-    """One for all of a part whose splats have nothing to choose by."""
+    """Return the number of a part's colour maps; 1 if its splats have no rows to choose by."""
     if part.color_maps is None:
         return 0
     return 1 if part.map_rows is None else len(part.color_maps)
@@ -55,9 +62,14 @@ def part_views(
     fog: Fog | None,
     clip: HeightClip | None = None,
 ) -> np.ndarray:
-    """The float32 numbers of every part's view, [P, VIEW], formed in float64; none is an overlay.
+    """Return the views of parts that are no overlays, float32 [P, VIEW], formed in float64.
 
-    poses: world_from_part, float64 [P, 4, 4].
+    Args:
+        poses: world_from_part, float64 [P, 4, 4].
+        camera: the camera.
+        settings: thresholds of the image.
+        fog: fog before the splats; None for clear air.
+        clip: height at which splats are cut; None for no cut.
     """
     camera_from_part = camera.camera_from_world.numpy() @ poses
     rotations = camera_from_part[:, :3, :3]
@@ -68,44 +80,52 @@ def part_views(
     centre = np.array([camera.cx, camera.cy])
     size = np.array([camera.width, camera.height], np.float64)
     margin = TAN_FOV_MARGIN * 0.5 * size / focal
-    low, high = -(centre / focal + margin), (size - centre) / focal + margin
+    low_tangents = -(centre / focal + margin)
+    high_tangents = (size - centre) / focal + margin
     if camera.is_orthographic:
-        low, high = np.zeros(2), np.zeros(2)  # the Jacobian has no terms of x/z and y/z
-    widest = np.maximum(np.abs(low), np.abs(high))
+        # the Jacobian has no terms of x/z and y/z
+        low_tangents = np.zeros(2)
+        high_tangents = np.zeros(2)
+    widest_tangents = np.maximum(np.abs(low_tangents), np.abs(high_tangents))
     views = np.zeros((len(poses), layout.VIEW))
     views[:, layout.V_ROTATION :][:, :9] = rotations.reshape(-1, 9)
     views[:, layout.V_EYE :][:, :6] = np.concatenate([coarse_eyes, eyes - coarse_eyes], 1)
-    views[:, layout.V_FOCAL :][:, :2], views[:, layout.V_CENTRE :][:, :2] = focal, centre
+    views[:, layout.V_FOCAL :][:, :2] = focal
+    views[:, layout.V_CENTRE :][:, :2] = centre
     views[:, layout.V_SIZE :][:, :2] = size
-    views[:, layout.V_LOW :][:, :2], views[:, layout.V_HIGH :][:, :2] = low, high
-    views[:, layout.V_GAIN :][:, :2] = MAX_EXTENT_SIGMAS * focal * np.sqrt(1 + widest**2)
-    views[:, layout.V_NEAR], views[:, layout.V_BLUR] = settings.near_m, settings.blur_px2
-    views[:, layout.V_ALPHA_MIN], views[:, layout.V_LOG_CUT] = ALPHA_MIN, math.log2(ALPHA_MIN)
+    views[:, layout.V_LOW :][:, :2] = low_tangents
+    views[:, layout.V_HIGH :][:, :2] = high_tangents
+    views[:, layout.V_GAIN :][:, :2] = MAX_EXTENT_SIGMAS * focal * np.sqrt(1 + widest_tangents**2)
+    views[:, layout.V_NEAR] = settings.near_m
+    views[:, layout.V_BLUR] = settings.blur_px2
+    views[:, layout.V_ALPHA_MIN] = ALPHA_MIN
+    views[:, layout.V_LOG_CUT] = math.log2(ALPHA_MIN)
     if fog is not None:
-        views[:, layout.V_SIGMA] = fog.sigma_per_m
+        views[:, layout.V_EXTINCTION] = fog.sigma_per_m
         views[:, layout.V_AIRLIGHT :][:, :3] = fog.rgb
         if fog.scale_height_m is not None:
-            above = float(camera.centre[2]) - fog.base_z_m
-            views[:, layout.V_EYE_HEIGHT] = above / fog.scale_height_m
+            eye_above_base_m = float(camera.centre[2]) - fog.base_z_m
+            views[:, layout.V_EYE_HEIGHT] = eye_above_base_m / fog.scale_height_m
             views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / fog.scale_height_m
     views[:, layout.V_FOG_FAR] = _NO_FAR
     if fog is not None and fog.scale_height_m is None and settings.fog_cut > 0:
-        far = -math.log(settings.fog_cut) / max(fog.sigma_per_m, 1 / _NO_FAR)
-        views[:, layout.V_FOG_FAR] = min(far, _NO_FAR)
+        fog_far_m = -math.log(settings.fog_cut) / max(fog.sigma_per_m, 1 / _NO_FAR)
+        views[:, layout.V_FOG_FAR] = min(fog_far_m, _NO_FAR)
     views[:, layout.V_PARALLEL] = camera.is_orthographic
     views[:, layout.V_RADIUS_CLIP] = settings.radius_clip_px or _NO_RADIUS_CLIP
     views[:, layout.V_EXTENT] = MAX_EXTENT_SIGMAS
     views[:, layout.V_CLIP_EYE] = views[:, layout.V_CLIP_REACH] = _NO_CLIP
     if clip is not None:
-        up, eye_height = np.array(clip.up), clip.height_of(camera.centre.tolist())
-        views[:, layout.V_CLIP_EYE] = clip.sign * eye_height
-        views[:, layout.V_CLIP_PART :][:, :3] = clip.sign * (up @ poses[:, :3, :3])
-        upwards = camera.camera_from_world.numpy()[:3, :3] @ up
-        views[:, layout.V_CLIP_CAMERA :][:, :3] = clip.sign * upwards
-        views[:, layout.V_CLIP_FALL] = clip.sign * eye_height
-        views[:, layout.V_CLIP_LONGEST] = LONGEST
+        clip_up = np.array(clip.up)
+        eye_height_m = clip.height_of(camera.centre.tolist())
+        views[:, layout.V_CLIP_EYE] = clip.sign * eye_height_m
+        views[:, layout.V_CLIP_PART :][:, :3] = clip.sign * (clip_up @ poses[:, :3, :3])
+        clip_up_in_camera = camera.camera_from_world.numpy()[:3, :3] @ clip_up
+        views[:, layout.V_CLIP_CAMERA :][:, :3] = clip.sign * clip_up_in_camera
+        views[:, layout.V_CLIP_FALL] = clip.sign * eye_height_m
+        views[:, layout.V_CLIP_LONGEST] = MAX_DEPTH_GROWTH
         if camera.is_orthographic:
-            views[:, layout.V_CLIP_FALL] = -clip.sign * upwards[2]
+            views[:, layout.V_CLIP_FALL] = -clip.sign * clip_up_in_camera[2]
             views[:, layout.V_CLIP_LONGEST] = _NO_CLIP
         views[:, layout.V_CLIP_EDGE] = clip.edge_px
         views[:, layout.V_CLIP_REACH] = min(clip.reach_m, _NO_CLIP)
@@ -113,14 +133,14 @@ def part_views(
 
 
 def part_poses(poses: Sequence[torch.Tensor | None]) -> np.ndarray:
-    """float64 [P, 4, 4] of parts' poses, None standing for the identity."""
+    """Return the poses of parts, float64 [P, 4, 4]; None stands for the identity."""
     return np.stack([np.eye(4) if pose is None else pose.numpy() for pose in poses])
 
 
 def raster_modes(
     settings: RasterSettings, fog: Fog | None, clip: HeightClip | None = None, *, with_color: bool
 ) -> np.ndarray:
-    """The kernels' modes, int64."""
+    """Return the modes of the projection, int64 [MODES]."""
     degree = MAX_DEGREE if settings.sh_degree is None else settings.sh_degree
     modes = np.zeros(layout.MODES, np.int64)
     modes[layout.M_COLOR] = with_color

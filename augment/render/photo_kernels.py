@@ -7,86 +7,122 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.render.composite_kernels import layered_way
+from augment.render.composite_kernels import layered_distance
 from augment.render.cpu.jit import kernel
 from augment.render.fog import MAX_EXPONENT
 from augment.render.layout import U
 
 
 @kernel
-def scene_colors(pixels, color_map, least, out):
-    """out = max(M (pixels / 255) + m, least). pixels: uint8 [H, W, 3]. color_map: [3, 4]."""
+def scene_colors(pixels, color_map, min_color, out):
+    """Write out = max(M (pixels / 255) + m, min_color).
+
+    Args:
+        pixels: uint8 [H, W, 3].
+        color_map: (M, m), [3, 4].
+        min_color: smallest colour.
+        out: float32 [H, W, 3].
+    """
     height, width, _ = pixels.shape
-    whole = np.float32(255)
-    m00, m01, m02, m03 = color_map[0, 0], color_map[0, 1], color_map[0, 2], color_map[0, 3]
-    m10, m11, m12, m13 = color_map[1, 0], color_map[1, 1], color_map[1, 2], color_map[1, 3]
-    m20, m21, m22, m23 = color_map[2, 0], color_map[2, 1], color_map[2, 2], color_map[2, 3]
+    max_level = np.float32(255)
+    m00 = color_map[0, 0]
+    m01 = color_map[0, 1]
+    m02 = color_map[0, 2]
+    m03 = color_map[0, 3]
+    m10 = color_map[1, 0]
+    m11 = color_map[1, 1]
+    m12 = color_map[1, 2]
+    m13 = color_map[1, 3]
+    m20 = color_map[2, 0]
+    m21 = color_map[2, 1]
+    m22 = color_map[2, 2]
+    m23 = color_map[2, 3]
     for i in prange(height):
         for j in range(width):
-            r = np.float32(pixels[i, j, 0]) / whole
-            g = np.float32(pixels[i, j, 1]) / whole
-            b = np.float32(pixels[i, j, 2]) / whole
-            out[i, j, 0] = max(m00 * r + m01 * g + m02 * b + m03, least)
-            out[i, j, 1] = max(m10 * r + m11 * g + m12 * b + m13, least)
-            out[i, j, 2] = max(m20 * r + m21 * g + m22 * b + m23, least)
+            r = np.float32(pixels[i, j, 0]) / max_level
+            g = np.float32(pixels[i, j, 1]) / max_level
+            b = np.float32(pixels[i, j, 2]) / max_level
+            out[i, j, 0] = max(m00 * r + m01 * g + m02 * b + m03, min_color)
+            out[i, j, 1] = max(m10 * r + m11 * g + m12 * b + m13, min_color)
+            out[i, j, 2] = max(m20 * r + m21 * g + m22 * b + m23, min_color)
 
 
 @kernel
 def styled_colors(pixels, land, sky, share, out):
-    """out = (1 - share) max(land, 0) + share max(sky, 0), each a map [3, 4] of pixels / 255.
+    """Write out = (1 - share) max(land, 0) + share max(sky, 0), each a map [3, 4] of pixels / 255.
 
-    pixels: uint8 [H, W, 3]. share: [H, W].
+    Args:
+        pixels: uint8 [H, W, 3].
+        land: colour map of the land.
+        sky: colour map of the sky.
+        share: share of the sky, [H, W].
+        out: float32 [H, W, 3].
     """
     height, width, _ = pixels.shape
-    whole, one, zero = np.float32(255), np.float32(1), np.float32(0)
+    max_level = np.float32(255)
+    one_f32 = np.float32(1)
+    zero = np.float32(0)
     for i in prange(height):
         for j in range(width):
-            r = np.float32(pixels[i, j, 0]) / whole
-            g = np.float32(pixels[i, j, 1]) / whole
-            b = np.float32(pixels[i, j, 2]) / whole
+            r = np.float32(pixels[i, j, 0]) / max_level
+            g = np.float32(pixels[i, j, 1]) / max_level
+            b = np.float32(pixels[i, j, 2]) / max_level
             w = share[i, j]
             for c in range(U(3)):
-                near = land[c, 0] * r + land[c, 1] * g + land[c, 2] * b + land[c, 3]
-                far = sky[c, 0] * r + sky[c, 1] * g + sky[c, 2] * b + sky[c, 3]
-                out[i, j, c] = (one - w) * max(near, zero) + w * max(far, zero)
+                land_color = land[c, 0] * r + land[c, 1] * g + land[c, 2] * b + land[c, 3]
+                sky_color = sky[c, 0] * r + sky[c, 1] * g + sky[c, 2] * b + sky[c, 3]
+                out[i, j, c] = (one_f32 - w) * max(land_color, zero) + w * max(sky_color, zero)
 
 
 @kernel
-def sky_share(alpha, marks, solid, u, v, fall, out):
-    """1 - a (1 - sky) of what the photo shows: how much of each pixel is sky; 0 where it falls.
+def sky_share(alpha, sky_marks, alpha_limits, u, v, fall, out):
+    """Write the share of sky in every pixel of a photo, 1 - a (1 - sky), and 0 where the ray sees
+    the road.
 
-    alpha [H, W]: of surfaces; marks [H, W, 3]: times sky, the first channel. solid: alphas that are
-    taken for nothing and for all. u [W], v [H]: image coordinates at unit depth. fall: of the
-    camera's axes [3], and the least at which a ray sees the road.
+    Args:
+        alpha: alpha of the surfaces, [H, W].
+        sky_marks: alpha times sky in the first channel, [H, W, 3].
+        alpha_limits: alphas that count as nothing and as everything.
+        u: image coordinates of the columns at unit depth, [W].
+        v: image coordinates of the rows at unit depth, [H].
+        fall: fall of the camera's axes [3], and the smallest fall of a ray that sees the road.
+        out: float32 [H, W].
     """
     height, width = alpha.shape
-    zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)
-    per = one / (solid[1] - solid[0])
+    zero = np.float32(0)
+    one_f32 = np.float32(1)
+    tiny = np.float32(1e-6)
+    per_alpha = one_f32 / (alpha_limits[1] - alpha_limits[0])
     for i in prange(height):
         down = fall[1] * v[i] + fall[2]
         for j in range(width):
-            level = min(marks[i, j, 0] / max(alpha[i, j], tiny), one)
-            a = min(max((alpha[i, j] - solid[0]) * per, zero), one)
-            share = one - a * (one - level)
-            out[i, j] = zero if fall[0] * u[j] + down > fall[3] else share
+            sky_level = min(sky_marks[i, j, 0] / max(alpha[i, j], tiny), one_f32)
+            coverage = min(max((alpha[i, j] - alpha_limits[0]) * per_alpha, zero), one_f32)
+            pixel_share = one_f32 - coverage * (one_f32 - sky_level)
+            out[i, j] = zero if fall[0] * u[j] + down > fall[3] else pixel_share
 
 
 @kernel
 def mix(rgb, other, weight, out):
-    """out = (1 - weight) rgb + weight other. rgb: [H, W, 3]. other: the same, or [1, 1, 3]."""
+    """Write out = (1 - weight) rgb + weight other.
+
+    rgb: [H, W, 3]. other: [H, W, 3] or [1, 1, 3].
+    """
     height, width, _ = rgb.shape
-    one, step = np.float32(1), np.int64(len(other) > 1)
+    one_f32 = np.float32(1)
+    step = np.int64(len(other) > 1)
     for i in prange(height):
         for j in range(width):
             w = weight[i, j]
-            row, column = np.int64(i) * step, np.int64(j) * step
+            row = np.int64(i) * step
+            column = np.int64(j) * step
             for c in range(3):
-                out[i, j, c] = (one - w) * rgb[i, j, c] + w * other[row, column, c]
+                out[i, j, c] = (one_f32 - w) * rgb[i, j, c] + w * other[row, column, c]
 
 
 @kernel
 def add_faded(base, rgb, weight, out):
-    """out = base + weight rgb."""
+    """Write out = base + weight rgb."""
     height, width, _ = rgb.shape
     for i in prange(height):
         for j in range(width):
@@ -95,38 +131,57 @@ def add_faded(base, rgb, weight, out):
 
 
 @kernel
-def transmittance(alpha, depth, lens, fall, fog, road, out):
-    """T of a photo's pixels: augment.base_photo's `transmittance`.
+def transmittance(alpha, depth, lens, fall, fog_numbers, road, out):
+    """Write the transmittance of a photo's pixels: `transmittance` of augment.base_photo.
 
-    lens: 1 / fx, 1 / fy, cx, cy. fall: of the camera's axes [3]. fog: sigma, 1 / scale height (0
-    for uniform), the eye's height over the base. road: the camera's height
-    above it (0 where unknown), and the least fall that sees it.
+    Args:
+        alpha: alpha of the surfaces, [H, W].
+        depth: z of the surfaces, [H, W], metres.
+        lens: 1 / fx, 1 / fy, cx, cy.
+        fall: fall of the camera's axes [3].
+        fog_numbers: extinction (1/m), 1 / scale height (0 for uniform fog), and the eye's height
+            over the base (m).
+        road: the camera's height above the road (m; 0 if unknown), and the smallest fall of a ray
+            that sees it.
+        out: float32 [H, W].
     """
     height, width = alpha.shape
-    half, one, zero = np.float32(0.5), np.float32(1), np.float32(0)
-    sigma, inverse = fog[0], fog[1]
-    a = fog[2] * inverse
-    above = sigma * math.exp(min(-a, np.float32(MAX_EXPONENT)))
+    half = np.float32(0.5)
+    one_f32 = np.float32(1)
+    zero = np.float32(0)
+    extinction_per_m = fog_numbers[0]
+    inverse_scale_height = fog_numbers[1]
+    eye_scale_heights = fog_numbers[2] * inverse_scale_height
+    extinction_at_eye = extinction_per_m * math.exp(
+        min(-eye_scale_heights, np.float32(MAX_EXPONENT))
+    )
     for i in prange(height):
         v = (np.float32(i) + half - lens[3]) * lens[1]
         for j in range(width):
             u = (np.float32(j) + half - lens[2]) * lens[0]
-            falls = fall[0] * u + fall[1] * v + fall[2]
-            length = math.sqrt(one + u * u + v * v)
-            share, seen = alpha[i, j], zero
-            if share > zero:
+            ray_fall = fall[0] * u + fall[1] * v + fall[2]
+            length = math.sqrt(one_f32 + u * u + v * v)
+            surface_share = alpha[i, j]
+            transmitted = zero
+            if surface_share > zero:
                 distance = depth[i, j] * length
-                if inverse > zero:
-                    distance = layered_way(distance, a, -depth[i, j] * falls * inverse)
-                seen = share * math.exp(-sigma * distance)
-            if share < one:
-                behind = zero
-                if road[0] > zero and falls > road[1]:
-                    distance = road[0] / falls * length
-                    if inverse > zero:
-                        distance = layered_way(distance, a, -road[0] * inverse)
-                    behind = math.exp(-sigma * distance)
-                elif inverse > zero and falls < zero:
-                    behind = math.exp(-above / inverse * length / -falls)
-                seen += (one - share) * behind
-            out[i, j] = seen
+                if inverse_scale_height > zero:
+                    distance = layered_distance(
+                        distance, eye_scale_heights, -depth[i, j] * ray_fall * inverse_scale_height
+                    )
+                transmitted = surface_share * math.exp(-extinction_per_m * distance)
+            if surface_share < one_f32:
+                background = zero
+                if road[0] > zero and ray_fall > road[1]:
+                    distance = road[0] / ray_fall * length
+                    if inverse_scale_height > zero:
+                        distance = layered_distance(
+                            distance, eye_scale_heights, -road[0] * inverse_scale_height
+                        )
+                    background = math.exp(-extinction_per_m * distance)
+                elif inverse_scale_height > zero and ray_fall < zero:
+                    background = math.exp(
+                        -extinction_at_eye / inverse_scale_height * length / -ray_fall
+                    )
+                transmitted += (one_f32 - surface_share) * background
+            out[i, j] = transmitted

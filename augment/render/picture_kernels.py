@@ -1,5 +1,7 @@
-"""Numba kernels for passes over finished pictures: airlight by elevation, forward scatter in fog, a
-camera's noise. Loops are of one task each, which LLVM writes as vectors.
+"""Numba kernels for passes over finished images: airlight by elevation, forward scatter, and noise.
+
+`composite`, `scatter` and `sensor` launch them. Each loop does one task, which lets LLVM vectorise
+it.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.render.composite_kernels import airlight_gain, layered_way
+from augment.render.composite_kernels import airlight_gain, layered_distance
 from augment.render.cpu.jit import inner, kernel
 from augment.render.fog import MAX_EXPONENT
 from augment.render.layout import U
@@ -17,11 +19,11 @@ from augment.render.layout import U
 
 @inner()
 def decay(y):
-    """exp(-y) for |y| <= 80, within 5e-6 of 1: of plain sums, which LLVM writes as vectors."""
+    """Return exp(-y) for |y| <= 80, within 5e-6 of 1, by plain sums that LLVM vectorises."""
     z = y * np.float32(-1 / 64)
-    one = np.float32(1)
-    p = one + z * np.float32(1 / 4) * (one + z * np.float32(1 / 5))
-    p = one + z * (one + z * np.float32(1 / 2) * (one + z * np.float32(1 / 3) * p))
+    one_f32 = np.float32(1)
+    p = one_f32 + z * np.float32(1 / 4) * (one_f32 + z * np.float32(1 / 5))
+    p = one_f32 + z * (one_f32 + z * np.float32(1 / 2) * (one_f32 + z * np.float32(1 / 3) * p))
     p *= p
     p *= p
     p *= p
@@ -31,114 +33,176 @@ def decay(y):
 
 
 @kernel
-def add_elevation(rgb, alpha, depth, u, v, rise, medium, gains, varying, behind):
-    """rgb += alpha (1 - t) gain varying, in place: what elevation adds to the airlight; of endless
-    fog behind also (1 - alpha) (behind + gain varying).
+def add_elevation(rgb, alpha, depth, u, v, rise, fog_numbers, gains, varying, behind):
+    """Add to rgb the airlight that elevation adds: rgb += alpha (1 - t) gain varying, in place.
 
-    depth: [H, W], z. u [W], v [H]: image coordinates at unit depth. rise [3]: world z along the
-    camera's axes. medium: extinction at its base, height of the eye above that in scale heights,
-    1 / scale height (0 of uniform fog). gains: as of airlight_gain. behind: airlight [3], or empty.
-    All float32.
+    With endless fog behind, (1 - alpha) (behind + gain varying) is added, too. All arrays are
+    float32.
+
+    Args:
+        rgb: [H, W, 3].
+        alpha: [H, W].
+        depth: z, [H, W], metres.
+        u: image coordinates of the columns at unit depth, [W].
+        v: image coordinates of the rows at unit depth, [H].
+        rise: world z along the camera's axes, [3].
+        fog_numbers: extinction at the base (1/m), height of the eye above it in scale heights, and
+            1 / scale height (0 for uniform fog).
+        gains: as in airlight_gain.
+        varying: the share of the airlight that varies with elevation, [3].
+        behind: airlight [3], or empty.
     """
-    sigma, eye, per_height = medium[0], medium[1], medium[2]
-    one, most = np.float32(1), np.float32(MAX_EXPONENT)
-    width, uncovered = alpha.shape[1], np.float32(behind.size > 0)
+    extinction_per_m = fog_numbers[0]
+    eye_scale_heights = fog_numbers[1]
+    per_height = fog_numbers[2]
+    one_f32 = np.float32(1)
+    max_exponent = np.float32(MAX_EXPONENT)
+    width = alpha.shape[1]
+    has_background = np.float32(behind.size > 0)
     for i in prange(alpha.shape[0]):
         share = np.empty(width, np.float32)
-        far, up = one + v[i] * v[i], v[i] * rise[1] + rise[2]
+        row_length_squared = one_f32 + v[i] * v[i]
+        row_rise = v[i] * rise[1] + rise[2]
         for j in range(width):
-            share[j] = sigma * depth[i, j] * math.sqrt(u[j] * u[j] + far)
+            share[j] = extinction_per_m * depth[i, j] * math.sqrt(u[j] * u[j] + row_length_squared)
         if per_height > 0:
             for j in range(width):
-                climb = depth[i, j] * (u[j] * rise[0] + up) * per_height
-                share[j] = layered_way(share[j], eye, climb)
+                climb = depth[i, j] * (u[j] * rise[0] + row_rise) * per_height
+                share[j] = layered_distance(share[j], eye_scale_heights, climb)
         for j in range(width):
-            slope = (u[j] * rise[0] + up) / math.sqrt(u[j] * u[j] + far)
-            fogged = alpha[i, j] * (one - decay(min(share[j], most)))
-            fogged += uncovered * (one - alpha[i, j])
-            share[j] = fogged * airlight_gain(slope, gains)
+            slope = (u[j] * rise[0] + row_rise) / math.sqrt(u[j] * u[j] + row_length_squared)
+            fog_share = alpha[i, j] * (one_f32 - decay(min(share[j], max_exponent)))
+            fog_share += has_background * (one_f32 - alpha[i, j])
+            share[j] = fog_share * airlight_gain(slope, gains)
         for j in range(width):
             for c in range(U(3)):
                 rgb[i, j, c] += share[j] * varying[c]
-                if uncovered > 0:
-                    rgb[i, j, c] += (one - alpha[i, j]) * behind[c]
+                if has_background > 0:
+                    rgb[i, j, c] += (one_f32 - alpha[i, j]) * behind[c]
 
 
 @kernel
-def scattered_share(alpha, depth, u, v, climb, strength, sigma, medium, out):
-    """out [H, W] = 1 - exp(-strength tau) of every pixel; without a depth it shows sky.
+def scattered_share(
+    alpha, depth, u, v, climb, strength, extinction_per_m, inverse_scale_height, out
+):
+    """Write out [H, W] = 1 - exp(-strength tau) of every pixel; a pixel without depth shows sky.
 
-    u [W], v [H]: image coordinates at unit depth. climb [3]: the world's z along the camera's axes.
-    sigma: extinction at the eye's height. medium: 1 / scale height, which is 0 in uniform fog. All
-    float32.
+    All arrays are float32.
+
+    Args:
+        alpha: alpha of the surfaces, [H, W].
+        depth: z of the surfaces, [H, W], metres.
+        u: image coordinates of the columns at unit depth, [W].
+        v: image coordinates of the rows at unit depth, [H].
+        climb: world z along the camera's axes, [3].
+        strength: factor of tau.
+        extinction_per_m: extinction at the eye's height.
+        inverse_scale_height: 1 / scale height; 0 for uniform fog.
+        out: float32 [H, W].
     """
-    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
-    limit = np.float32(80)  # exp(80) is still finite, and nothing is seen through as much
+    zero = np.float32(0)
+    half = np.float32(0.5)
+    one_f32 = np.float32(1)
+    limit = np.float32(80)  # exp(80) is still finite, and fog that deep is opaque
     for i in prange(depth.shape[0]):
-        far, up = one + v[i] * v[i], climb[1] * v[i] + climb[2]
-        if medium > zero:
+        row_length_squared = one_f32 + v[i] * v[i]
+        row_rise = climb[1] * v[i] + climb[2]
+        if inverse_scale_height > zero:
             for j in range(depth.shape[1]):
-                length, slope = math.sqrt(u[j] * u[j] + far), climb[0] * u[j] + up
-                x = slope * depth[i, j] * medium  # scale heights up to the surface
-                x = min(max(x, -limit), np.float32(1e6))
-                near = abs(x) < np.float32(0.02)
-                series = one - half * x * (one - x * np.float32(1 / 3))
-                share = (one - decay(min(x, limit))) / (one if near else x)
-                tau = sigma * depth[i, j] * length * (series if near else share)
-                # Of a ray that does not climb the limit, too: it ends in the deepest fog.
-                sky = strength * sigma / medium * length / max(slope, np.float32(1e-30))
-                behind = one - decay(min(sky, limit))
-                share = one - decay(min(strength * tau, limit))
-                shown = alpha[i, j] if depth[i, j] > zero else zero
-                out[i, j] = min(max(behind + shown * (share - behind), zero), one)
+                length = math.sqrt(u[j] * u[j] + row_length_squared)
+                slope = climb[0] * u[j] + row_rise
+                rise = slope * depth[i, j] * inverse_scale_height  # scale heights up to the surface
+                rise = min(max(rise, -limit), np.float32(1e6))
+                is_small = abs(rise) < np.float32(0.02)
+                series = one_f32 - half * rise * (one_f32 - rise * np.float32(1 / 3))
+                share = (one_f32 - decay(min(rise, limit))) / (one_f32 if is_small else rise)
+                tau = extinction_per_m * depth[i, j] * length * (series if is_small else share)
+                # A ray that does not climb has the limit, too: it ends in the deepest fog.
+                sky_depth = (
+                    strength
+                    * extinction_per_m
+                    / inverse_scale_height
+                    * length
+                    / max(slope, np.float32(1e-30))
+                )
+                sky_share = one_f32 - decay(min(sky_depth, limit))
+                share = one_f32 - decay(min(strength * tau, limit))
+                surface_alpha = alpha[i, j] if depth[i, j] > zero else zero
+                out[i, j] = min(max(sky_share + surface_alpha * (share - sky_share), zero), one_f32)
         else:
             for j in range(depth.shape[1]):
-                tau = strength * sigma * depth[i, j] * math.sqrt(u[j] * u[j] + far)
-                shown = alpha[i, j] if depth[i, j] > zero else zero
-                out[i, j] = min(max(one - shown * decay(min(tau, limit)), zero), one)
+                tau = (
+                    strength
+                    * extinction_per_m
+                    * depth[i, j]
+                    * math.sqrt(u[j] * u[j] + row_length_squared)
+                )
+                surface_alpha = alpha[i, j] if depth[i, j] > zero else zero
+                out[i, j] = min(
+                    max(one_f32 - surface_alpha * decay(min(tau, limit)), zero), one_f32
+                )
 
 
 @kernel
-def weigh(rgb, weight, around, least, out):
-    """out [H, W, 4] = (rgb, 1) weight / sqrt(around), and around becomes 1 / sqrt(around)."""
+def weight_pixels(rgb, weight, neighbourhood_weight, min_weight, out):
+    """Write out [H, W, 4] = (rgb, 1) weight / sqrt(neighbourhood_weight + min_weight).
+
+    neighbourhood_weight becomes 1 / sqrt(neighbourhood_weight + min_weight).
+    """
     for i in prange(weight.shape[0]):
         for j in range(weight.shape[1]):
-            around[i, j] = np.float32(1) / math.sqrt(around[i, j] + least)
-            own = weight[i, j] * around[i, j]
-            out[i, j, 0], out[i, j, 1] = rgb[i, j, 0] * own, rgb[i, j, 1] * own
-            out[i, j, 2], out[i, j, 3] = rgb[i, j, 2] * own, own
+            neighbourhood_weight[i, j] = np.float32(1) / math.sqrt(
+                neighbourhood_weight[i, j] + min_weight
+            )
+            pixel_weight = weight[i, j] * neighbourhood_weight[i, j]
+            out[i, j, 0] = rgb[i, j, 0] * pixel_weight
+            out[i, j, 1] = rgb[i, j, 1] * pixel_weight
+            out[i, j, 2] = rgb[i, j, 2] * pixel_weight
+            out[i, j, 3] = pixel_weight
 
 
 @kernel
-def multiply(image, factors, factor):
-    """image [H, W, 4] times factors [H, W] and factor, in place."""
+def scale_pixels(image, factors, factor):
+    """Multiply image [H, W, 4] by factors [H, W] and factor, in place."""
     for i in prange(image.shape[0]):
         for j in range(image.shape[1]):
-            own = factors[i, j] * factor
+            pixel_factor = factors[i, j] * factor
             for c in range(4):
-                image[i, j, c] *= own
+                image[i, j, c] *= pixel_factor
 
 
 @kernel
 def blend_scattered(rgb, weight, spread):
-    """rgb + w (spread - rgb n), in place. weight [H, W]: w. spread [H, W, 4]: colours, n."""
+    """Write rgb + w (spread - rgb n), in place.
+
+    weight [H, W]: w. spread [H, W, 4]: colours, and n.
+    """
     for i in prange(rgb.shape[0]):
         for j in range(rgb.shape[1]):
             w = weight[i, j]
-            kept = np.float32(1) - w * spread[i, j, 3]
-            red, green, blue = rgb[i, j, 0], rgb[i, j, 1], rgb[i, j, 2]
-            rgb[i, j, 0] = red * kept + w * spread[i, j, 0]
-            rgb[i, j, 1] = green * kept + w * spread[i, j, 1]
-            rgb[i, j, 2] = blue * kept + w * spread[i, j, 2]
+            sharp_share = np.float32(1) - w * spread[i, j, 3]
+            red = rgb[i, j, 0]
+            green = rgb[i, j, 1]
+            blue = rgb[i, j, 2]
+            rgb[i, j, 0] = red * sharp_share + w * spread[i, j, 0]
+            rgb[i, j, 1] = green * sharp_share + w * spread[i, j, 1]
+            rgb[i, j, 2] = blue * sharp_share + w * spread[i, j, 2]
 
 
 @kernel
 def add_noise(values, draws, sigmas):
-    """values + sigmas[their 8-bit level] (draws - 128), in place; [H, 3 W], draws: uint8."""
-    half, top, middle = np.float32(0.5), np.float32(255), np.float32(128)
+    """Add sigmas[8-bit level] (draws - 128) to values, in place.
+
+    values: [H, 3 W]. draws: uint8 [H, 3 W]. sigmas: [256].
+    """
+    half = np.float32(0.5)
+    max_level = np.float32(255)
+    mean_draw = np.float32(128)
     for i in prange(values.shape[0]):
         levels = np.empty(values.shape[1], np.uint8)
         for j in range(values.shape[1]):
-            levels[j] = np.uint8(min(max(values[i, j] * top + half, np.float32(0)), top))
+            levels[j] = np.uint8(
+                min(max(values[i, j] * max_level + half, np.float32(0)), max_level)
+            )
         for j in range(values.shape[1]):
-            values[i, j] += sigmas[levels[j]] * (np.float32(draws[i, j]) - middle)
+            values[i, j] += sigmas[levels[j]] * (np.float32(draws[i, j]) - mean_draw)

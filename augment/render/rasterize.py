@@ -1,4 +1,4 @@
-"""The public entry to rasterisation: checks the arguments, picks a backend, calls it."""
+"""The public entry to rasterisation: it checks the arguments, chooses a backend and calls it."""
 
 from __future__ import annotations
 
@@ -46,15 +46,18 @@ from augment.scene import Gaussians, PosedGaussians
 
 
 def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) -> RenderOutput:
-    """Pixels of alpha >= 1 - stop become opaque. output: with alpha; written to by kernels.
+    """Make pixels of alpha >= 1 - stop opaque.
 
     Behind a raised transmittance stop nothing has been blended. Left transparent, that share of a
-    pixel would show the sky through every wall; instead what the pixel has blended stands for it:
-    rgb and overlay are divided by alpha, which becomes 1. (1e-4, the default, is less than 8 bits
+    pixel would show the sky through every wall. Instead, the blended part stands for it: rgb and
+    overlay are divided by alpha, and alpha becomes 1. (The default stop of 1e-4 is less than 8 bits
     show, and gsplat leaves it transparent, too.)
 
-    backend: on the CPU, float32 without gradients goes through a kernel, equal within float
-    rounding.
+    Args:
+        output: a render with alpha; the kernels overwrite it.
+        stop: transmittance stop of the render.
+        backend: on the CPU, float32 without gradients goes through a kernel, equal within float
+            rounding.
     """
     alpha = output.alpha
     assert alpha is not None
@@ -64,21 +67,23 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
         from augment.render import composite_kernels
         from augment.render.threads import kernel_threads
 
-        flat = {name: image.numpy().reshape(-1) for name, image in images.items()}
-        rgb, overlay = (flat.get(name, np.empty(0, np.float32)) for name in ("rgb", "overlay"))
+        flat_images = {name: image.numpy().reshape(-1) for name, image in images.items()}
+        rgb, overlay = (
+            flat_images.get(name, np.empty(0, np.float32)) for name in ("rgb", "overlay")
+        )
         with kernel_threads():
             composite_kernels.renormalise_alpha(
                 alpha.numpy().reshape(-1), rgb, overlay, np.float32(1 - stop)
             )
         return output
-    finished = alpha >= 1 - stop
-    scale = torch.where(finished, 1 / alpha.clamp_min(1 - stop), torch.ones_like(alpha))
-    scaled = {
+    is_finished = alpha >= 1 - stop
+    scale = torch.where(is_finished, 1 / alpha.clamp_min(1 - stop), torch.ones_like(alpha))
+    scaled_images = {
         name: image * (scale[..., None] if image.ndim == 3 else scale)
         for name, image in images.items()
     }
-    opaque = torch.where(finished, torch.ones_like(alpha), alpha)
-    return dataclasses.replace(output, alpha=opaque, **scaled)
+    opaque_alpha = torch.where(is_finished, torch.ones_like(alpha), alpha)
+    return dataclasses.replace(output, alpha=opaque_alpha, **scaled_images)
 
 
 logger = logging.getLogger(__name__)
@@ -95,26 +100,31 @@ def rasterize(
     pixel_mask: torch.Tensor | None = None,
     backend: str = AUTO,
 ) -> RenderOutput:
-    """Image buffers of the parts seen by the camera; the sky is not part of them.
+    """Return image buffers of the parts seen by the camera; the sky is not part of them.
 
-    buffers: names from augment.render.buffers; the others are None in the result. splat_ids counts
-    through the parts in the order given. fog: fades every splat's colour towards the airlight by
-    its own distance. clip: only what lies above, or below, a height is drawn
-    (augment.render.layout).
-    pixel_mask: bool [H, W], the pixels that will be looked at; a backend may leave the others 0.
-    backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, of pinhole cameras,
-    without fog, clip, light per pixel or colour maps and where no other buffer is asked for),
-    "cuda" (Triton, float32; parts may lie on either side, and are kept on the GPU as long as their
-    tensors live; the buffers lie there; gradients as augment.render.cuda.backward says),
-    "reference" (torch, float32 or float64, gradients of all, on the CPU), or "auto": cuda where the
-    Gaussians lie on a GPU, else cpu where it can do the job, else reference.
+    Args:
+        parts: Gaussians with their poses; splat_ids counts through them in this order.
+        camera: the camera.
+        buffers: names from augment.render.buffers; the other buffers are None in the result.
+        settings: thresholds of the image.
+        fog: fog that fades every splat's colour towards the airlight by the splat's own distance.
+        clip: height above, or below, which splats are drawn (augment.render.layout).
+        pixel_mask: bool [H, W], the pixels that will be looked at; a backend may leave the others
+            0.
+        backend: one of "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, for
+            pinhole cameras, without fog, clip, light per pixel or colour maps, and only if no other
+            buffer is asked for), "cuda" (Triton, float32; parts may lie on either side and are kept
+            on the GPU as long as their tensors live; the buffers lie there; gradients as
+            augment.render.cuda.backward says), "reference" (torch, float32 or float64, gradients of
+            all buffers, on the CPU), "auto" (cuda if the Gaussians lie on a GPU, else cpu if it can
+            do the job, else reference).
 
     Raises:
-        ValueError, TypeError: an argument no backend, or not the one named, can take.
-        BackendUnavailable: the backend named cannot run on this machine.
+        ValueError, TypeError: no backend, or not the named one, can take an argument.
+        BackendUnavailable: the named backend cannot run on this machine.
     """
     _check_arguments(parts, camera, buffers, settings)
-    _check_places(parts, backend)
+    _check_devices(parts, backend)
     if fog is not None and camera.is_orthographic:
         raise ValueError(
             f"camera {camera.name!r} is orthographic: there is no eye from which to measure how "
@@ -129,25 +139,28 @@ def rasterize(
             f"{pixel_mask.dtype} {list(pixel_mask.shape)}"
         )
     image = _Image(parts, camera, frozenset(buffers), settings, fog, clip, pixel_mask)
-    chosen = _choose(image, backend)
-    if settings.lod_px > 0 and not _tracked(parts):
-        seen_by = cut_in_fog(settings, fog, clip, image.buffers)
-        levels = choose_parts(parts, camera, seen_by, fog, clip, whole=chosen == CPU)
-        return levels.restore_ids(_render(image._replace(parts=levels.parts), chosen))
-    return _render(image, chosen)
+    chosen_backend = _choose_backend(image, backend)
+    if settings.lod_px > 0 and not _needs_gradients(parts):
+        level_settings = cut_in_fog(settings, fog, clip, image.buffers)
+        levels = choose_parts(parts, camera, level_settings, fog, clip, whole=chosen_backend == CPU)
+        return levels.restore_ids(_render(image._replace(parts=levels.parts), chosen_backend))
+    return _render(image, chosen_backend)
 
 
 def _render(image: _Image, backend: str) -> RenderOutput:
+    """Return the image; pixels behind a raised transmittance stop are opaque."""
     stop = image.settings.transmittance_stop
     if stop <= TRANSMITTANCE_STOP:
-        return _draw(image, backend)
-    drawn = _draw(image._replace(buffers=image.buffers | {ALPHA}), backend)
-    opaque = renormalise_alpha(drawn, stop, backend=backend)
-    return opaque if ALPHA in image.buffers else dataclasses.replace(opaque, alpha=None)
+        return _call_backend(image, backend)
+    output = _call_backend(image._replace(buffers=image.buffers | {ALPHA}), backend)
+    opaque_output = renormalise_alpha(output, stop, backend=backend)
+    return (
+        opaque_output if ALPHA in image.buffers else dataclasses.replace(opaque_output, alpha=None)
+    )
 
 
 class _Image(NamedTuple):
-    """What is to be drawn: the arguments of `rasterize`, checked."""
+    """The checked arguments of `rasterize`."""
 
     parts: Sequence[PosedGaussians]
     camera: Camera
@@ -158,43 +171,47 @@ class _Image(NamedTuple):
     pixel_mask: torch.Tensor | None
 
 
-def _draw(image: _Image, backend: str) -> RenderOutput:
+def _call_backend(image: _Image, backend: str) -> RenderOutput:
+    """Return the image by one backend, with its own function for gradients."""
     if backend == REFERENCE:
         return rasterize_reference(*image[:-1])
     module = import_cuda() if backend == CUDA else import_cpu()
-    if _tracked(image.parts):
+    if _needs_gradients(image.parts):
         if backend == CUDA:
             from augment.render.cuda.backward import rasterize_with_gradients
         else:
             from augment.render.cpu.backward import rasterize_with_gradients
         return rasterize_with_gradients(*image[:4])
-    parts, mask = [_detached(p) for p in image.parts], image.pixel_mask
+    parts = [_detach_part(p) for p in image.parts]
+    mask = image.pixel_mask
     if backend == CUDA:
         return module.rasterize_cuda(parts, *image[1:])
     return module.rasterize_cpu(parts, *image[1:-1], None if mask is None else mask.numpy())
 
 
-def _choose(image: _Image, backend: str) -> str:
-    """The backend to use; the first time a choice is made for a reason, it is logged."""
+def _choose_backend(image: _Image, backend: str) -> str:
+    """Return the backend to use. The first choice for each reason is logged."""
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
-    first = image.parts[0].gaussians.means
-    if backend == AUTO and first.device.type != "cpu":
+    first_means = image.parts[0].gaussians.means
+    if backend == AUTO and first_means.device.type != "cpu":
         backend = CUDA
     if backend == REFERENCE:
         return REFERENCE
     obstacle = None
-    if first.dtype != torch.float32:
-        obstacle = f"the Gaussians are {first.dtype}, it takes torch.float32"
-    elif _tracked(image.parts):
-        what = _gradients_it_lacks(image, backend)
-        obstacle = what and f"gradients {what} are asked for, it has none"
+    if first_means.dtype != torch.float32:
+        obstacle = f"the Gaussians are {first_means.dtype}, it takes torch.float32"
+    elif _needs_gradients(image.parts):
+        missing_gradients = _missing_gradients(image, backend)
+        obstacle = missing_gradients and f"gradients {missing_gradients} are asked for, it has none"
     if backend in (CPU, CUDA):
         if obstacle:
-            others = "'auto' or 'reference'" if backend == CPU else "'reference', on the CPU"
+            other_backends = (
+                "'auto' or 'reference'" if backend == CPU else "'reference', on the CPU"
+            )
             raise ValueError(
                 f"backend {backend!r} cannot render these Gaussians: {obstacle}; convert or detach "
-                f"them, or use backend {others}"
+                f"them, or use backend {other_backends}"
             )
         return backend
     if obstacle is None:
@@ -209,8 +226,8 @@ def _choose(image: _Image, backend: str) -> str:
     return CPU
 
 
-def _gradients_it_lacks(image: _Image, backend: str) -> str | None:
-    """What the backend would need gradients of and has none; None where it has all."""
+def _missing_gradients(image: _Image, backend: str) -> str | None:
+    """Return the gradients that are asked for and that the backend lacks; None if it has all."""
     if any(part.shading is not None for part in image.parts):
         return "of light per pixel"
     if any(part.color_maps is not None for part in image.parts):
@@ -223,8 +240,8 @@ def _gradients_it_lacks(image: _Image, backend: str) -> str | None:
         return None  # colours move no other buffer, and any camera has its own kernels' gradients
     if image.camera.is_orthographic:
         return "of an orthographic camera"
-    others = image.buffers - DIFFERENTIABLE
-    return f"of {', '.join(sorted(others))}" if others else None
+    other_buffers = image.buffers - DIFFERENTIABLE
+    return f"of {', '.join(sorted(other_buffers))}" if other_buffers else None
 
 
 @functools.cache
@@ -238,26 +255,31 @@ def _check_arguments(
     buffers: Collection[str],
     settings: RasterSettings,
 ) -> None:
+    """Check parts, buffers and settings; the first fault is raised."""
     if isinstance(buffers, str):
         raise TypeError(f"buffers must be a collection of names; got the string {buffers!r}")
-    unknown = sorted(set(buffers) - set(BUFFERS))
-    if unknown or not buffers:
-        what = f"unknown buffers {', '.join(map(repr, unknown))}" if unknown else "no buffers"
-        raise ValueError(f"{what} asked for; known: {', '.join(BUFFERS)}")
+    unknown_buffers = sorted(set(buffers) - set(BUFFERS))
+    if unknown_buffers or not buffers:
+        problem = (
+            f"unknown buffers {', '.join(map(repr, unknown_buffers))}"
+            if unknown_buffers
+            else "no buffers"
+        )
+        raise ValueError(f"{problem} asked for; known: {', '.join(BUFFERS)}")
     _check_settings(settings)
     if not isinstance(parts, Sequence) or not parts:
         raise ValueError(
             f"parts must be a non-empty sequence of PosedGaussians; got "
             f"{'an empty one' if isinstance(parts, Sequence) else type(parts).__name__}"
         )
-    first = parts[0].gaussians.means
-    if first.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"Gaussians must be float32 or float64; got {first.dtype}")
+    first_means = parts[0].gaussians.means
+    if first_means.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"Gaussians must be float32 or float64; got {first_means.dtype}")
     for number, part in enumerate(parts):
         means = part.gaussians.means
-        if means.dtype != first.dtype:
+        if means.dtype != first_means.dtype:
             raise ValueError(
-                f"all parts must share one dtype; part 0 is {first.dtype}, "
+                f"all parts must share one dtype; part 0 is {first_means.dtype}, "
                 f"part {number} is {means.dtype}"
             )
         _check_pose(part, number, camera)
@@ -265,14 +287,14 @@ def _check_arguments(
         _check_color_maps(part, number)
 
 
-def _check_places(parts: Sequence[PosedGaussians], backend: str) -> None:
-    """All tensors on the CPU, or, for a backend that can take it, all of one GPU."""
+def _check_devices(parts: Sequence[PosedGaussians], backend: str) -> None:
+    """Check that all tensors lie on the CPU or, for a backend that can take it, on one GPU."""
     if backend in (AUTO, CUDA):
-        places = {part.gaussians.means.device for part in parts}
-        away = {place for place in places if place.type != "cpu"}
-        if backend == AUTO and away and places != away:
+        devices = {part.gaussians.means.device for part in parts}
+        gpu_devices = {device for device in devices if device.type != "cpu"}
+        if backend == AUTO and gpu_devices and devices != gpu_devices:
             raise ValueError(
-                f"parts lie on {', '.join(sorted(map(str, places)))}; move all to one device, or "
+                f"parts lie on {', '.join(sorted(map(str, devices)))}; move all to one device, or "
                 f"name the backend"
             )
         return
@@ -285,12 +307,14 @@ def _check_places(parts: Sequence[PosedGaussians], backend: str) -> None:
 
 
 def _check_shading(part: PosedGaussians, number: int) -> None:
+    """Check the light of a part that is lit pixel by pixel."""
     if part.shading is None:
         return
-    expected, slopes = (len(part.gaussians), 3), part.shading.slopes
-    if tuple(slopes.shape) != expected or not slopes.dtype.is_floating_point:
+    shape = (len(part.gaussians), 3)
+    slopes = part.shading.slopes
+    if tuple(slopes.shape) != shape or not slopes.dtype.is_floating_point:
         raise ValueError(
-            f"part {number}: shading.slopes must be floats {list(expected)} (from its Gaussians); "
+            f"part {number}: shading.slopes must be floats {list(shape)} (from its Gaussians); "
             f"got {slopes.dtype} {list(slopes.shape)}"
         )
     length = math.hypot(*part.shading.sun)
@@ -303,6 +327,7 @@ def _check_shading(part: PosedGaussians, number: int) -> None:
 
 
 def _check_color_maps(part: PosedGaussians, number: int) -> None:
+    """Check the colour maps of a part and their rows."""
     maps = part.color_maps
     if maps is None:
         return
@@ -326,6 +351,7 @@ def _check_color_maps(part: PosedGaussians, number: int) -> None:
 
 
 def _check_pose(part: PosedGaussians, number: int, camera: Camera) -> None:
+    """Check the pose of a part."""
     pose = part.world_from_part
     if pose is None:
         return
@@ -342,32 +368,36 @@ def _check_pose(part: PosedGaussians, number: int, camera: Camera) -> None:
 
 
 def _check_settings(settings: RasterSettings) -> None:
-    s, degree, most = settings, settings.sh_degree, MAX_TRANSMITTANCE_STOP
-    above_0 = "finite and > 0 (metres)"
+    """Check the range of every setting."""
+    s = settings
+    degree = settings.sh_degree
+    max_stop = MAX_TRANSMITTANCE_STOP
+    positive_metres = "finite and > 0 (metres)"
     rules = {
-        "near_m": (0 < s.near_m < math.inf, above_0),
+        "near_m": (0 < s.near_m < math.inf, positive_metres),
         "alpha_max": (
             0 < s.alpha_max < 1,
             "between 0 and 1 (usual: 0.999 or 0.99), since a splat of alpha 1 would never be "
             "blended",
         ),
-        "mode_depth_floor_m": (0 < s.mode_depth_floor_m < math.inf, above_0),
+        "mode_depth_floor_m": (0 < s.mode_depth_floor_m < math.inf, positive_metres),
         "transmittance_stop": (
-            0 < s.transmittance_stop <= most,
-            f"> 0 and at most {most}, since median depth is where less than half the light is left",
+            0 < s.transmittance_stop <= max_stop,
+            f"> 0 and at most {max_stop}, since median depth is where less than half the light is "
+            f"left",
         ),
         "radius_clip_px": (0 <= s.radius_clip_px < math.inf, "finite and >= 0 (pixels)"),
         "blur_px2": (0 < s.blur_px2 <= COV2D_BLUR, f"> 0 and at most {COV2D_BLUR} (px^2)"),
-        "fog_cut": (0 <= s.fog_cut <= most, f">= 0 and at most {most}"),
+        "fog_cut": (0 <= s.fog_cut <= max_stop, f">= 0 and at most {max_stop}"),
         "lod_px": (0 <= s.lod_px < math.inf, "finite and >= 0 (pixels)"),
         "sh_degree": (degree is None or 0 <= degree <= MAX_DEGREE, f"None or 0 to {MAX_DEGREE}"),
     }
-    for name, (is_good, expected) in rules.items():
+    for name, (is_good, requirement) in rules.items():
         if not is_good:
-            raise ValueError(f"settings.{name} must be {expected}; got {getattr(s, name)}")
+            raise ValueError(f"settings.{name} must be {requirement}; got {getattr(s, name)}")
 
 
-def _tracked(parts: Sequence[PosedGaussians]) -> bool:
+def _needs_gradients(parts: Sequence[PosedGaussians]) -> bool:
     return torch.is_grad_enabled() and any(_requires_grad(p.gaussians) for p in parts)
 
 
@@ -375,8 +405,11 @@ def _requires_grad(gaussians: Gaussians) -> bool:
     return any(getattr(gaussians, name).requires_grad for name in (*GEOMETRY, "sh"))
 
 
-def _detached(part: PosedGaussians) -> PosedGaussians:
-    """The part without autograd, which numpy would refuse; the same object where it has none."""
+def _detach_part(part: PosedGaussians) -> PosedGaussians:
+    """Return the part without autograd, which numpy would refuse.
+
+    It is the same object if no tensor requires a gradient.
+    """
     if not _requires_grad(part.gaussians):
         return part
     tensors = {name: getattr(part.gaussians, name).detach() for name in (*GEOMETRY, "sh")}

@@ -4,9 +4,16 @@
     order     by float32 z, ties by index through the parts
     blend     alpha = min(alpha_max, opacity exp(-sigma)), front to back   per pixel
 
+`rasterize` calls it for backend "reference"; the kernels on the CPU and the GPU are tested against
+it. It takes the parts of a scene and a camera, and returns the image buffers.
+
 Kerbl et al. 2023, "3D Gaussian splatting for real-time radiance field rendering"; thresholds of
 gsplat 1.5.3. In exact arithmetic an image depends on no box: a splat of opacity <= 1 has alpha
 below 1/255 outside min(3.33, sqrt(2 ln(255 opacity))) sigmas, so boxes and tiles only save work.
+
+Symbols: S splats of a tile, P pixels, M splats in front of the camera, N Gaussians of a part.
+sigma is half the squared Mahalanobis distance of a pixel from a splat's mean; tau is the optical
+depth of the fog before a splat.
 """
 
 from __future__ import annotations
@@ -42,15 +49,15 @@ from augment.render.constants import (
     RasterSettings,
 )
 from augment.render.fog import Fog, blend_airlight, optical_depth
-from augment.render.layout import FAR_PX, LONGEST, SHARP_PX2, HeightClip
+from augment.render.layout import FAR_PX, MAX_DEPTH_GROWTH, SHARP_PX2, HeightClip
 from augment.render.mode_depth import Clusters
 from augment.render.sh import evaluate_sh
 from augment.render.shading import LINES, TINY, light_share, shading_lines
 from augment.scene import Gaussians, PosedGaussians
 
-# ---- Projection of the reference rasteriser: Gaussians of a scene to splats of one image ---------
-# Positions are taken relative to the eye before anything else, so that float32 keeps its digits in
-# scenes that are kilometres wide. Zwicker et al. 2001, "EWA volume splatting", with the clamps and
+# ---- Projection: Gaussians of a scene to splats of one image -------------------------------------
+# First of all, positions are taken relative to the eye, so that float32 keeps its digits in scenes
+# that are kilometres wide. Zwicker et al. 2001, "EWA volume splatting", with the clamps and
 # thresholds of gsplat 1.5.3.
 
 
@@ -58,14 +65,21 @@ from augment.scene import Gaussians, PosedGaussians
 class Splats:
     """M Gaussians seen by one camera.
 
-    ids: index counted through all parts. depths: z, metres. means2d: pixels. covs2d: xx, xy, yy,
-    px^2, blurred. dets: their determinants. opacities: after antialiasing. colors: display-encoded
-    and >= 0, in the fog where there is any; None where no colour was asked for. overlay: 1 of those
-    of an overlay, else 0. cuts: of splats
-    clipped at a height, value at means2d and slope in x and y, per px: clamp(value, 0, 1) is the
-    share of alpha that is kept at a pixel; then the growth of the surface's depth in x and y, its
-    share per px (seen by an orthographic camera: metres per px), and the most that it may grow or
-    shrink. None without a clip.
+    ids: index of the Gaussian, counted through all parts.
+    depths: z of the centre, metres.
+    means2d: centre in the image, pixels.
+    covs2d: xx, xy, yy of the blurred covariance, px^2.
+    dets: determinant of that covariance, px^4.
+    opacities: opacity after antialiasing.
+    colors: display-encoded and >= 0, with the fog if there is any; None if no colour was asked for.
+    overlay: 1 for a splat of an overlay, else 0.
+    cuts: cut of a splat that is clipped at a height; None without a clip. First the value at
+        means2d and its slopes in x and y, per px: clamp(value, 0, 1) is the share of alpha that is
+        kept at a pixel. Then the growth of the surface's depth in x and y, its share per px (for an
+        orthographic
+        camera: metres per px), and the most that the depth may grow or shrink.
+    lights: light of a splat that is lit pixel by pixel (augment.render.shading); None if no part
+    is.
     """
 
     ids: Int64[Tensor, "M"]
@@ -83,16 +97,16 @@ class Splats:
         return self.ids.shape[0]
 
     def columns(self) -> dict[str, Tensor]:
-        """The fields that are there, by name; one row a splat."""
+        """Return the fields that are not None, by name; one row per splat."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return {name: value for name, value in values.items() if value is not None}
 
     def select(self, index: Tensor) -> Splats:
-        """The splats at the given indices or mask, in that order."""
+        """Return the splats at the given indices or mask, in that order."""
         return dataclasses.replace(self, **{k: v[index] for k, v in self.columns().items()})
 
     def split(self, sizes: list[int] | int) -> list[Splats]:
-        """Consecutive runs of the splats, of the given sizes, as views."""
+        """Return consecutive runs of the splats, of the given sizes, as views."""
         names = list(self.columns())
         runs = zip(*(value.split(sizes) for value in self.columns().values()), strict=True)
         return [dataclasses.replace(self, **dict(zip(names, run, strict=True))) for run in runs]
@@ -107,20 +121,32 @@ def project_parts(
     *,
     with_color: bool = True,
 ) -> Splats:
-    """Splats of all parts that are in front of the camera and opaque enough, in index order."""
-    projected: list[Splats] = []
+    """Return the splats of all parts that are in front of the camera and opaque enough.
+
+    Args:
+        parts: Gaussians with their poses.
+        camera: the camera.
+        settings: thresholds of the image.
+        fog: fog that fades the colours; None for clear air.
+        clip: height at which splats are cut; None for no cut.
+        with_color: if False, colours and lights are not computed.
+
+    Returns:
+        Splats in the order of the Gaussians' indices.
+    """
+    part_splats: list[Splats] = []
     any_light = with_color and any(part.shading is not None for part in parts)
     first_id = 0
     for part in parts:
-        projected.append(
+        part_splats.append(
             _project_part(part, first_id, camera, settings, fog, clip, with_color, any_light)
         )
         first_id += len(part.gaussians)
-    if len(projected) == 1:
-        return projected[0]
-    columns = [splats.columns() for splats in projected]
-    joined = {name: torch.cat([column[name] for column in columns]) for name in columns[0]}
-    return dataclasses.replace(projected[0], **joined)
+    if len(part_splats) == 1:
+        return part_splats[0]
+    columns = [splats.columns() for splats in part_splats]
+    joined_columns = {name: torch.cat([column[name] for column in columns]) for name in columns[0]}
+    return dataclasses.replace(part_splats[0], **joined_columns)
 
 
 def _project_part(
@@ -133,19 +159,34 @@ def _project_part(
     with_color: bool,
     any_light: bool,
 ) -> Splats:
+    """Return the splats of one part.
+
+    Args:
+        part: Gaussians with their pose.
+        first_id: index of the part's first Gaussian, counted through all parts.
+        camera: the camera.
+        settings: thresholds of the image.
+        fog: fog before the splats; None for clear air.
+        clip: height at which splats are cut; None for no cut.
+        with_color: if False, colours and lights are not computed.
+        any_light: if True, some part is lit pixel by pixel, so every splat gets lights.
+    """
     camera_from_part = camera.camera_from_world
     if part.world_from_part is not None:
         camera_from_part = camera_from_part @ part.world_from_part
     rotation = camera_from_part[:3, :3].to(part.gaussians.means.dtype)
     offsets = _offsets_from_eye(part.gaussians.means, camera_from_part)
-    # Term by term: a matrix product may round the same mean differently at another index, and ties
-    # would no longer be ties.
+    # The product is summed term by term: a matrix product may round the same mean differently at
+    # another index, and ties would no longer be ties.
     x, y, z = offsets.unbind(1)
     depths = x * rotation[2, 0] + y * rotation[2, 1] + z * rotation[2, 2]
-    kept = (depths >= settings.near_m) & (part.gaussians.opacities >= ALPHA_MIN)
-    index = torch.nonzero(kept).squeeze(-1)
+    is_drawn = (depths >= settings.near_m) & (part.gaussians.opacities >= ALPHA_MIN)
+    index = torch.nonzero(is_drawn).squeeze(-1)
 
-    gaussians, offsets, depths = part.gaussians.select(index), offsets[index], depths[index]
+    # Centres in the camera, and their ellipses in the image.
+    gaussians = part.gaussians.select(index)
+    offsets = offsets[index]
+    depths = depths[index]
     points = torch.cat([offsets @ rotation[:2].T, depths[:, None]], 1)  # in the camera
     axes = rotation @ rotmat_from_quat(gaussians.quats) * gaussians.scales[:, None, :]  # [M, 3, 3]
     covs2d, det_sharp = _project_covariances(points, axes, camera)
@@ -156,11 +197,12 @@ def _project_part(
     if settings.antialiased:
         tiny = torch.finfo(dets.dtype).tiny  # the slope of sqrt is infinite at 0
         opacities = opacities * torch.sqrt((det_sharp / dets).clamp_min(tiny))
+    # Colour, then the light and the cut of parts that have them.
     colors = None
     if with_color:
-        towards = rotation[2].expand_as(offsets) if camera.is_orthographic else offsets
+        view_directions = rotation[2].expand_as(offsets) if camera.is_orthographic else offsets
         rows = None if part.map_rows is None else part.map_rows[index]
-        colors = _colors(gaussians, rows, towards, part, camera, settings, fog)
+        colors = _colors(gaussians, rows, view_directions, part, camera, settings, fog)
     splats = Splats(
         ids=index + first_id,
         depths=depths,
@@ -181,16 +223,17 @@ def _project_part(
         splats = dataclasses.replace(splats, lights=lights)
     if clip is not None:
         heights = clip.sign * _heights(gaussians, offsets, part, camera, clip)
-        cuts, partly = _cut(heights, axes, points, camera, clip)
-        splats = dataclasses.replace(splats, cuts=cuts).select(partly)
+        cuts, has_kept_part = _cut(heights, axes, points, camera, clip)
+        splats = dataclasses.replace(splats, cuts=cuts).select(has_kept_part)
     if settings.radius_clip_px > 0:
         splats = splats.select(half_extents(splats).amax(1) > settings.radius_clip_px)
     return splats
 
 
 def half_extents(splats: Splats) -> Float[Tensor, "M 2"]:
-    """Half the width and height, px, of the boxes in which the splats' alpha can reach 1/255."""
-    opacities, covs2d = splats.opacities.detach(), splats.covs2d.detach()
+    """Return half the width and height, px, of the boxes in which alpha can reach 1/255."""
+    opacities = splats.opacities.detach()
+    covs2d = splats.covs2d.detach()
     sigmas = torch.sqrt(2 * torch.log(opacities / ALPHA_MIN).clamp_min(0))
     return sigmas.clamp_max(MAX_EXTENT_SIGMAS)[:, None] * torch.sqrt(covs2d[:, ::2])
 
@@ -198,7 +241,10 @@ def half_extents(splats: Splats) -> Float[Tensor, "M 2"]:
 def _heights(
     gaussians: Gaussians, offsets: Tensor, part: PosedGaussians, camera: Camera, clip: HeightClip
 ) -> Float[Tensor, "M"]:
-    """Heights of the means above the plane, by way of the eye, so that float32 keeps its digits."""
+    """Return the heights of the means above the clip's plane, metres.
+
+    They are sums of the eye's height and the height over the eye, so that float32 keeps its digits.
+    """
     rise = torch.tensor(clip.up, dtype=torch.float64)
     if part.world_from_part is not None:
         rise = rise @ part.world_from_part[:3, :3]
@@ -212,34 +258,40 @@ def _cut(
     camera: Camera,
     clip: HeightClip,
 ) -> tuple[Float[Tensor, "M 6"], Tensor]:
-    """Cuts, and which splats have a part on the kept side. heights: positive there."""
+    """Return the cut of every splat and a mask of the splats that have a part on the kept side.
+
+    heights: heights of the means, positive on the kept side, metres.
+    """
     rise = torch.tensor(clip.up, dtype=torch.float64)
     up = (clip.sign * (camera.camera_from_world[:3, :3] @ rise)).to(axes.dtype)
     reach = MAX_EXTENT_SIGMAS * (up @ axes).norm(dim=-1)
     gx, gy = _depth_slope(*_image_axes(points, axes, camera), axes[:, 2])
-    by = _divisors(points, camera)
-    fall = clip.sign * clip.height_of(camera.centre.tolist()) / by**2
-    most = LONGEST
+    divisors = _divisors(points, camera)
+    fall = clip.sign * clip.height_of(camera.centre.tolist()) / divisors**2
+    max_growth = MAX_DEPTH_GROWTH
     if camera.is_orthographic:
-        fall, most = -up[2], math.inf
+        fall = -up[2]
+        max_growth = math.inf
     slope = torch.stack([up[0] / camera.fx - fall * gx, up[1] / camera.fy - fall * gy], -1)
     length = slope.norm(dim=-1).clamp_min(1e-20)
-    offset = (heights / by / length).clamp(-FAR_PX, FAR_PX)
-    deep = (MAX_EXTENT_SIGMAS * axes[:, 2].norm(dim=-1) / by).clamp_max(most)
-    whole = heights >= reach
-    offset = torch.where(whole, torch.full_like(offset, FAR_PX), offset) + clip.edge_px
-    slope = torch.where(whole[:, None], torch.zeros_like(slope), slope / length[:, None])
-    cuts = torch.cat([offset[:, None], slope, torch.stack([gx / by, gy / by, deep], -1)], 1)
+    offset = (heights / divisors / length).clamp(-FAR_PX, FAR_PX)
+    growth_limit = (MAX_EXTENT_SIGMAS * axes[:, 2].norm(dim=-1) / divisors).clamp_max(max_growth)
+    is_uncut = heights >= reach
+    offset = torch.where(is_uncut, torch.full_like(offset, FAR_PX), offset) + clip.edge_px
+    slope = torch.where(is_uncut[:, None], torch.zeros_like(slope), slope / length[:, None])
+    cuts = torch.cat(
+        [offset[:, None], slope, torch.stack([gx / divisors, gy / divisors, growth_limit], -1)], 1
+    )
     return cuts, (heights >= -reach) & (heights - reach <= clip.reach_m)
 
 
 def _depth_slope(
     right: Float[Tensor, "M 3"], down: Float[Tensor, "M 3"], away: Float[Tensor, "M 3"]
 ) -> tuple[Float[Tensor, "M"], Float[Tensor, "M"]]:
-    """g = S2^-1 c (augment.render.layout), per px right and down, of semi-axes.
+    """Return g = S2^-1 c (augment.render.layout) per px right and down, from semi-axes.
 
-    Determinants are written as products of cross products (Lagrange, Binet-Cauchy): of needles, and
-    of sheets seen edge-on, all digits would cancel, even in float64.
+    Determinants are written as products of cross products (Lagrange, Binet-Cauchy). For needles,
+    and for sheets seen edge-on, all digits would cancel otherwise, even in float64.
     """
     scale = (down.square().sum(1) + SHARP_PX2).rsqrt()[:, None]
     minors = torch.linalg.cross(right, down) * scale
@@ -255,11 +307,11 @@ def _depth_slope(
 def _offsets_from_eye(
     means: Float[Tensor, "N 3"], camera_from_part: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "N 3"]:
-    """Means minus the camera's centre, in the part's axes.
+    """Return the means minus the camera's centre, in the part's axes.
 
-    The centre is the point that the transform takes to the origin, also where a rotation read from
-    a file is orthonormal to seven digits only. It is subtracted in two steps, since it rarely is a
-    float32 number.
+    The centre is the point that the transform takes to the origin. This also holds where a rotation
+    read from a file is orthonormal to seven digits only. The centre is subtracted in two steps,
+    since it rarely is a float32 number.
     """
     eye = torch.linalg.solve(camera_from_part[:3, :3], -camera_from_part[:3, 3])
     coarse = eye.to(means.dtype)
@@ -267,12 +319,17 @@ def _offsets_from_eye(
 
 
 def _project_points(points: Float[Tensor, "M 3"], camera: Camera) -> Float[Tensor, "M 2"]:
-    x, y, by = points[:, 0], points[:, 1], _divisors(points, camera)
-    return torch.stack([camera.fx * x / by + camera.cx, camera.fy * y / by + camera.cy], -1)
+    """Return the image positions of points in the camera, pixels."""
+    x = points[:, 0]
+    y = points[:, 1]
+    divisors = _divisors(points, camera)
+    return torch.stack(
+        [camera.fx * x / divisors + camera.cx, camera.fy * y / divisors + camera.cy], -1
+    )
 
 
 def _divisors(points: Float[Tensor, "M 3"], camera: Camera) -> Float[Tensor, "M"]:
-    """What x and y are divided by in the projection: z, or 1 where rays are parallel."""
+    """Return the divisor of x and y in the projection: z, or 1 for parallel rays."""
     z = points[:, 2]
     return torch.ones_like(z) if camera.is_orthographic else z
 
@@ -280,10 +337,15 @@ def _divisors(points: Float[Tensor, "M 3"], camera: Camera) -> Float[Tensor, "M"
 def _project_covariances(
     points: Float[Tensor, "M 3"], axes: Float[Tensor, "M 3 3"], camera: Camera
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
-    """Covariances (xx, xy, yy) in px^2, not blurred, and their determinants.
+    """Return the unblurred covariances (xx, xy, yy), px^2, and their determinants.
 
-    axes: columns are the semi-axes in the camera, metres. The projection is linearised at the
-    splat's centre, or at the nearest point within a margin around the image where it lies outside.
+    The projection is linearised at the splat's centre. If the centre lies outside a margin around
+    the image, the nearest point within the margin is used instead.
+
+    Args:
+        points: centres in the camera, metres.
+        axes: matrices whose columns are the semi-axes in the camera, metres.
+        camera: the camera.
     """
     right, down = _image_axes(points, axes, camera)
     covs2d = torch.stack([(right * right).sum(1), (right * down).sum(1), (down * down).sum(1)], -1)
@@ -294,7 +356,7 @@ def _project_covariances(
 def _image_axes(
     points: Float[Tensor, "M 3"], axes: Float[Tensor, "M 3 3"], camera: Camera
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
-    """The semi-axes in the image, px right and px down."""
+    """Return the semi-axes in the image, px right and px down."""
     if camera.is_orthographic:
         return camera.fx * axes[:, 0], camera.fy * axes[:, 1]
     z = points[:, 2]
@@ -319,27 +381,40 @@ def _colors(
     settings: RasterSettings,
     fog: Fog | None,
 ) -> Float[Tensor, "M 3"]:
-    """max(SH + 0.5, 0), mapped, and seen through the fog. rows: of the colour maps. offsets: from
-    the eye, in the part's axes; without fog their lengths do not matter.
+    """Return max(SH + 0.5, 0), mapped and faded by the fog.
+
+    Args:
+        gaussians: Gaussians of one part that are projected.
+        rows: row of the part's colour maps for every Gaussian; None if all use the first.
+        offsets: vectors from the eye, in the part's axes; without fog their lengths do not matter.
+        part: the part.
+        camera: the camera.
+        settings: thresholds of the image.
+        fog: fog before the splats; None for clear air.
     """
     directions = torch.nn.functional.normalize(offsets, dim=-1)
     colors = (evaluate_sh(gaussians.sh, directions, settings.sh_degree) + 0.5).clamp_min(0)
     if part.color_maps is not None:
-        colors = _mapped(colors, part.color_maps.to(colors.dtype), rows)
+        colors = _map_colors(colors, part.color_maps.to(colors.dtype), rows)
     if fog is None:
         return colors
     return blend_airlight(colors, _optical_depths(gaussians, offsets, part, camera, fog), fog)
 
 
-def _mapped(
+def _map_colors(
     colors: Float[Tensor, "M 3"], maps: Float[Tensor, "C 3 4"], rows: Int16[Tensor, "M"] | None
 ) -> Float[Tensor, "M 3"]:
-    """Every colour under its map, the first where there is no such row; not below 0."""
+    """Return every colour under its colour map, not below 0.
+
+    A row that is not among the maps means the first map.
+    """
     if rows is None:
         return (colors @ maps[0, :, :3].T + maps[0, :, 3]).clamp_min(0)
     index = torch.where((rows >= 0) & (rows < len(maps)), rows, 0).long()
-    own = maps[index]
-    return (torch.einsum("mij,mj->mi", own[..., :3], colors) + own[..., 3]).clamp_min(0)
+    splat_maps = maps[index]
+    return (torch.einsum("mij,mj->mi", splat_maps[..., :3], colors) + splat_maps[..., 3]).clamp_min(
+        0
+    )
 
 
 def _optical_depths(
@@ -349,7 +424,7 @@ def _optical_depths(
     camera: Camera,
     fog: Fog,
 ) -> Float[Tensor, "M"]:
-    """Of the fog before every splat."""
+    """Return the optical depth of the fog before every splat."""
     heights = None
     if fog.scale_height_m is not None:
         heights = gaussians.means[:, 2]
@@ -365,35 +440,49 @@ def _lights(
     points: Float[Tensor, "M 3"],
     camera: Camera,
 ) -> Float[Tensor, "M 9"]:
-    """The lines of a shaded part's splats (augment.render.shading). points: in the camera."""
+    """Return the shading lines of a lit part's splats (augment.render.shading).
+
+    points: centres of the splats in the camera, metres.
+    """
     assert part.shading is not None
     normals = rotmat_from_quat(part.gaussians.quats[index])[:, :, 2] @ rotation.T
     sun = rotation @ torch.tensor(part.shading.sun, dtype=rotation.dtype)
-    towards = torch.tensor([0.0, 0, 1]).to(points).expand_as(points)
-    towards = towards if camera.is_orthographic else points
+    view_directions = torch.tensor([0.0, 0, 1]).to(points).expand_as(points)
+    view_directions = view_directions if camera.is_orthographic else points
     slopes = part.shading.slopes[index].to(rotation.dtype)
-    return shading_lines(normals, towards, slopes, sun, part.shading.wrap, camera)
+    return shading_lines(normals, view_directions, slopes, sun, part.shading.wrap, camera)
 
 
 def order_by_depth(splats: Splats) -> Splats:
-    """Nearest first by float32 z, whatever the dtype; equal depths stay in index order."""
+    """Return the splats nearest first by float32 z, whatever the dtype.
+
+    Splats of equal depth stay in index order.
+    """
     return splats.select(torch.argsort(splats.depths.detach().float(), stable=True))
 
 
-TILE = 16  # pixels a side
+# Side of a tile, pixels.
+TILE = 16
 # Splats of a tile that are blended at once. 256 pixels x 96 splats stay in a core's cache, and
-# torch keeps so few values on one thread; handing them to others would cost more than the work,
-# far more where the cores are busy. Hence also exp2 and sums below instead of exp and matrix
+# torch keeps so few values on one thread. Several threads would cost more than the work, far more
+# if the cores are busy. This is also why exp2 and sums are used below instead of exp and matrix
 # products, which go to a library that wakes its threads for any size.
 BLOCK = 96
+# log2 of e, which turns exp into exp2.
 LOG2_E = math.log2(math.e)
-MEDIAN = 0.5  # median depth is where transmittance falls below this
+# Transmittance that defines median depth: the depth where transmittance falls below it.
+MEDIAN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """Which splats each tile blends. tile_splat_ids [E]: splat indices, tile after tile, each in
-    the order of the splats. tile_offsets [tiles + 1]: where in it tile i (row by row) begins.
+    """The splats that each tile blends.
+
+    tile_splat_ids [E]: splat indices, tile after tile, each tile's in the order of the splats.
+    tile_offsets [tiles + 1]: position in tile_splat_ids at which the list of tile i (row by row)
+    begins.
+    columns: number of tile columns.
+    rows: number of tile rows.
     """
 
     tile_splat_ids: Int64[Tensor, "E"]
@@ -410,10 +499,10 @@ def rasterize_reference(
     fog: Fog | None,
     clip: HeightClip | None = None,
 ) -> RenderOutput:
-    """The image of the parts: project, order, blend. Arguments are checked by `rasterize`.
+    """Return the image of the parts: project, order, blend. `rasterize` checks the arguments.
 
-    Differentiable with respect to all float tensors of the Gaussians; the cut-offs (order, alpha
-    threshold, transmittance stop) are taken as constant.
+    The result is differentiable with respect to all float tensors of the Gaussians. The cut-offs
+    (order, alpha threshold, transmittance stop) are taken as constant.
     """
     with_color = RGB in buffers
     splats = project_parts(parts, camera, settings, fog, clip, with_color=with_color)
@@ -422,23 +511,32 @@ def rasterize_reference(
 
 
 def bin_to_tiles(splats: Splats, camera: Camera) -> TileLists:
-    """Every tile's splats: those whose box, in which alpha can reach 1/255, touches the tile."""
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+    """Return every tile's splats: those whose box, in which alpha can reach 1/255, touches the
+    tile.
+    """
+    columns = -(-camera.width // TILE)
+    rows = -(-camera.height // TILE)
     x0, x1 = _tile_span(splats, 0, columns)
     y0, y1 = _tile_span(splats, 1, rows)
     widths = (x1 - x0).clamp_min(0)
     counts = widths * (y1 - y0).clamp_min(0)
-    counts[splats.opacities < ALPHA_MIN] = 0  # antialiasing may have thinned them since projection
-    owners = torch.repeat_interleave(counts)  # [E]
-    within = torch.arange(len(owners)) - (counts.cumsum(0) - counts)[owners]
-    tiles = (y0[owners] + within // widths[owners]) * columns + x0[owners] + within % widths[owners]
+    counts[splats.opacities < ALPHA_MIN] = 0  # antialiasing may have lowered them
+    splat_ids = torch.repeat_interleave(counts)  # [E]
+    tile_in_box = torch.arange(len(splat_ids)) - (counts.cumsum(0) - counts)[splat_ids]
+    tiles = (
+        (y0[splat_ids] + tile_in_box // widths[splat_ids]) * columns
+        + x0[splat_ids]
+        + tile_in_box % widths[splat_ids]
+    )
     order = torch.argsort(tiles, stable=True)
     tile_offsets = torch.searchsorted(tiles[order], torch.arange(columns * rows + 1))
-    return TileLists(owners[order], tile_offsets, columns, rows)
+    return TileLists(splat_ids[order], tile_offsets, columns, rows)
 
 
 def _tile_span(splats: Splats, axis: int, tiles: int) -> tuple[Tensor, Tensor]:
-    """First tile and one past the last along x (axis 0) or y (axis 1) of each splat's box."""
+    """Return the first tile and one past the last of each splat's box, along x (axis 0) or y (axis
+    1).
+    """
     centres = splats.means2d.detach()[:, axis]
     # Rounding must not lose a pixel whose alpha is just 1/255.
     half = half_extents(splats)[:, axis] * (1 + 1e-5) + 1e-3
@@ -454,8 +552,10 @@ def blend(
     buffers: frozenset[str],
     settings: RasterSettings,
 ) -> RenderOutput:
-    """Buffers [H, W] of ordered splats; tile by tile, and so in little memory."""
-    recompute = torch.is_grad_enabled() and any(
+    """Return buffers [H, W] of ordered splats. Tiles are blended one by one, which takes little
+    memory.
+    """
+    needs_checkpoint = torch.is_grad_enabled() and any(
         value.requires_grad for value in splats.columns().values()
     )
     sizes = lists.tile_offsets.diff().tolist()
@@ -464,18 +564,20 @@ def blend(
     # tile as long as the scene.
     for tile, tile_splat_ids in enumerate(splats.select(lists.tile_splat_ids).split(sizes)):
         args = (tile_splat_ids, divmod(tile, lists.columns), buffers, settings, camera)
-        if recompute and len(tile_splat_ids):  # a backward pass would else keep every splat x pixel
+        if needs_checkpoint and len(
+            tile_splat_ids
+        ):  # a backward pass would else keep every splat x pixel
             tiles.append(
                 checkpoint(blend_tile, *args, use_reentrant=False, preserve_rng_state=False)
             )
         else:
             tiles.append(blend_tile(*args))
     images = {name: _assemble([getattr(t, name) for t in tiles], lists, camera) for name in buffers}
-    if recompute and len(lists.tile_splat_ids) == 0:
+    if needs_checkpoint and len(lists.tile_splat_ids) == 0:
         # A view of nothing is a function of the splats too: its gradients are 0, not an error.
         floats = [value for value in splats.columns().values() if value.is_floating_point()]
-        nothing = torch.stack([value[:0].sum() for value in floats]).sum()
-        images = {n: i + nothing if i.is_floating_point() else i for n, i in images.items()}
+        zero_sum = torch.stack([value[:0].sum() for value in floats]).sum()
+        images = {n: i + zero_sum if i.is_floating_point() else i for n, i in images.items()}
     return RenderOutput(**images)
 
 
@@ -493,7 +595,15 @@ def blend_tile(
     settings: RasterSettings,
     camera: Camera,
 ) -> RenderOutput:
-    """Buffers [TILE, TILE] of the tile at (row, column). splats: its own, nearest first."""
+    """Return buffers [TILE, TILE] of one tile.
+
+    Args:
+        splats: splats of the tile, nearest first.
+        tile: row and column of the tile.
+        buffers: names of the buffers.
+        settings: thresholds of the image.
+        camera: the camera.
+    """
     dtype = splats.depths.dtype
     step = torch.arange(TILE, dtype=dtype) + 0.5
     y, x = torch.meshgrid(tile[0] * TILE + step, tile[1] * TILE + step, indexing="ij")
@@ -504,17 +614,19 @@ def blend_tile(
     clusters = Clusters.empty(TILE * TILE, dtype)
     heaviest = torch.zeros(TILE * TILE, dtype=dtype)
     ids = torch.full((TILE * TILE,), -1, dtype=torch.int64)
-    for near in splats.split(BLOCK) if len(splats) else ():
-        weights, after = blend_weights(near, pixels, transmittance, settings)  # [S, P] both
+    for block in splats.split(BLOCK) if len(splats) else ():
+        weights, transmittance_behind = blend_weights(
+            block, pixels, transmittance, settings
+        )  # [S, P] both
         alpha = alpha + weights.sum(0)
-        if near.colors is not None:
-            rgb = rgb + _weighted_sums(weights, near.colors)
-            if near.lights is not None:
-                rgb = rgb + _shaded(near, pixels, weights, camera)
+        if block.colors is not None:
+            rgb = rgb + _weighted_sums(weights, block.colors)
+            if block.lights is not None:
+                rgb = rgb + _lit_colors(block, pixels, weights, camera)
         if OVERLAY in buffers:
-            overlay = overlay + (weights * near.overlay[:, None]).sum(0)
+            overlay = overlay + (weights * block.overlay[:, None]).sum(0)
         if buffers & {EXPECTED_DEPTH, MODE_DEPTH}:
-            surfaces = _surface_depths(near, pixels, camera.is_orthographic)
+            surfaces = _surface_depths(block, pixels, camera.is_orthographic)
             depth = depth + (weights * surfaces).sum(0)
             if MODE_DEPTH in buffers:
                 for row in torch.nonzero(weights.detach().any(1))[:, 0].tolist():
@@ -522,14 +634,16 @@ def blend_tile(
                         surfaces[row], weights[row], settings.mode_depth_floor_m
                     )
         if MEDIAN_DEPTH in buffers:
-            median = median + _median_here(near.depths, weights, after, transmittance)
+            median = median + _median_depths(
+                block.depths, weights, transmittance_behind, transmittance
+            )
         if SPLAT_IDS in buffers:
             weight = weights.detach().amax(0)
-            rows = torch.arange(len(near))[:, None]
-            row = torch.where(weights == weight, rows, len(near)).amin(0)  # the first of equals
-            ids = torch.where(weight > heaviest, near.ids[row], ids)
+            rows = torch.arange(len(block))[:, None]
+            row = torch.where(weights == weight, rows, len(block)).amin(0)  # the first of equals
+            ids = torch.where(weight > heaviest, block.ids[row], ids)
             heaviest = torch.maximum(heaviest, weight)
-        transmittance = after[-1]
+        transmittance = transmittance_behind[-1]
         if bool((transmittance <= settings.transmittance_stop).all()):
             break
     values = {
@@ -541,8 +655,10 @@ def blend_tile(
         MODE_DEPTH: clusters.heaviest_mode(),
         OVERLAY: overlay,
     }
-    shaped = {name: values[name].reshape(TILE, TILE, *values[name].shape[1:]) for name in buffers}
-    return RenderOutput(**shaped)
+    tile_images = {
+        name: values[name].reshape(TILE, TILE, *values[name].shape[1:]) for name in buffers
+    }
+    return RenderOutput(**tile_images)
 
 
 def blend_weights(
@@ -551,11 +667,17 @@ def blend_weights(
     transmittance: Float[Tensor, "P"],
     settings: RasterSettings,
 ) -> tuple[Float[Tensor, "S P"], Float[Tensor, "S P"]]:
-    """Weight of every splat at every pixel, and the transmittance behind it.
+    """Return the weight of every splat at every pixel, and the transmittance behind it.
 
-    pixels: x, y of their centres. transmittance: in front of the first splat. Transmittance never
-    grows, so the splats that are not blended are those that stand behind the stop, and the one that
-    would leave no more than TRANSMITTANCE_STOP, or the stop where that is less (RasterSettings).
+    Transmittance never grows. So the splats that are not blended are those that stand behind the
+    stop, and the one that would leave at most TRANSMITTANCE_STOP, or the stop if that is less
+    (RasterSettings).
+
+    Args:
+        splats: splats of a tile, nearest first.
+        pixels: x and y of the pixels' centres.
+        transmittance: transmittance in front of the first splat.
+        settings: thresholds of the image.
     """
     dx = pixels[0] - splats.means2d[:, :1]  # [S, P]
     dy = pixels[1] - splats.means2d[:, 1:]
@@ -563,68 +685,77 @@ def blend_weights(
     alphas = (splats.opacities[:, None] * torch.exp2(-LOG2_E * sigma)).clamp_max(settings.alpha_max)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas, torch.zeros_like(alphas))
     if splats.cuts is not None:
-        at, slope_x, slope_y = splats.cuts.T[:3, :, None]
-        alphas = alphas * (at + slope_x * dx + slope_y * dy).clamp(0, 1)
-    after = transmittance * torch.cumprod(1 - alphas, 0)
-    before = torch.cat([transmittance[None], after[:-1]])
+        value_at_mean, slope_x, slope_y = splats.cuts.T[:3, :, None]
+        alphas = alphas * (value_at_mean + slope_x * dx + slope_y * dy).clamp(0, 1)
+    transmittance_behind = transmittance * torch.cumprod(1 - alphas, 0)
+    transmittance_before = torch.cat([transmittance[None], transmittance_behind[:-1]])
     stop = settings.transmittance_stop
-    kept = (after > min(stop, TRANSMITTANCE_STOP)) & (before > stop)
-    weights = torch.where(kept, alphas * before, torch.zeros_like(alphas))
-    return weights, after
+    is_blended = (transmittance_behind > min(stop, TRANSMITTANCE_STOP)) & (
+        transmittance_before > stop
+    )
+    weights = torch.where(is_blended, alphas * transmittance_before, torch.zeros_like(alphas))
+    return weights, transmittance_behind
 
 
-def _shaded(
+def _lit_colors(
     splats: Splats, pixels: Float[Tensor, "2 P"], weights: Float[Tensor, "S P"], camera: Camera
 ) -> Float[Tensor, "P 3"]:
-    """What the light adds to the colours of splats that are lit pixel by pixel."""
+    """Return the light that splats lit pixel by pixel add to the colours."""
     assert splats.lights is not None
-    dx, dy = pixels[0] - splats.means2d[:, :1], pixels[1] - splats.means2d[:, 1:]
-    reach = torch.log(splats.opacities / ALPHA_MIN).clamp_min(TINY)[:, None]
-    rim = (_sigmas(splats, dx, dy) / reach).clamp(0, 1)
-    share = light_share(splats.lights, dx, dy, rim, camera)
+    dx = pixels[0] - splats.means2d[:, :1]
+    dy = pixels[1] - splats.means2d[:, 1:]
+    log_contrast = torch.log(splats.opacities / ALPHA_MIN).clamp_min(TINY)[:, None]
+    rim_share = (_sigmas(splats, dx, dy) / log_contrast).clamp(0, 1)
+    share = light_share(splats.lights, dx, dy, rim_share, camera)
     return _weighted_sums(weights * share, splats.lights[:, 6:])
 
 
 def _sigmas(
     splats: Splats, dx: Float[Tensor, "S P"], dy: Float[Tensor, "S P"]
 ) -> Float[Tensor, "S P"]:
-    """Half the squared Mahalanobis distance of pixels dx, dy away from the means."""
-    xy, yy = splats.covs2d[:, 1:2], splats.covs2d[:, 2:3]  # [S, 1]
+    """Return half the squared Mahalanobis distance of pixels at (dx, dy) from the means."""
+    # [S, 1]
+    xy = splats.covs2d[:, 1:2]
+    yy = splats.covs2d[:, 2:3]
     # d^T cov^-1 d with the square completed: never negative, in whatever precision.
-    along = dx - (xy / yy) * dy
-    return 0.5 * (along * along * (yy / splats.dets[:, None]) + dy * dy / yy)
+    offset_along_row = dx - (xy / yy) * dy
+    return 0.5 * (offset_along_row * offset_along_row * (yy / splats.dets[:, None]) + dy * dy / yy)
 
 
 def _surface_depths(
     splats: Splats, pixels: Float[Tensor, "2 P"], is_orthographic: bool
 ) -> Float[Tensor, "S P"]:
-    """z of every splat at every pixel: its centre's, or with a clip that of its surface."""
+    """Return z of every splat at every pixel: of its centre, or with a clip of its surface."""
     depths = splats.depths[:, None].expand(-1, pixels.shape[1])
     if splats.cuts is None:
         return depths
-    right, down, most = splats.cuts.T[3:, :, None]
-    dx, dy = pixels[0] - splats.means2d[:, :1], pixels[1] - splats.means2d[:, 1:]
-    growth = (right * dx + down * dy).clamp(-most, most)
+    slope_x, slope_y, max_growth = splats.cuts.T[3:, :, None]
+    dx = pixels[0] - splats.means2d[:, :1]
+    dy = pixels[1] - splats.means2d[:, 1:]
+    growth = (slope_x * dx + slope_y * dy).clamp(-max_growth, max_growth)
     return depths + growth if is_orthographic else depths / (1 - growth)
 
 
 def _weighted_sums(
     weights: Float[Tensor, "S P"], colors: Float[Tensor, "S 3"]
 ) -> Float[Tensor, "P 3"]:
-    """weights^T colors without a matrix product (see BLOCK)."""
+    """Return weights^T colors without a matrix product (see BLOCK)."""
     return torch.stack([(weights * channel[:, None]).sum(0) for channel in colors.unbind(1)], -1)
 
 
-def _median_here(
+def _median_depths(
     depths: Float[Tensor, "S"],
     weights: Float[Tensor, "S P"],
-    after: Float[Tensor, "S P"],
+    transmittance_behind: Float[Tensor, "S P"],
     transmittance: Float[Tensor, "P"],
 ) -> Float[Tensor, "P"]:
-    """z of the splat of this block that brings transmittance below one half; 0 where none does."""
-    row = (after >= MEDIAN).sum(0)
-    inside = row < len(depths)
+    """Return z of the splat of this block that brings transmittance below one half.
+
+    It is 0 where no splat of the block does.
+    """
+    row = (transmittance_behind >= MEDIAN).sum(0)
+    is_inside = row < len(depths)
     row = row.clamp_max(len(depths) - 1)
-    blended = weights.gather(0, row[None])[0] > 0
-    crossing = inside & blended & (transmittance >= MEDIAN)
-    return torch.where(crossing, depths[row], torch.zeros_like(depths[row]))
+    is_blended = weights.gather(0, row[None])[0] > 0
+    is_crossing = is_inside & is_blended & (transmittance >= MEDIAN)
+    return torch.where(is_crossing, depths[row], torch.zeros_like(depths[row]))

@@ -1,27 +1,32 @@
-"""Forward scatter: droplets smear the light that comes through fog, the more the deeper it is.
+"""Forward scatter: droplets smear the light that comes through fog, the more the deeper the fog is.
+
+`effects.smog` calls `scatter_forward` on finished images.
 
 A droplet much larger than the wavelength diffracts as much light as it blocks (Babinet; van de
 Hulst 1957, "Light Scattering by Small Particles", ch. 8: an extinction of twice the cross-section),
 into an angle of about wavelength / diameter. Large things keep that light, and with it the contrast
-that Koschmieder's visibility goes by; fine ones lose it. In the small-angle approximation (Wells
-1969, "Loss of resolution in water as a result of multiple small-angle scattering"; Kopeika 1998, "A
-System Engineering Approach to Imaging", ch. 17) what arrives of a detail of nu cycles a radian,
-beside what arrives of a large thing, is
+that Koschmieder's visibility is defined by; fine details lose it. In the small-angle approximation
+(Wells 1969, "Loss of resolution in water as a result of multiple small-angle scattering"; Kopeika
+1998, "A System Engineering Approach to Imaging", ch. 17) a detail of nu cycles per radian arrives,
+relative to a large thing, with the factor
 
     M(nu) = exp(-tau (1 - P(nu))),     P(nu) = int_0^1 C(u nu lambda / D) du
 
-tau: optical depth of the way, of which diffraction has as much again. C: the transform of a disc's
-diffraction, which is the autocorrelation of the disc. u: the share of the way that lies behind the
-droplet, since what is deflected close to a thing still comes from beside it. M(0) = 1: no light is
-lost. It is the many-times scattered light of Narasimhan and Nayar (2003, "Shedding Light on the
-Weather"), without the wide angles that they keep, which are airlight here.
+tau: optical depth of the ray, of which diffraction has as much again.
+C: transform of a disc's diffraction, which is the autocorrelation of the disc.
+u: share of the ray that lies behind the droplet, since light that is deflected close to a thing
+    still comes from beside it.
+lambda, D: WAVELENGTH_UM and DROPLET_UM.
 
-In the picture the sharp share is exp(-tau), the rest is spread by one kernel: the one of M at
-NOMINAL_DEPTH, put together from the levels of a Gaussian pyramid. What passes between two pixels
-goes by the nearer one's depth, so that near outlines stay sharp and dark cars have no halo in the
-fog behind them: weights w_p w_q / sqrt(N_p N_q) with w = 1 - exp(-tau) and N = kernel * w, which
-are the same both ways, so no light is made or lost. Colours are display-encoded, as fog blends
-them.
+M(0) = 1: no light is lost. M describes the multiple scattering of Narasimhan and Nayar (2003,
+"Shedding Light on the Weather"), without the wide angles of that model, which are airlight here.
+
+In the image the sharp share is exp(-tau). The rest is spread by one kernel, that of M at
+NOMINAL_DEPTH, composed from the levels of a Gaussian pyramid. The light that two pixels exchange
+depends on the depth of the nearer one, so near outlines stay sharp and dark cars have no halo in
+the fog behind them: the weights are w_p w_q / sqrt(N_p N_q) with w = 1 - exp(-tau) and
+N = kernel * w. They are the same in both directions, so no light is made or lost. Colours are
+display-encoded, as fog blends them.
 """
 
 from __future__ import annotations
@@ -45,14 +50,21 @@ from augment.render.composite import ROWS, pixels_at_unit_depth
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
 
+# Wavelength of the light, micrometres.
 WAVELENGTH_UM = 0.55
-DROPLET_UM = 20.0  # across: heavy advection fog, of mode radius 10 um (Shettle and Fenn 1979)
+# Diameter of a droplet, micrometres: heavy advection fog, of mode radius 10 um (Shettle and Fenn
+# 1979).
+DROPLET_UM = 20.0
+# Angle into which a droplet diffracts, radians.
 DIFFRACTION_RAD = WAVELENGTH_UM / DROPLET_UM
-NOMINAL_DEPTH = 1.5  # where a fifth of the contrast of large things is left
-NUM_LEVELS = 5  # of the pyramid, above the picture
-# Of the picture that is blurred: the least that shows DIFFRACTION_RAD in so many pixels.
+# Optical depth of the kernel: a fifth of the contrast of large things is left there.
+NOMINAL_DEPTH = 1.5
+# Number of the pyramid's levels above the image.
+NUM_LEVELS = 5
+# Smallest number of pixels that DIFFRACTION_RAD spans in the image that is blurred.
 _MIN_PX = 12.0
-_MIN_WEIGHT = 1e-6  # of neighbourhoods that scatter nothing
+# Weight that is added to neighbourhoods, since some scatter nothing.
+_MIN_WEIGHT = 1e-6
 
 Image = TypeVar("Image", np.ndarray, Tensor)  # [H, W, C]
 
@@ -67,149 +79,181 @@ def scatter_forward(
     *,
     backend: str = AUTO,
 ) -> Float[Tensor, "H W 3"]:
-    """The finished picture in fog, its sky included, with its light smeared by the fog.
+    """Return the finished image in fog, sky included, with its light smeared by the fog.
 
-    depth: z, metres; 0 where there is no surface. alpha: of the surfaces; the rest is sky, at its
-    own optical depth.
-    strength: tau's factor, 1 for a droplet's whole diffraction; > 0. backend: on the CPU pixels go
-    through kernels, equal to this definition within 1e-4, and `rgb` is overwritten.
+    Args:
+        rgb: the image, display-encoded; on the CPU it is overwritten.
+        alpha: alpha of the surfaces; the rest of a pixel is sky, at its own optical depth.
+        depth: z of the surfaces, metres; 0 where there is no surface.
+        camera: camera of the image.
+        medium: the fog.
+        strength: factor of tau, > 0; 1 for the whole diffraction of a droplet.
+        backend: on the CPU, pixels go through kernels, equal to this definition within 1e-4.
     """
     factor = 2 ** max(0, math.floor(math.log2(DIFFRACTION_RAD * camera.fx / _MIN_PX)))
     size = max(1, camera.height // factor), max(1, camera.width // factor)
-    # Levels whose kernel would be larger than the picture tell nothing of it.
+    # Levels whose kernel would be larger than the image are left out.
     levels = max(0, min(NUM_LEVELS, int(math.log2(min(size))) - 1))
     shares = level_shares(DIFFRACTION_RAD * camera.fx / factor)[: levels + 1]
     if kernels_for(backend, rgb, alpha, depth) == CPU:
         weight = _scattered_share(alpha, depth, camera, medium, strength)
-        return _exchanged(rgb, weight, size, shares)
+        return _exchange_light(rgb, weight, size, shares)
     weight = _scattered_share_by_torch(alpha, depth, camera, medium, strength)[..., None]
-    small, own = _resized(rgb, size), _resized(weight, size)
-    around = (1 / (_spread(own, shares) + _MIN_WEIGHT)).sqrt()
-    own = own * around
-    spread = _spread(torch.cat([small * own, own], -1), shares) * around * sum(shares[1:])
-    spread = _resized(spread, (camera.height, camera.width))
+    small_rgb = _resize(rgb, size)
+    small_weight = _resize(weight, size)
+    neighbourhood_scale = (1 / (_blur_by_pyramid(small_weight, shares) + _MIN_WEIGHT)).sqrt()
+    small_weight = small_weight * neighbourhood_scale
+    spread = (
+        _blur_by_pyramid(torch.cat([small_rgb * small_weight, small_weight], -1), shares)
+        * neighbourhood_scale
+        * sum(shares[1:])
+    )
+    spread = _resize(spread, (camera.height, camera.width))
     return rgb + weight * (spread[..., :3] - rgb * spread[..., 3:])
 
 
-def _exchanged(
+def _exchange_light(
     rgb: Tensor, weight: np.ndarray, size: tuple[int, int], shares: tuple[float, ...]
 ) -> Tensor:
-    """What the pixels' light becomes, of weights w [H, W], by kernels. size: at which it is
-    blurred.
+    """Return the image after its pixels have exchanged light, by kernels.
+
+    Args:
+        rgb: the image; it is overwritten.
+        weight: weights w [H, W].
+        size: height and width at which the light is blurred.
+        shares: shares of the pyramid's levels.
     """
-    full, sharp = (rgb.shape[0], rgb.shape[1]), rgb.detach().contiguous().numpy()
-    own = _resized(weight[..., None], size)
-    around = _spread(own, shares)[..., 0]
-    weighed = np.empty((*size, 4), np.float32)
+    full_size = (rgb.shape[0], rgb.shape[1])
+    sharp_rgb = rgb.detach().contiguous().numpy()
+    small_weight = _resize(weight[..., None], size)
+    neighbourhood_weight = _blur_by_pyramid(small_weight, shares)[..., 0]
+    weighted_rgb = np.empty((*size, 4), np.float32)
     with kernel_threads(ROWS):
-        picture_kernels.weigh(
-            _resized(sharp, size), own[..., 0], around, np.float32(_MIN_WEIGHT), weighed
+        picture_kernels.weight_pixels(
+            _resize(sharp_rgb, size),
+            small_weight[..., 0],
+            neighbourhood_weight,
+            np.float32(_MIN_WEIGHT),
+            weighted_rgb,
         )
-        spread = _spread(weighed, shares)
-        picture_kernels.multiply(spread, around, np.float32(sum(shares[1:])))
-        picture_kernels.blend_scattered(sharp, weight, _resized(spread, full))
-    return torch.from_numpy(sharp)
+        spread = _blur_by_pyramid(weighted_rgb, shares)
+        picture_kernels.scale_pixels(spread, neighbourhood_weight, np.float32(sum(shares[1:])))
+        picture_kernels.blend_scattered(sharp_rgb, weight, _resize(spread, full_size))
+    return torch.from_numpy(sharp_rgb)
 
 
 def _scattered_share(
-    alpha: Tensor, depth: Tensor, camera: Camera, medium: Fog, strength: float
+    alpha: Tensor, depth: Tensor, camera: Camera, fog: Fog, strength: float
 ) -> Float32[np.ndarray, "H W"]:
-    """As _scattered_share_by_torch, by a kernel."""
-    height_m, sigma = medium.scale_height_m, medium.sigma_per_m
-    if height_m is not None:
-        a = (float(camera.centre[2]) - medium.base_z_m) / height_m
-        sigma *= math.exp(min(-a, MAX_EXPONENT))
+    """Return `_scattered_share_by_torch`, by a kernel."""
+    scale_height_m = fog.scale_height_m
+    extinction_per_m = fog.sigma_per_m
+    if scale_height_m is not None:
+        a = (float(camera.centre[2]) - fog.base_z_m) / scale_height_m
+        extinction_per_m *= math.exp(min(-a, MAX_EXPONENT))
     out = np.empty((camera.height, camera.width), np.float32)
     with kernel_threads(ROWS):
         picture_kernels.scattered_share(
-            alpha.contiguous().numpy(), depth.contiguous().numpy(), *pixels_at_unit_depth(camera),
-            camera.world_from_camera[2, :3].numpy().astype(np.float32), np.float32(strength),
-            np.float32(min(sigma, 1e30)), np.float32(0 if height_m is None else 1 / height_m), out,
-        )  # fmt: skip
+            alpha.contiguous().numpy(),
+            depth.contiguous().numpy(),
+            *pixels_at_unit_depth(camera),
+            camera.world_from_camera[2, :3].numpy().astype(np.float32),
+            np.float32(strength),
+            np.float32(min(extinction_per_m, 1e30)),
+            np.float32(0 if scale_height_m is None else 1 / scale_height_m),
+            out,
+        )
     return out
 
 
 def _scattered_share_by_torch(
-    alpha: Tensor, depth: Tensor, camera: Camera, medium: Fog, strength: float
+    alpha: Tensor, depth: Tensor, camera: Camera, fog: Fog, strength: float
 ) -> Float[Tensor, "H W"]:
-    """1 - exp(-strength tau) of every pixel: how much of its light is deflected."""
+    """Return 1 - exp(-strength tau) of every pixel: the share of its light that is deflected."""
     lengths = camera.ray_lengths(depth.dtype, depth.device)
-    eye_z_m, point_z_m, behind = float(camera.centre[2]), None, 1.0
-    if medium.scale_height_m is not None:
+    eye_z_m = float(camera.centre[2])
+    point_z_m = None
+    sky_share = 1.0
+    if fog.scale_height_m is not None:
         climb = camera.ray_directions(depth.dtype, depth.device)[..., 2]
         point_z_m = eye_z_m + depth * climb
-        behind = -torch.expm1(-strength * sky_optical_depth(medium, climb / lengths, eye_z_m))
-    tau = optical_depth(medium, depth * lengths, eye_z_m, point_z_m)
-    shown = torch.where(depth > 0, alpha, 0.0)
-    return (behind + shown * (-torch.expm1(-strength * tau) - behind)).clamp(0, 1)
+        sky_share = -torch.expm1(-strength * sky_optical_depth(fog, climb / lengths, eye_z_m))
+    tau = optical_depth(fog, depth * lengths, eye_z_m, point_z_m)
+    shown_alpha = torch.where(depth > 0, alpha, 0.0)
+    return (sky_share + shown_alpha * (-torch.expm1(-strength * tau) - sky_share)).clamp(0, 1)
 
 
 # ---- The kernel ----------------------------------------------------------------------------------
 
 
 def disc_autocorrelation(x: np.ndarray) -> np.ndarray:
-    """C of the module's equation: overlap of two discs of diameter 1 at a distance x >= 0."""
+    """Return C of the module: overlap of two discs of diameter 1 at a distance x >= 0."""
     x = np.clip(x, 0, 1)
     return 2 / np.pi * (np.arccos(x) - x * np.sqrt(1 - x * x))
 
 
 def once_scattered(cycles: np.ndarray) -> np.ndarray:
-    """P of the module's equation [K]. cycles: nu lambda / D."""
+    """Return P of the module's equation [K]. cycles: nu lambda / D."""
     u = (np.arange(1000) + 0.5) / 1000
     return disc_autocorrelation(u * cycles[:, None]).mean(1)
 
 
 def scattered(cycles: np.ndarray, tau: float) -> np.ndarray:
-    """Of the light that was deflected at least once, what a detail keeps: (M - M(inf)) / (1 -
-    M(inf)) = (exp(tau P) - 1) / (exp(tau) - 1), [K].
+    """Return the contrast that light keeps which was deflected at least once, [K].
+
+    It is (M - M(inf)) / (1 - M(inf)) = (exp(tau P) - 1) / (exp(tau) - 1).
     """
     return np.expm1(tau * once_scattered(cycles)) / math.expm1(tau)
 
 
 @functools.lru_cache(maxsize=64)
 def level_shares(diffraction_px: float) -> tuple[float, ...]:
-    """Shares [NUM_LEVELS + 1] of the pyramid's levels in the kernel, which sum to 1; level 0 is the
-    picture itself. diffraction_px: pixels that DIFFRACTION_RAD spans.
+    """Return the shares [NUM_LEVELS + 1] of the pyramid's levels in the kernel. They sum to 1.
 
-    A level blurs by a variance of 2 (4^level - 1) / 3 px^2: a binomial of variance 1 down and one
-    up between each two. Least squares over the frequencies that pixels can show: within
-    0.05 from 6 px on, 0.11 at 3.
+    Level 0 is the image itself. A level blurs by a variance of 2 (4^level - 1) / 3 px^2: between
+    two levels lie a binomial of variance 1 on the way down and one on the way up. The shares are a
+    least squares fit over the frequencies that pixels can show: within 0.05 from 6 px on, 0.11 at
+    3.
+
+    diffraction_px: pixels that DIFFRACTION_RAD spans.
     """
     frequency = np.geomspace(1e-3, 0.5, 200)  # cycles a pixel
     variance = 2 * (4.0 ** np.arange(NUM_LEVELS + 1) - 1) / 3
     levels = np.exp(-2 * np.pi**2 * variance * frequency[:, None] ** 2)
-    whole = 1e3 * np.ones((1, NUM_LEVELS + 1))
+    sum_row = 1e3 * np.ones((1, NUM_LEVELS + 1))
     kernel = np.append(scattered(frequency * diffraction_px, NOMINAL_DEPTH), 1e3)
-    shares, _ = nnls(np.concatenate([levels, whole]), kernel)
+    shares, _ = nnls(np.concatenate([levels, sum_row]), kernel)
     return tuple(float(share) for share in shares / shares.sum())
 
 
 # ---- The pyramid: of arrays by OpenCV, of tensors by torch ---------------------------------------
-# Arrays since torch's threads cost more than they give where others are busy.
+# The CPU uses arrays: torch's threads cost more than they gain while other threads are busy.
 
+# Weights of a binomial of variance 1, px^2.
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 
 
-def _spread(image: Image, shares: tuple[float, ...]) -> Image:
-    """The image under the kernel without its level 0. Each level is blurred going down as it is
-    going up, so the kernel is symmetric.
+def _blur_by_pyramid(image: Image, shares: tuple[float, ...]) -> Image:
+    """Return the image under the kernel without its level 0.
+
+    Each level is blurred equally on the way down and on the way up, so the kernel is symmetric.
     """
     levels = [image]
     for _ in shares[1:]:
         levels.append(pyramid_down(levels[-1]))
-    whole = sum(shares[1:]) or 1.0
-    total = levels[-1] * (shares[-1] / whole)
+    total_share = sum(shares[1:]) or 1.0
+    total = levels[-1] * (shares[-1] / total_share)
     for level in range(len(shares) - 2, -1, -1):
         total = pyramid_up(total, (levels[level].shape[0], levels[level].shape[1]))
         if level > 0:
-            total += levels[level] * (shares[level] / whole)
+            total += levels[level] * (shares[level] / total_share)
     return total
 
 
 def pyramid_down(image: Image) -> Image:
-    """Every second pixel of every second row of the image under a binomial of variance 1."""
+    """Return every second pixel of every second row of the image under a binomial of variance 1."""
     if isinstance(image, np.ndarray):
-        return _with_channels(cv2.pyrDown(image), image)
+        return _restore_channels(cv2.pyrDown(image), image)
     rows = F.pad(image.permute(2, 0, 1)[:, None], (2, 2, 2, 2), mode="reflect")
     taps = torch.tensor(_BINOMIAL, device=image.device, dtype=image.dtype)
     rows = F.conv2d(rows, taps.view(1, 1, 5, 1), stride=(2, 1))
@@ -217,10 +261,10 @@ def pyramid_down(image: Image) -> Image:
 
 
 def pyramid_up(image: Image, size: tuple[int, int]) -> Image:
-    """The image at twice its size, between its pixels under the same binomial."""
+    """Return the image at twice its size, interpolated with the same binomial."""
     if isinstance(image, np.ndarray):
-        return _with_channels(cv2.pyrUp(image, dstsize=size[::-1]), image)
-    # As OpenCV: before the first pixel comes the second one, after the last comes itself.
+        return _restore_channels(cv2.pyrUp(image, dstsize=size[::-1]), image)
+    # Borders as in OpenCV: the second pixel comes before the first, and the last is repeated.
     small = F.pad(image.permute(2, 0, 1)[:, None], (1, 0, 1, 0), mode="reflect")
     small = F.pad(small, (0, 1, 0, 1), mode="replicate")
     taps = 2 * torch.tensor(_BINOMIAL, device=image.device, dtype=image.dtype)
@@ -229,18 +273,18 @@ def pyramid_up(image: Image, size: tuple[int, int]) -> Image:
     return rows[:, 0, 4 : 4 + size[0], 4 : 4 + size[1]].permute(1, 2, 0)
 
 
-def _resized(image: Image, size: tuple[int, int]) -> Image:
-    """At another size: means over areas where it shrinks, bilinear where it grows."""
+def _resize(image: Image, size: tuple[int, int]) -> Image:
+    """Return the image at another size: area means if it shrinks, bilinear if it grows."""
     if (image.shape[0], image.shape[1]) == size:
         return image
     shrinks = image.shape[0] > size[0] or image.shape[1] > size[1]
     if isinstance(image, np.ndarray):
-        how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        return _with_channels(cv2.resize(image, size[::-1], interpolation=how), image)
+        interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        return _restore_channels(cv2.resize(image, size[::-1], interpolation=interpolation), image)
     mode = "area" if shrinks else "bilinear"
     return F.interpolate(image.permute(2, 0, 1)[None], size, mode=mode)[0].permute(1, 2, 0)
 
 
-def _with_channels(array: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """OpenCV drops a single channel."""
+def _restore_channels(array: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """Return the array with the channel that OpenCV drops from images with a single one."""
     return array.reshape(*array.shape[:2], like.shape[2])

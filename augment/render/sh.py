@@ -15,9 +15,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+# Highest degree.
 MAX_DEGREE = 3
-SH_C0 = 0.5 * math.sqrt(1 / math.pi)  # the constant function of band 0
-
+# The constant function of band 0.
+SH_C0 = 0.5 * math.sqrt(1 / math.pi)
+# Factors of the polynomials of bands 1 to 3, named by the polynomial.
 C1 = math.sqrt(3 / (4 * math.pi))
 C2_XY = math.sqrt(15 / (4 * math.pi))
 C2_ZZ = math.sqrt(5 / (16 * math.pi))
@@ -30,11 +32,13 @@ C3_ZXX = 0.5 * C3_XYZ
 
 
 def sh_basis(directions: Float[Tensor, "*B 3"], degree: int) -> Float[Tensor, "*B K"]:
-    """Every basis function up to `degree` at unit directions."""
+    """Return every basis function up to `degree` at unit directions."""
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"degree must be 0 to {MAX_DEGREE}; got {degree}")
     x, y, z = directions.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
     values = [torch.full_like(x, SH_C0)]
     if degree >= 1:
         values += [-C1 * y, C1 * z, -C1 * x]
@@ -62,10 +66,12 @@ def sh_basis(directions: Float[Tensor, "*B 3"], degree: int) -> Float[Tensor, "*
 def evaluate_sh(
     sh: Float[Tensor, "N K 3"], directions: Float[Tensor, "N 3"], max_degree: int | None = None
 ) -> Float[Tensor, "N 3"]:
-    """Sum of sh times basis for every splat; 0.5 is not added and nothing is clamped.
+    """Return the sum of sh times basis for every splat; 0.5 is not added and nothing is clamped.
 
-    directions: unit vectors from the eye to the splat. max_degree: higher bands are left out;
-    None takes all that sh holds.
+    Args:
+        sh: coefficients.
+        directions: unit vectors from the eye to the splats.
+        max_degree: highest band that is evaluated; None for all bands that sh holds.
     """
     degree = math.isqrt(sh.shape[1]) - 1
     if max_degree is not None:
@@ -75,7 +81,9 @@ def evaluate_sh(
 
 
 def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "N K 3"]:
-    """Coefficients of the function turned by `rotation`: f'(R d) = f(d), exact in every band."""
+    """Return the coefficients of the function turned by `rotation`: f'(R d) = f(d), exact in every
+    band.
+    """
     degree = math.isqrt(sh.shape[1]) - 1
     turn = sh_turn(rotation, degree).to(sh.dtype)
     bands = [slice(band * band, (band + 1) ** 2) for band in range(degree + 1)]
@@ -83,31 +91,36 @@ def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Flo
 
 
 def sh_turn(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "K K"]:
-    """What turns coefficients by a rotation, float64; a block for each band.
+    """Return the matrix that turns coefficients by a rotation, float64; it has a block for each
+    band.
 
-    A turn mixes the functions of one band only, so each block follows from the values at more
-    directions than it has functions: Y(d) c' = Y(R^T d) c.
+    A rotation mixes the functions of one band only. So each block follows from the values at more
+    directions than the band has functions: Y(d) c' = Y(R^T d) c.
     """
     directions, inverses = _turn_solver(degree)
-    there = sh_basis(directions @ rotation.to(torch.float64), degree).numpy()  # at rows R^T d
-    turn = np.zeros((there.shape[1], there.shape[1]))
+    turned_basis = sh_basis(
+        directions @ rotation.to(torch.float64), degree
+    ).numpy()  # at rows R^T d
+    turn = np.zeros((turned_basis.shape[1], turned_basis.shape[1]))
     for band, inverse in enumerate(inverses):
         block = slice(band * band, (band + 1) ** 2)
-        turn[block, block] = inverse @ there[:, block]
+        turn[block, block] = inverse @ turned_basis[:, block]
     return torch.from_numpy(turn)
 
 
 @functools.lru_cache(maxsize=MAX_DEGREE + 1)
 def _turn_solver(degree: int) -> tuple[Tensor, tuple[np.ndarray, ...]]:
-    """Directions, and for each band the pseudo-inverse of its functions there."""
+    """Return sample directions, and for each band the pseudo-inverse of its functions there."""
     directions = _sphere_samples(4 * (degree + 1) ** 2)
-    here = sh_basis(directions, degree).numpy()
+    basis = sh_basis(directions, degree).numpy()
     bands = range(degree + 1)
-    return directions, tuple(np.linalg.pinv(here[:, b * b : (b + 1) ** 2]) for b in bands)
+    return directions, tuple(np.linalg.pinv(basis[:, b * b : (b + 1) ** 2]) for b in bands)
 
 
 def _sphere_samples(count: int) -> Float[Tensor, "S 3"]:
-    """Evenly spread unit vectors on a Fibonacci spiral, float64: well conditioned for any band."""
+    """Return evenly spread unit vectors on a Fibonacci spiral, float64. They suit any band
+    numerically.
+    """
     step = torch.arange(count, dtype=torch.float64)
     z = 1 - (2 * step + 1) / count
     angle = step * (math.pi * (3 - math.sqrt(5)))
@@ -115,7 +128,10 @@ def _sphere_samples(count: int) -> Float[Tensor, "S 3"]:
     return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], -1)
 
 
-# ---- What the kernels that fold colour maps into spherical harmonics are given, on CPU and GPU ---
+# ---- Constants of the kernels that fold colour maps into spherical harmonics, on CPU and GPU -----
 
-FOLDED = 13  # numbers of a folded map: 9 of M row by row, 3 that the first function gets, changes
-BLACK = np.float32(-0.5 / SH_C0)  # sh_00 of a colour of 0
+# Numbers of a folded map: 9 of its matrix row by row, 3 that are added to the first function, and
+# one that is not 0 if the map changes anything.
+FOLDED = 13
+# First coefficient of a colour of 0.
+BLACK = np.float32(-0.5 / SH_C0)

@@ -1,8 +1,8 @@
-"""The threads that numba's kernels run on: TBB, which survives fork and serves several callers; and
-threads that draw one view each.
+"""Threads of numba's kernels, and threads that draw one view each.
 
-numba's own choice is often OpenMP, which kills DataLoader workers forked after the parent has
-rendered. pip puts TBB's library where the loader does not look, so it is loaded by its path first.
+Kernels run on TBB, which survives fork and serves several callers. numba's own choice is often
+OpenMP, which kills DataLoader workers that are forked after the parent has rendered. pip puts TBB's
+library where the loader does not look, so it is loaded by its path first.
 """
 
 # pyright: reportPrivateImportUsage=false, reportAttributeAccessIssue=false
@@ -31,19 +31,23 @@ from augment.errors import BackendUnavailable
 
 logger = logging.getLogger(__name__)
 
+# File name of TBB's library.
 TBB_LIBRARY = "libtbb.so.12"
-_ONE_CALLER = "workqueue"  # numba's own layer survives fork too, but two callers end the process
+# numba's own layer. It survives fork too, but two callers at a time end the process.
+_ONE_CALLER = "workqueue"
+# Folder of the control groups.
 _CGROUP = Path("/sys/fs/cgroup")
 
 _one_caller_at_a_time = threading.RLock()
-_limits: dict[int, int] = {}  # process id: threads; a forked worker does not take its parent's
+# Thread limits by process id: a forked worker does not take its parent's limit.
+_limits: dict[int, int] = {}
 
 
 @functools.cache
 def select_thread_pool() -> str:
-    """Choose numba's threading layer, once, before its pool starts; returns the layer's name.
+    """Choose numba's threading layer, once, before its pool starts, and return the layer's name.
 
-    A layer the user named (NUMBA_THREADING_LAYER) and a pool that runs already are left alone.
+    A layer that the user named (NUMBA_THREADING_LAYER) and a running pool are left alone.
 
     Raises:
         BackendUnavailable: the layer that the user named cannot be used.
@@ -51,7 +55,8 @@ def select_thread_pool() -> str:
     try:
         layer = numba.threading_layer()  # raises while no pool runs
     except ValueError:
-        layer, has_tbb = numba.config.THREADING_LAYER, _preload_tbb()
+        layer = numba.config.THREADING_LAYER
+        has_tbb = _preload_tbb()
         if layer == "default":
             layer = numba.config.THREADING_LAYER = "tbb" if has_tbb else _ONE_CALLER
         else:
@@ -74,16 +79,17 @@ def select_thread_pool() -> str:
 
 def _start_named(layer: str) -> str:
     """Start numba's pool on the layer that the user named, which may stand for several (`safe`).
+
     Returns the name of the layer that it runs on.
     """
     try:
         numba.get_num_threads()  # starts the pool
         return numba.threading_layer()
     except ValueError as error:
-        why = str(error).splitlines()[0].rstrip(".")
+        reason = str(error).splitlines()[0].rstrip(".")
         hint = ": install the package 'tbb'" if layer == "tbb" else ""
         raise BackendUnavailable(
-            f"NUMBA_THREADING_LAYER={layer}: {why}{hint}; or leave the variable unset, and "
+            f"NUMBA_THREADING_LAYER={layer}: {reason}{hint}; or leave the variable unset, and "
             f"a layer that works is chosen (numba has tbb, omp, workqueue, safe, forksafe, "
             f"threadsafe)"
         ) from None
@@ -95,8 +101,8 @@ def _preload_tbb() -> bool:
         files = importlib.metadata.files("tbb") or []
     except importlib.metadata.PackageNotFoundError:
         files = []
-    installed = [Path(str(f.locate())).resolve() for f in files if f.name == TBB_LIBRARY]
-    for path in (*installed, Path(sys.prefix) / "lib" / TBB_LIBRARY, TBB_LIBRARY):
+    installed_paths = [Path(str(f.locate())).resolve() for f in files if f.name == TBB_LIBRARY]
+    for path in (*installed_paths, Path(sys.prefix) / "lib" / TBB_LIBRARY, TBB_LIBRARY):
         try:
             ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
         except OSError:
@@ -107,26 +113,27 @@ def _preload_tbb() -> bool:
 
 @contextmanager
 def kernel_threads(chunk: int = 1) -> Iterator[None]:
-    """Around launches of parallel kernels: as many threads as `thread_count` says, kept busy.
+    """Give the parallel kernels that are launched inside as many threads as `thread_count` says.
 
-    Work is handed out `chunk` iterations at a time. Iterations differ much in cost, and with
-    numba's default, one equal share a thread, all would wait for the slowest.
+    Work is handed out `chunk` iterations at a time, which keeps all threads busy. Iterations differ
+    much in cost; with numba's default, one equal share per thread, all would wait for the slowest.
     """
-    alone = _one_caller_at_a_time if select_thread_pool() == _ONE_CALLER else nullcontext()
-    before = numba.get_num_threads()
-    with alone, numba.parallel_chunksize(chunk):
+    caller_lock = _one_caller_at_a_time if select_thread_pool() == _ONE_CALLER else nullcontext()
+    num_threads_before = numba.get_num_threads()
+    with caller_lock, numba.parallel_chunksize(chunk):
         numba.set_num_threads(thread_count())
         try:
             yield
         finally:
-            numba.set_num_threads(before)
+            numba.set_num_threads(num_threads_before)
 
 
 def thread_count() -> int:
-    """Threads that kernels launched from this thread use.
+    """Return the number of threads that kernels launched from this thread use.
 
-    At most numba's own setting, and `limit_threads`; where that was not called, one in a DataLoader
-    worker (whose siblings want the other cores), and else as many as this process may use cores.
+    The number is at most numba's own setting and the limit of `limit_threads`. Without such a limit
+    it is one in a DataLoader worker, whose siblings want the other cores. Elsewhere it is the
+    number of cores that this process may use.
     """
     select_thread_pool()
     limit = _limits.get(os.getpid())
@@ -136,39 +143,45 @@ def thread_count() -> int:
 
 
 def serves_several() -> bool:
-    """Whether several threads of this process can run kernels at the same time."""
+    """Return True if several threads of this process can run kernels at the same time."""
     return select_thread_pool() != _ONE_CALLER
 
 
-SPACE_OF_SPLAT = 110  # bytes of the work space that a thread has, which draws views of its own
-MAX_SPACE = 1 << 29  # bytes of all beyond the first
+# Bytes of work space per splat of a thread that draws its own views.
+BYTES_PER_SPLAT = 110
+# Bytes of work space of all such threads but the first.
+MAX_WORK_SPACE_BYTES = 1 << 29
 
 
 def views_at_once(gaussians: int) -> int:
-    """How many views of so many Gaussians this thread's cores draw at a time, a thread each."""
+    """Return how many views of so many Gaussians are drawn at a time, one thread each."""
     if not serves_several():
         return 1
-    return min(thread_count(), 1 + MAX_SPACE // (SPACE_OF_SPLAT * max(gaussians, 1)))
+    return min(thread_count(), 1 + MAX_WORK_SPACE_BYTES // (BYTES_PER_SPLAT * max(gaussians, 1)))
 
 
 def divided_threads(count: int) -> ThreadPoolExecutor:
-    """`count` threads for whole tasks, that divide what `thread_count` gives to the calling one."""
-    total, torch_threads = thread_count(), torch.get_num_threads()
-    started = threading.Barrier(count + 1)
+    """Return a pool of `count` threads for whole tasks. They divide the threads of the calling one.
+
+    The calling thread's share is `thread_count`.
+    """
+    total = thread_count()
+    torch_threads = torch.get_num_threads()
+    all_started = threading.Barrier(count + 1)
 
     def start(number: int) -> None:
         share = max(1, total // count + (number < total % count))
         numba.set_num_threads(share)  # both are settings of this thread
         torch.set_num_threads(min(share, torch_threads))
-        started.wait()
+        all_started.wait()
 
     pool = ThreadPoolExecutor(count, thread_name_prefix="view")
     try:
-        for number in range(count):  # each takes one: it holds its thread until all have
+        for number in range(count):  # each task holds its thread until all threads have one
             pool.submit(start, number)
-        started.wait()
+        all_started.wait()
     except BaseException:
-        started.abort()
+        all_started.abort()
         pool.shutdown(wait=False)
         raise
     torch.set_num_threads(torch_threads)  # torch gives new threads the number that was set last
@@ -176,7 +189,7 @@ def divided_threads(count: int) -> ThreadPoolExecutor:
 
 
 def limit_threads(count: int | None) -> None:
-    """Use at most `count` threads for every kernel of this process; None takes the limit back."""
+    """Use at most `count` threads for every kernel of this process; None removes the limit."""
     if count is None:
         _limits.pop(os.getpid(), None)
     elif count >= 1:
@@ -186,7 +199,7 @@ def limit_threads(count: int | None) -> None:
 
 
 def usable_cores() -> int:
-    """Cores this process may keep busy: its affinity, and its container's share of time."""
+    """Return the cores that this process may use: its affinity and its container's quota."""
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
     return min(cores, _container_cores() or cores)
@@ -194,7 +207,7 @@ def usable_cores() -> int:
 
 @functools.cache
 def _container_cores() -> int | None:
-    """The control group's CPU quota in cores, rounded up; None where there is none."""
+    """Return the control group's CPU quota in cores, rounded up; None without a quota."""
     try:
         quota, period = (_CGROUP / "cpu.max").read_text().split()
     except (OSError, ValueError):

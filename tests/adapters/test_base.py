@@ -18,12 +18,12 @@ from splat_scenes import street
 
 from adapters.base import open_scene, recognise, scenes_of
 from adapters.camera_files.camera_files import read_views
-from adapters.detect_format import FILES, FOLDERS, looked_for, recognised
+from adapters.detect_format import FILES, FOLDERS, describe_unrecognised, detect_scheme
 from adapters.drivestudio.drive import read_config as drivestudio_config
 from adapters.lidar_scene.image_views import read_image
 from adapters.nuscenes.tables import read_rows
 from adapters.pandaset import PandaSetLabels
-from adapters.plain_files import check_image, inside, read_json, read_numbers, read_pose
+from adapters.plain_files import check_image, read_json, read_numbers, read_pose, resolve_inside
 from adapters.recording.adapter import read_sweep
 from adapters.safe_pickle import read_array, read_frame
 from adapters.scene_folder import storable
@@ -222,12 +222,12 @@ def grow(root: Path, names: list[str], data: bytes = PLAIN) -> Path:
 
 def test_folders_are_recognised(tmp_path):
     for number, (scheme, names) in enumerate(TREES):
-        assert recognised(grow(tmp_path / str(number), names)) == scheme, names
+        assert detect_scheme(grow(tmp_path / str(number), names)) == scheme, names
     day = grow(tmp_path / "2011_09_26", ["calib_cam_to_cam.txt"])
-    assert recognised(grow(day / "drive", ["velodyne_points/", "image_02/"])) == "kitti"
+    assert detect_scheme(grow(day / "drive", ["velodyne_points/", "image_02/"])) == "kitti"
     many, one = grow(tmp_path / "many", [CLOUD], MULTI_PART), grow(tmp_path / "one", [CLOUD])
-    assert recognised(many) == recognised(many / CLOUD) == "street_gaussians"
-    assert recognised(one / CLOUD) == recognised((one / CLOUD).parent) == "gaussians"
+    assert detect_scheme(many) == detect_scheme(many / CLOUD) == "street_gaussians"
+    assert detect_scheme(one / CLOUD) == detect_scheme((one / CLOUD).parent) == "gaussians"
 
 
 def test_files_are_recognised(tmp_path):
@@ -239,7 +239,7 @@ def test_files_are_recognised(tmp_path):
         "iteration_7.pth": "street_gaussians",
     }
     grow(tmp_path, list(known), b"x")
-    assert {path.name: recognised(path) for path in sorted(tmp_path.iterdir())} == known
+    assert {path.name: detect_scheme(path) for path in sorted(tmp_path.iterdir())} == known
     write_ply(tmp_path / "a.bin", street(length=8))
     assert recognise(tmp_path / "a.bin") == "gaussians"
 
@@ -252,7 +252,7 @@ def test_what_is_not_known_is_answered_with_what_was_looked_for(tmp_path):
         assert signature.what in str(caught.value)
     assert f"give one, such as {tmp_path}/set/seq. Looked for" in str(caught.value)
     (tmp_path / "a.txt").write_text("hello")
-    assert all(signature.what in looked_for(tmp_path / "a.txt") for signature in FILES)
+    assert all(signature.what in describe_unrecognised(tmp_path / "a.txt") for signature in FILES)
 
 
 @pytest.mark.parametrize(
@@ -541,18 +541,18 @@ def test_names_in_tables_stay_inside_the_folder_or_where_its_owner_linked_it(tmp
     root, elsewhere = tmp_path / "set", tmp_path / "elsewhere"
     grow(root, ["samples/a.jpg"])
     grow(elsewhere, ["a.jpg"])
-    assert inside(root, "samples/a.jpg", "row 1") == root / "samples" / "a.jpg"
+    assert resolve_inside(root, "samples/a.jpg", "row 1") == root / "samples" / "a.jpg"
     (root / "samples" / "own.jpg").symlink_to(root / "samples" / "a.jpg")
     (root / "sweeps").symlink_to(elsewhere)  # another disk
     for name in ("samples/own.jpg", "sweeps/a.jpg"):
-        assert inside(root, name, "row 1").read_bytes() == PLAIN
+        assert resolve_inside(root, name, "row 1").read_bytes() == PLAIN
     for name in ("samples/link.jpg", "one.jpg"):
         (root / name).symlink_to(elsewhere / "a.jpg")
         with pytest.raises(AdapterError, match=rf"row 7 names '{name}'.*outside"):
-            inside(root, name, "row 7")
+            resolve_inside(root, name, "row 7")
     for name in ("../elsewhere/a.jpg", "/etc/passwd", "", "samples/../../a", "a\\b", "a\0b"):
         with pytest.raises(AdapterError, match=r"without '\.\.'"):
-            inside(root, name, "row 7")
+            resolve_inside(root, name, "row 7")
 
 
 def merged(levels: int) -> str:

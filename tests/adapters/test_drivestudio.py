@@ -16,12 +16,12 @@ from drivestudio_files import COUNT, START, STRIDE, quat_of, rotation_of, write_
 from scipy.spatial.transform import Rotation
 
 from adapters.base import open_scene
-from adapters.detect_format import recognised
+from adapters.detect_format import detect_scheme
 from adapters.drivestudio.adapter import (
     drivestudio_labels,
     open_drivestudio,
     read_sky,
-    turned_faces,
+    rotate_cubemap,
 )
 from augment.cameras import Camera
 from augment.errors import AdapterError
@@ -348,7 +348,7 @@ def test_sky_texels_are_the_checkpoint_s_own(flat):
 def test_a_sky_on_a_slope_is_looked_up_between_texels():
     faces = torch.rand(6, 9, 9, 3, generator=torch.Generator().manual_seed(3))
     turn = rotation_of(np.array([0.9, 0.3, -0.2, 0.25]))
-    shown = turned_faces(faces, turn)
+    shown = rotate_cubemap(faces, turn)
     there = directions_of_cubemap(9) @ torch.from_numpy(turn.T).float()
     assert torch.allclose(shown, CubemapSky(faces).sample(there), atol=1e-5)
 
@@ -451,7 +451,7 @@ def test_options_that_cannot_be_used_are_refused(numbers):
 
 
 def test_runs_are_recognised_and_data_found(numbers, tmp_path, monkeypatch):
-    assert recognised(numbers.folder) == "drivestudio"
+    assert detect_scheme(numbers.folder) == "drivestudio"
     assert open_scene(str(numbers.folder)).name == "run"
     # A relative root is one from above the run, or from where one is.
     files.write_config(numbers.folder, Path("data"), "waymo", {})

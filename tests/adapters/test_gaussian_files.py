@@ -16,7 +16,7 @@ from splat_scenes import gaussians_at, street
 from adapters.base import open_scene
 from adapters.camera_files.camera_files import look_at_pose
 from adapters.camera_files.paths import solid_points
-from adapters.detect_format import recognised
+from adapters.detect_format import detect_scheme
 from adapters.gaussian_files import (
     GaussianOptions,
     doubt_about_metres,
@@ -283,7 +283,7 @@ def test_files_of_a_folder_are_parts_of_one_scene(tmp_path: Path) -> None:
     bands = torch.nn.functional.pad(far.sh, (0, 0, 0, 4 - far.sh.shape[1]))
     write_ply(tmp_path / "b.ply", dataclasses.replace(far, sh=bands))
     write_ply(tmp_path / "a.ply", near)
-    assert recognised(tmp_path) == "gaussians"
+    assert detect_scheme(tmp_path) == "gaussians"
     scene = open_scene(f"{tmp_path}?up=+z&scale=1")
     said = problem_with(scene, "2 files are taken as parts of one scene")
     assert f"a.ply ({len(near)}), b.ply ({len(far)})" in said and "filled up with zeros" in said

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from adapters.lidar_scene.image_views import Body, Seen, View, observe_views
+from adapters.lidar_scene.image_views import Body, SurfelColours, View, observe_views
 from adapters.lidar_scene.kernels import SkyGatherer
 from adapters.lidar_scene.split import join_tracks
 from adapters.lidar_scene.surfels import Surfels
@@ -60,7 +60,9 @@ def gatherer() -> SkyGatherer:
     return SkyGatherer(32, math.radians(15))
 
 
-def observed(*bodies: Body, views: list[View], sky: SkyGatherer | None = None) -> list[Seen]:
+def observed(
+    *bodies: Body, views: list[View], sky: SkyGatherer | None = None
+) -> list[SurfelColours]:
     seen, problems = observe_views(bodies, views, sky or gatherer(), image_scale=1.0)
     assert problems == ()
     return list(seen)
@@ -76,7 +78,7 @@ def test_surfels_take_the_colour_of_their_pixels(tmp_path):
     image[:, WIDTH // 2 :] = GREEN  # the right half: negative y
     surfels = wall(5.0, 2.0)
     (seen,) = observed(Body(surfels), views=[view(tmp_path / "a.png", image, camera())])
-    assert seen.seen.all()
+    assert seen.is_observed.all()
     assert_coloured(seen.colours[surfels.centres[:, 1] > 0.5], RED)
     assert_coloured(seen.colours[surfels.centres[:, 1] < -0.5], GREEN)
 
@@ -86,10 +88,10 @@ def test_what_is_behind_a_surface_or_the_camera_or_aside_is_unseen(tmp_path):
     aside = dataclasses.replace(aside, centres=aside.centres + np.float32([0, 30, 0]))
     views = [view(tmp_path / "a.png", solid(RED), camera())]
     front, back, *unseen = observed(*map(Body, (near, far, behind, aside)), views=views)
-    assert front.seen.all() and not any(seen.seen.any() for seen in unseen)
+    assert front.is_observed.all() and not any(seen.is_observed.any() for seen in unseen)
     hidden = np.abs(far.centres[:, 1:]).max(axis=1) < 1.3  # 0.8 m at 4 m hides 1.6 m at 8 m
     free = np.abs(far.centres[:, 1:]).max(axis=1) > 2.0
-    assert not back.seen[hidden].any() and back.seen[free].all()
+    assert not back.is_observed[hidden].any() and back.is_observed[free].all()
 
 
 def test_the_median_leaves_one_odd_image_out(tmp_path):
@@ -125,10 +127,10 @@ def test_a_moving_box_hides_the_world_even_where_lidar_saw_through_it(tmp_path):
     bodies = Body(wall(8.0, 0.8)), Body(wall(0.0, -1.0), *moving_box())
     views = [view(tmp_path / "a.png", solid(RED), camera(time_ns=0))]
     seen, _ = observed(*bodies, views=views)
-    assert not seen.seen.any()
+    assert not seen.is_observed.any()
     views.append(view(tmp_path / "b.png", solid(GREEN), camera(time_ns=10**8)))
     seen, _ = observed(*bodies, views=views)
-    assert seen.seen.all()
+    assert seen.is_observed.all()
     assert_coloured(seen.colours.mean(0), GREEN, atol=0.01)
 
 
@@ -140,7 +142,7 @@ def test_actors_are_coloured_where_they_are_at_the_cameras_time(tmp_path):
     (seen,) = observed(body, views=[view(tmp_path / "a.png", image, camera(time_ns=0))])
     assert_coloured(seen.colours[np.abs(own.centres[:, 1]) < 0.5].mean(0), RED)
     (seen,) = observed(body, views=[view(tmp_path / "b.png", image, camera(time_ns=10**9))])
-    assert not seen.seen.any()
+    assert not seen.is_observed.any()
 
 
 def test_rows_that_show_the_recording_car_are_not_used(tmp_path):
@@ -148,7 +150,7 @@ def test_rows_that_show_the_recording_car_are_not_used(tmp_path):
     views = [view(tmp_path / "a.png", solid(RED), camera(), used_rows=0.5)]
     (seen,) = observed(Body(surfels), views=views)
     heights = surfels.centres[:, 2]
-    assert not seen.seen[heights < -0.2].any() and seen.seen[heights > 0.2].all()
+    assert not seen.is_observed[heights < -0.2].any() and seen.is_observed[heights > 0.2].all()
 
 
 def test_images_that_cannot_be_used_are_problems(tmp_path):
@@ -156,7 +158,7 @@ def test_images_that_cannot_be_used_are_problems(tmp_path):
     (tmp_path / "bad.png").write_bytes(b"no image")
     bad = View(camera(), tmp_path / "bad.png", 3)
     (seen,), problems = observe_views([Body(wall(5, 1))], [small, bad], gatherer(), image_scale=1.0)
-    assert not seen.seen.any()
+    assert not seen.is_observed.any()
     assert "small.png is 32 px wide, not 64; left out" in problems[0]
     assert "frame 3: image" in problems[1] and "bad.png cannot be decoded" in problems[1]
 

@@ -371,7 +371,7 @@ def test_a_file_of_poses_gives_the_same_motion(copy, tmp_path):
 def test_poses_go_by_number_unless_there_are_as_many_as_frames(copy, tmp_path):
     street.write_odometry(tmp_path / "poses.txt", 2)
     source = find_source(str(copy), {"poses": str(tmp_path / "poses.txt")})[0]
-    assert source.chosen.numbers == (0, 1)
+    assert source.selection.numbers == (0, 1)
     assert source.problems == ("left out 1 frame (2): no pose is known",)
     for folder in ("image_02", "image_03", "velodyne_points"):
         for path in sorted((copy / folder / "data").iterdir(), reverse=True):
@@ -406,7 +406,7 @@ def test_registration_recovers_turns_and_long_steps():
 def test_registration_goes_on_without_a_sweep_but_not_without_surfaces(copy):
     (copy / "velodyne_points/data/0000000001.bin").unlink()
     source = find_source(str(copy), {"poses": "icp"})[0]
-    assert source.chosen.numbers == (0, 2)
+    assert source.selection.numbers == (0, 2)
     assert "left out 1 frame (1): no pose is known" in source.problems
     np.zeros((500, 4), "<f4").tofile(copy / "velodyne_points/data/0000000002.bin")
     with pytest.raises(AdapterError, match=r"the sweep of frame 2 has too few surfaces"):
@@ -594,7 +594,7 @@ def test_tracklets_in_another_encoding_hide_nothing(copy):
 def test_a_damaged_pose_costs_its_frame(copy, content, message):
     (copy / "oxts/data/0000000000.txt").write_text(content)
     source = find_source(str(copy), {})[0]
-    assert source.chosen.numbers == (1, 2) and message in source.problems[0]
+    assert source.selection.numbers == (1, 2) and message in source.problems[0]
     for path in (copy / "oxts/data").iterdir():
         path.write_text(content)
     with pytest.raises(AdapterError, match=rf"no file can be used: frame 0.*{message[:20]}"):

@@ -17,7 +17,7 @@ import pytest
 from shown import psnr, psnr_of, render
 
 from adapters.base import recognise
-from adapters.nuscenes.adapter import EGO_M, nuscenes_labels, open_nuscenes
+from adapters.nuscenes.adapter import EGO_BOX_M, nuscenes_labels, open_nuscenes
 from adapters.nuscenes.tables import read_rows, read_tables
 from adapters.uri import format_uri
 from augment.errors import AdapterError
@@ -206,7 +206,7 @@ def test_a_quarter_of_the_real_returns_are_the_cars_own(real):
     pose = real.frame(0).world_from_ego.numpy()
     world = real.lidar(0).points_m - real.world_origin_m
     ego = (world - pose[:3, 3]) @ pose[:3, :3]
-    own = ((ego > EGO_M[0]) & (ego < EGO_M[1])).all(axis=1)
+    own = ((ego > EGO_BOX_M[0]) & (ego < EGO_BOX_M[1])).all(axis=1)
     near = np.linalg.norm(ego[:, :2] - [0.94, 0], axis=1) < 2.5
     assert own.sum() == near.sum() == 8526
 

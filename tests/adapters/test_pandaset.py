@@ -267,7 +267,7 @@ def cuboids(*boxes: tuple) -> pd.DataFrame:
 def kept(*tables: pd.DataFrame) -> list[list[tuple[str, str]]]:
     """Of each frame the boxes that stay, and the names of their objects."""
     objects = tie_boxes(dict(enumerate(tables)))
-    uuids = [t["uuid"][objects.kept(t["uuid"])] for t in tables]
+    uuids = [t["uuid"][objects.is_best_box(t["uuid"])] for t in tables]
     return [[(uuid, objects.names[uuid]) for uuid in frame] for frame in uuids]
 
 

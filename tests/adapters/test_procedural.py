@@ -281,13 +281,14 @@ def _some_shapes(rng: np.random.Generator, copies: int) -> Shapes:
 
 def _plan(shapes: Shapes, *spacing: float, hidden: bool = False) -> SplatPlan:
     """Splats this far apart along both axes of all shapes."""
-    spacings, seen = np.full((len(shapes), 2), spacing), np.full(len(shapes), hidden)
-    return SplatPlan(None, shapes, spacings, None, seen)
+    spacings = np.full((len(shapes), 2), spacing)
+    is_hidden = np.full(len(shapes), hidden)
+    return SplatPlan(None, shapes, spacings, None, is_hidden)
 
 
 def _cells(plan: SplatPlan) -> tuple[Cells, np.ndarray]:
     """Cells, and their sides in metres [N, 2, 3]."""
-    cells = make_cells(plan.shapes, plan.counts(1.0), plan.hidden)
+    cells = make_cells(plan.shapes, plan.counts(1.0), plan.is_hidden)
     return cells, cells.sides @ plan.shapes.axes[cells.shape]
 
 

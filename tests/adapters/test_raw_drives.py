@@ -30,7 +30,7 @@ from adapters.drivestudio.adapter import drivestudio_labels
 from adapters.kitti.adapter import KittiLabels
 from adapters.nuscenes.adapter import nuscenes_labels
 from adapters.pandaset import PandaSetLabels
-from adapters.plain_files import Number, read_json, read_numbers, read_yaml, validated
+from adapters.plain_files import Number, read_json, read_numbers, read_yaml, validate_content
 from adapters.procedural import StreetLabels
 from adapters.raw_drive import NO_SURFACE, IncompleteDrive, Picture, class_of_air, usable_images
 from adapters.recording.adapter import RecordingLabels
@@ -113,7 +113,7 @@ def test_texts_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
 
 def test_values_of_another_type_are_said_to_be_corrected_not_copied(tmp_path: Path) -> None:
     with pytest.raises(AdapterError, match=r"x: must be a valid number.* Correct the value") as e:
-        validated(Number, "a", "x")
+        validate_content(Number, "a", "x")
     assert "opy" not in str(e.value)
 
 

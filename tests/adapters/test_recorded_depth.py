@@ -15,9 +15,9 @@ from adapters.training_views.depth_priors import (
     align,
     find_maps,
     find_sparse,
+    is_visible_return,
     join_priors,
     read_relative,
-    visible,
 )
 from adapters.training_views.views import RecordedViews
 from augment.errors import AdapterError
@@ -51,7 +51,7 @@ def test_returns_that_a_nearer_object_hides_from_the_camera_are_dropped(tmp_path
     cam = drives.camera(size=(240, 160), focal_px=200.0)
     scene = drives.drive(tmp_path, 1, cameras=lambda f: {"front": cam}, sweeps={0: points})
     seen = read_returns(scene, 0).seen_by(cam)
-    kept = visible(seen, cam)
+    kept = is_visible_return(seen, cam)
     rays = cam.ray_directions().double().numpy().reshape(-1, 3)[seen.pixels]
     hidden = entry(cam.centre.numpy(), rays) < seen.depth_m - 2.5  # behind the box, not its roof
     assert hidden.sum() > 300 and (~hidden).sum() > 5000
@@ -71,11 +71,11 @@ def test_slopes_poles_and_edges_hide_nothing():
     rows, columns = np.mgrid[10:90:2, 0:240:2]
     pixels = np.concatenate([rows, v]) * 240 + np.concatenate([columns, u])
     seen = DepthPixels.of(pixels.ravel(), depth.ravel())
-    kept = visible(seen, cam).reshape(depth.shape)
+    kept = is_visible_return(seen, cam).reshape(depth.shape)
     # Only far floor beside the pole or the house may go: it has nearer floor below it too.
     assert set(np.nonzero(~kept)[1]) <= {58, 59, 61, 62, 88, 89} and kept.mean() > 0.99
     assert kept[:39].all()
-    assert len(visible(DepthPixels.of(np.zeros(0, int), np.zeros(0)), cam)) == 0
+    assert len(is_visible_return(DepthPixels.of(np.zeros(0, int), np.zeros(0)), cam)) == 0
 
 
 def test_the_first_prior_of_a_pixel_is_believed_and_the_nearest_of_one_prior():

@@ -445,7 +445,10 @@ def test_an_object_that_travels_moves_whatever_is_said(copy):
     )]  # fmt: skip
     recording.write_boxes(copy, columns)
     objects = objects_of(copy)
-    assert {s.object_id for s in objects.moving} == {"car", "parked"} and objects.still == ()
+    assert {s.object_id for s in objects.moving_boxes} == {
+        "car",
+        "parked",
+    } and objects.static_boxes == ()
 
 
 def test_boxes_that_cannot_stand_anywhere_are_left_out_of_tracks_only(copy):
@@ -455,7 +458,7 @@ def test_boxes_that_cannot_stand_anywhere_are_left_out_of_tracks_only(copy):
     columns["qw"][4] = 0.0
     recording.write_boxes(copy, columns)
     objects = objects_of(copy)
-    assert objects.moving == () and [s.object_id for s in objects.still] == ["parked"]
+    assert objects.moving_boxes == () and [s.object_id for s in objects.static_boxes] == ["parked"]
     (problem,) = objects.problems
     assert "3 boxes, the first in frame 0" in problem
     assert np.isnan(RecordingLabels(copy).boxes(0).centers_m[0, 2])
@@ -666,10 +669,10 @@ def test_boxes_have_their_own_times_and_one_name_a_frame(copy):
     columns = recording.box_columns(3)
     columns["timestamp_ns"] = [recording.time_ns(f) + 9 for f in columns["frame"]]
     recording.write_boxes(copy, columns)
-    assert [s.timestamp_ns for s in objects_of(copy).moving] == columns["timestamp_ns"][::2]
+    assert [s.timestamp_ns for s in objects_of(copy).moving_boxes] == columns["timestamp_ns"][::2]
     recording.write_boxes(copy, columns | {"track_id": ["car"] * 6})
     objects = objects_of(copy)
-    assert len(objects.moving) == 3 and "3 boxes share name and frame" in objects.problems[0]
+    assert len(objects.moving_boxes) == 3 and "3 boxes share name and frame" in objects.problems[0]
 
 
 def test_damaged_boxes_name_their_file(copy):

@@ -17,7 +17,7 @@ from street_gaussians_files import Facts, write_dataset
 from street_gaussians_models import RawModel, RawPart, config_tree, random_part, write_model
 
 from adapters.base import open_scene
-from adapters.detect_format import recognised
+from adapters.detect_format import detect_scheme
 from adapters.street_gaussians.adapter import (
     camera_changes,
     check_changes,
@@ -311,7 +311,7 @@ def test_weights_in_a_point_cloud_show_the_same_without_what_they_lack(
 def test_what_a_scene_knows(tmp_path: Path, drive: Facts) -> None:
     model = saved(tmp_path, drive, raw_model(drive))
     scene = open_scene(str(model))
-    assert recognised(model) == "street_gaussians"
+    assert detect_scheme(model) == "street_gaussians"
     assert (scene.name, scene.source) == ("run", f"street_gaussians:{model}")
     assert scene.recorded_source == f"street_gaussians:{drive.root}"
     assert scene.has_metric_scale and scene.ground is None and scene.ground_z_m is None

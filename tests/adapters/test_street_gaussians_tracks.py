@@ -12,7 +12,7 @@ from street_gaussians_files import HEADER, StreetObject, pose_about_z, write_dat
 
 from adapters.street_gaussians.data import (
     ModelConfig,
-    place_rows,
+    assign_columns,
     read_data,
     read_track_table,
     tracklets_of,
@@ -222,7 +222,7 @@ def test_columns_are_those_of_going_through_the_file_by_hand(tmp_path_factory, d
     path.write_text(HEADER + "\n".join(text).replace("np.float64(", "").replace(")", ""))
     table = read_track_table(path)
     frames = range(3, 7)
-    placed = place_rows(table, np.arange(len(table)), frames, poses)
+    placed = assign_columns(table, np.arange(len(table)), frames, poses)
     if any(f in frames for f, *_ in rows):
         assert tracklets_of(table, placed).ids.tolist() == slow_columns(rows, frames, poses)
     else:

@@ -42,14 +42,14 @@ WALL_M = 20.0
 def scene(tmp_path) -> Scene:
     """A road up to a wall, below an open sky; the photos are noise that no render could show."""
     road, end = sheet((0.6, WALL_M), (-12, 12)), wall(WALL_M, (-12, 12), (0, 3))
-    found = drive(road, end, ground_z_m=0.0)
+    recorded_scene = drive(road, end, ground_z_m=0.0)
     frames = []
-    for frame in found.frames:
+    for frame in recorded_scene.frames:
         path = tmp_path / f"{frame.index}.png"
         image = np.random.default_rng(frame.index).integers(0, 256, (90, 160, 3), np.uint8)
         assert cv2.imwrite(str(path), image)
         frames.append(dataclasses.replace(frame, image_paths={"ahead": str(path)}))
-    return dataclasses.replace(found, frames=tuple(frames))
+    return dataclasses.replace(recorded_scene, frames=tuple(frames))
 
 
 def photo_of(scene: Scene, frame: int = 0) -> np.ndarray:
@@ -98,9 +98,9 @@ def test_snow_and_water_leave_every_pixel_that_they_do_not_cover(scene):
     flood = recipe_of(flood=Flood(level_m=0.3, turbidity_ntu=500.0, waves=Waves(height=0.0)))
     view = render_view(scene, ahead(scene), flood)
     water = view.masks["water"] == 255
-    apart = cv2.dilate(water.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
-    assert 0.2 < water.mean() < 0.8 and apart.mean() > 0.2
-    np.testing.assert_array_equal(view.rgb[apart], photo[apart])
+    is_dry = cv2.dilate(water.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
+    assert 0.2 < water.mean() < 0.8 and is_dry.mean() > 0.2
+    np.testing.assert_array_equal(view.rgb[is_dry], photo[is_dry])
     assert (view.rgb[water] != photo[water]).any(-1).mean() > 0.95
 
 
@@ -148,9 +148,9 @@ def test_a_hole_in_the_road_is_as_far_as_the_road(scene):
     """And the sky is far, however the hole is read."""
     smog = Smog(extinction_per_m=0.05, color=AIRLIGHT)
     bare = dataclasses.replace(scene, background=wall(WALL_M, (-12, 12), (0, 3)))
-    whole, holed = (render_view(s, ahead(s), recipe_of(smog=smog)).rgb for s in (scene, bare))
+    full_rgb, holed = (render_view(s, ahead(s), recipe_of(smog=smog)).rgb for s in (scene, bare))
     road = slice(60, 90)
-    assert np.abs(whole[road].astype(int) - holed[road]).mean() < 1.0
+    assert np.abs(full_rgb[road].astype(int) - holed[road]).mean() < 1.0
     unknown = dataclasses.replace(bare, ground_z_m=None)
     assert (render_view(unknown, ahead(unknown), recipe_of(smog=smog)).rgb[road] == 179).any()
 
@@ -186,12 +186,14 @@ def test_a_close_thing_ends_where_the_photo_shows_its_end():
         photo = Photo(camera, pixels, "cpu")
         depth = torch.from_numpy(np.where(columns < 174, 2.0, 40.0)).float().repeat(180, 1)
         raster = RenderOutput(alpha=torch.ones(180, 320), expected_depth=depth)
-        found = photo.transmittance(raster, fog)[90]
-        near, far = float(found[120]), float(found[250])
+        row_transmittance = photo.transmittance(raster, fog)[90]
+        near, far = float(row_transmittance[120]), float(row_transmittance[250])
         assert near > 0.85 and far < 0.15
-        assert bool((found[:162] > 0.8).all()) and bool((found[182:] < 0.2).all())
+        assert bool((row_transmittance[:162] > 0.8).all()) and bool(
+            (row_transmittance[182:] < 0.2).all()
+        )
         if moved:
-            assert bool((found[170:] < 0.3).all())
+            assert bool((row_transmittance[170:] < 0.3).all())
         else:
             values = torch.where(depth < 10, 0.9, 0.1)
             assert torch.equal(photo.aligned(values, torch.ones(180, 320), depth), values)
@@ -209,8 +211,8 @@ def test_fog_on_the_photo_is_fog_on_exact_depth(tmp_path):
     camera = frame.cameras[name].scaled(0.5)
     photo = render_view(scene, frame.cameras[name], clear).rgb
     assert cv2.imwrite(str(path), photo[..., ::-1])
-    own = dataclasses.replace(frame, cameras={name: camera}, image_paths={name: str(path)})
-    scene = dataclasses.replace(scene, frames=(own,))
+    photo_frame = dataclasses.replace(frame, cameras={name: camera}, image_paths={name: str(path)})
+    scene = dataclasses.replace(scene, frames=(photo_frame,))
     true = truth.render(camera)
     distance = true.depth * camera.ray_lengths(torch.float64).numpy()
     for visibility_m in (50.0, 150.0):
@@ -233,8 +235,8 @@ def test_a_style_maps_land_and_sky_of_the_photo_each_by_its_own(scene):
     memo_of(scene).put(("style maps", style), maps, shared=True)
     rgb = render_view(scene, ahead(scene), recipe_of(style=style)).rgb
     photo = photo_of(scene).astype(float) / 255
-    for rows, own in ((slice(60, 85), land), (slice(0, 10), sky)):
-        expected = photo[rows] @ own[:, :3].numpy().T + own[:, 3].numpy()
+    for rows, expected_map in ((slice(60, 85), land), (slice(0, 10), sky)):
+        expected = photo[rows] @ expected_map[:, :3].numpy().T + expected_map[:, 3].numpy()
         assert np.abs(rgb[rows, 20:140] - 255 * expected[:, 20:140]).max() <= 0.51
 
 
@@ -250,7 +252,7 @@ def test_splats_say_by_marks_what_a_style_does_to_them(scene):
     levels = torch.zeros(len(scene.background), dtype=torch.int16)
     levels[: len(end)] = (end.means[:, 1] > 0).short() * (LEVELS // 2)
     sky = torch.tensor([[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0]])
-    whole = SceneStyle(StyleMaps(maps, sky, sky), scene.sky, scene, levels).on_photo
+    full_style = SceneStyle(StyleMaps(maps, sky, sky), scene.sky, scene, levels).on_photo
     camera = ahead(scene)
 
     def shown(style, dtype=torch.float32):
@@ -261,14 +263,18 @@ def test_splats_say_by_marks_what_a_style_does_to_them(scene):
         moved = {name: None if own is None else own.to(dtype) for name, own in moved.items()}
         return photo.clear_picture(dataclasses.replace(raster, **moved), parts)
 
-    by_marks, by_ids = shown(whole), shown(dataclasses.replace(whole, marks=None))
+    by_marks, by_ids = shown(full_style), shown(dataclasses.replace(full_style, marks=None))
     assert float((by_marks - by_ids).abs().quantile(0.9)) < 0.01
-    torch.testing.assert_close(by_marks, shown(whole, torch.float64).float(), rtol=0, atol=1e-5)
-    one = dataclasses.replace(whole, splats=maps[:1], others=None, marks=whole.marks[:: len(maps)])
-    one = dataclasses.replace(one, rows=levels)  # one map for all takes a kernel
-    fast, slow = shown(one), shown(dataclasses.replace(one, others=maps[:0]))
+    torch.testing.assert_close(
+        by_marks, shown(full_style, torch.float64).float(), rtol=0, atol=1e-5
+    )
+    single_style = dataclasses.replace(
+        full_style, splats=maps[:1], others=None, marks=full_style.marks[:: len(maps)]
+    )
+    single_style = dataclasses.replace(single_style, rows=levels)  # one map for all takes a kernel
+    fast, slow = shown(single_style), shown(dataclasses.replace(single_style, others=maps[:0]))
     torch.testing.assert_close(fast, slow, rtol=0, atol=1e-6)
-    by_ids = shown(dataclasses.replace(one, marks=None))
+    by_ids = shown(dataclasses.replace(single_style, marks=None))
     assert float((fast - by_ids).abs().quantile(0.9)) < 0.01
 
 
@@ -296,19 +302,24 @@ def test_what_was_not_recorded_is_refused_before_anything_is_written(scene, tmp_
     recipe = recipe_of()
     frames = tuple(dataclasses.replace(f, image_paths={}) for f in scene.frames)
     none = dataclasses.replace(scene, frames=frames)
-    one = dataclasses.replace(scene, frames=(scene.frames[0], frames[1]))
+    partial_scene = dataclasses.replace(scene, frames=(scene.frames[0], frames[1]))
     jobs = (
         (scene, recipe, {"camera_path": frames}, "a camera path shows what no camera"),
-        (one, recipe, {}, r"1 of 2 selected images .* camera 'ahead' of frame 1: none is known"),
+        (
+            partial_scene,
+            recipe,
+            {},
+            r"1 of 2 selected images .* camera 'ahead' of frame 1: none is known",
+        ),
     )
-    for found, own, options, message in jobs:
-        job = RenderJob("test:sheets", [own], tmp_path / "out", **options)
+    for job_scene, job_recipe, options, message in jobs:
+        job = RenderJob("test:sheets", [job_recipe], tmp_path / "out", **options)
         with pytest.raises(SceneError, match=message):
-            run_job(job, scene_loader=lambda _, found=found: found, progress=False)
+            run_job(job, scene_loader=lambda _, job_scene=job_scene: job_scene, progress=False)
     assert not (tmp_path / "out").exists()
     run_job(
         RenderJob("test:sheets", [recipe], tmp_path / "out", frames=[0]),
-        scene_loader=lambda _: one,
+        scene_loader=lambda _: partial_scene,
         progress=False,
     )
     with pytest.raises(SceneError, match=r"has no recorded images; open the recording"):

@@ -63,10 +63,10 @@ def label(
         render=Render(base=base),  # pyright: ignore[reportArgumentType]
     )
     instances = Instances((), (0,), _Labels(labelled))
-    shown, measured = label_view(
+    labelled_view, measured = label_view(
         labelled, instances, ORIGIN_M, CAMERA, view, recipe, lambda: evidence
     )
-    return shown.instance, *_tables(measured)
+    return labelled_view.instance, *_tables(measured)
 
 
 def _tables(measured: BoxWeather) -> tuple[BoxNumbers, BoxNumbers]:
@@ -85,8 +85,8 @@ class _Labels:
 
 
 def amodal_of(*boxes: tuple) -> np.ndarray:
-    placed = PlacedBoxes.of(make_boxes(*boxes), ORIGIN_M)
-    return outline_placed(placed, CAMERA).xyxy
+    world_boxes = PlacedBoxes.of(make_boxes(*boxes), ORIGIN_M)
+    return outline_placed(world_boxes, CAMERA).xyxy
 
 
 @pytest.mark.parametrize(
@@ -112,8 +112,8 @@ def test_an_object_is_estimated_where_returns_prove_it_and_depth_misses_it(
     image, flat, masks = label(depth_m, returns, instance=instance)
     assert flat["is_estimated"].tolist() == [is_estimated]
     if not is_estimated:
-        shown = depth_m == 28.0
-        assert bool(flat["pixels"][0]) == bool(masks["pixels"][0]) == shown
+        is_shown = depth_m == 28.0
+        assert bool(flat["pixels"][0]) == bool(masks["pixels"][0]) == is_shown
         return
     np.testing.assert_allclose(flat["modal_xyxy"], amodal_of(CAR), atol=1)
     assert flat["visible_fraction"][0] == 1
@@ -144,14 +144,14 @@ def test_a_rendered_picture_shows_only_what_has_splats(splats: list, is_drawn: b
 
 
 def test_what_snow_buries_of_an_object_is_not_estimated() -> None:
-    placed = PlacedBoxes.of(make_boxes(CAR), ORIGIN_M)
+    world_boxes = PlacedBoxes.of(make_boxes(CAR), ORIGIN_M)
     depth_m = np.full((CAMERA.height, CAMERA.width), 100, np.float32)
     evidence = Evidence(SortedPoints.of(np.array(ON_CAR)), NO_POINTS, frozenset())
     bottoms = []
     for buried_m in (0.0, 0.4):
         estimates = estimate_boxes(
-            placed, ("car",), CAMERA, outline_placed(placed, CAMERA),
-            find_occlusion(placed, CAMERA, depth_m), lambda: evidence,
+            world_boxes, ("car",), CAMERA, outline_placed(world_boxes, CAMERA),
+            find_occlusion(world_boxes, CAMERA, depth_m), lambda: evidence,
             on_photo=True, buried_m=np.array([buried_m]),
         )  # fmt: skip
         bottoms.append(estimates[0].xyxy[3])

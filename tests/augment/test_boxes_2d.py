@@ -161,18 +161,20 @@ def test_fractions_and_bounds_are_those_of_rays(hidden_to_y: float, instance: bo
     recipe = Recipe(output=Output(instance=instance, depth="median"))
     boxes, view = scene.boxes(0), render_view(scene, camera, recipe, backend="cpu")
     numbers = measure_boxes(boxes, instances_of(scene), ORIGIN, camera, view)["box_2d"]
-    whole, left = seen_by_rays(camera, hidden_to_y)
+    num_whole, num_left = seen_by_rays(camera, hidden_to_y)
     # Splats blur edges by a pixel, and the box's lowest 8 cm own no surface.
-    assert numbers["visible_fraction"][0] == pytest.approx(left.sum() / whole.sum(), abs=0.04)
-    assert numbers["pixels"][0] == pytest.approx(left.sum(), abs=0.1 * whole.sum())
+    assert numbers["visible_fraction"][0] == pytest.approx(
+        num_left.sum() / num_whole.sum(), abs=0.04
+    )
+    assert numbers["pixels"][0] == pytest.approx(num_left.sum(), abs=0.1 * num_whole.sum())
     assert numbers["truncated_fraction"].tolist()[0::2] == [0, 1]
-    if not left.any():
+    if not num_left.any():
         assert np.isnan(numbers["modal_xyxy"][0]).all()
         return
-    rows, columns = np.nonzero(left)
+    rows, columns = np.nonzero(num_left)
     bounds = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
     np.testing.assert_allclose(numbers["modal_xyxy"][0], bounds, atol=2)
-    rows, columns = np.nonzero(whole)
+    rows, columns = np.nonzero(num_whole)
     bounds = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
     amodal = [numbers[side][0] for side in ("x0", "y0", "x1", "y1")]
     np.testing.assert_allclose(amodal, bounds, atol=1)
@@ -180,10 +182,12 @@ def test_fractions_and_bounds_are_those_of_rays(hidden_to_y: float, instance: bo
 
 def test_a_box_across_the_border_is_truncated_by_its_share_of_the_outline() -> None:
     scene = street()
-    whole = scene.frames[0].cameras["ahead"]
-    x0, x1 = (measure(scene, whole)[0][side][0] for side in ("x0", "x1"))
+    full_camera = scene.frames[0].cameras["ahead"]
+    x0, x1 = (measure(scene, full_camera)[0][side][0] for side in ("x0", "x1"))
     middle = round((x0 + x1) / 2)
-    cut = whole.cropped(middle, 0, 480 - middle, 270)  # symmetric: the car stands straight ahead
+    cut = full_camera.cropped(
+        middle, 0, 480 - middle, 270
+    )  # symmetric: the car stands straight ahead
     numbers, _ = measure(scene, cut)
     assert numbers["truncated_fraction"][0] == pytest.approx(0.5, abs=0.03)
     assert numbers["x0"][0] == 0 and numbers["x1"][0] == pytest.approx(x1 - middle)
@@ -246,15 +250,15 @@ def test_snow_on_a_parked_car_is_the_car(surface: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def job_output(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("street") / "out"
     assert run(out).failed == 0
     return out
 
 
-def test_files_agree_over_frames_and_with_a_live_scene(whole: Path) -> None:
-    boxes = read_boxes(whole / FOLDER / "labels" / "boxes.parquet")
-    measured = box_tables()["box_2d"].read(whole / FOLDER / "labels" / "boxes_2d.parquet")
+def test_files_agree_over_frames_and_with_a_live_scene(job_output: Path) -> None:
+    boxes = read_boxes(job_output / FOLDER / "labels" / "boxes.parquet")
+    measured = box_tables()["box_2d"].read(job_output / FOLDER / "labels" / "boxes_2d.parquet")
     ids = {
         t: int(n)
         for f in boxes.values()
@@ -263,15 +267,15 @@ def test_files_agree_over_frames_and_with_a_live_scene(whole: Path) -> None:
     # The actor, then tracks as frame 0 lists them, then what frame 1 adds.
     assert ids == {"car": 1, "parked": 2, "behind": 3, "later": 4}
     live = SceneDataset(street(), RECIPE, backend="cpu")
-    for row in read_manifest(whole).to_pylist():
+    for row in read_manifest(job_output).to_pylist():
         frame = row["frame"]
         assert row["box_2d_path"] == str(FOLDER / "labels/boxes_2d.parquet")
-        image = cv2.imread(str(whole / row["instance_path"]), cv2.IMREAD_UNCHANGED)
-        shown = {ids[t] for t in ("parked", "car", *(["later"] if frame else []))}
-        assert set(np.unique(image).tolist()) == {0, *shown}
+        image = cv2.imread(str(job_output / row["instance_path"]), cv2.IMREAD_UNCHANGED)
+        shown_ids = {ids[t] for t in ("parked", "car", *(["later"] if frame else []))}
+        assert set(np.unique(image).tolist()) == {0, *shown_ids}
         assert boxes[frame].instances.tolist() == [ids[t] for t in boxes[frame].boxes.track_ids]
         np.testing.assert_array_equal(measured[frame, "ahead"]["instance"], boxes[frame].instances)
-    stored = WeatherDataset(whole)
+    stored = WeatherDataset(job_output)
     for sample, other in zip(stored, live, strict=True):
         assert torch.equal(sample["instance"], other["instance"])
         for key in ("instance", "modal_xyxy", "visible_fraction", "truncated_fraction"):
@@ -285,23 +289,25 @@ def files_of(out: Path) -> dict[str, bytes]:
     return {str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*") if p.is_file()}
 
 
-def test_parts_in_any_order_and_workers_give_the_files_of_one_run(whole: Path, tmp_path) -> None:
+def test_parts_in_any_order_and_workers_give_the_files_of_one_run(
+    job_output: Path, tmp_path
+) -> None:
     run(tmp_path / "parts", frames=[1])
     assert run(tmp_path / "parts").skipped == 1
-    assert files_of(tmp_path / "parts") == files_of(whole)
+    assert files_of(tmp_path / "parts") == files_of(job_output)
     (tmp_path / "parts" / FOLDER / "labels" / "boxes_2d.parquet").unlink()
     assert run(tmp_path / "parts").written == 2  # only rendering tells
-    assert files_of(tmp_path / "parts") == files_of(whole)
+    assert files_of(tmp_path / "parts") == files_of(job_output)
 
 
 def test_a_frame_that_could_not_be_read_renumbers_what_was_rendered_without_it(
-    whole: Path, tmp_path: Path
+    job_output: Path, tmp_path: Path
 ) -> None:
     """Frame 0 first shows a track: frame 1 has been numbered without it."""
     result = run(tmp_path, opened=lambda uri: street(StreetLabels(unreadable=0)))
     assert (result.written, result.failed) == (1, 1)
     assert run(tmp_path).written == 2
-    assert files_of(tmp_path) == files_of(whole)
+    assert files_of(tmp_path) == files_of(job_output)
     assert run(tmp_path).skipped == 2
 
 
@@ -318,8 +324,8 @@ def test_objects_beyond_sixteen_bits_have_no_instance(caplog) -> None:
     assert "instance images number 65535 of them" in caplog.text
 
 
-def test_targets_of_what_is_seen(whole: Path) -> None:
-    sample = WeatherDataset(whole, frames=[0])[0]
+def test_targets_of_what_is_seen(job_output: Path) -> None:
+    sample = WeatherDataset(job_output, frames=[0])[0]
     _, amodal = torchvision_sample(sample)
     assert amodal["track_ids"] == ["parked", "car"]
     assert 0.3 < amodal["visible_fraction"][0] < 0.7 < 0.95 < amodal["visible_fraction"][1]
@@ -327,20 +333,22 @@ def test_targets_of_what_is_seen(whole: Path) -> None:
     assert torch.equal(modal["boxes"], sample["boxes"]["modal_xyxy"][:2])
     widths = [float(t["boxes"][0, 2] - t["boxes"][0, 0]) for t in (amodal, modal)]
     assert 0.3 < widths[1] / widths[0] < 0.7  # the wall hides half of the parked car
-    _, seen = torchvision_sample(sample, min_visible_fraction=0.8)
-    assert seen["track_ids"] == ["car"]
-    hidden = street(hidden_to_y=2.0)
-    _, none = torchvision_sample(SceneDataset(hidden, RECIPE, backend="cpu")[0], bounds="modal")
+    _, visible_target = torchvision_sample(sample, min_visible_fraction=0.8)
+    assert visible_target["track_ids"] == ["car"]
+    flooded_street = street(hidden_to_y=2.0)
+    _, none = torchvision_sample(
+        SceneDataset(flooded_street, RECIPE, backend="cpu")[0], bounds="modal"
+    )
     assert none["track_ids"] == ["car"]
 
     old = {key: None for key in ("modal_xyxy", "visible_fraction", "truncated_fraction")}
     older = {**sample, "boxes": {**sample["boxes"], **old}}
     assert "visible_fraction" not in torchvision_sample(older)[1]
-    for asked in ({"bounds": "modal"}, {"min_visible_fraction": 0.1}):
+    for options in ({"bounds": "modal"}, {"min_visible_fraction": 0.1}):
         with pytest.raises(
             ValueError, match=r"need what labels/boxes_2d.parquet says; scene 'shee"
         ):
-            torchvision_sample(older, **asked)
+            torchvision_sample(older, **options)
     unchecked = torchvision_sample.__wrapped__  # as in production, where nothing checks types
     with pytest.raises(ValueError, match="bounds must be one of amodal, modal; got 'tight'"):
         unchecked(sample, bounds="tight")
@@ -389,7 +397,7 @@ def a_sample(boxes: Boxes, frame: str = "world", weather: BoxWeather | None = No
     pose = world_from_camera.numpy()
     quats = torch.from_numpy(boxes.quats)
     turned = multiply_quats(quat_from_rotmat(world_from_camera[:3, :3]).expand_as(quats), quats)
-    there = Boxes(
+    labelled_boxes = Boxes(
         boxes.track_ids,
         boxes.labels,
         boxes.centers_m @ pose[:3, :3].T + pose[:3, 3],
@@ -401,7 +409,7 @@ def a_sample(boxes: Boxes, frame: str = "world", weather: BoxWeather | None = No
     camera |= {"world_from_camera": world_from_camera, "world_from_ego": world_from_ego}
     images = dict.fromkeys(buffers())
     return {
-        "boxes": box_tensors(there, weather or {}, frame, origins[frame].numpy()),
+        "boxes": box_tensors(labelled_boxes, weather or {}, frame, origins[frame].numpy()),
         "camera": camera,
         "image": torch.zeros(3, HEIGHT, WIDTH),
         "scene": "street",
@@ -466,11 +474,19 @@ def test_boxes_enclose_the_rays_that_meet_them_tightly() -> None:
             low, high = xyxy[:2], xyxy[2:]
             assert not in_view or float((high - low).min()) < 0.5
             continue
-        found = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]) / STEPS
+        ray_bounds = (
+            np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]) / STEPS
+        )
         assert in_view
         # Within the borders of the rays' cells, and a pointed end falls between the rays.
-        outside = np.array([xyxy[0] - found[0], xyxy[1] - found[1], found[2] - xyxy[2],
-                            found[3] - xyxy[3]])  # fmt: skip
+        outside = np.array(
+            [
+                xyxy[0] - ray_bounds[0],
+                xyxy[1] - ray_bounds[1],
+                ray_bounds[2] - xyxy[2],
+                ray_bounds[3] - xyxy[3],
+            ]
+        )
         assert outside.max() <= 1 / STEPS + slack
         assert outside.min() >= -0.6
         checked += 1

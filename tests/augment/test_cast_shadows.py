@@ -74,8 +74,8 @@ def test_the_sun_is_where_shadows_say():
     assert abs(shadows.azimuth_deg - SUN_DEG[0]) <= 50  # a long wall's shadow tells little of it
     np.testing.assert_allclose(shadows.ratio, RATIO, atol=0.03)
     spots = places()
-    lit, known, height_m = shadows.at(spots[:, 0], spots[:, 1])
-    inner = known > 0.99
+    lit, known_share, height_m = shadows.at(spots[:, 0], spots[:, 1])
+    inner = known_share > 0.99
     assert inner.mean() > 0.7 and np.abs(height_m[inner]).max() < 0.02
     assert ((lit > 0.5) == (in_sun() > 0.5))[inner].mean() > 0.95
     beyond = shadows.at(np.array([1e6, np.nan]), np.array([0.0, 0.0]))
@@ -113,8 +113,10 @@ def test_snow_has_the_contrast_of_the_ground():
     assert 0.45 < ratio < 0.65
     assert contrast(mild, snow) == pytest.approx(ratio, abs=0.02)
     assert 0.35 < contrast(street(in_sun()), snow) < 0.5
-    given = Snow(depth_m=0.1, light=SnowLight(sun=0.0))
-    assert contrast(mild, given) > 0.9 and "light.sun is 0" in told_light(mild, given)
+    snow_without_sun = Snow(depth_m=0.1, light=SnowLight(sun=0.0))
+    assert contrast(mild, snow_without_sun) > 0.9 and "light.sun is 0" in told_light(
+        mild, snow_without_sun
+    )
 
 
 def test_little_or_no_ground_tells_nothing():
@@ -170,14 +172,18 @@ def test_fading_comes_before_a_style():
     part = PosedGaussians(scene.background)
     maps = torch.rand(3, 3, 4)
     classes = torch.arange(len(scene.background)).remainder(5).to(torch.int16) - 1
-    for own, rows in ((maps[:1], None), (maps, classes)):
-        styled = dataclasses.replace(part, color_maps=own, color_rows=rows)
+    for style_maps, rows in ((maps[:1], None), (maps, classes)):
+        styled = dataclasses.replace(part, color_maps=style_maps, color_rows=rows)
         both = faded.on(styled)
         assert both.color_maps is not None and both.color_rows is not None
         found_maps = both.color_maps[both.color_rows.long()]
-        row = 0 if rows is None else torch.where((rows >= 0) & (rows < len(own)), rows, 0).long()
+        row = (
+            0
+            if rows is None
+            else torch.where((rows >= 0) & (rows < len(style_maps)), rows, 0).long()
+        )
         inner = faded.maps[faded.rows.long()][:, :, :3]
-        expected = own[row] if rows is not None else own.expand(len(classes), 3, 4)
+        expected = style_maps[row] if rows is not None else style_maps.expand(len(classes), 3, 4)
         torch.testing.assert_close(found_maps[..., :3], expected[..., :3] @ inner)
         torch.testing.assert_close(found_maps[..., 3], expected[..., 3].contiguous())
 
@@ -211,6 +217,6 @@ def test_the_streets_shadows_are_its_suns():
     road = (scene.background.semantic == ROAD).numpy()
     spots = scene.background.means.double().numpy()[road][::7]
     spots = spots[np.abs(spots[:, 0]) < 30]
-    seen = ~body.tree.occluded(spots + np.array([0, 0, 0.02]), body.lighting.to_sun)
-    lit, known, _ = shadows.at(spots[:, 0], spots[:, 1])
-    assert ((lit > 0.5) == seen)[known > 0.99].mean() > 0.9
+    is_lit = ~body.tree.occluded(spots + np.array([0, 0, 0.02]), body.lighting.to_sun)
+    lit, known_share, _ = shadows.at(spots[:, 0], spots[:, 1])
+    assert ((lit > 0.5) == is_lit)[known_share > 0.99].mean() > 0.9

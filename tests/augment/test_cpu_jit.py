@@ -240,11 +240,11 @@ def turned(rows, table, out):
     for part in prange(2):
         if part == 0:
             kind = v8.lane_numbers()
-            v8.turn(kind, table, rows, U(3), U(9), out, U(0))
+            v8.transpose_rows(kind, table, rows, U(3), U(9), out, U(0))
             v8.store(out, U(512), v8.exp2_where(v8.at_least(kind, v8.splat(np.float32(3))), kind))
         else:
             kind = v8.wide_columns()
-            v8.turn(kind, table, rows, U(3), U(9), out, U(16))
+            v8.transpose_rows(kind, table, rows, U(3), U(9), out, U(16))
             for row in range(v8.rows_in(kind)):
                 v8.store(out, U(544) + row * U(8), v8.load_row(kind, table, row))
 

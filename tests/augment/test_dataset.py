@@ -168,12 +168,12 @@ def test_outputs_that_lack_what_others_have_are_refused_by_name(tmp_path: Path) 
     write_scene(full, [CLEAR, FOGGY, FLOODED])
     none = {"semantic": False, "labels": False, "lidar": False}
     write_scene(bare, [make_recipe(variant=number, **none) for number in range(4)])
-    alike, poor = WeatherDataset(full), WeatherDataset(bare)  # masks need not be everywhere
-    assert len(WeatherDataset([full])) == len(alike) == 24
+    complete, poor = WeatherDataset(full), WeatherDataset(bare)  # masks need not be everywhere
+    assert len(WeatherDataset([full])) == len(complete) == 24
     assert poor[0]["semantic"] is None and poor.given() == {"image", "depth", "instance"}
     fog = "street/fog-000, street/fog-001, street/fog-002 and 1 more"
-    named = rf"boxes: none in {bare} \({fog}\); semantic: none in {bare} .* Leave it out "
-    with pytest.raises(ValueError, match=named + r"\(load=\('image', 'depth', 'instance', "):
+    message = rf"boxes: none in {bare} \({fog}\); semantic: none in {bare} .* Leave it out "
+    with pytest.raises(ValueError, match=message + r"\(load=\('image', 'depth', 'instance', "):
         WeatherDataset([full, bare])
     with pytest.raises(ValueError, match=rf"lidar: none in {bare} .*load=\('depth',\)"):
         WeatherDataset([full, bare], load=["lidar", "depth"])
@@ -181,32 +181,39 @@ def test_outputs_that_lack_what_others_have_are_refused_by_name(tmp_path: Path) 
     assert len(WeatherDataset([full, bare], variants=["clear-000", "clear-009"])) == 16
     # Of datasets opened apart, by what takes them together.
     with pytest.raises(ValueError, match=rf"`weathered` \({bare}\) have no boxes, semantic, those"):
-        MixedDataset(clean_frames(alike), poor, 0.5)
+        MixedDataset(clean_frames(complete), poor, 0.5)
     with pytest.raises(ValueError, match=r"`clean` \(.*full\) have no depth, those of `weathered`"):
         MixedDataset(WeatherDataset(full, load=()), WeatherDataset(bare, load=["depth"]), 0.5)
     with pytest.raises(
         ValueError, match=r"1 of a batch's 2 samples have no semantic: .* street/fo"
     ):
-        collate_frames([alike[0], poor[0]])
+        collate_frames([complete[0], poor[0]])
     for root, fault in (([], "got an empty list"), ([full, tmp_path], "no output folder")):
         with pytest.raises((ValueError, OutputError), match=fault):
             WeatherDataset(root)
 
 
 def test_outputs_together_have_the_samples_of_each(tmp_path: Path) -> None:
-    one, other = tmp_path / "one", tmp_path / "other"
-    write_scene(one, [CLEAR, FLOODED])
-    write_scene(other, [CLEAR, FOGGY], frames=3)
-    apart = [WeatherDataset(one), WeatherDataset(other)]
-    both = pickle.loads(pickle.dumps(WeatherDataset([one, other])))
-    assert len(both) == len(apart[0]) + len(apart[1]) == 28
-    for index, of in ((0, apart[0][0]), (15, apart[0][15]), (16, apart[1][0]), (27, apart[1][11])):
+    first_folder, second_folder = tmp_path / "one", tmp_path / "other"
+    write_scene(first_folder, [CLEAR, FLOODED])
+    write_scene(second_folder, [CLEAR, FOGGY], frames=3)
+    datasets = [WeatherDataset(first_folder), WeatherDataset(second_folder)]
+    both = pickle.loads(pickle.dumps(WeatherDataset([first_folder, second_folder])))
+    assert len(both) == len(datasets[0]) + len(datasets[1]) == 28
+    for index, of in (
+        (0, datasets[0][0]),
+        (15, datasets[0][15]),
+        (16, datasets[1][0]),
+        (27, datasets[1][11]),
+    ):
         assert_same_sample(both[index], of)
-    assert both.table["output"].to_pylist() == [str(one)] * 16 + [str(other)] * 12
-    foggy = WeatherDataset([one, other], where=pc.field("smog_extinction_per_m") > 0)
-    assert_same_sample(foggy[0], apart[1][6])
+    assert both.table["output"].to_pylist() == [str(first_folder)] * 16 + [str(second_folder)] * 12
+    foggy = WeatherDataset(
+        [first_folder, second_folder], where=pc.field("smog_extinction_per_m") > 0
+    )
+    assert_same_sample(foggy[0], datasets[1][6])
     # A clip is of one output, though both have the scene and the variant.
-    lengths = [len(ClipDataset(dataset, 3)) for dataset in (*apart, both)]
+    lengths = [len(ClipDataset(dataset, 3)) for dataset in (*datasets, both)]
     assert lengths[2] == lengths[0] + lengths[1] > 0
 
 
@@ -336,8 +343,8 @@ class MemoryStore:
 
     @staticmethod
     def of(folder: Path) -> MemoryStore:
-        found = (path for path in folder.rglob("*") if path.is_file())
-        return MemoryStore({p.relative_to(folder).as_posix(): p.read_bytes() for p in found})
+        files = (path for path in folder.rglob("*") if path.is_file())
+        return MemoryStore({p.relative_to(folder).as_posix(): p.read_bytes() for p in files})
 
     def read(self, path: str) -> bytes:
         if path not in self.files:
@@ -369,13 +376,15 @@ def remote(folder: Path) -> MemoryStore:
 
 
 def test_a_remote_folder_reads_like_a_local_one(folder: Path, remote: MemoryStore) -> None:
-    here, there = WeatherDataset(folder, load=ALL), WeatherDataset(remote, load=ALL)
-    assert len(here) == len(there) == 24 and same_tables(here.table, there.table)
+    local, remote_dataset = WeatherDataset(folder, load=ALL), WeatherDataset(remote, load=ALL)
+    assert len(local) == len(remote_dataset) == 24 and same_tables(
+        local.table, remote_dataset.table
+    )
     for index in range(24):
-        assert_same_sample(here[index], there[index], but=("paths",))
+        assert_same_sample(local[index], remote_dataset[index], but=("paths",))
     path = "street/clear-000/images/front/000000.png"
-    assert there[0]["paths"]["image"] == f"memory://bucket/out/{path}?region=here"
-    assert here[0]["paths"]["image"] == str(folder / path)
+    assert remote_dataset[0]["paths"]["image"] == f"memory://bucket/out/{path}?region=here"
+    assert local[0]["paths"]["image"] == str(folder / path)
 
 
 def test_blocks_of_running_jobs_are_seen(folder: Path, remote: MemoryStore) -> None:
@@ -411,9 +420,9 @@ def test_sweeps(folder: Path) -> None:
 
 @pytest.mark.parametrize("frame", ["ego", "camera"])
 def test_boxes_and_points_in_other_frames(folder: Path, frame) -> None:
-    asked = {"variants": ["clear-000"], "cameras": ["rear/left"], "load": ("boxes", "lidar")}
-    world = WeatherDataset(folder, **asked)[2]
-    moved = WeatherDataset(folder, box_frame=frame, **asked)[2]
+    selection = {"variants": ["clear-000"], "cameras": ["rear/left"], "load": ("boxes", "lidar")}
+    world = WeatherDataset(folder, **selection)[2]
+    moved = WeatherDataset(folder, box_frame=frame, **selection)[2]
     assert (world["boxes"]["frame"], moved["boxes"]["frame"]) == ("world", frame)
     frame_from_world = invert_rigid(moved["camera"][f"world_from_{frame}"])
     for key, kind in (("centers_m", "boxes"), ("points_m", "lidar")):
@@ -428,15 +437,15 @@ def test_boxes_and_points_in_other_frames(folder: Path, frame) -> None:
 
 
 def test_only_what_is_asked_for_is_read(remote: MemoryStore) -> None:
-    whole = dict(remote.files)
+    all_files = dict(remote.files)
     folders = {"boxes": "labels", "image": "images"}
     for kind in ALL:
-        kept = ("manifest", "calibration", f"/{folders.get(kind, kind)}/")
-        remote.files = {p: d for p, d in whole.items() if any(part in p for part in kept)}
+        name_parts = ("manifest", "calibration", f"/{folders.get(kind, kind)}/")
+        remote.files = {p: d for p, d in all_files.items() if any(part in p for part in name_parts)}
         variant = "clear-009" if kind in ("water", "snow") else "clear-000"
         dataset = WeatherDataset(remote, variants=[variant], frames=[1], load=[kind])
-        there = {name for name in ALL if dataset[0][name] is not None}
-        assert there == ({kind} if kind != "snow" else set())
+        kinds = {name for name in ALL if dataset[0][name] is not None}
+        assert kinds == ({kind} if kind != "snow" else set())
         if kind not in ("boxes", "lidar"):
             batch = collate_frames([dataset[0], dataset[1]])
             assert (batch[kind] is None) == (kind == "snow")
@@ -446,9 +455,9 @@ def test_only_what_is_asked_for_is_read(remote: MemoryStore) -> None:
 def test_columns_are_the_manifests(folder: Path, checksum: str | None) -> None:
     """Also those with more values than 16 bits tell apart, or with other checksums."""
     table = pq.read_table(folder / MANIFEST)
-    whole = WeatherDataset(folder).rows
-    chosen = whole.take(np.array([5, 3, -1]))
-    assert same_tables(whole.to_arrow(), table)
+    all_rows = WeatherDataset(folder).rows
+    chosen = all_rows.take(np.array([5, 3, -1]))
+    assert same_tables(all_rows.to_arrow(), table)
     assert same_tables(chosen.to_arrow(), table.take([5, 3, 23]))
     assert same_row(chosen.row(1), table, 3)
 

@@ -47,15 +47,15 @@ def many_scenes(count: int) -> pa.Table:
 
 
 def test_a_split_shares_no_scene_and_loses_none() -> None:
-    whole = many_scenes(300)
+    table = many_scenes(300)
     fractions = {"train": 0.7, "val": 0.2, "test": 0.1}
-    found = scenes_of(split_by_scene(whole, fractions, seed=3))
-    assert sum(map(len, found.values())) == 300
-    assert set.union(*found.values()) == set(whole["scene"].to_pylist())
+    parts = scenes_of(split_by_scene(table, fractions, seed=3))
+    assert sum(map(len, parts.values())) == 300
+    assert set.union(*parts.values()) == set(table["scene"].to_pylist())
     for name, fraction in fractions.items():
         # Four standard deviations of a binomial distribution.
-        assert abs(len(found[name]) - 300 * fraction) < 4 * (300 * fraction * (1 - fraction)) ** 0.5
-    assert found != scenes_of(split_by_scene(whole, fractions, seed=4))
+        assert abs(len(parts[name]) - 300 * fraction) < 4 * (300 * fraction * (1 - fraction)) ** 0.5
+    assert parts != scenes_of(split_by_scene(table, fractions, seed=4))
 
 
 def test_a_scene_stays_where_it_is_when_others_come() -> None:
@@ -69,17 +69,17 @@ def test_a_scene_stays_where_it_is_when_others_come() -> None:
 def test_exact_splits() -> None:
     fractions = {"train": 0.75, "val": 0.15, "test": 0.1}
     for count in (0, 1, 3, 45):
-        found = scenes_of(split_by_scene(many_scenes(count), fractions, exact=True))
-        assert sum(map(len, found.values())) == count
-        assert all(abs(len(found[name]) - f * count) < 1 for name, f in fractions.items())
+        parts = scenes_of(split_by_scene(many_scenes(count), fractions, exact=True))
+        assert sum(map(len, parts.values())) == count
+        assert all(abs(len(parts[name]) - f * count) < 1 for name, f in fractions.items())
 
 
 def test_splits_of_datasets(written: Path) -> None:
     parts = split_by_scene(WeatherDataset(written), {"a": 0.5, "b": 0.5}, exact=True)
-    found = {name: set(part.table["scene"].to_pylist()) for name, part in parts.items()}
-    assert sorted(map(sorted, found.values())) == [["alley"], ["street"]]
+    scenes = {name: set(part.table["scene"].to_pylist()) for name, part in parts.items()}
+    assert sorted(map(sorted, scenes.values())) == [["alley"], ["street"]]
     assert {len(part) for part in parts.values()} == {12, 36}
-    assert all(part[0]["scene"] in found[name] for name, part in parts.items())
+    assert all(part[0]["scene"] in scenes[name] for name, part in parts.items())
     for fractions in ({}, {"train": 0.8}, {"train": 1.2, "val": -0.2}):
         with pytest.raises(ValueError, match="fractions must be >= 0 and add up to 1"):
             split_by_scene(WeatherDataset(written), fractions)
@@ -129,54 +129,54 @@ def test_boxes_of_clips_in_the_cameras_frames(written: Path) -> None:
 
 
 def test_clips_never_span_gaps(written: Path) -> None:
-    whole = WeatherDataset(written, load=())
+    dataset = WeatherDataset(written, load=())
     # Four sequences (three variants and another scene) of six frames.
-    assert len(ClipDataset(whole, 6)) == 4 and len(ClipDataset(whole, 7)) == 0
-    assert frames_of(ClipDataset(whole, 2, step=3, stride=2))[:2] == [[0, 3], [2, 5]]
-    one = whole.select(np.arange(12))
-    rows = one.table
+    assert len(ClipDataset(dataset, 6)) == 4 and len(ClipDataset(dataset, 7)) == 0
+    assert frames_of(ClipDataset(dataset, 2, step=3, stride=2))[:2] == [[0, 3], [2, 5]]
+    single_scene = dataset.select(np.arange(12))
+    rows = single_scene.table
     lacking = np.array([row != (2, "front") for row in zip(
         rows["frame"].to_pylist(), rows["camera"].to_pylist(), strict=True)])  # fmt: skip
-    assert frames_of(ClipDataset(one.select(lacking), 2)) == [[0, 1], [3, 4], [4, 5]]
-    other = ClipDataset(one.select(lacking), 2, cameras=["rear/left"])
+    assert frames_of(ClipDataset(single_scene.select(lacking), 2)) == [[0, 1], [3, 4], [4, 5]]
+    other = ClipDataset(single_scene.select(lacking), 2, cameras=["rear/left"])
     assert len(other) == 5 and other.row_numbers(1).shape == (2, 1)
-    even = whole.select(whole.rows.numbers("frame") % 2 == 0)  # a job over every second frame
+    even = dataset.select(dataset.rows.numbers("frame") % 2 == 0)  # a job over every second frame
     assert frames_of(ClipDataset(even, 3)) == [[0, 2, 4]] * 4
     with pytest.raises(ValueError, match="length, step and stride must be >= 1; got"):
-        ClipDataset(whole, 0)
+        ClipDataset(dataset, 0)
     with pytest.raises(ValueError, match=r"no camera \['back'\]; there are"):
-        ClipDataset(whole, 2, cameras=["back"])
+        ClipDataset(dataset, 2, cameras=["back"])
     with pytest.raises(IndexError, match="clip 4 of a dataset of 4"):
-        ClipDataset(whole, 6)[4]
-    assert len(ClipDataset(whole.select(np.zeros(len(whole), bool)), 1)) == 0
+        ClipDataset(dataset, 6)[4]
+    assert len(ClipDataset(dataset.select(np.zeros(len(dataset), bool)), 1)) == 0
 
 
 def test_clips_never_span_a_pause(written: Path) -> None:
-    one = WeatherDataset(written, scenes=["alley"])
-    table = one.table
+    alley = WeatherDataset(written, scenes=["alley"])
+    table = alley.table
     late_ns = 300_000_000 * (table["frame"].to_numpy() >= 4)
     times = pa.array(table["timestamp_ns"].to_numpy() + late_ns)
     place = table.column_names.index("timestamp_ns")
-    one.rows = Rows.of(table.set_column(place, "timestamp_ns", times))
-    assert frames_of(ClipDataset(one, 2)) == [[0, 1], [1, 2], [2, 3], [4, 5]]
+    alley.rows = Rows.of(table.set_column(place, "timestamp_ns", times))
+    assert frames_of(ClipDataset(alley, 2)) == [[0, 1], [1, 2], [2, 3], [4, 5]]
 
 
 def test_pairs_show_the_same_moment(written: Path) -> None:
-    whole = WeatherDataset(written)
-    pairs = PairedDataset.of(whole)
+    dataset = WeatherDataset(written)
+    pairs = PairedDataset.of(dataset)
     assert len(pairs) == 24 and pairs.unpaired == 0
-    seen = set()
+    moments = set()
     for index in range(len(pairs)):
         clean, weathered = pairs[index]["clean"], pairs[index]["weathered"]
         for key in ("scene", "frame"):
             assert clean[key] == weathered[key]
         assert clean["camera"]["name"] == weathered["camera"]["name"]
         assert clean["variant"] == "clear-000"
-        seen.add(weathered["variant"])
-    assert seen == {"fog-000", "clear-009"}
-    named = PairedDataset.of(whole, clean_variant="fog-000")
-    assert len(named) == 24 and named[0]["clean"]["variant"] == "fog-000"
-    assert named.unpaired == 12  # alley has no fog
+        moments.add(weathered["variant"])
+    assert moments == {"fog-000", "clear-009"}
+    fog_pairs = PairedDataset.of(dataset, clean_variant="fog-000")
+    assert len(fog_pairs) == 24 and fog_pairs[0]["clean"]["variant"] == "fog-000"
+    assert fog_pairs.unpaired == 12  # alley has no fog
 
 
 def test_what_is_clean(written: Path, tmp_path: Path) -> None:
@@ -186,44 +186,44 @@ def test_what_is_clean(written: Path, tmp_path: Path) -> None:
     level = make_recipe("clear", variant=1, flood=Flood(level_m=0.0))
     bare = make_recipe("clear", variant=2, snow=Snow(depth_m=0.0))
     write_scene(tmp_path, [CLEAR, level, bare], frames=2)
-    found = clean_frames(WeatherDataset(tmp_path))
+    clean = clean_frames(WeatherDataset(tmp_path))
     # Water at a level of 0 is water; snow of no depth is none.
-    assert set(found.table["variant"].to_pylist()) == {"clear-000", "clear-002"}
-    whole = WeatherDataset(tmp_path)
+    assert set(clean.table["variant"].to_pylist()) == {"clear-000", "clear-002"}
+    dataset = WeatherDataset(tmp_path)
     with pytest.raises(ValueError, match=r"frame 0, camera 'front' has more than one clean image"):
-        PairedDataset.of(whole)
-    assert len(PairedDataset.of(whole, "clear-002")) == 8
+        PairedDataset.of(dataset)
+    assert len(PairedDataset.of(dataset, "clear-002")) == 8
     with pytest.raises(ValueError, match=r"no variant 'x'; there are clear-000, clear-001"):
-        clean_frames(whole, "x")
+        clean_frames(dataset, "x")
     foggy = WeatherDataset(written, scenes=["street"], variants=["fog-000"], frames=[5])
     with pytest.raises(ValueError, match="no clean image has the scene, frame and camera"):
-        PairedDataset(clean_frames(whole, "clear-000"), foggy)
+        PairedDataset(clean_frames(dataset, "clear-000"), foggy)
 
 
 def test_mixtures_depend_on_seed_epoch_and_index_only(written: Path) -> None:
-    whole = WeatherDataset(written, load=())
-    clean = clean_frames(whole)
-    weathered = whole.select(whole.rows.numbers("frame") < 5)
+    dataset = WeatherDataset(written, load=())
+    clean = clean_frames(dataset)
+    weathered = dataset.select(dataset.rows.numbers("frame") < 5)
     weathered = weathered.select(
         np.array([name != "clear-000" for name in weathered.table["variant"].to_pylist()])
     )
     mixed = MixedDataset(clean, weathered, 0.5, seed=1)
     assert len(mixed) == len(clean) == 24
-    drawn: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     of_clean, of_weathered = clean.table.to_pylist(), weathered.table.to_pylist()
     for epoch in range(40):
         mixed.set_epoch(epoch)
         for index in range(24):
             row = mixed.weathered_row(index)
             if of_clean[index]["scene"] == "street" and of_clean[index]["frame"] < 5:
-                drawn["clear-000" if row is None else of_weathered[row]["variant"]] += 1
+                counts["clear-000" if row is None else of_weathered[row]["variant"]] += 1
             else:
                 assert row is None
             if row is not None:
                 for name in ("scene", "frame", "camera"):
                     assert of_weathered[row][name] == of_clean[index][name]
     # 400 draws; four standard deviations.
-    assert abs(drawn["clear-000"] - 200) < 40 and abs(drawn["fog-000"] - 100) < 35
+    assert abs(counts["clear-000"] - 200) < 40 and abs(counts["fog-000"] - 100) < 35
     mixed.set_epoch(3)
     again = MixedDataset(clean, weathered, 0.5, seed=1)
     again.set_epoch(3)
@@ -249,22 +249,22 @@ def test_every_sample_once_over_all_ranks(uneven) -> None:
         ]
         shares = [list(sampler) for sampler in samplers]
         assert [len(share) for share in shares] == [len(sampler) for sampler in samplers]
-        given = Counter(index for share in shares for index in share)
+        counts = Counter(index for share in shares for index in share)
         if uneven == "exact":
-            assert given == Counter(range(count))
+            assert counts == Counter(range(count))
         else:
             assert len(set(map(len, shares))) == 1
-            extra = given.total() - count
+            extra = counts.total() - count
             assert -ranks < extra < ranks and (extra >= 0) == (uneven == "pad" or extra == 0)
-            assert set(given) <= set(range(count)) and len(given) == min(count, given.total())
+            assert set(counts) <= set(range(count)) and len(counts) == min(count, counts.total())
 
 
 def test_orders_differ_by_epoch_and_seed() -> None:
-    one, other = ShardedSampler(50, seed=1), ShardedSampler(50, seed=1)
-    first = list(one)
-    assert first == list(one) == list(other) and sorted(first) == list(range(50))
-    one.set_epoch(1)
-    assert list(one) != first and list(ShardedSampler(50, seed=2)) != first
+    first_sampler, second_sampler = ShardedSampler(50, seed=1), ShardedSampler(50, seed=1)
+    first = list(first_sampler)
+    assert first == list(first_sampler) == list(second_sampler) and sorted(first) == list(range(50))
+    first_sampler.set_epoch(1)
+    assert list(first_sampler) != first and list(ShardedSampler(50, seed=2)) != first
     assert list(ShardedSampler(range(5), shuffle=False)) == [0, 1, 2, 3, 4]
 
 
@@ -292,8 +292,8 @@ def test_an_epoch_goes_on_after_an_interruption(ranks_after: int) -> None:
 
 def test_a_sampler_knows_what_it_gave_out(unchecked) -> None:
     sampler = ShardedSampler(10, seed=4)
-    given = iter(sampler)
-    first = [next(given) for _ in range(4)]
+    iterator = iter(sampler)
+    first = [next(iterator) for _ in range(4)]
     other = ShardedSampler(10, seed=4)
     other.load_state_dict(sampler.state_dict())
     assert sorted(first + list(other)) == list(range(10))
@@ -308,7 +308,7 @@ def test_a_sampler_knows_what_it_gave_out(unchecked) -> None:
 
 def test_ranks_and_workers_share_an_epoch(written: Path) -> None:
     dataset = WeatherDataset(written, load=())
-    seen: Counter[tuple] = Counter()
+    counts: Counter[tuple] = Counter()
     for rank in range(2):
         loader = DataLoader(
             dataset, batch_size=5, num_workers=2, collate_fn=collate_frames,
@@ -321,5 +321,5 @@ def test_ranks_and_workers_share_an_epoch(written: Path) -> None:
                 batch["frame"].tolist(),
                 batch["camera"]["name"],
             )
-            seen.update(zip(*keys, strict=True))
-    assert len(seen) == 48 and set(seen.values()) == {1}
+            counts.update(zip(*keys, strict=True))
+    assert len(counts) == 48 and set(counts.values()) == {1}

@@ -161,13 +161,15 @@ def test_labelled_returns_come_first_and_are_the_datasets_minus_its_origin() -> 
     classes = np.repeat([7, 3], [40_000, len(points) - 40_000])
     labels = KnownLabels(points + origin, classes)
     wrong = splats(road() + np.array([0, 0, 0.7]), Class.ROAD)
-    known = scene(0.05, labels=labels, world_origin_m=origin, background=wrong)
-    ground = ground_of(known)
+    labelled_scene = scene(0.05, labels=labels, world_origin_m=origin, background=wrong)
+    ground = ground_of(labelled_scene)
     assert ground.source == "lidar labels"
     assert ground.lowest_z_m == pytest.approx(0, abs=HEIGHT_M)
     assert ground.median_z_m == pytest.approx(0.05 * LENGTH_M / 2, abs=HEIGHT_M)
-    assert ground_of(known) is ground  # remembered
-    assert ground_of(dataclasses.replace(known)) == ground  # and the same when measured again
+    assert ground_of(labelled_scene) is ground  # remembered
+    assert (
+        ground_of(dataclasses.replace(labelled_scene)) == ground
+    )  # and the same when measured again
 
 
 def test_classes_nobody_explains_are_not_taken_for_roads(with_open3d) -> None:

@@ -61,9 +61,9 @@ def coco_of(out: Path, part: str = "train") -> dict:
 
 
 def annotations_of(out: Path, variant: str, frame: int = 0) -> tuple[dict, list[dict]]:
-    read = coco_of(out)
-    found = [i for i in read["images"] if (i["variant"], i["frame"]) == (variant, frame)]
-    return found[0], [a for a in read["annotations"] if a["image_id"] == found[0]["id"]]
+    coco_file = coco_of(out)
+    images = [i for i in coco_file["images"] if (i["variant"], i["frame"]) == (variant, frame)]
+    return images[0], [a for a in coco_file["annotations"] if a["image_id"] == images[0]["id"]]
 
 
 def pixels_of(annotation: dict) -> np.ndarray:
@@ -79,8 +79,8 @@ def pixels_of(annotation: dict) -> np.ndarray:
                 number -= 1 << shift
             counts.append(number + (counts[-2] if len(counts) > 2 else 0))
             number = shift = 0
-    shown = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
-    return np.pad(shown, (0, height * width - len(shown))).reshape(width, height).T
+    is_object = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
+    return np.pad(is_object, (0, height * width - len(is_object))).reshape(width, height).T
 
 
 # ---- Masks ---------------------------------------------------------------------------------------
@@ -97,18 +97,20 @@ def test_masks_are_encoded_as_pycocotools_encodes_them() -> None:
         if trial % 7 == 0:
             image[:] = trial % 2
         numbers = np.array([1, 2, 9, 0, 3, 2], np.uint16)
-        found = encode_masks(image, numbers)
+        encoded = encode_masks(image, numbers)
         for box, number in enumerate(numbers):
-            own = (image == number) & (number > 0)
-            rows, columns = np.nonzero(own)
-            sides = [found[side][box] for side in ("left", "top", "right", "bottom")]
-            assert found["pixels"][box] == own.sum()
-            if not own.any():
-                assert sides == [0, 0, 0, 0] and found["rle"][box] == ""
+            object_mask = (image == number) & (number > 0)
+            rows, columns = np.nonzero(object_mask)
+            sides = [encoded[side][box] for side in ("left", "top", "right", "bottom")]
+            assert encoded["pixels"][box] == object_mask.sum()
+            if not object_mask.any():
+                assert sides == [0, 0, 0, 0] and encoded["rle"][box] == ""
                 continue
             assert sides == [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-            expected = mask.encode(np.asfortranarray(own.astype(np.uint8)))["counts"].decode()
-            assert found["rle"][box] == expected
+            expected = mask.encode(np.asfortranarray(object_mask.astype(np.uint8)))[
+                "counts"
+            ].decode()
+            assert encoded["rle"][box] == expected
 
 
 def test_a_pixel_by_depth_shows_the_smallest_box_that_has_its_surface() -> None:
@@ -117,21 +119,21 @@ def test_a_pixel_by_depth_shows_the_smallest_box_that_has_its_surface() -> None:
     boxes, camera = scene.boxes(0), scene.frames[0].cameras["ahead"].scaled(0.25)
     rng = np.random.default_rng(1)
     depth = rng.uniform(0, 20, (camera.height, camera.width)).astype(np.float32)
-    placed = PlacedBoxes.of(boxes, np.asarray(scene.world_origin_m))
-    sizes = [placed.sizes_m, placed.sizes_m * [[3], [1], [2]]]
-    tight = [replace(placed, sizes_m=s, low_m=-s / 2, high_m=s / 2) for s in sizes]
+    world_boxes = PlacedBoxes.of(boxes, np.asarray(scene.world_origin_m))
+    sizes = [world_boxes.sizes_m, world_boxes.sizes_m * [[3], [1], [2]]]
+    tight = [replace(world_boxes, sizes_m=s, low_m=-s / 2, high_m=s / 2) for s in sizes]
     points = depth[..., None] * camera.ray_directions(torch.float64).numpy()
     points = points + camera.centre.numpy()
-    for own in tight:
+    for sized_boxes in tight:
         owners = np.zeros(depth.shape, np.int64)
-        for box in np.argsort(-np.prod(own.sizes_m, axis=1)):
-            along = (points - own.centres_m[box]) @ own.rotations[box]
-            inside = (abs(along) <= own.sizes_m[box] / 2).all(axis=-1) & (depth > 0)
+        for box in np.argsort(-np.prod(sized_boxes.sizes_m, axis=1)):
+            along = (points - sized_boxes.centres_m[box]) @ sized_boxes.rotations[box]
+            inside = (abs(along) <= sized_boxes.sizes_m[box] / 2).all(axis=-1) & (depth > 0)
             owners[inside] = box + 1
-        found = find_occlusion(own, camera, depth, with_owners=True).owners
-        assert found is not None and (owners > 0).sum() > 20
+        box_owners = find_occlusion(sized_boxes, camera, depth, with_owners=True).owners
+        assert box_owners is not None and (owners > 0).sum() > 20
         # Rays that graze a side: rounding decides, in one pixel of a thousand at most.
-        assert (found != owners).mean() < 1e-3
+        assert (box_owners != owners).mean() < 1e-3
 
 
 def test_masks_follow_the_instance_image_where_there_is_one(output: Path) -> None:
@@ -146,8 +148,8 @@ def test_masks_follow_the_instance_image_where_there_is_one(output: Path) -> Non
     # By depth the lowest 8 cm are left out, and the wall's edge blurs: nearly the same.
     by_depth = {a["track_id"]: a for a in annotations_of(output, "clear-000")[1]}
     for annotation in annotations:
-        one, other = pixels_of(annotation), pixels_of(by_depth[annotation["track_id"]])
-        assert (one & other).sum() > 0.85 * (one | other).sum()
+        mask, depth_mask = pixels_of(annotation), pixels_of(by_depth[annotation["track_id"]])
+        assert (mask & depth_mask).sum() > 0.85 * (mask | depth_mask).sum()
 
 
 # ---- The formats, read back ----------------------------------------------------------------------
@@ -157,11 +159,11 @@ def test_masks_follow_the_instance_image_where_there_is_one(output: Path) -> Non
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 def test_pycocotools_reads_the_annotations(output: Path) -> None:
     coco = pytest.importorskip("pycocotools.coco", reason="pycocotools is not installed")
-    read = coco.COCO(str(output / "labels/coco/instances_train.json"))
-    assert [c["name"] for c in read.loadCats(read.getCatIds())] == ["Car"]
-    assert len(read.getImgIds()) == 8 and len(read.getAnnIds()) > 10
-    for annotation in read.loadAnns(read.getAnnIds()):
-        mask = read.annToMask(annotation).astype(bool)
+    coco_api = coco.COCO(str(output / "labels/coco/instances_train.json"))
+    assert [c["name"] for c in coco_api.loadCats(coco_api.getCatIds())] == ["Car"]
+    assert len(coco_api.getImgIds()) == 8 and len(coco_api.getAnnIds()) > 10
+    for annotation in coco_api.loadAnns(coco_api.getAnnIds()):
+        mask = coco_api.annToMask(annotation).astype(bool)
         np.testing.assert_array_equal(mask, pixels_of(annotation))
         rows, columns = np.nonzero(mask)
         x, y, width, height = annotation["bbox"]
@@ -169,12 +171,14 @@ def test_pycocotools_reads_the_annotations(output: Path) -> None:
             columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
         )  # fmt: skip
         assert annotation["area"] == mask.sum()
-    for image in read.loadImgs(read.getImgIds()):
+    for image in coco_api.loadImgs(coco_api.getImgIds()):
         shape = cv2.imread(str(output / image["file_name"])).shape
         assert shape == (image["height"], image["width"], 3)
     # A wall stands before half of the parked car.
-    hidden = [a for a in read.anns.values() if a["track_id"] == "parked" and a["iscrowd"] == 0]
-    assert all(0.1 < a["occlusion"] < 0.9 for a in hidden if a["image_id"] == 0)
+    hidden_annotations = [
+        a for a in coco_api.anns.values() if a["track_id"] == "parked" and a["iscrowd"] == 0
+    ]
+    assert all(0.1 < a["occlusion"] < 0.9 for a in hidden_annotations if a["image_id"] == 0)
 
 
 def kitti_objects(out: Path, number: int) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
@@ -185,8 +189,8 @@ def kitti_objects(out: Path, number: int) -> tuple[np.ndarray, list[tuple[str, n
     )
     lines = (top / f"label_2/{number:06d}.txt").read_text().splitlines()
     words = [line.split() for line in lines]
-    assert all(len(each) == 15 for each in words)
-    objects = [(each[0], np.array(each[1:], np.float64)) for each in words]
+    assert all(len(line_words) == 15 for line_words in words)
+    objects = [(line_words[0], np.array(line_words[1:], np.float64)) for line_words in words]
     return np.array(calib["P2"].split(), np.float64).reshape(3, 4), objects
 
 
@@ -244,16 +248,16 @@ def test_yolo_boxes_are_those_of_coco(output: Path) -> None:
     assert (top / "data.yaml").read_text() == (
         'train: images/train\nval: images/train\nnames:\n  0: "Car"\n'
     )
-    read = coco_of(output)
-    for image in read["images"]:
+    coco_file = coco_of(output)
+    for image in coco_file["images"]:
         name = f"train/{image['id']:06d}"
         assert (top / f"images/{name}.png").samefile(output / image["file_name"])
         lines = (top / f"labels/{name}.txt").read_text().splitlines()
-        shown = [
-            a for a in read["annotations"] if a["image_id"] == image["id"] and not a["iscrowd"]
+        coco_annotations = [
+            a for a in coco_file["annotations"] if a["image_id"] == image["id"] and not a["iscrowd"]
         ]
         size = np.array([image["width"], image["height"]] * 2)
-        for line, annotation in zip(lines, shown, strict=True):
+        for line, annotation in zip(lines, coco_annotations, strict=True):
             category, *numbers = map(float, line.split())
             cx, cy, width, height = np.array(numbers) * size
             box = [cx - width / 2, cy - height / 2, width, height]
@@ -266,9 +270,9 @@ def test_what_the_weather_hides_is_marked_or_left_out(output: Path) -> None:
     image, marked = annotations_of(output, "marked-000")
     removed = annotations_of(output, "removed-000")[1]
     assert [a["track_id"] for a in marked] == [a["track_id"] for a in clear]
-    hidden = {a["track_id"] for a in marked if a["visibility"] < 0.4}
-    assert hidden == {a["track_id"] for a in marked if a["iscrowd"]} == {"parked"}
-    assert {a["track_id"] for a in removed} == {a["track_id"] for a in clear} - hidden
+    hidden_ids = {a["track_id"] for a in marked if a["visibility"] < 0.4}
+    assert hidden_ids == {a["track_id"] for a in marked if a["iscrowd"]} == {"parked"}
+    assert {a["track_id"] for a in removed} == {a["track_id"] for a in clear} - hidden_ids
     kinds = [kind for kind, _ in kitti_objects(output, image["id"])[1]]
     assert kinds == ["DontCare" if a["iscrowd"] else "Car" for a in marked]
     dont_care = next(n for kind, n in kitti_objects(output, image["id"])[1] if kind == "DontCare")
@@ -298,8 +302,8 @@ class OddLabels(StreetLabels):
 
 def test_boxes_without_a_size_or_a_label_are_no_objects(tmp_path: Path) -> None:
     """Their tables keep them as they are; nothing for trainers has a number that is none."""
-    asked = recipe(f"{ALL}, instance: true")
-    job = RenderJob("test:odd", [asked], tmp_path, frames=[0], backend="cpu")
+    mask_recipe = recipe(f"{ALL}, instance: true")
+    job = RenderJob("test:odd", [mask_recipe], tmp_path, frames=[0], backend="cpu")
     run_job(job, scene_loader=lambda uri: street(OddLabels()), progress=False)
     done = write_labels(tmp_path)
     assert done.unmapped == {"": 1} and done.without_numbers == 1
@@ -323,36 +327,38 @@ def test_the_first_row_that_takes_a_label_names_its_category() -> None:
     cases = {"vehicle.bus.rigid": "bus", "vehicle.car": "car", "a.rider": "person", "vehicle": None}
     assert {label: category_of(label, table) for label in cases} == cases
     assert category_of("anything", None) == "anything"
-    every = (Category(label="*", name="object"),)
-    assert category_of("", None) is category_of("", every) is None  # the dataset has no label
+    any_category = (Category(label="*", name="object"),)
+    assert (
+        category_of("", None) is category_of("", any_category) is None
+    )  # the dataset has no label
 
 
 def test_what_will_be_written_is_known_before(output: Path) -> None:
     table = "categories: [{label: Car, name: vehicle}], min_visibility: 0.4"
     planned = planned_labels(street(), recipe(f"{ALL}, {table}").output)
     assert planned is not None and planned["min_visibility"] == 0.4
-    asked = [name.replace("*", "000000*") for name in planned["files"]]
-    both = [name for text in asked for name in _expanded(text)]
+    patterns = [name.replace("*", "000000*") for name in planned["files"]]
+    both = [name for text in patterns for name in _expanded(text)]
     assert len(both) == 8 and all(any(output.glob(name)) for name in both)
     boxes = [street().boxes(frame.index) for frame in street().frames]
-    labels = [label for own in boxes for label in own.labels]
+    labels = [label for frame_boxes in boxes for label in frame_boxes.labels]
     tracks = {
         track
-        for own in boxes
-        for track, lb in zip(own.track_ids, own.labels, strict=True)
+        for frame_boxes in boxes
+        for track, lb in zip(frame_boxes.track_ids, frame_boxes.labels, strict=True)
         if lb == "Car"
     }
-    known = {"vehicle": {"boxes": labels.count("Car"), "objects": len(tracks)}}
-    assert planned["categories"] == known
+    expected_categories = {"vehicle": {"boxes": labels.count("Car"), "objects": len(tracks)}}
+    assert planned["categories"] == expected_categories
     assert sum(planned["unmapped"].values()) == len(labels) - labels.count("Car")
     assert planned_labels(street(), recipe("labels: true").output) is None
 
 
 def _expanded(pattern: str) -> list[str]:
-    before, brace, rest = pattern.partition("{")
+    before, brace, suffix = pattern.partition("{")
     if not brace:
         return [pattern]
-    names, _, after = rest.partition("}")
+    names, _, after = suffix.partition("}")
     return [before + name + after for name in names.split(",")]
 
 
@@ -384,18 +390,23 @@ def test_the_files_do_not_depend_on_how_the_job_went(tmp_path: Path) -> None:
     """One scene after the other or in blocks, at once or in parts: the same bytes."""
     recipes = make_recipes(("fog",), texts=LABELLED)
     run_generate(make_job(tmp_path / "blocks", recipes=recipes), progress=False)
-    given = {s.uri: recipes.of_scene(s, s.uri[5]) for s in make_job("x", recipes=recipes).scenes}
-    for uri, resolved in given.items():
+    scene_recipes = {
+        s.uri: recipes.of_scene(s, s.uri[5]) for s in make_job("x", recipes=recipes).scenes
+    }
+    for uri, resolved in scene_recipes.items():
         for frames in ((0, 2), None):
             job = RenderJob(uri, resolved, tmp_path / "parts", frames=frames)
             run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
             write_labels(tmp_path / "parts")
     write_labels(tmp_path / "blocks")
-    one, other = tree_digest(tmp_path / "blocks/labels"), tree_digest(tmp_path / "parts/labels")
-    assert one == other and len(one) > 5 * 14
+    block_digest, part_digest = (
+        tree_digest(tmp_path / "blocks/labels"),
+        tree_digest(tmp_path / "parts/labels"),
+    )
+    assert block_digest == part_digest and len(block_digest) > 5 * 14
     count = sum(len(FakeLabels().boxes(frame)) for frame in range(4))
-    shown = {a["track_id"] for a in coco_of(tmp_path / "parts")["annotations"]}
-    assert shown and shown <= {f"track-{k}" for k in range(count)}
+    shown_ids = {a["track_id"] for a in coco_of(tmp_path / "parts")["annotations"]}
+    assert shown_ids and shown_ids <= {f"track-{k}" for k in range(count)}
     split = LabelsAsked(split={"train": 0.5, "val": 0.5}, seed=0)
     parts = write_labels(tmp_path / "parts", split).parts
     scenes = {p: {i["scene"] for i in coco_of(tmp_path / "parts", p)["images"]} for p in parts}

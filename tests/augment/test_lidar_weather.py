@@ -21,12 +21,18 @@ from augment.effects.flood.flood import FloodMedium
 from augment.effects.flood.lidar import ABSORPTION_905_PER_M, meet_water
 from augment.effects.flood.waves import make_waves
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
-from augment.effects.lidar.beam import LidarModel, origins_of
+from augment.effects.lidar.beam import LidarModel, find_beam_origins
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import soft_echo, soft_response, wavelength_factor
 from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.effect import snow_layers_of
-from augment.effects.snow.lidar import GROUND_SLACK_M, LidarSnow, layer_of, meet_layers, snow_in
+from augment.effects.snow.lidar import (
+    GROUND_SLACK_M,
+    LidarSnow,
+    find_lidar_snow,
+    intersect_layers,
+    make_snow_grid,
+)
 from augment.effects.snow.snow import PlacedSnow, placement_settings
 from augment.errors import OutputError
 from augment.jobs.manifest import read_manifest
@@ -98,10 +104,10 @@ def test_every_row_keeps_its_place() -> None:
     same = (out.points_m == sweep.points_m).all(1)
     assert not same[np.isin(code, [SCATTERED, LOST, MOVED])].any()
     assert same[~np.isin(code, [SCATTERED, LOST, MOVED])].all()
-    kept = drop_lost(out)
-    assert len(kept) == (code != LOST).sum() < 500
-    assert np.isfinite(kept.points_m).all()
-    np.testing.assert_array_equal(kept.columns["ring"], kept.columns["source_index"])
+    received = drop_lost(out)
+    assert len(received) == (code != LOST).sum() < 500
+    assert np.isfinite(received.points_m).all()
+    np.testing.assert_array_equal(received.columns["ring"], received.columns["source_index"])
     assert drop_lost(sweep) is sweep
 
 
@@ -119,8 +125,8 @@ def test_returns_that_are_none_and_sweeps_without_intensity() -> None:
     np.testing.assert_array_equal(out.points_m[bad], sweep.points_m[bad])
     assert (out.columns["weather_code"] == SCATTERED).any()
     with_gap = np.where(bad, np.nan, 0.4)
-    shown = weathered_sweep(street(), recipe(smog=40, flood=0.1), 0, sweep_of(points, with_gap))
-    np.testing.assert_array_equal(np.isnan(shown.columns["intensity"]), bad)
+    weathered = weathered_sweep(street(), recipe(smog=40, flood=0.1), 0, sweep_of(points, with_gap))
+    np.testing.assert_array_equal(np.isnan(weathered.columns["intensity"]), bad)
     empty = weathered_sweep(street(), recipe(smog=40, flood=0.1), 0, sweep_of(np.zeros((0, 3))))
     assert len(empty) == 0 and set(empty.columns) >= ADDED
 
@@ -141,14 +147,14 @@ def test_origins_by_default_and_wrong_ones() -> None:
     sweep = sweep_of(some_points(4))
     unknown = street(labels=SensorLabels(None))
     expected = WORLD_ORIGIN_M + np.array([0.0, 0.0, 1.8])
-    np.testing.assert_allclose(origins_of(unknown, 0, sweep), np.tile(expected, (4, 1)))
+    np.testing.assert_allclose(find_beam_origins(unknown, 0, sweep), np.tile(expected, (4, 1)))
 
     class Wrong(SensorLabels):
         def lidar_origins(self, frame_index, sweep):
             return np.zeros((1, 3))
 
     with pytest.raises(ValueError, match=r"must be \[4, 3\].*got \[1, 3\]"):
-        origins_of(street(labels=Wrong(None)), 0, sweep)
+        find_beam_origins(street(labels=Wrong(None)), 0, sweep)
 
 
 def _depth_gaps(scene: Scene, camera: Camera, view: WeatheredView, sweep: LidarSweep) -> np.ndarray:
@@ -158,10 +164,12 @@ def _depth_gaps(scene: Scene, camera: Camera, view: WeatheredView, sweep: LidarS
     x, y, z = (offsets @ pose[:3, :3].T + pose[:3, 3]).T
     ahead = z > 0.5
     column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    seen = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    at = row[seen].astype(int), column[seen].astype(int)
-    shown, is_snow = view.depth_m[at], view.masks["snow"][at] == 255
-    return np.abs(z[seen] - shown)[is_snow & (shown > 0)]
+    is_in_image = (
+        ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    )
+    at = row[is_in_image].astype(int), column[is_in_image].astype(int)
+    image_depth_m, is_snow = view.depth_m[at], view.masks["snow"][at] == 255
+    return np.abs(z[is_in_image] - image_depth_m)[is_snow & (image_depth_m > 0)]
 
 
 @pytest.mark.long
@@ -201,10 +209,10 @@ def test_auto_weathers_what_it_can_and_tells_of_the_rest(tmp_path: Path) -> None
         rows = read_manifest(out).to_pylist()
         return done.failed, {row["frame"]: (row["lidar"], row["lidar_note"]) for row in rows}
 
-    failed, shown = outcome(wet, tmp_path / "out")
-    assert failed == 0 and shown[0] == shown[2] == ("weather", shown[0][1])
-    assert shown[3] == (None, None)  # there is no sweep
-    kind, note = shown[1]
+    failed, entries = outcome(wet, tmp_path / "out")
+    assert failed == 0 and entries[0] == entries[2] == ("weather", entries[0][1])
+    assert entries[3] == (None, None)  # there is no sweep
+    kind, note = entries[1]
     assert kind == "clean" and "not in depth or sweeps" in note
     assert re.search(r"no weather on this sweep: ValueError: lidar_origins of _Misfit", note)
     paths = [tmp_path / f"out/street/wet-000/lidar/{n:06d}.parquet" for n in range(3)]
@@ -216,10 +224,10 @@ def test_auto_weathers_what_it_can_and_tells_of_the_rest(tmp_path: Path) -> None
     for image in (tmp_path / "out/street/wet-000/images/front").iterdir():
         image.unlink()
     paths[2].write_bytes(before[2][:100])
-    assert outcome(wet, tmp_path / "out") == (0, shown)
+    assert outcome(wet, tmp_path / "out") == (0, entries)
     assert [path.read_bytes() for path in paths] == before
-    failed, shown = outcome(strict, tmp_path / "strict")
-    assert failed == 1 and shown[1] == (None, None) and shown[0][0] == "weather"
+    failed, entries = outcome(strict, tmp_path / "strict")
+    assert failed == 1 and entries[1] == (None, None) and entries[0][0] == "weather"
     with pytest.raises(OutputError, match="recipe hash there"):
         outcome(strict, tmp_path / "out")
 
@@ -243,11 +251,13 @@ def test_intensities_fall_by_two_ways() -> None:
     sweep = sweep_of(points, intensity=0.5)
     out = weathered_sweep(street(), recipe(smog=Smog(extinction_per_m=0.01)), 0, sweep)
     code = out.columns["weather_code"]
-    seen = code == ATTENUATED
-    assert seen.all(), "nothing is near the noise yet"
+    is_attenuated = code == ATTENUATED
+    assert is_attenuated.all(), "nothing is near the noise yet"
     expected = 0.5 * np.exp(-2 * 0.01 * ranges_of(sweep))
-    np.testing.assert_allclose(out.columns["intensity"][seen], expected[seen], rtol=1e-5)
-    assert (out.points_m[seen] == sweep.points_m[seen]).all()
+    np.testing.assert_allclose(
+        out.columns["intensity"][is_attenuated], expected[is_attenuated], rtol=1e-5
+    )
+    assert (out.points_m[is_attenuated] == sweep.points_m[is_attenuated]).all()
 
 
 @pytest.mark.parametrize("alpha", [0.002, 0.06, 0.5])
@@ -283,17 +293,17 @@ def test_the_soft_echo_is_the_integral(alpha: float) -> None:
 def test_denser_smog_leaves_less() -> None:
     sweep = sweep_of(some_points(1500), intensity=np.linspace(0, 1, 1500))
     scene = street()
-    kept, bright, unchanged = [], [], []
+    attenuated_masks, bright, unchanged = [], [], []
     for visibility_m in (5000, 1000, 300, 100, 50, 20, 5):
         out = weathered_sweep(scene, recipe(smog=visibility_m), 0, sweep)
         code = out.columns["weather_code"]
-        kept.append(code == ATTENUATED)
+        attenuated_masks.append(code == ATTENUATED)
         unchanged.append(code == UNCHANGED)
-        bright.append(np.where(kept[-1], out.columns["intensity"], 0))
+        bright.append(np.where(attenuated_masks[-1], out.columns["intensity"], 0))
     for thin, dense in itertools.pairwise(unchanged):
         assert not (dense & ~thin).any()
     for (thin, dense), (lit, dim) in zip(
-        itertools.pairwise(kept), itertools.pairwise(bright), strict=True
+        itertools.pairwise(attenuated_masks), itertools.pairwise(bright), strict=True
     ):
         assert not (dense & ~thin & ~unchanged[0]).any()
         assert (dim[dense & thin] <= lit[dense & thin]).all()
@@ -315,21 +325,21 @@ def scene():
 
 
 def meets(cells: SnowCells, depths: np.ndarray | float, points: np.ndarray) -> np.ndarray:
-    """Where beams to points end on a layer of snow, [N, 3]."""
-    layer = layer_of(cells, np.broadcast_to(np.float32(depths), len(cells)).copy())
+    """Return the points where beams end on a layer of snow, [N, 3]."""
+    layer = make_snow_grid(cells, np.broadcast_to(np.float32(depths), len(cells)).copy())
     snow = LidarSnow(layer, {}, 0.8)
     origins, directions, ends = beams(points)
-    hits = meet_layers(snow, street(), sweep_of(points), 0, origins, directions, ends)
+    hits = intersect_layers(snow, street(), sweep_of(points), 0, origins, directions, ends)
     assert (hits <= ends).all()
     return origins + hits[:, None] * directions
 
 
 def test_level_snow_is_met_at_its_top() -> None:
     points = ground_points(np.linspace(1, 19, 300))
-    found = meets(FLAT, 0.1, points)
-    np.testing.assert_allclose(found[:, 2], 0.1, atol=1e-6)  # cells are float32
+    points_on_snow = meets(FLAT, 0.1, points)
+    np.testing.assert_allclose(points_on_snow[:, 2], 0.1, atol=1e-6)  # cells are float32
     expected = SENSOR_M[0] + (points[:, 0] - SENSOR_M[0]) * (1.7 / 1.8)
-    np.testing.assert_allclose(found[:, 0], expected, atol=1e-5)
+    np.testing.assert_allclose(points_on_snow[:, 0], expected, atol=1e-5)
 
 
 @settings(max_examples=12, deadline=None, derandomize=True)
@@ -344,11 +354,11 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
     points = np.column_stack(
         [rng.uniform(1, 16, 12), rng.uniform(-5, 5, 12), rng.uniform(0, 3, 12)]
     )
-    layer = layer_of(cells, depths, grid_m=0.5)
+    layer = make_snow_grid(cells, depths, grid_m=0.5)
     if layer is None:
         return
     origins, directions, ends = beams(points)
-    shallow = meet_layers(
+    shallow = intersect_layers(
         LidarSnow(layer, {}, 1.0), street(), sweep_of(points), 0, origins, directions, ends
     )
     steps = np.arange(0.3, 20, 5e-3)
@@ -364,21 +374,21 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
     # A beam may clip a corner by less than a step, which the search does not see.
     assert (shallow[entered] <= first[entered] + 1e-6).all()
     assert (np.abs(shallow - first)[entered] < 1e-2).mean() > 0.8
-    deep = layer_of(cells, deeper * depths, grid_m=0.5)
-    hits = meet_layers(
+    deep = make_snow_grid(cells, deeper * depths, grid_m=0.5)
+    hits = intersect_layers(
         LidarSnow(deep, {}, 1.0), street(), sweep_of(points), 0, origins, directions, ends
     )
     assert (hits <= shallow + 1e-6).all()
 
 
 def test_the_layer_is_that_of_the_images(scene) -> None:
-    placed = PlacedSnow(SNOW, seed=0)
-    top = snow_in(scene, placed).ground.top
-    means = snow_layers_of(scene, placed).ground.gaussians.means.numpy()
+    recipe_snow = PlacedSnow(SNOW, seed=0)
+    top = find_lidar_snow(scene, recipe_snow).ground.top
+    means = snow_layers_of(scene, recipe_snow).ground.gaussians.means.numpy()
     covered = np.isfinite(top)
     # A splat's middle lies a centimetre inside the layer whose surface it shows.
     assert np.median(top[covered]) == pytest.approx(np.median(means[:, 2]), abs=0.02)
-    layer = snow_in(scene, placed).ground
+    layer = find_lidar_snow(scene, recipe_snow).ground
     index = np.floor((means[:, :2] - layer.corner) / layer.cell_m).astype(int)
     near = top[np.clip(index[:, 1], 0, top.shape[0] - 1), np.clip(index[:, 0], 0, top.shape[1] - 1)]
     # Drifts are centimetres high and metres long: with another seed they would not agree.
@@ -432,19 +442,21 @@ def medium(level_m: float = 0.02, extinction: float = 0.34, index: float = 1.333
 
 def test_a_shallow_bed_by_hand() -> None:
     """Straight down through 2 cm: 1 - F = 0.98, exp(-2 7.5 0.02), and 2 cm of water as 2.7."""
-    found = meet_water(medium(), *beams(np.array([[0.0, 0.0, 0.0]])), np.array([0.3]))
+    water_echo = meet_water(medium(), *beams(np.array([[0.0, 0.0, 0.0]])), np.array([0.3]))
     transmitted = 1 - ((1.333 - 1) / (1.333 + 1)) ** 2
-    assert found.kept[0] == pytest.approx(transmitted**2 * math.exp(-0.04 * ABSORPTION_905_PER_M))
-    assert found.range_m[0] == pytest.approx(1.78 + 1.333 * 0.02)
-    assert found.surface_m[0] == pytest.approx(1.78) and found.is_bed[0]
+    assert water_echo.kept[0] == pytest.approx(
+        transmitted**2 * math.exp(-0.04 * ABSORPTION_905_PER_M)
+    )
+    assert water_echo.range_m[0] == pytest.approx(1.78 + 1.333 * 0.02)
+    assert water_echo.surface_m[0] == pytest.approx(1.78) and water_echo.is_bed[0]
 
 
 def test_a_slanted_beam_bends() -> None:
     """45 degrees: asin(sin 45 / n) below, so 2 cm take 2 cm / cos of that."""
-    found = meet_water(medium(), *beams(np.array([[1.8, 0.0, 0.0]])), np.array([0.3]))
+    water_echo = meet_water(medium(), *beams(np.array([[1.8, 0.0, 0.0]])), np.array([0.3]))
     below = math.asin(math.sin(math.pi / 4) / 1.333)
     expected = 1.78 * math.sqrt(2) + 1.333 * 0.02 / math.cos(below)
-    assert found.range_m[0] == pytest.approx(expected, abs=1e-9)
+    assert water_echo.range_m[0] == pytest.approx(expected, abs=1e-9)
 
 
 def test_a_clear_flood_shows_its_bed_near_the_car_and_nothing_farther() -> None:

@@ -71,12 +71,12 @@ def test_a_merged_splat_has_the_mean_covariance_and_colour_of_the_mixture():
     weight = weight / weight.sum()
     mean = (weight[:, None] * g.means.double()).sum(0)
     off = g.means.double() - mean
-    own = turn @ torch.diag_embed(s**2) @ turn.mT + off[:, :, None] * off[:, None]
-    covariance = (weight[:, None, None] * own).sum(0)
+    covariances = turn @ torch.diag_embed(s**2) @ turn.mT + off[:, :, None] * off[:, None]
+    covariance = (weight[:, None, None] * covariances).sum(0)
     turn = rotmat_from_quat(merged.quats)[0]
-    found = turn @ torch.diag(merged.scales[0] ** 2) @ turn.T
+    merged_covariance = turn @ torch.diag(merged.scales[0] ** 2) @ turn.T
     torch.testing.assert_close(merged.means[0], mean)  # float64: rounding alone
-    torch.testing.assert_close(found, covariance)
+    torch.testing.assert_close(merged_covariance, covariance)
     torch.testing.assert_close(merged.sh[0], (weight[:, None, None] * g.sh.double()).sum(0))
 
 
@@ -95,15 +95,15 @@ def test_one_place_covers_what_its_splats_cover_together(opacity):
 def test_large_splats_stay_as_they_are_and_clear_ones_are_left_out():
     small, large = one_gaussian((1.0, 1.0, 0.0), 0.02), one_gaussian((1.0, 1.0, 0.01), 0.9)
     g = lod.join_pieces(
-        lod.Piece(each, np.zeros(1, np.int32), np.zeros(1, np.int64))
-        for each in (small, large, small, dataclasses.replace(small, opacities=torch.zeros(1)))
+        lod.Piece(splat, np.zeros(1, np.int32), np.zeros(1, np.int64))
+        for splat in (small, large, small, dataclasses.replace(small, opacities=torch.zeros(1)))
     ).gaussians
     merged, leads, into = lod.merge_cells(g, np.zeros(4, np.int64), 0.4, 0.1)
     assert sorted(leads.tolist()) == [0, 1]
     assert into[0] == into[2] != into[1] and into[3] == -1
-    kept = int(np.flatnonzero(leads == 1)[0])
+    large_row = int(np.flatnonzero(leads == 1)[0])
     for name in ("means", "quats", "scales", "opacities", "sh"):
-        assert torch.equal(getattr(merged, name)[kept], getattr(g, name)[1])
+        assert torch.equal(getattr(merged, name)[large_row], getattr(g, name)[1])
 
 
 def test_a_merged_splat_stands_for_the_heaviest_of_the_class_that_weighs_most():
@@ -152,13 +152,15 @@ def test_merged_surfaces_stay_closed_and_keep_their_mean_colour(part):
             is_orthographic=True,
         )
         full = draw(part, camera, RasterSettings())
-        found = draw(part, camera, RasterSettings(lod_px=1.1))
-        seen = full.alpha > 0.99
-        assert seen.float().mean() > 0.2
-        assert float((found.alpha - full.alpha)[seen].abs().mean()) < 0.01
-        shown = (found.rgb / found.alpha[..., None] - full.rgb / full.alpha[..., None])[seen]
+        merged = draw(part, camera, RasterSettings(lod_px=1.1))
+        is_opaque = full.alpha > 0.99
+        assert is_opaque.float().mean() > 0.2
+        assert float((merged.alpha - full.alpha)[is_opaque].abs().mean()) < 0.01
+        color_errors = (merged.rgb / merged.alpha[..., None] - full.rgb / full.alpha[..., None])[
+            is_opaque
+        ]
         # Where the wall stands on the road, cells have the colours of both.
-        assert float(shown.mean().abs()) < 1 / 255
+        assert float(color_errors.mean().abs()) < 1 / 255
 
 
 # ---- what a camera takes -------------------------------------------------------------------------
@@ -232,17 +234,19 @@ def test_numbers_of_splats_are_the_parts_own_and_actors_keep_theirs(part):
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = torch.tensor([20.0, 1.0, 0.0])
     actor = PosedGaussians(one_gaussian((0.0, 0.0, 0.0), 0.4, 0.99), pose, 1)
-    drawn = [
+    id_images = [
         rasterize([part, actor], eye(), buffers=BUFFERS, settings=s).splat_ids
         for s in (RasterSettings(), RasterSettings(lod_px=4.0))
     ]
-    assert int(drawn[1].max()) == len(part.gaussians)  # the actor's, the last of all
+    assert int(id_images[1].max()) == len(part.gaussians)  # the actor's, the last of all
     # In its rim, of some 40 pixels, a merged splat may be the heaviest.
-    is_actor = [ids == len(part.gaussians) for ids in drawn]
+    is_actor = [ids == len(part.gaussians) for ids in id_images]
     assert int(is_actor[0].sum()) > 10 and int((is_actor[0] & ~is_actor[1]).sum()) <= 15
     classes = torch.cat([part.gaussians.semantic, torch.zeros(2, dtype=torch.int16)])
-    shown = [torch.where(ids < 0, -1, classes[ids]) for ids in drawn]
-    assert float((shown[0] == shown[1]).float().mean()) > 0.98  # but where wall and road meet
+    class_images = [torch.where(ids < 0, -1, classes[ids]) for ids in id_images]
+    assert (
+        float((class_images[0] == class_images[1]).float().mean()) > 0.98
+    )  # but where wall and road meet
 
 
 def test_a_camera_that_sees_nothing_of_the_part_draws_nothing(part):
@@ -257,19 +261,21 @@ def test_colour_maps_by_row_follow_the_splats_that_merged_ones_stand_for(part):
     maps = torch.stack([torch.eye(3, 4), swap])
     rows = (g.semantic == int(SemanticClass.BUILDING)).to(torch.int16)
     mapped = dataclasses.replace(part, color_maps=maps, color_rows=rows)
-    plain, shown = draw(part, eye()), draw(mapped, eye())
+    plain_view, mapped_view = draw(part, eye()), draw(mapped, eye())
     wall = draw(part, eye(), SHARP, (SPLAT_IDS,)).splat_ids
     is_wall = (wall >= 0) & (g.semantic[wall.clamp_min(0)] == int(SemanticClass.BUILDING))
     inside = torch.nn.functional.max_pool2d(1 - is_wall[None].float(), 5, 1, 2)[0] == 0
     assert inside.sum() > 50
-    close = (shown.rgb[..., [1, 0, 2]] - plain.rgb).abs().amax(-1)[inside]
+    close = (mapped_view.rgb[..., [1, 0, 2]] - plain_view.rgb).abs().amax(-1)[inside]
     assert float(close.mean()) < 0.01  # but where the road's own colour shines in
 
 
 def test_levels_are_made_once_for_the_same_gaussians(part):
     assert lod.levels_of(part.gaussians) is lod.levels_of(part.gaussians)
-    taken = [lod.choose_parts([part], eye(), SHARP).parts[0].gaussians for _ in range(2)]
-    assert taken[0].means is taken[1].means  # what a backend remembers of it stays known
+    level_gaussians = [lod.choose_parts([part], eye(), SHARP).parts[0].gaussians for _ in range(2)]
+    assert (
+        level_gaussians[0].means is level_gaussians[1].means
+    )  # what a backend remembers of it stays known
 
 
 def test_a_size_that_is_no_number_of_pixels_is_refused(part):

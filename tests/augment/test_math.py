@@ -57,8 +57,8 @@ def test_signs_and_order_of_the_trained_convention():
 @pytest.mark.parametrize("cut", [0, 1, 2, 3])
 def test_max_degree_leaves_higher_bands_out(cut):
     sh, directions = _coefficients(5, 3), _directions(5)
-    kept = sh[:, : (cut + 1) ** 2]
-    assert torch.equal(evaluate_sh(sh, directions, cut), evaluate_sh(kept, directions))
+    low_bands = sh[:, : (cut + 1) ** 2]
+    assert torch.equal(evaluate_sh(sh, directions, cut), evaluate_sh(low_bands, directions))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -126,11 +126,11 @@ def test_a_cubemap_has_no_seams():
         for second in range(first + 1, 3):
             for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
                 sides = []
-                for way in (-1, 1):
+                for side in (-1, 1):
                     d = torch.zeros(401, 3, dtype=torch.float64)
                     d[:, first], d[:, second] = (
-                        signs[0] * (1 - way * near),
-                        signs[1] * (1 + way * near),
+                        signs[0] * (1 - side * near),
+                        signs[1] * (1 + side * near),
                     )
                     d[:, 3 - first - second] = along
                     sides.append(sky.sample(d))
@@ -152,8 +152,8 @@ def test_a_latlong_image_reproduces_a_smooth_function():
     e, a = torch.meshgrid(elevation, azimuth, indexing="ij")
     directions = torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()], -1)
     sky = LatLongSky(smooth(directions))
-    asked = random_directions()
-    assert (sky.sample(asked) - smooth(asked)).abs().max() < 0.02
+    sampled_directions = random_directions()
+    assert (sky.sample(sampled_directions) - smooth(sampled_directions)).abs().max() < 0.02
 
 
 # float64 arithmetic of a few dozen operations: 1e-12 leaves four digits of slack.
@@ -296,13 +296,13 @@ def test_the_first_numbers_are_pinned() -> None:
 
 
 def test_the_same_key_starts_anew() -> None:
-    one, two = rng_for(**KEY), rng_for(**KEY)
-    one.random(100)
-    assert first() == float(two.random())
+    first_rng, second_rng = rng_for(**KEY), rng_for(**KEY)
+    first_rng.random(100)
+    assert first() == float(second_rng.random())
 
 
 def test_every_part_of_the_key_counts() -> None:
-    others = [
+    other_rngs = [
         {},
         {"seed": 8},
         {"scene": "streets"},
@@ -316,7 +316,7 @@ def test_every_part_of_the_key_counts() -> None:
         {"scene": 'street", 3, "front'},  # what a key joined with commas would confuse
         {"scene": ""},
     ]
-    assert len({first(**other) for other in others}) == len(others)
+    assert len({first(**other) for other in other_rngs}) == len(other_rngs)
 
 
 @pytest.mark.parametrize(

@@ -112,9 +112,9 @@ def test_flip_grows_with_noise_and_leaves_its_inputs_alone():
     scores = []
     for noise in (0.02, 0.05, 0.2):
         a, b = (image.astype(np.float32) for image in pictures(noise=noise))
-        kept = a.copy(), b.copy()
+        copies = a.copy(), b.copy()
         scores.append(flip(a, b))
-        assert (a == kept[0]).all() and (b == kept[1]).all()
+        assert (a == copies[0]).all() and (b == copies[1]).all()
     assert scores == sorted(scores) and scores[0] < scores[-1]
 
 
@@ -203,17 +203,17 @@ def moved(**kwargs):
 @pytest.mark.parametrize("position", [(0, 0, 0), (0.3, 0.5, -0.2), (-1, -0.7, 0.3)])
 def test_a_wall_agrees_with_itself(yaw, position):
     a, b = view_of_wall(moved()), view_of_wall(moved(position=position, yaw=yaw))
-    found = warped_consistency(a, b)
+    consistency = warped_consistency(a, b)
     # Perspective bends the linear colours within a pixel where the wall is seen at an angle.
-    assert found.rmse < (1e-12 if yaw == 0 else 2e-5)
-    assert found.share > 0.5
+    assert consistency.rmse < (1e-12 if yaw == 0 else 2e-5)
+    assert consistency.share > 0.5
 
 
 def test_an_offset_is_the_error():
     a, b = view_of_wall(moved()), view_of_wall(moved(position=(0, 0.4, 0)), shift=0.07)
-    found = warped_consistency(a, b)
-    assert found.rmse == pytest.approx(0.07, rel=1e-9)
-    assert found.relative == pytest.approx(0.07 / found.spread, rel=1e-9)
+    consistency = warped_consistency(a, b)
+    assert consistency.rmse == pytest.approx(0.07, rel=1e-9)
+    assert consistency.relative == pytest.approx(0.07 / consistency.spread, rel=1e-9)
 
 
 def test_the_share_is_the_overlap():
@@ -236,10 +236,10 @@ def test_what_is_hidden_does_not_count():
     b.depth_m[board] = 3.0
     b.picture[board] = 0.9
     warped, counts = warp_view(a, b)
-    found = warped_consistency(a, b)
+    consistency = warped_consistency(a, b)
     free = warped_consistency(a, view_of_wall(b.camera))
-    assert found.rmse < 1e-12
-    assert found.share == pytest.approx(
+    assert consistency.rmse < 1e-12
+    assert consistency.share == pytest.approx(
         free.share - 21 * 21 / counts.size, abs=2 * 21 / counts.size
     )
     assert (warped[~counts] == 0).all()
@@ -250,15 +250,17 @@ def test_the_sky_does_not_count(side):
     views = {"a": view_of_wall(moved()), "b": view_of_wall(moved(position=(0, 0.1, 0)))}
     views[side].alpha[:20] = 0.5
     views[side].picture[:20] = 1.0
-    found = warped_consistency(views["a"], views["b"])
-    assert found.rmse < 1e-12 and 0.2 < found.share < 0.55
+    consistency = warped_consistency(views["a"], views["b"])
+    assert consistency.rmse < 1e-12 and 0.2 < consistency.share < 0.55
 
 
 def test_nothing_in_common_gives_nan():
     a, b = view_of_wall(moved()), view_of_wall(moved())
     b = dataclasses.replace(b, camera=moved(yaw=math.pi))
-    found = warped_consistency(a, b)
-    assert found.share == 0 and math.isnan(found.rmse) and math.isnan(found.relative)
+    consistency = warped_consistency(a, b)
+    assert (
+        consistency.share == 0 and math.isnan(consistency.rmse) and math.isnan(consistency.relative)
+    )
     b.depth_m[:] = math.nan
     assert warped_consistency(b, a).share == 0
 
@@ -276,16 +278,16 @@ def compared(paths, a, b, **kwargs):
     return consistency_of(a, warped, moved), consistency_of(a, warped, warp.counts), moved
 
 
-@pytest.mark.parametrize("apart", [1, 7])
-def test_a_board_goes_along_with_its_box(apart):
-    a, b = wall_view(driving_camera(0)), wall_view(driving_camera(apart))
+@pytest.mark.parametrize("num_frames_between", [1, 7])
+def test_a_board_goes_along_with_its_box(num_frames_between):
+    a, b = wall_view(driving_camera(0)), wall_view(driving_camera(num_frames_between))
     moving, whole, moved = compared(ActorPaths(board_boxes(FRAMES)), a, b)
     on_board = a.depth_m < 7
     assert moved.sum() > 0.5 * on_board.sum() and not (moved & ~on_board).any()
     assert moving.rmse < 1e-6 and whole.rmse < 1e-6
     # As if it stood the board agrees in depth, and its paint does not.
     standing = find_warp(a, b)
-    apart_m = apart * FRAME_NS * 1e-9 * 2.0
+    apart_m = num_frames_between * FRAME_NS * 1e-9 * 2.0
     wrong = consistency_of(a, standing.sample(b.picture), standing.counts & on_board)
     assert wrong.rmse == pytest.approx(0.2 * apart_m * np.sqrt(2 / 3), rel=0.05)
 
@@ -334,18 +336,18 @@ def torchvision_vgg16(narrow):
     return nn.Sequential(*layers)
 
 
-def plainly(layers, taken, heads, a, b):
+def plainly(layers, layer_numbers, heads, a, b):
     """The metric as its definition says it, pixel by pixel."""
     shift = torch.tensor([-0.030, -0.088, -0.188])[:, None, None]
     scale = torch.tensor([0.458, 0.448, 0.450])[:, None, None]
-    total, one, other = 0.0, (2 * a - 1 - shift) / scale, (2 * b - 1 - shift) / scale
+    total, features_a, features_b = 0.0, (2 * a - 1 - shift) / scale, (2 * b - 1 - shift) / scale
     with torch.no_grad():
         for number, layer in enumerate(layers):
-            one, other = layer(one), layer(other)
-            if number not in taken:
+            features_a, features_b = layer(features_a), layer(features_b)
+            if number not in layer_numbers:
                 continue
-            head = heads[taken.index(number)].flatten()
-            f, g = one.flatten(1).T, other.flatten(1).T  # [pixels, channels]
+            head = heads[layer_numbers.index(number)].flatten()
+            f, g = features_a.flatten(1).T, features_b.flatten(1).T  # [pixels, channels]
             f, g = (x / x.norm(dim=1, keepdim=True).clamp(min=1e-10) for x in (f, g))
             total += float(((f - g).square() @ head).mean())
     return total
@@ -356,9 +358,9 @@ def heads_of(weights):
 
 
 def as_torchvision(weights):
-    named = {re.sub(r"net\.slice\d\.", "features.", n): v for n, v in weights.items()}
-    rest = {"classifier.1.weight": torch.zeros(2, 2)}
-    return {n: v for n, v in named.items() if not n.startswith("lin")} | rest
+    renamed_weights = {re.sub(r"net\.slice\d\.", "features.", n): v for n, v in weights.items()}
+    classifier = {"classifier.1.weight": torch.zeros(2, 2)}
+    return {n: v for n, v in renamed_weights.items() if not n.startswith("lin")} | classifier
 
 
 @pytest.fixture(scope="module")
@@ -372,12 +374,12 @@ def test_alex_is_the_definition(alex):
     del state["classifier.1.weight"]
     layers.load_state_dict(state)
     a, b = picture_pairs(1), picture_pairs(2)
-    found = Lpips(ALEX, alex)(a, b)
+    distances = Lpips(ALEX, alex)(a, b)
     heads = list(heads_of(alex).values())
     for number in range(2):
-        wanted = plainly(layers, [1, 4, 7, 9, 11], heads, a[number], b[number])
-        assert wanted > 0.01
-        assert float(found[number]) == pytest.approx(wanted, rel=1e-4)  # float32 sums
+        expected = plainly(layers, [1, 4, 7, 9, 11], heads, a[number], b[number])
+        assert expected > 0.01
+        assert float(distances[number]) == pytest.approx(expected, rel=1e-4)  # float32 sums
 
 
 def test_vgg_is_the_definition():
@@ -391,8 +393,8 @@ def test_vgg_is_the_definition():
     layers.load_state_dict(names)
     a, b = picture_pairs(1), picture_pairs(2)
     heads = list(heads_of(weights).values())
-    wanted = plainly(layers, [3, 8, 15, 22, 29], heads, a[0], b[0])
-    assert float(Lpips(narrow, weights)(a, b)[0]) == pytest.approx(wanted, rel=1e-4)
+    expected = plainly(layers, [3, 8, 15, 22, 29], heads, a[0], b[0])
+    assert float(Lpips(narrow, weights)(a, b)[0]) == pytest.approx(expected, rel=1e-4)
 
 
 def test_equal_pictures_are_0_apart_and_order_does_not_matter(alex):
@@ -425,16 +427,16 @@ def test_files_of_both_layouts(alex, tmp_path, suffix):
 
     scaling = {"scaling_layer.shift": torch.tensor([-0.030, -0.088, -0.188])[None, :, None, None]}
     copies = {f"lins.{n[3]}.{n[5:]}": v.clone() for n, v in heads_of(alex).items()}
-    whole = load_lpips(written("whole", alex | scaling | copies))
+    whole_metric = load_lpips(written("whole", alex | scaling | copies))
     parts = load_lpips(written("net", as_torchvision(alex)), written("heads", heads_of(alex)))
     a, b = picture_pairs(1), picture_pairs(2)
-    wanted = Lpips(ALEX, alex)(a, b)
-    assert whole.name == parts.name == "alex"
-    assert torch.equal(whole(a, b), wanted) and torch.equal(parts(a, b), wanted)
+    expected = Lpips(ALEX, alex)(a, b)
+    assert whole_metric.name == parts.name == "alex"
+    assert torch.equal(whole_metric(a, b), expected) and torch.equal(parts(a, b), expected)
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"lin2.model.1.weight": None}, r"lacks lin2.model.1.weight, a tensor \[1, 384, .*own"),
         ({BIAS: torch.zeros(3)}, r"net.slice3.6.bias must be floats \[384\]; .*\[3\]"),
@@ -445,10 +447,10 @@ def test_files_of_both_layouts(alex, tmp_path, suffix):
         ({"scaling_layer.shift": torch.zeros(1, 3, 1, 1)}, r"scaling_layer.shift is \[0.0"),
     ],
 )  # fmt: skip
-def test_other_tensors_are_refused(alex, tmp_path, change, told):
+def test_other_tensors_are_refused(alex, tmp_path, change, message):
     tensors = {n: v for n, v in (alex | change).items() if v is not None}
     save_file(tensors, tmp_path / "w.safetensors")
-    with pytest.raises(MetricError, match=told):
+    with pytest.raises(MetricError, match=message):
         load_lpips(tmp_path / "w.safetensors")
 
 

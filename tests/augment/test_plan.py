@@ -127,9 +127,9 @@ def test_colour_maps_apply_where_cameras_have_them_and_the_recipe_lets_them():
 
     def step(recipe: Recipe, **color_maps):
         plan = make_plan(recipe, scene(frames=frames, color_maps=color_maps))
-        [found] = [s for s in plan.steps if s.name == "camera colour map"]
-        assert found.runs == plan.recorded_exposure
-        return found
+        [exposure_step] = [s for s in plan.steps if s.name == "camera colour map"]
+        assert exposure_step.runs == plan.recorded_exposure
+        return exposure_step
 
     dark = torch.eye(3, 4) * 0.5
     assert not step(Recipe()).runs

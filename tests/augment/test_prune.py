@@ -46,8 +46,8 @@ def buffers(scene: Scene, camera: Camera, error: float):
 def luma(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     out = rasterize([PosedGaussians(gaussians)], camera, backend="cpu")
     assert out.rgb is not None and out.alpha is not None
-    seen = out.rgb + (1 - out.alpha)[..., None] * prune.SKY
-    return seen.double() @ torch.tensor(prune.LUMA, dtype=torch.float64)
+    rgb = out.rgb + (1 - out.alpha)[..., None] * prune.SKY
+    return rgb.double() @ torch.tensor(prune.LUMA, dtype=torch.float64)
 
 
 def test_changes_are_those_of_pictures_without_the_splat(monkeypatch):
@@ -56,29 +56,35 @@ def test_changes_are_those_of_pictures_without_the_splat(monkeypatch):
     splats = dataclasses.replace(splats, opacities=splats.opacities.clamp(0.02, 0.9))
     camera = camera_ahead(64, 48, 50.0)
     errors = prune.errors_of(scene_of(splats, camera))
-    whole, there = luma(splats, camera), np.isfinite(errors)
-    assert 10 < there.sum() < 40  # some stand behind the camera
-    order, found = np.argsort(errors), np.zeros(40)
-    found[order] = np.diff(errors[order].clip(max=1), prepend=0)  # of one view: their running sum
-    for i in np.flatnonzero(there):
+    full_luma, is_framed = luma(splats, camera), np.isfinite(errors)
+    assert 10 < is_framed.sum() < 40  # some stand behind the camera
+    order, errors_by_order = np.argsort(errors), np.zeros(40)
+    errors_by_order[order] = np.diff(
+        errors[order].clip(max=1), prepend=0
+    )  # of one view: their running sum
+    for i in np.flatnonzero(is_framed):
         left = splats.select(torch.arange(40) != i)
-        change = abs(float((luma(left, camera) - whole).mean()))
-        assert found[i] >= 0.97 * change - 1e-7  # the cut-off at 1/255 comes sooner or later
-        own = rasterize([PosedGaussians(splats.select(torch.tensor([i])))], camera, backend="cpu")
-        assert own.alpha is not None  # weights are no more than alphas
-        most = max(change * 1.03, prune.LEAST_CONTRAST * float(own.alpha.mean()))
-        assert found[i] <= most + 1e-7
+        change = abs(float((luma(left, camera) - full_luma).mean()))
+        assert (
+            errors_by_order[i] >= 0.97 * change - 1e-7
+        )  # the cut-off at 1/255 comes sooner or later
+        splat_view = rasterize(
+            [PosedGaussians(splats.select(torch.tensor([i])))], camera, backend="cpu"
+        )
+        assert splat_view.alpha is not None  # weights are no more than alphas
+        most = max(change * 1.03, prune.LEAST_CONTRAST * float(splat_view.alpha.mean()))
+        assert errors_by_order[i] <= most + 1e-7
 
 
 def street_of_walls() -> tuple[Scene, Camera]:
     """A red wall, 100 splats that it hides, one beside it, and one behind the camera."""
     y, z = np.meshgrid(np.linspace(-3, 3, 13), np.linspace(-2, 2, 9))
     wall = stack(*(one_gaussian((5.0, *at), 0.5, 0.999) for at in zip(y.flat, z.flat, strict=True)))
-    hidden = random_gaussians(100, seed=1, sh_degree=0, size=0.1)
-    hidden.means[:] = torch.tensor([12.0, 0, 0]) + hidden.means * 0.05
-    others = stack(one_gaussian((5.0, 2.9, 0.0), 0.01, 0.05), one_gaussian((-5.0, 0.0, 0.0)))
+    hidden_splats = random_gaussians(100, seed=1, sh_degree=0, size=0.1)
+    hidden_splats.means[:] = torch.tensor([12.0, 0, 0]) + hidden_splats.means * 0.05
+    front_splats = stack(one_gaussian((5.0, 2.9, 0.0), 0.01, 0.05), one_gaussian((-5.0, 0.0, 0.0)))
     camera = camera_ahead(64, 48, 50.0)
-    return scene_of(stack(wall, hidden, others), camera), camera
+    return scene_of(stack(wall, hidden_splats, front_splats), camera), camera
 
 
 def test_hidden_splats_go_without_a_trace_and_those_that_no_view_framed_stay():
@@ -98,12 +104,12 @@ def test_hidden_splats_go_without_a_trace_and_those_that_no_view_framed_stay():
 def test_the_mean_change_follows_what_was_asked_for():
     scene = scene_of(random_gaussians(3000, seed=5, sh_degree=0), camera_ahead(64, 48, 50.0))
     (camera,) = scene.frames[0].cameras.values()
-    whole = buffers(scene, camera, 0).rgb
+    full_rgb = buffers(scene, camera, 0).rgb
     errors = list[float]()
-    for asked in (1e-4, 1e-3, 1e-2):
-        change = buffers(scene, camera, asked).rgb - whole
+    for error in (1e-4, 1e-3, 1e-2):
+        change = buffers(scene, camera, error).rgb - full_rgb
         # Neighbours that go together uncover each other, the more the more of them go.
-        assert abs(float((change @ torch.tensor(prune.LUMA)).mean())) <= 2.5 * asked
+        assert abs(float((change @ torch.tensor(prune.LUMA)).mean())) <= 2.5 * error
         errors.append(float(change.abs().mean()))
     assert 0 < errors[0] < errors[1] < errors[2]
 
@@ -130,13 +136,16 @@ def test_more_is_found_where_more_is_asked_for():
     for threads in (1, 2):
         limit_threads(threads)
         try:
-            whole, slowly = prune.errors_of(dataclasses.replace(scene)), dataclasses.replace(scene)
+            full_errors, slowly = (
+                prune.errors_of(dataclasses.replace(scene)),
+                dataclasses.replace(scene),
+            )
             part = prune.errors_of(slowly, 3e-4).copy()
             assert prune.errors_of(slowly, 1e-4) is prune.errors_of(slowly, 3e-4)
-            np.testing.assert_array_equal(part, np.where(part <= 4e-4, whole, np.inf))
-            assert (part[whole <= 3e-4] <= 3e-4).all()
-            assert np.isinf(part).sum() > np.isinf(whole).sum()
-            np.testing.assert_array_equal(prune.errors_of(slowly), whole)
+            np.testing.assert_array_equal(part, np.where(part <= 4e-4, full_errors, np.inf))
+            assert (part[full_errors <= 3e-4] <= 3e-4).all()
+            assert np.isinf(part).sum() > np.isinf(full_errors).sum()
+            np.testing.assert_array_equal(prune.errors_of(slowly), full_errors)
         finally:
             limit_threads(None)
 
@@ -208,8 +217,8 @@ def test_scenes_of_vehicles_alone_are_drawn_whole():
     camera = scene.frames[0].cameras["front"].scaled(0.1)
     recipes = [Recipe(render=Render(prune=error)) for error in (0.0, 1e-3)]
     share_effects(Sharing(scene, recipes))
-    whole, left = (render_view(scene, camera, recipe).rgb for recipe in recipes)
-    np.testing.assert_array_equal(whole, left)
+    full_rgb, left = (render_view(scene, camera, recipe).rgb for recipe in recipes)
+    np.testing.assert_array_equal(full_rgb, left)
 
 
 def test_weather_is_drawn_on_what_is_left():

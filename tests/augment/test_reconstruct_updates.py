@@ -829,7 +829,7 @@ def test_the_view_that_sees_a_splat_best_bounds_its_size() -> None:
         found.add(splats, 0, np.eye(4), camera, sky)
         found.add(splats, 1, shift, camera, sky)
     np.testing.assert_allclose(found.px_per_m, [40 / 2, 50 / 39, 0, 0], rtol=1e-6)
-    assert found.seen.tolist() == [3, 3, 0, 0] and not found.refuted.any()
+    assert found.num_views.tolist() == [3, 3, 0, 0] and not found.is_refuted.any()
 
 
 def test_the_sky_of_several_images_refutes_what_lies_before_it() -> None:
@@ -842,9 +842,9 @@ def test_the_sky_of_several_images_refutes_what_lies_before_it() -> None:
         sky = np.zeros((48, 64), np.bool_)
         sky[:sky_above, :columns] = True
         found.add(splats, 0, np.eye(4), camera_ahead(64, 48, 40.0), sky)
-    assert found.seen.tolist() == [4, 4, 4]
-    assert found.in_sky.tolist() == [3, 1, 0]
-    assert found.refuted.tolist() == [True, False, False]
+    assert found.num_views.tolist() == [4, 4, 4]
+    assert found.num_in_sky.tolist() == [3, 1, 0]
+    assert found.is_refuted.tolist() == [True, False, False]
 
 
 def test_a_part_may_become_empty_but_not_the_scene() -> None:

@@ -220,12 +220,12 @@ def test_empty_scenes_repeated_tracks_and_missing_frames_are_errors():
 
 
 def test_a_colour_map_of_an_image_goes_before_that_of_its_camera():
-    own, common = torch.eye(3, 4) * 0.5, torch.eye(3, 4) * 0.7
+    image_map, camera_map = torch.eye(3, 4) * 0.5, torch.eye(3, 4) * 0.7
     s = dataclasses.replace(
-        scene(), color_maps={"front": common}, image_color_maps={("front", 5): own}
+        scene(), color_maps={"front": camera_map}, image_color_maps={("front", 5): image_map}
     )
-    assert s.color_map(named("front", 5)) is own
-    assert s.color_map(named("front", 6)) is common
+    assert s.color_map(named("front", 5)) is image_map
+    assert s.color_map(named("front", 6)) is camera_map
     assert s.color_map(named("rear", 5)) is None
 
 
@@ -255,12 +255,14 @@ def test_colours_in_the_world_stand_still_while_an_actor_turns():
     directions = torch.nn.functional.normalize(torch.tensor([[1.0, 2, 3], [-1, 0.5, 0]]), dim=1)
     for timestamp_ns in (1_000, 1_600, 2_000):
         (_, part) = scene((actor,)).parts_at(timestamp_ns)
-        own = directions @ part.world_from_part[:3, :3].float()  # as its own frame sees them
+        actor_directions = (
+            directions @ part.world_from_part[:3, :3].float()
+        )  # as its own frame sees them
         for k in range(3):
             sh = gaussians.sh[k].expand(2, 16, 3)
             expected = evaluate_sh(sh, directions)
-            seen = evaluate_sh(part.gaussians.sh[k].expand(2, 16, 3), own)
-            assert torch.allclose(seen, expected, atol=1e-5)
+            actor_colors = evaluate_sh(part.gaussians.sh[k].expand(2, 16, 3), actor_directions)
+            assert torch.allclose(actor_colors, expected, atol=1e-5)
     fixed = dataclasses.replace(actor, colors_in_world=False)
     assert fixed.gaussians_at(1_600) is gaussians
 
@@ -294,12 +296,12 @@ def test_the_kernel_of_colours_equals_their_definition(bands, has_waves, turns):
 
 
 def test_an_actor_is_absent_in_a_gap_of_its_track():
-    whole = track()
-    gappy = dataclasses.replace(whole, max_gap_ns=500)
-    assert whole.pose_at(1_500) is not None and gappy.pose_at(1_500) is None
-    assert torch.equal(gappy.pose_at(1_100), whole.world_from_actor[0])
-    assert torch.equal(gappy.pose_at(1_900), whole.world_from_actor[1])
-    assert dataclasses.replace(whole, max_gap_ns=1_000).pose_at(1_500) is not None
+    gapless_track = track()
+    gappy = dataclasses.replace(gapless_track, max_gap_ns=500)
+    assert gapless_track.pose_at(1_500) is not None and gappy.pose_at(1_500) is None
+    assert torch.equal(gappy.pose_at(1_100), gapless_track.world_from_actor[0])
+    assert torch.equal(gappy.pose_at(1_900), gapless_track.world_from_actor[1])
+    assert dataclasses.replace(gapless_track, max_gap_ns=1_000).pose_at(1_500) is not None
 
 
 def test_datasets_names_for_objects_have_classes():
@@ -331,56 +333,56 @@ class InFile:
 
 
 def test_a_value_is_made_once_and_forgotten_when_too_many_bytes_came_after_it():
-    memo, made = SceneMemo(max_bytes=400), []  # for one more beside the largest
+    memo, made_keys = SceneMemo(max_bytes=400), []  # for one more beside the largest
 
     def get(key: str) -> np.ndarray:
-        return memo.get((key,), lambda: made.append(key) or np.zeros(100, np.float32))
+        return memo.get((key,), lambda: made_keys.append(key) or np.zeros(100, np.float32))
 
     assert get("a") is get("a")
     get("b")
     get("a")  # used again: "b" is the one unused for longest
     get("c")
     get("a"), get("c")
-    assert made == ["a", "b", "c"]
+    assert made_keys == ["a", "b", "c"]
     get("b")
-    assert made == ["a", "b", "c", "b"]
+    assert made_keys == ["a", "b", "c", "b"]
 
 
 def test_threads_wait_for_the_one_that_makes_a_value():
-    memo, made = SceneMemo(), []
+    memo, made_keys = SceneMemo(), []
 
     def make() -> object:
         sleep(0.05)
-        made.append(1)
+        made_keys.append(1)
         return object()
 
-    found = []
+    values = []
     threads = [
-        threading.Thread(target=lambda: found.append(memo.get(("slow",), make))) for _ in range(4)
+        threading.Thread(target=lambda: values.append(memo.get(("slow",), make))) for _ in range(4)
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(made) == 1 and len({id(value) for value in found}) == 1
+    assert len(made_keys) == 1 and len({id(value) for value in values}) == 1
 
 
 def test_what_is_shared_is_found_by_another_process_memo():
-    here, there = SceneMemo(), SceneMemo(max_bytes=1)
-    here.put(("own",), 1)
-    here.put(("plain",), 2, shared=True)
-    here.put(("stored",), InFile(3), shared=True)
-    there.update(pickle.loads(pickle.dumps(here.shared())))
-    assert there.known(("plain",)) and not there.known(("own",))
+    parent_memo, worker_memo = SceneMemo(), SceneMemo(max_bytes=1)
+    parent_memo.put(("own",), 1)
+    parent_memo.put(("plain",), 2, shared=True)
+    parent_memo.put(("stored",), InFile(3), shared=True)
+    worker_memo.update(pickle.loads(pickle.dumps(parent_memo.shared())))
+    assert worker_memo.known(("plain",)) and not worker_memo.known(("own",))
 
     def refuse() -> None:
         raise AssertionError("it was handed over")
 
-    assert there.get(("plain",), refuse) == 2
-    first = there.get(("stored",), refuse)
-    assert first == [3] and here.get(("stored",), refuse) == [3]
-    there.get(("other",), lambda: torch.zeros(1000))  # what is shared is found again
-    assert there.get(("stored",), refuse) == [3]
+    assert worker_memo.get(("plain",), refuse) == 2
+    first = worker_memo.get(("stored",), refuse)
+    assert first == [3] and parent_memo.get(("stored",), refuse) == [3]
+    worker_memo.get(("other",), lambda: torch.zeros(1000))  # what is shared is found again
+    assert worker_memo.get(("stored",), refuse) == [3]
 
 
 def test_a_memo_goes_with_its_owner():

@@ -14,16 +14,16 @@ import torch
 from augment.cameras import Camera, Frame
 from augment.cast_shadows import linear_from_display
 from augment.effects.snow.cells import FLUSH, OPEN_EDGE
-from augment.effects.snow.kernels import BARE_M, FARTHEST_M, FOLIAGE_MOST_M
+from augment.effects.snow.kernels import MAX_FOLIAGE_DEPTH_M, MAX_GRAIN_DISTANCE_M, MIN_DEPTH_M
 from augment.effects.snow.layer import (
-    PRESSED,
+    PRESSED_SHARE,
     build_snow_layer,
+    covered_share,
+    define_depths,
     find_depths,
     gradient_noise,
-    heights_of,
-    mottle_of,
+    mottle_noise,
     profile_of,
-    share_covered,
 )
 from augment.effects.snow.light import Illumination, display_from_linear, illumination_of, light_of
 from augment.effects.snow.near_camera import Crystals, Layer, SnowLayers
@@ -100,10 +100,10 @@ def test_layer_is_rounded_at_open_edges_and_nowhere_else():
 def test_share_of_level_ground_that_carries_snow(depth_m, coverage):
     snow = Snow(depth_m=depth_m, coverage=coverage)
     expected = coverage * (1 - math.exp(-depth_m / 0.004))
-    assert math.isclose(share_covered(snow), expected, rel_tol=1e-9)
+    assert math.isclose(covered_share(snow), expected, rel_tol=1e-9)
     heights = _depths(level_bed(100.0, 0.2).ground, depth_m=depth_m, coverage=coverage)
     assert abs((heights > 0).mean() - expected) < 0.02
-    assert (heights[heights > 0] >= BARE_M).all()
+    assert (heights[heights > 0] >= MIN_DEPTH_M).all()
 
 
 def test_snow_through_foliage_is_thin_and_in_flecks():
@@ -114,7 +114,7 @@ def test_snow_through_foliage_is_thin_and_in_flecks():
     for depth_m in (0.01, 0.1, 0.5):
         open_m, left_m = (_depths(c, depth_m=depth_m, tracks="never") for c in (cells, green))
         assert 0.25 < (left_m > 0).mean() / (open_m > 0).mean() < 0.42
-        assert left_m.max() <= FOLIAGE_MOST_M + 1e-6 and (left_m <= open_m).all()
+        assert left_m.max() <= MAX_FOLIAGE_DEPTH_M + 1e-6 and (left_m <= open_m).all()
 
 
 # --- tracks and water -----------------------------------------------------------------------------
@@ -129,7 +129,7 @@ def _rutted():
 def test_tracks_are_pressed_where_the_recipe_says():
     cells = _rutted()
     rut = cells.tracks.numpy() == 1
-    for depth_m, tracks, shown in (
+    for depth_m, tracks, has_tracks in (
         (0.3, "auto", True),
         (0.31, "auto", False),
         (0.31, "always", True),
@@ -137,7 +137,7 @@ def test_tracks_are_pressed_where_the_recipe_says():
     ):
         heights = _depths(cells, depth_m=depth_m, tracks=tracks)
         ratio = np.median(heights[rut]) / np.median(heights[~rut])
-        assert abs(ratio - (1 - PRESSED if shown else 1)) < 0.1
+        assert abs(ratio - (1 - PRESSED_SHARE if has_tracks else 1)) < 0.1
 
 
 def test_no_snow_below_the_waters_edge():
@@ -336,13 +336,13 @@ def test_kernel_computes_what_the_definition_says(options, corner_m, water):
     rng = np.random.default_rng(9)
     profile = profile_of(Snow(**options), rng, on_ground=True, water_level_z_m=water)
     depths = find_depths(cells, profile, SEED)
-    expected = heights_of(cells, profile)
+    expected = define_depths(cells, profile)
     open_m = expected[cells.semantic.numpy() != SemanticClass.VEGETATION]
     assert (open_m == 0).any() == (water is not None or options["depth_m"] < 0.2)
     np.testing.assert_allclose(depths.heights, expected, rtol=2e-6, atol=1e-12)
     covered = expected > 0
     np.testing.assert_allclose(
-        depths.mottle[covered], mottle_of(cells, profile)[covered], rtol=1e-6, atol=1e-6
+        depths.mottle[covered], mottle_noise(cells, profile)[covered], rtol=1e-6, atol=1e-6
     )
 
 
@@ -446,8 +446,8 @@ def test_an_even_sky_is_overcast() -> None:
 
 
 def test_a_clear_sky_makes_blue_shadows_half_as_bright_and_warm_light() -> None:
-    found = light_of(street(sky_with_sun(0, 45, radius_deg=4)))
-    assert found.sun_share == pytest.approx(0.9)
+    scene_light = light_of(street(sky_with_sun(0, 45, radius_deg=4)))
+    assert scene_light.sun_share == pytest.approx(0.9)
     light = illumination_of(street(sky_with_sun(0, 45, radius_deg=4)), snow())
     assert 0.45 < luminance(light.shadow_rgb) / luminance(light.lit_rgb) < 0.6
     red, green, blue = light.shadow_rgb
@@ -457,22 +457,22 @@ def test_a_clear_sky_makes_blue_shadows_half_as_bright_and_warm_light() -> None:
 
 
 def test_level_snow_gets_the_light_of_the_road() -> None:
-    """Where nothing nears white: linear radiance is the road's times the ratio of the albedos."""
+    """Far below white, linear radiance is the road's times the ratio of the albedos."""
     for sky in (sky_with_sun(0, 30, radius_deg=4), ConstantSky(torch.tensor([0.2, 0.2, 0.2]))):
         for rgb in ((0.05, 0.05, 0.05), (0.2, 0.2, 0.2)):
             light = illumination_of(street(sky, rgb), snow(albedo=0.8))
-            shown = float(level(light) @ [0.2126, 0.7152, 0.0722])
+            snow_luminance = float(level(light) @ [0.2126, 0.7152, 0.0722])
             # sRGB's two halves are given to four digits
-            assert shown == pytest.approx(luminance(rgb) * 0.8 / 0.10, rel=1e-4)
+            assert snow_luminance == pytest.approx(luminance(rgb) * 0.8 / 0.10, rel=1e-4)
 
 
 def test_what_the_recipe_says_holds() -> None:
     place = street(sky_with_sun(50, 40))
-    found = light_of(place)
+    scene_light = light_of(place)
     azimuth = illumination_of(place, snow(sun_azimuth_deg=-100))
-    assert azimuth.sun == pytest.approx(unit(-100, found.elevation_deg), abs=1e-9)
+    assert azimuth.sun == pytest.approx(unit(-100, scene_light.elevation_deg), abs=1e-9)
     elevation = illumination_of(place, snow(sun_elevation_deg=0))
-    assert elevation.sun == pytest.approx(unit(found.azimuth_deg, 0), abs=1e-9)
+    assert elevation.sun == pytest.approx(unit(scene_light.azimuth_deg, 0), abs=1e-9)
     both = illumination_of(place, snow(sun_azimuth_deg=90, sun_elevation_deg=90))
     assert both.sun == pytest.approx((0, 0, 1), abs=1e-9)
     ratios = []
@@ -518,15 +518,15 @@ def above(x_m: float = 0.0, height_m: float = 2.0, focal: float = 500.0) -> Came
     return looking((x_m, 0.0, height_m), (x_m, 0.0, 0.0), 160, 120, focal)
 
 
-def grained(view: Camera, *, height_m=2.0, hidden=None, carriers=(), backend="cpu", **options):
-    """What grain makes of even snow at z = 0 seen from straight above; float32 [H, W, 3]."""
+def grained(view: Camera, *, height_m=2.0, occluded=None, carriers=(), backend="cpu", **options):
+    """Return a picture of even snow at z = 0 with grain, from straight above; float32 [H, W, 3]."""
     size = (view.height, view.width)
     args = {"grain": GRAIN, "snow": torch.ones(size), "extinction_per_m": 0.0} | options
     grain, snow = args.pop("grain"), args.pop("snow")
     even, depth = torch.full((*size, 3), 0.7), args.pop("depth", torch.full(size, height_m))
     sun = tuple(CLOSE_SUN.tolist())
     return add_grain(
-        *(even, depth, snow, hidden, view, grain, sun, carriers), backend=backend, **args
+        *(even, depth, snow, occluded, view, grain, sun, carriers), backend=backend, **args
     )
 
 
@@ -564,9 +564,9 @@ def test_no_grain_where_nothing_shows_it():
     size, even = (view.height, view.width), torch.full((view.height, view.width, 3), 0.7)
     cases: list[dict[str, Any]] = [
         {"snow": torch.zeros(size)},
-        {"hidden": torch.ones(size, dtype=torch.bool)},
+        {"occluded": torch.ones(size, dtype=torch.bool)},
         {"height_m": 0.0},
-        {"height_m": FARTHEST_M + 0.1},
+        {"height_m": MAX_GRAIN_DISTANCE_M + 0.1},
         {"height_m": math.nan},
         {"grain": Grain(0.0, 0.4, 5)},
         {"extinction_per_m": 1e6},

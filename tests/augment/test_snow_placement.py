@@ -15,10 +15,10 @@ from safetensors.torch import load_file, save_file
 from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowCells, SnowSupport
 from augment.effects.snow.placement import (
     EGO_WIDTH_M,
-    WHEEL_SHARE,
+    WHEEL_OFFSET_SHARE,
     PlacementSettings,
+    find_wheel_paths,
     place_snow_support,
-    wheel_paths,
 )
 from augment.effects.snow.snow import placement_settings
 from augment.effects.snow.support import FORMAT, load_support, save_support, support_key, support_of
@@ -48,7 +48,7 @@ def place(scene: Scene, settings: PlacementSettings = COARSE) -> SnowSupport:
 
 
 def check_cells(cells: SnowCells, gaussians: int) -> None:
-    """What holds for the cells of any scene."""
+    """Check the rules that the cells of every scene keep."""
     count = len(cells)
     for field in dataclasses.fields(SnowCells):
         values = getattr(cells, field.name)
@@ -304,11 +304,11 @@ def test_the_ground_is_buried_and_walls_are_not() -> None:
 
 def test_wheel_tracks_are_those_of_a_recorded_drive() -> None:
     recorded = drive(GROUND)
-    y_m = [float(path.points_m[:, 1].mean()) for path in wheel_paths(recorded)]
+    y_m = [float(path.points_m[:, 1].mean()) for path in find_wheel_paths(recorded)]
     assert len(y_m) == 1
     invented = dataclasses.replace(recorded, seen_frames=())
-    assert wheel_paths(invented) == ()
-    assert len(wheel_paths(invented, with_invented=True)) == 1
+    assert find_wheel_paths(invented) == ()
+    assert len(find_wheel_paths(invented, with_invented=True)) == 1
     aside = torch.eye(4, dtype=torch.float64)
     aside[1, 3] = 3.0
     frames = tuple(
@@ -316,7 +316,7 @@ def test_wheel_tracks_are_those_of_a_recorded_drive() -> None:
         for frame in recorded.frames
     )
     on_path = dataclasses.replace(recorded, frames=frames, seen_frames=recorded.frames)
-    assert [float(path.points_m[:, 1].mean()) for path in wheel_paths(on_path)] == y_m
+    assert [float(path.points_m[:, 1].mean()) for path in find_wheel_paths(on_path)] == y_m
     for tracks, expected in (("auto", False), ("always", True)):
         settings = placement_settings(Snow(depth_m=0.1, tracks=tracks), invented)
         assert settings.invented_tracks == expected
@@ -326,7 +326,7 @@ def test_wheel_tracks_are_those_of_a_recorded_drive() -> None:
 def test_wheels_leave_tracks_beside_the_path() -> None:
     scene = drive(sheet((-6, 30), (-8, 8)), places=[(x, 0.0, 1.5) for x in (0.0, 2.0, 4.0)])
     cells = place(scene, PlacementSettings(cell_m=0.05)).ground
-    wheels = WHEEL_SHARE * EGO_WIDTH_M
+    wheels = WHEEL_OFFSET_SHARE * EGO_WIDTH_M
     for x in (6.0, 12.0):
         for y in (wheels, -wheels):
             assert float(cells.tracks[under(cells, x, y)]) > 0.6

@@ -98,8 +98,8 @@ def test_snow_lies_on_the_road_the_roof_and_the_car(scene):
     lies = white.masks["snow"] == 255
     assert set(np.unique(white.masks["snow"])) == {0, 255}
     for kind in (ROAD, CAR):
-        seen = clean.semantic == kind
-        assert seen.sum() > 50
+        class_mask = clean.semantic == kind
+        assert class_mask.sum() > 50
     assert lies[clean.semantic == ROAD].mean() > 0.9
     assert (white.semantic[lies] == SemanticClass.SNOW).mean() > 0.98
     assert not lies[clean.semantic == SemanticClass.SKY][:200].any()
@@ -318,19 +318,19 @@ def covered_by(scene, points):
 def test_open_flat_and_seen_ground_is_covered(mode):
     assert mode["covered"] >= 0.96
     assert all(share is None or share >= 0.95 for share in mode["rings"].values())
-    for drawn in mode["depths"]:
-        assert drawn["covered"] >= 0.95  # pixels of 10 cm, half of which may be something else
+    for row in mode["depths"]:
+        assert row["covered"] >= 0.95  # pixels of 10 cm, half of which may be something else
 
 
 @pytest.mark.long
 def test_little_lies_where_the_sky_is_not_seen(mode):
-    assert all(drawn["sheltered"] <= 0.01 for drawn in mode["depths"])
+    assert all(row["sheltered"] <= 0.01 for row in mode["depths"])
 
 
 @pytest.mark.long
 def test_snow_is_as_high_as_its_depth(found, mode):
-    for drawn in mode["depths"]:
-        assert drawn["error_on_scene_m"]["median"] <= 0.2 * drawn["depth_m"] + 0.01
+    for row in mode["depths"]:
+        assert row["error_on_scene_m"]["median"] <= 0.2 * row["depth_m"] + 0.01
     assert abs(mode["error_m"]["bias"] - found["scene_bias_m"]) < 0.01
     assert mode["error_m"]["p95"] < 0.06
 
@@ -360,24 +360,24 @@ def test_floaters_do_not_lift_the_snow(true_street, points):
         sh=torch.zeros(count, 1, 3),
         semantic=torch.full((count,), int(SemanticClass.UNKNOWN), dtype=torch.int16),
     )
-    own = true_street.background
-    assert own.semantic is not None and veil.semantic is not None
+    background = true_street.background
+    assert background.semantic is not None and veil.semantic is not None
     veiled = dataclasses.replace(
         true_street,
         background=Gaussians(
-            means=torch.cat([own.means, veil.means]),
-            quats=torch.cat([own.quats, veil.quats]),
-            scales=torch.cat([own.scales, veil.scales]),
-            opacities=torch.cat([own.opacities, veil.opacities]),
-            sh=torch.cat([own.sh, veil.sh]),
-            semantic=torch.cat([own.semantic, veil.semantic]),
+            means=torch.cat([background.means, veil.means]),
+            quats=torch.cat([background.quats, veil.quats]),
+            scales=torch.cat([background.scales, veil.scales]),
+            opacities=torch.cat([background.opacities, veil.opacities]),
+            sh=torch.cat([background.sh, veil.sh]),
+            semantic=torch.cat([background.semantic, veil.semantic]),
         ),
     )
     under = (np.abs(points.xy[:, 0]) < 5) & (points.xy[:, 1] > -4) & (points.xy[:, 1] < 1)
     cells, flat = covered_by(veiled, points)
-    there = flat.chosen(under[points.is_seen & (points.slope < math.radians(30))])
-    assert (cells_over(cells, there) >= 0).any()
-    assert np.nanmedian(np.abs(support_heights(cells, there) - there.z)) < 0.06
+    open_points = flat.chosen(under[points.is_seen & (points.slope < math.radians(30))])
+    assert (cells_over(cells, open_points) >= 0).any()
+    assert np.nanmedian(np.abs(support_heights(cells, open_points) - open_points.z)) < 0.06
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ import torch
 from fitted_scenes import START_NS, fitted_scene
 
 from adapters.base import open_scene
-from adapters.detect_format import recognised
+from adapters.detect_format import detect_scheme
 from augment.errors import SceneError
 from augment.files import sog
 from augment.files.export import export_sog
@@ -79,7 +79,7 @@ def test_a_palette_that_does_not_hold_all_is_near_all(
 ) -> None:
     """600 rows around 20 centres in a palette of 64: what is left is the spread around them."""
     monkeypatch.setattr(sog, "MAX_PALETTE", 64)
-    monkeypatch.setattr(sog, "_COARSE", 8)
+    monkeypatch.setattr(sog, "_NUM_GROUPS", 8)
     before = some_gaussians(600, 4)
     rng = torch.Generator().manual_seed(2)
     centres = torch.rand(20, 3, 3, generator=rng) - 0.5
@@ -188,7 +188,7 @@ def test_a_scene_comes_back_upright(tmp_path: Path) -> None:
     export_sog(scene, tmp_path / "street.sog", START_NS)
     with zipfile.ZipFile(tmp_path / "street.sog") as archive:
         archive.extractall(tmp_path / "folder")
-    assert recognised(tmp_path / "folder") == "gaussians"
+    assert detect_scheme(tmp_path / "folder") == "gaussians"
     for path in ("street.sog", "folder"):
         opened = open_scene(f"gaussians:{tmp_path}/{path}")
         assert opened.has_known_gravity and opened.has_metric_scale
@@ -285,7 +285,7 @@ def streamed(folder: Path, **changes: Any) -> Path:
 
 def test_a_streamed_scene_is_one_level_of_all_chunks(tmp_path: Path) -> None:
     path = streamed(tmp_path)
-    assert recognised(tmp_path) == recognised(path) == "gaussians"
+    assert detect_scheme(tmp_path) == detect_scheme(path) == "gaussians"
     fine = open_scene(f"{tmp_path}?path=orbit")
     assert fine.name == tmp_path.name and len(fine.background) == 6
     assert any("the finest, level 0 of 2 is taken; lod=N" in text for text in fine.problems)

@@ -17,10 +17,10 @@ def work() -> None:
 
 
 def test_a_watcher_hears_which_pass_runs_and_how_far_it_has_got():
-    told = list[PassProgress]()
-    with watched(told.append), stopwatch() as seconds:
+    reports = list[PassProgress]()
+    with watched(reports.append), stopwatch() as seconds:
         work()
-    assert told == [
+    assert reports == [
         PassProgress("view plan"),
         PassProgress("placing snow", 0, 2),
         PassProgress("placing snow", 1, 2),
@@ -31,18 +31,18 @@ def test_a_watcher_hears_which_pass_runs_and_how_far_it_has_got():
     ]
     assert set(seconds) == {"view plan", "sky"}
     work()
-    assert len(told) == 7  # nobody listens any more
+    assert len(reports) == 7  # nobody listens any more
 
 
 @pytest.mark.parametrize("last", [("sky", 0), ("placing snow", 0), ("placing snow", 1)])
 def test_what_a_watcher_raises_gives_up_what_runs(last):
-    told = list[PassProgress]()
+    reports = list[PassProgress]()
 
     def tell(progress: PassProgress) -> None:
-        told.append(progress)
+        reports.append(progress)
         if (progress.name, progress.done) == last:
             raise KeyError("nobody waits")
 
     with pytest.raises(KeyError, match="nobody waits"), watched(tell):
         work()
-    assert (told[-1].name, told[-1].done) == last
+    assert (reports[-1].name, reports[-1].done) == last

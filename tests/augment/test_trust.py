@@ -89,10 +89,12 @@ def recorded(scene: Scene, folder: Path) -> Scene:
 
 def test_a_street_has_no_hole_and_its_sky_is_unknown():
     trust = judge_scene(open_street(), cameras=["front", "left"])
-    assert all(view.ground_open == 0 for own in trust.cameras for view in own.views)
+    assert all(
+        view.ground_open == 0 for camera_trust in trust.cameras for view in camera_trust.views
+    )
     assert all("lets more than 2 %" in text for text in trust.problems)  # it is a coarse one
     assert trust.unknown == ("whether the sky is empty: no recorded image tells where it is",)
-    assert [own.seen_images for own in trust.cameras] == [2, 2]
+    assert [camera_trust.seen_images for camera_trust in trust.cameras] == [2, 2]
 
 
 def test_a_hole_in_the_road_is_counted_named_and_not_trusted():
@@ -101,13 +103,13 @@ def test_a_hole_in_the_road_is_counted_named_and_not_trusted():
     local = street.background.means.double() - camera.centre
     across, _, along = (local @ camera.world_from_camera[:3, :3]).T
     hole = without(street, (along > 5) & (along < 9) & (across.abs() < 2) & (local[:, 2] < 0))
-    (own,) = judge_scene(hole, hole.frames[:1], ["front"], count=1).cameras
-    assert 0.05 < own.views[0].ground_open < 0.8
-    assert own.views[0].ground_leaks >= own.views[0].ground_open
-    assert "of the ground has no surface" in own.problems[0]
+    (camera_trust,) = judge_scene(hole, hole.frames[:1], ["front"], count=1).cameras
+    assert 0.05 < camera_trust.views[0].ground_open < 0.8
+    assert camera_trust.views[0].ground_leaks >= camera_trust.views[0].ground_open
+    assert "of the ground has no surface" in camera_trust.problems[0]
     lost = mean_trust(street, camera) - mean_trust(hole, camera)
     below = elevation_rad(camera) < 0
-    assert lost / below.mean() == pytest.approx(own.views[0].ground_open, abs=0.1)
+    assert lost / below.mean() == pytest.approx(camera_trust.views[0].ground_open, abs=0.1)
     assert trust_mask(hole, camera)[~below].mean() > 0.95 * 255
 
 
@@ -116,10 +118,12 @@ def test_sky_on_a_sheet_is_found_by_the_recorded_image_and_not_trusted(tmp_path)
     empty = judge_view(drive, drive.frames[0].cameras["front"].scaled(0.25), 0)
     assert empty.sky_covered is not None and empty.sky_covered < 0.01
     pane = with_sheet(drive)
-    (own,) = judge_scene(pane, cameras=["front"], count=1).cameras
-    assert own.views[0].sky_covered > 0.03
-    assert any("% of the image, has a surface nearer than 200 m" in text for text in own.problems)
-    camera = pane.frames[own.views[0].frame].cameras["front"].scaled(0.25)
+    (camera_trust,) = judge_scene(pane, cameras=["front"], count=1).cameras
+    assert camera_trust.views[0].sky_covered > 0.03
+    assert any(
+        "% of the image, has a surface nearer than 200 m" in text for text in camera_trust.problems
+    )
+    camera = pane.frames[camera_trust.views[0].frame].cameras["front"].scaled(0.25)
     assert mean_trust(drive, camera) - mean_trust(pane, camera) > 0.01
 
 
@@ -139,10 +143,10 @@ def test_hardly_any_sky_is_not_judged_and_the_share_is_said(tmp_path):
         cv2.imwrite(str(path), rgb)
         frame = dataclasses.replace(scene.frames[0], image_paths={"ahead": str(path)})
         drive = dataclasses.replace(scene, frames=(frame,))
-        (own,) = judge_scene(drive, count=1).cameras
-        assert own.views[0].sky == pytest.approx(rows / 96, abs=0.03)
-        assert own.views[0].sky_covered > 0.3
-        said += [text for text in own.problems if "of the sky" in text]
+        (camera_trust,) = judge_scene(drive, count=1).cameras
+        assert camera_trust.views[0].sky == pytest.approx(rows / 96, abs=0.03)
+        assert camera_trust.views[0].sky_covered > 0.3
+        said += [text for text in camera_trust.problems if "of the sky" in text]
     (text,) = said
     assert "of the sky, which is 31 % of the image, has a surface nearer than 200 m" in text
 
@@ -173,15 +177,19 @@ def test_sky_ends_at_lidar_returns_and_below_the_horizon():
     rgb = np.full((80, 120, 3), (150, 190, 240), np.uint8)
     rgb[45:] = (70, 70, 70)
     rgb[20:, 80:] = (60, 40, 30)  # a house that ends below the top
-    found = find_sky(rgb, elevation_rad(camera))
-    assert found.sky[:15].all() and not found.sky[46:].any() and not found.sky[25:, 85:].any()
-    assert found.solid[46:].all()
+    image_sky = find_sky(rgb, elevation_rad(camera))
+    assert (
+        image_sky.sky[:15].all()
+        and not image_sky.sky[46:].any()
+        and not image_sky.sky[25:, 85:].any()
+    )
+    assert image_sky.solid[46:].all()
     hits = np.zeros((80, 120), bool)
     hits[5:45:4, 10:40] = True  # a wall as bright as the sky, up to where the LiDAR sees
     top_rad = float(elevation_rad(camera)[5, 20])
-    found = find_sky(rgb, elevation_rad(camera), hits, top_rad)
-    assert not found.sky[:40, 10:40].any() and not found.solid[:2, 15:35].any()
-    assert found.sky[:15, 60:].all()
+    image_sky = find_sky(rgb, elevation_rad(camera), hits, top_rad)
+    assert not image_sky.sky[:40, 10:40].any() and not image_sky.solid[:2, 15:35].any()
+    assert image_sky.sky[:15, 60:].all()
     assert find_sky(np.zeros((80, 120, 3), np.uint8), elevation_rad(camera)) is None  # night
 
 
@@ -257,8 +265,8 @@ def test_a_camera_path_is_judged_by_what_the_scene_was_made_from(tmp_path):
     )  # fmt: skip
     moved = with_camera_path(street, path)
     assert len(seen_views(moved).views) == 4
-    (own,) = judge_scene(moved, count=1).cameras
-    assert own.away and "stand away from all images" in own.problems[0]
+    (camera_trust,) = judge_scene(moved, count=1).cameras
+    assert camera_trust.away and "stand away from all images" in camera_trust.problems[0]
     save_scene(moved, tmp_path / "saved")
     again = load_scene_parts(tmp_path / "saved")
     assert [f.index for f in again.seen_frames] == [f.index for f in street.frames]

@@ -166,8 +166,8 @@ def test_a_camera_exposes_what_the_weather_left(scene):
 def test_without_a_map_of_its_own_a_camera_keeps_every_bit(scene):
     clean = view_of(scene)
     dark = torch.eye(3, 4) * 0.5
-    others = dataclasses.replace(scene, color_maps={"rear": dark, "front": torch.eye(3, 4)})
-    assert np.array_equal(view_of(others).rgb, clean.rgb)
+    mapped_scene = dataclasses.replace(scene, color_maps={"rear": dark, "front": torch.eye(3, 4)})
+    assert np.array_equal(view_of(mapped_scene).rgb, clean.rgb)
     neutral = Recipe(render=Render(exposure="neutral"))
     mapped = dataclasses.replace(scene, color_maps={"front": dark})
     assert np.array_equal(render_view(mapped, camera(), neutral).rgb, clean.rgb)
@@ -196,22 +196,22 @@ def surrounded() -> Scene:
 
 def around(camera: Camera) -> list[Camera]:
     """The camera turned to all sides, up and down."""
-    eye, found = camera.centre, []
+    eye, cameras = camera.centre, []
     for turns, pitch in ((0, 0), (0, 0.7), (1, -0.9), (2, 0), (2, -0.9), (3, 0.7)):
         yaw = turns * np.pi / 2
         level = camera_ahead(80, 46, 40.0, position=eye.tolist(), yaw=yaw)
         half = torch.tensor([np.cos(pitch / 2), np.sin(pitch / 2), 0, 0], dtype=torch.float64)
         turned = rotmat_from_quat(half) @ level.camera_from_world[:3, :3]
         pose = rigid(turned, -turned @ eye)
-        found.append(dataclasses.replace(level, camera_from_world=pose))
-    return found
+        cameras.append(dataclasses.replace(level, camera_from_world=pose))
+    return cameras
 
 
 def everything(plan, scene: Scene, camera: Camera, **_) -> ViewPlan:
     """Nothing left out of the plan."""
     actors = tuple(range(1, len(scene.actors) + 1))
     active = tuple(
-        dataclasses.replace(own, seen=frozenset((0, *actors))) for own in plan.active(scene)
+        dataclasses.replace(effect, seen=frozenset((0, *actors))) for effect in plan.active(scene)
     )
     return ViewPlan(actors, active, plan.buffers, plan.bare_buffers, plan.steps)
 
@@ -233,10 +233,10 @@ def test_what_is_left_out_changes_no_bit(surrounded, monkeypatch, name):
     recipe = Recipe(weather=WEATHERS[name], output=output)
     plan = make_plan(recipe, surrounded)
     cameras = around(surrounded.frames[0].cameras["ahead"])
-    left_out = 0
+    num_left_out = 0
     for camera in cameras:
         view = plan_view(plan, surrounded, camera)
-        left_out += (
+        num_left_out += (
             len(surrounded.actors)
             - len(view.actors)
             + (name == "snow" and "snow" not in view.names)
@@ -248,7 +248,7 @@ def test_what_is_left_out_changes_no_bit(surrounded, monkeypatch, name):
         assert np.array_equal(lean.rgb, full.rgb) and np.array_equal(lean.depth_m, full.depth_m)
         assert lean.masks.keys() == full.masks.keys()
         assert all(np.array_equal(lean.masks[n], full.masks[n]) for n in full.masks)
-    assert left_out > len(cameras)
+    assert num_left_out > len(cameras)
 
 
 def test_actors_keep_their_numbers(surrounded):
@@ -281,17 +281,17 @@ def test_a_gaussian_that_touches_the_image_is_never_out_of_view(kind):
         scales=torch.from_numpy(10 ** rng.uniform(-3, 0.95, (count, 3))).float(),
         opacities=torch.from_numpy(rng.choice([0.01, 0.5, 1.0], count)).float(),
     )
-    each = Bounds(means.astype(np.float32).astype(float), np.zeros((count, 3)),
+    bounds_of_each = Bounds(means.astype(np.float32).astype(float), np.zeros((count, 3)),
         g.scales.numpy().max(1).astype(float), np.zeros(count, int))  # fmt: skip
-    may = may_show(each, pose.numpy(), camera, 0.01)
+    may = may_show(bounds_of_each, pose.numpy(), camera, 0.01)
     splats = project_parts([PosedGaussians(g, pose)], camera, RasterSettings(), with_color=False)
     low, high = splats.means2d - half_extents(splats), splats.means2d + half_extents(splats)
     size = torch.tensor([camera.width, camera.height])
     touches = ((torch.ceil(low - 0.5) <= high - 0.5) & (high >= 0.5) & (low <= size - 0.5)).all(1)
-    shown = np.zeros(count, bool)
-    shown[splats.ids[touches].numpy()] = True
-    assert may[shown].all()
-    assert shown.sum() > 200 and (~may).sum() > 200
+    is_shown = np.zeros(count, bool)
+    is_shown[splats.ids[touches].numpy()] = True
+    assert may[is_shown].all()
+    assert is_shown.sum() > 200 and (~may).sum() > 200
     # One box around neighbours is in view wherever one of them is.
     groups = bound_chunks(g, np.ones(count, bool), 1.0)
     squares = np.floor(g.means.numpy()[:, :2].astype(float) / 1.0).astype(int)

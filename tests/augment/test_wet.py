@@ -14,24 +14,30 @@ from augment.effects.flood.water_plane import mirrored_camera
 from augment.effects.flood.waves import WaveField
 from augment.effects.snow.cells import SnowSupport
 from augment.effects.wet import kernels, reflection
-from augment.effects.wet.darkening import darkened, display_of, linear_of, wet_albedo, wet_ratio
-from augment.effects.wet.effect import DARKER, MIRRORED, SHINE
+from augment.effects.wet.darkening import (
+    darken_gaussians,
+    to_display,
+    to_linear,
+    wet_albedo,
+    wet_ratio,
+)
+from augment.effects.wet.effect import DARKENING_PASS, MIRROR_PASS, REFLECTION_PASS
 from augment.effects.wet.ground import (
     CELL_M,
     NO_PUDDLES,
-    SETTINGS,
+    PLACEMENT_SETTINGS,
     WetGround,
     wet_ground,
     wet_splats,
 )
-from augment.effects.wet.kernels import CHANNELS, HEIGHT, HOLLOW, OPEN, RISE_X
+from augment.effects.wet.kernels import CHANNELS, HEIGHT, HOLLOW, OPEN, SLOPE_X
 from augment.effects.wet.reflection import (
     Film,
     Mirror,
     Plane,
     blur_upright,
     find_ground,
-    mirrored_in,
+    mirror_camera,
     plane_in_view,
     shade_wet,
 )
@@ -60,7 +66,7 @@ def flat_map(size_m: float = 60.0, rise: float = 0.0, hollow: float = 0.0) -> We
     x = (np.arange(count) + 0.5) * CELL_M - size_m / 2
     channels = torch.zeros(count, count, CHANNELS)
     channels[..., HEIGHT] = torch.from_numpy(rise * x).float()
-    channels[..., OPEN], channels[..., RISE_X], channels[..., HOLLOW] = 1.0, rise, hollow
+    channels[..., OPEN], channels[..., SLOPE_X], channels[..., HOLLOW] = 1.0, rise, hollow
     tops = channels[..., HEIGHT].clone()
     return WetGround(
         *(-size_m / 2, -size_m / 2, channels, tops, torch.ones_like(tops)), np.zeros(16, np.float32)
@@ -85,24 +91,24 @@ def test_wet_over_dry_albedo_is_angstroms(dry, wet):
 
 def test_a_splat_loses_the_light_that_its_albedo_says():
     white, dry = 0.8, torch.tensor([0.06, 0.2, 0.5])
-    own = one_gaussian(rgb=display_of(dry * white).numpy())
-    wet = darkened(own, torch.ones(1), white)
-    ratio = linear_of(0.5 + SH_C0 * wet.sh[0, 0]) / linear_of(0.5 + SH_C0 * own.sh[0, 0])
+    gaussians = one_gaussian(rgb=to_display(dry * white).numpy())
+    wet = darken_gaussians(gaussians, torch.ones(1), white)
+    ratio = to_linear(0.5 + SH_C0 * wet.sh[0, 0]) / to_linear(0.5 + SH_C0 * gaussians.sh[0, 0])
     assert torch.allclose(ratio, wet_albedo(dry) / dry, rtol=0.005)
-    half = wet_ratio(display_of(dry * white)[None], white, 0.5)[0]
+    half = wet_ratio(to_display(dry * white)[None], white, 0.5)[0]
     assert bool(((half < 1) & (half > ratio.sqrt().sqrt() * 0.5)).all())
 
 
 def test_dry_splats_keep_their_bits_and_black_ones_stay_finite():
-    own = random_gaussians(50, seed=1)
-    assert darkened(own, torch.zeros(50), 0.5) is own
+    gaussians = random_gaussians(50, seed=1)
+    assert darken_gaussians(gaussians, torch.zeros(50), 0.5) is gaussians
     wet = torch.zeros(50)
     wet[7] = 1.0
-    found = darkened(own, wet, 1e-4)
-    others = torch.arange(50) != 7
-    assert torch.equal(found.sh[others], own.sh[others])
-    black = dataclasses.replace(own, sh=own.sh - 9.0)
-    assert bool(torch.isfinite(darkened(black, torch.ones(50), 0.3).sh).all())
+    darkened = darken_gaussians(gaussians, wet, 1e-4)
+    is_dry = torch.arange(50) != 7
+    assert torch.equal(darkened.sh[is_dry], gaussians.sh[is_dry])
+    black = dataclasses.replace(gaussians, sh=gaussians.sh - 9.0)
+    assert bool(torch.isfinite(darken_gaussians(black, torch.ones(50), 0.3).sh).all())
 
 
 # ---- The map of the ground -----------------------------------------------------------------------
@@ -122,7 +128,7 @@ def scene_with(z_m: np.ndarray, cell_m=0.2, corner_m=(0.0, 0.0), above=(), frame
         frames=frames,
     )
     cells = cells_on_grid(z_m, cell_m, corner_m=corner_m)
-    memo_of(scene).put(("snow support", SETTINGS), SnowSupport(cells, {}))
+    memo_of(scene).put(("snow support", PLACEMENT_SETTINGS), SnowSupport(cells, {}))
     return scene
 
 
@@ -167,7 +173,7 @@ def test_a_scene_without_open_ground_is_left_as_it_is():
     eye = looking((0.4, 0.4, 1.5), (3.0, 0.4, 0.8))
     view = plan_view(make_plan(rain(), scene), scene, eye)
     skipped = {s.name: s for s in view.steps}
-    assert not skipped[MIRRORED].runs and "no open ground" in skipped[SHINE].why
+    assert not skipped[MIRROR_PASS].runs and "no open ground" in skipped[REFLECTION_PASS].why
     film = rain(0.0, wetness=1.0)  # without what falls
     dry, wet = (render_buffers(scene, eye, make_plan(r, scene)).rgb for r in (Recipe(), film))
     assert torch.equal(dry, wet)
@@ -178,7 +184,7 @@ def test_a_scene_without_open_ground_is_left_as_it_is():
 
 def test_the_mirror_of_level_ground_is_a_floods():
     camera = looking((3.0, -2.0, 1.5), (12.0, 1.0, 0.7))
-    mine, flood = mirrored_in(camera, Plane((0.0, 0.0, 1.0), 0.25)), mirrored_camera(camera, 0.25)
+    mine, flood = mirror_camera(camera, Plane((0.0, 0.0, 1.0), 0.25)), mirrored_camera(camera, 0.25)
     assert torch.allclose(mine.camera_from_world, flood.camera_from_world, atol=1e-12)
     assert (mine.cx, mine.cy, mine.fx) == (flood.cx, flood.cy, flood.fx)
 
@@ -205,7 +211,7 @@ def shown_by(lamp, rise: float, film: Film, focal=600.0):
     rays = camera.ray_directions(torch.float64)
     depth = (plane.offset_m - float(up @ camera.centre)) / (rays @ up)
     depth = torch.where(depth > 0, depth, 0.0).float()
-    view = mirrored_in(camera, plane)
+    view = mirror_camera(camera, plane)
     out = rasterize(
         [PosedGaussians(one_gaussian(lamp, 0.05, 0.99, (1.0, 1.0, 1.0)))],
         view,
@@ -219,7 +225,7 @@ def shown_by(lamp, rise: float, film: Film, focal=600.0):
     share, _ = find_ground(camera, depth, torch.ones_like(depth), ground)
     dark = torch.zeros(camera.height, camera.width, 3)
     lit = shade_wet(dark.clone(), camera, depth, share, ground, film, mirror)
-    return camera, plane, linear_of(lit).sum(-1)
+    return camera, plane, to_linear(lit).sum(-1)
 
 
 def mirrored_pixel(camera: Camera, plane: Plane, lamp) -> tuple[float, float]:
@@ -250,7 +256,7 @@ def test_a_lamps_reflection_lies_at_the_mirrored_pixel(rise):
     upright = float((light.sum(1) * (rows - y) ** 2).sum()) / total
     sideways = float((light.sum(0) * (columns - middle) ** 2).sum()) / total
     assert upright > 6 * sideways  # a long streak along the view
-    assert 0.2 < math.sqrt(upright) / (camera.fy * 2 * kernels.ASPHALT * 0.6) < 1.5
+    assert 0.2 < math.sqrt(upright) / (camera.fy * 2 * kernels.ASPHALT_ROUGHNESS * 0.6) < 1.5
 
 
 def test_a_rough_film_reflects_more_at_grazing_angles():
@@ -269,26 +275,26 @@ def test_kernels_do_as_the_definitions_do():
     camera = looking((-10.0, 1.0, 1.4), (0.0, 0.0, 0.2), 97, 61, 90.0, timestamp_ns=1_234_567_891)
     ground = flat_map()
     ground.channels[..., HOLLOW] = torch.randn(ground.channels.shape[:2], generator=gen)
-    ground.channels[..., RISE_X] = 0.01 * torch.randn(ground.channels.shape[:2], generator=gen)
+    ground.channels[..., SLOPE_X] = 0.01 * torch.randn(ground.channels.shape[:2], generator=gen)
     ground.channels[..., HEIGHT] = 0.05 * torch.randn(ground.channels.shape[:2], generator=gen)
     rays = camera.ray_directions(torch.float64)
     depth = torch.where(rays[..., 2] < -0.01, -1.4 / rays[..., 2].clamp_max(-0.01), 0.0).float()
     depth[5:9, 5:9] = math.inf
-    shown = torch.rand(depth.shape, generator=gen)
-    share, rows = find_ground(camera, depth, shown, ground)
-    expected, same = find_ground(camera, depth, shown, ground, backend="reference")
+    visible_share = torch.rand(depth.shape, generator=gen)
+    share, rows = find_ground(camera, depth, visible_share, ground)
+    expected, same = find_ground(camera, depth, visible_share, ground, backend="reference")
     assert rows == same and torch.allclose(share, expected, atol=1e-5)
     picture = 1.2 * torch.rand(40, 97, 3, generator=gen)
     levels, defined = blur_upright(picture), blur_upright(picture, backend="reference")
     assert all(torch.allclose(a, b, atol=2e-5) for a, b in zip(levels, defined, strict=True))
-    view = mirrored_in(camera, Plane((0.0, 0.0, 1.0), 0.0)).cropped(0, 5, 97, 40)
+    view = mirror_camera(camera, Plane((0.0, 0.0, 1.0), 0.0)).cropped(0, 5, 97, 40)
     far = 30 * torch.rand(40, 97, generator=gen)
     mirror = Mirror(view, levels, torch.where(far > 6, far, 0.0))
     film = Film(0.8, 0.3, rings_of(8.0, 7, camera.timestamp_ns))
     rgb = torch.rand(61, 97, 3, generator=gen)
-    rest = camera, depth, share, ground, film, mirror
-    actual = shade_wet(rgb.clone(), *rest)
-    defined = shade_wet(rgb.clone(), *rest, backend="reference")
+    arguments = camera, depth, share, ground, film, mirror
+    actual = shade_wet(rgb.clone(), *arguments)
+    defined = shade_wet(rgb.clone(), *arguments, backend="reference")
     assert bool(torch.isfinite(actual).all())
     # Depth of the mirror is noise here: a texel's border moves a few looks by the last bit.
     error = (actual - defined).abs()
@@ -300,11 +306,11 @@ def test_rings_on_a_flood_are_the_definitions():
     camera = looking((0.0, 0.0, 1.2), (2.0, 0.3, 0.0), 80, 60, 3000.0, timestamp_ns=987_654_321)
     still = WaveField(*(torch.zeros(60, 80) for _ in range(3)))
     rings = rings_of(20.0, 1, camera.timestamp_ns)
-    found = with_rings(still, camera, 0.0, rings)
+    field = with_rings(still, camera, 0.0, rings)
     expected = with_rings(still, camera, 0.0, rings, backend="reference")
     for name in ("normal_x", "normal_y", "slope_variance"):
-        assert torch.allclose(getattr(found, name), getattr(expected, name), atol=1e-6)
-    assert float(found.normal_x.abs().max()) > 0.02 and float(still.normal_x.abs().max()) == 0
+        assert torch.allclose(getattr(field, name), getattr(expected, name), atol=1e-6)
+    assert float(field.normal_x.abs().max()) > 0.02 and float(still.normal_x.abs().max()) == 0
     assert with_rings(still, camera, 0.0, NO_RINGS) is still
 
 
@@ -371,7 +377,7 @@ def test_a_dry_recipe_keeps_its_bits_and_a_wet_one_mirrors_the_wall():
     assert np.array_equal(render_view(scene, eye, rain(0.0)).rgb, clean)
     for dry in (rain(0.0), rain(5.0, wetness=0.0)):
         plan = {s.name: s for s in make_plan(dry, scene).steps}
-        assert not plan[DARKER].runs and plan[DARKER].why
+        assert not plan[DARKENING_PASS].runs and plan[DARKENING_PASS].why
     wet = rain(0.0, wetness=1.0, puddles=0.0)
     image = render_view(scene, eye, wet).rgb
     assert np.array_equal(image, render_view(scene, eye, wet).rgb)  # alone and again
@@ -404,9 +410,9 @@ def test_extremes_stay_finite():
     scene, eye = street()
     for recipe in (rain(300.0, puddles=1.0), rain(1e-6), rain(30.0, wetness=1.0, puddles=0.5)):
         tiny = recipe.model_copy(update={"render": Render(scale=0.02)})
-        for one in (recipe, tiny):
-            plan = make_plan(one, scene)
-            out = render_buffers(scene, eye.scaled(one.render.scale), plan)
+        for weather in (recipe, tiny):
+            plan = make_plan(weather, scene)
+            out = render_buffers(scene, eye.scaled(weather.render.scale), plan)
             assert bool(torch.isfinite(out.rgb).all())
     low = looking((5.0, 6.0, -0.5), (22.0, 6.0, 3.0), 64, 48, 60.0)
     assert bool(torch.isfinite(render_buffers(scene, low, make_plan(rain(), scene)).rgb).all())

@@ -38,11 +38,13 @@ weather:
 class Dust(EffectModel):
     """Dust in the air."""
 
-    meant_by = (("dust", "sand"),)
+    synonyms = (("dust", "sand"),)
     file_fields = ("map",)
     knobs = (
         Knob("steps", (1, 8), "steps along a ray", 3.5, tiers={"draft": 1}),
-        Knob("light", ("flat", "soft"), "light on dust", 20, works=lambda it: it.density > 0.5),
+        Knob(
+            "light", ("flat", "soft"), "light on dust", 20, applies_to=lambda it: it.density > 0.5
+        ),
     )
     columns = (
         Column("dust_density", lambda it: it.density, "Dust", absent=0.0, shows="nonzero"),
@@ -66,8 +68,8 @@ class Dust(EffectModel):
     def changes(self) -> bool:
         return self.density > 0
 
-    def surface(self, shown: str) -> tuple[str, bool] | None:
-        return ("dust", False) if shown == "first" else None
+    def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:
+        return ("dust", False) if output_surface == "first" else None
 
 
 @pytest.fixture(params=["weather.dust", "dust"])

@@ -20,7 +20,7 @@ from recipes.flood import MAX_WAVES, Flood, Wave, Waves
 from recipes.lens_drops import LensDrops
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.rain import Rain
-from recipes.ranges import words
+from recipes.ranges import format_value
 from recipes.recipe_file import Leaf, recipe_file, recipe_json_schema, write_schema
 from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
@@ -461,7 +461,7 @@ def field_table() -> str:
             if name == "probability":  # told once, above the table
                 continue
             default = spec.info.get_default()
-            known = "" if default is None else f"`{words(default)}`"
+            known = "" if default is None else f"`{format_value(default)}`"
             default = "`null`" if spec.nullable else known
             default = "required" if spec.info.is_required() else default
             rows.append(f"| `{spec.path}` | {spec.allowed()} | {default} | {spec.description} |\n")

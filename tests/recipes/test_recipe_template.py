@@ -120,11 +120,11 @@ def test_ranges_in_words() -> None:
 def test_a_rule_broken_by_a_draw_is_a_recipe_error() -> None:
     """The last guard, for templates that were not made by the loader."""
     smog = {"visibility_m": Fixed(5.0), "color": Fixed("blue")}
-    made = RecipeTemplate("x", "code", given={"weather": {"smog": smog}})
+    made = RecipeTemplate("x", "code", field_values={"weather": {"smog": smog}})
     with pytest.raises(RecipeError, match=r"^code: variant 0: weather.smog.color: Input should"):
         made.resolve(0)
     waves = {"components": [{}, {"steepness": Fixed(2.0)}]}
-    made = RecipeTemplate("x", "code", given={"weather": {"flood": {"waves": waves}}})
+    made = RecipeTemplate("x", "code", field_values={"weather": {"flood": {"waves": waves}}})
     where = r"variant 0: weather\.flood\.waves\.components\[1\]\.steepness: Input should be less"
     with pytest.raises(RecipeError, match=where):
         made.resolve(0)

@@ -57,7 +57,7 @@ def bench_effects(
     photos: Path | None = None,
     json_file: JsonFile = None,
 ) -> int:
-    """What each effect costs a frame, and how far its pictures are from what is known.
+    """Measure the cost of each effect in a frame, and the errors of its pictures.
 
     Args:
         only: Some of the effects.
@@ -92,7 +92,7 @@ def bench_fit(scene: str | None = None, quick: bool = False, json_file: JsonFile
 def bench_jobs(
     repeats: int = 3, quick: bool = False, scene: str | None = None, json_file: JsonFile = None
 ) -> int:
-    """What a job adds to bare rendering, a job of 10,000 images, and opening scenes.
+    """Measure a job's overhead over bare rendering, a job of 10,000 images, and opening scenes.
 
     Args:
         repeats: How often each way is timed.
@@ -153,7 +153,7 @@ def bench_gpu(
     if table is not None:
         subject.write_table(table, result)
     _show(result, json_file, () if table is None else (table,))
-    return int(any("failed" in found for found in result["facts"]["sections"].values()))
+    return int(any("failed" in section for section in result["facts"]["sections"].values()))
 
 
 def bench_trade(
@@ -165,7 +165,7 @@ def bench_trade(
     pictures: Path | None = None,
     json_file: JsonFile = None,
 ) -> int:
-    """What each setting that buys speed costs in accuracy on a scene, and the tiers as a whole.
+    """Measure speed and errors of each quality setting on a scene, and of the tiers as a whole.
 
     Args:
         scene: What is rendered.
@@ -184,15 +184,16 @@ def bench_trade(
     if pictures is not None:
         subject.check_matplotlib()
     case = subject.QUICK if quick else subject.WHOLE_CASE
-    found = subject.bench_trade(scene, recipe or subject.RECIPES, case, backend=device)
-    shown, written = subject.printable(found.figures), list[Path]()
+    trade = subject.bench_trade(scene, recipe or subject.RECIPES, case, backend=device)
+    printed_figures = subject.printable(trade.figures)
+    written = list[Path]()
     if table is not None:
-        table.write_text(harness.markdown(shown), encoding="utf-8")
+        table.write_text(harness.markdown(printed_figures), encoding="utf-8")
         written.append(table)
     if pictures is not None:
-        written += subject.draw_trade(pictures, found)
-    _show(shown, None, written)
-    write_json(json_file, found.figures)
+        written += subject.draw_trade(pictures, trade)
+    _show(printed_figures, None, written)
+    write_json(json_file, trade.figures)
     return 0
 
 

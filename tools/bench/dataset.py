@@ -71,7 +71,8 @@ class DatasetCase:
     memory: bool = True
 
 
-WHOLE, QUICK = DatasetCase(), DatasetCase(images=32, rows=20_000, live=4)
+WHOLE = DatasetCase()
+QUICK = DatasetCase(images=32, rows=20_000, live=4)
 
 
 def measure(
@@ -81,7 +82,8 @@ def measure(
     case: DatasetCase | None = None,
 ) -> Figures:
     """folder: an output folder with JPEG images to read; None makes one."""
-    machine, case = machine_facts(), case or (QUICK if quick else WHOLE)
+    machine = machine_facts()
+    case = case or (QUICK if quick else WHOLE)
     with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
         scratch = Path(name)
         if folder is None:
@@ -92,29 +94,32 @@ def measure(
         facts, rows = _read(folder, case, repeats)
         live = _render_live(case, repeats)
         large = _write_manifest_of(scratch / "large", folder, case.rows)
-        held = WeatherDataset(large).rows.batch.nbytes / 2**20
+        table_mib = WeatherDataset(large).rows.batch.nbytes / 2**20
         peak = peak_mib_in_subprocess(_opening_of, (large,)) if case.memory else None
     title = "{images} JPEGs of {width}x{height}, {kib:.0f} KiB each, batches of ".format(**facts)
-    rates, memory = ("what", "workers", "images/s"), ("rows", "MiB held", "MiB at most")
+    rates = ("what", "workers", "images/s")
+    memory = ("rows", "MiB held", "MiB at most")
     tables = [
         Table(f"{title}{BATCH}", (*rates, "of decoding"), rows),
         Table("Rendered on the fly", (*rates, "of rendering"), live),
-        Table("Opening a large manifest", memory, [(case.rows, held, peak)]),
+        Table("Opening a large manifest", memory, [(case.rows, table_mib, peak)]),
     ]
     return figures("dataset", tables, machine=machine, **facts)
 
 
 def _write_manifest_of(target: Path, folder: Path, count: int) -> Path:
     """The folder's manifest, a variant after the other, of images that are not there."""
-    table, pieces = read_manifest(folder), []
-    own, each = table["variant"][0].as_py(), table.num_rows
-    for first in range(0, count, each):
-        piece = table.slice(0, min(each, count - first))
+    table = read_manifest(folder)
+    pieces = []
+    variant = table["variant"][0].as_py()
+    num_rows = table.num_rows
+    for first in range(0, count, num_rows):
+        piece = table.slice(0, min(num_rows, count - first))
         columns = dict(zip(piece.column_names, piece.columns, strict=True))
-        name = f"fog-{first // each:05d}"
+        name = f"fog-{first // num_rows:05d}"
         for key in columns:
             if key.endswith("_path"):
-                columns[key] = pc.replace_substring(columns[key], own, name)
+                columns[key] = pc.replace_substring(columns[key], variant, name)
         columns["variant"] = pa.array([name] * piece.num_rows, columns["variant"].type)
         columns["checksum"] = pa.array([f"{first + n:064x}" for n in range(piece.num_rows)])
         pieces.append(pa.table(columns))
@@ -133,11 +138,11 @@ def _read(folder: Path, case: DatasetCase, repeats: int) -> tuple[Figures, list[
     facts = {"images": len(files), **size, "kib": sum(map(len, files)) / len(files) / 1024}
     rows: list[tuple] = []
     for workers in case.workers:
-        ways = {DECODING: _pass_through(_Decoding(files), workers)} | {
+        readers = {DECODING: _pass_through(_Decoding(files), workers)} | {
             name: _pass_through(WeatherDataset(folder, **READINGS[name]), workers)
             for name in case.readings
         }
-        rows += _rates(rounds(ways, repeats), workers, len(files))
+        rows += _rates(rounds(readers, repeats), workers, len(files))
     return facts, rows
 
 
@@ -153,16 +158,16 @@ def _render_live(case: DatasetCase, repeats: int) -> list[tuple]:
             for name in CAMERAS:
                 render_view(scene, frame.cameras[name], recipe)
 
-    ways = {"rendering alone": render_all, "SceneDataset": _pass_through(live, 0)}
-    return _rates(rounds(ways, repeats), 0, len(live))
+    renderers = {"rendering alone": render_all, "SceneDataset": _pass_through(live, 0)}
+    return _rates(rounds(renderers, repeats), 0, len(live))
 
 
 def _rates(seconds: Mapping[str, list[float]], workers: int, images: int) -> list[tuple]:
     """Medians; the fraction is of the first case, round by round."""
     limit = next(iter(seconds.values()))
     return [
-        (name, workers, images / spread(own)["median"], spread_ratio(limit, own)["median"])
-        for name, own in seconds.items()
+        (name, workers, images / spread(times)["median"], spread_ratio(limit, times)["median"])
+        for name, times in seconds.items()
     ]
 
 

@@ -70,7 +70,8 @@ def measure(quick: bool = False, scene: str | None = None, case: FitCase | None 
     Raises:
         ClimateGSError: the scene cannot be opened or has no recorded images.
     """
-    machine, case = machine_facts(), case or (QUICK if quick else WHOLE)
+    machine = machine_facts()
+    case = case or (QUICK if quick else WHOLE)
     if scene is not None:
         steps, facts = time_steps(scene, case.scale, case)
         return figures("fit", [steps], machine=machine, scene=scene, **facts)
@@ -91,7 +92,8 @@ def _fit_table(uri: str, out: Path, truth: str, case: FitCase) -> Table:
     """A fit of the street: its held-out views, and its depth beside the street's exact one."""
     options = {"steps": case.fit_steps, "scale": case.street_scale, "truth": truth}
     report = fit_scene(FitOptions(scene=uri, out=out, **options)).report
-    mean, exact = report["mean"], (report.get("truth") or {}).get("median", {})
+    mean = report["mean"]
+    exact = (report.get("truth") or {}).get("median", {})
     scores = [mean.get(s) for s in ("psnr", "ssim", "flip", "depth_median_m", "depth_p90_m")]
     depth = exact.get("median_m"), exact.get("p90_m")
     row = ("procedural street", report["step"], *scores, *depth, report["seconds"] / 60)
@@ -99,8 +101,9 @@ def _fit_table(uri: str, out: Path, truth: str, case: FitCase) -> Table:
 
 
 def time_steps(uri: str, scale: float, case: FitCase) -> tuple[Table, Figures]:
-    """Of `case.steps` steps after the first; where the scene makes more than `case.splats`
-    Gaussians, so many are kept.
+    """Time `case.steps` steps after the first.
+
+    Where the scene makes more than `case.splats` Gaussians, that many are taken.
     """
     scene = open_scene(uri)
     if not any(frame.image_paths for frame in scene.frames):
@@ -111,27 +114,31 @@ def time_steps(uri: str, scale: float, case: FitCase) -> tuple[Table, Figures]:
     source = RecordedViews(scene, scale=scale)
     for key in source.train:
         source.load(key)  # as in a long run, where images come from memory
-    before, started = begin_peak(), time.perf_counter()
+    before = begin_peak()
+    started = time.perf_counter()
     warm_up()
-    config, tuning = FitConfig(densify="none"), Tuning(sh_every=1)
+    config = FitConfig(densify="none")
+    tuning = Tuning(sh_every=1)
     trainer = Trainer(scene, source, config, NOMINAL_STEPS, tuning=tuning)
     for _ in range(UNTIMED):
         trainer.run_step()
-    warm_up_s, seconds = time.perf_counter() - started, defaultdict(list)
+    warm_up_s = time.perf_counter() - started
+    seconds = defaultdict(list)
     for _ in tqdm(range(case.steps), unit="step"):
         started = time.perf_counter()
         record = trainer.run_step()
         seconds["whole step"].append(time.perf_counter() - started)
-        for stage, each in record.stage_s.items():
-            seconds[stage].append(each)
-    memory, note = None, ""
+        for stage, stage_seconds in record.stage_s.items():
+            seconds[stage].append(stage_seconds)
+    memory = None
+    note = ""
     if before is not None:
         memory = {"before": before, "peak": status_mib("VmHWM")}
         note = f"resident at most {memory['peak']:.0f} MiB, {before:.0f} before training"
     sizes = sorted({(c.width, c.height) for c in map(source.camera, source.train)})
-    shown = ", ".join(f"{width}x{height}" for width, height in sizes)
-    title = f"A step of {len(trainer.splats):,} splats, {len(source.train)} views of {shown}"
-    rows = [(stage, *spread_ms(each).values()) for stage, each in seconds.items()]
+    size_text = ", ".join(f"{width}x{height}" for width, height in sizes)
+    title = f"A step of {len(trainer.splats):,} splats, {len(source.train)} views of {size_text}"
+    rows = [(stage, *spread_ms(stage_seconds).values()) for stage, stage_seconds in seconds.items()]
     facts = {
         "splats": len(trainer.splats),
         "actors": len(scene.actors),
@@ -148,5 +155,5 @@ def _thinned(scene: Scene, splats: int) -> Scene:
     left = len(scene.background) - max(0, count - splats)
     if not 0 < left < len(scene.background):
         return scene
-    kept = torch.linspace(0, len(scene.background) - 1, left, dtype=torch.float64).long()
-    return dataclasses.replace(scene, background=scene.background.select(kept))
+    row_ids = torch.linspace(0, len(scene.background) - 1, left, dtype=torch.float64).long()
+    return dataclasses.replace(scene, background=scene.background.select(row_ids))

@@ -40,18 +40,23 @@ from tools.bench.scenes import (
     recipe_of,
 )
 
-TIERS, WAVES = ("sky", "screen_space", "mirrored"), ("still", "calm")
+TIERS = ("sky", "screen_space", "mirrored")
+WAVES = ("still", "calm")
 OPAQUE = {"absorption_per_m": (1e6, 1e6, 1e6)}
 EDGE_PX = 3  # pixels this close to the water's border show two surfaces; splats overhang as far
-DARK, LIT = 2 / 255, 8 / 255  # a black pixel, and what it is compared with when it should not be
+DARK = 2 / 255  # a black pixel, and what it is compared with when it should not be
+LIT = 8 / 255
 BLOCK = 32
 MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
 
 
 def flood_recipe(
-    reflection: str = "mirrored", waves: str = "still", output: Output = PICTURE_ONLY, **given: Any
+    reflection: str = "mirrored",
+    waves: str = "still",
+    output: Output = PICTURE_ONLY,
+    **other_effects: Any,
 ) -> Recipe:
-    fields = {**WATER, "reflection": reflection, "waves": {"preset": waves}, **given}
+    fields = {**WATER, "reflection": reflection, "waves": {"preset": waves}, **other_effects}
     return recipe_of({"flood": fields}, output)
 
 
@@ -141,9 +146,9 @@ def water_error(picture: Picture, truth: Picture) -> dict[str, Any]:
     worst = (0.0, 0, 0)
     for row in range(0, error.shape[0], BLOCK):
         for column in range(0, error.shape[1], BLOCK):
-            here = np.s_[row : row + BLOCK, column : column + BLOCK]
-            if 2 * mask[here].sum() >= BLOCK * BLOCK:
-                worst = max(worst, (float(error[here][mask[here]].mean()), column, row))
+            block = np.s_[row : row + BLOCK, column : column + BLOCK]
+            if 2 * mask[block].sum() >= BLOCK * BLOCK:
+                worst = max(worst, (float(error[block][mask[block]].mean()), column, row))
     return {
         "psnr_db": psnr(picture.rgb, truth.rgb, mask),
         "black_share": float(black.sum() / mask.sum()),
@@ -175,7 +180,8 @@ def mirror_parts(parts: Sequence[PosedGaussians], level_z_m: float) -> list[Pose
 
     A mirrored pose would be no rigid motion. Mirrored once more in the part's own frame it is one.
     """
-    plane, identity = MIRROR.clone(), torch.eye(4, dtype=torch.float64)
+    plane = MIRROR.clone()
+    identity = torch.eye(4, dtype=torch.float64)
     plane[2, 3] = 2 * level_z_m
     poses = [identity if p.world_from_part is None else p.world_from_part for p in parts]
     return [
@@ -196,7 +202,8 @@ def mirrored_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Float[Tens
         out = rasterize(parts, camera, buffers=buffers, settings=plan.settings, clip=clip)
         return out.rgb.double(), out.alpha.double()[..., None]
 
-    parts, level_z_m = scene.parts_for(camera), medium.level_z_m
+    parts = scene.parts_for(camera)
+    level_z_m = medium.level_z_m
     front, alpha_above = layer(parts, HeightClip(level_z_m, ABOVE))
     rgb, alpha = layer(mirror_parts(parts, level_z_m), HeightClip(level_z_m, BELOW, overlaps=True))
     rays = camera.ray_directions(torch.float64)
@@ -218,7 +225,8 @@ def fresnel_by_angles(cosine: np.ndarray, index: float) -> np.ndarray:
     refracted = np.arcsin(np.sin(incident) / index)
     steep = incident < 1e-4  # both quotients are 0 / 0 at 0; the limit is right to 1e-8 here
     incident = np.where(steep, math.pi / 4, incident)
-    less, more = incident - refracted, incident + refracted
+    less = incident - refracted
+    more = incident + refracted
     share = 0.5 * ((np.sin(less) / np.sin(more)) ** 2 + (np.tan(less) / np.tan(more)) ** 2)
     return np.where(steep, ((index - 1) / (index + 1)) ** 2, share)
 

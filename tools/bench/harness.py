@@ -101,11 +101,11 @@ def replace_marked(text: str, start: str, end: str, content: str) -> str:
     Raises:
         ValueError: it lacks a marker.
     """
-    before, found, rest = text.partition(start)
-    _, closed, after = rest.partition(end)
-    if not (found and closed):
+    text_before, start_mark, marked_text = text.partition(start)
+    _, end_mark, text_after = marked_text.partition(end)
+    if not (start_mark and end_mark):
         raise ValueError(f"the document has no '{start}' with '{end}' after it")
-    return f"{before}{start}\n\n{content.strip()}\n\n{end}{after}"
+    return f"{text_before}{start}\n\n{content.strip()}\n\n{end}{text_after}"
 
 
 def format_cell(cell: Cell) -> str:
@@ -132,20 +132,20 @@ def _numeric_columns(table: Mapping[str, Any]) -> list[bool]:
 
 
 class WallClock:
-    """The host's, for work that is done when its call returns. A mark is a moment on the clock."""
+    """The host's clock, for work that is done when its call returns."""
 
     def mark(self) -> Any:
         return time.perf_counter()
 
     def wait(self) -> None:
-        """Until all work that was asked for is done."""
+        """Wait until all work is done."""
 
     def seconds(self, first: Any, then: Any) -> float:
         return then - first
 
 
 class EventClock(WallClock):
-    """The GPU's: marks are events among its work, so that nothing waits while they are set."""
+    """The GPU's clock: marks are events among its work, so that setting them never waits."""
 
     def mark(self) -> torch.cuda.Event:
         event = torch.cuda.Event(enable_timing=True)
@@ -175,38 +175,47 @@ def rounds(
             cases[name]()
             marks[name].append((start, clock.mark()))
     clock.wait()
-    return {name: [clock.seconds(*p) for p in each[warm_up:]] for name, each in marks.items()}
+    return {
+        name: [clock.seconds(*p) for p in case_marks[warm_up:]]
+        for name, case_marks in marks.items()
+    }
 
 
 def in_turns(names: Mapping[str, Any], repeat: int) -> list[str]:
-    """The names in order, and every other time in the opposite one."""
+    """Return the names in order, and every other time in the opposite order."""
     return [*names] if repeat % 2 else [*names][::-1]
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """In the order in which tables list them; p90: nine of ten values are below."""
+    """Return median, minimum and 90 % quantile, in the order in which tables list them."""
     low, middle, high = np.quantile(values, [0, 0.5, 0.9])
     return {"median": float(middle), "min": float(low), "p90": float(high)}
 
 
 def spread_ms(seconds: Sequence[float]) -> dict[str, float]:
+    """Return the spread of times in milliseconds."""
     return spread([1e3 * s for s in seconds])
 
 
 def spread_ratio(over: Sequence[float], under: Sequence[float]) -> dict[str, float]:
-    """Of ratios, pair by pair."""
+    """Return the spread of ratios, pair by pair."""
     return spread([o / u for o, u in zip(over, under, strict=True)])
 
 
 def median_ms(seconds: Sequence[float]) -> float:
+    """Return the median of times in milliseconds."""
     return 1e3 * float(np.median(seconds))
 
 
-def image_difference(own: torch.Tensor, expected: torch.Tensor) -> dict[str, float]:
-    """Of rgb [H, W, 3], by each pixel's worst channel: the 99.9 % quantile, the maximum, and how
-    many pixels are off by more than FLIP.
+def image_difference(rgb: torch.Tensor, expected: torch.Tensor) -> dict[str, float]:
+    """Compare two pictures, rgb [H, W, 3], by each pixel's worst channel.
+
+    Returns:
+        The 99.9 % quantile of the error, its maximum, the number of pixels that are off by more
+        than
+        FLIP, and the number of pixels.
     """
-    error = (own.detach().cpu() - expected.detach().cpu()).abs().amax(-1).numpy()
+    error = (rgb.detach().cpu() - expected.detach().cpu()).abs().amax(-1).numpy()
     return {
         "p999": float(np.quantile(error, 0.999)),
         "max": float(error.max()),
@@ -217,11 +226,12 @@ def image_difference(own: torch.Tensor, expected: torch.Tensor) -> dict[str, flo
 
 # ---- memory and processes -----------------------------------------------------------------------
 
-_STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_STATUS = Path("/proc/self/status")
+RESET_PEAK = Path("/proc/self/clear_refs")
 
 
 def status_mib(field: str) -> float:
-    """MiB of this process by /proc, such as VmRSS."""
+    """Return a size of this process from /proc in MiB, such as VmRSS."""
     match = re.search(rf"^{field}:\s*(\d+)", _STATUS.read_text(), re.MULTILINE)
     if match is None:
         raise RuntimeError(f"{_STATUS} has no {field}")
@@ -229,8 +239,9 @@ def status_mib(field: str) -> float:
 
 
 def begin_peak() -> float | None:
-    """Resident MiB now, from where `VmHWM` counts on; None where the system cannot tell. Freed heap
-    is given back first, of which glibc keeps up to 64 MiB.
+    """Start to count `VmHWM` anew; return the resident MiB now, or None without /proc.
+
+    Freed heap is returned to the system first, of which glibc would keep up to 64 MiB.
     """
     if not RESET_PEAK.is_file():
         return None
@@ -244,31 +255,35 @@ def begin_peak() -> float | None:
 
 
 def extra_mib(action: Action) -> float | None:
-    """MiB that this process takes at the highest moment of an action, its result included, above
-    what it holds before; None where the system cannot tell.
+    """Return the peak memory of an action above the memory before it, MiB; None without /proc.
+
+    The action's result counts, too.
     """
     before = begin_peak()
     if before is None:
         return None
-    kept = action()
-    highest = status_mib("VmHWM")
-    del kept  # alive until the mark was read
-    return highest - before
+    action_result = action()
+    peak_mib = status_mib("VmHWM")
+    del action_result  # alive until the peak was read
+    return peak_mib - before
 
 
 def peak_mib_in_subprocess(
     work: Callable[..., Action], arguments: tuple[Any, ...], within_s: float = 600
 ) -> float | None:
-    """`extra_mib` of the action that work returns, in a fresh process: one that has rendered before
-    holds scratch memory.
+    """Return `extra_mib` of the action that `work` returns, measured in a fresh process.
+
+    A process that has rendered before would still hold scratch memory.
 
     Raises:
         RuntimeError: the process failed or took too long.
     """
-    found = run_in_subprocess(_extra_mib_of, (work, arguments), within_s)
-    if "mib" not in found:
-        raise RuntimeError(f"measuring the memory of {work.__name__}{arguments} failed: {found}")
-    return found["mib"]
+    subprocess_figures = run_in_subprocess(_extra_mib_of, (work, arguments), within_s)
+    if "mib" not in subprocess_figures:
+        raise RuntimeError(
+            f"measuring the memory of {work.__name__}{arguments} failed: {subprocess_figures}"
+        )
+    return subprocess_figures["mib"]
 
 
 def _extra_mib_of(work: Callable[..., Action], arguments: tuple[Any, ...]) -> Figures:
@@ -276,14 +291,14 @@ def _extra_mib_of(work: Callable[..., Action], arguments: tuple[Any, ...]) -> Fi
 
 
 def guarded(work: Callable[..., Figures], arguments: tuple[Any, ...]) -> Figures:
-    """What the work gives and the `seconds` it took; or what it `failed` with."""
+    """Return the figures of the work with the `seconds` that it took, or its error as `failed`."""
     start = time.perf_counter()
     try:
-        found = work(*arguments)
-    except Exception as error:  # others wait their turn
+        work_figures = work(*arguments)
+    except Exception as error:  # the other sections must still run
         traceback.print_exc(file=sys.stderr)
         return {"failed": f"{type(error).__name__}: {error}"}
-    return {**found, "seconds": round(time.perf_counter() - start, 2)}
+    return {**work_figures, "seconds": round(time.perf_counter() - start, 2)}
 
 
 def run_in_subprocess(
@@ -322,7 +337,7 @@ def _send_result(
 
 
 def machine_facts() -> Figures:
-    """Of this machine and process; starts numba's thread pool if nobody has yet.
+    """Return facts of this machine and process; start numba's thread pool if it is not running.
 
     load: processes that ran or waited over the minute before; more than a few tenths disturb.
     """
@@ -341,12 +356,12 @@ def machine_facts() -> Figures:
         "load": load_average(),
         "platform": platform.platform(),
         "python": platform.python_version(),
-        "versions": {name: found for name in PACKAGES if (found := version_of(name))},
+        "versions": {name: version for name in PACKAGES if (version := version_of(name))},
     }
 
 
 def load_average() -> float | None:
-    """Processes that ran or waited over the last minute; None where the system does not say."""
+    """Return the processes that ran or waited over the last minute; None if unknown."""
     return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
 
 
@@ -356,8 +371,9 @@ def version_of(package: str) -> str | None:
 
 
 def machine_line(result: Mapping[str, Any]) -> str:
-    """What figures were measured on; facts may hold a `gpu`."""
-    machine, gpu = result["machine"], result.get("facts", result).get("gpu")
+    """Return a line about the machine and its load; facts may hold a `gpu`."""
+    machine = result["machine"]
+    gpu = result.get("facts", result).get("gpu")
     return (f"{gpu['name']}; " if gpu else "") + (
         f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; "
         f"load {machine['load']} before, {result['load_after']} after"
@@ -366,8 +382,8 @@ def machine_line(result: Mapping[str, Any]) -> str:
 
 def _proc_field(path: str, name: str) -> str | None:
     with contextlib.suppress(OSError):
-        found = re.search(rf"^{name}\s*:\s*(.*)$", Path(path).read_text(), re.MULTILINE)
-        return found[1] if found else None
+        match = re.search(rf"^{name}\s*:\s*(.*)$", Path(path).read_text(), re.MULTILINE)
+        return match[1] if match else None
 
 
 # ---- the GPU ------------------------------------------------------------------------------------
@@ -387,23 +403,24 @@ def check_gpu() -> None:
 
 
 def gpu_facts() -> Figures | None:
-    """Of the current GPU; None where torch sees none."""
+    """Return facts of the current GPU; None where torch sees none."""
     if not torch.cuda.is_available():
         return None
-    found = torch.cuda.get_device_properties(torch.cuda.current_device())
+    properties = torch.cuda.get_device_properties(torch.cuda.current_device())
     return {
-        "name": found.name,
-        "memory_gib": round(found.total_memory / 2**30, 1),
-        "processors": found.multi_processor_count,
-        "capability": f"{found.major}.{found.minor}",
+        "name": properties.name,
+        "memory_gib": round(properties.total_memory / 2**30, 1),
+        "processors": properties.multi_processor_count,
+        "capability": f"{properties.major}.{properties.minor}",
         "cuda": torch.version.cuda,
         "triton": version_of("triton"),
     }
 
 
 def peak_gpu_mib(action: Action) -> tuple[float, float] | tuple[None, None]:
-    """MiB of tensors on the GPU at the action's highest moment: all of them, and above what lay
-    there before. None without a GPU. What torch holds free is not counted.
+    """Return the peak MiB of tensors on the GPU during an action: in all, and above those before.
+
+    Free memory that torch keeps is not counted. Both are None without a GPU.
     """
     if not torch.cuda.is_available():
         return None, None
@@ -412,8 +429,8 @@ def peak_gpu_mib(action: Action) -> tuple[float, float] | tuple[None, None]:
     before = torch.cuda.memory_allocated()
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
-    kept = action()
+    action_result = action()
     torch.cuda.synchronize()
-    highest = torch.cuda.max_memory_allocated()
-    del kept
-    return highest / 2**20, (highest - before) / 2**20
+    peak_bytes = torch.cuda.max_memory_allocated()
+    del action_result
+    return peak_bytes / 2**20, (peak_bytes - before) / 2**20

@@ -36,8 +36,10 @@ from tools.bench.harness import (
 from tools.bench.scenes import front_name
 
 BUFFERS = (RGB, ALPHA, MEDIAN_DEPTH)
-NEAR_M, SIZES_PX = 100.0, (0.5, 1.0, 2.0)
-NEAR, FULL = f"nearest {NEAR_M:.0f} m alone", "everything"
+NEAR_M = 100.0
+SIZES_PX = (0.5, 1.0, 2.0)
+NEAR = f"nearest {NEAR_M:.0f} m alone"
+FULL = "everything"
 COLUMNS = ("drawn", "ms", "ms of the processor", "over the nearest 100 m", "least", "p90",
            "FLIP", "PSNR")  # fmt: skip
 WITHIN_S = 900.0
@@ -74,9 +76,9 @@ def _draw(scene: Scene, camera: Camera, lod_px: float) -> RenderOutput:
 
 
 def _picture(scene: Scene, camera: Camera, lod_px: float) -> np.ndarray:
-    drawn = _draw(scene, camera, lod_px)
-    assert drawn.rgb is not None and drawn.alpha is not None
-    return to_bytes(composite_sky(drawn.rgb, drawn.alpha, camera, scene.sky)).numpy()
+    rendered = _draw(scene, camera, lod_px)
+    assert rendered.rgb is not None and rendered.alpha is not None
+    return to_bytes(composite_sky(rendered.rgb, rendered.alpha, camera, scene.sky)).numpy()
 
 
 class ProcessorClock(WallClock):
@@ -87,33 +89,41 @@ class ProcessorClock(WallClock):
 
 
 def _measure(uri: str, repeats: int) -> Figures:
-    machine, rows, begun = machine_facts(), [], time.perf_counter()
+    machine = machine_facts()
+    rows = []
+    begun = time.perf_counter()
     memory = [[f"{px:g}" if px else "off", *_memory(uri, px)] for px in (1.0, 0.0)]
-    whole = open_scene(uri)
+    full_scene = open_scene(uri)
     opened_s = time.perf_counter() - begun
-    camera = first_camera(whole)
-    near = nearest(whole, camera)
-    cases = {NEAR: (near, 0.0), f"{NEAR}, lod_px 1": (near, 1.0), FULL: (whole, 0.0)}
-    cases |= {f"lod_px {px:g}": (whole, px) for px in SIZES_PX}
+    camera = first_camera(full_scene)
+    near = nearest(full_scene, camera)
+    cases = {NEAR: (near, 0.0), f"{NEAR}, lod_px 1": (near, 1.0), FULL: (full_scene, 0.0)}
+    cases |= {f"lod_px {px:g}": (full_scene, px) for px in SIZES_PX}
     actions = {name: functools.partial(_draw, of, camera, px) for name, (of, px) in cases.items()}
     seconds = rounds(actions, repeats)
     busy = rounds(actions, max(repeats // 2, 1), warm_up=0, clock=ProcessorClock())
-    truth = _picture(whole, camera, 0.0)
+    truth = _picture(full_scene, camera, 0.0)
     for name, (of, px) in cases.items():
         ratio = spread_ratio(seconds[name], seconds[NEAR]).values()
         errors = [None, None]
-        if of is whole and px > 0:
+        if of is full_scene and px > 0:
             picture = _picture(of, camera, px)
             is_same = np.array_equal(picture, truth)
             errors = [flip(picture, truth), None if is_same else psnr(picture, truth)]
         rows.append([name, median_ms(seconds[name]), median_ms(busy[name]), *ratio, *errors])
-    levels = levels_of(whole.background)
+    levels = levels_of(full_scene.background)
     sizes = [
-        [number, levels.cell_m(number) if number else None, len(own.gaussians), len(own.squares)]
-        for number, own in enumerate(levels.levels)
+        [
+            number,
+            levels.cell_m(number) if number else None,
+            len(level.gaussians),
+            len(level.squares),
+        ]
+        for number, level in enumerate(levels.levels)
     ]
     title = (
-        f"Views: {whole.name}, {len(whole.background):,} Gaussians, {camera.width}x{camera.height}"
+        f"Views: {full_scene.name}, {len(full_scene.background):,} Gaussians, "
+        f"{camera.width}x{camera.height}"
     )
     tables = [
         Table(title, COLUMNS, rows, f"{len(near.background):,} Gaussians within {NEAR_M:g} m"),
@@ -125,10 +135,10 @@ def _measure(uri: str, repeats: int) -> Figures:
 
 
 def _memory(uri: str, lod_px: float) -> Sequence[float | None]:
-    found = run_in_subprocess(_memory_of, (uri, lod_px), WITHIN_S)
-    if "most" not in found:
-        raise RuntimeError(f"measuring the memory of {uri} failed: {found}")
-    return found["opened"], found["most"]
+    memory_figures = run_in_subprocess(_memory_of, (uri, lod_px), WITHIN_S)
+    if "most" not in memory_figures:
+        raise RuntimeError(f"measuring the memory of {uri} failed: {memory_figures}")
+    return memory_figures["opened"], memory_figures["most"]
 
 
 def _memory_of(uri: str, lod_px: float) -> Figures:

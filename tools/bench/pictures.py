@@ -29,12 +29,15 @@ from tools.drawing import resized, write, write_rgb, write_video
 Which = Literal["street", "drive", "lidar", "video"]
 STREET = "procedural:street?seed=3&frames=40"
 FRAME = 12
-CELL_WIDTH, COLUMNS, QUALITY = 600, 3, 76
+CELL_WIDTH = 600
+COLUMNS = 3
+QUALITY = 76
 SHOWN = ("drizzle", "rain", "downpour", "flurries", "snowfall", "blizzard")
 # One map on the finished picture, so that snow and flakes stand in the same light as the rest.
 DUSK = ("style.preset=grey-dusk", "style.strength=1", "style.applied_to=picture")
 VIDEO = {"downpour": range(20), "blizzard": range(20, 40)}
-VIDEO_SIZE, VIDEO_HZ = (640, 360), 10
+VIDEO_SIZE = (640, 360)
+VIDEO_HZ = 10
 
 SWEEPS: dict[str, tuple[str, ...]] = {
     "clear": (),
@@ -52,12 +55,10 @@ CODES = {
     codes.SCATTERED: ("scattered", (255, 115, 60)),
     codes.PRECIPITATION: ("drops, flakes", (255, 225, 70)),
 }
-PX_PER_M, PANEL, SIDE, GROUND = (
-    8,
-    (500, 350),
-    96,
-    24,
-)  # of a sweep's panel: its view from above, from the side; its grey
+PX_PER_M = 8  # of a sweep's panel: its view from above, from the side; its grey
+PANEL = (500, 350)
+SIDE = 96
+GROUND = 24
 
 
 def main(
@@ -93,14 +94,14 @@ def recipe_of(preset: str, sets: Sequence[str], scale: float = 1.0) -> Recipe:
 
 
 def draw_weathers(scene: Scene, camera: str, scale: float, path: Path) -> None:
-    """What falls, COLUMNS beside each other, each by day above itself at dusk."""
+    """Draw all kinds of falling weather, COLUMNS beside each other, by day above dusk."""
     lines = []
-    own = scene.frame(FRAME).cameras[camera]
+    recorded_camera = scene.frame(FRAME).cameras[camera]
     for first in range(0, len(SHOWN), COLUMNS):
         for time, sets in (("day", ()), ("dusk", DUSK)):
             cells = []
             for preset in SHOWN[first : first + COLUMNS]:
-                rgb = render_view(scene, own, recipe_of(preset, sets, scale)).rgb
+                rgb = render_view(scene, recorded_camera, recipe_of(preset, sets, scale)).rgb
                 cell = resized(rgb, CELL_WIDTH, cv2.INTER_AREA)
                 named(cell, f"{preset}, {time}")
                 cells.append(cell)
@@ -112,8 +113,10 @@ def drive_through(scene: Scene, camera: str) -> Iterator[np.ndarray]:
     """One drive whose weather changes."""
     for preset, numbers in VIDEO.items():
         for number in numbers:
-            own = scene.frame(number).cameras[camera].resized(*VIDEO_SIZE)
-            rgb = render_view(scene, own, recipe_of(preset, ("camera.noise=0",))).rgb.copy()
+            recorded_camera = scene.frame(number).cameras[camera].resized(*VIDEO_SIZE)
+            rgb = render_view(
+                scene, recorded_camera, recipe_of(preset, ("camera.noise=0",))
+            ).rgb.copy()
             named(rgb, preset)
             yield rgb
 
@@ -135,8 +138,8 @@ def _panel(scene: Scene, title: str, recipe: Recipe) -> np.ndarray:
     source = scene.lidar(FRAME)
     assert source is not None, f"{scene.name} has no sweep of frame {FRAME}"
     sweep = weathered_sweep(scene, recipe, FRAME, source)
-    found = sweep.columns.get(codes.CODE_COLUMN, np.zeros(len(sweep.points_m), np.uint8))
-    points = np.where((found == codes.LOST)[:, None], source.points_m, sweep.points_m)
+    point_codes = sweep.columns.get(codes.CODE_COLUMN, np.zeros(len(sweep.points_m), np.uint8))
+    points = np.where((point_codes == codes.LOST)[:, None], source.points_m, sweep.points_m)
     ego_from_world = invert_rigid(frame.world_from_ego).numpy()
     points = points - np.asarray(scene.world_origin_m)
     points = points @ ego_from_world[:3, :3].T + ego_from_world[:3, 3]
@@ -149,12 +152,17 @@ def _panel(scene: Scene, title: str, recipe: Recipe) -> np.ndarray:
     is_near = np.abs(points[:, 1]) < 6  # what the view from the side shows
     shares = []
     for code, (name, color) in CODES.items():
-        own = found == code
-        _dot(panel[:height], across[own], above[own], color)
+        has_code = point_codes == code
+        _dot(panel[:height], across[has_code], above[has_code], color)
         if code != codes.LOST:
-            _dot(panel[height:], across[own & is_near], beside[own & is_near] - height, color)
-        if own.any():
-            percent = 100 * own.mean()
+            _dot(
+                panel[height:],
+                across[has_code & is_near],
+                beside[has_code & is_near] - height,
+                color,
+            )
+        if has_code.any():
+            percent = 100 * has_code.mean()
             shares.append(
                 (f"{name} {percent:.0f} %" if percent >= 1 else f"{name} {percent:.1g} %", color)
             )
@@ -167,7 +175,8 @@ def _panel(scene: Scene, title: str, recipe: Recipe) -> np.ndarray:
 
 
 def _dot(image: np.ndarray, x: np.ndarray, y: np.ndarray, color: tuple[int, int, int]) -> None:
-    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    column = np.floor(x).astype(int)
+    row = np.floor(y).astype(int)
     inside = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])
     image[row[inside], column[inside]] = color
 

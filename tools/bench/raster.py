@@ -48,7 +48,8 @@ BLEND_COLUMNS = ("lanes", "M blends/s", "M multiply-adds/s", "multiply-adds a bl
                  "instructions a blend", "share of the machine")  # fmt: skip
 # Of one register of pixels that are all blended, loads and stores aside; by lanes.
 BLEND_INSTRUCTIONS = {16: 20, 8: 23}
-SHEETS, SHEETS_SIZE = 400, (640, 480)  # splats that cover the whole image, and its size
+SHEETS = 400  # splats that cover the whole image, and its size
+SHEETS_SIZE = (640, 480)
 FMA_ROUNDS = 1 << 21
 REFERENCE_CASE = RasterCase(5_000, 320, 240)  # what the torch reference draws within a second
 
@@ -62,22 +63,31 @@ class RasterCases:
     memory: bool = True
 
 
-WHOLE, QUICK = RasterCases(), RasterCases((SMALL_CASE,))
+WHOLE = RasterCases()
+QUICK = RasterCases((SMALL_CASE,))
 
 
 def measure(quick: bool = False, repeats: int = 7, cases: RasterCases | None = None) -> Figures:
     """repeats: timed rounds of a clear and a smoggy frame a scene."""
-    machine, cases = machine_facts(), cases or (QUICK if quick else WHOLE)
-    warm_up_s, stages, work, facts = warm_up(), [], [], []
+    machine = machine_facts()
+    cases = cases or (QUICK if quick else WHOLE)
+    warm_up_s = warm_up()
+    stages = []
+    work = []
+    facts = []
     for case in cases.scenes:
-        found = _measure(case, repeats, cases.memory)
-        facts.append(found)
-        timed = {**found["stages_ms"], "frame": found["ms"], "with smog": found["smog_ms"]}
+        case_result = _measure(case, repeats, cases.memory)
+        facts.append(case_result)
+        timed = {
+            **case_result["stages_ms"],
+            "frame": case_result["ms"],
+            "with smog": case_result["smog_ms"],
+        }
         stages += [(case.name, name, *ms.values()) for name, ms in timed.items()]
-        rate = found["pairs"] / found["ms"]["median"] / 1e3
-        counts = (found["visible"], found["pairs"], found["listed_pairs"], rate)
-        memory = (found["scene_mib"], found["frame_mib"])
-        work.append((case.name, found["smog_over_clear"]["median"], *counts, *memory))
+        rate = case_result["pairs"] / case_result["ms"]["median"] / 1e3
+        counts = (case_result["visible"], case_result["pairs"], case_result["listed_pairs"], rate)
+        memory = (case_result["scene_mib"], case_result["frame_mib"])
+        work.append((case.name, case_result["smog_over_clear"]["median"], *counts, *memory))
     beside = _beside_reference(cases.reference, min(repeats, 3))
     blending = _blending(repeats)
     tables = [
@@ -107,7 +117,8 @@ def _measure(case: RasterCase, repeats: int, memory: bool) -> Figures:
     """
     frame_mib = peak_mib_in_subprocess(frame_of, (case,)) if memory else None
     gaussians, camera = random_scene(case)
-    parts, stages = [PosedGaussians(gaussians)], []
+    parts = [PosedGaussians(gaussians)]
+    stages = []
 
     def clear() -> None:
         stages.append({})
@@ -135,28 +146,42 @@ def multiply_add(rounds, sums):
     for run in prange(sums.size // v8.WIDE):
         one = v8.wide_columns()
         half = v8.splat_as(one, np.float32(0.5))
-        a, b, c, d, e, f = one, one, one, one, one, one
-        g, h, i, j, k, m = one, one, one, one, one, one
+        a = one
+        b = one
+        c = one
+        d = one
+        e = one
+        f = one
+        g = one
+        h = one
+        i = one
+        j = one
+        k = one
+        m = one
         for _ in range(rounds):
-            a, b, c = (
-                v8.fmuladd(a, half, one), v8.fmuladd(b, half, one), v8.fmuladd(c, half, one)
-            )  # fmt: skip
-            d, e, f = (
-                v8.fmuladd(d, half, one), v8.fmuladd(e, half, one), v8.fmuladd(f, half, one)
-            )  # fmt: skip
-            g, h, i = (
-                v8.fmuladd(g, half, one), v8.fmuladd(h, half, one), v8.fmuladd(i, half, one)
-            )  # fmt: skip
-            j, k, m = (
-                v8.fmuladd(j, half, one), v8.fmuladd(k, half, one), v8.fmuladd(m, half, one)
-            )  # fmt: skip
-        a, d, g, j = a + b + c, d + e + f, g + h + i, j + k + m
+            a = v8.fmuladd(a, half, one)  # fmt: skip
+            b = v8.fmuladd(b, half, one)
+            c = v8.fmuladd(c, half, one)
+            d = v8.fmuladd(d, half, one)  # fmt: skip
+            e = v8.fmuladd(e, half, one)
+            f = v8.fmuladd(f, half, one)
+            g = v8.fmuladd(g, half, one)  # fmt: skip
+            h = v8.fmuladd(h, half, one)
+            i = v8.fmuladd(i, half, one)
+            j = v8.fmuladd(j, half, one)  # fmt: skip
+            k = v8.fmuladd(k, half, one)
+            m = v8.fmuladd(m, half, one)
+        a = a + b + c
+        d = d + e + f
+        g = g + h + i
+        j = j + k + m
         v8.store(sums, np.uint64(run * v8.WIDE), a + d + g + j)
 
 
 def _blending(repeats: int) -> Figures:
     """How many blends a second of one core's time, and multiply-adds in turn with them."""
-    (width, height), side = SHEETS_SIZE, float(SHEETS_SIZE[0])
+    (width, height) = SHEETS_SIZE
+    side = float(SHEETS_SIZE[0])
     means = torch.zeros(SHEETS, 3)
     means[:, 2] = torch.linspace(2, 3, SHEETS)
     sheets = Gaussians(
@@ -168,7 +193,8 @@ def _blending(repeats: int) -> Figures:
     )
     ahead = torch.eye(4, dtype=torch.float64)
     camera = Camera("sheets", width, height, side, side, width / 2, height / 2, ahead)
-    sums, seconds = np.zeros(v8.WIDE, np.float32), []
+    sums = np.zeros(v8.WIDE, np.float32)
+    seconds = []
     before = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
@@ -217,6 +243,7 @@ def _beside_reference(case: RasterCase, repeats: int) -> Figures:
         return rasterize_reference(parts, camera, BUFFERS, SETTINGS, None)
 
     seconds = rounds({"reference": reference, "cpu": lambda: _draw(parts, camera)}, repeats)
-    reference_ms, cpu_ms = median_ms(seconds["reference"]), median_ms(seconds["cpu"])
+    reference_ms = median_ms(seconds["reference"])
+    cpu_ms = median_ms(seconds["cpu"])
     times = {"reference_ms": reference_ms, "cpu_ms": cpu_ms, "speed_up": reference_ms / cpu_ms}
     return {**times, **image_difference(_draw(parts, camera).rgb, reference().rgb)}

@@ -61,7 +61,8 @@ class RasterCase:
         return f"{self.count // multiples[suffix]}{suffix}@{self.width}x{self.height}"
 
 
-SMALL_CASE, LARGE_CASE = RasterCase(100_000, 640, 480), RasterCase(1_000_000, 1600, 1066)
+SMALL_CASE = RasterCase(100_000, 640, 480)
+LARGE_CASE = RasterCase(1_000_000, 1600, 1066)
 
 
 def random_scene(case: RasterCase, *, seed: int = 0) -> tuple[Gaussians, Camera]:
@@ -71,7 +72,8 @@ def random_scene(case: RasterCase, *, seed: int = 0) -> tuple[Gaussians, Camera]
     logarithm between 4 and 60 mm, rotations uniform, opacity Beta(0.9, 1.2) clipped to [0.005, 1].
     """
     rng = np.random.default_rng(seed)
-    count, focal = case.count, FOCAL_PER_WIDTH * case.width
+    count = case.count
+    focal = FOCAL_PER_WIDTH * case.width
     z = rng.uniform(2, 20, count)
     x = rng.uniform(-1.1, 1.1, count) * z * (case.width / 2 / focal)
     y = rng.uniform(-1.1, 1.1, count) * z * (case.height / 2 / focal)
@@ -83,7 +85,7 @@ def random_scene(case: RasterCase, *, seed: int = 0) -> tuple[Gaussians, Camera]
     means = np.stack([z, -x, -y], -1)  # the camera looks along +x, z is up
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     fields = (means, quats, scales, opacities, sh)
-    gaussians = Gaussians(*(torch.from_numpy(each.astype(np.float32)) for each in fields))
+    gaussians = Gaussians(*(torch.from_numpy(field.astype(np.float32)) for field in fields))
     rotation = torch.tensor([[0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
     pose = rigid(rotation, torch.zeros(3, dtype=torch.float64))
     centre = (case.width / 2, case.height / 2)
@@ -96,39 +98,44 @@ def street_uri(frames: int = 1, gaussians: int | None = None) -> str:
 
 
 def front_name(names: Sequence[str]) -> str:
-    """The shortest with `front` in it, or the first."""
+    """Return the shortest name that contains `front`, or else the first name."""
     return min((name for name in names if "front" in name), key=len, default=names[0])
 
 
 def front_camera(scene: Scene, width: int | None = None) -> Camera:
-    """That of the middle frame, by default of its own size."""
+    """Return the front camera of the middle frame, by default at its own size."""
     cameras = scene.frames[len(scene.frames) // 2].cameras
     camera = cameras[front_name([*cameras])]
     return camera if width is None else camera.scaled(width / camera.width)
 
 
 def all_cameras(scene: Scene) -> list[Camera]:
+    """Return the cameras of all frames."""
     return [camera for frame in scene.frames for camera in frame.cameras.values()]
 
 
 def water_camera(scene: Scene, width: int, height: int, backend: str = "auto") -> Camera:
-    """`front_camera`, zoomed where less or more than about a third of the image is water."""
-    own, choice = front_camera(scene), []
+    """Return `front_camera`, zoomed until about a third of the image is water."""
+    front = front_camera(scene)
+    candidates = []
     recipe = recipe_of({"flood": {**WATER, "reflection": "sky", "waves": {"preset": "still"}}})
     for zoom in ZOOMS:
-        scale = zoom * width / own.width
+        scale = zoom * width / front.width
         cx, cy = (
             size / 2 + scale * off
-            for size, off in ((width, own.cx - own.width / 2), (height, own.cy - own.height / 2))
+            for size, off in (
+                (width, front.cx - front.width / 2),
+                (height, front.cy - front.height / 2),
+            )
         )
         size = {"width": width, "height": height, "cx": cx, "cy": cy}
-        camera = dataclasses.replace(own, fx=own.fx * scale, fy=own.fy * scale, **size)
+        camera = dataclasses.replace(front, fx=front.fx * scale, fy=front.fy * scale, **size)
         water = frame_of(scene, camera.scaled(SMALL), recipe, backend)().masks.get("water")
         off = abs((0.0 if water is None else float(water.float().mean())) - 1 / 3)
         if off <= NEAR_SHARE:
             return camera
-        choice.append((off, camera))
-    return min(choice, key=lambda entry: entry[0])[1]
+        candidates.append((off, camera))
+    return min(candidates, key=lambda entry: entry[0])[1]
 
 
 # ---- recipes ------------------------------------------------------------------------------------
@@ -140,14 +147,17 @@ WATER = {"level_m": 0.25, "reference": "median"}
 
 
 def recipe_of(effects: Mapping[str, Any], output: Output = PICTURE_ONLY) -> Recipe:
-    """effects: fields of each, by the effect's name."""
+    """Return a recipe with some effects.
+
+    effects: fields of each effect, by its name.
+    """
     weather = {name: fields for name, fields in effects.items() if name in Weather.model_fields}
-    others = {name: fields for name, fields in effects.items() if name not in weather}
-    return Recipe.model_validate({"weather": weather, "output": output, **others})
+    other_sections = {name: fields for name, fields in effects.items() if name not in weather}
+    return Recipe.model_validate({"weather": weather, "output": output, **other_sections})
 
 
 def frame_of(scene: Scene, camera: Camera, recipe: Recipe, backend: str = "auto") -> Action:
-    """Renders a view as floats, by a plan that is made once."""
+    """Return an action that renders a view as floats, by a plan that is made once."""
     plan = make_plan(recipe, scene)
     return functools.partial(render_buffers, scene, camera, plan, backend=backend)
 
@@ -156,7 +166,7 @@ def record_street(
     folder: Path, recipe: Recipe, *, scale: float = 1.0, frames: int, gaussians: int,
     cameras: Sequence[str] | None = None,
 ) -> tuple[Scene, Path]:  # fmt: skip
-    """The procedural street, and the folder of one variant of it that a job has written."""
+    """Run a job on the procedural street; return the scene, and the folder of its one variant."""
     scene = open_scene(street_uri(frames, gaussians))
     recipe = recipe.model_copy(update={"render": recipe.render.model_copy(update={"scale": scale})})
     job = RenderJob(scene.source, [recipe], folder, cameras=cameras)
@@ -172,25 +182,20 @@ Cases = Mapping[str, tuple[Recipe, Recipe]]  # with the effect, and the clean fr
 
 @dataclass(frozen=True)
 class EffectCase:
-    """What an effect is measured on. scenes: of its cost, in an image of width x height pixels.
-    street: of its errors, procedural, because the truth must be known; frames, cameras, scale: of
-    the street's views. cell_m: of snow near the path. splats: of the SH that a style maps. presets:
-    styles whose pictures are compared, empty for all. photos: a folder that style methods are
-    scored on. memory: whether it is measured.
-    """
+    """Scenes and sizes of an effect's measurements."""
 
-    scenes: tuple[str, ...] = (street_uri(gaussians=1_000_000),)
-    width: int = 1600
-    height: int = 1066
-    street: str = street_uri(6)
-    frames: tuple[int, ...] = (0, 5)
-    cameras: tuple[str, ...] = ("front", "left", "back")
-    scale: float = 1.0
-    cell_m: float = 0.05
-    splats: int = 1_000_000
-    presets: tuple[str, ...] = ()
-    photos: Path | None = None
-    memory: bool = True
+    scenes: tuple[str, ...] = (street_uri(gaussians=1_000_000),)  # scenes that measure its cost
+    width: int = 1600  # pixels of the images that measure its cost
+    height: int = 1066  # pixels, likewise
+    street: str = street_uri(6)  # procedural scene that measures errors: its truth is known
+    frames: tuple[int, ...] = (0, 5)  # frames of the street's views
+    cameras: tuple[str, ...] = ("front", "left", "back")  # cameras of the street's views
+    scale: float = 1.0  # scale of the street's views
+    cell_m: float = 0.05  # metres of a snow cell near the path
+    splats: int = 1_000_000  # splats whose SH a style maps
+    presets: tuple[str, ...] = ()  # styles whose pictures are compared; empty for all
+    photos: Path | None = None  # folder that style methods are scored on
+    memory: bool = True  # whether memory is measured
 
     def open_street(self) -> tuple[Scene, StreetTruth]:
         return open_scene(self.street), open_truth(parse_uri(self.street)[2])
@@ -213,34 +218,46 @@ QUICK = EffectCase(
 def measure_effect(
     effect: str, repeats: int, case: EffectCase, scene: str | None = None
 ) -> Figures:
-    """effect: a module of this folder. scene: another whose cost is measured, too."""
-    machine, scenes = machine_facts(), (*case.scenes, *([scene] if scene else []))
+    """Measure one effect.
+
+    effect: a module of this folder. scene: a further scene whose cost is measured.
+    """
+    machine = machine_facts()
+    scenes = (*case.scenes, *([scene] if scene else []))
     subject = importlib.import_module(f"tools.bench.{effect}")
     tables = subject.tables(dataclasses.replace(case, scenes=scenes), repeats)
     return figures(effect, tables, machine=machine)
 
 
 def cost_tables(case: EffectCase, cases: Cases, staged: Sequence[str], repeats: int) -> list[Table]:
-    """Of every scene: frames of every case in turns with clean ones. staged: cases whose stages and
-    memory are shown.
+    """Measure, for every scene, the frames of every case in turns with clean ones.
+
+    staged: cases whose stages and memory are shown.
     """
     tables: list[Table] = []
     for uri in case.scenes:
         scene = open_scene(uri)
         camera = water_camera(scene, case.width, case.height)
-        rows, stages = [], {}
+        rows = []
+        stages = {}
         for name, (recipe, clean) in tqdm(cases.items(), "frames", leave=False):
             pair = {"effect": recipe, "clean": clean}
             seconds, stage_times = time_frames(scene, camera, pair, repeats)
             ratio = spread_ratio(seconds["effect"], seconds["clean"]).values()
-            clean_ms, effect_ms = median_ms(seconds["clean"]), median_ms(seconds["effect"])
+            clean_ms = median_ms(seconds["clean"])
+            effect_ms = median_ms(seconds["effect"])
             rows.append([name, clean_ms, effect_ms, *ratio])
             if name in staged:
                 stages.setdefault("clean", {**stage_times["clean"], "whole": clean_ms})
                 stages[name] = {**stage_times["effect"], "whole": effect_ms}
-        names = dict.fromkeys(s for each in stages.values() for s in each if s != "whole")
-        shown = [s for s in names if any(each.get(s, 0) >= 0.1 for each in stages.values())]
-        by_stage = [[s, *(each.get(s) for each in stages.values())] for s in (*shown, "whole")]
+        names = dict.fromkeys(s for stage_ms in stages.values() for s in stage_ms if s != "whole")
+        shown_stages = [
+            s for s in names if any(stage_ms.get(s, 0) >= 0.1 for stage_ms in stages.values())
+        ]
+        by_stage = [
+            [s, *(stage_ms.get(s) for stage_ms in stages.values())]
+            for s in (*shown_stages, "whole")
+        ]
         count = sum(len(part.gaussians) for part in scene.parts_for(camera))
         title = f"Frames: {uri}, {count:,} Gaussians, {camera.name} {case.width}x{case.height}"
         columns = ("case", "clean ms", "with it ms", "ratio", "least", "p90")
@@ -268,8 +285,11 @@ def time_frames(
     frames = {name: frame_of(scene, camera, recipe, backend) for name, recipe in recipes.items()}
     actions = {name: functools.partial(timed_frame, name, frame) for name, frame in frames.items()}
     return rounds(actions, repeats), {
-        name: {stage: median_ms([lap.get(stage, 0.0) for lap in each[1:]]) for stage in each[-1]}
-        for name, each in stage_times.items()
+        name: {
+            stage: median_ms([lap.get(stage, 0.0) for lap in frame_stages[1:]])
+            for stage in frame_stages[-1]
+        }
+        for name, frame_stages in stage_times.items()
     }
 
 

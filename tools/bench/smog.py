@@ -48,10 +48,19 @@ def tables(case: EffectCase, repeats: int) -> list[Table]:
         errors = [smog_error(recipe, scene, view) for view in views]
         for region in views[0].regions:
             masks = [view.regions[region] for view in views]
-            own = np.concatenate([e[mask] for e, mask in zip(errors, masks, strict=True)])
-            if len(own):
-                median, p99 = map(float, np.quantile(own, [0.5, 0.99]))
-                rows.append([*key, region, len(own), median, p99, 100 * float((own > 4).mean())])
+            masked_errors = np.concatenate([e[mask] for e, mask in zip(errors, masks, strict=True)])
+            if len(masked_errors):
+                median, p99 = map(float, np.quantile(masked_errors, [0.5, 0.99]))
+                rows.append(
+                    [
+                        *key,
+                        region,
+                        len(masked_errors),
+                        median,
+                        p99,
+                        100 * float((masked_errors > 4).mean()),
+                    ]
+                )
     title = f"Largest channel error against exact smog, 1/255: {case.street}"
     columns = ("smog", "model", "region", "pixels", "median", "p99", "above 4/255, %")
     return [*cost_tables(case, costs, staged, repeats), Table(title, columns, rows)]
@@ -70,7 +79,8 @@ class TruthView:
 
 
 def truth_view(scene: Scene, truth: StreetTruth, camera: Camera) -> TruthView:
-    clean, exact = frame_of(scene, camera, CLEAN)().rgb, truth.render(camera)
+    clean = frame_of(scene, camera, CLEAN)().rgb
+    exact = truth.render(camera)
     surface = np.isfinite(exact.depth)
     smooth = surface & away_from_silhouettes(exact)
     return TruthView(camera, clean, exact, {"smooth": smooth, "silhouette": surface & ~smooth})
@@ -78,10 +88,12 @@ def truth_view(scene: Scene, truth: StreetTruth, camera: Camera) -> TruthView:
 
 def smog_error(recipe: Recipe, scene: Scene, view: TruthView) -> np.ndarray:
     """Largest channel error [H, W] of the fogged splats against exact smog, in 1/255."""
-    fog, camera = make_plan(recipe, scene).placed["smog"].data.fog, view.camera
+    fog = make_plan(recipe, scene).placed["smog"].data.fog
+    camera = view.camera
     fogged = frame_of(scene, camera, recipe)().rgb
     z = torch.from_numpy(np.where(np.isfinite(view.exact.depth), view.exact.depth, 1.0))
-    rays, eye_z = camera.ray_directions(torch.float64), float(camera.centre[2])
+    rays = camera.ray_directions(torch.float64)
+    eye_z = float(camera.centre[2])
     lengths = rays.norm(dim=-1)
     tau = optical_depth(fog, z * lengths, eye_z, eye_z + z * rays[..., 2])
     exact = blend_airlight(view.clean.double(), tau, fog, rays[..., 2] / lengths).float()

@@ -47,7 +47,8 @@ from tools.bench.scenes import (
     recipe_of,
 )
 
-NEXT_CAMERA, AHEAD = "next camera", "1 ahead"
+NEXT_CAMERA = "next camera"
+AHEAD = "1 ahead"
 SHADINGS = ("per_splat", "per_pixel")
 ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
 DEPTHS_M = (0.02, 0.1, 0.4)
@@ -58,11 +59,14 @@ LIFT_M = 1e-3  # of a point above its own surface, before it looks at a camera
 
 
 def snow_recipe(
-    shading: str = "per_splat", cell_m: float = 0.05, output: Output = PICTURE_ONLY, **given: Any
+    shading: str = "per_splat",
+    cell_m: float = 0.05,
+    output: Output = PICTURE_ONLY,
+    **other_effects: Any,
 ) -> Recipe:
-    """10 cm of snow. given: fields of other effects, by name."""
+    """10 cm of snow. other_effects: fields of other effects, by name."""
     snow = {"depth_m": 0.1, "shading": shading, "cell_m": cell_m}
-    return recipe_of({"snow": snow, **given}, output)
+    return recipe_of({"snow": snow, **other_effects}, output)
 
 
 def tables(case: EffectCase, repeats: int) -> list[Table]:
@@ -79,34 +83,35 @@ def tables(case: EffectCase, repeats: int) -> list[Table]:
                           recipe_of(beside, output))
         for shading, title, beside, output in cases
     }  # fmt: skip
-    found = [placement_table(uri, case, repeats) for uri in case.scenes]
-    found += cost_tables(case, costs, SHADINGS, repeats)
+    all_tables = [placement_table(uri, case, repeats) for uri in case.scenes]
+    all_tables += cost_tables(case, costs, SHADINGS, repeats)
     street, truth = case.open_street()
     reach_m, pixel_m = (16.0, 0.1) if case.cell_m >= 0.1 else (32.0, 0.05)
     accuracy = snow_accuracy(street, truth, cell_m=case.cell_m, reach_m=reach_m, pixel_m=pixel_m)
-    found += accuracy_tables(case.street, accuracy)
+    all_tables += accuracy_tables(case.street, accuracy)
     columns = ("other view", "points", "equal masks", "worst pair", "colour rms, 1/255")
     for shading in SHADINGS:
         rows = snow_masks(street, case.frames, case.scale / 2, shading, case.cell_m)
-        found.append(Table(f"Masks of two views, {shading}", columns, rows))
-    return found
+        all_tables.append(Table(f"Masks of two views, {shading}", columns, rows))
+    return all_tables
 
 
 # ---- placement: what it takes, and what it covers -----------------------------------------------
 
 
 def placement(scene: Scene, cell_m: float, backend: str = "auto") -> Callable[[], SnowSupport]:
-    """Finds where snow can lie, for all cameras."""
+    """Return an action that places snow for all cameras."""
     settings = placement_settings(snow_recipe(cell_m=cell_m).weather.snow, scene)
     cameras = all_cameras(scene)
     return functools.partial(place_snow_support, scene, cameras, settings, backend=backend)
 
 
 def placement_table(uri: str, case: EffectCase, repeats: int) -> Table:
-    """Seconds of finding where snow can lie for all cameras, and of snow laid on it."""
+    """Time the placement of snow for all cameras, and the layer of snow on it."""
     scene = open_scene(uri)
     find = placement(scene, case.cell_m)
-    support, stages = find(), rounds({"all": find}, min(repeats, 3))
+    support = find()
+    stages = rounds({"all": find}, min(repeats, 3))
     depths_m = itertools.cycle((0.05, 0.1, 0.3))  # what was laid last does not help the next
 
     def lay(shading: str) -> object:
@@ -120,7 +125,7 @@ def placement_table(uri: str, case: EffectCase, repeats: int) -> Table:
     return Table(
         f"Placement: {uri}, {len(all_cameras(scene))} cameras, cells of {case.cell_m:g} m",
         ("stage", "seconds", "least"),
-        [[stage, float(np.median(each)), min(each)] for stage, each in stages.items()],
+        [[stage, float(np.median(times)), min(times)] for stage, times in stages.items()],
         f"{len(support.ground):,} cells, {on_vehicles:,} on {len(support.actors)} vehicles"
         + ("" if mib is None else f"; {mib:.0f} MiB above the scene"),
     )
@@ -156,7 +161,7 @@ class TruePoints:
 
 
 def still(truth: StreetTruth) -> StreetTruth:
-    """The street without what moves."""
+    """Return the street without moving objects."""
     return StreetTruth(dataclasses.replace(truth.street, movers=()))
 
 
@@ -165,11 +170,13 @@ def camera_from_above(cameras: Sequence[Camera], *, reach_m: float, pixel_m: flo
     distance along x and y; rows towards -y.
     """
     centres = np.stack([camera.centre.numpy()[:2] for camera in cameras])
-    low, high = centres.min(0) - reach_m, centres.max(0) + reach_m
+    low = centres.min(0) - reach_m
+    high = centres.max(0) + reach_m
     width, height = (int(n) for n in np.ceil((high - low) / pixel_m))
     eye = torch.tensor([*((low + high) / 2), SKY_Z_M], dtype=torch.float64)
     rotation = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    pose, scale = rigid(rotation, -rotation @ eye), 1 / pixel_m
+    pose = rigid(rotation, -rotation @ eye)
+    scale = 1 / pixel_m
     return Camera(
         "from above", width, height, scale, scale, width / 2, height / 2, pose, is_orthographic=True
     )
@@ -184,7 +191,7 @@ def pixel_places(camera: Camera) -> np.ndarray:
 
 
 def pixels_of(camera: Camera, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of places [P, 2] in a camera from above."""
+    """Return rows and columns of positions [P, 2] in a camera from above."""
     off = (xy - camera.centre.numpy()[:2]) * [camera.fx, -camera.fy] + [camera.cx, camera.cy]
     columns, rows = np.floor(off).astype(np.int64).T
     return rows, columns
@@ -217,9 +224,9 @@ def true_points(
         from_path_m=away,
         is_seen=np.zeros(len(xy), bool),
     )
-    met = (away <= reach_m) & np.isfinite(hits.distance)
-    points = points.chosen(met)
-    return dataclasses.replace(points, is_seen=_seen(truth, cameras, points, hits.normal[met]))
+    is_hit = (away <= reach_m) & np.isfinite(hits.distance)
+    points = points.chosen(is_hit)
+    return dataclasses.replace(points, is_seen=_seen(truth, cameras, points, hits.normal[is_hit]))
 
 
 def _seen(
@@ -227,19 +234,22 @@ def _seen(
 ) -> np.ndarray:
     """bool [P]: seen by one of the cameras, whatever its distance."""
     places = np.concatenate([points.xy, points.z[:, None]], 1) + LIFT_M * normals
-    seen = np.zeros(len(points), bool)
+    is_seen = np.zeros(len(points), bool)
     for camera in cameras:
-        left = np.flatnonzero(~seen)
-        pose, to_eye = camera.camera_from_world.numpy(), camera.centre.numpy() - places[left]
+        left = np.flatnonzero(~is_seen)
+        pose = camera.camera_from_world.numpy()
+        to_eye = camera.centre.numpy() - places[left]
         x, y, z = (places[left] @ pose[:3, :3].T + pose[:3, 3]).T
         depth = np.maximum(z, 1e-9)
-        u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+        u = camera.fx * x / depth + camera.cx
+        v = camera.fy * y / depth + camera.cy
         inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         inside &= (to_eye * normals[left]).sum(1) > 0
         if inside.any():
-            left, to_eye = left[inside], to_eye[inside]
-            seen[left] = ~truth.street.static.tree.occluded(places[left], to_eye, 1.0)
-    return seen
+            left = left[inside]
+            to_eye = to_eye[inside]
+            is_seen[left] = ~truth.street.static.tree.occluded(places[left], to_eye, 1.0)
+    return is_seen
 
 
 def snow_accuracy(
@@ -256,7 +266,8 @@ def snow_accuracy(
     within which points are taken. pixel_m: of the view from above; every second of its pixels along
     each axis is a point.
     """
-    cameras, street = all_cameras(scene), still(truth)
+    cameras = all_cameras(scene)
+    street = still(truth)
     above = camera_from_above(cameras, reach_m=reach_m, pixel_m=pixel_m)
     points = true_points(
         street, cameras, pixel_places(above)[1::2, 1::2].reshape(-1, 2), reach_m=reach_m
@@ -265,72 +276,83 @@ def snow_accuracy(
     flat = points.chosen(points.is_seen & (points.slope < max_slope))
     crown = flat.semantic == SemanticClass.VEGETATION
     bias = _scene_bias_m(scene, street, flat, above)
-    found = []
+    estimator_rows = []
     for estimator in estimators:
         settings = PlacementSettings(cell_m=cell_m, estimator=estimator)
         support = place_snow_support(scene, cameras, settings)
         covered = cells_over(support.ground, flat) >= 0
         rings = {}
         for low, high in itertools.pairwise(RINGS_M):
-            own = (flat.from_path_m >= low) & (flat.from_path_m < high)
-            rings[f"{low:g}-{high:g} m"] = float(covered[own].mean()) if own.any() else None
-        found.append({
+            in_ring = (flat.from_path_m >= low) & (flat.from_path_m < high)
+            rings[f"{low:g}-{high:g} m"] = float(covered[in_ring].mean()) if in_ring.any() else None
+        estimator_rows.append({
             "estimator": estimator,
             "covered": float(covered[~crown].mean()),
             "rings": rings,
             "error_m": height_error(support_heights(support.ground, flat) - flat.z),
             "depths": [_drawn(scene, support, street, flat, above, d, bias) for d in depths_m],
         })  # fmt: skip
-    return {"points": len(flat), "scene_bias_m": bias, "estimators": found}
+    return {"points": len(flat), "scene_bias_m": bias, "estimators": estimator_rows}
 
 
-def accuracy_tables(street: str, found: dict[str, Any]) -> list[Table]:
+def accuracy_tables(street: str, accuracy: dict[str, Any]) -> list[Table]:
     """Lengths in cm, shares in %."""
 
     def hundredfold(values: Sequence[float | None]) -> list[float | None]:
         return [None if value is None else 100 * value for value in values]
 
-    placed, drawn = [], []
-    for each in found["estimators"]:
-        shares = [each["covered"], *each["rings"].values(), *each["error_m"].values()]
-        placed.append([each["estimator"], *hundredfold(shares)])
-        for one in each["depths"]:
-            shares = [one["depth_m"], one["covered"], one["sheltered"], *one["error_m"].values()]
-            median = one["error_on_scene_m"]["median"]
-            drawn.append([each["estimator"], *hundredfold([*shares, median])])
-    rings = found["estimators"][0]["rings"]
+    placement_rows = []
+    height_rows = []
+    for estimator_figures in accuracy["estimators"]:
+        shares = [
+            estimator_figures["covered"],
+            *estimator_figures["rings"].values(),
+            *estimator_figures["error_m"].values(),
+        ]
+        placement_rows.append([estimator_figures["estimator"], *hundredfold(shares)])
+        for depth_figures in estimator_figures["depths"]:
+            shares = [
+                depth_figures["depth_m"],
+                depth_figures["covered"],
+                depth_figures["sheltered"],
+                *depth_figures["error_m"].values(),
+            ]
+            median = depth_figures["error_on_scene_m"]["median"]
+            height_rows.append([estimator_figures["estimator"], *hundredfold([*shares, median])])
+    rings = accuracy["estimators"][0]["rings"]
     lengths = ("error cm", "p95", "bias")
     return [
         Table(
-            f"Cells, %: {street}, {found['points']:,} points open to the sky, flat and seen",
+            f"Cells, %: {street}, {accuracy['points']:,} points open to the sky, flat and seen",
             ("heights from", "covered", *rings, *lengths),
-            placed,
+            placement_rows,
         ),
         Table(
             "Snow as drawn from above, %",
             ("heights from", "depth cm", "covered", "sheltered", *lengths, "on the scene's own"),
-            drawn,
-            f"the scene's own surface is off by {100 * found['scene_bias_m']:+.1f} cm",
+            height_rows,
+            f"the scene's own surface is off by {100 * accuracy['scene_bias_m']:+.1f} cm",
         ),
     ]
 
 
 def cells_over(cells: SnowCells, points: TruePoints) -> np.ndarray:
     """int64 [P]: the cell over each point and close to its surface, -1 where there is none."""
-    centers, sizes = cells.centers_m.numpy().astype(np.float64), cells.sizes_m.numpy()
+    centers = cells.centers_m.numpy().astype(np.float64)
+    sizes = cells.sizes_m.numpy()
     out = np.full(len(points), -1, np.int64)
     for size in np.unique(sizes):
-        own = np.flatnonzero(sizes == size)
-        low = centers[own, :2] - size / 2
+        cell_ids = np.flatnonzero(sizes == size)
+        low = centers[cell_ids, :2] - size / 2
         offset = low[0] % size  # cells of one size share a grid
         key = _keys(np.round((low - offset) / size).astype(np.int64))
         place = _keys(np.floor((points.xy - offset) / size).astype(np.int64))
         order = np.argsort(key)
-        at = np.minimum(np.searchsorted(key[order], place), len(own) - 1)
-        found = own[order[at]]
-        met = key[order[at]] == place
-        met &= np.abs(_heights(cells, found, points.xy) - points.z) <= OVER_M
-        out[met] = found[met]
+        at = np.minimum(np.searchsorted(key[order], place), len(cell_ids) - 1)
+        candidate_ids = cell_ids[order[at]]
+        is_match = key[order[at]] == place
+        is_match &= np.abs(_heights(cells, candidate_ids, points.xy) - points.z) <= OVER_M
+        out[is_match] = candidate_ids[is_match]
     return out
 
 
@@ -349,13 +371,14 @@ def _heights(cells: SnowCells, which: np.ndarray, xy: np.ndarray) -> np.ndarray:
 def support_heights(cells: SnowCells, points: TruePoints) -> np.ndarray:
     """z [P] of the support under each point, NaN where it has none."""
     over = cells_over(cells, points)
-    z, met = np.full(len(points), np.nan), over >= 0
-    z[met] = _heights(cells, over[met], points.xy[met])
+    z = np.full(len(points), np.nan)
+    is_covered = over >= 0
+    z[is_covered] = _heights(cells, over[is_covered], points.xy[is_covered])
     return z
 
 
 def height_error(off: np.ndarray) -> dict[str, float | None]:
-    """Of height differences [P], NaN left out."""
+    """Return figures of height differences [P] without NaN."""
     off = off[np.isfinite(off)]
     if len(off) == 0:
         return {"median": None, "p95": None, "bias": None}
@@ -395,12 +418,14 @@ def _drawn(
     settings = RasterSettings(sh_degree=0)
     out = rasterize(parts, above, buffers=BUFFERS, settings=settings, clip=UNCUT)
     height = SKY_Z_M - out.mode_depth.to(torch.float64).numpy()
-    shown = out.overlay.numpy() >= 0.5
-    z, there = height[pixels_of(above, flat.xy)], shown[pixels_of(above, flat.xy)]
-    on_it = there & (np.abs(z - depth_m - flat.z) <= OVER_M + 0.5 * depth_m)
+    shows_snow = out.overlay.numpy() >= 0.5
+    z = height[pixels_of(above, flat.xy)]
+    shows_snow_there = shows_snow[pixels_of(above, flat.xy)]
+    on_it = shows_snow_there & (np.abs(z - depth_m - flat.z) <= OVER_M + 0.5 * depth_m)
     off = np.where(on_it, z - flat.z - depth_m, np.nan)
-    step = max(1, int(shown.sum()) // 400_000)
-    places, heights = pixel_places(above)[shown][::step], height[shown][::step]
+    step = max(1, int(shows_snow.sum()) // 400_000)
+    places = pixel_places(above)[shows_snow][::step]
+    heights = height[shows_snow][::step]
     sunk = heights < surface_below(truth, places) - OVER_M
     return {
         "depth_m": depth_m,
@@ -414,7 +439,7 @@ def _drawn(
 def snow_masks(
     scene: Scene, frames: Sequence[int], scale: float, shading: str, cell_m: float
 ) -> list[list[Any]]:
-    """Of neighbouring cameras, and of cameras a frame ahead, where their depths agree."""
+    """Compare masks of neighbouring cameras and of cameras a frame ahead where depths agree."""
     recipe = snow_recipe(shading, cell_m, Output(depth="expected", labels=False))
 
     def seen(camera: Camera) -> tuple[DepthView, np.ndarray]:
@@ -469,22 +494,23 @@ def mask_agreement(
     the view whose depth says which points are shared, and the mask bool [H, W].
     """
     view_of = functools.cache(view_of)
-    found: dict[str, list[tuple[int, int, float, int]]] = {}
-    for kind, one, other in pairs:
-        (here, here_mask), (there, there_mask) = view_of(one), view_of(other)
-        warp = find_warp(here, there)
-        ours = here_mask[warp.counts]
-        images = np.concatenate([there.picture, there_mask[..., None]], -1)
+    counts_by_kind: dict[str, list[tuple[int, int, float, int]]] = {}
+    for kind, first, second in pairs:
+        (first_view, first_mask) = view_of(first)
+        (second_view, second_mask) = view_of(second)
+        warp = find_warp(first_view, second_view)
+        ours = first_mask[warp.counts]
+        images = np.concatenate([second_view.picture, second_mask[..., None]], -1)
         theirs = warp.sample(images)[warp.counts]
         same = ours == (theirs[:, 3] > 0.5)
         both = ours & same
-        squares = float(((here.picture[warp.counts][both] - theirs[both, :3]) ** 2).sum())
+        squares = float(((first_view.picture[warp.counts][both] - theirs[both, :3]) ** 2).sum())
         counts = (len(ours), int(same.sum()), squares, int(both.sum()))
-        found.setdefault(kind, []).append(counts)
+        counts_by_kind.setdefault(kind, []).append(counts)
     rows: list[list[Cell]] = []
-    for kind, each in found.items():
-        points, same, squares, both = (sum(column) for column in zip(*each, strict=True))
-        worst = min((s / p for p, s, _, _ in each if p), default=None)
+    for kind, pair_counts in counts_by_kind.items():
+        points, same, squares, both = (sum(column) for column in zip(*pair_counts, strict=True))
+        worst = min((s / p for p, s, _, _ in pair_counts if p), default=None)
         rms = 255 * math.sqrt(squares / (3 * both)) if both else None
         rows.append([kind, points, same / points if points else None, worst, rms])
     return rows

@@ -46,13 +46,15 @@ from tools.bench.scenes import (
     recipe_of,
 )
 
-PHOTO_PX, HOLDOUT, PAIRS = 256, 8, 60
+PHOTO_PX = 256
+HOLDOUT = 8
+PAIRS = 60
 OVERSATURATED = 0.2  # of the pixels
 SATURATED = 254.5 / 255  # of a channel: displayed as full
 
 
-def style_recipe(preset: str = "overcast", **given: Any) -> Recipe:
-    return recipe_of({"style": {"preset": preset, **given}})
+def style_recipe(preset: str = "overcast", **other_fields: Any) -> Recipe:
+    return recipe_of({"style": {"preset": preset, **other_fields}})
 
 
 def tables(case: EffectCase, repeats: int) -> list[Table]:
@@ -92,8 +94,8 @@ def _fold_table(case: RasterCase, repeats: int) -> Table:
         for where, out in (("in place", gaussians.sh), ("new memory", None))
     }
     rows = [
-        [name, median_ms(each), min(each) * 1e3, moved / min(each) / 1e9]
-        for name, each in rounds(actions, repeats).items()
+        [name, median_ms(times), min(times) * 1e3, moved / min(times) / 1e9]
+        for name, times in rounds(actions, repeats).items()
     ]
     title = f"Maps folded into {len(gaussians):,} Gaussians, {moved / 1e6:.0f} MB read and written"
     return Table(title, ("map", "ms", "least", "GB/s at best"), rows)
@@ -104,26 +106,29 @@ def _folded_error_table(uri: str, case: EffectCase) -> Table:
     with a colour below 0 is blended, which is clamped before the map if the map is not folded.
     """
     scene = open_scene(uri)
-    camera, rows = front_camera(scene, case.width), []
+    camera = front_camera(scene, case.width)
+    rows = []
     for preset in case.presets or style_preset_names():
         recipes = (style_recipe(preset, evaluated=where) for where in ("sh", "color"))
         folded, mapped = (frame_of(scene, camera, r)().rgb.numpy() for r in recipes)
         off = 255 * np.abs(folded - mapped).max(-1)
-        found = psnr(folded.clip(0, 1), mapped.clip(0, 1)) if off.any() else None
-        rows.append([preset, found, float(off.max()), 100 * float((off > 1).mean())])
+        psnr_db = psnr(folded.clip(0, 1), mapped.clip(0, 1)) if off.any() else None
+        rows.append([preset, psnr_db, float(off.max()), 100 * float((off > 1).mean())])
     columns = ("preset", "PSNR dB", "largest", "off by > 1/255, %")
     return Table(f"Maps folded into SH against mapped colours, 1/255: {uri}", columns, rows)
 
 
 def _map_table(scene: Scene, repeats: int) -> Table:
     """From a style image's file to the map, and what the scene's side takes once."""
-    net, rgb = load_network(None), frame_of(scene, front_camera(scene, 1920), CLEAN)().rgb
+    net = load_network(None)
+    rgb = frame_of(scene, front_camera(scene, 1920), CLEAN)().rgb
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "style.jpg"
         cv2.imwrite(str(path), quantise(rgb * torch.tensor([1.0, 0.8, 0.6]))[..., ::-1])
         image = read_style_image(path)
         reading = rounds({"reading the image": lambda: read_style_image(path)}, repeats)
-    content, pictures = content_statistics(scene, per_region=True), content_pictures(scene)
+    content = content_statistics(scene, per_region=True)
+    pictures = content_pictures(scene)
 
     def closed(method: Any, per_region: bool = False) -> object:
         style = image_statistics(image)
@@ -144,7 +149,7 @@ def _map_table(scene: Scene, repeats: int) -> Table:
         "once a scene: pictures": lambda: once(content_pictures),
     }
     seconds = reading | rounds(actions, repeats)
-    rows = [[name, median_ms(each), 1e3 * min(each)] for name, each in seconds.items()]
+    rows = [[name, median_ms(times), 1e3 * min(times)] for name, times in seconds.items()]
     return Table("From a style image to its map", ("what", "ms", "least"), rows)
 
 
@@ -175,19 +180,21 @@ def _score_table(photos: Path) -> Table:
 
 
 def _oversaturated_share(method: Method, photos: torch.Tensor) -> float:
-    """Of PAIRS pairs of different photos: those in which the pixels with a full channel are more,
-    by OVERSATURATED of all, than in content and style.
+    """Return the share of oversaturated pictures among PAIRS pairs of different photos.
+
+    A picture is oversaturated if more of its pixels have a full channel than in content and style,
+    by OVERSATURATED of all pixels.
     """
 
     def saturated(color_map: torch.Tensor, photo: torch.Tensor) -> float:
         return float((mapped_picture(color_map, photo) > SATURATED).any(0).float().mean())
 
-    every = list(itertools.permutations(photos, 2))
+    photo_pairs = list(itertools.permutations(photos, 2))
     generator = torch.Generator().manual_seed(0)
-    chosen = torch.randperm(len(every), generator=generator)[:PAIRS].tolist()
+    chosen = torch.randperm(len(photo_pairs), generator=generator)[:PAIRS].tolist()
     eye = torch.eye(3, 4)
     beyond = []
-    for content, style in (every[index] for index in chosen):
+    for content, style in (photo_pairs[index] for index in chosen):
         before = max(saturated(eye, photo) for photo in (content, style))
         beyond.append(saturated(method(content, style), content) - before)
     return float(np.mean(np.array(beyond) > OVERSATURATED))

@@ -76,8 +76,11 @@ from tools.drawing import captioned, strip, write_rgb
 from tools.render import warm_up
 
 WHOLE = "whole"  # stands for a knob where several are set
-DEPTH, JPEG = "output.depth", "output.jpeg_quality"
-REFERENCE, DEFAULTS, CLEAN = "reference", "defaults", "clean"
+DEPTH = "output.depth"
+JPEG = "output.jpeg_quality"
+REFERENCE = "reference"
+DEFAULTS = "defaults"
+CLEAN = "clean"
 WATER = "water"  # the mask of what a ray meets before the scene
 TRUTH = "truth"  # what depths are compared with where the scene's surfaces are known
 PRESETS = {
@@ -122,7 +125,8 @@ class TradeCase:
     memory: bool = True
 
 
-WHOLE_CASE, QUICK = TradeCase(), TradeCase(width=240, repeats=1, memory=False)
+WHOLE_CASE = TradeCase()
+QUICK = TradeCase(width=240, repeats=1, memory=False)
 
 
 def trade_recipe(name: str) -> Recipe:
@@ -148,23 +152,28 @@ def measured_values(knob: Knob, recipe: Recipe | None = None) -> Sequence[Value]
 
 
 def settings_of_trade(recipe: Recipe, wholes: Wholes | None = None) -> list[tuple[Row, Recipe]]:
-    """What rows begin with, and the recipe in that setting: reference first, each knob's other
-    values alone, then the recipe with its own settings, and the tiers. wholes: in place of all but
-    the reference.
+    """Return the settings to measure: the start of each row, and its recipe.
+
+    The reference comes first, then each other value of each knob alone, then the recipe with its
+    own
+    settings, and the tiers.
+
+    wholes: settings of many knobs that replace all but the reference.
     """
-    best, knobs = as_reference(recipe), knobs_of(recipe)
+    best = as_reference(recipe)
+    knobs = knobs_of(recipe)
     references = {knob.path: knob.reference for knob in knobs if knob.chosen}
     single: list[tuple[Row, Recipe]] = []
     if wholes is None:
         pairs = [(knob.path, value) for knob in knobs for value in measured_values(knob, recipe)]
         single = [({"knob": p, "value": v}, with_settings(best, {p: v})) for p, v in pairs]
         single.append(({"knob": WHOLE, "value": DEFAULTS}, recipe))
-    whole: list[tuple[Row, Recipe]] = []
+    whole_rows: list[tuple[Row, Recipe]] = []
     for name, settings in {REFERENCE: {}, **(TIERS if wholes is None else wholes)}.items():
-        given = {path: settings.get(path, value) for path, value in references.items()}
-        row = {"knob": WHOLE, "value": name, "settings": given}
-        whole.append((row, with_settings(best, given)))
-    return [whole[0], *single, *whole[1:]]
+        all_settings = {path: settings.get(path, value) for path, value in references.items()}
+        row = {"knob": WHOLE, "value": name, "settings": all_settings}
+        whole_rows.append((row, with_settings(best, all_settings)))
+    return [whole_rows[0], *single, *whole_rows[1:]]
 
 
 def trade_views(scene: Scene, width: int) -> list[tuple[int, Camera]]:
@@ -209,12 +218,12 @@ class Standard:
     true_m: np.ndarray | None = None
 
     def region(self, knob: str) -> np.ndarray:
-        """Where a knob's depth errors count: on what its effect covers, else on all surfaces."""
-        own = next((e for e in effects.EFFECTS if knob.startswith(f"{e.section}.")), None)
-        if own is None or own.mask is None:
+        """Return the pixels of a knob's depth errors: its effect's, or else all surfaces."""
+        effect = next((e for e in effects.EFFECTS if knob.startswith(f"{e.section}.")), None)
+        if effect is None or effect.mask is None:
             return self.surfaces
-        covered = self.masks.get(own.mask, np.zeros_like(self.surfaces))
-        return covered if own.lies_on_scene else covered & self.surfaces
+        covered = self.masks.get(effect.mask, np.zeros_like(self.surfaces))
+        return covered if effect.lies_on_scene else covered & self.surfaces
 
 
 def standard_of(
@@ -225,7 +234,8 @@ def standard_of(
     if recipe.output.depth == "none":
         recipe = with_settings(recipe, {DEPTH: "median"})
     solid = frame_of(scene, camera, recipe)()
-    depth, alpha = solid.depth_m, solid.raster.alpha
+    depth = solid.depth_m
+    alpha = solid.raster.alpha
     surfaces = (alpha >= SURFACE_ALPHA) & (depth > 0)
     if WATER in solid.masks:
         of_water = with_settings(recipe, {"output.surface": "first"})
@@ -252,30 +262,40 @@ def errors_of(knob: str, trials: Sequence[Trial], standards: Sequence[Standard])
     """Depth against the reference's; of estimators, where the scene's exact depth is known, against
     that. depth_against: which of the two; None where the recipe writes none.
     """
-    where = [standard.region(knob) for standard in standards]
-    known = [standard.best.depth for standard in standards]
-    true, against = [standard.true_m for standard in standards], None
-    if knob == DEPTH and all(depth is not None for depth in true):
-        against, known = TRUTH, true
-        where = [np.isfinite(t) & s.surfaces for t, s in zip(true, standards, strict=True)]
-    elif all(depth is not None for depth in known):
-        against = REFERENCE
-        where = [region & (depth > 0) for region, depth in zip(where, known, strict=True)]
-    depths = [trial.depth if against else None for trial in trials]
+    regions = [standard.region(knob) for standard in standards]
+    expected_depths = [standard.best.depth for standard in standards]
+    true_depths_m = [standard.true_m for standard in standards]
+    depth_reference = None
+    if knob == DEPTH and all(depth is not None for depth in true_depths_m):
+        depth_reference = TRUTH
+        expected_depths = true_depths_m
+        regions = [
+            np.isfinite(t) & s.surfaces for t, s in zip(true_depths_m, standards, strict=True)
+        ]
+    elif all(depth is not None for depth in expected_depths):
+        depth_reference = REFERENCE
+        regions = [
+            region & (depth > 0) for region, depth in zip(regions, expected_depths, strict=True)
+        ]
+    depths = [trial.depth if depth_reference else None for trial in trials]
     pictures = [trial.picture for trial in trials]
     return {
         **picture_figures(pictures, [standard.best.picture for standard in standards]),
-        **depth_figures(depths, known, where),
-        "depth_against": against,
+        **depth_figures(depths, expected_depths, regions),
+        "depth_against": depth_reference,
         "flicker": flicker(standards[:2], pictures[:2]),
     }
 
 
-def picture_figures(own: Sequence[np.ndarray], best: Sequence[np.ndarray]) -> Row:
-    """Of uint8 pictures [H, W, 3] by view, display-encoded. psnr: dB, of the mean squared error of
-    all views; None where there is none. flip, ssim: means; worst_flip: of the worst view.
+def picture_figures(pictures: Sequence[np.ndarray], best: Sequence[np.ndarray]) -> Row:
+    """Compare uint8 pictures [H, W, 3] of all views, display-encoded.
+
+    Returns:
+        psnr: dB, of the mean squared error of all views; None for equal pictures. flip, ssim:
+            means.
+        worst_flip: FLIP of the worst view.
     """
-    pairs = list(zip(own, best, strict=True))
+    pairs = list(zip(pictures, best, strict=True))
     mse = fmean(float((((a.astype(np.float64) - b) / 255) ** 2).mean()) for a, b in pairs)
     # Many settings have no effect on some scene.
     flips = [0.0 if np.array_equal(a, b) else flip(a, b) for a, b in pairs]
@@ -296,13 +316,13 @@ def depth_figures(
     """
     if any(depth is None for depth in depths) or not any(region.any() for region in where):
         return {"abs_rel": None, "off_5cm": None}
-    own, good = (
-        np.concatenate([i[r] for i, r in zip(each, where, strict=True)]).astype(np.float64)
-        for each in (depths, right)
+    measured_m, expected_m = (
+        np.concatenate([i[r] for i, r in zip(depth_images, where, strict=True)]).astype(np.float64)
+        for depth_images in (depths, right)
     )
-    found = depth_errors(own, good, own > 0)
-    close = found.within_5cm * found.pixels / own.size if found.pixels else 0.0
-    return {"abs_rel": found.abs_rel, "off_5cm": 1 - close}
+    errors = depth_errors(measured_m, expected_m, measured_m > 0)
+    close = errors.within_5cm * errors.pixels / measured_m.size if errors.pixels else 0.0
+    return {"abs_rel": errors.abs_rel, "off_5cm": 1 - close}
 
 
 def flicker(standards: Sequence[Standard], pictures: Sequence[np.ndarray]) -> float:
@@ -348,28 +368,29 @@ def bench_trade(
     there; on which pixels errors count is the CPU backend's to say. Raises SceneError, RecipeError:
     the scene or a recipe cannot be used.
     """
-    drawn = [trade_recipe(name) for name in recipes]
+    resolved_recipes = [trade_recipe(name) for name in recipes]
     scene = open_scene(scene_uri)
     with contextlib.suppress(SceneError):  # looked for once, not for every copy of the scene
         scene = dataclasses.replace(scene, ground=ground_of(scene))
     share_errors(scene)
     views = trade_views(scene, case.width)
     cameras = [camera for _, camera in views]
-    machine, gpu = harness.machine_facts(), None if backend == CPU else harness.gpu_facts()
-    warm_up(drawn)
+    machine = harness.machine_facts()
+    gpu = None if backend == CPU else harness.gpu_facts()
+    warm_up(resolved_recipes)
     true_m = true_depths(scene_uri, cameras) or [None] * len(cameras)
-    pictures: dict[str, dict[str, np.ndarray]] = {recipe.name: {} for recipe in drawn}
+    pictures: dict[str, dict[str, np.ndarray]] = {recipe.name: {} for recipe in resolved_recipes}
     entries = []
-    for recipe in tqdm(drawn, unit="recipe"):
-        own = dataclasses.replace(scene)  # which forgets what it knows of other recipes
-        memo_of(own).update(memo_of(scene).shared())
+    for recipe in tqdm(resolved_recipes, unit="recipe"):
+        recipe_scene = dataclasses.replace(scene)  # its memo holds nothing of other recipes
+        memo_of(recipe_scene).update(memo_of(scene).shared())
         settings = settings_of_trade(recipe, wholes)
         standards = [
-            standard_of(own, camera, settings[0][1], true, backend)
+            standard_of(recipe_scene, camera, settings[0][1], true, backend)
             for camera, true in zip(cameras, true_m, strict=True)
         ]
         rows: list[Row] = []
-        for row, picture in setting_rows(own, recipe, settings, standards, case, backend):
+        for row, picture in setting_rows(recipe_scene, recipe, settings, standards, case, backend):
             rows.append(row)
             if row["knob"] == WHOLE:
                 pictures[recipe.name][row["value"]] = picture
@@ -377,7 +398,7 @@ def bench_trade(
             rows += jpeg_rows([standard.best.picture for standard in standards])
         rows = [{name: _rounded(value) for name, value in row.items()} for row in rows]
         entries.append({"recipe": recipe.name, "rows": rows})
-    found = {
+    trade_figures = {
         "scene": scene.name,
         "gaussians": len(scene.background.means),
         "views": [
@@ -391,7 +412,7 @@ def bench_trade(
         "load_after": harness.load_average(),
         "recipes": entries,
     }
-    return Trade(found, pictures)
+    return Trade(trade_figures, pictures)
 
 
 def setting_rows(
@@ -408,26 +429,31 @@ def setting_rows(
     clean = as_reference(recipe.model_copy(update={"weather": Weather(), "style": None}))
     cameras = [standard.camera for standard in standards]
 
-    def frame(own: Recipe, camera: Camera) -> harness.Action:
+    def frame(trial_recipe: Recipe, camera: Camera) -> harness.Action:
         """Without enlarging it, which takes no part in the time."""
-        return functools.partial(default_renderer(), scene, camera, own, backend=backend)
+        return functools.partial(default_renderer(), scene, camera, trial_recipe, backend=backend)
 
     for start in range(1, max(len(settings), 2), AT_A_TIME):
         group = [({}, clean), settings[0], *settings[start : start + AT_A_TIME]]
-        trials = [[render_trial(scene, c, own, backend) for c in cameras] for _, own in group]
+        trials = [
+            [render_trial(scene, c, trial_recipe, backend) for c in cameras]
+            for _, trial_recipe in group
+        ]
         seconds: list[list[float]] = [[] for _ in group]
         for camera in cameras:
-            frames = {str(n): frame(own, camera) for n, (_, own) in enumerate(group)}
+            frames = {
+                str(n): frame(trial_recipe, camera) for n, (_, trial_recipe) in enumerate(group)
+            }
             for name, timed in harness.rounds(frames, case.repeats).items():
                 seconds[int(name)] += timed
         for n in range(1 if start == 1 else 2, len(group)):
-            head, own = group[n]
+            head, trial_recipe = group[n]
             row = {**head, **_times(seconds[n])}
             row["over_reference"] = harness.spread_ratio(seconds[n], seconds[1])["median"]
             row["over_clean"] = harness.spread_ratio(seconds[n], seconds[0])["median"]
             row |= errors_of(row["knob"], trials[n], standards)
             if case.memory and row["knob"] == WHOLE:
-                row["mib"] = frame_mib(frame(own, cameras[0]), backend)
+                row["mib"] = frame_mib(frame(trial_recipe, cameras[0]), backend)
             yield row, trials[n][0].picture
 
 
@@ -448,12 +474,12 @@ def jpeg_rows(pictures: Sequence[np.ndarray]) -> Iterator[Row]:
     for quality in ("png", *KNOBS[JPEG].values):
         output = Output() if quality == "png" else Output(image="jpg", jpeg_quality=quality)
         encode = [functools.partial(encode_image, picture, output) for picture in pictures]
-        times = harness.rounds({str(n): each for n, each in enumerate(encode)}, 1).values()
-        files = [each() for each in encode]
+        times = harness.rounds({str(n): encoder for n, encoder in enumerate(encode)}, 1).values()
+        files = [encoder() for encoder in encode]
         yield {
             "knob": JPEG,
             "value": quality,
-            **_times([s for each in times for s in each]),
+            **_times([s for encoder in times for s in encoder]),
             "kilobytes": fmean(len(data) / 1e3 for data in files),
             **picture_figures([decode_image(data) for data in files], pictures),
         }
@@ -484,16 +510,19 @@ def printable(trade: Mapping[str, Any]) -> Figures:
     """Tables in the form that all subjects are printed in: of every recipe the settings, wholes
     first, and the files; columns of which something is known.
     """
-    order, tables = [WHOLE, *KNOBS], []
+    order = [WHOLE, *KNOBS]
+    tables = []
     for entry in trade["recipes"]:
         rows = sorted(entry["rows"], key=lambda row: order.index(row["knob"]))
         for title, of_files in ((entry["recipe"], False), (f"{entry['recipe']}, files", True)):
-            shown = [row for row in rows if (row["knob"] == JPEG) == of_files]
-            columns = {n: k for n, k in COLUMNS.items() if any(r.get(k) is not None for r in shown)}
-            cells = [[_cell(key, row.get(key)) for key in columns.values()] for row in shown]
+            table_rows = [row for row in rows if (row["knob"] == JPEG) == of_files]
+            columns = {
+                n: k for n, k in COLUMNS.items() if any(r.get(k) is not None for r in table_rows)
+            }
+            cells = [[_cell(key, row.get(key)) for key in columns.values()] for row in table_rows]
             tables += [Table(title, tuple(columns), cells)] if cells else []
-    shown = harness.figures("trade", tables, machine=trade["machine"], gpu=trade["gpu"])
-    return {**shown, "load_after": trade["load_after"]}
+    table_rows = harness.figures("trade", tables, machine=trade["machine"], gpu=trade["gpu"])
+    return {**table_rows, "load_after": trade["load_after"]}
 
 
 def _cell(key: str, value: Any) -> Any:
@@ -520,20 +549,23 @@ class Unmeasured(Exception):
 
 
 def tiers_from(tables: Tables) -> dict[str, dict[str, Value]]:
-    """What each tier sets, by the knobs' paths; knobs at reference are left out. Raises Unmeasured:
-    the tables lack settings that have to be rendered together.
+    """Return the settings of each tier, by the knobs' paths, without knobs at reference.
+
+    Raises:
+        Unmeasured: the tables lack settings that have to be rendered together.
     """
     return {name: tier_from(tables, bound) for name, bound in BOUNDS.items()}
 
 
 def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
     """The rule for one bound."""
-    rows, ladders = rows_of(tables), {}
+    rows = rows_of(tables)
+    ladders = {}
     for path, knob in KNOBS.items():
         if knob.chosen:
             costs = [value_cost(rows, path, value) for value in knob.values[:-1]]
-            known = [cost for cost in costs if cost is not None]
-            fast_first = useful([*known, Cost(knob.reference, 100.0, 0.0)])[::-1]
+            known_costs = [cost for cost in costs if cost is not None]
+            fast_first = useful([*known_costs, Cost(knob.reference, 100.0, 0.0)])[::-1]
             # What is beyond the bound alone need not be rendered with others.
             ladders[path] = [cost for cost in fast_first if cost.flip <= bound]
     by_time = sorted(ladders, key=lambda path: _saved(rows, path, ladders[path]), reverse=True)
@@ -547,17 +579,21 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
 def _saved(rows: Sequence[Row], path: str, costs: Sequence[Cost]) -> float:
     """The most that a value of the knob saves of all recipes: few have some knobs."""
     of_values = (_of_value(rows, path, cost.value) for cost in costs)
-    return max(-sum(math.log(row["over_reference"]) for row in own) for own in of_values)
+    return max(
+        -sum(math.log(row["over_reference"]) for row in value_rows) for value_rows in of_values
+    )
 
 
 def value_cost(rows: Sequence[Row], path: str, value: Value) -> Cost | None:
     """ms: here per cent of the reference's time. flip: the worst. None of a value that no table has
     or that changes no picture: a time would be noise.
     """
-    own = [row for row in _of_value(rows, path, value) if row["worst_flip"] > 0]
-    if not own:
+    changed_rows = [row for row in _of_value(rows, path, value) if row["worst_flip"] > 0]
+    if not changed_rows:
         return None
-    return Cost(value, 100 * _mean_ratio(own), max(row["worst_flip"] for row in own))
+    return Cost(
+        value, 100 * _mean_ratio(changed_rows), max(row["worst_flip"] for row in changed_rows)
+    )
 
 
 def whole_flip(rows: Sequence[Row], settings: Settings) -> float:
@@ -568,13 +604,15 @@ def whole_flip(rows: Sequence[Row], settings: Settings) -> float:
     for row in rows:
         by_recipe.setdefault((row["scene"], row["recipe"]), []).append(row)
     worst = [0.0]
-    for own in by_recipe.values():
-        knobs = {row["knob"] for row in own}
+    for recipe_rows in by_recipe.values():
+        knobs = {row["knob"] for row in recipe_rows}
         if moved := _moved(settings, knobs):
-            found = [row["worst_flip"] for row in own if _moved(_settings(row), knobs) == moved]
-            if not found:
+            flips = [
+                row["worst_flip"] for row in recipe_rows if _moved(_settings(row), knobs) == moved
+            ]
+            if not flips:
                 raise Unmeasured(settings)
-            worst += found
+            worst += flips
     return max(worst)
 
 
@@ -615,8 +653,10 @@ def measure_wholes(table: dict[str, Any], uri: str, wholes: Wholes, case: TradeC
     names = [entry["recipe"] for entry in table["recipes"]]
     trade = bench_trade(uri, names, case, wholes=wholes)
     for entry, new in zip(table["recipes"], trade.figures["recipes"], strict=True):
-        kept = [row for row in entry["rows"] if row["knob"] != WHOLE or row["value"] not in wholes]
-        entry["rows"] = kept + [row for row in new["rows"] if row["value"] in wholes]
+        other_rows = [
+            row for row in entry["rows"] if row["knob"] != WHOLE or row["value"] not in wholes
+        ]
+        entry["rows"] = other_rows + [row for row in new["rows"] if row["value"] in wholes]
     return trade
 
 
@@ -644,7 +684,8 @@ def document(text: str, tables: Tables) -> str:
         "knobs": _knob_lines(tables),
     }
     for name, lines in sections.items():
-        start, end = START.format(name=name), END.format(name=name)
+        start = START.format(name=name)
+        end = END.format(name=name)
         text = harness.replace_marked(text, start, end, "\n".join(lines))
     return text
 
@@ -653,7 +694,7 @@ def _machine_line(trade: Mapping[str, Any]) -> str:
     view = "{camera} of frame {frame} ({width}x{height})"
     return (
         f"- {harness.machine_line(trade)}; {trade['scene']}, {trade['gaussians']:,} Gaussians; "
-        f"{', '.join(view.format(**each) for each in trade['views'])}; "
+        f"{', '.join(view.format(**view_facts) for view_facts in trade['views'])}; "
         f"{trade['repeats']} timed frames of each view and setting."
     )
 
@@ -668,13 +709,14 @@ def _tier_lines() -> list[str]:
 
 def _whole_lines(tables: Tables) -> list[str]:
     """Settings as a whole, a row a recipe: time over the reference's, and the worst view's FLIP."""
-    names, lines = (DEFAULTS, *BOUNDS), []
-    whole = [row for row in rows_of(tables) if row["knob"] == WHOLE]
-    found = {(row["scene"], row["recipe"], row["value"]): row for row in whole}
-    for scene, recipe in dict.fromkeys(key[:2] for key in found):
-        of = [found[scene, recipe, name] for name in names]
+    names = (DEFAULTS, *BOUNDS)
+    lines = []
+    whole_rows = [row for row in rows_of(tables) if row["knob"] == WHOLE]
+    row_of = {(row["scene"], row["recipe"], row["value"]): row for row in whole_rows}
+    for scene, recipe in dict.fromkeys(key[:2] for key in row_of):
+        of = [row_of[scene, recipe, name] for name in names]
         cells = [f"{row['over_reference']:.2f}, {row['worst_flip']:.3f}" for row in of]
-        lines.append([scene, recipe, f"{found[scene, recipe, REFERENCE]['ms']:.0f}", *cells])
+        lines.append([scene, recipe, f"{row_of[scene, recipe, REFERENCE]['ms']:.0f}", *cells])
     header = ["scene", "recipe", "reference ms", *(f"{name}: x, FLIP" for name in names)]
     return _lines(header, lines)
 
@@ -686,8 +728,10 @@ def _knob_lines(tables: Tables) -> list[str]:
         for path, knob in KNOBS.items()
         for value in measured_values(knob)
     ]
-    each = ("x reference", "worst FLIP", "depth off")
-    return _lines(["knob", "value", *(f"{t['scene']}: {n}" for t in tables for n in each)], rows)
+    headings = ("x reference", "worst FLIP", "depth off")
+    return _lines(
+        ["knob", "value", *(f"{t['scene']}: {n}" for t in tables for n in headings)], rows
+    )
 
 
 def _knob_cells(table: Mapping[str, Any], path: str, value: Value) -> list[str]:
@@ -704,13 +748,14 @@ def _knob_cells(table: Mapping[str, Any], path: str, value: Value) -> list[str]:
 
 
 def _lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Of a Markdown table; all columns but the first two to the right."""
+    """Return the lines of a Markdown table; all columns but the first two are right-aligned."""
     return harness.markdown_lines(header, ["---", "---", *["---:"] * (len(header) - 2)], rows)
 
 
 # ---- pictures -----------------------------------------------------------------------------------
 
-CROP_PX, CROP_AT = 300, (0.5, 0.56)  # height, and middle within the picture, of what is shown
+CROP_PX = 300  # height, and middle within the picture, of what is shown
+CROP_AT = (0.5, 0.56)
 
 
 def check_matplotlib() -> None:
@@ -723,7 +768,8 @@ def draw_trade(folder: Path, trade: Trade) -> list[Path]:
     """trade_<scene>.png, FLIP against time by recipe, and trade_<scene>_tiers.jpg."""
     folder.mkdir(parents=True, exist_ok=True)
     name = "".join(c if c.isalnum() else "_" for c in trade.figures["scene"])
-    chart, tiers = folder / f"trade_{name}.png", folder / f"trade_{name}_tiers.jpg"
+    chart = folder / f"trade_{name}.png"
+    tiers = folder / f"trade_{name}_tiers.jpg"
     draw_chart(chart, trade.figures)
     draw_tiers(tiers, trade)
     return [chart, tiers]
@@ -745,10 +791,10 @@ def draw_chart(path: Path, figures: Mapping[str, Any]) -> None:
             if row["knob"] not in (DEPTH, JPEG) and not str(row["value"]).startswith("candidate"):
                 is_whole = row["knob"] == WHOLE
                 name = row["value"] if is_whole else row["knob"].removeprefix("weather.")
-                own = points.setdefault(name, [] if is_whole else [(1.0, 0.0)])
-                own.insert(-1, (row["over_reference"], row["flip"]))
-        for name, own in points.items():
-            axes.plot(*zip(*own, strict=True), marker="D" if len(own) == 1 else ".", label=name)
+                curve = points.setdefault(name, [] if is_whole else [(1.0, 0.0)])
+                curve.insert(-1, (row["over_reference"], row["flip"]))
+        for name, curve in points.items():
+            axes.plot(*zip(*curve, strict=True), marker="D" if len(curve) == 1 else ".", label=name)
         axes.set_yscale("symlog", linthresh=1e-3)  # 0 is on it
         axes.set_xlim(left=0)
         axes.set_xlabel("time over the reference's")
@@ -764,20 +810,22 @@ def draw_tiers(path: Path, trade: Trade) -> None:
     """
     lines = []
     for entry in trade.figures["recipes"]:
-        whole = {row["value"]: row for row in entry["rows"] if row["knob"] == WHOLE}
+        whole_rows = {row["value"]: row for row in entry["rows"] if row["knob"] == WHOLE}
         panels = []
         for name in (REFERENCE, *list(BOUNDS)[::-1]):
-            picture, row = trade.pictures[entry["recipe"]][name], whole[name]
+            picture = trade.pictures[entry["recipe"]][name]
+            row = whole_rows[name]
             height, width = picture.shape[:2]
-            tall, wide = height // 2, min(width, height * 2 // 3)
+            tall = height // 2
+            wide = min(width, height * 2 // 3)
             top = min(max(0, round(CROP_AT[1] * height - tall / 2)), height - tall)
             left = min(max(0, round(CROP_AT[0] * width - wide / 2)), width - wide)
             part = picture[top : top + tall, left : left + wide]
             size = (round(CROP_PX * wide / tall), CROP_PX)
-            shown = cv2.resize(part, size, interpolation=cv2.INTER_NEAREST)
+            enlarged = cv2.resize(part, size, interpolation=cv2.INTER_NEAREST)
             error = "" if name == REFERENCE else f", FLIP {row['flip']:.4f}"
             panels.append(
-                captioned(shown, f"{entry['recipe']}, {name}", f"{row['ms']:.0f} ms{error}")
+                captioned(enlarged, f"{entry['recipe']}, {name}", f"{row['ms']:.0f} ms{error}")
             )
         lines.append(strip(panels))
     write_rgb(path, np.concatenate(lines))
@@ -788,7 +836,8 @@ def main(arguments: Sequence[str]) -> None:
     pairs = [argument.partition("=") for argument in arguments]
     if not all(uri for _, _, uri in pairs):
         raise SystemExit("usage: python -m tools.bench.trade [TABLE.json=SCENE_URI ...]")
-    paths, uris = [Path(path) for path, _, _ in pairs], [uri for _, _, uri in pairs]
+    paths = [Path(path) for path, _, _ in pairs]
+    uris = [uri for _, _, uri in pairs]
     tables = [json.loads(path.read_text()) for path in paths]
     if tables:
         width = max(view["width"] for view in tables[0]["views"])

@@ -1,4 +1,4 @@
-"""A recipe's weather on LiDAR sweeps: smog, rain and snowfall, lying snow, standing water."""
+"""Applies a recipe's weather to LiDAR sweeps: smog, rain, snowfall, lying snow, standing water."""
 
 from augment.effects.lidar.codes import (
     ATTENUATED,

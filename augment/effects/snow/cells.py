@@ -1,6 +1,7 @@
-"""Where snow can lie in a scene: cells of surfaces that are open to the sky, found once.
+"""Records of the cells of a scene's surfaces that are open to the sky: where snow can lie.
 
-A support knows nothing of a recipe's depth: snow of any depth is laid on the same support.
+`placement` finds them once a scene, `support` stores them, and snow, wet ground and LiDAR read
+them. They do not depend on a recipe's depth: snow of any depth is laid on the same cells.
 """
 
 from __future__ import annotations
@@ -11,43 +12,46 @@ from dataclasses import dataclass
 from jaxtyping import Float32, Int16, Int32
 from torch import Tensor
 
-# In SnowCells.neighbours, where no cell of the same size follows on that side: the surface falls
-# away (a roof's edge, or the shade of something above it), or it goes on or rises (a wall, cells of
-# another size), against which the layer keeps its depth.
-OPEN_EDGE, FLUSH = -1, -2
-EDGE_CAP_M = 2.0  # distances to the edge are not told apart beyond this
+# Codes in SnowCells.neighbours for a side where no cell of the same size follows.
+OPEN_EDGE = -1  # the surface falls away: a roof's edge, or the shade of something above it
+# The surface goes on or rises (a wall, cells of another size); the layer keeps its depth.
+FLUSH = -2
+EDGE_CAP_M = 2.0  # largest distance to an edge that is recorded
 
 
 @dataclass(frozen=True, eq=False)
 class SnowCells:
-    """C cells on the surfaces of one part of a scene: squares seen from above, in the part's frame
-    (an actor's: origin at its box's centre, z up).
+    """Cells on the surfaces of one part of a scene that are open to the sky.
 
-    centers_m [C, 3]: x and y of the middle, and z of the surface there. normals [C, 3]: unit, of
-    the surface, z > 0. sizes_m [C]: sides. edge_m [C]: level distance from the middle to the
-    nearest open edge (see OPEN_EDGE), half a cell at least, EDGE_CAP_M at most. neighbours [C, 4]:
-    cells to the -x, +x, -y and +y side, or OPEN_EDGE or FLUSH. light [C]: brightness of the bare
-    surface relative to what is usual for its class nearby, 1 = usual; shadows that the recording
-    holds show in it. tracks [C]: 0 to 1, how much of a wheel track it is. banks [C, 2]: level
-    vector towards obstacles that stand beside the cell, 0 far from any to about 1 at their foot.
-    semantic [C]: class of the surface; VEGETATION is foliage, not grass.
-
-    buried [B]: Gaussians of the part that are the surface, or lie close beneath it.
-    buried_by [B, 5]: cells over each of them, at its middle and at 1.5 standard deviations along
-    its two longest axes; what all of these cells cover with snow is hidden by it. -1 where there
-    is no cell, so that the Gaussian is never hidden.
+    Each of the C cells is a square seen from above, in the part's frame (an actor's frame has its
+    origin at the box's centre, z up). B Gaussians of the part are the surface, or lie close beneath
+    it: snow can hide them.
     """
 
+    # Middle of each cell: x, y, and z of the surface there.
     centers_m: Float32[Tensor, "C 3"]
+    # Unit normals of the surface, z > 0.
     normals: Float32[Tensor, "C 3"]
+    # Sides of the squares.
     sizes_m: Float32[Tensor, "C"]
+    # Level distance from the middle to the nearest open edge (OPEN_EDGE): half a cell at least,
+    # EDGE_CAP_M at most.
     edge_m: Float32[Tensor, "C"]
+    # Indices of the cells to the -x, +x, -y and +y side, or OPEN_EDGE or FLUSH.
     neighbours: Int32[Tensor, "C 4"]
+    # Brightness of the bare surface relative to what is usual for its class nearby, 1 = usual;
+    # shadows that the recording holds show in it.
     light: Float32[Tensor, "C"]
+    # How much of a wheel track the cell is, 0 to 1.
     tracks: Float32[Tensor, "C"]
+    # Level vector towards obstacles beside the cell: 0 far from any, about 1 long at their foot.
     banks: Float32[Tensor, "C 2"]
+    # Class of the surface; VEGETATION is foliage, not grass.
     semantic: Int16[Tensor, "C"]
+    # Indices of the Gaussians that snow can hide.
     buried: Int32[Tensor, "B"]
+    # Cells over each of these Gaussians: at its middle, and at 1.5 standard deviations along its
+    # two longest axes. Snow on all of these cells hides the Gaussian; -1 (no cell) means never.
     buried_by: Int32[Tensor, "B 5"]
 
     def __len__(self) -> int:
@@ -56,9 +60,7 @@ class SnowCells:
 
 @dataclass(frozen=True, eq=False)
 class SnowSupport:
-    """The cells of a whole scene. ground: of the background. actors: by track_id, of those that
-    carry snow.
-    """
+    """Cells of a whole scene."""
 
-    ground: SnowCells
-    actors: Mapping[str, SnowCells]
+    ground: SnowCells  # cells of the background
+    actors: Mapping[str, SnowCells]  # cells of the actors that can carry snow, by track_id

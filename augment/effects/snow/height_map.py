@@ -1,4 +1,8 @@
-"""A part of a scene as seen from straight above: heights, colours, classes."""
+"""Renders parts of a scene from straight above, and the depth that the cameras of a drive see.
+
+Input: posed Gaussians. Output: `HeightMap` (heights, colours and classes of the highest surface)
+and `Views` (small depth images that tell if a camera sees a cell). Callers: `placement`, `surface`.
+"""
 
 from __future__ import annotations
 
@@ -42,14 +46,18 @@ from augment.semantics import SemanticClass
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_MAX_AT_ONCE = 8  # a square of cells takes up to some 300 MB while it is worked on
-_ROWS = 8192  # of arrays, in one part: what is made from them stays in a core's caches
+_MAX_THREADS = 8  # largest number of threads; each square of cells takes up to some 300 MB
+# Rows of arrays in a slice, so that its intermediates stay in a core's caches.
+_ROWS_PER_SLICE = 8192
 
 
 class _Worker(threading.local):
+    """State of a thread: True while it works on an item."""
+
     is_busy = False
 
     def begin(self) -> None:
+        """Mark the thread as busy."""
         self.is_busy = True
 
 
@@ -63,18 +71,24 @@ def in_order(
     after_each: Callable[[], object] = lambda: None,
     backend: str = AUTO,
 ) -> list[Result]:
-    """The function's results for each item, in the items' order, found by as many threads as
-    kernels use: numpy, cv2 and kernels let other threads go on. backend: with "cuda" by the calling
-    thread alone, which has the device and the stream that are meant.
+    """Call a function for each item and return the results in the items' order.
 
-    after_each: called in this thread, for one item after another.
+    Items are shared among as many threads as kernels use: numpy, cv2 and kernels release the GIL.
+
+    Args:
+        function: function of one item.
+        items: items to work on.
+        after_each: called in this thread after each item, in order.
+        backend: with "cuda" the calling thread works alone, since it holds the device and the
+            stream.
     """
-    items, results = list(items), []
-    threads = min(thread_count(), len(items), _MAX_AT_ONCE)
-    alone = threads <= 1 or _worker.is_busy or backend == CUDA
+    items = list(items)
+    results = []
+    threads = min(thread_count(), len(items), _MAX_THREADS)
+    is_serial = threads <= 1 or _worker.is_busy or backend == CUDA
     with (
         nullcontext()
-        if alone
+        if is_serial
         else ThreadPoolExecutor(threads, "placing snow", initializer=_worker.begin) as pool
     ):
         for result in map(function, items) if pool is None else pool.map(function, items):
@@ -84,50 +98,51 @@ def in_order(
 
 
 def slices_of(count: int) -> list[slice]:
-    """Parts of `count` rows, for `in_order`."""
-    return [slice(start, min(count, start + _ROWS)) for start in range(0, count, _ROWS)]
+    """Split `count` rows into slices, for `in_order`."""
+    return [
+        slice(start, min(count, start + _ROWS_PER_SLICE))
+        for start in range(0, count, _ROWS_PER_SLICE)
+    ]
 
 
-# ---- What lies highest ---------------------------------------------------------------------------
+# ---- The highest surface -------------------------------------------------------------------------
 
 Estimator = Literal["mode", "expected", "median"]
 
-COVERED = 0.5  # of a pixel must be opaque, for something to lie there
-_EYE_ABOVE_M = 100.0
-_HANGS_M = 1.0  # over a surface: where half of what falls lands so high up, it is sheltered
-_SHELTER_M = 1.0  # what stands less far above a cell hides no sky from it
-_SHELTER_CELLS = 2  # narrower things hide too little of it
-_TRUE_M = 1.0  # in coarser cells, splats that together cover one are too faint one by one
-_FINE_M = 0.3  # in coarser cells, what is blurred to their width is no measure
+MIN_COVERED_ALPHA = 0.5  # least alpha of a pixel in which something lies
+_EYE_HEIGHT_M = 100.0  # height of the camera over the highest centre
+# Height over a surface: where half of the snow lands so high up, the surface is sheltered.
+_MIN_OVERHANG_M = 1.0
+_MIN_SHELTER_HEIGHT_M = 1.0  # a thing less far above a cell hides no sky from it
+_MIN_SHELTER_CELLS = 2  # narrower things hide too little of the sky
+# In coarser cells, splats are drawn without antialiasing: those that cover a cell together would be
+# too faint one by one.
+_MAX_ANTIALIASED_CELL_M = 1.0
+_MAX_THIN_CELL_M = 0.3  # in coarser cells, thin things cannot be found by blurring
 
 
 @dataclass(frozen=True, eq=False)
 class HeightMap:
-    """What is highest at each cell of a grid. Arrays [H, W, ...], rows towards +y.
+    """Highest surface at each cell of a grid. Arrays are [H, W, ...], rows towards +y."""
 
-    left_m, bottom_m: the grid's corner; cell_m: its step. alpha: float32. height_m: float32, z of
-    the surface; 0 where not covered. rgb: float32 [H, W, 3], of what is there, light from all sides
-    alike. ids: int32, heaviest Gaussian, counted through the parts, -1 where none. is_thin: bool,
-    what is there is narrower than a cell (a wall on edge, a fence, twigs): it keeps snow off what
-    is below and carries none itself.
-    """
-
-    left_m: float
-    bottom_m: float
-    cell_m: float
-    alpha: np.ndarray
-    height_m: np.ndarray
-    rgb: np.ndarray
-    ids: np.ndarray
+    left_m: float  # least x of the grid
+    bottom_m: float  # least y of the grid
+    cell_m: float  # side of a cell
+    alpha: np.ndarray  # float32, opacity of what lies there
+    height_m: np.ndarray  # float32, z of the surface; 0 where not covered
+    rgb: np.ndarray  # float32 [H, W, 3], colour of the surface, the same from all directions
+    ids: np.ndarray  # int32, heaviest Gaussian, counted through the parts; -1 where there is none
+    # bool: the surface is narrower than a cell (a wall on edge, a fence, twigs). It keeps snow off
+    # what is below and carries none itself.
     is_thin: np.ndarray
 
     @property
     def covered(self) -> np.ndarray:
-        """bool [H, W]: something lies there that can carry snow."""
-        return self.alpha >= COVERED
+        """Cells where something lies that can carry snow, bool [H, W]."""
+        return self.alpha >= MIN_COVERED_ALPHA
 
     def centers(self) -> tuple[np.ndarray, np.ndarray]:
-        """x [W] and y [H] of the cells' middles, float64."""
+        """Return x [W] and y [H] of the cells' middles, float64."""
         rows, columns = self.alpha.shape
         return (
             self.left_m + (np.arange(columns) + 0.5) * self.cell_m,
@@ -136,49 +151,53 @@ class HeightMap:
 
 
 def plain_gaussians(gaussians: Gaussians) -> Gaussians:
-    """float32, with the colour that all directions share, without gradients."""
+    """Return the Gaussians in float32 without gradients; sh keeps the constant colour only."""
     g = gaussians
     columns = (g.means, g.quats, g.scales, g.opacities, g.sh[:, :1])
-    plain = (c.detach().to(torch.float32).contiguous() for c in columns)
-    return Gaussians(*plain, semantic=g.semantic)
+    converted = (c.detach().to(torch.float32).contiguous() for c in columns)
+    return Gaussians(*converted, semantic=g.semantic)
 
 
 def classes_of(gaussians: Gaussians) -> np.ndarray:
-    """int16 [N]: UNKNOWN throughout where classes are not known."""
+    """Classes of the Gaussians, int16 [N]; UNKNOWN everywhere if they have none."""
     if gaussians.semantic is None:
         return np.full(len(gaussians), SemanticClass.UNKNOWN, np.int16)
     return gaussians.semantic.numpy()
 
 
 class Footprints:
-    """What Gaussians may cover, seen from above: rectangles (x, y) of those that are not too faint,
-    and the heights of all.
+    """Bounds of Gaussians seen from above.
+
+    It holds rectangles (x, y) of the Gaussians that are not too faint to show, and z of all.
     """
 
     def __init__(self, gaussians: Gaussians) -> None:
-        means, reach = gaussians.means.numpy(), gaussians.scales.numpy().max(1, initial=0)
+        means = gaussians.means.numpy()
+        reach = gaussians.scales.numpy().max(1, initial=0)
         reach = reach * np.float32(MAX_EXTENT_SIGMAS)
-        self._shown = np.flatnonzero(gaussians.opacities.numpy() >= np.float32(ALPHA_MIN))
-        middles, reach = means[self._shown, :2].T, reach[self._shown]
-        self._least, self._most = middles - reach, middles + reach  # [2, N]
+        self._visible_ids = np.flatnonzero(gaussians.opacities.numpy() >= np.float32(ALPHA_MIN))
+        centers_xy = means[self._visible_ids, :2].T
+        reach = reach[self._visible_ids]
+        self._lows = centers_xy - reach  # [2, N]
+        self._highs = centers_xy + reach
         self._z_m = np.ascontiguousarray(means[:, 2])
 
     def in_box(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """int64: numbers of the Gaussians that may be seen between two corners (x, y)."""
-        inside = np.ones(len(self._shown), bool)
+        """Return the indices of the Gaussians that may show between two corners (x, y), int64."""
+        is_inside = np.ones(len(self._visible_ids), bool)
         for axis in range(2):
-            inside &= self._most[axis] >= low[axis]
-            inside &= self._least[axis] <= high[axis]
-        return self._shown[inside]
+            is_inside &= self._highs[axis] >= low[axis]
+            is_inside &= self._lows[axis] <= high[axis]
+        return self._visible_ids[is_inside]
 
-    def top_m(self, chosen: np.ndarray | None = None) -> float:
-        """z of the highest centre, of those chosen by number; -inf where there is none."""
-        z_m = self._z_m if chosen is None else self._z_m[chosen]
+    def top_m(self, chosen_ids: np.ndarray | None = None) -> float:
+        """Return z of the highest centre of all or of the chosen Gaussians; -inf without any."""
+        z_m = self._z_m if chosen_ids is None else self._z_m[chosen_ids]
         return float(z_m.max(initial=-np.inf))
 
 
 def top_of(parts: Sequence[PosedGaussians]) -> float:
-    """z that no centre of the parts exceeds, world; -inf where there is none."""
+    """Return a z that no centre of the parts exceeds, world; -inf without any Gaussians."""
     return max((_top_m(part) for part in parts if len(part.gaussians)), default=-math.inf)
 
 
@@ -194,59 +213,72 @@ def draw_from_above(
     top_m: float | None = None,
     backend: str = AUTO,
 ) -> HeightMap:
-    """Draw parts of plain Gaussians from above. corner_m: least x and y. shape: rows and columns of
-    cells. pixel_mask: bool of that shape; other cells may be left empty. with_thin: whether what is
-    thin is looked for, by a second drawing in which it is blurred to a pixel's width. top_m: of
-    `top_of`, where that is known.
+    """Render parts of plain Gaussians from straight above.
+
+    Args:
+        parts: posed parts, see `plain_gaussians`.
+        corner_m: least x and y of the grid.
+        cell_m: side of a cell.
+        shape: rows and columns of cells.
+        estimator: depth buffer that heights are taken from.
+        pixel_mask: bool of that shape; other cells may be left empty.
+        with_thin: if True, thin things are found by a second rendering, which blurs them to a
+            pixel's width.
+        top_m: result of `top_of`, if known.
+        backend: backend that renders.
     """
     rows, columns = shape
     if top_m is None:
         top_m = top_of(parts)
-    top = top_m if math.isfinite(top_m) else 0.0
-    middle = (corner_m[0] + columns * cell_m / 2, corner_m[1] + rows * cell_m / 2)
+    top_z_m = top_m if math.isfinite(top_m) else 0.0
+    middle_m = (corner_m[0] + columns * cell_m / 2, corner_m[1] + rows * cell_m / 2)
     pose = torch.eye(4, dtype=torch.float64)
     pose[1, 1] = pose[2, 2] = -1.0  # x to +x, rows towards -y, depth downwards
-    eye = torch.tensor([*middle, top + _EYE_ABOVE_M], dtype=torch.float64)
+    eye = torch.tensor([*middle_m, top_z_m + _EYE_HEIGHT_M], dtype=torch.float64)
     pose[:3, 3] = -pose[:3, :3] @ eye
-    lens = (1 / cell_m, 1 / cell_m, columns / 2, rows / 2)
-    camera = Camera("from above", columns, rows, *lens, pose, is_orthographic=True)
-    shown = None
+    intrinsics = (1 / cell_m, 1 / cell_m, columns / 2, rows / 2)
+    camera = Camera("from above", columns, rows, *intrinsics, pose, is_orthographic=True)
+    mask = None
     if pixel_mask is not None:
-        shown = torch.from_numpy(np.ascontiguousarray(pixel_mask[::-1]))
-        shown = gpu.upload(shown) if backend == CUDA else shown
+        mask = torch.from_numpy(np.ascontiguousarray(pixel_mask[::-1]))
+        mask = gpu.upload(mask) if backend == CUDA else mask
     names = (ALPHA, DEPTH_ESTIMATORS[estimator], MEDIAN_DEPTH, RGB, SPLAT_IDS)
-    alpha, depths, medians, rgb, ids = _draw(
-        parts, camera, names, shown, antialiased=cell_m <= _TRUE_M, backend=backend
+    alpha, depths, medians, rgb, ids = _render_buffers(
+        parts, camera, names, mask, antialiased=cell_m <= _MAX_ANTIALIASED_CELL_M, backend=backend
     )
-    covered, height = _heights(alpha, depths, float(eye[2]))
-    alpha = np.where(covered, alpha, np.minimum(alpha, np.float32(COVERED / 2)))
+    covered, height = _heights_from_depths(alpha, depths, float(eye[2]))
+    alpha = np.where(covered, alpha, np.minimum(alpha, np.float32(MIN_COVERED_ALPHA / 2)))
     is_thin = np.zeros(shape, bool)
-    if with_thin and cell_m <= _FINE_M:
-        alpha_wide, depths = _draw(
-            parts, camera, names[:2], shown, antialiased=False, backend=backend
+    if with_thin and cell_m <= _MAX_THIN_CELL_M:
+        alpha_wide, depths = _render_buffers(
+            parts, camera, names[:2], mask, antialiased=False, backend=backend
         )
-        covered_wide, height_wide = _heights(alpha_wide, depths, float(eye[2]))
-        shelters = covered & covered_wide & (height_wide - height > _SHELTER_M)
-        wide = np.ones((_SHELTER_CELLS, _SHELTER_CELLS), np.uint8)
-        shelters = cv2.morphologyEx(shelters.astype(np.uint8), cv2.MORPH_OPEN, wide) > 0
-        is_thin = shelters | (covered_wide & ~covered)
+        covered_wide, height_wide = _heights_from_depths(alpha_wide, depths, float(eye[2]))
+        is_shelter = covered & covered_wide & (height_wide - height > _MIN_SHELTER_HEIGHT_M)
+        kernel = np.ones((_MIN_SHELTER_CELLS, _MIN_SHELTER_CELLS), np.uint8)
+        is_shelter = cv2.morphologyEx(is_shelter.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
+        is_thin = is_shelter | (covered_wide & ~covered)
         height[is_thin], alpha[is_thin] = height_wide[is_thin], alpha_wide[is_thin]
-    above = np.where(medians > 0, eye[2].item() - medians.astype(np.float64), 0).astype(np.float32)
-    hangs = (alpha >= COVERED) & (medians > 0) & (above - height > _HANGS_M)
-    height[hangs], is_thin = above[hangs], is_thin | hangs
+    median_heights = np.where(medians > 0, eye[2].item() - medians.astype(np.float64), 0).astype(
+        np.float32
+    )
+    is_overhang = (
+        (alpha >= MIN_COVERED_ALPHA) & (medians > 0) & (median_heights - height > _MIN_OVERHANG_M)
+    )
+    height[is_overhang], is_thin = median_heights[is_overhang], is_thin | is_overhang
     return HeightMap(
         left_m=corner_m[0],
         bottom_m=corner_m[1],
         cell_m=cell_m,
         alpha=alpha,
         height_m=height,
-        rgb=rgb / np.maximum(alpha, np.float32(COVERED / 2))[..., None],
+        rgb=rgb / np.maximum(alpha, np.float32(MIN_COVERED_ALPHA / 2))[..., None],
         ids=np.where(alpha > 0, ids, -1),
         is_thin=is_thin,
     )
 
 
-def _draw(
+def _render_buffers(
     parts: Sequence[PosedGaussians],
     camera: Camera,
     names: tuple[str, ...],
@@ -255,10 +287,10 @@ def _draw(
     antialiased: bool,
     backend: str,
 ) -> list[np.ndarray]:
-    """Buffers of a view from above, rows towards +y."""
-    # Other depths than the mode's are for comparing them: rather slower with all buffers, which
-    # takes a kernel of the CPU that there is, than at once after one has been compiled for each.
-    out = rasterize(
+    """Render buffers of a view from above, rows towards +y."""
+    # Other depths than the mode's serve comparisons only. Rendering all buffers is slower, but uses
+    # the CPU kernel that is compiled already; a kernel of its own would be compiled for each.
+    render = rasterize(
         parts,
         camera,
         buffers=names if MODE_DEPTH in names else BUFFERS,
@@ -269,19 +301,21 @@ def _draw(
         else pixel_mask,
         backend=backend,
     )
-    images = (getattr(out, name).cpu().numpy() for name in names)
+    images = (getattr(render, name).cpu().numpy() for name in names)
     return [np.ascontiguousarray(image[::-1]) for image in images]
 
 
-def _heights(alpha: np.ndarray, depths: np.ndarray, eye_z_m: float) -> tuple[np.ndarray, ...]:
-    """Where something lies, bool [H, W], and its z, float32, 0 elsewhere."""
-    covered = (alpha >= COVERED) & (depths > 0) & np.isfinite(depths)
+def _heights_from_depths(
+    alpha: np.ndarray, depths: np.ndarray, eye_z_m: float
+) -> tuple[np.ndarray, ...]:
+    """Return the covered cells, bool [H, W], and their z, float32 [H, W], 0 elsewhere."""
+    covered = (alpha >= MIN_COVERED_ALPHA) & (depths > 0) & np.isfinite(depths)
     height = np.where(covered, eye_z_m - depths.astype(np.float64), 0.0)
     return covered, height.astype(np.float32)
 
 
 def _top_m(part: PosedGaussians) -> float:
-    """A height that no centre of the part exceeds, world."""
+    """Return a z that no centre of the part exceeds, world."""
     means = part.gaussians.means
     if part.world_from_part is None:
         return float(means[:, 2].max())
@@ -289,55 +323,77 @@ def _top_m(part: PosedGaussians) -> float:
     return float(pose[2, 3]) + math.sqrt(float((means * means).sum(1).max()))
 
 
-# ---- What the cameras of a drive can see of what lies on the ground ------------------------------
+# ---- Which points of the ground the cameras of a drive can see -----------------------------------
 
-WIDTH_PX = 200  # of the depth images: they tell houses apart, not posts
+DEPTH_IMAGE_WIDTH_PX = 200  # longer side of the depth images: they resolve houses, not posts
 LIFTS_M = (0.0, 0.3, 1.0)  # depths of snow at which a cell may be seen
-_FAR_SHARE, _FAR_M = 1.05, 0.3  # of the depth there, and beyond it: what blurred images hide
-_BELOW_SHARE = 1.02  # of the depth there: snow on top of what shows its underside
-_GRAZING = math.sin(math.radians(3))  # how far normals may be off
-_MARGIN_PX = 3.0
-_VIEW_ROWS = 256  # points a thread takes at a time
+# A point is visible up to this factor of the image's depth plus this distance, since images are
+# blurred.
+_DEPTH_TOLERANCE_SHARE = 1.05
+_DEPTH_TOLERANCE_M = 0.3
+# The same factor for snow on top of a surface that shows its underside.
+_UNDERSIDE_SHARE = 1.02
+_MAX_NORMAL_ERROR_SINE = math.sin(math.radians(3))  # sine of the largest error of normals
+_MARGIN_PX = 3.0  # pixels beyond the image that count as inside
+_POINTS_PER_TASK = 256  # number of points that a thread takes at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Cameras with the depth that they see. See surface_kernels.find_seen."""
+    """Cameras with the depth that they see, in the layout of surface_kernels.find_visible."""
 
-    views: np.ndarray
-    sizes: np.ndarray
-    depths: np.ndarray
+    views: np.ndarray  # float64 [V, 17], a camera a row
+    sizes: np.ndarray  # int64 [V, 3]: width, height, and where the camera's depths begin
+    depths: np.ndarray  # float32, depths of all cameras, infinite where nothing is
 
     @property
     def lowest_m(self) -> float:
-        """z of the lowest of them; infinite where there are none."""
+        """z of the lowest camera; infinite without cameras."""
         return float(self.views[:, 14].min(initial=np.inf))
 
     def near(self, low: np.ndarray, high: np.ndarray, reach_m: float) -> Views:
-        """Those whose centre is within reach_m of the rectangle between two corners (x, y)."""
+        """Select the cameras whose centre is within reach_m of a rectangle given by two corners."""
         centres = self.views[:, 12:14]
-        gap = np.maximum(np.maximum(low - centres, centres - high), 0)
-        chosen = (np.hypot(gap[:, 0], gap[:, 1]) <= reach_m) | (self.views[:, 15] == 1)
-        return replace(self, views=self.views[chosen], sizes=self.sizes[chosen])
+        gaps = np.maximum(np.maximum(low - centres, centres - high), 0)
+        is_near = (np.hypot(gaps[:, 0], gaps[:, 1]) <= reach_m) | (self.views[:, 15] == 1)
+        return replace(self, views=self.views[is_near], sizes=self.sizes[is_near])
 
     def see(self, points: np.ndarray, normals: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
-        """bool [C]: points float64 [C, 3], of surfaces with unit normals [C, 3], that one sees.
+        """Tell for each point if some camera sees it, bool [C].
 
-        What most views look through, where they should show it, is not there for any of them, but
-        where is_sure, bool [C].
+        A point that more views look through than show is not there for any of them.
+
+        Args:
+            points: float64 [C, 3], points of surfaces, world.
+            normals: [C, 3], unit normals of the surfaces.
+            is_sure: bool [C], points whose surface is known to be there.
         """
-        points, normals = np.asarray(points, np.float64), np.asarray(normals, np.float64)
+        points = np.asarray(points, np.float64)
+        normals = np.asarray(normals, np.float64)
         lifts = np.array(LIFTS_M)
-        tolerances = np.array([_FAR_SHARE, _FAR_M, _BELOW_SHARE, _GRAZING, _MARGIN_PX])
-        seen = np.empty(len(points), bool)
-        with kernel_threads(_VIEW_ROWS):
-            surface_kernels.find_seen(
+        tolerances = np.array(
+            [
+                _DEPTH_TOLERANCE_SHARE,
+                _DEPTH_TOLERANCE_M,
+                _UNDERSIDE_SHARE,
+                _MAX_NORMAL_ERROR_SINE,
+                _MARGIN_PX,
+            ]
+        )
+        is_visible = np.empty(len(points), bool)
+        with kernel_threads(_POINTS_PER_TASK):
+            surface_kernels.find_visible(
                 np.ascontiguousarray(points),
                 np.ascontiguousarray(normals),
                 np.ascontiguousarray(is_sure),
-                *(self.views, self.sizes, self.depths, lifts, tolerances, seen),
+                self.views,
+                self.sizes,
+                self.depths,
+                lifts,
+                tolerances,
+                is_visible,
             )
-        return seen
+        return is_visible
 
 
 def draw_views(
@@ -347,17 +403,27 @@ def draw_views(
     backend: str = AUTO,
     after_each: Callable[[], object] = lambda: None,
 ) -> Views:
-    """The depth that each camera sees of the parts, in small images; drawn by `backend`."""
-    views, sizes, start = [], [], 0
+    """Render small depth images of the parts for each camera, with `backend`."""
+    views = []
+    sizes = []
+    start = 0
     depths: list[Tensor] = []
     for camera in cameras:
-        small = camera.scaled(min(1.0, WIDTH_PX / max(camera.width, camera.height)))
-        out = rasterize(parts, small, buffers=(ALPHA, EXPECTED_DEPTH), clip=UNCUT, backend=backend)
-        assert out.alpha is not None and out.expected_depth is not None
-        depths.append(torch.where(out.alpha >= COVERED, out.expected_depth, math.inf).flatten())
-        views.append(_numbers(small))
-        sizes.append((small.width, small.height, start))
-        start += small.width * small.height
+        small_camera = camera.scaled(
+            min(1.0, DEPTH_IMAGE_WIDTH_PX / max(camera.width, camera.height))
+        )
+        render = rasterize(
+            parts, small_camera, buffers=(ALPHA, EXPECTED_DEPTH), clip=UNCUT, backend=backend
+        )
+        assert render.alpha is not None and render.expected_depth is not None
+        depths.append(
+            torch.where(
+                render.alpha >= MIN_COVERED_ALPHA, render.expected_depth, math.inf
+            ).flatten()
+        )
+        views.append(_camera_row(small_camera))
+        sizes.append((small_camera.width, small_camera.height, start))
+        start += small_camera.width * small_camera.height
         after_each()
     return Views(
         np.array(views, np.float64).reshape(-1, 17),
@@ -366,9 +432,9 @@ def draw_views(
     )
 
 
-def _numbers(camera: Camera) -> np.ndarray:
-    """A row of `Views.views`."""
+def _camera_row(camera: Camera) -> np.ndarray:
+    """Return a camera's row of `Views.views`."""
     rotation = camera.camera_from_world[:3, :3].numpy().ravel()
-    lens = (camera.fx, camera.cx, camera.fy)
-    parallel = float(camera.is_orthographic)
-    return np.array([*rotation, *lens, *camera.centre.numpy(), parallel, camera.cy])
+    intrinsics = (camera.fx, camera.cx, camera.fy)
+    is_orthographic = float(camera.is_orthographic)
+    return np.array([*rotation, *intrinsics, *camera.centre.numpy(), is_orthographic, camera.cy])

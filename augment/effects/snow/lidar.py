@@ -1,7 +1,8 @@
-"""Lying snow on a LiDAR sweep: beams end on its surface, which is bright at 905 nm.
+"""Puts lying snow on a LiDAR sweep: beams end on its surface, which is bright at 905 nm.
 
-The layer has the support, profile and seed of the images', so that drifts, patches and wheel tracks
-are where the pictures have them, on a grid of GRID_M cells, without the images' levelling.
+Caller: `SnowEffect.meet`. The layer has the support, profile and seed of the images' layer, so that
+drifts, patches and wheel tracks are where the pictures have them. It lies on a grid of GRID_M cells
+and is not evened out as the images' layer is.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import MOVED
 from augment.effects.snow import kernels
 from augment.effects.snow.cells import SnowCells, SnowSupport
-from augment.effects.snow.layer import find_depths, profile_on
+from augment.effects.snow.layer import find_depths, profile_on_part
 from augment.effects.snow.snow import PlacedSnow, placement_settings
 from augment.effects.snow.support import support_of
 from augment.labels import LidarSweep
@@ -26,58 +27,64 @@ from augment.scene import Scene
 # Fresh snow gives back 0.95 of visible light and 0.90 at 0.9 um; old, coarse snow 0.9 and 0.7
 # (Wiscombe and Warren 1980, figure 8): the recipe's albedo times this.
 ALBEDO_AT_905 = 0.93
-GRID_M = 0.1
-MIN_FACING = 0.02  # cosine
-_MAX_CELLS = 8_000_000  # of a grid; larger scenes get coarser ones
-GROUND_SLACK_M, ACTOR_SLACK_M = 0.15, 0.05
-_REACH_M = 200.0  # actors farther away are not asked
-_ABOUT_M, _EVERY = 3.0, 8  # returns that tell when the sensor looked at an actor
-_SAME_DRIVE_NS = 10**9  # a sweep's times are within this of its frame's
+GRID_M = 0.1  # side of a grid's cells
+MIN_FACING_COSINE = 0.02  # least cosine of incidence on the layer
+_MAX_CELLS = 8_000_000  # largest number of cells of a grid; larger scenes get coarser cells
+# Depths below the layer's underside at which it still stops beams, on the ground and on actors.
+GROUND_SLACK_M = 0.15
+ACTOR_SLACK_M = 0.05
+_MAX_ACTOR_DISTANCE_M = 200.0  # distance beyond which actors are ignored
+# Returns within _ACTOR_RADIUS_M of an actor, one in _RETURN_STRIDE, give the time when the sensor
+# looked at it.
+_ACTOR_RADIUS_M = 3.0
+_RETURN_STRIDE = 8
+_MAX_CLOCK_GAP_NS = 10**9  # largest difference of a sweep's times from its frame's time
 
 
 @dataclass(frozen=True, eq=False)
 class SnowGrid:
-    """Snow on one part, in the part's frame: see kernels.meet_layer. radius_m: of the circle
-    about the part's origin that holds it, seen from above.
-    """
+    """Snow on one part, in the part's frame: see kernels.intersect_layer."""
 
     corner: np.ndarray
     cell_m: float
     base: np.ndarray
     top: np.ndarray
     highest: np.ndarray
-    radius_m: float
+    radius_m: float  # radius of the circle about the part's origin that holds it, seen from above
 
 
 @dataclass(frozen=True, eq=False)
 class LidarSnow:
-    """The snow in a scene. actors: by track_id. reflectance: of it, met head on."""
+    """Snow in a scene."""
 
-    ground: SnowGrid | None
-    actors: Mapping[str, SnowGrid]
-    reflectance: float
+    ground: SnowGrid | None  # snow on the background
+    actors: Mapping[str, SnowGrid]  # snow on actors, by track_id
+    reflectance: float  # reflectance of the snow, met head on
 
 
-def meet_snow(
-    echoes: Echoes, scene: Scene, placed: PlacedSnow, sweep: LidarSweep, frame_ns: int
+def intersect_snow(
+    echoes: Echoes, scene: Scene, recipe_snow: PlacedSnow, sweep: LidarSweep, frame_ns: int
 ) -> None:
-    """End beams on the snow where they come to it first. Thread-safe.
+    """End beams on the snow where they meet it first. Thread-safe.
 
     Raises:
         SceneError: snow cannot be placed in this scene.
     """
-    snow = snow_in(scene, placed)
+    snow = find_lidar_snow(scene, recipe_snow)
     ranges = echoes.ranges_m
-    hits = meet_layers(snow, scene, sweep, frame_ns, echoes.origins, echoes.directions, ranges)
+    hits = intersect_layers(snow, scene, sweep, frame_ns, echoes.origins, echoes.directions, ranges)
     rows = np.flatnonzero(hits < ranges)
     # The layer counts as level, but its grains stand out: no beam slides over it unreflected.
-    facing = np.maximum(np.abs(echoes.directions[rows, 2]), MIN_FACING)
+    facing = np.maximum(np.abs(echoes.directions[rows, 2]), MIN_FACING_COSINE)
     echoes.replace(rows, hits[rows], snow.reflectance * np.clip(facing, 0.0, 1.0), MOVED)
 
 
-def layer_of(cells: SnowCells, depths_m: np.ndarray, *, grid_m: float = GRID_M) -> SnowGrid | None:
-    """Snow of depths [C] on cells; None where there is none."""
-    centers, sizes = cells.centers_m.numpy(), cells.sizes_m.numpy()
+def make_snow_grid(
+    cells: SnowCells, depths_m: np.ndarray, *, grid_m: float = GRID_M
+) -> SnowGrid | None:
+    """Return snow of depths [C] on cells as a grid; None where there is none."""
+    centers = cells.centers_m.numpy()
+    sizes = cells.sizes_m.numpy()
     covered = depths_m > 0
     if not covered.any():
         return None
@@ -90,7 +97,7 @@ def layer_of(cells: SnowCells, depths_m: np.ndarray, *, grid_m: float = GRID_M) 
     depths = np.ascontiguousarray(depths_m, np.float32)
     kernels.fill_layer(centers, sizes, depths, low, cell, base, top)
     radius = float(np.hypot(*(centers[covered, :2] + np.sign(centers[covered, :2]) * half).T).max())
-    # The greatest of every block of the grid, for the march to skip.
+    # The largest value of every block of the grid, so that the march can skip blocks.
     block = kernels.BLOCK
     blocks = [-(-n // block) for n in top.shape]
     padded = np.full([n * block for n in blocks], -np.inf, np.float32)
@@ -99,18 +106,18 @@ def layer_of(cells: SnowCells, depths_m: np.ndarray, *, grid_m: float = GRID_M) 
     return SnowGrid(low, cell, base, top, highest, radius)
 
 
-def snow_in(scene: Scene, placed: PlacedSnow) -> LidarSnow:
-    """The snow of a recipe in a scene. Thread-safe.
+def find_lidar_snow(scene: Scene, recipe_snow: PlacedSnow) -> LidarSnow:
+    """Return the snow of a recipe in a scene. Thread-safe.
 
     Raises:
         SceneError: snow cannot be placed in this scene.
     """
-    support = support_of(scene, placement_settings(placed.snow, scene))
-    key = ("lidar snow", scene.name, placed)
-    return memo_of(support).get(key, lambda: _lay(support, scene, placed))
+    support = support_of(scene, placement_settings(recipe_snow.snow, scene))
+    key = ("lidar snow", scene.name, recipe_snow)
+    return memo_of(support).get(key, lambda: _build_grids(support, scene, recipe_snow))
 
 
-def meet_layers(
+def intersect_layers(
     snow: LidarSnow,
     scene: Scene,
     sweep: LidarSweep,
@@ -119,38 +126,51 @@ def meet_layers(
     directions: np.ndarray,
     ends_m: np.ndarray,
 ) -> np.ndarray:
-    """Where beams [N] end, ends_m at most, float64 [N]. origins, directions: [N, 3], scene world.
+    """Return the distances at which beams end, float64 [N], ends_m at most.
 
-    An actor stands where it was at the times of the returns about it, else at the frame's time.
+    An actor stands where it was at the times of the returns about it, or else at the frame's time.
+
+    Args:
+        snow: snow in the scene.
+        scene: the scene.
+        sweep: the sweep, whose times are read.
+        frame_ns: time of the frame.
+        origins: [N, 3], world.
+        directions: [N, 3], unit, world.
+        ends_m: [N], lengths of the beams.
     """
     hits = ends_m.copy()
     if snow.ground is not None:
-        _meet(snow.ground, np.eye(4), math.inf, origins, directions, hits, GROUND_SLACK_M)
-    every = np.flatnonzero(ends_m > 0)[::_EVERY]
-    if not snow.actors or not len(every):
+        _intersect_grid(snow.ground, np.eye(4), math.inf, origins, directions, hits, GROUND_SLACK_M)
+    sample_rows = np.flatnonzero(ends_m > 0)[::_RETURN_STRIDE]
+    if not snow.actors or not len(sample_rows):
         return hits
-    ends = origins[every] + ends_m[every, None] * directions[every]
-    times = _times(sweep, frame_ns)
-    eye = np.median(origins[every], axis=0)
+    ends = origins[sample_rows] + ends_m[sample_rows, None] * directions[sample_rows]
+    times = _return_times(sweep, frame_ns)
+    eye = np.median(origins[sample_rows], axis=0)
     for actor in scene.actors:
         layer = snow.actors.get(actor.track_id)
         pose = actor.track.pose_at(frame_ns)
         if layer is None or pose is None:
             continue
-        place = pose[:2, 3].numpy()
-        if np.hypot(*(place - eye[:2])) > _REACH_M:
+        position = pose[:2, 3].numpy()
+        if np.hypot(*(position - eye[:2])) > _MAX_ACTOR_DISTANCE_M:
             continue
         if times is not None:
-            about = np.hypot(*(ends[:, :2] - place).T) < layer.radius_m + _ABOUT_M
-            if about.any():
-                pose = actor.track.pose_at(int(np.sort(times[every][about])[about.sum() // 2]))
+            is_about = np.hypot(*(ends[:, :2] - position).T) < layer.radius_m + _ACTOR_RADIUS_M
+            if is_about.any():
+                pose = actor.track.pose_at(
+                    int(np.sort(times[sample_rows][is_about])[is_about.sum() // 2])
+                )
         if pose is not None:
-            world = pose.double().numpy()
-            _meet(layer, world, layer.radius_m, origins, directions, hits, ACTOR_SLACK_M)
+            world_from_part = pose.double().numpy()
+            _intersect_grid(
+                layer, world_from_part, layer.radius_m, origins, directions, hits, ACTOR_SLACK_M
+            )
     return hits
 
 
-def _meet(
+def _intersect_grid(
     layer: SnowGrid,
     world_from_part: np.ndarray,
     radius_m: float,
@@ -159,34 +179,49 @@ def _meet(
     hits: np.ndarray,
     slack_m: float,
 ) -> None:
+    """Shorten beams to where they meet one layer, in place."""
     part_from_world = np.eye(4)
     part_from_world[:3, :3] = world_from_part[:3, :3].T
     part_from_world[:3, 3] = -world_from_part[:3, :3].T @ world_from_part[:3, 3]
-    kernels.meet_layer(
-        *(origins, directions, hits, part_from_world[:3].copy()),
+    kernels.intersect_layer(
+        origins,
+        directions,
+        hits,
+        part_from_world[:3].copy(),
         np.array([world_from_part[0, 3], world_from_part[1, 3], radius_m]),
-        *(layer.corner, layer.cell_m, layer.base, layer.top, layer.highest, slack_m),
+        layer.corner,
+        layer.cell_m,
+        layer.base,
+        layer.top,
+        layer.highest,
+        slack_m,
     )
 
 
-def _lay(support: SnowSupport, scene: Scene, placed: PlacedSnow) -> LidarSnow:
+def _build_grids(support: SnowSupport, scene: Scene, recipe_snow: PlacedSnow) -> LidarSnow:
+    """Compute the snow of a recipe on every part of the scene."""
+
     def layer(cells: SnowCells, track_id: str | None) -> SnowGrid | None:
-        given = (placed.snow, placed.seed, placed.water_level_z_m)
-        profile, rng = profile_on(track_id, scene, *given)
+        """Return the grid of one part; track_id: None for the background."""
+        snow_settings = (recipe_snow.snow, recipe_snow.seed, recipe_snow.water_level_z_m)
+        profile, rng = profile_on_part(track_id, scene, *snow_settings)
         seed = rng.integers(0, 2**64, dtype=np.uint64)
-        grid_m = GRID_M if track_id is None else min(GRID_M, placed.snow.cell_m)
-        return layer_of(cells, find_depths(cells, profile, seed).heights, grid_m=grid_m)
+        grid_m = GRID_M if track_id is None else min(GRID_M, recipe_snow.snow.cell_m)
+        return make_snow_grid(cells, find_depths(cells, profile, seed).heights, grid_m=grid_m)
 
     actors = {track_id: layer(cells, track_id) for track_id, cells in support.actors.items()}
     return LidarSnow(
         ground=layer(support.ground, None),
-        actors={track_id: laid for track_id, laid in actors.items() if laid is not None},
-        reflectance=ALBEDO_AT_905 * placed.snow.albedo,
+        actors={track_id: grid for track_id, grid in actors.items() if grid is not None},
+        reflectance=ALBEDO_AT_905 * recipe_snow.snow.albedo,
     )
 
 
-def _times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
-    """int64 [N] of timestamp_ns, or t in seconds, where they are on the frames' clock."""
+def _return_times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
+    """Return the times of returns, int64 [N], or None where they are not on the frames' clock.
+
+    They come from the column timestamp_ns, or from t in seconds.
+    """
     column = sweep.columns.get("timestamp_ns")
     if column is not None and np.asarray(column).dtype.kind in "iu":
         times = np.asarray(column).astype(np.int64)
@@ -195,5 +230,5 @@ def _times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
         if column is None or np.asarray(column).dtype.kind != "f" or not np.isfinite(column).all():
             return None
         times = np.round(np.clip(column, -9e9, 9e9) * 1e9).astype(np.int64)
-    near = len(times) > 0 and abs(int(np.median(times)) - frame_ns) <= _SAME_DRIVE_NS
-    return times if near else None
+    is_on_clock = len(times) > 0 and abs(int(np.median(times)) - frame_ns) <= _MAX_CLOCK_GAP_NS
+    return times if is_on_clock else None

@@ -1,9 +1,14 @@
-"""The light that snow in a scene would stand in: where the sun is, how bright it is, what colour.
+"""Estimates the light on snow in a scene: direction, brightness and colour of the sun.
 
-A recording rarely shows its sun, and its pictures hold no physical unit. Shadows on the ground
-tell how much of the light is the sun's, and the sky where they do not; the sky tells the direction,
-unless shadows contradict it; and the road, whose albedo is roughly known, what a surface of a given
-albedo looks like at this exposure.
+Input: a `Scene` and the recipe's snow. Output: `SceneLight`, what the scene shows, and
+`Illumination`, the light on snow. Callers: snow's `effect`, wet ground, falling snow and rain.
+
+A recording rarely shows its sun, and its pictures hold no physical unit. Each question has its own
+evidence:
+
+- the sun's share of the light: shadows on the ground, or the sky's contrast without them;
+- the sun's direction: the sky, unless shadows contradict it;
+- the brightness of a given albedo at this exposure: the road, whose albedo is roughly known.
 """
 
 from __future__ import annotations
@@ -35,136 +40,146 @@ _GROUND_ALBEDOS: tuple[tuple[SemanticClass | None, float, bool], ...] = (
     (SemanticClass.TERRAIN, 0.18, False),
     (None, 0.12, False),
 )
-_MIN_SPLATS = 20
+_MIN_SPLATS = 20  # least number of splats of a class
 
-_SKY_SAMPLES = 16_384  # over the upper half, one in 1.1 degrees
-_SMOOTH_OVER = 40  # of them: a disc 8 degrees wide, so that no single texel wins
-_BRIGHTEST = 0.01  # share of the samples that may be the sun's region
-_REGION_COSINE = math.cos(math.radians(15.0))
-_LOWEST_SINE = math.sin(math.radians(3.0))  # below are skylines
+_NUM_SKY_SAMPLES = 16_384  # number of directions over the upper half, one in 1.1 degrees
+_NUM_NEIGHBOURS = 40  # number of directions in a disc 8 degrees wide, so that no single texel wins
+_SUN_REGION_SHARE = 0.01  # share of the samples that may be the sun's region
+_REGION_COSINE = math.cos(math.radians(15.0))  # cosine of the radius of the sun's region
+_MIN_SKY_SINE = math.sin(math.radians(3.0))  # sine of the elevation below which skylines are
 
 # Contrast: brightest region over the sky's mean. A grey sky that is three times as bright at the
 # zenith as at the horizon (Moon and Spencer 1942) has 1.5. Pictures clip at white, so that the sun
 # in a sky of bright clouds has little more; a blue sky has the sun at less contrast.
 # Blueness: blue over red of the mean, about 1 overcast and 1.8 clear.
-_UNIFORM_CONTRAST = 1.2
-_GREY_CONTRASTS, _BLUE_CONTRASTS = (1.5, 3.0), (1.2, 1.9)  # overcast below, clear above
-_GREY_BLUENESS, _CLEAR_BLUENESS = 1.15, 1.8
-_OVERCAST_SHARE, _CLEAR_SHARE = 0.1, 0.9
-_LOW_SUN_SHARE, _HIGH_SUN_DEG = 0.5, 30.0  # of that share; the air takes its part of a low sun
-_UNKNOWN_SUN_DEG = (135.0, 45.0)  # azimuth, elevation, where the sky shows none
+_UNIFORM_CONTRAST = 1.2  # contrast below which the sky shows no sun
+# Contrasts of a grey and of a blue sky: overcast below the first, clear above the second.
+_GREY_SKY_CONTRASTS = (1.5, 3.0)
+_BLUE_SKY_CONTRASTS = (1.2, 1.9)
+_GREY_BLUENESS = 1.15  # blueness of a grey sky
+_CLEAR_BLUENESS = 1.8  # blueness of a blue sky
+_OVERCAST_SHARE = 0.1  # the sun's share of the light under an overcast sky
+_CLEAR_SHARE = 0.9  # the sun's share of the light under a clear sky
+_LOW_SUN_SHARE = 0.5  # factor of that share at the horizon, where the air dims the sun
+_HIGH_SUN_DEG = 30.0  # elevation from which on that factor is 1
+_UNKNOWN_SUN_DEG = (135.0, 45.0)  # azimuth and elevation, where the sky shows no sun
 
-# Light on snow in shadow over light on snow that faces the sun, at no sun and at nothing but sun.
-_SHADE_OVERCAST, _SHADE_CLEAR = 0.95, 0.50
-_DARKEST_SHADE = 0.35  # as the ground's shadows tell it: snow around lights shadows on snow
-_WRAP_OVERCAST, _WRAP_CLEAR = 0.9, 0.5
-# Shadows that explain at least so much of the ground's brightness move the sun, if one where the
-# sky has it explains less than that share of it.
-_TELLING, _AGREEING = 0.15, 0.75
-_SUN_TINT = (1.02, 1.0, 0.96)
-_TINT_RANGE = (0.8, 1.25)
-_KNEE, _CEILING = 0.45, 0.86  # linear; the ceiling is 0.93 display-encoded
-_LUMINANCE = (0.2126, 0.7152, 0.0722)
+# Light on snow in shadow over light on snow that faces the sun, without sun and with sun alone.
+_SHADE_OVERCAST = 0.95
+_SHADE_CLEAR = 0.50
+# Least such ratio from shadows on the ground: snow around lights shadows on snow.
+_MIN_SHADE = 0.35
+# How far light reaches around, without sun and with sun alone.
+_WRAP_OVERCAST = 0.9
+_WRAP_CLEAR = 0.5
+# Shadows move the sun if they explain at least the first share of the ground's brightness, and a
+# sun where the sky has it explains less than the second share of that.
+_MIN_EXPLAINED = 0.15
+_MIN_AGREEMENT = 0.75
+_SUN_TINT = (1.02, 1.0, 0.96)  # linear colour of the sun, relative
+_TINT_RANGE = (0.8, 1.25)  # limits of a tint's channels
+# Luminance at which the shoulder begins, and its limit; linear. 0.86 is 0.93 display-encoded.
+_SHOULDER_KNEE = 0.45
+_SHOULDER_CEILING = 0.86
+_LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)  # weights of linear sRGB
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """The light on snow. sun: unit, towards the sun, scene world. lit_rgb: display-encoded colour
-    of snow that faces the sun, albedo included. shadow_rgb: of snow that the sun does not reach;
-    no channel is brighter than lit_rgb's. wrap: how far light reaches around (see SplatShading).
-    """
+    """Light on snow."""
 
-    sun: tuple[float, float, float]
-    lit_rgb: tuple[float, float, float]
+    sun: tuple[float, float, float]  # unit vector towards the sun, world
+    lit_rgb: tuple[float, float, float]  # display-encoded colour of snow that faces the sun
+    # Display-encoded colour of snow that the sun does not reach; no channel exceeds lit_rgb's.
     shadow_rgb: tuple[float, float, float]
-    wrap: float
+    wrap: float  # how far light reaches around, see SplatShading
 
 
 @dataclass(frozen=True)
 class SceneLight:
-    """What a scene shows of its light.
+    """Light that a scene shows."""
 
-    azimuth_deg, elevation_deg: of the sun, 0 degrees azimuth is world +x. sun_share: 0 to 1, of the
-    light. shadow_ratio: luminance of shaded over lit ground, 1 where nothing casts a shadow; None
-    where the ground does not tell. contrast: of the sky's brightest region over its mean.
-    sky_rgb_linear: mean of the upper half by solid angle. ground_albedo: as assumed, None where no
-    ground was found. ground_rgb_linear: of what the sun lights, its median where there are no
-    shadows; the sky's mean without ground. ground_is_grey: its tint is the light's.
-    """
-
-    azimuth_deg: float
-    elevation_deg: float
-    sun_share: float
+    azimuth_deg: float  # azimuth of the sun, 0 is world +x
+    elevation_deg: float  # elevation of the sun
+    sun_share: float  # share of the light that is the sun's, 0 to 1
+    # Luminance of shaded over lit ground; 1 where nothing casts a shadow, None where unknown.
     shadow_ratio: float | None
-    contrast: float
-    sky_rgb_linear: tuple[float, float, float]
-    ground_albedo: float | None
+    contrast: float  # luminance of the sky's brightest region over its mean
+    sky_rgb_linear: tuple[float, float, float]  # mean of the upper half by solid angle
+    ground_albedo: float | None  # assumed albedo of the ground; None where no ground was found
+    # Colour of sunlit ground: its median without shadows; the sky's mean without ground.
     ground_rgb_linear: tuple[float, float, float]
-    ground_is_grey: bool
+    ground_is_grey: bool  # True if the ground's tint is the light's
 
 
 def illumination_of(scene: Scene, snow: Snow) -> Illumination:
-    """The light on a recipe's snow in a scene: what the recipe leaves open, the scene answers.
+    """Estimate the light on a recipe's snow in a scene; the scene fills gaps of the recipe.
 
-    Level snow in the sun gets radiance = albedo x ground / ground's albedo, in linear light; snow
+    Level snow in the sun gets radiance = albedo x ground / ground's albedo, in linear light. Snow
     that faces the sun is brighter by the wrapped cosine (Green 2004, "Real-time approximations to
-    subsurface scattering"), bent below white by a soft shoulder; shadows keep their ratio to it.
+    subsurface scattering"), bent below white by a soft shoulder. Shadows keep their ratio to it.
     Without ground, snow in shadow gets the mean light of the sky.
     """
-    found = light_of(scene)
+    scene_light = light_of(scene)
     light = snow.light
     azimuth_deg, elevation_deg, share = (
-        own if given is None else given
-        for own, given in (
-            (found.azimuth_deg, light.sun_azimuth_deg),
-            (found.elevation_deg, light.sun_elevation_deg),
-            (found.sun_share, light.sun),
+        scene_value if recipe_value is None else recipe_value
+        for scene_value, recipe_value in (
+            (scene_light.azimuth_deg, light.sun_azimuth_deg),
+            (scene_light.elevation_deg, light.sun_elevation_deg),
+            (scene_light.sun_share, light.sun),
         )
     )
-    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
-    flat = math.cos(elevation)
-    sun = (flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation))
+    azimuth = math.radians(azimuth_deg)
+    elevation = math.radians(elevation_deg)
+    horizontal = math.cos(elevation)
+    sun = (horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), math.sin(elevation))
     wrap = _mix(_WRAP_OVERCAST, _WRAP_CLEAR, share)
     facing_level = max(0.0, sun[2] + wrap) / (1 + wrap)
     shade = _mix(_SHADE_OVERCAST, _SHADE_CLEAR, share)
-    if light.sun is None and found.shadow_ratio is not None:
+    if light.sun is None and scene_light.shadow_ratio is not None:
         # Level snow has the ratio of the level road: s = q (s + (1 - s) facing_level).
-        level = found.shadow_ratio * facing_level
-        shade = level / max(1 - found.shadow_ratio + level, 1e-6)
-        shade = min(max(shade, _DARKEST_SHADE), _SHADE_OVERCAST)
+        level_ratio = scene_light.shadow_ratio * facing_level
+        shade = level_ratio / max(1 - scene_light.shadow_ratio + level_ratio, 1e-6)
+        shade = min(max(shade, _MIN_SHADE), _SHADE_OVERCAST)
     if light.brightness is None:
-        lit = _shoulder(snow.albedo * _facing_light(found, shade, facing_level))
+        lit = _shoulder(snow.albedo * _facing_light(scene_light, shade, facing_level))
     else:
-        given = float(linear_from_display(np.array(light.brightness)))
-        lit = min(1.0, given * snow.albedo / FRESH_ALBEDO)
-    # A grey road shows the light's colour, but its own and its shadows' as well: a part is taken.
-    cast = _tint(found.ground_rgb_linear, 0.25) if found.ground_is_grey else np.ones(3)
-    lit_linear = lit * _even(cast * np.asarray(_SUN_TINT) ** share)
-    sky_linear = lit * _even(cast * _tint(found.sky_rgb_linear, 0.2 + 0.4 * share))
+        recipe_luminance = float(linear_from_display(np.array(light.brightness)))
+        lit = min(1.0, recipe_luminance * snow.albedo / FRESH_ALBEDO)
+    # A grey road shows the light's colour, but also its own and its shadows': a quarter is taken.
+    ground_tint = (
+        _tint(scene_light.ground_rgb_linear, 0.25) if scene_light.ground_is_grey else np.ones(3)
+    )
+    lit_linear = lit * _normalize_luminance(ground_tint * np.asarray(_SUN_TINT) ** share)
+    sky_linear = lit * _normalize_luminance(
+        ground_tint * _tint(scene_light.sky_rgb_linear, 0.2 + 0.4 * share)
+    )
     lit_rgb, shadow_rgb = (
-        _triple(display_from_linear(np.clip(linear, 0, 1)))
-        for linear in (lit_linear, _shadow(lit_linear, sky_linear, shade))
+        _three_floats(display_from_linear(np.clip(linear, 0, 1)))
+        for linear in (lit_linear, _shadow_colour(lit_linear, sky_linear, shade))
     )
     return Illumination(sun, lit_rgb, shadow_rgb, wrap)
 
 
 def display_from_linear(linear: np.ndarray) -> np.ndarray:
-    """sRGB values in [0, 1] of linear light in [0, 1]: the inverse of `linear_from_display`."""
+    """Convert linear light in [0, 1] to sRGB values; the inverse of `linear_from_display`."""
     high = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     return np.where(linear <= 0.0031308, linear * 12.92, high)
 
 
-def _facing_light(found: SceneLight, shade: float, facing_level: float) -> float:
-    """Luminance of a white surface that faces the sun."""
-    ground = _luminance(np.asarray(found.ground_rgb_linear))
-    if found.ground_albedo is None:
-        return ground / shade  # it is the sky's, which is all that shadows get
-    return ground / found.ground_albedo / _mix(shade, 1.0, facing_level)
+def _facing_light(scene_light: SceneLight, shade: float, facing_level: float) -> float:
+    """Return the luminance of a white surface that faces the sun."""
+    ground = _luminance(np.asarray(scene_light.ground_rgb_linear))
+    if scene_light.ground_albedo is None:
+        return ground / shade  # this is the sky's light, which is all that shadows get
+    return ground / scene_light.ground_albedo / _mix(shade, 1.0, facing_level)
 
 
-def _shadow(lit: np.ndarray, tinted: np.ndarray, shade: float) -> np.ndarray:
-    """Linear colour [3] of shadow, `shade` times as bright as lit and of the tint of `tinted`,
-    which is as bright as lit; of less tint where a channel would come out above lit's.
+def _shadow_colour(lit: np.ndarray, tinted: np.ndarray, shade: float) -> np.ndarray:
+    """Linear colour [3] of shadow, `shade` times as bright as lit, in the tint of `tinted`.
+
+    tinted: colour as bright as lit. The tint is weaker where a channel would exceed lit's.
     """
     excess = np.maximum(tinted - lit, 1e-12)
     strength = np.minimum(1.0, lit * (1 / shade - 1) / excess).min()
@@ -172,116 +187,131 @@ def _shadow(lit: np.ndarray, tinted: np.ndarray, shade: float) -> np.ndarray:
 
 
 def light_of(scene: Scene) -> SceneLight:
-    """What the scene shows of its light; worked out once per scene object."""
+    """Return the light that the scene shows; it is computed once for each scene object."""
     return memo_of(scene).get(("snow light",), lambda: _find_light(scene))
 
 
 def _find_light(scene: Scene) -> SceneLight:
-    (azimuth_deg, elevation_deg), contrast, sky_rgb = _look_at_sky(scene.sky)
-    red, _, blue = _triple(sky_rgb)
+    """Find the light of a scene by its sky, its ground and its cast shadows."""
+    (azimuth_deg, elevation_deg), contrast, sky_rgb = _find_sun_in_sky(scene.sky)
+    red, _, blue = _three_floats(sky_rgb)
     is_blue = _ramp(blue / red, _GREY_BLUENESS, _CLEAR_BLUENESS) if red > 1e-6 else 0.0
-    overcast_at, clear_at = (
+    overcast_contrast, clear_contrast = (
         _mix(grey, blue, is_blue)
-        for grey, blue in zip(_GREY_CONTRASTS, _BLUE_CONTRASTS, strict=True)
+        for grey, blue in zip(_GREY_SKY_CONTRASTS, _BLUE_SKY_CONTRASTS, strict=True)
     )
-    clear = _ramp(contrast, overcast_at, clear_at)
-    clear *= _mix(_LOW_SUN_SHARE, 1.0, _ramp(elevation_deg, 0.0, _HIGH_SUN_DEG))
-    share, ratio = _mix(_OVERCAST_SHARE, _CLEAR_SHARE, clear), None
-    rgb, albedo, is_grey = _look_at_ground(scene) or (sky_rgb, None, False)
+    clearness = _ramp(contrast, overcast_contrast, clear_contrast)
+    clearness *= _mix(_LOW_SUN_SHARE, 1.0, _ramp(elevation_deg, 0.0, _HIGH_SUN_DEG))
+    share = _mix(_OVERCAST_SHARE, _CLEAR_SHARE, clearness)
+    ratio = None
+    rgb, albedo, is_grey = _find_ground_colour(scene) or (sky_rgb, None, False)
     shadows = shadows_of(scene)
     if shadows is not None and albedo is not None:
         ratio = shadows.luminance_ratio
         share = min(max(1 - ratio, _OVERCAST_SHARE), _CLEAR_SHARE)
         if shadows.certainty > 0:
             rgb = rgb ** (1 - shadows.certainty) * np.array(shadows.lit_rgb) ** shadows.certainty
-        explains = shadows.certainty * float(shadows.explained.max())
-        if explains >= _TELLING and shadows.explained_by(azimuth_deg, elevation_deg) < _AGREEING:
-            azimuth_deg, elevation_deg = shadows.azimuth_deg, shadows.elevation_deg
+        explained_share = shadows.certainty * float(shadows.explained.max())
+        if (
+            explained_share >= _MIN_EXPLAINED
+            and shadows.explained_by(azimuth_deg, elevation_deg) < _MIN_AGREEMENT
+        ):
+            azimuth_deg = shadows.azimuth_deg
+            elevation_deg = shadows.elevation_deg
     return SceneLight(
         azimuth_deg=azimuth_deg,
         elevation_deg=elevation_deg,
         sun_share=share,
         shadow_ratio=ratio,
         contrast=contrast,
-        sky_rgb_linear=_triple(sky_rgb),
+        sky_rgb_linear=_three_floats(sky_rgb),
         ground_albedo=albedo,
-        ground_rgb_linear=_triple(rgb),
+        ground_rgb_linear=_three_floats(rgb),
         ground_is_grey=is_grey,
     )
 
 
 def told_light(scene: Scene, snow: Snow) -> str:
-    """Where the light on a recipe's snow comes from, in a few words."""
+    """Describe in a few words where the light on a recipe's snow comes from."""
     if snow.light.sun is not None:
         return f"light: weather.snow.light.sun is {snow.light.sun:g}"
-    found = light_of(scene)
-    if found.shadow_ratio is None:
-        return f"light: {100 * found.sun_share:.0f} % of it the sun's, by the contrast of the sky"
-    if found.shadow_ratio == 1:
+    light = light_of(scene)
+    if light.shadow_ratio is None:
+        return f"light: {100 * light.sun_share:.0f} % of it the sun's, by the contrast of the sky"
+    if light.shadow_ratio == 1:
         return "light: flat, nothing casts a shadow on the ground"
-    return f"light: shadows on the ground have {found.shadow_ratio:.2f} of the light beside them"
+    return f"light: shadows on the ground have {light.shadow_ratio:.2f} of the light beside them"
 
 
-def _look_at_sky(sky: Sky) -> tuple[tuple[float, float], float, np.ndarray]:
-    """The sun's azimuth and elevation in degrees, the contrast, and the mean linear colour [3]."""
-    directions, near = _sky_samples()
+def _find_sun_in_sky(sky: Sky) -> tuple[tuple[float, float], float, np.ndarray]:
+    """Return the sun's (azimuth, elevation) in degrees, the contrast, and the mean colour.
+
+    The mean colour [3] is linear.
+    """
+    directions, neighbours = _sky_samples()
     rgb = sky.sample(torch.from_numpy(directions.astype(np.float32))).double().numpy()
     linear = linear_from_display(np.clip(np.nan_to_num(rgb), 0, 1))
     mean_rgb = linear.mean(0)
-    smooth = (linear * np.asarray(_LUMINANCE)).sum(1)[near].mean(1)
-    peak, mean = float(smooth.max()), float(smooth.mean())
+    smoothed = (linear * np.asarray(_LUMINANCE_WEIGHTS)).sum(1)[neighbours].mean(1)
+    peak = float(smoothed.max())
+    mean = float(smoothed.mean())
     contrast = peak / mean if mean > 1e-6 else 1.0
     if contrast < _UNIFORM_CONTRAST:
         return _UNKNOWN_SUN_DEG, contrast, mean_rgb
-    floor = np.quantile(smooth, 1 - _BRIGHTEST)
-    in_region = (directions * directions[smooth.argmax()]).sum(1) >= _REGION_COSINE
-    weights = np.where(in_region, np.maximum(smooth - floor, 0), 0)
-    if weights.sum() <= 0:  # a plateau wider than the share: its middle
-        weights = np.where(in_region, smooth, 0)
+    min_luminance = np.quantile(smoothed, 1 - _SUN_REGION_SHARE)
+    in_region = (directions * directions[smoothed.argmax()]).sum(1) >= _REGION_COSINE
+    weights = np.where(in_region, np.maximum(smoothed - min_luminance, 0), 0)
+    if weights.sum() <= 0:  # a plateau wider than the share: take its middle
+        weights = np.where(in_region, smoothed, 0)
     x, y, z = (weights[:, None] * directions).sum(0)
-    azimuth_deg, elevation_deg = math.atan2(y, x), math.atan2(z, math.hypot(x, y))
+    azimuth_deg = math.atan2(y, x)
+    elevation_deg = math.atan2(z, math.hypot(x, y))
     return (math.degrees(azimuth_deg), math.degrees(elevation_deg)), contrast, mean_rgb
 
 
 @functools.cache
 def _sky_samples() -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors above the skyline, evenly spread on a golden spiral, float64 [_SKY_SAMPLES, 3],
-    and the numbers of those around each, [_SKY_SAMPLES, _SMOOTH_OVER].
+    """Return directions above the skyline and the neighbours of each.
+
+    Returns:
+        float64 [_NUM_SKY_SAMPLES, 3], unit vectors evenly spread on a golden spiral; and
+        [_NUM_SKY_SAMPLES, _NUM_NEIGHBOURS], indices of those around each.
     """
-    index = np.arange(_SKY_SAMPLES)
-    z = _LOWEST_SINE + (1 - _LOWEST_SINE) * (index + 0.5) / _SKY_SAMPLES
+    index = np.arange(_NUM_SKY_SAMPLES)
+    z = _MIN_SKY_SINE + (1 - _MIN_SKY_SINE) * (index + 0.5) / _NUM_SKY_SAMPLES
     angle = index * (math.pi * (3 - math.sqrt(5)))
-    flat = np.sqrt(1 - z * z)
-    directions = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)
-    return directions, np.asarray(KDTree(directions).query(directions, _SMOOTH_OVER)[1])
+    horizontal = np.sqrt(1 - z * z)
+    directions = np.stack([horizontal * np.cos(angle), horizontal * np.sin(angle), z], 1)
+    return directions, np.asarray(KDTree(directions).query(directions, _NUM_NEIGHBOURS)[1])
 
 
-def _look_at_ground(scene: Scene) -> tuple[np.ndarray, float, bool] | None:
-    """The ground's median linear colour [3], its albedo, and whether it is grey; None without any.
+def _find_ground_colour(scene: Scene) -> tuple[np.ndarray, float, bool] | None:
+    """Return the ground's median linear colour [3], its albedo, and if it is grey; or None.
 
-    By area: layers beneath a surface, which nothing sees, are of fewer and smaller splats.
+    The median is taken by area: layers beneath a surface, which nothing sees, are of fewer and
+    smaller splats.
     """
     g = scene.background
-    solid = (g.opacities > SOLID_OPACITY).numpy()
+    is_solid = (g.opacities > SOLID_OPACITY).numpy()
     for semantic, albedo, is_grey in _GROUND_ALBEDOS:
         if semantic is None:
-            chosen = solid & is_low_and_level(g, scene)
+            is_ground = is_solid & is_low_and_level(g, scene)
         elif g.semantic is None:
             continue
         else:
-            chosen = solid & (g.semantic == semantic).numpy()
-        if chosen.sum() < _MIN_SPLATS:
+            is_ground = is_solid & (g.semantic == semantic).numpy()
+        if is_ground.sum() < _MIN_SPLATS:
             continue
-        sizes = g.scales.double().numpy()[chosen]
+        sizes = g.scales.double().numpy()[is_ground]
         areas = sizes.prod(1) / np.maximum(sizes.min(1), 1e-12)
-        rgb = 0.5 + SH_C0 * g.sh[:, 0].double().numpy()[chosen]
+        rgb = 0.5 + SH_C0 * g.sh[:, 0].double().numpy()[is_ground]
         linear = linear_from_display(np.clip(np.nan_to_num(rgb), 0, 1))
-        return _median(linear, areas), albedo, is_grey
+        return _weighted_median(linear, areas), albedo, is_grey
     return None
 
 
-def _median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The weighted median of each column of values [N, C], by weights [N] of which one is > 0."""
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the weighted median of each column of values [N, C]; one weight [N] must be > 0."""
     medians = []
     for column in values.T:
         order = np.argsort(column, kind="stable")
@@ -291,40 +321,43 @@ def _median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _shoulder(luminance: float) -> float:
-    """The same up to the knee, then ever slower towards the ceiling, without a kink."""
-    if luminance <= _KNEE:
+    """Compress luminance above the knee towards the ceiling, without a kink."""
+    if luminance <= _SHOULDER_KNEE:
         return luminance
-    room = _CEILING - _KNEE
-    return _KNEE + room * -math.expm1(-(luminance - _KNEE) / room)
+    room = _SHOULDER_CEILING - _SHOULDER_KNEE
+    return _SHOULDER_KNEE + room * -math.expm1(-(luminance - _SHOULDER_KNEE) / room)
 
 
 def _tint(rgb_linear: tuple[float, float, float], strength: float) -> np.ndarray:
-    """The colour's hue at luminance 1, [3]: 0 strength is white, 1 all of it, within limits."""
+    """Hue of the colour at luminance 1, [3]; strength 0 is white, 1 the full hue, within limits."""
     rgb = np.asarray(rgb_linear)
     luminance = _luminance(rgb)
     if luminance < 1e-6:
         return np.ones(3)
-    return _even(np.clip((rgb / luminance) ** strength, *_TINT_RANGE))
+    return _normalize_luminance(np.clip((rgb / luminance) ** strength, *_TINT_RANGE))
 
 
-def _even(rgb: np.ndarray) -> np.ndarray:
-    """Scaled to luminance 1."""
+def _normalize_luminance(rgb: np.ndarray) -> np.ndarray:
+    """Scale a colour to luminance 1."""
     return rgb / _luminance(rgb)
 
 
 def _luminance(rgb_linear: np.ndarray) -> float:
-    return float((rgb_linear * np.asarray(_LUMINANCE)).sum())
+    """Return the luminance of a linear colour."""
+    return float((rgb_linear * np.asarray(_LUMINANCE_WEIGHTS)).sum())
 
 
-def _triple(values: np.ndarray) -> tuple[float, float, float]:
+def _three_floats(values: np.ndarray) -> tuple[float, float, float]:
+    """Return three floats."""
     red, green, blue = (float(value) for value in values)
     return (red, green, blue)
 
 
 def _mix(low: float, high: float, share: float) -> float:
+    """Interpolate between low and high."""
     return low + share * (high - low)
 
 
 def _ramp(value: float, low: float, high: float) -> float:
-    """0 below low, 1 above high, straight between."""
+    """Return 0 below low, 1 above high, and a straight line between."""
     return min(1.0, max(0.0, (value - low) / (high - low)))

@@ -1,4 +1,8 @@
-"""Snow that lies in a scene, ready to be drawn for a camera, and the glints on it."""
+"""Records of the snow that lies in a scene, ready to be rendered for a camera, and its glints.
+
+`layer.build_snow_layer` makes the records once a scene. `SnowLayers.parts_for` turns them into
+posed Gaussians for each view.
+"""
 
 from __future__ import annotations
 
@@ -23,16 +27,24 @@ from augment.render.sh import SH_C0
 from augment.scene import Gaussians, PosedGaussians, Scene, SplatShading
 from augment.semantics import SemanticClass
 
-_BLOCK = 256  # neighbouring points
+_BLOCK_ROWS = 256  # number of neighbouring points in a block
 
 
-def near_rows(owner: Any, points: np.ndarray, eye_m: np.ndarray, reach_m: float) -> np.ndarray:
-    """int64: rows of the owner's points [P, 3] that hold all within reach of the eye, and some
-    others: of blocks whose boxes are near.
+def find_near_rows(owner: Any, points: np.ndarray, eye_m: np.ndarray, reach_m: float) -> np.ndarray:
+    """Select the rows of points [P, 3] that hold all points within reach of the eye, int64.
+
+    Points are tested in blocks of neighbouring rows, so some farther points are selected, too.
+
+    Args:
+        owner: object that the points belong to; the blocks' boxes are remembered with it.
+        points: [P, 3].
+        eye_m: [3], in the points' frame.
+        reach_m: distance from the eye.
     """
 
     def corners() -> tuple[np.ndarray, np.ndarray]:
-        starts = np.arange(0, len(points), _BLOCK)
+        """Return the lowest and highest corner of each block, [B, 3]."""
+        starts = np.arange(0, len(points), _BLOCK_ROWS)
         return np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
 
     if not len(points):
@@ -40,155 +52,175 @@ def near_rows(owner: Any, points: np.ndarray, eye_m: np.ndarray, reach_m: float)
     lows, highs = memo_of(owner).get(("corners of blocks",), corners)
     gaps = np.maximum(np.maximum(lows - eye_m, eye_m - highs), 0.0)
     blocks = np.flatnonzero((gaps * gaps).sum(1) <= (1.001 * reach_m) ** 2)
-    rows = (blocks[:, None] * _BLOCK + np.arange(_BLOCK)).reshape(-1)
+    rows = (blocks[:, None] * _BLOCK_ROWS + np.arange(_BLOCK_ROWS)).reshape(-1)
     return rows[: np.searchsorted(rows, len(points))]
 
 
-# ---- Crystals on snow that throw the sun at a camera: glints, which come and go as it moves ------
+# ---- Glints: crystals on snow that throw the sun at a camera, and come and go as it moves --------
 
-FARTHEST_M = 15.0  # from the camera: glints fade until there
-LOBE_DEG = 9.0  # how far a mirror may be off what throws the sun at the camera
-MIN_OPACITY = 0.02  # opacity below which a glint is none
-# Mirrors face every direction alike, so that one crystal in 80 throws the sun at an eye. On a GPU,
-# which does not count them, there is room for five times as many.
-GLINT_OF = 16
-SIZE_M = 0.002  # standard deviation of a glint
-LIFTED = 4.0  # height over a disc's middle, in its thickness
-PER_DISC = 2  # crystals at most
-WIDEST_M = 0.15  # discs larger than this are too far for any glint
-DULL, STRONG = 0.02, 0.25  # by how much lit snow outshines shaded snow where glints begin, are full
-CLEAN = 0.9  # of the usual brightness: packed and shaded snow below it shows none
+MAX_GLINT_DISTANCE_M = 15.0  # distance from the camera at which glints have faded
+LOBE_DEG = 9.0  # largest angle between a mirror and the normal that throws the sun at the camera
+MIN_OPACITY = 0.02  # least opacity of a glint
+# Mirrors face every direction alike, so that one crystal in 80 throws the sun at an eye. A GPU does
+# not count the glints; it has room for one crystal in CRYSTALS_PER_GLINT, five times as many.
+CRYSTALS_PER_GLINT = 16
+GLINT_SIZE_M = 0.002  # standard deviation of a glint
+GLINT_LIFT = 4.0  # height of a glint over a disc's middle, in the disc's thickness
+MAX_CRYSTALS_PER_DISC = 2  # largest number of crystals on a disc
+MAX_GLINT_DISC_M = 0.15  # larger discs are too far away for any glint
+MIN_SUN_CONTRAST = 0.02  # luminance by which lit snow outshines shaded snow where glints begin
+FULL_SUN_CONTRAST = 0.25  # the same where glints are full
+# Least brightness of a disc with glints, over the median: packed and shaded snow has none.
+MIN_GLINT_BRIGHTNESS = 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class Crystals:
-    """G crystals that may glint. places_m [G, 3], mirrors [G, 3] (unit): in the part's frame.
+    """G crystals that may glint, in the part's frame."""
 
-    strength: of their light, 0 to 1.
-    """
-
-    places_m: Float32[Tensor, "G 3"]
-    mirrors: Float32[Tensor, "G 3"]
-    strength: float
+    places_m: Float32[Tensor, "G 3"]  # positions
+    mirrors: Float32[Tensor, "G 3"]  # unit normals of the mirrors
+    strength: float  # strength of their light, 0 to 1
 
     def glints(
         self, sun: Float[Tensor, "3"], eye_m: Float[Tensor, "3"], *, backend: str = AUTO
     ) -> Gaussians | None:
-        """Small bright Gaussians where a mirror throws the sun into the eye; None without any.
+        """Make bright Gaussians where a mirror throws the sun into the eye; None without any.
 
-        sun: unit, towards it. eye_m: the camera's centre. Both in the part's frame. backend: with
-        "cuda" they lie on the GPU, where nobody counts them: some have opacity 0.
+        Args:
+            sun: unit vector towards the sun, in the part's frame.
+            eye_m: the camera's centre, in the part's frame.
+            backend: with "cuda" the Gaussians lie on the GPU. They are not counted there, so some
+                of them have opacity 0.
         """
-        eye, towards_sun = eye_m.numpy().astype(np.float32), sun.numpy().astype(np.float32)
-        near = near_rows(self, self.places_m.numpy(), eye, FARTHEST_M)
-        if backend == CUDA and len(near):
-            rows, view = gpu.upload(near), gpu.upload(np.stack([towards_sun, eye]))
+        eye = eye_m.numpy().astype(np.float32)
+        towards_sun = sun.numpy().astype(np.float32)
+        near_ids = find_near_rows(self, self.places_m.numpy(), eye, MAX_GLINT_DISTANCE_M)
+        if backend == CUDA and len(near_ids):
+            rows = gpu.upload(near_ids)
+            view = gpu.upload(np.stack([towards_sun, eye]))
             places, mirrors = (gpu.resident(t)[rows] for t in (self.places_m, self.mirrors))
             power = glint_power(places, mirrors, self.strength, view[0], view[1])
-            power, index = power.topk(min(len(near), 64 + len(near) // GLINT_OF), sorted=False)
+            power, index = power.topk(
+                min(len(near_ids), 64 + len(near_ids) // CRYSTALS_PER_GLINT), sorted=False
+            )
             opacities = torch.where(power > MIN_OPACITY, power.clip(max=1), 0.0)
             return _glints_at(places[index], opacities)
         # numpy, since starting threads would take longer than the arithmetic on one part's crystals
-        places, mirrors = self.places_m.numpy()[near], self.mirrors.numpy()[near]
+        places = self.places_m.numpy()[near_ids]
+        mirrors = self.mirrors.numpy()[near_ids]
         power = glint_power(places, mirrors, self.strength, towards_sun, eye)
-        shown = power > MIN_OPACITY
-        if not shown.any():
+        is_visible = power > MIN_OPACITY
+        if not is_visible.any():
             return None
-        opacities = np.minimum(power[shown], 1).astype(np.float32)
-        return _glints_at(torch.from_numpy(places[shown]), torch.from_numpy(opacities))
+        opacities = np.minimum(power[is_visible], 1).astype(np.float32)
+        return _glints_at(torch.from_numpy(places[is_visible]), torch.from_numpy(opacities))
 
 
 def glint_power(places: Any, mirrors: Any, strength: float, sun: Any, eye: Any) -> Any:
-    """Opacities [G] of crystals' glints, below MIN_OPACITY where there is none; float32 arrays or
-    tensors. places, mirrors [G, 3]; sun: unit, towards it; eye: all in the part's frame.
+    """Opacities of crystals' glints, [G]; below MIN_OPACITY there is no glint.
+
+    Args:
+        places: [G, 3], positions, float32 array or tensor.
+        mirrors: [G, 3], unit normals of the mirrors.
+        strength: strength of the sun's light, 0 to 1.
+        sun: [3], unit vector towards the sun.
+        eye: [3], the camera's centre. All are in the part's frame.
     """
     views = eye - places
     distances = ((views * views).sum(1) ** 0.5).clip(1e-6)
-    halves = views / distances[:, None] + sun
-    lengths = ((halves * halves).sum(1) ** 0.5).clip(1e-6)
-    aligned = (halves * mirrors).sum(1) / lengths
-    off = (1 - aligned) / (1 - math.cos(math.radians(LOBE_DEG)))  # 1 at the lobe's rim
-    return strength * (1 - off).clip(0) ** 0.5 * (1 - distances / FARTHEST_M)
+    half_vectors = views / distances[:, None] + sun
+    lengths = ((half_vectors * half_vectors).sum(1) ** 0.5).clip(1e-6)
+    aligned = (half_vectors * mirrors).sum(1) / lengths
+    lobe_share = (1 - aligned) / (1 - math.cos(math.radians(LOBE_DEG)))  # 1 at the lobe's rim
+    return strength * (1 - lobe_share).clip(0) ** 0.5 * (1 - distances / MAX_GLINT_DISTANCE_M)
 
 
 def _glints_at(places: Tensor, opacities: Tensor) -> Gaussians:
-    count, device = len(places), places.device
+    """Return white Gaussians at places [G, 3]."""
+    count = len(places)
+    device = places.device
     return Gaussians(
         means=places,
         quats=torch.eye(4, device=device)[:1].repeat(count, 1),
-        scales=torch.full((count, 3), SIZE_M, device=device),
+        scales=torch.full((count, 3), GLINT_SIZE_M, device=device),
         opacities=opacities,
         sh=torch.full((count, 1, 3), 0.5 / SH_C0, device=device),  # white
         semantic=torch.full((count,), int(SemanticClass.SNOW), dtype=torch.int16, device=device),
     )
 
 
-def crystals_of(
+def draw_crystals(
     gaussians: Gaussians,
     normals: Float32[Tensor, "S 3"],
-    rises: float,
+    sun_contrast: float,
     sparkle: float,
     rng: np.random.Generator,
 ) -> Crystals | None:
-    """As many of all possible crystals as `sparkle` says; None where the light makes no glints.
+    """Draw crystals on a layer's discs; None where the light makes no glints.
 
-    Their mirrors face every direction above the snow alike. normals: of the discs. rises: by how
-    much snow in the sun is brighter than in shade.
+    Mirrors face every direction above the snow alike.
+
+    Args:
+        gaussians: the layer's discs.
+        normals: [S, 3], normals of the discs.
+        sun_contrast: luminance by which snow in the sun is brighter than in shade.
+        sparkle: share of all possible crystals, from the recipe.
+        rng: random numbers of this part.
     """
-    strength = min((rises - DULL) / (STRONG - DULL), 1.0)
+    strength = min((sun_contrast - MIN_SUN_CONTRAST) / (FULL_SUN_CONTRAST - MIN_SUN_CONTRAST), 1.0)
     if strength <= 0 or len(gaussians) == 0:
         return None
     brightness = gaussians.sh[:, 0].mean(1) * SH_C0 + 0.5
-    bearing = gaussians.scales[:, :2].amax(1) < WIDEST_M
-    bearing &= brightness > CLEAN * brightness.median()
-    draws = torch.from_numpy(rng.random((5, PER_DISC * len(gaussians)), np.float32))
-    kept = ((draws[0] < sparkle) & bearing.repeat(PER_DISC)).nonzero()[:, 0]
-    draws, discs = draws[:, kept], kept % len(gaussians)
-    up, around = draws[1], 2 * math.pi * draws[2]
-    flat = (1 - up * up).sqrt()
-    mirrors = torch.stack([flat * around.cos(), flat * around.sin(), up], 1)
-    side, thick = gaussians.scales[discs, 1:2], gaussians.scales[discs, 2:3]
-    beside = torch.stack([draws[3] - 0.5, draws[4] - 0.5, torch.zeros_like(up)], 1) * side
-    places = gaussians.means[discs] + LIFTED * thick * normals[discs] + beside
+    has_glints = gaussians.scales[:, :2].amax(1) < MAX_GLINT_DISC_M
+    has_glints &= brightness > MIN_GLINT_BRIGHTNESS * brightness.median()
+    draws = torch.from_numpy(rng.random((5, MAX_CRYSTALS_PER_DISC * len(gaussians)), np.float32))
+    crystal_ids = ((draws[0] < sparkle) & has_glints.repeat(MAX_CRYSTALS_PER_DISC)).nonzero()[:, 0]
+    draws = draws[:, crystal_ids]
+    disc_ids = crystal_ids % len(gaussians)
+    mirror_z = draws[1]
+    azimuth = 2 * math.pi * draws[2]
+    mirror_xy = (1 - mirror_z * mirror_z).sqrt()
+    mirrors = torch.stack([mirror_xy * azimuth.cos(), mirror_xy * azimuth.sin(), mirror_z], 1)
+    side_m = gaussians.scales[disc_ids, 1:2]
+    thickness_m = gaussians.scales[disc_ids, 2:3]
+    offsets = torch.stack([draws[3] - 0.5, draws[4] - 0.5, torch.zeros_like(mirror_z)], 1) * side_m
+    places = gaussians.means[disc_ids] + GLINT_LIFT * thickness_m * normals[disc_ids] + offsets
     return Crystals(places, mirrors, strength)
 
 
-# ---- Snow that lies in a scene, ready to be drawn: Gaussians added, and Gaussians hidden ---------
+# ---- Layers of snow: Gaussians to add, and Gaussians to hide -------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """The snow on one part of a scene.
+    """Snow on one part of a scene."""
 
-    gaussians [S]: the snow, in the part's frame, semantic SNOW. opacities [N]: of the part's own
-    Gaussians, 0 for those that the snow buries. slopes [S, 3]: see SplatShading; None where the
-    light is in the Gaussians' colours already. normals [S, 3]: unit, where the light's share is one
-    for a splat but changes as the part turns; None where it is one for a pixel.
-    """
-
+    # Gaussians of the snow, in the part's frame, with semantic SNOW.
     gaussians: Gaussians
+    # Opacities of the part's own Gaussians, 0 for those that the snow buries.
     opacities: Float[Tensor, "N"]
+    # Colour that full sun adds to each Gaussian, see SplatShading; None where the colours are lit.
     slopes: Float[Tensor, "S 3"] | None = None
+    # Unit normals. Given for a part that moves and is lit splat by splat, since its light changes
+    # as it turns; None otherwise.
     normals: Float[Tensor, "S 3"] | None = None
     crystals: Crystals | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class SnowLayers:
-    """The snow in a scene. actors: layers by track_id. sun, wrap: of the light, for layers with
-    slopes (world; see SplatShading). thickness_m: the layer's depth on level ground. grain: how it
-    looks from close by.
-    """
+    """Snow in a scene."""
 
-    ground: Layer
-    actors: Mapping[str, Layer]
-    sun: tuple[float, float, float]
-    wrap: float
-    thickness_m: float
-    grain: Grain
+    ground: Layer  # snow on the background
+    actors: Mapping[str, Layer]  # snow on actors, by track_id
+    sun: tuple[float, float, float]  # unit vector towards the sun, world, for layers with slopes
+    wrap: float  # how far light reaches around, see SplatShading, for layers with slopes
+    thickness_m: float  # depth of the snow on level ground
+    grain: Grain  # how the snow looks from close by
 
     def layer_on(self, scene: Scene, instance_id: int) -> Layer | None:
-        """The snow on the background (0) or an actor (1 + its index); None where it has none."""
+        """Return the snow on the background (0) or an actor (1 + its index), or None."""
         if instance_id == 0:
             return self.ground
         return self.actors.get(scene.actors[instance_id - 1].track_id)
@@ -198,78 +230,112 @@ class SnowLayers:
         scene: Scene,
         camera: Camera,
         without_snow: Sequence[PosedGaussians] | None = None,
-        snowy: Collection[int] | None = None,
+        snowy_ids: Collection[int] | None = None,
         *,
         backend: str = AUTO,
     ) -> tuple[PosedGaussians, ...]:
-        """The scene's parts and the snow on them at the moment the camera took its image.
+        """Return the scene's parts and their snow at the moment the camera took its image.
 
-        The scene's own come first, in their order. without_snow: those that are drawn, the
-        background first. snowy: instance ids of the parts whose snow is; None for all. backend:
-        with "cuda", what changes with the view lies on the GPU, equal within float rounding.
+        The scene's own parts come first, in their order.
+
+        Args:
+            scene: the scene.
+            camera: the camera.
+            without_snow: parts to render, the background first; None for all parts of the scene.
+            snowy_ids: instance ids of the parts whose snow is rendered; None for all.
+            backend: with "cuda", arrays that change with the view lie on the GPU, equal within
+                float rounding.
         """
         without_snow = scene.parts_for(camera) if without_snow is None else without_snow
-        parts, covered = [], []
+        parts = []
+        snowy_parts = []
         for part in without_snow:
             layer = self.layer_on(scene, part.instance_id)
-            if layer is None or (snowy is not None and part.instance_id not in snowy):
+            if layer is None or (snowy_ids is not None and part.instance_id not in snowy_ids):
                 parts.append(part)
                 continue
-            left = _left_visible(layer, part.gaussians)
-            parts.append(dataclasses.replace(part, gaussians=left))
+            visible_gaussians = _hide_buried(layer, part.gaussians)
+            parts.append(dataclasses.replace(part, gaussians=visible_gaussians))
             if len(layer.gaussians):
-                covered.append((layer, part))
-        for layer, part in covered:
-            parts.extend(self._posed(layer, part, camera, backend))
+                snowy_parts.append((layer, part))
+        for layer, part in snowy_parts:
+            parts.extend(self._pose_layer(layer, part, camera, backend))
         return tuple(parts)
 
-    def _posed(
+    def _pose_layer(
         self, layer: Layer, part: PosedGaussians, camera: Camera, backend: str
     ) -> list[PosedGaussians]:
-        """The layer where its part stands, and its glints."""
-        pose, eye_m = part.world_from_part, camera.centre
+        """Return the layer at the pose of its part, and its glints."""
+        world_from_part = part.world_from_part
+        eye_m = camera.centre
         sun = torch.tensor(self.sun, dtype=torch.float64)
-        if pose is not None:
-            sun, eye_m = pose[:3, :3].T @ sun, pose[:3, :3].T @ (eye_m - pose[:3, 3])
-        gaussians, slopes = layer.gaussians, layer.slopes
+        if world_from_part is not None:
+            sun = world_from_part[:3, :3].T @ sun
+            eye_m = world_from_part[:3, :3].T @ (eye_m - world_from_part[:3, 3])
+        gaussians = layer.gaussians
+        slopes = layer.slopes
         if layer.normals is not None:
             assert slopes is not None
-            towards = sun.tolist()
-            gaussians = _lit(gaussians, slopes, layer.normals, towards, self.wrap, backend)
+            sun_direction = sun.tolist()
+            gaussians = _light_per_splat(
+                gaussians, slopes, layer.normals, sun_direction, self.wrap, backend
+            )
             slopes = None
-        drawn = [(gaussians, slopes)]
+        gaussians_and_slopes = [(gaussians, slopes)]
         if layer.crystals is not None:
             glints = layer.crystals.glints(sun, eye_m, backend=backend)
-            drawn += [] if glints is None else [(glints, None)]
-        towards_sun, instance = tuple(sun.tolist()), part.instance_id
-        lights = (None if s is None else SplatShading(s, towards_sun, self.wrap) for _, s in drawn)
+            gaussians_and_slopes += [] if glints is None else [(glints, None)]
+        towards_sun = tuple(sun.tolist())
+        instance = part.instance_id
+        shadings = (
+            None if s is None else SplatShading(s, towards_sun, self.wrap)
+            for _, s in gaussians_and_slopes
+        )
         return [
-            PosedGaussians(splats, pose, instance, is_overlay=True, shading=light)
-            for (splats, _), light in zip(drawn, lights, strict=True)
+            PosedGaussians(splats, world_from_part, instance, is_overlay=True, shading=shading)
+            for (splats, _), shading in zip(gaussians_and_slopes, shadings, strict=True)
         ]
 
 
-def _left_visible(layer: Layer, own: Gaussians) -> Gaussians:
-    """A part's Gaussians less those that the snow buries: one object for as long as the part's own
-    is one, so that what a GPU knows of it is not asked for anew every frame.
+def _hide_buried(layer: Layer, gaussians: Gaussians) -> Gaussians:
+    """Return a part's Gaussians with opacity 0 where the snow buries them.
+
+    The result is one object for as long as the part's Gaussians are one, so that a GPU keeps what
+    it holds of it from frame to frame.
     """
-    of_layers = memo_of(own).get(("left visible by snow",), WeakKeyDictionary[Layer, Gaussians])
-    if layer not in of_layers:
-        of_layers[layer] = dataclasses.replace(own, opacities=layer.opacities)
-    return of_layers[layer]
+    gaussians_by_layer = memo_of(gaussians).get(
+        ("left visible by snow",), WeakKeyDictionary[Layer, Gaussians]
+    )
+    if layer not in gaussians_by_layer:
+        gaussians_by_layer[layer] = dataclasses.replace(gaussians, opacities=layer.opacities)
+    return gaussians_by_layer[layer]
 
 
-def _lit(
-    gaussians: Gaussians, slopes: Tensor, normals: Tensor, sun: list[float], wrap: float, on: str
+def _light_per_splat(
+    gaussians: Gaussians,
+    slopes: Tensor,
+    normals: Tensor,
+    sun: list[float],
+    wrap: float,
+    backend: str,
 ) -> Gaussians:
-    """The Gaussians in the light that their own normals catch. sun: unit, in the part's frame. on:
-    the backend.
+    """Return the Gaussians in the light that their own normals catch.
+
+    Args:
+        gaussians: snow in shade.
+        slopes: [S, 3], colour that full sun adds.
+        normals: [S, 3], unit normals, in the part's frame.
+        sun: unit vector towards the sun, in the part's frame.
+        wrap: how far light reaches around, see SplatShading.
+        backend: the backend.
     """
     # numpy, since starting threads would take longer than the arithmetic on one part's snow
-    sh, rises, n = (
-        gpu.resident(t) if on == CUDA else t.numpy() for t in (gaussians.sh, slopes, normals)
+    sh, slope_values, normal_values = (
+        gpu.resident(t) if backend == CUDA else t.numpy() for t in (gaussians.sh, slopes, normals)
     )
-    facing = n[:, 0] * sun[0] + n[:, 1] * sun[1] + n[:, 2] * sun[2]
-    share = ((facing + wrap) / (1 + wrap)).clip(0, 1) / SH_C0
-    lit = sh + (rises * share[:, None])[:, None, :]
-    return dataclasses.replace(gaussians, sh=torch.as_tensor(lit))
+    facing = (
+        normal_values[:, 0] * sun[0] + normal_values[:, 1] * sun[1] + normal_values[:, 2] * sun[2]
+    )
+    sun_share = ((facing + wrap) / (1 + wrap)).clip(0, 1) / SH_C0
+    lit_sh = sh + (slope_values * sun_share[:, None])[:, None, :]
+    return dataclasses.replace(gaussians, sh=torch.as_tensor(lit_sh))

@@ -1,4 +1,4 @@
-"""The snow of a recipe before it is laid in a scene, and labelled boxes with snow on them."""
+"""Snow of a recipe before it is laid in a scene, and labelled boxes with snow on them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from recipes.snow import Snow
 
 @dataclass(frozen=True)
 class PlacedSnow:
-    """Snow of one recipe. seed: of its drifts. water_level_z_m: of the flood that melts what it
-    reaches, scene world; None without one.
-    """
+    """Snow of one recipe."""
 
     snow: Snow
-    seed: int
+    seed: int  # seed of the drifts
+    # Height of the flood that melts the snow it reaches, world; None without a flood.
     water_level_z_m: float | None = None
 
 
@@ -35,37 +34,44 @@ def placement_settings(snow: Snow, scene: Scene) -> PlacementSettings:
     )
 
 
-# ---- How much of what an image shows of labelled boxes is snow -----------------------------------
+# ---- Share of snow in what an image shows of labelled boxes --------------------------------------
 
-MARGIN_M = 0.05  # by which splats blur the layer's surface
-DRIFTED = 1.5  # how deep drifts make the layer, relative to its depth on level ground
-KEPT_OF_HEIGHT = 0.25  # of a low box in deep snow, from its top down
+SURFACE_MARGIN_M = 0.05  # width by which splats blur the layer's surface
+DRIFT_DEPTH_RATIO = 1.5  # depth of the layer in drifts over its depth on level ground
+MIN_BOX_HEIGHT_SHARE = 0.25  # least share of a low box, from its top down, that stays in deep snow
 
 
 def snow_pixels(
-    placed: PlacedBoxes,
+    boxes: PlacedBoxes,
     camera: Camera,
     surface_depth_m: Float32[np.ndarray, "H W"],
     snow: UInt8[np.ndarray, "H W"],
     thickness_m: float,
 ) -> BoxPixels:
-    """How many pixels show each box or the snow on it, and how many of them (`marked`) show snow.
+    """Count the pixels that show each box or the snow on it, and those of them that show snow.
 
-    surface_depth_m: z of the first solid surface, snow included; 0 = none. snow: 255 where the
-    pixel shows snow. thickness_m: of the layer on level ground.
+    The second count is `marked`.
+
+    Args:
+        boxes: labelled boxes.
+        camera: the camera.
+        surface_depth_m: z of the first solid surface, snow included; 0 = none.
+        snow: 255 where the pixel shows snow.
+        thickness_m: depth of the layer on level ground.
     """
-    return count_pixels(placed_in_snow(placed, thickness_m), camera, surface_depth_m, snow)
+    return count_pixels(extend_boxes_by_snow(boxes, thickness_m), camera, surface_depth_m, snow)
 
 
-def placed_in_snow(placed: PlacedBoxes, thickness_m: float) -> PlacedBoxes:
-    """The boxes with the snow on them. thickness_m: of the layer on level ground.
+def extend_boxes_by_snow(boxes: PlacedBoxes, thickness_m: float) -> PlacedBoxes:
+    """Return the boxes with the snow on them; thickness_m: depth of the layer on level ground.
 
-    The top of a box is raised, for the snow on it counts as the box; so is its bottom, for the snow
-    around its wheels does not.
+    The top of a box is raised, since the snow on it counts as the box. Its bottom is raised, since
+    the snow around its wheels does not.
     """
-    height = placed.sizes_m[:, 2]
-    low, high = placed.low_m.copy(), placed.high_m.copy()
-    above_ground = np.minimum(thickness_m + MARGIN_M, (1 - KEPT_OF_HEIGHT) * height)
+    height = boxes.sizes_m[:, 2]
+    low = boxes.low_m.copy()
+    high = boxes.high_m.copy()
+    above_ground = np.minimum(thickness_m + SURFACE_MARGIN_M, (1 - MIN_BOX_HEIGHT_SHARE) * height)
     low[:, 2] = np.maximum(low[:, 2], above_ground - height / 2)
-    high[:, 2] = height / 2 + max(SIDES_M, DRIFTED * thickness_m + MARGIN_M)
-    return dataclasses.replace(placed, low_m=low, high_m=high)
+    high[:, 2] = height / 2 + max(SIDES_M, DRIFT_DEPTH_RATIO * thickness_m + SURFACE_MARGIN_M)
+    return dataclasses.replace(boxes, low_m=low, high_m=high)

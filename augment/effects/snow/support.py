@@ -1,4 +1,8 @@
-"""Where snow can lie, found once: remembered while the scene lives, and kept in a folder."""
+"""Finds a scene's support once: it is remembered while the scene lives, and stored in a folder.
+
+`placement.place_snow_support` does the work. Callers: snow and wet ground (`support_of` for
+pictures and sweeps, `share_support` at the start of a job).
+"""
 
 from __future__ import annotations
 
@@ -28,24 +32,29 @@ from augment.scene import Gaussians, Scene
 
 logger = logging.getLogger(__name__)
 
-# Raised whenever the same scene would give another support, or a file hold it otherwise.
+# Name of the file format. Its number goes up whenever the same scene would give another support, or
+# a file would hold it otherwise.
 FORMAT = "climategs-snow-bed-7"
-_ABOUT = "snow_bed"
+_METADATA_KEY = "snow_bed"  # key of the metadata in a file
+# Types of the fields of SnowCells other than float32.
 _DTYPES = {
     "neighbours": torch.int32,
     "semantic": torch.int16,
     "buried": torch.int32,
     "buried_by": torch.int32,
 }
+# Second dimension of the fields of SnowCells that have one.
 _COLUMNS = {"centers_m": 3, "normals": 3, "neighbours": 4, "banks": 2, "buried_by": 5}
 
 
 def support_key(
     scene: Scene, cameras: Sequence[Camera], settings: PlacementSettings, *, backend: str = AUTO
 ) -> str:
-    """Hex digest of all that a support depends on: Gaussians, tracks, cameras, poses, settings,
-    what places it (the GPU rounds otherwise than the CPU), and this code's version. Of colours,
-    what all directions share. Order of the cameras counts.
+    """Return a hex digest of everything that a support depends on.
+
+    That is Gaussians, tracks, cameras, poses, settings, the backend that places it (the GPU rounds
+    otherwise than the CPU), and the version of this code. Of colours, it covers those that all
+    directions share. The order of the cameras counts.
     """
     digest = hashlib.blake2b(FORMAT.encode(), digest_size=20)
     if backend == CUDA:
@@ -55,50 +64,52 @@ def support_key(
     for actor in scene.actors:
         digest.update(repr((actor.track_id, actor.label, actor.size_m)).encode())
         _add_gaussians(digest, actor.gaussians)
-        _add(digest, actor.track.timestamps_ns, actor.track.world_from_actor)
+        _add_tensors(digest, actor.track.timestamps_ns, actor.track.world_from_actor)
     for camera in cameras:
         numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        about = (camera.name, *numbers, camera.timestamp_ns, camera.is_orthographic)
-        digest.update(repr(about).encode())
-        _add(digest, camera.camera_from_world)
-    _add(digest, *(frame.world_from_ego for frame in scene.frames))
+        camera_values = (camera.name, *numbers, camera.timestamp_ns, camera.is_orthographic)
+        digest.update(repr(camera_values).encode())
+        _add_tensors(digest, camera.camera_from_world)
+    _add_tensors(digest, *(frame.world_from_ego for frame in scene.frames))
     if scene.seen_frames is not None:  # wheel tracks are those of the recorded drive
         digest.update(repr(settings.invented_tracks).encode())
-        _add(digest, *(frame.world_from_ego for frame in scene.seen_frames))
+        _add_tensors(digest, *(frame.world_from_ego for frame in scene.seen_frames))
     return digest.hexdigest()
 
 
 def save_support(path: Path, support: SnowSupport, key: str) -> None:
-    """Write a support, as a whole or not at all, without its seconds: equal ones are equal bytes.
+    """Write a support, as a whole or not at all. Equal supports are equal bytes: no time is stored.
 
     Raises:
         OutputError: the system refused (disk full, no permission ...); `path` is then as it was.
     """
-    tensors = _named("ground", support.ground)
+    tensors = _named_tensors("ground", support.ground)
     for number, cells in enumerate(support.actors.values()):
-        tensors |= _named(f"actors.{number}", cells)
-    about = {"format": FORMAT, "key": key, "track_ids": list(support.actors)}
-    # A single entry: several are written in any order.
-    write_atomic(path, save(tensors, metadata={_ABOUT: json.dumps(about, sort_keys=True)}))
+        tensors |= _named_tensors(f"actors.{number}", cells)
+    metadata = {"format": FORMAT, "key": key, "track_ids": list(support.actors)}
+    # The metadata has a single entry, since several would be written in any order.
+    write_atomic(
+        path, save(tensors, metadata={_METADATA_KEY: json.dumps(metadata, sort_keys=True)})
+    )
 
 
 def load_support(path: Path, key: str) -> SnowSupport:
-    """The support of a file.
+    """Read the support of a file.
 
     Raises:
         SceneError: there is no such file, it is damaged or no snow support, or not that of `key`.
     """
     try:
         with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {}).get(_ABOUT, "{}"))
-            _check_about(path, about, key)
-            track_ids = about["track_ids"]
+            metadata = json.loads((file.metadata() or {}).get(_METADATA_KEY, "{}"))
+            _check_metadata(path, metadata, key)
+            track_ids = metadata["track_ids"]
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         actors = {
-            track_id: _cells(path, tensors, f"actors.{number}")
+            track_id: _cells_from_tensors(path, tensors, f"actors.{number}")
             for number, track_id in enumerate(track_ids)
         }
-        return SnowSupport(_cells(path, tensors, "ground"), actors)
+        return SnowSupport(_cells_from_tensors(path, tensors, "ground"), actors)
     except FileNotFoundError as error:
         raise SceneError(f"{path}: no such file, so no snow support to read") from error
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
@@ -108,33 +119,35 @@ def load_support(path: Path, key: str) -> SnowSupport:
         ) from error
 
 
-def _check_about(path: Path, about: Any, key: str) -> None:
-    about = about if isinstance(about, dict) else {}
-    if about.get("format") != FORMAT:
+def _check_metadata(path: Path, metadata: Any, key: str) -> None:
+    """Check the format and the key in a file's metadata."""
+    metadata = metadata if isinstance(metadata, dict) else {}
+    if metadata.get("format") != FORMAT:
         raise SceneError(
-            f"{path} is no snow support of this version: its format is {about.get('format')!r}, "
+            f"{path} is no snow support of this version: its format is {metadata.get('format')!r}, "
             f"expected {FORMAT!r}; delete it, and it is made anew"
         )
-    if about.get("key") != key:
+    if metadata.get("key") != key:
         raise SceneError(
-            f"{path} is the snow support of something else: its key is {about.get('key')!r}, "
+            f"{path} is the snow support of something else: its key is {metadata.get('key')!r}, "
             f"expected {key!r}; the scene, the cameras or the settings have changed since"
         )
 
 
-def _named(part: str, cells: SnowCells) -> dict[str, Tensor]:
+def _named_tensors(part: str, cells: SnowCells) -> dict[str, Tensor]:
+    """Return the tensors of one part's cells, by their names in a file."""
     return {
         f"{part}.{field.name}": getattr(cells, field.name).contiguous().clone()
         for field in fields(SnowCells)
     }
 
 
-def _cells(path: Path, tensors: Mapping[str, Tensor], part: str) -> SnowCells:
-    """The cells of one part, after a look at every shape and at every number that is an index."""
-    found = {field.name: tensors[f"{part}.{field.name}"] for field in fields(SnowCells)}
-    counts = {"cell": len(found["sizes_m"]), "buried": len(found["buried"])}
-    for name, tensor in found.items():
-        rows = counts["buried" if name.startswith("buried") else "cell"]
+def _cells_from_tensors(path: Path, tensors: Mapping[str, Tensor], part: str) -> SnowCells:
+    """Return the cells of one part, after a check of every shape and every index."""
+    fields_by_name = {field.name: tensors[f"{part}.{field.name}"] for field in fields(SnowCells)}
+    num_rows = {"cell": len(fields_by_name["sizes_m"]), "buried": len(fields_by_name["buried"])}
+    for name, tensor in fields_by_name.items():
+        rows = num_rows["buried" if name.startswith("buried") else "cell"]
         shape = (rows, _COLUMNS[name]) if name in _COLUMNS else (rows,)
         dtype = _DTYPES.get(name, torch.float32)
         if tuple(tensor.shape) != shape or tensor.dtype != dtype:
@@ -142,22 +155,27 @@ def _cells(path: Path, tensors: Mapping[str, Tensor], part: str) -> SnowCells:
                 f"{part}.{name} must be {dtype} {list(shape)}; got {tensor.dtype} "
                 f"{list(tensor.shape)}"
             )
-    for name, least in (("neighbours", FLUSH), ("buried_by", -1)):
-        values = found[name]
-        if values.numel() and not least <= int(values.min()) <= int(values.max()) < counts["cell"]:
+    for name, min_index in (("neighbours", FLUSH), ("buried_by", -1)):
+        values = fields_by_name[name]
+        if (
+            values.numel()
+            and not min_index <= int(values.min()) <= int(values.max()) < num_rows["cell"]
+        ):
             raise ValueError(f"{part}.{name} names cells that are not there")
-    if counts["buried"] and int(found["buried"].min()) < 0:
+    if num_rows["buried"] and int(fields_by_name["buried"].min()) < 0:
         raise ValueError(f"{part}.buried names Gaussians that are not there")
-    return SnowCells(**found)
+    return SnowCells(**fields_by_name)
 
 
 def _add_gaussians(digest: hashlib.blake2b, gaussians: Gaussians) -> None:
+    """Add Gaussians to a digest."""
     g = gaussians
-    own = (g.means, g.quats, g.scales, g.opacities, g.sh[:, 0])
-    _add(digest, *own, *(() if g.semantic is None else (g.semantic,)))
+    tensors = (g.means, g.quats, g.scales, g.opacities, g.sh[:, 0])
+    _add_tensors(digest, *tensors, *(() if g.semantic is None else (g.semantic,)))
 
 
-def _add(digest: hashlib.blake2b, *tensors: Tensor) -> None:
+def _add_tensors(digest: hashlib.blake2b, *tensors: Tensor) -> None:
+    """Add tensors to a digest, with their shapes and types."""
     for tensor in tensors:
         array = np.ascontiguousarray(tensor.detach().numpy())
         digest.update(repr((array.shape, array.dtype.str)).encode())
@@ -173,49 +191,61 @@ def support_of(
     backend: str = AUTO,
     progress: bool = False,
 ) -> SnowSupport:
-    """The support of a scene: remembered, else read from the folder, else placed and written there.
+    """Return the support of a scene: remembered, read from the folder, or placed and written there.
 
-    cameras: those that must see the snow; None for all of the scene's. folder: supports
-    are kept there as snow-<key>.safetensors; a file that cannot be used is replaced, with a
-    warning. backend: that places what is not remembered yet, see place_snow_support. A scene and
-    its settings have one support, so that its pictures, sweeps and labels agree.
+    A scene and its settings have one support, so that its pictures, sweeps and labels agree.
+
+    Args:
+        scene: the scene.
+        settings: settings of the cells.
+        cameras: cameras that must see the snow; None for all of the scene's.
+        folder: folder that keeps supports as snow-<key>.safetensors. A file that cannot be used is
+            replaced, with a warning.
+        backend: backend that places a support which is not remembered yet, see place_snow_support.
+        progress: if True, a progress bar is shown.
 
     Raises:
         SceneError: as place_snow_support.
         OutputError: the folder cannot be written.
     """
 
-    def find() -> SnowSupport:
-        every = every_camera(scene) if cameras is None else cameras
-        key = "" if folder is None else support_key(scene, every, settings, backend=backend)
+    def find_support() -> SnowSupport:
+        viewing_cameras = all_cameras(scene) if cameras is None else cameras
+        key = (
+            "" if folder is None else support_key(scene, viewing_cameras, settings, backend=backend)
+        )
         path = None if folder is None else support_path(folder, key)
         if path is not None and path.is_file():
             try:
                 return load_support(path, key)
             except SceneError as error:
                 logger.warning("the snow of %s is placed anew: %s", scene.name, error)
-        support = place_snow_support(scene, every, settings, backend=backend, progress=progress)
+        support = place_snow_support(
+            scene, viewing_cameras, settings, backend=backend, progress=progress
+        )
         if path is not None:
             save_support(path, support, key)
         return support
 
-    return memo_of(scene).get(("snow support", settings), find)
+    return memo_of(scene).get(("snow support", settings), find_support)
 
 
 @dataclass(frozen=True)
 class StoredSupport:
-    """A support in its file."""
+    """Support in its file."""
 
     path: str
     key: str
 
     def load(self) -> SnowSupport:
+        """Read the support."""
         return load_support(Path(self.path), self.key)
 
 
 def share_support(job: Sharing, settings: PlacementSettings) -> None:
-    """Find the support and share it, in a file of the folder where there is one, with whoever
-    takes over the scene's memo.
+    """Find the support of a job's scene and share it with the processes that take over its memo.
+
+    It is shared as a file where the job has a folder.
     """
     support = support_of(
         job.scene,
@@ -227,10 +257,10 @@ def share_support(job: Sharing, settings: PlacementSettings) -> None:
     )
     stored: SnowSupport | StoredSupport = support
     if job.folder is not None:
-        every = every_camera(job.scene) if job.cameras is None else job.cameras
-        key = support_key(job.scene, every, settings, backend=job.backend)
+        viewing_cameras = all_cameras(job.scene) if job.cameras is None else job.cameras
+        key = support_key(job.scene, viewing_cameras, settings, backend=job.backend)
         path = support_path(job.folder, key)
-        if not path.is_file():  # this process knew it from a job in another folder
+        if not path.is_file():  # this process remembers it from a job in another folder
             save_support(path, support, key)
         stored = StoredSupport(str(path), key)
     memo = memo_of(job.scene)
@@ -238,10 +268,11 @@ def share_support(job: Sharing, settings: PlacementSettings) -> None:
     memo.put(("snow support", settings), support)
 
 
-def every_camera(scene: Scene) -> list[Camera]:
+def all_cameras(scene: Scene) -> list[Camera]:
+    """Return all cameras of the scene's frames."""
     return [camera for frame in scene.frames for camera in frame.cameras.values()]
 
 
 def support_path(folder: Path, key: str) -> Path:
-    """Where the support of a key is kept in a folder."""
+    """Return the file in which a folder keeps the support of a key."""
     return folder / f"snow-{key}.safetensors"

@@ -1,4 +1,4 @@
-"""Wet ground as an effect: darker splats, and what the film of water on them mirrors."""
+"""Wet ground as an effect: darker splats, and reflections in the film of water on them."""
 
 from __future__ import annotations
 
@@ -27,8 +27,14 @@ from augment.effects.effect import (
 from augment.effects.lidar.beam import Echoes
 from augment.effects.snow.light import light_of
 from augment.effects.snow.support import share_support
-from augment.effects.wet.darkening import darkened, wet_ratio, white_level
-from augment.effects.wet.ground import SETTINGS, WetGround, WetSplats, wet_ground, wet_splats
+from augment.effects.wet.darkening import darken_gaussians, wet_ratio, white_level
+from augment.effects.wet.ground import (
+    PLACEMENT_SETTINGS,
+    WetGround,
+    WetSplats,
+    wet_ground,
+    wet_splats,
+)
 from augment.effects.wet.lidar import wet_echoes
 from augment.effects.wet.reflection import (
     Film,
@@ -36,7 +42,7 @@ from augment.effects.wet.reflection import (
     Plane,
     blur_upright,
     find_ground,
-    mirrored_in,
+    mirror_camera,
     plane_in_view,
     shade_wet,
 )
@@ -50,37 +56,43 @@ from augment.timing import timed
 from recipes.rain import Rain
 from recipes.schema import Recipe
 
-DARKER, MIRRORED, SHINE = PASSES = (
+# Labels of the passes, in plans and timings.
+DARKENING_PASS, MIRROR_PASS, REFLECTION_PASS = PASSES = (
     "wet ground: darker",
     "wet ground: mirrored view",
     "wet ground: reflection",
 )
-LEAST_SEEN = 0.05  # of a photo's ground through fog, below which its colour is not known
-STOP = 0.01  # of its transmittance: a film reflects little of what is behind that
-SOLID = 0.5  # alpha from which on the mirrored view shows a surface
-LOWERED_M = 0.3  # below the plane: what stands on ground that is no plane is whole
-LOW_MARGIN_PX = 8
-UP_MARGIN = 0.2  # of the image's height, that rough ground looks higher than its mirror
+# Least transmittance of fog at which a photo's ground has a known colour.
+MIN_PHOTO_TRANSMITTANCE = 0.05
+# Transmittance at which rendering of the mirrored view stops; a film reflects little of what lies
+# behind.
+MIRROR_TRANSMITTANCE_STOP = 0.01
+MIN_SURFACE_ALPHA = 0.5  # least alpha at which the mirrored view shows a surface
+# Depth below the plane down to which things are mirrored, so that they stay whole on uneven ground.
+CLIP_DEPTH_M = 0.3
+LOWER_MARGIN_PX = 8  # rows below the mirrored rows
+# Rows above them, in the image's height: rough ground mirrors higher things, too.
+UPPER_MARGIN_SHARE = 0.2
 
 
 @dataclass(frozen=True)
 class PlacedWet:
-    """Of a recipe. seed: of the puddles' noise. wetness, puddles: 0 to 1. mirror_px: of the
-    picture, that a pixel of the mirrored view is wide.
-    """
+    """Wet ground of a recipe."""
 
-    seed: int
-    wetness: float
-    puddles: float
-    rate_mm_h: float
-    mirror_px: float
+    seed: int  # seed of the puddles' noise
+    wetness: float  # 0 to 1
+    puddles: float  # share of the ground under puddles, 0 to 1
+    rate_mm_h: float  # rate of the rain
+    mirror_px: float  # width of a pixel of the mirrored view, in pixels of the picture
 
 
 class WetEffect(Effect):
-    """Ground that rain has wetted: a part of the section that rain in the air is the other of."""
+    """Wet ground. Shares the recipe section `weather.rain` with `RainEffect`."""
 
-    name, section, model = "wet", "weather.rain", Rain
-    draws = (MIRRORED,)
+    name = "wet"
+    section = "weather.rain"
+    model = Rain
+    draws = (MIRROR_PASS,)
     shares_files = True
 
     def reads_splats(self, recipe: Recipe) -> bool:
@@ -89,23 +101,28 @@ class WetEffect(Effect):
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
         rain = self.of(recipe)
-        why = ""
+        reason = ""
         if rain is None or rain.ground_wetness == 0:
-            why = "the recipe has no rain" if rain is None else "the rain leaves the ground dry"
+            reason = "the recipe has no rain" if rain is None else "the rain leaves the ground dry"
         elif rain.wetness is None and not (scene.has_metric_scale and scene.has_known_gravity):
-            why = "wetness is null, and the scene's metres or gravity are not known"
-        if rain is None or why:
+            reason = "wetness is null, and the scene's metres or gravity are not known"
+        if rain is None or reason:
             stages = (SCENE, PICTURE, PICTURE)
             return Placed(
-                None, tuple(Step(n, False, why, s) for n, s in zip(PASSES, stages, strict=True))
+                None, tuple(Step(n, False, reason, s) for n, s in zip(PASSES, stages, strict=True))
             )
         check_metric_and_level(scene)
-        wet = f"wetness {rain.ground_wetness:.2g} of what is open to the sky"
-        mirrored = f"at 1 / {rain.mirror_px:g} of the resolution, without the ground"
+        wet_description = f"wetness {rain.ground_wetness:.2g} of what is open to the sky"
+        mirror_description = f"at 1 / {rain.mirror_px:g} of the resolution, without the ground"
         steps = (
-            Step(DARKER, True, wet, SCENE),
-            Step(MIRRORED, True, mirrored, PICTURE),
-            Step(SHINE, True, f"{wet}; puddles on {100 * rain.puddle_share:.3g} %", PICTURE),
+            Step(DARKENING_PASS, True, wet_description, SCENE),
+            Step(MIRROR_PASS, True, mirror_description, PICTURE),
+            Step(
+                REFLECTION_PASS,
+                True,
+                f"{wet_description}; puddles on {100 * rain.puddle_share:.3g} %",
+                PICTURE,
+            ),
         )
         numbers = rain.ground_wetness, rain.puddle_share, rain.rate_mm_h, rain.mirror_px
         data = PlacedWet(recipe.seed, *numbers)
@@ -115,27 +132,28 @@ class WetEffect(Effect):
         return wet_ground(own.scene, own.data.seed, backend=own.backend)
 
     def share(self, job: Sharing) -> None:
-        found = (self.of(recipe) for recipe in job.recipes)
-        if any(rain and rain.ground_wetness > 0 for rain in found):
-            share_support(job, SETTINGS)
+        """Find where rain can fall, once for the job."""
+        rains = (self.of(recipe) for recipe in job.recipes)
+        if any(rain and rain.ground_wetness > 0 for rain in rains):
+            share_support(job, PLACEMENT_SETTINGS)
 
     def cameras(self, own: Active, camera: Camera) -> tuple[Camera, ...] | None:
-        plane = _plane(own, camera)
+        plane = _find_plane(own, camera)
         return (
             None if plane is None else (camera, _mirror_camera(camera, plane, (0, camera.height)))
         )
 
     def in_view(self, own: Active, sight: Sight) -> InView:
-        if _plane(own, sight.camera) is not None:
+        if _find_plane(own, sight.camera) is not None:
             return InView()
-        why = "no open ground is in view"
-        return InView(skipped=dict.fromkeys((MIRRORED, SHINE), why))
+        reason = "no open ground is in view"
+        return InView(skipped=dict.fromkeys((MIRROR_PASS, REFLECTION_PASS), reason))
 
     def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
         splats = wet_splats(own.scene, own.prepared)
-        with timed(DARKER):
+        with timed(DARKENING_PASS):
             parts = [
-                replace(part, gaussians=_wetted(part.gaussians, splats, own))
+                replace(part, gaussians=_darken_part(part.gaussians, splats, own))
                 if part.instance_id == 0 and not part.is_overlay
                 else part
                 for part in layers.parts
@@ -143,30 +161,35 @@ class WetEffect(Effect):
         return replace(layers, parts=parts)
 
     def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
-        plane = _plane(own, camera)
-        depth, alpha = drawn.raster.expected_depth, drawn.raster.alpha
+        plane = _find_plane(own, camera)
+        depth = drawn.raster.expected_depth
+        alpha = drawn.raster.alpha
         if plane is None or depth is None or alpha is None:
             return drawn
-        shown = alpha if drawn.raster.overlay is None else alpha - drawn.raster.overlay
+        visible_alpha = alpha if drawn.raster.overlay is None else alpha - drawn.raster.overlay
         for mask in drawn.masks.values():
-            shown = torch.where(mask, 0.0, shown)
-        with timed(SHINE):
-            share, rows = find_ground(camera, depth, shown, own.prepared, backend=own.backend)
+            visible_alpha = torch.where(mask, 0.0, visible_alpha)
+        with timed(REFLECTION_PASS):
+            share, rows = find_ground(
+                camera, depth, visible_alpha, own.prepared, backend=own.backend
+            )
         if rows == (0, 0):
-            why = "no open ground is seen"
-            return replace(drawn, skipped={**drawn.skipped, MIRRORED: why, SHINE: why})
+            reason = "no open ground is seen"
+            return replace(
+                drawn, skipped={**drawn.skipped, MIRROR_PASS: reason, REFLECTION_PASS: reason}
+            )
         rgb = drawn.rgb
         if drawn.layers.photo is not None:
-            with timed(DARKER):
+            with timed(DARKENING_PASS):
                 rgb = _darken_photo(own, drawn, camera, share)
-        with timed(MIRRORED):
-            mirror = _draw_mirror(own, drawn.layers, camera, plane, rows)
-        with timed(SHINE):
+        with timed(MIRROR_PASS):
+            mirror = _render_mirror(own, drawn.layers, camera, plane, rows)
+        with timed(REFLECTION_PASS):
             data = own.data
             rings = rings_of(data.rate_mm_h, data.seed, camera.timestamp_ns)
             film = Film(data.wetness, own.prepared.puddle_level(data.puddles), rings)
             rgb = shade_wet(
-                *(rgb, camera, depth, share, own.prepared, film, mirror), backend=own.backend
+                rgb, camera, depth, share, own.prepared, film, mirror, backend=own.backend
             )
         return replace(drawn, rgb=rgb)
 
@@ -174,79 +197,94 @@ class WetEffect(Effect):
         wet_echoes(echoes, own.prepared, own.data.wetness, own.data.puddles)
 
 
-def _plane(own: Active, camera: Camera) -> Plane | None:
+def _find_plane(wet_effect: Active, camera: Camera) -> Plane | None:
+    """Return the plane of the ground in view, remembered with the camera."""
     return memo_of(camera).get(
-        ("wet plane", own.prepared), lambda: plane_in_view(camera, own.prepared)
+        ("wet plane", wet_effect.prepared), lambda: plane_in_view(camera, wet_effect.prepared)
     )
 
 
 def _mirror_camera(camera: Camera, plane: Plane, rows: tuple[int, int]) -> Camera:
-    """That sees what the ground in some rows of the image mirrors, and what is above it."""
-    view, (first, end) = mirrored_in(camera, plane), rows
-    top = camera.height - end - int(UP_MARGIN * camera.height)
-    bottom = camera.height - first + LOW_MARGIN_PX
+    """Return a camera that sees what the ground in rows of the image mirrors, and more above."""
+    view = mirror_camera(camera, plane)
+    (first_row, end_row) = rows
+    top = camera.height - end_row - int(UPPER_MARGIN_SHARE * camera.height)
+    bottom = camera.height - first_row + LOWER_MARGIN_PX
     return view.cropped(0, top, camera.width, bottom - top)
 
 
-def _draw_mirror(
-    own: Active, layers: LayerRenderer, camera: Camera, plane: Plane, rows: tuple[int, int]
+def _render_mirror(
+    wet_effect: Active, layers: LayerRenderer, camera: Camera, plane: Plane, rows: tuple[int, int]
 ) -> Mirror:
-    view = _mirror_camera(camera, plane, rows).scaled(1 / own.data.mirror_px)
-    splats = wet_splats(own.scene, own.prepared)
+    """Render the mirrored view."""
+    view = _mirror_camera(camera, plane, rows).scaled(1 / wet_effect.data.mirror_px)
+    splats = wet_splats(wet_effect.scene, wet_effect.prepared)
     parts = [
-        replace(part, gaussians=_without_ground(part.gaussians, splats))
+        replace(part, gaussians=_remove_ground(part.gaussians, splats))
         if part.instance_id == 0
         else part
-        for part in layers.unpruned or layers.parts  # pruned for views with the ground in them
+        for part in layers.unpruned
+        or layers.parts  # the pruned parts are for views with the ground in them
         if not part.is_overlay
     ]
-    stop = max(STOP, layers.settings.transmittance_stop)
+    stop = max(MIRROR_TRANSMITTANCE_STOP, layers.settings.transmittance_stop)
     settings = replace(layers.settings, transmittance_stop=stop)
     layers = replace(layers, parts=parts, photo=None, settings=settings)
-    raster = layers.draw(view, plane.above(LOWERED_M), frozenset({RGB, ALPHA, EXPECTED_DEPTH}))
+    raster = layers.draw(view, plane.above(CLIP_DEPTH_M), frozenset({RGB, ALPHA, EXPECTED_DEPTH}))
     assert raster.rgb is not None and raster.alpha is not None
     assert raster.expected_depth is not None
     rgb = layers.add_sky(raster.rgb, raster.alpha, view)
     depth = raster.expected_depth
     if depth.device.type == "cpu":  # torch's threads would wait for more work meanwhile
-        depth.detach().numpy()[raster.alpha.detach().numpy() < SOLID] = 0
+        depth.detach().numpy()[raster.alpha.detach().numpy() < MIN_SURFACE_ALPHA] = 0
     else:
-        depth = torch.where(raster.alpha >= SOLID, depth, 0.0)
-    return Mirror(view, blur_upright(rgb, backend=own.backend), depth)
+        depth = torch.where(raster.alpha >= MIN_SURFACE_ALPHA, depth, 0.0)
+    return Mirror(view, blur_upright(rgb, backend=wet_effect.backend), depth)
 
 
 def _darken_photo(
-    own: Active, drawn: Drawn, camera: Camera, share: Float[Tensor, "H W"]
+    wet_effect: Active, view: Drawn, camera: Camera, share: Float[Tensor, "H W"]
 ) -> Float[Tensor, "H W 3"]:
-    """A recorded picture whose ground is as dark as the splats' is: the part of a pixel's colour
-    that comes through the fog.
+    """Darken the ground of a recorded picture as its splats are darkened.
+
+    Only the part of a pixel's colour that comes through the fog is darkened.
     """
-    photo, fog, rgb = drawn.layers.photo, drawn.layers.fog, drawn.rgb
-    assert photo is not None and drawn.raster.expected_depth is not None
-    clear, seen = rgb, torch.ones_like(share)
+    photo = view.layers.photo
+    fog = view.layers.fog
+    rgb = view.rgb
+    assert photo is not None and view.raster.expected_depth is not None
+    clear_rgb = rgb
+    transmittance = torch.ones_like(share)
     if fog is not None:
-        points = camera.ray_directions(device=rgb.device) * drawn.raster.expected_depth[..., None]
+        points = camera.ray_directions(device=rgb.device) * view.raster.expected_depth[..., None]
         eye_z_m = float(camera.centre[2])
-        seen = torch.exp(
+        transmittance = torch.exp(
             -optical_depth(fog, points.norm(dim=-1), eye_z_m, eye_z_m + points[..., 2])
         )
         airlight = photo.airlight(fog)
-        clear = (rgb - (1 - seen)[..., None] * airlight) / seen.clamp_min(LEAST_SEEN)[..., None]
-    white = white_level(light_of(own.light))
-    ratio = wet_ratio(clear.clamp_min(0), white, own.data.wetness * share)
-    return rgb + seen[..., None] * clear * (ratio - 1)
+        clear_rgb = (rgb - (1 - transmittance)[..., None] * airlight) / transmittance.clamp_min(
+            MIN_PHOTO_TRANSMITTANCE
+        )[..., None]
+    white = white_level(light_of(wet_effect.light))
+    ratio = wet_ratio(clear_rgb.clamp_min(0), white, wet_effect.data.wetness * share)
+    return rgb + transmittance[..., None] * clear_rgb * (ratio - 1)
 
 
-def _wetted(own: Gaussians, splats: WetSplats, active: Active) -> Gaussians:
-    wetness = active.data.wetness
-    white = white_level(light_of(active.light))
-    return memo_of(own).get(
-        ("wetted", wetness, white, splats), lambda: darkened(own, wetness * splats.wet, white)
+def _darken_part(gaussians: Gaussians, splats: WetSplats, wet_effect: Active) -> Gaussians:
+    """Return a part's Gaussians, darkened by water; remembered with them."""
+    wetness = wet_effect.data.wetness
+    white = white_level(light_of(wet_effect.light))
+    return memo_of(gaussians).get(
+        ("wetted", wetness, white, splats),
+        lambda: darken_gaussians(gaussians, wetness * splats.wet, white),
     )
 
 
-def _without_ground(own: Gaussians, splats: WetSplats) -> Gaussians:
-    return memo_of(own).get(
+def _remove_ground(gaussians: Gaussians, splats: WetSplats) -> Gaussians:
+    """Return a part's Gaussians without the ground; remembered with them."""
+    return memo_of(gaussians).get(
         ("without ground", splats),
-        lambda: replace(own, opacities=torch.where(splats.is_ground, 0.0, own.opacities)),
+        lambda: replace(
+            gaussians, opacities=torch.where(splats.is_ground, 0.0, gaussians.opacities)
+        ),
     )

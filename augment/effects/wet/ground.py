@@ -1,8 +1,9 @@
-"""The ground that rain wets: its heights, how open to the sky it is, where water would stand.
+"""Maps the ground that rain wets: its heights, how open to the sky it is, where water would stand.
 
-A map over the world's x and y, made once a scene from the cells that snow can lie on
-(augment.effects.snow.support): both fall from the same sky. What stands over the ground keeps it
-dry, and the shelter's edge is soft.
+Input: a scene's support (augment.effects.snow.support), since rain and snow fall from the same sky.
+Output: `WetGround`, a map over the world's x and y, made once a scene, and `WetSplats`. Callers:
+`wet.effect`, `wet.reflection`, `wet.lidar`. A thing that stands over the ground keeps it dry, and
+the shelter's edge is soft.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from augment.effects.snow.cells import SnowCells
-from augment.effects.snow.layer import field_of, octaves_of
+from augment.effects.snow.layer import draw_octaves, sum_octaves
 from augment.effects.snow.placement import PlacementSettings
 from augment.effects.snow.support import support_of
 from augment.effects.wet.kernels import CHANNELS, HEIGHT, OPEN
@@ -28,12 +29,13 @@ from augment.rng import rng_for
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 
-SETTINGS = PlacementSettings()  # of the cells: those of snow, so that both take one search
-CELL_M = 0.2  # of the map; finer than the ground's water is patchy
+# Settings of the cells. They equal those of snow by default, so that both share one search.
+PLACEMENT_SETTINGS = PlacementSettings()
+CELL_M = 0.2  # side of the map's cells; the ground's water is less finely patched
 
-# How much of a surface a film of water closes over where it is wet through: asphalt and concrete
-# hold one, soil and grass let it seep.
-_FILMS = {
+# Share of a wet surface that a film of water covers: asphalt and concrete hold a film, soil and
+# grass let it seep.
+_FILM_SHARES = {
     SemanticClass.UNKNOWN: 1.0,
     SemanticClass.ROAD: 1.0,
     SemanticClass.LANE_MARKING: 1.0,
@@ -41,79 +43,92 @@ _FILMS = {
     SemanticClass.TERRAIN: 0.25,
     SemanticClass.OTHER: 0.8,
 }
-GROUND = (
+GROUND_CLASSES = (
     SemanticClass.ROAD,
     SemanticClass.LANE_MARKING,
     SemanticClass.SIDEWALK,
     SemanticClass.TERRAIN,
 )
-_UNSURE = (SemanticClass.UNKNOWN, SemanticClass.OTHER)
-_STEP_M = 0.25  # a rise between neighbouring cells that ground does not make
-_NEAR_PATH_M = 6.0
-_SHELTER_SIGMA_M = 0.3  # how far wind drives drops in under an edge
-_SMOOTH_M, _LEVEL_M = 0.4, 1.2  # blurs of heights: for what lies on the ground, and for its tilt
-_HOLLOW_M = 2.6  # wider dips drain
-_DEEPEST_M = 0.03  # water that a hollow of a street holds before it runs over
-_STEEPEST = np.tan(np.radians(15.0))  # no water stands on more
-# Of puddles' noise: (lattice step in metres, standard deviation), and its weight beside hollows,
-# whose centimetres count as much as so many standard deviations.
-_NOISE = ((7.0, 0.8), (2.9, 0.5), (1.2, 0.25), (0.55, 0.1))
-_PER_CM = 0.8
-_NOISE_EVERY = 2  # cells
-NO_PUDDLES = 1e6  # of HOLLOW, that no place has
+_UNSURE_CLASSES = (SemanticClass.UNKNOWN, SemanticClass.OTHER)
+_MAX_GROUND_STEP_M = 0.25  # least step between neighbouring cells that is no ground
+_PATH_RADIUS_M = 6.0  # distance from the path within which its surface is looked for
+_SHELTER_SIGMA_M = 0.3  # distance to which wind drives drops in under an edge
+_HEIGHT_BLUR_M = 0.4  # standard deviation of the blur of heights
+_SLOPE_BLUR_M = 1.2  # the same for the heights that slopes are taken from
+_MAX_HOLLOW_WIDTH_M = 2.6  # largest width of a hollow; wider dips drain
+_MAX_WATER_DEPTH_M = 0.03  # largest depth of water in a street's hollow, before it runs over
+_MAX_PUDDLE_SLOPE = np.tan(np.radians(15.0))  # steepest slope with standing water
+# Octaves of the puddles' noise: (lattice step in metres, standard deviation).
+_PUDDLE_OCTAVES = ((7.0, 0.8), (2.9, 0.5), (1.2, 0.25), (0.55, 0.1))
+_WEIGHT_PER_CM = 0.8  # weight of a hollow's centimetre, in standard deviations of that noise
+_NOISE_STRIDE = 2  # distance between samples of the noise, cells
+NO_PUDDLES = 1e6  # value of HOLLOW that no place has
 
 
 @dataclass(frozen=True, eq=False)
 class WetGround:
-    """The ground about the cameras' path. left_m, bottom_m: the corner. channels [Y, X, CHANNELS],
-    rows towards +y, at the cells' middles:
+    """Ground about the cameras' path.
 
-    HEIGHT: z of the ground, smoothed, world; that of the nearest where there is none. OPEN: 0 to 1,
-    how far rain reaches it, times the film that its surface holds; 0 where it is no ground. RISE_X,
-    RISE_Y: its slope. HOLLOW: how soon water stands there, see `puddle_level`. TRACK: 0 to 1, how
-    much of a wheel track it is. tops_m, exposed [Y, X]: highest surface that can be wet, ground or
-    roof, NaN where there is none, and how open that is to the rain.
+    `channels` has rows towards +y, and values at the cells' middles:
+
+    - HEIGHT: z of the ground, smoothed, world; z of the nearest ground where there is none.
+    - OPEN: 0 to 1, how far rain reaches it, times the film that its surface holds; 0 = no ground.
+    - SLOPE_X, SLOPE_Y: slope of the ground.
+    - HOLLOW: order in which puddles form; water stands first where it is highest.
+    - TRACK: 0 to 1, how much of a wheel track it is.
     """
 
-    left_m: float
-    bottom_m: float
+    left_m: float  # least x of the map
+    bottom_m: float  # least y of the map
     channels: Float[Tensor, "Y X C"]
+    # Height of the highest surface that can be wet, ground or roof; NaN where there is none.
     tops_m: Float[Tensor, "Y X"]
+    # How open that surface is to the rain, 0 to 1.
     exposed: Float[Tensor, "Y X"]
+    # Values of HOLLOW on open ground, in rising order.
     ordered_hollows: np.ndarray
 
     @property
     def is_empty(self) -> bool:
+        """True if no ground is open to the sky."""
         return not bool((self.channels[..., OPEN] > 0).any())
 
     def at(self, x_m: Tensor, y_m: Tensor) -> Float[Tensor, "*B C"]:
-        """The channels between the cells' middles; beyond the map its border's, and not open."""
+        """Return the channels between the cells' middles.
+
+        Beyond the map they are those of its border, but not open.
+        """
         rows, columns = self.channels.shape[:2]
-        x, y = (x_m - self.left_m) / CELL_M - 0.5, (y_m - self.bottom_m) / CELL_M - 0.5
-        inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
-        x, y = x.clamp(0, columns - 1), y.clamp(0, rows - 1)
-        i, j = x.long().clamp_max(max(columns - 2, 0)), y.long().clamp_max(max(rows - 2, 0))
-        u, v = (x - i)[..., None].float(), (y - j)[..., None].float()
-        i1, j1 = (i + 1).clamp_max(columns - 1), (j + 1).clamp_max(rows - 1)
+        x = (x_m - self.left_m) / CELL_M - 0.5
+        y = (y_m - self.bottom_m) / CELL_M - 0.5
+        is_inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
+        x = x.clamp(0, columns - 1)
+        y = y.clamp(0, rows - 1)
+        i = x.long().clamp_max(max(columns - 2, 0))
+        j = y.long().clamp_max(max(rows - 2, 0))
+        u = (x - i)[..., None].float()
+        v = (y - j)[..., None].float()
+        i1 = (i + 1).clamp_max(columns - 1)
+        j1 = (j + 1).clamp_max(rows - 1)
         flat = self.channels.reshape(-1, CHANNELS)
         below = flat[j * columns + i] * (1 - u) + flat[j * columns + i1] * u
         above = flat[j1 * columns + i] * (1 - u) + flat[j1 * columns + i1] * u
-        out = below * (1 - v) + above * v
-        out[..., OPEN] *= inside
-        return out
+        values = below * (1 - v) + above * v
+        values[..., OPEN] *= is_inside
+        return values
 
     def nearest(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """The channels of the cells about points, as `at` beyond the map."""
+        """Return the channels of the cells about points; beyond the map, see `at`."""
         rows, columns = self.channels.shape[:2]
         i = np.floor((x_m - self.left_m) / CELL_M).astype(np.int64)
         j = np.floor((y_m - self.bottom_m) / CELL_M).astype(np.int64)
-        inside = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
-        out = self.channels.numpy()[np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)]
-        out[..., OPEN] *= inside
-        return out
+        is_inside = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
+        values = self.channels.numpy()[np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)]
+        values[..., OPEN] *= is_inside
+        return values
 
     def puddle_level(self, share: float) -> float:
-        """The HOLLOW beyond which water stands where `share` of the open ground has puddles."""
+        """Return the HOLLOW above which water stands if `share` of the open ground has puddles."""
         ordered = self.ordered_hollows
         if share <= 0 or not len(ordered):
             return NO_PUDDLES
@@ -121,48 +136,59 @@ class WetGround:
 
 
 def wet_ground(scene: Scene, seed: int, *, backend: str = "auto") -> WetGround:
-    """The ground of a scene; seed: of the noise that puddles follow.
+    """Return the ground of a scene; seed: seed of the noise that puddles follow.
 
     Raises:
         SceneError: metres or gravity are not known.
     """
-    cells = support_of(scene, SETTINGS, backend=backend).ground
+    cells = support_of(scene, PLACEMENT_SETTINGS, backend=backend).ground
     key = ("wet ground", seed)
-    path = [frame.world_from_ego[:3, 3].numpy() for frame in scene.frames]
-    path += [c.centre.numpy() for f in scene.frames for c in f.cameras.values()]
-    return memo_of(scene).get(key, lambda: _make(cells, np.array(path).reshape(-1, 3), seed))
+    places = [frame.world_from_ego[:3, 3].numpy() for frame in scene.frames]
+    places += [camera.centre.numpy() for f in scene.frames for camera in f.cameras.values()]
+    return memo_of(scene).get(
+        key, lambda: _make_ground(cells, np.array(places).reshape(-1, 3), seed)
+    )
 
 
-def _make(cells: SnowCells, path: np.ndarray, seed: int) -> WetGround:
+def _make_ground(cells: SnowCells, path: np.ndarray, seed: int) -> WetGround:
+    """Make the map from the scene's cells."""
     classes = cells.semantic.numpy()
-    kept = classes != SemanticClass.VEGETATION
-    if not kept.any():
-        nothing = torch.zeros(2, 2)
+    is_kept = classes != SemanticClass.VEGETATION
+    if not is_kept.any():
+        empty_map = torch.zeros(2, 2)
         channels = torch.zeros(2, 2, CHANNELS)
-        return WetGround(0.0, 0.0, channels, nothing / 0, nothing, np.zeros(0, np.float32))
-    centres, sizes = cells.centers_m.double().numpy()[kept], cells.sizes_m.double().numpy()[kept]
-    classes, tracks = classes[kept], cells.tracks.numpy()[kept]
-    low = np.floor((centres[:, :2] - sizes[:, None] / 2).min(0) / CELL_M) - 2
-    high = np.ceil((centres[:, :2] + sizes[:, None] / 2).max(0) / CELL_M) + 2
-    columns, rows = (high - low).astype(np.int64)
-    paint = _Painter(low, int(columns), int(rows), centres[:, :2], sizes)
-    tops = paint.mean(centres[:, 2])
-    films = np.array([_FILMS.get(SemanticClass(c), 0.0) for c in range(len(SemanticClass))])
-    film = np.nan_to_num(paint.mean(films[classes]))
-    unsure = np.nan_to_num(paint.mean(np.isin(classes, _UNSURE).astype(np.float64))) > 0.5
-    known = np.nan_to_num(paint.mean(np.isin(classes, GROUND).astype(np.float64))) > 0.5
-    ground = known | (unsure & _about_path(tops, path, low))
-    track = np.where(ground, np.nan_to_num(paint.mean(tracks.astype(np.float64))), 0)
-    exposed = _softened(np.isfinite(tops))
-    open_ = _softened(ground) * np.where(ground, film, 0)
-    open_ = _blur(open_, _SHELTER_SIGMA_M / 2)
-    heights = _smooth(tops, ground, _SMOOTH_M)
-    level = _smooth(tops, ground, _LEVEL_M)
+        return WetGround(0.0, 0.0, channels, empty_map / 0, empty_map, np.zeros(0, np.float32))
+    centres = cells.centers_m.double().numpy()[is_kept]
+    sizes = cells.sizes_m.double().numpy()[is_kept]
+    classes = classes[is_kept]
+    tracks = cells.tracks.numpy()[is_kept]
+    low_cell = np.floor((centres[:, :2] - sizes[:, None] / 2).min(0) / CELL_M) - 2
+    high_cell = np.ceil((centres[:, :2] + sizes[:, None] / 2).max(0) / CELL_M) + 2
+    columns, rows = (high_cell - low_cell).astype(np.int64)
+    painter = _Painter(low_cell, int(columns), int(rows), centres[:, :2], sizes)
+    tops = painter.mean(centres[:, 2])
+    films = np.array([_FILM_SHARES.get(SemanticClass(c), 0.0) for c in range(len(SemanticClass))])
+    film = np.nan_to_num(painter.mean(films[classes]))
+    is_unsure = (
+        np.nan_to_num(painter.mean(np.isin(classes, _UNSURE_CLASSES).astype(np.float64))) > 0.5
+    )
+    is_known = (
+        np.nan_to_num(painter.mean(np.isin(classes, GROUND_CLASSES).astype(np.float64))) > 0.5
+    )
+    is_ground = is_known | (is_unsure & _is_ground_by_path(tops, path, low_cell))
+    track = np.where(is_ground, np.nan_to_num(painter.mean(tracks.astype(np.float64))), 0)
+    exposed = _soften_mask(np.isfinite(tops))
+    openness = _soften_mask(is_ground) * np.where(is_ground, film, 0)
+    openness = _blur(openness, _SHELTER_SIGMA_M / 2)
+    heights = _smooth_heights(tops, is_ground, _HEIGHT_BLUR_M)
+    level = _smooth_heights(tops, is_ground, _SLOPE_BLUR_M)
     rise_y, rise_x = np.gradient(level, CELL_M)
-    hollows = _hollows(heights, np.hypot(rise_x, rise_y), ground, track, low, seed)
-    channels = np.stack([heights, open_, rise_x, rise_y, hollows, _blur(track, 0.15)], -1)
-    ordered = np.sort(hollows[open_ > 0.5]).astype(np.float32)
-    left_m, bottom_m = (low * CELL_M).tolist()
+    puddle_order = _puddle_order(
+        heights, np.hypot(rise_x, rise_y), is_ground, track, low_cell, seed
+    )
+    channels = np.stack([heights, openness, rise_x, rise_y, puddle_order, _blur(track, 0.15)], -1)
+    ordered = np.sort(puddle_order[openness > 0.5]).astype(np.float32)
+    left_m, bottom_m = (low_cell * CELL_M).tolist()
     return WetGround(
         left_m,
         bottom_m,
@@ -174,146 +200,168 @@ def _make(cells: SnowCells, path: np.ndarray, seed: int) -> WetGround:
 
 
 class _Painter:
-    """Cells of many sizes onto the map's, each over all that its square covers."""
+    """Painter of cells of many sizes on the map's cells, each over all that its square covers."""
 
     def __init__(
         self, low: np.ndarray, columns: int, rows: int, xy: np.ndarray, sizes: np.ndarray
     ) -> None:
         self._shape = rows, columns
-        place, source = [], []
+        map_ids = []
+        cell_ids = []
         for size in np.unique(sizes):
             index = np.flatnonzero(sizes == size)
-            across = max(1, round(float(size) / CELL_M))
-            steps = (np.arange(across) + 0.5) * (size / across) - size / 2
+            num_steps = max(1, round(float(size) / CELL_M))
+            steps = (np.arange(num_steps) + 0.5) * (size / num_steps) - size / 2
             for dx in steps:
                 for dy in steps:
-                    at = np.floor((xy[index] + (dx, dy)) / CELL_M - low).astype(np.int64)
-                    place.append(at[:, 1] * columns + at[:, 0])
-                    source.append(index)
-        self._place, self._source = np.concatenate(place), np.concatenate(source)
-        self._count = np.bincount(self._place, minlength=rows * columns)
+                    columns_rows = np.floor((xy[index] + (dx, dy)) / CELL_M - low).astype(np.int64)
+                    map_ids.append(columns_rows[:, 1] * columns + columns_rows[:, 0])
+                    cell_ids.append(index)
+        self._map_ids = np.concatenate(map_ids)
+        self._cell_ids = np.concatenate(cell_ids)
+        self._count = np.bincount(self._map_ids, minlength=rows * columns)
 
     def mean(self, values: np.ndarray) -> np.ndarray:
-        """[Y, X]; NaN where no cell lies."""
-        sums = np.bincount(self._place, values[self._source], len(self._count))
+        """Return the mean of the cells' values in each cell of the map, [Y, X]; NaN without any."""
+        sums = np.bincount(self._map_ids, values[self._cell_ids], len(self._count))
         with np.errstate(invalid="ignore", divide="ignore"):
             return (sums / self._count).reshape(self._shape)
 
 
-def _about_path(tops: np.ndarray, path: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """Where surfaces without a class are ground: they go on without a step from the path."""
-    there = np.isfinite(tops)
-    filled = np.where(there, tops, 0).astype(np.float32)
+def _is_ground_by_path(tops: np.ndarray, path: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """Tell where surfaces without a class are ground: they go on without a step from the path."""
+    is_surface = np.isfinite(tops)
+    heights = np.where(is_surface, tops, 0).astype(np.float32)
     kernel = np.ones((3, 3), np.uint8)
-    most = cv2.dilate(np.where(there, filled, -np.float32(1e6)), kernel)
-    least = cv2.erode(np.where(there, filled, np.float32(1e6)), kernel)
+    highest = cv2.dilate(np.where(is_surface, heights, -np.float32(1e6)), kernel)
+    lowest = cv2.erode(np.where(is_surface, heights, np.float32(1e6)), kernel)
     labels = np.zeros(tops.shape, np.int32)
-    ndimage.label(there & (most - least < _STEP_M), output=labels)
+    ndimage.label(is_surface & (highest - lowest < _MAX_GROUND_STEP_M), output=labels)
     places = np.floor(path[:, :2] / CELL_M - low).astype(np.int64)
-    near = np.zeros(tops.shape, np.uint8)
-    inside = ((places >= 0) & (places < np.array(tops.shape[::-1]))).all(1)
-    near[places[inside, 1], places[inside, 0]] = 1
-    reach = 2 * round(_NEAR_PATH_M / CELL_M) + 1
-    near = cv2.dilate(near, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))) > 0
-    counts = np.bincount(labels[near & (labels > 0)], minlength=1)
-    found = (labels == counts.argmax()) & (labels > 0) if counts.any() else np.zeros_like(there)
-    return cv2.dilate(found.astype(np.uint8), kernel).astype(bool) & there
+    near_path = np.zeros(tops.shape, np.uint8)
+    is_inside = ((places >= 0) & (places < np.array(tops.shape[::-1]))).all(1)
+    near_path[places[is_inside, 1], places[is_inside, 0]] = 1
+    reach = 2 * round(_PATH_RADIUS_M / CELL_M) + 1
+    near_path = (
+        cv2.dilate(near_path, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))) > 0
+    )
+    counts = np.bincount(labels[near_path & (labels > 0)], minlength=1)
+    is_ground = (
+        (labels == counts.argmax()) & (labels > 0) if counts.any() else np.zeros_like(is_surface)
+    )
+    return cv2.dilate(is_ground.astype(np.uint8), kernel).astype(bool) & is_surface
 
 
-def _softened(mask: np.ndarray) -> np.ndarray:
-    """1 inside, falling to 0 at the edge."""
+def _soften_mask(mask: np.ndarray) -> np.ndarray:
+    """Blur a mask: 1 inside, falling to 0 at the edge."""
     return np.clip(2 * _blur(mask.astype(np.float64), _SHELTER_SIGMA_M) - 0.9, 0, 1)
 
 
 def _blur(values: np.ndarray, sigma_m: float) -> np.ndarray:
+    """Blur values of the map."""
     sigma = sigma_m / CELL_M
     return cv2.GaussianBlur(
         values.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE
     ).astype(np.float64)
 
 
-def _smooth(tops: np.ndarray, ground: np.ndarray, sigma_m: float) -> np.ndarray:
-    """Heights of the ground, blurred over ground alone; the nearest beyond it."""
-    middle = float(np.median(tops[ground])) if ground.any() else 0.0  # keeps float32's digits
-    weight = _blur(ground.astype(np.float64), sigma_m)
-    sums = _blur(np.where(ground, np.nan_to_num(tops) - middle, 0), sigma_m)
-    known = weight > 0.02
-    if not known.any():
+def _smooth_heights(tops: np.ndarray, is_ground: np.ndarray, sigma_m: float) -> np.ndarray:
+    """Return heights of the ground, blurred over ground alone; the nearest beyond it."""
+    # Heights relative to their median keep float32's digits.
+    median_height = float(np.median(tops[is_ground])) if is_ground.any() else 0.0
+    weight = _blur(is_ground.astype(np.float64), sigma_m)
+    sums = _blur(np.where(is_ground, np.nan_to_num(tops) - median_height, 0), sigma_m)
+    is_known = weight > 0.02
+    if not is_known.any():
         return np.zeros(tops.shape)
-    out = np.where(known, sums / np.maximum(weight, 0.02), 0) + middle
+    out = np.where(is_known, sums / np.maximum(weight, 0.02), 0) + median_height
     nearest: Any = ndimage.distance_transform_edt(
-        ~known, return_distances=False, return_indices=True
+        ~is_known, return_distances=False, return_indices=True
     )
     return out[tuple(nearest)]
 
 
-def _hollows(
+def _puddle_order(
     heights: np.ndarray,
     slope: np.ndarray,
-    ground: np.ndarray,
+    is_ground: np.ndarray,
     track: np.ndarray,
     low: np.ndarray,
     seed: int,
 ) -> np.ndarray:
-    """How soon water stands: a hollow's depth, which a closing of the heights fills, ruts, and
-    noise of the place; less on slopes.
+    """Return the order in which puddles form, [Y, X]; water stands first where it is highest.
+
+    It adds up the depth of a hollow, which a closing of the heights fills, ruts, and noise. It is
+    less on slopes.
     """
-    wide = 2 * round(_HOLLOW_M / CELL_M / 2) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
-    base = heights.astype(np.float32)
-    filled = cv2.morphologyEx(base, cv2.MORPH_CLOSE, disc)
-    depth_cm = _blur(np.clip(filled - base, 0, _DEEPEST_M) * 100, 0.2)
+    width = 2 * round(_MAX_HOLLOW_WIDTH_M / CELL_M / 2) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+    heights_m = heights.astype(np.float32)
+    closed = cv2.morphologyEx(heights_m, cv2.MORPH_CLOSE, disc)
+    depth_cm = _blur(np.clip(closed - heights_m, 0, _MAX_WATER_DEPTH_M) * 100, 0.2)
     rng = rng_for(seed=seed, scene="", effect="puddles")
-    rows, columns = (-(-n // _NOISE_EVERY) + 1 for n in heights.shape)
-    x = (low[0] + (np.arange(columns) + 0.5) * _NOISE_EVERY) * CELL_M
-    y = (low[1] + (np.arange(rows) + 0.5) * _NOISE_EVERY) * CELL_M
+    rows, columns = (-(-n // _NOISE_STRIDE) + 1 for n in heights.shape)
+    x = (low[0] + (np.arange(columns) + 0.5) * _NOISE_STRIDE) * CELL_M
+    y = (low[1] + (np.arange(rows) + 0.5) * _NOISE_STRIDE) * CELL_M
     grid_x, grid_y = np.meshgrid(x, y)
-    noise = field_of(octaves_of(_NOISE, rng), grid_x.ravel(), grid_y.ravel()).reshape(rows, columns)
-    size = (columns * _NOISE_EVERY, rows * _NOISE_EVERY)
+    noise = sum_octaves(draw_octaves(_PUDDLE_OCTAVES, rng), grid_x.ravel(), grid_y.ravel()).reshape(
+        rows, columns
+    )
+    size = (columns * _NOISE_STRIDE, rows * _NOISE_STRIDE)
     noise = cv2.resize(noise, size, interpolation=cv2.INTER_CUBIC)
     noise = noise[: heights.shape[0], : heights.shape[1]]
-    out = _PER_CM * depth_cm + noise + 0.3 * track
-    return out - 4 * np.clip(slope / _STEEPEST, 0, 2) - 6.0 * (_blur(ground, 0.2) < 0.5)
+    order = _WEIGHT_PER_CM * depth_cm + noise + 0.3 * track
+    return (
+        order - 4 * np.clip(slope / _MAX_PUDDLE_SLOPE, 0, 2) - 6.0 * (_blur(is_ground, 0.2) < 0.5)
+    )
 
 
-# ---- Which splats are wetted ---------------------------------------------------------------------
+# ---- Splats that rain wets -----------------------------------------------------------------------
 
-_ON_SURFACE_M = 0.15  # splats as far off a cell's surface are it
-_UPRIGHT = 0.8  # cosine of the tilt of a splat that may be a roof
-_MIN_ROOF = (SemanticClass.BUILDING, SemanticClass.BARRIER)
+_SURFACE_DISTANCE_M = 0.15  # distance from a cell's surface up to which a splat belongs to it
+_MIN_ROOF_COSINE = 0.8  # least cosine of the tilt of a splat that may be a roof
+_ROOF_CLASSES = (SemanticClass.BUILDING, SemanticClass.BARRIER)  # classes that may be roofs
 
 
 @dataclass(frozen=True, eq=False)
 class WetSplats:
-    """Of N background Gaussians. wet [N]: 0 to 1, how far rain reaches them. is_ground [N]: which
-    are the ground's, wet or dry.
-    """
+    """Wetness of N background Gaussians."""
 
-    wet: Float[Tensor, "N"]
-    is_ground: Tensor
+    wet: Float[Tensor, "N"]  # how far rain reaches them, 0 to 1
+    is_ground: Tensor  # bool [N], Gaussians of the ground, wet or dry
 
 
 def wet_splats(scene: Scene, ground: WetGround) -> WetSplats:
-    """The background's splats that lie on open ground or roofs."""
+    """Find the background's splats that lie on open ground or roofs."""
     return memo_of(ground).get(("wet splats",), lambda: _find_splats(scene.background, ground))
 
 
-def _find_splats(own: Gaussians, ground: WetGround) -> WetSplats:
-    classes = np.zeros(len(own), np.int16) if own.semantic is None else own.semantic.numpy()
-    x, y, z = own.means.double().numpy().T.reshape(3, -1)
+def _find_splats(gaussians: Gaussians, ground: WetGround) -> WetSplats:
+    """Find the wet splats by their height over the map and their class."""
+    classes = (
+        np.zeros(len(gaussians), np.int16)
+        if gaussians.semantic is None
+        else gaussians.semantic.numpy()
+    )
+    x, y, z = gaussians.means.double().numpy().T.reshape(3, -1)
     channels = ground.at(torch.from_numpy(x), torch.from_numpy(y)).numpy()
-    near = np.abs(z - channels[:, HEIGHT]) < 2 * _ON_SURFACE_M
-    is_ground = np.isin(classes, GROUND) | (np.isin(classes, _UNSURE) & near)
+    is_near = np.abs(z - channels[:, HEIGHT]) < 2 * _SURFACE_DISTANCE_M
+    is_ground = np.isin(classes, GROUND_CLASSES) | (np.isin(classes, _UNSURE_CLASSES) & is_near)
     i = np.floor((x - ground.left_m) / CELL_M).astype(np.int64)
     j = np.floor((y - ground.bottom_m) / CELL_M).astype(np.int64)
     rows, columns = ground.tops_m.shape
-    inside = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
-    i, j = np.clip(i, 0, columns - 1), np.clip(j, 0, rows - 1)
-    off = np.abs(z - ground.tops_m.numpy()[j, i])
-    on = np.clip(2 - off / _ON_SURFACE_M, 0, 1) * inside
-    on = np.nan_to_num(on) * ground.exposed.numpy()[j, i]
-    thinnest = own.scales.argmin(1)
-    up = rotmat_from_quat(own.quats)[:, 2][torch.arange(len(own)), thinnest].abs().numpy()
-    can_be = is_ground | (np.isin(classes, _MIN_ROOF) & (up > _UPRIGHT))
-    wet = np.where(can_be, on, 0).astype(np.float32)
-    return WetSplats(torch.from_numpy(wet), torch.from_numpy(is_ground & near))
+    is_inside = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
+    i = np.clip(i, 0, columns - 1)
+    j = np.clip(j, 0, rows - 1)
+    surface_distance = np.abs(z - ground.tops_m.numpy()[j, i])
+    wetness = np.clip(2 - surface_distance / _SURFACE_DISTANCE_M, 0, 1) * is_inside
+    wetness = np.nan_to_num(wetness) * ground.exposed.numpy()[j, i]
+    thinnest = gaussians.scales.argmin(1)
+    thin_axis_z = (
+        rotmat_from_quat(gaussians.quats)[:, 2][torch.arange(len(gaussians)), thinnest]
+        .abs()
+        .numpy()
+    )
+    can_be_wet = is_ground | (np.isin(classes, _ROOF_CLASSES) & (thin_axis_z > _MIN_ROOF_COSINE))
+    wet = np.where(can_be_wet, wetness, 0).astype(np.float32)
+    return WetSplats(torch.from_numpy(wet), torch.from_numpy(is_ground & is_near))

@@ -1,5 +1,6 @@
-"""Kernels of wet ground: which pixels show it, and what its film mirrors. `reflection` and
-`ripples` define what they compute, and launch them.
+"""Numba kernels of wet ground: which pixels show it, and what its film mirrors.
+
+`reflection` and `ripples` define what they compute, and launch them.
 """
 
 from __future__ import annotations
@@ -17,76 +18,93 @@ from augment.render.cpu.simd import LOG2_E, exp2_fine, log2
 from augment.render.layout import LANES, U
 from augment.rng import STEP_X, STEP_Y
 
-# Channels of the ground's map.
-HEIGHT, OPEN, RISE_X, RISE_Y, HOLLOW, TRACK, CHANNELS = range(7)
+# Channels of the ground's map, see ground.WetGround; CHANNELS is their number.
+HEIGHT, OPEN, SLOPE_X, SLOPE_Y, HOLLOW, WHEEL_TRACK, CHANNELS = range(7)
 
 # ---- Rings of drops ------------------------------------------------------------------------------
 
-SQUARE_M = 0.12  # a ring ends before it is as wide
-MAX_DROPS = 2  # in a square at a time
-AT = 9 * MAX_DROPS  # rows of drops that may reach a square; one more names it
-LIFE_NS = 400_000_000
-SPEED_MPS = 0.23  # least of capillary-gravity waves on water, whose length is 1.7 cm
-WAVE_M, WIDTH_M, SLOPE = 0.022, 0.016, 0.1
-ENDS = 3.0  # widths beyond which a ring is none
-LEAST_FALL = 1e-7  # of a ray that meets a plane, at unit depth
-LEAST_SINE = 0.02  # of the angle at which a pixel's footprint is judged
-FADED_PX, FULL_PX = 2.0, 4.0  # waves of so many pixels are gone, and full
-_X, _Y = np.uint64(STEP_X), np.uint64(STEP_Y)
-_S24, _S44 = np.uint64(24), np.uint64(44)
-_LOW20, _LIFE, _UNIT = np.uint64(0xFFFFF), np.uint64(LIFE_NS), 2.0**-20
+SQUARE_M = 0.12  # side of the squares; a ring ends before it is as wide
+MAX_DROPS = 2  # largest number of drops in a square at a time
+# Largest number of drops that may reach a square; the row after them names it.
+MAX_NEARBY_DROPS = 9 * MAX_DROPS
+LIFE_NS = 400_000_000  # life of a ring
+SPEED_MPS = 0.23  # least speed of capillary-gravity waves on water, at a length of 1.7 cm
+RING_WAVE_M = 0.022  # length of a ring's waves
+RING_WIDTH_M = 0.016  # width of a ring
+RING_SLOPE = 0.1  # largest slope of a ring
+RING_END_WIDTHS = 3.0  # number of widths from its crest at which a ring ends
+MIN_FALL = 1e-7  # least fall of a ray that meets a plane, at unit depth
+MIN_FOOTPRINT_SINE = 0.02  # least sine of the angle between ray and ground, for a pixel's footprint
+FADED_PX = 2.0  # length of waves, in pixels, below which they do not show
+FULL_PX = 4.0  # length of waves, in pixels, from which on they show fully
+_COLUMN_STEP = np.uint64(STEP_X)  # step of the hash per column
+_ROW_STEP = np.uint64(STEP_Y)  # step of the hash per row
+_SHIFT_24 = np.uint64(24)
+_SHIFT_44 = np.uint64(44)
+_LOW_20_BITS = np.uint64(0xFFFFF)  # mask of the low 20 bits
+_LIFE_NS_UINT = np.uint64(LIFE_NS)
+_UNIT = 2.0**-20  # size of one step of those bits
 
 
 @inner()
 def _find_drops(column, row, rings, seed, timestamp_ns, drops):
     """Enter the rings that may reach a square: how many, and x, y, radius and slope of each."""
     reach = SPEED_MPS * LIFE_NS * 1e-9
-    found = 0
+    num_found = 0
     for di in range(-1, 2):
         for dj in range(-1, 2):
-            i, j = column + di, row + dj
-            place = np.uint64(np.int64(i)) * _X + np.uint64(np.int64(j)) * _Y
+            i = column + di
+            j = row + dj
+            place_bits = np.uint64(np.int64(i)) * _COLUMN_STEP + np.uint64(np.int64(j)) * _ROW_STEP
             for drop in range(MAX_DROPS):
-                first = mix(place + seed + np.uint64(drop))
-                passed = timestamp_ns + np.int64((first >> _S24) % _LIFE)
-                again, age = passed // LIFE_NS, (passed % LIFE_NS) / LIFE_NS
-                bits = mix(first ^ (np.uint64(again) * _X))
-                if np.float64(np.int64(bits & _LOW20)) * _UNIT < rings[0]:
-                    u = np.float64(np.int64(bits >> _S44)) * _UNIT
-                    v = np.float64(np.int64((bits >> _S24) & _LOW20)) * _UNIT
-                    drops[found, 0], drops[found, 1] = (i + u) * SQUARE_M, (j + v) * SQUARE_M
-                    drops[found, 2] = reach * age
-                    drops[found, 3] = SLOPE * (1.0 - age) * (1.0 - age)
-                    found += 1
-    drops[AT, 0], drops[AT, 1], drops[AT, 2] = column, row, found
+                drop_bits = mix(place_bits + seed + np.uint64(drop))
+                elapsed_ns = timestamp_ns + np.int64((drop_bits >> _SHIFT_24) % _LIFE_NS_UINT)
+                num_falls = elapsed_ns // LIFE_NS
+                age = (elapsed_ns % LIFE_NS) / LIFE_NS
+                bits = mix(drop_bits ^ (np.uint64(num_falls) * _COLUMN_STEP))
+                if np.float64(np.int64(bits & _LOW_20_BITS)) * _UNIT < rings[0]:
+                    u = np.float64(np.int64(bits >> _SHIFT_44)) * _UNIT
+                    v = np.float64(np.int64((bits >> _SHIFT_24) & _LOW_20_BITS)) * _UNIT
+                    drops[num_found, 0] = (i + u) * SQUARE_M
+                    drops[num_found, 1] = (j + v) * SQUARE_M
+                    drops[num_found, 2] = reach * age
+                    drops[num_found, 3] = RING_SLOPE * (1.0 - age) * (1.0 - age)
+                    num_found += 1
+    drops[MAX_NEARBY_DROPS, 0] = column
+    drops[MAX_NEARBY_DROPS, 1] = row
+    drops[MAX_NEARBY_DROPS, 2] = num_found
 
 
 @inner()
 def rings_at(x, y, footprint, rings, seed, timestamp_ns, drops):
-    """(slope x, slope y, variance of the rest). rings: share, variance, unseen. drops [AT + 1, 4]:
-    those about the square of the last point, which its last row names.
+    """Return the rings' slopes towards x and y at a point, and the variance of the rest.
+
+    rings: share, variance, unseen. drops [MAX_NEARBY_DROPS + 1, 4]: rings about the square of the
+    last point, which the last row names.
     """
-    shown = (WAVE_M / max(footprint, 1e-9) - FADED_PX) / (FULL_PX - FADED_PX)
-    shown = min(max(shown, 0.0), 1.0)
-    shown = shown * shown * (3.0 - 2.0 * shown)
-    variance = rings[1] + (rings[2] - rings[1]) * shown * shown
+    visible_share = (RING_WAVE_M / max(footprint, 1e-9) - FADED_PX) / (FULL_PX - FADED_PX)
+    visible_share = min(max(visible_share, 0.0), 1.0)
+    visible_share = visible_share * visible_share * (3.0 - 2.0 * visible_share)
+    variance = rings[1] + (rings[2] - rings[1]) * visible_share * visible_share
     sx = sy = 0.0
-    if shown <= 0.0 or rings[0] <= 0.0:
+    if visible_share <= 0.0 or rings[0] <= 0.0:
         return sx, sy, variance
-    column, row = math.floor(x / SQUARE_M), math.floor(y / SQUARE_M)
-    if not (drops[AT, 0] == column and drops[AT, 1] == row):
+    column = math.floor(x / SQUARE_M)
+    row = math.floor(y / SQUARE_M)
+    if not (drops[MAX_NEARBY_DROPS, 0] == column and drops[MAX_NEARBY_DROPS, 1] == row):
         _find_drops(column, row, rings, seed, timestamp_ns, drops)
-    for k in range(np.int64(drops[AT, 2])):
-        dx, dy = x - drops[k, 0], y - drops[k, 1]
+    for k in range(np.int64(drops[MAX_NEARBY_DROPS, 2])):
+        dx = x - drops[k, 0]
+        dy = y - drops[k, 1]
         d = max(math.sqrt(dx * dx + dy * dy), 1e-4)
-        off = (d - drops[k, 2]) / WIDTH_M
-        if abs(off) > ENDS:
+        crest_distance = (d - drops[k, 2]) / RING_WIDTH_M
+        if abs(crest_distance) > RING_END_WIDTHS:
             continue
-        s = drops[k, 3] * math.exp(-off * off)
-        s *= math.sin((2.0 * math.pi * WIDTH_M / WAVE_M) * off) / d
+        s = drops[k, 3] * math.exp(-crest_distance * crest_distance)
+        s *= math.sin((2.0 * math.pi * RING_WIDTH_M / RING_WAVE_M) * crest_distance) / d
         sx += s * dx
         sy += s * dy
-    return sx * shown, sy * shown, variance
+    return sx * visible_share, sy * visible_share, variance
 
 
 # ---- Eight pixels at a time ----------------------------------------------------------------------
@@ -94,93 +112,103 @@ def rings_at(x, y, footprint, rings, seed, timestamp_ns, drops):
 
 @inner()
 def _splat(number):
+    """Return eight copies of a number."""
     return v8.splat(np.float32(number))
 
 
 @inner()
 def _clamp(value, low, high):
-    """low where it is NaN."""
+    """Clamp values; the result is low where they are NaN."""
     return v8.minimum(v8.maximum(value, _splat(low)), _splat(high))
 
 
 @inner()
-def _line(value, slope, offset):
+def _linear(value, slope, offset):
+    """Return value * slope + offset."""
     return v8.fmuladd(value, _splat(slope), _splat(offset))
 
 
 @inner()
 def _smoothstep(t):
-    """From 0 at t = 0 to 1 at 1."""
+    """Smooth step from 0 at t = 0 to 1 at t = 1."""
     t = _clamp(t, 0.0, 1.0)
-    return t * t * _line(t, -2.0, 3.0)
+    return t * t * _linear(t, -2.0, 3.0)
 
 
 @inner()
 def _dot(x, y, z, a, b, c):
+    """Return the dot product of (x, y, z) and (a, b, c)."""
     return v8.fmuladd(x, a, v8.fmuladd(y, b, z * c))
 
 
 @inner()
-def _turn(row, x, y, z):
-    """A row of a matrix times vectors."""
+def _rotate(row, x, y, z):
+    """Return a row of a matrix times vectors."""
     return _dot(x, y, z, v8.splat(row[0]), v8.splat(row[1]), v8.splat(row[2]))
 
 
 @inner()
-def _across(first, lens):
-    """x at unit depth of the pixels from column `first` on. lens: 1 / fx, 1 / fy, cx, cy."""
+def _ray_x(first, lens):
+    """Return x at unit depth of the pixels from column `first` on; lens: 1 / fx, 1 / fy, cx, cy."""
     middle = v8.splat(np.float32(first) + np.float32(0.5) - lens[2])
     return (middle + v8.lane_numbers()) * v8.splat(lens[0])
 
 
 @inner()
 def _any(mask):
+    """Tell if any lane of a mask is set."""
     return v8.mask_bits(mask) != U(0)
 
 
 @inner()
-def _store_places(places, spare, u, v, i, j):
-    """Texels of float coordinates, column and row, and shares of the way to the next ones."""
-    v8.store_whole(places, U(0), i)
-    v8.store_whole(places, U(LANES), j)
+def _store_texels(texels, spare, u, v, i, j):
+    """Store texels of float coordinates (column, row), and shares of the way to the next texels."""
+    v8.store_whole(texels, U(0), i)
+    v8.store_whole(texels, U(LANES), j)
     v8.store(spare, U(0), u - i)
     v8.store(spare, U(LANES), v - j)
 
 
-# ---- Which pixels show open ground ---------------------------------------------------------------
-# In the loops over pixels tuples hold numbers alone: numba counts references to arrays of records,
-# which takes longer than the arithmetic. `spare` is what lanes are handed over in: shares of the
-# way to the next texels, then, from OUT on, results.
+# ---- Pixels that show open ground ----------------------------------------------------------------
+# In the loops over pixels, tuples hold numbers alone: numba counts references to arrays of records,
+# which takes longer than the arithmetic. `spare` passes values between lanes and loops: shares of
+# the way to the next texels, then, from RESULTS_START on, results.
 
-NEAR_OFF, NEAR_PER_M = 0.08, 0.003  # metres off the ground's height that a pixel surely may be
-FAR_OFF, FAR_PER_M = 0.2, 0.008  # and where it is something else
-FAINT = 0.004  # shares below this are none
-OUT, SPARE = 2 * LANES, 8 * LANES
+# Height off the ground, in metres and in metres per metre of distance, up to which a pixel shows
+# ground for certain.
+GROUND_TOLERANCE_M = 0.08
+GROUND_TOLERANCE_PER_M = 0.003
+# The same, from which on it shows something else.
+MAX_GROUND_OFFSET_M = 0.2
+MAX_GROUND_OFFSET_PER_M = 0.008
+MIN_GROUND_SHARE = 0.004  # smaller shares of ground count as 0
+RESULTS_START = 2 * LANES  # index of the results in `spare`
+SPARE_SIZE = 8 * LANES  # size of `spare`
 
 
-class View(NamedTuple):
-    """lens: 1 / fx, 1 / fy, cx, cy. axes [3, 3]: world_from_camera. eye [8]: its column and row in
-    the map, from the first cell's middle on, cells per metre, z; its columns and rows in the coarse
-    and in the fine mottle, less whole turns. place: its x and y, float64. rows, columns: of the
-    map, 2 at least. `_read_view` makes tuples of the arrays.
-    """
+class MapView(NamedTuple):
+    """View of a camera on the map. `_read_view` makes tuples of its arrays."""
 
-    lens: Any
-    axes: Any
+    lens: Any  # 1 / fx, 1 / fy, cx, cy
+    axes: Any  # [3, 3], world_from_camera
+    # [8]: the eye's column and row in the map (from the first cell's middle), cells per metre, z;
+    # its column and row in the coarse and in the fine mottle, without whole turns.
     eye: Any
-    place: Any
-    rows: Any
-    columns: Any
+    eye_xy: Any  # x and y of the eye, float64
+    rows: Any  # rows of the map, 2 at least
+    columns: Any  # columns of the map, 2 at least
 
 
 @inner()
 def _read_view(view):
-    lens, eye = view.lens, view.eye
-    return View(
+    """Return the view with tuples in place of arrays."""
+    lens = view.lens
+    eye = view.eye
+    return MapView(
         (lens[0], lens[1], lens[2], lens[3]),
         _read_matrix(view.axes),
         (eye[0], eye[1], eye[2], eye[3], eye[4], eye[5], eye[6], eye[7]),
-        (view.place[0], view.place[1]),
+        (view.eye_xy[0], view.eye_xy[1]),
         view.rows,
         view.columns,
     )
@@ -188,124 +216,166 @@ def _read_view(view):
 
 @inner()
 def _read_matrix(m):
+    """Return a 3 x 3 matrix as tuples."""
     return ((m[0, 0], m[0, 1], m[0, 2]), (m[1, 0], m[1, 1], m[1, 2]), (m[2, 0], m[2, 1], m[2, 2]))
 
 
 @inner()
-def _find_cells(px, py, view, places, spare):
-    """Whether points from the eye lie on the map; finds the cells below left of them."""
-    eye, zero, per_m = view.eye, _splat(0), v8.splat(view.eye[2])
-    u, v = v8.fmuladd(px, per_m, v8.splat(eye[0])), v8.fmuladd(py, per_m, v8.splat(eye[1]))
-    inside = v8.both(v8.at_least(u, zero), v8.at_least(_splat(view.columns - 1), u))
-    inside = v8.both(inside, v8.at_least(v, zero))
-    inside = v8.both(inside, v8.at_least(_splat(view.rows - 1), v))
-    i, j = v8.floor(_clamp(u, 0, view.columns - 2)), v8.floor(_clamp(v, 0, view.rows - 2))
-    _store_places(places, spare, u, v, i, j)
-    return inside
+def _find_cells(px, py, view, texels, spare):
+    """Tell if points from the eye lie on the map, and find the cells below left of them."""
+    eye = view.eye
+    zero = _splat(0)
+    per_m = v8.splat(view.eye[2])
+    u = v8.fmuladd(px, per_m, v8.splat(eye[0]))
+    v = v8.fmuladd(py, per_m, v8.splat(eye[1]))
+    is_inside = v8.both(v8.at_least(u, zero), v8.at_least(_splat(view.columns - 1), u))
+    is_inside = v8.both(is_inside, v8.at_least(v, zero))
+    is_inside = v8.both(is_inside, v8.at_least(_splat(view.rows - 1), v))
+    i = v8.floor(_clamp(u, 0, view.columns - 2))
+    j = v8.floor(_clamp(v, 0, view.rows - 2))
+    _store_texels(texels, spare, u, v, i, j)
+    return is_inside
 
 
 @inner()
-def _look_up(cells, columns, channel, count, places, spare):
-    """spare[OUT + k LANES + lane]: `count` channels from `channel` on, between the map's cells."""
-    step, down = U(CHANNELS), U(columns * CHANNELS)
+def _interpolate_channels(cells, columns, channel, count, texels, spare):
+    """Interpolate `count` channels from `channel` on between the map's cells.
+
+    The results go to spare[RESULTS_START + k LANES + lane].
+    """
+    step = U(CHANNELS)
+    down = U(columns * CHANNELS)
     for lane in range(U(LANES)):
-        first = U(places[lane + U(LANES)]) * down + U(places[lane]) * step + U(channel)
-        u, v = spare[lane], spare[lane + U(LANES)]
+        start = U(texels[lane + U(LANES)]) * down + U(texels[lane]) * step + U(channel)
+        u = spare[lane]
+        v = spare[lane + U(LANES)]
         for k in range(U(count)):
-            at = first + k
-            a = cells[at] + (cells[at + step] - cells[at]) * u
-            at += down
-            b = cells[at] + (cells[at + step] - cells[at]) * u
-            spare[U(OUT) + k * U(LANES) + lane] = a + (b - a) * v
+            index = start + k
+            a = cells[index] + (cells[index + step] - cells[index]) * u
+            index += down
+            b = cells[index] + (cells[index + step] - cells[index]) * u
+            spare[U(RESULTS_START) + k * U(LANES) + lane] = a + (b - a) * v
 
 
 @inner()
-def _find_in_row(row, width, view, cells, depth, shown, share):
+def _find_ground_in_row(row, width, view, cells, depth, visible_share, share):
+    """Find the open ground in one row of the image; return the row's largest share."""
     view = _read_view(view)
-    lens, axes = view.lens, view.axes
-    places, spare = np.empty(2 * LANES, np.int32), np.empty(SPARE, np.float32)
-    zero, one, half = _splat(0), _splat(1), np.float32(0.5)
+    lens = view.lens
+    axes = view.axes
+    texels = np.empty(2 * LANES, np.int32)
+    spare = np.empty(SPARE_SIZE, np.float32)
+    zero = _splat(0)
+    ones = _splat(1)
+    half = np.float32(0.5)
     down = (np.float32(row) + half - lens[3]) * lens[1]
-    b, best = v8.splat(down), zero
+    b = v8.splat(down)
+    max_share = zero
     for x in range(U(row * width), U((row + 1) * width)):
         share[x] = np.float32(0)
-    left, right = (half - lens[2]) * lens[0], (np.float32(width) - half - lens[2]) * lens[0]
+    left = (half - lens[2]) * lens[0]
+    right = (np.float32(width) - half - lens[2]) * lens[0]
     level = axes[2][1] * down + axes[2][2]
     if min(axes[2][0] * left, axes[2][0] * right) + level >= np.float32(0):
         return np.float32(0)
     for j in range(0, width, LANES):
-        first = min(j, width - LANES)  # the last eight of a row take those before them
+        first = min(j, width - LANES)  # the last eight pixels of a row overlap those before them
         pixel = U(row * width + first)
-        z, own, a = v8.load(depth, pixel), v8.load(shown, pixel), _across(first, lens)
-        rise = _turn(axes[2], a, b, one)
-        falls = v8.both(v8.greater(z, zero), v8.greater(own, zero))
-        falls = v8.both(falls, v8.greater(zero, rise))
-        if not _any(falls):
+        z = v8.load(depth, pixel)
+        ground_share = v8.load(visible_share, pixel)
+        a = _ray_x(first, lens)
+        ray_z = _rotate(axes[2], a, b, ones)
+        is_ground = v8.both(v8.greater(z, zero), v8.greater(ground_share, zero))
+        is_ground = v8.both(is_ground, v8.greater(zero, ray_z))
+        if not _any(is_ground):
             continue
-        px, py, pz = z * _turn(axes[0], a, b, one), z * _turn(axes[1], a, b, one), z * rise
-        falls = v8.both(falls, _find_cells(px, py, view, places, spare))
-        if not _any(falls):
+        px = z * _rotate(axes[0], a, b, ones)
+        py = z * _rotate(axes[1], a, b, ones)
+        pz = z * ray_z
+        is_ground = v8.both(is_ground, _find_cells(px, py, view, texels, spare))
+        if not _any(is_ground):
             continue
-        _look_up(cells, view.columns, HEIGHT, 2, places, spare)
-        off = v8.absolute(pz + v8.splat(view.eye[3]) - v8.load(spare, U(OUT)))
-        distance = z * v8.sqrt(_dot(a, b, one, a, b, one))
-        near = _line(distance, NEAR_PER_M, NEAR_OFF)
-        gap = _line(distance, FAR_PER_M - NEAR_PER_M, FAR_OFF - NEAR_OFF)
-        own = own * v8.load(spare, U(OUT + LANES)) * (one - _smoothstep((off - near) / gap))
-        own = v8.select(v8.both(falls, v8.greater(own, _splat(FAINT))), own, zero)
-        v8.store(share, pixel, own)
-        best = v8.maximum(best, own)
-    v8.store(spare, U(0), best)
-    most = spare[0]
+        _interpolate_channels(cells, view.columns, HEIGHT, 2, texels, spare)
+        height_gap = v8.absolute(pz + v8.splat(view.eye[3]) - v8.load(spare, U(RESULTS_START)))
+        distance = z * v8.sqrt(_dot(a, b, ones, a, b, ones))
+        tolerance_m = _linear(distance, GROUND_TOLERANCE_PER_M, GROUND_TOLERANCE_M)
+        gap = _linear(
+            distance,
+            MAX_GROUND_OFFSET_PER_M - GROUND_TOLERANCE_PER_M,
+            MAX_GROUND_OFFSET_M - GROUND_TOLERANCE_M,
+        )
+        ground_share = (
+            ground_share
+            * v8.load(spare, U(RESULTS_START + LANES))
+            * (ones - _smoothstep((height_gap - tolerance_m) / gap))
+        )
+        ground_share = v8.select(
+            v8.both(is_ground, v8.greater(ground_share, _splat(MIN_GROUND_SHARE))),
+            ground_share,
+            zero,
+        )
+        v8.store(share, pixel, ground_share)
+        max_share = v8.maximum(max_share, ground_share)
+    v8.store(spare, U(0), max_share)
+    row_max = spare[0]
     for lane in range(1, LANES):
-        most = max(most, spare[lane])
-    return most
+        row_max = max(row_max, spare[lane])
+    return row_max
 
 
 @kernel
-def find_ground(view, cells, width, depth, shown, share, most):
-    """share [H W]: of each pixel that is open ground; most [H]: of a row's pixels.
+def find_ground(view, cells, width, depth, visible_share, share, row_max):
+    """Find how much of each pixel is open ground, share [H W], and each row's largest share.
 
-    cells: the map, flat, CHANNELS of each cell. depth, shown: [H W]. W >= LANES.
+    cells: the map, flat, CHANNELS of each cell. depth, visible_share: [H W]. W >= LANES.
     """
-    for y in prange(most.size):
-        most[y] = _find_in_row(np.int64(y), width, view, cells, depth, shown, share)
+    for y in prange(row_max.size):
+        row_max[y] = _find_ground_in_row(
+            np.int64(y), width, view, cells, depth, visible_share, share
+        )
 
 
-# ---- What the film mirrors -----------------------------------------------------------------------
+# ---- Reflections in the film ---------------------------------------------------------------------
 
-R0 = 0.0201  # of water under a right angle
-ASPHALT, PUDDLE = 0.085, 0.008  # standard deviations of slopes: alpha / sqrt 2 of 0.12 and 0.011
-TRACK_SMOOTHS = 0.35  # share of the roughness that wheels have polished away
-FILM = 0.75  # of wet asphalt that shows water: stones stand out of it
-RIM = 0.12  # of a puddle, in HOLLOW
-MOTTLE_SIDE = 256  # a power of 2: texels of the noise that makes film and roughness uneven
-FINE_M, COARSE_M = 0.012, 0.2  # its texels
-FINE, COARSE = 0.07, 0.05  # by how much of the film
-LEVELS = 9  # of the mirrored picture: sharp, and blurred upright by 2 to 256 pixels
-SHARP_PX = 2.0  # of the image: blurs of less are none
-FARTHEST_M = 1e5  # stands for the sky
-RUN = 6144  # numbers that a thread decodes at a time
-_LEAST = 1e-6  # what 1 - cosine is at least
-_PER_ROW = np.array([0.5 ** max(k - 1, 0) for k in range(LEVELS)], np.float32)
+R0 = 0.0201  # reflectance of water at normal incidence
+# Standard deviations of slopes: alpha / sqrt 2, for alpha of 0.12 and 0.011.
+ASPHALT_ROUGHNESS = 0.085
+PUDDLE_ROUGHNESS = 0.008
+TRACK_SMOOTHING = 0.35  # share of the roughness that wheels have polished away
+FILM_SHARE = 0.75  # share of wet asphalt that shows water: stones stand out of it
+PUDDLE_RIM = 0.12  # half width of a puddle's rim, in HOLLOW
+# Texels on a side of the noise that makes film and roughness uneven; a power of 2.
+MOTTLE_SIDE = 256
+FINE_TEXEL_M = 0.012  # texel of the fine noise
+COARSE_TEXEL_M = 0.2  # texel of the coarse noise
+FINE_AMPLITUDE = 0.07  # change of the film per deviation of the fine noise
+COARSE_AMPLITUDE = 0.05  # change of the film per deviation of the coarse noise
+# Number of levels of the mirrored picture: sharp, and blurred upright by 2 to 256 pixels.
+NUM_LEVELS = 9
+MIN_BLUR_PX = 2.0  # blur, in pixels of the image, below which the picture stays sharp
+SKY_DISTANCE_M = 1e5  # distance of the sky
+VALUES_PER_TASK = 6144  # number of values that a thread decodes at a time
+_MIN_ONE_MINUS_COSINE = 1e-6  # least value of 1 - cosine
+# Rows of each level.
+_ROW_SCALES = np.array([0.5 ** max(k - 1, 0) for k in range(NUM_LEVELS)], np.float32)
 
 
-class Mirrored(NamedTuple):
-    """lens: fx, fy, cx, cy; rotation [3, 3] (camera_from_world): of the mirrored camera. offset
-    [3]: its centre, from the eye. width: of all its levels, 2 at least. rows: of the first.
-    """
+class MirrorView(NamedTuple):
+    """Mirrored camera and picture."""
 
-    lens: Any
-    rotation: Any
-    offset: Any
-    width: Any
-    rows: Any
+    lens: Any  # fx, fy, cx, cy
+    rotation: Any  # [3, 3], camera_from_world
+    offset: Any  # [3], centre of the mirrored camera, from the eye
+    width: Any  # width of all levels, 2 at least
+    rows: Any  # number of rows of the first level
 
 
 @inner()
 def _read_mirror(mirror):
-    lens, offset = mirror.lens, mirror.offset
-    return Mirrored(
+    """Return the mirror with tuples in place of arrays."""
+    lens = mirror.lens
+    offset = mirror.offset
+    return MirrorView(
         (lens[0], lens[1], lens[2], lens[3]),
         _read_matrix(mirror.rotation),
         (offset[0], offset[1], offset[2]),
@@ -314,245 +384,300 @@ def _read_mirror(mirror):
     )
 
 
-class Water(NamedTuple):
-    """wetness, level: see reflection.Film. rings: share, variance, unseen."""
+class WaterOnGround(NamedTuple):
+    """Water on the ground."""
 
-    wetness: Any
-    level: Any
-    rings: Any
+    wetness: Any  # see reflection.Film
+    puddle_threshold: Any  # see reflection.Film
+    rings: Any  # share, variance, unseen
     seed: Any
     timestamp_ns: Any
 
 
 @inner()
 def _read_water(water):
+    """Return the water with tuples in place of arrays."""
     rings = water.rings[0], water.rings[1], water.rings[2]
-    return Water(water.wetness, water.level, rings, water.seed, water.timestamp_ns)
+    return WaterOnGround(
+        water.wetness, water.puddle_threshold, rings, water.seed, water.timestamp_ns
+    )
 
 
 @inner()
 def _lanes_if(condition):
-    """How often a loop over lanes runs. Numba prunes references of arrays that a loop uses, but not
-    of those that a branch does.
+    """Return the number of turns of a loop over lanes: all or none.
+
+    Numba prunes references of arrays that a loop uses, but not of those that a branch uses.
     """
     return U(LANES) if condition else U(0)
 
 
 @inner()
-def _mottle(noise, px, py, weight, per_texel, column, row, places, spare):
-    """Weighted noise. column, row: the eye's."""
+def _mottle(noise, px, py, weight, per_texel, column, row, texels, spare):
+    """Return weighted noise at points from the eye; column, row: the eye's, in texels."""
     u = v8.fmuladd(px, _splat(per_texel), v8.splat(column))
     v = v8.fmuladd(py, _splat(per_texel), v8.splat(row))
-    _store_places(places, spare, u, v, v8.floor(u), v8.floor(v))
-    side, wrap = U(MOTTLE_SIDE), np.int32(MOTTLE_SIDE - 1)
-    counts = v8.greater(weight, _splat(0))
-    for lane in range(_lanes_if(_any(counts))):
-        i, j = places[lane], places[lane + U(LANES)]
-        left, right = U(i & wrap), U((i + np.int32(1)) & wrap)
-        low, high = U(j & wrap) * side, U((j + np.int32(1)) & wrap) * side
+    _store_texels(texels, spare, u, v, v8.floor(u), v8.floor(v))
+    side = U(MOTTLE_SIDE)
+    wrap = np.int32(MOTTLE_SIDE - 1)
+    has_weight = v8.greater(weight, _splat(0))
+    for lane in range(_lanes_if(_any(has_weight))):
+        i = texels[lane]
+        j = texels[lane + U(LANES)]
+        left = U(i & wrap)
+        right = U((i + np.int32(1)) & wrap)
+        low = U(j & wrap) * side
+        high = U((j + np.int32(1)) & wrap) * side
         a = noise[low + left] + (noise[low + right] - noise[low + left]) * spare[lane]
         b = noise[high + left] + (noise[high + right] - noise[high + left]) * spare[lane]
-        spare[U(OUT) + lane] = a + (b - a) * spare[lane + U(LANES)]
-    return v8.select(counts, weight * v8.load(spare, U(OUT)), _splat(0))
+        spare[U(RESULTS_START) + lane] = a + (b - a) * spare[lane + U(LANES)]
+    return v8.select(has_weight, weight * v8.load(spare, U(RESULTS_START)), _splat(0))
 
 
 @inner()
-def _ring_lanes(px, py, footprint, puddle, place, water, spare, drops):
-    """`rings_at` where puddles are: see there."""
-    shown = v8.both(v8.greater(puddle, _splat(0)), v8.greater(_splat(WAVE_M / FADED_PX), footprint))
+def _ring_lanes(px, py, footprint, puddle, eye_xy, water, spare, drops):
+    """Compute `rings_at` for the lanes with puddles."""
+    is_visible = v8.both(
+        v8.greater(puddle, _splat(0)), v8.greater(_splat(RING_WAVE_M / FADED_PX), footprint)
+    )
     v8.store(spare, U(0), px)
     v8.store(spare, U(LANES), py)
-    v8.store(spare, U(OUT), _splat(0))
-    v8.store(spare, U(OUT + LANES), _splat(0))
-    v8.store(spare, U(OUT + 2 * LANES), _splat(water.rings[1]))
-    v8.store(spare, U(OUT + 3 * LANES), v8.select(shown, footprint, _splat(0)))
-    for lane in range(_lanes_if(water.rings[0] > 0 and _any(shown))):
-        at = U(OUT) + lane
-        wide = spare[at + U(3 * LANES)]
-        if wide > np.float32(0):
-            x, y = place[0] + spare[lane], place[1] + spare[lane + U(LANES)]
-            sx, sy, rest = rings_at(
-                x, y, np.float64(wide), water.rings, water.seed, water.timestamp_ns, drops
+    v8.store(spare, U(RESULTS_START), _splat(0))
+    v8.store(spare, U(RESULTS_START + LANES), _splat(0))
+    v8.store(spare, U(RESULTS_START + 2 * LANES), _splat(water.rings[1]))
+    v8.store(spare, U(RESULTS_START + 3 * LANES), v8.select(is_visible, footprint, _splat(0)))
+    for lane in range(_lanes_if(water.rings[0] > 0 and _any(is_visible))):
+        index = U(RESULTS_START) + lane
+        footprint_m = spare[index + U(3 * LANES)]
+        if footprint_m > np.float32(0):
+            x = eye_xy[0] + spare[lane]
+            y = eye_xy[1] + spare[lane + U(LANES)]
+            sx, sy, rest_variance = rings_at(
+                x, y, np.float64(footprint_m), water.rings, water.seed, water.timestamp_ns, drops
             )
-            spare[at] = np.float32(sx)
-            spare[at + U(LANES)] = np.float32(sy)
-            spare[at + U(2 * LANES)] = np.float32(rest)
-    slopes = v8.load(spare, U(OUT)), v8.load(spare, U(OUT + LANES))
-    return slopes[0], slopes[1], v8.load(spare, U(OUT + 2 * LANES))
+            spare[index] = np.float32(sx)
+            spare[index + U(LANES)] = np.float32(sy)
+            spare[index + U(2 * LANES)] = np.float32(rest_variance)
+    slopes = v8.load(spare, U(RESULTS_START)), v8.load(spare, U(RESULTS_START + LANES))
+    return slopes[0], slopes[1], v8.load(spare, U(RESULTS_START + 2 * LANES))
 
 
 @inner()
-def _reflectance(cosine, rough):
-    """As reflection.mean_reflectance."""
-    one = _splat(1)
-    power = _splat(5) * exp2_fine(rough * _splat(-2.69 * LOG2_E))
-    base = v8.maximum(one - cosine, _splat(_LEAST))
-    rest = exp2_fine(v8.maximum(power * log2(base), _splat(-126)))
-    rest = rest / _line(rough * v8.sqrt(rough), 22.7, 1.0)
-    return _line(rest, 1 - R0, R0)
+def _reflectance(cosine, roughness):
+    """Return the mean reflectance, as reflection.mean_reflectance defines it."""
+    ones = _splat(1)
+    power = _splat(5) * exp2_fine(roughness * _splat(-2.69 * LOG2_E))
+    one_minus_cosine = v8.maximum(ones - cosine, _splat(_MIN_ONE_MINUS_COSINE))
+    schlick_term = exp2_fine(v8.maximum(power * log2(one_minus_cosine), _splat(-126)))
+    schlick_term = schlick_term / _linear(roughness * v8.sqrt(roughness), 22.7, 1.0)
+    return _linear(schlick_term, 1 - R0, R0)
 
 
 @inner()
 def _to_linear(value):
-    """Linear light of display-encoded values."""
+    """Convert display-encoded values to linear light."""
     value = v8.maximum(value, _splat(0))
-    high = exp2_fine(_splat(2.4) * log2(_line(value, 1 / 1.055, 0.055 / 1.055)))
+    high = exp2_fine(_splat(2.4) * log2(_linear(value, 1 / 1.055, 0.055 / 1.055)))
     low = value * _splat(1 / 12.92)
     return v8.select(v8.greater(value, _splat(0.04045)), high, low)
 
 
 @inner()
 def _to_display(linear):
-    """Display-encoded values of linear light; of what is below 0, those of 0."""
+    """Convert linear light to display-encoded values; light below 0 counts as 0."""
     high = exp2_fine(_splat(1 / 2.4) * log2(v8.maximum(linear, _splat(0.0031308))))
     low = v8.maximum(linear, _splat(0)) * _splat(12.92)
-    return v8.select(v8.greater(linear, _splat(0.0031308)), _line(high, 1.055, -0.055), low)
+    return v8.select(v8.greater(linear, _splat(0.0031308)), _linear(high, 1.055, -0.055), low)
 
 
 @inner()
 def _project(mirror, x, y, z):
-    """Column and row of points from the mirrored eye."""
-    lens, rotation = mirror.lens, mirror.rotation
-    per_z = _splat(1) / v8.maximum(_turn(rotation[2], x, y, z), _splat(1e-3))
-    column, row = _turn(rotation[0], x, y, z) * per_z, _turn(rotation[1], x, y, z) * per_z
+    """Return column and row of points from the mirrored eye."""
+    lens = mirror.lens
+    rotation = mirror.rotation
+    per_z = _splat(1) / v8.maximum(_rotate(rotation[2], x, y, z), _splat(1e-3))
+    column = _rotate(rotation[0], x, y, z) * per_z
+    row = _rotate(rotation[1], x, y, z) * per_z
     column = v8.fmuladd(v8.splat(lens[0]), column, v8.splat(lens[2]))
     return column, v8.fmuladd(v8.splat(lens[1]), row, v8.splat(lens[3]))
 
 
 @inner()
-def _way_at(mirror, depth, column, row, px, py, pz, places, spare):
-    """Metres from points of the ground to what the mirrored picture shows."""
-    lens, m, offset, width = mirror.lens, mirror.rotation, mirror.offset, U(mirror.width)
+def _distance_at(mirror, depth, column, row, px, py, pz, texels, spare):
+    """Return the distance from points of the ground to what the mirrored picture shows, metres."""
+    lens = mirror.lens
+    m = mirror.rotation
+    offset = mirror.offset
+    width = U(mirror.width)
     i = v8.floor(_clamp(column, 0, mirror.width - 1))
     j = v8.floor(_clamp(row, 0, mirror.rows - 1))
-    v8.store_whole(places, U(0), i)
-    v8.store_whole(places, U(LANES), j)
+    v8.store_whole(texels, U(0), i)
+    v8.store_whole(texels, U(LANES), j)
     for lane in range(U(LANES)):
-        spare[lane] = depth[U(places[lane + U(LANES)]) * width + U(places[lane])]
-    z, half, one = v8.load(spare, U(0)), np.float32(0.5), np.float32(1)
-    a = (i + v8.splat(half - lens[2])) * v8.splat(one / lens[0]) * z
-    b = (j + v8.splat(half - lens[3])) * v8.splat(one / lens[1]) * z
-    x = _turn((m[0][0], m[1][0], m[2][0]), a, b, z) + v8.splat(offset[0]) - px
-    y = _turn((m[0][1], m[1][1], m[2][1]), a, b, z) + v8.splat(offset[1]) - py
-    up = _turn((m[0][2], m[1][2], m[2][2]), a, b, z) + v8.splat(offset[2]) - pz
-    way = v8.sqrt(_dot(x, y, up, x, y, up))
-    return v8.select(v8.greater(z, _splat(0)), way, _splat(FARTHEST_M))
+        spare[lane] = depth[U(texels[lane + U(LANES)]) * width + U(texels[lane])]
+    z = v8.load(spare, U(0))
+    half = np.float32(0.5)
+    unit = np.float32(1)
+    a = (i + v8.splat(half - lens[2])) * v8.splat(unit / lens[0]) * z
+    b = (j + v8.splat(half - lens[3])) * v8.splat(unit / lens[1]) * z
+    x = _rotate((m[0][0], m[1][0], m[2][0]), a, b, z) + v8.splat(offset[0]) - px
+    y = _rotate((m[0][1], m[1][1], m[2][1]), a, b, z) + v8.splat(offset[1]) - py
+    up = _rotate((m[0][2], m[1][2], m[2][2]), a, b, z) + v8.splat(offset[2]) - pz
+    distances = v8.sqrt(_dot(x, y, up, x, y, up))
+    return v8.select(v8.greater(z, _splat(0)), distances, _splat(SKY_DISTANCE_M))
 
 
 @inner()
-def _look_at(mirror, colors, levels, column, row, sigma, places, spare):
-    """Linear light of the mirrored picture at points, blurred upright by sigma >= 1 pixels."""
-    low = v8.floor(_clamp(log2(sigma), 0, LEVELS - 2))
-    upper = _clamp(sigma / exp2_fine(low) - _splat(1), 0, 1)
+def _look_up_mirror(mirror, colors, levels, column, row, sigma, texels, spare):
+    """Return linear light of the mirrored picture at points, blurred upright by sigma pixels.
+
+    sigma >= 1.
+    """
+    lower_level = v8.floor(_clamp(log2(sigma), 0, NUM_LEVELS - 2))
+    upper_share = _clamp(sigma / exp2_fine(lower_level) - _splat(1), 0, 1)
     x = _clamp(column - _splat(0.5), 0, mirror.width - 1)
     i = v8.minimum(v8.floor(x), _splat(mirror.width - 2))
-    _store_places(places, spare, x, upper + low, i, low)
-    v8.store(spare, U(OUT), _clamp(row, -1e6, 1e6))
-    pixel, wide = U(3), U(3 * mirror.width)
-    red, green, blue = U(OUT + 2 * LANES), U(OUT + 3 * LANES), U(OUT + 4 * LANES)
+    _store_texels(texels, spare, x, upper_share + lower_level, i, lower_level)
+    v8.store(spare, U(RESULTS_START), _clamp(row, -1e6, 1e6))
+    pixel = U(3)
+    row_stride = U(3 * mirror.width)
+    red = U(RESULTS_START + 2 * LANES)
+    green = U(RESULTS_START + 3 * LANES)
+    blue = U(RESULTS_START + 4 * LANES)
     for lane in range(U(LANES)):
-        level, y, color = U(places[lane + U(LANES)]), spare[U(OUT) + lane], _splat(0)
+        level = U(texels[lane + U(LANES)])
+        y = spare[U(RESULTS_START) + lane]
+        color = _splat(0)
         for k in range(U(2)):
             last = np.int64(levels[U(1), level]) - 1
-            v = y * _PER_ROW[level] - np.float32(0.5)
+            v = y * _ROW_SCALES[level] - np.float32(0.5)
             v = min(max(v, np.float32(0)), np.float32(last))
             j = np.int64(v)
-            at = pixel * (U(levels[U(0), level]) + U(places[lane])) + U(j) * wide
-            above = v8.load(colors, at)
-            below = v8.load(colors, at + (wide if j < last else U(0)))
+            index = pixel * (U(levels[U(0), level]) + U(texels[lane])) + U(j) * row_stride
+            above = v8.load(colors, index)
+            below = v8.load(colors, index + (row_stride if j < last else U(0)))
             between = v8.fmuladd(v8.splat(v - np.float32(j)), below - above, above)
             weight = spare[lane + U(LANES)] if k else np.float32(1) - spare[lane + U(LANES)]
             color = v8.fmuladd(v8.splat(weight), between, color)
             level += U(1)
-        v8.store(spare, U(OUT + LANES), color)  # of two texels side by side
-        at, u = U(OUT + LANES), spare[lane]
-        spare[red + lane] = spare[at] + (spare[at + U(3)] - spare[at]) * u
-        spare[green + lane] = spare[at + U(1)] + (spare[at + U(4)] - spare[at + U(1)]) * u
-        spare[blue + lane] = spare[at + U(2)] + (spare[at + U(5)] - spare[at + U(2)]) * u
+        v8.store(spare, U(RESULTS_START + LANES), color)  # colours of two texels side by side
+        index = U(RESULTS_START + LANES)
+        u = spare[lane]
+        spare[red + lane] = spare[index] + (spare[index + U(3)] - spare[index]) * u
+        spare[green + lane] = spare[index + U(1)] + (spare[index + U(4)] - spare[index + U(1)]) * u
+        spare[blue + lane] = spare[index + U(2)] + (spare[index + U(5)] - spare[index + U(2)]) * u
     return v8.load(spare, red), v8.load(spare, green), v8.load(spare, blue)
 
 
 @inner()
-def _film(track, puddle, uneven, variance, wetness):
-    """Deviation of slopes, and the share of the ground that the film covers."""
-    one = _splat(1)
-    rough = _splat(ASPHALT) * _line(track, -TRACK_SMOOTHS, 1.0) * (one - uneven)
-    still = v8.sqrt(_line(variance, 0.5, PUDDLE * PUDDLE))
-    film = _clamp(_line(track, 0.1, FILM) + uneven, 0.0, 1.0)
-    cover = v8.splat(wetness) * v8.fmuladd(one - film, puddle, film)
-    return v8.fmuladd(puddle, still - rough, rough), cover
+def _film_on_ground(track, puddle, uneven, variance, wetness):
+    """Return the deviation of slopes, and the share of the ground that the film covers."""
+    ones = _splat(1)
+    roughness = _splat(ASPHALT_ROUGHNESS) * _linear(track, -TRACK_SMOOTHING, 1.0) * (ones - uneven)
+    puddle_roughness = v8.sqrt(_linear(variance, 0.5, PUDDLE_ROUGHNESS * PUDDLE_ROUGHNESS))
+    film_share = _clamp(_linear(track, 0.1, FILM_SHARE) + uneven, 0.0, 1.0)
+    covered_share = v8.splat(wetness) * v8.fmuladd(ones - film_share, puddle, film_share)
+    return v8.fmuladd(puddle, puddle_roughness - roughness, roughness), covered_share
 
 
 @inner()
-def _mixed(own, seen, strength):
-    linear = _to_linear(own)
-    return _to_display(v8.fmuladd(strength, seen - linear, linear))
+def _mix_light(encoded, reflected, strength):
+    """Mix display-encoded values with reflected linear light by a strength."""
+    linear = _to_linear(encoded)
+    return _to_display(v8.fmuladd(strength, reflected - linear, linear))
 
 
 @inner()
 def _shade_row(
     line, width, view, cells, depth, share, mirror, colors, levels, mirror_depth, water, noise, rgb
 ):
-    view, mirror, water = _read_view(view), _read_mirror(mirror), _read_water(water)
-    lens, axes, eye, offset = view.lens, view.axes, view.eye, mirror.offset
-    places, spare = np.empty(2 * LANES, np.int32), np.empty(SPARE, np.float32)
-    drops, one = np.full((AT + 1, 4), np.nan), _splat(1)
+    """Mix reflections into one row of the image."""
+    view = _read_view(view)
+    mirror = _read_mirror(mirror)
+    water = _read_water(water)
+    lens = view.lens
+    axes = view.axes
+    eye = view.eye
+    offset = mirror.offset
+    texels = np.empty(2 * LANES, np.int32)
+    spare = np.empty(SPARE_SIZE, np.float32)
+    drops = np.full((MAX_NEARBY_DROPS + 1, 4), np.nan)
+    ones = _splat(1)
     b = v8.splat((np.float32(line) + np.float32(0.5) - lens[3]) * lens[1])
     for j in range(0, width, LANES):
-        # The last eight of a row take those before them, which stay as they are.
+        # The last eight pixels of a row overlap those before them, which stay as they are.
         first = min(j, width - LANES)
         pixel = U(line * width + first)
-        own = v8.load(share, pixel)
-        inside = v8.both(
-            v8.greater(own, _splat(0)), v8.at_least(v8.lane_numbers(), _splat(j - first))
+        ground_share = v8.load(share, pixel)
+        is_ground = v8.both(
+            v8.greater(ground_share, _splat(0)), v8.at_least(v8.lane_numbers(), _splat(j - first))
         )
-        if not _any(inside):
+        if not _any(is_ground):
             continue
-        a, z = _across(first, lens), v8.select(inside, v8.load(depth, pixel), one)
-        px, py = z * _turn(axes[0], a, b, one), z * _turn(axes[1], a, b, one)
-        pz = z * _turn(axes[2], a, b, one)
-        _find_cells(px, py, view, places, spare)
-        _look_up(cells, view.columns, RISE_X, 4, places, spare)
-        rise_x, rise_y = v8.load(spare, U(OUT)), v8.load(spare, U(OUT + LANES))
-        hollow, track = v8.load(spare, U(OUT + 2 * LANES)), v8.load(spare, U(OUT + 3 * LANES))
-        puddle = _smoothstep(_line(hollow - v8.splat(water.level), 0.5 / RIM, 0.5))
-        puddle = v8.select(inside, puddle * v8.splat(water.wetness), _splat(0))
+        a = _ray_x(first, lens)
+        z = v8.select(is_ground, v8.load(depth, pixel), ones)
+        px = z * _rotate(axes[0], a, b, ones)
+        py = z * _rotate(axes[1], a, b, ones)
+        pz = z * _rotate(axes[2], a, b, ones)
+        _find_cells(px, py, view, texels, spare)
+        _interpolate_channels(cells, view.columns, SLOPE_X, 4, texels, spare)
+        slope_x = v8.load(spare, U(RESULTS_START))
+        slope_y = v8.load(spare, U(RESULTS_START + LANES))
+        puddle_order = v8.load(spare, U(RESULTS_START + 2 * LANES))
+        track = v8.load(spare, U(RESULTS_START + 3 * LANES))
+        puddle = _smoothstep(
+            _linear(puddle_order - v8.splat(water.puddle_threshold), 0.5 / PUDDLE_RIM, 0.5)
+        )
+        puddle = v8.select(is_ground, puddle * v8.splat(water.wetness), _splat(0))
         distance = v8.sqrt(_dot(px, py, pz, px, py, pz))
-        per_distance = one / distance
-        footprint = v8.maximum(v8.negate(pz * per_distance), _splat(LEAST_SINE))
+        inverse_distance = ones / distance
+        footprint = v8.maximum(v8.negate(pz * inverse_distance), _splat(MIN_FOOTPRINT_SINE))
         footprint = distance * v8.splat(lens[1]) / footprint
-        coarse = _splat(COARSE) * _clamp(_line(footprint, -1 / COARSE_M, 2.0), 0.0, 1.0)
-        coarse = _mottle(noise, px, py, coarse, 1 / COARSE_M, eye[4], eye[5], places, spare)
-        fine = _splat(FINE) * _clamp(_line(footprint, -1 / FINE_M, 2.0), 0.0, 1.0)
-        fine = _mottle(noise, px, py, fine, 1 / FINE_M, eye[6], eye[7], places, spare)
-        sx, sy, variance = _ring_lanes(px, py, footprint, puddle, view.place, water, spare, drops)
-        rough, cover = _film(track, puddle, coarse + fine, variance, water.wetness)
-        flat = puddle - one
-        nx, ny = rise_x * flat - sx * puddle, rise_y * flat - sy * puddle
-        nz = one / v8.sqrt(v8.fmuladd(nx, nx, v8.fmuladd(ny, ny, one)))
-        nx, ny = nx * nz, ny * nz
-        cosine = v8.negate(_dot(nx, ny, nz, px, py, pz) * per_distance)
+        coarse = _splat(COARSE_AMPLITUDE) * _clamp(
+            _linear(footprint, -1 / COARSE_TEXEL_M, 2.0), 0.0, 1.0
+        )
+        coarse = _mottle(noise, px, py, coarse, 1 / COARSE_TEXEL_M, eye[4], eye[5], texels, spare)
+        fine = _splat(FINE_AMPLITUDE) * _clamp(_linear(footprint, -1 / FINE_TEXEL_M, 2.0), 0.0, 1.0)
+        fine = _mottle(noise, px, py, fine, 1 / FINE_TEXEL_M, eye[6], eye[7], texels, spare)
+        sx, sy, variance = _ring_lanes(px, py, footprint, puddle, view.eye_xy, water, spare, drops)
+        roughness, cover = _film_on_ground(track, puddle, coarse + fine, variance, water.wetness)
+        asphalt_weight = puddle - ones
+        nx = slope_x * asphalt_weight - sx * puddle
+        ny = slope_y * asphalt_weight - sy * puddle
+        nz = ones / v8.sqrt(v8.fmuladd(nx, nx, v8.fmuladd(ny, ny, ones)))
+        nx = nx * nz
+        ny = ny * nz
+        cosine = v8.negate(_dot(nx, ny, nz, px, py, pz) * inverse_distance)
         cosine = _clamp(cosine, 0.005, 1.0)
-        # What a ray, 2 cosine normal - towards the eye, meets.
-        mx, my, mz = px - v8.splat(offset[0]), py - v8.splat(offset[1]), pz - v8.splat(offset[2])
+        # The mirrored ray is 2 cosine normal - direction to the eye; find the point that it meets.
+        mx = px - v8.splat(offset[0])
+        my = py - v8.splat(offset[1])
+        mz = pz - v8.splat(offset[2])
         column, row = _project(mirror, mx, my, mz)
-        way = _way_at(mirror, mirror_depth, column, row, px, py, pz, places, spare)
-        twice = cosine + cosine
+        mirror_distance = _distance_at(mirror, mirror_depth, column, row, px, py, pz, texels, spare)
+        double_cosine = cosine + cosine
         column, row = _project(
             mirror,
-            v8.fmuladd(way, v8.fmuladd(px, per_distance, twice * nx), mx),
-            v8.fmuladd(way, v8.fmuladd(py, per_distance, twice * ny), my),
-            v8.fmuladd(way, v8.fmuladd(pz, per_distance, twice * nz), mz),
+            v8.fmuladd(mirror_distance, v8.fmuladd(px, inverse_distance, double_cosine * nx), mx),
+            v8.fmuladd(mirror_distance, v8.fmuladd(py, inverse_distance, double_cosine * ny), my),
+            v8.fmuladd(mirror_distance, v8.fmuladd(pz, inverse_distance, double_cosine * nz), mz),
         )
-        sigma = v8.splat(np.float32(2) / lens[1]) * rough * way / (way + distance)
-        sigma = sigma * sigma / (sigma + _splat(SHARP_PX))
-        sigma = v8.maximum(sigma * v8.splat(mirror.lens[1] * lens[1]), one)
-        red, green, blue = _look_at(mirror, colors, levels, column, row, sigma, places, spare)
-        strength = own * cover * _reflectance(cosine, rough)
+        sigma = (
+            v8.splat(np.float32(2) / lens[1])
+            * roughness
+            * mirror_distance
+            / (mirror_distance + distance)
+        )
+        sigma = sigma * sigma / (sigma + _splat(MIN_BLUR_PX))
+        sigma = v8.maximum(sigma * v8.splat(mirror.lens[1] * lens[1]), ones)
+        red, green, blue = _look_up_mirror(
+            mirror, colors, levels, column, row, sigma, texels, spare
+        )
+        strength = ground_share * cover * _reflectance(cosine, roughness)
         r, g, b_ = v8.load_colours(rgb, U(3) * pixel)
-        red = v8.select(inside, _mixed(r, red, strength), r)
-        green = v8.select(inside, _mixed(g, green, strength), g)
-        blue = v8.select(inside, _mixed(b_, blue, strength), b_)
+        red = v8.select(is_ground, _mix_light(r, red, strength), r)
+        green = v8.select(is_ground, _mix_light(g, green, strength), g)
+        blue = v8.select(is_ground, _mix_light(b_, blue, strength), b_)
         v8.store_colours(rgb, U(3) * pixel, red, green, blue)
 
 
@@ -563,23 +688,34 @@ def shade_wet(
     """Mix reflections into rgb [3 H W], in place, where share says how much is open ground.
 
     cells, depth, share: as of find_ground. colors: flat, linear light of the mirror's levels one
-    after the other, and two numbers more. levels [2, LEVELS]: first texel and rows of each.
-    mirror_depth: flat, z, 0 of the sky. noise: flat, MOTTLE_SIDE squared.
+    after another, and two numbers more. levels [2, NUM_LEVELS]: first texel and number of rows of
+    each. mirror_depth: flat, z, 0 for the sky. noise: flat, MOTTLE_SIDE squared.
     """
     for y in prange(depth.size // width):
         _shade_row(
-            np.int64(y), width, view, cells, depth, share,
-            mirror, colors, levels, mirror_depth, water, noise, rgb,
-        )  # fmt: skip
+            np.int64(y),
+            width,
+            view,
+            cells,
+            depth,
+            share,
+            mirror,
+            colors,
+            levels,
+            mirror_depth,
+            water,
+            noise,
+            rgb,
+        )
 
 
 @kernel
-def decode(rgb, linear):
-    """Linear light of display-encoded numbers, flat, LANES of them at least."""
+def decode_srgb(rgb, linear):
+    """Convert display-encoded numbers to linear light; flat arrays of LANES numbers at least."""
     count = rgb.size
-    for run in prange((count + RUN - 1) // RUN):
-        start = np.int64(run) * RUN
-        for i in range(start, min(start + RUN, count), LANES):
+    for run in prange((count + VALUES_PER_TASK - 1) // VALUES_PER_TASK):
+        start = np.int64(run) * VALUES_PER_TASK
+        for i in range(start, min(start + VALUES_PER_TASK, count), LANES):
             at = U(min(i, count - LANES))
             v8.store(linear, at, _to_linear(v8.load(rgb, at)))
 
@@ -588,35 +724,52 @@ def decode(rgb, linear):
 
 
 @inner()
-def _add_in_row(line, axes, centre, height, lens, rings, seed, timestamp_ns, nxs, nys, variance):
-    drops = np.full((AT + 1, 4), np.nan)
+def _add_rings_in_row(
+    line, axes, centre, height, lens, rings, seed, timestamp_ns, nxs, nys, variance
+):
+    """Add rings to one row of the image."""
+    drops = np.full((MAX_NEARBY_DROPS + 1, 4), np.nan)
     b = (line + 0.5 - lens[3]) / lens[1]
     for x in range(nxs.shape[1]):
         a = (x + 0.5 - lens[2]) / lens[0]
         fall = -(axes[2, 0] * a + axes[2, 1] * b + axes[2, 2])
-        if not fall > LEAST_FALL:
+        if not fall > MIN_FALL:
             continue
         z = height / fall
         px = centre[0] + z * (axes[0, 0] * a + axes[0, 1] * b + axes[0, 2])
         py = centre[1] + z * (axes[1, 0] * a + axes[1, 1] * b + axes[1, 2])
         length = math.sqrt(1.0 + a * a + b * b)
-        footprint = z * length / lens[1] / max(fall / length, LEAST_SINE)
-        sx, sy, rest = rings_at(px, py, footprint, rings, seed, timestamp_ns, drops)
-        nx, ny = np.float64(nxs[line, x]), np.float64(nys[line, x])
+        footprint = z * length / lens[1] / max(fall / length, MIN_FOOTPRINT_SINE)
+        sx, sy, rest_variance = rings_at(px, py, footprint, rings, seed, timestamp_ns, drops)
+        nx = np.float64(nxs[line, x])
+        ny = np.float64(nys[line, x])
         nz = math.sqrt(max(1.0 - nx * nx - ny * ny, 1e-6))
-        gx, gy = nx / nz - sx, ny / nz - sy
+        gx = nx / nz - sx
+        gy = ny / nz - sy
         scale = 1.0 / math.sqrt(gx * gx + gy * gy + 1.0)
-        nxs[line, x], nys[line, x] = np.float32(gx * scale), np.float32(gy * scale)
-        variance[line, x] += np.float32(0.5 * rest)
+        nxs[line, x] = np.float32(gx * scale)
+        nys[line, x] = np.float32(gy * scale)
+        variance[line, x] += np.float32(0.5 * rest_variance)
 
 
 @kernel
 def add_rings(axes, centre, height, lens, rings, seed, timestamp_ns, normal_x, normal_y, variance):
-    """Rings on the waves of a level plane, `height` below the eye, in place: normals' x and y, and
-    the variance of slope, [H, W]. axes: world_from_camera [3, 3]. centre: world x and y.
+    """Add rings to the waves of a level plane, `height` below the eye, in place.
+
+    normal_x, normal_y, variance: [H, W], normals' x and y and the variance of slope. axes: [3, 3],
+    world_from_camera. centre: world x and y.
     """
     for y in prange(normal_x.shape[0]):
-        _add_in_row(
-            np.int64(y), axes, centre, height, lens, rings, seed, timestamp_ns,
-            normal_x, normal_y, variance,
-        )  # fmt: skip
+        _add_rings_in_row(
+            np.int64(y),
+            axes,
+            centre,
+            height,
+            lens,
+            rings,
+            seed,
+            timestamp_ns,
+            normal_x,
+            normal_y,
+            variance,
+        )

@@ -1,16 +1,22 @@
-"""What wet ground mirrors: the scene from the eye mirrored in it, blurred by the film's roughness.
+"""Renders reflections in wet ground: the scene from the mirrored eye, blurred by a rough film.
 
     L = (1 - k F) C + k F M        in linear light
 
-C: the ground as drawn; F: the share of light that a rough film reflects; k: how much of the pixel
-the film closes over; M: the mirrored picture, through the fog of the whole way. Where fog is
-uniform both C and M hold its airlight in their share, so that the sum is exact.
+- C: the ground as rendered.
+- F: share of light that a rough film reflects.
+- k: share of the pixel that the film covers.
+- M: the mirrored picture, through the fog of its whole path.
+
+Where fog is uniform, C and M hold its airlight in their share, so that the sum is exact.
 
 A film's slopes s (standard deviation along one axis) turn the mirrored ray by 2 s up and down, and
 by 2 s sin(grazing angle) sideways, about the point where it leaves the ground. Seen from the eye,
-that moves what stands a share q = way from the ground / way from the eye by q times as much: lamps
+this moves a thing by q times as much, q = distance from the ground / distance from the eye: lamps
 far behind the ground become long upright streaks, and a wall is sharp at its foot. M is blurred
-upright to a few widths once, and looked up between two of them pixel by pixel.
+upright to a few widths once, and each pixel looks up between two of them.
+
+Caller: `WetEffect.edit_image` (`find_ground`, then `shade_wet`). On the CPU, `wet.kernels` compute
+the same.
 """
 
 from __future__ import annotations
@@ -30,37 +36,37 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.effects.wet import kernels
-from augment.effects.wet.darkening import display_of, linear_of
+from augment.effects.wet.darkening import to_display, to_linear
 from augment.effects.wet.ground import CELL_M, WetGround
 from augment.effects.wet.kernels import (
-    ASPHALT,
-    COARSE,
-    COARSE_M,
-    FAINT,
-    FAR_OFF,
-    FAR_PER_M,
-    FARTHEST_M,
-    FILM,
-    FINE,
-    FINE_M,
+    ASPHALT_ROUGHNESS,
+    COARSE_AMPLITUDE,
+    COARSE_TEXEL_M,
+    FILM_SHARE,
+    FINE_AMPLITUDE,
+    FINE_TEXEL_M,
+    GROUND_TOLERANCE_M,
+    GROUND_TOLERANCE_PER_M,
     HEIGHT,
     HOLLOW,
-    LEAST_SINE,
-    LEVELS,
+    MAX_GROUND_OFFSET_M,
+    MAX_GROUND_OFFSET_PER_M,
+    MIN_BLUR_PX,
+    MIN_FOOTPRINT_SINE,
+    MIN_GROUND_SHARE,
     MOTTLE_SIDE,
-    NEAR_OFF,
-    NEAR_PER_M,
+    NUM_LEVELS,
     OPEN,
-    PUDDLE,
+    PUDDLE_RIM,
+    PUDDLE_ROUGHNESS,
     R0,
-    RIM,
-    RISE_X,
-    RISE_Y,
-    SHARP_PX,
-    TRACK,
-    TRACK_SMOOTHS,
+    SKY_DISTANCE_M,
+    SLOPE_X,
+    SLOPE_Y,
+    TRACK_SMOOTHING,
+    WHEEL_TRACK,
 )
-from augment.effects.wet.ripples import Rings, numbers_of, ring_slopes
+from augment.effects.wet.ripples import Rings, ring_arrays, ring_slopes
 from augment.geometry import rigid
 from augment.render.buffers import AUTO, CPU, kernels_for
 from augment.render.layout import ABOVE, LANES, HeightClip
@@ -68,237 +74,280 @@ from augment.render.threads import kernel_threads
 
 # ---- The plane and its mirrored camera -----------------------------------------------------------
 
-NEAR_M, FAR_M = 1.0, 60.0  # of the ground that the plane is fitted to
-RAYS = 24  # a side, through the image
+# Distances between which the plane is fitted to the ground.
+MIN_FIT_DISTANCE_M = 1.0
+MAX_FIT_DISTANCE_M = 60.0
+NUM_RAYS = 24  # number of rays on a side of the image
 
 
 @dataclass(frozen=True)
 class Plane:
-    """Points x with up . x = offset_m; up: unit, world."""
+    """Points x with up . x = offset_m."""
 
-    up: tuple[float, float, float]
-    offset_m: float
+    up: tuple[float, float, float]  # unit normal, world
+    offset_m: float  # distance from the origin
 
     def above(self, lowered_m: float) -> HeightClip:
+        """Return the clip that keeps what lies above the plane, lowered by `lowered_m`."""
         return HeightClip(self.offset_m - lowered_m, ABOVE, up=self.up)
 
 
 def plane_in_view(camera: Camera, ground: WetGround) -> Plane | None:
-    """The plane through the open ground that a camera sees, nearest ground first; None where its
-    rays meet none.
+    """Fit a plane to the open ground that a camera sees, nearest ground first.
 
-    Rays march to the map's heights by fixed steps of their length, so that a hill hides what is
-    behind it.
+    It is None where the camera's rays meet no ground. Rays march to the map's heights by fixed
+    steps of their length, so that a hill hides what is behind it.
     """
-    points, weights = _seen_ground(camera, ground)
+    points, weights = _sample_ground(camera, ground)
     if weights.sum() <= 0:
         return None
-    middle = (weights[:, None] * points).sum(0) / weights.sum()
-    local = points - middle
-    a = np.concatenate([local[:, :2], np.ones((len(local), 1))], 1)
+    center = (weights[:, None] * points).sum(0) / weights.sum()
+    local = points - center
+    design = np.concatenate([local[:, :2], np.ones((len(local), 1))], 1)
     ridge = 1e-3 * weights.sum() * np.diag([1.0, 1.0, 0.0])
     slopes = np.zeros(3)
-    for _ in range(3):  # what is off the first plane by much is another surface
-        off = np.abs(local[:, 2] - a @ slopes)
-        own = weights * (1 / (1 + (off / 0.15) ** 2))
+    for _ in range(3):  # points far off the first plane belong to another surface
+        height_gaps = np.abs(local[:, 2] - design @ slopes)
+        robust_weights = weights * (1 / (1 + (height_gaps / 0.15) ** 2))
         slopes = np.linalg.solve(
-            (a.T * own) @ a + ridge + 1e-9 * np.eye(3), (a.T * own) @ local[:, 2]
+            (design.T * robust_weights) @ design + ridge + 1e-9 * np.eye(3),
+            (design.T * robust_weights) @ local[:, 2],
         )
     normal = np.array([-slopes[0], -slopes[1], 1.0])
     normal /= np.linalg.norm(normal)
-    at = middle + np.array([0, 0, slopes[2]])
+    point = center + np.array([0, 0, slopes[2]])
     up = (float(normal[0]), float(normal[1]), float(normal[2]))
-    plane = Plane(up, float(normal @ at))
+    plane = Plane(up, float(normal @ point))
     if float(np.dot(normal, camera.centre.numpy())) - plane.offset_m < 0.05:
-        return None  # an eye in the ground mirrors nothing
+        return None  # an eye in the ground sees no reflections
     return plane
 
 
-def _seen_ground(camera: Camera, ground: WetGround) -> tuple[np.ndarray, np.ndarray]:
-    """Points [N, 3] where rays of a grid over the image meet open ground, and weights [N]."""
-    small = camera.resized(RAYS, RAYS)
-    rays = small.ray_directions(torch.float64).reshape(-1, 3).numpy()
+def _sample_ground(camera: Camera, ground: WetGround) -> tuple[np.ndarray, np.ndarray]:
+    """Return points [N, 3] where rays over the image meet open ground, and weights [N]."""
+    small_camera = camera.resized(NUM_RAYS, NUM_RAYS)
+    rays = small_camera.ray_directions(torch.float64).reshape(-1, 3).numpy()
     eye = camera.centre.numpy()
-    level = np.linalg.norm(rays[:, :2], axis=1)
-    way = NEAR_M * (FAR_M / NEAR_M) ** (np.arange(33) / 32)
-    at = eye + (rays / np.maximum(level, 1e-6)[:, None])[:, None] * way[None, :, None]
-    heights = ground.nearest(at[..., 0], at[..., 1])[..., HEIGHT]
-    under = at[..., 2] <= heights
-    first = under.argmax(1)
-    hit = under.any(1) & (rays[:, 2] < 0)
-    points = at[np.arange(len(rays)), first]
-    own = ground.nearest(points[:, 0], points[:, 1])
-    points[:, 2] = own[:, HEIGHT]
-    weights = np.where(hit, own[:, OPEN], 0) / (1 + way[first] / 10)
+    horizontal = np.linalg.norm(rays[:, :2], axis=1)
+    distances = MIN_FIT_DISTANCE_M * (MAX_FIT_DISTANCE_M / MIN_FIT_DISTANCE_M) ** (
+        np.arange(33) / 32
+    )
+    points_on_rays = (
+        eye + (rays / np.maximum(horizontal, 1e-6)[:, None])[:, None] * distances[None, :, None]
+    )
+    heights = ground.nearest(points_on_rays[..., 0], points_on_rays[..., 1])[..., HEIGHT]
+    is_under = points_on_rays[..., 2] <= heights
+    first_step = is_under.argmax(1)
+    is_hit = is_under.any(1) & (rays[:, 2] < 0)
+    points = points_on_rays[np.arange(len(rays)), first_step]
+    channels = ground.nearest(points[:, 0], points[:, 1])
+    points[:, 2] = channels[:, HEIGHT]
+    weights = np.where(is_hit, channels[:, OPEN], 0) / (1 + distances[first_step] / 10)
     return points, weights
 
 
-def mirrored_in(camera: Camera, plane: Plane) -> Camera:
-    """The camera whose pictures are the reflections that `camera` sees in the plane; its pixel
-    (column, row) is the reflection in (column, height - 1 - row).
+def mirror_camera(camera: Camera, plane: Plane) -> Camera:
+    """Return the camera whose pictures are the reflections that `camera` sees in the plane.
+
+    Its pixel (column, row) is the reflection in (column, height - 1 - row).
     """
-    n = torch.tensor(plane.up, dtype=torch.float64)
-    house = torch.eye(3, dtype=torch.float64) - 2 * n[:, None] * n
+    normal = torch.tensor(plane.up, dtype=torch.float64)
+    householder = torch.eye(3, dtype=torch.float64) - 2 * normal[:, None] * normal
     flip = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
-    rotation = flip[:, None] * camera.camera_from_world[:3, :3] @ house
-    eye = house @ camera.centre + 2 * plane.offset_m * n
+    rotation = flip[:, None] * camera.camera_from_world[:3, :3] @ householder
+    eye = householder @ camera.centre + 2 * plane.offset_m * normal
     pose = rigid(rotation, -rotation @ eye)
     return dataclasses.replace(camera, camera_from_world=pose, cy=camera.height - camera.cy)
 
 
 # ---- The mirrored picture and its blurs ----------------------------------------------------------
 
-SIDEWAYS = 0.14  # of the blur upright: the sine of the angle at which most of a road is seen
+# Sideways blur over upright blur: the sine of the angle at which most of a road is seen.
+SIDEWAYS_BLUR_RATIO = 0.14
 
 
 class Mirror(NamedTuple):
-    """The mirrored picture. camera: of its first level. levels: linear light [H, W >> k, 3] ...,
-    level k > 0 blurred upright by 2^k pixels, its rows 2^(k-1) apart. depth: z, 0 for the sky.
-    """
+    """Mirrored picture."""
 
-    camera: Camera
+    camera: Camera  # camera of the first level
+    # Linear light, [H, W, 3], [H, W, 3], [H / 2, W, 3] ...: level k > 0 is blurred upright by 2^k
+    # pixels, its rows are 2^(k-1) apart.
     levels: list[Tensor]
-    depth: Float[Tensor, "H W"]
+    depth: Float[Tensor, "H W"]  # z, 0 for the sky
 
 
 def blur_upright(
     rgb: Float[Tensor, "H W 3"], *, backend: str = AUTO
 ) -> list[Float[Tensor, "h W 3"]]:
-    """The display-encoded picture in linear light, and its blurs: see Mirror.
+    """Return the display-encoded picture in linear light, and its blurs, see Mirror.
 
     backend: on the CPU OpenCV blurs, equal to the definition within float rounding.
     """
     if kernels_for(backend, rgb) == CPU and rgb.numel() >= LANES:
         linear = np.empty(tuple(rgb.shape), np.float32)
         with kernel_threads():
-            kernels.decode(_flat(rgb), linear.reshape(-1))
-        image, levels = linear, [torch.from_numpy(linear)]
-        for k in range(1, LEVELS):
-            upright, aside = map(_taps, _widening(k))
+            kernels.decode_srgb(_flat_array(rgb), linear.reshape(-1))
+        image = linear
+        levels = [torch.from_numpy(linear)]
+        for k in range(1, NUM_LEVELS):
+            upright, sideways = map(_gaussian_weights, _added_blur(k))
             if k >= 2:
                 image = np.concatenate((image, image[-1:])) if len(image) % 2 else image
                 image = cv2.addWeighted(image[0::2], 0.5, image[1::2], 0.5, 0.0)
-            image = cv2.sepFilter2D(image, -1, aside, upright, borderType=cv2.BORDER_REPLICATE)
+            image = cv2.sepFilter2D(image, -1, sideways, upright, borderType=cv2.BORDER_REPLICATE)
             levels.append(torch.from_numpy(image))
         return levels
-    linear = linear_of(rgb)
-    image, found = linear.permute(2, 0, 1)[:, None], [linear]  # [3, 1, H, W]
-    for k in range(1, LEVELS):
+    linear = to_linear(rgb)
+    image = linear.permute(2, 0, 1)[:, None]  # [3, 1, H, W]
+    reference_levels = [linear]
+    for k in range(1, NUM_LEVELS):
         if k >= 2:
-            image = _halved(image)
-        for axis, sigma in zip((2, 3), _widening(k), strict=True):
-            image = _gauss(image, sigma, axis)
-        found.append(image[:, 0].permute(1, 2, 0))
-    return found
+            image = _halve_rows(image)
+        for axis, sigma in zip((2, 3), _added_blur(k), strict=True):
+            image = _blur_axis(image, sigma, axis)
+        reference_levels.append(image[:, 0].permute(1, 2, 0))
+    return reference_levels
 
 
-def _widening(k: int) -> tuple[float, float]:
-    """Standard deviations upright, in rows that are 2^(k-1) apart, and sideways, that take a blur
-    of 2^(k-1) pixels (or none) to one of 2^k.
+def _added_blur(k: int) -> tuple[float, float]:
+    """Return the blur, upright and sideways, that takes level k - 1 to level k.
+
+    Level k is blurred by 2^k pixels, level 0 not at all. The upright standard deviation is in rows
+    that are 2^(k-1) apart.
     """
     added = math.sqrt(4.0**k - (4.0 ** (k - 1) if k > 1 else 0.0))
-    return added / 2.0 ** (k - 1), SIDEWAYS * added
+    return added / 2.0 ** (k - 1), SIDEWAYS_BLUR_RATIO * added
 
 
-def _taps(sigma: float) -> np.ndarray:
+def _gaussian_weights(sigma: float) -> np.ndarray:
+    """Return the weights of a Gaussian blur."""
     reach = math.ceil(2.5 * sigma)
-    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    return (taps / taps.sum()).astype(np.float32)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return (weights / weights.sum()).astype(np.float32)
 
 
-def _gauss(image: Tensor, sigma: float, axis: int) -> Tensor:
-    taps = torch.from_numpy(_taps(sigma)).to(image)
-    reach = len(taps) // 2
+def _blur_axis(image: Tensor, sigma: float, axis: int) -> Tensor:
+    """Blur an image [3, 1, H, W] along one axis."""
+    weights = torch.from_numpy(_gaussian_weights(sigma)).to(image)
+    reach = len(weights) // 2
     pad = (0, 0, reach, reach) if axis == 2 else (reach, reach, 0, 0)
     shape = (1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)
     padded = torch.nn.functional.pad(image, pad, mode="replicate")
-    return torch.nn.functional.conv2d(padded, taps.reshape(shape))
+    return torch.nn.functional.conv2d(padded, weights.reshape(shape))
 
 
-def _halved(image: Tensor) -> Tensor:
+def _halve_rows(image: Tensor) -> Tensor:
+    """Average pairs of rows."""
     if image.shape[2] % 2:
         image = torch.cat((image, image[:, :, -1:]), 2)
     return 0.5 * (image[:, :, 0::2] + image[:, :, 1::2])
 
 
-def _look_up(levels: list[Tensor], column: Tensor, row: Tensor, sigma: Tensor) -> Tensor:
-    """Colours [P, 3] between the two levels about a blur of sigma pixels."""
+def _look_up_levels(levels: list[Tensor], column: Tensor, row: Tensor, sigma: Tensor) -> Tensor:
+    """Return colours [P, 3] between the two levels about a blur of sigma pixels."""
     sigma = sigma.clamp_min(1.0)
-    low = torch.log2(sigma).floor().clamp(0, LEVELS - 2)
-    number = low + (sigma / torch.exp2(low) - 1).clamp_max(1.0)
+    lower_level = torch.log2(sigma).floor().clamp(0, NUM_LEVELS - 2)
+    level_number = lower_level + (sigma / torch.exp2(lower_level) - 1).clamp_max(1.0)
     out = torch.zeros(len(column), 3, dtype=column.dtype, device=column.device)
     for k, image in enumerate(levels):
-        weight = (1 - (number - k).abs()).clamp_min(0)
-        some = torch.nonzero(weight > 0)[:, 0]
-        if len(some):
+        weight = (1 - (level_number - k).abs()).clamp_min(0)
+        rows_of_level = torch.nonzero(weight > 0)[:, 0]
+        if len(rows_of_level):
             rows_apart = 2.0 ** max(k - 1, 0)
-            seen = _bilinear(image, column[some], row[some] / rows_apart)
-            out[some] += weight[some, None] * seen
+            colours = _bilinear(image, column[rows_of_level], row[rows_of_level] / rows_apart)
+            out[rows_of_level] += weight[rows_of_level, None] * colours
     return out
 
 
 def _bilinear(image: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """Interpolate an image between its pixels."""
     height, width = image.shape[:2]
-    x, y = (column - 0.5).clamp(0, width - 1), (row - 0.5).clamp(0, height - 1)
-    c0, r0 = x.long(), y.long()
-    c1, r1 = (c0 + 1).clamp_max(width - 1), (r0 + 1).clamp_max(height - 1)
-    u, v = (x - c0)[:, None], (y - r0)[:, None]
+    x = (column - 0.5).clamp(0, width - 1)
+    y = (row - 0.5).clamp(0, height - 1)
+    c0 = x.long()
+    r0 = y.long()
+    c1 = (c0 + 1).clamp_max(width - 1)
+    r1 = (r0 + 1).clamp_max(height - 1)
+    u = (x - c0)[:, None]
+    v = (y - r0)[:, None]
     flat = image.reshape(-1, image.shape[-1])
     top = flat[r0 * width + c0] * (1 - u) + flat[r0 * width + c1] * u
     bottom = flat[r1 * width + c0] * (1 - u) + flat[r1 * width + c1] * u
     return top * (1 - v) + bottom * v
 
 
-# ---- Where wet ground is seen, and what it mirrors -----------------------------------------------
+# ---- Pixels of wet ground, and their reflections -------------------------------------------------
 
 
 class Film(NamedTuple):
-    """Water on the ground. wetness: 0 to 1. level: of HOLLOW, beyond which it stands in puddles.
-    rings: on them.
-    """
+    """Water on the ground."""
 
-    wetness: float
-    level: float
-    rings: Rings
+    wetness: float  # 0 to 1
+    puddle_threshold: float  # value of HOLLOW above which water stands in puddles
+    rings: Rings  # rings of drops on the puddles
 
 
 def find_ground(
     camera: Camera,
     depth: Float[Tensor, "H W"],
-    shown: Float[Tensor, "H W"],
+    visible_share: Float[Tensor, "H W"],
     ground: WetGround,
     *,
     backend: str = AUTO,
 ) -> tuple[Float[Tensor, "H W"], tuple[int, int]]:
-    """How much of each pixel is open ground, and the first row and one past the last that has any.
+    """Find how much of each pixel is open ground.
 
-    depth: z of what a pixel shows, 0 = none. shown: how much of the pixel is the scene's own.
-    backend: the CPU's kernel equals the definition within float rounding.
+    Args:
+        camera: the camera.
+        depth: z of what a pixel shows, 0 = none.
+        visible_share: share of the pixel that shows the scene's own splats.
+        ground: map of the ground.
+        backend: the CPU's kernel equals the definition within float rounding.
+
+    Returns:
+        The shares [H, W]; the first row with open ground, and one past the last.
     """
-    if kernels_for(backend, depth, shown) == CPU and camera.width >= LANES:
+    if kernels_for(backend, depth, visible_share) == CPU and camera.width >= LANES:
         share = np.empty(tuple(depth.shape), np.float32)
-        most, flat = np.empty(len(share), np.float32), share.reshape(-1)
-        with kernel_threads(ROWS):
+        row_max = np.empty(len(share), np.float32)
+        flat_share = share.reshape(-1)
+        with kernel_threads(ROWS_PER_TASK):
             kernels.find_ground(
-                *_view(camera, ground), camera.width, _flat(depth), _flat(shown), flat, most
+                *_map_view(camera, ground),
+                camera.width,
+                _flat_array(depth),
+                _flat_array(visible_share),
+                flat_share,
+                row_max,
             )
-        found = np.flatnonzero(most > 0)
-        rows = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, 0)
+        rows_with_ground = np.flatnonzero(row_max > 0)
+        rows = (
+            (int(rows_with_ground[0]), int(rows_with_ground[-1]) + 1)
+            if len(rows_with_ground)
+            else (0, 0)
+        )
         return torch.from_numpy(share), rows
-    points, distance, channels = _points(camera, depth, ground)
-    off = (points[..., 2] + float(camera.centre[2]) - channels[..., HEIGHT]).abs()
-    near, far = NEAR_OFF + NEAR_PER_M * distance, FAR_OFF + FAR_PER_M * distance
-    share = shown * channels[..., OPEN] * (1 - _smoothstep(near, far, off))
-    is_ground = (depth > 0) & depth.isfinite() & (points[..., 2] < 0) & (share > FAINT)
-    found_rows = torch.nonzero(is_ground.any(1))[:, 0]
-    rows = (int(found_rows[0]), int(found_rows[-1]) + 1) if len(found_rows) else (0, 0)
+    points, distance, channels = _ground_points(camera, depth, ground)
+    height_gap = (points[..., 2] + float(camera.centre[2]) - channels[..., HEIGHT]).abs()
+    tolerance_m = GROUND_TOLERANCE_M + GROUND_TOLERANCE_PER_M * distance
+    max_offset_m = MAX_GROUND_OFFSET_M + MAX_GROUND_OFFSET_PER_M * distance
+    share = (
+        visible_share
+        * channels[..., OPEN]
+        * (1 - _smoothstep(tolerance_m, max_offset_m, height_gap))
+    )
+    is_ground = (depth > 0) & depth.isfinite() & (points[..., 2] < 0) & (share > MIN_GROUND_SHARE)
+    ground_rows = torch.nonzero(is_ground.any(1))[:, 0]
+    rows = (int(ground_rows[0]), int(ground_rows[-1]) + 1) if len(ground_rows) else (0, 0)
     return torch.where(is_ground, share, 0.0), rows
 
 
-def _points(camera: Camera, depth: Tensor, ground: WetGround) -> tuple[Tensor, Tensor, Tensor]:
-    """Points from the eye, how far they are, and the map's channels there."""
-    known = torch.where(depth.isfinite(), depth, 0.0).double()
-    points = camera.ray_directions(torch.float64, depth.device) * known[..., None]
+def _ground_points(
+    camera: Camera, depth: Tensor, ground: WetGround
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return points from the eye, their distances, and the map's channels there."""
+    finite_depth = torch.where(depth.isfinite(), depth, 0.0).double()
+    points = camera.ray_directions(torch.float64, depth.device) * finite_depth[..., None]
     eye = camera.centre.to(depth.device)
     channels = ground.at(points[..., 0] + eye[0], points[..., 1] + eye[1])
     return points.float(), points.norm(dim=-1).float(), channels
@@ -315,50 +364,75 @@ def shade_wet(
     *,
     backend: str = AUTO,
 ) -> Float[Tensor, "H W 3"]:
-    """The picture with reflections on its wet ground; on the CPU, `rgb` is overwritten.
+    """Add reflections to the wet ground of a picture; on the CPU, `rgb` is overwritten.
 
-    share: of `find_ground`. backend: as there.
+    Args:
+        rgb: display-encoded picture.
+        camera: the camera.
+        depth: z of what a pixel shows.
+        share: result of `find_ground`.
+        ground: map of the ground.
+        film: water on the ground.
+        mirror: mirrored picture.
+        backend: the CPU's kernel equals the definition within float rounding.
     """
-    wide = camera.width >= LANES and mirror.camera.width >= 2
-    if kernels_for(backend, rgb, depth, share) == CPU and rgb.is_contiguous() and wide:
-        with kernel_threads(ROWS):
+    is_wide_enough = camera.width >= LANES and mirror.camera.width >= 2
+    if kernels_for(backend, rgb, depth, share) == CPU and rgb.is_contiguous() and is_wide_enough:
+        with kernel_threads(ROWS_PER_TASK):
             kernels.shade_wet(
-                *_view(camera, ground), camera.width, _flat(depth), _flat(share),
-                *_mirrored(mirror, camera), *_water(film), _flat(rgb),
-            )  # fmt: skip
+                *_map_view(camera, ground),
+                camera.width,
+                _flat_array(depth),
+                _flat_array(share),
+                *_mirror_arrays(mirror, camera),
+                *_water_arrays(film),
+                _flat_array(rgb),
+            )
         return rgb
-    points, distance, ch = _points(camera, depth, ground)
-    puddle = film.wetness * _smoothstep(film.level - RIM, film.level + RIM, ch[..., HOLLOW])
-    to_eye = -points / distance.clamp_min(1e-6)[..., None]
-    footprint = distance / camera.fy / to_eye[..., 2].clamp_min(LEAST_SINE)
-    eye = camera.centre.to(points.device)
-    x, y = points[..., 0].double() + eye[0], points[..., 1].double() + eye[1]
-    uneven = sum(
-        amount * (2 - footprint / texel).clamp(0, 1) * _mottle(x, y, texel)
-        for amount, texel in ((COARSE, COARSE_M), (FINE, FINE_M))
+    points, distance, channels = _ground_points(camera, depth, ground)
+    puddle = film.wetness * _smoothstep(
+        film.puddle_threshold - PUDDLE_RIM,
+        film.puddle_threshold + PUDDLE_RIM,
+        channels[..., HOLLOW],
     )
-    rough = ASPHALT * (1 - TRACK_SMOOTHS * ch[..., TRACK]) * (1 - uneven)
+    to_eye = -points / distance.clamp_min(1e-6)[..., None]
+    footprint = distance / camera.fy / to_eye[..., 2].clamp_min(MIN_FOOTPRINT_SINE)
+    eye = camera.centre.to(points.device)
+    x = points[..., 0].double() + eye[0]
+    y = points[..., 1].double() + eye[1]
+    uneven = sum(
+        amplitude * (2 - footprint / texel).clamp(0, 1) * _mottle(x, y, texel)
+        for amplitude, texel in ((COARSE_AMPLITUDE, COARSE_TEXEL_M), (FINE_AMPLITUDE, FINE_TEXEL_M))
+    )
+    roughness = (
+        ASPHALT_ROUGHNESS * (1 - TRACK_SMOOTHING * channels[..., WHEEL_TRACK]) * (1 - uneven)
+    )
     slope_x, slope_y, variance = ring_slopes(film.rings, x, y, footprint)
-    still = torch.sqrt(PUDDLE**2 + 0.5 * variance)
-    rough = rough + puddle * (still - rough)
-    flat = 1 - puddle
-    slope = (-ch[..., RISE_X] * flat - slope_x * puddle, -ch[..., RISE_Y] * flat - slope_y * puddle)
-    normal = torch.nn.functional.normalize(torch.stack((*slope, torch.ones_like(flat)), -1), dim=-1)
+    puddle_roughness = torch.sqrt(PUDDLE_ROUGHNESS**2 + 0.5 * variance)
+    roughness = roughness + puddle * (puddle_roughness - roughness)
+    asphalt_weight = 1 - puddle
+    slope = (
+        -channels[..., SLOPE_X] * asphalt_weight - slope_x * puddle,
+        -channels[..., SLOPE_Y] * asphalt_weight - slope_y * puddle,
+    )
+    normal = torch.nn.functional.normalize(
+        torch.stack((*slope, torch.ones_like(asphalt_weight)), -1), dim=-1
+    )
     cosine = (normal * to_eye).sum(-1).clamp(0.005, 1)
-    own_film = (FILM + uneven + 0.1 * ch[..., TRACK]).clamp(0, 1)
-    cover = film.wetness * (own_film + (1 - own_film) * puddle)
-    strength = share * cover * mean_reflectance(cosine, rough)
+    film_share = (FILM_SHARE + uneven + 0.1 * channels[..., WHEEL_TRACK]).clamp(0, 1)
+    covered_share = film.wetness * (film_share + (1 - film_share) * puddle)
+    strength = share * covered_share * mean_reflectance(cosine, roughness)
     ray = 2 * cosine[..., None] * normal - to_eye
-    seen = _seen_in_mirror(points, distance, ray, rough, mirror, camera)
-    own = linear_of(rgb)
-    mixed = display_of((own + strength[..., None] * (seen - own)).clamp_min(0))
+    reflected = _reflected_light(points, distance, ray, roughness, mirror, camera)
+    linear = to_linear(rgb)
+    mixed = to_display((linear + strength[..., None] * (reflected - linear)).clamp_min(0))
     return torch.where((share > 0)[..., None], mixed, rgb)
 
 
-def _seen_in_mirror(
-    points: Tensor, distance: Tensor, ray: Tensor, rough: Tensor, mirror: Mirror, camera: Camera
+def _reflected_light(
+    points: Tensor, distance: Tensor, ray: Tensor, roughness: Tensor, mirror: Mirror, camera: Camera
 ) -> Tensor:
-    """Linear light [H, W, 3] that the mirrored picture shows in rays from the ground.
+    """Return the linear light [H, W, 3] that the mirrored picture shows in rays from the ground.
 
     A ray is as long as the flat mirror's.
     """
@@ -367,104 +441,122 @@ def _seen_in_mirror(
     to_mirror = (view.centre - camera.centre).to(ray)
 
     def project(vector: Tensor) -> tuple[Tensor, Tensor]:
+        """Return column and row of vectors from the mirrored eye."""
         x, y, z = (vector @ axes.T).unbind(-1)
         z = z.clamp_min(1e-3)
         return view.fx * x / z + view.cx, view.fy * y / z + view.cy
 
-    def way_at(column: Tensor, row: Tensor) -> Tensor:
+    def distance_at(column: Tensor, row: Tensor) -> Tensor:
+        """Return the distance from the ground to what the mirrored picture shows in a pixel."""
         c = column.clamp(0, view.width - 1).long()
         r = row.clamp(0, view.height - 1).long()
         z = mirror.depth[r, c]
-        at = ((c + 0.5 - view.cx) / view.fx * z, (r + 0.5 - view.cy) / view.fy * z, z)
-        way = (torch.stack(at, -1) @ axes + to_mirror - points).norm(dim=-1)
-        return torch.where(z > 0, way, torch.full_like(way, FARTHEST_M))
+        camera_point = ((c + 0.5 - view.cx) / view.fx * z, (r + 0.5 - view.cy) / view.fy * z, z)
+        mirror_distance = (torch.stack(camera_point, -1) @ axes + to_mirror - points).norm(dim=-1)
+        return torch.where(z > 0, mirror_distance, torch.full_like(mirror_distance, SKY_DISTANCE_M))
 
-    way = way_at(*project(points - to_mirror))
-    column, row = project(points + way[..., None] * ray - to_mirror)
-    sigma = camera.fy * 2 * rough * way / (way + distance)
-    sigma = sigma * sigma / (sigma + SHARP_PX) * (view.fy / camera.fy)
-    found = _look_up(mirror.levels, column.reshape(-1), row.reshape(-1), sigma.reshape(-1))
-    return found.reshape(*column.shape, 3)
+    mirror_distance = distance_at(*project(points - to_mirror))
+    column, row = project(points + mirror_distance[..., None] * ray - to_mirror)
+    sigma = camera.fy * 2 * roughness * mirror_distance / (mirror_distance + distance)
+    sigma = sigma * sigma / (sigma + MIN_BLUR_PX) * (view.fy / camera.fy)
+    colours = _look_up_levels(mirror.levels, column.reshape(-1), row.reshape(-1), sigma.reshape(-1))
+    return colours.reshape(*column.shape, 3)
 
 
 def mean_reflectance(cosine: Float[Tensor, "*B"], slopes: Float[Tensor, "*B"]) -> Tensor:
-    """Schlick's reflectance, averaged over slopes of a standard deviation (Bruneton et al. 2010,
-    "Real-time realistic ocean lighting", section 5.3).
+    """Return Schlick's reflectance, averaged over slopes of a standard deviation.
+
+    Source: Bruneton et al. 2010, "Real-time realistic ocean lighting", section 5.3.
     """
     power = 5 * torch.exp(-2.69 * slopes)
-    rest = (1 - cosine).clamp_min(0) ** power / (1 + 22.7 * slopes**1.5)
-    return R0 + (1 - R0) * rest
+    schlick_term = (1 - cosine).clamp_min(0) ** power / (1 + 22.7 * slopes**1.5)
+    return R0 + (1 - R0) * schlick_term
 
 
 def _smoothstep(low: float | Tensor, high: float | Tensor, value: Tensor) -> Tensor:
+    """Smooth step from 0 at low to 1 at high."""
     t = ((value - low) / (high - low)).clamp(0, 1)
     return t * t * (3 - 2 * t)
 
 
 @functools.cache
-def mottle_table() -> np.ndarray:
-    """float32 [MOTTLE_SIDE] * 2 of unit deviation, smooth over some texels, whose sides meet."""
+def make_mottle_table() -> np.ndarray:
+    """float32 [MOTTLE_SIDE] * 2 of unit deviation, smooth over some texels; its sides meet."""
     white = np.random.Generator(np.random.PCG64(1)).standard_normal(2 * (MOTTLE_SIDE,))
     smooth = ndimage.gaussian_filter(white, 1.0, mode="wrap")
     return (smooth / smooth.std()).astype(np.float32)
 
 
 def _mottle(x: Tensor, y: Tensor, texel_m: float) -> Tensor:
-    noise = torch.from_numpy(mottle_table()).to(x.device)
-    u, v = x / texel_m, y / texel_m
-    i, j = u.floor(), v.floor()
-    u, v = (u - i).float(), (v - j).float()
-    i0, j0 = (i.long() % MOTTLE_SIDE), (j.long() % MOTTLE_SIDE)
-    i1, j1 = (i0 + 1) % MOTTLE_SIDE, (j0 + 1) % MOTTLE_SIDE
+    """Return the noise of the table at points."""
+    noise = torch.from_numpy(make_mottle_table()).to(x.device)
+    u = x / texel_m
+    v = y / texel_m
+    i = u.floor()
+    j = v.floor()
+    u = (u - i).float()
+    v = (v - j).float()
+    i0 = i.long() % MOTTLE_SIDE
+    j0 = j.long() % MOTTLE_SIDE
+    i1 = (i0 + 1) % MOTTLE_SIDE
+    j1 = (j0 + 1) % MOTTLE_SIDE
     below = noise[j0, i0] * (1 - u) + noise[j0, i1] * u
     return below * (1 - v) + (noise[j1, i0] * (1 - u) + noise[j1, i1] * u) * v
 
 
 # ---- The kernels' arrays -------------------------------------------------------------------------
 
-ROWS = 8  # image rows a thread takes at a time: rows without ground cost nothing
+# Number of image rows that a thread takes at a time; rows without ground cost nothing.
+ROWS_PER_TASK = 8
 
 
-def _flat(part: Tensor) -> np.ndarray:
+def _flat_array(part: Tensor) -> np.ndarray:
+    """Return a tensor as a flat float32 array."""
     return part.detach().float().contiguous().numpy().reshape(-1)
 
 
-def _floats(*numbers: float) -> np.ndarray:
+def _float_array(*numbers: float) -> np.ndarray:
+    """Return numbers as a float32 array."""
     return np.array(numbers, np.float32)
 
 
-def _view(camera: Camera, ground: WetGround) -> tuple[kernels.View, np.ndarray]:
+def _map_view(camera: Camera, ground: WetGround) -> tuple[kernels.MapView, np.ndarray]:
+    """Return the view on the map, and the map, as kernels take them."""
     pose = camera.world_from_camera.numpy()
     place = np.ascontiguousarray(pose[:2, 3])
     cells = (place - (ground.left_m, ground.bottom_m)) / CELL_M - 0.5
-    turns = [place / texel_m % MOTTLE_SIDE for texel_m in (COARSE_M, FINE_M)]
-    view = kernels.View(
-        _floats(1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy),
+    turns = [place / texel_m % MOTTLE_SIDE for texel_m in (COARSE_TEXEL_M, FINE_TEXEL_M)]
+    view = kernels.MapView(
+        _float_array(1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy),
         np.ascontiguousarray(pose[:3, :3], np.float32),
-        _floats(*cells, 1 / CELL_M, pose[2, 3], *turns[0], *turns[1]),
+        _float_array(*cells, 1 / CELL_M, pose[2, 3], *turns[0], *turns[1]),
         place,
         *ground.channels.shape[:2],
     )
     return view, ground.channels.numpy().reshape(-1)
 
 
-def _mirrored(
+def _mirror_arrays(
     mirror: Mirror, camera: Camera
-) -> tuple[kernels.Mirrored, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[kernels.MirrorView, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the mirror as kernels take it: view, colours, levels, depth."""
     view = mirror.camera
     rows = np.array([len(level) for level in mirror.levels])
-    mirrored = kernels.Mirrored(
-        _floats(view.fx, view.fy, view.cx, view.cy),
+    mirrored = kernels.MirrorView(
+        _float_array(view.fx, view.fy, view.cx, view.cy),
         np.ascontiguousarray(view.camera_from_world.numpy()[:3, :3], np.float32),
         (view.centre - camera.centre).float().numpy(),
         view.width,
         view.height,
     )
-    colors = np.concatenate([*(_flat(level) for level in mirror.levels), _floats(0.0, 0.0)])
+    colors = np.concatenate(
+        [*(_flat_array(level) for level in mirror.levels), _float_array(0.0, 0.0)]
+    )
     levels = np.stack([np.append(0, rows[:-1].cumsum()) * view.width, rows])
-    return mirrored, colors, levels, _flat(mirror.depth)
+    return mirrored, colors, levels, _flat_array(mirror.depth)
 
 
-def _water(film: Film) -> tuple[kernels.Water, np.ndarray]:
-    numbers = np.float32(film.wetness), np.float32(film.level), *numbers_of(film.rings)
-    return kernels.Water(*numbers), mottle_table().reshape(-1)
+def _water_arrays(film: Film) -> tuple[kernels.WaterOnGround, np.ndarray]:
+    """Return the water and the mottle table as kernels take them."""
+    numbers = np.float32(film.wetness), np.float32(film.puddle_threshold), *ring_arrays(film.rings)
+    return kernels.WaterOnGround(*numbers), make_mottle_table().reshape(-1)

@@ -1,11 +1,13 @@
-"""Rings that drops draw on standing water: the torch definition.
+"""Draws the rings of drops on standing water: the torch definition.
 
-The plane is cut into squares. In each, a few drops at a time meet the water: which and where is a
-hash of the square, the drop's number and how often it has fallen, so that the rings at a moment are
-a pure function of seed, place and time. A ring of capillary waves runs at their least speed
-and fades; its slope at a distance d from the drop, at an age of a share t of its life, is
+Callers: wet ground (`ring_slopes`) and floods (`with_rings`). The plane is cut into squares. In
+each square, a few drops at a time meet the water; a hash of the square, the drop's number and the
+number of its falls says which drops fall and where. So the rings at a moment are a pure function of
+seed, place and time. A ring of capillary waves runs at their least speed and fades. Its slope at a
+distance d from the drop, at an age of a share t of its life, is
 
-    SLOPE (1 - t)^2 sin(2 pi x / WAVE_M) exp(-(x / WIDTH_M)^2),   x = d - SPEED_MPS age
+    RING_SLOPE (1 - t)^2 sin(2 pi x / RING_WAVE_M) exp(-(x / RING_WIDTH_M)^2),   x = d - SPEED_MPS
+    age
 
 along the line to the drop. Drops beyond those few, and rings too fine for a pixel, are a variance
 of slope, of the same sum.
@@ -25,61 +27,74 @@ from augment.cameras import Camera
 from augment.effects.flood.waves import WaveField
 from augment.effects.wet import kernels
 from augment.effects.wet.kernels import (
-    ENDS,
     FADED_PX,
     FULL_PX,
-    LEAST_FALL,
-    LEAST_SINE,
     LIFE_NS,
     MAX_DROPS,
-    SLOPE,
+    MIN_FALL,
+    MIN_FOOTPRINT_SINE,
+    RING_END_WIDTHS,
+    RING_SLOPE,
+    RING_WAVE_M,
+    RING_WIDTH_M,
     SPEED_MPS,
     SQUARE_M,
-    WAVE_M,
-    WIDTH_M,
 )
 from augment.render.buffers import AUTO, CPU, kernels_for
 from augment.render.threads import kernel_threads
 from augment.rng import MIX_A, MIX_B, STEP_X, STEP_Y
 
 _LIFE_S = LIFE_NS * 1e-9
-# Mean square of the slopes of one ring, over its life, times its area: m2.
+# Mean square of the slopes of one ring over its life, times its area, m2.
 RING_M2 = (
-    0.5 * SLOPE**2 * (2 * math.pi * SPEED_MPS * _LIFE_S / 30) * WIDTH_M * math.sqrt(math.pi / 2)
+    0.5
+    * RING_SLOPE**2
+    * (2 * math.pi * SPEED_MPS * _LIFE_S / 30)
+    * RING_WIDTH_M
+    * math.sqrt(math.pi / 2)
 )
 
 
 class Rings(NamedTuple):
-    """Of one moment. share: of the squares' drops that fall. variance: of all slopes. unseen: of
-    those that are drawn nowhere. seed, timestamp_ns: what the drops are a function of.
-    """
+    """Rings at one moment."""
 
-    share: float
-    variance: float
-    unseen: float
-    seed: int
-    timestamp_ns: int
+    share: float  # share of the squares' drops that fall
+    variance: float  # variance of all slopes
+    unseen: float  # variance of the slopes of drops that are not drawn
+    seed: int  # seed of the drops
+    timestamp_ns: int  # the moment
 
 
-def drops_per_m2_s(rate_mm_h: float, least_mm: float = 1.0) -> float:
-    """Drops wider than `least_mm` that meet level ground: the sizes of Marshall and Palmer (1948),
-    N = 8000 exp(-L D) / (m3 mm), L = 4.1 R^-0.21 / mm, at the speeds of Atlas et al. (1973), v =
-    9.65 - 10.3 exp(-0.6 D) m/s, integrated in closed form.
+def drops_per_m2_s(rate_mm_h: float, min_diameter_mm: float = 1.0) -> float:
+    """Return the rate of drops wider than `min_diameter_mm` that meet level ground, 1/(m2 s).
+
+    Sizes follow Marshall and Palmer (1948), N = 8000 exp(-L D) / (m3 mm), L = 4.1 R^-0.21 / mm.
+    Speeds follow Atlas et al. (1973), v = 9.65 - 10.3 exp(-0.6 D) m/s. The integral is in closed
+    form.
     """
     if rate_mm_h <= 0:
         return 0.0
-    rate = 4.1 * rate_mm_h**-0.21
-    fast, slow = rate, rate + 0.6
+    slope_per_mm = 4.1 * rate_mm_h**-0.21
+    first_exponent = slope_per_mm
+    second_exponent = slope_per_mm + 0.6
     return 8000 * (
-        9.65 * math.exp(-fast * least_mm) / fast - 10.3 * math.exp(-slow * least_mm) / slow
+        9.65 * math.exp(-first_exponent * min_diameter_mm) / first_exponent
+        - 10.3 * math.exp(-second_exponent * min_diameter_mm) / second_exponent
     )
 
 
 def rings_of(rate_mm_h: float, seed: int, timestamp_ns: int) -> Rings:
-    at_once = drops_per_m2_s(rate_mm_h) * _LIFE_S  # rings per m2
-    most = MAX_DROPS / SQUARE_M**2
-    unseen = max(at_once - most, 0.0) * RING_M2
-    return Rings(min(at_once / most, 1.0), at_once * RING_M2, unseen, seed, timestamp_ns)
+    """Return the rings of rain at a moment."""
+    rings_per_m2 = drops_per_m2_s(rate_mm_h) * _LIFE_S  # rings per m2
+    max_rings_per_m2 = MAX_DROPS / SQUARE_M**2
+    unseen_variance = max(rings_per_m2 - max_rings_per_m2, 0.0) * RING_M2
+    return Rings(
+        min(rings_per_m2 / max_rings_per_m2, 1.0),
+        rings_per_m2 * RING_M2,
+        unseen_variance,
+        seed,
+        timestamp_ns,
+    )
 
 
 def ring_slopes(
@@ -88,108 +103,131 @@ def ring_slopes(
     y_m: Float[Tensor, "*P"],
     footprint_m: Float[Tensor, "*P"],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Slopes towards x and y, and the variance of what is not in them, at points of the plane
-    (float64, world). footprint_m: what a pixel covers along the view.
+    """Return slopes towards x and y, and the variance of what is not in them, at points.
+
+    Args:
+        rings: rings of the moment.
+        x_m: world.
+        y_m: world.
+        footprint_m: length that a pixel covers along the view.
     """
-    x, y = x_m.double(), y_m.double()
-    shown = ((WAVE_M / footprint_m.clamp_min(1e-9) - FADED_PX) / (FULL_PX - FADED_PX)).clamp(0, 1)
-    shown = (shown * shown * (3 - 2 * shown)).double()
-    i, j = torch.floor(x / SQUARE_M).long(), torch.floor(y / SQUARE_M).long()
-    slope_x, slope_y = torch.zeros_like(x), torch.zeros_like(y)
+    x = x_m.double()
+    y = y_m.double()
+    visible_share = (
+        (RING_WAVE_M / footprint_m.clamp_min(1e-9) - FADED_PX) / (FULL_PX - FADED_PX)
+    ).clamp(0, 1)
+    visible_share = (visible_share * visible_share * (3 - 2 * visible_share)).double()
+    i = torch.floor(x / SQUARE_M).long()
+    j = torch.floor(y / SQUARE_M).long()
+    slope_x = torch.zeros_like(x)
+    slope_y = torch.zeros_like(y)
     for di in (-1, 0, 1):
         for dj in (-1, 0, 1):
             for drop in range(MAX_DROPS):
                 u, v, age = _drop(rings, i + di, j + dj, drop)
-                dx, dy = x - (i + di + u) * SQUARE_M, y - (j + dj + v) * SQUARE_M
-                d = torch.sqrt(dx * dx + dy * dy).clamp_min(1e-4)
-                off = d - SPEED_MPS * _LIFE_S * age
-                s = SLOPE * (1 - age) ** 2 * torch.exp(-((off / WIDTH_M) ** 2))
-                s = s * torch.sin(2 * math.pi * off / WAVE_M) / d
-                s = torch.where(off.abs() > ENDS * WIDTH_M, 0.0, s)
-                slope_x, slope_y = slope_x + s * dx, slope_y + s * dy
-    variance = rings.variance + (rings.unseen - rings.variance) * shown**2
-    return (slope_x * shown).float(), (slope_y * shown).float(), variance.float()
+                dx = x - (i + di + u) * SQUARE_M
+                dy = y - (j + dj + v) * SQUARE_M
+                distance = torch.sqrt(dx * dx + dy * dy).clamp_min(1e-4)
+                crest_distance = distance - SPEED_MPS * _LIFE_S * age
+                s = RING_SLOPE * (1 - age) ** 2 * torch.exp(-((crest_distance / RING_WIDTH_M) ** 2))
+                s = s * torch.sin(2 * math.pi * crest_distance / RING_WAVE_M) / distance
+                s = torch.where(crest_distance.abs() > RING_END_WIDTHS * RING_WIDTH_M, 0.0, s)
+                slope_x = slope_x + s * dx
+                slope_y = slope_y + s * dy
+    variance = rings.variance + (rings.unseen - rings.variance) * visible_share**2
+    return (slope_x * visible_share).float(), (slope_y * visible_share).float(), variance.float()
 
 
 def _drop(rings: Rings, i: Tensor, j: Tensor, drop: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Where in its square (0 to 1) a drop fell last, and the ring's age, 1 for no ring.
+    """Return where in its square (0 to 1) a drop fell last, and the ring's age, 1 for no ring.
 
-    int64 wraps as uint64 does; `_right` shifts as that.
+    int64 wraps as uint64 does; `_shift_right` shifts as uint64.
     """
-    first = _mix(i * _signed(STEP_X) + j * _signed(STEP_Y) + _signed(rings.seed * 8 + drop))
-    passed = rings.timestamp_ns + _right(first, 24) % LIFE_NS
-    again, age = passed // LIFE_NS, (passed % LIFE_NS).double() / LIFE_NS
-    bits = _mix(first ^ (again * _signed(STEP_X)))
-    u, v = _right(bits, 44).double() / 2**20, (_right(bits, 24) & 0xFFFFF).double() / 2**20
-    falls = (bits & 0xFFFFF).double() / 2**20 < rings.share
-    return u, v, torch.where(falls, age, 1.0)
+    drop_bits = _mix_bits(
+        i * _signed(STEP_X) + j * _signed(STEP_Y) + _signed(rings.seed * 8 + drop)
+    )
+    elapsed_ns = rings.timestamp_ns + _shift_right(drop_bits, 24) % LIFE_NS
+    num_falls = elapsed_ns // LIFE_NS
+    age = (elapsed_ns % LIFE_NS).double() / LIFE_NS
+    bits = _mix_bits(drop_bits ^ (num_falls * _signed(STEP_X)))
+    u = _shift_right(bits, 44).double() / 2**20
+    v = (_shift_right(bits, 24) & 0xFFFFF).double() / 2**20
+    has_fallen = (bits & 0xFFFFF).double() / 2**20 < rings.share
+    return u, v, torch.where(has_fallen, age, 1.0)
 
 
-def _mix(bits: Tensor) -> Tensor:
-    """Every bit of the result hangs on every bit of the input (splitmix64)."""
-    bits = (bits ^ _right(bits, 30)) * _signed(MIX_A)
-    bits = (bits ^ _right(bits, 27)) * _signed(MIX_B)
-    return bits ^ _right(bits, 31)
+def _mix_bits(bits: Tensor) -> Tensor:
+    """Mix bits (splitmix64): every bit of the result depends on every bit of the input."""
+    bits = (bits ^ _shift_right(bits, 30)) * _signed(MIX_A)
+    bits = (bits ^ _shift_right(bits, 27)) * _signed(MIX_B)
+    return bits ^ _shift_right(bits, 31)
 
 
-def _right(bits: Tensor, by: int) -> Tensor:
-    return (bits >> by) & ((1 << (64 - by)) - 1)
+def _shift_right(bits: Tensor, num_bits: int) -> Tensor:
+    """Shift right as for uint64."""
+    return (bits >> num_bits) & ((1 << (64 - num_bits)) - 1)
 
 
 def _signed(number: int) -> int:
+    """Return the int64 of the same bits as a uint64."""
     number %= 1 << 64
     return number - (1 << 64) if number >= 1 << 63 else number
 
 
 # ---- On the waves of a flood ---------------------------------------------------------------------
 
-ROWS = 8  # image rows a thread takes at a time
+ROWS_PER_TASK = 8  # number of image rows that a thread takes at a time
 
 
 def with_rings(
     field: WaveField, camera: Camera, level_z_m: float, rings: Rings, *, backend: str = AUTO
 ) -> WaveField:
-    """The surface of a level plane with drops' rings on its waves, where the camera looks down at
-    it. backend: the CPU's kernel equals the definition within float rounding.
+    """Return the surface of a level plane with drops' rings on its waves.
+
+    Rings show where the camera looks down at the plane. backend: the CPU's kernel equals the
+    definition within float rounding.
     """
     height = float(camera.centre[2]) - level_z_m
     if rings.variance == 0 or height <= 0:
         return field
     if kernels_for(backend, field.normal_x) == CPU:
         x, y, variance = (
-            part.clone() for part in (field.normal_x, field.normal_y, field.slope_variance)
+            tensor.clone() for tensor in (field.normal_x, field.normal_y, field.slope_variance)
         )
         pose = camera.world_from_camera.numpy()
-        with kernel_threads(ROWS):
+        with kernel_threads(ROWS_PER_TASK):
             kernels.add_rings(
                 np.ascontiguousarray(pose[:3, :3]),
                 np.ascontiguousarray(pose[:2, 3]),
                 height,
                 np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-                *numbers_of(rings),
-                *(part.numpy() for part in (x, y, variance)),
+                *ring_arrays(rings),
+                *(tensor.numpy() for tensor in (x, y, variance)),
             )
         return WaveField(x, y, variance)
     rays = camera.ray_directions(torch.float64, field.normal_x.device)
-    meets = rays[..., 2] < -LEAST_FALL
-    fall = torch.where(meets, -rays[..., 2], 1.0)
-    away = height / fall
-    centre, length = camera.centre.to(rays.device), rays.norm(dim=-1)
-    x, y = centre[0] + away * rays[..., 0], centre[1] + away * rays[..., 1]
-    footprint = away * length / camera.fy / (fall / length).clamp_min(LEAST_SINE)
-    slope_x, slope_y, rest = ring_slopes(rings, x, y, footprint)
-    nx, ny = field.normal_x, field.normal_y
+    is_hit = rays[..., 2] < -MIN_FALL
+    fall = torch.where(is_hit, -rays[..., 2], 1.0)
+    ray_depth = height / fall
+    centre = camera.centre.to(rays.device)
+    length = rays.norm(dim=-1)
+    x = centre[0] + ray_depth * rays[..., 0]
+    y = centre[1] + ray_depth * rays[..., 1]
+    footprint = ray_depth * length / camera.fy / (fall / length).clamp_min(MIN_FOOTPRINT_SINE)
+    slope_x, slope_y, rest_variance = ring_slopes(rings, x, y, footprint)
+    nx = field.normal_x
+    ny = field.normal_y
     nz = (1 - nx * nx - ny * ny).clamp_min(1e-6).sqrt()
     slopes = torch.stack((nx / nz - slope_x, ny / nz - slope_y, torch.ones_like(nz)), -1)
     tilted = torch.nn.functional.normalize(slopes, dim=-1)
     return WaveField(
-        torch.where(meets, tilted[..., 0], nx),
-        torch.where(meets, tilted[..., 1], ny),
-        torch.where(meets, field.slope_variance + 0.5 * rest, field.slope_variance),
+        torch.where(is_hit, tilted[..., 0], nx),
+        torch.where(is_hit, tilted[..., 1], ny),
+        torch.where(is_hit, field.slope_variance + 0.5 * rest_variance, field.slope_variance),
     )
 
 
-def numbers_of(rings: Rings) -> tuple[np.ndarray, np.uint64, np.int64]:
-    """As kernels take them."""
+def ring_arrays(rings: Rings) -> tuple[np.ndarray, np.uint64, np.int64]:
+    """Return rings as kernels take them."""
     numbers = np.array([rings.share, rings.variance, rings.unseen])
     return numbers, np.uint64(rings.seed * 8 % 2**64), np.int64(rings.timestamp_ns)

@@ -1,10 +1,11 @@
-"""Gradients on the CPU: a render that remembers how it was made, and the way back.
+"""Gradients on the CPU: a render that records how it was made, and its backward pass.
 
     tape = record(inputs, camera, settings, scratch, with_depth=…)   rgb, alpha, expected_depth
     grads = tape.backward(d_rgb, d_alpha, d_expected_depth)          a row a touched Gaussian
 
-The forward pass is `cpu.rasterize_cpu` in a single slice of z, so that every list entry is still
-there when the way back needs it. Bits do not depend on the number of threads.
+The forward pass is that of `cpu.rasterize_cpu` in a single slice of z, so that every list entry
+still exists when the backward pass needs it. Bits do not depend on the number of threads.
+`rasterize` calls `rasterize_with_gradients`; the trainer and `prune` use the tape.
 """
 
 from __future__ import annotations
@@ -40,16 +41,21 @@ from augment.render.sh import sh_basis
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians
 
-_RANGES = 8  # pieces of work in adding up shares
+# Pieces of work in adding up shares.
+_SUM_RANGES = 8
 
 
 @dataclass(frozen=True, eq=False)
 class SplatGradients:
     """dL of every Gaussian that the image shows, block by block (Inputs.blocks).
 
-    Block b has counts[b] rows, from row b BLOCK on. rows: float32 [B BLOCK, GRAD], columns as
-    backward_kernels names them. ids: int32 [B BLOCK], index of the Gaussian in its part.
-    Both live in the tape's scratch: they are overwritten by its next use.
+    Block b has counts[b] rows, from row b BLOCK on. rows and ids live in the tape's scratch: its
+    next use overwrites them.
+
+    rows: float32 [B BLOCK, GRAD], columns as backward_kernels names them.
+    ids: int32 [B BLOCK], index of the Gaussian in its part.
+    counts: int64 [B], rows of each block.
+    blocks: int64 [B, 3], as in Inputs.
     """
 
     rows: np.ndarray
@@ -60,10 +66,10 @@ class SplatGradients:
 
 @dataclass(frozen=True, eq=False)
 class Tape:
-    """A finished render of one camera and what its gradients take.
+    """A finished render of one camera and the arrays that its gradients need.
 
-    rgb [H, W, 3], alpha [H, W], expected_depth [H, W] or None: float32, as RenderOutput's. All
-    arrays live in the scratch that `record` was given.
+    rgb [H, W, 3], alpha [H, W] and expected_depth [H, W] (or None) are float32, as in RenderOutput.
+    All arrays live in the scratch that `record` was given.
     """
 
     inputs: Inputs
@@ -72,7 +78,7 @@ class Tape:
     alpha: np.ndarray
     expected_depth: np.ndarray | None
     splats: Splats
-    listed: TileSplats
+    tile_splats: TileSplats
     frame: Frame
     scratch: Scratch
 
@@ -84,26 +90,30 @@ class Tape:
         *,
         timer: StageTimer | None = None,
     ) -> SplatGradients:
-        """Gradients of a loss with these derivatives by the images, all float32, contiguous."""
+        """Return gradients of a loss with these derivatives by the images, all float32 and
+        contiguous.
+        """
         timer = StageTimer(None) if timer is None else timer
         depth = d_depth = None
         if self.expected_depth is not None and d_expected_depth is not None:
-            weight = np.maximum(self.alpha, np.float32(DEPTH_EPS))
-            depth = self.expected_depth * weight
-            d_depth = d_expected_depth / weight
-            inside = self.alpha > np.float32(DEPTH_EPS)
-            d_alpha = d_alpha - np.where(inside, d_depth * self.expected_depth, np.float32(0))
-        scratch, inputs = self.scratch, self.inputs
-        slots, blocks = inputs.slots, len(inputs.blocks)
+            alpha_floor = np.maximum(self.alpha, np.float32(DEPTH_EPS))
+            depth = self.expected_depth * alpha_floor
+            d_depth = d_expected_depth / alpha_floor
+            is_covered = self.alpha > np.float32(DEPTH_EPS)
+            d_alpha = d_alpha - np.where(is_covered, d_depth * self.expected_depth, np.float32(0))
+        scratch = self.scratch
+        inputs = self.inputs
+        slots = inputs.slots
+        blocks = len(inputs.blocks)
         rows = scratch.array("grads", (slots, backward_kernels.GRAD), np.float32)
         ids = scratch.array("grad_ids", (slots,), np.int32)
         counts = scratch.array("grad_counts", (blocks,), np.int64)
         images = (self.rgb, self.alpha, depth, d_rgb, d_alpha, d_depth)
         slopes = backward_kernels.Slopes(*(None if i is None else i.reshape(-1) for i in images))
         with kernel_threads():
-            sums, touched = self._sum_shares(slopes, timer)
+            sums, is_touched = self._sum_shares(slopes, timer)
             backward_kernels.project_backward(
-                inputs.read, self.splats, touched, sums, rows.reshape(-1), ids, counts
+                inputs.read, self.splats, is_touched, sums, rows.reshape(-1), ids, counts
             )
             timer.end_stage("project backward")
         return SplatGradients(rows, ids, counts, inputs.blocks)
@@ -111,38 +121,50 @@ class Tape:
     def splat_effects(
         self, d_rgb: np.ndarray, d_alpha: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of every splat in the frame: its number, the sum of its weights times the loss's
-        derivative by red, and of its alphas times the loss's derivatives by them.
+        """Return numbers, summed weights and summed effects on alpha of the frame's splats.
+
+        Returns:
+            For every splat in the frame: its number, the sum of its weights times the loss's
+            derivative by red, and the sum of its alphas times the loss's derivatives by them.
         """
         images = (self.rgb, self.alpha, None, d_rgb, d_alpha, None)
         slopes = backward_kernels.Slopes(*(None if i is None else i.reshape(-1) for i in images))
         with kernel_threads():
-            sums, touched = self._sum_shares(slopes, StageTimer(None))
-        there = np.arange(BLOCK) < self.splats.found[:, None]  # [B, BLOCK]
-        there, records = there.reshape(-1), self.splats.records.reshape(-1, RECORD)
-        ids = records[there, SPLAT_ID].view(np.int32)
-        shares = sums.reshape(-1, backward_kernels.SHARE)[there]
-        shares[touched[there] == 0] = 0  # where no light came is whatever lay there
+            sums, is_touched = self._sum_shares(slopes, StageTimer(None))
+        is_filled = np.arange(BLOCK) < self.splats.splat_counts[:, None]  # [B, BLOCK]
+        is_filled = is_filled.reshape(-1)
+        records = self.splats.records.reshape(-1, RECORD)
+        ids = records[is_filled, SPLAT_ID].view(np.int32)
+        shares = sums.reshape(-1, backward_kernels.SHARE)[is_filled]
+        shares[is_touched[is_filled] == 0] = 0  # these slots hold what the last use left
         by_log2 = shares[:, backward_kernels.S_0]
         return ids, shares[:, backward_kernels.S_RED], by_log2 / np.float32(math.log(2))
 
     def _sum_shares(
         self, slopes: backward_kernels.Slopes, timer: StageTimer
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What all tiles say of every slot, and which slots any light came to."""
-        scratch, listed, slots = self.scratch, self.listed, self.inputs.slots
-        entries = len(listed.tile_splat_ids)
+        """Return the sums of all tiles' shares for every slot, and the slots that light reached."""
+        scratch = self.scratch
+        tile_splats = self.tile_splats
+        slots = self.inputs.slots
+        entries = len(tile_splats.tile_splat_ids)
         shares = scratch.array("shares", (entries * backward_kernels.SHARE,), np.float32)
-        reached = scratch.array("reached", (len(listed.tile_offsets) - 1,), np.int64)
+        num_reached = scratch.array("reached", (len(tile_splats.tile_offsets) - 1,), np.int64)
         sums = scratch.array("sums", (slots * backward_kernels.SHARE,), np.float32)
-        touched = scratch.array("touched", (slots,), np.uint8)
-        backward_kernels.blend_backward(listed, self.frame, slopes, shares, reached)
+        is_touched = scratch.array("touched", (slots,), np.uint8)
+        backward_kernels.blend_backward(tile_splats, self.frame, slopes, shares, num_reached)
         timer.end_stage("raster backward")
         backward_kernels.sum_shares(
-            listed.tile_splat_ids, listed.tile_offsets, reached, shares, _RANGES, sums, touched
+            tile_splats.tile_splat_ids,
+            tile_splats.tile_offsets,
+            num_reached,
+            shares,
+            _SUM_RANGES,
+            sums,
+            is_touched,
         )
         timer.end_stage("sum backward")
-        return sums, touched
+        return sums, is_touched
 
 
 def record(
@@ -154,10 +176,10 @@ def record(
     with_depth: bool,
     timer: StageTimer | None = None,
 ) -> Tape:
-    """Render colour, alpha and, if asked for, expected depth, and keep what `backward` needs.
+    """Render colour, alpha and, if asked for, expected depth, and keep the arrays of `backward`.
 
     Raises:
-        ValueError: the camera is orthographic; the way back knows pinhole cameras only.
+        ValueError: the camera is orthographic; the gradients are those of pinhole cameras.
     """
     if camera.is_orthographic:
         raise ValueError(
@@ -179,13 +201,19 @@ def record(
         timer.end_stage("bin")
         timer.count("visible", len(slots))
         timer.count("pairs", len(tile_splat_ids))
-        listed = tiles.blend_lists(splats, tile_splat_ids, tile_offsets, is_last=True)
+        tile_splats = tiles.blend_lists(splats, tile_splat_ids, tile_offsets, is_last=True)
         timer.end_stage("raster")
     return Tape(
-        inputs=inputs, camera=camera, rgb=images[RGB], alpha=images[ALPHA],
-        expected_depth=images.get(EXPECTED_DEPTH), splats=splats, listed=listed,
-        frame=tiles.frame, scratch=scratch,
-    )  # fmt: skip
+        inputs=inputs,
+        camera=camera,
+        rgb=images[RGB],
+        alpha=images[ALPHA],
+        expected_depth=images.get(EXPECTED_DEPTH),
+        splats=splats,
+        tile_splats=tile_splats,
+        frame=tiles.frame,
+        scratch=scratch,
+    )
 
 
 # ---- The CPU rasteriser as a torch operation: forward and backward through the kernels -----------
@@ -201,20 +229,22 @@ def rasterize_with_gradients(
     buffers: frozenset[str],
     settings: RasterSettings,
 ) -> RenderOutput:
-    """As `cpu.rasterize_cpu` without fog, recorded by autograd. buffers: some of DIFFERENTIABLE.
+    """Return `cpu.rasterize_cpu` without fog, recorded by autograd.
 
-    All splats are listed at once instead of slice by slice, so this takes more memory than a plain
+    All splats are listed at once instead of slice by slice. So this takes more memory than a plain
     render: 48 bytes for every pair of a splat and a tile, kept until backward.
+
+    buffers: some of DIFFERENTIABLE.
     """
     tensors = [getattr(part.gaussians, name) for part in parts for name in _FIELDS]
-    setting = _Setting(tuple(parts), camera, settings, EXPECTED_DEPTH in buffers)
-    rgb, alpha, depth = _Rasterize.apply(setting, *tensors)
+    arguments = _OperationArguments(tuple(parts), camera, settings, EXPECTED_DEPTH in buffers)
+    rgb, alpha, depth = _Rasterize.apply(arguments, *tensors)
     images = {RGB: rgb, ALPHA: alpha, EXPECTED_DEPTH: depth}
     return RenderOutput(**{name: images[name] for name in buffers})
 
 
-class _Setting(NamedTuple):
-    """What an operation is told besides its tensors."""
+class _OperationArguments(NamedTuple):
+    """Arguments of an operation besides its tensors."""
 
     parts: tuple[PosedGaussians, ...]
     camera: Camera
@@ -223,21 +253,26 @@ class _Setting(NamedTuple):
 
 
 class _Rasterize(torch.autograd.Function):
+    """The render as an autograd operation; its tensors are those of all parts, part by part."""
+
     @staticmethod
-    def forward(ctx: Any, setting: _Setting, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        ctx: Any, arguments: _OperationArguments, *tensors: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         parts = [
             PosedGaussians(
-                Gaussians(**{n: t.detach() for n, t in zip(_FIELDS, own, strict=True)}),
+                Gaussians(**{n: t.detach() for n, t in zip(_FIELDS, part_tensors, strict=True)}),
                 part.world_from_part,
                 part.instance_id,
             )
-            for part, own in zip(setting.parts, _groups(tensors), strict=True)
+            for part, part_tensors in zip(arguments.parts, _group_by_part(tensors), strict=True)
         ]
-        inputs = gather_inputs(parts, setting.camera, setting.settings, None, with_color=True)
+        inputs = gather_inputs(parts, arguments.camera, arguments.settings, None, with_color=True)
         tape = record(
-            inputs, setting.camera, setting.settings, Scratch(), with_depth=setting.with_depth
+            inputs, arguments.camera, arguments.settings, Scratch(), with_depth=arguments.with_depth
         )
-        ctx.tape, ctx.setting = tape, setting
+        ctx.tape = tape
+        ctx.arguments = arguments
         ctx.save_for_backward(*tensors)  # so that a change in place is noticed
         depth = np.zeros_like(tape.alpha) if tape.expected_depth is None else tape.expected_depth
         # Copies: the tape keeps its own images, whatever is done to these.
@@ -256,15 +291,18 @@ class _Rasterize(torch.autograd.Function):
         grads = tape.backward(
             d_rgb.contiguous().numpy(),
             d_alpha.contiguous().numpy(),
-            d_depth.contiguous().numpy() if ctx.setting.with_depth else None,
+            d_depth.contiguous().numpy() if ctx.arguments.with_depth else None,
         )
-        out: list[Tensor | None] = [None]
-        for number, own in enumerate(_groups(ctx.saved_tensors)):
-            out += _part_gradients(grads, number, own, tape.inputs.views[number], ctx.setting)
-        return tuple(out)
+        gradients: list[Tensor | None] = [None]
+        for number, part_tensors in enumerate(_group_by_part(ctx.saved_tensors)):
+            gradients += _part_gradients(
+                grads, number, part_tensors, tape.inputs.views[number], ctx.arguments
+            )
+        return tuple(gradients)
 
 
-def _groups(tensors: Sequence[Tensor]) -> list[Sequence[Tensor]]:
+def _group_by_part(tensors: Sequence[Tensor]) -> list[Sequence[Tensor]]:
+    """Return the tensors of each part."""
     return [tensors[i : i + len(_FIELDS)] for i in range(0, len(tensors), len(_FIELDS))]
 
 
@@ -273,31 +311,35 @@ def _part_gradients(
     number: int,
     tensors: Sequence[Tensor],
     view: np.ndarray,
-    setting: _Setting,
+    arguments: _OperationArguments,
 ) -> list[Tensor]:
-    """Dense gradients of one part's five tensors; zero where the image shows nothing of a splat."""
+    """Return dense gradients of one part's five tensors; zero for splats that the image does not
+    show.
+    """
     blocks = np.flatnonzero(grads.blocks[:, 0] == number)
-    used = [np.arange(b * BLOCK, b * BLOCK + grads.counts[b]) for b in blocks]
-    at = np.concatenate(used) if used else np.zeros(0, np.int64)
-    index = torch.from_numpy(grads.ids[at].astype(np.int64))
-    own = torch.from_numpy(grads.rows[at].copy())
+    block_rows = [np.arange(b * BLOCK, b * BLOCK + grads.counts[b]) for b in blocks]
+    rows = np.concatenate(block_rows) if block_rows else np.zeros(0, np.int64)
+    index = torch.from_numpy(grads.ids[rows].astype(np.int64))
+    gradient_rows = torch.from_numpy(grads.rows[rows].copy())
     means, quats, scales, opacities, sh = (t.detach() for t in tensors)
     d_sh = torch.zeros_like(sh)
     degree = int(sh.shape[1] ** 0.5) - 1
-    if setting.settings.sh_degree is not None:
-        degree = min(degree, setting.settings.sh_degree)
+    if arguments.settings.sh_degree is not None:
+        degree = min(degree, arguments.settings.sh_degree)
     eye = torch.from_numpy(view[V_EYE : V_EYE + 3].copy())
-    rest = torch.from_numpy(view[V_EYE + 3 : V_EYE + 6].copy())
-    directions = torch.nn.functional.normalize(means[index] - eye - rest, dim=-1)
+    eye_remainder = torch.from_numpy(view[V_EYE + 3 : V_EYE + 6].copy())
+    directions = torch.nn.functional.normalize(means[index] - eye - eye_remainder, dim=-1)
     basis = sh_basis(directions, degree)  # [M, K']
-    color = own[:, backward_kernels.G_COLOR : backward_kernels.G_COLOR + 3]
+    color = gradient_rows[:, backward_kernels.G_COLOR : backward_kernels.G_COLOR + 3]
     d_sh[index, : basis.shape[1]] = basis[:, :, None] * color[:, None, :]
-    d_quats = own[:, backward_kernels.G_QUAT : backward_kernels.G_QUAT + 4]
-    d_scales = own[:, backward_kernels.G_SCALE : backward_kernels.G_SCALE + 3] / scales[index]
-    d_opacities = own[:, backward_kernels.G_OPACITY] / opacities[index]
+    d_quats = gradient_rows[:, backward_kernels.G_QUAT : backward_kernels.G_QUAT + 4]
+    d_scales = (
+        gradient_rows[:, backward_kernels.G_SCALE : backward_kernels.G_SCALE + 3] / scales[index]
+    )
+    d_opacities = gradient_rows[:, backward_kernels.G_OPACITY] / opacities[index]
     at_mean = backward_kernels.G_MEAN
     return [
-        torch.zeros_like(means).index_copy(0, index, own[:, at_mean : at_mean + 3]),
+        torch.zeros_like(means).index_copy(0, index, gradient_rows[:, at_mean : at_mean + 3]),
         torch.zeros_like(quats).index_copy(0, index, d_quats),
         torch.zeros_like(scales).index_copy(0, index, d_scales),
         torch.zeros_like(opacities).index_copy(0, index, d_opacities),

@@ -1,17 +1,19 @@
-"""Numba kernel: from gradients of the image to gradients of every splat of every tile's list.
+"""Numba kernels from gradients of the image to gradients of every Gaussian.
 
-The forward blend is repeated front to back. With q_i = dL/dw_i, the same for all that a weight
-w_i = alpha_i T_i is multiplied with, and rest_i = sum of w_j q_j behind splat i,
+The forward blend is repeated front to back. Let q_i = dL/dw_i, the sum of the terms that a weight
+w_i = alpha_i T_i is multiplied with, and behind_i the sum of w_j q_j behind splat i. Then
 
-    dL/dalpha_i = T_i q_i - rest_i / (1 - alpha_i),
+    dL/dalpha_i = T_i q_i - behind_i / (1 - alpha_i),
 
-where rest starts as the sum over the whole pixel, known from the finished image, and loses w_i q_i
-at every splat: no transmittance is ever divided by.
+where `behind` starts as the sum over the whole pixel, known from the finished image, and loses
+w_i q_i at every splat. So nothing is divided by a transmittance.
 
 A splat's share of a tile is kept as sums over its pixels of g = dL/de (e: log2 of alpha, see
 augment.render.layout) times powers of `off` (sharp pixels off the ridge) and `dy`, from which
-project_backward derives everything geometric. Each list entry has its own place for them, so
-nothing is added in an order that depends on threads.
+project_backward derives the gradients of the geometry. Each list entry has its own place for them,
+so no order of addition depends on threads.
+
+`cpu.backward` launches blend_backward, sum_shares and project_backward, in this order.
 """
 
 from __future__ import annotations
@@ -51,21 +53,25 @@ from augment.render.cpu.project import add_direction_slopes
 from augment.render.cpu.simd import LOG2_E, floats_at
 from augment.render.layout import BLOCK, LANES, PIXELS, RECORD, STRIP, STRIPS, TILE_H, TILE_W, U
 
-# Of a list entry, one cache line: sums of g, g off, g off^2, g dy, g off dy, g dy^2, and of
-# |dL/d mean| along x (over 2 sharp) and y (over 2); then dL/d colour (3) and z.
+# Sums of a list entry, one cache line: of g, g off, g off^2, g dy, g off dy, g dy^2, and of
+# |dL/d mean| along x (over 2 sharp) and y (over 2); then dL/d colour (3) and dL/d z.
 SHARE = 16
 S_0, S_X, S_XX, S_Y, S_XY, S_YY, S_ABS_X, S_ABS_Y, S_RED, S_GREEN, S_BLUE, S_DEPTH = range(12)
 
-# Planes of a tile: transmittance as in blend, what lies behind, and the pixel's gradients.
-TRANSMITTANCE, REST, G_RED, G_GREEN, G_BLUE, G_ALPHA, G_DEPTH = (U(i * PIXELS) for i in range(7))
+# Planes of a tile: transmittance as in blend, `behind`, and the pixel's gradients.
+TRANSMITTANCE, BEHIND, G_RED, G_GREEN, G_BLUE, G_ALPHA, G_DEPTH = (U(i * PIXELS) for i in range(7))
 PLANES = 7 * PIXELS
-GROUP = 4  # tiles a thread takes at a time
+# Tiles that a thread takes at a time.
+GROUP = 4
 _LN2 = np.float32(math.log(2))
 
 
 class Slopes(NamedTuple):
-    """rgb, alpha: flat images as rendered; depth: sum of weights times z. d_rgb, d_alpha, d_depth:
-    the loss's derivatives by them. depth and d_depth may be None.
+    """Images and the loss's derivatives by them, flat.
+
+    rgb, alpha: images as rendered.
+    depth: sum of weights times z; may be None.
+    d_rgb, d_alpha, d_depth: derivatives of the loss by them; d_depth may be None.
     """
 
     rgb: Any
@@ -77,35 +83,53 @@ class Slopes(NamedTuple):
 
 
 @kernel
-def blend_backward(splats, frame, slopes, shares, reached):
-    """dL of every list entry that the forward blend came to.
+def blend_backward(splats, frame, slopes, shares, num_reached):
+    """Write dL of every list entry that the forward blend reached.
 
-    splats, frame: as for blend.blend_tiles, in one slice. shares: float32 [entries * SHARE], filled
-    up to reached[tile] (int64, tiles) entries of each list.
+    Args:
+        splats, frame: as for blend.blend_tiles, in one slice.
+        slopes: images and derivatives.
+        shares: float32 [entries * SHARE], written up to num_reached[tile] entries of each list.
+        num_reached: int64 [tiles], written.
     """
-    for group in prange((reached.size + GROUP - 1) // GROUP):
-        columns, s = (frame.size[0] + TILE_W - 1) // TILE_W, slopes
-        state, rows = np.empty(PLANES, np.float32), np.empty(2 * STRIPS, np.int64)
-        staged, spans = aligned_floats(RECORD * BATCH), np.empty(2 * BATCH, np.int32)
-        values, places = np.empty(2 * ITEMS, np.float32), np.empty(ITEMS, np.int32)
+    for group in prange((num_reached.size + GROUP - 1) // GROUP):
+        columns = (frame.size[0] + TILE_W - 1) // TILE_W
+        s = slopes
+        state = np.empty(PLANES, np.float32)
+        rows = np.empty(2 * STRIPS, np.int64)
+        staged = aligned_floats(RECORD * BATCH)
+        spans = np.empty(2 * BATCH, np.int32)
+        values = np.empty(2 * ITEMS, np.float32)
+        places = np.empty(ITEMS, np.int32)
         starts = aligned_floats(STARTS)
         work = Work(state, staged, spans, starts, values, places, rows, None, None, None, None)
-        for tile in range(group * GROUP, min((group + 1) * GROUP, reached.size)):
-            first, last = splats.tile_offsets[tile], splats.tile_offsets[tile + 1]
-            left, top = tile % columns * TILE_W, tile // columns * TILE_H
+        for tile in range(group * GROUP, min((group + 1) * GROUP, num_reached.size)):
+            first = splats.tile_offsets[tile]
+            last = splats.tile_offsets[tile + 1]
+            left = tile % columns * TILE_W
+            top = tile // columns * TILE_H
             if first < last:
                 _load_tile(
-                    state, left, top, frame.size, s.rgb, s.alpha, s.depth, s.d_rgb, s.d_alpha,
+                    state,
+                    left,
+                    top,
+                    frame.size,
+                    s.rgb,
+                    s.alpha,
+                    s.depth,
+                    s.d_rgb,
+                    s.d_alpha,
                     s.d_depth,
-                )  # fmt: skip
+                )
             corner = (np.float32(left), np.float32(top))
-            reached[tile] = _replay_list(
+            num_reached[tile] = _replay_list(
                 splats, first, last, corner, frame.limits, work, slopes.d_depth, shares
             )
 
 
 @inner()
 def _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_depth):
+    """Load the gradients of a tile's pixels, and the sums that lie behind their first splat."""
     for pixel in range(U(PIXELS)):
         x = left + np.int64(pixel // U(STRIP) * U(LANES) + pixel % U(LANES))
         y = top + np.int64(pixel % U(STRIP) // U(LANES))
@@ -116,9 +140,11 @@ def _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_dept
             continue
         at = U(y * size[0] + x)
         first = U(3) * at
-        red, green, blue = d_rgb[first], d_rgb[first + U(1)], d_rgb[first + U(2)]
-        rest = red * rgb[first] + green * rgb[first + U(1)] + blue * rgb[first + U(2)]
-        rest += d_alpha[at] * alpha[at]
+        red = d_rgb[first]
+        green = d_rgb[first + U(1)]
+        blue = d_rgb[first + U(2)]
+        behind = red * rgb[first] + green * rgb[first + U(1)] + blue * rgb[first + U(2)]
+        behind += d_alpha[at] * alpha[at]
         state[pixel] = np.float32(1)
         state[G_RED + pixel] = red
         state[G_GREEN + pixel] = green
@@ -126,18 +152,26 @@ def _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_dept
         state[G_ALPHA + pixel] = d_alpha[at]
         if d_depth is not None:
             state[G_DEPTH + pixel] = d_depth[at]
-            rest += d_depth[at] * depth[at]
-        state[REST + pixel] = rest
+            behind += d_depth[at] * depth[at]
+        state[BEHIND + pixel] = behind
 
 
 @inner()
 def _replay_list(splats, first, last, corner, limits, work, d_depth, shares):
-    """Fill the shares of a tile's list as far as light reaches; returns how far that is."""
-    state, staged, spans, rows = work.state, work.staged, work.spans, work.rows
-    values, places, starts = work.values, work.places, work.starts
-    records, ids, columns = splats.records, splats.tile_splat_ids, v8.lane_numbers()
+    """Fill the shares of a tile's list as far as light reaches, and return how far that is."""
+    state = work.state
+    staged = work.staged
+    spans = work.spans
+    rows = work.rows
+    values = work.values
+    places = work.places
+    starts = work.starts
+    records = splats.records
+    ids = splats.tile_splat_ids
+    columns = v8.lane_numbers()
     for strip in range(STRIPS):
-        rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
+        rows[2 * strip] = 0
+        rows[2 * strip + 1] = TILE_H
         if first < last:
             shrink(state, strip, rows, columns)
     for at in range(first, last, BATCH):
@@ -152,12 +186,12 @@ def _replay_list(splats, first, last, corner, limits, work, d_depth, shares):
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
-            found = find_spans(staged, count, strip, rows, limits[1], spans, starts)
-            list_items(staged, found, U(strip), spans, starts, columns, values, places)
+            span_bits = find_spans(staged, count, strip, rows, limits[1], spans, starts)
+            list_items(staged, span_bits, U(strip), spans, starts, columns, values, places)
             item = U(0)
-            while found != U(0):
-                k = v8.lowest_bit(found)
-                found &= found - U(1)
+            while span_bits != U(0):
+                k = v8.lowest_bit(span_bits)
+                span_bits &= span_bits - U(1)
                 end = item + U(spans[U(BATCH) + k] - spans[k])
                 _add_share(work, k, item, end, limits, d_depth, shares, (U(at) + k) * U(SHARE))
                 item = end
@@ -167,50 +201,81 @@ def _replay_list(splats, first, last, corner, limits, work, d_depth, shares):
 
 @inner()
 def _add_share(work, k, item, end, limits, d_depth, shares, share):
-    """Blend one splat into its rows of a strip, adding what each pixel says of it."""
-    state, staged, values, places = work.state, work.staged, work.values, work.places
+    """Blend one splat into its rows of a strip, and add its pixels' gradients to its share."""
+    state = work.state
+    staged = work.staged
+    values = work.values
+    places = work.places
     n = U(BATCH)
-    alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
-    least, end_light = v8.splat(limits[2]), v8.splat(limits[7])
-    zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
+    alpha_max = v8.splat(limits[0])
+    log_cut = v8.splat(limits[1])
+    min_transmittance = v8.splat(limits[2])
+    stop = v8.splat(limits[7])
+    zeros = v8.splat(np.float32(0))
+    ones = v8.splat(np.float32(1))
+    # Shape and colour of the splat in all lanes.
     sharp = staged[U(L.SHARP_X) * n + k]
     fall = v8.splat(staged[U(L.FALL_Y) * n + k])
     tilt = v8.splat(-sharp * staged[U(L.LEAN_X) * n + k])
-    steps, ln2 = v8.splat(sharp), v8.splat(_LN2)
-    red, green = v8.splat(staged[U(L.RED) * n + k]), v8.splat(staged[U(L.GREEN) * n + k])
-    blue, z = v8.splat(staged[U(L.BLUE) * n + k]), zero
+    steps = v8.splat(sharp)
+    ln2 = v8.splat(_LN2)
+    red = v8.splat(staged[U(L.RED) * n + k])
+    green = v8.splat(staged[U(L.GREEN) * n + k])
+    blue = v8.splat(staged[U(L.BLUE) * n + k])
+    z = zeros
     if d_depth is not None:
         z = v8.splat(staged[U(L.DEPTH) * n + k])
-    s0, sx, sxx, sy, sxy, syy = zero, zero, zero, zero, zero, zero
-    sr, sg, sb, sz, ax, ay = zero, zero, zero, zero, zero, zero
+    # Sums over the pixels: of g and its products, of colour and depth, of |dL/d mean|.
+    s0 = zeros
+    sx = zeros
+    sxx = zeros
+    sy = zeros
+    sxy = zeros
+    syy = zeros
+    sr = zeros
+    sg = zeros
+    sb = zeros
+    sz = zeros
+    ax = zeros
+    ay = zeros
     for i in range(item, end):
-        at = U(places[i]) % U(PLACES) * U(LANES)
-        row = np.float32(at % U(STRIP) // U(LANES)) + np.float32(0.5)
+        # Alpha, weight and transmittance, as in the forward blend.
+        pixel = U(places[i]) % U(PLACES) * U(LANES)
+        row = np.float32(pixel % U(STRIP) // U(LANES)) + np.float32(0.5)
         dy = v8.splat(row - staged[U(L.MEAN_Y) * n + k])
         off = v8.fmuladd(steps, v8.lane_numbers(), v8.splat(values[i + U(ITEMS)]))
-        e = v8.fmuladd(v8.negate(off), off, v8.splat(values[i]))
-        alpha = alpha_of(e, alpha_max, log_cut)
-        transmittance = v8.load(state, at)
+        log_alpha = v8.fmuladd(v8.negate(off), off, v8.splat(values[i]))
+        alpha = alpha_of(log_alpha, alpha_max, log_cut)
+        transmittance = v8.load(state, pixel)
         weight = alpha * transmittance
-        after = transmittance - weight
-        kept = v8.greater(after, least)
-        weight = v8.select(kept, weight, zero)
-        v8.store(state, at, remaining_transmittance(transmittance, after, kept, end_light))
-        g_red, g_green = v8.load(state, at + G_RED), v8.load(state, at + G_GREEN)
-        g_blue = v8.load(state, at + G_BLUE)
-        q = v8.fmuladd(g_red, red, v8.load(state, at + G_ALPHA))
+        transmittance_behind = transmittance - weight
+        is_blended = v8.greater(transmittance_behind, min_transmittance)
+        weight = v8.select(is_blended, weight, zeros)
+        v8.store(
+            state,
+            pixel,
+            remaining_transmittance(transmittance, transmittance_behind, is_blended, stop),
+        )
+        # q = dL/dw, and what remains of the sum behind the splat.
+        g_red = v8.load(state, pixel + G_RED)
+        g_green = v8.load(state, pixel + G_GREEN)
+        g_blue = v8.load(state, pixel + G_BLUE)
+        q = v8.fmuladd(g_red, red, v8.load(state, pixel + G_ALPHA))
         q = v8.fmuladd(g_green, green, q)
         q = v8.fmuladd(g_blue, blue, q)
         if d_depth is not None:
-            g_depth = v8.load(state, at + G_DEPTH)
+            g_depth = v8.load(state, pixel + G_DEPTH)
             q = v8.fmuladd(g_depth, z, q)
             sz = v8.fmuladd(weight, g_depth, sz)
-        rest = v8.fmuladd(v8.negate(weight), q, v8.load(state, at + REST))
-        v8.store(state, at + REST, rest)
-        by_alpha = transmittance * q - rest / (one - alpha)
-        # Nothing moves an alpha that is cut off, clamped or behind the stop.
-        free = v8.both(v8.both(v8.at_least(e, log_cut), kept), v8.greater(alpha_max, alpha))
-        g = v8.select(free, by_alpha * alpha * ln2, zero)
+        behind = v8.fmuladd(v8.negate(weight), q, v8.load(state, pixel + BEHIND))
+        v8.store(state, pixel + BEHIND, behind)
+        # g = dL/de.
+        by_alpha = transmittance * q - behind / (ones - alpha)
+        # An alpha that is cut off, clamped or behind the stop has no gradient.
+        is_free = v8.both(
+            v8.both(v8.at_least(log_alpha, log_cut), is_blended), v8.greater(alpha_max, alpha)
+        )
+        g = v8.select(is_free, by_alpha * alpha * ln2, zeros)
         g_off = g * off
         sr = v8.fmuladd(weight, g_red, sr)
         sg = v8.fmuladd(weight, g_green, sg)
@@ -225,31 +290,35 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
         ay = ay + v8.absolute(v8.fmuladd(tilt, g_off, fall * (g * dy)))
     shape = v8.totals(s0, sx, sxx, sy, sxy, syy, ax, ay)
     v8.store(shares, share, v8.load(shares, share) + shape)
-    color = v8.totals(sr, sg, sb, sz, zero, zero, zero, zero)
+    color = v8.totals(sr, sg, sb, sz, zeros, zeros, zeros, zeros)
     v8.store(shares, share + U(8), v8.load(shares, share + U(8)) + color)
 
 
 @kernel
-def sum_shares(tile_splat_ids, tile_offsets, reached, shares, ranges, sums, touched):
-    """Every slot's shares of all tiles, added in the order of the tiles.
+def sum_shares(tile_splat_ids, tile_offsets, num_reached, shares, ranges, sums, is_touched):
+    """Add every slot's shares of all tiles, in the order of the tiles.
 
-    Each of `ranges` runs of slots looks at all entries and takes its own, so the order of addition
-    depends on nothing. sums: float32 [slots * SHARE]; touched: uint8 [slots], 1 where any entry
-    was reached; both are filled.
+    Each of `ranges` runs of slots looks at all entries and takes its own. So the order of addition
+    is always the same.
+
+    sums: float32 [slots * SHARE], written. is_touched: uint8 [slots], written: 1 if any entry was
+    reached.
     """
-    slots = touched.size
+    slots = is_touched.size
     for run in prange(ranges):
-        low, high = U(slots * run // ranges), U(slots * (run + 1) // ranges)
+        low = U(slots * run // ranges)
+        high = U(slots * (run + 1) // ranges)
         for slot in range(low, high):
-            touched[slot] = 0
-        for tile in range(reached.size):
-            for entry in range(U(tile_offsets[tile]), U(tile_offsets[tile] + reached[tile])):
+            is_touched[slot] = 0
+        for tile in range(num_reached.size):
+            for entry in range(U(tile_offsets[tile]), U(tile_offsets[tile] + num_reached[tile])):
                 slot = U(tile_splat_ids[entry])
                 if slot < low or slot >= high:
                     continue
-                at, share = slot * U(SHARE), entry * U(SHARE)
-                if touched[slot] == 0:
-                    touched[slot] = 1
+                at = slot * U(SHARE)
+                share = entry * U(SHARE)
+                if is_touched[slot] == 0:
+                    is_touched[slot] = 1
                     for i in range(U(0), U(SHARE), U(LANES)):
                         v8.store(sums, at + i, v8.load(shares, share + i))
                 else:
@@ -262,57 +331,87 @@ def sum_shares(tile_splat_ids, tile_offsets, reached, shares, ranges, sums, touc
 # Eight splats at a time, by the chain rule through the projection. Names: g_a is dL/da.
 
 # A row of gradients, one cache line: by mean (3, metres, in the part's axes), unit quaternion (4,
-# tangential), logarithms of scales (3) and opacity, colour before its clamp at 0 (3). Between them
-# what densification looks at: the sum of |dL/d mean| over pixels (1/px), and the largest sigma, px.
+# tangential), logarithms of scales (3) and opacity, colour before its clamp at 0 (3). The row also
+# holds two numbers for densification: G_ABS, the sum of |dL/d mean| over pixels (1/px), and
+# G_RADIUS, the largest sigma, px.
 GRAD = 16
-G_MEAN, G_QUAT, G_ABS, G_SCALE, G_OPACITY, G_COLOR, G_RADIUS = 0, 3, 7, 8, 11, 12, 15
+G_MEAN = 0
+G_QUAT = 3
+G_ABS = 7
+G_SCALE = 8
+G_OPACITY = 11
+G_COLOR = 12
+G_RADIUS = 15
 
 _INVERSE_LN2 = np.float32(1 / math.log(2))
 _SLOPES = 16  # rows of eight: gradients of the SH functions, weighted
 
 
 @kernel
-def project_backward(inputs, splats, touched, sums, grads, ids, counts):
-    """A row of `grads` for every touched splat, block by block in the order of its Gaussians.
+def project_backward(inputs, splats, is_touched, sums, grads, ids, counts):
+    """Write a row of `grads` for every touched splat, block by block in the order of its Gaussians.
 
-    inputs, splats: project_slice's. touched, sums: what sum_shares wrote. Block b fills rows
-    b BLOCK to b BLOCK + counts[b] of grads (float32 [B BLOCK * GRAD]) and of ids (int32, index of
-    the Gaussian in its part).
+    Block b fills rows b BLOCK to b BLOCK + counts[b].
+
+    Args:
+        inputs, splats: as for project_slice.
+        is_touched, sums: as sum_shares wrote them.
+        grads: float32 [B BLOCK * GRAD], written.
+        ids: int32 [B BLOCK], written: index of the Gaussian in its part.
+        counts: int64 [B], written: rows of each block.
     """
     for block in prange(inputs.blocks.shape[0]):
-        part, records = inputs.blocks[block, 0], splats.records
-        view, modes, addresses = inputs.views[part], inputs.modes, inputs.addresses
-        slots, picked = np.empty(BLOCK + LANES, np.int32), np.empty(BLOCK + LANES, np.int32)
+        part = inputs.blocks[block, 0]
+        records = splats.records
+        view = inputs.views[part]
+        modes = inputs.modes
+        addresses = inputs.addresses
+        slots = np.empty(BLOCK + LANES, np.int32)
+        gaussian_ids = np.empty(BLOCK + LANES, np.int32)
         rows = np.empty((_SLOPES + GRAD) * LANES, np.float32)
-        base, taken = block * BLOCK, U(0)
-        for slot in range(base, base + splats.found[block]):
-            if touched[slot] != 0:
+        base = block * BLOCK
+        num_touched = U(0)
+        # Touched splats of the block, filled up to a whole group of eight.
+        for slot in range(base, base + splats.splat_counts[block]):
+            if is_touched[slot] != 0:
                 number = np.float32(records[slot * RECORD + L.SPLAT_ID]).view(np.int32)
-                slots[taken] = np.int32(slot)
-                picked[taken] = number - np.int32(inputs.first_ids[part])
-                ids[U(base) + taken] = picked[taken]
-                taken += U(1)
-        counts[block] = taken
-        if taken == U(0):
+                slots[num_touched] = np.int32(slot)
+                gaussian_ids[num_touched] = number - np.int32(inputs.first_ids[part])
+                ids[U(base) + num_touched] = gaussian_ids[num_touched]
+                num_touched += U(1)
+        counts[block] = num_touched
+        if num_touched == U(0):
             continue
         for lane in range(U(LANES)):
-            slots[taken + lane] = slots[taken - U(1)]
-            picked[taken + lane] = picked[taken - U(1)]
+            slots[num_touched + lane] = slots[num_touched - U(1)]
+            gaussian_ids[num_touched + lane] = gaussian_ids[num_touched - U(1)]
+        # Arrays of the block's part.
         count, functions = inputs.sizes[part]
         means = floats_at(addresses[part, L.A_MEANS], count * 3)
         quats = floats_at(addresses[part, L.A_QUATS], count * 4)
         scales = floats_at(addresses[part, L.A_SCALES], count * 3)
         sh = floats_at(addresses[part, L.A_SH], count * functions * 3)
-        used = min(modes[L.M_FUNCTIONS], functions)
-        for at in range(U(0), taken, U(LANES)):
+        num_functions = min(modes[L.M_FUNCTIONS], functions)
+        # Gradients of eight Gaussians, then their rows.
+        for group in range(U(0), num_touched, U(LANES)):
             _color_backward(
-                sh, U(functions), U(used), means, view, slots, picked, at, records, sums, rows
+                sh,
+                U(functions),
+                U(num_functions),
+                means,
+                view,
+                slots,
+                gaussian_ids,
+                group,
+                records,
+                sums,
+                rows,
             )
             _geometry_backward(
-                means, quats, scales, view, slots, picked, at, modes, records, sums, rows
+                means, quats, scales, view, slots, gaussian_ids, group, modes, records, sums, rows
             )
-            for lane in range(min(U(LANES), taken - at)):
-                row = (U(base) + at + lane) * U(GRAD)
+            for lane in range(min(U(LANES), num_touched - group)):
+                row = (U(base) + group + lane) * U(GRAD)
                 for field in range(U(GRAD)):
                     grads[row + field] = rows[(U(_SLOPES) + field) * U(LANES) + lane]
 
@@ -324,32 +423,36 @@ def _write(rows, field, value):
 
 @inner()
 def _color_backward(
-    sh, functions, used, means, view, slots, picked, at, records, sums, rows
-):  # fmt: skip
-    """Rows of colour, and of the mean as far as the viewing direction changes the colour."""
+    sh, functions, num_functions, means, view, slots, gaussian_ids, group, records, sums, rows
+):
+    """Write the rows of colour, and of the mean as far as the direction changes the colour."""
     for lane in range(U(LANES)):
-        slot, splat = U(slots[at + lane]), U(picked[at + lane])
-        share, record = slot * U(SHARE), slot * U(RECORD)
-        zero = np.float32(0)
-        red = sums[share + U(S_RED)] if records[record + U(L.RED)] > zero else zero
-        green = sums[share + U(S_GREEN)] if records[record + U(L.GREEN)] > zero else zero
-        blue = sums[share + U(S_BLUE)] if records[record + U(L.BLUE)] > zero else zero
+        slot = U(slots[group + lane])
+        splat = U(gaussian_ids[group + lane])
+        share = slot * U(SHARE)
+        record = slot * U(RECORD)
+        zeros = np.float32(0)
+        red = sums[share + U(S_RED)] if records[record + U(L.RED)] > zeros else zeros
+        green = sums[share + U(S_GREEN)] if records[record + U(L.GREEN)] > zeros else zeros
+        blue = sums[share + U(S_BLUE)] if records[record + U(L.BLUE)] > zeros else zeros
         rows[U(_SLOPES + G_COLOR) * U(LANES) + lane] = red
         rows[U(_SLOPES + G_COLOR + 1) * U(LANES) + lane] = green
         rows[U(_SLOPES + G_COLOR + 2) * U(LANES) + lane] = blue
         first = splat * functions * U(3)
-        for k in range(U(1), used):
+        for k in range(U(1), num_functions):
             c = first + k * U(3)
             rows[k * U(LANES) + lane] = red * sh[c] + green * sh[c + U(1)] + blue * sh[c + U(2)]
-    zero = v8.splat(np.float32(0))
-    if used == U(1):
+    zeros = v8.splat(np.float32(0))
+    if num_functions == U(1):
         for axis in range(3):
-            _write(rows, G_MEAN + axis, zero)
+            _write(rows, G_MEAN + axis, zeros)
         return
-    dx, dy, dz = from_eye(means, picked, at, view)
+    dx, dy, dz = from_eye(means, gaussian_ids, group, view)
     inverse = v8.splat(np.float32(1)) / v8.sqrt(dot(dx, dy, dz, dx, dy, dz))
-    x, y, z = dx * inverse, dy * inverse, dz * inverse
-    gx, gy, gz = add_direction_slopes(x, y, z, used, rows)
+    x = dx * inverse
+    y = dy * inverse
+    z = dz * inverse
+    gx, gy, gz = add_direction_slopes(x, y, z, num_functions, rows)
     radial = dot(gx, gy, gz, x, y, z)
     _write(rows, G_MEAN, (gx - radial * x) * inverse)
     _write(rows, G_MEAN + 1, (gy - radial * y) * inverse)
@@ -358,98 +461,129 @@ def _color_backward(
 
 @inner()
 def _share(sums, slots, at, field):
+    """Return one sum of eight splats."""
     return v8.gather(sums, slots, at, U(SHARE), U(field))
 
 
 @inner()
 def _geometry_backward(
-    means, quats, scales, view, slots, picked, at, modes, records, sums, rows
-):  # fmt: skip
-    one, two = v8.splat(np.float32(1)), v8.splat(np.float32(2))
+    means, quats, scales, view, slots, gaussian_ids, group, modes, records, sums, rows
+):
+    """Write the rows of mean, quaternion, scales and opacity, and those for densification."""
+    ones = v8.splat(np.float32(1))
+    two = v8.splat(np.float32(2))
     k = v8.splat(np.float32(0.5) * LOG2_E)
-    x, y, z = to_camera(from_eye(means, picked, at, view), view)
-    inverse = one / z
-    right, down, sizes, jx, jy, m = semi_axes(quats, scales, picked, at, x, y, inverse, view)
+    x, y, z = to_camera(from_eye(means, gaussian_ids, group, view), view)
+    inverse = ones / z
+    right, down, sizes, jx, jy, m = semi_axes(
+        quats, scales, gaussian_ids, group, x, y, inverse, view
+    )
     x0, x1, x2 = right
     y0, y1, y2 = down
     s0, s1, s2 = sizes
     blur = v8.splat(view[L.V_BLUR])
-    xx, yy = dot(x0, x1, x2, x0, x1, x2), dot(y0, y1, y2, y0, y1, y2)
-    cxx, cyy = xx + blur, yy + blur
-    sharp = v8.gather(records, slots, at, U(RECORD), U(L.SHARP_X))
-    lean = v8.gather(records, slots, at, U(RECORD), U(L.LEAN_X))
-    along = k / (sharp * sharp)
+    xx = dot(x0, x1, x2, x0, x1, x2)
+    yy = dot(y0, y1, y2, y0, y1, y2)
+    cxx = xx + blur
+    cyy = yy + blur
+    sharp_x = v8.gather(records, slots, group, U(RECORD), U(L.SHARP_X))
+    lean_x = v8.gather(records, slots, group, U(RECORD), U(L.LEAN_X))
+    variance_along_row = k / (sharp_x * sharp_x)
 
     # The conic: e = ... - sharp^2 (dx - lean dy)^2 - k / cyy dy^2, sharp^2 = k / along.
-    sum_0, sum_x = _share(sums, slots, at, S_0), _share(sums, slots, at, S_X)
-    inverse_cyy = one / cyy
-    g_along = _share(sums, slots, at, S_XX) / along
-    g_lean = two * sharp * _share(sums, slots, at, S_XY) * inverse_cyy
-    g_fall = k * inverse_cyy * inverse_cyy * _share(sums, slots, at, S_YY)
+    sum_0 = _share(sums, slots, group, S_0)
+    sum_x = _share(sums, slots, group, S_X)
+    inverse_cyy = ones / cyy
+    g_along = _share(sums, slots, group, S_XX) / variance_along_row
+    g_lean = two * sharp_x * _share(sums, slots, group, S_XY) * inverse_cyy
+    g_fall = k * inverse_cyy * inverse_cyy * _share(sums, slots, group, S_YY)
     g_xx = g_along
-    g_xy = g_lean - two * lean * g_along
-    g_yy = lean * lean * g_along - lean * g_lean + g_fall
+    g_xy = g_lean - two * lean_x * g_along
+    g_yy = lean_x * lean_x * g_along - lean_x * g_lean + g_fall
     if modes[L.M_ANTIALIASED]:
         # log2 of opacity holds half of log2(det / det_blurred), det = |x cross y|^2.
         half = v8.splat(np.float32(0.5) * _INVERSE_LN2) * sum_0
-        c0, c1, c2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
+        c0 = x1 * y2 - x2 * y1
+        c1 = x2 * y0 - x0 * y2
+        c2 = x0 * y1 - x1 * y0
         tiny = v8.splat(np.float32(1e-30))
         inverse_det = half / v8.maximum(dot(c0, c1, c2, c0, c1, c2), tiny)
-        inverse_blurred = half / v8.maximum(along * cyy, tiny)
-        xy = lean * cyy
+        inverse_blurred = half / v8.maximum(variance_along_row * cyy, tiny)
+        xy = lean_x * cyy
         g_xx = g_xx + yy * inverse_det - cyy * inverse_blurred
         g_yy = g_yy + xx * inverse_det - cxx * inverse_blurred
         g_xy = g_xy + two * xy * (inverse_blurred - inverse_det)
 
-    g_px = two * sharp * sum_x
+    g_px = two * sharp_x * sum_x
     fall = k * inverse_cyy
-    g_py = two * (fall * _share(sums, slots, at, S_Y) - sharp * lean * sum_x)
-    abs_x = two * sharp * _share(sums, slots, at, S_ABS_X)
-    abs_y = two * _share(sums, slots, at, S_ABS_Y)
+    g_py = two * (fall * _share(sums, slots, group, S_Y) - sharp_x * lean_x * sum_x)
+    abs_x = two * sharp_x * _share(sums, slots, group, S_ABS_X)
+    abs_y = two * _share(sums, slots, group, S_ABS_Y)
     _write(rows, G_ABS, v8.sqrt(v8.fmuladd(abs_x, abs_x, abs_y * abs_y)))
     _write(rows, G_RADIUS, v8.sqrt(v8.maximum(cxx, cyy)))
     _write(rows, G_OPACITY, v8.splat(_INVERSE_LN2) * sum_0)
 
     # Semi-axes: xx = sum x_j^2, xy = sum x_j y_j, yy = sum y_j^2.
-    two_xx, two_yy = two * g_xx, two * g_yy
-    a0, b0 = two_xx * x0 + g_xy * y0, g_xy * x0 + two_yy * y0
-    a1, b1 = two_xx * x1 + g_xy * y1, g_xy * x1 + two_yy * y1
-    a2, b2 = two_xx * x2 + g_xy * y2, g_xy * x2 + two_yy * y2
+    two_xx = two * g_xx
+    two_yy = two * g_yy
+    a0 = two_xx * x0 + g_xy * y0
+    b0 = g_xy * x0 + two_yy * y0
+    a1 = two_xx * x1 + g_xy * y1
+    b1 = g_xy * x1 + two_yy * y1
+    a2 = two_xx * x2 + g_xy * y2
+    b2 = g_xy * x2 + two_yy * y2
     _write(rows, G_SCALE, a0 * x0 + b0 * y0)
     _write(rows, G_SCALE + 1, a1 * x1 + b1 * y1)
     _write(rows, G_SCALE + 2, a2 * x2 + b2 * y2)
-    a0, a1, a2, b0, b1, b2 = s0 * a0, s1 * a1, s2 * a2, s0 * b0, s1 * b1, s2 * b2
+    a0 = s0 * a0
+    a1 = s1 * a1
+    a2 = s2 * a2
+    b0 = s0 * b0
+    b1 = s1 * b1
+    b2 = s2 * b2
     _write_quats(
-        quats, picked, at, rows,
-        (a0 * jx[0] + b0 * jy[0], a1 * jx[0] + b1 * jy[0], a2 * jx[0] + b2 * jy[0],
-         a0 * jx[1] + b0 * jy[1], a1 * jx[1] + b1 * jy[1], a2 * jx[1] + b2 * jy[1],
-         a0 * jx[2] + b0 * jy[2], a1 * jx[2] + b1 * jy[2], a2 * jx[2] + b2 * jy[2]),
-    )  # fmt: skip
+        quats,
+        gaussian_ids,
+        group,
+        rows,
+        (
+            a0 * jx[0] + b0 * jy[0],
+            a1 * jx[0] + b1 * jy[0],
+            a2 * jx[0] + b2 * jy[0],
+            a0 * jx[1] + b0 * jy[1],
+            a1 * jx[1] + b1 * jy[1],
+            a2 * jx[1] + b2 * jy[1],
+            a0 * jx[2] + b0 * jy[2],
+            a1 * jx[2] + b1 * jy[2],
+            a2 * jx[2] + b2 * jy[2],
+        ),
+    )
 
     # The Jacobian's rows jx = fx (r - u t) / z, jy = fy (s - v t) / z.
-    p0, p1, p2 = (
-        dot(a0, a1, a2, m[0], m[1], m[2]),
-        dot(a0, a1, a2, m[3], m[4], m[5]),
-        dot(a0, a1, a2, m[6], m[7], m[8]),
-    )
-    q0, q1, q2 = (
-        dot(b0, b1, b2, m[0], m[1], m[2]),
-        dot(b0, b1, b2, m[3], m[4], m[5]),
-        dot(b0, b1, b2, m[6], m[7], m[8]),
-    )
-    zero, t = v8.splat(np.float32(0)), rotation_row(view, U(2))
-    fx, fy = v8.splat(view[L.V_FOCAL]) * inverse, v8.splat(view[L.V_FOCAL + 1]) * inverse
-    u_low, u_high = v8.splat(view[L.V_LOW]), v8.splat(view[L.V_HIGH])
-    v_low, v_high = v8.splat(view[L.V_LOW + 1]), v8.splat(view[L.V_HIGH + 1])
-    raw_u, raw_v = x * inverse, y * inverse
+    p0 = dot(a0, a1, a2, m[0], m[1], m[2])
+    p1 = dot(a0, a1, a2, m[3], m[4], m[5])
+    p2 = dot(a0, a1, a2, m[6], m[7], m[8])
+    q0 = dot(b0, b1, b2, m[0], m[1], m[2])
+    q1 = dot(b0, b1, b2, m[3], m[4], m[5])
+    q2 = dot(b0, b1, b2, m[6], m[7], m[8])
+    zeros = v8.splat(np.float32(0))
+    t = rotation_row(view, U(2))
+    fx = v8.splat(view[L.V_FOCAL]) * inverse
+    fy = v8.splat(view[L.V_FOCAL + 1]) * inverse
+    u_low = v8.splat(view[L.V_LOW])
+    u_high = v8.splat(view[L.V_HIGH])
+    v_low = v8.splat(view[L.V_LOW + 1])
+    v_high = v8.splat(view[L.V_HIGH + 1])
+    raw_u = x * inverse
+    raw_v = y * inverse
     free_u = v8.both(v8.at_least(raw_u, u_low), v8.at_least(u_high, raw_u))
     free_v = v8.both(v8.at_least(raw_v, v_low), v8.at_least(v_high, raw_v))
-    g_u = v8.select(free_u, zero - fx * dot(p0, p1, p2, t[0], t[1], t[2]), zero)
-    g_v = v8.select(free_v, zero - fy * dot(q0, q1, q2, t[0], t[1], t[2]), zero)
+    g_u = v8.select(free_u, zeros - fx * dot(p0, p1, p2, t[0], t[1], t[2]), zeros)
+    g_v = v8.select(free_v, zeros - fy * dot(q0, q1, q2, t[0], t[1], t[2]), zeros)
     g_x = (g_u + g_px * v8.splat(view[L.V_FOCAL])) * inverse
     g_y = (g_v + g_py * v8.splat(view[L.V_FOCAL + 1])) * inverse
     g_z = dot(p0, p1, p2, jx[0], jx[1], jx[2]) + dot(q0, q1, q2, jy[0], jy[1], jy[2])
-    g_z = _share(sums, slots, at, S_DEPTH) - g_z * inverse - g_x * raw_u - g_y * raw_v
+    g_z = _share(sums, slots, group, S_DEPTH) - g_z * inverse - g_x * raw_u - g_y * raw_v
     for axis in range(3):
         at_axis = U(_SLOPES + G_MEAN + axis) * U(LANES)
         from_color = v8.load(rows, at_axis)
@@ -458,11 +592,16 @@ def _geometry_backward(
 
 
 @inner()
-def _write_quats(quats, picked, at, rows, g):
-    """dL by the unit quaternion from dL by its rotation matrix, row by row; radial part removed."""
+def _write_quats(quats, gaussian_ids, group, rows, g):
+    """Write dL by the unit quaternion, without its radial part.
+
+    g: dL by its rotation matrix, row by row.
+    """
     two = v8.splat(np.float32(2))
-    w, x = v8.gather(quats, picked, at, U(4), U(0)), v8.gather(quats, picked, at, U(4), U(1))
-    y, z = v8.gather(quats, picked, at, U(4), U(2)), v8.gather(quats, picked, at, U(4), U(3))
+    w = v8.gather(quats, gaussian_ids, group, U(4), U(0))
+    x = v8.gather(quats, gaussian_ids, group, U(4), U(1))
+    y = v8.gather(quats, gaussian_ids, group, U(4), U(2))
+    z = v8.gather(quats, gaussian_ids, group, U(4), U(3))
     g_w = two * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
     g_x = two * (
         w * (g[7] - g[5]) + y * (g[1] + g[3]) + z * (g[2] + g[6]) - two * x * (g[4] + g[8])

@@ -1,11 +1,11 @@
-"""Numba kernels: blend every tile's splats front to back.
+"""Numba kernels that list splats tile by tile and blend them front to back.
 
-Batch by batch of a tile's list, strip by strip, the items (geometry.list_items) are blended in
-turn. Strips shrink to the rows in which a pixel still lets light through, and a tile ends where
-none does.
+A tile's list is blended batch by batch. In each strip of the tile the items of a batch
+(geometry.list_items) are blended in turn. Strips shrink to the rows in which a pixel still lets
+light through, and a tile is finished when no row is left.
 
-The kernel is compiled twice: for colour and alpha alone (`wanted` is None), and for everything,
-where the bits of `wanted` say which images there are.
+The kernel is compiled twice: for colour and alpha alone (`buffer_bits` is None), and for all
+images, where `buffer_bits` says which images there are.
 """
 
 from __future__ import annotations
@@ -61,35 +61,45 @@ from augment.render.mode_depth import BETA_PER_SIGMA, FARTHER, GAMMA, NEARER
 # The projection has counted each block's splats by bins of z. Sorting moves them to their bins,
 # block after block, then sorts every bin within the cache; both keep equal depths in index order.
 
-_DIGIT_BITS = BIN_SHIFT // 2  # what z bins leave to sort, in two passes
+# Bits of a digit of the key. Two digits are the bits that bins of z leave to sort.
+_DIGIT_BITS = BIN_SHIFT // 2
+# Number of a digit's values.
 _DIGITS = 1 << _DIGIT_BITS
-_FEW = 32  # splats sorted faster by insertion
+# Largest number of splats that insertion sorts faster.
+_MAX_INSERTION_SORT = 32
 
 
 @kernel
-def scatter_to_bins(keys, found, first_bin, heads, binned_keys, binned_slots):
-    """Copy every block's keys, and the slots they stand for, to their bins.
+def scatter_to_bins(keys, splat_counts, first_bin, heads, binned_keys, binned_slots):
+    """Copy every block's keys, and the slots that they stand for, to their bins.
 
-    keys: uint32 [B BLOCK], bits of z. found: int64 [B], how many each block has. heads: int64
-    [B, Z], where each block writes its splats of each bin; used up.
+    Args:
+        keys: uint32 [B BLOCK], bits of z.
+        splat_counts: int64 [B], splats of each block.
+        first_bin: number of the first bin.
+        heads: int64 [B, Z], position where each block writes its splats of each bin; used up.
+        binned_keys, binned_slots: written.
     """
-    for block in prange(found.size):
-        for i in range(found[block]):
+    for block in prange(splat_counts.size):
+        for i in range(splat_counts[block]):
             slot = block * BLOCK + i
             key = keys[slot]
             z_bin = np.int64(key >> np.uint32(BIN_SHIFT)) - first_bin
-            at = heads[block, z_bin]
-            heads[block, z_bin] = at + 1
-            binned_keys[at] = key
-            binned_slots[at] = slot
+            position = heads[block, z_bin]
+            heads[block, z_bin] = position + 1
+            binned_keys[position] = key
+            binned_slots[position] = slot
 
 
 @kernel
 def sort_bins(bin_starts, keys, slots, rects, spare_keys, spare_slots, sorted_rects):
-    """Sort every bin [bin_starts[z], bin_starts[z + 1]) by key; gather the splats' tiles alike."""
+    """Sort every bin [bin_starts[z], bin_starts[z + 1]) by key, and gather the splats' tiles in
+    that order.
+    """
     for z_bin in prange(bin_starts.size - 1):
-        first, last = bin_starts[z_bin], bin_starts[z_bin + 1]
-        if last - first <= _FEW:
+        first = bin_starts[z_bin]
+        last = bin_starts[z_bin + 1]
+        if last - first <= _MAX_INSERTION_SORT:
             _sort_few(keys, slots, first, last)
         else:
             heads = np.empty(_DIGITS, np.int64)
@@ -101,18 +111,21 @@ def sort_bins(bin_starts, keys, slots, rects, spare_keys, spare_slots, sorted_re
 
 @inner()
 def _sort_few(keys, slots, first, last):
+    """Sort a few splats by insertion."""
     for i in range(first + 1, last):
-        key, slot = keys[i], slots[i]
+        key = keys[i]
+        slot = slots[i]
         j = i
         while j > first and keys[j - 1] > key:
             keys[j], slots[j] = keys[j - 1], slots[j - 1]
             j -= 1
-        keys[j], slots[j] = key, slot
+        keys[j] = key
+        slots[j] = slot
 
 
 @inner()
 def _sort_digit(keys, slots, to_keys, to_slots, first, last, shift, heads):
-    """One stable counting sort by a digit of the key."""
+    """Run one stable counting sort by a digit of the key."""
     mask = U(_DIGITS - 1)
     for digit in range(_DIGITS):
         heads[digit] = 0
@@ -132,48 +145,55 @@ def _sort_digit(keys, slots, to_keys, to_slots, first, last, shift, heads):
 
 
 @inner()
-def _unpack(rect):
-    """First column and row, last column and row of a splat's tiles."""
+def _unpack_rect(rect):
+    """Return first column and row, last column and row of a splat's tiles."""
     mask = U(0xFFFF)
     return rect & mask, (rect >> U(16)) & mask, (rect >> U(32)) & mask, rect >> U(48)
 
 
 @kernel
 def count_corners(sorted_rects, first, last, columns, corners):
-    """Where rectangles of tiles begin and end: +1 and -1 at the corners of each.
+    """Count where rectangles of tiles begin and end: +1 and -1 at the corners of each.
 
-    corners: int32 [C, (rows + 1) (columns + 1)], each of C runs of splats its own; summed over
-    itself from the top left it says how many splats touch each tile.
+    The cumulative sum of the corners, from the top left, is the number of splats that touch each
+    tile.
+
+    corners: int32 [C, (rows + 1) (columns + 1)], written; each of C runs of splats has its own.
     """
-    runs = corners.shape[0]
+    num_runs = corners.shape[0]
     width = U(columns + 1)
-    for run in prange(runs):
+    for run in prange(num_runs):
         for i in range(corners.shape[1]):
             corners[run, i] = 0
-        own = corners[run]
-        start = first + (last - first) * run // runs
-        for i in range(U(start), U(first + (last - first) * (run + 1) // runs)):
-            c0, r0, c1, r1 = _unpack(sorted_rects[i])
-            top, bottom = r0 * width, (r1 + U(1)) * width
-            own[top + c0] += 1
-            own[top + c1 + U(1)] -= 1
-            own[bottom + c0] -= 1
-            own[bottom + c1 + U(1)] += 1
+        run_corners = corners[run]
+        start = first + (last - first) * run // num_runs
+        for i in range(U(start), U(first + (last - first) * (run + 1) // num_runs)):
+            c0, r0, c1, r1 = _unpack_rect(sorted_rects[i])
+            top = r0 * width
+            bottom = (r1 + U(1)) * width
+            run_corners[top + c0] += 1
+            run_corners[top + c1 + U(1)] -= 1
+            run_corners[bottom + c0] -= 1
+            run_corners[bottom + c1 + U(1)] += 1
 
 
 @kernel
 def fill_lists(slots, sorted_rects, first, last, columns, heads, tile_splat_ids, bands):
-    """Slots of every open tile's splats, nearest first. Bands of rows share the work.
+    """Write the slots of every open tile's splats, nearest first. Bands of tile rows share the
+    work.
 
-    heads: int64 [tiles], where each tile's list begins; negative where it has none; used up.
-    A thread looks at every splat but writes its own tiles only, so lists stay in order and in its
-    cache.
+    A thread reads every splat but writes only its own tiles. So lists stay in order and in the
+    thread's cache.
+
+    heads: int64 [tiles], position where each tile's list begins, negative for a tile without one;
+    used up.
     """
     rows = heads.size // columns
     for band in prange(bands):
-        top, bottom = rows * band // bands, rows * (band + 1) // bands - 1
+        top = rows * band // bands
+        bottom = rows * (band + 1) // bands - 1
         for i in range(U(first), U(last)):
-            c0, r0, c1, r1 = _unpack(sorted_rects[i])
+            c0, r0, c1, r1 = _unpack_rect(sorted_rects[i])
             for row in range(max(r0, U(top)), min(r1, U(bottom)) + U(1)):
                 base = row * U(columns)
                 for tile in range(base + c0, base + c1 + U(1)):
@@ -184,120 +204,152 @@ def fill_lists(slots, sorted_rects, first, last, columns, heads, tile_splat_ids,
 
 
 # ---- Numba functions: mode depth, item by item (see augment.render.mode_depth) -------------------
-# Sums are kept times the cluster's weight, so that a sample that joins costs no division and no
-# root.
+# Comparisons are multiplied by the cluster's weight, so that a sample that joins costs no division
+# and no root.
 
-# Planes of a tile, from where the caller says: of the running cluster the depth it began with and
-# the sums of w, w (z - first), w (z - first)^2; of the heaviest one its weight and mode.
+# Planes of a tile, from the caller's position on. For the running cluster: the depth with which it
+# began, and the sums of w, w (z - first) and w (z - first)^2. For the heaviest cluster: its weight
+# and its mode.
 FIRST, MASS, MOMENT, SQUARE, HEAVIEST, MODE = (U(i * PIXELS) for i in range(6))
 MODE_PLANES = 6
 
-_FARTHER, _NEARER = np.float32(FARTHER), np.float32(NEARER)
+# Limits of mode_depth, over the spread in beta and over its square.
+_FARTHER = np.float32(FARTHER)
+_NEARER = np.float32(NEARER)
 _FARTHER_2 = np.float32((FARTHER * BETA_PER_SIGMA) ** 2)
 _NEARER_2 = np.float32((NEARER * BETA_PER_SIGMA) ** 2)
-_BACK = np.float32(GAMMA * BETA_PER_SIGMA)
-# What rounding may add to a sum of weights; far more than it does.
+# Distance of a cluster's mode before its mean, over its standard deviation.
+_MODE_SHIFT = np.float32(GAMMA * BETA_PER_SIGMA)
+# Margin for the rounding of a sum of weights, far larger than the rounding.
 _SLACK = np.float32(1e-4)
 
 
 @inner()
 def add_sample(state, at, depth, weight, floor):
-    """An item's pixels' next samples. state, at: their place in the plane FIRST."""
-    zero, none = v8.splat_as(depth, np.float32(0)), v8.splat_as(depth, np.float32(-1))
-    first, mass = v8.load_as(depth, state, at + FIRST), v8.load_as(depth, state, at + MASS)
-    moment, square = v8.load_as(depth, state, at + MOMENT), v8.load_as(depth, state, at + SQUARE)
-    off = depth - first
-    aside = v8.fmuladd(off, mass, v8.negate(moment))  # mass (z - mean)
+    """Add the next samples of an item's pixels to their clusters.
+
+    state, at: a tile's state, and the position of the pixels in the plane FIRST.
+    """
+    zeros = v8.splat_as(depth, np.float32(0))
+    minus_ones = v8.splat_as(depth, np.float32(-1))
+    first_depth = v8.load_as(depth, state, at + FIRST)
+    mass = v8.load_as(depth, state, at + MASS)
+    moment = v8.load_as(depth, state, at + MOMENT)
+    square = v8.load_as(depth, state, at + SQUARE)
+    depth_offset = depth - first_depth
+    mass_offset = v8.fmuladd(depth_offset, mass, v8.negate(moment))  # mass (z - mean)
     spread = _spread(mass, moment, square)
-    is_farther = v8.at_least(aside, zero)
+    is_farther = v8.at_least(mass_offset, zeros)
     reach = v8.select(is_farther, v8.splat_as(depth, _FARTHER), v8.splat_as(depth, _NEARER))
     reach_2 = v8.select(is_farther, v8.splat_as(depth, _FARTHER_2), v8.splat_as(depth, _NEARER_2))
-    by_floor = v8.splat_as(depth, floor) * reach * mass - v8.absolute(aside)
-    by_spread = v8.fmuladd(reach_2, spread, v8.negate(aside * aside))
-    joins = v8.greater(v8.maximum(by_floor, by_spread), zero)
-    begins = v8.select(joins, none, v8.select(v8.greater(weight, zero), zero, none))
-    if v8.any_not_negative(begins):
-        is_new = v8.at_least(begins, zero)
+    floor_margin = v8.splat_as(depth, floor) * reach * mass - v8.absolute(mass_offset)
+    spread_margin = v8.fmuladd(reach_2, spread, v8.negate(mass_offset * mass_offset))
+    has_joined = v8.greater(v8.maximum(floor_margin, spread_margin), zeros)
+    new_cluster_sign = v8.select(
+        has_joined, minus_ones, v8.select(v8.greater(weight, zeros), zeros, minus_ones)
+    )
+    if v8.any_not_negative(new_cluster_sign):
+        is_new = v8.at_least(new_cluster_sign, zeros)
         best = v8.load_as(depth, state, at + HEAVIEST)
-        heavier = v8.both(is_new, v8.greater(mass, best))
+        is_heavier = v8.both(is_new, v8.greater(mass, best))
         mode = v8.select(
-            heavier, _mode(first, mass, moment, spread), v8.load_as(depth, state, at + MODE)
+            is_heavier,
+            _mode(first_depth, mass, moment, spread),
+            v8.load_as(depth, state, at + MODE),
         )
-        v8.store(state, at + HEAVIEST, v8.select(heavier, mass, best))
+        v8.store(state, at + HEAVIEST, v8.select(is_heavier, mass, best))
         v8.store(state, at + MODE, mode)
-        v8.store(state, at + FIRST, v8.select(is_new, depth, first))
-        off, mass = v8.select(is_new, zero, off), v8.select(is_new, zero, mass)
-        moment, square = v8.select(is_new, zero, moment), v8.select(is_new, zero, square)
-    weighted = weight * off
+        v8.store(state, at + FIRST, v8.select(is_new, depth, first_depth))
+        depth_offset = v8.select(is_new, zeros, depth_offset)
+        mass = v8.select(is_new, zeros, mass)
+        moment = v8.select(is_new, zeros, moment)
+        square = v8.select(is_new, zeros, square)
+    weighted = weight * depth_offset
     v8.store(state, at + MASS, mass + weight)
     v8.store(state, at + MOMENT, moment + weighted)
-    v8.store(state, at + SQUARE, v8.fmuladd(weighted, off, square))
+    v8.store(state, at + SQUARE, v8.fmuladd(weighted, depth_offset, square))
 
 
 @inner()
 def can_grow(state, at, transmittance):
-    """Not negative where the running cluster may still become the heaviest, or is it.
+    """Return numbers that are not negative where the running cluster is the heaviest or may become
+    it.
 
-    transmittance: what light is left, negative where blending has stopped.
+    transmittance: transmittance of the pixels, negative where blending has stopped.
     """
-    none = v8.splat_as(transmittance, np.float32(-1))
-    mass, best = (
-        v8.load_as(transmittance, state, at + MASS),
-        v8.load_as(transmittance, state, at + HEAVIEST),
-    )
-    most = mass + transmittance + v8.splat_as(transmittance, _SLACK) - best
+    minus_ones = v8.splat_as(transmittance, np.float32(-1))
+    mass = v8.load_as(transmittance, state, at + MASS)
+    best = v8.load_as(transmittance, state, at + HEAVIEST)
+    possible_gain = mass + transmittance + v8.splat_as(transmittance, _SLACK) - best
     return v8.select(
-        v8.greater(transmittance, v8.splat_as(transmittance, np.float32(0))), most, none
+        v8.greater(transmittance, v8.splat_as(transmittance, np.float32(0))),
+        possible_gain,
+        minus_ones,
     )
 
 
 @inner()
 def close_clusters(state, start):
-    """The last cluster is compared too: leaves the result in the plane MODE."""
+    """Compare the last cluster, too, and leave the result in the plane MODE."""
     for i in range(U(0), U(PIXELS), U(LANES)):
         at = U(start) + i
-        first, mass = v8.load(state, at + FIRST), v8.load(state, at + MASS)
-        moment, square = v8.load(state, at + MOMENT), v8.load(state, at + SQUARE)
-        mode = _mode(first, mass, moment, _spread(mass, moment, square))
-        heavier = v8.greater(mass, v8.load(state, at + HEAVIEST))
-        v8.store(state, at + MODE, v8.select(heavier, mode, v8.load(state, at + MODE)))
+        first_depth = v8.load(state, at + FIRST)
+        mass = v8.load(state, at + MASS)
+        moment = v8.load(state, at + MOMENT)
+        square = v8.load(state, at + SQUARE)
+        mode = _mode(first_depth, mass, moment, _spread(mass, moment, square))
+        is_heavier = v8.greater(mass, v8.load(state, at + HEAVIEST))
+        v8.store(state, at + MODE, v8.select(is_heavier, mode, v8.load(state, at + MODE)))
 
 
 @inner()
 def _spread(mass, moment, square):
-    """mass^2 times the variance."""
+    """Return mass^2 times the variance."""
     spread = v8.fmuladd(mass, square, v8.negate(moment * moment))
     return v8.maximum(spread, v8.splat_as(spread, np.float32(0)))
 
 
 @inner()
 def _mode(first, mass, moment, spread):
-    return first + (moment - v8.splat_as(first, _BACK) * v8.sqrt(spread)) / mass
+    """Return the mode of a cluster."""
+    return first + (moment - v8.splat_as(first, _MODE_SHIFT) * v8.sqrt(spread)) / mass
 
 
-GROUP = 8  # tiles a thread takes at a time
-LINE = 16  # float32 of a cache line
+# Tiles that a thread takes at a time.
+GROUP = 8
+# float32 numbers of a cache line.
+LINE = 16
 
 # Planes of a tile's state, PIXELS float32 each, strip after strip, row after row. The transmittance
-# is negative where blending has stopped; its size is then the final one. An image needs its plane
-# and all before, so those that cost most come last.
+# is negative where blending has stopped; its absolute value is then the final one. An image needs
+# its plane and all planes before it, so the most expensive ones come last.
 TRANSMITTANCE, P_RED, P_GREEN, P_BLUE, P_OVERLAY = (U(i * PIXELS) for i in range(5))
 P_DEPTH, P_MEDIAN, P_BEST, P_ID, P_MODE = (U(i * PIXELS) for i in range(5, 10))
-COLOR_STATE, OVERLAY_STATE, MODELESS_STATE = 4 * PIXELS, 5 * PIXELS, 9 * PIXELS
+# Numbers of a state for colour and alpha, for overlay besides, for all but mode depth, and for all.
+COLOR_STATE = 4 * PIXELS
+OVERLAY_STATE = 5 * PIXELS
+MODELESS_STATE = 9 * PIXELS
 STATE = MODELESS_STATE + MODE_PLANES * PIXELS
 
-CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
+# Status of a finished tile.
+CLOSED = 0
+# Status of a tile that is being blended.
+OPEN = 1
+# Status of a tile that no splat has reached.
+FRESH = 2
 
 
-# Bits of `wanted`: the images, in the order of BUFFERS; then whether splats have cuts, some splat
-# of the batch at hand is cut, and colour depends on splats' lights.
+# Bits of `buffer_bits`: the images, in the order of BUFFERS; then CLIP if splats have cuts, CUT if
+# a splat of the batch at hand is cut, and LIT_RGB if colour depends on splats' lights.
 RGB, ALPHA, EXPECTED, MEDIAN, IDS, MODES, OVERLAY, CLIP, CUT, LIT_RGB = (1 << i for i in range(10))
-SURFACES = EXPECTED | MODES  # images of depths that a cut bends
-ORDERED = MEDIAN | IDS | MODES  # images that most pixels need no more splats for early on
+# Images of depths that a cut bends.
+SURFACES = EXPECTED | MODES
+# Images that most pixels have finished early in their list.
+ORDERED = MEDIAN | IDS | MODES
 
 
 class Images(NamedTuple):
-    """Flat images to write, in the order of BUFFERS; empty where one is not asked for."""
+    """Flat images to write, in the order of BUFFERS; an image that was not asked for is empty."""
 
     rgb: Any
     alpha: Any
@@ -309,8 +361,13 @@ class Images(NamedTuple):
 
 
 class TileSplats(NamedTuple):
-    """What tiles blend. records, cuts, lights: flat, of each slot (see layout, geometry).
-    tile_splat_ids, tile_offsets: every tile's list of slots.
+    """Splats that tiles blend.
+
+    records: records of all slots, flat (see layout).
+    cuts: cuts of all slots, flat (see layout).
+    lights: lights of all slots, flat (see geometry).
+    tile_splat_ids: slots of every tile's list, tile after tile.
+    tile_offsets: position where each tile's list begins.
     """
 
     records: Any
@@ -321,9 +378,12 @@ class TileSplats(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN), what a splat must
-    leave more of than this to be blended, 1 where rays are parallel, mode depth's floor, 1/fx^2,
-    1/fy^2, the transmittance at which a pixel is finished.
+    """Numbers of the image.
+
+    size: image width and height.
+    limits: float32: alpha_max; log2(ALPHA_MIN); transmittance that a splat must exceed behind it to
+        be blended; 1 for parallel rays; mode depth's floor; 1/fx^2; 1/fy^2; transmittance at which
+        a pixel is finished.
     """
 
     size: Any
@@ -331,7 +391,7 @@ class Frame(NamedTuple):
 
 
 class Work(NamedTuple):
-    """A tile's state, and what a batch of its splats asks for: see geometry."""
+    """A tile's state, and the arrays of a batch of its splats (see geometry)."""
 
     state: Any
     staged: Any
@@ -343,27 +403,35 @@ class Work(NamedTuple):
     lines: Any
     edges: Any
     surfaces: Any
-    lit: Any
+    staged_lights: Any
 
 
 @kernel
-def blend_tiles(splats, tiles, states, is_last, frame, images, wanted):
-    """Blend one slice of z into every open tile; write the pixels of those that end.
+def blend_tiles(splats, tiles, states, is_last, frame, images, buffer_bits):
+    """Blend one slice of z into every open tile, and write the pixels of the tiles that are
+    finished.
 
-    tiles: uint8 [tiles], CLOSED, OPEN or FRESH, updated. states: float32 [tiles * used part of
-    STATE], where open tiles wait for the next slice. wanted: bits, or None for RGB and alpha.
+    Args:
+        splats: splats of the slice.
+        tiles: uint8 [tiles], CLOSED, OPEN or FRESH, updated.
+        states: float32 [tiles * numbers of a state], state of open tiles between slices.
+        is_last: if True, all tiles are finished.
+        frame: numbers of the image.
+        images: images to write.
+        buffer_bits: images that are asked for, or None for RGB and alpha.
     """
     for group in prange((tiles.size + GROUP - 1) // GROUP):
-        _blend_group(np.int64(group), splats, tiles, states, is_last, frame, images, wanted)
+        _blend_group(np.int64(group), splats, tiles, states, is_last, frame, images, buffer_bits)
 
 
 @inner()
-def _blend_group(group, splats, tiles, states, is_last, frame, images, wanted):
+def _blend_group(group, splats, tiles, states, is_last, frame, images, buffer_bits):
+    """Blend the tiles of one group."""
     size = frame.size
     columns = (size[0] + TILE_W - 1) // TILE_W
-    used = states.size // tiles.size
+    state_size = states.size // tiles.size
     work = Work(
-        aligned_floats(STATE + LINE),  # v8.load_row reads a number beyond
+        aligned_floats(STATE + LINE),  # v8.load_row reads one number beyond the state
         aligned_floats(RECORD * BATCH),
         np.empty(2 * BATCH, np.int32),
         aligned_floats(STARTS),
@@ -377,38 +445,43 @@ def _blend_group(group, splats, tiles, states, is_last, frame, images, wanted):
     )
     state = work.state
     for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
-        first, last = splats.tile_offsets[tile], splats.tile_offsets[tile + 1]
+        first = splats.tile_offsets[tile]
+        last = splats.tile_offsets[tile + 1]
         if tiles[tile] == CLOSED or (first == last and not is_last):
             continue
-        left, top = tile % columns * TILE_W, tile // columns * TILE_H
+        left = tile % columns * TILE_W
+        top = tile // columns * TILE_H
+        # State of the tile before this slice.
         if tiles[tile] == FRESH:
-            _clear(state, used, size[0] - left, size[1] - top)
+            _clear(state, state_size, size[0] - left, size[1] - top)
         else:
-            _copy(states, U(tile * used), state, U(0), U(used))
+            _copy(states, U(tile * state_size), state, U(0), U(state_size))
+        # Fetch the pixels' cache lines for writing.
         for y in range(min(TILE_H, size[1] - top)):
             at = U((top + y) * size[0] + left)
             v8.prefetch_to_write(images.alpha, at)
-            if wanted is None or wanted & RGB:
+            if buffer_bits is None or buffer_bits & RGB:
                 for line in range(U(0), U(3 * TILE_W), U(LINE)):
                     v8.prefetch_to_write(images.rgb, U(3) * at + line)
         corner = (np.float32(left), np.float32(top))
-        is_open = _blend_list(splats, first, last, corner, frame.limits, wanted, work)
+        is_open = _blend_list(splats, first, last, corner, frame.limits, buffer_bits, work)
+        # Keep the state for the next slice, or write the pixels.
         if is_open and not is_last:
-            _copy(state, U(0), states, U(tile * used), U(used))
+            _copy(state, U(0), states, U(tile * state_size), U(state_size))
             tiles[tile] = OPEN
         else:
-            if wanted is not None and wanted & MODES:
+            if buffer_bits is not None and buffer_bits & MODES:
                 close_clusters(state, P_MODE)
-            _write_pixels(state, left, top, size, images, wanted)
+            _write_pixels(state, left, top, size, images, buffer_bits)
             tiles[tile] = CLOSED
 
 
 @inner()
 def aligned_floats(count):
-    """So many float32 that begin where a cache line does."""
-    room = np.empty(count + LINE, np.float32)
-    past = (U(room.ctypes.data) // U(room.itemsize)) % U(LINE)
-    return room[LINE - np.int64(past) :][:count]
+    """Return `count` float32 numbers that begin at a cache line."""
+    buffer = np.empty(count + LINE, np.float32)
+    start_offset = (U(buffer.ctypes.data) // U(buffer.itemsize)) % U(LINE)
+    return buffer[LINE - np.int64(start_offset) :][:count]
 
 
 @inner()
@@ -418,12 +491,12 @@ def _copy(source, source_at, target, target_at, count):
 
 
 @inner()
-def _clear(state, used, width, height):
-    """A tile before the first splat; pixels beyond the image count as finished."""
-    nobody = np.int32(-1).view(np.float32)
-    for i in range(U(0), U(used), U(LANES)):
+def _clear(state, state_size, width, height):
+    """Set a tile to its state before the first splat; pixels beyond the image count as finished."""
+    no_splat_id = np.int32(-1).view(np.float32)
+    for i in range(U(0), U(state_size), U(LANES)):
         value = np.float32(1) if i < P_RED else np.float32(0)
-        value = nobody if P_ID <= i < P_MODE else value
+        value = no_splat_id if P_ID <= i < P_MODE else value
         v8.store(state, i, v8.splat(value))
     if width < TILE_W or height < TILE_H:
         for y in range(TILE_H):
@@ -434,180 +507,228 @@ def _clear(state, used, width, height):
 
 @inner()
 def _place_of(x, y):
-    """Where a pixel of the tile stands in a plane of its state."""
+    """Return the position of a tile's pixel in a plane of its state."""
     row = x // LANES * TILE_H + y
     return row // ROWS * WIDE + x % LANES * ROWS + row % ROWS
 
 
 @inner()
-def _blend_list(splats, first, last, corner, limits, wanted, work):
-    """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
-    state, staged, spans, rows = work.state, work.staged, work.spans, work.rows
-    records, ids, columns = splats.records, splats.tile_splat_ids, v8.wide_columns()
+def _blend_list(splats, first, last, corner, limits, buffer_bits, work):
+    """Blend a tile's list into its state. Return True if any pixel still lets light through."""
+    state = work.state
+    staged = work.staged
+    spans = work.spans
+    rows = work.rows
+    records = splats.records
+    ids = splats.tile_splat_ids
+    columns = v8.wide_columns()
+    # Open rows of every strip.
     for strip in range(STRIPS):
-        rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
+        rows[2 * strip] = 0
+        rows[2 * strip + 1] = TILE_H
         shrink(state, strip, rows, columns)
     for at in range(first, last, BATCH):
         if is_closed(rows):
             return False
         count = U(min(BATCH, last - at))
+        # Fetch the next batch's records, then transpose this batch's records, lights and cuts.
         for k in range(U(at) + count, U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(ids[k]) * U(RECORD))
         stage(records, ids, U(at), count, corner, staged)
         any_cut = False
-        if wanted is not None:
-            if wanted & LIT_RGB:
-                stage_lights(splats.lights, ids, U(at), count, work.lit)
-            if wanted & CLIP:
-                bent = wanted & SURFACES != 0
-                any_cut = stage_cuts(splats.cuts, ids, U(at), count, staged, bent, work.lines)
+        if buffer_bits is not None:
+            if buffer_bits & LIT_RGB:
+                stage_lights(splats.lights, ids, U(at), count, work.staged_lights)
+            if buffer_bits & CLIP:
+                has_surfaces = buffer_bits & SURFACES != 0
+                any_cut = stage_cuts(
+                    splats.cuts, ids, U(at), count, staged, has_surfaces, work.lines
+                )
+        # Strip by strip, list the items of the batch and blend them.
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
-            found = find_spans(staged, count, strip, rows, limits[1], spans, work.starts)
-            if found == U(0):
+            span_bits = find_spans(staged, count, strip, rows, limits[1], spans, work.starts)
+            if span_bits == U(0):
                 continue
             items = list_items(
-                staged, found, U(strip), spans, work.starts, columns, work.values, work.places
+                staged, span_bits, U(strip), spans, work.starts, columns, work.values, work.places
             )
-            now = wanted
-            if wanted is not None:
-                if wanted & CLIP and wanted & SURFACES:
-                    list_lines(work.lines, SURFACE, found, spans, U(strip), columns, work.surfaces)
+            batch_bits = buffer_bits
+            if buffer_bits is not None:
+                if buffer_bits & CLIP and buffer_bits & SURFACES:
+                    list_lines(
+                        work.lines, SURFACE, span_bits, spans, U(strip), columns, work.surfaces
+                    )
                 if any_cut:
-                    list_lines(work.lines, SHARE, found, spans, U(strip), columns, work.edges)
-                    now = wanted | CUT
-                elif wanted & ORDERED and not _can_change(state, strip, rows, wanted, columns):
-                    now = wanted & ~ORDERED
-            _blend_items(work, items, columns, limits, now)
+                    list_lines(work.lines, SHARE, span_bits, spans, U(strip), columns, work.edges)
+                    batch_bits = buffer_bits | CUT
+                elif buffer_bits & ORDERED and not _can_change(
+                    state, strip, rows, buffer_bits, columns
+                ):
+                    batch_bits = buffer_bits & ~ORDERED
+            _blend_items(work, items, columns, limits, batch_bits)
             shrink(state, strip, rows, columns)
     return not is_closed(rows)
 
 
 @inner()
-def _can_change(state, strip, rows, wanted, columns):
-    """Whether a pixel of the strip may still find its median depth or a heavier splat or cluster.
+def _can_change(state, strip, rows, buffer_bits, columns):
+    """Return True if a pixel of the strip may still find its median depth or a heavier splat or
+    cluster.
 
-    It finds none once its transmittance has fallen below one half and the best weight so far,
-    which most pixels reach early: the rest of the list costs them no more than colour does.
+    It finds none once its transmittance has fallen below one half and the best weight so far. Most
+    pixels reach that early; the remaining list then costs them no more than colour does.
     """
-    most = v8.splat_as(columns, np.float32(-1))
+    possible_gain = v8.splat_as(columns, np.float32(-1))
     half = v8.splat_as(columns, np.float32(0.5))
     for row in range(rows[2 * strip] // ROWS * ROWS, rows[2 * strip + 1], ROWS):
         at = U(strip * STRIP + row * LANES)
         transmittance = v8.load_as(columns, state, at)
-        if wanted & MEDIAN:
-            most = v8.maximum(most, transmittance - half)
-        if wanted & IDS:
-            most = v8.maximum(most, transmittance - v8.load_as(columns, state, at + P_BEST))
-        if wanted & MODES:
-            most = v8.maximum(most, can_grow(state, at + P_MODE, transmittance))
-    return v8.any_not_negative(most)
+        if buffer_bits & MEDIAN:
+            possible_gain = v8.maximum(possible_gain, transmittance - half)
+        if buffer_bits & IDS:
+            possible_gain = v8.maximum(
+                possible_gain, transmittance - v8.load_as(columns, state, at + P_BEST)
+            )
+        if buffer_bits & MODES:
+            possible_gain = v8.maximum(possible_gain, can_grow(state, at + P_MODE, transmittance))
+    return v8.any_not_negative(possible_gain)
 
 
 @inner()
 def is_closed(rows):
-    closed = True
+    """Return True if no strip has an open row."""
+    has_no_open_row = True
     for strip in range(STRIPS):
-        closed = closed and rows[2 * strip] >= rows[2 * strip + 1]
-    return closed
+        has_no_open_row = has_no_open_row and rows[2 * strip] >= rows[2 * strip + 1]
+    return has_no_open_row
 
 
 @inner()
 def shrink(state, strip, rows, columns):
-    """Leave out a strip's first and last rows while no pixel of them is open."""
-    low, high = rows[2 * strip], rows[2 * strip + 1]
+    """Leave out a strip's first and last rows while none of their pixels is open."""
+    low = rows[2 * strip]
+    high = rows[2 * strip + 1]
     while low < high and not _is_open(state, strip, low, columns):
         low += 1
     while low < high and not _is_open(state, strip, high - 1, columns):
         high -= 1
-    rows[2 * strip], rows[2 * strip + 1] = low, high
+    rows[2 * strip] = low
+    rows[2 * strip + 1] = high
 
 
 @inner()
 def _is_open(state, strip, row, columns):
-    each = v8.rows_in(columns)
-    first = U(row) - U(row) % each
-    left = v8.load_as(columns, state, U(strip * STRIP) + first * U(LANES))
-    if each == U(1):
-        return v8.any_not_negative(left)
-    at, here = v8.row_numbers(columns), v8.splat_as(columns, np.float32(U(row) - first))
-    here = v8.both(v8.at_least(at, here), v8.at_least(here, at))
-    return v8.any_not_negative(v8.select(here, left, v8.splat_as(columns, np.float32(-1))))
+    """Return True if a pixel of the row lets light through."""
+    rows_per_item = v8.rows_in(columns)
+    first = U(row) - U(row) % rows_per_item
+    transmittance = v8.load_as(columns, state, U(strip * STRIP) + first * U(LANES))
+    if rows_per_item == U(1):
+        return v8.any_not_negative(transmittance)
+    row_numbers = v8.row_numbers(columns)
+    is_row = v8.splat_as(columns, np.float32(U(row) - first))
+    is_row = v8.both(v8.at_least(row_numbers, is_row), v8.at_least(is_row, row_numbers))
+    return v8.any_not_negative(
+        v8.select(is_row, transmittance, v8.splat_as(columns, np.float32(-1)))
+    )
 
 
 @inner()
-def _blend_items(work, items, columns, limits, wanted):
-    """Blend all items in turn. The next one's alpha is begun before this one is blended."""
-    state, staged, values, places = work.state, work.staged, work.values, work.places
-    lines, lit = work.lines, work.lit
-    alpha_max, log_cut = v8.splat_as(columns, limits[0]), v8.splat_as(columns, limits[1])
-    least, end = v8.splat_as(columns, limits[2]), v8.splat_as(columns, limits[7])
-    zero = v8.splat_as(columns, np.float32(0))
-    n, ends_early = U(BATCH), limits[7] > limits[2]
+def _blend_items(work, items, columns, limits, buffer_bits):
+    """Blend all items in turn. The next item's alpha is begun before an item is blended."""
+    state = work.state
+    staged = work.staged
+    values = work.values
+    places = work.places
+    lines = work.lines
+    staged_lights = work.staged_lights
+    alpha_max = v8.splat_as(columns, limits[0])
+    log_cut = v8.splat_as(columns, limits[1])
+    min_transmittance = v8.splat_as(columns, limits[2])
+    stop = v8.splat_as(columns, limits[7])
+    zeros = v8.splat_as(columns, np.float32(0))
+    n = U(BATCH)
+    ends_early = limits[7] > limits[2]
     places[items] = 0  # one item is read beyond the last
-    coded = U(places[0])
-    next_e = log2_alpha(staged, values, coded // U(PLACES), U(0), columns)
-    next_alpha = alpha_of(next_e, alpha_max, log_cut)
+    item_code = U(places[0])
+    next_log_alpha = log2_alpha(staged, values, item_code // U(PLACES), U(0), columns)
+    next_alpha = alpha_of(next_log_alpha, alpha_max, log_cut)
     for item in range(items):
-        splat, place, e, alpha = coded // U(PLACES), coded % U(PLACES), next_e, next_alpha
-        coded = U(places[item + U(1)])
-        next_e = log2_alpha(staged, values, coded // U(PLACES), item + U(1), columns)
-        next_alpha = alpha_of(next_e, alpha_max, log_cut)
-        if wanted is not None and wanted & CUT:
+        # Take this item's alpha, and begin the next item's.
+        splat = item_code // U(PLACES)
+        place = item_code % U(PLACES)
+        log_alpha = next_log_alpha
+        alpha = next_alpha
+        item_code = U(places[item + U(1)])
+        next_log_alpha = log2_alpha(staged, values, item_code // U(PLACES), item + U(1), columns)
+        next_alpha = alpha_of(next_log_alpha, alpha_max, log_cut)
+        if buffer_bits is not None and buffer_bits & CUT:
             alpha = alpha * kept_share(lines, work.edges, splat, item, columns)
+        # Weight of the splat, and the transmittance that remains.
         at = place * U(WIDE)
         transmittance = v8.load_as(columns, state, at)
         weight = alpha * transmittance
-        after = transmittance - weight
-        kept = v8.greater(after, least)
-        left = v8.select(kept, after, v8.minus_abs(transmittance))
+        transmittance_behind = transmittance - weight
+        is_blended = v8.greater(transmittance_behind, min_transmittance)
+        remaining = v8.select(is_blended, transmittance_behind, v8.minus_abs(transmittance))
         if ends_early:
-            left = remaining_transmittance(transmittance, after, kept, end)
-        v8.store(state, at, left)
-        weight = v8.select(kept, weight, zero)
-        if wanted is None or wanted & RGB:
+            remaining = remaining_transmittance(
+                transmittance, transmittance_behind, is_blended, stop
+            )
+        v8.store(state, at, remaining)
+        weight = v8.select(is_blended, weight, zeros)
+        # Sums of the images that are asked for.
+        if buffer_bits is None or buffer_bits & RGB:
             _add(state, at + P_RED, weight, staged[U(L.RED) * n + splat])
             _add(state, at + P_GREEN, weight, staged[U(L.GREEN) * n + splat])
             _add(state, at + P_BLUE, weight, staged[U(L.BLUE) * n + splat])
-        if wanted is not None:
-            if wanted & LIT_RGB and is_lit(lit, splat):
-                share = weight * light_share(lit, staged, splat, e, place, columns, limits)
-                _add(state, at + P_RED, share, lit[U(L_RED) * n + splat])
-                _add(state, at + P_GREEN, share, lit[U(L_GREEN) * n + splat])
-                _add(state, at + P_BLUE, share, lit[U(L_BLUE) * n + splat])
-            if wanted & OVERLAY:
+        if buffer_bits is not None:
+            if buffer_bits & LIT_RGB and is_lit(staged_lights, splat):
+                share = weight * light_share(
+                    staged_lights, staged, splat, log_alpha, place, columns, limits
+                )
+                _add(state, at + P_RED, share, staged_lights[U(L_RED) * n + splat])
+                _add(state, at + P_GREEN, share, staged_lights[U(L_GREEN) * n + splat])
+                _add(state, at + P_BLUE, share, staged_lights[U(L_BLUE) * n + splat])
+            if buffer_bits & OVERLAY:
                 _add(state, at + P_OVERLAY, weight, staged[U(L.IS_OVERLAY) * n + splat])
-            if wanted & SURFACES:
+            if buffer_bits & SURFACES:
                 centre = staged[U(L.DEPTH) * n + splat]
                 depth = v8.splat_as(columns, centre)
-                if wanted & CLIP:
+                if buffer_bits & CLIP:
                     depth = surface_depth(
                         lines, work.surfaces, splat, item, columns, centre, limits[3]
                     )
-                if wanted & EXPECTED:
+                if buffer_bits & EXPECTED:
                     sums = v8.fmuladd(weight, depth, v8.load_as(columns, state, at + P_DEPTH))
                     v8.store(state, at + P_DEPTH, sums)
-                if wanted & MODES:
+                if buffer_bits & MODES:
                     add_sample(state, at + P_MODE, depth, weight, limits[4])
-            if wanted & MEDIAN:
+            if buffer_bits & MEDIAN:
                 half = v8.splat_as(columns, np.float32(0.5))
-                crossed = v8.both(v8.at_least(transmittance, half), v8.greater(half, after))
+                has_crossed = v8.both(
+                    v8.at_least(transmittance, half), v8.greater(half, transmittance_behind)
+                )
                 depth = v8.splat_as(columns, staged[U(L.DEPTH) * n + splat])
-                before = v8.load_as(columns, state, at + P_MEDIAN)
-                v8.store(state, at + P_MEDIAN, v8.select(v8.both(crossed, kept), depth, before))
-            if wanted & IDS:
+                previous = v8.load_as(columns, state, at + P_MEDIAN)
+                v8.store(
+                    state,
+                    at + P_MEDIAN,
+                    v8.select(v8.both(has_crossed, is_blended), depth, previous),
+                )
+            if buffer_bits & IDS:
                 best = v8.load_as(columns, state, at + P_BEST)
-                heavier = v8.greater(weight, best)
-                v8.store(state, at + P_BEST, v8.select(heavier, weight, best))
+                is_heavier = v8.greater(weight, best)
+                v8.store(state, at + P_BEST, v8.select(is_heavier, weight, best))
                 number = v8.splat_as(columns, staged[U(L.SPLAT_ID) * n + splat])
-                before = v8.load_as(columns, state, at + P_ID)
-                v8.store(state, at + P_ID, v8.select(heavier, number, before))
+                previous = v8.load_as(columns, state, at + P_ID)
+                v8.store(state, at + P_ID, v8.select(is_heavier, number, previous))
 
 
 @inner()
 def log2_alpha(staged, values, splat, item, columns):
-    """Of a splat at an item's pixels (see augment.render.layout)."""
+    """Return the log2 of a splat's alpha at an item's pixels (see augment.render.layout)."""
     sharp = v8.splat_as(columns, staged[U(L.SHARP_X) * U(BATCH) + splat])
     rows = U(ITEMS) // v8.rows_in(columns)
     off = v8.fmuladd(sharp, columns, v8.by_row(columns, values, item + rows))
@@ -615,15 +736,19 @@ def log2_alpha(staged, values, splat, item, columns):
 
 
 @inner()
-def alpha_of(e, alpha_max, log_cut):
-    return v8.minimum(v8.exp2_where(v8.at_least(e, log_cut), e), alpha_max)
+def alpha_of(log_alpha, alpha_max, log_cut):
+    """Return alpha from its log2: 0 below the cut, at most alpha_max."""
+    return v8.minimum(v8.exp2_where(v8.at_least(log_alpha, log_cut), log_alpha), alpha_max)
 
 
 @inner()
-def remaining_transmittance(transmittance, after, kept, end):
-    """Transmittance behind a splat, negative where the pixel is finished. kept: it is blended."""
-    final = v8.minus_abs(v8.select(kept, after, transmittance))
-    return v8.select(v8.greater(after, end), after, final)
+def remaining_transmittance(transmittance, transmittance_behind, is_blended, stop):
+    """Return the transmittance behind a splat, negative where the pixel is finished.
+
+    is_blended: mask of the pixels at which the splat is blended.
+    """
+    final = v8.minus_abs(v8.select(is_blended, transmittance_behind, transmittance))
+    return v8.select(v8.greater(transmittance_behind, stop), transmittance_behind, final)
 
 
 @inner()
@@ -633,19 +758,20 @@ def _add(state, at, weight, value):
 
 
 @inner()
-def _write_pixels(state, left, top, size, images, wanted):
-    """Pixels of a finished tile to the images."""
+def _write_pixels(state, left, top, size, images, buffer_bits):
+    """Write the pixels of a finished tile to the images."""
     columns = v8.wide_columns()
-    one, least = v8.splat(np.float32(1)), v8.splat(np.float32(DEPTH_EPS))
+    ones = v8.splat(np.float32(1))
+    min_weight = v8.splat(np.float32(DEPTH_EPS))
     for y in range(U(min(TILE_H, size[1] - top))):
         for strip in range(U(STRIPS)):
             column = left + np.int64(strip) * LANES
             at = U(_place_of(np.int64(strip) * LANES, np.int64(y)))
             pixel = U((top + np.int64(y)) * size[0] + column)
             count = min(LANES, size[0] - column)
-            opacity = one - v8.absolute(v8.load_row(columns, state, at))
+            opacity = ones - v8.absolute(v8.load_row(columns, state, at))
             _write(images.alpha, pixel, opacity, count)
-            if wanted is None or wanted & RGB:
+            if buffer_bits is None or buffer_bits & RGB:
                 red = v8.load_row(columns, state, at + P_RED)
                 green = v8.load_row(columns, state, at + P_GREEN)
                 blue = v8.load_row(columns, state, at + P_BLUE)
@@ -657,28 +783,28 @@ def _write_pixels(state, left, top, size, images, wanted):
                         images.rgb[first] = v8.lane(red, k)
                         images.rgb[first + U(1)] = v8.lane(green, k)
                         images.rgb[first + U(2)] = v8.lane(blue, k)
-            if wanted is not None:
-                if wanted & EXPECTED:
+            if buffer_bits is not None:
+                if buffer_bits & EXPECTED:
                     weighted = v8.load_row(columns, state, at + P_DEPTH)
-                    depth = weighted / v8.maximum(opacity, least)
+                    depth = weighted / v8.maximum(opacity, min_weight)
                     _write(images.expected, pixel, depth, count)
-                if wanted & MEDIAN:
+                if buffer_bits & MEDIAN:
                     value = v8.load_row(columns, state, at + P_MEDIAN)
                     _write(images.median, pixel, value, count)
-                if wanted & IDS:
+                if buffer_bits & IDS:
                     number = v8.load_row(columns, state, at + P_ID)
                     _write(images.ids.view(np.float32), pixel, number, count)
-                if wanted & MODES:
+                if buffer_bits & MODES:
                     value = v8.load_row(columns, state, at + P_MODE + MODE)
                     _write(images.mode, pixel, value, count)
-                if wanted & OVERLAY:
+                if buffer_bits & OVERLAY:
                     value = v8.load_row(columns, state, at + P_OVERLAY)
                     _write(images.overlay, pixel, value, count)
 
 
 @inner()
 def _write(image, at, values, count):
-    """The first of eight values, as many as lie in the image."""
+    """Write the first of eight values, as many as lie in the image."""
     if count >= LANES:
         v8.store(image, at, values)
     else:

@@ -1,4 +1,4 @@
-"""The CPU rasteriser: arrays for the numba kernels, and the order in which they run.
+"""The CPU rasteriser: arrays for the numba kernels, and the order in which the kernels run.
 
     choose    blocks of Gaussians that the view may see                   (order)
     rank      z and a generous box of their Gaussians                     (project)
@@ -8,7 +8,8 @@
       bin       splats of every open tile, in that order                  (blend)
       raster    blend them; close the tiles that nothing shines through   (blend)
 
-Slices change no bit of the image: what they leave out lies behind closed tiles.
+Slices change no bit of the image: what they leave out lies behind closed tiles. `rasterize` calls
+`rasterize_cpu`; `backward` and the trainer use the stages one by one.
 """
 
 from __future__ import annotations
@@ -54,15 +55,17 @@ from augment.render.part_views import raster_modes, views_of
 from augment.render.threads import kernel_threads, thread_count, usable_cores
 from augment.scene import Gaussians, PosedGaussians
 
-# ---- What the CPU kernels read: scene parts by address, and the numbers of a view ----------------
+# ---- Inputs of the CPU kernels: scene parts by address, and the numbers of a view ----------------
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """All parts for one launch: nothing is concatenated, and actors cost no launch of their own.
+    """All parts for one launch. Nothing is concatenated, and actors cost no launch of their own.
 
-    addresses, sizes, first_ids, views, blocks, orders: see project; None where every part stands in
-    its own order. modes: see layout. kept_alive: what the addresses point to.
+    addresses, sizes, first_ids, views, blocks: see project.Parts.
+    modes: see layout.
+    kept_alive: owners of the memory that the addresses point to.
+    orders: see project.Parts; None if every part stands in its own order.
     """
 
     addresses: np.ndarray
@@ -76,7 +79,7 @@ class Inputs:
 
     @property
     def read(self) -> project_kernels.Parts:
-        """What kernels read of it."""
+        """Arrays that the kernels read."""
         orders = np.zeros(len(self.sizes), np.uint64) if self.orders is None else self.orders
         return project_kernels.Parts(
             self.addresses, self.sizes, self.first_ids, orders, self.views, self.blocks, self.modes
@@ -84,12 +87,12 @@ class Inputs:
 
     @property
     def is_ordered(self) -> bool:
-        """Whether any part stands in another order than its own."""
+        """True if any part stands in another order than its own."""
         return self.orders is not None and bool(self.orders.any())
 
     @property
     def slots(self) -> int:
-        """Room for every Gaussian, block by block."""
+        """Number of slots: room for every Gaussian, block by block."""
         return len(self.blocks) * layout.BLOCK
 
 
@@ -103,27 +106,54 @@ def gather_inputs(
     with_color: bool,
     culled: bool = False,
 ) -> Inputs:
-    """Addresses and numbers of all parts; their tensors are not copied if they are contiguous.
+    """Return addresses and numbers of all parts. Contiguous tensors are not copied.
 
-    culled: whether blocks that the view cannot see are left out.
+    Args:
+        parts: Gaussians with their poses.
+        camera: the camera.
+        settings: thresholds of the image.
+        fog: fog before the splats; None for clear air.
+        clip: height at which splats are cut; None for no cut.
+        with_color: if True, colours are computed.
+        culled: if True, blocks that the view cannot see are left out.
     """
-    kept_alive, addresses, orders, blocks = list[Any](), [], [], []
+    kept_alive = list[Any]()
+    addresses = []
+    orders = []
+    blocks = []
     for number, part in enumerate(parts):
-        g, count = part.gaussians, len(part.gaussians)
-        order = order_of(g) if culled and part.rows is None else None
+        gaussians = part.gaussians
+        count = len(part.gaussians)
+        order = order_of(gaussians) if culled and part.rows is None else None
         if order is None:
             rows = np.array([[0, count]]) if part.rows is None else part.rows
-            kept = _blocks(rows) if count > layout.BLOCK or part.rows is not None else rows
-            own = [g.means, g.quats, g.scales, g.opacities]
+            block_rows = (
+                _split_into_blocks(rows) if count > layout.BLOCK or part.rows is not None else rows
+            )
+            geometry_arrays = [
+                gaussians.means,
+                gaussians.quats,
+                gaussians.scales,
+                gaussians.opacities,
+            ]
         else:
-            kept = order.blocks_seen(part, camera, settings, fog, clip)
-            own = [order.means, *(order.sorted(t).rows for t in (g.quats, g.scales, g.opacities))]
+            block_rows = order.visible_blocks(part, camera, settings, fog, clip)
+            geometry_arrays = [
+                order.means,
+                *(
+                    order.sorted(t).rows
+                    for t in (gaussians.quats, gaussians.scales, gaussians.opacities)
+                ),
+            ]
             kept_alive.append(order.ids)
-        read = [_readable(array) for array in (*own, g.sh, *_looks(part))]
-        kept_alive += read
-        addresses.append([_address(array) for array in read])
+        part_arrays = [
+            _as_kernel_array(array)
+            for array in (*geometry_arrays, gaussians.sh, *_appearance_arrays(part))
+        ]
+        kept_alive += part_arrays
+        addresses.append([_address(array) for array in part_arrays])
         orders.append(0 if order is None else _address(order.ids))
-        blocks += [(number, first, last) for first, last in kept.tolist()]
+        blocks += [(number, first, last) for first, last in block_rows.tolist()]
     sizes = [(len(part.gaussians), part.gaussians.sh.shape[1]) for part in parts]
     counts = [size[0] for size in sizes]
     modes = raster_modes(settings, fog, clip, with_color=with_color)
@@ -140,33 +170,35 @@ def gather_inputs(
     )
 
 
-def _blocks(rows: np.ndarray) -> np.ndarray:
-    """int64 [B, 2]: runs of rows (first, last + 1) in pieces of at most a block."""
+def _split_into_blocks(rows: np.ndarray) -> np.ndarray:
+    """Return runs of rows (first, last + 1) in pieces of at most a block, int64 [B, 2]."""
     counts = -(-(rows[:, 1] - rows[:, 0]) // layout.BLOCK)
     run = np.repeat(np.arange(len(rows)), counts)
     first = rows[run, 0] + layout.BLOCK * (np.arange(len(run)) - (counts.cumsum() - counts)[run])
     return np.stack([first, np.minimum(first + layout.BLOCK, rows[run, 1])], 1)
 
 
-_READ = (torch.float32, torch.int16)
-_UNREAD = torch.zeros(1), torch.zeros(1), torch.zeros(1, dtype=torch.int16)
+_KERNEL_DTYPES = (torch.float32, torch.int16)
+_UNREAD_ARRAYS = torch.zeros(1), torch.zeros(1), torch.zeros(1, dtype=torch.int16)
 
 
-def _looks(part: PosedGaussians) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Slopes of light float32 [N, 3], colour maps float32 [C, 3, 4] and their rows int16 [N]; [1]
-    of what is not read.
+def _appearance_arrays(part: PosedGaussians) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return slopes of light float32 [N, 3], colour maps float32 [C, 3, 4] and their rows int16
+    [N].
+
+    An array that the kernels do not read has one number.
     """
-    slopes, maps, rows = _UNREAD
+    slopes, maps, map_rows = _UNREAD_ARRAYS
     if part.shading is not None:
         slopes = part.shading.slopes
     if part.color_maps is not None:
         maps = part.color_maps
-    return slopes, maps, rows if part.map_rows is None else part.map_rows
+    return slopes, maps, map_rows if part.map_rows is None else part.map_rows
 
 
-def _readable(array: Any) -> Any:
-    """The tensor or array as kernels read it: float32 or int16, row after row."""
-    if isinstance(array, np.ndarray) or (array.dtype in _READ and array.is_contiguous()):
+def _as_kernel_array(array: Any) -> Any:
+    """Return the tensor or array as kernels read it: float32 or int16, row after row."""
+    if isinstance(array, np.ndarray) or (array.dtype in _KERNEL_DTYPES and array.is_contiguous()):
         return array
     return array.to(torch.float32 if array.is_floating_point() else torch.int16).contiguous()
 
@@ -176,21 +208,22 @@ def _address(array: Any) -> int:
 
 
 # ---- Work space, kept between frames: fresh pages cost as much as the work -----------------------
-# Every render takes a space of its own, so threads that render at once never share one.
+# Every render takes its own space, so threads that render at once never share one.
 
-_LINE = 64  # bytes of a cache line
-# Kept for later renders, of which there are rarely more at once. Append and pop are atomic.
+# Bytes of a cache line.
+_LINE = 64
+# Free work spaces. There are rarely more renders at a time. Append and pop are atomic.
 _SPACES: deque[Scratch] = deque(maxlen=max(2, usable_cores()))
 
 
 class Scratch:
-    """Named arrays that keep their memory; each grows to the largest size asked for."""
+    """Named arrays that keep their memory; each grows to the largest requested size."""
 
     def __init__(self) -> None:
         self._buffers: dict[str, np.ndarray] = {}
 
     def array(self, name: str, shape: tuple[int, ...], dtype: type) -> np.ndarray:
-        """An array that starts at a cache line, with whatever the last render left in it."""
+        """Return an array that starts at a cache line; it holds what the last render left in it."""
         count = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         buffer = self._buffers.get(name)
         if buffer is None or buffer.nbytes < count:
@@ -206,7 +239,7 @@ class Scratch:
 
 @contextmanager
 def borrowed_scratch() -> Iterator[Scratch]:
-    """A space for one render, handed back afterwards."""
+    """Lend a work space to one render; it is handed back afterwards."""
     try:
         scratch = _SPACES.pop()
     except IndexError:
@@ -218,18 +251,23 @@ def borrowed_scratch() -> Iterator[Scratch]:
 
 
 def release_scratch() -> None:
-    """Give all kept memory back; the next render takes it anew."""
+    """Free all work spaces; the next render allocates its own."""
     _SPACES.clear()
 
 
-_RANK_RUNS = 8  # pieces of work in ranking, each with its own histogram
-# A slice ends where the splats before it would cover every pixel this many times over with opacity
-# 1: by then, and each time that doubles, most tiles of a dense scene have closed.
+# Pieces of work in ranking, each with its own histogram.
+_RANK_RUNS = 8
+# Cover at which the first slice ends: the splats before it would cover every pixel this many times
+# with opacity 1. By then most tiles of a dense scene have closed.
 _SLICE_COVER = 10.0
+# Factor by which the cover grows from one slice's end to the next.
 _SLICE_GROWTH = 1.4
-_MIN_SLICE = 20_000  # fewer splats cost less than another slice does
-_DTYPES = {SPLAT_IDS: np.int32}  # of images; others are float32
-_MAX_PAIRS = 1 << 24  # (splat, tile) pairs listed at once: 64 MB
+# Smallest number of splats in a slice: fewer splats cost less than another slice does.
+_MIN_SLICE = 20_000
+# Dtypes of images that are not float32.
+_DTYPES = {SPLAT_IDS: np.int32}
+# Largest number of (splat, tile) pairs that are listed at once: 64 MB.
+_MAX_PAIRS = 1 << 24
 
 
 def rasterize_cpu(
@@ -243,13 +281,22 @@ def rasterize_cpu(
     *,
     stage_times: dict[str, float] | None = None,
 ) -> RenderOutput:
-    """The image of the parts in float32, without gradients. Arguments are checked by `rasterize`.
+    """Return the image of the parts in float32, without gradients. `rasterize` checks the
+    arguments.
 
-    pixel_mask: bool [H, W]; tiles without a pixel of the mask are left out and hold zeros.
+    The bits are the same on any number of threads and for any choice of buffers.
 
-    The same bits on any number of threads, whichever buffers are asked for. stage_times: seconds of
-    "project", "sort", "bin" and "raster" and the counts "visible" (splats that touch a tile which
-    nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
+    Args:
+        parts: Gaussians with their poses.
+        camera: the camera.
+        buffers: names of the buffers.
+        settings: thresholds of the image.
+        fog: fog before the splats; None for clear air.
+        clip: height at which splats are cut; None for no cut.
+        pixel_mask: bool [H, W]; tiles without a pixel of the mask are left out and hold zeros.
+        stage_times: dictionary to which are added the seconds of "project", "sort", "bin" and
+            "raster" and the counts "visible" (splats that touch a tile which nearer ones have not
+            closed) and "pairs" (of splats and such tiles).
     """
     timer = StageTimer(stage_times)
     settings = cut_in_fog(settings, fog, clip, buffers)
@@ -265,27 +312,31 @@ def rasterize_cpu(
         for bins in itertools.pairwise(edges):
             if fog is not None and settings.fog_cut > 0:
                 nearest_m = float(np.uint32(bins[0] << layout.BIN_SHIFT).view(np.float32))
-                tiles.stop_at(settings.fog_cut / _clearest(fog, camera, nearest_m))
+                tiles.stop_at(settings.fog_cut / _max_transmittance(fog, camera, nearest_m))
             splats = project(inputs, depths, bins, tiles, scratch)
             timer.end_stage("project")
             slots, rects = sort(splats, bins[0], scratch, is_ordered=inputs.is_ordered)
             timer.end_stage("sort")
             timer.count("visible", len(slots))
             tiles.blend(splats, slots, rects, is_last=bins[1] == edges[-1], timer=timer)
-            if not tiles.open.any():
+            if not tiles.status.any():
                 break
     return RenderOutput(**{name: torch.from_numpy(image) for name, image in images.items()})
 
 
-def _clearest(fog: Fog, camera: Camera, distance_m: float) -> float:
-    """No more light comes through the fog from anywhere at this distance: that from straight up."""
-    eye_z_m, way_m = float(camera.centre[2]), np.array([distance_m])
-    depth = float(optical_depth_of_arrays(fog, way_m, eye_z_m, eye_z_m + way_m)[0])
+def _max_transmittance(fog: Fog, camera: Camera, distance_m: float) -> float:
+    """Return the largest transmittance of the fog from any point at this distance.
+
+    It is the transmittance from straight up.
+    """
+    eye_z_m = float(camera.centre[2])
+    ray_distance = np.array([distance_m])
+    depth = float(optical_depth_of_arrays(fog, ray_distance, eye_z_m, eye_z_m + ray_distance)[0])
     return math.exp(-min(depth, MAX_EXPONENT))
 
 
 class StageTimer:
-    """Adds the time between stage ends, and counts, to the caller's dictionary."""
+    """Adds the time between the ends of stages, and counts, to the caller's dictionary."""
 
     def __init__(self, times: dict[str, float] | None) -> None:
         self._times = {} if times is None else times
@@ -311,7 +362,12 @@ def image_arrays(camera: Camera, buffers: frozenset[str]) -> dict[str, np.ndarra
 
 
 def rank(inputs: Inputs, camera: Camera, scratch: Scratch) -> tuple[np.ndarray, list[int]]:
-    """z of all Gaussians (0: cannot be seen), and where the slices begin and end, in bins of z."""
+    """Return z of all Gaussians and the edges of the slices.
+
+    Returns:
+        z [slots], 0 for a Gaussian that cannot be seen, and the bins of z where the slices begin
+        and end.
+    """
     depths = scratch.array("depths", (inputs.slots,), np.float32)
     histograms = scratch.array("histograms", (_RANK_RUNS, 2, layout.BINS), np.float64)
     project_kernels.rank_splats(inputs.read, depths, histograms)
@@ -320,23 +376,30 @@ def rank(inputs: Inputs, camera: Camera, scratch: Scratch) -> tuple[np.ndarray, 
 
 
 def _slice_edges(cover: np.ndarray, counts: np.ndarray) -> list[int]:
-    """First bin of every slice, and the end of the last. cover, counts: of each bin of z.
+    """Return the first bin of every slice, and the end of the last.
 
-    Bin 0 is not among them: there stand the Gaussians that cannot be seen.
+    Bin 0 is left out: it holds the Gaussians that cannot be seen.
+
+    Args:
+        cover: opacity times area of the splats in each bin of z, relative to the image.
+        counts: number of splats in each bin of z.
     """
-    filled = np.flatnonzero(counts[1:]) + 1
-    if len(filled) == 0:
+    filled_bins = np.flatnonzero(counts[1:]) + 1
+    if len(filled_bins) == 0:
         return [1, 2]
-    edges, end = [int(filled[0])], int(filled[-1]) + 1
-    cover, counts = cover.cumsum(), counts.cumsum()
-    target, taken = _SLICE_COVER, 0.0
+    edges = [int(filled_bins[0])]
+    end = int(filled_bins[-1]) + 1
+    cover = cover.cumsum()
+    counts = counts.cumsum()
+    target = _SLICE_COVER
+    num_before = 0.0
     while target < cover[-1]:
         edge = int(np.searchsorted(cover, target)) + 1
         if counts[-1] - counts[edge - 1] < _MIN_SLICE:
             break
-        if counts[edge - 1] - taken >= _MIN_SLICE:
+        if counts[edge - 1] - num_before >= _MIN_SLICE:
             edges.append(edge)
-            taken = counts[edge - 1]
+            num_before = counts[edge - 1]
         target *= _SLICE_GROWTH
     return [*edges, end]
 
@@ -344,7 +407,7 @@ def _slice_edges(cover: np.ndarray, counts: np.ndarray) -> list[int]:
 def project(
     inputs: Inputs, depths: np.ndarray, bins: tuple[int, int], tiles: Tiles, scratch: Scratch
 ) -> project_kernels.Splats:
-    """The slice's splats; cuts and lights are empty where nothing asks for them."""
+    """Return the slice's splats. Cuts and lights are empty if no part needs them."""
     blocks = len(inputs.blocks)
     cuts = geometry.CUT * inputs.slots if inputs.modes[layout.M_CLIP] else 0
     lights = geometry.SHADING_LINES * inputs.slots if inputs.modes[layout.M_LIGHT] else 0
@@ -352,7 +415,7 @@ def project(
         scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
         scratch.array("rects", (inputs.slots,), np.uint64),
         scratch.array("keys", (inputs.slots,), np.uint32),
-        scratch.array("found", (blocks,), np.int64),
+        scratch.array("splat_counts", (blocks,), np.int64),
         scratch.array("bin_counts", (blocks, bins[1] - bins[0]), np.int32),
         scratch.array("cuts", (cuts,), np.float32),
         scratch.array("lights", (lights,), np.float32),
@@ -366,17 +429,18 @@ def project(
 def sort(
     splats: project_kernels.Splats, first_bin: int, scratch: Scratch, *, is_ordered: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Slots nearest first (ties in index order), and their tiles in that order. is_ordered: whether
-    any part's slots are in another order than its Gaussians.
+    """Return the slots nearest first (ties in index order), and their tiles in that order.
+
+    is_ordered: if True, some part's slots are in another order than its Gaussians.
     """
     # Bin after bin, and in each of them block after block.
-    bin_offsets = np.append(0, splats.counts.sum(0, dtype=np.int64).cumsum())
-    heads = bin_offsets[:-1] + splats.counts.cumsum(0, dtype=np.int64) - splats.counts
+    bin_offsets = np.append(0, splats.bin_counts.sum(0, dtype=np.int64).cumsum())
+    heads = bin_offsets[:-1] + splats.bin_counts.cumsum(0, dtype=np.int64) - splats.bin_counts
     count = int(bin_offsets[-1])
     keys, spare_keys = (scratch.array(f"sorted_keys{i}", (count,), np.uint32) for i in range(2))
     slots, spare_slots = (scratch.array(f"sorted_slots{i}", (count,), np.int32) for i in range(2))
     rects = scratch.array("sorted_rects", (count,), np.uint64)
-    blend_kernels.scatter_to_bins(splats.keys, splats.found, first_bin, heads, keys, slots)
+    blend_kernels.scatter_to_bins(splats.keys, splats.splat_counts, first_bin, heads, keys, slots)
     blend_kernels.sort_bins(bin_offsets, keys, slots, splats.rects, spare_keys, spare_slots, rects)
     if is_ordered:
         project_kernels.order_ties(keys, slots, rects, splats.records)
@@ -384,7 +448,7 @@ def sort(
 
 
 class Tiles:
-    """The image's tiles while it is rendered: which are open, and what they hold."""
+    """The image's tiles during a render: their status and their state."""
 
     def __init__(
         self,
@@ -410,35 +474,39 @@ class Tiles:
             ],
             np.float32,
         )
-        self.frame, self._stop = blend_kernels.Frame(size, limits), settings.transmittance_stop
+        self.frame = blend_kernels.Frame(size, limits)
+        self._stop = settings.transmittance_stop
         # Alpha is always written, so that kernels come in fewer variants.
-        spare = {ALPHA: scratch.array("alpha", (camera.height, camera.width), np.float32)}
-        none = {name: np.empty(0, _DTYPES.get(name, np.float32)) for name in BUFFERS}
-        flat = {name: image.reshape(-1) for name, image in (none | spare | images).items()}
-        self._images = blend_kernels.Images(*(flat[name] for name in BUFFERS))
-        self._wanted = sum(1 << BUFFERS.index(name) for name in {ALPHA, *images})
-        used = _state_size(images)
+        alpha_buffer = {ALPHA: scratch.array("alpha", (camera.height, camera.width), np.float32)}
+        empty_images = {name: np.empty(0, _DTYPES.get(name, np.float32)) for name in BUFFERS}
+        flat_images = {
+            name: image.reshape(-1)
+            for name, image in (empty_images | alpha_buffer | images).items()
+        }
+        self._images = blend_kernels.Images(*(flat_images[name] for name in BUFFERS))
+        self._buffer_bits = sum(1 << BUFFERS.index(name) for name in {ALPHA, *images})
+        state_size = _state_size(images)
         self._scratch = scratch
-        self._states = scratch.array("states", (count * used,), np.float32)
-        self.open = scratch.array("open", (count,), np.uint8)
-        self.open[:] = blend_kernels.FRESH
+        self._states = scratch.array("states", (count * state_size,), np.float32)
+        self.status = scratch.array("open", (count,), np.uint8)
+        self.status[:] = blend_kernels.FRESH
 
     def leave_out(self, pixel_mask: np.ndarray) -> None:
         """Close the tiles without a pixel of the mask [H, W]; their pixels become 0."""
-        drawn = any_in_squares(pixel_mask, layout.TILE_W)
-        self.open[~drawn.reshape(-1)] = blend_kernels.CLOSED
+        has_masked_pixel = any_in_squares(pixel_mask, layout.TILE_W)
+        self.status[~has_masked_pixel.reshape(-1)] = blend_kernels.CLOSED
         for image in self._images:
             image.fill(0)
 
     def stop_at(self, transmittance: float) -> None:
-        """Finish pixels that let no more than this through, or than the settings say."""
+        """Finish pixels at this transmittance, or at the settings' stop if that is greater."""
         stop = min(max(transmittance, self._stop), MAX_TRANSMITTANCE_STOP)
         self.frame.limits[-1] = stop  # see blend.Frame
 
     def open_sums(self) -> np.ndarray:
-        """int32 [rows + 1, columns + 1]: open tiles above and to the left."""
+        """Return the number of open tiles above and to the left, int32 [rows + 1, columns + 1]."""
         sums = np.zeros((self._rows + 1, self._columns + 1), np.int32)
-        is_open = (self.open != blend_kernels.CLOSED).reshape(self._rows, self._columns)
+        is_open = (self.status != blend_kernels.CLOSED).reshape(self._rows, self._columns)
         sums[1:, 1:] = is_open.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
         return sums
 
@@ -451,8 +519,9 @@ class Tiles:
         is_last: bool,
         timer: StageTimer,
     ) -> None:
-        """Blend splats, nearest first, into the open tiles; is_last closes them all."""
-        first, count = 0, len(slots)
+        """Blend splats, nearest first, into the open tiles; is_last closes all tiles."""
+        first = 0
+        count = len(slots)
         while True:
             end, tile_splat_ids, tile_offsets = self.list_tile_splats(slots, rects, first)
             timer.end_stage("bin")
@@ -460,7 +529,7 @@ class Tiles:
             self.blend_lists(splats, tile_splat_ids, tile_offsets, is_last=is_last and end == count)
             timer.end_stage("raster")
             first = end
-            if first == count or not self.open.any():
+            if first == count or not self.status.any():
                 return
 
     def blend_lists(
@@ -471,40 +540,48 @@ class Tiles:
         *,
         is_last: bool,
     ) -> blend_kernels.TileSplats:
-        """Blend every open tile's list; is_last closes them all. Returns what was blended."""
-        listed = blend_kernels.TileSplats(
+        """Blend every open tile's list, and return the lists; is_last closes all tiles."""
+        tile_splats = blend_kernels.TileSplats(
             splats.records, splats.cuts, splats.lights, tile_splat_ids, tile_offsets
         )
-        wanted = self._wanted
-        wanted |= blend_kernels.CLIP if splats.cuts.size else 0
-        wanted |= blend_kernels.LIT_RGB if splats.lights.size and wanted & blend_kernels.RGB else 0
+        buffer_bits = self._buffer_bits
+        buffer_bits |= blend_kernels.CLIP if splats.cuts.size else 0
+        buffer_bits |= (
+            blend_kernels.LIT_RGB if splats.lights.size and buffer_bits & blend_kernels.RGB else 0
+        )
         blend_kernels.blend_tiles(
-            listed, self.open, self._states, is_last, self.frame, self._images,
-            None if wanted == blend_kernels.RGB | blend_kernels.ALPHA else wanted,
-        )  # fmt: skip
-        return listed
+            tile_splats,
+            self.status,
+            self._states,
+            is_last,
+            self.frame,
+            self._images,
+            None if buffer_bits == blend_kernels.RGB | blend_kernels.ALPHA else buffer_bits,
+        )
+        return tile_splats
 
     def list_all(self, slots: np.ndarray, rects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The lists of all splats and where each begins, however long they are."""
+        """Return the lists of all splats, however long, and the position where each begins."""
         _, tile_splat_ids, tile_offsets = self.list_tile_splats(slots, rects, 0, limit=None)
         return tile_splat_ids, tile_offsets
 
     def list_tile_splats(
         self, slots: np.ndarray, rects: np.ndarray, first: int, limit: int | None = _MAX_PAIRS
     ) -> tuple[int, np.ndarray, np.ndarray]:
-        """Lists of every open tile's splats, nearest first, from the splat `first` on.
+        """Return the lists of every open tile's splats, nearest first, from the splat `first` on.
 
-        Returns where they stop, which is before the end where they would be too long, the lists
-        one after the other, and where each begins.
+        Returns:
+            The splat before which the lists stop, which is not the end if they would exceed
+            `limit`; the lists one after the other; and the position where each begins.
         """
         end = len(slots)
         counts = self._count(rects, first, end)
         if limit is not None and counts.sum() > limit:
-            end = first + _splats_in(rects[first:], limit)
+            end = first + _num_splats_within(rects[first:], limit)
             counts = self._count(rects, first, end)
         tile_offsets = np.append(0, np.cumsum(counts))
-        heads = np.where(self.open != blend_kernels.CLOSED, tile_offsets[:-1], -1)
-        tile_splat_ids = self._scratch.array("members", (int(tile_offsets[-1]),), np.int32)
+        heads = np.where(self.status != blend_kernels.CLOSED, tile_offsets[:-1], -1)
+        tile_splat_ids = self._scratch.array("tile_splat_ids", (int(tile_offsets[-1]),), np.int32)
         bands = min(self._rows, 2 * thread_count())
         blend_kernels.fill_lists(
             slots, rects, first, end, self._columns, heads, tile_splat_ids, bands
@@ -512,16 +589,16 @@ class Tiles:
         return end, tile_splat_ids, tile_offsets
 
     def _count(self, rects: np.ndarray, first: int, end: int) -> np.ndarray:
-        """int64 [tiles]: splats [first, end) in each; none in closed tiles."""
+        """Return the number of the splats [first, end) in each tile, int64 [tiles]; 0 if closed."""
         shape = (self._rows + 1, self._columns + 1)
         corners = self._scratch.array("corners", (thread_count(), shape[0] * shape[1]), np.int32)
         blend_kernels.count_corners(rects, first, end, self._columns, corners)
         totals = corners.sum(0, dtype=np.int64).reshape(shape).cumsum(0).cumsum(1)
-        return np.where(self.open != blend_kernels.CLOSED, totals[:-1, :-1].reshape(-1), 0)
+        return np.where(self.status != blend_kernels.CLOSED, totals[:-1, :-1].reshape(-1), 0)
 
 
 def _state_size(images: dict[str, np.ndarray]) -> int:
-    """float32 numbers that a tile keeps between slices for these images."""
+    """Return how many float32 numbers a tile keeps between slices for these images."""
     names = set(images) - {RGB, ALPHA}
     if MODE_DEPTH in names:
         return blend_kernels.STATE
@@ -530,15 +607,16 @@ def _state_size(images: dict[str, np.ndarray]) -> int:
     return blend_kernels.OVERLAY_STATE if names else blend_kernels.COLOR_STATE
 
 
-def _splats_in(rects: np.ndarray, limit: int) -> int:
-    """How many splats in turn touch no more than `limit` tiles; at least one."""
+def _num_splats_within(rects: np.ndarray, limit: int) -> int:
+    """Return how many splats in turn touch at most `limit` tiles; at least one."""
     corners = rects.view(np.uint16).reshape(-1, 4).astype(np.int64)  # as in blend
     tiles = (corners[:, 2] - corners[:, 0] + 1) * (corners[:, 3] - corners[:, 1] + 1)
     return max(1, int(np.searchsorted(tiles.cumsum(), limit, side="right")))
 
 
 def warm_up() -> float:
-    """Compile every kernel that colour, alpha and median depth need; seconds it took.
+    """Compile every kernel that colour, alpha and median depth need, and return the seconds it
+    took.
 
     Later processes read the compiled kernels from the cache folder (see kernel_cache.py).
     """

@@ -1,6 +1,6 @@
-"""How the CPU backend's functions are compiled. Importing compiles nothing; the first call does.
+"""Compilation of the CPU backend's functions. Importing compiles nothing; the first call does.
 
-Division follows IEEE 754 (error_model), and no rounding is left to the compiler (no fast-math), so
+Division follows IEEE 754 (error_model), and no rounding is left to the compiler (no fast-math). So
 an image has the same bits from every variant of a kernel.
 """
 
@@ -30,14 +30,15 @@ logger = logging.getLogger(__name__)
 MIN_PAUSE_S = 10.0
 _COMMON = {"nogil": True, "error_model": "numpy"}
 
-KERNELS: dict[str, Any] = {}  # all that were imported, by "module:function"
+# All imported kernels, by "module:function".
+KERNELS: dict[str, Any] = {}
 
-# Called by kernels only, which keep its code in their own cache files.
+# Decorator of a function that kernels call; they keep its code in their own cache files.
 inner = functools.partial(numba.njit, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_COMMON)
 
 
 def _hash_sources() -> str:
-    """Digest of the files that hold functions which kernels of other files call."""
+    """Return a digest of the files that hold functions which kernels of other files call."""
     folder = Path(__file__).parent
     render = folder.parent
     sources = [
@@ -53,28 +54,31 @@ SOURCES = _hash_sources()
 
 
 def kernel(function: FunctionType) -> Any:
-    """A parallel kernel, launched from Python and compiled once for these sources and this machine.
+    """Return a parallel kernel, launched from Python and compiled once per version and machine.
 
-    numba's cache looks at the kernel's own file alone and would go on using code of other files
-    that has changed since. It does look at what a function closes over, so a hash of all files is
-    put there. Of processes that want a kernel at the same time, one compiles it and the others
-    wait for it.
+    numba's cache looks at the kernel's own file alone, and would go on using code of other files
+    that has changed since. It does look at the variables that a function closes over, so a hash of
+    all files is put there. If several processes want a kernel at the same time, one compiles it and
+    the others wait for it.
     """
     return _compiled(function, parallel=True)
 
 
 def serial_kernel(function: FunctionType) -> Any:
-    """As `kernel`, on the thread that calls it."""
+    """Return a kernel as `kernel` does, for the calling thread alone."""
     return _compiled(function, parallel=False)
 
 
 def _compiled(function: FunctionType, *, parallel: bool) -> Any:
+    """Return a numba function that is compiled once for these sources, by one process at a time."""
     code = function.__code__.replace(co_freevars=("sources",))
-    closed = FunctionType(code, function.__globals__, function.__name__, None, (CellType(SOURCES),))
-    functools.update_wrapper(closed, function)
-    del closed.__wrapped__
-    compiled = numba.njit(parallel=parallel, **_COMMON)(closed)
-    if (cache := cache_of_kernel(closed, SOURCES)) is not None:
+    closure = FunctionType(
+        code, function.__globals__, function.__name__, None, (CellType(SOURCES),)
+    )
+    functools.update_wrapper(closure, function)
+    del closure.__wrapped__
+    compiled = numba.njit(parallel=parallel, **_COMMON)(closure)
+    if (cache := cache_of_kernel(closure, SOURCES)) is not None:
         compiled._cache = cache
     name = f"{function.__module__}:{function.__name__}"
     compiled.compile = functools.partial(_compile_alone, compiled.compile, name)
@@ -85,8 +89,8 @@ def _compiled(function: FunctionType, *, parallel: bool) -> Any:
 def cached_njit(**options: Any) -> Callable[[FunctionType], Any]:
     """Return a decorator as `numba.njit(cache=True, **options)`, for functions beside the kernels.
 
-    What is compiled lies in the user's cache folder, and is compiled again when any file in the
-    function's folder changes.
+    Compiled code lies in the user's cache folder. A function is compiled again when any file in its
+    folder changes.
     """
 
     def decorate(function: FunctionType) -> Any:
@@ -106,14 +110,16 @@ def _hash_folder(folder: str) -> str:
 
 
 def _compile_alone(compile_kernel: Callable[[Any], Any], name: str, sig: Any) -> Any:
-    # In this order: a kernel's compilation compiles those that it calls, under numba's lock.
+    # The locks are taken in this order, since a kernel's compilation compiles the kernels that it
+    # calls, under numba's lock.
     with global_compiler_lock, compiling(name, sig), _CLOCK.running():
         return compile_kernel(sig)
 
 
 class _Clock:
-    """The seconds that this process has spent on compiling kernels, and on reading them from the
-    cache. It runs under numba's lock, so for one thread at a time.
+    """Seconds that this process has spent on compiling kernels, and on reading them from the cache.
+
+    It runs under numba's lock, so for one thread at a time.
     """
 
     def __init__(self) -> None:
@@ -122,6 +128,7 @@ class _Clock:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
+        """Count the time inside; nested uses count once."""
         started = time.perf_counter()
         self._depth += 1
         try:
@@ -136,8 +143,9 @@ _CLOCK = _Clock()
 
 
 class _CompileLog(event.Listener):
-    """Logs that kernels are compiled, before the first of several is. Reading them from the cache
-    is no such event.
+    """Listener that logs before the first of several kernels is compiled.
+
+    Reading kernels from the cache is no such event.
     """
 
     def __init__(self) -> None:
@@ -164,29 +172,33 @@ def seconds_compiling() -> float:
 
 @contextlib.contextmanager
 def compiling(name: str, sig: Any, *, wait: bool = True) -> Iterator[bool]:
-    """The right to compile a kernel, among this user's processes, or to read it from the cache.
+    """Take the right to compile a kernel, or to read it from the cache, among this user's
+    processes.
 
-    Yields False where another process has it and there is no waiting.
+    Yields False if another process has it and `wait` is False.
     """
     digest = hashlib.sha256(f"{SOURCES} {name} {sig}".encode()).digest()
-    place, way = int.from_bytes(digest[:7], "big"), fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB)
+    lock_byte = int.from_bytes(digest[:7], "big")
+    lock_mode = fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB)
     try:
         file = _lock_file(os.getpid())
-        fcntl.lockf(file, way, 1, place)
+        fcntl.lockf(file, lock_mode, 1, lock_byte)
     except BlockingIOError:
         yield False
-    except OSError:  # there is no such folder: processes may do the same work twice
+    except OSError:  # there is no such folder, so processes may do the same work twice
         yield True
     else:
         try:
             yield True
         finally:
-            fcntl.lockf(file, fcntl.LOCK_UN, 1, place)
+            fcntl.lockf(file, fcntl.LOCK_UN, 1, lock_byte)
 
 
 @functools.cache
 def _lock_file(_process: int) -> int:
-    """A file of which each kernel's lock is a byte. It stays open: closing it ends all locks."""
+    """Return a file of which each kernel's lock is a byte. It stays open: closing it ends all
+    locks.
+    """
     cache = user_cache_folder()
     if cache is None:
         raise FileNotFoundError("this user has no home folder, so no cache folder")

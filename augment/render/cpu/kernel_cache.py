@@ -37,10 +37,10 @@ SECONDS_A_DAY = 86_400
 
 
 def user_cache_folder() -> Path | None:
-    """Return the folder of this package in the user's cache folder; it may not exist yet. None
-    where the user has no home.
+    """Return the folder of this package in the user's cache folder; it may not exist yet.
 
-    A relative XDG_CACHE_HOME does not count, as the XDG Base Directory Specification says.
+    It is None if the user has no home. A relative XDG_CACHE_HOME does not count, as the XDG Base
+    Directory Specification says.
     """
     cache_home = Path(os.environ.get("XDG_CACHE_HOME", ""))
     try:
@@ -52,19 +52,20 @@ def user_cache_folder() -> Path | None:
 
 @functools.cache
 def kernel_cache_folder() -> Path | None:
-    """Return the folder of the compiled kernels: the same one for as long as this process runs.
-    None where the user has no home.
+    """Return the folder of the compiled kernels; it is the same one as long as this process runs.
+
+    It is None if the user has no home.
     """
     folder = user_cache_folder()
     return None if folder is None else folder / "kernels"
 
 
 def cache_of_kernel(function: Any, sources_digest: str) -> FunctionCache | None:
-    """Return numba's cache of one kernel; None where no folder can be written.
+    """Return numba's cache of one kernel; None if no folder can be written.
 
     Args:
         function: the Python function of the kernel.
-        sources_digest: of the files whose code the kernel may contain besides its own file.
+        sources_digest: digest of the files whose code the kernel may contain besides its own file.
     """
 
     class Folder(UserCacheLocator):
@@ -83,7 +84,7 @@ def cache_of_kernel(function: Any, sources_digest: str) -> FunctionCache | None:
 
 
 class UserCacheLocator(_CacheLocator):
-    """The place of one kernel's files: a folder named by all that the kernel is made from."""
+    """Locator of one kernel's files: a folder that is named by all sources of the kernel."""
 
     digest_of_others = ""
 
@@ -109,6 +110,7 @@ class UserCacheLocator(_CacheLocator):
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> UserCacheLocator | None:
+        """Return the locator of a kernel; None if its folder cannot be written."""
         kernels = kernel_cache_folder()
         if kernels is None:
             return None
@@ -132,7 +134,7 @@ def _is_ready(path: str) -> bool:
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder of a kernel, or note that it is in use still."""
+    """Make the folder of a kernel, or note that it is still in use."""
     if not folder.is_dir():
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         _remove_unused(folder.parent)
@@ -142,7 +144,7 @@ def make_folder(folder: Path) -> None:
 
 
 def _remove_unused(folder: Path) -> None:
-    """Remove what no process has used for KEEP_DAYS. Who still does compiles again."""
+    """Remove folders that no process has used for KEEP_DAYS; their kernels are compiled again."""
     oldest = time.time() - KEEP_DAYS * SECONDS_A_DAY
     for entry in os.scandir(folder):
         with contextlib.suppress(OSError):

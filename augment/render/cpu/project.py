@@ -1,8 +1,8 @@
-"""Numba kernels: Gaussians of all parts to splats of one image.
+"""Numba kernels that project the Gaussians of all parts to splats of one image.
 
-Two steps, so that what nearer splats hide is never projected: `rank_splats` finds z and a generous
-box, `project_slice` does the rest for the splats of one range of z, if a tile they touch is still
-open. Both take Gaussians eight at a time.
+The projection has two steps, so that splats hidden by nearer ones are never projected.
+`rank_splats` finds z and a generous box. `project_slice` does the rest for the splats of one range
+of z, if a tile that they touch is still open. Both take Gaussians eight at a time.
 """
 
 from __future__ import annotations
@@ -54,12 +54,15 @@ from augment.render.sh import (
     SH_C0,
 )
 
-# ---- Numba kernels: what colour a splat shows to the camera. SH of degrees 0 to 3, then fog -----
-# Eight splats at a time for what depends on the direction alone (`prepare_colors`), one at a time
-# for the sum over its coefficients (`write_color`), which are read where they lie in the scene.
+# ---- Numba kernels: colour of a splat towards the camera, from SH of degrees 0 to 3, then fog ----
+# `prepare_colors` computes the terms that depend on the direction alone, eight splats at a time.
+# `write_color` sums over the coefficients of one splat, which are read in place in the scene.
 
+# Largest number of SH functions.
 MAX_FUNCTIONS = 16
-TRANSMITTANCE = MAX_FUNCTIONS  # row of the fog's transmittance, after those of the SH functions
+# Row of the fog's transmittance, after those of the SH functions.
+TRANSMITTANCE = MAX_FUNCTIONS
+# Number of rows for colours.
 COLOR_ROWS = MAX_FUNCTIONS + 1
 
 _C0, _C1, _C2_XY, _C2_ZZ, _C2_XX = map(np.float32, (SH_C0, C1, C2_XY, C2_ZZ, C2_XX))
@@ -70,56 +73,66 @@ _C3_CUBIC, _C3_XYZ, _C3_ZZ, _C3_ZZZ, _C3_ZXX = map(
 
 @inner()
 def prepare_colors(dx, dy, dz, view, functions, fog, rows):
-    """SH functions and transmittance of eight splats, d from the eye in the part's axes.
+    """Write SH functions and transmittance of eight splats.
 
-    rows: flat, COLOR_ROWS of eight, filled.
+    Args:
+        dx, dy, dz: vectors from the eye, in the part's axes.
+        view: numbers of the view.
+        functions: number of SH functions.
+        fog: mode of the fog.
+        rows: COLOR_ROWS rows of eight numbers, flat; written.
     """
     distance = v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
     inverse = v8.splat(np.float32(1)) / distance
     write_basis(dx * inverse, dy * inverse, dz * inverse, functions, rows)
     if fog != L.NO_FOG:
-        tau = v8.splat(view[L.V_SIGMA]) * distance
+        tau = v8.splat(view[L.V_EXTINCTION]) * distance
         if fog == L.LAYERED_FOG:
             tau = tau * _layered_density(dx, dy, dz, view)
-        lowest = v8.splat(np.float32(-126))  # 1e-38: nothing is seen through it
+        lowest = v8.splat(np.float32(-126))  # 1e-38: fog that deep is opaque
         transmittance = exp2_fine(v8.maximum(tau * v8.splat(-LOG2_E), lowest))
         v8.store(rows, U(TRANSMITTANCE * LANES), transmittance)
 
 
 @inner()
 def _layered_density(dx, dy, dz, view):
-    """Mean density along the way, relative to the base: exp(-min(a, b)) (1 - exp(-x)) / x.
+    """Return the mean density along a ray, relative to the base: exp(-min(a, b)) (1 - exp(-x)) / x.
 
-    a, b: heights of eye and splat in scale heights, x = |b - a|; see weather.fog.
+    a and b are the heights of eye and splat in scale heights, and x = |b - a|; see
+    augment.render.fog.
     """
-    one, zero = v8.splat(np.float32(1)), v8.splat(np.float32(0))
-    up = v8.splat(view[L.V_UP + 2]) * dz
-    up = v8.fmuladd(v8.splat(view[L.V_UP + 1]), dy, up)
-    up = v8.fmuladd(v8.splat(view[L.V_UP]), dx, up)
-    x = v8.maximum(up, v8.negate(up))
-    lowest = v8.splat(view[L.V_EYE_HEIGHT]) + v8.minimum(up, zero)
+    ones = v8.splat(np.float32(1))
+    zeros = v8.splat(np.float32(0))
+    climb = v8.splat(view[L.V_UP + 2]) * dz
+    climb = v8.fmuladd(v8.splat(view[L.V_UP + 1]), dy, climb)
+    climb = v8.fmuladd(v8.splat(view[L.V_UP]), dx, climb)
+    x = v8.maximum(climb, v8.negate(climb))
+    lowest = v8.splat(view[L.V_EYE_HEIGHT]) + v8.minimum(climb, zeros)
     fade = exp2_fine(v8.maximum(x * v8.splat(-LOG2_E), v8.splat(np.float32(-126))))
     series = v8.fmuladd(x, v8.splat(np.float32(1 / 120)), v8.splat(np.float32(-1 / 24)))
     series = v8.fmuladd(x, series, v8.splat(np.float32(1 / 6)))
     series = v8.fmuladd(x, series, v8.splat(np.float32(-1 / 2)))
-    series = v8.fmuladd(x, series, one)
+    series = v8.fmuladd(x, series, ones)
     # Below 0.1 the difference 1 - exp(-x) has lost a digit, and the series' next term is 1e-8.
-    short = v8.greater(v8.splat(np.float32(0.1)), x)
-    mean = v8.select(short, series, (one - fade) / v8.select(short, one, x))
+    is_short = v8.greater(v8.splat(np.float32(0.1)), x)
+    mean = v8.select(is_short, series, (ones - fade) / v8.select(is_short, ones, x))
     power = v8.minimum(v8.negate(lowest), v8.splat(np.float32(MAX_EXPONENT))) * v8.splat(LOG2_E)
     return exp2_fine(v8.maximum(power, v8.splat(np.float32(-126)))) * mean
 
 
 @inner()
 def write_basis(x, y, z, functions, rows):
-    """The first `functions` spherical harmonics of unit directions, as render.sh lists them."""
+    """Write the first `functions` spherical harmonics of unit directions (see render.sh)."""
     v8.store(rows, U(0 * LANES), v8.splat(_C0))
     if functions > 1:
         v8.store(rows, U(1 * LANES), v8.splat(-_C1) * y)
         v8.store(rows, U(2 * LANES), v8.splat(_C1) * z)
         v8.store(rows, U(3 * LANES), v8.splat(-_C1) * x)
     if functions > 4:
-        xx, yy, zz, xy = x * x, y * y, z * z, x * y
+        xx = x * x
+        yy = y * y
+        zz = z * z
+        xy = x * y
         two = v8.splat(np.float32(2))
         v8.store(rows, U(4 * LANES), v8.splat(_C2_XY) * xy)
         v8.store(rows, U(5 * LANES), v8.splat(-_C2_XY) * y * z)
@@ -127,7 +140,8 @@ def write_basis(x, y, z, functions, rows):
         v8.store(rows, U(7 * LANES), v8.splat(-_C2_XY) * x * z)
         v8.store(rows, U(8 * LANES), v8.splat(_C2_XX) * (xx - yy))
         if functions > 9:
-            three, four = v8.splat(np.float32(3)), v8.splat(np.float32(4))
+            three = v8.splat(np.float32(3))
+            four = v8.splat(np.float32(4))
             v8.store(rows, U(9 * LANES), v8.splat(-_C3_CUBIC) * y * (three * xx - yy))
             v8.store(rows, U(10 * LANES), v8.splat(_C3_XYZ) * xy * z)
             v8.store(rows, U(11 * LANES), v8.splat(-_C3_ZZ) * y * (four * zz - xx - yy))
@@ -138,72 +152,95 @@ def write_basis(x, y, z, functions, rows):
 
 
 @inner()
-def write_color(sh, at, functions, maps, at_map, view, fog, rows, lane, records, slot):
-    """max(0.5 + sum sh Y, 0), mapped and in the fog, to the record that starts at `slot`.
+def write_color(sh, sh_start, functions, maps, map_start, view, fog, rows, lane, records, slot):
+    """Write max(0.5 + sum sh Y, 0), mapped and in the fog, to the record that starts at `slot`.
 
-    sh, maps: flat; the splat's coefficients start at `at`, its colour map at `at_map`, which is
-    negative where it has none.
+    Args:
+        sh: SH coefficients, flat.
+        sh_start: position of the splat's coefficients.
+        functions: number of SH functions.
+        maps: colour maps, flat.
+        map_start: position of the splat's colour map; negative without one.
+        view: numbers of the view.
+        fog: mode of the fog.
+        rows, lane: rows that prepare_colors wrote, and the splat's number in them.
+        records, slot: records, flat, and position of the splat's record.
     """
     r = g = b = np.float32(0.5)
     for k in range(U(functions)):
         value = rows[k * U(LANES) + lane]
-        r = scalar_fmuladd(value, sh[at], r)
-        g = scalar_fmuladd(value, sh[at + U(1)], g)
-        b = scalar_fmuladd(value, sh[at + U(2)], b)
-        at += U(3)
+        r = scalar_fmuladd(value, sh[sh_start], r)
+        g = scalar_fmuladd(value, sh[sh_start + U(1)], g)
+        b = scalar_fmuladd(value, sh[sh_start + U(2)], b)
+        sh_start += U(3)
     zero = np.float32(0)
-    r, g, b = max(r, zero), max(g, zero), max(b, zero)
-    if at_map >= 0:
-        mapped_r = _map_channel(maps, U(at_map), r, g, b)
-        mapped_g = _map_channel(maps, U(at_map) + U(4), r, g, b)
-        b = _map_channel(maps, U(at_map) + U(8), r, g, b)
-        r, g = mapped_r, mapped_g
+    r = max(r, zero)
+    g = max(g, zero)
+    b = max(b, zero)
+    if map_start >= 0:
+        mapped_r = _map_channel(maps, U(map_start), r, g, b)
+        mapped_g = _map_channel(maps, U(map_start) + U(4), r, g, b)
+        b = _map_channel(maps, U(map_start) + U(8), r, g, b)
+        r = mapped_r
+        g = mapped_g
     if fog != L.NO_FOG:
-        t = rows[U(TRANSMITTANCE * LANES) + lane]
-        hidden = np.float32(1) - t
-        r = scalar_fmuladd(t, r, hidden * view[L.V_AIRLIGHT])
-        g = scalar_fmuladd(t, g, hidden * view[L.V_AIRLIGHT + 1])
-        b = scalar_fmuladd(t, b, hidden * view[L.V_AIRLIGHT + 2])
+        transmittance = rows[U(TRANSMITTANCE * LANES) + lane]
+        fog_share = np.float32(1) - transmittance
+        r = scalar_fmuladd(transmittance, r, fog_share * view[L.V_AIRLIGHT])
+        g = scalar_fmuladd(transmittance, g, fog_share * view[L.V_AIRLIGHT + 1])
+        b = scalar_fmuladd(transmittance, b, fog_share * view[L.V_AIRLIGHT + 2])
     records[slot + U(L.RED)] = r
     records[slot + U(L.GREEN)] = g
     records[slot + U(L.BLUE)] = b
 
 
 @inner()
-def _map_channel(maps, at, r, g, b):
-    """One row of a colour map, at four numbers from `at`, applied to a colour; not below 0."""
-    value = scalar_fmuladd(maps[at], r, maps[at + U(3)])
-    value = scalar_fmuladd(maps[at + U(1)], g, value)
-    return max(scalar_fmuladd(maps[at + U(2)], b, value), np.float32(0))
+def _map_channel(maps, row_start, r, g, b):
+    """Return one row of a colour map, four numbers, applied to a colour; not below 0."""
+    value = scalar_fmuladd(maps[row_start], r, maps[row_start + U(3)])
+    value = scalar_fmuladd(maps[row_start + U(1)], g, value)
+    return max(scalar_fmuladd(maps[row_start + U(2)], b, value), np.float32(0))
 
 
 @inner()
 def add_direction_slopes(x, y, z, functions, rows):
-    """Sum over SH functions k >= 1 of a row's weight times the slope of the function, by x, y, z.
+    """Return the sum over SH functions k >= 1 of a row's weight times the function's slope by x, y,
+    z.
 
-    rows: flat; the weights of function k for eight splats start at k LANES. Slopes are those of
-    the polynomials in `write_basis`; only their part across the direction has a meaning.
+    The slopes are those of the polynomials in `write_basis`; only their part across the direction
+    has a meaning.
+
+    rows: flat; the weights of function k for eight splats start at k LANES.
     """
-    two, three = v8.splat(np.float32(2)), v8.splat(np.float32(3))
+    two = v8.splat(np.float32(2))
+    three = v8.splat(np.float32(3))
     c1 = v8.splat(_C1)
     gx = v8.negate(c1 * v8.load(rows, U(3 * LANES)))
     gy = v8.negate(c1 * v8.load(rows, U(1 * LANES)))
     gz = c1 * v8.load(rows, U(2 * LANES))
     if functions > U(4):
-        xy, zz = v8.splat(_C2_XY), v8.splat(_C2_ZZ)
-        a4, a5 = xy * v8.load(rows, U(4 * LANES)), xy * v8.load(rows, U(5 * LANES))
-        a6, a7 = two * zz * v8.load(rows, U(6 * LANES)), xy * v8.load(rows, U(7 * LANES))
+        xy = v8.splat(_C2_XY)
+        zz = v8.splat(_C2_ZZ)
+        a4 = xy * v8.load(rows, U(4 * LANES))
+        a5 = xy * v8.load(rows, U(5 * LANES))
+        a6 = two * zz * v8.load(rows, U(6 * LANES))
+        a7 = xy * v8.load(rows, U(7 * LANES))
         a8 = two * v8.splat(_C2_XX) * v8.load(rows, U(8 * LANES))
         gx = gx + a4 * y - a6 * x - a7 * z + a8 * x
         gy = gy + a4 * x - a5 * z - a6 * y - a8 * y
         gz = gz - a5 * y + two * a6 * z - a7 * x
     if functions > U(9):
         four = v8.splat(np.float32(4))
-        xx, yy, zz = x * x, y * y, z * z
-        cubic, high = v8.splat(_C3_CUBIC), v8.splat(_C3_ZZ)
-        a9, a15 = cubic * v8.load(rows, U(9 * LANES)), cubic * v8.load(rows, U(15 * LANES))
+        xx = x * x
+        yy = y * y
+        zz = z * z
+        cubic = v8.splat(_C3_CUBIC)
+        high = v8.splat(_C3_ZZ)
+        a9 = cubic * v8.load(rows, U(9 * LANES))
+        a15 = cubic * v8.load(rows, U(15 * LANES))
         a10 = v8.splat(_C3_XYZ) * v8.load(rows, U(10 * LANES))
-        a11, a13 = high * v8.load(rows, U(11 * LANES)), high * v8.load(rows, U(13 * LANES))
+        a11 = high * v8.load(rows, U(11 * LANES))
+        a13 = high * v8.load(rows, U(13 * LANES))
         a12 = three * v8.splat(_C3_ZZZ) * v8.load(rows, U(12 * LANES))
         a14 = v8.splat(_C3_ZXX) * v8.load(rows, U(14 * LANES))
         three_diff = three * (xx - yy)
@@ -217,22 +254,29 @@ def add_direction_slopes(x, y, z, functions, rows):
     return gx, gy, gz
 
 
-# Rows of eight that the projection leaves for writing: a record, the pixels a splat covers, colour.
+# Rows of eight numbers that `_project_eight` writes: colour, covered pixels, record, cut, light.
 _X_LO, _X_HI, _Y_LO, _Y_HI = (COLOR_ROWS + i for i in range(4))
 _FIELDS = COLOR_ROWS + 4
 _CUTS = _FIELDS + L.DEPTH + 1
 _LIGHTS = _CUTS + CUT
 _ROWS = _LIGHTS + SHADING_LINES
-_TIE_RUN = 4096  # places that a thread looks for ties in at a time
-_HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
+# Places in which a thread looks for ties at a time.
+_TIE_RUN = 4096
+# Largest sum of variances, px^2: beyond it float32 overflows, which no pixel would show.
+_HUGE = np.float32(1e37)
 
 
 class Parts(NamedTuple):
-    """What is projected. addresses: uint64 [P, ADDRESSES], see layout. sizes: int64 [P, 2],
-    Gaussians and SH functions. first_ids: int64 [P]. orders: uint64 [P], addresses of int32, the
-    Gaussian at every place of means, quats, scales and opacities; 0 where they stand in the part's
-    own order, as all else does. views: float32 [P, VIEW]. blocks: int64 [B, 3], part, first and
-    last + 1 place. modes: int64 [MODES].
+    """Parts that are projected.
+
+    addresses: uint64 [P, ADDRESSES], see layout.
+    sizes: int64 [P, 2], numbers of Gaussians and of SH functions.
+    first_ids: int64 [P], index of each part's first Gaussian, counted through all parts.
+    orders: uint64 [P], addresses of int32: the Gaussian at every place of means, quats, scales and
+        opacities. 0 if they stand in the part's own order, as all other arrays do.
+    views: float32 [P, VIEW], see layout.
+    blocks: int64 [B, 3], part, first and last + 1 place.
+    modes: int64 [MODES], see layout.
     """
 
     addresses: Any
@@ -245,86 +289,106 @@ class Parts(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """Block b owns slots [b BLOCK, (b + 1) BLOCK) and fills found[b] of them in the order of its
-    places: records, RECORD float32 each; rects, uint64, the tiles touched as blend unpacks
-    them; keys, uint32, the bits of z. counts: int32 [B, Z], of those in each bin of the slice.
-    cuts: CUT float32 each, where modes ask for a clip; lights: LINES each, where for light.
+    """Splats of a slice. Block b owns slots [b BLOCK, (b + 1) BLOCK) and fills the first of them.
+
+    records: RECORD float32 of each slot, in the order of the block's places.
+    rects: uint64, the tiles that a splat touches, as blend unpacks them.
+    keys: uint32, the bits of z.
+    splat_counts: int64 [B], splats of each block.
+    bin_counts: int32 [B, Z], splats in each bin of the slice.
+    cuts: CUT float32 of each slot, if modes ask for a clip.
+    lights: SHADING_LINES float32 of each slot, if modes ask for light.
     """
 
     records: Any
     rects: Any
     keys: Any
-    found: Any
-    counts: Any
+    splat_counts: Any
+    bin_counts: Any
     cuts: Any
     lights: Any
 
 
 @kernel
 def rank_splats(inputs, depths, histograms):
-    """z of every Gaussian that may be seen, 0 for the others, and where along z the image is paid.
+    """Write z of every Gaussian that may be seen, 0 for the others, and the cover of the image
+    along z.
 
-    depths: float32 [B BLOCK]. histograms: float64 [C, BINS], each of C runs of blocks its own:
-    opacity times area, px^2.
+    Args:
+        inputs: the parts.
+        depths: float32 [B BLOCK], written.
+        histograms: float64 [C, 2, BINS], written: opacity times area (px^2) and number of the
+            splats in each bin of z. Each of C runs of blocks has its own.
     """
-    runs = histograms.shape[0]
-    for run in prange(runs):
-        addresses, total = inputs.addresses, inputs.blocks.shape[0]
+    num_runs = histograms.shape[0]
+    for run in prange(num_runs):
+        addresses = inputs.addresses
+        num_blocks = inputs.blocks.shape[0]
         histogram = histograms[run]
-        picked, areas = np.empty(LANES, np.int32), np.empty(LANES, np.float32)
+        gaussian_ids = np.empty(LANES, np.int32)
+        areas = np.empty(LANES, np.float32)
         for z_bin in range(histogram.shape[1]):
             histogram[0, z_bin] = histogram[1, z_bin] = 0
-        for block in range(total * run // runs, total * (run + 1) // runs):
+        for block in range(num_blocks * run // num_runs, num_blocks * (run + 1) // num_runs):
             part, first, last = inputs.blocks[block]
-            count, view = inputs.sizes[part, 0], inputs.views[part]
+            count = inputs.sizes[part, 0]
+            view = inputs.views[part]
             means = floats_at(addresses[part, L.A_MEANS], count * 3)
             scales = floats_at(addresses[part, L.A_SCALES], count * 3)
             opacities = floats_at(addresses[part, L.A_OPACITIES], count)
-            at = block * BLOCK
+            slot = block * BLOCK
             for group in range(first, last, LANES):
                 for lane in range(LANES):
-                    picked[lane] = min(group + lane, last - 1)
-                _rank_eight(means, scales, opacities, view, picked, depths, U(at), areas)
+                    gaussian_ids[lane] = min(group + lane, last - 1)
+                _rank_eight(means, scales, opacities, view, gaussian_ids, depths, U(slot), areas)
                 for lane in range(min(LANES, last - group)):
-                    z = depths[at + lane]
+                    z = depths[slot + lane]
                     if z > 0:
                         z_bin = np.float32(z).view(np.int32) >> BIN_SHIFT
                         histogram[0, z_bin] += areas[lane]
                         histogram[1, z_bin] += 1
-                at += LANES
+                slot += LANES
 
 
 @inner()
-def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
-    zero, two = v8.splat(np.float32(0)), v8.splat(np.float32(2))
-    d = from_eye(means, picked, U(0), view)
+def _rank_eight(means, scales, opacities, view, gaussian_ids, depths, slot, areas):
+    """Write z (0 if they cannot be seen) and the expected areas of eight Gaussians."""
+    zeros = v8.splat(np.float32(0))
+    two = v8.splat(np.float32(2))
+    d = from_eye(means, gaussian_ids, U(0), view)
     x, y, z = to_camera(d, view)
     inverse = inverse_divisor(z, view)
     x, y = to_image(x, y, inverse, view)
-    s0, s1, s2 = gather3(scales, picked, U(0))
-    opacity = v8.gather(opacities, picked, U(0), U(1), U(0))
+    s0, s1, s2 = gather3(scales, gaussian_ids, U(0))
+    opacity = v8.gather(opacities, gaussian_ids, U(0), U(1), U(0))
     # No direction of an ellipsoid is longer than its longest axis, and no blur wider than 2 px.
     longest = v8.maximum(s0, v8.maximum(s1, s2))
     reach = longest * inverse
-    far_x = v8.fmuladd(v8.splat(view[L.V_GAIN]), reach, two)
-    far_y = v8.fmuladd(v8.splat(view[L.V_GAIN + 1]), reach, two)
-    seen = v8.both(
+    extent_x = v8.fmuladd(v8.splat(view[L.V_GAIN]), reach, two)
+    extent_y = v8.fmuladd(v8.splat(view[L.V_GAIN + 1]), reach, two)
+    # Near plane and opacity, the image's four edges, the fog, the clip, the radius clip.
+    may_be_seen = v8.both(
         v8.at_least(z, v8.splat(view[L.V_NEAR])),
         v8.at_least(opacity, v8.splat(view[L.V_ALPHA_MIN])),
     )
-    seen = v8.both(seen, v8.at_least(x + far_x, zero))
-    seen = v8.both(seen, v8.at_least(v8.splat(view[L.V_SIZE]) - x + far_x, zero))
-    seen = v8.both(seen, v8.at_least(y + far_y, zero))
-    seen = v8.both(seen, v8.at_least(v8.splat(view[L.V_SIZE + 1]) - y + far_y, zero))
-    far = v8.splat(view[L.V_FOG_FAR] * view[L.V_FOG_FAR])
-    seen = v8.both(seen, v8.at_least(far, dot(d[0], d[1], d[2], d[0], d[1], d[2])))
-    height, size = height_of(d, view), v8.splat(view[L.V_EXTENT]) * longest
-    seen = v8.both(seen, v8.at_least(height + size, zero))
-    seen = v8.both(seen, v8.at_least(v8.splat(view[L.V_CLIP_REACH]), height - size))
+    may_be_seen = v8.both(may_be_seen, v8.at_least(x + extent_x, zeros))
+    may_be_seen = v8.both(may_be_seen, v8.at_least(v8.splat(view[L.V_SIZE]) - x + extent_x, zeros))
+    may_be_seen = v8.both(may_be_seen, v8.at_least(y + extent_y, zeros))
+    may_be_seen = v8.both(
+        may_be_seen, v8.at_least(v8.splat(view[L.V_SIZE + 1]) - y + extent_y, zeros)
+    )
+    max_distance_squared = v8.splat(view[L.V_FOG_FAR] * view[L.V_FOG_FAR])
+    may_be_seen = v8.both(
+        may_be_seen, v8.at_least(max_distance_squared, dot(d[0], d[1], d[2], d[0], d[1], d[2]))
+    )
+    height = height_of(d, view)
+    size = v8.splat(view[L.V_EXTENT]) * longest
+    may_be_seen = v8.both(may_be_seen, v8.at_least(height + size, zeros))
+    may_be_seen = v8.both(may_be_seen, v8.at_least(v8.splat(view[L.V_CLIP_REACH]), height - size))
     if view[L.V_RADIUS_CLIP] > np.float32(0):
-        seen = v8.both(seen, _may_exceed_clip(opacity, reach, view))
-    v8.store(depths, at, v8.select(seen, z, zero))
-    # Mean over all directions of the ellipse's area, 2 pi sigma^2; it only cuts z into slices.
+        may_be_seen = v8.both(may_be_seen, _may_exceed_clip(opacity, reach, view))
+    v8.store(depths, slot, v8.select(may_be_seen, z, zeros))
+    # The mean over all directions of the ellipse's area, 2 pi sigma^2, only cuts z into slices.
     squares = s0 * s1 + s1 * s2 + s0 * s2
     focal = v8.splat(view[L.V_FOCAL] * view[L.V_FOCAL + 1] * np.float32(2 * math.pi / 3))
     area = v8.fmuladd(focal * squares, inverse * inverse, two) * opacity
@@ -333,11 +397,12 @@ def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
 
 @inner()
 def _may_exceed_clip(opacity, reach, view):
-    """False only of splats that are surely no larger than the view's radius clip.
+    """Return False only for splats that are surely no larger than the view's radius clip.
 
-    reach: longest semi-axis over the divisor. The bound is that of the projection with the longest
-    axis for all and the opacity before antialiasing, which only lowers it; the margins are a
-    thousand times what rounding may take off.
+    The bound is that of the projection with the longest axis for all axes, and with the opacity
+    before antialiasing, which only lowers it. The margins are a thousand times the rounding error.
+
+    reach: longest semi-axis over the divisor.
     """
     k = v8.splat(np.float32(0.5) * LOG2_E)
     budget = v8.maximum(log2(opacity) - v8.splat(view[L.V_LOG_CUT]), v8.splat(np.float32(0))) / k
@@ -352,25 +417,36 @@ def _may_exceed_clip(opacity, reach, view):
 
 @kernel
 def project_slice(inputs, depth_bits, bins, open_sums, splats):
-    """Splats of the Gaussians in bins[0] <= bin of z < bins[1] that touch an open tile.
+    """Project the Gaussians in bins[0] <= bin of z < bins[1] that touch an open tile.
 
-    depth_bits: uint32, what rank_splats wrote. open_sums: int32 [rows + 1, columns + 1], number of
-    open tiles above and left. splats: written.
+    Args:
+        inputs: the parts.
+        depth_bits: uint32, z as rank_splats wrote it.
+        bins: first bin, and one past the last.
+        open_sums: int32 [rows + 1, columns + 1], number of open tiles above and left.
+        splats: written.
     """
     for block in prange(inputs.blocks.shape[0]):
-        # Of its own: numba drops what a parallel loop itself writes to arrays of a record.
+        # A separate function, since numba drops what a parallel loop writes to a record's arrays.
         _project_block(np.int64(block), inputs, depth_bits, bins, open_sums, splats)
 
 
 @inner()
 def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
+    """Project the Gaussians of one block."""
     part, first, last = inputs.blocks[block]
-    addresses, modes, view = inputs.addresses, inputs.modes, inputs.views[part]
-    records, rects, keys, counts = splats.records, splats.rects, splats.keys, splats.counts
-    picked = np.empty(BLOCK + LANES, np.int32)
+    addresses = inputs.addresses
+    modes = inputs.modes
+    view = inputs.views[part]
+    records = splats.records
+    rects = splats.rects
+    keys = splats.keys
+    bin_counts = splats.bin_counts
+    gaussian_ids = np.empty(BLOCK + LANES, np.int32)
     rows = np.empty(_ROWS * LANES, np.float32)
     base = block * BLOCK
-    taken = _pick_bins(depth_bits, base, first, last, bins, picked)
+    # Gaussians of the slice, and the arrays of their part.
+    num_picked = _pick_bins(depth_bits, base, first, last, bins, gaussian_ids)
     count, functions = inputs.sizes[part]
     means = floats_at(addresses[part, L.A_MEANS], count * 3)
     quats = floats_at(addresses[part, L.A_QUATS], count * 4)
@@ -383,26 +459,38 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
     map_rows = shorts_at(addresses[part, L.A_ROWS], count if map_count > 1 else 1)
     is_ordered = inputs.orders[part] != U(0)
     order = floats_at(inputs.orders[part], count if is_ordered else 1)
-    used = min(modes[L.M_FUNCTIONS], functions)
+    num_functions = min(modes[L.M_FUNCTIONS], functions)
+    # Project eight Gaussians, then write those that touch an open tile one by one.
     slot = U(base)
-    for at in range(U(0), U(taken), U(LANES)):
-        _project_eight(means, quats, scales, opacities, view, picked, at, used, modes, rows)
-        for lane in range(min(U(LANES), U(taken) - at)):
-            if not _touches_open(rows, lane, open_sums, rects, slot):
+    for group in range(U(0), U(num_picked), U(LANES)):
+        _project_eight(
+            means, quats, scales, opacities, view, gaussian_ids, group, num_functions, modes, rows
+        )
+        for lane in range(min(U(LANES), U(num_picked) - group)):
+            if not _touches_open_tile(rows, lane, open_sums, rects, slot):
                 continue
-            splat = picked[at + lane]
+            splat = gaussian_ids[group + lane]
             if is_ordered:
                 splat = np.float32(order[splat]).view(np.int32)
             record = slot * U(RECORD)
             _write_record(rows, lane, inputs.first_ids[part] + splat, records, record)
             records[record + U(L.IS_OVERLAY)] = view[L.V_OVERLAY]
             if modes[L.M_COLOR]:
-                from_sh = U(splat) * U(functions * 3)
-                at_map = _map_of(map_rows, splat, map_count)
+                sh_start = U(splat) * U(functions * 3)
+                map_start = _map_start(map_rows, splat, map_count)
                 write_color(
-                    sh, from_sh, used, maps, at_map, view, modes[L.M_FOG], rows, lane,
-                    records, record,
-                )  # fmt: skip
+                    sh,
+                    sh_start,
+                    num_functions,
+                    maps,
+                    map_start,
+                    view,
+                    modes[L.M_FOG],
+                    rows,
+                    lane,
+                    records,
+                    record,
+                )
             if modes[L.M_CLIP]:
                 for field in range(U(L.C_REACH + 1)):
                     cut = rows[(U(_CUTS) + field) * U(LANES) + lane]
@@ -411,21 +499,22 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
                 _write_lights(slopes, splat, modes[L.M_FOG], view, rows, lane, splats.lights, slot)
             keys[slot] = np.float32(records[record + U(L.DEPTH)]).view(np.uint32)
             slot += U(1)
-    splats.found[block] = slot - U(base)
-    for z_bin in range(counts.shape[1]):
-        counts[block, z_bin] = 0
+    # Count the block's splats, in all and in each bin of z.
+    splats.splat_counts[block] = slot - U(base)
+    for z_bin in range(bin_counts.shape[1]):
+        bin_counts[block, z_bin] = 0
     for i in range(U(base), slot):
-        counts[block, np.int64(keys[i] >> np.uint32(BIN_SHIFT)) - bins[0]] += 1
+        bin_counts[block, np.int64(keys[i] >> np.uint32(BIN_SHIFT)) - bins[0]] += 1
 
 
 @kernel
 def order_ties(keys, slots, rects, records):
-    """Put splats of equal keys in the order of their ids. keys: sorted, slots and rects alike."""
-    runs = (keys.size + _TIE_RUN - 1) // _TIE_RUN
-    for run in prange(runs):
+    """Put splats of equal keys in the order of their ids. keys are sorted; slots and rects move."""
+    num_runs = (keys.size + _TIE_RUN - 1) // _TIE_RUN
+    for run in prange(num_runs):
         end = min((np.int64(run) + 1) * _TIE_RUN, keys.size)
         first = np.int64(run) * _TIE_RUN
-        while 0 < first < end and keys[first] == keys[first - 1]:  # the run before has these
+        while 0 < first < end and keys[first] == keys[first - 1]:  # the run before sorts these
             first += 1
         while first < end:
             last = first + 1
@@ -438,19 +527,21 @@ def order_ties(keys, slots, rects, records):
 
 @inner()
 def _sort_by_id(slots, rects, records, first, last):
-    """Shell's sort: equal depths come in a few rising runs, of any length."""
+    """Sort by id with Shell's sort: equal depths come in a few rising runs, of any length."""
     gap = 1
     while 3 * gap < last - first:
         gap = 3 * gap + 1
     while gap > 0:
         for i in range(first + gap, last):
-            slot, rect = slots[i], rects[i]
+            slot = slots[i]
+            rect = rects[i]
             number = _id_of(records, slot)
             j = i
             while j - gap >= first and _id_of(records, slots[j - gap]) > number:
                 slots[j], rects[j] = slots[j - gap], rects[j - gap]
                 j -= gap
-            slots[j], rects[j] = slot, rect
+            slots[j] = slot
+            rects[j] = rect
         gap //= 3
 
 
@@ -460,22 +551,22 @@ def _id_of(records, slot):
 
 
 @inner()
-def _pick_bins(depth_bits, base, first, last, bins, picked):
-    """Numbers of a block's Gaussians in a range of bins, filled up to whole groups of eight."""
+def _pick_bins(depth_bits, base, first, last, bins, gaussian_ids):
+    """Write the numbers of a block's Gaussians in a range of bins, filled up to groups of eight."""
     low = np.uint32(bins[0] << BIN_SHIFT)
     span = np.uint32((bins[1] - bins[0]) << BIN_SHIFT)
-    taken = U(0)
+    num_picked = U(0)
     for i in range(U(last - first)):
-        picked[taken] = np.int32(first + np.int64(i))
-        taken += U(np.uint32(depth_bits[U(base) + i] - low) < span)
+        gaussian_ids[num_picked] = np.int32(first + np.int64(i))
+        num_picked += U(np.uint32(depth_bits[U(base) + i] - low) < span)
     for lane in range(U(LANES)):
-        picked[taken + lane] = picked[max(taken, U(1)) - U(1)]
-    return taken
+        gaussian_ids[num_picked + lane] = gaussian_ids[max(num_picked, U(1)) - U(1)]
+    return num_picked
 
 
 @inner()
-def _map_of(map_rows, splat, map_count):
-    """Where a splat's colour map starts, -1 without one; rows that are none mean the first."""
+def _map_start(map_rows, splat, map_count):
+    """Return the position of a splat's colour map, -1 without one. A wrong row means the first."""
     if map_count == 0:
         return np.int64(-1)
     row = np.int64(0)
@@ -487,21 +578,29 @@ def _map_of(map_rows, splat, map_count):
 
 
 @inner()
-def _touches_open(rows, lane, open_sums, rects, slot):
-    """Whether a splat covers a pixel centre and one of its tiles is open; writes its tiles."""
-    x_lo, x_hi = rows[U(_X_LO * LANES) + lane], rows[U(_X_HI * LANES) + lane]
-    y_lo, y_hi = rows[U(_Y_LO * LANES) + lane], rows[U(_Y_HI * LANES) + lane]
+def _touches_open_tile(rows, lane, open_sums, rects, slot):
+    """Write a splat's tiles, and return True if it covers a pixel centre and one of its tiles is
+    open.
+    """
+    x_lo = rows[U(_X_LO * LANES) + lane]
+    x_hi = rows[U(_X_HI * LANES) + lane]
+    y_lo = rows[U(_Y_LO * LANES) + lane]
+    y_hi = rows[U(_Y_HI * LANES) + lane]
     if not (x_lo <= x_hi and y_lo <= y_hi):
         return False
-    c0, c1 = U(x_lo) // U(TILE_W), U(x_hi) // U(TILE_W)
-    r0, r1 = U(y_lo) // U(TILE_H), U(y_hi) // U(TILE_H)
+    c0 = U(x_lo) // U(TILE_W)
+    c1 = U(x_hi) // U(TILE_W)
+    r0 = U(y_lo) // U(TILE_H)
+    r1 = U(y_hi) // U(TILE_H)
     rects[slot] = c0 | r0 << U(16) | c1 << U(32) | r1 << U(48)
-    c1, r1 = c1 + U(1), r1 + U(1)
+    c1 = c1 + U(1)
+    r1 = r1 + U(1)
     return open_sums[r1, c1] - open_sums[r0, c1] - open_sums[r1, c0] + open_sums[r0, c0] > 0
 
 
 @inner()
 def _write_record(rows, lane, number, records, record):
+    """Copy a splat's fields from `rows` to its record."""
     for field in range(U(L.DEPTH + 1)):
         records[record + field] = rows[(U(_FIELDS) + field) * U(LANES) + lane]
     records[record + U(L.SPLAT_ID)] = np.int32(number).view(np.float32)
@@ -509,6 +608,7 @@ def _write_record(rows, lane, number, records, record):
 
 @inner()
 def _write_lights(slopes, splat, fog, view, rows, lane, lights, slot):
+    """Write the lights of a splat; zeros if its part is not lit pixel by pixel."""
     first = slot * U(SHADING_LINES)
     if not view[L.V_LIT] > np.float32(0):
         for line in range(U(SHADING_LINES)):
@@ -525,68 +625,82 @@ def _write_lights(slopes, splat, fog, view, rows, lane, lights, slot):
 
 
 @inner()
-def _project_eight(means, quats, scales, opacities, view, picked, at, functions, modes, rows):
-    """Records, pixel boxes and colour rows of eight Gaussians, side by side in `rows`."""
-    d = from_eye(means, picked, at, view)
+def _project_eight(
+    means, quats, scales, opacities, view, gaussian_ids, group, functions, modes, rows
+):
+    """Write records, pixel boxes and colour rows of eight Gaussians, side by side in `rows`."""
+    # SH functions and fog towards the eye.
+    d = from_eye(means, gaussian_ids, group, view)
     if modes[L.M_COLOR]:
-        towards = rotation_row(view, U(2)) if view[L.V_PARALLEL] > 0 else d
-        prepare_colors(towards[0], towards[1], towards[2], view, functions, modes[L.M_FOG], rows)
+        directions = rotation_row(view, U(2)) if view[L.V_PARALLEL] > 0 else d
+        prepare_colors(
+            directions[0], directions[1], directions[2], view, functions, modes[L.M_FOG], rows
+        )
+    # Centre in the camera, and covariance in the image.
     x, y, z = to_camera(d, view)
     inverse = inverse_divisor(z, view)
-    xx, xy, yy, minors = image_covariance(quats, scales, picked, at, x, y, inverse, view)
+    xx, xy, yy, minors = image_covariance(quats, scales, gaussian_ids, group, x, y, inverse, view)
 
-    one, half = v8.splat(np.float32(1)), v8.splat(np.float32(0.5))
-    blur, k = v8.splat(view[L.V_BLUR]), v8.splat(np.float32(0.5) * LOG2_E)
-    blurred_x, blurred_y = xx + blur, yy + blur
-    inverse_y, inverse_x = one / blurred_y, one / blurred_x
+    ones = v8.splat(np.float32(1))
+    half = v8.splat(np.float32(0.5))
+    blur = v8.splat(view[L.V_BLUR])
+    k = v8.splat(np.float32(0.5) * LOG2_E)
+    blurred_x = xx + blur
+    blurred_y = yy + blur
+    inverse_y = ones / blurred_y
+    inverse_x = ones / blurred_x
     # Variance along a row, det / yy. minors = det / yy before the blur, so nothing overflows.
-    along = blur + v8.fmuladd(blur * xx, inverse_y, minors)
-    log_opacity = log2(v8.gather(opacities, picked, at, U(1), U(0)))
+    variance_along_row = blur + v8.fmuladd(blur * xx, inverse_y, minors)
+    log_opacity = log2(v8.gather(opacities, gaussian_ids, group, U(1), U(0)))
     if modes[L.M_ANTIALIASED]:
-        log_opacity = v8.fmuladd(half, log2(minors / along), log_opacity)
+        log_opacity = v8.fmuladd(half, log2(minors / variance_along_row), log_opacity)
+    # Box in which alpha reaches the cut.
     log_cut = v8.splat(view[L.V_LOG_CUT])
     budget = v8.maximum(log_opacity - log_cut, v8.splat(np.float32(0))) / k
-    radius_x, radius_y = v8.sqrt(budget * blurred_x), v8.sqrt(budget * blurred_y)
+    radius_x = v8.sqrt(budget * blurred_x)
+    radius_y = v8.sqrt(budget * blurred_y)
 
     mean_x, mean_y = to_image(x, y, inverse, view)
-    drawn = v8.both(
+    is_drawn = v8.both(
         v8.at_least(log_opacity, log_cut), v8.at_least(v8.splat(_HUGE), blurred_x + blurred_y)
     )
-    larger = v8.maximum(radius_x, radius_y)
-    drawn = v8.both(drawn, v8.greater(larger, v8.splat(view[L.V_RADIUS_CLIP])))
+    larger_radius = v8.maximum(radius_x, radius_y)
+    is_drawn = v8.both(is_drawn, v8.greater(larger_radius, v8.splat(view[L.V_RADIUS_CLIP])))
+    # Cut at a height, and lines of the light.
     if modes[L.M_CLIP]:
-        partly, offset, lx, ly, gx, gy, deep = cut_eight(
-            quats, scales, picked, at, d, x, y, inverse, view
+        has_kept_part, offset, lx, ly, gx, gy, growth_limit = cut_eight(
+            quats, scales, gaussian_ids, group, d, x, y, inverse, view
         )
-        drawn = v8.both(drawn, partly)
+        is_drawn = v8.both(is_drawn, has_kept_part)
         v8.store(rows, U((_CUTS + L.C_AT) * LANES), offset)
         v8.store(rows, U((_CUTS + L.C_X) * LANES), lx)
         v8.store(rows, U((_CUTS + L.C_Y) * LANES), ly)
         v8.store(rows, U((_CUTS + L.C_RIGHT) * LANES), gx)
         v8.store(rows, U((_CUTS + L.C_DOWN) * LANES), gy)
-        v8.store(rows, U((_CUTS + L.C_REACH) * LANES), deep)
+        v8.store(rows, U((_CUTS + L.C_REACH) * LANES), growth_limit)
     if modes[L.M_LIGHT] and view[L.V_LIT] > np.float32(0):
-        zero = v8.splat(np.float32(0))
-        ray = (zero, zero, one) if view[L.V_PARALLEL] > 0 else (x, y, z)
-        lines = light_eight(rotation_from_quats(quats, picked, at), ray, view)
+        zeros = v8.splat(np.float32(0))
+        ray = (zeros, zeros, ones) if view[L.V_PARALLEL] > 0 else (x, y, z)
+        lines = light_eight(rotation_from_quats(quats, gaussian_ids, group), ray, view)
         v8.store(rows, U((_LIGHTS + L_FACING) * LANES), lines[0])
         v8.store(rows, U((_LIGHTS + L_X) * LANES), lines[1])
         v8.store(rows, U((_LIGHTS + L_Y) * LANES), lines[2])
         v8.store(rows, U((_LIGHTS + L_WRAP) * LANES), lines[3])
         v8.store(rows, U((_LIGHTS + L_LEAN_X) * LANES), lines[4])
         v8.store(rows, U((_LIGHTS + L_LEAN_Y) * LANES), lines[5])
-    _write_box(mean_x, radius_x, v8.splat(view[L.V_SIZE]), drawn, U(_X_LO), U(_X_HI), rows)
-    _write_box(mean_y, radius_y, v8.splat(view[L.V_SIZE + 1]), drawn, U(_Y_LO), U(_Y_HI), rows)
+    # Covered pixels, and the fields of the record.
+    _write_box(mean_x, radius_x, v8.splat(view[L.V_SIZE]), is_drawn, U(_X_LO), U(_X_HI), rows)
+    _write_box(mean_y, radius_y, v8.splat(view[L.V_SIZE + 1]), is_drawn, U(_Y_LO), U(_Y_HI), rows)
     _write(rows, U(L.MEAN_X), mean_x)
     _write(rows, U(L.MEAN_Y), mean_y)
     _write(rows, U(L.LEAN_X), xy * inverse_y)
-    _write(rows, U(L.SHARP_X), v8.sqrt(k / along))
+    _write(rows, U(L.SHARP_X), v8.sqrt(k / variance_along_row))
     _write(rows, U(L.FALL_Y), k * inverse_y)
     _write(rows, U(L.LOG_OPACITY), log_opacity)
     _write(rows, U(L.RADIUS_Y), radius_y)
     _write(rows, U(L.FALL_X), k * inverse_x)
     _write(rows, U(L.LEAN_Y), xy * inverse_x)
-    _write(rows, U(L.BLUNT_Y), v8.sqrt(along * blurred_y * inverse_x / k))
+    _write(rows, U(L.BLUNT_Y), v8.sqrt(variance_along_row * blurred_y * inverse_x / k))
     _write(rows, U(L.DEPTH), z)
 
 
@@ -596,11 +710,15 @@ def _write(rows, field, value):
 
 
 @inner()
-def _write_box(mean, radius, size, drawn, low, high, rows):
-    """First and last pixel whose centre lies within the radius; the last below where none does."""
-    zero, half = v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
-    one = v8.splat(np.float32(1))
-    first = v8.maximum(mean - radius - half, zero)
-    last = v8.minimum(mean + radius - half, size - one)
-    v8.store(rows, low * U(LANES), v8.negate(v8.floor(v8.negate(first))))
-    v8.store(rows, high * U(LANES), v8.select(drawn, v8.floor(last), v8.negate(one)))
+def _write_box(mean, radius, size, is_drawn, first_field, last_field, rows):
+    """Write the first and last pixel whose centre lies within the radius.
+
+    The last is below the first if there is none.
+    """
+    zeros = v8.splat(np.float32(0))
+    half = v8.splat(np.float32(0.5))
+    ones = v8.splat(np.float32(1))
+    first = v8.maximum(mean - radius - half, zeros)
+    last = v8.minimum(mean + radius - half, size - ones)
+    v8.store(rows, first_field * U(LANES), v8.negate(v8.floor(v8.negate(first))))
+    v8.store(rows, last_field * U(LANES), v8.select(is_drawn, v8.floor(last), v8.negate(ones)))

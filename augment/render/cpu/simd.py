@@ -1,14 +1,15 @@
-"""Eight or sixteen float32 in one register: numba types, so that kernels say what the processor
+"""Eight or sixteen float32 in one register: numba types with which kernels say what the processor
 does.
 
-A compiler's own vectoriser gives up on pixel loops for reasons that are hard to see and change with
-every release. `float8` and `float16` values are LLVM vectors instead: `+ - * /` work lane by lane,
-the rest are the functions below. Those that make a vector make `float8`; the ones that are given a
-vector make one of its kind, so a kernel for `WIDE` lanes is the same source on every processor.
+A compiler's own vectoriser gives up on pixel loops for reasons that are hard to see and that change
+with every release. `float8` and `float16` values are LLVM vectors instead: `+ - * /` work lane by
+lane, and the functions below do the rest. Functions that make a vector from numbers make `float8`;
+functions that take a vector make one of its type. So a kernel for `WIDE` lanes is the same source
+on every processor.
 
-No fast-math anywhere, and `fmuladd` is the only fused operation (where the processor has it), so
-the bits of a result depend neither on the code around it nor on how many lanes there are.
-Indices are uint64 into flat contiguous arrays; nothing checks them.
+There is no fast-math, and `fmuladd` is the only fused operation (if the processor has it). So the
+bits of a result depend neither on the code around it nor on the number of lanes. Indices are uint64
+into flat contiguous arrays; nothing checks them.
 """
 
 from __future__ import annotations
@@ -26,21 +27,25 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from augment.render.cpu.jit import inner
 
+# Lanes of float8.
 LANES = 8
+# Processor features that numba needs for sixteen lanes.
 _AVX512 = {"+avx512f", "+avx512bw", "+avx512dq", "+avx512vl"}
 
 
 def _widest() -> int:
-    """Lanes of the widest register that numba compiles for, of 8 and 16."""
+    """Return the lanes of the widest register that numba compiles for, 8 or 16."""
     features = config.CPU_FEATURES
     features = codegen.get_host_cpu_features() if features is None else features
     return 16 if set(features.split(",")) >= _AVX512 else LANES
 
 
+# Lanes of the widest register.
 WIDE = _widest()
 
 _INT = ir.IntType(32)
-_SQRT_HALF = 0x3F3504F3  # bits of the float32 nearest sqrt(1/2)
+# Bits of the float32 nearest sqrt(1/2).
+_SQRT_HALF = 0x3F3504F3
 
 
 class _Floats(types.Type):
@@ -55,7 +60,8 @@ class _Masks(types.Type):
         super().__init__(name=f"boolx{lanes}")
 
 
-float8, float16 = _Floats(8), _Floats(16)
+float8 = _Floats(8)
+float16 = _Floats(16)
 
 
 @register_model(_Floats)
@@ -103,8 +109,9 @@ def _floats(lanes: int) -> ir.VectorType:
 
 
 def _like(value, numbers):
-    """A constant for each lane of a vector: the same number, or numbers lane by lane. Floats for
-    float numbers, else int32.
+    """Return a constant for each lane of a vector: the same number, or numbers lane by lane.
+
+    Float numbers give floats; other numbers give int32.
     """
     lanes = value.type.count
     numbers = list(numbers) if hasattr(numbers, "__iter__") else [numbers] * lanes
@@ -145,19 +152,19 @@ def _load(lanes: int):
 
 @intrinsic
 def load(typingctx, array, index):
-    """array[index : index + 8]."""
+    """Return array[index : index + 8]."""
     return float8(array, types.uint64), _load(LANES)
 
 
 @intrinsic
 def load_as(typingctx, vector, array, index):
-    """array[index : index + lanes], as many as the vector has."""
+    """Return array[index : index + lanes], with the lanes of the vector."""
     return vector(vector, array, types.uint64), _load(vector.lanes)
 
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """array[index : index + lanes] = value."""
+    """Store array[index : index + lanes] = value."""
 
     def codegen(context, builder, sig, args):
         at = _pointer(context, builder, sig.args[0], *args[:2])
@@ -169,12 +176,12 @@ def store(typingctx, array, index, value):
 
 @intrinsic
 def store_whole(typingctx, array, index, value):
-    """array[index : index + lanes] = value without its fraction, for an int32 array."""
+    """Store array[index : index + lanes] = value without its fraction, for an int32 array."""
 
     def codegen(context, builder, sig, args):
         at = _pointer(context, builder, sig.args[0], *args[:2])
-        whole = builder.fptosi(args[2], ir.VectorType(_INT, args[2].type.count))
-        builder.store(whole, builder.bitcast(at, whole.type.as_pointer()), align=4)
+        integers = builder.fptosi(args[2], ir.VectorType(_INT, args[2].type.count))
+        builder.store(integers, builder.bitcast(at, integers.type.as_pointer()), align=4)
         return context.get_dummy_value()
 
     return types.void(array, types.uint64, value), codegen
@@ -182,7 +189,7 @@ def store_whole(typingctx, array, index, value):
 
 @intrinsic
 def store_ramp(typingctx, array, index, start):
-    """array[index : index + 8] = start + (0 ... 7), for an int32 array."""
+    """Store array[index : index + 8] = start + (0 ... 7), for an int32 array."""
 
     def codegen(context, builder, sig, args):
         at = _pointer(context, builder, sig.args[0], *args[:2])
@@ -195,16 +202,18 @@ def store_ramp(typingctx, array, index, start):
 
 
 @intrinsic
-def turn(typingctx, vector, array, rows, first, last, turned, at):
-    """turned[field, at + lane] = array[rows[first + lane], field] for 16 fields and all lanes.
+def transpose_rows(typingctx, vector, array, rows, first, last, transposed, column):
+    """Store transposed[field, column + lane] = array[rows[first + lane], field] for 16 fields, all
+    lanes.
 
-    array: flat, rows of 16. rows: int32; the last one is taken where there are no more. turned:
+    array: flat, rows of 16. rows: int32; the row at `last` stands for those after it. transposed:
     flat, rows of 32.
     """
     lanes = vector.lanes
 
     def codegen(context, builder, sig, args):
-        wide, kind = ir.IntType(64), _floats(lanes).as_pointer()
+        wide = ir.IntType(64)
+        kind = _floats(lanes).as_pointer()
         starts = []
         for lane in range(lanes):
             number = builder.add(args[3], wide(lane))
@@ -225,22 +234,22 @@ def turn(typingctx, vector, array, rows, first, last, turned, at):
         return context.get_dummy_value()
 
     number = types.uint64
-    return types.void(vector, array, rows, number, number, turned, number), codegen
+    return types.void(vector, array, rows, number, number, transposed, number), codegen
 
 
 def _transposed(builder, rows):
-    """A square of as many vectors as they have lanes. Every step is one instruction of AVX."""
+    """Return the transpose of a square of vectors. Every step is one AVX instruction."""
     lanes = len(rows)
 
     def pick(left, right, numbers):
         return builder.shuffle_vector(left, right, _like(left, numbers))
 
     def weave(left, right, width, half):
-        """Of every four lanes a half of both, in turns of so many lanes."""
+        """Return one half of every four lanes of both vectors, alternating after `width` lanes."""
         numbers = [
-            block + 2 * half + turn * width + k + side * lanes
+            block + 2 * half + repeat * width + k + side * lanes
             for block in range(0, lanes, 4)
-            for turn in range(2 // width)
+            for repeat in range(2 // width)
             for side in range(2)
             for k in range(width)
         ]
@@ -267,7 +276,7 @@ def _transposed(builder, rows):
 
 @intrinsic
 def gather(typingctx, array, rows, first, stride, column):
-    """array[rows[first + lane] * stride + column]; rows is an int32 array."""
+    """Return array[rows[first + lane] * stride + column]; rows is an int32 array."""
 
     def codegen(context, builder, sig, args):
         wide = ir.IntType(64)
@@ -284,9 +293,10 @@ def gather(typingctx, array, rows, first, stride, column):
 
 
 def _operation(result, *kinds):
-    """Makes a function for kernels of emit(builder, *values), which writes its instructions.
+    """Return a decorator that makes a function for kernels from emit(builder, *values).
 
-    _Floats and _Masks among the kinds are of as many lanes as the vectors that it is given.
+    emit writes the instructions. _Floats and _Masks among the types have as many lanes as the
+    vectors that the function gets.
     """
 
     def wrap(emit):
@@ -295,8 +305,10 @@ def _operation(result, *kinds):
 
         def define(typingctx, *values):
             lanes = next((value.lanes for value in values if hasattr(value, "lanes")), None)
-            found = [kind(lanes) if isinstance(kind, type) else kind for kind in (result, *kinds)]
-            return found[0](*found[1:]), codegen
+            lane_types = [
+                kind(lanes) if isinstance(kind, type) else kind for kind in (result, *kinds)
+            ]
+            return lane_types[0](*lane_types[1:]), codegen
 
         names = ("typingctx", *"abcdefgh"[: len(kinds)])
         define.__name__ = emit.__name__
@@ -308,8 +320,10 @@ def _operation(result, *kinds):
     return wrap
 
 
-_unary, _binary = _operation(_Floats, _Floats), _operation(_Floats, _Floats, _Floats)
-_ternary, _comparison = _operation(_Floats, *[_Floats] * 3), _operation(_Masks, _Floats, _Floats)
+_unary = _operation(_Floats, _Floats)
+_binary = _operation(_Floats, _Floats, _Floats)
+_ternary = _operation(_Floats, *[_Floats] * 3)
+_comparison = _operation(_Masks, _Floats, _Floats)
 
 # The same number in all lanes, of eight or of the vector's; 0, 1, ... 7; a b + c, rounded once.
 splat = _operation(float8, types.float32)(lambda b, value: _broadcast(b, value, LANES))
@@ -326,7 +340,7 @@ negate = _unary(lambda b, value: b.fneg(value))
 # a where a < b (a > b), else b, so b where a is NaN.
 minimum = _binary(lambda b, *args: b.select(b.fcmp_ordered("<", *args), *args))
 maximum = _binary(lambda b, *args: b.select(b.fcmp_ordered(">", *args), *args))
-# Lanes where a > b, or a >= b; never where either is NaN. Lanes that are in both masks.
+# Masks of the lanes where a > b, or a >= b (not where either is NaN), and of lanes in both masks.
 greater = _comparison(lambda b, *args: b.fcmp_ordered(">", *args))
 at_least = _comparison(lambda b, *args: b.fcmp_ordered(">=", *args))
 both = _operation(_Masks, _Masks, _Masks)(lambda b, *masks: b.and_(*masks))
@@ -345,7 +359,7 @@ ROWS = WIDE // LANES
 wide_columns = _operation(_Floats(WIDE))(
     lambda b: ir.Constant(_floats(WIDE), [float(i // ROWS) for i in range(WIDE)])
 )
-# Of a vector's lanes: their column; how many rows there are, and which is a lane's.
+# Number of rows of a vector's pixels, and the row of every lane.
 rows_in = _operation(types.uint64, _Floats)(
     lambda b, vector: ir.IntType(64)(vector.type.count // LANES)
 )
@@ -358,8 +372,9 @@ row_numbers = _unary(
 
 @intrinsic
 def load_row(typingctx, vector, array, index):
-    """One row of a vector that begins at array[index]: index is its place plus the row."""
-    lanes, load_lanes = vector.lanes, _load(vector.lanes)
+    """Return one row of a vector that begins at array[index]; index is its place plus the row."""
+    lanes = vector.lanes
+    load_lanes = _load(vector.lanes)
 
     def codegen(context, builder, sig, args):
         value = load_lanes(context, builder, sig, args)
@@ -371,7 +386,7 @@ def load_row(typingctx, vector, array, index):
 
 @intrinsic
 def by_row(typingctx, vector, array, index):
-    """array[index] in every lane, or, of two rows, array[2 index] and array[2 index + 1]."""
+    """Return array[index] in all lanes, or, for two rows, array[2 index] and array[2 index + 1]."""
     lanes = vector.lanes
 
     def codegen(context, builder, sig, args):
@@ -387,19 +402,19 @@ def by_row(typingctx, vector, array, index):
 
 @_unary
 def minus_abs(builder, value):
-    """-|a|: a with its sign bit set."""
+    """Return -|a|: a with its sign bit set."""
     return _numbers(builder, builder.or_(_bits(builder, value), _like(value, -(2**31))))
 
 
 @_unary
 def absolute(builder, value):
-    """|a|: a with its sign bit clear."""
+    """Return |a|: a with its sign bit clear."""
     return _numbers(builder, builder.and_(_bits(builder, value), _like(value, 2**31 - 1)))
 
 
 @_operation(float8, *[float8] * LANES)
 def totals(builder, *rows):
-    """The sums of the eight lanes of a to h, as lanes 0 to 7; always added in the same order."""
+    """Return the sums of the lanes of a to h, as lanes 0 to 7; the order of addition is fixed."""
 
     def fold(left, right, low, high):
         halves = [builder.shuffle_vector(left, right, _like(left, lanes)) for lanes in (low, high)]
@@ -422,29 +437,30 @@ def lane(builder, value, number):
 
 
 # ---- Pixels of three colours, which lie one after the other --------------------------------------
-# Of 24 such numbers each register has a colour's in lanes that the other two have not: lane
-# (colour + 3 pixel) % 8. So two blends and a permutation sort them, and the same way back.
+# 24 such numbers fill three registers. A colour's number of a pixel is in lane
+# (colour + 3 pixel) % 8, so each register has a colour's numbers in lanes where the other two have
+# none. Two blends and a permutation sort them, and the same steps lead back.
 
 _MIXED = [[(colour + 3 * pixel) % LANES for pixel in range(LANES)] for colour in range(3)]
 
 
 def _owner(colour: int, lane: int) -> int:
-    """Which of three registers has a colour's number in a lane."""
+    """Return the number of the register, of three, that has a colour's number in a lane."""
     return (colour + 3 * _MIXED[colour].index(lane)) // LANES
 
 
 def _blend(builder, values, choose):
-    """Lane by lane the value that `choose` names."""
-    pairs = [choose(lane) for lane in range(LANES)]
-    two = [lane + LANES * (pick == 1) for lane, pick in enumerate(pairs)]
-    mixed = builder.shuffle_vector(*values[:2], _like(values[0], two))
-    three = [lane + LANES * (pick == 2) for lane, pick in enumerate(pairs)]
-    return builder.shuffle_vector(mixed, values[2], _like(mixed, three))
+    """Return lane by lane the value that `choose` names."""
+    picks = [choose(lane) for lane in range(LANES)]
+    first_lanes = [lane + LANES * (pick == 1) for lane, pick in enumerate(picks)]
+    mixed = builder.shuffle_vector(*values[:2], _like(values[0], first_lanes))
+    all_lanes = [lane + LANES * (pick == 2) for lane, pick in enumerate(picks)]
+    return builder.shuffle_vector(mixed, values[2], _like(mixed, all_lanes))
 
 
 @intrinsic
 def load_colours(typingctx, array, index):
-    """Red, green and blue of the eight pixels from array[index] on."""
+    """Return red, green and blue of the eight pixels from array[index] on."""
     kind = types.UniTuple(float8, 3)
 
     def codegen(context, builder, sig, args):
@@ -464,7 +480,7 @@ def load_colours(typingctx, array, index):
 
 @intrinsic
 def store_colours(typingctx, array, index, red, green, blue):
-    """What `load_colours` loads."""
+    """Store red, green and blue of the eight pixels from array[index] on."""
 
     def codegen(context, builder, sig, args):
         at = _pointer(context, builder, sig.args[0], *args[:2])
@@ -474,8 +490,14 @@ def store_colours(typingctx, array, index, red, green, blue):
             lanes = [_MIXED[colour].index(lane) for lane in range(LANES)]
             mixed.append(builder.shuffle_vector(value, value, _like(value, lanes)))
         for k in range(3):
-            own = [next(c for c in range(3) if _owner(c, lane) == k) for lane in range(LANES)]
-            row = _blend(builder, mixed, lambda lane, own=own: own[lane])
+            source_registers = [
+                next(c for c in range(3) if _owner(c, lane) == k) for lane in range(LANES)
+            ]
+            row = _blend(
+                builder,
+                mixed,
+                lambda lane, source_registers=source_registers: source_registers[lane],
+            )
             builder.store(row, builder.gep(at, [_INT(k)]), align=4)
         return context.get_dummy_value()
 
@@ -484,10 +506,10 @@ def store_colours(typingctx, array, index, red, green, blue):
 
 @_operation(types.boolean, _Floats)
 def any_not_negative(builder, value):
-    """Whether the sign bit of any lane is clear."""
-    whole = ir.IntType(value.type.count)
+    """Return True if the sign bit of any lane is clear."""
+    all_bits = ir.IntType(value.type.count)
     clear = builder.icmp_signed(">=", _bits(builder, value), _like(value, 0))
-    return builder.icmp_unsigned("!=", builder.bitcast(clear, whole), whole(0))
+    return builder.icmp_unsigned("!=", builder.bitcast(clear, all_bits), all_bits(0))
 
 
 def _exponent_bits(builder, value):
@@ -497,18 +519,20 @@ def _exponent_bits(builder, value):
 
 @_unary
 def exponent(builder, value):
-    """The k for which a / 2**k lies in [sqrt(1/2), sqrt(2)); a > 0 and normal."""
+    """Return the k for which a / 2**k lies in [sqrt(1/2), sqrt(2)); a > 0 and normal."""
     return builder.sitofp(_exponent_bits(builder, value), value.type)
 
 
 @_unary
 def mantissa(builder, value):
-    """a / 2**exponent(a)."""
+    """Return a / 2**exponent(a)."""
     power = builder.shl(_exponent_bits(builder, value), _like(value, 23))
     return _numbers(builder, builder.sub(_bits(builder, value), power))
 
 
 def _prefetch(to_write: int):
+    """Return the code generator of a prefetch, to read or to write."""
+
     def codegen(context, builder, sig, args):
         at = _pointer(context, builder, sig.args[0], *args)
         kind = ir.FunctionType(ir.VoidType(), [at.type, _INT, _INT, _INT])
@@ -521,25 +545,26 @@ def _prefetch(to_write: int):
 
 @intrinsic
 def prefetch(typingctx, array, index):
-    """Ask for the cache line of array[index] before it is needed."""
+    """Fetch the cache line of array[index] before it is needed."""
     return types.void(array, types.uint64), _prefetch(0)
 
 
 @intrinsic
 def prefetch_to_write(typingctx, array, index):
-    """Likewise, before it is written."""
+    """Fetch the cache line of array[index] before it is written."""
     return types.void(array, types.uint64), _prefetch(1)
 
 
-# ---- What the CPU kernels need beyond arithmetic: exponentials, logarithms, arrays by address ----
+# ---- Beyond arithmetic: exponentials, logarithms, arrays by address ------------------------------
 
 LOG2_E = np.float32(math.log2(math.e))
-_ROUND = 1.5 * 2**23  # adding it leaves the nearest integer in the low bits
+# Number whose addition leaves the nearest integer in the low bits.
+_ROUND = 1.5 * 2**23
 # 2**x on [-0.5, 0.5], least maximal relative error (2.6e-6), lowest power first.
 _COARSE = tuple(
     np.float32(c) for c in (0.999999261, 0.693121815, 0.240247448, 0.0559178609, 0.00957010198)
 )
-# 2**x likewise with 2**0 exactly 1 (9e-8).
+# The same with 2**0 exactly 1 (9e-8).
 _FINE = tuple(
     np.float32(c) for c in (1, 0.693146978, 0.240222421, 0.0555073374, 0.00967151266, 0.00132647272)
 )
@@ -548,34 +573,39 @@ _LOG1, _LOG3, _LOG5, _LOG7 = (np.float32(2 / math.log(2) / n) for n in (1, 3, 5,
 
 
 def _emit_exp2(builder, coefficients, x, mask=None):
-    """coefficients: of 2**x on [-0.5, 0.5]. Zero where a mask is given and a lane is not in it.
+    """Write the instructions of 2**x; lanes outside the mask, if there is one, become 0.
 
-    With AVX-512, what lies between x and the nearest integer, and a scaling by 2**k, are one
+    With AVX-512, the distance of x from the nearest integer and a scaling by 2**k are one
     instruction each, with the same bits. Lanes outside the mask must not be scaled: numbers below
     2**-126 would cost a hundred times as much.
+
+    coefficients: of 2**x on [-0.5, 0.5].
     """
     lanes = x.type.count
-    fused = lanes == 16
-    if fused:
-        f = _avx512(builder, "reduce", [x, _INT(8)])  # 8: from the nearest, no exceptions
-        power = builder.fsub(x, f)
+    has_avx512 = lanes == 16
+    if has_avx512:
+        fraction = _avx512(builder, "reduce", [x, _INT(8)])  # 8: from the nearest, no exceptions
+        power = builder.fsub(x, fraction)
     else:
         power = builder.fadd(x, _like(x, _ROUND))
-        f = builder.fsub(x, builder.fsub(power, _like(x, _ROUND)))
-    p = _like(x, float(coefficients[-1]))
+        fraction = builder.fsub(x, builder.fsub(power, _like(x, _ROUND)))
+    power_of_fraction = _like(x, float(coefficients[-1]))
     for coefficient in coefficients[-2::-1]:
-        p = _call(builder, "fmuladd", [p, f, _like(x, float(coefficient))])
-    if fused:
-        return _avx512(builder, "scalef", [p, power], mask)
+        power_of_fraction = _call(
+            builder, "fmuladd", [power_of_fraction, fraction, _like(x, float(coefficient))]
+        )
+    if has_avx512:
+        return _avx512(builder, "scalef", [power_of_fraction, power], mask)
     power = builder.shl(_bits(builder, power), _like(x, 23))
-    scaled = _numbers(builder, builder.add(_bits(builder, p), power))
+    scaled = _numbers(builder, builder.add(_bits(builder, power_of_fraction), power))
     return scaled if mask is None else builder.select(mask, scaled, _like(x, 0.0))
 
 
 def _avx512(builder, name: str, args, mask=None):
-    """An instruction of AVX-512 on sixteen floats; 0 in lanes outside the mask."""
-    kind, short = args[0].type, ir.IntType(16)
-    mask = short(-1) if mask is None else builder.bitcast(mask, short)
+    """Write an AVX-512 instruction on sixteen floats; lanes outside the mask become 0."""
+    kind = args[0].type
+    bits16 = ir.IntType(16)
+    mask = bits16(-1) if mask is None else builder.bitcast(mask, bits16)
     args = [*args, _like(args[0], 0.0), mask, _INT(4)]  # 4: round as always
     function = builder.module.declare_intrinsic(
         f"llvm.x86.avx512.mask.{name}.ps.512", (), ir.FunctionType(kind, [a.type for a in args])
@@ -583,21 +613,22 @@ def _avx512(builder, name: str, args, mask=None):
     return builder.call(function, args)
 
 
-# 2**x for |x| <= 126; any bits at all elsewhere. Relative error 3e-6; the second, 0 outside a mask.
+# 2**x for |x| <= 126, and undefined elsewhere, with a relative error of 3e-6. The second is 0
+# outside a mask.
 exp2 = _unary(lambda b, x: _emit_exp2(b, _COARSE, x))
 exp2_where = _operation(_Floats, _Masks, _Floats)(
     lambda b, mask, x: _emit_exp2(b, _COARSE, x, mask)
 )
-# Likewise to float32's precision and exact at 0.
+# 2**x to float32's precision, and exact at 0.
 exp2_fine = _unary(lambda b, x: _emit_exp2(b, _FINE, x))
 
 
 @inner()
 def log2(x):
-    """Base-2 logarithm, of eight, for normal x > 0; error below 2e-7 (1 + |result|)."""
-    one = splat(np.float32(1))
+    """Return the base-2 logarithm of eight normal x > 0; error below 2e-7 (1 + |result|)."""
+    ones = splat(np.float32(1))
     m = mantissa(x)
-    s = (m - one) / (m + one)
+    s = (m - ones) / (m + ones)
     ss = s * s
     p = fmuladd(splat(_LOG7), ss, splat(_LOG5))
     p = fmuladd(p, ss, splat(_LOG3))
@@ -607,13 +638,13 @@ def log2(x):
 
 @_operation(types.float32, *[types.float32] * 3)
 def scalar_fmuladd(builder, *args):
-    """a b + c of scalars, rounded once where the processor has fused multiply-add."""
+    """Return a b + c of scalars, rounded once if the processor has fused multiply-add."""
     kind = ir.FunctionType(ir.FloatType(), [ir.FloatType()] * 3)
     return builder.call(builder.module.declare_intrinsic("llvm.fmuladd.f32", (), kind), args)
 
 
 def _pointer_to(number, bits):
-    """From an address to a pointer."""
+    """Return a function that makes a pointer from an address."""
     to = _operation(types.CPointer(number), types.uint64)
     return to(lambda b, address: b.inttoptr(address, bits.as_pointer()))
 
@@ -624,13 +655,13 @@ _short_pointer = _pointer_to(types.int16, ir.IntType(16))
 
 @inner()
 def shorts_at(address, count):
-    """The int16 array of `count` numbers at a memory address; the caller keeps it alive."""
+    """Return the int16 array of `count` numbers at an address; the caller keeps it alive."""
     return numba.carray(_short_pointer(address), (count,))
 
 
 @inner()
 def floats_at(address, count):
-    """The float32 array of `count` numbers at a memory address; the caller keeps it alive.
+    """Return the float32 array of `count` numbers at an address; the caller keeps it alive.
 
     One launch can then serve any number of scene parts, whose arrays differ in shape.
     """

@@ -1,9 +1,9 @@
 """The GPU rasteriser as a torch operation.
 
-Colours' gradients, which are all that training a style network takes, are our own kernels': dL by
-sh of every part from rgb, whatever other buffers are made beside it, since colours move none of
-them. Gradients of means, quats, scales and opacities, from rgb, alpha and expected depth, are
-gsplat's (augment.render.gsplat_backend), which is an extra. Camera and part poses get none.
+Training a style network needs the gradients of colours only. They come from our own kernels: dL by
+sh of every part from rgb. Other buffers may be made beside it, since colours change none of them.
+Gradients of means, quats, scales and opacities, from rgb, alpha and expected depth, come from
+gsplat (augment.render.gsplat_backend), which is an extra. Camera and part poses have no gradients.
 """
 
 from __future__ import annotations
@@ -34,11 +34,16 @@ from augment.scene import PosedGaussians
 # Only colours move: order, alpha and transmittance are constants of the image, so nothing of the
 # forward blend is kept but its lists. The same bits come out every time.
 
-# All pixels of a tile times BATCH entries in the registers of two warps: more entries do not fit,
-# more warps wait for each other.
-_BATCH, _TILE_WARPS = 8, 2
-# Most splats are in few tiles; one that is in all must not take long either.
-_SPLATS, _LANES = 8, 16
+# Entries of a tile's list that are processed at a time. All pixels of a tile times _BATCH entries
+# lie in the registers of two warps: more entries do not fit, and more warps wait for each other.
+_BATCH = 8
+# Warps of a program.
+_TILE_WARPS = 2
+# Splats of a program that adds up shares.
+_SPLATS = 8
+# Sums of each splat. Most splats are in few tiles, but a splat in all of them must be fast, too.
+_LANES = 16
+# Splats of a program that computes gradients of sh.
 _SH_SPLATS = 32
 
 
@@ -49,28 +54,47 @@ def color_gradients(
     settings: RasterSettings,
     d_rgb: Float32[Tensor, "H W 3"],
 ) -> Float32[Tensor, "N 3"]:
-    """dL by the colours that spherical harmonics make, 0 where the clamp at 0 holds them.
+    """Return dL by the colours of the spherical harmonics, 0 where the clamp at 0 holds them.
 
     d_rgb: dL by the image that `blend` makes of the splats, without cuts and light per pixel.
     """
-    entries, count = len(tiles.tile_splat_ids), len(splats.keys)
+    entries = len(tiles.tile_splat_ids)
+    count = len(splats.keys)
     device = splats.keys.device
     d_colors = torch.zeros(count, 3, device=device)
     if entries == 0:
         return d_colors
     shares = torch.zeros(3, entries, device=device)
     launch(
-        kernels.share_colors, (tiles.columns * tiles.rows,), splats.records, tiles.tile_splat_ids,
-        tiles.tile_offsets, d_rgb.contiguous(), shares, camera.width, camera.height,
-        limits_of(settings), BATCH=_BATCH, num_warps=_TILE_WARPS,
-    )  # fmt: skip
+        kernels.share_colors,
+        (tiles.columns * tiles.rows,),
+        splats.records,
+        tiles.tile_splat_ids,
+        tiles.tile_offsets,
+        d_rgb.contiguous(),
+        shares,
+        camera.width,
+        camera.height,
+        limits_of(settings),
+        BATCH=_BATCH,
+        num_warps=_TILE_WARPS,
+    )
     owners, order = torch.sort(tiles.tile_splat_ids, stable=True)  # lists are tile after tile
     bounds = torch.arange(count + 1, dtype=owners.dtype, device=device)
     launch(
-        kernels.sum_shares, (-(-count // _SPLATS),), shares, order,
-        torch.searchsorted(owners, bounds), splats.records, d_colors, count, entries,
-        SPLATS=_SPLATS, LANES=_LANES, num_warps=1,
-    )  # fmt: skip
+        kernels.sum_shares,
+        (-(-count // _SPLATS),),
+        shares,
+        order,
+        torch.searchsorted(owners, bounds),
+        splats.records,
+        d_colors,
+        count,
+        entries,
+        SPLATS=_SPLATS,
+        LANES=_LANES,
+        num_warps=1,
+    )
     return d_colors
 
 
@@ -81,16 +105,25 @@ def sh_gradients(
     functions: int,
     used: int,
 ) -> Float32[Tensor, "M K 3"]:
-    """dL by sh [M, K = functions, 3] of a part, of which the camera's view is `view` (layout's
-    V_*); 0 in functions from `used` on.
+    """Return dL by the sh of a part, [M, K = functions, 3]; 0 in functions from `used` on.
+
+    view: numbers of the camera's view of the part (layout's V_*).
     """
     values = 3 * functions
     d_sh = torch.empty(len(means), functions, 3, device=means.device)
     launch(
-        kernels.spread_to_sh, (-(-len(means) // _SH_SPLATS),), means, view, d_colors, d_sh,
-        len(means), used,
-        SPLATS=_SH_SPLATS, VALUES=values, COLUMNS=1 << (values - 1).bit_length(),
-    )  # fmt: skip
+        kernels.spread_to_sh,
+        (-(-len(means) // _SH_SPLATS),),
+        means,
+        view,
+        d_colors,
+        d_sh,
+        len(means),
+        used,
+        SPLATS=_SH_SPLATS,
+        VALUES=values,
+        COLUMNS=1 << (values - 1).bit_length(),
+    )
     return d_sh
 
 
@@ -100,25 +133,31 @@ def rasterize_with_gradients(
     buffers: frozenset[str],
     settings: RasterSettings,
 ) -> RenderOutput:
-    """As `cuda.rasterize_cuda` without fog and clip, recorded by autograd; no part has light per
-    pixel or colour maps. buffers: some of DIFFERENTIABLE where geometry asks for gradients.
+    """Return `cuda.rasterize_cuda` without fog and clip, recorded by autograd.
 
-    The splats' records and the tiles' lists are kept until backward.
+    No part has light per pixel or colour maps. The splats' records and the tiles' lists are kept
+    until backward.
+
+    buffers: some of DIFFERENTIABLE if geometry requires gradients.
 
     Raises:
-        BackendUnavailable: geometry asks for gradients, and gsplat is not installed.
+        BackendUnavailable: geometry requires gradients, and gsplat is not installed.
     """
     if tracked_geometry(parts):
-        drawn = draw_with_gsplat(parts, camera, settings, with_depth=EXPECTED_DEPTH in buffers)
-        return RenderOutput(**{name: getattr(drawn, name) for name in buffers})
+        gsplat_images = draw_with_gsplat(
+            parts, camera, settings, with_depth=EXPECTED_DEPTH in buffers
+        )
+        return RenderOutput(**{name: getattr(gsplat_images, name) for name in buffers})
     names = tuple(sorted(buffers))
-    setting = _Setting(tuple(_detached(part) for part in parts), camera, settings, names)
-    images = _Rasterize.apply(setting, *[part.gaussians.sh for part in parts])
+    arguments = _OperationArguments(
+        tuple(_detached(part) for part in parts), camera, settings, names
+    )
+    images = _Rasterize.apply(arguments, *[part.gaussians.sh for part in parts])
     return RenderOutput(**dict(zip(names, images, strict=True)))
 
 
-class _Setting(NamedTuple):
-    """What an operation is told besides its tensors."""
+class _OperationArguments(NamedTuple):
+    """Arguments of an operation besides its tensors."""
 
     parts: tuple[PosedGaussians, ...]
     camera: Camera
@@ -128,44 +167,51 @@ class _Setting(NamedTuple):
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, setting: _Setting, *shs: Tensor) -> tuple[Tensor, ...]:
-        parts, camera, settings = setting.parts, setting.camera, setting.settings
-        names = frozenset(setting.buffers)
+    def forward(ctx: Any, arguments: _OperationArguments, *shs: Tensor) -> tuple[Tensor, ...]:
+        parts = arguments.parts
+        camera = arguments.camera
+        settings = arguments.settings
+        names = frozenset(arguments.buffers)
         inputs = gather_inputs(parts, camera, settings, None, None, with_color=RGB in names)
         splats = project(inputs)
         tiles = list_tiles(splats, camera, None)
         images = blend(splats, tiles, camera, names, settings)
-        ctx.setting, ctx.splats, ctx.tiles = setting, splats, tiles
-        ctx.views, ctx.most = inputs.views.reshape(-1, VIEW), int(inputs.modes[M_FUNCTIONS])
-        ctx.likenesses = [(sh.device, sh.shape[1]) for sh in shs]
+        ctx.arguments = arguments
+        ctx.splats = splats
+        ctx.tiles = tiles
+        ctx.views = inputs.views.reshape(-1, VIEW)
+        ctx.max_functions = int(inputs.modes[M_FUNCTIONS])
+        ctx.sh_layouts = [(sh.device, sh.shape[1]) for sh in shs]
         # Kept by autograd, so that a change in place before backward is noticed.
         ctx.save_for_backward(*[resident(part.gaussians.means) for part in parts])
-        ctx.mark_non_differentiable(*[images[n] for n in setting.buffers if n != RGB])
-        return tuple(images[name] for name in setting.buffers)
+        ctx.mark_non_differentiable(*[images[n] for n in arguments.buffers if n != RGB])
+        return tuple(images[name] for name in arguments.buffers)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride] - torch's own way
         ctx: Any, *d_images: Tensor
     ) -> tuple[Any, ...]:
-        setting: _Setting = ctx.setting
-        if RGB not in setting.buffers:
-            return (None,) * (1 + len(setting.parts))
-        d_rgb = d_images[setting.buffers.index(RGB)]
-        d_colors = color_gradients(ctx.splats, ctx.tiles, setting.camera, setting.settings, d_rgb)
-        out: list[Tensor | None] = [None]
+        arguments: _OperationArguments = ctx.arguments
+        if RGB not in arguments.buffers:
+            return (None,) * (1 + len(arguments.parts))
+        d_rgb = d_images[arguments.buffers.index(RGB)]
+        d_colors = color_gradients(
+            ctx.splats, ctx.tiles, arguments.camera, arguments.settings, d_rgb
+        )
+        gradients: list[Tensor | None] = [None]
         first = 0
         for number, means in enumerate(ctx.saved_tensors):
-            device, functions = ctx.likenesses[number]
-            own = d_colors[first : first + len(means)]
+            device, functions = ctx.sh_layouts[number]
+            part_d_colors = d_colors[first : first + len(means)]
             first += len(means)
             if not ctx.needs_input_grad[1 + number]:
-                out.append(None)
+                gradients.append(None)
                 continue
-            used = min(ctx.most, functions)
-            d_sh = sh_gradients(means, ctx.views[number], own, functions, used)
-            out.append(d_sh.to(device))
-        return tuple(out)
+            num_functions = min(ctx.max_functions, functions)
+            d_sh = sh_gradients(means, ctx.views[number], part_d_colors, functions, num_functions)
+            gradients.append(d_sh.to(device))
+        return tuple(gradients)
 
 
 def _detached(part: PosedGaussians) -> PosedGaussians:

@@ -5,6 +5,7 @@
     blend     every tile's, front to back, into the images asked for      (blend_kernels)
 
 No sum depends on the order in which programs run, so the same bits come out every time.
+`rasterize` calls `rasterize_cuda`; `cuda.backward` uses the stages one by one.
 """
 
 from __future__ import annotations
@@ -41,8 +42,10 @@ from augment.scene import PosedGaussians
 
 
 def project(inputs: CudaInputs) -> CudaSplats:
-    """Records, keys, tiles, and, where the modes ask for them, cuts and lights."""
-    count, device, modes = inputs.count, inputs.device, [int(mode) for mode in inputs.modes]
+    """Return records, keys and tiles of all splats; cuts and lights too, if the modes ask."""
+    count = inputs.count
+    device = inputs.device
+    modes = [int(mode) for mode in inputs.modes]
 
     def floats(columns: int) -> torch.Tensor:
         return torch.empty((count, columns), dtype=torch.float32, device=device)
@@ -59,35 +62,50 @@ def project(inputs: CudaInputs) -> CudaSplats:
         lights=floats(shading.LINES) if modes[layout.M_LIGHT] else None,
     )
     launch(
-        project_gaussians, (len(inputs.block_parts),), inputs.table, inputs.views,
+        project_gaussians,
+        (len(inputs.block_parts),),
+        inputs.table,
+        inputs.views,
         inputs.block_parts,
         (splats.records, splats.keys, splats.rects, splats.counts, splats.cuts, splats.lights),
-        COLOR=modes[layout.M_COLOR], FUNCTIONS=modes[layout.M_FUNCTIONS],
-        ANTIALIASED=modes[layout.M_ANTIALIASED], FOG=modes[layout.M_FOG],
-        BLOCK=BLOCK, num_warps=BLOCK // 32,
-    )  # fmt: skip
+        COLOR=modes[layout.M_COLOR],
+        FUNCTIONS=modes[layout.M_FUNCTIONS],
+        ANTIALIASED=modes[layout.M_ANTIALIASED],
+        FOG=modes[layout.M_FOG],
+        BLOCK=BLOCK,
+        num_warps=BLOCK // 32,
+    )
     return splats
 
 
-# ---- Tile lists: which splats every tile blends, nearest first, ties by index --------------------
+# ---- Tile lists: the splats that every tile blends, nearest first, ties by index -----------------
 #     order    of the Gaussians by the bits of z                                stable sort
 #     expand   every splat to its pairs with tiles, in that order               list_pairs
 #     group    the pairs by tile, which leaves each tile's in order of depth    stable sort
 
-_SPLATS, _PAIRS = 256, 512  # of a program; a thread looks for the owners of four pairs at once
-_MAX_PAIRS = 2**31 - 1024  # tiles' lists begin at an int32, and are read some way beyond
+# Splats of a program.
+_SPLATS = 256
+# Pairs of a program; a thread searches the owners of four pairs at a time.
+_PAIRS = 512
+# Largest number of pairs: a list begins at an int32 position, and some positions beyond are read.
+_MAX_PAIRS = 2**31 - 1024
 
 
 def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) -> CudaTiles:
-    """The lists of all tiles. pixel_mask: bool [H, W]; tiles without a pixel of it get none.
+    """Return the lists of all tiles.
 
-    Waits for the GPU once, to learn how many pairs there are.
+    This waits for the GPU once, to learn how many pairs there are.
+
+    pixel_mask: bool [H, W]; tiles without a pixel of it get no list.
 
     Raises:
         ValueError: there are more pairs than an int32 can count.
     """
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
-    count, tiles, device = len(splats.keys), columns * rows, splats.keys.device
+    columns = -(-camera.width // TILE)
+    rows = -(-camera.height // TILE)
+    count = len(splats.keys)
+    tiles = columns * rows
+    device = splats.keys.device
     is_drawn = (
         None if pixel_mask is None else _tiles_with_pixels(pixel_mask.to(device), columns, rows)
     )
@@ -95,10 +113,17 @@ def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) ->
     order = torch.sort(splats.keys, stable=True).indices
     counts = torch.empty(count, dtype=torch.int32, device=device)
     runtime.launch(
-        count_tiles, (-(-count // _SPLATS),), order, splats.counts, splats.rects,
-        None if is_drawn is None else _sums_from_corner(is_drawn), counts, count, columns,
+        count_tiles,
+        (-(-count // _SPLATS),),
+        order,
+        splats.counts,
+        splats.rects,
+        None if is_drawn is None else _sums_from_corner(is_drawn),
+        counts,
+        count,
+        columns,
         BLOCK=_SPLATS,
-    )  # fmt: skip
+    )
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
     pairs = int(ends[-1]) if count else 0
     if pairs > _MAX_PAIRS:
@@ -108,24 +133,36 @@ def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) ->
             f"or smaller Gaussians"
         )
 
-    # One number more than there are tiles stands for those that are not wanted, behind all others.
-    numbers = torch.int16 if tiles <= torch.iinfo(torch.int16).max else torch.int32
-    tile_of = torch.empty(pairs, dtype=numbers, device=device)
+    # The number after the last tile stands for all tiles that are not drawn.
+    index_dtype = torch.int16 if tiles <= torch.iinfo(torch.int16).max else torch.int32
+    tile_of = torch.empty(pairs, dtype=index_dtype, device=device)
     owners = torch.empty(pairs, dtype=torch.int32, device=device)
     runtime.launch(
-        list_pairs, (-(-pairs // _PAIRS),), order, ends, splats.rects,
-        is_drawn, tile_of, owners, pairs, count, count.bit_length(), columns, tiles, BLOCK=_PAIRS,
-    )  # fmt: skip
-    grouped, index = torch.sort(tile_of, stable=True)
-    edges = torch.arange(tiles + 1, dtype=numbers, device=device)
-    tile_offsets = torch.searchsorted(grouped, edges, out_int32=True)
+        list_pairs,
+        (-(-pairs // _PAIRS),),
+        order,
+        ends,
+        splats.rects,
+        is_drawn,
+        tile_of,
+        owners,
+        pairs,
+        count,
+        count.bit_length(),
+        columns,
+        tiles,
+        BLOCK=_PAIRS,
+    )
+    sorted_tiles, index = torch.sort(tile_of, stable=True)
+    edges = torch.arange(tiles + 1, dtype=index_dtype, device=device)
+    tile_offsets = torch.searchsorted(sorted_tiles, edges, out_int32=True)
     return CudaTiles(owners[index], tile_offsets, columns, rows)
 
 
 def _tiles_with_pixels(
     pixel_mask: Bool[Tensor, "H W"], columns: int, rows: int
 ) -> Bool[Tensor, "R C"]:
-    """Tiles with a pixel of the mask."""
+    """Return the tiles with a pixel of the mask."""
     height, width = pixel_mask.shape
     padded = pixel_mask.new_zeros(rows * TILE, columns * TILE)
     padded[:height, :width] = pixel_mask
@@ -133,7 +170,7 @@ def _tiles_with_pixels(
 
 
 def _sums_from_corner(is_drawn: Bool[Tensor, "R C"]) -> Int32[Tensor, "R1 C1"]:
-    """Wanted tiles above and to the left of each corner."""
+    """Return the number of drawn tiles above and to the left of each corner."""
     sums = is_drawn.cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32)
     return torch.nn.functional.pad(sums, (1, 0, 1, 0))
 
@@ -142,7 +179,8 @@ def _sums_from_corner(is_drawn: Bool[Tensor, "R C"]) -> Int32[Tensor, "R1 C1"]:
 
 # Pixels of a program, which is one warp. Larger blocks spend less on reading their lists, smaller
 # ones less on pixels that a splat does not cover. Powers of 2; the warp's threads must fit into it.
-_BLOCK_W, _BLOCK_H = 16, 8
+_BLOCK_W = 16
+_BLOCK_H = 8
 
 # The kernel reads records and cuts four numbers at a time and names them in this order.
 assert (layout.MEAN_X, layout.MEAN_Y, layout.LEAN_X, layout.SHARP_X) == (0, 1, 2, 3)
@@ -160,7 +198,7 @@ def blend(
     buffers: frozenset[str],
     settings: RasterSettings,
 ) -> dict[str, Tensor]:
-    """The images asked for, [H, W] each, rgb [H, W, 3], on the GPU."""
+    """Return the requested images, [H, W] each, rgb [H, W, 3], on the GPU."""
     images = {name: _empty(name, camera, splats) for name in buffers | {ALPHA}}
     per_tile = (TILE // _BLOCK_W) * (TILE // _BLOCK_H)
     runtime.launch(
@@ -181,9 +219,9 @@ def blend(
 
 
 def limits_of(settings: RasterSettings) -> tuple[float, float, float, float]:
-    """What blending is limited by, as blend_blocks names it."""
-    end = settings.transmittance_stop
-    return settings.alpha_max, math.log2(ALPHA_MIN), min(end, TRANSMITTANCE_STOP), end
+    """Return the limits of blending, as blend_blocks names them."""
+    stop = settings.transmittance_stop
+    return settings.alpha_max, math.log2(ALPHA_MIN), min(stop, TRANSMITTANCE_STOP), stop
 
 
 def _empty(name: str, camera: Camera, splats: CudaSplats) -> Tensor:
@@ -206,12 +244,20 @@ def rasterize_cuda(
     *,
     timer: GpuStageTimer | None = None,
 ) -> RenderOutput:
-    """The image of the parts in float32, on the GPU, without gradients. Arguments are checked by
-    `rasterize`.
+    """Return the image of the parts in float32, on the GPU, without gradients.
 
-    pixel_mask: bool [H, W]; tiles without a pixel of the mask are left out and hold zeros. timer:
-    told of "project", "list" and "blend", and of the counts "visible" (splats that touch a tile)
-    and "pairs" (of splats and tiles).
+    `rasterize` checks the arguments.
+
+    Args:
+        parts: Gaussians with their poses.
+        camera: the camera.
+        buffers: names of the buffers.
+        settings: thresholds of the image.
+        fog: fog before the splats; None for clear air.
+        clip: height at which splats are cut; None for no cut.
+        pixel_mask: bool [H, W]; tiles without a pixel of the mask are left out and hold zeros.
+        timer: gets the ends of "project", "list" and "blend", and the counts "visible" (splats that
+            touch a tile) and "pairs" (of splats and tiles).
     """
     inputs = gather_inputs(parts, camera, settings, fog, clip, with_color=RGB in buffers)
     splats = project(inputs)

@@ -1,8 +1,8 @@
-"""The GPU that Triton's kernels run on: which one it is, what has been copied to it, launches.
+"""The GPU that Triton's kernels run on: its choice, the copies on it, and launches.
 
-Nothing here is imported or compiled before a backend that needs it is asked for. With
-TRITON_INTERPRET=1 set before the kernels are imported, Triton runs them in Python on CPU tensors
-instead: thousands of times slower, and so for small tests, but everywhere.
+Nothing here is imported or compiled before a backend needs it. With TRITON_INTERPRET=1 set before
+the kernels are imported, Triton runs them in Python on CPU tensors instead: thousands of times
+slower, so for small tests only, but on any machine.
 """
 
 from __future__ import annotations
@@ -20,7 +20,11 @@ from augment.errors import BackendUnavailable
 
 
 def check_can_run() -> None:
-    """Raises BackendUnavailable, which says why Triton's kernels cannot run here."""
+    """Check that Triton's kernels can run here.
+
+    Raises:
+        BackendUnavailable: they cannot; the message says why.
+    """
     obstacle = _obstacle()
     if obstacle is not None:
         raise BackendUnavailable(f"backend 'cuda' is unavailable: {obstacle}")
@@ -43,13 +47,16 @@ def _obstacle() -> str | None:
 
 
 def _driver_obstacle() -> str | None:
-    """Why Triton cannot launch: it compiles its own launchers, by what the machine has for that."""
+    """Return the reason why Triton cannot launch kernels, or None.
+
+    Triton compiles its own launchers with the compiler and headers of the machine.
+    """
     from triton.runtime import driver
 
     try:
-        # Made when it is first asked for.
+        # Triton makes it at the first access.
         driver.active.utils  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
-    except Exception as error:  # of a compiler, a linker, a folder: whatever stands in its way
+    except Exception as error:  # of a compiler, a linker, a folder or anything else
         return (
             f"Triton cannot build what launches its kernels ({type(error).__name__}: {error}). It "
             f"needs a C compiler (gcc or clang), the headers of this Python, and a home folder or "
@@ -60,9 +67,9 @@ def _driver_obstacle() -> str | None:
 
 @functools.cache
 def is_interpreted() -> bool:
-    """Whether Triton interprets kernels (TRITON_INTERPRET=1) instead of compiling them.
+    """Return True if Triton interprets kernels (TRITON_INTERPRET=1) instead of compiling them.
 
-    Decided once: a kernel is of one kind or the other from the time it is imported.
+    This is decided once: a kernel is of one kind or the other from the time it is imported.
     """
     import triton
 
@@ -70,12 +77,12 @@ def is_interpreted() -> bool:
 
 
 def has_gpu() -> bool:
-    """Whether kernels can run on a real GPU: what `auto` asks before it takes one."""
+    """Return True if kernels can run on a real GPU; `auto` checks this before it takes one."""
     return torch.cuda.is_available() and _obstacle() is None and not is_interpreted()
 
 
 def gpu_device() -> torch.device:
-    """Where the cuda backend's tensors live: the current GPU, or the CPU where interpreted."""
+    """Return the device of the backend's tensors: the current GPU, or the CPU if interpreted."""
     return _device()
 
 
@@ -86,7 +93,7 @@ def _device() -> torch.device:
 
 
 def upload(array: np.ndarray | Tensor) -> Tensor:
-    """A copy on the GPU, for this frame only; it is on its way when this returns."""
+    """Return a copy on the GPU, for this frame only; the transfer may still be running."""
     tensor = (
         torch.from_numpy(np.ascontiguousarray(array)) if isinstance(array, np.ndarray) else array
     )
@@ -100,19 +107,21 @@ _copies: dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Tensor]] = {}
 
 
 def resident(tensor: Tensor) -> Tensor:
-    """The tensor on the GPU, detached and contiguous; copied once for as long as it lives.
+    """Return the tensor on the GPU, detached and contiguous; it is copied once for as long as it
+    lives.
 
-    A tensor that is there already is not copied, unless it is not contiguous, or begins at no
-    multiple of 16 bytes, as within another tensor: kernels read as many at a time.
+    A tensor that is on the GPU already is copied only if it is not contiguous, or does not begin at
+    a multiple of 16 bytes, as a part of another tensor may: kernels read 16 bytes at a time.
     """
     device = gpu_device()
     if tensor.device == device:
-        own = tensor.detach().contiguous()
-        return own if address_of(own) % 16 == 0 else own.clone()
-    key, version = (id(tensor), str(device)), version_of(tensor)
-    known = _copies.get(key)
-    if known is not None and known[0]() is tensor and known[1] == version:
-        return known[2]
+        gpu_tensor = tensor.detach().contiguous()
+        return gpu_tensor if address_of(gpu_tensor) % 16 == 0 else gpu_tensor.clone()
+    key = (id(tensor), str(device))
+    version = version_of(tensor)
+    entry = _copies.get(key)
+    if entry is not None and entry[0]() is tensor and entry[1] == version:
+        return entry[2]
     copy = tensor.detach().contiguous().to(device)
     if version is not None:
         _copies[key] = (weakref.ref(tensor, lambda _: _copies.pop(key, None)), version, copy)
@@ -120,55 +129,63 @@ def resident(tensor: Tensor) -> Tensor:
 
 
 def version_of(tensor: Tensor) -> int | None:
-    """Another number after every change in place; None where torch does not count these, as of
-    tensors made in its inference mode: what such a tensor held may be kept by nobody.
+    """Return a number that changes with every change in place; None if torch does not count
+    changes.
+
+    torch does not count them for tensors made in its inference mode: their values must not be
+    cached.
     """
     return None if tensor.is_inference() else tensor._version
 
 
 def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
-    """Run a Triton kernel over a grid of programs; nothing where the grid is empty.
+    """Run a Triton kernel over a grid of programs; an empty grid does nothing.
 
-    arguments: in the kernel's order; tensors must lie on the GPU and be contiguous; numbers may be
-    numpy's. constants: its tl.constexpr parameters by name, and num_warps where the usual 4 are not
-    wanted.
+    Args:
+        kernel: the kernel.
+        grid: numbers of programs.
+        arguments: in the kernel's order. Tensors must lie on the GPU and be contiguous; numbers may
+            be numpy's.
+        constants: the kernel's tl.constexpr parameters by name, and num_warps if it is not the
+            usual 4.
     """
     if 0 in grid:
         return
     # Triton refuses integers of numpy where it compiles, but not where it interprets.
-    given = [_argument(argument) for argument in arguments]
-    # Interpreted kernels run in numpy, which warns of infinities that a GPU goes on with.
+    kernel_arguments = [_argument(argument) for argument in arguments]
+    # Interpreted kernels run in numpy, which warns of infinities; a GPU does not.
     with np.errstate(all="ignore"):
-        # Fused multiply-add is Triton's own choice too, until a version that asks to be told.
-        kernel[grid](*given, enable_fp_fusion=True, **constants)
+        # Fused multiply-add is Triton's default today, but a later version may change it.
+        kernel[grid](*kernel_arguments, enable_fp_fusion=True, **constants)
 
 
 def address_of(tensor: Tensor) -> int:
-    """Where a tensor's numbers lie on the GPU, for kernels that take many parts in one launch.
+    """Return the address of a tensor's numbers on the GPU, for kernels that take many parts in one
+    launch.
 
-    Whoever launches them keeps the tensor alive.
+    The caller keeps the tensor alive.
     """
     return _kernel_argument(tensor).data_ptr()
 
 
-def _argument(given: Any) -> Any:
-    if isinstance(given, tuple):
-        return tuple(map(_argument, given))
-    return _kernel_argument(given.item() if isinstance(given, np.generic) else given)
+def _argument(argument: Any) -> Any:
+    if isinstance(argument, tuple):
+        return tuple(map(_argument, argument))
+    return _kernel_argument(argument.item() if isinstance(argument, np.generic) else argument)
 
 
 def _kernel_argument(argument: Any) -> Any:
     return argument
 
 
-# ---- Copies from the GPU that nobody waits for until the numbers are needed ----------------------
+# ---- Copies from the GPU, without waiting until the numbers are needed ---------------------------
 
 
 class Download:
-    """A tensor on its way into the CPU's memory.
+    """A tensor that is being copied into the CPU's memory.
 
-    The copy goes into page-locked memory, past the kernels that are launched after it. Memory of
-    this kind is scarce: it is used again as soon as nobody holds the result any more.
+    The copy goes into page-locked memory, beside the kernels that are launched after it. Memory of
+    this kind is scarce: it is used again as soon as the result is no longer referenced.
     """
 
     def __init__(self, tensor: Tensor) -> None:
@@ -181,13 +198,13 @@ class Download:
         with torch.cuda.stream(stream):
             self._host = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
             self._host.copy_(tensor, non_blocking=True)
-            # Whoever waits sleeps, and leaves the core to the threads that write files.
+            # A waiting thread sleeps, which leaves the core to the threads that write files.
             self._arrived = torch.cuda.Event(blocking=True)
             self._arrived.record(stream)
         tensor.record_stream(stream)  # its memory is not given away before it has been read
 
     def result(self) -> Tensor:
-        """The copy; waits until it is there."""
+        """Wait for the copy and return it."""
         if self._arrived is not None:
             self._arrived.synchronize()
             self._arrived = None
@@ -195,15 +212,16 @@ class Download:
 
 
 def download(images: Mapping[str, Tensor]) -> Callable[[], dict[str, np.ndarray]]:
-    """Starts the images' way into the CPU's memory; what is returned waits for them. A tensor of
-    two names is copied once, one that lies on the CPU not at all.
+    """Start to copy images into the CPU's memory, and return a function that waits for them.
+
+    A tensor with two names is copied once; a tensor on the CPU is not copied.
     """
     unique = {id(image): image.detach() for image in images.values()}
     copies = {k: i if i.device.type == "cpu" else Download(i) for k, i in unique.items()}
 
     def finish() -> dict[str, np.ndarray]:
-        found = {k: (c.result() if isinstance(c, Download) else c) for k, c in copies.items()}
-        return {name: found[id(image)].numpy() for name, image in images.items()}
+        arrays = {k: (c.result() if isinstance(c, Download) else c) for k, c in copies.items()}
+        return {name: arrays[id(image)].numpy() for name, image in images.items()}
 
     return finish
 

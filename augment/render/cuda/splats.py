@@ -1,4 +1,4 @@
-"""What the stages of the GPU rasteriser hand to each other. Tensors lie on the GPU."""
+"""Records that the stages of the GPU rasteriser hand to each other. Tensors lie on the GPU."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
 from augment.scene import Gaussians, PosedGaussians
 
-# ---- What the GPU's projection reads: scene parts by address, and the numbers of a view ----------
+# ---- Inputs of the GPU's projection: scene parts by address, and the numbers of a view -----------
 
-BLOCK = 128  # Gaussians that one program projects, all of one part
+# Gaussians that one program projects, all of one part.
+BLOCK = 128
 
 # A part's row in the table: ADDRESSES (see layout), its Gaussians, the SH functions of each, and
 # how many Gaussians and how many programs the parts before it take.
@@ -33,11 +34,14 @@ COLUMNS = T_BLOCK + 1
 
 @dataclass(frozen=True, eq=False)
 class CudaInputs:
-    """All P parts for one launch: nothing is concatenated, and actors cost no launch of their own.
+    """All P parts for one launch. Nothing is concatenated, and actors cost no launch of their own.
 
-    table: rows as above. views, modes: see layout; modes stay on the CPU. block_parts: the part of
-    every program. count: Gaussians of all parts. tensors: what the addresses point to, kept alive
-    by this.
+    table: rows of COLUMNS numbers, as listed above.
+    views: see layout.
+    block_parts: the part of every program.
+    count: Gaussians of all parts.
+    modes: see layout; they stay on the CPU.
+    tensors: owners of the memory that the addresses point to.
     """
 
     table: Int64[Tensor, "R"]
@@ -61,17 +65,21 @@ def gather_inputs(
     *,
     with_color: bool,
 ) -> CudaInputs:
-    """Addresses and numbers of all parts. Tensors are copied to the GPU the first time only; per
-    frame there is one small upload.
+    """Return addresses and numbers of all parts.
+
+    Tensors are copied to the GPU the first time only; each frame has one small upload.
     """
     device = gpu_device()
     tensors: list[Tensor] = []
     rows: list[list[int]] = []
     for part in parts:
         gaussians = _resident_gaussians(part.gaussians, device)
-        others = [None if tensor is None else _readable(tensor) for tensor in _looks(part)]
-        tensors += gaussians.tensors + [tensor for tensor in others if tensor is not None]
-        addresses = [0 if tensor is None else address_of(tensor) for tensor in others]
+        appearance = [
+            None if tensor is None else _as_kernel_tensor(tensor)
+            for tensor in _appearance_tensors(part)
+        ]
+        tensors += gaussians.tensors + [tensor for tensor in appearance if tensor is not None]
+        addresses = [0 if tensor is None else address_of(tensor) for tensor in appearance]
         rows.append([*gaussians.addresses, *addresses, *part.gaussians.sh.shape[:2], 0, 0])
     table = np.array(rows, np.int64)
     blocks = -(-table[:, T_COUNT] // BLOCK)
@@ -81,13 +89,15 @@ def gather_inputs(
     modes[layout.M_LIGHT] = with_color and any(part.shading is not None for part in parts)
     views = views_of(parts, camera, settings, fog, clip)
     block_parts = np.repeat(np.arange(len(parts), dtype=np.int32), blocks)
-    packed = upload(np.concatenate([*(a.reshape(-1).view(np.int32) for a in (table, views)),
-                                    block_parts]))  # fmt: skip
-    views_at, parts_at = 2 * table.size, 2 * table.size + views.size
+    upload_buffer = upload(
+        np.concatenate([*(a.reshape(-1).view(np.int32) for a in (table, views)), block_parts])
+    )
+    views_start = 2 * table.size
+    parts_start = 2 * table.size + views.size
     return CudaInputs(
-        table=packed[:views_at].view(torch.int64),
-        views=packed[views_at:parts_at].view(torch.float32),
-        block_parts=packed[parts_at:],
+        table=upload_buffer[:views_start].view(torch.int64),
+        views=upload_buffer[views_start:parts_start].view(torch.float32),
+        block_parts=upload_buffer[parts_start:],
         count=int(table[:, T_COUNT].sum()),
         modes=modes,
         tensors=tensors,
@@ -95,8 +105,9 @@ def gather_inputs(
 
 
 class _Resident(NamedTuple):
-    """Gaussians on the GPU, as `layout` lists what a part is read from. versions: of the tensors
-    when that was.
+    """Gaussians on the GPU, as `layout` lists the arrays of a part.
+
+    versions: versions of the tensors when the addresses were taken.
     """
 
     versions: list[int | None]
@@ -104,53 +115,66 @@ class _Resident(NamedTuple):
     addresses: list[int]
 
 
-def _resident_gaussians(g: Gaussians, device: torch.device) -> _Resident:
-    """Known of scenes' parts, which stay the same from frame to frame: asking for every tensor of
-    every part anew would take longer than the GPU takes to project them.
-    """
-    given = (g.means, g.quats, g.scales, g.opacities, g.sh)
-    versions = [version_of(tensor) for tensor in given]
+def _resident_gaussians(gaussians: Gaussians, device: torch.device) -> _Resident:
+    """Return Gaussians on the GPU, cached for the parts of scenes.
 
-    def read() -> _Resident:
-        tensors = [_readable(tensor) for tensor in given]
+    The parts stay the same from frame to frame. Looking up every tensor of every part again would
+    take longer than the GPU takes to project them.
+    """
+    sources = (
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+    )
+    versions = [version_of(tensor) for tensor in sources]
+
+    def copy_to_gpu() -> _Resident:
+        tensors = [_as_kernel_tensor(tensor) for tensor in sources]
         return _Resident(versions, tensors, [address_of(tensor) for tensor in tensors])
 
     if None in versions:
-        return read()
-    memo, key = memo_of(g), ("on the GPU", device)
-    known = memo.get(key, read)
-    if known.versions != versions:
-        known = read()
-        memo.put(key, known)
-    return known
+        return copy_to_gpu()
+    memo = memo_of(gaussians)
+    key = ("on the GPU", device)
+    gpu_gaussians = memo.get(key, copy_to_gpu)
+    if gpu_gaussians.versions != versions:
+        gpu_gaussians = copy_to_gpu()
+        memo.put(key, gpu_gaussians)
+    return gpu_gaussians
 
 
-def _looks(part: PosedGaussians) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """What a part is read from besides its Gaussians, as `layout` lists it."""
+def _appearance_tensors(part: PosedGaussians) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """Return the arrays of a part besides its Gaussians, as `layout` lists them."""
     slopes = None if part.shading is None else part.shading.slopes
     return slopes, part.color_maps, part.map_rows
 
 
-def _readable(tensor: Tensor) -> Tensor:
-    """Float32, or int16 as it is, on the GPU."""
+def _as_kernel_tensor(tensor: Tensor) -> Tensor:
+    """Return the tensor on the GPU: float32, or int16 if it is."""
     if tensor.is_floating_point() and tensor.dtype != torch.float32:
         tensor = tensor.to(torch.float32)
     return resident(tensor)
 
 
-HIDDEN = 0x7F800000  # key of Gaussians that are not drawn: infinity's bits, behind all others
-TILE = 16  # pixels a side
+# Key of Gaussians that are not drawn: the bits of infinity, behind all other keys.
+HIDDEN = 0x7F800000
+# Side of a tile, pixels.
+TILE = 16
 
 
 @dataclass(frozen=True, eq=False)
 class CudaSplats:
-    """All N Gaussians of all parts, by index; rows of those that are not drawn are not written.
+    """All N Gaussians of all parts, by index. Rows of Gaussians that are not drawn are not written.
 
-    records: as augment.render.layout's RECORD. keys: bits of float32 z, HIDDEN where not drawn.
-    rects: first tile of a splat, column + (row << 16), and its last, likewise; not written where it
-    is not drawn. counts: how many tiles that is, 0 where not drawn. cuts: of a clip, as layout's
-    CUT; None without one. lights: augment.render.shading's lines; None
-    where no part is lit pixel by pixel or no colour is asked for.
+    records: RECORD numbers, see layout.
+    keys: bits of float32 z, HIDDEN if not drawn.
+    rects: first tile of a splat, column + (row << 16), and its last tile in the same form.
+    counts: number of these tiles, 0 if not drawn.
+    cuts: CUT numbers, see layout; None without a clip.
+    lights: LINES numbers, see augment.render.shading; None if no part is lit pixel by pixel or no
+        colour is asked for.
     """
 
     records: Float32[Tensor, "N 16"]
@@ -163,11 +187,13 @@ class CudaSplats:
 
 @dataclass(frozen=True, eq=False)
 class CudaTiles:
-    """Which splats each tile blends, nearest first, ties by index.
+    """The splats that each tile blends, nearest first, ties by index.
 
-    tile_splat_ids: rows of CudaSplats, tile after tile. tile_offsets: int32 [tiles + 1]: tile i
-    (row by row) owns tile_splat_ids[tile_offsets[i]:tile_offsets[i + 1]]. Tiles without a wanted
-    pixel own none.
+    tile_splat_ids: rows of CudaSplats, tile after tile.
+    tile_offsets: int32 [tiles + 1]. Tile i (row by row) has
+        tile_splat_ids[tile_offsets[i]:tile_offsets[i + 1]]; tiles that are not drawn have none.
+    columns: number of tile columns.
+    rows: number of tile rows.
     """
 
     tile_splat_ids: Int32[Tensor, "E"]
@@ -179,7 +205,7 @@ class CudaTiles:
 class GpuStageTimer:
     """Times of a frame's stages on the GPU, by events, so that nothing waits until they are read.
 
-    Where kernels are interpreted there is no GPU to time, and all are 0.
+    If kernels are interpreted there is no GPU to time, and all times are 0.
     """
 
     def __init__(self) -> None:
@@ -189,7 +215,7 @@ class GpuStageTimer:
         self._mark()
 
     def end_stage(self, name: str) -> None:
-        """The time since the lap before belongs to `name`."""
+        """Add the time since the last end of a stage to `name`."""
         self._names.append(name)
         self._mark()
 
@@ -200,7 +226,7 @@ class GpuStageTimer:
             self._events.append(event)
 
     def milliseconds(self) -> dict[str, float]:
-        """Waits for the GPU."""
+        """Wait for the GPU and return the milliseconds of every stage."""
         out = dict.fromkeys(self._names, 0.0)
         if self._events:
             self._events[-1].synchronize()
