@@ -48,6 +48,17 @@ def test_names_in_the_map_are_in_the_files_beside_them():
     assert checked > 20
 
 
+def test_names_in_the_steps_are_somewhere_in_the_code():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    steps = text.split("## Add a dataset")[1].split("## Tests")[0]
+    names = set(re.findall(r"`(_?[A-Za-z]\w+)(?:\([^`]*\))?`", steps))
+    folders = ("adapters", "augment", "recipes", "tests", "tools")
+    files = (path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+    code = set(re.findall(r"\w+", "".join(file.read_text() for file in files)))
+    placeholders = {name for name in names if "NAME" in name or name == "YourEffect"}
+    assert len(names) > 30 and names - placeholders - code == set()
+
+
 def anchors(page: Path) -> set[str]:
     """Anchors of a page's headings, as hosting services and editors make them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)

@@ -1,9 +1,7 @@
 """Write a drive of your own as a recording, open it as a scene, and render it in fog.
 
 Run it with: python docs/examples/own_drive.py [OUTPUT_FOLDER]
-
-A recording is a plain folder: images, poses and, if you have them, LiDAR, depth and boxes. All its
-files are in docs/datasets/recording.md. Here the embedded street stands for your sensors.
+docs/datasets/recording.md lists all files of a recording. The embedded street stands for your car.
 """
 
 import json
@@ -38,11 +36,10 @@ def write_recording(root: Path) -> None:
         columns = {key: returns[key] for key in ("x", "y", "z", "timestamp_ns")}
         pq.write_table(pa.table(columns), root / "lidar" / f"{name}.parquet")
         lens = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-        pose = camera.world_from_camera.tolist()  # 4x4; x right, y down, z forward
+        lens["world_from_camera"] = camera.world_from_camera.tolist()  # x right, y down, z forward
         entry = {"frame": frame.index, "timestamp_ns": frame.timestamp_ns}
         entry["world_from_ego"] = frame.world_from_ego.tolist()  # x forward, y left, z up
-        entry["cameras"] = {"front": {**lens, "world_from_camera": pose}}
-        entries.append(entry)
+        entries.append({**entry, "cameras": {"front": lens}})
     (root / "calibration.json").write_text(json.dumps({"frames": entries}))
 
 

@@ -1,7 +1,6 @@
 """Add an effect of your own: colours turn to sepia with distance.
 
 Run it with: python docs/examples/own_effect.py [OUTPUT_FOLDER]
-
 docs/effects.md ("Adding an effect") lists the other hooks: masks, label tables, LiDAR.
 """
 
@@ -10,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import torch
 from pydantic import Field
 
 from adapters.base import open_scene
@@ -41,21 +39,21 @@ class SepiaEffect(Effect):
         return Placed(sepia, (step,), buffers=frozenset({EXPECTED_DEPTH} if sepia else ()))
 
     def edit_image(self, own, drawn, camera):  # once per view
-        rgb, raster = drawn.rgb, drawn.raster  # rgb: display-encoded [H, W, 3]
-        is_sky = raster.alpha < 0.5
-        depth = raster.expected_depth.masked_fill(is_sky, torch.inf)  # metres [H, W]
-        share = torch.exp2(-depth / own.data.half_m)[..., None]
+        is_sky = drawn.raster.alpha < 0.5  # infinitely far
+        depth = drawn.raster.expected_depth.masked_fill(is_sky, float("inf"))  # metres [H, W]
+        t = (-depth / own.data.half_m).exp2()[..., None]
+        rgb = drawn.rgb  # display-encoded [H, W, 3]
         gray = (rgb @ rgb.new_tensor([0.2126, 0.7152, 0.0722]))[..., None]
-        return replace(drawn, rgb=share * rgb + (1 - share) * gray * rgb.new_tensor([1.1, 1, 0.75]))
+        return replace(drawn, rgb=t * rgb + (1 - t) * gray * rgb.new_tensor([1.1, 1, 0.75]))
 
 
 def main(output_dir: Path) -> None:
     """Write own_effect.png."""
+    output_dir.mkdir(parents=True, exist_ok=True)
     add_effect(SepiaEffect())  # before a recipe names it
     recipe = parse_recipe(RECIPE, source="own_effect.py").resolve(0)
     scene = open_scene(STREET)
     view = render_view(scene, scene.frames[0].cameras["front"], recipe)
-    output_dir.mkdir(parents=True, exist_ok=True)
     path = output_dir / "own_effect.png"
     cv2.imwrite(str(path), view.rgb[..., ::-1])
     print(f"picture: {path}")

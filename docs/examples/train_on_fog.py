@@ -1,7 +1,6 @@
 """Render foggy images with labels, and train a small network on them to find the road.
 
 Run it with: python docs/examples/train_on_fog.py [OUTPUT_FOLDER]
-
 The network is a toy. The example shows the path of the data: job, output folder, DataLoader.
 """
 
@@ -9,7 +8,6 @@ import sys
 from pathlib import Path
 
 import cv2
-import numpy as np
 import torch
 from torch import nn
 from torch.utils.data import DataLoader
@@ -52,11 +50,11 @@ def main(output_dir: Path) -> None:
             optimizer.step()
     print(f"{len(data)} images; loss {loss.item():.2f} (0.69 is chance)")
 
-    share = logits[0].detach().sigmoid()  # [H, W]
-    columns = [batch["image"][0], is_road[0].expand(3, -1, -1), share.expand(3, -1, -1)]
-    picture = torch.cat(columns, dim=2).permute(1, 2, 0).numpy()  # [H, 3 W, 3], 0 to 1
+    label = is_road[:1].expand(3, -1, -1)
+    prediction = logits[:1].detach().sigmoid().expand(3, -1, -1)
+    picture = torch.cat([batch["image"][0], label, prediction], dim=2)  # [3, H, 3 W], 0 to 1
     path = output_dir / "train_on_fog.png"
-    cv2.imwrite(str(path), (picture[..., ::-1] * 255).astype(np.uint8))
+    cv2.imwrite(str(path), (picture * 255).byte().permute(1, 2, 0).numpy()[..., ::-1])
     print(f"picture: {path}")
 
 
