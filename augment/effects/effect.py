@@ -1,9 +1,11 @@
-"""What an effect is: one class says all that the rest of the package asks of it.
+"""The effect protocol: one class holds everything that the package asks of an effect.
 
 `augment.effects.EFFECTS` lists the effects in the order in which they are applied. Planning and
-`explain`, rendering, warm-up, jobs, label tables, datasets and LiDAR walk that tuple and know none
-of them by name. The recipe's side (its model, manifest columns and knobs) is a
-`recipes.effect.EffectModel`. docs/effects.md shows how to add one.
+`explain`, rendering, warm-up, jobs, label tables, datasets and LiDAR walk that tuple. They know no
+effect by name. The recipe's side of an effect (its model, manifest columns and knobs) is a
+`recipes.effect.EffectModel`. docs/effects.md shows how to add an effect.
+
+The hooks of `Effect`, by when they are called:
 
     once a recipe and scene    place            facts, with a reason for every pass
     once a scene               prepare, relight, share
@@ -35,234 +37,322 @@ from recipes.effect import EffectModel
 from recipes.fields import found
 from recipes.schema import Recipe
 
-# When a pass runs: as the scene is put together, as it is drawn, on the finished picture.
+# Stages of a view. A pass runs while the scene is put together, while it is drawn, or on the
+# finished picture.
 SCENE, DRAWING, PICTURE = STAGES = ("scene", "drawing", "picture")
 
 
 @dataclass(frozen=True)
 class Step:
-    """One possible pass. why: the reason it runs, or the reason it does not."""
+    """One possible pass of an effect, as `explain` lists it."""
 
     name: str
+    """Name of the pass, which is also its time label."""
+
     runs: bool
+    """True if the pass runs."""
+
     why: str
+    """The reason why the pass runs or does not run."""
+
     stage: str = DRAWING
+    """Stage of the view: SCENE, DRAWING or PICTURE."""
 
 
 def skipped(names: Sequence[str], why: str, stage: str = DRAWING) -> tuple[Step, ...]:
-    """Passes none of which runs."""
+    """Return a `Step` for each of these passes, none of which runs."""
     return tuple(Step(name, False, why, stage) for name in names)
 
 
 @dataclass(frozen=True)
 class Placed:
-    """An effect of a recipe in a scene, in plain facts that can be printed, compared and tested.
-
-    data: what drawing takes; None where the effect changes nothing. steps: every pass considered,
-    also those of an effect that the recipe lacks. buffers: asked of the rasteriser for the
-    effect's own sake. water_level_z_m: of water that it puts into the scene, scene world.
-    """
+    """Plan of one effect in a scene: plain facts that can be printed, compared and tested."""
 
     data: Any
+    """Numbers that the drawing hooks need; None if the effect changes nothing."""
+
     steps: tuple[Step, ...]
+    """All passes that were considered, also for an effect that the recipe does not have."""
+
     buffers: frozenset[str] = frozenset()
+    """Buffers of the rasteriser that the effect itself needs."""
+
     water_level_z_m: float | None = None
+    """Height of the water that the effect puts into the scene: scene world, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class Active:
-    """An effect at work in a scene. earlier: those that are applied before it. seen: what
-    `Effect.in_view` found of it in one view.
-    """
+    """An effect that is at work in a scene. Every hook that draws receives this record."""
 
     effect: Effect
+    """The effect's hooks."""
+
     data: Any
+    """`Placed.data` of the effect; never None."""
+
     scene: Scene
+    """The scene that the effect changes."""
+
     backend: str
+    """Name of the backend that renders the images."""
+
     earlier: tuple[Active, ...] = ()
+    """Effects that are applied before this one."""
+
     seen: Any = None
+    """`InView.seen` of the view at hand, as `Effect.in_view` returned it."""
 
     @cached_property
     def prepared(self) -> Any:
-        """What `Effect.prepare` gives."""
+        """Result of `Effect.prepare`."""
         return self.effect.prepare(self)
 
     @cached_property
     def light(self) -> Scene:
-        """The scene that the effect takes its light from: as earlier effects have left it."""
+        """Scene that the effect takes its light from: the scene as earlier effects relit it."""
         relit = (other.effect.relight(other) for other in reversed(self.earlier))
         return next((scene for scene in relit if scene is not None), self.scene)
 
 
 @dataclass(frozen=True, eq=False)
 class Sharing:
-    """What a job will render. cameras: all that a camera path has, or None for the scene's: never a
-    selection, so that no image depends on what else is rendered. folder: for what lies in files,
-    which later jobs find; None to keep it in memory. backend: that renders the images. progress:
-    bars on stderr.
-    """
+    """Everything that a job will render. `Effect.share` precomputes from it."""
 
     scene: Scene
+    """The scene of all images."""
+
     recipes: Sequence[Recipe]
+    """All recipes of the job."""
+
     cameras: Sequence[Camera] | None = None
+    """All cameras of a camera path; None for the scene's cameras. It is never a selection of them,
+    so that no image depends on what else is rendered.
+    """
+
     folder: Path | None = None
+    """Folder for results in files, which later jobs reuse; None keeps them in memory."""
+
     backend: str = "auto"
+    """Name of the backend that renders the images."""
+
     progress: bool = False
+    """True to show progress bars on stderr."""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What can be seen of a scene in one view. cameras: that look into it, between them. poses:
-    world_from_part of the parts that exist, by instance id, the background's (0) included.
-    """
+    """Query for `Effect.in_view`: one view of a scene."""
 
     camera: Camera
+    """Camera of the image."""
+
     cameras: tuple[Camera, ...]
+    """Cameras that look into the scene for this view; together they cover all that it can show."""
+
     poses: Mapping[int, np.ndarray]
+    """world_from_part [4, 4] of the parts that exist, by instance id; 0 is the background."""
+
     near_m: float
+    """Near plane, metres: nothing closer is drawn."""
 
 
 @dataclass(frozen=True)
 class InView:
-    """What a camera can see of an effect. skipped: reasons by the passes that it saves. owners:
-    instance ids of the parts that must be drawn for it. seen: whatever the other hooks of the view
-    want to know.
-    """
+    """What one view can show of an effect."""
 
     is_seen: bool = True
+    """False if the effect cannot change the image."""
+
     skipped: Mapping[str, str] = field(default_factory=dict)
+    """Reason for each pass that this view does not need, by the pass's name."""
+
     owners: frozenset[int] = frozenset()
+    """Instance ids of the parts that must be drawn for the effect."""
+
     seen: Any = None
+    """Data that the other hooks of the view need; they read it as `Active.seen`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A picture. rgb: display-encoded, not clamped, sky included. raster: buffers of the scene's
-    surfaces. layers: what was drawn, with its fog. masks: bool, by name. skipped: reasons by the
-    passes that drawing found needless.
-    """
+    """A rendered picture, which later effects edit."""
 
     rgb: Float[Tensor, "H W 3"]
+    """Display-encoded colour, not clamped, sky included."""
+
     raster: RenderOutput
+    """Buffers of the scene's surfaces."""
+
     layers: LayerRenderer
+    """The parts, sky and fog that were drawn."""
+
     masks: Mapping[str, Bool[Tensor, "H W"]] = field(default_factory=dict)
+    """Masks of effects, by the mask's name."""
+
     skipped: Mapping[str, str] = field(default_factory=dict)
+    """Reason for each pass that proved needless while drawing, by the pass's name."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrontSurface:
-    """A surface before the scene's, which images of what a ray meets first show in its mask's
-    pixels. semantic: its class. depth_m: z, metres; None where it has none.
+    """A surface of the effect in front of the scene's surfaces.
+
+    Images of the first surface along a ray show it in the pixels of the effect's mask.
     """
 
     semantic: int
+    """Semantic class of the surface."""
+
     depth_m: Float[Tensor, "H W"] | None
+    """z of the surface in the camera, metres; None if it has no depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class EffectView:
-    """What an effect's labels are measured from. placed: by the recipe. depth_m: z of the first
-    solid surface, metres, 0 = none; None where the effect does nothing or no label needs it. mask:
-    255 where the effect is what the pixel shows; None where none of it can be in view.
-    water_level_z_m: of water that is drawn, scene world.
-    """
+    """Inputs that an effect's labels are measured from, for one view."""
 
     placed: Placed
+    """The effect's plan for the recipe."""
+
     depth_m: Float32[np.ndarray, "H W"] | None
+    """z of the first solid surface, metres, 0 = none. None if the effect does nothing or if no
+    label needs it.
+    """
+
     mask: UInt8[np.ndarray, "H W"] | None
+    """255 where the pixel shows the effect; None if the view cannot show it."""
+
     water_level_z_m: float | None
+    """Height of the water that is drawn: scene world, metres."""
 
 
 class Effect:
-    """One effect; hooks that are not overridden leave things as they are.
-
-    name: one word. section: dotted path of its part of a recipe, whose model is `model`. mask: name
-    of its mask image and file. is_see_through: other effects' masks keep the pixels of its own.
-    share_column: of the manifest, for the share of an image's pixels in its mask. table: of what it
-    does to labelled boxes. lies_on_scene: it adds surfaces to the scene, as overlays
-    (PosedGaussians.is_overlay), which output.surface = "scene" leaves out. shares_files: what it
-    shares is large, takes long and lies in files. draws: those of its passes that run the
-    rasteriser. folded: what turns off a pass that runs inside the
-    rasteriser, by its name: dotted path of a field, and its value.
-    """
+    """One effect. A hook that is not overridden leaves things as they are."""
 
     name: ClassVar[str]
+    """Name of the effect, one word."""
+
     section: ClassVar[str]
+    """Dotted path of the effect's section in a recipe."""
+
     model: ClassVar[type[EffectModel]]
+    """Recipe model of that section."""
+
     mask: ClassVar[str | None] = None
+    """Name of the effect's mask image and file; None if it has no mask."""
+
     is_see_through: ClassVar[bool] = False
+    """If True, the masks of other effects keep the pixels of this effect's mask."""
+
     share_column: ClassVar[str | None] = None
+    """Manifest column with the share of an image's pixels that lie in the mask."""
+
     table: ClassVar[BoxTable | None] = None
+    """Label table: how the effect changes the labelled boxes."""
+
     lies_on_scene: ClassVar[bool] = False
+    """If True, the effect adds surfaces to the scene as overlays (PosedGaussians.is_overlay).
+    `output.surface = "scene"` leaves them out.
+    """
+
     shares_files: ClassVar[bool] = False
+    """If True, `share` takes long and stores large results in files."""
+
     draws: ClassVar[tuple[str, ...]] = ()
+    """Names of those passes that run the rasteriser."""
+
     folded: ClassVar[Mapping[str, tuple[str, Any]]] = {}
+    """Passes that run inside the rasteriser: by name, the dotted path of a recipe field and the
+    value of it that turns the pass off.
+    """
 
     def of(self, recipe: Recipe) -> Any:
-        """Its section of the recipe, or None."""
+        """Return the effect's section of a recipe, or None."""
         return found(recipe, self.section)
 
     # ---- Once a recipe and scene, once a scene ---------------------------------------------------
 
     def reads_splats(self, recipe: Recipe) -> bool:
-        """Whether it works with the background's numbers: a large scene is read whole for it."""
+        """Return True if the effect reads the background's Gaussians.
+
+        A large scene is then read completely, instead of only what the views show.
+        """
         return self.of(recipe) is not None
 
     def kernels(self, section: Any) -> Hashable:
-        """What of its section chooses the kernels that are compiled; None where nothing does."""
+        """Return the settings of a section that choose compiled kernels; None if none does.
+
+        Warm-up compiles once for each distinct value.
+        """
         return None
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
-        """The effect in the scene's heights and scale. later: effects that are applied after it.
+        """Return the plan of the effect, in the scene's heights and scale.
+
+        Args:
+            recipe: the recipe, also one without this effect.
+            scene: the scene to change.
+            later: plans of the effects that are applied after this one, by name.
 
         Raises:
-            SceneError: the scene does not know a fact that the effect needs.
+            SceneError: the scene lacks a fact that the effect needs.
         """
         raise NotImplementedError
 
     def prepare(self, own: Active) -> Any:
-        """What all views share; kept in `augment.memo.memo_of(own.scene)`."""
+        """Return data that all views share; it is kept in the scene's memo (`memo_of`)."""
         return None
 
     def relight(self, own: Active) -> Scene | None:
-        """A scene with the light that later effects find, or None where it is as before."""
+        """Return the scene in the light that later effects should use; None if unchanged."""
         return None
 
     def share(self, job: Sharing) -> None:
-        """Prepare what a job's processes would otherwise each work out, and `put` it into the
-        scene's memo as shared.
+        """Precompute data that each process of a job would otherwise compute for itself.
+
+        The results are `put` into the scene's memo as shared.
         """
 
     # ---- Once a view -----------------------------------------------------------------------------
 
     def cameras(self, own: Active, camera: Camera) -> tuple[Camera, ...] | None:
-        """Those that look into the scene for this view; None where it is the camera alone."""
+        """Return the cameras that look into the scene for this view; None for `camera` alone."""
         return None
 
     def in_view(self, own: Active, sight: Sight) -> InView:
-        """What of the effect the view can show, at little cost; no bit of a picture may change."""
+        """Return what the view can show of the effect, at little cost.
+
+        The answer saves work only: it must not change a single bit of any picture.
+        """
         return InView()
 
     def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
-        """The scene of this view (parts, sky, fog) with the effect in it."""
+        """Return this view's scene (parts, sky, fog) with the effect in it."""
         return layers
 
     def draw(
         self, own: Active, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
     ) -> Drawn | None:
-        """The picture, of an effect that draws the scene in layers of its own."""
+        """Return the picture, if the effect draws the scene in its own layers; else None."""
         return None
 
     def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
-        """The finished picture with the effect on it."""
+        """Return the finished picture with the effect on it."""
         return drawn
 
     def mask_of(self, own: Active, drawn: Drawn) -> Bool[Tensor, "H W"] | None:
-        """Where the effect is what a pixel shows; pixels of later effects' masks are taken out."""
+        """Return the pixels that show the effect.
+
+        The caller removes the pixels that belong to masks of later effects.
+        """
         return drawn.masks.get(self.mask or "")
 
     def front_surface(self, own: Active, camera: Camera) -> FrontSurface | None:
-        """What a ray meets first in the pixels of its mask, if that is no surface of the scene."""
+        """Return the effect's surface in the pixels of its mask.
+
+        None if the first surface along those rays is one of the scene.
+        """
         return None
 
     # ---- Labels, in the writing threads ----------------------------------------------------------
@@ -270,19 +360,29 @@ class Effect:
     def measure(
         self, placed: PlacedBoxes, camera: Camera, view: EffectView
     ) -> dict[str, np.ndarray]:
-        """The stored columns of `table`, [B] each. placed: labelled boxes in the scene's world."""
+        """Return the stored columns of `table`, [B] each.
+
+        Args:
+            placed: the labelled boxes, in the scene's world.
+            camera: camera of the image.
+            view: the effect in this view.
+        """
         raise NotImplementedError
 
     def grow_boxes(self, placed: PlacedBoxes, view: EffectView) -> PlacedBoxes:
-        """The boxes with what the effect lays on them, which counts as theirs."""
+        """Return the boxes grown by what the effect lays on them, which counts as their own."""
         return placed
 
     # ---- LiDAR -----------------------------------------------------------------------------------
 
     def meet(self, own: Active, echoes: Any, frame_ns: int) -> None:
-        """Surfaces of the effect that beams end on, or are bent by. echoes: changes in place
-        (augment.effects.lidar.beam.Echoes).
+        """Apply surfaces of the effect that stop or bend beams.
+
+        echoes: `augment.effects.lidar.beam.Echoes`, changed in place.
         """
 
     def attenuate(self, own: Active, echoes: Any, rng: np.random.Generator) -> None:
-        """What the effect in the air takes from echoes, and adds; after all surfaces."""
+        """Weaken echoes by the effect's particles in the air and add the particles' own echoes.
+
+        It runs after `meet` of all effects.
+        """

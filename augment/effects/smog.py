@@ -1,6 +1,7 @@
-"""Smog, haze and fog: the fog of a recipe in a scene, and what it does to boxes and LiDAR.
+"""Smog, haze and fog: the effect, the transmittance of labelled boxes, and LiDAR in fog.
 
-The physics of light is augment.render.fog.
+`SmogEffect` turns a recipe's `weather.smog` into a `Fog` in the scene's heights. The physics of
+light in fog is augment.render.fog.
 """
 
 from __future__ import annotations
@@ -54,34 +55,47 @@ from recipes.smog import KOSCHMIEDER
 
 # ---- The effect ----------------------------------------------------------------------------------
 
-PER_GAUSSIAN, ON_BUFFERS = "smog per Gaussian", "smog on buffers"
-ELEVATION, SKY, SCATTER = "airlight by elevation", "sky", "forward scatter"
+# Names of the passes.
+PER_GAUSSIAN = "smog per Gaussian"
+ON_BUFFERS = "smog on buffers"
+ELEVATION = "airlight by elevation"
+SKY = "sky"
+SCATTER = "forward scatter"
 SHADOWS = "shadows in smog"
-DAMPING = 1e-4  # of the squared gains of a camera's colour map, where that is inverted
+
+DAMPING = 1e-4  # added to the squared gains of a camera's colour map when it is inverted
 
 
 @dataclass(frozen=True)
 class PlacedSmog:
-    """fog: in the scene's heights. on_buffers: applied to finished layers, not to every splat.
-    is_common: whether the mean of the cameras' exposures gives its colour in all of them.
-    scatter: strength of the forward scatter. sun: of its light, what arrives at the ground; 1 where
-    shadows stay as they are.
-    """
+    """Numbers of the smog in a scene, `Placed.data` of `SmogEffect`."""
 
     fog: Fog
+    """The fog in the scene's heights."""
+
     on_buffers: bool
+    """If True, the fog is applied to finished layers instead of to every Gaussian."""
+
     is_common: bool = False
+    """If True, the mean of the cameras' exposures gives the fog's colour in all of them."""
+
     scatter: float = 0.0
+    """Strength of the forward scatter."""
+
     sun: float = 1.0
+    """Share of the sun's light that arrives at the ground; 1 leaves shadows as they are."""
 
 
 class SmogEffect(Effect):
     """Smog, haze and fog, in front of the scene and its sky."""
 
-    name, section, model = "smog", "weather.smog", Smog
+    name = "smog"
+    section = "weather.smog"
+    model = Smog
     folded: ClassVar = {PER_GAUSSIAN: ("weather.smog", None)}
-    # transmittance: 0 to 1, of the smog between camera and box; NaN of a box whose numbers are not
-    # finite. pixels: those it is the mean of; it is an estimate of none, or where NOT_COUNTED.
+    # transmittance: 0 to 1, of the smog between camera and box; NaN for a box whose numbers are
+    # not finite. pixels: number of pixels that the transmittance is the mean of. With 0 pixels or
+    # NOT_COUNTED, the transmittance is an estimate.
     table = BoxTable(
         name="box_smog",
         file="labels/smog.parquet",
@@ -107,17 +121,17 @@ class SmogEffect(Effect):
             reason += "; one airlight for all cameras, by the mean of their exposures"
         on_photo = recipe.render.base == RECORDED
         on_buffers = on_photo or smog.model == "deferred"
-        other = "weather.smog.model chooses the other way"
+        other_reason = "weather.smog.model chooses the other way"
         if on_photo:
-            other = "render.base is 'recorded': the photo's pixels are faded by their depth"
+            other_reason = "render.base is 'recorded': the photo's pixels are faded by their depth"
         sky = Step(SKY, True, "sampled, then faded through the smog up to infinity")
         if fog.scale_height_m is None:
             sky = Step(SKY, False, "uniform smog hides it: the airlight colour stands for it")
-        sun, fading = _sun_in(fog, smog, scene)
+        sun, shadow_reason = _sun_in(fog, smog, scene)
         steps = (
-            Step(SHADOWS, sun < 1, fading, SCENE),
-            Step(PER_GAUSSIAN, not on_buffers, other if on_buffers else reason),
-            Step(ON_BUFFERS, on_buffers, reason if on_buffers else other),
+            Step(SHADOWS, sun < 1, shadow_reason, SCENE),
+            Step(PER_GAUSSIAN, not on_buffers, other_reason if on_buffers else reason),
+            Step(ON_BUFFERS, on_buffers, reason if on_buffers else other_reason),
             Step(ELEVATION, fog.overcast > 0, f"weather.smog.overcast is {fog.overcast:g}"),
             sky,
             Step(SCATTER, smog.scatter > 0, f"weather.smog.scatter is {smog.scatter:g}", PICTURE),
@@ -142,7 +156,8 @@ class SmogEffect(Effect):
                 parts = [p if p.instance_id or p.is_overlay else faded.on(p) for p in layers.parts]
                 photo = layers.photo and replace(layers.photo, faded=faded)
                 layers = replace(layers, parts=tuple(parts), photo=photo)
-        fog, common = own.data.fog, own.scene.common_color_map
+        fog = own.data.fog
+        common = own.scene.common_color_map
         if own.data.is_common and common is not None:
             fog = before_map(fog, own.scene.color_map(camera), common)
         return replace(layers, fog=fog, fog_on_buffers=own.data.on_buffers)
@@ -150,12 +165,14 @@ class SmogEffect(Effect):
     def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
         if own.data.scatter == 0:
             return drawn
-        alpha, depth = drawn.raster.alpha, drawn.raster.median_depth
+        alpha = drawn.raster.alpha
+        depth = drawn.raster.median_depth
         assert alpha is not None and depth is not None
-        fog, strength = own.data.fog, own.data.scatter
+        fog = own.data.fog
+        scatter = own.data.scatter
         with timed(SCATTER):
             rgb = scatter_forward(
-                drawn.rgb, alpha, depth, camera, fog, strength, backend=own.backend
+                drawn.rgb, alpha, depth, camera, fog, scatter, backend=own.backend
             )
         return replace(drawn, rgb=rgb)
 
@@ -164,15 +181,15 @@ class SmogEffect(Effect):
     ) -> dict[str, np.ndarray]:
         data = view.placed.data
         fog = None if data is None else data.fog
-        found = box_transmittance(placed, camera, fog, view.depth_m, view.water_level_z_m)
-        return {"transmittance": found.transmittance, "pixels": found.pixels}
+        estimate = box_transmittance(placed, camera, fog, view.depth_m, view.water_level_z_m)
+        return {"transmittance": estimate.transmittance, "pixels": estimate.pixels}
 
     def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
         fog_echoes(echoes, own.data.fog, rng)
 
 
 def _sun_in(fog: Fog, smog: Smog, scene: Scene) -> tuple[float, str]:
-    """What of the sun's light counts as arriving at the ground, and why."""
+    """Return the share of the sun's light that arrives at the ground, and the reason."""
     if smog.shadow_fade == 0:
         return 1.0, "weather.smog.shadow_fade is 0"
     shadows = shadows_of(scene)
@@ -187,7 +204,7 @@ def _sun_in(fog: Fog, smog: Smog, scene: Scene) -> tuple[float, str]:
 
 
 def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:
-    """The smog in the scene's heights, or None where it would change nothing; and why."""
+    """Return the smog in the scene's heights and the reason; None if it would change nothing."""
     if smog is None:
         return None, "the recipe has no smog"
     if smog.sigma_per_m == 0:
@@ -212,17 +229,24 @@ def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:
 def before_map(
     fog: Fog, color_map: Float[Tensor, "3 4"] | None, common: Float[Tensor, "3 4"]
 ) -> Fog:
-    """The fog that a camera's colour map M gives the airlight that the common map C gives `fog`.
+    """Return the fog whose airlight, after a camera's colour map, looks as in the common exposure.
 
-    Maps are affine, so M(t c + (1 - t) a) = t M(c) + (1 - t) M(a): a = M^-1 C(A) leaves surfaces
-    the exposure of their camera. The inverse is damped, a = A + (M'M + d)^-1 M' (C - M)(A), and
-    no gain of it exceeds 1 / (2 sqrt d) = 50: airlight keeps its own colour where a camera records
-    next to nothing of it, and its bits where M is C. color_map: None for the identity.
+    Let A be the fog's airlight, M the camera's map and C the common map. Maps are affine, so
+    M(t c + (1 - t) a) = t M(c) + (1 - t) M(a). The airlight a = M^-1 C(A) therefore gives fog the
+    common exposure, while surfaces keep the exposure of their camera. The inverse is damped,
+    a = A + (M'M + d)^-1 M' (C - M)(A) with d = DAMPING, so that none of its gains exceeds
+    1 / (2 sqrt d) = 50. The airlight keeps its colour where a camera records almost nothing of it,
+    and keeps its bits where M equals C.
+
+    Args:
+        fog: the fog with airlight A.
+        color_map: M; None for the identity.
+        common: C.
     """
-    own = torch.eye(3, 4, dtype=torch.float64) if color_map is None else color_map.double()
-    left, gains, right = torch.linalg.svd(own[:, :3])
+    camera_map = torch.eye(3, 4, dtype=torch.float64) if color_map is None else color_map.double()
+    left, gains, right = torch.linalg.svd(camera_map[:, :3])
     damped = (gains / (gains**2 + DAMPING))[:, None]
-    change = right.T @ (damped * (left.T @ (common - own)))  # [3, 4]
+    change = right.T @ (damped * (left.T @ (common - camera_map)))  # [3, 4]
     airlight = torch.tensor(fog.rgb, dtype=torch.float64)
     varying = airlight + change[:, :3] @ airlight
     rgb = varying + change[:, 3]
@@ -234,37 +258,45 @@ def before_map(
 
 @dataclass(frozen=True, eq=False)
 class BoxTransmittance:
-    """transmittance: 0 to 1, NaN of boxes whose numbers are not finite. pixels: those that it is
-    the mean of; where there are none, or they are NOT_COUNTED, it is an estimate.
-    """
+    """Transmittance of the smog between the camera and each of B boxes."""
 
     transmittance: Float64[np.ndarray, " B"]
+    """0 to 1; NaN for boxes whose numbers are not finite."""
+
     pixels: Int64[np.ndarray, " B"]
+    """Number of pixels that the transmittance is the mean of. With 0 or NOT_COUNTED, the
+    transmittance is an estimate.
+    """
 
 
 def box_transmittance(
     placed: PlacedBoxes,
     camera: Camera,
-    medium: Fog | None,
+    fog: Fog | None,
     surface_depth_m: Float32[np.ndarray, "H W"] | None,
     water_level_z_m: float | None = None,
 ) -> BoxTransmittance:
-    """exp(-tau) between the eye and each box, by the smog that the image shows.
+    """Return exp(-tau) of the smog between the camera's eye and each box.
 
-    surface_depth_m: z of what the pixels show, 0 = none; it decides which of them show a box, and
-    how far it is there. A box that none shows, or any where depth is not known, has the mean over
-    its corners and its centre. water_level_z_m: scene world; an eye in the water looks at what
-    else is in it through no smog, as `flood_view` draws it.
+    Args:
+        placed: the boxes, in the scene's world.
+        camera: camera of the image.
+        fog: the smog; None for none.
+        surface_depth_m: z of the surfaces that the pixels show, metres, 0 = none. It decides which
+            pixels show a box and how far away the box is there. If it is None, or if no pixel
+            shows the box, the result is the mean over the box's corners and its centre.
+        water_level_z_m: height of the water, scene world. An eye under water sees other things
+            under water through no smog, as `flood_view` draws them.
     """
     pixels = np.full(len(placed), NOT_COUNTED)
     transmittance = np.ones(len(placed))
-    if medium is None:
+    if fog is None:
         return BoxTransmittance(np.where(placed.is_usable, transmittance, np.nan), pixels)
     eye_m = camera.centre.numpy()
     is_dry = water_level_z_m is None or eye_m[2] > water_level_z_m
 
     def transmittance_to(distance_m: np.ndarray, point_z_m: np.ndarray) -> np.ndarray:
-        t = np.exp(-optical_depth_of_arrays(medium, distance_m, eye_m[2], point_z_m))
+        t = np.exp(-optical_depth_of_arrays(fog, distance_m, eye_m[2], point_z_m))
         return t if is_dry else np.where(point_z_m <= water_level_z_m, 1.0, t)
 
     points = np.concatenate([placed.corners_m, placed.centres_m[:, None]], axis=1)  # [B, 9, 3]
@@ -285,37 +317,40 @@ def box_transmittance(
 
 
 # ---- On a LiDAR sweep ----------------------------------------------------------------------------
-# Hahner et al. 2021, "Fog Simulation on Real LiDAR Point Clouds in Adverse Weather", ICCV. The echo
-# of a pulse P(t) = P0 sin^2(pi t / (2 tau)), 0 <= t <= 2 tau, of half-power width tau:
+# Hahner et al. 2021, "Fog Simulation on Real LiDAR Point Clouds in Adverse Weather", ICCV. A pulse
+# P(t) = P0 sin^2(pi t / (2 tau)), 0 <= t <= 2 tau, of half-power width tau has two echoes:
 #
 #     hard, from a surface at R0   (rho / pi) exp(-2 T(R0)) / R0^2
-#     soft, of droplets, at R      beta int_0^{2w} sin^2(pi x / (2w)) exp(-2 alpha r) xi(r) / r^2 dx
+#     soft, from droplets at R     beta int_0^{2w} sin^2(pi x / (2w)) exp(-2 alpha r) xi(r) / r^2 dx
 #                                  r = R - x, w = c tau / 2
 #
 # T is the optical depth, alpha the extinction, beta = 0.046 / MOR the backscatter, MOR = ln(20) /
 # alpha the meteorological optical range; xi rises from 0 at overlap_from_m to 1 at overlap_full_m.
 # Ranges count from the pulse's middle, so that a surface at R0 is reported at R0 and not at R0 + w.
-# The smog is that of the images, thinned to the LiDAR's wavelength (`wavelength_factor`).
+# The smog is the smog of the images, thinned to the LiDAR's wavelength (`wavelength_factor`).
 
-VISIBLE_UM = 0.55
+VISIBLE_UM = 0.55  # wavelength of visible light, micrometres
 BACKSCATTER_MOR = 0.046  # beta x MOR, 1/sr
-MOR_OPTICAL_DEPTH = math.log(20)
-# Fog is clumpy: the backscatter of what a pulse fills varies about its mean as a gamma variate of
-# this shape, by half of it.
+MOR_OPTICAL_DEPTH = math.log(20)  # optical depth of one meteorological optical range
+# Fog is clumpy: the backscatter of the volume that a pulse fills is a gamma variate of this shape
+# about its mean; its standard deviation is half of the mean.
 CLUMPS = 4.0
-_STEP_M, _FAR_M = 0.02, 15.0  # of the soft echo, tabulated
-_PULSE_STEPS = 150
-_DENSITY_STEP = 0.02  # of log alpha, within which the soft echo is one
+_STEP_M = 0.02  # step of the ranges at which the soft echo is tabulated, metres
+_FAR_M = 15.0  # largest tabulated range, metres
+_PULSE_STEPS = 150  # steps of the integral over the pulse
+_DENSITY_STEP = 0.02  # step of log alpha; densities within one step share a tabulated soft echo
 
-# q(V) of Kim, McArthur and Korevaar (2001), V in km: sigma ~ wavelength^-q. Least V, slope, offset.
+# Kim, McArthur and Korevaar (2001): sigma ~ wavelength^-q, q = slope V + offset, V the visibility
+# in km. Rows: smallest V, slope, offset.
 _KIM = ((50.0, 0.0, 1.6), (6.0, 0.0, 1.3), (1.0, 0.16, 0.34), (0.5, 1.0, -0.5), (0.0, 0.0, 0.0))
 
 
 def wavelength_factor(extinction_per_m: float, wavelength_um: float = 0.905) -> float:
-    """Extinction at the LiDAR's wavelength over that of visible light (0.55 um).
+    """Return the extinction at the LiDAR's wavelength over the extinction of visible light.
 
-    (wavelength / 0.55 um)^-q with q by the visibility, see _KIM; measurements scatter by some 20 %.
-    At 905 nm: 1 in fog, whose droplets are larger than either wavelength, 0.78 at 1 km, 0.52 at 6.
+    It is (wavelength / 0.55 um)^-q, where q follows from the visibility by _KIM. Measurements
+    scatter about it by some 20 %. At 905 nm it is 1 in fog, whose droplets are larger than either
+    wavelength, 0.78 at a visibility of 1 km, and 0.52 at 6 km.
     """
     if extinction_per_m <= 0:
         return 1.0
@@ -324,45 +359,44 @@ def wavelength_factor(extinction_per_m: float, wavelength_um: float = 0.905) -> 
     return (wavelength_um / VISIBLE_UM) ** -(slope * visibility_km + offset)
 
 
-def extinction_at(medium: Fog, z_m: np.ndarray) -> np.ndarray:
-    """alpha [N] at heights, 1/metre."""
-    if medium.scale_height_m is None:
-        return np.full(len(z_m), medium.sigma_per_m)
-    height = (z_m - medium.base_z_m) / medium.scale_height_m
-    return medium.sigma_per_m * np.exp(np.minimum(-height, MAX_EXPONENT))
+def extinction_at(fog: Fog, z_m: np.ndarray) -> np.ndarray:
+    """Return alpha [N] at heights z_m [N] (scene world), 1/metre."""
+    if fog.scale_height_m is None:
+        return np.full(len(z_m), fog.sigma_per_m)
+    height = (z_m - fog.base_z_m) / fog.scale_height_m
+    return fog.sigma_per_m * np.exp(np.minimum(-height, MAX_EXPONENT))
 
 
 class SoftEcho(NamedTuple):
-    """What droplets give back, by reported range. ranges_m [K]: rising. signal [K]: as `signal`.
-    strongest [K]: the greatest up to each range. share [K]: of the whole echo, up to each range.
-    """
+    """Echo of the droplets, tabulated by reported range."""
 
-    ranges_m: np.ndarray
-    signal: np.ndarray
-    strongest: np.ndarray
-    share: np.ndarray
+    ranges_m: np.ndarray  # [K] reported ranges, rising, metres
+    signal: np.ndarray  # [K] strength, in the unit of `augment.effects.lidar.beam.signal`
+    strongest: np.ndarray  # [K] the greatest strength up to each range
+    share: np.ndarray  # [K] share of the whole echo that comes from up to each range
 
 
 def soft_response(alpha_per_m: float, echoes_m: np.ndarray, model: LidarModel) -> np.ndarray:
-    """The soft integral, without near_gain, at reported ranges [K]; midpoint rule over the pulse.
+    """Return the soft integral, without near_gain, at reported ranges [K].
 
-    An echo at R is reported at R - w. Droplets nearer than overlap_from_m are not seen.
+    The midpoint rule integrates over the pulse. An echo at R is reported at R - w. Droplets nearer
+    than overlap_from_m give no echo.
     """
     w = model.pulse_m
     x = (np.arange(_PULSE_STEPS) + 0.5) * (2 * w / _PULSE_STEPS)
     r = echoes_m[:, None] + w - x
-    seen = np.clip(
+    overlap = np.clip(
         (r - model.overlap_from_m) / (model.overlap_full_m - model.overlap_from_m), 0.0, 1.0
     )
     r = np.maximum(r, model.overlap_from_m)
-    echo = np.sin(math.pi * x / (2 * w)) ** 2 * np.exp(-2 * alpha_per_m * r) * seen / r**2
+    echo = np.sin(math.pi * x / (2 * w)) ** 2 * np.exp(-2 * alpha_per_m * r) * overlap / r**2
     beta = BACKSCATTER_MOR * alpha_per_m / MOR_OPTICAL_DEPTH
     return beta * echo.sum(1) * (2 * w / _PULSE_STEPS)
 
 
 @functools.lru_cache(maxsize=256)
 def soft_echo(alpha_per_m: float, model: LidarModel) -> SoftEcho:
-    """The soft echo tabulated; what comes from beyond _FAR_M is too weak to count."""
+    """Return the tabulated soft echo; echoes from beyond _FAR_M are too weak to count."""
     ranges = np.arange(model.overlap_from_m, _FAR_M, _STEP_M)
     response = model.near_gain * soft_response(alpha_per_m, ranges, model)
     total = np.cumsum(response)
@@ -371,31 +405,25 @@ def soft_echo(alpha_per_m: float, model: LidarModel) -> SoftEcho:
 
 
 class Scatter(NamedTuple):
-    """The strongest echo of the droplets before each return. signal [N]: as `signal` gives it, 0
-    where none can be. ranges_m [N]: where it is reported.
-    """
+    """The strongest echo of the droplets in front of each of N surfaces."""
 
-    signal: np.ndarray
-    ranges_m: np.ndarray
+    signal: np.ndarray  # [N] strength, in the unit of `beam.signal`; 0 where there is no echo
+    ranges_m: np.ndarray  # [N] reported range, metres
 
 
 def scatter_before(
-    medium: Fog,
-    eyes_z_m: np.ndarray,
-    ends_m: np.ndarray,
-    model: LidarModel,
-    rng: np.random.Generator,
+    fog: Fog, eyes_z_m: np.ndarray, ends_m: np.ndarray, model: LidarModel, rng: np.random.Generator
 ) -> Scatter:
-    """What comes back from the smog before surfaces at ends_m [N].
+    """Draw the echoes of the smog in front of surfaces at ranges ends_m [N].
 
-    Its strength varies with the clumps that a beam meets (CLUMPS); the range of the strongest is
-    drawn from the echo's shape. N numbers of each are drawn whatever the density, so that denser
-    smog differs by nothing else.
+    The strength varies with the clumps that a beam meets (CLUMPS). The range of the strongest echo
+    is drawn from the echo's shape. N numbers of each kind are drawn at any density, so that
+    only the density differs between two smogs.
     """
     count = len(ends_m)
     clump = rng.standard_gamma(CLUMPS, count) / CLUMPS
-    where = rng.random(count)
-    alpha = extinction_at(medium, eyes_z_m)
+    quantile = rng.random(count)
+    alpha = extinction_at(fog, eyes_z_m)
     out = Scatter(np.zeros(count), np.zeros(count))
     usable = (alpha > 0) & (ends_m > model.overlap_from_m) & np.isfinite(alpha)
     group = np.rint(np.log(np.where(usable, alpha, 1.0)) / _DENSITY_STEP).astype(np.int64)
@@ -404,32 +432,36 @@ def scatter_before(
         rows = np.flatnonzero(usable & (group == number)) if high > low else np.flatnonzero(usable)
         if not len(rows):
             continue
-        is_uniform = medium.scale_height_m is None
-        mean = medium.sigma_per_m if is_uniform else math.exp(number * _DENSITY_STEP)
+        is_uniform = fog.scale_height_m is None
+        mean = fog.sigma_per_m if is_uniform else math.exp(number * _DENSITY_STEP)
         echo = soft_echo(float(mean), model)
         last = ((ends_m[rows] - echo.ranges_m[0]) / _STEP_M).astype(np.int64)
         last = np.clip(last, 0, len(echo.ranges_m) - 1)
         out.signal[rows] = echo.strongest[last] * clump[rows]
-        at = np.interp(where[rows] * echo.share[last], echo.share, echo.ranges_m)
-        out.ranges_m[rows] = np.minimum(at, ends_m[rows])
+        echo_range = np.interp(quantile[rows] * echo.share[last], echo.share, echo.ranges_m)
+        out.ranges_m[rows] = np.minimum(echo_range, ends_m[rows])
     return out
 
 
-def fog_echoes(echoes: Echoes, medium: Fog, rng: np.random.Generator) -> None:
-    """Echoes seen through the fog, or lost to its own. medium: of visible light."""
+def fog_echoes(echoes: Echoes, fog: Fog, rng: np.random.Generator) -> None:
+    """Weaken echoes by the fog, and replace those that the fog's own echo exceeds.
+
+    fog: the fog with its extinction of visible light.
+    """
     model = echoes.model
-    factor = wavelength_factor(medium.sigma_per_m, model.wavelength_um)
-    medium = dataclasses.replace(medium, sigma_per_m=factor * medium.sigma_per_m)
-    eyes_z, air = echoes.origins[:, 2], echoes.air_m
+    factor = wavelength_factor(fog.sigma_per_m, model.wavelength_um)
+    fog = dataclasses.replace(fog, sigma_per_m=factor * fog.sigma_per_m)
+    eyes_z = echoes.origins[:, 2]
+    air = echoes.air_m
     ends_z = eyes_z + air * echoes.directions[:, 2]
-    tau = optical_depth_of_arrays(medium, air, eyes_z, ends_z, series_below=1e-4)
+    tau = optical_depth_of_arrays(fog, air, eyes_z, ends_z, series_below=1e-4)
     echoes.gain *= np.exp(-2 * tau)
-    scatter = scatter_before(medium, eyes_z, air, model, rng)
-    echoes.haze_per_m += extinction_at(medium, eyes_z)
+    scatter = scatter_before(fog, eyes_z, air, model, rng)
+    echoes.haze_per_m += extinction_at(fog, eyes_z)
     echo = signal(echoes.reflectance * echoes.gain, np.maximum(echoes.ranges_m, 1e-3))
     wins = (scatter.signal > echo) & (echoes.ranges_m > 0) & (echoes.codes != LOST)
     rows = np.flatnonzero(wins)
     ranges = scatter.ranges_m[rows]
-    # As reflectance of a surface whose echo from that range is as strong.
+    # Reflectance of a surface whose echo from that range is as strong.
     white = signal(np.ones(len(rows)), np.maximum(ranges, 1e-3))
     echoes.replace(rows, ranges, scatter.signal[rows] / white, SCATTERED)

@@ -444,7 +444,7 @@ def test_a_shallow_bed_by_hand() -> None:
     """Straight down through 2 cm: 1 - F = 0.98, exp(-2 7.5 0.02), and 2 cm of water as 2.7."""
     water_echo = meet_water(medium(), *beams(np.array([[0.0, 0.0, 0.0]])), np.array([0.3]))
     transmitted = 1 - ((1.333 - 1) / (1.333 + 1)) ** 2
-    assert water_echo.kept[0] == pytest.approx(
+    assert water_echo.bed_gain[0] == pytest.approx(
         transmitted**2 * math.exp(-0.04 * ABSORPTION_905_PER_M)
     )
     assert water_echo.range_m[0] == pytest.approx(1.78 + 1.333 * 0.02)

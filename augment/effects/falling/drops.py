@@ -1,4 +1,4 @@
-"""Drops and flakes: how many of which size fall how fast, and where each of them is at a time.
+"""Drops and flakes: their sizes, numbers and fall speeds, and their positions at a time.
 
 Sizes follow exponential laws N(D) = N0 exp(-Lambda D), D in mm of water, per m^3 and mm:
 
@@ -7,14 +7,14 @@ Sizes follow exponential laws N(D) = N0 exp(-Lambda D), D in mm of water, per m^
     snow  Lambda = 2.29 R^-0.45    Sekhon and Srivastava 1970, "Snow size spectra and radar
                                    reflectivity"; D of the melted flake
 
-R: mm of water an hour. Fall speeds: Atlas, Srivastava and Sekhon 1973, v = 9.65 - 10.3 exp(-0.6 D)
-m/s for rain; v = 0.8 d^0.16 m/s for flakes of d mm (Locatelli and Hobbs 1974, aggregates). N0 is
-such that what falls is R.
+R is the rate in mm of water an hour. Fall speeds: v = 9.65 - 10.3 exp(-0.6 D) m/s for rain (Atlas,
+Srivastava and Sekhon 1973); v = 0.8 d^0.16 m/s for flakes of d mm (Locatelli and Hobbs 1974,
+aggregates). N0 is chosen so that the rate is R.
 
-Of each class of sizes there is a lattice of cells with one drop a cell in the mean, which moves as
-one with that class's fall speed and the wind. Drops stand still in it but for the sway of flakes,
-so that where one is at a time is a function of the seed, the class, the cell and the time, and of
-nothing else. A hash of the cell says how many drops it has (Poisson), where in it, and how large.
+Each class of sizes has a lattice of cells with one drop a cell in the mean. The lattice moves as a
+whole, with the fall speed of the class and the wind. Drops do not move within it, except for the
+sway of flakes. So the position of a drop depends only on the seed, the class, the cell and the
+time. A hash of the cell gives the number of its drops (Poisson), their positions and their sizes.
 """
 
 from __future__ import annotations
@@ -30,41 +30,48 @@ from scipy.stats import poisson
 
 Kind = Literal["rain", "snow"]
 
-# What a drop takes from the light over its cross-section: as much again as it blocks is diffracted
-# (van de Hulst 1957, "Light Scattering by Small Particles", ch. 8).
+# Extinction cross-section of a drop over its geometric cross-section: a drop diffracts as much
+# light again as it blocks (van de Hulst 1957, "Light Scattering by Small Particles", ch. 8).
 EXTINCTION_EFFICIENCY = 2.0
-NUM_CLASSES = 8
-NUM_QUANTILES = 17
-MAX_IN_CELL = 5  # one cell in 1700 would have more
-_SMALLEST_MM, _LARGEST_MM = 0.1, {"rain": 6.0, "snow": 7.0}  # of water
-_SNOW_DENSITY = 0.1  # of a flake, over water
-_LEAST_RATE = 1e-3  # mm/h, below which sizes stay: the laws were measured far above
-_STEPS = 400  # of the integral over a class
+NUM_CLASSES = 8  # classes of sizes
+NUM_QUANTILES = 17  # tabulated quantiles of the diameters in a class
+MAX_IN_CELL = 5  # most drops in a cell; one cell in 1700 would have more
+_MIN_DIAMETER_MM = 0.1  # smallest diameter, of water
+_MAX_DIAMETER_MM = {"rain": 6.0, "snow": 7.0}  # largest diameter, of water
+_SNOW_DENSITY = 0.1  # density of a flake over that of water
+# Rate below which sizes stay the same, mm/h: the laws were measured at much higher rates.
+_MIN_RATE_MM_H = 1e-3
+_NUM_STEPS = 400  # steps of the integral over a class
 
 
 @dataclass(frozen=True, eq=False)
 class Sizes:
-    """Classes of drops or flakes, smallest first.
-
-    counts_per_m3 [B]. diameters_m [B]: root of the mean square. speeds_mps [B]: of the fall, mean
-    by mass. quantiles_m [B, NUM_QUANTILES]: diameters by the share of a class that is smaller,
-    evenly spaced. mass_kg [B]: of one, mean.
-    """
+    """Classes of drops or flakes, smallest first."""
 
     counts_per_m3: Float64[np.ndarray, "B"]
+    """Number of drops per cubic metre."""
+
     diameters_m: Float64[np.ndarray, "B"]
+    """Root mean square of the diameters."""
+
     speeds_mps: Float64[np.ndarray, "B"]
+    """Fall speed, mean by mass."""
+
     quantiles_m: Float64[np.ndarray, "B Q"]
+    """NUM_QUANTILES quantiles of the diameters, at evenly spaced shares."""
+
     mass_kg: Float64[np.ndarray, "B"]
+    """Mean mass of a drop."""
 
     @property
     def extinctions_per_m(self) -> Float64[np.ndarray, "B"]:
+        """Extinction of visible light by each class."""
         areas = math.pi / 4 * self.diameters_m**2
         return EXTINCTION_EFFICIENCY * self.counts_per_m3 * areas
 
     @property
     def extinction_per_m(self) -> float:
-        """Of visible light, by all of them."""
+        """Extinction of visible light by all classes."""
         return float(self.extinctions_per_m.sum())
 
     @property
@@ -80,21 +87,21 @@ class Sizes:
 
 @functools.lru_cache(maxsize=64)
 def sizes_of(kind: Kind, rate_mm_h: float) -> Sizes:
-    """The sizes in rain or snowfall of a rate > 0."""
-    rate = max(rate_mm_h, _LEAST_RATE)
+    """Return the sizes in rain or snowfall of a rate > 0."""
+    rate = max(rate_mm_h, _MIN_RATE_MM_H)
     slope = 4.1 * rate**-0.21 if kind == "rain" else 2.29 * rate**-0.45  # per mm
     swelling = 1.0 if kind == "rain" else _SNOW_DENSITY ** (-1 / 3)
-    edges = np.geomspace(_SMALLEST_MM, _LARGEST_MM[kind], NUM_CLASSES + 1)
-    share = (np.arange(_STEPS) + 0.5) / _STEPS
+    edges = np.geomspace(_MIN_DIAMETER_MM, _MAX_DIAMETER_MM[kind], NUM_CLASSES + 1)
+    share = (np.arange(_NUM_STEPS) + 0.5) / _NUM_STEPS
     water_mm = edges[:-1, None] + share * (edges[1:] - edges[:-1])[:, None]  # [B, _STEPS]
-    counts = np.exp(-slope * water_mm) * ((edges[1:] - edges[:-1]) / _STEPS)[:, None]
+    counts = np.exp(-slope * water_mm) * ((edges[1:] - edges[:-1]) / _NUM_STEPS)[:, None]
     across_mm = swelling * water_mm
     speeds = 9.65 - 10.3 * np.exp(-0.6 * water_mm) if kind == "rain" else 0.8 * across_mm**0.16
     speeds = np.maximum(speeds, 0.01)
     mass = math.pi / 6 * 1000 * (water_mm / 1000) ** 3  # kg
     falls = (counts * mass * speeds).sum() * 3600
     total = counts.sum(1)
-    number = np.maximum(total, 1e-300)  # of a class that has none
+    number = np.maximum(total, 1e-300)  # a class may be empty
     smaller = np.cumsum(counts, 1) / number[:, None]
     evenly = np.linspace(0, 1, NUM_QUANTILES)
     quantiles = [
@@ -110,13 +117,13 @@ def sizes_of(kind: Kind, rate_mm_h: float) -> Sizes:
     )
 
 
-# ---- Where each drop is --------------------------------------------------------------------------
+# ---- Positions of drops --------------------------------------------------------------------------
 
 CELL_FACTORS = (0x8CB92BA72F3D8DD7, 0xD1B54A32D192ED03, 0xABC98388FB8FAC03)
 
 
 @functools.cache
 def cell_counts() -> Float64[np.ndarray, "6"]:
-    """Below which share of the hashes a cell has no more than 0, 1, ... drops, and their mean."""
+    """Return the shares of hashes below which a cell has at most 0, 1, ... drops, and the mean."""
     below = poisson.cdf(np.arange(MAX_IN_CELL), 1.0)
     return np.append(below, float((1 - below).sum()))

@@ -1,4 +1,4 @@
-"""Rain and falling snow as effects: on the finished picture, by its depth."""
+"""The effects rain and snowfall: they edit the finished picture by its depth."""
 
 from __future__ import annotations
 
@@ -28,15 +28,20 @@ from recipes.rain import Rain
 from recipes.schema import Recipe
 from recipes.snowfall import Snowfall
 
-STREAKS, FLAKES = "rain streaks and veil", "snowflakes and veil"
+STREAKS = "rain streaks and veil"
+FLAKES = "snowflakes and veil"
 
 
 class FallingEffect(Effect):
-    """What falls through the air. step: its pass. kind: as of Falling. Its placed data are one."""
+    """Precipitation in the air. The data of its plan are a `Falling`."""
 
     is_see_through: ClassVar[bool] = True
+
     step: ClassVar[str]
+    """Name of the pass."""
+
     kind: ClassVar[Kind]
+    """Kind of the precipitation, as in `Falling`."""
 
     def reads_splats(self, recipe: Recipe) -> bool:
         return False
@@ -61,11 +66,11 @@ class FallingEffect(Effect):
             section.min_width_px,
             section.color,
         )
-        return _placed(falling, self.step, scene)
+        return _plan_of(falling, self.step, scene)
 
     def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
         assert self.mask is not None
-        return _fallen(own, drawn, camera, self.step, self.mask)
+        return _draw_over(own, drawn, camera, self.step, self.mask)
 
     def measure(
         self, placed: PlacedBoxes, camera: Camera, view: EffectView
@@ -74,34 +79,43 @@ class FallingEffect(Effect):
         return measure_falling(self.table, placed, camera, view)
 
     def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
-        kind, rate = own.data.kind, float(own.data.rate_mm_h)
+        kind = own.data.kind
+        rate = float(own.data.rate_mm_h)
         precipitation_echoes(echoes, scatterers_of(kind, rate), rng)
 
 
 class RainEffect(FallingEffect):
     """Rain in the air."""
 
-    name, section, model, mask = "rain", "weather.rain", Rain, "rain"
-    step, kind = STREAKS, "rain"
+    name = "rain"
+    section = "weather.rain"
+    model = Rain
+    mask = "rain"
+    step = STREAKS
+    kind = "rain"
     table = falling_table("rain", "streak")
 
 
 class SnowfallEffect(FallingEffect):
     """Snow in the air."""
 
-    name, section, model, mask = "snowfall", "weather.snowfall", Snowfall, "snowfall"
-    step, kind = FLAKES, "snow"
+    name = "snowfall"
+    section = "weather.snowfall"
+    model = Snowfall
+    mask = "snowfall"
+    step = FLAKES
+    kind = "snow"
     table = falling_table("snowfall", "flake")
 
 
 def blows_to(speed_mps: float, from_deg: float) -> tuple[float, float]:
-    """A wind's velocity along x and y. from_deg: 0 comes from +x, 90 from +y."""
+    """Return a wind's velocity along x and y. from_deg: 0 comes from +x, 90 from +y."""
     angle = math.radians(from_deg)
     return -speed_mps * math.cos(angle), -speed_mps * math.sin(angle)
 
 
-def _placed(falling: Falling, step: str, scene: Scene) -> Placed:
-    """Raises SceneError where the shutter is open for longer than from image to image."""
+def _plan_of(falling: Falling, step: str, scene: Scene) -> Placed:
+    """Return the plan. Raise SceneError if the exposure is longer than the frame interval."""
     interval = frame_interval_s(scene)
     if interval is not None and falling.exposure_s >= interval:
         raise SceneError(
@@ -122,11 +136,12 @@ def _placed(falling: Falling, step: str, scene: Scene) -> Placed:
     return Placed(falling, (Step(step, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH}))
 
 
-def _fallen(own: Active, drawn: Drawn, camera: Camera, step: str, mask: str) -> Drawn:
-    alpha, depth = drawn.raster.alpha, drawn.raster.expected_depth
+def _draw_over(own: Active, drawn: Drawn, camera: Camera, step: str, mask: str) -> Drawn:
+    alpha = drawn.raster.alpha
+    depth = drawn.raster.expected_depth
     assert alpha is not None and depth is not None
     with timed(step):
-        rgb, near = draw_falling(
+        rgb, drop_mask = draw_falling(
             drawn.rgb,
             alpha,
             depth,
@@ -138,12 +153,12 @@ def _fallen(own: Active, drawn: Drawn, camera: Camera, step: str, mask: str) -> 
             splats=_surfaces_of(drawn),
             backend=own.backend,
         )
-    masks = {**drawn.masks, mask: near}
+    masks = {**drawn.masks, mask: drop_mask}
     return replace(drawn, rgb=rgb, masks=masks)
 
 
 def _surfaces_of(drawn: Drawn) -> Float[Tensor, "H W 3"] | None:
-    """What the splats give to the picture, where nothing has been drawn over all of it since."""
+    """Return the Gaussians' part of the picture; None if something was drawn over all of it."""
     splats = drawn.raster.rgb
     if splats is None or drawn.layers.photo is not None:
         return None

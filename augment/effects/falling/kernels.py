@@ -1,4 +1,4 @@
-"""Numba kernels: which drops a camera sees, what of a pixel they cover, the veil of the rest."""
+"""Numba kernels: the drops in a camera's view, their cover of each pixel, and the veil."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from augment.render.layout import LANES, U
 from augment.rng import STEP_X
 
 ROWS = 16  # image rows of a band, which a thread draws at a time
-FADE = 0.75  # of the distance to which a class is drawn: beyond, its drops fade into the veil
-SOFT = 0.03  # of its depth: so far behind a surface a drop is hidden
-LEAST_RADIUS = 1.25  # pixels; a smaller one would show where pixels lie
-EDGE = 0.02  # of alpha, and of green from the sky: from here on a pixel shows both
-NUM_NUMBERS = 9  # of a drop in the picture
+FADE = 0.75  # share of a class's drawn depth beyond which its drops fade into the veil
+SOFT = 0.03  # share of its depth by which a drop is behind a surface when it is fully hidden
+LEAST_RADIUS = 1.25  # smallest radius, pixels; a smaller one would show the pixel grid
+EDGE = 0.02  # smallest alpha, and green from the sky, of a pixel that shows surface and sky
+NUM_NUMBERS = 9  # numbers of a drop in the picture
 _HALF = float(2**-21)
 _CELL_X, _CELL_Y, _CELL_Z = (np.uint64(f) for f in CELL_FACTORS)
 _STEP = np.uint64(STEP_X)
@@ -29,14 +29,14 @@ _STEP = np.uint64(STEP_X)
 
 @inner()
 def _unit(bits, shift):
-    """21 of the bits as a number in [0, 1)."""
+    """Return 21 of the bits as a number in [0, 1)."""
     return np.float64((bits >> np.uint64(shift)) & np.uint64(0x1FFFFF)) * _HALF
 
 
 @inner()
 def _cosine(turns):
-    """cos(2 pi turns), within 1e-9; without a branch, which no processor could foresee."""
-    x = 2 * math.pi * (0.25 - abs(turns - math.floor(turns + 0.5)))  # whose sine it is
+    """Return cos(2 pi turns), within 1e-9, without a branch (no processor could predict it)."""
+    x = 2 * math.pi * (0.25 - abs(turns - math.floor(turns + 0.5)))  # the result is the sine of x
     q = x * x
     p = 1 - q * (1 / 110) * (1 - q * (1 / 156))
     p = 1 - q * (1 / 20) * (1 - q * (1 / 42) * (1 - q * (1 / 72) * p))
@@ -45,13 +45,18 @@ def _cosine(turns):
 
 @inner()
 def _sway(x, y, z, sways, flutter):
-    """How far the air's eddies and a flake's own flutter move it, along x, y and z.
+    """Return how far the air's eddies and a flake's own flutter move it, along x, y and z.
 
-    sways: as of find_drops. flutter: turns of the flake. Eddies: three waves across their direction
-    of travel, so the air is neither pressed nor thinned; flutter: a level circle of its own.
+    Eddies are three transverse waves, so they do not compress the air. Flutter is a level circle of
+    each flake.
+
+    sways: as in find_drops. flutter: turns of the flake.
     """
-    speed, per_turn = sways[0], 1 / (2 * math.pi)
-    a, b, c = 0.6 / 2.0 * speed, 0.6 / 2.7 * speed, 0.6 / 3.4 * speed
+    speed = sways[0]
+    per_turn = 1 / (2 * math.pi)
+    a = 0.6 / 2.0 * speed
+    b = 0.6 / 2.7 * speed
+    c = 0.6 / 3.4 * speed
     d = speed / (4 + 8 * (flutter * _HALF))
     along_x = 1.1 * per_turn * x + sways[2]
     along_y = 1.5 * per_turn * y + sways[3]
@@ -65,48 +70,79 @@ def _sway(x, y, z, sways, flutter):
 
 @kernel
 def find_drops(
-    slabs, columns, cells, keys, moves, sways, quantiles, shares, planes, shutter, lens,
-    offsets, counts, found,
-):  # fmt: skip
-    """counts [S]: drops of each slab of cells that are seen. found [N, NUM_NUMBERS]: theirs from
-    offsets [S] on: column and row at both ends of a streak, 1 / z there, radius up to which it
-    covers as much as in its middle, radius beyond which nothing, covered share. Empty: counts are
-    of all drops in the cells, which takes next to no time.
+    slabs,
+    columns,
+    cells,
+    keys,
+    moves,
+    sways,
+    quantiles,
+    shares,
+    planes,
+    shutter,
+    lens,
+    offsets,
+    counts,
+    drops,
+):
+    """Find the drops in a camera's view.
 
-    slabs [S, 2]: class, x of the cells. columns [B, 2]: first y, end. cells [B, 4]: size, how far
-    what is seen of a drop can be from its cell's middle, depth to which the class is drawn, how far
-    it can be from the drop's place in the lattice. keys [B]: of the hashes. moves [B, 3, 3]: where
-    the lattice has moved to as the shutter opens, between, as it closes. sways: their speed, the
-    time, turns of the three eddies, those of a flake's flutter and what its number adds to them.
-    quantiles [B, Q]. shares: as drops.cell_counts. planes [5, 4]:
-    inwards normal and offset of the view's sides and its front. shutter [2, 3, 4]:
-    camera_from_world as the shutter opens and closes. lens: fx, fy, cx, cy, width, height, least
-    depth, diameter of the aperture, depth in focus. All float64 but for the integers and found.
+    If `drops` is empty, only `counts` is written: the number of all drops in the cells, in view or
+    not, which takes almost no time. All arrays are float64 except the integers and `drops`.
+
+    Args:
+        slabs: [S, 2] class, x of the cells.
+        columns: [B, 2] first y, end.
+        cells: [B, 4] size; largest distance of a visible part of a drop from its cell's middle;
+            depth up to which the class is drawn; largest distance of a visible part from the drop's
+            position in the lattice.
+        keys: [B] keys of the hashes.
+        moves: [B, 3, 3] displacement of the lattice as the shutter opens, in the middle, and as it
+            closes.
+        sways: their speed, the time, turns of the three eddies, turns of a flake's flutter, and
+            the turns that each unit of the flake's number adds.
+        quantiles: [B, Q] diameters.
+        shares: as drops.cell_counts.
+        planes: [5, 4] inward normal and offset of the view's sides and its front.
+        shutter: [2, 3, 4] camera_from_world as the shutter opens and closes.
+        lens: fx, fy, cx, cy, width, height, smallest depth, diameter of the aperture, depth in
+            focus.
+        offsets: [S] first row in `drops` of each slab.
+        counts: output [S], number of drops of each slab that are in view.
+        drops: output [N, NUM_NUMBERS] column and row at both ends of a streak, 1 / z there, radius
+            up to which it covers as much as in its middle, radius beyond which it covers nothing,
+            covered share.
     """
-    is_counting = len(found) == 0
+    is_counting = len(drops) == 0
     for slab in prange(len(slabs)):
-        b, i = slabs[slab, 0], slabs[slab, 1]
-        size, reach, farthest = cells[b, 0], cells[b, 1], cells[b, 2]
+        b = slabs[slab, 0]
+        i = slabs[slab, 1]
+        size = cells[b, 0]
+        reach = cells[b, 1]
+        farthest = cells[b, 2]
         number = np.int64(0)
-        spare, at, ends = cells[b, 3], np.empty(3), np.empty((2, 3))
+        spread_m = cells[b, 3]
+        point = np.empty(3)
+        ends = np.empty((2, 3))
         for j in range(columns[b, 0], columns[b, 1]):
             x = (np.float64(i) + 0.5) * size + moves[b, 1, 0]
             y = (np.float64(j) + 0.5) * size + moves[b, 1, 1]
-            low, high = -1e18, 1e18  # z of the cells' middles, scene world
+            low = -1e18
+            high = 1e18  # z of the cells' middles, scene world
             for side in range(6):
                 n = min(side, 4)  # the last one is the far end, which faces the front
                 flip = -1.0 if side == 5 else 1.0
-                rest = flip * (planes[n, 0] * x + planes[n, 1] * y + planes[n, 3]) + reach
+                plane_offset = flip * (planes[n, 0] * x + planes[n, 1] * y + planes[n, 3]) + reach
                 if side == 5:
-                    rest += farthest
+                    plane_offset += farthest
                 slope = flip * planes[n, 2]
                 if abs(slope) < 1e-9:
-                    if rest < 0:
+                    if plane_offset < 0:
                         high = -1e18
                 elif slope > 0:
-                    low = max(low, -rest / slope)
+                    low = max(low, -plane_offset / slope)
                 else:
-                    high = min(high, -rest / slope)
+                    high = min(high, -plane_offset / slope)
             if low > high:
                 continue
             first = np.int64(math.floor((low - moves[b, 1, 2]) / size - 0.5))
@@ -123,57 +159,64 @@ def find_drops(
                         number += 1
                         continue
                     bits = mix(cell + np.uint64(drop + 1) * _STEP)
-                    at[0] = (np.float64(i) + _unit(bits, 0)) * size + moves[b, 1, 0]
-                    at[1] = (np.float64(j) + _unit(bits, 21)) * size + moves[b, 1, 1]
-                    at[2] = (np.float64(k) + _unit(bits, 42)) * size + moves[b, 1, 2]
-                    inside, ahead = np.inf, 0.0
+                    point[0] = (np.float64(i) + _unit(bits, 0)) * size + moves[b, 1, 0]
+                    point[1] = (np.float64(j) + _unit(bits, 21)) * size + moves[b, 1, 1]
+                    point[2] = (np.float64(k) + _unit(bits, 42)) * size + moves[b, 1, 2]
+                    inside = np.inf
+                    ahead = 0.0
                     for n in range(5):
-                        ahead = planes[n, 0] * at[0] + planes[n, 1] * at[1] + planes[n, 2] * at[2]
+                        ahead = (
+                            planes[n, 0] * point[0]
+                            + planes[n, 1] * point[1]
+                            + planes[n, 2] * point[2]
+                        )
                         ahead += planes[n, 3]
                         inside = min(inside, ahead)
-                    if inside < -spare or ahead > farthest + spare:
+                    if inside < -spread_m or ahead > farthest + spread_m:
                         continue
                     more = mix(bits ^ _STEP)
                     for c in range(3):
-                        at[c] += moves[b, 0, c] - moves[b, 1, c]
-                    if sways[0] > 0:  # which moves it less than its size while the shutter is open
+                        point[c] += moves[b, 0, c] - moves[b, 1, c]
+                    if sways[0] > 0:  # the sway while the shutter is open is below a flake's size
                         flutter = np.float64((more >> np.uint64(21)) & np.uint64(0x1FFFFF))
-                        dx, dy, dz = _sway(at[0], at[1], at[2], sways, flutter)
-                        at[0], at[1], at[2] = at[0] + dx, at[1] + dy, at[2] + dz
+                        dx, dy, dz = _sway(point[0], point[1], point[2], sways, flutter)
+                        point[0], point[1], point[2] = point[0] + dx, point[1] + dy, point[2] + dz
                     for end in range(2):
                         if end == 1:
                             for c in range(3):
-                                at[c] += moves[b, 2, c] - moves[b, 0, c]
+                                point[c] += moves[b, 2, c] - moves[b, 0, c]
                         for c in range(3):
                             ends[end, c] = (
-                                shutter[end, c, 0] * at[0]
-                                + shutter[end, c, 1] * at[1]
-                                + shutter[end, c, 2] * at[2]
+                                shutter[end, c, 0] * point[0]
+                                + shutter[end, c, 1] * point[1]
+                                + shutter[end, c, 2] * point[2]
                                 + shutter[end, c, 3]
                             )
-                    near = lens[6]
-                    z0, z1 = ends[0, 2], ends[1, 2]
-                    if max(z0, z1) <= near:
+                    min_depth = lens[6]
+                    z0 = ends[0, 2]
+                    z1 = ends[1, 2]
+                    if max(z0, z1) <= min_depth:
                         continue
-                    for end in range(2):  # what is behind the front is cut off
-                        if ends[end, 2] < near:
-                            cut = (near - z0) / (z1 - z0)
+                    for end in range(2):  # cut off the part behind the view's front
+                        if ends[end, 2] < min_depth:
+                            cut = (min_depth - z0) / (z1 - z0)
                             for c in range(3):
                                 ends[end, c] = ends[0, c] + cut * (ends[1, c] - ends[0, c])
-                            ends[end, 2] = near
-                            z0, z1 = ends[0, 2], ends[1, 2]
+                            ends[end, 2] = min_depth
+                            z0 = ends[0, 2]
+                            z1 = ends[1, 2]
                     z = 0.5 * (z0 + z1)
                     if z >= farthest:
                         continue
-                    place = _unit(more, 0) * (quantiles.shape[1] - 1)
-                    q = np.int64(place)
+                    quantile_index = _unit(more, 0) * (quantiles.shape[1] - 1)
+                    q = np.int64(quantile_index)
                     across = quantiles[b, q]
-                    across += (place - q) * (quantiles[b, q + 1] - across)
+                    across += (quantile_index - q) * (quantiles[b, q + 1] - across)
                     focal = math.sqrt(lens[0] * lens[1])
-                    wide = across / z * focal
+                    width_px = across / z * focal
                     blur = lens[7] * abs(1 / z - 1 / lens[8]) * focal
-                    outside = max(0.5 * (wide + blur) + 0.5, LEAST_RADIUS)
-                    inside = max(0.5 * abs(wide - blur) - 0.5, 0.0)
+                    outside = max(0.5 * (width_px + blur) + 0.5, LEAST_RADIUS)
+                    inside = max(0.5 * abs(width_px - blur) - 0.5, 0.0)
                     u0 = lens[0] * ends[0, 0] / z0 + lens[2]
                     v0 = lens[1] * ends[0, 1] / z0 + lens[3]
                     u1 = lens[0] * ends[1, 0] / z1 + lens[2]
@@ -190,38 +233,51 @@ def find_drops(
                     spread = length * (2 * inside + slope / (1.5 * (outside + inside)))
                     spread += 0.5 * math.pi * (outside * outside + inside * inside)
                     fade = min(max((farthest - z) / ((1 - FADE) * farthest), 0.0), 1.0)
-                    cover = min(0.5 * math.pi * wide * wide / spread, 1.0)  # two cross-sections
+                    cover = min(
+                        0.5 * math.pi * width_px * width_px / spread, 1.0
+                    )  # two cross-sections
                     row = offsets[slab] + number
-                    found[row, 0], found[row, 1] = u0, v0
-                    found[row, 2], found[row, 3] = u1, v1
-                    found[row, 4], found[row, 5] = 1 / z0, 1 / z1
-                    found[row, 6], found[row, 7] = inside, outside
-                    found[row, 8] = cover * fade
+                    drops[row, 0] = u0
+                    drops[row, 1] = v0
+                    drops[row, 2] = u1
+                    drops[row, 3] = v1
+                    drops[row, 4] = 1 / z0
+                    drops[row, 5] = 1 / z1
+                    drops[row, 6] = inside
+                    drops[row, 7] = outside
+                    drops[row, 8] = cover * fade
                     number += 1
         counts[slab] = number
 
 
 @serial_kernel
 def list_drops(drops, bands, begins, listed):
-    """Rows of drops, those that reach into each of `bands` bands of ROWS image rows, in order.
+    """List the rows of the drops that reach into each of `bands` bands of ROWS image rows.
 
-    begins [bands + 1]: where each band's begin in `listed`, which may be too short: then it is not
-    filled. Returns how long it has to be.
+    Rows are in order. If `listed` is too short, it is not filled.
+
+    begins [bands + 1]: output, start of each band in `listed`.
+
+    Returns:
+        The length that `listed` needs.
     """
     for band in range(bands + 1):
         begins[band] = 0
-    most = np.float32(bands - 1)
-    per_row, zero = np.float32(1 / ROWS), np.float32(0)
+    last_band = np.float32(bands - 1)
+    per_row = np.float32(1 / ROWS)
+    zero = np.float32(0)
     for is_filling in range(2):
         for row in range(len(drops)):
-            v0, v1, outside = drops[row, 1], drops[row, 3], drops[row, 7]
-            top = np.int64(min(max((min(v0, v1) - outside) * per_row, zero), most))
-            end = np.int64(min(max((max(v0, v1) + outside) * per_row, zero), most))
+            v0 = drops[row, 1]
+            v1 = drops[row, 3]
+            outside = drops[row, 7]
+            top = np.int64(min(max((min(v0, v1) - outside) * per_row, zero), last_band))
+            end = np.int64(min(max((max(v0, v1) + outside) * per_row, zero), last_band))
             for band in range(top, end + 1):
                 if is_filling == 1:
                     listed[begins[band]] = row
                 begins[band] += 1
-        if is_filling == 1:  # each ends where the next one began
+        if is_filling == 1:  # begins[band] is now the end of a band, the start of the next one
             for band in range(bands, 0, -1):
                 begins[band] = begins[band - 1]
             begins[0] = 0
@@ -236,15 +292,16 @@ def list_drops(drops, bands, begins, listed):
 
 @inner()
 def _nearest_in_row(row, width, alpha, depth, eight):
-    """Depth of the nearest surface in an image row. eight: spare."""
-    zeros, never = v8.splat(np.float32(0)), v8.splat(np.float32(np.inf))
-    found = never
+    """Return the depth of the nearest surface in an image row. eight: scratch."""
+    zeros = v8.splat(np.float32(0))
+    no_surface = v8.splat(np.float32(np.inf))
+    nearest_z = no_surface
     for j in range(0, width, LANES):
         pixel = U(row * width + min(j, width - LANES))
         z = v8.load(depth, pixel)
-        shown = v8.both(v8.greater(z, zeros), v8.greater(v8.load(alpha, pixel), zeros))
-        found = v8.minimum(found, v8.select(shown, z, never))
-    v8.store(eight, U(0), found)
+        has_surface = v8.both(v8.greater(z, zeros), v8.greater(v8.load(alpha, pixel), zeros))
+        nearest_z = v8.minimum(nearest_z, v8.select(has_surface, z, no_surface))
+    v8.store(eight, U(0), nearest_z)
     nearest = eight[0]
     for lane in range(1, LANES):
         nearest = min(nearest, eight[lane])
@@ -253,92 +310,126 @@ def _nearest_in_row(row, width, alpha, depth, eight):
 
 @inner()
 def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, clear):
-    """clear: share of each pixel of image rows top to bottom that none of the drops covers, in
-    their order. alpha, depth: of all pixels.
+    """Write the share of each pixel of image rows top to bottom that no drop covers into clear.
+
+    The drops count in their order. alpha, depth: of all pixels.
     """
-    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
-    far, last_block = np.float32(width), width - LANES
-    zeros, ones, soft = v8.splat(zero), v8.splat(one), v8.splat(np.float32(1 / SOFT))
+    zero = np.float32(0)
+    half = np.float32(0.5)
+    unit = np.float32(1)
+    image_end = np.float32(width)
+    last_block = width - LANES
+    zeros = v8.splat(zero)
+    ones = v8.splat(unit)
+    soft = v8.splat(np.float32(1 / SOFT))
     for i in range(U((bottom - top) * width)):
-        clear[i] = one
-    for place in range(first, end):
-        drop = drops[listed[place]]
-        u0, v0, near, outside, share = drop[0], drop[1], drop[4], drop[7], drop[8]
-        du, dv, farther = drop[2] - u0, drop[3] - v0, drop[5] - near
-        per_length = one / max(du * du + dv * dv, np.float32(1e-12))
+        clear[i] = unit
+    for position in range(first, end):
+        drop = drops[listed[position]]
+        u0 = drop[0]
+        v0 = drop[1]
+        near = drop[4]
+        outside = drop[7]
+        share = drop[8]
+        du = drop[2] - u0
+        dv = drop[3] - v0
+        farther = drop[5] - near
+        per_length = unit / max(du * du + dv * dv, np.float32(1e-12))
         beyond = outside * outside
         ramp = share / (beyond - drop[6] * drop[6])
-        # A streak that is about upright is looked at over its whole width in all rows.
-        leans = abs(du) > np.float32(LANES / 2) and abs(dv) > np.float32(1e-3)
-        per_row = one / dv if leans else zero
+        # In all rows a nearly upright streak is evaluated over its full width.
+        is_slanted = abs(du) > np.float32(LANES / 2) and abs(dv) > np.float32(1e-3)
+        per_row = unit / dv if is_slanted else zero
         begin = max(top, np.int64(min(v0, drop[3]) - outside + np.float32(ROWS)) - ROWS)
         last = min(bottom, np.int64(max(max(v0, drop[3]) + outside, zero)) + 1)
         left = np.int64(max(min(u0, drop[2]) - outside, zero))
-        right = np.int64(min(max(max(u0, drop[2]) + outside + one, zero), far))
+        right = np.int64(min(max(max(u0, drop[2]) + outside + unit, zero), image_end))
         for row in range(begin, last):
             v = np.float32(row) + half - v0
-            if leans:  # the piece of the streak that is so near to the row
-                middle, reach = v * per_row, outside * abs(per_row)
-                ua = u0 + min(max(middle - reach, zero), one) * du
-                ub = u0 + min(max(middle + reach, zero), one) * du
+            if is_slanted:  # the piece of the streak that is so near to the row
+                middle = v * per_row
+                reach = outside * abs(per_row)
+                ua = u0 + min(max(middle - reach, zero), unit) * du
+                ub = u0 + min(max(middle + reach, zero), unit) * du
                 left = np.int64(max(min(ua, ub) - outside, zero))
-                right = np.int64(min(max(max(ua, ub) + outside + one, zero), far))
-            ax, base = v8.splat(du * per_length), v8.splat(v * dv * per_length)
+                right = np.int64(min(max(max(ua, ub) + outside + unit, zero), image_end))
+            ax = v8.splat(du * per_length)
+            base = v8.splat(v * dv * per_length)
             for j in range(left, right, LANES):
                 at = min(j, last_block)  # the last eight pixels of a row take those before them
                 x = v8.splat(np.float32(at) + half - u0) + v8.lane_numbers()
                 along = v8.minimum(v8.maximum(v8.fmuladd(x, ax, base), zeros), ones)
                 x = v8.fmuladd(along, v8.splat(-du), x)
                 y = v8.fmuladd(along, v8.splat(-dv), v8.splat(v))
-                away = v8.fmuladd(x, x, y * y)
-                covered = (v8.splat(beyond) - away) * v8.splat(ramp)
+                distance2 = v8.fmuladd(x, x, y * y)
+                covered = (v8.splat(beyond) - distance2) * v8.splat(ramp)
                 covered = v8.minimum(v8.maximum(covered, zeros), v8.splat(share))
                 pixel = U(row * width + at)
                 surface = v8.load(depth, pixel)
                 per_z = v8.fmuladd(along, v8.splat(farther), v8.splat(near))
                 behind = (ones - surface * per_z) * soft
-                hidden = v8.load(alpha, pixel) * v8.minimum(v8.maximum(behind, zeros), ones)
-                hidden = v8.select(v8.greater(surface, zeros), hidden, zeros)
-                covered = covered * (ones - hidden)
+                hidden_share = v8.load(alpha, pixel) * v8.minimum(v8.maximum(behind, zeros), ones)
+                hidden_share = v8.select(v8.greater(surface, zeros), hidden_share, zeros)
+                covered = covered * (ones - hidden_share)
                 if at < j:
                     numbers = v8.lane_numbers() + v8.splat(np.float32(at - j))
                     covered = v8.select(v8.at_least(numbers, zeros), covered, zeros)
-                own = U((row - top) * width + at)
-                v8.store(clear, own, v8.load(clear, own) * (ones - covered))
+                band_pixel = U((row - top) * width + at)
+                v8.store(clear, band_pixel, v8.load(clear, band_pixel) * (ones - covered))
 
 
 @kernel
 def cover_pixels(drops, listed, begins, alpha, depth, clear):
-    """clear [H, W]: share of each pixel that none of the drops covers, in their order.
+    """Write the share of each pixel that no drop covers into clear [H, W], where W >= LANES.
 
-    drops: as found by find_drops. listed, begins: as of list_drops. alpha, depth [H W]: of the
-    surfaces; depth 0 where none is. W >= LANES.
+    Args:
+        drops: result of find_drops; they count in their order.
+        listed: result of list_drops.
+        begins: result of list_drops.
+        alpha: [H W] opacity of the surfaces.
+        depth: [H W] z of the surfaces; 0 without a surface.
+        clear: output.
     """
     height, width = clear.shape
     for band in prange(len(begins) - 1):
         top = np.int64(band) * ROWS
         bottom = min(top + ROWS, height)
-        own = np.empty(ROWS * width, np.float32)
+        band_clear = np.empty(ROWS * width, np.float32)
         _cover_band(
-            drops, listed, begins[band], begins[band + 1],
-            top, bottom, width, alpha, depth, own,
-        )  # fmt: skip
+            drops,
+            listed,
+            begins[band],
+            begins[band + 1],
+            top,
+            bottom,
+            width,
+            alpha,
+            depth,
+            band_clear,
+        )
         for row in range(top, bottom):
             for j in range(U(width)):
-                clear[U(row), j] = own[U((row - top) * width) + j]
+                clear[U(row), j] = band_clear[U((row - top) * width) + j]
 
 
 @inner()
-def _classes_in_row(nearest, bands, own):
-    """What blend_falling's bands say of a row: how many rows `own` [NUM_CLASSES, 5] has of classes
-    that are not all veil where the nearest surface is, and slope and offset of the optical depth
-    of the others, which grows with z alone.
+def _classes_in_row(nearest, bands, partial):
+    """Sort the classes of blend_falling's bands for one image row.
+
+    partial [NUM_CLASSES, 5]: output, bands of the classes that are not completely veil at the
+    nearest surface.
+
+    Returns:
+        The number of rows of `partial`, and slope and offset of the optical depth of the other
+        classes, which is linear in z.
     """
-    count, slope, offset = 0, np.float32(0), np.float32(0)
+    count = 0
+    slope = np.float32(0)
+    offset = np.float32(0)
     for b in range(NUM_CLASSES):
         if bands[b, 4] > nearest:
             for k in range(5):
-                own[count, k] = bands[b, k]
+                partial[count, k] = bands[b, k]
             count += 1
         else:
             slope += bands[b, 0]
@@ -348,34 +439,43 @@ def _classes_in_row(nearest, bands, own):
 
 @inner()
 def _decay(x):
-    """exp(-x) where 0 <= x, of 80 where that is more."""
+    """Return exp(-x) for x >= 0; larger x than MAX_EXPONENT count as MAX_EXPONENT."""
     x = v8.minimum(v8.maximum(x, v8.splat(np.float32(0))), v8.splat(np.float32(MAX_EXPONENT)))
     return exp2_fine(x * v8.splat(-LOG2_E))
 
 
 @inner()
-def _blend_pixels(pixels, at, splats, pixel, u, lengths, shown, clear, tau, sky, light):
-    """Eight pixels behind the veil and the drops, in place.
+def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, tau, sky, light):
+    """Blend eight pixels with the veil and the drops, in place.
 
-    splats: as of blend_falling. shown: alpha. tau: the veil's optical depth at unit depth. sky:
-    transmittance up to the sky. light [3, 4]: airlight; light of a drop in the mean, what of it
-    grows to the right, and ahead.
+    splats: as in blend_falling. opacity: alpha. tau: the veil's optical depth at unit depth. sky:
+    transmittance up to the sky. light [3, 4]: airlight; mean light of a drop; its change to the
+    right; its change ahead.
     """
-    zeros, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
-    near = _decay(tau * lengths)
-    per_length = one / lengths
+    zeros = v8.splat(np.float32(0))
+    ones = v8.splat(np.float32(1))
+    surface_transmittance = _decay(tau * lengths)
+    per_length = ones / lengths
     red, green, blue = v8.load_colours(pixels, at)
-    r, g, b = red, green, blue
-    edge = v8.minimum(shown, one - shown) - v8.splat(np.float32(EDGE))
+    r = red
+    g = green
+    b = blue
+    edge = v8.minimum(opacity, ones - opacity) - v8.splat(np.float32(EDGE))
     is_mixed = False
     if splats.size > 0 and v8.any_not_negative(edge):
         r, g, b = v8.load_colours(splats, U(3) * pixel)
         edge = v8.minimum(edge, green - g - v8.splat(np.float32(EDGE)))
         is_mixed = v8.any_not_negative(edge)
     edge = v8.at_least(edge, zeros)
-    red = _veil(v8.maximum(red, zeros), r, is_mixed, edge, light[0], shown, near, sky)
-    green = _veil(v8.maximum(green, zeros), g, is_mixed, edge, light[1], shown, near, sky)
-    blue = _veil(v8.maximum(blue, zeros), b, is_mixed, edge, light[2], shown, near, sky)
+    red = _veil(
+        v8.maximum(red, zeros), r, is_mixed, edge, light[0], opacity, surface_transmittance, sky
+    )
+    green = _veil(
+        v8.maximum(green, zeros), g, is_mixed, edge, light[1], opacity, surface_transmittance, sky
+    )
+    blue = _veil(
+        v8.maximum(blue, zeros), b, is_mixed, edge, light[2], opacity, surface_transmittance, sky
+    )
     red = _blend_colour(red, light[0], u, clear, per_length)
     green = _blend_colour(green, light[1], u, clear, per_length)
     blue = _blend_colour(blue, light[2], u, clear, per_length)
@@ -383,26 +483,31 @@ def _blend_pixels(pixels, at, splats, pixel, u, lengths, shown, clear, tau, sky,
 
 
 @inner()
-def _veil(own, splats, is_mixed, edge, light, shown, near, sky):
-    """The square of a colour behind the veil. edge: lanes whose pixels show both surfaces and sky,
-    each behind its own, if any is_mixed. near: transmittance up to the surfaces.
+def _veil(color, splats, is_mixed, edge, light, opacity, surface_transmittance, sky):
+    """Return the square of a colour behind the veil.
+
+    edge: lanes whose pixels show both surfaces and sky, each behind its own veil, if is_mixed.
+    surface_transmittance: transmittance up to the surfaces.
     """
-    zeros, air = v8.splat(np.float32(0)), v8.splat(light[0])
-    veiled = air + (sky + shown * (near - sky)) * (own * own - air)
+    zeros = v8.splat(np.float32(0))
+    air = v8.splat(light[0])
+    veiled = air + (sky + opacity * (surface_transmittance - sky)) * (color * color - air)
     if is_mixed:
-        rest = v8.splat(np.float32(1)) - shown
-        behind = v8.minimum(v8.maximum(own - splats, zeros), rest)
-        ahead = (own - behind) / v8.maximum(shown, v8.splat(np.float32(EDGE)))
-        behind = behind / v8.maximum(rest, v8.splat(np.float32(EDGE)))
-        ahead = shown * v8.sqrt(v8.maximum(air + near * (ahead * ahead - air), zeros))
-        behind = rest * v8.sqrt(v8.maximum(air + sky * (behind * behind - air), zeros))
+        sky_share = v8.splat(np.float32(1)) - opacity
+        behind = v8.minimum(v8.maximum(color - splats, zeros), sky_share)
+        ahead = (color - behind) / v8.maximum(opacity, v8.splat(np.float32(EDGE)))
+        behind = behind / v8.maximum(sky_share, v8.splat(np.float32(EDGE)))
+        ahead = opacity * v8.sqrt(
+            v8.maximum(air + surface_transmittance * (ahead * ahead - air), zeros)
+        )
+        behind = sky_share * v8.sqrt(v8.maximum(air + sky * (behind * behind - air), zeros))
         veiled = v8.select(edge, (ahead + behind) * (ahead + behind), veiled)
     return veiled
 
 
 @inner()
 def _blend_colour(veiled, light, u, clear, per_length):
-    """The colour whose square is `veiled`, behind the drops."""
+    """Return the colour whose square is `veiled`, behind the drops."""
     glow = v8.splat(light[1]) + (v8.splat(light[2]) * u + v8.splat(light[3])) * per_length
     out = glow + clear * (veiled - glow)
     return v8.sqrt(v8.maximum(out, v8.splat(np.float32(0))))
@@ -410,18 +515,36 @@ def _blend_colour(veiled, light, u, clear, per_length):
 
 @inner()
 def _blend_row(
-    row, width, rgb, splats, alpha, depth, clear, first, nearest,
-    rays, climb, bands, upwards, light, own, rest,
-):  # fmt: skip
-    """A row of blend_falling. clear: from place `first` on. own, rest: spare."""
-    zeros, half, least = v8.splat(np.float32(0)), np.float32(0.5), np.float32(1e-6)
-    count, slope, offset = _classes_in_row(nearest, bands, own)
+    row,
+    width,
+    rgb,
+    splats,
+    alpha,
+    depth,
+    clear,
+    first,
+    nearest,
+    rays,
+    climb,
+    bands,
+    upwards,
+    light,
+    partial,
+    pixels,
+):
+    """Blend a row of blend_falling. clear: from index `first` on. partial, pixels: scratch."""
+    zeros = v8.splat(np.float32(0))
+    half = np.float32(0.5)
+    least = np.float32(1e-6)
+    count, slope, offset = _classes_in_row(nearest, bands, partial)
     v = (np.float32(row) + half - rays[3]) * rays[1]
-    flat, level = v8.splat(np.float32(1) + v * v), climb[1] * v + climb[2]
-    left, right = (half - rays[2]) * rays[0], (np.float32(width) - rays[2]) * rays[0]
+    flat = v8.splat(np.float32(1) + v * v)
+    level = climb[1] * v + climb[2]
+    left = (half - rays[2]) * rays[0]
+    right = (np.float32(width) - rays[2]) * rays[0]
     shows_sky = max(climb[0] * left, climb[0] * right) + level > least
     for j in range(0, width, LANES):
-        # The last eight of a row take pixels before them, which are not written.
+        # The last eight pixels of a row include earlier ones, which are not written.
         at = min(j, width - LANES)
         pixel = U(row * width + at)
         u = v8.splat(np.float32(at) + half - rays[2]) + v8.lane_numbers()
@@ -430,54 +553,85 @@ def _blend_row(
         z = v8.load(depth, pixel)
         tau = v8.splat(slope) * z + v8.splat(offset)
         for b in range(U(count)):
-            inside = v8.maximum(z - v8.splat(own[b, 1]), zeros)
-            inside = v8.minimum(inside, v8.splat(own[b, 2]))
-            beyond = v8.maximum(z - v8.splat(own[b, 4]), zeros)
-            tau = tau + v8.splat(own[b, 0]) * (inside * inside * v8.splat(own[b, 3]) + beyond)
+            inside = v8.maximum(z - v8.splat(partial[b, 1]), zeros)
+            inside = v8.minimum(inside, v8.splat(partial[b, 2]))
+            beyond = v8.maximum(z - v8.splat(partial[b, 4]), zeros)
+            tau = tau + v8.splat(partial[b, 0]) * (
+                inside * inside * v8.splat(partial[b, 3]) + beyond
+            )
         sky = zeros
-        if shows_sky:  # below the horizon nothing is seen through so much
+        if shows_sky:  # below the horizon nothing is visible through so much veil
             steep = v8.splat(climb[0]) * u + v8.splat(level)
             sky = _decay(v8.splat(upwards) * lengths / v8.maximum(steep, v8.splat(least)))
-        shown = v8.select(v8.greater(z, zeros), v8.load(alpha, pixel), zeros)
-        through = v8.load(clear, first + U(at))
+        opacity = v8.select(v8.greater(z, zeros), v8.load(alpha, pixel), zeros)
+        clear_share = v8.load(clear, first + U(at))
         if at == j:
             _blend_pixels(
-                rgb, U(3) * pixel, splats, pixel, u, lengths, shown, through, tau, sky, light
+                rgb, U(3) * pixel, splats, pixel, u, lengths, opacity, clear_share, tau, sky, light
             )
         else:
             for k in range(U(3 * LANES)):
-                rest[k] = rgb[U(3) * pixel + k]
-            _blend_pixels(rest, U(0), splats, pixel, u, lengths, shown, through, tau, sky, light)
+                pixels[k] = rgb[U(3) * pixel + k]
+            _blend_pixels(
+                pixels, U(0), splats, pixel, u, lengths, opacity, clear_share, tau, sky, light
+            )
             for k in range(U(3 * (j - at)), U(3 * LANES)):
-                rgb[U(3) * pixel + k] = rest[k]
+                rgb[U(3) * pixel + k] = pixels[k]
 
 
 @kernel
 def blend_falling(
-    rgb, splats, alpha, depth, drops, listed, begins, least,
-    rays, climb, bands, upwards, airlight, glow, mask,
-):  # fmt: skip
-    """rgb [3 H W] behind the veil and the drops, in place; mask [H, W]: where a drawn drop leaves
-    less than `least` of a pixel clear.
+    rgb,
+    splats,
+    alpha,
+    depth,
+    drops,
+    listed,
+    begins,
+    least,
+    rays,
+    climb,
+    bands,
+    upwards,
+    airlight,
+    glow,
+    mask,
+):
+    """Blend a picture with the veil and the drops, in place.
 
-    splats [3 H W]: what of rgb is the surfaces', the rest being the sky's; empty where that is not
-    known: then both are seen through the mean of their veils, so that a bright sky shines at edges.
-    alpha, depth, drops, listed, begins: as of cover_pixels. rays: 1 / fx, 1 / fy, cx, cy. climb
-    [3]: the world's z along the camera's axes. bands [NUM_CLASSES, 5]: extinction of a class, depth
-    where it begins, over which depth it grows, half its inverse, depth from which on it is whole.
-    upwards: optical depth straight up. airlight [3]. glow [3, 4]: light of a drop by direction
-    along the camera's axes, and in the mean. Light is squares of display-encoded colours. All
-    float32.
+    Light is in squares of display-encoded colours. All arrays are float32 except indices and mask.
+
+    Args:
+        rgb: [3 H W] the picture, changed in place.
+        splats: [3 H W] the surfaces' part of rgb; the other part is the sky's. If the parts are not
+            known, it is empty: then both lie behind the mean of their veils, so that a bright sky
+            shines at edges.
+        alpha: as in cover_pixels.
+        depth: as in cover_pixels.
+        drops: as in cover_pixels.
+        listed: as in cover_pixels.
+        begins: as in cover_pixels.
+        least: clear share of a pixel below which the pixel is in the mask.
+        rays: 1 / fx, 1 / fy, cx, cy.
+        climb: [3] the world's z along the camera's axes.
+        bands: [NUM_CLASSES, 5] extinction of a class, depth where its veil begins, depth over which
+            it grows, half the inverse of that, depth from which it is complete.
+        upwards: optical depth straight up.
+        airlight: [3].
+        glow: [3, 4] light of a drop by direction along the camera's axes, and its mean.
+        mask: output [H, W], pixels of which drawn drops leave less than `least`.
     """
     height, width = mask.shape
     for band in prange(len(begins) - 1):
         top = np.int64(band) * ROWS
         bottom = min(top + ROWS, height)
-        clear, nearest = np.empty(ROWS * width, np.float32), np.empty(ROWS, np.float32)
-        light, own = np.empty((3, 4), np.float32), np.empty((NUM_CLASSES, 5), np.float32)
-        rest = np.empty(3 * LANES, np.float32)
-        for row in range(top, bottom):  # which brings the surfaces into the cache, in order
-            nearest[row - top] = _nearest_in_row(row, width, alpha, depth, rest)
+        clear = np.empty(ROWS * width, np.float32)
+        nearest = np.empty(ROWS, np.float32)
+        light = np.empty((3, 4), np.float32)
+        partial = np.empty((NUM_CLASSES, 5), np.float32)
+        pixels = np.empty(3 * LANES, np.float32)
+        for row in range(top, bottom):  # this also brings the surfaces into the cache, in order
+            nearest[row - top] = _nearest_in_row(row, width, alpha, depth, pixels)
         _cover_band(
             drops, listed, begins[band], begins[band + 1], top, bottom, width, alpha, depth, clear
         )
@@ -490,6 +644,20 @@ def blend_falling(
                 light[c, 0], light[c, 1], light[c, 2] = airlight[c], glow[c, 3], glow[c, 0]
                 light[c, 3] = glow[c, 1] * v + glow[c, 2]
             _blend_row(
-                row, width, rgb, splats, alpha, depth, clear, first, nearest[row - top],
-                rays, climb, bands, upwards, light, own, rest,
-            )  # fmt: skip
+                row,
+                width,
+                rgb,
+                splats,
+                alpha,
+                depth,
+                clear,
+                first,
+                nearest[row - top],
+                rays,
+                climb,
+                bands,
+                upwards,
+                light,
+                partial,
+                pixels,
+            )

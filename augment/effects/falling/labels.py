@@ -1,6 +1,4 @@
-"""What rain and snowfall do to labelled boxes: how much of their light comes through, and how many
-of their pixels show a drop.
-"""
+"""Rain and snowfall on labelled boxes: transmittance up to each box, and pixels with a drop."""
 
 from __future__ import annotations
 
@@ -15,13 +13,17 @@ from augment.render.fog import Fog
 
 
 def falling_table(name: str, drop: str) -> BoxTable:
-    """The table of an effect. drop: what falls, `streak` or `flake`.
+    """Return the label table of an effect. drop: `streak` or `flake`.
 
-    {name}_transmittance: 0 to 1, of all drops between camera and box, drawn or veil; NaN of a box
-    whose numbers are not finite. pixels: that show the box, or NOT_COUNTED. {drop}_pixels: those
-    of them in the effect's mask.
+    Columns:
+        {name}_transmittance: 0 to 1, of all drops between camera and box, drawn or veil; NaN for a
+            box whose numbers are not finite.
+        pixels: number of pixels that show the box, or NOT_COUNTED.
+        {drop}_pixels: number of those pixels that lie in the effect's mask.
     """
-    through, marked, share = f"{name}_transmittance", f"{drop}_pixels", f"{drop}_fraction"
+    through = f"{name}_transmittance"
+    marked = f"{drop}_pixels"
+    share = f"{drop}_fraction"
     return BoxTable(
         name=f"box_{name}",
         file=f"labels/{name}.parquet",
@@ -36,15 +38,16 @@ def falling_table(name: str, drop: str) -> BoxTable:
 def measure_falling(
     table: BoxTable, placed: PlacedBoxes, camera: Camera, view: EffectView
 ) -> dict[str, np.ndarray]:
-    """The stored columns of a falling_table. Drops count on average by distance, as in the veil:
-    those that are drawn take as much, somewhere near.
+    """Return the stored columns of a `falling_table`.
+
+    The transmittance is the mean by distance, as in the veil. Drawn drops take as much on average.
     """
     through, _, marked = table.stored
     data = view.placed.data
-    medium = None if data is None else Fog(data.sizes.extinction_per_m, (0.0, 0.0, 0.0))
-    found = box_transmittance(placed, camera, medium, view.depth_m, view.water_level_z_m)
+    fog = None if data is None else Fog(data.sizes.extinction_per_m, (0.0, 0.0, 0.0))
+    estimate = box_transmittance(placed, camera, fog, view.depth_m, view.water_level_z_m)
     stored = {
-        through: found.transmittance,
+        through: estimate.transmittance,
         "pixels": np.full(len(placed), NOT_COUNTED),
         marked: np.zeros(len(placed), np.int64),
     }

@@ -1,4 +1,4 @@
-"""What the kernels of falling drops compute, in plain NumPy and torch: slow, and easy to check."""
+"""Reference of the kernels of falling drops in plain NumPy and torch: slow, and easy to check."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 def find_drops_by_numpy(walk: Walk) -> Float32[np.ndarray, "N 9"]:
-    """As kernels.find_drops, of all cells of the box around each class's pyramid of sight."""
-    found = [_drops_of_class(walk, number) for number in range(len(walk.cells))]
-    return np.concatenate(found).astype(np.float32)
+    """Find drops as kernels.find_drops does, in all cells of the box around each class's view."""
+    drops = [_drops_of_class(walk, number) for number in range(len(walk.cells))]
+    return np.concatenate(drops).astype(np.float32)
 
 
 def _drops_of_class(walk: Walk, number: int) -> np.ndarray:
@@ -30,7 +30,7 @@ def _drops_of_class(walk: Walk, number: int) -> np.ndarray:
     if len(rows) == 0:
         return np.zeros((0, 9))
     columns = np.arange(*walk.columns[number])
-    # The heights of the box: where the middle of the view is, and as far around as it reaches.
+    # The heights of the box: the middle of the view, plus and minus its reach.
     around = farthest * np.sqrt(1 + (walk.lens[4:6] / walk.lens[:2]).sum() ** 2) + reach
     pose = walk.shutter.mean(0)
     eye_z = float(-(pose[:, :3].T @ pose[:, 3])[2])
@@ -53,21 +53,21 @@ def _drops_of_class(walk: Walk, number: int) -> np.ndarray:
         return ((values >> np.uint64(shift)) & np.uint64(0x1FFFFF)) / 2.0**21
 
     within = np.stack([unit(bits, shift) for shift in (0, 21, 42)], 1)
-    at = (cells[cell] + within) * size + walk.moves[number, 0]
+    points = (cells[cell] + within) * size + walk.moves[number, 0]
     if walk.sways[0] > 0:
-        at = at + sway(at, walk.sways[1], unit(more, 21), float(walk.sways[0]))
-    closed = at + (walk.moves[number, 2] - walk.moves[number, 0])
+        points = points + sway(points, walk.sways[1], unit(more, 21), float(walk.sways[0]))
+    closed = points + (walk.moves[number, 2] - walk.moves[number, 0])
     ends = [
         point @ pose[:, :3].T + pose[:, 3]
-        for point, pose in zip((at, closed), walk.shutter, strict=True)
+        for point, pose in zip((points, closed), walk.shutter, strict=True)
     ]
-    place = unit(more, 0) * (walk.quantiles.shape[1] - 1)
-    across = np.interp(place, np.arange(walk.quantiles.shape[1]), walk.quantiles[number])
+    quantile_index = unit(more, 0) * (walk.quantiles.shape[1] - 1)
+    across = np.interp(quantile_index, np.arange(walk.quantiles.shape[1]), walk.quantiles[number])
     return _streaks(ends[0], ends[1], across, farthest, walk.lens)
 
 
 def sway(at: np.ndarray, time: float, phase: np.ndarray, speed: float) -> np.ndarray:
-    """Where eddies and flutter move flakes, [N, 3]: as kernels._sway.
+    """Return how far eddies and flutter move flakes, [N, 3], as kernels._sway does.
 
     phase: of the flutter, 0 to 1. speed: of eddies and of flutter, m/s.
     """
@@ -87,38 +87,43 @@ def sway(at: np.ndarray, time: float, phase: np.ndarray, speed: float) -> np.nda
 def _streaks(
     opened: np.ndarray, closed: np.ndarray, across: np.ndarray, farthest: float, lens: np.ndarray
 ) -> np.ndarray:
-    """Drops in the picture from where they are as the shutter opens and closes, [N, 3] each."""
+    """Return drops in the picture from their positions at shutter opening and closing, [N, 3]."""
     fx, fy, cx, cy, width, height, near, aperture, focus = lens
-    seen = np.maximum(opened[:, 2], closed[:, 2]) > near
-    opened, closed, across = opened[seen], closed[seen], across[seen]
+    is_ahead = np.maximum(opened[:, 2], closed[:, 2]) > near
+    opened = opened[is_ahead]
+    closed = closed[is_ahead]
+    across = across[is_ahead]
     cut = (near - opened[:, 2]) / np.where(closed[:, 2] == opened[:, 2], 1, (closed - opened)[:, 2])
     crossing = opened + cut[:, None] * (closed - opened)
     crossing[:, 2] = near
     opened, closed = (np.where(e[:, 2:] < near, crossing, e) for e in (opened, closed))
-    z0, z1 = opened[:, 2], closed[:, 2]
-    z, focal = (z0 + z1) / 2, math.sqrt(fx * fy)
-    wide, blur = across / z * focal, aperture * np.abs(1 / z - 1 / focus) * focal
-    outside = np.maximum((wide + blur) / 2 + 0.5, LEAST_RADIUS)
-    inside = np.maximum(np.abs(wide - blur) / 2 - 0.5, 0)
+    z0 = opened[:, 2]
+    z1 = closed[:, 2]
+    z = (z0 + z1) / 2
+    focal = math.sqrt(fx * fy)
+    width_px = across / z * focal
+    blur = aperture * np.abs(1 / z - 1 / focus) * focal
+    outside = np.maximum((width_px + blur) / 2 + 0.5, LEAST_RADIUS)
+    inside = np.maximum(np.abs(width_px - blur) / 2 - 0.5, 0)
     u = np.stack([fx * opened[:, 0] / z0 + cx, fx * closed[:, 0] / z1 + cx])
     v = np.stack([fy * opened[:, 1] / z0 + cy, fy * closed[:, 1] / z1 + cy])
     length = np.hypot(u[1] - u[0], v[1] - v[0])
-    # Of 1 up to `inside`, then falling as a parabola: across a line, and over a disc.
+    # Cover is 1 up to `inside`, then falls as a parabola: across a line, and over a disc.
     slope = (2 * outside + inside) * (outside - inside)
     spread = length * (2 * inside + slope / (1.5 * (outside + inside)))
     spread += math.pi / 2 * (outside**2 + inside**2)
     fade = np.clip((farthest - z) / ((1 - FADE) * farthest), 0, 1)
-    cover = np.minimum(math.pi / 2 * wide**2 / spread, 1) * fade
-    shown = (z < farthest) & (u.max(0) >= -outside) & (v.max(0) >= -outside)
-    shown &= (u.min(0) <= width + outside) & (v.min(0) <= height + outside)
+    cover = np.minimum(math.pi / 2 * width_px**2 / spread, 1) * fade
+    is_in_view = (z < farthest) & (u.max(0) >= -outside) & (v.max(0) >= -outside)
+    is_in_view &= (u.min(0) <= width + outside) & (v.min(0) <= height + outside)
     numbers = (u[0], v[0], u[1], v[1], 1 / z0, 1 / z1, inside, outside, cover)
-    return np.stack(numbers, 1)[shown]
+    return np.stack(numbers, 1)[is_in_view]
 
 
 def cover_by_numpy(
     drops: np.ndarray, alpha: np.ndarray, depth: np.ndarray
 ) -> Float[np.ndarray, "H W"]:
-    """As kernels.cover_pixels: what is left clear."""
+    """Return the clear share of each pixel, as kernels.cover_pixels does."""
     height, width = depth.shape
     clear = np.ones((height, width))
     for u0, v0, u1, v1, near, far, inside, outside, share in drops.astype(np.float64):
@@ -127,15 +132,17 @@ def cover_by_numpy(
         )
         across = slice(max(0, math.floor(min(u0, u1) - outside)), math.ceil(max(u0, u1) + outside))
         y, x = np.mgrid[:height, :width][:, rows, across] + 0.5
-        du, dv = u1 - u0, v1 - v0
+        du = u1 - u0
+        dv = v1 - v0
         along = ((x - u0) * du + (y - v0) * dv) / max(du * du + dv * dv, 1e-12)
         along = along.clip(0, 1)
-        away = (x - u0 - along * du) ** 2 + (y - v0 - along * dv) ** 2
-        covered = ((outside**2 - away) / (outside**2 - inside**2)).clip(0, 1) * share
-        per_z, surface = near + along * (far - near), depth[rows, across]
+        distance2 = (x - u0 - along * du) ** 2 + (y - v0 - along * dv) ** 2
+        covered = ((outside**2 - distance2) / (outside**2 - inside**2)).clip(0, 1) * share
+        per_z = near + along * (far - near)
+        surface = depth[rows, across]
         behind = ((1 - surface * per_z) / SOFT).clip(0, 1)
-        hidden = np.where(surface > 0, alpha[rows, across] * behind, 0)
-        clear[rows, across] *= 1 - covered * (1 - hidden)
+        hidden_share = np.where(surface > 0, alpha[rows, across] * behind, 0)
+        clear[rows, across] *= 1 - covered * (1 - hidden_share)
     return clear
 
 
@@ -147,7 +154,7 @@ def blend_by_torch(
     veil: Veil,
     splats: Float[Tensor, "H W 3"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
-    """As kernels.blend_falling."""
+    """Blend as kernels.blend_falling does."""
     rays, climb, bands, upwards, airlight, glow = (
         torch.from_numpy(numbers).to(rgb.device, rgb.dtype) for numbers in veil
     )
@@ -157,27 +164,30 @@ def blend_by_torch(
     v, u = torch.meshgrid(v, u, indexing="ij")
     length = torch.sqrt(1 + u * u + v * v)
     z = depth[..., None]
-    extinction, begin, grows, half_inverse, whole = bands.unbind(1)
+    extinction, begin, grows, half_inverse, full_depth = bands.unbind(1)
     inside = torch.minimum((z - begin).clamp_min(0), grows)
-    tau = (extinction * (inside**2 * half_inverse + (z - whole).clamp_min(0))).sum(-1)
+    tau = (extinction * (inside**2 * half_inverse + (z - full_depth).clamp_min(0))).sum(-1)
     slope = climb[0] * u + climb[1] * v + climb[2]
     sky = torch.exp(-(upwards * length / slope.clamp_min(1e-6)).clamp_max(80))
-    shown = torch.where(depth > 0, alpha, 0)
+    surface_share = torch.where(depth > 0, alpha, 0)
     near = torch.exp(-(tau * length).clamp_max(80))
     directions = torch.stack([u, v, torch.ones_like(u)], -1) / length[..., None]
     light = directions @ glow[:, :3].T + glow[:, 3]
-    own = rgb.clamp_min(0)
-    mixed = airlight + (sky + shown * (near - sky))[..., None] * (own**2 - airlight)
+    squared = rgb.clamp_min(0)
+    mixed = airlight + (sky + surface_share * (near - sky))[..., None] * (squared**2 - airlight)
     if splats is not None:
-        parts, rest = shown[..., None], 1 - shown[..., None]
-        behind = torch.minimum((own - splats).clamp_min(0), rest)
-        ahead = ((own - behind) / parts.clamp_min(EDGE)) ** 2
-        behind = (behind / rest.clamp_min(EDGE)) ** 2
+        surface_parts = surface_share[..., None]
+        sky_share = 1 - surface_share[..., None]
+        behind = torch.minimum((squared - splats).clamp_min(0), sky_share)
+        ahead = ((squared - behind) / surface_parts.clamp_min(EDGE)) ** 2
+        behind = (behind / sky_share.clamp_min(EDGE)) ** 2
         ahead = airlight + near[..., None] * (ahead - airlight)
         behind = airlight + sky[..., None] * (behind - airlight)
-        both = parts * ahead.clamp_min(0).sqrt() + rest * behind.clamp_min(0).sqrt()
+        mixed_edge = (
+            surface_parts * ahead.clamp_min(0).sqrt() + sky_share * behind.clamp_min(0).sqrt()
+        )
         green = rgb[..., 1:2] - splats[..., 1:2]
-        is_mixed = torch.minimum(torch.minimum(parts, rest), green) >= EDGE
-        mixed = torch.where(is_mixed, both**2, mixed)
-    own = mixed
-    return (light + clear[..., None].to(rgb.dtype) * (own - light)).clamp_min(0).sqrt()
+        is_mixed = torch.minimum(torch.minimum(surface_parts, sky_share), green) >= EDGE
+        mixed = torch.where(is_mixed, mixed_edge**2, mixed)
+    squared = mixed
+    return (light + clear[..., None].to(rgb.dtype) * (squared - light)).clamp_min(0).sqrt()

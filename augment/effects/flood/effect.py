@@ -1,4 +1,7 @@
-"""A flood as an effect: where its water stands, what a camera sees of it, boxes and LiDAR in it."""
+"""The flood effect: the water's level in a scene, its picture, box labels and LiDAR.
+
+`FloodEffect` turns a recipe's `weather.flood` into a `FloodMedium`. `flood_view` draws the picture.
+"""
 
 from __future__ import annotations
 
@@ -46,17 +49,22 @@ PASSES: tuple[str, ...] = (
     "flood: mirrored view",
     "flood: screen march",
 )
-MIN_DEPTH_M = 0.05  # waves run in at least this much water
-_SPARE_PX = 8.0  # of the margins in flood_view, and of the splats' blur at a coarse resolution
+MIN_DEPTH_M = 0.05  # smallest water depth, metres, that the waves' dispersion takes
+# Pixels added to the margins of flood_view, for their rounding and for the blur of splats.
+_SPARE_PX = 8.0
 
 
 class FloodEffect(Effect):
-    """Standing water; it draws the scene in layers, above the surface, below it and mirrored."""
+    """Standing water. It draws the scene in layers: above the surface, below it, and mirrored."""
 
-    name, section, model, mask = "flood", "weather.flood", Flood, "water"
+    name = "flood"
+    section = "weather.flood"
+    model = Flood
+    mask = "water"
     draws = PASSES[1:3]
-    # submerged_fraction: of the box's height. pixels: that show the box, or NOT_COUNTED in an image
-    # without water in view. hidden_pixels: those behind water.
+    # submerged_fraction: share of the box's height that is under water. pixels: number of pixels
+    # that show the box, or NOT_COUNTED in an image without water in view. hidden_pixels: number of
+    # those pixels that show the box through water.
     table = BoxTable(
         name="box_water",
         file="labels/water.parquet",
@@ -76,9 +84,9 @@ class FloodEffect(Effect):
         return section.reflection
 
     def share(self, job: Sharing) -> None:
-        """The height of the road."""
+        """Precompute the height of the road."""
         if any(self.of(recipe) is not None for recipe in job.recipes):
-            with suppress(SceneError):  # which every image then says
+            with suppress(SceneError):  # every image reports the error itself
                 memo_of(job.scene).put(("ground",), ground_of(job.scene), shared=True)
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
@@ -88,8 +96,8 @@ class FloodEffect(Effect):
                 None, tuple(Step(name, False, "the recipe has no flood") for name in PASSES)
             )
         rain = recipe.weather.rain
-        rate = rain.rate_mm_h if rain is not None else 0.0
-        medium, reason = flood_medium(flood, recipe.seed, scene, rate)
+        rain_mm_h = rain.rate_mm_h if rain is not None else 0.0
+        medium, reason = flood_medium(flood, recipe.seed, scene, rain_mm_h)
         level_z_m = medium.level_z_m
         if lowest_z_m(scene) >= level_z_m:
             why = f"no splat reaches below the level, z = {level_z_m:.2f} m"
@@ -113,15 +121,15 @@ class FloodEffect(Effect):
     def draw(
         self, own: Active, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
     ) -> Drawn | None:
-        found = render_flooded(layers, camera, own.data, buffers)
-        if found is None:
+        image = render_flooded(layers, camera, own.data, buffers)
+        if image is None:
             return None
         why = "what stands before the water hides all of it"
-        hidden = dict.fromkeys(PASSES if found.is_hidden else (), why)
-        return Drawn(found.rgb, found.scene, layers, {"water": found.water}, hidden)
+        skip_reasons = dict.fromkeys(PASSES if image.is_hidden else (), why)
+        return Drawn(image.rgb, image.scene, layers, {"water": image.water}, skip_reasons)
 
     def front_surface(self, own: Active, camera: Camera) -> FrontSurface | None:
-        if _is_under(own.data, camera):  # seen from below, the surface has no depth
+        if _is_under(own.data, camera):  # from below, the surface has no depth
             return FrontSurface(int(SemanticClass.WATER), None)
         return FrontSurface(int(SemanticClass.WATER), plane_depth(camera, own.data.level_z_m))
 
@@ -130,12 +138,14 @@ class FloodEffect(Effect):
     ) -> dict[str, np.ndarray]:
         level_z_m = view.placed.water_level_z_m
         assert level_z_m is not None
-        pixels, hidden = np.full(len(placed), NOT_COUNTED), np.zeros(len(placed), np.int64)
+        pixels = np.full(len(placed), NOT_COUNTED)
+        num_hidden = np.zeros(len(placed), np.int64)
         if view.depth_m is not None and view.mask is not None:
             counted = hidden_pixels(placed, camera, view.depth_m, view.mask)
-            pixels, hidden = counted.pixels, counted.marked
+            pixels = counted.pixels
+            num_hidden = counted.marked
         submerged = submerged_fraction(placed, level_z_m)
-        return {"submerged_fraction": submerged, "pixels": pixels, "hidden_pixels": hidden}
+        return {"submerged_fraction": submerged, "pixels": pixels, "hidden_pixels": num_hidden}
 
     def meet(self, own: Active, echoes: Echoes, frame_ns: int) -> None:
         meet_flood(echoes, own.data)
@@ -148,7 +158,13 @@ def _is_under(medium: FloodMedium, camera: Camera) -> bool:
 def flood_medium(
     flood: Flood, seed: int, scene: Scene, rain_mm_h: float = 0.0
 ) -> tuple[FloodMedium, str]:
-    """The flood at its height in the scene, and what explains it. seed: of the recipe.
+    """Return the flood at its height in the scene, and the text that explains it.
+
+    Args:
+        flood: the recipe's section.
+        seed: the recipe's seed.
+        scene: the scene; its road gives the height.
+        rain_mm_h: rate of the rain whose drops draw rings on the water.
 
     Raises:
         SceneError: the scene's scale, gravity or road is not known.
@@ -179,7 +195,8 @@ def flood_medium(
 
 
 def _steps(medium: FloodMedium, reason: str) -> tuple[Step, ...]:
-    waves, tier = len(medium.waves.amplitudes_m), medium.reflection
+    waves = len(medium.waves.amplitudes_m)
+    tier = medium.reflection
     mirrored = {
         "sky": "reflection 'sky' shows no scene",
         "screen_space": "at a quarter of the resolution, for what the screen does not show",
@@ -195,7 +212,7 @@ def _steps(medium: FloodMedium, reason: str) -> tuple[Step, ...]:
 
 
 def layer_cameras(medium: FloodMedium, camera: Camera) -> tuple[Camera, ...]:
-    """Cameras that see, between them, what the layers of a view with water can show."""
+    """Return cameras that together cover all that the layers of a view with water can show."""
     wide = _grown(camera, MAX_SHIFT * camera.height + _SPARE_PX)
     if medium.reflection == "sky" or _is_under(medium, camera):
         return (wide,)
@@ -204,21 +221,26 @@ def layer_cameras(medium: FloodMedium, camera: Camera) -> tuple[Camera, ...]:
 
 
 def _grown(camera: Camera, margin_px: float) -> Camera:
-    m = int(np.ceil(margin_px))
-    return camera.cropped(-m, -m, camera.width + 2 * m, camera.height + 2 * m)
+    margin = int(np.ceil(margin_px))
+    return camera.cropped(-margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
 
 
 # ---- Labelled boxes ------------------------------------------------------------------------------
 
 
 def submerged_fraction(placed: PlacedBoxes, level_z_m: float) -> Float64[np.ndarray, " B"]:
-    """The part of each box's height that is under water, 0 to 1; tilted boxes from their corners.
+    """Return the share of each box's height that is under water, 0 to 1.
 
-    level_z_m: scene world. A box without height is wholly in or out; one whose numbers are not
-    finite has NaN.
+    The corners give the height, also of tilted boxes. A box without height is either under water
+    or not. A box whose numbers are not finite has NaN.
+
+    Args:
+        placed: the boxes, in the scene's world.
+        level_z_m: height of the water, scene world.
     """
     z = placed.corners_m[..., 2]  # [B, 8]
-    low, high = z.min(axis=1), z.max(axis=1)
+    low = z.min(axis=1)
+    high = z.max(axis=1)
     height = high - low
     with np.errstate(invalid="ignore"):
         fraction = (level_z_m - low) / np.where(height > 0, height, 1.0)
@@ -233,9 +255,12 @@ def hidden_pixels(
     scene_depth_m: Float32[np.ndarray, "H W"],
     water: UInt8[np.ndarray, "H W"],
 ) -> BoxPixels:
-    """How many pixels show each box, and how many of them (`marked`) do so through water.
+    """Count the pixels that show each box, and those of them (`marked`) that water hides.
 
-    scene_depth_m: z of the scene's own surface, seen through the water; 0 = none. water: 255 where
-    water is the first surface.
+    Args:
+        placed: the boxes, in the scene's world.
+        camera: camera of the image.
+        scene_depth_m: z of the scene's surface behind the water, metres; 0 = none.
+        water: 255 where water is the first surface.
     """
     return count_pixels(placed, camera, scene_depth_m, water)

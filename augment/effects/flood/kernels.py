@@ -30,10 +30,12 @@ from augment.render.cpu.jit import inner, kernel
 # So float64 is needed once per wave and chunk of a row; float32 counts turns from the anchor.
 
 CHUNK = 64  # columns that share an anchor; few enough for float32 turns good to 1e-6
-KEPT, FADING = 7, 10  # float32 numbers that are laid out per wave
+FULL_SIZE = 7  # float32 numbers per wave that all pixels of a chunk resolve
+FADING_SIZE = 10  # float32 numbers per wave that some pixels of a chunk resolve
 _ZERO, _HALF, _ONE, _THREE = (np.float32(x) for x in (0, 0.5, 1, 3))
-TINY = np.float32(1e-24)  # square of a normal's length, before it is made 1, at a cusp
-# sin(pi r) / r and cos(pi r) in powers of r^2 for |r| <= 1/2, least maximal error (3e-9, 5e-8).
+TINY = np.float32(1e-24)  # squared length, before normalisation, of a normal at a cusp
+# Minimax coefficients of sin(pi r) / r and cos(pi r) in powers of r^2 for |r| <= 1/2; their errors
+# are at most 3e-9 and 5e-8.
 SINE = (3.14159258, -5.16770688, 2.55003138, -0.598045173, 0.0772201257)
 COSINE = (0.999999953, -4.93479286, 4.05841191, -1.33188016, 0.219696799)
 _S0, _S1, _S2, _S3, _S4 = (np.float32(c) for c in SINE)
@@ -42,7 +44,7 @@ _C0, _C1, _C2, _C3, _C4 = (np.float32(c) for c in COSINE)
 
 @inner()
 def _sin_cos(turns):
-    """sin and cos of 2 pi turns, off by less than 4e-7 beside what turns is off."""
+    """Return sin and cos of 2 pi turns. Their error beyond that of `turns` is below 4e-7."""
     r = turns - v8.floor(turns + v8.splat(_HALF))
     z = r * r
     s = v8.fmuladd(v8.splat(_S4), z, v8.splat(_S3))
@@ -59,7 +61,7 @@ def _sin_cos(turns):
 
 @inner()
 def _ray_z(column, row_z, rotation, lens):
-    """World z of a pixel's ray, by the same roundings as Camera.ray_directions."""
+    """Return the world z of a pixel's ray, with the same roundings as Camera.ray_directions."""
     return (column + 0.5 - lens[2]) / lens[0] * rotation[2, 0] + row_z + rotation[2, 2]
 
 
@@ -71,8 +73,9 @@ def _meets(column, row_z, rotation, lens, height, farthest):
 
 @inner()
 def _columns_that_meet(width, row_z, rotation, lens, height, farthest):
-    """First and one past the last column whose rays meet the plane, which are an interval."""
-    first, last = 0, width - 1
+    """Return the first and one past the last of the columns, an interval, that meet the plane."""
+    first = 0
+    last = width - 1
     meets_first = _meets(first, row_z, rotation, lens, height, farthest)
     meets_last = _meets(last, row_z, rotation, lens, height, farthest)
     if meets_first == meets_last:
@@ -87,27 +90,44 @@ def _columns_that_meet(width, row_z, rotation, lens, height, farthest):
 
 
 @inner()
-def _sort_waves(waves, terms, place, step, z, drop, bend, columns, spacing, kept, fading, faded):
+def _sort_waves(
+    waves, terms, place, step, z, drop, bend, columns, spacing, full_waves, fading_waves, faded
+):
     """Sort the waves of one chunk by whether all, some or none of its pixels resolve them.
 
-    place: p0. step: A. z: of the anchor's ray. drop, bend: the constant and the linear part of the
-    step down. columns: the chunk's first and last, from the anchor. spacing: the least of
-    (s / d_z)^2 times the square of the length in pixels at which a wave is gone, and the greatest
-    times that of its full height. kept, fading: filled with what `_add_kept` and `_add_fading` want
-    of a wave; how many there are is returned. faded [3]: slope variance of the rest, xx, xy, yy.
+    Args:
+        waves: as in `fill_field`.
+        terms: as in `fill_field`.
+        place: p0.
+        step: A.
+        z: of the anchor's ray.
+        drop: constant part of the step down.
+        bend: linear part of the step down.
+        columns: the chunk's first and last, from the anchor.
+        spacing: the smallest (s / d_z)^2 times the square of the wavelength in pixels at which a
+            wave is gone, and the largest (s / d_z)^2 times the square of that of its full height.
+        full_waves: output, numbers of the waves that all pixels resolve, for `_add_full`.
+        fading_waves: output, numbers of the waves that some pixels resolve, for `_add_fading`.
+        faded: output [3], slope variance xx, xy, yy of the waves that no pixel resolves.
+
+    Returns:
+        The number of waves in `full_waves` and in `fading_waves`.
     """
-    many = some = np.uint64(0)
+    num_full = num_fading = np.uint64(0)
     faded[:] = _ZERO
     for i in range(len(waves)):
-        kx, ky = waves[i, 0], waves[i, 1]
+        kx = waves[i, 0]
+        ky = waves[i, 1]
         along = kx * step[0] + ky * step[1]
         side = (along * z) ** 2
         down = kx * drop[0] + ky * drop[1]
         down_more = kx * bend[0] + ky * bend[1]
-        left, right = down + columns[0] * down_more, down + columns[1] * down_more
+        left = down + columns[0] * down_more
+        right = down + columns[1] * down_more
         nearest = 0.0 if left * right < 0.0 else min(left * left, right * right)
         if spacing[0] * (side + nearest) >= 1.0:
-            gx, gy = terms[i, 3], terms[i, 4]
+            gx = terms[i, 3]
+            gy = terms[i, 4]
             faded[0] += _HALF * gx * gx
             faded[1] += _HALF * gx * gy
             faded[2] += _HALF * gy * gy
@@ -115,17 +135,17 @@ def _sort_waves(waves, terms, place, step, z, drop, bend, columns, spacing, kept
         turns = kx * place[0] + ky * place[1] + waves[i, 2]
         turns -= np.floor(turns)
         if spacing[1] * (side + max(left * left, right * right)) <= 1.0:
-            at = many * np.uint64(KEPT)
-            _put(kept, at, turns, along, terms, i)
-            many += np.uint64(1)
+            offset = num_full * np.uint64(FULL_SIZE)
+            _put(full_waves, offset, turns, along, terms, i)
+            num_full += np.uint64(1)
         else:
-            at = some * np.uint64(FADING)
-            _put(fading, at, turns, along, terms, i)
-            fading[at + np.uint64(7)] = np.float32(side)
-            fading[at + np.uint64(8)] = np.float32(down)
-            fading[at + np.uint64(9)] = np.float32(down_more)
-            some += np.uint64(1)
-    return many, some
+            offset = num_fading * np.uint64(FADING_SIZE)
+            _put(fading_waves, offset, turns, along, terms, i)
+            fading_waves[offset + np.uint64(7)] = np.float32(side)
+            fading_waves[offset + np.uint64(8)] = np.float32(down)
+            fading_waves[offset + np.uint64(9)] = np.float32(down_more)
+            num_fading += np.uint64(1)
+    return num_full, num_fading
 
 
 @inner()
@@ -142,42 +162,49 @@ def _term(values, at, k):
 
 
 @inner()
-def _add_kept(kept, count, way):
-    """The sums over waves of the tangents' five terms; way: s n of eight pixels."""
+def _add_full(full_waves, count, distance):
+    """Return the sums over waves of the tangents' five terms. distance: s n of 8 pixels."""
     xx = xy = yy = gx = gy = v8.splat(_ZERO)
     for i in range(count):
-        at = i * np.uint64(KEPT)
-        sine, cosine = _sin_cos(v8.fmuladd(_term(kept, at, 1), way, _term(kept, at, 0)))
-        xx = v8.fmuladd(_term(kept, at, 2), sine, xx)
-        xy = v8.fmuladd(_term(kept, at, 3), sine, xy)
-        yy = v8.fmuladd(_term(kept, at, 4), sine, yy)
-        gx = v8.fmuladd(_term(kept, at, 5), cosine, gx)
-        gy = v8.fmuladd(_term(kept, at, 6), cosine, gy)
+        offset = i * np.uint64(FULL_SIZE)
+        sine, cosine = _sin_cos(
+            v8.fmuladd(_term(full_waves, offset, 1), distance, _term(full_waves, offset, 0))
+        )
+        xx = v8.fmuladd(_term(full_waves, offset, 2), sine, xx)
+        xy = v8.fmuladd(_term(full_waves, offset, 3), sine, xy)
+        yy = v8.fmuladd(_term(full_waves, offset, 4), sine, yy)
+        gx = v8.fmuladd(_term(full_waves, offset, 5), cosine, gx)
+        gy = v8.fmuladd(_term(full_waves, offset, 6), cosine, gy)
     return xx, xy, yy, gx, gy
 
 
 @inner()
-def _add_fading(fading, count, way, n, spacing, limits, towards, sums):
-    """As `_add_kept` with weights; what they leave out goes to the variance `lost`.
+def _add_fading(fading_waves, count, distance, n, spacing, limits, view, sums):
+    """Add waves as `_add_full` does, with weights; the part they leave out adds to `lost`.
 
-    towards: vx, vy. sums: what is added to: lost, xx, xy, yy, gx, gy.
+    towards: vx, vy. sums: the sums to add to: lost (a slope variance), xx, xy, yy, gx, gy.
     """
-    vx, vy = towards
+    vx, vy = view
     lost, xx, xy, yy, gx, gy = sums
-    gone, rise = limits[1], _ONE / (limits[2] - limits[1])
+    faded_px = limits[1]
+    rise = _ONE / (limits[2] - limits[1])
     for i in range(count):
-        at = i * np.uint64(FADING)
-        down = v8.fmuladd(_term(fading, at, 9), n, _term(fading, at, 8))
-        per_pixel = spacing * v8.sqrt(v8.fmuladd(down, down, _term(fading, at, 7)))
-        t = (v8.splat(_ONE) / per_pixel - v8.splat(gone)) * v8.splat(rise)
+        offset = i * np.uint64(FADING_SIZE)
+        down = v8.fmuladd(_term(fading_waves, offset, 9), n, _term(fading_waves, offset, 8))
+        per_pixel = spacing * v8.sqrt(v8.fmuladd(down, down, _term(fading_waves, offset, 7)))
+        t = (v8.splat(_ONE) / per_pixel - v8.splat(faded_px)) * v8.splat(rise)
         t = v8.minimum(v8.maximum(t, v8.splat(_ZERO)), v8.splat(_ONE))
         weight = t * t * (v8.splat(_THREE) - t - t)
-        sine, cosine = _sin_cos(v8.fmuladd(_term(fading, at, 1), way, _term(fading, at, 0)))
-        sine, cosine = weight * sine, weight * cosine
-        xx = v8.fmuladd(_term(fading, at, 2), sine, xx)
-        xy = v8.fmuladd(_term(fading, at, 3), sine, xy)
-        yy = v8.fmuladd(_term(fading, at, 4), sine, yy)
-        slope_x, slope_y = _term(fading, at, 5), _term(fading, at, 6)
+        sine, cosine = _sin_cos(
+            v8.fmuladd(_term(fading_waves, offset, 1), distance, _term(fading_waves, offset, 0))
+        )
+        sine = weight * sine
+        cosine = weight * cosine
+        xx = v8.fmuladd(_term(fading_waves, offset, 2), sine, xx)
+        xy = v8.fmuladd(_term(fading_waves, offset, 3), sine, xy)
+        yy = v8.fmuladd(_term(fading_waves, offset, 4), sine, yy)
+        slope_x = _term(fading_waves, offset, 5)
+        slope_y = _term(fading_waves, offset, 6)
         gx = v8.fmuladd(slope_x, cosine, gx)
         gy = v8.fmuladd(slope_y, cosine, gy)
         slope = slope_x * vx + slope_y * vy
@@ -187,50 +214,64 @@ def _add_fading(fading, count, way, n, spacing, limits, towards, sums):
 
 
 @inner()
-def _shade_chunk(kept, many, fading, some, faded, ray, height, limits, begin, end, out):
-    """out [3 * CHUNK]: normal x, normal y and variance of columns begin to end from the anchor.
+def _shade_chunk(
+    full_waves, num_full, fading_waves, num_fading, faded, ray, height, limits, begin, end, out
+):
+    """Write normal x, normal y and variance of one chunk into out [3 * CHUNK].
 
-    ray: d0 and a, their x, y and z. limits [3]: of `fill_field`.
+    begin, end: the columns, from the anchor. ray: d0 and a, their x, y and z. limits [3]: as in
+    `fill_field`.
     """
-    zero, one = v8.splat(_ZERO), v8.splat(_ONE)
+    zero = v8.splat(_ZERO)
+    ones = v8.splat(_ONE)
     x0, y0, z0, ax, ay, az = ray
     for block in range((end - begin + 7) // 8):
         n = v8.splat(np.float32(begin + 8 * block)) + v8.lane_numbers()
-        inverse = one / v8.fmuladd(v8.splat(az), n, v8.splat(z0))
+        inverse = ones / v8.fmuladd(v8.splat(az), n, v8.splat(z0))
         away = v8.splat(-height) * inverse
         spacing = v8.absolute(away * inverse)
         dx = v8.fmuladd(v8.splat(ax), n, v8.splat(x0))
         dy = v8.fmuladd(v8.splat(ay), n, v8.splat(y0))
         length = v8.sqrt(v8.fmuladd(dx, dx, dy * dy))
         slanted = v8.at_least(length, v8.splat(limits[0]))
-        vx, vy = v8.select(slanted, dx / length, one), v8.select(slanted, dy / length, zero)
+        vx = v8.select(slanted, dx / length, ones)
+        vy = v8.select(slanted, dy / length, zero)
         lost = v8.splat(faded[0]) * vx * vx
         lost = v8.fmuladd(v8.splat(faded[1] + faded[1]) * vx, vy, lost)
         lost = v8.fmuladd(v8.splat(faded[2]) * vy, vy, lost)
-        way = away * n
-        xx, xy, yy, gx, gy = _add_kept(kept, many, way)
+        distance = away * n
+        xx, xy, yy, gx, gy = _add_full(full_waves, num_full, distance)
         lost, xx, xy, yy, gx, gy = _add_fading(
-            fading, some, way, n, spacing, limits, (vx, vy), (lost, xx, xy, yy, gx, gy)
+            fading_waves,
+            num_fading,
+            distance,
+            n,
+            spacing,
+            limits,
+            (vx, vy),
+            (lost, xx, xy, yy, gx, gy),
         )
-        wide, deep = one - xx, one - yy
+        wide = ones - xx
+        deep = ones - yy
         nx = v8.negate(v8.fmuladd(xy, gy, deep * gx))
         ny = v8.negate(v8.fmuladd(xy, gx, wide * gy))
         nz = v8.maximum(wide * deep - xy * xy, zero)
         square = v8.fmuladd(nx, nx, v8.fmuladd(ny, ny, nz * nz))
-        scale = one / v8.sqrt(v8.maximum(square, v8.splat(TINY)))
-        at = np.uint64(8 * block)
-        v8.store(out, at, nx * scale)
-        v8.store(out, at + np.uint64(CHUNK), ny * scale)
-        v8.store(out, at + np.uint64(2 * CHUNK), v8.maximum(lost, zero))
+        scale = ones / v8.sqrt(v8.maximum(square, v8.splat(TINY)))
+        offset = np.uint64(8 * block)
+        v8.store(out, offset, nx * scale)
+        v8.store(out, offset + np.uint64(CHUNK), ny * scale)
+        v8.store(out, offset + np.uint64(2 * CHUNK), v8.maximum(lost, zero))
 
 
 @inner()
 def _anchor(begin, end, row_z, rotation, lens):
-    """A column near the middle, or the end with the nearer plane where distances differ much.
+    """Return the middle column, or the end with the nearer plane if distances differ much.
 
-    Turns counted from a point near the horizon would be lost in float32.
+    Turns counted from a point near the horizon would lose their digits in float32.
     """
-    middle, last = (begin + end) // 2, end - 1
+    middle = (begin + end) // 2
+    last = end - 1
     z = abs(_ray_z(middle, row_z, rotation, lens))
     z_begin = abs(_ray_z(begin, row_z, rotation, lens))
     z_last = abs(_ray_z(last, row_z, rotation, lens))
@@ -243,18 +284,29 @@ def _anchor(begin, end, row_z, rotation, lens):
 def fill_field(
     rotation, eye, height, lens, farthest, limits, waves, terms, normal_x, normal_y, slope_variance
 ):
-    """Normals and slope variance where a pixel's ray meets the plane; other pixels are left alone.
+    """Write normals and slope variance of the pixels whose rays meet the plane.
 
-    rotation [3, 3]: world_from_camera. eye [2]: its x and y. height: of the eye over the plane.
-    lens: fx, fy, cx, cy. farthest: depth at which the plane is still met. waves [N, 3]: turns per
-    metre of x and of y, turns at the origin. All float64. limits [3]: horizontal part of a ray, at
-    unit z, below which it is vertical; lengths in pixels at which a wave is gone, and at full
-    height. terms [N, 5]: S Dx Dx, S Dx Dy, S Dy Dy, k A Dx, k A Dy. Both float32, as the outputs
-    [H, W].
+    Other pixels are not written.
+
+    Args:
+        rotation: [3, 3] world_from_camera, float64.
+        eye: [2] x and y of the eye, float64.
+        height: of the eye over the plane.
+        lens: fx, fy, cx, cy, float64.
+        farthest: largest depth at which a ray meets the plane.
+        limits: [3] horizontal part of a ray, at unit z, below which it counts as vertical;
+            wavelengths in pixels at which a wave is gone and at which it has its full height;
+            float32.
+        waves: [N, 3] turns per metre of x and of y, turns at the origin, float64.
+        terms: [N, 5] S Dx Dx, S Dx Dy, S Dy Dy, k A Dx, k A Dy, float32.
+        normal_x: output [H, W], float32.
+        normal_y: output [H, W], float32.
+        slope_variance: output [H, W], float32.
     """
     images = (normal_x, normal_y, slope_variance)
     for i in numba.prange(normal_x.shape[0]):
-        # A function of its own: numba compiles what stands in a parallel loop many times over.
+        # The row is a separate function, because numba compiles the body of a parallel loop many
+        # times.
         _fill_row(np.int64(i), rotation, eye, height, lens, farthest, limits, waves, terms, images)
 
 
@@ -262,24 +314,28 @@ def fill_field(
 def _fill_row(i, rotation, eye, height, lens, farthest, limits, waves, terms, images):
     normal_x, normal_y, slope_variance = images
     width = normal_x.shape[1]
-    ax, ay, az = rotation[0, 0] / lens[0], rotation[1, 0] / lens[0], rotation[2, 0] / lens[0]
-    bx, by, bz = rotation[0, 1] / lens[1], rotation[1, 1] / lens[1], rotation[2, 1] / lens[1]
+    ax = rotation[0, 0] / lens[0]
+    ay = rotation[1, 0] / lens[0]
+    az = rotation[2, 0] / lens[0]
+    bx = rotation[0, 1] / lens[1]
+    by = rotation[1, 1] / lens[1]
+    bz = rotation[2, 1] / lens[1]
     v = (i + 0.5 - lens[3]) / lens[1]
     row_z = v * rotation[2, 1]
     first, end = _columns_that_meet(width, row_z, rotation, lens, height, farthest)
     if first == end:
         return
-    kept = np.empty(len(waves) * KEPT, np.float32)
-    fading = np.empty(len(waves) * FADING, np.float32)
+    full_waves = np.empty(len(waves) * FULL_SIZE, np.float32)
+    fading_waves = np.empty(len(waves) * FADING_SIZE, np.float32)
     faded = np.empty(3, np.float32)
     out = np.empty(3 * CHUNK, np.float32)
     for begin in range(first, end, CHUNK):
         stop = min(begin + CHUNK, end)
-        at = _anchor(begin, stop, row_z, rotation, lens)
-        u = (at + 0.5 - lens[2]) / lens[0]
+        anchor = _anchor(begin, stop, row_z, rotation, lens)
+        u = (anchor + 0.5 - lens[2]) / lens[0]
         x = u * rotation[0, 0] + v * rotation[0, 1] + rotation[0, 2]
         y = u * rotation[1, 0] + v * rotation[1, 1] + rotation[1, 2]
-        z = _ray_z(at, row_z, rotation, lens)
+        z = _ray_z(anchor, row_z, rotation, lens)
         z_begin = _ray_z(begin, row_z, rotation, lens)
         z_last = _ray_z(stop - 1, row_z, rotation, lens)
         s = -height / z
@@ -287,18 +343,41 @@ def _fill_row(i, rotation, eye, height, lens, farthest, limits, waves, terms, im
         step = ax - az / z * x, ay - az / z * y
         drop = bx * z - bz * x, by * z - bz * y
         bend = bx * az - bz * ax, by * az - bz * ay
-        near, far = max(abs(z_begin), abs(z_last)), min(abs(z_begin), abs(z_last))
-        sparse = (limits[1] * height / (near * near)) ** 2
-        dense = (limits[2] * height / (far * far)) ** 2
-        columns = float(begin - at), float(stop - 1 - at)
+        nearest = max(abs(z_begin), abs(z_last))
+        farthest_z = min(abs(z_begin), abs(z_last))
+        sparse = (limits[1] * height / (nearest * nearest)) ** 2
+        dense = (limits[2] * height / (farthest_z * farthest_z)) ** 2
+        columns = float(begin - anchor), float(stop - 1 - anchor)
         spacing = sparse, dense
-        many, some = _sort_waves(
-            waves, terms, place, step, z, drop, bend, columns, spacing, kept, fading, faded
+        num_full, num_fading = _sort_waves(
+            waves,
+            terms,
+            place,
+            step,
+            z,
+            drop,
+            bend,
+            columns,
+            spacing,
+            full_waves,
+            fading_waves,
+            faded,
         )
         start = np.float32(x), np.float32(y), np.float32(z)
         ray = (*start, np.float32(ax), np.float32(ay), np.float32(az))
-        chunk = begin - at, stop - at
-        _shade_chunk(kept, many, fading, some, faded, ray, np.float32(height), limits, *chunk, out)
+        chunk = begin - anchor, stop - anchor
+        _shade_chunk(
+            full_waves,
+            num_full,
+            fading_waves,
+            num_fading,
+            faded,
+            ray,
+            np.float32(height),
+            limits,
+            *chunk,
+            out,
+        )
         for j in range(stop - begin):
             normal_x[i, begin + j] = out[j]
             normal_y[i, begin + j] = out[CHUNK + j]
@@ -306,37 +385,39 @@ def _fill_row(i, rotation, eye, height, lens, farthest, limits, waves, terms, im
 
 
 # ---- Mirrored rays, eight at a time, through a pyramid of the nearest depth ----------------------
-# The letters are those of `screen_space`, which defines the result. The pyramid holds inverse
-# depths, which are linear along a ray's image: a cell of level l is the largest of 4^l x 4^l
-# pixels, 0 where nothing stands. A ray whose inverse depth stays above a cell's all the way across
-# is in front of everything there and passes the cell at once.
+# `screen_space` defines the symbols and the result. The pyramid holds inverse depths, which are
+# linear along a ray's image: a cell of level l is the largest of 4^l x 4^l pixels, 0 without a
+# surface. A ray whose inverse depth stays above a cell's value all the way across is in front of
+# everything in the cell and passes the cell in one step.
 #
 # The levels lie in one array: level 0, padded to whole cells of the highest level, [R, C]; to the
 # right of it the others, level l from row R (1 - 4 / 4^l) on. view: the vertical in the camera (3),
 # its image N (3), fx, fy, cx, cy, the eye's height over the water, and the image's width, height.
 
-COVERED = np.float32(1 - 1 / 512)  # an alpha through which the water does not show
-THICKNESS_M = np.float32(0.25)  # how thick anything is taken to be, at least,
-THICKNESS = np.float32(0.02)  # and as a share of its depth
-HIDDEN_PX = np.float32(64)  # a ray may run behind something for so long
-NEAR_M = np.float32(0.05)  # rays coming back end so far from the camera's plane
-AGREEING = np.float32(0.05)  # neighbours of one surface: relative difference of inverse depths
+COVERED = np.float32(1 - 1 / 512)  # alpha from which the water does not show through
+THICKNESS_M = np.float32(0.25)  # assumed thickness of every surface, at least, metres
+THICKNESS = np.float32(0.02)  # assumed thickness as a share of the surface's depth
+HIDDEN_PX = np.float32(64)  # longest run of a ray behind a surface, pixels
+NEAR_M = np.float32(0.05)  # rays that come back end at this distance from the camera's plane
+AGREEING = np.float32(0.05)  # largest relative difference of inverse depths within one surface
 EDGE = np.float32(0.04)  # share of the image over which the weight falls to 0
 
-LEVELS = 3  # above the pixels
-BLOCK = 4**LEVELS  # pixels along a cell of the highest one
+LEVELS = 3  # levels above the pixels
+BLOCK = 4**LEVELS  # pixels along a cell of the highest level
 
-MAX_STEPS = 1024  # cells a ray may look at; streets need 20 on average
-NUDGE = np.float32(1e-3)  # pixels past a cell's border, against rounding
+MAX_STEPS = 1024  # most cells that a ray may visit; streets need 20 on average
+NUDGE = np.float32(1e-3)  # step past a cell's border, pixels, against rounding
 _INFINITE = np.float32(math.inf)
-FARTHEST = np.float32(1e-9)  # inverse depth; nothing is seen beyond
-# Ways (in |x|) that one bilinear patch may hold: those of one surface.
-_SMOOTH, _SMOOTH_WAY = np.float32(0.2), np.float32(0.05)
+FARTHEST = np.float32(1e-9)  # smallest inverse depth of a surface
+# Largest difference of ray lengths (in |x|) within one bilinear patch: a share of the length, plus
+# a constant.
+_SMOOTH_SHARE = np.float32(0.2)
+_SMOOTH_LENGTH = np.float32(0.05)
 
 
 @kernel
 def build_pyramid(alpha, depth, pyramid):
-    """Largest inverse depths of the front's solid pixels, in pyramid [R, C + C / 4]."""
+    """Write the largest inverse depths of the front's solid pixels into pyramid [R, C + C / 4]."""
     height, width = alpha.shape
     rows = pyramid.shape[0]
     columns = pyramid.shape[1] // 5 * 4
@@ -344,52 +425,60 @@ def build_pyramid(alpha, depth, pyramid):
         for i in range(block * BLOCK, (block + 1) * BLOCK):
             out = pyramid[i]
             if i < height:
-                seen, z = alpha[i], depth[i]
+                opacity = alpha[i]
+                z = depth[i]
                 for j in range(width):
-                    out[j] = _ONE / z[j] if seen[j] >= _HALF else _ZERO
+                    out[j] = _ONE / z[j] if opacity[j] >= _HALF else _ZERO
                 out[width:columns] = _ZERO
             else:
                 out[:columns] = _ZERO
-        fine, size = pyramid[block * BLOCK : (block + 1) * BLOCK, :columns], 4
+        fine = pyramid[block * BLOCK : (block + 1) * BLOCK, :columns]
+        size = 4
         for _ in range(LEVELS):
             first = rows - rows * 4 // size + block * (BLOCK // size)
             coarse = pyramid[first : first + BLOCK // size, columns : columns + columns // size]
             for i in range(coarse.shape[0]):
-                a, b, c, d = fine[4 * i], fine[4 * i + 1], fine[4 * i + 2], fine[4 * i + 3]
+                a = fine[4 * i]
+                b = fine[4 * i + 1]
+                c = fine[4 * i + 2]
+                d = fine[4 * i + 3]
                 for j in range(coarse.shape[1]):
                     largest = _ZERO
                     for k in range(4 * j, 4 * j + 4):
                         largest = max(largest, max(max(a[k], b[k]), max(c[k], d[k])))
                     coarse[i, j] = largest
-            fine, size = coarse, size * 4
+            fine = coarse
+            size = size * 4
 
 
 @intrinsic
 def _fetch(typingctx, array, row, column):
-    """array[row, column] for eight pairs of whole numbers >= -1, of a contiguous 2-D array."""
+    """Read array[row, column] for eight pairs of integers >= -1 from a contiguous 2-D array."""
 
     def codegen(context, builder, sig, args):
-        whole, wide = ir.VectorType(ir.IntType(32), v8.LANES), ir.IntType(64)
-        held = context.make_array(sig.args[0])(context, builder, args[0])
+        int_lanes = ir.VectorType(ir.IntType(32), v8.LANES)
+        int64 = ir.IntType(64)
+        image = context.make_array(sig.args[0])(context, builder, args[0])
         rows, columns = (
-            builder.trunc(n, ir.IntType(32)) for n in cgutils.unpack_tuple(builder, held.shape)
+            builder.trunc(n, ir.IntType(32)) for n in cgutils.unpack_tuple(builder, image.shape)
         )
-        undefined = ir.Constant(whole, ir.Undefined)
-        pitch, last = undefined, undefined
+        undefined = ir.Constant(int_lanes, ir.Undefined)
+        pitch = undefined
+        last = undefined
         size = builder.sub(builder.mul(rows, columns), ir.IntType(32)(1))
         for lane in range(v8.LANES):
             pitch = builder.insert_element(pitch, columns, ir.IntType(32)(lane))
             last = builder.insert_element(last, size, ir.IntType(32)(lane))
-        index = builder.mul(builder.fptosi(args[1], whole), pitch)
-        index = builder.add(index, builder.fptosi(args[2], whole))
-        zero = ir.Constant(whole, [0] * v8.LANES)
+        index = builder.mul(builder.fptosi(args[1], int_lanes), pitch)
+        index = builder.add(index, builder.fptosi(args[2], int_lanes))
+        zero = ir.Constant(int_lanes, [0] * v8.LANES)
         index = builder.select(builder.icmp_signed("<", index, zero), zero, index)
         index = builder.select(builder.icmp_signed(">", index, last), last, index)
         value = ir.Constant(ir.VectorType(ir.FloatType(), v8.LANES), ir.Undefined)
         for lane in range(v8.LANES):
             number = ir.IntType(32)(lane)
-            at = builder.zext(builder.extract_element(index, number), wide)
-            element = builder.load(builder.gep(held.data, [at]))
+            element_index = builder.zext(builder.extract_element(index, number), int64)
+            element = builder.load(builder.gep(image.data, [element_index]))
             value = builder.insert_element(value, element, number)
         return value
 
@@ -397,14 +486,15 @@ def _fetch(typingctx, array, row, column):
 
 
 @inner()
-def _difference(before, here, after, has_before, has_after):
-    """Change of the inverse depth per pixel, from those neighbours that belong to the surface."""
-    total, count = _ZERO, _ZERO
-    if has_after and abs(after - here) < AGREEING * here:
-        total += after - here
+def _difference(before, center, after, has_before, has_after):
+    """Return the change of the inverse depth per pixel, by neighbours on the same surface."""
+    total = _ZERO
+    count = _ZERO
+    if has_after and abs(after - center) < AGREEING * center:
+        total += after - center
         count += _ONE
-    if has_before and abs(here - before) < AGREEING * here:
-        total += here - before
+    if has_before and abs(center - before) < AGREEING * center:
+        total += center - before
         count += _ONE
     return total / max(count, _ONE)
 
@@ -413,111 +503,124 @@ def _difference(before, here, after, has_before, has_after):
 def _edge_weight(x, y, width, height):
     fx = min(max(min(x, width - x) / (EDGE * width), _ZERO), _ONE)
     fy = min(max(min(y, height - y) / (EDGE * height), _ZERO), _ONE)
-    two, three = np.float32(2), np.float32(3)
+    two = np.float32(2)
+    three = np.float32(3)
     return fx * fx * (three - two * fx) * fy * fy * (three - two * fy)
 
 
 @inner()
 def _set_up(view, xs, ys, first):
-    """Numbers of eight mirrored rays, those of the definition's record, and where they begin."""
-    width, height = view[11], view[12]
-    x0, y0 = v8.load(xs, first), v8.load(ys, first)
-    one, zero = v8.splat(_ONE), v8.splat(_ZERO)
-    nx, ny, nz = v8.splat(view[0]), v8.splat(view[1]), v8.splat(view[2])
+    """Return the numbers of eight mirrored rays (see `screen_space._Rays`) and their start."""
+    width = view[11]
+    height = view[12]
+    x0 = v8.load(xs, first)
+    y0 = v8.load(ys, first)
+    ones = v8.splat(_ONE)
+    zero = v8.splat(_ZERO)
+    nx = v8.splat(view[0])
+    ny = v8.splat(view[1])
+    nz = v8.splat(view[2])
     u = (x0 - v8.splat(view[8])) / v8.splat(view[6])
     v = (y0 - v8.splat(view[9])) / v8.splat(view[7])
     slope = u * nx + v * ny + nz
-    gx, gy = v8.splat(view[3]) - x0 * nz, v8.splat(view[4]) - y0 * nz
+    gx = v8.splat(view[3]) - x0 * nz
+    gy = v8.splat(view[4]) - y0 * nz
     g = v8.maximum(v8.maximum(v8.absolute(gx), v8.absolute(gy)), v8.splat(np.float32(1e-9)))
     rise = slope * v8.splat(np.float32(-2))
     scale = rise * g
-    bend = (one + rise * nz) / scale
+    bend = (ones + rise * nz) / scale
     near = v8.negate(slope) / v8.splat(view[10])
-    dx, dy = gx / g, gy / g
+    dx = gx / g
+    dy = gy / g
     # A ray along an axis never gets to the other axis's next border.
     tiny = v8.splat(np.float32(1e-30))
-    inverse_x = one / v8.select(v8.greater(v8.absolute(dx), tiny), dx, tiny)
-    inverse_y = one / v8.select(v8.greater(v8.absolute(dy), tiny), dy, tiny)
-    ahead_x = v8.select(v8.at_least(inverse_x, zero), one, zero)
-    ahead_y = v8.select(v8.at_least(inverse_y, zero), one, zero)
+    inverse_x = ones / v8.select(v8.greater(v8.absolute(dx), tiny), dx, tiny)
+    inverse_y = ones / v8.select(v8.greater(v8.absolute(dy), tiny), dy, tiny)
+    ahead_x = v8.select(v8.at_least(inverse_x, zero), ones, zero)
+    ahead_y = v8.select(v8.at_least(inverse_y, zero), ones, zero)
     end = v8.minimum(
         (ahead_x * v8.splat(width) - x0) * inverse_x, (ahead_y * v8.splat(height) - y0) * inverse_y
     )
-    back = (one - one / (near * v8.splat(NEAR_M))) / bend
+    back = (ones - ones / (near * v8.splat(NEAR_M))) / bend
     returns = v8.greater(zero, bend)
     end = v8.select(returns, v8.minimum(end, back), end)
-    far = v8.at_least(bend * end, one)
-    end = v8.select(far, one / bend, end)
-    to_sky = v8.select(far, one, zero)
+    far = v8.at_least(bend * end, ones)
+    end = v8.select(far, ones / bend, end)
+    to_sky = v8.select(far, ones, zero)
     ray = (x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, bend * near, end)
-    # Nothing is met in the pixel that the ray starts from.
+    # A ray meets nothing in its first pixel.
     t = v8.splat(_HALF) * v8.minimum(v8.absolute(inverse_x), v8.absolute(inverse_y))
     size = v8.splat(np.float32(4))
-    state = (t + v8.splat(NUDGE), end, size, one / size, zero, one, zero)
+    state = (t + v8.splat(NUDGE), end, size, ones / size, zero, ones, zero)
     return ray, state, to_sky, scale
 
 
 @inner()
 def _step(pyramid, ray, state):
-    """Eight rays look into one cell each, and pass it or go into its parts.
+    """Move eight rays through one cell each, or down into its parts.
 
-    state: t, the t to stop at, the cell's size and its inverse, pixels spent behind something
-    without a break, 1 if there were none ever, 1 where something is met.
+    state: t, the t to stop at, the cell's size and its inverse, pixels behind a surface without a
+    break, 1 if there never were any, 1 if the ray has hit a surface.
     """
     x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, change, end = ray
-    t, stop, size, inverse, hidden, clean, met = state
-    zero, half, one = (v8.splat(_ZERO), v8.splat(_HALF), v8.splat(_ONE))
-    four, quarter = v8.splat(np.float32(4)), v8.splat(np.float32(0.25))
+    t, stop, size, inverse, hidden_px, clean, has_hit = state
+    zero = v8.splat(_ZERO)
+    half = v8.splat(_HALF)
+    ones = v8.splat(_ONE)
+    four = v8.splat(np.float32(4))
+    quarter = v8.splat(np.float32(0.25))
     rows = v8.splat(np.float32(pyramid.shape[0]))
     columns = v8.splat(np.float32(pyramid.shape[1] // 5 * 4))
     going = v8.greater(stop, t)
     cell_x = v8.floor(v8.fmuladd(t, dx, x0) * inverse)
     cell_y = v8.floor(v8.fmuladd(t, dy, y0) * inverse)
     level_row = v8.maximum(rows - rows * four * inverse, zero)
-    level_column = v8.select(v8.greater(size, one), columns, zero)
+    level_column = v8.select(v8.greater(size, ones), columns, zero)
     surface = _fetch(pyramid, cell_y + level_row, cell_x + level_column)
     leave_x = ((cell_x + ahead_x) * size - x0) * inverse_x
     leave_y = ((cell_y + ahead_y) * size - y0) * inverse_y
     leave = v8.maximum(v8.minimum(v8.minimum(leave_x, leave_y), end), t)
     beyond = leave + v8.splat(NUDGE)
-    # Up only out of the parent, which has been looked into already.
+    # A ray goes up only when it leaves the parent cell, which it has tested already.
     above = inverse * quarter
-    other_x = v8.floor(v8.fmuladd(beyond, dx, x0) * above) - v8.floor(cell_x * quarter)
-    other_y = v8.floor(v8.fmuladd(beyond, dy, y0) * above) - v8.floor(cell_y * quarter)
+    parent_step_x = v8.floor(v8.fmuladd(beyond, dx, x0) * above) - v8.floor(cell_x * quarter)
+    parent_step_y = v8.floor(v8.fmuladd(beyond, dy, y0) * above) - v8.floor(cell_y * quarter)
     climbs = v8.both(
         v8.greater(v8.splat(np.float32(BLOCK)), size),
-        v8.greater(v8.absolute(other_x) + v8.absolute(other_y), half),
+        v8.greater(v8.absolute(parent_step_x) + v8.absolute(parent_step_y), half),
     )
-    k0, k1 = near - change * t, near - change * leave
+    k0 = near - change * t
+    k1 = near - change * leave
     nearest = v8.maximum(v8.minimum(k0, k1), v8.splat(FARTHEST))
     reached = v8.both(going, v8.at_least(surface, nearest))
     thick = v8.maximum(v8.splat(THICKNESS), v8.splat(THICKNESS_M) * surface)
-    entered = v8.at_least(v8.maximum(k0, k1) * (one + thick), surface)
-    pixel = v8.both(reached, v8.at_least(one, size))
+    entered = v8.at_least(v8.maximum(k0, k1) * (ones + thick), surface)
+    pixel = v8.both(reached, v8.at_least(ones, size))
     hit = v8.both(pixel, entered)
-    met = v8.select(hit, one, met)
+    has_hit = v8.select(hit, ones, has_hit)
     clean = v8.select(pixel, v8.select(entered, clean, zero), clean)
-    hidden = v8.select(pixel, hidden + (leave - t), v8.select(reached, hidden, zero))
-    stop = v8.select(hit, v8.negate(one), stop)
-    stop = v8.select(v8.greater(hidden, v8.splat(HIDDEN_PX)), v8.negate(one), stop)
-    moved = v8.select(pixel, beyond, v8.select(reached, t, beyond))
-    t = v8.select(hit, t, v8.select(going, moved, t))
-    up = v8.select(climbs, four, one)
-    size = v8.select(reached, v8.maximum(size * quarter, one), size * up)
+    hidden_px = v8.select(pixel, hidden_px + (leave - t), v8.select(reached, hidden_px, zero))
+    stop = v8.select(hit, v8.negate(ones), stop)
+    stop = v8.select(v8.greater(hidden_px, v8.splat(HIDDEN_PX)), v8.negate(ones), stop)
+    next_t = v8.select(pixel, beyond, v8.select(reached, t, beyond))
+    t = v8.select(hit, t, v8.select(going, next_t, t))
+    up = v8.select(climbs, four, ones)
+    size = v8.select(reached, v8.maximum(size * quarter, ones), size * up)
     up = v8.select(climbs, above, inverse)
-    inverse = v8.select(reached, v8.minimum(inverse * four, one), up)
-    return t, stop, size, inverse, hidden, clean, met
+    inverse = v8.select(reached, v8.minimum(inverse * four, ones), up)
+    return t, stop, size, inverse, hidden_px, clean, has_hit
 
 
 @inner()
-def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts):
-    """Results of eight rays that have ended."""
+def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, lengths, trusts):
+    """Write the results of eight rays that have ended."""
     x0, y0, dx, dy, _, _, _, _, near, change, end = ray
-    t, stop, _, _, _, clean, met = state
-    half, zero = v8.splat(_HALF), v8.splat(_ZERO)
+    t, stop, _, _, _, clean, has_hit = state
+    half = v8.splat(_HALF)
+    zero = v8.splat(_ZERO)
     sky = v8.select(v8.at_least(t, stop), clean * to_sky, zero)
-    t = v8.select(v8.greater(met, half), t, end)
-    v8.store(lanes, np.uint64(0), met)
+    t = v8.select(v8.greater(has_hit, half), t, end)
+    v8.store(lanes, np.uint64(0), has_hit)
     v8.store(lanes, np.uint64(8), sky)
     v8.store(lanes, np.uint64(16), t)
     v8.store(lanes, np.uint64(24), dx)
@@ -528,71 +631,83 @@ def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts
     v8.store(lanes, np.uint64(64), scale)
     v8.store(lanes, np.uint64(72), x0)
     v8.store(lanes, np.uint64(80), y0)
-    width, height = view[11], view[12]
+    width = view[11]
+    height = view[12]
     for lane in range(8):
-        way, trust, t_last = _INFINITE, _ZERO, lanes[16 + lane]
-        x, y = lanes[72 + lane], lanes[80 + lane]
-        step_x, step_y = lanes[24 + lane], lanes[32 + lane]
+        length = _INFINITE
+        trust = _ZERO
+        t_last = lanes[16 + lane]
+        x = lanes[72 + lane]
+        y = lanes[80 + lane]
+        step_x = lanes[24 + lane]
+        step_y = lanes[32 + lane]
         if lanes[lane] > _HALF:
-            change_, near_ = lanes[40 + lane], lanes[48 + lane]
-            way, t_last = _meet(
+            change_ = lanes[40 + lane]
+            near_ = lanes[48 + lane]
+            length, t_last = _meet(
                 pyramid, width, height, x, y, step_x, step_y, t_last, change_, near_
             )
             t_last = min(t_last, lanes[56 + lane])
-            way = way * near_ / lanes[64 + lane]
+            length = length * near_ / lanes[64 + lane]
         if lanes[lane] > _HALF or lanes[8 + lane] > _HALF:
             trust = _edge_weight(x + t_last * step_x, y + t_last * step_y, width, height)
-        ways[first + np.uint64(lane)] = way
+        lengths[first + np.uint64(lane)] = length
         trusts[first + np.uint64(lane)] = trust
 
 
 @inner()
 def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
-    """t / k and t where the ray, of inverse depth k, meets the plane through the pixel found at t.
+    """Return t / k and t where the ray meets the plane through the surface in the pixel at t.
 
-    At most 1 px off that pixel.
+    k is the ray's inverse depth there. The result is at most 1 px off that pixel.
     """
     cx = min(max(int(x0 + t * dx), 0), int(width) - 1)
     cy = min(max(int(y0 + t * dy), 0), int(height) - 1)
-    here = pyramid[cy, cx]
-    left, above = max(cx - 1, 0), max(cy - 1, 0)  # a pixel is its own neighbour at the border
-    right, below = min(cx + 1, int(width) - 1), min(cy + 1, int(height) - 1)
-    across = _difference(pyramid[cy, left], here, pyramid[cy, right], cx > left, right > cx)
-    down = _difference(pyramid[above, cx], here, pyramid[below, cx], cy > above, below > cy)
-    off_x, off_y = (np.float32(cx) + _HALF - x0, np.float32(cy) + _HALF - y0)
+    center = pyramid[cy, cx]
+    left = max(cx - 1, 0)
+    above = max(cy - 1, 0)  # a pixel is its own neighbour at the border
+    right = min(cx + 1, int(width) - 1)
+    below = min(cy + 1, int(height) - 1)
+    across = _difference(pyramid[cy, left], center, pyramid[cy, right], cx > left, right > cx)
+    down = _difference(pyramid[above, cx], center, pyramid[below, cx], cy > above, below > cy)
+    off_x = np.float32(cx) + _HALF - x0
+    off_y = np.float32(cy) + _HALF - y0
     closing = -change - across * dx - down * dy
     middle = off_x * dx if abs(dx) >= abs(dy) else off_y * dy
-    meet = middle
+    t_meet = middle
     if closing != _ZERO:
-        meet = (here - across * off_x - down * off_y - near) / closing
+        t_meet = (center - across * off_x - down * off_y - near) / closing
     reach = np.float32(1.5)
-    meet = max(min(max(meet, middle - reach), middle + reach), _ZERO)
-    # Not farther than what was met, however the ray grazes it.
-    back = here / (_ONE + max(THICKNESS, THICKNESS_M * here))
-    return meet / max(near - change * meet, back), meet
+    t_meet = max(min(max(t_meet, middle - reach), middle + reach), _ZERO)
+    # The end is not beyond the surface that was hit, even if the ray grazes it.
+    back = center / (_ONE + max(THICKNESS, THICKNESS_M * center))
+    return t_meet / max(near - change * t_meet, back), t_meet
 
 
 @inner()
-def _run(pyramid, view, lanes, xs, ys, count, ways, trusts):
-    """(way / |x|, weight) of the mirrored rays of a list's first `count` pixels; it has room for
-    eight more. xs, ys: pixel centres that see the water. lanes: scratch.
+def _run(pyramid, view, lanes, xs, ys, count, lengths, trusts):
+    """Trace the mirrored rays of the first `count` pixels of a list, which has room for 8 more.
+
+    xs, ys: pixel centres that see the water. lanes: scratch. ways, trusts: outputs, ray lengths
+    over |x| and weights.
     """
     for first in range(0, count, 8):
         for spare in range(count, first + 8):
-            xs[spare], ys[spare] = xs[count - 1], ys[count - 1]
+            xs[spare] = xs[count - 1]
+            ys[spare] = ys[count - 1]
         at = np.uint64(first)
         ray, state, to_sky, scale = _set_up(view, xs, ys, at)
         for _ in range(MAX_STEPS):
-            # The sign is clear where a ray goes on; one that has ended just here does no harm.
+            # The sign bit is clear while a ray goes on. A ray that ends exactly here does no harm.
             if not v8.any_not_negative(state[1] - state[0]):
                 break
             state = _step(pyramid, ray, state)
-        _finish(pyramid, view, lanes, ray, state, to_sky, scale, at, ways, trusts)
+        _finish(pyramid, view, lanes, ray, state, to_sky, scale, at, lengths, trusts)
 
 
 @inner()
 def _sees_water(view, alpha, column, row):
-    """Whether the pixel's ray falls and the front leaves something of the water to see."""
+    """Return True if the pixel's ray falls and the front does not cover the water."""
     if 0 <= row < alpha.shape[0] and 0 <= column < alpha.shape[1] and alpha[row, column] >= COVERED:
         return False
     u = (np.float32(column) + _HALF - view[8]) / view[6]
@@ -606,16 +721,17 @@ def _inside(alpha, column, row):
 
 
 @kernel
-def trace(pyramid, view, alpha, needed, left, top, stride, ways, weights):
-    """Ways (in |x|) and weights of every `stride`-th pixel; weight -1 where none is needed."""
-    columns = ways.shape[1]
-    for i in numba.prange(ways.shape[0]):
+def trace(pyramid, view, alpha, needed, left, top, stride, lengths, weights):
+    """Write ray lengths (in |x|) and weights (-1 if not needed) of every `stride`-th pixel."""
+    columns = lengths.shape[1]
+    for i in numba.prange(lengths.shape[0]):
         lanes = np.empty(88, np.float32)
         lists = np.empty((4, columns + 8), np.float32)
-        row, count = top + i * stride, 0
+        row = top + i * stride
+        count = 0
         for j in range(columns):
             column = left + j * stride
-            ways[i, j] = _INFINITE
+            lengths[i, j] = _INFINITE
             weights[i, j] = _ZERO
             if not (needed[i * stride, j * stride] and _sees_water(view, alpha, column, row)):
                 weights[i, j] = -_ONE
@@ -626,81 +742,102 @@ def trace(pyramid, view, alpha, needed, left, top, stride, ways, weights):
         _run(pyramid, view, lanes, lists[0], lists[1], count, lists[2], lists[3])
         for n in range(count):
             j = (int(lists[0, n]) - left) // stride
-            ways[i, j] = lists[2, n]
+            lengths[i, j] = lists[2, n]
             weights[i, j] = lists[3, n]
 
 
 @inner()
 def _to_metres(view, alpha, needed, column, row, distance, weight):
-    """A row of ways (in |x|) becomes metres; only needed pixels that show water get a weight."""
+    """Convert a row of ray lengths from |x| to metres; zero the weights of other pixels.
+
+    Only needed pixels that show water keep a weight.
+    """
     v = (np.float32(row) + _HALF - view[9]) / view[7]
-    vv, slope_v = _ONE + v * v, v * view[1] + view[2]
+    vv = _ONE + v * v
+    slope_v = v * view[1] + view[2]
     inside = 0 <= row < alpha.shape[0]
     for j in range(distance.shape[0]):
         u = (np.float32(column + j) + _HALF - view[8]) / view[6]
         slope = u * view[0] + slope_v
         covered = inside and 0 <= column + j < alpha.shape[1] and alpha[row, column + j] >= COVERED
-        hidden = slope >= _ZERO or covered or not needed[j] or weight[j] < _ZERO
+        is_hidden = slope >= _ZERO or covered or not needed[j] or weight[j] < _ZERO
         r = math.sqrt(vv + u * u) * view[10] / -slope
-        distance[j] = _INFINITE if hidden else distance[j] * r
-        weight[j] = _ZERO if hidden else weight[j]
+        distance[j] = _INFINITE if is_hidden else distance[j] * r
+        weight[j] = _ZERO if is_hidden else weight[j]
 
 
 @kernel
-def spread(pyramid, view, alpha, needed, left, top, stride, ways, weights, distance, weight):
-    """Metres and weights of all pixels; the four traced around a pixel speak for it if they agree.
+def spread(pyramid, view, alpha, needed, left, top, stride, lengths, weights, distance, weight):
+    """Write metres and weights of all pixels.
 
-    Where they do not, at silhouettes and beside covered pixels, the pixel is traced itself.
+    A pixel is interpolated if the four traced pixels around it agree. If they do not, at
+    silhouettes and beside covered pixels, the pixel itself is traced.
     """
     height, width = distance.shape
-    rows, columns = ways.shape
-    part = _ONE / np.float32(stride)
+    rows, columns = lengths.shape
+    inverse_stride = _ONE / np.float32(stride)
     for i in numba.prange(rows):
         lanes = np.empty(88, np.float32)
         lists = np.empty((4, stride * (width + stride) + 8), np.float32)
         count = 0
-        below, deep = min(i + 1, rows - 1), min(stride, height - i * stride)
+        below = min(i + 1, rows - 1)
+        num_rows = min(stride, height - i * stride)
         y0 = i * stride
         for j in range(columns):
-            right, wide = min(j + 1, columns - 1), min(stride, width - j * stride)
+            right = min(j + 1, columns - 1)
+            num_columns = min(stride, width - j * stride)
             x0 = j * stride
-            w00, w01, w10, w11 = ways[i, j], ways[i, right], ways[below, j], ways[below, right]
-            t00, t01 = weights[i, j], weights[i, right]
-            t10, t11 = weights[below, j], weights[below, right]
-            least, most = min(min(w00, w01), min(w10, w11)), max(max(w00, w01), max(w10, w11))
-            sure = min(min(t00, t01), min(t10, t11))
-            doubt = max(max(t00, t01), max(t10, t11))
-            same = sure > _ZERO or (sure == _ZERO and doubt == _ZERO)
-            if same and least < _INFINITE:
-                same = most - least <= _SMOOTH * least + _SMOOTH_WAY
-            if same or doubt < _ZERO:
-                for di in range(deep):
-                    fy = np.float32(di) * part
-                    w0, w1 = w00 + (w10 - w00) * fy, w01 + (w11 - w01) * fy
-                    t0, t1 = t00 + (t10 - t00) * fy, t01 + (t11 - t01) * fy
-                    for dj in range(wide):
-                        fx = np.float32(dj) * part
-                        way = w0 + (w1 - w0) * fx if least < _INFINITE else _INFINITE
-                        distance[y0 + di, x0 + dj] = way
+            w00 = lengths[i, j]
+            w01 = lengths[i, right]
+            w10 = lengths[below, j]
+            w11 = lengths[below, right]
+            t00 = weights[i, j]
+            t01 = weights[i, right]
+            t10 = weights[below, j]
+            t11 = weights[below, right]
+            min_length = min(min(w00, w01), min(w10, w11))
+            max_length = max(max(w00, w01), max(w10, w11))
+            min_weight = min(min(t00, t01), min(t10, t11))
+            max_weight = max(max(t00, t01), max(t10, t11))
+            is_same_surface = min_weight > _ZERO or (min_weight == _ZERO and max_weight == _ZERO)
+            if is_same_surface and min_length < _INFINITE:
+                is_same_surface = (
+                    max_length - min_length <= _SMOOTH_SHARE * min_length + _SMOOTH_LENGTH
+                )
+            if is_same_surface or max_weight < _ZERO:
+                for di in range(num_rows):
+                    fy = np.float32(di) * inverse_stride
+                    w0 = w00 + (w10 - w00) * fy
+                    w1 = w01 + (w11 - w01) * fy
+                    t0 = t00 + (t10 - t00) * fy
+                    t1 = t01 + (t11 - t01) * fy
+                    for dj in range(num_columns):
+                        fx = np.float32(dj) * inverse_stride
+                        length = w0 + (w1 - w0) * fx if min_length < _INFINITE else _INFINITE
+                        distance[y0 + di, x0 + dj] = length
                         weight[y0 + di, x0 + dj] = t0 + (t1 - t0) * fx
                 continue
-            for di in range(deep):
-                for dj in range(wide):
-                    way, trust = w00, t00
-                    column, row = left + x0 + dj, top + y0 + di
+            for di in range(num_rows):
+                for dj in range(num_columns):
+                    length = w00
+                    pixel_weight = t00
+                    column = left + x0 + dj
+                    row = top + y0 + di
                     if di > 0 or dj > 0:
-                        way, trust = _INFINITE, _ZERO
-                        asked = needed[y0 + di, x0 + dj] and _inside(alpha, column, row)
-                        if asked and _sees_water(view, alpha, column, row):
+                        length = _INFINITE
+                        pixel_weight = _ZERO
+                        is_needed = needed[y0 + di, x0 + dj] and _inside(alpha, column, row)
+                        if is_needed and _sees_water(view, alpha, column, row):
                             lists[0, count] = np.float32(column) + _HALF
                             lists[1, count] = np.float32(row) + _HALF
                             count += 1
-                    distance[y0 + di, x0 + dj] = way
-                    weight[y0 + di, x0 + dj] = trust
+                    distance[y0 + di, x0 + dj] = length
+                    weight[y0 + di, x0 + dj] = pixel_weight
         _run(pyramid, view, lanes, lists[0], lists[1], count, lists[2], lists[3])
         for n in range(count):
-            x, y = int(lists[0, n]) - left, int(lists[1, n]) - top
+            x = int(lists[0, n]) - left
+            y = int(lists[1, n]) - top
             distance[y, x] = lists[2, n]
             weight[y, x] = lists[3, n]
-        for y in range(y0, y0 + deep):
+        for y in range(y0, y0 + num_rows):
             _to_metres(view, alpha, needed[y], left, top + y, distance[y], weight[y])

@@ -1,10 +1,9 @@
-"""A water surface's picture: what it reflects, and what is seen through it. The torch definition,
-and the launch of the CPU's kernel.
+"""Colour of a water surface: the torch definition, and the launch of the CPU's kernel.
 
     water = sum_i w_i F_i R_i + (1 - sum_i w_i F_i) T
 
-i runs over the slopes inside a pixel; F: reflected share of the light, R: what comes from the
-mirrored direction, T: what comes up through the surface.
+i runs over the slopes inside a pixel, w is their weight, F the reflected share of the light, R the
+light from the mirrored direction, and T the light that comes up through the surface.
 """
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ from augment.effects.flood.flood import FloodMedium, Layer, reflectance
 from augment.effects.flood.screen_space import ScreenReflection
 from augment.effects.flood.water_kernels import (
     BED_STEPS,
+    CONVERGED_M,
     EDGE,
     FAINT,
     FARTHEST,
@@ -32,11 +32,10 @@ from augment.effects.flood.water_kernels import (
     MATCH_SHARE,
     MIN_COSINE,
     MIN_DEPTH,
-    SETTLED_M,
+    MIN_NORMAL_Z2,
     SOLID_ALPHA,
-    STEEPEST,
 )
-from augment.effects.flood.water_plane import image_coordinates, places_in
+from augment.effects.flood.water_plane import image_coordinates, scale_and_offset
 from augment.effects.flood.waves import WaveField
 from augment.memo import memo_of
 from augment.render.buffers import CPU, kernels_for
@@ -56,7 +55,7 @@ from augment.sky import (
 
 
 class Water(NamedTuple):
-    """What `shade_water` is given; fog is None where it has no density."""
+    """Arguments of `shade_water`; fog is None if it has no density."""
 
     camera: Camera
     cover: Float[Tensor, "h w"]
@@ -82,12 +81,22 @@ def shade_water(
     fog: Fog | None = None,
     backend: str = CPU,
 ) -> Float[Tensor, "h w 3"]:
-    """Colour of the water where the camera's rays meet it, not clamped; 0 where they do not.
+    """Return the colour of the water where the camera's rays meet it, not clamped; 0 elsewhere.
 
-    cover: alpha of what stands before the water; above HIDDEN_COVER the result is the water's own
-    colour, or the fog's. bed: from a window of the same image. mirror: from the mirrored eye.
-    screen: serves the smooth pixels. Layers are fogged already; fog here dims the sky and the
-    water's own colour. backend: the CPU's kernel equals the definition within float rounding.
+    The layers contain their fog already. The fog here dims the sky and the colour of deep water.
+
+    Args:
+        camera: camera of the pixels, a window of the image.
+        cover: alpha of the scene in front of the water. Above HIDDEN_COVER the result is the colour
+            of deep water, or of the fog.
+        medium: the water.
+        field: normals of the waves.
+        bed: the bed, from a window of the same image.
+        mirror: the scene above the water, from the mirrored eye.
+        screen: screen-space reflections, for the smooth pixels.
+        sky: the sky.
+        fog: the fog.
+        backend: the CPU's kernel equals the definition within float rounding.
 
     Raises:
         ValueError: the bed's camera and this one are not windows of one image.
@@ -106,19 +115,19 @@ def shade_water(
     out = below
     if medium.refraction_index != 1:
         rays = mirrored(surface.to_eye, normals)
-        seen = below.new_zeros(*weights.shape, 4)
+        reflected = below.new_zeros(*weights.shape, 4)
         if mirror is not None:
-            seen = reflect_mirror(surface, rays, mirror, smooth)
+            reflected = reflect_mirror(surface, rays, mirror, smooth)
         if screen is not None:
-            image = reflect_screen(surface, rays[0], screen, smooth, seen[0])
-            seen = torch.cat((image[None], seen[1:]))
-        # Facets that look away from the eye count as seen edge-on.
+            image = reflect_screen(surface, rays[0], screen, smooth, reflected[0])
+            reflected = torch.cat((image[None], reflected[1:]))
+        # Facets that face away from the eye count as edge-on.
         cosine = (normals * surface.to_eye).sum(-1).clamp(MIN_COSINE, 1)
         share = weights * reflectance(cosine, medium.refraction_index, medium.fresnel)
-        color = before_sky(seen, reflect_sky(surface, rays, water))
+        color = before_sky(reflected, reflect_sky(surface, rays, water))
         out = below + (share[..., None] * (color - below)).sum(0)
-    plain = _tensor(medium.rgb if fog is None else fog.rgb, out)
-    out = torch.where((cover <= HIDDEN_COVER)[..., None], out, plain)
+    plain_color = _tensor(medium.rgb if fog is None else fog.rgb, out)
+    out = torch.where((cover <= HIDDEN_COVER)[..., None], out, plain_color)
     return torch.where(surface.meets[..., None], out, 0)
 
 
@@ -126,15 +135,15 @@ def _tensor(numbers: tuple[float, ...], like: Tensor) -> Tensor:
     return torch.tensor(numbers, dtype=like.dtype, device=like.device)
 
 
-# ---- What a layer's image shows in a direction ---------------------------------------------------
+# ---- Look-ups in a layer's image by direction ----------------------------------------------------
 # Image coordinates are (column, row) in pixels. Vectors are in world axes and start at the layer's
 # optical centre.
 
-MIP_LEVELS = 7  # blurs up to 64 pixels: three taps are seldom farther apart
+MIP_LEVELS = 7  # they blur up to 64 pixels; three taps are seldom farther apart
 
 
 def project(camera: Camera, vectors: Float[Tensor, "*B 3"]) -> tuple[Tensor, Tensor]:
-    """Column and row of vectors that start at the optical centre; huge for those behind it."""
+    """Return column and row of vectors from the optical centre; huge values behind the camera."""
     local = vectors @ _axes(camera, vectors).T
     x, y, z = local.unbind(-1)
     z = z.clamp_min(MIN_DEPTH)
@@ -146,7 +155,7 @@ def is_inside(camera: Camera, column: Tensor, row: Tensor) -> Bool[Tensor, "*B"]
 
 
 def clamp_to(camera: Camera, column: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
-    """The nearest coordinates between the centres of the image's outermost pixels."""
+    """Clamp coordinates to the area between the centres of the image's outermost pixels."""
     return column.clamp(0.5, camera.width - 0.5), row.clamp(0.5, camera.height - 0.5)
 
 
@@ -155,23 +164,24 @@ def _axes(camera: Camera, like: Tensor) -> Float[Tensor, "3 3"]:
 
 
 def point_at(layer: Layer, column: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
-    """(is there a surface, vector to it [*B, 3]) at the nearest pixel of coordinates inside."""
+    """Return (has a surface, vector to it [*B, 3]) at the nearest pixel inside the image."""
     camera = layer.camera
-    column, row = column.clamp(0, camera.width - 1).long(), row.clamp(0, camera.height - 1).long()
+    column = column.clamp(0, camera.width - 1).long()
+    row = row.clamp(0, camera.height - 1).long()
     solid = layer.alpha[row, column] >= SOLID_ALPHA
-    depth = torch.where(solid, layer.depth[row, column], 0)  # meaningless where nothing is
+    depth = torch.where(solid, layer.depth[row, column], 0)  # meaningless without a surface
     x = (column + (0.5 - camera.cx)) * depth / camera.fx
     y = (row + (0.5 - camera.cy)) * depth / camera.fy
     return solid, torch.stack((x, y, depth), -1) @ _axes(camera, depth)
 
 
 def stacked(layer: Layer) -> Float[Tensor, "H W 4"]:
-    """Premultiplied colour and alpha in one image."""
+    """Return premultiplied colour and alpha in one image."""
     return torch.cat((layer.rgb, layer.alpha[..., None]), -1)
 
 
 def bilinear(image: Float[Tensor, "H W C"], column: Tensor, row: Tensor) -> Float[Tensor, "*B C"]:
-    """The image between its pixel centres; coordinates outside take the border's value."""
+    """Interpolate an image between pixel centres; coordinates outside take the border's value."""
     height, width, channels = image.shape
     return _between(image.reshape(-1, channels), column, row, 0, width, height)
 
@@ -184,38 +194,50 @@ def _between(
     width: int | Tensor,
     height: int | Tensor,
 ) -> Tensor:
-    """first, width, height: of the image in the flat one, of each pixel its own or one for all."""
-    x, y = (column - 0.5).clamp_min(0).clamp_max(width - 1), (row - 0.5).clamp_min(0)
+    """Interpolate bilinearly in images that lie one after the other in `flat`.
+
+    first, width, height: first row of the image in `flat` and its size; one value, or one a pixel.
+    """
+    x = (column - 0.5).clamp_min(0).clamp_max(width - 1)
+    y = (row - 0.5).clamp_min(0)
     y = y.clamp_max(height - 1)
-    c0, r0 = x.long(), y.long()
-    c1, r1 = (c0 + 1).clamp_max(width - 1), (r0 + 1).clamp_max(height - 1)
-    fc, fr = (x - c0)[..., None], (y - r0)[..., None]
-    above, below = first + r0 * width, first + r1 * width
+    c0 = x.long()
+    r0 = y.long()
+    c1 = (c0 + 1).clamp_max(width - 1)
+    r1 = (r0 + 1).clamp_max(height - 1)
+    fc = (x - c0)[..., None]
+    fr = (y - r0)[..., None]
+    above = first + r0 * width
+    below = first + r1 * width
     top = flat[above + c0] * (1 - fc) + flat[above + c1] * fc
     bottom = flat[below + c0] * (1 - fc) + flat[below + c1] * fc
     return top * (1 - fr) + bottom * fr
 
 
 def mip_chain(image: Float[Tensor, "H W C"]) -> list[Tensor]:
-    """The image and its averages over 2 x 2 pixels, each from the last; odd borders count twice."""
+    """Return the image and its averages over 2 x 2 pixels, level by level.
+
+    The last row or column of an odd size counts twice.
+    """
     levels = [image]
     while len(levels) < MIP_LEVELS and max(levels[-1].shape[:2]) > 1:
-        last = levels[-1]
-        height, width = last.shape[:2]
+        fine = levels[-1]
+        height, width = fine.shape[:2]
         if height % 2:
-            last = torch.cat((last, last[-1:]))
+            fine = torch.cat((fine, fine[-1:]))
         if width % 2:
-            last = torch.cat((last, last[:, -1:]), 1)
-        wide = last[0::2] + last[1::2]
-        levels.append((wide[:, 0::2] + wide[:, 1::2]) * 0.25)
+            fine = torch.cat((fine, fine[:, -1:]), 1)
+        row_sums = fine[0::2] + fine[1::2]
+        levels.append((row_sums[:, 0::2] + row_sums[:, 1::2]) * 0.25)
     return levels
 
 
 def blurred(
     levels: list[Tensor], column: Tensor, row: Tensor, spacing: Float[Tensor, "H W"]
 ) -> Float[Tensor, "T H W C"]:
-    """Bilinear from the mip level whose pixels are `spacing` wide (pixels), blended between two."""
-    sizes, first = [], 0
+    """Look up the mip level whose pixels are `spacing` wide (pixels), blending two levels."""
+    sizes = []
+    first = 0
     for image in levels:
         sizes.append((first, image.shape[1], image.shape[0]))
         first += image.shape[0] * image.shape[1]
@@ -226,45 +248,42 @@ def blurred(
     low = level.floor()
     share = (level - low)[..., None]
 
-    def seen(number: Tensor) -> Tensor:
+    def look_up(number: Tensor) -> Tensor:
         scale = torch.exp2(-number)
         return _between(flat, column * scale, row * scale, *table[number.long()].unbind(-1))
 
-    return (1 - share) * seen(low) + share * seen((low + 1).clamp_max(top))
+    return (1 - share) * look_up(low) + share * look_up((low + 1).clamp_max(top))
 
 
-# ---- Where a camera's rays meet the water, and how the surface is tilted there -------------------
+# ---- Points where a camera's rays meet the water, and the tilt of the surface there --------------
 # Points are relative to the eye: float32 stays exact far from the world's origin.
 
-SMOOTH_PX = 2.0  # reflections that a pixel's slopes spread over less are as good as sharp
+SMOOTH_PX = 2.0  # reflections spread by a pixel's slopes over less than this count as sharp
 
 
 class Surface(NamedTuple):
-    """What the pixels of a camera see of a plane `height_m` below the eye.
+    """A plane below the eye, at every pixel of a camera."""
 
-    meets: the ray goes down; where it does not, the rest is made up but finite. directions: rays
-    with unit z in the camera. points: where they meet the plane. distance: from there to the eye.
-    """
-
-    height_m: float
-    meets: Bool[Tensor, "H W"]
-    directions: Float[Tensor, "H W 3"]
-    points: Float[Tensor, "H W 3"]
-    distance: Float[Tensor, "H W"]
-    to_eye: Float[Tensor, "H W 3"]
+    height_m: float  # of the eye over the plane
+    meets: Bool[Tensor, "H W"]  # the ray goes down; elsewhere the other values are dummies
+    directions: Float[Tensor, "H W 3"]  # rays with unit z in the camera
+    points: Float[Tensor, "H W 3"]  # where the rays meet the plane, relative to the eye
+    distance: Float[Tensor, "H W"]  # from these points to the eye, metres
+    to_eye: Float[Tensor, "H W 3"]  # unit vectors from these points to the eye
 
 
 def meet_plane(camera: Camera, level_z_m: float, like: Tensor) -> Surface:
-    """The horizontal plane at level_z_m, below the eye, as the camera's rays meet it. like: whose
-    type and device the result has.
+    """Return the points where a camera's rays meet the plane at level_z_m, below the eye.
+
+    like: a tensor whose type and device the result takes.
     """
-    exact = camera.ray_directions(torch.float64, like.device)
-    meets = exact[..., 2] < 0
+    rays_f64 = camera.ray_directions(torch.float64, like.device)
+    meets = rays_f64[..., 2] < 0
     straight_down = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64, device=like.device)
-    directions = torch.where(meets[..., None], exact, straight_down)
+    directions = torch.where(meets[..., None], rays_f64, straight_down)
     height = float(camera.centre[2]) - level_z_m
-    along = (height / -directions[..., 2]).clamp(max=FARTHEST)
-    points = along[..., None] * directions
+    depth = (height / -directions[..., 2]).clamp(max=FARTHEST)
+    points = depth[..., None] * directions
     points[..., 2] = -height
     length = directions.norm(dim=-1)
     return Surface(
@@ -272,20 +291,20 @@ def meet_plane(camera: Camera, level_z_m: float, like: Tensor) -> Surface:
         meets,
         directions.to(like.dtype),
         points.to(like.dtype),
-        (along * length).to(like.dtype),
+        (depth * length).to(like.dtype),
         (-directions / length[..., None]).to(like.dtype),
     )
 
 
 def is_smooth(field: WaveField, camera: Camera) -> Bool[Tensor, "H W"]:
-    """Where the slopes inside a pixel of `camera` hardly blur what it mirrors."""
+    """Return the mask of pixels whose inner slopes hardly blur their reflections."""
     return field.slope_variance < smooth_variance(camera)
 
 
 def smooth_variance(camera: Camera) -> float:
-    """The slope variance V that spreads a reflection by 2 sqrt(3 V) fy = SMOOTH_PX pixels.
+    """Return the slope variance V that spreads a reflection by 2 sqrt(3 V) fy = SMOOTH_PX pixels.
 
-    A slope turns the mirrored ray by twice its angle; sqrt(3 V) is what `tilted_normals` takes.
+    A slope turns the mirrored ray by twice its angle; `tilted_normals` uses the slope sqrt(3 V).
     """
     return (SMOOTH_PX / (2 * camera.fy)) ** 2 / 3
 
@@ -293,17 +312,18 @@ def smooth_variance(camera: Camera) -> float:
 def tilted_normals(
     surface: Surface, field: WaveField, smooth: Bool[Tensor, "H W"]
 ) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W 3"]]:
-    """Weights and unit normals of slopes that stand for all slopes in a pixel.
+    """Return weights and unit normals of three slopes that represent all slopes in a pixel.
 
-    Gauss-Hermite quadrature over the slope along the view's horizontal direction, whose variance is
-    V: the pixel's own normal, the first, has weight 2/3, slopes sqrt(3 V) to either side 1/6 each.
-    In smooth pixels the first alone counts.
+    They are a Gauss-Hermite quadrature over the slope along the view's horizontal direction, whose
+    variance is V. The pixel's mean normal comes first, with weight 2/3. The slopes sqrt(3 V) to
+    either side have weight 1/6 each. In smooth pixels the first normal alone counts.
     """
     dtype = surface.points.dtype
-    nx, ny = field.normal_x.to(dtype), field.normal_y.to(dtype)
-    nz = torch.sqrt((1 - nx * nx - ny * ny).clamp_min(STEEPEST))
+    nx = field.normal_x.to(dtype)
+    ny = field.normal_y.to(dtype)
+    nz = torch.sqrt((1 - nx * nx - ny * ny).clamp_min(MIN_NORMAL_Z2))
     horizontal = surface.to_eye[..., :2]
-    # Seen straight from above the view has no horizontal direction: nothing is tilted then.
+    # A view straight down has no horizontal direction: nothing is tilted then.
     horizontal = horizontal / horizontal.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     spread = torch.where(smooth, 0, torch.sqrt(3 * field.slope_variance.to(dtype)))
     offset = torch.stack((torch.zeros_like(spread), spread, -spread))[..., None]
@@ -315,7 +335,7 @@ def tilted_normals(
 
 
 def mirrored(to_eye: Float[Tensor, "H W 3"], normal: Tensor) -> Float[Tensor, "*B H W 3"]:
-    """Unit directions in which the surface mirrors the view, none below the horizon."""
+    """Return unit directions in which the surface mirrors the view, none below the horizon."""
     cosine = (normal * to_eye).sum(-1, keepdim=True)
     ray = 2 * cosine * normal - to_eye
     return _at_least_upward(ray)
@@ -324,7 +344,7 @@ def mirrored(to_eye: Float[Tensor, "H W 3"], normal: Tensor) -> Float[Tensor, "*
 def refracted(
     to_eye: Float[Tensor, "H W 3"], normal: Tensor, index: float
 ) -> Float[Tensor, "H W 3"]:
-    """Unit directions of the view under the surface by Snell's law, all of them downward.
+    """Return unit directions of the view under the surface by Snell's law, all of them downward.
 
     t = -v / n + (c / n - sqrt(1 - (1 - c^2) / n^2)) normal
     """
@@ -338,93 +358,106 @@ def _at_least_upward(ray: Tensor) -> Tensor:
     return torch.nn.functional.normalize(torch.cat((ray[..., :2], upward), -1), dim=-1)
 
 
-# ---- The bed as seen through the surface ---------------------------------------------------------
+# ---- The bed, through the surface ----------------------------------------------------------------
 
 
 def through_the_surface(
     surface: Surface, normal: Float[Tensor, "H W 3"], water: Water
 ) -> Float[Tensor, "H W 3"]:
-    """Colour of the light that comes up through the surface: T = a bed + (1 - a) water.
+    """Return the light that comes up through the surface, T = a bed + (1 - a) water.
 
-    The search along the refracted ray starts from the bed straight behind the pixel, which is taken
-    where it leaves the bed's image or meets a hole; the water's own colour where there is no bed
-    behind the pixel, or too deep to be seen.
+    The search along the refracted ray starts from the bed straight behind the pixel. That point is
+    used where the search leaves the bed's image or meets a hole. The result is the colour of deep
+    water where no bed is behind the pixel, or where the bed is too deep to be visible.
     """
-    camera, medium, bed, fog = water.camera, water.medium, water.bed, water.fog
+    camera = water.camera
+    medium = water.medium
+    bed = water.bed
+    fog = water.fog
     deep = _tensor(medium.rgb, normal).expand(normal.shape)
     if fog is not None:
         deep = blend_airlight(deep, fog_before(surface, water, fog), fog)
-    right, left, down, top = places_in(bed.camera, camera).tolist()
-    own_column, own_row = (
+    right, left, down, top = scale_and_offset(bed.camera, camera).tolist()
+    straight_column, straight_row = (
         ((torch.arange(size, device=normal.device) + 0.5) * scale + offset).to(normal.dtype)
         for size, scale, offset in ((camera.width, right, left), (camera.height, down, top))
     )
-    own_row, own_column = torch.meshgrid(own_row, own_column, indexing="ij")
-    own_solid, own_point = point_at(bed, own_column, own_row)
-    own_depth = _depth_below(surface, own_point)
+    straight_row, straight_column = torch.meshgrid(straight_row, straight_column, indexing="ij")
+    has_bed, straight_point = point_at(bed, straight_column, straight_row)
+    straight_depth = _depth_below(surface, straight_point)
     extinction = _tensor(medium.extinction_per_m, normal)
     bends = medium.refraction_index != 1
     ray = -surface.to_eye  # nothing bends, whatever the waves
     if bends:
         ray = refracted(surface.to_eye, normal, medium.refraction_index)
-    opaque = _optical_depth(own_depth / -ray[..., 2], extinction.min())
-    own_solid = own_solid & is_inside(bed.camera, own_column, own_row)
-    own_solid = own_solid & (opaque < -math.log(medium.bed_cut))
+    thickness = _optical_depth(straight_depth / -ray[..., 2], extinction.min())
+    has_bed = has_bed & is_inside(bed.camera, straight_column, straight_row)
+    has_bed = has_bed & (thickness < -math.log(medium.bed_cut))
     image = stacked(bed)
-    depth, colors = own_depth, bilinear(image, own_column, own_row)
+    depth = straight_depth
+    colors = bilinear(image, straight_column, straight_row)
     if bends:
-        found, met_depth, met_colors = _search(surface, ray, bed, image, own_solid, own_depth)
-        depth = torch.where(found, met_depth, depth)
-        colors = torch.where(found[..., None], met_colors, colors)
-    colors = torch.where(own_solid[..., None], colors, 0)
-    length = torch.where(own_solid, depth / -ray[..., 2], 0)[..., None]
-    a = torch.exp(-_optical_depth(length, extinction))
-    return a * (colors[..., :3] + (1 - colors[..., 3:]) * deep) + (1 - a) * deep
+        is_found, refracted_depth, refracted_colors = _search(
+            surface, ray, bed, image, has_bed, straight_depth
+        )
+        depth = torch.where(is_found, refracted_depth, depth)
+        colors = torch.where(is_found[..., None], refracted_colors, colors)
+    colors = torch.where(has_bed[..., None], colors, 0)
+    length = torch.where(has_bed, depth / -ray[..., 2], 0)[..., None]
+    transmittance = torch.exp(-_optical_depth(length, extinction))
+    return (
+        transmittance * (colors[..., :3] + (1 - colors[..., 3:]) * deep)
+        + (1 - transmittance) * deep
+    )
 
 
 def _search(
-    surface: Surface, ray: Tensor, bed: Layer, image: Tensor, found: Tensor, depth: Tensor
+    surface: Surface, ray: Tensor, bed: Layer, image: Tensor, is_found: Tensor, depth: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(found, depth below the plane, colour and alpha) of the bed along refracted rays."""
+    """Return (is found, depth below the plane, colour and alpha) of the bed along refracted rays.
+
+    is_found, depth: the start of the search: pixels with a bed and its depth below the plane.
+    """
     per_depth = ray / -ray[..., 2:]
-    going = found
+    is_moving = is_found
     for _ in range(BED_STEPS):
         column, row = project(bed.camera, surface.points + depth[..., None] * per_depth)
         solid, point = point_at(bed, column, row)
-        found = found & (~going | (is_inside(bed.camera, column, row) & solid))
-        going = going & found
-        last, depth = depth, torch.where(going, _depth_below(surface, point), depth)
-        going = going & ((depth - last).abs() > SETTLED_M)
+        is_found = is_found & (~is_moving | (is_inside(bed.camera, column, row) & solid))
+        is_moving = is_moving & is_found
+        previous_depth = depth
+        depth = torch.where(is_moving, _depth_below(surface, point), depth)
+        is_moving = is_moving & ((depth - previous_depth).abs() > CONVERGED_M)
     column, row = project(bed.camera, surface.points + depth[..., None] * per_depth)
     colors = bilinear(image, column, row)
-    found = found & is_inside(bed.camera, column, row) & (colors[..., 3] >= SOLID_ALPHA)
-    return found, depth, colors
+    is_found = is_found & is_inside(bed.camera, column, row) & (colors[..., 3] >= SOLID_ALPHA)
+    return is_found, depth, colors
 
 
 def _optical_depth(length: Tensor, extinction_per_m: Tensor) -> Tensor:
-    return torch.where(length > 0, extinction_per_m * length, 0)  # infinity times no way is none
+    return torch.where(length > 0, extinction_per_m * length, 0)  # infinity times 0 is 0 here
 
 
 def _depth_below(surface: Surface, point: Tensor) -> Float[Tensor, "H W"]:
-    """Metres of points below the plane, 0 above it. point: relative to the eye."""
+    """Return how far points (relative to the eye) are below the plane, metres; 0 above it."""
     return (-surface.height_m - point[..., 2]).clamp_min(0)
 
 
 def fog_before(surface: Surface, water: Water, fog: Fog) -> Float[Tensor, "H W"]:
-    """Optical depth of the fog between the eye and the surface."""
+    """Return the optical depth of the fog between the eye and the surface."""
     level = torch.full_like(surface.distance, water.medium.level_z_m)
     return optical_depth(fog, surface.distance, float(water.camera.centre[2]), level)
 
 
-# ---- What the surface reflects: the sky, the mirrored layer, the image itself --------------------
+# ---- Reflections of the sky, of the mirrored layer, and of the image itself ----------------------
 
 
 def reflect_sky(
     surface: Surface, rays: Float[Tensor, "T H W 3"], water: Water
 ) -> Float[Tensor, "T H W 3"]:
-    """The sky in unit directions that climb, through the fog before it and before the surface."""
-    seen, layered = sky_behind(water.sky, water.fog)
-    colors = sample_at(seen, rays)
+    """Return the sky in rising unit directions, through the fog before it and the surface."""
+    visible_sky, layered = sky_behind(water.sky, water.fog)
+    colors = sample_at(visible_sky, rays)
     if layered is None:
         return colors
     above = vertical_optical_depth(layered, water.medium.level_z_m)
@@ -435,19 +468,20 @@ def reflect_sky(
 def reflect_mirror(
     surface: Surface, rays: Float[Tensor, "T H W 3"], mirror: Layer, smooth: Bool[Tensor, "H W"]
 ) -> Float[Tensor, "T H W 4"]:
-    """The mirrored layer's colours and alphas.
+    """Return colours and alphas of the mirrored layer along mirrored rays.
 
-    A ray's length is first that of the flat mirror's ray, then what the layer shows where the
-    tilted ray of that length ends. All of a pixel's rays take the length of the first; each sees an
-    average as wide as they lie apart: single points would show as so many ghosts.
+    The length of a ray is first the length of the flat mirror's ray, then the distance to the
+    surface that the layer shows where the tilted ray of that length ends. All rays of a pixel take
+    the length of the first ray. Each takes an average as wide as the rays' spacing in the image,
+    because single points would show as separate ghost images.
     """
     to_mirror = _tensor((0.0, 0.0, -2 * surface.height_m), rays)
     flat = surface.directions * _tensor((1.0, 1.0, -1.0), rays)
 
     def end_of(ray: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-        far = distance.isinf()
-        end = surface.points + torch.where(far, 0, distance)[..., None] * ray - to_mirror
-        vector = torch.where(far[..., None], ray, end)
+        is_infinite = distance.isinf()
+        end = surface.points + torch.where(is_infinite, 0, distance)[..., None] * ray - to_mirror
+        vector = torch.where(is_infinite[..., None], ray, end)
         return clamp_to(mirror.camera, *project(mirror.camera, vector))
 
     def distance_at(column: Tensor, row: Tensor) -> Tensor:
@@ -455,11 +489,11 @@ def reflect_mirror(
         distance = (point + to_mirror - surface.points).norm(dim=-1)
         return torch.where(solid, distance, torch.inf)
 
-    first = distance_at(*clamp_to(mirror.camera, *project(mirror.camera, flat)))
-    column, row = end_of(rays, distance_at(*end_of(rays[0], first)))
-    apart = torch.hypot(column[1:] - column[0], row[1:] - row[0]).mean(0)
+    flat_distance = distance_at(*clamp_to(mirror.camera, *project(mirror.camera, flat)))
+    column, row = end_of(rays, distance_at(*end_of(rays[0], flat_distance)))
+    spacing = torch.hypot(column[1:] - column[0], row[1:] - row[0]).mean(0)
     levels = mip_chain(stacked(mirror))
-    return blurred(levels, column, row, torch.where(smooth, 1, apart))
+    return blurred(levels, column, row, torch.where(smooth, 1, spacing))
 
 
 def reflect_screen(
@@ -467,9 +501,9 @@ def reflect_screen(
     ray: Float[Tensor, "H W 3"],
     screen: ScreenReflection,
     smooth: Bool[Tensor, "H W"],
-    rest: Tensor,
+    mirror_color: Tensor,
 ) -> Float[Tensor, "H W 4"]:
-    """What the image itself shows where the rays of smooth pixels end; `rest` elsewhere."""
+    """Return the image at the ends of smooth pixels' rays; `mirror_color` elsewhere."""
     camera = screen.layer.camera
     column, row, matches = _end_in_image(surface, ray, screen)
     matches = matches & is_inside(camera, column, row) & smooth
@@ -478,13 +512,14 @@ def reflect_screen(
     x = (torch.minimum(across, down) / EDGE).clamp(0, 1)
     fade = x * x * (3 - 2 * x)
     weight = torch.where(matches, screen.weight * fade, 0)[..., None]
-    seen = bilinear(stacked(screen.layer), *clamp_to(camera, column, row))
-    return weight * seen + (1 - weight) * rest
+    image_color = bilinear(stacked(screen.layer), *clamp_to(camera, column, row))
+    return weight * image_color + (1 - weight) * mirror_color
 
 
-def before_sky(seen: Float[Tensor, "*B 4"], sky: Float[Tensor, "*B 3"]) -> Tensor:
-    """Premultiplied colours and alphas before a sky, which is left out where it hardly shows."""
-    color, alpha = seen[..., :3], seen[..., 3:]
+def before_sky(rgba: Float[Tensor, "*B 4"], sky: Float[Tensor, "*B 3"]) -> Tensor:
+    """Blend premultiplied colours and alphas over a sky; leave it out where it hardly shows."""
+    color = rgba[..., :3]
+    alpha = rgba[..., 3:]
     opaque = 1 - alpha <= FAINT
     return torch.where(opaque, color / alpha.clamp_min(0.5), color + (1 - alpha) * sky)
 
@@ -492,44 +527,54 @@ def before_sky(seen: Float[Tensor, "*B 4"], sky: Float[Tensor, "*B 3"]) -> Tenso
 def _end_in_image(
     surface: Surface, ray: Tensor, screen: ScreenReflection
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(column, row, does the image show there what the ray ends at)."""
-    layer, far = screen.layer, screen.distance.isinf()
+    """Return (column, row, is the surface of the image there the one that the ray ends at)."""
+    layer = screen.layer
+    is_infinite = screen.distance.isinf()
     forward = _axes(layer.camera, ray)[2]
 
-    def look(distance: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def look_up(distance: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         end = surface.points + distance[..., None] * ray
-        column, row = project(layer.camera, torch.where(far[..., None], ray, end))
+        column, row = project(layer.camera, torch.where(is_infinite[..., None], ray, end))
         solid, point = point_at(layer, column, row)
         ahead = end @ forward
         matches = (point @ forward - ahead).abs() < (MATCH_SHARE * ahead).clamp_min(MATCH_M)
         return column, row, solid, point, matches
 
-    distance = torch.where(far, 0, screen.distance)
-    _, _, solid, point, _ = look(distance)
+    distance = torch.where(is_infinite, 0, screen.distance)
+    _, _, solid, point, _ = look_up(distance)
     corrected = (point - surface.points).norm(dim=-1)
-    column, row, solid, _, matches = look(torch.where(solid, corrected, distance))
-    return column, row, torch.where(far, ~solid, solid & matches)
+    column, row, solid, _, matches = look_up(torch.where(solid, corrected, distance))
+    return column, row, torch.where(is_infinite, ~solid, solid & matches)
 
 
 # ---- The kernel's arrays -------------------------------------------------------------------------
 
-ROWS = 8  # image rows a thread takes at a time: rows without water cost nothing
-MIP_ROWS = 32
-SKY_SIZE = 256  # texels along a face where a sky that is no cube map is sampled onto one
-LARGEST = 1e30  # stands for infinity: its products with 0 are 0
+ROWS = 8  # image rows that a thread takes at a time; rows without water cost nothing
+MIP_ROWS = 32  # rows of a mip level that a thread takes at a time
+SKY_SIZE = 256  # texels along a face of the cube map onto which another sky is sampled
+LARGEST = 1e30  # replaces infinity: its products with 0 are 0
 
 
 def _run_kernel(water: Water) -> Tensor:
-    camera, field, screen = water.camera, water.field, water.screen
+    camera = water.camera
+    field = water.field
+    screen = water.screen
     texels, size, layered = _flat_faces(water.sky, water.fog)
     limit = smooth_variance(camera)
     axes = np.ascontiguousarray(camera.world_from_camera[:3, :3].numpy())
-    front, distance, weight = None, water.cover, water.cover
+    front = None
+    distance = water.cover
+    weight = water.cover
     if screen is not None:
-        front, distance, weight = screen.layer, screen.distance, screen.weight
+        front = screen.layer
+        distance = screen.distance
+        weight = screen.weight
     x, y, variance = map(_array, (field.normal_x, field.normal_y, field.slope_variance))
     pixels = kernels.Pixels(
-        *image_coordinates(camera), axes, _array(water.cover), places_in(water.bed.camera, camera)
+        *image_coordinates(camera),
+        axes,
+        _array(water.cover),
+        scale_and_offset(water.bed.camera, camera),
     )
     out = np.empty((camera.height, camera.width, 3), np.float32)
     with kernel_threads(ROWS):
@@ -553,18 +598,22 @@ def _array(part: Tensor) -> np.ndarray:
 
 
 def _flat_faces(sky: Sky, fog: Fog | None) -> tuple[Tensor, int, Fog | None]:
-    """(flat cube map, size of its faces with border, the fog before them)."""
-    seen, layered = sky_behind(sky, fog)
-    if isinstance(seen, ConstantSky):
-        return _padded(seen.rgb.expand(6, 3, 3, 3)), 3, layered
-    if isinstance(seen, CubemapSky):
-        key = ("flat faces", seen.faces._version)
-        faces = memo_of(seen).get(key, lambda: _padded(bordered_faces(seen)))
-        return faces, len(seen.faces[0]) + 2, layered
-    if isinstance(seen, LatLongSky):
-        key = ("flat faces", seen.image._version)
-        return memo_of(seen).get(key, lambda: _padded(_sampled(seen))), SKY_SIZE + 2, layered
-    return _padded(_sampled(seen)), SKY_SIZE + 2, layered
+    """Return (flat cube map, size of its faces with border, the fog before them)."""
+    visible_sky, layered = sky_behind(sky, fog)
+    if isinstance(visible_sky, ConstantSky):
+        return _padded(visible_sky.rgb.expand(6, 3, 3, 3)), 3, layered
+    if isinstance(visible_sky, CubemapSky):
+        key = ("flat faces", visible_sky.faces._version)
+        faces = memo_of(visible_sky).get(key, lambda: _padded(bordered_faces(visible_sky)))
+        return faces, len(visible_sky.faces[0]) + 2, layered
+    if isinstance(visible_sky, LatLongSky):
+        key = ("flat faces", visible_sky.image._version)
+        return (
+            memo_of(visible_sky).get(key, lambda: _padded(_sampled(visible_sky))),
+            SKY_SIZE + 2,
+            layered,
+        )
+    return _padded(_sampled(visible_sky)), SKY_SIZE + 2, layered
 
 
 def _sampled(sky: Sky) -> Tensor:
@@ -572,7 +621,7 @@ def _sampled(sky: Sky) -> Tensor:
 
 
 def _padded(faces: Tensor) -> Tensor:
-    """Four numbers a texel, and a row and a texel beyond them."""
+    """Pad faces to four numbers a texel, with a row and a texel beyond them."""
     size = faces.shape[1]
     out = torch.zeros(6 * size * size + size + 1, 4)
     out[: 6 * size * size, :3] = faces.detach().reshape(-1, 3)
@@ -580,13 +629,16 @@ def _padded(faces: Tensor) -> Tensor:
 
 
 def _image(layer: Layer | None) -> kernels.Image:
-    """A layer as the kernel takes it: of None an empty one."""
+    """Return a layer in the kernel's format; an empty image for None."""
     if layer is None:
         nothing = np.zeros(0, np.float32)
         return kernels.Image(np.zeros(22, np.float32), nothing, nothing, nothing)
     camera = layer.camera
     rotation = camera.camera_from_world[:3, :3].numpy()
-    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    fx = camera.fx
+    fy = camera.fy
+    cx = camera.cx
+    cy = camera.cy
     project = rotation * [[fx], [fy], [1.0]]
     rays = rotation.T @ [[1 / fx, 0.0, -cx / fx], [0.0, 1 / fy, -cy / fy], [0.0, 0.0, 1.0]]
     numbers = [*project.reshape(-1), *rays.reshape(-1), cx, cy, camera.width, camera.height]
@@ -599,11 +651,15 @@ def _image(layer: Layer | None) -> kernels.Image:
 def _mips(layer: Layer | None, rough: bool) -> kernels.Mips:
     if layer is None or not rough:
         return kernels.Mips(np.zeros(1, np.float32), np.zeros((1, 3), np.int64))
-    rgb, alpha = _array(layer.rgb), _array(layer.alpha)
+    rgb = _array(layer.rgb)
+    alpha = _array(layer.alpha)
     height, width = alpha.shape
-    spare, sizes, first = width + 1, [(0, width, height)], height * width
+    spare = width + 1
+    sizes = [(0, width, height)]
+    first = height * width
     while len(sizes) < MIP_LEVELS and max(height, width) > 1:
-        height, width = (height + 1) // 2, (width + 1) // 2
+        height = (height + 1) // 2
+        width = (width + 1) // 2
         sizes.append((first, width, height))
         first += height * width
     mips = np.empty((first + spare, 4), np.float32)
@@ -617,13 +673,17 @@ def _mips(layer: Layer | None, rough: bool) -> kernels.Mips:
 
 
 def _medium_numbers(water: Water, layered: Fog | None) -> np.ndarray:
-    """`kernels.Medium`. layered: the fog before the sky."""
-    medium, eye_z = water.medium, float(water.camera.centre[2])
+    """Return the numbers of `kernels.Medium`. layered: the fog before the sky."""
+    medium = water.medium
+    eye_z = float(water.camera.centre[2])
     level = medium.level_z_m
-    per_m, above, airlight = 0.0, -1.0, (0.0, 0.0, 0.0)
+    per_m = 0.0
+    above = -1.0
+    airlight = (0.0, 0.0, 0.0)
     if water.fog is not None:
         metre, height = torch.tensor([1.0, level], dtype=torch.float64)
-        per_m, airlight = float(optical_depth(water.fog, metre, eye_z, height)), water.fog.rgb
+        per_m = float(optical_depth(water.fog, metre, eye_z, height))
+        airlight = water.fog.rgb
     if layered is not None:
         above = vertical_optical_depth(layered, level)
     numbers = [eye_z - level, medium.refraction_index, medium.fresnel == "schlick"]

@@ -1,10 +1,10 @@
-"""Where drops are on a camera's glass: a function of seed, camera, time and the car's path.
+"""Drops on a camera's glass: a function of seed, camera, time and the car's path.
 
-Each of the drops that a recipe counts lives through one life after another. A life has a number, by
-the time; where it begins and how large it is are hashed from seed, camera, drop and life. With a
-wiper, lives end when it wipes, and drops arrive one by one until it wipes again. Larger drops run:
-down by gravity, and with the air stream by the way that the car has driven since they came. Nothing
-is remembered from image to image.
+Each of the drops that a recipe counts lives through one life after another. The time gives the
+number of a life. Its position and size are hashed from seed, camera, drop and life. With a wiper,
+lives end when it wipes, and drops arrive one by one until it wipes again. Larger drops run: down by
+gravity, and with the air stream by the distance that the car has driven since they came. No state
+is carried from image to image.
 """
 
 from __future__ import annotations
@@ -23,43 +23,48 @@ from augment.rng import STEP_X, mix, rng_for
 from augment.scene import Scene
 from recipes.lens_drops import LensDrops
 
-LIFE_S = (8.0, 40.0)  # of a drop on glass that nothing wipes
+LIFE_S = (8.0, 40.0)  # shortest and longest life of a drop on glass without a wiper
 # Drops above 0.5 mm that come down on a square metre in a second, by the rate in mm/h to the power
 # of 0.53: Marshall and Palmer's sizes at Atlas's speeds within 8 % from 2.5 to 100 mm/h.
 FLUX = 850.0
-MAX_COUNT = 500
-RUNS_FROM_M = 1.2e-3  # radius from which a drop overcomes the glass's hold
-RUN_MPS = 3e-3  # of a drop larger than that by a millimetre
-BALANCE_MPS = 15.0  # speed of the car at which the air stream carries as strongly as gravity
-_MAX_RUN = 2.0  # times RUN_MPS
-_MEANDER_M, _MEANDER_TURN_M = 0.6e-3, 8e-3  # to the sides of a drop's way, and how long a bend is
-_LARGEST_SD = 2.5  # of the radii's logarithm, where their distribution ends
-_DRAWS = 12
+MAX_COUNT = 500  # most drops on a camera's glass
+RUNS_FROM_M = 1.2e-3  # radius from which a drop runs down the glass
+RUN_MPS = 3e-3  # speed of a drop whose radius is larger than that by a millimetre
+BALANCE_MPS = 15.0  # speed of the car at which the air stream drives drops as strongly as gravity
+_MAX_RUN = 2.0  # largest speed of a drop, in RUN_MPS
+_MEANDER_M = 0.6e-3  # amplitude of a drop's path to its sides
+_MEANDER_TURN_M = 8e-3  # length of a bend of that path
+_MAX_RADIUS_SD = 2.5  # end of the radii's distribution, in standard deviations of their logarithm
+_NUM_DRAWS = 12  # random numbers of a drop's life
 
 
 class Drops(NamedTuple):
-    """N drops on the glass, in the order of their numbers. centres_m [N, 2]: right and down from
-    the optical axis. radii_m [N]: of a circle of the mean extent. bends [N, 4]: of the outline, see
-    augment.effects.lens_drops.optics. contact_rad [N]: angle between glass and water at the rim.
-    """
+    """N drops on the glass, in the order of their numbers."""
 
-    centres_m: np.ndarray
-    radii_m: np.ndarray
-    bends: np.ndarray
-    contact_rad: np.ndarray
+    centres_m: np.ndarray  # [N, 2] right and down from the optical axis
+    radii_m: np.ndarray  # [N] mean radius
+    bends: np.ndarray  # [N, 4] shape of the outline, see augment.effects.lens_drops.optics
+    contact_rad: np.ndarray  # [N] angle between glass and water at the rim
 
 
 @dataclass(frozen=True)
 class PlacedDrops:
-    """drops: of the recipe. seed: the recipe's. rate_mm_h: of its rain."""
+    """Numbers of the drops on cameras' glasses."""
 
     drops: LensDrops
+    """The recipe's section."""
+
     seed: int
+    """The recipe's seed."""
+
     rate_mm_h: float = 0.0
+    """Rate of the recipe's rain."""
 
     def count_on(self, camera: Camera) -> int:
-        """How many a camera looks through: those that the recipe gives, or as many as its rain
-        brings to a pane across its way in the time that they stay.
+        """Return the number of drops on a camera's glass.
+
+        It is the recipe's number, or the number that its rain brings to an upright pane in the time
+        that drops stay.
         """
         if self.drops.count is not None:
             return self.drops.count
@@ -68,75 +73,82 @@ class PlacedDrops:
         return min(round(FLUX * self.rate_mm_h**0.53 * area_m2 * stay_s), MAX_COUNT)
 
 
-def drops_at(placed: PlacedDrops, scene: Scene, camera: Camera) -> Drops:
-    """The drops on the camera's glass at its time."""
-    own, count = placed.drops, placed.count_on(camera)
-    rng = rng_for(
-        seed=placed.seed, scene=scene.name, effect="camera.lens_drops", camera=camera.name
-    )
+def drops_at(plan: PlacedDrops, scene: Scene, camera: Camera) -> Drops:
+    """Return the drops on the camera's glass at its time."""
+    section = plan.drops
+    count = plan.count_on(camera)
+    rng = rng_for(seed=plan.seed, scene=scene.name, effect="camera.lens_drops", camera=camera.name)
     key = rng.integers(0, 2**64, dtype=np.uint64)
     time_ns = np.full(count, camera.timestamp_ns, np.int64)
     slots = np.arange(count, dtype=np.uint64)
-    if own.wiper_s is None:
+    if section.wiper_s is None:
         constant = _units(key, slots, np.zeros(count, np.int64))
         life_s = LIFE_S[0] + (LIFE_S[1] - LIFE_S[0]) * constant[:, 0]
         life_ns = (1e9 * life_s).astype(np.int64)
         time_ns += (constant[:, 1] * life_ns).astype(np.int64)
     else:
-        life_ns = np.full(count, round(1e9 * own.wiper_s))
-        wiper = rng_for(seed=placed.seed, scene=scene.name, effect="camera.lens_drops.wiper")
+        life_ns = np.full(count, round(1e9 * section.wiper_s))
+        wiper = rng_for(seed=plan.seed, scene=scene.name, effect="camera.lens_drops.wiper")
         time_ns += int(wiper.random() * life_ns[0]) if count else 0
     lives = time_ns // life_ns
     units = _units(key, slots, lives + 1)
     age_s = (time_ns - lives * life_ns) / 1e9
-    if own.wiper_s is not None:
-        age_s = age_s - units[:, 2] * own.wiper_s
-    sd = np.clip(ndtri(np.clip(units[:, 3], 1e-9, 1 - 1e-9)), -_LARGEST_SD, _LARGEST_SD)
-    radii_m = own.radius_mm / 1000 * np.exp(own.radius_spread * sd)
-    low = own.glass_m * np.array([-camera.cx / camera.fx, -camera.cy / camera.fy])
-    extent = own.glass_m * np.array([camera.width / camera.fx, camera.height / camera.fy])
+    if section.wiper_s is not None:
+        age_s = age_s - units[:, 2] * section.wiper_s
+    sd = np.clip(ndtri(np.clip(units[:, 3], 1e-9, 1 - 1e-9)), -_MAX_RADIUS_SD, _MAX_RADIUS_SD)
+    radii_m = section.radius_mm / 1000 * np.exp(section.radius_spread * sd)
+    low = section.glass_m * np.array([-camera.cx / camera.fx, -camera.cy / camera.fy])
+    extent = section.glass_m * np.array([camera.width / camera.fx, camera.height / camera.fy])
     centres_m = low + extent * units[:, 4:6]
     centres_m += _run(scene, camera, np.maximum(age_s, 0.0), radii_m, units)
-    bends = np.stack([0.14 * units[:, 8], math.tau * units[:, 9], 0.08 * units[:, 10],
-                      math.tau * units[:, 7]], -1)  # fmt: skip
+    bends = np.stack(
+        [0.14 * units[:, 8], math.tau * units[:, 9], 0.08 * units[:, 10], math.tau * units[:, 7]],
+        -1,
+    )
     contact_rad = np.radians(35 + 30 * units[:, 11])
-    there = age_s >= 0
-    return Drops(centres_m[there], radii_m[there], bends[there], contact_rad[there])
+    has_arrived = age_s >= 0
+    return Drops(
+        centres_m[has_arrived], radii_m[has_arrived], bends[has_arrived], contact_rad[has_arrived]
+    )
 
 
 def _run(
     scene: Scene, camera: Camera, age_s: np.ndarray, radii_m: np.ndarray, units: np.ndarray
 ) -> np.ndarray:
-    """How far drops have run since they came [N, 2], metres on the glass."""
+    """Return how far drops have run since they came [N, 2], metres on the glass."""
     larger = np.clip((radii_m - RUNS_FROM_M) / 1e-3, 0, _MAX_RUN) * (0.5 + units[:, 6])
     rotation = camera.camera_from_world[:3, :3].numpy()
     down = -rotation[:2, 2] if scene.has_known_gravity else np.array([0.0, 1.0])
-    path = memo_of(scene).get(("odometer",), lambda: Odometer.of(scene))
-    ahead = rotation @ path.ahead_at(camera.timestamp_ns)
-    # What blows along the axis is turned upwards by the glass, as by a windscreen.
+    odometer = memo_of(scene).get(("odometer",), lambda: Odometer.of(scene))
+    ahead = rotation @ odometer.ahead_at(camera.timestamp_ns)
+    # The glass turns air along the axis upwards, as a windscreen does.
     air = np.array([-ahead[0], -ahead[1] - abs(ahead[2])])
-    driven_m = path.driven_m(camera.timestamp_ns, age_s)
-    way = age_s[:, None] * down + (driven_m / BALANCE_MPS)[:, None] * air
-    way *= (RUN_MPS * larger)[:, None]
-    length = np.hypot(*way.T)
-    across = np.stack([-way[:, 1], way[:, 0]], -1) / np.maximum(length, 1e-12)[:, None]
+    driven_m = odometer.driven_m(camera.timestamp_ns, age_s)
+    run_m = age_s[:, None] * down + (driven_m / BALANCE_MPS)[:, None] * air
+    run_m *= (RUN_MPS * larger)[:, None]
+    length = np.hypot(*run_m.T)
+    across = np.stack([-run_m[:, 1], run_m[:, 0]], -1) / np.maximum(length, 1e-12)[:, None]
     bend = np.sin(math.tau * (length / _MEANDER_TURN_M + units[:, 7]))
     bend -= np.sin(math.tau * units[:, 7])
-    return way + (_MEANDER_M * bend * np.minimum(length / _MEANDER_TURN_M, 1))[:, None] * across
+    return run_m + (_MEANDER_M * bend * np.minimum(length / _MEANDER_TURN_M, 1))[:, None] * across
 
 
 @dataclass(frozen=True, eq=False)
 class Odometer:
-    """The way that the car has driven. times_ns [T]: strictly increasing. driven_m [T]. ahead
-    [T, 3]: the car's x axis in the world.
-    """
+    """Distance that the car has driven."""
 
     times_ns: list[int]
+    """[T] times of the frames, strictly increasing."""
+
     metres: np.ndarray
+    """[T] distance driven since the first frame."""
+
     ahead: np.ndarray
+    """[T, 3] the car's x axis in the world."""
 
     @staticmethod
     def of(scene: Scene) -> Odometer:
+        """Return the odometer of a scene's frames."""
         poses = {frame.timestamp_ns: frame.world_from_ego.numpy() for frame in scene.frames}
         times = sorted(poses)
         places = np.array([poses[t][:3, 3] for t in times]).reshape(-1, 3)
@@ -145,14 +157,15 @@ class Odometer:
         return Odometer(times, np.concatenate([[0.0], np.cumsum(steps)]), ahead)
 
     def ahead_at(self, time_ns: int) -> np.ndarray:
-        """The car's x axis [3] at the frame before this time, or the first; 0 without frames."""
+        """Return the car's x axis [3] at the last frame before this time; 0 without frames."""
         if not self.times_ns:
             return np.zeros(3)
         return self.ahead[max(bisect_right(self.times_ns, time_ns) - 1, 0)]
 
     def driven_m(self, time_ns: int, before_s: np.ndarray) -> np.ndarray:
-        """Metres driven in the seconds before a time [N]; beyond the frames on at the same speed,
-        and none of a car that is known at one time only.
+        """Return the metres driven in the seconds before a time [N].
+
+        Beyond the frames the car goes on at the same speed. With fewer than two frames it stands.
         """
         if len(self.times_ns) < 2:
             return np.zeros(len(before_s))
@@ -169,9 +182,10 @@ class Odometer:
 
 
 def _units(key: np.uint64, slots: np.ndarray, lives: np.ndarray) -> np.ndarray:
-    """Numbers in [0, 1) of every drop's life [N, _DRAWS], by rounds of SplitMix64 (Steele, Lea and
-    Flood 2014).
+    """Return random numbers in [0, 1) of every drop's life [N, _NUM_DRAWS].
+
+    They are rounds of SplitMix64 (Steele, Lea and Flood 2014).
     """
     state = mix(mix(key + slots) + lives.astype(np.uint64))
-    columns = np.arange(1, _DRAWS + 1, dtype=np.uint64) * np.uint64(STEP_X)
+    columns = np.arange(1, _NUM_DRAWS + 1, dtype=np.uint64) * np.uint64(STEP_X)
     return (mix(state[:, None] + columns) >> np.uint64(11)) * 2.0**-53

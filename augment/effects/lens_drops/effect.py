@@ -1,4 +1,4 @@
-"""Drops of water on the camera's glass: the last of what stands between scene and sensor."""
+"""The effect lens drops: drops of water on the camera's glass, the last thing before the sensor."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ ON_GLASS = "lens drops"
 class LensDropsEffect(Effect):
     """Drops on the glass before the lens, which show the scene upside down and out of focus."""
 
-    name, section, model, mask = "lens_drops", "camera.lens_drops", LensDrops, "lens_drops"
+    name = "lens_drops"
+    section = "camera.lens_drops"
+    model = LensDrops
+    mask = "lens_drops"
     is_see_through = True
     share_column = "lens_drops_fraction"
 
@@ -56,7 +59,8 @@ class LensDropsEffect(Effect):
         if camera.is_orthographic:
             return drawn
         with timed(ON_GLASS):
-            drops, lens = drops_at(own.data, own.scene, camera), own.data.drops
+            drops = drops_at(own.data, own.scene, camera)
+            lens = own.data.drops
             if len(drops.radii_m) == 0:
                 return drawn
             around = map_surroundings(

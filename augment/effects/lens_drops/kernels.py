@@ -11,14 +11,23 @@ from augment.render.cpu.jit import kernel
 
 
 @kernel
-def blend_drops(rgb, layer, step, margin, least, shown, mask):
-    """rgb [H, W, 3], in place: sqrt((1 - c) rgb^2 + light) where c >= least; mask [H, W] becomes
-    c >= shown.
+def blend_drops(rgb, layer, step, margin, least, mask_share, mask):
+    """Blend drops over rgb [H, W, 3] in place: sqrt((1 - c) rgb^2 + light) where c >= least.
 
-    layer [h, w, 4]: light and c of cells `step` pixels wide, the picture's first after `margin`
-    cells. Bilinear. All floats float32.
+    Light and cover c are bilinear in the layer. All floats are float32.
+
+    Args:
+        rgb: the picture, changed in place.
+        layer: [h, w, 4] light and c of cells that are `step` pixels wide.
+        step: width of a cell, pixels.
+        margin: number of cells before the picture's first.
+        least: smallest c that changes a pixel.
+        mask_share: smallest c of a pixel in the mask.
+        mask: output [H, W], c >= mask_share.
     """
-    half, one, zero = np.float32(0.5), np.float32(1), np.float32(0)
+    half = np.float32(0.5)
+    unit = np.float32(1)
+    zero = np.float32(0)
     for i in prange(rgb.shape[0]):
         y = (np.float32(i) + half) / step + np.float32(margin) - half
         top = int(y)
@@ -33,9 +42,9 @@ def blend_drops(rgb, layer, step, margin, least, shown, mask):
             left = int(x)
             right = x - np.float32(left)
             cover = cells[left, 3] + right * (cells[left + 1, 3] - cells[left, 3])
-            mask[i, j] = cover >= shown
+            mask[i, j] = cover >= mask_share
             if cover >= least:
-                clear = max(one - cover, zero)
+                clear = max(unit - cover, zero)
                 for k in range(3):
                     light = cells[left, k] + right * (cells[left + 1, k] - cells[left, k])
                     behind = max(rgb[i, j, k], zero)

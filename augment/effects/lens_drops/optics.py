@@ -1,9 +1,9 @@
-"""What drops on the glass do to a picture.
+"""Optics of drops on the glass in front of a camera.
 
 A lens focused at infinity sees, in one pixel, the glass over a disc as wide as its aperture: a drop
-is blurred by that disc, and covers the share of it that lies on the drop. What shines through the
-drop are the scene's surroundings, far away, refracted by the flat glass and by a spherical cap of
-water (Snell, n = 1.33; Fresnel's losses; none beyond total reflection, which makes a rim dark).
+is blurred by that disc, and covers the share of it that lies on the drop. The light through a drop
+comes from the scene's surroundings, far away, refracted by the flat glass and by a spherical cap of
+water (Snell, n = 1.33; Fresnel's losses; no light beyond total reflection, which darkens the rim).
 Deviations of tens of degrees are smeared by the aperture: soft discs, dark above and bright below.
 
 So the drops are drawn through the aperture's centre, on a grid as coarse as the blur allows, from a
@@ -33,10 +33,11 @@ from augment.render.threads import kernel_threads
 from augment.sky import is_stand_in
 
 WATER = 1.33  # refractive index
-COVERED = 0.1  # share of a pixel's light from drops, from which the mask says so
-LEAST = 1e-3  # share from which a pixel changes
-_MAP_DEG, _MAP_REACH_DEG = 0.75, 81.0  # of the surroundings: cells, and how far from the axis
-_CELLS_AT_ONCE = 1 << 20
+COVERED = 0.1  # share of a pixel's light from drops from which the mask holds the pixel
+MIN_SHARE = 1e-3  # share of a pixel's light from drops from which the pixel changes
+_MAP_DEG = 0.75  # size of a cell in the map of the surroundings
+_MAP_REACH_DEG = 81.0  # largest angle from the axis in that map
+_CELLS_AT_ONCE = 1 << 20  # cells of the layer that are drawn at a time
 _BLUR_CELLS = 4.0  # radius of the aperture's disc in cells of the layer, if it has as many pixels
 
 
@@ -46,9 +47,16 @@ _BLUR_CELLS = 4.0  # radius of the aperture's disc in cells of the layer, if it 
 def map_surroundings(
     rgb: Float[Tensor, "H W 3"], camera: Camera, layers: LayerRenderer | None, *, level: bool
 ) -> Float32[np.ndarray, "S S 3"]:
-    """Light from all around the camera's axis, by the angles atan(x / z) and atan(y / z) in cells
-    of _MAP_DEG: the picture, above the horizon outside of it the sky in its fog, the picture's
-    border elsewhere. layers: that drew the picture. level: whether +z is known to point up.
+    """Return a map of the light around the camera's axis.
+
+    Its axes are the angles atan(x / z) and atan(y / z) in cells of _MAP_DEG. It holds the picture;
+    outside of it the sky in its fog above the horizon, and the picture's border elsewhere.
+
+    Args:
+        rgb: the picture.
+        camera: camera of the picture.
+        layers: the parts, sky and fog that the picture shows.
+        level: True if +z is known to point up.
     """
     angles = np.arange(-_MAP_REACH_DEG, _MAP_REACH_DEG + _MAP_DEG / 2, _MAP_DEG)
     slopes = np.tan(np.radians(angles))
@@ -57,7 +65,7 @@ def map_surroundings(
     x = (camera.fx * slopes + camera.cx) * (size[0] / camera.width) - 0.5
     y = (camera.fy * slopes + camera.cy) * (size[1] / camera.height) - 0.5
     columns, rows = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
-    found = cv2.remap(
+    picture = cv2.remap(
         _shrunk(rgb, size), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     if layers is not None and level and not is_stand_in(layers.sky):
@@ -66,12 +74,12 @@ def map_surroundings(
         rays = np.stack([u, v, np.ones_like(u)], -1) @ rotation.T
         beside = (columns < -0.5) | (columns > size[0] - 0.5)
         outside = (beside | (rows < -0.5) | (rows > size[1] - 0.5)) & (rays[..., 2] > 0)
-        found[outside] = _sky_colors(layers, rays[outside], float(camera.centre[2]))
-    return np.square(np.maximum(found, 0))
+        picture[outside] = _sky_colors(layers, rays[outside], float(camera.centre[2]))
+    return np.square(np.maximum(picture, 0))
 
 
 def _shrunk(rgb: Float[Tensor, "H W 3"], size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
-    """The picture in so many columns and rows, each the mean of what it covers."""
+    """Return the picture in this many columns and rows, each the mean of its area."""
     if rgb.device.type == "cpu":
         return cv2.resize(rgb.detach().numpy(), size, interpolation=cv2.INTER_AREA)
     small = F.interpolate(rgb.permute(2, 0, 1)[None], size[::-1], mode="area")
@@ -79,7 +87,7 @@ def _shrunk(rgb: Float[Tensor, "H W 3"], size: tuple[int, int]) -> Float32[np.nd
 
 
 def _sky_colors(layers: LayerRenderer, rays: np.ndarray, eye_z_m: float) -> np.ndarray:
-    """Of world directions [N, 3], seen through the fog."""
+    """Return the sky's colours in world directions [N, 3], through the fog."""
     sky, fog = sky_behind(layers.sky, layers.fog)
     directions = F.normalize(torch.from_numpy(rays).float(), dim=-1)
     colors = sky.sample(directions)
@@ -100,8 +108,11 @@ def draw_drops(
     glass_m: float,
     aperture_m: float,
 ) -> tuple[Float32[np.ndarray, "h w 4"], float, int]:
-    """The drops' light and the share of each pixel that they cover; its cells' size in pixels, and
-    the cells before the picture's first.
+    """Draw the drops on a coarse grid.
+
+    Returns:
+        The drops' light and covered share of each cell, the size of a cell in pixels, and the
+        number of cells before the picture's first.
     """
     blur_px = aperture_m / glass_m * camera.fx
     step = max(1.0, blur_px / _BLUR_CELLS)
@@ -109,29 +120,33 @@ def draw_drops(
     margin = math.ceil(blur) + 2
     width, height = (math.ceil(side / step) + 2 * margin for side in (camera.width, camera.height))
     layer = np.zeros((height, width, 4), np.float32)
-    fx, fy = camera.fx / step, camera.fy / step
-    cx, cy = camera.cx / step + margin, camera.cy / step + margin
+    fx = camera.fx / step
+    fy = camera.fy / step
+    cx = camera.cx / step + margin
+    cy = camera.cy / step + margin
     reach = drops.radii_m * (1 + drops.bends[:, 0] + drops.bends[:, 2]) / glass_m
-    at = drops.centres_m / glass_m * (fx, fy) + (cx, cy)
+    centres_px = drops.centres_m / glass_m * (fx, fy) + (cx, cy)
     windows = [
-        (_window(y, fy * far + 1, height), _window(x, fx * far + 1, width))
-        for (x, y), far in zip(at, reach, strict=True)
+        (_window(y, fy * radius + 1, height), _window(x, fx * radius + 1, width))
+        for (x, y), radius in zip(centres_px, reach, strict=True)
     ]
     sizes = [(y.stop - y.start) * (x.stop - x.start) for y, x in windows]
-    seen = [number for number, size in enumerate(sizes) if size > 0]
-    numbers, cells = list[int](), 0
-    for number in seen:
+    visible_numbers = [number for number, size in enumerate(sizes) if size > 0]
+    numbers = list[int]()
+    cells = 0
+    for number in visible_numbers:
         numbers.append(number)
         cells += sizes[number]
-        if cells < _CELLS_AT_ONCE and number != seen[-1]:
+        if cells < _CELLS_AT_ONCE and number != visible_numbers[-1]:
             continue
-        own = Drops(*(array[numbers] for array in drops))
-        chosen = [windows[n] for n in numbers]
-        light = _drop_light(own, chosen, surroundings, (fx, fy, cx, cy), glass_m)
-        for window, premultiplied in zip(chosen, light, strict=True):
+        group_drops = Drops(*(array[numbers] for array in drops))
+        group_windows = [windows[n] for n in numbers]
+        light = _drop_light(group_drops, group_windows, surroundings, (fx, fy, cx, cy), glass_m)
+        for window, premultiplied in zip(group_windows, light, strict=True):
             layer[window] *= 1 - premultiplied[..., 3:]
             layer[window] += premultiplied
-        numbers, cells = list[int](), 0
+        numbers = list[int]()
+        cells = 0
     if blur > 0.5:
         layer = cv2.filter2D(layer, -1, _disc(blur), borderType=cv2.BORDER_CONSTANT)
     return layer, step, margin
@@ -149,23 +164,28 @@ def _drop_light(
     lens: tuple[float, float, float, float],
     glass_m: float,
 ) -> list[Float32[np.ndarray, "h w 4"]]:
-    """Light through each drop, and what of each cell it covers, in its window of rows and columns.
+    """Return the light through each drop, and its cover of each cell, in its window of cells.
+
     lens: fx, fy, cx, cy in cells.
     """
     fx, fy, cx, cy = lens
     places = [np.mgrid[window].reshape(2, -1) for window in windows]
     rows, columns = np.concatenate(places, 1).astype(np.float32) + np.float32(0.5)
-    counts = [own.shape[1] for own in places]
+    counts = [place.shape[1] for place in places]
 
     def of_cells(values: np.ndarray) -> np.ndarray:
         return np.repeat(values.astype(np.float32), counts, axis=0)
 
-    u, v = (columns - np.float32(cx)) / fx, (rows - np.float32(cy)) / fy
-    centres, radii_m = of_cells(drops.centres_m), of_cells(drops.radii_m)
-    right, down = u * glass_m - centres[:, 0], v * glass_m - centres[:, 1]
+    u = (columns - np.float32(cx)) / fx
+    v = (rows - np.float32(cy)) / fy
+    centres = of_cells(drops.centres_m)
+    radii_m = of_cells(drops.radii_m)
+    right = u * glass_m - centres[:, 0]
+    down = v * glass_m - centres[:, 1]
     # The rim's distance is the radius times 1 + a cos 2(t - t0) + b cos 3(t - t1), by direction t;
     # bends: a, 2 t0, b, 3 t1.
-    t, (a, t0, b, t1) = np.arctan2(down, right), of_cells(drops.bends).T
+    t = np.arctan2(down, right)
+    (a, t0, b, t1) = of_cells(drops.bends).T
     rims_m = radii_m * (1 + a * np.cos(2 * t - t0) + b * np.cos(3 * t - t1))
     rims_m = np.maximum(rims_m, np.float32(1e-12))  # radii may be below float32's least
     # A drop smaller than a cell covers its share of it.
@@ -189,38 +209,44 @@ def _refracted(
     contact: np.ndarray,
     surroundings: np.ndarray,
 ) -> Float32[np.ndarray, "N 3"]:
-    """What is seen along rays of slopes u, v through caps of water. right, down: where they meet
-    it, the rim being at 1. contact: sine of the surface's tilt there. All [N].
+    """Return the light along rays of slopes u, v through caps of water.
+
+    right, down: point where the ray meets the cap, whose rim is at 1. contact: sine of the
+    surface's tilt at the rim. All are [N].
     """
     length = np.sqrt(1 + u * u + v * v)
-    wx, wy = u / (WATER * length), v / (WATER * length)  # flat glass: Snell at its outer side
+    wx = u / (WATER * length)
+    wy = v / (WATER * length)  # flat glass: Snell at its outer side
     wz = np.sqrt(1 - wx * wx - wy * wy)
-    away = np.hypot(right, down)
-    tilt = np.minimum(away, 1) * contact
-    nx, ny = (tilt * along / np.maximum(away, 1e-9) for along in (right, down))
+    rim_distance = np.hypot(right, down)
+    tilt = np.minimum(rim_distance, 1) * contact
+    nx, ny = (tilt * along / np.maximum(rim_distance, 1e-9) for along in (right, down))
     nz = np.sqrt(1 - tilt * tilt)
     inside = wx * nx + wy * ny + wz * nz
-    left = 1 - WATER**2 * (1 - inside * inside)  # below 0: totally reflected
-    outside = np.sqrt(np.maximum(left, 0))
+    cosine2 = 1 - WATER**2 * (1 - inside * inside)  # below 0: totally reflected
+    outside = np.sqrt(np.maximum(cosine2, 0))
     turn = outside - WATER * inside
     x, y, z = (WATER * w + turn * n for w, n in ((wx, nx), (wy, ny), (wz, nz)))
     s = (WATER * inside - outside) / (WATER * inside + outside)
     p = (inside - WATER * outside) / (inside + WATER * outside)
-    through = np.where(left > 0, 1 - (s * s + p * p) / 2, 0)
-    middle, wide = (len(surroundings) - 1) / 2, 1024  # OpenCV takes no row of more than 32767
+    transmittance = np.where(cosine2 > 0, 1 - (s * s + p * p) / 2, 0)
+    middle = (len(surroundings) - 1) / 2
+    row_length = 1024  # OpenCV takes no row of more than 32767
     columns, rows = (
-        np.resize(np.degrees(np.arctan2(along, np.maximum(z, 1e-6))) / _MAP_DEG + middle,
-                  (-(-len(u) // wide), wide)).astype(np.float32)
+        np.resize(
+            np.degrees(np.arctan2(along, np.maximum(z, 1e-6))) / _MAP_DEG + middle,
+            (-(-len(u) // row_length), row_length),
+        ).astype(np.float32)
         for along in (x, y)
-    )  # fmt: skip
+    )
     colors = cv2.remap(
         surroundings, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    return through[:, None] * colors.reshape(-1, 3)[: len(u)]
+    return transmittance[:, None] * colors.reshape(-1, 3)[: len(u)]
 
 
 def _disc(radius: float) -> Float32[np.ndarray, "K K"]:
-    """A disc's mean over its pixels; they sum to 1."""
+    """Return a disc's cover of pixels, normalised to a sum of 1."""
     reach = math.ceil(radius)
     x = np.arange(-reach, reach + 1)
     disc = np.clip(radius + 0.5 - np.hypot(x[:, None], x), 0, 1).astype(np.float32)
@@ -238,13 +264,15 @@ def blend_drops(
     *,
     backend: str,
 ) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
-    """The picture behind the drops, and where they give at least COVERED of its light. On the CPU
-    by a kernel, equal to this definition within float rounding; `rgb` is overwritten.
+    """Return the picture behind the drops, and the mask of pixels with COVERED of light from drops.
+
+    On the CPU a kernel computes it, equal to this definition within float rounding; `rgb` is then
+    overwritten.
     """
     height, width, _ = rgb.shape
     if kernels_for(backend, rgb) == CPU and rgb.is_contiguous():
         mask = np.empty((height, width), np.bool_)
-        numbers = np.float32(step), margin, np.float32(LEAST), np.float32(COVERED)
+        numbers = np.float32(step), margin, np.float32(MIN_SHARE), np.float32(COVERED)
         with kernel_threads(ROWS):
             kernels.blend_drops(rgb.detach().numpy(), layer, *numbers, mask)
         return rgb, torch.from_numpy(mask)
@@ -254,8 +282,9 @@ def blend_drops(
         for n, m in ((width, layer.shape[1]), (height, layer.shape[0]))
     )
     grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]
-    found = F.grid_sample(cells.permute(2, 0, 1)[None], grid, align_corners=False)[0]
-    light, cover = found[:3].permute(1, 2, 0).clamp_min(0), found[3]
+    drop_layer = F.grid_sample(cells.permute(2, 0, 1)[None], grid, align_corners=False)[0]
+    light = drop_layer[:3].permute(1, 2, 0).clamp_min(0)
+    cover = drop_layer[3]
     behind = (1 - cover).clamp_min(0)[..., None] * rgb.clamp_min(0).square()
-    blended = torch.where((cover >= LEAST)[..., None], (behind + light).sqrt(), rgb)
+    blended = torch.where((cover >= MIN_SHARE)[..., None], (behind + light).sqrt(), rgb)
     return blended, cover >= COVERED

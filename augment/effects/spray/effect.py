@@ -1,4 +1,4 @@
-"""Spray as an effect: behind vehicles in the rain, on the finished picture and along beams."""
+"""The effect spray: behind vehicles in the rain, on the finished picture and along beams."""
 
 from __future__ import annotations
 
@@ -35,20 +35,28 @@ SPRAY = "spray behind vehicles"
 
 @dataclass(frozen=True)
 class PlacedSpray:
-    """water_m: on the road. wind_mps: where it blows to. seed: the recipe's."""
+    """Numbers of the spray in a scene."""
 
     water_m: float
+    """Depth of the water on the road."""
+
     wind_mps: tuple[float, float]
+    """Velocity of the wind along world x and y."""
+
     seed: int
+    """The recipe's seed."""
 
     def puffs(self, scene: Scene, time_ns: int) -> Puffs:
+        """Return the puffs in the air at a time."""
         return spray_puffs(scene, time_ns, self.water_m, seed=self.seed, wind_mps=self.wind_mps)
 
 
 class SprayEffect(Effect):
-    """What vehicles lift from a wet road."""
+    """Water that vehicles lift from a wet road."""
 
-    name, section, model = "spray", "weather.rain", Rain
+    name = "spray"
+    section = "weather.rain"
+    model = Rain
 
     def reads_splats(self, recipe: Recipe) -> bool:
         return False
@@ -57,7 +65,8 @@ class SprayEffect(Effect):
         return (section.changes and section.spray) or None
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
-        rain, why = self.of(recipe), ""
+        rain = self.of(recipe)
+        why = ""
         if rain is None or not rain.changes:
             why = "the recipe has no rain" if rain is None else "weather.rain.rate_mm_h is 0"
         elif not rain.spray:
@@ -70,17 +79,16 @@ class SprayEffect(Effect):
             return Placed(None, skipped((SPRAY,), why, PICTURE))
         wind_mps = blows_to(rain.wind_mps, rain.wind_from_deg)
         water_m = film_depth_m(rain.rate_mm_h) * rain.ground_wetness
-        placed = PlacedSpray(water_m, wind_mps, recipe.seed)
+        spray = PlacedSpray(water_m, wind_mps, recipe.seed)
         why = (
             f"{len(spraying_actors(scene))} actors drive faster than {3.6 * FROM_MPS:.0f} km/h on "
-            f"{1000 * placed.water_m:.2g} mm of water"
+            f"{1000 * spray.water_m:.2g} mm of water"
         )
-        return Placed(
-            placed, (Step(SPRAY, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH})
-        )
+        return Placed(spray, (Step(SPRAY, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH}))
 
     def in_view(self, own: Active, sight: Sight) -> InView:
-        puffs, camera = own.data.puffs(own.scene, sight.camera.timestamp_ns), sight.camera
+        puffs = own.data.puffs(own.scene, sight.camera.timestamp_ns)
+        camera = sight.camera
         windows = windows_of(puffs, camera)
         if not ((windows[:, 0] < windows[:, 1]) & (windows[:, 2] < windows[:, 3])).any():
             return InView(False, {SPRAY: "no spray can be in view"})
@@ -91,7 +99,11 @@ class SprayEffect(Effect):
         assert raster.alpha is not None and raster.expected_depth is not None
         with timed(SPRAY):
             rgb = blend_puffs(
-                *(drawn.rgb, raster.alpha, raster.expected_depth, camera, own.seen),
+                drawn.rgb,
+                raster.alpha,
+                raster.expected_depth,
+                camera,
+                own.seen,
                 glow_of(own.light).mean,
                 fog=drawn.layers.fog,
                 backend=own.backend,

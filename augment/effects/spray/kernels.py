@@ -32,24 +32,28 @@ def blend_puffs(rgb, depth, rays, puffs, windows, light, fog):
             x0 = puffs[n, 1] * v + puffs[n, 2]
             y0 = puffs[n, 4] * v + puffs[n, 5]
             z0 = puffs[n, 7] * v + puffs[n, 8]
-            cx, cy, cz = puffs[n, 9], puffs[n, 10], puffs[n, 11]
+            cx = puffs[n, 9]
+            cy = puffs[n, 10]
+            cz = puffs[n, 11]
             cc = cx * cx + cy * cy + cz * cz
             run = windows[n, 4]
             for first in range(windows[n, 2], windows[n, 3], run):
                 u = (np.float64(first) + 0.5 * run - rays[2]) / rays[0]
-                x, y, z = x0 + puffs[n, 0] * u, y0 + puffs[n, 3] * u, z0 + puffs[n, 6] * u
+                x = x0 + puffs[n, 0] * u
+                y = y0 + puffs[n, 3] * u
+                z = z0 + puffs[n, 6] * u
                 a = x * x + y * y + z * z
                 nearest = (x * cx + y * cy + z * cz) / a  # z where the ray comes closest
-                off = cc - a * nearest * nearest
-                if off > puffs[n, 14]:
+                distance2 = cc - a * nearest * nearest
+                if distance2 > puffs[n, 14]:
                     continue
-                per = math.sqrt(0.5 * a)
-                before = per * nearest
+                inverse_width = math.sqrt(0.5 * a)
+                before = inverse_width * nearest
                 entered = 1.0 if before > 4 else math.erf(before)  # within 1e-7
-                way = math.sqrt((1 + u * u + v * v) / a)
-                half = 0.5 * puffs[n, 12] * way * math.exp(-0.5 * off)
+                ray_length = math.sqrt((1 + u * u + v * v) / a)
+                half = 0.5 * puffs[n, 12] * ray_length * math.exp(-0.5 * distance2)
                 for j in range(first, min(first + run, windows[n, 3])):
-                    behind = per * (np.float64(depth[row, j]) - nearest)
+                    behind = inverse_width * (np.float64(depth[row, j]) - nearest)
                     if behind < -4:
                         continue
                     passed = entered + (1.0 if behind > 4 else math.erf(behind))
@@ -58,9 +62,11 @@ def blend_puffs(rgb, depth, rays, puffs, windows, light, fog):
                     clears[j] += tau * puffs[n, 13]
         for j in range(rgb.shape[1]):
             if taus[j] > 0:
-                left = math.exp(-taus[j])
+                transmittance = math.exp(-taus[j])
                 clear = clears[j] / taus[j]
                 for k in range(3):
                     behind = max(np.float64(rgb[row, j, k]), 0.0)
-                    own = clear * light[k] + (1 - clear) * fog[k]
-                    rgb[row, j, k] = math.sqrt(left * behind * behind + (1 - left) * own)
+                    added_light = clear * light[k] + (1 - clear) * fog[k]
+                    rgb[row, j, k] = math.sqrt(
+                        transmittance * behind * behind + (1 - transmittance) * added_light
+                    )

@@ -1,8 +1,8 @@
-"""Spray on a LiDAR sweep: what of an echo comes through it, and its own.
+"""Spray on a LiDAR sweep: it weakens echoes and sends back its own.
 
-As in fog (Hahner et al. 2021, see augment.effects.smog), but of puffs that are thin against their
-distance, so that an echo's strength is the extinction where the densest of them lies on the beam:
-backscatter times half the pulse's length, dimmed there and back.
+The model is that of fog (Hahner et al. 2021, see augment.effects.smog), with puffs that are thin
+compared with their distance. The strength of a puff's echo follows from the extinction at the
+densest point on the beam: backscatter times half the pulse's length, dimmed there and back.
 """
 
 from __future__ import annotations
@@ -17,17 +17,19 @@ from augment.effects.lidar.codes import LOST, SCATTERED
 from augment.effects.smog import BACKSCATTER_MOR, CLUMPS, MOR_OPTICAL_DEPTH
 from augment.effects.spray.puffs import CUT, Puffs
 
-_TOGETHER = 16  # puffs that beams are looked for together
+_GROUP_SIZE = 16  # puffs that are tested against the beams together
 
 
 def spray_echoes(echoes: Echoes, puffs: Puffs, rng: np.random.Generator) -> None:
-    """Echoes seen through the puffs, or lost to those of the droplets themselves."""
+    """Weaken echoes by the puffs, and replace those that the droplets' own echoes exceed."""
     count = len(echoes.ranges_m)
-    clumps, jitter = rng.standard_gamma(CLUMPS, count) / CLUMPS, rng.standard_normal(count)
+    clumps = rng.standard_gamma(CLUMPS, count) / CLUMPS
+    jitter = rng.standard_normal(count)
     rows = np.flatnonzero(beams_near(echoes, puffs))
     if not len(rows):
         return
-    origins, directions = echoes.origins[rows], echoes.directions[rows]
+    origins = echoes.origins[rows]
+    directions = echoes.directions[rows]
     ends_m = echoes.air_m[rows]
     tau, at_m = look_through(puffs, origins, directions, ends_m)
     before, _ = look_through(puffs, origins, directions, at_m)
@@ -44,44 +46,46 @@ def spray_echoes(echoes: Echoes, puffs: Puffs, rng: np.random.Generator) -> None
 
 
 def beams_near(echoes: Echoes, puffs: Puffs) -> np.ndarray:
-    """Which beams pass near a puff on their way, bool [N]."""
+    """Return the mask [N] of the beams that pass near a puff."""
     near = np.zeros(len(echoes.ranges_m), bool)
     radii_m = np.sqrt(CUT) * puffs.scales_m.max(1, initial=0)
-    for first in range(0, len(radii_m), _TOGETHER):
-        own = slice(first, first + _TOGETHER)
-        middle = puffs.centres_m[own].mean(0)
-        away = np.linalg.norm(puffs.centres_m[own] - middle, axis=1)
-        reach = float((away + radii_m[own]).max())
+    for first in range(0, len(radii_m), _GROUP_SIZE):
+        group = slice(first, first + _GROUP_SIZE)
+        middle = puffs.centres_m[group].mean(0)
+        distances = np.linalg.norm(puffs.centres_m[group] - middle, axis=1)
+        reach = float((distances + radii_m[group]).max())
         offsets = middle - echoes.origins
         along = (offsets * echoes.directions).sum(1)
-        aside = (offsets * offsets).sum(1) - along * along
-        near |= (aside < reach**2) & (along > -reach) & (along < echoes.air_m + reach)
+        distance2 = (offsets * offsets).sum(1) - along * along
+        near |= (distance2 < reach**2) & (along > -reach) & (along < echoes.air_m + reach)
     return near & (echoes.ranges_m > 0)
 
 
 def look_through(
     puffs: Puffs, origins: np.ndarray, directions: np.ndarray, ends_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Optical depth [M] of the puffs along beams up to their ends, and where the densest one lies
-    on each, 0 where there is none. directions: unit.
+    """Return the optical depth [M] of the puffs along beams, and the range of the densest point.
+
+    The range is 0 for a beam without a puff. directions: unit.
     """
     tau, at_m, densest = np.zeros((3, len(ends_m)))
     for centre, whitening, extinction in zip(*puffs, strict=True):
-        ways, starts = directions @ whitening.T, (centre - origins) @ whitening.T
-        a = (ways * ways).sum(1)
-        nearest = (ways * starts).sum(1) / a
-        off = (starts * starts).sum(1) - a * nearest * nearest
-        there = extinction * np.exp(-off / 2) * (off < CUT)
-        per = np.sqrt(a / 2)
-        passed = erf(per * (ends_m - nearest)) + erf(per * nearest)
-        tau += there * np.sqrt(math.pi / (2 * a)) * np.maximum(passed, 0)
-        denser = (there > densest) & (nearest > 0) & (nearest < ends_m)
-        at_m[denser], densest[denser] = nearest[denser], there[denser]
+        whitened_directions = directions @ whitening.T
+        starts = (centre - origins) @ whitening.T
+        a = (whitened_directions * whitened_directions).sum(1)
+        nearest = (whitened_directions * starts).sum(1) / a
+        distance2 = (starts * starts).sum(1) - a * nearest * nearest
+        extinction_at_nearest = extinction * np.exp(-distance2 / 2) * (distance2 < CUT)
+        inverse_width = np.sqrt(a / 2)
+        passed = erf(inverse_width * (ends_m - nearest)) + erf(inverse_width * nearest)
+        tau += extinction_at_nearest * np.sqrt(math.pi / (2 * a)) * np.maximum(passed, 0)
+        denser = (extinction_at_nearest > densest) & (nearest > 0) & (nearest < ends_m)
+        at_m[denser], densest[denser] = nearest[denser], extinction_at_nearest[denser]
     return tau, at_m
 
 
 def extinction_at(puffs: Puffs, points_m: np.ndarray) -> np.ndarray:
-    """Of all puffs together at points [M, 3], 1/metre."""
+    """Return the extinction of all puffs together at points [M, 3], 1/metre."""
     total = np.zeros(len(points_m))
     for centre, whitening, extinction in zip(*puffs, strict=True):
         offsets = (points_m - centre) @ whitening.T

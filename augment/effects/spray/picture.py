@@ -1,4 +1,4 @@
-"""Puffs of spray before a picture: their light, and how much of the picture they take.
+"""Puffs of spray in front of a picture: their light and their opacity.
 
 The optical depth of a Gaussian puff along a ray, from the eye to the surface that the pixel shows,
 is in closed form, so a puff that holds the camera, or a car, is no special case:
@@ -27,33 +27,38 @@ from augment.render.composite import ROWS
 from augment.render.fog import Fog, optical_depth_of_arrays
 from augment.render.threads import kernel_threads
 
-_RUN_SD, _MAX_RUN = 12, 8  # runs of pixels: in standard deviations of a puff 1 / 12, and pixels
+_RUNS_PER_SD = 12  # runs of pixels in a standard deviation of a puff
+_MAX_RUN = 8  # longest run, pixels
 
 
 def windows_of(puffs: Puffs, camera: Camera) -> np.ndarray:
-    """Top, bottom, left, right of the pixels that each puff can show in, and in how long runs of a
-    row it hardly varies, int64 [N, 5].
+    """Return the windows of pixels that each puff can show in, int64 [N, 5].
+
+    The columns are top, bottom, left, right, and the length of runs of pixels in a row over which
+    the puff hardly varies.
     """
     pose = camera.camera_from_world.numpy()
     centres = puffs.centres_m @ pose[:3, :3].T + pose[:3, 3]
-    own = puffs.whitenings @ pose[:3, :3].T
-    reach = CUT * np.linalg.inv(np.swapaxes(own, 1, 2) @ own)
+    whitenings = puffs.whitenings @ pose[:3, :3].T
+    reach = CUT * np.linalg.inv(np.swapaxes(whitenings, 1, 2) @ whitenings)
     windows = np.empty((len(centres), 5), np.int64)
     sides = ((1, camera.fy, camera.cy, camera.height), (0, camera.fx, camera.cx, camera.width))
-    for place, (axis, focal, middle, size) in zip((0, 2), sides, strict=True):
+    for column, (axis, focal, middle, size) in zip((0, 2), sides, strict=True):
         low, high = _tangents(centres[:, axis], centres[:, 2], reach[:, [axis, 2]][:, :, [axis, 2]])
         with np.errstate(invalid="ignore"):
-            windows[:, place] = np.clip(np.floor(focal * low + middle), 0, size)
-            windows[:, place + 1] = np.clip(np.ceil(focal * high + middle), 0, size)
+            windows[:, column] = np.clip(np.floor(focal * low + middle), 0, size)
+            windows[:, column + 1] = np.clip(np.ceil(focal * high + middle), 0, size)
     windows[centres[:, 2] + np.sqrt(reach[:, 2, 2]) <= 0, :4] = 0
     deviations_px = (windows[:, 3] - windows[:, 2]) / (2 * math.sqrt(CUT))
-    windows[:, 4] = np.clip(deviations_px / _RUN_SD, 1, _MAX_RUN)
+    windows[:, 4] = np.clip(deviations_px / _RUNS_PER_SD, 1, _MAX_RUN)
     return windows
 
 
 def _tangents(x: np.ndarray, z: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest slope x / z of an ellipse's part of z > 0, seen from the origin [N]:
-    (x - s z)^2 = (1, -s) reach (1, -s). Infinite where it crosses z = 0.
+    """Return the lowest and highest slope s = x / z of an ellipse's part at z > 0, [N] each.
+
+    They solve (x - s z)^2 = (1, -s) reach (1, -s). They are infinite where the ellipse crosses
+    z = 0.
     """
     a = z * z - reach[:, 1, 1]
     b = x * z - reach[:, 0, 1]
@@ -61,8 +66,10 @@ def _tangents(x: np.ndarray, z: np.ndarray, reach: np.ndarray) -> tuple[np.ndarr
     inside = b * b - a * c
     root = np.sqrt(np.maximum(inside, 0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        first, second = (b - root) / a, (b + root) / a
-    low, high = np.minimum(first, second), np.maximum(first, second)
+        first = (b - root) / a
+        second = (b + root) / a
+    low = np.minimum(first, second)
+    high = np.maximum(first, second)
     is_right = x - z * reach[:, 0, 1] / reach[:, 1, 1] > 0  # where it crosses z = 0
     crosses = a <= 0
     low, high = (
@@ -84,18 +91,31 @@ def blend_puffs(
     fog: Fog | None = None,
     backend: str = CPU,
 ) -> Float[Tensor, "H W 3"]:
-    """The picture behind the puffs. depth: z of surfaces, metres. light [3]: of the puffs, as the
-    square of display-encoded colours. fog: before them. On the CPU by a kernel, equal to this
-    definition within float rounding; `rgb` is overwritten.
+    """Return the picture behind the puffs.
+
+    On the CPU a kernel computes it, equal to this definition within float rounding; `rgb` is then
+    overwritten.
+
+    Args:
+        rgb: the picture, display-encoded.
+        alpha: opacity of the surfaces.
+        depth: z of the surfaces, metres.
+        camera: camera of the picture.
+        puffs: the puffs.
+        light: [3] light of the puffs, the square of display-encoded colours.
+        fog: the fog in front of them.
+        backend: name of the backend.
     """
     windows = windows_of(puffs, camera)
-    seen = (windows[:, 0] < windows[:, 1]) & (windows[:, 2] < windows[:, 3])
-    if not seen.any():
+    is_in_view = (windows[:, 0] < windows[:, 1]) & (windows[:, 2] < windows[:, 3])
+    if not is_in_view.any():
         return rgb
-    puffs, windows = Puffs(*(array[seen] for array in puffs)), windows[seen]
-    numbers, before = _numbers(puffs, camera, fog), np.zeros(3)
+    puffs = Puffs(*(array[is_in_view] for array in puffs))
+    windows = windows[is_in_view]
+    numbers = _numbers(puffs, camera, fog)
+    fog_light = np.zeros(3)
     if fog is not None:
-        before = np.square(np.asarray(fog.rgb, np.float64))
+        fog_light = np.square(np.asarray(fog.rgb, np.float64))
     if kernels_for(backend, rgb, depth) == CPU and rgb.is_contiguous():
         # By numpy: torch's threads would wait for more work, on the cores that the kernel needs.
         z = depth.contiguous().numpy()
@@ -103,27 +123,43 @@ def blend_puffs(
         rays = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         with kernel_threads(ROWS):
             kernels.blend_puffs(
-                rgb.detach().numpy(), surfaces, rays, numbers, windows,
-                np.asarray(light, np.float64), before,
-            )  # fmt: skip
+                rgb.detach().numpy(),
+                surfaces,
+                rays,
+                numbers,
+                windows,
+                np.asarray(light, np.float64),
+                fog_light,
+            )
         return rgb
     surfaces = torch.where((alpha >= 0.5) & (depth > 0), depth, torch.inf).float()
-    return _blend_by_torch(rgb, surfaces, camera, numbers, windows, light, before)
+    return _blend_by_torch(rgb, surfaces, camera, numbers, windows, light, fog_light)
 
 
 def _numbers(puffs: Puffs, camera: Camera, fog: Fog | None) -> np.ndarray:
-    """[N, 15], as of kernels.blend_puffs."""
-    rotation, eye = camera.camera_from_world[:3, :3].numpy(), camera.centre.numpy()
-    own = puffs.whitenings @ rotation.T
+    """Return the numbers of the puffs, [N, 15], as kernels.blend_puffs takes them."""
+    rotation = camera.camera_from_world[:3, :3].numpy()
+    eye = camera.centre.numpy()
+    camera_whitenings = puffs.whitenings @ rotation.T
     offsets = puffs.centres_m - eye
     whitened = (puffs.whitenings @ offsets[:, :, None])[..., 0]
-    clear = np.ones(len(own))
+    fog_transmittance = np.ones(len(camera_whitenings))
     if fog is not None:
-        away, heights = np.linalg.norm(offsets, axis=1), puffs.centres_m[:, 2]
-        clear = np.exp(-optical_depth_of_arrays(fog, away, np.full(len(own), eye[2]), heights))
+        distances = np.linalg.norm(offsets, axis=1)
+        heights = puffs.centres_m[:, 2]
+        fog_transmittance = np.exp(
+            -optical_depth_of_arrays(
+                fog, distances, np.full(len(camera_whitenings), eye[2]), heights
+            )
+        )
     strength = math.sqrt(2 * math.pi) * puffs.extinction_per_m
-    numbers = [own.reshape(-1, 9), whitened, strength[:, None], clear[:, None]]
-    return np.concatenate([*numbers, np.full((len(own), 1), CUT)], 1)
+    numbers = [
+        camera_whitenings.reshape(-1, 9),
+        whitened,
+        strength[:, None],
+        fog_transmittance[:, None],
+    ]
+    return np.concatenate([*numbers, np.full((len(camera_whitenings), 1), CUT)], 1)
 
 
 def _blend_by_torch(
@@ -133,7 +169,7 @@ def _blend_by_torch(
     numbers: np.ndarray,
     windows: np.ndarray,
     light: np.ndarray,
-    before: np.ndarray,
+    fog_light: np.ndarray,
 ) -> Tensor:
     tau = torch.zeros(rgb.shape[:2], dtype=torch.float64, device=rgb.device)
     clear = torch.zeros_like(tau)
@@ -144,19 +180,23 @@ def _blend_by_torch(
         u = torch.arange(right - left, device=tau.device) // run * run + left + run / 2
         u = (u.to(tau.dtype) - camera.cx) / camera.fx
         d = torch.stack(torch.broadcast_tensors(u, v[part[0], None], tau.new_ones(1)), -1)
-        own = d @ torch.from_numpy(puff[:9].reshape(3, 3)).to(tau.device).T
+        whitened = d @ torch.from_numpy(puff[:9].reshape(3, 3)).to(tau.device).T
         centre = torch.from_numpy(puff[9:12]).to(tau.device)
-        a = own.square().sum(-1)
-        nearest = (own @ centre) / a
+        a = whitened.square().sum(-1)
+        nearest = (whitened @ centre) / a
         off = centre.square().sum() - a * nearest.square()
         per = (a / 2).sqrt()
         passed = torch.erf(per * (surfaces[part] - nearest)) + torch.erf(per * nearest)
-        found = puff[12] * d.norm(dim=-1) / a.sqrt() * torch.exp(-off / 2) * passed.clamp_min(0) / 2
-        found = torch.where(off > puff[14], 0.0, found)
-        tau[part] += found
-        clear[part] += found * puff[13]
+        puff_tau = (
+            puff[12] * d.norm(dim=-1) / a.sqrt() * torch.exp(-off / 2) * passed.clamp_min(0) / 2
+        )
+        puff_tau = torch.where(off > puff[14], 0.0, puff_tau)
+        tau[part] += puff_tau
+        clear[part] += puff_tau * puff[13]
     share = (clear / tau.clamp_min(1e-300))[..., None]
-    own = share * torch.from_numpy(light).to(tau) + (1 - share) * torch.from_numpy(before).to(tau)
+    whitened = share * torch.from_numpy(light).to(tau) + (1 - share) * torch.from_numpy(
+        fog_light
+    ).to(tau)
     left = torch.exp(-tau)[..., None]
-    blended = (left * rgb.clamp_min(0).square() + (1 - left) * own).sqrt().to(rgb.dtype)
+    blended = (left * rgb.clamp_min(0).square() + (1 - left) * whitened).sqrt().to(rgb.dtype)
     return torch.where((tau > 0)[..., None], blended, rgb)

@@ -25,29 +25,33 @@ from augment.memo import memo_of
 from augment.rng import STEP_X, mix, rng_for
 from augment.scene import Actor, Scene
 
-FROM_MPS = 40 / 3.6
-_FULL_MPS, _FULL_SHARE, _MAX_SHARE = 90 / 3.6, 0.1, 0.2  # of the water, in the air
-_TYRE_M, _DROPLET_M = 0.2, 3e-4
-_USUAL_M = (4.5, 1.8)  # length and width of a car, by which others lift more or less
-_FLOW_M, _CROSSFALL = 5.0, 0.02  # of the road, where the water runs off
-INTERVAL_S, LIFE_S = 0.1, 3.5
-_SETTLE_S, _BORN_S = 1.2, 0.12  # in which droplets rain out, and a puff comes up
-_WAKE_SHARE, _WAKE_S = 0.35, 0.5  # of the vehicle's speed, and how soon that is gone
-_STEP_S = 0.25  # to either side, over which speeds are taken
-_MAX_MPS = 70.0  # what is faster has jumped
-THINNEST = 0.003  # optical depth below which a puff is left out
+FROM_MPS = 40 / 3.6  # speed from which a vehicle lifts spray
+_FULL_MPS = 90 / 3.6  # speed at which _FULL_SHARE of the water is in the air
+_FULL_SHARE = 0.1  # share of the water that is in the air at _FULL_MPS
+_MAX_SHARE = 0.2  # largest share of the water that is in the air
+_TYRE_M = 0.2  # width of the tyres
+_DROPLET_M = 3e-4  # diameter of the droplets
+_CAR_SIZE_M = (4.5, 1.8)  # length and width of a usual car; others lift more or less by their size
+_FLOW_M = 5.0  # length over which the water runs off the road
+_CROSSFALL = 0.02  # slope of the road across
+INTERVAL_S = 0.1  # time between two puffs of a vehicle
+LIFE_S = 3.5  # life of a puff
+_RAIN_OUT_S = 1.2  # time constant in which droplets rain out
+_GROWTH_S = 0.12  # time in which a puff comes up
+_WAKE_SHARE = 0.35  # share of the vehicle's speed with which the wake drags a puff
+_WAKE_S = 0.5  # time constant in which that drag ends
+_STEP_S = 0.25  # time to either side over which speeds are differences of positions
+_MAX_MPS = 70.0  # largest plausible speed; a faster track has jumped
+MIN_OPTICAL_DEPTH = 0.003  # optical depth below which a puff is left out
 CUT = 9.0  # square of the distance in standard deviations at which a puff ends
 
 
 class Puffs(NamedTuple):
-    """N puffs whose extinction is extinction_per_m exp(-|w (x - c)|^2 / 2). centres_m [N, 3]: c,
-    scene world. whitenings [N, 3, 3]: w, in standard deviations per metre. extinction_per_m [N]: at
-    the centre.
-    """
+    """N puffs whose extinction is extinction_per_m exp(-|w (x - c)|^2 / 2)."""
 
-    centres_m: np.ndarray
-    whitenings: np.ndarray
-    extinction_per_m: np.ndarray
+    centres_m: np.ndarray  # [N, 3] c, scene world
+    whitenings: np.ndarray  # [N, 3, 3] w, standard deviations per metre
+    extinction_per_m: np.ndarray  # [N] extinction at the centre
 
     @property
     def scales_m(self) -> np.ndarray:
@@ -57,19 +61,20 @@ class Puffs(NamedTuple):
 
 
 def film_depth_m(rate_mm_h: float) -> float:
-    """Water on a road from which rain of this rate runs off, by the empirical law of road drainage
-    0.046 mm sqrt(length rate) / slope^0.2.
+    """Return the depth of the water on a road from which rain of this rate runs off.
+
+    It follows the empirical law of road drainage, 0.046 mm sqrt(length rate) / slope^0.2.
     """
     return 0.046e-3 * math.sqrt(_FLOW_M * rate_mm_h) / _CROSSFALL**0.2
 
 
 def spraying_actors(scene: Scene) -> tuple[int, ...]:
-    """Numbers (from 0) of the actors that are ever fast enough; worked out once a scene."""
+    """Return the numbers (from 0) of the actors that are ever fast enough; cached per scene."""
 
-    def find() -> tuple[int, ...]:
+    def compute() -> tuple[int, ...]:
         return tuple(n for n, actor in enumerate(scene.actors) if _top_speed(actor) > FROM_MPS)
 
-    return memo_of(scene).get(("actors that spray",), find)
+    return memo_of(scene).get(("actors that spray",), compute)
 
 
 def _top_speed(actor: Actor) -> float:
@@ -85,22 +90,28 @@ def spray_puffs(
     seed: int,
     wind_mps: tuple[float, float] = (0.0, 0.0),
 ) -> Puffs:
-    """All puffs in the air at a time. water_m: on the road. wind_mps: where it blows to."""
-    found = [
+    """Return all puffs in the air at a time.
+
+    water_m: depth of the water on the road. wind_mps: velocity of the wind.
+    """
+    puffs = [
         _puffs_of(scene, number, time_ns, water_m, seed, np.array([*wind_mps, 0.0]))
         for number in spraying_actors(scene)
     ]
-    nothing = Puffs(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
-    return Puffs(*(np.concatenate(arrays) for arrays in zip(nothing, *found, strict=True)))
+    no_puffs = Puffs(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
+    return Puffs(*(np.concatenate(arrays) for arrays in zip(no_puffs, *puffs, strict=True)))
 
 
 def _puffs_of(
     scene: Scene, number: int, time_ns: int, water_m: float, seed: int, wind_mps: np.ndarray
 ) -> Puffs:
-    actor, interval_ns = scene.actors[number], round(1e9 * INTERVAL_S)
-    births = np.arange((time_ns - round(1e9 * LIFE_S)) // interval_ns + 1,
-                       time_ns // interval_ns + 1) * interval_ns  # fmt: skip
-    # A vehicle comes from where its track begins to lead, and is gone after its end.
+    actor = scene.actors[number]
+    interval_ns = round(1e9 * INTERVAL_S)
+    births = (
+        np.arange((time_ns - round(1e9 * LIFE_S)) // interval_ns + 1, time_ns // interval_ns + 1)
+        * interval_ns
+    )
+    # Before its track begins, a vehicle comes straight to its start. It is gone after its end.
     births = births[births <= int(actor.track.timestamps_ns[-1]) + actor.track.hold_ns]
     age_s = (time_ns - births) / 1e9
     start_ns = int(actor.track.timestamps_ns[0])
@@ -110,11 +121,15 @@ def _puffs_of(
     share = np.clip((speed - FROM_MPS) / (_FULL_MPS - FROM_MPS) * _FULL_SHARE, 0, _MAX_SHARE)
     share[speed > _MAX_MPS] = 0
     length, width, height = actor.size_m
-    size = min(length / _USUAL_M[0], 4.0) * min(width / _USUAL_M[1], 2.0)
+    size = min(length / _CAR_SIZE_M[0], 4.0) * min(width / _CAR_SIZE_M[1], 2.0)
     per_metre = 3 * _TYRE_M * water_m * share / _DROPLET_M * size
     draws = _draws(seed, scene.name, actor.track_id, births // interval_ns)
-    whole = per_metre * speed * INTERVAL_S * (0.4 + 1.2 * draws[:, 0])  # puffs differ
-    left = np.exp(-age_s / _SETTLE_S) * (1 - (age_s / LIFE_S) ** 2) * np.minimum(age_s / _BORN_S, 1)
+    initial_extinction = per_metre * speed * INTERVAL_S * (0.4 + 1.2 * draws[:, 0])  # puffs differ
+    remaining_share = (
+        np.exp(-age_s / _RAIN_OUT_S)
+        * (1 - (age_s / LIFE_S) ** 2)
+        * np.minimum(age_s / _GROWTH_S, 1)
+    )
     ahead = velocity / np.maximum(speed, 1e-9)[:, None]
     aside = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))], 1)
     aside /= np.maximum(np.linalg.norm(aside, axis=1), 1e-9)[:, None]
@@ -127,23 +142,26 @@ def _puffs_of(
     centres += (np.maximum(rise, 0.2) - height / 2)[:, None] * over
     centres += 0.6 * age_s[:, None] * wind_mps
     lengths = 0.3 + 0.4 * speed * INTERVAL_S + 0.9 * age_s
-    widths, heights = 0.35 * width + 0.4 * age_s, 0.25 + 0.35 * (1 - np.exp(-age_s))
+    widths = 0.35 * width + 0.4 * age_s
+    heights = 0.25 + 0.35 * (1 - np.exp(-age_s))
     scales = np.stack([lengths, widths, heights], 1)
-    extinction = whole * left / ((2 * math.pi) ** 1.5 * scales.prod(1))
+    extinction = initial_extinction * remaining_share / ((2 * math.pi) ** 1.5 * scales.prod(1))
     axes = np.stack([ahead, aside, over], 1)
-    there = math.sqrt(2 * math.pi) * extinction * scales.max(1) > THINNEST
-    return Puffs(centres[there], (axes / scales[:, :, None])[there], extinction[there])
+    is_visible = math.sqrt(2 * math.pi) * extinction * scales.max(1) > MIN_OPTICAL_DEPTH
+    return Puffs(
+        centres[is_visible], (axes / scales[:, :, None])[is_visible], extinction[is_visible]
+    )
 
 
 def _draws(seed: int, scene: str, track_id: str, births: np.ndarray) -> np.ndarray:
-    """Numbers in [0, 1) of every puff, [N, 3]."""
+    """Return random numbers in [0, 1) of every puff, [N, 3]."""
     rng = rng_for(seed=seed, scene=scene, effect=f"spray of {track_id}")
     key = rng.integers(0, 2**64, dtype=np.uint64)
     columns = np.arange(1, 4, dtype=np.uint64) * np.uint64(STEP_X)
     return (mix(mix(key + births.astype(np.uint64))[:, None] + columns) >> np.uint64(11)) * 2.0**-53
 
 
-# ---- Where vehicles were, also before their tracks begin: straight on ----------------------------
+# ---- Positions of vehicles; before their tracks begin they drive straight on ---------------------
 
 
 def _times_s(actor: Actor, start_ns: int) -> np.ndarray:
@@ -151,19 +169,21 @@ def _times_s(actor: Actor, start_ns: int) -> np.ndarray:
 
 
 def _places(actor: Actor, seconds: np.ndarray) -> np.ndarray:
-    """[N, 3] at times since the track's first."""
-    known = _times_s(actor, int(actor.track.timestamps_ns[0]))
+    """Return positions [N, 3] at times since the track's first."""
+    track_times_s = _times_s(actor, int(actor.track.timestamps_ns[0]))
     places = actor.track.world_from_actor[:, :3, 3].double().numpy()
-    found = np.stack([np.interp(seconds, known, places[:, axis]) for axis in range(3)], -1)
-    if len(known) > 1:
-        # The first and last half second say how fast.
-        head = min(np.searchsorted(known, 2 * _STEP_S), len(known) - 1)
-        tail = max(np.searchsorted(known, known[-1] - 2 * _STEP_S, "right") - 1, 0)
-        first = (places[head] - places[0]) / (known[head] - known[0])
-        last = (places[-1] - places[tail]) / (known[-1] - known[tail])
-        found = found + np.minimum(seconds, 0)[:, None] * first
-        found += np.maximum(seconds - known[-1], 0)[:, None] * last
-    return found
+    positions = np.stack(
+        [np.interp(seconds, track_times_s, places[:, axis]) for axis in range(3)], -1
+    )
+    if len(track_times_s) > 1:
+        # The first and last half second give the speed.
+        head = min(np.searchsorted(track_times_s, 2 * _STEP_S), len(track_times_s) - 1)
+        tail = max(np.searchsorted(track_times_s, track_times_s[-1] - 2 * _STEP_S, "right") - 1, 0)
+        first = (places[head] - places[0]) / (track_times_s[head] - track_times_s[0])
+        last = (places[-1] - places[tail]) / (track_times_s[-1] - track_times_s[tail])
+        positions = positions + np.minimum(seconds, 0)[:, None] * first
+        positions += np.maximum(seconds - track_times_s[-1], 0)[:, None] * last
+    return positions
 
 
 def _velocities(actor: Actor, seconds: np.ndarray) -> np.ndarray:

@@ -77,9 +77,12 @@ def _check(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
 # may still differ from the sky behind it.
 
 LEVELS = 8  # steps from a splat of the land to one of the sky
-_NEAR, _FAR = 0.06, 0.16  # greatest difference of a channel: sky up to here, none from there
-_LIKELY, _UNLIKELY = 7.0, 14.0  # squared Mahalanobis distance from the colours of the seen sky
-_LOW_DEG, _HIGH_DEG = 0.5, 3.0  # elevation: none up to here, all from there
+_NEAR = 0.06
+_FAR = 0.16  # greatest difference of a channel: sky up to here, none from there
+_LIKELY = 7.0
+_UNLIKELY = 14.0  # squared Mahalanobis distance from the colours of the seen sky
+_LOW_DEG = 0.5
+_HIGH_DEG = 3.0  # elevation: none up to here, all from there
 _FLOOR = 0.01  # standard deviation added to the seen sky's, so that a plain one is not a point
 _MAX_PLACES = 64  # that the sky is looked at from
 
@@ -96,7 +99,8 @@ def sky_levels(scene: Scene, maps: StyleMaps) -> Int16[Tensor, "N"] | None:
 
 
 def _find(scene: Scene, seen: Float[Tensor, "3 4"]) -> Int16[Tensor, "N"] | None:
-    g, places = scene.background, _places(scene)
+    g = scene.background
+    places = _places(scene)
     if len(places) == 0 or len(g) == 0 or not scene.has_known_gravity:
         return None
     rgb = np.clip(0.5 + SH_C0 * g.sh[:, 0].double().numpy(), 0, 1)
@@ -145,7 +149,8 @@ def _places(scene: Scene) -> np.ndarray:
 
 def _distance(rgb: np.ndarray, seen: Float[Tensor, "3 4"]) -> np.ndarray:
     """Squared, in standard deviations of the seen sky's colours."""
-    mean, covariance = seen[:, 3].double().numpy(), seen[:, :3].double().numpy()
+    mean = seen[:, 3].double().numpy()
+    covariance = seen[:, :3].double().numpy()
     inverse = np.linalg.inv(covariance + _FLOOR**2 * np.eye(3))
     apart = rgb - mean
     return np.einsum("ni,ij,nj->n", apart, inverse, apart)
@@ -182,7 +187,8 @@ def style_gaussians(
     sh = gaussians.sh
     if out is not None:
         _check_out(out, sh)
-    splats, classes = maps.splats, _rows_of(gaussians, len(maps.splats))
+    splats = maps.splats
+    classes = _rows_of(gaussians, len(maps.splats))
     if levels is not None:
         splats, classes = level_maps(maps), map_rows(levels, gaussians.semantic, len(splats))
     if out is None and not bool(_changes(splats).any()):
@@ -219,7 +225,8 @@ def _on_cpu(
 
 def style_actor(actor: Actor, maps: StyleMaps) -> Actor:
     """The actor in mapped colours, at all times: its waves add to sh_00, so only M acts on them."""
-    waves, splats = actor.color_waves, maps.splats
+    waves = actor.color_waves
+    splats = maps.splats
     if waves is not None:
         matrices = fold_maps(splats, waves.coefficients.dtype)[:, :9].reshape(-1, 3, 3)
         classes = _rows_of(actor.gaussians, len(splats))
@@ -259,7 +266,8 @@ def fold_maps(
     changes nothing, else 1. Worked out in float64.
     """
     wide = maps.detach().double()
-    matrix, offset = wide[:, :, :3], wide[:, :, 3]
+    matrix = wide[:, :, :3]
+    offset = wide[:, :, 3]
     first = (0.5 * matrix.sum(2) + offset - 0.5) / SH_C0
     changes = _changes(maps).double()[:, None]
     return torch.cat([matrix.reshape(-1, 9), first, changes], 1).to(dtype)
@@ -327,7 +335,8 @@ def _rows_of(gaussians: Gaussians, count: int) -> Tensor | None:
     if count == 1 or classes is None or not len(classes):
         return None
     values = classes.cpu().numpy()  # torch's own least and greatest take longer on the CPU
-    low, high = int(values.min()), int(values.max())
+    low = int(values.min())
+    high = int(values.max())
     if low < 0 or high >= count:
         raise ValueError(
             f"the style has maps for classes 0 to {count - 1}; the Gaussians' classes are "

@@ -1,7 +1,7 @@
-"""The colours of a scene as its cameras show them: what a style is mapped from.
+"""Colours of a scene in its cameras' views: the content that a style maps from.
 
-A few views, small, spread evenly over the scene's frames and cameras, in the scene's own colours.
-Of a scene that no camera sees, the Gaussians' own colours, weighted by how much they could cover.
+A few small views are spread evenly over the scene's frames and cameras. For a scene that no camera
+sees, the Gaussians' colours are used instead, weighted by the area that they could cover.
 """
 
 from __future__ import annotations
@@ -38,11 +38,12 @@ from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, Sky, is_stand_in
 
-VIEWS = 12
-VIEW_PIXELS = 200 * 130  # of each, about
-PICTURES = 4  # that a network looks at
-PICTURE_SIZE = 256  # pixels, what networks take
-# Splats never cover a pixel altogether; what glimmers through in sum is no sky.
+VIEWS = 12  # views that the statistics are taken from
+VIEW_PIXELS = 200 * 130  # approximate number of pixels of a view
+PICTURES = 4  # pictures that a network takes
+PICTURE_SIZE = 256  # side of these pictures, pixels
+# Smallest share of the sky in all views. Splats never cover a pixel completely, and a smaller share
+# is only what shines through them.
 MIN_SKY = 0.005
 
 _CHANNELS = (ROAD, VEGETATION, REST)  # of the picture that says what a pixel shows
@@ -83,7 +84,7 @@ def content_pictures(
 
 
 def content_key(scene: Scene, cameras: Sequence[Camera] | None = None) -> Hashable:
-    """What of the cameras the scene's content depends on."""
+    """Return the numbers of the cameras that the scene's content depends on."""
     return tuple(
         (
             c.width,
@@ -100,8 +101,10 @@ def content_key(scene: Scene, cameras: Sequence[Camera] | None = None) -> Hashab
 
 
 def select_views(scene: Scene, cameras: Sequence[Camera] | None, count: int) -> tuple[Camera, ...]:
-    """At most `count` of the cameras (None: of the scene's own), spread evenly over their names and
-    over time; orthographic ones are left out. Which depends on nothing that is rendered.
+    """Return at most `count` of the cameras, spread evenly over their names and over time.
+
+    cameras: None for the scene's own. Orthographic cameras are left out. The selection does not
+    depend on what is rendered.
     """
     if cameras is None:
         cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
@@ -124,7 +127,7 @@ def select_views(scene: Scene, cameras: Sequence[Camera] | None, count: int) -> 
 
 
 def knows_regions(scene: Scene) -> bool:
-    """Whether any of the scene's Gaussians is known to be road or vegetation."""
+    """Return True if any of the scene's Gaussians is known to be road or vegetation."""
     regions = [REGION_OF_CLASS.get(cls) in (ROAD, VEGETATION) for cls in SemanticClass]
     table = np.zeros(CLASSES, bool)
     table[list(SemanticClass)] = regions
@@ -138,57 +141,55 @@ def gaussian_statistics(scene: Scene, *, per_region: bool) -> Statistics:
     They stand for the whole picture: how much sky would be seen is not known.
     """
     rgb, weights = _splat_colors(scene)
-    whole = statistics_of(rgb, weights)
-    assert whole is not None
-    found = {WHOLE: whole, LAND: whole}
+    statistics = statistics_of(rgb, weights)
+    assert statistics is not None
+    regions = {WHOLE: statistics, LAND: statistics}
     if per_region:
         channels = np.concatenate([_channels(part) for part in scene.all_gaussians])
         for number, region in enumerate(_CHANNELS):
-            own = np.where(channels == number, weights, 0)
-            _add(found, region, rgb, own, float(weights.sum()))
-    return found
+            region_weights = np.where(channels == number, weights, 0)
+            _add(regions, region, rgb, region_weights, float(weights.sum()))
+    return regions
 
 
 def _statistics(scene: Scene, views: Sequence[Camera], per_region: bool) -> Statistics:
     per_region = per_region and knows_regions(scene)
     marked = _marked_scene(scene) if per_region else None
-    seen = [_see(scene, marked, _small(camera)) for camera in views]
-    if not any((view.alpha > 0).any() for view in seen):
+    view_pixels = [_view_pixels(scene, marked, _small(camera)) for camera in views]
+    if not any((view.alpha > 0).any() for view in view_pixels):
         return gaussian_statistics(scene, per_region=per_region)
-    alpha = np.concatenate([view.alpha for view in seen])
-    land = np.concatenate([view.land for view in seen])
+    alpha = np.concatenate([view.alpha for view in view_pixels])
+    land = np.concatenate([view.land for view in view_pixels])
     total = float(alpha.size)
-    found: dict[str, ColorStatistics] = {}
+    regions: dict[str, ColorStatistics] = {}
     if is_stand_in(scene.sky):  # a grey that nobody saw has no part in the scene's mood
-        _add(found, WHOLE, land, alpha, float(alpha.sum(dtype=np.float64)))
+        _add(regions, WHOLE, land, alpha, float(alpha.sum(dtype=np.float64)))
     else:
-        picture = np.concatenate([view.picture for view in seen])
-        _add(found, WHOLE, picture, np.ones_like(alpha), total)
-    _add(found, LAND, land, alpha, total)
+        picture = np.concatenate([view.picture for view in view_pixels])
+        _add(regions, WHOLE, picture, np.ones_like(alpha), total)
+    _add(regions, LAND, land, alpha, total)
     open_share = np.clip(1 - alpha, 0, 1)
     if open_share.sum(dtype=np.float64) >= MIN_SKY * total:
-        _add(found, SKY, np.concatenate([view.sky for view in seen]), open_share, total)
+        _add(regions, SKY, np.concatenate([view.sky for view in view_pixels]), open_share, total)
     if per_region:
-        marks = np.concatenate([view.marks for view in seen])
+        marks = np.concatenate([view.marks for view in view_pixels])
         for number, region in enumerate(_CHANNELS):
-            _add(found, region, land, marks[:, number], total)
-    return found
+            _add(regions, region, land, marks[:, number], total)
+    return regions
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """Of a view's P pixels, float32 in [0, 1]: picture, land (the splats alone) and sky (alone)
-    [P, 3]; alpha [P]; marks [P, 3], weights of _CHANNELS, or [0, 3].
-    """
+class _ViewPixels:
+    """A view's P pixels, float32 in [0, 1]."""
 
-    picture: np.ndarray
-    land: np.ndarray
-    sky: np.ndarray
-    alpha: np.ndarray
-    marks: np.ndarray
+    picture: np.ndarray  # [P, 3]
+    land: np.ndarray  # [P, 3] colour of the splats alone
+    sky: np.ndarray  # [P, 3] colour of the sky alone
+    alpha: np.ndarray  # [P]
+    marks: np.ndarray  # [P, 3] weights of _CHANNELS, or [0, 3]
 
 
-def _see(scene: Scene, marked: Scene | None, camera: Camera) -> _Seen:
+def _view_pixels(scene: Scene, marked: Scene | None, camera: Camera) -> _ViewPixels:
     rgb_image, alpha_image = _render(scene, camera)
     nothing = torch.from_numpy(np.zeros((camera.height, camera.width, 3), np.float32))
     sky_image = composite_sky(nothing, nothing[..., 0].contiguous(), camera, scene.sky)
@@ -198,7 +199,7 @@ def _see(scene: Scene, marked: Scene | None, camera: Camera) -> _Seen:
     marks = np.empty((0, 3), np.float32)
     if marked is not None:
         marks = np.clip(_render(marked, camera)[0].numpy().reshape(-1, 3), 0, 1)
-    return _Seen(
+    return _ViewPixels(
         picture=np.clip(rgb + (1 - alpha)[:, None] * sky, 0, 1),
         land=np.clip(rgb / np.maximum(alpha, np.float32(1e-6))[:, None], 0, 1),
         sky=np.clip(sky, 0, 1),
@@ -208,16 +209,16 @@ def _see(scene: Scene, marked: Scene | None, camera: Camera) -> _Seen:
 
 
 def _add(
-    found: dict[str, ColorStatistics],
+    regions: dict[str, ColorStatistics],
     region: str,
     rgb: np.ndarray,
     weights: np.ndarray,
     total: float,
 ) -> None:
-    one = statistics_of(rgb, weights, total=total)
+    statistics = statistics_of(rgb, weights, total=total)
     # Float rounding of the marks leaves traces of regions that are nowhere.
-    if one is not None and one.share > 1e-6:
-        found[region] = one
+    if statistics is not None and statistics.share > 1e-6:
+        regions[region] = statistics
 
 
 def _pictures(scene: Scene, views: Sequence[Camera]) -> Float[Tensor, "B 3 256 256"]:
@@ -241,7 +242,7 @@ def _sky_of_pictures(scene: Scene, rgb: Tensor, alpha: Tensor) -> Sky:
 
 
 def _palette(scene: Scene) -> Float[Tensor, "3 256 256"]:
-    """Colours of Gaussians, each as often as its weight says, in no order that means aught."""
+    """Return colours of Gaussians, each as often as its weight says, in no meaningful order."""
     rgb, weights = _splat_colors(scene)
     reached = np.cumsum(weights)
     pixels = PICTURE_SIZE**2
@@ -252,9 +253,9 @@ def _palette(scene: Scene) -> Float[Tensor, "3 256 256"]:
 
 def _render(scene: Scene, camera: Camera) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
-        seen = rasterize(scene.parts_for(camera), camera)
-    assert seen.rgb is not None and seen.alpha is not None
-    return seen.rgb.float(), seen.alpha.float()
+        output = rasterize(scene.parts_for(camera), camera)
+    assert output.rgb is not None and output.alpha is not None
+    return output.rgb.float(), output.alpha.float()
 
 
 def _marked_scene(scene: Scene) -> Scene:
@@ -285,7 +286,8 @@ def _splat_colors(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """The constant colours of all Gaussians, float64 [N, 3], and their weights [N]: opacity times
     the mean over three sides of what is seen of an ellipsoid, m^2; 1 where all weigh nothing.
     """
-    colors, weights = [], []
+    colors = []
+    weights = []
     for part in scene.all_gaussians:
         colors.append(np.clip(0.5 + SH_C0 * part.sh[:, 0].detach().double().numpy(), 0, 1))
         a, b, c = part.scales.detach().double().numpy().T

@@ -1,4 +1,4 @@
-"""Style as an effect: the colours of the scene, or of the finished picture, under its maps."""
+"""The effect style: colour maps on the scene, or on the finished picture."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ from augment.timing import timed
 from recipes.schema import Recipe
 from recipes.style import Style
 
-ON_SCENE, ON_PICTURE = "style on the scene", "style on the picture"
+ON_SCENE = "style on the scene"
+ON_PICTURE = "style on the picture"
 
 
 @dataclass(frozen=True, eq=False)
 class PackedMaps:
-    """Maps as arrays: pickled tensors would lie in memory that is gone with their process."""
+    """Maps as NumPy arrays: the memory of pickled tensors would end with their process."""
 
     arrays: tuple[Any, ...]
+    """The fields of `StyleMaps`, in order."""
 
     @staticmethod
     def of(maps: StyleMaps) -> PackedMaps:
@@ -36,14 +38,18 @@ class PackedMaps:
         return PackedMaps(tuple(None if t is None else t.numpy() for t in tensors))
 
     def load(self) -> StyleMaps:
-        found: list[Any] = [None if a is None else torch.from_numpy(a.copy()) for a in self.arrays]
-        return StyleMaps(*found)
+        tensors: list[Any] = [
+            None if a is None else torch.from_numpy(a.copy()) for a in self.arrays
+        ]
+        return StyleMaps(*tensors)
 
 
 class StyleEffect(Effect):
-    """The colours of an image or a preset, taken on by what stands in the weather, or by all."""
+    """The colours of an image or a preset, on the scene or on the finished picture."""
 
-    name, section, model = "style", "style", Style
+    name = "style"
+    section = "style"
+    model = Style
     folded: ClassVar = {ON_SCENE: ("style", None)}
 
     def kernels(self, section: Style) -> Hashable:
@@ -63,15 +69,15 @@ class StyleEffect(Effect):
         reason = f"{style.method} from {source} at strength {style.strength:g}"
         on_picture = style.applied_to == "picture"
         maps = "a map for every region" if style.per_region else "one map for all splats"
-        when = {
+        evaluation = {
             "color": "applied as they are projected",
             "sh": "folded into the background's SH once, applied to actors as they are projected",
         }[style.evaluated]
-        other = f"style.applied_to is {style.applied_to!r}"
-        how = f"{reason}, {maps}, {when}; snow and water keep their colours"
+        other_reason = f"style.applied_to is {style.applied_to!r}"
+        scene_reason = f"{reason}, {maps}, {evaluation}; snow and water keep their colours"
         steps = (
-            Step(ON_SCENE, not on_picture, other if on_picture else how, SCENE),
-            Step(ON_PICTURE, on_picture, reason if on_picture else other, PICTURE),
+            Step(ON_SCENE, not on_picture, other_reason if on_picture else scene_reason, SCENE),
+            Step(ON_PICTURE, on_picture, reason if on_picture else other_reason, PICTURE),
         )
         return Placed(style, steps)
 
@@ -82,9 +88,9 @@ class StyleEffect(Effect):
         return own.prepared.lighting_scene if own.data.applied_to == "scene" else None
 
     def share(self, job: Sharing) -> None:
-        """The maps, so that no other process renders what they are fitted to, or reads files."""
-        found = (self.of(recipe) for recipe in job.recipes)
-        for style in dict.fromkeys(s for s in found if s and s.changes):
+        """Precompute the maps, so that other processes render no content and read no files."""
+        styles = (self.of(recipe) for recipe in job.recipes)
+        for style in dict.fromkeys(s for s in styles if s and s.changes):
             maps = style_maps(job.scene, style, cameras=job.cameras)
             memo = memo_of(job.scene)
             memo.put(("style maps", style), PackedMaps.of(maps), shared=True)

@@ -46,7 +46,8 @@ def find_sky(rgb: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """
     if min(weights.shape) < _MIN_SIDE_PX:
         return np.zeros(weights.shape, bool)
-    small, small_weights = _small(rgb), _small(weights)
+    small = _small(rgb)
+    small_weights = _small(weights)
     steps = _color_steps(small)
     border = _best_border(small, small_weights, steps)
     sky = (np.arange(len(small))[:, None] < border) & (small_weights > 0)
@@ -64,21 +65,23 @@ def region_masks(rgb: np.ndarray, weights: np.ndarray, sky: np.ndarray) -> dict[
     the bottom edge; only below a sky, for indoors the same is a table. REST is what remains, where
     either was found. None is smaller than 4 % of the picture.
     """
-    enough = _MIN_SHARE * sky.size
+    min_pixels = _MIN_SHARE * sky.size
     masks: dict[str, np.ndarray] = {}
-    outdoors = sky.sum() >= enough
+    outdoors = sky.sum() >= min_pixels
     land = ~sky & (weights > 0)
-    if outdoors and land.sum() >= enough:
+    if outdoors and land.sum() >= min_pixels:
         masks |= {SKY: sky, LAND: land}
     if min(sky.shape) < _MIN_SIDE_PX:
         return masks
     green = _green(rgb) & land
     grey = _road(rgb) & land & ~green if outdoors else np.zeros_like(land)
-    found = {name: m for name, m in ((VEGETATION, green), (ROAD, grey)) if m.sum() >= enough}
-    rest = land & ~np.logical_or.reduce([*found.values(), np.zeros_like(land)])
-    if found and rest.sum() >= enough:
-        found[REST] = rest
-    return masks | found
+    land_masks = {
+        name: m for name, m in ((VEGETATION, green), (ROAD, grey)) if m.sum() >= min_pixels
+    }
+    rest_mask = land & ~np.logical_or.reduce([*land_masks.values(), np.zeros_like(land)])
+    if land_masks and rest_mask.sum() >= min_pixels:
+        land_masks[REST] = rest_mask
+    return masks | land_masks
 
 
 def _small(values: np.ndarray) -> np.ndarray:
@@ -140,11 +143,12 @@ def _spread(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_sky(small: np.ndarray, sky: np.ndarray, steps: np.ndarray) -> bool:
-    """Whether the region at the top can be nothing else: by day, at dusk, overcast, or lit night.
+    """Return True if the region at the top must be a sky: by day, at dusk, overcast, or lit night.
 
     Numbers chosen by eye on photographs of skies and of walls, water, leaves and rooms.
     """
-    share, columns = sky.mean(), (sky.sum(0) > len(sky) // 25).mean()
+    share = sky.mean()
+    columns = (sky.sum(0) > len(sky) // 25).mean()
     if not _MIN_SHARE <= share <= 1 - _MIN_SHARE or columns < _MIN_COLUMNS:
         return False
     red, green, blue = small[sky].mean(0).tolist()
@@ -176,7 +180,9 @@ def _grown(small: np.ndarray, sky: np.ndarray, steps: np.ndarray, border: np.nda
 
 
 def _green(rgb: np.ndarray) -> np.ndarray:
-    red, green, blue = rgb[..., 0], rgb[..., 1], rgb[..., 2]
+    red = rgb[..., 0]
+    green = rgb[..., 1]
+    blue = rgb[..., 2]
     total = red + green + blue
     excess = 2 * green - red - blue > 0.1 * total
     return excess & (green > red) & (blue < 0.85 * green) & (total > 0.15) & (total < 2.4)
@@ -184,7 +190,8 @@ def _green(rgb: np.ndarray) -> np.ndarray:
 
 def _road(rgb: np.ndarray) -> np.ndarray:
     small = _small(rgb)
-    most, least = small.max(2), small.min(2)
+    most = small.max(2)
+    least = small.min(2)
     grey = (most - least < 0.2 * most) & (most > 0.1) & (_color_steps(small) < 0.08)
     grey[: len(grey) // 2] = False
     _, parts = cv2.connectedComponents(grey.astype(np.uint8), connectivity=4)
@@ -273,15 +280,16 @@ def _sums(image: StyleImage, parts: np.ndarray, count: int) -> np.ndarray:
 
 
 def _statistics(sums: np.ndarray, parts: list[int]) -> ColorStatistics:
-    total, own = sums[:, 0, 0].sum(), sums[parts].sum(0)
-    mean = own[0, 1:] / own[0, 0]
-    covariance = own[1:, 1:] / own[0, 0] - np.outer(mean, mean)
+    total = sums[:, 0, 0].sum()
+    part_sums = sums[parts].sum(0)
+    mean = part_sums[0, 1:] / part_sums[0, 0]
+    covariance = part_sums[1:, 1:] / part_sums[0, 0] - np.outer(mean, mean)
     # A constant colour's variance is zero less rounding.
     values, vectors = np.linalg.eigh(covariance)
     if values[0] < 0:
         covariance = (vectors * np.maximum(values, 0)) @ vectors.T
         covariance = (covariance + covariance.T) / 2
-    return ColorStatistics(mean, covariance, float(own[0, 0] / total))
+    return ColorStatistics(mean, covariance, float(part_sums[0, 0] / total))
 
 
 def _read(path: Path, what: str) -> tuple[np.ndarray, np.ndarray | None]:

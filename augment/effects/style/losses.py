@@ -95,9 +95,12 @@ _OPPONENT = (
 )
 _DIRECTIONS = (
     *_OPPONENT,
-    (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0),
-    (0.0, 1 / math.sqrt(2), -1 / math.sqrt(2)), (1 / math.sqrt(2), 0.0, -1 / math.sqrt(2)),
-)  # fmt: skip
+    (1.0, 0.0, 0.0),
+    (0.0, 1.0, 0.0),
+    (0.0, 0.0, 1.0),
+    (0.0, 1 / math.sqrt(2), -1 / math.sqrt(2)),
+    (1 / math.sqrt(2), 0.0, -1 / math.sqrt(2)),
+)
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)  # about a Gaussian of 1 px
 _CONTRAST_GAIN = 2.0  # of edges, which vary less than colours do: about as much deviation
 
@@ -147,7 +150,10 @@ class FilterBank(nn.Module):
 
 def _edges(x: Tensor) -> Tensor:
     """Rises and falls [B, 8 C, H - 1, W - 1] along four directions, over the same length each."""
-    a, b, c, d = x[..., :-1, :-1], x[..., :-1, 1:], x[..., 1:, :-1], x[..., 1:, 1:]
+    a = x[..., :-1, :-1]
+    b = x[..., :-1, 1:]
+    c = x[..., 1:, :-1]
+    d = x[..., 1:, 1:]
     slopes = torch.cat(
         [(b + d - a - c) / 2, (c + d - a - b) / 2, (d - a) / math.sqrt(2), (c - b) / math.sqrt(2)],
         1,
@@ -235,7 +241,7 @@ def moments(feature: Float[Tensor, "B C H W"]) -> tuple[Tensor, Tensor]:
 
 
 def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Of the terms that weigh something; the others may be anything.
+    """Return the weighted sum of the terms with a weight; the other terms may have any value.
 
     Raises:
         StyleError: there are none.

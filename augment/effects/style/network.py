@@ -39,7 +39,8 @@ from recipes.files import open_file
 ENCODERS = ("small", "b0")
 LOOKED_AT_PX = 32  # by the small encoder: the arrangement of colours, not the detail
 SMALL_CHANNELS = (16, 32, 64, 96, 96)
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
 B0_WIDTH = 1280
 
 
@@ -175,21 +176,26 @@ MOMENT_FEATURES = 18 + 3 * len(LEVELS) + 6 * len(_PAIRED_LEVELS)
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Of B pictures. features: float32 [B, MOMENT_FEATURES], about -3 to 3.
+    """Colour moments of B pictures, float32.
 
-    normal: float32 [B, 3, R, R], the small copies with the mean photo's moments.
-    normalise, restore: float32 [B, 4, 4] matrices of colours as columns, a homogeneous 1 last: from
-    the picture's moments to the mean photo's, and the inverse.
+    The matrices act on colours as columns with a homogeneous 1 last.
     """
 
     features: Float[Tensor, "B F"]
+    """MOMENT_FEATURES numbers a picture, about -3 to 3."""
+
     normal: Float[Tensor, "B 3 R R"]
+    """Small copies of the pictures with the mean photo's moments."""
+
     normalise: Float[Tensor, "B 4 4"]
+    """Maps from the picture's moments to the mean photo's."""
+
     restore: Float[Tensor, "B 4 4"]
+    """Inverse of `normalise`."""
 
 
 def image_moments(images: Float[Tensor, "B 3 H W"]) -> Moments:
-    """Of display-encoded pictures. No gradient passes: pictures are given, not trained.
+    """Return the moments of display-encoded pictures, without gradients.
 
     The maps are optimal transports between Gaussian distributions of colours (Olkin and Pukelsheim
     1982): A = S^-1/2 (S^1/2 R S^1/2)^1/2 S^-1/2 for covariances S (of the picture) and R (of the
@@ -211,7 +217,9 @@ def image_moments(images: Float[Tensor, "B 3 H W"]) -> Moments:
         matrix = normalise[:, :3, :3].float()
         normal = torch.einsum("bij,bjhw->bihw", matrix, small)
         normal = normal + normalise[:, :3, 3, None, None].float()
-        features = torch.cat([_own(mean, covariance), _of_shape(normal), _levels(normal)], dim=1)
+        features = torch.cat(
+            [_moment_features(mean, covariance), _of_shape(normal), _levels(normal)], dim=1
+        )
         return Moments(features, normal, normalise.float(), restore.float())
 
 
@@ -239,7 +247,9 @@ def _affine(matrix: Float[Tensor, "B 3 3"], offset: Float[Tensor, "B 3"]) -> Flo
     return torch.cat([top, last], dim=1)
 
 
-def _own(mean: Float[Tensor, "B 3"], covariance: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 9"]:
+def _moment_features(
+    mean: Float[Tensor, "B 3"], covariance: Float[Tensor, "B 3 3"]
+) -> Float[Tensor, "B 9"]:
     """The picture's own mean (3) and root of the covariance (6)."""
     root, _ = _roots(covariance)
     upper = torch.triu_indices(3, 3, device=root.device)
@@ -247,8 +257,10 @@ def _own(mean: Float[Tensor, "B 3"], covariance: Float[Tensor, "B 3 3"]) -> Floa
 
 
 def _of_shape(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B 9"]:
-    """Of the normalised picture, which a change of light hardly moves: what the upper half has
-    above the lower (3), skewness (3), kurtosis (3)."""
+    """Return features of the normalised picture, which a change of light hardly changes.
+
+    They are the difference of the upper and the lower half (3), skewness (3) and kurtosis (3).
+    """
     centred = normal - normal.mean((2, 3), keepdim=True)
     scaled = centred / centred.flatten(2).std(2).clamp_min(0.05)[..., None, None]
     half = scaled.shape[2] // 2
@@ -267,12 +279,13 @@ def _levels(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B F"]:
     places = [round(level * (sample.shape[2] - 1)) for level in LEVELS]
     # One by one: a list of places would be copied to a GPU, and waited for.
     levels = torch.stack([sample[:, :, place] for place in places], 2).clamp(-1, 2)  # [B, 3, L]
-    found = [3 * (levels - 0.43).flatten(1)]
+    features = [3 * (levels - 0.43).flatten(1)]
     for index in _PAIRED_LEVELS:
-        low, high = levels[:, :, index], levels[:, :, -1 - index]
+        low = levels[:, :, index]
+        high = levels[:, :, -1 - index]
         gain = 1 / (high - low).clamp_min(0.25)
-        found += [gain - 1.2, -gain * low]
-    return torch.cat(found, dim=1)
+        features += [gain - 1.2, -gain * low]
+    return torch.cat(features, dim=1)
 
 
 SIZE_PX = 256  # of the pictures that the encoder is given
@@ -301,7 +314,8 @@ class Gscm(nn.Module):
             nn.init.zeros_(value)
         basis = _basis()
         self.basis = nn.Buffer(basis)  # [4, k], orthonormal: how T holds a map of colours
-        self.content_p, self.style_p = nn.Parameter(basis.clone()), nn.Parameter(basis.clone())
+        self.content_p = nn.Parameter(basis.clone())
+        self.style_p = nn.Parameter(basis.clone())
         self.content_q = nn.Parameter(basis[:3].T.clone())
         self.style_q = nn.Parameter(basis[:3].T.clone())
 
@@ -309,13 +323,13 @@ class Gscm(nn.Module):
         self, images: Float[Tensor, "B 3 S S"]
     ) -> tuple[Float[Tensor, "B k k"], Float[Tensor, "B k k"]]:
         """f_c and f_s: the content stage's T and the style stage's. images: in [0, 1]."""
-        found = image_moments(images)
-        features = torch.cat([self.encoder(images, found.normal), found.features], dim=1)
+        moments = image_moments(images)
+        features = torch.cat([self.encoder(images, moments.normal), moments.features], dim=1)
         predicted = self.head(nn.functional.silu(self.hidden(features)))
-        predicted = HEAD_SCALE * (predicted + self.direct(found.features))
+        predicted = HEAD_SCALE * (predicted + self.direct(moments.features))
         content, style = predicted.unflatten(1, (2, LATENT, LATENT)).unbind(1)
         eye = torch.eye(LATENT, device=images.device)
-        normalise, restore = self._lifted(found)
+        normalise, restore = self._lifted(moments)
         # Rows: the moments act first on the content and last on the style.
         return normalise @ (eye + content), (eye + style) @ restore
 
@@ -327,11 +341,11 @@ class Gscm(nn.Module):
         """sGSCM, folded."""
         return (self.style_p @ f_s @ self.style_q).transpose(1, 2)
 
-    def _lifted(self, found: Moments) -> tuple[Float[Tensor, "B k k"], Float[Tensor, "B k k"]]:
+    def _lifted(self, moments: Moments) -> tuple[Float[Tensor, "B k k"], Float[Tensor, "B k k"]]:
         """The moments' maps of colours, as T's that leave the rest of the space alone."""
         eye, small = (torch.eye(n, device=self.basis.device) for n in (LATENT, 4))
         lift = self.basis.T  # [k, 4]
-        maps = (found.normalise, found.restore)
+        maps = (moments.normalise, moments.restore)
         first, second = (eye + lift @ (m.transpose(1, 2) - small) @ lift.T for m in maps)
         return first, second
 

@@ -156,10 +156,13 @@ def sample_pairs(
     first = torch.randint(count, (batch,), generator=generator)
     second = (first + torch.randint(1, count, (batch,), generator=generator)) % count
     recoloring = sample_recolorings(batch, generator)
-    first, second = first.to(photos.device), second.to(photos.device)
-    one = _varied(_cut(photos[first], generator, size_px), generator)
-    two = _varied(_cut(photos[second], generator, size_px), generator)
-    return PairBatch(one, recoloring(one), two, recoloring(two))
+    first = first.to(photos.device)
+    second = second.to(photos.device)
+    first_photos = _varied(_cut(photos[first], generator, size_px), generator)
+    second_photos = _varied(_cut(photos[second], generator, size_px), generator)
+    return PairBatch(
+        first_photos, recoloring(first_photos), second_photos, recoloring(second_photos)
+    )
 
 
 def _varied(
@@ -176,8 +179,8 @@ def _varied(
     foreign = foreign & (torch.rand((count, 1, 1), generator=generator) < MIXED_SHARE)
     mixed = torch.where(foreign[:, None].to(photos.device), photos.roll(1, 0), photos)
     usual = vars(RecolorSettings()).items()
-    little = RecolorSettings(**{n: 0.0 if "share" in n else VARIED * v for n, v in usual})
-    return sample_recolorings(count, generator, little)(mixed)
+    small_settings = RecolorSettings(**{n: 0.0 if "share" in n else VARIED * v for n, v in usual})
+    return sample_recolorings(count, generator, small_settings)(mixed)
 
 
 def _about_grey(
@@ -186,7 +189,8 @@ def _about_grey(
     """Turn colours about the grey axis, and scale their distance from it; grey stays as it is."""
     third = torch.full((3, 3), 1 / 3)
     cross = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / 3**0.5
-    cos, sin = hue_rad.cos()[:, None, None], hue_rad.sin()[:, None, None]
+    cos = hue_rad.cos()[:, None, None]
+    sin = hue_rad.sin()[:, None, None]
     turned = third + cos * (torch.eye(3) - third) + sin * cross  # Rodrigues' formula
     luma = torch.tensor(GREY).expand(3, 3)
     return torch.lerp(luma.expand(len(saturation), 3, 3), turned, saturation[:, None, None])
@@ -200,7 +204,8 @@ def _cut(
     centres = (1 - sides) * (2 * torch.rand((count, 2), generator=generator) - 1)
     mirrored = torch.where(torch.rand(count, generator=generator) < 0.5, -1.0, 1.0)
     theta = torch.zeros(count, 2, 3)
-    theta[:, 0, 0], theta[:, 1, 1] = sides[:, 0] * mirrored, sides[:, 1]
+    theta[:, 0, 0] = sides[:, 0] * mirrored
+    theta[:, 1, 1] = sides[:, 1]
     theta[:, :, 2] = centres
     theta = theta.to(photos.device)
     grid = functional.affine_grid(theta, [count, 3, size_px, size_px], align_corners=False)
@@ -275,14 +280,15 @@ def score_pairs(
     method: Method, photos: Float[Tensor, "P 3 S S"], *, repeats: int
 ) -> dict[str, float]:
     """Means of PSNR (dB) by name, of each photo under `repeats` recolourings, always the same."""
-    count, half = len(photos), photos.shape[3] // 2
+    count = len(photos)
+    half = photos.shape[3] // 2
     generator = torch.Generator().manual_seed(0)
-    found: dict[str, list[float]] = {name: [] for name in ("same", "half", "below", "look")}
+    scores: dict[str, list[float]] = {name: [] for name in ("same", "half", "below", "look")}
     for repeat in range(repeats):
-        all_of_them = sample_recolorings(count, generator)
+        recolorings = sample_recolorings(count, generator)
         for index, photo in enumerate(photos):
-            one = slice(index, index + 1)
-            look = Recoloring(all_of_them.maps[one], all_of_them.gamma[one], all_of_them.curve[one])
+            row = slice(index, index + 1)
+            look = Recoloring(recolorings.maps[row], recolorings.gamma[row], recolorings.curve[row])
             recolored = look(photo[None])[0]
             other = look(photos[(index + 1 + repeat % (count - 1)) % count][None])[0]
             for name, content, style, target in (
@@ -292,8 +298,8 @@ def score_pairs(
                 ("look", photo, other, recolored),
             ):
                 mapped = mapped_picture(method(content, style), content).clamp(0, 1)
-                found[name].append(_psnr_db(mapped, target))
-    return {name: float(np.mean(values)) for name, values in found.items()}
+                scores[name].append(_psnr_db(mapped, target))
+    return {name: float(np.mean(values)) for name, values in scores.items()}
 
 
 def network_method(net: Gscm) -> Method:

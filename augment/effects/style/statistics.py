@@ -17,8 +17,12 @@ from torch import Tensor
 from augment.effects.style.color_maps import CLASSES, StyleMaps
 from augment.semantics import SemanticClass
 
-WHOLE, SKY, LAND = "whole", "sky", "land"  # land: all but the sky
-VEGETATION, ROAD, REST = "vegetation", "road", "rest"  # of the land
+WHOLE = "whole"
+SKY = "sky"
+LAND = "land"  # everything except the sky
+VEGETATION = "vegetation"
+ROAD = "road"
+REST = "rest"  # land without vegetation and road
 
 # What a Gaussian's class says of its region; every other class is of the rest.
 REGION_OF_CLASS: Mapping[SemanticClass, str] = {
@@ -33,13 +37,16 @@ REGION_OF_CLASS: Mapping[SemanticClass, str] = {
 
 @dataclass(frozen=True, eq=False)
 class ColorStatistics:
-    """Of one region. mean: float64 [3]. covariance: float64 [3, 3], symmetric, not negative
-    definite. share: of the picture's weight that the region has, in (0, 1].
-    """
+    """Colour statistics of one region."""
 
     mean: np.ndarray
+    """Mean colour, float64 [3]."""
+
     covariance: np.ndarray
+    """Covariance of the colours, float64 [3, 3], symmetric, positive semidefinite."""
+
     share: float = 1.0
+    """Share of the picture's weight that the region has, in (0, 1]."""
 
     def __post_init__(self) -> None:
         shapes = (self.mean.shape, self.covariance.shape)
@@ -57,9 +64,10 @@ Statistics = Mapping[str, ColorStatistics]  # by region; WHOLE is always there
 def statistics_of(
     rgb: np.ndarray, weights: np.ndarray | None = None, *, total: float | None = None
 ) -> ColorStatistics | None:
-    """Of colours float [N, 3] with weights [N] >= 0; None where they weigh nothing.
+    """Return the statistics of colours float [N, 3]; None if their weights sum to 0.
 
-    total: the whole picture's weight, for the share; the region's own by default.
+    weights: [N], >= 0. total: weight of the complete picture, for the share; by default the weight
+    of these colours.
     """
     rgb = np.asarray(rgb, np.float64).reshape(-1, 3)
     w = np.ones(len(rgb)) if weights is None else np.asarray(weights, np.float64).reshape(-1)
@@ -75,8 +83,8 @@ def statistics_of(
         for j in range(i + 1):
             product = np.einsum("n,n->", weighted, channels[j]) / weight
             covariance[i, j] = covariance[j, i] = product
-    whole = weight if total is None else total
-    return ColorStatistics(mean, covariance, weight / whole)
+    total_weight = weight if total is None else total
+    return ColorStatistics(mean, covariance, weight / total_weight)
 
 
 # ---- Linear colour maps in closed form, from the statistics of a scene and of a style ------------
@@ -89,18 +97,21 @@ _GREY = np.full(3, 3**-0.5)
 
 @dataclass(frozen=True)
 class Limits:
-    """What a map may do.
-
-    floor: standard deviation added to both sides (in quadrature), about one step of 8 bits: below
-    it lies rounding, not colour. max_gain: of any direction of colour; more shows noise and
-    banding. min_gain: of any direction; far below one, as a grey style does want grey.
-    min_contrast: of the grey axis; a constant style tints a scene, and leaves its shapes.
-    """
+    """Limits of a colour map."""
 
     floor: float = 1 / 255
+    """Standard deviation added to both sides (in quadrature), about one step of 8 bits: smaller
+    deviations are rounding.
+    """
+
     max_gain: float = 3.0
+    """Largest gain of any direction of colour; more shows noise and banding."""
+
     min_gain: float = 0.05
+    """Smallest gain of any direction; far below one, because a grey style wants grey."""
+
     min_contrast: float = 0.4
+    """Smallest gain of the grey axis: a constant style tints a scene but leaves its shapes."""
 
     def __post_init__(self) -> None:
         if not (
@@ -116,7 +127,8 @@ LAND_LIMITS = Limits()
 # A sky is smooth: gains show its steps of 8 bits; and a plain sky (overcast) is a wish.
 SKY_LIMITS = Limits(max_gain=2.0, min_contrast=0.2)
 
-_SMALL_SHARE, _LARGE_SHARE = 0.02, 0.15  # of a picture: where a region's own map begins and is full
+_SMALL_SHARE = 0.02  # share of a picture from which a region's own map counts
+_LARGE_SHARE = 0.15  # share of a picture from which a region's own map counts fully
 _ROOM = 2.0  # standard deviations that a limited map keeps between its mean and black or white
 
 
@@ -170,25 +182,28 @@ def closed_maps(
         return _mapped(content[region], style[region], limits, strength, form)
 
     picture = between(WHOLE)
-    both = content.keys() & style.keys()
-    own_sky = SKY in both
-    land = between(LAND) if own_sky and LAND in both else picture
-    sky = between(SKY, SKY_LIMITS) if own_sky else picture
+    common_regions = content.keys() & style.keys()
+    has_sky = SKY in common_regions
+    land = between(LAND) if has_sky and LAND in common_regions else picture
+    sky = between(SKY, SKY_LIMITS) if has_sky else picture
     splats = land[None]
     if per_region:
         regions = {
             region: torch.lerp(land, between(region), _trust(content[region], style[region]))
             for region in (ROAD, VEGETATION, REST)
-            if region in both
+            if region in common_regions
         }
         splats = torch.stack([_of_class(value, regions, land, sky) for value in range(CLASSES)])
-    seen = content[SKY] if own_sky else None
-    about = seen and torch.from_numpy(np.column_stack([seen.covariance, seen.mean])).float()
+    content_sky = content[SKY] if has_sky else None
+    about = (
+        content_sky
+        and torch.from_numpy(np.column_stack([content_sky.covariance, content_sky.mean])).float()
+    )
     return StyleMaps(splats.float(), sky.float(), picture.float(), about)
 
 
 def _trust(content: ColorStatistics, style: ColorStatistics) -> float:
-    """Of a region's own map, by its smaller share: 0 to 1 without a step."""
+    """Return the weight of a region's own map, by the smaller share: smooth from 0 to 1."""
     share = min(content.share, style.share)
     x = float(np.clip((share - _SMALL_SHARE) / (_LARGE_SHARE - _SMALL_SHARE), 0, 1))
     return x * x * (3 - 2 * x)
@@ -271,8 +286,10 @@ def _target_mean(
     that meets no limit has the style's mean.
     """
     mapped = np.diag(matrix @ (content.covariance + floor) @ matrix.T)
-    own = np.diag(style.covariance + floor)
-    room = np.clip(_ROOM * (np.sqrt(mapped) - np.sqrt(own)), 0, 0.5)
+    style_variances = np.diag(style.covariance + floor)
+    room = np.clip(_ROOM * (np.sqrt(mapped) - np.sqrt(style_variances)), 0, 0.5)
     # Beyond rounding: without a limit both spreads are the same.
-    acts = room > 1e-9
-    return np.clip(style.mean, np.where(acts, room, -np.inf), np.where(acts, 1 - room, np.inf))
+    is_limited = room > 1e-9
+    return np.clip(
+        style.mean, np.where(is_limited, room, -np.inf), np.where(is_limited, 1 - room, np.inf)
+    )

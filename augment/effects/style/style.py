@@ -1,4 +1,4 @@
-"""A scene in a style, as pictures need it: mapped parts and sky, and what lights the snow."""
+"""A scene in a style: mapped parts and sky, and the scene that lights the snow."""
 
 from __future__ import annotations
 
@@ -73,18 +73,18 @@ def style_maps(scene: Scene, style: Style, *, cameras: Sequence[Camera] | None =
         return StyleMaps(torch.eye(3, 4)[None], torch.eye(3, 4), torch.eye(3, 4))
     memo = memo_of(scene)
 
-    def find() -> StyleMaps:
+    def compute() -> StyleMaps:
         key = ("style maps of cameras", style, content_key(scene, cameras))
         return memo.get(key, lambda: _find_maps(scene, style, cameras))
 
     shared = ("style maps", style)
-    return memo.get(shared, find) if memo.known(shared) else find()
+    return memo.get(shared, compute) if memo.known(shared) else compute()
 
 
 def _find_maps(scene: Scene, style: Style, cameras: Sequence[Camera] | None) -> StyleMaps:
     if style.method == "gscm":
-        found = _network_map(scene, style, cameras)
-        return StyleMaps(found[None], found, found)
+        color_map = _network_map(scene, style, cameras)
+        return StyleMaps(color_map[None], color_map, color_map)
     preset = style.preset
     return closed_maps(
         content_statistics(scene, cameras, per_region=style.per_region),
@@ -109,14 +109,14 @@ def _network_map(
     picture = _style_picture(_style_image(style))
     net = _network(style.checkpoint, _stamp(style.checkpoint))
     content = content_pictures(scene, cameras)
-    found = compose(style_side(net, picture), _content_side(scene, net, content)).double()
-    if not bool(torch.isfinite(found).all()):
+    color_map = compose(style_side(net, picture), _content_side(scene, net, content)).double()
+    if not bool(torch.isfinite(color_map).all()):
         raise StyleError(
-            f"the network gives no finite map for style image {style.image}: {found.tolist()}; "
+            f"the network gives no finite map for style image {style.image}: {color_map.tolist()}; "
             f"use another checkpoint, or method mkl"
         )
     mean = content.double().mean((0, 2, 3))
-    full = _limited(found, mean)
+    full = _limited(color_map, mean)
     # The identity at strength 0, the map at 1, straight between and beyond.
     return _limited(torch.lerp(torch.eye(3, 4).double(), full, style.strength), mean).float()
 
@@ -140,11 +140,11 @@ def _network(path: str | None, _stamp: tuple[int, int]) -> Gscm:
 
 
 def _stamp(path: str | None) -> tuple[int, int]:
-    """What changes with a file; of one that is not there, nothing: reading it says so."""
+    """Return a stamp that changes with a file; (0, 0) without a file, which reading reports."""
     if path is None or not Path(path).is_file():
         return (0, 0)
-    found = Path(path).stat()
-    return (found.st_mtime_ns, found.st_size)
+    status = Path(path).stat()
+    return (status.st_mtime_ns, status.st_size)
 
 
 def _style_picture(image: StyleImage) -> Float[Tensor, "1 3 256 256"]:
@@ -160,12 +160,13 @@ def _style_picture(image: StyleImage) -> Float[Tensor, "1 3 256 256"]:
 
 def _limited(color_map: Float[Tensor, "3 4"], mean: Float[Tensor, "3"]) -> Float[Tensor, "3 4"]:
     """The map with no gain above that of the closed forms; the mean colour goes where it went."""
-    matrix, offset = color_map[:, :3], color_map[:, 3]
+    matrix = color_map[:, :3]
+    offset = color_map[:, 3]
     u, gains, v = torch.linalg.svd(matrix)
     if float(gains.max()) <= LAND_LIMITS.max_gain:
         return color_map
-    tamed = u @ torch.diag(gains.clamp(max=LAND_LIMITS.max_gain)) @ v
-    return torch.cat([tamed, (offset + (matrix - tamed) @ mean)[:, None]], 1)
+    limited_matrix = u @ torch.diag(gains.clamp(max=LAND_LIMITS.max_gain)) @ v
+    return torch.cat([limited_matrix, (offset + (matrix - limited_matrix) @ mean)[:, None]], 1)
 
 
 # ---- Styles that come with the package: colour statistics of a mood, in place of an image --------
@@ -197,7 +198,7 @@ class _Preset(Closed):
 
 
 def preset_statistics(name: str) -> Statistics:
-    """Of LAND, SKY and, put together from SHARES of both, WHOLE.
+    """Return the statistics of LAND and SKY, and of WHOLE, which combines SHARES of both.
 
     Raises:
         StyleError: there is no style of that name, or its file is not as it should be.
@@ -220,18 +221,20 @@ def parse_statistics(text: str, *, source: str) -> Statistics:
         raise StyleError(str(error)) from None
     except ValidationError as error:
         raise StyleError(f"{source}: {'; '.join(readable(error))}") from None
-    found: dict[str, ColorStatistics] = {}
+    regions: dict[str, ColorStatistics] = {}
     for region, share in SHARES.items():
         moments: _Moments = getattr(preset, region)
-        mean, covariance = np.array(moments.mean), np.array(moments.covariance)
-        found[region] = ColorStatistics(mean, covariance, share)
-    return {WHOLE: together(tuple(found.values())), **found}
+        mean = np.array(moments.mean)
+        covariance = np.array(moments.covariance)
+        regions[region] = ColorStatistics(mean, covariance, share)
+    return {WHOLE: together(tuple(regions.values())), **regions}
 
 
 def together(parts: tuple[ColorStatistics, ...]) -> ColorStatistics:
     """The statistics of disjoint parts as one, each by its share."""
     share = sum(part.share for part in parts)
-    mean, second = np.zeros(3), np.zeros((3, 3))
+    mean = np.zeros(3)
+    second = np.zeros((3, 3))
     for part in parts:
         mean += part.share / share * part.mean
     for part in parts:
@@ -266,7 +269,10 @@ class SceneStyle:
     @cached_property
     def on_photo(self) -> PhotoStyle:
         """The maps for a photo of the scene."""
-        splats, levels, rows, marks = self.maps.splats, None, None, None
+        splats = self.maps.splats
+        levels = None
+        rows = None
+        marks = None
         others = [m for m in torch.unique(splats, dim=0) if not torch.equal(m, splats[0])]
         if self.levels is not None:
             levels = torch.nn.functional.pad(self.levels.float() / LEVELS, (1, 1))
@@ -297,7 +303,8 @@ class SceneStyle:
 
     def _mapped(self, part: PosedGaussians, backend: str) -> PosedGaussians:
         if self.folds and part.gaussians.sh is self.bare.background.sh:
-            own, sh = part.gaussians, self._folded_on_gpu if backend == CUDA else self._folded
+            own = part.gaussians
+            sh = self._folded_on_gpu if backend == CUDA else self._folded
             folded = memo_of(own).get(  # one object, of which levels of detail are made once
                 ("folded", id(sh)), lambda: dataclasses.replace(own, sh=sh)
             )
@@ -338,7 +345,8 @@ def scene_style_of(scene: Scene, style: Style) -> SceneStyle:
     def find() -> SceneStyle:
         # The scene itself would be kept alive by what is remembered for as long as it lives.
         bare = dataclasses.replace(scene)
-        sky, levels = style_sky(scene.sky, maps.sky), sky_levels(scene, maps)
+        sky = style_sky(scene.sky, maps.sky)
+        levels = sky_levels(scene, maps)
         return SceneStyle(maps, sky, bare, levels, folds=style.evaluated == "sh")
 
     return memo_of(scene).get(("scene style", style, maps), find)

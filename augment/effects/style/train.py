@@ -62,7 +62,7 @@ from augment.scene import Scene
 
 # ---- Contents: views of scenes, and photographs as scenes of one Gaussian a pixel ----------------
 
-KEPT_COLORS = 65536  # Gaussians of a scene that are remembered to draw samples from
+KEPT_COLORS = 65536  # most Gaussians of a scene whose colours are stored to draw samples from
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 MIN_TO_HOLD_OUT = 5  # of fewer photos none is spared
 
@@ -95,7 +95,7 @@ def scene_contents(
 
 
 def view_picture(scene: Scene, camera: Camera) -> Float[Tensor, "3 H W"]:
-    """What a camera sees of the scene and its sky, display-encoded, not clamped."""
+    """Return a camera's picture of the scene and its sky, display-encoded, not clamped."""
     output = rasterize(scene.parts_for(camera), camera, buffers=(RGB, ALPHA))
     assert output.rgb is not None and output.alpha is not None
     sky = scene.sky.sample(camera.ray_directions()).permute(2, 0, 1).contiguous()
@@ -116,8 +116,8 @@ def colors_of(scene: Scene, *, count: int = KEPT_COLORS, seed: int = 0) -> Gauss
         index = torch.randint(total, (count,), generator=generator).sort().values
     chosen = []
     for part, end in zip(parts, ends.tolist(), strict=True):
-        own = index[(index >= end - len(part)) & (index < end)] - (end - len(part))
-        sh = part.sh[own].float()
+        part_index = index[(index >= end - len(part)) & (index < end)] - (end - len(part))
+        sh = part.sh[part_index].float()
         chosen.append(functional.pad(sh, (0, 0, 0, k - sh.shape[1])))
     values = SH_C0 * torch.cat(chosen)[None]
     return GaussianColors(values[:, :, 0] + 0.5, values[:, :, 1:])
@@ -160,17 +160,17 @@ def read_photos(paths: Sequence[Path], size_px: int, *, holdout: int) -> Photos:
     pixels = torch.zeros(0, 3, size_px, size_px, dtype=torch.uint8)
     if squares:
         pixels = torch.from_numpy(np.stack(squares))
-    apart = torch.zeros(len(pixels), dtype=torch.bool)
+    is_held_out = torch.zeros(len(pixels), dtype=torch.bool)
     if holdout and len(pixels) >= MIN_TO_HOLD_OUT:
-        apart[holdout - 1 :: holdout] = True
-    return Photos(pixels[~apart], pixels[apart], tuple(problems))
+        is_held_out[holdout - 1 :: holdout] = True
+    return Photos(pixels[~is_held_out], pixels[is_held_out], tuple(problems))
 
 
 def _find(paths: Sequence[Path]) -> list[Path]:
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     for path in paths:
         if path.is_file():
-            found[path] = None
+            files[path] = None
             continue
         if not path.is_dir():
             raise StyleError(f"photos: there is no file or folder {path}")
@@ -179,15 +179,15 @@ def _find(paths: Sequence[Path]) -> list[Path]:
             raise StyleError(
                 f"photos: {path} holds no images ({', '.join(SUFFIXES)}), nor do folders in it"
             )
-        found.update(dict.fromkeys(inside))
-    return list(found)
+        files.update(dict.fromkeys(inside))
+    return list(files)
 
 
-# ---- What a step sees ----------------------------------------------------------------------------
+# ---- Pictures of a training step -----------------------------------------------------------------
 
-SCENE_SHARE = 0.5  # of the contents, where there are both scenes and photos
+SCENE_SHARE = 0.5  # share of scenes among the contents, if there are both scenes and photos
 PERTURBED = 0.5  # share of the styles that are recoloured first
-COLORS = 1024  # Gaussians, or pixels, whose colours are compared, an item
+COLORS = 1024  # Gaussians, or pixels, of an item whose colours are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +223,7 @@ class TrainingPool:
         return self.photos.device
 
     def pictures(self) -> Float[Tensor, "P 3 S S"]:
-        """Of views, then photos, float32."""
+        """Return the pictures of views, then of photos, float32."""
         return torch.stack([self._picture(number) for number in range(len(self))]).clamp(0, 1)
 
     def draw(self, generator: torch.Generator, batch: int) -> Draw:
@@ -236,13 +236,13 @@ class TrainingPool:
         for _ in range(batch):
             wants_view, wants_recolor = torch.rand(2, generator=generator).tolist()
             is_view = bool(self.views) and (not len(self.photos) or wants_view < SCENE_SHARE)
-            own = _integer(len(self.views) if is_view else len(self.photos), generator)
-            own += 0 if is_view else len(self.views)
-            other = _integer(max(len(self) - 1, 1), generator)
-            other = (other + (other >= own)) % len(self)
-            contents.append(self._content(own))
-            style = self._picture(other)[None]
-            if wants_recolor < PERTURBED or other == own:
+            content_number = _integer(len(self.views) if is_view else len(self.photos), generator)
+            content_number += 0 if is_view else len(self.views)
+            style_number = _integer(max(len(self) - 1, 1), generator)
+            style_number = (style_number + (style_number >= content_number)) % len(self)
+            contents.append(self._content(content_number))
+            style = self._picture(style_number)[None]
+            if wants_recolor < PERTURBED or style_number == content_number:
                 style = recolor(style, generator)
             styles.append(style[0])
         return Draw(
@@ -398,19 +398,23 @@ class StyleTrainer:
         self.pool = pool
         self.step = 0
         self._features = features.to(pool.device)
-        self._steps, self._seed, self._learning_rate = steps, seed, learning_rate
-        self._weights, self._batch, self._pair_batch = weights, batch, pair_batch
+        self._steps = steps
+        self._seed = seed
+        self._learning_rate = learning_rate
+        self._weights = weights
+        self._batch = batch
+        self._pair_batch = pair_batch
         self._paired = pool.pictures() if weights["pairs"] > 0 and len(pool) > 1 else None
         self._frozen_norm = frozen_norm
         self._parameters = {n: p for n, p in net.named_parameters() if p.requires_grad}
         self._adam = torch.optim.Adam(self._parameters.values(), lr=learning_rate)
 
     def learning_rate_at(self, step: int) -> float:
-        """Of the step with this number, counted from 0."""
+        """Return the learning rate of the step with this number, counted from 0."""
         return self._learning_rate * DECAY ** (3 * step // self._steps)
 
     def is_warming_up(self, step: int) -> bool:
-        """Whether the cycle loss is alone in this step; never, where it weighs nothing."""
+        """Return True if this step has the cycle loss alone; never if that loss has no weight."""
         return self._weights["cycle"] > 0 and step < WARM_UP * self._steps
 
     @one_thread()
@@ -461,11 +465,11 @@ class StyleTrainer:
         Raises:
             StyleError: the arrays are of another network.
         """
-        own = {n: tuple(t.shape) for n, t in self.net.state_dict().items()}
-        found = {n.removeprefix("net."): a for n, a in arrays.items() if n.startswith("net.")}
-        if {n: tuple(a.shape) for n, a in found.items()} != own:
+        expected_shapes = {n: tuple(t.shape) for n, t in self.net.state_dict().items()}
+        net_arrays = {n.removeprefix("net."): a for n, a in arrays.items() if n.startswith("net.")}
+        if {n: tuple(a.shape) for n, a in net_arrays.items()} != expected_shapes:
             raise StyleError("the state to go on from is of another network")
-        self.net.load_state_dict({n: torch.from_numpy(a.copy()) for n, a in found.items()})
+        self.net.load_state_dict({n: torch.from_numpy(a.copy()) for n, a in net_arrays.items()})
         for name, parameter in self._parameters.items():
             start = f"adam.{name}:"
             parts = {n.removeprefix(start): a for n, a in arrays.items() if n.startswith(start)}
@@ -483,7 +487,8 @@ class StyleTrainer:
         warming_up = self.is_warming_up(self.step)
         terms = paper_terms(self.net, draw, self._features, only_cycle=warming_up)
         if self._paired is not None and not warming_up:
-            generator, size_px = generator_for(self._seed, self.step, "pairs"), draw.styles.shape[2]
+            generator = generator_for(self._seed, self.step, "pairs")
+            size_px = draw.styles.shape[2]
             pairs = sample_pairs(self._paired, generator, self._pair_batch, size_px=size_px)
             weights = PAIR_WEIGHTS | {"range": self._weights["range"]}
             terms["pairs"] = weighted_sum(pair_losses(self.net, pairs), weights)
