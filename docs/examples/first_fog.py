@@ -1,6 +1,7 @@
 """Render one camera of the embedded street, clear and in fog.
 
 Run it with: python docs/examples/first_fog.py [OUTPUT_FOLDER]
+The first run of an example also compiles kernels, which takes about half a minute.
 """
 
 import sys
