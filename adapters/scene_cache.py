@@ -43,6 +43,7 @@ from adapters.detect_format import detect_scheme
 from adapters.scene_folder import with_images_in
 from adapters.uri import SCHEMES, format_uri, parse_uri
 from augment.errors import AdapterError, ClimateGSError, OutputError, SceneError
+from augment.files.ply import SPLAT_SUFFIXES
 from augment.files.recorded_images import has_image
 from augment.files.scene_file import FILES as SCENE_FILES
 from augment.files.scene_file import (
@@ -280,7 +281,8 @@ def _builder() -> tuple[str, ...]:
 _DIGEST_FORMAT = 1
 _DIGESTS = "digests"
 _WHOLE = ("scene", "gaussians")  # schemes
-_SPLAT_FILES = {".ply", ".splat", ".spz", ".sog", ".json", ".txt", ".bin", ".webp"}
+# Endings of the files that belong to a folder of splats: splats, and what lies beside them.
+_SPLAT_FILES = {*SPLAT_SUFFIXES, ".json", ".txt", ".bin", ".webp"}
 _IMAGES_OF_DRIVES = {".jpg", ".jpeg", ".png", ".webp"}
 _MAX_WHOLE_BYTES = 1 << 20
 _IMAGE_SAMPLE_BYTES = 1 << 12
@@ -321,7 +323,7 @@ def _digest_files(scheme: str, path: str, query: Mapping[str, str]) -> dict[str,
     files: dict[str, tuple[Path, bool]] = {}
     for place in places:
         for file in _visible_files(place) if place.is_dir() else (place,):
-            if scheme == "gaussians" and root.is_dir() and file.suffix not in _SPLAT_FILES:
+            if scheme == "gaussians" and root.is_dir() and file.suffix.lower() not in _SPLAT_FILES:
                 continue
             files[os.path.relpath(file, root)] = file, scheme in _WHOLE
     for key, value in query.items():  # of cameras, say

@@ -278,3 +278,12 @@ def test_scenes_without_files_of_their_own_have_a_digest_too(tmp_path: Path) -> 
     assert first not in (None, scene_digest("procedural:street?seed=4&frames=2"))
     assert scene_digest(f"scene:{tmp_path / 'missing'}") is None
     assert scene_digest(str(tmp_path)) is None
+
+
+def test_a_digest_is_of_every_kind_of_splat_file_in_a_folder(cache, tmp_path):
+    digests = set()
+    for name in ("a.ply", "b.SPZ", "c.glb", "d.gltf", "e.usdz", "f.sog"):
+        (tmp_path / name).write_bytes(name.encode())
+        digests.add(scene_digest(f"gaussians:{tmp_path}"))
+    (tmp_path / "notes.md").write_text("nothing to render")
+    assert len(digests) == 6 and scene_digest(f"gaussians:{tmp_path}") in digests
