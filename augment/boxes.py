@@ -146,7 +146,8 @@ class WorldBoxes:
     """world_from_box."""
     low_m: Float64[np.ndarray, "B 3"]
     """Lowest corner of the part that owns surfaces, along the box's axes from its centre: the
-    lowest centimetres are left out, other sides are drawn wider (BOTTOM_MARGIN_M, SIDE_MARGIN_M)."""
+    lowest centimetres are left out, other sides are drawn wider (BOTTOM_MARGIN_M,
+    SIDE_MARGIN_M)."""
     high_m: Float64[np.ndarray, "B 3"]
     """Highest corner of that part."""
     corners_m: Float64[np.ndarray, "B 8 3"]

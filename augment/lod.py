@@ -65,7 +65,8 @@ from augment.semantics import SemanticClass
 
 # Splats of a part below which it is drawn as it is.
 MIN_SPLATS = 20_000
-# Candidates of c_1, metres: the first is taken whose cells leave at most MAX_REMAINING_SHARE of the splats.
+# Candidates of c_1, metres: the first is taken whose cells leave at most MAX_REMAINING_SHARE of the
+# splats.
 CELLS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 # Share of the splats that merging in the finest cells may leave.
 MAX_REMAINING_SHARE = 0.6

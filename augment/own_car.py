@@ -1,8 +1,8 @@
 """Pixels of a camera's images that show the recording car itself.
 
 In: the images of one camera, in the order in which the car moved. Out: a bool mask
-(`find_own_car_mask`; `own_car_mask` for a scene's recorded images). `augment.views` passes the mask on
-to the estimates of boxes; training views leave these pixels out of the loss.
+(`find_own_car_mask`; `own_car_mask` for a scene's recorded images). `augment.views` passes the mask
+on to the estimates of boxes; training views leave these pixels out of the loss.
 
 The recording car stays as it is while the road moves by. It is looked for from the image's bottom
 upwards, where the road would be less than ten metres away. Only contrast along the road's apparent

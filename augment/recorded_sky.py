@@ -383,7 +383,9 @@ def sky_mask(
 
 
 def _as_bright_as_sky(rgb: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """Return the pixels of `find_sky_like_pixels`, and those brighter than most of the candidates."""
+    """Return the pixels of `find_sky_like_pixels`, and those brighter than most of the
+    candidates.
+    """
     luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     if not candidates.any():
         return candidates

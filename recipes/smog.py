@@ -33,7 +33,7 @@ class Smog(EffectModel):
     columns = (
         Column(
             "smog_extinction_per_m",
-            lambda smog: smog.sigma_per_m,
+            lambda smog: smog.resolved_extinction_per_m,
             "Visibility in smog",
             "m",
             value_if_absent=0.0,
@@ -76,15 +76,16 @@ class Smog(EffectModel):
         neither = "needs a density: give visibility_m (metres) or extinction_per_m (1/metre)"
         if (self.visibility_m is None) == (self.extinction_per_m is None):
             raise ValueError(neither if self.visibility_m is None else both)
-        if self.sigma_per_m > MAX_EXTINCTION_PER_M:
+        if self.resolved_extinction_per_m > MAX_EXTINCTION_PER_M:
             raise ValueError(
                 f"visibility_m = {self.visibility_m:g} means an extinction of "
-                f"{self.sigma_per_m:.3g}/metre; at most {MAX_EXTINCTION_PER_M:g}/metre is allowed"
+                f"{self.resolved_extinction_per_m:.3g}/metre; at most "
+                f"{MAX_EXTINCTION_PER_M:g}/metre is allowed"
             )
         return self
 
     @property
-    def sigma_per_m(self) -> float:
+    def resolved_extinction_per_m(self) -> float:
         """Return the extinction coefficient at the base height, 1/metre."""
         if self.extinction_per_m is not None:
             return self.extinction_per_m

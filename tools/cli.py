@@ -230,8 +230,8 @@ class RecordOptions(Command):
         )
         road = recording.road
         print(
-            f"{recording.frames} frames, {recording.images} images; {recording.num_images_without_pose} have no "
-            f"pose, left out"
+            f"{recording.frames} frames, {recording.images} images; "
+            f"{recording.num_images_without_pose} have no pose, left out"
         )
         print(
             f"road: {road.points} points, half of them within {100 * road.residual:.1f} % of the "

@@ -359,8 +359,8 @@ def _recipe_file(scene: Scene, out: Path, name: str) -> Path:
 def _check_there(scene: Scene, out: Path, deleted: Sequence[str]) -> None:
     if deleted:
         raise OutputError(
-            f"{_recipe_file(scene, out, deleted[0])} was deleted, though {out / MANIFEST_FILE} lists "
-            f"images of {deleted[0]}; render it again"
+            f"{_recipe_file(scene, out, deleted[0])} was deleted, though {out / MANIFEST_FILE} "
+            f"lists images of {deleted[0]}; render it again"
         )
 
 

@@ -165,8 +165,8 @@ def write_labels(out: Path | str, options: LabelOptions | None = None) -> Labels
         rows = [row for row in rows if (row["scene"], row["variant"]) in policies]
         if not rows:
             raise NothingLabelled(
-                f"{out / MANIFEST_FILE}: no image has masks to write labels from; render a scene that "
-                f"has boxes with output.labels: [{', '.join(FORMATS)}], or some of them"
+                f"{out / MANIFEST_FILE}: no image has masks to write labels from; render a "
+                f"scene that has boxes with output.labels: [{', '.join(FORMATS)}], or some of them"
             )
         names = _categories(out, rows, policies)
         run = _Writing(out, RowReader(store, verify=False), request, policies, names)

@@ -302,11 +302,11 @@ class Effect:
         """
         raise NotImplementedError
 
-    def prepare(self, own: EffectInScene) -> Any:
+    def prepare(self, effect: EffectInScene) -> Any:
         """Return data that all views share; it is kept in the scene's memo (`memo_of`)."""
         return None
 
-    def relight(self, own: EffectInScene) -> Scene | None:
+    def relight(self, effect: EffectInScene) -> Scene | None:
         """Return the scene in the light that later effects should use; None if unchanged."""
         return None
 
@@ -318,11 +318,11 @@ class Effect:
 
     # ---- Once a view -----------------------------------------------------------------------------
 
-    def cameras(self, own: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
+    def cameras(self, effect: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
         """Return the cameras that look into the scene for this view; None for `camera` alone."""
         return None
 
-    def visibility(self, own: EffectInScene, query: ViewQuery) -> Visibility:
+    def visibility(self, effect: EffectInScene, query: ViewQuery) -> Visibility:
         """Return what the view can show of the effect, at little cost.
 
         The answer saves work only: it must not change a single bit of any picture.
@@ -330,29 +330,29 @@ class Effect:
         return Visibility()
 
     def edit_scene(
-        self, own: EffectInScene, layers: LayerRenderer, camera: Camera
+        self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
         """Return this view's scene (parts, sky, fog) with the effect in it."""
         return layers
 
     def draw(
-        self, own: EffectInScene, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
+        self, effect: EffectInScene, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
     ) -> RenderedView | None:
         """Return the picture, if the effect draws the scene in its own layers; else None."""
         return None
 
-    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
+    def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         """Return the finished picture with the effect on it."""
-        return drawn
+        return view
 
-    def visible_mask(self, own: EffectInScene, drawn: RenderedView) -> Bool[Tensor, "H W"] | None:
+    def visible_mask(self, effect: EffectInScene, view: RenderedView) -> Bool[Tensor, "H W"] | None:
         """Return the pixels that show the effect.
 
         The caller removes the pixels that belong to masks of later effects.
         """
-        return drawn.masks.get(self.mask_name or "")
+        return view.masks.get(self.mask_name or "")
 
-    def front_surface(self, own: EffectInScene, camera: Camera) -> FrontSurface | None:
+    def front_surface(self, effect: EffectInScene, camera: Camera) -> FrontSurface | None:
         """Return the effect's surface in the pixels of its mask.
 
         None if the first surface along those rays is one of the scene.
@@ -362,7 +362,7 @@ class Effect:
     # ---- Labels, in the writing threads ----------------------------------------------------------
 
     def measure_boxes(
-        self, boxes: WorldBoxes, camera: Camera, view: LabelInputs
+        self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
     ) -> dict[str, np.ndarray]:
         """Return the stored columns of `table`, [B] each.
 
@@ -373,19 +373,19 @@ class Effect:
         """
         raise NotImplementedError
 
-    def grow_boxes(self, boxes: WorldBoxes, view: LabelInputs) -> WorldBoxes:
+    def grow_boxes(self, boxes: WorldBoxes, inputs: LabelInputs) -> WorldBoxes:
         """Return the boxes grown by what the effect lays on them, which counts as their own."""
         return boxes
 
     # ---- LiDAR -----------------------------------------------------------------------------------
 
-    def intersect_beams(self, own: EffectInScene, echoes: Any, frame_ns: int) -> None:
+    def intersect_beams(self, effect: EffectInScene, echoes: Any, frame_ns: int) -> None:
         """Apply surfaces of the effect that stop or bend beams.
 
         echoes: `augment.effects.lidar.beam.Echoes`, changed in place.
         """
 
-    def attenuate_beams(self, own: EffectInScene, echoes: Any, rng: np.random.Generator) -> None:
+    def attenuate_beams(self, effect: EffectInScene, echoes: Any, rng: np.random.Generator) -> None:
         """Weaken echoes by the effect's particles in the air and add the particles' own echoes.
 
         It runs after `meet` of all effects.

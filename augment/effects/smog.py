@@ -92,11 +92,11 @@ class SmogEffect(Effect):
     name = "smog"
     section = "weather.smog"
     model = Smog
-    folded: ClassVar = {PER_GAUSSIAN: ("weather.smog", None)}
+    off_switches: ClassVar = {PER_GAUSSIAN: ("weather.smog", None)}
     # transmittance: 0 to 1, of the smog between camera and box; NaN for a box whose numbers are
     # not finite. pixels: number of pixels that the transmittance is the mean of. With 0 pixels or
     # NOT_COUNTED, the transmittance is an estimate.
-    table = BoxTable(
+    box_table = BoxTable(
         name="box_smog",
         file="labels/smog.parquet",
         kind="box smog",
@@ -109,7 +109,9 @@ class SmogEffect(Effect):
         smog = self.section_of(recipe)
         return smog is not None and smog.shadow_fade > 0
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
+    def plan_in_scene(
+        self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
+    ) -> EffectPlan:
         smog = self.section_of(recipe)
         fog, reason = _in_heights(smog, scene)
         if fog is None:
@@ -146,52 +148,54 @@ class SmogEffect(Effect):
         data = SmogPlan(fog, on_buffers, is_common, smog.scatter, sun)
         return EffectPlan(data, steps, frozenset(buffers))
 
-    def prepare(self, own: EffectInScene) -> FadedShadows | None:
-        return faded_shadows(own.scene, own.settings.sun)
+    def prepare(self, effect: EffectInScene) -> FadedShadows | None:
+        return faded_shadows(effect.scene, effect.settings.sun)
 
-    def share(self, job: JobContext) -> None:
-        if any(smog and smog.shadow_fade > 0 for smog in map(self.section_of, job.recipes)):
-            precompute_shadows(job.scene)
+    def precompute(self, context: JobContext) -> None:
+        if any(smog and smog.shadow_fade > 0 for smog in map(self.section_of, context.recipes)):
+            precompute_shadows(context.scene)
 
     def edit_scene(
-        self, own: EffectInScene, layers: LayerRenderer, camera: Camera
+        self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
-        faded = own.prepared_data if own.settings.sun < 1 else None
+        faded = effect.prepared_data if effect.settings.sun < 1 else None
         if faded is not None:
             with timed(SHADOWS):
                 parts = [p if p.instance_id or p.is_overlay else faded.on(p) for p in layers.parts]
                 photo = layers.photo and replace(layers.photo, faded_shadows=faded)
                 layers = replace(layers, parts=tuple(parts), photo=photo)
-        fog = own.settings.fog
-        common = own.scene.common_color_map
-        if own.settings.is_common and common is not None:
-            fog = fog_before_color_map(fog, own.scene.color_map(camera), common)
-        return replace(layers, fog=fog, applies_fog_to_buffers=own.settings.on_buffers)
+        fog = effect.settings.fog
+        common = effect.scene.common_color_map
+        if effect.settings.is_common and common is not None:
+            fog = fog_before_color_map(fog, effect.scene.color_map(camera), common)
+        return replace(layers, fog=fog, applies_fog_to_buffers=effect.settings.on_buffers)
 
-    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
-        if own.settings.scatter == 0:
-            return drawn
-        alpha = drawn.raster.alpha
-        depth = drawn.raster.median_depth
+    def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
+        if effect.settings.scatter == 0:
+            return view
+        alpha = view.raster.alpha
+        depth = view.raster.median_depth
         assert alpha is not None and depth is not None
-        fog = own.settings.fog
-        scatter = own.settings.scatter
+        fog = effect.settings.fog
+        scatter = effect.settings.scatter
         with timed(SCATTER):
             rgb = scatter_forward(
-                drawn.rgb, alpha, depth, camera, fog, scatter, backend=own.backend
+                view.rgb, alpha, depth, camera, fog, scatter, backend=effect.backend
             )
-        return replace(drawn, rgb=rgb)
+        return replace(view, rgb=rgb)
 
-    def measure(
-        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
+    def measure_boxes(
+        self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
     ) -> dict[str, np.ndarray]:
-        data = view.plan.data
+        data = inputs.plan.data
         fog = None if data is None else data.fog
-        estimate = box_transmittance(placed, camera, fog, view.depth_m, view.water_level_z_m)
+        estimate = box_transmittance(boxes, camera, fog, inputs.depth_m, inputs.water_level_z_m)
         return {"transmittance": estimate.transmittance, "pixels": estimate.num_pixels}
 
-    def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
-        fog_echoes(echoes, own.settings.fog, rng)
+    def attenuate_beams(
+        self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
+    ) -> None:
+        fog_echoes(echoes, effect.settings.fog, rng)
 
 
 def _sun_in(fog: Fog, smog: Smog, scene: Scene) -> tuple[float, str]:
@@ -213,10 +217,10 @@ def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:
     """Return the smog in the scene's heights and the reason; None if it would change nothing."""
     if smog is None:
         return None, "the recipe has no smog"
-    if smog.sigma_per_m == 0:
+    if smog.resolved_extinction_per_m == 0:
         return None, "the smog has no density, so it changes nothing"
     base_z_m = 0.0
-    reason = f"extinction {smog.sigma_per_m:.6g}/m, model {smog.model}"
+    reason = f"extinction {smog.resolved_extinction_per_m:.6g}/m, model {smog.model}"
     if smog.scale_height_m is not None:
         if scene.ground_z_m is None:
             raise SceneError(
@@ -228,7 +232,9 @@ def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:
         reason += f", scale height {smog.scale_height_m:g} m above z = {base_z_m:.2f} m"
     if not scene.has_metric_scale:
         reason += "; the scene's unit is not known to be a metre, so densities are per scene unit"
-    fog = Fog(smog.sigma_per_m, smog.color, smog.scale_height_m, base_z_m, smog.overcast)
+    fog = Fog(
+        smog.resolved_extinction_per_m, smog.color, smog.scale_height_m, base_z_m, smog.overcast
+    )
     return fog, reason
 
 
@@ -278,7 +284,7 @@ class BoxTransmittance:
 
 
 def box_transmittance(
-    placed: WorldBoxes,
+    boxes: WorldBoxes,
     camera: Camera,
     fog: Fog | None,
     surface_depth_m: Float32[np.ndarray, "H W"] | None,
@@ -296,10 +302,10 @@ def box_transmittance(
         water_level_z_m: height of the water, scene world. An eye under water sees other things
             under water through no smog, as `flood_view` draws them.
     """
-    pixels = np.full(len(placed), NOT_COUNTED)
-    transmittance = np.ones(len(placed))
+    pixels = np.full(len(boxes), NOT_COUNTED)
+    transmittance = np.ones(len(boxes))
     if fog is None:
-        return BoxTransmittance(np.where(placed.is_usable, transmittance, np.nan), pixels)
+        return BoxTransmittance(np.where(boxes.is_usable, transmittance, np.nan), pixels)
     eye_m = camera.centre.numpy()
     is_dry = water_level_z_m is None or eye_m[2] > water_level_z_m
 
@@ -307,13 +313,13 @@ def box_transmittance(
         t = np.exp(-optical_depth_numpy(fog, distance_m, eye_m[2], point_z_m))
         return t if is_dry else np.where(point_z_m <= water_level_z_m, 1.0, t)
 
-    points = np.concatenate([placed.corners_m, placed.centres_m[:, None]], axis=1)  # [B, 9, 3]
+    points = np.concatenate([boxes.corners_m, boxes.centres_m[:, None]], axis=1)  # [B, 9, 3]
     distance = np.linalg.norm(points - eye_m, axis=-1)
     transmittance = transmittance_to(distance, points[..., 2]).mean(axis=1)
     if surface_depth_m is not None:
         pixels[:] = 0
         upwards = camera.world_from_camera[2, :3].numpy()  # the world's z along the camera's axes
-        for number, rows, columns in pixels_of_boxes(placed, camera, surface_depth_m):
+        for number, rows, columns in pixels_of_boxes(boxes, camera, surface_depth_m):
             z = surface_depth_m[rows, columns].astype(np.float64)
             across = (columns + 0.5 - camera.cx) / camera.fx
             down = (rows + 0.5 - camera.cy) / camera.fy
@@ -321,7 +327,7 @@ def box_transmittance(
             distance = z * np.sqrt(1 + across**2 + down**2)
             pixels[number] = len(rows)
             transmittance[number] = float(transmittance_to(distance, point_z).mean())
-    return BoxTransmittance(np.where(placed.is_usable, transmittance, np.nan), pixels)
+    return BoxTransmittance(np.where(boxes.is_usable, transmittance, np.nan), pixels)
 
 
 # ---- On a LiDAR sweep ----------------------------------------------------------------------------

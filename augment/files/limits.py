@@ -42,8 +42,8 @@ def check_memory(where: str, num_gaussians: int, *, num_sh: int, file_bytes: int
     max_rows = (FREE_BYTES + BYTES_PER_BYTE * file_bytes) // row_bytes
     if num_gaussians > max_rows:
         raise SceneError(
-            f"{where} announces {num_gaussians} Gaussians of {row_bytes} bytes in memory each; at most "
-            f"{max_rows} are taken from its {file_bytes} bytes ({FREE_BYTES >> 20} MiB, and "
+            f"{where} announces {num_gaussians} Gaussians of {row_bytes} bytes in memory each; at "
+            f"most {max_rows} are taken from its {file_bytes} bytes ({FREE_BYTES >> 20} MiB, and "
             f"{BYTES_PER_BYTE} bytes for each of the file's): it is damaged, or made to fill the "
             "memory. If it is whole, "
             f"export it as .ply"

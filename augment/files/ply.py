@@ -354,8 +354,9 @@ def _check_columns(header: PlyHeader, table: PlyElement, *, has_terms: bool) -> 
             )
     if 1 + counts["f_rest_"] not in NUM_SH_BY_DEGREE:
         raise SceneError(
-            f"{where}: f_rest_0, f_rest_1, … must be {tuple(3 * (k - 1) for k in NUM_SH_BY_DEGREE)} in "
-            f"number (SH degrees 0 to 3); got {3 * counts['f_rest_']}"
+            f"{where}: f_rest_0, f_rest_1, … must "
+            f"be {tuple(3 * (k - 1) for k in NUM_SH_BY_DEGREE)} "
+            f"in number (SH degrees 0 to 3); got {3 * counts['f_rest_']}"
         )
     return counts["f_dc_"], counts["f_rest_"]
 

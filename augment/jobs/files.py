@@ -104,8 +104,8 @@ def measure_boxes(
         world_origin_m: Origin that was subtracted from the dataset's world, metres.
         camera: Camera at the written resolution.
         view: The image, with the data that labels are measured from.
-        box_visibility: Result of `find_box_visibility` for the image, with masks by depth if it has owners;
-            computed here if None.
+        box_visibility: Result of `find_box_visibility` for the image, with masks by depth if it has
+            owners; computed here if None.
     """
     world_boxes = WorldBoxes.from_labels(boxes, world_origin_m)
     numbers_of_table: dict[str, BoxNumbers] = {}

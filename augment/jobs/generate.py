@@ -570,8 +570,8 @@ class GenerateResult:
     seconds: float
     """Wall-clock time of the call, seconds."""
     timings: dict[str, float] = field(default_factory=dict)
-    """Seconds by kind of work, summed over threads and workers (see `worker.compute_time_shares`). Measured
-    by the clock: `plan`, `scan` of what is finished, and `render_wall`, everything else.
+    """Seconds by kind of work, summed over threads and workers (see `worker.compute_time_shares`).
+    Measured by the clock: `plan`, `scan` of what is finished, and `render_wall`, everything else.
     """
 
 

@@ -501,8 +501,8 @@ def read_manifest_rows(store: Store, excluded_columns: Collection[str] = ()) -> 
     table = _merge_parts(store, excluded_columns)[0]
     if table is None:
         raise OutputError(
-            f"{store.uri} holds neither {MANIFEST_FILE} nor finished blocks: it is no output folder, or "
-            f"nothing in it is finished yet. A job writes its manifest when it ends"
+            f"{store.uri} holds neither {MANIFEST_FILE} nor finished blocks: it is no output "
+            f"folder, or nothing in it is finished yet. A job writes its manifest when it ends"
         )
     return table
 

@@ -1,7 +1,7 @@
 """Rendering of an opened scene's images, one frame of one variant at a time, and their writing.
 
-In: a scene, its frames and a `RenderSetup`. Out: files in the output folder, and an `Outcome` for each
-image. `render_job` calls it. The same code runs in the job's own process and in its workers.
+In: a scene, its frames and a `RenderSetup`. Out: files in the output folder, and an `Outcome` for
+each image. `render_job` calls it. The same code runs in the job's own process and in its workers.
 """
 
 from __future__ import annotations

@@ -10,7 +10,8 @@ depths are mixtures. B's colour there is bilinear. The error is the root of the 
 differences of display-encoded colours over all pixels that count and all three channels.
 
 The world has to stand still between the two: render both at one time stamp, or say where A's points
-are when B is taken (`move_surfaces` computes it for the points of actors). The sky is not part of it.
+are when B is taken (`move_surfaces` computes it for the points of actors). The sky is not part of
+it.
 Warping is no exact inverse of rendering (bilinear colours, depths of blended surfaces, colours that
 truly depend on the direction), so the error of a perfect scene is small and not 0.
 

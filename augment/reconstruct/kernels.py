@@ -849,12 +849,14 @@ def update_splats(
                 second = corrections[Index(2) * n + Index(1)]
                 _update_geometry(
                     (means, quats, scales, opacities), splat, rows, row,
-                    basis[Index(_MAX_SH * NUM_LANES) + lane], rates, smallest[moment_row], (first, second),
+                    basis[Index(_MAX_SH * NUM_LANES) + lane], rates, smallest[moment_row], (first,
+                    second),
                     (state.geometry_m, state.geometry_v), moment_row * Index(GEOMETRY), work,
                 )  # fmt: skip
                 _update_sh(
-                    sh, splat * Index(num_sh) * Index(3), rows, row, basis, lane, Index(functions), rates,
-                    (first, second), (state.sh_m, state.sh_v), moment_row * Index(num_sh) * Index(3), work,
+                    sh, splat * Index(num_sh) * Index(3), rows, row, basis, lane, Index(functions),
+                    rates, (first, second), (state.sh_m, state.sh_v), moment_row * Index(num_sh) *
+                    Index(3), work,
                 )  # fmt: skip
 
 

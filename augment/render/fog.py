@@ -46,7 +46,7 @@ MAX_EXPONENT = 80.0
 class Fog:
     """Fog in a scene.
 
-    sigma_per_m: extinction at height base_z_m, 1/m.
+    extinction_per_m: extinction at height base_z_m, 1/m.
     rgb: airlight at the horizon, display-encoded. The rasterisers draw this colour;
         `composite.add_elevation` adds the dependence on elevation to their images.
     scale_height_m: height over which the fog thins by a factor e, metres; None for uniform fog.
@@ -64,7 +64,9 @@ class Fog:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.extinction_per_m) and self.extinction_per_m >= 0):
-            raise ValueError(f"sigma_per_m must be finite and >= 0; got {self.extinction_per_m}")
+            raise ValueError(
+                f"extinction_per_m must be finite and >= 0; got {self.extinction_per_m}"
+            )
         if self.scale_height_m is not None and not (
             math.isfinite(self.scale_height_m) and self.scale_height_m > 0
         ):

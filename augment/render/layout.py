@@ -33,7 +33,8 @@ import numpy as np
 # Parallel rays need no inverse depth: z(p) is exact for a plane, and the height is linear in p.
 # With a clip, expected and mode depth are taken over these surfaces, too: over 1/i(p), at most as
 # far from the centre as the splat reaches. The centres of large splats lie nearer or farther than
-# what a pixel shows of them, by more than shallow water is deep. `SURFACE_DEPTHS_ONLY` asks for these depths and
+# what a pixel shows of them, by more than shallow water is deep. `SURFACE_DEPTHS_ONLY` asks for
+# these depths and
 # cuts nothing.
 
 ABOVE = "above"

@@ -113,7 +113,8 @@ def _preload_tbb() -> bool:
 
 @contextmanager
 def kernel_threads(chunk: int = 1) -> Iterator[None]:
-    """Give the parallel kernels that are launched inside as many threads as `num_kernel_threads` says.
+    """Give the parallel kernels that are launched inside as many threads as `num_kernel_threads`
+    says.
 
     Work is handed out `chunk` iterations at a time, which keeps all threads busy. Iterations differ
     much in cost; with numba's default, one equal share per thread, all would wait for the slowest.

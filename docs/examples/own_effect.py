@@ -14,7 +14,7 @@ from pydantic import Field
 from adapters.base import open_scene
 from augment import render_view
 from augment.effects import add_effect
-from augment.effects.effect import PICTURE, Effect, Placed, Step
+from augment.effects.effect import PICTURE, Effect, EffectPlan, Step
 from augment.render.buffers import EXPECTED_DEPTH
 from recipes.effect import EffectModel
 from recipes.load import parse_recipe
@@ -33,10 +33,10 @@ class SepiaEffect(Effect):
 
     name, section, model = "sepia", "weather.sepia", Sepia
 
-    def place(self, recipe, scene, later):  # once per recipe and scene
-        sepia = self.of(recipe)  # None where the recipe has no such section
+    def plan_in_scene(self, recipe, scene, later_plans):  # once per recipe and scene
+        sepia = self.section_of(recipe)  # None where the recipe has no such section
         step = Step("sepia", sepia is not None, "the recipe says so", PICTURE)
-        return Placed(sepia, (step,), buffers=frozenset({EXPECTED_DEPTH} if sepia else ()))
+        return EffectPlan(sepia, (step,), buffers=frozenset({EXPECTED_DEPTH} if sepia else ()))
 
     def edit_image(self, own, drawn, camera):  # once per view
         is_sky = drawn.raster.alpha < 0.5  # infinitely far

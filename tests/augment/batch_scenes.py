@@ -222,7 +222,11 @@ def fake_effects(
         effects["snow"] = seen(EffectPlan(snow, ()), 1 / 2)
     if weather.smog is not None:
         smog = weather.smog
-        fog = SmogPlan(Fog(smog.sigma_per_m, smog.color), False) if smog.sigma_per_m else None
+        fog = (
+            SmogPlan(Fog(smog.resolved_extinction_per_m, smog.color), False)
+            if smog.resolved_extinction_per_m
+            else None
+        )
         effects["smog"] = seen(EffectPlan(fog, ()))
     if recipe.style is not None:
         effects["style"] = LabelInputs(EffectPlan(None, ()), None, None, None)

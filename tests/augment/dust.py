@@ -63,7 +63,7 @@ class DustEffect(Effect):
 
     name, section, model, mask = "dust", "weather.dust", Dust, "dust"
     # clear_fraction: t at the box's centre.
-    table = BoxTable(
+    box_table = BoxTable(
         name="box_dust",
         file="labels/dust.parquet",
         kind="box dust",
@@ -72,15 +72,17 @@ class DustEffect(Effect):
         visible_column="clear_fraction",
     )
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
+    def plan_in_scene(
+        self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
+    ) -> EffectPlan:
         dust = self.section_of(recipe)
         if dust is None:
             return EffectPlan(None, skipped((TINT,), "the recipe has no dust", PICTURE))
         step = Step(TINT, True, f"half of what stands {dust.half_m:g} m away is dust", PICTURE)
         return EffectPlan(dust, (step,), buffers=frozenset({EXPECTED_DEPTH}))
 
-    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
-        raster, dust = drawn.raster, own.settings
+    def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
+        raster, dust = view.raster, effect.settings
         assert raster.expected_depth is not None and raster.alpha is not None
         with timed(TINT):
             metres = raster.expected_depth
@@ -88,15 +90,17 @@ class DustEffect(Effect):
                 metres = metres * camera.ray_lengths(metres.dtype, metres.device)
             far = torch.full_like(metres, math.inf)  # the sky is all dust
             clear = torch.exp2(-torch.where(raster.alpha >= 0.5, metres, far) / dust.half_m)
-            color = torch.tensor(dust.color, dtype=drawn.rgb.dtype, device=drawn.rgb.device)
-            rgb = clear[..., None] * drawn.rgb + (1 - clear[..., None]) * color
-        return replace(drawn, rgb=rgb, masks={**drawn.masks, "dust": clear < 0.5})
+            color = torch.tensor(dust.color, dtype=view.rgb.dtype, device=view.rgb.device)
+            rgb = clear[..., None] * view.rgb + (1 - clear[..., None]) * color
+        return replace(view, rgb=rgb, masks={**view.masks, "dust": clear < 0.5})
 
-    def measure(
-        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
+    def measure_boxes(
+        self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
     ) -> dict[str, np.ndarray]:
-        away_m = np.linalg.norm(placed.centres_m - camera.centre.numpy(), axis=1)
-        return {"clear_fraction": np.exp2(-away_m / view.plan.data.half_m)}
+        away_m = np.linalg.norm(boxes.centres_m - camera.centre.numpy(), axis=1)
+        return {"clear_fraction": np.exp2(-away_m / inputs.plan.data.half_m)}
 
-    def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
-        echoes.gain *= np.exp2(-2 * echoes.air_path_m / own.settings.half_m)  # there and back
+    def attenuate_beams(
+        self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
+    ) -> None:
+        echoes.gain *= np.exp2(-2 * echoes.air_path_m / effect.settings.half_m)  # there and back

@@ -319,8 +319,8 @@ def test_objects_beyond_sixteen_bits_have_no_instance(caplog) -> None:
             return Boxes(names, names, zeros, zeros, np.zeros((MAX_INSTANCE, 4)))
 
     many = Instances(("car",), (0, 1), Many())
-    assert many.numbers_of(("car", "0-0", f"0-{MAX_INSTANCE - 2}", f"0-{MAX_INSTANCE - 1}", "1-0", "no")
-                   ).tolist() == [1, 2, MAX_INSTANCE, 0, 0, 0]  # fmt: skip
+    track_ids = ("car", "0-0", f"0-{MAX_INSTANCE - 2}", f"0-{MAX_INSTANCE - 1}", "1-0", "no")
+    assert many.numbers_of(track_ids).tolist() == [1, 2, MAX_INSTANCE, 0, 0, 0]
     assert "instance images number 65535 of them" in caplog.text
 
 

@@ -180,13 +180,13 @@ def street(count: int = COUNT) -> Gaussians:
 
 
 @pytest.mark.parametrize("height_m", [None, 3.0, 15.0, 200.0])
-@pytest.mark.parametrize("sigma_per_m", [1e-4, 0.02, 0.3, 100.0])
+@pytest.mark.parametrize("extinction_per_m", [1e-4, 0.02, 0.3, 100.0])
 @pytest.mark.parametrize("at", [(0.0, 0.0, 1.5), (0.0, 0.0, 90.0), (10_000.0, 0.0, 1.5), "inside"])
-def test_fog_hides_what_is_left_out(at, sigma_per_m: float, height_m: float | None):
+def test_fog_hides_what_is_left_out(at, extinction_per_m: float, height_m: float | None):
     scene = drawn(street())
     if at == "inside":
         at = tuple(scene.means[int(scene.scales.amax(1).argmax())].tolist())
-    fog = Fog(sigma_per_m, (0.9, 0.5, 0.1), height_m)
+    fog = Fog(extinction_per_m, (0.9, 0.5, 0.1), height_m)
     faces = torch.from_numpy(np.random.default_rng(0).integers(0, 2, (6, 4, 4, 3))).float()
     sky = CubemapSky(faces)
     for yaw in (0.0, math.pi):

@@ -98,7 +98,7 @@ def test_smog_stands_on_the_road():
     plan = plan_of(Smog(visibility_m=100, scale_height_m=30, base_height_m=2))
     fog = plan.effect_plans["smog"].data.fog
     assert fog.base_z_m == 2.25
-    assert fog.sigma_per_m == pytest.approx(0.03912)
+    assert fog.extinction_per_m == pytest.approx(0.03912)
 
 
 def test_a_scale_height_over_an_unknown_road_is_an_error_that_says_what_to_do():

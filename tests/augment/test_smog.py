@@ -124,7 +124,7 @@ def test_deferred_smog_fogs_what_covers_the_pixel_and_leaves_the_rest_to_the_sky
 
 def test_impossible_densities_are_refused():
     for sigma in (-0.1, math.nan, math.inf):
-        with pytest.raises(ValueError, match="sigma_per_m must be finite and >= 0"):
+        with pytest.raises(ValueError, match="extinction_per_m must be finite and >= 0"):
             Fog(sigma, GREY)
     with pytest.raises(ValueError, match="scale_height_m must be finite and > 0; got 0"):
         Fog(0.1, GREY, scale_height_m=0.0)

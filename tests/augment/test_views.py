@@ -211,7 +211,8 @@ def everything(plan, scene: Scene, camera: Camera, **_) -> ViewPlan:
     """Nothing left out of the plan."""
     actors = tuple(range(1, len(scene.actors) + 1))
     active = tuple(
-        dataclasses.replace(effect, seen=frozenset((0, *actors))) for effect in plan.active(scene)
+        dataclasses.replace(effect, view_data=frozenset((0, *actors)))
+        for effect in plan.active(scene)
     )
     return ViewPlan(actors, active, plan.buffers, plan.bare_buffers, plan.steps)
 

@@ -464,9 +464,8 @@ def field_table() -> str:
             known = "" if default is None else f"`{format_value(default)}`"
             default = "`null`" if spec.nullable else known
             default = "required" if spec.info.is_required() else default
-            rows.append(
-                f"| `{spec.path}` | {spec.describe_allowed_values()} | {default} | {spec.description} |\n"
-            )
+            allowed = spec.describe_allowed_values()
+            rows.append(f"| `{spec.path}` | {allowed} | {default} | {spec.description} |\n")
     return "".join(rows)
 
 

@@ -55,10 +55,12 @@ class FallingEffect(Effect):
     def reads_splats(self, recipe: Recipe) -> bool:
         return False
 
-    def kernels(self, section: Rain | Snowfall) -> Any:
+    def kernel_key(self, section: Rain | Snowfall) -> Any:
         return section.changes or None
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
+    def plan_in_scene(
+        self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
+    ) -> EffectPlan:
         section: Rain | Snowfall | None = self.section_of(recipe)
         if section is None or not section.changes:
             why = f"the recipe has no {self.name}"
@@ -77,19 +79,21 @@ class FallingEffect(Effect):
         )
         return _plan_of(falling, self.step, scene)
 
-    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
+    def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         assert self.mask_name is not None
-        return _draw_over(own, drawn, camera, self.step, self.mask_name)
+        return _draw_over(effect, view, camera, self.step, self.mask_name)
 
-    def measure(
-        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
+    def measure_boxes(
+        self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
     ) -> dict[str, np.ndarray]:
         assert self.box_table is not None
-        return measure_falling(self.box_table, placed, camera, view)
+        return measure_falling(self.box_table, boxes, camera, inputs)
 
-    def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
-        kind = own.settings.kind
-        rate = float(own.settings.rate_mm_h)
+    def attenuate_beams(
+        self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
+    ) -> None:
+        kind = effect.settings.kind
+        rate = float(effect.settings.rate_mm_h)
         precipitation_echoes(echoes, scatterers_of(kind, rate), rng)
 
 
@@ -99,10 +103,10 @@ class RainEffect(FallingEffect):
     name = "rain"
     section = "weather.rain"
     model = Rain
-    mask = "rain"
+    mask_name = "rain"
     step = STREAKS
     kind = "rain"
-    table = falling_table("rain", "streak")
+    box_table = falling_table("rain", "streak")
 
 
 class SnowfallEffect(FallingEffect):
@@ -111,10 +115,10 @@ class SnowfallEffect(FallingEffect):
     name = "snowfall"
     section = "weather.snowfall"
     model = Snowfall
-    mask = "snowfall"
+    mask_name = "snowfall"
     step = FLAKES
     kind = "snow"
-    table = falling_table("snowfall", "flake")
+    box_table = falling_table("snowfall", "flake")
 
 
 def wind_velocity_mps(speed_mps: float, from_deg: float) -> tuple[float, float]:
@@ -148,32 +152,32 @@ def _plan_of(falling: Precipitation, step: str, scene: Scene) -> EffectPlan:
 
 
 def _draw_over(
-    own: EffectInScene, drawn: RenderedView, camera: Camera, step: str, mask: str
+    effect: EffectInScene, view: RenderedView, camera: Camera, step: str, mask: str
 ) -> RenderedView:
-    alpha = drawn.raster.alpha
-    depth = drawn.raster.expected_depth
+    alpha = view.raster.alpha
+    depth = view.raster.expected_depth
     assert alpha is not None and depth is not None
     with timed(step):
         rgb, drop_mask = draw_falling(
-            drawn.rgb,
+            view.rgb,
             alpha,
             depth,
             camera,
-            own.settings,
-            scene=own.lit_scene,
-            fog=drawn.layers.fog,
-            motion=motion_of(own.scene, camera),
-            splats=_surfaces_of(drawn),
-            backend=own.backend,
+            effect.settings,
+            scene=effect.lit_scene,
+            fog=view.layers.fog,
+            motion=motion_of(effect.scene, camera),
+            splats=_surfaces_of(view),
+            backend=effect.backend,
         )
-    masks = {**drawn.masks, mask: drop_mask}
-    return replace(drawn, rgb=rgb, masks=masks)
+    masks = {**view.masks, mask: drop_mask}
+    return replace(view, rgb=rgb, masks=masks)
 
 
-def _surfaces_of(drawn: RenderedView) -> Float[Tensor, "H W 3"] | None:
+def _surfaces_of(view: RenderedView) -> Float[Tensor, "H W 3"] | None:
     """Return the Gaussians' part of the picture; None if something was drawn over all of it."""
-    splats = drawn.raster.rgb
-    if splats is None or drawn.layers.photo is not None:
+    splats = view.raster.rgb
+    if splats is None or view.layers.photo is not None:
         return None
-    is_first = not drawn.masks.keys() & {"rain", "snowfall"}
-    return splats if is_first and splats.data_ptr() != drawn.rgb.data_ptr() else None
+    is_first = not view.masks.keys() & {"rain", "snowfall"}
+    return splats if is_first and splats.data_ptr() != view.rgb.data_ptr() else None

@@ -36,22 +36,22 @@ def falling_table(name: str, drop: str) -> BoxTable:
 
 
 def measure_falling(
-    table: BoxTable, placed: WorldBoxes, camera: Camera, view: LabelInputs
+    table: BoxTable, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
 ) -> dict[str, np.ndarray]:
     """Return the stored columns of a `falling_table`.
 
     The transmittance is the mean by distance, as in the veil. Drawn drops take as much on average.
     """
     through, _, marked = table.stored_columns
-    data = view.plan.data
+    data = inputs.plan.data
     fog = None if data is None else Fog(data.sizes.extinction_per_m, (0.0, 0.0, 0.0))
-    estimate = box_transmittance(placed, camera, fog, view.depth_m, view.water_level_z_m)
+    estimate = box_transmittance(boxes, camera, fog, inputs.depth_m, inputs.water_level_z_m)
     stored = {
         through: estimate.transmittance,
-        "pixels": np.full(len(placed), NOT_COUNTED),
-        marked: np.zeros(len(placed), np.int64),
+        "pixels": np.full(len(boxes), NOT_COUNTED),
+        marked: np.zeros(len(boxes), np.int64),
     }
-    if data is not None and view.depth_m is not None and view.mask is not None:
-        counted = count_pixels(placed, camera, view.depth_m, view.mask)
+    if data is not None and inputs.depth_m is not None and inputs.mask is not None:
+        counted = count_pixels(boxes, camera, inputs.depth_m, inputs.mask)
         stored |= {"pixels": counted.num_pixels, marked: counted.num_marked}
     return stored

@@ -7,7 +7,8 @@ count on average, by Beer-Lambert, and single large ones are drawn at random.
     drop at r        (rho_d / pi) min(1, D / w)^2 exp(-2 alpha r) xi(r) / r^2
 
 The strongest echo counts. alpha is the extinction of the images, w = aperture + divergence r is the
-beam's width, and xi is the share of a near spot's light that the receiver collects (`receiver_overlap`).
+beam's width, and xi is the share of a near spot's light that the receiver collects
+(`receiver_overlap`).
 n(D) dD drops per volume are a Poisson process along the beam. So the strongest echo is stronger
 than s with probability 1 - exp(-M(s)), where M is the mean number of drops with a stronger echo
 (`EchoTable`). Two random numbers a beam, at any rate, give the strength and range of the echo, so

@@ -60,12 +60,12 @@ class FloodEffect(Effect):
     name = "flood"
     section = "weather.flood"
     model = Flood
-    mask = "water"
-    draws = PASSES[1:3]
+    mask_name = "water"
+    raster_passes = PASSES[1:3]
     # submerged_fraction: share of the box's height that is under water. pixels: number of pixels
     # that show the box, or NOT_COUNTED in an image without water in view. hidden_pixels: number of
     # those pixels that show the box through water.
-    table = BoxTable(
+    box_table = BoxTable(
         name="box_water",
         file="labels/water.parquet",
         kind="box water",
@@ -80,16 +80,18 @@ class FloodEffect(Effect):
         hidden_column="hidden_fraction",
     )
 
-    def kernels(self, section: Flood) -> Hashable:
+    def kernel_key(self, section: Flood) -> Hashable:
         return section.reflection
 
-    def share(self, job: JobContext) -> None:
+    def precompute(self, context: JobContext) -> None:
         """Precompute the height of the road."""
-        if any(self.section_of(recipe) is not None for recipe in job.recipes):
+        if any(self.section_of(recipe) is not None for recipe in context.recipes):
             with suppress(SceneError):  # every image reports the error itself
-                memo_of(job.scene).put(("ground",), ground_of(job.scene), shared=True)
+                memo_of(context.scene).put(("ground",), ground_of(context.scene), shared=True)
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
+    def plan_in_scene(
+        self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
+    ) -> EffectPlan:
         flood = self.section_of(recipe)
         if flood is None:
             return EffectPlan(
@@ -104,51 +106,55 @@ class FloodEffect(Effect):
             return EffectPlan(None, skipped(PASSES, why), water_level_z_m=level_z_m)
         return EffectPlan(medium, _steps(medium, reason), water_level_z_m=level_z_m)
 
-    def cameras(self, own: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
-        is_drawn = _is_under(own.settings, camera) or plane_window(camera, own.settings.level_z_m)
-        return layer_cameras(own.settings, camera) if is_drawn else None
+    def cameras(self, effect: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
+        is_drawn = _is_under(effect.settings, camera) or plane_window(
+            camera, effect.settings.level_z_m
+        )
+        return layer_cameras(effect.settings, camera) if is_drawn else None
 
-    def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
-        camera = sight.camera
-        if _is_under(own.settings, camera):
+    def visibility(self, effect: EffectInScene, query: ViewQuery) -> Visibility:
+        camera = query.camera
+        if _is_under(effect.settings, camera):
             why = "the camera is under water: it sees what lies below and what lies above"
             return Visibility(skip_reasons=dict.fromkeys(PASSES, why))
-        if plane_window(camera, own.settings.level_z_m) is None:
+        if plane_window(camera, effect.settings.level_z_m) is None:
             why = "no ray of this camera meets the water's plane"
             return Visibility(False, dict.fromkeys(PASSES, why))
         return Visibility()
 
     def draw(
-        self, own: EffectInScene, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
+        self, effect: EffectInScene, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
     ) -> RenderedView | None:
-        image = render_flooded(layers, camera, own.settings, buffers)
+        image = render_flooded(layers, camera, effect.settings, buffers)
         if image is None:
             return None
         why = "what stands before the water hides all of it"
         skip_reasons = dict.fromkeys(PASSES if image.is_hidden else (), why)
         return RenderedView(image.rgb, image.scene, layers, {"water": image.water}, skip_reasons)
 
-    def front_surface(self, own: EffectInScene, camera: Camera) -> FrontSurface | None:
-        if _is_under(own.settings, camera):  # from below, the surface has no depth
+    def front_surface(self, effect: EffectInScene, camera: Camera) -> FrontSurface | None:
+        if _is_under(effect.settings, camera):  # from below, the surface has no depth
             return FrontSurface(int(SemanticClass.WATER), None)
-        return FrontSurface(int(SemanticClass.WATER), plane_depth(camera, own.settings.level_z_m))
+        return FrontSurface(
+            int(SemanticClass.WATER), plane_depth(camera, effect.settings.level_z_m)
+        )
 
-    def measure(
-        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
+    def measure_boxes(
+        self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
     ) -> dict[str, np.ndarray]:
-        level_z_m = view.plan.water_level_z_m
+        level_z_m = inputs.plan.water_level_z_m
         assert level_z_m is not None
-        pixels = np.full(len(placed), NOT_COUNTED)
-        num_hidden = np.zeros(len(placed), np.int64)
-        if view.depth_m is not None and view.mask is not None:
-            counted = count_hidden_pixels(placed, camera, view.depth_m, view.mask)
+        pixels = np.full(len(boxes), NOT_COUNTED)
+        num_hidden = np.zeros(len(boxes), np.int64)
+        if inputs.depth_m is not None and inputs.mask is not None:
+            counted = count_hidden_pixels(boxes, camera, inputs.depth_m, inputs.mask)
             pixels = counted.num_pixels
             num_hidden = counted.num_marked
-        submerged = submerged_fraction(placed, level_z_m)
+        submerged = submerged_fraction(boxes, level_z_m)
         return {"submerged_fraction": submerged, "pixels": pixels, "hidden_pixels": num_hidden}
 
-    def meet(self, own: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
-        meet_flood(echoes, own.settings)
+    def intersect_beams(self, effect: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
+        meet_flood(echoes, effect.settings)
 
 
 def _is_under(medium: FloodMedium, camera: Camera) -> bool:
@@ -228,7 +234,7 @@ def _grown(camera: Camera, margin_px: float) -> Camera:
 # ---- Labelled boxes ------------------------------------------------------------------------------
 
 
-def submerged_fraction(placed: WorldBoxes, level_z_m: float) -> Float64[np.ndarray, " B"]:
+def submerged_fraction(boxes: WorldBoxes, level_z_m: float) -> Float64[np.ndarray, " B"]:
     """Return the share of each box's height that is under water, 0 to 1.
 
     The corners give the height, also of tilted boxes. A box without height is either under water
@@ -238,7 +244,7 @@ def submerged_fraction(placed: WorldBoxes, level_z_m: float) -> Float64[np.ndarr
         placed: the boxes, in the scene's world.
         level_z_m: height of the water, scene world.
     """
-    z = placed.corners_m[..., 2]  # [B, 8]
+    z = boxes.corners_m[..., 2]  # [B, 8]
     low = z.min(axis=1)
     high = z.max(axis=1)
     height = high - low
@@ -246,11 +252,11 @@ def submerged_fraction(placed: WorldBoxes, level_z_m: float) -> Float64[np.ndarr
         fraction = (level_z_m - low) / np.where(height > 0, height, 1.0)
         flat = np.where(level_z_m > low, 1.0, 0.0)
     fraction = np.where(height > 0, np.clip(fraction, 0.0, 1.0), flat)
-    return np.where(placed.is_usable, fraction, np.nan)
+    return np.where(boxes.is_usable, fraction, np.nan)
 
 
 def count_hidden_pixels(
-    placed: WorldBoxes,
+    boxes: WorldBoxes,
     camera: Camera,
     scene_depth_m: Float32[np.ndarray, "H W"],
     water: UInt8[np.ndarray, "H W"],
@@ -263,4 +269,4 @@ def count_hidden_pixels(
         scene_depth_m: z of the scene's surface behind the water, metres; 0 = none.
         water: 255 where water is the first surface.
     """
-    return count_pixels(placed, camera, scene_depth_m, water)
+    return count_pixels(boxes, camera, scene_depth_m, water)

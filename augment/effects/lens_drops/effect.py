@@ -32,17 +32,19 @@ class LensDropsEffect(Effect):
     name = "lens_drops"
     section = "camera.lens_drops"
     model = LensDrops
-    mask = "lens_drops"
+    mask_name = "lens_drops"
     is_see_through = True
     share_column = "lens_drops_fraction"
 
     def reads_splats(self, recipe: Recipe) -> bool:
         return False
 
-    def kernels(self, section: LensDrops) -> Hashable:
+    def kernel_key(self, section: LensDrops) -> Hashable:
         return section.changes or None
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
+    def plan_in_scene(
+        self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
+    ) -> EffectPlan:
         drops = self.section_of(recipe)
         rate_mm_h = section_at(recipe, "weather.rain.rate_mm_h") or 0.0
         why = ""
@@ -63,19 +65,19 @@ class LensDropsEffect(Effect):
         data = LensDropsPlan(drops, recipe.seed, rate_mm_h)
         return EffectPlan(data, (Step(ON_GLASS, True, why, PICTURE),))
 
-    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
+    def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         if camera.is_orthographic:
-            return drawn
+            return view
         with timed(ON_GLASS):
-            drops = drops_at(own.settings, own.scene, camera)
-            lens = own.settings.drops
+            drops = drops_at(effect.settings, effect.scene, camera)
+            lens = effect.settings.drops
             if len(drops.radii_m) == 0:
-                return drawn
+                return view
             around = map_surroundings(
-                drawn.rgb, camera, drawn.layers, level=own.scene.has_known_gravity
+                view.rgb, camera, view.layers, level=effect.scene.has_known_gravity
             )
             layer, step, margin = draw_drops(
                 drops, around, camera, glass_m=lens.glass_m, aperture_m=lens.aperture_m
             )
-            rgb, mask = blend_drops(drawn.rgb, layer, step, margin, backend=own.backend)
-        return replace(drawn, rgb=rgb, masks={**drawn.masks, self.mask_name: mask})
+            rgb, mask = blend_drops(view.rgb, layer, step, margin, backend=effect.backend)
+        return replace(view, rgb=rgb, masks={**view.masks, self.mask_name: mask})

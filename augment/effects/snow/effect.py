@@ -68,15 +68,15 @@ class SnowEffect(Effect):
     name = "snow"
     section = "weather.snow"
     model = Snow
-    mask = "snow"
-    lies_on_scene = shares_files = True
-    folded: ClassVar = {
+    mask_name = "snow"
+    adds_overlays = shares_files = True
+    off_switches: ClassVar = {
         LAYER_PASS: ("weather.snow", None),
         LIGHT_PASS: ("weather.snow.shading", "per_splat"),
     }
     # pixels: number that show the box or the snow on it, or NOT_COUNTED without snow in view.
     # count_snow_pixels: number of them that show snow.
-    table = BoxTable(
+    box_table = BoxTable(
         name="box_snow",
         file="labels/snow.parquet",
         kind="box snow",
@@ -86,10 +86,12 @@ class SnowEffect(Effect):
         hidden_column="snow_fraction",
     )
 
-    def kernels(self, section: Snow) -> Hashable:
+    def kernel_key(self, section: Snow) -> Hashable:
         return section.shading
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
+    def plan_in_scene(
+        self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
+    ) -> EffectPlan:
         snow = self.section_of(recipe)
         if snow is None or not snow.changes:
             reason = "the recipe has no snow"
@@ -104,7 +106,7 @@ class SnowEffect(Effect):
             f"no steeper than {snow.max_slope_deg:g} deg and seen by a camera; cells of "
             f"{100 * snow.cell_m:g} cm near the path; {describe_light(scene, snow)}"
         )
-        levels = (other.water_level_z_m for other in later.values())
+        levels = (other.water_level_z_m for other in later_plans.values())
         level_z_m = next((level for level in levels if level is not None), None)
         if level_z_m is not None:
             reason += f"; none below the water's level, z = {level_z_m:.2f} m"
@@ -118,27 +120,29 @@ class SnowEffect(Effect):
         buffers = {OVERLAY, EXPECTED_DEPTH} if snow.grain > 0 else {OVERLAY}
         return EffectPlan(SnowPlan(snow, seed, level_z_m), steps, frozenset(buffers))
 
-    def prepare(self, own: EffectInScene) -> SnowLayers:
-        return build_snow_layers(own.scene, own.settings, own.lit_scene, backend=own.backend)
+    def prepare(self, effect: EffectInScene) -> SnowLayers:
+        return build_snow_layers(
+            effect.scene, effect.settings, effect.lit_scene, backend=effect.backend
+        )
 
-    def share(self, job: JobContext) -> None:
+    def precompute(self, context: JobContext) -> None:
         """Find where snow can lie, once for all recipes of the job."""
-        sections = (self.section_of(recipe) for recipe in job.recipes)
+        sections = (self.section_of(recipe) for recipe in context.recipes)
         distinct = dict.fromkeys(
-            exposure_settings(snow, job.scene) for snow in sections if snow and snow.changes
+            exposure_settings(snow, context.scene) for snow in sections if snow and snow.changes
         )
         for settings in distinct:
-            precompute_shadows(job.scene)
-            share_exposed_surface(job, settings)
+            precompute_shadows(context.scene)
+            share_exposed_surface(context, settings)
 
-    def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
-        layers = own.prepared_data
-        boxes = memo_of(layers).get(("boxes of snow",), lambda: _bound_layers(own.scene, layers))
-        owners = find_visible_owners(boxes, sight.world_from_parts, sight.cameras, sight.near_m)
+    def visibility(self, effect: EffectInScene, query: ViewQuery) -> Visibility:
+        layers = effect.prepared_data
+        boxes = memo_of(layers).get(("boxes of snow",), lambda: _bound_layers(effect.scene, layers))
+        owners = find_visible_owners(boxes, query.world_from_parts, query.cameras, query.near_m)
         if not owners:
             why = "neither snow nor what it buries can be in view"
             return Visibility(False, dict.fromkeys((*PASSES, GRAIN_PASS), why))
-        is_lit_per_pixel = any(_is_lit_per_pixel(layers.layer_on(own.scene, n)) for n in owners)
+        is_lit_per_pixel = any(_is_lit_per_pixel(layers.layer_on(effect.scene, n)) for n in owners)
         why = (
             {} if is_lit_per_pixel else {LIGHT_PASS: "no snow that is lit per pixel can be in view"}
         )
@@ -147,56 +151,61 @@ class SnowEffect(Effect):
         )
 
     def edit_scene(
-        self, own: EffectInScene, layers: LayerRenderer, camera: Camera
+        self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
         with timed(LAYER_PASS):
-            parts = own.prepared_data.parts_for(
-                own.scene, camera, layers.parts, own.view_data, backend=own.backend
+            parts = effect.prepared_data.parts_for(
+                effect.scene, camera, layers.parts, effect.view_data, backend=effect.backend
             )
         return replace(layers, parts=parts)
 
-    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
-        snow = drawn.raster.overlay
-        depth = drawn.raster.expected_depth
-        if own.settings.snow.grain == 0 or camera.is_orthographic or snow is None or depth is None:
-            return drawn
-        layers = own.prepared_data
-        masks_before_snow = list(drawn.masks.values())  # water lies before the snow beneath it
+    def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
+        snow = view.raster.overlay
+        depth = view.raster.expected_depth
+        if (
+            effect.settings.snow.grain == 0
+            or camera.is_orthographic
+            or snow is None
+            or depth is None
+        ):
+            return view
+        layers = effect.prepared_data
+        masks_before_snow = list(view.masks.values())  # water lies before the snow beneath it
         with timed(GRAIN_PASS):
             rgb = add_grain(
-                drawn.rgb,
+                view.rgb,
                 depth,
                 snow,
                 torch.stack(masks_before_snow).any(0) if masks_before_snow else None,
                 camera,
                 layers.grain,
                 layers.sun,
-                _find_carriers(own, camera),
-                extinction_per_m=_extinction_at(camera, drawn.layers.fog),
-                backend=own.backend,
+                _find_carriers(effect, camera),
+                extinction_per_m=_extinction_at(camera, view.layers.fog),
+                backend=effect.backend,
             )
-        return replace(drawn, rgb=rgb)
+        return replace(view, rgb=rgb)
 
-    def mask_of(self, own: EffectInScene, drawn: RenderedView) -> Bool[Tensor, "H W"] | None:
-        overlay = drawn.raster.overlay
+    def visible_mask(self, effect: EffectInScene, view: RenderedView) -> Bool[Tensor, "H W"] | None:
+        overlay = view.raster.overlay
         return None if overlay is None else overlay >= MIN_MASK_SHARE
 
-    def measure(
-        self, placed: WorldBoxes, camera: Camera, view: LabelInputs
+    def measure_boxes(
+        self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
     ) -> dict[str, np.ndarray]:
-        if _shows_snow(view) and view.depth_m is not None and view.mask is not None:
-            thickness_m = view.plan.data.snow.depth_m
-            counted = count_snow_pixels(placed, camera, view.depth_m, view.mask, thickness_m)
+        if _shows_snow(inputs) and inputs.depth_m is not None and inputs.mask is not None:
+            thickness_m = inputs.plan.data.snow.depth_m
+            counted = count_snow_pixels(boxes, camera, inputs.depth_m, inputs.mask, thickness_m)
             return {"pixels": counted.num_pixels, "snow_pixels": counted.num_marked}
-        no_pixels = np.zeros(len(placed), np.int64)
-        return {"pixels": np.full(len(placed), NOT_COUNTED), "snow_pixels": no_pixels}
+        no_pixels = np.zeros(len(boxes), np.int64)
+        return {"pixels": np.full(len(boxes), NOT_COUNTED), "snow_pixels": no_pixels}
 
-    def grow_boxes(self, placed: WorldBoxes, view: LabelInputs) -> WorldBoxes:
-        shows_snow = _shows_snow(view)
-        return extend_boxes_by_snow(placed, view.plan.data.snow.depth_m) if shows_snow else placed
+    def grow_boxes(self, boxes: WorldBoxes, inputs: LabelInputs) -> WorldBoxes:
+        shows_snow = _shows_snow(inputs)
+        return extend_boxes_by_snow(boxes, inputs.plan.data.snow.depth_m) if shows_snow else boxes
 
-    def meet(self, own: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
-        intersect_snow(echoes, own.scene, own.settings, echoes.source, frame_ns)
+    def intersect_beams(self, effect: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
+        intersect_snow(echoes, effect.scene, effect.settings, echoes.source, frame_ns)
 
 
 def _find_carriers(snow_effect: EffectInScene, camera: Camera) -> list[Carrier]:
@@ -229,9 +238,9 @@ def _extinction_at(camera: Camera, fog: Fog | None) -> float:
     return float(optical_depth_numpy(fog, np.ones(1), eye_z_m, eye_z_m)[0])
 
 
-def _shows_snow(view: LabelInputs) -> bool:
+def _shows_snow(inputs: LabelInputs) -> bool:
     """Tell if the view shows snow."""
-    return view.plan.data is not None and view.mask is not None and bool(view.mask.any())
+    return inputs.plan.data is not None and inputs.mask is not None and bool(inputs.mask.any())
 
 
 def build_snow_layers(

@@ -873,8 +873,8 @@ def _exit_distance(o, inverse_d, low, size):
 def fill_layer(centers, sizes, depths, corner, cell, base, top):
     """Enter snow on square cells [C] into a grid; the highest counts where several cells meet.
 
-    centers [C, 3], sizes [C]: see ExposedCells. depths [C]: 0 is no snow. base, top: float32 [H, W],
-    -inf before the call.
+    centers [C, 3], sizes [C]: see ExposedCells. depths [C]: 0 is no snow. base, top: float32 [H,
+    W], -inf before the call.
     """
     rows, columns = base.shape
     for i in range(len(depths)):

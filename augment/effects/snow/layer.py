@@ -1,6 +1,7 @@
-"""Lays snow of a recipe's depth on a scene's support, as Gaussians in the colours of its light.
+"""Lays snow of a recipe's depth on a scene's exposed surface, as Gaussians in the colours of its
+light.
 
-Input: a `ExposedSurface`, the recipe's snow, its light and a seed; the result depends on nothing else.
+Input: an `ExposedSurface`, the recipe's snow, its light and a seed. The result depends on nothing else.
 Output: `SnowLayers`. Caller: `effect.snow_layers_of`; `lidar` uses the depths alone. The depth of
 the snow is
 

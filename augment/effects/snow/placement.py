@@ -1,7 +1,8 @@
 """Finds the surfaces of a scene that are open to the sky and visible to a camera.
 
 Input: a `Scene`, the cameras that must see the surfaces, `ExposureSettings`. Output: a
-`ExposedSurface`, square cells on the background and on vehicles. Caller: `support.exposed_surface_of`.
+`ExposedSurface`, square cells on the background and on vehicles. Caller:
+`support.exposed_surface_of`.
 
 1. `plan_tiles` plans square tiles about the cameras' path, with finer cells near it.
 2. `draw_views` renders the depth that some cameras along the drive see.

@@ -1,7 +1,7 @@
 """Finds a scene's support once: it is remembered while the scene lives, and stored in a folder.
 
-`placement.find_exposed_surface` does the work. Callers: snow and wet ground (`exposed_surface_of` for
-pictures and sweeps, `share_exposed_surface` at the start of a job).
+`placement.find_exposed_surface` does the work. Callers: snow and wet ground (`exposed_surface_of`
+for pictures and sweeps, `share_exposed_surface` at the start of a job).
 """
 
 from __future__ import annotations
@@ -201,7 +201,8 @@ def exposed_surface_of(
         cameras: cameras that must see the snow; None for all of the scene's.
         folder: folder that keeps supports as snow-<key>.safetensors. A file that cannot be used is
             replaced, with a warning.
-        backend: backend that places a support which is not remembered yet, see find_exposed_surface.
+        backend: backend that places a support which is not remembered yet, see
+            find_exposed_surface.
         progress: if True, a progress bar is shown.
 
     Raises:
@@ -244,28 +245,28 @@ class StoredExposedSurface:
         return load_exposed_surface(Path(self.path), self.key)
 
 
-def share_exposed_surface(job: JobContext, settings: ExposureSettings) -> None:
+def share_exposed_surface(context: JobContext, settings: ExposureSettings) -> None:
     """Find the support of a job's scene and share it with the processes that take over its memo.
 
     It is shared as a file where the job has a folder.
     """
     support = exposed_surface_of(
-        job.scene,
+        context.scene,
         settings,
-        cameras=job.cameras,
-        folder=job.folder,
-        backend=job.backend,
-        progress=job.progress,
+        cameras=context.cameras,
+        folder=context.folder,
+        backend=context.backend,
+        progress=context.progress,
     )
     stored: ExposedSurface | StoredExposedSurface = support
-    if job.folder is not None:
-        viewing_cameras = all_cameras(job.scene) if job.cameras is None else job.cameras
-        key = exposed_surface_key(job.scene, viewing_cameras, settings, backend=job.backend)
-        path = exposed_surface_path(job.folder, key)
+    if context.folder is not None:
+        viewing_cameras = all_cameras(context.scene) if context.cameras is None else context.cameras
+        key = exposed_surface_key(context.scene, viewing_cameras, settings, backend=context.backend)
+        path = exposed_surface_path(context.folder, key)
         if not path.is_file():  # this process remembers it from a job in another folder
             save_exposed_surface(path, support, key)
         stored = StoredExposedSurface(str(path), key)
-    memo = memo_of(job.scene)
+    memo = memo_of(context.scene)
     memo.put(("snow support", settings), stored, shared=True)
     memo.put(("snow support", settings), support)
 

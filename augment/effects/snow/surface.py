@@ -1,8 +1,8 @@
 """Finds the surfaces on a height map that can carry snow.
 
 Input: a `HeightMap` of one square, seen from above. Output: a `Surface` with slopes, sides and
-distances to open edges; `CellList` arrays of its cells; `ExposedCells`, the finished record. Callers:
-`placement` for the background, and `find_actor_cells` here for a vehicle.
+distances to open edges; `CellList` arrays of its cells; `ExposedCells`, the finished record.
+Callers: `placement` for the background, and `find_actor_cells` here for a vehicle.
 """
 
 from __future__ import annotations
@@ -417,7 +417,8 @@ def find_buried(
     """Find the Gaussians that are the surface or lie close beneath it.
 
     Returns:
-        buried int32 [B] and buried_by int32 [B, 5], see ExposedCells, of Gaussians that snow can hide.
+        buried int32 [B] and buried_by int32 [B, 5], see ExposedCells, of Gaussians that snow can
+        hide.
     """
     results = []
     if len(cells.sizes_m):

@@ -67,10 +67,12 @@ class SprayEffect(Effect):
     def reads_splats(self, recipe: Recipe) -> bool:
         return False
 
-    def kernels(self, section: Rain) -> Hashable:
+    def kernel_key(self, section: Rain) -> Hashable:
         return (section.changes and section.spray) or None
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
+    def plan_in_scene(
+        self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
+    ) -> EffectPlan:
         rain = self.section_of(recipe)
         why = ""
         if rain is None or not rain.changes:
@@ -87,38 +89,38 @@ class SprayEffect(Effect):
         water_m = film_depth_m(rain.rate_mm_h) * rain.ground_wetness
         spray = SprayPlan(water_m, wind_mps, recipe.seed)
         why = (
-            f"{len(spraying_actors(scene))} actors drive faster than {3.6 * MIN_SPEED_MPS:.0f} km/h on "
-            f"{1000 * spray.water_m:.2g} mm of water"
+            f"{len(spraying_actors(scene))} actors drive faster than {3.6 * MIN_SPEED_MPS:.0f} "
+            f"km/h on {1000 * spray.water_m:.2g} mm of water"
         )
         return EffectPlan(
             spray, (Step(SPRAY, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH})
         )
 
-    def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
-        puffs = own.settings.puffs(own.scene, sight.camera.timestamp_ns)
-        camera = sight.camera
+    def visibility(self, effect: EffectInScene, query: ViewQuery) -> Visibility:
+        puffs = effect.settings.puffs(effect.scene, query.camera.timestamp_ns)
+        camera = query.camera
         windows = windows_of(puffs, camera)
         if not ((windows[:, 0] < windows[:, 1]) & (windows[:, 2] < windows[:, 3])).any():
             return Visibility(False, {SPRAY: "no spray can be in view"})
         return Visibility(view_data=puffs)
 
-    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
-        raster = drawn.raster
+    def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
+        raster = view.raster
         assert raster.alpha is not None and raster.expected_depth is not None
         with timed(SPRAY):
             rgb = blend_puffs(
-                drawn.rgb,
+                view.rgb,
                 raster.alpha,
                 raster.expected_depth,
                 camera,
-                own.view_data,
-                glow_of(own.lit_scene).mean,
-                fog=drawn.layers.fog,
-                backend=own.backend,
+                effect.view_data,
+                glow_of(effect.lit_scene).mean,
+                fog=view.layers.fog,
+                backend=effect.backend,
             )
-        return replace(drawn, rgb=rgb)
+        return replace(view, rgb=rgb)
 
-    def meet(self, own: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
+    def intersect_beams(self, effect: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
         key = f"lidar.spray at {frame_ns} ns"
-        rng = rng_for(seed=own.settings.seed, scene=own.scene.name, effect=key)
-        spray_echoes(echoes, own.settings.puffs(own.scene, frame_ns), rng)
+        rng = rng_for(seed=effect.settings.seed, scene=effect.scene.name, effect=key)
+        spray_echoes(echoes, effect.settings.puffs(effect.scene, frame_ns), rng)

@@ -59,12 +59,14 @@ class StyleEffect(Effect):
     name = "style"
     section = "style"
     model = Style
-    folded: ClassVar = {ON_SCENE: ("style", None)}
+    off_switches: ClassVar = {ON_SCENE: ("style", None)}
 
-    def kernels(self, section: Style) -> Hashable:
+    def kernel_key(self, section: Style) -> Hashable:
         return (section.applied_to, section.method) if section.changes else None
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
+    def plan_in_scene(
+        self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
+    ) -> EffectPlan:
         style = self.section_of(recipe)
         if style is None or not style.changes:
             why = "the recipe has no style"
@@ -90,36 +92,40 @@ class StyleEffect(Effect):
         )
         return EffectPlan(style, steps)
 
-    def prepare(self, own: EffectInScene) -> SceneStyle:
-        return scene_style_of(own.scene, own.settings)
+    def prepare(self, effect: EffectInScene) -> SceneStyle:
+        return scene_style_of(effect.scene, effect.settings)
 
-    def relight(self, own: EffectInScene) -> Scene | None:
-        return own.prepared_data.lighting_scene if own.settings.applied_to == "scene" else None
+    def relight(self, effect: EffectInScene) -> Scene | None:
+        return (
+            effect.prepared_data.lighting_scene if effect.settings.applied_to == "scene" else None
+        )
 
-    def share(self, job: JobContext) -> None:
+    def precompute(self, context: JobContext) -> None:
         """Precompute the maps, so that other processes render no content and read no files."""
-        styles = (self.section_of(recipe) for recipe in job.recipes)
+        styles = (self.section_of(recipe) for recipe in context.recipes)
         for style in dict.fromkeys(s for s in styles if s and s.changes):
-            maps = style_maps(job.scene, style, cameras=job.cameras)
-            memo = memo_of(job.scene)
+            maps = style_maps(context.scene, style, cameras=context.cameras)
+            memo = memo_of(context.scene)
             memo.put(("style maps", style), PackedMaps.of(maps), shared=True)
             memo.put(("style maps", style), maps)
 
     def edit_scene(
-        self, own: EffectInScene, layers: LayerRenderer, camera: Camera
+        self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
-        if own.settings.applied_to == "picture":
+        if effect.settings.applied_to == "picture":
             return layers
-        style = own.prepared_data
+        style = effect.prepared_data
         photo = layers.photo
         if photo is not None:
             photo = replace(photo, style=style.on_photo)
-        parts = style.on(layers.parts, backend=own.backend)
+        parts = style.on(layers.parts, backend=effect.backend)
         return replace(layers, parts=parts, sky=style.sky, photo=photo)
 
-    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
-        if own.settings.applied_to != "picture":
-            return drawn
+    def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
+        if effect.settings.applied_to != "picture":
+            return view
         with timed(ON_PICTURE):
-            rgb = apply_color_map(drawn.rgb, own.prepared_data.maps.picture, backend=own.backend)
-        return replace(drawn, rgb=rgb)
+            rgb = apply_color_map(
+                view.rgb, effect.prepared_data.maps.picture, backend=effect.backend
+            )
+        return replace(view, rgb=rgb)

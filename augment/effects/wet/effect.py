@@ -92,14 +92,16 @@ class WetEffect(Effect):
     name = "wet"
     section = "weather.rain"
     model = Rain
-    draws = (MIRROR_PASS,)
-    shares_files = True
+    raster_passes = (MIRROR_PASS,)
+    precomputes_files = True
 
     def reads_splats(self, recipe: Recipe) -> bool:
         rain = self.section_of(recipe)
         return rain is not None and rain.ground_wetness > 0
 
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, EffectPlan]) -> EffectPlan:
+    def plan_in_scene(
+        self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
+    ) -> EffectPlan:
         rain = self.section_of(recipe)
         reason = ""
         if rain is None or rain.ground_wetness == 0:
@@ -128,76 +130,89 @@ class WetEffect(Effect):
         data = WetGroundPlan(recipe.seed, *numbers)
         return EffectPlan(data, steps, frozenset({EXPECTED_DEPTH}))
 
-    def prepare(self, own: EffectInScene) -> WetGround:
-        return wet_ground(own.scene, own.settings.seed, backend=own.backend)
+    def prepare(self, effect: EffectInScene) -> WetGround:
+        return wet_ground(effect.scene, effect.settings.seed, backend=effect.backend)
 
-    def share(self, job: JobContext) -> None:
+    def precompute(self, context: JobContext) -> None:
         """Find where rain can fall, once for the job."""
-        rains = (self.section_of(recipe) for recipe in job.recipes)
+        rains = (self.section_of(recipe) for recipe in context.recipes)
         if any(rain and rain.ground_wetness > 0 for rain in rains):
-            share_exposed_surface(job, PLACEMENT_SETTINGS)
+            share_exposed_surface(context, PLACEMENT_SETTINGS)
 
-    def cameras(self, own: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
-        plane = _find_plane(own, camera)
+    def cameras(self, effect: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
+        plane = _find_plane(effect, camera)
         return (
             None if plane is None else (camera, _mirror_camera(camera, plane, (0, camera.height)))
         )
 
-    def in_view(self, own: EffectInScene, sight: ViewQuery) -> Visibility:
-        if _find_plane(own, sight.camera) is not None:
+    def visibility(self, effect: EffectInScene, query: ViewQuery) -> Visibility:
+        if _find_plane(effect, query.camera) is not None:
             return Visibility()
         reason = "no open ground is in view"
         return Visibility(skip_reasons=dict.fromkeys((MIRROR_PASS, REFLECTION_PASS), reason))
 
     def edit_scene(
-        self, own: EffectInScene, layers: LayerRenderer, camera: Camera
+        self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
-        splats = wet_splats(own.scene, own.prepared_data)
+        splats = wet_splats(effect.scene, effect.prepared_data)
         with timed(DARKENING_PASS):
             parts = [
-                replace(part, gaussians=_darken_part(part.gaussians, splats, own))
+                replace(part, gaussians=_darken_part(part.gaussians, splats, effect))
                 if part.instance_id == 0 and not part.is_overlay
                 else part
                 for part in layers.parts
             ]
         return replace(layers, parts=parts)
 
-    def edit_image(self, own: EffectInScene, drawn: RenderedView, camera: Camera) -> RenderedView:
-        plane = _find_plane(own, camera)
-        depth = drawn.raster.expected_depth
-        alpha = drawn.raster.alpha
+    def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
+        plane = _find_plane(effect, camera)
+        depth = view.raster.expected_depth
+        alpha = view.raster.alpha
         if plane is None or depth is None or alpha is None:
-            return drawn
-        visible_alpha = alpha if drawn.raster.overlay is None else alpha - drawn.raster.overlay
-        for mask in drawn.masks.values():
+            return view
+        visible_alpha = alpha if view.raster.overlay is None else alpha - view.raster.overlay
+        for mask in view.masks.values():
             visible_alpha = torch.where(mask, 0.0, visible_alpha)
         with timed(REFLECTION_PASS):
             share, rows = find_ground(
-                camera, depth, visible_alpha, own.prepared_data, backend=own.backend
+                camera, depth, visible_alpha, effect.prepared_data, backend=effect.backend
             )
         if rows == (0, 0):
             reason = "no open ground is seen"
             return replace(
-                drawn,
-                skip_reasons={**drawn.skip_reasons, MIRROR_PASS: reason, REFLECTION_PASS: reason},
+                view,
+                skip_reasons={**view.skip_reasons, MIRROR_PASS: reason, REFLECTION_PASS: reason},
             )
-        rgb = drawn.rgb
-        if drawn.layers.photo is not None:
+        rgb = view.rgb
+        if view.layers.photo is not None:
             with timed(DARKENING_PASS):
-                rgb = _darken_photo(own, drawn, camera, share)
+                rgb = _darken_photo(effect, view, camera, share)
         with timed(MIRROR_PASS):
-            mirror = _render_mirror(own, drawn.layers, camera, plane, rows)
+            mirror = _render_mirror(effect, view.layers, camera, plane, rows)
         with timed(REFLECTION_PASS):
-            data = own.settings
+            data = effect.settings
             rings = make_rings(data.rate_mm_h, data.seed, camera.timestamp_ns)
-            film = Film(data.wetness, own.prepared_data.find_puddle_threshold(data.puddles), rings)
-            rgb = shade_wet(
-                rgb, camera, depth, share, own.prepared_data, film, mirror, backend=own.backend
+            film = Film(
+                data.wetness, effect.prepared_data.find_puddle_threshold(data.puddles), rings
             )
-        return replace(drawn, rgb=rgb)
+            rgb = shade_wet(
+                rgb,
+                camera,
+                depth,
+                share,
+                effect.prepared_data,
+                film,
+                mirror,
+                backend=effect.backend,
+            )
+        return replace(view, rgb=rgb)
 
-    def attenuate(self, own: EffectInScene, echoes: Echoes, rng: np.random.Generator) -> None:
-        dim_wet_echoes(echoes, own.prepared_data, own.settings.wetness, own.settings.puddles)
+    def attenuate_beams(
+        self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
+    ) -> None:
+        dim_wet_echoes(
+            echoes, effect.prepared_data, effect.settings.wetness, effect.settings.puddles
+        )
 
 
 def _find_plane(wet_effect: EffectInScene, camera: Camera) -> Plane | None:
