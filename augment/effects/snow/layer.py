@@ -1,8 +1,8 @@
 """Lays snow of a recipe's depth on a scene's exposed surface, as Gaussians in the colours of its
 light.
 
-Input: an `ExposedSurface`, the recipe's snow, its light and a seed. The result depends on nothing else.
-Output: `SnowLayers`. Caller: `effect.snow_layers_of`; `lidar` uses the depths alone. The depth of
+Input: an `ExposedSurface`, the recipe's snow, its light and a seed. The result depends on nothing
+else. Output: `SnowLayers`. Caller: `effect.snow_layers_of`; `lidar` uses the depths alone. The depth of
 the snow is
 
 h = depth * drift(x, y) * shoulder(edge), less in wheel tracks, and 0 between patches and by water.
