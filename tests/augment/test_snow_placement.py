@@ -65,7 +65,7 @@ def check_cells(cells: ExposedCells, gaussians: int) -> None:
     for field in dataclasses.fields(ExposedCells):
         values = getattr(cells, field.name)
         assert bool(torch.isfinite(values.double()).all()), field.name
-        if not field.name.startswith("buried"):
+        if field.name not in ("hideable_ids", "covering_cells"):
             assert len(values) == count, field.name
     np.testing.assert_allclose(cells.normals.norm(dim=1), 1, atol=1e-5)
     assert bool((cells.normals[:, 2] > 0).all())
@@ -528,22 +528,24 @@ def test_contents_that_do_not_fit_are_refused(support: ExposedSurface, tmp_path:
     save_exposed_surface(path, support, "k")
     whole = load_file(path)
     ids: dict = {"format": FORMAT, "key": "k", "track_ids": list(support.actors)}
-    short = whole["ground.light"][1:].clone()
+    short = whole["ground.relative_light"][1:].clone()
     neighbours, buried_by, buried = (
-        whole[f"ground.{name}"].clone() for name in ("neighbours", "buried_by", "buried")
+        whole[f"ground.{name}"].clone() for name in ("neighbours", "covering_cells", "hideable_ids")
     )
     neighbours[0, 0], buried_by[0, 0], buried[0] = -3, len(support.ground), -1
-    missing = {name: tensor for name, tensor in whole.items() if name != "actors.1.banks"}
+    missing = {
+        name: tensor for name, tensor in whole.items() if name != "actors.1.obstacle_vectors"
+    }
     for tensors, about in (
-        (whole | {"ground.light": short}, ids),
+        (whole | {"ground.relative_light": short}, ids),
         (missing, ids),
-        (whole | {"ground.tracks": whole["ground.tracks"].double()}, ids),
+        (whole | {"ground.track_share": whole["ground.track_share"].double()}, ids),
         (whole | {"ground.neighbours": neighbours}, ids),
-        (whole | {"ground.buried_by": buried_by}, ids),
-        (whole | {"ground.buried": buried}, ids),
+        (whole | {"ground.covering_cells": buried_by}, ids),
+        (whole | {"ground.hideable_ids": buried}, ids),
         (whole, ids | {"track_ids": 3}),
     ):
-        save_file(tensors, path, metadata={"snow_bed": json.dumps(about)})
+        save_file(tensors, path, metadata={"exposed_surface": json.dumps(about)})
         with pytest.raises(SceneError, match="damaged"):
             load_exposed_surface(path, "k")
 

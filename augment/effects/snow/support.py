@@ -34,17 +34,23 @@ logger = logging.getLogger(__name__)
 
 # Name of the file format. Its number goes up whenever the same scene would give another support, or
 # a file would hold it otherwise.
-FORMAT = "climategs-snow-bed-7"
-_METADATA_KEY = "snow_bed"  # key of the metadata in a file
+FORMAT = "climategs-exposed-surface-8"
+_METADATA_KEY = "exposed_surface"  # key of the metadata in a file
 # Types of the fields of ExposedCells other than float32.
 _DTYPES = {
     "neighbours": torch.int32,
     "semantic": torch.int16,
-    "buried": torch.int32,
-    "buried_by": torch.int32,
+    "hideable_ids": torch.int32,
+    "covering_cells": torch.int32,
 }
 # Second dimension of the fields of ExposedCells that have one.
-_COLUMNS = {"centers_m": 3, "normals": 3, "neighbours": 4, "banks": 2, "buried_by": 5}
+_COLUMNS = {
+    "centers_m": 3,
+    "normals": 3,
+    "neighbours": 4,
+    "obstacle_vectors": 2,
+    "covering_cells": 5,
+}
 
 
 def exposed_surface_key(
@@ -145,9 +151,10 @@ def _named_tensors(part: str, cells: ExposedCells) -> dict[str, Tensor]:
 def _cells_from_tensors(path: Path, tensors: Mapping[str, Tensor], part: str) -> ExposedCells:
     """Return the cells of one part, after a check of every shape and every index."""
     fields_by_name = {field.name: tensors[f"{part}.{field.name}"] for field in fields(ExposedCells)}
-    num_rows = {"cell": len(fields_by_name["sizes_m"]), "buried": len(fields_by_name["buried"])}
+    num_cells = len(fields_by_name["sizes_m"])
+    num_hideable = len(fields_by_name["hideable_ids"])
     for name, tensor in fields_by_name.items():
-        rows = num_rows["buried" if name.startswith("buried") else "cell"]
+        rows = num_hideable if name in ("hideable_ids", "covering_cells") else num_cells
         shape = (rows, _COLUMNS[name]) if name in _COLUMNS else (rows,)
         dtype = _DTYPES.get(name, torch.float32)
         if tuple(tensor.shape) != shape or tensor.dtype != dtype:
@@ -155,15 +162,12 @@ def _cells_from_tensors(path: Path, tensors: Mapping[str, Tensor], part: str) ->
                 f"{part}.{name} must be {dtype} {list(shape)}; got {tensor.dtype} "
                 f"{list(tensor.shape)}"
             )
-    for name, min_index in (("neighbours", FLUSH), ("buried_by", -1)):
+    for name, min_index in (("neighbours", FLUSH), ("covering_cells", -1)):
         values = fields_by_name[name]
-        if (
-            values.numel()
-            and not min_index <= int(values.min()) <= int(values.max()) < num_rows["cell"]
-        ):
+        if values.numel() and not (min_index <= int(values.min()) <= int(values.max()) < num_cells):
             raise ValueError(f"{part}.{name} names cells that are not there")
-    if num_rows["buried"] and int(fields_by_name["buried"].min()) < 0:
-        raise ValueError(f"{part}.buried names Gaussians that are not there")
+    if num_hideable and int(fields_by_name["hideable_ids"].min()) < 0:
+        raise ValueError(f"{part}.hideable_ids names Gaussians that are not there")
     return ExposedCells(**fields_by_name)
 
 

@@ -577,10 +577,14 @@ def make_cells(
         slices_of(len(cells.sizes_m)),
     )
     buried, buried_by = find_buried(gaussians, cells_under, cells)
-    copied_names = ("normals", "sizes_m", "edge_m", "tracks", "banks", "semantic")
     return ExposedCells(
-        **{name: torch.from_numpy(getattr(cells, name)) for name in copied_names},
         centers_m=torch.from_numpy(cells.centers_m.astype(np.float32)),
+        normals=torch.from_numpy(cells.normals),
+        sizes_m=torch.from_numpy(cells.sizes_m),
+        edge_distance_m=torch.from_numpy(cells.edge_m),
+        track_share=torch.from_numpy(cells.tracks),
+        obstacle_vectors=torch.from_numpy(cells.banks),
+        semantic=torch.from_numpy(cells.semantic),
         neighbours=torch.from_numpy(neighbours),
         relative_light=torch.from_numpy(light),
         hideable_ids=torch.from_numpy(buried),
