@@ -55,7 +55,7 @@ class PassProgress:
     """Progress of the pass that runs."""
 
     name: str
-    """The pass's name, as plans have it: "rasterise"; or a preparation's: "placing snow"."""
+    """The pass's name, as plans have it: "rasterise"; or a preparation's: "finding exposed surfaces"."""
     num_done: int = 0
     """Steps that are done."""
     num_steps: int = 0
@@ -122,7 +122,7 @@ def counted_steps(name: str, total: int) -> Iterator[Callable[[], None]]:
     Yields a function, which is to be called after each step.
 
     Args:
-        name: what is prepared, for people: "placing snow".
+        name: what is prepared, for people: "finding exposed surfaces".
         total: number of steps.
     """
     watch = _watching.get()

@@ -69,7 +69,8 @@ class SnowEffect(Effect):
     section = "weather.snow"
     model = Snow
     mask_name = "snow"
-    adds_overlays = shares_files = True
+    adds_overlays = True
+    precomputes_files = True
     off_switches: ClassVar = {
         LAYER_PASS: ("weather.snow", None),
         LIGHT_PASS: ("weather.snow.shading", "per_splat"),

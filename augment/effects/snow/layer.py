@@ -2,8 +2,8 @@
 light.
 
 Input: an `ExposedSurface`, the recipe's snow, its light and a seed. The result depends on nothing
-else. Output: `SnowLayers`. Caller: `effect.snow_layers_of`; `lidar` uses the depths alone. The depth of
-the snow is
+else. Output: `SnowLayers`. Caller: `effect.build_snow_layers`; `lidar` uses the depths alone. The
+depth of the snow is
 
 h = depth * drift(x, y) * shoulder(edge), less in wheel tracks, and 0 between patches and by water.
 
