@@ -492,7 +492,7 @@ def _sample(block: Block, loader: SceneLoader, plan: JobPlan) -> Sample:
                 frames=[frame_numbers[len(frame_numbers) // 2]],
                 cameras=[camera],
                 backend=plan.backend,
-                shared_files_dir=Path(folder) / "beds",
+                shared_files_dir=Path(folder) / "shared",
             )
             start_s = time.perf_counter()
             run_job(job, scene_loader=loader, progress=False)
@@ -702,7 +702,7 @@ class _Generation:
             self._timings["plan"] = time.perf_counter() - start_s
             blocks = select_shard(plan.blocks, *self._job.shard)
             pending_blocks = self._find_pending_blocks(blocks)
-            self._timings["scan"] = time.perf_counter() - start_s - self._timings["plan"]
+            self._timings["find_finished"] = time.perf_counter() - start_s - self._timings["plan"]
             work = BlockWork(
                 pending_blocks,
                 plan.names,

@@ -397,7 +397,9 @@ def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path)
     before = bed.stat().st_mtime_ns
     deeper = make_recipe(variant=1, snow=Snow(depth_m=0.3, cell_m=0.2))
     assert run(RenderJob(uri, [deeper], one_run_dir), None).failures == ()
-    assert [p.stat().st_mtime_ns for p in (one_run_dir / ".climategs").glob("exposed-*")] == [before]
+    assert [p.stat().st_mtime_ns for p in (one_run_dir / ".climategs").glob("exposed-*")] == [
+        before
+    ]
 
 
 # ---- Maps of styles: found once a job, and what renders its images again -------------------------

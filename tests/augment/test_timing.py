@@ -34,7 +34,9 @@ def test_a_watcher_hears_which_pass_runs_and_how_far_it_has_got():
     assert len(reports) == 7  # nobody listens any more
 
 
-@pytest.mark.parametrize("last", [("sky", 0), ("finding exposed surfaces", 0), ("finding exposed surfaces", 1)])
+@pytest.mark.parametrize(
+    "last", [("sky", 0), ("finding exposed surfaces", 0), ("finding exposed surfaces", 1)]
+)
 def test_what_a_watcher_raises_gives_up_what_runs(last):
     reports = list[PassProgress]()
 
