@@ -55,8 +55,7 @@ class PassProgress:
     """Progress of the pass that runs."""
 
     name: str
-    """Name of a pass, as plans have it ("rasterise"), or of a preparation ("finding exposed surfaces").
-    """
+    """Name of a pass ("rasterise") or of a preparation ("finding exposed surfaces")."""
     num_done: int = 0
     """Steps that are done."""
     num_steps: int = 0

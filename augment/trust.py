@@ -184,7 +184,7 @@ def source_views(scene: Scene) -> SourceViews:
     For a fitted scene they are those that it was fitted to, as its files say; else all that was
     recorded.
     """
-    return memo_of(scene).get("seen views", lambda: _find_seen_views(scene))
+    return memo_of(scene).get("source views", lambda: _find_seen_views(scene))
 
 
 def unfitted_cameras(scene: Scene) -> tuple[str, ...]:

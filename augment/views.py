@@ -102,7 +102,7 @@ def render_buffers(
     """
     with timed("view plan"):
         view = plan_view(plan, scene, camera, backend=backend)
-    with timed("parts"):
+    with timed("collect parts"):
         bare_parts = scene.parts_for(camera, view.actor_ids)
     color_map = scene.color_map(camera) if plan.uses_recorded_exposure else None
     photo = None

@@ -245,8 +245,8 @@ class JobResult:
     """One line for each failure."""
     timings: dict[str, float] = field(default_factory=dict)
     """Seconds by kind of work, summed over threads and workers, or of the job itself (open,
-    choose_settings, prepare, read_labels, share_scene, finish). `worker.compute_time_shares` says what
-    bound the job.
+    choose_settings, prepare, read_labels, share_scene, finish). `worker.compute_time_shares` says
+    what bound the job.
     """
 
 

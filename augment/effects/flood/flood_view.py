@@ -322,7 +322,7 @@ def render_flooded(
     fog = renderer.fog
     backend = renderer.backend
     device = front.alpha.device
-    with timed("flood: where it is seen"):
+    with timed("flood: find water"):
         water, max_water_share = find_water(front.alpha, camera, backend=backend)
     if max_water_share < 1 - HIDDEN_COVER:
         with timed("sky"):
@@ -357,7 +357,7 @@ def render_flooded(
             needed = is_smooth(field, crop)  # rough water reflects the mirrored view alone
             layer = as_layer(camera, front)
             screen = trace_screen(layer, crop, medium.level_z_m, needed=needed, backend=backend)
-    with timed("flood: colours of the water"):
+    with timed("flood: shade water"):
         color = shade_water(
             crop,
             cover,
@@ -370,7 +370,7 @@ def render_flooded(
             fog=fog,
             backend=backend,
         )
-    with timed("flood: layers joined"):
+    with timed("flood: composite layers"):
         image = composite_water(front, camera, window, color, renderer)
         scene = merge_depths(front, bed, bed_window, buffers, backend=backend)
     return FloodedImage(image, scene, water)

@@ -55,7 +55,7 @@ from recipes.schema import Recipe
 from recipes.snow import Snow
 
 # Labels of the passes, in plans and timings.
-LAYER_PASS, LIGHT_PASS = PASSES = ("snow: placement and layer", "snow: light per pixel")
+LAYER_PASS, LIGHT_PASS = PASSES = ("snow: exposed surface and layer", "snow: light per pixel")
 GRAIN_PASS = "snow: grain"
 MIN_MASK_SHARE = 0.5  # least share of snow in a pixel of the mask
 _CHUNK_M = 8.0  # side of the squares in which snow is bounded

@@ -58,7 +58,7 @@ from recipes.schema import Recipe
 
 # Labels of the passes, in plans and timings.
 DARKENING_PASS, MIRROR_PASS, REFLECTION_PASS = PASSES = (
-    "wet ground: darker",
+    "wet ground: darkening",
     "wet ground: mirrored view",
     "wet ground: reflection",
 )
