@@ -76,7 +76,7 @@ class SnowEffect(Effect):
         LIGHT_PASS: ("weather.snow.shading", "per_splat"),
     }
     # pixels: number that show the box or the snow on it, or NOT_COUNTED without snow in view.
-    # count_snow_pixels: number of them that show snow.
+    # snow_pixels: number of them that show snow.
     box_table = BoxTable(
         name="box_snow",
         file="labels/snow.parquet",
@@ -127,7 +127,7 @@ class SnowEffect(Effect):
         )
 
     def precompute(self, context: JobContext) -> None:
-        """Find where snow can lie, once for all recipes of the job."""
+        """Find the exposed surface of the scene, once for all recipes of the job."""
         sections = (self.section_of(recipe) for recipe in context.recipes)
         distinct = dict.fromkeys(
             exposure_settings(snow, context.scene) for snow in sections if snow and snow.changes
@@ -253,11 +253,11 @@ def build_snow_layers(
         scene: the scene.
         recipe_snow: snow of a recipe.
         light: scene whose light the snow lies in; None for the scene's own.
-        backend: backend that finds where snow can lie, unless that is known (see
+        backend: backend that finds the exposed surface, unless it is known (see
             augment.effects.snow.support).
 
     Raises:
-        SceneError: snow cannot be placed in this scene, or not with cells this small.
+        SceneError: snow cannot be laid in this scene, or not with cells this small.
     """
     support = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene), backend=backend)
     light = None if light is scene else light
