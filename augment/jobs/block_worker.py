@@ -592,8 +592,8 @@ class BlockWorker:
             folder = self._shared_dir()
             lock = folder / f"beds-{folder_name(block.scene)}.lock"
             with file_lock(lock, "finds where snow can lie"):
-                sharing = effects.JobContext(scene, [recipe], folder=folder, backend=backend)
-                effects.precompute_effects(sharing, only_files=True)
+                context = effects.JobContext(scene, [recipe], folder=folder, backend=backend)
+                effects.precompute_effects(context, only_files=True)
 
 
 class _SceneFailed(ClimateGSError):

@@ -170,7 +170,8 @@ def compute_time_shares(
 
     Args:
         seconds: Seconds by kind of work.
-        held_up: Number of workers that wait while the job itself does other work than rendering.
+        num_waiting_workers: Number of workers that wait while the job itself does other work than
+            rendering.
     """
     workers_s = seconds.get(WORKERS, 0.0)
     writers_s = seconds.get(WRITERS, 0.0)
@@ -215,8 +216,8 @@ _log = logging.getLogger(__name__)
 class Renderer(Protocol):
     """Function that renders an image: `augment.views.render_view`, `begin_view`, or a stand-in.
 
-    It returns a View, or a Pending one; in the second case a job begins the next view before it
-    waits.
+    It returns a ViewResult, or a pending one; in the second case a job begins the next view before
+    it waits.
     """
 
     def __call__(self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> Any: ...
@@ -254,7 +255,7 @@ class Chunk:
     """Images of one frame under one recipe."""
 
     variant: int
-    """Position in Setup.recipes."""
+    """Position in RenderSetup.recipes."""
     frame: int
     """Frame number."""
     cameras: tuple[str, ...]
@@ -266,7 +267,7 @@ class Outcome:
     """Result of one image."""
 
     variant: int
-    """Position in Setup.recipes."""
+    """Position in RenderSetup.recipes."""
     frame: int
     """Frame number."""
     camera: str
@@ -284,7 +285,7 @@ class Outcome:
     box_weather: BoxWeather = field(default_factory=dict)
     """Measured numbers of the image's boxes."""
     shares: Mapping[str, float] = field(default_factory=dict)
-    """Shares of the image's pixels, as of Written."""
+    """Shares of the image's pixels, as of ViewFiles."""
 
 
 @dataclass(frozen=True)
