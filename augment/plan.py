@@ -307,7 +307,7 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
         backend: the rasteriser's backend.
 
     Raises:
-        SceneError: an effect cannot be placed in this scene.
+        SceneError: an effect is not possible in this scene.
     """
     active_effects = plan.active_effects(scene, backend=backend)
     effect_cameras = [

@@ -3,8 +3,8 @@
 `with timed("flood: bed"):` stands in a pass and costs two look-ups where nobody listens. `with
 stopwatch() as seconds:` around it measures. The GPU is then waited for at both ends of a pass,
 which makes the whole slower and each time its own. `with watched(report):` around it reports which
-pass has begun, and each step of long preparations (`counted`). It changes no picture and waits for
-nothing. An exception that the watcher raises gives up the work inside.
+pass has begun, and each step of long preparations (`counted_steps`). It changes no picture and
+waits for nothing. An exception that the watcher raises gives up the work inside.
 """
 
 from __future__ import annotations

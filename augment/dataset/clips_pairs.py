@@ -45,10 +45,10 @@ class ShardedSampler(Sampler[int]):
         ranks: number of processes; None takes torch.distributed's where it runs, else 1.
         shuffle: if False, the order is that of the samples.
         seed: seed of the order.
-        uneven: what happens where the number of samples is no multiple of the ranks. `exact`: some
-            ranks have one sample more. `pad`: the first places come again, so that all ranks have
-            as many (collective operations wait for each other). `drop`: the last places are left
-            out this epoch.
+        remainder: what happens where the number of samples is no multiple of the ranks. `exact`:
+            some ranks have one sample more. `pad`: the first places come again, so that all ranks
+            have as many (collective operations wait for each other). `drop`: the last places are
+            left out this epoch.
 
     To go on after an interruption, keep `state_dict(given)` and load it into a sampler of the same
     samples and seed; the number of ranks may then be another. A DataLoader asks its sampler ahead
@@ -107,10 +107,10 @@ class ShardedSampler(Sampler[int]):
         """Return the place in the epoch, in plain numbers that JSON holds.
 
         Args:
-            given: number of samples of this rank that were trained on since the epoch began or the
-                last state was loaded: batches times their size. Every rank must have trained on the
-                same number. None takes the number that this sampler yielded, which is right if no
-                worker reads ahead.
+            num_trained: number of samples of this rank that were trained on since the epoch began
+                or the last state was loaded: batches times their size. Every rank must have trained
+                on the same number. None takes the number that this sampler yielded, which is right
+                if no worker reads ahead.
         """
         ahead = (self._num_yielded if num_trained is None else num_trained) * self.ranks
         return {
@@ -181,7 +181,7 @@ def split_by_scene(
     scenes, 0.2 is often none or four.
 
     Args:
-        whole: the dataset or table.
+        dataset: the dataset or table.
         fractions: parts of the scenes by name, in order; they add up to 1.
         seed: seed of the split.
         exact: if True, deal the scenes such that each part's number is off by less than one; a
@@ -252,8 +252,8 @@ class PairedDataset(Dataset):
 
     clean, weathered: over one output folder or two; each with its own options and transform. A
     sample is `{"clean": sample, "weathered": sample}`, in the order of the weathered ones; those
-    without a clean one are left out, `unpaired` of them. Cameras of a pair have the same pose, and
-    the same size if their recipes' scale is the same.
+    without a clean one are left out, `num_unpaired` of them. Cameras of a pair have the same pose,
+    and the same size if their recipes' scale is the same.
 
         frames = WeatherDataset("out/fog")
         pairs = PairedDataset.of(frames)

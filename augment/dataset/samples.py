@@ -174,7 +174,7 @@ def make_sample(
         camera: the camera of the image.
         world_from_ego: pose of the car, float64 [4, 4].
         labels: labels of the frame.
-        described: weather, paths and NAMES.
+        metadata: weather, paths and NAMES.
     """
     sample: Sample = dict.fromkeys(loadable())
     for name, image in images.items():

@@ -293,7 +293,7 @@ def box_transmittance(
     """Return exp(-tau) of the smog between the camera's eye and each box.
 
     Args:
-        placed: the boxes, in the scene's world.
+        boxes: the boxes, in the scene's world.
         camera: camera of the image.
         fog: the smog; None for none.
         surface_depth_m: z of the surfaces that the pixels show, metres, 0 = none. It decides which

@@ -595,8 +595,8 @@ class BlockWorker:
             folder = self._shared_dir()
             lock = folder / f"shared-files-{folder_name(block.scene)}.lock"
             with file_lock(lock, "finds the surfaces that are open to the sky"):
-                sharing = effects.JobContext(scene, [recipe], folder=folder, backend=backend)
-                effects.precompute_effects(sharing, only_files=True)
+                context = effects.JobContext(scene, [recipe], folder=folder, backend=backend)
+                effects.precompute_effects(context, only_files=True)
 
 
 class _SceneFailed(ClimateGSError):

@@ -1,6 +1,6 @@
 """Plan of a dataset job: every scene's images under every resolved recipe, cut into blocks.
 
-In: recipes of a job and records of its scenes. Out: a `Plan` for `generate`, and the status of a
+In: recipes of a job and records of its scenes. Out: a `JobPlan` for `generate`, and the status of a
 job for `climategs status`. The plan is stored in the output as `.climategs/jobs/<name>.json`, so
 that progress can be read from the output alone.
 """

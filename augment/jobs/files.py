@@ -797,7 +797,7 @@ def write_view(
         paths: Paths relative to the output folder, by kind.
 
     Raises:
-        ValueError: A buffer has another type or shape than View says.
+        ValueError: A buffer has another type or shape than ViewResult says.
         OutputError: The system refuses; no partial file is left.
     """
     start_s = time.perf_counter()
@@ -926,7 +926,7 @@ def label_view(
         instances: Numbers of the scene's objects.
         world_origin_m: Origin that was subtracted from the dataset's world, metres.
         camera: Camera at the written resolution.
-        view: View that `check_view` has passed.
+        view: result that `check_view` has passed.
         evidence: Reads further evidence of the frame's objects.
     """
     numbers_of_table: dict[str, BoxNumbers] = {}

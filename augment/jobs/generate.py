@@ -433,7 +433,7 @@ def estimate_job(
 
     Args:
         open_scene: Opens a scene by its URI.
-        each: Called with a recipe's name before its pictures.
+        on_recipe: Called with a recipe's name before its pictures.
     """
     first_blocks: dict[str, Block] = {}
     for block in plan.blocks:
@@ -618,7 +618,7 @@ class Workers:
     """The workers that a job asks for.
 
     Attributes:
-        opened: Name of the scene that each slot has open.
+        scene_of_slot: Name of the scene that each slot has open.
     """
 
     def __init__(self, job: GenerateJob) -> None:

@@ -217,8 +217,8 @@ _log = logging.getLogger(__name__)
 class Renderer(Protocol):
     """Function that renders an image: `augment.views.render_view`, `begin_view`, or a stand-in.
 
-    It returns a View, or a Pending one; in the second case a job begins the next view before it
-    waits.
+    It returns a ViewResult, or a pending one; in the second case a job begins the next view before
+    it waits.
     """
 
     def __call__(self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> Any: ...
@@ -256,7 +256,7 @@ class Chunk:
     """Images of one frame under one recipe."""
 
     variant: int
-    """Position in Setup.recipes."""
+    """Position in RenderSetup.recipes."""
     frame: int
     """Frame number."""
     cameras: tuple[str, ...]
@@ -268,7 +268,7 @@ class Outcome:
     """Result of one image."""
 
     variant: int
-    """Position in Setup.recipes."""
+    """Position in RenderSetup.recipes."""
     frame: int
     """Frame number."""
     camera: str
@@ -286,7 +286,7 @@ class Outcome:
     box_weather: BoxWeather = field(default_factory=dict)
     """Measured numbers of the image's boxes."""
     shares: Mapping[str, float] = field(default_factory=dict)
-    """Shares of the image's pixels, as of Written."""
+    """Shares of the image's pixels, as of ViewFiles."""
 
 
 @dataclass(frozen=True)

@@ -257,14 +257,16 @@ def build_snow_layers(
             augment.effects.snow.support).
 
     Raises:
-        SceneError: snow cannot be laid in this scene, or not with cells this small.
+        SceneError: this scene cannot have snow, or not with cells this small.
     """
-    support = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene), backend=backend)
+    exposed_surface = exposed_surface_of(
+        scene, exposure_settings(recipe_snow.snow, scene), backend=backend
+    )
     light = None if light is scene else light
 
     def build_layers() -> SnowLayers:
         return lay_snow(
-            support,
+            exposed_surface,
             scene,
             recipe_snow.snow,
             find_snow_light(light or scene, recipe_snow.snow),
@@ -272,7 +274,7 @@ def build_snow_layers(
             water_level_z_m=recipe_snow.water_level_z_m,
         )
 
-    return memo_of(scene).get(("snow layers", recipe_snow, support, light), build_layers)
+    return memo_of(scene).get(("snow layers", recipe_snow, exposed_surface, light), build_layers)
 
 
 def _bound_layers(scene: Scene, layers: SnowLayers) -> Bounds:

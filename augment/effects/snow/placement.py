@@ -1,6 +1,6 @@
 """Finds the surfaces of a scene that are open to the sky and visible to a camera.
 
-Input: a `Scene`, the cameras that must see the surfaces, `ExposureSettings`. Output: a
+Input: a `Scene`, the cameras that must see the surfaces, `ExposureSettings`. Output: an
 `ExposedSurface`, square cells on the background and on vehicles. Caller:
 `support.exposed_surface_of`.
 
@@ -676,7 +676,7 @@ def find_wheel_paths(scene: Scene, *, has_invented_path: bool = False) -> tuple[
 
     Args:
         scene: its recorded frames give the path of the ego, also where a camera path replaces them.
-        with_invented: if True, the ego of an invented drive has a path, too.
+        has_invented_path: if True, the ego of an invented drive has a path, too.
     """
     paths = []
     frames = scene.seen_frames or scene.frames
