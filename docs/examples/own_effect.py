@@ -1,7 +1,6 @@
 """Add an effect of your own: colours turn to sepia with distance.
 
-Run it with: python docs/examples/own_effect.py [OUTPUT_FOLDER]
-docs/effects.md ("Adding an effect") lists the other hooks: masks, label tables, LiDAR.
+Run it with: python docs/examples/own_effect.py [OUTPUT_FOLDER]; docs/effects.md lists all hooks.
 """
 
 import sys

@@ -292,7 +292,7 @@ def fill_splats(cells, depths, tops, firsts, lights, colors, splats):
 
     lights [3, 3]: direction of the sun, colour of lit snow, colour of shaded snow. splats: written.
     """
-    for i in prange(len(depths.heights)):
+    for i in prange(len(depths.depths_m)):
         # A function of its own, since numba compiles the body of a parallel loop many times over.
         _fill_cell(np.int64(i), cells, depths, tops, firsts, lights, colors, splats)
 
@@ -306,7 +306,7 @@ def _fill_cell(i, cells, depths, tops, firsts, lights, colors, splats):
     neighbours = cells.neighbours
     tracks = cells.tracks
     light = cells.light
-    depths_m = depths.heights
+    depths_m = depths.depths_m
     mottle = depths.mottle
     random_bits = depths.random_bits
     means = splats.means
@@ -684,7 +684,7 @@ def find_depths(cells, settings, drifts, patches, mottling, seed, depths):
     tracks = cells.tracks
     banks = cells.banks
     semantic = cells.semantic
-    depths_m = depths.heights
+    depths_m = depths.depths_m
     mottle = depths.mottle
     random_bits = depths.random_bits
     is_everywhere = settings.threshold <= -1e9
