@@ -235,7 +235,7 @@ def box_tensors(
         streak_fraction, flake_fraction
                           [B], part of its pixels that shows a streak or a flake; NaN as above
         visibility        [B], part of the box that all of this leaves visible, 0 to 1
-                          (`augment.jobs.files.visibility`)
+                          (`augment.jobs.files.combine_visibility`)
 
     Values are None without the weather that they measure. instance, modal_xyxy, visible_fraction
     and truncated_fraction are None where the output is older than they.
