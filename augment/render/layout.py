@@ -76,11 +76,13 @@ class HeightClip:
     def __post_init__(self) -> None:
         if self.kept_side not in SIGNS or not math.isfinite(self.z_m):
             raise ValueError(
-                f"a clip keeps 'above' or 'below' a finite height; "
+                f"kept_side of a clip must be 'above' or 'below' and z_m finite; "
                 f"got {self.kept_side!r}, z_m = {self.z_m}"
             )
         if not self.max_distance_m >= 0:
-            raise ValueError(f"a clip's reach_m must be >= 0 metres; got {self.max_distance_m}")
+            raise ValueError(
+                f"a clip's max_distance_m must be >= 0 metres; got {self.max_distance_m}"
+            )
 
     @property
     def sign(self) -> float:
