@@ -133,7 +133,7 @@ def measure_ground(
         points: points of the road's surface, [N, 3], scene world.
         positions: the path, float64 [P, 3], scene world.
         source: origin of the points.
-        level_m: height above or below the path from which points are another road's.
+        max_height_m: height above or below the path from which points are another road's.
     """
     stretches = Stretches.along_path(positions)
     points = np.asarray(points[:: 1 + len(points) // _MAX_MEASURED], np.float64)

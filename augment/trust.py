@@ -184,7 +184,7 @@ def source_views(scene: Scene) -> SourceViews:
     For a fitted scene they are those that it was fitted to, as its files say; else all that was
     recorded.
     """
-    return memo_of(scene).get("seen views", lambda: _find_seen_views(scene))
+    return memo_of(scene).get("source views", lambda: _find_seen_views(scene))
 
 
 def unfitted_cameras(scene: Scene) -> tuple[str, ...]:
@@ -865,13 +865,17 @@ def _judge_camera(
     nearest_views = {
         f.index: nearest_view(sources, f.cameras[name].scaled(scale or 1.0)) for f in camera_frames
     }
-    known_views = {index: near for index, near in nearest_views.items() if near is not None}
+    known_views = {
+        index: nearest for index, nearest in nearest_views.items() if nearest is not None
+    }
     farthest_view = (
         max(known_views.values(), key=lambda n: _pose_difference(*n[:2])) if known_views else None
     )
     is_unfitted = name in unfitted_cameras(scene)
     frames_away = tuple(
-        index for index, near in known_views.items() if scene.has_metric_scale and _is_away(near)
+        index
+        for index, nearest in known_views.items()
+        if scene.has_metric_scale and _is_away(nearest)
     )
     drawn_frames = (
         [camera_frames[(2 * k + 1) * len(camera_frames) // (2 * count)] for k in range(count)]

@@ -133,7 +133,7 @@ def write_labels(out: Path | str, options: LabelOptions | None = None) -> Labels
 
     Args:
         out: folder of the output.
-        asked: options; None takes those of the last call, or the recipes' if there was none.
+        options: options; None takes those of the last call, or the recipes' if there was none.
 
     Raises:
         NothingLabelled: no variant has both masks and a recipe that asks for a format.
@@ -466,10 +466,10 @@ def kitti_line(obj: LabelledObject) -> str:
         return _kitti_text(DONT_CARE, -1.0, -1, [-10.0, *sides, *unknown])
     length, width, height = obj.size_m
     x, y, z = obj.centre_m
-    turn = math.atan2(-heading[2], heading[0])
-    alpha = math.remainder(turn - math.atan2(x, z), math.tau)
+    rotation_y = math.atan2(-heading[2], heading[0])
+    alpha = math.remainder(rotation_y - math.atan2(x, z), math.tau)
     truncated = min(max(obj.truncated_fraction, 0.0), 1.0)
-    numbers = [alpha, *sides, height, width, length, x, y + height / 2, z, turn]
+    numbers = [alpha, *sides, height, width, length, x, y + height / 2, z, rotation_y]
     return _kitti_text("_".join(obj.category.split()), truncated, _occluded(obj), numbers)
 
 

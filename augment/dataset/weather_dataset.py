@@ -530,7 +530,7 @@ class WeatherDataset(Dataset):
         load = self.options.load.difference(without)
         camera, world_from_ego = reader.camera(row)
         paths = {kind: row[f"{kind}_path"] for kind in path_kinds()}
-        described = {
+        metadata = {
             "weather": {name: row[name] for name in self.rows.weather},
             "paths": {kind: path and reader.name(path) for kind, path in paths.items()},
         }
@@ -540,7 +540,7 @@ class WeatherDataset(Dataset):
             camera=camera,
             world_from_ego=world_from_ego,
             labels=reader.labels(row, load),
-            metadata=described | {name: row[name] for name in NAMES},
+            metadata=metadata | {name: row[name] for name in NAMES},
         )
 
     def select(self, rows: np.ndarray) -> WeatherDataset:

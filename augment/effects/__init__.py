@@ -30,11 +30,16 @@ EFFECTS: tuple[Effect, ...] = (
 
 
 def precompute_effects(context: JobContext, *, only_files: bool = False) -> None:
-    """Work out what all images of a job share, once: it is then in the scene's memo, whose
-    `shared()` other processes take over. only_files: nothing but what lies in files.
+    """Precompute the data that all images of a job share, once.
+
+    The data are then in the scene's memo. Other processes take over the memo's `shared()`.
+
+    Args:
+        context: the scene, recipes and cameras of the job.
+        only_files: if True, only effects that store their data in files precompute them.
 
     Raises:
-        SceneError, StyleError: an effect cannot be had in this scene.
+        SceneError, StyleError: an effect is not possible in this scene.
     """
     for effect in EFFECTS:
         if effect.precomputes_files or not only_files:
@@ -45,10 +50,10 @@ def precompute_effects(context: JobContext, *, only_files: bool = False) -> None
 
 
 def add_effect(effect: Effect) -> None:
-    """Apply one more effect after those that are there, and let recipes speak of it.
+    """Add an effect, which is applied after all others, and its section of recipes.
 
-    Whoever walks the effects reads `augment.effects.EFFECTS` anew. Worker processes know the effect
-    if a module that they import adds it.
+    Code that walks the effects reads `augment.effects.EFFECTS` each time. Worker processes know the
+    effect if a module that they import adds it.
 
     Raises:
         ValueError: there is an effect of this name already.
@@ -63,6 +68,6 @@ def add_effect(effect: Effect) -> None:
 def remove_effect(name: str) -> None:
     """Undo `add_effect`."""
     global EFFECTS
-    (gone,) = (effect for effect in EFFECTS if effect.name == name)
-    remove_section(gone.section)
-    EFFECTS = tuple(effect for effect in EFFECTS if effect is not gone)
+    (removed_effect,) = (effect for effect in EFFECTS if effect.name == name)
+    remove_section(removed_effect.section)
+    EFFECTS = tuple(effect for effect in EFFECTS if effect is not removed_effect)

@@ -111,7 +111,7 @@ def hold_claim(
 
     Args:
         patience_s: Longest wait, seconds.
-        doing: What the holders do, after "another process".
+        activity: What the holders do, after "another process".
 
     Raises:
         OutputError: Another process holds the claim for longer than that.

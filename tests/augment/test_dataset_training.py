@@ -302,7 +302,7 @@ def test_a_sampler_knows_what_it_gave_out(unchecked) -> None:
         ShardedSampler(10, seed=9).load_state_dict(sampler.state_dict())
     with pytest.raises(ValueError, match="rank must be 0 to 1 of 2; got 2"):
         ShardedSampler(4, rank=2, ranks=2)
-    with pytest.raises(ValueError, match="uneven must be one of exact, pad, drop; got 'cut'"):
+    with pytest.raises(ValueError, match="remainder must be one of exact, pad, drop; got 'cut'"):
         ShardedSampler(4, remainder="cut")
 
 

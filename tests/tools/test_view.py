@@ -173,7 +173,7 @@ def test_ten_fields_come_first_and_tooltips_are_short():
 def test_at_rest_is_said_of_the_whole_picture_of_the_wish_alone():
     wish = Wish(Edits("clear"), 0, "front")
     at_rest = ShownPicture(wish, 320, 180, 0.03, at=1.0, is_rest=True)
-    placing = Activity(PassProgress("placing snow", 12, 21))
+    placing = Activity(PassProgress("finding exposed surfaces", 12, 21))
 
     def said(shown: ShownPicture | None, wish: Wish, activity: Activity | None, **own: Any) -> str:
         return page_status(shown, wish, activity, **{"waited_s": 0.0, "now": 1.1, **own}).text
@@ -182,7 +182,7 @@ def test_at_rest_is_said_of_the_whole_picture_of_the_wish_alone():
     snowy = dataclasses.replace(wish, edits=Edits("fresh-snow"))
     assert said(at_rest, snowy, Activity()) == "Picture not of this recipe yet: drawing"
     assert said(at_rest, snowy, placing, waited_s=4.2) == (
-        "Picture not of this recipe yet: placing snow, step 12 of 21, 4 s"
+        "Picture not of this recipe yet: finding exposed surfaces, step 12 of 21, 4 s"
     )
     assert said(at_rest, snowy, Activity(compiling=1, compiled=3)) == (
         "Picture not of this recipe yet: compiling kernels (only the first time, 3 done)"

@@ -138,7 +138,9 @@ def test_a_new_preset_is_not_at_rest_before_its_own_picture_is_there(browser, tm
         page = opened(browser, url)
         page.get_by_label("preset").first.click()
         page.get_by_role("option", name="fresh-snow", exact=True).click()
-        page.wait_for_function("() => document.body.innerText.includes('placing snow, step')")
+        page.wait_for_function(
+            "() => document.body.innerText.includes('finding exposed surfaces, step')"
+        )
         assert "at rest" not in page.locator("body").inner_text()
         at_rest(page)
         camera = viewer.scene.frames[0].cameras["front"]

@@ -279,7 +279,7 @@ def _run_long_job(images: int, out: Path) -> Mapping[str, float]:
         "plan, s": result.timings["plan"],
         "first image to last, s": result.timings["render_wall"],
         "an image, ms": 1e3 * result.timings["render_wall"] / result.written,
-        "resume when all is done, s": again.timings["plan"] + again.timings["scan"],
+        "resume when all is done, s": again.timings["plan"] + again.timings["find_finished"],
         "--status, s": status_s,
         "resident at the end, MiB": resident,
         "resident at most, MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,

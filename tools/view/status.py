@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 MOVING_S = 0.4  # The time for which the status line speaks of a moving picture, seconds.
 BUSY_S = 0.5  # The shortest wait that gets a bar, seconds.
 # The passes that draw nothing yet: effects find out there what they put into the scene.
-_PREPARATIONS = ("plan", "view plan", "parts", "prune")
+_PREPARATIONS = ("plan", "view plan", "collect parts", "prune")
 
 
 @dataclass(frozen=True)

@@ -124,7 +124,7 @@ def glow_of(scene: Scene) -> Glow:
         slope = 1.5 * (light[:, :, None] * directions[:, None]).mean(0)
         return Glow(light[is_above & (z < _HORIZON_SINE)].mean(0), light.mean(0), slope)
 
-    return memo_of(scene).get(("light of what falls",), compute)
+    return memo_of(scene).get(("light of precipitation",), compute)
 
 
 def _in_fog(glow: Glow, fog: Fog | None, eye_z_m: float, extinction_per_m: float) -> Glow:

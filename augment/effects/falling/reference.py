@@ -126,7 +126,7 @@ def cover_by_numpy(
     """Return the clear share of each pixel, as kernels.cover_pixels does."""
     height, width = depth.shape
     clear = np.ones((height, width))
-    for u0, v0, u1, v1, near, far, inside, outside, share in drops.astype(np.float64):
+    for u0, v0, u1, v1, first_per_z, last_per_z, inside, outside, share in drops.astype(np.float64):
         rows = slice(
             max(0, math.floor(min(v0, v1) - outside)), math.ceil(max(v0, v1) + outside) + 1
         )
@@ -138,10 +138,10 @@ def cover_by_numpy(
         along = along.clip(0, 1)
         distance2 = (x - u0 - along * du) ** 2 + (y - v0 - along * dv) ** 2
         covered = ((outside**2 - distance2) / (outside**2 - inside**2)).clip(0, 1) * share
-        per_z = near + along * (far - near)
+        per_z = first_per_z + along * (last_per_z - first_per_z)
         surface = depth[rows, across]
-        behind = ((1 - surface * per_z) / SOFT).clip(0, 1)
-        hidden_share = np.where(surface > 0, alpha[rows, across] * behind, 0)
+        hidden_weight = ((1 - surface * per_z) / SOFT).clip(0, 1)
+        hidden_share = np.where(surface > 0, alpha[rows, across] * hidden_weight, 0)
         clear[rows, across] *= 1 - covered * (1 - hidden_share)
     return clear
 
@@ -170,21 +170,24 @@ def blend_by_torch(
     slope = climb[0] * u + climb[1] * v + climb[2]
     sky = torch.exp(-(upwards * length / slope.clamp_min(1e-6)).clamp_max(80))
     surface_share = torch.where(depth > 0, alpha, 0)
-    near = torch.exp(-(tau * length).clamp_max(80))
+    surface_transmittance = torch.exp(-(tau * length).clamp_max(80))
     directions = torch.stack([u, v, torch.ones_like(u)], -1) / length[..., None]
     light = directions @ glow[:, :3].T + glow[:, 3]
     squared = rgb.clamp_min(0)
-    mixed = airlight + (sky + surface_share * (near - sky))[..., None] * (squared**2 - airlight)
+    mixed = airlight + (sky + surface_share * (surface_transmittance - sky))[..., None] * (
+        squared**2 - airlight
+    )
     if splats is not None:
         surface_parts = surface_share[..., None]
         sky_share = 1 - surface_share[..., None]
-        behind = torch.minimum((squared - splats).clamp_min(0), sky_share)
-        ahead = ((squared - behind) / surface_parts.clamp_min(EDGE)) ** 2
-        behind = (behind / sky_share.clamp_min(EDGE)) ** 2
-        ahead = airlight + near[..., None] * (ahead - airlight)
-        behind = airlight + sky[..., None] * (behind - airlight)
+        sky_part = torch.minimum((squared - splats).clamp_min(0), sky_share)
+        surface_part = ((squared - sky_part) / surface_parts.clamp_min(EDGE)) ** 2
+        sky_part = (sky_part / sky_share.clamp_min(EDGE)) ** 2
+        surface_part = airlight + surface_transmittance[..., None] * (surface_part - airlight)
+        sky_part = airlight + sky[..., None] * (sky_part - airlight)
         mixed_edge = (
-            surface_parts * ahead.clamp_min(0).sqrt() + sky_share * behind.clamp_min(0).sqrt()
+            surface_parts * surface_part.clamp_min(0).sqrt()
+            + sky_share * sky_part.clamp_min(0).sqrt()
         )
         green = rgb[..., 1:2] - splats[..., 1:2]
         is_mixed = torch.minimum(torch.minimum(surface_parts, sky_share), green) >= EDGE

@@ -163,7 +163,7 @@ def _surface_slope(i, axis, neighbours, size, ground_slope, centers, tops):
     """Return the rise of the surface per metre along x (axis 0) or y (1)."""
     before, run_before = _side_surface(i, 2 * axis, neighbours, size, centers, tops)
     after, run_after = _side_surface(i, 2 * axis + 1, neighbours, size, centers, tops)
-    if run_before < size:  # where the layer ends, the support's height at its edge counts
+    if run_before < size:  # where the layer ends, the bare surface's height counts
         before -= run_before * ground_slope
     if run_after < size:
         after += run_after * ground_slope

@@ -2,8 +2,8 @@
 light.
 
 Input: an `ExposedSurface`, the recipe's snow, its light and a seed. The result depends on nothing
-else. Output: `SnowLayers`. Caller: `effect.snow_layers_of`; `lidar` uses the depths alone. The depth of
-the snow is
+else. Output: `SnowLayers`. Caller: `effect.build_snow_layers`; `lidar` uses the depths alone. The
+depth of the snow is
 
 h = depth * drift(x, y) * shoulder(edge), less in wheel tracks, and 0 between patches and by water.
 
@@ -190,7 +190,7 @@ class DepthSettings(NamedTuple):
     wind_x: float  # direction that the wind blows towards
     wind_y: float
     pressed: float  # share of the depth that wheels take
-    floor_z_m: float  # z of the lowest support with snow
+    floor_z_m: float  # z of the lowest surface with snow
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,7 +359,7 @@ class LayerColors(NamedTuple):
 
 
 def lay_snow(
-    support: ExposedSurface,
+    exposed_surface: ExposedSurface,
     scene: Scene,
     snow: Snow,
     light: SnowIllumination,
@@ -367,13 +367,13 @@ def lay_snow(
     seed: int,
     water_level_z_m: float | None = None,
 ) -> SnowLayers:
-    """Lay the recipe's snow on a support of the scene.
+    """Lay the recipe's snow on the exposed surface of the scene.
 
     No tensor of the scene is written to. `Layer.opacities` is the part's own tensor where nothing
     is buried, and a copy otherwise.
 
     Args:
-        support: cells of the scene.
+        exposed_surface: cells of the scene.
         scene: the scene.
         snow: the recipe's snow.
         light: light on the snow.
@@ -390,9 +390,9 @@ def lay_snow(
         )
 
     actors = {actor.track_id: actor.gaussians for actor in scene.actors}
-    ground = layer_of(support.ground, scene.background, None)
+    ground = layer_of(exposed_surface.ground, scene.background, None)
     actor_layers = {
-        name: layer_of(cells, actors[name], name) for name, cells in support.actors.items()
+        name: layer_of(cells, actors[name], name) for name, cells in exposed_surface.actors.items()
     }
     grain = _grain_of_snow(snow, scene, light, seed)
     return SnowLayers(

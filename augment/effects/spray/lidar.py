@@ -47,7 +47,7 @@ def spray_echoes(echoes: Echoes, puffs: Puffs, rng: np.random.Generator) -> None
 
 def beams_near(echoes: Echoes, puffs: Puffs) -> np.ndarray:
     """Return the mask [N] of the beams that pass near a puff."""
-    near = np.zeros(len(echoes.ranges_m), bool)
+    is_near = np.zeros(len(echoes.ranges_m), bool)
     radii_m = np.sqrt(CUT) * puffs.scales_m.max(1, initial=0)
     for first in range(0, len(radii_m), _GROUP_SIZE):
         group = slice(first, first + _GROUP_SIZE)
@@ -57,8 +57,8 @@ def beams_near(echoes: Echoes, puffs: Puffs) -> np.ndarray:
         offsets = middle - echoes.origins
         along = (offsets * echoes.directions).sum(1)
         distance2 = (offsets * offsets).sum(1) - along * along
-        near |= (distance2 < reach**2) & (along > -reach) & (along < echoes.air_path_m + reach)
-    return near & (echoes.ranges_m > 0)
+        is_near |= (distance2 < reach**2) & (along > -reach) & (along < echoes.air_path_m + reach)
+    return is_near & (echoes.ranges_m > 0)
 
 
 def look_through(

@@ -195,6 +195,10 @@ def _blend_by_torch(
     whitened = share * torch.from_numpy(light).to(tau) + (1 - share) * torch.from_numpy(
         fog_light
     ).to(tau)
-    left = torch.exp(-tau)[..., None]
-    blended = (left * rgb.clamp_min(0).square() + (1 - left) * whitened).sqrt().to(rgb.dtype)
+    transmittance = torch.exp(-tau)[..., None]
+    blended = (
+        (transmittance * rgb.clamp_min(0).square() + (1 - transmittance) * whitened)
+        .sqrt()
+        .to(rgb.dtype)
+    )
     return torch.where((tau > 0)[..., None], blended, rgb)
