@@ -50,9 +50,9 @@ class ShardedSampler(Sampler[int]):
             have as many (collective operations wait for each other). `drop`: the last places are
             left out this epoch.
 
-    To go on after an interruption, keep `state_dict(given)` and load it into a sampler of the same
-    samples and seed; the number of ranks may then be another. A DataLoader asks its sampler ahead
-    of what it yields, so say how many samples of this rank were trained on.
+    To go on after an interruption, keep `state_dict(num_trained)` and load it into a sampler of the
+    same samples and seed; the number of ranks may then be another. A DataLoader asks its sampler
+    ahead of what it yields, so say how many samples of this rank were trained on.
 
     Raises:
         ValueError: arguments that do not fit each other.

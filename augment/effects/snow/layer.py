@@ -512,7 +512,7 @@ def _make_splats(
 ) -> tuple[Gaussians, Tensor | None, Tensor | None]:
     """Make the Gaussians of the snow, with their normals and slopes if asked for."""
     depths_m = depths.depths_m
-    arrays = cell_arrays(cells)._replace(relative_light=_soften_light(cells, depths_m, depth_m))
+    arrays = cell_arrays(cells)._replace(light=_soften_light(cells, depths_m, depth_m))
     tops = find_snow_tops(cells, depths_m)
     counts = np.empty(len(cells), np.int64)
     with kernel_threads(CELLS_PER_TASK):
