@@ -29,7 +29,7 @@ from augment.jobs.manifest import effect_masks
 
 # ---- Samples dealt to all processes, the same again after an interruption ------------------------
 
-Uneven = Literal["exact", "pad", "drop"]
+Remainder = Literal["exact", "pad", "drop"]
 
 
 class ShardedSampler(Sampler[int]):
@@ -66,7 +66,7 @@ class ShardedSampler(Sampler[int]):
         ranks: int | None = None,
         shuffle: bool = True,
         seed: int = 0,
-        remainder: Uneven = "exact",
+        remainder: Remainder = "exact",
     ) -> None:
         process_rank, num_processes = _process_rank()
         self.rank = process_rank if rank is None else rank
@@ -74,10 +74,10 @@ class ShardedSampler(Sampler[int]):
         self.count = samples if isinstance(samples, int) else len(samples)
         self.shuffle = shuffle
         self.seed = seed
-        self.uneven = remainder
+        self.remainder = remainder
         if not 0 <= self.rank < self.ranks:
             raise ValueError(f"rank must be 0 to {self.ranks - 1} of {self.ranks}; got {self.rank}")
-        check_choice("uneven", remainder, Uneven)
+        check_choice("remainder", remainder, Remainder)
         self.epoch = 0
         self._num_done = 0  # samples of all ranks before the place where the epoch goes on
         self._num_yielded = 0
@@ -97,10 +97,12 @@ class ShardedSampler(Sampler[int]):
     def __len__(self) -> int:
         """Return the number of samples of this rank that the epoch still has."""
         num_remaining = max(self.count - self._num_done, 0)
-        if self.uneven == "exact":
+        if self.remainder == "exact":
             return len(range(self.rank, num_remaining, self.ranks))
         return (
-            -(-num_remaining // self.ranks) if self.uneven == "pad" else num_remaining // self.ranks
+            -(-num_remaining // self.ranks)
+            if self.remainder == "pad"
+            else num_remaining // self.ranks
         )
 
     def state_dict(self, num_trained: int | None = None) -> dict[str, Any]:
@@ -146,7 +148,7 @@ class ShardedSampler(Sampler[int]):
         if self.shuffle:
             np.random.default_rng([self.seed, self.epoch]).shuffle(order)
         remaining_samples = order[self._num_done :]
-        if self.uneven == "pad" and len(remaining_samples):
+        if self.remainder == "pad" and len(remaining_samples):
             num_missing = -len(remaining_samples) % self.ranks
             remaining_samples = np.concatenate([remaining_samples, np.resize(order, num_missing)])
         return remaining_samples[self.rank :: self.ranks][: len(self)].tolist()
@@ -355,7 +357,7 @@ class MixedDataset(Dataset):
 def _check_alike(**sides: WeatherDataset) -> None:
     """Raise ValueError where the first dataset lacks what the second one's samples have."""
     (name, first), (other, second) = sides.items()
-    if names := sorted(second.given() - first.given()):
+    if names := sorted(second.available_kinds() - first.available_kinds()):
         raise ValueError(
             f"samples of `{name}` ({', '.join(first.uris)}) have no {', '.join(names)}, those of "
             f"`{other}` ({', '.join(second.uris)}) have: batches would not stack. Open both with a "

@@ -571,7 +571,8 @@ class GenerateResult:
     """Wall-clock time of the call, seconds."""
     timings: dict[str, float] = field(default_factory=dict)
     """Seconds by kind of work, summed over threads and workers (see `worker.compute_time_shares`).
-    Measured by the clock: `plan`, `scan` of what is finished, and `render_wall`, everything else.
+    Measured by the clock: `plan`, `find_finished` for what is done, and `render_wall`, everything
+    else.
     """
 
 
