@@ -554,7 +554,7 @@ class FadedShadows:
             The share of the sun that each point sees (the mean for points that are no ground, which
             changes nothing), and factors of encoded colours by steps of that share.
         """
-        sun_share = _lit_near(self.shadows, *np.moveaxis(points_m, -1, 0))
+        sun_share = _find_sun_share(self.shadows, *np.moveaxis(points_m, -1, 0))
         factors = _fade_factors(self.shadows, self.transmittance, np.linspace(0, 1, 256))
         factors[round(255 * self.shadows.lit_share)] = 1
         return sun_share.astype(np.float32), factors
@@ -573,7 +573,7 @@ def faded_shadows(scene: Scene, transmittance: float) -> FadedShadows | None:
 
     def place() -> Tensor:
         g = scene.background
-        sun_share = _lit_near(shadows, *g.means.double().numpy().T)
+        sun_share = _find_sun_share(shadows, *g.means.double().numpy().T)
         rows = 1 + np.rint(sun_share * (NUM_FADES - 1))
         is_unchanged = np.abs(sun_share - shadows.lit_share) < 1e-6
         if g.semantic is not None:
@@ -603,7 +603,7 @@ def sun_transmittance(fog: Fog, shadows: CastShadows, ground_z_m: float) -> floa
     return math.exp(-vertical_optical_depth(fog, ground_z_m) / sun_sine)
 
 
-def _lit_near(
+def _find_sun_share(
     shadows: CastShadows, x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray
 ) -> np.ndarray:
     """Return the share of the sun that places see, blended to the mean off the ground."""

@@ -196,7 +196,7 @@ class Level:
     """Name of the file that the splats come from, whose numbers are checked when they are taken;
     None where they need no check."""
     num_part_splats: int = 0
-    """Number of the part's splats, where `unchecked` is set."""
+    """Number of the part's splats, where `unchecked_file` is set."""
     _checked: Bool[np.ndarray, "C"] = field(init=False)
     """Mask of the boxes whose splats have been checked."""
 
@@ -387,7 +387,7 @@ def update_levels(levels: Levels, g: Gaussians) -> Levels:
         SceneError: the levels' file is damaged.
     """
     new_levels = [
-        replace(levels.levels[0], gaussians=slice_gaussians(g, slice(None)), unchecked=None)
+        replace(levels.levels[0], gaussians=slice_gaussians(g, slice(None)), unchecked_file=None)
     ]
     for finer, level in itertools.pairwise(levels.levels):
         if len(finer.parents) and not -1 <= finer.parents.min() <= finer.parents.max() < len(

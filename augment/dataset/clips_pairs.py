@@ -29,7 +29,7 @@ from augment.jobs.manifest import effect_masks
 
 # ---- Samples dealt to all processes, the same again after an interruption ------------------------
 
-Uneven = Literal["exact", "pad", "drop"]
+Remainder = Literal["exact", "pad", "drop"]
 
 
 class ShardedSampler(Sampler[int]):
@@ -50,9 +50,9 @@ class ShardedSampler(Sampler[int]):
             have as many (collective operations wait for each other). `drop`: the last places are
             left out this epoch.
 
-    To go on after an interruption, keep `state_dict(given)` and load it into a sampler of the same
-    samples and seed; the number of ranks may then be another. A DataLoader asks its sampler ahead
-    of what it yields, so say how many samples of this rank were trained on.
+    To go on after an interruption, keep `state_dict(num_trained)` and load it into a sampler of the
+    same samples and seed; the number of ranks may then be another. A DataLoader asks its sampler
+    ahead of what it yields, so say how many samples of this rank were trained on.
 
     Raises:
         ValueError: arguments that do not fit each other.
@@ -66,7 +66,7 @@ class ShardedSampler(Sampler[int]):
         ranks: int | None = None,
         shuffle: bool = True,
         seed: int = 0,
-        remainder: Uneven = "exact",
+        remainder: Remainder = "exact",
     ) -> None:
         process_rank, num_processes = _process_rank()
         self.rank = process_rank if rank is None else rank
@@ -77,7 +77,7 @@ class ShardedSampler(Sampler[int]):
         self.remainder = remainder
         if not 0 <= self.rank < self.ranks:
             raise ValueError(f"rank must be 0 to {self.ranks - 1} of {self.ranks}; got {self.rank}")
-        check_choice("remainder", remainder, Uneven)
+        check_choice("remainder", remainder, Remainder)
         self.epoch = 0
         self._num_done = 0  # samples of all ranks before the place where the epoch goes on
         self._num_yielded = 0
@@ -357,7 +357,7 @@ class MixedDataset(Dataset):
 def _check_alike(**sides: WeatherDataset) -> None:
     """Raise ValueError where the first dataset lacks what the second one's samples have."""
     (name, first), (other, second) = sides.items()
-    if names := sorted(second.given() - first.given()):
+    if names := sorted(second.available_kinds() - first.available_kinds()):
         raise ValueError(
             f"samples of `{name}` ({', '.join(first.uris)}) have no {', '.join(names)}, those of "
             f"`{other}` ({', '.join(second.uris)}) have: batches would not stack. Open both with a "

@@ -58,7 +58,7 @@ NAMES = ("scene", "variant", "frame", "recipe_hash", "surface")  # as in the man
 class Buffer(NamedTuple):
     """Form of an image beside the picture."""
 
-    stored: type
+    pixel_type: type
     """Type of the file's pixels."""
     tensor: Callable[[np.ndarray], torch.Tensor]
     """Function that makes the sample's tensor of the file's pixels."""

@@ -158,13 +158,14 @@ class SmogEffect(Effect):
     def edit_scene(
         self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
-        faded = effect.prepared_data if effect.settings.sun < 1 else None
-        if faded is not None:
+        shadows = effect.prepared_data if effect.settings.sun < 1 else None
+        if shadows is not None:
             with timed(SHADOWS):
                 parts = [
-                    p if p.instance_id or p.is_overlay else faded.apply_to(p) for p in layers.parts
+                    p if p.instance_id or p.is_overlay else shadows.apply_to(p)
+                    for p in layers.parts
                 ]
-                photo = layers.photo and replace(layers.photo, faded_shadows=faded)
+                photo = layers.photo and replace(layers.photo, faded_shadows=shadows)
                 layers = replace(layers, parts=tuple(parts), photo=photo)
         fog = effect.settings.fog
         common = effect.scene.common_color_map

@@ -162,13 +162,13 @@ class Tally:
     seconds: Counter[str] = field(default_factory=Counter)
     """Seconds by kind of work."""
 
-    def add(self, done: BlockResult) -> None:
+    def add(self, result: BlockResult) -> None:
         """Add the counts of a finished block."""
-        self.written += done.written
-        self.skipped += done.skipped
-        self.failed += done.failed
-        self.failures += done.failures
-        self.seconds.update(done.seconds or {})
+        self.written += result.written
+        self.skipped += result.skipped
+        self.failed += result.failed
+        self.failures += result.failures
+        self.seconds.update(result.seconds or {})
 
 
 class SceneWork(Work):
@@ -571,7 +571,8 @@ class GenerateResult:
     """Wall-clock time of the call, seconds."""
     timings: dict[str, float] = field(default_factory=dict)
     """Seconds by kind of work, summed over threads and workers (see `worker.compute_time_shares`).
-    Measured by the clock: `plan`, `scan` of what is finished, and `render_wall`, everything else.
+    Measured by the clock: `plan`, `find_finished` for what is done, and `render_wall`, everything
+    else.
     """
 
 

@@ -609,7 +609,7 @@ class MirrorResult:
     """
     missing: list[str] = field(default_factory=list)
     """Recorded images that the source no longer has."""
-    others: list[str] = field(default_factory=list)
+    extra_files: list[str] = field(default_factory=list)
     """Files of the copy that the source does not have."""
 
 
@@ -793,7 +793,9 @@ class _Mirroring:
             foreign_names = [
                 name for name in foreign_names if not os.path.lexists(self.tree.root / name)
             ]
-        self.result.others += [f"{folder.relative}/{name}".lstrip("/") for name in foreign_names]
+        self.result.extra_files += [
+            f"{folder.relative}/{name}".lstrip("/") for name in foreign_names
+        ]
         for inner_place, _ in folder.folders:
             self._make_folder(self._target(inner_place))
         for file in folder.files:

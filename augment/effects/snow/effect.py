@@ -35,7 +35,7 @@ from augment.effects.snow.kernels import MAX_GRAIN_DISTANCE_M
 from augment.effects.snow.layer import lay_snow
 from augment.effects.snow.lidar import intersect_snow
 from augment.effects.snow.light import describe_light, find_snow_light
-from augment.effects.snow.near_camera import GLINT_SIZE_M, Layer, SnowLayers
+from augment.effects.snow.near_camera import GLINT_SIZE_M, PartSnow, SnowLayers
 from augment.effects.snow.relief import Carrier, add_grain
 from augment.effects.snow.snow import (
     SnowPlan,
@@ -287,7 +287,7 @@ def _bound_layers(scene: Scene, layers: SnowLayers) -> Bounds:
     return Bounds.join(_bound_layer(layer, gaussians, n) for n, layer, gaussians in parts if layer)
 
 
-def _bound_layer(layer: Layer, gaussians: Gaussians, owner: int) -> Bounds:
+def _bound_layer(layer: PartSnow, gaussians: Gaussians, owner: int) -> Bounds:
     """Return the bounds of a part's snow, its glints, and the splats that it buries.
 
     Where none of these is in view, the part looks as it does without snow.
@@ -302,6 +302,6 @@ def _bound_layer(layer: Layer, gaussians: Gaussians, owner: int) -> Bounds:
     return Bounds.join(bounds)
 
 
-def _is_lit_per_pixel(layer: Layer | None) -> bool:
+def _is_lit_per_pixel(layer: PartSnow | None) -> bool:
     """Tell if a layer is lit pixel by pixel."""
     return layer is not None and layer.sunlight_rgb is not None and layer.normals is None

@@ -402,15 +402,15 @@ def _fill_cell(i, cells, depths, tops, firsts, lights, colors, splats):
 
 
 @kernel
-def hide_buried(buried, buried_by, depths_m, opacities):
-    """Set opacity 0 for every Gaussian buried[b] whose cells buried_by[b] all carry snow."""
-    for b in prange(len(buried)):
+def hide_buried(hideable_ids, covering_cells, depths_m, opacities):
+    """Set opacity 0 for every Gaussian hideable_ids[b] whose covering_cells[b] all carry snow."""
+    for b in prange(len(hideable_ids)):
         is_hidden = True
-        for k in range(buried_by.shape[1]):
-            cell_id = buried_by[b, k]
+        for k in range(covering_cells.shape[1]):
+            cell_id = covering_cells[b, k]
             is_hidden &= cell_id >= 0 and depths_m[cell_id] > 0
         if is_hidden:
-            opacities[buried[b]] = 0
+            opacities[hideable_ids[b]] = 0
 
 
 # ---- Grain of near snow, as `relief.add_grain` defines it ----------------------------------------

@@ -31,7 +31,7 @@ from augment.effects.snow import kernels
 from augment.effects.snow.cells import MAX_EDGE_DISTANCE_M, ExposedCells, ExposedSurface
 from augment.effects.snow.kernels import CellArrays, CellDepths, SplatArrays
 from augment.effects.snow.light import SnowIllumination
-from augment.effects.snow.near_camera import Layer, SnowLayers, draw_crystals
+from augment.effects.snow.near_camera import PartSnow, SnowLayers, draw_crystals
 from augment.effects.snow.relief import Grain
 from augment.render.threads import kernel_threads
 from augment.rng import STEP_X, STEP_Y, mix, rng_for
@@ -369,8 +369,8 @@ def lay_snow(
 ) -> SnowLayers:
     """Lay the recipe's snow on the exposed surface of the scene.
 
-    No tensor of the scene is written to. `Layer.opacities` is the part's own tensor where nothing
-    is buried, and a copy otherwise.
+    No tensor of the scene is written to. `PartSnow.visible_opacities` is the part's own tensor
+    where nothing is buried, and a copy otherwise.
 
     Args:
         exposed_surface: cells of the scene.
@@ -382,7 +382,7 @@ def lay_snow(
             on actors stays. None without water.
     """
 
-    def layer_of(cells: ExposedCells, gaussians: Gaussians, track_id: str | None) -> Layer:
+    def layer_of(cells: ExposedCells, gaussians: Gaussians, track_id: str | None) -> PartSnow:
         """Return the layer on one part; track_id: None for the background."""
         profile, rng = profile_on_part(track_id, scene, snow, seed, water_level_z_m)
         return _build_part_layer(
@@ -429,7 +429,7 @@ def _build_part_layer(
     rng: np.random.Generator,
     *,
     moves: bool,
-) -> Layer:
+) -> PartSnow:
     """Lay snow on one part of the scene."""
     per_pixel = snow.shading == "per_pixel"
     colors = LayerColors(
@@ -455,7 +455,7 @@ def _build_part_layer(
         assert normals is not None
         sun_contrast = float(lights[1].mean() - lights[2].mean())
         crystals = draw_crystals(snow_gaussians, normals, sun_contrast, snow.sparkle, rng)
-    return Layer(
+    return PartSnow(
         gaussians=snow_gaussians,
         visible_opacities=_hide_buried(cells, gaussians, depths.depths_m),
         sunlight_rgb=slopes,

@@ -8,7 +8,7 @@ Input: a `Scene`, the cameras that must see the surfaces, `ExposureSettings`. Ou
 2. `draw_views` renders the depth that some cameras along the drive see.
 3. `_GroundSearch.find` works on one square of tiles at a time, each with a margin: it renders the
    square from above, closes holes, separates the surfaces, keeps the cells that a camera sees, and
-   finds their light, wheel tracks and banks.
+   finds their light, wheel tracks and obstacles.
 4. `find_actor_cells` does the same for each vehicle, in the vehicle's own frame.
 5. `_GroundSearch.join` links neighbouring cells across squares and finds the Gaussians that the
    cells bury.
