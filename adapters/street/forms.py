@@ -86,20 +86,20 @@ def fractal_noise(points: np.ndarray, octaves: int, seed: int = 0) -> np.ndarray
 class Material(IntEnum):
     """Rule by which a surface's albedo varies with the place."""
 
-    PLAIN = 0
-    ASPHALT = 1
-    MARKING = 2
-    PAVING = 3
-    PLASTER = 4
-    BRICK = 5
-    STONE = 6
-    TILES = 7
-    GRASS = 8
-    LEAVES = 9
-    BARK = 10
+    PLAIN = 0  # the albedo of the shape, everywhere
+    ASPHALT = 1  # carriageways and flat roofs
+    MARKING = 2  # paint on the road
+    PAVING = 3  # slabs of pavements
+    PLASTER = 4  # plastered walls
+    BRICK = 5  # courses of bricks
+    STONE = 6  # courses of stones
+    TILES = 7  # courses of roof tiles
+    GRASS = 8  # grass of the land
+    LEAVES = 9  # masses of leaves, as in a crown's core
+    BARK = 10  # trunks and boughs
     GLASS = 11  # window pane: shading adds what it mirrors
     PAINT = 12  # car paint: shading adds a clear coat
-    RIM = 13
+    RIM = 13  # spokes and hub of a wheel
     LEAF = 14  # one tuft of leaves: a single splat, one light
     SHOP = 15  # a shop's pane: as GLASS, with goods behind it
 
@@ -309,10 +309,15 @@ class Look(NamedTuple):
 class Shapes(np.recarray):
     """P shapes: an array of records, each field an attribute.
 
-    origin: float [P, 3], metres. axes: float [P, 3, 3], rows u, v, w, metres. shading: float [P, 3,
-    3]; the light's normal of flat kinds and leaves is shading[0] + u shading[1] + v shading[2].
-    variation: float [P], in [0, 1), differs between equal shapes. The other fields are those of
-    Look.
+    Attributes:
+        origin: float [P, 3], origin of the local frame, metres.
+        axes: float [P, 3, 3], axes u, v, w of the local frame as rows, metres.
+        shading: float [P, 3, 3]. The normal that lights flat kinds and leaves is
+            shading[0] + u shading[1] + v shading[2].
+        variation: float [P], in [0, 1), differs between equal shapes.
+        kind: int [P], form of the shape, a Kind.
+        edges: uint [P], sides where the splats end crisply, bits such as U0.
+        rgb, ambient, spacing, material, semantic, backed: the fields of Look.
     """
 
     FIELDS = np.dtype([
@@ -601,9 +606,13 @@ def quads(corners: np.ndarray, look: Look, *, normals: np.ndarray | None = None)
 
 
 def triangles(
-    a: Vectors, b: Vectors, c: Vectors, look: Look, edges: int = 0,
+    a: Vectors,
+    b: Vectors,
+    c: Vectors,
+    look: Look,
+    edges: int = 0,
     shading: Sequence[np.ndarray] | None = None,
-) -> Shapes:  # fmt: skip
+) -> Shapes:
     """Return triangles that face (b - a) x (c - a)."""
     a = _as_vectors(a)
     u = b - a

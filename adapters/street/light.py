@@ -205,9 +205,13 @@ def _sky_beside_cars(points: np.ndarray, footprints: np.ndarray) -> np.ndarray:
 
 
 def _reflected_radiance(
-    lighting: Lighting, points: np.ndarray, normals: np.ndarray, material: np.ndarray,
-    sun: np.ndarray, sky: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+    lighting: Lighting,
+    points: np.ndarray,
+    normals: np.ndarray,
+    material: np.ndarray,
+    sun: np.ndarray,
+    sky: np.ndarray,
+) -> np.ndarray:
     """Return the reflected radiance [N, 3]: sky above the roofs, the street below, a glint of
     the sun.
     """

@@ -21,9 +21,9 @@ from augment.render.cpu.jit import kernel_function, serial_kernel
 # second child (the first child follows it); count [M] int64: shapes in a leaf, 0 for an inner node;
 # order [P] int64: shapes as the leaves list them.
 
-# Entries of the traversal's stack: far more than the depth of any street's tree.
+# Number of entries of the traversal's stack, far more than the depth of any street's tree.
 STACK_SIZE = 512
-# Bins of the surface-area heuristic along an axis.
+# Number of bins of the surface-area heuristic along an axis.
 NUM_BINS = 16
 # Largest number of shapes in a leaf.
 MAX_LEAF_SHAPES = 4
@@ -179,9 +179,8 @@ def build(
     order,  # in: any order of the shapes; out: as the leaves list them
 ):
     """Fill a tree, depth first, and return its number of nodes."""
-    ranges = np.empty(
-        (STACK_SIZE, 3), np.int64
-    )  # range of order, and the parent whose second child it is
+    # Begin and end of a range of `order`, and the parent whose second child it is, or -1.
+    ranges = np.empty((STACK_SIZE, 3), np.int64)
     ranges[0, 0] = 0
     ranges[0, 1] = len(order)
     ranges[0, 2] = -1

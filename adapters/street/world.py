@@ -146,9 +146,14 @@ def reveals(opening: Rectangle, depth_m: float, look: Look) -> Shapes:
 
 @joined
 def glazing(
-    opening: Rectangle, columns: int, rows: int, depth_m: float, frame: Look,
-    bar_m: float = 0.07, pane: Look = GLASS,
-) -> Iterator[Shapes]:  # fmt: skip
+    opening: Rectangle,
+    columns: int,
+    rows: int,
+    depth_m: float,
+    frame: Look,
+    bar_m: float = 0.07,
+    pane: Look = GLASS,
+) -> Iterator[Shapes]:
     """Build panes with a frame and bars that fill an opening."""
     x0, z0, x1, z1 = opening
     half_bar_m = bar_m / 2
@@ -373,9 +378,13 @@ def _house(seed: int, width: float, is_fine: bool) -> Iterator[Shapes]:
 
 
 def _ground_floor(
-    rng: np.random.Generator, facade: Facade, width: float, window_centers: list[float],
-    holes: list[Rectangle], is_fine: bool,
-) -> Iterator[Shapes]:  # fmt: skip
+    rng: np.random.Generator,
+    facade: Facade,
+    width: float,
+    window_centers: list[float],
+    holes: list[Rectangle],
+    is_fine: bool,
+) -> Iterator[Shapes]:
     """Build a shop, or a door between windows."""
     floor = float(pavement_z(FACADE_M)) + 0.02
     if facade.has_shop:
@@ -400,9 +409,7 @@ def _back(facade: Facade, width: float, eaves: float) -> Shapes:
 
 
 @joined
-def _roof(
-    rng: np.random.Generator, facade: Facade, width: float, eaves: float
-) -> Iterator[Shapes]:  # fmt: skip
+def _roof(rng: np.random.Generator, facade: Facade, width: float, eaves: float) -> Iterator[Shapes]:
     """Build a ridged roof along the street, or a flat roof behind a parapet."""
     wall = facade.wall._replace(backed=False)
     trim = facade.trim
@@ -531,7 +538,7 @@ def build_ground(layout: Layout) -> Iterator[Shapes]:
 
 def _sloped_panels(
     rectangles, slope: float, z0: float, look: Look, edges: np.ndarray | int = ALL_EDGES
-) -> Shapes:  # fmt: skip
+) -> Shapes:
     """Return panels over rectangles [R, 4] on the plane z = z0 + slope y, facing up."""
     x0, y0, x1, y1 = np.reshape(rectangles, (-1, 4)).T
     u = xyz(x1 - x0, 0, 0)
