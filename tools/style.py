@@ -22,13 +22,13 @@ from pydantic import ValidationError
 from adapters.base import open_scene
 from adapters.scene_folder import prepare_for_storage
 from augment.cameras import Camera
-from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, styled_scene
+from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, style_scene
 from augment.effects.style.content import content_pictures, content_statistics, select_views
 from augment.effects.style.losses import FeatureExtractor, open_features
 from augment.effects.style.network import B0Encoder, load_imagenet_weights, save_network
 from augment.effects.style.style import SceneStyle, style_maps
 from augment.effects.style.train import (
-    DEFINITIONS,
+    SCORE_DEFINITIONS,
     Content,
     Draw,
     StepRecord,
@@ -299,7 +299,7 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
         "seconds": training.seconds(),
         "scenes": [uri_text(uri) for uri in options.scenes],
         "problems": list(run.data.problems),
-        "definitions": DEFINITIONS,
+        "definitions": SCORE_DEFINITIONS,
         "scores": _scores(run) | score_photos(net, run.data.held_out),
         "history": training.rows,
     }
@@ -351,7 +351,7 @@ def apply_style(options: ApplyOptions) -> dict[str, Any]:
     maps = style_maps(scene, requested)
     map_s = time.perf_counter()
 
-    styled = styled_scene(scene, maps)
+    styled = style_scene(scene, maps)
     facts: dict[str, Any] = {
         "scene": scene.source,
         "out": str(out),
@@ -485,7 +485,7 @@ def _render(scene: Scene, camera: Camera, style_parts: SceneStyle | None = None)
     parts = scene.parts_for(camera)
     sky = scene.sky
     if style_parts is not None:
-        parts = style_parts.on(parts)
+        parts = style_parts.map_parts(parts)
         sky = style_parts.sky
     raster = rasterize(parts, camera)
     assert raster.rgb is not None and raster.alpha is not None

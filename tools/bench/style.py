@@ -15,13 +15,13 @@ import numpy as np
 import torch
 
 from adapters.base import open_scene
-from augment.effects.style.color_maps import CLASSES, StyleMaps, style_gaussians
+from augment.effects.style.color_maps import NUM_CLASSES, StyleMaps, style_gaussians
 from augment.effects.style.content import content_pictures, content_statistics
 from augment.effects.style.images import image_statistics, read_style_image
 from augment.effects.style.network import gscm_map, load_network, network_facts
 from augment.effects.style.pairs import (
     Method,
-    closed_method,
+    closed_form_method,
     mapped_picture,
     network_method,
     score_pairs,
@@ -90,7 +90,7 @@ def _fold_table(case: RasterCase, repeats: int) -> Table:
     moved = 2 * gaussians.sh.nbytes
     actions = {
         f"{name}, {where}": fold(gaussians, count, out)
-        for name, count in (("one map", 1), ("a map a class", CLASSES))
+        for name, count in (("one map", 1), ("a map a class", NUM_CLASSES))
         for where, out in (("in place", gaussians.sh), ("new memory", None))
     }
     rows = [
@@ -165,10 +165,10 @@ def _score_table(photos: Path) -> Table:
     )
     pictures = squares.float() / 255
     methods = {
-        "none": closed_method(strength=0.0),
-        "reinhard": closed_method(reinhard_map),
-        "mkl": closed_method(),
-        "mkl, half": closed_method(strength=0.5),
+        "none": closed_form_method(strength=0.0),
+        "reinhard": closed_form_method(reinhard_map),
+        "mkl": closed_form_method(),
+        "mkl, half": closed_form_method(strength=0.5),
         "gscm": network_method(load_network(None)),
     }
     rows = []
