@@ -243,7 +243,7 @@ def test_without_a_gpu_the_commands_say_so(capsys):
 @pytest.mark.gpu
 def test_a_small_run_on_a_gpu(tmp_path):
     case = dataclasses.replace(
-        gpu.QUICK, load={"copy_bytes": 1 << 24, "programs": 264, "steps": 256}
+        gpu.QUICK_CASE, load={"copy_bytes": 1 << 24, "programs": 264, "steps": 256}
     )
     result = measure(case, timing=Timing(3, 1), json_file=tmp_path / "gpu.json")
     sections = result["facts"]["sections"]

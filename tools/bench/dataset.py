@@ -71,8 +71,8 @@ class DatasetCase:
     memory: bool = True
 
 
-WHOLE = DatasetCase()
-QUICK = DatasetCase(images=32, rows=20_000, live=4)
+FULL_CASE = DatasetCase()
+QUICK_CASE = DatasetCase(images=32, rows=20_000, live=4)
 
 
 def measure(
@@ -83,7 +83,7 @@ def measure(
 ) -> Figures:
     """folder: an output folder with JPEG images to read; None makes one."""
     machine = machine_facts()
-    case = case or (QUICK if quick else WHOLE)
+    case = case or (QUICK_CASE if quick else FULL_CASE)
     with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
         scratch = Path(name)
         if folder is None:

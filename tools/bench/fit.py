@@ -59,8 +59,8 @@ class FitCase:
     street_scale: float = 0.5
 
 
-WHOLE = FitCase()
-QUICK = FitCase(steps=20, frames=4, cameras=("front", "left", "back"), fit_steps=0)
+FULL_CASE = FitCase()
+QUICK_CASE = FitCase(steps=20, frames=4, cameras=("front", "left", "back"), fit_steps=0)
 
 
 def measure(quick: bool = False, scene: str | None = None, case: FitCase | None = None) -> Figures:
@@ -71,7 +71,7 @@ def measure(quick: bool = False, scene: str | None = None, case: FitCase | None 
         ClimateGSError: the scene cannot be opened or has no recorded images.
     """
     machine = machine_facts()
-    case = case or (QUICK if quick else WHOLE)
+    case = case or (QUICK_CASE if quick else FULL_CASE)
     if scene is not None:
         steps, facts = time_steps(scene, case.scale, case)
         return figures("fit", [steps], machine=machine, scene=scene, **facts)

@@ -63,14 +63,14 @@ class RasterCases:
     memory: bool = True
 
 
-WHOLE = RasterCases()
-QUICK = RasterCases((SMALL_CASE,))
+FULL_CASE = RasterCases()
+QUICK_CASE = RasterCases((SMALL_CASE,))
 
 
 def measure(quick: bool = False, repeats: int = 7, cases: RasterCases | None = None) -> Figures:
     """repeats: timed rounds of a clear and a smoggy frame a scene."""
     machine = machine_facts()
-    cases = cases or (QUICK if quick else WHOLE)
+    cases = cases or (QUICK_CASE if quick else FULL_CASE)
     warm_up_s = warm_up()
     stages = []
     work = []

@@ -208,8 +208,8 @@ class EffectCase:
         ]
 
 
-WHOLE = EffectCase()
-QUICK = EffectCase(
+FULL_CASE = EffectCase()
+QUICK_CASE = EffectCase(
     (street_uri(),), 800, 533, street_uri(2, 120_000), (0,), ("front",), scale=0.5, cell_m=0.1,
     splats=200_000, presets=("overcast", "golden-hour"),
 )  # fmt: skip

@@ -111,8 +111,9 @@ COLUMNS = {
     "worst": "worst_flip", "PSNR": "psnr", "SSIM": "ssim", "depth off, %": "off_5cm",
     "abs-rel, %": "abs_rel", "flicker": "flicker", "MiB": "mib",
 }  # fmt: skip
-# {knob, value, ms, flip, ...}: a knob's path and value, all others at reference; or WHOLE, a name
-# and, under `settings`, what is set. In tables of several scenes and recipes also these two.
+# The figures of one setting: {knob, value, ms, flip, ...}. Either knob is a path and value its value,
+# and all other knobs are at reference; or knob is ALL_KNOBS, value is a name, and `settings` has the
+# value of every knob. Rows of several scenes and recipes also have `scene` and `recipe`.
 Row = dict[str, Any]
 Tables = Sequence[Mapping[str, Any]]
 Wholes = Mapping[str, Mapping[str, Value]]
@@ -132,8 +133,8 @@ class TradeCase:
     memory: bool = True
 
 
-WHOLE_CASE = TradeCase()
-QUICK = TradeCase(width=240, repeats=1, memory=False)
+FULL_CASE = TradeCase()
+QUICK_CASE = TradeCase(width=240, repeats=1, memory=False)
 
 
 def trade_recipe(name: str) -> Recipe:
@@ -365,7 +366,7 @@ class Trade(NamedTuple):
 def bench_trade(
     scene_uri: str,
     recipes: Sequence[str] = RECIPES,
-    case: TradeCase = WHOLE_CASE,
+    case: TradeCase = FULL_CASE,
     *,
     wholes: Wholes | None = None,
     backend: str = CPU,
