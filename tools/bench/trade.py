@@ -111,9 +111,10 @@ COLUMNS = {
     "worst": "worst_flip", "PSNR": "psnr", "SSIM": "ssim", "depth off, %": "off_5cm",
     "abs-rel, %": "abs_rel", "flicker": "flicker", "MiB": "mib",
 }  # fmt: skip
-# The figures of one setting: {knob, value, ms, flip, ...}. Either knob is a path and value its value,
-# and all other knobs are at reference; or knob is ALL_KNOBS, value is a name, and `settings` has the
-# value of every knob. Rows of several scenes and recipes also have `scene` and `recipe`.
+# The figures of one setting: {knob, value, ms, flip, ...}. Either `knob` is a path, `value` is its
+# value and all other knobs are at reference; or `knob` is ALL_KNOBS, `value` is a name, and
+# `settings` has the value of every knob. Rows of several scenes and recipes also have `scene` and
+# `recipe`.
 Row = dict[str, Any]
 Tables = Sequence[Mapping[str, Any]]
 Wholes = Mapping[str, Mapping[str, Value]]
