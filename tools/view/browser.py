@@ -21,7 +21,7 @@ document.body.addEventListener("pointerdown", (event) => {
 """
 
 
-def page_style(place_sliders: Iterable[Any], headings: Iterable[Any]) -> str:
+def page_style(position_sliders: Iterable[Any], headings: Iterable[Any]) -> str:
     """The page's style as HTML.
 
     Args:
@@ -30,7 +30,7 @@ def page_style(place_sliders: Iterable[Any], headings: Iterable[Any]) -> str:
             and their marks get room.
         headings: Handles of ticks that begin a part of the page; their labels are bold.
     """
-    sliders = [f"[id='{handle._impl.uuid}']" for handle in place_sliders]
+    sliders = [f"[id='{handle._impl.uuid}']" for handle in position_sliders]
     labels = [f"label[for='{handle._impl.uuid}']" for handle in headings]
     rules = {
         ", ".join(f"{slider} + *" for slider in sliders): "display: none",

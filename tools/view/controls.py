@@ -128,11 +128,11 @@ class Control:
     """The upper end of its slider or number."""
     valid: tuple[float, float] = (-math.inf, math.inf)
     """The ends of what its model allows, which its box takes."""
-    least_value: float | None = None
+    log_start: float | None = None
     """The smallest value but 0 of a logarithmic slider; None for one that follows from its ends."""
-    way: Literal["linear", "log", "both sides"] = "linear"
+    scale: Literal["linear", "log", "both sides"] = "linear"
     """The scale of its slider: how a position stands for a value."""
-    whole: bool = False
+    is_integer: bool = False
     """Whether it has no fractions."""
     words: tuple[str, ...] = ()
     """The values to choose from, where they can be listed."""
@@ -157,12 +157,12 @@ class Control:
         """True if the exact number has a separate box. The box that belongs to a slider takes only
         the slider's values; if the slider is not linear, it holds a position and not a value.
         """
-        return self.way != "linear" or (self.low, self.high) != self.valid
+        return self.scale != "linear" or (self.low, self.high) != self.valid
 
     @property
     def step(self) -> float:
         """Step of a linear slider: a power of ten, or twice or five times one."""
-        if self.whole:
+        if self.is_integer:
             return 1
         exact = (self.high - self.low) / STEPS
         power = 10.0 ** math.floor(math.log10(exact))
@@ -171,12 +171,12 @@ class Control:
     @property
     def box_step(self) -> float:
         """Change of the box's number by an arrow beside it."""
-        return self.step if self.way == "linear" else self.least
+        return self.step if self.scale == "linear" else self.smallest_nonzero
 
     @property
     def box_digits(self) -> int:
         """Digits behind the point that the box takes."""
-        return 0 if self.whole else BOX_DIGITS + max(0, math.ceil(-math.log10(self.box_step)))
+        return 0 if self.is_integer else BOX_DIGITS + max(0, math.ceil(-math.log10(self.box_step)))
 
     @property
     def start(self) -> Any:
@@ -185,7 +185,7 @@ class Control:
             return self.default
         if self.kind == "slider":
             value = self.value_at(0.5)
-            return round(value) if self.whole else value
+            return round(value) if self.is_integer else value
         return {
             "number": int(max(self.low, 0)),
             "colour": [0.5] * 3,
@@ -194,12 +194,12 @@ class Control:
         }.get(self.kind)
 
     @property
-    def least(self) -> float:
+    def smallest_nonzero(self) -> float:
         """The smallest value but 0 of a slider that is not linear."""
-        if self.way == "both sides":
+        if self.scale == "both sides":
             return 0.01
-        if self.least_value is not None:
-            return self.least_value
+        if self.log_start is not None:
+            return self.log_start
         return self.low if self.low > 0 else max(self.high * 10.0**-DECADES, MIN_LOG_VALUE)
 
     @property
@@ -208,20 +208,20 @@ class Control:
         linear one, of others at most five decades, and the end from which on the values are 0.
         The last has the unit.
         """
-        if self.way == "linear":
+        if self.scale == "linear":
             ends = (self.low, (self.low + self.high) / 2, self.high)
             return tuple(
                 (v, f"{_brief(v)} {u}".strip())
                 for v, u in zip(ends, ("", "", self.unit), strict=True)
             )
-        both = self.way == "both sides"
-        first = 0 if both else math.ceil(math.log10(self.least) - 1e-9)
+        both = self.scale == "both sides"
+        first = 0 if both else math.ceil(math.log10(self.smallest_nonzero) - 1e-9)
         last = math.floor(math.log10(self.high) + 1e-9)
         mark_decades = 1 if last - first < MAX_MARKS else 2
         values = [10.0**power for power in range(first, last + 1, mark_decades)]
         if both:
             values = [*(-value for value in reversed(values) if value <= -self.low), 0.0, *values]
-        elif self.low <= 0 and self.way_of(values[0]) > MIN_MARK_DISTANCE:
+        elif self.low <= 0 and self.position_at(values[0]) > MIN_MARK_DISTANCE:
             values = [0.0, *values]
         words = [_brief(value) for value in values]
         words[-1] = f"{words[-1]} {self.unit}".strip()
@@ -229,28 +229,30 @@ class Control:
 
     def value_at(self, position: float) -> float:
         """Return the value at a position on the slider, 0 to 1, to three digits."""
-        if self.way == "log":
+        if self.scale == "log":
             if position <= 0 and self.low <= 0:
                 return max(self.low, 0.0)
-            low = math.log(self.least)
+            low = math.log(self.smallest_nonzero)
             value = math.exp(low + position * (math.log(self.high) - low))
-        elif self.way == "both sides":
+        elif self.scale == "both sides":
             most = max(-self.low, self.high)
-            value = self.least * math.sinh((2 * position - 1) * math.asinh(most / self.least))
+            value = self.smallest_nonzero * math.sinh(
+                (2 * position - 1) * math.asinh(most / self.smallest_nonzero)
+            )
         else:
             value = self.low + position * (self.high - self.low)
         return min(max(float(f"{value:.3g}"), self.low), self.high)
 
-    def way_of(self, value: float) -> float:
+    def position_at(self, value: float) -> float:
         """Return the position of a value on the slider, 0 to 1; an end if the value lies beyond."""
-        if self.way == "log":
-            if value <= self.least:
+        if self.scale == "log":
+            if value <= self.smallest_nonzero:
                 return 0.0
-            low = math.log(self.least)
+            low = math.log(self.smallest_nonzero)
             position = (math.log(value) - low) / (math.log(self.high) - low)
-        elif self.way == "both sides":
-            most = math.asinh(max(-self.low, self.high) / self.least)
-            position = (math.asinh(value / self.least) / most + 1) / 2
+        elif self.scale == "both sides":
+            most = math.asinh(max(-self.low, self.high) / self.smallest_nonzero)
+            position = (math.asinh(value / self.smallest_nonzero) / most + 1) / 2
         else:
             position = (value - self.low) / (self.high - self.low)
         return min(max(position, 0.0), 1.0)
@@ -291,15 +293,15 @@ class Group:
         return shorten(self.hint)
 
     @property
-    def main(self) -> tuple[Control, ...]:
+    def main_controls(self) -> tuple[Control, ...]:
         """The controls that are shown first, in the order of MAIN_FIELDS."""
         by_label = {control.label: control for control in self.controls}
         return tuple(by_label[name] for name in MAIN_FIELDS.get(self.path, ()))
 
     @property
-    def rest(self) -> Group:
+    def secondary_group(self) -> Group:
         """The group without its main controls."""
-        controls = tuple(control for control in self.controls if control not in self.main)
+        controls = tuple(control for control in self.controls if control not in self.main_controls)
         return replace(self, controls=controls)
 
     def walk(self) -> Iterator[Control]:
@@ -381,16 +383,16 @@ def _numeric(leaf: Leaf, attributes: dict[str, Any]) -> Control:
     ends = (low, high)
     if any(map(math.isinf, ends)) or (is_integer and high - low > MAX_SLIDER_INTEGERS):
         return Control(
-            kind="number", low=low, high=high, valid=ends, whole=is_integer, **attributes
+            kind="number", low=low, high=high, valid=ends, is_integer=is_integer, **attributes
         )
     start, end = _useful_ends(leaf.path, low, high)
     scale: Literal["linear", "log", "both sides"] = "linear"
-    least = None
+    log_start = None
     if not is_integer and "_deg" not in leaf.path:
         # By what the model allows: a field that may span decades is thought of in decades.
         if low >= 0 and (high >= MAX_LINEAR or (low > 0 and high > 100 * low)):
             scale = "log"
-            least = start or None
+            log_start = start or None
             start = 0.0 if low == 0 else start
         elif start < 0 and end - start > 2 * MAX_LINEAR:
             scale = "both sides"
@@ -399,16 +401,18 @@ def _numeric(leaf: Leaf, attributes: dict[str, Any]) -> Control:
         low=start,
         high=end,
         valid=ends,
-        least_value=least,
-        way=scale,
-        whole=is_integer,
+        log_start=log_start,
+        scale=scale,
+        is_integer=is_integer,
         **attributes,
     )
     if ">" not in limits:
         return control
     # The end itself is not allowed.
-    first = low + (control.step if scale == "linear" else min(control.least, MIN_LOG_VALUE))
-    start = control.least if scale == "log" else max(start, first)
+    first = low + (
+        control.step if scale == "linear" else min(control.smallest_nonzero, MIN_LOG_VALUE)
+    )
+    start = control.smallest_nonzero if scale == "log" else max(start, first)
     return replace(control, low=start, valid=(first, high))
 
 
@@ -423,7 +427,7 @@ def _useful_ends(path: str, low: float, high: float) -> tuple[float, float]:
     return low, high
 
 
-def start_of_model(section: str) -> dict[str, Any]:
+def start_values_of_model(section: str) -> dict[str, Any]:
     """Return values of a valid section that changes something: the middle of every required field;
     and of one field more where the section's rules want one, or where that field is 0.
     """
@@ -431,11 +435,11 @@ def start_of_model(section: str) -> dict[str, Any]:
     controls = group_of(section).controls
     required = [c for c in controls if model.model_fields[c.label].is_required()]
     required_values = {
-        c.label: c.value_at(VISIBLE_POSITION) if c.way == "log" else c.start for c in required
+        c.label: c.value_at(VISIBLE_POSITION) if c.scale == "log" else c.start for c in required
     }
     optional = [{c.label: c.start} for c in controls if c.nullable and is_number(c.start)]
     zero = [c for c in controls if c.kind == "slider" and c.default == 0 and not c.nullable]
-    small = [{c.label: (int if c.whole else float)(c.value_at(0.2))} for c in zero]
+    small = [{c.label: (int if c.is_integer else float)(c.value_at(0.2))} for c in zero]
     for extra_values in ({}, *optional, *small):
         try:
             effect = model.model_validate(required_values | extra_values)

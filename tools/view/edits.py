@@ -21,7 +21,7 @@ from recipes.fields import section_at, with_unchecked_field
 from recipes.job import scaled_recipe
 from recipes.load import dump_recipe, load_recipe, preset_names, read_overrides
 from recipes.schema import Recipe, Sensor
-from tools.view.controls import start_of_model
+from tools.view.controls import start_values_of_model
 
 
 def as_yaml(value: Any) -> str:
@@ -58,7 +58,7 @@ class Edits:
         edits = replace(self, absent=self.absent - {section})
         if section_at(replace(edits, values={}).recipe(), section) is not None:
             return edits
-        start = as_yaml(start_of_section(section))
+        start = as_yaml(start_values(section))
         return replace(edits, added={**self.added, section: start})
 
     def without_section(self, section: str) -> Edits:
@@ -81,7 +81,7 @@ class Edits:
         overrides = read_overrides(self.sets(), "changed", folder=self.folder)
         return scaled_recipe(load_recipe(self.source, overrides).resolve(0), self.scale)
 
-    def giving_way(self, changed: str, nullable_paths: tuple[str, ...]) -> Edits:
+    def without_conflict(self, changed_path: str, nullable_paths: tuple[str, ...]) -> Edits:
         """Return the edits if they are valid, else without the first field of some that contradicts
         the changed one, such as the other of two densities.
         """
@@ -94,7 +94,7 @@ class Edits:
                     edits.recipe()
                 except RecipeError:
                     continue
-                return edits if path != changed else self
+                return edits if path != changed_path else self
         return self
 
     def command(self, where: str) -> str:
@@ -105,7 +105,7 @@ class Edits:
         return " ".join(word for word in words if word)
 
 
-def start_of_section(section: str) -> dict[str, Any]:
+def start_values(section: str) -> dict[str, Any]:
     """Values to start an effect with: those of the plainest preset that has it, or else the middle
     of what its fields allow.
     """
@@ -118,7 +118,7 @@ def start_of_section(section: str) -> dict[str, Any]:
             candidates.append((len(recipe.sections()), len(start), name, start))
     if candidates:
         return _short(min(candidates, key=lambda entry: entry[:3])[3])
-    return start_of_model(section)
+    return start_values_of_model(section)
 
 
 def _short(value: Any) -> Any:
@@ -137,7 +137,7 @@ def without_weather(recipe: Recipe) -> Recipe:
     return recipe.model_copy(update={"camera": Sensor()})
 
 
-def renamed(recipe: Recipe, name: str) -> Recipe:
+def rename_recipe(recipe: Recipe, name: str) -> Recipe:
     """Return the recipe under another name.
 
     Raises:
@@ -175,7 +175,7 @@ def save_recipe(recipe: Recipe, path: Path) -> None:
         raise
 
 
-def free_path(folder: Path, name: str, *endings: str) -> Path:
+def unused_path(folder: Path, name: str, *endings: str) -> Path:
     """Return FOLDER/NAME, or NAME-2, NAME-3, ... where no ending of it is taken."""
     for number in itertools.count(1):
         path = folder / (name if number == 1 else f"{name}-{number}")

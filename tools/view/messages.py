@@ -40,7 +40,7 @@ Coordinate = Annotated[float, Meta(ge=-1e7, le=1e7)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 Pixels = Annotated[int, Meta(ge=0, le=2**15)]
 Number = Annotated[float, Meta(ge=-1e300, le=1e300)]
-Whole = Annotated[int, Meta(ge=-(2**53), le=2**53)]
+WholeNumber = Annotated[int, Meta(ge=-(2**53), le=2**53)]
 Text = Annotated[str, Meta(max_length=MAX_TEXT)]
 
 
@@ -65,7 +65,13 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, tag_field="type", forbid_unk
 class Updates(msgspec.Struct, forbid_unknown_fields=True):
     """The new value of a widget, and nothing else of it."""
 
-    value: bool | Whole | Number | Text | Annotated[tuple[Whole | Number, ...], Meta(max_length=8)]
+    value: (
+        bool
+        | WholeNumber
+        | Number
+        | Text
+        | Annotated[tuple[WholeNumber | Number, ...], Meta(max_length=8)]
+    )
 
 
 class GuiUpdateMessage(msgspec.Struct, tag=True, tag_field="type", forbid_unknown_fields=True):
@@ -112,7 +118,7 @@ class Upload:
     start: FileTransferStartUpload
     parts: dict[int, bytes] = field(default_factory=dict)
     size_bytes: int = 0
-    last: float = field(default_factory=time.monotonic)
+    last_part_time: float = field(default_factory=time.monotonic)
 
 
 class Uploads:
@@ -150,7 +156,7 @@ class Uploads:
             return []
         upload.parts[part.part_index] = part.content
         upload.size_bytes += len(part.content)
-        upload.last = time.monotonic()
+        upload.last_part_time = time.monotonic()
         start = upload.start
         count = len(upload.parts)
         too_large = upload.size_bytes > start.size_bytes or part.part_index >= start.part_count
@@ -174,7 +180,7 @@ class Uploads:
     def forget_idle(self) -> None:
         """Give up those that no part has come of for a while."""
         for key, upload in list(self._uploads.items()):
-            if time.monotonic() - upload.last > UPLOAD_S:
+            if time.monotonic() - upload.last_part_time > UPLOAD_S:
                 del self._uploads[key]
                 self._report(
                     f"{upload.start.filename} was not uploaded: no part of it has come for "

@@ -19,7 +19,7 @@ from augment.jobs.store import Store, open_store
 from recipes.files import open_file
 from recipes.schema import columns_of_effects
 from tools.view.fields import NONE
-from tools.view.pictures import BAR, color_classes, color_depth, color_numbers, split
+from tools.view.pictures import BAR, color_classes, color_depth, color_numbers, split_pictures
 from tools.view.text import paragraph, printable, table
 from tools.view.widgets import options_of
 
@@ -140,38 +140,40 @@ class OutputPage:
         gui.set_panel_label(printable(f"ClimateGS: {viewer.store.uri.rpartition('/')[2]}"))
         self._status = gui.add_html("")
         self._options: dict[str, dict[str, Any]] = {}  # by the dropdown's label
-        self._scene = self._dropdown("scene", viewer.values("scene"))
-        self._camera = self._dropdown("camera", viewer.values("camera"))
+        self._scene = self._add_dropdown("scene", viewer.values("scene"))
+        self._camera = self._add_dropdown("camera", viewer.values("camera"))
         frames = viewer.values("frame")
         self._frame = gui.add_slider("frame", 0, max(len(frames) - 1, 1), 1, 0)
-        self._variant = self._dropdown("variant", viewer.values("variant"))
+        self._variant = self._add_dropdown("variant", viewer.values("variant"))
         kinds = ("image", "depth", "semantic", "instance", *mask_names())
         row_kinds = [k for k in kinds if any(row.get(f"{k}_path") for row in rows)]
-        self._shows = self._dropdown("shows", row_kinds)
-        self._other = self._dropdown("left of the line", [NONE, *viewer.values("variant")])
+        self._shows = self._add_dropdown("shows", row_kinds)
+        self._left_variant = self._add_dropdown(
+            "left of the line", [NONE, *viewer.values("variant")]
+        )
         self._line = gui.add_slider("line", 0.0, 1.0, 0.005, 0.5)
         self._ranges: dict[str, Any] = {}
         with gui.add_folder("only images with", visible=bool(viewer.numbers)):
             for name in viewer.numbers:
-                self._ranges[name] = self._range(name)
+                self._ranges[name] = self._add_range_slider(name)
         self._facts = gui.add_html("")
         self._frames = frames
         for part in (self._frame, self._line):
-            self._when(part, self._show)
+            self._subscribe(part, self._show)
         self._show()
         client.camera.on_update(self._on_camera)
 
-    def _dropdown(self, label: str, values: list[Any]) -> Any:
+    def _add_dropdown(self, label: str, values: list[Any]) -> Any:
         self._options[label] = options_of(values)
         part = self.client.gui.add_dropdown(label, tuple(self._options[label]))
-        self._when(part, self._show)
+        self._subscribe(part, self._show)
         return part
 
-    def _chosen(self, part: Any) -> Any:
+    def _selected_value(self, part: Any) -> Any:
         """The value that the option of a dropdown stands for."""
         return self._options[part.label][part.value]
 
-    def _range(self, name: str) -> Any:
+    def _add_range_slider(self, name: str) -> Any:
         values = self.viewer.values(name)
         low = float(values[0])
         high = float(values[-1])
@@ -183,10 +185,10 @@ class OutputPage:
         part = self.client.gui.add_multi_slider(
             name, low, high, step=step, initial_value=(low, high), hint=hint
         )
-        self._when(part, self._narrow)
+        self._subscribe(part, self._narrow)
         return part
 
-    def _when(self, part: Any, act: Callable[[], None]) -> None:
+    def _subscribe(self, part: Any, act: Callable[[], None]) -> None:
         @part.on_update
         async def _(event: Any) -> None:
             if event.client is not None:
@@ -224,20 +226,22 @@ class OutputPage:
     def _show(self) -> None:
         matching = [row for row in self.viewer.rows if self._matches(row)]
         frame = self._frames[min(self._frame.value, len(self._frames) - 1)]
-        scene, camera, shows = map(self._chosen, (self._scene, self._camera, self._shows))
+        scene, camera, shows = map(self._selected_value, (self._scene, self._camera, self._shows))
         view = {"scene": scene, "camera": camera, "frame": frame}
-        row = self._find(matching, view | {"variant": self._chosen(self._variant)})
+        row = self._find(matching, view | {"variant": self._selected_value(self._variant)})
         count = f"{len(matching)} of {len(self.viewer.rows)} images"
         if row is None:
             self.show_status(f"{count}; none of this scene, camera, frame and variant")
             return
         try:
             picture = self.viewer.picture(row, shows)
-            left_row = self._find(self.viewer.rows, view | {"variant": self._chosen(self._other)})
+            left_row = self._find(
+                self.viewer.rows, view | {"variant": self._selected_value(self._left_variant)}
+            )
             if left_row is not None:
                 left_picture = self.viewer.picture(left_row, shows)
                 if left_picture.shape == picture.shape:
-                    picture = split(left_picture, picture, self._line.value)
+                    picture = split_pictures(left_picture, picture, self._line.value)
         except OutputError as error:
             self.show_status(f"{count}; {error}")
             return

@@ -102,7 +102,7 @@ def free_camera(
     )
 
 
-def away_sentence(scene: Scene, camera: Camera) -> str | None:
+def distance_warning(scene: Scene, camera: Camera) -> str | None:
     """Return a warning about a picture that is far from where any image was recorded.
 
     Returns:
@@ -126,7 +126,7 @@ def away_sentence(scene: Scene, camera: Camera) -> str | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class PageImage:
     """rgb: uint8 [H, W, 3], the picture or what stands for it. depth_m: z, 0 where there is none;
     None where nobody asked.
     """
@@ -135,7 +135,7 @@ class Shown:
     depth_m: np.ndarray | None
 
 
-def what_can_be_shown() -> tuple[str, ...]:
+def picture_kinds() -> tuple[str, ...]:
     masks = (f"mask of {e.mask_name}" for e in effects.EFFECTS if e.mask_name is not None)
     return (PICTURE, DEPTH, CLASSES, INSTANCES, SPLATS, *masks, f"mask of {TRUST}")
 
@@ -162,7 +162,7 @@ def recipe_to_show(recipe: Recipe, shows: str, *, with_depth: bool, factor: floa
     return with_unchecked_field(recipe, "render.scale", recipe.render.scale * factor)
 
 
-def coarse(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
+def coarse_recipe(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
     """Return the recipe of a picture while something moves: with shortcuts of the rasteriser, and
     without outputs that the page does not show. No change makes a preparation run again.
     """
@@ -175,7 +175,9 @@ def coarse(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
     return recipe
 
 
-def draw(scene: Scene, camera: Camera, recipe: Recipe, shows: str, *, backend: str = AUTO) -> Shown:
+def draw(
+    scene: Scene, camera: Camera, recipe: Recipe, shows: str, *, backend: str = AUTO
+) -> PageImage:
     """Return what a page shows. camera: before recipe.render.scale. recipe: of recipe_to_show."""
     if shows == SPLATS:
         return _draw_splat_ids(scene, camera, recipe, backend)
@@ -190,16 +192,16 @@ def draw(scene: Scene, camera: Camera, recipe: Recipe, shows: str, *, backend: s
     elif shows.startswith("mask of "):
         mask = view.masks.get(shows.removeprefix("mask of "))
         rgb = rgb // 3 if mask is None else np.where(mask[..., None] > 0, rgb, rgb // 3)
-    return Shown(rgb, view.depth_m)
+    return PageImage(rgb, view.depth_m)
 
 
-def _draw_splat_ids(scene: Scene, camera: Camera, recipe: Recipe, backend: str) -> Shown:
+def _draw_splat_ids(scene: Scene, camera: Camera, recipe: Recipe, backend: str) -> PageImage:
     plan = make_plan(with_unchecked_field(recipe, "output.semantic", True), scene)
     view = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     ids = getattr(view.raster, SPLAT_IDS).cpu().numpy()
     rgb = np.where(ids[..., None] >= 0, color_numbers(ids), 0).astype(np.uint8)
     depth = None if view.depth_m is None else view.depth_m.float().cpu().numpy()
-    return Shown(rgb, depth)
+    return PageImage(rgb, depth)
 
 
 def color_depth(depth_m: np.ndarray) -> np.ndarray:
@@ -235,7 +237,7 @@ def _class_colors() -> np.ndarray:
 _CLASS_COLORS = _class_colors()
 
 
-def in_window(view: Shown, place: Place) -> Shown:
+def add_window_bars(view: PageImage, place: Place) -> PageImage:
     """Return the image with the window's bars around it."""
     height, width = view.rgb.shape[:2]
     right = place.size[0] - place.left - width
@@ -247,10 +249,10 @@ def in_window(view: Shown, place: Place) -> Shown:
     depth = view.depth_m
     if depth is not None:
         depth = cv2.copyMakeBorder(depth, *sides, cv2.BORDER_CONSTANT, value=BAR_M)
-    return Shown(rgb, depth)
+    return PageImage(rgb, depth)
 
 
-def split(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
+def split_pictures(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
     """Return one picture to the left of a white line and the other to its right."""
     column = round(share * after.shape[1])
     picture = after.copy()
@@ -259,7 +261,7 @@ def split(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
     return picture
 
 
-def depth_of_page(depth_m: np.ndarray) -> np.ndarray:
+def page_depth(depth_m: np.ndarray) -> np.ndarray:
     """Return the depth that the page is sent: FAR_M at most, and where there is no surface."""
     return np.where(depth_m > 0, np.minimum(depth_m, FAR_M), FAR_M)
 

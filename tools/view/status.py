@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from augment.timing import PassProgress
 
 if TYPE_CHECKING:
-    from tools.view.page import Wish
+    from tools.view.page import ViewRequest
 
 MOVING_S = 0.4  # The time for which the status line speaks of a moving picture, seconds.
 BUSY_S = 0.5  # The shortest wait that gets a bar, seconds.
@@ -23,7 +23,7 @@ _PREPARATIONS = ("plan", "view plan", "parts", "prune")
 class ShownPicture:
     """The picture that a page has got last."""
 
-    wish: Wish
+    request: ViewRequest
     """The wish of the page that it was drawn for."""
     width: int
     """Its columns, without bars."""
@@ -31,9 +31,9 @@ class ShownPicture:
     """Its rows, without bars."""
     seconds: float
     """The time that it took, seconds."""
-    at: float
+    sent_at: float
     """When it was sent, on the monotonic clock."""
-    is_rest: bool
+    is_at_rest: bool
     """Whether it is the whole picture, and not a rough one while something moves."""
     is_complete: bool = True
     """Whether what lies over the picture is there, too."""
@@ -84,7 +84,7 @@ def describe_activity(activity: Activity | None) -> str:
 
 def page_status(
     picture: ShownPicture | None,
-    wish: Wish,
+    request: ViewRequest,
     activity: Activity | None,
     *,
     waited_s: float,
@@ -103,13 +103,13 @@ def page_status(
     """
     if has_failed:
         return Status("Not drawn", False)
-    is_current = picture is not None and picture.wish is wish
+    is_current = picture is not None and picture.request is request
     if picture is not None:
         size = f"{picture.width} x {picture.height}"
-        if is_current and picture.is_rest and picture.is_complete:
+        if is_current and picture.is_at_rest and picture.is_complete:
             recipe = "" if picture.is_valid else "; of the last recipe that was valid"
             return Status(f"{size} at rest, {1000 * picture.seconds:.0f} ms{recipe}", True)
-        if not picture.is_rest and now - picture.at < MOVING_S:
+        if not picture.is_at_rest and now - picture.sent_at < MOVING_S:
             return Status(f"{size} while moving, {1000 * picture.seconds:.0f} ms", is_current)
     work = describe_activity(activity)
     if waited_s >= 1:
@@ -122,16 +122,16 @@ def page_status(
     return Status(text, is_current, share, waited_s >= BUSY_S)
 
 
-def _what_is_shown(picture: ShownPicture | None, wish: Wish) -> str:
+def _describe_picture(picture: ShownPicture | None, request: ViewRequest) -> str:
     """Return in words how the picture differs from the wish."""
     if picture is None:
         return "First picture"
-    if picture.wish is wish:
-        follows = "what lies over it" if picture.is_rest else "the whole one"
+    if picture.request is request:
+        follows = "what lies over it" if picture.is_at_rest else "the whole one"
         return f"{'Picture' if picture.is_rest else 'Rough picture'}, {follows} follows"
-    if picture.wish.edits != wish.edits:
+    if picture.request.edits != request.edits:
         return "Picture not of this recipe yet"
-    views = ((w.frame, w.camera, w.pose) for w in (picture.wish, wish))
+    views = ((w.frame, w.camera, w.pose) for w in (picture.request, request))
     if len(set(views)) > 1:
         return "Picture not of this view yet"
     return "Picture not up to date yet"
