@@ -1,6 +1,8 @@
-"""Controls of a recipe's fields, made by walking its models: the fields to set, the ends of each,
-the values along a slider that spans decades, and the order of the fields. Nothing of a page is in
-here.
+"""Controls of a recipe's fields: what a person can set, without any widget.
+
+The controls are made by walking the recipe's models. A control has its field's path, the ends of
+its values, and the scale of its slider: how a position stands for a value. `fields.py` makes the
+widgets of a page from controls, and `page.py` puts them in order.
 """
 
 from __future__ import annotations
@@ -35,8 +37,8 @@ MAX_MARKS = 5  # The most marks along a logarithmic slider, a decade from each o
 # The least distance of two marks, of a slider's length: else their words run into each other.
 MIN_MARK_DISTANCE = 0.15
 
-# The fields that a page shows first, by section: what a weather report or a road user would say of
-# the weather. All others, and effects without an entry, come under "more".
+# The fields that a page shows first, by section. They are the words of a weather report or of a
+# road user. All other fields, and effects without an entry, come under "more".
 MAIN_FIELDS = {
     "weather.smog": ("visibility_m",),  # as weather services and drivers tell fog
     "weather.rain": ("rate_mm_h", "wetness"),  # what falls, and how dark and bright the road gets
@@ -91,7 +93,7 @@ USEFUL_ENDS = {
 FULL_TURN = 360.0
 MAX_BOTH_SIDES = 100.0  # The largest absolute value on a slider of both signs without an entry.
 
-# By the end of a field's name, the longer end first.
+# The symbol of a unit by the end of a field's name; longer ends come before shorter ones.
 UNIT_SYMBOLS = {
     "_per_m": "1/m",
     "_mm_h": "mm/h",
@@ -119,7 +121,7 @@ class Control:
     hint: str
     """The field's meaning, and its unit."""
     nullable: bool = False
-    """Whether the field may be null."""
+    """True if the field may be null."""
     default: Any = None
     """Its value where nothing is given; None where the field must be given, or is null."""
     low: float = 0.0
@@ -129,16 +131,17 @@ class Control:
     valid: tuple[float, float] = (-math.inf, math.inf)
     """The ends of what its model allows, which its box takes."""
     log_start: float | None = None
-    """The smallest value but 0 of a logarithmic slider; None for one that follows from its ends."""
+    """The smallest value above 0 of a logarithmic slider; None if it follows from the ends."""
     scale: Literal["linear", "log", "both sides"] = "linear"
-    """The scale of its slider: how a position stands for a value."""
+    """The scale of the slider: how a position stands for a value."""
     is_integer: bool = False
-    """Whether it has no fractions."""
+    """True if its values are whole numbers."""
     words: tuple[str, ...] = ()
     """The values to choose from, where they can be listed."""
 
     @property
     def label(self) -> str:
+        """The last name of the path."""
         return self.path.rpartition(".")[2]
 
     @property
@@ -195,7 +198,7 @@ class Control:
 
     @property
     def smallest_nonzero(self) -> float:
-        """The smallest value but 0 of a slider that is not linear."""
+        """The smallest absolute value above 0 of a slider that is not linear."""
         if self.scale == "both sides":
             return 0.01
         if self.log_start is not None:
@@ -204,9 +207,10 @@ class Control:
 
     @property
     def marks(self) -> tuple[tuple[float, str], ...]:
-        """Values along a slider that has a box, and words for them: both ends and the middle of a
-        linear one, of others at most five decades, and the end from which on the values are 0.
-        The last has the unit.
+        """Values along a slider that has a box, and the word for each.
+
+        A linear slider has marks at both ends and in the middle. Other sliders have marks at no
+        more than MAX_MARKS decades, and at 0 where there is room. The last word has the unit.
         """
         if self.scale == "linear":
             ends = (self.low, (self.low + self.high) / 2, self.high)
@@ -259,7 +263,7 @@ class Control:
 
 
 def shorten(text: str) -> str:
-    """The first sentence, or as many of its words as a tooltip has room for."""
+    """Return the first sentence, cut at a word if it is longer than MAX_HINT characters."""
     first = re.split(r"(?<=\.)\s", text.strip(), maxsplit=1)[0]
     return textwrap.shorten(first, MAX_HINT, placeholder=" ...")
 
@@ -270,31 +274,38 @@ def _brief(value: float) -> str:
 
 @dataclass(frozen=True)
 class Group:
-    """The controls of a section and of the sections in it. optional: null where it is absent."""
+    """The controls of a recipe's section and of the sections in it."""
 
     path: str
+    """The dotted path of the section: "weather.smog"."""
     hint: str
+    """The meaning of the section."""
     optional: bool
+    """True if the section may be null, which means that its effect is absent."""
     controls: tuple[Control, ...]
+    """The controls of its own fields."""
     groups: tuple[Group, ...]
+    """The groups of the sections in it."""
 
     @property
     def label(self) -> str:
+        """The last name of the path."""
         return self.path.rpartition(".")[2]
 
     @property
     def title(self) -> str:
-        """The section's name, with words of daily use where it has some."""
+        """The section's name, with an everyday word where PLAIN_WORDS has one."""
         words = PLAIN_WORDS.get(self.path)
         return self.label if words is None else f"{self.label} ({words})"
 
     @property
     def tooltip(self) -> str:
+        """The first sentence of the hint."""
         return shorten(self.hint)
 
     @property
     def main_controls(self) -> tuple[Control, ...]:
-        """The controls that are shown first, in the order of MAIN_FIELDS."""
+        """The controls that a page shows first, in the order of MAIN_FIELDS."""
         by_label = {control.label: control for control in self.controls}
         return tuple(by_label[name] for name in MAIN_FIELDS.get(self.path, ()))
 
@@ -305,14 +316,14 @@ class Group:
         return replace(self, controls=controls)
 
     def walk(self) -> Iterator[Control]:
-        """Its controls, then those of the sections in it."""
+        """Yield the group's controls, then those of the sections in it."""
         yield from self.controls
         for group in self.groups:
             yield from group.walk()
 
 
 def group_of(path: str) -> Group:
-    """The section at a dotted path: `weather.smog`, `camera`."""
+    """Return the group of the section at a dotted path, such as `weather.smog` or `camera`."""
     section = recipe_file()
     for name in path.split("."):
         section = section.INNER[name]
@@ -320,12 +331,12 @@ def group_of(path: str) -> Group:
 
 
 def effect_groups() -> tuple[Group, ...]:
-    """Every effect that recipes know at this time."""
+    """Return the groups of all effects that recipes know now."""
     return tuple(map(group_of, SECTIONS))
 
 
 def split_by_rank(groups: Sequence[Group]) -> tuple[tuple[Group, ...], tuple[Group, ...]]:
-    """The effects that have main fields, in the order of MAIN_FIELDS, and the others."""
+    """Return the effects that have main fields, in the order of MAIN_FIELDS, and the others."""
     by_path = {group.path: group for group in groups}
     main = tuple(by_path[path] for path in MAIN_FIELDS if path in by_path)
     return main, tuple(group for group in groups if group.path not in MAIN_FIELDS)
@@ -417,7 +428,7 @@ def _numeric(leaf: Leaf, attributes: dict[str, Any]) -> Control:
 
 
 def _useful_ends(path: str, low: float, high: float) -> tuple[float, float]:
-    """Return the ends of a field's slider. low, high: the ends of what the model allows."""
+    """Return the ends of a field's slider. low, high: ends of the values that the model allows."""
     if path in USEFUL_ENDS:
         return USEFUL_ENDS[path]
     if path.endswith("_deg") and (low, high) == (-FULL_TURN, FULL_TURN):
@@ -428,8 +439,10 @@ def _useful_ends(path: str, low: float, high: float) -> tuple[float, float]:
 
 
 def start_values_of_model(section: str) -> dict[str, Any]:
-    """Return values of a valid section that changes something: the middle of every required field;
-    and of one field more where the section's rules want one, or where that field is 0.
+    """Return values of a valid section that changes the picture.
+
+    Every required field gets a value in the middle of its slider. One further field gets a value if
+    the section would otherwise be invalid or without effect.
     """
     model = SECTIONS[section]
     controls = group_of(section).controls

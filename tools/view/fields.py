@@ -1,4 +1,4 @@
-"""A recipe's controls as widgets of a page, each of which takes a value and tells of changes."""
+"""Widgets of a page for the controls of a recipe. A widget shows a value and reports changes."""
 
 from __future__ import annotations
 
@@ -26,10 +26,13 @@ class Field:
     """One control on a page.
 
     Args:
-        label: What the page calls the field; None for its name.
-        when: Is called with a widget and a function; calls the function with each new value.
-        changed: Is called with the control and the field's new value as YAML.
-        uploaded: Is called with the control and a file's name and content.
+        gui: viser's interface of the page.
+        control: The control.
+        label: The label on the page; None for the field's name.
+        subscribe: A function of a widget and a listener. It calls the listener with each new value
+            of the widget.
+        on_change: A function of the control and the field's new value as YAML.
+        on_upload: A function of the control, and a file's name and content.
     """
 
     def __init__(
@@ -58,7 +61,7 @@ class Field:
             subscribe(button, lambda file: on_upload(control, file.name, file.content), "on_upload")
 
     def show(self, value: Any) -> None:
-        """Show a value, without calling `changed`."""
+        """Show a value, without calling `on_change`."""
         if self._set_checkbox is not None:
             self._set_checkbox.value = value is not None
             for part in self._parts:
@@ -69,7 +72,7 @@ class Field:
             part.value = part_value
 
     def _part_values(self, value: Any) -> tuple[Any, ...]:
-        """Return the value in the form of each of the widgets."""
+        """Return the value in the form that each widget of the field takes."""
         control = self.control
         if control.kind in ("slider", "number"):
             kind = int if control.is_integer else float
