@@ -117,7 +117,7 @@ def test_every_field_of_every_effect_has_a_control_whose_ends_its_model_takes(du
 def test_an_effect_that_is_switched_on_starts_from_values_its_model_takes(dust):
     for section in SECTIONS:
         edits = Edits("clear").with_section(section)
-        assert section_at(edits.recipe(), section).changes, start_values(section)
+        assert section_at(edits.recipe(), section).has_effect, start_values(section)
         assert section_at(edits.without_section(section).recipe(), section) is None
 
 
@@ -172,7 +172,7 @@ def test_ten_fields_come_first_and_tooltips_are_short():
 # ---- What a page says ----------------------------------------------------------------------------
 
 
-def test_at_rest_is_said_of_the_whole_picture_of_the_wish_alone():
+def test_at_rest_is_said_of_the_whole_picture_of_the_request_alone():
     request = ViewRequest(Edits("clear"), 0, "front")
     at_rest = ShownPicture(request, 320, 180, 0.03, sent_at=1.0, is_at_rest=True)
     placing = Activity(PassProgress("placing snow", 12, 21))

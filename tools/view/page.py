@@ -1,4 +1,9 @@
-"""One client's page: its widgets, what they ask for, and what has been drawn for it."""
+"""One client's page: its widgets, its request, and the pictures that it shows.
+
+A page has a ViewRequest: the recipe with its changes, the frame, the camera and all that the page
+shows. Widgets change the request on the server's event loop. The viewer's thread (`server.py`)
+draws the latest request and calls the page's `show_*` methods.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +50,7 @@ if TYPE_CHECKING:
 
     from tools.view.server import Viewer
 
-REST_S = 0.15  # The time without a change after which the whole picture is drawn, seconds.
+REST_S = 0.15  # The time without a change after which the full picture is drawn, seconds.
 PLAY_S = 0.1  # The time from frame to frame of a drive that is played, seconds.
 # The window's camera counts as not moved within this distance of where it was put, metres.
 POSE_M = 0.01
@@ -60,13 +65,13 @@ MAX_NAME = 64  # The longest name of an uploaded file, characters.
 MAX_TASKS = 8  # The most tasks of a page that may wait.
 MAX_ASPECT = 8.0  # The largest ratio of a window's longer side to its shorter one.
 _MAIN_NAMES = [name for names in MAIN_FIELDS.values() for name in names]
-# The names that are shown with their section: those of several main fields, and "preset", which is
-# also the name of the whole recipe's dropdown.
+# The names of fields that are shown with their section: names that several main fields have, and
+# "preset", which is also the label of the recipe's dropdown.
 SHARED_NAMES = {"preset", *(name for name in _MAIN_NAMES if _MAIN_NAMES.count(name) > 1)}
 BAR_FULL = 100.0  # The value of a full progress bar, percent.
 _ERROR = "color:#c92a2a"  # The CSS of an error message.
-# The CSS of the status line. Two lines and a bar are always there: nothing below may move away from
-# under the mouse.
+# The CSS of the status line. It always has the height of two lines, so that widgets below it never
+# move away from under the mouse.
 _STATUS = "font-weight:bold;line-height:1.3;min-height:2.6em"
 _WAITS = "color:#a35200"  # The CSS of a status line while the picture is not the one asked for.
 # The CSS of a warning about the view.
@@ -75,63 +80,81 @@ _WARNING = "background:#fff3bf;color:#5c3c00;padding:0.3em 0.7em;margin-bottom:0
 
 @dataclass(frozen=True)
 class FreePose:
-    """Pose of the window's camera in a flight: world_from_camera."""
+    """Pose of the window's camera in a flight, and its field of view."""
 
     wxyz: tuple[float, ...]
+    """The rotation of world_from_camera as a quaternion."""
     position: tuple[float, ...]
+    """The translation of world_from_camera."""
     fov_rad: float
+    """The vertical field of view, radians."""
 
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """The view that a page asks for.
-
-    frame: a position in the scene's frames. pose: None for the recorded camera's. share: where the
-    line of a split picture stands, 0 to 1 from the left.
-    """
+    """The view that a page asks for."""
 
     edits: Edits
+    """The recipe and the changes to it."""
     frame: int
+    """The position in the viewer's frames, from 0."""
     camera: str
+    """The name of a recorded camera."""
     pose: FreePose | None = None
+    """The pose in a flight; None for the pose of the recorded camera."""
     shows: str = PICTURE
+    """The kind of the picture, one of `picture_kinds()`."""
     boxes: bool = False
+    """True if labelled boxes are drawn over the picture."""
     lidar: bool = False
+    """True if LiDAR returns are drawn over the picture."""
     frustums: bool = False
+    """True if the frame's cameras are drawn over the picture."""
     is_split: bool = False
+    """True if the left part of the picture shows the scene without weather."""
     share: float = 0.5
+    """The column of the line in a split picture, as a share of the width."""
     every_pixel: bool = False
+    """True if the picture has the recipe's full resolution, whatever the window's size."""
     is_playing: bool = False
+    """True while the drive is played."""
 
     @property
     def needs_depth(self) -> bool:
-        """True if things are drawn over the picture that its surfaces can hide."""
+        """True if overlays are drawn that surfaces of the picture can hide."""
         return self.boxes or self.lidar or self.frustums
 
 
 @dataclass
 class DrawingProgress:
-    """Progress of the drawing of one page's wishes, which are numbered from 1. Times are on the
-    monotonic clock, in seconds.
+    """Progress in drawing one page's requests, which are numbered from 1.
 
-    wish_number: the latest wish. drawn_number: the last wish that was drawn. rest_number: the last
-    wish that was drawn at rest. last: when the latest wish came, or was given up. wish_time: when
-    it came. due: when a drive that is played goes on.
+    Times are on the monotonic clock, in seconds.
     """
 
     request_number: int = 1
+    """The number of the latest request."""
     drawn_number: int = 0
+    """The number of the last request that was drawn."""
     rest_number: int = 0
+    """The number of the last request that was drawn at rest, in full quality."""
     last_change_time: float = 0.0
+    """The time when the latest request came, or when its drawing was given up."""
     request_time: float = field(default_factory=time.monotonic)
+    """The time when the latest request came."""
     next_frame_time: float = 0.0
+    """The time when a drive that is played goes to its next frame."""
     factor: float = FACTORS[1]
+    """The share of the full resolution while something moves."""
     tasks: deque[Callable[[], None]] = field(default_factory=deque)
+    """The tasks that wait for the viewer's thread."""
 
 
 class Page:
-    """All methods but those that the viewer's thread calls (`show_*`) are called on the server's
-    event loop.
+    """One client's page.
+
+    The viewer's thread calls the methods `show_*`. All other methods run on the server's event
+    loop.
     """
 
     def __init__(self, viewer: Viewer, client: ClientHandle) -> None:
@@ -193,7 +216,7 @@ class Page:
         return self._last_valid_recipe
 
     def camera_of(self, request: ViewRequest) -> Camera:
-        """Return the camera of a wish, before the recipe's scale."""
+        """Return the camera of a request, before the recipe's scale."""
         recorded = self.recorded_camera(request)
         pose = request.pose
         if pose is None:
@@ -217,10 +240,10 @@ class Page:
     def window_height(self) -> int:
         return self._window[1] or 720
 
-    # ---- Wishes ----------------------------------------------------------------------------------
+    # ---- Requests --------------------------------------------------------------------------------
 
     def ask(self, **changes: Any) -> None:
-        """Wish for something else; the viewer's thread draws the latest wish."""
+        """Change fields of the request. The viewer's thread draws only the latest request."""
         with self.viewer.changed:
             self.request = replace(self.request, **changes)
             self.progress.request_number += 1
@@ -229,7 +252,11 @@ class Page:
         self.update_status()
 
     def add_task(self, task: Callable[[], None]) -> None:
-        """Have the viewer's thread do something between two pictures."""
+        """Have the viewer's thread run a task between two pictures.
+
+        Raises:
+            ClimateGSError: too many tasks wait.
+        """
         if len(self.progress.tasks) >= MAX_TASKS:
             raise ClimateGSError(f"{MAX_TASKS} tasks wait to be done: press it again after them")
         with self.viewer.changed:
@@ -270,7 +297,7 @@ class Page:
         self._open_recipe(str(create_file(self.viewer.out / "opened", stem, ".yaml", content)))
 
     def _open_recipe(self, source: str) -> None:
-        """Open another recipe, without changes to it."""
+        """Open another recipe, a preset or a file, without changes to it."""
         edits = Edits(source, self.request.edits.scale, folder=self.viewer.out)
         self.edit(edits, show=True)
 
@@ -334,8 +361,10 @@ class Page:
         return _is_near(np.array(pose.wxyz), np.array(pose.position), *target)
 
     def _resize(self, width: int, height: int) -> bool:
-        """Take over the window's size. Return True if its shape is new, or if it has more pixels
-        than ever in this shape: a slow browser reports fewer for a while.
+        """Store the window's size. Return True if it counts as new.
+
+        A size counts as new if its shape is new, or if it has more pixels than any before in this
+        shape: a slow browser reports fewer pixels for a while.
         """
         old_width, old_height = self._window
         same_shape = abs(width * old_height - height * old_width) <= 2 * max(width, old_width)
@@ -407,7 +436,7 @@ class Page:
         self._subscribe(self._variant, lambda number: self._set("variant", int(number)))
 
     def _set(self, path: str, value: Any) -> None:
-        """Set a field whose change may change other fields."""
+        """Set a field whose change may also change the values of other fields."""
         self.edit(self.request.edits.with_values({path: as_yaml(value)}), show=True)
 
     def _build_main_effect(self, group: Group) -> None:
@@ -440,7 +469,7 @@ class Page:
             self._build_group(inner)
 
     def _build_controls(self, controls: Iterable[Control], section: str = "") -> None:
-        """Add fields. section: the word before a name that several fields have."""
+        """Add fields. section: the word before labels that are in SHARED_NAMES."""
         for control in controls:
             label = (
                 f"{section}.{control.label}" if section and control.label in SHARED_NAMES else None
@@ -499,7 +528,13 @@ class Page:
         self._subscribe(part, lambda value: self.ask(**{name: value}))
 
     def _subscribe(self, part: Any, act: Callable[[Any], None], kind: str = "on_update") -> None:
-        """Call `act` with the value that people give a widget. The page says what it raises."""
+        """Call `act` with each value that people give a widget. The page shows what it raises.
+
+        Args:
+            part: viser's handle of the widget.
+            act: A function of the widget's value.
+            kind: The name of viser's method that takes a listener.
+        """
 
         async def on_event(event: Any) -> None:
             if event.client is None:  # not people, but `_show_values`
@@ -548,7 +583,13 @@ class Page:
         )
 
     def _add_reported_task(self, part: Any, word: str, task: Callable[[], None]) -> None:
-        """Have the viewer's thread do a task. A part of the page shows a word until it is done."""
+        """Have the viewer's thread run a task. A widget shows a word until the task is done.
+
+        Args:
+            part: viser's handle of the widget.
+            word: The word.
+            task: The task; on success it shows its result in the widget.
+        """
 
         def act() -> None:
             try:
@@ -566,7 +607,7 @@ class Page:
             self._move_to_recorded_camera()
 
     def _show_values(self) -> None:
-        """Have all widgets stand at the recipe's values."""
+        """Set all widgets to the recipe's values."""
         try:
             recipe = self.recipe(self.request.edits)
         except RecipeError as error:
@@ -584,22 +625,23 @@ class Page:
         self._variant.value = recipe.variant
         self._tier.value = recipe.quality.tier or NONE
 
-    # ---- Shown by the viewer's thread ------------------------------------------------------------
+    # ---- Called by the viewer's thread -----------------------------------------------------------
 
     def show_progress(self, picture: ShownPicture) -> None:
-        """Take note that a picture has been sent."""
+        """Store a picture that was sent, and update the status line."""
         self._picture = picture
         self._failed_request = None
         self.update_status()
 
     def show_failure(self, request: ViewRequest) -> None:
-        """Take note that a wish could not be drawn."""
+        """Store a request that could not be drawn, and update the status line."""
         self._failed_request = request
         self.update_status()
 
     def update_status(self) -> None:
-        """Say what the picture shows, and what is being done for the next one. Any thread may call
-        it.
+        """Update the status line: the picture, and the work for the next one.
+
+        Any thread may call it.
         """
         if self.is_closed:
             return
@@ -621,7 +663,7 @@ class Page:
             self._show_bar(status)
 
     def _show_bar(self, status: Status) -> None:
-        """Show the finished share as a bar; where it is not known, the bar only moves."""
+        """Show the finished share as a bar. If the share is not known, the bar only moves."""
         is_known = status.share is not None or not status.is_long
         value = round(BAR_FULL * (status.share or 0.0), 1) if is_known else BAR_FULL
         if self._bar.value != value:
@@ -630,33 +672,35 @@ class Page:
             self._bar.animated = not is_known
 
     def show_warning(self, text: str | None) -> None:
-        """Show a warning about the view; None takes it away."""
+        """Show a warning about the view; None removes it."""
         content = "" if text is None else paragraph(text, style=_WARNING)
         if self._warning.content != content:
             self._warning.content = content
             self._warning.visible = text is not None
 
     def show_error(self, text: str | None) -> None:
-        """Show an error; None takes it away."""
+        """Show an error; None removes it."""
         if text is None and not self._error.visible:
             return
         self._error.content = paragraph(text or "", style=_ERROR)
         self._error.visible = text is not None
 
     def show_plan(self, content: str) -> None:
-        """Show HTML of a table."""
+        """Show the table of the plan, as HTML."""
         if self._plan.content != content:
             self._plan.content = content
 
     def show_tiers(self, content: str) -> None:
-        """Show HTML of a table."""
+        """Show the table of the tiers, as HTML."""
         self._tiers.content = content
 
     def show_saved(self, text: str, command: str) -> None:
+        """Show the names of saved files, and the command line that renders them."""
         self._save_report.content = paragraph(text)
         self.show_command(command)
 
     def show_command(self, command: str) -> None:
+        """Show a command line with a button that copies it."""
         content = (
             f'<div style="{STYLE}">'
             '<textarea readonly rows="6" style="width:100%;font:11px monospace">'
@@ -668,7 +712,13 @@ class Page:
             self._command.content = content
 
     def show_picture(self, rgb: np.ndarray, depth_m: np.ndarray | None, *, moving: bool) -> None:
-        """Send a picture: as PNG at rest, as JPEG while something moves."""
+        """Send a picture, as PNG at rest and as JPEG while something moves.
+
+        Args:
+            rgb: [H, W, 3], uint8.
+            depth_m: [H, W], metres, 0 where there is no surface; None without overlays.
+            moving: True while something moves.
+        """
         depth = None if depth_m is None else page_depth(depth_m)
         kind = "jpeg" if moving else "png"
         self.client.scene.set_background_image(rgb, kind, jpeg_quality=80, depth=depth)
@@ -676,7 +726,12 @@ class Page:
     def show_overlays(
         self, request: ViewRequest, points: tuple[np.ndarray, np.ndarray] | None
     ) -> None:
-        """Draw the boxes, cameras and LiDAR returns that the wish asks for over the picture."""
+        """Draw the boxes, cameras and LiDAR returns of a request over the picture.
+
+        Args:
+            request: The request.
+            points: Points and colours of LiDAR returns, from `lidar_points`; None for none.
+        """
         scene = self.viewer.scene
         frame = self.frame_of(request)
         for handle in self._overlays.values():
@@ -716,7 +771,10 @@ class Page:
 
 
 def first_camera(scene: Scene, frame: Frame) -> str:
-    """Return a camera that looks ahead, if possible one that the scene was made from."""
+    """Return the name of a camera that looks ahead.
+
+    Cameras whose images the scene was made from come first.
+    """
     unfitted_names = unfitted_cameras(scene)
     names = [name for name in frame.cameras if name not in unfitted_names] or list(frame.cameras)
     return min(names, key=lambda name: ("front" not in name, len(name)))
@@ -725,7 +783,7 @@ def first_camera(scene: Scene, frame: Frame) -> str:
 def _is_near(
     wxyz: np.ndarray, position: np.ndarray, target_position: np.ndarray, target_rotation: np.ndarray
 ) -> bool:
-    """Return True if a pose is within POSE_M and POSE_RAD of one that the window was put at."""
+    """Return True if a pose is within POSE_M and POSE_RAD of a target."""
     w, x, y, z = wxyz
     ahead = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
     turn_rad = float(np.linalg.norm(ahead - target_rotation[:, 2]))

@@ -1,8 +1,8 @@
-"""The server behind the pages: one thread draws what each asks for last, first for those that move.
+"""The server of `climategs view`: it serves pages, and one thread draws for all of them.
 
-While a camera or a slider moves, pictures are small and rough, and only the latest wish counts; at
-rest the picture is the one that `climategs render` writes. A page that is slow to take pictures
-waits in its own connection, and a closed one is forgotten.
+The thread draws the latest request of each page; pages on which something moves come first. While
+a camera or a slider moves, pictures are small and rough. At rest the picture is the one that
+`climategs render` writes. A page that is slow to take pictures delays only its own connection.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class Pages(Protocol):
     def stop(self) -> None: ...
 
     def open_page(self, client: ClientHandle) -> Callable[[str], None]:
-        """Open a page. Return the function that shows there what the server has refused."""
+        """Open a client's page. Return the function that shows on it what the server refused."""
         ...
 
     def close_page(self, client: ClientHandle) -> None: ...
@@ -146,16 +146,16 @@ def import_viser() -> Any:
 
 @contextlib.contextmanager
 def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
-    """Serve pages at an address within the block, which gets their URL with its token.
+    """Serve pages while the block runs. The block gets the pages' URL with its token.
 
     Args:
-        viser: The module.
-        viewer: What is served.
+        viser: The module viser.
+        viewer: The pages.
         host: An address of this machine.
-        port: Or the next that is free.
+        port: The port; the next free one is taken if it is in use.
 
     Raises:
-        ClimateGSError: the address is none of this machine's.
+        ClimateGSError: this machine does not have the address.
     """
     from tools.view.messages import MAX_MESSAGE_BYTES, PageConnection  # has viser's libraries
 
@@ -204,8 +204,9 @@ def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
 
 
 def _note_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Say in one line that a message of a page ended in an exception: viser casts the values of
-    widgets before anything checks them.
+    """Log in one line that a message of a page ended in an exception.
+
+    viser casts the values of widgets before anything checks them.
     """
     error = context.get("exception")
     if error is None:
@@ -254,19 +255,19 @@ class Viewer:
         self._ticker.join(JOIN_S)
 
     def activity_for(self, page: Page) -> Activity | None:
-        """Return what the thread does for a page, or is about to; None while it serves another."""
+        """Return the thread's work for a page; None while it works for another page."""
         current = self._activity
         if current is None:
             return Activity()
         return current[1] if current[0] is page else None
 
     def _note_pass(self, progress: PassProgress) -> None:
-        """Take note that the thread has got to a pass, or to a step of one."""
+        """Store the pass, or the step of a pass, that the thread has reached."""
         if self._activity is not None:
             self._activity[1].progress = progress
 
     def _update_pages(self) -> None:
-        """Have all pages say what is being done, again and again until the server ends."""
+        """Update the status lines of all pages every TICK_S seconds until the server ends."""
         while not self._end.wait(TICK_S):
             for page in tuple(self.pages):
                 page.update_status()
@@ -285,7 +286,7 @@ class Viewer:
             self.pages = [page for page in self.pages if not page.is_closed]
 
     def report(self, page: Page, error: Exception) -> None:
-        """Say on the page what went wrong; log the traceback of a defect."""
+        """Show an error on its page. Log the traceback if it is a defect of this program."""
         if page.is_closed:
             return
         if not isinstance(error, ClimateGSError | RecipeError):
@@ -299,7 +300,7 @@ class Viewer:
             self._serve_pages()
 
     def _count_compiling(self, change: int) -> None:
-        """Count a kernel that begins to be compiled (1), or that is compiled (-1)."""
+        """Count a compilation of a kernel. change: 1 when it begins, -1 when it ends."""
         if self._activity is not None:
             activity = self._activity[1]
             activity.compiling = max(0, activity.compiling + change)
@@ -326,8 +327,11 @@ class Viewer:
                 self._activity = None
 
     def _next_work(self) -> tuple[Page | None, Any]:
-        """Return the page that has waited longest and its work; or None, and the seconds until
-        there is work (None: until something changes).
+        """Return the page to work for next.
+
+        Returns:
+            The page that has waited longest, and its work. If no page has work: None, and the
+            seconds until there is work, or None if work begins only after a change.
         """
         now = time.monotonic()
         pause = None
@@ -438,9 +442,18 @@ class Viewer:
     ) -> tuple[PageImage, dict[str, float]]:
         """Return the picture without bars, and the seconds of its passes by their names.
 
+        Args:
+            page: The page.
+            request: The page's request when the work began.
+            recipe: The request's recipe, or the last valid one.
+            camera: The camera, before the recipe's scale.
+            factor: The resolution relative to the recipe's.
+            moving: True while something moves.
+
         Raises:
-            _Outdated: at rest, before a pass: the page is closed or wishes for something else.
-                Within a preparation: the page is closed, or an effect has been taken out.
+            _Outdated: the picture is no longer needed. Before a pass at rest: the page is closed
+                or its request has changed. Within a preparation: the page is closed, or its
+                request lacks an effect of the recipe.
         """
 
         def check_request(progress: PassProgress) -> None:
@@ -512,7 +525,7 @@ class Viewer:
         camera: Camera,
         pass_seconds: dict[str, float],
     ) -> None:
-        """Show what follows a picture at rest: overlays, the plan and the command line."""
+        """Show all that follows a picture at rest: overlays, the plan and the command line."""
         points = None
         if request.lidar:
             self._note_pass(PassProgress("LiDAR returns"))
@@ -542,7 +555,7 @@ class Viewer:
     def _is_new(self, recipe: Recipe) -> bool:
         return tuple(recipe.sections()) not in self._compiled_sections
 
-    # ---- What pages have done --------------------------------------------------------------------
+    # ---- Tasks of pages --------------------------------------------------------------------------
 
     def measure_tiers(self, page: Page) -> None:
         """Show the time of the view at rest in each tier, and its difference from the reference."""
@@ -571,7 +584,17 @@ class Viewer:
         page.show_tiers(table(("tier", "size", "ms", "mean difference, of 255"), rows))
 
     def save(self, page: Page, name: str, *, with_picture: bool) -> None:
-        """Save the recipe; with it the picture, if asked for, and the camera of a flight."""
+        """Save the recipe of a page, and in a flight also its camera, below the output folder.
+
+        Args:
+            page: The page.
+            name: The name of the recipe and of its files.
+            with_picture: True if the picture is saved, too.
+
+        Raises:
+            RecipeError: a recipe cannot have the name, or the edits make no valid recipe.
+            ClimateGSError: the picture is too large, or the folder cannot be written.
+        """
         request = page.request
         recipe = rename_recipe(page.recipe(request.edits), name)
         if with_picture:
@@ -624,21 +647,31 @@ class Viewer:
         write_new_file(path, (json.dumps({**sizes, "frames": [frame]}, indent=1) + "\n").encode())
 
     def _view_words(self, request: ViewRequest, camera_path: Path | None) -> str:
-        """Return the scene and the view in words of the command line."""
+        """Return the options of a command line for a request's scene and view.
+
+        Args:
+            request: The request.
+            camera_path: The file of a flight's camera; None for the recorded camera.
+        """
         scene = f"--scene {shlex.quote(self.uri)}"
         if camera_path is not None:
             return f"{scene} --camera-path {shlex.quote(str(camera_path))}"
         return (
-            f"{scene} --frames {self.frames[wish.frame].index} --cameras {shlex.quote(wish.camera)}"
+            f"{scene} --frames {self.frames[request.frame].index} "
+            f"--cameras {shlex.quote(request.camera)}"
         )
 
     def _command(self, page: Page, request: ViewRequest) -> str:
-        """Return the command line of the view as it is; a note where files must be saved first."""
+        """Return the command line that renders a request's view.
+
+        A flight and uploaded files have no command line before the recipe is saved. They get a
+        note instead.
+        """
         files = any(path.endswith(("image", "mask", "checkpoint")) for path in request.edits.values)
         if files or request.pose is not None:
             what = "a flight" if request.pose is not None else "an uploaded file"
             return f"# {what}: save the recipe first, and the command will stand here"
-        return request.edits.command(f"{self._where(wish, None)} --out out/view")
+        return request.edits.command(f"{self._view_words(request, None)} --out out/view")
 
 
 def check_size(width: float, height: float) -> None:
@@ -657,8 +690,10 @@ def check_size(width: float, height: float) -> None:
 
 @contextlib.contextmanager
 def _compilations_counted(count: Callable[[int], None]) -> Iterator[None]:
-    """Call a function when numba begins (1) and ends (-1) to compile a kernel; not for kernels that
-    lie in its cache.
+    """Count compilations of numba while the block runs, without kernels that numba has cached.
+
+    Args:
+        count: A function that is called with 1 when a compilation begins and with -1 when it ends.
     """
     from numba.core.event import Event, Listener, install_listener
 
@@ -674,11 +709,11 @@ def _compilations_counted(count: Callable[[int], None]) -> Iterator[None]:
 
 
 class _Outdated(Exception):
-    """Nobody waits for the picture any more."""
+    """Raised when the picture in work is no longer needed."""
 
 
 def _lacks_effect_of(page: Page, recipe: Recipe) -> bool:
-    """Return True if the page asks for a recipe without an effect that another one has."""
+    """Return True if the page now asks for a recipe that lacks an effect of `recipe`."""
     try:
         page_recipe = page.recipe(page.request.edits)
     except RecipeError:
@@ -687,7 +722,12 @@ def _lacks_effect_of(page: Page, recipe: Recipe) -> bool:
 
 
 def _next_factor(factor: float, seconds: float) -> float:
-    """Return the resolution of the next picture while something moves, relative to the recipe's."""
+    """Return the share of the full resolution for the next picture while something moves.
+
+    Args:
+        factor: The share of the last picture.
+        seconds: The time that the last picture took.
+    """
     if seconds > FRAME_S:
         factor *= max(0.7, FRAME_S / seconds)
     elif seconds < FRAME_S / 2:

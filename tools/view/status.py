@@ -122,7 +122,7 @@ def page_status(
     if activity is not None and activity.progress is not None and not activity.compiling:
         total = activity.progress.num_steps
         share = activity.progress.num_done / total if total else None
-    text = f"{_what_is_shown(picture, wish)}: {work}"
+    text = f"{_describe_picture(picture, request)}: {work}"
     return Status(text, is_current, share, waited_s >= BUSY_S)
 
 
@@ -132,7 +132,7 @@ def _describe_picture(picture: ShownPicture | None, request: ViewRequest) -> str
         return "First picture"
     if picture.request is request:
         follows = "what lies over it" if picture.is_at_rest else "the whole one"
-        return f"{'Picture' if picture.is_rest else 'Rough picture'}, {follows} follows"
+        return f"{'Picture' if picture.is_at_rest else 'Rough picture'}, {follows} follows"
     if picture.request.edits != request.edits:
         return "Picture not of this recipe yet"
     views = ((w.frame, w.camera, w.pose) for w in (picture.request, request))
