@@ -1,5 +1,6 @@
-"""What `fit` and `style train` share: steps until the end or a signal, and checkpoints on disk from
-which a training goes on to the same bits.
+"""The training loop of `fit` and `style train`, and its checkpoints.
+
+A training runs until its last step or a signal. It goes on from a checkpoint to the same bits.
 
 A checkpoint's `fit.json` says all there is to say and names the arrays' file with its checksum; it
 is written last and replaced in one step, so a kill at any moment leaves a whole checkpoint: this
@@ -150,7 +151,7 @@ def open_training(
     result: str,
     changed: str,
 ) -> Training:
-    """A new training, or the one that `folder` has a checkpoint of.
+    """Return a new training, or the one whose checkpoint is in `folder`.
 
     trainer: makes one for a number of steps: learning rates that decay need it before the first
     one. estimate(budget_s): the number of steps that fill the time, and seconds of one. result,
@@ -201,7 +202,7 @@ def run_training(
     checkpoint_s: float = CHECKPOINT_S,
     progress: bool = True,
 ) -> Outcome:
-    """Steps from the trainer's to the plan's last, or until asked to stop.
+    """Run steps until the plan's last step, or until a stop is requested.
 
     add(record): of every step. score(): adds rows to the history, about EVALUATIONS times.
     postfix(record): for the progress bar. write(complete): the result; returns the report.
@@ -239,7 +240,7 @@ def run_training(
 
 
 def evaluation_steps(steps: int) -> frozenset[int]:
-    """About EVALUATIONS even points of a run, the last step among them."""
+    """Return about EVALUATIONS evenly spaced steps of a run, with the last step."""
     return frozenset(max(1, round(steps * i / EVALUATIONS)) for i in range(1, EVALUATIONS + 1))
 
 
@@ -310,7 +311,7 @@ class State(BaseModel):
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
-    """Replace the folder's checkpoint. Returned is what its JSON holds.
+    """Replace the folder's checkpoint. Return the content of its JSON file.
 
     Raises:
         OutputError: the system refused; the checkpoint before is then as it was.
@@ -346,7 +347,7 @@ def _check_same(options: Any, before: Checkpoint) -> None:
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Every setting that is not the same: `scale was 0.25, now 0.5`."""
+    """Return every setting that differs as text: `scale was 0.25, now 0.5`."""
     return [
         f"{name} was {before.get(name)}, now {now.get(name)}"
         for name in dict.fromkeys([*before, *now])
@@ -355,7 +356,7 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
 
 
 def load_checkpoint(folder: Path, *, arrays: bool = True) -> Checkpoint | None:
-    """The folder's checkpoint; None where there is none. arrays: False leaves them on disk.
+    """Load the folder's checkpoint; None if there is none. arrays: False leaves them on disk.
 
     Raises:
         OutputError: a file of it is missing, damaged, or of another version.
@@ -433,7 +434,7 @@ Row = Mapping[str, Any]
 
 
 class Line(NamedTuple):
-    """A number of the history's rows, those of a split (test, train) alone where one is named."""
+    """A number of the history's rows. If a split (test, train) is named, only its rows count."""
 
     key: str
     label: str = ""
