@@ -1,6 +1,7 @@
-"""The `climategs` command: models of options, and functions where there is little to ask for, whose
-docstrings are the help; and how errors leave it. Heavy imports stay inside the functions, so that
-`--help` answers at once.
+"""The `climategs` command: its subcommands, and what it prints for errors.
+
+A subcommand is a model of options, or a function if it has few options. Their docstrings are the
+text of `--help`. Heavy imports stay inside the functions, so that `--help` answers at once.
 """
 
 from __future__ import annotations

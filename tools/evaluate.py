@@ -172,29 +172,40 @@ def _say_duration(pairs: int, pair_s: float) -> None:
 
 
 class View(NamedTuple):
-    """An image with its depth. shows_water, shows_actor: bool [H, W]; None without such a file."""
+    """An image with its depth and masks."""
 
     depth_view: DepthView
+    """The image, its depth and its camera."""
     shows_water: np.ndarray | None
+    """[H, W], bool. True where the image shows water; None without such a file."""
     shows_actor: np.ndarray | None
+    """[H, W], bool. True where the image shows an actor; None without such a file."""
 
 
 class Pair(NamedTuple):
     """Two rows of the manifest. The view of row b is warped into that of row a."""
 
     kind: str
+    """The kind of the pair: which frames or cameras it compares."""
     a: int
+    """The row of the view that is compared with the warped one."""
     b: int
+    """The row of the view that is warped."""
 
 
 class Drive(NamedTuple):
-    """The images of one variant of one scene. rows: by (frame, camera)."""
+    """The images of one variant of one scene."""
 
     scene: str
+    """The name of the scene."""
     variant: str
+    """The name of the variant."""
     recipe: str
+    """The name of the recipe."""
     effects: str
+    """The names of the recipe's effects."""
     rows: dict[tuple[int, str], int]
+    """The rows of the manifest by frame and camera."""
 
 
 class Views:
@@ -362,17 +373,20 @@ def _neighbours(views: Views, rows: Sequence[int]) -> list[tuple[int, int]]:
 
 
 class Compared(NamedTuple):
-    """B warped into A. warped: float64 [H, W, 3]. warp: which pixels count. moved: bool [H, W],
-    carried along with a box. water: bool [H, W], where either shows water; None where no file says.
-    noise: float64 [H, W, 2], variance of the cameras' in A and in `warped`; None without any.
-    """
+    """A view A, and a view B that is warped into A."""
 
     a: View
+    """The view A."""
     warped: np.ndarray
+    """[H, W, 3], float64. The picture of B, warped into A."""
     warp: Warp
+    """The warp, with the pixels that count."""
     moved: np.ndarray
+    """[H, W], bool. True where a pixel was moved with a box."""
     water: np.ndarray | None
+    """[H, W], bool. True where A or B shows water; None without such files."""
     noise: np.ndarray | None
+    """[H, W, 2], float64. Variance of camera noise in A and in `warped`; None without noise."""
 
 
 def compare(views: Views, pair: Pair) -> Compared:

@@ -200,43 +200,61 @@ def _place_of(table: pa.Table, among: np.ndarray, clear: set[int], variants: int
 
 
 class Picture(NamedTuple):
-    """A JPEG inside the page. uri: its data. width, height: its size, pixels."""
+    """A JPEG inside the page."""
 
     uri: Markup
+    """The image's bytes as a data URI."""
     width: int
+    """The width, pixels."""
     height: int
+    """The height, pixels."""
 
 
 class Figure(NamedTuple):
-    """A picture with its caption. link: to the file beside the page. depth: its caption shows the
-    colours of depths. keys: (name, CSS colour) of classes.
-    """
+    """A picture with its caption."""
 
     picture: Picture
+    """The picture."""
     alt: str
+    """The text in place of the picture."""
     title: str
+    """The first line of the caption."""
     note: str
+    """The second line of the caption."""
     weather: str | None = None
+    """The weather in words; None without a line for it."""
     link: str | None = None
+    """The link to the image's file next to the page; None without a link."""
     is_depth: bool = False
+    """True if the caption shows the colours of depths."""
     keys: Sequence[tuple[str, str]] = ()
+    """The name and the CSS colour of every class in the picture."""
 
 
 class Shares(NamedTuple):
-    """How many pictures of each kind a page has, and how many bytes each may take."""
+    """Numbers of a page's pictures of each kind, and the bytes that each may take."""
 
     places: int
+    """The number of places that are compared."""
     variants: int
+    """The number of variants that are compared at each place."""
     samples: int
+    """The number of images that are shown with their buffers."""
     thumbnails: int
+    """The number of thumbnails."""
     large_bytes: int
+    """The largest size of a picture of a comparison, bytes."""
     buffer_bytes: int
+    """The largest size of a picture of a buffer, bytes."""
     small_bytes: int
+    """The largest size of a thumbnail, bytes."""
 
     @staticmethod
     def of(images: int) -> Shares:
-        """Share out a page's images: a third for comparisons, a quarter for depth and classes, the
-        rest for contact sheets.
+        """Divide a page's images among the kinds of pictures.
+
+        A third is for comparisons, a quarter for depth and classes, and all others are for contact
+        sheets.
         """
         num_compared = images // 3
         samples = images // 4 // _SAMPLE
@@ -251,16 +269,20 @@ class Shares(NamedTuple):
 
 @dataclass(frozen=True)
 class Gallery:
-    """The page's pictures. clear: the numbers of the variants without weather. cameras: as they
-    stand on the car. linked: whether they lead to the files, which lie beside the page.
-    """
+    """The page's pictures."""
 
     table: pa.Table
+    """The rows of finished images, with the column `draw`."""
     clear: set[int]
+    """The numbers of the variants without weather."""
     cameras: list[str]
+    """The names of the cameras in their order on the car."""
     files: ReportFiles
+    """The files of the output."""
     shares: Shares
+    """The numbers and sizes of pictures."""
     linked: bool
+    """True if pictures link to the output's files, which lie next to the page."""
 
     def compare(self) -> dict[str, Any]:
         """Sliders between variants of one place. lacks: what there is nothing of: a `clear` variant

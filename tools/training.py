@@ -2,9 +2,9 @@
 
 A training runs until its last step or a signal. It goes on from a checkpoint to the same bits.
 
-A checkpoint's `fit.json` says all there is to say and names the arrays' file with its checksum; it
-is written last and replaced in one step, so a kill at any moment leaves a whole checkpoint: this
-one or the one before.
+A checkpoint is a file `fit.json` and a file of arrays, which `fit.json` names with its checksum.
+`fit.json` is written last and replaced in one step. So a kill at any moment leaves a complete
+checkpoint: the new one or the one before.
 """
 
 from __future__ import annotations
@@ -57,7 +57,10 @@ _STOPPING = b"\nstopping after this step; interrupt again to stop at once\n"
 
 @dataclass(frozen=True)
 class Outcome:
-    """code: the command's exit code, 130 where it was interrupted. report: as in report.json."""
+    """The result of a training.
+
+    code: the command's exit code, 130 if it was interrupted. report: the content of report.json.
+    """
 
     code: int
     report: dict[str, Any]
@@ -278,12 +281,16 @@ class StopRequest:
 
 
 class Checkpoint(BaseModel):
-    """A training after `step` of `steps` steps, as `fit.json` holds it but for the arrays.
+    """A training after `step` of `steps` steps, as `fit.json` stores it, and its arrays.
 
-    settings, length: what was asked for. data: what was found in the recorded data. history: rows
-    so far; sums: of the steps since the last row; seconds: spent so far. facts, arrays: the
-    trainer's state; no arrays before the first step. state: their file and its SHA-256. finished:
-    the result and its report stand.
+    settings, length: the settings and the length that the user chose.
+    steps, step: the number of all steps, and of the steps so far.
+    data: facts about the recorded data.
+    finished: True if the result and its report are written.
+    seconds: the time spent so far.
+    history: the rows so far. sums: sums over the steps since the last row.
+    facts, arrays: the trainer's state. Before the first step there are no arrays.
+    state: the file of the arrays and its SHA-256.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -304,7 +311,10 @@ class Checkpoint(BaseModel):
 
 
 class State(BaseModel):
-    """A file of a checkpoint's arrays. file: a name, so that nothing outside the folder is read."""
+    """The file of a checkpoint's arrays, and its SHA-256.
+
+    `file` is a name without a folder, so that nothing outside the checkpoint's folder is read.
+    """
 
     file: str = Field(pattern=r"^[^/\\]+$")
     sha256: str
@@ -444,7 +454,7 @@ class Line(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """last: how a line's last value is written in the legend."""
+    """A panel of the chart. last: the format of a line's last value in the legend."""
 
     title: str
     lines: tuple[Line, ...]

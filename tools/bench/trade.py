@@ -858,7 +858,7 @@ def _whole_lines(tables: Tables) -> list[str]:
 
 
 def _knob_lines(tables: Tables) -> list[str]:
-    """Draw a panel for each recipe: a line for each knob, a mark for settings of all knobs."""
+    """Return a table of knobs: mean ratio of times and worst errors over affected recipes."""
     rows = [
         [f"`{path}`", _text(value), *(c for t in tables for c in _knob_cells(t, path, value))]
         for path, knob in KNOBS.items()
