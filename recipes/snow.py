@@ -104,5 +104,7 @@ class Snow(EffectModel):
 
     def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:
         return (
-            (f"snow {self.depth_m:.3g} m deep", output_surface != "scene") if self.has_effect else None
+            (f"snow {self.depth_m:.3g} m deep", output_surface != "scene")
+            if self.has_effect
+            else None
         )
