@@ -128,7 +128,7 @@ def sky_levels(scene: Scene, maps: StyleMaps) -> Int16[Tensor, "N"] | None:
 
 
 def _find_sky_levels(scene: Scene, sky_moments: Float[Tensor, "3 4"]) -> Int16[Tensor, "N"] | None:
-    """Compute what `sky_levels` returns."""
+    """Compute the sky levels (see `sky_levels`) without the memo."""
     background = scene.background
     centres = _camera_centres(scene)
     if len(centres) == 0 or len(background) == 0 or not scene.has_known_gravity:

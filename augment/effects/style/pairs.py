@@ -236,9 +236,8 @@ def _turn_about_grey(
     cross_product = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / 3**0.5
     cos = hue_rad.cos()[:, None, None]
     sin = hue_rad.sin()[:, None, None]
-    hue_matrix = (
-        grey_projection + cos * (torch.eye(3) - grey_projection) + sin * cross_product
-    )  # Rodrigues' formula
+    # Rodrigues' formula.
+    hue_matrix = grey_projection + cos * (torch.eye(3) - grey_projection) + sin * cross_product
     luma_matrix = torch.tensor(LUMA).expand(3, 3)
     return torch.lerp(
         luma_matrix.expand(len(saturation), 3, 3), hue_matrix, saturation[:, None, None]

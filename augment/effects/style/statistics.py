@@ -220,7 +220,7 @@ def closed_maps(
     sky_map = map_between(SKY, SKY_LIMITS) if has_sky else picture_map
     splats = land_map[None]
     if per_region:
-        regions = {
+        region_maps = {
             region: torch.lerp(
                 land_map, map_between(region), _region_weight(content[region], style[region])
             )
@@ -228,7 +228,7 @@ def closed_maps(
             if region in common_regions
         }
         splats = torch.stack(
-            [_map_of_class(value, regions, land_map, sky_map) for value in range(NUM_CLASSES)]
+            [_map_of_class(value, region_maps, land_map, sky_map) for value in range(NUM_CLASSES)]
         )
     content_sky = content[SKY] if has_sky else None
     sky_moments = (

@@ -374,9 +374,8 @@ class SceneStyle:
         if self.folds_sh and part.gaussians.sh is self.unstyled_scene.background.sh:
             unfolded = part.gaussians
             sh = self._gpu_sh if backend == CUDA else self._cpu_sh
-            folded_gaussians = memo_of(
-                unfolded
-            ).get(  # one object, whose levels of detail are made once
+            # One object, whose levels of detail are made once.
+            folded_gaussians = memo_of(unfolded).get(
                 ("folded", id(sh)), lambda: dataclasses.replace(unfolded, sh=sh)
             )
             return dataclasses.replace(part, gaussians=folded_gaussians)
