@@ -576,7 +576,7 @@ def tube(start: Sequence[float], end: Sequence[float], radius_m: float, look: Lo
 
 
 def ellipsoids(centres: Vectors, axes: np.ndarray, look: Look) -> Shapes:
-    """Return ellipsoids with orthogonal semi-axes axes [P, 3, 3] (rows), metres."""
+    """Return ellipsoids with orthogonal semi-axes, the rows of `axes` [P, 3, 3], metres."""
     return Shapes.of(Kind.ELLIPSOID, _as_vectors(centres), axes.transpose(1, 0, 2), look)
 
 

@@ -791,7 +791,7 @@ class AdamState(NamedTuple):
     sh_v: np.ndarray
     age: np.ndarray
     grads: np.ndarray
-    smallest: np.ndarray
+    min_scale_m: np.ndarray
 
 
 @kernel
@@ -816,7 +816,7 @@ def update_splats(
     counts = gradients.counts
     age = state.age
     grads = state.grads
-    smallest = state.smallest
+    min_scales_m = state.min_scale_m
     for block in prange(blocks.shape[0]):
         part = blocks[block, 0]
         num_splats, num_sh = sizes[part]
@@ -851,8 +851,8 @@ def update_splats(
                 second = corrections[Index(2) * n + Index(1)]
                 _update_geometry(
                     (means, quats, scales, opacities), splat, rows, row,
-                    basis[Index(_MAX_SH * NUM_LANES) + lane], rates, smallest[moment_row], (first,
-                    second),
+                    basis[Index(_MAX_SH * NUM_LANES) + lane], rates, min_scales_m[moment_row],
+                    (first, second),
                     (state.geometry_m, state.geometry_v), moment_row * Index(GEOMETRY), work,
                 )  # fmt: skip
                 _update_sh(
@@ -901,7 +901,9 @@ def _adam8(g, rates, first, second, m, m_at, v, v_at):
 
 
 @kernel_function()
-def _update_geometry(splats, splat, rows, row, pixel_m, rates, smallest, bias, moments, at, work):
+def _update_geometry(
+    splats, splat, rows, row, pixel_m, rates, min_scale_m, bias, moments, at, work
+):
     """Update a splat's mean, rotation, scales and opacity."""
     means, quats, scales, opacities = splats
     (first, second) = bias
@@ -918,7 +920,7 @@ def _update_geometry(splats, splat, rows, row, pixel_m, rates, smallest, bias, m
     v8.store(work, Index(8), factors)
     for i in range(Index(3)):
         means[Index(3) * splat + i] -= pixel_m * work[i]
-    min_scale = max(smallest, rates[R_SMALLEST])
+    min_scale = max(min_scale_m, rates[R_SMALLEST])
     norm = np.float32(0)
     for i in range(Index(4)):
         q = quats[Index(4) * splat + i] - work[Index(G_QUAT) + i]

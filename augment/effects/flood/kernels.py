@@ -193,7 +193,7 @@ def _add_full(full_waves, count, distance):
 def _add_fading(fading_waves, count, distance, n, spacing, limits, view, sums):
     """Add waves as `_add_full` does, with weights; the part they leave out adds to `lost`.
 
-    towards: vx, vy. sums: the sums to add to: lost (a slope variance), xx, xy, yy, gx, gy.
+    view: vx, vy. sums: the sums to add to: lost (a slope variance), xx, xy, yy, gx, gy.
     """
     vx, vy = view
     lost, xx, xy, yy, gx, gy = sums
