@@ -343,9 +343,9 @@ def apply_style(options: ApplyOptions) -> dict[str, Any]:
         print_note(f"note: {problem}")
     scene = prepare_for_storage(scene)
     open_s = time.perf_counter()
-    if requested.changes and requested.method == "gscm":
+    if requested.has_effect and requested.method == "gscm":
         content_pictures(scene)
-    elif requested.changes:
+    elif requested.has_effect:
         content_statistics(scene, per_region=requested.per_region)
     measure_s = time.perf_counter()
     maps = style_maps(scene, requested)
@@ -412,7 +412,7 @@ def _style_facts(style: Style) -> dict[str, Any]:
     for name in ("image", "mask", "checkpoint"):
         if name in facts:
             path = Path(facts[name])
-            content = path.read_bytes() if style.changes else b""
+            content = path.read_bytes() if style.has_effect else b""
             facts[name] = {"name": path.name, "sha256": hashlib.sha256(content).hexdigest()}
     return facts
 

@@ -115,7 +115,7 @@ def test_every_field_of_every_effect_has_a_control_whose_ends_its_model_takes(du
 def test_an_effect_that_is_switched_on_starts_from_values_its_model_takes(dust):
     for section in SECTIONS:
         edits = Edits("clear").with_section(section)
-        assert section_at(edits.recipe(), section).changes, start_of_section(section)
+        assert section_at(edits.recipe(), section).has_effect, start_of_section(section)
         assert section_at(edits.without_section(section).recipe(), section) is None
 
 

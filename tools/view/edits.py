@@ -113,7 +113,7 @@ def start_of_section(section: str) -> dict[str, Any]:
     for name in preset_names():
         recipe = load_recipe(name).resolve(0)
         effect = section_at(recipe, section)
-        if effect is not None and effect.changes:
+        if effect is not None and effect.has_effect:
             start = effect.model_dump(mode="json", exclude_defaults=True)
             candidates.append((len(recipe.sections()), len(start), name, start))
     if candidates:

@@ -56,13 +56,13 @@ class FallingEffect(Effect):
         return False
 
     def kernel_key(self, section: Rain | Snowfall) -> Any:
-        return section.changes or None
+        return section.has_effect or None
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:
         section: Rain | Snowfall | None = self.section_of(recipe)
-        if section is None or not section.changes:
+        if section is None or not section.has_effect:
             why = f"the recipe has no {self.name}"
             if section is not None:
                 why = f"{self.section}.rate_mm_h is 0"

@@ -94,7 +94,7 @@ class SnowEffect(Effect):
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:
         snow = self.section_of(recipe)
-        if snow is None or not snow.changes:
+        if snow is None or not snow.has_effect:
             reason = "the recipe has no snow"
             if snow is not None:
                 nothing = "depth" if snow.depth_m == 0 else "coverage"
@@ -130,7 +130,7 @@ class SnowEffect(Effect):
         """Find the exposed surface of the scene, once for all recipes of the job."""
         sections = (self.section_of(recipe) for recipe in context.recipes)
         distinct = dict.fromkeys(
-            exposure_settings(snow, context.scene) for snow in sections if snow and snow.changes
+            exposure_settings(snow, context.scene) for snow in sections if snow and snow.has_effect
         )
         for settings in distinct:
             precompute_shadows(context.scene)

@@ -62,13 +62,13 @@ class StyleEffect(Effect):
     off_switches: ClassVar = {ON_SCENE: ("style", None)}
 
     def kernel_key(self, section: Style) -> Hashable:
-        return (section.applied_to, section.method) if section.changes else None
+        return (section.applied_to, section.method) if section.has_effect else None
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:
         style = self.section_of(recipe)
-        if style is None or not style.changes:
+        if style is None or not style.has_effect:
             why = "the recipe has no style"
             if style is not None:
                 why = "the style has no strength, so it changes nothing"
@@ -103,7 +103,7 @@ class StyleEffect(Effect):
     def precompute(self, context: JobContext) -> None:
         """Precompute the maps, so that other processes render no content and read no files."""
         styles = (self.section_of(recipe) for recipe in context.recipes)
-        for style in dict.fromkeys(s for s in styles if s and s.changes):
+        for style in dict.fromkeys(s for s in styles if s and s.has_effect):
             maps = style_maps(context.scene, style, cameras=context.cameras)
             memo = memo_of(context.scene)
             memo.put(("style maps", style), PackedMaps.of(maps), shared=True)

@@ -69,7 +69,7 @@ def style_maps(scene: Scene, style: Style, *, cameras: Sequence[Camera] | None =
     Raises:
         StyleError: an image, a preset or a checkpoint cannot be used.
     """
-    if not style.changes:
+    if not style.has_effect:
         return StyleMaps(torch.eye(3, 4)[None], torch.eye(3, 4), torch.eye(3, 4))
     memo = memo_of(scene)
 
