@@ -406,7 +406,7 @@ def assert_equal_cells(a: ExposedCells, b: ExposedCells) -> None:
         assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
-# ---- exposed surfaces in files ----------------------------------------------------------------------
+# ---- exposed surfaces in files -------------------------------------------------------------------
 
 SETTINGS = ExposureSettings(cell_m=0.2)
 
