@@ -80,11 +80,7 @@ class StyleEffect(Effect):
     ) -> EffectPlan:
         style = self.section_of(recipe)
         if style is None or not style.has_effect:
-<<<<<<< HEAD
             off_reason = "the recipe has no style"
-=======
-            why = "the recipe has no style"
->>>>>>> 57ebf603587ad6a2db4c5db5ff579f0408a41ea8
             if style is not None:
                 off_reason = "the style has no strength, so it changes nothing"
             steps = (
