@@ -117,11 +117,7 @@ def test_every_field_of_every_effect_has_a_control_whose_ends_its_model_takes(du
 def test_an_effect_that_is_switched_on_starts_from_values_its_model_takes(dust):
     for section in SECTIONS:
         edits = Edits("clear").with_section(section)
-<<<<<<< HEAD
         assert section_at(edits.recipe(), section).has_effect, start_values(section)
-=======
-        assert section_at(edits.recipe(), section).has_effect, start_of_section(section)
->>>>>>> 57ebf603587ad6a2db4c5db5ff579f0408a41ea8
         assert section_at(edits.without_section(section).recipe(), section) is None
 
 
