@@ -48,7 +48,7 @@ from tools.output import print_note
 EVALUATIONS = 10
 CHECKPOINT_S = 120.0
 RESERVE = 0.05  # of the time, for evaluations and checkpoints
-VERSION = 3
+VERSION = 4
 PLAN_FILE = "fit.json"  # the checkpoint's settings, history and names of arrays
 REPORT_FILE = "report.json"  # the report of a training, for programs
 _STATES = "state-*.safetensors"
