@@ -548,16 +548,18 @@ class _Writing:
             self._write_lists(new, formats, sets)
         return LabelsResult(
             folder=new,
-            **self._counted(formats),
+            images=self._counts("images", formats),
+            objects=self._counts("objects", formats),
+            num_hidden=self._counts("hidden", formats),
             parts=dict(self.parts),
             unmapped=self.categories.unmapped,
             unused_rows=self.categories.unused,
             without_numbers=self.without_numbers,
         )
 
-    def _counted(self, formats: set[str]) -> dict[str, Any]:
-        kinds = ("images", "objects", "hidden")
-        return {kind: {f: self.counts[kind, f] for f in sorted(formats)} for kind in kinds}
+    def _counts(self, kind: str, formats: set[str]) -> dict[str, int]:
+        """Return the number of images, objects or hidden objects by format."""
+        return {name: self.counts[kind, name] for name in sorted(formats)}
 
     def _make_folders(self, new: Path, formats: set[str]) -> None:
         parts = [
@@ -627,7 +629,9 @@ class _Writing:
             asked=self.request,
             categories=self.categories.names,
             unmapped=dict(self.categories.unmapped),
-            **self._counted(formats),
+            images=self._counts("images", formats),
+            objects=self._counts("objects", formats),
+            hidden=self._counts("hidden", formats),
         )
         (new / RECORD).write_text(record.model_dump_json(indent=1) + "\n")
 
