@@ -557,7 +557,7 @@ class _Writing:
             without_numbers=self.without_numbers,
         )
 
-    def _counts(self, kind: str, formats: set[str]) -> dict[str, int]:
+    def _counts(self, kind: str, formats: set[str]) -> dict[Any, int]:
         """Return the number of images, objects or hidden objects by format."""
         return {name: self.counts[kind, name] for name in sorted(formats)}
 

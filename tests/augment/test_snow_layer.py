@@ -703,7 +703,7 @@ def glinting_street():
         name: layer(
             near_discs(count, seed, far_m=2.0),
             own=2,
-            slopes=0.3 * torch.ones(count, 3),
+            sunlight_rgb=0.3 * torch.ones(count, 3),
             normals=normals[:count],
             crystals=crystals(count, seed, spread_m=1.0) if seed == 8 else None,
         )
