@@ -451,8 +451,8 @@ class TimedBoxes:
         frame: number of the frame.
         boxes: the boxes.
         timestamps_ns: int64 [B], or one time for all.
-        moves: bool [B], True for boxes that are labelled as moving. None if their attributes say
-            it.
+        is_moving: bool [B], True for boxes that are labelled as moving. None if their attributes
+            say it.
         rotations: float64 [B, 3, 3], if they are known better than from the quaternions.
     """
 
@@ -682,7 +682,7 @@ def scene_of_drive(
     Args:
         drive: the drive.
         options: options of the opening.
-        added: Gaussians of the background from elsewhere.
+        extra_background: Gaussians of the background from elsewhere.
         ground: the road, if it is known from elsewhere.
 
     Raises:

@@ -228,8 +228,10 @@ class PhotoStyle:
     """Those of the splats' maps that differ from the first; None where there are none."""
     mark_maps: Float[Tensor, "R 3 4"] | None = None
     """Maps that turn any colour into marks: the share of sky in a splat, and how far it takes each
-    of `others`; [R, 3, 4], by rows of the background's splats, or by classes where `rows` is None.
-    None where there is nothing to mark, or where `others` are more than two."""
+    of `other_splat_maps`; [R, 3, 4], by rows of the background's splats, or by classes where
+    `mark_rows` is None. None where there is nothing to mark, or where `other_splat_maps` are more
+    than two.
+    """
     mark_rows: Int16[Tensor, " N"] | None = None
     """Row of `marks` of each splat of the background; None where `marks` go by classes."""
 
@@ -332,7 +334,7 @@ class Photo:
         """Return the photo with what lies on the scene, before any smog.
 
         Args:
-            raster: buffers of the parts that `prepare` gives.
+            raster: buffers of the parts that `prepare_parts` gives.
             parts: those parts.
         """
         rgb = self._land if self.style is None else self._styled(self.style, raster, parts)
@@ -348,11 +350,11 @@ class Photo:
         """Return the photo in the colours of a style."""
         assert raster.alpha is not None
         if not self._takes_marks(parts):
-            surface_rgb, sky_rgb, level = self.layer_colors(raster, parts, self.camera)
+            surface_rgb, sky_rgb, sky_level = self.layer_colors(raster, parts, self.camera)
             return mix(
                 surface_rgb,
                 sky_rgb,
-                self.sharpen(self._sky_share(raster.alpha, level), SKY_RADIUS_FACTOR),
+                self.sharpen(self._sky_share(raster.alpha, sky_level), SKY_RADIUS_FACTOR),
             )
         alpha = raster.alpha
         marks = raster.rgb
@@ -360,24 +362,24 @@ class Photo:
         if choose_kernels(self.backend, alpha, marks) == CPU:
             share = self.sharpen(self._marked_share_on_cpu(alpha, marks), SKY_RADIUS_FACTOR)
         else:
-            level = (marks[..., 0] / alpha.clamp_min(1e-6)).clamp_max(1)
-            share = self.sharpen(self._sky_share(alpha, level), SKY_RADIUS_FACTOR)
+            sky_level = (marks[..., 0] / alpha.clamp_min(1e-6)).clamp_max(1)
+            share = self.sharpen(self._sky_share(alpha, sky_level), SKY_RADIUS_FACTOR)
         if style.other_splat_maps is None and self.backend == CPU:
             return self._in_both_on_cpu(style, share)
         surface_rgb = self._land
-        for number, other in enumerate(
+        for number, splat_map in enumerate(
             () if style.other_splat_maps is None else style.other_splat_maps
         ):
             weight = (marks[..., 1 + number] / alpha.clamp_min(1e-6)).clamp_max(1)
-            surface_rgb = mix(surface_rgb, self._in_colors(other), weight)
+            surface_rgb = mix(surface_rgb, self._in_colors(splat_map), weight)
         return mix(surface_rgb, self._sky, share)
 
     def _sky_share(
-        self, alpha: Float[Tensor, "H W"], level: Float[Tensor, "H W"] | None
+        self, alpha: Float[Tensor, "H W"], sky_level: Float[Tensor, "H W"] | None
     ) -> Float[Tensor, "H W"]:
         """Return the share of sky in each pixel: beside the surfaces, and painted on them."""
         alpha = opaque_alpha(alpha)
-        share = 1 - alpha if level is None else 1 - alpha * (1 - level)
+        share = 1 - alpha if sky_level is None else 1 - alpha * (1 - sky_level)
         if self.height_m is not None:
             share = share.masked_fill(self.ray_fall > MIN_ROAD_FALL, 0.0)
         return share
@@ -506,7 +508,7 @@ class Photo:
 
         Args:
             values: the values.
-            times: radius of the guided filter, in RADIUS.
+            times: radius of the guided filter, in FILTER_RADIUS_FRACTION.
         """
         radius = max(2, round(FILTER_RADIUS_FRACTION * times * self.camera.width))
         source = np.ascontiguousarray(values.detach().cpu().float().numpy())
@@ -698,7 +700,7 @@ def open_photo(
         pixels = read_scaled(path, recorded_camera, camera)
     except ImageFault as fault:
         raise SceneError(f"camera {camera.name}: recorded image {path} {fault}") from None
-    undone = None
+    scene_from_recorded = None
     if color_map is not None:
         matrix = color_map[:, :3].double()
         offset = color_map[:, 3].double()
@@ -709,12 +711,12 @@ def open_photo(
                 f"exposure: neutral"
             )
         inverse = torch.linalg.inv(matrix)
-        undone = torch.cat([inverse, -(inverse @ offset)[:, None]], 1).float()
+        scene_from_recorded = torch.cat([inverse, -(inverse @ offset)[:, None]], 1).float()
     height_m = None
     if scene.has_known_gravity and scene.ground_z_m is not None:
         camera_height_m = float(camera.centre[2]) - scene.ground_z_m
         height_m = min(camera_height_m, MAX_CAMERA_HEIGHT_M) if camera_height_m > 0 else None
-    return Photo(camera, pixels, backend, undone, height_m)
+    return Photo(camera, pixels, backend, scene_from_recorded, height_m)
 
 
 def _at_most(camera: Camera, width_px: int) -> tuple[int, int]:

@@ -77,7 +77,7 @@ def bound_squares(
 
     Args:
         gaussians: the Gaussians.
-        chosen: mask of the Gaussians, [N].
+        is_chosen: mask of the Gaussians, [N].
         side_m: side of the squares; infinite for one box.
         owner: instance id of the part.
     """

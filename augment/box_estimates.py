@@ -77,7 +77,7 @@ class SortedPoints:
             boxes: the boxes.
             number: index of the box.
             low_m: lowest corner of the part that counts, in the box's axes from its centre.
-            margins: if True, sides reach as far as the box owns surfaces; else as far as it is
+            with_margins: if True, sides reach as far as the box owns surfaces; else as far as it is
                 labelled.
         """
         high_m = boxes.high_m[number] if with_margins else boxes.sizes_m[number] / 2

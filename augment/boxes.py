@@ -63,10 +63,10 @@ class BoxPixels:
 
 
 def marked_fraction(
-    marked: Int64[np.ndarray, " B"], pixels: Int64[np.ndarray, " B"]
+    num_marked: Int64[np.ndarray, " B"], num_pixels: Int64[np.ndarray, " B"]
 ) -> Float64[np.ndarray, " B"]:
     """Return marked / pixels; 0 where pixels were not counted, NaN where there are none."""
-    return np.where(pixels == 0, np.nan, marked / np.maximum(pixels, 1))
+    return np.where(num_pixels == 0, np.nan, num_marked / np.maximum(num_pixels, 1))
 
 
 def count_pixels(
@@ -80,15 +80,15 @@ def count_pixels(
     Args:
         boxes: the boxes.
         camera: the camera of the image.
-        depth_m: as for `shown_pixels`.
+        depth_m: as for `pixels_of_boxes`.
         mask: the mask.
     """
-    pixels = np.zeros(len(boxes), np.int64)
-    marked = np.zeros(len(boxes), np.int64)
+    num_pixels = np.zeros(len(boxes), np.int64)
+    num_marked = np.zeros(len(boxes), np.int64)
     for number, rows, columns in pixels_of_boxes(boxes, camera, depth_m):
-        pixels[number] = len(rows)
-        marked[number] = np.count_nonzero(mask[rows, columns] == 255)
-    return BoxPixels(pixels, marked)
+        num_pixels[number] = len(rows)
+        num_marked[number] = np.count_nonzero(mask[rows, columns] == 255)
+    return BoxPixels(num_pixels, num_marked)
 
 
 def pixels_of_boxes(
@@ -227,7 +227,7 @@ def pixel_windows(boxes: WorldBoxes, camera: Camera) -> Int64[np.ndarray, "B 4"]
 
 
 def cut_edges(end: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return `end` of each edge [..., 3], moved along the edge to z = NEAR_M where it is nearer."""
+    """Return `end` of each edge [..., 3], moved along it to MIN_DEPTH_M where it is nearer."""
     length = other[..., 2] - end[..., 2]
     is_behind = (end[..., 2] < MIN_DEPTH_M) & (length > 0)
     t = np.where(is_behind, (MIN_DEPTH_M - end[..., 2]) / np.where(is_behind, length, 1.0), 0.0)
@@ -595,9 +595,9 @@ def paint_boxes(
 ) -> UInt16[np.ndarray, "H W"]:
     """Return the instance image of a scene's actors with the boxes that have no actor.
 
-    A pixel of no actor shows the box in which its surface lies (`shown_pixels`), unless the surface
-    is of a class that no object has. Of several boxes, a box whose labelled sides enclose the
-    surface goes before one in whose margin it lies, and then the smaller box.
+    A pixel of no actor shows the box in which its surface lies (`pixels_of_boxes`), unless the
+    surface is of a class that no object has. Of several boxes, a box whose labelled sides enclose
+    the surface goes before one in whose margin it lies, and then the smaller box.
 
     Args:
         instance: the actors' numbers by pixel.
@@ -677,8 +677,8 @@ def encode_masks(
 
 def _as_texts(counts: list[np.ndarray]) -> np.ndarray:
     """Return differences of run lengths as COCO's texts."""
-    joined = np.concatenate([np.zeros(0, np.int64), *counts])
-    groups = joined[:, None] >> np.arange(0, 35, 5)  # [N, 7]: of 35 bits
+    all_counts = np.concatenate([np.zeros(0, np.int64), *counts])
+    groups = all_counts[:, None] >> np.arange(0, 35, 5)  # [N, 7]: of 35 bits
     remaining_bits = groups >> 5  # what follows is zeros, or ones of a negative number
     is_last = np.where(groups & 16, remaining_bits == -1, remaining_bits == 0)
     last = is_last.argmax(axis=1)[:, None]

@@ -143,16 +143,16 @@ class CastShadows:
 
     def light_at(self, places_m: np.ndarray) -> np.ndarray:
         """Return luminance over that in the sun at places [N, 3], [N]; NaN off the known ground."""
-        lit, known_share, height_m = self.sample(places_m[:, 0], places_m[:, 1])
+        sun_share, known_share, height_m = self.sample(places_m[:, 0], places_m[:, 1])
         ratio = self.luminance_ratio
         on_ground = (known_share > 0.5) & (np.abs(places_m[:, 2] - height_m) < ON_GROUND_M)
-        light = ratio + (1 - ratio) * lit / np.maximum(known_share, 0.5)
+        light = ratio + (1 - ratio) * sun_share / np.maximum(known_share, 0.5)
         return np.where(on_ground, light, np.nan)
 
     def sample(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return lit, known and height_m at places of any shape, float32, interpolated.
 
-        `known` is 0 beyond the map.
+        `known_share` is 0 beyond the map.
         """
         # OpenCV's pixels are centred at whole numbers.
         rows = ((x_m - self.corner_m[0]) / self.cell_m - 0.5).astype(np.float32)
@@ -252,11 +252,13 @@ def _find_shadows(scene: Scene) -> CastShadows | None:
     horizons = grid.horizons(tops, road.height_m, rows, columns, _AZIMUTHS)
     log_luminance = road.log_luminance[rows, columns]
     log_luminance = log_luminance.clip(*np.quantile(log_luminance, [0.01, 0.99]))
-    explained = _explain_variance(horizons, log_luminance)
-    if not np.isfinite(explained).any():
+    explained_share = _explain_variance(horizons, log_luminance)
+    if not np.isfinite(explained_share).any():
         return None
-    explained = np.where(np.isfinite(explained), explained, 0.0)
-    azimuth_index, elevation_index = np.unravel_index(explained.argmax(), explained.shape)
+    explained_share = np.where(np.isfinite(explained_share), explained_share, 0.0)
+    azimuth_index, elevation_index = np.unravel_index(
+        explained_share.argmax(), explained_share.shape
+    )
     slope = math.tan(_ELEVATIONS[elevation_index])
     is_shaded = horizons[azimuth_index] > slope
     log_rgb = np.log(np.maximum(road.linear[rows, columns], 1e-4))
@@ -272,9 +274,7 @@ def _find_shadows(scene: Scene) -> CastShadows | None:
     if min(dark_and_lit[0].sum(), dark_and_lit[1].sum()) < _MIN_SHARE * len(is_dark):
         certainty = 0.0
         dark_and_lit = (is_dark, ~is_dark)
-    modes = [
-        np.median(log_rgb[chosen], 0) if chosen.any() else log_rgb[0] for chosen in dark_and_lit
-    ]
+    modes = [np.median(log_rgb[mask], 0) if mask.any() else log_rgb[0] for mask in dark_and_lit]
     change = (modes[0] - modes[1]).clip(math.log(_DARKEST), 0)
     ratio = np.exp(certainty * change)
 
@@ -306,7 +306,7 @@ def _find_shadows(scene: Scene) -> CastShadows | None:
         lit_share=float(lit[all_ground.is_known].mean()),
         azimuth_deg=math.degrees(_AZIMUTHS[azimuth_index]),
         elevation_deg=math.degrees(_ELEVATIONS[elevation_index]),
-        explained_share=explained.astype(np.float32),
+        explained_share=explained_share.astype(np.float32),
         sun_share=np.where(all_ground.is_known, lit, 0).astype(np.float32),
         known_share=all_ground.is_known.astype(np.float32),
         height_m=np.where(all_ground.is_known, all_ground.height_m, 0).astype(np.float32),
@@ -554,10 +554,10 @@ class FadedShadows:
             The share of the sun that each point sees (the mean for points that are no ground, which
             changes nothing), and factors of encoded colours by steps of that share.
         """
-        lit = _lit_near(self.shadows, *np.moveaxis(points_m, -1, 0))
+        sun_share = _find_sun_share(self.shadows, *np.moveaxis(points_m, -1, 0))
         factors = _fade_factors(self.shadows, self.transmittance, np.linspace(0, 1, 256))
         factors[round(255 * self.shadows.lit_share)] = 1
-        return lit.astype(np.float32), factors
+        return sun_share.astype(np.float32), factors
 
 
 def faded_shadows(scene: Scene, transmittance: float) -> FadedShadows | None:
@@ -573,9 +573,9 @@ def faded_shadows(scene: Scene, transmittance: float) -> FadedShadows | None:
 
     def place() -> Tensor:
         g = scene.background
-        lit = _lit_near(shadows, *g.means.double().numpy().T)
-        rows = 1 + np.rint(lit * (NUM_FADES - 1))
-        is_unchanged = np.abs(lit - shadows.lit_share) < 1e-6
+        sun_share = _find_sun_share(shadows, *g.means.double().numpy().T)
+        rows = 1 + np.rint(sun_share * (NUM_FADES - 1))
+        is_unchanged = np.abs(sun_share - shadows.lit_share) < 1e-6
         if g.semantic is not None:
             is_unchanged |= ~np.isin(
                 g.semantic.numpy(), [int(semantic) for semantic in _GROUND_CLASSES]
@@ -603,20 +603,22 @@ def sun_transmittance(fog: Fog, shadows: CastShadows, ground_z_m: float) -> floa
     return math.exp(-vertical_optical_depth(fog, ground_z_m) / sun_sine)
 
 
-def _lit_near(
+def _find_sun_share(
     shadows: CastShadows, x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray
 ) -> np.ndarray:
     """Return the share of the sun that places see, blended to the mean off the ground."""
-    lit, known_share, height_m = shadows.sample(x_m, y_m)
+    sun_share, known_share, height_m = shadows.sample(x_m, y_m)
     relative_height = np.abs(z_m - height_m / np.maximum(known_share, 1e-6)) / ON_GROUND_M
     weight = known_share * (2 - 2 * relative_height).clip(0, 1)
-    return shadows.lit_share + weight * (lit / np.maximum(known_share, 1e-6) - shadows.lit_share)
+    return shadows.lit_share + weight * (
+        sun_share / np.maximum(known_share, 1e-6) - shadows.lit_share
+    )
 
 
-def _fade_factors(shadows: CastShadows, transmittance: float, lit: np.ndarray) -> np.ndarray:
+def _fade_factors(shadows: CastShadows, transmittance: float, sun_shares: np.ndarray) -> np.ndarray:
     """Return (E' / E)^(1/2.2) for shares of the sun [K], float32 [K, 3]."""
     q = np.array(shadows.shade_ratio)
-    sun_share = lit[:, None]
+    sun_share = sun_shares[:, None]
     mean_share = shadows.lit_share
     faded_light = q + (1 - q) * (transmittance * sun_share + (1 - transmittance) * mean_share)
     return ((faded_light / (q + (1 - q) * sun_share)) ** (1 / _ENCODING)).astype(np.float32)

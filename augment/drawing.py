@@ -98,7 +98,7 @@ class LayerRenderer:
         pixel_mask: Bool[Tensor, "H W"] | None = None,
         photo_share: Float[Tensor, "H W"] | None = None,
     ) -> RenderOutput:
-        """Return what `draw` returns, with the airlight of the horizon at every elevation."""
+        """Return the buffers of the layer, with the airlight of the horizon at every elevation."""
         buffer_fog = self.fog if self.applies_fog_to_buffers else None
         photo = self.photo if self.photo is not None and self.photo.is_seen_by(camera) else None
         parts = self.parts

@@ -133,7 +133,7 @@ def measure_ground(
         points: points of the road's surface, [N, 3], scene world.
         positions: the path, float64 [P, 3], scene world.
         source: origin of the points.
-        level_m: height above or below the path from which points are another road's.
+        max_height_m: height above or below the path from which points are another road's.
     """
     stretches = Stretches.along_path(positions)
     points = np.asarray(points[:: 1 + len(points) // _MAX_MEASURED], np.float64)
@@ -473,7 +473,7 @@ def _measure_ground(scene: Scene) -> Ground:
     if ground is None and len(points):
         ground = _measure_by_planes(points[classes >= 0], positions)
     if ground is None:
-        ground = _measure_by_planes(_below_cameras(scene), positions, level_m=math.inf)
+        ground = _measure_by_planes(_below_cameras(scene), positions, max_height_m=math.inf)
     return _estimate_from_path(scene, positions) if ground is None else ground
 
 
@@ -527,7 +527,7 @@ def _below_cameras(scene: Scene) -> np.ndarray:
 
 
 def _measure_by_planes(
-    points: np.ndarray, positions: np.ndarray, *, level_m: float = MAX_ROAD_HEIGHT_M
+    points: np.ndarray, positions: np.ndarray, *, max_height_m: float = MAX_ROAD_HEIGHT_M
 ) -> Ground | None:
     """Return the ground by open3d's planes; None, and a warning, where open3d cannot be had."""
     if len(points) == 0:
@@ -537,7 +537,7 @@ def _measure_by_planes(
     except BackendUnavailable as error:
         logger.warning("the road is not looked for among unlabelled points: %s", error)
         return None
-    return measure_ground(road_points, positions, "ransac", max_height_m=level_m)
+    return measure_ground(road_points, positions, "ransac", max_height_m=max_height_m)
 
 
 def _estimate_from_path(scene: Scene, positions: np.ndarray) -> Ground:

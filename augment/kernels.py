@@ -60,7 +60,7 @@ def poses_at(timestamp_ns, straight_rad, tracks, is_present, out):
                 after = middle
         sample = before if timestamp_ns <= times[first] else after
         is_between = times[first] < timestamp_ns < times[last]
-        max_gap_ns = tracks.gaps_ns[actor]
+        max_gap_ns = tracks.max_gaps_ns[actor]
         if is_between and 0 <= max_gap_ns < times[after] - times[before]:
             is_between = False
             sample = before if timestamp_ns - times[before] <= hold_ns else after

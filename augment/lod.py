@@ -14,14 +14,14 @@ For a camera of focal length f, level k serves squares at a distance of at least
 
     d_k = f c_k / lod_px,
 
-where a cell is no larger than lod_px pixels. From d_k to (1 + BAND) d_k a square fades into the
-square that holds it. The two have shares w and 1 - w, and a splat of opacity o is drawn with 1 - (1
-- o)^w, so that transmittances, which multiply, stay those of one level. Distances are Euclidean,
-and a square's is never below that of the square that holds it. So shares add up to 1, change
-without a step as the camera moves, and stay the same when it turns.
+where a cell is no larger than lod_px pixels. From d_k to (1 + FADE_BAND) d_k a square fades into
+the square that holds it. The two have shares w and 1 - w, and a splat of opacity o is drawn with 1
+- (1 - o)^w, so that transmittances, which multiply, stay those of one level. Distances are
+Euclidean, and a square's is never below that of the square that holds it. So shares add up to 1,
+change without a step as the camera moves, and stay the same when it turns.
 
-Splats whose colours differ by less than ALIKE are merged in cells of 2 c_k. Merging keeps the
-moments of the mixture and its mean colour:
+Splats whose colours differ by less than MAX_COLOR_DIFFERENCE are merged in cells of 2 c_k. Merging
+keeps the moments of the mixture and its mean colour:
 
     mu = sum w_i mu_i,    Sigma = sum w_i (Sigma_i + (mu_i - mu)(mu_i - mu)^T).
 
@@ -148,7 +148,7 @@ class Squares:
 
 
 class SplatBoxes(NamedTuple):
-    """Boxes around the means of every CELL splats of a level."""
+    """Boxes around the means of every CELL_SIZE splats of a level."""
 
     lows: Float[np.ndarray, "C 3"]
     """Lowest corners, metres."""
@@ -189,14 +189,14 @@ class Level:
     squares: Squares
     """The squares of the level."""
     boxes: SplatBoxes
-    """Boxes around every CELL splats."""
+    """Boxes around every CELL_SIZE splats."""
     parents: Int32[np.ndarray, "N"]
     """Splat of the next level that each splat is merged into, [N]; -1 for none."""
     unchecked_file: str | None = None
     """Name of the file that the splats come from, whose numbers are checked when they are taken;
     None where they need no check."""
     num_part_splats: int = 0
-    """Number of the part's splats, where `unchecked` is set."""
+    """Number of the part's splats, where `unchecked_file` is set."""
     _checked: Bool[np.ndarray, "C"] = field(init=False)
     """Mask of the boxes whose splats have been checked."""
 
@@ -207,7 +207,7 @@ class Level:
         """Check the numbers of the splats in some boxes, once.
 
         Args:
-            cells: indices of the boxes of CELL splats.
+            cells: indices of the boxes of CELL_SIZE splats.
         """
         if self.unchecked_file is None:
             return
@@ -240,7 +240,7 @@ class Tree(NamedTuple):
     cells_m: Float[np.ndarray, "S"]
     """c_k of each square's level, metres; 0 at level 0."""
     cells: SplatBoxes
-    """Boxes around every CELL splats, of all levels."""
+    """Boxes around every CELL_SIZE splats, of all levels."""
     cell_starts: Int64[np.ndarray, "_"]
     """First of `cells` of each level."""
 
@@ -346,10 +346,14 @@ def levels_of(gaussians: Gaussians, *, antialiased: bool = False) -> Levels:
     """
 
     def make() -> Levels:
-        stored = cached_of_tensor(gaussians.means, "levels", lambda: None)
-        if stored is None or antialiased or not _has_shapes(gaussians, stored.levels[0].gaussians):
+        stored_levels = cached_of_tensor(gaussians.means, "levels", lambda: None)
+        if (
+            stored_levels is None
+            or antialiased
+            or not _has_shapes(gaussians, stored_levels.levels[0].gaussians)
+        ):
             return build_levels(gaussians, antialiased=antialiased)
-        return update_levels(stored, gaussians)
+        return update_levels(stored_levels, gaussians)
 
     return memo_of(gaussians).get((*_LEVELS, antialiased), make)
 
@@ -383,7 +387,7 @@ def update_levels(levels: Levels, g: Gaussians) -> Levels:
         SceneError: the levels' file is damaged.
     """
     new_levels = [
-        replace(levels.levels[0], gaussians=slice_gaussians(g, slice(None)), unchecked=None)
+        replace(levels.levels[0], gaussians=slice_gaussians(g, slice(None)), unchecked_file=None)
     ]
     for finer, level in itertools.pairwise(levels.levels):
         if len(finer.parents) and not -1 <= finer.parents.min() <= finer.parents.max() < len(
@@ -405,10 +409,10 @@ def _reweigh(finer: Level, g: Gaussians, level: Level) -> Gaussians:
         level: the level before the edit.
     """
     count = len(level.gaussians)
-    functions = g.sh.shape[1]
+    num_sh = g.sh.shape[1]
     old_weights = np.zeros(count)
     new_weights = np.zeros(count)
-    sh = np.zeros((count, functions * 3))
+    sh = np.zeros((count, num_sh * 3))
     for rows in batches(len(g)):
         targets = finer.parents[rows]
         merged_rows = np.flatnonzero(targets >= 0)
@@ -424,8 +428,8 @@ def _reweigh(finer: Level, g: Gaussians, level: Level) -> Gaussians:
         old_row_weights = area * finer.gaussians.opacities[rows].numpy()[merged_rows]
         old_weights[first:end] += np.bincount(targets - first, old_row_weights, size)
         new_weights[first:end] += np.bincount(targets - first, row_weights, size)
-        values = g.sh[rows].reshape(-1, functions * 3).numpy()[merged_rows]
-        for column in range(functions * 3):
+        values = g.sh[rows].reshape(-1, num_sh * 3).numpy()[merged_rows]
+        for column in range(num_sh * 3):
             channel_sum = np.bincount(targets - first, row_weights * values[:, column], size)
             sh[first:end, column] += channel_sum
     has_weight = (new_weights > 0) & (old_weights > 0)
@@ -452,8 +456,8 @@ def join_pieces(pieces: Iterable[LevelPiece]) -> LevelPiece:
     gaussians, stands_for, keys = zip(*pieces, strict=True)
     columns = {name: torch.cat([getattr(g, name) for g in gaussians]) for name in _COLUMNS}
     classes = [g.semantic for g in gaussians if g.semantic is not None]
-    joined = Gaussians(**columns, semantic=torch.cat(classes) if classes else None)
-    return LevelPiece(joined, np.concatenate(stands_for), np.concatenate(keys))
+    joined_gaussians = Gaussians(**columns, semantic=torch.cat(classes) if classes else None)
+    return LevelPiece(joined_gaussians, np.concatenate(stands_for), np.concatenate(keys))
 
 
 def build_levels(
@@ -470,7 +474,7 @@ def build_levels(
         gaussians: the Gaussians.
         antialiased: if True, the levels are for a rasteriser whose blur covers no more of the
             image.
-        keep: puts the pieces of a level where the level is to lie.
+        store_piece: puts the pieces of a level where the level is to lie.
     """
     detached = slice_gaussians(gaussians, slice(None))
     finest_m, order, keys = square_order(detached)
@@ -506,7 +510,7 @@ def square_order(g: Gaussians) -> tuple[float, Int64[np.ndarray, "N"], Int64[np.
 
 
 def batches(count: int) -> Iterator[slice]:
-    """Return slices that cut `count` rows into runs of BATCH."""
+    """Return slices that cut `count` rows into runs of MERGE_BATCH."""
     return (slice(first, min(first + MERGE_BATCH, count)) for first in range(0, count, MERGE_BATCH))
 
 
@@ -804,7 +808,7 @@ def choose_parts(
     fog: Fog | None = None,
     clip: HeightClip | None = None,
     *,
-    whole: bool = True,
+    takes_whole_levels: bool = True,
 ) -> ReplacedParts:
     """Return the parts that a camera needs of large backgrounds, and all other parts.
 
@@ -814,8 +818,8 @@ def choose_parts(
         settings: the rasteriser's settings, with lod_px > 0.
         fog: hides what is far away; None for clear air.
         clip: the level plane and the side of it that is drawn; None for both sides.
-        whole: if True, take levels whole and name the rows to draw; else make a part of every run
-            of rows.
+        takes_whole_levels: if True, take levels whole and name the rows to draw; else make a part
+            of every run of rows.
     """
     chosen_parts = list[PosedGaussians]()
     stood_for = list[tuple[int, np.ndarray | None]]()
@@ -827,7 +831,9 @@ def choose_parts(
             taken_runs = [*_select_runs(levels, part, camera, settings, fog, clip)]
             if _is_merged(levels, taken_runs):
                 replacements = (
-                    piece for t in taken_runs for piece in _pieces(t, part, is_whole=whole)
+                    piece
+                    for t in taken_runs
+                    for piece in _pieces(t, part, is_whole=takes_whole_levels)
                 )
         for piece, stands_for in replacements:
             chosen_parts.append(piece)

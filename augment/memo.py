@@ -3,7 +3,7 @@
 `memo_of(scene).get(key, make)` makes a value at its first use and keeps it while its owner lives.
 An owner keeps at most MAX_BYTES beside its largest value; values that have not been used for
 longest go first. Values that a job's worker processes also need are `put` with `shared=True`:
-`shared()` returns them, and `update` takes them over.
+`shared()` returns them, and `take_shared` takes them over.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ class SceneMemo:
 
         Args:
             key: the key.
-            value: the value, or a Stored that loads it.
-            shared: if True, hand the value, or the file it is Stored in, to worker processes; it is
+            value: the value, or a StoredValue that loads it.
+            shared: if True, hand the value, or the file it is stored in, to worker processes; it is
                 kept whatever its size.
         """
         with self._lock:

@@ -130,7 +130,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     if recipe.quality.has_open_choice:
         raise RecipeError(
             f"recipe {recipe.name}, variant {recipe.variant}: quality {recipe.quality.summary} has "
-            f"still to choose its settings in view of a scene, as jobs do; settle the recipe first "
+            f"still to choose its settings for a scene, as jobs do; resolve its quality first "
             f"(augment.jobs.quality)"
         )
     check_base(recipe, scene)
@@ -307,7 +307,7 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
         backend: the rasteriser's backend.
 
     Raises:
-        SceneError: an effect cannot be placed in this scene.
+        SceneError: an effect is not possible in this scene.
     """
     active_effects = plan.active_effects(scene, backend=backend)
     effect_cameras = [

@@ -10,11 +10,11 @@ the rasteriser's backward pass adds up over a view. A splat's change in a view i
 
     max(|sum of w_i L(B_i - c_i)|, MIN_CONTRAST sum of w_i) / pixels,    L: luma,
 
-and the view that would change most counts. MIN_CONTRAST stands for what changes of both signs
-hide, and for the changes that neighbours make when they go together. Splats that change least go
-first, until their changes add up to the error that is allowed in some view. After each of the
-ROUNDS the views are rendered again without the splats that have gone, since what these covered
-counts more then: a far front of many small splats would go as a whole otherwise. (Fan et al. 2024,
+and the view that would change most counts. MIN_CONTRAST stands for what changes of both signs hide,
+and for the changes that neighbours make when they go together. Splats that change least go first,
+until their changes add up to the error that is allowed in some view. After each of the ROUND_ERRORS
+the views are rendered again without the splats that have gone, since what these covered counts more
+then: a far front of many small splats would go as a whole otherwise. (Fan et al. 2024,
 "LightGaussian", and Niemeyer et al. 2024, "RadSplat", leave out by weight alone, which at the same
 error leaves out less.)
 """
@@ -100,11 +100,11 @@ def prune_parts(
 
 
 def precompute_errors(scene: Scene, max_error: float = math.inf, *, progress: bool = False) -> None:
-    """Find the errors up to `most` now, so that other processes take them over.
+    """Find the errors up to `max_error` now, so that other processes take them over.
 
     Args:
         scene: the scene.
-        most: largest error that is needed, share of white.
+        max_error: largest error that is needed, share of white.
         progress: if True, show a bar on stderr.
     """
     if not has_stored_levels(scene.background):
@@ -119,12 +119,12 @@ def errors_of(
     float32.
 
     It adds up the changes by the splat and by all splats that change less, in the worst recorded
-    view. It is infinite for splats that no view has in its frame, and beyond `most` unless somebody
-    has asked for more. Errors are found once a scene.
+    view. It is infinite for splats that no view has in its frame, and beyond `max_error` unless
+    somebody has asked for more. Errors are found once a scene.
 
     Args:
         scene: the scene.
-        most: largest error that is needed, share of white.
+        max_error: largest error that is needed, share of white.
         progress: if True, show a bar on stderr.
     """
     search = _search_of(scene)

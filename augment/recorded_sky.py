@@ -197,7 +197,7 @@ def find_sky(
     Args:
         rgb: the image.
         elevation_rad: elevation of the pixels' rays above the horizon.
-        hits: pixels with a LiDAR return; None without LiDAR.
+        has_return: pixels with a LiDAR return; None without LiDAR.
         lidar_top_rad: elevation at which the LiDAR's view ends; above a surface that reaches it, a
             wall may go on.
     """
@@ -271,7 +271,10 @@ def _recorded_sky(scene: Scene, frame: Frame, camera: Camera) -> RecordedSky | N
     else:
         top_rad = _top_rad(points, camera.centre.numpy().astype(np.float32))
     return find_sky(
-        rgb, elevation_rad(camera), _hits(points, camera), math.inf if top_rad is None else top_rad
+        rgb,
+        elevation_rad(camera),
+        _find_returns(points, camera),
+        math.inf if top_rad is None else top_rad,
     )
 
 
@@ -295,7 +298,7 @@ def _sweep(scene: Scene, frame: Frame) -> np.ndarray | None:
         return None
 
 
-def _hits(points: np.ndarray, camera: Camera) -> np.ndarray:
+def _find_returns(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the mask of pixels with a LiDAR return."""
     pose = camera.camera_from_world.numpy().astype(np.float32)
     local = points @ pose[:3, :3].T + pose[:3, 3]
@@ -303,9 +306,9 @@ def _hits(points: np.ndarray, camera: Camera) -> np.ndarray:
     u = np.floor(camera.fx * local[:, 0] / local[:, 2] + camera.cx)
     v = np.floor(camera.fy * local[:, 1] / local[:, 2] + camera.cy)
     is_inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    hits = np.zeros((camera.height, camera.width), bool)
-    hits[v[is_inside].astype(int), u[is_inside].astype(int)] = True
-    return hits
+    has_return = np.zeros((camera.height, camera.width), bool)
+    has_return[v[is_inside].astype(int), u[is_inside].astype(int)] = True
+    return has_return
 
 
 # ---- Sky by the surfaces of a scene from LiDAR, for training views -------------------------------
@@ -421,11 +424,11 @@ def _keep_sure_pieces(sky: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
     """
     border = max(2, round(_BORDER_PART * sky.shape[1]))
     grown_sky = _grow_mask(sky, 2 * border + 1, 2 * border + 1).astype(np.uint8)
-    pieces = np.asarray(cv2.connectedComponents(grown_sky, connectivity=4)[1], np.int32)
-    is_kept = np.zeros(int(pieces.max()) + 1, np.bool_)
-    is_kept[pieces[is_sure & sky]] = True
-    is_kept[pieces[0][sky[0]]] = True
-    return is_kept[pieces] & sky
+    components = np.asarray(cv2.connectedComponents(grown_sky, connectivity=4)[1], np.int32)
+    is_kept = np.zeros(int(components.max()) + 1, np.bool_)
+    is_kept[components[is_sure & sky]] = True
+    is_kept[components[0][sky[0]]] = True
+    return is_kept[components] & sky
 
 
 def _find_thin_things(rgb: np.ndarray, sky: np.ndarray) -> np.ndarray:

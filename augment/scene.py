@@ -267,7 +267,7 @@ def colors_at(
         sh: spherical harmonics of N Gaussians.
         waves: their change over time; None leaves the colours.
         timestamp_ns: the time.
-        turn: the rotation; None turns nothing.
+        rotation: the rotation; None turns nothing.
         fast: send float32 through the CPU kernel, which equals the definition here within float
             rounding.
     """
@@ -280,7 +280,7 @@ def colors_at(
 
 
 def _colors_by_kernel(
-    sh: Tensor, waves: ColorSeries | None, timestamp_ns: int, turn: Tensor | None
+    sh: Tensor, waves: ColorSeries | None, timestamp_ns: int, rotation: Tensor | None
 ) -> Tensor:
     """Return `colors_at` of float32 values, by the CPU kernel."""
     coefficients = np.zeros((len(sh), 0, 3), np.float32)
@@ -289,8 +289,8 @@ def _colors_by_kernel(
         coefficients = waves.coefficients.detach().contiguous().numpy()
         weights = waves.weights_at(timestamp_ns)
     turn_matrix = np.zeros((0, 0), np.float32)
-    if turn is not None and sh.shape[1] > 1:
-        turn_matrix = sh_rotation(turn, math.isqrt(sh.shape[1]) - 1).numpy().astype(np.float32)
+    if rotation is not None and sh.shape[1] > 1:
+        turn_matrix = sh_rotation(rotation, math.isqrt(sh.shape[1]) - 1).numpy().astype(np.float32)
     out = np.empty(tuple(sh.shape), np.float32)
     sh_rows = sh.detach().contiguous().numpy()
     term_weights = np.asarray(weights, np.float32)
@@ -420,14 +420,14 @@ class Actor:
         The colours of the last moment are kept, for other cameras that look at it.
         """
         pose = self.track.pose_at(timestamp_ns) if self.colors_in_world else None
-        turn = None if pose is None or self.gaussians.sh_degree == 0 else pose[:3, :3].T
-        if self.color_waves is None and turn is None:
+        rotation = None if pose is None or self.gaussians.sh_degree == 0 else pose[:3, :3].T
+        if self.color_waves is None and rotation is None:
             return self.gaussians
         gaussians = self.gaussians
         waves = self.color_waves
 
         def color() -> Gaussians:
-            return replace(gaussians, sh=colors_at(gaussians.sh, waves, timestamp_ns, turn))
+            return replace(gaussians, sh=colors_at(gaussians.sh, waves, timestamp_ns, rotation))
 
         inputs = [gaussians.sh, *([] if waves is None else [waves.coefficients])]
         if any(tensor.requires_grad or tensor.is_inference() for tensor in inputs):
@@ -621,7 +621,7 @@ class Scene:
 
         Args:
             timestamp_ns: the time.
-            only: instance_ids of the actors to take; None for all.
+            actor_ids: instance_ids of the actors to take; None for all.
         """
         yield PosedGaussians(self.background)
         for number, actor in enumerate(self.actors, start=1):

@@ -3,8 +3,8 @@
 `with timed("flood: bed"):` stands in a pass and costs two look-ups where nobody listens. `with
 stopwatch() as seconds:` around it measures. The GPU is then waited for at both ends of a pass,
 which makes the whole slower and each time its own. `with watched(report):` around it reports which
-pass has begun, and each step of long preparations (`counted`). It changes no picture and waits for
-nothing. An exception that the watcher raises gives up the work inside.
+pass has begun, and each step of long preparations (`counted_steps`). It changes no picture and
+waits for nothing. An exception that the watcher raises gives up the work inside.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class PassProgress:
     """Progress of the pass that runs."""
 
     name: str
-    """The pass's name, as plans have it: "rasterise"; or a preparation's: "placing snow"."""
+    """Name of a pass ("rasterise") or of a preparation ("finding exposed surfaces")."""
     num_done: int = 0
     """Steps that are done."""
     num_steps: int = 0
@@ -122,7 +122,7 @@ def counted_steps(name: str, total: int) -> Iterator[Callable[[], None]]:
     Yields a function, which is to be called after each step.
 
     Args:
-        name: what is prepared, for people: "placing snow".
+        name: what is prepared, for people: "finding exposed surfaces".
         total: number of steps.
     """
     watch = _watching.get()

@@ -68,11 +68,11 @@ HORIZON_RAD = math.radians(1.5)
 MAX_MAGNIFICATION = 1.5
 # Magnification from which a pixel's detail is invented; trust falls from 1.0 on.
 NO_TRUST_MAGNIFICATION = 4.0
-# Distance from the nearest seen view up to which a view is trusted, metres: half a lane and more.
+# Distance from the nearest source view up to which a view is trusted, metres: half a lane and more.
 # Beyond it the sides of parked cars appear that nobody has seen.
 MAX_DISTANCE_M = 2.0
-# Angle to the nearest seen view up to which a view is trusted: beyond it, a quarter of a camera 60
-# degrees wide looks past what it saw.
+# Angle to the nearest source view up to which a view is trusted: beyond it, a quarter of a camera
+# 60 degrees wide looks past what it saw.
 MAX_ANGLE_RAD = math.radians(15)
 
 # Columns of the points that are looked for in the views of the scene.
@@ -168,7 +168,7 @@ class SourceViews:
 
 
 class NearestView(NamedTuple):
-    """The seen view nearest to a camera."""
+    """The source view nearest to a camera."""
 
     distance_m: float
     """Distance between the cameras' centres."""
@@ -184,7 +184,7 @@ def source_views(scene: Scene) -> SourceViews:
     For a fitted scene they are those that it was fitted to, as its files say; else all that was
     recorded.
     """
-    return memo_of(scene).get("seen views", lambda: _find_seen_views(scene))
+    return memo_of(scene).get("source views", lambda: _find_source_views(scene))
 
 
 def unfitted_cameras(scene: Scene) -> tuple[str, ...]:
@@ -231,7 +231,7 @@ def magnification_sentence(learnt_scale: float | None, scale: float) -> str | No
 
 
 def nearest_view(sources: SourceViews, camera: Camera) -> NearestView | None:
-    """Return the seen view nearest to a camera; None where no view is known.
+    """Return the source view nearest to a camera; None where no view is known.
 
     A metre of distance counts as much as 7.5 degrees.
     """
@@ -248,7 +248,7 @@ def _pose_difference(distance_m: Any, angle_rad: Any) -> Any:
     return distance_m / MAX_DISTANCE_M + angle_rad / MAX_ANGLE_RAD
 
 
-def _find_seen_views(scene: Scene) -> SourceViews:
+def _find_source_views(scene: Scene) -> SourceViews:
     """Return the views that a scene was made from, as `source_views`."""
     frames = _made_from(scene)
     fit = _fit_record(scene.made_by, frames)
@@ -860,18 +860,22 @@ def _judge_camera(
 ) -> CameraTrust:
     """Judge one camera; the arguments are those of `judge_scene`."""
     sources = source_views(scene)
-    seen_by_camera = sources.of_camera(name)
+    camera_sources = sources.of_camera(name)
     camera_frames = [f for f in frames if name in f.cameras and not f.cameras[name].is_orthographic]
     nearest_views = {
         f.index: nearest_view(sources, f.cameras[name].scaled(scale or 1.0)) for f in camera_frames
     }
-    known_views = {index: near for index, near in nearest_views.items() if near is not None}
+    known_views = {
+        index: nearest for index, nearest in nearest_views.items() if nearest is not None
+    }
     farthest_view = (
         max(known_views.values(), key=lambda n: _pose_difference(*n[:2])) if known_views else None
     )
     is_unfitted = name in unfitted_cameras(scene)
     frames_away = tuple(
-        index for index, near in known_views.items() if scene.has_metric_scale and _is_away(near)
+        index
+        for index, nearest in known_views.items()
+        if scene.has_metric_scale and _is_away(nearest)
     )
     drawn_frames = (
         [camera_frames[(2 * k + 1) * len(camera_frames) // (2 * count)] for k in range(count)]
@@ -886,12 +890,12 @@ def _judge_camera(
             views.append(judge_view(scene, _shrink_camera(camera), index, backend=backend))
         except Exception as error:  # as in a job: one bad frame is named, and the others go on
             failures.append(f"frame {index} cannot be drawn: {error}")
-    centres = [view.camera.centre for view in seen_by_camera]
+    centres = [view.camera.centre for view in camera_sources]
     steps = [float((b - a).norm()) for a, b in itertools.pairwise(centres)]
     camera_trust = CameraTrust(
         name=name,
-        seen_images=len(seen_by_camera),
-        seen_width_px=max((view.camera.width for view in seen_by_camera), default=None),
+        seen_images=len(camera_sources),
+        seen_width_px=max((view.camera.width for view in camera_sources), default=None),
         seen_path_m=sum(steps, 0.0),
         nearest=farthest_view,
         away=frames_away,

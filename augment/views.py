@@ -102,7 +102,7 @@ def render_buffers(
     """
     with timed("view plan"):
         view = plan_view(plan, scene, camera, backend=backend)
-    with timed("parts"):
+    with timed("collect parts"):
         bare_parts = scene.parts_for(camera, view.actor_ids)
     color_map = scene.color_map(camera) if plan.uses_recorded_exposure else None
     photo = None
@@ -394,13 +394,13 @@ class ViewPool:
     """Begins views of a scene, several at once on threads of their own.
 
     On a GPU, or where there is only one thread, views are rendered one after the other. Close the
-    pool, or use it as a context manager. `ahead` is how many views may be in flight while another
-    is begun.
+    pool, or use it as a context manager. `num_in_flight` is how many views may be in flight while
+    another is begun.
 
     Args:
         scene: the scene, whose size decides how many threads pay off.
         backend: as for `render_view`.
-        views: the largest number of views that will be begun.
+        max_views: the largest number of views that will be begun.
     """
 
     def __init__(self, scene: Scene, backend: str = AUTO, max_views: int = sys.maxsize) -> None:

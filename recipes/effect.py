@@ -24,11 +24,11 @@ class Knob:
     Attributes:
         path: dotted path of the field; in a model, from the model's section.
         values: from the fastest to the most accurate, which is the reference.
-        what: the setting in a few words, for tables.
+        description: the setting in a few words, for tables.
         rank: order in which knobs use up an allowed error; knobs that save most have the lowest
             ranks.
-        chosen: if True, a tier or a target may set the knob. If False, it is only measured: the
-            field says what is written, or none of its values saves time.
+        is_selectable: if True, a tier or a target may set the knob. If False, it is only measured:
+            the field says what is written, or none of its values saves time.
         tiers: value by tier, if it is not the reference.
         applies_to: function of a section that returns True if the knob changes anything there.
         section: dotted path of the section.
@@ -54,11 +54,11 @@ class Column:
 
     Attributes:
         value: function of a section; NaN and None mean that there is no value.
-        absent: value if the recipe has no such section; None for a column of words.
-        shows: numbers that mean that the effect is present: "all", or all but 0 ("nonzero"). None
-            if the column says nothing about that.
-        refutes: if True, any other number means that the effect is absent, whatever other columns
-            say.
+        value_if_absent: value if the recipe has no such section; None for a column of words.
+        presence_values: numbers that mean that the effect is present: "all", or all but 0
+            ("nonzero"). None if the column says nothing about that.
+        decides_absence: if True, any other number means that the effect is absent, whatever other
+            columns say.
         title: title of the number on an axis.
         unit: unit of that number, which is `factor` times the column's, or `over` divided by it.
         linear: if True, the axis is never logarithmic.

@@ -46,7 +46,7 @@ class LensDrops(EffectModel):
     """Time from one wipe to the next; null for glass that nothing wipes."""
 
     @property
-    def changes(self) -> bool:
+    def has_effect(self) -> bool:
         return self.count != 0
 
     @property

@@ -98,7 +98,7 @@ class Rain(EffectModel):
     wetness."""
 
     @property
-    def changes(self) -> bool:
+    def has_effect(self) -> bool:
         """Return False for rain without a rate, which changes nothing in the air."""
         return self.rate_mm_h > 0
 

@@ -98,11 +98,13 @@ class Snow(EffectModel):
     """What drifts, patches and grain are drawn from; null for the recipe's seed."""
 
     @property
-    def changes(self) -> bool:
+    def has_effect(self) -> bool:
         """Return False for snow without depth or coverage, which changes nothing."""
         return self.depth_m > 0 and self.coverage > 0
 
     def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:
         return (
-            (f"snow {self.depth_m:.3g} m deep", output_surface != "scene") if self.changes else None
+            (f"snow {self.depth_m:.3g} m deep", output_surface != "scene")
+            if self.has_effect
+            else None
         )

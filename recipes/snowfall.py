@@ -54,6 +54,6 @@ class Snowfall(EffectModel):
     farther ones are the veil."""
 
     @property
-    def changes(self) -> bool:
+    def has_effect(self) -> bool:
         """Return False for snowfall without a rate, which changes nothing."""
         return self.rate_mm_h > 0

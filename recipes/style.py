@@ -134,7 +134,7 @@ class Style(EffectModel):
         return self
 
     @property
-    def changes(self) -> bool:
+    def has_effect(self) -> bool:
         """Return False for a style without strength, which changes nothing."""
         return self.strength > 0
 

@@ -33,10 +33,27 @@ VAGUE_WORDS = (
     "this those told wanted way ways what whole"
 )
 VAGUE = frozenset(VAGUE_WORDS.split())
+# Words that name a function well: they are verbs, too.
+VERBS = frozenset({"read"})
 RIDDLING = ("What ", "Of ", "Whether ", "That ", "Where ", "Which ")
 
 # How many places of each kind are left in a folder; a folder that is not here has none.
-STUMBLES: dict[str, dict[str, int]] = {}
+STUMBLES: dict[str, dict[str, int]] = {
+    "adapters": {"vague": 6},
+    "adapters/camera_files": {"packed": 1},
+    "adapters/drivestudio": {"packed": 1},
+    "adapters/lidar_scene": {"vague": 1},
+    "adapters/waymo": {"vague": 1},
+    "augment": {"packed": 2},
+    "augment/dataset": {"vague": 2},
+    "augment/effects": {"packed": 14, "vague": 3},
+    "augment/files": {"packed": 3, "vague": 1},
+    "augment/render": {"packed": 2},
+    "recipes": {"vague": 2},
+    "tools": {"vague": 3},
+    "tools/bench": {"vague": 1},
+    "tools/view": {"vague": 2},
+}
 
 
 class Place(NamedTuple):
@@ -60,7 +77,7 @@ def places_in(tree: ast.Module) -> Iterator[Place]:
         elif isinstance(node, ast.Assign) and is_packed(node):
             yield Place("packed", node.lineno, ast.unparse(node))
         elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            if node.name in VAGUE:
+            if node.name in VAGUE - VERBS:
                 yield Place("vague", node.lineno, node.name)
             docstring = ast.get_docstring(node) or ""
             if docstring.startswith(RIDDLING):

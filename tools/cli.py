@@ -1,6 +1,7 @@
-"""The `climategs` command: models of options, and functions where there is little to ask for, whose
-docstrings are the help; and how errors leave it. Heavy imports stay inside the functions, so that
-`--help` answers at once.
+"""The `climategs` command: its subcommands, and what it prints for errors.
+
+A subcommand is a model of options, or a function if it has few options. Their docstrings are the
+text of `--help`. Heavy imports stay inside the functions, so that `--help` answers at once.
 """
 
 from __future__ import annotations
@@ -599,7 +600,7 @@ def style() -> None:
 
 
 def open_with_path(uri: str, camera_path: Path | None) -> Scene:
-    """The scene of a URI, with the cameras of a path file, if given, in place of its own."""
+    """Open the scene of a URI, with the cameras of a path file, if given, in place of its own."""
     from adapters.base import open_scene
 
     scene = open_scene(uri)
@@ -634,7 +635,7 @@ GROUPS = {"style": {"apply": ApplyOptions, "train": StyleTrainOptions, "presets"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command. Returns 0; 1 where images failed, 2 for an error, 130 if interrupted."""
+    """Run one command. Return 0; 1 where images failed, 2 for an error, 130 if interrupted."""
     if not sys.stderr.isatty():  # a log needs a progress line now and then, not ten a second
         os.environ.setdefault("TQDM_MININTERVAL", "10")
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -670,7 +671,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def check_arguments(arguments: list[str]) -> None:
-    """Raise ClimateGSError for one that is not UTF-8: paths go into manifests, which hold texts."""
+    """Check that arguments are UTF-8 texts: paths go into manifests, which hold texts.
+
+    Raises:
+        ClimateGSError: an argument is not UTF-8.
+    """
     for number, argument in enumerate(arguments, 1):
         try:
             argument.encode()
@@ -684,7 +689,7 @@ def check_arguments(arguments: list[str]) -> None:
 
 
 def _bench_commands() -> dict[str, Callable[..., int]]:
-    """Those of `climategs bench`, which the installed package leaves out."""
+    """Return the commands of `climategs bench`, which the installed package lacks."""
     if importlib.util.find_spec("tools.bench") is None:
         from augment.errors import ClimateGSError
 
@@ -698,7 +703,7 @@ def _bench_commands() -> dict[str, Callable[..., int]]:
 
 
 def _is_ours(error: Exception) -> bool:
-    """Errors a user can act on; others are defects, and their traceback is worth seeing."""
+    """Return True for an error that a user can act on; others are defects and get a traceback."""
     from recipes.errors import RecipeError
 
     if isinstance(error, RecipeError):

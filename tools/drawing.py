@@ -69,7 +69,7 @@ def write(
 
 
 def captioned(image: np.ndarray, title: str, text: str) -> np.ndarray:
-    """A picture uint8 [H, W, 3] with two lines under it."""
+    """Return a picture, uint8 [H, W, 3], with two lines of text below it."""
     caption = np.full((CAPTION_PX, image.shape[1], 3), 255, np.uint8)
     write(caption, title, 4, 17, size=0.48)
     write(caption, text, 4, 36, size=0.42, color=(110, 110, 110))
@@ -77,7 +77,7 @@ def captioned(image: np.ndarray, title: str, text: str) -> np.ndarray:
 
 
 def strip(panels: Sequence[np.ndarray]) -> np.ndarray:
-    """Pictures of one height side by side on white."""
+    """Return pictures of one height side by side on white."""
     gap = np.full((panels[0].shape[0], GAP_PX, 3), 255, np.uint8)
     return np.concatenate([part for panel in panels for part in (gap, panel)][1:], 1)
 
@@ -94,7 +94,7 @@ def text_width(text: str, size: float, thickness: int = 1) -> int:
 
 
 def color_mapped(values: np.ndarray, color_map: int) -> np.ndarray:
-    """uint8 [H, W, 3] RGB of values [H, W] in [0, 1] (clamped), by one of OpenCV's colour maps."""
+    """Return colours of values [H, W] in [0, 1] (clamped) by a colour map, uint8 [H, W, 3]."""
     levels = (np.clip(values, 0, 1) * 255).round().astype(np.uint8)
     return cv2.cvtColor(cv2.applyColorMap(levels, color_map), cv2.COLOR_BGR2RGB)
 
@@ -106,7 +106,7 @@ def color_bar(width: int, height: int, color_map: int) -> np.ndarray:
 
 
 def linear_ticks(low: float, high: float, most: int = 6) -> list[float]:
-    """About `most` numbers within [low, high], 1, 2 or 5 times a power of ten apart."""
+    """Return about `most` numbers within [low, high], 1, 2 or 5 times a power of ten apart."""
     rough = (high - low) / most
     if not rough > 1e-300:
         return [low]
@@ -118,8 +118,11 @@ def linear_ticks(low: float, high: float, most: int = 6) -> list[float]:
 
 
 def log_ticks(low: float, high: float, most: int = 7) -> list[float]:
-    """1, 2 and 5 times powers of ten within [low, high]; powers alone where those are more than
-    `most`, and any round numbers where there would be none or one.
+    """Return 1, 2 and 5 times powers of ten within [low, high].
+
+    If those are more than `most`, only powers are returned. If there would be no number or one,
+    any round numbers are returned.
+
     """
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     for digits in ((1, 2, 5), (1,)):
@@ -142,7 +145,7 @@ def short_number(value: float) -> str:
 
 
 def value_codes(table: pa.Table, *columns: str) -> np.ndarray:
-    """int [rows]: a number for each combination of the columns' values, none of which is null."""
+    """Return an integer for each combination of the columns' values, [rows]; none is null."""
     joined = pc.binary_join_element_wise(*(table[c].cast(pa.string()) for c in columns), "\0")
     return pc.dictionary_encode(joined).combine_chunks().indices.to_numpy()
 
@@ -182,8 +185,10 @@ def cameras_on_car(store: Store, table: pa.Table) -> list[str]:
 
 
 def _finished(out: Path, **choices: str | list[str] | None) -> pa.Table:
-    """The rows of finished images whose columns have one of the given values each: a list of them,
-    or an option's text, of frames None for the middle one.
+    """Return the rows of finished images whose columns have the selected values.
+
+    A selection is a list of values or an option's text. None for frames selects the middle frame.
+
 
     Raises:
         OutputError: there is no finished image, or none of one of the values.
@@ -218,8 +223,10 @@ def _finished(out: Path, **choices: str | list[str] | None) -> pa.Table:
 
 
 def shown_variants(table: pa.Table) -> list[Row]:
-    """The first row of every scene and variant, of at most MAX_SHOWN of them: a scene's clearest,
-    driest and barest first.
+    """Return the first row of every scene and variant, and no more than MAX_SHOWN rows.
+
+    The variants of a scene with the least fog, rain and snow come first.
+
     """
     rows = table.take(first_of_each(table, "scene", "variant")).to_pylist()
     rows.sort(key=lambda row: (row["scene"], *_numbers(row), row["variant"]))
@@ -237,7 +244,7 @@ def _numbers(row: Row) -> list[float]:
 
 
 def _weather(row: Row) -> str:
-    """The variant's name and what its weather means to a person."""
+    """Return the variant's name and its weather in words."""
     columns = sorted(columns_of_effects().values(), key=lambda column: column.is_number)
     values = {column.name: row.get(column.name, column.value_of(None)) for column in columns}
     present_columns = [
@@ -253,7 +260,7 @@ def _weather(row: Row) -> str:
 
 
 def _read(out: Path, row: Row) -> np.ndarray:
-    """uint8 [H, W, 3] RGB of a row's image."""
+    """Read a row's image, RGB uint8 [H, W, 3]."""
     path = resolve_inside(out, row["image_path"])
     try:
         return decode_image(path.read_bytes())
@@ -269,7 +276,7 @@ def _read(out: Path, row: Row) -> np.ndarray:
 def draw_sheet(
     out: Path, recipe: str = "all", camera: str = "all", frame: str | None = None
 ) -> Path:
-    """Writes OUT/contact_sheet.png, of what `sheet_lines` chooses."""
+    """Write OUT/contact_sheet.png with the images that `sheet_lines` chooses."""
     path = out / "contact_sheet.png"
     write_rgb(path, contact_sheet(sheet_lines(out, recipe, camera, frame)))
     return path
@@ -305,7 +312,7 @@ def sheet_lines(
 def draw_video(
     out: Path, camera: str, frames_per_second: float = 10.0, recipe: str = "all"
 ) -> Path:
-    """Writes OUT/video_<camera>.mp4: scenes and variants side by side, frame by frame.
+    """Write OUT/video_<camera>.mp4: scenes and variants side by side, frame by frame.
 
     Raises:
         OutputError: as `draw_sheet`; or the variants have no frame in common.
@@ -328,7 +335,7 @@ def draw_video(
 
 
 def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) -> np.ndarray:
-    """One picture of many: a row per (title, images), a caption under each image.
+    """Return one picture of many: a row for each (title, images), a caption below each image.
 
     Images are uint8 [H, W, 3] RGB of any size; all are scaled to one width. Returns RGB.
     """
@@ -353,7 +360,7 @@ def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) 
 
 
 def side_by_side(images: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
-    """Images of equal size in a row of up to three, else in a square grid, each named."""
+    """Return named images of equal size in a row of up to three, or else in a square grid."""
     columns = len(images) if len(images) <= 3 else math.ceil(math.sqrt(len(images)))
     source_height, source_width = images[0][1].shape[:2]
     width = VIDEO_WIDTH // columns // 2 * 2  # codecs want even sides
@@ -371,8 +378,11 @@ def side_by_side(images: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: float) -> None:
-    """An MP4 of RGB frames of equal size, whose sides are even, taken one at a time: H.264 where
-    imageio-ffmpeg is installed, else MPEG-4 part 2, which OpenCV can always write.
+    """Write RGB frames as an MP4 file, one frame at a time.
+
+    All frames have one size with even sides. The codec is H.264 if imageio-ffmpeg is installed, and
+    else MPEG-4 part 2, which OpenCV can always write.
+
 
     Raises:
         OutputError: the file cannot be written, or not encoded.

@@ -1,4 +1,4 @@
-"""How consistent the images of an output are: between frames, and between cameras.
+"""Measure how consistent the images of an output are: between frames, and between cameras.
 
 The protocol is in docs/evaluation.md; warping is `augment.metrics.consistency`'s.
 """
@@ -80,7 +80,7 @@ _PARTS = {ALL: "", DRY: "without water", WATER: "water only"}
 
 
 def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[str, Any]:
-    """The consistency of an output's images, as facts for `evaluation_text` and for JSON.
+    """Measure the consistency of an output's images; return facts for `evaluation_text` and JSON.
 
     Raises:
         OutputError: nothing is finished there, a file is missing or damaged, there is no pair, or
@@ -135,7 +135,7 @@ def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[
 
 
 def _notes(drives: Sequence[Drive], kinds: Collection[str], short: int, long: int) -> list[str]:
-    """Explain why tables are empty. kinds: the kinds of the pairs that there are."""
+    """Explain why tables are empty. kinds: the kinds of pairs that the output has."""
     distances = {SHORT: short, LONG: long}
     missing_kinds = [kind for kind in distances if kind not in kinds]
     by_camera = [
@@ -162,7 +162,7 @@ def _notes(drives: Sequence[Drive], kinds: Collection[str], short: int, long: in
 
 
 def _say_duration(pairs: int, pair_s: float) -> None:
-    """Say how long a long evaluation takes, once it is known what a pair does."""
+    """Print how long a long evaluation will take, after one pair has been timed."""
     total_s = pairs * pair_s
     if total_s > _MIN_SAID_S:
         print_note(
@@ -172,33 +172,44 @@ def _say_duration(pairs: int, pair_s: float) -> None:
 
 
 class View(NamedTuple):
-    """An image with its depth. shows_water, shows_actor: bool [H, W], None where no file says."""
+    """An image with its depth and masks."""
 
     depth_view: DepthView
+    """The image, its depth and its camera."""
     shows_water: np.ndarray | None
+    """[H, W], bool. True where the image shows water; None without such a file."""
     shows_actor: np.ndarray | None
+    """[H, W], bool. True where the image shows an actor; None without such a file."""
 
 
 class Pair(NamedTuple):
-    """Rows of the manifest: b is warped into a."""
+    """Two rows of the manifest. The view of row b is warped into that of row a."""
 
     kind: str
+    """The kind of the pair: which frames or cameras it compares."""
     a: int
+    """The row of the view that is compared with the warped one."""
     b: int
+    """The row of the view that is warped."""
 
 
 class Drive(NamedTuple):
-    """The images of one variant of one scene. rows: by (frame, camera)."""
+    """The images of one variant of one scene."""
 
     scene: str
+    """The name of the scene."""
     variant: str
+    """The name of the variant."""
     recipe: str
+    """The name of the recipe."""
     effects: str
+    """The names of the recipe's effects."""
     rows: dict[tuple[int, str], int]
+    """The rows of the manifest by frame and camera."""
 
 
 class Views:
-    """Reads the views of an output, the last ones kept. scenes, recipes: which; None for all.
+    """Reads the views of an output and caches the last ones. scenes, recipes: names; None for all.
 
     Raises:
         OutputError: nothing is finished there, or nothing of these scenes and recipes.
@@ -242,7 +253,7 @@ class Views:
         return list(drives.values())
 
     def camera(self, row: int) -> Camera:
-        """The row's camera in the dataset's world, which is that of the boxes."""
+        """Return the row's camera in the dataset's world, the world of the boxes."""
         manifest_row = self.rows.row(row)
         record, _ = self._reader.camera(manifest_row)
         try:
@@ -265,8 +276,10 @@ class Views:
             ) from error
 
     def noise(self, row: int) -> float:
-        """Sigma of the noise that the row's recipe gives its camera; 0 of JPEG, which loses some of
-        it, and of a variant without its recipe.
+        """Return the sigma of the camera noise in the row's recipe.
+
+        It is 0 for JPEG files, which lose some of the noise, and for variants without a recipe.
+
         """
         manifest_row = self.rows.row(row)
         return self._noise(
@@ -360,17 +373,20 @@ def _neighbours(views: Views, rows: Sequence[int]) -> list[tuple[int, int]]:
 
 
 class Compared(NamedTuple):
-    """B warped into A. warped: float64 [H, W, 3]. warp: which pixels count. moved: bool [H, W],
-    carried along with a box. water: bool [H, W], where either shows water; None where no file says.
-    noise: float64 [H, W, 2], variance of the cameras' in A and in `warped`; None without any.
-    """
+    """A view A, and a view B that is warped into A."""
 
     a: View
+    """The view A."""
     warped: np.ndarray
+    """[H, W, 3], float64. The picture of B, warped into A."""
     warp: Warp
+    """The warp, with the pixels that count."""
     moved: np.ndarray
+    """[H, W], bool. True where a pixel was moved with a box."""
     water: np.ndarray | None
+    """[H, W], bool. True where A or B shows water; None without such files."""
     noise: np.ndarray | None
+    """[H, W, 2], float64. Variance of camera noise in A and in `warped`; None without noise."""
 
 
 def compare(views: Views, pair: Pair) -> Compared:
@@ -447,7 +463,7 @@ def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> di
 
 
 def _summaries(records: Iterable[dict[str, Any]], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Means over the pairs that have these values in common."""
+    """Return means over the pairs that share the values of some columns."""
     groups: dict[tuple, list[dict[str, Any]]] = {}
     for record in records:
         groups.setdefault(tuple(record[name] for name in names), []).append(record)
@@ -507,7 +523,7 @@ def _worst(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def pair_picture(views: Views, record: dict[str, Any]) -> np.ndarray:
-    """uint8 [H', W', 3]: its frame, the other one warped, their error and the mask."""
+    """Draw a pair: its frame, the other warped, their error and the mask, uint8 [H', W', 3]."""
     comparison = compare(views, record["rows"])
     picture = comparison.a.depth_view.picture
     counts = comparison.warp.is_counted
@@ -580,7 +596,7 @@ def _table(facts: dict[str, Any], kind: str, with_lpips: bool) -> list[str]:
 
 
 def _rows(row: dict[str, Any], kind: str, with_lpips: bool) -> Iterator[list[str]]:
-    """The cells of one recipe: all pixels, then those without and with water."""
+    """Return the cells of one recipe: all pixels, then pixels without and with water."""
     summary = row[kind]
     names = [row["recipe"], row["effects"]]
     if summary is None or summary[ALL] is None:

@@ -1,4 +1,4 @@
-"""`climategs inspect`: what is in a scene; `climategs explain`: the plan of a recipe on a scene,
+"""`climategs inspect` shows the content of a scene; `climategs explain` the plan of a recipe on it,
 and where a frame spends its time, pass by pass, measured on a few of the scene's views.
 """
 
@@ -41,8 +41,10 @@ VIEWS = 3
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:
-    """Counts, bounds, memory, what is known and what is not, the problems found, and what of a few
-    small views of it is not fit for weather.
+    """Describe a scene: counts, bounds, memory, what it has and lacks, and its problems.
+
+    A few small views of it are drawn to find what is not fit for weather.
+
     """
     actors = [
         {
@@ -105,9 +107,7 @@ def _describe_gaussians(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def describe_drive(incomplete: IncompleteDrive) -> dict[str, Any]:
-    """Frames, cameras, returns, boxes and ground of a drive that no scene can be made of, what it
-    lacks, and the problems found.
-    """
+    """Describe a drive that no scene can be made of: its data, what it lacks, and its problems."""
     drive = incomplete.drive
     ground = incomplete.ground
     boxes = {frame.index: drive.labels.boxes(frame.index) for frame in drive.frames}
@@ -143,7 +143,7 @@ def describe_drive(incomplete: IncompleteDrive) -> dict[str, Any]:
 
 
 def drive_text(facts: dict[str, Any]) -> str:
-    """The facts of `describe_drive` as a page of text."""
+    """Return the facts of `describe_drive` as a page of text."""
     return fill("inspect_drive.txt", **facts)
 
 
@@ -178,7 +178,7 @@ def _describe_frames(frames: Sequence[Frame]) -> dict[str, Any]:
 
 
 def _describe_ground(scene: Scene) -> dict[str, Any]:
-    """The ground's record, or without it the sentence that says what is lacking."""
+    """Return the record of the ground, or without one a sentence about what is missing."""
     try:
         ground = ground_of(scene)
     except SceneError as error:
@@ -187,7 +187,7 @@ def _describe_ground(scene: Scene) -> dict[str, Any]:
 
 
 def _describe_labels(scene: Scene) -> dict[str, Any]:
-    """From the first frame only: reading every sweep of a long drive would take minutes."""
+    """Describe the labels of the first frame: reading all sweeps of a long drive takes minutes."""
     if scene.labels is None or not scene.frames:
         return {"boxes": None, "lidar": None}
     index = scene.frames[0].index
@@ -201,7 +201,7 @@ def _describe_labels(scene: Scene) -> dict[str, Any]:
 
 
 def scene_text(facts: dict[str, Any]) -> str:
-    """The facts of `describe_scene` as a page of text."""
+    """Return the facts of `describe_scene` as a page of text."""
     made_by = {name: _short(value) for name, value in facts["made_by"].items()}
     return fill("inspect.txt", **{**facts, "made_by": made_by})
 
@@ -281,7 +281,7 @@ def _view_facts(plan: Plan, scene: Scene, scale: float, *, all_of_it: bool) -> d
 
 
 def measure_passes(recipe: Recipe, scene: Scene, count: int = VIEWS) -> dict[str, Any]:
-    """Renders a few views with a stopwatch. The recipe's scale and outputs count; files do not.
+    """Time a few views pass by pass, with the recipe's scale and outputs, without writing files.
 
     views: how many were rendered, ROUNDS times each after a warm-up. frame_ms: of one view. share:
     of each pass in it, of those that were measured. folded: shares of what is computed inside the
@@ -327,7 +327,7 @@ def measure_passes(recipe: Recipe, scene: Scene, count: int = VIEWS) -> dict[str
 
 
 def sample_views(scene: Scene, count: int) -> list[Camera]:
-    """So many of the scene's views, or all, spread over frames and cameras alike."""
+    """Return some of the scene's views, spread evenly over frames and cameras; or all of them."""
     views = [camera for frame in scene.frames for camera in frame.cameras.values()]
     if len(views) <= count:
         return views
@@ -341,7 +341,7 @@ def sample_views(scene: Scene, count: int) -> list[Camera]:
 
 
 def without_folded(recipe: Recipe, scene: Scene) -> dict[str, Recipe]:
-    """The recipe without each of the passes that run inside the rasteriser, by the pass's name."""
+    """Return recipes that each lack one pass inside the rasteriser, by the pass's name."""
     runs = {step.name for step in make_plan(recipe, scene).steps if step.runs}
     folded = {name: f for effect in effects.EFFECTS for name, f in effect.off_switches.items()}
     return {
@@ -352,7 +352,7 @@ def without_folded(recipe: Recipe, scene: Scene) -> dict[str, Recipe]:
 
 
 def _runs(scene: Scene, camera: Camera, recipe: Recipe) -> list[dict[str, float]]:
-    """Seconds of the view's passes, and of the whole as FRAME, of each run after a warm-up."""
+    """Return the seconds of a view's passes, and of all as FRAME, for each run after a warm-up."""
     runs = []
     for _ in range(1 + ROUNDS):
         start = time.perf_counter()
@@ -367,7 +367,7 @@ def _sum(times: Sequence[Mapping[str, float]], *names: str) -> float:
 
 
 def explanation_text(facts: dict[str, Any]) -> str:
-    """The facts of `explain_recipe` as a page of text."""
+    """Return the facts of `explain_recipe` as a page of text."""
     sections = {"style": facts["recipe"]["style"], **facts["recipe"]["weather"]}
     return fill(
         "explain.txt",
@@ -380,7 +380,7 @@ def explanation_text(facts: dict[str, Any]) -> str:
 
 
 def _pass_lines(steps: list[dict[str, Any]], times: dict[str, Any] | None) -> list[str]:
-    """One line a pass, with its share of the time where that was measured."""
+    """Return a line for each pass, with its share of the time where that was measured."""
     share = times["share"] if times else {}
     step_names = {step["name"] for step in steps if step["runs"]}
     other_names = [name for name in share if name not in step_names]
@@ -398,8 +398,10 @@ def _pass_lines(steps: list[dict[str, Any]], times: dict[str, Any] | None) -> li
 
 
 def _share(name: str, times: dict[str, Any] | None) -> str:
-    """A pass's own time, and in brackets what it adds inside the rasteriser; nothing where neither
-    was measured.
+    """Return the time of a pass as text, and in brackets its time inside the rasteriser.
+
+    The text is empty if neither was measured.
+
     """
     if times is None:
         return ""
@@ -416,7 +418,7 @@ def _percent(share: float) -> str:
 
 
 def _flat(path: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Every number below a field with its dotted path; what is not given is left out."""
+    """Yield every number below a field with its dotted path, without fields that are not given."""
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from _flat(f"{path}.{name}", inner)

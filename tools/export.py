@@ -151,7 +151,7 @@ def clear_notes(
 
 
 def _clear_note(kind: str, total: int, places: Mapping[str | None, bool], scene: str) -> list[str]:
-    """places: files of the scene's, and whether they will be weathered."""
+    """Return a note on files that stay clear. places: files of the scene, and True if weathered."""
     num_left_out = list(places.values()).count(False)
     num_others = total - len(places)
     reasons = [f"{num_left_out} of frames or cameras that are not rendered"] if num_left_out else []
@@ -215,8 +215,11 @@ def mirror_outputs(
 
 
 def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "hard") -> int:
-    """`climategs mirror`: opens the scene, or all that the manifest has in turn, builds the copies,
-    prints. Returns the exit code."""
+    """Run `climategs mirror`. Return the exit code.
+
+    It opens the scene, or one after the other all scenes of the manifest, builds the copies and
+    prints what it did.
+    """
     columns = ["source", "scene", "frame", "camera", "lidar"]
     rows = read_manifest(out).select(columns).to_pylist()
     names_by_source: dict[str, list[str]] = {}  # a job can give scenes other names
@@ -327,7 +330,7 @@ def _of_other_scenes(
 def _rows(
     scene: Scene, out: Path, variants: Sequence[str] | None
 ) -> dict[str, list[dict[str, Any]]]:
-    """The manifest's rows of the scene's variants, by name."""
+    """Return the manifest's rows of the scene's variants, by name."""
     table = read_manifest(out)
     pairs = {
         (row["scene"], row["variant"]) for row in table.select(["scene", "variant"]).to_pylist()
@@ -391,7 +394,7 @@ def _has_all(scene: Scene, rows: list[dict[str, Any]]) -> bool:
 
 
 def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> None:
-    """Images of the same recipe in another format are not rendered twice beside each other."""
+    """Check that the output has no images of the same recipe in another format."""
     if not (out / MANIFEST_FILE).is_file() or recipe.output.image == written_as:
         return
     rows = select_variant_rows(read_manifest(out), {(scene.name, variant_name(recipe))})

@@ -153,7 +153,7 @@ def _prepare(options: FitOptions, folder: Path, before: Checkpoint | None) -> _R
         result="scene",
         changed=f"{options.scene} is not what {options.out} was fitted to so far",
     )
-    return _Run(options, training, scene, source, notes, dict(checks.to_json))
+    return _Run(options, training, scene, source, notes, dict(checks.report_facts))
 
 
 def _recorded_views(scene: Scene, options: FitOptions) -> RecordedViews:

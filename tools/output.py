@@ -175,7 +175,7 @@ def check_scene_out(out: Path, *, may_replace: bool, why: str = "") -> None:
 
 
 def path_beside(out: Path, ending: str) -> Path:
-    """OUT with an ending behind its name.
+    """Return OUT with an ending after its name.
 
     Raises:
         OutputError: OUT has no name.

@@ -83,7 +83,7 @@ def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> None:
 
 
 def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> None:
-    """As `warm_up`, for other processes, which find what was compiled in the caches on the disk.
+    """Compile kernels for other processes, which find them in the caches on disk. See `warm_up`.
 
     A GPU is used in a process of its own: this one would hold a part of its memory until it ends.
     """
@@ -164,7 +164,7 @@ def _warm_recipe(recipe: Recipe, photo: str, backend: str) -> None:
 
 
 def _warm_up_scene(level_z_m: float, photo: str, *, with_labels: bool) -> Scene:
-    """A level road above a flood's surface, and a splat below it; the level counts from z = 0."""
+    """Return a scene of a level road above a flood's surface, and a splat below it."""
     across = torch.arange(-ACROSS, ACROSS + 1) * SPACING_M
     x, y = torch.meshgrid(across + 4, across, indexing="ij")
     road = torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), level_z_m + 0.1)], 1)
@@ -194,7 +194,7 @@ def _warm_up_scene(level_z_m: float, photo: str, *, with_labels: bool) -> Scene:
 
 
 class _NoLabels:
-    """Labels of which there are none: what is drawn for labels' sake is drawn."""
+    """An empty set of labels, so that everything that labels need is drawn."""
 
     def boxes(self, frame_index: int) -> Boxes:
         return Boxes.empty()
@@ -204,12 +204,12 @@ class _NoLabels:
 
 
 def _one_return(z_m: float) -> LidarSweep:
-    """A sweep of one return, from the road ahead."""
+    """Return a sweep with one return, from the road ahead."""
     return LidarSweep({"x": np.array([4.0]), "y": np.array([0.0]), "z": np.array([z_m])})
 
 
 def _camera(z_m: float) -> Camera:
-    """A level camera that looks ahead along +x."""
+    """Return a level camera that looks ahead along +x."""
     rotation = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
     centre = torch.tensor([0.0, 0.0, z_m], dtype=torch.float64)
     pose = rigid(rotation, -rotation @ centre)
@@ -217,7 +217,7 @@ def _camera(z_m: float) -> Camera:
 
 
 def generate_dataset(options: GenerateOptions) -> int:
-    """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
+    """Run the job and print its result. Return the exit code: 1 if images failed."""
     job = options.job
     out = options.out
     backend = options.backend
@@ -265,7 +265,7 @@ def generate_dataset(options: GenerateOptions) -> int:
 
 
 def show_status(out: str) -> int:
-    """Prints how far the jobs of an output have come. Returns the exit code: 1 for unfinished ones.
+    """Print the progress of an output's jobs. Return the exit code: 1 for unfinished jobs.
 
     Raises:
         ClimateGSError: no job was ever started there.
@@ -342,7 +342,7 @@ def _size(count: float) -> str:
 
 
 def render_recipes(options: RenderOptions) -> int:
-    """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
+    """Run the job and print its result. Return the exit code: 1 if images failed."""
     out = options.out
     backend = options.backend
     recipes = resolve_recipes(options.recipes, options.variants, options.scale, options.overrides)
@@ -435,7 +435,7 @@ def _write_labels(out: Path, recipes: Sequence[Recipe], images: int) -> None:
 def _cameras(
     options: RenderOptions, scene: Scene, path: Sequence[Frame] | None
 ) -> Sequence[str] | None:
-    """Names, or None for all; a note says which are left out."""
+    """Return the names of the cameras, or None for all. A note names those that are left out."""
     if options.cameras != FITTED:
         return names_in(options.cameras)
     unfitted_names = () if path is not None else unfitted_cameras(scene)
@@ -451,7 +451,7 @@ def resolve_recipes(
     scale: float = 1.0,
     overrides: Sequence[str] = (),
 ) -> list[Recipe]:
-    """The recipes' variants in numbers, at `scale` times each recipe's resolution.
+    """Return the recipes' variants in numbers, at `scale` times each recipe's resolution.
 
     Raises:
         RecipeError: a recipe is invalid, or scaled beyond its limits.
@@ -476,7 +476,7 @@ def resolve_recipes(
 def _with_quality(
     recipe: Recipe, scene: Scene, options: RenderOptions, path: Sequence[Frame] | None
 ) -> Recipe:
-    """The recipe with the settings of its quality; a note says which it had to choose."""
+    """Return the recipe with the settings of its quality. A note names chosen settings."""
     if not recipe.quality.has_open_choice:
         return recipe
     resolved = choose_settings(
@@ -496,7 +496,7 @@ def _with_quality(
 
 
 def run_demo(out: Path, frames: int) -> int:
-    """The embedded street under five recipes, and pictures of it. Returns the exit code."""
+    """Render the embedded street under five recipes, with pictures. Return the exit code."""
     start_s = time.perf_counter()
     uri = f"procedural:street?seed=3&frames={frames}"
     print_note(f"building {uri}")

@@ -340,7 +340,7 @@ def read_trainers(files: ReportFiles) -> LabelsRecord | None:
 def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict[str, Any] | None:
     """Count boxes by the share that the weather leaves visible, in VISIBILITY_STEPS.
 
-    The product of what every effect leaves, as `augment.jobs.files.visibility` has it.
+    The product of what every effect leaves, as `augment.jobs.files.combine_visibility` has it.
     """
     kinds = (
         kind

@@ -61,8 +61,13 @@ def shown_numbers(quantity: Column, numbers: np.ndarray) -> np.ndarray:
 
 
 def find_draws(table: pa.Table) -> pa.Table:
-    """The first row of each scene and variant, with the columns `images`, how many it has, and
-    `is_clear`, without weather and style. table: of finished images, with the column `draw`.
+    """Return the first row of each scene and variant, with two more columns.
+
+    `images` is the number of its images; `is_clear` is True without weather and style.
+
+    Args:
+        table: The rows of finished images, with the column `draw`.
+
     """
     _, first, images = np.unique(table["draw"].to_numpy(), return_index=True, return_counts=True)
     rows = table.take(first)
@@ -87,7 +92,7 @@ class Spread:
 
     @property
     def is_constant(self) -> bool:
-        """All values are one, but for rounding."""
+        """True if all values are equal except for rounding."""
         low = self.values.min()
         high = self.values.max()
         return not high - low > 1e-9 * max(abs(low), abs(high))
@@ -151,7 +156,7 @@ def weather_of_recipes(draws: pa.Table) -> dict[str, str]:
 
 
 def weather_text(row: Mapping[str, Any]) -> str:
-    """A row's weather in a few words."""
+    """Return a row's weather in a few words."""
     texts = []
     for column in sorted(columns_of_effects().values(), key=lambda column: column.is_number):
         value = row.get(column.name)
@@ -166,7 +171,7 @@ def weather_text(row: Mapping[str, Any]) -> str:
 
 
 def _number_columns(table: pa.Table) -> list[str]:
-    """The weather's columns that hold numbers, those known here first."""
+    """Return the weather's columns that have numbers; columns that are known here come first."""
     order = {column: number for number, column in enumerate(columns_of_effects())}
     columns = [
         c for c in weather_columns(table) if pa.types.is_floating(table.schema.field(c).type)
@@ -182,7 +187,7 @@ def _as_floats(table: pa.Table, column: str) -> np.ndarray:
 def histogram(
     values: np.ndarray, weights: np.ndarray, *, linear: bool = False
 ) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Edges [n + 1], counts [n], and whether edges are spaced evenly in the logarithm.
+    """Return edges [n + 1], counts [n], and True if edges are evenly spaced in the logarithm.
 
     values: finite [v], two of them unlike, each counted as often as its whole weight says. linear:
     not logarithmic, however far the values are spread.
@@ -199,7 +204,7 @@ def histogram(
 
 
 def chart(spread: Spread) -> dict[str, Any]:
-    """A histogram for the template, places in SVG units.
+    """Return a histogram for the template, with positions in SVG units.
 
     bars: (x, y, width, height, from, to, images). marks: x of a tick for each variant beneath, of
     at most MAX_MARKS, evenly chosen. labels: (x, number) of the axis. most: of the tallest bar.
@@ -239,7 +244,7 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def short(number: float) -> str:
-    """Three significant digits, no exponent where there need be none."""
+    """Return a number as text with three significant digits, and no exponent if possible."""
     if not math.isfinite(number) or number == 0:
         return f"{number + 0.0:g}"  # without the sign of -0.0
     size = abs(number)
@@ -257,7 +262,7 @@ def count(number: int, noun: str = "") -> str:
 
 
 def plural_of(number: int, noun: str) -> str:
-    """The noun as it stands behind the number."""
+    """Return the noun in singular or plural, as it follows the number."""
     if number == 1 or not noun:
         return noun
     return noun + ("es" if noun.endswith(("x", "ss")) else "s")
@@ -274,7 +279,7 @@ def byte_size(number: int) -> str:
 
 
 def percent(part: float, total: float) -> str:
-    """A share as text, such as 41 % or < 1 %; – where the total is 0."""
+    """Return a share as text, such as 41 % or < 1 %; – where the total is 0."""
     if not total:
         return "–"
     share = 100 * part / total

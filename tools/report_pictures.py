@@ -128,17 +128,17 @@ class ReportFiles:
         return self.read(path, checked)
 
     def read_picture(self, row: Row) -> np.ndarray | None:
-        """uint8 [H, W, 3] RGB of a manifest's row."""
+        """Return the picture of a manifest's row, RGB uint8 [H, W, 3]."""
         return self.read_image(row["image_path"], decode_image, row["checksum"])
 
 
 def rows_with(table: pa.Table, column: str, value: str) -> np.ndarray:
-    """int64: the numbers of the rows with that value; of a million rows a copy is large."""
+    """Return the numbers of the rows with a value, int64; a copy of the rows would be large."""
     return np.flatnonzero(pc.equal(table[column], value).to_numpy())
 
 
 def pick_images(table: pa.Table, among: np.ndarray, number: int, shift: int = 0) -> list[Row]:
-    """At most `number` rows: one each of evenly chosen variants, wandering over frames and cameras.
+    """Return at most `number` rows, of evenly chosen variants and varying frames and cameras.
 
     Evenly spaced rows would mostly show one camera: the numbers of frames and cameras divide them.
     among: the rows to choose from. shift: of the place, so that calls for one row each do not all
@@ -200,43 +200,61 @@ def _place_of(table: pa.Table, among: np.ndarray, clear: set[int], variants: int
 
 
 class Picture(NamedTuple):
-    """uri: a JPEG inside the page. width, height: of it, pixels."""
+    """A JPEG inside the page."""
 
     uri: Markup
+    """The image's bytes as a data URI."""
     width: int
+    """The width, pixels."""
     height: int
+    """The height, pixels."""
 
 
 class Figure(NamedTuple):
-    """A picture with its caption. link: to the file beside the page. depth: its caption shows the
-    colours of depths. keys: (name, CSS colour) of classes.
-    """
+    """A picture with its caption."""
 
     picture: Picture
+    """The picture."""
     alt: str
+    """The text in place of the picture."""
     title: str
+    """The first line of the caption."""
     note: str
+    """The second line of the caption."""
     weather: str | None = None
+    """The weather in words; None without a line for it."""
     link: str | None = None
+    """The link to the image's file next to the page; None without a link."""
     is_depth: bool = False
+    """True if the caption shows the colours of depths."""
     keys: Sequence[tuple[str, str]] = ()
+    """The name and the CSS colour of every class in the picture."""
 
 
 class Shares(NamedTuple):
-    """How many pictures of each kind a page has, and how many bytes each may take."""
+    """Numbers of a page's pictures of each kind, and the bytes that each may take."""
 
     places: int
+    """The number of places that are compared."""
     variants: int
+    """The number of variants that are compared at each place."""
     samples: int
+    """The number of images that are shown with their buffers."""
     thumbnails: int
+    """The number of thumbnails."""
     large_bytes: int
+    """The largest size of a picture of a comparison, bytes."""
     buffer_bytes: int
+    """The largest size of a picture of a buffer, bytes."""
     small_bytes: int
+    """The largest size of a thumbnail, bytes."""
 
     @staticmethod
     def of(images: int) -> Shares:
-        """Share out a page's images: a third for comparisons, a quarter for depth and classes, the
-        rest for contact sheets.
+        """Divide a page's images among the kinds of pictures.
+
+        A third is for comparisons, a quarter for depth and classes, and all others are for contact
+        sheets.
         """
         num_compared = images // 3
         samples = images // 4 // _SAMPLE
@@ -251,16 +269,20 @@ class Shares(NamedTuple):
 
 @dataclass(frozen=True)
 class Gallery:
-    """The page's pictures. clear: the numbers of the variants without weather. cameras: as they
-    stand on the car. linked: whether they lead to the files, which lie beside the page.
-    """
+    """The page's pictures."""
 
     table: pa.Table
+    """The rows of finished images, with the column `draw`."""
     clear: set[int]
+    """The numbers of the variants without weather."""
     cameras: list[str]
+    """The names of the cameras in their order on the car."""
     files: ReportFiles
+    """The files of the output."""
     shares: Shares
+    """The numbers and sizes of pictures."""
     linked: bool
+    """True if pictures link to the output's files, which lie next to the page."""
 
     def compare(self) -> dict[str, Any]:
         """Sliders between variants of one place. lacks: what there is nothing of: a `clear` variant
@@ -291,7 +313,7 @@ class Gallery:
         return {"places": comparisons, "lacks": None if has_pairs else lacks}
 
     def contact_sheets(self, recipes: Sequence[str]) -> dict[str, Any]:
-        """A strip of thumbnails for each recipe, as many recipes as there are pictures for."""
+        """Return a strip of thumbnails for each of as many recipes as the budget allows."""
         chosen_recipes = evenly(list(recipes), self.shares.thumbnails)
         num_images = max(1, min(8, self.shares.thumbnails // max(len(chosen_recipes), 1)))
         strips = []
@@ -307,7 +329,7 @@ class Gallery:
         return {"strips": strips, "of": len(recipes)}
 
     def buffers(self, recipes: Sequence[str]) -> list[list[Figure]]:
-        """Images of some recipes with their depth, classes and masks."""
+        """Return images of some recipes with their depth, classes and masks."""
         has_buffers = pc.or_(*(pc.is_valid(self.table[f"{k}_path"]) for k in ("depth", "semantic")))
         table = self.table
         recipes_with_buffers = set(pc.unique(self.table["recipe"].filter(has_buffers)).to_pylist())
@@ -379,7 +401,10 @@ def read_buffers(row: Row, files: ReportFiles, width: int, most: int) -> list[Fi
 
 
 def color_depth(depth_m: np.ndarray) -> tuple[np.ndarray, str]:
-    """uint8 [H, W, 3] and its range: the logarithm between the 1st and the 99th percentile.
+    """Return colours of depths, uint8 [H, W, 3], and their range.
+
+    The colours are logarithmic in depth, from the 1st to the 99th percentile.
+
 
     depth_m: float32 [H, W], 0 = none, which is grey.
     """
@@ -396,14 +421,17 @@ def color_depth(depth_m: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def depth_gradient() -> str:
-    """CSS stops of `color_depth`'s colours, near to far."""
+    """Return CSS stops of `color_depth`'s colours, from near to far."""
     levels = np.linspace(255, 0, 9).astype(np.uint8)[:, None]
     stops = color_mapped(levels / 255, cv2.COLORMAP_TURBO)[:, 0]
     return ",".join("rgb({} {} {})".format(*stop) for stop in stops.tolist())
 
 
 def embed(rgb: np.ndarray, width: int, most: int) -> Picture:
-    """A JPEG of at most `width` pixels across and about `most` bytes: quality gives way, then size.
+    """Return a JPEG of at most `width` pixels across and about `most` bytes.
+
+    If it is too large, the quality is lowered first, and then the size.
+
 
     rgb: uint8 [H, W, 3]. A picture much taller than wide is at most 1.5 times as tall as `width`.
     """

@@ -22,13 +22,13 @@ from pydantic import ValidationError
 from adapters.base import open_scene
 from adapters.scene_folder import prepare_for_storage
 from augment.cameras import Camera
-from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, styled_scene
+from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, style_scene
 from augment.effects.style.content import content_pictures, content_statistics, select_views
 from augment.effects.style.losses import FeatureExtractor, open_features
 from augment.effects.style.network import B0Encoder, load_imagenet_weights, save_network
 from augment.effects.style.style import SceneStyle, style_maps
 from augment.effects.style.train import (
-    DEFINITIONS,
+    SCORE_DEFINITIONS,
     Content,
     Draw,
     StepRecord,
@@ -87,7 +87,7 @@ UNTIMED = 2  # the number of steps before them that are not timed
 def train_style(
     options: StyleTrainOptions, *, progress: bool = True, checkpoint_s: float = CHECKPOINT_S
 ) -> Outcome:
-    """Trains, or goes on training, into `options.out`.
+    """Train a network into `options.out`, or go on with a training there.
 
     Raises:
         ClimateGSError: options, data or the output folder cannot be used as they are.
@@ -115,12 +115,12 @@ def train_style(
 
 
 def checkpoint_folder(out: Path) -> Path:
-    """Folder of the checkpoint from which a training in `out` goes on."""
+    """Return the folder of the checkpoint from which a training in `out` goes on."""
     return out / "checkpoint"
 
 
 class _Data(NamedTuple):
-    """scored: what networks are scored by. held_out: photos."""
+    """Pictures of a training. scored: by which networks are scored. held_out: photos."""
 
     pool: TrainingPool
     scored: Draw
@@ -273,7 +273,7 @@ def _train(run: _Run, progress: bool, checkpoint_s: float) -> Outcome:
 
 
 def _scores(run: _Run) -> dict[str, Any]:
-    """Scores of the network as it is now."""
+    """Return the scores of the network as it is now."""
     return score_training(run.training.trainer.net, run.data.scored, run.features)
 
 
@@ -299,7 +299,7 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
         "seconds": training.seconds(),
         "scenes": [uri_text(uri) for uri in options.scenes],
         "problems": list(run.data.problems),
-        "definitions": DEFINITIONS,
+        "definitions": SCORE_DEFINITIONS,
         "scores": _scores(run) | score_photos(net, run.data.held_out),
         "history": training.rows,
     }
@@ -324,7 +324,7 @@ VISIBLE = 1 / 255  # a difference of colour
 
 
 def apply_style(options: ApplyOptions) -> dict[str, Any]:
-    """Writes the styled scene and its picture, prints what was done, and returns it as facts.
+    """Write the styled scene and its picture. Print and return facts about them.
 
     Raises:
         StyleError: the style cannot be used. SceneError: the scene cannot. OutputError: OUT holds
@@ -343,15 +343,15 @@ def apply_style(options: ApplyOptions) -> dict[str, Any]:
         print_note(f"note: {problem}")
     scene = prepare_for_storage(scene)
     open_s = time.perf_counter()
-    if requested.changes and requested.method == "gscm":
+    if requested.has_effect and requested.method == "gscm":
         content_pictures(scene)
-    elif requested.changes:
+    elif requested.has_effect:
         content_statistics(scene, per_region=requested.per_region)
     measure_s = time.perf_counter()
     maps = style_maps(scene, requested)
     map_s = time.perf_counter()
 
-    styled = styled_scene(scene, maps)
+    styled = style_scene(scene, maps)
     facts: dict[str, Any] = {
         "scene": scene.source,
         "out": str(out),
@@ -378,7 +378,7 @@ def apply_style(options: ApplyOptions) -> dict[str, Any]:
 
 
 def picture_path(out: Path) -> Path:
-    """Path of a styled scene's picture, beside the scene's folder."""
+    """Return the path of a styled scene's picture, beside the scene's folder."""
     return path_beside(out, ".style.jpg")
 
 
@@ -388,7 +388,7 @@ def style_text(facts: Mapping[str, Any]) -> str:
 
 
 def _style(options: ApplyOptions) -> Style:
-    """Style of an image file, or of the preset of that name (a file of that name is ./NAME)."""
+    """Return the style of an image file, or of a preset (a file of that name is ./NAME)."""
     source = options.style
     is_preset = source in style_preset_names()
     if not is_preset and not Path(source).exists() and not Path(source).suffix:
@@ -403,7 +403,7 @@ def _style(options: ApplyOptions) -> Style:
 
 
 def _style_facts(style: Style) -> dict[str, Any]:
-    """Facts of a style that are stored with the scene: files by name and digest, not by path."""
+    """Return facts of a style to store with the scene: files by name and digest, not by path."""
     facts = {
         name: value
         for name, value in style.model_dump(exclude={"applied_to", "evaluated", "digest"}).items()
@@ -412,7 +412,7 @@ def _style_facts(style: Style) -> dict[str, Any]:
     for name in ("image", "mask", "checkpoint"):
         if name in facts:
             path = Path(facts[name])
-            content = path.read_bytes() if style.changes else b""
+            content = path.read_bytes() if style.has_effect else b""
             facts[name] = {"name": path.name, "sha256": hashlib.sha256(content).hexdigest()}
     return facts
 
@@ -481,11 +481,11 @@ def _views(scene: Scene) -> list[Camera]:
 
 
 def _render(scene: Scene, camera: Camera, style_parts: SceneStyle | None = None) -> torch.Tensor:
-    """The picture with its sky, not clamped. style_parts: a style to render it under."""
+    """Return the picture with its sky, not clamped. style_parts: the style; None for none."""
     parts = scene.parts_for(camera)
     sky = scene.sky
     if style_parts is not None:
-        parts = style_parts.on(parts)
+        parts = style_parts.map_parts(parts)
         sky = style_parts.sky
     raster = rasterize(parts, camera)
     assert raster.rgb is not None and raster.alpha is not None
@@ -515,7 +515,7 @@ def _apply_facts(scene: Scene, maps: StyleMaps) -> dict[str, Any]:
 
 
 def _picture(scene: Scene, styled: Scene) -> np.ndarray | None:
-    """uint8 RGB: a view a row, before and after; None of a scene without cameras."""
+    """Draw views before and after, a row each, RGB uint8; None for a scene without cameras."""
     rows = []
     for camera in _views(scene):
         panels = [

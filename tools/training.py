@@ -1,9 +1,10 @@
-"""What `fit` and `style train` share: steps until the end or a signal, and checkpoints on disk from
-which a training goes on to the same bits.
+"""The training loop of `fit` and `style train`, and its checkpoints.
 
-A checkpoint's `fit.json` says all there is to say and names the arrays' file with its checksum; it
-is written last and replaced in one step, so a kill at any moment leaves a whole checkpoint: this
-one or the one before.
+A training runs until its last step or a signal. It goes on from a checkpoint to the same bits.
+
+A checkpoint is a file `fit.json` and a file of arrays, which `fit.json` names with its checksum.
+`fit.json` is written last and replaced in one step. So a kill at any moment leaves a complete
+checkpoint: the new one or the one before.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from tools.output import print_note
 EVALUATIONS = 10
 CHECKPOINT_S = 120.0
 RESERVE = 0.05  # of the time, for evaluations and checkpoints
-VERSION = 3
+VERSION = 4
 PLAN_FILE = "fit.json"  # the checkpoint's settings, history and names of arrays
 REPORT_FILE = "report.json"  # the report of a training, for programs
 _STATES = "state-*.safetensors"
@@ -56,7 +57,10 @@ _STOPPING = b"\nstopping after this step; interrupt again to stop at once\n"
 
 @dataclass(frozen=True)
 class Outcome:
-    """code: the command's exit code, 130 where it was interrupted. report: as in report.json."""
+    """The result of a training.
+
+    code: the command's exit code, 130 if it was interrupted. report: the content of report.json.
+    """
 
     code: int
     report: dict[str, Any]
@@ -150,7 +154,7 @@ def open_training(
     result: str,
     changed: str,
 ) -> Training:
-    """A new training, or the one that `folder` has a checkpoint of.
+    """Return a new training, or the one whose checkpoint is in `folder`.
 
     trainer: makes one for a number of steps: learning rates that decay need it before the first
     one. estimate(budget_s): the number of steps that fill the time, and seconds of one. result,
@@ -201,7 +205,7 @@ def run_training(
     checkpoint_s: float = CHECKPOINT_S,
     progress: bool = True,
 ) -> Outcome:
-    """Steps from the trainer's to the plan's last, or until asked to stop.
+    """Run steps until the plan's last step, or until a stop is requested.
 
     add(record): of every step. score(): adds rows to the history, about EVALUATIONS times.
     postfix(record): for the progress bar. write(complete): the result; returns the report.
@@ -239,7 +243,7 @@ def run_training(
 
 
 def evaluation_steps(steps: int) -> frozenset[int]:
-    """About EVALUATIONS even points of a run, the last step among them."""
+    """Return about EVALUATIONS evenly spaced steps of a run, with the last step."""
     return frozenset(max(1, round(steps * i / EVALUATIONS)) for i in range(1, EVALUATIONS + 1))
 
 
@@ -277,12 +281,16 @@ class StopRequest:
 
 
 class Checkpoint(BaseModel):
-    """A training after `step` of `steps` steps, as `fit.json` holds it but for the arrays.
+    """A training after `step` of `steps` steps, as `fit.json` stores it, and its arrays.
 
-    settings, length: what was asked for. data: what was found in the recorded data. history: rows
-    so far; sums: of the steps since the last row; seconds: spent so far. facts, arrays: the
-    trainer's state; no arrays before the first step. state: their file and its SHA-256. finished:
-    the result and its report stand.
+    settings, length: the settings and the length that the user chose.
+    steps, step: the number of all steps, and of the steps so far.
+    data: facts about the recorded data.
+    finished: True if the result and its report are written.
+    seconds: the time spent so far.
+    history: the rows so far. sums: sums over the steps since the last row.
+    facts, arrays: the trainer's state. Before the first step there are no arrays.
+    state: the file of the arrays and its SHA-256.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -303,14 +311,17 @@ class Checkpoint(BaseModel):
 
 
 class State(BaseModel):
-    """A file of a checkpoint's arrays. file: a name, so that nothing outside the folder is read."""
+    """The file of a checkpoint's arrays, and its SHA-256.
+
+    `file` is a name without a folder, so that nothing outside the checkpoint's folder is read.
+    """
 
     file: str = Field(pattern=r"^[^/\\]+$")
     sha256: str
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
-    """Replace the folder's checkpoint. Returned is what its JSON holds.
+    """Replace the folder's checkpoint. Return the content of its JSON file.
 
     Raises:
         OutputError: the system refused; the checkpoint before is then as it was.
@@ -346,7 +357,7 @@ def _check_same(options: Any, before: Checkpoint) -> None:
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Every setting that is not the same: `scale was 0.25, now 0.5`."""
+    """Return every setting that differs as text: `scale was 0.25, now 0.5`."""
     return [
         f"{name} was {before.get(name)}, now {now.get(name)}"
         for name in dict.fromkeys([*before, *now])
@@ -355,7 +366,7 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
 
 
 def load_checkpoint(folder: Path, *, arrays: bool = True) -> Checkpoint | None:
-    """The folder's checkpoint; None where there is none. arrays: False leaves them on disk.
+    """Load the folder's checkpoint; None if there is none. arrays: False leaves them on disk.
 
     Raises:
         OutputError: a file of it is missing, damaged, or of another version.
@@ -433,7 +444,7 @@ Row = Mapping[str, Any]
 
 
 class Line(NamedTuple):
-    """A number of the history's rows, those of a split (test, train) alone where one is named."""
+    """A number of the history's rows. If a split (test, train) is named, only its rows count."""
 
     key: str
     label: str = ""
@@ -443,7 +454,7 @@ class Line(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """last: how a line's last value is written in the legend."""
+    """A panel of the chart. last: the format of a line's last value in the legend."""
 
     title: str
     lines: tuple[Line, ...]

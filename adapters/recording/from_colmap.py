@@ -97,7 +97,7 @@ class RecordingSummary(NamedTuple):
 
     Attributes:
         frames, images: their numbers.
-        left_out: number of the folder's images without a pose.
+        num_images_without_pose: number of the folder's images without a pose.
         metres: length of the model's unit. None if it is not known.
         residual_m: median distance of the cameras from their given positions. None without
             positions.

@@ -44,22 +44,26 @@ def value_noise(points: np.ndarray, seed: int = 0) -> np.ndarray:
     base = np.floor(points)
     fraction = (points - base).astype(np.float32)
     fraction = fraction * fraction * (3 - 2 * fraction)
-    index = sum(base[:, k].astype(np.int64) * _STEPS[k] for k in range(points.shape[1]))
+    index = sum(base[:, k].astype(np.int64) * _CORNER_STEPS[k] for k in range(points.shape[1]))
     index = (index + seed * 7919) & (TABLE_SIZE - 1)
 
     def blend(offset: int, axes: int) -> np.ndarray:
         if axes == 0:
-            return _TABLE[offset:][index]
+            return _NOISE_TABLE[offset:][index]
         low = blend(offset, axes - 1)
-        high = blend(offset + _STEPS[axes - 1], axes - 1)
+        high = blend(offset + _CORNER_STEPS[axes - 1], axes - 1)
         return low + fraction[:, axes - 1] * (high - low)
 
     return blend(0, points.shape[1])
 
 
+# Number of entries of the noise table.
 TABLE_SIZE = 1 << 16
-_TABLE = np.tile(2 * hashed(np.arange(TABLE_SIZE, dtype=np.int32)[:, None], 1) - 1, 2)
-_STEPS = (1, 40503, 12289)  # far apart in the table, whichever few cells are compared
+# Random values in [-1, 1], twice one after the other, so that an offset needs no modulo.
+_NOISE_TABLE = np.tile(2 * hashed(np.arange(TABLE_SIZE, dtype=np.int32)[:, None], 1) - 1, 2)
+# Steps in the table from a cell to its neighbour along each axis. They are chosen so that nearby
+# cells are far from each other in the table.
+_CORNER_STEPS = (1, 40503, 12289)
 
 
 def fractal_noise(points: np.ndarray, octaves: int, seed: int = 0) -> np.ndarray:
@@ -82,20 +86,20 @@ def fractal_noise(points: np.ndarray, octaves: int, seed: int = 0) -> np.ndarray
 class Material(IntEnum):
     """Rule by which a surface's albedo varies with the place."""
 
-    PLAIN = 0
-    ASPHALT = 1
-    MARKING = 2
-    PAVING = 3
-    PLASTER = 4
-    BRICK = 5
-    STONE = 6
-    TILES = 7
-    GRASS = 8
-    LEAVES = 9
-    BARK = 10
+    PLAIN = 0  # the albedo of the shape, everywhere
+    ASPHALT = 1  # carriageways and flat roofs
+    MARKING = 2  # paint on the road
+    PAVING = 3  # slabs of pavements
+    PLASTER = 4  # plastered walls
+    BRICK = 5  # courses of bricks
+    STONE = 6  # courses of stones
+    TILES = 7  # courses of roof tiles
+    GRASS = 8  # grass of the land
+    LEAVES = 9  # masses of leaves, as in a crown's core
+    BARK = 10  # trunks and boughs
     GLASS = 11  # window pane: shading adds what it mirrors
     PAINT = 12  # car paint: shading adds a clear coat
-    RIM = 13
+    RIM = 13  # spokes and hub of a wheel
     LEAF = 14  # one tuft of leaves: a single splat, one light
     SHOP = 15  # a shop's pane: as GLASS, with goods behind it
 
@@ -129,7 +133,7 @@ def albedo(shapes: Shapes, shape: np.ndarray, local: np.ndarray) -> np.ndarray:
     material = shapes.material[shape]
     out = shapes.rgb[shape]
     for value in np.unique(material):
-        if rule := _RULES.get(Material(int(value))):
+        if rule := _ALBEDO_RULES.get(Material(int(value))):
             index = np.flatnonzero(material == value)
             shape_index = shape[index]
             local_coords = local[index]
@@ -220,7 +224,8 @@ def _rim(spots: SurfacePoints) -> np.ndarray:
     return spots.rgb * np.where(radius > 0.88, 1.0, bright)[:, None]
 
 
-_RULES: dict[Material, Callable[[SurfacePoints], np.ndarray]] = {
+# Functions that give the albedo of points on each material; others keep the albedo of the shape.
+_ALBEDO_RULES: dict[Material, Callable[[SurfacePoints], np.ndarray]] = {
     Material.ASPHALT: _asphalt,
     Material.MARKING: _marking,
     Material.PAVING: _paving,
@@ -270,6 +275,7 @@ U1 = 2
 V0 = 4
 # The side v = 1.
 V1 = 8
+# All four sides.
 ALL_EDGES = U0 | U1 | V0 | V1
 # A triangle that leaves the splats on its diagonal to the other half of its quad.
 OPEN_DIAGONAL = 16
@@ -303,10 +309,15 @@ class Look(NamedTuple):
 class Shapes(np.recarray):
     """P shapes: an array of records, each field an attribute.
 
-    origin: float [P, 3], metres. axes: float [P, 3, 3], rows u, v, w, metres. shading: float [P, 3,
-    3]; the light's normal of flat kinds and leaves is shading[0] + u shading[1] + v shading[2].
-    variation: float [P], in [0, 1), differs between equal shapes. The other fields are those of
-    Look.
+    Attributes:
+        origin: float [P, 3], origin of the local frame, metres.
+        axes: float [P, 3, 3], axes u, v, w of the local frame as rows, metres.
+        shading: float [P, 3, 3]. The normal that lights flat kinds and leaves is
+            shading[0] + u shading[1] + v shading[2].
+        variation: float [P], in [0, 1), differs between equal shapes.
+        kind: int [P], form of the shape, a Kind.
+        edges: uint [P], sides where the splats end crisply, bits such as U0.
+        rgb, ambient, spacing, material, semantic, backed: the fields of Look.
     """
 
     FIELDS = np.dtype([
@@ -399,9 +410,8 @@ class Shapes(np.recarray):
         return normals
 
 
-_RECORD_BYTES = np.dtype(
-    (np.void, Shapes.FIELDS.itemsize)
-)  # numpy would compare all fields in Python
+# Shapes as opaque records: NumPy would compare all fields in Python.
+_RECORD_BYTES = np.dtype((np.void, Shapes.FIELDS.itemsize))
 
 
 def join(parts: Sequence[Shapes]) -> Shapes:
@@ -566,7 +576,7 @@ def tube(start: Sequence[float], end: Sequence[float], radius_m: float, look: Lo
 
 
 def ellipsoids(centres: Vectors, axes: np.ndarray, look: Look) -> Shapes:
-    """Return ellipsoids with orthogonal semi-axes axes [P, 3, 3] (rows), metres."""
+    """Return ellipsoids with orthogonal semi-axes, the rows of `axes` [P, 3, 3], metres."""
     return Shapes.of(Kind.ELLIPSOID, _as_vectors(centres), axes.transpose(1, 0, 2), look)
 
 
@@ -596,9 +606,13 @@ def quads(corners: np.ndarray, look: Look, *, normals: np.ndarray | None = None)
 
 
 def triangles(
-    a: Vectors, b: Vectors, c: Vectors, look: Look, edges: int = 0,
+    a: Vectors,
+    b: Vectors,
+    c: Vectors,
+    look: Look,
+    edges: int = 0,
     shading: Sequence[np.ndarray] | None = None,
-) -> Shapes:  # fmt: skip
+) -> Shapes:
     """Return triangles that face (b - a) x (c - a)."""
     a = _as_vectors(a)
     u = b - a

@@ -114,37 +114,57 @@ TERRAIN_Z_M = 0.03
 class Mover(NamedTuple):
     """An actor that goes straight along x at a steady speed (negative: towards -x)."""
 
-    name: str  # car-0, pedestrian-1
-    x_m: float  # at the first frame
+    name: str
+    """Name, for example car-0 or pedestrian-1."""
+
+    x_m: float
+    """x at the first frame."""
+
     y_m: float
+    """y at all times."""
+
     speed_mps: float
+    """Speed along x."""
+
     seed: int
+    """Seed of the mover's model and colours."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Plan of a street.
-
-    Attributes:
-        parameters: the street's parameters.
-        x0, x1: beginning and end of the carriageway, metres.
-        zebra_x: middle of the zebra crossing.
-        plots: beginning and end of each building or garden, its side (+1 left, -1 right), seed, and
-            True for a garden.
-        trees, lamps, signs, parked: positions (x, y).
-        movers: moving actors.
-    """
+    """Plan of a street. Lengths are in metres, in the scene's world."""
 
     parameters: StreetParameters
+    """Parameters of the street."""
+
     x0: float
+    """x of the carriageway's beginning."""
+
     x1: float
+    """x of the carriageway's end."""
+
     zebra_x: float
+    """x of the zebra crossing's middle."""
+
     plots: list[tuple[float, float, int, int, bool]]
-    trees: np.ndarray  # [T, 2]
-    lamps: np.ndarray  # [L, 2]
-    signs: np.ndarray  # [S, 2]
-    parked: np.ndarray  # [C, 2]
+    """Beginning and end of each building or garden along x, its side of the street (+1 left, -1
+    right), its seed, and True for a garden.
+    """
+
+    trees: np.ndarray
+    """Positions (x, y) of the street trees, [T, 2]."""
+
+    lamps: np.ndarray
+    """Positions (x, y) of the lamps, [L, 2]."""
+
+    signs: np.ndarray
+    """Positions (x, y) of the signs, [S, 2]."""
+
+    parked: np.ndarray
+    """Positions (x, y) of the parked cars, [C, 2]."""
+
     movers: list[Mover]
+    """Moving actors."""
 
 
 def road_z(y: np.ndarray | float) -> np.ndarray | float:
@@ -240,8 +260,9 @@ def _draw_parked_cars(
     return np.array([slots[i] for i in sorted(slot_numbers)]).reshape(-1, 2)
 
 
-# x at the first frame, side of the road, speed; of the ego car's where it drives the same way.
-CARS = (
+# x at the first frame, side of the road and speed of the moving cars. The speed of cars that drive
+# in the ego car's direction is relative to it.
+CAR_STARTS = (
     (17.0, -1, 0.6), (34.0, 1, -9.0), (-13.0, -1, -0.4),
     (62.0, 1, -8.2), (-24.0, 1, -9.5), (33.0, -1, 0.9),
 )  # fmt: skip
@@ -249,7 +270,7 @@ CARS = (
 
 def _draw_movers(rng: np.random.Generator, parameters: StreetParameters) -> list[Mover]:
     movers = []
-    for i, (x, side, speed) in enumerate(CARS[: parameters.moving]):
+    for i, (x, side, speed) in enumerate(CAR_STARTS[: parameters.moving]):
         speed += parameters.speed_mps if side < 0 else 0.0
         movers.append(Mover(f"car-{i}", x, side * LANE_M / 2, speed, int(rng.integers(2**31))))
     for i in range(parameters.pedestrians):
@@ -274,7 +295,7 @@ SWAY_LENGTH_M = 55.0
 CAMERA_Z_M = 1.6
 # name: (forward, left) of the ego origin in metres, yaw in degrees to the left. Each fires when the
 # LiDAR's beam, which turns clockwise once a frame and looks ahead at the frame's time, passes it.
-MOUNTS = {
+CAMERA_MOUNTS = {
     "front": (1.6, 0.0, 0.0),
     "front_left": (1.5, 0.45, 55.0),
     "front_right": (1.5, -0.45, -55.0),
@@ -314,7 +335,7 @@ def build_frames(parameters: StreetParameters) -> tuple[Frame, ...]:
     frames = []
     for index in range(parameters.frames):
         time = frame_time_ns(index)
-        cameras = {name: _camera(parameters, name, time) for name in MOUNTS}
+        cameras = {name: _camera(parameters, name, time) for name in CAMERA_MOUNTS}
         pose = torch.from_numpy(_world_from_ego(parameters, time))
         frames.append(Frame(index, time, pose, cameras))
     return tuple(frames)
@@ -328,13 +349,13 @@ def _world_from_ego(parameters: StreetParameters, timestamp_ns: int) -> np.ndarr
 
 def camera_offset_ns(name: str) -> int:
     """Return the time from the frame's time to the moment when a camera fires."""
-    yaw_deg = MOUNTS[name][2]
+    yaw_deg = CAMERA_MOUNTS[name][2]
     shift_ns = FRAME_NS if yaw_deg > 0 and name != "back" else 0
     return round(-yaw_deg / 360 * FRAME_NS) % FRAME_NS - shift_ns
 
 
 def _camera(parameters: StreetParameters, name: str, frame_ns: int) -> Camera:
-    forward_m, left_m, yaw_deg = MOUNTS[name]
+    forward_m, left_m, yaw_deg = CAMERA_MOUNTS[name]
     time = frame_ns + camera_offset_ns(name)
     width = parameters.width
     height = parameters.height

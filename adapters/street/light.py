@@ -205,9 +205,13 @@ def _sky_beside_cars(points: np.ndarray, footprints: np.ndarray) -> np.ndarray:
 
 
 def _reflected_radiance(
-    lighting: Lighting, points: np.ndarray, normals: np.ndarray, material: np.ndarray,
-    sun: np.ndarray, sky: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+    lighting: Lighting,
+    points: np.ndarray,
+    normals: np.ndarray,
+    material: np.ndarray,
+    sun: np.ndarray,
+    sky: np.ndarray,
+) -> np.ndarray:
     """Return the reflected radiance [N, 3]: sky above the roofs, the street below, a glint of
     the sun.
     """
@@ -244,12 +248,18 @@ def encode_display(radiance: np.ndarray) -> np.ndarray:
 
 # ---- The sky: a gradient with a sun, cumulus clouds, and a hazy skyline below which land begins --
 
-FACE_SIZE = 512
+# Side of a face of the sky's cube map.
+SKY_FACE_SIZE_PX = 512
+# Linear colour of the sky at the zenith.
 ZENITH_RGB = np.array([0.16, 0.34, 0.74])
+# Linear colour of the sky at the horizon.
 HORIZON_RGB = np.array([0.66, 0.77, 0.92])
+# Linear colour of sunlit clouds.
 CLOUD_RGB = np.array([1.75, 1.72, 1.68])
+# Linear colour of the shaded sides of clouds.
 CLOUD_SHADE_RGB = np.array([0.62, 0.67, 0.74])
-CLOUD_HEIGHT = 1.0  # clouds lie on a plane; its height only sets their size against the noise
+# Height of the plane in which the clouds lie. It only sets their size relative to the noise.
+CLOUD_HEIGHT = 1.0
 
 
 def direction_to_sun(seed: int) -> np.ndarray:
@@ -267,12 +277,12 @@ def direction_to_sun(seed: int) -> np.ndarray:
 def build_sky(seed: int) -> CubemapSky:
     """Return a cube map of display-encoded colours. The last two are cached."""
     to_sun = direction_to_sun(seed)
-    directions = directions_of_cubemap(FACE_SIZE).numpy().reshape(-1, 3)
+    directions = directions_of_cubemap(SKY_FACE_SIZE_PX).numpy().reshape(-1, 3)
     faces = np.empty_like(directions)
     is_above_horizon = directions[:, 2] > -0.03
     faces[is_above_horizon] = encode_display(_radiance(directions[is_above_horizon], seed, to_sun))
     faces[~is_above_horizon] = encode_display(HAZE_RGB * 0.62)
-    cube = faces.reshape(6, FACE_SIZE, FACE_SIZE, 3).astype(np.float32)
+    cube = faces.reshape(6, SKY_FACE_SIZE_PX, SKY_FACE_SIZE_PX, 3).astype(np.float32)
     return CubemapSky(torch.from_numpy(cube))
 
 

@@ -23,7 +23,7 @@ STRETCH_M = 100.0
 # Speed of the ego car.
 SPEED_MPS = 20.0
 # Frames of one stretch.
-FRAMES = round(STRETCH_M / SPEED_MPS / (FRAME_NS * 1e-9))
+STRETCH_FRAMES = round(STRETCH_M / SPEED_MPS / (FRAME_NS * 1e-9))
 # Ratio of a street's splats to those of the stretch that its cameras drive along.
 SPLATS_PER_STRETCH_SPLAT = 1.35
 
@@ -63,7 +63,7 @@ def write_long_street(
     scene = street(seeds[0])
     parameters = parse_parameters(_query(seeds[0], gaussians))
     parameters = parameters.model_copy(
-        update={"frames": stretches * FRAMES + 1}
+        update={"frames": stretches * STRETCH_FRAMES + 1}
     )  # more than a URI may ask
     save_large_scene(
         dataclasses.replace(
@@ -82,5 +82,10 @@ def write_long_street(
 
 
 def _query(seed: int, gaussians: int) -> dict[str, str]:
-    numbers = {"seed": seed, "frames": FRAMES + 1, "speed_mps": SPEED_MPS, "gaussians": gaussians}
+    numbers = {
+        "seed": seed,
+        "frames": STRETCH_FRAMES + 1,
+        "speed_mps": SPEED_MPS,
+        "gaussians": gaussians,
+    }
     return {name: str(value) for name, value in numbers.items()}

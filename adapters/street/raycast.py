@@ -21,12 +21,12 @@ from augment.render.cpu.jit import kernel_function, serial_kernel
 # second child (the first child follows it); count [M] int64: shapes in a leaf, 0 for an inner node;
 # order [P] int64: shapes as the leaves list them.
 
-# Entries of the traversal's stack: far more than the depth of any street's tree.
-STACK = 512
-# Bins of the surface-area heuristic along an axis.
-BINS = 16
+# Number of entries of the traversal's stack, far more than the depth of any street's tree.
+STACK_SIZE = 512
+# Number of bins of the surface-area heuristic along an axis.
+NUM_BINS = 16
 # Largest number of shapes in a leaf.
-LEAF_SHAPES = 4
+MAX_LEAF_SHAPES = 4
 # Hits nearer than this are on the surface where the ray starts.
 MIN_HIT_DISTANCE_M = 1e-7
 
@@ -47,7 +47,7 @@ def trace(
     """Find the nearest shape, or any, along each ray. The hit_* arrays are written."""
     boxes, first, count, order = tree
     kind, shape_origin, inverse = shapes
-    stack = np.empty(STACK, np.int64)
+    stack = np.empty(STACK_SIZE, np.int64)
     for ray in range(origins.shape[0]):
         o = origins[ray, 0], origins[ray, 1], origins[ray, 2]
         d = directions[ray, 0], directions[ray, 1], directions[ray, 2]
@@ -179,9 +179,8 @@ def build(
     order,  # in: any order of the shapes; out: as the leaves list them
 ):
     """Fill a tree, depth first, and return its number of nodes."""
-    ranges = np.empty(
-        (STACK, 3), np.int64
-    )  # range of order, and the parent whose second child it is
+    # Begin and end of a range of `order`, and the parent whose second child it is, or -1.
+    ranges = np.empty((STACK_SIZE, 3), np.int64)
     ranges[0, 0] = 0
     ranges[0, 1] = len(order)
     ranges[0, 2] = -1
@@ -202,7 +201,7 @@ def build(
             _grow_box(boxes[node], shape_boxes[order[entry]])
         first[node] = start
         count[node] = stop - start
-        if stop - start > LEAF_SHAPES:
+        if stop - start > MAX_LEAF_SHAPES:
             count[node] = 0
             middle = _split(shape_boxes, order, start, stop, scratch)
             ranges[num_ranges, 0] = middle
@@ -235,7 +234,7 @@ def _half_box_area(box):
 @kernel_function()
 def _bin_of_box(box, axis, low, high):
     """Return the number of the bin between low and high that holds twice the box's centre."""
-    return min(BINS - 1, int((box[3 + axis] - box[axis] - low) / (high - low) * BINS))
+    return min(NUM_BINS - 1, int((box[3 + axis] - box[axis] - low) / (high - low) * NUM_BINS))
 
 
 @kernel_function()
@@ -249,9 +248,9 @@ def _split(boxes, order, start, stop, scratch):
     best_bin = 0
     best_low = 0.0
     best_high = 0.0
-    bins = np.empty((BINS, 6))
-    counts = np.empty(BINS, np.int64)
-    right_costs = np.empty(BINS)
+    bins = np.empty((NUM_BINS, 6))
+    counts = np.empty(NUM_BINS, np.int64)
+    right_costs = np.empty(NUM_BINS)
     running_box = np.empty(6)
     for axis in range(3):
         low = math.inf
@@ -270,13 +269,13 @@ def _split(boxes, order, start, stop, scratch):
             _grow_box(bins[b], boxes[order[entry]])
         running_box.fill(-math.inf)
         num_shapes = 0
-        for b in range(BINS - 1, 0, -1):
+        for b in range(NUM_BINS - 1, 0, -1):
             num_shapes += counts[b]
             _grow_box(running_box, bins[b])
             right_costs[b] = num_shapes * _half_box_area(running_box) if num_shapes > 0 else 0.0
         running_box.fill(-math.inf)
         num_shapes = 0
-        for b in range(BINS - 1):
+        for b in range(NUM_BINS - 1):
             num_shapes += counts[b]
             _grow_box(running_box, bins[b])
             if num_shapes > 0 and right_costs[b + 1] > 0:

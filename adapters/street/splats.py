@@ -447,9 +447,9 @@ def _area(length: np.ndarray) -> np.ndarray:
 # ---- The shadow a mover casts on the ground, which travels with it as a soft dark layer ----------
 
 # Edge of a cell of a shadow's grid.
-CELL_M = 0.06
+SHADOW_CELL_M = 0.06
 # The grid reaches at most this far beyond the mover.
-MARGIN_M = 2.0
+MAX_SHADOW_MARGIN_M = 2.0
 # Largest cover of a shadow: the ground below must keep the largest weight in its pixels.
 MAX_COVER = 0.5
 # Surfaces this near to the ground's plane receive the shadow.
@@ -477,7 +477,7 @@ class ContactShadow:
 
         It is zero away from the ground.
         """
-        cell = (points[:, :2] - self.origin) / CELL_M
+        cell = (points[:, :2] - self.origin) / SHADOW_CELL_M
         low_cell = np.floor(cell).astype(np.int64)
         is_inside = np.all((low_cell >= 0) & (low_cell < np.array(self.values.shape) - 1), axis=1)
         is_inside &= np.abs(points[:, 2] - self.ground_z) < GROUND_BAND_M
@@ -498,10 +498,10 @@ def contact_shadow(mover: MovingBody) -> ContactShadow:
     lighting = mover.body.lighting
     half = np.array(mover.size_m[:2]) / 2
     length = mover.size_m[2] / np.tan(np.arcsin(lighting.to_sun[2]))
-    half_grid = half + np.minimum(length, MARGIN_M) + 0.4
-    counts = np.ceil(2 * half_grid / CELL_M).astype(int) + 1
-    origin = -(counts - 1) * CELL_M / 2
-    x, y = (origin[k] + CELL_M * np.arange(counts[k]) for k in range(2))
+    half_grid = half + np.minimum(length, MAX_SHADOW_MARGIN_M) + 0.4
+    counts = np.ceil(2 * half_grid / SHADOW_CELL_M).astype(int) + 1
+    origin = -(counts - 1) * SHADOW_CELL_M / 2
+    x, y = (origin[k] + SHADOW_CELL_M * np.arange(counts[k]) for k in range(2))
     grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
     points = np.concatenate([grid, np.full((len(grid), 1), lighting.ground_z)], 1)
     is_shaded = [mover.body.tree.occluded(points, d) for d in lighting.sun_directions()]
@@ -527,7 +527,7 @@ def contact_shadow(mover: MovingBody) -> ContactShadow:
 # ---- Gaussians of cells --------------------------------------------------------------------------
 
 # Opacity of every splat.
-OPACITY = 0.99
+SPLAT_OPACITY = 0.99
 # Standard deviation per cell side: the least that leaves no gap (alpha > 0.99 in the mean), since
 # wider splats blur and lead more (see BLEND_LEAD).
 SIGMA_PER_SIDE = 0.74
@@ -649,8 +649,9 @@ def _gaussians(
     leaf_rows = np.flatnonzero(shapes.material[shape] == Material.LEAF)
     size = np.linalg.norm(shapes.axes[shape[leaf_rows]], axis=2, keepdims=True)
     frames[leaf_rows] = (shapes.axes[shape[leaf_rows]] / size).transpose(0, 2, 1)
-    sigmas[leaf_rows], means[leaf_rows] = LEAF_SIGMA * size[..., 0], shapes.origin[shape[leaf_rows]]
-    opacities = np.full(len(means), OPACITY)
+    sigmas[leaf_rows] = LEAF_SIGMA * size[..., 0]
+    means[leaf_rows] = shapes.origin[shape[leaf_rows]]
+    opacities = np.full(len(means), SPLAT_OPACITY)
     return _make_gaussians(means, frames, sigmas, opacities, rgb, shapes.semantic[shape])
 
 
@@ -688,7 +689,7 @@ def shadow_gaussians(shadow: ContactShadow) -> Gaussians:
     """Return a mover's shadow as thin translucent layers, none heavy enough to hide the ground's
     class.
     """
-    size = np.array(shadow.values.shape) * CELL_M
+    size = np.array(shadow.values.shape) * SHADOW_CELL_M
     x, y = (np.arange(SHADOW_SPACING_M / 2, s, SHADOW_SPACING_M) for s in size)
     grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2) + shadow.origin
     points = np.concatenate([grid, np.full((len(grid), 1), shadow.ground_z)], 1)

@@ -78,7 +78,9 @@ from augment.semantics import SemanticClass as Class
 REVEAL_M = 0.14
 # Width of the surround of windows.
 SURROUND_M = 0.13
+# Look of window panes.
 GLASS = Look((0.022, 0.026, 0.03), Class.BUILDING, Material.GLASS, backed=True)
+# Look of shop panes.
 SHOP_GLASS = GLASS._replace(material=Material.SHOP)
 # Visible faces of a box on a front.
 _FRONT_FACES = ("-y", "+x", "-x", "+z", "-z")
@@ -90,20 +92,37 @@ class Facade(NamedTuple):
     """Looks and measures of a house's front."""
 
     wall: Look
+    """Look of the wall."""
+
     base: Look
+    """Look of the plinth at the foot of the wall."""
+
     trim: Look
+    """Look of sills, surrounds and ledges."""
+
     frame: Look
+    """Look of the frames of windows and doors."""
+
     accent: Look
+    """Look of door leaves and shop fronts."""
+
     window_m: tuple[float, float]
+    """Width and height of a window."""
+
     floor_m: float
+    """Height of an upper floor."""
+
     ground_m: float
+    """Height of the ground floor."""
+
     has_surround: bool
+    """True if windows have a surround."""
+
     has_shop: bool
+    """True if there is a shop on the ground floor."""
 
 
-def panels(
-    rectangles, depth_m: float, look: Look, edges: np.ndarray | int = ALL_EDGES
-) -> Shapes:  # fmt: skip
+def panels(rectangles, depth_m: float, look: Look, edges: np.ndarray | int = ALL_EDGES) -> Shapes:
     """Return upright panels over (x, z) rectangles [R, 4] at y = depth_m. They face the street."""
     x0, z0, x1, z1 = np.asarray(rectangles, np.float64).reshape(-1, 4).T
     u = xyz(x1 - x0, 0, 0)
@@ -127,9 +146,14 @@ def reveals(opening: Rectangle, depth_m: float, look: Look) -> Shapes:
 
 @joined
 def glazing(
-    opening: Rectangle, columns: int, rows: int, depth_m: float, frame: Look,
-    bar_m: float = 0.07, pane: Look = GLASS,
-) -> Iterator[Shapes]:  # fmt: skip
+    opening: Rectangle,
+    columns: int,
+    rows: int,
+    depth_m: float,
+    frame: Look,
+    bar_m: float = 0.07,
+    pane: Look = GLASS,
+) -> Iterator[Shapes]:
     """Build panes with a frame and bars that fill an opening."""
     x0, z0, x1, z1 = opening
     half_bar_m = bar_m / 2
@@ -245,9 +269,9 @@ def shop_front(opening: Rectangle, facade: Facade, has_awning: bool) -> Iterator
 # ---- Houses and gardens --------------------------------------------------------------------------
 
 # Depth of a house.
-DEPTH_M = 10.5
+HOUSE_DEPTH_M = 10.5
 # Lower end of the walls, below the pavement.
-BASE_M = -0.25
+WALL_BASE_Z_M = -0.25
 # Depth of a hidden inner wall behind the front. Where the front's splats let a little light
 # through, it keeps the back wall from showing.
 INNER_WALL_M = 0.45
@@ -259,16 +283,24 @@ WALLS = (
     *[((0.36, 0.16, 0.11), Material.BRICK), ((0.42, 0.22, 0.14), Material.BRICK)],
     *[((0.30, 0.19, 0.15), Material.BRICK), ((0.55, 0.49, 0.39), Material.STONE)],
 )
+# Linear colours of doors and shop fronts.
 ACCENTS = (
     (0.05, 0.13, 0.10), (0.24, 0.03, 0.03), (0.04, 0.07, 0.18),
     (0.10, 0.055, 0.03), (0.03, 0.03, 0.035), (0.30, 0.17, 0.03),
 )  # fmt: skip
+# Linear colours of roofs.
 ROOFS = ((0.24, 0.10, 0.065), (0.13, 0.12, 0.125), (0.19, 0.09, 0.06))
+# Look of stone trim.
 STONE = Look((0.60, 0.57, 0.51), Class.BUILDING)
+# Look of the windows of distant houses, without mirroring.
 _PANE = Look((0.10, 0.12, 0.14), Class.BUILDING)
+# Look of gutters and other sheet metal.
 _ZINC = Look((0.22, 0.22, 0.215), Class.BUILDING)
+# Look of chimneys.
 _CHIMNEY = Look((0.33, 0.16, 0.11), Class.BUILDING, Material.BRICK)
+# Look of flat roofs.
 _GRAVEL = Look((0.30, 0.29, 0.27), Class.BUILDING, Material.ASPHALT, spacing=1.6)
+# Upright faces of a box.
 _UPRIGHT_FACES = ("-y", "+y", "+x", "-x")
 
 
@@ -334,21 +366,25 @@ def _house(seed: int, width: float, is_fine: bool) -> Iterator[Shapes]:
     for z0, z1, reach in (ledge_span, (eaves - 0.32, eaves, 0.28)):
         holes.append((0.0, z0, width, z1))
         yield boxes((0.0, -reach, z0), (width, 0.0, z1), facade.trim, faces=_LEDGE_FACES)
-    base, edges = cut((0.0, BASE_M, width, 0.5), [h for h in holes if h[1] < 0.5])
+    base, edges = cut((0.0, WALL_BASE_Z_M, width, 0.5), [h for h in holes if h[1] < 0.5])
     yield panels(base, -0.0, facade.base, edges)
     wall, edges = cut((0.0, 0.5, width, eaves), holes)
     yield panels(wall, 0.0, facade.wall, edges)
     yield _back(facade, width, eaves)
     yield _roof(rng, facade, width, eaves)
     inner_wall = facade.wall._replace(material=Material.PLAIN, backed=False)
-    yield panels((0.0, BASE_M, width, eaves), INNER_WALL_M, inner_wall)
+    yield panels((0.0, WALL_BASE_Z_M, width, eaves), INNER_WALL_M, inner_wall)
     yield tube((0.12, -0.09, 0.0), (0.12, -0.09, eaves - 0.2), 0.05, _ZINC)  # a rainpipe
 
 
 def _ground_floor(
-    rng: np.random.Generator, facade: Facade, width: float, window_centers: list[float],
-    holes: list[Rectangle], is_fine: bool,
-) -> Iterator[Shapes]:  # fmt: skip
+    rng: np.random.Generator,
+    facade: Facade,
+    width: float,
+    window_centers: list[float],
+    holes: list[Rectangle],
+    is_fine: bool,
+) -> Iterator[Shapes]:
     """Build a shop, or a door between windows."""
     floor = float(pavement_z(FACADE_M)) + 0.02
     if facade.has_shop:
@@ -358,7 +394,7 @@ def _ground_floor(
         return
     door_x = window_centers[int(rng.integers(len(window_centers)))]
     opening = (door_x - 0.58, floor + 0.12, door_x + 0.58, floor + 2.95)
-    holes += [opening, (opening[0] - 0.1, BASE_M, opening[2] + 0.1, opening[1])]
+    holes += [opening, (opening[0] - 0.1, WALL_BASE_Z_M, opening[2] + 0.1, opening[1])]
     yield door(opening, facade)
     corners = [(x - facade.window_m[0] / 2, 1.15) for x in window_centers if x != door_x]
     yield windows(corners, facade, is_fine, holes)
@@ -367,31 +403,31 @@ def _ground_floor(
 def _back(facade: Facade, width: float, eaves: float) -> Shapes:
     """Build the plain side and back walls."""
     wall = facade.wall._replace(spacing=1.6, backed=False)
-    return boxes((0.0, 0.0, BASE_M), (width, DEPTH_M, eaves), wall, faces=("+x", "-x", "+y"))
+    return boxes(
+        (0.0, 0.0, WALL_BASE_Z_M), (width, HOUSE_DEPTH_M, eaves), wall, faces=("+x", "-x", "+y")
+    )
 
 
 @joined
-def _roof(
-    rng: np.random.Generator, facade: Facade, width: float, eaves: float
-) -> Iterator[Shapes]:  # fmt: skip
+def _roof(rng: np.random.Generator, facade: Facade, width: float, eaves: float) -> Iterator[Shapes]:
     """Build a ridged roof along the street, or a flat roof behind a parapet."""
     wall = facade.wall._replace(backed=False)
     trim = facade.trim
     if rng.random() < 0.35:
         top = eaves + 0.75
-        yield parallelograms((0, 0.3, eaves), (width, 0, 0), (0, DEPTH_M - 0.3, 0), _GRAVEL)
+        yield parallelograms((0, 0.3, eaves), (width, 0, 0), (0, HOUSE_DEPTH_M - 0.3, 0), _GRAVEL)
         yield boxes((0, 0, eaves), (width, 0.3, top), wall, faces=_UPRIGHT_FACES)
         yield boxes((-0.0, -0.07, top), (width, 0.37, top + 0.1), trim, faces=_LEDGE_FACES)
         return
     tiles = Look(ROOFS[rng.integers(len(ROOFS))], Class.BUILDING, Material.TILES, spacing=1.3)
-    half_depth = DEPTH_M / 2
+    half_depth = HOUSE_DEPTH_M / 2
     overhang = 0.35
     rise = half_depth * float(np.tan(np.radians(rng.uniform(30, 40))))
     drop = overhang * rise / half_depth
     edge_z = eaves - drop + 0.12
     slope = np.array([0.0, half_depth + overhang, rise + drop])
     yield parallelograms((0.0, -overhang, edge_z), (width, 0, 0), slope, tiles)
-    far_corner = (width, DEPTH_M + overhang, edge_z)
+    far_corner = (width, HOUSE_DEPTH_M + overhang, edge_z)
     yield parallelograms(far_corner, (-width, 0, 0), slope * [1, -1, 1], tiles)
     low_corner = (0.0, -overhang - 0.12, edge_z - 0.14)
     high_corner = (width, -overhang + 0.02, edge_z + 0.0)
@@ -403,7 +439,7 @@ def _roof(
     )
     for x, order in ((0.0, (0, 2, 1)), (width, (0, 1, 2))):
         gable_corners = np.array(
-            [(x, 0.0, eaves), (x, DEPTH_M, eaves), (x, half_depth, eaves + rise + 0.1)]
+            [(x, 0.0, eaves), (x, HOUSE_DEPTH_M, eaves), (x, half_depth, eaves + rise + 0.1)]
         )
         yield triangles(*gable_corners[list(order)], wall._replace(spacing=0.8))
     for x in (0.7, width - 1.5)[: int(rng.integers(1, 3))]:
@@ -418,7 +454,7 @@ def _garden(width: float) -> Shapes:
     hedge = Look((0.075, 0.13, 0.03), Class.VEGETATION, Material.LEAVES)
     stone = Look((0.52, 0.50, 0.46), Class.BARRIER)
     return join([
-        boxes((0, 0.0, BASE_M), (width, 0.3, 0.95), brick, faces=_UPRIGHT_FACES),
+        boxes((0, 0.0, WALL_BASE_Z_M), (width, 0.3, 0.95), brick, faces=_UPRIGHT_FACES),
         boxes((0, -0.05, 0.95), (width, 0.35, 1.03), stone, faces=_LEDGE_FACES),
         boxes((0.05, 0.5, 0.0), (width - 0.05, 1.5, 1.75), hedge, edges=0),
     ])  # fmt: skip
@@ -438,7 +474,7 @@ def _second_row(layout: Layout) -> Iterator[Shapes]:
             wall = facade.wall._replace(backed=False)
             columns = np.arange(1.2, width - 1.6, 2.6)
             holes = [(w, z, w + 1.2, z + 1.5) for z in (1.2, 4.2) for w in columns]
-            front, edges = cut((0.0, BASE_M, width, height), holes)
+            front, edges = cut((0.0, WALL_BASE_Z_M, width, height), holes)
             shapes = join([
                 panels(front, 0.0, wall, edges & np.uint8(U0 | U1 | V1)),
                 panels(holes, 0.1, _PANE),
@@ -452,12 +488,19 @@ def _second_row(layout: Layout) -> Iterator[Shapes]:
 
 # ---- The ground: carriageway and markings, kerbs, pavements, cross streets, the land around ------
 
+# Look of the carriageway.
 ASPHALT = Look((0.105, 0.105, 0.11), Class.ROAD, Material.ASPHALT, spacing=1.3, backed=True)
+# Look of repaired patches of the carriageway.
 REPAIR = Look((0.075, 0.075, 0.08), Class.ROAD, Material.ASPHALT, spacing=1.3, backed=True)
+# Look of manhole covers.
 IRON = Look((0.06, 0.058, 0.055), Class.ROAD)
+# Look of lane markings.
 MARKING = Look((0.72, 0.72, 0.70), Class.LANE_MARKING, Material.MARKING)
+# Look of pavements.
 PAVING = Look((0.34, 0.325, 0.30), Class.SIDEWALK, Material.PAVING, spacing=1.2, backed=True)
+# Look of kerb stones.
 KERB = Look((0.44, 0.43, 0.41), Class.SIDEWALK)
+# Look of grass.
 GRASS = Look((0.13, 0.19, 0.05), Class.TERRAIN, Material.GRASS, spacing=2.5)
 
 # Length of a section of the carriageway.
@@ -465,11 +508,11 @@ SECTION_M = 6.0
 # Around the middle of the zebra crossing, no other mark lies within this distance.
 ZEBRA_CLEAR_M = 3.6
 # Width of the cross streets' far pavement.
-PAVEMENT_M = 4.6
+FAR_PAVEMENT_M = 4.6
 # Half of the cross streets' length.
 CROSS_HALF_M = 70.0
 # Distance of the pavements' end, under the walls, from the street's middle.
-EDGE_M = FACADE_M + 0.6
+PAVEMENT_END_M = FACADE_M + 0.6
 
 
 @joined
@@ -483,9 +526,9 @@ def build_ground(layout: Layout) -> Iterator[Shapes]:
     west = layout.x0 - CROSS_STREET_M
     east = layout.x1 + CROSS_STREET_M
     holes: list[Rectangle] = [
-        (layout.x0, -EDGE_M, layout.x1, EDGE_M),
-        (west - PAVEMENT_M, -CROSS_HALF_M, layout.x0, CROSS_HALF_M),
-        (layout.x1, -CROSS_HALF_M, east + PAVEMENT_M, CROSS_HALF_M),
+        (layout.x0, -PAVEMENT_END_M, layout.x1, PAVEMENT_END_M),
+        (west - FAR_PAVEMENT_M, -CROSS_HALF_M, layout.x0, CROSS_HALF_M),
+        (layout.x1, -CROSS_HALF_M, east + FAR_PAVEMENT_M, CROSS_HALF_M),
     ]
     margin = TERRAIN_REACH_M
     pieces, edges = cut((west - margin, -margin, east + margin, margin), holes)
@@ -495,7 +538,7 @@ def build_ground(layout: Layout) -> Iterator[Shapes]:
 
 def _sloped_panels(
     rectangles, slope: float, z0: float, look: Look, edges: np.ndarray | int = ALL_EDGES
-) -> Shapes:  # fmt: skip
+) -> Shapes:
     """Return panels over rectangles [R, 4] on the plane z = z0 + slope y, facing up."""
     x0, y0, x1, y1 = np.reshape(rectangles, (-1, 4)).T
     u = xyz(x1 - x0, 0, 0)
@@ -589,7 +632,10 @@ def _pavements(layout: Layout) -> Iterator[Shapes]:
     for side in (1, -1):
         start = (layout.x0, side * ROAD_HALF_M, low_z)
         yield _kerb_face(start, (layout.x1 - layout.x0, 0, 0), side < 0)
-        for near_y, far_y, look in ((ROAD_HALF_M, inner_y, KERB), (inner_y, EDGE_M, PAVING)):
+        for near_y, far_y, look in (
+            (ROAD_HALF_M, inner_y, KERB),
+            (inner_y, PAVEMENT_END_M, PAVING),
+        ):
             low_y, high_y = sorted((side * near_y, side * far_y))
             yield _sloped_panels(
                 (layout.x0, low_y, layout.x1, high_y), side * PAVEMENT_SLOPE, z0, look
@@ -605,7 +651,7 @@ def _cross_streets(layout: Layout) -> Iterator[Shapes]:
         near_x, far_x = sorted((x, kerb))
         yield _sloped_panels((near_x, -half_length, far_x, half_length), 0.0, z, ASPHALT)
         yield _kerb_face((kerb, -half_length, z), (0, 2 * half_length, 0), direction > 0)
-        near_x, far_x = sorted((kerb, kerb + direction * PAVEMENT_M))
+        near_x, far_x = sorted((kerb, kerb + direction * FAR_PAVEMENT_M))
         yield _sloped_panels(
             (near_x, -half_length, far_x, half_length), 0.0, z + KERB_RISE_M, PAVING
         )
@@ -617,9 +663,13 @@ def _cross_streets(layout: Layout) -> Iterator[Shapes]:
 # ---- A person in mid-stride: tubes and ellipsoids, one rigid body --------------------------------
 # Frame: x forward, y left, z up, origin on the ground between the feet.
 
+# Length, width and height of a person's box.
 PERSON_SIZE_M = (0.92, 0.66, 1.80)
+# Linear colours of skin.
 SKIN = ((0.52, 0.31, 0.21), (0.28, 0.15, 0.09), (0.60, 0.40, 0.29))
+# Linear colours of coats.
 COATS = ((0.30, 0.05, 0.05), (0.05, 0.10, 0.22), (0.36, 0.31, 0.22), (0.06, 0.14, 0.09))
+# Linear colours of trousers.
 TROUSERS = ((0.035, 0.045, 0.08), (0.05, 0.05, 0.05), (0.20, 0.17, 0.12))
 
 
@@ -659,10 +709,14 @@ def draw_person(seed: int) -> Iterator[Shapes]:
 
 # ---- Trees: a trunk with a few boughs, and a crown of many small leafy blobs around a dense core -
 
+# Look of trunks and boughs.
 BARK = Look((0.13, 0.10, 0.075), Class.VEGETATION, Material.BARK)
+# Look of leaf tufts.
 LEAF = Look((0.12, 0.21, 0.04), Class.VEGETATION, Material.LEAF)
-CORE = Look((0.045, 0.08, 0.02), Class.VEGETATION, Material.LEAVES, ambient=0.4, spacing=3.0)
-WOOD = Look((0.07, 0.12, 0.035), Class.VEGETATION, Material.LEAVES, spacing=2.2)
+# Look of the dense core of a crown.
+CROWN_CORE = Look((0.045, 0.08, 0.02), Class.VEGETATION, Material.LEAVES, ambient=0.4, spacing=3.0)
+# Look of the woods far out.
+WOODS = Look((0.07, 0.12, 0.035), Class.VEGETATION, Material.LEAVES, spacing=2.2)
 # Leaf tufts of a street tree near the drive.
 NEAR_LEAVES = 2600
 # Leaf tufts of a street tree at a middle distance.
@@ -699,7 +753,7 @@ def build_vegetation(layout: Layout) -> Iterator[Shapes]:
     x = (layout.x0 + layout.x1) / 2
     x = x + (1 + (layout.x1 - layout.x0) / 2 / 200) * radius * np.cos(angle)
     axes = np.eye(3) * (size[:, None] * [1.5, 1.5, 0.85])[:, None]
-    woods = ellipsoids(xyz(x, radius * np.sin(angle), 0.55 * size), axes, WOOD)
+    woods = ellipsoids(xyz(x, radius * np.sin(angle), 0.55 * size), axes, WOODS)
     woods.variation[:] = rng.random(130)
     yield woods
 
@@ -717,7 +771,7 @@ def _tree(rng: np.random.Generator, size: float, num_leaves: int) -> Iterator[Sh
         angle = rng.uniform(0, 0.8) + k * np.pi / 2
         branch = np.array([np.cos(angle), np.sin(angle), 0.9]) * radii * 0.62
         yield tube(fork * 0.98, fork + branch, 0.055 * size, BARK)
-    yield ball(top, radii * 0.62, CORE)
+    yield ball(top, radii * 0.62, CROWN_CORE)
     yield _crown(rng, top, radii, num_leaves)
 
 
@@ -762,6 +816,7 @@ def _crown(
 # ---- Cars: a lofted body with smooth plates, a glasshouse on top, wheels and lights --------------
 # Car frame: x forward, y left, z up, origin on the ground under the middle.
 
+# Linear colours of car paint.
 PAINTS = (
     (0.42, 0.42, 0.43), (0.05, 0.055, 0.06), (0.62, 0.62, 0.61),
     (0.30, 0.02, 0.02), (0.03, 0.07, 0.20), (0.16, 0.17, 0.18),
@@ -771,37 +826,60 @@ PAINTS = (
 CAR_SPACING = 0.6
 # Paint of unpainted cars. `draw_car` replaces its negative colour.
 PAINT = Look((-1.0, -1.0, -1.0), Class.VEHICLE, Material.PAINT, spacing=CAR_SPACING)
+# Look of car windows.
 CAR_GLASS = PAINT._replace(rgb=(0.012, 0.014, 0.016), ambient=0.8)
+# Look of tyres.
 TYRE = Look((0.022, 0.022, 0.023), Class.VEHICLE, spacing=CAR_SPACING)
+# Look of wheel arches.
 ARCH = TYRE.tinted((0.008, 0.008, 0.008))
+# Look of wheel rims.
 RIM = TYRE._replace(rgb=(0.46, 0.46, 0.47), material=Material.RIM)
+# Look of black trim.
 TRIM = TYRE.tinted((0.03, 0.03, 0.032))
+# Look of headlights.
 HEADLIGHT = TYRE.tinted((0.72, 0.74, 0.78))
+# Look of tail lights.
 TAILLIGHT = TYRE.tinted((0.42, 0.015, 0.015))
+# Look of number plates.
 PLATE = TYRE.tinted((0.72, 0.71, 0.62))
+# Radius of the wheels.
 WHEEL_RADIUS_M = 0.32
 
 
 class CarModel(NamedTuple):
-    """Measures of a car in metres. hood, tail: x of the lower ends of windscreen and rear
-    window.
-    """
+    """Measures of a car in metres, in the car frame."""
 
     length: float
+    """Length of the body."""
+
     width: float
-    belt: float
-    roof: float
-    hood: float
-    tail: float
-    roof_front: float
-    roof_rear: float
+    """Width of the body."""
+
+    belt_z: float
+    """z of the belt line, on which the windows stand."""
+
+    roof_z: float
+    """z of the roof."""
+
+    hood_x: float
+    """x of the windscreen's lower end."""
+
+    tail_x: float
+    """x of the rear window's lower end."""
+
+    roof_front_x: float
+    """x of the windscreen's upper end."""
+
+    roof_rear_x: float
+    """x of the rear window's upper end."""
 
     @property
     def size_m(self) -> tuple[float, float, float]:
         """Return length, width and height of the car's box."""
-        return (self.length + 0.08, self.width + 0.08, self.roof + 0.02 + 0.04)
+        return (self.length + 0.08, self.width + 0.08, self.roof_z + 0.02 + 0.04)
 
 
+# Models that cars are drawn from.
 CAR_MODELS = (
     CarModel(4.25, 1.80, 0.90, 1.46, 0.95, -1.95, 0.20, -1.45),  # hatchback
     CarModel(4.60, 1.82, 0.90, 1.42, 1.00, -1.65, 0.25, -0.90),  # saloon
@@ -813,14 +891,14 @@ def draw_car(seed: int) -> tuple[CarModel, Shapes]:
     """Draw a car of some model and paint from the seed."""
     rng = np.random.default_rng(seed)
     model = CAR_MODELS[rng.integers(len(CAR_MODELS))]
-    shapes = _unpainted(model).copy()
+    shapes = _build_unpainted_car(model).copy()
     shapes.rgb[shapes.rgb[:, 0] < 0] = PAINTS[rng.integers(len(PAINTS))]
     return model, shapes
 
 
 @lru_cache(maxsize=len(CAR_MODELS))
 @joined
-def _unpainted(model: CarModel) -> Iterator[Shapes]:
+def _build_unpainted_car(model: CarModel) -> Iterator[Shapes]:
     """Build a car whose paint has no colour yet."""
     yield from _body(model)
     yield from _glasshouse(model)
@@ -835,9 +913,9 @@ def _body(model: CarModel) -> Iterator[Shapes]:
     x = s * half
     end = np.abs(s)
     width = model.width / 2 * (1 - 0.07 * end**4 - 0.13 * np.clip((end - 0.9) / 0.1, 0, 1) ** 2)
-    hood = np.clip((x - model.hood + 0.25) / (half - model.hood + 0.25), 0, 1)
-    boot = np.clip((model.tail + 0.2 - x) / (half + model.tail + 0.2), 0, 1)
-    top = model.belt - 0.17 * hood**1.6 - 0.05 * boot - 0.14 * np.clip((end - 0.94) / 0.06, 0, 1)
+    hood = np.clip((x - model.hood_x + 0.25) / (half - model.hood_x + 0.25), 0, 1)
+    boot = np.clip((model.tail_x + 0.2 - x) / (half + model.tail_x + 0.2), 0, 1)
+    top = model.belt_z - 0.17 * hood**1.6 - 0.05 * boot - 0.14 * np.clip((end - 0.94) / 0.06, 0, 1)
     low = 0.20 + 0.12 * np.clip((end - 0.86) / 0.14, 0, 1)
     # (share of the half width, share of the height) around one side of a section, from the sill up.
     lower = ((0.90, 0), (0.97, 0.10), (1.0, 0.42), (0.985, 0.72))
@@ -871,13 +949,13 @@ def _glasshouse(model: CarModel) -> Iterator[Shapes]:
     """Build windscreen, side windows with pillars, rear window and roof."""
     base = model.width / 2 * 0.89
     top = model.width / 2 * 0.70
-    z0 = model.belt - 0.02
-    z1 = model.roof
+    z0 = model.belt_z - 0.02
+    z1 = model.roof_z
 
     def side_point(s: float, t: float, sign: int) -> np.ndarray:
         """Return the point at s from rear to front and t from belt to roof."""
-        rear = model.tail + (model.roof_rear - model.tail) * t
-        front = model.hood + (model.roof_front - model.hood) * t
+        rear = model.tail_x + (model.roof_rear_x - model.tail_x) * t
+        front = model.hood_x + (model.roof_front_x - model.hood_x) * t
         y = sign * (base + (top - base) * t**1.3 + 0.05 * t * (1 - t) * 4)  # bulging
         return np.array([rear + (front - rear) * s, y, z0 + (z1 - z0) * t])
 
@@ -905,10 +983,10 @@ def _glasshouse(model: CarModel) -> Iterator[Shapes]:
                 corners.append([ends[0][k] + (ends[1][k] - ends[0][k]) * u for u, k in loop])
             yield quads(corners, look)
     # A gently domed roof.
-    x = np.linspace(model.roof_rear, model.roof_front, 7)[:, None]
+    x = np.linspace(model.roof_rear_x, model.roof_front_x, 7)[:, None]
     lateral = np.linspace(-1, 1, 7)
     dome = 0.03 * (1 - lateral[None, :] ** 2) * np.sin(np.linspace(0, np.pi, 7))[:, None] ** 0.5
-    yield _loft(xyz(x, lateral * top, model.roof + dome * 0.6))
+    yield _loft(xyz(x, lateral * top, model.roof_z + dome * 0.6))
 
 
 def _wheels(model: CarModel) -> Iterator[Shapes]:
@@ -932,8 +1010,8 @@ def _details(model: CarModel) -> Iterator[Shapes]:
     """Build lamps, mirrors, grille, number plates and bumpers."""
     half_length = model.length / 2
     half_width = model.width / 2
-    front_z = model.belt - 0.35
-    rear_z = model.belt - 0.20
+    front_z = model.belt_z - 0.35
+    rear_z = model.belt_z - 0.20
     for side in (1, -1):
         for look, faces, x0, x1, z0, z1, inner_fraction, outer_y in (
             (
@@ -959,10 +1037,10 @@ def _details(model: CarModel) -> Iterator[Shapes]:
             (
                 TRIM,
                 "+x -x +y -y +z -z",
-                model.hood - 0.42,
-                model.hood - 0.30,
-                model.belt,
-                model.belt + 0.13,
+                model.hood_x - 0.42,
+                model.hood_x - 0.30,
+                model.belt_z,
+                model.belt_z + 0.13,
                 0.93,
                 half_width + 0.035,
             ),
@@ -988,18 +1066,28 @@ def _details(model: CarModel) -> Iterator[Shapes]:
 
 # ---- Lamps, signs, litter bins and bollards ------------------------------------------------------
 
+# Look of steel masts and poles.
 STEEL = Look((0.16, 0.17, 0.17), Class.POLE)
+# Look of a lantern's glass.
 LANTERN = Look((0.72, 0.71, 0.66), Class.POLE)
+# Look of the backs of signs.
 GREY = Look((0.30, 0.31, 0.32), Class.SIGN, spacing=0.5)
+# Look of white sign paint.
 WHITE = GREY.tinted((0.75, 0.75, 0.74))
+# Look of blue sign paint.
 BLUE = GREY.tinted((0.03, 0.11, 0.36))
+# Look of black sign paint.
 BLACK = GREY.tinted((0.02, 0.02, 0.02))
+# Look of red sign paint.
 RED = GREY.tinted((0.48, 0.03, 0.03))
+# Look of litter bins.
 GREEN = Look((0.05, 0.10, 0.07), Class.OTHER)
+# Look of bollards.
 CAST_IRON = Look((0.10, 0.10, 0.105), Class.BARRIER)
 
 
 def _sign_pole(height: float) -> tuple:
+    """Return the builder and arguments of a sign's pole."""
     return (tube, (-0.03, 0, -0.05), (-0.03, 0, height), 0.032, STEEL)
 
 
@@ -1010,10 +1098,13 @@ def _sign_plate(z: float, width: float, height: float, look: Look, x=0.012, y=0.
 
 
 def _sign_back(z: float, size: float) -> tuple:
+    """Return the builder and arguments of a square back facing -x."""
     return (parallelograms, (0.0, -size / 2, z - size / 2), (0, 0, size), (0, size, 0), GREY)
 
 
-# Forms as (builder, its arguments). LAMP: a tapered mast with an arm over the road (towards +y).
+# Forms of furniture are tuples of (builder, its arguments).
+
+# Form of a lamp: a tapered mast with an arm over the road (towards +y).
 LAMP = (
     (tube, (0, 0, -0.05), (0, 0, 0.9), 0.085, STEEL),
     (tube, (0, 0, 0.9), (0, 0, 6.4), 0.055, STEEL),
@@ -1022,16 +1113,19 @@ LAMP = (
     (parallelograms, (-0.11, 1.4, 6.675), (0, 0.6, 0), (0.22, 0, 0), LANTERN),
     (ball, (0, 0, 6.38), (0.07, 0.07, 0.07), STEEL),
 )
+# Form of a litter bin.
 LITTER_BIN = (
     (tube, (0, 0, 0.0), (0, 0, 0.85), 0.22, GREEN),
     (disc, (0, 0, 0.85), (0, 0, 1), 0.22, GREEN.tinted((0.02, 0.02, 0.02))),
     (tube, (0, 0, 0.85), (0, 0, 0.92), 0.23, STEEL),
 )
+# Form of a bollard.
 BOLLARD = (
     (tube, (0, 0, 0.0), (0, 0, 0.85), 0.06, CAST_IRON),
     (tube, (0, 0, 0.66), (0, 0, 0.76), 0.064, WHITE),
     (ball, (0, 0, 0.85), (0.06, 0.06, 0.05), CAST_IRON),
 )
+# Form of the sign of a zebra crossing.
 CROSSING_SIGN = (
     _sign_pole(2.75),
     _sign_back(2.45, 0.62),
@@ -1039,6 +1133,7 @@ CROSSING_SIGN = (
     (triangles, (0.022, -0.2, 2.3), np.array([0.022, 0.2, 2.3]), (0.022, 0.0, 2.66), WHITE),
     _sign_plate(2.40, 0.09, 0.18, BLACK, 0.032),
 )
+# Form of the sign of a speed limit.
 LIMIT_SIGN = (
     _sign_pole(2.85),
     (disc, (0.010, 0, 2.5), (1, 0, 0), 0.31, RED),
@@ -1049,6 +1144,7 @@ LIMIT_SIGN = (
     _sign_plate(2.5, 0.13, 0.24, BLACK, 0.024, 0.1),
     _sign_plate(2.5, 0.045, 0.14, WHITE, 0.030, 0.1),
 )
+# Form of the sign of a parking place.
 PARKING_SIGN = (
     _sign_pole(2.7),
     _sign_back(2.4, 0.5),
@@ -1058,6 +1154,7 @@ PARKING_SIGN = (
     _sign_plate(2.4, 0.18, 0.07, WHITE, 0.02, 0.02),
     _sign_plate(2.47, 0.07, 0.2, WHITE, 0.02, 0.11),
 )
+# Forms of the street's signs, in the order of Layout.signs.
 SIGNS = (CROSSING_SIGN, CROSSING_SIGN, LIMIT_SIGN, LIMIT_SIGN, PARKING_SIGN)
 
 
@@ -1081,7 +1178,7 @@ def build_furniture(layout: Layout) -> Iterator[Shapes]:
 # Height of a typical house, for sky light between the fronts.
 ROOF_Z_M = 11.5
 # Depth of tyres in the road, as on their contact patch.
-SINK_M = 0.008
+TYRE_SINK_M = 0.008
 
 
 @dataclass(frozen=True, eq=False)
@@ -1089,29 +1186,39 @@ class MovingBody:
     """A mover's body in its box frame, with its motion."""
 
     name: str
+    """Name of the mover, for example car-0."""
+
     label: str
+    """Label of the actor, Car or Pedestrian."""
+
     size_m: tuple[float, float, float]
+    """Length, width and height of its box."""
+
     body: Body
+    """Shapes, tree and light in the box frame."""
+
     motion: Motion
+    """Motion of the box centre."""
 
 
 @dataclass(frozen=True, eq=False)
 class Street:
-    """A built street.
-
-    Attributes:
-        parameters: its parameters.
-        layout: its plan.
-        static: the body of everything that does not move.
-        movers: the moving bodies.
-        parked: name, centre, size and yaw of each parked car.
-    """
+    """A built street."""
 
     parameters: StreetParameters
+    """Parameters of the street."""
+
     layout: Layout
+    """Plan of the street."""
+
     static: Body
+    """Body of everything that does not move."""
+
     movers: tuple[MovingBody, ...]
+    """Moving bodies."""
+
     parked: tuple[tuple, ...]
+    """Name, centre, size and yaw of each parked car."""
 
 
 @lru_cache(maxsize=2)
@@ -1126,7 +1233,7 @@ def build_street(parameters: StreetParameters) -> Street:
     for number, (x, y) in enumerate(layout.parked):  # each faces its side's traffic
         model, car = draw_car(int(rng.integers(2**31)))
         yaw = 0.0 if y < 0 else np.pi
-        ground = float(road_z(PARKED_Y_M)) - SINK_M
+        ground = float(road_z(PARKED_Y_M)) - TYRE_SINK_M
         parts.append(car.moved((x, y, ground), yaw))
         centre = (float(x), float(y), ground + model.size_m[2] / 2)
         parked_cars.append((f"parked-{number}", centre, model.size_m, yaw))
@@ -1150,7 +1257,7 @@ def _moving_body(
     if mover.name.startswith("car"):
         model, shapes = draw_car(mover.seed)
         size = model.size_m
-        ground = float(road_z(mover.y_m)) - SINK_M
+        ground = float(road_z(mover.y_m)) - TYRE_SINK_M
         label = "Car"
     else:
         shapes = draw_person(mover.seed)

@@ -393,7 +393,7 @@ class ViewCheckResults:
     offsets: tuple[CameraOffset, ...]
 
     @property
-    def to_json(self) -> dict[str, Any]:
+    def report_facts(self) -> dict[str, Any]:
         """Return JSON-able facts for reports: pixels of the compared image, to the right and
         down.
         """

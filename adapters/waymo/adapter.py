@@ -475,7 +475,7 @@ class WaymoLabels:
     segment: Segment
 
     @property
-    def lidar_top_rad(self) -> float:
+    def max_lidar_elevation_rad(self) -> float:
         """Return the highest elevation of the TOP laser.
 
         The others look 30 degrees up, but 20 m far.
@@ -640,7 +640,7 @@ def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDr
         boxes=boxes,
         labels=labels,
         world_origin_m=origin,
-        lidar_top_deg=float(np.degrees(labels.lidar_top_rad)),
+        lidar_top_deg=float(np.degrees(labels.max_lidar_elevation_rad)),
         problems=(
             *segment.problems,
             *chosen.problems,

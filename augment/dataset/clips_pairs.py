@@ -29,7 +29,7 @@ from augment.jobs.manifest import effect_masks
 
 # ---- Samples dealt to all processes, the same again after an interruption ------------------------
 
-Uneven = Literal["exact", "pad", "drop"]
+Remainder = Literal["exact", "pad", "drop"]
 
 
 class ShardedSampler(Sampler[int]):
@@ -45,14 +45,14 @@ class ShardedSampler(Sampler[int]):
         ranks: number of processes; None takes torch.distributed's where it runs, else 1.
         shuffle: if False, the order is that of the samples.
         seed: seed of the order.
-        uneven: what happens where the number of samples is no multiple of the ranks. `exact`: some
-            ranks have one sample more. `pad`: the first places come again, so that all ranks have
-            as many (collective operations wait for each other). `drop`: the last places are left
-            out this epoch.
+        remainder: what happens where the number of samples is no multiple of the ranks. `exact`:
+            some ranks have one sample more. `pad`: the first places come again, so that all ranks
+            have as many (collective operations wait for each other). `drop`: the last places are
+            left out this epoch.
 
-    To go on after an interruption, keep `state_dict(given)` and load it into a sampler of the same
-    samples and seed; the number of ranks may then be another. A DataLoader asks its sampler ahead
-    of what it yields, so say how many samples of this rank were trained on.
+    To go on after an interruption, keep `state_dict(num_trained)` and load it into a sampler of the
+    same samples and seed; the number of ranks may then be another. A DataLoader asks its sampler
+    ahead of what it yields, so say how many samples of this rank were trained on.
 
     Raises:
         ValueError: arguments that do not fit each other.
@@ -66,7 +66,7 @@ class ShardedSampler(Sampler[int]):
         ranks: int | None = None,
         shuffle: bool = True,
         seed: int = 0,
-        remainder: Uneven = "exact",
+        remainder: Remainder = "exact",
     ) -> None:
         process_rank, num_processes = _process_rank()
         self.rank = process_rank if rank is None else rank
@@ -74,10 +74,10 @@ class ShardedSampler(Sampler[int]):
         self.count = samples if isinstance(samples, int) else len(samples)
         self.shuffle = shuffle
         self.seed = seed
-        self.uneven = remainder
+        self.remainder = remainder
         if not 0 <= self.rank < self.ranks:
             raise ValueError(f"rank must be 0 to {self.ranks - 1} of {self.ranks}; got {self.rank}")
-        check_choice("uneven", remainder, Uneven)
+        check_choice("remainder", remainder, Remainder)
         self.epoch = 0
         self._num_done = 0  # samples of all ranks before the place where the epoch goes on
         self._num_yielded = 0
@@ -97,20 +97,22 @@ class ShardedSampler(Sampler[int]):
     def __len__(self) -> int:
         """Return the number of samples of this rank that the epoch still has."""
         num_remaining = max(self.count - self._num_done, 0)
-        if self.uneven == "exact":
+        if self.remainder == "exact":
             return len(range(self.rank, num_remaining, self.ranks))
         return (
-            -(-num_remaining // self.ranks) if self.uneven == "pad" else num_remaining // self.ranks
+            -(-num_remaining // self.ranks)
+            if self.remainder == "pad"
+            else num_remaining // self.ranks
         )
 
     def state_dict(self, num_trained: int | None = None) -> dict[str, Any]:
         """Return the place in the epoch, in plain numbers that JSON holds.
 
         Args:
-            given: number of samples of this rank that were trained on since the epoch began or the
-                last state was loaded: batches times their size. Every rank must have trained on the
-                same number. None takes the number that this sampler yielded, which is right if no
-                worker reads ahead.
+            num_trained: number of samples of this rank that were trained on since the epoch began
+                or the last state was loaded: batches times their size. Every rank must have trained
+                on the same number. None takes the number that this sampler yielded, which is right
+                if no worker reads ahead.
         """
         ahead = (self._num_yielded if num_trained is None else num_trained) * self.ranks
         return {
@@ -146,7 +148,7 @@ class ShardedSampler(Sampler[int]):
         if self.shuffle:
             np.random.default_rng([self.seed, self.epoch]).shuffle(order)
         remaining_samples = order[self._num_done :]
-        if self.uneven == "pad" and len(remaining_samples):
+        if self.remainder == "pad" and len(remaining_samples):
             num_missing = -len(remaining_samples) % self.ranks
             remaining_samples = np.concatenate([remaining_samples, np.resize(order, num_missing)])
         return remaining_samples[self.rank :: self.ranks][: len(self)].tolist()
@@ -181,7 +183,7 @@ def split_by_scene(
     scenes, 0.2 is often none or four.
 
     Args:
-        whole: the dataset or table.
+        dataset: the dataset or table.
         fractions: parts of the scenes by name, in order; they add up to 1.
         seed: seed of the split.
         exact: if True, deal the scenes such that each part's number is off by less than one; a
@@ -252,8 +254,8 @@ class PairedDataset(Dataset):
 
     clean, weathered: over one output folder or two; each with its own options and transform. A
     sample is `{"clean": sample, "weathered": sample}`, in the order of the weathered ones; those
-    without a clean one are left out, `unpaired` of them. Cameras of a pair have the same pose, and
-    the same size if their recipes' scale is the same.
+    without a clean one are left out, `num_unpaired` of them. Cameras of a pair have the same pose,
+    and the same size if their recipes' scale is the same.
 
         frames = WeatherDataset("out/fog")
         pairs = PairedDataset.of(frames)
@@ -355,7 +357,7 @@ class MixedDataset(Dataset):
 def _check_alike(**sides: WeatherDataset) -> None:
     """Raise ValueError where the first dataset lacks what the second one's samples have."""
     (name, first), (other, second) = sides.items()
-    if names := sorted(second.given() - first.given()):
+    if names := sorted(second.available_kinds() - first.available_kinds()):
         raise ValueError(
             f"samples of `{name}` ({', '.join(first.uris)}) have no {', '.join(names)}, those of "
             f"`{other}` ({', '.join(second.uris)}) have: batches would not stack. Open both with a "

@@ -133,7 +133,7 @@ def write_labels(out: Path | str, options: LabelOptions | None = None) -> Labels
 
     Args:
         out: folder of the output.
-        asked: options; None takes those of the last call, or the recipes' if there was none.
+        options: options; None takes those of the last call, or the recipes' if there was none.
 
     Raises:
         NothingLabelled: no variant has both masks and a recipe that asks for a format.
@@ -466,10 +466,10 @@ def kitti_line(obj: LabelledObject) -> str:
         return _kitti_text(DONT_CARE, -1.0, -1, [-10.0, *sides, *unknown])
     length, width, height = obj.size_m
     x, y, z = obj.centre_m
-    turn = math.atan2(-heading[2], heading[0])
-    alpha = math.remainder(turn - math.atan2(x, z), math.tau)
+    rotation_y = math.atan2(-heading[2], heading[0])
+    alpha = math.remainder(rotation_y - math.atan2(x, z), math.tau)
     truncated = min(max(obj.truncated_fraction, 0.0), 1.0)
-    numbers = [alpha, *sides, height, width, length, x, y + height / 2, z, turn]
+    numbers = [alpha, *sides, height, width, length, x, y + height / 2, z, rotation_y]
     return _kitti_text("_".join(obj.category.split()), truncated, _occluded(obj), numbers)
 
 
@@ -548,16 +548,18 @@ class _Writing:
             self._write_lists(new, formats, sets)
         return LabelsResult(
             folder=new,
-            **self._counted(formats),
+            images=self._counts("images", formats),
+            objects=self._counts("objects", formats),
+            num_hidden=self._counts("hidden", formats),
             parts=dict(self.parts),
             unmapped=self.categories.unmapped,
             unused_rows=self.categories.unused,
             without_numbers=self.without_numbers,
         )
 
-    def _counted(self, formats: set[str]) -> dict[str, Any]:
-        kinds = ("images", "objects", "hidden")
-        return {kind: {f: self.counts[kind, f] for f in sorted(formats)} for kind in kinds}
+    def _counts(self, kind: str, formats: set[str]) -> dict[Any, int]:
+        """Return the number of images, objects or hidden objects by format."""
+        return {name: self.counts[kind, name] for name in sorted(formats)}
 
     def _make_folders(self, new: Path, formats: set[str]) -> None:
         parts = [
@@ -627,7 +629,9 @@ class _Writing:
             asked=self.request,
             categories=self.categories.names,
             unmapped=dict(self.categories.unmapped),
-            **self._counted(formats),
+            images=self._counts("images", formats),
+            objects=self._counts("objects", formats),
+            hidden=self._counts("hidden", formats),
         )
         (new / RECORD).write_text(record.model_dump_json(indent=1) + "\n")
 

@@ -58,7 +58,7 @@ NAMES = ("scene", "variant", "frame", "recipe_hash", "surface")  # as in the man
 class Buffer(NamedTuple):
     """Form of an image beside the picture."""
 
-    stored: type
+    pixel_type: type
     """Type of the file's pixels."""
     tensor: Callable[[np.ndarray], torch.Tensor]
     """Function that makes the sample's tensor of the file's pixels."""
@@ -174,7 +174,7 @@ def make_sample(
         camera: the camera of the image.
         world_from_ego: pose of the car, float64 [4, 4].
         labels: labels of the frame.
-        described: weather, paths and NAMES.
+        metadata: weather, paths and NAMES.
     """
     sample: Sample = dict.fromkeys(loadable())
     for name, image in images.items():
@@ -235,7 +235,7 @@ def box_tensors(
         streak_fraction, flake_fraction
                           [B], part of its pixels that shows a streak or a flake; NaN as above
         visibility        [B], part of the box that all of this leaves visible, 0 to 1
-                          (`augment.jobs.files.visibility`)
+                          (`augment.jobs.files.combine_visibility`)
 
     Values are None without the weather that they measure. instance, modal_xyxy, visible_fraction
     and truncated_fraction are None where the output is older than they.

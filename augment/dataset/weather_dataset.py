@@ -280,7 +280,9 @@ class RowReader:
                 if kind == "image" and self.verify:
                     _check_digest(data, row["checksum"])
                 is_image = kind == "image"
-                image = decode_image(data) if is_image else decode_png(data, buffers()[kind].stored)
+                image = (
+                    decode_image(data) if is_image else decode_png(data, buffers()[kind].pixel_type)
+                )
                 _check_size(image, row)
             images[kind] = image
         return images
@@ -495,8 +497,8 @@ class WeatherDataset(Dataset):
         self.rows = _read_rows(stores, where, requested)
         _check_all_have(self.rows, self.options.load, self.uris)
 
-    def given(self) -> frozenset[str]:
-        """Return the names of `load` that the samples have, without the masks."""
+    def available_kinds(self) -> frozenset[str]:
+        """Return the kinds of data in `load` that the samples have, without the masks."""
         load = self.options.load.difference(mask_names())
         return frozenset(k for k in load if k == "image" or self.rows.has_file(k).any())
 
@@ -530,7 +532,7 @@ class WeatherDataset(Dataset):
         load = self.options.load.difference(without)
         camera, world_from_ego = reader.camera(row)
         paths = {kind: row[f"{kind}_path"] for kind in path_kinds()}
-        described = {
+        metadata = {
             "weather": {name: row[name] for name in self.rows.weather},
             "paths": {kind: path and reader.name(path) for kind, path in paths.items()},
         }
@@ -540,7 +542,7 @@ class WeatherDataset(Dataset):
             camera=camera,
             world_from_ego=world_from_ego,
             labels=reader.labels(row, load),
-            metadata=described | {name: row[name] for name in NAMES},
+            metadata=metadata | {name: row[name] for name in NAMES},
         )
 
     def select(self, rows: np.ndarray) -> WeatherDataset:

@@ -1,4 +1,8 @@
-"""The effects, in the order in which they are applied."""
+"""The list of all effects, in the order in which they are applied to an image.
+
+The pipeline (`augment.plan`, `augment.views`) walks through EFFECTS. Other packages may extend the
+list by `add_effect`.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +18,9 @@ from augment.effects.wet.effect import WetEffect
 from augment.prune import precompute_errors, prune_error_of
 from recipes.schema import add_section, remove_section
 
-# Style colours what stands in the weather, rain wets it; then come the air before it, snow on it,
-# water over it, spray, what falls before all of it, and last the camera's own glass.
+# Effects in the order in which they are applied. Style colours the scene, and rain wets it. Then
+# come the air in front of it, the snow on it, the water over it, the spray, falling rain and snow,
+# and last the drops on the camera's lens.
 EFFECTS: tuple[Effect, ...] = (
     StyleEffect(),
     WetEffect(),
@@ -30,11 +35,17 @@ EFFECTS: tuple[Effect, ...] = (
 
 
 def precompute_effects(context: JobContext, *, only_files: bool = False) -> None:
-    """Work out what all images of a job share, once: it is then in the scene's memo, whose
-    `shared()` other processes take over. only_files: nothing but what lies in files.
+    """Precompute data that all images of a job share.
+
+    The data go into the scene's memo, whose `shared()` other processes take over.
+
+    Args:
+        context: scene, recipes and cameras of the job.
+        only_files: if True, only data that are kept in files are precomputed.
 
     Raises:
-        SceneError, StyleError: an effect cannot be had in this scene.
+        SceneError: an effect is impossible in this scene.
+        StyleError: a style cannot be used.
     """
     for effect in EFFECTS:
         if effect.precomputes_files or not only_files:
@@ -45,24 +56,24 @@ def precompute_effects(context: JobContext, *, only_files: bool = False) -> None
 
 
 def add_effect(effect: Effect) -> None:
-    """Apply one more effect after those that are there, and let recipes speak of it.
+    """Add an effect to the end of EFFECTS, and its section to recipes.
 
-    Whoever walks the effects reads `augment.effects.EFFECTS` anew. Worker processes know the effect
-    if a module that they import adds it.
+    Code that walks through the effects reads `augment.effects.EFFECTS` anew each time. Worker
+    processes know the effect if a module that they import adds it.
 
     Raises:
         ValueError: there is an effect of this name already.
     """
     global EFFECTS
-    if any(effect.name == other.name for other in EFFECTS):
+    if any(effect.name == known_effect.name for known_effect in EFFECTS):
         raise ValueError(f"there is an effect {effect.name!r} already")
     add_section(effect.section, effect.model)
     EFFECTS = (*EFFECTS, effect)
 
 
 def remove_effect(name: str) -> None:
-    """Undo `add_effect`."""
+    """Remove an effect that `add_effect` added, and its section from recipes."""
     global EFFECTS
-    (gone,) = (effect for effect in EFFECTS if effect.name == name)
-    remove_section(gone.section)
-    EFFECTS = tuple(effect for effect in EFFECTS if effect is not gone)
+    (removed_effect,) = (effect for effect in EFFECTS if effect.name == name)
+    remove_section(removed_effect.section)
+    EFFECTS = tuple(effect for effect in EFFECTS if effect is not removed_effect)

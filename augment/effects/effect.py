@@ -7,12 +7,12 @@ effect by name. The recipe's side of an effect (its model, manifest columns and 
 
 The hooks of `Effect`, by when they are called:
 
-    once a recipe and scene    place            facts, with a reason for every pass
-    once a scene               prepare, relight, share
-    once a view                cameras, in_view, edit_scene, draw, edit_image, mask_of,
-                               front_surface
-    labels of a view           measure, grow_boxes, table
-    once a sweep               meet, attenuate
+    once a recipe and scene    plan_in_scene    facts, with a reason for every pass
+    once a scene               prepare, relight, precompute
+    once a view                cameras, visibility, edit_scene, draw, edit_image,
+                               visible_mask, front_surface
+    labels of a view           measure_boxes, grow_boxes, box_table
+    once a sweep               intersect_beams, attenuate_beams
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class EffectInScene:
     """Effects that are applied before this one."""
 
     view_data: Any = None
-    """`Visibility.seen` of the view at hand, as `Effect.in_view` returned it."""
+    """`Visibility.view_data` of the view at hand, as `Effect.visibility` returned it."""
 
     @cached_property
     def prepared_data(self) -> Any:
@@ -117,7 +117,7 @@ class EffectInScene:
 
 @dataclass(frozen=True, eq=False)
 class JobContext:
-    """Everything that a job will render. `Effect.share` precomputes from it."""
+    """Everything that a job will render. `Effect.precompute` receives it."""
 
     scene: Scene
     """The scene of all images."""
@@ -142,7 +142,7 @@ class JobContext:
 
 @dataclass(frozen=True)
 class ViewQuery:
-    """Query for `Effect.in_view`: one view of a scene."""
+    """Query for `Effect.visibility`: one view of a scene."""
 
     camera: Camera
     """Camera of the image."""
@@ -159,7 +159,7 @@ class ViewQuery:
 
 @dataclass(frozen=True)
 class Visibility:
-    """What one view can show of an effect."""
+    """Visibility of an effect in one view."""
 
     is_visible: bool = True
     """False if the effect cannot change the image."""
@@ -171,7 +171,7 @@ class Visibility:
     """Instance ids of the parts that must be drawn for the effect."""
 
     view_data: Any = None
-    """Data that the other hooks of the view need; they read it as `EffectInScene.seen`."""
+    """Data that the other hooks of the view need; they read it as `EffectInScene.view_data`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +257,7 @@ class Effect:
     """
 
     precomputes_files: ClassVar[bool] = False
-    """If True, `share` takes long and stores large results in files."""
+    """If True, `precompute` takes long and stores large results in files."""
 
     raster_passes: ClassVar[tuple[str, ...]] = ()
     """Names of those passes that run the rasteriser."""
@@ -295,7 +295,7 @@ class Effect:
         Args:
             recipe: the recipe, also one without this effect.
             scene: the scene to change.
-            later: plans of the effects that are applied after this one, by name.
+            later_plans: plans of the effects that are applied after this one, by name.
 
         Raises:
             SceneError: the scene lacks a fact that the effect needs.
@@ -323,7 +323,7 @@ class Effect:
         return None
 
     def visibility(self, effect: EffectInScene, query: ViewQuery) -> Visibility:
-        """Return what the view can show of the effect, at little cost.
+        """Return what the view can show of the effect. This must cost little.
 
         The answer saves work only: it must not change a single bit of any picture.
         """
@@ -364,12 +364,12 @@ class Effect:
     def measure_boxes(
         self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
     ) -> dict[str, np.ndarray]:
-        """Return the stored columns of `table`, [B] each.
+        """Return the stored columns of `box_table`, [B] each.
 
         Args:
-            placed: the labelled boxes, in the scene's world.
+            boxes: the labelled boxes, in the scene's world.
             camera: camera of the image.
-            view: the effect in this view.
+            inputs: the plan, depth and mask of the effect in this view.
         """
         raise NotImplementedError
 
@@ -388,5 +388,5 @@ class Effect:
     def attenuate_beams(self, effect: EffectInScene, echoes: Any, rng: np.random.Generator) -> None:
         """Weaken echoes by the effect's particles in the air and add the particles' own echoes.
 
-        It runs after `meet` of all effects.
+        It runs after `intersect_beams` of all effects.
         """

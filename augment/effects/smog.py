@@ -158,11 +158,14 @@ class SmogEffect(Effect):
     def edit_scene(
         self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
-        faded = effect.prepared_data if effect.settings.sun < 1 else None
-        if faded is not None:
+        shadows = effect.prepared_data if effect.settings.sun < 1 else None
+        if shadows is not None:
             with timed(SHADOWS):
-                parts = [p if p.instance_id or p.is_overlay else faded.on(p) for p in layers.parts]
-                photo = layers.photo and replace(layers.photo, faded_shadows=faded)
+                parts = [
+                    p if p.instance_id or p.is_overlay else shadows.apply_to(p)
+                    for p in layers.parts
+                ]
+                photo = layers.photo and replace(layers.photo, faded_shadows=shadows)
                 layers = replace(layers, parts=tuple(parts), photo=photo)
         fog = effect.settings.fog
         common = effect.scene.common_color_map
@@ -293,7 +296,7 @@ def box_transmittance(
     """Return exp(-tau) of the smog between the camera's eye and each box.
 
     Args:
-        placed: the boxes, in the scene's world.
+        boxes: the boxes, in the scene's world.
         camera: camera of the image.
         fog: the smog; None for none.
         surface_depth_m: z of the surfaces that the pixels show, metres, 0 = none. It decides which

@@ -344,7 +344,7 @@ def finite_array(
     """Return a small checked float32 tensor as float64.
 
     Raises:
-        AdapterError: as `tensor`, or the tensor holds NaN or infinite numbers.
+        AdapterError: as `checked_tensor`, or the tensor holds NaN or infinite numbers.
     """
     values = copy_mapped_tensor(checked_tensor(content, name, shape, where)).double().numpy()
     if not np.isfinite(values).all():

@@ -3,7 +3,7 @@
 Beside the files of a scene folder, whose background is then sorted by squares (augment.lod),
 
     levels.safetensors    of each level k: k.keys, k.starts, k.lows, k.highs, k.longest (Squares),
-                          k.boxes.lows, k.boxes.highs, k.boxes.longest (Boxes), k.parents; from
+                          k.boxes.lows, k.boxes.highs, k.boxes.longest (SplatBoxes), k.parents; from
                           level 1 on also k.means, k.quats, ..., k.stands_for
 
 holds the levels of detail, and the metadata `finest_m`. All arrays are mapped: a view reads the

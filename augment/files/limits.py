@@ -31,9 +31,9 @@ def check_memory(where: str, num_gaussians: int, *, num_sh: int, file_bytes: int
 
     Args:
         where: the file, for the message.
-        rows: the number of Gaussians that the file announces.
-        functions: spherical harmonics a Gaussian, 1 to 16.
-        size: bytes of the file, or of all files that hold the Gaussians.
+        num_gaussians: the number of Gaussians that the file announces.
+        num_sh: spherical harmonics a Gaussian, 1 to 16.
+        file_bytes: bytes of the file, or of all files that hold the Gaussians.
 
     Raises:
         SceneError: they take more than FREE_BYTES and BYTES_PER_BYTE for each byte of the file.
@@ -61,7 +61,7 @@ def read_json_object(path: Path, max_bytes: int) -> dict[str, Any]:
 
     Args:
         path: the file.
-        most: the largest size that is read, bytes.
+        max_bytes: the largest size that is read, bytes.
 
     Raises:
         SceneError: the file is larger, or its text cannot be used.

@@ -140,7 +140,7 @@ def take_parts(
         tensors: the arrays of the file.
         document: the scene's document.
         where: the file, for messages.
-        unread: if True, the background's numbers are not checked yet.
+        skips_background_check: if True, the background's numbers are not checked yet.
 
     Returns:
         The parts, and one sentence about each thing that was left out.

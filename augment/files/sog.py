@@ -142,7 +142,7 @@ class _Files:
             self.zip.close()
 
     def read(self, name: str, max_bytes: int) -> bytes:
-        """Read a file of at most `most` bytes."""
+        """Read a file of at most `max_bytes` bytes."""
         if name in ("", ".", "..") or any(mark in name for mark in "/\\\0"):
             raise SceneError(
                 f"{self.path} names the file {name!r}; names must be of files beside {META}"
@@ -167,7 +167,7 @@ class _Files:
 
         Args:
             name: the file.
-            most: the largest size of the file, bytes.
+            max_bytes: the largest size of the file, bytes.
             count: the number of Gaussians; the image has as many pixels or slightly more.
         """
         data = self.read(name, max_bytes)

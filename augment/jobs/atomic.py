@@ -343,7 +343,7 @@ def wait_for_lock(path: Path, descriptor: int, *, patience_s: float, activity: s
     Args:
         path: Name of the file, for messages.
         patience_s: Longest wait, seconds.
-        doing: What the holder does, after "another process".
+        activity: What the holder does, after "another process".
 
     Raises:
         OutputError: Another process has held the lock for that long.

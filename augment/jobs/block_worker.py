@@ -268,6 +268,9 @@ def clear_leftovers(store: Store, scratch: Path | None, published_blocks: Iterab
         remove_temporaries(folder)
     for state_folder in (PARTS, VARIANTS, QUALITY):
         remove_temporaries(store.local_dir / state_folder)
+    with raise_output_error(state_dir):
+        for lock in state_dir.glob("beds-*.lock"):  # the names in older versions
+            lock.unlink(missing_ok=True)
     for path in store.list(CLAIMS_FOLDER):
         name = path.removeprefix(f"{CLAIMS_FOLDER}/").removesuffix(".lock")
         if folder_name(name) != name:  # not a claim's file: another program has put it there
@@ -590,10 +593,10 @@ class BlockWorker:
         backend = self._setup.backend
         if any(e.precomputes_files and e.section_of(recipe) is not None for e in effects.EFFECTS):
             folder = self._shared_dir()
-            lock = folder / f"beds-{folder_name(block.scene)}.lock"
-            with file_lock(lock, "finds where snow can lie"):
-                sharing = effects.JobContext(scene, [recipe], folder=folder, backend=backend)
-                effects.precompute_effects(sharing, only_files=True)
+            lock = folder / f"shared-files-{folder_name(block.scene)}.lock"
+            with file_lock(lock, "finds the surfaces that are open to the sky"):
+                context = effects.JobContext(scene, [recipe], folder=folder, backend=backend)
+                effects.precompute_effects(context, only_files=True)
 
 
 class _SceneFailed(ClimateGSError):

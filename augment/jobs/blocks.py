@@ -1,6 +1,6 @@
 """Plan of a dataset job: every scene's images under every resolved recipe, cut into blocks.
 
-In: recipes of a job and records of its scenes. Out: a `Plan` for `generate`, and the status of a
+In: recipes of a job and records of its scenes. Out: a `JobPlan` for `generate`, and the status of a
 job for `climategs status`. The plan is stored in the output as `.climategs/jobs/<name>.json`, so
 that progress can be read from the output alone.
 """
@@ -27,6 +27,7 @@ from augment.jobs.claims import CLAIMS_FOLDER, try_claim
 from augment.jobs.files import RECORDED, SceneIndex, has_lidar, select_frames
 from augment.jobs.layout import (
     MANIFEST_FILE,
+    PROGRESS_LOGS,
     STATE_FOLDER,
     folder_name,
     parse_errors_as_output_errors,
@@ -576,8 +577,8 @@ def _count_staged_images(store: Store) -> dict[str, int]:
     counts: dict[str, int] = {}
     for folder in (store.local_dir / STATE_FOLDER / "blocks").glob("*"):
         with contextlib.suppress(OSError, OutputError):  # another process has published it
-            progress_logs = list(folder.glob(f"{STATE_FOLDER}/journal/*/*.jsonl"))
-            finished = sum(read_file(j).count(b'"status":"ok"') for j in progress_logs)
+            progress_logs = list(folder.glob(f"{STATE_FOLDER}/{PROGRESS_LOGS}/*/*.jsonl"))
+            finished = sum(read_file(path).count(b'"status":"ok"') for path in progress_logs)
             if (folder / MANIFEST_FILE).is_file():  # a run that was stopped, or had failures
                 finished += read_manifest(folder)["status"].to_pylist().count(OK)
             counts[folder.name] = finished

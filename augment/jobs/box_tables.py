@@ -94,10 +94,12 @@ class BoxTable:
             return 1 - columns[self.hidden_column]
         return columns[self.visible_column] if self.visible_column else None
 
-    def make_numbers(self, track_ids: Sequence[str], **stored: np.ndarray) -> BoxNumbers:
+    def make_numbers(self, track_ids: Sequence[str], **stored_columns: np.ndarray) -> BoxNumbers:
         """Return the numbers of an image, with the derived columns."""
-        derived = {name: derive(stored) for name, derive in self.derived_columns.items()}
-        return BoxNumbers(tuple(track_ids), stored | derived)
+        derived_columns = {
+            name: derive(stored_columns) for name, derive in self.derived_columns.items()
+        }
+        return BoxNumbers(tuple(track_ids), stored_columns | derived_columns)
 
     def to_json(self, numbers: BoxNumbers) -> list[list[Any]]:
         """Return the numbers as lists for the progress log; floats keep all their digits."""
@@ -179,7 +181,7 @@ def _joined(arrays: list[np.ndarray], dtype: type) -> np.ndarray:
 
 
 def pixel_fraction(column_name: str) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
-    """Return a function that divides a column by the box's `pixels`, float64 [B].
+    """Return a function that divides a column by the box's column `pixels`, float64 [B].
 
     The result is 0 where the column was not counted, and NaN for a box without pixels.
 

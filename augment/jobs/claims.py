@@ -111,7 +111,7 @@ def hold_claim(
 
     Args:
         patience_s: Longest wait, seconds.
-        doing: What the holders do, after "another process".
+        activity: What the holders do, after "another process".
 
     Raises:
         OutputError: Another process holds the claim for longer than that.
@@ -267,7 +267,7 @@ class _ObjectClaim(Claim):
             # claim, which no process takes over before its lifetime has passed.
             self._renew()
             left_s = self._renewed_s + self._times.lifetime_s - _clock_s()
-            if not self._loss_reason and left_s > self._store.patience.timeout_s:
+            if not self._loss_reason and left_s > self._store.retry_settings.timeout_s:
                 self._store.delete_once(self._path)
         except OutputError as error:
             _log.warning("a claim ends only in %.0f s: %s", self._times.lifetime_s, error)

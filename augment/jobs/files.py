@@ -233,7 +233,7 @@ def find_box_visibility(
         grown_boxes,
         camera,
         surface.depth_m,
-        surface.actors,
+        surface.actor_instance,
         actor_numbers,
         classes=surface.classes,
         with_owners=masks,
@@ -258,11 +258,15 @@ def _with_own_car(surface: Any) -> Any:
     """Return the LabelSurfaces with the recording car as the nearest surface of its pixels."""
     if surface.own_car is None:
         return surface
-    actors = surface.actors
+    instance_image = surface.actor_instance
     return dataclasses.replace(
         surface,
         depth_m=np.where(surface.own_car, np.float32(OWN_CAR_DEPTH_M), surface.depth_m),
-        actors=None if actors is None else np.where(surface.own_car, np.uint16(0), actors),
+        actor_instance=(
+            None
+            if instance_image is None
+            else np.where(surface.own_car, np.uint16(0), instance_image)
+        ),
     )
 
 
@@ -793,7 +797,7 @@ def write_view(
         paths: Paths relative to the output folder, by kind.
 
     Raises:
-        ValueError: A buffer has another type or shape than View says.
+        ValueError: A buffer has another type or shape than ViewResult says.
         OutputError: The system refuses; no partial file is left.
     """
     start_s = time.perf_counter()
@@ -922,7 +926,7 @@ def label_view(
         instances: Numbers of the scene's objects.
         world_origin_m: Origin that was subtracted from the dataset's world, metres.
         camera: Camera at the written resolution.
-        view: View that `check_view` has passed.
+        view: result that `check_view` has passed.
         evidence: Reads further evidence of the frame's objects.
     """
     numbers_of_table: dict[str, BoxNumbers] = {}

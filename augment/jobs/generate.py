@@ -162,13 +162,13 @@ class Tally:
     seconds: Counter[str] = field(default_factory=Counter)
     """Seconds by kind of work."""
 
-    def add(self, done: BlockResult) -> None:
+    def add(self, result: BlockResult) -> None:
         """Add the counts of a finished block."""
-        self.written += done.written
-        self.skipped += done.skipped
-        self.failed += done.failed
-        self.failures += done.failures
-        self.seconds.update(done.seconds or {})
+        self.written += result.written
+        self.skipped += result.skipped
+        self.failed += result.failed
+        self.failures += result.failures
+        self.seconds.update(result.seconds or {})
 
 
 class SceneWork(Work):
@@ -433,7 +433,7 @@ def estimate_job(
 
     Args:
         open_scene: Opens a scene by its URI.
-        each: Called with a recipe's name before its pictures.
+        on_recipe: Called with a recipe's name before its pictures.
     """
     first_blocks: dict[str, Block] = {}
     for block in plan.blocks:
@@ -492,7 +492,7 @@ def _sample(block: Block, loader: SceneLoader, plan: JobPlan) -> Sample:
                 frames=[frame_numbers[len(frame_numbers) // 2]],
                 cameras=[camera],
                 backend=plan.backend,
-                shared_files_dir=Path(folder) / "beds",
+                shared_files_dir=Path(folder) / "shared",
             )
             start_s = time.perf_counter()
             run_job(job, scene_loader=loader, progress=False)
@@ -571,7 +571,8 @@ class GenerateResult:
     """Wall-clock time of the call, seconds."""
     timings: dict[str, float] = field(default_factory=dict)
     """Seconds by kind of work, summed over threads and workers (see `worker.compute_time_shares`).
-    Measured by the clock: `plan`, `scan` of what is finished, and `render_wall`, everything else.
+    Measured by the clock: `plan`, `find_finished` for what is done, and `render_wall`, everything
+    else.
     """
 
 
@@ -618,7 +619,7 @@ class Workers:
     """The workers that a job asks for.
 
     Attributes:
-        opened: Name of the scene that each slot has open.
+        scene_of_slot: Name of the scene that each slot has open.
     """
 
     def __init__(self, job: GenerateJob) -> None:
@@ -702,7 +703,7 @@ class _Generation:
             self._timings["plan"] = time.perf_counter() - start_s
             blocks = select_shard(plan.blocks, *self._job.shard)
             pending_blocks = self._find_pending_blocks(blocks)
-            self._timings["scan"] = time.perf_counter() - start_s - self._timings["plan"]
+            self._timings["find_finished"] = time.perf_counter() - start_s - self._timings["plan"]
             work = BlockWork(
                 pending_blocks,
                 plan.names,

@@ -41,6 +41,7 @@ from augment.jobs.claims import hold_claim
 from augment.jobs.files import SceneIndex, box_tables, calibration_bytes, frame_entry, read_entries
 from augment.jobs.layout import (
     MANIFEST_FILE,
+    PROGRESS_LOGS,
     STATE_FOLDER,
     SWEEP_FOLDER,
     FileListing,
@@ -73,12 +74,12 @@ from augment.jobs.worker import Chunk, Outcome, describe_error
 from recipes.schema import Recipe
 
 _log = logging.getLogger(__name__)
-# Folder of the progress logs inside the state folder.
-PROGRESS_LOGS = "journal"
+# Folder in which older versions kept the progress logs, inside the state folder.
+_OLD_PROGRESS_LOGS = "journal"
 
 
 class ProgressLog:
-    """Progress log of a variant, `.climategs/journal/<scene>/<variant>.jsonl`.
+    """Progress log of a variant, `.climategs/progress/<scene>/<variant>.jsonl`.
 
     It holds the variant's identity, then a line for every image whose files are in place. A line
     counts only with its line break, so a job that is killed while writing a line loses only that
@@ -156,6 +157,31 @@ def logged_variants(out_dir: Path) -> list[str]:
     """Return folders (`<scene>/<variant>`) of the variants that a job has begun and not ended."""
     root = out_dir / STATE_FOLDER / PROGRESS_LOGS
     return sorted(str(p.relative_to(root).with_suffix("")) for p in root.glob("*/*.jsonl"))
+
+
+def _take_over_old_logs(out_dir: Path) -> None:
+    """Move the progress logs of an older version to where this one keeps them.
+
+    The caller holds the output's lock. A variant that has a log in both folders was begun by this
+    version and then by an older one. Its newer log stays, and the images that only the other one
+    lists are rendered again.
+    """
+    old_dir = path_below(out_dir, (STATE_FOLDER, _OLD_PROGRESS_LOGS))
+    if not old_dir.is_dir():
+        return
+    logs_dir = path_below(out_dir, (STATE_FOLDER, PROGRESS_LOGS))
+    with raise_output_error(old_dir):
+        if not logs_dir.exists():
+            old_dir.rename(logs_dir)
+            flush_folder(logs_dir.parent)
+            return
+        for old_path in old_dir.glob("*/*.jsonl"):
+            path = path_below(logs_dir, old_path.relative_to(old_dir).parts)
+            if not path.exists():
+                make_folder(path.parent)
+                old_path.rename(path)
+                flush_folder(path.parent)
+    _remove_tree(old_dir)
 
 
 def _line(value: dict[str, Any]) -> bytes:
@@ -450,6 +476,7 @@ class JobState:
         """Delete leftovers of a killed run, and read the rows that it finished."""
         if (self.out_dir / MANIFEST_FILE).is_file():
             self._table = read_manifest(self.out_dir)
+        _take_over_old_logs(self.out_dir)
         path_below(self.out_dir, (STATE_FOLDER, PROGRESS_LOGS, folder_name(self.index.name)))
         listing = FileListing(self.out_dir)
         replaced_variants = [v for v in self.variants if v.load(self._table, listing, overwrite)]

@@ -26,6 +26,8 @@ from recipes.schema import Recipe
 MANIFEST_FILE = "manifest.parquet"
 # Folder of the jobs' state.
 STATE_FOLDER = ".climategs"
+# Folder of the progress logs inside the state folder, see augment.jobs.job_state.
+PROGRESS_LOGS = "progress"
 # Folder of LiDAR sweeps, inside a variant's folder; inside the scene's for sweeps without weather.
 SWEEP_FOLDER = "lidar"
 

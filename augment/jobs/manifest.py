@@ -94,8 +94,8 @@ def later_columns() -> dict[str, str | None]:
     Without water and snow all surfaces are the same; new rows of such a variant hold the default.
     The settings that old rows were rendered with are in their recipes, and are not known here.
     """
-    later = dict.fromkeys(name for name in leading_columns() if name not in _FIRST)
-    return {**later, "base": "splats", "surface": "solid"}
+    columns = dict.fromkeys(name for name in leading_columns() if name not in _FIRST)
+    return {**columns, "base": "splats", "surface": "solid"}
 
 
 def weather_columns(table: pa.Table) -> list[str]:
@@ -178,16 +178,20 @@ def read_manifest(out_dir: Path) -> pa.Table:
     return parse_manifest(data, str(path))
 
 
-def parse_manifest(data: bytes, source_name: str, without: Collection[str] = ()) -> pa.Table:
+def parse_manifest(
+    data: bytes, source_name: str, excluded_columns: Collection[str] = ()
+) -> pa.Table:
     """Return the table in a manifest's bytes, with the columns that an older version lacks.
 
     Args:
         data: Bytes of the Parquet file.
         source_name: Name of the file, for errors.
-        without: Columns to leave out, which saves memory.
+        excluded_columns: Columns to leave out, which saves memory.
     """
-    table = _with_later_columns(read_table(data, source_name, without=without), without)
-    _check_types(table, source_name, without)
+    table = _with_later_columns(
+        read_table(data, source_name, excluded_columns=excluded_columns), excluded_columns
+    )
+    _check_types(table, source_name, excluded_columns)
     for name in weather_columns(table):
         if table[name].null_count:  # some programs write NaN as null
             column = pc.fill_null(table[name], math.nan)
@@ -208,10 +212,12 @@ def check_rows(rows: Sequence[Row], key: tuple[str, str], source_name: str) -> N
     _check_values(rows_to_table(rows), source_name)
 
 
-def _check_types(table: pa.Table, source_name: str, without: Collection[str]) -> None:
+def _check_types(table: pa.Table, source_name: str, excluded_columns: Collection[str]) -> None:
     """Raise OutputError where a column is missing or has another type."""
     column_types = {
-        n: kind for n, kind in _column_types(weather_columns(table)).items() if n not in without
+        n: kind
+        for n, kind in _column_types(weather_columns(table)).items()
+        if n not in excluded_columns
     }
     advice = "It was written by another program or version: write to another output folder"
     missing_columns = sorted(column_types.keys() - set(table.column_names))
@@ -385,11 +391,11 @@ def _in_variants(table: pa.Table, variants: set[tuple[str, str]]) -> np.ndarray:
     return is_in_variants
 
 
-def _with_later_columns(table: pa.Table, without: Collection[str]) -> pa.Table:
+def _with_later_columns(table: pa.Table, excluded_columns: Collection[str]) -> pa.Table:
     """Return the table with the columns that older versions lack, filled with their defaults."""
     column_types = leading_columns()
     for name, default in later_columns().items():
-        if name not in table.column_names and name not in without:
+        if name not in table.column_names and name not in excluded_columns:
             column = pa.array([default] * table.num_rows, column_types[name])
             position = [n for n in column_types if n in table.column_names or n == name].index(name)
             table = table.add_column(position, name, column)
@@ -493,7 +499,7 @@ def read_manifest_rows(store: Store, excluded_columns: Collection[str] = ()) -> 
     """Return the rows of all finished and failed images, sorted by `manifest.KEY`.
 
     Args:
-        without: Columns to leave out, which saves memory.
+        excluded_columns: Columns to leave out, which saves memory.
 
     Raises:
         OutputError: Nothing is finished yet, or a file is damaged.
@@ -535,7 +541,7 @@ def parts_to_merge(store: Store) -> int:
 
 
 def _merge_parts(
-    store: Store, without: Collection[str] = ()
+    store: Store, excluded_columns: Collection[str] = ()
 ) -> tuple[pa.Table | None, bytes | None, list[Part]]:
     """Return the rows of manifest and parts, the manifest's bytes as they are, and the parts.
 
@@ -543,11 +549,11 @@ def _merge_parts(
     """
     for attempt in range(_MAX_RACES):
         parts = sorted(list_parts(store).values(), key=lambda part: part.name)
-        table, data = _load_manifest(store, without)
+        table, data = _load_manifest(store, excluded_columns)
         merged_names = _merged_part_names(table)
         try:
             new_tables = [
-                parse_manifest(store.read(part.path), f"{store.uri}/{part.path}", without)
+                parse_manifest(store.read(part.path), f"{store.uri}/{part.path}", excluded_columns)
                 for part in parts
                 if part.name not in merged_names
             ]
@@ -563,14 +569,14 @@ def _merge_parts(
 
 
 def _load_manifest(
-    store: Store, without: Collection[str] = ()
+    store: Store, excluded_columns: Collection[str] = ()
 ) -> tuple[pa.Table | None, bytes | None]:
     """Return the manifest's table and bytes; None for both where there is no manifest."""
     try:
         data = store.read(MANIFEST_FILE)
     except StoredFileMissing:
         return None, None
-    return parse_manifest(data, f"{store.uri}/{MANIFEST_FILE}", without), data
+    return parse_manifest(data, f"{store.uri}/{MANIFEST_FILE}", excluded_columns), data
 
 
 def _merged_part_names(table: pa.Table | None) -> Collection[str]:
@@ -634,7 +640,7 @@ class Identity:
             len(digests) > 1
         )
 
-    def check(self, stored: Identity, source_name: str) -> None:
+    def check(self, stored_identity: Identity, source_name: str) -> None:
         """Raise OutputError where images of another identity are in the folder."""
         names = {
             "source": "scene",
@@ -644,13 +650,13 @@ class Identity:
             "backend": "backend",
         }
         new_values = asdict(self)
-        stored_values = asdict(stored)
+        stored_values = asdict(stored_identity)
         different = [
             f"{label} there {stored_values[name]!r}, here {new_values[name]!r}"
             for name, label in names.items()
             if new_values[name] != stored_values[name]
         ]
-        if not different and self.is_of_other_content(stored):
+        if not different and self.is_of_other_content(stored_identity):
             different = [
                 f"the files of the scene {self.source} have changed since: the digest of their "
                 f"content is {stored_values['source_digest']!r} there, "
@@ -699,7 +705,7 @@ def image_row(
         pictured: The image.
         paths: Paths of the image's files by column; a failed image gets none, whatever they say.
         status: OK or FAILED.
-        shares: Shares of the image's pixels, as of `files.Written`.
+        shares: Shares of the image's pixels, as of `files.ViewFiles`.
     """
     return {
         "scene": scene,

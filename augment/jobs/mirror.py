@@ -408,8 +408,8 @@ class Replacement(NamedTuple):
         """Return the replacement from a manifest's row of a finished image."""
         name = row["image_path"]
         form = ImageForm("jpg" if name.endswith(".jpg") else "png", (row["width"], row["height"]))
-        shown = ReplacementRecord(scene=row["scene"], image=name, sha256=row["checksum"])
-        return Replacement(resolve_inside(out_dir, name), shown, form)
+        record = ReplacementRecord(scene=row["scene"], image=name, sha256=row["checksum"])
+        return Replacement(resolve_inside(out_dir, name), record, form)
 
     @staticmethod
     def sweep(
@@ -421,8 +421,8 @@ class Replacement(NamedTuple):
             content: Makes the bytes of the file in this place from the sweep.
         """
         path = resolve_inside(out_dir, row["lidar_path"])
-        shown = ReplacementRecord(scene=row["scene"], sweep=row["lidar_path"])
-        return Replacement(path, shown, content=content and partial(content, path))
+        record = ReplacementRecord(scene=row["scene"], sweep=row["lidar_path"])
+        return Replacement(path, record, content=content and partial(content, path))
 
 
 def is_weathered(row: Mapping[str, Any]) -> bool:
@@ -609,7 +609,7 @@ class MirrorResult:
     """
     missing: list[str] = field(default_factory=list)
     """Recorded images that the source no longer has."""
-    others: list[str] = field(default_factory=list)
+    extra_files: list[str] = field(default_factory=list)
     """Files of the copy that the source does not have."""
 
 
@@ -793,7 +793,9 @@ class _Mirroring:
             foreign_names = [
                 name for name in foreign_names if not os.path.lexists(self.tree.root / name)
             ]
-        self.result.others += [f"{folder.relative}/{name}".lstrip("/") for name in foreign_names]
+        self.result.extra_files += [
+            f"{folder.relative}/{name}".lstrip("/") for name in foreign_names
+        ]
         for inner_place, _ in folder.folders:
             self._make_folder(self._target(inner_place))
         for file in folder.files:

@@ -49,7 +49,7 @@ def find_span_frames(
 
     Args:
         frames: Frames of the scene, in order of time.
-        rendered: Numbers of the frames that have images.
+        rendered_frames: Numbers of the frames that have images.
         cameras: Names of the cameras that were rendered.
     """
     span: list[int] = []

@@ -359,7 +359,7 @@ def file_lock(path: Path, activity: str) -> Iterator[None]:
     """Context manager that only one process of this machine enters at a time.
 
     Args:
-        doing: What is done inside, after "another process".
+        activity: What is done inside, after "another process".
 
     Raises:
         OutputError: The wait takes too long.

@@ -154,13 +154,13 @@ def search_settings(
 ) -> Settings:
     """Return settings that keep a bound of error or of time.
 
-    A step is taken where it leads towards the preferred value, and where `keeps` says that the
-    settings with it keep the bound.
+    A step is taken where it leads towards the preferred value, and where `keeps_bound` says that
+    the settings with it keep the bound.
 
     Args:
         ladders: Values of each knob, from the preferred one to the one to begin with; the settings
             to begin with must keep the bound.
-        keeps: Returns True if settings keep the bound.
+        keeps_bound: Returns True if settings keep the bound.
         steps: Knobs and values to try, in order. None: knob after knob, each at its preferred
             values first.
     """
@@ -206,7 +206,7 @@ def select_useful_values(costs: Sequence[Cost]) -> list[Cost]:
 
 
 def steps_back(costs: Mapping[str, Sequence[Cost]]) -> tuple[Ladders, list[Step]]:
-    """Return ladders and steps to `search` a budget of time with.
+    """Return ladders and steps to search a budget of time with.
 
     The ladders go from reference to the fastest of the useful values. The steps go back to slower
     values, and those that undo the most error come first, because the worst error shows.
@@ -248,7 +248,7 @@ class SettingsBench:
     backend: str
     """Name of the rasteriser's backend."""
     cameras: Sequence[Camera] | None
-    """Cameras that snow is placed and style maps are fitted for; the scene's own if None."""
+    """Cameras that surfaces are found and style maps fitted for; the scene's own if None."""
     renderer: Renderer | None
     """Renderer of the images; the library's own if None."""
     on_picture: Callable[[], object]
@@ -598,8 +598,8 @@ def choose_settings(
     and errors are those of `resolve_quality`.
 
     Args:
-        anew: If True, choose again, and keep the new choice in place of the old one.
-        keep: If True, the output keeps a new choice.
+        choose_again: If True, choose again, and keep the new choice in place of the old one.
+        keep_choice: If True, the output keeps a new choice.
     """
     if not recipe.quality.has_open_choice:
         return recipe

@@ -206,7 +206,7 @@ class RenderJob:
     again.
     """
     shared_files_dir: Path | None = None
-    """Folder that keeps the files that images share (where snow can lie) for later jobs; the state
+    """Folder that keeps the files that images share (exposed surfaces) for later jobs; the state
     folder of the output if None.
     """
     source_digest: str | None = None
@@ -244,8 +244,9 @@ class JobResult:
     failures: tuple[str, ...] = ()
     """One line for each failure."""
     timings: dict[str, float] = field(default_factory=dict)
-    """Seconds by kind of work, summed over threads and workers, or of the job itself (open, settle,
-    prepare, labels, share, finish). `worker.compute_time_shares` says what bound the job.
+    """Seconds by kind of work, summed over threads and workers, or of the job itself (open,
+    choose_settings, prepare, read_labels, share_scene, finish). `worker.compute_time_shares` says
+    what bound the job.
     """
 
 
@@ -280,7 +281,7 @@ def run_job(
     start_s = time.perf_counter()
     job_run = _Run(job, scene_loader(job.scene_uri), renderer, on_outcome, progress)
     opening_s = time.perf_counter() - start_s
-    job_run.times.add("open", opening_s - job_run.times.so_far().get("settle", 0.0))
+    job_run.times.add("open", opening_s - job_run.times.so_far().get("choose_settings", 0.0))
     job_run.execute()
     seconds = time.perf_counter() - start_s
     job_run.times.add(WORKERS, job.workers * seconds)
@@ -456,7 +457,7 @@ class _Run:
         shared_scene = None
         if self.job.workers > 1:
             check_sendable(self.renderer)
-            with self.times.measure("share"):
+            with self.times.measure("share_scene"):
                 shared_scene = share_scene(
                     self.scene, self.index.frames, self.out_dir / STATE_FOLDER
                 )
@@ -486,7 +487,7 @@ class _Run:
         if not recipe.quality.has_open_choice:
             return recipe
         assert self.scene is not None
-        with self.times.measure("settle"):
+        with self.times.measure("choose_settings"):
             return choose_settings(
                 open_store(self.out_dir),
                 recipe,
@@ -536,7 +537,7 @@ class _Run:
 
     def _fail_unlabelled(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Record the images of frames with unreadable boxes as failed; return the other chunks."""
-        with self.times.measure("labels"):
+        with self.times.measure("read_labels"):
             labelled_frames = {c.frame for c in chunks if uses_boxes(self.recipes[c.variant])}
             self.boxes.get(sorted(labelled_frames))
             if labelled_frames:

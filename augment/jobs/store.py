@@ -399,10 +399,10 @@ class RemoteStore:
 
     local_dir = None
 
-    def __init__(self, uri: str, patience: RetrySettings = RetrySettings()) -> None:
+    def __init__(self, uri: str, retry_settings: RetrySettings = RetrySettings()) -> None:
         self._place = _parse(uri)
         self.uri = self._place.public
-        self.patience = patience
+        self.retry_settings = retry_settings
         self._uri = uri
         # Connections by process: a parent's are kept, because closing them in a child is not safe.
         self._connections: dict[tuple[int, RetrySettings], Any] = {}
@@ -411,7 +411,7 @@ class RemoteStore:
         return f"RemoteStore({self.uri!r})"
 
     def __reduce__(self) -> tuple:
-        return (RemoteStore, (self._uri, self.patience))
+        return (RemoteStore, (self._uri, self.retry_settings))
 
     def read(self, path: str) -> bytes:
         path = stored_path(path, self.uri)
@@ -475,7 +475,7 @@ class RemoteStore:
     def delete_once(self, path: str) -> None:
         """Delete an object without retries: a second request might hit a later object."""
         with contextlib.suppress(StoredFileMissing):
-            once = replace(self.patience, retries=0)
+            once = replace(self.retry_settings, retries=0)
             self._call("delete", path, lambda obs, connection: obs.delete(connection, path), once)
 
     def read_version(self, path: str) -> StoredVersion | None:
@@ -526,11 +526,11 @@ class RemoteStore:
         operation: str,
         path: str,
         call: Callable[[Any, Any], _T],
-        patience: RetrySettings | None = None,
+        retry_settings: RetrySettings | None = None,
     ) -> _T:
         """Return the result of a call of obstore, with this process's connection."""
         obs = _load_obstore()
-        key = (os.getpid(), patience or self.patience)
+        key = (os.getpid(), retry_settings or self.retry_settings)
         try:
             if key not in self._connections:
                 self._connections[key] = _open(obs, self._place, key[1])
@@ -562,12 +562,12 @@ def _mark(facts: Mapping[str, Any]) -> dict[str, str]:
     return {name: facts[name] for name in ("e_tag", "version") if facts[name] is not None}
 
 
-def _open(obs: Any, place: _Place, patience: RetrySettings) -> Any:
+def _open(obs: Any, place: _Place, retry_settings: RetrySettings) -> Any:
     """Return obstore's store of the place."""
-    backoff = {"init_backoff": timedelta(seconds=patience.first_wait_s)}
-    retry = {"max_retries": patience.retries, "backoff": backoff}
+    backoff = {"init_backoff": timedelta(seconds=retry_settings.first_wait_s)}
+    retry = {"max_retries": retry_settings.retries, "backoff": backoff}
     client_options: dict[str, Any] = {
-        "read_timeout": timedelta(seconds=patience.timeout_s),
+        "read_timeout": timedelta(seconds=retry_settings.timeout_s),
         "timeout": timedelta(days=1),  # limit of a complete download
     }
     settings: dict[str, Any] = {"client_options": client_options, "retry_config": retry}

@@ -82,10 +82,12 @@ def pack_column(pieces: Sequence[np.ndarray], *, source_name: str) -> PackedColu
     return PackedColumn(pa.chunked_array(texts, type=pa.string()), "json")
 
 
-def check_count(table: pa.Table, described: int) -> None:
+def check_count(table: pa.Table, num_described_rows: int) -> None:
     """Raise ValueError where a table has another number of rows than described."""
-    if table.num_rows != described:
-        raise ValueError(f"it has {table.num_rows} rows, its metadata describe {described}")
+    if table.num_rows != num_described_rows:
+        raise ValueError(
+            f"it has {table.num_rows} rows, its metadata describe {num_described_rows}"
+        )
 
 
 def checked_int(value: object) -> int:
@@ -159,20 +161,22 @@ def read_table(
     source: Path | bytes,
     source_name: str,
     columns: Sequence[str] | None = None,
-    without: Collection[str] = (),
+    excluded_columns: Collection[str] = (),
 ) -> pa.Table:
     """Return the table in a Parquet file of any origin, with valid columns of Arrow's own types.
 
     Args:
         source_name: Name of the file, for errors.
         columns: If given, only those of these columns that the file has.
-        without: Columns to leave out.
+        excluded_columns: Columns to leave out.
     """
     with open_parquet(source, source_name) as (content, file):
         name_counts = Counter(file.schema_arrow.names)
         if repeated_names := [name for name, count in name_counts.items() if count > 1]:
             raise OutputError(f"{source_name} has several columns {repeated_names[0]!r}; leave one")
-        column_names = [n for n in columns or name_counts if n in name_counts and n not in without]
+        column_names = [
+            n for n in columns or name_counts if n in name_counts and n not in excluded_columns
+        ]
         long_texts = check_table(content, file, column_names)
         if long_texts:
             file = pq.ParquetFile(content, read_dictionary=long_texts)

@@ -51,15 +51,16 @@ from recipes.schema import Recipe
 
 # ---- Where a job's time goes: seconds by kind of work, and the kind that bounds the job ----------
 # In every worker one thread renders and hands finished views to threads that encode and write them.
-# The rendering thread waits (is *held*) while the writing threads have too many views in hand, and
-# at the end until they have written the last ones. The busiest threads bound the job: the work of
+# The rendering thread waits for files while the writing threads have too many views in hand, and at
+# the end until they have written the last ones. The busiest threads bound the job: the work of
 # the other threads runs beside it and costs nothing.
 
-# Kinds of work of the rendering threads. `render` includes `await`: waiting for the view in flight.
+# Kinds of work of the rendering threads. `render` includes `wait_for_views`: waiting for
+# the view in flight.
 RENDER = "render"
-AWAIT = "await"
+WAIT_FOR_VIEWS = "wait_for_views"
 # Waiting for the writing threads.
-HELD = "held"
+WAIT_FOR_FILES = "wait_for_files"
 # All time of the rendering threads.
 RENDERERS = "renderers"
 # Kinds of work of the writing threads.
@@ -77,10 +78,10 @@ _WRITING_LABELS = {ENCODE: "encoding", WRITE: "writing to disk", MEASURE: "boxes
 # Labels of the work beside rendering and writing, for people.
 _OTHER_LABELS = {
     "open": "opening scenes",
-    "settle": "choosing settings",
+    "choose_settings": "choosing settings",
     "prepare": "preparing effects",
-    "labels": "reading labels",
-    "share": "handing the scene to workers",
+    "read_labels": "reading labels",
+    "share_scene": "handing the scene to workers",
     "finish": "writing manifests",
     "publish": "publishing",
 }
@@ -170,7 +171,8 @@ def compute_time_shares(
 
     Args:
         seconds: Seconds by kind of work.
-        held_up: Number of workers that wait while the job itself does other work than rendering.
+        num_waiting_workers: Number of workers that wait while the job itself does other work than
+            rendering.
     """
     workers_s = seconds.get(WORKERS, 0.0)
     writers_s = seconds.get(WRITERS, 0.0)
@@ -179,8 +181,8 @@ def compute_time_shares(
     # A worker's writing threads exist as long as the worker does, at work or not.
     writers_s *= workers_s / seconds[RENDERERS]
     rendering_share = seconds[RENDER] / workers_s
-    held_share = seconds.get(HELD, 0.0) / workers_s
-    other_share = max(0.0, 1 - rendering_share - held_share)
+    waiting_share = seconds.get(WAIT_FOR_FILES, 0.0) / workers_s
+    other_share = max(0.0, 1 - rendering_share - waiting_share)
     share_of_label = {
         label: num_waiting_workers * seconds.get(k, 0.0) / workers_s
         for k, label in _OTHER_LABELS.items()
@@ -190,8 +192,8 @@ def compute_time_shares(
     )
     return TimeShares(
         rendering=rendering_share,
-        waiting_for_views=seconds.get(AWAIT, 0.0) / workers_s,
-        waiting_for_files=held_share,
+        waiting_for_views=seconds.get(WAIT_FOR_VIEWS, 0.0) / workers_s,
+        waiting_for_files=waiting_share,
         other_work=other_share,
         beside_by=max(share_of_label, key=share_of_label.__getitem__),
         writing={
@@ -215,8 +217,8 @@ _log = logging.getLogger(__name__)
 class Renderer(Protocol):
     """Function that renders an image: `augment.views.render_view`, `begin_view`, or a stand-in.
 
-    It returns a View, or a Pending one; in the second case a job begins the next view before it
-    waits.
+    It returns a ViewResult, or a pending one; in the second case a job begins the next view before
+    it waits.
     """
 
     def __call__(self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> Any: ...
@@ -254,7 +256,7 @@ class Chunk:
     """Images of one frame under one recipe."""
 
     variant: int
-    """Position in Setup.recipes."""
+    """Position in RenderSetup.recipes."""
     frame: int
     """Frame number."""
     cameras: tuple[str, ...]
@@ -266,7 +268,7 @@ class Outcome:
     """Result of one image."""
 
     variant: int
-    """Position in Setup.recipes."""
+    """Position in RenderSetup.recipes."""
     frame: int
     """Frame number."""
     camera: str
@@ -284,7 +286,7 @@ class Outcome:
     box_weather: BoxWeather = field(default_factory=dict)
     """Measured numbers of the image's boxes."""
     shares: Mapping[str, float] = field(default_factory=dict)
-    """Shares of the image's pixels, as of Written."""
+    """Shares of the image's pixels, as of ViewFiles."""
 
 
 @dataclass(frozen=True)
@@ -404,7 +406,7 @@ class FrameRunner:
         """Wait for the oldest view in flight and queue the writing of its files."""
         rendered, pending_view = self._in_flight[0]
         try:
-            with self._times.measure(RENDER, AWAIT):
+            with self._times.measure(RENDER, WAIT_FOR_VIEWS):
                 view = pending_view.result()
         except Exception as error:
             self._in_flight.popleft()
@@ -426,7 +428,7 @@ class FrameRunner:
         finally:
             if self._views is not None:
                 self._views.close()
-            with self._times.measure(HELD):
+            with self._times.measure(WAIT_FOR_FILES):
                 self._pump.close()
         seconds = time.perf_counter() - self._start_s
         self._times.add(RENDERERS, seconds)
@@ -473,8 +475,8 @@ class FrameRunner:
         self._submit(lambda: self._deliver(outcome))
 
     def _submit(self, task: Callable[[], Any]) -> Future:
-        """Queue a task of the writing threads; the wait for a free place counts as HELD."""
-        with self._times.measure(HELD):
+        """Queue a task of the writing threads; waiting for a free place is WAIT_FOR_FILES."""
+        with self._times.measure(WAIT_FOR_FILES):
             return self._pump.submit(task)
 
     def _write(self, rendered: _RenderedView, view: ViewResult) -> None:

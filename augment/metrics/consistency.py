@@ -392,7 +392,7 @@ def _inside(boxes: Sequence[PosedBox], view: DepthView) -> np.ndarray:
 def _shown(
     boxes: Sequence[PosedBox], view: DepthView, margin_m: float = 0.0
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Yield the pixels of boxes as `shown_pixels`, with a margin on all sides."""
+    """Yield the pixels of boxes as `pixels_of_boxes`, with a margin on all sides."""
     if not boxes:
         return iter(())
     poses = torch.from_numpy(np.stack([box.world_from_box for box in boxes]))

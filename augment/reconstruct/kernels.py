@@ -59,7 +59,7 @@ def sample_sky(alpha, faces, rotation, intrinsics, min_transmittance, colors, te
     height, width = alpha.shape
     size = faces.shape[1]
     half = np.float32(0.5)
-    one = np.float32(1)
+    one_f32 = np.float32(1)
     zero = np.float32(0)
     last = np.float32(size - 1)
     scale = np.float32(size) * half
@@ -74,7 +74,7 @@ def sample_sky(alpha, faces, rotation, intrinsics, min_transmittance, colors, te
             by = rotation[1, 1] * v + rotation[1, 2]
             bz = rotation[2, 1] * v + rotation[2, 2]
             for j in range(width):
-                if one - alpha[i, j] < min_transmittance:
+                if one_f32 - alpha[i, j] < min_transmittance:
                     texels[i, j] = UNSEEN
                     for c in range(3):
                         colors[c, i, j] = zero
@@ -114,9 +114,9 @@ def sample_sky(alpha, faces, rotation, intrinsics, min_transmittance, colors, te
                 fractions[0, i, j] = fc
                 fractions[1, i, j] = fr
                 for c in range(3):
-                    top = faces[face, r0, c0, c] * (one - fc) + faces[face, r0, c1, c] * fc
-                    bottom = faces[face, r1, c0, c] * (one - fc) + faces[face, r1, c1, c] * fc
-                    colors[c, i, j] = top * (one - fr) + bottom * fr
+                    top = faces[face, r0, c0, c] * (one_f32 - fc) + faces[face, r0, c1, c] * fc
+                    bottom = faces[face, r1, c0, c] * (one_f32 - fc) + faces[face, r1, c1, c] * fc
+                    colors[c, i, j] = top * (one_f32 - fr) + bottom * fr
 
 
 @kernel
@@ -132,7 +132,7 @@ def scatter_sky(d_rgb, alpha, texels, fractions, size, parts, touched):
         touched: uint8 [PARTS, >= texels], zero before the first call.
     """
     height, width = alpha.shape
-    one = np.float32(1)
+    one_f32 = np.float32(1)
     zero = np.float32(0)
     bands = (height + BAND - 1) // BAND
     for part in prange(PARTS):
@@ -142,7 +142,7 @@ def scatter_sky(d_rgb, alpha, texels, fractions, size, parts, touched):
                     texel = texels[i, j]
                     if texel == UNSEEN:
                         continue
-                    transmittance = one - alpha[i, j]
+                    transmittance = one_f32 - alpha[i, j]
                     red = transmittance * d_rgb[i, j, 0]
                     green = transmittance * d_rgb[i, j, 1]
                     blue = transmittance * d_rgb[i, j, 2]
@@ -153,7 +153,7 @@ def scatter_sky(d_rgb, alpha, texels, fractions, size, parts, touched):
                     for corner in range(4):
                         right = corner & 1
                         below = corner >> 1
-                        weight = (fc if right else one - fc) * (fr if below else one - fr)
+                        weight = (fc if right else one_f32 - fc) * (fr if below else one_f32 - fr)
                         if weight == zero:  # also where the neighbour lies beyond the face
                             continue
                         corner_texel = texel + right + below * size
@@ -226,7 +226,7 @@ def compare_depth(expected, alpha, pixels, depth, weight, factor, min_alpha, d_e
             the
             image or the order does not increase.
     """
-    one = np.float32(1)
+    one_f32 = np.float32(1)
     zero = np.float32(0)
     for chunk in prange(sums.size):
         total = 0.0
@@ -240,8 +240,8 @@ def compare_depth(expected, alpha, pixels, depth, weight, factor, min_alpha, d_e
             expected_depth = expected[pixel]
             if not (alpha[pixel] > min_alpha and expected_depth > zero and depth[k] > zero):
                 continue
-            inverse = one / expected_depth
-            error = inverse - one / depth[k]
+            inverse = one_f32 / expected_depth
+            error = inverse - one_f32 / depth[k]
             total += weight[k] * abs(error)
             slope = factor * weight[k] * inverse * inverse
             d_expected[pixel] = -slope if error > zero else slope if error < zero else zero
@@ -260,9 +260,9 @@ def compare_depth(expected, alpha, pixels, depth, weight, factor, min_alpha, d_e
 #
 #     d/dx = G(a) + (x + y) G(2 b) + (x - y) G(2 c)
 #
-# Planes are rows of `stride` float32, a multiple of LANES. Planes that are blurred have PAD rows of
-# zeros above and below, and zeros from the image's width to the stride. Kernels return LANES sums
-# of every row, which the caller adds up in float64.
+# Planes are rows of `stride` float32, a multiple of NUM_LANES. Planes that are blurred have PAD
+# rows of zeros above and below, and zeros from the image's width to the stride. Kernels return
+# NUM_LANES sums of every row, which the caller adds up in float64.
 
 PAD = 5  # the window's radius
 MARGIN = 8  # zeros on either side of a row that is blurred, >= PAD
@@ -357,12 +357,12 @@ def _composite_row(rgb, alpha, sky, row, size, rows, out, first, plane):
         rows[stride + j] = rgb[at * Index(3) + Index(1)]
         rows[Index(2) * stride + j] = rgb[at * Index(3) + Index(2)]
         rows[Index(3) * stride + j] = alpha[at]
-    one = v8.broadcast(np.float32(1))
+    ones = v8.broadcast(np.float32(1))
     for j in range(Index(0), stride, Index(NUM_LANES)):
-        transmittance = one - v8.load(rows, Index(3) * stride + j)
+        transmittance = ones - v8.load(rows, Index(3) * stride + j)
         for c in range(Index(0), Index(3)):
-            behind = v8.load(sky, (c * height + row) * stride + j)
-            value = v8.fmuladd(transmittance, behind, v8.load(rows, c * stride + j))
+            sky_color = v8.load(sky, (c * height + row) * stride + j)
+            value = v8.fmuladd(transmittance, sky_color, v8.load(rows, c * stride + j))
             v8.store(out, first + c * plane + j, value)
 
 
@@ -397,13 +397,13 @@ def compare(rgb, alpha, sky, color_map, recorded, weight, is_sky, size, written)
         recorded: flat uint8 [H, W, 3].
         weight, is_sky: flat [H, W].
         size: height, width, stride.
-        written: five arrays that are written: `behind`, the composited colour, flat planes
+        written: five arrays that are written: `composite`, the composited colour, flat planes
             [3, H, stride]; `pairs`, six flat planes [H + 2 PAD, stride], red, green, blue of x + y,
-            then of x - y; `weights`, a flat plane [H, stride]; `sums`, flat [H, 2, LANES], of
+            then of x - y; `weights`, a flat plane [H, stride]; `sums`, flat [H, 2, NUM_LANES], of
             weight |x - y| and of weight; `covered`, float64 [H], of alpha in the sky.
     """
     # Items are read one by one: unpacking gives wrong arrays in a parallel kernel (numba 0.68).
-    behind = written[0]
+    composite = written[0]
     pairs = written[1]
     weights = written[2]
     sums = written[3]
@@ -418,7 +418,7 @@ def compare(rgb, alpha, sky, color_map, recorded, weight, is_sky, size, written)
         for i in range(band * BAND, min((band + 1) * BAND, size[0])):
             row = Index(i)
             row_start = row * stride
-            _composite_row(rgb, alpha, sky, row, size, rows, behind, row_start, height * stride)
+            _composite_row(rgb, alpha, sky, row, size, rows, composite, row_start, height * stride)
             opacity = 0.0
             for j in range(Index(0), width):
                 at = row * width + j
@@ -439,7 +439,7 @@ def compare(rgb, alpha, sky, color_map, recorded, weight, is_sky, size, written)
                 is_used = v8.greater(w, zero)
                 weight_sum = weight_sum + w
                 for c in range(Index(0), Index(3)):
-                    x = _mapped(behind, row_start + j, height * stride, color_map, c)
+                    x = _mapped(composite, row_start + j, height * stride, color_map, c)
                     y = v8.select(is_used, v8.load(rows, c * stride + j) * to_unit, x)
                     v8.store(pairs, c * plane + first + j, x + y)
                     v8.store(pairs, (Index(3) + c) * plane + first + j, x - y)
@@ -462,7 +462,7 @@ def compare_windows(pairs, weights, size, slopes, sums):
         size: height, width, stride.
         slopes: written, nine flat planes [H + 2 PAD, stride]: a, 2 b, 2 c (see above) for red, then
             green, then blue.
-        sums: written, flat [H, LANES].
+        sums: written, flat [H, NUM_LANES].
     """
     stride = Index(size[2])
     plane = Index(size[0] + 2 * PAD) * stride
@@ -472,7 +472,7 @@ def compare_windows(pairs, weights, size, slopes, sums):
         for i in range(band * BAND, min((band + 1) * BAND, size[0])):
             row = Index(i)
             half = v8.broadcast(np.float32(0.5))
-            one = v8.broadcast(np.float32(1))
+            ones = v8.broadcast(np.float32(1))
             ssim_sum = v8.broadcast(np.float32(0))
             for c in range(Index(0), Index(3)):
                 for j in range(Index(0), stride, Index(NUM_LANES)):
@@ -504,7 +504,7 @@ def compare_windows(pairs, weights, size, slopes, sums):
                         b2, v8.broadcast(C2)
                     )  # a variance; rounding may make it negative
                     w = v8.load(weights, row * stride + j)
-                    inverse = one / (b1 * b2)
+                    inverse = ones / (b1 * b2)
                     ssim = a1 * a2 * inverse
                     ssim_sum = v8.fmuladd(ssim, w, ssim_sum)
                     w = w * inverse  # the derivatives by A1, A2, B1 and B2, times the weight
@@ -528,7 +528,7 @@ def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
     plane = Index(size[0] + 2 * PAD) * stride
     length = stride + Index(2 * MARGIN)
     zero = v8.broadcast(np.float32(0))
-    one = v8.broadcast(np.float32(1))
+    ones = v8.broadcast(np.float32(1))
     for c in range(Index(0), Index(3)):
         top = Index(3) * c * plane + row * stride
         for k in range(Index(0), Index(3)):
@@ -543,15 +543,15 @@ def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
             minus = v8.load(pairs, centre + Index(3) * plane + j)
             slope = v8.fmuladd(_blur_row(work, at + length), plus, _blur_row(work, at))
             slope = v8.fmuladd(_blur_row(work, at + length + length), minus, slope)
-            sign = v8.select(v8.greater(minus, zero), one, zero)
-            sign = v8.select(v8.greater(zero, minus), v8.negate(one), sign)
+            sign = v8.select(v8.greater(minus, zero), ones, zero)
+            sign = v8.select(v8.greater(zero, minus), v8.negate(ones), sign)
             slope = v8.fmuladd(slope, v8.broadcast(factors[1]), sign * w * v8.broadcast(factors[0]))
             v8.store(rows, c * stride + j, v8.select(v8.greater(w, zero), slope, zero))
 
 
 @kernel_function()
-def _map_slopes(rows, channel, behind, row_start, plane, stride, sums, first):
-    """Write the row's derivative by one channel of the colour map, LANES sums an entry."""
+def _map_slopes(rows, channel, composite, row_start, plane, stride, sums, first):
+    """Write the row's derivative by one channel of the colour map, NUM_LANES sums an entry."""
     zero = v8.broadcast(np.float32(0))
     red = zero
     green = zero
@@ -560,9 +560,9 @@ def _map_slopes(rows, channel, behind, row_start, plane, stride, sums, first):
     for j in range(Index(0), stride, Index(NUM_LANES)):
         slope = v8.load(rows, channel * stride + j)
         at = row_start + j
-        red = v8.fmuladd(slope, v8.load(behind, at), red)
-        green = v8.fmuladd(slope, v8.load(behind, at + plane), green)
-        blue = v8.fmuladd(slope, v8.load(behind, at + plane + plane), blue)
+        red = v8.fmuladd(slope, v8.load(composite, at), red)
+        green = v8.fmuladd(slope, v8.load(composite, at + plane), green)
+        blue = v8.fmuladd(slope, v8.load(composite, at + plane + plane), blue)
         offset = offset + slope
     v8.store(sums, first, red)
     v8.store(sums, first + Index(NUM_LANES), green)
@@ -582,18 +582,18 @@ def _times_transposed(rows, at, stride, color_map, k):
 
 @kernel
 def differentiate(
-    sky, color_map, is_sky, behind, pairs, slopes, weights, size, factors, d_rgb, d_alpha, sums
+    sky, color_map, is_sky, composite, pairs, slopes, weights, size, factors, d_rgb, d_alpha, sums
 ):
     """Compute the loss's derivatives by rgb, alpha and the colour map.
 
     Args:
         sky, color_map, is_sky, size: as in `compare`.
-        behind, pairs, weights: from `compare`.
+        composite, pairs, weights: from `compare`.
         slopes: from `compare_windows`.
         factors: float32, of the L1 loss and of SSIM per unit of weight, and of alpha in the sky.
         d_rgb: written, flat [H, W, 3].
         d_alpha: written, flat [H, W].
-        sums: written, flat [H, 3, 4, LANES], the row's part of the colour map's derivative.
+        sums: written, flat [H, 3, 4, NUM_LANES], the row's part of the colour map's derivative.
     """
     height = Index(size[0])
     width = Index(size[1])
@@ -609,7 +609,7 @@ def differentiate(
             _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows)
             for c in range(Index(0), Index(3)):
                 first = (row * Index(3) + c) * Index(4 * NUM_LANES)
-                _map_slopes(rows, c, behind, row_start, plane, stride, sums, first)
+                _map_slopes(rows, c, composite, row_start, plane, stride, sums, first)
             for j in range(Index(0), stride, Index(NUM_LANES)):
                 negative_d_alpha = v8.broadcast(np.float32(0))
                 for k in range(Index(0), Index(3)):
@@ -744,8 +744,8 @@ def update_sightings(means, pose, intrinsics, sky, px_per_m, num_views, num_in_s
 # Columns of the geometry's moments, two registers: means 3, quats 4, one unused, logarithms of
 # scales 3, logit of opacity 1, four unused.
 GEOMETRY = 16
-# Numbers of an update, float32: step sizes of a row's first 16 columns as GRAD lists them (negative
-# for opacity, whose odds are divided), of the SH, and the rest.
+# Numbers of an update, float32: step sizes of a row's first 16 columns as NUM_GRADIENTS lists them
+# (negative for opacity, whose odds are divided), of the SH, and the rest.
 R_ROW = 0  # step sizes of a row's first 16 columns
 R_SH_DC = 16  # step size of the SH of degree 0
 R_SH_REST = 17  # step size of the other SH
@@ -768,7 +768,7 @@ _SH_NUMBERS = 48  # numbers of a splat's SH; the work space holds gradients, mom
 
 
 def bias_corrections(beta1: float, beta2: float) -> np.ndarray:
-    """Return the moments' factors after each number of updates, float32 [CORRECTED + 1, 2]."""
+    """Return the moments' factors after 0 to MAX_CORRECTED_UPDATES updates, float32 [., 2]."""
     n = np.arange(MAX_CORRECTED_UPDATES + 1, dtype=np.float64)[:, None]
     n[0] = 1  # never read: a splat is updated before it is corrected
     return (1 / (1 - np.array([beta1, beta2]) ** n)).astype(np.float32)
@@ -777,7 +777,7 @@ def bias_corrections(beta1: float, beta2: float) -> np.ndarray:
 class GradientRows(NamedTuple):
     """The output of project_backward, flat."""
 
-    rows: np.ndarray  # float32, GRAD numbers for each splat
+    rows: np.ndarray  # float32, NUM_GRADIENTS numbers for each splat
     ids: np.ndarray  # int32, the splat of each row in its part
     counts: np.ndarray  # int64, rows of each block
 
@@ -791,12 +791,12 @@ class AdamState(NamedTuple):
     sh_v: np.ndarray
     age: np.ndarray
     grads: np.ndarray
-    smallest: np.ndarray
+    min_scale_m: np.ndarray
 
 
 @kernel
 def update_splats(
-    addresses, sizes, views, blocks, firsts, gradients, functions, rates, corrections, state
+    addresses, sizes, views, blocks, firsts, gradients, num_functions, rates, corrections, state
 ):
     """Apply one step of Adam to every row of gradients; splats with rows that are not finite stay.
 
@@ -806,8 +806,8 @@ def update_splats(
         addresses, sizes, views, blocks: as in project.
         firsts: int64 [P], index of each part's first splat in the arrays of moments.
         gradients: GradientRows.
-        functions: number of SH functions that are learnt now.
-        rates: float32 [RATES].
+        num_functions: number of SH functions that are learnt now.
+        rates: float32 [NUM_RATES].
         corrections: from `bias_corrections`, flat.
         state: AdamState.
     """
@@ -816,7 +816,7 @@ def update_splats(
     counts = gradients.counts
     age = state.age
     grads = state.grads
-    smallest = state.smallest
+    min_scales_m = state.min_scale_m
     for block in prange(blocks.shape[0]):
         part = blocks[block, 0]
         num_splats, num_sh = sizes[part]
@@ -830,7 +830,9 @@ def update_splats(
         work = np.zeros(4 * _SH_NUMBERS, np.float32)
         base = Index(block * BLOCK_SIZE)
         for at in range(Index(0), Index(counts[block]), Index(NUM_LANES)):
-            _write_bases(means, ids, base + at, Index(counts[block]) - at, view, functions, basis)
+            _write_bases(
+                means, ids, base + at, Index(counts[block]) - at, view, num_functions, basis
+            )
             for lane in range(min(Index(NUM_LANES), Index(counts[block]) - at)):
                 row = (base + at + lane) * Index(NUM_GRADIENTS)
                 splat = Index(ids[base + at + lane])
@@ -849,14 +851,14 @@ def update_splats(
                 second = corrections[Index(2) * n + Index(1)]
                 _update_geometry(
                     (means, quats, scales, opacities), splat, rows, row,
-                    basis[Index(_MAX_SH * NUM_LANES) + lane], rates, smallest[moment_row], (first,
-                    second),
+                    basis[Index(_MAX_SH * NUM_LANES) + lane], rates, min_scales_m[moment_row],
+                    (first, second),
                     (state.geometry_m, state.geometry_v), moment_row * Index(GEOMETRY), work,
                 )  # fmt: skip
                 _update_sh(
-                    sh, splat * Index(num_sh) * Index(3), rows, row, basis, lane, Index(functions),
-                    rates, (first, second), (state.sh_m, state.sh_v), moment_row * Index(num_sh) *
-                    Index(3), work,
+                    sh, splat * Index(num_sh) * Index(3), rows, row, basis, lane,
+                    Index(num_functions), rates, (first, second), (state.sh_m, state.sh_v),
+                    moment_row * Index(num_sh) * Index(3), work,
                 )  # fmt: skip
 
 
@@ -870,14 +872,14 @@ def _row_power(rows, row):
 
 
 @kernel_function()
-def _write_bases(means, ids, at, left, view, functions, basis):
+def _write_bases(means, ids, at, num_remaining, view, num_functions, basis):
     """Write SH functions of eight splats, and a pixel's width at each of them, metres."""
     lane_ids = np.empty(NUM_LANES, np.int32)
     for lane in range(Index(NUM_LANES)):
-        lane_ids[lane] = ids[at + min(lane, left - Index(1))]
+        lane_ids[lane] = ids[at + min(lane, num_remaining - Index(1))]
     dx, dy, dz = offsets_from_eye(means, lane_ids, Index(0), view)
     inverse = v8.broadcast(np.float32(1)) / v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
-    write_basis(dx * inverse, dy * inverse, dz * inverse, functions, basis)
+    write_basis(dx * inverse, dy * inverse, dz * inverse, num_functions, basis)
     row = Index(L.V_ROTATION + 6)
     z = v8.fmuladd(v8.broadcast(view[row]), dx, v8.broadcast(view[row + Index(1)]) * dy)
     z = v8.fmuladd(v8.broadcast(view[row + Index(2)]), dz, z)
@@ -887,11 +889,11 @@ def _write_bases(means, ids, at, left, view, functions, basis):
 @kernel_function()
 def _adam8(g, rates, first, second, m, m_at, v, v_at):
     """Update eight moments; return the factor of the step size."""
-    one = np.float32(1)
+    one_f32 = np.float32(1)
     beta1 = rates[R_BETA1]
     beta2 = rates[R_BETA2]
-    new_m = v8.fmuladd(v8.broadcast(beta1), v8.load(m, m_at), v8.broadcast(one - beta1) * g)
-    new_v = v8.fmuladd(v8.broadcast(beta2), v8.load(v, v_at), v8.broadcast(one - beta2) * g * g)
+    new_m = v8.fmuladd(v8.broadcast(beta1), v8.load(m, m_at), v8.broadcast(one_f32 - beta1) * g)
+    new_v = v8.fmuladd(v8.broadcast(beta2), v8.load(v, v_at), v8.broadcast(one_f32 - beta2) * g * g)
     v8.store(m, m_at, new_m)
     v8.store(v, v_at, new_v)
     root = v8.sqrt(new_v * v8.broadcast(second)) + v8.broadcast(_EPS)
@@ -899,14 +901,16 @@ def _adam8(g, rates, first, second, m, m_at, v, v_at):
 
 
 @kernel_function()
-def _update_geometry(splats, splat, rows, row, pixel_m, rates, smallest, bias, moments, at, work):
+def _update_geometry(
+    splats, splat, rows, row, pixel_m, rates, min_scale_m, bias, moments, at, work
+):
     """Update a splat's mean, rotation, scales and opacity."""
     means, quats, scales, opacities = splats
     (first, second) = bias
     (m, v) = moments
-    one = np.float32(1)
+    one_f32 = np.float32(1)
     o = min(max(opacities[splat], _MIN_OPACITY), _MAX_OPACITY)
-    rows[row + Index(G_OPACITY)] *= one - o
+    rows[row + Index(G_OPACITY)] *= one_f32 - o
     low = _adam8(v8.load(rows, row), rates, first, second, m, at, v, at)
     v8.store(work, Index(0), low * v8.load(rates, Index(R_ROW)))
     high = _adam8(
@@ -916,33 +920,33 @@ def _update_geometry(splats, splat, rows, row, pixel_m, rates, smallest, bias, m
     v8.store(work, Index(8), factors)
     for i in range(Index(3)):
         means[Index(3) * splat + i] -= pixel_m * work[i]
-    min_scale = max(smallest, rates[R_SMALLEST])
+    min_scale = max(min_scale_m, rates[R_SMALLEST])
     norm = np.float32(0)
     for i in range(Index(4)):
         q = quats[Index(4) * splat + i] - work[Index(G_QUAT) + i]
         quats[Index(4) * splat + i] = q
         norm += q * q
-    norm = one / np.float32(math.sqrt(norm))
+    norm = one_f32 / np.float32(math.sqrt(norm))
     for i in range(Index(4)):
         quats[Index(4) * splat + i] *= norm
     for i in range(Index(3)):
         s = scales[Index(3) * splat + i] * work[Index(G_SCALE) + i]
         scales[Index(3) * splat + i] = min(max(s, min_scale), rates[R_LARGEST])
-    odds = (one - o) / o * work[Index(G_OPACITY)]
-    opacities[splat] = min(max(one / (one + odds), _MIN_OPACITY), _MAX_OPACITY)
+    odds = (one_f32 - o) / o * work[Index(G_OPACITY)]
+    opacities[splat] = min(max(one_f32 / (one_f32 + odds), _MIN_OPACITY), _MAX_OPACITY)
 
 
 @kernel_function()
-def _update_sh(sh, start, rows, row, basis, lane, functions, rates, bias, moments, at, work):
+def _update_sh(sh, start, rows, row, basis, lane, num_functions, rates, bias, moments, at, work):
     """Update a splat's colours."""
     (first, second) = bias
     (m, v) = moments
     red = rows[row + Index(G_COLOR)]
     green = rows[row + Index(G_COLOR + 1)]
     blue = rows[row + Index(G_COLOR + 2)]
-    count = Index(3) * functions
+    count = Index(3) * num_functions
     # The moments are copied: eight at a time would reach into the next splat's moments.
-    for k in range(functions):
+    for k in range(num_functions):
         value = basis[k * Index(NUM_LANES) + lane]
         work[Index(3) * k] = value * red
         work[Index(3) * k + Index(1)] = value * green
@@ -985,7 +989,7 @@ def update_rows(values, m, v, age, rows, grads, rate, betas, corrections):
         corrections: as for `update_splats`.
     """
     for run in prange((rows.size + _ROWS_AT_ONCE - 1) // _ROWS_AT_ONCE):
-        one = np.float32(1)
+        one_f32 = np.float32(1)
         for i in range(
             Index(run * _ROWS_AT_ONCE), Index(min((run + 1) * _ROWS_AT_ONCE, rows.size))
         ):
@@ -997,7 +1001,9 @@ def update_rows(values, m, v, age, rows, grads, rate, betas, corrections):
             for channel in range(Index(3)):
                 at = Index(3) * row + channel
                 g = grads[i, channel]
-                m[at] = betas[0] * m[at] + (one - betas[0]) * g
-                v[at] = betas[1] * v[at] + (one - betas[1]) * g * g
+                m[at] = betas[0] * m[at] + (one_f32 - betas[0]) * g
+                v[at] = betas[1] * v[at] + (one_f32 - betas[1]) * g * g
                 root = np.float32(math.sqrt(v[at] * second)) + _EPS
-                values[at] = min(max(values[at] - rate * first * m[at] / root, np.float32(0)), one)
+                values[at] = min(
+                    max(values[at] - rate * first * m[at] / root, np.float32(0)), one_f32
+                )

@@ -64,7 +64,7 @@ class ImageBuffers:
         self.alpha_in_sky = np.empty(height)
         self.ssim_sums = np.empty((height, lanes), np.float32)
         self.map_sums = np.empty((height, 3, 4, lanes), np.float32)
-        self.behind = np.empty(3 * height * stride, np.float32)
+        self.composite = np.empty(3 * height * stride, np.float32)
         self.d_rgb = np.empty((height, width, 3), np.float32)
         self.d_alpha = np.empty((height, width), np.float32)
         self.d_expected_depth = np.empty((height, width), np.float32)
@@ -237,7 +237,7 @@ def _compare(
     weight_plane = buffers.weights
     kernels.compare(
         rgb.reshape(-1), alpha.reshape(-1), sky, flat_map, recorded, weight, is_sky, size,
-        (buffers.behind, pairs, weight_plane, buffers.sums.reshape(-1), buffers.alpha_in_sky),
+        (buffers.composite, pairs, weight_plane, buffers.sums.reshape(-1), buffers.alpha_in_sky),
     )  # fmt: skip
     error_sum, weight_sum = buffers.sums.sum(axis=(0, 2), dtype=np.float64).tolist()
     alpha_in_sky = float(buffers.alpha_in_sky.sum())
@@ -251,7 +251,7 @@ def _compare(
     value_weight = 1 / num_values if num_values > 0 else 0.0
     factors = ((1 - weights.d_ssim) * value_weight, ssim_factor, weights.sky / num_pixels)
     kernels.differentiate(
-        sky, flat_map, is_sky, buffers.behind, pairs, slopes, weight_plane, size,
+        sky, flat_map, is_sky, buffers.composite, pairs, slopes, weight_plane, size,
         np.array(factors, np.float32), buffers.d_rgb.reshape(-1), buffers.d_alpha.reshape(-1),
         buffers.map_sums.reshape(-1),
     )  # fmt: skip

@@ -377,7 +377,7 @@ class Sightings:
 
 
 def bound_sizes(splats: Splats) -> None:
-    """Make no scale smaller than `smallest`, in place.
+    """Make no scale smaller than `min_scale_m`, in place.
 
     Mip-Splatting adds the filter to the learnt size and dims the splat by the ratio of volumes.
     Here the filtered size itself is learnt, bounded from below. The sizes are the same, but flat
@@ -396,7 +396,7 @@ _MIN_SCALE_M = 1e-3  # metres; no scale gets smaller
 
 
 def splat_rates(rates: LearningRates, done: float, camera: Camera, extent_m: float) -> np.ndarray:
-    """Return the numbers of an update, float32 [RATES].
+    """Return the numbers of an update, float32 [NUM_RATES].
 
     Means decay exponentially over the run; the others fall exponentially to rates.late of their
     value.

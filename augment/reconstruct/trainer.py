@@ -484,7 +484,7 @@ class GsplatRenderer:
         Args:
             inputs: the view's inputs.
             positions: int64 [T], increasing positions in all parts one after another.
-            rows: float32 [T, GRAD], gradients of these splats.
+            rows: float32 [T, NUM_GRADIENTS], gradients of these splats.
         """
         counts = inputs.sizes[:, 0]
         part_ends = np.cumsum(counts)
@@ -546,7 +546,7 @@ class GsplatTape:
             )
 
     def _rows(self, ids: Tensor, order: Tensor) -> Tensor:
-        """Return gradient rows [M, GRAD] of the rendered splats.
+        """Return gradient rows [M, NUM_GRADIENTS] of the rendered splats.
 
         Their columns are those of augment.render.cpu.backward_kernels.
         """

@@ -90,7 +90,7 @@ def signatures_in_use() -> set[str]:
 def compile_ahead(module_prefixes: Iterable[str]) -> Iterator[None]:
     """Let other processes compile kernels meanwhile: one for each thread of this process but one.
 
-    parts: prefixes of the names of the modules whose kernels are compiled.
+    module_prefixes: prefixes of the names of the modules whose kernels are compiled.
     """
     spawn = multiprocessing.get_context("spawn")
     arguments = (tuple(module_prefixes),)

@@ -70,16 +70,16 @@ def _airlight(fog: Fog) -> Sky:
 
 
 @functools.lru_cache(maxsize=16)
-def _gains(overcast: float) -> np.ndarray:
+def _gains(elevation_gain: float) -> np.ndarray:
     """Return coefficients c of the varying airlight's growth with the slope, float32 [NUM_GAINS].
 
     At a slope s >= 0 the varying airlight is multiplied by 1 + s (c0 + c1 s + ...). The
-    coefficients are zeros without overcast.
+    coefficients are zeros if elevation_gain is 0.
     """
 
     def per_slope(slopes: np.ndarray) -> np.ndarray:
         """Return the growth of the airlight at slopes, over the slope."""
-        fog = Fog(0.0, (1.0, 1.0, 1.0), elevation_gain=overcast)
+        fog = Fog(0.0, (1.0, 1.0, 1.0), elevation_gain=elevation_gain)
         return airlight_gain(fog, torch.from_numpy(slopes))[:, 0].numpy() / slopes
 
     series = Chebyshev.interpolate(per_slope, NUM_GAINS - 1, [0, 1]).convert(kind=Polynomial)
@@ -113,7 +113,7 @@ def add_airlight_elevation(
         raster: render with colour, alpha and expected depth; on the CPU its colour is overwritten.
         camera: camera of the render.
         fog: fog of the render.
-        behind: if True, the endless fog behind the surfaces is added, too.
+        has_fog_behind: if True, the endless fog behind the surfaces is added, too.
         backend: as in `map_colors`.
     """
     rgb = raster.rgb

@@ -218,7 +218,7 @@ def _place_eight(x, y, z, scale, side, places, start):
         x, y, z: the directions, of any length.
         scale: half a face, texels.
         side: a face with its border, texels.
-        texel_places: the rows, flat.
+        places: the rows, flat.
         start: position in each row.
     """
     zeros = v8.broadcast(np.float32(0))
@@ -341,13 +341,13 @@ def _fence(typingctx):
 
 
 @kernel_function()
-def _map_splats(source, source_start, work, target_start, count, functions, folded):
+def _map_splats(source, source_start, work, target_start, count, num_functions, folded):
     """Map `count` splats by one map, from source[source_start:] to work[target_start:].
 
     A splat of degree 0 whose colour is below 0 is mapped as the black that it shows (see `map_sh`
     of augment.effects.style.color_maps).
     """
-    min_value = BLACK_SH_00 if functions == Index(1) else np.float32(-np.inf)
+    min_value = BLACK_SH_00 if num_functions == Index(1) else np.float32(-np.inf)
     a0 = folded[0]
     a1 = folded[1]
     a2 = folded[2]
@@ -357,7 +357,7 @@ def _map_splats(source, source_start, work, target_start, count, functions, fold
     c0 = folded[6]
     c1 = folded[7]
     c2 = folded[8]
-    for i in range(count * functions):
+    for i in range(count * num_functions):
         j = source_start + Index(3) * i
         k = target_start + Index(3) * i
         red = max(source[j], min_value)
@@ -366,16 +366,16 @@ def _map_splats(source, source_start, work, target_start, count, functions, fold
         work[k] = a0 * red + a1 * green + a2 * blue
         work[k + Index(1)] = b0 * red + b1 * green + b2 * blue
         work[k + Index(2)] = c0 * red + c1 * green + c2 * blue
-    row = Index(3) * functions
+    row = Index(3) * num_functions
     for splat in range(count):
         for channel in range(Index(3)):
             work[target_start + splat * row + channel] += folded[Index(9) + channel]
 
 
 @kernel_function()
-def _map_run(source, first, end, work, functions, classes, folded):
+def _map_run(source, first, end, work, num_functions, classes, folded):
     """Map the splats `first` to `end` into work, neighbours of one class together."""
-    row = Index(3) * functions
+    row = Index(3) * num_functions
     splat = first
     while splat < end:
         class_end = end
@@ -393,7 +393,7 @@ def _map_run(source, first, end, work, functions, classes, folded):
                 work,
                 target_start,
                 class_end - splat,
-                functions,
+                num_functions,
                 folded[map_index],
             )
         else:
@@ -403,25 +403,25 @@ def _map_run(source, first, end, work, functions, classes, folded):
 
 
 @kernel
-def apply_color_maps(source, target, functions, classes, folded):
+def apply_color_maps(source, target, num_functions, classes, folded):
     """Write target = source with every splat's functions mapped.
 
     Args:
         source: float32 [N * K * 3]; it may be the target.
-        target: float32 [N * K * 3], aligned to ALIGNMENT bytes.
-        functions: K, SH functions of a splat.
+        target: float32 [N * K * 3], aligned to ALIGNMENT_BYTES bytes.
+        num_functions: K, SH functions of a splat.
         classes: int16 [N], rows of folded; or [0] if all splats take the first.
-        folded: float32 [C, FOLDED]. A last number of 0 says that the map changes nothing; then the
-            splat's bits are copied.
+        folded: float32 [C, NUM_FOLDED]. A last number of 0 says that the map changes nothing; then
+            the splat's bits are copied.
     """
-    row = Index(3 * functions)
-    count = source.size // (3 * functions)
+    row = Index(3 * num_functions)
+    count = source.size // (3 * num_functions)
     for block in prange((count + SPLATS - 1) // SPLATS):
-        work = np.empty(SPLAT_RUN * 3 * functions, np.float32)
+        work = np.empty(SPLAT_RUN * 3 * num_functions, np.float32)
         end = Index(min((block + 1) * SPLATS, count))
         for first in range(Index(block * SPLATS), end, Index(SPLAT_RUN)):
             last = min(first + Index(SPLAT_RUN), end)
-            _map_run(source, first, last, work, Index(functions), classes, folded)
+            _map_run(source, first, last, work, Index(num_functions), classes, folded)
             size = (last - first) * row
             vector_end = size - size % Index(NUM_LANES)
             for i in range(Index(0), vector_end, Index(NUM_LANES)):

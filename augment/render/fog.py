@@ -47,12 +47,12 @@ class Fog:
     """Fog in a scene.
 
     extinction_per_m: extinction at height base_z_m, 1/m.
-    rgb: airlight at the horizon, display-encoded. The rasterisers draw this colour;
-        `composite.add_elevation` adds the dependence on elevation to their images.
+    airlight_rgb: airlight at the horizon, display-encoded. The rasterisers draw this colour;
+        `composite.add_airlight_elevation` adds the dependence on elevation to their images.
     scale_height_m: height over which the fog thins by a factor e, metres; None for uniform fog.
     base_z_m: height of the base, metres, scene world.
-    overcast: k / 2 of the module's equation; 0 for the same airlight in all directions.
-    varying_rgb: the share of `rgb` that g multiplies; None for all of it.
+    elevation_gain: k / 2 of the module's equation; 0 for the same airlight in all directions.
+    varying_airlight_rgb: the share of `airlight_rgb` that g multiplies; None for all of it.
     """
 
     extinction_per_m: float

@@ -125,9 +125,9 @@ def render_with_gsplat(
         camera: a pinhole camera.
         settings: thresholds of the image; they must be those that gsplat is compiled with.
         with_depth: if True, expected depth is rendered, too.
-        functions: number of SH functions; None for the number that the settings say.
-        keep_color_slopes: if True, colors.grad holds the colours' gradients after backward, even if
-            sh requires none.
+        num_sh_functions: number of SH functions; None for the number that the settings say.
+        keeps_color_gradients: if True, colors.grad holds the colours' gradients after backward,
+            even if sh requires none.
 
     Raises:
         BackendUnavailable: gsplat is not installed, or cannot be used.
@@ -183,7 +183,7 @@ def _gsplat_inputs(
     part: PosedGaussians,
     camera: Camera,
     settings: RasterSettings,
-    functions: int | None,
+    num_sh_functions: int | None,
     device: torch.device,
 ) -> tuple[Tensor, ...]:
     """Return means, quats, scales, opacities and colours of a part, as gsplat takes them.
@@ -200,7 +200,10 @@ def _gsplat_inputs(
     coarse_eye = eye.astype(np.float32)
     offsets = means - torch.from_numpy(coarse_eye).to(device)
     offsets = offsets - torch.from_numpy((eye - coarse_eye).astype(np.float32)).to(device)
-    degree = math.isqrt(sh.shape[1] if functions is None else min(functions, sh.shape[1])) - 1
+    degree = (
+        math.isqrt(sh.shape[1] if num_sh_functions is None else min(num_sh_functions, sh.shape[1]))
+        - 1
+    )
     if settings.sh_degree is not None:
         degree = min(degree, settings.sh_degree)
     colors = gsplat.spherical_harmonics(degree, offsets, sh) + 0.5

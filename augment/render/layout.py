@@ -1,7 +1,7 @@
 """Layout of the arrays that kernels hand to each other, on the CPU and, where noted, on the GPU.
 
 All arrays are flat. The CPU kernels index them with unsigned integers, which lets the compiler keep
-loops simple. `part_views` fills the arrays of a view; `cpu.driver` and `cuda.splats` allocate the
+loops simple. `view_numbers` fills the arrays of a view; `cpu.driver` and `cuda.splats` allocate the
 rest. The module also holds `HeightClip`, the plane at which splats are cut, and its derivation.
 """
 
@@ -59,11 +59,11 @@ class HeightClip:
     """Side of the plane up . x = z_m (world) that is drawn.
 
     z_m: height of the plane along `up`, metres.
-    keep: the side that is drawn, "above" or "below".
-    reach_m: distance from the plane, metres, beyond which splats may be left out because the
+    kept_side: the side that is drawn, "above" or "below".
+    max_distance_m: distance from the plane, metres, beyond which splats may be left out because the
         caller cannot see them. Splats count with their whole extent.
-    overlaps: if True, one more pixel of the edge is kept. This is for a layer that is seen behind
-        the edge of another layer, so that nothing shows between them.
+    has_overlap: if True, one more pixel of the edge is kept. This is for a layer that is seen
+        behind the edge of another layer, so that nothing shows between them.
     up: unit vector, world.
     """
 
@@ -76,11 +76,13 @@ class HeightClip:
     def __post_init__(self) -> None:
         if self.kept_side not in SIGNS or not math.isfinite(self.z_m):
             raise ValueError(
-                f"a clip keeps 'above' or 'below' a finite height; "
+                f"kept_side of a clip must be 'above' or 'below' and z_m finite; "
                 f"got {self.kept_side!r}, z_m = {self.z_m}"
             )
         if not self.max_distance_m >= 0:
-            raise ValueError(f"a clip's reach_m must be >= 0 metres; got {self.max_distance_m}")
+            raise ValueError(
+                f"a clip's max_distance_m must be >= 0 metres; got {self.max_distance_m}"
+            )
 
     @property
     def sign(self) -> float:

@@ -132,7 +132,7 @@ def add_weighted(base, rgb, weight, out):
 
 @kernel
 def compute_transmittance(alpha, depth, lens, fall, fog_numbers, road, out):
-    """Write the transmittance of a photo's pixels: `transmittance` of augment.base_photo.
+    """Write the transmittance of a photo's pixels: `Photo.transmittance` of augment.base_photo.
 
     Args:
         alpha: alpha of the surfaces, [H, W].

@@ -33,7 +33,7 @@ def decay(y):
 
 
 @kernel
-def add_elevation(rgb, alpha, depth, u, v, rise, fog_numbers, gains, varying, behind):
+def add_elevation(rgb, alpha, depth, u, v, rise, fog_numbers, gains, varying, airlight_behind):
     """Add to rgb the airlight that elevation adds: rgb += alpha (1 - t) gain varying, in place.
 
     With endless fog behind, (1 - alpha) (behind + gain varying) is added, too. All arrays are
@@ -50,7 +50,7 @@ def add_elevation(rgb, alpha, depth, u, v, rise, fog_numbers, gains, varying, be
             1 / scale height (0 for uniform fog).
         gains: as in airlight_gain.
         varying: the share of the airlight that varies with elevation, [3].
-        behind: airlight [3], or empty.
+        airlight_behind: airlight [3], or empty.
     """
     extinction_per_m = fog_numbers[0]
     eye_scale_heights = fog_numbers[1]
@@ -58,7 +58,7 @@ def add_elevation(rgb, alpha, depth, u, v, rise, fog_numbers, gains, varying, be
     one_f32 = np.float32(1)
     max_exponent = np.float32(MAX_EXPONENT)
     width = alpha.shape[1]
-    has_background = np.float32(behind.size > 0)
+    has_background = np.float32(airlight_behind.size > 0)
     for i in prange(alpha.shape[0]):
         share = np.empty(width, np.float32)
         row_length_squared = one_f32 + v[i] * v[i]
@@ -78,7 +78,7 @@ def add_elevation(rgb, alpha, depth, u, v, rise, fog_numbers, gains, varying, be
             for c in range(Index(3)):
                 rgb[i, j, c] += share[j] * varying[c]
                 if has_background > 0:
-                    rgb[i, j, c] += (one_f32 - alpha[i, j]) * behind[c]
+                    rgb[i, j, c] += (one_f32 - alpha[i, j]) * airlight_behind[c]
 
 
 @kernel

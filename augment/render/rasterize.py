@@ -142,7 +142,9 @@ def rasterize(
     chosen_backend = _choose_backend(image, backend)
     if settings.lod_px > 0 and not _needs_gradients(parts):
         level_settings = cut_in_fog(settings, fog, clip, image.buffers)
-        levels = choose_parts(parts, camera, level_settings, fog, clip, whole=chosen_backend == CPU)
+        levels = choose_parts(
+            parts, camera, level_settings, fog, clip, takes_whole_levels=chosen_backend == CPU
+        )
         return levels.restore_ids(_render(image._replace(parts=levels.parts), chosen_backend))
     return _render(image, chosen_backend)
 

@@ -86,7 +86,7 @@ def scatter_forward(
         alpha: alpha of the surfaces; the rest of a pixel is sky, at its own optical depth.
         depth: z of the surfaces, metres; 0 where there is no surface.
         camera: camera of the image.
-        medium: the fog.
+        fog: the fog.
         strength: factor of tau, > 0; 1 for the whole diffraction of a droplet.
         backend: on the CPU, pixels go through kernels, equal to this definition within 1e-4.
     """

@@ -76,7 +76,7 @@ def add_noise(
 
     Args:
         rgb: the image; it is overwritten if it lies on the CPU.
-        noise: sigma at mid grey, relative to the display's range; > 0.
+        mid_grey_sigma: sigma at mid grey, relative to the display's range; > 0.
         camera: camera of the image.
         seed: seed of the recipe.
         scene: name of the scene.
@@ -131,7 +131,7 @@ def noise_variance(
     rgb: Float[np.ndarray, "K 3"],
     down: Float[np.ndarray, " K"],
     across: Float[np.ndarray, " K"],
-    noise: float,
+    mid_grey_sigma: float,
 ) -> Float[np.ndarray, " K"]:
     """Return the variance of `add_noise` in colours that are sampled bilinearly, the mean over
     channels.
@@ -142,7 +142,7 @@ def noise_variance(
         rgb: colours, display-encoded.
         down: vertical position between two pixel centres, 0 to 1.
         across: horizontal position between two pixel centres, 0 to 1.
-        noise: sigma at mid grey, as in `add_noise`.
+        mid_grey_sigma: sigma at mid grey, as in `add_noise`.
     """
     row_weights = np.stack([1 - down, down])
     column_weights = np.stack([1 - across, across])
@@ -156,7 +156,7 @@ def noise_variance(
         for j in (-1, 0, 1)
     )
     levels = np.rint(rgb.clip(0, 1) * 255).astype(np.uint8)
-    return ((noise * noise_sigmas()[levels]) ** 2 * variance_share).mean(1)
+    return ((mid_grey_sigma * noise_sigmas()[levels]) ** 2 * variance_share).mean(1)
 
 
 @functools.cache

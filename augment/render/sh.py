@@ -85,9 +85,9 @@ def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Flo
     band.
     """
     degree = math.isqrt(sh.shape[1]) - 1
-    turn = sh_rotation(rotation, degree).to(sh.dtype)
+    matrix = sh_rotation(rotation, degree).to(sh.dtype)
     bands = [slice(band * band, (band + 1) ** 2) for band in range(degree + 1)]
-    return torch.cat([torch.einsum("ij,njc->nic", turn[b, b], sh[:, b]) for b in bands], 1)
+    return torch.cat([torch.einsum("ij,njc->nic", matrix[b, b], sh[:, b]) for b in bands], 1)
 
 
 def sh_rotation(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "K K"]:
@@ -101,11 +101,11 @@ def sh_rotation(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "K
     turned_basis = sh_basis(
         directions @ rotation.to(torch.float64), degree
     ).numpy()  # at rows R^T d
-    turn = np.zeros((turned_basis.shape[1], turned_basis.shape[1]))
+    matrix = np.zeros((turned_basis.shape[1], turned_basis.shape[1]))
     for band, inverse in enumerate(inverses):
         block = slice(band * band, (band + 1) ** 2)
-        turn[block, block] = inverse @ turned_basis[:, block]
-    return torch.from_numpy(turn)
+        matrix[block, block] = inverse @ turned_basis[:, block]
+    return torch.from_numpy(matrix)
 
 
 @functools.lru_cache(maxsize=MAX_DEGREE + 1)

@@ -52,7 +52,7 @@ def shading_lines(
 
     Args:
         normals: unit normals, camera axes.
-        towards: vectors from the eye to the splats, camera axes, of any length.
+        view_directions: vectors from the eye to the splats, camera axes, of any length.
         slopes: change of the colour with the share of the light.
         sun: unit vector towards the light, camera axes.
         wrap: wrap of the light around the dome.
@@ -87,7 +87,7 @@ def light_share(
         lines: shading numbers of the splats.
         dx: columns from the splats' means, pixels.
         dy: rows from the splats' means, pixels.
-        rim: D^2 of the module's equation, 0 to 1.
+        rim_share: D^2 of the module's equation, 0 to 1.
         camera: the camera.
     """
     facing, gx, gy, wrap, ax, ay = lines[:, :6].T[..., None]

@@ -1,7 +1,6 @@
 """Add an effect of your own: colours turn to sepia with distance.
 
-Run it with: python docs/examples/own_effect.py [OUTPUT_FOLDER]
-docs/effects.md ("Adding an effect") lists the other hooks: masks, label tables, LiDAR.
+Run it with: python docs/examples/own_effect.py [OUTPUT_FOLDER]; docs/effects.md lists all hooks.
 """
 
 import sys
@@ -31,20 +30,22 @@ class Sepia(EffectModel):  # the recipe section weather.sepia
 class SepiaEffect(Effect):
     """Fades colours: out = t rgb + (1 - t) sepia, t = 2^(-depth / half_m)."""
 
-    name, section, model = "sepia", "weather.sepia", Sepia
+    name = "sepia"
+    section = "weather.sepia"
+    model = Sepia
 
     def plan_in_scene(self, recipe, scene, later_plans):  # once per recipe and scene
         sepia = self.section_of(recipe)  # None where the recipe has no such section
         step = Step("sepia", sepia is not None, "the recipe says so", PICTURE)
         return EffectPlan(sepia, (step,), buffers=frozenset({EXPECTED_DEPTH} if sepia else ()))
 
-    def edit_image(self, own, drawn, camera):  # once per view
-        is_sky = drawn.raster.alpha < 0.5  # infinitely far
-        depth = drawn.raster.expected_depth.masked_fill(is_sky, float("inf"))  # metres [H, W]
-        t = (-depth / own.data.half_m).exp2()[..., None]
-        rgb = drawn.rgb  # display-encoded [H, W, 3]
+    def edit_image(self, effect, view, camera):  # once per view
+        is_sky = view.raster.alpha < 0.5  # infinitely far
+        depth = view.raster.expected_depth.masked_fill(is_sky, float("inf"))  # metres [H, W]
+        t = (-depth / effect.settings.half_m).exp2()[..., None]
+        rgb = view.rgb  # display-encoded [H, W, 3]
         gray = (rgb @ rgb.new_tensor([0.2126, 0.7152, 0.0722]))[..., None]
-        return replace(drawn, rgb=t * rgb + (1 - t) * gray * rgb.new_tensor([1.1, 1, 0.75]))
+        return replace(view, rgb=t * rgb + (1 - t) * gray * rgb.new_tensor([1.1, 1, 0.75]))
 
 
 def main(output_dir: Path) -> None:

@@ -35,7 +35,7 @@ from adapters.street.forms import (
     value_noise,
 )
 from adapters.street.layout import (
-    MOUNTS,
+    CAMERA_MOUNTS,
     ROAD_HALF_M,
     START_NS,
     StreetParameters,
@@ -427,7 +427,7 @@ def test_noise_depends_on_place_and_seed_alone():
 
 
 def test_cameras_fire_as_the_beam_passes():
-    offsets = {name: camera_offset_ns(name) for name in MOUNTS}
+    offsets = {name: camera_offset_ns(name) for name in CAMERA_MOUNTS}
     assert offsets["front"] == 0
     assert offsets["front_right"] == -offsets["front_left"] > 0
     assert offsets["right"] == -offsets["left"] == 30_555_556

@@ -86,7 +86,7 @@ def test_a_right_calibration_is_quiet(scene):
     # A tenth of a pixel would be perfect; the paint's cells are 1.3 pixels wide.
     assert offset.is_sure and math.hypot(offset.right_px, offset.down_px) < 0.5
     assert abs(checks.time_offset_s) < 0.005
-    assert json.loads(json.dumps(checks.to_json)) == checks.to_json
+    assert json.loads(json.dumps(checks.report_facts)) == checks.report_facts
 
 
 def test_images_of_several_sizes_are_compared(tmp_path):

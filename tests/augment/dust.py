@@ -61,7 +61,7 @@ class Dust(EffectModel):
 class DustEffect(Effect):
     """A colour cast that grows with distance: out = t rgb + (1 - t) dust, t = 2^(-d / half_m)."""
 
-    name, section, model, mask = "dust", "weather.dust", Dust, "dust"
+    name, section, model, mask_name = "dust", "weather.dust", Dust, "dust"
     # clear_fraction: t at the box's centre.
     box_table = BoxTable(
         name="box_dust",

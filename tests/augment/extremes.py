@@ -172,7 +172,7 @@ class Place:
         )
         for slope in SLOPES_DEG:
             settings = exposure_settings(snow_model(max_slope_deg=slope), base)
-            memo_of(scene).put(("snow support", settings), exposed_surface_of(base, settings))
+            memo_of(scene).put(("exposed surface", settings), exposed_surface_of(base, settings))
         return scene
 
 

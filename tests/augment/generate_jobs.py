@@ -2,7 +2,7 @@
 
 Worker processes import this module by name, so it needs nothing of pytest. Where the environment
 names a file (NOTES), every process appends a line to it before an image is rendered (`R`) and after
-its entry into the journal has returned (`A`): no `R` may follow the `A` of the same image.
+its entry into the progress log has returned (`A`): no `R` may follow the `A` of the same image.
 """
 
 from __future__ import annotations

@@ -209,7 +209,7 @@ def test_the_kernels_are_the_definition(height, eye_z):
         raster = RenderOutput(rgb=rgb.clone(), alpha=alpha, expected_depth=depth)
         return add_airlight_elevation(raster, view, fog, backend=backend, **options)
 
-    fast, slow = both(lambda on: bent(on, behind=True))
+    fast, slow = both(lambda on: bent(on, has_fog_behind=True))
     assert torch.allclose(fast, slow, atol=2e-5)
     fast, slow = both(bent)
     assert torch.allclose(fast, slow, atol=2e-5)

@@ -14,7 +14,7 @@ from adapters.procedural import open_truth
 from adapters.uri import parse_uri
 from augment.base_photo import MAX_CONDITION, Photo, open_photo
 from augment.cameras import Camera
-from augment.effects.style.color_maps import CLASSES, LEVELS, StyleMaps
+from augment.effects.style.color_maps import MAX_SKY_LEVEL, NUM_CLASSES, StyleMaps
 from augment.effects.style.style import SceneStyle
 from augment.errors import SceneError
 from augment.jobs.manifest import read_manifest
@@ -231,7 +231,7 @@ def test_a_style_maps_land_and_sky_of_the_photo_each_by_its_own(scene):
     style = Style(preset="dusk")
     land = torch.tensor([[0.5, 0.2, 0.0, 0.1], [0.0, 0.7, 0.0, 0.0], [0.1, 0.0, 0.6, 0.05]])
     sky = torch.tensor([[0.0, 0.0, 0.4, 0.3], [0.0, 0.5, 0.0, 0.2], [0.3, 0.0, 0.0, 0.1]])
-    maps = StyleMaps(land.repeat(CLASSES, 1, 1), sky, land)
+    maps = StyleMaps(land.repeat(NUM_CLASSES, 1, 1), sky, land)
     memo_of(scene).put(("style maps", style), maps, shared=True)
     rgb = render_view(scene, ahead(scene), recipe_of(style=style)).rgb
     photo = photo_of(scene).astype(float) / 255
@@ -242,7 +242,7 @@ def test_a_style_maps_land_and_sky_of_the_photo_each_by_its_own(scene):
 
 def test_splats_say_by_marks_what_a_style_does_to_them(scene):
     """As their heaviest splats do, pixel by pixel, where these are solid."""
-    maps = torch.eye(3, 4).repeat(CLASSES, 1, 1)
+    maps = torch.eye(3, 4).repeat(NUM_CLASSES, 1, 1)
     maps[:, :, 3] = 0.1
     maps[int(SemanticClass.ROAD), :, 3] = torch.tensor([0.3, 0.0, 0.2])
     end = wall(WALL_M, (-12, 12), (0, 3))
@@ -250,9 +250,9 @@ def test_splats_say_by_marks_what_a_style_does_to_them(scene):
     road = sheet((0.6, WALL_M), (-12, 12), semantic=int(SemanticClass.ROAD))
     scene = dataclasses.replace(scene, background=stack_all((end, road)))
     levels = torch.zeros(len(scene.background), dtype=torch.int16)
-    levels[: len(end)] = (end.means[:, 1] > 0).short() * (LEVELS // 2)
+    levels[: len(end)] = (end.means[:, 1] > 0).short() * (MAX_SKY_LEVEL // 2)
     sky = torch.tensor([[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0]])
-    full_style = SceneStyle(StyleMaps(maps, sky, sky), scene.sky, scene, levels).on_photo
+    full_style = SceneStyle(StyleMaps(maps, sky, sky), scene.sky, scene, levels).photo_style
     camera = ahead(scene)
 
     def shown(style, dtype=torch.float32):

@@ -170,7 +170,7 @@ def test_outputs_that_lack_what_others_have_are_refused_by_name(tmp_path: Path) 
     write_scene(bare, [make_recipe(variant=number, **none) for number in range(4)])
     complete, poor = WeatherDataset(full), WeatherDataset(bare)  # masks need not be everywhere
     assert len(WeatherDataset([full])) == len(complete) == 24
-    assert poor[0]["semantic"] is None and poor.given() == {"image", "depth", "instance"}
+    assert poor[0]["semantic"] is None and poor.available_kinds() == {"image", "depth", "instance"}
     fog = "street/fog-000, street/fog-001, street/fog-002 and 1 more"
     message = rf"boxes: none in {bare} \({fog}\); semantic: none in {bare} .* Leave it out "
     with pytest.raises(ValueError, match=message + r"\(load=\('image', 'depth', 'instance', "):

@@ -240,22 +240,22 @@ def test_mixtures_depend_on_seed_epoch_and_index_only(written: Path) -> None:
         MixedDataset(clean, weathered, 1.5)
 
 
-@pytest.mark.parametrize("uneven", ["exact", "pad", "drop"])
-def test_every_sample_once_over_all_ranks(uneven) -> None:
+@pytest.mark.parametrize("remainder", ["exact", "pad", "drop"])
+def test_every_sample_once_over_all_ranks(remainder) -> None:
     for count, ranks in ((0, 1), (0, 3), (1, 5), (7, 2), (7, 3), (24, 1), (24, 3), (24, 5)):
         samplers = [
-            ShardedSampler(count, rank=rank, ranks=ranks, seed=5, remainder=uneven)
+            ShardedSampler(count, rank=rank, ranks=ranks, seed=5, remainder=remainder)
             for rank in range(ranks)
         ]
         shares = [list(sampler) for sampler in samplers]
         assert [len(share) for share in shares] == [len(sampler) for sampler in samplers]
         counts = Counter(index for share in shares for index in share)
-        if uneven == "exact":
+        if remainder == "exact":
             assert counts == Counter(range(count))
         else:
             assert len(set(map(len, shares))) == 1
             extra = counts.total() - count
-            assert -ranks < extra < ranks and (extra >= 0) == (uneven == "pad" or extra == 0)
+            assert -ranks < extra < ranks and (extra >= 0) == (remainder == "pad" or extra == 0)
             assert set(counts) <= set(range(count)) and len(counts) == min(count, counts.total())
 
 
@@ -302,7 +302,7 @@ def test_a_sampler_knows_what_it_gave_out(unchecked) -> None:
         ShardedSampler(10, seed=9).load_state_dict(sampler.state_dict())
     with pytest.raises(ValueError, match="rank must be 0 to 1 of 2; got 2"):
         ShardedSampler(4, rank=2, ranks=2)
-    with pytest.raises(ValueError, match="uneven must be one of exact, pad, drop; got 'cut'"):
+    with pytest.raises(ValueError, match="remainder must be one of exact, pad, drop; got 'cut'"):
         ShardedSampler(4, remainder="cut")
 
 

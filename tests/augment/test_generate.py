@@ -442,7 +442,7 @@ def test_a_scene_whose_content_has_changed_is_refused(tmp_path: Path, executor: 
     rows = rows_of(tmp_path, scene="a")
     assert {row["source_digest"] for row in rows} == {"content1"}
     before = outputs(tmp_path)
-    options = {"rescan": True} if executor == "rescan" else {}
+    options = {"reopens_scenes": True} if executor == "rescan" else {}
     if executor == "without records":
         shutil.rmtree(tmp_path / ".climategs" / "scenes")
     changed = digested_job(tmp_path, "content2", renderer=must_not_render, **options)

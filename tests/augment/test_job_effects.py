@@ -381,7 +381,7 @@ def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path)
     assert (result.written, result.failures) == (4, ())
     assert run(RenderJob(uri, [recipe], shared, workers=2), None).failures == ()
     run(RenderJob(uri, [recipe], parts, frames=[1], cameras=["front"]), None)
-    for bed in (parts / ".climategs").glob("snow-*"):
+    for bed in (parts / ".climategs").glob("exposed-*"):
         bed.unlink()
     assert run(RenderJob(uri, [recipe], parts), None).skipped == 1
     for out in (shared, parts):
@@ -393,11 +393,13 @@ def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path)
         cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in one_run_dir.rglob("snow/*/*.png")
     ]
     assert len(masks) == 4 and max(mask.mean() for mask in masks) > 0
-    (bed,) = (one_run_dir / ".climategs").glob("snow-*")
+    (bed,) = (one_run_dir / ".climategs").glob("exposed-*")
     before = bed.stat().st_mtime_ns
     deeper = make_recipe(variant=1, snow=Snow(depth_m=0.3, cell_m=0.2))
     assert run(RenderJob(uri, [deeper], one_run_dir), None).failures == ()
-    assert [p.stat().st_mtime_ns for p in (one_run_dir / ".climategs").glob("snow-*")] == [before]
+    assert [p.stat().st_mtime_ns for p in (one_run_dir / ".climategs").glob("exposed-*")] == [
+        before
+    ]
 
 
 # ---- Maps of styles: found once a job, and what renders its images again -------------------------

@@ -328,7 +328,7 @@ def test_who_is_busiest_bounds_the_job() -> None:
         "renderers": 10.0,
         "writers": 20.0,
         "render": 9.0,
-        "held": 0.5,
+        "wait_for_files": 0.5,
     }
 
     def shares(**seconds: float):
@@ -338,15 +338,24 @@ def test_who_is_busiest_bounds_the_job() -> None:
 
     for bound_by, seconds in (
         ("rendering", {"encode": 8.0, "write": 1.0}),
-        ("encoding", {"render": 4.0, "held": 6.0, "encode": 15.0, "write": 4.0}),
-        ("writing to disk", {"render": 4.0, "held": 6.0, "encode": 5.0, "write": 14.0}),
-        ("LiDAR", {"render": 4.0, "held": 6.0, "lidar": 19.0}),
-        ("preparing effects", {"render": 2.0, "held": 0.0, "open": 1.0, "prepare": 6.0}),
+        ("encoding", {"render": 4.0, "wait_for_files": 6.0, "encode": 15.0, "write": 4.0}),
+        ("writing to disk", {"render": 4.0, "wait_for_files": 6.0, "encode": 5.0, "write": 14.0}),
+        ("LiDAR", {"render": 4.0, "wait_for_files": 6.0, "lidar": 19.0}),
+        ("preparing effects", {"render": 2.0, "wait_for_files": 0.0, "open": 1.0, "prepare": 6.0}),
         # Nothing of the job's own explains where four fifths went.
-        ("workers that start or have nothing to do", {"render": 2.0, "held": 0.0, "open": 1.0}),
+        (
+            "workers that start or have nothing to do",
+            {"render": 2.0, "wait_for_files": 0.0, "open": 1.0},
+        ),
     ):
         assert shares(**seconds).bound_by == bound_by
-    both = {"workers": 20.0, "renderers": 16.0, "writers": 32.0, "render": 12.0, "held": 2.0}
+    both = {
+        "workers": 20.0,
+        "renderers": 16.0,
+        "writers": 32.0,
+        "render": 12.0,
+        "wait_for_files": 2.0,
+    }
     time_shares = shares(**both, encode=20.0)
     assert time_shares.rendering == 0.6 and time_shares.waiting_for_files == 0.1
     assert time_shares.other_work == pytest.approx(0.3)
@@ -396,7 +405,7 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
 def test_workers_finish_a_view_that_nothing_follows(tmp_path: Path, reference_digests) -> None:
     """They have it in flight when they have no more to do, and the job waits for it."""
     result = run(fog_job(tmp_path, workers=2), begin_fake)
-    assert result.written == 8 and result.timings["await"] > 0
+    assert result.written == 8 and result.timings["wait_for_views"] > 0
     assert 0 < result.timings["renderers"] < result.timings["workers"]
     assert tree_digest(tmp_path) == reference_digests
 

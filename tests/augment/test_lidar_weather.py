@@ -320,7 +320,7 @@ def scene():
     opened = street(actors=(car,))
     roof = cells_on_grid(np.full((40, 18), 0.75), 0.1, corner_m=(-2.0, -0.9))
     support = ExposedSurface(ground=FLAT, actors={"car": roof})
-    memo_of(opened).put(("snow support", exposure_settings(SNOW, opened)), support)
+    memo_of(opened).put(("exposed surface", exposure_settings(SNOW, opened)), support)
     return opened
 
 

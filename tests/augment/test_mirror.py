@@ -353,14 +353,14 @@ def test_a_changed_source_is_noticed(source, out):
     assert again.changed == 2
     assert (done.folder / "README.md").samefile(table)
     assert (done.folder / "camera/front/poses2.json").samefile(new)
-    assert again.others == ["lidar/nothing.txt"]  # nobody here may decide to delete it
+    assert again.extra_files == ["lidar/nothing.txt"]  # nobody here may decide to delete it
 
 
 def test_others_files_stay_and_leftovers_go(source, out):
     done = trees.mirror(source, out)
     (done.folder / "infos.pkl").write_bytes(b"a loader's cache")
     (done.folder / "camera" / f".1-2{TEMPORARY_SUFFIX}").write_bytes(b"half")
-    assert trees.mirror(source, out).others == ["infos.pkl"]
+    assert trees.mirror(source, out).extra_files == ["infos.pkl"]
     assert set(trees.listing(done.folder)) - set(trees.listing(source)) == {"infos.pkl"}
 
 

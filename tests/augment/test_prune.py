@@ -51,7 +51,7 @@ def luma(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
 
 
 def test_changes_are_those_of_pictures_without_the_splat(monkeypatch):
-    monkeypatch.setattr(prune, "ROUNDS", (np.inf,))
+    monkeypatch.setattr(prune, "ROUND_ERRORS", (np.inf,))
     splats = random_gaussians(40, seed=3, sh_degree=1)
     splats = dataclasses.replace(splats, opacities=splats.opacities.clamp(0.02, 0.9))
     camera = camera_ahead(64, 48, 50.0)
@@ -121,7 +121,7 @@ def test_a_front_of_small_splats_does_not_go_as_a_whole(monkeypatch):
     front = stack(*(one_gaussian(at, 0.08, 0.6) for at in places))
     camera, error, changes, stay = camera_ahead(64, 48, 50.0), 3e-3, list[float](), list[bool]()
     for rounds in ((np.inf,), prune.ROUND_ERRORS):
-        monkeypatch.setattr(prune, "ROUNDS", rounds)
+        monkeypatch.setattr(prune, "ROUND_ERRORS", rounds)
         stays = torch.from_numpy(prune.errors_of(scene_of(front, camera)) > error)
         left = dataclasses.replace(front, opacities=torch.where(stays, 0.6, 0.0))
         changes.append(abs(float((luma(left, camera) - luma(front, camera)).mean())))

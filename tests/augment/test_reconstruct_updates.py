@@ -533,7 +533,7 @@ def test_what_is_not_touched_or_not_learnt_yet_keeps_its_bits():
     apply_update(splats, update)
     touched = np.zeros(len(splats), bool)
     touched[splats.starts[1] + update.touched[1]] = True
-    for name in before.keys() - {"starts", "semantic", "smallest"}:
+    for name in before.keys() - {"starts", "semantic", "min_scale_m"}:
         changed = getattr(splats, name) != before[name]
         assert not changed[~touched].any() and changed[touched].any(), name
         if name.startswith("sh"):

@@ -425,8 +425,12 @@ def test_an_interrupt_finishes_what_is_at_hand_and_can_be_resumed(tmp_path: Path
     assert tree_digest(tmp_path / "stopped") == tree_digest(tmp_path / "whole")
 
 
-def test_half_a_line_in_a_journal_is_not_believed(tmp_path: Path) -> None:
-    """As a kill in the midst of a write leaves it; whole lines before it still count."""
+@pytest.mark.parametrize("folders", [["progress"], ["journal"], ["progress", "journal"]])
+def test_half_a_line_in_a_progress_log_is_not_believed(tmp_path: Path, folders) -> None:
+    """As a kill in the midst of a write leaves it; whole lines before it still count.
+
+    Older versions kept the logs in `journal`: a job that one of them began goes on.
+    """
     recipes = [make_recipe("clear", labels=False)]  # whose rows are all that a line holds
     run(RenderJob("fake:street", recipes, tmp_path / "whole"))
     out = tmp_path / "torn"
@@ -435,10 +439,12 @@ def test_half_a_line_in_a_journal_is_not_believed(tmp_path: Path) -> None:
     (out / "manifest.parquet").unlink()
     lines = [{name: rows[0][name] for name in IDENTITY}, *rows]
     text = "".join(json.dumps(line) + "\n" for line in lines)
-    progress_log = out / ".climategs" / "journal" / "street" / "clear-000.jsonl"
-    progress_log.parent.mkdir(parents=True)
-    progress_log.write_text(text[:-20])
+    for folder in folders:
+        progress_log = out / ".climategs" / folder / "street" / "clear-000.jsonl"
+        progress_log.parent.mkdir(parents=True)
+        progress_log.write_text(text[:-20])
     assert run(RenderJob("fake:street", recipes, out)).skipped == 3
+    assert sorted(path.name for path in (out / ".climategs").iterdir()) == ["lock"]
     assert tree_digest(out) == tree_digest(tmp_path / "whole")
 
 
@@ -456,13 +462,13 @@ def test_half_a_line_in_a_journal_is_not_believed(tmp_path: Path) -> None:
         ("box_2d", {"pixels": 3}),
     ],
 )
-def test_a_damaged_journal_is_told(tmp_path: Path, field: str, value: object) -> None:
+def test_a_damaged_progress_log_is_reported(tmp_path: Path, field: str, value: object) -> None:
     """Whose lines are rows of the manifest, and come from anybody as that does."""
     job = fog_job(tmp_path, frames=[0])
     run(job)
     identity, *rows = read_manifest(tmp_path).to_pylist()[:1] * 2
     (tmp_path / "manifest.parquet").unlink()
-    progress_log = tmp_path / ".climategs" / "journal" / "street" / "fog-000.jsonl"
+    progress_log = tmp_path / ".climategs" / "progress" / "street" / "fog-000.jsonl"
     progress_log.parent.mkdir(parents=True)
     lines = [{name: identity[name] for name in IDENTITY}, {**rows[0], field: value}]
     progress_log.write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -475,10 +481,10 @@ def test_a_damaged_journal_is_told(tmp_path: Path, field: str, value: object) ->
 @pytest.mark.parametrize("ended", [True, False], ids=["finished", "only begun"])
 def test_another_recipe_under_the_same_name_is_refused(tmp_path: Path, ended: bool) -> None:
     run(RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0]))
-    if not ended:  # as a kill leaves it: a journal and no manifest
+    if not ended:  # as a kill leaves it: a progress log and no manifest
         identity = read_manifest(tmp_path).to_pylist()[0]
         (tmp_path / "manifest.parquet").unlink()
-        progress_log = tmp_path / ".climategs" / "journal" / "street" / "fog-000.jsonl"
+        progress_log = tmp_path / ".climategs" / "progress" / "street" / "fog-000.jsonl"
         progress_log.parent.mkdir(parents=True)
         progress_log.write_text(json.dumps({name: identity[name] for name in IDENTITY}) + "\n")
     before = tree_digest(tmp_path)

@@ -133,7 +133,7 @@ def test_both_sides_together_are_the_whole():
 
 @pytest.mark.parametrize(("z_m", "keep"), [(math.nan, "above"), (math.inf, "below")])
 def test_what_no_clip_can_be(z_m, keep):
-    with pytest.raises(ValueError, match="a clip keeps"):
+    with pytest.raises(ValueError, match="kept_side of a clip"):
         HeightClip(z_m, keep)
 
 

@@ -31,7 +31,7 @@ from augment.effects.snow.light import (
     find_scene_light,
     find_snow_light,
 )
-from augment.effects.snow.near_camera import Crystals, Layer, SnowLayers
+from augment.effects.snow.near_camera import Crystals, PartSnow, SnowLayers
 from augment.effects.snow.relief import Carrier, Grain, add_grain
 from augment.geometry import rigid
 from augment.render.buffers import ALPHA, RGB
@@ -650,12 +650,12 @@ def crystals(count: int, seed: int, *, spread_m=6.0) -> Crystals:
     return Crystals(torch.from_numpy(places), torch.from_numpy(mirrors), 0.9)
 
 
-def snow_layers_of(ground: Layer, **actors: Layer) -> SnowLayers:
+def snow_layers_of(ground: PartSnow, **actors: PartSnow) -> SnowLayers:
     return SnowLayers(ground, actors, tuple(CLOSE_SUN.tolist()), WRAP, 0.1, GRAIN)
 
 
-def layer(gaussians: Gaussians, own: int = 3, **options) -> Layer:
-    return Layer(gaussians, torch.ones(own), **options)
+def layer(gaussians: Gaussians, own: int = 3, **options) -> PartSnow:
+    return PartSnow(gaussians, torch.ones(own), **options)
 
 
 def drawn_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -703,7 +703,7 @@ def glinting_street():
         name: layer(
             near_discs(count, seed, far_m=2.0),
             own=2,
-            slopes=0.3 * torch.ones(count, 3),
+            sunlight_rgb=0.3 * torch.ones(count, 3),
             normals=normals[:count],
             crystals=crystals(count, seed, spread_m=1.0) if seed == 8 else None,
         )

@@ -65,7 +65,7 @@ def check_cells(cells: ExposedCells, gaussians: int) -> None:
     for field in dataclasses.fields(ExposedCells):
         values = getattr(cells, field.name)
         assert bool(torch.isfinite(values.double()).all()), field.name
-        if not field.name.startswith("buried"):
+        if field.name not in ("hideable_ids", "covering_cells"):
             assert len(values) == count, field.name
     np.testing.assert_allclose(cells.normals.norm(dim=1), 1, atol=1e-5)
     assert bool((cells.normals[:, 2] > 0).all())
@@ -128,8 +128,8 @@ def test_level_ground_ahead_is_covered_once(flat_ground) -> None:
     lowest = float(cells.centers_m[chosen, 2].abs().max())
     assert lowest < 0.005
     assert float(cells.normals[chosen, 2].min()) > 0.999
-    np.testing.assert_allclose(cells.light[chosen], 1, atol=0.02)
-    assert float(cells.edge_m[chosen].min()) == MAX_EDGE_DISTANCE_M
+    np.testing.assert_allclose(cells.relative_light[chosen], 1, atol=0.02)
+    assert float(cells.edge_distance_m[chosen].min()) == MAX_EDGE_DISTANCE_M
 
 
 def test_bits_do_not_depend_on_threads_or_on_who_watches(flat_ground) -> None:
@@ -141,7 +141,7 @@ def test_bits_do_not_depend_on_threads_or_on_who_watches(flat_ground) -> None:
     assert_equal_cells(together.ground, bed.ground)
     total = told[0].num_steps
     assert [progress.num_done for progress in told] == [*range(total + 1)] and total > 1
-    assert {progress.name for progress in told} == {"placing snow"}
+    assert {progress.name for progress in told} == {"finding exposed surfaces"}
 
 
 def test_a_platform_has_open_edges_and_the_ground_beside_it_none() -> None:
@@ -406,7 +406,7 @@ def assert_equal_cells(a: ExposedCells, b: ExposedCells) -> None:
         assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
-# ---- supports in files ---------------------------------------------------------------------------
+# ---- exposed surfaces in files -------------------------------------------------------------------
 
 SETTINGS = ExposureSettings(cell_m=0.2)
 
@@ -485,6 +485,8 @@ def test_keys_tell_contents_apart(scene: Scene) -> None:
 def test_a_support_is_found_once_and_a_damaged_file_is_written_anew(
     scene: Scene, tmp_path: Path, caplog
 ) -> None:
+    old_file = tmp_path / f"snow-{40 * 'a'}.safetensors"  # as version 7 of the format left it
+    old_file.touch()
     own = dataclasses.replace(scene)
     first = exposed_surface_of(own, SETTINGS, folder=tmp_path)
     assert exposed_surface_of(own, SETTINGS) is first
@@ -493,7 +495,7 @@ def test_a_support_is_found_once_and_a_damaged_file_is_written_anew(
     path.write_bytes(whole[:-5])
     again = exposed_surface_of(dataclasses.replace(scene), SETTINGS, folder=tmp_path)
     assert_equal(again, first)
-    assert "placed anew" in caplog.text and path.read_bytes() == whole
+    assert "is found again" in caplog.text and path.read_bytes() == whole
 
 
 def test_files_of_something_else_are_refused(support: ExposedSurface, tmp_path: Path) -> None:
@@ -504,7 +506,7 @@ def test_files_of_something_else_are_refused(support: ExposedSurface, tmp_path: 
     with pytest.raises(SceneError, match="of something else: its key is 'k', expected 'other'"):
         load_exposed_surface(path, "other")
     save_file({"x": torch.zeros(3)}, path)
-    with pytest.raises(SceneError, match="no snow support of this version"):
+    with pytest.raises(SceneError, match="no exposed surface of this version"):
         load_exposed_surface(path, "k")
     path.write_text("no tensors")
     with pytest.raises(SceneError, match="damaged"):
@@ -528,22 +530,24 @@ def test_contents_that_do_not_fit_are_refused(support: ExposedSurface, tmp_path:
     save_exposed_surface(path, support, "k")
     whole = load_file(path)
     ids: dict = {"format": FORMAT, "key": "k", "track_ids": list(support.actors)}
-    short = whole["ground.light"][1:].clone()
+    short = whole["ground.relative_light"][1:].clone()
     neighbours, buried_by, buried = (
-        whole[f"ground.{name}"].clone() for name in ("neighbours", "buried_by", "buried")
+        whole[f"ground.{name}"].clone() for name in ("neighbours", "covering_cells", "hideable_ids")
     )
     neighbours[0, 0], buried_by[0, 0], buried[0] = -3, len(support.ground), -1
-    missing = {name: tensor for name, tensor in whole.items() if name != "actors.1.banks"}
+    missing = {
+        name: tensor for name, tensor in whole.items() if name != "actors.1.obstacle_vectors"
+    }
     for tensors, about in (
-        (whole | {"ground.light": short}, ids),
+        (whole | {"ground.relative_light": short}, ids),
         (missing, ids),
-        (whole | {"ground.tracks": whole["ground.tracks"].double()}, ids),
+        (whole | {"ground.track_share": whole["ground.track_share"].double()}, ids),
         (whole | {"ground.neighbours": neighbours}, ids),
-        (whole | {"ground.buried_by": buried_by}, ids),
-        (whole | {"ground.buried": buried}, ids),
+        (whole | {"ground.covering_cells": buried_by}, ids),
+        (whole | {"ground.hideable_ids": buried}, ids),
         (whole, ids | {"track_ids": 3}),
     ):
-        save_file(tensors, path, metadata={"snow_bed": json.dumps(about)})
+        save_file(tensors, path, metadata={"exposed_surface": json.dumps(about)})
         with pytest.raises(SceneError, match="damaged"):
             load_exposed_surface(path, "k")
 

@@ -310,7 +310,7 @@ def points(true_street, truth):
 
 def covered_by(scene, points):
     bed = find_exposed_surface(scene, all_cameras(scene), ExposureSettings(cell_m=0.2))
-    flat = points.chosen(points.is_seen & (points.slope < math.radians(30)))
+    flat = points.select(points.is_seen & (points.slope < math.radians(30)))
     return bed.ground, flat
 
 
@@ -375,7 +375,7 @@ def test_floaters_do_not_lift_the_snow(true_street, points):
     )
     under = (np.abs(points.xy[:, 0]) < 5) & (points.xy[:, 1] > -4) & (points.xy[:, 1] < 1)
     cells, flat = covered_by(veiled, points)
-    open_points = flat.chosen(under[points.is_seen & (points.slope < math.radians(30))])
+    open_points = flat.select(under[points.is_seen & (points.slope < math.radians(30))])
     assert (cells_over(cells, open_points) >= 0).any()
     assert np.nanmedian(np.abs(support_heights(cells, open_points) - open_points.z)) < 0.06
 

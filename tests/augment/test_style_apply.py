@@ -13,15 +13,15 @@ from augment.cameras import Frame
 from augment.effects.snow.effect import build_snow_layers
 from augment.effects.style import network as checkpoint
 from augment.effects.style.color_maps import (
-    CLASSES,
-    LEVELS,
+    MAX_SKY_LEVEL,
+    NUM_CLASSES,
     StyleMaps,
     map_sh,
     sky_levels,
     style_actor,
     style_gaussians,
+    style_scene,
     style_sky,
-    styled_scene,
 )
 from augment.effects.style.content import content_pictures, content_statistics, gaussian_statistics
 from augment.effects.style.images import image_statistics, read_style_image
@@ -61,14 +61,14 @@ def maps_of(splats: torch.Tensor) -> StyleMaps:
 
 
 def maps_by_class() -> StyleMaps:
-    splats = torch.stack([some_map(seed) for seed in range(CLASSES)])
+    splats = torch.stack([some_map(seed) for seed in range(NUM_CLASSES)])
     splats[3] = torch.eye(3, 4)
     return maps_of(splats)
 
 
 def with_classes(count: int, sh_degree: int, *, runs: bool = False):
     gaussians = random_gaussians(count, sh_degree=sh_degree)
-    classes = torch.randint(0, CLASSES, (count,), generator=torch.Generator().manual_seed(5))
+    classes = torch.randint(0, NUM_CLASSES, (count,), generator=torch.Generator().manual_seed(5))
     classes = (classes.sort().values if runs else classes).short()
     return dataclasses.replace(gaussians, semantic=classes)
 
@@ -96,7 +96,7 @@ def test_identities_leave_every_bit(backend):
     odd = torch.tensor([-0.0, float("nan"), float("inf"), 1e-42])
     gaussians.sh.view(-1)[: len(odd)] = odd
     bits = gaussians.sh.clone().view(torch.int32)
-    every = maps_of(torch.eye(3, 4).repeat(CLASSES, 1, 1))
+    every = maps_of(torch.eye(3, 4).repeat(NUM_CLASSES, 1, 1))
     for maps in (IDENTITY_MAPS, every):
         assert style_gaussians(gaussians, maps, backend=backend) is gaussians
         out = torch.zeros_like(gaussians.sh)
@@ -128,11 +128,11 @@ def test_on_the_gpu_sh_of_either_side_give_new_ones_there_or_change_in_place(mon
             style_gaussians(gaussians, maps, out=torch.zeros_like(bits), backend="cuda")
 
 
-@pytest.mark.parametrize("wrong", [-1, CLASSES])
+@pytest.mark.parametrize("wrong", [-1, NUM_CLASSES])
 def test_classes_without_a_map_are_refused(wrong):
     gaussians = with_classes(5, 0)
     gaussians.semantic[2] = wrong
-    with pytest.raises(ValueError, match=rf"maps for classes 0 to {CLASSES - 1}.*{wrong}"):
+    with pytest.raises(ValueError, match=rf"maps for classes 0 to {NUM_CLASSES - 1}.*{wrong}"):
         style_gaussians(gaussians, maps_by_class())
     style_gaussians(gaussians, maps_of(some_map()[None]))  # one map asks for no class
 
@@ -275,7 +275,7 @@ def test_splats_and_sky_are_mapped_each_by_its_own(scene, backend):
 
 
 def test_every_class_takes_its_map(scene):
-    splats = torch.eye(3, 4).repeat(CLASSES, 1, 1)
+    splats = torch.eye(3, 4).repeat(NUM_CLASSES, 1, 1)
     splats[CAR] = gentle(5)
     maps = StyleMaps(splats, torch.eye(3, 4), gentle(3))
     memo_of(scene).put(("style maps", STYLE), maps, shared=True)
@@ -324,7 +324,7 @@ def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
     look = scene_style_of(scene, STYLE)
     snow = plan.effect_plans["snow"].data
     styled, plain = (build_snow_layers(scene, snow, light) for light in (look.lighting_scene, None))
-    parts = look.on(styled.parts_for(scene, camera_of(scene)))
+    parts = look.map_parts(styled.parts_for(scene, camera_of(scene)))
     assert any(part.is_overlay for part in parts)
     assert all((part.color_maps is None) == part.is_overlay for part in parts)
     # Its light is read from the mapped ground and sky, and differs from the bare scene's.
@@ -444,7 +444,7 @@ def test_the_scene_takes_on_the_colours(photo):
     scene = colourful()
     style = Style(image=str(photo), mask=str(photo.with_name("mask.png")))
     target = image_statistics(read_style_image(photo, photo.with_name("mask.png")))
-    styled = styled_scene(scene, style_maps(scene, style))
+    styled = style_scene(scene, style_maps(scene, style))
     found = content_statistics(styled, per_region=False)
     before = content_statistics(scene, per_region=False)
     for region in (LAND, SKY):
@@ -460,7 +460,7 @@ def test_no_strength_changes_nothing_and_reads_nothing():
 
 def test_regions(photo, tmp_path):
     maps = style_maps(fitted_scene(), Style(image=str(photo), per_region=True))
-    assert len(maps.splats) == CLASSES
+    assert len(maps.splats) == NUM_CLASSES
     with pytest.raises(StyleError, match=r"none\.png"):
         style_maps(fitted_scene(), Style(image=str(tmp_path / "none.png")))
 
@@ -517,7 +517,7 @@ def test_what_has_the_skys_colour_above_the_horizon_is_sky():
     pale, brick = (0.62, 0.69, 0.88), (0.6, 0.3, 0.2)
     high, low = (30.0, 0.0, 12.0), (30.0, 0.0, 0.5)
     assert levels_of(ball(high), ball(high, pale), ball(high, brick), ball(low)) == [
-        LEVELS, LEVELS, 0, 0,
+        MAX_SKY_LEVEL, MAX_SKY_LEVEL, 0, 0,
     ]  # fmt: skip
 
 
@@ -544,12 +544,12 @@ def test_the_halo_changes_with_the_sky_in_pictures_and_in_styled_scenes():
     memo_of(scene).put(("style maps", STYLE), maps(), shared=True)
     camera = scene.frames[0].cameras["ahead"]
     look = scene_style_of(scene, STYLE)
-    rows = look.on(scene.parts_for(camera))[0].color_rows
-    assert rows is not None and rows[-2:].tolist() == [LEVELS, 0] and not rows[:-2].any()
+    rows = look.map_parts(scene.parts_for(camera))[0].color_rows
+    assert rows is not None and rows[-2:].tolist() == [MAX_SKY_LEVEL, 0] and not rows[:-2].any()
     fused = render_view(scene, camera, Recipe(style=STYLE))
-    folded = render_view(styled_scene(scene, maps()), camera, Recipe())
+    folded = render_view(style_scene(scene, maps()), camera, Recipe())
     assert np.abs(fused.rgb.astype(int) - folded.rgb).max() <= 1
-    colors = (styled_scene(scene, maps()).background.sh[-2:, 0] * 0.28209479 + 0.5).tolist()
+    colors = (style_scene(scene, maps()).background.sh[-2:, 0] * 0.28209479 + 0.5).tolist()
     np.testing.assert_allclose(colors, [[0.9, 0.1, 0.1], [0.1, 0.9, 0.1]], atol=1e-5)
     assert torch.equal(look.lighting_scene.background.sh[-1], look.lighting_scene.background.sh[0])
 

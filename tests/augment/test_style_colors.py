@@ -14,11 +14,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from augment.effects.style import images
-from augment.effects.style.color_maps import CLASSES
+from augment.effects.style.color_maps import NUM_CLASSES
 from augment.effects.style.images import StyleImage, image_statistics, read_style_image
 from augment.effects.style.network import (
     METADATA_KEY,
-    SHIPPED,
+    SHIPPED_CHECKPOINT,
     Gscm,
     load_network,
     network_facts,
@@ -36,9 +36,9 @@ from augment.effects.style.statistics import (
     ColorStatistics,
     Limits,
     closed_maps,
+    color_statistics,
     mkl_map,
     reinhard_map,
-    statistics_of,
 )
 from augment.effects.style.style import parse_statistics, preset_statistics
 from augment.errors import StyleError
@@ -191,7 +191,7 @@ def test_regions_have_maps_of_their_own_by_class():
     regions = (SKY, LAND, ROAD, VEGETATION, REST)
     content, style = scene(0, *regions), scene(20, *regions)
     found = maps(content, style, per_region=True)
-    assert found.splats.shape == (CLASSES, 3, 4)
+    assert found.splats.shape == (NUM_CLASSES, 3, 4)
 
     def own(region):
         return mkl_map(content[region], style[region]).float()
@@ -254,8 +254,8 @@ def street():
     height = rng.uniform(0, 1, (1000, 1))
     sky = (0.5, 0.6, 0.75) + height * (0.25, 0.2, 0.1) + 0.01 * rng.standard_normal((1000, 3))
     both = np.concatenate([land, sky])
-    found = {WHOLE: statistics_of(both)}
-    found |= {LAND: statistics_of(land, total=4000.0), SKY: statistics_of(sky, total=4000.0)}
+    found = {WHOLE: color_statistics(both)}
+    found |= {LAND: color_statistics(land, total=4000.0), SKY: color_statistics(sky, total=4000.0)}
     return {LAND: land, SKY: sky}, found
 
 
@@ -405,7 +405,7 @@ def test_the_shipped_network():
     assert not set(facts["about"]["data"]["train"]) & set(facts["about"]["data"]["held_out"])
     figures = facts["about"]["figures"]
     assert figures["network"]["look"] > figures["mkl"]["look"] > 0
-    assert SHIPPED.stat().st_size < 10 * 2**20
+    assert SHIPPED_CHECKPOINT.stat().st_size < 10 * 2**20
 
 
 def png(pixels: np.ndarray, color_type: int, *extra: tuple[bytes, bytes]) -> bytes:

@@ -15,11 +15,11 @@ from augment.cameras import Frame
 from augment.effects.style.losses import FilterBank, weighted_sum
 from augment.effects.style.network import Gscm, apply_map
 from augment.effects.style.pairs import (
-    GREY,
+    LUMA,
     PAIR_WEIGHTS,
     PairBatch,
     RecolorSettings,
-    closed_method,
+    closed_form_method,
     pair_losses,
     recolor,
     sample_pairs,
@@ -297,7 +297,7 @@ def test_grey_and_night_are_reached():
     grey = sample_recolorings(64, seeded(), replace(STILL, grey_share=1.0))(images)
     spread = images.std(1).mean()
     assert (grey.std(1).mean((1, 2)) < 0.31 * spread).all()
-    luma = torch.tensor(GREY)
+    luma = torch.tensor(LUMA)
     torch.testing.assert_close(  # what is taken away is colour alone
         torch.einsum("c,bchw->bhw", luma, grey), torch.einsum("c,bchw->bhw", luma, images)
     )
@@ -313,12 +313,12 @@ def test_pairs_share_a_recolouring():
     batch, again = (sample_pairs(pair_photos(4), seeded(), 5, size_px=16) for _ in range(2))
     assert batch.photos.shape == (5, 3, 16, 16)
     assert all(torch.equal(*both) for both in zip(batch, again, strict=True))
-    assert (batch.photos - batch.others).abs().mean((1, 2, 3)).min() > 0.01
+    assert (batch.photos - batch.second_photos).abs().mean((1, 2, 3)).min() > 0.01
     # One recolouring for both: colours that both hold become the same colour.
     one = PairBatch(*(part[:1] for part in batch))
-    near = torch.cdist(*(picture[0].flatten(1).T for picture in (one.photos, one.others)))
+    near = torch.cdist(*(picture[0].flatten(1).T for picture in (one.photos, one.second_photos)))
     first, second = divmod(int(near.argmin()), near.shape[1])
-    became = (one.recolored[0].flatten(1)[:, first], one.others_recolored[0].flatten(1)[:, second])
+    became = (one.recolored[0].flatten(1)[:, first], one.second_recolored[0].flatten(1)[:, second])
     assert (became[0] - became[1]).abs().max() < 0.05 + 3 * float(near.min())
     assert torch.equal(torch.random.get_rng_state(), state)
     with pytest.raises(ValueError, match="at least 2 photos; got 1"):
@@ -353,13 +353,15 @@ def scored() -> torch.Tensor:
 
 def test_order_of_methods(scored):
     none, half, full = (
-        score_pairs(closed_method(strength=strength), scored, repeats=1)
+        score_pairs(closed_form_method(strength=strength), scored, repeats=1)
         for strength in (0.0, 0.5, 1.0)
     )
     assert none["same"] < half["same"] < full["same"]
     assert none["same"] == pytest.approx(none["look"])  # the style does not matter to it
     assert full["same"] > max(full["half"], full["below"], full["look"])
-    first, again = (score_pairs(closed_method(reinhard_map), scored, repeats=1) for _ in range(2))
+    first, again = (
+        score_pairs(closed_form_method(reinhard_map), scored, repeats=1) for _ in range(2)
+    )
     assert first == again != full
 
 

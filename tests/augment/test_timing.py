@@ -9,7 +9,7 @@ from augment.timing import PassProgress, counted_steps, stopwatch, timed, watche
 
 def work() -> None:
     with timed("view plan"):
-        with counted_steps("placing snow", 2) as advance:
+        with counted_steps("finding exposed surfaces", 2) as advance:
             advance()
             advance()
         with timed("sky"):
@@ -22,9 +22,9 @@ def test_a_watcher_hears_which_pass_runs_and_how_far_it_has_got():
         work()
     assert reports == [
         PassProgress("view plan"),
-        PassProgress("placing snow", 0, 2),
-        PassProgress("placing snow", 1, 2),
-        PassProgress("placing snow", 2, 2),
+        PassProgress("finding exposed surfaces", 0, 2),
+        PassProgress("finding exposed surfaces", 1, 2),
+        PassProgress("finding exposed surfaces", 2, 2),
         PassProgress("view plan"),
         PassProgress("sky"),
         PassProgress("view plan"),
@@ -34,7 +34,9 @@ def test_a_watcher_hears_which_pass_runs_and_how_far_it_has_got():
     assert len(reports) == 7  # nobody listens any more
 
 
-@pytest.mark.parametrize("last", [("sky", 0), ("placing snow", 0), ("placing snow", 1)])
+@pytest.mark.parametrize(
+    "last", [("sky", 0), ("finding exposed surfaces", 0), ("finding exposed surfaces", 1)]
+)
 def test_what_a_watcher_raises_gives_up_what_runs(last):
     reports = list[PassProgress]()
 

@@ -533,7 +533,7 @@ def test_an_actor_is_pushed_along_its_forces_in_the_world():
     poses = ActorPoses([actor_on(times), actor_on(times, EGO_VEHICLE, "b")])
     turned = pose((3.0, 0.0, 0.0), np.pi / 2)
     forces = Forces(
-        seen=np.array([True, True, True]),
+        is_visible=np.array([True, True, True]),
         shift=np.array([[9.0, 9, 9], [1.0, 0, 0], [1.0, 0, 0]]),
         turn=np.array([[0.0, 0, 0], [0.0, 0, 2.0], [0.0, 0, 2.0]]),
     )

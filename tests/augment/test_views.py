@@ -212,7 +212,7 @@ def everything(plan, scene: Scene, camera: Camera, **_) -> ViewPlan:
     actors = tuple(range(1, len(scene.actors) + 1))
     active = tuple(
         dataclasses.replace(effect, view_data=frozenset((0, *actors)))
-        for effect in plan.active(scene)
+        for effect in plan.active_effects(scene)
     )
     return ViewPlan(actors, active, plan.buffers, plan.bare_buffers, plan.steps)
 

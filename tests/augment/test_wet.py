@@ -134,7 +134,7 @@ def scene_with(z_m: np.ndarray, cell_m=0.2, corner_m=(0.0, 0.0), above=(), frame
         frames=frames,
     )
     cells = cells_on_grid(z_m, cell_m, corner_m=corner_m)
-    memo_of(scene).put(("snow support", PLACEMENT_SETTINGS), ExposedSurface(cells, {}))
+    memo_of(scene).put(("exposed surface", PLACEMENT_SETTINGS), ExposedSurface(cells, {}))
     return scene
 
 

@@ -71,7 +71,7 @@ class Dust(EffectModel):
     """Of the map."""
 
     @property
-    def changes(self) -> bool:
+    def has_effect(self) -> bool:
         return self.density > 0
 
     def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:

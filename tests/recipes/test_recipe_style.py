@@ -36,8 +36,8 @@ def template(text: str, folder: Path | None = None) -> RecipeTemplate:
 def test_a_preset_is_enough() -> None:
     recipe = template("style: {preset: dusk}").resolve(0)
     style = Style(preset="dusk")
-    assert recipe.style == style and style.changes and (style.name, style.files) == ("dusk", {})
-    assert not Style(preset="dusk", strength=0).changes
+    assert recipe.style == style and style.has_effect and (style.name, style.files) == ("dusk", {})
+    assert not Style(preset="dusk", strength=0).has_effect
 
 
 @pytest.mark.parametrize(

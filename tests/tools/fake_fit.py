@@ -131,8 +131,8 @@ class Fakes:
         stand_ins = {
             "open_scene": self._open,
             "RecordedViews": lambda scene, **options: FakeViews(scene, options["holdout"]),
-            "check_views": lambda *_: SimpleNamespace(time_offset_s=None, problems=(), facts={}),
-            "starting_scene": lambda scene, source: scene,
+            "check_views": lambda *_: SimpleNamespace(time_offset_s=None, problems=(), report_facts={}),
+            "complete_starting_scene": lambda scene, source: scene,
             "Trainer": self._trainer,
             "evaluate_views": lambda *asked, with_flip: asked,
             "mean_scores": _mean_scores,

@@ -35,7 +35,7 @@ from tools.bench import (
 )
 from tools.bench.gpu import GpuCase, Timing, measure
 from tools.bench.harness import WallClock, rounds, run_in_subprocess
-from tools.bench.pictures import DUSK, SHOWN, SWEEPS, recipe_of
+from tools.bench.pictures import DUSK, PRESETS, SWEEPS, recipe_of
 from tools.bench.scenes import EffectCase, RasterCase, measure_effect
 from tools.bench.trade import (
     ALL_KNOBS,
@@ -243,7 +243,7 @@ def test_without_a_gpu_the_commands_say_so(capsys):
 @pytest.mark.gpu
 def test_a_small_run_on_a_gpu(tmp_path):
     case = dataclasses.replace(
-        gpu.QUICK, load={"copy_bytes": 1 << 24, "programs": 264, "steps": 256}
+        gpu.QUICK_CASE, load={"copy_bytes": 1 << 24, "programs": 264, "steps": 256}
     )
     result = measure(case, timing=Timing(3, 1), json_file=tmp_path / "gpu.json")
     sections = result["facts"]["sections"]
@@ -418,7 +418,7 @@ def test_errors_of_settings_grow_away_from_the_reference(monkeypatch):
 
 
 def test_the_documentations_pictures_show_what_their_captions_say():
-    for preset in SHOWN:
+    for preset in PRESETS:
         day, dusk = (recipe_of(preset, sets) for sets in ((), DUSK))
         assert dusk.weather == day.weather and day.sections().keys() & {
             "weather.rain",

@@ -50,12 +50,12 @@ from tools.view.controls import (
     group_of,
     split_by_rank,
 )
-from tools.view.edits import Edits, free_path, save_recipe, start_of_section, without_weather
+from tools.view.edits import Edits, save_recipe, start_values, unused_path, without_weather
 from tools.view.outputs import OutputViewer, find_output
-from tools.view.page import Wish
+from tools.view.page import ViewRequest
 from tools.view.pictures import (
     PICTURE,
-    away_sentence,
+    distance_warning,
     draw,
     free_camera,
     place_in_window,
@@ -98,15 +98,17 @@ def test_every_field_of_every_effect_has_a_control_whose_ends_its_model_takes(du
             assert control.hint
             if control.kind != "slider":
                 continue
-            leaf, kind = leaves[control.path], int if control.whole else float
+            leaf, kind = leaves[control.path], int if control.is_integer else float
             for way in np.linspace(0, 1, 41):
                 value = kind(control.value_at(way))
                 assert leaf.accepts(value), (control, way, value)
-                if not control.whole and control.way_of(value) not in (0, 1):
-                    assert control.value_at(control.way_of(value)) == pytest.approx(value, 0.006)
+                if not control.is_integer and control.position_at(value) not in (0, 1):
+                    assert control.value_at(control.position_at(value)) == pytest.approx(
+                        value, 0.006
+                    )
     paths = {c.path: c for group in groups for c in group.walk()}
     half = paths["weather.dust.half_m"]
-    assert (half.way, half.high, half.hint.split()[-1]) == ("log", 1e6, "[metres]")
+    assert (half.scale, half.high, half.hint.split()[-1]) == ("log", 1e6, "[metres]")
     assert paths["weather.dust.distance"].words == ("depth", "ray")
     assert paths["weather.flood.level_m"].value_at(0.5) == 1
     assert paths["weather.smog.overcast"].step == 0.005
@@ -115,7 +117,7 @@ def test_every_field_of_every_effect_has_a_control_whose_ends_its_model_takes(du
 def test_an_effect_that_is_switched_on_starts_from_values_its_model_takes(dust):
     for section in SECTIONS:
         edits = Edits("clear").with_section(section)
-        assert section_at(edits.recipe(), section).changes, start_of_section(section)
+        assert section_at(edits.recipe(), section).has_effect, start_values(section)
         assert section_at(edits.without_section(section).recipe(), section) is None
 
 
@@ -140,11 +142,11 @@ def test_sliders_reach_what_presets_draw_and_boxes_all_that_a_recipe_takes():
         least, most = control.valid
         assert least <= control.low < control.high <= most
         for value in control.valid:  # the ends of the box
-            assert leaves[control.path].accepts(int(value) if control.whole else value)
-        if control.way == "both sides":
+            assert leaves[control.path].accepts(int(value) if control.is_integer else value)
+        if control.scale == "both sides":
             assert control.high - control.low <= 200, control.path
-        elif control.way == "log" and control.path in USEFUL_ENDS:
-            assert control.high <= 1e4 * control.least, control.path  # four decades
+        elif control.scale == "log" and control.path in USEFUL_ENDS:
+            assert control.high <= 1e4 * control.smallest_nonzero, control.path  # four decades
     ends = {control.path: (control.low, control.high) for control in sliders()}
     assert ends["weather.smog.base_height_m"] == (-50, 50)  # of -10,000 to 10,000
     assert ends["weather.flood.level_m"] == (-1, 3)
@@ -156,10 +158,10 @@ def test_sliders_reach_what_presets_draw_and_boxes_all_that_a_recipe_takes():
 
 def test_ten_fields_come_first_and_tooltips_are_short():
     main, others = split_by_rank(effect_groups())
-    first = [control.path for group in main for control in group.main]
+    first = [control.path for group in main for control in group.main_controls]
     assert len(first) == 10 and "weather.smog.visibility_m" in first
     for group in main:
-        paths = {control.path for control in (*group.main, *group.rest.walk())}
+        paths = {control.path for control in (*group.main_controls, *group.secondary_group.walk())}
         assert paths == {control.path for control in group.walk()}  # none is lost
     assert {group.path for group in (*main, *others)} == set(SECTIONS)
     for group in (*main, *others):
@@ -170,39 +172,45 @@ def test_ten_fields_come_first_and_tooltips_are_short():
 # ---- What a page says ----------------------------------------------------------------------------
 
 
-def test_at_rest_is_said_of_the_whole_picture_of_the_wish_alone():
-    wish = Wish(Edits("clear"), 0, "front")
-    at_rest = ShownPicture(wish, 320, 180, 0.03, at=1.0, is_rest=True)
-    placing = Activity(PassProgress("placing snow", 12, 21))
+def test_at_rest_is_said_of_the_whole_picture_of_the_request_alone():
+    request = ViewRequest(Edits("clear"), 0, "front")
+    at_rest = ShownPicture(request, 320, 180, 0.03, sent_at=1.0, is_at_rest=True)
+    placing = Activity(PassProgress("finding exposed surfaces", 12, 21))
 
-    def said(shown: ShownPicture | None, wish: Wish, activity: Activity | None, **own: Any) -> str:
-        return page_status(shown, wish, activity, **{"waited_s": 0.0, "now": 1.1, **own}).text
+    def said(
+        shown: ShownPicture | None, request: ViewRequest, activity: Activity | None, **own: Any
+    ) -> str:
+        return page_status(shown, request, activity, **{"waited_s": 0.0, "now": 1.1, **own}).text
 
-    assert said(at_rest, wish, Activity()) == "320 x 180 at rest, 30 ms"
-    snowy = dataclasses.replace(wish, edits=Edits("fresh-snow"))
+    assert said(at_rest, request, Activity()) == "320 x 180 at rest, 30 ms"
+    snowy = dataclasses.replace(request, edits=Edits("fresh-snow"))
     assert said(at_rest, snowy, Activity()) == "Picture not of this recipe yet: drawing"
     assert said(at_rest, snowy, placing, waited_s=4.2) == (
-        "Picture not of this recipe yet: placing snow, step 12 of 21, 4 s"
+        "Picture not of this recipe yet: finding exposed surfaces, step 12 of 21, 4 s"
     )
     assert said(at_rest, snowy, Activity(compiling=1, compiled=3)) == (
         "Picture not of this recipe yet: compiling kernels (only the first time, 3 done)"
     )
     assert "waiting for the picture of another page" in said(at_rest, snowy, None)
-    assert "not of this view yet" in said(at_rest, dataclasses.replace(wish, frame=1), Activity())
-    assert "not up to date yet" in said(at_rest, dataclasses.replace(wish, boxes=True), Activity())
-    assert said(None, wish, Activity()) == "First picture: drawing"
-    rough = dataclasses.replace(at_rest, is_rest=False)
-    assert said(rough, wish, Activity()) == "320 x 180 while moving, 30 ms"
-    assert said(rough, wish, Activity(PassProgress("sky")), now=2.0) == (
+    assert "not of this view yet" in said(
+        at_rest, dataclasses.replace(request, frame=1), Activity()
+    )
+    assert "not up to date yet" in said(
+        at_rest, dataclasses.replace(request, boxes=True), Activity()
+    )
+    assert said(None, request, Activity()) == "First picture: drawing"
+    rough = dataclasses.replace(at_rest, is_at_rest=False)
+    assert said(rough, request, Activity()) == "320 x 180 while moving, 30 ms"
+    assert said(rough, request, Activity(PassProgress("sky")), now=2.0) == (
         "Rough picture, the whole one follows: drawing (sky)"
     )
     bare = dataclasses.replace(at_rest, is_complete=False)
-    assert said(bare, wish, Activity(PassProgress("LiDAR returns"))) == (
+    assert said(bare, request, Activity(PassProgress("LiDAR returns"))) == (
         "Picture, what lies over it follows: drawing (LiDAR returns)"
     )
     refused = dataclasses.replace(at_rest, is_valid=False)
-    assert "of the last recipe that was valid" in said(refused, wish, Activity())
-    assert said(at_rest, wish, Activity(), has_failed=True) == "Not drawn"
+    assert "of the last recipe that was valid" in said(refused, request, Activity())
+    assert said(at_rest, request, Activity(), has_failed=True) == "Not drawn"
     status = page_status(at_rest, snowy, placing, waited_s=4.2, now=9.0)
     assert status.share == pytest.approx(12 / 21) and status.is_long and not status.is_current
 
@@ -221,7 +229,7 @@ def test_what_is_drawn_at_rest_has_the_bits_of_a_rendered_image_whatever_else_is
 def test_a_camera_away_from_all_recorded_images_is_told():
     scene = open_street()
     own = scene.frames[0].cameras["front"]
-    assert away_sentence(scene, own) is None
+    assert distance_warning(scene, own) is None
     pose = own.world_from_camera
     for forward_m, up_m, turn_rad, said in (
         (1.0, 0.0, 0.0, None), (0.0, 1.9, 0.0, None), (0.0, 0.0, 0.2, None),
@@ -233,7 +241,7 @@ def test_a_camera_away_from_all_recorded_images_is_told():
         )
         tilt[1, 3], tilt[2, 3] = -up_m, forward_m
         camera = dataclasses.replace(own, camera_from_world=invert_rigid(pose @ tilt))
-        sentence = away_sentence(scene, camera)
+        sentence = distance_warning(scene, camera)
         assert (sentence is None) == (said is None), (forward_m, up_m, turn_rad, sentence)
         assert said is None or f"Outside of what was recorded: {said}" in str(sentence)
 
@@ -263,9 +271,9 @@ def test_of_two_fields_that_exclude_each_other_the_older_gives_way():
     with pytest.raises(RecipeError, match="keep one of them"):
         edits.recipe()
     others = ("weather.smog.scale_height_m", "weather.smog.visibility_m")
-    smog = edits.giving_way("weather.smog.extinction_per_m", others).recipe().weather.smog
+    smog = edits.without_conflict("weather.smog.extinction_per_m", others).recipe().weather.smog
     assert smog is not None and (smog.extinction_per_m, smog.visibility_m) == (0.1, None)
-    assert Edits("clear").giving_way("seed", others) == Edits("clear")
+    assert Edits("clear").without_conflict("seed", others) == Edits("clear")
 
 
 def test_a_saved_recipe_reads_back_with_its_files_and_replaces_none(tmp_path):
@@ -276,7 +284,7 @@ def test_a_saved_recipe_reads_back_with_its_files_and_replaces_none(tmp_path):
         edits = Edits("clear", folder=tmp_path).with_values({
             "style": '{"image": "uploads/photo.png"}', "render.scale": "0.5",
         })  # fmt: skip
-        recipe, path = edits.recipe(), free_path(tmp_path, "mood", ".yaml").with_suffix(".yaml")
+        recipe, path = edits.recipe(), unused_path(tmp_path, "mood", ".yaml").with_suffix(".yaml")
         save_recipe(recipe, path)
         assert load_recipe(path).resolve(0).hash == recipe.hash
     assert sorted(p.name for p in tmp_path.glob("*.yaml")) == ["mood-2.yaml", "mood.yaml"]

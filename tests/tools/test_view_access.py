@@ -22,7 +22,7 @@ from recipes.errors import RecipeError
 from recipes.load import load_recipe
 from tools.view import messages, text
 from tools.view.access import Access
-from tools.view.edits import create_file, free_path, renamed, save_recipe
+from tools.view.edits import create_file, rename_recipe, save_recipe, unused_path
 from tools.view.messages import FileTransferPart, FileTransferStartUpload, Uploads, read_message
 from tools.view.server import MAX_PIXELS, check_size, import_viser, serve
 from tools.view.widgets import options_of
@@ -351,7 +351,7 @@ def test_files_of_pages_replace_nothing_and_follow_no_link(tmp_path):
     assert create_file(folder, "fog", ".yaml", b"3").name == "fog-2.yaml"
     assert (folder / "fog.yaml").read_bytes() == b"precious" and first.read_bytes() == b"1"
     assert not (tmp_path / "outside").exists()
-    assert free_path(folder, "fog", ".yaml").name == "fog-3"
+    assert unused_path(folder, "fog", ".yaml").name == "fog-3"
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "uploads").symlink_to(tmp_path / "elsewhere")
@@ -364,13 +364,13 @@ def test_files_of_pages_replace_nothing_and_follow_no_link(tmp_path):
     os.symlink("nowhere", tmp_path / "mine.yaml")
     with pytest.raises(FileExistsError):
         save_recipe(recipe, tmp_path / "mine.yaml")
-    assert free_path(tmp_path, "mine", ".yaml").name == "mine-2"
+    assert unused_path(tmp_path, "mine", ".yaml").name == "mine-2"
 
 
 @pytest.mark.parametrize("name", ["", "..", "a/b", "x" * 65, "a b", "<b>", "a\n"])
 def test_a_bad_name_is_refused_in_our_words(name):
     with pytest.raises(RecipeError, match="1 to 64 letters") as raised:
-        renamed(load_recipe("clear").resolve(0), name)
+        rename_recipe(load_recipe("clear").resolve(0), name)
     assert "pydantic" not in str(raised.value)
 
 

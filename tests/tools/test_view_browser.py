@@ -119,17 +119,17 @@ def test_arrow_keys_move_the_slider_that_has_the_focus_and_else_the_camera(brows
             slider.press("ArrowRight", delay=200)
         at_rest(page)
         assert before * 1.05 < float(number.input_value()) < before * 1.2
-        smog = own.recipe(own.wish.edits).weather.smog
+        smog = own.recipe(own.request.edits).weather.smog
         assert smog is not None and smog.visibility_m == float(number.input_value())
         page.get_by_role("tab", name="Weather").press("ArrowRight", delay=500)
         page.wait_for_timeout(2000)
-        assert own.wish.pose is None  # neither has flown
+        assert own.request.pose is None  # neither has flown
         page.mouse.click(300, 250)
         page.keyboard.down("ArrowRight")
         page.wait_for_function("() => document.body.innerText.includes('not of this view yet')")
         page.keyboard.up("ArrowRight")
         at_rest(page)
-        assert own.wish.pose is not None
+        assert own.request.pose is not None
         page.close()
 
 
@@ -138,7 +138,9 @@ def test_a_new_preset_is_not_at_rest_before_its_own_picture_is_there(browser, tm
         page = opened(browser, url)
         page.get_by_label("preset").first.click()
         page.get_by_role("option", name="fresh-snow", exact=True).click()
-        page.wait_for_function("() => document.body.innerText.includes('placing snow, step')")
+        page.wait_for_function(
+            "() => document.body.innerText.includes('finding exposed surfaces, step')"
+        )
         assert "at rest" not in page.locator("body").inner_text()
         at_rest(page)
         camera = viewer.scene.frames[0].cameras["front"]

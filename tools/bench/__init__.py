@@ -69,7 +69,7 @@ def bench_effects(
     """
     results: dict[str, Any] = {}
     subject = _subject("scenes")
-    case = dataclasses.replace(subject.QUICK if quick else subject.WHOLE, photos=photos)
+    case = dataclasses.replace(subject.QUICK_CASE if quick else subject.FULL_CASE, photos=photos)
     for name in only:
         results[name] = subject.measure_effect(name, repeats, case, scene)
         _show(results[name], None)
@@ -147,7 +147,9 @@ def bench_gpu(
     if set(sections) != {"launches"}:
         _subject("harness").check_gpu()
     subject = _subject("gpu")
-    case = dataclasses.replace(subject.QUICK if quick else subject.WHOLE, placement=placement)
+    case = dataclasses.replace(
+        subject.QUICK_CASE if quick else subject.FULL_CASE, placement=placement
+    )
     timing = subject.Timing(repeats=repeats)
     result = subject.measure(case, sections or subject.SECTIONS, timing, minutes, json_file)
     if table is not None:
@@ -183,7 +185,7 @@ def bench_trade(
     subject = _subject("trade")
     if pictures is not None:
         subject.check_matplotlib()
-    case = subject.QUICK if quick else subject.WHOLE_CASE
+    case = subject.QUICK_CASE if quick else subject.FULL_CASE
     trade = subject.bench_trade(scene, recipe or subject.RECIPES, case, backend=device)
     printed_figures = subject.printable(trade.figures)
     written = list[Path]()

@@ -1,7 +1,8 @@
-"""Samples a second out of an output folder and of a scene that is rendered on the fly, and memory.
+"""`climategs bench dataset`: samples a second of the two datasets, and memory of a long manifest.
 
-The folder holds JPEGs of 960x540 of the procedural street with depth, boxes and calibration, or is
-one that is there already. Files are read once before, so that the disk does not count.
+`measure` reads samples from an output folder, and renders samples of a scene on the fly. The folder
+is the caller's, or one that is made here: JPEGs of 960x540 of the procedural street with depth,
+boxes and calibration. All files are read once before, so that the disk does not count.
 """
 
 from __future__ import annotations
@@ -39,11 +40,11 @@ from tools.bench.harness import (
 )
 from tools.bench.scenes import record_street, street_uri
 
-BATCH = 8
-CAMERAS = ("front", "front_left", "front_right", "back")
-DECODING = "decoding alone (cv2.imdecode)"
-# What is read of every sample: WeatherDataset's options. Images are compared with their checksums
-# where `verify` is not False.
+BATCH = 8  # The number of samples of a batch.
+CAMERAS = ("front", "front_left", "front_right", "back")  # The cameras of the street's samples.
+DECODING = "decoding alone (cv2.imdecode)"  # The row with which readings are compared.
+# The options of WeatherDataset by the row's name. Images are compared with their checksums unless
+# `verify` is False.
 READINGS: Mapping[str, dict[str, Any]] = {
     "image, uint8": {"load": ("image",), "image_type": "uint8", "verify": False},
     "image, uint8, verified": {"load": ("image",), "image_type": "uint8"},
@@ -56,23 +57,29 @@ READINGS: Mapping[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class DatasetCase:
-    """images: in the folder. scale: of 960x540. rows: of the manifest whose memory is taken. live:
-    images rendered on the fly. gaussians: of the street. workers: of DataLoaders. memory: whether
-    it is measured.
-    """
+    """The sizes that are measured."""
 
     images: int = 256
+    """The number of images in the folder that is made."""
     scale: float = 1.0
+    """The scale of its images, relative to 960x540."""
     rows: int = 1_000_000
+    """The number of rows of the manifest whose memory is measured."""
     live: int = 16
+    """The number of images that are rendered on the fly."""
     gaussians: int = 60_000
+    """The number of Gaussians of the street."""
     workers: tuple[int, ...] = (2, 1)
+    """The numbers of worker processes of DataLoaders, one measurement for each."""
     readings: tuple[str, ...] = tuple(READINGS)
+    """The names of the READINGS that are measured."""
     memory: bool = True
+    """True if memory is measured."""
 
 
-WHOLE = DatasetCase()
-QUICK = DatasetCase(images=32, rows=20_000, live=4)
+FULL_CASE = DatasetCase()  # The case of published figures.
+# The case of `--quick`.
+QUICK_CASE = DatasetCase(images=32, rows=20_000, live=4)
 
 
 def measure(
@@ -81,9 +88,16 @@ def measure(
     repeats: int = 3,
     case: DatasetCase | None = None,
 ) -> Figures:
-    """folder: an output folder with JPEG images to read; None makes one."""
+    """Measure both datasets and the memory of a long manifest.
+
+    Args:
+        quick: True for QUICK_CASE.
+        folder: An output folder with JPEG images; None makes one.
+        repeats: The number of rounds that count.
+        case: Sizes; None for FULL_CASE or QUICK_CASE.
+    """
     machine = machine_facts()
-    case = case or (QUICK if quick else WHOLE)
+    case = case or (QUICK_CASE if quick else FULL_CASE)
     with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
         scratch = Path(name)
         if folder is None:
@@ -93,9 +107,9 @@ def measure(
             record_street(folder, recipe, scale=case.scale, cameras=CAMERAS, **size)
         facts, rows = _read(folder, case, repeats)
         live = _render_live(case, repeats)
-        large = _write_manifest_of(scratch / "large", folder, case.rows)
+        large = _write_long_manifest(scratch / "large", folder, case.rows)
         table_mib = WeatherDataset(large).rows.batch.nbytes / 2**20
-        peak = peak_mib_in_subprocess(_opening_of, (large,)) if case.memory else None
+        peak = peak_mib_in_subprocess(_open_dataset, (large,)) if case.memory else None
     title = "{images} JPEGs of {width}x{height}, {kib:.0f} KiB each, batches of ".format(**facts)
     rates = ("what", "workers", "images/s")
     memory = ("rows", "MiB held", "MiB at most")
@@ -107,8 +121,11 @@ def measure(
     return figures("dataset", tables, machine=machine, **facts)
 
 
-def _write_manifest_of(target: Path, folder: Path, count: int) -> Path:
-    """The folder's manifest, a variant after the other, of images that are not there."""
+def _write_long_manifest(target: Path, folder: Path, count: int) -> Path:
+    """Write a manifest of `count` rows, without images, and return its folder.
+
+    The rows are those of the folder's manifest, again and again with other names of the variant.
+    """
     table = read_manifest(folder)
     pieces = []
     variant = table["variant"][0].as_py()
@@ -127,11 +144,13 @@ def _write_manifest_of(target: Path, folder: Path, count: int) -> Path:
     return target
 
 
-def _opening_of(folder: Path) -> Action:
+def _open_dataset(folder: Path) -> Action:
+    """Return an action that opens a folder."""
     return lambda: WeatherDataset(folder)
 
 
 def _read(folder: Path, case: DatasetCase, repeats: int) -> tuple[Figures, list[tuple]]:
+    """Return facts of the folder's images, and rows of all readings and of decoding alone."""
     dataset = WeatherDataset(folder)
     files = [(folder / path).read_bytes() for path in dataset.table["image_path"].to_pylist()]
     size = {name: dataset.rows.row(0)[name] for name in ("width", "height")}
@@ -147,7 +166,7 @@ def _read(folder: Path, case: DatasetCase, repeats: int) -> tuple[Figures, list[
 
 
 def _render_live(case: DatasetCase, repeats: int) -> list[tuple]:
-    """Samples of a scene in fog beside the same views without a DataLoader."""
+    """Rows of a scene in fog as a dataset, and of the same views rendered in a loop."""
     scene = open_scene(street_uri(-(-case.live // len(CAMERAS)), case.gaussians))
     recipe = load_recipe("dense-fog").resolve(0)
     recipe = recipe.model_copy(update={"output": Output(depth="none", labels=False)})
@@ -163,7 +182,7 @@ def _render_live(case: DatasetCase, repeats: int) -> list[tuple]:
 
 
 def _rates(seconds: Mapping[str, list[float]], workers: int, images: int) -> list[tuple]:
-    """Medians; the fraction is of the first case, round by round."""
+    """Rows of rates: medians, and the share of the first case's rate, round by round."""
     limit = next(iter(seconds.values()))
     return [
         (name, workers, images / spread(times)["median"], spread_ratio(limit, times)["median"])
@@ -172,7 +191,7 @@ def _rates(seconds: Mapping[str, list[float]], workers: int, images: int) -> lis
 
 
 def _pass_through(dataset: Dataset, workers: int) -> Callable[[], int]:
-    """One pass through a dataset, whose workers live on."""
+    """Return an action that reads a dataset once. Its worker processes live on between passes."""
     loader = DataLoader(
         dataset,
         batch_size=BATCH,
@@ -185,7 +204,7 @@ def _pass_through(dataset: Dataset, workers: int) -> Callable[[], int]:
 
 
 class _Decoding(Dataset):
-    """Decodes images that are in memory, and hands nothing on."""
+    """A dataset that decodes images from memory and returns nothing."""
 
     def __init__(self, files: Sequence[bytes]) -> None:
         self.files = files

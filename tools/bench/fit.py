@@ -1,6 +1,7 @@
-"""A reconstruction: the time of each stage of a step, memory, and how good a fit becomes.
+"""`climategs bench fit`: time of each stage of a training step, memory, and the scores of a fit.
 
-Steps are timed at a fixed number of splats, so that every step is alike: none are added or removed.
+Steps are timed at a fixed number of splats: no splats are added or removed, so that all steps are
+alike.
 """
 
 from __future__ import annotations
@@ -36,42 +37,67 @@ from tools.bench.scenes import record_street
 from tools.fit import NOMINAL_STEPS, fit_scene
 from tools.options import FitOptions
 
-UNTIMED = 6  # first steps: compiling, and every view of a short recording decoded once
-FIT_COLUMNS = ("fit", "steps", "PSNR dB", "SSIM", "FLIP", "depth median m", "90 % m",
-               "true depth median m", "90 % m", "minutes")  # fmt: skip
+# The number of steps before the first timed one. They compile kernels, and decode every view of a
+# short recording.
+NUM_UNTIMED_STEPS = 6
+# The columns of the table of a fit.
+FIT_COLUMNS = (
+    "fit",
+    "steps",
+    "PSNR dB",
+    "SSIM",
+    "FLIP",
+    "depth median m",
+    "90 % m",
+    "true depth median m",
+    "90 % m",
+    "minutes",
+)
 
 
 @dataclass(frozen=True)
 class FitCase:
-    """splats, steps: of the timed steps. frames, gaussians, cameras, render_scale: of the street's
-    recording. fit_steps: of the fit that is compared with the street's exact depth, 0 for none.
-    scale: of recorded images; street_scale: of those of the street.
-    """
+    """The sizes that are measured."""
 
     splats: int = 200_000
+    """The number of splats of the timed steps."""
     steps: int = 150
+    """The number of timed steps."""
     frames: int = 16
+    """The number of frames of the street's recording."""
     gaussians: int = 400_000
+    """The number of Gaussians of the recorded street."""
     cameras: tuple[str, ...] | None = None
+    """The names of the cameras of the street's recording; None for all."""
     render_scale: float = 1.0
+    """The scale of the street's recorded images."""
     fit_steps: int = 3000
+    """The number of steps of the fit that is compared with the street's exact depth; 0 for none."""
     scale: float = 0.25
+    """The scale at which images of the caller's scene are fitted."""
     street_scale: float = 0.5
+    """The scale at which the street's images are fitted."""
 
 
-WHOLE = FitCase()
-QUICK = FitCase(steps=20, frames=4, cameras=("front", "left", "back"), fit_steps=0)
+FULL_CASE = FitCase()  # The case of published figures.
+# The case of `--quick`.
+QUICK_CASE = FitCase(steps=20, frames=4, cameras=("front", "left", "back"), fit_steps=0)
 
 
 def measure(quick: bool = False, scene: str | None = None, case: FitCase | None = None) -> Figures:
-    """scene: raw data to time steps on; by default a drive down the procedural street is recorded,
-    and also fitted to every other frame.
+    """Measure the steps of a reconstruction, and a fit of the procedural street.
+
+    Args:
+        quick: True for QUICK_CASE.
+        scene: The address of raw data whose steps are timed. By default a drive down the
+            procedural street is recorded, and also fitted to every other frame.
+        case: Sizes; None for FULL_CASE or QUICK_CASE.
 
     Raises:
         ClimateGSError: the scene cannot be opened or has no recorded images.
     """
     machine = machine_facts()
-    case = case or (QUICK if quick else WHOLE)
+    case = case or (QUICK_CASE if quick else FULL_CASE)
     if scene is not None:
         steps, facts = time_steps(scene, case.scale, case)
         return figures("fit", [steps], machine=machine, scene=scene, **facts)
@@ -89,7 +115,7 @@ def measure(quick: bool = False, scene: str | None = None, case: FitCase | None 
 
 
 def _fit_table(uri: str, out: Path, truth: str, case: FitCase) -> Table:
-    """A fit of the street: its held-out views, and its depth beside the street's exact one."""
+    """Fit the street. Return the scores of held-out views, and of depth against the exact depth."""
     options = {"steps": case.fit_steps, "scale": case.street_scale, "truth": truth}
     report = fit_scene(FitOptions(scene=uri, out=out, **options)).report
     mean = report["mean"]
@@ -101,9 +127,20 @@ def _fit_table(uri: str, out: Path, truth: str, case: FitCase) -> Table:
 
 
 def time_steps(uri: str, scale: float, case: FitCase) -> tuple[Table, Figures]:
-    """Time `case.steps` steps after the first.
+    """Time `case.steps` training steps, after NUM_UNTIMED_STEPS steps.
 
-    Where the scene makes more than `case.splats` Gaussians, that many are taken.
+    If the scene has more than `case.splats` Gaussians, only that many are used.
+
+    Args:
+        uri: The address of the scene.
+        scale: The scale at which its images are fitted.
+        case: The sizes.
+
+    Returns:
+        The table of the stages, and facts.
+
+    Raises:
+        ClimateGSError: the scene has no recorded images.
     """
     scene = open_scene(uri)
     if not any(frame.image_paths for frame in scene.frames):
@@ -113,14 +150,14 @@ def time_steps(uri: str, scale: float, case: FitCase) -> tuple[Table, Figures]:
     scene = _thinned(scene, case.splats)
     source = RecordedViews(scene, scale=scale)
     for key in source.train:
-        source.load(key)  # as in a long run, where images come from memory
+        source.load(key)  # In a long run, images come from memory, too.
     before = begin_peak()
     started = time.perf_counter()
     warm_up()
     config = FitConfig(densify="none")
     tuning = Tuning(steps_per_sh_band=1)
     trainer = Trainer(scene, source, config, NOMINAL_STEPS, tuning=tuning)
-    for _ in range(UNTIMED):
+    for _ in range(NUM_UNTIMED_STEPS):
         trainer.run_step()
     warm_up_s = time.perf_counter() - started
     seconds = defaultdict(list)
@@ -150,7 +187,7 @@ def time_steps(uri: str, scale: float, case: FitCase) -> tuple[Table, Figures]:
 
 
 def _thinned(scene: Scene, splats: int) -> Scene:
-    """The scene with so many splats where it has more, left out evenly from the background."""
+    """Return a scene with no more than `splats` splats, evenly left out of the background."""
     count = len(scene.background) + sum(len(actor.gaussians) for actor in scene.actors)
     left = len(scene.background) - max(0, count - splats)
     if not 0 < left < len(scene.background):

@@ -1,8 +1,8 @@
-"""Floods: their cost, and how far pictures of the water and its mask are from what is known.
+"""Floods: their cost in a frame, and the errors of pictures of water and of its mask.
 
-Still, opaque water under the mirrored tier is compared with a picture made without the flood's
-own mirror: the Gaussians themselves are mirrored. Other tiers are compared with the mirrored one.
-Which pixels show water first is known on the procedural street by casting rays.
+Still, opaque water under the mirrored tier is compared with a picture that does not use the flood's
+mirror: here the Gaussians themselves are mirrored. Other tiers are compared with the mirrored tier.
+The true mask of water is known on the procedural street by casting rays.
 """
 
 from __future__ import annotations
@@ -40,13 +40,16 @@ from tools.bench.scenes import (
     recipe_of,
 )
 
-TIERS = ("sky", "screen_space", "mirrored")
-WAVES = ("still", "calm")
-OPAQUE = {"absorption_per_m": (1e6, 1e6, 1e6)}
-EDGE_PX = 3  # pixels this close to the water's border show two surfaces; splats overhang as far
-DARK = 2 / 255  # a black pixel, and what it is compared with when it should not be
-LIT = 8 / 255
-BLOCK = 32
+TIERS = ("sky", "screen_space", "mirrored")  # The reflections of a flood, the last one is exact.
+WAVES = ("still", "calm")  # The presets of waves that are measured.
+OPAQUE = {"absorption_per_m": (1e6, 1e6, 1e6)}  # The fields of water that light does not pass.
+# The distance from the water's border, pixels, within which a pixel shows two surfaces. Splats
+# extend as far over an edge.
+EDGE_PX = 3
+DARK = 2 / 255  # The largest channel of a black pixel.
+LIT = 8 / 255  # The least channel of the true pixel where a black pixel is an error.
+BLOCK = 32  # The side of the squares of which the worst is reported, pixels.
+# The mirror in the plane z = 0, [4, 4].
 MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
 
 
@@ -56,13 +59,16 @@ def flood_recipe(
     output: Output = PICTURE_ONLY,
     **other_effects: Any,
 ) -> Recipe:
+    """Return a recipe of a flood. other_effects: further fields of the flood."""
     fields = {**WATER, "reflection": reflection, "waves": {"preset": waves}, **other_effects}
     return recipe_of({"flood": fields}, output)
 
 
 def tables(case: EffectCase, repeats: int) -> list[Table]:
-    """Costs of every tier still and with waves, as pictures only; of Schlick's formula; of depth
-    and labels as by default; and of water below everything.
+    """Measure costs and errors of floods.
+
+    Costs are those of every tier, still and with waves, as pictures only; of Schlick's formula; of
+    the default depth and labels; and of water below everything.
     """
     default = Recipe()
     costs = {f"{t}, {w}": (flood_recipe(t, w), CLEAN) for t in TIERS for w in WAVES}
@@ -97,13 +103,16 @@ def tables(case: EffectCase, repeats: int) -> list[Table]:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """rgb [H, W, 3] in [0, 1]. water [H, W]: where the view shows it first."""
+    """A picture, and its mask of water."""
 
     rgb: np.ndarray
+    """[H, W, 3], in [0, 1]."""
     water: np.ndarray
+    """[H, W], bool. True where the view shows water first."""
 
 
 def draw_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Picture:
+    """Draw a view and its mask of water."""
     buffers = frame_of(scene, camera, recipe)()
     none = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     water = buffers.masks.get("water", none)
@@ -111,13 +120,21 @@ def draw_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Picture:
 
 
 def inside(water: np.ndarray) -> np.ndarray:
-    """The water's pixels at least EDGE_PX from its border; the image's border is none."""
+    """Return the mask without pixels within EDGE_PX of its border; the image's edge is none."""
     kernel = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
     return cv2.erode(water.astype(np.uint8), kernel, borderValue=1).astype(bool)
 
 
 def analytic_error(scene: Scene, camera: Camera, fresnel: str = "exact") -> dict[str, Any]:
-    """The mirrored tier at full resolution against mirrored Gaussians: still, opaque water."""
+    """Compare the mirrored tier at full resolution with mirrored Gaussians.
+
+    The water is still and opaque.
+
+    Args:
+        scene: The scene.
+        camera: The camera.
+        fresnel: The formula of the reflected share: "exact" or "schlick".
+    """
     recipe = flood_recipe(fresnel=fresnel, layers_px=1, **OPAQUE)
     picture = draw_picture(scene, camera, recipe)
     truth = mirrored_picture(scene, camera, recipe).clamp(0, 1).numpy()
@@ -130,15 +147,21 @@ def analytic_error(scene: Scene, camera: Camera, fresnel: str = "exact") -> dict
 
 
 def tier_error(scene: Scene, camera: Camera, reflection: str, waves: str) -> dict[str, Any]:
-    """A tier against the mirrored one under the same waves, inside the water."""
+    """Compare a tier with the mirrored tier under the same waves, inside the water."""
     tiers = (flood_recipe(tier, waves) for tier in (reflection, "mirrored"))
     return water_error(*(draw_picture(scene, camera, recipe) for recipe in tiers))
 
 
 def water_error(picture: Picture, truth: Picture) -> dict[str, Any]:
-    """psnr_db in the water; black_share of its pixels that are dark and should not be; worst_block:
-    mean channel error in 1/255 of the worst square of BLOCK px that is at least half water, and
-    worst_at, its column and row.
+    """Return the errors of a picture inside the water of the true one.
+
+    Returns:
+        psnr_db: PSNR in the water.
+        black_share: the share of its pixels that are dark and should not be.
+        p99: 99 % quantile of the mean channel error, 1/255.
+        worst_block: mean channel error, 1/255, of the worst square of BLOCK px that is at least
+            half water.
+        worst_at: column and row of that square.
     """
     mask = inside(truth.water)
     black = (picture.rgb.max(-1) < DARK) & (truth.rgb.max(-1) >= LIT) & mask
@@ -159,7 +182,7 @@ def water_error(picture: Picture, truth: Picture) -> dict[str, Any]:
 
 
 def mirror_gaussians(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians mirrored in their frame's plane z = 0.
+    """Mirror Gaussians in the plane z = 0 of their frame.
 
     With M = diag(1, 1, -1) the axes R become M R M, a rotation again, since an ellipsoid does not
     change when one of its axes is turned round; its axis vector is -M v. The colour seen along d
@@ -176,9 +199,10 @@ def mirror_gaussians(gaussians: Gaussians) -> Gaussians:
 
 
 def mirror_parts(parts: Sequence[PosedGaussians], level_z_m: float) -> list[PosedGaussians]:
-    """The parts mirrored in the plane z = level_z_m of the world.
+    """Mirror parts in the plane z = level_z_m of the world.
 
-    A mirrored pose would be no rigid motion. Mirrored once more in the part's own frame it is one.
+    A mirrored pose alone is no rigid motion. So it is mirrored once more in the part's frame, and
+    so are the part's Gaussians.
     """
     plane = MIRROR.clone()
     identity = torch.eye(4, dtype=torch.float64)
@@ -191,13 +215,13 @@ def mirror_parts(parts: Sequence[PosedGaussians], level_z_m: float) -> list[Pose
 
 
 def mirrored_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Float[Tensor, "H W 3"]:
-    """The flooded view, not clamped, of an eye above still, opaque water."""
+    """Draw the flooded view of an eye above still, opaque water, without clamping colours."""
     plan = make_plan(recipe, scene)
     medium = plan.effect_plans["flood"].data
     assert medium.waves.is_flat
 
     def layer(parts: Sequence[PosedGaussians], clip: HeightClip) -> tuple[Tensor, Tensor]:
-        """Premultiplied rgb [H, W, 3] and alpha [H, W, 1], float64."""
+        """Draw premultiplied rgb [H, W, 3] and alpha [H, W, 1], float64."""
         buffers = frozenset({RGB, ALPHA})
         out = rasterize(parts, camera, buffers=buffers, settings=plan.settings, clip=clip)
         return out.rgb.double(), out.alpha.double()[..., None]
@@ -219,25 +243,40 @@ def mirrored_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Float[Tens
 
 
 def fresnel_by_angles(cosine: np.ndarray, index: float) -> np.ndarray:
-    """Fresnel's laws of sines and tangents, from air into an index > 1; unpolarised.
+    """Return the reflected share of unpolarised light from air, by Fresnel's sines and tangents.
 
+    With i the angle of incidence and t that of refraction:
     Rs = (sin(i - t) / sin(i + t))^2 and Rp = (tan(i - t) / tan(i + t))^2, sin i = index sin t.
+
+    Args:
+        cosine: Cosine of the angle of incidence, any shape.
+        index: Index of refraction, above 1.
     """
     incident = np.arccos(np.clip(cosine, 0, 1))
     refracted = np.arcsin(np.sin(incident) / index)
-    steep = incident < 1e-4  # both quotients are 0 / 0 at 0; the limit is right to 1e-8 here
-    incident = np.where(steep, math.pi / 4, incident)
-    less = incident - refracted
-    more = incident + refracted
-    share = 0.5 * ((np.sin(less) / np.sin(more)) ** 2 + (np.tan(less) / np.tan(more)) ** 2)
-    return np.where(steep, ((index - 1) / (index + 1)) ** 2, share)
+    # Both quotients are 0 / 0 at normal incidence. Their limit is right to 1e-8 here.
+    is_normal = incident < 1e-4
+    incident = np.where(is_normal, math.pi / 4, incident)
+    angle_difference = incident - refracted
+    angle_sum = incident + refracted
+    share = 0.5 * (
+        (np.sin(angle_difference) / np.sin(angle_sum)) ** 2
+        + (np.tan(angle_difference) / np.tan(angle_sum)) ** 2
+    )
+    return np.where(is_normal, ((index - 1) / (index + 1)) ** 2, share)
 
 
 def water_masks(
     scene: Scene, truth: StreetTruth, frames: Sequence[int], *, scale: float
 ) -> list[list[str | float]]:
-    """By view: the share of its pixels whose mask of water is the true one; the same away from
-    silhouettes, beyond which splats reach a little; and how many of the pixels those are.
+    """Compare masks of water with the true ones, view by view.
+
+    Splats extend a little beyond silhouettes, so pixels away from silhouettes also count by
+    themselves.
+
+    Returns:
+        Rows of the view, the share of its pixels with the true mask, the same share away from
+        silhouettes, and the share of pixels that are away from silhouettes.
     """
     rows: list[list[str | float]] = []
     recipe = flood_recipe("sky")

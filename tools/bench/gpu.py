@@ -1,10 +1,15 @@
-"""Every figure that the GPU backend is judged by, in one run of minutes.
+"""`climategs bench gpu`: measure every figure that the GPU backend is judged by, within minutes.
 
-Sections run in the order of their weight, each in a process of its own: one that fails, and be it
-by a fault that leaves the GPU unusable to its process, or that finds no time left, is said to be
-missing, and the others count. Beside times stands the least that a picture can take: the longer of
-what its stages move, at the speed of a copy, and of its blends, at the speed of a kernel that does
-nothing else. What a frame launches is counted where there is no GPU, too.
+`measure` runs SECTIONS in the order of their importance and returns their figures, as tables and
+as facts. Each section runs in its own process. If a section fails, or if no time is left for it,
+its entry says why and the other sections still count. A section may even fail with a GPU fault
+that makes the GPU unusable for its process.
+
+Next to a measured time stands its floor, the least time that the work can take. The floor is the
+longer of two times: the time to move the bytes of the stages at the speed of a copy, and the time
+to do the blends at the speed of a kernel that only blends.
+
+The section "launches" counts the operations that a frame starts on a GPU. It runs without a GPU.
 """
 
 from __future__ import annotations
@@ -93,46 +98,65 @@ from tools.bench.snow import placement
 from tools.bench.style import fold
 from tools.output import write_json
 
-BACKEND = "cuda"
-BUFFERS = frozenset({RGB, ALPHA})
-SETTINGS = RasterSettings()
-MEDIUM = Fog(extinction_per_m=0.03, airlight_rgb=(0.7, 0.72, 0.75))
-STAGES = ("project", "list", "blend")
-PLACEMENTS = PASSES = 3  # that count
-START = "<!-- gpu: made by climategs bench gpu --table docs/performance.md -->"
-END = "<!-- end of gpu -->"
+BACKEND = "cuda"  # The backend that is measured.
+BUFFERS = frozenset({RGB, ALPHA})  # The buffers that the rasteriser draws.
+SETTINGS = RasterSettings()  # The rasteriser's settings, those of the reference image.
+# The fog of the rasteriser's frames with smog.
+FOG = Fog(extinction_per_m=0.03, airlight_rgb=(0.7, 0.72, 0.75))
+STAGES = ("project", "list", "blend")  # The stages of a frame on the GPU, in their order.
+NUM_PLACEMENTS = 3  # The number of times that snow is placed, after a round that does not count.
+NUM_PASSES = 3  # The number of frames whose passes are timed, after one that does not count.
+# The lines of the document between which the tables are written.
+START_MARKER = "<!-- gpu: made by climategs bench gpu --table docs/performance.md -->"
+END_MARKER = "<!-- end of gpu -->"
 
 
 @dataclass(frozen=True)
 class Timing:
-    """How often and by which clock. warm_up: rounds before the first that counts.
+    """How often and by which clock actions are timed.
 
-    From one action's mark to its next is the time on the GPU, its waiting for the host's launches
-    included; no action waits for the one before unless it does so by itself.
+    The clock marks the end of every action. The time between two marks is the time on the GPU,
+    including the time that the GPU waits for the host's launches. No action waits for the one
+    before it, unless its own code does so.
     """
 
     repeats: int = 30
+    """The number of rounds that count."""
     warm_up: int = 5
+    """The number of rounds before the first that counts."""
     clock: WallClock = field(default_factory=EventClock)
+    """The clock that marks the end of every action."""
 
     def rounds(
         self, actions: Mapping[str, Action], clock: WallClock | None = None
     ) -> dict[str, list[float]]:
+        """Return the seconds of every action in every round that counts.
+
+        Args:
+            actions: The actions by name; they take turns within a round.
+            clock: Another clock than the record's.
+        """
         return rounds(actions, self.repeats, warm_up=self.warm_up, clock=clock or self.clock)
 
 
 # ---- the least that a frame can take ------------------------------------------------------------
 
-LANES = 256  # pixels of a program that only blends
+LANES = 256  # The number of pixels that a program of `blend_only` blends.
 
 
 @triton.jit(do_not_specialize=["steps"])
 def blend_only(out, steps, alpha_max, alpha_min, LANES: tl.constexpr):
-    """LANES pixels of a row, each blended `steps` times with a splat that moves along the row.
+    """Blend LANES pixels of a row `steps` times with a splat that moves along the row.
 
-    What a rasteriser's inner loop does for a pixel and a splat once all that is the same for a row
-    is known: a Gaussian, an exponential, the two limits of alpha, transmittance, three colours. The
-    sums are written so that none of it can be left out. out: float32 [programs, LANES].
+    This is the work of a rasteriser's inner loop for one pixel and one splat, without everything
+    that is the same for a whole row: a Gaussian, an exponential, the two limits of alpha, the
+    transmittance and three colours. The sum is stored so that the compiler can leave nothing out.
+
+    Args:
+        out: [programs, LANES], float32. Receives the sum of transmittance and colours.
+        steps: The number of blends of each pixel.
+        alpha_max: The largest alpha of a splat.
+        alpha_min: The smallest alpha that is blended.
     """
     pixel = tl.arange(0, LANES)
     x = pixel.to(tl.float32)
@@ -155,24 +179,35 @@ def blend_only(out, steps, alpha_max, alpha_min, LANES: tl.constexpr):
 
 @dataclass(frozen=True)
 class Ceilings:
-    """bytes_per_s: read and written, of a copy. blends_per_s: of a pixel and a splat, with colour,
-    everything in registers.
-    """
+    """The highest speeds that the GPU reaches, measured."""
 
     bytes_per_s: float
+    """Bytes a second of a copy, read and written together."""
     blends_per_s: float
+    """Blends a second of one pixel with one splat, with colour and everything in registers."""
 
-    def ms(self, moved: float, blends: float = 0.0) -> float:
-        """The least that so many bytes and blends can take, one beside the other."""
-        return 1e3 * max(moved / self.bytes_per_s, blends / self.blends_per_s)
+    def ms(self, num_bytes: float, num_blends: float = 0.0) -> float:
+        """Return the least milliseconds for the bytes and the blends, both at the same time."""
+        return 1e3 * max(num_bytes / self.bytes_per_s, num_blends / self.blends_per_s)
 
 
 def measure_ceilings(
     timing: Timing, *, copy_bytes: int = 1 << 30, programs: int = 132 * 32, steps: int = 8192
 ) -> Ceilings:
-    """The load is far more than caches hold and launches take."""
-    device, count = gpu_device(), copy_bytes // 4
-    source, target = torch.ones(count, device=device), torch.zeros(count, device=device)
+    """Measure the GPU's ceilings with a copy and with a kernel that only blends.
+
+    The default load is far larger than the caches, and takes far longer than its launches.
+
+    Args:
+        timing: How often and by which clock both are timed.
+        copy_bytes: The size of the array that is copied.
+        programs: The number of programs of the blending kernel.
+        steps: The number of blends of each pixel.
+    """
+    device = gpu_device()
+    count = copy_bytes // 4
+    source = torch.ones(count, device=device)
+    target = torch.zeros(count, device=device)
     out = torch.zeros((programs, LANES), device=device)
 
     def blend() -> None:
@@ -180,65 +215,104 @@ def measure_ceilings(
         launch(blend_only, (programs,), out, steps, *limits, LANES=LANES, num_warps=8)
 
     seconds = timing.rounds({"copy": lambda: target.copy_(source), "blend": blend})
-    copy_s, blend_s = (statistics.median(each) for each in seconds.values())
+    copy_s, blend_s = (statistics.median(times) for times in seconds.values())
     return Ceilings(2 * 4 * count / copy_s, programs * LANES * steps / blend_s)
 
 
-def floor_of(
+def frame_floor(
     parts: Sequence[PosedGaussians], camera: Camera, images: RenderOutput, ceilings: Ceilings
 ) -> Figures:
-    """What a clean frame must move and blend by stage, counted, and the least that it can take.
+    """Count the bytes and blends of a clean frame's stages, and the least time that they can take.
 
-    Inputs are read once, results written once, of the colours those of splats in view: what a sort
-    moves besides, and records that several tiles read, are the price of how it is done.
+    Each input is read once and each result is written once. Colours are read only of splats in
+    view. What a sort moves on top, and records that several tiles read again, are the cost of an
+    implementation and do not count.
+
+    Args:
+        parts: The splats of the scene with their poses.
+        camera: The camera of the frame.
+        images: The frame, drawn.
+        ceilings: The GPU's highest speeds.
+
+    Returns:
+        Figures: bytes of all and of each stage, milliseconds of each stage and of the frame, and
+        numbers of splats, of pairs of splats and tiles, and of blends (`count_blends`).
     """
     splats = project(gather_inputs(parts, camera, SETTINGS, None, None, with_color=True))
     tiles = list_tiles(splats, camera, None)
-    counted = count_blends(splats, tiles, camera, SETTINGS)
-    count, visible = len(splats.keys), int((splats.counts > 0).sum())
-    record = splats.records.shape[1] * 4
-    geometry = count * 4 * (3 + 3 + 1) + visible * 4 * 4  # means, scales, opacities; quaternions
-    colors = sum(12 * part.gaussians.sh.shape[1] * len(part.gaussians) for part in parts)
-    keys = 2 * 4 * count  # of depth, and how many tiles
-    drawn = sum(image.nbytes for image in vars(images).values() if image is not None)
-    moved = {
-        "project": geometry + colors * visible // count + keys + visible * (record + 8),
-        "list": keys + visible * 8 + 4 * len(tiles.tile_splat_ids) + 4 * len(tiles.tile_offsets),
-        "blend": 4 * counted["entries"] + counted["used"] * record + drawn,
+    blend_counts = count_blends(splats, tiles, camera, SETTINGS)
+    num_splats = len(splats.keys)
+    num_visible = int((splats.counts > 0).sum())
+    record_bytes = splats.records.shape[1] * 4
+    # Of all splats the means, scales and opacities; of splats in view the quaternions, too.
+    geometry_bytes = num_splats * 4 * (3 + 3 + 1) + num_visible * 4 * 4
+    color_bytes = sum(12 * part.gaussians.sh.shape[1] * len(part.gaussians) for part in parts)
+    key_bytes = 2 * 4 * num_splats  # The key of depth, and the number of tiles.
+    image_bytes = sum(image.nbytes for image in vars(images).values() if image is not None)
+    stage_bytes = {
+        "project": geometry_bytes
+        + color_bytes * num_visible // num_splats
+        + key_bytes
+        + num_visible * (record_bytes + 8),
+        "list": key_bytes
+        + num_visible * 8
+        + 4 * len(tiles.tile_splat_ids)
+        + 4 * len(tiles.tile_offsets),
+        "blend": 4 * blend_counts["entries"] + blend_counts["used"] * record_bytes + image_bytes,
     }
-    ms = {n: ceilings.ms(m, counted["done"] if n == "blend" else 0) for n, m in moved.items()}
+    stage_ms = {
+        stage: ceilings.ms(num_bytes, blend_counts["done"] if stage == "blend" else 0)
+        for stage, num_bytes in stage_bytes.items()
+    }
     return {
-        "bytes": sum(moved.values()),
-        "bytes_of": moved,
-        "ms": {**ms, "frame": sum(ms.values())},
-        "splats": count,
-        "visible": visible,
+        "bytes": sum(stage_bytes.values()),
+        "bytes_of": stage_bytes,
+        "ms": {**stage_ms, "frame": sum(stage_ms.values())},
+        "splats": num_splats,
+        "visible": num_visible,
         "pairs": len(tiles.tile_splat_ids),
-        **counted,
+        **blend_counts,
     }
 
 
 def count_blends(
     splats: CudaSplats, tiles: CudaTiles, camera: Camera, settings: RasterSettings
 ) -> dict[str, int]:
-    """done: pixels and splats that are blended, as the image's definition asks. listed: pixels and
-    splats of the tiles' lists. reached: those of them before all pixels of a tile are finished.
-    entries: entries of lists that are reached. used: splats that are in one of those.
+    """Count the blends of a frame, tile by tile, in plain Torch.
+
+    Args:
+        splats: The projected splats.
+        tiles: The lists of splats of all tiles.
+        camera: The camera of the frame.
+        settings: The rasteriser's settings, with the transmittance at which a pixel is finished.
+
+    Returns:
+        Numbers by name.
+        done: pairs of a pixel and a splat that are blended, as the image's definition asks.
+        listed: pairs of a pixel and a splat in the tiles' lists.
+        reached: the listed pairs up to where all pixels of their tile are finished.
+        entries: entries of lists that are reached.
+        used: splats that are in a reached entry.
     """
-    stop, device = settings.transmittance_stop, splats.records.device
+    stop = settings.transmittance_stop
+    device = splats.records.device
     used = torch.zeros(len(splats.records), dtype=torch.bool, device=device)
-    found = torch.zeros(4, dtype=torch.int64, device=device)
+    totals = torch.zeros(4, dtype=torch.int64, device=device)
     offsets = tiles.tile_offsets.tolist()
     for tile, (first, last) in enumerate(itertools.pairwise(offsets)):
-        left, top = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
+        # Pixel centres of the tile.
+        left = TILE * (tile % tiles.columns)
+        top = TILE * (tile // tiles.columns)
         x, y = (
             torch.arange(low, min(low + TILE, end), device=device) + 0.5
             for low, end in ((left, camera.width), (top, camera.height))
         )
-        y, x = (each.reshape(-1) for each in torch.meshgrid(y, x, indexing="ij"))
+        y, x = (grid.reshape(-1) for grid in torch.meshgrid(y, x, indexing="ij"))
+        # Alpha of every entry of the list at every pixel.
         ids = tiles.tile_splat_ids[first:last].long()
         splat = splats.records[ids].T[..., None]  # [fields, entries, 1]
-        dx, dy = x - splat[MEAN_X], y - splat[MEAN_Y]
+        dx = x - splat[MEAN_X]
+        dy = y - splat[MEAN_Y]
         bend = splat[SHARP_X] * (dx - splat[LEAN_X] * dy)
         log_alpha = splat[LOG_OPACITY] - bend * bend - splat[FALL_Y] * dy * dy
         alpha = log_alpha.exp2().clamp(max=settings.alpha_max)
@@ -246,15 +320,16 @@ def count_blends(
         if splats.cuts is not None:
             cut = splats.cuts[ids].T[..., None]
             alpha = alpha * (cut[C_VALUE] + cut[C_X] * dx + cut[C_Y] * dy).clamp(0, 1)
+        # Transmittance behind and in front of every entry.
         after = (1 - alpha).cumprod(0)
         before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
-        blended = (alpha > 0) & (before > stop) & (after > min(stop, TRANSMITTANCE_STOP))
-        reached = (before > stop).any(1)
-        used[ids[reached]] = True
-        counts = (blended.sum(), alpha.numel(), reached.sum() * len(x), reached.sum())
-        found += torch.stack([torch.as_tensor(each, device=device) for each in counts])
+        is_blended = (alpha > 0) & (before > stop) & (after > min(stop, TRANSMITTANCE_STOP))
+        is_reached = (before > stop).any(1)
+        used[ids[is_reached]] = True
+        counts = (is_blended.sum(), alpha.numel(), is_reached.sum() * len(x), is_reached.sum())
+        totals += torch.stack([torch.as_tensor(count, device=device) for count in counts])
     names = ("done", "listed", "reached", "entries")
-    return {**dict(zip(names, found.tolist(), strict=True)), "used": int(used.sum())}
+    return {**dict(zip(names, totals.tolist(), strict=True)), "used": int(used.sum())}
 
 
 # ---- the rasteriser on the random scene ---------------------------------------------------------
@@ -263,69 +338,97 @@ def count_blends(
 def draw(
     parts: list[PosedGaussians], camera: Camera, fog: Fog | None = None, timer: Any = None
 ) -> RenderOutput:
+    """Draw a frame of posed splats on the GPU, in smog where `fog` is given."""
     return rasterize_cuda(parts, camera, BUFFERS, SETTINGS, fog, timer=timer)
 
 
 def measure_raster(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figures:
-    """Milliseconds on the GPU, from the call's first work to the finished images there; ours in
-    turns with gsplat's, where it can be had.
+    """Measure a frame of the random scene on the GPU: times, stages, memory and floor.
+
+    Times are milliseconds on the GPU, from the call's first work to the finished images in its
+    memory. Our frames take turns with gsplat's where gsplat can be run.
+
+    Args:
+        case: The random scene and the size of its image.
+        timing: How often and by which clock frames are timed.
+        ceilings: The GPU's highest speeds, for the floor.
     """
     gaussians, camera = random_scene(case)
     parts = [PosedGaussians(gaussians)]
-    frames = {"clean": lambda: draw(parts, camera), "smog": lambda: draw(parts, camera, MEDIUM)}
-    stages = []
-    for _ in range(timing.warm_up + timing.repeats):  # in frames of their own
+    frames = {"clean": lambda: draw(parts, camera), "smog": lambda: draw(parts, camera, FOG)}
+    # Stages are timed in separate frames, since their timer costs time.
+    timed_stages = []
+    for _ in range(timing.warm_up + timing.repeats):
         timer = CudaStageTimer()
         draw(parts, camera, timer=timer)
-        stages.append(timer.milliseconds())
-    peak, extra = peak_gpu_mib(frames["clean"])  # before gsplat's copy of the scene lies there, too
+        timed_stages.append(timer.milliseconds())
+    # Memory is measured before gsplat's copy of the scene lies on the GPU, too.
+    peak, extra = peak_gpu_mib(frames["clean"])
     first, second = ([getattr(draw(parts, camera), n).cpu() for n in sorted(BUFFERS)] for _ in "ab")
     draws = gsplat_draws(gaussians, camera)
-    others = {} if isinstance(draws, str) else draws
-    seconds, gsplat = timing.rounds({**frames, **others}), {"left_out": draws}
-    if others:
-        fastest = min(others, key=lambda name: statistics.median(seconds[name]))
+    gsplat_frames = {} if isinstance(draws, str) else draws
+    seconds = timing.rounds({**frames, **gsplat_frames})
+    gsplat = {"left_out": draws}
+    if gsplat_frames:
+        fastest = min(gsplat_frames, key=lambda name: statistics.median(seconds[name]))
         ratio = spread_ratio(seconds["clean"], seconds[fastest])
-        rgb = image_difference(draw(parts, camera).rgb, others[fastest]())
+        rgb = image_difference(draw(parts, camera).rgb, gsplat_frames[fastest]())
         gsplat = {"way": fastest, "ratio": ratio, "rgb": rgb}
     return {
         "case": case.name,
         "scene_mib": gaussians.nbytes / 2**20,
         "peak_mib": peak,
         "frame_mib": extra,
-        "stages_ms": {s: spread([each[s] for each in stages[timing.warm_up :]]) for s in STAGES},
+        "stages_ms": {
+            stage: spread([stage_ms[stage] for stage_ms in timed_stages[timing.warm_up :]])
+            for stage in STAGES
+        },
         "same_bits": all(map(torch.equal, first, second)),
-        "floor": floor_of(parts, camera, draw(parts, camera), ceilings),
-        "ms": {name: spread_ms(each) for name, each in seconds.items()},
+        "floor": frame_floor(parts, camera, draw(parts, camera), ceilings),
+        "ms": {name: spread_ms(times) for name, times in seconds.items()},
         "smog_over_clean": spread_ratio(seconds["smog"], seconds["clean"]),
         "gsplat": gsplat,
     }
 
 
 def gsplat_draws(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Tensor]] | str:
-    """Ways to draw the scene's rgb with gsplat, by name; or why there is none. The first draw of
-    each has been done: it compiles where gsplat was installed without compiled kernels.
+    """Return functions that draw the scene's rgb with gsplat, by name; or why there is none.
+
+    Each function has been called once: the first call compiles kernels where gsplat was installed
+    without them.
     """
     if importlib.util.find_spec("gsplat") is None:
         return "gsplat is not installed (pip install 'climategs[gsplat]')"
     try:
-        draws = {f"gsplat, {way}": _gsplat_draw(gaussians, camera, way == "packed")
-                 for way in ("packed", "unpacked")}  # fmt: skip
-        for each in draws.values():
-            each()
-    except Exception as error:  # another's code, which may fail in ways of its own
+        draws = {
+            f"gsplat, {mode}": _gsplat_draw(gaussians, camera, mode == "packed")
+            for mode in ("packed", "unpacked")
+        }
+        for draw_once in draws.values():
+            draw_once()
+    except Exception as error:  # gsplat's code may raise any type.
         return f"gsplat failed: {type(error).__name__}: {error}"
     return draws
 
 
 def _gsplat_draw(gaussians: Gaussians, camera: Camera, packed: bool) -> Callable[[], Tensor]:
+    """Return a function that draws the scene's rgb with gsplat. packed: gsplat's option."""
     from gsplat import rasterization  # type: ignore[import-not-found]
 
     device = gpu_device()
-    given = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities",
-             "colors": "sh"}  # fmt: skip
+    # Fields of Gaussians by gsplat's argument.
+    tensor_fields = {
+        "means": "means",
+        "quats": "quats",
+        "scales": "scales",
+        "opacities": "opacities",
+        "colors": "sh",
+    }
     arguments = {
-        **{k: getattr(gaussians, v).detach().contiguous().to(device) for k, v in given.items()},
+        **{
+            k: getattr(gaussians, v).detach().contiguous().to(device)
+            for k, v in tensor_fields.items()
+        },
         "viewmats": camera.camera_from_world.float().to(device)[None],
         "Ks": camera.K.float().to(device)[None],
         "width": camera.width,
@@ -348,49 +451,79 @@ def _gsplat_draw(gaussians: Gaussians, camera: Camera, packed: bool) -> Callable
 
 
 def frame_recipes(cell_m: float = 0.05) -> dict[str, Recipe]:
-    """What is timed: pictures only, at default settings or those of a tier. The balanced flood is
-    the reference's, mirrored reflection and all, but for what the tier takes back; the fast tier of
-    snow lights it per splat.
+    """Return the recipes of the timed frames by name.
+
+    They draw pictures only, with default settings or those of a tier. The balanced flood is the
+    reference's flood, with its mirrored reflection, except for the settings that the tier lowers.
+    The fast tier of snow lights snow per splat.
+
+    Args:
+        cell_m: Edge of the cells of the snow, metres.
     """
-    calm = {**WATER, "waves": {"preset": "calm"}}
-    layer, overcast = {"depth_m": 0.1, "cell_m": cell_m}, {"style": {"preset": "overcast"}}
+    flood = {**WATER, "waves": {"preset": "calm"}}
+    snow = {"depth_m": 0.1, "cell_m": cell_m}
+    overcast = {"style": {"preset": "overcast"}}
     weather = {
         "smog": {"visibility_m": 400.0, "scale_height_m": 120.0},
         "flood": {"level_m": 0.15, "turbidity_ntu": 20.0},
-        "snow": layer,
+        "snow": snow,
     }
-    wet = {name: recipe_of({"flood": {**calm, "reflection": name}})
-           for name in ("mirrored", "screen_space")}  # fmt: skip
+    floods = {
+        name: recipe_of({"flood": {**flood, "reflection": name}})
+        for name in ("mirrored", "screen_space")
+    }
     return {
         "clean": CLEAN,
         "smog": recipe_of({"smog": {"visibility_m": 200}}),
-        "flood balanced": balanced(wet["mirrored"]),
-        "flood balanced, screen space": balanced(wet["screen_space"], "weather.flood.reflection"),
-        "snow fast tier": recipe_of({"snow": {**layer, "shading": "per_splat"}}),
-        "snow per pixel": recipe_of({"snow": {**layer, "shading": "per_pixel"}}),
+        "flood balanced": with_balanced_tier(floods["mirrored"]),
+        "flood balanced, screen space": with_balanced_tier(
+            floods["screen_space"], "weather.flood.reflection"
+        ),
+        "snow fast tier": recipe_of({"snow": {**snow, "shading": "per_splat"}}),
+        "snow per pixel": recipe_of({"snow": {**snow, "shading": "per_pixel"}}),
         "style": recipe_of(overcast),
-        "all at once, balanced": balanced(recipe_of({**weather, **overcast})),
+        "all at once, balanced": with_balanced_tier(recipe_of({**weather, **overcast})),
     }
 
 
-def balanced(recipe: Recipe, *kept: str) -> Recipe:
-    """The recipe as `quality: balanced` would set it, all it gives itself too, but for `kept`."""
+def with_balanced_tier(recipe: Recipe, *excluded_paths: str) -> Recipe:
+    """Return the recipe with the settings of `quality: balanced`.
+
+    The tier also replaces settings that the recipe gives.
+
+    Args:
+        recipe: The recipe.
+        excluded_paths: Dotted paths of settings that keep the recipe's value.
+    """
     tier = TIERS["balanced"]
-    knobs = (knob for knob in knobs_of(recipe) if knob.is_selectable and knob.path not in kept)
+    knobs = (
+        knob for knob in knobs_of(recipe) if knob.is_selectable and knob.path not in excluded_paths
+    )
     return with_settings(recipe, {knob.path: tier.get(knob.path, knob.reference) for knob in knobs})
 
 
 def measure_frames(
     scene: Scene, camera: Camera, recipes: Mapping[str, Recipe], timing: Timing
 ) -> Figures:
-    """Every recipe's frame, in turns. ms: on the GPU, to finished floats there. delivered: 8 bits
-    on the host.
+    """Measure every recipe's frame of a scene on the GPU; the recipes take turns.
+
+    Args:
+        scene: The scene.
+        camera: The camera of the frames.
+        recipes: Recipes by name; "clean" is the one that others are compared with.
+        timing: How often and by which clock frames are timed.
+
+    Returns:
+        Figures; of each frame "ms" (on the GPU, to finished floats in its memory), "delivered"
+        (8-bit pictures on the host, see `_delivered`), memory, and whether two frames are equal.
     """
     rows: dict[str, Figures] = {}
-    scenes = {name: dataclasses.replace(scene) for name in recipes}  # each has a memo of its own
+    # Every recipe gets a copy of the scene, since a scene caches what effects place in it.
+    scenes = {name: dataclasses.replace(scene) for name in recipes}
     actions = {n: frame_of(scenes[n], camera, recipe, BACKEND) for n, recipe in recipes.items()}
-    for name, frame in actions.items():  # one after the other: nobody else's snow counts as memory
-        frame()  # compiles, copies the scene and places what stays with it
+    # The first frames run one after the other, so that no other recipe's snow counts as memory.
+    for name, frame in actions.items():
+        frame()  # This compiles kernels, copies the scene and places what stays with it.
         peak, extra = peak_gpu_mib(frame)
         same_bits = torch.equal(frame().rgb.cpu(), frame().rgb.cpu())
         rows[name] = {"peak_mib": peak, "frame_mib": extra, "same_bits": same_bits}
@@ -407,11 +540,14 @@ def measure_frames(
 
 
 def _delivered(scene: Scene, camera: Camera, recipe: Recipe, timing: Timing) -> Figures:
-    """Milliseconds of the host's clock to pictures in 8 bits that lie there: of a view alone, and
-    of each of a row of them in which the next is begun before the last is waited for.
+    """Milliseconds of the host's clock until an 8-bit picture is in the host's memory.
+
+    Returns:
+        Figures: "ms" of a single view, and "row_ms" of a view in a sequence in which the next view
+        is begun before the last one is waited for.
     """
     view = functools.partial(render_view, scene, camera, recipe, backend=BACKEND)
-    alone = spread_ms(timing.rounds({"": view}, WallClock())[""])
+    single_ms = spread_ms(timing.rounds({"": view}, WallClock())[""])
     start = time.perf_counter()
     pending = begin_view(scene, camera, recipe, backend=BACKEND)
     for _ in range(timing.repeats):
@@ -419,48 +555,54 @@ def _delivered(scene: Scene, camera: Camera, recipe: Recipe, timing: Timing) -> 
         pending.result()
         pending = following
     pending.result()
-    return {"ms": alone, "row_ms": 1e3 * (time.perf_counter() - start) / (timing.repeats + 1)}
+    return {"ms": single_ms, "row_ms": 1e3 * (time.perf_counter() - start) / (timing.repeats + 1)}
 
 
 def measure_passes(scene: Scene, camera: Camera, recipes: Mapping[str, Recipe]) -> Figures:
-    """Milliseconds of every pass of a frame on the GPU and on the CPU, each waited for."""
-    found: Figures = {}
+    """Measure every pass of a recipe's frame on both backends, waiting for each; milliseconds."""
+    recipe_passes: Figures = {}
     for name, recipe in recipes.items():
-        own, found[name] = dataclasses.replace(scene), {}
+        scene_copy = dataclasses.replace(scene)
+        recipe_passes[name] = {}
         for backend in (BACKEND, CPU):
-            _, stages = time_frames(own, camera, {"": recipe}, PASSES, backend)
-            found[name][backend] = stages[""]
-    return {"passes": found}
+            _, stages = time_frames(scene_copy, camera, {"": recipe}, NUM_PASSES, backend)
+            recipe_passes[name][backend] = stages[""]
+    return {"passes": recipe_passes}
 
 
 # ---- what a frame launches ----------------------------------------------------------------------
 
-# Of torch's operations those that compute nothing: they make memory, or fetch a number.
-IDLE = ("empty", "new_empty", "_local_scalar_dense")
+# The first letters of torch operations that compute nothing: they reserve memory or read a number.
+IDLE_OPERATIONS = ("empty", "new_empty", "_local_scalar_dense")
 
 
 class TorchOps(TorchDispatchMode):
-    """Counts operations that would start a kernel on a GPU: all but views and IDLE ones."""
+    """Counts torch operations that start a kernel on a GPU: all but views and IDLE_OPERATIONS."""
 
     count = 0
+    """The number of operations so far."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         is_view = any(r.alias_info and not r.alias_info.is_write for r in func._schema.returns)
-        self.count += not (is_view or func.__name__.startswith(IDLE))
+        self.count += not (is_view or func.__name__.startswith(IDLE_OPERATIONS))
         return func(*args, **(kwargs or {}))
 
 
 @contextmanager
 def interpreted_kernels() -> Iterator[list[float]]:
-    """Seconds of each of Triton's kernels inside, whose own torch operations nobody counts."""
+    """Yield a list that receives the seconds of every Triton kernel that is interpreted inside.
+
+    Torch operations of the interpreter itself are not counted by TorchOps.
+    """
     from triton.runtime.interpreter import GridExecutor
 
-    run, seconds = GridExecutor.__call__, []
+    run = GridExecutor.__call__
+    seconds = []
 
-    def timed_run(*arguments: Any, **given: Any) -> None:
+    def timed_run(*arguments: Any, **options: Any) -> None:
         start = time.perf_counter()
         with _disable_current_modes():
-            run(*arguments, **given)
+            run(*arguments, **options)
         seconds.append(time.perf_counter() - start)
 
     GridExecutor.__call__ = timed_run
@@ -471,15 +613,24 @@ def interpreted_kernels() -> Iterator[list[float]]:
 
 
 def count_launches(scene: Scene, camera: Camera, recipes: Mapping[str, Recipe]) -> Figures:
-    """Of a frame to floats on the GPU: torch's operations and Triton's kernels, which do not depend
-    on sizes; host_ms: the time of all but the kernels, of a picture so small that operations take
-    no longer than it takes to start them. Needs no GPU: kernels are interpreted.
+    """Count the operations that a frame starts on a GPU, with interpreted kernels and no GPU.
+
+    Args:
+        scene: The scene.
+        camera: The camera. Its picture must be so small that an operation takes no longer than its
+            start.
+        recipes: Recipes by name.
+
+    Returns:
+        Figures; of each frame to finished floats "torch" (torch's operations) and "triton"
+        (Triton's kernels), which do not depend on sizes, and "host_ms" (milliseconds of everything
+        but the kernels).
     """
-    found: Figures = {}
+    launches: Figures = {}
     for name, recipe in recipes.items():
-        own = dataclasses.replace(scene)
-        frame_of(own, camera, recipe, CPU)()  # places what stays with the scene
-        frame = frame_of(own, camera, recipe, BACKEND)
+        scene_copy = dataclasses.replace(scene)
+        frame_of(scene_copy, camera, recipe, CPU)()  # This places what stays with the scene.
+        frame = frame_of(scene_copy, camera, recipe, BACKEND)
         frame()
         with interpreted_kernels() as kernels:
             start = time.perf_counter()
@@ -487,14 +638,18 @@ def count_launches(scene: Scene, camera: Camera, recipes: Mapping[str, Recipe]) 
             host_s = time.perf_counter() - start - sum(kernels)
         with interpreted_kernels() as kernels, TorchOps() as ops:
             frame()
-        found[name] = {"torch": ops.count, "triton": len(kernels), "host_ms": 1e3 * host_s}
-    return {"launches": found}
+        launches[name] = {"torch": ops.count, "triton": len(kernels), "host_ms": 1e3 * host_s}
+    return {"launches": launches}
 
 
 def interpreted_street() -> tuple[Scene, Camera]:
-    """The street's frame and sky around a road and a wall of few splats, for an interpreter."""
+    """Return a scene so small that kernels can be interpreted, and a camera of 24 x 16 pixels.
+
+    The scene has a road and a wall of few splats, with the frames and the sky of the street.
+    """
     x, y = np.meshgrid(np.arange(3.0, 13.0, 2), np.arange(-4.0, 5.0, 2))
-    road, wall = np.stack([x, y, 0 * x], -1), np.stack([0 * x + 13, y, (x - 3) / 2], -1)
+    road = np.stack([x, y, 0 * x], -1)
+    wall = np.stack([0 * x + 13, y, (x - 3) / 2], -1)
     means = torch.from_numpy(np.concatenate([road, wall])).reshape(-1, 3).float()
     count = len(means)
     scales = torch.tensor([[1.2, 1.2, 0.02], [0.02, 1.2, 1.2]]).repeat_interleave(count // 2, 0)
@@ -511,11 +666,17 @@ def interpreted_street() -> tuple[Scene, Camera]:
 
 
 def measure_fold(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figures:
-    """Folding one map and writing the mapped SH of random Gaussians of degree 3, on the GPU."""
-    own, _ = random_scene(case)
-    fields = {f.name: getattr(own, f.name) for f in dataclasses.fields(own)}
+    """Measure the fold of one colour map into the SH of random Gaussians of degree 3, on the GPU.
+
+    Args:
+        case: The random scene.
+        timing: How often and by which clock the fold is timed.
+        ceilings: The GPU's highest speeds, for the floor.
+    """
+    host_gaussians, _ = random_scene(case)
+    fields = {f.name: getattr(host_gaussians, f.name) for f in dataclasses.fields(host_gaussians)}
     tensors = {k: v.to(gpu_device()) for k, v in fields.items() if isinstance(v, Tensor)}
-    gaussians = dataclasses.replace(own, **tensors)
+    gaussians = dataclasses.replace(host_gaussians, **tensors)
     out = torch.empty_like(gaussians.sh)
     action = fold(gaussians, 1, out, BACKEND)
     action()
@@ -525,7 +686,13 @@ def measure_fold(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figure
 
 
 def measure_placement(scene: Scene, uri: str, cell_m: float = 0.05) -> Figures:
-    """Seconds of finding where snow can lie, for all cameras, on the host's clock."""
+    """Measure the search for places where snow can lie, for all cameras, by the host's clock.
+
+    Args:
+        scene: The scene.
+        uri: The address of the scene, for the report.
+        cell_m: Edge of the cells of the snow, metres.
+    """
     place = placement(scene, cell_m, BACKEND)
     return {
         "scene": scene.name,
@@ -533,32 +700,36 @@ def measure_placement(scene: Scene, uri: str, cell_m: float = 0.05) -> Figures:
         "gaussians": len(scene.background) + sum(len(a.gaussians) for a in scene.actors),
         "cameras": len(all_cameras(scene)),
         "cells": len(place().ground),
-        "place_s": spread(rounds({"place": place}, PLACEMENTS)["place"]),
+        "place_s": spread(rounds({"place": place}, NUM_PLACEMENTS)["place"]),
         "peak_mib": peak_gpu_mib(place)[0],
     }
 
 
 @torch.no_grad()
 def raster_agreement(case: RasterCase) -> Figures:
-    """How far the GPU's colours are from the CPU backend's, without and with smog."""
+    """Compare the GPU's colours of the random scene with the CPU backend's, clean and in smog."""
     from augment.render.cpu.driver import rasterize_cpu
 
     gaussians, camera = random_scene(case)
-    parts, found = [PosedGaussians(gaussians)], {}
-    for name, fog in (("clean", None), ("smog", MEDIUM)):
+    parts = [PosedGaussians(gaussians)]
+    differences = {}
+    for name, fog in (("clean", None), ("smog", FOG)):
         expected = rasterize_cpu(parts, camera, BUFFERS, SETTINGS, fog).rgb
-        found[name] = image_difference(draw(parts, camera, fog).rgb, expected)
-    return found
+        differences[name] = image_difference(draw(parts, camera, fog).rgb, expected)
+    return differences
 
 
 def frame_agreement(scene: Scene, camera: Camera, recipes: Mapping[str, Recipe]) -> Figures:
-    """The same by recipe; snow lies where one of them found a place for it."""
-    found = {}
+    """Compare the GPU's colours of every recipe's frame with the CPU backend's.
+
+    Both backends use the same places of snow: the scene caches them for the second.
+    """
+    differences = {}
     for name, recipe in recipes.items():
-        own = dataclasses.replace(scene)
-        images = [frame_of(own, camera, recipe, backend)().rgb for backend in (BACKEND, CPU)]
-        found[name] = image_difference(*images)
-    return found
+        scene_copy = dataclasses.replace(scene)
+        images = [frame_of(scene_copy, camera, recipe, backend)().rgb for backend in (BACKEND, CPU)]
+        differences[name] = image_difference(*images)
+    return differences
 
 
 # ---- sections -----------------------------------------------------------------------------------
@@ -566,30 +737,46 @@ def frame_agreement(scene: Scene, camera: Camera, recipes: Mapping[str, Recipe])
 
 @dataclass(frozen=True)
 class GpuCase:
-    """raster: the random scene. street: of the weathered frames, width x height pixels. placement:
-    scenes for snow, besides the street. cell_m: of the snow. load: as measure_ceilings takes it.
-    """
+    """The scenes and sizes that the sections measure."""
 
     raster: RasterCase = LARGE_CASE
+    """The random scene of the rasteriser."""
     street: str = street_uri(gaussians=1_000_000)
+    """The address of the scene of the weathered frames."""
     width: int = 1600
+    """The width of the weathered frames, pixels."""
     height: int = 1066
+    """The height of the weathered frames, pixels."""
     placement: tuple[str, ...] = ()
+    """The addresses of scenes in which snow is placed, besides the street."""
     cell_m: float = 0.05
+    """The edge of the cells of the snow, metres."""
     load: Mapping[str, int] = field(default_factory=dict)
+    """Keyword arguments of `measure_ceilings`: the size of its load."""
 
     def open_street(self) -> tuple[Scene, Camera]:
+        """Return the street and the camera of the weathered frames."""
         scene = open_scene(self.street)
         return scene, water_camera(scene, self.width, self.height, BACKEND)
 
 
-WHOLE, QUICK = GpuCase(), GpuCase(SMALL_CASE, street_uri(), width=640, height=426)
-CEILINGS, LAUNCHES = "ceilings", "launches"
+FULL_CASE = GpuCase()  # The case of published figures.
+QUICK_CASE = GpuCase(SMALL_CASE, street_uri(), width=640, height=426)  # The case of `--quick`.
+CEILINGS = "ceilings"  # The section that measures the GPU's highest speeds.
+LAUNCHES = "launches"  # The section that needs no GPU.
+# The names of all sections, in the order in which they run.
 SECTIONS = (CEILINGS, "raster", "style", "frames", "passes", "placement", "agreement", LAUNCHES)
 
 
 def run_section(name: str, case: GpuCase, timing: Timing, ceilings: Ceilings | None) -> Figures:
-    """One of SECTIONS; ceilings: None for their own."""
+    """Measure one section.
+
+    Args:
+        name: One of SECTIONS.
+        case: The scenes and sizes.
+        timing: How often and by which clock actions are timed.
+        ceilings: The GPU's highest speeds; None for the sections CEILINGS and LAUNCHES.
+    """
     recipes = frame_recipes(case.cell_m)
     match name:
         case "ceilings":
@@ -608,145 +795,202 @@ def run_section(name: str, case: GpuCase, timing: Timing, ceilings: Ceilings | N
         case "launches":
             return count_launches(*interpreted_street(), frame_recipes(cell_m=0.4))
     uris = (*case.placement, case.street)
-    found = [measure_placement(open_scene(uri), uri, case.cell_m) for uri in uris]
-    return {"scenes": [{**each, "named": each["uri"] != case.street} for each in found]}
+    placements = [measure_placement(open_scene(uri), uri, case.cell_m) for uri in uris]
+    return {"scenes": [{**entry, "named": entry["uri"] != case.street} for entry in placements]}
 
 
 def measure(
-    case: GpuCase = WHOLE,
+    case: GpuCase = FULL_CASE,
     sections: Sequence[str] = SECTIONS,
     timing: Timing | None = None,
     minutes: float = 9.0,
     json_file: Path | None = None,
     in_processes: bool = True,
 ) -> Figures:
-    """minutes: after which no further section begins, and one that runs is stopped. json_file: gets
-    the figures after every section. in_processes: each section in one of its own.
+    """Measure sections of the GPU bench and return their figures.
+
+    Args:
+        case: The scenes and sizes.
+        sections: Names out of SECTIONS.
+        timing: How often and by which clock actions are timed; None for the default.
+        minutes: The time after which no further section begins and a running one is stopped.
+        json_file: The file that receives the figures after every section.
+        in_processes: True if each section runs in its own process.
 
     Raises:
-        ValueError: no such section.
+        ValueError: `sections` has an unknown name.
     """
     unknown = sorted(set(sections) - set(SECTIONS))
     if unknown:
         raise ValueError(f"sections are {', '.join(SECTIONS)}; got {', '.join(unknown)}")
-    timing, start, machine = timing or Timing(), time.perf_counter(), machine_facts()
-    found: Figures = {name: {"left_out": "not asked for"} for name in SECTIONS}
-    asked = {*sections, *([] if set(sections) == {LAUNCHES} else [CEILINGS])}
+    timing = timing or Timing()
+    start = time.perf_counter()
+    machine = machine_facts()
+    facts: Figures = {name: {"left_out": "not asked for"} for name in SECTIONS}
+    # All sections but LAUNCHES need the ceilings for their floors.
+    requested = {*sections, *([] if set(sections) == {LAUNCHES} else [CEILINGS])}
     ceilings: Ceilings | None = None
-    for name in (name for name in SECTIONS if name in asked):
+    for name in (name for name in SECTIONS if name in requested):
         if name not in (CEILINGS, LAUNCHES) and ceilings is None:
-            found[name] = {"left_out": "the GPU's ceilings could not be measured"}
+            facts[name] = {"left_out": "the GPU's ceilings could not be measured"}
             continue
         left_s = 60 * minutes - (time.perf_counter() - start)
         work = (run_section, (name, case, timing, ceilings))
         with mock.patch.dict(os.environ, {"TRITON_INTERPRET": "1"} if name == LAUNCHES else {}):
-            found[name] = run_in_subprocess(*work, left_s) if in_processes else run_and_time(*work)
-        if "bytes_per_s" in found[name]:
-            ceilings = Ceilings(found[name]["bytes_per_s"], found[name]["blends_per_s"])
-        write_json(json_file, gpu_figures(found, timing, machine), say=False)
-    return gpu_figures(found, timing, machine)
+            facts[name] = run_in_subprocess(*work, left_s) if in_processes else run_and_time(*work)
+        if "bytes_per_s" in facts[name]:
+            ceilings = Ceilings(facts[name]["bytes_per_s"], facts[name]["blends_per_s"])
+        write_json(json_file, gpu_figures(facts, timing, machine), say=False)
+    return gpu_figures(facts, timing, machine)
 
 
 # ---- figures to reach, and tables ---------------------------------------------------------------
 
 
 class Target(NamedTuple):
-    """What the backend is to reach on one H200. most: in the unit. value: of a section's facts, a
-    spread or a number; raises _Missing where it was not measured.
-    """
+    """A figure that the backend must reach on one H200."""
 
-    what: str
+    title: str
+    """The words of the table's row."""
     unit: str
-    most: float
+    """The symbol of the unit; empty for a pure number."""
+    limit: float
+    """The largest value that meets the target, in the unit."""
     section: str
+    """The name of the section that measures the figure."""
     value: Callable[[Figures], Any]
+    """A function from the section's facts to the figure, a spread or a number. It raises _Missing
+    if the figure was not measured.
+    """
     has_floor: bool = False
+    """True if the section's facts have a floor of the figure."""
 
 
 class _Missing(Exception):
-    """Why a figure was not measured."""
+    """Raised with the reason why a figure was not measured."""
 
 
 def _gsplat_ratio(raster: Figures) -> Figures:
+    """Return the time of our clean frame over gsplat's, from facts of the section "raster"."""
     if "left_out" in raster["gsplat"]:
         raise _Missing(raster["gsplat"]["left_out"])
     return raster["gsplat"]["ratio"]
 
 
 def _slowest_named(placement: Figures) -> Figures:
-    """The procedural street alone decides nothing."""
-    named = [each["place_s"] for each in placement["scenes"] if each["named"]]
-    if not named:
+    """Return the seconds of the slowest scene that the caller named; the street does not count."""
+    spreads = [entry["place_s"] for entry in placement["scenes"] if entry["named"]]
+    if not spreads:
         raise _Missing("no scene was named with --placement")
-    return max(named, key=lambda seconds: seconds["median"])
+    return max(spreads, key=lambda seconds: seconds["median"])
 
 
-def _gigabytes(*peaks: float | None) -> float:
-    known = [mib for mib in peaks if mib is not None]
-    if len(known) < len(peaks):
+def _max_gigabytes(*peaks: float | None) -> float:
+    """Return the largest of peaks in MiB as gigabytes."""
+    measured_mib = [mib for mib in peaks if mib is not None]
+    if len(measured_mib) < len(peaks):
         raise _Missing("no GPU memory was measured")
-    return max(known) * 2**20 / 1e9
+    return max(measured_mib) * 2**20 / 1e9
 
 
-def _worst(errors: Figures) -> float:
-    return max(each["p999"] for each in errors.values())
+def _max_p999(errors: Figures) -> float:
+    """Return the largest 99.9th percentile of several image differences."""
+    return max(difference["p999"] for difference in errors.values())
 
 
+# The figures to reach, in the order of the table.
 TARGETS = (
     Target("clean frame", "ms", 3.0, "raster", lambda f: f["ms"]["clean"], has_floor=True),
     Target("smog in splats, over clean", "x", 1.1, "raster", lambda f: f["smog_over_clean"]),
-    Target("street: smog, over clean", "x", 1.1, "frames",
-           lambda f: f["frames"]["smog"]["over_clean"]),
-    Target("street: flood balanced", "ms", 6.0, "frames",
-           lambda f: f["frames"]["flood balanced"]["ms"]),
-    Target("street: snow fast tier, over clean", "x", 1.3, "frames",
-           lambda f: f["frames"]["snow fast tier"]["over_clean"]),
-    Target("street: most memory of any frame and its scene", "GB", 2.0, "frames",
-           lambda f: _gigabytes(*(row["peak_mib"] for row in f["frames"].values()))),
-    Target("street: rgb off the CPU backend's, 99.9 %, worst frame", "", 1e-3, "agreement",
-           lambda f: _worst(f["frames"])),
-    Target("style: fold and apply to all SH", "ms", 1.0, "style", lambda f: f["ms"],
-           has_floor=True),
+    Target(
+        "street: smog, over clean", "x", 1.1, "frames", lambda f: f["frames"]["smog"]["over_clean"]
+    ),
+    Target(
+        "street: flood balanced", "ms", 6.0, "frames", lambda f: f["frames"]["flood balanced"]["ms"]
+    ),
+    Target(
+        "street: snow fast tier, over clean",
+        "x",
+        1.3,
+        "frames",
+        lambda f: f["frames"]["snow fast tier"]["over_clean"],
+    ),
+    Target(
+        "street: most memory of any frame and its scene",
+        "GB",
+        2.0,
+        "frames",
+        lambda f: _max_gigabytes(*(row["peak_mib"] for row in f["frames"].values())),
+    ),
+    Target(
+        "street: rgb off the CPU backend's, 99.9 %, worst frame",
+        "",
+        1e-3,
+        "agreement",
+        lambda f: _max_p999(f["frames"]),
+    ),
+    Target(
+        "style: fold and apply to all SH", "ms", 1.0, "style", lambda f: f["ms"], has_floor=True
+    ),
     Target("placement of snow, PandaSet", "s", 1.0, "placement", _slowest_named),
-    Target("memory of the clean frame and its scene", "GB", 2.0, "raster",
-           lambda f: _gigabytes(f["peak_mib"])),
+    Target(
+        "memory of the clean frame and its scene",
+        "GB",
+        2.0,
+        "raster",
+        lambda f: _max_gigabytes(f["peak_mib"]),
+    ),
     Target("clean frame, over gsplat's", "x", 1.3, "raster", _gsplat_ratio),
-    Target("rgb off the CPU backend's, 99.9 %", "", 1e-3, "agreement",
-           lambda f: _worst(f["raster"])),
-)  # fmt: skip
+    Target(
+        "rgb off the CPU backend's, 99.9 %", "", 1e-3, "agreement", lambda f: _max_p999(f["raster"])
+    ),
+)
 
 
-def target_row(target: Target, found: Figures) -> tuple[Cell, ...]:
-    """what, measured, min, p90, at most, met or MISSED or why not measured, floor."""
-    facts, limit = found[target.section], f"{target.most:g} {target.unit}".strip()
+def target_row(target: Target, section_facts: Figures) -> tuple[Cell, ...]:
+    """Return a target's row of the table.
+
+    Args:
+        target: The figure to reach.
+        section_facts: The facts of every section, by its name.
+
+    Returns:
+        Title; median, least and 90th percentile; limit; "met", "MISSED" or why the figure was not
+        measured; floor.
+    """
+    facts = section_facts[target.section]
+    limit = f"{target.limit:g} {target.unit}".strip()
     try:
         if why := facts.get("failed") or facts.get("left_out"):
             raise _Missing(why)
         value = target.value(facts)
     except _Missing as why:
-        return (target.what, None, None, None, limit, f"not measured: {why}", None)
+        return (target.title, None, None, None, limit, f"not measured: {why}", None)
     row = tuple(value.values()) if isinstance(value, Mapping) else (value, None, None)
-    verdict = "met" if row[0] <= target.most else "MISSED"
+    verdict = "met" if row[0] <= target.limit else "MISSED"
     floor = facts["floor"]["ms"]["frame"] if target.has_floor else None
-    return (target.what, *row, limit, verdict, floor)
+    return (target.title, *row, limit, verdict, floor)
 
 
-def gpu_figures(found: Figures, timing: Timing, machine: Figures) -> Figures:
-    """In the JSON form; facts hold every section's."""
+def gpu_figures(section_facts: Figures, timing: Timing, machine: Figures) -> Figures:
+    """Return the facts of all sections and their tables in the form of the JSON file."""
     return figures(
         "gpu",
-        gpu_tables(found),
+        gpu_tables(section_facts),
         machine=machine,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
-        gpu=found[CEILINGS].get("gpu"),
+        gpu=section_facts[CEILINGS].get("gpu"),
         repeats=timing.repeats,
         warm_up=timing.warm_up,
-        sections=dict(found),
+        sections=dict(section_facts),
     )
 
 
-def gpu_tables(found: Figures) -> list[Table]:
-    ceilings, raster, frames = found[CEILINGS], found["raster"], found["frames"]
+def gpu_tables(section_facts: Figures) -> list[Table]:
+    """Return the tables of all sections that were measured, from the facts by section."""
+    ceilings = section_facts[CEILINGS]
+    raster = section_facts["raster"]
+    frames = section_facts["frames"]
     note = ""
     if "bytes_per_s" in ceilings:
         note = (
@@ -754,7 +998,14 @@ def gpu_tables(found: Figures) -> list[Table]:
             f"{ceilings['blends_per_s'] / 1e9:.0f} G blends/s"
         )
     columns = ("what", "measured", "min", "p90", "at most", "", "floor")
-    tables = [Table("Figures to reach", columns, [target_row(t, found) for t in TARGETS], note)]
+    tables = [
+        Table(
+            "Figures to reach",
+            columns,
+            [target_row(target, section_facts) for target in TARGETS],
+            note,
+        )
+    ]
     if "ms" in raster:
         floor = raster["floor"]
         note = (
@@ -764,58 +1015,94 @@ def gpu_tables(found: Figures) -> list[Table]:
         )
         rows = []
         for name, ms in {**raster["stages_ms"], **raster["ms"]}.items():
-            least, moved = floor["ms"].get(name), floor["bytes_of"].get(name)
+            floor_ms = floor["ms"].get(name)
+            num_bytes = floor["bytes_of"].get(name)
             if name in ("clean", "smog"):
-                least, moved = floor["ms"]["frame"], floor["bytes"]
+                floor_ms = floor["ms"]["frame"]
+                num_bytes = floor["bytes"]
             cells: Sequence[Cell] = (None, None, None, None)
-            if least is not None and (median := ms["median"]):
-                cells = (least, 100 * least / median, moved / 1e6, moved / median / 1e6)
+            if floor_ms is not None and (median := ms["median"]):
+                cells = (
+                    floor_ms,
+                    100 * floor_ms / median,
+                    num_bytes / 1e6,
+                    num_bytes / median / 1e6,
+                )
             rows.append((name, *ms.values(), *cells))
         columns = ("stage", "ms", "min", "p90", "floor ms", "% of it", "MB", "GB/s")
         tables.append(Table(f"Rasteriser, {raster['case']}", columns, rows, note))
     if "frames" in frames:
-        columns = ("frame", "ms", "min", "p90", "x clean", "8 bits, alone", "in a row",
-                   "MiB", "of it frame", "same bits")  # fmt: skip
+        columns = (
+            "frame",
+            "ms",
+            "min",
+            "p90",
+            "x clean",
+            "8 bits, alone",
+            "in a row",
+            "MiB",
+            "of it frame",
+            "same bits",
+        )
         rows = []
         for name, row in frames["frames"].items():
             delivered = (row["delivered"]["ms"]["median"], row["delivered"]["row_ms"])
-            rest = (row["peak_mib"], row["frame_mib"], row["same_bits"])
-            rows.append((name, *row["ms"].values(), row["over_clean"]["median"], *delivered, *rest))
+            memory_and_bits = (row["peak_mib"], row["frame_mib"], row["same_bits"])
+            rows.append(
+                (
+                    name,
+                    *row["ms"].values(),
+                    row["over_clean"]["median"],
+                    *delivered,
+                    *memory_and_bits,
+                )
+            )
         title = f"Street, {frames['gaussians']:,} Gaussians, {frames['camera']}"
         tables.append(Table(title, columns, rows))
-    if "passes" in found["passes"]:
+    if "passes" in section_facts["passes"]:
         rows = [
-            (name, stage, ms, each[CPU].get(stage))
-            for name, each in found["passes"]["passes"].items()
-            for stage, ms in each[BACKEND].items()
-            if max(ms, each[CPU].get(stage, 0)) >= 0.1
+            (name, stage, ms, backend_ms[CPU].get(stage))
+            for name, backend_ms in section_facts["passes"]["passes"].items()
+            for stage, ms in backend_ms[BACKEND].items()
+            if max(ms, backend_ms[CPU].get(stage, 0)) >= 0.1
         ]
         columns = ("frame", "pass", "GPU ms", "CPU ms")
         tables.append(Table("Passes, each waited for; below 0.1 ms left out", columns, rows))
-    if "launches" in found[LAUNCHES]:
+    if "launches" in section_facts[LAUNCHES]:
         columns = ("frame", "torch operations", "Triton kernels", "host ms")
-        rows = [(name, *each.values()) for name, each in found[LAUNCHES]["launches"].items()]
+        rows = [
+            (name, *counts.values()) for name, counts in section_facts[LAUNCHES]["launches"].items()
+        ]
         note = "host: of all but Triton's launches, on this machine"
         tables.append(Table("What a frame launches on a GPU", columns, rows, note))
-    if "scenes" in found["placement"]:
+    if "scenes" in section_facts["placement"]:
         columns = ("scene", "Gaussians", "cameras", "cells", "s", "min", "p90")
         keys = ("scene", "gaussians", "cameras", "cells")
         rows = [
-            (*map(each.get, keys), *each["place_s"].values())
-            for each in found["placement"]["scenes"]
+            (*map(entry.get, keys), *entry["place_s"].values())
+            for entry in section_facts["placement"]["scenes"]
         ]
         tables.append(Table("Where snow lies, once a scene", columns, rows))
-    if "frames" in found["agreement"]:
-        each = found["agreement"]
-        named = {f"random scene, {n}": e for n, e in each["raster"].items()}
-        named |= {f"street, {n}": e for n, e in each["frames"].items()}
+    if "frames" in section_facts["agreement"]:
+        agreement = section_facts["agreement"]
+        differences = {f"random scene, {n}": e for n, e in agreement["raster"].items()}
+        differences |= {f"street, {n}": e for n, e in agreement["frames"].items()}
         columns = ("rgb off the CPU backend's", "99.9 %", "max", "off by > 0.001", "pixels")
-        tables.append(Table("Agreement", columns, [(n, *e.values()) for n, e in named.items()]))
+        tables.append(
+            Table("Agreement", columns, [(n, *e.values()) for n, e in differences.items()])
+        )
     return tables
 
 
 def write_table(path: Path, result: Figures) -> None:
-    """Markdown into a document between its markers; a file without them is written anew."""
+    """Write the tables as Markdown between the markers of a document.
+
+    Args:
+        path: The document. If it is missing or has no markers, it is written anew.
+        result: The figures of `measure`.
+    """
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    page = text if START in text else f"{START}\n{END}\n"
-    path.write_text(replace_marked(page, START, END, markdown(result)), encoding="utf-8")
+    page = text if START_MARKER in text else f"{START_MARKER}\n{END_MARKER}\n"
+    path.write_text(
+        replace_marked(page, START_MARKER, END_MARKER, markdown(result)), encoding="utf-8"
+    )

@@ -1,7 +1,8 @@
-"""What every subject of `climategs bench` measures with: paired rounds, memory, figures.
+"""The tools of all subjects of `climategs bench`: paired rounds, memory, processes, figures.
 
-Cases run in turns, every other round in the opposite order, so that a disturbance of the machine
-falls on all of them; ratios are taken round by round. All figures of a subject have one JSON form.
+Cases take turns within a round, and every other round has the opposite order, so that a disturbance
+of the machine affects all cases alike. Ratios are taken round by round. The figures of a subject
+have one JSON form (`figures`), from which tables are printed or written as Markdown.
 """
 
 from __future__ import annotations
@@ -29,10 +30,12 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-Cell = str | float | int | None
-Action = Callable[[], object]
-Figures = dict[str, Any]
-FLIP = 1e-3  # a pixel off by more lies on the other side of a cut-off
+Cell = str | float | int | None  # A cell of a table; None is empty.
+Action = Callable[[], object]  # Work that is timed, or whose memory is measured.
+Figures = dict[str, Any]  # Measured values by name, which can be written as JSON.
+# The error of a pixel above which it lies on the other side of a cut-off in the two pictures.
+FLIP = 1e-3
+# The packages whose versions are reported.
 PACKAGES = ("climategs", "numpy", "torch", "triton", "numba", "llvmlite", "tbb", "gsplat")
 
 
@@ -41,16 +44,27 @@ PACKAGES = ("climategs", "numpy", "torch", "triton", "numba", "llvmlite", "tbb",
 
 @dataclass(frozen=True)
 class Table:
-    """Figures as people read them. rows: as long as columns; None is an empty cell."""
+    """Figures as people read them."""
 
     title: str
+    """The line above the table."""
     columns: Sequence[str]
+    """The headings of the columns."""
     rows: Sequence[Sequence[Cell]]
+    """The cells of every row, as many as there are columns."""
     note: str = ""
+    """The line below the table."""
 
 
 def figures(name: str, tables: Sequence[Table], *, machine: Figures, **facts: Any) -> Figures:
-    """The JSON form of a subject's figures. machine: `machine_facts()` from before it began."""
+    """Return the JSON form of a subject's figures.
+
+    Args:
+        name: The name of the subject.
+        tables: The tables.
+        machine: The `machine_facts()` from before the subject began.
+        facts: Further figures by name.
+    """
     return {
         "bench": name,
         "machine": machine,
@@ -64,7 +78,7 @@ def figures(name: str, tables: Sequence[Table], *, machine: Figures, **facts: An
 
 
 def print_figures(result: Figures) -> None:
-    """Tables in columns: text to the left, numbers to the right, to 3 significant digits."""
+    """Print the machine and all tables. Text is left-aligned, numbers are right-aligned."""
     print(f"{result['bench']}: {machine_line(result)}")
     for table in result["tables"]:
         print(f"\n{table['title']}")
@@ -79,7 +93,7 @@ def print_figures(result: Figures) -> None:
 
 
 def markdown(result: Figures) -> str:
-    """The machine and all tables, each under its title."""
+    """Return the machine and all tables as Markdown, each table under its title."""
     lines = [f"{machine_line(result)}."]
     for table in result["tables"]:
         marks = ["---:" if numeric else "---" for numeric in _numeric_columns(table)]
@@ -92,14 +106,21 @@ def markdown(result: Figures) -> str:
 def markdown_lines(
     header: Sequence[str], marks: Sequence[str], rows: Sequence[Sequence[str]]
 ) -> list[str]:
+    """Return the lines of a Markdown table. marks: alignment of every column, such as `---:`."""
     return [f"| {' | '.join(line)} |" for line in (header, marks, *rows)]
 
 
 def replace_marked(text: str, start: str, end: str, content: str) -> str:
-    """A document whose lines between two markers are content.
+    """Return a document with other lines between two markers.
+
+    Args:
+        text: The document.
+        start: The line of the first marker.
+        end: The line of the second marker.
+        content: The new lines between them.
 
     Raises:
-        ValueError: it lacks a marker.
+        ValueError: the document lacks a marker.
     """
     text_before, start_mark, marked_text = text.partition(start)
     _, end_mark, text_after = marked_text.partition(end)
@@ -109,7 +130,7 @@ def replace_marked(text: str, start: str, end: str, content: str) -> str:
 
 
 def format_cell(cell: Cell) -> str:
-    """3 significant digits, no exponent between 0.001 and 10^15; None is empty."""
+    """Return a cell's text: numbers to 3 significant digits, without exponent from 0.001 on."""
     if cell is None:
         return ""
     if isinstance(cell, bool):
@@ -124,6 +145,7 @@ def format_cell(cell: Cell) -> str:
 
 
 def _numeric_columns(table: Mapping[str, Any]) -> list[bool]:
+    """Return for every column of a table True if it has no text."""
     columns = zip(*table["rows"], strict=True) if table["rows"] else [()] * len(table["columns"])
     return [not any(isinstance(cell, str) for cell in column) for column in columns]
 
@@ -135,17 +157,19 @@ class WallClock:
     """The host's clock, for work that is done when its call returns."""
 
     def mark(self) -> Any:
+        """Return a mark of the time now."""
         return time.perf_counter()
 
     def wait(self) -> None:
         """Wait until all work is done."""
 
     def seconds(self, first: Any, then: Any) -> float:
+        """Return the seconds between two marks."""
         return then - first
 
 
 class EventClock(WallClock):
-    """The GPU's clock: marks are events among its work, so that setting them never waits."""
+    """The GPU's clock. Its marks are events in the GPU's queue, so that marking never waits."""
 
     def mark(self) -> torch.cuda.Event:
         event = torch.cuda.Event(enable_timing=True)
@@ -162,7 +186,17 @@ class EventClock(WallClock):
 def rounds(
     cases: Mapping[str, Action], repeats: int, *, warm_up: int = 1, clock: WallClock | None = None
 ) -> dict[str, list[float]]:
-    """Seconds of each case, one number a round. warm_up: rounds before the first that counts."""
+    """Run cases in turns and return the seconds of each, one number a round.
+
+    Args:
+        cases: The actions by name.
+        repeats: The number of rounds that count.
+        warm_up: The number of rounds before the first that counts.
+        clock: The clock; None for the host's.
+
+    Raises:
+        ValueError: there is no case, or no round.
+    """
     if repeats < 1 or not cases:
         raise ValueError(f"need repeats >= 1 and a case; got {repeats} and {list(cases)}")
     clock = clock or WallClock()
@@ -211,8 +245,7 @@ def image_difference(rgb: torch.Tensor, expected: torch.Tensor) -> dict[str, flo
     """Compare two pictures, rgb [H, W, 3], by each pixel's worst channel.
 
     Returns:
-        The 99.9 % quantile of the error, its maximum, the number of pixels that are off by more
-        than
+        The 99.9 % quantile of the error, its maximum, the number of pixels whose error is above
         FLIP, and the number of pixels.
     """
     error = (rgb.detach().cpu() - expected.detach().cpu()).abs().amax(-1).numpy()
@@ -226,8 +259,8 @@ def image_difference(rgb: torch.Tensor, expected: torch.Tensor) -> dict[str, flo
 
 # ---- memory and processes -----------------------------------------------------------------------
 
-_STATUS = Path("/proc/self/status")
-RESET_PEAK = Path("/proc/self/clear_refs")
+_STATUS = Path("/proc/self/status")  # The file with the sizes of this process.
+RESET_PEAK = Path("/proc/self/clear_refs")  # The file that resets the peak of resident memory.
 
 
 def status_mib(field: str) -> float:
@@ -304,9 +337,15 @@ def run_and_time(work: Callable[..., Figures], arguments: tuple[Any, ...]) -> Fi
 def run_in_subprocess(
     work: Callable[..., Figures], arguments: tuple[Any, ...], within_s: float
 ) -> Figures:
-    """As `run_and_time`, in a fresh process; `left_out` where no time is left or it takes longer.
+    """Run `run_and_time` in a fresh process.
 
-    work: of a module, so that the other process finds it.
+    Args:
+        work: A function of a module, so that the other process can import it.
+        arguments: Its arguments.
+        within_s: The time after which the process is stopped, seconds.
+
+    Returns:
+        The work's figures; `left_out` with the reason if there was no time, or too little.
     """
     if within_s <= 0:
         return {"left_out": "no time was left"}
@@ -339,7 +378,8 @@ def _send_result(
 def machine_facts() -> Figures:
     """Return facts of this machine and process; start numba's thread pool if it is not running.
 
-    load: processes that ran or waited over the minute before; more than a few tenths disturb.
+    The fact `load` is the mean number of processes that ran or waited over the last minute. More
+    than a few tenths disturb measurements.
     """
     from augment.render.threads import num_kernel_threads, select_thread_pool
 
@@ -366,12 +406,13 @@ def load_average() -> float | None:
 
 
 def version_of(package: str) -> str | None:
+    """Return the version of an installed package; None if it is not installed."""
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         return importlib.metadata.version(package)
 
 
 def machine_line(result: Mapping[str, Any]) -> str:
-    """Return a line about the machine and its load; facts may hold a `gpu`."""
+    """Return a line about the machine, its load and, where the facts have one, its GPU."""
     machine = result["machine"]
     gpu = result.get("facts", result).get("gpu")
     return (f"{gpu['name']}; " if gpu else "") + (
@@ -390,7 +431,11 @@ def _proc_field(path: str, name: str) -> str | None:
 
 
 def check_gpu() -> None:
-    """Raises BackendUnavailable where there is no GPU to measure."""
+    """Check that there is a GPU to measure.
+
+    Raises:
+        BackendUnavailable: there is none.
+    """
     from augment.errors import BackendUnavailable
     from augment.render.buffers import available_backends
     from augment.render.cuda.runtime import has_gpu

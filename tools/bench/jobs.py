@@ -1,8 +1,12 @@
-"""What jobs cost beside bare rendering, a rig's views drawn at once, a job of 10,000 images, and
-opening scenes.
+"""`climategs bench jobs`: measure what jobs cost and how fast scenes are opened.
 
-Claims, progress logs, durable files, publishing and the manifest are compared with a loop that
-renders, encodes and writes the same images; the long job draws nothing, so that the rest is left.
+`measure` returns four tables.
+1. A job beside a loop that renders, encodes and writes the same images. The difference is the cost
+   of claims, progress logs, durable files, publishing and the manifest.
+2. The cameras of one frame drawn one by one and all at once.
+3. A job of 10,000 tiny images. It draws nothing, so that only the job's own work is measured.
+4. The opening of scene files.
+
 Worker processes import this module by name.
 """
 
@@ -54,41 +58,51 @@ from tools.bench.harness import (
 )
 from tools.bench.scenes import RasterCase, random_scene, recipe_of, street_uri
 
-# Labels and LiDAR are left out of the comparison: they are work that bare rendering does not do.
-PLAIN = {"output.labels": False, "output.lidar": False}
-BLOCK_IMAGES = 12  # several variants in small blocks: both workers have work to the end
-BARE = "a loop: render, encode, write"
-ONE_BY_ONE, AT_ONCE = "one by one", "at once"
+# The settings of all jobs here: without labels and LiDAR, which bare rendering does not make.
+PLAIN_OUTPUT = {"output.labels": False, "output.lidar": False}
+# The number of images of a block: so small that two workers both have work until the end.
+BLOCK_IMAGES = 12
+BARE = "a loop: render, encode, write"  # The row of bare rendering.
+ONE_BY_ONE = "one by one"  # The mode that draws a rig's cameras one after the other.
+AT_ONCE = "at once"  # The mode that draws a rig's cameras together.
+# The effects of every weather that a rig is drawn in.
 RIG_WEATHERS = {
     "clean": {},
     "smog, 50 m": {"smog": {"visibility_m": 50}},
     "snow": {"snow": {"depth_m": 0.1}},
     "flood": {"flood": {"level_m": 0.15}},
 }
-TINY_CAMERAS, TINY_PERIOD_NS = ("front", "rear"), 100_000_000
+TINY_CAMERAS = ("front", "rear")  # The cameras of the tiny scene.
+TINY_PERIOD_NS = 100_000_000  # The time between two frames of the tiny scene, nanoseconds.
 
 
 @dataclass(frozen=True)
 class JobsCase:
-    """scene, scale, variants: of the images in fog that are compared. rig: a scene whose frame has
-    several cameras; rig_scale: of their images. images: of the long job.
-    gaussians: of the scene that is opened, SH of degree 3. workers: processes of the jobs that are
-    compared. memory: whether it is measured.
-    """
+    """The scenes and sizes that are measured."""
 
     scene: str = "procedural:street?seed=3&frames=4&width=1600&height=1066"
+    """The address of the scene whose images in fog are compared."""
     scale: float = 1.0
+    """The scale of those images."""
     variants: int = 3
+    """The number of variants of the recipe that are compared."""
     rig: str = street_uri()
+    """The address of a scene whose frames have several cameras."""
     rig_scale: float = 1.0
+    """The scale of the images of that scene."""
     images: int = 10_000
+    """The number of images of the long job."""
     gaussians: int = 1_000_000
+    """The number of Gaussians, with SH of degree 3, of the scene that is opened."""
     workers: tuple[int, ...] = (1, 2)
+    """The numbers of worker processes with which the compared job runs, one run for each."""
     memory: bool = True
+    """True if memory is measured."""
 
 
-WHOLE = JobsCase()
-QUICK = JobsCase(
+FULL_CASE = JobsCase()  # The case of published figures.
+# The case of `--quick`.
+QUICK_CASE = JobsCase(
     "procedural:street?seed=3&frames=4", 0.1, rig_scale=0.2, images=500, gaussians=50_000
 )
 
@@ -96,32 +110,42 @@ QUICK = JobsCase(
 def measure(
     quick: bool = False, scene: str | None = None, repeats: int = 3, case: JobsCase | None = None
 ) -> Figures:
-    """scene: another scene that is opened."""
-    machine, case = machine_facts(), case or (QUICK if quick else WHOLE)
+    """Measure jobs and the opening of scenes.
+
+    Args:
+        quick: True for QUICK_CASE.
+        scene: The address of a further scene to open.
+        repeats: The number of rounds that count.
+        case: Scenes and sizes; None for FULL_CASE or QUICK_CASE.
+    """
+    machine = machine_facts()
+    case = case or (QUICK_CASE if quick else FULL_CASE)
     with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
         folder = Path(name)
-        compared = _compare(case, folder, repeats)
-        rig = _measure_rig(case, max(repeats, 5))
-        long = _run_long_job(case.images, folder / "long")
-        opened = _open_files(case, scene, folder, repeats)
+        job_rows = _compare_with_loop(case, folder, repeats)
+        rig_rows = _measure_rig(case, max(repeats, 5))
+        long_job_figures = _run_long_job(case.images, folder / "long")
+        file_rows = _open_files(case, scene, folder, repeats)
     tables = [
         Table(
             "Images of a job beside bare rendering, PNG and depth",
             ("what", "ms an image", "rounds differ by", "images/s", "to bare"),
-            compared,
+            job_rows,
             "without starting workers, opening scenes and loading kernels",
         ),
         Table(
             "A frame's cameras drawn at once",
             ("weather", "ms one by one", "ms at once", "to one by one", "MiB one by one", "MiB"),
-            rig,
+            rig_rows,
             "8-bit images, one held at a time; MiB: at the highest moment, beyond the scene",
         ),
-        Table("A long job of tiny images, one process", ("what", "value"), [*long.items()]),
+        Table(
+            "A long job of tiny images, one process", ("what", "value"), [*long_job_figures.items()]
+        ),
         Table(
             f"Opening {case.gaussians:,} Gaussians; files in memory",
             ("what", "ms", "MiB of Gaussians", "peak memory of it"),
-            opened,
+            file_rows,
         ),
     ]
     return figures("jobs", tables, machine=machine)
@@ -130,33 +154,35 @@ def measure(
 # ---- beside bare rendering ----------------------------------------------------------------------
 
 
-def _compare(case: JobsCase, folder: Path, repeats: int) -> list[tuple]:
-    template = load_recipe("dense-fog", PLAIN)
+def _compare_with_loop(case: JobsCase, folder: Path, repeats: int) -> list[tuple]:
+    """Rows of a job in fog, with different executors, beside a loop without a job."""
+    template = load_recipe("dense-fog", PLAIN_OUTPUT)
     template = dataclasses.replace(template, variants=case.variants)
-    job = _job(case.scene, template, folder, scale=case.scale, block_images=BLOCK_IMAGES)
-    ways: dict[str, Callable[[Path], float]] = {
-        BARE: partial(_bare, case.scene, job.recipes),
-        "generate, this process": partial(_generate, job, "serial", 1),
+    job = _make_job(case.scene, template, folder, scale=case.scale, block_images=BLOCK_IMAGES)
+    runs: dict[str, Callable[[Path], float]] = {
+        BARE: partial(_run_bare_loop, case.scene, job.recipes),
+        "generate, this process": partial(_run_job, job, "serial", 1),
     } | {
-        f"generate, {count} processes of their own": partial(_generate, job, "processes", count)
+        f"generate, {count} processes of their own": partial(_run_job, job, "processes", count)
         for count in case.workers
     }
-    took: dict[str, list[float]] = {name: [] for name in ways}
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
 
     def run(name: str) -> None:
-        took[name].append(ways[name](folder / f"{[*ways].index(name)}-{len(took[name])}"))
+        seconds[name].append(runs[name](folder / f"{[*runs].index(name)}-{len(seconds[name])}"))
 
-    rounds({name: partial(run, name) for name in ways}, repeats)
-    bare = median_ms(took[BARE][1:])
+    rounds({name: partial(run, name) for name in runs}, repeats)
+    bare_ms = median_ms(seconds[BARE][1:])
+    # The first run of each is the warm-up round, which does not count.
     return [
-        (name, ms, 1e3 * (max(own) - min(own)), 1e3 / ms, ms / bare)
-        for name, (_, *own) in took.items()
-        for ms in [median_ms(own)]
+        (name, ms, 1e3 * (max(times) - min(times)), 1e3 / ms, ms / bare_ms)
+        for name, (_, *times) in seconds.items()
+        for ms in [median_ms(times)]
     ]
 
 
-def _bare(uri: str, recipes: JobRecipes, out: Path) -> float:
-    """Seconds an image of a loop: nothing is durable, nothing remembered."""
+def _run_bare_loop(uri: str, recipes: JobRecipes, out: Path) -> float:
+    """Return the seconds an image of a loop that makes no file durable and records no progress."""
     scene = open_scene(uri)
     views = [
         (recipe, camera, out / variant_name(recipe) / f"{name.replace('/', '_')}-{frame.index}")
@@ -165,7 +191,8 @@ def _bare(uri: str, recipes: JobRecipes, out: Path) -> float:
         for name, camera in frame.cameras.items()
     ]
     render_view(scene, views[0][1], views[0][0])
-    pump, started = WritePump(), time.perf_counter()
+    pump = WritePump()
+    started = time.perf_counter()
     for recipe, camera, path in views:
         pump.submit(partial(_write, render_view(scene, camera, recipe), path, recipe))
     pump.close()
@@ -173,37 +200,42 @@ def _bare(uri: str, recipes: JobRecipes, out: Path) -> float:
 
 
 def _write(view: WeatheredView, path: Path, recipe: Recipe) -> None:
+    """Encode and write a view's image, and its depth where it has one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if view.depth_m is not None:
         path.with_suffix(".depth.png").write_bytes(encode_depth(view.depth_m))
     path.with_suffix(".png").write_bytes(encode_image(view.rgb, recipe.output))
 
 
-def _generate(job: GenerateJob, executor: str, workers: int, out: Path) -> float:
-    """Seconds an image of a job once all its workers have the scene and their kernels."""
+def _run_job(job: GenerateJob, executor: str, workers: int, out: Path) -> float:
+    """Return the seconds an image of a job after all its workers have loaded scene and kernels."""
     setup = dataclasses.replace(job.setup, store_uri=str(out))
     run = dataclasses.replace(job, setup=setup, executor=executor, workers=workers)
     plan = plan_job(run, progress=False)
-    with contextlib.closing(Workers(run)) as own:
-        first, rest = (
-            BlockWork(blocks, plan.names, own.scene_of_slot, _refuse_failure)
+    with contextlib.closing(Workers(run)) as pool:
+        # The first block of each worker loads what it needs; the others are timed.
+        loading_work, timed_work = (
+            BlockWork(blocks, plan.names, pool.scene_of_slot, _refuse_failure)
             for blocks in (plan.blocks[:workers], plan.blocks[workers:])
         )
-        own.run(first)
+        pool.run(loading_work)
         started = time.perf_counter()
-        own.run(rest)
+        pool.run(timed_work)
         compact(open_store(out))
-        took = time.perf_counter() - started
-    if first.tally.written + rest.tally.written != plan.images:
-        raise RuntimeError(f"the job did not do what is measured: {first.tally}, {rest.tally}")
-    return took / rest.tally.written
+        seconds = time.perf_counter() - started
+    if loading_work.tally.written + timed_work.tally.written != plan.images:
+        raise RuntimeError(
+            f"the job did not do what is measured: {loading_work.tally}, {timed_work.tally}"
+        )
+    return seconds / timed_work.tally.written
 
 
 def _refuse_failure(block: Block, message: str) -> None:
+    """Raise an error for a block that failed: its time would be wrong."""
     raise RuntimeError(f"{block.key}: {message}")
 
 
-def _job(
+def _make_job(
     uri: str,
     template: RecipeTemplate,
     out: Path,
@@ -212,58 +244,70 @@ def _job(
     block_images: int = 64,
     **setup: Any,
 ) -> GenerateJob:
+    """Return a job of one recipe on one scene. setup: further fields of JobWorkerSetup."""
     fields = {"scenes": ["-"], "recipes": [template.name], "scale": scale}
     job = Job.model_validate({**fields, "block_images": block_images})
-    given = JobWorkerSetup(str(out), None, "auto", **{"open_scene": open_scene, **setup})
+    worker_setup = JobWorkerSetup(str(out), None, "auto", **{"open_scene": open_scene, **setup})
     scenes = [job.scenes[0].model_copy(update={"uri": uri})]
-    return GenerateJob(JobRecipes(job, {template.name: template}), scenes, given)
+    return GenerateJob(JobRecipes(job, {template.name: template}), scenes, worker_setup)
 
 
 # ---- a rig --------------------------------------------------------------------------------------
 
 
 def _measure_rig(case: JobsCase, repeats: int) -> list[tuple]:
-    rows, scene, both = [], open_scene(case.rig), (ONE_BY_ONE, AT_ONCE)
+    """Rows of a frame's cameras, drawn one by one and all at once, in every weather."""
+    rows = []
+    scene = open_scene(case.rig)
+    modes = (ONE_BY_ONE, AT_ONCE)
     for weather in RIG_WEATHERS:
-        seconds = rounds({w: _rig_of(scene, case.rig_scale, weather, w) for w in both}, repeats)
-        single, together = (seconds[way] for way in both)
-        given = (case.rig, case.rig_scale, weather)
+        seconds = rounds(
+            {name: _draw_rig(scene, case.rig_scale, weather, name) for name in modes}, repeats
+        )
+        single_s, together_s = (seconds[mode] for mode in modes)
+        rig_arguments = (case.rig, case.rig_scale, weather)
         memory = [
-            peak_mib_in_subprocess(_opened_rig, (*given, way)) if case.memory else None
-            for way in both
+            peak_mib_in_subprocess(_open_and_draw_rig, (*rig_arguments, mode))
+            if case.memory
+            else None
+            for mode in modes
         ]
-        ratio = spread_ratio(together, single)["median"]
-        rows.append((weather, median_ms(single), median_ms(together), ratio, *memory))
+        ratio = spread_ratio(together_s, single_s)["median"]
+        rows.append((weather, median_ms(single_s), median_ms(together_s), ratio, *memory))
     return rows
 
 
-def _rig_of(scene: Scene, scale: float, weather: str, way: str) -> Action:
-    """Draws the cameras of the first frame."""
+def _draw_rig(scene: Scene, scale: float, weather: str, mode: str) -> Action:
+    """Return an action that draws the cameras of the first frame. mode: ONE_BY_ONE or AT_ONCE."""
     recipe = recipe_of(RIG_WEATHERS[weather])
     cameras = [camera.scaled(scale) for camera in scene.frames[0].cameras.values()]
 
     def draw() -> None:
         views = (render_view(scene, camera, recipe) for camera in cameras)
-        for _ in render_views(scene, cameras, recipe) if way == AT_ONCE else views:
+        for _ in render_views(scene, cameras, recipe) if mode == AT_ONCE else views:
             pass
 
     return draw
 
 
-def _opened_rig(uri: str, scale: float, weather: str, way: str) -> Action:
-    """In a process that has drawn the cameras small, so that it holds kernels and the snow."""
+def _open_and_draw_rig(uri: str, scale: float, weather: str, mode: str) -> Action:
+    """Return `_draw_rig` of a scene whose cameras were drawn small before.
+
+    The process so holds the kernels and the snow, which do not count as memory of the action.
+    """
     scene = open_scene(uri)
-    _rig_of(scene, 0.1 * scale, weather, ONE_BY_ONE)()
-    return _rig_of(scene, scale, weather, way)
+    _draw_rig(scene, 0.1 * scale, weather, ONE_BY_ONE)()
+    return _draw_rig(scene, scale, weather, mode)
 
 
 # ---- a long job of tiny images ------------------------------------------------------------------
 
 
 def _run_long_job(images: int, out: Path) -> Mapping[str, float]:
+    """Run a job of tiny images, and run it again when all is done; return its figures."""
     frames = -(-images // len(TINY_CAMERAS))
-    template = parse_recipe("{}", source="tiny", name="tiny", overrides=PLAIN)
-    job = _job(f"tiny:{frames}", template, out, open_scene=open_tiny, renderer=render_tiny)
+    template = parse_recipe("{}", source="tiny", name="tiny", overrides=PLAIN_OUTPUT)
+    job = _make_job(f"tiny:{frames}", template, out, open_scene=open_tiny, renderer=render_tiny)
     job = dataclasses.replace(job, executor="serial")
     result = run_generate(job, progress=False)
     resident = status_mib("VmRSS")
@@ -279,7 +323,7 @@ def _run_long_job(images: int, out: Path) -> Mapping[str, float]:
         "plan, s": result.timings["plan"],
         "first image to last, s": result.timings["render_wall"],
         "an image, ms": 1e3 * result.timings["render_wall"] / result.written,
-        "resume when all is done, s": again.timings["plan"] + again.timings["scan"],
+        "resume when all is done, s": again.timings["plan"] + again.timings["find_finished"],
         "--status, s": status_s,
         "resident at the end, MiB": resident,
         "resident at most, MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
@@ -287,21 +331,23 @@ def _run_long_job(images: int, out: Path) -> Mapping[str, float]:
 
 
 def open_tiny(uri: str) -> Scene:
-    """`tiny:N`: N frames of two cameras and one splat."""
-    one, turn = torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]])
-    splat = Gaussians(one, turn, one + 0.1, torch.ones(1), torch.zeros(1, 1, 3))
+    """Return the scene of the address `tiny:N`: N frames of two cameras, and one splat."""
+    mean = torch.zeros(1, 3)
+    quat = torch.tensor([[1.0, 0, 0, 0]])
+    splat = Gaussians(mean, quat, mean + 0.1, torch.ones(1), torch.zeros(1, 1, 3))
     frames = tuple(map(_tiny_frame, range(int(uri.removeprefix("tiny:")))))
-    return Scene(uri, uri, splat, (), ConstantSky(one[0]), frames)
+    return Scene(uri, uri, splat, (), ConstantSky(mean[0]), frames)
 
 
 def _tiny_frame(index: int) -> Frame:
-    pose, time_ns = torch.eye(4, dtype=torch.float64), index * TINY_PERIOD_NS
+    pose = torch.eye(4, dtype=torch.float64)
+    time_ns = index * TINY_PERIOD_NS
     cameras = {n: Camera(n, 32, 18, 20.0, 20.0, 16.0, 9.0, pose, time_ns) for n in TINY_CAMERAS}
     return Frame(index, time_ns, pose, cameras)
 
 
 def render_tiny(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> WeatheredView:
-    """An image of one colour, another for every time."""
+    """Return a view of one grey that depends on the camera's time, and a depth of 4 m."""
     shade = camera.timestamp_ns // TINY_PERIOD_NS % 256
     rgb = np.full((camera.height, camera.width, 3), shade, np.uint8)
     return WeatheredView(camera, rgb, np.full(rgb.shape[:2], 4.0, np.float32), None, None)
@@ -311,29 +357,32 @@ def render_tiny(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -
 
 
 def _open_files(case: JobsCase, uri: str | None, folder: Path, repeats: int) -> list[tuple]:
+    """Rows of scene files of every format, and of the scene at `uri` where it is given."""
     gaussians, _ = random_scene(RasterCase(case.gaussians, 1600, 1066))
     scene = dataclasses.replace(open_scene(street_uri(gaussians=60_000)), background=gaussians)
     save_scene(scene, folder / "scene")
     save_scene_file(scene, folder / "scene.climategs")
     save_scene_file(scene, folder / "half.climategs", half=True)
     export_ply(scene, folder / "scene.ply", scene.frames[0].timestamp_ns)
-    ways = {
+    uris = {
         "gaussians: (.ply)": f"gaussians:{folder / 'scene.ply'}",
         "scene: folder": f"scene:{folder / 'scene'}",
         "scene: file": f"scene:{folder / 'scene.climategs'}",
         "scene: file, half precision": f"scene:{folder / 'half.climategs'}",
     } | ({} if uri is None else {uri: uri})
-    seconds = rounds({name: partial(open_scene, own) for name, own in ways.items()}, repeats)
+    seconds = rounds(
+        {name: partial(open_scene, scene_uri) for name, scene_uri in uris.items()}, repeats
+    )
     rows = []
-    for name, own in ways.items():
-        mib = open_scene(own).gaussian_bytes / 2**20
-        peak = peak_mib_in_subprocess(_opening_of, (own,)) if case.memory else None
+    for name, scene_uri in uris.items():
+        mib = open_scene(scene_uri).gaussian_bytes / 2**20
+        peak = peak_mib_in_subprocess(_open_warm, (scene_uri,)) if case.memory else None
         rows.append((name, median_ms(seconds[name]), mib, None if peak is None else peak / mib))
     return rows
 
 
-def _opening_of(uri: str) -> Action:
-    """A long-lived process imports what opening needs once."""
+def _open_warm(uri: str) -> Action:
+    """Return an action that opens a scene in a process that has imported everything for it."""
     open_scene(street_uri(gaussians=60_000))
     with contextlib.suppress(Exception):
         open_scene(f"{uri.partition(':')[0]}:/nowhere")

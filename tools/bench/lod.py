@@ -1,4 +1,8 @@
-"""Levels of detail on a long street: a view over its nearest 100 m alone, memory, and accuracy."""
+"""`climategs bench lod`: levels of detail on a long street.
+
+`measure` compares a view down the whole street with the same view of its nearest 100 m alone:
+time, memory, and the pictures' errors.
+"""
 
 from __future__ import annotations
 
@@ -35,19 +39,33 @@ from tools.bench.harness import (
 )
 from tools.bench.scenes import front_name
 
-BUFFERS = (RGB, ALPHA, MEDIAN_DEPTH)
-NEAR_M = 100.0
-SIZES_PX = (0.5, 1.0, 2.0)
-NEAR = f"nearest {NEAR_M:.0f} m alone"
-FULL = "everything"
-COLUMNS = ("drawn", "ms", "ms of the processor", "over the nearest 100 m", "least", "p90",
-           "FLIP", "PSNR")  # fmt: skip
-WITHIN_S = 900.0
+BUFFERS = (RGB, ALPHA, MEDIAN_DEPTH)  # The buffers that are drawn.
+NEAR_M = 100.0  # The largest distance from the camera of the street's nearest part, metres.
+SIZES_PX = (0.5, 1.0, 2.0)  # The values of lod_px that are measured, pixels.
+NEAR = f"nearest {NEAR_M:.0f} m alone"  # The row of the nearest part without levels.
+FULL = "everything"  # The row of the whole street without levels.
+# The columns of the table of views.
+COLUMNS = (
+    "drawn",
+    "ms",
+    "ms of the processor",
+    "over the nearest 100 m",
+    "least",
+    "p90",
+    "FLIP",
+    "PSNR",
+)
+WITHIN_S = 900.0  # The longest time of the process whose memory is measured, seconds.
 
 
 def measure(quick: bool = False, repeats: int = 7, scene: str | None = None) -> Figures:
-    """scene: a large scene; by default a kilometre of 20 million splats is written, or, quick, 200
-    metres of 100,000.
+    """Measure views, memory and levels of a long street.
+
+    Args:
+        quick: True for a street of 200 metres instead of a kilometre.
+        repeats: The number of rounds that count.
+        scene: The address of a large scene. By default a street is written: a kilometre of 20
+            million splats, or if quick 200 metres of about 100,000.
     """
     if scene is not None:
         return _measure(scene, repeats)
@@ -59,36 +77,39 @@ def measure(quick: bool = False, repeats: int = 7, scene: str | None = None) -> 
 
 
 def first_camera(scene: Scene) -> Camera:
-    """Ahead, where the drive begins: the whole street lies before it."""
+    """Return the front camera where the drive begins: the whole street lies before it."""
     cameras = scene.frames[0].cameras
     return cameras[front_name([*cameras])]
 
 
-def nearest(scene: Scene, camera: Camera) -> Scene:
-    """The scene without what is further than NEAR_M from the camera; its levels made anew."""
-    away = (scene.background.means - camera.centre.float()).norm(dim=1)
-    return dataclasses.replace(scene, background=scene.background.select(away < NEAR_M))
+def nearest_part(scene: Scene, camera: Camera) -> Scene:
+    """Return the scene with only the splats within NEAR_M of the camera, with new levels."""
+    distance_m = (scene.background.means - camera.centre.float()).norm(dim=1)
+    return dataclasses.replace(scene, background=scene.background.select(distance_m < NEAR_M))
 
 
 def _draw(scene: Scene, camera: Camera, lod_px: float) -> RenderOutput:
+    """Draw the background. lod_px: the size in pixels from which levels are used, 0 for never."""
     parts = [PosedGaussians(scene.background)]
     return rasterize(parts, camera, buffers=BUFFERS, settings=RasterSettings(lod_px=lod_px))
 
 
 def _picture(scene: Scene, camera: Camera, lod_px: float) -> np.ndarray:
+    """Return the picture of the background and the sky, uint8 [H, W, 3]."""
     rendered = _draw(scene, camera, lod_px)
     assert rendered.rgb is not None and rendered.alpha is not None
     return to_bytes(composite_sky(rendered.rgb, rendered.alpha, camera, scene.sky)).numpy()
 
 
 class ProcessorClock(WallClock):
-    """Time that this process's threads have had of the processors, whatever else runs."""
+    """A clock of the processor time of this process's threads, whatever else runs."""
 
     def mark(self) -> float:
         return time.process_time()
 
 
 def _measure(uri: str, repeats: int) -> Figures:
+    """Measure a scene with levels at an address."""
     machine = machine_facts()
     rows = []
     begun = time.perf_counter()
@@ -96,21 +117,30 @@ def _measure(uri: str, repeats: int) -> Figures:
     full_scene = open_scene(uri)
     opened_s = time.perf_counter() - begun
     camera = first_camera(full_scene)
-    near = nearest(full_scene, camera)
-    cases = {NEAR: (near, 0.0), f"{NEAR}, lod_px 1": (near, 1.0), FULL: (full_scene, 0.0)}
+    near_scene = nearest_part(full_scene, camera)
+    cases = {
+        NEAR: (near_scene, 0.0),
+        f"{NEAR}, lod_px 1": (near_scene, 1.0),
+        FULL: (full_scene, 0.0),
+    }
     cases |= {f"lod_px {px:g}": (full_scene, px) for px in SIZES_PX}
-    actions = {name: functools.partial(_draw, of, camera, px) for name, (of, px) in cases.items()}
+    actions = {
+        name: functools.partial(_draw, case_scene, camera, px)
+        for name, (case_scene, px) in cases.items()
+    }
     seconds = rounds(actions, repeats)
-    busy = rounds(actions, max(repeats // 2, 1), warm_up=0, clock=ProcessorClock())
+    processor_seconds = rounds(actions, max(repeats // 2, 1), warm_up=0, clock=ProcessorClock())
     truth = _picture(full_scene, camera, 0.0)
-    for name, (of, px) in cases.items():
+    for name, (case_scene, px) in cases.items():
         ratio = spread_ratio(seconds[name], seconds[NEAR]).values()
         errors = [None, None]
-        if of is full_scene and px > 0:
-            picture = _picture(of, camera, px)
+        if case_scene is full_scene and px > 0:
+            picture = _picture(case_scene, camera, px)
             is_same = np.array_equal(picture, truth)
             errors = [flip(picture, truth), None if is_same else psnr(picture, truth)]
-        rows.append([name, median_ms(seconds[name]), median_ms(busy[name]), *ratio, *errors])
+        rows.append(
+            [name, median_ms(seconds[name]), median_ms(processor_seconds[name]), *ratio, *errors]
+        )
     levels = levels_of(full_scene.background)
     sizes = [
         [
@@ -126,22 +156,29 @@ def _measure(uri: str, repeats: int) -> Figures:
         f"{camera.width}x{camera.height}"
     )
     tables = [
-        Table(title, COLUMNS, rows, f"{len(near.background):,} Gaussians within {NEAR_M:g} m"),
-        Table("Memory of a process that opens the scene and draws this view",
-              ("lod_px", "opened MiB", "most MiB"), memory),
+        Table(
+            title, COLUMNS, rows, f"{len(near_scene.background):,} Gaussians within {NEAR_M:g} m"
+        ),
+        Table(
+            "Memory of a process that opens the scene and draws this view",
+            ("lod_px", "opened MiB", "most MiB"),
+            memory,
+        ),
         Table("Levels", ("level", "cell m", "Gaussians", "squares"), sizes),
-    ]  # fmt: skip
+    ]
     return figures("lod", tables, machine=machine, opened_s=opened_s)
 
 
 def _memory(uri: str, lod_px: float) -> Sequence[float | None]:
-    memory_figures = run_in_subprocess(_memory_of, (uri, lod_px), WITHIN_S)
+    """Return the MiB of a fresh process with the scene open, and its peak when it draws a view."""
+    memory_figures = run_in_subprocess(_measure_memory, (uri, lod_px), WITHIN_S)
     if "most" not in memory_figures:
         raise RuntimeError(f"measuring the memory of {uri} failed: {memory_figures}")
     return memory_figures["opened"], memory_figures["most"]
 
 
-def _memory_of(uri: str, lod_px: float) -> Figures:
+def _measure_memory(uri: str, lod_px: float) -> Figures:
+    """Open a scene, draw a view, and return this process's memory after each of both, MiB."""
     scene = open_scene(uri)
     opened = status_mib("VmRSS")
     _draw(scene, first_camera(scene), lod_px)

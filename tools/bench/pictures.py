@@ -1,9 +1,9 @@
-"""The documentation's pictures of rain and snowfall, made again, some minutes in all:
+"""Make the documentation's pictures of rain and snowfall again. It takes some minutes.
 
     python -m tools.bench.pictures --drive scene:scenes/002
 
-A fitted PandaSet drive (docs/reconstruction.md) is what `drive` and `lidar` show; without --drive
-they are left as they are.
+The pictures `drive` and `lidar` show a fitted PandaSet drive (docs/reconstruction.md). Without
+--drive they are not made.
 """
 
 from __future__ import annotations
@@ -26,19 +26,23 @@ from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe
 from tools.drawing import resized, write, write_rgb, write_video
 
-Which = Literal["street", "drive", "lidar", "video"]
-STREET = "procedural:street?seed=3&frames=40"
-FRAME = 12
-CELL_WIDTH = 600
-COLUMNS = 3
-QUALITY = 76
-SHOWN = ("drizzle", "rain", "downpour", "flurries", "snowfall", "blizzard")
-# One map on the finished picture, so that snow and flakes stand in the same light as the rest.
+Which = Literal["street", "drive", "lidar", "video"]  # A picture that is made.
+STREET = "procedural:street?seed=3&frames=40"  # The address of the street.
+FRAME = 12  # The index of the frame that pictures show.
+CELL_WIDTH = 600  # The width of one picture among several, pixels.
+COLUMNS = 3  # The number of pictures side by side.
+QUALITY = 76  # The quality of JPEG files.
+# The presets of falling weather that are shown.
+PRESETS = ("drizzle", "rain", "downpour", "flurries", "snowfall", "blizzard")
+# The style of dusk. It is applied to the finished picture, so that snow and flakes get the same
+# light as everything else.
 DUSK = ("style.preset=grey-dusk", "style.strength=1", "style.applied_to=picture")
+# The frames of the video by preset.
 VIDEO = {"downpour": range(20), "blizzard": range(20, 40)}
-VIDEO_SIZE = (640, 360)
-VIDEO_HZ = 10
+VIDEO_SIZE = (640, 360)  # The width and height of the video, pixels.
+VIDEO_HZ = 10  # The video's frames a second.
 
+# The weathers of LiDAR sweeps by title, as texts of `--set`.
 SWEEPS: dict[str, tuple[str, ...]] = {
     "clear": (),
     "fog, visibility 60 m": ("weather.smog.visibility_m=60",),
@@ -47,6 +51,7 @@ SWEEPS: dict[str, tuple[str, ...]] = {
     "snowfall, 1 mm/h": ("weather.snowfall.rate_mm_h=1",),
     "snow on the ground, 20 cm": ("weather.snow.depth_m=0.2",),
 }
+# The name and the colour of every weather_code of a LiDAR return.
 CODES = {
     codes.UNCHANGED: ("unchanged", (150, 150, 150)),
     codes.ATTENUATED: ("attenuated", (120, 185, 235)),
@@ -55,10 +60,10 @@ CODES = {
     codes.SCATTERED: ("scattered", (255, 115, 60)),
     codes.PRECIPITATION: ("drops, flakes", (255, 225, 70)),
 }
-PX_PER_M = 8  # of a sweep's panel: its view from above, from the side; its grey
-PANEL = (500, 350)
-SIDE = 96
-GROUND = 24
+PX_PER_M = 8  # The scale of a sweep's panel, pixels a metre.
+PANEL = (500, 350)  # The width and height of the view from above, pixels.
+SIDE = 96  # The height of the view from the side, pixels.
+GROUND = 24  # The grey of a panel, 0 to 255.
 
 
 def main(
@@ -69,9 +74,9 @@ def main(
     """Draw the documentation's pictures of rain and snowfall.
 
     Args:
-        which: Which of them.
+        which: The pictures to make.
         drive: A fitted drive with a camera front_camera and LiDAR sweeps.
-        out: The folder.
+        out: The folder of the pictures.
     """
     if "street" in which or "video" in which:
         street = open_scene(STREET)
@@ -89,6 +94,7 @@ def main(
 
 
 def recipe_of(preset: str, sets: Sequence[str], scale: float = 1.0) -> Recipe:
+    """Return a preset's recipe with changed fields. sets: texts of `--set`."""
     overrides = read_overrides([*sets, f"render.scale={scale}"])
     return load_recipe(preset, overrides).resolve(0)
 
@@ -97,43 +103,45 @@ def draw_weathers(scene: Scene, camera: str, scale: float, path: Path) -> None:
     """Draw all kinds of falling weather, COLUMNS beside each other, by day above dusk."""
     lines = []
     recorded_camera = scene.frame(FRAME).cameras[camera]
-    for first in range(0, len(SHOWN), COLUMNS):
+    for first in range(0, len(PRESETS), COLUMNS):
         for time, sets in (("day", ()), ("dusk", DUSK)):
             cells = []
-            for preset in SHOWN[first : first + COLUMNS]:
+            for preset in PRESETS[first : first + COLUMNS]:
                 rgb = render_view(scene, recorded_camera, recipe_of(preset, sets, scale)).rgb
                 cell = resized(rgb, CELL_WIDTH, cv2.INTER_AREA)
-                named(cell, f"{preset}, {time}")
+                write_title(cell, f"{preset}, {time}")
                 cells.append(cell)
             lines.append(np.hstack(cells))
     write_rgb(path, np.vstack(lines), jpeg_quality=QUALITY)
 
 
 def drive_through(scene: Scene, camera: str) -> Iterator[np.ndarray]:
-    """One drive whose weather changes."""
+    """Yield the frames of a drive whose weather changes."""
     for preset, numbers in VIDEO.items():
         for number in numbers:
             recorded_camera = scene.frame(number).cameras[camera].resized(*VIDEO_SIZE)
             rgb = render_view(
                 scene, recorded_camera, recipe_of(preset, ("camera.noise=0",))
             ).rgb.copy()
-            named(rgb, preset)
+            write_title(rgb, preset)
             yield rgb
 
 
-def named(image: np.ndarray, text: str) -> None:
+def write_title(image: np.ndarray, text: str) -> None:
+    """Write a text into an image's upper left corner, white with a black shadow."""
     write(image, text, 11, 25, size=0.6, color=(0, 0, 0))
     write(image, text, 10, 24, size=0.6, color=(255, 255, 255))
 
 
 def sweeps_from_above(scene: Scene) -> np.ndarray:
-    """A panel for each of SWEEPS: from above, the shares of its codes, from the side."""
+    """Draw a panel for each of SWEEPS: view from above, shares of its codes, view from the side."""
     panels = [_panel(scene, title, recipe_of("clear", sets)) for title, sets in SWEEPS.items()]
     lines = [np.hstack(panels[k : k + COLUMNS]) for k in range(0, len(panels), COLUMNS)]
     return np.vstack(lines)
 
 
 def _panel(scene: Scene, title: str, recipe: Recipe) -> np.ndarray:
+    """Draw the panel of one sweep, uint8 [H, W, 3]."""
     frame = scene.frame(FRAME)
     source = scene.lidar(FRAME)
     assert source is not None, f"{scene.name} has no sweep of frame {FRAME}"
@@ -149,7 +157,7 @@ def _panel(scene: Scene, title: str, recipe: Recipe) -> np.ndarray:
     across = width / 3 + PX_PER_M * points[:, 0]
     above = height / 2 - PX_PER_M * points[:, 1]
     beside = height + SIDE - 12 - PX_PER_M * points[:, 2]
-    is_near = np.abs(points[:, 1]) < 6  # what the view from the side shows
+    is_near = np.abs(points[:, 1]) < 6  # The view from the side shows only these points.
     shares = []
     for code, (name, color) in CODES.items():
         has_code = point_codes == code
@@ -175,6 +183,7 @@ def _panel(scene: Scene, title: str, recipe: Recipe) -> np.ndarray:
 
 
 def _dot(image: np.ndarray, x: np.ndarray, y: np.ndarray, color: tuple[int, int, int]) -> None:
+    """Draw points at columns x and rows y that lie inside the image."""
     column = np.floor(x).astype(int)
     row = np.floor(y).astype(int)
     inside = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])

@@ -1,7 +1,7 @@
-"""Rain and snowfall: what they cost a frame, and what it costs to draw fewer drops one by one.
+"""Rain and snowfall: their cost in a frame, and the errors of drawing fewer drops one by one.
 
-What is not drawn is veil, so the means over squares of GRID pixels must agree; single pixels differ
-by the streaks that are left out.
+Drops that are not drawn one by one become part of a veil. So the means over squares of GRID pixels
+must agree, while single pixels differ by the streaks that are left out.
 """
 
 from __future__ import annotations
@@ -13,18 +13,22 @@ from augment.views import render_buffers
 from tools.bench.harness import Table
 from tools.bench.scenes import CLEAN, EffectCase, cost_tables, recipe_of
 
+# The effects of every measured weather, by its row's name.
 CASES = {
     **{f"rain {r:g} mm/h, dry": {"rain": {"rate_mm_h": r, "wetness": 0}} for r in (2.5, 10, 50)},
     "rain 10 mm/h": {"rain": {"rate_mm_h": 10}},
     "rain 50 mm/h": {"rain": {"rate_mm_h": 50}},
     **{f"snowfall {r:g} mm/h": {"snowfall": {"rate_mm_h": r}} for r in (0.3, 1, 4)},
 }
+# The weathers whose stages and memory are shown.
 STAGED = ("rain 10 mm/h, dry", "rain 10 mm/h", "snowfall 1 mm/h")
+# The values of min_width_px, the width from which a drop is drawn by itself, pixels.
 WIDTHS_PX = (0.25, 0.35, 0.5, 1.0, 2.0)
-GRID = 32  # px
+GRID = 32  # The side of the squares whose means are compared, pixels.
 
 
 def tables(case: EffectCase, repeats: int) -> list[Table]:
+    """Measure costs, and errors against pictures with the most drops drawn one by one."""
     costs = {name: (recipe_of(weather), CLEAN) for name, weather in CASES.items()}
     scene, _ = case.open_street()
     camera = case.views(scene, 1.0)[0]

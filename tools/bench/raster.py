@@ -1,4 +1,7 @@
-"""The CPU rasteriser on random scenes: stages, smog, memory, and the torch reference beside it."""
+"""`climategs bench raster`: the CPU rasteriser on random scenes.
+
+`measure` times each stage of a frame, smog, memory, blends a second, and the torch reference.
+"""
 
 from __future__ import annotations
 
@@ -36,41 +39,76 @@ from tools.bench.harness import (
 )
 from tools.bench.scenes import LARGE_CASE, SMALL_CASE, RasterCase, random_scene
 
-STAGES = ("project", "sort", "bin", "raster")
-BUFFERS = frozenset({RGB, ALPHA})
-SETTINGS = RasterSettings()
-FOG = Fog(extinction_per_m=0.03, airlight_rgb=(0.7, 0.72, 0.75))
-COLUMNS = ("scene", "smog / clear", "splats used", "pairs", "pairs listed", "M pairs/s",
-           "scene MiB", "frame MiB")  # fmt: skip
-REFERENCE_COLUMNS = ("reference ms", "cpu ms", "speed-up", "99.9 % within", "max", "flipped",
-                     "pixels")  # fmt: skip
-BLEND_COLUMNS = ("lanes", "M blends/s", "M multiply-adds/s", "multiply-adds a blend",
-                 "instructions a blend", "share of the machine")  # fmt: skip
-# Of one register of pixels that are all blended, loads and stores aside; by lanes.
+STAGES = ("project", "sort", "bin", "raster")  # The stages of a frame, in their order.
+BUFFERS = frozenset({RGB, ALPHA})  # The buffers that are drawn.
+SETTINGS = RasterSettings()  # The rasteriser's settings, those of the reference image.
+FOG = Fog(extinction_per_m=0.03, airlight_rgb=(0.7, 0.72, 0.75))  # The fog of frames with smog.
+# The columns of the table of a frame's work.
+COLUMNS = (
+    "scene",
+    "smog / clear",
+    "splats used",
+    "pairs",
+    "pairs listed",
+    "M pairs/s",
+    "scene MiB",
+    "frame MiB",
+)
+# The columns of the comparison with the torch reference.
+REFERENCE_COLUMNS = (
+    "reference ms",
+    "cpu ms",
+    "speed-up",
+    "99.9 % within",
+    "max",
+    "flipped",
+    "pixels",
+)
+# The columns of the table of blends.
+BLEND_COLUMNS = (
+    "lanes",
+    "M blends/s",
+    "M multiply-adds/s",
+    "multiply-adds a blend",
+    "instructions a blend",
+    "share of the machine",
+)
+# The number of instructions that blend one register of pixels, without loads and stores, by the
+# number of lanes of a register. All pixels of the register are blended.
 BLEND_INSTRUCTIONS = {16: 20, 8: 23}
-SHEETS = 400  # splats that cover the whole image, and its size
-SHEETS_SIZE = (640, 480)
-FMA_ROUNDS = 1 << 21
-REFERENCE_CASE = RasterCase(5_000, 320, 240)  # what the torch reference draws within a second
+SHEETS = 400  # The number of splats that cover the whole image, for blends a second.
+SHEETS_SIZE = (640, 480)  # The width and height of that image, pixels.
+FMA_ROUNDS = 1 << 21  # The number of rounds of multiply-adds.
+# The scene of the torch reference, which it draws within a second.
+REFERENCE_CASE = RasterCase(5_000, 320, 240)
 
 
 @dataclass(frozen=True)
 class RasterCases:
-    """reference: of the torch reference beside ours. memory: whether it is measured."""
+    """The random scenes that are measured."""
 
     scenes: Sequence[RasterCase] = (SMALL_CASE, LARGE_CASE)
+    """The scenes of timed frames."""
     reference: RasterCase = REFERENCE_CASE
+    """The scene that is also drawn by the torch reference."""
     memory: bool = True
+    """True if memory is measured."""
 
 
-WHOLE = RasterCases()
-QUICK = RasterCases((SMALL_CASE,))
+FULL_CASE = RasterCases()  # The case of published figures.
+QUICK_CASE = RasterCases((SMALL_CASE,))  # The case of `--quick`.
 
 
 def measure(quick: bool = False, repeats: int = 7, cases: RasterCases | None = None) -> Figures:
-    """repeats: timed rounds of a clear and a smoggy frame a scene."""
+    """Measure the CPU rasteriser.
+
+    Args:
+        quick: True for QUICK_CASE.
+        repeats: The number of timed rounds, of a clear frame and one with smog, for every scene.
+        cases: The scenes; None for FULL_CASE or QUICK_CASE.
+    """
     machine = machine_facts()
-    cases = cases or (QUICK if quick else WHOLE)
+    cases = cases or (QUICK_CASE if quick else FULL_CASE)
     warm_up_s = warm_up()
     stages = []
     work = []
@@ -112,8 +150,18 @@ def measure(quick: bool = False, repeats: int = 7, cases: RasterCases | None = N
 
 
 def _measure(case: RasterCase, repeats: int, memory: bool) -> Figures:
-    """visible: splats that touch a tile which nearer ones have not filled. pairs: of splats and
-    tiles that their boxes touch; listed_pairs: those of open tiles, which were blended.
+    """Measure frames of one random scene.
+
+    Args:
+        case: The scene.
+        repeats: The number of rounds that count.
+        memory: True if memory is measured.
+
+    Returns:
+        Figures, among them
+        visible: splats that touch a tile which nearer splats have not filled.
+        pairs: pairs of a splat and a tile that its box touches.
+        listed_pairs: the pairs of tiles that were not filled, which were blended.
     """
     frame_mib = peak_mib_in_subprocess(frame_of, (case,)) if memory else None
     gaussians, camera = random_scene(case)
@@ -128,7 +176,9 @@ def _measure(case: RasterCase, repeats: int, memory: bool) -> Figures:
     tiles = bin_to_tiles(project_parts(parts, camera, SETTINGS), camera)
     return {
         "case": case.name,
-        "stages_ms": {name: spread_ms([each[name] for each in stages[1:]]) for name in STAGES},
+        "stages_ms": {
+            name: spread_ms([stage_s[name] for stage_s in stages[1:]]) for name in STAGES
+        },
         "ms": spread_ms(seconds["clear"]),
         "smog_ms": spread_ms(seconds["smog"]),
         "smog_over_clear": spread_ratio(seconds["smog"], seconds["clear"]),
@@ -142,7 +192,12 @@ def _measure(case: RasterCase, repeats: int, memory: bool) -> Figures:
 
 @kernel
 def multiply_add(rounds, sums):
-    """Chains of fused multiply-adds of v8.WIDE lanes, as many as keep all units busy, a thread."""
+    """Run twelve chains of fused multiply-adds of v8.WIDE lanes, which keep all units busy.
+
+    Args:
+        rounds: The number of rounds of twelve multiply-adds.
+        sums: [threads * v8.WIDE], float32. Receives the sums, so that no work is left out.
+    """
     for run in prange(sums.size // v8.WIDE):
         one = v8.wide_columns()
         half = v8.broadcast_as(one, np.float32(0.5))
@@ -179,7 +234,7 @@ def multiply_add(rounds, sums):
 
 
 def _blending(repeats: int) -> Figures:
-    """How many blends a second of one core's time, and multiply-adds in turn with them."""
+    """Measure blends a second of one core's time, and multiply-adds a second in turn with them."""
     (width, height) = SHEETS_SIZE
     side = float(SHEETS_SIZE[0])
     means = torch.zeros(SHEETS, 3)
@@ -188,7 +243,7 @@ def _blending(repeats: int) -> Figures:
         means=means,
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(SHEETS, 1),
         scales=torch.tensor([[50.0, 50.0, 0.01]]).repeat(SHEETS, 1),
-        opacities=torch.full((SHEETS,), 0.01),  # no pixel is finished by all of them
+        opacities=torch.full((SHEETS,), 0.01),  # All of them together finish no pixel.
         sh=torch.zeros(SHEETS, 1, 3),
     )
     ahead = torch.eye(4, dtype=torch.float64)
@@ -223,11 +278,12 @@ def _blending(repeats: int) -> Figures:
 
 
 def _draw(parts: list[PosedGaussians], camera: Camera, fog: Fog | None = None) -> RenderOutput:
+    """Draw a frame with the CPU backend, in smog where `fog` is given."""
     return rasterize_cpu(parts, camera, BUFFERS, SETTINGS, fog)
 
 
 def frame_of(case: RasterCase) -> Action:
-    """A clear frame of a process that has compiled its kernels and holds the scene."""
+    """Return an action that draws a clear frame, with kernels compiled and the scene in memory."""
     warm_up()
     gaussians, camera = random_scene(case)
     return lambda: _draw([PosedGaussians(gaussians)], camera)
@@ -235,7 +291,7 @@ def frame_of(case: RasterCase) -> Action:
 
 @torch.no_grad()
 def _beside_reference(case: RasterCase, repeats: int) -> Figures:
-    """The torch reference and the CPU backend on one small scene, float32."""
+    """Compare the torch reference with the CPU backend on one small scene: times and colours."""
     gaussians, camera = random_scene(case)
     parts = [PosedGaussians(gaussians)]
 

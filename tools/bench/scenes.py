@@ -1,5 +1,7 @@
-"""What several subjects of `climategs bench` measure: scenes, cameras, recipes, and what a frame
-under an effect costs beside the clean one.
+"""Scenes, cameras and recipes that several subjects of `climategs bench` measure.
+
+`cost_tables` measures the cost of an effect: its frames in turns with clean frames. The modules of
+effects (`smog.py`, `flood.py`, `snow.py`, `rain.py`, `style.py`) add tables of their errors.
 """
 
 from __future__ import annotations
@@ -41,32 +43,38 @@ from tools.bench.harness import (
     spread_ratio,
 )
 
-ZOOMS = (1.0, 0.8, 1.25, 1.6, 2.0, 2.5)  # the first that is near is taken
-NEAR_SHARE = 0.05  # of the image; as much off is about a third, too
-FOCAL_PER_WIDTH = 0.8125  # 520 px at 640, 1300 px at 1600
+# The zooms that `water_camera` tries, in order. It takes the first whose share of water is right.
+ZOOMS = (1.0, 0.8, 1.25, 1.6, 2.0, 2.5)
+NEAR_SHARE = 0.05  # The largest error of the share of water in the image, which shall be a third.
+# The focal length of the random scene's camera by the image's width: 520 px at 640 px.
+FOCAL_PER_WIDTH = 0.8125
 
 
 @dataclass(frozen=True)
 class RasterCase:
-    """One size of the random scene. count: Gaussians. width, height: pixels."""
+    """One size of the random scene."""
 
     count: int
+    """The number of Gaussians."""
     width: int
+    """The width of the image, pixels."""
     height: int
+    """The height of the image, pixels."""
 
     @property
     def name(self) -> str:
+        """The size in short: "100k@640x480"."""
         multiples = {"M": 1_000_000, "k": 1_000, "": 1}
         suffix = next(s for s, multiple in multiples.items() if self.count % multiple == 0)
         return f"{self.count // multiples[suffix]}{suffix}@{self.width}x{self.height}"
 
 
-SMALL_CASE = RasterCase(100_000, 640, 480)
-LARGE_CASE = RasterCase(1_000_000, 1600, 1066)
+SMALL_CASE = RasterCase(100_000, 640, 480)  # The smaller of the usual sizes.
+LARGE_CASE = RasterCase(1_000_000, 1600, 1066)  # The larger of the usual sizes.
 
 
 def random_scene(case: RasterCase, *, seed: int = 0) -> tuple[Gaussians, Camera]:
-    """Gaussians with SH of degree 3 spread evenly over a view, and its camera.
+    """Return random Gaussians with SH of degree 3, spread evenly over a view, and its camera.
 
     Depth is uniform in 2 to 20 m, x and y within 1.1 of the frustum, each scale exp of a uniform
     logarithm between 4 and 60 mm, rotations uniform, opacity Beta(0.9, 1.2) clipped to [0.005, 1].
@@ -93,6 +101,7 @@ def random_scene(case: RasterCase, *, seed: int = 0) -> tuple[Gaussians, Camera]
 
 
 def street_uri(frames: int = 1, gaussians: int | None = None) -> str:
+    """Return the address of the procedural street. gaussians: None for the street's default."""
     size = "" if gaussians is None else f"&gaussians={gaussians}"
     return f"procedural:street?seed=3&frames={frames}{size}"
 
@@ -140,16 +149,18 @@ def water_camera(scene: Scene, width: int, height: int, backend: str = "auto") -
 
 # ---- recipes ------------------------------------------------------------------------------------
 
-PICTURE_ONLY = Output(depth="none", labels=False)
-CLEAN = Recipe(output=PICTURE_ONLY)
-# Water 25 cm above the median road, the middle one of a drive that may have a slope.
+PICTURE_ONLY = Output(depth="none", labels=False)  # The outputs of a timed frame.
+CLEAN = Recipe(output=PICTURE_ONLY)  # The recipe without effects.
+# The fields of a flood 25 cm above the median height of the road. A drive may have a slope.
 WATER = {"level_m": 0.25, "reference": "median"}
 
 
 def recipe_of(effects: Mapping[str, Any], output: Output = PICTURE_ONLY) -> Recipe:
     """Return a recipe with some effects.
 
-    effects: fields of each effect, by its name.
+    Args:
+        effects: The fields of each effect, by its name.
+        output: The outputs of the recipe.
     """
     weather = {name: fields for name, fields in effects.items() if name in Weather.model_fields}
     other_sections = {name: fields for name, fields in effects.items() if name not in weather}
@@ -163,10 +174,27 @@ def frame_of(scene: Scene, camera: Camera, recipe: Recipe, backend: str = "auto"
 
 
 def record_street(
-    folder: Path, recipe: Recipe, *, scale: float = 1.0, frames: int, gaussians: int,
+    folder: Path,
+    recipe: Recipe,
+    *,
+    scale: float = 1.0,
+    frames: int,
+    gaussians: int,
     cameras: Sequence[str] | None = None,
-) -> tuple[Scene, Path]:  # fmt: skip
-    """Run a job on the procedural street; return the scene, and the folder of its one variant."""
+) -> tuple[Scene, Path]:
+    """Run a job on the procedural street.
+
+    Args:
+        folder: The output folder.
+        recipe: The recipe of the images.
+        scale: The scale of the images.
+        frames: The number of frames.
+        gaussians: The number of Gaussians of the street.
+        cameras: The names of the cameras; None for all.
+
+    Returns:
+        The scene, and the folder of the job's only variant.
+    """
     scene = open_scene(street_uri(frames, gaussians))
     recipe = recipe.model_copy(update={"render": recipe.render.model_copy(update={"scale": scale})})
     job = RenderJob(scene.source, [recipe], folder, cameras=cameras)
@@ -174,10 +202,11 @@ def record_street(
     return scene, folder / folder_name(scene.name) / variant_name(recipe)
 
 
-# ---- what an effect costs -----------------------------------------------------------------------
+# ---- the cost of an effect ----------------------------------------------------------------------
 
-SMALL = 0.125  # resolution of the frame that loads kernels before memory is measured
-Cases = Mapping[str, tuple[Recipe, Recipe]]  # with the effect, and the clean frame beside it
+SMALL = 0.125  # The scale of the frame that loads kernels before memory is measured.
+# The recipe with an effect and the clean recipe that it is compared with, by the case's name.
+Cases = Mapping[str, tuple[Recipe, Recipe]]
 
 
 @dataclass(frozen=True)
@@ -198,9 +227,11 @@ class EffectCase:
     memory: bool = True  # whether memory is measured
 
     def open_street(self) -> tuple[Scene, StreetTruth]:
+        """Return the street and its exact surfaces."""
         return open_scene(self.street), open_truth(parse_uri(self.street)[2])
 
     def views(self, street: Scene, scale: float = 1.0) -> list[Camera]:
+        """Return the cameras of the street's views. scale: on top of the case's."""
         return [
             street.frame(frame).cameras[name].scaled(self.scale * scale)
             for frame in self.frames
@@ -208,11 +239,20 @@ class EffectCase:
         ]
 
 
-WHOLE = EffectCase()
-QUICK = EffectCase(
-    (street_uri(),), 800, 533, street_uri(2, 120_000), (0,), ("front",), scale=0.5, cell_m=0.1,
-    splats=200_000, presets=("overcast", "golden-hour"),
-)  # fmt: skip
+FULL_CASE = EffectCase()  # The case of published figures.
+# The case of `--quick`.
+QUICK_CASE = EffectCase(
+    (street_uri(),),
+    800,
+    533,
+    street_uri(2, 120_000),
+    (0,),
+    ("front",),
+    scale=0.5,
+    cell_m=0.1,
+    splats=200_000,
+    presets=("overcast", "golden-hour"),
+)
 
 
 def measure_effect(
@@ -220,7 +260,11 @@ def measure_effect(
 ) -> Figures:
     """Measure one effect.
 
-    effect: a module of this folder. scene: a further scene whose cost is measured.
+    Args:
+        effect: The name of a module of this folder.
+        repeats: The number of rounds that count.
+        case: The scenes and sizes.
+        scene: The address of a further scene in which the effect's cost is measured.
     """
     machine = machine_facts()
     scenes = (*case.scenes, *([scene] if scene else []))
@@ -230,9 +274,13 @@ def measure_effect(
 
 
 def cost_tables(case: EffectCase, cases: Cases, staged: Sequence[str], repeats: int) -> list[Table]:
-    """Measure, for every scene, the frames of every case in turns with clean ones.
+    """Measure the frames of every case in turns with clean frames, for every scene.
 
-    staged: cases whose stages and memory are shown.
+    Args:
+        case: The scenes and sizes.
+        cases: The recipes.
+        staged: The names of cases whose stages and memory are shown.
+        repeats: The number of rounds that count.
     """
     tables: list[Table] = []
     for uri in case.scenes:
@@ -274,7 +322,12 @@ def cost_tables(case: EffectCase, cases: Cases, staged: Sequence[str], repeats: 
 def time_frames(
     scene: Scene, camera: Camera, recipes: Mapping[str, Recipe], repeats: int, backend: str = "auto"
 ) -> tuple[dict[str, list[float]], dict[str, dict[str, float]]]:
-    """Seconds of each recipe's frames as floats, and medians of their stages, milliseconds."""
+    """Time frames of several recipes in turns, to finished floats.
+
+    Returns:
+        Seconds of every recipe's frames; medians of their stages in milliseconds, by recipe and
+        stage.
+    """
     stage_times: dict[str, list[dict[str, float]]] = {name: [] for name in recipes}
 
     def timed_frame(name: str, frame: Action) -> None:
@@ -294,7 +347,10 @@ def time_frames(
 
 
 def _warm_frame(uri: str, width: int, height: int, recipe: Recipe) -> Action:
-    """A frame of a process that has drawn it small: kernels, snow, maps and sky are there."""
+    """Return an action that draws a frame which was drawn small before.
+
+    So the process already holds kernels, snow, maps and sky.
+    """
     scene = open_scene(uri)
     camera = water_camera(scene, width, height)
     frame_of(scene, camera.scaled(SMALL), recipe)()

@@ -1,8 +1,9 @@
-"""Smog: its cost, and its errors against exact smog per pixel.
+"""Smog: its cost in a frame, and its errors against exact smog per pixel.
 
-The street's surfaces are known, and so is the distance d of every pixel. The exact picture is
-t(d) c + (1 - t(d)) airlight, with c the clean splat render: the smog is compared and not the
-splats' colour. Silhouettes, where a pixel shows two distances, count separately.
+The surfaces of the procedural street are known, and so is the distance d of every pixel. The exact
+picture is t(d) c + (1 - t(d)) airlight with transmittance t. The colour c is that of the clean
+splat render, so that only the smog is compared and not the splats' colours. Silhouettes, where one
+pixel shows two distances, count separately.
 """
 
 from __future__ import annotations
@@ -24,16 +25,20 @@ from recipes.schema import Recipe
 from tools.bench.harness import Table
 from tools.bench.scenes import CLEAN, EffectCase, cost_tables, frame_of, recipe_of
 
+# The fields of every measured smog, by its row's name.
 SMOGS = {
     "uniform, visibility 80 m": {"visibility_m": 80},
     "uniform, visibility 300 m": {"visibility_m": 300},
     "scale height 15 m, visibility 80 m": {"visibility_m": 80, "scale_height_m": 15},
 }
-SMOOTH = 5  # px: a pixel is away from silhouettes where this square around it is one surface
-SMOOTH_DEPTH = 0.1  # largest relative change of depth within that square
+# The side of the square around a pixel, pixels. A pixel is away from silhouettes if the square
+# around it shows one surface.
+SMOOTH_SQUARE_PX = 5
+SMOOTH_DEPTH_RATIO = 0.1  # The largest relative change of depth within that square.
 
 
 def tables(case: EffectCase, repeats: int) -> list[Table]:
+    """Measure costs of every smog, and errors by region of the street's views."""
     recipes = {
         (name, model): recipe_of({"smog": {**smog, "model": model}})
         for name, smog in SMOGS.items()
@@ -68,17 +73,20 @@ def tables(case: EffectCase, repeats: int) -> list[Table]:
 
 @dataclass(frozen=True, eq=False)
 class TruthView:
-    """A camera's clean splat render and the exact picture of the same surfaces. regions: bool
-    [H, W]: `smooth`, away from silhouettes, and `silhouette`, the other surface pixels.
-    """
+    """A camera's clean splat render, and the exact view of the same surfaces."""
 
     camera: Camera
+    """The camera."""
     clean: Tensor
+    """[H, W, 3]. The clean splat render."""
     exact: ExactView
+    """The exact view, with depth, classes and instances."""
     regions: Mapping[str, np.ndarray]
+    """Masks [H, W]: `smooth` is surface away from silhouettes, `silhouette` is other surface."""
 
 
 def truth_view(scene: Scene, truth: StreetTruth, camera: Camera) -> TruthView:
+    """Render a camera's clean and exact views."""
     clean = frame_of(scene, camera, CLEAN)().rgb
     exact = truth.render(camera)
     surface = np.isfinite(exact.depth)
@@ -87,7 +95,7 @@ def truth_view(scene: Scene, truth: StreetTruth, camera: Camera) -> TruthView:
 
 
 def smog_error(recipe: Recipe, scene: Scene, view: TruthView) -> np.ndarray:
-    """Largest channel error [H, W] of the fogged splats against exact smog, in 1/255."""
+    """Return the largest channel error [H, W] of splats in smog against exact smog, in 1/255."""
     fog = make_plan(recipe, scene).effect_plans["smog"].data.fog
     camera = view.camera
     fogged = frame_of(scene, camera, recipe)().rgb
@@ -101,10 +109,14 @@ def smog_error(recipe: Recipe, scene: Scene, view: TruthView) -> np.ndarray:
 
 
 def away_from_silhouettes(view: ExactView) -> np.ndarray:
-    """Pixels whose square of SMOOTH px shows one object, one class, and little change of depth."""
-    kernel = np.ones((SMOOTH, SMOOTH), np.uint8)
-    far = np.where(np.isfinite(view.depth), view.depth, 1e6).astype(np.float32)
-    ratio = cv2.dilate(far, kernel) / np.maximum(cv2.erode(far, kernel), 1e-6)
+    """Mask of pixels away from silhouettes, bool [H, W].
+
+    The square of SMOOTH_SQUARE_PX around such a pixel shows one object and one class, and its depth
+    changes by no more than SMOOTH_DEPTH_RATIO.
+    """
+    kernel = np.ones((SMOOTH_SQUARE_PX, SMOOTH_SQUARE_PX), np.uint8)
+    depth = np.where(np.isfinite(view.depth), view.depth, 1e6).astype(np.float32)
+    ratio = cv2.dilate(depth, kernel) / np.maximum(cv2.erode(depth, kernel), 1e-6)
     labels = (view.semantic.astype(np.float32) * 1000 + view.instance).astype(np.float32)
-    same = cv2.dilate(labels, kernel) == cv2.erode(labels, kernel)
-    return same & (ratio < 1 + SMOOTH_DEPTH)
+    is_one_surface = cv2.dilate(labels, kernel) == cv2.erode(labels, kernel)
+    return is_one_surface & (ratio < 1 + SMOOTH_DEPTH_RATIO)

@@ -1,9 +1,13 @@
-"""Snow: its cost, where it is placed, what it covers and should not, and its height.
+"""Snow: its cost in a frame, the time of its placement, and errors of its places and heights.
 
-The procedural street says what snow should lie on: points of its true surface from straight
-above. A point is open where the vertical ray from the sky meets it first, flat where the true
-surface is no steeper than the limit, seen where nothing stands between it and a camera. What
-drives or walks shelters nothing, nor does it hide anything.
+The true surface of the procedural street is known, and so are the points on which snow should lie.
+They are points on a grid of the ground plan, on the surface that is highest there, that are
+
+- open: the vertical ray from the sky meets the point first;
+- flat: the true surface is no steeper than the limit of snow;
+- seen: nothing stands between the point and a camera.
+
+Moving objects shelter no point and hide no point.
 """
 
 from __future__ import annotations
@@ -47,15 +51,19 @@ from tools.bench.scenes import (
     recipe_of,
 )
 
-NEXT_CAMERA = "next camera"
-AHEAD = "1 ahead"
-SHADINGS = ("per_splat", "per_pixel")
+NEXT_CAMERA = "next camera"  # The kind of pairs of neighbouring cameras.
+AHEAD = "1 ahead"  # The kind of pairs of a camera and itself one frame ahead.
+SHADINGS = ("per_splat", "per_pixel")  # The shadings of snow that are measured.
+# The estimators of height that a placement can use.
 ESTIMATORS: tuple[DepthEstimator, ...] = get_args(DepthEstimator)
-DEPTHS_M = (0.02, 0.1, 0.4)
-SKY_Z_M = 60.0  # above everything on the street
-OVER_M = 0.2  # a cell farther above or below the true surface does not lie on it
+DEPTHS_M = (0.02, 0.1, 0.4)  # The depths of snow whose heights are measured, metres.
+SKY_Z_M = 60.0  # A height above everything on the street, metres.
+# The largest height difference, metres, at which a cell still lies on the true surface.
+OVER_M = 0.2
+# The limits of the rings around the cameras' path in which covered points are counted, metres.
 RINGS_M = (0.0, 8.0, 16.0, 32.0)
-LIFT_M = 1e-3  # of a point above its own surface, before it looks at a camera
+# The lift of a point above its surface, metres, before rays to cameras are cast from it.
+LIFT_M = 1e-3
 
 
 def snow_recipe(
@@ -64,25 +72,40 @@ def snow_recipe(
     output: Output = PICTURE_ONLY,
     **other_effects: Any,
 ) -> Recipe:
-    """10 cm of snow. other_effects: fields of other effects, by name."""
+    """Return a recipe with 10 cm of snow.
+
+    Args:
+        shading: One of SHADINGS.
+        cell_m: The edge of the cells of the snow, metres.
+        output: The outputs of the recipe.
+        other_effects: Fields of other effects, by the effect's name.
+    """
     snow = {"depth_m": 0.1, "shading": shading, "cell_m": cell_m}
     return recipe_of({"snow": snow, **other_effects}, output)
 
 
 def tables(case: EffectCase, repeats: int) -> list[Table]:
-    """Costs of either shading alone, with depth and labels, and in smog; and in a flood."""
+    """Measure placement, costs, accuracy and the agreement of masks between views.
+
+    Costs are those of both shadings alone, with depth and labels, and in smog; and of one shading
+    in a flood.
+    """
     kinds = [
         ("", {}, PICTURE_ONLY),
         (", depth and labels", {}, Output()),
         (", smog", {"smog": {"visibility_m": 200}}, PICTURE_ONLY),
     ]
-    wet = (", flood", {"flood": {"level_m": 0.15, "reference": "median"}}, PICTURE_ONLY)
-    cases = [(shading, *kind) for kind in kinds for shading in SHADINGS] + [("per_splat", *wet)]
+    flood_kind = (", flood", {"flood": {"level_m": 0.15, "reference": "median"}}, PICTURE_ONLY)
+    cases = [(shading, *kind) for kind in kinds for shading in SHADINGS] + [
+        ("per_splat", *flood_kind)
+    ]
     costs = {
-        shading + title: (snow_recipe(shading, case.cell_m, output, **beside),
-                          recipe_of(beside, output))
-        for shading, title, beside, output in cases
-    }  # fmt: skip
+        shading + title: (
+            snow_recipe(shading, case.cell_m, output, **other_effects),
+            recipe_of(other_effects, output),
+        )
+        for shading, title, other_effects, output in cases
+    }
     all_tables = [placement_table(uri, case, repeats) for uri in case.scenes]
     all_tables += cost_tables(case, costs, SHADINGS, repeats)
     street, truth = case.open_street()
@@ -96,7 +119,7 @@ def tables(case: EffectCase, repeats: int) -> list[Table]:
     return all_tables
 
 
-# ---- placement: what it takes, and what it covers -----------------------------------------------
+# ---- placement: its time and its accuracy -------------------------------------------------------
 
 
 def placement(scene: Scene, cell_m: float, backend: str = "auto") -> Callable[[], ExposedSurface]:
@@ -112,14 +135,15 @@ def placement_table(uri: str, case: EffectCase, repeats: int) -> Table:
     find = placement(scene, case.cell_m)
     support = find()
     stages = rounds({"all": find}, min(repeats, 3))
-    depths_m = itertools.cycle((0.05, 0.1, 0.3))  # what was laid last does not help the next
+    # Each layer has another depth than the last one, so that nothing of that can be used again.
+    depths_m = itertools.cycle((0.05, 0.1, 0.3))
 
     def lay(shading: str) -> object:
         snow = recipe_of({"snow": {"depth_m": next(depths_m), "shading": shading}}).weather.snow
         return lay_snow(support, scene, snow, find_snow_light(scene, snow), seed=0)
 
-    laid = rounds({name: functools.partial(lay, name) for name in SHADINGS}, repeats)
-    stages |= {f"another depth, {name}": seconds for name, seconds in laid.items()}
+    layer_seconds = rounds({name: functools.partial(lay, name) for name in SHADINGS}, repeats)
+    stages |= {f"another depth, {name}": seconds for name, seconds in layer_seconds.items()}
     mib = peak_mib_in_subprocess(_warm_placement, (uri, case.cell_m)) if case.memory else None
     on_vehicles = sum(map(len, support.actors.values()))
     return Table(
@@ -140,23 +164,26 @@ def _warm_placement(uri: str, cell_m: float) -> Action:
 
 @dataclass(frozen=True, eq=False)
 class TruePoints:
-    """P places on a grid of the ground plan and the surface that is highest there.
-
-    xy [P, 2], z [P]: world, metres. slope [P]: of the surface, radians. semantic [P]: its class.
-    from_path_m [P]: level distance to the nearest camera. is_seen [P]: by a camera.
-    """
+    """P points on a grid of the ground plan, on the surface that is highest there."""
 
     xy: np.ndarray
+    """[P, 2]. Positions in the world, metres."""
     z: np.ndarray
+    """[P]. Heights of the surface in the world, metres."""
     slope: np.ndarray
+    """[P]. Slopes of the surface, radians."""
     semantic: np.ndarray
+    """[P]. Classes of the surface."""
     from_path_m: np.ndarray
+    """[P]. Horizontal distances to the nearest camera, metres."""
     is_seen: np.ndarray
+    """[P], bool. True if a camera sees the point."""
 
     def __len__(self) -> int:
         return len(self.z)
 
-    def chosen(self, mask: np.ndarray) -> TruePoints:
+    def select(self, mask: np.ndarray) -> TruePoints:
+        """Return the points of a mask [P]."""
         return TruePoints(*(getattr(self, f.name)[mask] for f in dataclasses.fields(self)))
 
 
@@ -166,8 +193,14 @@ def without_movers(truth: StreetTruth) -> StreetTruth:
 
 
 def camera_from_above(cameras: Sequence[Camera], *, reach_m: float, pixel_m: float) -> Camera:
-    """An orthographic camera that looks down on all that is within reach_m of the cameras, in level
-    distance along x and y; rows towards -y.
+    """Return an orthographic camera that looks down on the surroundings of cameras.
+
+    Its rows run towards -y.
+
+    Args:
+        cameras: The cameras.
+        reach_m: The image reaches so far beyond the outermost cameras along x and y, metres.
+        pixel_m: The side of a pixel on the ground, metres.
     """
     centres = np.stack([camera.centre.numpy()[:2] for camera in cameras])
     low = centres.min(0) - reach_m
@@ -183,7 +216,7 @@ def camera_from_above(cameras: Sequence[Camera], *, reach_m: float, pixel_m: flo
 
 
 def pixel_positions(camera: Camera) -> np.ndarray:
-    """x and y [H, W, 2] of the pixels of a camera from above."""
+    """Return x and y of the pixel centres of a camera from above, [H, W, 2]."""
     centre = camera.centre.numpy()
     x = centre[0] + (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = centre[1] - (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
@@ -198,11 +231,12 @@ def pixels_of(camera: Camera, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def surface_below(truth: StreetTruth, xy: np.ndarray) -> np.ndarray:
-    """z [P] of the highest surface at xy [P, 2]; -infinity where there is none."""
-    return SKY_Z_M - _drop(truth, xy).distance
+    """Return z [P] of the highest surface at xy [P, 2]; -infinity where there is none."""
+    return SKY_Z_M - _cast_down(truth, xy).distance
 
 
-def _drop(truth: StreetTruth, xy: np.ndarray) -> RayHits:
+def _cast_down(truth: StreetTruth, xy: np.ndarray) -> RayHits:
+    """Return the first hits of vertical rays from the sky at xy [P, 2]."""
     origins = np.concatenate([xy, np.full((len(xy), 1), SKY_Z_M)], 1)
     down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
     return truth.cast(origins, down, 0, with_rgb=False)
@@ -211,44 +245,58 @@ def _drop(truth: StreetTruth, xy: np.ndarray) -> RayHits:
 def true_points(
     truth: StreetTruth, cameras: Sequence[Camera], xy: np.ndarray, *, reach_m: float
 ) -> TruePoints:
-    """The open points at xy [P, 2] within reach_m of the cameras' path. truth: `still`."""
-    away = np.full(len(xy), np.inf)
+    """Return the open points at some positions that are near the cameras' path.
+
+    Args:
+        truth: The street without moving objects.
+        cameras: The cameras.
+        xy: [P, 2]. The positions in the world, metres.
+        reach_m: The largest horizontal distance to a camera, metres.
+    """
+    path_distance_m = np.full(len(xy), np.inf)
     for centre in {tuple(camera.centre.numpy()[:2].round(1)) for camera in cameras}:
-        np.minimum(away, np.hypot(*(xy - centre).T), out=away)
-    hits = _drop(truth, xy)
+        np.minimum(path_distance_m, np.hypot(*(xy - centre).T), out=path_distance_m)
+    hits = _cast_down(truth, xy)
     points = TruePoints(
         xy=xy,
         z=SKY_Z_M - hits.distance,
         slope=np.arccos(np.clip(hits.normal[:, 2], -1, 1)),
         semantic=hits.semantic,
-        from_path_m=away,
+        from_path_m=path_distance_m,
         is_seen=np.zeros(len(xy), bool),
     )
-    is_hit = (away <= reach_m) & np.isfinite(hits.distance)
-    points = points.chosen(is_hit)
+    is_hit = (path_distance_m <= reach_m) & np.isfinite(hits.distance)
+    points = points.select(is_hit)
     return dataclasses.replace(points, is_seen=_seen(truth, cameras, points, hits.normal[is_hit]))
 
 
 def _seen(
     truth: StreetTruth, cameras: Sequence[Camera], points: TruePoints, normals: np.ndarray
 ) -> np.ndarray:
-    """bool [P]: seen by one of the cameras, whatever its distance."""
+    """Return True for every point that a camera sees, at any distance; bool [P].
+
+    Args:
+        truth: The street without moving objects.
+        cameras: The cameras.
+        points: The points.
+        normals: [P, 3]. Normals of the surface at the points.
+    """
     places = np.concatenate([points.xy, points.z[:, None]], 1) + LIFT_M * normals
     is_seen = np.zeros(len(points), bool)
     for camera in cameras:
-        left = np.flatnonzero(~is_seen)
+        point_ids = np.flatnonzero(~is_seen)
         pose = camera.camera_from_world.numpy()
-        to_eye = camera.centre.numpy() - places[left]
-        x, y, z = (places[left] @ pose[:3, :3].T + pose[:3, 3]).T
+        to_eye = camera.centre.numpy() - places[point_ids]
+        x, y, z = (places[point_ids] @ pose[:3, :3].T + pose[:3, 3]).T
         depth = np.maximum(z, 1e-9)
         u = camera.fx * x / depth + camera.cx
         v = camera.fy * y / depth + camera.cy
-        inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        inside &= (to_eye * normals[left]).sum(1) > 0
-        if inside.any():
-            left = left[inside]
-            to_eye = to_eye[inside]
-            is_seen[left] = ~truth.street.static.tree.occluded(places[left], to_eye, 1.0)
+        is_inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        is_inside &= (to_eye * normals[point_ids]).sum(1) > 0
+        if is_inside.any():
+            point_ids = point_ids[is_inside]
+            to_eye = to_eye[is_inside]
+            is_seen[point_ids] = ~truth.street.static.tree.occluded(places[point_ids], to_eye, 1.0)
     return is_seen
 
 
@@ -262,9 +310,17 @@ def snow_accuracy(
     depths_m: Sequence[float] = DEPTHS_M,
     estimators: Sequence[DepthEstimator] = ESTIMATORS,
 ) -> dict[str, Any]:
-    """Figures of every estimator that placement can use. reach_m: level distance from the cameras
-    within which points are taken. pixel_m: of the view from above; every second of its pixels along
-    each axis is a point.
+    """Measure the accuracy of snow's places and heights with every estimator of height.
+
+    Args:
+        scene: The street's scene.
+        truth: The street's exact surfaces.
+        cell_m: The edge of the cells of the snow, metres.
+        reach_m: The largest horizontal distance of points from the cameras, metres.
+        pixel_m: The side of a pixel of the view from above, metres. Every second pixel along each
+            axis is a point.
+        depths_m: The depths of snow whose heights are measured, metres.
+        estimators: The estimators.
     """
     cameras = all_cameras(scene)
     street = without_movers(truth)
@@ -273,8 +329,8 @@ def snow_accuracy(
         street, cameras, pixel_positions(above)[1::2, 1::2].reshape(-1, 2), reach_m=reach_m
     )
     max_slope = math.radians(ExposureSettings(cell_m=cell_m).max_slope_deg)
-    flat = points.chosen(points.is_seen & (points.slope < max_slope))
-    crown = flat.semantic == SemanticClass.VEGETATION
+    flat = points.select(points.is_seen & (points.slope < max_slope))
+    is_crown = flat.semantic == SemanticClass.VEGETATION
     bias = _scene_bias_m(scene, street, flat, above)
     estimator_rows = []
     for estimator in estimators:
@@ -285,18 +341,22 @@ def snow_accuracy(
         for low, high in itertools.pairwise(RINGS_M):
             in_ring = (flat.from_path_m >= low) & (flat.from_path_m < high)
             rings[f"{low:g}-{high:g} m"] = float(covered[in_ring].mean()) if in_ring.any() else None
-        estimator_rows.append({
-            "estimator": estimator,
-            "covered": float(covered[~crown].mean()),
-            "rings": rings,
-            "error_m": height_error(support_heights(support.ground, flat) - flat.z),
-            "depths": [_drawn(scene, support, street, flat, above, d, bias) for d in depths_m],
-        })  # fmt: skip
+        estimator_rows.append(
+            {
+                "estimator": estimator,
+                "covered": float(covered[~is_crown].mean()),
+                "rings": rings,
+                "error_m": height_error(support_heights(support.ground, flat) - flat.z),
+                "depths": [
+                    _measure_layer(scene, support, street, flat, above, d, bias) for d in depths_m
+                ],
+            }
+        )
     return {"points": len(flat), "scene_bias_m": bias, "estimators": estimator_rows}
 
 
 def accuracy_tables(street: str, accuracy: dict[str, Any]) -> list[Table]:
-    """Lengths in cm, shares in %."""
+    """Return the tables of `snow_accuracy`, with lengths in cm and shares in %."""
 
     def hundredfold(values: Sequence[float | None]) -> list[float | None]:
         return [None if value is None else 100 * value for value in values]
@@ -337,7 +397,10 @@ def accuracy_tables(street: str, accuracy: dict[str, Any]) -> list[Table]:
 
 
 def cells_over(cells: ExposedCells, points: TruePoints) -> np.ndarray:
-    """int64 [P]: the cell over each point and close to its surface, -1 where there is none."""
+    """Return the id of the cell that lies over each point, int64 [P]; -1 where there is none.
+
+    A cell counts only within OVER_M of the true surface.
+    """
     centers = cells.centers_m.numpy().astype(np.float64)
     sizes = cells.sizes_m.numpy()
     out = np.full(len(points), -1, np.int64)
@@ -357,11 +420,12 @@ def cells_over(cells: ExposedCells, points: TruePoints) -> np.ndarray:
 
 
 def _keys(columns_rows: np.ndarray) -> np.ndarray:
+    """Return one int64 for each column and row, [P]."""
     return (columns_rows[:, 0] << 32) + columns_rows[:, 1]
 
 
 def _heights(cells: ExposedCells, which: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """z of cells' planes at places [P, 2]."""
+    """Return z of cells' planes at positions, [P]. which: cell ids [P]; xy: positions [P, 2]."""
     centers = cells.centers_m.numpy()[which].astype(np.float64)
     normals = cells.normals.numpy()[which].astype(np.float64)
     slopes = -normals[:, :2] / normals[:, 2:]
@@ -369,7 +433,7 @@ def _heights(cells: ExposedCells, which: np.ndarray, xy: np.ndarray) -> np.ndarr
 
 
 def support_heights(cells: ExposedCells, points: TruePoints) -> np.ndarray:
-    """z [P] of the support under each point, NaN where it has none."""
+    """Return z of the exposed surface at each point, [P]; NaN where a point has no cell."""
     over = cells_over(cells, points)
     z = np.full(len(points), np.nan)
     is_covered = over >= 0
@@ -387,9 +451,10 @@ def height_error(off: np.ndarray) -> dict[str, float | None]:
 
 
 def _scene_bias_m(scene: Scene, truth: StreetTruth, points: TruePoints, above: Camera) -> float:
-    """How far the scene's own Gaussians are above the true surface where the points are: median of
-    the centres of those that are heaviest there. A fitted or sampled surface has such an offset,
-    which no placement can know.
+    """Return the offset of the scene's surface above the true surface at points, metres.
+
+    It is the median over the centres of the Gaussians with the largest weight at the points. A
+    fitted or sampled surface has such an offset, and no placement can know it.
     """
     out = rasterize(
         [PosedGaussians(scene.background)], above, buffers=BUFFERS, clip=SURFACE_DEPTHS_ONLY
@@ -400,7 +465,7 @@ def _scene_bias_m(scene: Scene, truth: StreetTruth, points: TruePoints, above: C
     return float(np.median(off[np.abs(off) < OVER_M]))
 
 
-def _drawn(
+def _measure_layer(
     scene: Scene,
     support: ExposedSurface,
     truth: StreetTruth,
@@ -409,9 +474,23 @@ def _drawn(
     depth_m: float,
     scene_bias: float,
 ) -> dict[str, Any]:
-    """The points that snow covers, seen from above; the share of it that is drawn beneath what is
-    open to the sky; how far its surface is from the true one raised by its depth, and from that
-    with the scene's own offset.
+    """Draw the layer of snow from above and compare it with the true surface.
+
+    Args:
+        scene: The street's scene.
+        support: The surface on which snow is placed.
+        truth: The street without moving objects.
+        flat: The points that snow should cover.
+        above: The camera from above.
+        depth_m: The depth of the snow, metres.
+        scene_bias: The offset of the scene's surface above the true one, metres.
+
+    Returns:
+        depth_m: the depth.
+        covered: the share of the points, without vegetation, that snow covers.
+        sheltered: the share of snow that is drawn below the surface that is open to the sky.
+        error_m: height differences from the true surface raised by the depth.
+        error_on_scene_m: the same differences without the offset of the scene.
     """
     snow = recipe_of({"snow": {"depth_m": depth_m}}).weather.snow
     layer = lay_snow(support, scene, snow, find_snow_light(scene, snow), seed=0).ground
@@ -423,16 +502,16 @@ def _drawn(
     shows_snow = out.overlay.numpy() >= 0.5
     z = height[pixels_of(above, flat.xy)]
     shows_snow_there = shows_snow[pixels_of(above, flat.xy)]
-    on_it = shows_snow_there & (np.abs(z - depth_m - flat.z) <= OVER_M + 0.5 * depth_m)
-    off = np.where(on_it, z - flat.z - depth_m, np.nan)
+    is_covered = shows_snow_there & (np.abs(z - depth_m - flat.z) <= OVER_M + 0.5 * depth_m)
+    off = np.where(is_covered, z - flat.z - depth_m, np.nan)
     step = max(1, int(shows_snow.sum()) // 400_000)
     places = pixel_positions(above)[shows_snow][::step]
     heights = height[shows_snow][::step]
-    sunk = heights < surface_below(truth, places) - OVER_M
+    is_sheltered = heights < surface_below(truth, places) - OVER_M
     return {
         "depth_m": depth_m,
-        "covered": float(on_it[flat.semantic != SemanticClass.VEGETATION].mean()),
-        "sheltered": float(sunk.mean()) if len(sunk) else 0.0,
+        "covered": float(is_covered[flat.semantic != SemanticClass.VEGETATION].mean()),
+        "sheltered": float(is_sheltered.mean()) if len(is_sheltered) else 0.0,
         "error_m": height_error(off),
         "error_on_scene_m": height_error(off - scene_bias),
     }
@@ -444,12 +523,12 @@ def snow_masks(
     """Compare masks of neighbouring cameras and of cameras a frame ahead where depths agree."""
     recipe = snow_recipe(shading, cell_m, Output(depth="expected", labels=False))
 
-    def seen(camera: Camera) -> tuple[DepthView, np.ndarray]:
+    def render(camera: Camera) -> tuple[DepthView, np.ndarray]:
         buffers = frame_of(scene, camera, recipe)()
         images = buffers.rgb.clamp(0, 1), buffers.raster.expected_depth, buffers.raster.alpha
         return DepthView(camera, *(i.numpy() for i in images)), buffers.masks["snow"].numpy()
 
-    return mask_agreement(view_pairs(scene, frames, scale), seen)
+    return mask_agreement(view_pairs(scene, frames, scale), render)
 
 
 # ---- views of one moment ------------------------------------------------------------------------
@@ -458,24 +537,28 @@ def snow_masks(
 def view_pairs(
     scene: Scene, frames: Sequence[int], scale: float
 ) -> Iterator[tuple[str, Camera, Camera]]:
-    """Kind and cameras of pairs at one time: each camera and the next one clockwise; each and
-    itself where it stands a frame ahead.
+    """Yield the kind and the cameras of pairs of views at one time.
+
+    The pairs are each camera and the next one clockwise, and each camera and itself at its place
+    one frame ahead.
     """
     for index in frames:
         frame = scene.frame(index)
         ahead = next((f.cameras for f in scene.frames if f.index == index + 1), {})
         now, later = (
-            {n: dataclasses.replace(c.scaled(scale), timestamp_ns=frame.timestamp_ns)
-             for n, c in cameras.items()}
+            {
+                n: dataclasses.replace(c.scaled(scale), timestamp_ns=frame.timestamp_ns)
+                for n, c in cameras.items()
+            }
             for cameras in (frame.cameras, ahead)
-        )  # fmt: skip
+        )
         ring = clockwise(frame.cameras)
         yield from ((NEXT_CAMERA, now[a], now[b]) for a, b in ring if a != b)
         yield from ((AHEAD, now[name], later[name]) for name in now if name in later)
 
 
 def clockwise(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
-    """Each camera and the next one clockwise, by their optical axes; from the first one on."""
+    """Return each camera's name and the next one clockwise, by the cameras' optical axes."""
 
     def bearing(name: str) -> float:
         ahead = cameras[name].world_from_camera[:3, 2]
@@ -491,9 +574,17 @@ def mask_agreement(
     pairs: Iterator[tuple[str, Camera, Camera]],
     view_of: Callable[[Camera], tuple[DepthView, np.ndarray]],
 ) -> list[list[Cell]]:
-    """By kind of pairs: points that both show; share of them with equal masks, of all pairs and of
-    the worst; root mean square difference of colours, 1/255, where both masks are true. view_of:
-    the view whose depth says which points are shared, and the mask bool [H, W].
+    """Compare masks at the points that both views of a pair show.
+
+    Args:
+        pairs: Kinds and cameras, from `view_pairs`.
+        view_of: A function from a camera to its view, whose depth tells which points are shared,
+            and its mask, bool [H, W].
+
+    Returns:
+        Rows of the kind of pairs, the number of shared points, the share of points with equal
+        masks, the same share of the worst pair, and the root mean square difference of colours,
+        1/255, where both masks are true.
     """
     view_of = functools.cache(view_of)
     counts_by_kind: dict[str, list[tuple[int, int, float, int]]] = {}

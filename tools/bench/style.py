@@ -1,4 +1,4 @@
-"""Styles: their cost, maps folded into SH beside mapped colours, and methods on photographs."""
+"""Styles: their cost in a frame, errors of maps folded into SH, and scores on photographs."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ import numpy as np
 import torch
 
 from adapters.base import open_scene
-from augment.effects.style.color_maps import CLASSES, StyleMaps, style_gaussians
+from augment.effects.style.color_maps import NUM_CLASSES, StyleMaps, style_gaussians
 from augment.effects.style.content import content_pictures, content_statistics
 from augment.effects.style.images import image_statistics, read_style_image
 from augment.effects.style.network import gscm_map, load_network, network_facts
 from augment.effects.style.pairs import (
     Method,
-    closed_method,
+    closed_form_method,
     mapped_picture,
     network_method,
     score_pairs,
@@ -46,18 +46,21 @@ from tools.bench.scenes import (
     recipe_of,
 )
 
-PHOTO_PX = 256
-HOLDOUT = 8
-PAIRS = 60
-OVERSATURATED = 0.2  # of the pixels
-SATURATED = 254.5 / 255  # of a channel: displayed as full
+PHOTO_PX = 256  # The side of the squares of photographs, pixels.
+HOLDOUT = 8  # Every so many photographs one is scored, if the network's record names none.
+PAIRS = 60  # The number of pairs of photographs that are checked for oversaturation.
+# The share of further saturated pixels above which a picture is oversaturated.
+OVERSATURATED = 0.2
+SATURATED = 254.5 / 255  # The least channel of a saturated pixel: it is displayed as full.
 
 
 def style_recipe(preset: str = "overcast", **other_fields: Any) -> Recipe:
+    """Return a recipe of a style. other_fields: further fields of the style."""
     return recipe_of({"style": {"preset": preset, **other_fields}})
 
 
 def tables(case: EffectCase, repeats: int) -> list[Table]:
+    """Measure costs of styles, errors of folded maps, the time to a map, and scores."""
     costs = {
         "one map": (style_recipe(), CLEAN),
         "a map a region": (style_recipe(per_region=True), CLEAN),  # a preset's are the same
@@ -76,34 +79,45 @@ def tables(case: EffectCase, repeats: int) -> list[Table]:
 def fold(
     gaussians: Gaussians, count: int, out: torch.Tensor | None, backend: str = "auto"
 ) -> Action:
-    """Folds one map, or one of each class, into SH; colours stay finite however often."""
+    """Return an action that folds colour maps into SH. Colours stay finite however often it runs.
+
+    Args:
+        gaussians: The Gaussians.
+        count: The number of maps: 1, or one for each class.
+        out: The tensor that receives the mapped SH; None for a new one.
+        backend: The backend.
+    """
     map_34 = 0.9 * torch.eye(3, 4)
     maps = StyleMaps(map_34.repeat(count, 1, 1), map_34, map_34)
     return functools.partial(style_gaussians, gaussians, maps, out=out, backend=backend)
 
 
 def _fold_table(case: RasterCase, repeats: int) -> Table:
-    """One map, and one for each class, folded into the SH of random Gaussians."""
+    """Measure folds of one map, and of one map for each class, into the SH of random Gaussians."""
     gaussians, _ = random_scene(case)
     classes = torch.arange(len(gaussians), dtype=torch.int16) % (max(SemanticClass) + 1)
     gaussians = dataclasses.replace(gaussians, semantic=classes)
-    moved = 2 * gaussians.sh.nbytes
+    num_bytes = 2 * gaussians.sh.nbytes
     actions = {
         f"{name}, {where}": fold(gaussians, count, out)
-        for name, count in (("one map", 1), ("a map a class", CLASSES))
+        for name, count in (("one map", 1), ("a map a class", NUM_CLASSES))
         for where, out in (("in place", gaussians.sh), ("new memory", None))
     }
     rows = [
-        [name, median_ms(times), min(times) * 1e3, moved / min(times) / 1e9]
+        [name, median_ms(times), min(times) * 1e3, num_bytes / min(times) / 1e9]
         for name, times in rounds(actions, repeats).items()
     ]
-    title = f"Maps folded into {len(gaussians):,} Gaussians, {moved / 1e6:.0f} MB read and written"
+    title = (
+        f"Maps folded into {len(gaussians):,} Gaussians, {num_bytes / 1e6:.0f} MB read and written"
+    )
     return Table(title, ("map", "ms", "least", "GB/s at best"), rows)
 
 
 def _folded_error_table(uri: str, case: EffectCase) -> Table:
-    """Pictures of maps folded into SH against those of mapped colours. They differ where a splat
-    with a colour below 0 is blended, which is clamped before the map if the map is not folded.
+    """Compare pictures of maps folded into SH with pictures of mapped colours.
+
+    They differ where a splat with a colour below 0 is blended. Without folding, its colour is
+    clamped before the map.
     """
     scene = open_scene(uri)
     camera = front_camera(scene, case.width)
@@ -119,7 +133,7 @@ def _folded_error_table(uri: str, case: EffectCase) -> Table:
 
 
 def _map_table(scene: Scene, repeats: int) -> Table:
-    """From a style image's file to the map, and what the scene's side takes once."""
+    """Measure the time from a style image's file to its map, and the statistics of a scene."""
     net = load_network(None)
     rgb = frame_of(scene, front_camera(scene, 1920), CLEAN)().rgb
     with tempfile.TemporaryDirectory() as folder:
@@ -135,7 +149,9 @@ def _map_table(scene: Scene, repeats: int) -> Table:
         return closed_maps(content, style, method=method, strength=1.0, per_region=per_region)
 
     def once(find: Callable[..., object], **options: bool) -> object:
-        return find(dataclasses.replace(scene), **options)  # of a scene that remembers nothing
+        return find(
+            dataclasses.replace(scene), **options
+        )  # A copy of the scene has no cached statistics.
 
     actions: dict[str, Action] = {
         "mkl": lambda: closed("mkl"),
@@ -154,7 +170,7 @@ def _map_table(scene: Scene, repeats: int) -> Table:
 
 
 def _score_table(photos: Path) -> Table:
-    """How well methods do on photographs that the network was not trained on."""
+    """Score methods on photographs that the network was not trained on."""
     about = network_facts().get("about") or {}
     names = tuple(f"/{name}" for name in about.get("data", {}).get("held_out", ()))
     held_out = [file for file in sorted(photos.rglob("*")) if file.as_posix().endswith(names)]
@@ -165,10 +181,10 @@ def _score_table(photos: Path) -> Table:
     )
     pictures = squares.float() / 255
     methods = {
-        "none": closed_method(strength=0.0),
-        "reinhard": closed_method(reinhard_map),
-        "mkl": closed_method(),
-        "mkl, half": closed_method(strength=0.5),
+        "none": closed_form_method(strength=0.0),
+        "reinhard": closed_form_method(reinhard_map),
+        "mkl": closed_form_method(),
+        "mkl, half": closed_form_method(strength=0.5),
         "gscm": network_method(load_network(None)),
     }
     rows = []

@@ -1,20 +1,23 @@
-"""Speed for accuracy: what each knob of a recipe costs and saves on a scene, and the tiers.
+"""`climategs bench trade`: the time and the errors of quality settings, and the tiers of `quality`.
 
-Settings are timed a few at a time, in turns with the reference and the clean frame; ratios are
-taken within each turn. Pictures are compared in 8 bits by PSNR, SSIM and FLIP. Flicker is what is
-left in time: with E_t the picture less the reference's at frame t, E_(t+1) is warped into frame t
-by the reference's depth, so that the drive's motion does not count, and flicker is the root mean
-square of E_t - warped E_(t+1): 0 for an error that sticks to its surface, sqrt(2) times the error's
-own RMS for one that is drawn anew.
+A knob is a setting of a recipe that trades speed for accuracy. `bench_trade` renders a scene with
+every value of every knob, and with the tiers. Settings are timed a few at a time, in turns with the
+reference and the clean frame, and ratios are taken within each turn. Pictures are compared in 8
+bits by PSNR, SSIM and FLIP.
 
-The tiers of `quality` follow by the rule of docs/trade.md from the figures of docs/trade/*.json. A
-value's time is the geometric mean of its ratios to the reference.
+Flicker measures how an error changes in time. E_t is the picture minus the reference's picture at
+frame t. E_(t+1) is warped into frame t by the reference's depth, so that the drive's motion does
+not count. Flicker is the root mean square of E_t - warped E_(t+1). It is 0 for an error that sticks
+to its surface, and sqrt(2) times the error's RMS for an error that is random in every frame.
+
+The tiers follow from the figures of docs/trade/*.json by the rule of docs/trade.md. The time of a
+value is the geometric mean of its ratios to the reference.
 
     python -m tools.bench.trade [TABLE.json=SCENE_URI ...]
 
-renders the settings that the rule asks for and the tables lack, adds them, then the tiers
-themselves in place of earlier ones, with TABLE_tiers.jpg beside; and makes docs/trade.md's tables
-anew.
+renders the settings that the rule needs and the tables lack, and adds them to the tables. Then it
+renders the tiers, replaces the earlier ones, draws TABLE_tiers.jpg, and writes the tables of
+docs/trade.md again.
 """
 
 from __future__ import annotations
@@ -82,90 +85,127 @@ from tools.bench.scenes import frame_of, front_name, recipe_of
 from tools.drawing import captioned, strip, write_rgb
 from tools.render import warm_up
 
-ALL_KNOBS = "whole"  # stands for a knob where several are set
-DEPTH = "output.depth"
-JPEG = "output.jpeg_quality"
-REFERENCE = "reference"
-DEFAULTS = "defaults"
-CLEAN = "clean"
-WATER = "water"  # the mask of what a ray meets before the scene
-TRUTH = "truth"  # what depths are compared with where the scene's surfaces are known
+ALL_KNOBS = "whole"  # The word in place of a knob's path where several knobs are set.
+DEPTH = "output.depth"  # The knob of the estimator of depth.
+JPEG = "output.jpeg_quality"  # The knob of the quality of JPEG files.
+REFERENCE = "reference"  # The name of the settings with all knobs at reference.
+DEFAULTS = "defaults"  # The name of the recipe's own settings.
+CLEAN = "clean"  # The name of the recipe without effects.
+WATER = "water"  # The name of the mask of water, which a ray meets before the scene.
+TRUTH = "truth"  # The word for depths that are compared with the scene's exact depth.
+# The preset of every recipe that has one.
 PRESETS = {
-    "smog": "brown-smog", "flood": "street-flood", "snow": "fresh-snow", "style": "evening",
-    "rain": "rain", "snowfall": "flurries",
-}  # fmt: skip
-FOG = {"smog": {"visibility_m": 50.0}}  # of which the picture alone is rendered: it hides splats
+    "smog": "brown-smog",
+    "flood": "street-flood",
+    "snow": "fresh-snow",
+    "style": "evening",
+    "rain": "rain",
+    "snowfall": "flurries",
+}
+# The effects of the recipe "fog". It renders only the picture, since its fog hides splats.
+FOG = {"smog": {"visibility_m": 50.0}}
+# The effects of the recipe "all".
 ALL = {
     "smog": {"visibility_m": 400.0, "scale_height_m": 120.0},
     "flood": {"level_m": 0.15, "turbidity_ntu": 20.0},
     "snow": {"depth_m": 0.1},
     "style": {"preset": "overcast"},
 }
-RECIPES = (CLEAN, *PRESETS, "fog", "all")
-AT_A_TIME = 6  # settings between two frames of the reference
-DIGITS = 4  # significant ones that figures keep
-# What is measured of a knob at a value, by its heading where people read it.
+RECIPES = (CLEAN, *PRESETS, "fog", "all")  # The names of the recipes that are measured by default.
+NUM_SETTINGS_PER_TURN = 6  # The number of settings between two frames of the reference.
+DIGITS = 4  # The number of significant digits that figures have in files.
+# The key of a figure in a row, by the heading of its column.
 COLUMNS = {
-    "knob": "knob", "value": "value", "ms": "ms", "least": "ms_min", "p90": "ms_p90",
-    "kB": "kilobytes", "x reference": "over_reference", "x clean": "over_clean", "FLIP": "flip",
-    "worst": "worst_flip", "PSNR": "psnr", "SSIM": "ssim", "depth off, %": "off_5cm",
-    "abs-rel, %": "abs_rel", "flicker": "flicker", "MiB": "mib",
-}  # fmt: skip
-# {knob, value, ms, flip, ...}: a knob's path and value, all others at reference; or WHOLE, a name
-# and, under `settings`, what is set. In tables of several scenes and recipes also these two.
+    "knob": "knob",
+    "value": "value",
+    "ms": "ms",
+    "least": "ms_min",
+    "p90": "ms_p90",
+    "kB": "kilobytes",
+    "x reference": "over_reference",
+    "x clean": "over_clean",
+    "FLIP": "flip",
+    "worst": "worst_flip",
+    "PSNR": "psnr",
+    "SSIM": "ssim",
+    "depth off, %": "off_5cm",
+    "abs-rel, %": "abs_rel",
+    "flicker": "flicker",
+    "MiB": "mib",
+}
+# The figures of one setting: {knob, value, ms, flip, ...}. Either `knob` is a path, `value` is its
+# value and all other knobs are at reference; or `knob` is ALL_KNOBS, `value` is a name, and
+# `settings` has the value of every knob. Rows of several scenes and recipes also have `scene` and
+# `recipe`.
 Row = dict[str, Any]
-Tables = Sequence[Mapping[str, Any]]
-Wholes = Mapping[str, Mapping[str, Value]]
+Tables = Sequence[Mapping[str, Any]]  # The figures of several scenes.
+NamedSettings = Mapping[
+    str, Mapping[str, Value]
+]  # Values of knobs, by the settings' name and path.
 
 
-# ---- what is rendered ---------------------------------------------------------------------------
+# ---- recipes, settings and views------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class TradeCase:
-    """width: pixels of the pictures, at most. repeats: timed frames of each setting and view.
-    memory: whether it is measured, of settings as a whole.
-    """
+    """The size of the measurements."""
 
     width: int = 640
+    """The largest width of pictures, pixels."""
     repeats: int = 4
+    """The number of timed frames of each setting and view."""
     memory: bool = True
+    """True if memory is measured, for settings of all knobs together."""
 
 
-WHOLE_CASE = TradeCase()
-QUICK = TradeCase(width=240, repeats=1, memory=False)
+FULL_CASE = TradeCase()  # The case of published figures.
+QUICK_CASE = TradeCase(width=240, repeats=1, memory=False)  # The case of `--quick`.
 
 
 def trade_recipe(name: str) -> Recipe:
-    """One of RECIPES, a preset or a file: its first variant, without any wish for quality."""
+    """Return the first variant of a recipe, without a request for quality.
+
+    Args:
+        name: One of RECIPES, a preset or a file.
+    """
     if name == "fog":
         recipe = recipe_of(FOG, Output(depth="none", labels=False, lidar=False))
     elif name in (CLEAN, "all"):
         recipe = recipe_of(ALL if name == "all" else {}, Output())
     else:
         recipe = load_recipe(PRESETS.get(name, name)).resolve(0)
-    called = name if name in RECIPES else recipe.name
-    return recipe.model_copy(update={"name": called, "quality": Quality()})
+    recipe_name = name if name in RECIPES else recipe.name
+    return recipe.model_copy(update={"name": recipe_name, "quality": Quality()})
 
 
 def measured_values(knob: Knob, recipe: Recipe | None = None) -> Sequence[Value]:
-    """Those that pictures are rendered with: all estimators of depth, which none is the best of.
-    recipe: None for any.
+    """Return the values of a knob with which pictures are rendered.
+
+    They include all estimators of depth, since none of them is the best. The quality of JPEG has
+    none: it is measured on files.
+
+    Args:
+        knob: The knob.
+        recipe: The recipe; None for any.
     """
-    is_alone = recipe is not None and recipe.output.depth == "none"
-    if knob.path == JPEG or (knob.path == DEPTH and is_alone):  # the first is measured of files
+    has_no_depth = recipe is not None and recipe.output.depth == "none"
+    if knob.path == JPEG or (knob.path == DEPTH and has_no_depth):
         return ()
     return knob.values if knob.path == DEPTH else knob.values[:-1]
 
 
-def settings_of_trade(recipe: Recipe, wholes: Wholes | None = None) -> list[tuple[Row, Recipe]]:
+def settings_of_trade(
+    recipe: Recipe, wholes: NamedSettings | None = None
+) -> list[tuple[Row, Recipe]]:
     """Return the settings to measure: the start of each row, and its recipe.
 
-    The reference comes first, then each other value of each knob alone, then the recipe with its
-    own
+    The reference comes first, then each other value of each knob alone, then the recipe's own
     settings, and the tiers.
 
-    wholes: settings of many knobs that replace all but the reference.
+    Args:
+        recipe: The recipe.
+        wholes: Settings of many knobs that replace all but the reference.
     """
     best = with_reference_settings(recipe)
     knobs = knobs_of(recipe)
@@ -184,9 +224,13 @@ def settings_of_trade(recipe: Recipe, wholes: Wholes | None = None) -> list[tupl
 
 
 def trade_views(scene: Scene, width: int) -> list[tuple[int, Camera]]:
-    """Frames and cameras: the front camera in the middle of the drive, the same in the next frame,
-    and the camera that looks away from it the most. Raises SceneError: the scene has one frame
-    only, or two successive ones share no camera.
+    """Return the frames and cameras of the views that are rendered.
+
+    They are the front camera in the middle of the drive, the same camera in the next frame, and
+    the camera that looks away from it the most.
+
+    Raises:
+        SceneError: the scene has only one frame, or two successive frames share no camera.
     """
     at = max(0, (len(scene.frames) - 1) // 2)
     pair = scene.frames[at : at + 2]
@@ -210,19 +254,24 @@ def trade_views(scene: Scene, width: int) -> list[tuple[int, Camera]]:
 
 @dataclass(frozen=True, eq=False)
 class Standard:
-    """A view at reference. best: as other settings are rendered. first_m, alpha [H, W]: of what a
-    ray meets first, water too. surfaces [H, W]: where there are such. masks [H, W]: where an effect
-    is what a pixel shows, by name. true_m [H, W]: the scene's exact depth, infinite in the sky;
-    None where it is not known, or something lies on it.
-    """
+    """A view at reference, with which other settings are compared."""
 
     camera: Camera
+    """The camera."""
     best: Trial
+    """The view at reference, rendered in the same way as other settings."""
     first_m: np.ndarray
+    """[H, W]. Depth of the first surface that a ray meets, also of water, metres."""
     alpha: np.ndarray
+    """[H, W]. Opacity of that surface."""
     surfaces: np.ndarray
+    """[H, W], bool. True where the scene has a surface."""
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """[H, W] each, by name. True where a pixel shows an effect."""
     true_m: np.ndarray | None = None
+    """[H, W]. The scene's exact depth, infinite in the sky; None if it is not known, or if an
+    overlay lies on the scene.
+    """
 
     def region(self, knob: str) -> np.ndarray:
         """Return the pixels of a knob's depth errors: its effect's, or else all surfaces."""
@@ -236,7 +285,15 @@ class Standard:
 def render_standard(
     scene: Scene, camera: Camera, recipe: Recipe, true_m: np.ndarray | None, backend: str
 ) -> Standard:
-    """recipe: at reference. true_m: of the scene without what lies on it."""
+    """Render a view at reference.
+
+    Args:
+        scene: The scene.
+        camera: The camera.
+        recipe: The recipe with all knobs at reference.
+        true_m: [H, W]. The exact depth of the scene without overlays; None if it is not known.
+        backend: The rasteriser's backend.
+    """
     best = render_trial(scene, camera, recipe, backend)
     if recipe.output.depth == "none":
         recipe = with_settings(recipe, {DEPTH: "median"})
@@ -255,8 +312,9 @@ def render_standard(
 
 
 def true_depths(uri: str, cameras: Sequence[Camera]) -> list[np.ndarray] | None:
-    """z of the procedural street's surfaces, float64 [H, W] each, infinite in the sky; None of
-    other scenes.
+    """Return exact depths of the procedural street, float64 [H, W] for each camera.
+
+    Depth is infinite in the sky. Other scenes have none: the result is None.
     """
     scheme, _, query = parse_uri(uri)
     if scheme != "procedural":
@@ -266,8 +324,16 @@ def true_depths(uri: str, cameras: Sequence[Camera]) -> list[np.ndarray] | None:
 
 
 def errors_of(knob: str, trials: Sequence[Trial], standards: Sequence[Standard]) -> Row:
-    """Depth against the reference's; of estimators, where the scene's exact depth is known, against
-    that. depth_against: which of the two; None where the recipe writes none.
+    """Return the errors of pictures and depths with a knob at a value.
+
+    Depth is compared with the reference's depth. Estimators of depth are compared with the scene's
+    exact depth if it is known. The figure `depth_against` names the one that was used; it is None
+    if the recipe writes no depth.
+
+    Args:
+        knob: Path of the knob.
+        trials: The rendered views.
+        standards: The same views at reference.
     """
     regions = [standard.region(knob) for standard in standards]
     expected_depths = [standard.best.depth for standard in standards]
@@ -317,9 +383,17 @@ def picture_figures(pictures: Sequence[np.ndarray], best: Sequence[np.ndarray]) 
 def depth_figures(
     depths: Sequence[np.ndarray | None], right: Sequence[np.ndarray], where: Sequence[np.ndarray]
 ) -> Row:
-    """abs_rel: mean of |depth - right| / right where both have a surface. off_5cm: share of the
-    region's pixels, of all views, that are off by more than 5 cm or have no depth. None where
-    there is no depth, or the region is empty. right, where: by view, [H, W].
+    """Return errors of depth.
+
+    Args:
+        depths: [H, W] for each view. The measured depths, metres.
+        right: [H, W] for each view. The expected depths, metres.
+        where: [H, W] for each view, bool. The pixels that count.
+
+    Returns:
+        abs_rel: mean of |depth - right| / right where both have a surface.
+        off_5cm: share of the pixels, of all views, whose error is above 5 cm or that have no depth.
+        Both are None if there is no depth, or no pixel counts.
     """
     if any(depth is None for depth in depths) or not any(region.any() for region in where):
         return {"abs_rel": None, "off_5cm": None}
@@ -333,7 +407,14 @@ def depth_figures(
 
 
 def flicker(standards: Sequence[Standard], pictures: Sequence[np.ndarray]) -> float:
-    """Display-encoded, 0 to 1, of two successive pictures; NaN where they share no surface."""
+    """Return the flicker of two successive pictures, display-encoded, 0 to 1.
+
+    It is NaN if the pictures share no surface. The module's head has its definition.
+
+    Args:
+        standards: The two views at reference.
+        pictures: The two pictures, uint8 [H, W, 3].
+    """
     first, second = (
         DepthView(
             standard.camera,
@@ -356,24 +437,37 @@ def flicker(standards: Sequence[Standard], pictures: Sequence[np.ndarray]) -> fl
 
 
 class Trade(NamedTuple):
-    """figures: for JSON. pictures: the first view's, by recipe and name of the whole."""
+    """The result of `bench_trade`."""
 
     figures: Figures
+    """The figures, for JSON."""
     pictures: dict[str, dict[str, np.ndarray]]
+    """Pictures of the first view, by recipe and name of the settings of all knobs."""
 
 
 def bench_trade(
     scene_uri: str,
     recipes: Sequence[str] = RECIPES,
-    case: TradeCase = WHOLE_CASE,
+    case: TradeCase = FULL_CASE,
     *,
-    wholes: Wholes | None = None,
+    wholes: NamedSettings | None = None,
     backend: str = CPU,
 ) -> Trade:
-    """recipes: of RECIPES, presets or files. wholes: settings of many knobs that are measured
-    instead of single ones, by name. backend: CPU or CUDA. Times are the host's, to 8 bits that lie
-    there; on which pixels errors count is the CPU backend's to say. Raises SceneError, RecipeError:
-    the scene or a recipe cannot be used.
+    """Measure the time and the errors of settings on a scene.
+
+    Times are the host's, until an 8-bit picture is in its memory. The CPU backend decides on which
+    pixels errors count.
+
+    Args:
+        scene_uri: The address of the scene.
+        recipes: Names out of RECIPES, presets or files.
+        case: The size of the measurements.
+        wholes: Settings of many knobs by name, which are measured instead of single knobs.
+        backend: CPU or CUDA.
+
+    Raises:
+        SceneError: the scene cannot be used.
+        RecipeError: a recipe cannot be used.
     """
     resolved_recipes = [trade_recipe(name) for name in recipes]
     scene = open_scene(scene_uri)
@@ -430,18 +524,28 @@ def setting_rows(
     case: TradeCase,
     backend: str,
 ) -> Iterator[tuple[Row, np.ndarray]]:
-    """Rows, and pictures of the first view. settings: reference first. Timed frames take turns, on
-    one view after the other; all has been rendered, and so loaded and laid, before.
+    """Yield rows of settings, and their pictures of the first view.
+
+    Timed frames take turns, on one view after the other. Every setting has been rendered before,
+    so that kernels are loaded and snow is placed.
+
+    Args:
+        scene: The scene.
+        recipe: The recipe.
+        settings: The starts of rows and their recipes, with the reference first.
+        standards: The views at reference.
+        case: The size of the measurements.
+        backend: CPU or CUDA.
     """
     clean = with_reference_settings(recipe.model_copy(update={"weather": Weather(), "style": None}))
     cameras = [standard.camera for standard in standards]
 
     def frame(trial_recipe: Recipe, camera: Camera) -> harness.Action:
-        """Without enlarging it, which takes no part in the time."""
+        """Return an action that renders a frame without enlarging it to the full resolution."""
         return functools.partial(default_renderer(), scene, camera, trial_recipe, backend=backend)
 
-    for start in range(1, max(len(settings), 2), AT_A_TIME):
-        group = [({}, clean), settings[0], *settings[start : start + AT_A_TIME]]
+    for start in range(1, max(len(settings), 2), NUM_SETTINGS_PER_TURN):
+        group = [({}, clean), settings[0], *settings[start : start + NUM_SETTINGS_PER_TURN]]
         trials = [
             [render_trial(scene, c, trial_recipe, backend) for c in cameras]
             for _, trial_recipe in group
@@ -465,8 +569,9 @@ def setting_rows(
 
 
 def frame_mib(frame: harness.Action, backend: str) -> float | None:
-    """MiB of a frame above its scene, at its highest moment; on a GPU of its memory. The renderer's
-    work space is given back before, so that it counts, as in a process of its own.
+    """Return the peak memory of a frame above its scene, MiB; on a GPU that of its memory.
+
+    The renderer's work space is freed before, so that it counts as in a fresh process.
     """
     if backend == CUDA:
         return harness.peak_gpu_mib(frame)[1]
@@ -475,8 +580,9 @@ def frame_mib(frame: harness.Action, backend: str) -> float | None:
 
 
 def jpeg_rows(pictures: Sequence[np.ndarray]) -> Iterator[Row]:
-    """Encoding as PNG and as JPEG of each quality: ms and kB an image, errors against PNG, which
-    loses nothing.
+    """Yield rows of the encoding as PNG, and as JPEG of each quality.
+
+    A row has milliseconds and kB of an image, and its errors against PNG, which loses nothing.
     """
     for quality in ("png", *KNOBS[JPEG].values):
         output = Output() if quality == "png" else Output(image="jpg", jpeg_quality=quality)
@@ -497,14 +603,14 @@ def _times(seconds: Sequence[float]) -> Row:
 
 
 def _rounded(value: Any) -> Any:
-    """Numbers to a few digits: the rest is noise, and the files are kept."""
+    """Return a number with DIGITS digits, since further digits are noise; other values as given."""
     if not isinstance(value, float):
         return value
     return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
 
 
 def rows_of(tables: Tables) -> list[Row]:
-    """All rows, each with its scene and recipe."""
+    """Return all rows of tables, each with its scene and recipe."""
     return [
         {"scene": table["scene"], "recipe": entry["recipe"], **row}
         for table in tables
@@ -514,8 +620,10 @@ def rows_of(tables: Tables) -> list[Row]:
 
 
 def printable(trade: Mapping[str, Any]) -> Figures:
-    """Tables in the form that all subjects are printed in: of every recipe the settings, wholes
-    first, and the files; columns of which something is known.
+    """Return the figures in the form in which all subjects are printed.
+
+    Every recipe has a table of settings, with those of all knobs together first, and a table of
+    files. Columns without any value are left out.
     """
     order = [ALL_KNOBS, *KNOBS]
     tables = []
@@ -544,15 +652,15 @@ def _text(value: Value) -> str:
 
 # ---- the rule of the tiers ----------------------------------------------------------------------
 
-# balanced: what a viewer takes for the same picture: on every published scene under every recipe
-# it is below the FLIP of a JPEG at quality 92, which is what people who look at pictures take for
-# lossless. draft: what differs plainly and shows the same: reconstructions differ as much from the
-# recordings that they are made of (docs/reconstruction.md: 0.05 to 0.11 on held-out views).
+# The largest FLIP of a tier's pictures. balanced: a viewer takes the picture for the same. On every
+# published scene and recipe the bound is below the FLIP of a JPEG at quality 92, which people take
+# for lossless. draft: the picture differs visibly but shows the same things. Reconstructions differ
+# as much from their recordings (docs/reconstruction.md: 0.05 to 0.11 on held-out views).
 BOUNDS = {"draft": 0.10, "balanced": 0.02}
 
 
 class Unmeasured(Exception):
-    """Its argument: settings that the rule has to know the error of, and no row has."""
+    """Raised when no row has settings whose error the rule needs. Its argument: the settings."""
 
 
 def tiers_from(tables: Tables) -> dict[str, dict[str, Value]]:
@@ -565,7 +673,11 @@ def tiers_from(tables: Tables) -> dict[str, dict[str, Value]]:
 
 
 def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
-    """The rule for one bound."""
+    """Return the settings of one tier. bound: its largest FLIP.
+
+    Raises:
+        Unmeasured: the tables lack settings that have to be rendered together.
+    """
     rows = rows_of(tables)
     ladders = {}
     for path, knob in KNOBS.items():
@@ -586,7 +698,7 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
 
 
 def _saved(rows: Sequence[Row], path: str, costs: Sequence[Cost]) -> float:
-    """The most that a value of the knob saves of all recipes: few have some knobs."""
+    """Return the largest saving of a knob's values, as the sum of logarithms over all recipes."""
     of_values = (_of_value(rows, path, cost.value) for cost in costs)
     return max(
         -sum(math.log(row["over_reference"]) for row in value_rows) for value_rows in of_values
@@ -594,8 +706,10 @@ def _saved(rows: Sequence[Row], path: str, costs: Sequence[Cost]) -> float:
 
 
 def value_cost(rows: Sequence[Row], path: str, value: Value) -> Cost | None:
-    """ms: here per cent of the reference's time. flip: the worst. None of a value that no table has
-    or that changes no picture: a time would be noise.
+    """Return the cost of a knob's value.
+
+    Its `ms` is here per cent of the reference's time, and its `flip` is the worst. The result is
+    None if no table has the value, or if it changes no picture: its time would be noise.
     """
     changed_rows = [row for row in _of_value(rows, path, value) if row["worst_flip"] > 0]
     if not changed_rows:
@@ -606,8 +720,12 @@ def value_cost(rows: Sequence[Row], path: str, value: Value) -> Cost | None:
 
 
 def whole_flip(rows: Sequence[Row], settings: Settings) -> float:
-    """The worst of the rows of these settings together, of a single knob's where no other of the
-    recipe's is moved. Raises Unmeasured: a recipe has none.
+    """Return the worst FLIP of settings that are used together.
+
+    If only one knob of a recipe is not at reference, the rows of that knob alone count.
+
+    Raises:
+        Unmeasured: a recipe has no row of the settings.
     """
     by_recipe: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
@@ -631,7 +749,7 @@ def _settings(row: Row) -> Mapping[str, Value]:
 
 
 def _moved(settings: Mapping[str, Value], knobs: Container[str]) -> dict[str, Value]:
-    """Those of these knobs that are not at reference."""
+    """Return the settings of some knobs that are not at reference."""
     return {p: v for p, v in settings.items() if p in knobs and v != KNOBS[p].reference}
 
 
@@ -643,10 +761,10 @@ def _mean_ratio(rows: Sequence[Row]) -> float:
     return math.exp(sum(math.log(row["over_reference"]) for row in rows) / len(rows))
 
 
-def settle(
+def find_tiers(
     tables: Sequence[dict[str, Any]], uris: Sequence[str], case: TradeCase
 ) -> dict[str, dict[str, Value]]:
-    """The tiers; what the rule has to know and the tables lack is rendered and added to them."""
+    """Return the tiers. Settings that the rule needs and the tables lack are rendered and added."""
     while True:
         try:
             return tiers_from(tables)
@@ -657,8 +775,10 @@ def settle(
                 measure_wholes(table, uri, {f"candidate {tried + 1}": missing.args[0]}, case)
 
 
-def measure_wholes(table: dict[str, Any], uri: str, wholes: Wholes, case: TradeCase) -> Trade:
-    """Render settings on the table's scene and put their rows in place of those of their names."""
+def measure_wholes(
+    table: dict[str, Any], uri: str, wholes: NamedSettings, case: TradeCase
+) -> Trade:
+    """Render settings on the table's scene. Their rows replace the table's rows of these names."""
     names = [entry["recipe"] for entry in table["recipes"]]
     trade = bench_trade(uri, names, case, wholes=wholes)
     for entry, new in zip(table["recipes"], trade.figures["recipes"], strict=True):
@@ -671,21 +791,26 @@ def measure_wholes(table: dict[str, Any], uri: str, wholes: Wholes, case: TradeC
 
 # ---- docs/trade.md ------------------------------------------------------------------------------
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGE = DOCS / "trade.md"
-SCENES = {"street": "street", "pandaset": "PandaSet 002"}
-START = "<!-- {name}: made by python -m tools.bench.trade -->"
-END = "<!-- end of {name} -->"
+DOCS = Path(__file__).resolve().parents[2] / "docs"  # The folder of the documentation.
+PAGE = DOCS / "trade.md"  # The document with the tables.
+SCENES = {"street": "street", "pandaset": "PandaSet 002"}  # The titles of scenes by file name.
+# The lines of the document between which a table is written.
+START_MARKER = "<!-- {name}: made by python -m tools.bench.trade -->"
+END_MARKER = "<!-- end of {name} -->"
 
 
 def read_tables() -> list[dict[str, Any]]:
-    """The kept figures of SCENES, under the names that people know them by."""
+    """Read the published figures of SCENES, with their titles as names of the scenes."""
     files = {title: DOCS / "trade" / f"{name}.json" for name, title in SCENES.items()}
     return [{**json.loads(path.read_text()), "scene": title} for title, path in files.items()]
 
 
 def document(text: str, tables: Tables) -> str:
-    """The document with its tables made anew. Raises ValueError: it lacks a marker."""
+    """Return a document with new tables.
+
+    Raises:
+        ValueError: the document lacks a marker.
+    """
     sections = {
         "machine": [_machine_line(table) for table in tables],
         "tiers": _tier_lines(),
@@ -693,8 +818,8 @@ def document(text: str, tables: Tables) -> str:
         "knobs": _knob_lines(tables),
     }
     for name, lines in sections.items():
-        start = START.format(name=name)
-        end = END.format(name=name)
+        start = START_MARKER.format(name=name)
+        end = END_MARKER.format(name=name)
         text = harness.replace_marked(text, start, end, "\n".join(lines))
     return text
 
@@ -719,21 +844,21 @@ def _tier_lines() -> list[str]:
 
 
 def _whole_lines(tables: Tables) -> list[str]:
-    """Settings as a whole, a row a recipe: time over the reference's, and the worst view's FLIP."""
+    """Return a table of settings of all knobs: time over the reference's, and the worst FLIP."""
     names = (DEFAULTS, *BOUNDS)
     lines = []
     whole_rows = [row for row in rows_of(tables) if row["knob"] == ALL_KNOBS]
     row_of = {(row["scene"], row["recipe"], row["value"]): row for row in whole_rows}
     for scene, recipe in dict.fromkeys(key[:2] for key in row_of):
-        of = [row_of[scene, recipe, name] for name in names]
-        cells = [f"{row['over_reference']:.2f}, {row['worst_flip']:.3f}" for row in of]
+        named_rows = [row_of[scene, recipe, name] for name in names]
+        cells = [f"{row['over_reference']:.2f}, {row['worst_flip']:.3f}" for row in named_rows]
         lines.append([scene, recipe, f"{row_of[scene, recipe, REFERENCE]['ms']:.0f}", *cells])
     header = ["scene", "recipe", "reference ms", *(f"{name}: x, FLIP" for name in names)]
     return _lines(header, lines)
 
 
 def _knob_lines(tables: Tables) -> list[str]:
-    """Over all recipes that a knob has an effect on: mean ratio of times and the worst errors."""
+    """Return a table of knobs: mean ratio of times and worst errors over affected recipes."""
     rows = [
         [f"`{path}`", _text(value), *(c for t in tables for c in _knob_cells(t, path, value))]
         for path, knob in KNOBS.items()
@@ -765,18 +890,22 @@ def _lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 # ---- pictures -----------------------------------------------------------------------------------
 
-CROP_PX = 300  # height, and middle within the picture, of what is shown
-CROP_AT = (0.5, 0.56)
+CROP_PX = 300  # The height of a part of a picture that is shown, pixels.
+CROP_AT = (0.5, 0.56)  # The middle of that part, as shares of the picture's width and height.
 
 
 def check_matplotlib() -> None:
-    """Raises ClimateGSError where it is not installed, which takes no minutes to find out."""
+    """Check that matplotlib is installed, before minutes of measuring.
+
+    Raises:
+        ClimateGSError: it is not installed.
+    """
     if importlib.util.find_spec("matplotlib") is None:
         raise ClimateGSError("the trade's chart needs matplotlib: pip install 'climategs[plots]'")
 
 
 def draw_trade(folder: Path, trade: Trade) -> list[Path]:
-    """trade_<scene>.png, FLIP against time by recipe, and trade_<scene>_tiers.jpg."""
+    """Draw trade_<scene>.png, FLIP against time by recipe, and trade_<scene>_tiers.jpg."""
     folder.mkdir(parents=True, exist_ok=True)
     name = "".join(c if c.isalnum() else "_" for c in trade.figures["scene"])
     chart = folder / f"trade_{name}.png"
@@ -787,9 +916,7 @@ def draw_trade(folder: Path, trade: Trade) -> list[Path]:
 
 
 def draw_chart(path: Path, figures: Mapping[str, Any]) -> None:
-    """A panel for each recipe: a line a knob, from its values to the reference; settings as a
-    whole.
-    """
+    """Draw a panel for each recipe: a line for each knob, and a mark for settings of all knobs."""
     from matplotlib.figure import Figure
 
     recipes = figures["recipes"]
@@ -815,9 +942,10 @@ def draw_chart(path: Path, figures: Mapping[str, Any]) -> None:
 
 
 def draw_tiers(path: Path, trade: Trade) -> None:
-    """A row a recipe: the same part of the reference and the tiers, with their time and error. The
-    part is half the picture's height about CROP_AT; pixels are not smoothed, for they are what is
-    compared.
+    """Draw a row for each recipe: the same part of the reference and the tiers, time and error.
+
+    The part is half the picture's height around CROP_AT. Pixels are enlarged without smoothing,
+    since the pixels are compared.
     """
     lines = []
     for entry in trade.figures["recipes"]:
@@ -843,7 +971,7 @@ def draw_tiers(path: Path, trade: Trade) -> None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """[TABLE.json=SCENE_URI ...]: see the module."""
+    """Run the module's command with arguments TABLE.json=SCENE_URI."""
     pairs = [argument.partition("=") for argument in arguments]
     if not all(uri for _, _, uri in pairs):
         raise SystemExit("usage: python -m tools.bench.trade [TABLE.json=SCENE_URI ...]")
@@ -853,7 +981,7 @@ def main(arguments: Sequence[str]) -> None:
     if tables:
         width = max(view["width"] for view in tables[0]["views"])
         case = TradeCase(width=width, repeats=tables[0]["repeats"])
-        tiers = settle(tables, uris, case)
+        tiers = find_tiers(tables, uris, case)
         for path, uri, table in zip(paths, uris, tables, strict=True):
             trade = measure_wholes(table, uri, tiers, case)
             draw_tiers(path.with_name(f"{path.stem}_tiers.jpg"), trade)

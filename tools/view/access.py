@@ -1,14 +1,16 @@
-"""Who may open a page and connect to it: decided at the handshake, before anything is handled.
+"""The check of every request to the server: who may open a page and connect to it.
+
+The check runs at the handshake, before viser handles anything.
 
 A browser lets every site that its user visits send requests to this machine, also under a name
 that the site's owner points here. So a request is answered only where all of these hold:
 
 - it has the token of the printed address, in the address or in the cookie that the page sets;
-- what it names as `Host` is this machine, where pages are for browsers on this machine;
+- its `Host` is this machine, if pages are only for browsers on this machine;
 - its `Origin`, if it has one, is the address of the page itself.
 
-The page that is sent allows scripts of its own only, none made from text, and connects to nothing
-but the server it came from. Nothing is ever shared through servers of others.
+A page runs only its own scripts and none that are made from text. It connects only to the server
+that sent it. Nothing is ever shared through other servers.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ _REFUSAL = (
 
 
 class Access:
-    """The rule of one server.
+    """The rule by which one server admits requests.
 
     Args:
         is_local: If True, pages are for browsers on this machine only.
@@ -50,9 +52,9 @@ class Access:
         """Return why a request is refused; None if it is not.
 
         Args:
-            path: Path and query that are asked for.
+            path: Path and query of the request.
             headers: websockets' headers of the request.
-            port: At which the request came in, which the cookie's name has.
+            port: The port of the server; the cookie's name has it, too.
         """
         hosts = headers.get_all("Host")
         match = _HOST.fullmatch(hosts[0]) if len(hosts) == 1 else None
@@ -75,7 +77,7 @@ class Access:
         return None
 
     def page_headers(self, host: str, port: int) -> dict[str, str]:
-        """Headers of a page that is sent: what it may do, and the cookie for its connection.
+        """Return the headers of a page: what it may do, and the cookie for its connection.
 
         Args:
             host: The request's `Host`, which `refusal` has checked.
@@ -105,7 +107,7 @@ class Access:
         return hmac.compare_digest(text.encode("utf-8", "replace"), self.token.encode())
 
     def _cookies(self, headers: Any, port: int) -> list[str]:
-        """Values of the request's cookies that have our name."""
+        """Return the values of the request's cookies that have our cookie's name."""
         parts = (part.strip() for line in headers.get_all("Cookie") for part in line.split(";"))
         pairs = (part.partition("=") for part in parts)
         return [value for name, _, value in pairs if name == _cookie(port)]
@@ -124,17 +126,18 @@ def is_loopback(name: str) -> bool:
 def start_server(
     viser: Any, access: Access, host: str, port: int, *, script: str, **options: Any
 ) -> Any:
-    """Return a viser server that is open to those only whom `access` lets in, and shares nothing.
+    """Return a viser server that answers only requests that `access` admits, and shares nothing.
 
     Args:
-        viser: The module.
-        host: The address that pages are served at.
-        port: Or the next that is free.
-        script: JavaScript of ours that the page runs first.
-        options: More of `websockets.serve`, in place of viser's.
+        viser: The module viser.
+        access: The rule by which requests are admitted.
+        host: The address at which pages are served.
+        port: The port; the next free one is taken if it is in use.
+        script: JavaScript that the page runs first.
+        options: Options of `websockets.serve`, which replace viser's.
 
     Raises:
-        ClimateGSError: this version of viser cannot be guarded.
+        ClimateGSError: requests to this version of viser cannot be checked.
     """
 
     class PrivateServer(viser.ViserServer):
@@ -161,8 +164,9 @@ def start_server(
 def _guarded_handshakes(
     access: Access, script: str, options: dict[str, Any]
 ) -> Iterator[list[Any]]:
-    """Have websockets servers that start within the block ask `access` first; viser has no option
-    for it. The list that comes with the block has an item for each of them.
+    """Make websockets servers that start within the block ask `access` first.
+
+    viser has no option for it. The list that the block gets has one item for each such server.
     """
     import websockets.asyncio.server as module
     from websockets.datastructures import Headers
@@ -211,5 +215,5 @@ def _guarded_handshakes(
 
 
 def _cookie(port: int) -> str:
-    """Name of the cookie: a browser sends it to all ports of a machine."""
+    """Return the cookie's name. It has the port: a browser sends cookies to all ports of a host."""
     return f"climategs-view-{port}"

@@ -1,4 +1,4 @@
-"""Script and style of a page beside viser's widgets: the keys that fly, and the looks."""
+"""Script and style that a page has in addition to viser's: which keys fly, and how it looks."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ document.body.addEventListener("pointerdown", (event) => {
 """
 
 
-def page_style(place_sliders: Iterable[Any], headings: Iterable[Any]) -> str:
-    """The page's style as HTML.
+def page_style(position_sliders: Iterable[Any], headings: Iterable[Any]) -> str:
+    """Return the page's style as HTML.
 
     Args:
-        place_sliders: Handles of sliders whose numbers are places along their way, which tell
-            nobody anything: viser's box beside them is hidden, as the value has a box of its own,
-            and their marks get room.
-        headings: Handles of ticks that begin a part of the page; their labels are bold.
+        position_sliders: Handles of sliders whose numbers are positions and not values. The style
+            hides viser's box beside them, since the value has a separate box, and leaves room for
+            their marks.
+        headings: Handles of checkboxes that begin a part of the page; their labels are bold.
     """
-    sliders = [f"[id='{handle._impl.uuid}']" for handle in place_sliders]
+    sliders = [f"[id='{handle._impl.uuid}']" for handle in position_sliders]
     labels = [f"label[for='{handle._impl.uuid}']" for handle in headings]
     rules = {
         ", ".join(f"{slider} + *" for slider in sliders): "display: none",

@@ -1,6 +1,8 @@
-"""Controls of a recipe's fields, made by walking its models: the fields to set, the ends of each,
-the values along a slider that spans decades, and the order of the fields. Nothing of a page is in
-here.
+"""Controls of a recipe's fields: what a person can set, without any widget.
+
+The controls are made by walking the recipe's models. A control has its field's path, the ends of
+its values, and the scale of its slider: how a position stands for a value. `fields.py` makes the
+widgets of a page from controls, and `page.py` puts them in order.
 """
 
 from __future__ import annotations
@@ -35,8 +37,8 @@ MAX_MARKS = 5  # The most marks along a logarithmic slider, a decade from each o
 # The least distance of two marks, of a slider's length: else their words run into each other.
 MIN_MARK_DISTANCE = 0.15
 
-# The fields that a page shows first, by section: what a weather report or a road user would say of
-# the weather. All others, and effects without an entry, come under "more".
+# The fields that a page shows first, by section. They are the words of a weather report or of a
+# road user. All other fields, and effects without an entry, come under "more".
 MAIN_FIELDS = {
     "weather.smog": ("visibility_m",),  # as weather services and drivers tell fog
     "weather.rain": ("rate_mm_h", "wetness"),  # what falls, and how dark and bright the road gets
@@ -91,7 +93,7 @@ USEFUL_ENDS = {
 FULL_TURN = 360.0
 MAX_BOTH_SIDES = 100.0  # The largest absolute value on a slider of both signs without an entry.
 
-# By the end of a field's name, the longer end first.
+# The symbol of a unit by the end of a field's name; longer ends come before shorter ones.
 UNIT_SYMBOLS = {
     "_per_m": "1/m",
     "_mm_h": "mm/h",
@@ -119,7 +121,7 @@ class Control:
     hint: str
     """The field's meaning, and its unit."""
     nullable: bool = False
-    """Whether the field may be null."""
+    """True if the field may be null."""
     default: Any = None
     """Its value where nothing is given; None where the field must be given, or is null."""
     low: float = 0.0
@@ -128,17 +130,18 @@ class Control:
     """The upper end of its slider or number."""
     valid: tuple[float, float] = (-math.inf, math.inf)
     """The ends of what its model allows, which its box takes."""
-    least_value: float | None = None
-    """The smallest value but 0 of a logarithmic slider; None for one that follows from its ends."""
-    way: Literal["linear", "log", "both sides"] = "linear"
-    """The scale of its slider: how a position stands for a value."""
-    whole: bool = False
-    """Whether it has no fractions."""
+    log_start: float | None = None
+    """The smallest value above 0 of a logarithmic slider; None if it follows from the ends."""
+    scale: Literal["linear", "log", "both sides"] = "linear"
+    """The scale of the slider: how a position stands for a value."""
+    is_integer: bool = False
+    """True if its values are whole numbers."""
     words: tuple[str, ...] = ()
     """The values to choose from, where they can be listed."""
 
     @property
     def label(self) -> str:
+        """The last name of the path."""
         return self.path.rpartition(".")[2]
 
     @property
@@ -157,12 +160,12 @@ class Control:
         """True if the exact number has a separate box. The box that belongs to a slider takes only
         the slider's values; if the slider is not linear, it holds a position and not a value.
         """
-        return self.way != "linear" or (self.low, self.high) != self.valid
+        return self.scale != "linear" or (self.low, self.high) != self.valid
 
     @property
     def step(self) -> float:
         """Step of a linear slider: a power of ten, or twice or five times one."""
-        if self.whole:
+        if self.is_integer:
             return 1
         exact = (self.high - self.low) / STEPS
         power = 10.0 ** math.floor(math.log10(exact))
@@ -171,12 +174,12 @@ class Control:
     @property
     def box_step(self) -> float:
         """Change of the box's number by an arrow beside it."""
-        return self.step if self.way == "linear" else self.least
+        return self.step if self.scale == "linear" else self.smallest_nonzero
 
     @property
     def box_digits(self) -> int:
         """Digits behind the point that the box takes."""
-        return 0 if self.whole else BOX_DIGITS + max(0, math.ceil(-math.log10(self.box_step)))
+        return 0 if self.is_integer else BOX_DIGITS + max(0, math.ceil(-math.log10(self.box_step)))
 
     @property
     def start(self) -> Any:
@@ -185,7 +188,7 @@ class Control:
             return self.default
         if self.kind == "slider":
             value = self.value_at(0.5)
-            return round(value) if self.whole else value
+            return round(value) if self.is_integer else value
         return {
             "number": int(max(self.low, 0)),
             "colour": [0.5] * 3,
@@ -194,34 +197,35 @@ class Control:
         }.get(self.kind)
 
     @property
-    def least(self) -> float:
-        """The smallest value but 0 of a slider that is not linear."""
-        if self.way == "both sides":
+    def smallest_nonzero(self) -> float:
+        """The smallest absolute value above 0 of a slider that is not linear."""
+        if self.scale == "both sides":
             return 0.01
-        if self.least_value is not None:
-            return self.least_value
+        if self.log_start is not None:
+            return self.log_start
         return self.low if self.low > 0 else max(self.high * 10.0**-DECADES, MIN_LOG_VALUE)
 
     @property
     def marks(self) -> tuple[tuple[float, str], ...]:
-        """Values along a slider that has a box, and words for them: both ends and the middle of a
-        linear one, of others at most five decades, and the end from which on the values are 0.
-        The last has the unit.
+        """Values along a slider that has a box, and the word for each.
+
+        A linear slider has marks at both ends and in the middle. Other sliders have marks at no
+        more than MAX_MARKS decades, and at 0 where there is room. The last word has the unit.
         """
-        if self.way == "linear":
+        if self.scale == "linear":
             ends = (self.low, (self.low + self.high) / 2, self.high)
             return tuple(
                 (v, f"{_brief(v)} {u}".strip())
                 for v, u in zip(ends, ("", "", self.unit), strict=True)
             )
-        both = self.way == "both sides"
-        first = 0 if both else math.ceil(math.log10(self.least) - 1e-9)
+        both = self.scale == "both sides"
+        first = 0 if both else math.ceil(math.log10(self.smallest_nonzero) - 1e-9)
         last = math.floor(math.log10(self.high) + 1e-9)
         mark_decades = 1 if last - first < MAX_MARKS else 2
         values = [10.0**power for power in range(first, last + 1, mark_decades)]
         if both:
             values = [*(-value for value in reversed(values) if value <= -self.low), 0.0, *values]
-        elif self.low <= 0 and self.way_of(values[0]) > MIN_MARK_DISTANCE:
+        elif self.low <= 0 and self.position_at(values[0]) > MIN_MARK_DISTANCE:
             values = [0.0, *values]
         words = [_brief(value) for value in values]
         words[-1] = f"{words[-1]} {self.unit}".strip()
@@ -229,35 +233,37 @@ class Control:
 
     def value_at(self, position: float) -> float:
         """Return the value at a position on the slider, 0 to 1, to three digits."""
-        if self.way == "log":
+        if self.scale == "log":
             if position <= 0 and self.low <= 0:
                 return max(self.low, 0.0)
-            low = math.log(self.least)
+            low = math.log(self.smallest_nonzero)
             value = math.exp(low + position * (math.log(self.high) - low))
-        elif self.way == "both sides":
+        elif self.scale == "both sides":
             most = max(-self.low, self.high)
-            value = self.least * math.sinh((2 * position - 1) * math.asinh(most / self.least))
+            value = self.smallest_nonzero * math.sinh(
+                (2 * position - 1) * math.asinh(most / self.smallest_nonzero)
+            )
         else:
             value = self.low + position * (self.high - self.low)
         return min(max(float(f"{value:.3g}"), self.low), self.high)
 
-    def way_of(self, value: float) -> float:
+    def position_at(self, value: float) -> float:
         """Return the position of a value on the slider, 0 to 1; an end if the value lies beyond."""
-        if self.way == "log":
-            if value <= self.least:
+        if self.scale == "log":
+            if value <= self.smallest_nonzero:
                 return 0.0
-            low = math.log(self.least)
+            low = math.log(self.smallest_nonzero)
             position = (math.log(value) - low) / (math.log(self.high) - low)
-        elif self.way == "both sides":
-            most = math.asinh(max(-self.low, self.high) / self.least)
-            position = (math.asinh(value / self.least) / most + 1) / 2
+        elif self.scale == "both sides":
+            most = math.asinh(max(-self.low, self.high) / self.smallest_nonzero)
+            position = (math.asinh(value / self.smallest_nonzero) / most + 1) / 2
         else:
             position = (value - self.low) / (self.high - self.low)
         return min(max(position, 0.0), 1.0)
 
 
 def shorten(text: str) -> str:
-    """The first sentence, or as many of its words as a tooltip has room for."""
+    """Return the first sentence, cut at a word if it is longer than MAX_HINT characters."""
     first = re.split(r"(?<=\.)\s", text.strip(), maxsplit=1)[0]
     return textwrap.shorten(first, MAX_HINT, placeholder=" ...")
 
@@ -268,49 +274,56 @@ def _brief(value: float) -> str:
 
 @dataclass(frozen=True)
 class Group:
-    """The controls of a section and of the sections in it. optional: null where it is absent."""
+    """The controls of a recipe's section and of the sections in it."""
 
     path: str
+    """The dotted path of the section: "weather.smog"."""
     hint: str
+    """The meaning of the section."""
     optional: bool
+    """True if the section may be null, which means that its effect is absent."""
     controls: tuple[Control, ...]
+    """The controls of its own fields."""
     groups: tuple[Group, ...]
+    """The groups of the sections in it."""
 
     @property
     def label(self) -> str:
+        """The last name of the path."""
         return self.path.rpartition(".")[2]
 
     @property
     def title(self) -> str:
-        """The section's name, with words of daily use where it has some."""
+        """The section's name, with an everyday word where PLAIN_WORDS has one."""
         words = PLAIN_WORDS.get(self.path)
         return self.label if words is None else f"{self.label} ({words})"
 
     @property
     def tooltip(self) -> str:
+        """The first sentence of the hint."""
         return shorten(self.hint)
 
     @property
-    def main(self) -> tuple[Control, ...]:
-        """The controls that are shown first, in the order of MAIN_FIELDS."""
+    def main_controls(self) -> tuple[Control, ...]:
+        """The controls that a page shows first, in the order of MAIN_FIELDS."""
         by_label = {control.label: control for control in self.controls}
         return tuple(by_label[name] for name in MAIN_FIELDS.get(self.path, ()))
 
     @property
-    def rest(self) -> Group:
+    def secondary_group(self) -> Group:
         """The group without its main controls."""
-        controls = tuple(control for control in self.controls if control not in self.main)
+        controls = tuple(control for control in self.controls if control not in self.main_controls)
         return replace(self, controls=controls)
 
     def walk(self) -> Iterator[Control]:
-        """Its controls, then those of the sections in it."""
+        """Yield the group's controls, then those of the sections in it."""
         yield from self.controls
         for group in self.groups:
             yield from group.walk()
 
 
 def group_of(path: str) -> Group:
-    """The section at a dotted path: `weather.smog`, `camera`."""
+    """Return the group of the section at a dotted path, such as `weather.smog` or `camera`."""
     section = recipe_file()
     for name in path.split("."):
         section = section.INNER[name]
@@ -318,12 +331,12 @@ def group_of(path: str) -> Group:
 
 
 def effect_groups() -> tuple[Group, ...]:
-    """Every effect that recipes know at this time."""
+    """Return the groups of all effects that recipes know now."""
     return tuple(map(group_of, SECTIONS))
 
 
 def split_by_rank(groups: Sequence[Group]) -> tuple[tuple[Group, ...], tuple[Group, ...]]:
-    """The effects that have main fields, in the order of MAIN_FIELDS, and the others."""
+    """Return the effects that have main fields, in the order of MAIN_FIELDS, and the others."""
     by_path = {group.path: group for group in groups}
     main = tuple(by_path[path] for path in MAIN_FIELDS if path in by_path)
     return main, tuple(group for group in groups if group.path not in MAIN_FIELDS)
@@ -381,16 +394,16 @@ def _numeric(leaf: Leaf, attributes: dict[str, Any]) -> Control:
     ends = (low, high)
     if any(map(math.isinf, ends)) or (is_integer and high - low > MAX_SLIDER_INTEGERS):
         return Control(
-            kind="number", low=low, high=high, valid=ends, whole=is_integer, **attributes
+            kind="number", low=low, high=high, valid=ends, is_integer=is_integer, **attributes
         )
     start, end = _useful_ends(leaf.path, low, high)
     scale: Literal["linear", "log", "both sides"] = "linear"
-    least = None
+    log_start = None
     if not is_integer and "_deg" not in leaf.path:
         # By what the model allows: a field that may span decades is thought of in decades.
         if low >= 0 and (high >= MAX_LINEAR or (low > 0 and high > 100 * low)):
             scale = "log"
-            least = start or None
+            log_start = start or None
             start = 0.0 if low == 0 else start
         elif start < 0 and end - start > 2 * MAX_LINEAR:
             scale = "both sides"
@@ -399,21 +412,23 @@ def _numeric(leaf: Leaf, attributes: dict[str, Any]) -> Control:
         low=start,
         high=end,
         valid=ends,
-        least_value=least,
-        way=scale,
-        whole=is_integer,
+        log_start=log_start,
+        scale=scale,
+        is_integer=is_integer,
         **attributes,
     )
     if ">" not in limits:
         return control
     # The end itself is not allowed.
-    first = low + (control.step if scale == "linear" else min(control.least, MIN_LOG_VALUE))
-    start = control.least if scale == "log" else max(start, first)
+    first = low + (
+        control.step if scale == "linear" else min(control.smallest_nonzero, MIN_LOG_VALUE)
+    )
+    start = control.smallest_nonzero if scale == "log" else max(start, first)
     return replace(control, low=start, valid=(first, high))
 
 
 def _useful_ends(path: str, low: float, high: float) -> tuple[float, float]:
-    """Return the ends of a field's slider. low, high: the ends of what the model allows."""
+    """Return the ends of a field's slider. low, high: ends of the values that the model allows."""
     if path in USEFUL_ENDS:
         return USEFUL_ENDS[path]
     if path.endswith("_deg") and (low, high) == (-FULL_TURN, FULL_TURN):
@@ -423,19 +438,21 @@ def _useful_ends(path: str, low: float, high: float) -> tuple[float, float]:
     return low, high
 
 
-def start_of_model(section: str) -> dict[str, Any]:
-    """Return values of a valid section that changes something: the middle of every required field;
-    and of one field more where the section's rules want one, or where that field is 0.
+def start_values_of_model(section: str) -> dict[str, Any]:
+    """Return values of a valid section that changes the picture.
+
+    Every required field gets a value in the middle of its slider. One further field gets a value if
+    the section would otherwise be invalid or without effect.
     """
     model = SECTIONS[section]
     controls = group_of(section).controls
     required = [c for c in controls if model.model_fields[c.label].is_required()]
     required_values = {
-        c.label: c.value_at(VISIBLE_POSITION) if c.way == "log" else c.start for c in required
+        c.label: c.value_at(VISIBLE_POSITION) if c.scale == "log" else c.start for c in required
     }
     optional = [{c.label: c.start} for c in controls if c.nullable and is_number(c.start)]
     zero = [c for c in controls if c.kind == "slider" and c.default == 0 and not c.nullable]
-    small = [{c.label: (int if c.whole else float)(c.value_at(0.2))} for c in zero]
+    small = [{c.label: (int if c.is_integer else float)(c.value_at(0.2))} for c in zero]
     for extra_values in ({}, *optional, *small):
         try:
             effect = model.model_validate(required_values | extra_values)

@@ -21,31 +21,33 @@ from recipes.fields import section_at, with_unchecked_field
 from recipes.job import scaled_recipe
 from recipes.load import dump_recipe, load_recipe, preset_names, read_overrides
 from recipes.schema import Recipe, Sensor
-from tools.view.controls import start_of_model
+from tools.view.controls import start_values_of_model
 
 
 def as_yaml(value: Any) -> str:
-    """A plain value on one line, which YAML reads as the same."""
+    """Return a plain value as one line of YAML."""
     return json.dumps(value)
 
 
 @dataclass(frozen=True)
 class Edits:
-    """A recipe and the changes to it.
-
-    source: a preset, or a file's path. scale: resolution relative to the recipe's. values: YAML by
-    dotted path. added: sections that the source lacks, as YAML. absent: sections taken out, whose
-    values are kept for their return. folder: where uploaded files lie, which values name.
-    """
+    """A recipe and the changes to it."""
 
     source: str
+    """The name of a preset, or the path of a recipe file."""
     scale: float = 1.0
+    """The resolution relative to the recipe's."""
     values: Mapping[str, str] = field(default_factory=dict)
+    """The changed values as YAML, by dotted path."""
     added: Mapping[str, str] = field(default_factory=dict)
+    """The sections that the source lacks, as YAML, by dotted path."""
     absent: frozenset[str] = frozenset()
+    """The sections that are switched off. Their values are kept for switching them on again."""
     folder: Path = field(default_factory=Path)
+    """The folder of uploaded files, to which paths in values are relative."""
 
     def with_values(self, values: Mapping[str, str]) -> Edits:
+        """Return edits with further changed values."""
         return replace(self, values={**self.values, **values})
 
     def with_tier(self, tier: str | None) -> Edits:
@@ -54,18 +56,22 @@ class Edits:
         return self.with_values({f"quality.{name}": text for name, text in quality.items()})
 
     def with_section(self, section: str) -> Edits:
-        """Return edits with the effect: as it was, as the source has it, or with start values."""
+        """Return edits with a section switched on.
+
+        It has its values from before it was switched off, or else the source's, or start values.
+        """
         edits = replace(self, absent=self.absent - {section})
         if section_at(replace(edits, values={}).recipe(), section) is not None:
             return edits
-        start = as_yaml(start_of_section(section))
+        start = as_yaml(start_values(section))
         return replace(edits, added={**self.added, section: start})
 
     def without_section(self, section: str) -> Edits:
+        """Return edits with a section switched off."""
         return replace(self, absent=self.absent | {section})
 
     def sets(self) -> list[str]:
-        """FIELD=VALUE as `--set` takes them, in order."""
+        """Return FIELD=VALUE texts in the order in which `--set` takes them."""
         prefixes = tuple(f"{section}." for section in self.absent)
         added = {path: text for path, text in self.added.items() if path not in self.absent}
         values = {path: text for path, text in self.values.items() if not path.startswith(prefixes)}
@@ -81,9 +87,15 @@ class Edits:
         overrides = read_overrides(self.sets(), "changed", folder=self.folder)
         return scaled_recipe(load_recipe(self.source, overrides).resolve(0), self.scale)
 
-    def giving_way(self, changed: str, nullable_paths: tuple[str, ...]) -> Edits:
-        """Return the edits if they are valid, else without the first field of some that contradicts
-        the changed one, such as the other of two densities.
+    def without_conflict(self, changed_path: str, nullable_paths: tuple[str, ...]) -> Edits:
+        """Return the edits without a field that contradicts the changed one.
+
+        An example is the other of two densities. Valid edits are returned as they are, and so are
+        edits that no single field makes valid.
+
+        Args:
+            changed_path: Dotted path of the changed field.
+            nullable_paths: Dotted paths of fields that may be set to null, in order.
         """
         try:
             self.recipe()
@@ -94,31 +106,37 @@ class Edits:
                     edits.recipe()
                 except RecipeError:
                     continue
-                return edits if path != changed else self
+                return edits if path != changed_path else self
         return self
 
     def command(self, where: str) -> str:
-        """Return the command line that renders this. where: its scene, frames and cameras."""
+        """Return the command line that renders the edited recipe.
+
+        Args:
+            where: Its words that choose scene, frames, cameras and output folder.
+        """
         sets = " ".join(f"--set {shlex.quote(text)}" for text in self.sets())
         scale = "" if self.scale == 1 else f"--scale {self.scale:g}"
         words = ("climategs render", shlex.quote(self.source), sets, scale, "--variants 1", where)
         return " ".join(word for word in words if word)
 
 
-def start_of_section(section: str) -> dict[str, Any]:
-    """Values to start an effect with: those of the plainest preset that has it, or else the middle
-    of what its fields allow.
+def start_values(section: str) -> dict[str, Any]:
+    """Return the values with which an effect is switched on.
+
+    They are those of the preset with the fewest sections that has the effect. An effect without a
+    preset gets values in the middle of what its fields allow.
     """
     candidates = []
     for name in preset_names():
         recipe = load_recipe(name).resolve(0)
         effect = section_at(recipe, section)
-        if effect is not None and effect.changes:
+        if effect is not None and effect.has_effect:
             start = effect.model_dump(mode="json", exclude_defaults=True)
             candidates.append((len(recipe.sections()), len(start), name, start))
     if candidates:
         return _short(min(candidates, key=lambda entry: entry[:3])[3])
-    return start_of_model(section)
+    return start_values_of_model(section)
 
 
 def _short(value: Any) -> Any:
@@ -137,7 +155,7 @@ def without_weather(recipe: Recipe) -> Recipe:
     return recipe.model_copy(update={"camera": Sensor()})
 
 
-def renamed(recipe: Recipe, name: str) -> Recipe:
+def rename_recipe(recipe: Recipe, name: str) -> Recipe:
     """Return the recipe under another name.
 
     Raises:
@@ -156,7 +174,7 @@ def save_recipe(recipe: Recipe, path: Path) -> None:
     """Write a recipe in numbers, and its files in a folder of the recipe's name beside it.
 
     Raises:
-        FileExistsError: there is something at the path.
+        FileExistsError: the path exists.
         RecipeError: a file of the recipe cannot be read, or is not that of its digest.
         OutputError: the folder cannot be written.
     """
@@ -175,7 +193,7 @@ def save_recipe(recipe: Recipe, path: Path) -> None:
         raise
 
 
-def free_path(folder: Path, name: str, *endings: str) -> Path:
+def unused_path(folder: Path, name: str, *endings: str) -> Path:
     """Return FOLDER/NAME, or NAME-2, NAME-3, ... where no ending of it is taken."""
     for number in itertools.count(1):
         path = folder / (name if number == 1 else f"{name}-{number}")
@@ -188,7 +206,7 @@ def create_file(folder: Path, name: str, ending: str, data: bytes) -> Path:
     """Write a file at NAME + ENDING, or at NAME-2 + ENDING, ... where there is one already.
 
     Args:
-        folder: Where; it is made if it is missing.
+        folder: The folder; it is made if it is missing.
         name: The file's name without its ending; dots in it are kept.
         ending: The rest of the name.
         data: The file's bytes.

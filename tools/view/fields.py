@@ -1,4 +1,4 @@
-"""A recipe's controls as widgets of a page, each of which takes a value and tells of changes."""
+"""Widgets of a page for the controls of a recipe. A widget shows a value and reports changes."""
 
 from __future__ import annotations
 
@@ -17,35 +17,38 @@ MAX_EXACT = 2**53 - 1  # The largest whole number that a browser tells from its 
 MAX_POSITION = 100.0
 NONE = "(none)"  # The word for null in a dropdown.
 
-When = Callable[..., None]
-Changed = Callable[[Control, str], None]
-Uploaded = Callable[[Control, str, bytes], None]
+Subscribe = Callable[..., None]
+OnChange = Callable[[Control, str], None]
+OnUpload = Callable[[Control, str, bytes], None]
 
 
 class Field:
     """One control on a page.
 
     Args:
-        label: What the page calls the field; None for its name.
-        when: Is called with a widget and a function; calls the function with each new value.
-        changed: Is called with the control and the field's new value as YAML.
-        uploaded: Is called with the control and a file's name and content.
+        gui: viser's interface of the page.
+        control: The control.
+        label: The label on the page; None for the field's name.
+        subscribe: A function of a widget and a listener. It calls the listener with each new value
+            of the widget.
+        on_change: A function of the control and the field's new value as YAML.
+        on_upload: A function of the control, and a file's name and content.
     """
 
     def __init__(
         self,
         gui: GuiApi,
         control: Control,
-        when: When,
-        changed: Changed,
-        uploaded: Uploaded,
+        subscribe: Subscribe,
+        on_change: OnChange,
+        on_upload: OnUpload,
         label: str | None = None,
     ) -> None:
         self.control = control
-        self._when = when
-        self._changed = changed
+        self._subscribe = subscribe
+        self._on_change = on_change
         self.label = label or control.label
-        self.place_slider: Any = None  # it has positions, not values
+        self.position_slider: Any = None  # it has positions, not values
         self._set_checkbox: Any = None
         self._parts: list[Any] = []
         make = getattr(self, f"_make_{control.kind}")
@@ -55,10 +58,10 @@ class Field:
         make(gui, control)
         if control.kind == "file":
             button = gui.add_upload_button(f"upload {self.label}")
-            when(button, lambda file: uploaded(control, file.name, file.content), "on_upload")
+            subscribe(button, lambda file: on_upload(control, file.name, file.content), "on_upload")
 
     def show(self, value: Any) -> None:
-        """Show a value, without calling `changed`."""
+        """Show a value, without calling `on_change`."""
         if self._set_checkbox is not None:
             self._set_checkbox.value = value is not None
             for part in self._parts:
@@ -69,12 +72,12 @@ class Field:
             part.value = part_value
 
     def _part_values(self, value: Any) -> tuple[Any, ...]:
-        """Return the value in the form of each of the widgets."""
+        """Return the value in the form that each widget of the field takes."""
         control = self.control
         if control.kind in ("slider", "number"):
-            kind = int if control.whole else float
+            kind = int if control.is_integer else float
             if control.kind == "slider" and control.has_box:
-                return (kind(value), MAX_POSITION * control.way_of(value))
+                return (kind(value), MAX_POSITION * control.position_at(value))
             value = min(max(value, control.low), min(control.high, MAX_EXACT))
             return (kind(value),)
         if control.kind == "colour":
@@ -95,17 +98,17 @@ class Field:
     def _hear(self, part: Any, value_of: Callable[[Any], Any]) -> None:
         def on_change(part_value: Any) -> None:
             value = value_of(part_value)
-            if part is self._set_checkbox or self.place_slider is not None:
+            if part is self._set_checkbox or self.position_slider is not None:
                 self.show(value)
             text = value if self.control.kind == "list" and value else as_yaml(value)
-            self._changed(self.control, text)
+            self._on_change(self.control, text)
 
-        self._when(part, on_change)
+        self._subscribe(part, on_change)
 
     # ---- One for every kind of control
 
     def _make_slider(self, gui: GuiApi, control: Control) -> None:
-        kind = int if control.whole else float
+        kind = int if control.is_integer else float
         start = kind(min(max(control.start, control.low), control.high))
         if not control.has_box:
             low, high, step = map(kind, (control.low, control.high, control.step))
@@ -118,11 +121,13 @@ class Field:
         )
         number.precision = control.box_digits
         self._add(number)
-        marks = tuple((MAX_POSITION * control.way_of(value), word) for value, word in control.marks)
-        position = MAX_POSITION * control.way_of(start)
-        is_linear = control.way == "linear"
+        marks = tuple(
+            (MAX_POSITION * control.position_at(value), word) for value, word in control.marks
+        )
+        position = MAX_POSITION * control.position_at(start)
+        is_linear = control.scale == "linear"
         steps = (control.high - control.low) / control.step if is_linear else STEPS
-        self.place_slider = gui.add_slider(
+        self.position_slider = gui.add_slider(
             control.unit or " ",
             0.0,
             MAX_POSITION,
@@ -131,10 +136,10 @@ class Field:
             marks=marks,
             hint=control.tooltip,
         )
-        self._add(self.place_slider, lambda value: kind(control.value_at(value / MAX_POSITION)))
+        self._add(self.position_slider, lambda value: kind(control.value_at(value / MAX_POSITION)))
 
     def _make_number(self, gui: GuiApi, control: Control) -> None:
-        kind = int if control.whole else float
+        kind = int if control.is_integer else float
         low = kind(max(control.low, -MAX_EXACT))
         high = kind(min(control.high, MAX_EXACT))
         number = gui.add_number(

@@ -1,9 +1,9 @@
-"""Messages that a page may send: anything else goes no further than this file.
+"""Messages that a page may send. This file drops all others.
 
 viser handles whatever a connection sends, takes any number, sets any attribute of a widget that a
-message names, and keeps parts of uploads for as long as the connection lasts. So each message is
-read here first, by a schema, and written anew for viser. Uploads are put together here, within
-limits of size, number and time, and passed on whole.
+message names, and keeps parts of uploads for as long as the connection lasts. So this file reads
+each message first, by a schema, and writes it anew for viser. It also collects the parts of
+uploads, within limits of size, number and time, and passes on only complete files.
 
 This module needs the libraries of viser's protocol, which are installed with viser.
 """
@@ -31,7 +31,7 @@ from tools.view.widgets import value_of
 MAX_MESSAGE_BYTES = 2**20
 MAX_UPLOAD_BYTES = 64 * 2**20  # The largest sum of a page's uploads at one time, bytes.
 MAX_UPLOADS = 4  # The most uploads of a page at one time.
-UPLOAD_S = 60.0  # The time without a part after which an upload is given up, seconds.
+UPLOAD_S = 60.0  # The time without a new part after which an upload is given up, seconds.
 MAX_TEXT = 65_536  # The longest text in a widget, characters.
 _LOG = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ Coordinate = Annotated[float, Meta(ge=-1e7, le=1e7)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 Pixels = Annotated[int, Meta(ge=0, le=2**15)]
 Number = Annotated[float, Meta(ge=-1e300, le=1e300)]
-Whole = Annotated[int, Meta(ge=-(2**53), le=2**53)]
+WholeNumber = Annotated[int, Meta(ge=-(2**53), le=2**53)]
 Text = Annotated[str, Meta(max_length=MAX_TEXT)]
 
 
@@ -65,7 +65,13 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, tag_field="type", forbid_unk
 class Updates(msgspec.Struct, forbid_unknown_fields=True):
     """The new value of a widget, and nothing else of it."""
 
-    value: bool | Whole | Number | Text | Annotated[tuple[Whole | Number, ...], Meta(max_length=8)]
+    value: (
+        bool
+        | WholeNumber
+        | Number
+        | Text
+        | Annotated[tuple[WholeNumber | Number, ...], Meta(max_length=8)]
+    )
 
 
 class GuiUpdateMessage(msgspec.Struct, tag=True, tag_field="type", forbid_unknown_fields=True):
@@ -103,20 +109,24 @@ _DECODER = msgspec.msgpack.Decoder(PageMessage)
 
 @dataclass
 class Upload:
-    """A file whose parts are coming in.
-
-    start: its first message. parts: content by number. size_bytes: of the parts so far. last:
-    when the latest part came, as `time.monotonic` has it.
-    """
+    """A file whose parts are coming in."""
 
     start: FileTransferStartUpload
+    """The message that announced the file."""
     parts: dict[int, bytes] = field(default_factory=dict)
+    """The content of every part so far, by its number."""
     size_bytes: int = 0
-    last: float = field(default_factory=time.monotonic)
+    """The size of all parts so far, bytes."""
+    last_part_time: float = field(default_factory=time.monotonic)
+    """The time of the latest part on the monotonic clock, seconds."""
 
 
 class Uploads:
-    """The files that one page has begun to upload. report: says on the page what is refused."""
+    """The files that one page has begun to upload.
+
+    Args:
+        report: Shows on the page why a file is refused.
+    """
 
     def __init__(self, report: Callable[[str], None]) -> None:
         self._report = report
@@ -126,7 +136,7 @@ class Uploads:
         return len(self._uploads)
 
     def begin(self, start: FileTransferStartUpload) -> list[PageMessage]:
-        """Return what to pass on: an empty file has no parts."""
+        """Begin an upload. Return the messages to pass on: an empty file is complete at once."""
         size = start.size_bytes
         waiting = sum(upload.start.size_bytes for upload in self._uploads.values())
         if start.transfer_uuid in self._uploads:
@@ -144,13 +154,13 @@ class Uploads:
         return []
 
     def add(self, part: FileTransferPart) -> list[PageMessage]:
-        """Return what to pass on: the whole file with its last part."""
+        """Add a part. Return the messages to pass on: the complete file after its last part."""
         upload = self._uploads.get(part.transfer_uuid)
         if upload is None or part.part_index in upload.parts:
             return []
         upload.parts[part.part_index] = part.content
         upload.size_bytes += len(part.content)
-        upload.last = time.monotonic()
+        upload.last_part_time = time.monotonic()
         start = upload.start
         count = len(upload.parts)
         too_large = upload.size_bytes > start.size_bytes or part.part_index >= start.part_count
@@ -165,16 +175,18 @@ class Uploads:
         return [msgspec.structs.replace(start, part_count=1), file]
 
     def progress(self, message: FileTransferStartUpload | FileTransferPart) -> tuple[int, int]:
-        """Bytes of the message's file so far, and of all of it; of one that has ended or was
-        refused, twice the same, for the page to take the next.
+        """Return the bytes of the message's file so far, and its size in bytes.
+
+        Both numbers are equal for a file that has ended or was refused, so that the page goes on
+        to the next one.
         """
         upload = self._uploads.get(message.transfer_uuid)
         return (1, 1) if upload is None else (upload.size_bytes, upload.start.size_bytes)
 
     def forget_idle(self) -> None:
-        """Give up those that no part has come of for a while."""
+        """Give up uploads without a new part in the last UPLOAD_S seconds."""
         for key, upload in list(self._uploads.items()):
-            if time.monotonic() - upload.last > UPLOAD_S:
+            if time.monotonic() - upload.last_part_time > UPLOAD_S:
                 del self._uploads[key]
                 self._report(
                     f"{upload.start.filename} was not uploaded: no part of it has come for "
@@ -183,10 +195,10 @@ class Uploads:
 
 
 class PageConnection(ServerConnection):
-    """A page's connection, of which viser gets only the messages that a page may send.
+    """A page's connection. It gives viser only the messages that a page may send.
 
-    Once there is a page, `widget_of` gives viser's handle of a widget by its name in messages, and
-    `report` says on the page what was refused.
+    After the page is made, `widget_of` returns viser's handle of a widget by its name in messages,
+    and `report` shows on the page why something was refused.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -217,7 +229,7 @@ class PageConnection(ServerConnection):
         return self._ready.popleft()
 
     async def _admitted(self, message: PageMessage) -> list[PageMessage]:
-        """Return what of a message is passed on.
+        """Return the messages to pass on in place of one.
 
         Raises:
             ClimateGSError: the widget that it names cannot have the value.
@@ -262,10 +274,13 @@ class PageConnection(ServerConnection):
 
 
 def read_message(data: Any) -> PageMessage:
-    """Return a page's message.
+    """Decode a page's message.
+
+    Args:
+        data: The bytes of the message; any type, since a page may send anything.
 
     Raises:
-        ValueError: it is none that a page may send, or a value in it is none that a page has.
+        ValueError: a page may not send this message, or a value in it is out of range.
     """
     try:
         return _DECODER.decode(data)
@@ -274,7 +289,7 @@ def read_message(data: Any) -> PageMessage:
 
 
 def frame_of(message: dict[str, Any]) -> bytes:
-    """Bytes of a message to a page, as viser sends them: two lengths, and packed messages."""
+    """Return the bytes of a message to a page in viser's form: two lengths and packed messages."""
     content = {"messages": [message], "timestampSec": time.perf_counter()}
     inner = msgspec.msgpack.encode({**content, "binaryBufferLengths": ()})
     packed = zstandard.ZstdCompressor(level=1).compress(inner)

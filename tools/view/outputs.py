@@ -1,4 +1,4 @@
-"""An output folder in the browser: its images, found by what they show and by their numbers."""
+"""An output folder in the browser: its images, selected by scene, camera, frame and weather."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from augment.jobs.store import Store, open_store
 from recipes.files import open_file
 from recipes.schema import columns_of_effects
 from tools.view.fields import NONE
-from tools.view.pictures import BAR, color_classes, color_depth, color_numbers, split
+from tools.view.pictures import BAR, color_classes, color_depth, color_numbers, split_pictures
 from tools.view.text import paragraph, printable, table
 from tools.view.widgets import options_of
 
@@ -34,11 +34,16 @@ MAX_ASPECT = 8.0  # The largest ratio of a window's longer side to its shorter o
 
 
 def find_output(text: str) -> Store | None:
-    """Return the output of `climategs render` or `generate` that a command's scene names: a folder
-    or a bucket with a manifest. None if it names no such output.
+    """Return the output of `climategs render` or `generate` that a text names.
+
+    Args:
+        text: The `--scene` of a command: a folder or a bucket, or an address of a scene.
+
+    Returns:
+        The folder or bucket; None if the text names none with a manifest.
 
     Raises:
-        OutputError: a bucket that cannot be read.
+        OutputError: a bucket cannot be read.
     """
     if "://" not in text:
         return open_store(text) if (Path(text) / MANIFEST_FILE).is_file() else None
@@ -48,6 +53,9 @@ def find_output(text: str) -> Store | None:
 
 class OutputViewer:
     """The finished images of an output folder or bucket, for the pages of one server.
+
+    Args:
+        store: The folder or bucket.
 
     Raises:
         OutputError: there is no finished image, or the manifest is damaged.
@@ -63,19 +71,23 @@ class OutputViewer:
         self.pages: dict[int, OutputPage] = {}
 
     def values(self, column: str) -> list[Any]:
-        """Return the values that a column has, sorted; NaN left out."""
+        """Return the sorted values of a column, without NaN and without None."""
         values = {row[column] for row in self.rows}
         return sorted(value for value in values if value is not None and value == value)
 
     def _is_range(self, column: str) -> bool:
-        """Return True if a column can have a slider: two numbers or more, between finite ends."""
+        """Return True if a column can have a slider: at least two numbers, with finite ends."""
         values = self.values(column)
         if len(values) < 2 or not all(isinstance(value, int | float) for value in values):
             return False
         return math.isfinite(width := float(values[-1]) - float(values[0])) and width > MIN_RANGE
 
     def picture(self, row: Row, shows: str) -> np.ndarray:
-        """uint8 [H, W, 3]: a row's image, or what stands for another file of the row.
+        """Return the picture of a row's file, uint8 [H, W, 3].
+
+        Args:
+            row: The row of the manifest.
+            shows: The kind of the file: "image", "depth", "semantic", "instance" or a mask.
 
         Raises:
             OutputError: the file is missing or damaged, or the row has none.
@@ -114,21 +126,23 @@ class OutputViewer:
         return data
 
     def start(self) -> None:
-        """Pages draw for themselves."""
+        """Do nothing: no thread draws for the pages."""
 
     def stop(self) -> None:
-        """As `start`."""
+        """Do nothing: no thread draws for the pages."""
 
     def open_page(self, client: ClientHandle) -> Callable[[str], None]:
+        """Open a page. Return the function that shows a message on it."""
         self.pages[client.client_id] = page = OutputPage(self, client)
         return page.show_status
 
     def close_page(self, client: ClientHandle) -> None:
+        """Forget a client's page."""
         self.pages.pop(client.client_id, None)
 
 
 class OutputPage:
-    """One client's page. All runs on the server's event loop: there is little to do."""
+    """One client's page. All of its work is short, and runs on the server's event loop."""
 
     def __init__(self, viewer: OutputViewer, client: ClientHandle) -> None:
         self.viewer = viewer
@@ -140,38 +154,40 @@ class OutputPage:
         gui.set_panel_label(printable(f"ClimateGS: {viewer.store.uri.rpartition('/')[2]}"))
         self._status = gui.add_html("")
         self._options: dict[str, dict[str, Any]] = {}  # by the dropdown's label
-        self._scene = self._dropdown("scene", viewer.values("scene"))
-        self._camera = self._dropdown("camera", viewer.values("camera"))
+        self._scene = self._add_dropdown("scene", viewer.values("scene"))
+        self._camera = self._add_dropdown("camera", viewer.values("camera"))
         frames = viewer.values("frame")
         self._frame = gui.add_slider("frame", 0, max(len(frames) - 1, 1), 1, 0)
-        self._variant = self._dropdown("variant", viewer.values("variant"))
+        self._variant = self._add_dropdown("variant", viewer.values("variant"))
         kinds = ("image", "depth", "semantic", "instance", *mask_names())
         row_kinds = [k for k in kinds if any(row.get(f"{k}_path") for row in rows)]
-        self._shows = self._dropdown("shows", row_kinds)
-        self._other = self._dropdown("left of the line", [NONE, *viewer.values("variant")])
+        self._shows = self._add_dropdown("shows", row_kinds)
+        self._left_variant = self._add_dropdown(
+            "left of the line", [NONE, *viewer.values("variant")]
+        )
         self._line = gui.add_slider("line", 0.0, 1.0, 0.005, 0.5)
         self._ranges: dict[str, Any] = {}
         with gui.add_folder("only images with", visible=bool(viewer.numbers)):
             for name in viewer.numbers:
-                self._ranges[name] = self._range(name)
+                self._ranges[name] = self._add_range_slider(name)
         self._facts = gui.add_html("")
         self._frames = frames
         for part in (self._frame, self._line):
-            self._when(part, self._show)
+            self._subscribe(part, self._show)
         self._show()
         client.camera.on_update(self._on_camera)
 
-    def _dropdown(self, label: str, values: list[Any]) -> Any:
+    def _add_dropdown(self, label: str, values: list[Any]) -> Any:
         self._options[label] = options_of(values)
         part = self.client.gui.add_dropdown(label, tuple(self._options[label]))
-        self._when(part, self._show)
+        self._subscribe(part, self._show)
         return part
 
-    def _chosen(self, part: Any) -> Any:
-        """The value that the option of a dropdown stands for."""
+    def _selected_value(self, part: Any) -> Any:
+        """Return the value that a dropdown's selected option stands for."""
         return self._options[part.label][part.value]
 
-    def _range(self, name: str) -> Any:
+    def _add_range_slider(self, name: str) -> Any:
         values = self.viewer.values(name)
         low = float(values[0])
         high = float(values[-1])
@@ -183,10 +199,10 @@ class OutputPage:
         part = self.client.gui.add_multi_slider(
             name, low, high, step=step, initial_value=(low, high), hint=hint
         )
-        self._when(part, self._narrow)
+        self._subscribe(part, self._narrow)
         return part
 
-    def _when(self, part: Any, act: Callable[[], None]) -> None:
+    def _subscribe(self, part: Any, act: Callable[[], None]) -> None:
         @part.on_update
         async def _(event: Any) -> None:
             if event.client is not None:
@@ -224,20 +240,22 @@ class OutputPage:
     def _show(self) -> None:
         matching = [row for row in self.viewer.rows if self._matches(row)]
         frame = self._frames[min(self._frame.value, len(self._frames) - 1)]
-        scene, camera, shows = map(self._chosen, (self._scene, self._camera, self._shows))
+        scene, camera, shows = map(self._selected_value, (self._scene, self._camera, self._shows))
         view = {"scene": scene, "camera": camera, "frame": frame}
-        row = self._find(matching, view | {"variant": self._chosen(self._variant)})
+        row = self._find(matching, view | {"variant": self._selected_value(self._variant)})
         count = f"{len(matching)} of {len(self.viewer.rows)} images"
         if row is None:
             self.show_status(f"{count}; none of this scene, camera, frame and variant")
             return
         try:
             picture = self.viewer.picture(row, shows)
-            left_row = self._find(self.viewer.rows, view | {"variant": self._chosen(self._other)})
+            left_row = self._find(
+                self.viewer.rows, view | {"variant": self._selected_value(self._left_variant)}
+            )
             if left_row is not None:
                 left_picture = self.viewer.picture(left_row, shows)
                 if left_picture.shape == picture.shape:
-                    picture = split(left_picture, picture, self._line.value)
+                    picture = split_pictures(left_picture, picture, self._line.value)
         except OutputError as error:
             self.show_status(f"{count}; {error}")
             return
@@ -253,7 +271,12 @@ class OutputPage:
 
 
 def with_aspect(picture: np.ndarray, aspect: float) -> np.ndarray:
-    """The picture in the middle of one of another shape, which loses none of its pixels."""
+    """Return a picture with bars, so that it has another aspect and loses no pixel.
+
+    Args:
+        picture: [H, W, 3], uint8.
+        aspect: Width divided by height.
+    """
     height, width = picture.shape[:2]
     extra_width = max(0, round(height * aspect) - width)
     extra_height = max(0, round(width / aspect) - height)
@@ -264,7 +287,7 @@ def with_aspect(picture: np.ndarray, aspect: float) -> np.ndarray:
 
 
 def _facts_of(row: Row) -> str:
-    """Return an HTML table of all that the manifest says of an image."""
+    """Return an HTML table of an image's values in the manifest."""
     facts = {n: v for n, v in row.items() if v not in (None, "") and v == v}
     words = (f"{v:g}" if isinstance(v, float) else str(v) for v in facts.values())
     return table(("column", "value"), zip(facts, words, strict=True))

@@ -1,4 +1,7 @@
-"""Pictures for a page: the camera behind a window, pictures of a view, and overlays."""
+"""Pictures for a page: the camera of its window, images of a view, and overlays.
+
+`server.py` calls these functions with a scene and a page's request; they know nothing of pages.
+"""
 
 from __future__ import annotations
 
@@ -41,27 +44,32 @@ SPLATS = "splat ids"  # The word for the splats that its pixels show, in colours
 MOVING = {"transmittance_stop": 0.01, "radius_clip_px": 1.0}
 
 
-# ---- Which camera is behind the window -----------------------------------------------------------
+# ---- The camera of a window ----------------------------------------------------------------------
 
 
 class Place(NamedTuple):
-    """Place of a camera's image in a window.
-
-    fov_rad: the window's vertical field of view. size: the window's, in pixels of the image, width
-    first. left, top: the image's first column and row in it.
-    """
+    """Place of a camera's image in a window."""
 
     fov_rad: float
+    """The window's vertical field of view, radians."""
     size: tuple[int, int]
+    """The window's width and height, in pixels of the image."""
     left: int
+    """The column of the window at which the image begins."""
     top: int
+    """The row of the window at which the image begins."""
 
 
 def place_in_window(camera: Camera, aspect: float) -> Place:
-    """The smallest window that holds the camera's whole image, looking along its axis.
+    """Return the place of a camera's image in the smallest window that holds all of it.
 
-    A window's principal point is its middle and a camera's need not be, so there are bars; then
-    what is drawn over the image in the window is where the image shows it. aspect: width by height.
+    The window looks along the camera's axis. The principal point of a window is its middle, while
+    that of a camera may lie elsewhere. So the window has bars, and what the page draws over the
+    image lies at the right pixels.
+
+    Args:
+        camera: The camera.
+        aspect: The window's width divided by its height.
     """
     tan_x = max(camera.cx, camera.width - camera.cx) / camera.fx
     tan_y = max(camera.cy, camera.height - camera.cy) / camera.fy
@@ -80,9 +88,14 @@ def free_camera(
     fov_rad: float,
     aspect: float,
 ) -> Camera:
-    """A camera at any pose, with the pixels, the colours and the moment of a recorded one.
+    """Return a camera at any pose, with the pixel density, colours and time of a recorded one.
 
-    wxyz, position: world_from_camera of the scene's world, OpenCV axes. fov_rad: vertical.
+    Args:
+        recorded: The recorded camera.
+        wxyz: Rotation of world_from_camera as a quaternion, OpenCV axes.
+        position: Translation of world_from_camera in the scene's world.
+        fov_rad: Vertical field of view, radians.
+        aspect: Width divided by height.
     """
     quat = torch.tensor([*wxyz], dtype=torch.float64)
     pose = rigid(rotmat_from_quat(quat), torch.tensor([*position], dtype=torch.float64))
@@ -102,7 +115,7 @@ def free_camera(
     )
 
 
-def away_sentence(scene: Scene, camera: Camera) -> str | None:
+def distance_warning(scene: Scene, camera: Camera) -> str | None:
     """Return a warning about a picture that is far from where any image was recorded.
 
     Returns:
@@ -126,26 +139,34 @@ def away_sentence(scene: Scene, camera: Camera) -> str | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """rgb: uint8 [H, W, 3], the picture or what stands for it. depth_m: z, 0 where there is none;
-    None where nobody asked.
-    """
+class PageImage:
+    """An image for a page."""
 
     rgb: np.ndarray
+    """[H, W, 3], uint8. The rendered image, or colours that stand for depth, classes or numbers."""
     depth_m: np.ndarray | None
+    """[H, W]. Depth z, metres, 0 where there is no surface; None if it was not requested."""
 
 
-def what_can_be_shown() -> tuple[str, ...]:
+def picture_kinds() -> tuple[str, ...]:
+    """Return the words for all kinds of pictures that a page can show."""
     masks = (f"mask of {e.mask_name}" for e in effects.EFFECTS if e.mask_name is not None)
     return (PICTURE, DEPTH, CLASSES, INSTANCES, SPLATS, *masks, f"mask of {TRUST}")
 
 
 def recipe_to_show(recipe: Recipe, shows: str, *, with_depth: bool, factor: float) -> Recipe:
-    """The recipe with what is shown in its output, at `factor` times its resolution.
+    """Return the recipe with the outputs that a page needs, at `factor` times its resolution.
 
-    Its own outputs stay: a picture that is drawn together with other buffers can differ from one
-    drawn alone by the last bit, and at factor 1 the bits are those that `climategs render` writes.
-    Of the trust mask no picture depends.
+    The recipe's own outputs stay. A picture that is drawn together with other buffers can differ
+    in the last bit from one that is drawn alone. At factor 1 the page shows the bits that
+    `climategs render` writes. Only the trust mask is left out if it is not shown: no picture
+    depends on it.
+
+    Args:
+        recipe: The recipe.
+        shows: The kind of the picture, one of `picture_kinds()`.
+        with_depth: True if the page needs depth.
+        factor: The resolution relative to the recipe's.
     """
     output = recipe.output
     depth = output.depth if output.depth != "none" else "median"
@@ -162,9 +183,11 @@ def recipe_to_show(recipe: Recipe, shows: str, *, with_depth: bool, factor: floa
     return with_unchecked_field(recipe, "render.scale", recipe.render.scale * factor)
 
 
-def coarse(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
-    """Return the recipe of a picture while something moves: with shortcuts of the rasteriser, and
-    without outputs that the page does not show. No change makes a preparation run again.
+def coarse_recipe(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
+    """Return the recipe of a picture while something moves.
+
+    It has shortcuts of the rasteriser, and lacks outputs that the page does not show. No change
+    makes a preparation run again. The arguments are those of `recipe_to_show`.
     """
     if shows == PICTURE and not with_depth:
         changes = {"depth": "none", "semantic": False, "instance": False, "labels": False}
@@ -175,8 +198,18 @@ def coarse(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
     return recipe
 
 
-def draw(scene: Scene, camera: Camera, recipe: Recipe, shows: str, *, backend: str = AUTO) -> Shown:
-    """Return what a page shows. camera: before recipe.render.scale. recipe: of recipe_to_show."""
+def draw(
+    scene: Scene, camera: Camera, recipe: Recipe, shows: str, *, backend: str = AUTO
+) -> PageImage:
+    """Draw the image that a page shows.
+
+    Args:
+        scene: The scene.
+        camera: The camera, before `recipe.render.scale`.
+        recipe: The recipe, from `recipe_to_show`.
+        shows: The kind of the picture, one of `picture_kinds()`.
+        backend: The rasteriser's backend.
+    """
     if shows == SPLATS:
         return _draw_splat_ids(scene, camera, recipe, backend)
     view = render_view(scene, camera, recipe, backend=backend)
@@ -190,20 +223,24 @@ def draw(scene: Scene, camera: Camera, recipe: Recipe, shows: str, *, backend: s
     elif shows.startswith("mask of "):
         mask = view.masks.get(shows.removeprefix("mask of "))
         rgb = rgb // 3 if mask is None else np.where(mask[..., None] > 0, rgb, rgb // 3)
-    return Shown(rgb, view.depth_m)
+    return PageImage(rgb, view.depth_m)
 
 
-def _draw_splat_ids(scene: Scene, camera: Camera, recipe: Recipe, backend: str) -> Shown:
+def _draw_splat_ids(scene: Scene, camera: Camera, recipe: Recipe, backend: str) -> PageImage:
     plan = make_plan(with_unchecked_field(recipe, "output.semantic", True), scene)
     view = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     ids = getattr(view.raster, SPLAT_IDS).cpu().numpy()
     rgb = np.where(ids[..., None] >= 0, color_numbers(ids), 0).astype(np.uint8)
     depth = None if view.depth_m is None else view.depth_m.float().cpu().numpy()
-    return Shown(rgb, depth)
+    return PageImage(rgb, depth)
 
 
 def color_depth(depth_m: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3]: near is red, 100 m and more blue, by the logarithm; black where none is."""
+    """Return colours of depths, uint8 [H, W, 3].
+
+    The scale is logarithmic from red (near) to blue (MAX_DEPTH_M and more). Pixels without depth
+    are black.
+    """
     share = np.log(np.maximum(depth_m, 1.0)) / math.log(MAX_DEPTH_M)
     grey = (255 * (1 - np.clip(share, 0, 1))).astype(np.uint8)
     rgb = cv2.cvtColor(cv2.applyColorMap(grey, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
@@ -211,14 +248,14 @@ def color_depth(depth_m: np.ndarray) -> np.ndarray:
 
 
 def color_numbers(numbers: np.ndarray) -> np.ndarray:
-    """uint8 [..., 3]: neighbours in number are far apart in colour."""
+    """Return colours of whole numbers, uint8 [..., 3]. Successive numbers differ much in colour."""
     hashed = numbers.astype(np.uint32) * np.uint32(2654435761)
     hashed ^= hashed >> np.uint32(15)
     return np.stack([64 + (hashed >> np.uint32(s)) % 192 for s in (0, 8, 16)], -1).astype(np.uint8)
 
 
 def color_classes(classes: np.ndarray) -> np.ndarray:
-    """uint8 [..., 3] of uint8 numbers of SemanticClass."""
+    """Return the colours of classes, uint8 [..., 3]. classes: uint8 numbers of SemanticClass."""
     return _CLASS_COLORS[classes]
 
 
@@ -235,8 +272,8 @@ def _class_colors() -> np.ndarray:
 _CLASS_COLORS = _class_colors()
 
 
-def in_window(view: Shown, place: Place) -> Shown:
-    """Return the image with the window's bars around it."""
+def add_window_bars(view: PageImage, place: Place) -> PageImage:
+    """Return the image with bars around it, which fill the window."""
     height, width = view.rgb.shape[:2]
     right = place.size[0] - place.left - width
     bottom = place.size[1] - place.top - height
@@ -247,11 +284,17 @@ def in_window(view: Shown, place: Place) -> Shown:
     depth = view.depth_m
     if depth is not None:
         depth = cv2.copyMakeBorder(depth, *sides, cv2.BORDER_CONSTANT, value=BAR_M)
-    return Shown(rgb, depth)
+    return PageImage(rgb, depth)
 
 
-def split(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
-    """Return one picture to the left of a white line and the other to its right."""
+def split_pictures(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
+    """Return a picture with `before` to the left of a white line and `after` to its right.
+
+    Args:
+        before: [H, W, 3], uint8.
+        after: [H, W, 3], uint8.
+        share: The column of the line, as a share of the width.
+    """
     column = round(share * after.shape[1])
     picture = after.copy()
     picture[:, :column] = before[:, :column]
@@ -259,21 +302,26 @@ def split(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
     return picture
 
 
-def depth_of_page(depth_m: np.ndarray) -> np.ndarray:
-    """Return the depth that the page is sent: FAR_M at most, and where there is no surface."""
+def page_depth(depth_m: np.ndarray) -> np.ndarray:
+    """Return the depth that the page gets: no more than FAR_M, and FAR_M where no surface is."""
     return np.where(depth_m > 0, np.minimum(depth_m, FAR_M), FAR_M)
 
 
-# ---- What the page draws over them ---------------------------------------------------------------
+# ---- Overlays ------------------------------------------------------------------------------------
 
-# By a return's weather_code: unchanged, attenuated, scattered, lost, moved, precipitation.
+# The colour of a LiDAR return by its weather_code: unchanged, attenuated, scattered, lost, moved,
+# precipitation.
 _CODE_COLORS = np.array(
     [[0, 220, 255], [255, 220, 60], [255, 70, 70], [0, 0, 0], [255, 120, 255], [255, 255, 255]]
 )
 
 
 def box_lines(scene: Scene, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of the frame's labelled boxes in the scene's world, [N, 2, 3], and their colours."""
+    """Return the edges of a frame's labelled boxes and their colours.
+
+    Returns:
+        Ends of the edges, [N, 2, 3], in the scene's world; colours of the ends, [N, 2, 3].
+    """
     boxes = scene.boxes(frame.index)
     world_boxes = WorldBoxes.from_labels(boxes, np.asarray(scene.world_origin_m))
     lines = world_boxes.corners_m[world_boxes.is_usable][:, EDGES].reshape(-1, 2, 3)
@@ -285,8 +333,11 @@ def box_lines(scene: Scene, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 def lidar_points(
     scene: Scene, frame: Frame, recipe: Recipe
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The frame's returns as the recipe's weather leaves them, [N, 3] in the scene's world, and
-    colours by what it did to them; None where the frame has no sweep.
+    """Return a frame's LiDAR returns after the recipe's weather, and their colours.
+
+    Returns:
+        Points, [N, 3], in the scene's world; colours by weather_code, uint8 [N, 3]. None if the
+        frame has no sweep.
     """
     sweep = scene.lidar(frame.index)
     if sweep is None:

@@ -1,8 +1,8 @@
-"""The server behind the pages: one thread draws what each asks for last, first for those that move.
+"""The server of `climategs view`: it serves pages, and one thread draws for all of them.
 
-While a camera or a slider moves, pictures are small and rough, and only the latest wish counts; at
-rest the picture is the one that `climategs render` writes. A page that is slow to take pictures
-waits in its own connection, and a closed one is forgotten.
+The thread draws the latest request of each page; pages on which something moves come first. While
+a camera or a slider moves, pictures are small and rough. At rest the picture is the one that
+`climategs render` writes. A page that is slow to take pictures delays only its own connection.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ from tools.output import compiling_noted, print_note
 from tools.render import kernel_modules
 from tools.view.access import TOKEN_FIELD, Access, is_loopback, start_server
 from tools.view.browser import ARROWS_STAY_WITH_WIDGETS
-from tools.view.edits import Edits, free_path, renamed, save_recipe, without_weather
+from tools.view.edits import Edits, rename_recipe, save_recipe, unused_path, without_weather
 from tools.view.outputs import OutputViewer, find_output
-from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, Wish
+from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, ViewRequest
 from tools.view.pictures import (
-    Shown,
-    away_sentence,
-    coarse,
+    PageImage,
+    add_window_bars,
+    coarse_recipe,
+    distance_warning,
     draw,
-    in_window,
     lidar_points,
     place_in_window,
     recipe_to_show,
-    split,
+    split_pictures,
 )
 from tools.view.status import Activity, ShownPicture
 from tools.view.text import table
@@ -120,7 +120,7 @@ class Pages(Protocol):
     def stop(self) -> None: ...
 
     def open_page(self, client: ClientHandle) -> Callable[[str], None]:
-        """Open a page. Return the function that shows there what the server has refused."""
+        """Open a client's page. Return the function that shows on it what the server refused."""
         ...
 
     def close_page(self, client: ClientHandle) -> None: ...
@@ -146,16 +146,16 @@ def import_viser() -> Any:
 
 @contextlib.contextmanager
 def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
-    """Serve pages at an address within the block, which gets their URL with its token.
+    """Serve pages while the block runs. The block gets the pages' URL with its token.
 
     Args:
-        viser: The module.
-        viewer: What is served.
+        viser: The module viser.
+        viewer: The pages.
         host: An address of this machine.
-        port: Or the next that is free.
+        port: The port; the next free one is taken if it is in use.
 
     Raises:
-        ClimateGSError: the address is none of this machine's.
+        ClimateGSError: this machine does not have the address.
     """
     from tools.view.messages import MAX_MESSAGE_BYTES, PageConnection  # has viser's libraries
 
@@ -204,8 +204,9 @@ def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
 
 
 def _note_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Say in one line that a message of a page ended in an exception: viser casts the values of
-    widgets before anything checks them.
+    """Log in one line that a message of a page ended in an exception.
+
+    viser casts the values of widgets before anything checks them.
     """
     error = context.get("exception")
     if error is None:
@@ -239,7 +240,7 @@ class Viewer:
         self._activity: tuple[Page, Activity] | None = None
         self._thread = threading.Thread(target=self._run, name="pictures", daemon=True)
         self._end = threading.Event()
-        self._ticker = threading.Thread(target=self._tell, name="status", daemon=True)
+        self._ticker = threading.Thread(target=self._update_pages, name="status", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
@@ -254,19 +255,19 @@ class Viewer:
         self._ticker.join(JOIN_S)
 
     def activity_for(self, page: Page) -> Activity | None:
-        """Return what the thread does for a page, or is about to; None while it serves another."""
+        """Return the thread's work for a page; None while it works for another page."""
         current = self._activity
         if current is None:
             return Activity()
         return current[1] if current[0] is page else None
 
-    def _note(self, progress: PassProgress) -> None:
-        """Take note that the thread has got to a pass, or to a step of one."""
+    def _note_pass(self, progress: PassProgress) -> None:
+        """Store the pass, or the step of a pass, that the thread has reached."""
         if self._activity is not None:
             self._activity[1].progress = progress
 
-    def _tell(self) -> None:
-        """Have all pages say what is being done, again and again until the server ends."""
+    def _update_pages(self) -> None:
+        """Update the status lines of all pages every TICK_S seconds until the server ends."""
         while not self._end.wait(TICK_S):
             for page in tuple(self.pages):
                 page.update_status()
@@ -285,7 +286,7 @@ class Viewer:
             self.pages = [page for page in self.pages if not page.is_closed]
 
     def report(self, page: Page, error: Exception) -> None:
-        """Say on the page what went wrong; log the traceback of a defect."""
+        """Show an error on its page. Log the traceback if it is a defect of this program."""
         if page.is_closed:
             return
         if not isinstance(error, ClimateGSError | RecipeError):
@@ -299,7 +300,7 @@ class Viewer:
             self._serve_pages()
 
     def _count_compiling(self, change: int) -> None:
-        """Count a kernel that begins to be compiled (1), or that is compiled (-1)."""
+        """Count a compilation of a kernel. change: 1 when it begins, -1 when it ends."""
         if self._activity is not None:
             activity = self._activity[1]
             activity.compiling = max(0, activity.compiling + change)
@@ -308,10 +309,10 @@ class Viewer:
     def _serve_pages(self) -> None:
         while True:
             with self.changed:
-                page, work = self._next()
+                page, work = self._next_work()
                 while page is None and not self._is_ending:
                     self.changed.wait(work)
-                    page, work = self._next()
+                    page, work = self._next_work()
                 if self._is_ending:
                     return
                 # The others come first next time.
@@ -319,15 +320,18 @@ class Viewer:
             assert page is not None
             self._activity = (page, Activity())
             try:
-                self._work(page, work)
+                self._do_work(page, work)
             except Exception as error:
                 self.report(page, error)
             finally:
                 self._activity = None
 
-    def _next(self) -> tuple[Page | None, Any]:
-        """Return the page that has waited longest and its work; or None, and the seconds until
-        there is work (None: until something changes).
+    def _next_work(self) -> tuple[Page | None, Any]:
+        """Return the page to work for next.
+
+        Returns:
+            The page that has waited longest, and its work. If no page has work: None, and the
+            seconds until there is work, or None if work begins only after a change.
         """
         now = time.monotonic()
         pause = None
@@ -336,22 +340,24 @@ class Viewer:
                 return page, page.progress.tasks.popleft()
         for page in self.pages:
             progress = page.progress
-            is_moving = now - progress.last < REST_S or page.wish.is_playing
-            if progress.drawn_number < progress.wish_number and is_moving:
+            is_moving = now - progress.last_change_time < REST_S or page.request.is_playing
+            if progress.drawn_number < progress.request_number and is_moving:
                 return page, "moving"
         for page in self.pages:
             progress = page.progress
-            is_playing = page.wish.is_playing
-            if not is_playing and progress.rest_number == progress.wish_number:
+            is_playing = page.request.is_playing
+            if not is_playing and progress.rest_number == progress.request_number:
                 continue
-            wait_s = (progress.due if is_playing else progress.last + REST_S) - now
+            wait_s = (
+                progress.next_frame_time if is_playing else progress.last_change_time + REST_S
+            ) - now
             if wait_s <= 0:
                 return page, "advance" if is_playing else "rest"
             if wait_s < math.inf:
                 pause = wait_s if pause is None else min(pause, wait_s)
         return None, pause
 
-    def _work(self, page: Page, work: Any) -> None:
+    def _do_work(self, page: Page, work: Any) -> None:
         if callable(work):
             work()
             return
@@ -359,86 +365,102 @@ class Viewer:
             page.advance()
             return
         with self.changed:
-            wish = page.wish
-            wish_number = page.progress.wish_number
+            request = page.request
+            request_number = page.progress.request_number
         moving = work == "moving"
         progress = page.progress
-        progress.due = math.inf
+        progress.next_frame_time = math.inf
         due = time.monotonic() + PLAY_S
         try:
-            self._draw(page, wish, moving=moving)
-            progress.due = due
+            self._draw(page, request, moving=moving)
+            progress.next_frame_time = due
         except _Outdated:
             # A small picture comes first, however long the pass took.
-            progress.last = time.monotonic()
+            progress.last_change_time = time.monotonic()
         except Exception:
-            page.show_failure(wish)
+            page.show_failure(request)
             raise
         finally:  # what failed is not tried again before something changes
-            progress.drawn_number = wish_number
+            progress.drawn_number = request_number
             if not moving:
-                progress.rest_number = wish_number
+                progress.rest_number = request_number
 
     # ---- One picture -----------------------------------------------------------------------------
 
-    def _draw(self, page: Page, wish: Wish, *, moving: bool) -> None:
+    def _draw(self, page: Page, request: ViewRequest, *, moving: bool) -> None:
         refusal = None
         try:
-            recipe = page.recipe(wish.edits)
+            recipe = page.recipe(request.edits)
         except RecipeError as error:
             refusal = str(error)
-            recipe = page.good_recipe
+            recipe = page.last_valid_recipe
             if recipe is None:
                 raise
-        camera = page.camera_of(wish)
-        factor = self._factor(page, wish, recipe, camera)
+        camera = page.camera_of(request)
+        factor = self._factor(page, request, recipe, camera)
         if moving:
             factor *= page.progress.factor
         start_s = time.perf_counter()
-        with self._kernels(recipe):
-            view, pass_seconds = self._picture(page, wish, recipe, camera, factor, moving=moving)
+        with self._compile_new_kernels(recipe):
+            view, pass_seconds = self._picture(page, request, recipe, camera, factor, moving=moving)
             height, width = view.rgb.shape[:2]
-            if wish.pose is None:
+            if request.pose is None:
                 place = place_in_window(camera.resized(width, height), page.aspect)
-                view = in_window(view, place)
+                view = add_window_bars(view, place)
             draw_s = time.perf_counter() - start_s
             if page.is_closed:
                 return
             page.show_picture(view.rgb, view.depth_m, moving=moving)
             if moving:
-                page.progress.factor = _paced(page.progress.factor, draw_s)
+                page.progress.factor = _next_factor(page.progress.factor, draw_s)
             picture = ShownPicture(
-                wish=wish,
+                request=request,
                 width=width,
                 height=height,
                 seconds=draw_s,
-                at=time.monotonic(),
-                is_rest=not moving,
-                is_complete=not wish.lidar,
+                sent_at=time.monotonic(),
+                is_at_rest=not moving,
+                is_complete=not request.lidar,
                 is_valid=refusal is None,
             )
             page.show_progress(picture)
-            page.show_warning(away_sentence(self.scene, camera))
+            page.show_warning(distance_warning(self.scene, camera))
             page.show_error(refusal)
             if not moving:
-                self._finish(page, wish, recipe, camera, pass_seconds)
+                self._show_details(page, request, recipe, camera, pass_seconds)
                 page.show_progress(replace(picture, is_complete=True))
 
     def _picture(
-        self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, factor: float, *, moving: bool
-    ) -> tuple[Shown, dict[str, float]]:
+        self,
+        page: Page,
+        request: ViewRequest,
+        recipe: Recipe,
+        camera: Camera,
+        factor: float,
+        *,
+        moving: bool,
+    ) -> tuple[PageImage, dict[str, float]]:
         """Return the picture without bars, and the seconds of its passes by their names.
 
+        Args:
+            page: The page.
+            request: The page's request when the work began.
+            recipe: The request's recipe, or the last valid one.
+            camera: The camera, before the recipe's scale.
+            factor: The resolution relative to the recipe's.
+            moving: True while something moves.
+
         Raises:
-            _Outdated: at rest, before a pass: the page is closed or wishes for something else.
-                Within a preparation: the page is closed, or an effect has been taken out.
+            _Outdated: the picture is no longer needed. Before a pass at rest: the page is closed
+                or its request has changed. Within a preparation: the page is closed, or its
+                request lacks an effect of the recipe.
         """
 
-        def check_wish(progress: PassProgress) -> None:
-            self._note(progress)
+        def check_request(progress: PassProgress) -> None:
+            self._note_pass(progress)
             if page.is_closed:
                 raise _Outdated
-            if page.wish is wish:
+            if page.request is request:
                 return
             if progress.num_steps:  # most of what follows needs it, too: a depth that is dragged
                 if _lacks_effect_of(page, recipe):
@@ -446,27 +468,39 @@ class Viewer:
             elif not moving:
                 raise _Outdated
 
-        def draw_recipe(recipe: Recipe) -> Shown:
-            recipe = recipe_to_show(recipe, wish.shows, with_depth=wish.needs_depth, factor=factor)
+        def draw_recipe(recipe: Recipe) -> PageImage:
+            recipe = recipe_to_show(
+                recipe, request.shows, with_depth=request.needs_depth, factor=factor
+            )
             if moving:
-                recipe = coarse(recipe, wish.shows, with_depth=wish.needs_depth)
-            view = draw(self.scene, camera, recipe, wish.shows, backend=self.backend)
-            return view if wish.needs_depth else replace(view, depth_m=None)
+                recipe = coarse_recipe(recipe, request.shows, with_depth=request.needs_depth)
+            view = draw(self.scene, camera, recipe, request.shows, backend=self.backend)
+            return view if request.needs_depth else replace(view, depth_m=None)
 
         timer = contextlib.nullcontext({}) if moving else stopwatch()
-        with watched(check_wish), timer as pass_seconds:
+        with watched(check_request), timer as pass_seconds:
             view = draw_recipe(recipe)
-        if wish.is_split:
+        if request.is_split:
             clear = without_weather(recipe)
             size = view.rgb.shape
-            key = (wish.frame, wish.camera, wish.pose, wish.shows, size, moving, clear.render)
-            if page.before is None or page.before[0] != key:
-                with watched(check_wish):
-                    page.before = (key, draw_recipe(clear).rgb)
-            view = Shown(split(page.before[1], view.rgb, wish.share), view.depth_m)
+            key = (
+                request.frame,
+                request.camera,
+                request.pose,
+                request.shows,
+                size,
+                moving,
+                clear.render,
+            )
+            if page.clear_picture is None or page.clear_picture[0] != key:
+                with watched(check_request):
+                    page.clear_picture = (key, draw_recipe(clear).rgb)
+            view = PageImage(
+                split_pictures(page.clear_picture[1], view.rgb, request.share), view.depth_m
+            )
         return view, pass_seconds
 
-    def _factor(self, page: Page, wish: Wish, recipe: Recipe, camera: Camera) -> float:
+    def _factor(self, page: Page, request: ViewRequest, recipe: Recipe, camera: Camera) -> float:
         """Return the resolution that the window needs, relative to the recipe's: 1 or less.
 
         Raises:
@@ -475,34 +509,39 @@ class Viewer:
         scale = recipe.render.scale
         width = camera.width
         height = camera.height
-        if wish.pose is None:
+        if request.pose is None:
             width, height = place_in_window(camera, page.aspect).size
-        if wish.every_pixel:
+        if request.every_pixel:
             check_size(width * scale, height * scale)
             return 1.0
         fitting = math.sqrt(MAX_PIXELS / (width * height)) / scale
         return min(1.0, page.window_height / (height * scale), fitting)
 
-    def _finish(
-        self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, pass_seconds: dict[str, float]
+    def _show_details(
+        self,
+        page: Page,
+        request: ViewRequest,
+        recipe: Recipe,
+        camera: Camera,
+        pass_seconds: dict[str, float],
     ) -> None:
-        """Show what follows a picture at rest: overlays, the plan and the command line."""
+        """Show all that follows a picture at rest: overlays, the plan and the command line."""
         points = None
-        if wish.lidar:
-            self._note(PassProgress("LiDAR returns"))
-            points = lidar_points(self.scene, page.frame_of(wish), recipe)
-        viewpoint = wish.frustums and (wish.camera if wish.pose is None else "flight")
-        key = (wish.frame, wish.boxes, viewpoint, wish.lidar and recipe)
-        if page.overlaid != key:
-            page.show_overlays(wish, points)
-            page.overlaid = key
+        if request.lidar:
+            self._note_pass(PassProgress("LiDAR returns"))
+            points = lidar_points(self.scene, page.frame_of(request), recipe)
+        viewpoint = request.frustums and (request.camera if request.pose is None else "flight")
+        key = (request.frame, request.boxes, viewpoint, request.lidar and recipe)
+        if page.overlay_key != key:
+            page.show_overlays(request, points)
+            page.overlay_key = key
         steps = plan_view(make_plan(recipe, self.scene), self.scene, camera).steps
         rows = [(step.name, _milliseconds(pass_seconds.get(step.name)), step.why) for step in steps]
         page.show_plan(table(("pass", "ms", "why, or why not"), rows, [s.runs for s in steps]))
-        page.show_command(self._command(page, wish))
+        page.show_command(self._command(page, request))
 
     @contextlib.contextmanager
-    def _kernels(self, recipe: Recipe) -> Iterator[None]:
+    def _compile_new_kernels(self, recipe: Recipe) -> Iterator[None]:
         """Compile the kernels of new effects on all cores, while the block runs."""
         if not self._is_new(recipe):
             yield
@@ -516,18 +555,18 @@ class Viewer:
     def _is_new(self, recipe: Recipe) -> bool:
         return tuple(recipe.sections()) not in self._compiled_sections
 
-    # ---- What pages have done --------------------------------------------------------------------
+    # ---- Tasks of pages --------------------------------------------------------------------------
 
     def measure_tiers(self, page: Page) -> None:
         """Show the time of the view at rest in each tier, and its difference from the reference."""
-        wish = page.wish
-        camera = page.camera_of(wish)
-        scale = page.recipe(wish.edits).render.scale
+        request = page.request
+        camera = page.camera_of(request)
+        scale = page.recipe(request.edits).render.scale
         check_size(camera.width * scale, camera.height * scale)
         pictures: dict[str, tuple[float, np.ndarray]] = {}
         for tier in (*TIERS, "reference"):
-            recipe = wish.edits.with_tier(tier).recipe()
-            recipe = recipe_to_show(recipe, wish.shows, with_depth=False, factor=1.0)
+            recipe = request.edits.with_tier(tier).recipe()
+            recipe = recipe_to_show(recipe, request.shows, with_depth=False, factor=1.0)
             rgb = render_view(self.scene, camera, recipe, backend=self.backend).rgb
             times = []  # without what is prepared once
             for _ in range(2):
@@ -545,32 +584,42 @@ class Viewer:
         page.show_tiers(table(("tier", "size", "ms", "mean difference, of 255"), rows))
 
     def save(self, page: Page, name: str, *, with_picture: bool) -> None:
-        """Save the recipe; with it the picture, if asked for, and the camera of a flight."""
-        wish = page.wish
-        recipe = renamed(page.recipe(wish.edits), name)
+        """Save the recipe of a page, and in a flight also its camera, below the output folder.
+
+        Args:
+            page: The page.
+            name: The name of the recipe and of its files.
+            with_picture: True if the picture is saved, too.
+
+        Raises:
+            RecipeError: a recipe cannot have the name, or the edits make no valid recipe.
+            ClimateGSError: the picture is too large, or the folder cannot be written.
+        """
+        request = page.request
+        recipe = rename_recipe(page.recipe(request.edits), name)
         if with_picture:
-            camera = page.camera_of(wish)
+            camera = page.camera_of(request)
             scale = recipe.render.scale
             check_size(camera.width * scale, camera.height * scale)
         endings = (".yaml", ".camera.json", f".{recipe.output.image}")
         path = None
         while path is None:
-            path = free_path(self.out, name, *endings)
+            path = unused_path(self.out, name, *endings)
             try:
                 save_recipe(recipe, path.with_name(path.name + ".yaml"))
             except FileExistsError:  # since we looked
                 path = None
         file_names = [path.name + ".yaml"]
-        camera = page.recorded_camera(wish)
-        view_words = self._where(wish, camera_path=None)
-        if wish.pose is not None:
+        camera = page.recorded_camera(request)
+        view_words = self._view_words(request, camera_path=None)
+        if request.pose is not None:
             camera_path = path.with_name(path.name + ".camera.json")
-            self._write_path(page.camera_of(wish), camera_path)
+            self._write_path(page.camera_of(request), camera_path)
             # As the file says it, to the bit.
             (frame,) = frames_from_path_file(camera_path, self.scene)
             camera = frame.cameras[camera.name]
             file_names.append(camera_path.name)
-            view_words = self._where(wish, camera_path=camera_path)
+            view_words = self._view_words(request, camera_path=camera_path)
         if with_picture:
             view = render_view(self.scene, camera, recipe, backend=self.backend)
             picture = path.with_name(f"{path.name}.{recipe.output.image}")
@@ -597,22 +646,32 @@ class Viewer:
         }
         write_new_file(path, (json.dumps({**sizes, "frames": [frame]}, indent=1) + "\n").encode())
 
-    def _where(self, wish: Wish, camera_path: Path | None) -> str:
-        """Return the scene and the view in words of the command line."""
+    def _view_words(self, request: ViewRequest, camera_path: Path | None) -> str:
+        """Return the options of a command line for a request's scene and view.
+
+        Args:
+            request: The request.
+            camera_path: The file of a flight's camera; None for the recorded camera.
+        """
         scene = f"--scene {shlex.quote(self.uri)}"
         if camera_path is not None:
             return f"{scene} --camera-path {shlex.quote(str(camera_path))}"
         return (
-            f"{scene} --frames {self.frames[wish.frame].index} --cameras {shlex.quote(wish.camera)}"
+            f"{scene} --frames {self.frames[request.frame].index} "
+            f"--cameras {shlex.quote(request.camera)}"
         )
 
-    def _command(self, page: Page, wish: Wish) -> str:
-        """Return the command line of the view as it is; a note where files must be saved first."""
-        files = any(path.endswith(("image", "mask", "checkpoint")) for path in wish.edits.values)
-        if files or wish.pose is not None:
-            what = "a flight" if wish.pose is not None else "an uploaded file"
+    def _command(self, page: Page, request: ViewRequest) -> str:
+        """Return the command line that renders a request's view.
+
+        A flight and uploaded files have no command line before the recipe is saved. They get a
+        note instead.
+        """
+        files = any(path.endswith(("image", "mask", "checkpoint")) for path in request.edits.values)
+        if files or request.pose is not None:
+            what = "a flight" if request.pose is not None else "an uploaded file"
             return f"# {what}: save the recipe first, and the command will stand here"
-        return wish.edits.command(f"{self._where(wish, None)} --out out/view")
+        return request.edits.command(f"{self._view_words(request, None)} --out out/view")
 
 
 def check_size(width: float, height: float) -> None:
@@ -631,8 +690,10 @@ def check_size(width: float, height: float) -> None:
 
 @contextlib.contextmanager
 def _compilations_counted(count: Callable[[int], None]) -> Iterator[None]:
-    """Call a function when numba begins (1) and ends (-1) to compile a kernel; not for kernels that
-    lie in its cache.
+    """Count compilations of numba while the block runs, without kernels that numba has cached.
+
+    Args:
+        count: A function that is called with 1 when a compilation begins and with -1 when it ends.
     """
     from numba.core.event import Event, Listener, install_listener
 
@@ -648,20 +709,25 @@ def _compilations_counted(count: Callable[[int], None]) -> Iterator[None]:
 
 
 class _Outdated(Exception):
-    """Nobody waits for the picture any more."""
+    """Raised when the picture in work is no longer needed."""
 
 
 def _lacks_effect_of(page: Page, recipe: Recipe) -> bool:
-    """Return True if the page asks for a recipe without an effect that another one has."""
+    """Return True if the page now asks for a recipe that lacks an effect of `recipe`."""
     try:
-        page_recipe = page.recipe(page.wish.edits)
+        page_recipe = page.recipe(page.request.edits)
     except RecipeError:
         return False
     return not recipe.sections().keys() <= page_recipe.sections().keys()
 
 
-def _paced(factor: float, seconds: float) -> float:
-    """Return the resolution of the next picture while something moves, relative to the recipe's."""
+def _next_factor(factor: float, seconds: float) -> float:
+    """Return the share of the full resolution for the next picture while something moves.
+
+    Args:
+        factor: The share of the last picture.
+        seconds: The time that the last picture took.
+    """
     if seconds > FRAME_S:
         factor *= max(0.7, FRAME_S / seconds)
     elif seconds < FRAME_S / 2:

@@ -1,6 +1,6 @@
-"""The status line of a page: its picture, the work for the next one, and how far that has got.
+"""The status line of a page: its picture, the work for the next one, and its progress.
 
-"At rest" is said of nothing but the whole picture of what the page asks for now.
+The line says "at rest" only if the picture is complete and shows what the page requests now.
 """
 
 from __future__ import annotations
@@ -11,46 +11,46 @@ from typing import TYPE_CHECKING
 from augment.timing import PassProgress
 
 if TYPE_CHECKING:
-    from tools.view.page import Wish
+    from tools.view.page import ViewRequest
 
 MOVING_S = 0.4  # The time for which the status line speaks of a moving picture, seconds.
 BUSY_S = 0.5  # The shortest wait that gets a bar, seconds.
-# The passes that draw nothing yet: effects find out there what they put into the scene.
-_PREPARATIONS = ("plan", "view plan", "parts", "prune")
+# The passes that draw nothing yet. Effects compute there what they put into the scene.
+_PREPARATIONS = ("plan", "view plan", "collect parts", "prune")
 
 
 @dataclass(frozen=True)
 class ShownPicture:
-    """The picture that a page has got last."""
+    """The last picture that was sent to a page."""
 
-    wish: Wish
-    """The wish of the page that it was drawn for."""
+    request: ViewRequest
+    """The request of the page that it was drawn for."""
     width: int
-    """Its columns, without bars."""
+    """The number of columns, without bars."""
     height: int
-    """Its rows, without bars."""
+    """The number of rows, without bars."""
     seconds: float
-    """The time that it took, seconds."""
-    at: float
-    """When it was sent, on the monotonic clock."""
-    is_rest: bool
-    """Whether it is the whole picture, and not a rough one while something moves."""
+    """The time of drawing, seconds."""
+    sent_at: float
+    """The time when it was sent, on the monotonic clock, seconds."""
+    is_at_rest: bool
+    """True if it has full quality; False for a rough one while something moves."""
     is_complete: bool = True
-    """Whether what lies over the picture is there, too."""
+    """True if the overlays of the picture were sent, too."""
     is_valid: bool = True
-    """Whether the wish's recipe is valid; else the picture is of the last one that was."""
+    """True if the request's recipe is valid; else the picture shows the last valid recipe."""
 
 
 @dataclass
 class Activity:
-    """The work at hand of the thread that draws. It writes, other threads read."""
+    """The current work of the thread that draws. Only that thread writes it; others read."""
 
     progress: PassProgress | None = None
     """The pass that runs; None before the first."""
     compiling: int = 0
-    """Kernels that are being compiled."""
+    """The number of kernels that are being compiled."""
     compiled: int = 0
-    """Kernels that have been compiled for this picture."""
+    """The number of kernels that were compiled for this picture."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +60,19 @@ class Status:
     text: str
     """One sentence."""
     is_current: bool
-    """Whether the picture is of what the page asks for."""
+    """True if the picture shows what the page requests."""
     share: float | None = None
-    """How much of a preparation is done, 0 to 1; None where that is not known."""
+    """The finished share of a preparation, 0 to 1; None if it is not known."""
     is_long: bool = False
-    """Whether it takes long enough for a bar."""
+    """True if the work takes long enough for a progress bar."""
 
 
 def describe_activity(activity: Activity | None) -> str:
-    """Return the thread's work in words. activity: None while it draws for another page."""
+    """Return the thread's work in words.
+
+    Args:
+        activity: The work for this page; None while the thread draws for another page.
+    """
     if activity is None:
         return "waiting for the picture of another page"
     progress = activity.progress
@@ -84,7 +88,7 @@ def describe_activity(activity: Activity | None) -> str:
 
 def page_status(
     picture: ShownPicture | None,
-    wish: Wish,
+    request: ViewRequest,
     activity: Activity | None,
     *,
     waited_s: float,
@@ -95,21 +99,21 @@ def page_status(
 
     Args:
         picture: The last picture; None before the first.
-        wish: What the page asks for.
-        activity: What the thread does for this page; None while it draws for another.
-        waited_s: Seconds since the wish.
-        now: On the monotonic clock.
-        has_failed: Whether the wish could not be drawn.
+        request: The view that the page asks for.
+        activity: The work of the thread for this page; None while it draws for another page.
+        waited_s: Seconds since the request.
+        now: The time on the monotonic clock, seconds.
+        has_failed: True if the request could not be drawn.
     """
     if has_failed:
         return Status("Not drawn", False)
-    is_current = picture is not None and picture.wish is wish
+    is_current = picture is not None and picture.request is request
     if picture is not None:
         size = f"{picture.width} x {picture.height}"
-        if is_current and picture.is_rest and picture.is_complete:
+        if is_current and picture.is_at_rest and picture.is_complete:
             recipe = "" if picture.is_valid else "; of the last recipe that was valid"
             return Status(f"{size} at rest, {1000 * picture.seconds:.0f} ms{recipe}", True)
-        if not picture.is_rest and now - picture.at < MOVING_S:
+        if not picture.is_at_rest and now - picture.sent_at < MOVING_S:
             return Status(f"{size} while moving, {1000 * picture.seconds:.0f} ms", is_current)
     work = describe_activity(activity)
     if waited_s >= 1:
@@ -118,20 +122,20 @@ def page_status(
     if activity is not None and activity.progress is not None and not activity.compiling:
         total = activity.progress.num_steps
         share = activity.progress.num_done / total if total else None
-    text = f"{_what_is_shown(picture, wish)}: {work}"
+    text = f"{_describe_picture(picture, request)}: {work}"
     return Status(text, is_current, share, waited_s >= BUSY_S)
 
 
-def _what_is_shown(picture: ShownPicture | None, wish: Wish) -> str:
-    """Return in words how the picture differs from the wish."""
+def _describe_picture(picture: ShownPicture | None, request: ViewRequest) -> str:
+    """Return in words how the picture differs from the request."""
     if picture is None:
         return "First picture"
-    if picture.wish is wish:
-        follows = "what lies over it" if picture.is_rest else "the whole one"
-        return f"{'Picture' if picture.is_rest else 'Rough picture'}, {follows} follows"
-    if picture.wish.edits != wish.edits:
+    if picture.request is request:
+        follows = "what lies over it" if picture.is_at_rest else "the whole one"
+        return f"{'Picture' if picture.is_at_rest else 'Rough picture'}, {follows} follows"
+    if picture.request.edits != request.edits:
         return "Picture not of this recipe yet"
-    views = ((w.frame, w.camera, w.pose) for w in (picture.wish, wish))
+    views = ((w.frame, w.camera, w.pose) for w in (picture.request, request))
     if len(set(views)) > 1:
         return "Picture not of this view yet"
     return "Picture not up to date yet"

@@ -1,4 +1,4 @@
-"""Text for a page: every foreign text passes through here before a widget shows it.
+"""Texts for a page. Every text from outside is made safe here before a widget shows it.
 
 viser compiles the content of its Markdown widgets as MDX, in which braces hold JavaScript, and puts
 the content of its HTML widgets into the page as it is. So pages use no Markdown, and HTML is made
@@ -12,7 +12,7 @@ import html
 import unicodedata
 from collections.abc import Iterable, Sequence
 
-# The longest text on a page, characters: a page is not there to read a file of megabytes.
+# The longest text on a page, characters. A page is no reader for files of megabytes.
 MAX_LENGTH = 20_000
 # The CSS of all texts.
 STYLE = "font-size:0.875em;overflow-wrap:anywhere;padding:0 0.7em"
@@ -35,11 +35,11 @@ def escaped(text: object) -> str:
 
 
 def paragraph(text: object, *, style: str = "", bold: bool = False) -> str:
-    """HTML of a paragraph that shows a text letter for letter.
+    """Return HTML of a paragraph that shows a text letter for letter.
 
     Args:
         text: Any text.
-        style: More CSS, of our own.
+        style: Further CSS; it must not come from outside.
         bold: If True, the text is bold.
     """
     inner = f"<b>{escaped(text)}</b>" if bold else escaped(text)
@@ -49,7 +49,7 @@ def paragraph(text: object, *, style: str = "", bold: bool = False) -> str:
 def table(
     head: Sequence[object], rows: Iterable[Sequence[object]], bold: Sequence[bool] = ()
 ) -> str:
-    """HTML of a table that shows its texts letter for letter.
+    """Return HTML of a table that shows its texts letter for letter.
 
     Args:
         head: Titles of the columns.

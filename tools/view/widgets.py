@@ -1,4 +1,4 @@
-"""Values of widgets, checked, since a page may send any; and texts of options for any values."""
+"""Checked values of widgets, since a page may send any value; and texts of a dropdown's options."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from tools.view.text import printable
 
 
 def value_of(widget: Any, sent: Any) -> Any:
-    """Return what a page has sent as a value that the widget can have.
+    """Return the value that a page has sent, in the type of the widget's value.
 
     Args:
-        widget: viser's handle of it.
-        sent: A truth value, number, text, or a tuple of numbers.
+        widget: viser's handle of the widget.
+        sent: A bool, number, text, or a tuple of numbers.
 
     Raises:
-        ClimateGSError: it is of another kind, none of the widget's options, or beyond its ends.
+        ClimateGSError: the value has another type, is no option of the widget, or is out of range.
     """
     value = _cast(sent, widget.value)
     options = getattr(widget, "options", None)
@@ -41,7 +41,7 @@ def value_of(widget: Any, sent: Any) -> Any:
 
 
 def _cast(sent: Any, now: Any) -> Any:
-    """Return the value in the kind that the widget has now; None where it is of another."""
+    """Return the value in the type of the widget's current value; None if it has another type."""
     if isinstance(now, bool | str):
         return sent if type(sent) is type(now) else None
     if isinstance(now, int | float):
@@ -54,7 +54,7 @@ def _cast(sent: Any, now: Any) -> Any:
 
 
 def _ends(end: Any, numbers: tuple[Any, ...]) -> tuple[Any, ...]:
-    """One end for each of the numbers."""
+    """Return one end of the range for each of the numbers; None where there is no end."""
     if not isinstance(end, tuple):
         return (end,) * len(numbers)
     return (*end, *(None,) * len(numbers))[: len(numbers)]

@@ -124,7 +124,7 @@ def glow_of(scene: Scene) -> Glow:
         slope = 1.5 * (light[:, :, None] * directions[:, None]).mean(0)
         return Glow(light[is_above & (z < _HORIZON_SINE)].mean(0), light.mean(0), slope)
 
-    return memo_of(scene).get(("light of what falls",), compute)
+    return memo_of(scene).get(("light of precipitation",), compute)
 
 
 def _in_fog(glow: Glow, fog: Fog | None, eye_z_m: float, extinction_per_m: float) -> Glow:
@@ -164,15 +164,15 @@ class CellWalk(NamedTuple):
     lens: np.ndarray
 
 
-def max_depths_m(falling: Precipitation, camera: Camera) -> np.ndarray:
+def max_depths_m(precipitation: Precipitation, camera: Camera) -> np.ndarray:
     """Return the depth up to which each class is drawn [B].
 
     There a drop is `min_width_px` wide. The depth is smaller if more than MAX_DROPS would be drawn,
     and 0 if no drop of the class is drawn.
     """
-    sizes = falling.sizes
+    sizes = precipitation.sizes
     focal = math.sqrt(camera.fx * camera.fy)
-    farthest = sizes.diameters_m * focal / falling.min_width_px
+    farthest = sizes.diameters_m * focal / precipitation.min_width_px
     volume_factor = (
         camera.width * camera.height / (3 * camera.fx * camera.fy)
     )  # of a pyramid, over depth^3
@@ -181,22 +181,24 @@ def max_depths_m(falling: Precipitation, camera: Camera) -> np.ndarray:
     return np.where(farthest > NEAR_M, farthest, 0.0)
 
 
-def cell_walk(falling: Precipitation, camera: Camera, motion: Motion, scene: str) -> CellWalk:
+def cell_walk(precipitation: Precipitation, camera: Camera, motion: Motion, scene: str) -> CellWalk:
     """Return the cells that the camera's view crosses, and their drops' motion."""
-    sizes = falling.sizes
-    farthest = max_depths_m(falling, camera)
-    half_s = falling.exposure_s / 2
+    sizes = precipitation.sizes
+    farthest = max_depths_m(precipitation, camera)
+    half_s = precipitation.exposure_s / 2
     seconds = camera.timestamp_ns * 1e-9
     times = seconds + np.array([-half_s, 0.0, half_s])
     velocity = np.zeros((len(farthest), 3))
-    velocity[:, :2] = falling.wind_mps
+    velocity[:, :2] = precipitation.wind_mps
     velocity[:, 2] = -sizes.speeds_mps
     moves = velocity[:, None] * times[:, None]  # [B, 3, 3]
     poses = np.stack([motion.pose_after(camera, s) for s in (-half_s, half_s)])
     cells_m = sizes.cells_m
     speeds = np.linalg.norm(velocity - motion.velocity_mps, axis=1)
     speeds += np.linalg.norm(motion.turn_radps) * farthest
-    spread_m = half_s * speeds + sizes.quantiles_m[:, -1] / 2 + SWAY_REACH_S * falling.sway_mps
+    spread_m = (
+        half_s * speeds + sizes.quantiles_m[:, -1] / 2 + SWAY_REACH_S * precipitation.sway_mps
+    )
     spread_m += APERTURE_M / 2 * np.maximum(1, farthest / FOCUS_M)
     spread_m += kernels.LEAST_RADIUS / math.sqrt(camera.fx * camera.fy) * farthest
     reach = cells_m * math.sqrt(0.75) + spread_m
@@ -215,7 +217,7 @@ def cell_walk(falling: Precipitation, camera: Camera, motion: Motion, scene: str
     planes = np.concatenate([normals @ pose[:3, :3], normals @ pose[:3, 3:]], 1)
     planes[4, 3] -= NEAR_M
     slabs, columns = _columns_of(camera, cells_m, reach, farthest, moves[:, 1])
-    rng = rng_for(seed=falling.seed, scene=scene, effect=f"{falling.kind} in the air")
+    rng = rng_for(seed=precipitation.seed, scene=scene, effect=f"{precipitation.kind} in the air")
     lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     return CellWalk(
         slabs,
@@ -223,7 +225,7 @@ def cell_walk(falling: Precipitation, camera: Camera, motion: Motion, scene: str
         np.stack([cells_m, reach, farthest, spread_m], 1),
         rng.integers(0, 2**64, len(farthest), np.uint64),
         moves,
-        _sways(falling.sway_mps, seconds),
+        _sways(precipitation.sway_mps, seconds),
         sizes.quantiles_m,
         cell_counts(),
         planes,
@@ -332,18 +334,22 @@ class Veil(NamedTuple):
     glow: np.ndarray
 
 
-def veil_of(falling: Precipitation, camera: Camera, glow: Glow) -> Veil:
+def veil_of(precipitation: Precipitation, camera: Camera, glow: Glow) -> Veil:
     """Return the veil: extinction of the drops that are not drawn, and its light."""
-    extinctions = falling.sizes.extinctions_per_m
-    full_depths = max_depths_m(falling, camera)
+    extinctions = precipitation.sizes.extinctions_per_m
+    full_depths = max_depths_m(precipitation, camera)
     begin = kernels.FADE * full_depths
     grows = full_depths - begin
     half_inverse = np.divide(0.5, grows, out=np.zeros_like(grows), where=grows > 0)
     world = camera.world_from_camera[:3, :3].numpy()
-    from_behind = _DROP_LIGHT_FROM_BEHIND if falling.kind == "rain" else _FLAKE_LIGHT_FROM_BEHIND
-    airlight = glow.airlight if falling.color is None else np.asarray(falling.color) ** 2
+    from_behind = (
+        _DROP_LIGHT_FROM_BEHIND if precipitation.kind == "rain" else _FLAKE_LIGHT_FROM_BEHIND
+    )
+    airlight = (
+        glow.airlight if precipitation.color is None else np.asarray(precipitation.color) ** 2
+    )
     mean = glow.mean
-    if falling.kind == "snow":
+    if precipitation.kind == "snow":
         mean = mean + _SCATTERED_SHARE * (airlight - mean)
     numbers = (
         (1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy),
@@ -361,7 +367,7 @@ def draw_falling(
     alpha: Float[Tensor, "H W"],
     depth: Float[Tensor, "H W"],
     camera: Camera,
-    falling: Precipitation,
+    precipitation: Precipitation,
     *,
     scene: Scene,
     fog: Fog | None = None,
@@ -378,7 +384,7 @@ def draw_falling(
         alpha: opacity of the surfaces.
         depth: z of the surfaces, metres; 0 without a surface.
         camera: camera of the picture.
-        falling: the precipitation.
+        precipitation: the rain or snow in the air.
         scene: the scene whose light the drops have.
         fog: the fog in the air.
         motion: motion of the camera.
@@ -387,10 +393,10 @@ def draw_falling(
             augment.effects.falling.reference within 1e-4, and `rgb` is overwritten.
     """
     surfaces = [t.detach().float().cpu().numpy() for t in (alpha, depth)]
-    drops = find_drops(cell_walk(falling, camera, motion, scene.name))
-    extinction = falling.sizes.extinction_per_m
+    drops = find_drops(cell_walk(precipitation, camera, motion, scene.name))
+    extinction = precipitation.sizes.extinction_per_m
     glow = _in_fog(glow_of(scene), fog, float(camera.centre[2]), extinction)
-    veil = veil_of(falling, camera, glow)
+    veil = veil_of(precipitation, camera, glow)
     if choose_kernels(backend, rgb, alpha, depth) != CPU:
         from augment.effects.falling.reference import blend_by_torch
 

@@ -56,18 +56,18 @@ class FallingEffect(Effect):
         return False
 
     def kernel_key(self, section: Rain | Snowfall) -> Any:
-        return section.changes or None
+        return section.has_effect or None
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:
         section: Rain | Snowfall | None = self.section_of(recipe)
-        if section is None or not section.changes:
+        if section is None or not section.has_effect:
             why = f"the recipe has no {self.name}"
             if section is not None:
                 why = f"{self.section}.rate_mm_h is 0"
             return EffectPlan(None, skipped((self.step,), why, PICTURE))
-        falling = Precipitation(
+        precipitation = Precipitation(
             self.kind,
             section.rate_mm_h,
             wind_velocity_mps(section.wind_mps, section.wind_from_deg),
@@ -77,7 +77,7 @@ class FallingEffect(Effect):
             section.min_width_px,
             section.color,
         )
-        return _plan_of(falling, self.step, scene)
+        return _plan_of(precipitation, self.step, scene)
 
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         assert self.mask_name is not None
@@ -127,18 +127,19 @@ def wind_velocity_mps(speed_mps: float, from_deg: float) -> tuple[float, float]:
     return -speed_mps * math.cos(angle), -speed_mps * math.sin(angle)
 
 
-def _plan_of(falling: Precipitation, step: str, scene: Scene) -> EffectPlan:
+def _plan_of(precipitation: Precipitation, step: str, scene: Scene) -> EffectPlan:
     """Return the plan. Raise SceneError if the exposure is longer than the frame interval."""
     interval = frame_interval_s(scene)
-    if interval is not None and falling.exposure_s >= interval:
+    if interval is not None and precipitation.exposure_s >= interval:
         raise SceneError(
-            f"camera.exposure_ms = {falling.exposure_s * 1000:g} is not below the "
+            f"camera.exposure_ms = {precipitation.exposure_s * 1000:g} is not below the "
             f"{interval * 1000:.4g} ms between two images of a camera of scene {scene.name!r} "
             f"({scene.source}); set a shorter exposure"
         )
     why = (
-        f"{falling.rate_mm_h:g} mm/h: extinction {1000 * falling.sizes.extinction_per_m:.3g}/km, "
-        f"shutter open for {falling.exposure_s * 1000:g} ms"
+        f"{precipitation.rate_mm_h:g} mm/h: "
+        f"extinction {1000 * precipitation.sizes.extinction_per_m:.3g}/km, "
+        f"shutter open for {precipitation.exposure_s * 1000:g} ms"
     )
     if interval is None:
         why += "; the cameras' speed is not known, so they stand"
@@ -147,7 +148,7 @@ def _plan_of(falling: Precipitation, step: str, scene: Scene) -> EffectPlan:
     if not scene.has_known_gravity:
         why += "; it falls along -z, which is not known to point down"
     return EffectPlan(
-        falling, (Step(step, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH})
+        precipitation, (Step(step, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH})
     )
 
 

@@ -328,12 +328,12 @@ def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, cle
         drop = drops[listed[position]]
         u0 = drop[0]
         v0 = drop[1]
-        near = drop[4]
+        first_per_z = drop[4]
         outside = drop[7]
         share = drop[8]
         du = drop[2] - u0
         dv = drop[3] - v0
-        farther = drop[5] - near
+        per_z_change = drop[5] - first_per_z
         per_length = unit / max(du * du + dv * dv, np.float32(1e-12))
         beyond = outside * outside
         ramp = share / (beyond - drop[6] * drop[6])
@@ -366,9 +366,11 @@ def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, cle
                 covered = v8.minimum(v8.maximum(covered, zeros), v8.broadcast(share))
                 pixel = Index(row * width + at)
                 surface = v8.load(depth, pixel)
-                per_z = v8.fmuladd(along, v8.broadcast(farther), v8.broadcast(near))
-                behind = (ones - surface * per_z) * soft
-                hidden_share = v8.load(alpha, pixel) * v8.minimum(v8.maximum(behind, zeros), ones)
+                per_z = v8.fmuladd(along, v8.broadcast(per_z_change), v8.broadcast(first_per_z))
+                hidden_weight = (ones - surface * per_z) * soft
+                hidden_share = v8.load(alpha, pixel) * v8.minimum(
+                    v8.maximum(hidden_weight, zeros), ones
+                )
                 hidden_share = v8.select(v8.greater(surface, zeros), hidden_share, zeros)
                 covered = covered * (ones - hidden_share)
                 if at < j:
@@ -380,7 +382,7 @@ def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, cle
 
 @kernel
 def cover_pixels(drops, listed, begins, alpha, depth, clear):
-    """Write the share of each pixel that no drop covers into clear [H, W], where W >= LANES.
+    """Write the share of each pixel that no drop covers into clear [H, W], where W >= NUM_LANES.
 
     Args:
         drops: result of find_drops; they count in their order.
@@ -496,14 +498,14 @@ def _veil(color, splats, is_mixed, edge, light, opacity, surface_transmittance, 
     veiled = air + (sky + opacity * (surface_transmittance - sky)) * (color * color - air)
     if is_mixed:
         sky_share = v8.broadcast(np.float32(1)) - opacity
-        behind = v8.minimum(v8.maximum(color - splats, zeros), sky_share)
-        ahead = (color - behind) / v8.maximum(opacity, v8.broadcast(np.float32(EDGE)))
-        behind = behind / v8.maximum(sky_share, v8.broadcast(np.float32(EDGE)))
-        ahead = opacity * v8.sqrt(
-            v8.maximum(air + surface_transmittance * (ahead * ahead - air), zeros)
+        sky_part = v8.minimum(v8.maximum(color - splats, zeros), sky_share)
+        surface_part = (color - sky_part) / v8.maximum(opacity, v8.broadcast(np.float32(EDGE)))
+        sky_part = sky_part / v8.maximum(sky_share, v8.broadcast(np.float32(EDGE)))
+        surface_part = opacity * v8.sqrt(
+            v8.maximum(air + surface_transmittance * (surface_part * surface_part - air), zeros)
         )
-        behind = sky_share * v8.sqrt(v8.maximum(air + sky * (behind * behind - air), zeros))
-        veiled = v8.select(edge, (ahead + behind) * (ahead + behind), veiled)
+        sky_part = sky_share * v8.sqrt(v8.maximum(air + sky * (sky_part * sky_part - air), zeros))
+        veiled = v8.select(edge, (surface_part + sky_part) * (surface_part + sky_part), veiled)
     return veiled
 
 
@@ -539,14 +541,14 @@ def _blend_row(
     """Blend a row of blend_falling. clear: from index `first` on. partial, pixels: scratch."""
     zeros = v8.broadcast(np.float32(0))
     half = np.float32(0.5)
-    least = np.float32(1e-6)
+    min_climb = np.float32(1e-6)
     count, slope, offset = _classes_in_row(nearest, bands, partial)
     v = (np.float32(row) + half - rays[3]) * rays[1]
     flat = v8.broadcast(np.float32(1) + v * v)
     level = climb[1] * v + climb[2]
     left = (half - rays[2]) * rays[0]
     right = (np.float32(width) - rays[2]) * rays[0]
-    shows_sky = max(climb[0] * left, climb[0] * right) + level > least
+    shows_sky = max(climb[0] * left, climb[0] * right) + level > min_climb
     for j in range(0, width, NUM_LANES):
         # The last eight pixels of a row include earlier ones, which are not written.
         at = min(j, width - NUM_LANES)
@@ -566,7 +568,9 @@ def _blend_row(
         sky = zeros
         if shows_sky:  # below the horizon nothing is visible through so much veil
             steep = v8.broadcast(climb[0]) * u + v8.broadcast(level)
-            sky = _decay(v8.broadcast(upwards) * lengths / v8.maximum(steep, v8.broadcast(least)))
+            sky = _decay(
+                v8.broadcast(upwards) * lengths / v8.maximum(steep, v8.broadcast(min_climb))
+            )
         opacity = v8.select(v8.greater(z, zeros), v8.load(alpha, pixel), zeros)
         clear_share = v8.load(clear, first + Index(at))
         if at == j:
@@ -602,7 +606,7 @@ def blend_falling(
     drops,
     listed,
     begins,
-    least,
+    min_clear_share,
     rays,
     climb,
     bands,
@@ -625,7 +629,7 @@ def blend_falling(
         drops: as in cover_pixels.
         listed: as in cover_pixels.
         begins: as in cover_pixels.
-        least: clear share of a pixel below which the pixel is in the mask.
+        min_clear_share: clear share of a pixel below which the pixel is in the mask.
         rays: 1 / fx, 1 / fy, cx, cy.
         climb: [3] the world's z along the camera's axes.
         bands: [NUM_CLASSES, 5] extinction of a class, depth where its veil begins, depth over which
@@ -633,7 +637,7 @@ def blend_falling(
         upwards: optical depth straight up.
         airlight: [3].
         glow: [3, 4] light of a drop by direction along the camera's axes, and its mean.
-        mask: output [H, W], pixels of which drawn drops leave less than `least`.
+        mask: output [H, W], pixels of which drawn drops leave less than `min_clear_share`.
     """
     height, width = mask.shape
     for band in prange(len(begins) - 1):
@@ -652,7 +656,7 @@ def blend_falling(
         for row in range(top, bottom):
             first = Index((row - top) * width)
             for j in range(Index(width)):
-                mask[Index(row), j] = clear[first + j] < least
+                mask[Index(row), j] = clear[first + j] < min_clear_share
             v = (np.float32(row) + np.float32(0.5) - rays[3]) * rays[1]
             for c in range(3):
                 light[c, 0], light[c, 1], light[c, 2] = airlight[c], glow[c, 3], glow[c, 0]

@@ -21,17 +21,22 @@ def falling_table(name: str, drop: str) -> BoxTable:
         pixels: number of pixels that show the box, or NOT_COUNTED.
         {drop}_pixels: number of those pixels that lie in the effect's mask.
     """
-    through = f"{name}_transmittance"
-    marked = f"{drop}_pixels"
-    share = f"{drop}_fraction"
+    transmittance_column = f"{name}_transmittance"
+    marked_column = f"{drop}_pixels"
+    share_column = f"{drop}_fraction"
     return BoxTable(
         name=f"box_{name}",
         file=f"labels/{name}.parquet",
         kind=f"box {name}",
-        columns={through: np.float64, "pixels": np.int64, marked: np.int64, share: np.float64},
-        sample_columns=(through, share),
-        derived_columns={share: pixel_fraction(marked)},
-        visible_column=through,
+        columns={
+            transmittance_column: np.float64,
+            "pixels": np.int64,
+            marked_column: np.int64,
+            share_column: np.float64,
+        },
+        sample_columns=(transmittance_column, share_column),
+        derived_columns={share_column: pixel_fraction(marked_column)},
+        visible_column=transmittance_column,
     )
 
 
@@ -42,16 +47,16 @@ def measure_falling(
 
     The transmittance is the mean by distance, as in the veil. Drawn drops take as much on average.
     """
-    through, _, marked = table.stored_columns
+    transmittance_column, _, marked_column = table.stored_columns
     data = inputs.plan.data
     fog = None if data is None else Fog(data.sizes.extinction_per_m, (0.0, 0.0, 0.0))
     estimate = box_transmittance(boxes, camera, fog, inputs.depth_m, inputs.water_level_z_m)
-    stored = {
-        through: estimate.transmittance,
+    columns = {
+        transmittance_column: estimate.transmittance,
         "pixels": np.full(len(boxes), NOT_COUNTED),
-        marked: np.zeros(len(boxes), np.int64),
+        marked_column: np.zeros(len(boxes), np.int64),
     }
     if data is not None and inputs.depth_m is not None and inputs.mask is not None:
-        counted = count_pixels(boxes, camera, inputs.depth_m, inputs.mask)
-        stored |= {"pixels": counted.num_pixels, marked: counted.num_marked}
-    return stored
+        box_pixels = count_pixels(boxes, camera, inputs.depth_m, inputs.mask)
+        columns |= {"pixels": box_pixels.num_pixels, marked_column: box_pixels.num_marked}
+    return columns

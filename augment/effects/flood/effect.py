@@ -241,7 +241,7 @@ def submerged_fraction(boxes: WorldBoxes, level_z_m: float) -> Float64[np.ndarra
     or not. A box whose numbers are not finite has NaN.
 
     Args:
-        placed: the boxes, in the scene's world.
+        boxes: the boxes, in the scene's world.
         level_z_m: height of the water, scene world.
     """
     z = boxes.corners_m[..., 2]  # [B, 8]
@@ -261,10 +261,10 @@ def count_hidden_pixels(
     scene_depth_m: Float32[np.ndarray, "H W"],
     water: UInt8[np.ndarray, "H W"],
 ) -> BoxPixels:
-    """Count the pixels that show each box, and those of them (`marked`) that water hides.
+    """Count the pixels that show each box, and those of them (`num_marked`) that water hides.
 
     Args:
-        placed: the boxes, in the scene's world.
+        boxes: the boxes, in the scene's world.
         camera: camera of the image.
         scene_depth_m: z of the scene's surface behind the water, metres; 0 = none.
         water: 255 where water is the first surface.

@@ -100,9 +100,9 @@ def fresnel_reflectance(cosine: Float[Tensor, "*B"], index: float) -> Float[Tens
 def schlick_reflectance(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:
     """Return Schlick's approximation (1994), F0 + (1 - F0) (1 - cosine)^5.
 
-    F0 = ((n - 1) / (n + 1))^2. It holds for n >= 1 only, because it has no total reflection. At
-    n = 1.333 it differs from `exact` by up to 0.009 below 70 degrees, by 0.027 at 75 degrees and by
-    0.059 at 84 degrees.
+    F0 = ((n - 1) / (n + 1))^2. It holds for n >= 1 only, because it has no total reflection. At n =
+    1.333 it differs from `fresnel_reflectance` by up to 0.009 below 70 degrees, by 0.027 at 75
+    degrees and by 0.059 at 84 degrees.
     """
     if index == 1:
         return torch.zeros_like(cosine)

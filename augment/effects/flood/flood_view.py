@@ -112,10 +112,14 @@ def composite_water(
             water_kernels.composite_water(*rays, window.top, window.left, *images)
         return image
     mixed = window.cut(rgb) + (1 - window.cut(alpha))[..., None] * color
-    shared = min(max(dry - window.top, 0), len(mixed))  # rows that show both
-    if shared:
-        meets = falling(camera.cropped(window.left, window.top, mixed.shape[1], shared), rgb.device)
-        mixed[:shared] = torch.where(meets[..., None], mixed[:shared], window.cut(image)[:shared])
+    num_shared_rows = min(max(dry - window.top, 0), len(mixed))  # rows that show both
+    if num_shared_rows:
+        hits_plane = falling(
+            camera.cropped(window.left, window.top, mixed.shape[1], num_shared_rows), rgb.device
+        )
+        mixed[:num_shared_rows] = torch.where(
+            hits_plane[..., None], mixed[:num_shared_rows], window.cut(image)[:num_shared_rows]
+        )
     window.cut(image).copy_(mixed)
     return image
 
@@ -220,19 +224,21 @@ def view_from_below(
     up = directions[..., 2] / lengths
     air_directions = _into_air(directions / lengths[..., None], medium.refraction_index)
     reflected = fresnel_reflectance(up.clamp_min(0), 1 / medium.refraction_index)[..., None]
-    behind, fog = simplify_sky(sky, fog)
-    sky_rgb = sample_at(behind, air_directions)
+    sky_behind, fog = simplify_sky(sky, fog)
+    sky_rgb = sample_at(sky_behind, air_directions)
     if fog is not None:
         tau = sky_optical_depth(fog, air_directions[..., 2], medium.level_z_m)
         sky_rgb = blend_airlight(sky_rgb, tau, fog)
     outside = air.rgb + (1 - air.alpha)[..., None] * sky_rgb
     surface = (1 - reflected) * outside + reflected * deep
     depth = plane_depth(camera, medium.level_z_m, device).to(rgb.dtype)
-    meets = depth.isfinite()
-    distance = torch.where(meets, depth, torch.zeros_like(depth)) * lengths
+    hits_plane = depth.isfinite()
+    distance = torch.where(hits_plane, depth, torch.zeros_like(depth)) * lengths
     to_surface = transmittance(medium, distance)
     beyond = torch.where(
-        meets[..., None], to_surface * surface + (1 - to_surface) * deep, deep.expand_as(surface)
+        hits_plane[..., None],
+        to_surface * surface + (1 - to_surface) * deep,
+        deep.expand_as(surface),
     )
     return below_surface + (1 - front.alpha)[..., None] * beyond
 
@@ -322,7 +328,7 @@ def render_flooded(
     fog = renderer.fog
     backend = renderer.backend
     device = front.alpha.device
-    with timed("flood: where it is seen"):
+    with timed("flood: find water"):
         water, max_water_share = find_water(front.alpha, camera, backend=backend)
     if max_water_share < 1 - HIDDEN_COVER:
         with timed("sky"):
@@ -357,7 +363,7 @@ def render_flooded(
             needed = is_smooth(field, crop)  # rough water reflects the mirrored view alone
             layer = as_layer(camera, front)
             screen = trace_screen(layer, crop, medium.level_z_m, needed=needed, backend=backend)
-    with timed("flood: colours of the water"):
+    with timed("flood: shade water"):
         color = shade_water(
             crop,
             cover,
@@ -370,7 +376,7 @@ def render_flooded(
             fog=fog,
             backend=backend,
         )
-    with timed("flood: layers joined"):
+    with timed("flood: composite layers"):
         image = composite_water(front, camera, window, color, renderer)
         scene = merge_depths(front, bed, bed_window, buffers, backend=backend)
     return FloodedImage(image, scene, water)

@@ -91,7 +91,18 @@ def _columns_that_meet(width, row_z, rotation, lens, height, farthest):
 
 @kernel_function()
 def _sort_waves(
-    waves, terms, place, step, z, drop, bend, columns, spacing, full_waves, fading_waves, faded
+    waves,
+    terms,
+    place,
+    step,
+    z,
+    drop,
+    bend,
+    columns,
+    spacing,
+    full_waves,
+    fading_waves,
+    faded_variance,
 ):
     """Sort the waves of one chunk by whether all, some or none of its pixels resolve them.
 
@@ -108,13 +119,13 @@ def _sort_waves(
             wave is gone, and the largest (s / d_z)^2 times the square of that of its full height.
         full_waves: output, numbers of the waves that all pixels resolve, for `_add_full`.
         fading_waves: output, numbers of the waves that some pixels resolve, for `_add_fading`.
-        faded: output [3], slope variance xx, xy, yy of the waves that no pixel resolves.
+        faded_variance: output [3], slope variance xx, xy, yy of the waves that no pixel resolves.
 
     Returns:
         The number of waves in `full_waves` and in `fading_waves`.
     """
     num_full = num_fading = np.uint64(0)
-    faded[:] = _ZERO
+    faded_variance[:] = _ZERO
     for i in range(len(waves)):
         kx = waves[i, 0]
         ky = waves[i, 1]
@@ -128,9 +139,9 @@ def _sort_waves(
         if spacing[0] * (side + nearest) >= 1.0:
             gx = terms[i, 3]
             gy = terms[i, 4]
-            faded[0] += _HALF * gx * gx
-            faded[1] += _HALF * gx * gy
-            faded[2] += _HALF * gy * gy
+            faded_variance[0] += _HALF * gx * gx
+            faded_variance[1] += _HALF * gx * gy
+            faded_variance[2] += _HALF * gy * gy
             continue
         turns = kx * place[0] + ky * place[1] + waves[i, 2]
         turns -= np.floor(turns)
@@ -182,7 +193,7 @@ def _add_full(full_waves, count, distance):
 def _add_fading(fading_waves, count, distance, n, spacing, limits, view, sums):
     """Add waves as `_add_full` does, with weights; the part they leave out adds to `lost`.
 
-    towards: vx, vy. sums: the sums to add to: lost (a slope variance), xx, xy, yy, gx, gy.
+    view: vx, vy. sums: the sums to add to: lost (a slope variance), xx, xy, yy, gx, gy.
     """
     vx, vy = view
     lost, xx, xy, yy, gx, gy = sums
@@ -215,7 +226,17 @@ def _add_fading(fading_waves, count, distance, n, spacing, limits, view, sums):
 
 @kernel_function()
 def _shade_chunk(
-    full_waves, num_full, fading_waves, num_fading, faded, ray, height, limits, begin, end, out
+    full_waves,
+    num_full,
+    fading_waves,
+    num_fading,
+    faded_variance,
+    ray,
+    height,
+    limits,
+    begin,
+    end,
+    out,
 ):
     """Write normal x, normal y and variance of one chunk into out [3 * CHUNK].
 
@@ -236,9 +257,9 @@ def _shade_chunk(
         slanted = v8.at_least(length, v8.broadcast(limits[0]))
         vx = v8.select(slanted, dx / length, ones)
         vy = v8.select(slanted, dy / length, zero)
-        lost = v8.broadcast(faded[0]) * vx * vx
-        lost = v8.fmuladd(v8.broadcast(faded[1] + faded[1]) * vx, vy, lost)
-        lost = v8.fmuladd(v8.broadcast(faded[2]) * vy, vy, lost)
+        lost = v8.broadcast(faded_variance[0]) * vx * vx
+        lost = v8.fmuladd(v8.broadcast(faded_variance[1] + faded_variance[1]) * vx, vy, lost)
+        lost = v8.fmuladd(v8.broadcast(faded_variance[2]) * vy, vy, lost)
         distance = away * n
         xx, xy, yy, gx, gy = _add_full(full_waves, num_full, distance)
         lost, xx, xy, yy, gx, gy = _add_fading(
@@ -327,7 +348,7 @@ def _fill_row(i, rotation, eye, height, lens, farthest, limits, waves, terms, im
         return
     full_waves = np.empty(len(waves) * FULL_SIZE, np.float32)
     fading_waves = np.empty(len(waves) * FADING_SIZE, np.float32)
-    faded = np.empty(3, np.float32)
+    faded_variance = np.empty(3, np.float32)
     out = np.empty(3 * CHUNK, np.float32)
     for begin in range(first, end, CHUNK):
         stop = min(begin + CHUNK, end)
@@ -361,7 +382,7 @@ def _fill_row(i, rotation, eye, height, lens, farthest, limits, waves, terms, im
             spacing,
             full_waves,
             fading_waves,
-            faded,
+            faded_variance,
         )
         start = np.float32(x), np.float32(y), np.float32(z)
         ray = (*start, np.float32(ax), np.float32(ay), np.float32(az))
@@ -371,7 +392,7 @@ def _fill_row(i, rotation, eye, height, lens, farthest, limits, waves, terms, im
             num_full,
             fading_waves,
             num_fading,
-            faded,
+            faded_variance,
             ray,
             np.float32(height),
             limits,
@@ -529,7 +550,7 @@ def _set_up(view, xs, ys, first):
     rise = slope * v8.broadcast(np.float32(-2))
     scale = rise * g
     bend = (ones + rise * nz) / scale
-    near = v8.negate(slope) / v8.broadcast(view[10])
+    k_start = v8.negate(slope) / v8.broadcast(view[10])
     dx = gx / g
     dy = gy / g
     # A ray along an axis never gets to the other axis's next border.
@@ -542,13 +563,13 @@ def _set_up(view, xs, ys, first):
         (ahead_x * v8.broadcast(width) - x0) * inverse_x,
         (ahead_y * v8.broadcast(height) - y0) * inverse_y,
     )
-    back = (ones - ones / (near * v8.broadcast(NEAR_M))) / bend
+    back = (ones - ones / (k_start * v8.broadcast(NEAR_M))) / bend
     returns = v8.greater(zero, bend)
     end = v8.select(returns, v8.minimum(end, back), end)
     far = v8.at_least(bend * end, ones)
     end = v8.select(far, ones / bend, end)
     to_sky = v8.select(far, ones, zero)
-    ray = (x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, bend * near, end)
+    ray = (x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, k_start, bend * k_start, end)
     # A ray meets nothing in its first pixel.
     t = v8.broadcast(_HALF) * v8.minimum(v8.absolute(inverse_x), v8.absolute(inverse_y))
     size = v8.broadcast(np.float32(4))
@@ -563,7 +584,7 @@ def _step(pyramid, ray, state):
     state: t, the t to stop at, the cell's size and its inverse, pixels behind a surface without a
     break, 1 if there never were any, 1 if the ray has hit a surface.
     """
-    x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, change, end = ray
+    x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, k_start, change, end = ray
     t, stop, size, inverse, hidden_px, clean, has_hit = state
     zero = v8.broadcast(_ZERO)
     half = v8.broadcast(_HALF)
@@ -590,8 +611,8 @@ def _step(pyramid, ray, state):
         v8.greater(v8.broadcast(np.float32(BLOCK)), size),
         v8.greater(v8.absolute(parent_step_x) + v8.absolute(parent_step_y), half),
     )
-    k0 = near - change * t
-    k1 = near - change * leave
+    k0 = k_start - change * t
+    k1 = k_start - change * leave
     nearest = v8.maximum(v8.minimum(k0, k1), v8.broadcast(FARTHEST))
     reached = v8.mask_and(going, v8.at_least(surface, nearest))
     thick = v8.maximum(v8.broadcast(THICKNESS), v8.broadcast(THICKNESS_M) * surface)
@@ -615,7 +636,7 @@ def _step(pyramid, ray, state):
 @kernel_function()
 def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, lengths, trusts):
     """Write the results of eight rays that have ended."""
-    x0, y0, dx, dy, _, _, _, _, near, change, end = ray
+    x0, y0, dx, dy, _, _, _, _, k_start, change, end = ray
     t, stop, _, _, _, clean, has_hit = state
     half = v8.broadcast(_HALF)
     zero = v8.broadcast(_ZERO)
@@ -627,7 +648,7 @@ def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, lengths, tru
     v8.store(lanes, np.uint64(24), dx)
     v8.store(lanes, np.uint64(32), dy)
     v8.store(lanes, np.uint64(40), change)
-    v8.store(lanes, np.uint64(48), near)
+    v8.store(lanes, np.uint64(48), k_start)
     v8.store(lanes, np.uint64(56), end)
     v8.store(lanes, np.uint64(64), scale)
     v8.store(lanes, np.uint64(72), x0)
@@ -643,13 +664,22 @@ def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, lengths, tru
         step_x = lanes[24 + lane]
         step_y = lanes[32 + lane]
         if lanes[lane] > _HALF:
-            change_ = lanes[40 + lane]
-            near_ = lanes[48 + lane]
+            change_of_lane = lanes[40 + lane]
+            k_start_of_lane = lanes[48 + lane]
             length, t_last = _meet(
-                pyramid, width, height, x, y, step_x, step_y, t_last, change_, near_
+                pyramid,
+                width,
+                height,
+                x,
+                y,
+                step_x,
+                step_y,
+                t_last,
+                change_of_lane,
+                k_start_of_lane,
             )
             t_last = min(t_last, lanes[56 + lane])
-            length = length * near_ / lanes[64 + lane]
+            length = length * k_start_of_lane / lanes[64 + lane]
         if lanes[lane] > _HALF or lanes[8 + lane] > _HALF:
             trust = _edge_weight(x + t_last * step_x, y + t_last * step_y, width, height)
         lengths[first + np.uint64(lane)] = length
@@ -657,7 +687,7 @@ def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, lengths, tru
 
 
 @kernel_function()
-def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
+def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, k_start):
     """Return t / k and t where the ray meets the plane through the surface in the pixel at t.
 
     k is the ray's inverse depth there. The result is at most 1 px off that pixel.
@@ -677,19 +707,19 @@ def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
     middle = off_x * dx if abs(dx) >= abs(dy) else off_y * dy
     t_meet = middle
     if closing != _ZERO:
-        t_meet = (center - across * off_x - down * off_y - near) / closing
+        t_meet = (center - across * off_x - down * off_y - k_start) / closing
     reach = np.float32(1.5)
     t_meet = max(min(max(t_meet, middle - reach), middle + reach), _ZERO)
     # The end is not beyond the surface that was hit, even if the ray grazes it.
     back = center / (_ONE + max(THICKNESS, THICKNESS_M * center))
-    return t_meet / max(near - change * t_meet, back), t_meet
+    return t_meet / max(k_start - change * t_meet, back), t_meet
 
 
 @kernel_function()
 def _run(pyramid, view, lanes, xs, ys, count, lengths, trusts):
     """Trace the mirrored rays of the first `count` pixels of a list, which has room for 8 more.
 
-    xs, ys: pixel centres that see the water. lanes: scratch. ways, trusts: outputs, ray lengths
+    xs, ys: pixel centres that see the water. lanes: scratch. lengths, trusts: outputs, ray lengths
     over |x| and weights.
     """
     for first in range(0, count, 8):

@@ -40,7 +40,7 @@ class LensDropsEffect(Effect):
         return False
 
     def kernel_key(self, section: LensDrops) -> Hashable:
-        return section.changes or None
+        return section.has_effect or None
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
@@ -48,7 +48,7 @@ class LensDropsEffect(Effect):
         drops = self.section_of(recipe)
         rate_mm_h = section_at(recipe, "weather.rain.rate_mm_h") or 0.0
         why = ""
-        if drops is None or not drops.changes:
+        if drops is None or not drops.has_effect:
             absent = "the recipe has no drops on the lens"
             why = absent if drops is None else "camera.lens_drops.count is 0"
         elif drops.count is None and rate_mm_h == 0:

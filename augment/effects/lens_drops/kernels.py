@@ -11,8 +11,8 @@ from augment.render.cpu.jit import kernel
 
 
 @kernel
-def blend_drops(rgb, layer, step, margin, least, mask_share, mask):
-    """Blend drops over rgb [H, W, 3] in place: sqrt((1 - c) rgb^2 + light) where c >= least.
+def blend_drops(rgb, layer, step, margin, min_cover, mask_share, mask):
+    """Blend drops over rgb [H, W, 3] in place: sqrt((1 - c) rgb^2 + light) where c >= min_cover.
 
     Light and cover c are bilinear in the layer. All floats are float32.
 
@@ -21,7 +21,7 @@ def blend_drops(rgb, layer, step, margin, least, mask_share, mask):
         layer: [h, w, 4] light and c of cells that are `step` pixels wide.
         step: width of a cell, pixels.
         margin: number of cells before the picture's first.
-        least: smallest c that changes a pixel.
+        min_cover: smallest c that changes a pixel.
         mask_share: smallest c of a pixel in the mask.
         mask: output [H, W], c >= mask_share.
     """
@@ -43,9 +43,9 @@ def blend_drops(rgb, layer, step, margin, least, mask_share, mask):
             right = x - np.float32(left)
             cover = cells[left, 3] + right * (cells[left + 1, 3] - cells[left, 3])
             mask[i, j] = cover >= mask_share
-            if cover >= least:
+            if cover >= min_cover:
                 clear = max(unit - cover, zero)
                 for k in range(3):
                     light = cells[left, k] + right * (cells[left + 1, k] - cells[left, k])
-                    behind = max(rgb[i, j, k], zero)
-                    rgb[i, j, k] = math.sqrt(clear * behind * behind + max(light, zero))
+                    color = max(rgb[i, j, k], zero)
+                    rgb[i, j, k] = math.sqrt(clear * color * color + max(light, zero))

@@ -264,7 +264,8 @@ def blend_drops(
     *,
     backend: str,
 ) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
-    """Return the picture behind the drops, and the mask of pixels with COVERED of light from drops.
+    """Return the picture behind the drops, and the mask of pixels with MIN_MASK_SHARE of light from
+    drops.
 
     On the CPU a kernel computes it, equal to this definition within float rounding; `rgb` is then
     overwritten.
@@ -285,6 +286,6 @@ def blend_drops(
     drop_layer = F.grid_sample(cells.permute(2, 0, 1)[None], grid, align_corners=False)[0]
     light = drop_layer[:3].permute(1, 2, 0).clamp_min(0)
     cover = drop_layer[3]
-    behind = (1 - cover).clamp_min(0)[..., None] * rgb.clamp_min(0).square()
-    blended = torch.where((cover >= MIN_SHARE)[..., None], (behind + light).sqrt(), rgb)
+    background_light = (1 - cover).clamp_min(0)[..., None] * rgb.clamp_min(0).square()
+    blended = torch.where((cover >= MIN_SHARE)[..., None], (background_light + light).sqrt(), rgb)
     return blended, cover >= MIN_MASK_SHARE

@@ -16,7 +16,7 @@ UNCHANGED = 0  # the row equals the source's, to the bit
 ATTENUATED = 1
 SCATTERED = 2  # an echo of droplets in the air, spray or muddy water: no surface is there
 LOST = 3  # no echo above the sensor's noise: x, y, z are NaN, the intensity is 0
-MOVED = 4  # a surface elsewhere on the beam: that of the snow, or a bed under water
+MOVED = 4  # a surface elsewhere on the beam: that of the snow, or the ground under water
 PRECIPITATION = 5  # an echo of a raindrop or a flake: no surface is there
 
 

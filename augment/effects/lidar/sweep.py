@@ -45,7 +45,7 @@ def weathered_sweep(
         model: optics of the sensor.
 
     Raises:
-        SceneError: the weather cannot be placed in this scene.
+        SceneError: the weather is not possible in this scene.
         ValueError: the sweep has a column of one of the new names, or its labels' origins do not
             fit it.
     """

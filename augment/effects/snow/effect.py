@@ -35,7 +35,7 @@ from augment.effects.snow.kernels import MAX_GRAIN_DISTANCE_M
 from augment.effects.snow.layer import lay_snow
 from augment.effects.snow.lidar import intersect_snow
 from augment.effects.snow.light import describe_light, find_snow_light
-from augment.effects.snow.near_camera import GLINT_SIZE_M, Layer, SnowLayers
+from augment.effects.snow.near_camera import GLINT_SIZE_M, PartSnow, SnowLayers
 from augment.effects.snow.relief import Carrier, add_grain
 from augment.effects.snow.snow import (
     SnowPlan,
@@ -55,7 +55,7 @@ from recipes.schema import Recipe
 from recipes.snow import Snow
 
 # Labels of the passes, in plans and timings.
-LAYER_PASS, LIGHT_PASS = PASSES = ("snow: placement and layer", "snow: light per pixel")
+LAYER_PASS, LIGHT_PASS = PASSES = ("snow: exposed surface and layer", "snow: light per pixel")
 GRAIN_PASS = "snow: grain"
 MIN_MASK_SHARE = 0.5  # least share of snow in a pixel of the mask
 _CHUNK_M = 8.0  # side of the squares in which snow is bounded
@@ -69,13 +69,14 @@ class SnowEffect(Effect):
     section = "weather.snow"
     model = Snow
     mask_name = "snow"
-    adds_overlays = shares_files = True
+    adds_overlays = True
+    precomputes_files = True
     off_switches: ClassVar = {
         LAYER_PASS: ("weather.snow", None),
         LIGHT_PASS: ("weather.snow.shading", "per_splat"),
     }
     # pixels: number that show the box or the snow on it, or NOT_COUNTED without snow in view.
-    # count_snow_pixels: number of them that show snow.
+    # snow_pixels: number of them that show snow.
     box_table = BoxTable(
         name="box_snow",
         file="labels/snow.parquet",
@@ -93,7 +94,7 @@ class SnowEffect(Effect):
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:
         snow = self.section_of(recipe)
-        if snow is None or not snow.changes:
+        if snow is None or not snow.has_effect:
             reason = "the recipe has no snow"
             if snow is not None:
                 nothing = "depth" if snow.depth_m == 0 else "coverage"
@@ -126,10 +127,10 @@ class SnowEffect(Effect):
         )
 
     def precompute(self, context: JobContext) -> None:
-        """Find where snow can lie, once for all recipes of the job."""
+        """Find the exposed surface of the scene, once for all recipes of the job."""
         sections = (self.section_of(recipe) for recipe in context.recipes)
         distinct = dict.fromkeys(
-            exposure_settings(snow, context.scene) for snow in sections if snow and snow.changes
+            exposure_settings(snow, context.scene) for snow in sections if snow and snow.has_effect
         )
         for settings in distinct:
             precompute_shadows(context.scene)
@@ -252,18 +253,20 @@ def build_snow_layers(
         scene: the scene.
         recipe_snow: snow of a recipe.
         light: scene whose light the snow lies in; None for the scene's own.
-        backend: backend that finds where snow can lie, unless that is known (see
+        backend: backend that finds the exposed surface, unless it is known (see
             augment.effects.snow.support).
 
     Raises:
-        SceneError: snow cannot be placed in this scene, or not with cells this small.
+        SceneError: this scene cannot have snow, or not with cells this small.
     """
-    support = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene), backend=backend)
+    exposed_surface = exposed_surface_of(
+        scene, exposure_settings(recipe_snow.snow, scene), backend=backend
+    )
     light = None if light is scene else light
 
     def build_layers() -> SnowLayers:
         return lay_snow(
-            support,
+            exposed_surface,
             scene,
             recipe_snow.snow,
             find_snow_light(light or scene, recipe_snow.snow),
@@ -271,7 +274,7 @@ def build_snow_layers(
             water_level_z_m=recipe_snow.water_level_z_m,
         )
 
-    return memo_of(scene).get(("snow layers", recipe_snow, support, light), build_layers)
+    return memo_of(scene).get(("snow layers", recipe_snow, exposed_surface, light), build_layers)
 
 
 def _bound_layers(scene: Scene, layers: SnowLayers) -> Bounds:
@@ -284,7 +287,7 @@ def _bound_layers(scene: Scene, layers: SnowLayers) -> Bounds:
     return Bounds.join(_bound_layer(layer, gaussians, n) for n, layer, gaussians in parts if layer)
 
 
-def _bound_layer(layer: Layer, gaussians: Gaussians, owner: int) -> Bounds:
+def _bound_layer(layer: PartSnow, gaussians: Gaussians, owner: int) -> Bounds:
     """Return the bounds of a part's snow, its glints, and the splats that it buries.
 
     Where none of these is in view, the part looks as it does without snow.
@@ -299,6 +302,6 @@ def _bound_layer(layer: Layer, gaussians: Gaussians, owner: int) -> Bounds:
     return Bounds.join(bounds)
 
 
-def _is_lit_per_pixel(layer: Layer | None) -> bool:
+def _is_lit_per_pixel(layer: PartSnow | None) -> bool:
     """Tell if a layer is lit pixel by pixel."""
     return layer is not None and layer.sunlight_rgb is not None and layer.normals is None

@@ -89,7 +89,7 @@ def in_order(
     with (
         nullcontext()
         if is_serial
-        else ThreadPoolExecutor(threads, "placing snow", initializer=_worker.begin) as pool
+        else ThreadPoolExecutor(threads, "exposed surfaces", initializer=_worker.begin) as pool
     ):
         for result in map(function, items) if pool is None else pool.map(function, items):
             results.append(result)

@@ -163,7 +163,7 @@ def _surface_slope(i, axis, neighbours, size, ground_slope, centers, tops):
     """Return the rise of the surface per metre along x (axis 0) or y (1)."""
     before, run_before = _side_surface(i, 2 * axis, neighbours, size, centers, tops)
     after, run_after = _side_surface(i, 2 * axis + 1, neighbours, size, centers, tops)
-    if run_before < size:  # where the layer ends, the support's height at its edge counts
+    if run_before < size:  # where the layer ends, the bare surface's height counts
         before -= run_before * ground_slope
     if run_after < size:
         after += run_after * ground_slope
@@ -292,7 +292,7 @@ def fill_splats(cells, depths, tops, firsts, lights, colors, splats):
 
     lights [3, 3]: direction of the sun, colour of lit snow, colour of shaded snow. splats: written.
     """
-    for i in prange(len(depths.heights)):
+    for i in prange(len(depths.depths_m)):
         # A function of its own, since numba compiles the body of a parallel loop many times over.
         _fill_cell(np.int64(i), cells, depths, tops, firsts, lights, colors, splats)
 
@@ -306,7 +306,7 @@ def _fill_cell(i, cells, depths, tops, firsts, lights, colors, splats):
     neighbours = cells.neighbours
     tracks = cells.tracks
     light = cells.light
-    depths_m = depths.heights
+    depths_m = depths.depths_m
     mottle = depths.mottle
     random_bits = depths.random_bits
     means = splats.means
@@ -402,15 +402,15 @@ def _fill_cell(i, cells, depths, tops, firsts, lights, colors, splats):
 
 
 @kernel
-def hide_buried(buried, buried_by, depths_m, opacities):
-    """Set opacity 0 for every Gaussian buried[b] whose cells buried_by[b] all carry snow."""
-    for b in prange(len(buried)):
+def hide_buried(hideable_ids, covering_cells, depths_m, opacities):
+    """Set opacity 0 for every Gaussian hideable_ids[b] whose covering_cells[b] all carry snow."""
+    for b in prange(len(hideable_ids)):
         is_hidden = True
-        for k in range(buried_by.shape[1]):
-            cell_id = buried_by[b, k]
+        for k in range(covering_cells.shape[1]):
+            cell_id = covering_cells[b, k]
             is_hidden &= cell_id >= 0 and depths_m[cell_id] > 0
         if is_hidden:
-            opacities[buried[b]] = 0
+            opacities[hideable_ids[b]] = 0
 
 
 # ---- Grain of near snow, as `relief.add_grain` defines it ----------------------------------------
@@ -684,7 +684,7 @@ def find_depths(cells, settings, drifts, patches, mottling, seed, depths):
     tracks = cells.tracks
     banks = cells.banks
     semantic = cells.semantic
-    depths_m = depths.heights
+    depths_m = depths.depths_m
     mottle = depths.mottle
     random_bits = depths.random_bits
     is_everywhere = settings.threshold <= -1e9

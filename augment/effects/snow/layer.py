@@ -2,8 +2,8 @@
 light.
 
 Input: an `ExposedSurface`, the recipe's snow, its light and a seed. The result depends on nothing
-else. Output: `SnowLayers`. Caller: `effect.snow_layers_of`; `lidar` uses the depths alone. The depth of
-the snow is
+else. Output: `SnowLayers`. Caller: `effect.build_snow_layers`; `lidar` uses the depths alone. The
+depth of the snow is
 
 h = depth * drift(x, y) * shoulder(edge), less in wheel tracks, and 0 between patches and by water.
 
@@ -31,7 +31,7 @@ from augment.effects.snow import kernels
 from augment.effects.snow.cells import MAX_EDGE_DISTANCE_M, ExposedCells, ExposedSurface
 from augment.effects.snow.kernels import CellArrays, CellDepths, SplatArrays
 from augment.effects.snow.light import SnowIllumination
-from augment.effects.snow.near_camera import Layer, SnowLayers, draw_crystals
+from augment.effects.snow.near_camera import PartSnow, SnowLayers, draw_crystals
 from augment.effects.snow.relief import Grain
 from augment.render.threads import kernel_threads
 from augment.rng import STEP_X, STEP_Y, mix, rng_for
@@ -190,7 +190,7 @@ class DepthSettings(NamedTuple):
     wind_x: float  # direction that the wind blows towards
     wind_y: float
     pressed: float  # share of the depth that wheels take
-    floor_z_m: float  # z of the lowest support with snow
+    floor_z_m: float  # z of the lowest surface with snow
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,7 +359,7 @@ class LayerColors(NamedTuple):
 
 
 def lay_snow(
-    support: ExposedSurface,
+    exposed_surface: ExposedSurface,
     scene: Scene,
     snow: Snow,
     light: SnowIllumination,
@@ -367,13 +367,13 @@ def lay_snow(
     seed: int,
     water_level_z_m: float | None = None,
 ) -> SnowLayers:
-    """Lay the recipe's snow on a support of the scene.
+    """Lay the recipe's snow on the exposed surface of the scene.
 
-    No tensor of the scene is written to. `Layer.opacities` is the part's own tensor where nothing
-    is buried, and a copy otherwise.
+    No tensor of the scene is written to. `PartSnow.visible_opacities` is the part's own tensor
+    where nothing is buried, and a copy otherwise.
 
     Args:
-        support: cells of the scene.
+        exposed_surface: cells of the scene.
         scene: the scene.
         snow: the recipe's snow.
         light: light on the snow.
@@ -382,7 +382,7 @@ def lay_snow(
             on actors stays. None without water.
     """
 
-    def layer_of(cells: ExposedCells, gaussians: Gaussians, track_id: str | None) -> Layer:
+    def layer_of(cells: ExposedCells, gaussians: Gaussians, track_id: str | None) -> PartSnow:
         """Return the layer on one part; track_id: None for the background."""
         profile, rng = profile_on_part(track_id, scene, snow, seed, water_level_z_m)
         return _build_part_layer(
@@ -390,9 +390,9 @@ def lay_snow(
         )
 
     actors = {actor.track_id: actor.gaussians for actor in scene.actors}
-    ground = layer_of(support.ground, scene.background, None)
+    ground = layer_of(exposed_surface.ground, scene.background, None)
     actor_layers = {
-        name: layer_of(cells, actors[name], name) for name, cells in support.actors.items()
+        name: layer_of(cells, actors[name], name) for name, cells in exposed_surface.actors.items()
     }
     grain = _grain_of_snow(snow, scene, light, seed)
     return SnowLayers(
@@ -429,7 +429,7 @@ def _build_part_layer(
     rng: np.random.Generator,
     *,
     moves: bool,
-) -> Layer:
+) -> PartSnow:
     """Lay snow on one part of the scene."""
     per_pixel = snow.shading == "per_pixel"
     colors = LayerColors(
@@ -455,7 +455,7 @@ def _build_part_layer(
         assert normals is not None
         sun_contrast = float(lights[1].mean() - lights[2].mean())
         crystals = draw_crystals(snow_gaussians, normals, sun_contrast, snow.sparkle, rng)
-    return Layer(
+    return PartSnow(
         gaussians=snow_gaussians,
         visible_opacities=_hide_buried(cells, gaussians, depths.depths_m),
         sunlight_rgb=slopes,
@@ -512,7 +512,7 @@ def _make_splats(
 ) -> tuple[Gaussians, Tensor | None, Tensor | None]:
     """Make the Gaussians of the snow, with their normals and slopes if asked for."""
     depths_m = depths.depths_m
-    arrays = cell_arrays(cells)._replace(relative_light=_soften_light(cells, depths_m, depth_m))
+    arrays = cell_arrays(cells)._replace(light=_soften_light(cells, depths_m, depth_m))
     tops = find_snow_tops(cells, depths_m)
     counts = np.empty(len(cells), np.int64)
     with kernel_threads(CELLS_PER_TASK):

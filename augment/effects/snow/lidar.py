@@ -1,8 +1,8 @@
 """Puts lying snow on a LiDAR sweep: beams end on its surface, which is bright at 905 nm.
 
-Caller: `SnowEffect.meet`. The layer has the support, profile and seed of the images' layer, so that
-drifts, patches and wheel tracks are where the pictures have them. It lies on a grid of GRID_M cells
-and is not evened out as the images' layer is.
+Caller: `SnowEffect.intersect_beams`. The layer has the exposed surface, profile and seed of the
+images' layer, so that drifts, patches and wheel tracks are where the pictures have them. It lies on
+a grid of GRID_M cells and is not evened out as the images' layer is.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def intersect_snow(
     """End beams on the snow where they meet it first. Thread-safe.
 
     Raises:
-        SceneError: snow cannot be placed in this scene.
+        SceneError: this scene cannot have snow.
     """
     snow = find_lidar_snow(scene, recipe_snow)
     ranges = echoes.ranges_m
@@ -110,11 +110,13 @@ def find_lidar_snow(scene: Scene, recipe_snow: SnowPlan) -> LidarSnow:
     """Return the snow of a recipe in a scene. Thread-safe.
 
     Raises:
-        SceneError: snow cannot be placed in this scene.
+        SceneError: this scene cannot have snow.
     """
-    support = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene))
+    exposed_surface = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene))
     key = ("lidar snow", scene.name, recipe_snow)
-    return memo_of(support).get(key, lambda: _build_grids(support, scene, recipe_snow))
+    return memo_of(exposed_surface).get(
+        key, lambda: _build_grids(exposed_surface, scene, recipe_snow)
+    )
 
 
 def intersect_layers(
@@ -198,7 +200,7 @@ def _intersect_grid(
     )
 
 
-def _build_grids(support: ExposedSurface, scene: Scene, recipe_snow: SnowPlan) -> LidarSnow:
+def _build_grids(exposed_surface: ExposedSurface, scene: Scene, recipe_snow: SnowPlan) -> LidarSnow:
     """Compute the snow of a recipe on every part of the scene."""
 
     def layer(cells: ExposedCells, track_id: str | None) -> SnowGrid | None:
@@ -209,9 +211,11 @@ def _build_grids(support: ExposedSurface, scene: Scene, recipe_snow: SnowPlan) -
         grid_m = GRID_M if track_id is None else min(GRID_M, recipe_snow.snow.cell_m)
         return make_snow_grid(cells, find_depths(cells, profile, seed).depths_m, grid_m=grid_m)
 
-    actors = {track_id: layer(cells, track_id) for track_id, cells in support.actors.items()}
+    actors = {
+        track_id: layer(cells, track_id) for track_id, cells in exposed_surface.actors.items()
+    }
     return LidarSnow(
-        ground=layer(support.ground, None),
+        ground=layer(exposed_surface.ground, None),
         actors={track_id: grid for track_id, grid in actors.items() if grid is not None},
         reflectance=ALBEDO_AT_905 * recipe_snow.snow.albedo,
     )

@@ -193,7 +193,7 @@ def draw_crystals(
 
 
 @dataclass(frozen=True, eq=False)
-class Layer:
+class PartSnow:
     """Snow on one part of a scene."""
 
     # Gaussians of the snow, in the part's frame, with semantic SNOW.
@@ -212,14 +212,14 @@ class Layer:
 class SnowLayers:
     """Snow in a scene."""
 
-    ground: Layer  # snow on the background
-    actors: Mapping[str, Layer]  # snow on actors, by track_id
+    ground: PartSnow  # snow on the background
+    actors: Mapping[str, PartSnow]  # snow on actors, by track_id
     sun: tuple[float, float, float]  # unit vector towards the sun, world, for layers with slopes
     wrap: float  # how far light reaches around, see SplatShading, for layers with slopes
     thickness_m: float  # depth of the snow on level ground
     grain: Grain  # how the snow looks from close by
 
-    def layer_on(self, scene: Scene, instance_id: int) -> Layer | None:
+    def layer_on(self, scene: Scene, instance_id: int) -> PartSnow | None:
         """Return the snow on the background (0) or an actor (1 + its index), or None."""
         if instance_id == 0:
             return self.ground
@@ -263,7 +263,7 @@ class SnowLayers:
         return tuple(parts)
 
     def _pose_layer(
-        self, layer: Layer, part: PosedGaussians, camera: Camera, backend: str
+        self, layer: PartSnow, part: PosedGaussians, camera: Camera, backend: str
     ) -> list[PosedGaussians]:
         """Return the layer at the pose of its part, and its glints."""
         world_from_part = part.world_from_part
@@ -297,14 +297,14 @@ class SnowLayers:
         ]
 
 
-def _hide_buried(layer: Layer, gaussians: Gaussians) -> Gaussians:
+def _hide_buried(layer: PartSnow, gaussians: Gaussians) -> Gaussians:
     """Return a part's Gaussians with opacity 0 where the snow buries them.
 
     The result is one object for as long as the part's Gaussians are one, so that a GPU keeps what
     it holds of it from frame to frame.
     """
     gaussians_by_layer = memo_of(gaussians).get(
-        ("left visible by snow",), WeakKeyDictionary[Layer, Gaussians]
+        ("left visible by snow",), WeakKeyDictionary[PartSnow, Gaussians]
     )
     if layer not in gaussians_by_layer:
         gaussians_by_layer[layer] = dataclasses.replace(

@@ -1,6 +1,6 @@
 """Finds the surfaces of a scene that are open to the sky and visible to a camera.
 
-Input: a `Scene`, the cameras that must see the surfaces, `ExposureSettings`. Output: a
+Input: a `Scene`, the cameras that must see the surfaces, `ExposureSettings`. Output: an
 `ExposedSurface`, square cells on the background and on vehicles. Caller:
 `support.exposed_surface_of`.
 
@@ -8,7 +8,7 @@ Input: a `Scene`, the cameras that must see the surfaces, `ExposureSettings`. Ou
 2. `draw_views` renders the depth that some cameras along the drive see.
 3. `_GroundSearch.find` works on one square of tiles at a time, each with a margin: it renders the
    square from above, closes holes, separates the surfaces, keeps the cells that a camera sees, and
-   finds their light, wheel tracks and banks.
+   finds their light, wheel tracks and obstacles.
 4. `find_actor_cells` does the same for each vehicle, in the vehicle's own frame.
 5. `_GroundSearch.join` links neighbouring cells across squares and finds the Gaussians that the
    cells bury.
@@ -74,9 +74,9 @@ from augment.timing import counted_steps
 RING_DISTANCES_M = (8.0, 32.0, 48.0, 80.0, 120.0)
 # Size up to which cells double, about; a coarser cell_m does not double at all.
 MAX_DOUBLED_CELL_M = 1.0
-BYTES_PER_CELL = 70  # memory of a support's cell
-MAX_BYTES = 4 << 30  # largest memory of a support
-PROGRESS_LABEL = "placing snow"  # label of the progress bar and of the step counter
+BYTES_PER_CELL = 70  # memory of an exposed cell
+MAX_BYTES = 4 << 30  # largest memory of an exposed surface
+PROGRESS_LABEL = "finding exposed surfaces"  # label of the progress bar and of the step counter
 _TILE_SIDE_M = 3.2  # side of a tile, about
 _PATH_STEP_M = 1.0  # camera centres closer than this are one place of the path
 _MAX_PATH_GAP_M = 25.0  # camera centres farther apart than this are not joined
@@ -114,22 +114,23 @@ class TilePlan:
 
     @property
     def cells(self) -> int:
-        """Number of cells in all tiles; a support holds those of them that are open ground."""
+        """Number of cells in all tiles; those of them that are open ground become exposed cells."""
         counts = np.bincount(self.levels[self.levels >= 0].astype(np.int64))
         return sum(int(n) * self.cells_per_side(k) ** 2 for k, n in enumerate(counts))
 
     def check_size(self) -> None:
-        """Check that a support of these tiles fits in memory.
+        """Check that the cells of these tiles fit in memory.
 
         Raises:
-            SceneError: the support would take more than MAX_BYTES.
+            SceneError: the cells would take more than MAX_BYTES.
         """
         if self.cells * BYTES_PER_CELL <= MAX_BYTES:
             return
         min_cell_m = self.cell_m * math.sqrt(self.cells * BYTES_PER_CELL / MAX_BYTES)
         raise SceneError(
-            f"snow in cells of {self.cell_m:g} m would take {self.cells / 1e6:,.0f} million cells "
-            f"along this path, about {self.cells * BYTES_PER_CELL / 1e9:,.1f} GB; at most "
+            f"exposed surfaces in cells of {self.cell_m:g} m would take "
+            f"{self.cells / 1e6:,.0f} million cells along this path, about "
+            f"{self.cells * BYTES_PER_CELL / 1e9:,.1f} GB; at most "
             f"{MAX_BYTES / 1e9:.1f} GB are used. Take cells of {_round_up(min_cell_m):g} m or more "
             f"(weather.snow.cell_m), or fewer frames"
         )
@@ -171,7 +172,7 @@ class TilePlan:
 
 
 class CellNumbers:
-    """Index of each cell of a plan in a support; -1 where the support has no such cell."""
+    """Index of the exposed cell at each cell of a plan; -1 where there is none."""
 
     def __init__(self, plan: TilePlan) -> None:
         self._plan = plan
@@ -236,7 +237,7 @@ def plan_tiles(
         extent = path.max(0) - path.min(0)
         raise SceneError(
             f"the cameras' path covers {extent[0] / 1e3:,.1f} km x {extent[1] / 1e3:,.1f} km, more "
-            f"than snow can be placed along at once; take fewer frames"
+            f"than exposed surfaces can be searched along at once; take fewer frames"
         )
     origin = first_tile * side_m
     distance = _distance_to_path(path, origin, side_m, (int(num_tiles[1]), int(num_tiles[0])))
@@ -438,7 +439,9 @@ def ground_luminance(
 def relative_light(
     luminance: np.ndarray, classes: np.ndarray, in_light: np.ndarray | None = None
 ) -> np.ndarray:
-    """Luminance of each cell over the median of its class, float32 [C], see ExposedCells.light.
+    """Luminance of each cell over the median of its class, float32 [C].
+
+    See ExposedCells.relative_light.
 
     Args:
         luminance: float32 [C]; where it is NaN, the result is 1.
@@ -673,7 +676,7 @@ def find_wheel_paths(scene: Scene, *, has_invented_path: bool = False) -> tuple[
 
     Args:
         scene: its recorded frames give the path of the ego, also where a camera path replaces them.
-        with_invented: if True, the ego of an invented drive has a path, too.
+        has_invented_path: if True, the ego of an invented drive has a path, too.
     """
     paths = []
     frames = scene.seen_frames or scene.frames
@@ -863,7 +866,7 @@ def separate_foliage(surface: Surface, classes: np.ndarray) -> np.ndarray:
     return np.where(is_foliage, np.int16(SemanticClass.VEGETATION), classes_without_foliage)
 
 
-# ---- The support of a scene ----------------------------------------------------------------------
+# ---- The exposed surface of a scene --------------------------------------------------------------
 
 _MAX_SQUARE_CELLS = 1024  # cells on a side of the square that is rendered at once, about
 _MARGIN_M = MAX_EDGE_DISTANCE_M + 0.2  # width of the margin that is rendered about a square
@@ -875,7 +878,7 @@ _MIN_DROP_BELOW_CAMERAS_M = 0.5
 
 @dataclass(frozen=True)
 class ExposureSettings:
-    """Settings that decide where a support has cells."""
+    """Settings that decide where a scene has exposed cells."""
 
     cell_m: float = 0.05  # side of the cells near the path; it doubles with the distance from it
     max_slope_deg: float = 50.0  # steeper surfaces carry no snow

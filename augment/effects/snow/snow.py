@@ -50,7 +50,7 @@ def count_snow_pixels(
 ) -> BoxPixels:
     """Count the pixels that show each box or the snow on it, and those of them that show snow.
 
-    The second count is `marked`.
+    The second count is `num_marked`.
 
     Args:
         boxes: labelled boxes.

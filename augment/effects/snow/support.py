@@ -1,4 +1,4 @@
-"""Finds a scene's support once: it is remembered while the scene lives, and stored in a folder.
+"""Finds a scene's exposed surface once. It is remembered while the scene lives, and stored.
 
 `placement.find_exposed_surface` does the work. Callers: snow and wet ground (`exposed_surface_of`
 for pictures and sweeps, `share_exposed_surface` at the start of a job).
@@ -6,6 +6,7 @@ for pictures and sweeps, `share_exposed_surface` at the start of a job).
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import logging
@@ -32,27 +33,37 @@ from augment.scene import Gaussians, Scene
 
 logger = logging.getLogger(__name__)
 
-# Name of the file format. Its number goes up whenever the same scene would give another support, or
-# a file would hold it otherwise.
-FORMAT = "climategs-snow-bed-7"
-_METADATA_KEY = "snow_bed"  # key of the metadata in a file
+# Name of the file format. Its number goes up whenever the same scene would give another exposed
+# surface, or a file would hold it otherwise.
+FORMAT = "climategs-exposed-surface-8"
+_METADATA_KEY = "exposed_surface"  # key of the metadata in a file
+# Pattern of the names that files had up to version 7 of the format, which nobody reads any more.
+_OLD_FILES = f"snow-{40 * '[0-9a-f]'}.safetensors"
 # Types of the fields of ExposedCells other than float32.
 _DTYPES = {
     "neighbours": torch.int32,
     "semantic": torch.int16,
-    "buried": torch.int32,
-    "buried_by": torch.int32,
+    "hideable_ids": torch.int32,
+    "covering_cells": torch.int32,
 }
 # Second dimension of the fields of ExposedCells that have one.
-_COLUMNS = {"centers_m": 3, "normals": 3, "neighbours": 4, "banks": 2, "buried_by": 5}
+_COLUMNS = {
+    "centers_m": 3,
+    "normals": 3,
+    "neighbours": 4,
+    "obstacle_vectors": 2,
+    "covering_cells": 5,
+}
+# Fields of ExposedCells that have a row for each Gaussian that snow can hide, not for each cell.
+_FIELDS_OF_GAUSSIANS = ("hideable_ids", "covering_cells")
 
 
 def exposed_surface_key(
     scene: Scene, cameras: Sequence[Camera], settings: ExposureSettings, *, backend: str = AUTO
 ) -> str:
-    """Return a hex digest of everything that a support depends on.
+    """Return a hex digest of everything that an exposed surface depends on.
 
-    That is Gaussians, tracks, cameras, poses, settings, the backend that places it (the GPU rounds
+    That is Gaussians, tracks, cameras, poses, settings, the backend that finds it (the GPU rounds
     otherwise than the CPU), and the version of this code. Of colours, it covers those that all
     directions share. The order of the cameras counts.
     """
@@ -77,16 +88,18 @@ def exposed_surface_key(
     return digest.hexdigest()
 
 
-def save_exposed_surface(path: Path, support: ExposedSurface, key: str) -> None:
-    """Write a support, as a whole or not at all. Equal supports are equal bytes: no time is stored.
+def save_exposed_surface(path: Path, exposed_surface: ExposedSurface, key: str) -> None:
+    """Write an exposed surface, as a whole or not at all.
+
+    Equal surfaces are equal bytes, because no time is stored.
 
     Raises:
         OutputError: the system refused (disk full, no permission ...); `path` is then as it was.
     """
-    tensors = _named_tensors("ground", support.ground)
-    for number, cells in enumerate(support.actors.values()):
+    tensors = _named_tensors("ground", exposed_surface.ground)
+    for number, cells in enumerate(exposed_surface.actors.values()):
         tensors |= _named_tensors(f"actors.{number}", cells)
-    metadata = {"format": FORMAT, "key": key, "track_ids": list(support.actors)}
+    metadata = {"format": FORMAT, "key": key, "track_ids": list(exposed_surface.actors)}
     # The metadata has a single entry, since several would be written in any order.
     write_atomic(
         path, save(tensors, metadata={_METADATA_KEY: json.dumps(metadata, sort_keys=True)})
@@ -94,10 +107,11 @@ def save_exposed_surface(path: Path, support: ExposedSurface, key: str) -> None:
 
 
 def load_exposed_surface(path: Path, key: str) -> ExposedSurface:
-    """Read the support of a file.
+    """Read the exposed surface of a file.
 
     Raises:
-        SceneError: there is no such file, it is damaged or no snow support, or not that of `key`.
+        SceneError: there is no such file, it is damaged, it holds no exposed surface, or its key is
+            not `key`.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -111,11 +125,11 @@ def load_exposed_surface(path: Path, key: str) -> ExposedSurface:
         }
         return ExposedSurface(_cells_from_tensors(path, tensors, "ground"), actors)
     except FileNotFoundError as error:
-        raise SceneError(f"{path}: no such file, so no snow support to read") from error
+        raise SceneError(f"{path}: no such file, so there is no exposed surface to read") from error
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise SceneError(
-            f"{path} is damaged or no snow support ({type(error).__name__}: {error}); delete it, "
-            f"and it is made anew"
+            f"{path} is damaged or holds no exposed surface ({type(error).__name__}: {error}); "
+            f"delete it, and it is made anew"
         ) from error
 
 
@@ -124,12 +138,12 @@ def _check_metadata(path: Path, metadata: Any, key: str) -> None:
     metadata = metadata if isinstance(metadata, dict) else {}
     if metadata.get("format") != FORMAT:
         raise SceneError(
-            f"{path} is no snow support of this version: its format is {metadata.get('format')!r}, "
-            f"expected {FORMAT!r}; delete it, and it is made anew"
+            f"{path} holds no exposed surface of this version: its format is "
+            f"{metadata.get('format')!r}, expected {FORMAT!r}; delete it, and it is made anew"
         )
     if metadata.get("key") != key:
         raise SceneError(
-            f"{path} is the snow support of something else: its key is {metadata.get('key')!r}, "
+            f"{path} is the exposed surface of something else: its key is {metadata.get('key')!r}, "
             f"expected {key!r}; the scene, the cameras or the settings have changed since"
         )
 
@@ -145,9 +159,10 @@ def _named_tensors(part: str, cells: ExposedCells) -> dict[str, Tensor]:
 def _cells_from_tensors(path: Path, tensors: Mapping[str, Tensor], part: str) -> ExposedCells:
     """Return the cells of one part, after a check of every shape and every index."""
     fields_by_name = {field.name: tensors[f"{part}.{field.name}"] for field in fields(ExposedCells)}
-    num_rows = {"cell": len(fields_by_name["sizes_m"]), "buried": len(fields_by_name["buried"])}
+    num_cells = len(fields_by_name["sizes_m"])
+    num_gaussians = len(fields_by_name["hideable_ids"])
     for name, tensor in fields_by_name.items():
-        rows = num_rows["buried" if name.startswith("buried") else "cell"]
+        rows = num_gaussians if name in _FIELDS_OF_GAUSSIANS else num_cells
         shape = (rows, _COLUMNS[name]) if name in _COLUMNS else (rows,)
         dtype = _DTYPES.get(name, torch.float32)
         if tuple(tensor.shape) != shape or tensor.dtype != dtype:
@@ -155,15 +170,12 @@ def _cells_from_tensors(path: Path, tensors: Mapping[str, Tensor], part: str) ->
                 f"{part}.{name} must be {dtype} {list(shape)}; got {tensor.dtype} "
                 f"{list(tensor.shape)}"
             )
-    for name, min_index in (("neighbours", FLUSH), ("buried_by", -1)):
+    for name, min_index in (("neighbours", FLUSH), ("covering_cells", -1)):
         values = fields_by_name[name]
-        if (
-            values.numel()
-            and not min_index <= int(values.min()) <= int(values.max()) < num_rows["cell"]
-        ):
+        if values.numel() and not min_index <= int(values.min()) <= int(values.max()) < num_cells:
             raise ValueError(f"{part}.{name} names cells that are not there")
-    if num_rows["buried"] and int(fields_by_name["buried"].min()) < 0:
-        raise ValueError(f"{part}.buried names Gaussians that are not there")
+    if num_gaussians and int(fields_by_name["hideable_ids"].min()) < 0:
+        raise ValueError(f"{part}.hideable_ids names Gaussians that are not there")
     return ExposedCells(**fields_by_name)
 
 
@@ -191,17 +203,18 @@ def exposed_surface_of(
     backend: str = AUTO,
     progress: bool = False,
 ) -> ExposedSurface:
-    """Return the support of a scene: remembered, read from the folder, or placed and written there.
+    """Return the exposed surface of a scene.
 
-    A scene and its settings have one support, so that its pictures, sweeps and labels agree.
+    It is remembered, read from the folder, or found and written there. A scene and its settings
+    have one exposed surface, so that its pictures, sweeps and labels agree.
 
     Args:
         scene: the scene.
         settings: settings of the cells.
-        cameras: cameras that must see the snow; None for all of the scene's.
-        folder: folder that keeps supports as snow-<key>.safetensors. A file that cannot be used is
-            replaced, with a warning.
-        backend: backend that places a support which is not remembered yet, see
+        cameras: cameras that must see the surface; None for all of the scene's.
+        folder: folder that keeps exposed surfaces as exposed-<key>.safetensors. A file that cannot
+            be used is replaced, with a warning. Files of older versions are deleted.
+        backend: backend that finds a surface which is not remembered yet, see
             find_exposed_surface.
         progress: if True, a progress bar is shown.
 
@@ -210,7 +223,7 @@ def exposed_surface_of(
         OutputError: the folder cannot be written.
     """
 
-    def find_support() -> ExposedSurface:
+    def find_surface() -> ExposedSurface:
         viewing_cameras = all_cameras(scene) if cameras is None else cameras
         key = (
             ""
@@ -222,35 +235,37 @@ def exposed_surface_of(
             try:
                 return load_exposed_surface(path, key)
             except SceneError as error:
-                logger.warning("the snow of %s is placed anew: %s", scene.name, error)
-        support = find_exposed_surface(
+                logger.warning("the exposed surface of %s is found again: %s", scene.name, error)
+        exposed_surface = find_exposed_surface(
             scene, viewing_cameras, settings, backend=backend, progress=progress
         )
         if path is not None:
-            save_exposed_surface(path, support, key)
-        return support
+            save_exposed_surface(path, exposed_surface, key)
+            delete_old_files(path.parent)
+        return exposed_surface
 
-    return memo_of(scene).get(("snow support", settings), find_support)
+    return memo_of(scene).get(("exposed surface", settings), find_surface)
 
 
 @dataclass(frozen=True)
 class StoredExposedSurface:
-    """Support in its file."""
+    """Exposed surface in its file."""
 
     path: str
     key: str
 
     def load(self) -> ExposedSurface:
-        """Read the support."""
+        """Read the exposed surface."""
         return load_exposed_surface(Path(self.path), self.key)
 
 
 def share_exposed_surface(context: JobContext, settings: ExposureSettings) -> None:
-    """Find the support of a job's scene and share it with the processes that take over its memo.
+    """Find the exposed surface of a job's scene, and share it through the scene's memo.
 
-    It is shared as a file where the job has a folder.
+    Other processes of the job take over the memo. Where the job has a folder, the memo holds the
+    file instead of the surface.
     """
-    support = exposed_surface_of(
+    exposed_surface = exposed_surface_of(
         context.scene,
         settings,
         cameras=context.cameras,
@@ -258,17 +273,17 @@ def share_exposed_surface(context: JobContext, settings: ExposureSettings) -> No
         backend=context.backend,
         progress=context.progress,
     )
-    stored: ExposedSurface | StoredExposedSurface = support
+    stored: ExposedSurface | StoredExposedSurface = exposed_surface
     if context.folder is not None:
         viewing_cameras = all_cameras(context.scene) if context.cameras is None else context.cameras
         key = exposed_surface_key(context.scene, viewing_cameras, settings, backend=context.backend)
         path = exposed_surface_path(context.folder, key)
         if not path.is_file():  # this process remembers it from a job in another folder
-            save_exposed_surface(path, support, key)
+            save_exposed_surface(path, exposed_surface, key)
         stored = StoredExposedSurface(str(path), key)
     memo = memo_of(context.scene)
-    memo.put(("snow support", settings), stored, shared=True)
-    memo.put(("snow support", settings), support)
+    memo.put(("exposed surface", settings), stored, shared=True)
+    memo.put(("exposed surface", settings), exposed_surface)
 
 
 def all_cameras(scene: Scene) -> list[Camera]:
@@ -277,5 +292,12 @@ def all_cameras(scene: Scene) -> list[Camera]:
 
 
 def exposed_surface_path(folder: Path, key: str) -> Path:
-    """Return the file in which a folder keeps the support of a key."""
-    return folder / f"snow-{key}.safetensors"
+    """Return the file in which a folder keeps the exposed surface of a key."""
+    return folder / f"exposed-{key}.safetensors"
+
+
+def delete_old_files(folder: Path) -> None:
+    """Delete the files that older versions have left in a folder; no version reads both."""
+    for path in folder.glob(_OLD_FILES):
+        with contextlib.suppress(OSError):  # such a file takes room, and does no other harm
+            path.unlink()

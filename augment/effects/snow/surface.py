@@ -75,7 +75,7 @@ class Surface:
     slopes: np.ndarray  # float32 [H, W, 2], dz/dx and dz/dy
     can_carry: np.ndarray  # bool, snow stays on the cell
     sides: np.ndarray  # int8 [H, W, 4], see surface_kernels.compare_sides
-    edge_m: np.ndarray  # float32, see ExposedCells
+    edge_m: np.ndarray  # float32, see ExposedCells.edge_distance_m
 
 
 def find_surface(
@@ -169,7 +169,10 @@ def find_narrow_things(height_map: HeightMap, may_carry: np.ndarray) -> np.ndarr
 
 
 def find_banks(surface: Surface) -> np.ndarray:
-    """Vectors towards obstacles, float32 [H, W, 2], see ExposedCells.banks; 0 on obstacles."""
+    """Vectors towards obstacles, float32 [H, W, 2]; 0 on obstacles.
+
+    See ExposedCells.obstacle_vectors.
+    """
     cell = surface.map.cell_m
     covered = surface.map.covered
     heights = np.where(covered, surface.height_m, np.float32(np.inf))
@@ -394,9 +397,9 @@ def _gradient(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 # ---- Gaussians of the surface that snow lies on, which deep enough snow hides --------------------
 
-BURIAL_DEPTH_M = 0.5  # depth below the support down to which Gaussians are buried
+BURIAL_DEPTH_M = 0.5  # depth below the surface down to which Gaussians are buried
 BURIAL_HEIGHT_M = 0.08  # height above it up to which they are buried; half a cell at least
-# Largest angle between a flat Gaussian's normal and the support's.
+# Largest angle between a flat Gaussian's normal and the surface's.
 MAX_FACING_ANGLE_RAD = math.radians(40)
 _MAX_FLATNESS = 0.5  # largest ratio of the shortest axis to the next one, of a flat Gaussian
 # A Gaussian with no longer axis than this, no deeper below the surface, is buried at any attitude,
@@ -577,12 +580,16 @@ def make_cells(
         slices_of(len(cells.sizes_m)),
     )
     buried, buried_by = find_buried(gaussians, cells_under, cells)
-    copied_names = ("normals", "sizes_m", "edge_m", "tracks", "banks", "semantic")
     return ExposedCells(
-        **{name: torch.from_numpy(getattr(cells, name)) for name in copied_names},
         centers_m=torch.from_numpy(cells.centers_m.astype(np.float32)),
+        normals=torch.from_numpy(cells.normals),
+        sizes_m=torch.from_numpy(cells.sizes_m),
+        edge_distance_m=torch.from_numpy(cells.edge_m),
         neighbours=torch.from_numpy(neighbours),
         relative_light=torch.from_numpy(light),
+        track_share=torch.from_numpy(cells.tracks),
+        obstacle_vectors=torch.from_numpy(cells.banks),
+        semantic=torch.from_numpy(cells.semantic),
         hideable_ids=torch.from_numpy(buried),
         covering_cells=torch.from_numpy(buried_by),
     )

@@ -68,14 +68,14 @@ class SprayEffect(Effect):
         return False
 
     def kernel_key(self, section: Rain) -> Hashable:
-        return (section.changes and section.spray) or None
+        return (section.has_effect and section.spray) or None
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:
         rain = self.section_of(recipe)
         why = ""
-        if rain is None or not rain.changes:
+        if rain is None or not rain.has_effect:
             why = "the recipe has no rain" if rain is None else "weather.rain.rate_mm_h is 0"
         elif not rain.spray:
             why = "weather.rain.spray is false"

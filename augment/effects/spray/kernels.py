@@ -53,10 +53,10 @@ def blend_puffs(rgb, depth, rays, puffs, windows, light, fog):
                 ray_length = math.sqrt((1 + u * u + v * v) / a)
                 half = 0.5 * puffs[n, 12] * ray_length * math.exp(-0.5 * distance2)
                 for j in range(first, min(first + run, windows[n, 3])):
-                    behind = inverse_width * (np.float64(depth[row, j]) - nearest)
-                    if behind < -4:
+                    beyond = inverse_width * (np.float64(depth[row, j]) - nearest)
+                    if beyond < -4:
                         continue
-                    passed = entered + (1.0 if behind > 4 else math.erf(behind))
+                    passed = entered + (1.0 if beyond > 4 else math.erf(beyond))
                     tau = half * max(passed, 0.0)
                     taus[j] += tau
                     clears[j] += tau * puffs[n, 13]
@@ -65,8 +65,8 @@ def blend_puffs(rgb, depth, rays, puffs, windows, light, fog):
                 transmittance = math.exp(-taus[j])
                 clear = clears[j] / taus[j]
                 for k in range(3):
-                    behind = max(np.float64(rgb[row, j, k]), 0.0)
+                    color = max(np.float64(rgb[row, j, k]), 0.0)
                     added_light = clear * light[k] + (1 - clear) * fog[k]
                     rgb[row, j, k] = math.sqrt(
-                        transmittance * behind * behind + (1 - transmittance) * added_light
+                        transmittance * color * color + (1 - transmittance) * added_light
                     )

@@ -15,7 +15,7 @@ from scipy.special import erf
 from augment.effects.lidar.beam import Echoes, signal
 from augment.effects.lidar.codes import LOST, SCATTERED
 from augment.effects.smog import BACKSCATTER_MOR, CLUMPS, MOR_OPTICAL_DEPTH
-from augment.effects.spray.puffs import CUT, Puffs
+from augment.effects.spray.puffs import CUT_DISTANCE2, Puffs
 
 _GROUP_SIZE = 16  # puffs that are tested against the beams together
 
@@ -47,8 +47,8 @@ def spray_echoes(echoes: Echoes, puffs: Puffs, rng: np.random.Generator) -> None
 
 def beams_near(echoes: Echoes, puffs: Puffs) -> np.ndarray:
     """Return the mask [N] of the beams that pass near a puff."""
-    near = np.zeros(len(echoes.ranges_m), bool)
-    radii_m = np.sqrt(CUT) * puffs.scales_m.max(1, initial=0)
+    is_near = np.zeros(len(echoes.ranges_m), bool)
+    radii_m = np.sqrt(CUT_DISTANCE2) * puffs.scales_m.max(1, initial=0)
     for first in range(0, len(radii_m), _GROUP_SIZE):
         group = slice(first, first + _GROUP_SIZE)
         middle = puffs.centres_m[group].mean(0)
@@ -57,8 +57,8 @@ def beams_near(echoes: Echoes, puffs: Puffs) -> np.ndarray:
         offsets = middle - echoes.origins
         along = (offsets * echoes.directions).sum(1)
         distance2 = (offsets * offsets).sum(1) - along * along
-        near |= (distance2 < reach**2) & (along > -reach) & (along < echoes.air_path_m + reach)
-    return near & (echoes.ranges_m > 0)
+        is_near |= (distance2 < reach**2) & (along > -reach) & (along < echoes.air_path_m + reach)
+    return is_near & (echoes.ranges_m > 0)
 
 
 def look_through(
@@ -75,7 +75,7 @@ def look_through(
         a = (whitened_directions * whitened_directions).sum(1)
         nearest = (whitened_directions * starts).sum(1) / a
         distance2 = (starts * starts).sum(1) - a * nearest * nearest
-        extinction_at_nearest = extinction * np.exp(-distance2 / 2) * (distance2 < CUT)
+        extinction_at_nearest = extinction * np.exp(-distance2 / 2) * (distance2 < CUT_DISTANCE2)
         inverse_width = np.sqrt(a / 2)
         passed = erf(inverse_width * (ends_m - nearest)) + erf(inverse_width * nearest)
         tau += extinction_at_nearest * np.sqrt(math.pi / (2 * a)) * np.maximum(passed, 0)

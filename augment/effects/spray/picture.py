@@ -21,7 +21,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.effects.spray import kernels
-from augment.effects.spray.puffs import CUT, Puffs
+from augment.effects.spray.puffs import CUT_DISTANCE2, Puffs
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK
 from augment.render.fog import Fog, optical_depth_numpy
@@ -40,7 +40,7 @@ def windows_of(puffs: Puffs, camera: Camera) -> np.ndarray:
     pose = camera.camera_from_world.numpy()
     centres = puffs.centres_m @ pose[:3, :3].T + pose[:3, 3]
     whitenings = puffs.whitenings @ pose[:3, :3].T
-    reach = CUT * np.linalg.inv(np.swapaxes(whitenings, 1, 2) @ whitenings)
+    reach = CUT_DISTANCE2 * np.linalg.inv(np.swapaxes(whitenings, 1, 2) @ whitenings)
     windows = np.empty((len(centres), 5), np.int64)
     sides = ((1, camera.fy, camera.cy, camera.height), (0, camera.fx, camera.cx, camera.width))
     for column, (axis, focal, middle, size) in zip((0, 2), sides, strict=True):
@@ -49,7 +49,7 @@ def windows_of(puffs: Puffs, camera: Camera) -> np.ndarray:
             windows[:, column] = np.clip(np.floor(focal * low + middle), 0, size)
             windows[:, column + 1] = np.clip(np.ceil(focal * high + middle), 0, size)
     windows[centres[:, 2] + np.sqrt(reach[:, 2, 2]) <= 0, :4] = 0
-    deviations_px = (windows[:, 3] - windows[:, 2]) / (2 * math.sqrt(CUT))
+    deviations_px = (windows[:, 3] - windows[:, 2]) / (2 * math.sqrt(CUT_DISTANCE2))
     windows[:, 4] = np.clip(deviations_px / _RUNS_PER_SD, 1, _MAX_RUN)
     return windows
 
@@ -157,7 +157,7 @@ def _numbers(puffs: Puffs, camera: Camera, fog: Fog | None) -> np.ndarray:
         strength[:, None],
         fog_transmittance[:, None],
     ]
-    return np.concatenate([*numbers, np.full((len(camera_whitenings), 1), CUT)], 1)
+    return np.concatenate([*numbers, np.full((len(camera_whitenings), 1), CUT_DISTANCE2)], 1)
 
 
 def _blend_by_torch(
@@ -195,6 +195,10 @@ def _blend_by_torch(
     whitened = share * torch.from_numpy(light).to(tau) + (1 - share) * torch.from_numpy(
         fog_light
     ).to(tau)
-    left = torch.exp(-tau)[..., None]
-    blended = (left * rgb.clamp_min(0).square() + (1 - left) * whitened).sqrt().to(rgb.dtype)
+    transmittance = torch.exp(-tau)[..., None]
+    blended = (
+        (transmittance * rgb.clamp_min(0).square() + (1 - transmittance) * whitened)
+        .sqrt()
+        .to(rgb.dtype)
+    )
     return torch.where((tau > 0)[..., None], blended, rgb)

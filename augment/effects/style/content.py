@@ -1,7 +1,9 @@
 """Colours of a scene in its cameras' views: the content that a style maps from.
 
-A few small views are spread evenly over the scene's frames and cameras. For a scene that no camera
-sees, the Gaussians' colours are used instead, weighted by the area that they could cover.
+A scene and cameras come in. Colour statistics (for the closed forms) or whole pictures (for the
+network) go out to `augment.effects.style.style` and to the training. A few small views are spread
+evenly over the scene's frames and cameras. For a scene that no camera sees, the Gaussians' colours
+are used instead, weighted by the area that they could cover.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.style.color_maps import CLASSES
+from augment.effects.style.color_maps import NUM_CLASSES
 from augment.effects.style.statistics import (
     LAND,
     REGION_OF_CLASS,
@@ -28,7 +30,7 @@ from augment.effects.style.statistics import (
     WHOLE,
     ColorStatistics,
     Statistics,
-    statistics_of,
+    color_statistics,
 )
 from augment.memo import memo_of
 from augment.render.composite import composite_sky
@@ -38,15 +40,21 @@ from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, Sky, is_unknown_sky
 
-VIEWS = 12  # views that the statistics are taken from
-VIEW_PIXELS = 200 * 130  # approximate number of pixels of a view
-PICTURES = 4  # pictures that a network takes
-PICTURE_SIZE = 256  # side of these pictures, pixels
+# Largest number of views that the statistics are taken from.
+NUM_VIEWS = 12
+# Approximate number of pixels of a view.
+VIEW_PIXELS = 200 * 130
+# Largest number of pictures that a network takes.
+NUM_PICTURES = 4
+# Side of these pictures.
+PICTURE_SIZE_PX = 256
 # Smallest share of the sky in all views. Splats never cover a pixel completely, and a smaller share
-# is only what shines through them.
-MIN_SKY = 0.005
+# is only the sky that shines through them.
+MIN_SKY_SHARE = 0.005
 
-_CHANNELS = (ROAD, VEGETATION, REST)  # of the picture that says what a pixel shows
+# Regions that the three channels of a marked picture stand for (see `_marked_scene`).
+_CHANNELS = (ROAD, VEGETATION, REST)
+# Channel of each class in a marked picture; classes without a channel are left out.
 _CLASS_CHANNEL = {
     cls: _CHANNELS.index(region)
     for cls in SemanticClass
@@ -57,15 +65,20 @@ _CLASS_CHANNEL = {
 def content_statistics(
     scene: Scene, cameras: Sequence[Camera] | None = None, *, per_region: bool
 ) -> Statistics:
-    """Colour statistics of the scene: WHOLE always, LAND and SKY where they are seen.
+    """Return colour statistics of the scene, kept in its memo.
 
-    A grey that stands in for a sky counts as SKY alone.
+    A grey that stands in for an unknown sky counts as SKY alone.
 
-    cameras: those that the scene will be seen by; None for all of its own. per_region: also ROAD,
-    VEGETATION and REST where they are seen, of a scene whose Gaussians know at least one of the
-    first two. Kept in the scene's memo.
+    Args:
+        scene: the unstyled scene.
+        cameras: the cameras that the scene will be seen by; None for all of its own.
+        per_region: if True, statistics of ROAD, VEGETATION and REST are added where these regions
+            are visible, provided that some Gaussians are classified as road or vegetation.
+
+    Returns:
+        Statistics of WHOLE always, of LAND and SKY where they are visible.
     """
-    views = select_views(scene, cameras, VIEWS)
+    views = select_views(scene, cameras, NUM_VIEWS)
     key = ("content statistics", per_region, content_key(scene, cameras))
     return memo_of(scene).get(key, lambda: _statistics(scene, views, per_region))
 
@@ -73,12 +86,18 @@ def content_statistics(
 def content_pictures(
     scene: Scene, cameras: Sequence[Camera] | None = None
 ) -> Float[Tensor, "B 3 256 256"]:
-    """Whole pictures of the scene with its sky, in [0, 1], squeezed to a square: for a network.
+    """Return whole pictures of the scene with its sky, for a network; kept in the scene's memo.
 
-    cameras: as content_statistics. A scene that no camera sees gives one picture, of its
-    Gaussians' colours in no order. Kept in the scene's memo.
+    A scene that no camera sees gives one picture, of its Gaussians' colours in no order.
+
+    Args:
+        scene: the unstyled scene.
+        cameras: the cameras that the scene will be seen by; None for all of its own.
+
+    Returns:
+        Display-encoded pictures in [0, 1], squeezed to squares.
     """
-    views = select_views(scene, select_views(scene, cameras, VIEWS), PICTURES)
+    views = select_views(scene, select_views(scene, cameras, NUM_VIEWS), NUM_PICTURES)
     key = ("content pictures", content_key(scene, cameras))
     return memo_of(scene).get(key, lambda: _pictures(scene, views))
 
@@ -96,15 +115,19 @@ def content_key(scene: Scene, cameras: Sequence[Camera] | None = None) -> Hashab
             c.timestamp_ns,
             c.camera_from_world.numpy().tobytes(),
         )
-        for c in select_views(scene, cameras, VIEWS)
+        for c in select_views(scene, cameras, NUM_VIEWS)
     )
 
 
 def select_views(scene: Scene, cameras: Sequence[Camera] | None, count: int) -> tuple[Camera, ...]:
     """Return at most `count` of the cameras, spread evenly over their names and over time.
 
-    cameras: None for the scene's own. Orthographic cameras are left out. The selection does not
-    depend on what is rendered.
+    Orthographic cameras are left out. The selection does not depend on what is rendered.
+
+    Args:
+        scene: the scene whose cameras are taken if `cameras` is None.
+        cameras: the cameras to select from; None for the scene's own.
+        count: largest number of selected cameras.
     """
     if cameras is None:
         cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
@@ -116,65 +139,76 @@ def select_views(scene: Scene, cameras: Sequence[Camera] | None, count: int) -> 
     if not names:
         return ()
     if sum(map(len, by_name.values())) <= count:
-        return tuple(camera for group in by_name.values() for camera in group)
-    chosen = []
+        return tuple(
+            camera for same_name_cameras in by_name.values() for camera in same_name_cameras
+        )
+    selected_cameras = []
     for view in range(count):
-        spread = (2 * view + 1) / (2 * count)
-        few = len(names) <= count
-        group = by_name[names[view % len(names) if few else int(spread * len(names))]]
-        chosen.append(group[int(spread * len(group))])
-    return tuple({id(camera): camera for camera in chosen}.values())
+        position = (2 * view + 1) / (2 * count)
+        has_few_names = len(names) <= count
+        same_name_cameras = by_name[
+            names[view % len(names) if has_few_names else int(position * len(names))]
+        ]
+        selected_cameras.append(same_name_cameras[int(position * len(same_name_cameras))])
+    return tuple({id(camera): camera for camera in selected_cameras}.values())
 
 
 def knows_regions(scene: Scene) -> bool:
     """Return True if any of the scene's Gaussians is known to be road or vegetation."""
     regions = [REGION_OF_CLASS.get(cls) in (ROAD, VEGETATION) for cls in SemanticClass]
-    table = np.zeros(CLASSES, bool)
+    table = np.zeros(NUM_CLASSES, bool)
     table[list(SemanticClass)] = regions
     classes = [part.semantic for part in scene.all_gaussians]
     return any(c is not None and bool(table[c.numpy()].any()) for c in classes)
 
 
 def gaussian_statistics(scene: Scene, *, per_region: bool) -> Statistics:
-    """Statistics of the Gaussians' constant colours, weighted by opacity times mean extent.
+    """Return statistics of the Gaussians' constant colours, weighted by opacity times mean extent.
 
-    They stand for the whole picture: how much sky would be seen is not known.
+    They stand for the whole picture, because the share of the sky is not known.
+
+    Args:
+        scene: a scene that no camera sees.
+        per_region: if True, statistics of ROAD, VEGETATION and REST are added.
     """
     rgb, weights = _splat_colors(scene)
-    statistics = statistics_of(rgb, weights)
+    statistics = color_statistics(rgb, weights)
     assert statistics is not None
     regions = {WHOLE: statistics, LAND: statistics}
     if per_region:
         channels = np.concatenate([_channels(part) for part in scene.all_gaussians])
         for number, region in enumerate(_CHANNELS):
             region_weights = np.where(channels == number, weights, 0)
-            _add(regions, region, rgb, region_weights, float(weights.sum()))
+            _add_region(regions, region, rgb, region_weights, float(weights.sum()))
     return regions
 
 
 def _statistics(scene: Scene, views: Sequence[Camera], per_region: bool) -> Statistics:
+    """Return statistics of the scene in these views, or of its Gaussians if no view shows any."""
     per_region = per_region and knows_regions(scene)
     marked = _marked_scene(scene) if per_region else None
-    view_pixels = [_view_pixels(scene, marked, _small(camera)) for camera in views]
+    view_pixels = [_view_pixels(scene, marked, _small_camera(camera)) for camera in views]
     if not any((view.alpha > 0).any() for view in view_pixels):
         return gaussian_statistics(scene, per_region=per_region)
     alpha = np.concatenate([view.alpha for view in view_pixels])
     land = np.concatenate([view.land for view in view_pixels])
     total = float(alpha.size)
     regions: dict[str, ColorStatistics] = {}
-    if is_unknown_sky(scene.sky):  # a grey that nobody saw has no part in the scene's mood
-        _add(regions, WHOLE, land, alpha, float(alpha.sum(dtype=np.float64)))
+    if is_unknown_sky(scene.sky):  # a grey that stands in for the sky is no part of the scene
+        _add_region(regions, WHOLE, land, alpha, float(alpha.sum(dtype=np.float64)))
     else:
         picture = np.concatenate([view.picture for view in view_pixels])
-        _add(regions, WHOLE, picture, np.ones_like(alpha), total)
-    _add(regions, LAND, land, alpha, total)
+        _add_region(regions, WHOLE, picture, np.ones_like(alpha), total)
+    _add_region(regions, LAND, land, alpha, total)
     open_share = np.clip(1 - alpha, 0, 1)
-    if open_share.sum(dtype=np.float64) >= MIN_SKY * total:
-        _add(regions, SKY, np.concatenate([view.sky for view in view_pixels]), open_share, total)
+    if open_share.sum(dtype=np.float64) >= MIN_SKY_SHARE * total:
+        _add_region(
+            regions, SKY, np.concatenate([view.sky for view in view_pixels]), open_share, total
+        )
     if per_region:
         marks = np.concatenate([view.marks for view in view_pixels])
         for number, region in enumerate(_CHANNELS):
-            _add(regions, region, land, marks[:, number], total)
+            _add_region(regions, region, land, marks[:, number], total)
     return regions
 
 
@@ -182,17 +216,18 @@ def _statistics(scene: Scene, views: Sequence[Camera], per_region: bool) -> Stat
 class _ViewPixels:
     """A view's P pixels, float32 in [0, 1]."""
 
-    picture: np.ndarray  # [P, 3]
+    picture: np.ndarray  # [P, 3] colour of splats and sky together
     land: np.ndarray  # [P, 3] colour of the splats alone
     sky: np.ndarray  # [P, 3] colour of the sky alone
-    alpha: np.ndarray  # [P]
-    marks: np.ndarray  # [P, 3] weights of _CHANNELS, or [0, 3]
+    alpha: np.ndarray  # [P] opacity of the splats
+    marks: np.ndarray  # [P, 3] weights of _CHANNELS; [0, 3] without regions
 
 
 def _view_pixels(scene: Scene, marked: Scene | None, camera: Camera) -> _ViewPixels:
+    """Render a camera's view. marked: the scene of `_marked_scene`, or None without regions."""
     rgb_image, alpha_image = _render(scene, camera)
-    nothing = torch.from_numpy(np.zeros((camera.height, camera.width, 3), np.float32))
-    sky_image = composite_sky(nothing, nothing[..., 0].contiguous(), camera, scene.sky)
+    black_image = torch.from_numpy(np.zeros((camera.height, camera.width, 3), np.float32))
+    sky_image = composite_sky(black_image, black_image[..., 0].contiguous(), camera, scene.sky)
     # By NumPy from here: on arrays this small torch's threads cost more than they give.
     rgb, sky = (image.numpy().reshape(-1, 3) for image in (rgb_image, sky_image))
     alpha = np.clip(alpha_image.numpy().reshape(-1), 0, 1)
@@ -208,23 +243,25 @@ def _view_pixels(scene: Scene, marked: Scene | None, camera: Camera) -> _ViewPix
     )
 
 
-def _add(
+def _add_region(
     regions: dict[str, ColorStatistics],
     region: str,
     rgb: np.ndarray,
     weights: np.ndarray,
     total: float,
 ) -> None:
-    statistics = statistics_of(rgb, weights, total=total)
-    # Float rounding of the marks leaves traces of regions that are nowhere.
+    """Add statistics of the region to `regions`, unless its weights are only rounding errors."""
+    statistics = color_statistics(rgb, weights, total=total)
+    # Float rounding of the marks leaves traces of regions that are not visible.
     if statistics is not None and statistics.share > 1e-6:
         regions[region] = statistics
 
 
 def _pictures(scene: Scene, views: Sequence[Camera]) -> Float[Tensor, "B 3 256 256"]:
+    """Render square pictures of these views that show any splat; without any, a palette."""
     images = []
     for camera in views:
-        view = camera.resized(PICTURE_SIZE, PICTURE_SIZE)
+        view = camera.resized(PICTURE_SIZE_PX, PICTURE_SIZE_PX)
         rgb, alpha = _render(scene, view)
         if bool((alpha > 0).any()):
             image = composite_sky(rgb, alpha, view, _sky_of_pictures(scene, rgb, alpha))
@@ -235,23 +272,26 @@ def _pictures(scene: Scene, views: Sequence[Camera]) -> Float[Tensor, "B 3 256 2
 
 
 def _sky_of_pictures(scene: Scene, rgb: Tensor, alpha: Tensor) -> Sky:
-    """The scene's; where that is a stand-in, one of the mean colour of what else is seen."""
+    """Return the scene's sky; if that is a stand-in, a sky of the splats' mean visible colour."""
     if not is_unknown_sky(scene.sky):
         return scene.sky
     return ConstantSky((rgb.sum((0, 1)) / alpha.sum()).clamp(0, 1))
 
 
 def _palette(scene: Scene) -> Float[Tensor, "3 256 256"]:
-    """Return colours of Gaussians, each as often as its weight says, in no meaningful order."""
+    """Return a picture of Gaussians' colours, in proportion to their weights, in no order."""
     rgb, weights = _splat_colors(scene)
-    reached = np.cumsum(weights)
-    pixels = PICTURE_SIZE**2
-    at = np.searchsorted(reached, (np.arange(pixels) + 0.5) / pixels * reached[-1])
-    picture = rgb[np.minimum(at, len(rgb) - 1)].reshape(PICTURE_SIZE, PICTURE_SIZE, 3)
+    cumulative_weights = np.cumsum(weights)
+    num_pixels = PICTURE_SIZE_PX**2
+    indices = np.searchsorted(
+        cumulative_weights, (np.arange(num_pixels) + 0.5) / num_pixels * cumulative_weights[-1]
+    )
+    picture = rgb[np.minimum(indices, len(rgb) - 1)].reshape(PICTURE_SIZE_PX, PICTURE_SIZE_PX, 3)
     return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).float()
 
 
 def _render(scene: Scene, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return colour (premultiplied) and opacity of the splats in a view."""
     with torch.no_grad():
         output = rasterize(scene.parts_for(camera), camera)
     assert output.rgb is not None and output.alpha is not None
@@ -259,8 +299,10 @@ def _render(scene: Scene, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _marked_scene(scene: Scene) -> Scene:
-    """The scene with Gaussians of the colours (1, 0, 0) on roads, (0, 1, 0) on vegetation,
-    (0, 0, 1) on the rest, so that a picture of it holds every pixel's weights of the three.
+    """Return the scene with Gaussians coloured by their region.
+
+    Roads are (1, 0, 0), vegetation (0, 1, 0) and other land (0, 0, 1), so that a picture of the
+    scene holds the weights of these three regions in every pixel.
     """
 
     def marked(gaussians: Gaussians) -> Gaussians:
@@ -273,8 +315,8 @@ def _marked_scene(scene: Scene) -> Scene:
 
 
 def _channels(gaussians: Gaussians) -> np.ndarray:
-    """int64 [N]: the channel that marks each Gaussian; one past the last where none does."""
-    table = np.full(CLASSES, len(_CHANNELS), np.int64)
+    """Return the channel that marks each Gaussian, int64 [N]; without one, len(_CHANNELS)."""
+    table = np.full(NUM_CLASSES, len(_CHANNELS), np.int64)
     for cls, channel in _CLASS_CHANNEL.items():
         table[cls] = channel
     if gaussians.semantic is None:
@@ -283,8 +325,10 @@ def _channels(gaussians: Gaussians) -> np.ndarray:
 
 
 def _splat_colors(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """The constant colours of all Gaussians, float64 [N, 3], and their weights [N]: opacity times
-    the mean over three sides of what is seen of an ellipsoid, m^2; 1 where all weigh nothing.
+    """Return constant colours of all Gaussians, float64 [N, 3], and their weights [N].
+
+    A weight is the opacity times the ellipsoid's visible area, averaged over three sides, m^2. If
+    the sum of all weights is 0, all weights are 1.
     """
     colors = []
     weights = []
@@ -292,9 +336,12 @@ def _splat_colors(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         colors.append(np.clip(0.5 + SH_C0 * part.sh[:, 0].detach().double().numpy(), 0, 1))
         a, b, c = part.scales.detach().double().numpy().T
         weights.append(part.opacities.detach().double().numpy() * ((a * b + b * c + c * a) / 3))
-    weighted = np.concatenate(weights)
-    return np.concatenate(colors), weighted if weighted.sum() > 0 else np.ones_like(weighted)
+    all_weights = np.concatenate(weights)
+    return np.concatenate(colors), all_weights if all_weights.sum() > 0 else np.ones_like(
+        all_weights
+    )
 
 
-def _small(camera: Camera) -> Camera:
+def _small_camera(camera: Camera) -> Camera:
+    """Return the camera with about VIEW_PIXELS pixels, if it has more."""
     return camera.scaled(min(1.0, math.sqrt(VIEW_PIXELS / (camera.width * camera.height))))

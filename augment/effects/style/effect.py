@@ -1,4 +1,8 @@
-"""The effect style: colour maps on the scene, or on the finished picture."""
+"""The effect `style`: colour maps on the scene, or on the finished picture.
+
+It reads the recipe section `style`. The maps come from `augment.effects.style.style`. The list
+`augment.effects.EFFECTS` holds the effect.
+"""
 
 from __future__ import annotations
 
@@ -30,23 +34,30 @@ from augment.timing import timed
 from recipes.schema import Recipe
 from recipes.style import Style
 
-ON_SCENE = "style on the scene"
-ON_PICTURE = "style on the picture"
+# Time label and plan step of a style that is put on the scene.
+SCENE_STEP = "style on the scene"
+# Time label and plan step of a style that is put on the finished picture.
+PICTURE_STEP = "style on the picture"
 
 
 @dataclass(frozen=True, eq=False)
 class PackedMaps:
-    """Maps as NumPy arrays: the memory of pickled tensors would end with their process."""
+    """Maps as NumPy arrays, for other processes.
+
+    The memory of pickled tensors would end with the process that made them.
+    """
 
     arrays: tuple[Any, ...]
     """The fields of `StyleMaps`, in order."""
 
     @staticmethod
     def of(maps: StyleMaps) -> PackedMaps:
+        """Pack the maps."""
         tensors = (getattr(maps, field.name) for field in fields(maps))
         return PackedMaps(tuple(None if t is None else t.numpy() for t in tensors))
 
     def load(self) -> StyleMaps:
+        """Return the maps as tensors."""
         tensors: list[Any] = [
             None if a is None else torch.from_numpy(a.copy()) for a in self.arrays
         ]
@@ -54,41 +65,46 @@ class PackedMaps:
 
 
 class StyleEffect(Effect):
-    """The colours of an image or a preset, on the scene or on the finished picture."""
+    """Style effect. Maps colours of the scene or picture to those of an image or a preset."""
 
     name = "style"
     section = "style"
     model = Style
-    off_switches: ClassVar = {ON_SCENE: ("style", None)}
+    off_switches: ClassVar = {SCENE_STEP: ("style", None)}
 
     def kernel_key(self, section: Style) -> Hashable:
-        return (section.applied_to, section.method) if section.changes else None
+        return (section.applied_to, section.method) if section.has_effect else None
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:
         style = self.section_of(recipe)
-        if style is None or not style.changes:
-            why = "the recipe has no style"
+        if style is None or not style.has_effect:
+            off_reason = "the recipe has no style"
             if style is not None:
-                why = "the style has no strength, so it changes nothing"
-            steps = (Step(ON_SCENE, False, why, SCENE), Step(ON_PICTURE, False, why, PICTURE))
+                off_reason = "the style has no strength, so it changes nothing"
+            steps = (
+                Step(SCENE_STEP, False, off_reason, SCENE),
+                Step(PICTURE_STEP, False, off_reason, PICTURE),
+            )
             return EffectPlan(None, steps)
-        source = f"image {Path(style.image or '').name}"
+        source_text = f"image {Path(style.image or '').name}"
         if style.preset:
-            source = f"preset {style.preset!r}"
-        reason = f"{style.method} from {source} at strength {style.strength:g}"
+            source_text = f"preset {style.preset!r}"
+        style_text = f"{style.method} from {source_text} at strength {style.strength:g}"
         on_picture = style.applied_to == "picture"
-        maps = "a map for every region" if style.per_region else "one map for all splats"
-        evaluation = {
+        maps_text = "a map for every region" if style.per_region else "one map for all splats"
+        evaluation_text = {
             "color": "applied as they are projected",
             "sh": "folded into the background's SH once, applied to actors as they are projected",
         }[style.evaluated]
         other_reason = f"style.applied_to is {style.applied_to!r}"
-        scene_reason = f"{reason}, {maps}, {evaluation}; snow and water keep their colours"
+        scene_reason = (
+            f"{style_text}, {maps_text}, {evaluation_text}; snow and water keep their colours"
+        )
         steps = (
-            Step(ON_SCENE, not on_picture, other_reason if on_picture else scene_reason, SCENE),
-            Step(ON_PICTURE, on_picture, reason if on_picture else other_reason, PICTURE),
+            Step(SCENE_STEP, not on_picture, other_reason if on_picture else scene_reason, SCENE),
+            Step(PICTURE_STEP, on_picture, style_text if on_picture else other_reason, PICTURE),
         )
         return EffectPlan(style, steps)
 
@@ -103,7 +119,7 @@ class StyleEffect(Effect):
     def precompute(self, context: JobContext) -> None:
         """Precompute the maps, so that other processes render no content and read no files."""
         styles = (self.section_of(recipe) for recipe in context.recipes)
-        for style in dict.fromkeys(s for s in styles if s and s.changes):
+        for style in dict.fromkeys(s for s in styles if s and s.has_effect):
             maps = style_maps(context.scene, style, cameras=context.cameras)
             memo = memo_of(context.scene)
             memo.put(("style maps", style), PackedMaps.of(maps), shared=True)
@@ -117,14 +133,14 @@ class StyleEffect(Effect):
         style = effect.prepared_data
         photo = layers.photo
         if photo is not None:
-            photo = replace(photo, style=style.on_photo)
-        parts = style.on(layers.parts, backend=effect.backend)
+            photo = replace(photo, style=style.photo_style)
+        parts = style.map_parts(layers.parts, backend=effect.backend)
         return replace(layers, parts=parts, sky=style.sky, photo=photo)
 
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         if effect.settings.applied_to != "picture":
             return view
-        with timed(ON_PICTURE):
+        with timed(PICTURE_STEP):
             rgb = apply_color_map(
                 view.rgb, effect.prepared_data.maps.picture, backend=effect.backend
             )

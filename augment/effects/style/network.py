@@ -1,13 +1,17 @@
 """GSCM: the style network, two linear colour maps whose middle matrix an encoder predicts.
 
-Ke et al. 2023 and ClimateGS, "3D Gaussian Color Mapping". A colour c (a row) becomes c P T Q, with
-P and Q trained and T = E(picture), k x k. The content stage (nGSCM, T = f_c of the content) takes
-colours to a common space, the style stage (sGSCM, T = f_s of the style) from there to the style's.
-Nothing in between is nonlinear, so each stage folds to a 3x4 map and both to one.
+Pictures of a scene and of a style come in, one colour map [3, 4] goes out (`gscm_map`).
+`augment.effects.style.style` applies the network, `augment.effects.style.train` trains it.
 
-Two departures: c carries a homogeneous 1, so that maps move the mean (the paper's are 3x3). And T
-starts at the transport between the picture's colour moments and a mean photo's; the encoder
-predicts what to multiply it with.
+The network is that of Ke et al. 2023 and of ClimateGS, "3D Gaussian Color Mapping". A colour c (a
+row) becomes c P T Q. P and Q are trained, and T = E(picture) is a k x k matrix from an encoder E.
+The content stage (nGSCM, T = f_c of the content) takes colours to a common space. The style stage
+(sGSCM, T = f_s of the style) takes them from there to the style's colours. Nothing in between is
+nonlinear, so each stage folds to a 3 x 4 map, and both fold to one.
+
+There are two differences from the paper. c carries a homogeneous 1, so that maps move the mean (the
+paper's are 3 x 3). T starts at the transport between the picture's colour moments and those of a
+mean photo, and the encoder predicts the matrix that it is multiplied with.
 """
 
 from __future__ import annotations
@@ -33,42 +37,53 @@ from augment.files.checkpoints import read_state_dict
 from augment.jobs.atomic import write_atomic
 from recipes.files import open_file
 
-# ---- Encoders: pictures [B, 3, S, S], display-encoded, and small copies [B, 3, R, R] whose -------
-# colour moments were carried to a mean photo's, become features [B, .width].
+# ---- Encoders ------------------------------------------------------------------------------------
+# An encoder takes display-encoded pictures [B, 3, S, S] and small copies [B, 3, R, R] of them with
+# the colour moments of a mean photo. It returns features [B, encoder.width].
 
+# Names of the encoders.
 ENCODERS = ("small", "b0")
-LOOKED_AT_PX = 32  # by the small encoder: the arrangement of colours, not the detail
+# Side of the pictures in the small encoder: it sees the arrangement of colours, not the detail.
+SMALL_ENCODER_PX = 32
+# Output channels of the small encoder's convolutions.
 SMALL_CHANNELS = (16, 32, 64, 96, 96)
+# Mean colour of ImageNet's pictures, which pretrained networks subtract.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
+# Standard deviation of ImageNet's pictures, which pretrained networks divide by.
 IMAGENET_STD = (0.229, 0.224, 0.225)
+# Number of features of EfficientNet-B0.
 B0_WIDTH = 1280
 
 
 class SmallEncoder(nn.Module):
-    """Five convolutions of stride 2 and a pooling of means and deviations; for the CPU."""
+    """Small encoder for the CPU: five convolutions and a pooling of means and deviations."""
 
     def __init__(self) -> None:
         super().__init__()
         layers: list[nn.Module] = []
-        channels = 6
-        for index, out in enumerate(SMALL_CHANNELS):
+        num_inputs = 6
+        for index, num_outputs in enumerate(SMALL_CHANNELS):
             stride = 1 if index == len(SMALL_CHANNELS) - 1 else 2
-            layers += [nn.Conv2d(channels, out, 3, stride, 1), nn.GroupNorm(8, out), nn.SiLU()]
-            channels = out
+            layers += [
+                nn.Conv2d(num_inputs, num_outputs, 3, stride, 1),
+                nn.GroupNorm(8, num_outputs),
+                nn.SiLU(),
+            ]
+            num_inputs = num_outputs
         self.layers = nn.Sequential(*layers)
-        self.width = 2 * channels
+        self.width = 2 * num_inputs
 
     def forward(
         self, images: Float[Tensor, "B 3 S S"], normal: Float[Tensor, "B 3 R R"]
     ) -> Float[Tensor, "B W"]:
-        pictures = (functional.adaptive_avg_pool2d(p, LOOKED_AT_PX) for p in (images, normal))
+        pictures = (functional.adaptive_avg_pool2d(p, SMALL_ENCODER_PX) for p in (images, normal))
         features = self.layers(4 * (torch.cat(tuple(pictures), dim=1) - 0.43))
         deviations = (features.var((2, 3), correction=0) + 1e-6).sqrt()
         return torch.cat([features.mean((2, 3)), deviations], dim=1)
 
 
 class B0Encoder(nn.Module):
-    """EfficientNet-B0 (Tan and Le 2019), MONAI's; random weights until some are loaded."""
+    """EfficientNet-B0 (Tan and Le 2019) of MONAI, with random weights until some are loaded."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -94,40 +109,44 @@ class B0Encoder(nn.Module):
 
 
 def load_imagenet_weights(encoder: B0Encoder, path: Path) -> None:
-    """Fill EfficientNet-B0 with weights trained on ImageNet, from a file the user has.
+    """Fill EfficientNet-B0 with weights trained on ImageNet, from a file of the user.
 
-    path: .safetensors, or a state dict that torch saved, with torchvision's names
-    (`efficientnet_b0`), lukemelas' (`efficientnet-b0`) or MONAI's; its classifier is left out.
+    Args:
+        encoder: the network to fill; its classifier has no weights.
+        path: a .safetensors file or a state dict that torch saved, with the names of torchvision
+            (`efficientnet_b0`), of lukemelas (`efficientnet-b0`) or of MONAI.
 
     Raises:
         StyleError: the file cannot be read, or is not of this network.
     """
-    found = read_state_dict(path, StyleError, wrapped_in=("state_dict", "model"))
-    weights = {name.removeprefix("module."): value for name, value in found.items()}
+    file_weights = read_state_dict(path, StyleError, wrapped_in=("state_dict", "model"))
+    weights = {name.removeprefix("module."): value for name, value in file_weights.items()}
     fill_network(
         encoder.net,
         weights,
         path,
         "give torchvision's efficientnet_b0 or lukemelas' efficientnet-b0",
-        names=_names_in_file(list(encoder.net.state_dict()), weights),
+        file_names=_names_in_file(list(encoder.net.state_dict()), weights),
     )
 
 
-def _names_in_file(own: Sequence[str], weights: Mapping[str, Tensor]) -> dict[str, str]:
-    """Each of MONAI's names to the file's, whichever of the three schemes that has.
+def _names_in_file(net_names: Sequence[str], weights: Mapping[str, Tensor]) -> dict[str, str]:
+    """Return the file's name of each tensor, by MONAI's name, for any of three naming schemes.
 
-    MONAI numbers a block by its stack and over all (`_blocks.1.2`: the second stack's second),
-    lukemelas over all alone (`_blocks.2`). torchvision's layers have other names (`features.2.1`)
-    in the same order.
+    MONAI numbers a block by its stack and within the network (`_blocks.1.2` is in the second
+    stack). lukemelas numbers it within the network alone (`_blocks.2`). torchvision's layers have
+    other names (`features.2.1`) in the same order.
     """
     if "_conv_stem.weight" in weights:
-        by_stack = "_blocks.0.0._depthwise_conv.weight" in weights
-        return {n: n if by_stack else re.sub(r"^_blocks\.\d+", "_blocks", n) for n in own}
-    layers = {name.rpartition(".")[0] for name in weights if name.startswith("features.")}
-    numbered = sorted(layers, key=lambda name: [int(n) for n in re.findall(r"\d+", name)])
-    ours = dict.fromkeys(name.rpartition(".")[0] for name in own)
-    theirs = dict(itertools.zip_longest(ours, numbered[: len(ours)], fillvalue="features.?"))
-    return {n: f"{theirs[n.rpartition('.')[0]]}.{n.rpartition('.')[2]}" for n in own}
+        is_by_stack = "_blocks.0.0._depthwise_conv.weight" in weights
+        return {n: n if is_by_stack else re.sub(r"^_blocks\.\d+", "_blocks", n) for n in net_names}
+    layer_names = {name.rpartition(".")[0] for name in weights if name.startswith("features.")}
+    file_layers = sorted(layer_names, key=lambda name: [int(n) for n in re.findall(r"\d+", name)])
+    net_layers = dict.fromkeys(name.rpartition(".")[0] for name in net_names)
+    file_layer_of = dict(
+        itertools.zip_longest(net_layers, file_layers[: len(net_layers)], fillvalue="features.?")
+    )
+    return {n: f"{file_layer_of[n.rpartition('.')[0]]}.{n.rpartition('.')[2]}" for n in net_names}
 
 
 def fill_network(
@@ -136,42 +155,62 @@ def fill_network(
     path: Path,
     hint: str,
     *,
-    names: Mapping[str, str] | None = None,
+    file_names: Mapping[str, str] | None = None,
 ) -> None:
-    """Load the tensors of the file `path`, in any float. names: the file's, of each of the net's.
+    """Load a file's tensors, of any float type, into a network.
+
+    Args:
+        net: the network to fill.
+        tensors: the tensors of the file, by their names there.
+        path: the file, for error messages.
+        hint: end of the error messages, which tells the user what to do.
+        file_names: name in the file of each of the network's tensors; None for equal names.
 
     Raises:
-        StyleError: one is missing, of another shape or kind, or not finite; hint: what to do.
+        StyleError: a tensor is missing, has another shape or type, or is not finite.
     """
-    filled: dict[str, Tensor] = {}
-    for own, value in net.state_dict().items():
-        name = own if names is None else names[own]
-        given = tensors.get(name, value if name.endswith("num_batches_tracked") else None)
-        floats = value.is_floating_point()
-        if given is None or given.shape != value.shape or given.is_floating_point() != floats:
-            got = "nothing" if given is None else f"{given.dtype} {list(given.shape)}"
-            raise StyleError(
-                f"{path}: {name!r} must be {value.dtype} {list(value.shape)}; got {got}; {hint}"
+    state: dict[str, Tensor] = {}
+    for net_name, net_value in net.state_dict().items():
+        name = net_name if file_names is None else file_names[net_name]
+        file_value = tensors.get(name, net_value if name.endswith("num_batches_tracked") else None)
+        is_float = net_value.is_floating_point()
+        if (
+            file_value is None
+            or file_value.shape != net_value.shape
+            or file_value.is_floating_point() != is_float
+        ):
+            received = (
+                "nothing" if file_value is None else f"{file_value.dtype} {list(file_value.shape)}"
             )
-        if not bool(torch.isfinite(given).all()):
+            raise StyleError(
+                f"{path}: {name!r} must be {net_value.dtype} {list(net_value.shape)}; "
+                f"got {received}; {hint}"
+            )
+        if not bool(torch.isfinite(file_value).all()):
             raise StyleError(f"{path}: {name!r} holds values that are not finite; {hint}")
-        filled[own] = given.to(value.dtype)
-    net.load_state_dict(filled)
+        state[net_name] = file_value.to(net_value.dtype)
+    net.load_state_dict(state)
 
 
 # ---- A picture's colour moments, and the linear maps between them and a mean photo's -------------
-# What a global linear map can do depends mostly on the colours' mean and covariance, which no stack
-# of convolutions gives exactly, so encoders get them computed. The maps are symmetric and depend on
-# one picture only, as the two stages of GSCM do.
+# The best global linear map depends mostly on the colours' mean and covariance. No stack of
+# convolutions gives them exactly, so they are computed for the network. The maps are symmetric and
+# depend on one picture only, as the two stages of GSCM do.
 
-# Of 87 photos (kodak and open, 128 x 128): mean over photos of their colours' mean and covariance.
+# Mean colour of the mean photo: mean of 87 photos (kodak and open, 128 x 128).
 REFERENCE_MEAN = (0.43, 0.43, 0.42)
+# Covariance of the mean photo: mean of the covariances of the same 87 photos.
 REFERENCE_COVARIANCE = ((0.046, 0.039, 0.033), (0.039, 0.041, 0.036), (0.033, 0.036, 0.038))
-FLOOR_STD = 0.012  # added to every direction of colour: bounds the gain of grey pictures
-SMALL_PX = 64  # side of the copy that moments are taken of: noise and detail are no colour
-LEVELS = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)  # quantiles of the channels
-_PAIRED_LEVELS = (0, 1)  # of LEVELS, each with the one as far from the other end
-MOMENT_FEATURES = 18 + 3 * len(LEVELS) + 6 * len(_PAIRED_LEVELS)
+# Standard deviation added to every direction of colour; it bounds the gain of grey pictures.
+FLOOR_STD = 0.012
+# Side of the copy whose moments are taken; it is small because noise and detail are not wanted.
+MOMENT_SIDE_PX = 64
+# Quantiles of the channels that are features.
+QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
+# Indices of QUANTILES that are paired with the quantile as far from the other end.
+_PAIRED_QUANTILES = (0, 1)
+# Number of features that `image_moments` gives for a picture.
+NUM_MOMENT_FEATURES = 18 + 3 * len(QUANTILES) + 6 * len(_PAIRED_QUANTILES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +221,7 @@ class Moments:
     """
 
     features: Float[Tensor, "B F"]
-    """MOMENT_FEATURES numbers a picture, about -3 to 3."""
+    """NUM_MOMENT_FEATURES numbers per picture, about -3 to 3."""
 
     normal: Float[Tensor, "B 3 R R"]
     """Small copies of the pictures with the mean photo's moments."""
@@ -202,43 +241,51 @@ def image_moments(images: Float[Tensor, "B 3 H W"]) -> Moments:
     mean photo).
     """
     with torch.no_grad():
-        small = functional.adaptive_avg_pool2d(images, SMALL_PX)
-        pixels = small.flatten(2)  # [B, 3, N]
+        small_images = functional.adaptive_avg_pool2d(images, MOMENT_SIDE_PX)
+        pixels = small_images.flatten(2)  # [B, 3, N]
         mean = pixels.mean(2)
-        centred = pixels - mean[..., None]  # in float32 a difference of moments would be noise
-        spread = (centred @ centred.transpose(1, 2)).double() / pixels.shape[2]
+        # The mean is subtracted first: in float32 a difference of moments would be noise.
+        centred = pixels - mean[..., None]
+        pixel_covariance = (centred @ centred.transpose(1, 2)).double() / pixels.shape[2]
         mean = mean.double()
-        covariance = spread + FLOOR_STD**2 * torch.eye(3).to(mean)
+        covariance = pixel_covariance + FLOOR_STD**2 * torch.eye(3).to(mean)
         reference_mean = torch.tensor(REFERENCE_MEAN).to(mean)
-        reference = torch.tensor(REFERENCE_COVARIANCE).to(mean)
-        forth, back = _transports(covariance, reference)
-        normalise = _affine(forth, reference_mean - (forth @ mean[..., None])[..., 0])
-        restore = _affine(back, mean - back @ reference_mean)
+        reference_covariance = torch.tensor(REFERENCE_COVARIANCE).to(mean)
+        normalising_matrix, restoring_matrix = _transports(covariance, reference_covariance)
+        normalise = _affine(
+            normalising_matrix, reference_mean - (normalising_matrix @ mean[..., None])[..., 0]
+        )
+        restore = _affine(restoring_matrix, mean - restoring_matrix @ reference_mean)
         matrix = normalise[:, :3, :3].float()
-        normal = torch.einsum("bij,bjhw->bihw", matrix, small)
+        normal = torch.einsum("bij,bjhw->bihw", matrix, small_images)
         normal = normal + normalise[:, :3, 3, None, None].float()
         features = torch.cat(
-            [_moment_features(mean, covariance), _of_shape(normal), _levels(normal)], dim=1
+            [
+                _moment_features(mean, covariance),
+                _shape_features(normal),
+                _quantile_features(normal),
+            ],
+            dim=1,
         )
         return Moments(features, normal, normalise.float(), restore.float())
 
 
 def _transports(
-    of: Float[Tensor, "B 3 3"], to: Float[Tensor, "3 3"]
+    source: Float[Tensor, "B 3 3"], target: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3 3"]]:
-    """The optimal transport between the covariances, and its inverse."""
-    root, inverse_root = _roots(of)
-    middle, inverse_middle = _roots(root @ to @ root)
+    """Return the optimal transports between covariances, and their inverses."""
+    root, inverse_root = _roots(source)
+    middle, inverse_middle = _roots(root @ target @ root)
     return inverse_root @ middle @ inverse_root, root @ inverse_middle @ root
 
 
 def _roots(
     matrices: Float[Tensor, "B 3 3"],
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3 3"]]:
-    """The square roots of positive definite matrices, and their inverses."""
+    """Return the square roots of positive definite matrices, and their inverses."""
     values, vectors = torch.linalg.eigh(matrices)
-    root = values.clamp_min(1e-12).sqrt()[:, None, :]
-    return (vectors * root) @ vectors.transpose(1, 2), (vectors / root) @ vectors.transpose(1, 2)
+    roots = values.clamp_min(1e-12).sqrt()[:, None, :]
+    return (vectors * roots) @ vectors.transpose(1, 2), (vectors / roots) @ vectors.transpose(1, 2)
 
 
 def _affine(matrix: Float[Tensor, "B 3 3"], offset: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4 4"]:
@@ -250,13 +297,13 @@ def _affine(matrix: Float[Tensor, "B 3 3"], offset: Float[Tensor, "B 3"]) -> Flo
 def _moment_features(
     mean: Float[Tensor, "B 3"], covariance: Float[Tensor, "B 3 3"]
 ) -> Float[Tensor, "B 9"]:
-    """The picture's own mean (3) and root of the covariance (6)."""
+    """Return the picture's mean (3) and the square root of its covariance (6), scaled."""
     root, _ = _roots(covariance)
     upper = torch.triu_indices(3, 3, device=root.device)
     return torch.cat([4 * mean - 1.7, 8 * root[:, upper[0], upper[1]] - 0.7], dim=1).float()
 
 
-def _of_shape(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B 9"]:
+def _shape_features(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B 9"]:
     """Return features of the normalised picture, which a change of light hardly changes.
 
     They are the difference of the upper and the lower half (3), skewness (3) and kurtosis (3).
@@ -271,34 +318,46 @@ def _of_shape(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B 9"]:
     return torch.cat([upper_half, skewness, kurtosis], dim=1)
 
 
-def _levels(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B F"]:
-    """Quantiles of the normalised channels (21), and for two pairs of them, near black and white,
-    the gain and the offset that would spread them over what is displayed (12): most photos fill
-    that range, so levels tell how far light or a camera moved a picture."""
-    sample = normal[:, :, ::2, ::2].flatten(2).sort(dim=2).values
-    places = [round(level * (sample.shape[2] - 1)) for level in LEVELS]
-    # One by one: a list of places would be copied to a GPU, and waited for.
-    levels = torch.stack([sample[:, :, place] for place in places], 2).clamp(-1, 2)  # [B, 3, L]
-    features = [3 * (levels - 0.43).flatten(1)]
-    for index in _PAIRED_LEVELS:
-        low = levels[:, :, index]
-        high = levels[:, :, -1 - index]
+def _quantile_features(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B F"]:
+    """Return quantiles of the normalised channels (21), and gains and offsets from them (12).
+
+    A gain and an offset spread a pair of quantiles, near black and white, over the displayable
+    range. Most photos fill that range, so they tell how far light or a camera moved a picture.
+    """
+    sorted_values = normal[:, :, ::2, ::2].flatten(2).sort(dim=2).values
+    ranks = [round(level * (sorted_values.shape[2] - 1)) for level in QUANTILES]
+    # The ranks are read one by one: a list of indices would be copied to a GPU, which waits.
+    quantile_values = torch.stack([sorted_values[:, :, rank] for rank in ranks], 2).clamp(
+        -1, 2
+    )  # [B, 3, L]
+    features = [3 * (quantile_values - 0.43).flatten(1)]
+    for index in _PAIRED_QUANTILES:
+        low = quantile_values[:, :, index]
+        high = quantile_values[:, :, -1 - index]
         gain = 1 / (high - low).clamp_min(0.25)
         features += [gain - 1.2, -gain * low]
     return torch.cat(features, dim=1)
 
 
-SIZE_PX = 256  # of the pictures that the encoder is given
-LATENT = 16  # the paper's k
-HIDDEN = 96  # of the layer between features and T
-HEAD_SCALE = 0.1  # of T, so that a step of the optimiser is a small step of the map
+# Side of the pictures that the encoder takes.
+SIZE_PX = 256
+# Side of the matrix T, the paper's k.
+LATENT_SIZE = 16
+# Width of the layer between features and T.
+HIDDEN_WIDTH = 96
+# Scale of the predicted part of T, so that a step of the optimiser is a small step of the map.
+HEAD_SCALE = 0.1
 
 
 class Gscm(nn.Module):
-    """The network. encoder: of ENCODERS.
+    """Colour mapping network of two stages.
+
+    Args:
+        encoder: name of the encoder, one of ENCODERS.
 
     Raises:
-        ValueError: no such encoder. StyleError: its library is not installed.
+        ValueError: there is no such encoder.
+        StyleError: the encoder's library is not installed.
     """
 
     def __init__(self, encoder: str = "small") -> None:
@@ -307,9 +366,9 @@ class Gscm(nn.Module):
             raise ValueError(f"encoder must be one of {', '.join(ENCODERS)}; got {encoder!r}")
         self.encoder_name = encoder
         self.encoder = SmallEncoder() if encoder == "small" else B0Encoder()
-        self.hidden = nn.Linear(self.encoder.width + MOMENT_FEATURES, HIDDEN)
-        self.head = nn.Linear(HIDDEN, 2 * LATENT**2)
-        self.direct = nn.Linear(MOMENT_FEATURES, 2 * LATENT**2, bias=False)
+        self.hidden = nn.Linear(self.encoder.width + NUM_MOMENT_FEATURES, HIDDEN_WIDTH)
+        self.head = nn.Linear(HIDDEN_WIDTH, 2 * LATENT_SIZE**2)
+        self.direct = nn.Linear(NUM_MOMENT_FEATURES, 2 * LATENT_SIZE**2, bias=False)
         for value in (self.head.weight, self.head.bias, self.direct.weight):
             nn.init.zeros_(value)
         basis = _basis()
@@ -322,38 +381,42 @@ class Gscm(nn.Module):
     def encode(
         self, images: Float[Tensor, "B 3 S S"]
     ) -> tuple[Float[Tensor, "B k k"], Float[Tensor, "B k k"]]:
-        """f_c and f_s: the content stage's T and the style stage's. images: in [0, 1]."""
+        """Return f_c and f_s, the T of the content stage and of the style stage.
+
+        Args:
+            images: display-encoded pictures in [0, 1].
+        """
         moments = image_moments(images)
         features = torch.cat([self.encoder(images, moments.normal), moments.features], dim=1)
         predicted = self.head(nn.functional.silu(self.hidden(features)))
         predicted = HEAD_SCALE * (predicted + self.direct(moments.features))
-        content, style = predicted.unflatten(1, (2, LATENT, LATENT)).unbind(1)
-        eye = torch.eye(LATENT, device=images.device)
-        normalise, restore = self._lifted(moments)
+        content, style = predicted.unflatten(1, (2, LATENT_SIZE, LATENT_SIZE)).unbind(1)
+        eye = torch.eye(LATENT_SIZE, device=images.device)
+        normalise, restore = self._lift(moments)
         # Rows: the moments act first on the content and last on the style.
         return normalise @ (eye + content), (eye + style) @ restore
 
     def content_map(self, f_c: Float[Tensor, "B k k"]) -> Float[Tensor, "B 3 4"]:
-        """nGSCM, folded."""
+        """Return the folded maps of the content stage, nGSCM."""
         return (self.content_p @ f_c @ self.content_q).transpose(1, 2)
 
     def style_map(self, f_s: Float[Tensor, "B k k"]) -> Float[Tensor, "B 3 4"]:
-        """sGSCM, folded."""
+        """Return the folded maps of the style stage, sGSCM."""
         return (self.style_p @ f_s @ self.style_q).transpose(1, 2)
 
-    def _lifted(self, moments: Moments) -> tuple[Float[Tensor, "B k k"], Float[Tensor, "B k k"]]:
-        """The moments' maps of colours, as T's that leave the rest of the space alone."""
-        eye, small = (torch.eye(n, device=self.basis.device) for n in (LATENT, 4))
+    def _lift(self, moments: Moments) -> tuple[Float[Tensor, "B k k"], Float[Tensor, "B k k"]]:
+        """Return the moments' maps as matrices T, which leave all other dimensions unchanged."""
+        eye, eye4 = (torch.eye(n, device=self.basis.device) for n in (LATENT_SIZE, 4))
         lift = self.basis.T  # [k, 4]
         maps = (moments.normalise, moments.restore)
-        first, second = (eye + lift @ (m.transpose(1, 2) - small) @ lift.T for m in maps)
+        first, second = (eye + lift @ (matrix.transpose(1, 2) - eye4) @ lift.T for matrix in maps)
         return first, second
 
 
 def compose(
     second: Float[Tensor, "*B 3 4"], first: Float[Tensor, "*B 3 4"]
 ) -> Float[Tensor, "*B 3 4"]:
-    """The map that does `first`, then `second`."""
+    """Return the map that applies `first`, then `second`."""
     matrix = second[..., :3] @ first[..., :3]
     offset = second[..., :3] @ first[..., 3:] + second[..., 3:]
     return torch.cat([matrix, offset], dim=-1)
@@ -362,7 +425,7 @@ def compose(
 def apply_map(
     maps: Float[Tensor, "B 3 4"], colors: Float[Tensor, "B *N 3"]
 ) -> Float[Tensor, "B *N 3"]:
-    """Colours under their own map each, not clamped."""
+    """Return colours under the map of their batch item, not clamped."""
     flat = colors.flatten(1, -2) @ maps[:, :, :3].transpose(1, 2) + maps[:, None, :, 3]
     return flat.view(colors.shape)
 
@@ -370,69 +433,85 @@ def apply_map(
 def gscm_map(
     net: Gscm, content: Float[Tensor, "B 3 S S"], style: Float[Tensor, "1 3 S S"]
 ) -> Float[Tensor, "3 4"]:
-    """The one map of a scene and a style picture."""
+    """Return the map from a scene's pictures to a style picture."""
     return compose(style_side(net, style), content_side(net, content))
 
 
 def content_side(net: Gscm, content: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "3 4"]:
-    """nGSCM of a scene, the same for every style; f_c is the mean over the scene's pictures."""
-    with in_use(net):
+    """Return nGSCM of a scene, which is the same for every style.
+
+    f_c is the mean over the scene's pictures.
+    """
+    with inference(net):
         f_c, _ = net.encode(content)
         return net.content_map(f_c.mean(0, keepdim=True))[0]
 
 
 def style_side(net: Gscm, style: Float[Tensor, "1 3 S S"]) -> Float[Tensor, "3 4"]:
-    """sGSCM of a style picture, the same for every scene."""
-    with in_use(net):
+    """Return sGSCM of a style picture, which is the same for every scene."""
+    with inference(net):
         _, f_s = net.encode(style)
         return net.style_map(f_s)[0]
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """torch computes in one thread, so that bits do not depend on how many there are."""
-    before = torch.get_num_threads()
+    """Let torch compute in one thread, so that bits do not depend on the number of threads."""
+    num_threads_before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(num_threads_before)
 
 
 @contextmanager
-def in_use(net: Gscm) -> Iterator[None]:
-    """In one thread, without gradients, and not in training; afterwards as before."""
-    training = net.training
+def inference(net: Gscm) -> Iterator[None]:
+    """Use the network in evaluation mode, in one thread and without gradients.
+
+    Its mode is restored afterwards.
+    """
+    was_training = net.training
     try:
         with one_thread(), torch.no_grad():
             net.eval()
             yield
     finally:
-        net.train(training)
+        net.train(was_training)
 
 
 def _basis() -> Float[Tensor, "4 k"]:
-    """Orthonormal rows of cosines (the DCT-II's first): a fixed start that mixes all of k."""
-    place = (torch.arange(LATENT, dtype=torch.float64) + 0.5) * torch.pi / LATENT
-    basis = torch.stack([torch.cos(row * place) for row in range(4)])
+    """Return orthonormal rows of cosines (the DCT-II's first), a start that mixes all of k."""
+    phase = (torch.arange(LATENT_SIZE, dtype=torch.float64) + 0.5) * torch.pi / LATENT_SIZE
+    basis = torch.stack([torch.cos(row * phase) for row in range(4)])
     return (basis / basis.norm(dim=1, keepdim=True)).float()
 
 
 # ---- Networks in files: safetensors, whose one metadata entry is a header in JSON ----------------
-# It says what the network is and, as `about`, how it was trained (free). Tensors may be stored in
-# half precision; they are float32 in memory.
+# The header describes the network. Its entry `about` holds facts of the training, in any form.
+# Tensors may be stored in half precision; they are float32 in memory.
 
+# Key of the header in the file's metadata.
 METADATA_KEY = "climategs.gscm"
-SHIPPED = Path(__file__).parent / "checkpoints" / "gscm-small.safetensors"
-_HEADER = {"format": 1, "k": LATENT, "offset": True, "moments": True, "size": SIZE_PX}
-_WHAT_TO_DO = "give a file that `climategs style train` wrote, or none for the shipped network"
+# Network that comes with the package.
+SHIPPED_CHECKPOINT = Path(__file__).parent / "checkpoints" / "gscm-small.safetensors"
+# Entries that the header of every network of this version has.
+_HEADER = {"format": 1, "k": LATENT_SIZE, "offset": True, "moments": True, "size": SIZE_PX}
+# Advice at the end of error messages.
+_HINT = "give a file that `climategs style train` wrote, or none for the shipped network"
 
 
 def save_network(path: Path, net: Gscm, about: Mapping[str, Any]) -> None:
-    """Write the network whole or not at all. about: training facts, anything JSON can hold.
+    """Write the network, complete or not at all.
+
+    Args:
+        path: the file to write.
+        net: the network.
+        about: facts of the training, anything that JSON can hold.
 
     Raises:
-        StyleError: a weight is not finite. OutputError: the system refused.
+        StyleError: a weight is not finite.
+        OutputError: the file cannot be written.
     """
     tensors = {n: value.detach().cpu().contiguous() for n, value in net.state_dict().items()}
     for name, value in tensors.items():
@@ -444,56 +523,59 @@ def save_network(path: Path, net: Gscm, about: Mapping[str, Any]) -> None:
 
 
 def load_network(path: Path | None = None) -> Gscm:
-    """Read a network, ready to use (`eval`); the shipped one by default.
+    """Return the network of a file, in evaluation mode; the shipped one by default.
 
     Raises:
         StyleError: there is no such file, or it is no network of this format.
     """
-    path = SHIPPED if path is None else path
-    header, tensors = _read(path, with_tensors=True)
+    path = SHIPPED_CHECKPOINT if path is None else path
+    header, tensors = _read_checkpoint(path, with_tensors=True)
     net = Gscm(header["encoder"])
     if extra := sorted(tensors.keys() - net.state_dict().keys()):
-        raise StyleError(f"{path}: holds tensors of another network: {extra[:3]}; {_WHAT_TO_DO}")
-    fill_network(net, tensors, path, _WHAT_TO_DO)
+        raise StyleError(f"{path}: holds tensors of another network: {extra[:3]}; {_HINT}")
+    fill_network(net, tensors, path, _HINT)
     return net.eval().requires_grad_(False)
 
 
 def network_facts(path: Path | None = None) -> dict[str, Any]:
-    """The header of a network's file: format, encoder, k, offset, moments, size, about.
+    """Return the header of a network's file: format, encoder, k, offset, moments, size, about.
 
     Raises:
-        StyleError: as load_network, but for the tensors, which are not looked at.
+        StyleError: there is no such file, or its header is not of this format. The tensors are not
+            checked.
     """
-    return _read(SHIPPED if path is None else path, with_tensors=False)[0]
+    return _read_checkpoint(SHIPPED_CHECKPOINT if path is None else path, with_tensors=False)[0]
 
 
-def _read(path: Path, *, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _read_checkpoint(path: Path, *, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the header of a network's file, and its tensors if they are wanted."""
     try:
-        open_file(path).close()  # to open a pipe would wait for ever
+        open_file(path).close()  # refuses a pipe, which safe_open would wait for
         with safe_open(path, framework="pt") as file:
             names = file.keys() if with_tensors else ()
-            return _header(path, file.metadata()), {name: file.get_tensor(name) for name in names}
+            return _read_header(path, file.metadata()), {
+                name: file.get_tensor(name) for name in names
+            }
     except (OSError, SafetensorError) as error:
-        raise StyleError(
-            f"{path}: the style network cannot be read: {error}; {_WHAT_TO_DO}"
-        ) from error
+        raise StyleError(f"{path}: the style network cannot be read: {error}; {_HINT}") from error
 
 
-def _header(path: Path, metadata: Mapping[str, str] | None) -> dict[str, Any]:
+def _read_header(path: Path, metadata: Mapping[str, str] | None) -> dict[str, Any]:
+    """Return the checked header of a file with this metadata."""
     text = (metadata or {}).get(METADATA_KEY)
     if text is None:
-        raise StyleError(f"{path}: no {METADATA_KEY!r} in the file's metadata; {_WHAT_TO_DO}")
+        raise StyleError(f"{path}: no {METADATA_KEY!r} in the file's metadata; {_HINT}")
     try:
         header = json.loads(text)
     except ValueError as error:
-        raise StyleError(f"{path}: {METADATA_KEY!r} is not JSON: {error}; {_WHAT_TO_DO}") from error
+        raise StyleError(f"{path}: {METADATA_KEY!r} is not JSON: {error}; {_HINT}") from error
     if not isinstance(header, dict):
         raise StyleError(f"{path}: {METADATA_KEY!r} must be an object; got {text[:60]}")
     for name, value in _HEADER.items():
         if header.get(name) != value:
             raise StyleError(
                 f"{path}: {name} must be {value}; got {header.get(name)!r}: the file is of another "
-                f"version of climategs; {_WHAT_TO_DO}"
+                f"version of climategs; {_HINT}"
             )
     if header.get("encoder") not in ENCODERS:
         raise StyleError(

@@ -58,7 +58,7 @@ from recipes.schema import Recipe
 
 # Labels of the passes, in plans and timings.
 DARKENING_PASS, MIRROR_PASS, REFLECTION_PASS = PASSES = (
-    "wet ground: darker",
+    "wet ground: darkening",
     "wet ground: mirrored view",
     "wet ground: reflection",
 )
@@ -193,7 +193,7 @@ class WetEffect(Effect):
             data = effect.settings
             rings = make_rings(data.rate_mm_h, data.seed, camera.timestamp_ns)
             film = Film(
-                data.wetness, effect.prepared_data.find_puddle_threshold(data.puddles), rings
+                data.wetness, effect.prepared_data.find_puddle_threshold(data.puddle_share), rings
             )
             rgb = shade_wet(
                 rgb,
@@ -211,7 +211,7 @@ class WetEffect(Effect):
         self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
     ) -> None:
         dim_wet_echoes(
-            echoes, effect.prepared_data, effect.settings.wetness, effect.settings.puddles
+            echoes, effect.prepared_data, effect.settings.wetness, effect.settings.puddle_share
         )
 
 

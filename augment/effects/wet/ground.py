@@ -1,6 +1,7 @@
 """Maps the ground that rain wets: its heights, how open to the sky it is, where water would stand.
 
-Input: a scene's support (augment.effects.snow.support), since rain and snow fall from the same sky.
+Input: a scene's exposed surface (augment.effects.snow.support), since rain and snow fall from the
+same sky.
 Output: `WetGround`, a map over the world's x and y, made once a scene, and `WetSplats`. Callers:
 `wet.effect`, `wet.reflection`, `wet.lidar`. A thing that stands over the ground keeps it dry, and
 the shelter's edge is soft.
@@ -62,7 +63,7 @@ _MAX_PUDDLE_SLOPE = np.tan(np.radians(15.0))  # steepest slope with standing wat
 _PUDDLE_OCTAVES = ((7.0, 0.8), (2.9, 0.5), (1.2, 0.25), (0.55, 0.1))
 _WEIGHT_PER_CM = 0.8  # weight of a hollow's centimetre, in standard deviations of that noise
 _NOISE_STRIDE = 2  # distance between samples of the noise, cells
-NO_PUDDLES = 1e6  # value of HOLLOW that no place has
+NO_PUDDLES = 1e6  # value of PUDDLE_ORDER that no place has
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +73,11 @@ class WetGround:
     `channels` has rows towards +y, and values at the cells' middles:
 
     - HEIGHT: z of the ground, smoothed, world; z of the nearest ground where there is none.
-    - OPEN: 0 to 1, how far rain reaches it, times the film that its surface holds; 0 = no ground.
+    - EXPOSURE: 0 to 1, how far rain reaches it, times the film that its surface holds; 0 where
+      there is no ground.
     - SLOPE_X, SLOPE_Y: slope of the ground.
-    - HOLLOW: order in which puddles form; water stands first where it is highest.
-    - TRACK: 0 to 1, how much of a wheel track it is.
+    - PUDDLE_ORDER: order in which puddles form; water stands first where it is highest.
+    - WHEEL_TRACK: 0 to 1, how much of a wheel track it is.
     """
 
     left_m: float  # least x of the map
@@ -85,7 +87,7 @@ class WetGround:
     tops_m: Float[Tensor, "Y X"]
     # How open that surface is to the rain, 0 to 1.
     surface_exposure: Float[Tensor, "Y X"]
-    # Values of HOLLOW on open ground, in rising order.
+    # Values of PUDDLE_ORDER on open ground, in rising order.
     sorted_puddle_order: np.ndarray
 
     @property
@@ -118,7 +120,7 @@ class WetGround:
         return values
 
     def nearest(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """Return the channels of the cells about points; beyond the map, see `at`."""
+        """Return the channels of the cells about points; beyond the map, see `interpolate`."""
         rows, columns = self.channels.shape[:2]
         i = np.floor((x_m - self.left_m) / GROUND_CELL_M).astype(np.int64)
         j = np.floor((y_m - self.bottom_m) / GROUND_CELL_M).astype(np.int64)
@@ -128,7 +130,7 @@ class WetGround:
         return values
 
     def find_puddle_threshold(self, share: float) -> float:
-        """Return the HOLLOW above which water stands if `share` of the open ground has puddles."""
+        """Return the PUDDLE_ORDER above which water covers `share` of the open ground."""
         ordered = self.sorted_puddle_order
         if share <= 0 or not len(ordered):
             return NO_PUDDLES

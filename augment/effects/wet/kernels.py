@@ -18,7 +18,7 @@ from augment.render.cpu.simd import LOG2_E, exp2_fine, log2
 from augment.render.layout import NUM_LANES, Index
 from augment.rng import STEP_X, STEP_Y
 
-# Channels of the ground's map, see ground.WetGround; CHANNELS is their number.
+# Channels of the ground's map, see ground.WetGround; NUM_CHANNELS is their number.
 HEIGHT, EXPOSURE, SLOPE_X, SLOPE_Y, PUDDLE_ORDER, WHEEL_TRACK, NUM_CHANNELS = range(7)
 
 # ---- Rings of drops ------------------------------------------------------------------------------
@@ -241,7 +241,7 @@ def _find_cells(px, py, view, texels, spare):
 def _interpolate_channels(cells, columns, channel, count, texels, spare):
     """Interpolate `count` channels from `channel` on between the map's cells.
 
-    The results go to spare[RESULTS_START + k LANES + lane].
+    The results go to spare[RESULTS_START + k NUM_LANES + lane].
     """
     step = Index(NUM_CHANNELS)
     down = Index(columns * NUM_CHANNELS)
@@ -335,7 +335,7 @@ def _find_ground_in_row(row, width, view, cells, depth, visible_share, share):
 def find_ground(view, cells, width, depth, visible_share, share, row_max):
     """Find how much of each pixel is open ground, share [H W], and each row's largest share.
 
-    cells: the map, flat, CHANNELS of each cell. depth, visible_share: [H W]. W >= LANES.
+    cells: the map, flat, NUM_CHANNELS of each cell. depth, visible_share: [H W]. W >= NUM_LANES.
     """
     for y in prange(row_max.size):
         row_max[y] = _find_ground_in_row(
@@ -351,7 +351,7 @@ ASPHALT_ROUGHNESS = 0.085
 PUDDLE_ROUGHNESS = 0.008
 TRACK_SMOOTHING = 0.35  # share of the roughness that wheels have polished away
 FILM_SHARE = 0.75  # share of wet asphalt that shows water: stones stand out of it
-PUDDLE_RIM = 0.12  # half width of a puddle's rim, in HOLLOW
+PUDDLE_RIM = 0.12  # half width of a puddle's rim, in PUDDLE_ORDER
 # Texels on a side of the noise that makes film and roughness uneven; a power of 2.
 MOTTLE_SIDE = 256
 FINE_TEXEL_M = 0.012  # texel of the fine noise
@@ -593,12 +593,14 @@ def _look_up_mirror(mirror, colors, levels, column, row, sigma, texels, spare):
 
 
 @kernel_function()
-def _film_on_ground(track, puddle, uneven, variance, wetness):
+def _film_on_ground(track, puddle, unevenness, variance, wetness):
     """Return the deviation of slopes, and the share of the ground that the film covers."""
     ones = _splat(1)
-    roughness = _splat(ASPHALT_ROUGHNESS) * _linear(track, -TRACK_SMOOTHING, 1.0) * (ones - uneven)
+    roughness = (
+        _splat(ASPHALT_ROUGHNESS) * _linear(track, -TRACK_SMOOTHING, 1.0) * (ones - unevenness)
+    )
     puddle_roughness = v8.sqrt(_linear(variance, 0.5, PUDDLE_ROUGHNESS * PUDDLE_ROUGHNESS))
-    film_share = _clamp(_linear(track, 0.1, FILM_SHARE) + uneven, 0.0, 1.0)
+    film_share = _clamp(_linear(track, 0.1, FILM_SHARE) + unevenness, 0.0, 1.0)
     covered_share = v8.broadcast(wetness) * v8.fmuladd(ones - film_share, puddle, film_share)
     return v8.fmuladd(puddle, puddle_roughness - roughness, roughness), covered_share
 
@@ -734,7 +736,7 @@ def shade_wet(
 
 @kernel
 def decode_srgb(rgb, linear):
-    """Convert display-encoded numbers to linear light; flat arrays of LANES numbers at least."""
+    """Convert display-encoded numbers to linear light, in flat arrays of >= NUM_LANES numbers."""
     count = rgb.size
     for run in prange((count + VALUES_PER_TASK - 1) // VALUES_PER_TASK):
         start = np.int64(run) * VALUES_PER_TASK

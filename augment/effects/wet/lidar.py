@@ -1,7 +1,7 @@
 """Dims the echoes of wet ground: a film of water mirrors beams away and darkens what it lies on.
 
-Caller: `WetEffect.attenuate`. Light that meets the film at an angle of incidence whose cosine is c
-enters with 1 - F(c), is thrown back and forth between the ground and the film's upper side
+Caller: `WetEffect.attenuate_beams`. Light that meets the film at an angle of incidence whose cosine
+is c enters with 1 - F(c), is thrown back and forth between the ground and the film's upper side
 (`darkening`), and leaves towards the sensor through the same side, wider by n^2 (Lekner and Dorf
 1988):
 
@@ -86,7 +86,7 @@ def wet_echo_ratio(cosine: np.ndarray, reflectance: np.ndarray, puddle: np.ndarr
     ) / film_factor
 
 
-def dim_wet_echoes(echoes: Echoes, ground: WetGround, wetness: float, puddles: float) -> None:
+def dim_wet_echoes(echoes: Echoes, ground: WetGround, wetness: float, puddle_share: float) -> None:
     """Dim the echoes of wet ground; echoes of other weather's surfaces stay as they are."""
     is_dry_surface = (echoes.codes == UNCHANGED) | (echoes.codes == ATTENUATED)
     rows = np.flatnonzero(is_dry_surface & (echoes.ranges_m > 0))
@@ -98,7 +98,7 @@ def dim_wet_echoes(echoes: Echoes, ground: WetGround, wetness: float, puddles: f
     slope = channels[:, [SLOPE_X, SLOPE_Y]]
     cosine = (slope * directions[:, :2]).sum(1) - directions[:, 2]
     cosine = np.clip(cosine / np.sqrt(1 + (slope**2).sum(1)), 0.0, 1.0)
-    is_puddle = (channels[:, PUDDLE_ORDER] > ground.find_puddle_threshold(puddles)).astype(
+    is_puddle = (channels[:, PUDDLE_ORDER] > ground.find_puddle_threshold(puddle_share)).astype(
         np.float64
     )
     gain = wet_echo_ratio(cosine, echoes.reflectance[rows], is_puddle)

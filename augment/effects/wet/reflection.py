@@ -283,7 +283,7 @@ class Film(NamedTuple):
     """Water on the ground."""
 
     wetness: float  # 0 to 1
-    puddle_threshold: float  # value of HOLLOW above which water stands in puddles
+    puddle_threshold: float  # value of PUDDLE_ORDER above which water stands in puddles
     rings: Rings  # rings of drops on the puddles
 
 
@@ -400,12 +400,12 @@ def shade_wet(
     eye = camera.centre.to(points.device)
     x = points[..., 0].double() + eye[0]
     y = points[..., 1].double() + eye[1]
-    uneven = sum(
+    unevenness = sum(
         amplitude * (2 - footprint / texel).clamp(0, 1) * _mottle(x, y, texel)
         for amplitude, texel in ((COARSE_AMPLITUDE, COARSE_TEXEL_M), (FINE_AMPLITUDE, FINE_TEXEL_M))
     )
     roughness = (
-        ASPHALT_ROUGHNESS * (1 - TRACK_SMOOTHING * channels[..., WHEEL_TRACK]) * (1 - uneven)
+        ASPHALT_ROUGHNESS * (1 - TRACK_SMOOTHING * channels[..., WHEEL_TRACK]) * (1 - unevenness)
     )
     slope_x, slope_y, variance = ring_slopes(film.rings, x, y, footprint)
     puddle_roughness = torch.sqrt(PUDDLE_ROUGHNESS**2 + 0.5 * variance)
@@ -419,7 +419,7 @@ def shade_wet(
         torch.stack((*slope, torch.ones_like(asphalt_weight)), -1), dim=-1
     )
     cosine = (normal * to_eye).sum(-1).clamp(0.005, 1)
-    film_share = (FILM_SHARE + uneven + 0.1 * channels[..., WHEEL_TRACK]).clamp(0, 1)
+    film_share = (FILM_SHARE + unevenness + 0.1 * channels[..., WHEEL_TRACK]).clamp(0, 1)
     covered_share = film.wetness * (film_share + (1 - film_share) * puddle)
     strength = share * covered_share * mean_reflectance(cosine, roughness)
     ray = 2 * cosine[..., None] * normal - to_eye

@@ -49,11 +49,11 @@ _SUM_RANGES = 8
 class SplatGradients:
     """dL of every Gaussian that the image shows, block by block (Inputs.blocks).
 
-    Block b has counts[b] rows, from row b BLOCK on. rows and ids live in the tape's scratch: its
-    next use overwrites them.
+    Block b has counts[b] rows, from row b BLOCK_SIZE on. rows and ids live in the tape's scratch:
+    its next use overwrites them.
 
-    rows: float32 [B BLOCK, GRAD], columns as backward_kernels names them.
-    ids: int32 [B BLOCK], index of the Gaussian in its part.
+    rows: float32 [B BLOCK_SIZE, NUM_GRADIENTS], columns as backward_kernels names them.
+    ids: int32 [B BLOCK_SIZE], index of the Gaussian in its part.
     counts: int64 [B], rows of each block.
     blocks: int64 [B, 3], as in Inputs.
     """
@@ -69,7 +69,7 @@ class Tape:
     """A finished render of one camera and the arrays that its gradients need.
 
     rgb [H, W, 3], alpha [H, W] and expected_depth [H, W] (or None) are float32, as in RenderOutput.
-    All arrays live in the scratch that `record` was given.
+    All arrays live in the scratch that `record_render` was given.
     """
 
     inputs: Inputs
@@ -131,7 +131,7 @@ class Tape:
         slopes = backward_kernels.Slopes(*(None if i is None else i.reshape(-1) for i in images))
         with kernel_threads():
             sums, is_touched = self._sum_shares(slopes, StageTimer(None))
-        is_filled = np.arange(BLOCK_SIZE) < self.splats.splat_counts[:, None]  # [B, BLOCK]
+        is_filled = np.arange(BLOCK_SIZE) < self.splats.splat_counts[:, None]  # [B, BLOCK_SIZE]
         is_filled = is_filled.reshape(-1)
         records = self.splats.records.reshape(-1, RECORD)
         ids = records[is_filled, SPLAT_ID].view(np.int32)

@@ -367,13 +367,13 @@ _SLOPES = 16  # rows of eight: gradients of the SH functions, weighted
 def project_backward(inputs, splats, is_touched, sums, grads, ids, counts):
     """Write a row of `grads` for every touched splat, block by block in the order of its Gaussians.
 
-    Block b fills rows b BLOCK to b BLOCK + counts[b].
+    Block b fills rows b BLOCK_SIZE to b BLOCK_SIZE + counts[b].
 
     Args:
         inputs, splats: as for project_slice.
         is_touched, sums: as sum_shares wrote them.
-        grads: float32 [B BLOCK * GRAD], written.
-        ids: int32 [B BLOCK], written: index of the Gaussian in its part.
+        grads: float32 [B BLOCK_SIZE * NUM_GRADIENTS], written.
+        ids: int32 [B BLOCK_SIZE], written: index of the Gaussian in its part.
         counts: int64 [B], written: rows of each block.
     """
     for block in prange(inputs.blocks.shape[0]):
@@ -402,17 +402,17 @@ def project_backward(inputs, splats, is_touched, sums, grads, ids, counts):
             slots[num_touched + lane] = slots[num_touched - Index(1)]
             gaussian_ids[num_touched + lane] = gaussian_ids[num_touched - Index(1)]
         # Arrays of the block's part.
-        count, functions = inputs.sizes[part]
+        count, num_stored_functions = inputs.sizes[part]
         means = floats_at(addresses[part, L.A_MEANS], count * 3)
         quats = floats_at(addresses[part, L.A_QUATS], count * 4)
         scales = floats_at(addresses[part, L.A_SCALES], count * 3)
-        sh = floats_at(addresses[part, L.A_SH], count * functions * 3)
-        num_functions = min(modes[L.M_NUM_SH_FUNCTIONS], functions)
+        sh = floats_at(addresses[part, L.A_SH], count * num_stored_functions * 3)
+        num_functions = min(modes[L.M_NUM_SH_FUNCTIONS], num_stored_functions)
         # Gradients of eight Gaussians, then their rows.
         for group in range(Index(0), num_touched, Index(NUM_LANES)):
             _color_backward(
                 sh,
-                Index(functions),
+                Index(num_stored_functions),
                 Index(num_functions),
                 means,
                 view,
@@ -439,7 +439,17 @@ def _write(rows, field, value):
 
 @kernel_function()
 def _color_backward(
-    sh, functions, num_functions, means, view, slots, gaussian_ids, group, records, sums, rows
+    sh,
+    num_stored_functions,
+    num_functions,
+    means,
+    view,
+    slots,
+    gaussian_ids,
+    group,
+    records,
+    sums,
+    rows,
 ):
     """Write the rows of colour, and of the mean as far as the direction changes the colour."""
     for lane in range(Index(NUM_LANES)):
@@ -454,7 +464,7 @@ def _color_backward(
         rows[Index(_SLOPES + G_COLOR) * Index(NUM_LANES) + lane] = red
         rows[Index(_SLOPES + G_COLOR + 1) * Index(NUM_LANES) + lane] = green
         rows[Index(_SLOPES + G_COLOR + 2) * Index(NUM_LANES) + lane] = blue
-        first = splat * functions * Index(3)
+        first = splat * num_stored_functions * Index(3)
         for k in range(Index(1), num_functions):
             c = first + k * Index(3)
             rows[k * Index(NUM_LANES) + lane] = (

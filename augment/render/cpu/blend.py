@@ -74,7 +74,7 @@ def scatter_to_bins(keys, splat_counts, first_bin, heads, binned_keys, binned_sl
     """Copy every block's keys, and the slots that they stand for, to their bins.
 
     Args:
-        keys: uint32 [B BLOCK], bits of z.
+        keys: uint32 [B BLOCK_SIZE], bits of z.
         splat_counts: int64 [B], splats of each block.
         first_bin: number of the first bin.
         heads: int64 [B, Z], position where each block writes its splats of each bin; used up.

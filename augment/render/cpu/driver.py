@@ -64,7 +64,7 @@ class Inputs:
 
     addresses, sizes, first_ids, views, blocks: see project.Parts.
     modes: see layout.
-    kept_alive: owners of the memory that the addresses point to.
+    array_owners: owners of the memory that the addresses point to.
     orders: see project.Parts; None if every part stands in its own order.
     """
 
@@ -115,7 +115,7 @@ def gather_inputs(
         fog: fog before the splats; None for clear air.
         clip: height at which splats are cut; None for no cut.
         with_color: if True, colours are computed.
-        culled: if True, blocks that the view cannot see are left out.
+        is_culled: if True, blocks that the view cannot see are left out.
     """
     kept_alive = list[Any]()
     addresses = []

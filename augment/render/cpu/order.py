@@ -1,6 +1,6 @@
 """Gaussians in an order in which neighbours stand together, and the blocks that a view leaves out.
 
-Each run of CELL Gaussians along a Morton curve (Morton 1966) lies in a box. A camera tests the
+Each run of CELL_SIZE Gaussians along a Morton curve (Morton 1966) lies in a box. A camera tests the
 boxes and reads only the runs that may be seen. Kernels get the original numbers, so no bit of an
 image depends on the order. An order is made when means are drawn for the second time: for a single
 image, and for Gaussians that change from view to view, it would cost more than it saves.

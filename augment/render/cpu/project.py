@@ -82,19 +82,19 @@ _C3_CUBIC, _C3_XYZ, _C3_ZZ, _C3_ZZZ, _C3_ZXX = map(
 
 
 @kernel_function()
-def prepare_colors(dx, dy, dz, view, functions, fog, rows):
+def prepare_colors(dx, dy, dz, view, num_functions, fog, rows):
     """Write SH functions and transmittance of eight splats.
 
     Args:
         dx, dy, dz: vectors from the eye, in the part's axes.
         view: numbers of the view.
-        functions: number of SH functions.
+        num_functions: number of SH functions.
         fog: mode of the fog.
         rows: COLOR_ROWS rows of eight numbers, flat; written.
     """
     distance = v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
     inverse = v8.broadcast(np.float32(1)) / distance
-    write_basis(dx * inverse, dy * inverse, dz * inverse, functions, rows)
+    write_basis(dx * inverse, dy * inverse, dz * inverse, num_functions, rows)
     if fog != L.NO_FOG:
         tau = v8.broadcast(view[L.V_EXTINCTION]) * distance
         if fog == L.LAYERED_FOG:
@@ -133,14 +133,14 @@ def _layered_density(dx, dy, dz, view):
 
 
 @kernel_function()
-def write_basis(x, y, z, functions, rows):
-    """Write the first `functions` spherical harmonics of unit directions (see render.sh)."""
+def write_basis(x, y, z, num_functions, rows):
+    """Write the first `num_functions` spherical harmonics of unit directions (see render.sh)."""
     v8.store(rows, Index(0 * NUM_LANES), v8.broadcast(_C0))
-    if functions > 1:
+    if num_functions > 1:
         v8.store(rows, Index(1 * NUM_LANES), v8.broadcast(-_C1) * y)
         v8.store(rows, Index(2 * NUM_LANES), v8.broadcast(_C1) * z)
         v8.store(rows, Index(3 * NUM_LANES), v8.broadcast(-_C1) * x)
-    if functions > 4:
+    if num_functions > 4:
         xx = x * x
         yy = y * y
         zz = z * z
@@ -151,7 +151,7 @@ def write_basis(x, y, z, functions, rows):
         v8.store(rows, Index(6 * NUM_LANES), v8.broadcast(_C2_ZZ) * (two * zz - xx - yy))
         v8.store(rows, Index(7 * NUM_LANES), v8.broadcast(-_C2_XY) * x * z)
         v8.store(rows, Index(8 * NUM_LANES), v8.broadcast(_C2_XX) * (xx - yy))
-        if functions > 9:
+        if num_functions > 9:
             three = v8.broadcast(np.float32(3))
             four = v8.broadcast(np.float32(4))
             v8.store(rows, Index(9 * NUM_LANES), v8.broadcast(-_C3_CUBIC) * y * (three * xx - yy))
@@ -168,13 +168,13 @@ def write_basis(x, y, z, functions, rows):
 
 
 @kernel_function()
-def write_color(sh, sh_start, functions, maps, map_start, view, fog, rows, lane, records, slot):
+def write_color(sh, sh_start, num_functions, maps, map_start, view, fog, rows, lane, records, slot):
     """Write max(0.5 + sum sh Y, 0), mapped and in the fog, to the record that starts at `slot`.
 
     Args:
         sh: SH coefficients, flat.
         sh_start: position of the splat's coefficients.
-        functions: number of SH functions.
+        num_functions: number of SH functions.
         maps: colour maps, flat.
         map_start: position of the splat's colour map; negative without one.
         view: numbers of the view.
@@ -183,7 +183,7 @@ def write_color(sh, sh_start, functions, maps, map_start, view, fog, rows, lane,
         records, slot: records, flat, and position of the splat's record.
     """
     r = g = b = np.float32(0.5)
-    for k in range(Index(functions)):
+    for k in range(Index(num_functions)):
         value = rows[k * Index(NUM_LANES) + lane]
         r = scalar_fmuladd(value, sh[sh_start], r)
         g = scalar_fmuladd(value, sh[sh_start + Index(1)], g)
@@ -219,14 +219,14 @@ def _map_channel(maps, row_start, r, g, b):
 
 
 @kernel_function()
-def add_direction_slopes(x, y, z, functions, rows):
+def add_direction_slopes(x, y, z, num_functions, rows):
     """Return the sum over SH functions k >= 1 of a row's weight times the function's slope by x, y,
     z.
 
     The slopes are those of the polynomials in `write_basis`; only their part across the direction
     has a meaning.
 
-    rows: flat; the weights of function k for eight splats start at k LANES.
+    rows: flat; the weights of function k for eight splats start at k NUM_LANES.
     """
     two = v8.broadcast(np.float32(2))
     three = v8.broadcast(np.float32(3))
@@ -234,7 +234,7 @@ def add_direction_slopes(x, y, z, functions, rows):
     gx = v8.negate(c1 * v8.load(rows, Index(3 * NUM_LANES)))
     gy = v8.negate(c1 * v8.load(rows, Index(1 * NUM_LANES)))
     gz = c1 * v8.load(rows, Index(2 * NUM_LANES))
-    if functions > Index(4):
+    if num_functions > Index(4):
         xy = v8.broadcast(_C2_XY)
         zz = v8.broadcast(_C2_ZZ)
         a4 = xy * v8.load(rows, Index(4 * NUM_LANES))
@@ -245,7 +245,7 @@ def add_direction_slopes(x, y, z, functions, rows):
         gx = gx + a4 * y - a6 * x - a7 * z + a8 * x
         gy = gy + a4 * x - a5 * z - a6 * y - a8 * y
         gz = gz - a5 * y + two * a6 * z - a7 * x
-    if functions > Index(9):
+    if num_functions > Index(9):
         four = v8.broadcast(np.float32(4))
         xx = x * x
         yy = y * y
@@ -285,7 +285,7 @@ _HUGE = np.float32(1e37)
 class Parts(NamedTuple):
     """Parts that are projected.
 
-    addresses: uint64 [P, ADDRESSES], see layout.
+    addresses: uint64 [P, NUM_ADDRESSES], see layout.
     sizes: int64 [P, 2], numbers of Gaussians and of SH functions.
     first_ids: int64 [P], index of each part's first Gaussian, counted through all parts.
     orders: uint64 [P], addresses of int32: the Gaussian at every place of means, quats, scales and
@@ -305,7 +305,8 @@ class Parts(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """Splats of a slice. Block b owns slots [b BLOCK, (b + 1) BLOCK) and fills the first of them.
+    """Splats of a slice. Block b owns slots [b BLOCK_SIZE, (b + 1) BLOCK_SIZE) and fills the first
+    of them.
 
     records: RECORD float32 of each slot, in the order of the block's places.
     rects: uint64, the tiles that a splat touches, as blend unpacks them.
@@ -332,7 +333,7 @@ def rank_splats(inputs, depths, histograms):
 
     Args:
         inputs: the parts.
-        depths: float32 [B BLOCK], written.
+        depths: float32 [B BLOCK_SIZE], written.
         histograms: float64 [C, 2, BINS], written: opacity times area (px^2) and number of the
             splats in each bin of z. Each of C runs of blocks has its own.
     """
@@ -471,19 +472,19 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
     base = block * BLOCK_SIZE
     # Gaussians of the slice, and the arrays of their part.
     num_picked = _pick_bins(depth_bits, base, first, last, bins, gaussian_ids)
-    count, functions = inputs.sizes[part]
+    count, num_stored_functions = inputs.sizes[part]
     means = floats_at(addresses[part, L.A_MEANS], count * 3)
     quats = floats_at(addresses[part, L.A_QUATS], count * 4)
     scales = floats_at(addresses[part, L.A_SCALES], count * 3)
     opacities = floats_at(addresses[part, L.A_OPACITIES], count)
-    sh = floats_at(addresses[part, L.A_SH], count * functions * 3)
+    sh = floats_at(addresses[part, L.A_SH], count * num_stored_functions * 3)
     slopes = floats_at(addresses[part, L.A_SLOPES], count * 3 if view[L.V_LIT] > 0 else 1)
     map_count = np.int64(view[L.V_MAPS])
     maps = floats_at(addresses[part, L.A_MAPS], max(map_count, 1) * MAP)
     map_rows = shorts_at(addresses[part, L.A_ROWS], count if map_count > 1 else 1)
     is_ordered = inputs.orders[part] != Index(0)
     order = floats_at(inputs.orders[part], count if is_ordered else 1)
-    num_functions = min(modes[L.M_NUM_SH_FUNCTIONS], functions)
+    num_functions = min(modes[L.M_NUM_SH_FUNCTIONS], num_stored_functions)
     # Project eight Gaussians, then write those that touch an open tile one by one.
     slot = Index(base)
     for group in range(Index(0), Index(num_picked), Index(NUM_LANES)):
@@ -500,7 +501,7 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
             _write_record(rows, lane, inputs.first_ids[part] + splat, records, record)
             records[record + Index(L.IS_OVERLAY)] = view[L.V_OVERLAY]
             if modes[L.M_COLOR]:
-                sh_start = Index(splat) * Index(functions * 3)
+                sh_start = Index(splat) * Index(num_stored_functions * 3)
                 map_start = _map_start(map_rows, splat, map_count)
                 write_color(
                     sh,
@@ -650,7 +651,7 @@ def _write_lights(slopes, splat, fog, view, rows, lane, lights, slot):
 
 @kernel_function()
 def _project_eight(
-    means, quats, scales, opacities, view, gaussian_ids, group, functions, modes, rows
+    means, quats, scales, opacities, view, gaussian_ids, group, num_functions, modes, rows
 ):
     """Write records, pixel boxes and colour rows of eight Gaussians, side by side in `rows`."""
     # SH functions and fog towards the eye.
@@ -658,7 +659,7 @@ def _project_eight(
     if modes[L.M_COLOR]:
         directions = rotation_row(view, Index(2)) if view[L.V_PARALLEL] > 0 else d
         prepare_colors(
-            directions[0], directions[1], directions[2], view, functions, modes[L.M_FOG], rows
+            directions[0], directions[1], directions[2], view, num_functions, modes[L.M_FOG], rows
         )
     # Centre in the camera, and covariance in the image.
     x, y, z = to_camera(d, view)

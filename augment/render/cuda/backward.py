@@ -29,7 +29,7 @@ from augment.scene import PosedGaussians
 
 # ---- Gradients of colours on the GPU: the transposed blend, then the spherical harmonics ---------
 #     color_gradients(splats, tiles, camera, settings, d_rgb)   dL by every splat's colour
-#     sh_gradients(means, view, d_colors, functions, used)      dL by one part's sh
+#     sh_gradients(means, view, d_colors, ...)                  dL by one part's sh
 #
 # Only colours move: order, alpha and transmittance are constants of the image, so nothing of the
 # forward blend is kept but its lists. The same bits come out every time.
@@ -102,15 +102,15 @@ def sh_gradients(
     means: Float32[Tensor, "M 3"],
     view: Float32[Tensor, "V"],
     d_colors: Float32[Tensor, "M 3"],
-    functions: int,
-    used: int,
+    num_stored_functions: int,
+    num_functions: int,
 ) -> Float32[Tensor, "M K 3"]:
-    """Return dL by the sh of a part, [M, K = functions, 3]; 0 in functions from `used` on.
+    """Return dL by the sh of a part, [M, K, 3]; 0 in functions from `num_functions` on.
 
     view: numbers of the camera's view of the part (layout's V_*).
     """
-    values = 3 * functions
-    d_sh = torch.empty(len(means), functions, 3, device=means.device)
+    values = 3 * num_stored_functions
+    d_sh = torch.empty(len(means), num_stored_functions, 3, device=means.device)
     launch(
         kernels.spread_to_sh,
         (-(-len(means) // _SH_SPLATS),),
@@ -119,7 +119,7 @@ def sh_gradients(
         d_colors,
         d_sh,
         len(means),
-        used,
+        num_functions,
         SPLATS=_SH_SPLATS,
         VALUES=values,
         COLUMNS=1 << (values - 1).bit_length(),
@@ -202,14 +202,16 @@ class _Rasterize(torch.autograd.Function):
         gradients: list[Tensor | None] = [None]
         first = 0
         for number, means in enumerate(ctx.saved_tensors):
-            device, functions = ctx.sh_layouts[number]
+            device, num_stored_functions = ctx.sh_layouts[number]
             part_d_colors = d_colors[first : first + len(means)]
             first += len(means)
             if not ctx.needs_input_grad[1 + number]:
                 gradients.append(None)
                 continue
-            num_functions = min(ctx.max_functions, functions)
-            d_sh = sh_gradients(means, ctx.views[number], part_d_colors, functions, num_functions)
+            num_functions = min(ctx.max_functions, num_stored_functions)
+            d_sh = sh_gradients(
+                means, ctx.views[number], part_d_colors, num_stored_functions, num_functions
+            )
             gradients.append(d_sh.to(device))
         return tuple(gradients)
 

@@ -235,12 +235,12 @@ def through_fog(d, distance, view, FOG: tl.constexpr):
 
 
 @triton.jit
-def color_of(sh, functions, directions, distance, mask, FUNCTIONS: tl.constexpr):
+def color_of(sh, num_functions, directions, distance, mask, FUNCTIONS: tl.constexpr):
     """Return max(0.5 + sum sh Y, 0).
 
     Args:
         sh: pointers to every splat's coefficients.
-        functions: number of SH functions of a splat.
+        num_functions: number of SH functions of a splat.
         directions: vectors from the eye, in the part's axes, of length `distance`.
         distance: their lengths.
         mask: splats that are drawn.
@@ -253,8 +253,8 @@ def color_of(sh, functions, directions, distance, mask, FUNCTIONS: tl.constexpr)
     basis = sh_basis(x, y, z, FUNCTIONS)
     half = tl.full(x.shape, 0.5, tl.float32)
     color = (half, half, half)
-    num_read = tl.where(mask, functions, 0)
-    if functions % 4 == 0:
+    num_read = tl.where(mask, num_functions, 0)
+    if num_functions % 4 == 0:
         color = _sum_fours(color, sh, basis, num_read, FUNCTIONS)
     else:
         color = _sum_ones(color, sh, basis, num_read, FUNCTIONS)
@@ -628,9 +628,9 @@ def project_gaussians(
         if tl.load(view + V_PARALLEL) > 0.0:
             directions = (t[0] + zero, t[1] + zero, t[2] + zero)
         distance = tl.sqrt(dot(directions, directions))
-        functions = tl.load(row + T_FUNCTIONS).to(tl.int32)
-        sh = floats_at(tl.load(row + A_SH)) + first * 3 * functions + lane * 3 * functions
-        color = color_of(sh, functions, directions, distance, is_drawn, FUNCTIONS)
+        num_functions = tl.load(row + T_FUNCTIONS).to(tl.int32)
+        sh = floats_at(tl.load(row + A_SH)) + first * 3 * num_functions + lane * 3 * num_functions
+        color = color_of(sh, num_functions, directions, distance, is_drawn, FUNCTIONS)
         map_count = tl.load(view + V_MAPS).to(tl.int32)
         if map_count > 0:
             maps = floats_at(tl.load(row + A_MAPS))

@@ -26,8 +26,8 @@ from augment.scene import Gaussians, PosedGaussians
 # Gaussians that one program projects, all of one part.
 BLOCK = 128
 
-# A part's row in the table: ADDRESSES (see layout), its Gaussians, the SH functions of each, and
-# how many Gaussians and how many programs the parts before it take.
+# A part's row in the table: NUM_ADDRESSES (see layout), its Gaussians, the SH functions of each,
+# and how many Gaussians and how many programs the parts before it take.
 T_COUNT, T_FUNCTIONS, T_FIRST, T_BLOCK = range(layout.NUM_ADDRESSES, layout.NUM_ADDRESSES + 4)
 COLUMNS = T_BLOCK + 1
 
