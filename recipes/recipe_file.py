@@ -134,7 +134,7 @@ class Leaf:
         return self.kind in (int, float)
 
     @cached_property
-    def list_words(self) -> tuple[str, ...]:
+    def word_list(self) -> tuple[str, ...]:
         """Return the words that a list in the field's place may hold; none if it takes no list."""
         items = [part.get("items", {}) for part in self._schema.get("anyOf", ())]
         return tuple(str(word) for item in items for word in item.get("enum", ()))
@@ -197,8 +197,8 @@ class Leaf:
             text = f"[red, green, blue], each {self.channel.describe_allowed_values()}"
         elif self.is_number:
             text = self._allowed_number(value) + (f" ({self.unit})" if self.unit else "")
-        elif self.list_words:
-            text = f"true, false or a list of {', '.join(self.list_words)}"
+        elif self.word_list:
+            text = f"true, false or a list of {', '.join(self.word_list)}"
         elif self.kind is bool or "anyOf" in self._schema:
             *first, last = ("true", "false", *self.allowed_words)
             text = f"{', '.join(first)} or {last}"
@@ -248,7 +248,7 @@ class Leaf:
             channels = handler(node)
             numbers = [channel.value for channel in channels if isinstance(channel, Fixed)]
             return Fixed(as_triple(numbers)) if len(numbers) == 3 else Channels(channels)
-        if self.list_words and isinstance(node, ListNode):
+        if self.word_list and isinstance(node, ListNode):
             value: Any = tuple(getattr(item, "value", None) for item in node)
         elif isinstance(node, ListNode):
             raise refusal(f"must be {self.describe_allowed_values()}{guess_value(node, self)}")

@@ -470,14 +470,17 @@ def _summaries(records: Iterable[dict[str, Any]], names: Sequence[str]) -> list[
     return [
         {
             **{name: group[0][name] for name in (*names, "effects")},
-            **{kind: _of_kind([r for r in group if r["kind"] == kind]) for kind in KINDS},
+            **{kind: _summarise_pairs([r for r in group if r["kind"] == kind]) for kind in KINDS},
         }
         for group in groups.values()
     ]
 
 
-def _of_kind(records: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Summarise pairs of one kind; None where there are no pairs."""
+def _summarise_pairs(records: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Summarise the pairs of one kind (between frames, or between cameras); None without pairs.
+
+    A pair without an error over all pixels had nothing to compare: it is counted as left out.
+    """
     if not records:
         return None
     usable_records = [r for r in records if r[ALL]["rmse"] is not None]

@@ -430,7 +430,17 @@ def _bars(
 
 
 def _visible(paths: Mapping[str, str | None], files: ReportFiles) -> np.ndarray | None:
-    """Return the visible share of every box that a pixel shows, float64 [boxes], of a variant."""
+    """Return the share that the weather leaves visible of each box that covers a pixel.
+
+    Each table counts what one effect hides; the product over the tables is what all leave visible.
+
+    Args:
+        paths: path of each label table of a variant, by the manifest's column.
+        files: reads the tables, and notes those that cannot be read.
+
+    Returns:
+        float64 [boxes]; None if a table cannot be read, or if there is none.
+    """
     parts = []
     for column, path in paths.items():
         if path is None:

@@ -563,7 +563,8 @@ def _mark(facts: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _open(obs: Any, place: _Place, retry_settings: RetrySettings) -> Any:
-    """Return obstore's store of the place."""
+    """Return the obstore client (Azure, Google or S3) of a URI, with its credentials, endpoint,
+    timeouts and retries."""
     backoff = {"init_backoff": timedelta(seconds=retry_settings.first_wait_s)}
     retry = {"max_retries": retry_settings.retries, "backoff": backoff}
     client_options: dict[str, Any] = {

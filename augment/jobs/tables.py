@@ -113,11 +113,15 @@ def column_texts(data: pa.ChunkedArray) -> list[str]:
 
 
 def unpack_column(data: pa.ChunkedArray, kind: str, encoding: str) -> np.ndarray:
-    """Return the NumPy column that was packed.
+    """Return the NumPy column that `pack_column` stored, with the same bits and dtype.
 
     Args:
-        kind: Its `column_type`.
-        encoding: Its encoding, as of PackedColumn.
+        data: the stored column.
+        kind: text of its dtype with the shape of a row, as `column_type` gives it.
+        encoding: "json", or another `PackedColumn.encoding`.
+
+    Raises:
+        ValueError: the column has missing values.
     """
     packed_dtype = np.dtype(kind)
     dtype = packed_dtype.base

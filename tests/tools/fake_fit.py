@@ -131,7 +131,9 @@ class Fakes:
         stand_ins = {
             "open_scene": self._open,
             "RecordedViews": lambda scene, **options: FakeViews(scene, options["holdout"]),
-            "check_views": lambda *_: SimpleNamespace(time_offset_s=None, problems=(), report_facts={}),
+            "check_views": lambda *_: SimpleNamespace(
+                time_offset_s=None, problems=(), report_facts={}
+            ),
             "complete_starting_scene": lambda scene, source: scene,
             "Trainer": self._trainer,
             "evaluate_views": lambda *asked, with_flip: asked,

@@ -5,7 +5,7 @@ Input: a `Scene`, the cameras that must see the surfaces, `ExposureSettings`. Ou
 `support.exposed_surface_of`.
 
 1. `plan_tiles` plans square tiles about the cameras' path, with finer cells near it.
-2. `draw_views` renders the depth that some cameras along the drive see.
+2. `draw_views` renders the depth that a sample of the cameras along the drive sees.
 3. `_GroundSearch.find` works on one square of tiles at a time, each with a margin: it renders the
    square from above, closes holes, separates the surfaces, keeps the cells that a camera sees, and
    finds their light, wheel tracks and obstacles.
@@ -740,7 +740,17 @@ def draw_tracks(paths: Iterable[WheelPath], surface: Surface, classes: np.ndarra
 
 
 def _extended_path(poses: np.ndarray, extension_m: float) -> np.ndarray:
-    """Places of poses [T, 4, 4] at least _MIN_POSE_STEP_M apart, extended at both ends, [P, 3]."""
+    """Return the path of a vehicle, continued straight beyond both ends of the drive.
+
+    Tiles then also cover the ground that the cameras see beyond the drive.
+
+    Args:
+        poses: poses of the vehicle, x forward, [T, 4, 4].
+        extension_m: how far the path goes on at each end, metres; one point a metre.
+
+    Returns:
+        Points [P, 3]; those of the drive are at least _MIN_POSE_STEP_M apart.
+    """
     points = [poses[0, :3, 3]]
     for position in poses[1:, :3, 3]:
         if np.linalg.norm(position - points[-1]) >= _MIN_POSE_STEP_M:

@@ -1,4 +1,4 @@
-"""Numba kernels of wet ground: which pixels show it, and what its film mirrors.
+"""Numba kernels of wet ground: which pixels show it, and what its film of water mirrors.
 
 `reflection` and `ripples` define what they compute, and launch them.
 """
@@ -222,7 +222,18 @@ def _read_matrix(m):
 
 @kernel_function()
 def _find_cells(px, py, view, texels, spare):
-    """Tell if points from the eye lie on the map, and find the cells below left of them."""
+    """Return which points lie on the map, and store the cell and the weights of each in `texels`.
+
+    The cell is the one at the lower corner (the floor of both coordinates). Coordinates on the map
+    are offset * cells per metre + the eye's own.
+
+    Args:
+        px: x of eight points, offsets from the eye, metres.
+        py: y of the points, likewise.
+        view: the map's size, and the eye on it: coordinates in cells, and cells per metre.
+        texels: receives the cells and weights, see `_store_texels`.
+        spare: work space of `_store_texels`.
+    """
     eye = view.eye
     zero = _splat(0)
     per_m = v8.broadcast(view.eye[2])

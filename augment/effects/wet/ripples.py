@@ -1,16 +1,16 @@
 """Draws the rings of drops on standing water: the torch definition.
 
 Callers: wet ground (`ring_slopes`) and floods (`add_ring_waves`). The plane is cut into squares. In
-each square, a few drops at a time meet the water; a hash of the square, the drop's number and the
-number of its falls says which drops fall and where. So the rings at a moment are a pure function of
-seed, place and time. A ring of capillary waves runs at their least speed and fades. Its slope at a
-distance d from the drop, at an age of a share t of its life, is
+each square, a few drops at a time meet the water. A hash of the seed, the square, the drop's number
+and the number of its falls says which drops fall and where. So the rings at a moment are a pure
+function of seed, place and time. A ring spreads at the lowest speed of capillary waves, and fades.
+Its slope at a distance d from the drop, when a share t of its life has passed, is
 
-    RING_SLOPE (1 - t)^2 sin(2 pi x / RING_WAVE_M) exp(-(x / RING_WIDTH_M)^2),   x = d - SPEED_MPS
-    age
+    RING_SLOPE (1 - t)^2 sin(2 pi x / RING_WAVE_M) exp(-(x / RING_WIDTH_M)^2)
+    x = d - SPEED_MPS * age
 
-along the line to the drop. Drops beyond those few, and rings too fine for a pixel, are a variance
-of slope, of the same sum.
+along the line to the drop. Further drops, and rings finer than a pixel, are not drawn. They add to
+the variance of slope, so that its total stays the same.
 """
 
 from __future__ import annotations
@@ -182,10 +182,17 @@ ROWS_PER_TASK = 8  # number of image rows that a thread takes at a time
 def add_ring_waves(
     field: WaveField, camera: Camera, level_z_m: float, rings: Rings, *, backend: str = AUTO
 ) -> WaveField:
-    """Return the surface of a level plane with drops' rings on its waves.
+    """Return the waves of level water with the rings of drops added.
 
-    Rings show where the camera looks down at the plane. backend: the CPU's kernel equals the
-    definition within float rounding.
+    Pixels whose ray does not fall towards the water stay as they are. The CPU's kernel and the
+    torch code agree within float rounding.
+
+    Args:
+        field: normals and variance of slope of the waves, by pixel.
+        camera: the camera that sees the water.
+        level_z_m: height of the water, world z, metres.
+        rings: the rings at a moment.
+        backend: AUTO chooses the CPU's kernel where the field lies there.
     """
     height = float(camera.centre[2]) - level_z_m
     if rings.variance == 0 or height <= 0:
