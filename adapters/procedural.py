@@ -363,16 +363,18 @@ class StreetLabels:
         reflectivity = np.array([REFLECTIVITY.get(value, 0.0) for value in SemanticClass])
         incidence = np.abs((hits.normal[returns] * direction[returns]).sum(1))
         intensity = reflectivity[semantic] * (0.25 + 0.75 * incidence) * np.exp(-distance / 150)
-        return LidarSweep({
-            "x": x,
-            "y": y,
-            "z": z,
-            "intensity": intensity.astype(np.float32),
-            "timestamp_ns": time[returns],
-            "ring": np.tile(np.arange(rings), len(times))[returns].astype(np.uint8),
-            "semantic": semantic.astype(np.uint8),
-            "instance": hits.instance[returns].astype(np.uint16),
-        })  # fmt: skip
+        return LidarSweep(
+            {
+                "x": x,
+                "y": y,
+                "z": z,
+                "intensity": intensity.astype(np.float32),
+                "timestamp_ns": time[returns],
+                "ring": np.tile(np.arange(rings), len(times))[returns].astype(np.uint8),
+                "semantic": semantic.astype(np.uint8),
+                "instance": hits.instance[returns].astype(np.uint16),
+            }
+        )
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray:
         """Return the SemanticClass of each return: the sweep's own numbers."""

@@ -76,9 +76,18 @@ _IN_USE_S = 86_400.0
 MAX_BUILDING_S = 1800.0  # how long to wait for another process that builds the same scene
 _CODE = ("adapters", "augment", "recipes")
 _LIBRARIES = (
-    "climategs", "numpy", "scipy", "numba", "torch", "opencv-contrib-python-headless",
-    "opencv-python-headless", "opencv-python", "pandas", "pyarrow", "open3d",
-)  # fmt: skip
+    "climategs",
+    "numpy",
+    "scipy",
+    "numba",
+    "torch",
+    "opencv-contrib-python-headless",
+    "opencv-python-headless",
+    "opencv-python",
+    "pandas",
+    "pyarrow",
+    "open3d",
+)
 
 
 def cached_scene(

@@ -392,9 +392,11 @@ class Photo:
         numbers = *numbers, (*fall, math.inf if self.height_m is None else MIN_ROAD_FALL)
         with kernel_threads(ROWS_PER_THREAD):
             kernels.compute_sky_share(
-                alpha.detach().numpy(), marks.detach().numpy(),
-                *(np.asarray(n, np.float32) for n in numbers), out,
-            )  # fmt: skip
+                alpha.detach().numpy(),
+                marks.detach().numpy(),
+                *(np.asarray(n, np.float32) for n in numbers),
+                out,
+            )
         return torch.from_numpy(out)
 
     def _in_both_on_cpu(self, style: PhotoStyle, share: Tensor) -> Tensor:

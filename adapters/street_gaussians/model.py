@@ -300,9 +300,13 @@ def make_part(
 
 _PART_TENSORS = ("xyz", "feature_dc", "feature_rest", "scaling", "rotation", "opacity", "semantic")
 _TRAINING_KEYS = (
-    "spatial_lr_scale", "denom", "max_radii2D", "xyz_gradient_accum", "active_sh_degree",
+    "spatial_lr_scale",
+    "denom",
+    "max_radii2D",
+    "xyz_gradient_accum",
+    "active_sh_degree",
     "optimizer",
-)  # fmt: skip
+)
 # Numbers that are copied at a time.
 _CHUNK_NUMBERS = 1 << 18
 

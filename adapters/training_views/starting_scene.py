@@ -53,8 +53,11 @@ _MARGIN_M = 0.01  # from the body's outermost splats to its box
 _BODY_SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
 
 _WALLS = (
-    SemanticClass.BUILDING, SemanticClass.BARRIER, SemanticClass.VEGETATION, SemanticClass.UNKNOWN,
-)  # fmt: skip
+    SemanticClass.BUILDING,
+    SemanticClass.BARRIER,
+    SemanticClass.VEGETATION,
+    SemanticClass.UNKNOWN,
+)
 _WALL_COLUMNS = 240  # of the images in which walls are continued: one disc a pixel
 _MAX_WALL_IMAGES = 48  # in which walls are continued
 _MAX_WALL_M = 80.0  # beyond, a LiDAR's channels lie so far apart that a surface's end is unknown

@@ -250,10 +250,17 @@ def _unchanged(value: Any, *_: Any) -> Any:
 def _names() -> dict[tuple[str, str], Callable[..., Any]]:
     """Map the modules and names that a checkpoint may use to the functions that replace them."""
     torch_dtypes = {
-        "Double": torch.float64, "Float": torch.float32, "Half": torch.float16,
-        "BFloat16": torch.bfloat16, "Long": torch.int64, "Int": torch.int32, "Short": torch.int16,
-        "Char": torch.int8, "Byte": torch.uint8, "Bool": torch.bool,
-    }  # fmt: skip
+        "Double": torch.float64,
+        "Float": torch.float32,
+        "Half": torch.float16,
+        "BFloat16": torch.bfloat16,
+        "Long": torch.int64,
+        "Int": torch.int32,
+        "Short": torch.int16,
+        "Char": torch.int8,
+        "Byte": torch.uint8,
+        "Bool": torch.bool,
+    }
     storages = {f"{name}Storage": _StorageType(dtype) for name, dtype in torch_dtypes.items()}
     dtype_names = {str(d).removeprefix("torch."): _StorageType(d) for d in torch_dtypes.values()}
     return {

@@ -37,11 +37,23 @@ _COUNT_PATTERN = re.compile(r"[0-9]{1,18}")
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "ascii"}
 # numpy's type codes of the property types.
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 
 
 @dataclass(frozen=True)
@@ -258,8 +270,14 @@ def _parse_rows(file: BinaryIO, count: int, dtype: np.dtype, where: str, start: 
 # values of red, then of green, then of blue.
 
 SEMANTIC = "semantic_class"  # the column of semantic classes
-_GEOMETRY_COLUMNS = ("x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)),
-             *(f"rot_{i}" for i in range(4)))  # fmt: skip
+_GEOMETRY_COLUMNS = (
+    "x",
+    "y",
+    "z",
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+)
 _DC_COLUMNS = ("f_dc_0", "f_dc_1", "f_dc_2")
 # Columns of 8-bit colour that replace f_dc.
 _RGB_COLUMNS = {"f_dc_0": "red", "f_dc_1": "green", "f_dc_2": "blue"}

@@ -77,9 +77,16 @@ _SKY_ARRAYS = {"constant": "rgb", "latlong": "image", "cubemap": "faces"}  # the
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")  # arrays of Gaussians
 _HALF_ARRAYS = ("quats", "opacities", "sh", "waves")  # arrays that float16 files store as float16
 _ROW_SHAPES = {  # shape of a row of each array; None stands for any length
-    "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (None, 3),
-    "waves": (None, 3), "rgb": (), "image": (None, 3), "faces": (None, None, 3),
-}  # fmt: skip
+    "means": (3,),
+    "quats": (4,),
+    "scales": (3,),
+    "opacities": (),
+    "sh": (None, 3),
+    "waves": (None, 3),
+    "rgb": (),
+    "image": (None, 3),
+    "faces": (None, None, 3),
+}
 _MIN_FLOAT16_OVERFLOW = 65520  # the smallest number that float16 rounds to infinity
 
 
@@ -214,9 +221,15 @@ def _half(values: Tensor, where: str) -> Tensor:
 
 
 def _take_part(
-    tensors: dict[str, Tensor], part: str, count: int, precision: Precision, has_waves: bool,
-    where: str, *, is_read: bool = True,
-) -> SavedPart:  # fmt: skip
+    tensors: dict[str, Tensor],
+    part: str,
+    count: int,
+    precision: Precision,
+    has_waves: bool,
+    where: str,
+    *,
+    is_read: bool = True,
+) -> SavedPart:
     """Remove the arrays of one part from `tensors`; check shapes, types and classes."""
     columns = {
         name: _take_array(tensors, f"{part}.{name}", name, count, precision, where)
@@ -251,9 +264,13 @@ def _take_part(
 
 
 def _take_array(
-    tensors: dict[str, Tensor], name: str, kind: str, count: int | None, precision: Precision,
+    tensors: dict[str, Tensor],
+    name: str,
+    kind: str,
+    count: int | None,
+    precision: Precision,
     where: str,
-) -> Tensor:  # fmt: skip
+) -> Tensor:
     """Remove an array of `count` rows from `tensors` and check it.
 
     Args:

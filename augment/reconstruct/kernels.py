@@ -850,16 +850,32 @@ def update_splats(
                 first = corrections[Index(2) * n]
                 second = corrections[Index(2) * n + Index(1)]
                 _update_geometry(
-                    (means, quats, scales, opacities), splat, rows, row,
-                    basis[Index(_MAX_SH * NUM_LANES) + lane], rates, min_scales_m[moment_row],
+                    (means, quats, scales, opacities),
+                    splat,
+                    rows,
+                    row,
+                    basis[Index(_MAX_SH * NUM_LANES) + lane],
+                    rates,
+                    min_scales_m[moment_row],
                     (first, second),
-                    (state.geometry_m, state.geometry_v), moment_row * Index(GEOMETRY), work,
-                )  # fmt: skip
+                    (state.geometry_m, state.geometry_v),
+                    moment_row * Index(GEOMETRY),
+                    work,
+                )
                 _update_sh(
-                    sh, splat * Index(num_sh) * Index(3), rows, row, basis, lane,
-                    Index(num_functions), rates, (first, second), (state.sh_m, state.sh_v),
-                    moment_row * Index(num_sh) * Index(3), work,
-                )  # fmt: skip
+                    sh,
+                    splat * Index(num_sh) * Index(3),
+                    rows,
+                    row,
+                    basis,
+                    lane,
+                    Index(num_functions),
+                    rates,
+                    (first, second),
+                    (state.sh_m, state.sh_v),
+                    moment_row * Index(num_sh) * Index(3),
+                    work,
+                )
 
 
 @kernel_function()

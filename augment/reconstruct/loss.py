@@ -207,10 +207,18 @@ def view_loss(
     total += weights.depth * depth + weights.surface * surface + weights.sky * sky
     total += weights.ground * ground
     return ViewLoss(
-        total=total, l1=l1, ssim=ssim, depth=depth, sky=sky, d_rgb=buffers.d_rgb,
-        d_alpha=buffers.d_alpha, d_expected_depth=buffers.d_expected_depth, d_color_map=d_color_map,
-        d_sky=d_sky, surface=surface,
-    )  # fmt: skip
+        total=total,
+        l1=l1,
+        ssim=ssim,
+        depth=depth,
+        sky=sky,
+        d_rgb=buffers.d_rgb,
+        d_alpha=buffers.d_alpha,
+        d_expected_depth=buffers.d_expected_depth,
+        d_color_map=d_color_map,
+        d_sky=d_sky,
+        surface=surface,
+    )
 
 
 def _compare(
@@ -236,9 +244,16 @@ def _compare(
     slopes = buffers.slopes
     weight_plane = buffers.weights
     kernels.compare(
-        rgb.reshape(-1), alpha.reshape(-1), sky, flat_map, recorded, weight, is_sky, size,
+        rgb.reshape(-1),
+        alpha.reshape(-1),
+        sky,
+        flat_map,
+        recorded,
+        weight,
+        is_sky,
+        size,
         (buffers.composite, pairs, weight_plane, buffers.sums.reshape(-1), buffers.alpha_in_sky),
-    )  # fmt: skip
+    )
     error_sum, weight_sum = buffers.sums.sum(axis=(0, 2), dtype=np.float64).tolist()
     alpha_in_sky = float(buffers.alpha_in_sky.sum())
     num_values = 3 * weight_sum
@@ -251,10 +266,19 @@ def _compare(
     value_weight = 1 / num_values if num_values > 0 else 0.0
     factors = ((1 - weights.d_ssim) * value_weight, ssim_factor, weights.sky / num_pixels)
     kernels.differentiate(
-        sky, flat_map, is_sky, buffers.composite, pairs, slopes, weight_plane, size,
-        np.array(factors, np.float32), buffers.d_rgb.reshape(-1), buffers.d_alpha.reshape(-1),
+        sky,
+        flat_map,
+        is_sky,
+        buffers.composite,
+        pairs,
+        slopes,
+        weight_plane,
+        size,
+        np.array(factors, np.float32),
+        buffers.d_rgb.reshape(-1),
+        buffers.d_alpha.reshape(-1),
         buffers.map_sums.reshape(-1),
-    )  # fmt: skip
+    )
     d_color_map = buffers.map_sums.sum(axis=(0, 3), dtype=np.float64)
     return error_sum * value_weight, ssim, alpha_in_sky / num_pixels, d_color_map
 
@@ -303,11 +327,16 @@ def _compare_depth(
         return 0.0
     sums = np.empty(-(-len(view.depth_pixels) // kernels.CHUNK))
     kernels.compare_depth(
-        expected_depth.reshape(-1), alpha.reshape(-1), _writeable(view.depth_pixels),
-        _writeable(view.depth_m), _writeable(view.depth_weight),
-        np.float32(weights.depth / weight_sum), np.float32(MIN_ALPHA),
-        buffers.d_expected_depth.reshape(-1), sums,
-    )  # fmt: skip
+        expected_depth.reshape(-1),
+        alpha.reshape(-1),
+        _writeable(view.depth_pixels),
+        _writeable(view.depth_m),
+        _writeable(view.depth_weight),
+        np.float32(weights.depth / weight_sum),
+        np.float32(MIN_ALPHA),
+        buffers.d_expected_depth.reshape(-1),
+        sums,
+    )
     if sums.min() < 0:
         raise ValueError(
             f"view of camera {view.camera.name!r}: depth_pixels must be increasing indices from 0 "

@@ -82,13 +82,21 @@ class Splats:
                 semantic[start : start + len(part)] = part.semantic.numpy()
             start += len(part)
         return Splats(
-            starts=np.cumsum([0, *counts], dtype=np.int64), means=join("means"),
-            quats=join("quats"), scales=join("scales"), opacities=join("opacities"), sh=sh,
-            semantic=semantic, geometry_m=np.zeros((total, GEOMETRY), np.float32),
-            geometry_v=np.zeros((total, GEOMETRY), np.float32), sh_m=np.zeros_like(sh),
-            sh_v=np.zeros_like(sh), age=np.zeros(total, np.int32),
-            grads=np.zeros((total, 3), np.float32), min_scale_m=np.zeros(total, np.float32),
-        )  # fmt: skip
+            starts=np.cumsum([0, *counts], dtype=np.int64),
+            means=join("means"),
+            quats=join("quats"),
+            scales=join("scales"),
+            opacities=join("opacities"),
+            sh=sh,
+            semantic=semantic,
+            geometry_m=np.zeros((total, GEOMETRY), np.float32),
+            geometry_v=np.zeros((total, GEOMETRY), np.float32),
+            sh_m=np.zeros_like(sh),
+            sh_v=np.zeros_like(sh),
+            age=np.zeros(total, np.int32),
+            grads=np.zeros((total, 3), np.float32),
+            min_scale_m=np.zeros(total, np.float32),
+        )
 
     def gaussians(self, part: int) -> Gaussians:
         """Return a copy of one part."""
@@ -361,9 +369,14 @@ class Sightings:
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
         with kernel_threads():
             kernels.update_sightings(
-                splats.means[rows], camera_from_part.astype(np.float32), intrinsics, sky,
-                self.px_per_m[rows], self.num_views[rows], self.num_in_sky[rows],
-            )  # fmt: skip
+                splats.means[rows],
+                camera_from_part.astype(np.float32),
+                intrinsics,
+                sky,
+                self.px_per_m[rows],
+                self.num_views[rows],
+                self.num_in_sky[rows],
+            )
 
     @property
     def is_refuted(self) -> np.ndarray:
@@ -492,10 +505,16 @@ class ColorAdam:
         """
         with kernel_threads():
             kernels.update_rows(
-                self._values.reshape(-1), self._m.reshape(-1), self._v.reshape(-1), self._count,
-                rows, gradient, np.float32(rate), np.array([BETA1, BETA2], np.float32),
+                self._values.reshape(-1),
+                self._m.reshape(-1),
+                self._v.reshape(-1),
+                self._count,
+                rows,
+                gradient,
+                np.float32(rate),
+                np.array([BETA1, BETA2], np.float32),
                 CORRECTIONS.reshape(-1),
-            )  # fmt: skip
+            )
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the moments and counts themselves, by name."""

@@ -704,9 +704,16 @@ class Trainer:
         with _timed(stages, "densify"):
             self._densify()
         return StepRecord(
-            step=self.step, key=key, loss=loss.total, l1=loss.l1, ssim=loss.ssim, depth=loss.depth,
-            sky=loss.sky, splats=len(self.splats), stage_s=stages,
-        )  # fmt: skip
+            step=self.step,
+            key=key,
+            loss=loss.total,
+            l1=loss.l1,
+            ssim=loss.ssim,
+            depth=loss.depth,
+            sky=loss.sky,
+            splats=len(self.splats),
+            stage_s=stages,
+        )
 
     def scene(self) -> Scene:
         """Return the scene as fitted so far; it shares nothing with the trainer."""
@@ -829,11 +836,17 @@ class Trainer:
         forces = part_forces(inputs, grads)
         with kernel_threads():
             update_splats(
-                inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
-                GradientRows(grads.rows.reshape(-1), grads.ids, grads.counts), self._num_sh,
-                splat_rates(rates, done_fraction, camera, self._extent_m), CORRECTIONS.reshape(-1),
+                inputs.addresses,
+                inputs.sizes,
+                inputs.views,
+                inputs.blocks,
+                inputs.first_ids,
+                GradientRows(grads.rows.reshape(-1), grads.ids, grads.counts),
+                self._num_sh,
+                splat_rates(rates, done_fraction, camera, self._extent_m),
+                CORRECTIONS.reshape(-1),
                 splats.adam_state(),
-            )  # fmt: skip
+            )
         if loss.d_sky is not None:
             rate = decayed(rates.sky, rates.sky_end, done_fraction)
             is_sky = self._is_sky[loss.d_sky.texels]
@@ -858,9 +871,12 @@ class Trainer:
         growth = self._tuning.growth
         if config.densify != "none" and densify_due(growth, self.step, self._steps):
             self.splats = densify(
-                self.splats, growth, max_splats=config.max_splats, extent_m=self._extent_m,
+                self.splats,
+                growth,
+                max_splats=config.max_splats,
+                extent_m=self._extent_m,
                 refuted=self._update_sightings(with_actors=False),
-            )  # fmt: skip
+            )
 
     def _update_sightings(self, *, with_actors: bool) -> np.ndarray:
         """Update least sizes from all training views; return the refuted splats, bool [N].
