@@ -173,7 +173,7 @@ def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
     return [entry.model_copy(update={"uri": _uri(scheme, match, query)}) for match in matches]
 
 
-def _matches(top: Path, parts: tuple[str, ...], what: str) -> list[str]:
+def _matches(top: Path, parts: tuple[str, ...], scene_uri: str) -> list[str]:
     """Return the paths that match a pattern, in order.
 
     It works as glob.glob, but `**` follows no links, which may be circular, and the number of paths
@@ -191,7 +191,7 @@ def _matches(top: Path, parts: tuple[str, ...], what: str) -> list[str]:
             for entry in entries:
                 if next(entry_count) >= MAX_ENTRIES:
                     raise AdapterError(
-                        f"{what!r}: looked at {MAX_ENTRIES} files and folders and saw no end; "
+                        f"{scene_uri!r}: looked at {MAX_ENTRIES} files and folders and saw no end; "
                         f"name more of the path, or fewer levels (**)"
                     )
                 yield entry

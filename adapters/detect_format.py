@@ -126,11 +126,11 @@ _MULTI_PART = b"element vertex_"  # how a Street Gaussians .ply names its parts
 
 @dataclass(frozen=True)
 class Signature:
-    """Signs of one kind of scene. what: the kind in words, for messages."""
+    """Signs of one kind of scene. kind_words: the kind in words, for messages."""
 
     scheme: str
     is_here: Callable[[Path], bool]
-    what: str
+    kind_words: str
 
 
 def detect_scheme(path: Path) -> str | None:
@@ -148,7 +148,7 @@ def describe_unrecognised(path: Path) -> str:
     They say what lies at the path or below it, what it lacks, and what was looked for.
     """
     signatures = FILES if path.is_file() else FOLDERS
-    *most, last = (s.what for s in signatures)
+    *most, last = (s.kind_words for s in signatures)
     text = f"{', '.join(most)}, or {last}"
     if path.is_file():
         return f"Looked for {text}"
@@ -216,14 +216,14 @@ def _advice(folder: Path) -> str:
     ]
     more = f" and {len(kinds) - _MOST_KINDS} more kinds" if len(kinds) > _MOST_KINDS else ""
     said = [f"It holds {', '.join(counts) or 'no files'}{more}"]
-    for what, parts in _PARTS.items():
+    for dataset_name, parts in _PARTS.items():
         existing_parts = [n for n, patterns in parts if any(any(folder.glob(p)) for p in patterns)]
         missing = [name for name, _ in parts if name not in existing_parts]
         # Of many parts, one alone is anybody's name.
         if missing and len(existing_parts) > len(parts) // 5:
             is_are = "is" if len(existing_parts) == 1 else "are"
             said.append(
-                f"It is nearly {what}: {', '.join(existing_parts)} {is_are} there, "
+                f"It is nearly {dataset_name}: {', '.join(existing_parts)} {is_are} there, "
                 f"{', '.join(missing)} not"
             )
     guide = "docs/datasets/own-drive.md"

@@ -274,8 +274,8 @@ def doubt_about_metres(points: np.ndarray, scales: Tensor) -> str | None:
     if all(least <= value <= most for value, (least, most) in measures.values()):
         return None
     return "in metres it would be no street: " + ", ".join(
-        f"{value:.3g} {what} ({least:g} to {most:g} expected)"
-        for what, (value, (least, most)) in measures.items()
+        f"{value:.3g} {measure_name} ({least:g} to {most:g} expected)"
+        for measure_name, (value, (least, most)) in measures.items()
     )
 
 
@@ -592,7 +592,7 @@ def _find_world(
             f"Give scale=METRES_PER_UNIT (scale=1 if it is in metres); {about_scale}"
         )
     facts = ((knows_up, "which way is up"), (is_metric, "how long a unit is"))
-    unknown_facts = " and ".join(what for is_known, what in facts if not is_known)
+    unknown_facts = " and ".join(fact_name for is_known, fact_name in facts if not is_known)
     problems = [f"{file}: {sentence}" for sentence in (about_scale, about_up) if sentence]
     means = splats.gaussians.means
     sample = means[:: 1 + len(means) // 100_000].double().numpy() + splats.origin

@@ -376,7 +376,7 @@ def class_of_air(meaning: Mapping[int, int], names: Mapping[int, str], name: str
     if number is not None:
         return number
     for semantic in (NO_SURFACE, SemanticClass.UNKNOWN):
-        if numbers := [number for number, what in meaning.items() if what == semantic]:
+        if numbers := [number for number, meant in meaning.items() if meant == semantic]:
             return min(numbers)
     return next(number for number in itertools.count() if number not in meaning)
 

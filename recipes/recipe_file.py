@@ -470,8 +470,8 @@ def _problem(item: ErrorDetails) -> tuple[Place, str]:
         why = why_no_key(str(key), section, recipe_file())
         return node.place, f"{path}: {'no part of a range' if in_range else why}"
     if kind == "missing":
-        what = "" if in_range else f", {section.LEAVES[str(key)].describe_allowed_values()}"
-        return node.place, f"{path}: must be given{what}"
+        expectation = "" if in_range else f", {section.LEAVES[str(key)].describe_allowed_values()}"
+        return node.place, f"{path}: must be given{expectation}"
     if kind == "rule":
         return node.place, "\n".join(f"{path}: {text}" for text in item["msg"].splitlines())
     return node.place, f"{path} = {show(node)}: {item['msg'].replace('Input should', 'must', 1)}"

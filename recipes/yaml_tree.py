@@ -244,7 +244,7 @@ def _events(text: str, place: Place) -> Iterator[Event]:
         raise _invalid(place, 0, short(str(error), 160)) from None
 
 
-def _invalid(place: Place, line: int, what: str) -> Exception:
+def _invalid(place: Place, line: int, problem: str) -> Exception:
     if place.line is not None:
         place = replace(place, line=place.line + line)
-    return place.error(f"not valid YAML: {what}")
+    return place.error(f"not valid YAML: {problem}")

@@ -39,20 +39,13 @@ RIDDLING = ("What ", "Of ", "Whether ", "That ", "Where ", "Which ")
 
 # How many places of each kind are left in a folder; a folder that is not here has none.
 STUMBLES: dict[str, dict[str, int]] = {
-    "adapters": {"vague": 6},
     "adapters/camera_files": {"packed": 1},
     "adapters/drivestudio": {"packed": 1},
-    "adapters/lidar_scene": {"vague": 1},
-    "adapters/waymo": {"vague": 1},
     "augment": {"packed": 2},
     "augment/dataset": {"vague": 2},
-    "augment/effects": {"packed": 14, "vague": 3},
-    "augment/files": {"packed": 3, "vague": 1},
+    "augment/effects": {"packed": 14},
+    "augment/files": {"packed": 3},
     "augment/render": {"packed": 2},
-    "recipes": {"vague": 2},
-    "tools": {"vague": 3},
-    "tools/bench": {"vague": 1},
-    "tools/view": {"vague": 2},
 }
 
 

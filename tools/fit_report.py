@@ -464,7 +464,7 @@ def _draw_head(sheet: np.ndarray, nearest: float, farthest: float, unit: str) ->
 
 
 def _draw_scale(
-    sheet: np.ndarray, column: int, bar: np.ndarray, ticks: dict[str, float], nothing: str
+    sheet: np.ndarray, column: int, bar: np.ndarray, ticks: dict[str, float], grey_meaning: str
 ) -> None:
     """A colour bar at the right end of a column's head, and what grey means to its left."""
     height, width = bar.shape[:2]
@@ -477,7 +477,7 @@ def _draw_scale(
         write(sheet, text, at, y + height + 20, size=0.45, color=_INK, centred=True)
     left = x - 106
     sheet[y : y + height, left : left + height] = _NOTHING
-    write(sheet, nothing, left + height + 5, y + height, size=0.45, color=_INK)
+    write(sheet, grey_meaning, left + height + 5, y + height, size=0.45, color=_INK)
 
 
 def _column(number: int) -> int:

@@ -126,8 +126,8 @@ def _alters_picture(recipe: Recipe) -> bool:
 def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
     kernel_sets = set()
     if any(uses_boxes(recipe) for recipe in recipes):
-        nothing = WorldBoxes.from_labels(Boxes.empty(), np.zeros(3))
-        find_occlusion(nothing, _camera(1.0), np.zeros((SIZE, SIZE), np.float32))
+        no_boxes = WorldBoxes.from_labels(Boxes.empty(), np.zeros(3))
+        find_occlusion(no_boxes, _camera(1.0), np.zeros((SIZE, SIZE), np.float32))
     for recipe in recipes:
         output = recipe.output
         sections = ((effect, effect.section_of(recipe)) for effect in effects.EFFECTS)

@@ -432,8 +432,8 @@ def _write_state(path: Path, arrays: dict[str, np.ndarray]) -> str:
     return checksum
 
 
-def _damaged(path: Path, what: str) -> OutputError:
-    return OutputError(f"{path} is damaged: {what}. Begin anew with --overwrite")
+def _damaged(path: Path, problem: str) -> OutputError:
+    return OutputError(f"{path} is damaged: {problem}. Begin anew with --overwrite")
 
 
 # Colours of lines in the curves, which colour-blind readers can tell apart.

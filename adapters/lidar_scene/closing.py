@@ -546,10 +546,10 @@ def _fill_box(
     the sill, as far behind the box's side as its nearest surface. Of other objects only open cells
     are closed.
     """
-    nothing = (slice(0, 0), slice(0, 0)), np.zeros((0, 0), np.bool_), np.zeros((0, 0))
+    no_cells = (slice(0, 0), slice(0, 0)), np.zeros((0, 0), np.bool_), np.zeros((0, 0))
     window = box.window(cells.camera)
     if window is None:
-        return nothing
+        return no_cells
     rotation = box.world_from_box[:3, :3]
     origin = (centre - box.world_from_box[:3, 3]) @ rotation
     local = rays[window] @ rotation

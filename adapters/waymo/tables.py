@@ -166,8 +166,8 @@ class Rows:
     def has(self, field: str) -> bool:
         return self.name(field) in self._table.column_names
 
-    def fault(self, field: str, what: str) -> AdapterError:
-        return AdapterError(f"{self.path}: column {self.name(field)} {what}; {_ADVICE}")
+    def fault(self, field: str, problem: str) -> AdapterError:
+        return AdapterError(f"{self.path}: column {self.name(field)} {problem}; {_ADVICE}")
 
     def column(self, field: str) -> pa.Array:
         if not self.has(field):

@@ -59,7 +59,7 @@ class Step:
     """Stage of the view: SCENE, DRAWING or PICTURE."""
 
 
-def skipped(names: Sequence[str], why: str, stage: str = DRAWING) -> tuple[Step, ...]:
+def skipped_steps(names: Sequence[str], why: str, stage: str = DRAWING) -> tuple[Step, ...]:
     """Return a `Step` for each of these passes, none of which runs."""
     return tuple(Step(name, False, why, stage) for name in names)
 

@@ -39,7 +39,7 @@ from augment.effects.effect import (
     LabelInputs,
     RenderedView,
     Step,
-    skipped,
+    skipped_steps,
 )
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.lidar.codes import LOST, SCATTERED
@@ -115,9 +115,10 @@ class SmogEffect(Effect):
         smog = self.section_of(recipe)
         fog, reason = _in_heights(smog, scene)
         if fog is None:
-            nothing = skipped((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason)
-            unchanged = skipped((SHADOWS,), reason, SCENE)
-            return EffectPlan(None, (*unchanged, *nothing, *skipped((SCATTER,), reason, PICTURE)))
+            drawing_steps = skipped_steps((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason)
+            shadow_steps = skipped_steps((SHADOWS,), reason, SCENE)
+            scatter_steps = skipped_steps((SCATTER,), reason, PICTURE)
+            return EffectPlan(None, (*shadow_steps, *drawing_steps, *scatter_steps))
         is_common = recipe.render.exposure == "common" and scene.common_color_map is not None
         if is_common:
             reason += "; one airlight for all cameras, by the mean of their exposures"

@@ -400,7 +400,7 @@ def _message_size(message: Any) -> tuple[int, int]:
         is_compressed = batch.has(3) and length >= 8 and 0 <= offset <= len(body) - 8
         stated = struct.unpack_from("<q", body, offset)[0] if is_compressed else _NO_COMPRESSION
         num_bytes += max(length, 0) if stated == _NO_COMPRESSION else max(stated, 0)
-    rows = batch.whole(0)
+    rows = batch.whole_number(0)
     return max(rows, max((count for count, _ in batch.pairs(1)), default=0)), num_bytes
 
 
@@ -424,7 +424,7 @@ class _FlatTable:
         """Return True if the table has a field."""
         return self._offset_of(number) != 0
 
-    def whole(self, number: int) -> int:
+    def whole_number(self, number: int) -> int:
         """Return a whole number, or 0 without the field."""
         offset = self._offset_of(number)
         return self._read("<q", offset) if offset else 0

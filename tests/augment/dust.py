@@ -21,7 +21,7 @@ from augment.effects.effect import (
     LabelInputs,
     RenderedView,
     Step,
-    skipped,
+    skipped_steps,
 )
 from augment.effects.lidar.beam import Echoes
 from augment.jobs.box_tables import BoxTable
@@ -77,7 +77,7 @@ class DustEffect(Effect):
     ) -> EffectPlan:
         dust = self.section_of(recipe)
         if dust is None:
-            return EffectPlan(None, skipped((TINT,), "the recipe has no dust", PICTURE))
+            return EffectPlan(None, skipped_steps((TINT,), "the recipe has no dust", PICTURE))
         step = Step(TINT, True, f"half of what stands {dust.half_m:g} m away is dust", PICTURE)
         return EffectPlan(dust, (step,), buffers=frozenset({EXPECTED_DEPTH}))
 

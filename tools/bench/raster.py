@@ -199,33 +199,33 @@ def multiply_add(rounds, sums):
         sums: [threads * v8.WIDE], float32. Receives the sums, so that no work is left out.
     """
     for run in prange(sums.size // v8.WIDE):
-        one = v8.wide_columns()
-        half = v8.broadcast_as(one, np.float32(0.5))
-        a = one
-        b = one
-        c = one
-        d = one
-        e = one
-        f = one
-        g = one
-        h = one
-        i = one
-        j = one
-        k = one
-        m = one
+        lane_index = v8.wide_columns()
+        half = v8.broadcast_as(lane_index, np.float32(0.5))
+        a = lane_index
+        b = lane_index
+        c = lane_index
+        d = lane_index
+        e = lane_index
+        f = lane_index
+        g = lane_index
+        h = lane_index
+        i = lane_index
+        j = lane_index
+        k = lane_index
+        m = lane_index
         for _ in range(rounds):
-            a = v8.fmuladd(a, half, one)  # fmt: skip
-            b = v8.fmuladd(b, half, one)
-            c = v8.fmuladd(c, half, one)
-            d = v8.fmuladd(d, half, one)  # fmt: skip
-            e = v8.fmuladd(e, half, one)
-            f = v8.fmuladd(f, half, one)
-            g = v8.fmuladd(g, half, one)  # fmt: skip
-            h = v8.fmuladd(h, half, one)
-            i = v8.fmuladd(i, half, one)
-            j = v8.fmuladd(j, half, one)  # fmt: skip
-            k = v8.fmuladd(k, half, one)
-            m = v8.fmuladd(m, half, one)
+            a = v8.fmuladd(a, half, lane_index)
+            b = v8.fmuladd(b, half, lane_index)
+            c = v8.fmuladd(c, half, lane_index)
+            d = v8.fmuladd(d, half, lane_index)
+            e = v8.fmuladd(e, half, lane_index)
+            f = v8.fmuladd(f, half, lane_index)
+            g = v8.fmuladd(g, half, lane_index)
+            h = v8.fmuladd(h, half, lane_index)
+            i = v8.fmuladd(i, half, lane_index)
+            j = v8.fmuladd(j, half, lane_index)
+            k = v8.fmuladd(k, half, lane_index)
+            m = v8.fmuladd(m, half, lane_index)
         a = a + b + c
         d = d + e + f
         g = g + h + i
@@ -234,7 +234,7 @@ def multiply_add(rounds, sums):
 
 
 def _blending(repeats: int) -> Figures:
-    """Measure blends a second of one core's time, and multiply-adds a second in turn with them."""
+    """Measure blends a second of lane_index core's time, and multiply-adds a second in turn with them."""
     (width, height) = SHEETS_SIZE
     side = float(SHEETS_SIZE[0])
     means = torch.zeros(SHEETS, 3)

@@ -37,5 +37,5 @@ def page_style(position_sliders: Iterable[Any], headings: Iterable[Any]) -> str:
         ", ".join(sliders): "margin-bottom: 1em",
         ", ".join(labels): "font-weight: bold; color: black",
     }
-    text = " ".join(f"{where} {{ {what} }}" for where, what in rules.items() if where)
+    text = " ".join(f"{selector} {{ {style} }}" for selector, style in rules.items() if selector)
     return f"<style>{text}</style>"

@@ -669,8 +669,8 @@ class Viewer:
         """
         files = any(path.endswith(("image", "mask", "checkpoint")) for path in request.edits.values)
         if files or request.pose is not None:
-            what = "a flight" if request.pose is not None else "an uploaded file"
-            return f"# {what}: save the recipe first, and the command will stand here"
+            unsaved_part = "a flight" if request.pose is not None else "an uploaded file"
+            return f"# {unsaved_part}: save the recipe first, and the command will stand here"
         return request.edits.command(f"{self._view_words(request, None)} --out out/view")
 
 

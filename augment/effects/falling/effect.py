@@ -21,7 +21,7 @@ from augment.effects.effect import (
     LabelInputs,
     RenderedView,
     Step,
-    skipped,
+    skipped_steps,
 )
 from augment.effects.falling.air import Precipitation, draw_falling
 from augment.effects.falling.drops import Kind
@@ -66,7 +66,7 @@ class FallingEffect(Effect):
             why = f"the recipe has no {self.name}"
             if section is not None:
                 why = f"{self.section}.rate_mm_h is 0"
-            return EffectPlan(None, skipped((self.step,), why, PICTURE))
+            return EffectPlan(None, skipped_steps((self.step,), why, PICTURE))
         precipitation = Precipitation(
             self.kind,
             section.rate_mm_h,

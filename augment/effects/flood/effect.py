@@ -26,7 +26,7 @@ from augment.effects.effect import (
     Step,
     ViewQuery,
     Visibility,
-    skipped,
+    skipped_steps,
 )
 from augment.effects.flood.flood import FloodMedium
 from augment.effects.flood.flood_view import COARSE, MAX_MARGIN, MAX_SHIFT, render_flooded
@@ -103,7 +103,7 @@ class FloodEffect(Effect):
         level_z_m = medium.level_z_m
         if lowest_z_m(scene) >= level_z_m:
             why = f"no splat reaches below the level, z = {level_z_m:.2f} m"
-            return EffectPlan(None, skipped(PASSES, why), water_level_z_m=level_z_m)
+            return EffectPlan(None, skipped_steps(PASSES, why), water_level_z_m=level_z_m)
         return EffectPlan(medium, _steps(medium, reason), water_level_z_m=level_z_m)
 
     def cameras(self, effect: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:

@@ -631,8 +631,8 @@ def _padded(faces: Tensor) -> Tensor:
 def _image(layer: Layer | None) -> kernels.Image:
     """Return a layer in the kernel's format; an empty image for None."""
     if layer is None:
-        nothing = np.zeros(0, np.float32)
-        return kernels.Image(np.zeros(22, np.float32), nothing, nothing, nothing)
+        no_pixels = np.zeros(0, np.float32)
+        return kernels.Image(np.zeros(22, np.float32), no_pixels, no_pixels, no_pixels)
     camera = layer.camera
     rotation = camera.camera_from_world[:3, :3].numpy()
     fx = camera.fx

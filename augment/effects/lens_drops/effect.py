@@ -13,7 +13,7 @@ from augment.effects.effect import (
     EffectPlan,
     RenderedView,
     Step,
-    skipped,
+    skipped_steps,
 )
 from augment.effects.lens_drops.drops import LensDropsPlan, drops_at
 from augment.effects.lens_drops.optics import blend_drops, draw_drops, map_surroundings
@@ -54,7 +54,7 @@ class LensDropsEffect(Effect):
         elif drops.count is None and rate_mm_h == 0:
             why = "camera.lens_drops.count is null, and there is no rain"
         if drops is None or why:
-            return EffectPlan(None, skipped((ON_GLASS,), why, PICTURE))
+            return EffectPlan(None, skipped_steps((ON_GLASS,), why, PICTURE))
         blur_mrad = 2000 * drops.aperture_m / drops.glass_m
         many = f"{rate_mm_h:g} mm/h of" if drops.count is None else f"{drops.count}"
         why = (

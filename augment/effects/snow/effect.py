@@ -28,7 +28,7 @@ from augment.effects.effect import (
     Step,
     ViewQuery,
     Visibility,
-    skipped,
+    skipped_steps,
 )
 from augment.effects.lidar.beam import Echoes
 from augment.effects.snow.kernels import MAX_GRAIN_DISTANCE_M
@@ -97,9 +97,12 @@ class SnowEffect(Effect):
         if snow is None or not snow.has_effect:
             reason = "the recipe has no snow"
             if snow is not None:
-                nothing = "depth" if snow.depth_m == 0 else "coverage"
-                reason = f"the snow has no {nothing}, so it changes nothing"
-            steps = (*skipped(PASSES, reason, SCENE), Step(GRAIN_PASS, False, reason, PICTURE))
+                missing_field = "depth" if snow.depth_m == 0 else "coverage"
+                reason = f"the snow has no {missing_field}, so it changes nothing"
+            steps = (
+                *skipped_steps(PASSES, reason, SCENE),
+                Step(GRAIN_PASS, False, reason, PICTURE),
+            )
             return EffectPlan(None, steps)
         check_metric_and_level(scene)
         reason = (

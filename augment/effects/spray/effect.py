@@ -15,7 +15,7 @@ from augment.effects.effect import (
     Step,
     ViewQuery,
     Visibility,
-    skipped,
+    skipped_steps,
 )
 from augment.effects.falling.air import glow_of
 from augment.effects.falling.effect import wind_velocity_mps
@@ -84,7 +84,7 @@ class SprayEffect(Effect):
         elif not spraying_actors(scene):
             why = f"no actor drives faster than {3.6 * MIN_SPEED_MPS:.0f} km/h"
         if rain is None or why:
-            return EffectPlan(None, skipped((SPRAY,), why, PICTURE))
+            return EffectPlan(None, skipped_steps((SPRAY,), why, PICTURE))
         wind_mps = wind_velocity_mps(rain.wind_mps, rain.wind_from_deg)
         water_m = film_depth_m(rain.rate_mm_h) * rain.ground_wetness
         spray = SprayPlan(water_m, wind_mps, recipe.seed)
