@@ -234,7 +234,7 @@ def multiply_add(rounds, sums):
 
 
 def _blending(repeats: int) -> Figures:
-    """Measure blends a second of lane_index core's time, and multiply-adds a second in turn with them."""
+    """Measure blends a second of one core's time, and multiply-adds a second in turn with them."""
     (width, height) = SHEETS_SIZE
     side = float(SHEETS_SIZE[0])
     means = torch.zeros(SHEETS, 3)
