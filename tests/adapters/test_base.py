@@ -249,10 +249,12 @@ def test_what_is_not_known_is_answered_with_what_was_looked_for(tmp_path):
     with pytest.raises(AdapterError) as caught:
         detect_scheme_of_path(tmp_path / "set")
     for signature in FOLDERS:
-        assert signature.what in str(caught.value)
+        assert signature.kind_words in str(caught.value)
     assert f"give one, such as {tmp_path}/set/seq. Looked for" in str(caught.value)
     (tmp_path / "a.txt").write_text("hello")
-    assert all(signature.what in describe_unrecognised(tmp_path / "a.txt") for signature in FILES)
+    assert all(
+        signature.kind_words in describe_unrecognised(tmp_path / "a.txt") for signature in FILES
+    )
 
 
 @pytest.mark.parametrize(
