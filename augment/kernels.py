@@ -331,5 +331,7 @@ def count_box_pixels(
 def _add(counts, row, column):
     """Add one pixel to a box's counts (a row of `count_box_pixels`'s)."""
     counts[0] += 1
-    counts[2], counts[3] = min(counts[2], column), min(counts[3], row)
-    counts[4], counts[5] = max(counts[4], column + 1), max(counts[5], row + 1)
+    counts[2] = min(counts[2], column)
+    counts[3] = min(counts[3], row)
+    counts[4] = max(counts[4], column + 1)
+    counts[5] = max(counts[5], row + 1)

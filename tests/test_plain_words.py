@@ -41,10 +41,9 @@ RIDDLING = ("What ", "Of ", "Whether ", "That ", "Where ", "Which ")
 STUMBLES: dict[str, dict[str, int]] = {
     "adapters/camera_files": {"packed": 1},
     "adapters/drivestudio": {"packed": 1},
-    "augment": {"packed": 2},
     "augment/dataset": {"vague": 2},
-    "augment/effects": {"packed": 14},
-    "augment/files": {"packed": 3},
+    "augment/effects": {"packed": 10},
+    "augment/files": {"packed": 2},
     "augment/render": {"packed": 2},
 }
 

@@ -132,7 +132,9 @@ class Pickle(pickle._Unpickler):
                 if code != pickle.STOP:
                     self.dispatch[code[0]](self)
                 if self._built is not None:
-                    self._source.held_bytes, record, self._built = 0, self._built, None
+                    record = self._built
+                    self._built = None
+                    self._source.held_bytes = 0
                     yield record
             if len(self.stack) != 1 or self.metastack:
                 raise PickleError("it is cut short or damaged (no single value)")

@@ -180,7 +180,9 @@ def find_drops(
                     if sways[0] > 0:  # the sway while the shutter is open is below a flake's size
                         flutter = np.float64((more >> np.uint64(21)) & np.uint64(0x1FFFFF))
                         dx, dy, dz = _sway(point[0], point[1], point[2], sways, flutter)
-                        point[0], point[1], point[2] = point[0] + dx, point[1] + dy, point[2] + dz
+                        point[0] += dx
+                        point[1] += dy
+                        point[2] += dz
                     for end in range(2):
                         if end == 1:
                             for c in range(3):

@@ -258,14 +258,16 @@ def draw_from_above(
         kernel = np.ones((_MIN_SHELTER_CELLS, _MIN_SHELTER_CELLS), np.uint8)
         is_shelter = cv2.morphologyEx(is_shelter.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
         is_thin = is_shelter | (covered_wide & ~covered)
-        height[is_thin], alpha[is_thin] = height_wide[is_thin], alpha_wide[is_thin]
+        height[is_thin] = height_wide[is_thin]
+        alpha[is_thin] = alpha_wide[is_thin]
     median_heights = np.where(medians > 0, eye[2].item() - medians.astype(np.float64), 0).astype(
         np.float32
     )
     is_overhang = (
         (alpha >= MIN_COVERED_ALPHA) & (medians > 0) & (median_heights - height > _MIN_OVERHANG_M)
     )
-    height[is_overhang], is_thin = median_heights[is_overhang], is_thin | is_overhang
+    height[is_overhang] = median_heights[is_overhang]
+    is_thin = is_thin | is_overhang
     return HeightMap(
         left_m=corner_m[0],
         bottom_m=corner_m[1],

@@ -80,7 +80,8 @@ def look_through(
         passed = erf(inverse_width * (ends_m - nearest)) + erf(inverse_width * nearest)
         tau += extinction_at_nearest * np.sqrt(math.pi / (2 * a)) * np.maximum(passed, 0)
         denser = (extinction_at_nearest > densest) & (nearest > 0) & (nearest < ends_m)
-        at_m[denser], densest[denser] = nearest[denser], extinction_at_nearest[denser]
+        at_m[denser] = nearest[denser]
+        densest[denser] = extinction_at_nearest[denser]
     return tau, at_m
 
 
