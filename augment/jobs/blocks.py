@@ -27,6 +27,7 @@ from augment.jobs.claims import CLAIMS_FOLDER, try_claim
 from augment.jobs.files import RECORDED, SceneIndex, has_lidar, select_frames
 from augment.jobs.layout import (
     MANIFEST_FILE,
+    OLD_PROGRESS_LOGS,
     PROGRESS_LOGS,
     STATE_FOLDER,
     folder_name,
@@ -577,8 +578,10 @@ def _count_staged_images(store: Store) -> dict[str, int]:
     counts: dict[str, int] = {}
     for folder in (store.local_dir / STATE_FOLDER / "blocks").glob("*"):
         with contextlib.suppress(OSError, OutputError):  # another process has published it
-            progress_logs = list(folder.glob(f"{STATE_FOLDER}/{PROGRESS_LOGS}/*/*.jsonl"))
-            finished = sum(read_file(path).count(b'"status":"ok"') for path in progress_logs)
+            finished = 0
+            for name in (PROGRESS_LOGS, OLD_PROGRESS_LOGS):
+                for path in folder.glob(f"{STATE_FOLDER}/{name}/*/*.jsonl"):
+                    finished += read_file(path).count(b'"status":"ok"')
             if (folder / MANIFEST_FILE).is_file():  # a run that was stopped, or had failures
                 finished += read_manifest(folder)["status"].to_pylist().count(OK)
             counts[folder.name] = finished

@@ -41,6 +41,7 @@ from augment.jobs.claims import hold_claim
 from augment.jobs.files import SceneIndex, box_tables, calibration_bytes, frame_entry, read_entries
 from augment.jobs.layout import (
     MANIFEST_FILE,
+    OLD_PROGRESS_LOGS,
     PROGRESS_LOGS,
     STATE_FOLDER,
     SWEEP_FOLDER,
@@ -74,8 +75,6 @@ from augment.jobs.worker import Chunk, Outcome, describe_error
 from recipes.schema import Recipe
 
 _log = logging.getLogger(__name__)
-# Folder in which older versions kept the progress logs, inside the state folder.
-_OLD_PROGRESS_LOGS = "journal"
 
 
 class ProgressLog:
@@ -166,7 +165,7 @@ def _take_over_old_logs(out_dir: Path) -> None:
     version and then by an older one. Its newer log stays, and the images that only the other one
     lists are rendered again.
     """
-    old_dir = path_below(out_dir, (STATE_FOLDER, _OLD_PROGRESS_LOGS))
+    old_dir = path_below(out_dir, (STATE_FOLDER, OLD_PROGRESS_LOGS))
     if not old_dir.is_dir():
         return
     logs_dir = path_below(out_dir, (STATE_FOLDER, PROGRESS_LOGS))

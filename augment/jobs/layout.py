@@ -28,6 +28,8 @@ MANIFEST_FILE = "manifest.parquet"
 STATE_FOLDER = ".climategs"
 # Folder of the progress logs inside the state folder, see augment.jobs.job_state.
 PROGRESS_LOGS = "progress"
+# The same folder as older versions called it.
+OLD_PROGRESS_LOGS = "journal"
 # Folder of LiDAR sweeps, inside a variant's folder; inside the scene's for sweeps without weather.
 SWEEP_FOLDER = "lidar"
 
