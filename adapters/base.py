@@ -32,7 +32,7 @@ from adapters.uri import (
     parse_uri,
 )
 from augment.errors import AdapterError, SceneError
-from augment.scene import Ground, Scene
+from augment.scene.scene import Ground, Scene
 from recipes.errors import nearest_word
 from recipes.job import JobScene
 

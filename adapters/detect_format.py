@@ -23,7 +23,7 @@ from augment.files.scene_file import is_scene_file, is_scene_folder
 from augment.files.sog import META, is_sog_folder
 from augment.files.streamed_sog import LOD_META
 from augment.jobs.mirror import DatasetFolder
-from augment.scene import Scene
+from augment.scene.scene import Scene
 from recipes.files import open_file
 
 # ---- Which folder and files make up the dataset behind a scene, for copies in other weather ------

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from augment.cameras import Frame
+from augment.scene.cameras import Frame
 
 # Cosine between a camera's y axis and up from which it is upside down: 60 degrees at most.
 _UPSIDE_DOWN = 0.5

@@ -45,15 +45,15 @@ from adapters.camera_files.paths import (
 )
 from adapters.uri import UriOptions, format_uri
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
-from augment.cameras import Frame
 from augment.errors import AdapterError
 from augment.files.export import concatenate_gaussians
 from augment.files.ply import SPLAT_SUFFIXES, SplatFile, read_splats, recentring_origin
 from augment.files.sog import META, is_sog_folder
 from augment.files.streamed_sog import LOD_META
 from augment.rng import rng_for
-from augment.scene import Gaussians, Scene
-from augment.sky import ConstantSky
+from augment.scene.cameras import Frame
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.sky import ConstantSky
 
 Part = Annotated[float, Field(ge=0, le=1)]
 COLOURS = {"overcast": (0.85, 0.85, 0.85), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}

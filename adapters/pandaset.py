@@ -55,13 +55,13 @@ from adapters.raw_drive import (
 )
 from adapters.safe_pickle import read_frame
 from adapters.uri import format_uri
-from augment.cameras import Camera, Frame
 from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError
-from augment.geometry import invert_rigid, rigid, rotmat_from_quat
-from augment.labels import Boxes, LidarSweep
-from augment.scene import Scene
-from augment.semantics import SemanticClass, class_of_label
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import invert_rigid, rigid, rotmat_from_quat
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass, class_of_label
 
 # The recording car in its own frame (x forward, y left, z up): no other surface can be in there.
 EGO_M = np.array([[-3.0, -1.05, -1.0], [3.0, 1.05, 2.2]])

@@ -40,12 +40,12 @@ from adapters.street.splats import (
 )
 from adapters.street.world import Street, build_street
 from adapters.world import join_gaussians
-from augment.cameras import Camera
 from augment.errors import SceneError
-from augment.labels import Boxes, LidarSweep
-from augment.scene import Actor, Scene
-from augment.semantics import SemanticClass
-from augment.sky import Sky
+from augment.scene.cameras import Camera
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Actor, Scene
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import Sky
 
 logger = logging.getLogger(__name__)
 

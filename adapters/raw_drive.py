@@ -26,15 +26,15 @@ from pydantic import BeforeValidator, Field
 from adapters.drive_checks import camera_problems, lidar_problems
 from adapters.plain_files import MISSING, check_image
 from adapters.uri import UriOptions
-from augment.cameras import Frame
 from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED, is_in_air
 from augment.errors import AdapterError
 from augment.files.image_size import ImageHeader
 from augment.files.recorded_images import exif_hint
-from augment.geometry import rotmat_from_quat
-from augment.labels import Boxes, LabelSource, LidarSweep
-from augment.scene import Gaussians, Ground, Scene
-from augment.semantics import SemanticClass
+from augment.scene.cameras import Frame
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.labels import Boxes, LabelSource, LidarSweep
+from augment.scene.scene import Gaussians, Ground, Scene
+from augment.scene.semantics import SemanticClass
 
 NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
 # Returns further from the car's path than this are none: LiDARs of cars see some 300 m.

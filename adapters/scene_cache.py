@@ -53,17 +53,17 @@ from augment.files.scene_file import (
     load_scene_parts,
     save_scene_file,
 )
-from augment.jobs.atomic import (
+from augment.output.atomic import (
     open_lock,
     read_file,
     remove_temporaries,
     wait_for_lock,
     write_atomic,
 )
-from augment.jobs.layout import STATE_FOLDER
-from augment.labels import LabelSource
+from augment.output.layout import STATE_FOLDER
 from augment.render.cpu.kernel_cache import user_cache_folder
-from augment.scene import Scene, is_drawable
+from augment.scene.labels import LabelSource
+from augment.scene.scene import Scene, is_drawable
 from recipes.files import open_file
 
 logger = logging.getLogger(__name__)
@@ -232,7 +232,7 @@ def _files_of(
 
         yield from sorted(kitti_root(path)[1].glob("calib_*.txt"))
     elif scheme == "recording":  # a variant of a job has its scene's sweeps
-        from augment.jobs.layout import SWEEP_FOLDER
+        from augment.output.layout import SWEEP_FOLDER
 
         yield root / os.pardir / SWEEP_FOLDER
 

@@ -15,11 +15,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, SCHEMES, format_uri, parse_uri
-from augment.cameras import Frame
 from augment.errors import AdapterError
 from augment.files.scene_file import read_saved_scene
-from augment.labels import LabelSource
-from augment.scene import Scene
+from augment.scene.cameras import Frame
+from augment.scene.labels import LabelSource
+from augment.scene.scene import Scene
 
 _DATA_KEY = "data"
 

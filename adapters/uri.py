@@ -20,8 +20,8 @@ from augment.errors import AdapterError
 from recipes.errors import nearest_word
 
 if TYPE_CHECKING:  # torch would be loaded with them
-    from augment.labels import LabelSource
-    from augment.scene import Scene
+    from augment.scene.labels import LabelSource
+    from augment.scene.scene import Scene
 
 CAMERA_PATH_KEY = "camera_path"
 GROUND_KEY = "ground_z"

@@ -11,8 +11,8 @@ import torch
 
 from augment.errors import AdapterError
 from augment.files.export import transform_gaussians_rigidly
-from augment.scene import Gaussians
-from augment.semantics import class_of_label
+from augment.scene.scene import Gaussians
+from augment.scene.semantics import class_of_label
 
 # ---- Sets of Gaussians into one, and the class of an object's ------------------------------------
 

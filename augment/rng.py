@@ -65,7 +65,7 @@ def rng_for(
 def mix(bits: np.ndarray) -> np.ndarray:
     """Return uint64 of which every bit depends on every bit of the argument.
 
-    `augment.kernels.mix` is the same in kernels.
+    `augment.render.cpu.hash_kernels.mix` is the same in kernels.
     """
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(MIX_A)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(MIX_B)

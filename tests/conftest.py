@@ -41,7 +41,7 @@ def _checked_modules() -> list[str]:
         for path in paths
         if path.name != "__init__.py" and not KERNELS.search(path.read_text())
     ]
-    assert "augment.scene" in names and "augment.render.composite_kernels" not in names
+    assert "augment.scene.scene" in names and "augment.render.composite_kernels" not in names
     return names
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from scenes import camera_ahead, random_gaussians, random_pose
 
-from augment.cameras import Frame
-from augment.scene import Actor, ColorSeries, Gaussians, Ground, Scene, Track
-from augment.sky import CubemapSky
+from augment.scene.cameras import Frame
+from augment.scene.scene import Actor, ColorSeries, Gaussians, Ground, Scene, Track
+from augment.scene.sky import CubemapSky
 
 START_NS = 1_557_540_079_200_123_457  # too many digits for a float64
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from augment.labels import Boxes, LidarSweep
-from augment.scene import Scene
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Scene
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera
-from augment.geometry import rigid, rotmat_from_quat
 from augment.render.constants import RasterSettings
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid, rotmat_from_quat
+from augment.scene.scene import Gaussians, PosedGaussians
 
 
 def camera_ahead(

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from augment.cameras import Camera
-from augment.effects.snow.cells import (
+from augment.exposure.cells import (
     FLUSH,
     MAX_EDGE_DISTANCE_M,
     OPEN_EDGE,
     ExposedCells,
     ExposedSurface,
 )
-from augment.geometry import rigid
-from augment.scene import Actor, Gaussians, Scene
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid
+from augment.scene.scene import Actor, Gaussians, Scene
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky
 from tests.scenes import sh_of
 
 LEFT, RIGHT, BACK, FRONT = range(4)

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from augment.cameras import Camera, Frame
-from augment.geometry import rigid
-from augment.scene import Actor, Gaussians, Scene, Track
-from augment.sky import ConstantSky
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rigid
+from augment.scene.scene import Actor, Gaussians, Scene, Track
+from augment.scene.sky import ConstantSky
 from tests.scenes import camera_ahead, sh_of, stack
 
 STEP_M = 0.2  # between the splats of a sheet

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 
 from adapters import base
-from augment.scene import Scene
+from augment.scene.scene import Scene
 
 # The cheapest street there is: as few Gaussians as it can have, and few things in it.
 SMALL_STREET = "procedural:street?seed=3&frames=2&gaussians=60000&parked=4&moving=1&pedestrians=0"

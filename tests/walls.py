@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from scenes import camera_ahead
 
-from augment.cameras import Camera
-from augment.jobs.tables import FrameBoxes
-from augment.labels import Boxes
 from augment.metrics.consistency import DepthView
+from augment.output.tables import FrameBoxes
+from augment.scene.cameras import Camera
+from augment.scene.labels import Boxes
 
 WALL_M, BOARD_M, THICKNESS_M = 12.0, 6.0, 0.4  # the board's front face, and how thick it is
 BOARD_SIZE_M = np.array([THICKNESS_M, 2.0, 1.6])

@@ -31,7 +31,7 @@ from tools.options import (
 from tools.output import LABELS_OF_STORES, JsonFile, NoteHandler, check_local, write_json
 
 if TYPE_CHECKING:
-    from augment.scene import Scene
+    from augment.scene.scene import Scene
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
 Links = Literal["hard", "copy"]

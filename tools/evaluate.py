@@ -21,16 +21,9 @@ import pyarrow.compute as pc
 from pydantic import ValidationError
 from tqdm import tqdm
 
-from augment.cameras import Camera
 from augment.dataset.clips_pairs import masks_of
 from augment.dataset.weather_dataset import RowReader, Rows
 from augment.errors import OutputError
-from augment.geometry import invert_rigid
-from augment.jobs.files import depth_in_metres
-from augment.jobs.layout import folder_name, variant_folder
-from augment.jobs.manifest import OK, read_manifest_rows
-from augment.jobs.store import Store, open_store
-from augment.jobs.tables import read_boxes
 from augment.metrics.consistency import (
     ActorPaths,
     DepthView,
@@ -40,7 +33,14 @@ from augment.metrics.consistency import (
     move_surfaces,
 )
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
+from augment.output.layout import folder_name, variant_folder
+from augment.output.manifest import OK, read_manifest_rows
+from augment.output.store import Store, open_store
+from augment.output.tables import read_boxes
+from augment.output.view_files import depth_in_metres
 from augment.render.sensor import noise_variance
+from augment.scene.cameras import Camera
+from augment.scene.geometry import invert_rigid
 from recipes.errors import RecipeError
 from recipes.schema import Output, Sensor
 from recipes.template import readable

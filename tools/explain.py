@@ -17,18 +17,18 @@ import torch
 from adapters.base import open_scene
 from adapters.raw_drive import IncompleteDrive
 from augment import effects
-from augment.cameras import Camera, Frame
 from augment.dataset.label_files import forecast_labels
 from augment.errors import ClimateGSError, SceneError
-from augment.ground import describe_ground, ground_of
-from augment.jobs.quality import apply_settings, resolve_quality
-from augment.plan import Plan, make_plan, plan_view
+from augment.photo.trust import judge_scene
 from augment.render.threads import num_kernel_threads
-from augment.scene import Gaussians, Scene
-from augment.semantics import SemanticClass
+from augment.scene.cameras import Camera, Frame
+from augment.scene.ground import describe_ground, ground_of
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.semantics import SemanticClass
 from augment.timing import stopwatch
-from augment.trust import judge_scene
-from augment.views import render_view
+from augment.view.plan import Plan, make_plan, plan_view
+from augment.view.quality import apply_settings, resolve_quality
+from augment.view.render_view import render_view
 from recipes.fields import with_unchecked_field
 from recipes.load import load_recipe
 from recipes.schema import Recipe, free_knobs, settings_of

@@ -36,9 +36,6 @@ from augment.files.scene_file import (
     save_scene,
     save_scene_file,
 )
-from augment.jobs.files import RECORDED
-from augment.jobs.layout import MANIFEST_FILE, folder_name, variant_folder, variant_name
-from augment.jobs.manifest import OK, read_manifest, select_variant_rows
 from augment.jobs.mirror import (
     MIRROR_FOLDER,
     DatasetFolder,
@@ -58,8 +55,11 @@ from augment.jobs.mirror import (
 )
 from augment.jobs.mirror_sweeps import find_span_frames, is_sweep_between, weather_sweeps_between
 from augment.jobs.processes import OutputLock
-from augment.labels import StoresLidar
-from augment.scene import Scene
+from augment.output.layout import MANIFEST_FILE, folder_name, variant_folder, variant_name
+from augment.output.manifest import OK, read_manifest, select_variant_rows
+from augment.output.view_files import RECORDED
+from augment.scene.labels import StoresLidar
+from augment.scene.scene import Scene
 from recipes.load import load_recipe
 from recipes.schema import Recipe
 from tools.output import fill, print_note

@@ -23,10 +23,10 @@ from adapters.training_views.views import RecordedViews, holdout_step
 from adapters.uri import SCHEMES, format_uri
 from augment.errors import AdapterError, ClimateGSError
 from augment.files.scene_file import is_scene_folder, save_scene
+from augment.photo.trust import judge_scene
 from augment.reconstruct.trainer import StepRecord, Trainer
 from augment.reconstruct.view import ViewKey, ViewSource
-from augment.scene import Scene
-from augment.trust import judge_scene
+from augment.scene.scene import Scene
 from tools.fit_report import evaluate_views, mean_scores, truth_facts, truth_line, write_report
 from tools.options import FitOptions, parse_depth, resolved_uri
 from tools.output import check_scene_out, path_beside, print_note
@@ -317,7 +317,7 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
 
 
 def _fitted(run: _Run) -> dict[str, Any]:
-    """Scale and views that a fit learns from, as augment.trust.FitRecord."""
+    """Scale and views that a fit learns from, as augment.photo.trust.FitRecord."""
     views: dict[str, list[int]] = {}
     for key in run.source.train:
         views.setdefault(key.camera, []).append(key.frame)
@@ -393,7 +393,7 @@ def _check_recorded(scene: Scene) -> None:
     """
     if any(frame.image_paths for frame in scene.frames):
         return
-    from augment.jobs.layout import folder_name, variant_name
+    from augment.output.layout import folder_name, variant_name
     from recipes.load import load_recipe
 
     folder = f"raw/{folder_name(scene.name)}/{variant_name(load_recipe('clear').resolve(0))}"

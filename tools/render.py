@@ -21,31 +21,31 @@ from adapters.base import expand_job_scenes, open_scene
 from adapters.camera_files.paths import frames_from_path_file
 from adapters.scene_cache import scene_digest
 from augment import effects
-from augment.boxes import WorldBoxes, find_occlusion
-from augment.cameras import Camera, Frame
 from augment.dataset.label_files import NothingLabelled
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import ClimateGSError
-from augment.geometry import rigid
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.blocks import JobStatus, read_status, select_shard
-from augment.jobs.files import SceneIndex, check_frames, has_lidar, uses_boxes
 from augment.jobs.generate import GenerateJob, default_scratch, plan_job, run_generate
-from augment.jobs.layout import STATE_FOLDER, variant_name
-from augment.jobs.manifest import lidar_notes
 from augment.jobs.processes import choose_backend, renders_on_gpu
-from augment.jobs.quality import choose_settings, recipes_to_try
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.store import open_store
 from augment.jobs.worker import compute_time_shares
-from augment.labels import Boxes, LidarSweep
-from augment.plan import make_plan
+from augment.output.layout import STATE_FOLDER, variant_name
+from augment.output.manifest import lidar_notes
+from augment.output.store import open_store
+from augment.output.view_files import SceneIndex, check_frames, has_lidar, uses_boxes
+from augment.photo.trust import judge_scene, skipped_cameras_sentence, unfitted_cameras
 from augment.render.buffers import CPU, CUDA
 from augment.render.cuda.runtime import is_interpreted
-from augment.scene import Gaussians, Ground, Scene
-from augment.sky import CubemapSky
-from augment.trust import judge_scene, skipped_cameras_sentence, unfitted_cameras
-from augment.views import render_view
+from augment.scene.boxes import WorldBoxes, find_occlusion
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rigid
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Gaussians, Ground, Scene
+from augment.scene.sky import CubemapSky
+from augment.view.plan import make_plan
+from augment.view.quality import choose_settings, recipes_to_try
+from augment.view.render_view import render_view
 from recipes.fields import section_at
 from recipes.job import load_job, load_job_recipes, scaled_recipe
 from recipes.load import load_recipe, read_overrides
@@ -110,10 +110,14 @@ def kernel_modules(
     present_effects = [
         e for e in effects.EFFECTS if any(e.section_of(recipe) is not None for recipe in recipes)
     ]
-    folders = (type(effect).__module__.removesuffix(".effect") for effect in present_effects)
+    folders = {
+        folder
+        for effect in present_effects
+        for folder in (type(effect).__module__.removesuffix(".effect"), *effect.kernel_folders)
+    }
     pictures = (f"augment.render.{name}" for name in ("cpu", "composite_kernels"))
     passes = ["augment.render.picture_kernels"] if any(map(_alters_picture, recipes)) else []
-    return [*street, "augment.kernels", *pictures, *passes, *folders]
+    return [*street, "augment.scene", *pictures, *passes, *sorted(folders)]
 
 
 def _alters_picture(recipe: Recipe) -> bool:

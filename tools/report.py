@@ -25,11 +25,11 @@ from markupsafe import Markup
 from augment.dataset.label_files import LABELS, RECORD, LabelsRecord
 from augment.effects.lidar import codes
 from augment.errors import OutputError
-from augment.jobs.atomic import write_atomic
-from augment.jobs.files import box_tables
-from augment.jobs.layout import STATE_FOLDER, folder_name, path_kinds
-from augment.jobs.manifest import OK, read_manifest_rows
-from augment.jobs.store import Store, StoredFile, open_store
+from augment.output.atomic import write_atomic
+from augment.output.layout import STATE_FOLDER, folder_name, path_kinds
+from augment.output.manifest import OK, read_manifest_rows
+from augment.output.store import Store, StoredFile, open_store
+from augment.output.view_files import box_tables
 from tools.drawing import cameras_on_car, evenly, first_of_each, value_codes
 from tools.report_numbers import (
     byte_size,
@@ -340,7 +340,8 @@ def read_trainers(files: ReportFiles) -> LabelsRecord | None:
 def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict[str, Any] | None:
     """Count boxes by the share that the weather leaves visible, in VISIBILITY_STEPS.
 
-    The product of what every effect leaves, as `augment.jobs.files.combine_visibility` has it.
+    The product of what every effect leaves, as `augment.output.view_files.combine_visibility` has
+    it.
     """
     kinds = (
         kind

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from augment.jobs.manifest import effect_masks, weather_columns
+from augment.output.manifest import effect_masks, weather_columns
 from recipes.effect import Column
 from recipes.schema import columns_of_effects
 from tools.drawing import linear_ticks, log_ticks

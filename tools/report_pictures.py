@@ -22,12 +22,12 @@ from markupsafe import Markup
 
 from augment.errors import OutputError
 from augment.files.image_size import image_header
-from augment.jobs.files import decode_image, decode_png, depth_in_metres
-from augment.jobs.layout import mask_names
-from augment.jobs.manifest import Row
-from augment.jobs.store import Store, StoredFile, StoredFileMissing
-from augment.jobs.tables import read_table
-from augment.semantics import SemanticClass
+from augment.output.layout import mask_names
+from augment.output.manifest import Row
+from augment.output.store import Store, StoredFile, StoredFileMissing
+from augment.output.tables import read_table
+from augment.output.view_files import decode_image, decode_png, depth_in_metres
+from augment.scene.semantics import SemanticClass
 from tools.drawing import color_mapped, evenly, resized
 from tools.report_numbers import weather_text
 

@@ -21,7 +21,6 @@ from pydantic import ValidationError
 
 from adapters.base import open_scene
 from adapters.scene_folder import prepare_for_storage
-from augment.cameras import Camera
 from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, style_scene
 from augment.effects.style.content import content_pictures, content_statistics, select_views
 from augment.effects.style.losses import FeatureExtractor, open_features
@@ -43,12 +42,13 @@ from augment.effects.style.train import (
 )
 from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.files.scene_file import save_scene
-from augment.jobs.atomic import write_atomic
+from augment.output.atomic import write_atomic
 from augment.render.composite import composite_sky, to_byte_array
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians, Scene
-from augment.semantics import SemanticClass
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.semantics import SemanticClass
 from recipes.style import STYLES, Style, style_preset_names
 from recipes.template import readable
 from tools.drawing import captioned, strip, write_rgb

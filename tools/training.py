@@ -31,7 +31,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from augment.errors import OutputError
-from augment.jobs.atomic import (
+from augment.jobs.processes import OutputLock
+from augment.output.atomic import (
     flush_folder,
     make_folder,
     raise_output_error,
@@ -39,8 +40,7 @@ from augment.jobs.atomic import (
     temporary_path,
     write_atomic,
 )
-from augment.jobs.layout import STATE_FOLDER
-from augment.jobs.processes import OutputLock
+from augment.output.layout import STATE_FOLDER
 from augment.progress import ProgressBar
 from tools.options import length_of
 from tools.output import print_note

@@ -62,14 +62,14 @@ from adapters.raw_drive import (
     usable_images,
 )
 from adapters.uri import format_uri
-from augment.cameras import Camera, Frame
 from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED
 from augment.errors import AdapterError
-from augment.geometry import invert_rigid, quat_from_rotmat
-from augment.ground import measure_ground
-from augment.labels import Boxes, LidarSweep
-from augment.scene import Ground, Scene
-from augment.semantics import SemanticClass
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import invert_rigid, quat_from_rotmat
+from augment.scene.ground import measure_ground
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Ground, Scene
+from augment.scene.semantics import SemanticClass
 
 # ---- A log, and its labels -----------------------------------------------------------------------
 

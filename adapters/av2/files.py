@@ -28,7 +28,7 @@ from adapters.plain_files import LARGEST, Number, read_json, resolve_inside, val
 from augment.errors import AdapterError
 from augment.files.pickles import PickleError, read_npy
 from augment.files.stated_sizes import StatedSizeError, check_texts, read_feather
-from augment.semantics import SemanticClass
+from augment.scene.semantics import SemanticClass
 from recipes.files import open_file
 
 # ---- Feather tables ------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from adapters.camera_files.colmap_tables import check_colmap_tables
 from adapters.plain_files import LARGEST, Number, read_json
 from adapters.world import invert_pose
 from augment.errors import AdapterError
-from augment.jobs.manifest import MAX_SIDE_PX
+from augment.output.manifest import MAX_SIDE_PX
 
 # Largest error of a rotation, as in Camera. Poses written with four decimals or fewer fail.
 _ORTHONORMAL_TOLERANCE = 1e-4

@@ -29,9 +29,9 @@ from torch import Tensor
 from adapters.camera_files.camera_files import PosedView, lens_of, look_at_pose, read_views
 from adapters.uri import CAMERA_PATH_KEY, add_to_uri
 from adapters.world import WorldChange, invert_pose
-from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
-from augment.scene import Gaussians, Scene
+from augment.scene.cameras import Camera, Frame
+from augment.scene.scene import Gaussians, Scene
 
 # ---- Height of the ground, from Gaussians alone --------------------------------------------------
 # There are no labels in a splat file, so the ground is what lies low: a low quantile of the centres

@@ -41,7 +41,6 @@ from adapters.drivestudio.drive import (
 )
 from adapters.uri import format_uri
 from adapters.world import WorldChange, with_class_of
-from augment.cameras import Camera
 from augment.errors import AdapterError, SceneError
 from augment.files.checkpoints import (
     checked_tensor,
@@ -49,11 +48,18 @@ from augment.files.checkpoints import (
     dictionary_in,
     load_checkpoint,
 )
-from augment.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.render.composite import composite_sky
 from augment.render.sh import SH_C0, rotate_sh
-from augment.scene import NUM_SH_BY_DEGREE, Actor, Gaussians, Scene, Track, check_gaussians
-from augment.sky import ConstantSky, CubemapSky, Sky, cubemap_coordinates, directions_of_cubemap
+from augment.scene.cameras import Camera
+from augment.scene.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat, slerp
+from augment.scene.scene import NUM_SH_BY_DEGREE, Actor, Gaussians, Scene, Track, check_gaussians
+from augment.scene.sky import (
+    ConstantSky,
+    CubemapSky,
+    Sky,
+    cubemap_coordinates,
+    directions_of_cubemap,
+)
 
 # ---- The Gaussians of a run's models: tensors of a checkpoint, activated -------------------------
 

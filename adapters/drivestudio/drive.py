@@ -48,12 +48,12 @@ from adapters.plain_files import (
 from adapters.raw_drive import DriveOptions, stored_records
 from adapters.uri import UriOptions
 from adapters.world import rotation_to_z_up
-from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.files.checkpoints import dictionary_in, finite_array
 from augment.files.image_size import read_image_header
-from augment.geometry import invert_rigid, quat_from_rotmat
-from augment.labels import Boxes, LidarSweep
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import invert_rigid, quat_from_rotmat
+from augment.scene.labels import Boxes, LidarSweep
 
 # ---- A run's config.yaml, read by dotted keys such as `data.scene_idx` ---------------------------
 

@@ -68,11 +68,11 @@ from adapters.raw_drive import (
     usable_images,
 )
 from adapters.uri import format_uri
-from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
-from augment.geometry import invert_rigid, quat_from_rotmat
-from augment.labels import Boxes, LidarSweep
-from augment.scene import Scene
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import invert_rigid, quat_from_rotmat
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Scene
 
 # ---- Boxes and sweeps, read when asked -----------------------------------------------------------
 # A raw drive's boxes are in tracklet_labels.xml, in the Velodyne's frame of each frame. The object

@@ -33,12 +33,12 @@ from adapters.lidar_scene.split import SKIN_M, ObjectTrack, PointSet, is_flat
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels, ground_points
 from adapters.raw_drive import BoxSample
 from adapters.world import join_gaussians
-from augment.cameras import Camera
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
 from augment.render.rasterize import rasterize
-from augment.scene import Gaussians, PosedGaussians
-from augment.semantics import SemanticClass, class_of_label
-from augment.view_images import SURFACE_ALPHA
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians
+from augment.scene.semantics import SemanticClass, class_of_label
+from augment.view.images import SURFACE_ALPHA
 
 _WIDTH = 480  # columns of the images that are drawn
 _CELL_PX = 2  # smallest spacing of new discs, pixels of those images

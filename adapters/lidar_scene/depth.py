@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapters.lidar_scene.split import FLOOR_M, SKIN_M, Motion, inside_box
-from augment.cameras import Camera
 from augment.errors import AdapterError
-from augment.labels import EGO_VEHICLE, ClassifiesLidar, LidarSweep
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.labels import EGO_VEHICLE, ClassifiesLidar, LidarSweep
+from augment.scene.scene import Scene
 
 _NEAR_M = 0.1  # smallest depth of a return that a camera sees
 # Difference from the frame's time beyond which a sweep's times count from some other start.

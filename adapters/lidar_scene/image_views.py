@@ -22,8 +22,8 @@ from adapters.lidar_scene.kernels import SkyGatherer, row_slices
 from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import Surfels
 from adapters.plain_files import decode_image
-from augment.cameras import Camera
 from augment.jobs.processes import available_cores
+from augment.scene.cameras import Camera
 
 DEPTH_WIDTH = 480  # columns of the z-buffers
 DISC_PER_SPACING = 0.75  # radius of a disc in units of the spacing: neighbours overlap

@@ -24,10 +24,10 @@ import cv2
 import numpy as np
 import torch
 
-from augment.cameras import Camera
 from augment.jobs.processes import available_cores
 from augment.render.cpu.jit import cached_njit
-from augment.sky import CubemapSky, directions_of_cubemap
+from augment.scene.cameras import Camera
+from augment.scene.sky import CubemapSky, directions_of_cubemap
 
 # Images fade out over this fraction of their width, so that different exposures blend softly.
 _FEATHER_WIDTH = 0.12

@@ -38,11 +38,11 @@ from adapters.lidar_scene.surfels import (
 )
 from adapters.raw_drive import BoxSample, DriveOptions, RawDrive, TimedBoxes
 from adapters.world import join_gaussians
-from augment.cameras import Frame
 from augment.errors import AdapterError
-from augment.ground import measure_from_classes
-from augment.own_car import find_own_car_mask, moving_frames
-from augment.scene import Actor, Gaussians, Ground, Scene
+from augment.photo.own_car import find_own_car_mask, moving_frames
+from augment.scene.cameras import Frame
+from augment.scene.ground import measure_from_classes
+from augment.scene.scene import Actor, Gaussians, Ground, Scene
 
 logger = logging.getLogger(__name__)
 

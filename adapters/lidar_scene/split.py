@@ -14,10 +14,10 @@ import numpy as np
 import torch
 
 from adapters.raw_drive import BoxSample, Sweep
-from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat
 from augment.render.cpu.jit import cached_njit
-from augment.scene import Track
-from augment.semantics import SemanticClass
+from augment.scene.geometry import quat_from_rotmat, rigid, rotmat_from_quat
+from augment.scene.scene import Track
+from augment.scene.semantics import SemanticClass
 
 _MERGE_NS = 1_000_000  # two boxes of one object this close in time are one sample
 # A moving object's returns stray from its box by timing and labelling: within this of the box a

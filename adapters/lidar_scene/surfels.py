@@ -20,11 +20,11 @@ from scipy.spatial import cKDTree
 
 from adapters.lidar_scene.kernels import for_row_slices
 from adapters.lidar_scene.split import PointSet, is_flat
-from augment.geometry import quat_from_rotmat
 from augment.render.cpu.jit import cached_njit
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians
-from augment.semantics import SemanticClass as Class
+from augment.scene.geometry import quat_from_rotmat
+from augment.scene.scene import Gaussians
+from augment.scene.semantics import SemanticClass as Class
 
 NEAR_M = 6.0  # voxels have their given size up to this distance from the path
 # Edges grow with this power of the distance: slower than a LiDAR's spacing, because a narrow camera

@@ -51,14 +51,14 @@ from adapters.raw_drive import (
     world_classes,
 )
 from adapters.uri import format_uri
-from augment.cameras import Camera, Frame
 from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError
 from augment.files.pickles import read_npy
-from augment.geometry import invert_rigid
-from augment.labels import Boxes, LidarSweep
-from augment.scene import Scene
-from augment.semantics import SemanticClass
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import invert_rigid
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass
 from recipes.files import open_file
 
 # ---- Sweeps and boxes by frame, in the global world ----------------------------------------------

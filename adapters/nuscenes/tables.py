@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation
 from adapters.plain_files import Number, Text, resolve_inside, validate_content
 from adapters.raw_drive import DriveOptions
 from augment.errors import AdapterError
-from augment.labels import Boxes
+from augment.scene.labels import Boxes
 from recipes.files import open_file
 
 # Characters that are read at a time.

@@ -61,22 +61,22 @@ from adapters.recording.files import (
     unlisted_images,
 )
 from adapters.uri import format_uri
-from augment.cameras import Camera, Frame
 from augment.effects.lidar.beam import find_intensity_column
 from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError, OutputError
-from augment.jobs.files import decode_png, depth_in_metres
-from augment.jobs.layout import SWEEP_FOLDER, folder_name
-from augment.jobs.tables import (
+from augment.output.layout import SWEEP_FOLDER, folder_name
+from augment.output.tables import (
     ATTRIBUTE_PREFIX,
     has_climategs_metadata,
     read_boxes,
     read_lidar,
     read_table,
 )
-from augment.labels import Boxes, LidarSweep
-from augment.scene import Gaussians, Ground, Scene
-from augment.semantics import SemanticClass
+from augment.output.view_files import decode_png, depth_in_metres
+from augment.scene.cameras import Camera, Frame
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Gaussians, Ground, Scene
+from augment.scene.semantics import SemanticClass
 from recipes.files import open_file
 
 # ---- Boxes and sweeps, of a job or of any other program, with every column -----------------------

@@ -6,7 +6,7 @@
 What a `generate` job wrote has labels/boxes/*.parquet and calibration/*.json in their place, each
 of some frames and cameras; they are taken together. Frame numbers may have leading zeros or not. A
 camera's folder is its name, or, for a name that is no safe folder name, what
-`augment.jobs.layout.folder_name` makes of it.
+`augment.output.layout.folder_name` makes of it.
 
 Of calibration.json, the file that a render job writes, only `frames` is required, and in each frame
 `frame`, `timestamp_ns`, `world_from_ego` and `cameras`; a camera's timestamp_ns is the frame's
@@ -37,12 +37,12 @@ from pydantic import AfterValidator, BaseModel, Field
 
 from adapters.plain_files import Number, read_json, validate_content
 from adapters.raw_drive import NO_SURFACE, Picture, drive_origin, usable_images
-from augment.cameras import Camera, Frame
 from augment.errors import AdapterError, SceneError
-from augment.geometry import invert_rigid
-from augment.jobs.layout import folder_name
-from augment.jobs.manifest import MAX_SIDE_PX
-from augment.semantics import SemanticClass
+from augment.output.layout import folder_name
+from augment.output.manifest import MAX_SIDE_PX
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import invert_rigid
+from augment.scene.semantics import SemanticClass
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 CALIBRATION = "calibration.json"

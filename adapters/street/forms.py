@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from augment.semantics import SemanticClass
+from augment.scene.semantics import SemanticClass
 
 # ---- Smooth noise from hashed lattices: the same value for the same place, whoever asks ----------
 # Nothing here holds state, so a splat and a ray that meet a surface at one point see one colour.

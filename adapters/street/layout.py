@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from adapters.camera_files.camera_files import validate
 from adapters.uri import check_query
 from adapters.world import invert_pose
-from augment.cameras import Camera, Frame
-from augment.scene import Track
+from augment.scene.cameras import Camera, Frame
+from augment.scene.scene import Track
 
 
 class StreetParameters(BaseModel):

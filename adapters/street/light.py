@@ -17,7 +17,7 @@ import torch
 
 from adapters.street.forms import Material, Shapes, albedo, fractal_noise, value_noise
 from adapters.street.raycast import Tree
-from augment.sky import CubemapSky, directions_of_cubemap
+from augment.scene.sky import CubemapSky, directions_of_cubemap
 
 # Linear colour of sunlight.
 SUN_RGB = np.array([1.0, 0.91, 0.76]) * 2.75

@@ -20,10 +20,10 @@ from adapters.street.light import SKY_RGB, SUN_RGB, Body
 from adapters.street.raycast import Tree
 from adapters.street.world import MovingBody
 from adapters.world import join_gaussians
-from augment.geometry import quat_from_rotmat
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians
-from augment.semantics import SemanticClass
+from augment.scene.geometry import quat_from_rotmat
+from augment.scene.scene import Gaussians
+from augment.scene.semantics import SemanticClass
 
 # ---- How far apart the splats of each surface may stand, and how far below it they must lie ------
 # A splat's footprint should look equally large wherever the ego cameras see it from, so its spacing

@@ -68,7 +68,7 @@ from adapters.street.layout import (
 )
 from adapters.street.light import Body, Lighting, direction_to_sun
 from adapters.street.raycast import build_tree
-from augment.semantics import SemanticClass as Class
+from augment.scene.semantics import SemanticClass as Class
 
 # ---- House fronts: windows, doors and shops ------------------------------------------------------
 # A front has its own frame: x along the wall, y into the house, z up; its outer face is the plane

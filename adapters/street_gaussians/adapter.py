@@ -73,14 +73,14 @@ from adapters.street_gaussians.model import (
 )
 from adapters.uri import format_uri
 from adapters.world import with_class_of
-from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.files.pickles import PickleError
-from augment.geometry import quat_from_rotmat, rotmat_from_quat
-from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.memo import SceneMemo
-from augment.scene import Actor, ColorSeries, Scene, Track
-from augment.sky import ConstantSky, CubemapSky
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import quat_from_rotmat, rotmat_from_quat
+from augment.scene.labels import Boxes, LabelSource, LidarSweep
+from augment.scene.scene import Actor, ColorSeries, Scene, Track
+from augment.scene.sky import ConstantSky, CubemapSky
 
 
 def open_street_gaussians(path: str, query: dict[str, str]) -> Scene:

@@ -38,11 +38,11 @@ from adapters.camera_files.camera_files import validate
 from adapters.plain_files import read_json, read_numbers, read_pose, read_text
 from adapters.raw_drive import Picture, image_notes
 from adapters.world import invert_pose
-from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.files.image_size import ImageHeader, read_image_header
 from augment.files.recorded_images import exif_hint
-from augment.geometry import quat_from_rotmat, rotmat_from_quat, slerp
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import quat_from_rotmat, rotmat_from_quat, slerp
 
 CAMERA_NAMES = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 Number = Annotated[int, Field(ge=0, lt=10**9)]  # of a frame or object

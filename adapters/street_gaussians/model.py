@@ -32,8 +32,14 @@ from augment.files.checkpoints import (
     release,
 )
 from augment.files.ply import SEMANTIC, PlyElement, PlyHeader, read_columns, read_ply_header
-from augment.geometry import rotmat_from_quat
-from augment.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians, drawable_rows, is_drawable
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.scene import (
+    NUM_SH_BY_DEGREE,
+    Gaussians,
+    check_gaussians,
+    drawable_rows,
+    is_drawable,
+)
 
 # ---- What the URI of a trained model may ask for -----------------------------------------------
 

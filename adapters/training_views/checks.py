@@ -24,8 +24,10 @@ import torch
 from adapters.lidar_scene.depth import project_points
 from adapters.training_views.depth_priors import is_visible_return
 from adapters.training_views.views import RecordedViews
-from augment.cameras import Camera
-from augment.geometry import (
+from augment.photo.own_car import spread_evenly
+from augment.reconstruct.view import ViewKey
+from augment.scene.cameras import Camera
+from augment.scene.geometry import (
     invert_rigid,
     multiply_quats,
     quat_from_rotmat,
@@ -33,10 +35,8 @@ from augment.geometry import (
     rotmat_from_quat,
     slerp,
 )
-from augment.labels import LidarSweep
-from augment.own_car import spread_evenly
-from augment.reconstruct.view import ViewKey
-from augment.scene import Scene
+from augment.scene.labels import LidarSweep
+from augment.scene.scene import Scene
 
 _WIDTH = 480  # columns of the images compared, at most
 _REACH_DEG = 1.2  # largest shift that is searched, to each side

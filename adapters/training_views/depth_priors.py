@@ -21,13 +21,13 @@ import numpy as np
 from adapters.lidar_scene.depth import DepthPixels, read_returns
 from adapters.plain_files import decode_image
 from adapters.safe_pickle import read_array, read_array_dict
-from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.memo import SceneMemo
 from augment.reconstruct.view import ViewKey
 from augment.render.cpu.jit import cached_njit
 from augment.render.threads import kernel_threads
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""Masks of the recording car from a user, instead of those that `augment.own_car` finds."""
+"""Masks of the recording car from a user, instead of those that `augment.photo.own_car` finds."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from adapters.plain_files import decode_image
-from augment.cameras import Camera
 from augment.errors import AdapterError
+from augment.scene.cameras import Camera
 
 _WHITE = 128  # levels from which a pixel of a mask is white
 

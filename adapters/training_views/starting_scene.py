@@ -26,17 +26,17 @@ import torch
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
 from adapters.training_views.views import RecordedViews
 from adapters.world import join_gaussians
-from augment.cameras import Camera
-from augment.geometry import rigid
-from augment.labels import EGO_VEHICLE
-from augment.own_car import spread_evenly
+from augment.photo.own_car import spread_evenly
+from augment.photo.recorded_sky import TOP_MARGIN_RAD
 from augment.reconstruct.view import ViewSource
-from augment.recorded_sky import TOP_MARGIN_RAD
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
 from augment.render.rasterize import rasterize
-from augment.scene import Actor, Gaussians, Scene, Track
-from augment.semantics import SemanticClass
-from augment.view_images import SURFACE_ALPHA
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid
+from augment.scene.labels import EGO_VEHICLE
+from augment.scene.scene import Actor, Gaussians, Scene, Track
+from augment.scene.semantics import SemanticClass
+from augment.view.images import SURFACE_ALPHA
 
 logger = logging.getLogger(__name__)
 

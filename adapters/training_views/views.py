@@ -15,14 +15,14 @@ from tqdm import tqdm
 
 from adapters.training_views.depth_priors import DepthPriors, DepthSource, ReferenceDepth
 from adapters.training_views.masks import read_ego_mask
-from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import SceneMemo
-from augment.own_car import find_own_car_mask, moving_frames
+from augment.photo.own_car import find_own_car_mask, moving_frames
+from augment.photo.recorded_sky import lidar_top_rad, sky_mask
 from augment.reconstruct.view import RecordedView, ViewKey
-from augment.recorded_sky import lidar_top_rad, sky_mask
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 
 NONE = "none"
 _EVERY = re.compile(r"every-(\d{1,6})(?:st|nd|rd|th)")

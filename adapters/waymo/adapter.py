@@ -53,7 +53,6 @@ from adapters.waymo.tables import (
     find_segment,
     read_segment,
 )
-from augment.cameras import Camera, Frame
 from augment.effects.lidar.codes import INDEX_COLUMN
 from augment.errors import AdapterError
 from augment.files.image_size import image_header
@@ -64,10 +63,11 @@ from augment.files.packed_images import (
     ColumnKind,
     RowReader,
 )
-from augment.geometry import invert_rigid
-from augment.labels import Boxes, LidarSweep
-from augment.scene import Scene
-from augment.semantics import SemanticClass
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import invert_rigid
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass
 
 _SPIN_NS = 100_000_000  # the TOP laser turns ten times a second
 # The recording car in its own frame, a sedan or van of 4.7 to 5.2 m whose rear axle is 1.1 m from

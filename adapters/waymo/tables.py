@@ -26,8 +26,8 @@ from adapters.scene_cache import image_folder
 from adapters.uri import WAYMO_REQUIRED, WAYMO_SPLITS
 from augment.errors import AdapterError
 from augment.files.packed_images import NUMBER_LISTS, Lens, PackedImages, is_number, parquet_errors
-from augment.jobs.manifest import MAX_SIDE_PX
-from augment.jobs.tables import read_table
+from augment.output.manifest import MAX_SIDE_PX
+from augment.output.tables import read_table
 
 COMPONENTS = {
     "vehicle_pose": "VehiclePoseComponent",

@@ -13,12 +13,12 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from augment.boxes import WorldBoxes, outline_boxes, pixels_of_boxes
-from augment.cameras import Camera
 from augment.dataset.samples import buffers, check_choice, points_in_frame, quats_in_frame
-from augment.geometry import invert_rigid, rotmat_from_quat
-from augment.labels import Boxes
-from augment.semantics import class_of_label
+from augment.scene.boxes import WorldBoxes, outline_boxes, pixels_of_boxes
+from augment.scene.cameras import Camera
+from augment.scene.geometry import invert_rigid, rotmat_from_quat
+from augment.scene.labels import Boxes
+from augment.scene.semantics import class_of_label
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,8 +177,8 @@ def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
     """Return the pixels that show each of a sample's boxes, bool [B, H, W].
 
     A pixel shows a box if its surface, by the depth image, lies inside the box without its lowest
-    centimetres and with the other sides 10 cm wider (`augment.boxes`). An object in front of a box
-    is therefore not in the mask of the box. Where boxes overlap, a pixel is in both masks.
+    centimetres and with the other sides 10 cm wider (`augment.scene.boxes`). An object in front of
+    a box is therefore not in the mask of the box. Where boxes overlap, a pixel is in both masks.
 
     Raises:
         ValueError: the sample has no boxes or no depth.

@@ -25,7 +25,7 @@ from augment.dataset.samples import (
     stack_same_shape,
 )
 from augment.dataset.weather_dataset import Rows, WeatherDataset, number_groups
-from augment.jobs.manifest import effect_masks
+from augment.output.manifest import effect_masks
 
 # ---- Samples dealt to all processes, the same again after an interruption ------------------------
 

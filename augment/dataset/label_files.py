@@ -28,13 +28,11 @@ import numpy as np
 import torch
 from pydantic import BaseModel, NonNegativeInt
 
-from augment.boxes import are_usable
 from augment.dataset.clips_pairs import split_by_scene
 from augment.dataset.samples import points_in_frame
 from augment.dataset.weather_dataset import RowReader
 from augment.errors import OutputError
-from augment.geometry import invert_rigid, rotmat_from_quat
-from augment.jobs.atomic import (
+from augment.output.atomic import (
     copy_file,
     link_file,
     path_below,
@@ -42,14 +40,16 @@ from augment.jobs.atomic import (
     read_file,
     write_folder_atomically,
 )
-from augment.jobs.box_tables import BOXES_2D, MASK_SIDES, MASKS, SIDES
-from augment.jobs.claims import hold_claim
-from augment.jobs.files import CameraRecord, box_tables, combine_visibility
-from augment.jobs.layout import folder_name, resolve_inside
-from augment.jobs.manifest import MANIFEST_FILE, OK, read_manifest_rows
-from augment.jobs.store import open_store
-from augment.jobs.tables import read_boxes
-from augment.scene import Scene
+from augment.output.box_tables import BOXES_2D, MASK_SIDES, MASKS, SIDES
+from augment.output.claims import hold_claim
+from augment.output.layout import folder_name, resolve_inside
+from augment.output.manifest import MANIFEST_FILE, OK, read_manifest_rows
+from augment.output.store import open_store
+from augment.output.tables import read_boxes
+from augment.output.view_files import CameraRecord, box_tables, combine_visibility
+from augment.scene.boxes import are_usable
+from augment.scene.geometry import invert_rigid, rotmat_from_quat
+from augment.scene.scene import Scene
 from recipes.load import load_recipe, read_overrides
 from recipes.schema import Category, LabelFormat, Output
 

@@ -10,9 +10,6 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from augment.base_photo import check_photos
-from augment.box_estimates import evidence_of
-from augment.cameras import Camera, Frame
 from augment.dataset.samples import (
     BoxFrame,
     ImageType,
@@ -24,7 +21,11 @@ from augment.dataset.samples import (
 )
 from augment.effects import JobContext, precompute_effects
 from augment.errors import BackendUnavailable
-from augment.jobs.files import (
+from augment.jobs.processes import choose_backend
+from augment.jobs.worker import Renderer
+from augment.memo import memo_of
+from augment.output.layout import path_kinds, variant_name
+from augment.output.view_files import (
     SceneIndex,
     ViewResult,
     camera_record,
@@ -36,13 +37,12 @@ from augment.jobs.files import (
     select_frames,
     uses_boxes,
 )
-from augment.jobs.layout import path_kinds, variant_name
-from augment.jobs.processes import choose_backend
-from augment.jobs.quality import resolve_quality
-from augment.jobs.worker import Renderer
-from augment.memo import memo_of
+from augment.photo.recorded_base import check_photos
 from augment.render.buffers import CUDA
-from augment.scene import Scene
+from augment.scene.box_estimates import evidence_of
+from augment.scene.cameras import Camera, Frame
+from augment.scene.scene import Scene
+from augment.view.quality import resolve_quality
 from recipes.files import with_digest
 from recipes.schema import Recipe
 
@@ -71,7 +71,7 @@ class SceneDataset(Dataset):
             forks could not use. "cuda" is for samples of this process, or of workers that are
             started afresh (`spawn`).
         image_type: as for `WeatherDataset`.
-        renderer: renders a view; None takes `augment.views.render_view`.
+        renderer: renders a view; None takes `augment.view.render_view.render_view`.
         load: as for `WeatherDataset`; a live scene passes no sweeps on.
         box_frame: as for `WeatherDataset`.
         transform: as for `WeatherDataset`.
@@ -146,7 +146,7 @@ class SceneDataset(Dataset):
         if self._backend == CUDA and self._process != os.getpid():  # not unpickled: forked
             raise BackendUnavailable(_FORKED)
         if self._renderer is None:
-            from augment.views import render_views  # which brings the rasteriser
+            from augment.view.render_view import render_views  # which brings the rasteriser
 
             return render_views(self.scene, cameras, self.recipe, backend=self._backend)
         options = {"backend": self._backend}

@@ -4,7 +4,7 @@ A sample is a dictionary:
 
     image             float32 [3, H, W] in [0, 1], or uint8 if asked for; RGB, display-encoded
     depth             float32 [H, W], metres along the optical axis, 0 = none; or None
-    semantic          uint8 [H, W], augment.semantics.SemanticClass; or None
+    semantic          uint8 [H, W], augment.scene.semantics.SemanticClass; or None
     instance          int32 [H, W], 0 = none, else the object's number: `boxes` has them; or None
     water             bool [H, W], where a ray meets water first; None where there is no flood
     snow              bool [H, W], where the pixel shows snow; None where there is no snow
@@ -39,15 +39,15 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.utils.data import get_worker_info
 
-from augment.jobs.files import (
+from augment.output.layout import TRUST, mask_names
+from augment.output.view_files import (
     BoxWeather,
     CameraRecord,
     box_tables,
     combine_visibility,
     depth_in_metres,
 )
-from augment.jobs.layout import TRUST, mask_names
-from augment.labels import Boxes, LidarSweep
+from augment.scene.labels import Boxes, LidarSweep
 
 ImageType = Literal["float32", "uint8"]
 BoxFrame = Literal["world", "ego", "camera"]
@@ -235,7 +235,7 @@ def box_tensors(
         streak_fraction, flake_fraction
                           [B], part of its pixels that shows a streak or a flake; NaN as above
         visibility        [B], part of the box that all of this leaves visible, 0 to 1
-                          (`augment.jobs.files.combine_visibility`)
+                          (`augment.output.view_files.combine_visibility`)
 
     Values are None without the weather that they measure. instance, modal_xyxy, visible_fraction
     and truncated_fraction are None where the output is older than they.

@@ -40,9 +40,13 @@ from augment.dataset.samples import (
     make_sample,
 )
 from augment.errors import OutputError
-from augment.jobs.atomic import read_file
-from augment.jobs.box_tables import BoxNumbers
-from augment.jobs.files import (
+from augment.output.atomic import read_file
+from augment.output.box_tables import BoxNumbers
+from augment.output.layout import mask_names, path_kinds, resolve_inside
+from augment.output.manifest import OK, concat_rows, read_manifest_rows, weather_columns
+from augment.output.store import Store, StoredFileMissing, open_store
+from augment.output.tables import read_boxes, read_lidar
+from augment.output.view_files import (
     CameraRecord,
     box_tables,
     decode_image,
@@ -50,10 +54,6 @@ from augment.jobs.files import (
     read_camera,
     read_entries,
 )
-from augment.jobs.layout import mask_names, path_kinds, resolve_inside
-from augment.jobs.manifest import OK, concat_rows, read_manifest_rows, weather_columns
-from augment.jobs.store import Store, StoredFileMissing, open_store
-from augment.jobs.tables import read_boxes, read_lidar
 
 pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import
 

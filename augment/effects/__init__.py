@@ -1,11 +1,12 @@
 """The list of all effects, in the order in which they are applied to an image.
 
-The pipeline (`augment.plan`, `augment.views`) walks through EFFECTS. Other packages may extend the
-list by `add_effect`.
+The pipeline (`augment.view.plan`, `augment.view.render_view`) walks through EFFECTS. Other packages
+may extend the list by `add_effect`.
 """
 
 from __future__ import annotations
 
+from augment.detail.prune import precompute_errors, prune_error_of
 from augment.effects.effect import Effect, JobContext
 from augment.effects.falling.effect import RainEffect, SnowfallEffect
 from augment.effects.flood.effect import FloodEffect
@@ -15,7 +16,6 @@ from augment.effects.snow.effect import SnowEffect
 from augment.effects.spray.effect import SprayEffect
 from augment.effects.style.effect import StyleEffect
 from augment.effects.wet.effect import WetEffect
-from augment.prune import precompute_errors, prune_error_of
 from recipes.schema import add_section, remove_section
 
 # Effects in the order in which they are applied. Style colours the scene, and rain wets it. Then

@@ -27,12 +27,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
-from augment.boxes import WorldBoxes
-from augment.cameras import Camera
-from augment.drawing import LayerRenderer
-from augment.jobs.box_tables import BoxTable
+from augment.output.box_tables import BoxTable
 from augment.render.buffers import RenderOutput
-from augment.scene import Scene
+from augment.scene.boxes import WorldBoxes
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
+from augment.view.layers import LayerRenderer
 from recipes.effect import EffectModel
 from recipes.fields import section_at
 from recipes.schema import Recipe
@@ -261,6 +261,9 @@ class Effect:
 
     raster_passes: ClassVar[tuple[str, ...]] = ()
     """Names of those passes that run the rasteriser."""
+
+    kernel_folders: ClassVar[tuple[str, ...]] = ()
+    """Packages whose kernels the effect needs besides those of its own folder."""
 
     off_switches: ClassVar[Mapping[str, tuple[str, Any]]] = {}
     """Passes that run inside the rasteriser: by name, the dotted path of a recipe field and the

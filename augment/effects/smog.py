@@ -18,17 +18,6 @@ import torch
 from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
-from augment.base_photo import RECORDED
-from augment.boxes import NOT_COUNTED, WorldBoxes, pixels_of_boxes
-from augment.cameras import Camera
-from augment.cast_shadows import (
-    FadedShadows,
-    faded_shadows,
-    precompute_shadows,
-    shadows_of,
-    sun_transmittance,
-)
-from augment.drawing import LayerRenderer
 from augment.effects.effect import (
     PICTURE,
     SCENE,
@@ -44,12 +33,23 @@ from augment.effects.effect import (
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.lidar.codes import LOST, SCATTERED
 from augment.errors import SceneError
-from augment.jobs.box_tables import BoxTable
+from augment.light.cast_shadows import (
+    FadedShadows,
+    faded_shadows,
+    precompute_shadows,
+    shadows_of,
+    sun_transmittance,
+)
+from augment.output.box_tables import BoxTable
+from augment.photo.recorded_base import RECORDED
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
 from augment.render.scatter import scatter_forward
-from augment.scene import Scene
+from augment.scene.boxes import NOT_COUNTED, WorldBoxes, pixels_of_boxes
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from augment.timing import timed
+from augment.view.layers import LayerRenderer
 from recipes.schema import Recipe, Smog
 from recipes.smog import KOSCHMIEDER
 

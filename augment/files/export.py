@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.errors import OutputError, SceneError
 from augment.files.gltf import write_glb
 from augment.files.ply import write_ply, write_splat
@@ -26,12 +25,13 @@ from augment.files.scene_file import document_text, track_entry
 from augment.files.sog import MAX_PALETTE, write_sog
 from augment.files.spz import write_spz
 from augment.files.usd import write_usd
-from augment.geometry import multiply_quats, quat_from_rotmat, rotmat_from_quat
-from augment.jobs.atomic import raise_output_error, write_atomic, write_folder_atomically
-from augment.jobs.layout import folder_name
+from augment.output.atomic import raise_output_error, write_atomic, write_folder_atomically
+from augment.output.layout import folder_name
 from augment.render.sh import rotate_sh
-from augment.scene import NUM_SH_BY_DEGREE, Gaussians, Scene
-from augment.semantics import SemanticClass
+from augment.scene.cameras import Camera
+from augment.scene.geometry import multiply_quats, quat_from_rotmat, rotmat_from_quat
+from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, Scene
+from augment.scene.semantics import SemanticClass
 
 # ---- What an exported file cannot keep of a scene: one sentence each, for people -----------------
 

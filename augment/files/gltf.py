@@ -37,9 +37,9 @@ from pydantic import (
 from augment.errors import SceneError
 from augment.files.limits import check_memory, parse_json_object
 from augment.files.ply import SplatFile, join_positioned_parts
-from augment.geometry import rotmat_from_quat
-from augment.jobs.atomic import write_file_atomically
-from augment.scene import NUM_SH_BY_DEGREE, Gaussians
+from augment.output.atomic import write_file_atomically
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"  # the extension's name
 GLB = b"glTF"  # first bytes of a .glb

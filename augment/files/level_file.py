@@ -1,6 +1,6 @@
 """Reads and writes scenes too large for memory: scene folders that open without being read.
 
-Beside the files of a scene folder, whose background is then sorted by squares (augment.lod),
+Beside the files of a scene folder, whose background is then sorted by squares (augment.detail.lod),
 
     levels.safetensors    of each level k: k.keys, k.starts, k.lows, k.highs, k.longest (Squares),
                           k.boxes.lows, k.boxes.highs, k.boxes.longest (SplatBoxes), k.parents; from
@@ -23,10 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.errors import SceneError
-from augment.files.checkpoints import checked_tensor
-from augment.files.scene_file import read_tensors, save_scene
-from augment.lod import (
+from augment.detail.lod import (
     CELLS_M,
     MAX_LEVELS,
     Level,
@@ -39,8 +36,11 @@ from augment.lod import (
     slice_gaussians,
     square_order,
 )
+from augment.errors import SceneError
+from augment.files.checkpoints import checked_tensor
+from augment.files.scene_file import read_tensors, save_scene
 from augment.render.cpu.order import CELL_SIZE
-from augment.scene import NUM_SH_BY_DEGREE, Gaussians, Scene
+from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, Scene
 
 # Shapes of one row of the arrays, by name.
 _ROW_SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}

@@ -28,8 +28,8 @@ from augment.errors import AdapterError, OutputError
 from augment.files.image_size import image_header
 from augment.files.recorded_images import decode_pixels
 from augment.files.stated_sizes import StatedSizeError, check_row_group
-from augment.jobs.atomic import temporary_path
-from augment.jobs.tables import open_parquet
+from augment.output.atomic import temporary_path
+from augment.output.tables import open_parquet
 from recipes.files import open_file
 
 PACKED = "packed.json"  # the file that describes a folder's images

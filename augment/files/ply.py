@@ -22,9 +22,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.errors import SceneError
-from augment.jobs.atomic import write_file_atomically
+from augment.output.atomic import write_file_atomically
 from augment.render.sh import SH_C0
-from augment.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
+from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
 # ---- The container: a header, and tables of rows that are read in pieces -------------------------
 

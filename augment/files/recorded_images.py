@@ -13,8 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from augment.cameras import Camera
 from augment.files.image_size import ImageHeader, read_image_header
+from augment.scene.cameras import Camera
 from recipes.files import open_file
 
 _MAX_BYTES = 1 << 30  # bytes of an image file that are read

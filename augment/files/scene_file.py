@@ -38,13 +38,13 @@ from pydantic import (
 from safetensors import safe_open
 from torch import Tensor
 
-from augment.cameras import Camera, Frame
+from augment.detail.lod import store_levels
 from augment.errors import OutputError, SceneError
 from augment.files.checkpoints import checked_tensor
 from augment.files.limits import check_values
-from augment.jobs.atomic import write_file_atomically, write_folder_atomically
-from augment.lod import store_levels
-from augment.scene import (
+from augment.output.atomic import write_file_atomically, write_folder_atomically
+from augment.scene.cameras import Camera, Frame
+from augment.scene.scene import (
     NUM_SH_BY_DEGREE,
     Actor,
     ColorSeries,
@@ -57,8 +57,8 @@ from augment.scene import (
     drawable_rows,
     is_drawable,
 )
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from recipes.files import open_file
 
 # ---- The arrays of a saved scene: names, shapes, and the check that every number can be rendered -
@@ -472,7 +472,7 @@ class ImageColorMapEntry(_Closed):
 
 
 class GroundEntry(_Closed):
-    """The fields of the record augment.ground.Ground."""
+    """The fields of the record augment.scene.ground.Ground."""
 
     lowest_z_m: float
     median_z_m: float

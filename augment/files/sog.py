@@ -34,9 +34,9 @@ from augment.files.image_size import image_header
 from augment.files.limits import check_memory, parse_json_object, row_slices
 from augment.files.ply import SplatFile
 from augment.files.scene_file import validate_model
-from augment.jobs.atomic import write_file_atomically
+from augment.output.atomic import write_file_atomically
 from augment.rng import rng_for
-from augment.scene import Gaussians, check_gaussians
+from augment.scene.scene import Gaussians, check_gaussians
 from recipes.files import open_file
 
 SUFFIX = ".sog"  # the end of the zipped files' names

@@ -27,8 +27,8 @@ import torch
 from augment.errors import SceneError
 from augment.files.limits import check_memory, row_slices
 from augment.files.ply import SplatFile
-from augment.jobs.atomic import write_file_atomically
-from augment.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
+from augment.output.atomic import write_file_atomically
+from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
 SUFFIX = ".spz"  # the end of the files' names
 UP = "+y"  # the axis that points up

@@ -22,7 +22,7 @@ from augment.files.limits import check_memory, read_json_object
 from augment.files.ply import SplatFile
 from augment.files.scene_file import validate_model
 from augment.files.sog import META, SUFFIX, read_all_sog_gaussians
-from augment.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
+from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
 LOD_META = "lod-meta.json"  # the name of the file that describes the scene
 _MAX_META_BYTES = 128 << 20  # bytes of it; a tree of a hundred thousand leaves has about 20 MB

@@ -29,8 +29,8 @@ from augment.errors import SceneError
 from augment.files.limits import check_memory, parse_json_object
 from augment.files.ply import SplatFile, join_positioned_parts
 from augment.files.usd_stage import ATTRIBUTES, COEFFICIENTS
-from augment.jobs.atomic import make_folder, raise_output_error, write_file_atomically
-from augment.scene import NUM_SH_BY_DEGREE, Gaussians
+from augment.output.atomic import make_folder, raise_output_error, write_file_atomically
+from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians
 
 _BASE_MEMORY_BYTES = 2 << 30  # bytes of address space to read a file of any size
 _MEMORY_PER_BYTE = 16  # bytes beyond that for each byte of the file

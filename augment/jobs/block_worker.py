@@ -21,17 +21,20 @@ import pyarrow as pa
 
 from augment import effects
 from augment.errors import ClimateGSError, GpuLost, OutputError, SceneError, StyleError
-from augment.jobs.atomic import (
+from augment.jobs.blocks import Block, SceneRecord
+from augment.jobs.pools import OutcomeCallback
+from augment.jobs.processes import file_lock
+from augment.jobs.render_job import RenderJob, SceneLoader, file_folders, run_job
+from augment.jobs.worker import Outcome, Renderer, TaskFailed, WorkTimes, describe_error
+from augment.output.atomic import (
     copy_file,
     link_file,
     make_folder,
     raise_output_error,
     remove_temporaries,
 )
-from augment.jobs.blocks import Block, SceneRecord
-from augment.jobs.claims import CLAIMS_FOLDER, hold_claim, try_claim
-from augment.jobs.files import box_tables
-from augment.jobs.layout import (
+from augment.output.claims import CLAIMS_FOLDER, hold_claim, try_claim
+from augment.output.layout import (
     MANIFEST_FILE,
     STATE_FOLDER,
     SWEEP_FOLDER,
@@ -42,7 +45,7 @@ from augment.jobs.layout import (
     path_kinds,
     variant_folder,
 )
-from augment.jobs.manifest import (
+from augment.output.manifest import (
     OK,
     PARTS,
     Identity,
@@ -53,14 +56,11 @@ from augment.jobs.manifest import (
     read_manifest,
     write_manifest,
 )
-from augment.jobs.pools import OutcomeCallback
-from augment.jobs.processes import file_lock
-from augment.jobs.quality import CHOICES_FOLDER as QUALITY
-from augment.jobs.quality import choose_settings
-from augment.jobs.render_job import RenderJob, SceneLoader, file_folders, run_job
-from augment.jobs.store import LocalStore, Store, StoredFileMissing, open_store
-from augment.jobs.worker import Outcome, Renderer, TaskFailed, WorkTimes, describe_error
-from augment.scene import Scene
+from augment.output.store import LocalStore, Store, StoredFileMissing, open_store
+from augment.output.view_files import box_tables
+from augment.scene.scene import Scene
+from augment.view.quality import CHOICES_FOLDER as QUALITY
+from augment.view.quality import choose_settings
 from recipes.schema import Recipe
 
 # ---- Publishing: moves a block from the folder it was rendered in to the output ------------------

@@ -20,12 +20,10 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter
 
 import augment
-from augment.cameras import scaled_size
 from augment.errors import ClimateGSError, OutputError, SceneError
-from augment.jobs.atomic import read_file
-from augment.jobs.claims import CLAIMS_FOLDER, try_claim
-from augment.jobs.files import RECORDED, SceneIndex, has_lidar, select_frames
-from augment.jobs.layout import (
+from augment.output.atomic import read_file
+from augment.output.claims import CLAIMS_FOLDER, try_claim
+from augment.output.layout import (
     MANIFEST_FILE,
     OLD_PROGRESS_LOGS,
     PROGRESS_LOGS,
@@ -34,10 +32,12 @@ from augment.jobs.layout import (
     parse_errors_as_output_errors,
     variant_name,
 )
-from augment.jobs.manifest import OK, Identity, ImageFacts, Part, list_parts, read_manifest
-from augment.jobs.store import Store
-from augment.scene import Scene
-from augment.trust import judge_scene, source_views, unfitted_cameras
+from augment.output.manifest import OK, Identity, ImageFacts, Part, list_parts, read_manifest
+from augment.output.store import Store
+from augment.output.view_files import RECORDED, SceneIndex, has_lidar, select_frames
+from augment.photo.trust import judge_scene, source_views, unfitted_cameras
+from augment.scene.cameras import scaled_size
+from augment.scene.scene import Scene
 from recipes.job import ALL_CAMERAS, JobRecipes, JobScene
 from recipes.schema import Recipe, parse_frames
 
@@ -79,7 +79,7 @@ class SceneRecord:
     images.
     """
     problems: tuple[str, ...] = ()
-    """Reasons why the scene is not fit for weather, as of augment.trust.SceneTrust."""
+    """Reasons why the scene is not fit for weather, as of augment.photo.trust.SceneTrust."""
     digest: str | None = None
     """Digest of the scene's content; None where it is not known."""
 

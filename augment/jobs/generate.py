@@ -28,7 +28,6 @@ import pyarrow as pa
 
 import augment
 from augment.errors import OutputError
-from augment.jobs.atomic import raise_output_error
 from augment.jobs.block_worker import (
     BlockResult,
     BlockTask,
@@ -39,9 +38,14 @@ from augment.jobs.block_worker import (
     clear_leftovers,
 )
 from augment.jobs.blocks import Block, JobPlan, SceneRecord, make_job_plan, select_shard, store_plan
-from augment.jobs.claims import try_claim
-from augment.jobs.files import RECORDED
-from augment.jobs.layout import (
+from augment.jobs.pools import ProcessPool, RayPool, SerialPool, Work, WorkerPool, run_tasks
+from augment.jobs.processes import available_cores, renders_on_gpu
+from augment.jobs.render_job import RenderJob, SceneLoader, lacks_recipe, run_job, write_recipe
+from augment.jobs.scene_changes import SceneChange, changes_in
+from augment.jobs.worker import WORKERS, Outcome, TaskFailed
+from augment.output.atomic import raise_output_error
+from augment.output.claims import try_claim
+from augment.output.layout import (
     MANIFEST_FILE,
     STATE_FOLDER,
     FileListing,
@@ -49,7 +53,7 @@ from augment.jobs.layout import (
     variant_folder,
     variant_name,
 )
-from augment.jobs.manifest import (
+from augment.output.manifest import (
     FAILED,
     KEY,
     OK,
@@ -66,17 +70,13 @@ from augment.jobs.manifest import (
     rows_to_table,
     rows_without_files,
 )
-from augment.jobs.pools import ProcessPool, RayPool, SerialPool, Work, WorkerPool, run_tasks
-from augment.jobs.processes import available_cores, renders_on_gpu
-from augment.jobs.quality import Question, read_choice
-from augment.jobs.render_job import RenderJob, SceneLoader, lacks_recipe, run_job, write_recipe
-from augment.jobs.scene_changes import SceneChange, changes_in
-from augment.jobs.store import Store, StoredFileMissing, open_store
-from augment.jobs.worker import WORKERS, Outcome, TaskFailed
+from augment.output.store import Store, StoredFileMissing, open_store
+from augment.output.view_files import RECORDED
+from augment.photo.trust import magnification_sentence, skipped_cameras_sentence
 from augment.progress import ProgressBar
 from augment.render.buffers import AUTO, CUDA
-from augment.scene import Scene
-from augment.trust import magnification_sentence, skipped_cameras_sentence
+from augment.scene.scene import Scene
+from augment.view.quality import Question, read_choice
 from recipes.files import with_digest
 from recipes.job import JobRecipes, JobScene
 from recipes.schema import Recipe, columns_of_effects

@@ -24,9 +24,9 @@ from typing import Any
 
 import pyarrow as pa
 
-from augment.cameras import Frame
 from augment.errors import OutputError
-from augment.jobs.atomic import (
+from augment.jobs.worker import Chunk, Outcome, describe_error
+from augment.output.atomic import (
     flush_folder,
     make_folder,
     make_output_error,
@@ -36,10 +36,9 @@ from augment.jobs.atomic import (
     remove_temporaries,
     write_atomic,
 )
-from augment.jobs.box_tables import BoxNumbers, Item
-from augment.jobs.claims import hold_claim
-from augment.jobs.files import SceneIndex, box_tables, calibration_bytes, frame_entry, read_entries
-from augment.jobs.layout import (
+from augment.output.box_tables import BoxNumbers, Item
+from augment.output.claims import hold_claim
+from augment.output.layout import (
     MANIFEST_FILE,
     OLD_PROGRESS_LOGS,
     PROGRESS_LOGS,
@@ -55,7 +54,7 @@ from augment.jobs.layout import (
     variant_folder,
     variant_name,
 )
-from augment.jobs.manifest import (
+from augment.output.manifest import (
     OK,
     PARTS,
     Identity,
@@ -69,9 +68,16 @@ from augment.jobs.manifest import (
     select_variant_rows,
     write_manifest,
 )
-from augment.jobs.store import open_store
-from augment.jobs.tables import FrameBoxes, boxes_bytes, read_boxes
-from augment.jobs.worker import Chunk, Outcome, describe_error
+from augment.output.store import open_store
+from augment.output.tables import FrameBoxes, boxes_bytes, read_boxes
+from augment.output.view_files import (
+    SceneIndex,
+    box_tables,
+    calibration_bytes,
+    frame_entry,
+    read_entries,
+)
+from augment.scene.cameras import Frame
 from recipes.schema import Recipe
 
 _log = logging.getLogger(__name__)

@@ -30,11 +30,11 @@ import numpy as np
 from pydantic import BaseModel
 from tqdm import tqdm
 
-from augment.cameras import Frame
 from augment.effects.lidar.codes import drop_lost_returns
 from augment.errors import AdapterError, OutputError
 from augment.files.image_size import read_image_header
-from augment.jobs.atomic import (
+from augment.jobs.placed_files import ANY_SIZE, PlacedFile, PlacedFiles, digest_of
+from augment.output.atomic import (
     copy_file,
     flush_folder,
     link_file,
@@ -46,12 +46,12 @@ from augment.jobs.atomic import (
     write_atomic,
     write_file_atomically,
 )
-from augment.jobs.files import WritePump, decode_image, encode_image
-from augment.jobs.layout import folder_name, parse_errors_as_output_errors, resolve_inside
-from augment.jobs.manifest import OK
-from augment.jobs.placed_files import ANY_SIZE, PlacedFile, PlacedFiles, digest_of
-from augment.jobs.tables import read_lidar
-from augment.labels import LabelSource, StoresLidar
+from augment.output.layout import folder_name, parse_errors_as_output_errors, resolve_inside
+from augment.output.manifest import OK
+from augment.output.tables import read_lidar
+from augment.output.view_files import WritePump, decode_image, encode_image
+from augment.scene.cameras import Frame
+from augment.scene.labels import LabelSource, StoresLidar
 from recipes.load import load_recipe
 from recipes.schema import Output
 

@@ -16,17 +16,17 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from augment.cameras import Frame
 from augment.effects import JobContext, precompute_effects
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import OutputError
-from augment.jobs.atomic import write_atomic
-from augment.jobs.layout import STATE_FOLDER, SWEEP_FOLDER, item_paths, variant_folder
-from augment.jobs.manifest import OK
-from augment.jobs.tables import lidar_bytes, read_lidar_note
 from augment.jobs.worker import describe_error
-from augment.labels import StoresLidar
-from augment.scene import Scene
+from augment.output.atomic import write_atomic
+from augment.output.layout import STATE_FOLDER, SWEEP_FOLDER, item_paths, variant_folder
+from augment.output.manifest import OK
+from augment.output.tables import lidar_bytes, read_lidar_note
+from augment.scene.cameras import Frame
+from augment.scene.labels import StoresLidar
+from augment.scene.scene import Scene
 from recipes.schema import Recipe
 
 

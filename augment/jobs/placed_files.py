@@ -16,8 +16,8 @@ from typing import BinaryIO, NamedTuple
 
 from pydantic import TypeAdapter
 
-from augment.jobs.atomic import raise_output_error, write_atomic
-from augment.jobs.layout import parse_errors_as_output_errors
+from augment.output.atomic import raise_output_error, write_atomic
+from augment.output.layout import parse_errors_as_output_errors
 from recipes.files import open_file
 
 # Size of a file whose contents are encoded after its line is written.

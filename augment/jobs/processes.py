@@ -30,9 +30,8 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 import torch
 
-from augment.cameras import Frame
 from augment.errors import BackendUnavailable, ClimateGSError, OutputError
-from augment.jobs.atomic import (
+from augment.output.atomic import (
     MAX_MARK_BYTES,
     lock_holder,
     make_folder,
@@ -42,9 +41,10 @@ from augment.jobs.atomic import (
     temporary_path,
     wait_for_lock,
 )
-from augment.jobs.layout import STATE_FOLDER
+from augment.output.layout import STATE_FOLDER
 from augment.render.buffers import AUTO, BACKENDS, CPU, CUDA, REFERENCE, import_cpu, import_cuda
-from augment.scene import Scene
+from augment.scene.cameras import Frame
+from augment.scene.scene import Scene
 
 # ---- Choice of the rasteriser's backend ----------------------------------------------------------
 

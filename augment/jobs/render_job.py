@@ -22,15 +22,9 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import augment
-from augment.base_photo import check_photos
-from augment.cameras import Frame
 from augment.effects import JobContext, precompute_effects
 from augment.errors import ClimateGSError, OutputError
-from augment.jobs.atomic import path_below, read_file, write_atomic
-from augment.jobs.files import SceneIndex, select_frames, trajectory_id, uses_boxes
 from augment.jobs.job_state import BoxCache, JobState
-from augment.jobs.layout import MANIFEST_FILE, STATE_FOLDER, folder_name, variant_name
-from augment.jobs.manifest import FAILED, OK, Identity
 from augment.jobs.pools import ProcessPool, SerialPool, Work, WorkerPool, run_tasks
 from augment.jobs.processes import (
     OutputLock,
@@ -39,8 +33,6 @@ from augment.jobs.processes import (
     choose_backend,
     share_scene,
 )
-from augment.jobs.quality import choose_settings
-from augment.jobs.store import open_store
 from augment.jobs.worker import (
     WORKERS,
     Chunk,
@@ -52,8 +44,16 @@ from augment.jobs.worker import (
     WorkTimes,
 )
 from augment.memo import memo_of
+from augment.output.atomic import path_below, read_file, write_atomic
+from augment.output.layout import MANIFEST_FILE, STATE_FOLDER, folder_name, variant_name
+from augment.output.manifest import FAILED, OK, Identity
+from augment.output.store import open_store
+from augment.output.view_files import SceneIndex, select_frames, trajectory_id, uses_boxes
+from augment.photo.recorded_base import check_photos
 from augment.progress import ProgressBar
-from augment.scene import Scene
+from augment.scene.cameras import Frame
+from augment.scene.scene import Scene
+from augment.view.quality import choose_settings
 from recipes.fields import section_at, with_unchecked_field
 from recipes.files import read_files, with_digest
 from recipes.load import dump_recipe
@@ -266,7 +266,8 @@ def run_job(
 
     Args:
         scene_loader: Called once with `job.scene_uri`.
-        renderer: `augment.views.render_view` if None. With several workers it must be an importable
+        renderer: `augment.view.render_view.render_view` if None. With several workers it must be an
+        importable
             function, and the scene's labels and sky must be of importable classes.
         progress: If True, show a bar on stderr.
         on_outcome: Called after each image, from several threads, one call at a time.

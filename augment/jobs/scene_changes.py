@@ -19,10 +19,10 @@ import pyarrow.compute
 from augment.errors import OutputError
 from augment.jobs.block_worker import VARIANTS, clear_staged
 from augment.jobs.blocks import Block
-from augment.jobs.claims import hold_claim
-from augment.jobs.layout import MANIFEST_FILE, folder_name
-from augment.jobs.manifest import list_parts, read_manifest, write_manifest
-from augment.jobs.store import Store
+from augment.output.claims import hold_claim
+from augment.output.layout import MANIFEST_FILE, folder_name
+from augment.output.manifest import list_parts, read_manifest, write_manifest
+from augment.output.store import Store
 
 pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import
 

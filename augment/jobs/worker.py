@@ -20,12 +20,20 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from augment.box_estimates import evidence_of
-from augment.boxes import Instances
-from augment.cameras import Camera, Frame
 from augment.errors import GpuLost, OutputError
-from augment.jobs.atomic import write_atomic
-from augment.jobs.files import (
+from augment.jobs.processes import (
+    InheritedLock,
+    available_cores,
+    gpu_is_lost,
+    renders_on_gpu,
+    shorten_switch_interval,
+)
+from augment.memo import memo_of
+from augment.output.atomic import write_atomic
+from augment.output.layout import item_paths, variant_name
+from augment.output.manifest import FAILED, OK
+from augment.output.tables import lidar_bytes, read_lidar_note
+from augment.output.view_files import (
     BoxWeather,
     ViewResult,
     WritePump,
@@ -34,19 +42,11 @@ from augment.jobs.files import (
     uses_boxes,
     write_view,
 )
-from augment.jobs.layout import item_paths, variant_name
-from augment.jobs.manifest import FAILED, OK
-from augment.jobs.processes import (
-    InheritedLock,
-    available_cores,
-    gpu_is_lost,
-    renders_on_gpu,
-    shorten_switch_interval,
-)
-from augment.jobs.tables import lidar_bytes, read_lidar_note
-from augment.labels import Boxes, LidarSweep
-from augment.memo import memo_of
-from augment.scene import Scene
+from augment.scene.box_estimates import evidence_of
+from augment.scene.boxes import Instances
+from augment.scene.cameras import Camera, Frame
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Scene
 from recipes.schema import Recipe
 
 # ---- Where a job's time goes: seconds by kind of work, and the kind that bounds the job ----------
@@ -215,7 +215,7 @@ _log = logging.getLogger(__name__)
 
 @runtime_checkable
 class Renderer(Protocol):
-    """Function that renders an image: `augment.views.render_view`, `begin_view`, or a stand-in.
+    """Function that renders an image: `render_view`, `begin_view`, or a stand-in.
 
     It returns a ViewResult, or a pending one; in the second case a job begins the next view before
     it waits.
@@ -226,7 +226,7 @@ class Renderer(Protocol):
 
 @runtime_checkable
 class Pending(Protocol):
-    """View whose rendering has begun; `augment.views.PendingView` is one."""
+    """View whose rendering has begun; `augment.view.render_view.PendingView` is one."""
 
     def result(self) -> Any: ...
 
@@ -327,7 +327,7 @@ def default_renderer() -> Renderer:
 
     It is imported only here, because it imports the rasteriser.
     """
-    from augment.views import render_view
+    from augment.view.render_view import render_view
 
     return render_view
 
@@ -349,9 +349,9 @@ class _RenderedView:
 class FrameRunner:
     """Renders chunks, and writes their files on other threads.
 
-    The library's own renderer renders several views at once (`augment.views.ViewPool`) and hands
-    them over in their order. Where another renderer returns pending views, the next view is begun
-    before the last one is waited for, so that a GPU has work while pictures come back.
+    The library's own renderer renders several views at once (`augment.view.render_view.ViewPool`)
+    and hands them over in their order. Where another renderer returns pending views, the next view
+    is begun before the last one is waited for, so that a GPU has work while pictures come back.
 
     An error of the scene or of the renderer fails one image; an OutputError or GpuLost ends the
     run.
@@ -380,7 +380,7 @@ class FrameRunner:
         self._setup = setup
         self._views = None
         if renderer is None:
-            from augment.views import ViewPool  # imports the rasteriser
+            from augment.view.render_view import ViewPool  # imports the rasteriser
 
             self._views = ViewPool(scene, setup.backend)
             renderer = self._views.begin

@@ -30,12 +30,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from augment.boxes import CORNERS, WorldBoxes, pixels_of_boxes
-from augment.cameras import Camera
-from augment.geometry import invert_rigid, quat_from_rotmat, rigid
-from augment.jobs.tables import FrameBoxes
-from augment.labels import Boxes
-from augment.scene import Track
+from augment.output.tables import FrameBoxes
+from augment.scene.boxes import CORNERS, WorldBoxes, pixels_of_boxes
+from augment.scene.cameras import Camera
+from augment.scene.geometry import invert_rigid, quat_from_rotmat, rigid
+from augment.scene.labels import Boxes
+from augment.scene.scene import Track
 
 MIN_ALPHA = 0.95  # smallest alpha of a pixel that the scene fills, 0 to 1
 # Two depths agree if they differ by at most the sum of the two tolerances.
@@ -225,14 +225,14 @@ def _places(world: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, 
 # ---- Motion of things inside labelled boxes between the times of two pictures --------------------
 # A box is a rigid body. Its pose at a picture's own time is linear in position and slerp in
 # rotation between the labels before and after, as the renderer poses actors. A pixel shows a box by
-# the rule of `augment.boxes`. From picture A to picture B a pixel of a box that moves goes along
-# with it. Left out are: pixels of a moving box whose pose is not known at one of the two times;
-# pixels that show two moving boxes; and, in both pictures, other pixels within MARGIN_M of a moving
-# box: the road under a car, which has its shadow, parts of the car that reach beyond the label, and
-# blurred edges. Boxes that move less than STILL_M between the two times stand still, and their
-# content belongs to the world. A pose is known from HOLD_NS before a track's first label to as long
-# after its last, and not within gaps of more than MAX_GAP_NS. A box whose nearest label is further
-# away than that is not there.
+# the rule of `augment.scene.boxes`. From picture A to picture B a pixel of a box that moves goes
+# along with it. Left out are: pixels of a moving box whose pose is not known at one of the two
+# times; pixels that show two moving boxes; and, in both pictures, other pixels within MARGIN_M of a
+# moving box: the road under a car, which has its shadow, parts of the car that reach beyond the
+# label, and blurred edges. Boxes that move less than STILL_M between the two times stand still, and
+# their content belongs to the world. A pose is known from HOLD_NS before a track's first label to
+# as long after its last, and not within gaps of more than MAX_GAP_NS. A box whose nearest label is
+# further away than that is not there.
 
 MARGIN_M = 0.5  # width of the strip around a moving box that is left out, metres
 # Labels of parked cars tremble, and the tolerance of depths is larger than this.

@@ -31,8 +31,8 @@ from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at
 from augment.render.layout import BLOCK_SIZE, NUM_LANES, Index
 
 # ---- The learnt sky: a cube map's colours behind a view, and their gradient ----------------------
-# The lookup is `augment.sky.sample_within_faces`, bilinear and clamped at the edge of a face. Its
-# texel and fractions are stored for the backward pass.
+# The lookup is `augment.scene.sky.sample_within_faces`, bilinear and clamped at the edge of a face.
+# Its texel and fractions are stored for the backward pass.
 
 PARTS = 4  # copies of the cube map in which gradients are summed, for any number of threads
 # Image rows of a band. Part p sums bands p, p + PARTS, ..., so that all have as much sky.

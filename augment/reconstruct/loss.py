@@ -26,12 +26,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from augment.cameras import Camera
 from augment.reconstruct import kernels
 from augment.reconstruct.config import LossWeights
 from augment.reconstruct.view import RecordedView
 from augment.render.threads import kernel_threads
-from augment.sky import CubemapSky, Sky, directions_of_cubemap
+from augment.scene.cameras import Camera
+from augment.scene.sky import CubemapSky, Sky, directions_of_cubemap
 
 MIN_SKY = 1e-3  # transmittance; the sky behind less changes a pixel by at most 1/4 of an 8-bit step
 MIN_ALPHA = 0.05  # opacity from which a depth prior counts

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from augment.cameras import Camera
 from augment.errors import SceneError
 from augment.reconstruct import kernels
 from augment.reconstruct.config import Growth, LearningRates
 from augment.reconstruct.kernels import GEOMETRY
 from augment.render.cpu.backward_kernels import G_MEAN, G_OPACITY, G_QUAT, G_SCALE
 from augment.render.threads import kernel_threads
-from augment.scene import NUM_SH_BY_DEGREE, Gaussians
+from augment.scene.cameras import Camera
+from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians
 
 
 @dataclass(eq=False)

@@ -20,8 +20,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.cameras import Camera, Frame
-from augment.labels import EGO_VEHICLE
 from augment.reconstruct.config import FitConfig, LossWeights, Tuning
 from augment.reconstruct.kernels import MOMENTS, GradientRows, sum_forces, update_splats
 from augment.reconstruct.loss import (
@@ -58,8 +56,10 @@ from augment.render.layout import BLOCK_SIZE, M_NUM_SH_FUNCTIONS
 from augment.render.part_views import raster_modes, stack_poses, view_numbers
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
-from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
-from augment.sky import CubemapSky
+from augment.scene.cameras import Camera, Frame
+from augment.scene.labels import EGO_VEHICLE
+from augment.scene.scene import Actor, Gaussians, PosedGaussians, Scene, Track
+from augment.scene.sky import CubemapSky
 
 # ---- Small corrections of the poses of actors and cameras, learnt with the scene -----------------
 # Labelled boxes are centimetres off, and recorded poses some tenths of a pixel. Corrections are

@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from augment.cameras import Camera
+from augment.scene.cameras import Camera
 
 
 @dataclass(frozen=True)

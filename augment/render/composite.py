@@ -16,7 +16,6 @@ from jaxtyping import Float, UInt8
 from numpy.polynomial import Chebyshev, Polynomial
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.render import composite_kernels, picture_kernels
 from augment.render.buffers import AUTO, CPU, RenderOutput, choose_kernels
 from augment.render.fog import (
@@ -29,7 +28,8 @@ from augment.render.fog import (
     vertical_optical_depth,
 )
 from augment.render.threads import kernel_threads
-from augment.sky import (
+from augment.scene.cameras import Camera
+from augment.scene.sky import (
     ConstantSky,
     CubemapSky,
     Sky,

@@ -105,7 +105,7 @@ def composite_cubemap(
     Args:
         rgb: float32 [H, W, 3].
         alpha: float32 [H, W].
-        faces: [6, R + 2, R + 2, 3], with a border (augment.sky.with_border).
+        faces: [6, R + 2, R + 2, 3], with a border (augment.scene.sky.with_border).
         rotation: world_from_camera.
         ifx: 1 / focal length along x, 1/px.
         ify: 1 / focal length along y, 1/px.

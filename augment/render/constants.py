@@ -62,7 +62,7 @@ class RasterSettings:
     image that is shown enlarged, where splats would grow.
 
     lod_px: far splats of large backgrounds are drawn merged, in cells of at most this many pixels
-    (augment.lod); 0 draws all splats as they are.
+    (augment.detail.lod); 0 draws all splats as they are.
     """
 
     near_m: float = 0.01

@@ -32,8 +32,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.render.buffers import RenderOutput
+from augment.scene.cameras import Camera
 
 # Exponent of display encoding: display-encoded colour is about this root of luminance.
 ENCODING = 2.2

@@ -19,12 +19,12 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.errors import BackendUnavailable
-from augment.geometry import multiply_quats, quat_from_rotmat
 from augment.render.constants import COV2D_BLUR, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.cuda.runtime import gpu_device
-from augment.scene import PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.geometry import multiply_quats, quat_from_rotmat
+from augment.scene.scene import PosedGaussians
 
 # Fields of Gaussians whose gradients are gsplat's on the GPU.
 GEOMETRY = ("means", "quats", "scales", "opacities")

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from augment.cameras import Camera
 from augment.render import layout
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, TAN_FOV_MARGIN, RasterSettings
 from augment.render.fog import Fog
 from augment.render.layout import MAX_DEPTH_GROWTH, HeightClip
 from augment.render.sh import MAX_DEGREE
-from augment.scene import PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.scene import PosedGaussians
 
 # Height at which everything is on the kept side, metres.
 _NO_CLIP = 1e30

@@ -1,4 +1,7 @@
-"""Numba kernels of augment.base_photo: colours of a photo, transmittance by depth, mixed images."""
+"""Numba kernels of recorded pictures: their colours, transmittance by depth, mixed images.
+
+`augment.photo.recorded_base` calls them.
+"""
 
 from __future__ import annotations
 
@@ -132,7 +135,7 @@ def add_weighted(base, rgb, weight, out):
 
 @kernel
 def compute_transmittance(alpha, depth, lens, fall, fog_numbers, road, out):
-    """Write the transmittance of a photo's pixels: `Photo.transmittance` of augment.base_photo.
+    """Write the transmittance of a photo's pixels, as `Photo.transmittance` asks for it.
 
     Args:
         alpha: alpha of the surfaces, [H, W].

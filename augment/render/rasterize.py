@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from augment.cameras import Camera
+from augment.detail.lod import choose_parts
 from augment.errors import BackendUnavailable
-from augment.lod import choose_parts
 from augment.render.buffers import (
     ALPHA,
     AUTO,
@@ -42,7 +41,8 @@ from augment.render.gsplat_backend import GEOMETRY, tracked_geometry
 from augment.render.layout import HeightClip
 from augment.render.reference import rasterize_reference
 from augment.render.sh import MAX_DEGREE
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians
 
 
 def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) -> RenderOutput:

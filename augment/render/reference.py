@@ -28,8 +28,6 @@ from jaxtyping import Float, Int16, Int64
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from augment.cameras import Camera
-from augment.geometry import rotmat_from_quat, transform_points
 from augment.render.buffers import (
     ALPHA,
     EXPECTED_DEPTH,
@@ -53,7 +51,9 @@ from augment.render.layout import FAR_PX, MAX_DEPTH_GROWTH, SHARP_PX2, HeightCli
 from augment.render.mode_depth import Clusters
 from augment.render.sh import evaluate_sh
 from augment.render.shading import LINES, TINY, light_share, shading_lines
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rotmat_from_quat, transform_points
+from augment.scene.scene import Gaussians, PosedGaussians
 
 # ---- Projection: Gaussians of a scene to splats of one image -------------------------------------
 # First of all, positions are taken relative to the eye, so that float32 keeps its digits in scenes

@@ -43,12 +43,12 @@ from jaxtyping import Float, Float32
 from scipy.optimize import nnls
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.render import picture_kernels
 from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK, unit_depth_coordinates
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
+from augment.scene.cameras import Camera
 
 # Wavelength of the light, micrometres.
 WAVELENGTH_UM = 0.55

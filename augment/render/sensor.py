@@ -25,12 +25,12 @@ from jaxtyping import Float, UInt8
 from scipy.stats import norm
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.render import picture_kernels
 from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
+from augment.scene.cameras import Camera
 
 # Linear light, relative to full scale, at which reading is as noisy as photons are.
 READ_SHARE = 0.005

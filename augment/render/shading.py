@@ -30,7 +30,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.cameras import Camera
+from augment.scene.cameras import Camera
 
 # Numbers of a lit splat.
 LINES = 9

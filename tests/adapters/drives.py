@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 import torch
 
-from augment.cameras import Camera, Frame
-from augment.labels import Boxes, LidarSweep
-from augment.scene import Actor, Gaussians, Scene
-from augment.sky import ConstantSky
+from augment.scene.cameras import Camera, Frame
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Actor, Gaussians, Scene
+from augment.scene.sky import ConstantSky
 
 FRAME_NS = 100_000_000
 WHOLE = r"(?s)\A.*\Z"  # a pattern for all of a file

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians
+from augment.scene.scene import Gaussians
 
 
 def gaussians_at(means: torch.Tensor, rgb=(0.5, 0.5, 0.5), *, degree: int = 0) -> Gaussians:

@@ -26,11 +26,11 @@ from adapters.av2.files import GroundMap, sensor_of_laser
 from adapters.base import detect_scheme_of_path
 from adapters.raw_drive import DriveOptions
 from adapters.uri import SCHEMES, format_uri
-from augment.cameras import Camera
 from augment.errors import AdapterError
-from augment.ground import ground_of
-from augment.labels import ClassifiesLidar, KnowsLidarOrigins
-from augment.semantics import SemanticClass
+from augment.scene.cameras import Camera
+from augment.scene.ground import ground_of
+from augment.scene.labels import ClassifiesLidar, KnowsLidarOrigins
+from augment.scene.semantics import SemanticClass
 
 QUERY = {"voxel_m": "0.15", "image_scale": "1", "sky_size": "32"}
 ORIGIN = np.round(files.city_from_ego(files.START_NS - 80_000_000)[:3, 3])

@@ -8,9 +8,9 @@ import torch
 
 from adapters.lidar_scene.split import FLOOR_M, HALO_M, Motion, join_tracks, split_sweeps
 from adapters.raw_drive import BoxSample, Sweep
-from augment.geometry import rigid, rotmat_from_quat
-from augment.scene import Track
-from augment.semantics import SemanticClass
+from augment.scene.geometry import rigid, rotmat_from_quat
+from augment.scene.scene import Track
+from augment.scene.semantics import SemanticClass
 
 MS = 1_000_000
 SIZE = np.array([4.0, 2.0, 1.5])

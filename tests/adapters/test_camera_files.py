@@ -30,8 +30,8 @@ from adapters.street_gaussians.adapter import StreetGaussiansLabels
 from adapters.world import WorldChange
 from augment.errors import AdapterError
 from augment.files.ply import read_splats, write_ply
-from augment.scene import Scene
-from augment.sky import ConstantSky
+from augment.scene.scene import Scene
+from augment.scene.sky import ConstantSky
 
 # A camera at (1, 2, 3) that looks along world +x with world +z up, OpenCV axes as columns.
 LOOKS_ALONG_X = np.array(

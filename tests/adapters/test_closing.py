@@ -15,8 +15,8 @@ from adapters.pandaset import open_pandaset
 from adapters.raw_drive import BoxSample
 from augment.render.buffers import ALPHA
 from augment.render.rasterize import rasterize
-from augment.scene import Gaussians
-from augment.semantics import SemanticClass as Class
+from augment.scene.scene import Gaussians
+from augment.scene.semantics import SemanticClass as Class
 
 GREY, RED = (90, 90, 90), (200, 30, 30)
 HEIGHT_M = 1.5  # of the camera, over the road

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from adapters.drive_checks import camera_problems, lidar_problems
-from augment.cameras import Camera, Frame
+from augment.scene.cameras import Camera, Frame
 
 OPENGL = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
 BEHIND = np.array([[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]])

@@ -23,13 +23,13 @@ from adapters.drivestudio.adapter import (
     read_sky,
     rotate_cubemap,
 )
-from augment.cameras import Camera
 from augment.errors import AdapterError
-from augment.plan import make_plan
 from augment.render.rasterize import rasterize
-from augment.scene import Gaussians, PosedGaussians
-from augment.sky import ConstantSky, CubemapSky, directions_of_cubemap
-from augment.views import render_buffers
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians
+from augment.scene.sky import ConstantSky, CubemapSky, directions_of_cubemap
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers
 from recipes.schema import Recipe
 
 FRAME_NS = 100_000_000

@@ -11,13 +11,13 @@ import torch
 
 from adapters.lidar_scene.depth import read_returns
 from adapters.training_views.starting_scene import ego_body
-from augment.cameras import Camera, Frame
-from augment.geometry import transform_points
-from augment.labels import EGO_VEHICLE, Boxes, LidarSweep
 from augment.reconstruct.view import RecordedView, ViewKey
 from augment.render.rasterize import rasterize
-from augment.scene import PosedGaussians, Scene
-from augment.sky import ConstantSky
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import transform_points
+from augment.scene.labels import EGO_VEHICLE, Boxes, LidarSweep
+from augment.scene.scene import PosedGaussians, Scene
+from augment.scene.sky import ConstantSky
 from tests.scenes import camera_ahead, one_gaussian
 
 WIDTH, HEIGHT, FIRST_ROW = 320, 200, 150

@@ -20,10 +20,10 @@ from adapters.recording.adapter import RecordingLabels
 from adapters.street.layout import CAMBER, EGO_Y_M, road_z
 from augment.errors import BackendUnavailable
 from augment.files.ply import write_ply
-from augment.ground import ground_of, load_open3d
-from augment.labels import ClassifiesLidar, LidarSweep
-from augment.scene import Ground, Scene
-from augment.semantics import SemanticClass
+from augment.scene.ground import ground_of, load_open3d
+from augment.scene.labels import ClassifiesLidar, LidarSweep
+from augment.scene.scene import Ground, Scene
+from augment.scene.semantics import SemanticClass
 from tools.explain import describe_scene, scene_text
 
 SMALL = "voxel_m=0.15&image_scale=0.25&sky_size=16"

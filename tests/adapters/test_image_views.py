@@ -15,7 +15,7 @@ from adapters.lidar_scene.kernels import SkyGatherer
 from adapters.lidar_scene.split import join_tracks
 from adapters.lidar_scene.surfels import Surfels
 from adapters.raw_drive import BoxSample
-from augment.cameras import Camera
+from augment.scene.cameras import Camera
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 32.0
 # Camera axes in the world: looks along +x.

@@ -19,13 +19,13 @@ from adapters.base import open_scene
 from adapters.kitti.adapter import ATTRIBUTES, boxes_at, find_source, kitti_labels, open_kitti
 from adapters.kitti.files import kitti_root, oxts_poses, registered_poses
 from adapters.uri import format_uri
-from augment.box_estimates import evidence_of
-from augment.boxes import instances_of
 from augment.errors import AdapterError
-from augment.geometry import rotmat_from_quat
-from augment.jobs.files import label_view
-from augment.scene import Scene
-from augment.views import render_view
+from augment.output.view_files import label_view
+from augment.scene.box_estimates import evidence_of
+from augment.scene.boxes import instances_of
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.scene import Scene
+from augment.view.render_view import render_view
 from recipes.schema import Output, Recipe, Render
 
 QUERY = {"voxel_m": "0.2", "image_scale": "1", "sky_size": "32"}

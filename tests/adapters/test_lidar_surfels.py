@@ -43,13 +43,13 @@ from adapters.procedural import LOWEST_DEG, StreetLabels, lidar_rays
 from adapters.recording.adapter import RecordingLabels
 from adapters.street.layout import StreetParameters
 from adapters.street_gaussians.adapter import ROOF_SENSOR_M, StreetGaussiansLabels
-from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
-from augment.geometry import rotmat_from_quat
-from augment.labels import Boxes, KnowsLidarOrigins, LidarSweep
-from augment.scene import Actor, Scene, Track
-from augment.semantics import SemanticClass as Class
-from augment.sky import ConstantSky
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.labels import Boxes, KnowsLidarOrigins, LidarSweep
+from augment.scene.scene import Actor, Scene, Track
+from augment.scene.semantics import SemanticClass as Class
+from augment.scene.sky import ConstantSky
 
 ORIGIN = np.zeros((1, 3), np.float32)
 

@@ -21,9 +21,9 @@ from adapters.nuscenes.adapter import EGO_BOX_M, nuscenes_labels, open_nuscenes
 from adapters.nuscenes.tables import read_rows, read_tables
 from adapters.uri import format_uri
 from augment.errors import AdapterError
-from augment.labels import ClassifiesLidar
-from augment.scene import Scene
-from augment.semantics import SemanticClass
+from augment.scene.labels import ClassifiesLidar
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass
 
 ONE, TWO = files.SCENES
 QUERY = {"scene": TWO, "voxel_m": "0.15", "image_scale": "1", "sky_size": "32"}

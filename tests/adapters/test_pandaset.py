@@ -34,9 +34,9 @@ from adapters.pandaset import (
 from adapters.raw_drive import DriveOptions
 from adapters.uri import format_uri
 from augment.errors import AdapterError
-from augment.geometry import rotmat_from_quat
 from augment.render.rasterize import rasterize
-from augment.semantics import SemanticClass
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.semantics import SemanticClass
 
 QUERY = {"voxel_m": "0.1", "image_scale": "1", "sky_size": "32"}
 

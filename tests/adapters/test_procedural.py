@@ -52,8 +52,8 @@ from adapters.street.splats import Cells, SplatPlan, make_cells
 from adapters.street.world import build_street
 from augment.errors import AdapterError, SceneError
 from augment.render.rasterize import rasterize
-from augment.scene import Scene
-from augment.semantics import SemanticClass
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass
 
 QUERY = {"seed": "3", "width": "480", "height": "270"}
 

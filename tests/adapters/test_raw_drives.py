@@ -48,9 +48,9 @@ from augment.effects.lidar import (
 )
 from augment.effects.lidar.beam import find_intensity_column
 from augment.errors import AdapterError
-from augment.jobs.tables import lidar_bytes
-from augment.labels import LidarSweep, StoresLidar
-from augment.semantics import SemanticClass
+from augment.output.tables import lidar_bytes
+from augment.scene.labels import LidarSweep, StoresLidar
+from augment.scene.semantics import SemanticClass
 from recipes.load import load_recipe
 from tools.cli import main
 from tools.explain import describe_drive, drive_text

@@ -13,13 +13,13 @@ import torch
 
 from adapters.training_views.masks import read_ego_mask
 from adapters.training_views.views import RecordedViews
-from augment.cameras import Frame
 from augment.errors import AdapterError
-from augment.own_car import find_own_car_mask, moving_frames, own_car_mask
+from augment.photo.own_car import find_own_car_mask, moving_frames, own_car_mask
+from augment.photo.recorded_sky import find_sky_like_pixels, lidar_top_rad, sky_mask
 from augment.reconstruct.view import ViewKey
-from augment.recorded_sky import find_sky_like_pixels, lidar_top_rad, sky_mask
-from augment.scene import Scene
-from augment.sky import ConstantSky
+from augment.scene.cameras import Frame
+from augment.scene.scene import Scene
+from augment.scene.sky import ConstantSky
 from tests.scenes import one_gaussian
 
 NO_RETURNS = np.zeros(0, np.int32)

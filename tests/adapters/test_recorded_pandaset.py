@@ -13,8 +13,8 @@ from adapters.pandaset import PandaSetLabels, read_frames
 from adapters.raw_drive import DriveOptions
 from adapters.training_views.checks import check_views
 from adapters.training_views.views import RecordedViews
-from augment.scene import Scene
-from augment.sky import ConstantSky
+from augment.scene.scene import Scene
+from augment.scene.sky import ConstantSky
 
 
 @pytest.fixture(scope="module")

@@ -34,11 +34,11 @@ from adapters.recording.files import find_images, numbered_files, read_calibrati
 from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, read_scaled
-from augment.jobs.layout import folder_name
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.tables import lidar_bytes
-from augment.recorded_sky import recorded_sky
-from augment.semantics import SemanticClass
+from augment.output.layout import folder_name
+from augment.output.tables import lidar_bytes
+from augment.photo.recorded_sky import recorded_sky
+from augment.scene.semantics import SemanticClass
 from recipes.load import load_recipe
 from tests.exif import with_orientation
 from tests.streets import LABELLED_STREET, open_street

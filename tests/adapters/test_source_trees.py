@@ -27,7 +27,7 @@ from augment.errors import AdapterError
 from augment.files.scene_file import save_scene
 from augment.jobs.mirror import survey
 from augment.jobs.render_job import RenderJob, run_job
-from augment.scene import Scene
+from augment.scene.scene import Scene
 from recipes.schema import Recipe
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents, listing, snapshot

@@ -17,9 +17,9 @@ from adapters.street_gaussians.adapter import StreetGaussiansLabels, labels_of, 
 from adapters.street_gaussians.data import ModelConfig, frames_of, held_out_steps, read_data
 from adapters.uri import format_uri
 from augment.errors import AdapterError
-from augment.geometry import rotmat_from_quat
-from augment.labels import LabelSource
 from augment.render.sh import SH_C0
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.labels import LabelSource
 
 FRONT = ModelConfig(cameras=(0, 1, 2))
 ALL = ModelConfig(cameras=(0, 1, 2, 3, 4))

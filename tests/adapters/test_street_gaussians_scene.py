@@ -36,13 +36,13 @@ from adapters.street_gaussians.data import (
     Tracklets,
 )
 from adapters.street_gaussians.model import Part, PoseChanges
-from augment.cameras import Camera
 from augment.errors import AdapterError
-from augment.plan import make_plan
 from augment.render.rasterize import rasterize
-from augment.scene import Gaussians, PosedGaussians, Scene
-from augment.sky import ConstantSky
-from augment.views import render_buffers
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians, Scene
+from augment.scene.sky import ConstantSky
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers
 from recipes.schema import Recipe
 from tests.assertions import assert_images_close
 

@@ -10,8 +10,8 @@ import torch
 
 from adapters.training_views.starting_scene import continue_walls
 from adapters.training_views.views import RecordedViews
-from augment.scene import Scene
-from augment.semantics import SemanticClass
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass
 
 AWAY_M, LEFT_TOP_M, RIGHT_TOP_M = 20.0, 10.0, 2.0
 SIZE, FOCAL_PX = (160, 120), 100.0

@@ -24,8 +24,8 @@ from adapters.waymo.tables import Rows, SegmentFiles
 from augment.effects.lidar.beam import find_reflectances
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, decode_image, has_image, is_whole_jpeg
-from augment.recorded_sky import lidar_top_rad
-from augment.semantics import SemanticClass
+from augment.photo.recorded_sky import lidar_top_rad
+from augment.scene.semantics import SemanticClass
 
 RIG = Rig()
 STAMPS = files.stamps_of(3, 2)

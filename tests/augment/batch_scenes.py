@@ -17,22 +17,22 @@ from typing import Any
 import numpy as np
 import torch
 
-from augment.cameras import Camera, Frame
 from augment.effects.effect import EffectPlan, LabelInputs
 from augment.effects.smog import SmogPlan
-from augment.effects.snow.cells import OPEN_EDGE, ExposedCells, ExposedSurface
-from augment.effects.snow.placement import ExposureSettings
 from augment.effects.snow.snow import SnowPlan
-from augment.effects.snow.support import exposed_surface_of
 from augment.effects.style.color_maps import StyleMaps
 from augment.errors import AdapterError
+from augment.exposure.cells import OPEN_EDGE, ExposedCells, ExposedSurface
+from augment.exposure.exposed_surface import exposed_surface_of
+from augment.exposure.placement import ExposureSettings
 from augment.jobs.render_job import RenderJob, run_job
-from augment.labels import Boxes, LidarSweep
 from augment.render.fog import Fog
-from augment.scene import Gaussians, Scene
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky
-from augment.views import LabelSurfaces
+from augment.scene.cameras import Camera, Frame
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky
+from augment.view.render_view import LabelSurfaces
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow

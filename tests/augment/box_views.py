@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from batch_scenes import ORIGIN_M
 
-from augment.boxes import WorldBoxes
-from augment.cameras import Camera
-from augment.geometry import rotmat_from_quat
-from augment.labels import Boxes
+from augment.scene.boxes import WorldBoxes
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.labels import Boxes
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 CAR_M = (4.0, 2.0, 1.5)

@@ -11,8 +11,6 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from augment.boxes import WorldBoxes
-from augment.cameras import Camera
 from augment.effects.effect import (
     PICTURE,
     Effect,
@@ -24,9 +22,11 @@ from augment.effects.effect import (
     skipped_steps,
 )
 from augment.effects.lidar.beam import Echoes
-from augment.jobs.box_tables import BoxTable
+from augment.output.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH
-from augment.scene import Scene
+from augment.scene.boxes import WorldBoxes
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from augment.timing import timed
 from recipes.effect import Column, EffectModel, Knob
 from recipes.fields import Colour, Number

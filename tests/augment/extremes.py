@@ -18,17 +18,17 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from augment import effects
-from augment.cameras import Camera
 from augment.effects.snow.snow import exposure_settings
-from augment.effects.snow.support import exposed_surface_of
-from augment.geometry import rigid
+from augment.exposure.exposed_surface import exposed_surface_of
 from augment.memo import memo_of
-from augment.plan import make_plan
 from augment.render.composite import to_byte_array
-from augment.scene import Actor, Gaussians, Ground, Scene, Track
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
-from augment.views import WeatheredBuffers, WeatheredView, render_buffers, render_view
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid
+from augment.scene.scene import Actor, Gaussians, Ground, Scene, Track
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky, CubemapSky, LatLongSky, Sky
+from augment.view.plan import make_plan
+from augment.view.render_view import WeatheredBuffers, WeatheredView, render_buffers, render_view
 from recipes.schema import Recipe
 from tests.augment.hard_scenes import examples
 from tests.snow_scenes import box_car, drive, sheet, side_wall, wall

@@ -17,15 +17,15 @@ from pathlib import Path
 
 from batch_scenes import FakeView, fake_render, open_fake, tree_digest
 
-from augment.cameras import Camera
 from augment.errors import OutputError
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.generate import GenerateJob
 from augment.jobs.job_state import ProgressLog
-from augment.jobs.layout import STATE_FOLDER
-from augment.jobs.manifest import read_manifest_rows
-from augment.jobs.store import open_store
-from augment.scene import Scene
+from augment.output.layout import STATE_FOLDER
+from augment.output.manifest import read_manifest_rows
+from augment.output.store import open_store
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from recipes.job import Job, JobRecipes, JobScene
 from recipes.load import parse_recipe
 from recipes.schema import Recipe

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from augment.cameras import Camera
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.constants import COV2D_BLUR, RasterSettings
 from augment.render.cuda import runtime as gpu
@@ -29,7 +28,8 @@ from augment.render.reference import (
     project_parts,
 )
 from augment.render.sh import SH_C0, evaluate_sh
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians
 from tests.augment.pretend_gpu import AwayTensor, held_by
 
 

@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from hypothesis import HealthCheck, settings
 
-from augment.cameras import Camera
-from augment.geometry import rigid
 from augment.render.constants import ALPHA_MIN
 from augment.render.fog import Fog
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians, PosedGaussians, SplatShading
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid
+from augment.scene.scene import Gaussians, PosedGaussians, SplatShading
 
 MIN_SCALE, MAX_SCALE = 1e-8, 1e4  # metres
 EDGE = np.float32(ALPHA_MIN)

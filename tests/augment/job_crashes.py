@@ -43,13 +43,13 @@ from tqdm import tqdm
 import augment.jobs.generate as drive
 import augment.jobs.pools as pools
 from augment.errors import OutputError
-from augment.jobs.atomic import TEMPORARY_SUFFIX
 from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
-from augment.jobs.layout import STATE_FOLDER
-from augment.jobs.manifest import read_manifest_rows
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.store import open_store
-from augment.jobs.tables import lidar_bytes
+from augment.output.atomic import TEMPORARY_SUFFIX
+from augment.output.layout import STATE_FOLDER
+from augment.output.manifest import read_manifest_rows
+from augment.output.store import open_store
+from augment.output.tables import lidar_bytes
 from recipes.flood import Flood
 from recipes.snow import Snow
 

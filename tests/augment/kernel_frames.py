@@ -12,15 +12,15 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from augment.cameras import Camera, Frame
-from augment.geometry import rigid
 from augment.render.buffers import RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
-from augment.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
-from augment.semantics import SemanticClass
-from augment.sky import CubemapSky
-from augment.views import render_view
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rigid
+from augment.scene.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import CubemapSky
+from augment.view.render_view import render_view
 from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from augment.cameras import Camera
 from augment.reconstruct.config import LossWeights
 from augment.reconstruct.loss import MIN_ALPHA, MIN_SKY
 from augment.reconstruct.view import RecordedView
-from augment.sky import sample_within_faces
+from augment.scene.cameras import Camera
+from augment.scene.sky import sample_within_faces
 
 RADIUS, SIGMA = 5, 1.5
 C1, C2 = 0.01**2, 0.03**2

@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from augment.jobs.manifest import read_manifest
 from augment.jobs.mirror import (
     DatasetFolder,
     MirrorResult,
@@ -20,7 +19,8 @@ from augment.jobs.mirror import (
     weathered_images,
 )
 from augment.jobs.render_job import RenderJob, run_job
-from augment.scene import Scene
+from augment.output.manifest import read_manifest
+from augment.scene.scene import Scene
 from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recipe, open_fake
 
 IMAGES = r"camera/[^/]+/\d+\.(png|jpg)"

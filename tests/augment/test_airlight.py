@@ -7,15 +7,15 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from augment.cameras import Camera
 from augment.effects.smog import fog_before_color_map
-from augment.plan import make_plan
 from augment.render.buffers import RenderOutput
 from augment.render.composite import add_airlight_elevation, composite_sky, simplify_sky
 from augment.render.fog import Fog, airlight_gain
-from augment.scene import Ground, Scene
-from augment.sky import CubemapSky
-from augment.views import render_buffers, render_view
+from augment.scene.cameras import Camera
+from augment.scene.scene import Ground, Scene
+from augment.scene.sky import CubemapSky
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers, render_view
 from recipes.flood import Flood
 from recipes.schema import Recipe, Render, Smog, Weather
 from tests.scenes import camera_ahead

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from augment.errors import OutputError
-from augment.jobs import atomic
-from augment.jobs.atomic import (
+from augment.jobs.processes import OutputLock, file_lock
+from augment.output import atomic
+from augment.output.atomic import (
     TEMPORARY_SUFFIX,
     copy_file,
     open_lock,
@@ -25,9 +26,8 @@ from augment.jobs.atomic import (
     write_file_atomically,
     write_folder_atomically,
 )
-from augment.jobs.claims import try_lock
-from augment.jobs.processes import OutputLock, file_lock
-from augment.jobs.store import LocalStore
+from augment.output.claims import try_lock
+from augment.output.store import LocalStore
 
 DATA = b"whole" * 1000
 

@@ -12,21 +12,21 @@ import torch
 from adapters.base import open_scene
 from adapters.procedural import open_truth
 from adapters.uri import parse_uri
-from augment.base_photo import MAX_CONDITION, Photo, open_photo
-from augment.cameras import Camera
 from augment.effects.style.color_maps import MAX_SKY_LEVEL, NUM_CLASSES, StyleMaps
 from augment.effects.style.style import SceneStyle
 from augment.errors import SceneError
-from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
 from augment.memo import memo_of
-from augment.plan import make_plan
+from augment.output.manifest import read_manifest
+from augment.photo.recorded_base import MAX_CONDITION, Photo, open_photo
 from augment.render.buffers import RenderOutput
 from augment.render.fog import Fog
 from augment.render.rasterize import rasterize
-from augment.scene import Scene
-from augment.semantics import SemanticClass
-from augment.views import render_buffers, render_view
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers, render_view
 from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow

@@ -12,20 +12,20 @@ import torch
 from adapters.base import open_scene
 from adapters.street.layout import parse_parameters
 from adapters.street.world import build_street
-from augment.cast_shadows import (
+from augment.effects.snow.light import describe_light, find_scene_light, find_snow_light
+from augment.light.cast_shadows import (
     CastShadows,
     faded_shadows,
     linear_from_display,
     shadows_of,
     sun_transmittance,
 )
-from augment.effects.snow.light import describe_light, find_scene_light, find_snow_light
-from augment.plan import make_plan
 from augment.render.fog import Fog
 from augment.render.sh import SH_C0
-from augment.scene import PosedGaussians, Scene
-from augment.semantics import SemanticClass
-from augment.views import render_buffers, render_view
+from augment.scene.scene import PosedGaussians, Scene
+from augment.scene.semantics import SemanticClass
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers, render_view
 from recipes.schema import Recipe, Render, Smog, Weather
 from recipes.snow import Snow, SnowLight
 from tests.snow_scenes import drive, sheet, side_wall, wall

@@ -275,7 +275,7 @@ from torch.utils.data import DataLoader, Dataset
 from augment.render.cpu.driver import rasterize_cpu
 from augment.render.constants import RasterSettings
 from augment.render.threads import limit_threads, num_kernel_threads
-from augment.scene import PosedGaussians
+from augment.scene.scene import PosedGaussians
 from tests.scenes import camera_ahead, random_gaussians
 
 PARTS = [PosedGaussians(random_gaussians(500))]
@@ -313,7 +313,7 @@ from augment.render.compile_ahead import describe_type, find_type, read_signatur
 threads._preload_tbb = lambda: False
 from augment.render.cpu.driver import rasterize_cpu
 from augment.render.constants import RasterSettings
-from augment.scene import PosedGaussians
+from augment.scene.scene import PosedGaussians
 from tests.scenes import camera_ahead, random_gaussians
 
 parts = [PosedGaussians(random_gaussians(3000))]
@@ -335,7 +335,7 @@ from augment.render.constants import RasterSettings
 from augment.render.cpu.simd import WIDE
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
-from augment.scene import PosedGaussians
+from augment.scene.scene import PosedGaussians
 from tests.augment.hard_scenes import KINDS, hard_gaussians, in_weather, wide_camera
 
 camera, everything = wide_camera(60.0, (75, 53)), frozenset(BUFFERS)

@@ -19,21 +19,21 @@ import torch
 
 pytest.importorskip("triton")
 
-from augment.cameras import Camera
-from augment.effects.snow import placement
-from augment.effects.snow.placement import ExposureSettings, find_exposed_surface
-from augment.geometry import rigid, rotmat_from_quat
-from augment.labels import Boxes
+from augment.exposure import placement
+from augment.exposure.placement import ExposureSettings, find_exposed_surface
 from augment.render.buffers import CUDA, RenderOutput, available_backends
 from augment.render.composite import apply_color_map, composite_sky, to_byte_array
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.runtime import upload
 from augment.render.fog import Fog, apply_fog_to_render
 from augment.render.rasterize import renormalise_alpha
-from augment.scene import Ground, Scene
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
-from augment.views import WeatheredView, begin_view, render_view
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid, rotmat_from_quat
+from augment.scene.labels import Boxes
+from augment.scene.scene import Ground, Scene
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky, CubemapSky, LatLongSky, Sky
+from augment.view.render_view import WeatheredView, begin_view, render_view
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style

@@ -13,7 +13,6 @@ import torch
 
 pytest.importorskip("triton")
 
-from augment.cameras import Camera
 from augment.errors import BackendUnavailable
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
 from augment.render.constants import RasterSettings
@@ -21,7 +20,8 @@ from augment.render.cuda import runtime as gpu
 from augment.render.fog import Fog
 from augment.render.gsplat_backend import render_with_gsplat
 from augment.render.rasterize import rasterize
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians
 from tests.augment import gsplat_stand_in
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, slight_pose, stack

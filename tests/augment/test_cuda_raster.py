@@ -30,7 +30,7 @@ from augment.render.cuda.driver import list_tiles
 from augment.render.cuda.splats import BLOCK, HIDDEN, TILE, CudaSplats, CudaTiles
 from augment.render.layout import SURFACE_DEPTHS_ONLY, HeightClip
 from augment.render.rasterize import rasterize
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close, assert_labels_equal, assert_stored_render
 from tests.augment.hard_scenes import (
     KINDS,

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera
 from augment.render.buffers import ALPHA, BUFFERS, RGB, RenderOutput
 from augment.render.composite import composite_sky
 from augment.render.constants import ALPHA_MIN, RasterSettings
@@ -21,8 +20,9 @@ from augment.render.cpu.order import CELL_SIZE, spatial_order
 from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
-from augment.scene import Gaussians, PosedGaussians
-from augment.sky import ConstantSky, CubemapSky
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians
+from augment.scene.sky import ConstantSky, CubemapSky
 from tests.augment.hard_scenes import KINDS, hard_gaussians, wide_camera
 from tests.scenes import camera_ahead, random_gaussians, random_pose, sh_of
 

@@ -11,10 +11,10 @@ import torch
 from augment import effects
 from augment.dataset import WeatherDataset
 from augment.effects.lidar.codes import ATTENUATED, CODE_COLUMN, LOST, UNCHANGED
-from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
-from augment.plan import make_plan
-from augment.views import render_view
+from augment.output.manifest import read_manifest
+from augment.view.plan import make_plan
+from augment.view.render_view import render_view
 from recipes.errors import RecipeError
 from recipes.load import load_recipe
 from recipes.recipe_file import recipe_json_schema

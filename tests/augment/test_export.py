@@ -31,11 +31,11 @@ from augment.files.export import (
     transform_gaussians_rigidly,
 )
 from augment.files.ply import read_ply, read_splats
-from augment.geometry import rigid, rotmat_from_quat, transform_points
 from augment.render.rasterize import rasterize
 from augment.render.sh import evaluate_sh
-from augment.scene import Actor, ColorSeries, Gaussians, PosedGaussians, Scene, Track
-from augment.semantics import SemanticClass
+from augment.scene.geometry import rigid, rotmat_from_quat, transform_points
+from augment.scene.scene import Actor, ColorSeries, Gaussians, PosedGaussians, Scene, Track
+from augment.scene.semantics import SemanticClass
 
 NOW = START_NS + 100_000_000
 

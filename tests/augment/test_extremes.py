@@ -13,16 +13,16 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from augment.cameras import Camera
-from augment.effects.snow.cells import ExposedCells
 from augment.effects.snow.layer import find_depths, find_snow_tops, make_depth_profile
 from augment.effects.snow.snow import exposure_settings
-from augment.effects.snow.support import exposed_surface_of
-from augment.plan import make_plan
+from augment.exposure.cells import ExposedCells
+from augment.exposure.exposed_surface import exposed_surface_of
 from augment.rng import rng_for
-from augment.scene import Actor, Gaussians, Track
-from augment.semantics import SemanticClass
-from augment.views import WeatheredView, render_buffers, render_view
+from augment.scene.cameras import Camera
+from augment.scene.scene import Actor, Gaussians, Track
+from augment.scene.semantics import SemanticClass
+from augment.view.plan import make_plan
+from augment.view.render_view import WeatheredView, render_buffers, render_view
 from recipes.errors import RecipeError
 from recipes.load import parse_recipe
 from recipes.schema import Recipe

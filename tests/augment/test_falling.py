@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera, Frame
 from augment.effects.falling import air, reference
 from augment.effects.falling.air import (
     Glow,
@@ -25,13 +24,14 @@ from augment.effects.falling.air import (
 from augment.effects.falling.drops import sizes_of
 from augment.effects.falling.shutter import STANDING, Motion, motion_of
 from augment.errors import SceneError
-from augment.plan import make_plan
 from augment.render.buffers import REFERENCE
 from augment.render.fog import Fog
 from augment.render.threads import limit_threads
-from augment.scene import Scene
-from augment.sky import ConstantSky
-from augment.views import render_view
+from augment.scene.cameras import Camera, Frame
+from augment.scene.scene import Scene
+from augment.scene.sky import ConstantSky
+from augment.view.plan import make_plan
+from augment.view.render_view import render_view
 from recipes.schema import Rain, Recipe, Sensor, Weather
 from recipes.snowfall import Snowfall
 from tests.scenes import camera_ahead, random_gaussians

@@ -12,7 +12,6 @@ import torch
 from pydantic import ValidationError
 
 from augment import effects
-from augment.boxes import NOT_COUNTED, WorldBoxes
 from augment.dataset import WeatherDataset
 from augment.effects.effect import LabelInputs
 from augment.effects.falling.lidar import (
@@ -33,13 +32,14 @@ from augment.effects.smog import fog_echoes
 from augment.effects.wet.ground import GROUND_CELL_M, WetGround
 from augment.effects.wet.kernels import EXPOSURE, NUM_CHANNELS, PUDDLE_ORDER
 from augment.effects.wet.lidar import dim_wet_echoes, wet_echo_ratio
-from augment.jobs.files import box_tables, combine_visibility
-from augment.jobs.manifest import effect_masks, read_manifest
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.tables import lidar_bytes
-from augment.labels import Boxes
-from augment.plan import make_plan
+from augment.output.manifest import effect_masks, read_manifest
+from augment.output.tables import lidar_bytes
+from augment.output.view_files import box_tables, combine_visibility
 from augment.render.fog import Fog
+from augment.scene.boxes import NOT_COUNTED, WorldBoxes
+from augment.scene.labels import Boxes
+from augment.view.plan import make_plan
 from recipes.schema import Output, Rain, Recipe, Snow, Snowfall, Weather
 from tests.lidar_sweeps import (
     SENSOR_M,

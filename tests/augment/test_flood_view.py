@@ -22,23 +22,23 @@ from box_views import (
 
 from adapters.base import open_scene
 from adapters.procedural import open_truth
-from augment import drawing
-from augment.boxes import BOTTOM_MARGIN_M, SIDE_MARGIN_M
-from augment.cameras import Camera, Frame
 from augment.effects.flood.effect import count_hidden_pixels, flood_of_recipe, submerged_fraction
 from augment.effects.flood.flood import fresnel_reflectance, schlick_reflectance
 from augment.effects.flood.flood_view import visible_depth_m
-from augment.geometry import rigid
-from augment.labels import Boxes
-from augment.plan import make_plan
 from augment.render.buffers import RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
-from augment.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, Sky
-from augment.views import render_buffers, render_view
+from augment.scene.boxes import BOTTOM_MARGIN_M, SIDE_MARGIN_M
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rigid
+from augment.scene.labels import Boxes
+from augment.scene.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky, Sky
+from augment.view import layers
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers, render_view
 from recipes.flood import Flood, Wave, Waves
 from recipes.schema import Output, Recipe, Smog, Weather
 from tests.augment.pretend_gpu import pretended_gpu
@@ -327,7 +327,7 @@ def test_a_gpu_shows_the_cpu_s_picture(scene, monkeypatch, reflection, smog):
     with contextlib.ExitStack() as stack:
         if gpu.is_interpreted():
             stack.enter_context(pretended_gpu(monkeypatch))
-            monkeypatch.setattr(drawing, "rasterize", drawn_elsewhere)
+            monkeypatch.setattr(layers, "rasterize", drawn_elsewhere)
         there = render_buffers(scene, view, plan, backend="cuda")
         error = (there.rgb.cpu() - here.rgb).abs().amax(-1)
         wet, depth = there.masks["water"].cpu(), there.depth_m.cpu()

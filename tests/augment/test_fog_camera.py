@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera
-from augment.plan import make_plan
 from augment.render.fog import Fog
 from augment.render.scatter import (
     DIFFRACTION_RAD,
@@ -26,7 +24,9 @@ from augment.render.scatter import (
     scattered,
 )
 from augment.render.sensor import add_noise, blur_lens, draw_noise, noise_sigmas, noise_variance
-from augment.views import render_view
+from augment.scene.cameras import Camera
+from augment.view.plan import make_plan
+from augment.view.render_view import render_view
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Render, Sensor, Smog, Weather
 from tests.streets import open_street

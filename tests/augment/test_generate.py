@@ -27,15 +27,15 @@ from generate_jobs import (
 )
 
 from augment.errors import ClimateGSError, OutputError
-from augment.jobs.atomic import write_atomic
 from augment.jobs.blocks import read_status, stored_plans
 from augment.jobs.generate import GenerateJob, GenerateResult, Workers, plan_job, run_generate
-from augment.jobs.layout import STATE_FOLDER, folder_name
-from augment.jobs.manifest import list_parts, read_manifest, read_manifest_rows
 from augment.jobs.processes import available_cores
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.store import open_store
 from augment.jobs.worker import compute_time_shares
+from augment.output.atomic import write_atomic
+from augment.output.layout import STATE_FOLDER, folder_name
+from augment.output.manifest import list_parts, read_manifest, read_manifest_rows
+from augment.output.store import open_store
 from recipes.job import JobRecipes, JobScene
 
 

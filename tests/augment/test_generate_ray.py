@@ -13,10 +13,10 @@ import pytest
 from batch_scenes import FakeView, fake_render, slow_render
 from generate_jobs import leftovers, make_job, outputs
 
-from augment.cameras import Camera
 from augment.errors import ClimateGSError
 from augment.jobs.generate import run_generate
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from recipes.schema import Recipe
 
 HERE = Path(__file__).parent

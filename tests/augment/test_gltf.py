@@ -20,9 +20,9 @@ from augment.errors import SceneError
 from augment.files.export import export_glb
 from augment.files.gltf import read_gltf, write_glb
 from augment.files.ply import read_splats, write_ply
-from augment.geometry import rotmat_from_quat
 from augment.render.sh import evaluate_sh
-from augment.scene import Gaussians
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.scene import Gaussians
 
 KHR = "KHR_gaussian_splatting"
 HALF = math.sqrt(0.5)

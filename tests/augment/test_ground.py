@@ -15,13 +15,13 @@ import pytest
 import torch
 from scenes import camera_ahead, one_gaussian
 
-from augment.cameras import Frame
 from augment.errors import BackendUnavailable, SceneError
-from augment.ground import Stretches, ground_of, ground_points, load_open3d, measure_ground
-from augment.labels import Boxes, LidarSweep
-from augment.scene import Gaussians, Ground, Scene
-from augment.semantics import SemanticClass as Class
-from augment.sky import ConstantSky
+from augment.scene.cameras import Frame
+from augment.scene.ground import Stretches, ground_of, ground_points, load_open3d, measure_ground
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Gaussians, Ground, Scene
+from augment.scene.semantics import SemanticClass as Class
+from augment.scene.sky import ConstantSky
 
 LENGTH_M, CAMERA_M, NOISE_M = 45.0, 1.6, 0.02
 FRAMES = 10
@@ -238,7 +238,7 @@ def test_without_open3d_the_path_stands_in_and_the_log_says_what_to_install(
     monkeypatch, caplog
 ) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)  # importing it then fails
-    with caplog.at_level(logging.WARNING, logger="augment.ground"):
+    with caplog.at_level(logging.WARNING, logger="augment.scene.ground"):
         ground = ground_of(scene(background=splats(np.concatenate([road(), clutter()]))))
     assert ground.source == "ego path"
     (record,) = caplog.records

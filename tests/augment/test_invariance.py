@@ -10,8 +10,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from augment.cameras import Camera, Frame
-from augment.geometry import rigid
 from augment.reconstruct import kernels as adam
 from augment.reconstruct.config import LearningRates
 from augment.reconstruct.splats import CORRECTIONS, Splats, splat_rates
@@ -34,9 +32,11 @@ from augment.render.layout import HeightClip
 from augment.render.part_views import stack_poses
 from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads, limit_threads
-from augment.scene import Gaussians, Ground, PosedGaussians, Scene
-from augment.sky import ConstantSky
-from augment.views import render_view
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rigid
+from augment.scene.scene import Gaussians, Ground, PosedGaussians, Scene
+from augment.scene.sky import ConstantSky
+from augment.view.render_view import render_view
 from recipes.schema import Flood, Output, Recipe, Smog, Weather
 from tests.augment.extremes import street
 from tests.augment.hard_scenes import (

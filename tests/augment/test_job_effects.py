@@ -27,18 +27,18 @@ from batch_scenes import (
     tree_digest,
 )
 
-from augment.boxes import WorldBoxes
-from augment.cameras import Camera
 from augment.dataset import WeatherDataset
 from augment.effects.flood.effect import count_hidden_pixels, submerged_fraction
 from augment.effects.smog import box_transmittance
 from augment.effects.snow.snow import count_snow_pixels
 from augment.effects.style import style as scene_maps
 from augment.errors import OutputError, StyleError
-from augment.jobs.files import box_tables, combine_visibility
-from augment.jobs.manifest import later_columns, read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job, stored_names
-from augment.labels import Boxes
+from augment.output.manifest import later_columns, read_manifest
+from augment.output.view_files import box_tables, combine_visibility
+from augment.scene.boxes import WorldBoxes
+from augment.scene.cameras import Camera
+from augment.scene.labels import Boxes
 from recipes.errors import RecipeError
 from recipes.files import with_digest
 from recipes.flood import Flood

@@ -34,13 +34,13 @@ from pretend_gpu import pretended_gpu
 
 from augment.errors import ClimateGSError, GpuLost, OutputError
 from augment.jobs import worker as runner
-from augment.jobs.files import WritePump
-from augment.jobs.manifest import read_manifest
 from augment.jobs.processes import available_cores, share_scene, thread_limits, wait_for_result
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.worker import compute_time_shares
-from augment.scene import Actor, Track
-from augment.sky import LatLongSky
+from augment.output.manifest import read_manifest
+from augment.output.view_files import WritePump
+from augment.scene.scene import Actor, Track
+from augment.scene.sky import LatLongSky
 from recipes.flood import Flood
 from recipes.snow import Snow
 from recipes.style import Style
@@ -173,7 +173,7 @@ def test_an_interrupt_lands_what_is_in_flight(tmp_path: Path, reference_digests)
 def test_a_job_on_a_gpu_gives_the_pictures_of_the_cpu(tmp_path: Path, monkeypatch) -> None:
     """Drawn as jobs draw there, one view in flight, and one by one: the same bytes."""
     pytest.importorskip("triton")
-    from augment.views import render_view
+    from augment.view.render_view import render_view
 
     def of_job(folder: str, backend: str, renderer=None) -> None:
         job = fog_job(tmp_path / folder, frames=[1], backend=backend)
@@ -379,7 +379,7 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     show.
     """
     monkeypatch.setattr(
-        "augment.effects.snow.support.find_exposed_surface", lambda *_, **__: make_bed(3.0)
+        "augment.exposure.exposed_surface.find_exposed_surface", lambda *_, **__: make_bed(3.0)
     )
     monkeypatch.setattr("augment.effects.style.style._find_maps", lambda *_: make_maps(0.4))
     style = Style(preset="dusk")

@@ -15,15 +15,15 @@ from batch_scenes import FakeLabels, fake_render, open_fake, tree_digest
 from generate_jobs import make_job, make_recipes
 from test_boxes_2d import StreetLabels, open_street, street
 
-from augment.boxes import WorldBoxes, encode_masks, find_occlusion
 from augment.dataset import LabelOptions, write_labels
 from augment.dataset.label_files import NothingLabelled, category_of, forecast_labels
 from augment.errors import OutputError
 from augment.jobs.generate import run_generate
-from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.tables import read_boxes
-from augment.labels import Boxes
+from augment.output.manifest import read_manifest
+from augment.output.tables import read_boxes
+from augment.scene.boxes import WorldBoxes, encode_masks, find_occlusion
+from augment.scene.labels import Boxes
 from recipes.load import parse_recipe
 from recipes.schema import Category, Recipe
 

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera, Frame
 from augment.dataset import WeatherDataset
-from augment.drawing import LayerRenderer
 from augment.effects.lens_drops.drops import Drops, LensDropsPlan, drops_at
 from augment.effects.lens_drops.optics import (
     MIN_MASK_SHARE,
@@ -20,13 +18,15 @@ from augment.effects.lens_drops.optics import (
     draw_drops,
     map_surroundings,
 )
-from augment.geometry import rigid
-from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
-from augment.plan import make_plan, plan_view
+from augment.output.manifest import read_manifest
 from augment.render.buffers import CPU, REFERENCE
-from augment.scene import Scene
-from augment.views import render_view
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rigid
+from augment.scene.scene import Scene
+from augment.view.layers import LayerRenderer
+from augment.view.plan import make_plan, plan_view
+from augment.view.render_view import render_view
 from recipes.lens_drops import LensDrops
 from recipes.schema import Output, Rain, Recipe, Render, Sensor, Smog, Weather
 from tests.streets import LABELLED_STREET, open_street

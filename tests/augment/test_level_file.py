@@ -12,16 +12,16 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from augment import lod
+from augment.detail import lod
 from augment.errors import SceneError
 from augment.files.level_file import save_large_scene
 from augment.files.scene_file import LEVELS, load_scene_parts, save_scene
-from augment.plan import make_plan
 from augment.render.constants import RasterSettings
 from augment.render.rasterize import rasterize
-from augment.scene import PosedGaussians, Scene
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky
+from augment.scene.scene import PosedGaussians, Scene
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky
+from augment.view.plan import make_plan
 from recipes.schema import Flood, Recipe, Smog, Snowfall, Weather
 from tests.augment.test_lod import eye, road
 

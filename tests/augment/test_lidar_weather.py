@@ -16,7 +16,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from augment.cameras import Camera
 from augment.effects.flood.flood import FloodMedium
 from augment.effects.flood.lidar import ABSORPTION_905_PER_M, meet_water
 from augment.effects.flood.waves import make_waves
@@ -24,7 +23,6 @@ from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED,
 from augment.effects.lidar.beam import LidarModel, find_beam_origins
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import soft_echo, soft_response, wavelength_factor
-from augment.effects.snow.cells import ExposedCells, ExposedSurface
 from augment.effects.snow.effect import build_snow_layers
 from augment.effects.snow.lidar import (
     GROUND_SLACK_M,
@@ -35,13 +33,15 @@ from augment.effects.snow.lidar import (
 )
 from augment.effects.snow.snow import SnowPlan, exposure_settings
 from augment.errors import OutputError
-from augment.jobs.manifest import read_manifest
+from augment.exposure.cells import ExposedCells, ExposedSurface
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.tables import lidar_bytes, read_lidar
-from augment.labels import LidarSweep
 from augment.memo import memo_of
-from augment.scene import Scene
-from augment.views import WeatheredView, render_view
+from augment.output.manifest import read_manifest
+from augment.output.tables import lidar_bytes, read_lidar
+from augment.scene.cameras import Camera
+from augment.scene.labels import LidarSweep
+from augment.scene.scene import Scene
+from augment.view.render_view import WeatheredView, render_view
 from recipes.flood import Flood, Waves
 from recipes.schema import Recipe, Smog, Weather
 from recipes.smog import KOSCHMIEDER

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from augment import kernels, lod
-from augment.geometry import rotmat_from_quat
+from augment.detail import lod
 from augment.render.buffers import ALPHA, BUFFERS, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads
-from augment.scene import Gaussians, PosedGaussians
-from augment.semantics import SemanticClass
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.scene import Gaussians, PosedGaussians
+from augment.scene.semantics import SemanticClass
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, sh_of
 
 STEP_M, SHARP = 0.1, RasterSettings(lod_px=2.0)
@@ -86,7 +86,7 @@ def test_one_place_covers_what_its_splats_cover_together(opacity):
     out, count = np.empty(1), 3
     args = np.full(count, opacity), np.zeros((count, 2)), np.tile(np.eye(2), (count, 1, 1))
     with kernel_threads():
-        kernels.sum_covered_areas(np.array([0, count]), *args, out)
+        lod_kernels.sum_covered_areas(np.array([0, count]), *args, out)
     r = np.arange(0, 6, 1e-3)
     exact = 2 * np.pi * (r * (1 - (1 - opacity * np.exp(-r * r / 2)) ** count)).sum() * 1e-3
     assert out[0] == pytest.approx(exact, rel=0.02)  # what lies beyond 3.15 deviations is left out

@@ -17,8 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augment.errors import OutputError
-from augment.jobs.layout import path_kinds
-from augment.jobs.manifest import (
+from augment.jobs.render_job import RenderJob, run_job
+from augment.output.layout import path_kinds
+from augment.output.manifest import (
     FAILED,
     MAX_SIDE_PX,
     OK,
@@ -37,9 +38,8 @@ from augment.jobs.manifest import (
     read_manifest_rows,
     rows_to_table,
 )
-from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.store import Store, open_store
-from augment.jobs.tables import read_table
+from augment.output.store import Store, open_store
+from augment.output.tables import read_table
 
 
 @pytest.fixture(scope="module")

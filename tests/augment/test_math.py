@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera, Frame
 from augment.errors import SceneError
-from augment.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.render.sh import evaluate_sh, rotate_sh, sh_basis
 from augment.rng import rng_for
-from augment.sky import CubemapSky, LatLongSky, cubemap_coordinates, directions_of_cubemap
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat, slerp
+from augment.scene.sky import CubemapSky, LatLongSky, cubemap_coordinates, directions_of_cubemap
 
 
 def _directions(count, seed=0):

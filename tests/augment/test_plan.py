@@ -3,12 +3,12 @@ import dataclasses
 import pytest
 import torch
 
-from augment.cameras import Camera, Frame
 from augment.errors import SceneError
-from augment.labels import Boxes, LidarSweep
-from augment.plan import Plan, make_plan
-from augment.scene import Gaussians, Scene
-from augment.sky import ConstantSky
+from augment.scene.cameras import Camera, Frame
+from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.sky import ConstantSky
+from augment.view.plan import Plan, make_plan
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from augment import prune
-from augment.cameras import Camera, Frame
+from augment.detail import prune
+from augment.detail.lod import MIN_SPLATS
 from augment.effects import JobContext, precompute_effects
-from augment.lod import MIN_SPLATS
 from augment.memo import memo_of
-from augment.plan import make_plan
 from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
-from augment.scene import Gaussians, PosedGaussians, Scene
-from augment.sky import ConstantSky
-from augment.views import render_buffers, render_view
+from augment.scene.cameras import Camera, Frame
+from augment.scene.scene import Gaussians, PosedGaussians, Scene
+from augment.scene.sky import ConstantSky
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers, render_view
 from recipes.schema import Output, Recipe, Render
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, stack
 from tests.streets import open_street

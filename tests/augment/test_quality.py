@@ -15,11 +15,15 @@ from generate_jobs import make_job, make_recipes
 from hypothesis import given
 from hypothesis import strategies as st
 
-from augment.cameras import Frame
 from augment.errors import OutputError, SceneError
 from augment.jobs.generate import plan_job, run_generate
-from augment.jobs.manifest import read_manifest
-from augment.jobs.quality import (
+from augment.jobs.render_job import RenderJob, run_job
+from augment.metrics.image import flip
+from augment.output.manifest import read_manifest
+from augment.output.store import open_store
+from augment.scene.cameras import Frame
+from augment.view.plan import make_plan
+from augment.view.quality import (
     Cost,
     Question,
     apply_settings,
@@ -34,11 +38,7 @@ from augment.jobs.quality import (
     select_useful_values,
     steps_back,
 )
-from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.store import open_store
-from augment.metrics.image import flip
-from augment.plan import make_plan
-from augment.views import render_view
+from augment.view.render_view import render_view
 from recipes.errors import RecipeError
 from recipes.fields import section_at
 from recipes.load import load_recipe, parse_recipe
@@ -210,8 +210,8 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Workbench:
     however small the picture is.
     """
     bench = Workbench()
-    monkeypatch.setattr("augment.jobs.quality.flip", _mean_error)
-    monkeypatch.setattr("augment.jobs.quality.perf_counter", lambda: bench.now_s)
+    monkeypatch.setattr("augment.view.quality.flip", _mean_error)
+    monkeypatch.setattr("augment.view.quality.perf_counter", lambda: bench.now_s)
     return bench
 
 

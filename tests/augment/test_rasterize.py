@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera
 from augment.errors import BackendUnavailable
-from augment.geometry import rigid, rotmat_from_quat
 from augment.render import buffers as backends
 from augment.render import rasterize as module
 from augment.render.buffers import (
@@ -33,8 +31,10 @@ from augment.render.cpu.driver import rasterize_cpu
 from augment.render.fog import Fog
 from augment.render.rasterize import rasterize, renormalise_alpha
 from augment.render.reference import rasterize_reference
-from augment.scene import Gaussians, PosedGaussians
-from augment.sky import CubemapSky
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid, rotmat_from_quat
+from augment.scene.scene import Gaussians, PosedGaussians
+from augment.scene.sky import CubemapSky
 from tests.assertions import assert_images_close, assert_labels_equal, assert_stored_render
 from tests.scenes import (
     GOLDEN,

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera
 from augment.errors import SceneError
-from augment.geometry import rigid, rotmat_from_quat
 from augment.reconstruct import kernels
 from augment.reconstruct.config import Growth, LearningRates, LossWeights
 from augment.reconstruct.loss import IDENTITY_MAP, LossScratch, ViewLoss, view_loss
@@ -46,7 +44,9 @@ from augment.render.layout import BLOCK_SIZE
 from augment.render.part_views import stack_poses
 from augment.render.sh import sh_basis
 from augment.render.threads import kernel_threads, limit_threads
-from augment.scene import Gaussians
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid, rotmat_from_quat
+from augment.scene.scene import Gaussians
 from tests.augment.loss_definition import reference_loss, ssim_map
 from tests.scenes import camera_ahead, random_gaussians, slight_pose
 

@@ -16,8 +16,8 @@ from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
-from augment.scene import Gaussians, PosedGaussians, SplatShading
-from augment.sky import CubemapSky
+from augment.scene.scene import Gaussians, PosedGaussians, SplatShading
+from augment.scene.sky import CubemapSky
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, sh_of, slight_pose
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")

@@ -28,13 +28,13 @@ from batch_scenes import (
 )
 
 import augment
-from augment.cameras import Frame
 from augment.errors import OutputError, SceneError
-from augment.jobs.layout import item_paths, resolve_inside
-from augment.jobs.manifest import read_manifest
 from augment.jobs.processes import OutputLock, process_mark
 from augment.jobs.render_job import JobResult, RenderJob, run_job
-from augment.jobs.tables import read_boxes, read_lidar
+from augment.output.layout import item_paths, resolve_inside
+from augment.output.manifest import read_manifest
+from augment.output.tables import read_boxes, read_lidar
+from augment.scene.cameras import Frame
 from recipes.load import load_recipe
 from recipes.schema import Render
 

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera
 from augment.effects.flood.water_plane import mirrored_camera
-from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat
 from augment.render.buffers import ALPHA, BUFFERS, MODE_DEPTH, OVERLAY, RGB
 from augment.render.composite import composite_sky
 from augment.render.constants import COV2D_BLUR, RasterSettings
@@ -22,8 +20,10 @@ from augment.render.layout import SURFACE_DEPTHS_ONLY, HeightClip
 from augment.render.mode_depth import GAMMA, HIGH, LOW, Clusters
 from augment.render.rasterize import rasterize
 from augment.render.reference import project_parts
-from augment.scene import Gaussians, PosedGaussians, SplatShading
-from augment.sky import ConstantSky, CubemapSky
+from augment.scene.cameras import Camera
+from augment.scene.geometry import quat_from_rotmat, rigid, rotmat_from_quat
+from augment.scene.scene import Gaussians, PosedGaussians, SplatShading
+from augment.scene.sky import ConstantSky, CubemapSky
 from tests.assertions import assert_images_close
 from tests.scenes import (
     camera_ahead,

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from augment.geometry import multiply_quats, quat_from_rotmat, transform_points
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
 from augment.render.constants import RasterSettings
 from augment.render.fog import Fog
 from augment.render.reference import order_by_depth, project_parts, rasterize_reference
 from augment.render.sh import rotate_sh
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.geometry import multiply_quats, quat_from_rotmat, transform_points
+from augment.scene.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close
 from tests.scenes import (
     GOLDEN,

@@ -13,8 +13,7 @@ import torch
 from batch_scenes import tree_digest
 from torch.utils.data import DataLoader
 
-import augment.views
-from augment.cameras import Camera
+import augment.view.render_view
 from augment.dataset import SceneDataset
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.render.cpu.order import spatial_order
@@ -24,8 +23,9 @@ from augment.render.threads import (
     num_kernel_threads,
     split_threads,
 )
-from augment.scene import Gaussians, Scene
-from augment.views import ViewPool, WeatheredView, begin_view, render_view, render_views
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, Scene
+from augment.view.render_view import ViewPool, WeatheredView, begin_view, render_view, render_views
 from recipes.flood import Flood
 from recipes.rain import Rain
 from recipes.schema import Output, Recipe, Render, Weather
@@ -187,7 +187,7 @@ def test_a_view_that_fails_takes_no_other_with_it(scene, single, tmp_path, monke
         return begin_view(scene, camera, recipe, backend=backend)
 
     with monkeypatch.context() as patched:
-        patched.setattr(augment.views, "begin_view", begin)
+        patched.setattr(augment.view.render_view, "begin_view", begin)
         result = job(scene, tmp_path)
     assert (result.written, result.failed) == (3, 1)
     assert result.failures[0].endswith("frame 0, camera left: rendering: RuntimeError: no light")

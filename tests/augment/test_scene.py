@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera
 from augment.errors import SceneError
-from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.memo import SceneMemo, memo_of
 from augment.render.sh import evaluate_sh
-from augment.scene import (
+from augment.scene.cameras import Camera
+from augment.scene.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
+from augment.scene.scene import (
     Actor,
     ColorSeries,
     Gaussians,
@@ -30,8 +30,8 @@ from augment.scene import (
     drawable_rows,
     is_drawable,
 )
-from augment.semantics import SemanticClass, class_of_label
-from augment.sky import ConstantSky
+from augment.scene.semantics import SemanticClass, class_of_label
+from augment.scene.sky import ConstantSky
 
 
 def some(count: int = 5) -> Gaussians:
@@ -127,7 +127,7 @@ def test_a_track_interpolates_holds_and_ends():
 
 
 def pose_by_tensors(track: Track, time: int) -> torch.Tensor:
-    """Between two samples, by the functions of augment.geometry."""
+    """Between two samples, by the functions of augment.scene.geometry."""
     times, poses = track.timestamps_ns, track.world_from_actor
     after = int(torch.searchsorted(times, time, right=True))
     a, b = poses[after - 1], poses[after]

@@ -31,11 +31,11 @@ from augment.files.scene_file import (
     save_scene,
     save_scene_file,
 )
-from augment.geometry import multiply_quats
-from augment.jobs import atomic as atomic_folder
+from augment.output import atomic as atomic_folder
 from augment.render.sh import evaluate_sh
-from augment.scene import Actor, ColorSeries, Gaussians, Track
-from augment.sky import ConstantSky, LatLongSky
+from augment.scene.geometry import multiply_quats
+from augment.scene.scene import Actor, ColorSeries, Gaussians, Track
+from augment.scene.sky import ConstantSky, LatLongSky
 
 DIFFERENT = ("source", "labels")  # a loaded scene is opened from its folder
 

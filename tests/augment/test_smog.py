@@ -12,10 +12,7 @@ from box_views import CAR_M, UPRIGHT, boxes_at_random, make_boxes, make_camera, 
 
 from adapters.procedural import open_truth
 from adapters.uri import parse_uri
-from augment.boxes import BOTTOM_MARGIN_M, NOT_COUNTED, SIDE_MARGIN_M
 from augment.effects.smog import box_transmittance
-from augment.geometry import rotmat_from_quat
-from augment.labels import Boxes
 from augment.render.fog import (
     Fog,
     apply_deferred_fog,
@@ -24,6 +21,9 @@ from augment.render.fog import (
     optical_depth_numpy,
     sky_optical_depth,
 )
+from augment.scene.boxes import BOTTOM_MARGIN_M, NOT_COUNTED, SIDE_MARGIN_M
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.labels import Boxes
 from tests.streets import open_street
 from tools.bench.scenes import recipe_of
 from tools.bench.smog import smog_error, truth_view

@@ -11,9 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera, Frame
-from augment.cast_shadows import linear_from_display
-from augment.effects.snow.cells import FLUSH, OPEN_EDGE
 from augment.effects.snow.kernels import MAX_FOLIAGE_DEPTH_M, MAX_GRAIN_DISTANCE_M, MIN_DEPTH_M
 from augment.effects.snow.layer import (
     PRESSED_SHARE,
@@ -33,14 +30,17 @@ from augment.effects.snow.light import (
 )
 from augment.effects.snow.near_camera import Crystals, PartSnow, SnowLayers
 from augment.effects.snow.relief import Carrier, Grain, add_grain
-from augment.geometry import rigid
+from augment.exposure.cells import FLUSH, OPEN_EDGE
+from augment.light.cast_shadows import linear_from_display
 from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.render.threads import limit_threads
-from augment.scene import Actor, Gaussians, Scene, Track
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, LatLongSky, Sky
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rigid
+from augment.scene.scene import Actor, Gaussians, Scene, Track
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky, LatLongSky, Sky
 from recipes.snow import Snow, SnowLight
 from tests.augment.pretend_gpu import AwayTensor, held_by, pretended_gpu
 from tests.snow_beds import bed_of_cells, cells_on_grid, grid_surface, level_bed, looking, scene_of

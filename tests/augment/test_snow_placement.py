@@ -12,34 +12,34 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from augment.effects.snow.cells import (
+from augment.effects.snow.snow import exposure_settings
+from augment.errors import OutputError, SceneError
+from augment.exposure.cells import (
     FLUSH,
     MAX_EDGE_DISTANCE_M,
     OPEN_EDGE,
     ExposedCells,
     ExposedSurface,
 )
-from augment.effects.snow.placement import (
-    EGO_WIDTH_M,
-    WHEEL_OFFSET_SHARE,
-    ExposureSettings,
-    find_exposed_surface,
-    find_wheel_paths,
-)
-from augment.effects.snow.snow import exposure_settings
-from augment.effects.snow.support import (
+from augment.exposure.exposed_surface import (
     FORMAT,
     exposed_surface_key,
     exposed_surface_of,
     load_exposed_surface,
     save_exposed_surface,
 )
-from augment.effects.snow.surface import is_vehicle
-from augment.errors import OutputError, SceneError
-from augment.labels import EGO_VEHICLE
+from augment.exposure.placement import (
+    EGO_WIDTH_M,
+    WHEEL_OFFSET_SHARE,
+    ExposureSettings,
+    find_exposed_surface,
+    find_wheel_paths,
+)
+from augment.exposure.surface import is_vehicle
 from augment.render.threads import limit_threads
-from augment.scene import Gaussians, Scene, Track
-from augment.semantics import SemanticClass
+from augment.scene.labels import EGO_VEHICLE
+from augment.scene.scene import Gaussians, Scene, Track
+from augment.scene.semantics import SemanticClass
 from augment.timing import PassProgress, watched
 from recipes.snow import Snow
 from tests.scenes import one_gaussian, stack

@@ -21,15 +21,15 @@ from box_views import (
 
 from adapters.base import open_scene, parse_uri
 from adapters.procedural import open_truth
-from augment.boxes import SIDE_MARGIN_M
-from augment.effects.snow.placement import ExposureSettings, find_exposed_surface
 from augment.effects.snow.snow import count_snow_pixels
 from augment.errors import SceneError
-from augment.labels import Boxes
-from augment.plan import make_plan
-from augment.scene import Gaussians, Scene
-from augment.semantics import SemanticClass
-from augment.views import render_buffers, render_view
+from augment.exposure.placement import ExposureSettings, find_exposed_surface
+from augment.scene.boxes import SIDE_MARGIN_M
+from augment.scene.labels import Boxes
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.semantics import SemanticClass
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers, render_view
 from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow

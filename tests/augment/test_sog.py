@@ -23,8 +23,8 @@ from augment.files import sog
 from augment.files.export import export_sog
 from augment.files.ply import read_splats
 from augment.files.sog import read_sog, write_sog
-from augment.geometry import rotmat_from_quat
-from augment.scene import Gaussians
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.scene import Gaussians
 
 LEVELS = [float(level) for level in range(256)]
 

@@ -26,7 +26,7 @@ from augment.files.ply import (
     write_ply,
     write_splat,
 )
-from augment.scene import Gaussians
+from augment.scene.scene import Gaussians
 
 BASIC = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
          "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip

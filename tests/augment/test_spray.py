@@ -22,12 +22,12 @@ from augment.effects.spray.puffs import (
     spray_puffs,
     spraying_actors,
 )
-from augment.plan import make_plan
 from augment.render.buffers import CPU, REFERENCE
 from augment.render.fog import Fog
-from augment.scene import Actor, Gaussians, Scene, Track
-from augment.sky import ConstantSky
-from augment.views import render_view
+from augment.scene.scene import Actor, Gaussians, Scene, Track
+from augment.scene.sky import ConstantSky
+from augment.view.plan import make_plan
+from augment.view.render_view import render_view
 from recipes.schema import Rain, Recipe, Render, Weather
 from tests.lidar_sweeps import sweep_of
 from tests.scenes import camera_ahead, one_gaussian

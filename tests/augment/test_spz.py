@@ -17,8 +17,8 @@ from augment.errors import SceneError
 from augment.files.export import export_ply, export_spz
 from augment.files.ply import read_splats
 from augment.files.spz import read_spz, write_spz
-from augment.geometry import rotmat_from_quat
-from augment.scene import Gaussians
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.scene import Gaussians
 
 MAGIC = 0x5053474E
 

@@ -16,7 +16,7 @@ import pytest
 from augment.errors import AdapterError, OutputError
 from augment.files.packed_images import NUMBER_LISTS, RowReader
 from augment.files.stated_sizes import StatedSizeError, read_feather
-from augment.jobs.tables import read_table
+from augment.output.tables import read_table
 
 COUNT = 5_000_000
 LETTERS = "x" * 40_000

@@ -30,11 +30,17 @@ import pytest
 from generate_jobs import image_name, make_job, make_recipes, outputs
 
 from augment.errors import OutputError
-from augment.jobs.atomic import TEMPORARY_SUFFIX
 from augment.jobs.blocks import read_status
-from augment.jobs.claims import CLAIMS_FOLDER, ClaimTimes, try_claim, try_lock
 from augment.jobs.generate import run_generate
-from augment.jobs.store import LocalStore, RemoteStore, RetrySettings, StoredFileMissing, open_store
+from augment.output.atomic import TEMPORARY_SUFFIX
+from augment.output.claims import CLAIMS_FOLDER, ClaimTimes, try_claim, try_lock
+from augment.output.store import (
+    LocalStore,
+    RemoteStore,
+    RetrySettings,
+    StoredFileMissing,
+    open_store,
+)
 from tools.view.outputs import OutputViewer, find_output
 
 # ---- An S3 server in this process, and failures to order ----------------------------------------
@@ -500,7 +506,7 @@ def test_a_remote_output_has_the_files_of_a_local_one(server, tmp_path, monkeypa
     """Requests fail now and then; the job is stopped twice, and what was finished stays so."""
     lazy = SimpleNamespace(collect=lambda: None)
     monkeypatch.setattr("augment.jobs.block_worker.gc", lazy)
-    monkeypatch.setattr("augment.jobs.claims.CLAIM_TIMES", ClaimTimes(0.2))
+    monkeypatch.setattr("augment.output.claims.CLAIM_TIMES", ClaimTimes(0.2))
     scenes = ["fake:a?frames=3"]
     recipes = make_recipes(["fog"], block_images=2)
     run_generate(make_job(tmp_path / "local", scenes, recipes), progress=False)
@@ -551,8 +557,8 @@ SHORT = ClaimTimes(renewal_s=60.0, lifetime_s=1.0)
 # Holds "a" in the stores that it is given, and says so; stays, or ends without releasing anything.
 HOLDER = """
 import sys, time
-from augment.jobs.claims import try_claim
-from augment.jobs.store import open_store
+from augment.output.claims import try_claim
+from augment.output.store import open_store
 seconds, *uris = sys.argv[1:]
 claims = [try_claim(open_store(uri), "a") for uri in uris]
 assert None not in claims
@@ -562,8 +568,8 @@ time.sleep(float(seconds))
 # Claims "a" again and again; two never hold it at once.
 CONTENDER = """
 import os, sys, time
-from augment.jobs.claims import try_claim
-from augment.jobs.store import open_store
+from augment.output.claims import try_claim
+from augment.output.store import open_store
 uri, mark, left = sys.argv[1], sys.argv[2], int(sys.argv[3])
 deadline_s = time.monotonic() + 60
 print("contending", flush=True)

@@ -9,7 +9,6 @@ import torch
 from fitted_scenes import fitted_scene
 from scenes import camera_ahead, random_gaussians
 
-from augment.cameras import Frame
 from augment.effects.snow.effect import build_snow_layers
 from augment.effects.style import network as checkpoint
 from augment.effects.style.color_maps import (
@@ -31,16 +30,17 @@ from augment.effects.style.statistics import ROAD as ROADS
 from augment.effects.style.style import scene_style_of, style_maps
 from augment.errors import StyleError
 from augment.memo import memo_of
-from augment.plan import make_plan
 from augment.render.composite import apply_color_map, composite_sky
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0, evaluate_sh
 from augment.render.threads import limit_threads
-from augment.scene import Actor, ColorSeries, Gaussians, PosedGaussians, Scene, Track
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, CubemapSky, LatLongSky
-from augment.views import render_buffers, render_view
+from augment.scene.cameras import Frame
+from augment.scene.scene import Actor, ColorSeries, Gaussians, PosedGaussians, Scene, Track
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky, CubemapSky, LatLongSky
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers, render_view
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style

@@ -42,7 +42,7 @@ from augment.effects.style.statistics import (
 )
 from augment.effects.style.style import parse_statistics, preset_statistics
 from augment.errors import StyleError
-from augment.semantics import SemanticClass
+from augment.scene.semantics import SemanticClass
 from recipes.style import style_preset_names, style_preset_text
 from tests.exif import with_orientation
 

@@ -11,7 +11,6 @@ import pytest
 import torch
 from scenes import camera_ahead, one_gaussian, random_gaussians
 
-from augment.cameras import Frame
 from augment.effects.style.losses import FilterBank, weighted_sum
 from augment.effects.style.network import Gscm, apply_map
 from augment.effects.style.pairs import (
@@ -43,8 +42,9 @@ from augment.render.buffers import ALPHA, RGB
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
-from augment.scene import Actor, Scene, Track
-from augment.sky import ConstantSky
+from augment.scene.cameras import Frame
+from augment.scene.scene import Actor, Scene, Track
+from augment.scene.sky import ConstantSky
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 
 SIZE = 16

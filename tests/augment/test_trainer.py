@@ -13,11 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera, Frame
 from augment.errors import BackendUnavailable
-from augment.geometry import rigid, rotmat_from_quat
-from augment.labels import EGO_VEHICLE
-from augment.plan import make_plan
 from augment.reconstruct.config import FitConfig, Growth, LearningRates, Tuning
 from augment.reconstruct.splats import Splats
 from augment.reconstruct.trainer import (
@@ -38,9 +34,13 @@ from augment.render.cpu.backward import Tape
 from augment.render.cpu.driver import Scratch
 from augment.render.layout import BLOCK_SIZE
 from augment.render.threads import limit_threads
-from augment.scene import Actor, Gaussians, Scene, Track
-from augment.sky import CubemapSky, cubemap_coordinates
-from augment.views import render_buffers
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rigid, rotmat_from_quat
+from augment.scene.labels import EGO_VEHICLE
+from augment.scene.scene import Actor, Gaussians, Scene, Track
+from augment.scene.sky import CubemapSky, cubemap_coordinates
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers
 from recipes.schema import Output, Recipe
 from tests.augment import gsplat_stand_in
 from tests.augment.loss_definition import reference_picture

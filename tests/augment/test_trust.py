@@ -15,17 +15,14 @@ from scenes import camera_ahead, one_gaussian, stack
 from streets import open_street
 
 from adapters.camera_files.paths import with_camera_path
-from augment.cameras import Camera, Frame
 from augment.dataset.weather_dataset import WeatherDataset
 from augment.files.scene_file import load_scene_parts, save_scene
 from augment.jobs.blocks import SceneRecord, cut_into_blocks
-from augment.jobs.layout import item_paths
-from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
-from augment.recorded_sky import elevation_rad, find_sky
-from augment.scene import Actor, Gaussians, Scene, Track
-from augment.sky import ConstantSky
-from augment.trust import (
+from augment.output.layout import item_paths
+from augment.output.manifest import read_manifest
+from augment.photo.recorded_sky import elevation_rad, find_sky
+from augment.photo.trust import (
     MAX_MAGNIFICATION,
     judge_scene,
     judge_view,
@@ -34,7 +31,10 @@ from augment.trust import (
     trust_mask,
     unfitted_cameras,
 )
-from augment.views import render_view
+from augment.scene.cameras import Camera, Frame
+from augment.scene.scene import Actor, Gaussians, Scene, Track
+from augment.scene.sky import ConstantSky
+from augment.view.render_view import render_view
 from recipes.fields import changed
 from recipes.load import load_recipe
 from recipes.schema import Recipe

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from augment import views as apply
-from augment.bounds import Bounds, bound_squares, may_show
-from augment.boxes import instances_of
-from augment.cameras import Camera, Frame
-from augment.geometry import rigid, rotmat_from_quat
-from augment.jobs.files import measure_boxes
-from augment.labels import Boxes
-from augment.plan import ViewPlan, make_plan, plan_view
+from augment.detail.bounds import Bounds, bound_squares, may_show
+from augment.output.view_files import measure_boxes
 from augment.render.constants import RasterSettings
 from augment.render.reference import half_extents, project_parts
-from augment.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, CubemapSky
-from augment.views import render_buffers, render_view
+from augment.scene.boxes import instances_of
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rigid, rotmat_from_quat
+from augment.scene.labels import Boxes
+from augment.scene.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky, CubemapSky
+from augment.view import render_view as apply
+from augment.view.plan import ViewPlan, make_plan, plan_view
+from augment.view.render_view import render_buffers, render_view
 from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow

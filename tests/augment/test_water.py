@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera
 from augment.effects.flood import water as water_module
 from augment.effects.flood.flood import FloodMedium, Layer, reflectance
 from augment.effects.flood.screen_space import ScreenReflection, trace_screen
@@ -27,9 +26,10 @@ from augment.effects.flood.waves import (
     turns_at,
     wave_field,
 )
-from augment.geometry import invert_rigid, rigid, rotmat_from_quat
 from augment.render.fog import Fog
-from augment.sky import ConstantSky, CubemapSky
+from augment.scene.cameras import Camera
+from augment.scene.geometry import invert_rigid, rigid, rotmat_from_quat
+from augment.scene.sky import ConstantSky, CubemapSky
 from recipes.flood import Wave, Waves
 
 NONE = np.zeros(0)

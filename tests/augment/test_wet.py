@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera, Frame
 from augment.effects.flood.water_plane import mirrored_camera
 from augment.effects.flood.waves import WaveField
-from augment.effects.snow.cells import ExposedSurface
 from augment.effects.wet import kernels, reflection
 from augment.effects.wet.darkening import (
     darken_gaussians,
@@ -48,14 +46,16 @@ from augment.effects.wet.ripples import (
     make_rings,
     ring_slopes,
 )
+from augment.exposure.cells import ExposedSurface
 from augment.memo import memo_of
-from augment.plan import make_plan, plan_view
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
-from augment.scene import PosedGaussians, Scene
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky
-from augment.views import render_buffers, render_view
+from augment.scene.cameras import Camera, Frame
+from augment.scene.scene import PosedGaussians, Scene
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky
+from augment.view.plan import make_plan, plan_view
+from augment.view.render_view import render_buffers, render_view
 from recipes.rain import Rain
 from recipes.schema import Output, Recipe, Render, Weather
 from tests.scenes import one_gaussian, random_gaussians, stack

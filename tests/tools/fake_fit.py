@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera, Frame
 from augment.files.scene_file import FORMAT
 from augment.reconstruct.config import FitConfig
 from augment.reconstruct.trainer import StepRecord
 from augment.reconstruct.view import RecordedView, ViewKey
-from augment.scene import Scene
-from augment.sky import ConstantSky
+from augment.scene.cameras import Camera, Frame
+from augment.scene.scene import Scene
+from augment.scene.sky import ConstantSky
 from tests.scenes import one_gaussian
 from tools import fit
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from augment.jobs.files import box_tables, encode_depth, encode_ids, encode_image
-from augment.jobs.layout import path_kinds
-from augment.jobs.manifest import rows_to_table, write_manifest
-from augment.jobs.tables import FrameBoxes, boxes_bytes, parquet_bytes
-from augment.labels import Boxes
+from augment.output.layout import path_kinds
+from augment.output.manifest import rows_to_table, write_manifest
+from augment.output.tables import FrameBoxes, boxes_bytes, parquet_bytes
+from augment.output.view_files import box_tables, encode_depth, encode_ids, encode_image
+from augment.scene.labels import Boxes
 from recipes.schema import Output
 
 HEIGHT, WIDTH = 24, 40

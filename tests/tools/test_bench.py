@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera
 from augment.errors import ClimateGSError
-from augment.jobs.quality import Trial
+from augment.scene.cameras import Camera
+from augment.view.quality import Trial
 from recipes.schema import KNOBS, TIERS, knobs_of
 from tests.streets import SMALL_STREET, open_street
 from tools.bench import (

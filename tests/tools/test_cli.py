@@ -22,9 +22,9 @@ from augment.dataset import WeatherDataset
 from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.files.ply import write_ply
 from augment.files.scene_file import load_scene_parts, save_scene
-from augment.jobs.manifest import read_manifest
-from augment.labels import Boxes
-from augment.scene import Gaussians, Scene
+from augment.output.manifest import read_manifest
+from augment.scene.labels import Boxes
+from augment.scene.scene import Gaussians, Scene
 from recipes.schema import Output, Recipe
 from recipes.style import style_preset_names
 from tests.snow_scenes import box_car, drive, sheet
@@ -155,16 +155,16 @@ def test_render_takes_selections_and_scale(scene_uri, recipe, tmp_path):
 
 
 def test_a_failing_image_gives_exit_code_1(scene_uri, recipe, tmp_path, monkeypatch, capsys):
-    import augment.views
+    import augment.view.render_view
 
-    real = augment.views.begin_view
+    real = augment.view.render_view.begin_view
 
     def breaks_on_the_second_frame(scene, camera, recipe, *, backend):
         if camera.timestamp_ns > 0:
             raise RuntimeError("no light")
         return real(scene, camera, recipe, backend=backend)
 
-    monkeypatch.setattr(augment.views, "begin_view", breaks_on_the_second_frame)
+    monkeypatch.setattr(augment.view.render_view, "begin_view", breaks_on_the_second_frame)
     out = tmp_path / "out"
     assert main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"]) == 1
     streams = capsys.readouterr()

@@ -18,8 +18,8 @@ import pytest
 from augment.dataset import WeatherDataset
 from augment.errors import ClimateGSError
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.store import open_store
-from augment.jobs.tables import METADATA_KEY
+from augment.output.store import open_store
+from augment.output.tables import METADATA_KEY
 from recipes.flood import Flood
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
 from tools.cli import EvaluateOptions

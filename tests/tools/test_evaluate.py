@@ -12,13 +12,19 @@ from report_outputs import make_row
 from safetensors.torch import save_file
 from walls import FRAME_NS, board_boxes, driving_camera, wall_view
 
-from augment.cameras import Frame
 from augment.errors import OutputError
-from augment.jobs.files import encode_depth, encode_ids, encode_image, encode_mask, frame_entry
-from augment.jobs.manifest import rows_to_table, write_manifest
-from augment.jobs.tables import boxes_bytes
 from augment.metrics.lpips import ALEX, expected_shapes
+from augment.output.manifest import rows_to_table, write_manifest
+from augment.output.tables import boxes_bytes
+from augment.output.view_files import (
+    encode_depth,
+    encode_ids,
+    encode_image,
+    encode_mask,
+    frame_entry,
+)
 from augment.render.sensor import add_noise
+from augment.scene.cameras import Frame
 from recipes.load import dump_recipe
 from recipes.schema import Output, Recipe, Sensor
 from tools.cli import EvaluateOptions

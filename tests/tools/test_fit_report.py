@@ -13,12 +13,12 @@ import pytest
 import torch
 
 from adapters.procedural import ExactView, open_procedural, open_truth
-from augment.cameras import Camera, Frame
-from augment.geometry import rigid
 from augment.reconstruct.view import RecordedView, ViewKey
-from augment.scene import Scene
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rigid
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky
 from tests.scenes import camera_ahead, one_gaussian
 from tools.fit_report import (
     CELL_WIDTH,

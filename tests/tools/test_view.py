@@ -28,13 +28,13 @@ from streets import LABELLED_STREET, SMALL_STREET, open_street
 from websockets.exceptions import InvalidStatus
 
 from augment import effects
-from augment.cameras import Camera
 from augment.errors import ClimateGSError, OutputError
-from augment.geometry import invert_rigid
-from augment.jobs.manifest import rows_to_table, write_manifest
-from augment.jobs.store import open_store
+from augment.output.manifest import rows_to_table, write_manifest
+from augment.output.store import open_store
+from augment.scene.cameras import Camera
+from augment.scene.geometry import invert_rigid
 from augment.timing import PassProgress, counted_steps
-from augment.views import render_view
+from augment.view.render_view import render_view
 from recipes.errors import RecipeError
 from recipes.fields import section_at, with_unchecked_field
 from recipes.load import load_recipe, preset_names
@@ -311,7 +311,7 @@ def test_a_flight_starts_with_the_recorded_cameras_pixels_and_pose():
     scene = open_street()
     own = scene.frames[0].cameras["front"]
     pose = own.world_from_camera
-    from augment.geometry import quat_from_rotmat
+    from augment.scene.geometry import quat_from_rotmat
 
     wxyz = quat_from_rotmat(pose[:3, :3]).tolist()
     fov = 2 * math.atan(own.height / 2 / own.fy)

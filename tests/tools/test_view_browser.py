@@ -21,8 +21,8 @@ import pytest
 from streets import SMALL_STREET
 from test_view import SCALE, hostile_output, rendered, served
 
-from augment.jobs.store import open_store
-from augment.views import render_view
+from augment.output.store import open_store
+from augment.view.render_view import render_view
 from tools.view.edits import Edits
 from tools.view.outputs import OutputViewer
 from tools.view.server import import_viser, serve

@@ -21,10 +21,10 @@ from torch.utils.data import DataLoader, Dataset
 
 from adapters.base import open_scene
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
-from augment.jobs.atomic import write_atomic
-from augment.jobs.layout import MANIFEST_FILE
-from augment.jobs.manifest import manifest_bytes, read_manifest
-from augment.views import render_view
+from augment.output.atomic import write_atomic
+from augment.output.layout import MANIFEST_FILE
+from augment.output.manifest import manifest_bytes, read_manifest
+from augment.view.render_view import render_view
 from recipes.load import load_recipe
 from recipes.schema import Output, Recipe
 from tools.bench.harness import (

@@ -22,7 +22,7 @@ from augment.errors import ClimateGSError
 from augment.reconstruct.config import FitConfig, Tuning
 from augment.reconstruct.trainer import Trainer
 from augment.render.cpu.driver import warm_up
-from augment.scene import Scene
+from augment.scene.scene import Scene
 from recipes.load import load_recipe
 from tools.bench.harness import (
     Figures,

@@ -20,14 +20,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from adapters.procedural import StreetTruth
-from augment.cameras import Camera
 from augment.effects.flood.water_plane import plane_depth
 from augment.metrics.image import psnr
-from augment.plan import make_plan
 from augment.render.buffers import ALPHA, RGB
 from augment.render.layout import ABOVE, BELOW, HeightClip
 from augment.render.rasterize import rasterize
-from augment.scene import Gaussians, PosedGaussians, Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians, Scene
+from augment.view.plan import make_plan
 from recipes.schema import Output, Recipe
 from tools.bench.harness import Table
 from tools.bench.scenes import (

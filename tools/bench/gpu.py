@@ -38,7 +38,6 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 from adapters.base import open_scene
-from augment.cameras import Camera
 from augment.render.buffers import ALPHA, CPU, RGB, RenderOutput
 from augment.render.constants import ALPHA_MIN, COV2D_BLUR, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.cuda.driver import list_tiles, project, rasterize_cuda
@@ -56,8 +55,9 @@ from augment.render.layout import (
     MEAN_Y,
     SHARP_X,
 )
-from augment.scene import Gaussians, Ground, PosedGaussians, Scene
-from augment.views import begin_view, render_view
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, Ground, PosedGaussians, Scene
+from augment.view.render_view import begin_view, render_view
 from recipes.schema import TIERS, Recipe, knobs_of, with_settings
 from tools.bench.harness import (
     Action,

@@ -27,19 +27,19 @@ import numpy as np
 import torch
 
 from adapters.base import open_scene
-from augment.cameras import Camera, Frame
 from augment.files.export import export_ply
 from augment.files.scene_file import save_scene, save_scene_file
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.blocks import Block, read_status
-from augment.jobs.files import WritePump, encode_depth, encode_image
 from augment.jobs.generate import BlockWork, GenerateJob, Workers, plan_job, run_generate
-from augment.jobs.layout import variant_name
-from augment.jobs.manifest import compact
-from augment.jobs.store import open_store
-from augment.scene import Gaussians, Scene
-from augment.sky import ConstantSky
-from augment.views import WeatheredView, render_view, render_views
+from augment.output.layout import variant_name
+from augment.output.manifest import compact
+from augment.output.store import open_store
+from augment.output.view_files import WritePump, encode_depth, encode_image
+from augment.scene.cameras import Camera, Frame
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.sky import ConstantSky
+from augment.view.render_view import WeatheredView, render_view, render_views
 from recipes.job import Job, JobRecipes
 from recipes.load import load_recipe, parse_recipe
 from recipes.schema import Recipe

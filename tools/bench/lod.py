@@ -17,14 +17,14 @@ import numpy as np
 
 from adapters.base import open_scene
 from adapters.street.long_street import write_long_street
-from augment.cameras import Camera
-from augment.lod import levels_of
+from augment.detail.lod import levels_of
 from augment.metrics.image import flip, psnr
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, RGB, RenderOutput
 from augment.render.composite import composite_sky, to_bytes
 from augment.render.constants import RasterSettings
 from augment.render.rasterize import rasterize
-from augment.scene import PosedGaussians, Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import PosedGaussians, Scene
 from tools.bench.harness import (
     Figures,
     Table,

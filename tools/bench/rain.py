@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import cv2
 
-from augment.plan import make_plan
-from augment.views import render_buffers
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers
 from tools.bench.harness import Table
 from tools.bench.scenes import CLEAN, EffectCase, cost_tables, recipe_of
 

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from numba import prange
 
-from augment.cameras import Camera
 from augment.render.buffers import ALPHA, RGB, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.cpu import simd as v8
@@ -23,7 +22,8 @@ from augment.render.cpu.jit import kernel
 from augment.render.fog import Fog
 from augment.render.reference import bin_to_tiles, project_parts, rasterize_reference
 from augment.render.threads import kernel_threads
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians
 from tools.bench.harness import (
     Action,
     Figures,

@@ -21,15 +21,15 @@ from tqdm import tqdm
 
 from adapters.base import open_scene, parse_uri
 from adapters.procedural import StreetTruth, open_truth
-from augment.cameras import Camera
-from augment.geometry import rigid
-from augment.jobs.layout import folder_name, variant_name
 from augment.jobs.render_job import RenderJob, run_job
-from augment.plan import make_plan
+from augment.output.layout import folder_name, variant_name
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians, Scene
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid
+from augment.scene.scene import Gaussians, Scene
 from augment.timing import stopwatch
-from augment.views import render_buffers
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers
 from recipes.schema import Output, Recipe, Weather
 from tools.bench.harness import (
     Action,

@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from adapters.procedural import ExactView, StreetTruth
-from augment.cameras import Camera
-from augment.plan import make_plan
 from augment.render.fog import blend_airlight, optical_depth
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
+from augment.view.plan import make_plan
 from recipes.schema import Recipe
 from tools.bench.harness import Table
 from tools.bench.scenes import CLEAN, EffectCase, cost_tables, frame_of, recipe_of

@@ -25,21 +25,21 @@ import torch
 
 from adapters.base import open_scene
 from adapters.procedural import RayHits, StreetTruth
-from augment.cameras import Camera
-from augment.effects.snow.cells import ExposedCells, ExposedSurface
-from augment.effects.snow.height_map import DepthEstimator
 from augment.effects.snow.layer import lay_snow
 from augment.effects.snow.light import find_snow_light
-from augment.effects.snow.placement import ExposureSettings, find_exposed_surface
 from augment.effects.snow.snow import exposure_settings
-from augment.geometry import rigid
+from augment.exposure.cells import ExposedCells, ExposedSurface
+from augment.exposure.height_map import DepthEstimator
+from augment.exposure.placement import ExposureSettings, find_exposed_surface
 from augment.metrics.consistency import DepthView, find_warp
 from augment.render.buffers import BUFFERS
 from augment.render.constants import RasterSettings
 from augment.render.layout import SURFACE_DEPTHS_ONLY
 from augment.render.rasterize import rasterize
-from augment.scene import PosedGaussians, Scene
-from augment.semantics import SemanticClass
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid
+from augment.scene.scene import PosedGaussians, Scene
+from augment.scene.semantics import SemanticClass
 from recipes.schema import Output, Recipe
 from tools.bench.harness import Action, Cell, Table, peak_mib_in_subprocess, rounds
 from tools.bench.scenes import (

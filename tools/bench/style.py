@@ -30,8 +30,8 @@ from augment.effects.style.statistics import closed_maps, reinhard_map
 from augment.effects.style.train import read_photos
 from augment.metrics.image import psnr
 from augment.render.composite import to_byte_array
-from augment.scene import Gaussians, Scene
-from augment.semantics import SemanticClass
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.semantics import SemanticClass
 from recipes.schema import Recipe
 from recipes.style import style_preset_names
 from tools.bench.harness import Action, Table, median_ms, rounds

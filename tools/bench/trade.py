@@ -43,11 +43,20 @@ from tqdm import tqdm
 from adapters.base import open_scene, parse_uri
 from adapters.procedural import open_truth
 from augment import effects
-from augment.cameras import Camera
+from augment.detail.prune import precompute_errors
 from augment.errors import ClimateGSError, SceneError
-from augment.ground import ground_of
-from augment.jobs.files import decode_image, encode_image
-from augment.jobs.quality import (
+from augment.jobs.worker import default_renderer
+from augment.memo import memo_of
+from augment.metrics.consistency import DepthView, warp_view
+from augment.metrics.image import depth_errors, flip, ssim
+from augment.output.view_files import decode_image, encode_image
+from augment.render.buffers import CPU, CUDA
+from augment.render.cpu.driver import free_scratch
+from augment.scene.cameras import Camera
+from augment.scene.ground import ground_of
+from augment.scene.scene import Scene
+from augment.view.images import SURFACE_ALPHA
+from augment.view.quality import (
     Cost,
     Settings,
     Trial,
@@ -55,16 +64,7 @@ from augment.jobs.quality import (
     search_settings,
     select_useful_values,
 )
-from augment.jobs.worker import default_renderer
-from augment.memo import memo_of
-from augment.metrics.consistency import DepthView, warp_view
-from augment.metrics.image import depth_errors, flip, ssim
-from augment.prune import precompute_errors
-from augment.render.buffers import CPU, CUDA
-from augment.render.cpu.driver import free_scratch
-from augment.scene import Scene
-from augment.view_images import SURFACE_ALPHA
-from augment.views import render_view
+from augment.view.render_view import render_view
 from recipes.load import load_recipe
 from recipes.schema import (
     KNOBS,

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from augment.cameras import Camera, Frame
 from augment.errors import ClimateGSError
-from augment.geometry import quat_from_rotmat
-from augment.scene import Scene
-from augment.trust import unfitted_cameras
+from augment.photo.trust import unfitted_cameras
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import quat_from_rotmat
+from augment.scene.scene import Scene
 from recipes.errors import RecipeError
 from recipes.fields import section_at
 from recipes.load import describe_preset, preset_names

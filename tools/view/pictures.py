@@ -16,18 +16,18 @@ import numpy as np
 import torch
 
 from augment import effects
-from augment.boxes import EDGES, WorldBoxes
-from augment.cameras import Camera, Frame
 from augment.effects.lidar.codes import CODE_COLUMN, drop_lost_returns
 from augment.effects.lidar.sweep import weathered_sweep
-from augment.geometry import invert_rigid, rigid, rotmat_from_quat
-from augment.jobs.layout import TRUST
-from augment.plan import make_plan
+from augment.output.layout import TRUST
+from augment.photo.trust import MAX_ANGLE_RAD, MAX_DISTANCE_M, nearest_view, source_views
 from augment.render.buffers import AUTO, SPLAT_IDS
-from augment.scene import Scene
-from augment.semantics import SemanticClass
-from augment.trust import MAX_ANGLE_RAD, MAX_DISTANCE_M, nearest_view, source_views
-from augment.views import render_buffers, render_view
+from augment.scene.boxes import EDGES, WorldBoxes
+from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import invert_rigid, rigid, rotmat_from_quat
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass
+from augment.view.plan import make_plan
+from augment.view.render_view import render_buffers, render_view
 from recipes.fields import with_unchecked_field
 from recipes.schema import Recipe
 

@@ -30,15 +30,15 @@ import numpy as np
 
 from adapters.base import open_scene
 from adapters.camera_files.paths import frames_from_path_file
-from augment.cameras import Camera
 from augment.errors import ClimateGSError
-from augment.jobs.atomic import write_new_file
-from augment.jobs.files import check_frames, encode_image
 from augment.jobs.processes import choose_backend
-from augment.plan import make_plan, plan_view
-from augment.scene import Scene
+from augment.output.atomic import write_new_file
+from augment.output.view_files import check_frames, encode_image
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from augment.timing import PassProgress, stopwatch, watched
-from augment.views import render_view
+from augment.view.plan import make_plan, plan_view
+from augment.view.render_view import render_view
 from recipes.errors import RecipeError, short
 from recipes.schema import TIERS, Recipe
 from tools.output import compiling_noted, print_note

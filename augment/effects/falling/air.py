@@ -28,7 +28,6 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.falling import kernels
 from augment.effects.falling.drops import Kind, Sizes, cell_counts, sizes_of
 from augment.effects.falling.shutter import STANDING, Motion
@@ -39,8 +38,9 @@ from augment.render.fog import MAX_EXPONENT, Fog
 from augment.render.layout import NUM_LANES
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
-from augment.scene import Scene
-from augment.sky import is_unknown_sky
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
+from augment.scene.sky import is_unknown_sky
 
 LAYER_M = 1000.0  # height of the layer from which rain and snow fall, metres
 MAX_DROPS = 50_000  # most drops that are drawn in a picture; more make the veil begin sooner

@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.boxes import WorldBoxes
-from augment.cameras import Camera
 from augment.effects.effect import (
     PICTURE,
     Effect,
@@ -31,7 +29,9 @@ from augment.effects.falling.shutter import frame_interval_s, motion_of
 from augment.effects.lidar.beam import Echoes
 from augment.errors import SceneError
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH
-from augment.scene import Scene
+from augment.scene.boxes import WorldBoxes
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from augment.timing import timed
 from recipes.rain import Rain
 from recipes.schema import Recipe

@@ -8,8 +8,8 @@ import numpy as np
 from numba import prange
 
 from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL, NUM_CLASSES
-from augment.kernels import mix
 from augment.render.cpu import simd as v8
+from augment.render.cpu.hash_kernels import mix
 from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
 from augment.render.cpu.simd import LOG2_E, exp2_fine
 from augment.render.fog import MAX_EXPONENT

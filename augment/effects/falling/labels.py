@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from augment.boxes import NOT_COUNTED, WorldBoxes, count_pixels
-from augment.cameras import Camera
 from augment.effects.effect import LabelInputs
 from augment.effects.smog import box_transmittance
-from augment.jobs.box_tables import BoxTable, pixel_fraction
+from augment.output.box_tables import BoxTable, pixel_fraction
 from augment.render.fog import Fog
+from augment.scene.boxes import NOT_COUNTED, WorldBoxes, count_pixels
+from augment.scene.cameras import Camera
 
 
 def falling_table(name: str, drop: str) -> BoxTable:

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from augment.cameras import Camera
 from augment.memo import memo_of
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 
 _MAX_GAP_S = 2.0  # longest time between two recorded poses that give a speed
 

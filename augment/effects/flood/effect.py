@@ -11,10 +11,7 @@ from contextlib import suppress
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from augment.bounds import lowest_z_m
-from augment.boxes import NOT_COUNTED, BoxPixels, WorldBoxes, count_pixels
-from augment.cameras import Camera
-from augment.drawing import LayerRenderer
+from augment.detail.bounds import lowest_z_m
 from augment.effects.effect import (
     Effect,
     EffectInScene,
@@ -35,11 +32,14 @@ from augment.effects.flood.water_plane import mirrored_camera, plane_depth, plan
 from augment.effects.flood.waves import make_waves
 from augment.effects.lidar.beam import Echoes
 from augment.errors import SceneError
-from augment.ground import ground_of
-from augment.jobs.box_tables import BoxTable, pixel_fraction
 from augment.memo import memo_of
-from augment.scene import Scene
-from augment.semantics import SemanticClass
+from augment.output.box_tables import BoxTable, pixel_fraction
+from augment.scene.boxes import NOT_COUNTED, BoxPixels, WorldBoxes, count_pixels
+from augment.scene.cameras import Camera
+from augment.scene.ground import ground_of
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass
+from augment.view.layers import LayerRenderer
 from recipes.flood import Flood
 from recipes.schema import Recipe
 

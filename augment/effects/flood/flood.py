@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.flood.waves import WaveSet
+from augment.scene.cameras import Camera
 
 # ---- The water and its layers --------------------------------------------------------------------
 

@@ -23,8 +23,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from augment.cameras import Camera
-from augment.drawing import LayerRenderer
 from augment.effects.flood import water_kernels
 from augment.effects.flood.flood import FloodMedium, Layer, fresnel_reflectance
 from augment.effects.flood.screen_space import trace_screen
@@ -49,8 +47,10 @@ from augment.render.constants import DEPTH_EPS
 from augment.render.fog import Fog, blend_airlight, sky_optical_depth
 from augment.render.layout import ABOVE, BELOW, HeightClip
 from augment.render.threads import kernel_threads
-from augment.sky import Sky, sample_at
+from augment.scene.cameras import Camera
+from augment.scene.sky import Sky, sample_at
 from augment.timing import timed
+from augment.view.layers import LayerRenderer
 
 # ---- Layers composited ---------------------------------------------------------------------------
 

@@ -27,12 +27,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.flood import kernels
 from augment.effects.flood.flood import Layer
 from augment.effects.flood.water_plane import Window, falling, window_offset
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.threads import kernel_threads
+from augment.scene.cameras import Camera
 
 # The kernels' thresholds as Python floats, which torch accepts.
 MIN_COVERED_ALPHA, THICKNESS_M, THICKNESS = map(

@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.flood import water_kernels as kernels
 from augment.effects.flood.flood import FloodMedium, Layer, reflectance
 from augment.effects.flood.screen_space import ScreenReflection
@@ -42,7 +41,8 @@ from augment.render.buffers import CPU, choose_kernels
 from augment.render.composite import simplify_sky
 from augment.render.fog import Fog, blend_airlight, optical_depth, vertical_optical_depth
 from augment.render.threads import kernel_threads
-from augment.sky import (
+from augment.scene.cameras import Camera
+from augment.scene.sky import (
     ConstantSky,
     CubemapSky,
     LatLongSky,

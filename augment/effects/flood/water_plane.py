@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from augment.cameras import Camera
-from augment.geometry import any_in_squares, rigid
+from augment.scene.cameras import Camera
+from augment.scene.geometry import any_in_squares, rigid
 
 # ---- Which rays meet the plane -------------------------------------------------------------------
 

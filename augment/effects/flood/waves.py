@@ -21,11 +21,11 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.flood import kernels as waves_kernels
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
+from augment.scene.cameras import Camera
 from recipes.flood import Wave, Waves
 
 GRAVITY_MPS2 = 9.80665  # standard gravity, m/s^2

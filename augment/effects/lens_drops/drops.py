@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
-from augment.cameras import Camera
 from augment.memo import memo_of
 from augment.rng import STEP_X, mix, rng_for
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from recipes.lens_drops import LensDrops
 
 LIFE_S = (8.0, 40.0)  # shortest and longest life of a drop on glass without a wiper

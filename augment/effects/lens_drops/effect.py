@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping
 from dataclasses import replace
 
-from augment.cameras import Camera
 from augment.effects.effect import (
     PICTURE,
     Effect,
@@ -17,7 +16,8 @@ from augment.effects.effect import (
 )
 from augment.effects.lens_drops.drops import LensDropsPlan, drops_at
 from augment.effects.lens_drops.optics import blend_drops, draw_drops, map_surroundings
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from augment.timing import timed
 from recipes.fields import section_at
 from recipes.lens_drops import LensDrops

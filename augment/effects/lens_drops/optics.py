@@ -22,15 +22,15 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from augment.cameras import Camera
-from augment.drawing import LayerRenderer
 from augment.effects.lens_drops import kernels
 from augment.effects.lens_drops.drops import Drops
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK, simplify_sky
 from augment.render.fog import blend_airlight, sky_optical_depth
 from augment.render.threads import kernel_threads
-from augment.sky import is_unknown_sky
+from augment.scene.cameras import Camera
+from augment.scene.sky import is_unknown_sky
+from augment.view.layers import LayerRenderer
 
 WATER = 1.33  # refractive index
 MIN_MASK_SHARE = 0.1  # share of a pixel's light from drops from which the mask holds the pixel

@@ -20,8 +20,8 @@ from augment.effects.lidar.codes import (
     MOVED,
     UNCHANGED,
 )
-from augment.labels import KnowsLidarOrigins, LidarSweep
-from augment.scene import Scene
+from augment.scene.labels import KnowsLidarOrigins, LidarSweep
+from augment.scene.scene import Scene
 
 # ---- The sensor: its optics as assumed, its intensities, where its beams start -------------------
 

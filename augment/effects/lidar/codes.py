@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from augment.labels import LidarSweep
+from augment.scene.labels import LidarSweep
 
 CODE_COLUMN = "weather_code"  # column of the codes below
 INDEX_COLUMN = "source_index"  # column of the row in the source's sweep

@@ -15,10 +15,10 @@ import numpy as np
 
 from augment.effects.lidar.beam import DEFAULT_MODEL, Echoes, LidarModel, find_beam_origins
 from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN
-from augment.labels import LidarSweep
-from augment.plan import make_plan
 from augment.rng import rng_for
-from augment.scene import Scene
+from augment.scene.labels import LidarSweep
+from augment.scene.scene import Scene
+from augment.view.plan import make_plan
 from recipes.schema import Recipe
 
 

@@ -11,11 +11,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from augment.bounds import Bounds, bound_points, bound_squares, find_visible_owners
-from augment.boxes import NOT_COUNTED, WorldBoxes
-from augment.cameras import Camera
-from augment.cast_shadows import precompute_shadows
-from augment.drawing import LayerRenderer
+from augment.detail.bounds import Bounds, bound_points, bound_squares, find_visible_owners
 from augment.effects.effect import (
     PICTURE,
     SCENE,
@@ -43,14 +39,18 @@ from augment.effects.snow.snow import (
     exposure_settings,
     extend_boxes_by_snow,
 )
-from augment.effects.snow.support import exposed_surface_of, share_exposed_surface
-from augment.ground import check_metric_and_level
-from augment.jobs.box_tables import BoxTable, pixel_fraction
+from augment.exposure.exposed_surface import exposed_surface_of, share_exposed_surface
+from augment.light.cast_shadows import precompute_shadows
 from augment.memo import memo_of
+from augment.output.box_tables import BoxTable, pixel_fraction
 from augment.render.buffers import EXPECTED_DEPTH, OVERLAY
 from augment.render.fog import Fog, optical_depth_numpy
-from augment.scene import Gaussians, Scene
+from augment.scene.boxes import NOT_COUNTED, WorldBoxes
+from augment.scene.cameras import Camera
+from augment.scene.ground import check_metric_and_level
+from augment.scene.scene import Gaussians, Scene
 from augment.timing import timed
+from augment.view.layers import LayerRenderer
 from recipes.schema import Recipe
 from recipes.snow import Snow
 
@@ -71,6 +71,7 @@ class SnowEffect(Effect):
     mask_name = "snow"
     adds_overlays = True
     precomputes_files = True
+    kernel_folders = ("augment.exposure",)
     off_switches: ClassVar = {
         LAYER_PASS: ("weather.snow", None),
         LIGHT_PASS: ("weather.snow.shading", "per_splat"),
@@ -257,7 +258,7 @@ def build_snow_layers(
         recipe_snow: snow of a recipe.
         light: scene whose light the snow lies in; None for the scene's own.
         backend: backend that finds the exposed surface, unless it is known (see
-            augment.effects.snow.support).
+            augment.exposure.exposed_surface).
 
     Raises:
         SceneError: this scene cannot have snow, or not with cells this small.

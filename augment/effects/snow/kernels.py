@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from augment.effects.snow.cells import OPEN_EDGE
-from augment.kernels import mix
+from augment.exposure.cells import OPEN_EDGE
+from augment.render.cpu.hash_kernels import mix
 from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
 from augment.render.sh import SH_C0
 from augment.rng import STEP_X, STEP_Y
-from augment.semantics import SemanticClass
+from augment.scene.semantics import SemanticClass
 
 # ---- Noise ---------------------------------------------------------------------------------------
 

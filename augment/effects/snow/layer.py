@@ -28,15 +28,15 @@ import torch
 from torch import Tensor
 
 from augment.effects.snow import kernels
-from augment.effects.snow.cells import MAX_EDGE_DISTANCE_M, ExposedCells, ExposedSurface
 from augment.effects.snow.kernels import CellArrays, CellDepths, SplatArrays
 from augment.effects.snow.light import SnowIllumination
 from augment.effects.snow.near_camera import PartSnow, SnowLayers, draw_crystals
 from augment.effects.snow.relief import Grain
+from augment.exposure.cells import MAX_EDGE_DISTANCE_M, ExposedCells, ExposedSurface
 from augment.render.threads import kernel_threads
 from augment.rng import STEP_X, STEP_Y, mix, rng_for
-from augment.scene import Gaussians, Scene
-from augment.semantics import SemanticClass
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.semantics import SemanticClass
 from recipes.snow import Snow
 
 # ---- Noise over the plane that snow's depth and patches follow: the numpy definition -------------

@@ -16,13 +16,13 @@ import numpy as np
 from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import MOVED
 from augment.effects.snow import kernels
-from augment.effects.snow.cells import ExposedCells, ExposedSurface
 from augment.effects.snow.layer import find_depths, profile_on_part
 from augment.effects.snow.snow import SnowPlan, exposure_settings
-from augment.effects.snow.support import exposed_surface_of
-from augment.labels import LidarSweep
+from augment.exposure.cells import ExposedCells, ExposedSurface
+from augment.exposure.exposed_surface import exposed_surface_of
 from augment.memo import memo_of
-from augment.scene import Scene
+from augment.scene.labels import LidarSweep
+from augment.scene.scene import Scene
 
 # Fresh snow gives back 0.95 of visible light and 0.90 at 0.9 um; old, coarse snow 0.9 and 0.7
 # (Wiscombe and Warren 1980, figure 8): the recipe's albedo times this.

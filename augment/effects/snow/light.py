@@ -21,12 +21,17 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from augment.cast_shadows import SOLID_OPACITY, is_low_and_level, linear_from_display, shadows_of
+from augment.light.cast_shadows import (
+    SOLID_OPACITY,
+    is_low_and_level,
+    linear_from_display,
+    shadows_of,
+)
 from augment.memo import memo_of
 from augment.render.sh import SH_C0
-from augment.scene import Scene
-from augment.semantics import SemanticClass
-from augment.sky import Sky
+from augment.scene.scene import Scene
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import Sky
 from recipes.snow import Snow
 
 FRESH_ALBEDO = 0.85  # `light.brightness` is of this snow; fresh snow has 0.8 to 0.95 (Oke 1987)

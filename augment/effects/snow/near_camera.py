@@ -18,14 +18,14 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.snow.relief import Grain
 from augment.memo import memo_of
 from augment.render.buffers import AUTO, CUDA
 from augment.render.cuda import runtime as gpu
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians, PosedGaussians, Scene, SplatShading
-from augment.semantics import SemanticClass
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians, Scene, SplatShading
+from augment.scene.semantics import SemanticClass
 
 _BLOCK_ROWS = 256  # number of neighbouring points in a block
 

@@ -25,11 +25,11 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.snow import kernels
 from augment.effects.snow.kernels import MAX_GRAIN_DISTANCE_M, GrainView
 from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.threads import kernel_threads
+from augment.scene.cameras import Camera
 
 # Brightness per slope of the relief towards the sun at a clear day's contrast, and brightness per
 # deviation of the noise in any light. Both hold for the recipe's grain of 1.

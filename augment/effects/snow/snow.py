@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from augment.boxes import SIDE_MARGIN_M, BoxPixels, WorldBoxes, count_pixels
-from augment.cameras import Camera
-from augment.effects.snow.placement import ExposureSettings, has_invented_drive
-from augment.scene import Scene
+from augment.exposure.placement import ExposureSettings, has_invented_drive
+from augment.scene.boxes import SIDE_MARGIN_M, BoxPixels, WorldBoxes, count_pixels
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from recipes.snow import Snow
 
 

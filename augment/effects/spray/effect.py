@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 
-from augment.cameras import Camera
 from augment.effects.effect import (
     PICTURE,
     Effect,
@@ -31,7 +30,8 @@ from augment.effects.spray.puffs import (
 )
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH
 from augment.rng import rng_for
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from augment.timing import timed
 from recipes.rain import Rain
 from recipes.schema import Recipe

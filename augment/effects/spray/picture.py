@@ -19,13 +19,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.spray import kernels
 from augment.effects.spray.puffs import CUT_DISTANCE2, Puffs
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK
 from augment.render.fog import Fog, optical_depth_numpy
 from augment.render.threads import kernel_threads
+from augment.scene.cameras import Camera
 
 _RUNS_PER_SD = 12  # runs of pixels in a standard deviation of a puff
 _MAX_RUN = 8  # longest run, pixels

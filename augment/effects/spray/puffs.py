@@ -24,7 +24,7 @@ import numpy as np
 
 from augment.memo import memo_of
 from augment.rng import STEP_X, mix, rng_for
-from augment.scene import Actor, Scene
+from augment.scene.scene import Actor, Scene
 
 # Speed from which a vehicle lifts spray.
 MIN_SPEED_MPS = 40 / 3.6

@@ -31,9 +31,9 @@ from augment.render.buffers import AUTO, CPU, CUDA, choose_kernels
 from augment.render.cuda import runtime
 from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
-from augment.scene import Actor, Gaussians, Scene
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky, is_unknown_sky
+from augment.scene.scene import Actor, Gaussians, Scene
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky, CubemapSky, LatLongSky, Sky, is_unknown_sky
 
 # Number of semantic classes, UNKNOWN included.
 NUM_CLASSES = max(SemanticClass) + 1

@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.style.color_maps import NUM_CLASSES
 from augment.effects.style.statistics import (
     LAND,
@@ -36,9 +35,10 @@ from augment.memo import memo_of
 from augment.render.composite import composite_sky
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians, Scene
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, Sky, is_unknown_sky
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky, Sky, is_unknown_sky
 
 # Largest number of views that the statistics are taken from.
 NUM_VIEWS = 12

@@ -13,8 +13,6 @@ from typing import Any, ClassVar
 
 import torch
 
-from augment.cameras import Camera
-from augment.drawing import LayerRenderer
 from augment.effects.effect import (
     PICTURE,
     SCENE,
@@ -29,8 +27,10 @@ from augment.effects.style.color_maps import StyleMaps
 from augment.effects.style.style import SceneStyle, scene_style_of, style_maps
 from augment.memo import memo_of
 from augment.render.composite import apply_color_map
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 from augment.timing import timed
+from augment.view.layers import LayerRenderer
 from recipes.schema import Recipe
 from recipes.style import Style
 

@@ -34,7 +34,7 @@ from torch.nn import functional
 
 from augment.errors import StyleError
 from augment.files.checkpoints import read_state_dict
-from augment.jobs.atomic import write_atomic
+from augment.output.atomic import write_atomic
 from recipes.files import open_file
 
 # ---- Encoders ------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.effects.style.color_maps import NUM_CLASSES, StyleMaps
-from augment.semantics import SemanticClass
+from augment.scene.semantics import SemanticClass
 
 # Region of the complete picture.
 WHOLE = "whole"

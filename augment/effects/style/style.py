@@ -21,8 +21,6 @@ from jaxtyping import Float, Int16
 from pydantic import ValidationError, field_validator
 from torch import Tensor
 
-from augment.base_photo import PhotoStyle
-from augment.cameras import Camera
 from augment.effects.style.color_maps import (
     MAX_SKY_LEVEL,
     StyleMaps,
@@ -50,9 +48,11 @@ from augment.effects.style.statistics import (
 )
 from augment.errors import StyleError
 from augment.memo import memo_of, size_of
+from augment.photo.recorded_base import PhotoStyle
 from augment.render.buffers import AUTO, CUDA
-from augment.scene import PosedGaussians, Scene
-from augment.sky import Sky
+from augment.scene.cameras import Camera
+from augment.scene.scene import PosedGaussians, Scene
+from augment.scene.sky import Sky
 from recipes.errors import RecipeError
 from recipes.fields import ClosedModel, Number, Unit
 from recipes.style import Style, style_preset_text

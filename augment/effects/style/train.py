@@ -35,7 +35,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from augment.cameras import Camera
 from augment.effects.style.content import select_views
 from augment.effects.style.images import read_style_image
 from augment.effects.style.losses import (
@@ -60,7 +59,8 @@ from augment.errors import SceneError, StyleError
 from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
-from augment.scene import Scene
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
 
 # ---- Contents: views of scenes, and photographs as scenes of one Gaussian a pixel ----------------
 

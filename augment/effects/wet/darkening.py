@@ -20,7 +20,7 @@ from torch import Tensor
 
 from augment.effects.snow.light import SceneLight
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians
+from augment.scene.scene import Gaussians
 
 REFRACTION_INDEX = 1.33  # n, of water
 OUTER_REFLECTANCE = 0.0659  # R, diffuse reflectance of water from outside

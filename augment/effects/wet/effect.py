@@ -10,8 +10,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.cameras import Camera
-from augment.drawing import LayerRenderer
 from augment.effects.effect import (
     PICTURE,
     SCENE,
@@ -26,7 +24,6 @@ from augment.effects.effect import (
 )
 from augment.effects.lidar.beam import Echoes
 from augment.effects.snow.light import find_scene_light
-from augment.effects.snow.support import share_exposed_surface
 from augment.effects.wet.darkening import darken_gaussians, wet_ratio, white_level
 from augment.effects.wet.ground import (
     PLACEMENT_SETTINGS,
@@ -47,12 +44,15 @@ from augment.effects.wet.reflection import (
     shade_wet,
 )
 from augment.effects.wet.ripples import make_rings
-from augment.ground import check_metric_and_level
+from augment.exposure.exposed_surface import share_exposed_surface
 from augment.memo import memo_of
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.fog import optical_depth
-from augment.scene import Gaussians, Scene
+from augment.scene.cameras import Camera
+from augment.scene.ground import check_metric_and_level
+from augment.scene.scene import Gaussians, Scene
 from augment.timing import timed
+from augment.view.layers import LayerRenderer
 from recipes.rain import Rain
 from recipes.schema import Recipe
 
@@ -94,6 +94,7 @@ class WetEffect(Effect):
     model = Rain
     raster_passes = (MIRROR_PASS,)
     precomputes_files = True
+    kernel_folders = ("augment.exposure",)
 
     def reads_splats(self, recipe: Recipe) -> bool:
         rain = self.section_of(recipe)

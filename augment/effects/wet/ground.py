@@ -1,10 +1,9 @@
 """Maps the ground that rain wets: its heights, how open to the sky it is, where water would stand.
 
-Input: a scene's exposed surface (augment.effects.snow.support), since rain and snow fall from the
-same sky.
-Output: `WetGround`, a map over the world's x and y, made once a scene, and `WetSplats`. Callers:
-`wet.effect`, `wet.reflection`, `wet.lidar`. A thing that stands over the ground keeps it dry, and
-the shelter's edge is soft.
+Input: a scene's exposed surface (augment.exposure.exposed_surface), since rain and snow fall from
+the same sky. Output: `WetGround`, a map over the world's x and y, made once a scene, and
+`WetSplats`. Callers: `wet.effect`, `wet.reflection`, `wet.lidar`. A thing that stands over the
+ground keeps it dry, and the shelter's edge is soft.
 """
 
 from __future__ import annotations
@@ -19,16 +18,16 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from augment.effects.snow.cells import ExposedCells
 from augment.effects.snow.layer import draw_octaves, sum_octaves
-from augment.effects.snow.placement import ExposureSettings
-from augment.effects.snow.support import exposed_surface_of
 from augment.effects.wet.kernels import EXPOSURE, HEIGHT, NUM_CHANNELS
-from augment.geometry import rotmat_from_quat
+from augment.exposure.cells import ExposedCells
+from augment.exposure.exposed_surface import exposed_surface_of
+from augment.exposure.placement import ExposureSettings
 from augment.memo import memo_of
 from augment.rng import rng_for
-from augment.scene import Gaussians, Scene
-from augment.semantics import SemanticClass
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.semantics import SemanticClass
 
 # Settings of the cells. They equal those of snow by default, so that both share one search.
 PLACEMENT_SETTINGS = ExposureSettings()

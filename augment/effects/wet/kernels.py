@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
-from augment.kernels import mix
 from augment.render.cpu import simd as v8
+from augment.render.cpu.hash_kernels import mix
 from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.cpu.simd import LOG2_E, exp2_fine, log2
 from augment.render.layout import NUM_LANES, Index

@@ -34,7 +34,6 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.wet import kernels
 from augment.effects.wet.darkening import to_display, to_linear
 from augment.effects.wet.ground import GROUND_CELL_M, WetGround
@@ -67,10 +66,11 @@ from augment.effects.wet.kernels import (
     WHEEL_TRACK,
 )
 from augment.effects.wet.ripples import Rings, ring_arrays, ring_slopes
-from augment.geometry import rigid
 from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.layout import ABOVE, NUM_LANES, HeightClip
 from augment.render.threads import kernel_threads
+from augment.scene.cameras import Camera
+from augment.scene.geometry import rigid
 
 # ---- The plane and its mirrored camera -----------------------------------------------------------
 

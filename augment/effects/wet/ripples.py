@@ -23,7 +23,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.effects.flood.waves import WaveField
 from augment.effects.wet import kernels
 from augment.effects.wet.kernels import (
@@ -43,6 +42,7 @@ from augment.effects.wet.kernels import (
 from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.threads import kernel_threads
 from augment.rng import MIX_A, MIX_B, STEP_X, STEP_Y
+from augment.scene.cameras import Camera
 
 _LIFE_S = LIFE_NS * 1e-9
 # Mean square of the slopes of one ring over its life, times its area, m2.

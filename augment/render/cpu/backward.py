@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.constants import DEPTH_EPS, RasterSettings
 from augment.render.cpu import backward_kernels
@@ -39,7 +38,8 @@ from augment.render.cpu.project import Splats
 from augment.render.layout import BLOCK_SIZE, RECORD, SPLAT_ID, V_EYE
 from augment.render.sh import sh_basis
 from augment.render.threads import kernel_threads
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians
 
 # Pieces of work in adding up shares.
 _SUM_RANGES = 8

@@ -26,8 +26,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from augment.cameras import Camera
-from augment.geometry import any_in_squares
 from augment.render import layout
 from augment.render.buffers import (
     ALPHA,
@@ -53,7 +51,9 @@ from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
 from augment.render.threads import kernel_threads, num_kernel_threads, usable_cores
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.geometry import any_in_squares
+from augment.scene.scene import Gaussians, PosedGaussians
 
 # ---- Inputs of the CPU kernels: scene parts by address, and the numbers of a view ----------------
 

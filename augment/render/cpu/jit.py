@@ -47,7 +47,6 @@ def _hash_sources() -> str:
         *sorted(folder.glob("*.py")),
         *sorted(render.glob("*_kernels.py")),
         render / "layout.py",
-        render.parent / "kernels.py",
     ]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 

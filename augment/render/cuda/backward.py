@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.render.buffers import EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.cuda import blend_kernels as kernels
@@ -25,7 +24,8 @@ from augment.render.cuda.runtime import gpu_copy, launch
 from augment.render.cuda.splats import CudaSplats, CudaTiles, gather_inputs
 from augment.render.gsplat_backend import render_with_gsplat, tracked_geometry
 from augment.render.layout import M_NUM_SH_FUNCTIONS, VIEW
-from augment.scene import PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.scene import PosedGaussians
 
 # ---- Gradients of colours on the GPU: the transposed blend, then the spherical harmonics ---------
 #     color_gradients(splats, tiles, camera, settings, d_rgb)   dL by every splat's colour

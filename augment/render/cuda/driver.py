@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Bool, Int32
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.render import layout, shading
 from augment.render.buffers import ALPHA, BUFFERS, RGB, SPLAT_IDS, RenderOutput
 from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
@@ -36,7 +35,8 @@ from augment.render.cuda.splats import (
 )
 from augment.render.fog import Fog
 from augment.render.layout import HeightClip
-from augment.scene import PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.scene import PosedGaussians
 
 # ---- The GPU's projection: splats of all Gaussians of all parts, in one launch -------------------
 

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
-from augment.cameras import Camera
 from augment.memo import memo_of
 from augment.render import layout
 from augment.render.constants import RasterSettings
@@ -19,7 +18,8 @@ from augment.render.cuda.runtime import address_of, gpu_copy, gpu_device, upload
 from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene.cameras import Camera
+from augment.scene.scene import Gaussians, PosedGaussians
 
 # ---- Inputs of the GPU's projection: scene parts by address, and the numbers of a view -----------
 

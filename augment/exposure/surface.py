@@ -1,0 +1,734 @@
+"""Finds the surfaces on a height map that can carry snow.
+
+Input: a `HeightMap` of one square, seen from above. Output: a `Surface` with slopes, sides and
+distances to open edges; `CellList` arrays of its cells; `ExposedCells`, the finished record.
+Callers: `placement` for the background, and `find_actor_cells` here for a vehicle.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from augment.exposure import surface_kernels
+from augment.exposure.cells import FLUSH, MAX_EDGE_DISTANCE_M, ExposedCells
+from augment.exposure.height_map import (
+    DepthEstimator,
+    Footprints,
+    HeightMap,
+    classes_of,
+    draw_from_above,
+    in_order,
+    plain_gaussians,
+    slices_of,
+)
+from augment.exposure.surface_kernels import LINK, RISES
+from augment.render.buffers import AUTO
+from augment.render.threads import kernel_threads
+from augment.scene.geometry import rotmat_from_quat
+from augment.scene.labels import EGO_VEHICLE
+from augment.scene.scene import Actor, Gaussians, PosedGaussians
+from augment.scene.semantics import SemanticClass, class_of_label
+
+MAX_STEP_M = 0.25  # lower steps, such as kerbs, do not break a layer
+_STEP_RADIUS_M = 0.4  # distance from a cell within which heights are compared for steps
+# A thing narrower and higher than this carries no snow: wires, arms of lamps.
+_MAX_NARROW_WIDTH_M = 0.4
+_MIN_NARROW_HEIGHT_M = 1.5
+_MIN_HIGH_AREA_M2 = 0.6  # smaller patches so high up are ledges, or float before walls
+# Share of a patch's cells that stand high, from which on it is a wire or the top of a fence.
+_MIN_LINEAR_SHARE = 0.85
+_MAX_GAP_M = 0.6  # wider gaps may be deep
+_MAX_BRIDGED_HEIGHT_M = 0.1  # height above a surface from which on a thing is not bridged
+MIN_AREA_M2 = 0.05  # smaller patches are specks
+MIN_CELLS = 4  # patches of fewer cells are specks
+MAX_POCKET_M2 = 0.1  # largest area of a gap that snow bridges
+_MAX_POCKET_STEP_M = 0.3  # largest range of heights around such a gap
+_POCKET_BLUR_CELLS = 1.5  # standard deviation of the blur that fills it
+# Height over the lowest cell nearby from which on a thing is an obstacle.
+MIN_OBSTACLE_HEIGHT_M = 0.4
+_BANK_REACH_M = 1.0  # distance within which that lowest cell is searched
+_BANK_BLUR_M = 0.35  # standard deviation of the blur of obstacles
+# Scales of smoothing; one cell at least.
+_MEDIAN_RADIUS_M = 0.1
+_PLANE_RADIUS_M = 0.15
+_PLANE_SLACK_M = 0.05  # height off a plane at which a cell still counts for its fit
+_MAX_SMOOTHING_M = 0.02  # largest change of a height by smoothing
+_EXTRA_SLOPE_RAD = math.radians(8)  # angle beyond the steepest slope up to which planes are fitted
+_MAX_SLOPE_RAD = math.radians(80)  # steepest plane
+_ROWS_PER_TASK = 8  # number of grid rows that a thread takes at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Highest surface on the grid of a height map [H, W]."""
+
+    map: HeightMap
+    height_m: np.ndarray  # float32, without the noise of single cells
+    slopes: np.ndarray  # float32 [H, W, 2], dz/dx and dz/dy
+    can_carry: np.ndarray  # bool, snow stays on the cell
+    sides: np.ndarray  # int8 [H, W, 4], see surface_kernels.compare_sides
+    edge_m: np.ndarray  # float32, see ExposedCells.edge_distance_m
+
+
+def find_surface(
+    height_map: HeightMap,
+    may_carry: np.ndarray,
+    *,
+    max_slope_deg: float,
+    min_area_m2: float = MIN_AREA_M2,
+    floor_m: float | None = None,
+    on_vehicles: np.ndarray,
+) -> Surface:
+    """Find the surface of a map, and where snow stays on it.
+
+    Args:
+        height_map: heights of a square, seen from above.
+        may_carry: bool [H, W]; where it is False, nothing carries snow.
+        max_slope_deg: steeper surfaces carry no snow.
+        min_area_m2: a patch that ends within the map and is smaller than this, or than MIN_CELLS,
+            carries no snow.
+        floor_m: z of what the map does not show. None: z is low there, except in small gaps.
+        on_vehicles: bool [H, W], cells that show a vehicle's body, see `_close_vehicle_tops` and
+            `_is_vehicle_top`.
+    """
+    height_map = _close_vehicle_tops(height_map, on_vehicles)
+    cell = height_map.cell_m
+    covered = height_map.covered.copy()
+    shape = covered.shape
+    smoothed = np.empty(shape, np.float32)
+    fitted_m = np.empty(shape, np.float32)
+    slopes = np.empty((*shape, 2), np.float32)
+    is_fitted = np.empty(shape, bool)
+    max_slope_rad = math.radians(max_slope_deg)
+    with kernel_threads(_ROWS_PER_TASK):
+        surface_kernels.median_heights(
+            height_map.height_m,
+            covered,
+            int(np.clip(round(_MEDIAN_RADIUS_M / cell), 1, 3)),
+            smoothed,
+        )
+        max_fit_slope = math.tan(min(max_slope_rad + _EXTRA_SLOPE_RAD, _MAX_SLOPE_RAD))
+        surface_kernels.fit_planes(
+            smoothed,
+            covered,
+            int(np.clip(round(_PLANE_RADIUS_M / cell), 1, 5)),
+            cell,
+            _PLANE_SLACK_M,
+            max_fit_slope,
+            _MAX_SMOOTHING_M,
+            fitted_m,
+            slopes,
+            is_fitted,
+        )
+    floor_heights = (
+        _floor_heights(fitted_m, covered & may_carry, cell)
+        if floor_m is None
+        else np.float32(floor_m)
+    )
+    lowest, local_range = _local_range(fitted_m, covered, floor_heights, cell)
+    is_steep = np.hypot(slopes[..., 0], slopes[..., 1]) > math.tan(max_slope_rad)
+    can_carry = (
+        is_fitted & may_carry & ~_is_narrow(fitted_m, covered & may_carry, floor_heights, cell)
+    )
+    can_carry &= ~(is_steep & (local_range > _highest_step(max_slope_rad, cell)))
+    can_carry &= ~on_vehicles | _is_vehicle_top(
+        fitted_m, covered, can_carry & on_vehicles, max_slope_rad, cell
+    )
+    max_step_m = max(MAX_STEP_M, math.tan(max_slope_rad) * cell)
+    sides = _compare_sides(fitted_m, lowest, covered, can_carry, max_step_m)
+    min_cells = max(MIN_CELLS, math.ceil(min_area_m2 / cell**2))
+    is_high = fitted_m - lowest > _MIN_NARROW_HEIGHT_M
+    can_carry &= ~_find_specks(
+        can_carry, sides, is_high, min_cells, max(min_cells, round(_MIN_HIGH_AREA_M2 / cell**2))
+    )
+    filled_mask = _fill_pockets(fitted_m, slopes, can_carry, covered, cell)
+    can_carry |= filled_mask
+    covered |= filled_mask
+    sides = _compare_sides(fitted_m, lowest, covered, can_carry, max_step_m)
+    edges = np.empty(shape, np.float32)
+    with kernel_threads(_ROWS_PER_TASK):
+        surface_kernels.edge_distances(
+            can_carry, sides, max(MAX_EDGE_DISTANCE_M / cell, 0.5), edges
+        )
+    return Surface(height_map, fitted_m, slopes, can_carry, sides, edges * np.float32(cell))
+
+
+def find_narrow_things(height_map: HeightMap, may_carry: np.ndarray) -> np.ndarray:
+    """Find high things so narrow that snow falls past them: lamps, wires; bool [H, W]."""
+    is_solid = height_map.covered & may_carry
+    floor_heights = _floor_heights(height_map.height_m, is_solid, height_map.cell_m)
+    return _is_narrow(height_map.height_m, is_solid, floor_heights, height_map.cell_m)
+
+
+def find_banks(surface: Surface) -> np.ndarray:
+    """Vectors towards obstacles, float32 [H, W, 2]; 0 on obstacles.
+
+    See ExposedCells.obstacle_vectors.
+    """
+    cell = surface.map.cell_m
+    covered = surface.map.covered
+    heights = np.where(covered, surface.height_m, np.float32(np.inf))
+    reach = max(1, round(_BANK_REACH_M / cell))
+    lowest = cv2.erode(heights, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    is_obstacle = covered & (surface.height_m - lowest > MIN_OBSTACLE_HEIGHT_M)
+    if not is_obstacle.any():
+        return np.zeros((*covered.shape, 2), np.float32)
+    sigma = max(_BANK_BLUR_M / cell, 0.5)
+    blurred = cv2.GaussianBlur(
+        is_obstacle.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE
+    )
+    banks = np.stack(_gradient(blurred), -1) * np.float32(sigma * math.sqrt(2 * math.pi))
+    length = np.hypot(banks[..., 0], banks[..., 1])
+    banks /= np.maximum(length, 1)[..., None]
+    banks[is_obstacle | ~surface.can_carry] = 0
+    return banks
+
+
+def normals_from_slopes(slopes: np.ndarray) -> np.ndarray:
+    """Return the upward unit normals [..., 3] of slopes [..., 2]."""
+    normals = np.concatenate([-slopes, np.ones_like(slopes[..., :1])], -1)
+    return normals / np.sqrt((normals * normals).sum(-1, keepdims=True))
+
+
+def _floor_heights(height: np.ndarray, is_solid: np.ndarray, cell: float) -> np.ndarray:
+    """Assumed heights where the map shows nothing, [H, W].
+
+    A gap up to _MAX_GAP_M wide is as high as the lowest cell about it. Wider gaps are deep.
+    """
+    size = 2 * max(1, round(_MAX_GAP_M / 2 / cell)) + 1
+    kernel = np.ones((size, size), np.uint8)
+    is_narrow_gap = cv2.morphologyEx(is_solid.astype(np.uint8), cv2.MORPH_CLOSE, kernel) > 0
+    lowest = cv2.erode(np.where(is_solid, height, np.float32(1e6)), kernel)
+    return np.where(is_narrow_gap & (lowest < 1e6), lowest, np.float32(-1e6))
+
+
+def _local_range(
+    height: np.ndarray, covered: np.ndarray, floor_heights: np.ndarray | np.float32, cell: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest height and range of covered heights within _STEP_RADIUS_M of each cell, [H, W].
+
+    The range means nothing where no cell is covered.
+    """
+    reach = max(1, round(_STEP_RADIUS_M / cell))
+    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    lowest_covered = cv2.erode(np.where(covered, height, np.float32(1e6)), kernel)
+    highest_covered = cv2.dilate(np.where(covered, height, np.float32(-1e6)), kernel)
+    lowest = cv2.erode(np.where(covered, height, floor_heights), kernel)
+    return lowest, highest_covered - lowest_covered
+
+
+def _is_narrow(
+    height: np.ndarray, is_solid: np.ndarray, floor_heights: np.ndarray | np.float32, cell: float
+) -> np.ndarray:
+    """Things that stand more than _MIN_NARROW_HEIGHT_M above both sides, bool [H, W].
+
+    The two sides are _MAX_NARROW_WIDTH_M or three cells apart.
+    """
+    size = max(3, round(_MAX_NARROW_WIDTH_M / cell))  # a wall between two cells shows in both
+    kernel = np.ones((size, size), np.uint8)
+    # An even square has no middle.
+    erode_anchor = (size - 1) // 2
+    dilate_anchor = size - 1 - (size - 1) // 2
+    heights = np.where(is_solid, height, floor_heights)
+    lowest = cv2.erode(
+        heights, kernel, anchor=(erode_anchor, erode_anchor), borderType=cv2.BORDER_REPLICATE
+    )
+    opened = cv2.dilate(
+        lowest, kernel, anchor=(dilate_anchor, dilate_anchor), borderType=cv2.BORDER_REPLICATE
+    )
+    return is_solid & (height - opened > _MIN_NARROW_HEIGHT_M)
+
+
+def _highest_step(max_slope_rad: float, cell: float) -> float:
+    """Return the height of the highest step that a layer of snow covers, metres.
+
+    A cell that is steeper than the limit lies on a low step, not on a slope, where heights around
+    it differ by no more than this. A slope as steep as the limit may differ by less.
+    """
+    return min(MAX_STEP_M, 2 * max(_STEP_RADIUS_M, cell) * math.tan(max_slope_rad))
+
+
+def _compare_sides(
+    height: np.ndarray, lowest: np.ndarray, covered: np.ndarray, can_carry: np.ndarray, step: float
+) -> np.ndarray:
+    """Return the side codes of the cells, int8 [H, W, 4], see surface_kernels.compare_sides."""
+    sides = np.empty((*height.shape, 4), np.int8)
+    with kernel_threads(_ROWS_PER_TASK):
+        surface_kernels.compare_sides(height, lowest, covered, can_carry, step, sides)
+    return sides
+
+
+def _find_specks(
+    can_carry: np.ndarray,
+    sides: np.ndarray,
+    is_high: np.ndarray,
+    min_cells: int,
+    min_high_cells: int,
+) -> np.ndarray:
+    """Find the cells of patches that are too small to carry snow, bool [H, W].
+
+    A patch of linked cells that ends within the grid is too small below `min_cells` cells, or below
+    `min_high_cells` cells if all of it stands high above something beside it. A patch that stands
+    high     nearly everywhere is too narrow at any length.
+
+    cv2 labels patches of pixels, so links become pixels between those of the cells.
+    """
+    rows, columns = can_carry.shape
+    pixels = np.zeros((2 * rows - 1, 2 * columns - 1), np.uint8)
+    pixels[::2, ::2] = can_carry
+    right_sides = sides[..., 1] == LINK
+    up_sides = sides[..., 3] == LINK
+    pixels[::2, 1::2] = can_carry[:, :-1] & right_sides[:, :-1] & can_carry[:, 1:]
+    pixels[1::2, ::2] = can_carry[:-1] & up_sides[:-1] & can_carry[1:]
+    count, labels = cv2.connectedComponents(pixels, connectivity=4)
+    labels = labels[::2, ::2]
+    labels = labels.astype(np.int64)
+    num_cells = np.bincount(labels.ravel(), minlength=count)
+    num_low_cells = np.bincount(labels[can_carry & ~is_high], minlength=count)
+    is_linear = num_low_cells <= (1 - _MIN_LINEAR_SHARE) * num_cells
+    for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        num_cells[border] = min_high_cells  # the patch may go on outside
+    return (is_linear | (num_cells < np.where(num_low_cells > 0, min_cells, min_high_cells)))[
+        labels
+    ]
+
+
+# ---- Vehicles: a reconstruction leaves shells, tufts and slivers on their sides ------------------
+
+VEHICLE_MAX_SLOPE_DEG = 38.0  # wind screens carry snow, side and rear windows do not
+_MAX_SHELL_GAP_M = 0.3  # narrower dips in a roof or bonnet are gaps between shells
+_BODY_BLUR_M = 0.1  # standard deviation of the blur with which slopes of bodies are measured
+_MIN_STRIP_WIDTH_M = 0.3  # narrower strips are sills, mirrors and the rims of doors
+
+
+def _close_vehicle_tops(height_map: HeightMap, on_vehicles: np.ndarray) -> HeightMap:
+    """Raise the heights of vehicles to the top of their close surroundings."""
+    covered = on_vehicles & height_map.covered
+    if not covered.any():
+        return height_map
+    tops = np.where(covered, height_map.height_m, np.float32(-1e6))
+    tops = cv2.morphologyEx(tops, cv2.MORPH_CLOSE, _disc(_MAX_SHELL_GAP_M, height_map.cell_m))
+    tops = np.where(covered, tops, height_map.height_m)
+    return dataclasses.replace(height_map, height_m=tops)
+
+
+def _is_vehicle_top(
+    height: np.ndarray,
+    covered: np.ndarray,
+    can_carry: np.ndarray,
+    max_slope_rad: float,
+    cell: float,
+) -> np.ndarray:
+    """Cells on the roof or bonnet of a vehicle that can carry snow, bool [H, W].
+
+    Such a cell is level, lies well inside the rim, and is no sliver. A step blurred by sigma is as
+    steep as h / (sigma sqrt(2 pi)), which separates the rim of a door from the roof's curvature.
+    """
+    if not can_carry.any():
+        return can_carry
+    sigma = max(_BODY_BLUR_M / cell, 0.5)
+    weights = covered.astype(np.float32)
+    total = cv2.GaussianBlur(weights, (0, 0), sigma)
+    mean = cv2.GaussianBlur(height * weights, (0, 0), sigma) / np.maximum(total, np.float32(1e-6))
+    max_gradient = math.tan(min(max_slope_rad, math.radians(VEHICLE_MAX_SLOPE_DEG)))
+    is_level = can_carry & (np.hypot(*_gradient(mean)) <= max_gradient * cell)
+    return (
+        cv2.morphologyEx(is_level.astype(np.uint8), cv2.MORPH_OPEN, _disc(_MIN_STRIP_WIDTH_M, cell))
+        > 0
+    )
+
+
+def _disc(width_m: float, cell: float) -> np.ndarray:
+    """Return a round structuring element of one cell or more."""
+    side = 2 * round(width_m / cell / 2) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+
+
+def _fill_pockets(
+    height: np.ndarray, slopes: np.ndarray, can_carry: np.ndarray, covered: np.ndarray, cell: float
+) -> np.ndarray:
+    """Fill small gaps in a surface, which snow bridges; return their cells, bool [H, W].
+
+    Heights and slopes of the gaps are replaced by those around them, in place. A thing that stands
+    out of the surface, or a gap between two levels, is not filled.
+    """
+    count, labels = cv2.connectedComponents((~can_carry).astype(np.uint8), connectivity=4)
+    labels = labels.astype(np.int64)
+    is_pocket = np.bincount(labels.ravel(), minlength=count) <= max(1, MAX_POCKET_M2 / cell**2)
+    for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        is_pocket[border] = False  # the gap may go on outside
+    is_pocket[labels[can_carry]] = False
+    kernel = np.ones((7, 7), np.uint8)
+    highest = cv2.dilate(np.where(can_carry, height, np.float32(-np.inf)), kernel)
+    lowest = cv2.erode(np.where(can_carry, height, np.float32(np.inf)), kernel)
+    pocket_mask = is_pocket[labels]
+    with np.errstate(invalid="ignore", over="ignore"):  # far from any surface both are infinite
+        broken_mask = pocket_mask & ~(highest - lowest < _MAX_POCKET_STEP_M)
+    broken_mask |= pocket_mask & covered & (height - highest > _MAX_BRIDGED_HEIGHT_M)
+    is_pocket[labels[broken_mask]] = False
+    filled_mask = is_pocket[labels]
+    if not filled_mask.any():
+        return filled_mask
+    weights = can_carry.astype(np.float32)
+    total = cv2.GaussianBlur(weights, (0, 0), _POCKET_BLUR_CELLS)
+    for values in (height, slopes[..., 0], slopes[..., 1]):
+        mean = cv2.GaussianBlur(values * weights, (0, 0), _POCKET_BLUR_CELLS)
+        values[filled_mask] = mean[filled_mask] / total[filled_mask]
+    return filled_mask
+
+
+def _gradient(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Differences to +x and +y per cell; 0 beyond the borders."""
+    padded = np.pad(values, 1, mode="edge")
+    half = np.float32(0.5)
+    return (
+        (padded[1:-1, 2:] - padded[1:-1, :-2]) * half,
+        (padded[2:, 1:-1] - padded[:-2, 1:-1]) * half,
+    )
+
+
+# ---- Gaussians of the surface that snow lies on, which deep enough snow hides --------------------
+
+BURIAL_DEPTH_M = 0.5  # depth below the surface down to which Gaussians are buried
+BURIAL_HEIGHT_M = 0.08  # height above it up to which they are buried; half a cell at least
+# Largest angle between a flat Gaussian's normal and the surface's.
+MAX_FACING_ANGLE_RAD = math.radians(40)
+_MAX_FLATNESS = 0.5  # largest ratio of the shortest axis to the next one, of a flat Gaussian
+# A Gaussian with no longer axis than this, no deeper below the surface, is buried at any attitude,
+_MAX_SMALL_SCALE_M = 0.06
+_MAX_SMALL_DEPTH_M = 0.15
+_MIN_EDGE_DISTANCE_M = 0.15  # but only so far from an open edge, where it may be a wall's top
+_LOOKUP_SIGMAS = 1.5  # distance along a Gaussian's axes at which the cells over it are looked up
+
+
+# Function that returns the indices, int32 [P], of the cells under points float64 [P, 2]; -1 where
+# there is no cell.
+CellsUnder = Callable[[np.ndarray], np.ndarray]
+
+
+def find_buried(
+    gaussians: Gaussians, cells_under: CellsUnder, cells: CellList
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the Gaussians that are the surface or lie close beneath it.
+
+    Returns:
+        buried int32 [B] and buried_by int32 [B, 5], see ExposedCells, of Gaussians that snow can
+        hide.
+    """
+    results = []
+    if len(cells.sizes_m):
+        slices = slices_of(len(gaussians))
+        results = in_order(
+            lambda part: _find_buried_slice(gaussians, cells_under, part, cells), slices
+        )
+    return (
+        np.concatenate([np.zeros(0, np.int32), *(buried for buried, _ in results)]),
+        np.concatenate([np.zeros((0, 5), np.int32), *(cells_above for _, cells_above in results)]),
+    )
+
+
+def _find_buried_slice(
+    gaussians: Gaussians, cells_under: CellsUnder, part_slice: slice, cells: CellList
+) -> tuple[np.ndarray, np.ndarray]:
+    """Do the work of `find_buried` for a slice of the Gaussians that fits a core's caches."""
+    normals = cells.normals
+    means = gaussians.means[part_slice].numpy().astype(np.float64)
+    ids_below = cells_under(means[:, :2])
+    index = np.flatnonzero(ids_below >= 0)
+    cell_ids = ids_below[index]
+    offset = means[index] - cells.centers_m[cell_ids]
+    rise = (offset * normals[cell_ids]).sum(1) / normals[
+        cell_ids, 2
+    ]  # above the cell's plane, along z
+    is_near = (rise > -BURIAL_DEPTH_M) & (
+        rise < np.maximum(BURIAL_HEIGHT_M, cells.sizes_m[cell_ids] / 2)
+    )
+    index = index[is_near]
+    cell_ids = cell_ids[is_near]
+    rise = rise[is_near]
+    rows = torch.from_numpy(index)
+    axes = rotmat_from_quat(gaussians.quats[part_slice][rows]).numpy()  # columns: the axes
+    scales = gaussians.scales[part_slice][rows].numpy()
+    order = np.argsort(scales, axis=1, kind="stable")
+    axes = np.take_along_axis(axes, order[:, None, :], 2)
+    scales = np.take_along_axis(scales, order, 1)
+    is_facing = np.abs((axes[..., 0] * normals[cell_ids]).sum(1)) >= math.cos(MAX_FACING_ANGLE_RAD)
+    is_flat = scales[:, 0] <= _MAX_FLATNESS * scales[:, 1]
+    is_small = (
+        (scales[:, 2] < _MAX_SMALL_SCALE_M)
+        & (rise > -_MAX_SMALL_DEPTH_M)
+        & (cells.edge_m[cell_ids] >= _MIN_EDGE_DISTANCE_M)
+    )
+    is_surface = (is_flat & is_facing) | is_small
+    index = index[is_surface]
+    cell_ids = cell_ids[is_surface]
+    axes = axes[is_surface]
+    scales = scales[is_surface]
+    lookups = [cell_ids]
+    for axis in (2, 1):
+        for sign in (1, -1):
+            offset_xy = sign * _LOOKUP_SIGMAS * scales[:, axis, None] * axes[:, :2, axis]
+            lookups.append(cells_under(means[index, :2] + offset_xy))
+    buried_by = np.stack(lookups, 1)
+    is_covered = (buried_by >= 0).all(1)
+    return (part_slice.start + index[is_covered]).astype(np.int32), buried_by[is_covered].astype(
+        np.int32
+    )
+
+
+# ---- Cells of grids, joined list by list, and made into a record ---------------------------------
+
+
+class CellList(NamedTuple):
+    """Cells of some grid: C rows of arrays, with the fields of ExposedCells and two others."""
+
+    centers_m: np.ndarray
+    normals: np.ndarray
+    sizes_m: np.ndarray
+    edge_m: np.ndarray
+    # int8 [C, 4], LINK where a cell of the same size follows, or OPEN_EDGE or FLUSH.
+    sides: np.ndarray
+    luminance: np.ndarray  # luminance of the bare ground, see ground_luminance; NaN where unknown
+    tracks: np.ndarray
+    banks: np.ndarray
+    semantic: np.ndarray
+
+    @staticmethod
+    def joined(lists: Sequence[CellList]) -> CellList:
+        """Join several lists, in order."""
+        return CellList(*map(np.concatenate, zip(*lists, strict=True)))
+
+    @staticmethod
+    def empty() -> CellList:
+        """Return a list without cells."""
+        no_values = np.zeros(0, np.float32)
+        no_pairs = np.zeros((0, 2), np.float32)
+        normals = np.zeros((0, 3), np.float32)
+        sides = np.zeros((0, 4), np.int8)
+        semantic = np.zeros(0, np.int16)
+        return CellList(
+            np.zeros((0, 3)),
+            normals,
+            no_values,
+            no_values,
+            sides,
+            no_values,
+            no_values,
+            no_pairs,
+            semantic,
+        )
+
+
+def cells_at(
+    surface: Surface,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    *,
+    sides: np.ndarray,
+    luminance: np.ndarray | None = None,
+    tracks: np.ndarray | None = None,
+    banks: np.ndarray | None = None,
+    classes: np.ndarray,
+) -> CellList:
+    """Return the cells of a surface at rows and columns [C]; the other arrays are [H, W]."""
+    x, y = surface.map.centers()
+    num_cells = len(rows)
+    index = (rows, columns)
+    height = surface.height_m[index].astype(np.float64)
+    return CellList(
+        centers_m=np.stack([x[columns], y[rows], height], 1),
+        normals=normals_from_slopes(surface.slopes[index]).astype(np.float32),
+        sizes_m=np.full(num_cells, surface.map.cell_m, np.float32),
+        edge_m=surface.edge_m[index],
+        sides=sides[index],
+        luminance=np.full(num_cells, np.nan, np.float32) if luminance is None else luminance[index],
+        tracks=np.zeros(num_cells, np.float32) if tracks is None else tracks[index],
+        banks=np.zeros((num_cells, 2), np.float32) if banks is None else banks[index],
+        semantic=classes[index],
+    )
+
+
+def _link_slice(
+    cells: CellList, cells_under: CellsUnder, part_slice: slice, neighbours: np.ndarray
+) -> None:
+    """Write the indices of linked cells into `neighbours`, int32 [P, 4], for a slice of cells."""
+    centers_m = cells.centers_m[part_slice, :2]
+    sizes_m = cells.sizes_m[part_slice]
+    sides = cells.sides[part_slice]
+    for side, step in enumerate(((-1, 0), (1, 0), (0, -1), (0, 1))):
+        rows = np.flatnonzero(sides[:, side] == LINK)
+        cell_ids = cells_under(centers_m[rows] + np.array(step) * sizes_m[rows, None])
+        is_same_size = (cell_ids >= 0) & (cells.sizes_m[cell_ids] == sizes_m[rows])
+        neighbours[rows, side] = np.where(is_same_size, cell_ids, FLUSH)
+
+
+def make_cells(
+    cells: CellList, light: np.ndarray, cells_under: CellsUnder, gaussians: Gaussians
+) -> ExposedCells:
+    """Make the record of cells: link neighbours by their places, and find the buried Gaussians."""
+    neighbours = cells.sides.astype(np.int32)
+    in_order(
+        lambda part: _link_slice(cells, cells_under, part, neighbours[part]),
+        slices_of(len(cells.sizes_m)),
+    )
+    buried, buried_by = find_buried(gaussians, cells_under, cells)
+    return ExposedCells(
+        centers_m=torch.from_numpy(cells.centers_m.astype(np.float32)),
+        normals=torch.from_numpy(cells.normals),
+        sizes_m=torch.from_numpy(cells.sizes_m),
+        edge_distance_m=torch.from_numpy(cells.edge_m),
+        neighbours=torch.from_numpy(neighbours),
+        relative_light=torch.from_numpy(light),
+        track_share=torch.from_numpy(cells.tracks),
+        obstacle_vectors=torch.from_numpy(cells.banks),
+        semantic=torch.from_numpy(cells.semantic),
+        hideable_ids=torch.from_numpy(buried),
+        covering_cells=torch.from_numpy(buried_by),
+    )
+
+
+# ---- Snow on vehicles: cells in their own frames, carried along as they drive --------------------
+
+MAX_CELL_M = 0.05  # largest side of a vehicle's cells
+MIN_ACTOR_AREA_M2 = 0.3  # least area of all cells of a vehicle; less is not worth a layer
+MIN_TRAVEL_M = 0.5  # an actor that goes less far than this is parked
+# Steepest slope with snow on a moving vehicle: drivers clear their windows, and steeper snow
+# slides off.
+MOVING_MAX_SLOPE_DEG = 25.0
+# Height of the box's bottom part, which holds wheels and the shadow on the road.
+_WHEEL_HEIGHT_M = 0.25
+_BOX_MARGIN_M = 0.3  # margin about the box, for mirrors and for boxes that are too small
+_MIN_PATCH_M2 = 0.15  # least area of a vehicle's patch
+_GROUND_CLASSES = tuple(SemanticClass[n] for n in ("ROAD", "LANE_MARKING", "SIDEWALK", "TERRAIN"))
+
+
+def is_vehicle(actor: Actor) -> bool:
+    """Tell if an actor is a vehicle.
+
+    Most of its Gaussians, those of the ground excepted, must be a vehicle's. Without classes, its
+    label decides. The recording car does not count.
+    """
+    if actor.label == EGO_VEHICLE or len(actor.gaussians) == 0:
+        return False
+    classes = classes_of(actor.gaussians)
+    body_classes = classes[~np.isin(classes, (*_GROUND_CLASSES, SemanticClass.UNKNOWN))]
+    if len(body_classes):
+        return int(np.bincount(body_classes).argmax()) == SemanticClass.VEHICLE
+    return class_of_label(actor.label) == SemanticClass.VEHICLE
+
+
+def is_moving(actor: Actor) -> bool:
+    """Tell if an actor goes anywhere during the drive."""
+    positions = actor.track.world_from_actor[:, :3, 3]
+    return bool(((positions - positions[0]).norm(dim=1) > MIN_TRAVEL_M).any())
+
+
+def find_actor_cells(
+    actor: Actor,
+    *,
+    cell_m: float,
+    max_slope_deg: float,
+    estimator: DepthEstimator,
+    backend: str = AUTO,
+) -> ExposedCells | None:
+    """Find the cells on a vehicle, in its own frame; None where it has too few to carry snow.
+
+    All cells on its outline have open edges, since the surface falls away there.
+
+    Args:
+        actor: the vehicle.
+        cell_m: side of the cells; MAX_CELL_M at most.
+        max_slope_deg: steeper surfaces carry no snow.
+        estimator: depth buffer that heights are taken from.
+        backend: backend that renders the vehicle from above.
+    """
+    cell_side_m = min(cell_m, MAX_CELL_M)
+    gaussians = plain_gaussians(actor.gaussians)
+    half_size_m = np.array(actor.size_m[:2]) / 2 + _BOX_MARGIN_M
+    if not (np.isfinite(half_size_m).all() and (half_size_m < 100).all()):
+        return None
+    classes = classes_of(gaussians)
+    body_mask = ~np.isin(classes, _GROUND_CLASSES)
+    body_mask &= gaussians.means.numpy()[:, 2] > _WHEEL_HEIGHT_M - actor.size_m[2] / 2
+    body_ids = np.intersect1d(
+        Footprints(gaussians).in_box(-half_size_m, half_size_m), np.flatnonzero(body_mask)
+    )
+    if len(body_ids) == 0:
+        return None
+    half_size_cells = np.ceil(half_size_m / cell_side_m).astype(int)
+    shape = (2 * int(half_size_cells[1]), 2 * int(half_size_cells[0]))
+    body = gaussians.select(_index_tensor(body_ids))
+    height_map = draw_from_above(
+        [PosedGaussians(body)],
+        corner_m=(
+            -cell_side_m * float(half_size_cells[0]),
+            -cell_side_m * float(half_size_cells[1]),
+        ),
+        cell_m=cell_side_m,
+        shape=shape,
+        estimator=estimator,
+        with_thin=False,
+        backend=backend,
+    )
+    bottom_z_m = np.float32(_WHEEL_HEIGHT_M - actor.size_m[2] / 2)
+    max_slope = min(max_slope_deg, MOVING_MAX_SLOPE_DEG) if is_moving(actor) else max_slope_deg
+    is_body = height_map.height_m > bottom_z_m
+    is_body[[0, -1]] = is_body[:, [0, -1]] = (
+        False  # open edges all round, also where the body is cut off
+    )
+    height_map = dataclasses.replace(
+        height_map, alpha=np.where(is_body, height_map.alpha, np.float32(0))
+    )
+    surface = find_surface(
+        height_map,
+        is_body,
+        max_slope_deg=max_slope,
+        min_area_m2=_MIN_PATCH_M2,
+        floor_m=float(bottom_z_m),
+        on_vehicles=is_body,
+    )
+    rows, columns = np.nonzero(surface.can_carry)
+    if len(rows) * cell_side_m**2 < MIN_ACTOR_AREA_M2:
+        return None
+    grid = surface.map
+    body_classes = classes[body_ids]
+    cell_classes = np.where(
+        grid.ids >= 0, body_classes[np.maximum(grid.ids, 0)], SemanticClass.VEHICLE
+    )
+    lookup = _grid_lookup(grid, rows, columns)
+    sides = np.where(surface.sides == RISES, FLUSH, surface.sides)
+    cells = cells_at(surface, rows, columns, sides=sides, classes=cell_classes.astype(np.int16))
+    actor_cells = make_cells(cells, np.ones(len(rows), np.float32), lookup, body)
+    actor_cells.hideable_ids.copy_(_index_tensor(body_ids)[actor_cells.hideable_ids.long()])
+    return actor_cells
+
+
+def _index_tensor(numbers: np.ndarray) -> torch.Tensor:
+    """Return an index tensor of an array."""
+    return torch.from_numpy(np.ascontiguousarray(numbers))
+
+
+def _grid_lookup(grid: HeightMap, rows: np.ndarray, columns: np.ndarray) -> CellsUnder:
+    """Return the lookup for a single grid that has cells at rows and columns [C]."""
+    corner = np.array([grid.left_m, grid.bottom_m])
+    numbers: np.ndarray = np.full(grid.alpha.shape, -1, np.int32)
+    numbers[rows, columns] = np.arange(len(rows), dtype=np.int32)
+
+    def cells_under(xy: np.ndarray) -> np.ndarray:
+        """Return the indices of the cells under points [P, 2]; -1 where there is no cell."""
+        grid_places = np.floor((xy - corner) / grid.cell_m)
+        is_inside = ((grid_places >= 0) & (grid_places < numbers.shape[::-1])).all(1)
+        cell_ids = np.full(len(xy), -1, np.int32)
+        indices = grid_places[is_inside].astype(np.int64)
+        cell_ids[is_inside] = numbers[indices[:, 1], indices[:, 0]]
+        return cell_ids
+
+    return cells_under

@@ -1,0 +1,264 @@
+"""Pixels of a camera's images that show the recording car itself.
+
+In: the images of one camera, in the order in which the car moved. Out: a bool mask
+(`find_own_car_mask`; `own_car_mask` for a scene's recorded images). `augment.view.render_view`
+passes the mask on to the estimates of boxes; training views leave these pixels out of the loss.
+
+The recording car stays as it is while the road moves by. It is looked for from the image's bottom
+upwards, where the road would be less than ten metres away. Only contrast along the road's apparent
+motion counts, since kerbs and lane lines that run along it stay as they are, too. Smooth paint says
+nothing by itself; it belongs to the edge above it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from augment.files.recorded_images import ImageFault, read_scaled
+from augment.memo import memo_of
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
+
+T = TypeVar("T")
+
+# Columns of the images that are compared, at most.
+_WORK_WIDTH = 320
+# Images that are compared, at most.
+MAX_IMAGES = 24
+# Images without which nothing is found.
+_MIN_IMAGES = 6
+# Distance between the places of compared images, metres.
+_STEP_M = 0.25
+# Height of a camera above the road, about, metres.
+_CAMERA_HEIGHT_M = 1.6
+# Distance within which the road is looked at, metres: nobody follows another car this closely for a
+# whole drive.
+_REACH_M = 10.0
+# Columns of the coarse image in which the road's motion is computed.
+_FLOW_WIDTH = 80
+# Motion of the road that counts, at least, pixels of the coarse image.
+_MIN_MOTION_PX = 0.25
+# Contrast that counts fully, levels of 255 a pixel.
+_CONTRAST = 2.0
+# Share of the energy across the motion that may appear along it.
+_LEAK = 0.06
+# Share of the contrast that stays at which evidence is zero: less speaks against, more for the car.
+_STAYS = 0.4
+# Side of the window in which evidence is averaged, pixels.
+_WINDOW = 7
+# Pixels by which the averaging window reaches over the car's edge.
+_OVERREACH = 2
+# Weight of evidence against the car.
+_AGAINST = 0.2
+# Evidence that a step by a row between two columns must be worth.
+_STEP_COST = 0.1
+# Cost of any step, at most, as a part of the height.
+_JUMP_PART = 0.05
+# Mean evidence of a column without which there is no car, as a part of the height.
+_MIN_PART = 0.004
+# Width of the car, at least, as a part of the image's width.
+_MIN_WIDTH = 0.15
+
+
+def moving_frames(cameras: Sequence[Camera]) -> list[int]:
+    """Return positions of at most MAX_IMAGES images of a drive, in order, between which it
+    moved.
+    """
+    positions: list[int] = []
+    last_centre = None
+    for i, camera in enumerate(cameras):
+        centre = camera.centre.numpy()
+        if last_centre is None or np.linalg.norm(centre - last_centre) >= _STEP_M:
+            positions.append(i)
+            last_centre = centre
+    return spread_evenly(positions, MAX_IMAGES)
+
+
+def spread_evenly(items: Sequence[T], count: int) -> list[T]:
+    """Return at most `count` of the items, evenly spread, with the first and the last."""
+    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[i] for i in places]
+
+
+def find_own_car_mask(cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the pixels that show the recording car, bool [H, W].
+
+    Nothing is found in fewer than six images, above the horizon, or where the car shows no edge
+    across the motion.
+
+    Args:
+        cameras: the camera at each image.
+        images: images of one camera, uint8 [H, W, 3], in the order in which the car moved
+            (`moving_frames`); their sizes may differ a little.
+
+    Returns:
+        The mask, at the first image's size.
+    """
+    height, width = images[0].shape[:2] if images else (0, 0)
+    if len(images) < _MIN_IMAGES:
+        return np.zeros((height, width), np.bool_)
+    num_columns = min(_WORK_WIDTH, width)
+    size = (num_columns, max(1, round(height * num_columns / width)))
+    flow = cv2.resize(_road_flow(cameras), size, interpolation=cv2.INTER_NEAREST)
+    evidence = _evidence(images, size, flow)
+    car_tops = _car_tops(evidence, np.isnan(flow[..., 0]))
+    mask = (np.arange(size[1])[:, None] >= car_tops[None]).astype(np.uint8)
+    return cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _road_flow(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the direction in which the road would move at each pixel, unit float32 [h, w, 2].
+
+    It is coarse, and NaN where the road would be far away or hardly move. Images of other sizes are
+    squeezed to the first's.
+    """
+    flows = []
+    first_camera = cameras[0].scaled(_FLOW_WIDTH / cameras[0].width)
+    coarse_cameras = [camera.resized(first_camera.width, first_camera.height) for camera in cameras]
+    for camera, next_camera in itertools.pairwise(coarse_cameras):
+        rays = camera.ray_directions().double().numpy()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ray_scale = -_CAMERA_HEIGHT_M / rays[..., 2]
+            is_far = ray_scale * np.hypot(rays[..., 0], rays[..., 1]) > _REACH_M
+        ray_scale[(rays[..., 2] >= 0) | is_far] = np.nan
+        points = camera.centre.numpy() + ray_scale[..., None] * rays
+        pose = next_camera.camera_from_world.numpy()
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        local[local[..., 2] < 0.1] = np.nan
+        u = next_camera.fx * local[..., 0] / local[..., 2] + next_camera.cx
+        v = next_camera.fy * local[..., 1] / local[..., 2] + next_camera.cy
+        rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+        flows.append(np.stack([u - columns, v - rows], -1))
+    mean = np.mean(flows, axis=0)
+    length = np.linalg.norm(mean, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        return np.where(length >= _MIN_MOTION_PX, mean / length, np.nan).astype(np.float32)
+
+
+def _evidence(images: Sequence[np.ndarray], size: tuple[int, int], flow: np.ndarray) -> np.ndarray:
+    """Return the evidence for the car at each pixel, float32 [H, W].
+
+    It goes from -_STAYS, against the car, to 1 - _STAYS, for it.
+    """
+    direction = np.nan_to_num(flow)
+    mean = np.zeros(size[::-1], np.float32)
+    energy = np.zeros(size[::-1], np.float32)  # of contrast along the motion
+    energy_across = np.zeros(size[::-1], np.float32)  # of contrast across it
+    for image in images:
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        grey = cv2.GaussianBlur(grey, (0, 0), 1.0)
+        dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=1 / 8)
+        dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=1 / 8)
+        slope = dx * direction[..., 0] + dy * direction[..., 1]
+        mean += slope / len(images)
+        energy += slope * slope / len(images)
+        energy_across += (dx * direction[..., 1] - dy * direction[..., 0]) ** 2 / len(images)
+    window = (_WINDOW, _WINDOW)
+    mean_energy = cv2.blur(energy, window)
+    # Chance alone leaves 1 / N of the energy in the mean of N images.
+    static_share = (
+        cv2.blur(mean * mean, window) / np.maximum(mean_energy, 1e-6) - 1 / len(images)
+    ) / (1 - 1 / len(images))
+    # Lines along the motion have some contrast along it, too: they are rough, and the motion is
+    # not exact.
+    motion_energy = np.maximum(mean_energy - np.float32(_LEAK) * cv2.blur(energy_across, window), 0)
+    strength = np.minimum(np.sqrt(motion_energy) / np.float32(_CONTRAST), 1)
+    return (static_share - np.float32(_STAYS)) * strength
+
+
+def _car_tops(evidence: np.ndarray, is_unknown: np.ndarray) -> np.ndarray:
+    """Return the first row of the car in each column, int [W]; the height where there is none.
+
+    Of all lines through the columns it is the one with most evidence below it and fewest steps
+    (Viterbi).
+    """
+    height, width = evidence.shape
+    first_row = int((~is_unknown).any(axis=1).argmax())  # the rows above cannot be the car
+    evidence = evidence[first_row:]
+    is_unknown = is_unknown[first_row:]
+    rows_left = len(evidence)
+    # What is reflected in paint moves, so that evidence against the car counts less.
+    weighted = np.where(evidence > 0, evidence, _AGAINST * evidence)
+    score = np.zeros((rows_left + 1, width))
+    score[:-1] = np.cumsum(weighted[::-1], axis=0)[::-1]
+    # Above the first unknown row, from below, nothing can be known.
+    score[:-1][np.logical_or.accumulate(is_unknown[::-1], axis=0)[::-1]] = -np.inf
+    rows = np.arange(rows_left + 1)
+    step = np.minimum(_STEP_COST * np.abs(rows[:, None] - rows), _JUMP_PART * height)
+    best_scores = score[:, 0]
+    came_from = np.zeros((width, rows_left + 1), np.int64)
+    for x in range(1, width):
+        scores = best_scores[None] - step
+        came_from[x] = scores.argmax(axis=1)
+        best_scores = scores[rows, came_from[x]] + score[:, x]
+    top_row = np.empty(width, np.int64)
+    top_row[-1] = best_scores.argmax()
+    for x in range(width - 1, 0, -1):
+        top_row[x - 1] = came_from[x, top_row[x]]
+    # The window the evidence was averaged in reaches over the edge.
+    top_row = np.minimum(top_row + _OVERREACH, rows_left)
+    gain = score[top_row, np.arange(width)]
+    is_found = (top_row < rows_left).mean() >= _MIN_WIDTH and gain.mean() >= _MIN_PART * height
+    return first_row + top_row if is_found else np.full(width, height)
+
+
+# ---- The recording car in a scene's recorded images ----------------------------------------------
+
+# Scale of the images in which the recording car is looked for.
+_SCALE = 0.25
+
+
+def own_car_mask(scene: Scene, camera: Camera) -> Bool[np.ndarray, "H W"] | None:
+    """Return the pixels of a recorded image that show the recording car.
+
+    None where it shows none, or where too few of the scene's images are there to tell. The mask is
+    found once for all images of a camera.
+
+    Args:
+        scene: the scene, whose frames have the images.
+        camera: a camera of the scene, at any scale, or a window of it.
+    """
+    camera_and_mask = memo_of(scene).get(
+        ("own car", camera.name), lambda: _find_own_car(scene, camera.name)
+    )
+    if camera_and_mask is None:
+        return None
+    small_camera, mask = camera_and_mask
+    # The place of each pixel's centre in the small image.
+    small_columns = (np.arange(camera.width) + 0.5 - camera.cx) * (
+        small_camera.fx / camera.fx
+    ) + small_camera.cx
+    small_rows = (np.arange(camera.height) + 0.5 - camera.cy) * (
+        small_camera.fy / camera.fy
+    ) + small_camera.cy
+    columns = np.clip(small_columns.astype(int), 0, small_camera.width - 1)
+    rows = np.clip(small_rows.astype(int), 0, small_camera.height - 1)
+    return mask[np.ix_(rows, columns)]
+
+
+def _find_own_car(scene: Scene, name: str) -> tuple[Camera, np.ndarray] | None:
+    """Return a camera at _SCALE and the mask of its images; None where these show no car."""
+    frames = [f for f in scene.frames if name in f.cameras and name in f.image_paths]
+    frames = [frames[i] for i in moving_frames([f.cameras[name] for f in frames])]
+    cameras = []
+    images = []
+    for frame in frames:
+        camera = frame.cameras[name]
+        try:
+            image = read_scaled(Path(frame.image_paths[name]), camera, camera.scaled(_SCALE))
+        except ImageFault:
+            continue
+        cameras.append(camera)
+        images.append(image)
+    if len({image.shape for image in images}) != 1:  # none, or of several sizes
+        return None
+    mask = find_own_car_mask(cameras, images)
+    return (cameras[0].scaled(_SCALE), mask) if mask.any() else None

@@ -1,0 +1,471 @@
+"""Rendering of one view of a scene in its weather, as float buffers and as 8-bit images.
+
+In: a scene, a camera, a recipe. Out: `WeatheredBuffers` (tensors, by `render_buffers`) or
+`WeatheredView` (arrays as files hold them, by `render_view`). Jobs, the viewer and the tools call
+`begin_view` or a `ViewPool`, so that the next view begins before the last one has left the GPU.
+`augment.view.plan` decides which passes a view needs; this module runs them in the order of
+`EFFECTS`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from augment import effects
+from augment.detail.prune import prune_parts
+from augment.effects.effect import LabelInputs, RenderedView
+from augment.jobs.processes import choose_backend, renders_on_gpu, wait_for_result
+from augment.output.layout import TRUST
+from augment.photo.own_car import own_car_mask
+from augment.photo.recorded_base import open_photo
+from augment.photo.trust import trust_mask
+from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
+from augment.render.composite import apply_color_map
+from augment.render.rasterize import rasterize
+from augment.render.sensor import add_noise, blur_lens
+from augment.render.threads import num_concurrent_views, split_threads
+from augment.scene.cameras import Camera
+from augment.scene.scene import PosedGaussians, Scene
+from augment.timing import timed
+from augment.view.images import SURFACE_ALPHA, ViewImages, start_images
+from augment.view.layers import LayerRenderer
+from augment.view.plan import (
+    BARE_SURFACE_PASS,
+    LENS_BLUR_PASS,
+    SENSOR_NOISE_PASS,
+    Plan,
+    ViewPlan,
+    make_plan,
+    plan_view,
+)
+from recipes.schema import Recipe
+
+# ---- The passes of one view, in the order in which they run --------------------------------------
+
+
+def render_view(
+    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO
+) -> WeatheredView:
+    """Render one view under the recipe's weather, in 8 bits.
+
+    Args:
+        scene: the scene.
+        camera: the view, before recipe.render.scale.
+        recipe: the weather and the outputs.
+        backend: as for `rasterize`, but "auto" takes the GPU where there is one.
+    """
+    return begin_view(scene, camera, recipe, backend=backend).result()
+
+
+def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO) -> PendingView:
+    """Begin the view of `render_view`; its `result` waits for the GPU.
+
+    Another view can be begun before this one's result is asked for. The arguments are those of
+    `render_view`.
+    """
+    if backend == AUTO:
+        backend = choose_backend(backend, scene)
+    with timed("plan"):
+        plan = make_plan(recipe, scene)
+    buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
+    images = start_images(buffers, plan)
+    # The closure below holds the camera and not the buffers, which the images may long outlive.
+    camera = buffers.camera
+    trust = dict[str, np.ndarray]()
+    if recipe.output.trust:
+        with timed("trust mask"):
+            trust[TRUST] = trust_mask(scene, camera, backend=backend)
+    own_car = None
+    if plan.is_on_photo and plan.finds_boxes:
+        with timed("recording car"):
+            own_car = own_car_mask(scene, camera)
+    return PendingView(lambda: _weathered(images(), camera, plan, recipe, trust, own_car))
+
+
+def render_buffers(
+    scene: Scene, camera: Camera, plan: Plan, *, backend: str = AUTO
+) -> WeatheredBuffers:
+    """Render one view as floats.
+
+    Args:
+        scene: the scene.
+        camera: the view, at the resolution to render.
+        plan: the passes that the recipe requires (`augment.view.plan.make_plan`).
+        backend: as for `rasterize`.
+    """
+    with timed("view plan"):
+        view = plan_view(plan, scene, camera, backend=backend)
+    with timed("collect parts"):
+        bare_parts = scene.parts_for(camera, view.actor_ids)
+    color_map = scene.color_map(camera) if plan.uses_recorded_exposure else None
+    photo = None
+    if plan.is_on_photo:
+        with timed("photo"):
+            photo = open_photo(scene, camera, color_map, backend=backend)
+    layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
+    for effect in view.effects:
+        layers = effect.hooks.edit_scene(effect, layers, camera)
+    if plan.prune > 0:
+        with timed("prune"):
+            parts = prune_parts(layers.parts, scene, camera, plan.prune)
+            layers = replace(layers, parts=parts, unpruned_parts=layers.parts)
+    rendered = _draw(view, layers, camera)
+    for effect in view.effects:
+        rendered = effect.hooks.edit_image(effect, rendered, camera)
+    rgb = rendered.rgb
+    if color_map is not None:  # a camera exposes what the weather has left, so this comes last
+        with timed("camera colour map"):
+            rgb = apply_color_map(rgb, color_map, backend=backend)
+    if plan.sensor.psf_px > 0:
+        with timed(LENS_BLUR_PASS):
+            rgb = blur_lens(rgb, plan.sensor.psf_px)
+    if plan.sensor.noise > 0:
+        with timed(SENSOR_NOISE_PASS):
+            noise_sigma = plan.sensor.noise
+            noise_seed = plan.seed
+            rgb = add_noise(
+                rgb, noise_sigma, camera, seed=noise_seed, scene=scene.name, backend=backend
+            )
+    with timed("depth of surfaces"):
+        depth_m = _surface_depth(rendered.raster, plan, plan.image_buffers)
+    return WeatheredBuffers(
+        camera=camera,
+        rgb=rgb,
+        raster=rendered.raster,
+        depth_m=depth_m,
+        parts=tuple(layers.parts),
+        plan=view.skip_steps(rendered.skip_reasons),
+        masks=_masks(view, rendered),
+        bare_buffers=_bare(rendered.raster, bare_parts, camera, plan, view, backend),
+    )
+
+
+def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> RenderedView:
+    """Return the view as rendered by the last effect that draws the scene in layers of its own, or,
+    without such an effect, as one layer with its sky.
+    """
+    for effect in reversed(view.effects):
+        rendered = effect.hooks.draw(effect, layers, camera, view.buffers)
+        if rendered is not None:
+            return rendered
+    return RenderedView(*layers.render_with_sky(camera, view.buffers), layers)
+
+
+def _masks(view: ViewPlan, rendered: RenderedView) -> dict[str, Tensor]:
+    """Return a bool mask for each effect in view: the pixels that show the effect.
+
+    A pixel that several opaque effects cover belongs to the one that is applied last.
+    """
+    masks = dict[str, Tensor]()
+    opaque_masks = list[Tensor]()
+    for effect in reversed(view.effects):
+        mask = effect.hooks.visible_mask(effect, rendered)
+        if mask is not None and effect.hooks.mask_name is not None:
+            for opaque_mask in opaque_masks:
+                mask = mask & ~opaque_mask
+            masks[effect.hooks.mask_name] = mask
+            opaque_masks += [] if effect.hooks.is_see_through else [mask]
+    return masks
+
+
+def _surface_depth(raster: RenderOutput, plan: Plan, buffers: frozenset[str]) -> Tensor | None:
+    """Return z of the surfaces, metres, 0 where there is none; None unless the plan needs it.
+
+    The planned depth estimator is taken if it is among `buffers`, else the expected depth, which
+    labels are measured from.
+    """
+    if plan.depth_buffer is None and not plan.finds_boxes:
+        return None
+    estimator = plan.depth_buffer if plan.depth_buffer in buffers else None
+    z = getattr(raster, estimator or EXPECTED_DEPTH)
+    if z is None or raster.alpha is None:
+        return None
+    if z.device.type == "cpu" and not (z.requires_grad or raster.alpha.requires_grad):
+        return torch.from_numpy(np.where(raster.alpha.numpy() >= SURFACE_ALPHA, z.numpy(), 0))
+    return torch.where(raster.alpha >= SURFACE_ALPHA, z, 0.0)
+
+
+def _bare(
+    raster: RenderOutput,
+    parts: tuple[PosedGaussians, ...],
+    camera: Camera,
+    plan: Plan,
+    view: ViewPlan,
+    backend: str,
+) -> BareBuffers | None:
+    """Return the buffers of the scene without what lies on it; None unless planned.
+
+    Args:
+        raster: buffers of the picture, which shows the bare scene where the view has no pass for
+            it.
+        parts: the scene's parts, without what effects laid on them.
+        camera: the view.
+        plan: the plan of all views.
+        view: the plan of this view.
+        backend: as for `rasterize`.
+    """
+    if not plan.bare_buffers:
+        return None
+    if view.bare_buffers:
+        with timed(BARE_SURFACE_PASS):
+            raster = rasterize(
+                parts, camera, buffers=view.bare_buffers, settings=plan.settings, backend=backend
+            )
+    return BareBuffers(raster, _surface_depth(raster, plan, plan.bare_buffers), parts)
+
+
+def _weathered(
+    images: ViewImages,
+    camera: Camera,
+    plan: Plan,
+    recipe: Recipe,
+    trust: Mapping[str, np.ndarray],
+    own_car: np.ndarray | None,
+) -> WeatheredView:
+    """Return the finished view: the images, and what labels are measured from."""
+    masks = dict(trust)
+    views = dict[str, LabelInputs]()
+    for effect in effects.EFFECTS:
+        if effect.section_of(recipe) is None:
+            continue
+        effect_plan = plan.effect_plans[effect.name]
+        mask = images.masks.get(effect.mask_name or "")
+        is_in_view = effect_plan.data is not None and (effect.mask_name is None or mask is not None)
+        depth = images.scene_depth_m if is_in_view else None
+        views[effect.name] = LabelInputs(effect_plan, depth, mask, plan.water_level_z_m)
+        if effect.mask_name is not None:
+            empty_mask = np.zeros((camera.height, camera.width), np.uint8)
+            masks[effect.mask_name] = empty_mask if mask is None else mask
+    return WeatheredView(
+        camera=camera,
+        rgb=images.rgb,
+        depth_m=None if plan.depth_buffer is None else images.depth_m,
+        semantic=images.semantic if plan.has_semantic else None,
+        instance=images.instance,
+        masks=masks,
+        effects=views,
+        surface=_surface_view(images, plan, own_car),
+    )
+
+
+def _surface_view(
+    images: ViewImages, plan: Plan, own_car: np.ndarray | None
+) -> LabelSurfaces | None:
+    """Return the surfaces that labels are measured from; None where nobody asks for boxes."""
+    depth = images.scene_depth_m
+    is_bare = bool(plan.bare_buffers)
+    if depth is None:
+        return None
+    shows_first = plan.shows_first_hit and plan.water_level_z_m is not None
+    # The other images show the surfaces of this depth, unless they are bare or show the water.
+    is_of_depth = not (is_bare or shows_first)
+    return LabelSurfaces(
+        depth_m=depth,
+        actor_instance=images.instance if is_of_depth else None,
+        classes=images.semantic if is_of_depth else None,
+        instance_depth_m=images.depth_m if is_bare else depth,
+        instance_classes=images.semantic,
+        is_bare=is_bare,
+        own_car=own_car,
+    )
+
+
+# ---- What a view consists of ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class BareBuffers:
+    """Buffers of the scene without what effects laid on it (snow, for example)."""
+
+    raster: RenderOutput
+    """Buffers of the bare surfaces, without colours."""
+    depth_m: Float[Tensor, "H W"] | None
+    """z of the bare surfaces, metres, 0 where there is none; None unless planned."""
+    parts: tuple[PosedGaussians, ...]
+    """The rendered parts, in the order in which splat_ids count their splats."""
+
+
+@dataclass(frozen=True, eq=False)
+class WeatheredBuffers:
+    """One finished view as float tensors."""
+
+    camera: Camera
+    """The camera of the view, at the rendered resolution."""
+    rgb: Float[Tensor, "H W 3"]
+    """The picture: display-encoded, not clamped, sky included."""
+    raster: RenderOutput
+    """Buffers of the scene's surfaces, snow included. With water in view they are those under the
+    water, too, and without colours."""
+    depth_m: Float[Tensor, "H W"] | None
+    """z of the scene's surface, metres, 0 where there is none; None unless planned."""
+    parts: tuple[PosedGaussians, ...]
+    """The rendered parts, in the order in which splat_ids count their splats."""
+    plan: ViewPlan
+    """The passes that were carried out."""
+    masks: Mapping[str, Bool[Tensor, "H W"]] = field(default_factory=dict)
+    """Pixels that show an effect, by the effect's mask name; only effects that can be in view."""
+    bare_buffers: BareBuffers | None = None
+    """Buffers of the scene without what lies on it; None unless planned."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelSurfaces:
+    """Surfaces of one view that labels are measured from.
+
+    Depths are float32 [H, W], z in metres, 0 = none.
+    """
+
+    depth_m: np.ndarray
+    """Depth of the first solid surface: snow counts, water does not."""
+    actor_instance: np.ndarray | None
+    """Instance image of those surfaces, uint16 [H, W], actors only; None where there is none."""
+    instance_depth_m: np.ndarray | None
+    """Depth of the surfaces that the view's instance image shows; None without one."""
+    instance_classes: np.ndarray | None
+    """Classes of the surfaces that the view's instance image shows; None without one."""
+    is_bare: bool
+    """If True, `instance_depth_m` and `instance_classes` are without what lies on the scene."""
+    classes: np.ndarray | None = None
+    """Classes of the surfaces of `depth_m`, uint8 [H, W]; None where no image shows them."""
+    own_car: np.ndarray | None = None
+    """Pixels of a recorded picture that show the recording car, of which the scene has no surfaces,
+    bool [H, W]; None where it shows none."""
+
+
+@dataclass(frozen=True, eq=False)
+class WeatheredView:
+    """One finished view as it is written to files."""
+
+    camera: Camera
+    """The camera of the view, at the rendered resolution."""
+    rgb: np.ndarray
+    """The picture, uint8 [H, W, 3]."""
+    depth_m: np.ndarray | None
+    """Depth, float32 [H, W], metres, 0 = none; None unless planned."""
+    semantic: np.ndarray | None
+    """SemanticClass of each pixel, uint8 [H, W]; None unless planned."""
+    instance: np.ndarray | None
+    """Instance of each pixel, uint16 [H, W]: 0 = background or sky, else 1 + the actor's index in
+    the scene (`augment.output.view_files.label_view` adds boxes without an actor)."""
+    masks: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Masks by name, uint8 [H, W]: 255 where the pixel shows the effect, else 0; TRUST holds 0 to
+    255."""
+    effects: Mapping[str, LabelInputs] = field(default_factory=dict)
+    """Inputs of the effects' own labels, for every effect that the recipe has, by name."""
+    surface: LabelSurfaces | None = None
+    """Surfaces that boxes are measured from; None where nobody asks for boxes."""
+
+
+class PendingView:
+    """A view that was begun.
+
+    On a GPU it may still be computed; other backends have finished it.
+    """
+
+    def __init__(self, finish: Callable[[], WeatheredView]) -> None:
+        self._finish: Callable[[], WeatheredView] | None = finish
+        self._view: WeatheredView | None = None
+
+    def result(self) -> WeatheredView:
+        """Return the finished view, the same one at every call, and wait for it where needed.
+
+        Only one thread at a time may call this.
+        """
+        if self._finish is not None:
+            self._view = self._finish()
+            self._finish = None
+        assert self._view is not None
+        return self._view
+
+
+# ---- Several views at once -----------------------------------------------------------------------
+# On the CPU some work of a view cannot be divided, and threads that share a view wait for each
+# other. All cores are busy only if each thread renders a view of its own, in its own work space.
+
+
+class ViewPool:
+    """Begins views of a scene, several at once on threads of their own.
+
+    On a GPU, or where there is only one thread, views are rendered one after the other. Close the
+    pool, or use it as a context manager. `num_in_flight` is how many views may be in flight while
+    another is begun.
+
+    Args:
+        scene: the scene, whose size decides how many threads pay off.
+        backend: as for `render_view`.
+        max_views: the largest number of views that will be begun.
+    """
+
+    def __init__(self, scene: Scene, backend: str = AUTO, max_views: int = sys.maxsize) -> None:
+        backend = choose_backend(backend, scene) if backend == AUTO else backend
+        self.num_in_flight = int(renders_on_gpu(backend))
+        self._threads = None
+        if backend == CPU:
+            count = min(max_views, num_concurrent_views(sum(map(len, scene.all_gaussians))))
+            if count > 1:
+                self.num_in_flight = count
+                self._threads = split_threads(count)
+
+    def begin(
+        self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO
+    ) -> PendingView:
+        """Begin a view, as the function `begin_view` does."""
+        if self._threads is None:
+            return begin_view(scene, camera, recipe, backend=backend)
+        future = self._threads.submit(
+            lambda: begin_view(scene, camera, recipe, backend=backend).result()
+        )
+        return PendingView(lambda: wait_for_result(future))
+
+    def close(self) -> None:
+        """Begin no further view; views that are being rendered are finished, and nobody waits for
+        them.
+        """
+        if self._threads is not None:
+            self._threads.shutdown(wait=False, cancel_futures=True)
+
+    def __enter__(self) -> ViewPool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def render_views(
+    scene: Scene, cameras: Sequence[Camera], recipe: Recipe, *, backend: str = AUTO
+) -> Iterator[WeatheredView]:
+    """Yield `render_view` of each camera, in order and to the same bits.
+
+    Several views are rendered at once. The exception of a view has a note that names its camera.
+
+    Args:
+        scene: the scene.
+        cameras: the views, before recipe.render.scale.
+        recipe: the weather and the outputs.
+        backend: as for `render_view`.
+    """
+    with ViewPool(scene, backend, len(cameras)) as pool:
+        pending_views = deque[tuple[Camera, PendingView]]()
+        for camera in cameras:
+            pending_views.append((camera, pool.begin(scene, camera, recipe, backend=backend)))
+            if len(pending_views) > pool.num_in_flight:
+                yield _finish_view(*pending_views.popleft())
+        for pending_view in pending_views:
+            yield _finish_view(*pending_view)
+
+
+def _finish_view(camera: Camera, pending: PendingView) -> WeatheredView:
+    """Return the result of a view; an exception gets a note that names its camera."""
+    try:
+        return pending.result()
+    except Exception as error:
+        error.add_note(f"in the view of camera {camera.name!r} at {camera.timestamp_ns} ns")
+        raise
