@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.detail import lod
+from augment.detail import lod, lod_kernels
 from augment.render.buffers import ALPHA, BUFFERS, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.render.rasterize import rasterize
