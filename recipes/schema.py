@@ -265,6 +265,11 @@ class Render(Section):
     scene, for views from within 2 m of a recorded one; of no effect with lod_px or on recorded
     images."""
 
+    @property
+    def is_on_recorded(self) -> bool:
+        """Return True if the recorded images stay the picture."""
+        return self.base == "recorded"
+
 
 class Sensor(Section):
     """Effects of the camera on the light that reaches it, after all weather. Depth, classes,

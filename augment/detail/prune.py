@@ -34,7 +34,6 @@ from jaxtyping import Bool, Float, Int, Int32
 
 from augment.detail.lod import has_stored_levels
 from augment.memo import memo_of
-from augment.photo.recorded_base import RECORDED
 from augment.progress import ProgressBar
 from augment.render.constants import RasterSettings
 from augment.render.cpu.order import cached_of_tensor
@@ -75,7 +74,7 @@ SplatChanges = tuple[Int32[np.ndarray, "_"], Float[np.ndarray, "_"]]
 
 def prune_error_of(render: Render) -> float:
     """Return the recipe's error, or 0 where nothing is pruned: merged splats, recorded images."""
-    return 0.0 if render.base == RECORDED or render.lod_px > 0 else render.prune
+    return 0.0 if render.is_on_recorded or render.lod_px > 0 else render.prune
 
 
 def prune_parts(

@@ -41,7 +41,6 @@ from augment.light.cast_shadows import (
     sun_transmittance,
 )
 from augment.output.box_tables import BoxTable
-from augment.photo.recorded_base import RECORDED
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
 from augment.render.scatter import scatter_forward
@@ -122,7 +121,7 @@ class SmogEffect(Effect):
         is_common = recipe.render.exposure == "common" and scene.common_color_map is not None
         if is_common:
             reason += "; one airlight for all cameras, by the mean of their exposures"
-        on_photo = recipe.render.base == RECORDED
+        on_photo = recipe.render.is_on_recorded
         on_buffers = on_photo or smog.model == "deferred"
         other_reason = "weather.smog.model chooses the other way"
         if on_photo:

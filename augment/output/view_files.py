@@ -41,7 +41,6 @@ from augment.output.box_tables import (
 )
 from augment.output.layout import TRUST, mask_share_columns
 from augment.output.tables import checked_int
-from augment.photo import recorded_base
 from augment.scene.box_estimates import Estimate, Evidence, estimate_boxes
 from augment.scene.boxes import (
     MIN_DEPTH_M,
@@ -938,7 +937,7 @@ def label_view(
     box_visibility = None
     if surface is not None:
         uses_depth = wants_masks and not output.instance
-        on_photo = recipe.render.base == recorded_base.RECORDED
+        on_photo = recipe.render.is_on_recorded
         box_visibility = find_box_visibility(
             boxes,
             instances,

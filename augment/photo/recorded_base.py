@@ -62,8 +62,6 @@ from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import PosedGaussians, Scene
 from recipes.schema import Recipe
 
-# Value of recipe.render.base for pictures on recorded images.
-RECORDED = "recorded"
 # Alpha of reconstructed surfaces up to which a pixel counts as empty. What a photo shows is opaque,
 # while reconstructed surfaces let some light through.
 CLEAR_ALPHA = 0.04
@@ -129,7 +127,7 @@ def check_photos(
     Raises:
         SceneError: names the missing image, and says what to do.
     """
-    names = sorted({recipe.name for recipe in recipes if recipe.render.base == RECORDED})
+    names = sorted({recipe.name for recipe in recipes if recipe.render.is_on_recorded})
     if not names:
         return
     request = f"recipe {', '.join(names)}: render.base is 'recorded'"
@@ -158,7 +156,7 @@ def check_base(recipe: Recipe, scene: Scene) -> None:
     Raises:
         SceneError: the scale is above 1, or the scene has no recorded images.
     """
-    if recipe.render.base != RECORDED:
+    if not recipe.render.is_on_recorded:
         return
     request = f"recipe {recipe.name}: render.base is 'recorded'"
     if recipe.render.scale > 1:

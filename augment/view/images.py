@@ -18,6 +18,7 @@ from torch import Tensor
 
 from augment.render.buffers import RenderOutput
 from augment.render.composite import to_bytes
+from augment.render.constants import SURFACE_ALPHA
 from augment.render.cuda.runtime import download, gpu_copy
 from augment.scene.scene import PosedGaussians
 from augment.scene.semantics import SemanticClass
@@ -27,8 +28,6 @@ from augment.view.plan import Plan
 if TYPE_CHECKING:
     from augment.view.render_view import WeatheredBuffers
 
-SURFACE_ALPHA = 0.5
-"""Alpha below which a pixel shows more sky than surface, and has no depth."""
 _MASK = "mask "
 """Prefix that tells masks from the other images among the downloaded ones."""
 

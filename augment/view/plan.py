@@ -27,7 +27,7 @@ from augment.effects.effect import (
     Step,
     ViewQuery,
 )
-from augment.photo.recorded_base import RECORDED, check_base
+from augment.photo.recorded_base import check_base
 from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.scene.cameras import Camera
@@ -181,7 +181,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         shows_first_hit=output.surface == "first",
         finds_boxes=finds_boxes,
         uses_recorded_exposure=exposure.runs,
-        is_on_photo=recipe.render.base == RECORDED,
+        is_on_photo=recipe.render.is_on_recorded,
         sensor=recipe.camera,
         seed=recipe.seed,
         steps=_all_steps(recipe, scene, effect_plans, buffers, bare_buffers, exposure),
@@ -238,11 +238,11 @@ def _is_covered(candidates: Iterable[Effect], effect_plans: Mapping[str, EffectP
 
 def _photo_step(recipe: Recipe) -> Step:
     """Return the pass that keeps the recorded image as the picture."""
-    base = recipe.render.base
-    why = f"render.base is {base!r}"
-    if base == RECORDED:
+    is_on_recorded = recipe.render.is_on_recorded
+    why = f"render.base is {recipe.render.base!r}"
+    if is_on_recorded:
         why += ": the recorded image is the picture, edges of the weather move to its own"
-    return Step("photo", base == RECORDED, why)
+    return Step("photo", is_on_recorded, why)
 
 
 def _exposure_step(recipe: Recipe, scene: Scene) -> Step:

@@ -29,13 +29,14 @@ from augment.photo.recorded_base import open_photo
 from augment.photo.trust import trust_mask
 from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
 from augment.render.composite import apply_color_map
+from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.render.sensor import add_noise, blur_lens
 from augment.render.threads import num_concurrent_views, split_threads
 from augment.scene.cameras import Camera
 from augment.scene.scene import PosedGaussians, Scene
 from augment.timing import timed
-from augment.view.images import SURFACE_ALPHA, ViewImages, start_images
+from augment.view.images import ViewImages, start_images
 from augment.view.layers import LayerRenderer
 from augment.view.plan import (
     BARE_SURFACE_PASS,

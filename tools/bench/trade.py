@@ -51,11 +51,11 @@ from augment.metrics.consistency import DepthView, warp_view
 from augment.metrics.image import depth_errors, flip, ssim
 from augment.output.view_files import decode_image, encode_image
 from augment.render.buffers import CPU, CUDA
+from augment.render.constants import SURFACE_ALPHA
 from augment.render.cpu.driver import free_scratch
 from augment.scene.cameras import Camera
 from augment.scene.ground import ground_of
 from augment.scene.scene import Scene
-from augment.view.images import SURFACE_ALPHA
 from augment.view.quality import (
     Cost,
     Settings,
