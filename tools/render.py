@@ -22,7 +22,6 @@ from adapters.camera_files.paths import frames_from_path_file
 from adapters.scene_cache import scene_digest
 from augment import effects
 from augment.dataset.label_files import NothingLabelled
-from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import ClimateGSError
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.blocks import JobStatus, read_status, select_shard
@@ -46,6 +45,7 @@ from augment.scene.sky import CubemapSky
 from augment.view.plan import make_plan
 from augment.view.quality import choose_settings, recipes_to_try
 from augment.view.render_view import render_view
+from augment.view.weathered_sweep import weathered_sweep
 from recipes.fields import section_at
 from recipes.job import load_job, load_job_recipes, scaled_recipe
 from recipes.load import load_recipe, read_overrides

@@ -47,7 +47,6 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
-from augment.detail.bounds import Bounds
 from augment.detail.lod_kernels import sum_covered_areas
 from augment.errors import SceneError
 from augment.memo import memo_of
@@ -58,6 +57,7 @@ from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
+from augment.scene.bounds import Bounds
 from augment.scene.cameras import Camera
 from augment.scene.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.scene.scene import Gaussians, PosedGaussians, is_drawable

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 from augment.effects import JobContext, precompute_effects
-from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import OutputError
 from augment.jobs.worker import describe_error
 from augment.output.atomic import write_atomic
@@ -27,6 +26,7 @@ from augment.output.tables import lidar_bytes, read_lidar_note
 from augment.scene.cameras import Frame
 from augment.scene.labels import StoresLidar
 from augment.scene.scene import Scene
+from augment.view.weathered_sweep import weathered_sweep
 from recipes.schema import Recipe
 
 

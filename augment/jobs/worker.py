@@ -580,7 +580,7 @@ class FrameRunner:
         """
         if recipe.lidar != "weather":
             return sweep, None
-        from augment.effects.lidar.sweep import weathered_sweep
+        from augment.view.weathered_sweep import weathered_sweep
 
         try:
             return weathered_sweep(self._scene, recipe, frame, sweep), None

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from augment import effects
-from augment.detail.bounds import actor_boxes, find_visible_owners
 from augment.detail.lod import check_background
 from augment.detail.prune import prune_error_of
 from augment.effects.effect import (
@@ -30,6 +29,7 @@ from augment.effects.effect import (
 from augment.photo.recorded_base import check_base
 from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
+from augment.scene.bounds import actor_boxes, find_visible_owners
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 from recipes.errors import RecipeError

@@ -27,7 +27,6 @@ from augment.effects.falling.lidar import (
 )
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, PRECIPITATION, UNCHANGED
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
-from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import fog_echoes
 from augment.effects.wet.ground import GROUND_CELL_M, WetGround
 from augment.effects.wet.kernels import EXPOSURE, NUM_CHANNELS, PUDDLE_ORDER
@@ -40,6 +39,7 @@ from augment.render.fog import Fog
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes
 from augment.scene.labels import Boxes
 from augment.view.plan import make_plan
+from augment.view.weathered_sweep import weathered_sweep
 from recipes.schema import Output, Rain, Recipe, Snow, Snowfall, Weather
 from tests.lidar_sweeps import (
     SENSOR_M,

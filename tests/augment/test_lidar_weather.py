@@ -21,7 +21,6 @@ from augment.effects.flood.lidar import ABSORPTION_905_PER_M, meet_water
 from augment.effects.flood.waves import make_waves
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost_returns
 from augment.effects.lidar.beam import LidarModel, find_beam_origins
-from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import soft_echo, soft_response, wavelength_factor
 from augment.effects.snow.effect import build_snow_layers
 from augment.effects.snow.lidar import (
@@ -42,6 +41,7 @@ from augment.scene.cameras import Camera
 from augment.scene.labels import LidarSweep
 from augment.scene.scene import Scene
 from augment.view.render_view import WeatheredView, render_view
+from augment.view.weathered_sweep import weathered_sweep
 from recipes.flood import Flood, Waves
 from recipes.schema import Recipe, Smog, Weather
 from recipes.smog import KOSCHMIEDER

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from augment.detail.bounds import Bounds, bound_squares, may_show
 from augment.output.view_files import measure_boxes
 from augment.render.constants import RasterSettings
 from augment.render.reference import half_extents, project_parts
+from augment.scene.bounds import Bounds, bound_squares, may_show
 from augment.scene.boxes import instances_of
 from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import rigid, rotmat_from_quat

@@ -14,7 +14,6 @@ import pytest
 
 from adapters import detect_format as source_trees
 from augment.effects.lidar import drop_lost_returns
-from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import AdapterError, ClimateGSError, OutputError
 from augment.jobs.mirror_sweeps import find_span_frames
 from augment.jobs.render_job import RenderJob, run_job
@@ -22,6 +21,7 @@ from augment.output.manifest import read_manifest
 from augment.output.tables import read_lidar
 from augment.scene.labels import LidarSweep
 from augment.scene.scene import Scene
+from augment.view.weathered_sweep import weathered_sweep
 from recipes.flood import Flood
 from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents

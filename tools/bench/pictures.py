@@ -18,10 +18,10 @@ import tyro
 
 from adapters.base import open_scene
 from augment.effects.lidar import codes
-from augment.effects.lidar.sweep import weathered_sweep
 from augment.scene.geometry import invert_rigid
 from augment.scene.scene import Scene
 from augment.view.render_view import render_view
+from augment.view.weathered_sweep import weathered_sweep
 from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe
 from tools.drawing import resized, write, write_rgb, write_video

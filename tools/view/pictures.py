@@ -17,7 +17,6 @@ import torch
 
 from augment import effects
 from augment.effects.lidar.codes import CODE_COLUMN, drop_lost_returns
-from augment.effects.lidar.sweep import weathered_sweep
 from augment.output.layout import TRUST
 from augment.photo.trust import MAX_ANGLE_RAD, MAX_DISTANCE_M, nearest_view, source_views
 from augment.render.buffers import AUTO, SPLAT_IDS
@@ -28,6 +27,7 @@ from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
 from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers, render_view
+from augment.view.weathered_sweep import weathered_sweep
 from recipes.fields import with_unchecked_field
 from recipes.schema import Recipe
 

@@ -11,7 +11,6 @@ from contextlib import suppress
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from augment.detail.bounds import lowest_z_m
 from augment.effects.effect import (
     Effect,
     EffectInScene,
@@ -34,6 +33,7 @@ from augment.effects.lidar.beam import Echoes
 from augment.errors import SceneError
 from augment.memo import memo_of
 from augment.output.box_tables import BoxTable, pixel_fraction
+from augment.scene.bounds import lowest_z_m
 from augment.scene.boxes import NOT_COUNTED, BoxPixels, WorldBoxes, count_pixels
 from augment.scene.cameras import Camera
 from augment.scene.ground import ground_of

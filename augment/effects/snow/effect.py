@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from augment.detail.bounds import Bounds, bound_points, bound_squares, find_visible_owners
 from augment.effects.effect import (
     PICTURE,
     SCENE,
@@ -45,6 +44,7 @@ from augment.memo import memo_of
 from augment.output.box_tables import BoxTable, pixel_fraction
 from augment.render.buffers import EXPECTED_DEPTH, OVERLAY
 from augment.render.fog import Fog, optical_depth_numpy
+from augment.scene.bounds import Bounds, bound_points, bound_squares, find_visible_owners
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes
 from augment.scene.cameras import Camera
 from augment.scene.ground import check_metric_and_level

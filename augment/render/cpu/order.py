@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.detail.bounds import Bounds, may_show
 from augment.render import layout
 from augment.render.buffers import ALPHA, RGB
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSettings
 from augment.render.fog import Fog, optical_depth_numpy
 from augment.render.layout import HeightClip
+from augment.scene.bounds import Bounds, may_show
 from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, PosedGaussians
 
@@ -40,7 +40,7 @@ _MIN_FAINT_SHARE = 0.1
 _BITS_PER_AXIS = 10
 # Relative rounding margin of a sum's terms: a hundred times that of float32.
 _ROUNDING = 1e-5
-# Pixels by which a splat may exceed its box; 1.9 of it is the blur, as in augment.detail.bounds.
+# Pixels by which a splat may exceed its box; 1.9 of it is the blur, as in augment.scene.bounds.
 _BLUR_PX = 3.0
 
 # ---- Values of tensors, cached as long as the tensors live and do not change ---------------------
