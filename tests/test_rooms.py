@@ -35,7 +35,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "scene": ("augment.scene",),
     "render": ("augment.render",),
     "detail": ("augment.detail", "augment.render.rasterize"),
-    "atomic": (
+    "disk": (
+        "augment.files.stated_sizes",
         "augment.output.atomic",
         "augment.output.box_tables",
         "augment.output.codecs",
@@ -56,11 +57,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "adapters": ("adapters",),
     "tools": ("tools",),
 }
-# Lazy imports that close a circle: the choice between CPU and GPU, made once a process.
-CIRCLES = {
-    ("augment.render.buffers", "augment.render.cpu.driver"),
-    ("augment.render.buffers", "augment.render.cuda.driver"),
-}
+MAX_ROOT_FILES = 6  # at the root of augment/, `__init__` among them
 
 
 def module_paths() -> dict[str, Path]:
@@ -96,3 +93,76 @@ def room_of(module: str) -> str:
         if f"{module}.".startswith(f"{prefix}.")
     )
     return max(fits)[1]
+
+
+def import_graph() -> dict[str, set[str]]:
+    """Return the modules that each module imports."""
+    modules = module_paths()
+    return {module: {*imports_of(path, modules)} - {module} for module, path in modules.items()}
+
+
+def room_graph() -> dict[str, set[str]]:
+    """Return the rooms that each room imports, without itself."""
+    graph: dict[str, set[str]] = {room: set() for room in ROOMS}
+    for module, imported_modules in import_graph().items():
+        graph[room_of(module)] |= {room_of(imported) for imported in imported_modules}
+    return {room: imported_rooms - {room} for room, imported_rooms in graph.items()}
+
+
+def picture_edges() -> set[tuple[str, str]]:
+    """Return the arrows of a picture of the rooms, each from a room to one that imports it.
+
+    An arrow that others imply is left out: a -> c where there are a -> b and b -> c.
+    """
+    graph = room_graph()
+    below: dict[str, set[str]] = {}  # all rooms that a room stands on, directly or not
+    for room in ROOMS:
+        below[room] = graph[room].union(*(below[lower] for lower in graph[room]))
+    return {
+        (lower, room)
+        for room in ROOMS
+        for lower in graph[room]
+        if not any(lower in below[between] for between in graph[room])
+    }
+
+
+def test_every_module_imports_only_its_own_room_and_earlier_ones():
+    order = list(ROOMS)
+    upward_imports = [
+        f"{module} ({room_of(module)}) imports {imported} ({room_of(imported)})"
+        for module, imported_modules in import_graph().items()
+        for imported in imported_modules
+        if order.index(room_of(imported)) > order.index(room_of(module))
+    ]
+    assert upward_imports == []
+
+
+def test_no_imports_close_a_circle_even_inside_functions():
+    graph = import_graph()
+    while True:  # take away modules that import nothing that is left
+        free = {module for module, imported in graph.items() if not imported & graph.keys()}
+        if not free:
+            break
+        graph = {module: imported for module, imported in graph.items() if module not in free}
+    assert graph == {}, "these modules import each other, or stand on modules that do"
+
+
+def test_every_room_is_a_folder_or_a_file_that_exists():
+    modules = module_paths()
+    prefixes = [prefix for room in ROOMS.values() for prefix in room]
+    assert [prefix for prefix in prefixes if prefix not in modules] == []
+    assert {room_of(module) for module in modules} == set(ROOMS)
+
+
+def test_few_files_lie_at_the_root_of_the_library():
+    files = sorted(path.name for path in (ROOT / "augment").glob("*.py"))
+    assert len(files) <= MAX_ROOT_FILES, files
+
+
+def test_the_picture_of_the_rooms_shows_the_imports():
+    (picture,) = re.findall(
+        r"```mermaid\n(.*?)```", (ROOT / "docs/design.md").read_text(), flags=re.DOTALL
+    )
+    arrows = set(re.findall(r"^ *(\w+) --> (\w+)$", picture, flags=re.MULTILINE))
+    assert arrows == picture_edges()
+    assert set(re.findall(r"^ *(\w+)\[", picture, flags=re.MULTILINE)) == set(ROOMS)
