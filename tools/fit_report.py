@@ -24,12 +24,13 @@ from augment.output.atomic import make_folder, make_output_error, write_atomic
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.composite import to_byte_array
+from augment.render.constants import SURFACE_ALPHA
 from augment.scene.cameras import Camera
 from augment.scene.geometry import rigid
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
 from augment.view.plan import make_plan
-from augment.view.render_view import SURFACE_ALPHA, render_buffers
+from augment.view.render_view import render_buffers
 from recipes.load import load_recipe
 from recipes.schema import Recipe
 from tools.drawing import (

@@ -34,11 +34,11 @@ from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_sur
 from adapters.raw_drive import BoxSample
 from adapters.world import join_gaussians
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
+from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, PosedGaussians
 from augment.scene.semantics import SemanticClass, class_of_label
-from augment.view.images import SURFACE_ALPHA
 
 _WIDTH = 480  # columns of the images that are drawn
 _CELL_PX = 2  # smallest spacing of new discs, pixels of those images

@@ -30,13 +30,13 @@ from augment.photo.own_car import spread_evenly
 from augment.photo.recorded_sky import TOP_MARGIN_RAD
 from augment.reconstruct.view import ViewSource
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
+from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera
 from augment.scene.geometry import rigid
 from augment.scene.labels import EGO_VEHICLE
 from augment.scene.scene import Actor, Gaussians, Scene, Track
 from augment.scene.semantics import SemanticClass
-from augment.view.images import SURFACE_ALPHA
 
 logger = logging.getLogger(__name__)
 

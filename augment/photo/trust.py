@@ -41,11 +41,11 @@ from augment.photo.recorded_sky import (
     recorded_sky,
 )
 from augment.render.buffers import ALPHA, AUTO, MEDIAN_DEPTH, RGB, SPLAT_IDS
+from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import EGO_VEHICLE
 from augment.scene.scene import Scene
-from augment.view.images import SURFACE_ALPHA
 
 # Distance from which a surface before the sky fades in any fog and casts no pane, metres.
 SKY_FROM_M = 200.0

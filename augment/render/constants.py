@@ -20,6 +20,8 @@ COV2D_BLUR = 0.3
 MAX_EXTENT_SIGMAS = 3.33
 # Share of the image by which the range of the Jacobian's x/z and y/z exceeds the image.
 TAN_FOV_MARGIN = 0.3
+# Alpha below which a pixel shows more sky than surface, and has no depth.
+SURFACE_ALPHA = 0.5
 # Smallest weight that expected depth is divided by.
 DEPTH_EPS = 1e-10
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,24 +17,21 @@ from torch import Tensor
 
 from augment.render.buffers import RenderOutput
 from augment.render.composite import to_bytes
+from augment.render.constants import SURFACE_ALPHA
 from augment.render.cuda.runtime import download, gpu_copy
 from augment.scene.scene import PosedGaussians
 from augment.scene.semantics import SemanticClass
 from augment.timing import timed
 from augment.view.plan import Plan
+from augment.view.results import WeatheredBuffers
 
-if TYPE_CHECKING:
-    from augment.view.render_view import WeatheredBuffers
-
-SURFACE_ALPHA = 0.5
-"""Alpha below which a pixel shows more sky than surface, and has no depth."""
 _MASK = "mask "
 """Prefix that tells masks from the other images among the downloaded ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewImages:
-    """Images of one view, as the fields of `augment.view.render_view.WeatheredView`."""
+    """Images of one view, as the fields of `augment.view.results.WeatheredView`."""
 
     rgb: np.ndarray
     """The picture, uint8 [H, W, 3]."""
