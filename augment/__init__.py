@@ -9,7 +9,8 @@ from importlib import import_module
 __version__ = "0.6.0"
 
 _PUBLIC = {
-    "augment.view.render_view": ("WeatheredView", "render_buffers", "render_view", "render_views"),
+    "augment.view.render_view": ("render_buffers", "render_view", "render_views"),
+    "augment.view.results": ("WeatheredView",),
     "augment.jobs.render_job": ("JobResult", "RenderJob", "run_job"),
     "augment.output.manifest": ("read_manifest",),
     "augment.scene.cameras": ("Camera", "Frame"),

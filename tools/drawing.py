@@ -19,10 +19,10 @@ import pyarrow.compute as pc
 
 from augment.errors import OutputError
 from augment.output.atomic import write_atomic, write_file_atomically
+from augment.output.codecs import decode_image
 from augment.output.layout import folder_name, parse_errors_as_output_errors, resolve_inside
 from augment.output.manifest import OK, Row, read_manifest
 from augment.output.store import Store, open_store
-from augment.output.view_files import decode_image
 from recipes.schema import columns_of_effects, parse_frames
 from tools.output import print_note
 

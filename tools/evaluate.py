@@ -33,11 +33,11 @@ from augment.metrics.consistency import (
     move_surfaces,
 )
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
+from augment.output.codecs import depth_in_metres
 from augment.output.layout import folder_name, variant_folder
 from augment.output.manifest import OK, read_manifest_rows
 from augment.output.store import Store, open_store
 from augment.output.tables import read_boxes
-from augment.output.view_files import depth_in_metres
 from augment.render.sensor import noise_variance
 from augment.scene.cameras import Camera
 from augment.scene.geometry import invert_rigid

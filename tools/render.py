@@ -26,14 +26,13 @@ from augment.errors import ClimateGSError
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.blocks import JobStatus, read_status, select_shard
 from augment.jobs.generate import GenerateJob, default_scratch, plan_job, run_generate
-from augment.jobs.processes import choose_backend, renders_on_gpu
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.worker import compute_time_shares
 from augment.output.layout import STATE_FOLDER, variant_name
 from augment.output.manifest import lidar_notes
 from augment.output.store import open_store
-from augment.output.view_files import SceneIndex, check_frames, has_lidar, uses_boxes
 from augment.photo.trust import judge_scene, skipped_cameras_sentence, unfitted_cameras
+from augment.render.backends import choose_backend, renders_on_gpu
 from augment.render.buffers import CPU, CUDA
 from augment.render.cuda.runtime import is_interpreted
 from augment.scene.boxes import WorldBoxes, find_occlusion
@@ -41,7 +40,9 @@ from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import rigid
 from augment.scene.labels import Boxes, LidarSweep
 from augment.scene.scene import Gaussians, Ground, Scene
+from augment.scene.scene_index import SceneIndex, check_frames, has_lidar
 from augment.scene.sky import CubemapSky
+from augment.view.box_labels import uses_boxes
 from augment.view.plan import make_plan
 from augment.view.quality import choose_settings, recipes_to_try
 from augment.view.render_view import render_view

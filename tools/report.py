@@ -26,10 +26,10 @@ from augment.dataset.label_files import LABELS, RECORD, LabelsRecord
 from augment.effects.lidar import codes
 from augment.errors import OutputError
 from augment.output.atomic import write_atomic
+from augment.output.box_weather import box_tables
 from augment.output.layout import STATE_FOLDER, folder_name, path_kinds
 from augment.output.manifest import OK, read_manifest_rows
 from augment.output.store import Store, StoredFile, open_store
-from augment.output.view_files import box_tables
 from tools.drawing import cameras_on_car, evenly, first_of_each, value_codes
 from tools.report_numbers import (
     byte_size,
@@ -340,7 +340,7 @@ def read_trainers(files: ReportFiles) -> LabelsRecord | None:
 def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict[str, Any] | None:
     """Count boxes by the share that the weather leaves visible, in VISIBILITY_STEPS.
 
-    The product of what every effect leaves, as `augment.output.view_files.combine_visibility` has
+    The product of what every effect leaves, as `augment.output.box_weather.combine_visibility` has
     it.
     """
     kinds = (

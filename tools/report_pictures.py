@@ -22,11 +22,11 @@ from markupsafe import Markup
 
 from augment.errors import OutputError
 from augment.files.image_size import image_header
+from augment.output.codecs import decode_image, decode_png, depth_in_metres
 from augment.output.layout import mask_names
 from augment.output.manifest import Row
 from augment.output.store import Store, StoredFile, StoredFileMissing
 from augment.output.tables import read_table
-from augment.output.view_files import decode_image, decode_png, depth_in_metres
 from augment.scene.semantics import SemanticClass
 from tools.drawing import color_mapped, evenly, resized
 from tools.report_numbers import weather_text

@@ -64,6 +64,7 @@ from adapters.uri import format_uri
 from augment.effects.lidar.beam import find_intensity_column
 from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError, OutputError
+from augment.output.codecs import decode_png, depth_in_metres
 from augment.output.layout import SWEEP_FOLDER, folder_name
 from augment.output.tables import (
     ATTRIBUTE_PREFIX,
@@ -72,7 +73,6 @@ from augment.output.tables import (
     read_lidar,
     read_table,
 )
-from augment.output.view_files import decode_png, depth_in_metres
 from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import Boxes, LidarSweep
 from augment.scene.scene import Gaussians, Ground, Scene

@@ -30,7 +30,7 @@ from adapters.recording.files import CALIBRATION, IMAGE_SUFFIXES
 from adapters.world import invert_pose
 from augment.errors import AdapterError
 from augment.files.recorded_images import twelve_bits_fault
-from augment.output.view_files import encode_depth
+from augment.output.codecs import encode_depth
 
 CAMERA = "camera"  # of images that lie in no folder of their own
 _JPEG_QUALITY = 97

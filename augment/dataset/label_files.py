@@ -41,12 +41,13 @@ from augment.output.atomic import (
     write_folder_atomically,
 )
 from augment.output.box_tables import BOXES_2D, MASK_SIDES, MASKS, SIDES
+from augment.output.box_weather import box_tables, combine_visibility
+from augment.output.calibration import CameraRecord
 from augment.output.claims import hold_claim
 from augment.output.layout import folder_name, resolve_inside
 from augment.output.manifest import MANIFEST_FILE, OK, read_manifest_rows
 from augment.output.store import open_store
 from augment.output.tables import read_boxes
-from augment.output.view_files import CameraRecord, box_tables, combine_visibility
 from augment.scene.boxes import are_usable
 from augment.scene.geometry import invert_rigid, rotmat_from_quat
 from augment.scene.scene import Scene

@@ -21,28 +21,21 @@ from augment.dataset.samples import (
 )
 from augment.effects import JobContext, precompute_effects
 from augment.errors import BackendUnavailable
-from augment.jobs.processes import choose_backend
-from augment.jobs.worker import Renderer
 from augment.memo import memo_of
+from augment.output.calibration import camera_record
+from augment.output.codecs import decode_image, encode_image, quantise_depth
 from augment.output.layout import path_kinds, variant_name
-from augment.output.view_files import (
-    SceneIndex,
-    ViewResult,
-    camera_record,
-    check_view,
-    decode_image,
-    encode_image,
-    label_view,
-    quantise_depth,
-    select_frames,
-    uses_boxes,
-)
 from augment.photo.recorded_base import check_photos
+from augment.render.backends import choose_backend
 from augment.render.buffers import CUDA
 from augment.scene.box_estimates import evidence_of
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import Scene
+from augment.scene.scene_index import SceneIndex, select_frames
+from augment.view.box_labels import label_view, uses_boxes
 from augment.view.quality import resolve_quality
+from augment.view.render_view import render_views
+from augment.view.results import Renderer, ViewResult, check_view
 from recipes.files import with_digest
 from recipes.schema import Recipe
 
@@ -146,8 +139,6 @@ class SceneDataset(Dataset):
         if self._backend == CUDA and self._process != os.getpid():  # not unpickled: forked
             raise BackendUnavailable(_FORKED)
         if self._renderer is None:
-            from augment.view.render_view import render_views  # which brings the rasteriser
-
             return render_views(self.scene, cameras, self.recipe, backend=self._backend)
         options = {"backend": self._backend}
         return (self._renderer(self.scene, camera, self.recipe, **options) for camera in cameras)

@@ -39,14 +39,11 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.utils.data import get_worker_info
 
+from augment.output.box_tables import BoxWeather
+from augment.output.box_weather import box_tables, combine_visibility
+from augment.output.calibration import CameraRecord
+from augment.output.codecs import depth_in_metres
 from augment.output.layout import TRUST, mask_names
-from augment.output.view_files import (
-    BoxWeather,
-    CameraRecord,
-    box_tables,
-    combine_visibility,
-    depth_in_metres,
-)
 from augment.scene.labels import Boxes, LidarSweep
 
 ImageType = Literal["float32", "uint8"]
@@ -235,7 +232,7 @@ def box_tensors(
         streak_fraction, flake_fraction
                           [B], part of its pixels that shows a streak or a flake; NaN as above
         visibility        [B], part of the box that all of this leaves visible, 0 to 1
-                          (`augment.output.view_files.combine_visibility`)
+                          (`augment.output.box_weather.combine_visibility`)
 
     Values are None without the weather that they measure. instance, modal_xyxy, visible_fraction
     and truncated_fraction are None where the output is older than they.

@@ -42,18 +42,13 @@ from augment.dataset.samples import (
 from augment.errors import OutputError
 from augment.output.atomic import read_file
 from augment.output.box_tables import BoxNumbers
+from augment.output.box_weather import box_tables
+from augment.output.calibration import CameraRecord, read_camera, read_entries
+from augment.output.codecs import decode_image, decode_png
 from augment.output.layout import mask_names, path_kinds, resolve_inside
 from augment.output.manifest import OK, concat_rows, read_manifest_rows, weather_columns
 from augment.output.store import Store, StoredFileMissing, open_store
 from augment.output.tables import read_boxes, read_lidar
-from augment.output.view_files import (
-    CameraRecord,
-    box_tables,
-    decode_image,
-    decode_png,
-    read_camera,
-    read_entries,
-)
 
 pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import
 

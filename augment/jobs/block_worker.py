@@ -25,7 +25,7 @@ from augment.jobs.blocks import Block, SceneRecord
 from augment.jobs.pools import OutcomeCallback
 from augment.jobs.processes import file_lock
 from augment.jobs.render_job import RenderJob, SceneLoader, file_folders, run_job
-from augment.jobs.worker import Outcome, Renderer, TaskFailed, WorkTimes, describe_error
+from augment.jobs.worker import Outcome, TaskFailed, WorkTimes, describe_error
 from augment.output.atomic import (
     copy_file,
     link_file,
@@ -33,6 +33,7 @@ from augment.output.atomic import (
     raise_output_error,
     remove_temporaries,
 )
+from augment.output.box_weather import box_tables
 from augment.output.claims import CLAIMS_FOLDER, hold_claim, try_claim
 from augment.output.layout import (
     MANIFEST_FILE,
@@ -57,10 +58,10 @@ from augment.output.manifest import (
     write_manifest,
 )
 from augment.output.store import LocalStore, Store, StoredFileMissing, open_store
-from augment.output.view_files import box_tables
 from augment.scene.scene import Scene
 from augment.view.quality import CHOICES_FOLDER as QUALITY
 from augment.view.quality import choose_settings
+from augment.view.results import Renderer
 from recipes.schema import Recipe
 
 # ---- Publishing: moves a block from the folder it was rendered in to the output ------------------

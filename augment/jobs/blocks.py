@@ -22,6 +22,7 @@ from pydantic import Field, TypeAdapter
 import augment
 from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.output.atomic import read_file
+from augment.output.calibration import RECORDED
 from augment.output.claims import CLAIMS_FOLDER, try_claim
 from augment.output.layout import (
     MANIFEST_FILE,
@@ -34,10 +35,10 @@ from augment.output.layout import (
 )
 from augment.output.manifest import OK, Identity, ImageFacts, Part, list_parts, read_manifest
 from augment.output.store import Store
-from augment.output.view_files import RECORDED, SceneIndex, has_lidar, select_frames
 from augment.photo.trust import judge_scene, source_views, unfitted_cameras
 from augment.scene.cameras import scaled_size
 from augment.scene.scene import Scene
+from augment.scene.scene_index import SceneIndex, has_lidar, select_frames
 from recipes.job import ALL_CAMERAS, JobRecipes, JobScene
 from recipes.schema import Recipe, parse_frames
 

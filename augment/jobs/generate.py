@@ -39,11 +39,12 @@ from augment.jobs.block_worker import (
 )
 from augment.jobs.blocks import Block, JobPlan, SceneRecord, make_job_plan, select_shard, store_plan
 from augment.jobs.pools import ProcessPool, RayPool, SerialPool, Work, WorkerPool, run_tasks
-from augment.jobs.processes import available_cores, renders_on_gpu
+from augment.jobs.processes import available_cores
 from augment.jobs.render_job import RenderJob, SceneLoader, lacks_recipe, run_job, write_recipe
 from augment.jobs.scene_changes import SceneChange, changes_in
 from augment.jobs.worker import WORKERS, Outcome, TaskFailed
 from augment.output.atomic import raise_output_error
+from augment.output.calibration import RECORDED
 from augment.output.claims import try_claim
 from augment.output.layout import (
     MANIFEST_FILE,
@@ -71,9 +72,9 @@ from augment.output.manifest import (
     rows_without_files,
 )
 from augment.output.store import Store, StoredFileMissing, open_store
-from augment.output.view_files import RECORDED
 from augment.photo.trust import magnification_sentence, skipped_cameras_sentence
 from augment.progress import ProgressBar
+from augment.render.backends import renders_on_gpu
 from augment.render.buffers import AUTO, CUDA
 from augment.scene.scene import Scene
 from augment.view.quality import Question, read_choice

@@ -37,6 +37,8 @@ from augment.output.atomic import (
     write_atomic,
 )
 from augment.output.box_tables import BoxNumbers, Item
+from augment.output.box_weather import box_tables
+from augment.output.calibration import calibration_bytes, frame_entry, read_entries
 from augment.output.claims import hold_claim
 from augment.output.layout import (
     MANIFEST_FILE,
@@ -70,14 +72,8 @@ from augment.output.manifest import (
 )
 from augment.output.store import open_store
 from augment.output.tables import FrameBoxes, boxes_bytes, read_boxes
-from augment.output.view_files import (
-    SceneIndex,
-    box_tables,
-    calibration_bytes,
-    frame_entry,
-    read_entries,
-)
 from augment.scene.cameras import Frame
+from augment.scene.scene_index import SceneIndex
 from recipes.schema import Recipe
 
 _log = logging.getLogger(__name__)

@@ -34,6 +34,7 @@ from augment.effects.lidar.codes import drop_lost_returns
 from augment.errors import AdapterError, OutputError
 from augment.files.image_size import read_image_header
 from augment.jobs.placed_files import ANY_SIZE, PlacedFile, PlacedFiles, digest_of
+from augment.jobs.write_pump import WritePump
 from augment.output.atomic import (
     copy_file,
     flush_folder,
@@ -46,10 +47,10 @@ from augment.output.atomic import (
     write_atomic,
     write_file_atomically,
 )
+from augment.output.codecs import decode_image, encode_image
 from augment.output.layout import folder_name, parse_errors_as_output_errors, resolve_inside
 from augment.output.manifest import OK
 from augment.output.tables import read_lidar
-from augment.output.view_files import WritePump, decode_image, encode_image
 from augment.scene.cameras import Frame
 from augment.scene.labels import LabelSource, StoresLidar
 from recipes.load import load_recipe

@@ -1,7 +1,7 @@
-"""Processes of jobs: choice of the backend, child processes, the output's lock, a shared scene.
+"""Processes of jobs: child processes, interrupts, the output's lock, a shared scene.
 
-`pools` starts worker processes with it, and `render_job` shares an open scene with them. `augment`
-and `tools` ask it for cores and backends.
+`pools` starts worker processes with it, and `render_job` shares an open scene with them. `tools`
+and `adapters` ask it for cores.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import reduction, resource_tracker
 from multiprocessing.connection import Connection, wait
@@ -30,7 +30,7 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 import torch
 
-from augment.errors import BackendUnavailable, ClimateGSError, OutputError
+from augment.errors import ClimateGSError, OutputError
 from augment.output.atomic import (
     MAX_MARK_BYTES,
     lock_holder,
@@ -42,72 +42,9 @@ from augment.output.atomic import (
     wait_for_lock,
 )
 from augment.output.layout import STATE_FOLDER
-from augment.render.buffers import AUTO, BACKENDS, CPU, CUDA, REFERENCE, import_cpu, import_cuda
+from augment.render.threads import wait_for_result
 from augment.scene.cameras import Frame
 from augment.scene.scene import Scene
-
-# ---- Choice of the rasteriser's backend ----------------------------------------------------------
-
-
-def choose_backend(backend: str, scene: Scene, *, gpu: bool = True) -> str:
-    """Return the backend that will render the scene: `auto` resolved, any other name checked.
-
-    It is resolved once for the whole job, so that a resumed job cannot mix backends in one folder.
-
-    Args:
-        backend: Name of a backend, or `auto`, which takes the GPU where there is one.
-        gpu: If False, `auto` never takes the GPU.
-
-    Raises:
-        ValueError: There is no such backend.
-        BackendUnavailable: It cannot run on this machine.
-    """
-    from augment.render.cuda.runtime import has_gpu
-
-    if backend == AUTO:  # imports only what it uses: no triton without a GPU
-        means = [scene.background.means, *(actor.gaussians.means for actor in scene.actors)]
-        is_plain = all(m.dtype == torch.float32 and not m.requires_grad for m in means)
-        if is_plain and gpu and has_gpu():
-            return CUDA
-        try:
-            import_cpu()
-        except BackendUnavailable:
-            return REFERENCE
-        return CPU if is_plain else REFERENCE
-    if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
-    if backend == CPU:
-        import_cpu()
-    if backend == CUDA:  # only this name initialises the GPU
-        import_cuda()
-    return backend
-
-
-def gpu_is_lost(backend: str) -> bool:
-    """Return True if the GPU no longer answers this process, as after a faulty kernel.
-
-    Every later call to the GPU fails then. Waits for the GPU.
-    """
-    if backend != CUDA or not torch.cuda.is_initialized():
-        return False
-    try:
-        torch.cuda.synchronize()
-    except RuntimeError:
-        return True
-    return False
-
-
-def renders_on_gpu(backend: str) -> bool:
-    """Return True if a job that names this backend renders on a GPU.
-
-    `auto` does so where there is one.
-    """
-    if backend == AUTO:
-        from augment.render.cuda.runtime import has_gpu
-
-        return has_gpu()
-    return backend == CUDA
-
 
 Result = TypeVar("Result")
 # Longest turn of a thread at Python beside a thread that launches kernels, seconds.
@@ -312,18 +249,6 @@ def run_uninterrupted(call: Callable[[], Result]) -> Result:
         return call()
     with ThreadPoolExecutor(1) as pool:
         return wait_for_result(pool.submit(call))
-
-
-def wait_for_result(future: Future[Result]) -> Result:
-    """Return the future's result.
-
-    An interrupt in `future.result()` can end as a RuntimeError of its lock, if it comes when the
-    lock has just been released; a SimpleQueue has no such moment.
-    """
-    queue = SimpleQueue()
-    future.add_done_callback(queue.put)
-    queue.get()
-    return future.result()
 
 
 def sender(connection: Connection) -> Callable[[Any], None]:

@@ -26,18 +26,11 @@ from augment.effects import JobContext, precompute_effects
 from augment.errors import ClimateGSError, OutputError
 from augment.jobs.job_state import BoxCache, JobState
 from augment.jobs.pools import ProcessPool, SerialPool, Work, WorkerPool, run_tasks
-from augment.jobs.processes import (
-    OutputLock,
-    SharedScene,
-    check_sendable,
-    choose_backend,
-    share_scene,
-)
+from augment.jobs.processes import OutputLock, SharedScene, check_sendable, share_scene
 from augment.jobs.worker import (
     WORKERS,
     Chunk,
     Outcome,
-    Renderer,
     RenderSetup,
     SceneSetup,
     TaskFailed,
@@ -45,15 +38,19 @@ from augment.jobs.worker import (
 )
 from augment.memo import memo_of
 from augment.output.atomic import path_below, read_file, write_atomic
+from augment.output.calibration import trajectory_id
 from augment.output.layout import MANIFEST_FILE, STATE_FOLDER, folder_name, variant_name
 from augment.output.manifest import FAILED, OK, Identity
 from augment.output.store import open_store
-from augment.output.view_files import SceneIndex, select_frames, trajectory_id, uses_boxes
 from augment.photo.recorded_base import check_photos
 from augment.progress import ProgressBar
+from augment.render.backends import choose_backend
 from augment.scene.cameras import Frame
 from augment.scene.scene import Scene
+from augment.scene.scene_index import SceneIndex, select_frames
+from augment.view.box_labels import uses_boxes
 from augment.view.quality import choose_settings
+from augment.view.results import Renderer
 from recipes.fields import section_at, with_unchecked_field
 from recipes.files import read_files, with_digest
 from recipes.load import dump_recipe

@@ -16,37 +16,29 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from augment.errors import GpuLost, OutputError
-from augment.jobs.processes import (
-    InheritedLock,
-    available_cores,
-    gpu_is_lost,
-    renders_on_gpu,
-    shorten_switch_interval,
-)
+from augment.jobs.processes import InheritedLock, available_cores, shorten_switch_interval
+from augment.jobs.view_files import write_view
+from augment.jobs.write_pump import WritePump
 from augment.memo import memo_of
 from augment.output.atomic import write_atomic
+from augment.output.box_tables import BoxWeather
 from augment.output.layout import item_paths, variant_name
 from augment.output.manifest import FAILED, OK
 from augment.output.tables import lidar_bytes, read_lidar_note
-from augment.output.view_files import (
-    BoxWeather,
-    ViewResult,
-    WritePump,
-    check_view,
-    label_view,
-    uses_boxes,
-    write_view,
-)
+from augment.render.backends import gpu_is_lost, renders_on_gpu
 from augment.scene.box_estimates import evidence_of
 from augment.scene.boxes import Instances
 from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import Boxes, LidarSweep
 from augment.scene.scene import Scene
+from augment.view.box_labels import label_view, uses_boxes
+from augment.view.render_view import ViewPool
+from augment.view.results import Pending, Renderer, ViewResult, check_view
 from recipes.schema import Recipe
 
 # ---- Where a job's time goes: seconds by kind of work, and the kind that bounds the job ----------
@@ -213,24 +205,6 @@ MESSAGE_LENGTH = 500
 _log = logging.getLogger(__name__)
 
 
-@runtime_checkable
-class Renderer(Protocol):
-    """Function that renders an image: `render_view`, `begin_view`, or a stand-in.
-
-    It returns a ViewResult, or a pending one; in the second case a job begins the next view before
-    it waits.
-    """
-
-    def __call__(self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> Any: ...
-
-
-@runtime_checkable
-class Pending(Protocol):
-    """View whose rendering has begun; `augment.view.render_view.PendingView` is one."""
-
-    def result(self) -> Any: ...
-
-
 @dataclass(frozen=True)
 class RenderSetup:
     """Everything that rendering needs besides scene and frames; small and picklable."""
@@ -322,16 +296,6 @@ def describe_error(error: BaseException, activity: str) -> str:
     return text if len(text) <= MESSAGE_LENGTH else text[: MESSAGE_LENGTH - 3] + "..."
 
 
-def default_renderer() -> Renderer:
-    """Return the library's renderer.
-
-    It is imported only here, because it imports the rasteriser.
-    """
-    from augment.view.render_view import render_view
-
-    return render_view
-
-
 @dataclass(frozen=True, eq=False)
 class _RenderedView:
     """Image whose rendering is done, or has begun."""
@@ -380,8 +344,6 @@ class FrameRunner:
         self._setup = setup
         self._views = None
         if renderer is None:
-            from augment.view.render_view import ViewPool  # imports the rasteriser
-
             self._views = ViewPool(scene, setup.backend)
             renderer = self._views.begin
         self._renderer: Renderer = renderer

@@ -19,9 +19,11 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from queue import SimpleQueue
+from typing import TypeVar
 
 import numba
 import torch
@@ -30,6 +32,8 @@ from torch.utils.data import get_worker_info
 from augment.errors import BackendUnavailable
 
 logger = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
 
 # File name of TBB's library.
 TBB_LIBRARY = "libtbb.so.12"
@@ -222,3 +226,15 @@ def _container_cores() -> int | None:
     if not quota.isdigit() or not period.isdigit():  # "max" and -1: no quota
         return None
     return max(1, math.ceil(int(quota) / max(int(period), 1)))
+
+
+def wait_for_result(future: Future[Result]) -> Result:
+    """Return the future's result.
+
+    An interrupt in `future.result()` can end as a RuntimeError of its lock, if it comes when the
+    lock has just been released; a SimpleQueue has no such moment.
+    """
+    queue = SimpleQueue()
+    future.add_done_callback(queue.put)
+    queue.get()
+    return future.result()

@@ -2,7 +2,7 @@
 
 In: the labelled boxes of a frame, their outlines and occlusion in an image (`augment.scene.boxes`),
 and the frame's LiDAR. Out: `estimate_boxes` gives the pixels of such boxes;
-`augment.output.view_files` writes them into label tables.
+`augment.view.box_labels` puts them into label tables.
 
 A few returns of a far car make no surface: the depth there is that of other splats, before it or
 behind it. Its LiDAR returns still prove that nothing hides it. Such a box is taken to show the

@@ -1,7 +1,7 @@
 """Labelled boxes in images: their pixels, 2D outlines, occlusion, and numbers in instance images.
 
 In: the labelled boxes of a frame, a camera and the depth of a rendered view. Out: counts of pixels,
-2D boxes and instance numbers, as the label tables of jobs hold them (`augment.output.view_files`);
+2D boxes and instance numbers, as the label tables of jobs hold them (`augment.view.box_labels`);
 effects count pixels of their masks here.
 """
 

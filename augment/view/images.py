@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -24,9 +23,7 @@ from augment.scene.scene import PosedGaussians
 from augment.scene.semantics import SemanticClass
 from augment.timing import timed
 from augment.view.plan import Plan
-
-if TYPE_CHECKING:
-    from augment.view.render_view import WeatheredBuffers
+from augment.view.results import WeatheredBuffers
 
 _MASK = "mask "
 """Prefix that tells masks from the other images among the downloaded ones."""
@@ -34,7 +31,7 @@ _MASK = "mask "
 
 @dataclass(frozen=True, eq=False)
 class ViewImages:
-    """Images of one view, as the fields of `augment.view.render_view.WeatheredView`."""
+    """Images of one view, as the fields of `augment.view.results.WeatheredView`."""
 
     rgb: np.ndarray
     """The picture, uint8 [H, W, 3]."""

@@ -24,16 +24,17 @@ import numpy as np
 import augment
 from augment.effects import JobContext, precompute_effects
 from augment.errors import SceneError
-from augment.jobs.worker import Renderer, default_renderer
 from augment.memo import memo_of
 from augment.metrics.image import flip
+from augment.output.calibration import trajectory_id
 from augment.output.claims import hold_claim
 from augment.output.layout import STATE_FOLDER, parse_errors_as_output_errors
 from augment.output.store import Store, StoredFileMissing
-from augment.output.view_files import trajectory_id
 from augment.progress import ProgressBar
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import Scene
+from augment.view.render_view import render_view
+from augment.view.results import Renderer
 from recipes.fields import with_unchecked_field
 from recipes.schema import KNOBS, Recipe, Value, free_knobs, with_settings
 
@@ -76,7 +77,7 @@ def render_trial(
         RecipeError: The recipe is not resolved.
     """
     start_s = perf_counter()
-    view = (renderer or default_renderer())(scene, camera, recipe, backend=backend)
+    view = (renderer or render_view)(scene, camera, recipe, backend=backend)
     seconds = perf_counter() - start_s
     width, height = size or (camera.width, camera.height)
     depth = view.depth_m

@@ -11,28 +11,27 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment import effects
 from augment.detail.prune import prune_parts
 from augment.effects.effect import LabelInputs, RenderedView
-from augment.jobs.processes import choose_backend, renders_on_gpu, wait_for_result
 from augment.output.layout import TRUST
 from augment.photo.own_car import own_car_mask
 from augment.photo.recorded_base import open_photo
 from augment.photo.trust import trust_mask
+from augment.render.backends import choose_backend, renders_on_gpu
 from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
 from augment.render.composite import apply_color_map
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.render.sensor import add_noise, blur_lens
-from augment.render.threads import num_concurrent_views, split_threads
+from augment.render.threads import num_concurrent_views, split_threads, wait_for_result
 from augment.scene.cameras import Camera
 from augment.scene.scene import PosedGaussians, Scene
 from augment.timing import timed
@@ -46,6 +45,13 @@ from augment.view.plan import (
     ViewPlan,
     make_plan,
     plan_view,
+)
+from augment.view.results import (
+    BareBuffers,
+    LabelSurfaces,
+    PendingView,
+    WeatheredBuffers,
+    WeatheredView,
 )
 from recipes.schema import Recipe
 
@@ -277,114 +283,6 @@ def _surface_view(
         is_bare=is_bare,
         own_car=own_car,
     )
-
-
-# ---- What a view consists of ---------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class BareBuffers:
-    """Buffers of the scene without what effects laid on it (snow, for example)."""
-
-    raster: RenderOutput
-    """Buffers of the bare surfaces, without colours."""
-    depth_m: Float[Tensor, "H W"] | None
-    """z of the bare surfaces, metres, 0 where there is none; None unless planned."""
-    parts: tuple[PosedGaussians, ...]
-    """The rendered parts, in the order in which splat_ids count their splats."""
-
-
-@dataclass(frozen=True, eq=False)
-class WeatheredBuffers:
-    """One finished view as float tensors."""
-
-    camera: Camera
-    """The camera of the view, at the rendered resolution."""
-    rgb: Float[Tensor, "H W 3"]
-    """The picture: display-encoded, not clamped, sky included."""
-    raster: RenderOutput
-    """Buffers of the scene's surfaces, snow included. With water in view they are those under the
-    water, too, and without colours."""
-    depth_m: Float[Tensor, "H W"] | None
-    """z of the scene's surface, metres, 0 where there is none; None unless planned."""
-    parts: tuple[PosedGaussians, ...]
-    """The rendered parts, in the order in which splat_ids count their splats."""
-    plan: ViewPlan
-    """The passes that were carried out."""
-    masks: Mapping[str, Bool[Tensor, "H W"]] = field(default_factory=dict)
-    """Pixels that show an effect, by the effect's mask name; only effects that can be in view."""
-    bare_buffers: BareBuffers | None = None
-    """Buffers of the scene without what lies on it; None unless planned."""
-
-
-@dataclass(frozen=True, eq=False)
-class LabelSurfaces:
-    """Surfaces of one view that labels are measured from.
-
-    Depths are float32 [H, W], z in metres, 0 = none.
-    """
-
-    depth_m: np.ndarray
-    """Depth of the first solid surface: snow counts, water does not."""
-    actor_instance: np.ndarray | None
-    """Instance image of those surfaces, uint16 [H, W], actors only; None where there is none."""
-    instance_depth_m: np.ndarray | None
-    """Depth of the surfaces that the view's instance image shows; None without one."""
-    instance_classes: np.ndarray | None
-    """Classes of the surfaces that the view's instance image shows; None without one."""
-    is_bare: bool
-    """If True, `instance_depth_m` and `instance_classes` are without what lies on the scene."""
-    classes: np.ndarray | None = None
-    """Classes of the surfaces of `depth_m`, uint8 [H, W]; None where no image shows them."""
-    own_car: np.ndarray | None = None
-    """Pixels of a recorded picture that show the recording car, of which the scene has no surfaces,
-    bool [H, W]; None where it shows none."""
-
-
-@dataclass(frozen=True, eq=False)
-class WeatheredView:
-    """One finished view as it is written to files."""
-
-    camera: Camera
-    """The camera of the view, at the rendered resolution."""
-    rgb: np.ndarray
-    """The picture, uint8 [H, W, 3]."""
-    depth_m: np.ndarray | None
-    """Depth, float32 [H, W], metres, 0 = none; None unless planned."""
-    semantic: np.ndarray | None
-    """SemanticClass of each pixel, uint8 [H, W]; None unless planned."""
-    instance: np.ndarray | None
-    """Instance of each pixel, uint16 [H, W]: 0 = background or sky, else 1 + the actor's index in
-    the scene (`augment.output.view_files.label_view` adds boxes without an actor)."""
-    masks: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Masks by name, uint8 [H, W]: 255 where the pixel shows the effect, else 0; TRUST holds 0 to
-    255."""
-    effects: Mapping[str, LabelInputs] = field(default_factory=dict)
-    """Inputs of the effects' own labels, for every effect that the recipe has, by name."""
-    surface: LabelSurfaces | None = None
-    """Surfaces that boxes are measured from; None where nobody asks for boxes."""
-
-
-class PendingView:
-    """A view that was begun.
-
-    On a GPU it may still be computed; other backends have finished it.
-    """
-
-    def __init__(self, finish: Callable[[], WeatheredView]) -> None:
-        self._finish: Callable[[], WeatheredView] | None = finish
-        self._view: WeatheredView | None = None
-
-    def result(self) -> WeatheredView:
-        """Return the finished view, the same one at every call, and wait for it where needed.
-
-        Only one thread at a time may call this.
-        """
-        if self._finish is not None:
-            self._view = self._finish()
-            self._finish = None
-        assert self._view is not None
-        return self._view
 
 
 # ---- Several views at once -----------------------------------------------------------------------

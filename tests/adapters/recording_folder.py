@@ -14,7 +14,7 @@ import pandaset_folder as street
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from augment.output.view_files import encode_depth
+from augment.output.codecs import encode_depth
 
 # PandaSet's class numbers of the street's returns, by name of SemanticClass.
 CLASSES = {"7": "road", "41": "building", "13": "vehicle"}

@@ -28,8 +28,8 @@ from adapters.gaussian_files import (
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.errors import AdapterError, SceneError
 from augment.files.ply import write_ply, write_splat
-from augment.output.view_files import check_frames
 from augment.scene.scene import Gaussians
+from augment.scene.scene_index import check_frames
 
 TO_Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z-up world to COLMAP's usual y-down
 

@@ -20,11 +20,11 @@ from adapters.kitti.adapter import ATTRIBUTES, boxes_at, find_source, kitti_labe
 from adapters.kitti.files import kitti_root, oxts_poses, registered_poses
 from adapters.uri import format_uri
 from augment.errors import AdapterError
-from augment.output.view_files import label_view
 from augment.scene.box_estimates import evidence_of
 from augment.scene.boxes import instances_of
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import Scene
+from augment.view.box_labels import label_view
 from augment.view.render_view import render_view
 from recipes.schema import Output, Recipe, Render
 

@@ -32,7 +32,7 @@ from augment.scene.labels import Boxes, LidarSweep
 from augment.scene.scene import Gaussians, Scene
 from augment.scene.semantics import SemanticClass
 from augment.scene.sky import ConstantSky
-from augment.view.render_view import LabelSurfaces
+from augment.view.results import LabelSurfaces
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow

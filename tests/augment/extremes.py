@@ -28,7 +28,8 @@ from augment.scene.scene import Actor, Gaussians, Ground, Scene, Track
 from augment.scene.semantics import SemanticClass
 from augment.scene.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from augment.view.plan import make_plan
-from augment.view.render_view import WeatheredBuffers, WeatheredView, render_buffers, render_view
+from augment.view.render_view import render_buffers, render_view
+from augment.view.results import WeatheredBuffers, WeatheredView
 from recipes.schema import Recipe
 from tests.augment.hard_scenes import examples
 from tests.snow_scenes import box_car, drive, sheet, side_wall, wall

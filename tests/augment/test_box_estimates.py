@@ -10,14 +10,14 @@ import pytest
 from batch_scenes import ORIGIN_M
 from box_views import UPRIGHT, make_boxes, make_camera
 
-from augment.output.box_tables import BOXES_2D, BoxNumbers
-from augment.output.view_files import BoxWeather, label_view
+from augment.output.box_tables import BOXES_2D, BoxNumbers, BoxWeather
 from augment.scene.box_estimates import Evidence, SortedPoints, estimate_boxes
 from augment.scene.boxes import Instances, WorldBoxes, find_occlusion, outline_world_boxes
 from augment.scene.cameras import Camera
 from augment.scene.labels import Boxes
 from augment.scene.semantics import SemanticClass
-from augment.view.render_view import LabelSurfaces, WeatheredView
+from augment.view.box_labels import label_view
+from augment.view.results import LabelSurfaces, WeatheredView
 from recipes.schema import Output, Recipe, Render
 
 CAR = ((30.0, 0.0, 0.75), (4.0, 1.8, 1.5), UPRIGHT)

@@ -17,15 +17,16 @@ from augment.dataset.samples import box_tensors, buffers
 from augment.errors import AdapterError
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.output.box_tables import BoxNumbers, BoxWeather
+from augment.output.box_weather import box_tables
 from augment.output.manifest import read_manifest
 from augment.output.tables import read_boxes
-from augment.output.view_files import box_tables, label_view, measure_boxes
 from augment.scene.boxes import MAX_INSTANCE, Instances, instances_of
 from augment.scene.cameras import Camera
 from augment.scene.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat
 from augment.scene.labels import Boxes
 from augment.scene.scene import Gaussians, Scene
 from augment.scene.semantics import SemanticClass
+from augment.view.box_labels import label_view, measure_boxes
 from augment.view.render_view import render_view
 from recipes.schema import Output, Recipe, Render, Weather
 from recipes.snow import Snow

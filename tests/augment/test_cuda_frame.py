@@ -33,7 +33,8 @@ from augment.scene.labels import Boxes
 from augment.scene.scene import Ground, Scene
 from augment.scene.semantics import SemanticClass
 from augment.scene.sky import ConstantSky, CubemapSky, LatLongSky, Sky
-from augment.view.render_view import WeatheredView, begin_view, render_view
+from augment.view.render_view import begin_view, render_view
+from augment.view.results import WeatheredView
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style

@@ -22,7 +22,8 @@ from augment.scene.cameras import Camera
 from augment.scene.scene import Actor, Gaussians, Track
 from augment.scene.semantics import SemanticClass
 from augment.view.plan import make_plan
-from augment.view.render_view import WeatheredView, render_buffers, render_view
+from augment.view.render_view import render_buffers, render_view
+from augment.view.results import WeatheredView
 from recipes.errors import RecipeError
 from recipes.load import parse_recipe
 from recipes.schema import Recipe

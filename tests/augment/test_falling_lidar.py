@@ -32,9 +32,9 @@ from augment.effects.wet.ground import GROUND_CELL_M, WetGround
 from augment.effects.wet.kernels import EXPOSURE, NUM_CHANNELS, PUDDLE_ORDER
 from augment.effects.wet.lidar import dim_wet_echoes, wet_echo_ratio
 from augment.jobs.render_job import RenderJob, run_job
+from augment.output.box_weather import box_tables, combine_visibility
 from augment.output.manifest import effect_masks, read_manifest
 from augment.output.tables import lidar_bytes
-from augment.output.view_files import box_tables, combine_visibility
 from augment.render.fog import Fog
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes
 from augment.scene.labels import Boxes

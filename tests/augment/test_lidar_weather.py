@@ -40,7 +40,8 @@ from augment.output.tables import lidar_bytes, read_lidar
 from augment.scene.cameras import Camera
 from augment.scene.labels import LidarSweep
 from augment.scene.scene import Scene
-from augment.view.render_view import WeatheredView, render_view
+from augment.view.render_view import render_view
+from augment.view.results import WeatheredView
 from augment.view.weathered_sweep import weathered_sweep
 from recipes.flood import Flood, Waves
 from recipes.schema import Recipe, Smog, Weather

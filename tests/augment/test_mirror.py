@@ -20,7 +20,7 @@ from augment.errors import AdapterError, OutputError
 from augment.jobs import mirror as mirror_module
 from augment.jobs.mirror import dataset_format, mirror_folder, read_record, weathered_images
 from augment.output.atomic import TEMPORARY_SUFFIX
-from augment.output.view_files import decode_image
+from augment.output.codecs import decode_image
 
 
 @pytest.fixture

@@ -25,7 +25,8 @@ from augment.render.threads import (
 )
 from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, Scene
-from augment.view.render_view import ViewPool, WeatheredView, begin_view, render_view, render_views
+from augment.view.render_view import ViewPool, begin_view, render_view, render_views
+from augment.view.results import WeatheredView
 from recipes.flood import Flood
 from recipes.rain import Rain
 from recipes.schema import Output, Recipe, Render, Weather

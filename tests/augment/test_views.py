@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from augment.output.view_files import measure_boxes
 from augment.render.constants import RasterSettings
 from augment.render.reference import half_extents, project_parts
 from augment.scene.bounds import Bounds, bound_squares, may_show
@@ -20,6 +19,7 @@ from augment.scene.scene import Actor, Gaussians, Ground, PosedGaussians, Scene,
 from augment.scene.semantics import SemanticClass
 from augment.scene.sky import ConstantSky, CubemapSky
 from augment.view import render_view as apply
+from augment.view.box_labels import measure_boxes
 from augment.view.plan import ViewPlan, make_plan, plan_view
 from augment.view.render_view import render_buffers, render_view
 from recipes.flood import Flood, Waves

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from augment.output.box_weather import box_tables
+from augment.output.codecs import encode_depth, encode_ids, encode_image
 from augment.output.layout import path_kinds
 from augment.output.manifest import rows_to_table, write_manifest
 from augment.output.tables import FrameBoxes, boxes_bytes, parquet_bytes
-from augment.output.view_files import box_tables, encode_depth, encode_ids, encode_image
 from augment.scene.labels import Boxes
 from recipes.schema import Output
 

@@ -14,15 +14,10 @@ from walls import FRAME_NS, board_boxes, driving_camera, wall_view
 
 from augment.errors import OutputError
 from augment.metrics.lpips import ALEX, expected_shapes
+from augment.output.calibration import frame_entry
+from augment.output.codecs import encode_depth, encode_ids, encode_image, encode_mask
 from augment.output.manifest import rows_to_table, write_manifest
 from augment.output.tables import boxes_bytes
-from augment.output.view_files import (
-    encode_depth,
-    encode_ids,
-    encode_image,
-    encode_mask,
-    frame_entry,
-)
 from augment.render.sensor import add_noise
 from augment.scene.cameras import Frame
 from recipes.load import dump_recipe

@@ -20,10 +20,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from augment.errors import OutputError
+from augment.output.box_weather import box_tables, combine_visibility
 from augment.output.layout import MANIFEST_FILE
 from augment.output.manifest import publish_part, rows_to_table, write_manifest
 from augment.output.store import LocalStore
-from augment.output.view_files import box_tables, combine_visibility
 from tests.tools.report_outputs import make_row, street_rows, write_output
 from tools import drawing, report
 from tools.cli import main

@@ -32,14 +32,16 @@ from augment.files.scene_file import save_scene, save_scene_file
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.blocks import Block, read_status
 from augment.jobs.generate import BlockWork, GenerateJob, Workers, plan_job, run_generate
+from augment.jobs.write_pump import WritePump
+from augment.output.codecs import encode_depth, encode_image
 from augment.output.layout import variant_name
 from augment.output.manifest import compact
 from augment.output.store import open_store
-from augment.output.view_files import WritePump, encode_depth, encode_image
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import Gaussians, Scene
 from augment.scene.sky import ConstantSky
-from augment.view.render_view import WeatheredView, render_view, render_views
+from augment.view.render_view import render_view, render_views
+from augment.view.results import WeatheredView
 from recipes.job import Job, JobRecipes
 from recipes.load import load_recipe, parse_recipe
 from recipes.schema import Recipe

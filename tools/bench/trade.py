@@ -45,11 +45,10 @@ from adapters.procedural import open_truth
 from augment import effects
 from augment.detail.prune import precompute_errors
 from augment.errors import ClimateGSError, SceneError
-from augment.jobs.worker import default_renderer
 from augment.memo import memo_of
 from augment.metrics.consistency import DepthView, warp_view
 from augment.metrics.image import depth_errors, flip, ssim
-from augment.output.view_files import decode_image, encode_image
+from augment.output.codecs import decode_image, encode_image
 from augment.render.buffers import CPU, CUDA
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.cpu.driver import free_scratch
@@ -542,7 +541,7 @@ def setting_rows(
 
     def frame(trial_recipe: Recipe, camera: Camera) -> harness.Action:
         """Return an action that renders a frame without enlarging it to the full resolution."""
-        return functools.partial(default_renderer(), scene, camera, trial_recipe, backend=backend)
+        return functools.partial(render_view, scene, camera, trial_recipe, backend=backend)
 
     for start in range(1, max(len(settings), 2), NUM_SETTINGS_PER_TURN):
         group = [({}, clean), settings[0], *settings[start : start + NUM_SETTINGS_PER_TURN]]

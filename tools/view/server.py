@@ -31,11 +31,12 @@ import numpy as np
 from adapters.base import open_scene
 from adapters.camera_files.paths import frames_from_path_file
 from augment.errors import ClimateGSError
-from augment.jobs.processes import choose_backend
 from augment.output.atomic import write_new_file
-from augment.output.view_files import check_frames, encode_image
+from augment.output.codecs import encode_image
+from augment.render.backends import choose_backend
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
+from augment.scene.scene_index import check_frames
 from augment.timing import PassProgress, stopwatch, watched
 from augment.view.plan import make_plan, plan_view
 from augment.view.render_view import render_view
