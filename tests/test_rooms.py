@@ -39,7 +39,6 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "augment.files.stated_sizes",
         "augment.output.atomic",
         "augment.output.box_tables",
-        "augment.output.codecs",
         "augment.output.tables",
     ),
     "files": ("augment.files",),

@@ -1,4 +1,4 @@
-"""The choice of the backend that renders, once for a whole job, a viewer or a live dataset.
+"""The backends that work here, and the choice of one, once for a job, a viewer or a live dataset.
 
 In: the name of a backend or `auto`, and a scene. Out: the name of a backend that works here.
 `augment.render.rasterize` chooses for a single picture, from the tensors that it gets.
@@ -6,10 +6,12 @@ In: the name of a backend or `auto`, and a scene. Out: the name of a backend tha
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import torch
 
 from augment.errors import BackendUnavailable
-from augment.render.buffers import AUTO, BACKENDS, CPU, CUDA, REFERENCE, import_cpu, import_cuda
+from augment.render.buffers import AUTO, BACKENDS, CPU, CUDA, REFERENCE
 from augment.scene.scene import Scene
 
 
@@ -71,3 +73,44 @@ def gpu_is_lost(backend: str) -> bool:
     except RuntimeError:
         return True
     return False
+
+
+def available_backends() -> dict[str, str | None]:
+    """Return every backend but "auto": None if it can run here, else the reason why it cannot."""
+    obstacles: dict[str, str | None] = {REFERENCE: None, CPU: None, CUDA: None}
+    for backend, import_backend in ((CPU, import_cpu), (CUDA, import_cuda)):
+        try:
+            import_backend()
+        except BackendUnavailable as error:
+            obstacles[backend] = str(error)
+    return obstacles
+
+
+def import_cpu() -> ModuleType:
+    """Import the numba backend.
+
+    Raises:
+        BackendUnavailable: a package is missing; the message names it.
+    """
+    try:
+        from augment.render.cpu import driver as cpu
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"backend 'cpu' is unavailable: {error}. Install the package's dependencies (numba, "
+            f"tbb), or use backend 'reference', which needs torch only and is far slower"
+        ) from error
+    return cpu
+
+
+def import_cuda() -> ModuleType:
+    """Import the Triton backend.
+
+    Raises:
+        BackendUnavailable: a package or a GPU is missing; the message names it.
+    """
+    from augment.render.cuda import runtime
+
+    runtime.require_gpu()
+    from augment.render.cuda import driver as cuda
+
+    return cuda

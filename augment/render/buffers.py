@@ -3,62 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import ModuleType
 
 import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
-from augment.errors import BackendUnavailable
-
-# ---- The rasteriser's backends by name, and the check that they can run here ---------------------
+# ---- The backends of the rasteriser by name ------------------------------------------------------
 
 AUTO = "auto"
 REFERENCE = "reference"
 CPU = "cpu"
 CUDA = "cuda"
 BACKENDS = (AUTO, REFERENCE, CPU, CUDA)
-
-
-def available_backends() -> dict[str, str | None]:
-    """Return every backend but "auto": None if it can run here, else the reason why it cannot."""
-    obstacles: dict[str, str | None] = {REFERENCE: None, CPU: None, CUDA: None}
-    for backend, import_backend in ((CPU, import_cpu), (CUDA, import_cuda)):
-        try:
-            import_backend()
-        except BackendUnavailable as error:
-            obstacles[backend] = str(error)
-    return obstacles
-
-
-def import_cpu() -> ModuleType:
-    """Import the numba backend.
-
-    Raises:
-        BackendUnavailable: a package is missing; the message names it.
-    """
-    try:
-        from augment.render.cpu import driver as cpu
-    except ImportError as error:
-        raise BackendUnavailable(
-            f"backend 'cpu' is unavailable: {error}. Install the package's dependencies (numba, "
-            f"tbb), or use backend 'reference', which needs torch only and is far slower"
-        ) from error
-    return cpu
-
-
-def import_cuda() -> ModuleType:
-    """Import the Triton backend.
-
-    Raises:
-        BackendUnavailable: a package or a GPU is missing; the message names it.
-    """
-    from augment.render.cuda import runtime
-
-    runtime.require_gpu()
-    from augment.render.cuda import driver as cuda
-
-    return cuda
 
 
 def choose_kernels(backend: str, *images: Tensor | None) -> str:

@@ -14,6 +14,7 @@ import torch
 
 from augment.detail.lod import choose_parts
 from augment.errors import BackendUnavailable
+from augment.render.backends import import_cpu, import_cuda
 from augment.render.buffers import (
     ALPHA,
     AUTO,
@@ -26,8 +27,6 @@ from augment.render.buffers import (
     RGB,
     RenderOutput,
     choose_kernels,
-    import_cpu,
-    import_cuda,
 )
 from augment.render.constants import (
     COV2D_BLUR,

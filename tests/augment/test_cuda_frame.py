@@ -21,7 +21,8 @@ pytest.importorskip("triton")
 
 from augment.exposure import placement
 from augment.exposure.placement import ExposureSettings, find_exposed_surface
-from augment.render.buffers import CUDA, RenderOutput, available_backends
+from augment.render.backends import available_backends
+from augment.render.buffers import CUDA, RenderOutput
 from augment.render.composite import apply_color_map, composite_sky, to_byte_array
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.runtime import upload

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from augment.errors import BackendUnavailable
-from augment.render import buffers as backends
+from augment.render import backends
 from augment.render import rasterize as module
 from augment.render.buffers import (
     ALPHA,

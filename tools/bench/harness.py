@@ -437,7 +437,7 @@ def check_gpu() -> None:
         BackendUnavailable: there is none.
     """
     from augment.errors import BackendUnavailable
-    from augment.render.buffers import available_backends
+    from augment.render.backends import available_backends
     from augment.render.cuda.runtime import has_gpu
 
     if not has_gpu():
