@@ -27,7 +27,7 @@ from jaxtyping import Float64, UInt8, UInt16
 
 from augment import effects
 from augment.errors import OutputError, SceneError
-from augment.files.recorded_images import decode_pixels
+from augment.files.image_size import decode_pixels
 from augment.jobs.processes import renders_on_gpu, run_uninterrupted
 from augment.output.atomic import read_file, write_atomic
 from augment.output.box_tables import (

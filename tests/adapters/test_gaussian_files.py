@@ -27,7 +27,8 @@ from adapters.gaussian_files import (
 )
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.errors import AdapterError, SceneError
-from augment.files.ply import write_ply, write_splat
+from augment.files.ply import write_ply
+from augment.files.splat import write_splat
 from augment.output.view_files import check_frames
 from augment.scene.scene import Gaussians
 

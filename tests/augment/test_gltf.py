@@ -13,16 +13,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_spz import some_gaussians
 
 from adapters.base import open_scene
 from augment.errors import SceneError
-from augment.files.export import export_glb
+from augment.files.export import export_splats
+from augment.files.formats import read_splats
 from augment.files.gltf import read_gltf, write_glb
-from augment.files.ply import read_splats, write_ply
+from augment.files.ply import write_ply
 from augment.render.sh import evaluate_sh
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import Gaussians
+from tests.augment.test_spz import some_gaussians
 
 KHR = "KHR_gaussian_splatting"
 HALF = math.sqrt(0.5)
@@ -105,7 +106,7 @@ def test_a_round_trip_keeps_floats(tmp_path: Path, bands: int) -> None:
 def test_a_scene_comes_back_upright_in_metres(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", some_gaussians())
     before = open_scene(f"gaussians:{tmp_path}/a.ply?up=+z&scale=1")
-    export_glb(before, tmp_path / "a.glb", 0)
+    export_splats(before, tmp_path / "a.glb", 0, kind="glb")
     after = open_scene(f"{tmp_path}/a.glb")  # told by its first bytes
     assert after.has_metric_scale and after.has_known_gravity
     assert torch.equal(after.background.means, before.background.means)

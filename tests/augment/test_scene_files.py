@@ -13,15 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fitted_scenes import assert_same, fitted_scene
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
-from scenes import camera_ahead, random_gaussians
 
 from augment.errors import OutputError, SceneError
-from augment.files import scene_file as tensor_files
+from augment.files import tensors as tensor_files
 from augment.files.scene_file import (
     FILES,
     is_scene_file,
@@ -36,6 +34,8 @@ from augment.render.sh import evaluate_sh
 from augment.scene.geometry import multiply_quats
 from augment.scene.scene import Actor, ColorSeries, Gaussians, Track
 from augment.scene.sky import ConstantSky, LatLongSky
+from tests.fitted_scenes import assert_same, fitted_scene
+from tests.scenes import camera_ahead, random_gaussians
 
 DIFFERENT = ("source", "labels")  # a loaded scene is opened from its folder
 

@@ -14,17 +14,17 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from fitted_scenes import START_NS, fitted_scene
 
 from adapters.base import open_scene
 from adapters.detect_format import detect_scheme
 from augment.errors import SceneError
 from augment.files import sog
-from augment.files.export import export_sog
-from augment.files.ply import read_splats
+from augment.files.export import export_splats
+from augment.files.formats import read_splats
 from augment.files.sog import read_sog, write_sog
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import Gaussians
+from tests.fitted_scenes import START_NS, fitted_scene
 
 LEVELS = [float(level) for level in range(256)]
 
@@ -185,7 +185,7 @@ def test_a_scene_comes_back_upright(tmp_path: Path) -> None:
     scene = fitted_scene(
         background=before, actors=(), has_known_gravity=True, has_metric_scale=True
     )
-    export_sog(scene, tmp_path / "street.sog", START_NS)
+    export_splats(scene, tmp_path / "street.sog", START_NS, kind="sog")
     with zipfile.ZipFile(tmp_path / "street.sog") as archive:
         archive.extractall(tmp_path / "folder")
     assert detect_scheme(tmp_path / "folder") == "gaussians"

@@ -16,16 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augment.errors import SceneError
-from augment.files.ply import (
-    iterate_rows,
-    read_ply,
-    read_ply_header,
-    read_splat,
-    read_splats,
-    recentring_origin,
-    write_ply,
-    write_splat,
-)
+from augment.files.formats import read_splats
+from augment.files.ply import iterate_rows, read_ply, read_ply_header, write_ply
+from augment.files.splat import read_splat, write_splat
+from augment.files.splat_format import recentring_origin
 from augment.scene.scene import Gaussians
 
 BASIC = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",

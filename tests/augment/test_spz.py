@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from streets import open_street
 
 from adapters.base import open_scene
 from augment.errors import SceneError
-from augment.files.export import export_ply, export_spz
-from augment.files.ply import read_splats
+from augment.files.export import export_splats
+from augment.files.formats import read_splats
 from augment.files.spz import read_spz, write_spz
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import Gaussians
+from tests.streets import open_street
 
 MAGIC = 0x5053474E
 
@@ -106,8 +106,8 @@ def test_a_scene_comes_back_upright(tmp_path: Path) -> None:
     """The file's y is up, the scene's z again; its Gaussians are those of the .ply."""
     scene = open_street()
     moment = scene.frames[0].timestamp_ns
-    export_spz(scene, tmp_path / "street.spz", moment)
-    export_ply(scene, tmp_path / "street.ply", moment)
+    export_splats(scene, tmp_path / "street.spz", moment, kind="spz")
+    export_splats(scene, tmp_path / "street.ply", moment)
     spz = open_scene(f"gaussians:{tmp_path}/street.spz?scale=1").background
     ply = open_scene(f"gaussians:{tmp_path}/street.ply?scale=1").background
     assert len(spz) == len(ply) and spz.sh_degree == ply.sh_degree

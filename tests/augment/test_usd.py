@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 import torch
 from pxr import UsdUtils
-from test_spz import some_gaussians
 
 from adapters.base import open_scene
 from augment.errors import SceneError
-from augment.files.export import export_usd
-from augment.files.ply import read_splats, write_ply
+from augment.files.export import export_splats
+from augment.files.formats import read_splats
+from augment.files.ply import write_ply
 from augment.files.usd import read_usd, write_usd
+from tests.augment.test_spz import some_gaussians
 
 SPLATS = "def ParticleField3DGaussianSplat"
 # A Gaussian at (1, 2, 3), a turn of 90 degrees about z, opacity 0.25.
@@ -51,7 +52,7 @@ def test_a_round_trip_keeps_floats(tmp_path: Path, bands: int) -> None:
 def test_a_scene_comes_back(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", some_gaussians())
     before = open_scene(f"gaussians:{tmp_path}/a.ply?up=+z&scale=1")
-    export_usd(before, tmp_path / "a.usdc", 0)
+    export_splats(before, tmp_path / "a.usdc", 0, kind="usd")
     after = open_scene(f"{tmp_path}/a.usdc")  # told by its suffix
     assert after.has_metric_scale and after.has_known_gravity
     assert torch.equal(after.background.means, before.background.means)
