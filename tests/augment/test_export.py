@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adapters.base import open_scene
-from augment.errors import OutputError, SceneError
+from augment.errors import OutputError
 from augment.files.export import (
     export_cameras,
     export_losses,
@@ -22,8 +21,6 @@ from augment.files.export import (
     inria_cameras,
     is_parts_folder,
 )
-from augment.files.formats import SplatKind, read_splats, splat_writer
-from augment.files.ply import read_ply
 from augment.render.rasterize import rasterize
 from augment.render.sh import evaluate_sh
 from augment.scene.geometry import rigid, rotmat_from_quat, transform_points
@@ -149,31 +146,6 @@ def test_shape_and_colour_turn_along(quat, shift, degree):
 # Files of one moment
 
 
-def ulps(ours: torch.Tensor, theirs: torch.Tensor) -> int:
-    """The greatest number of float32 steps between positive numbers."""
-    return int((ours.view(torch.int32).long() - theirs.view(torch.int32).long()).abs().max())
-
-
-def test_a_ply_keeps_all_but_rounding(tmp_path):
-    """Logs and logits round once, and so do their inverses: a few steps of float32 are lost."""
-    scene = drive(background=with_classes(random_gaussians(20_000, seed=9, sh_degree=3)))
-    export_splats(scene, tmp_path / "a.ply", NOW)
-    file = read_ply(tmp_path / "a.ply")
-    written, read = bake_scene(scene, NOW), file.gaussians
-    for name in ("means", "sh", "semantic"):
-        assert torch.equal(getattr(read, name), getattr(written, name)), name
-    assert 0 < ulps(read.scales, written.scales) <= 5
-    assert 0 < ulps(read.opacities, written.opacities) <= 10
-    torch.testing.assert_close(read.quats, written.quats, rtol=0, atol=2e-7)
-    assert dict(file.notes) == {"world_origin_m": "448262.0 4421337.0 -0.1"}
-    export_splats(dataclasses.replace(scene, has_metric_scale=True, has_known_gravity=True),
-               tmp_path / "a.ply", NOW)  # fmt: skip
-    assert read_ply(tmp_path / "a.ply").notes["up"] == "+z"
-    assert read_ply(tmp_path / "a.ply").notes["unit"] == "metre"
-    ours, theirs = image([PosedGaussians(written)]), image([PosedGaussians(read)])
-    assert np.quantile(differences(ours, theirs), 0.999) < 0.05
-
-
 def test_an_exported_ply_opens_as_the_scene_was(tmp_path):
     scene = drive(has_metric_scale=True, has_known_gravity=True)
     export_splats(scene, tmp_path / "a.ply", NOW)
@@ -190,25 +162,6 @@ def test_an_exported_ply_opens_as_the_scene_was(tmp_path):
     ours = image(tuple(scene.parts_at(NOW)))
     theirs = image(tuple(again.parts_at(0)))
     assert np.quantile(differences(ours, theirs), 0.999) < 2
-
-
-def test_missing_folders_are_made_and_a_file_in_their_place_is_named(tmp_path):
-    scene = drive(actors=())
-    (tmp_path / "file").write_text("")
-    for kind in get_args(SplatKind):
-        name = f"a{splat_writer(kind).suffix}"
-        export_splats(scene, tmp_path / kind / "below" / name, NOW, kind=kind)
-        assert len(read_splats(tmp_path / kind / "below" / name).gaussians) == 300
-        with pytest.raises(OutputError, match=r"cannot write .* in the way"):
-            export_splats(scene, tmp_path / "file" / "below" / name, NOW, kind=kind)
-
-
-def test_a_moment_with_nothing_in_it_is_refused(tmp_path):
-    scene = drive(background=Gaussians.empty(), actors=drive().actors[2:])
-    for kind in get_args(SplatKind):
-        with pytest.raises(SceneError, match=f"shows no Gaussians at {NOW} ns"):
-            export_splats(scene, tmp_path / "a", NOW, kind=kind)
-    assert not list(tmp_path.iterdir())
 
 
 def test_cameras_are_inrias(tmp_path):
