@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, WAYMO_REQUIRED, WAYMO_SPLITS, parse_uri
 from augment.errors import AdapterError
-from augment.files.ply import SPLAT_SUFFIXES
+from augment.files.formats import splat_names, splat_suffixes
+from augment.files.ply import PLY
 from augment.files.scene_file import is_scene_file, is_scene_folder
 from augment.files.sog import META, is_sog_folder
 from augment.files.streamed_sog import LOD_META
@@ -296,13 +297,15 @@ def _holds_splats(folder: Path) -> bool:
         return True
     if (folder / LOD_META).is_file() or is_sog_folder(folder):
         return True
-    return any(name.lower().endswith(SPLAT_SUFFIXES) for name in _names(folder))
+    return any(name.lower().endswith(splat_suffixes()) for name in _names(folder))
 
 
 def _is_splat_file(path: Path) -> bool:
     if path.name == LOD_META or (path.name == META and is_sog_folder(path.parent)):
         return True
-    return path.suffix.lower() in SPLAT_SUFFIXES[1:] or _start_of(path)[:4] in (b"ply\n", b"ply\r")
+    suffix = path.suffix.lower()
+    is_named = suffix in splat_suffixes() and suffix not in PLY.suffixes
+    return is_named or _start_of(path).startswith(PLY.first_bytes)
 
 
 def _is_multi_part(path: Path) -> bool:
@@ -356,8 +359,8 @@ FOLDERS = (
     Signature(
         "gaussians",
         _holds_splats,
-        "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply), .ply, .splat, .spz, .sog, "
-        ".glb, .gltf or .usd files, a lod-meta.json, or meta.json and images of SOG, in it",
+        f"a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply), {splat_names()} files, a "
+        f"{LOD_META}, or {META} and images of SOG, in it",
     ),
 )
 FILES = (
@@ -372,9 +375,5 @@ FILES = (
         lambda path: re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None,
         "checkpoint_*.pth of drivestudio",
     ),
-    Signature(
-        "gaussians",
-        _is_splat_file,
-        "a .ply, .splat, .spz, .sog, .glb, .gltf or .usd file or a lod-meta.json",
-    ),
+    Signature("gaussians", _is_splat_file, f"a {splat_names()} file or a {LOD_META}"),
 )

@@ -46,14 +46,15 @@ from adapters.camera_files.paths import (
 from adapters.uri import UriOptions, format_uri
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.errors import AdapterError
-from augment.files.export import concatenate_gaussians
-from augment.files.ply import SPLAT_SUFFIXES, SplatFile, read_splats, recentring_origin
+from augment.files.formats import read_splats, splat_names, splat_suffixes
 from augment.files.sog import META, is_sog_folder
+from augment.files.splat_format import SplatFile, recentring_origin
 from augment.files.streamed_sog import LOD_META
 from augment.rng import rng_for
 from augment.scene.cameras import Frame
 from augment.scene.scene import Gaussians, Scene
 from augment.scene.sky import ConstantSky
+from augment.scene.transform import concatenate_gaussians
 
 Part = Annotated[float, Field(ge=0, le=1)]
 COLOURS = {"overcast": (0.85, 0.85, 0.85), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -447,9 +448,9 @@ def find_splat_files(path: Path, options: GaussianOptions) -> tuple[Path, ...]:
     kinds = {file.suffix.lower() for file in files}
     if not files:
         raise AdapterError(
-            f"{path}: expected point_cloud/iteration_N/point_cloud.ply, a {LOD_META}, .ply, "
-            f".splat, .spz, .sog, .glb, .gltf or .usd files, or meta.json and images of SOG, in "
-            f"this folder; found none. Give the file itself"
+            f"{path}: expected point_cloud/iteration_N/point_cloud.ply, a {LOD_META}, "
+            f"{splat_names()} files, or meta.json and images of SOG, in this folder; found none. "
+            f"Give the file itself"
         )
     if len(kinds) > 1:
         names = [file.name for file in files[:8]]
@@ -463,7 +464,9 @@ def find_splat_files(path: Path, options: GaussianOptions) -> tuple[Path, ...]:
 
 def splat_files_of(folder: Path) -> tuple[Path, ...]:
     """Return the folder's splat files by their suffixes, in the order of their names."""
-    return tuple(sorted(file for file in folder.iterdir() if file.suffix.lower() in SPLAT_SUFFIXES))
+    return tuple(
+        sorted(file for file in folder.iterdir() if file.suffix.lower() in splat_suffixes())
+    )
 
 
 def _listed_files(folder: Path, names: Sequence[str]) -> tuple[Path, ...]:

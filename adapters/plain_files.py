@@ -16,8 +16,8 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 
 from augment.errors import AdapterError
-from augment.files.image_size import ImageHeader, image_header
-from augment.files.recorded_images import TWELVE_BITS, decode_pixels, has_12_bits
+from augment.files.image_size import ImageHeader, decode_pixels, image_header
+from augment.files.recorded_images import TWELVE_BITS, has_12_bits
 from augment.files.recorded_images import ImageFault as ImageFault
 from augment.files.recorded_images import decode_image as decode_image
 from augment.files.recorded_images import is_whole_jpeg as is_whole_jpeg

@@ -43,7 +43,7 @@ from adapters.detect_format import detect_scheme
 from adapters.scene_folder import with_images_in
 from adapters.uri import SCHEMES, format_uri, parse_uri
 from augment.errors import AdapterError, ClimateGSError, OutputError, SceneError
-from augment.files.ply import SPLAT_SUFFIXES
+from augment.files.formats import splat_suffixes
 from augment.files.recorded_images import has_image
 from augment.files.scene_file import FILES as SCENE_FILES
 from augment.files.scene_file import (
@@ -291,7 +291,7 @@ _DIGEST_FORMAT = 1
 _DIGESTS = "digests"
 _WHOLE = ("scene", "gaussians")  # schemes
 # Endings of the files that belong to a folder of splats: splats, and what lies beside them.
-_SPLAT_FILES = {*SPLAT_SUFFIXES, ".json", ".txt", ".bin", ".webp"}
+_SPLAT_FILES = {*splat_suffixes(), ".json", ".txt", ".bin", ".webp"}
 _IMAGES_OF_DRIVES = {".jpg", ".jpeg", ".png", ".webp"}
 _MAX_WHOLE_BYTES = 1 << 20
 _IMAGE_SAMPLE_BYTES = 1 << 12

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from augment.errors import AdapterError
-from augment.files.export import transform_gaussians_rigidly
 from augment.scene.scene import Gaussians
 from augment.scene.semantics import class_of_label
+from augment.scene.transform import transform_gaussians_rigidly
 
 # ---- Sets of Gaussians into one, and the class of an object's ------------------------------------
 

@@ -25,7 +25,9 @@ _PUBLIC = {
     "augment.scene.scene": ("Actor", "Gaussians", "PosedGaussians", "Scene", "Track"),
     "augment.scene.semantics": ("SemanticClass",),
     "augment.scene.sky": ("ConstantSky", "CubemapSky", "LatLongSky"),
-    "augment.files.ply": ("read_splats", "write_ply", "write_splat"),
+    "augment.files.formats": ("read_splats",),
+    "augment.files.ply": ("write_ply",),
+    "augment.files.splat": ("write_splat",),
     "augment.render.fog": ("Fog",),
 }
 _HOMES = {name: module for module, names in _PUBLIC.items() for name in names}

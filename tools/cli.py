@@ -13,12 +13,13 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self, get_args
 
 import tyro
 from pydantic import AfterValidator, Field, model_validator
 from tyro.conf import Positional, arg
 
+from augment.files.formats import ExportKind, SplatKind, join_names
 from tools.options import (
     FITTED,
     Command,
@@ -465,26 +466,25 @@ class ExportOptions(SceneCommand):
     Args:
         scene: The scene, as for render.
         out: The file or folder; a file's suffix is added where it lacks.
-        kind: file: everything in one .climategs file. scene: the same as a folder. ply, splat, spz,
-            sog, glb (glTF), usd: Gaussians as they are at one frame.
-            ply-parts: background and every actor apart.
-        frame: At which ply, splat, spz, sog, glb and usd are baked. The first by default.
+        kind: file: everything in one .climategs file. scene: the same as a folder. ply-parts:
+            background and every actor apart. The others: Gaussians as they are at one frame.
+        frame: The frame that a file of one moment shows. The first by default.
         half: A file of about half the size, at a small loss.
         overwrite: Replace what is there.
     """
 
     scene: Positional[str]
     out: Path
-    kind: Literal["file", "scene", "ply", "ply-parts", "splat", "spz", "sog", "glb", "usd"] = "file"
+    kind: ExportKind = "file"
     frame: int | None = None
     half: bool = False
     overwrite: bool = False
 
     @model_validator(mode="after")
     def _kind_has_them(self) -> Self:
-        if self.frame is not None and self.kind not in ("ply", "splat", "spz", "sog", "glb", "usd"):
-            text = "--frame is for ply, splat, spz, sog, glb and usd, of one moment; not for"
-            raise ValueError(f"{text} {self.kind}")
+        if self.frame is not None and self.kind not in get_args(SplatKind):
+            kinds = join_names(get_args(SplatKind), "and")
+            raise ValueError(f"--frame is for {kinds}, of one moment; not for {self.kind}")
         if self.half and self.kind != "file":
             text = "--half is for a single scene file (--kind file); not for"
             raise ValueError(f"{text} {self.kind}")

@@ -18,17 +18,12 @@ from augment.errors import AdapterError, ClimateGSError, OutputError
 from augment.files.export import (
     CAMERAS,
     PARTS,
-    ExportKind,
     export_cameras,
-    export_glb,
     export_losses,
-    export_ply,
     export_ply_parts,
-    export_sog,
-    export_splat,
-    export_spz,
-    export_usd,
+    export_splats,
 )
+from augment.files.formats import ExportKind, splat_formats, splat_writer
 from augment.files.scene_file import (
     FILES,
     SCENE_SUFFIX,
@@ -67,14 +62,9 @@ from tools.output import fill, print_note
 if TYPE_CHECKING:
     from tools.cli import ExportOptions
 
-_SUFFIXES: dict[ExportKind, str] = {
+_SUFFIXES = {
     "file": SCENE_SUFFIX,
-    "ply": ".ply",
-    "splat": ".splat",
-    "spz": ".spz",
-    "sog": ".sog",
-    "glb": ".glb",
-    "usd": ".usdc",
+    **{f.writer.kind: f.writer.suffix for f in splat_formats() if f.writer is not None},
 }
 
 
@@ -492,14 +482,9 @@ def _write(scene: Scene, out: Path, kind: ExportKind, moment: int, half: bool) -
     if kind == "ply-parts":
         export_ply_parts(scene, out)
         return [out / PARTS, *sorted(out.rglob("*.ply")), *out.glob(CAMERAS)]
-    alone = {"spz": export_spz, "sog": export_sog, "glb": export_glb, "usd": export_usd}
-    if kind in alone:
-        alone[kind](scene, out, moment)
+    export_splats(scene, out, moment, kind=kind)
+    if not splat_writer(kind).has_camera_file:
         return [out]
-    if kind == "ply":
-        export_ply(scene, out, moment)
-    else:
-        export_splat(scene, out, moment)
     cameras = out.parent / CAMERAS
     if export_cameras(scene, out.parent):
         return [out, cameras] if cameras.exists() else [out]

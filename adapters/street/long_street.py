@@ -15,7 +15,7 @@ import torch
 from adapters.procedural import open_procedural
 from adapters.street.layout import FRAME_NS, build_frames, parse_parameters
 from adapters.uri import CAMERA_PATH_KEY, add_to_uri
-from augment.files.level_file import save_large_scene
+from augment.files.large_scene import save_large_scene
 from augment.scene.scene import Gaussians, Scene
 
 # Length of a stretch.

@@ -6,37 +6,26 @@ opacities are stored as logarithms and logits, so they read back to rounding, no
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
-
-import torch
-from jaxtyping import Float
-from torch import Tensor
+from typing import Any
 
 from augment.errors import OutputError, SceneError
-from augment.files.gltf import write_glb
-from augment.files.ply import write_ply, write_splat
+from augment.files.formats import ExportKind, SplatKind, splat_writer
+from augment.files.ply import write_ply
 from augment.files.scene_file import document_text, track_entry
-from augment.files.sog import MAX_PALETTE, write_sog
-from augment.files.spz import write_spz
-from augment.files.usd import write_usd
+from augment.files.splat_format import SplatWriter
 from augment.output.atomic import raise_output_error, write_atomic, write_folder_atomically
 from augment.output.layout import folder_name
-from augment.render.sh import rotate_sh
 from augment.scene.cameras import Camera
-from augment.scene.geometry import multiply_quats, quat_from_rotmat, rotmat_from_quat
-from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, Scene
-from augment.scene.semantics import SemanticClass
+from augment.scene.scene import Gaussians, Scene
+from augment.scene.transform import bake_scene
 
 # ---- What an exported file cannot keep of a scene: one sentence each, for people -----------------
 
 _VISIBLE_OFFSET_PX = 0.1  # a smaller offset of the principal point goes unmentioned
-ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz", "sog", "glb", "usd"]
 
 
 def export_losses(
@@ -47,7 +36,7 @@ def export_losses(
     Args:
         scene: the scene.
         kind: the kind of file.
-        timestamp_ns: the moment at which ply and splat files are baked.
+        timestamp_ns: the moment that a splat file shows.
         half: whether a scene file stores float16.
 
     Returns:
@@ -55,8 +44,14 @@ def export_losses(
     """
     if kind in ("scene", "file"):
         return tuple(_saved_losses(scene, kind, half=half))
-    losses = [*_place_losses(scene, kind, timestamp_ns), *_colour_losses(scene, kind)]
-    return (*losses, *_fact_losses(scene, kind))
+    is_parts = kind == "ply-parts"
+    writer = splat_writer("ply" if kind == "ply-parts" else kind)
+    return (
+        *(_parts_losses(scene) if is_parts else _moment_losses(scene, timestamp_ns)),
+        *_world_losses(scene, writer),
+        *_colour_losses(scene, writer, is_parts=is_parts),
+        *_fact_losses(scene, writer),
+    )
 
 
 def _saved_losses(scene: Scene, kind: ExportKind, *, half: bool) -> Iterator[str]:
@@ -76,41 +71,39 @@ def _saved_losses(scene: Scene, kind: ExportKind, *, half: bool) -> Iterator[str
         )
 
 
-def _place_losses(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iterator[str]:
-    """Losses in positions, poses, units and axes."""
-    if kind == "ply-parts":
-        if any(len(part) == 0 for part in scene.all_gaussians):
-            yield "parts without Gaussians have no file"
-    elif scene.actors:
-        assert timestamp_ns is not None
-        num_actors = sum(actor.track.pose_at(timestamp_ns) is not None for actor in scene.actors)
-        number = next((f.index for f in scene.frames if f.timestamp_ns == timestamp_ns), None)
-        moment = f"at {timestamp_ns} ns" if number is None else f"in frame {number}"
-        yield f"actors ({num_actors}) stand still where they are {moment}"
-        if num_actors < len(scene.actors):
-            yield f"actors ({len(scene.actors) - num_actors}) that are not there then are left out"
-        if delay_ns := _greatest_delay_ns(scene, timestamp_ns):
-            yield (
-                f"the frame's cameras took their images up to {delay_ns / 1e6:.0f} ms from that "
-                f"moment, so that moving actors are a little off in them"
-            )
-    if kind in ("splat", "spz", "sog", "glb", "usd") and scene.world_origin_m.any():
-        place = ", ".join(f"{v:.3f}" for v in scene.world_origin_m)
-        yield f"where the scene lies in the dataset's world ({place}) is left out"
-    if kind == "splat":
-        yield "which way is up and how long a unit is are left out: open it with ?up=+z&scale=1"
-    if kind == "spz":
-        yield "how long a unit is is left out: open it with ?scale=1; y points up in it"
-    if kind in ("spz", "sog", "usd"):
-        yield "cameras are left out"
-    if kind == "glb":
-        unit = "its unit is the metre, y points up in it; cameras are left out"
+def _parts_losses(scene: Scene) -> Iterator[str]:
+    """Losses of files that hold one part each."""
+    if any(len(part) == 0 for part in scene.all_gaussians):
+        yield "parts without Gaussians have no file"
+
+
+def _moment_losses(scene: Scene, timestamp_ns: int | None) -> Iterator[str]:
+    """Losses of a file that shows one moment."""
+    if not scene.actors:
+        return
+    assert timestamp_ns is not None
+    num_actors = sum(actor.track.pose_at(timestamp_ns) is not None for actor in scene.actors)
+    number = next((f.index for f in scene.frames if f.timestamp_ns == timestamp_ns), None)
+    moment = f"at {timestamp_ns} ns" if number is None else f"in frame {number}"
+    yield f"actors ({num_actors}) stand still where they are {moment}"
+    if num_actors < len(scene.actors):
+        yield f"actors ({len(scene.actors) - num_actors}) that are not there then are left out"
+    if delay_ns := _greatest_delay_ns(scene, timestamp_ns):
         yield (
-            unit if scene.has_metric_scale else f"how long the scene's unit is is not known; {unit}"
+            f"the frame's cameras took their images up to {delay_ns / 1e6:.0f} ms from that "
+            f"moment, so that moving actors are a little off in them"
         )
 
 
-def _colour_losses(scene: Scene, kind: ExportKind) -> Iterator[str]:
+def _world_losses(scene: Scene, writer: SplatWriter) -> Iterator[str]:
+    """Losses of the place in the world, of axes, unit and cameras."""
+    if not writer.keeps_world_origin and scene.world_origin_m.any():
+        place = ", ".join(f"{v:.3f}" for v in scene.world_origin_m)
+        yield f"where the scene lies in the dataset's world ({place}) is left out"
+    yield from (loss.sentence for loss in writer.world_losses if loss.applies_to(scene))
+
+
+def _colour_losses(scene: Scene, writer: SplatWriter, *, is_parts: bool) -> Iterator[str]:
     """Losses in colours, sky and classes."""
     yield "the sky is left out"
     if scene.color_mapped_cameras:
@@ -120,43 +113,27 @@ def _colour_losses(scene: Scene, kind: ExportKind) -> Iterator[str]:
         )
     waves = sum(actor.color_waves is not None for actor in scene.actors)
     if waves:
-        which = "their constant part" if kind == "ply-parts" else "those of that moment"
+        which = "their constant part" if is_parts else "those of that moment"
         yield f"colours of actors ({waves}) that change over time are {which}"
-    if kind == "ply-parts" and any(actor.colors_in_world for actor in scene.actors):
+    if is_parts and any(actor.colors_in_world for actor in scene.actors):
         yield (
             "colours of actors by direction are for directions of the world, and viewers turn them "
             "with the actor"
         )
-    if kind == "sog":
-        yield (
-            "places are rounded to 0.1 mm at the origin, 1 cm at 100 m and 10 cm at 1 km from it, "
-            "rotations to 1 degree, opacities to 8 bits, scales and colours to the nearest of "
-            "256 each"
-        )
-        if any(part.sh_degree > 0 for part in scene.all_gaussians):
-            yield f"SH is rounded to the nearest of {MAX_PALETTE} sets, where there are more"
-    if kind == "spz":
-        yield (
-            "places are rounded to 0.12 mm within 2 km, scales by up to 3 %, rotations to 0.25 "
-            "degrees, opacities, colours and SH to 8 bits and less; SH beyond -1 and 1 is cut off"
-        )
-    if kind == "splat":
-        yield "colours, opacities and rotations have 8 bits; colours below 0 or above 1 are cut off"
-        if any(part.sh_degree > 0 for part in scene.all_gaussians):
-            yield "colours do not depend on the direction of view: SH bands above 0 are left out"
+    yield from (loss.sentence for loss in writer.value_losses if loss.applies_to(scene))
     has_classes = any(part.semantic is not None for part in scene.all_gaussians)
-    if kind in ("splat", "spz", "sog", "glb", "usd") and has_classes:
+    if has_classes and not writer.keeps_classes:
         yield "semantic classes are left out"
 
 
-def _fact_losses(scene: Scene, kind: ExportKind) -> Iterator[str]:
+def _fact_losses(scene: Scene, writer: SplatWriter) -> Iterator[str]:
     """Losses in labels, cameras and other facts."""
     if scene.labels is not None:
         yield f"boxes and LiDAR stay with {scene.recorded_source or scene.source}"
     if scene.ground_z_m is not None:
         yield f"the road's height is left out: open it with ?ground_z={scene.ground_z_m:.3f}"
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    if cameras and kind not in ("spz", "sog", "glb", "usd"):
+    if cameras and writer.has_camera_file:
         offset_px = max(
             max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
             for camera in cameras
@@ -184,123 +161,6 @@ def _greatest_delay_ns(scene: Scene, timestamp_ns: int) -> int:
     return max(delays, default=0)
 
 
-# ---- Gaussians in another frame, and all Gaussians of a scene at one moment ----------------------
-
-_ROWS_AT_ONCE = 65536  # Gaussians whose colours are rotated together
-
-
-def transform_gaussians_rigidly(
-    gaussians: Gaussians,
-    rotation: Float[Tensor, "3 3"],
-    shift: Float[Tensor, "3"],
-    scale: float = 1.0,
-) -> Gaussians:
-    """Return the Gaussians at scale * rotation @ mean + shift.
-
-    Quaternions and SH are rotated too. Positions are computed in float64 and rounded once.
-
-    Args:
-        gaussians: the Gaussians.
-        rotation: float64 [3, 3].
-        shift: float64 [3].
-        scale: a factor of positions and sizes.
-    """
-    means = scale * (gaussians.means.double() @ rotation.T) + shift
-    moved = dataclasses.replace(
-        gaussians,
-        means=means.to(gaussians.means.dtype),
-        scales=gaussians.scales if scale == 1.0 else gaussians.scales * scale,
-    )
-    if torch.equal(rotation, torch.eye(3, dtype=rotation.dtype)):
-        return moved
-    quat = quat_from_rotmat(rotation).to(gaussians.quats.dtype).expand_as(gaussians.quats)
-    sh = gaussians.sh if gaussians.sh_degree == 0 else _rotate_sh_in_pieces(gaussians.sh, rotation)
-    return dataclasses.replace(moved, quats=multiply_quats(quat, gaussians.quats), sh=sh)
-
-
-def transform_gaussians(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians:
-    """Return the Gaussians under a linear map without mirrors; their shapes are exact.
-
-    SH rotate by the rotation that is nearest to the map.
-
-    Args:
-        gaussians: the Gaussians.
-        matrix: float64 [3, 3], with a positive determinant.
-    """
-    u, stretch, vh = torch.linalg.svd(matrix)
-    rotation = u @ vh
-    scale = float(stretch.mean())
-    no_shift = torch.zeros(3, dtype=torch.float64)
-    if float(stretch[0] - stretch[2]) <= 1e-6 * scale:
-        if torch.allclose(rotation, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12):
-            rotation = torch.eye(3, dtype=torch.float64)  # changes no bit
-        return transform_gaussians_rigidly(gaussians, rotation, no_shift, scale)
-    quats = torch.nn.functional.normalize(gaussians.quats.double(), dim=1)
-    axes = matrix @ rotmat_from_quat(quats) * gaussians.scales.double()[:, None]
-    is_usable = axes.isfinite().all(2).all(1)
-    axes = torch.where(is_usable[:, None, None], axes, torch.eye(3, dtype=torch.float64))
-    axes, scales, _ = torch.linalg.svd(axes)  # covariance = axes scales^2 axes^T
-    scales = torch.where(is_usable[:, None], scales, torch.nan)
-    axes = axes * torch.linalg.det(axes)[:, None, None]
-    moved = transform_gaussians_rigidly(gaussians, rotation, no_shift)
-    return dataclasses.replace(
-        moved,
-        means=(gaussians.means.double() @ matrix.T).to(gaussians.means.dtype),
-        quats=quat_from_rotmat(axes).to(gaussians.quats.dtype),
-        scales=scales.to(gaussians.scales.dtype),
-    )
-
-
-def bake_scene(scene: Scene, timestamp_ns: int) -> Gaussians:
-    """Return the background and the actors of one moment as Gaussians of the scene's world.
-
-    They have the colours of that moment, and the order of `Scene.parts_at`. Colours of a lower
-    degree are filled up with zero bands, unknown classes with UNKNOWN.
-    """
-    parts = []
-    for part in scene.parts_at(timestamp_ns):
-        gaussians = part.gaussians
-        pose = part.world_from_part
-        if pose is not None:
-            gaussians = transform_gaussians_rigidly(gaussians, pose[:3, :3], pose[:3, 3])
-        parts.append(gaussians)
-    return concatenate_gaussians(parts)
-
-
-def concatenate_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
-    """Return the Gaussians of all parts, one part after another.
-
-    Colours of a lower degree are filled up with zero bands, unknown classes with UNKNOWN.
-    """
-    if len(parts) == 1:
-        return parts[0]
-    names = ("means", "quats", "scales", "opacities")
-    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-    count = sum(map(len, parts))
-    bands = NUM_SH_BY_DEGREE[max(part.sh_degree for part in parts if len(part) or count == 0)]
-    sh = torch.zeros(count, bands, 3, dtype=parts[0].sh.dtype)
-    has_classes = any(part.semantic is not None for part in parts)
-    semantic = torch.full((count,), int(SemanticClass.UNKNOWN), dtype=torch.int16)
-    start = 0
-    for part in parts:
-        rows = slice(start, start + len(part))
-        sh[rows, : part.sh.shape[1]] = part.sh[:, :bands]
-        if part.semantic is not None:
-            semantic[rows] = part.semantic
-        start = rows.stop
-    return Gaussians(**columns, sh=sh, semantic=semantic if has_classes else None)
-
-
-def _rotate_sh_in_pieces(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Tensor:
-    """Rotate SH without temporaries as large as the coefficients of a large scene."""
-    rotated = torch.empty_like(sh)
-    for start in range(0, len(sh), _ROWS_AT_ONCE):
-        rotated[start : start + _ROWS_AT_ONCE] = rotate_sh(
-            sh[start : start + _ROWS_AT_ONCE], rotation
-        )
-    return rotated
-
-
 # ---- Files ---------------------------------------------------------------------------------------
 
 BACKGROUND = "background.ply"  # the Gaussians that do not move
@@ -311,57 +171,27 @@ _FORMAT = "climategs-parts"  # the format that parts.json names
 _FORMAT_PATTERN = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + _FORMAT.encode() + rb'"')
 
 
-def export_ply(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene at one moment into an INRIA .ply.
+def export_splats(
+    scene: Scene, path: str | Path, timestamp_ns: int, *, kind: SplatKind = "ply"
+) -> None:
+    """Write the scene at one moment into a splat file of any format.
 
-    Its comments say `up: +z` where gravity is known, and `unit: metre` where the scale is.
+    A .ply's comments say `up: +z` where gravity is known, and `unit: metre` where the scale is.
+
+    Args:
+        scene: the scene.
+        path: the file.
+        timestamp_ns: the moment.
+        kind: the kind of file.
+
+    Raises:
+        SceneError: the scene shows no Gaussians then, or the format cannot hold them.
+        OutputError: the file cannot be written.
     """
-    write_ply(path, _baked_or_error(scene, timestamp_ns), notes=_notes(scene))
-
-
-def export_splat(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene at one moment into a .splat."""
-    gaussians = _baked_or_error(scene, timestamp_ns)
-    write_splat(path, replace(gaussians, sh=gaussians.sh[:, :1]))  # export_losses says so
-
-
-def export_spz(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene at one moment into a .spz, y up."""
-    write_spz(path, _y_up(_baked_or_error(scene, timestamp_ns)))
-
-
-def export_glb(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene at one moment into a .glb with KHR_gaussian_splatting, y up."""
-    write_glb(path, _y_up(_baked_or_error(scene, timestamp_ns)))
-
-
-def export_usd(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene at one moment into a .usdc, in the scene's axes."""
-    has_gravity = scene.has_known_gravity
-    has_scale = scene.has_metric_scale
-    write_usd(
-        path, _baked_or_error(scene, timestamp_ns), is_upright=has_gravity, is_metric=has_scale
-    )
-
-
-def _y_up(gaussians: Gaussians) -> Gaussians:
-    """Return Gaussians with z up as Gaussians with y up."""
-    z_to_y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
-    return transform_gaussians_rigidly(gaussians, z_to_y, torch.zeros(3, dtype=torch.float64))
-
-
-def export_sog(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene at one moment into a .sog, y down: viewers turn it as they turn a .ply.
-
-    Its meta.json says `up` and `unit` as the .ply's comments do.
-    """
-    z_to_minus_y = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
-    gaussians = _baked_or_error(scene, timestamp_ns)
-    notes = {key: note for key, note in _notes(scene).items() if key in ("up", "unit")}
-    if "up" in notes:
-        notes["up"] = "-y"
-    zero = torch.zeros(3, dtype=torch.float64)
-    write_sog(path, transform_gaussians_rigidly(gaussians, z_to_minus_y, zero), notes=notes)
+    gaussians = bake_scene(scene, timestamp_ns)
+    if len(gaussians) == 0:
+        raise SceneError(f"scene {scene.name!r} shows no Gaussians at {timestamp_ns} ns")
+    splat_writer(kind).write(Path(path), gaussians, _notes(scene))
 
 
 def export_cameras(scene: Scene, folder: str | Path) -> bool:
@@ -471,20 +301,8 @@ def _write_parts(scene: Scene, folder: Path) -> None:
     write_atomic(folder / PARTS, document_text(facts).encode())
 
 
-def _baked_or_error(scene: Scene, timestamp_ns: int) -> Gaussians:
-    """Bake the scene at one moment.
-
-    Raises:
-        SceneError: it shows no Gaussians then.
-    """
-    gaussians = bake_scene(scene, timestamp_ns)
-    if len(gaussians) == 0:
-        raise SceneError(f"scene {scene.name!r} shows no Gaussians at {timestamp_ns} ns")
-    return gaussians
-
-
 def _notes(scene: Scene) -> dict[str, str]:
-    """Return the facts of a scene that a file's comments keep."""
+    """Return the facts of a scene that splat files keep, by their names in SplatFile.notes."""
     notes = {}
     if scene.has_known_gravity:
         notes["up"] = "+z"

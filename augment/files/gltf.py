@@ -36,13 +36,21 @@ from pydantic import (
 
 from augment.errors import SceneError
 from augment.files.limits import check_memory, parse_json_object
-from augment.files.ply import SplatFile, join_positioned_parts
+from augment.files.splat_format import (
+    Loss,
+    SplatFile,
+    SplatFormat,
+    SplatWriter,
+    join_positioned_parts,
+    rotate_z_to_y,
+)
 from augment.output.atomic import write_file_atomically
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians
+from augment.scene.transform import transform_gaussians
 
 EXTENSION = "KHR_gaussian_splatting"  # the extension's name
-GLB = b"glTF"  # first bytes of a .glb
+_GLB_MARK = b"glTF"  # first bytes of a .glb
 NOTES = {"up": "+y", "unit": "metre"}  # facts that hold for every glTF file
 _HEADERS = (
     struct.Struct("<4sIIII"),  # the file's header and that of its first chunk
@@ -458,7 +466,7 @@ def _sh_name(degree: int, number: int) -> str:
 def _read_chunks(path: Path) -> tuple[bytes, np.ndarray | None]:
     """Return the JSON text, and the binary chunk of a .glb."""
     data = np.memmap(path, np.uint8, "r")
-    if bytes(data[:4]) != GLB:
+    if bytes(data[:4]) != _GLB_MARK:
         if len(data) > _MAX_JSON_BYTES:
             raise SceneError(
                 f"{path}: a .gltf has at most {_MAX_JSON_BYTES} bytes; save it as .glb"
@@ -490,8 +498,6 @@ def _place_columns(columns: _Columns, matrix: np.ndarray) -> tuple[np.ndarray, G
 
     The means of these Gaussians are unused.
     """
-    from augment.files.export import transform_gaussians  # imported here: it imports this module
-
     gaussians = Gaussians(
         means=torch.zeros(len(columns.means), 3),
         **{
@@ -557,7 +563,29 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
     if total >= 1 << 32:
         raise SceneError(f"{path}: {total} bytes; a .glb ends at 4 GiB: export as .ply or .spz")
     with write_file_atomically(Path(path)) as file:
-        file.write(first_header.pack(GLB, 2, total, len(text), _JSON_CHUNK) + text)
+        file.write(first_header.pack(_GLB_MARK, 2, total, len(text), _JSON_CHUNK) + text)
         file.write(second_header.pack(ends[-1], _BINARY_CHUNK))
         for array in arrays:
             file.write(array.tobytes())
+
+
+_AXES = "its unit is the metre, y points up in it; cameras are left out"
+GLB = SplatFormat(
+    name=".glb",
+    reader=read_gltf,
+    suffixes=(".glb",),
+    first_bytes=(_GLB_MARK,),
+    writer=SplatWriter(
+        kind="glb",
+        suffix=".glb",
+        write=lambda path, gaussians, _facts: write_glb(path, rotate_z_to_y(gaussians)),
+        world_losses=(
+            Loss(_AXES, lambda scene: scene.has_metric_scale),
+            Loss(
+                f"how long the scene's unit is is not known; {_AXES}",
+                lambda scene: not scene.has_metric_scale,
+            ),
+        ),
+    ),
+)
+GLTF = SplatFormat(name=".gltf", reader=read_gltf, suffixes=(".gltf",))

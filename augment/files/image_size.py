@@ -1,4 +1,4 @@
-"""Reads the header of an image file before a decoder allocates memory for its pixels."""
+"""Reads the header of an image file before a decoder allocates memory, and the stored pixels."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import cv2
+import numpy as np
 
 from recipes.files import open_file
 
@@ -182,3 +185,20 @@ def _tiff_numbers(data: bytes, tags: Sequence[int]) -> dict[int, int]:
             number_format = f"{byte_order}{'H' if value_type == 3 else 'I'}"
             (numbers[tag],) = struct.unpack_from(number_format, data, entry_offset + 8)
     return numbers
+
+
+def decode_pixels(data: bytes | np.ndarray, flags: int) -> np.ndarray | None:
+    """Return the pixels of an image file's content as they are stored; EXIF rotates nothing.
+
+    Args:
+        data: the file's bytes.
+        flags: flags of cv2.imdecode.
+
+    Returns:
+        The array of cv2.imdecode; None where the content cannot be decoded.
+    """
+    data = np.frombuffer(data, np.uint8)
+    try:
+        return cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+    except cv2.error:  # larger than OpenCV allows
+        return None

@@ -11,7 +11,9 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from augment.errors import SceneError
 from recipes.files import open_file
@@ -23,6 +25,8 @@ _COLOUR_BYTES = 12  # bytes of one spherical harmonic of three channels in float
 _ROWS_AT_ONCE = 1 << 18  # Gaussians that are decoded together, so that temporaries stay small
 
 MAX_VALUES = 16_000_000  # values of a JSON text, counted by its commas and brackets
+_MAX_PROBLEMS_SHOWN = 5  # problems of JSON that a message names
+Entry = TypeVar("Entry", bound=BaseModel)
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 
 
@@ -114,3 +118,25 @@ def parse_json_object(text: bytes, where: str, *, max_values: int = MAX_VALUES) 
     if not isinstance(content, dict):
         raise SceneError(f"{where}: its JSON must be an object; got {content!r:.60}")
     return content
+
+
+def validate_model(model: type[Entry], content: object, where: str) -> Entry:
+    """Return JSON, or a record, as the model.
+
+    Raises:
+        SceneError: it does not fit; the message names the fields.
+    """
+    try:
+        return model.model_validate(content)
+    except (RecursionError, OverflowError):
+        raise SceneError(f"{where}: nested too deeply or numbers too large") from None
+    except ValidationError as error:
+        problems = error.errors(include_url=False, include_context=False)
+    problem_texts = [
+        f"{'.'.join(map(str, p['loc']))}: {p['msg']}; got {p['input']!r:.60}"
+        for p in problems[:_MAX_PROBLEMS_SHOWN]
+    ]
+    num_hidden = len(problems) - len(problem_texts)
+    raise SceneError(
+        f"{where}: " + "; ".join(problem_texts) + (f"; and {num_hidden} more" if num_hidden else "")
+    )

@@ -25,8 +25,7 @@ from pydantic import BaseModel, ConfigDict, NonNegativeInt, ValidationError
 from pydantic.dataclasses import dataclass
 
 from augment.errors import AdapterError, OutputError
-from augment.files.image_size import image_header
-from augment.files.recorded_images import decode_pixels
+from augment.files.image_size import decode_pixels, image_header
 from augment.files.stated_sizes import StatedSizeError, check_row_group
 from augment.output.atomic import temporary_path
 from augment.output.tables import open_parquet

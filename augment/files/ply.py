@@ -1,27 +1,24 @@
-"""Reads and writes Gaussians in plain files: INRIA's .ply (SH degree 0 to 3) and .splat.
+"""Reads and writes Gaussians in INRIA's .ply files (SH degree 0 to 3).
 
-`read_splats` reads every splat format; the other formats' modules return its record `SplatFile`. A
-.splat is a row of 32-byte records. A header is not trusted: counts are compared with the size of
-the file before anything is allocated, so a damaged or hostile file costs a message and no memory.
+A header is not trusted: counts are compared with the size of the file before anything is allocated,
+so a damaged or hostile file costs a message and no memory.
 """
 
 from __future__ import annotations
 
 import itertools
-import logging
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from augment.errors import SceneError
+from augment.files.splat_format import SplatFile, SplatFormat, SplatWriter, recentring_origin
 from augment.output.atomic import write_file_atomically
 from augment.render.sh import SH_C0
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
@@ -398,100 +395,6 @@ def _guess_content(header: PlyHeader, names: set[str]) -> str:
 
 # ---- Files ---------------------------------------------------------------------------------------
 
-_USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb", ".gltf", *_USD_SUFFIXES)
-# Distance from zero, metres, from which coordinates are recentred: float32 resolves 0.06 mm at
-# 1 km, and 0.25 m at UTM's 4000 km.
-RECENTRE_BEYOND_M = 1000.0
-_MAX_COORDINATE_M = 1e15  # beyond, float64 has no decimetres
-_SPLAT_RECORD = np.dtype(
-    [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)]
-)
-
-_log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class SplatFile:
-    """The content of a splat file."""
-
-    gaussians: Gaussians  # in the file's axes and unit
-    # float64 [3]: subtracted from the file's coordinates; zero except for double-precision .ply
-    # files far from the origin.
-    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    # The `key: value` comments of a .ply, and the same facts of other formats.
-    notes: Mapping[str, str] = field(default_factory=dict)
-    problems: tuple[str, ...] = ()  # one sentence about each thing that was left out
-
-
-def read_splats(
-    path: str | Path, *, activated: bool | None = None, level: int | None = None
-) -> SplatFile:
-    """Read a splat file of any format that is supported.
-
-    Formats are recognised by the first bytes (.ply, .spz, .sog, glTF), the name (.splat, .usd), the
-    meta.json of a SOG folder, or the lod-meta.json of a streamed one.
-
-    Args:
-        path: the file.
-        activated: for a .ply only, as in `read_ply`.
-        level: for a lod-meta.json only, the level of detail; 0, the finest, by default.
-
-    Raises:
-        SceneError: the file does not exist, has an unknown format or damaged content, or its
-            Gaussians need more memory than there is; the message says what was expected.
-    """
-    path = Path(path)
-    try:
-        return _reader_of(path, activated, level)(path)
-    except MemoryError as error:
-        raise SceneError(f"{path}: its Gaussians need more memory than there is: {error}") from None
-    except OSError as error:
-        raise SceneError(f"{path} cannot be read: {error.strerror or error}") from error
-
-
-def _reader_of(
-    path: Path, activated: bool | None, level: int | None
-) -> Callable[[Path], SplatFile]:
-    """Return the function that reads a file."""
-    from augment.files.gltf import GLB, read_gltf  # imported here: they import this module
-    from augment.files.sog import META, ZIP, read_sog
-    from augment.files.spz import GZIP, read_spz, refuse_bare_spz
-    from augment.files.streamed_sog import LOD_META, read_streamed_sog
-    from augment.files.usd import read_usd
-
-    if not path.is_file():
-        raise SceneError(f"{path}: no such file; expected a .ply, .splat, .spz, .sog, .glb or .usd")
-    with path.open("rb") as file:
-        start = file.read(8)
-    if level is not None and path.name != LOD_META:
-        raise SceneError(f"{path} has no levels of detail, as a {LOD_META} has; leave lod out")
-    if start[:3] == b"ply" and start[3:4] in (b"\n", b"\r"):
-        return partial(read_ply, activated=activated)
-    if activated is not None:
-        raise SceneError(
-            f"{path}: only a .ply may store values before or after their activation; leave "
-            f"activated out"
-        )
-    if path.name == LOD_META:
-        return partial(read_streamed_sog, level=level or 0)
-    if start[:2] == GZIP:
-        return read_spz
-    if path.suffix.lower() in _USD_SUFFIXES:  # before ZIP, which a .usdz is too
-        return read_usd
-    if start[:4] == ZIP or path.name == META:
-        return read_sog
-    if start[:4] == GLB or path.suffix.lower() == ".gltf":
-        return read_gltf
-    refuse_bare_spz(path, start)
-    if path.suffix.lower() == ".splat":
-        return read_splat
-    raise SceneError(
-        f"{path}: neither a .ply (its first line would be 'ply') nor a .spz, .sog or .glb, nor "
-        "named .splat, .gltf or .usd; convert other splat formats (.ksplat) to .ply first, for "
-        "example with SuperSplat"
-    )
-
 
 def read_ply(
     path: str | Path, element: str = "vertex", *, activated: bool | None = None
@@ -563,35 +466,6 @@ def _looks_activated(scales: Tensor, opacities: Tensor) -> bool:
     return is_fraction and bool((scales > 0).all())
 
 
-def read_splat(path: str | Path) -> SplatFile:
-    """Read a .splat file: colour without view dependence (SH degree 0), linear scales."""
-    path = Path(path)
-    size = path.stat().st_size
-    if size == 0 or size % _SPLAT_RECORD.itemsize:
-        raise SceneError(
-            f"{path}: a .splat file is a row of 32-byte records; got {size} bytes = "
-            f"{size // 32} records and {size % 32} bytes: truncated, or another format"
-        )
-    records = np.fromfile(path, dtype=_SPLAT_RECORD)
-    rgba = torch.from_numpy(np.ascontiguousarray(records["rgba"])).float() / 255
-    quat_bytes = torch.from_numpy(np.ascontiguousarray(records["quat"])).float()
-    all_gaussians = Gaussians(
-        means=torch.from_numpy(np.ascontiguousarray(records["mean"])),
-        quats=(quat_bytes - 128) / 128,
-        scales=torch.from_numpy(np.ascontiguousarray(records["scale"])),
-        opacities=rgba[:, 3].contiguous(),
-        sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None],
-    )
-    gaussians, problems = check_gaussians(all_gaussians, where=str(path))
-    if len(gaussians) * 2 < len(all_gaussians):
-        raise SceneError(
-            f"{path}: only {len(gaussians)} of {len(all_gaussians)} records hold usable numbers, "
-            "so this is "
-            "probably no .splat file. " + " ".join(problems)
-        )
-    return SplatFile(gaussians, problems=problems)
-
-
 def write_ply(
     path: str | Path, gaussians: Gaussians, *, notes: Mapping[str, str] | None = None
 ) -> None:
@@ -635,69 +509,18 @@ def _file_columns(part: Gaussians) -> dict[str, np.ndarray]:
     return _columns_of({name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()})
 
 
-def write_splat(path: str | Path, gaussians: Gaussians) -> None:
-    """Write a .splat file, atomically.
-
-    The format stores 8 bits of colour, opacity and rotation. It has no SH bands above degree 0;
-    a warning is logged when they are dropped.
-    """
-    if gaussians.sh_degree > 0:
-        _log.warning("%s: .splat holds no view dependence; SH bands above 0 are dropped", path)
-    records = np.zeros(len(gaussians), dtype=_SPLAT_RECORD)
-    records["mean"] = gaussians.means.detach().cpu().numpy()
-    records["scale"] = gaussians.scales.detach().cpu().numpy()
-    rgb = 0.5 + SH_C0 * gaussians.sh[:, 0]
-    rgba = torch.cat([rgb, gaussians.opacities[:, None]], 1).clamp(0, 1)
-    records["rgba"] = (rgba * 255).round().detach().cpu().numpy()
-    quats = (gaussians.quats * 128 + 128).round().clamp(0, 255)
-    records["quat"] = quats.detach().cpu().numpy()
-    with write_file_atomically(Path(path)) as file:
-        file.write(records.tobytes())
-
-
-def recentring_origin(points: Float[np.ndarray, "N 3"]) -> np.ndarray:
-    """Return the whole-metre origin to subtract from coordinates, float64 [3].
-
-    It is the median of the points within _MAX_COORDINATE_M if that lies more than RECENTRE_BEYOND_M
-    from zero; else zero.
-    """
-    usable_points = points[(np.abs(points) < _MAX_COORDINATE_M).all(1)]  # False for NaN, too
-    if len(usable_points) == 0:
-        return np.zeros(3)
-    median = np.median(usable_points, axis=0).astype(np.float64)
-    return np.round(median) if np.linalg.norm(median) > RECENTRE_BEYOND_M else np.zeros(3)
-
-
-def join_positioned_parts(
-    parts: Sequence[tuple[np.ndarray, Gaussians]],
-    path: Path,
-    notes: Mapping[str, str],
-    problems: Sequence[str],
-) -> SplatFile:
-    """Join the parts of a file into one set of Gaussians.
-
-    Args:
-        parts: for each part the positions of its Gaussians in the file's axes, float64 [N, 3], and
-            its Gaussians, whose own means are ignored.
-        path: the file, for messages.
-        notes: the notes of the result.
-        problems: the problems found so far.
-
-    Raises:
-        SceneError: no Gaussian can be rendered.
-    """
-    means = np.concatenate([places for places, _ in parts])
-    origin = recentring_origin(means)
-    bands = max(part.sh.shape[1] for _, part in parts)
-    sh = [torch.nn.functional.pad(p.sh, (0, 0, 0, bands - p.sh.shape[1])) for _, p in parts]
-    with np.errstate(over="ignore"):  # infinite values are left out later, and reported
-        means_f32 = (means - origin).astype(np.float32)
-    all_gaussians = Gaussians(
-        means=torch.from_numpy(means_f32),
-        quats=torch.cat([part.quats for _, part in parts]),
-        scales=torch.cat([part.scales for _, part in parts]),
-        opacities=torch.cat([part.opacities for _, part in parts]),
-        sh=torch.cat(sh),
-    )
-    gaussians, new_problems = check_gaussians(all_gaussians, where=str(path))
-    return SplatFile(gaussians, origin, notes, (*problems, *new_problems))
+PLY = SplatFormat(
+    name=".ply",
+    reader=read_ply,
+    suffixes=(".ply",),
+    first_bytes=(b"ply\n", b"ply\r"),
+    option="activated",
+    writer=SplatWriter(
+        kind="ply",
+        suffix=".ply",
+        write=lambda path, gaussians, facts: write_ply(path, gaussians, notes=facts),
+        keeps_world_origin=True,
+        keeps_classes=True,
+        has_camera_file=True,
+    ),
+)

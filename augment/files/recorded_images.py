@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from augment.files.image_size import ImageHeader, read_image_header
+from augment.files.image_size import ImageHeader, decode_pixels, read_image_header
 from augment.scene.cameras import Camera
 from recipes.files import open_file
 
@@ -34,23 +34,6 @@ TWELVE_BITS = (
     f"has 16 bits a channel and no value above {_MAX_12_BIT_VALUE} of 65535, as files of a "
     "sensor's 12 bits; it would be black: store 8 bits, or multiply its values by 16"
 )
-
-
-def decode_pixels(data: bytes | np.ndarray, flags: int) -> np.ndarray | None:
-    """Return the pixels of an image file's content as they are stored; EXIF rotates nothing.
-
-    Args:
-        data: the file's bytes.
-        flags: flags of cv2.imdecode.
-
-    Returns:
-        The array of cv2.imdecode; None where the content cannot be decoded.
-    """
-    data = np.frombuffer(data, np.uint8)
-    try:
-        return cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
-    except cv2.error:  # larger than OpenCV allows
-        return None
 
 
 def has_12_bits(data: bytes | np.ndarray) -> bool:

@@ -21,7 +21,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -31,17 +31,17 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
-    ValidationError,
     model_serializer,
     model_validator,
 )
-from safetensors import safe_open
 from torch import Tensor
 
 from augment.detail.lod import store_levels
 from augment.errors import OutputError, SceneError
 from augment.files.checkpoints import checked_tensor
-from augment.files.limits import check_values
+from augment.files.level_file import LEVELS, read_levels
+from augment.files.limits import check_values, validate_model
+from augment.files.tensors import read_tensors, write_tensors
 from augment.output.atomic import write_file_atomically, write_folder_atomically
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import (
@@ -316,11 +316,9 @@ def _range(values: Tensor) -> tuple[float, float]:
 FORMAT = "climategs-scene"  # the format that a scene.json names
 VERSION = 2  # the version that is read and written
 MAX_BYTES = 256 << 20  # bytes of a scene.json; a drive of an hour has about 30 MB
-_MAX_PROBLEMS_SHOWN = 5  # problems that a message names
 _MAX_KEYS = 10_000  # keys of one object, such as a frame's cameras
 # Largest error of R R^T - I in a pose; the camera's own class allows 1e-4.
 _ROTATION_TOLERANCE = 1e-3
-Entry = TypeVar("Entry", bound=BaseModel)
 
 
 def _plain_text(text: str) -> str:
@@ -553,28 +551,6 @@ def check_format(format_name: object, version: object, where: str) -> None:
         )
 
 
-def validate_model(model: type[Entry], content: object, where: str) -> Entry:
-    """Return JSON, or a record, as the model.
-
-    Raises:
-        SceneError: it does not fit; the message names the fields.
-    """
-    try:
-        return model.model_validate(content)
-    except (RecursionError, OverflowError):
-        raise SceneError(f"{where}: nested too deeply or numbers too large") from None
-    except ValidationError as error:
-        problems = error.errors(include_url=False, include_context=False)
-    problem_texts = [
-        f"{'.'.join(map(str, p['loc']))}: {p['msg']}; got {p['input']!r:.60}"
-        for p in problems[:_MAX_PROBLEMS_SHOWN]
-    ]
-    num_hidden = len(problems) - len(problem_texts)
-    raise SceneError(
-        f"{where}: " + "; ".join(problem_texts) + (f"; and {num_hidden} more" if num_hidden else "")
-    )
-
-
 def _no_constant(name: str) -> float:
     """Refuse NaN and Infinity, which Python's reader would accept."""
     raise ValueError(f"{name} is no number of JSON")
@@ -774,61 +750,12 @@ def _json_facts(scene: Scene) -> dict[str, Any]:
         ) from error
 
 
-# ---- Safetensors files: written without a copy of the arrays, read mapped into memory ------------
-
-MAX_HEADER_BYTES = 100_000_000  # bytes of a header, the format's own limit
-# safetensors' names of numpy's types.
-_TYPES = {"<f4": "F32", "<f2": "F16", "<i2": "I16", "<i4": "I32", "<i8": "I64"}
-_ALIGNMENT = 64  # bytes: a cache line, and any vector register
-
-
-def write_tensors(
-    file: BinaryIO, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str] | None = None
-) -> None:
-    """Write contiguous arrays, the widest types first, so that each one is aligned."""
-    header: dict[str, object] = {} if metadata is None else {"__metadata__": dict(metadata)}
-    names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
-    end = 0
-    for name in names:
-        array = arrays[name]
-        begin = end
-        end = end + array.nbytes
-        code = _TYPES[array.dtype.newbyteorder("<").str]
-        header[name] = {"dtype": code, "shape": array.shape, "data_offsets": [begin, end]}
-    text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
-    text += b" " * (-(len(text) + 8) % _ALIGNMENT)
-    if len(text) > MAX_HEADER_BYTES:
-        raise SceneError(
-            f"{file.name}: cameras, tracks and facts take {len(text)} bytes of text; a single file "
-            f"may hold {MAX_HEADER_BYTES}. Write a scene folder instead, which has no such limit"
-        )
-    file.write(len(text).to_bytes(8, "little"))
-    file.write(text)
-    for name in names:
-        little_endian = arrays[name].astype(arrays[name].dtype.newbyteorder("<"), copy=False)
-        file.write(little_endian.reshape(-1).view(np.uint8).data)
-
-
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Map the arrays of a file and read its metadata. Writes to the arrays stay in memory."""
-    try:
-        open_file(path).close()  # opening a pipe would wait for ever
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return tensors, file.metadata() or {}
-    except OSError as error:
-        raise SceneError(f"{path} cannot be read: {error}") from error
-    except Exception as error:  # whatever a damaged header leads to, in safetensors or in torch
-        raise SceneError(f"{path} is damaged or no safetensors file: {error}") from error
-
-
 # ---- Folders and single files --------------------------------------------------------------------
 
 DOCUMENT = "scene.json"  # everything but the arrays
 GAUSSIANS = "gaussians.safetensors"  # the arrays of background and actors
 SKY = "sky.safetensors"  # the array of the sky
 FILES = (DOCUMENT, GAUSSIANS, SKY)  # the files that a scene folder must have
-LEVELS = "levels.safetensors"  # levels of detail of a large scene (augment.files.level_file)
 SCENE_SUFFIX = ".climategs"  # the end of a scene file's name
 _SKY_PREFIX = "sky."  # start of the names of the sky's arrays in a scene file
 _FORMAT_PATTERN = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + FORMAT.encode() + rb'"')
@@ -962,8 +889,6 @@ def read_saved_scene(path: str | Path) -> SavedScene:
     sky = take_sky(opened.sky, document.sky, document.precision, in_sky)
     scene = scene_of(document, parts, sky, source=f"scene:{path}", where=in_document)
     if is_large:
-        from augment.files.level_file import read_levels
-
         store_levels(scene.background, read_levels(levels, scene.background))
     return SavedScene(scene, Path(document.working_folder))
 

@@ -31,17 +31,23 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from augment.errors import SceneError
 from augment.files.image_size import image_header
-from augment.files.limits import check_memory, parse_json_object, row_slices
-from augment.files.ply import SplatFile
-from augment.files.scene_file import validate_model
+from augment.files.limits import check_memory, parse_json_object, row_slices, validate_model
+from augment.files.splat_format import (
+    Loss,
+    SplatFile,
+    SplatFormat,
+    SplatWriter,
+    has_directional_colors,
+)
 from augment.output.atomic import write_file_atomically
 from augment.rng import rng_for
 from augment.scene.scene import Gaussians, check_gaussians
+from augment.scene.transform import transform_gaussians_rigidly
 from recipes.files import open_file
 
 SUFFIX = ".sog"  # the end of the zipped files' names
 META = "meta.json"  # the name of the file that describes the others
-ZIP = b"PK\x03\x04"  # first bytes of a zip
+_ZIP = b"PK\x03\x04"  # first bytes of a zip
 _CODEBOOK_SIZE = 256  # numbers of a codebook
 _MAX_CODE = 65535  # the largest code of a coordinate
 _NUM_SH_REST = (0, 3, 8, 15)  # coefficients a channel beyond the first, by bands
@@ -568,3 +574,42 @@ def _nearest_centres(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
         for start in range(0, len(rows), rows_at_once)
     ]
     return np.concatenate(parts)
+
+
+def _export(path: Path, gaussians: Gaussians, facts: Mapping[str, str]) -> None:
+    """Write a scene's Gaussians with y down: viewers turn them as they turn a .ply.
+
+    meta.json says `up` and `unit` as a .ply's comments do.
+    """
+    z_to_minus_y = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    notes = {key: facts[key] for key in ("up", "unit") if key in facts}
+    if "up" in notes:
+        notes["up"] = "-y"
+    zero = torch.zeros(3, dtype=torch.float64)
+    write_sog(path, transform_gaussians_rigidly(gaussians, z_to_minus_y, zero), notes=notes)
+
+
+SOG = SplatFormat(
+    name=".sog",
+    reader=read_sog,
+    suffixes=(SUFFIX,),
+    first_bytes=(_ZIP,),
+    file_names=(META,),
+    writer=SplatWriter(
+        kind="sog",
+        suffix=SUFFIX,
+        write=_export,
+        world_losses=(Loss("cameras are left out"),),
+        value_losses=(
+            Loss(
+                "places are rounded to 0.1 mm at the origin, 1 cm at 100 m and 10 cm at 1 km from "
+                "it, rotations to 1 degree, opacities to 8 bits, scales and colours to the nearest "
+                "of 256 each"
+            ),
+            Loss(
+                f"SH is rounded to the nearest of {MAX_PALETTE} sets, where there are more",
+                has_directional_colors,
+            ),
+        ),
+    ),
+)

@@ -26,14 +26,14 @@ import torch
 
 from augment.errors import SceneError
 from augment.files.limits import check_memory, row_slices
-from augment.files.ply import SplatFile
+from augment.files.splat_format import Loss, SplatFile, SplatFormat, SplatWriter, rotate_z_to_y
 from augment.output.atomic import write_file_atomically
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
-SUFFIX = ".spz"  # the end of the files' names
 UP = "+y"  # the axis that points up
-GZIP = b"\x1f\x8b"  # first bytes of a gzip stream
+_GZIP = b"\x1f\x8b"  # first bytes of a gzip stream
 _MAGIC = 0x5053474E  # first number of a header
+_MARK = _MAGIC.to_bytes(4, "little")  # its bytes
 _HEADER = struct.Struct("<IIIBBBB")  # the fields of _Header
 WRITTEN_VERSION = 3  # the version that is written
 _EXTENSIONS_FLAG = 0x2  # set if there are records of vendors, before the columns or after them
@@ -90,6 +90,7 @@ def read_spz(path: str | Path) -> SplatFile:
     """
     path = Path(path)
     try:
+        _refuse_bare_spz(path)
         with gzip.open(path) as stream:
             header = _unpack_header(path, stream.read(_HEADER.size))
             columns = {
@@ -108,17 +109,11 @@ def read_spz(path: str | Path) -> SplatFile:
     return SplatFile(gaussians, notes={"up": UP}, problems=problems)
 
 
-def refuse_bare_spz(path: Path, start: bytes) -> None:
-    """Refuse a file that begins with the mark of .spz and not with that of gzip.
-
-    Args:
-        path: the file.
-        start: its first bytes.
-
-    Raises:
-        SceneError: it is such a file.
-    """
-    if start[:4] != _MAGIC.to_bytes(4, "little"):
+def _refuse_bare_spz(path: Path) -> None:
+    """Refuse a file that begins with the mark of .spz and not with that of gzip."""
+    with path.open("rb") as file:
+        start = file.read(8)
+    if not start.startswith(_MARK):
         return
     version = int.from_bytes(start[4:8], "little")
     if version < 4:
@@ -160,7 +155,7 @@ def _decode_gaussians(header: _Header, columns: Mapping[str, np.ndarray]) -> Gau
 
 def _unpack_header(path: Path, data: bytes) -> _Header:
     """Check a header."""
-    if len(data) < _HEADER.size or data[:4] != _MAGIC.to_bytes(4, "little"):
+    if len(data) < _HEADER.size or not data.startswith(_MARK):
         raise SceneError(f"{path}: not a .spz file: its stream does not begin with 'NGSP'")
     header = _Header(*_HEADER.unpack(data))
     if header.version not in (1, 2, 3):
@@ -308,3 +303,27 @@ def _encode_sh(sh: np.ndarray) -> np.ndarray:
     )[:, None]
     codes = np.rint((128 * sh + 128) / steps) * steps
     return _round_to_bytes(codes)
+
+
+SPZ = SplatFormat(
+    name=".spz",
+    reader=read_spz,
+    suffixes=(".spz",),
+    first_bytes=(_GZIP, _MARK),
+    writer=SplatWriter(
+        kind="spz",
+        suffix=".spz",
+        write=lambda path, gaussians, _facts: write_spz(path, rotate_z_to_y(gaussians)),
+        world_losses=(
+            Loss("how long a unit is is left out: open it with ?scale=1; y points up in it"),
+            Loss("cameras are left out"),
+        ),
+        value_losses=(
+            Loss(
+                "places are rounded to 0.12 mm within 2 km, scales by up to 3 %, rotations to 0.25 "
+                "degrees, opacities, colours and SH to 8 bits and less; SH beyond -1 and 1 is cut "
+                "off"
+            ),
+        ),
+    ),
+)

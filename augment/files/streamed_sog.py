@@ -18,10 +18,9 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 from augment.errors import SceneError
-from augment.files.limits import check_memory, read_json_object
-from augment.files.ply import SplatFile
-from augment.files.scene_file import validate_model
+from augment.files.limits import check_memory, read_json_object, validate_model
 from augment.files.sog import META, SUFFIX, read_all_sog_gaussians
+from augment.files.splat_format import SplatFile, SplatFormat
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
 LOD_META = "lod-meta.json"  # the name of the file that describes the scene
@@ -227,3 +226,8 @@ def _chunk_bytes(chunk: Path) -> int:
     if chunk.name != META:
         return chunk.stat().st_size
     return sum(file.stat().st_size for file in chunk.parent.iterdir() if file.is_file())
+
+
+STREAMED_SOG = SplatFormat(
+    name=LOD_META, reader=read_streamed_sog, file_names=(LOD_META,), option="level"
+)

@@ -19,6 +19,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,10 +28,17 @@ import torch
 
 from augment.errors import SceneError
 from augment.files.limits import check_memory, parse_json_object
-from augment.files.ply import SplatFile, join_positioned_parts
+from augment.files.splat_format import (
+    Loss,
+    SplatFile,
+    SplatFormat,
+    SplatWriter,
+    join_positioned_parts,
+)
 from augment.files.usd_stage import ATTRIBUTES, COEFFICIENTS
 from augment.output.atomic import make_folder, raise_output_error, write_file_atomically
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians
+from augment.scene.transform import transform_gaussians
 
 _BASE_MEMORY_BYTES = 2 << 30  # bytes of address space to read a file of any size
 _MEMORY_PER_BYTE = 16  # bytes beyond that for each byte of the file
@@ -121,8 +129,6 @@ def _splats(path: Path, facts: dict[str, Any], output: IO[bytes]) -> SplatFile:
         facts: the line of JSON that `usd_stage.py` wrote.
         output: its output after that line.
     """
-    from augment.files.export import transform_gaussians  # imported here: it imports this module
-
     problems = [f"{path}: {sentence}" for sentence in facts["problems"]]
     prims = facts["prims"]
     num_gaussians = sum(prim["columns"]["positions"][0] for prim in prims)
@@ -230,3 +236,18 @@ def write_usd(path: str | Path, gaussians: Gaussians, *, is_upright: bool, is_me
             layer.Export(str(temporary_file))
             with temporary_file.open("rb") as source, write_file_atomically(path) as file:
                 shutil.copyfileobj(source, file)
+
+
+def _export(path: Path, gaussians: Gaussians, facts: Mapping[str, str]) -> None:
+    """Write a scene's Gaussians in the scene's axes."""
+    write_usd(path, gaussians, is_upright="up" in facts, is_metric="unit" in facts)
+
+
+USD = SplatFormat(
+    name=".usd",
+    reader=read_usd,
+    suffixes=(".usd", ".usda", ".usdc", ".usdz"),
+    writer=SplatWriter(
+        kind="usd", suffix=".usdc", write=_export, world_losses=(Loss("cameras are left out"),)
+    ),
+)

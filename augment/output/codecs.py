@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from augment.files.recorded_images import decode_pixels
+from augment.files.image_size import decode_pixels
 from recipes.schema import Output
 
 # PNG settings by time and size at 960x540 on one core: libpng's run-length strategy with one fixed

@@ -29,7 +29,8 @@ from adapters.camera_files.paths import (
 from adapters.street_gaussians.adapter import StreetGaussiansLabels
 from adapters.world import WorldChange
 from augment.errors import AdapterError
-from augment.files.ply import read_splats, write_ply
+from augment.files.formats import read_splats
+from augment.files.ply import write_ply
 from augment.scene.scene import Scene
 from augment.scene.sky import ConstantSky
 

@@ -11,7 +11,6 @@ import numpy as np
 import plyfile
 import pytest
 import torch
-from splat_scenes import gaussians_at, street
 
 from adapters.base import open_scene
 from adapters.camera_files.camera_files import look_at_pose
@@ -27,9 +26,11 @@ from adapters.gaussian_files import (
 )
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.errors import AdapterError, SceneError
-from augment.files.ply import write_ply, write_splat
+from augment.files.ply import write_ply
+from augment.files.splat import write_splat
 from augment.scene.scene import Gaussians
 from augment.scene.scene_index import check_frames
+from tests.adapters.splat_scenes import gaussians_at, street
 
 TO_Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z-up world to COLMAP's usual y-down
 
@@ -59,7 +60,7 @@ def drive_poses(names: list[str], *, change: np.ndarray | None = None) -> dict[s
 def turned(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
     """Balls only: their orientation does not matter."""
     means = gaussians.means @ torch.from_numpy(rotation).float().T
-    return Gaussians(**{**vars(gaussians), "means": means})
+    return dataclasses.replace(gaussians, means=means)
 
 
 def save_model(folder: Path, gaussians: Gaussians, cameras: list | None = None) -> Path:
@@ -97,7 +98,7 @@ def test_a_bare_street_is_turned_and_driven_and_says_what_was_estimated(tmp_path
 def test_a_bare_file_that_may_be_anything_gets_no_path(tmp_path: Path) -> None:
     """Opened, so that it can be looked at and exported; to render it says what to give."""
     small = street()
-    small = Gaussians(**{**vars(small), "means": small.means / 20, "scales": small.scales / 20})
+    small = dataclasses.replace(small, means=small.means / 20, scales=small.scales / 20)
     ball = torch.nn.functional.normalize(torch.randn(2000, 3), dim=1)
     for gaussians, why in (
         (small, "in metres it would be no street: "),
@@ -117,7 +118,7 @@ def test_a_bare_file_that_may_be_anything_gets_no_path(tmp_path: Path) -> None:
 def test_cameras_on_a_car_give_up_and_unit(tmp_path: Path) -> None:
     """As training from COLMAP leaves it: y down, in a unit of its own."""
     source = turned(street(heading_deg=0), TO_Y_DOWN)
-    source = Gaussians(**{**vars(source), "means": source.means / 5, "scales": source.scales / 5})
+    source = dataclasses.replace(source, means=source.means / 5, scales=source.scales / 5)
     poses = drive_poses(["1", "2", "3"], change=TO_Y_DOWN)
     for pose in poses.values():
         pose[:3, 3] /= 5
@@ -238,7 +239,7 @@ def test_far_coordinates_are_recentred(tmp_path: Path) -> None:
 
 def test_far_float32_coordinates_are_recentred_and_lamented(tmp_path: Path) -> None:
     near = street(heading_deg=0)
-    write_ply(tmp_path / "a.ply", Gaussians(**{**vars(near), "means": near.means + 2_000_000}))
+    write_ply(tmp_path / "a.ply", dataclasses.replace(near, means=near.means + 2_000_000))
     scene = open_gaussians(tmp_path / "a.ply", {"scale": "1"})
     assert scene.background.means.abs().max() < 100
     text = problem_with(scene, "km from zero")
@@ -358,13 +359,8 @@ TILTED = "0.25,-0.9,0.3"
 def posed(gaussians: Gaussians, up: str, unit: float = 1.0) -> Gaussians:
     """Balls of a z-up world as a file whose `up` points up stores them, in units of `unit` m."""
     turn = torch.from_numpy(rotation_to_z_up(parse_up(up)).T).float()
-    return Gaussians(
-        **{
-            **vars(gaussians),
-            "means": gaussians.means @ turn.T / unit,
-            "scales": gaussians.scales / unit,
-        }
-    )
+    means, scales = gaussians.means @ turn.T / unit, gaussians.scales / unit
+    return dataclasses.replace(gaussians, means=means, scales=scales)
 
 
 def box(count: int, low: list[float], high: list[float]) -> torch.Tensor:

@@ -23,7 +23,7 @@ from recording_folder import write_recording
 from adapters.base import open_scene
 from adapters.scene_cache import LIMIT_KEY, cached_scene, scene_digest
 from augment.errors import AdapterError
-from augment.files.export import export_ply
+from augment.files.export import export_splats
 from augment.files.scene_file import save_scene
 from augment.render.rasterize import rasterize
 from tools.cli import main
@@ -225,7 +225,7 @@ def _scene(root: Path) -> str:
 
 def _splats(root: Path) -> str:
     root.mkdir(parents=True)
-    export_ply(fitted_scene(), root / "point_cloud.ply", 0)
+    export_splats(fitted_scene(), root / "point_cloud.ply", 0)
     return f"gaussians:{root}?"
 
 

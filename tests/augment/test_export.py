@@ -8,34 +8,27 @@ import json
 import numpy as np
 import pytest
 import torch
-from fitted_scenes import START_NS, fitted_scene, frame, with_classes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import camera_ahead, random_gaussians, slight_pose
 
 from adapters.base import open_scene
-from augment.errors import OutputError, SceneError
+from augment.errors import OutputError
 from augment.files.export import (
-    bake_scene,
     export_cameras,
-    export_glb,
     export_losses,
-    export_ply,
     export_ply_parts,
-    export_sog,
-    export_splat,
-    export_spz,
-    export_usd,
+    export_splats,
     inria_cameras,
     is_parts_folder,
-    transform_gaussians_rigidly,
 )
-from augment.files.ply import read_ply, read_splats
 from augment.render.rasterize import rasterize
 from augment.render.sh import evaluate_sh
 from augment.scene.geometry import rigid, rotmat_from_quat, transform_points
 from augment.scene.scene import Actor, ColorSeries, Gaussians, PosedGaussians, Scene, Track
 from augment.scene.semantics import SemanticClass
+from augment.scene.transform import bake_scene, transform_gaussians_rigidly
+from tests.fitted_scenes import START_NS, fitted_scene, frame, with_classes
+from tests.scenes import camera_ahead, random_gaussians, slight_pose
 
 NOW = START_NS + 100_000_000
 
@@ -153,34 +146,9 @@ def test_shape_and_colour_turn_along(quat, shift, degree):
 # Files of one moment
 
 
-def ulps(ours: torch.Tensor, theirs: torch.Tensor) -> int:
-    """The greatest number of float32 steps between positive numbers."""
-    return int((ours.view(torch.int32).long() - theirs.view(torch.int32).long()).abs().max())
-
-
-def test_a_ply_keeps_all_but_rounding(tmp_path):
-    """Logs and logits round once, and so do their inverses: a few steps of float32 are lost."""
-    scene = drive(background=with_classes(random_gaussians(20_000, seed=9, sh_degree=3)))
-    export_ply(scene, tmp_path / "a.ply", NOW)
-    file = read_ply(tmp_path / "a.ply")
-    written, read = bake_scene(scene, NOW), file.gaussians
-    for name in ("means", "sh", "semantic"):
-        assert torch.equal(getattr(read, name), getattr(written, name)), name
-    assert 0 < ulps(read.scales, written.scales) <= 5
-    assert 0 < ulps(read.opacities, written.opacities) <= 10
-    torch.testing.assert_close(read.quats, written.quats, rtol=0, atol=2e-7)
-    assert dict(file.notes) == {"world_origin_m": "448262.0 4421337.0 -0.1"}
-    export_ply(dataclasses.replace(scene, has_metric_scale=True, has_known_gravity=True),
-               tmp_path / "a.ply", NOW)  # fmt: skip
-    assert read_ply(tmp_path / "a.ply").notes["up"] == "+z"
-    assert read_ply(tmp_path / "a.ply").notes["unit"] == "metre"
-    ours, theirs = image([PosedGaussians(written)]), image([PosedGaussians(read)])
-    assert np.quantile(differences(ours, theirs), 0.999) < 0.05
-
-
 def test_an_exported_ply_opens_as_the_scene_was(tmp_path):
     scene = drive(has_metric_scale=True, has_known_gravity=True)
-    export_ply(scene, tmp_path / "a.ply", NOW)
+    export_splats(scene, tmp_path / "a.ply", NOW)
     assert export_cameras(scene, tmp_path)
     again = open_scene(str(tmp_path / "a.ply"))
     assert again.has_metric_scale and again.has_known_gravity
@@ -194,26 +162,6 @@ def test_an_exported_ply_opens_as_the_scene_was(tmp_path):
     ours = image(tuple(scene.parts_at(NOW)))
     theirs = image(tuple(again.parts_at(0)))
     assert np.quantile(differences(ours, theirs), 0.999) < 2
-
-
-def test_missing_folders_are_made_and_a_file_in_their_place_is_named(tmp_path):
-    scene = drive(actors=())
-    (tmp_path / "file").write_text("")
-    kinds = (export_ply, export_splat, export_spz, export_sog, export_glb, export_usd)
-    for export in kinds:
-        name = export.__name__.removeprefix("export_").replace("usd", "usdc")
-        export(scene, tmp_path / name / "below" / f"a.{name}", NOW)
-        assert len(read_splats(tmp_path / name / "below" / f"a.{name}").gaussians) == 300
-        with pytest.raises(OutputError, match=r"cannot write .* in the way"):
-            export(scene, tmp_path / "file" / "below" / f"a.{name}", NOW)
-
-
-def test_a_moment_with_nothing_in_it_is_refused(tmp_path):
-    scene = drive(background=Gaussians.empty(), actors=drive().actors[2:])
-    for export, name in ((export_ply, "a.ply"), (export_splat, "a.splat")):
-        with pytest.raises(SceneError, match=f"shows no Gaussians at {NOW} ns"):
-            export(scene, tmp_path / name, NOW)
-    assert not list(tmp_path.iterdir())
 
 
 def test_cameras_are_inrias(tmp_path):

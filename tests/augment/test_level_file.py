@@ -14,8 +14,9 @@ from safetensors.torch import load_file, save_file
 
 from augment.detail import lod
 from augment.errors import SceneError
-from augment.files.level_file import save_large_scene
-from augment.files.scene_file import LEVELS, load_scene_parts, save_scene
+from augment.files.large_scene import save_large_scene
+from augment.files.level_file import LEVELS
+from augment.files.scene_file import load_scene_parts, save_scene
 from augment.render.constants import RasterSettings
 from augment.render.rasterize import rasterize
 from augment.scene.scene import PosedGaussians, Scene

@@ -27,7 +27,7 @@ import numpy as np
 import torch
 
 from adapters.base import open_scene
-from augment.files.export import export_ply
+from augment.files.export import export_splats
 from augment.files.scene_file import save_scene, save_scene_file
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.blocks import Block, read_status
@@ -365,7 +365,7 @@ def _open_files(case: JobsCase, uri: str | None, folder: Path, repeats: int) -> 
     save_scene(scene, folder / "scene")
     save_scene_file(scene, folder / "scene.climategs")
     save_scene_file(scene, folder / "half.climategs", half=True)
-    export_ply(scene, folder / "scene.ply", scene.frames[0].timestamp_ns)
+    export_splats(scene, folder / "scene.ply", scene.frames[0].timestamp_ns)
     uris = {
         "gaussians: (.ply)": f"gaussians:{folder / 'scene.ply'}",
         "scene: folder": f"scene:{folder / 'scene'}",
