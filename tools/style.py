@@ -1,7 +1,7 @@
 """`climategs style apply`: a scene in the colours of a photograph or a preset, as a scene folder;
 `style train`: photographs and scenes become a network that maps colours.
 
-Bytes depend on the data, the settings and the number of steps alone; times are only printed.
+The network's bytes depend on the data, the settings and the number of steps alone.
 """
 
 from __future__ import annotations
@@ -9,11 +9,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,22 +22,20 @@ from adapters.base import open_scene
 from adapters.scene_folder import prepare_for_storage
 from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, style_scene
 from augment.effects.style.content import content_pictures, content_statistics, select_views
-from augment.effects.style.losses import FeatureExtractor, open_features
-from augment.effects.style.network import B0Encoder, load_imagenet_weights, save_network
+from augment.effects.style.losses import open_features
+from augment.effects.style.network import B0Encoder, Gscm, load_imagenet_weights, save_network
 from augment.effects.style.style import SceneStyle, style_maps
 from augment.effects.style.train import (
-    SCORE_DEFINITIONS,
     Content,
-    Draw,
+    Photos,
     StepRecord,
-    StyleTrainer,
     TrainingPool,
-    generator_for,
     new_network,
+    photo_contents,
     read_photos,
     scene_contents,
     score_photos,
-    score_training,
+    train_network,
 )
 from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.files.scene_file import save_scene
@@ -52,111 +49,94 @@ from augment.scene.semantics import SemanticClass
 from recipes.style import STYLES, Style, style_preset_names
 from recipes.template import readable
 from tools.drawing import captioned, strip, write_rgb
-from tools.options import StyleTrainOptions, uri_text
+from tools.options import DEFAULT_MINUTES, StyleTrainOptions, value_or
 from tools.output import check_scene_out, fill, path_beside, print_note
-from tools.training import (
-    CHECKPOINT_S,
-    PLAN_FILE,
-    REPORT_FILE,
-    RESERVE,
-    STYLE_PANELS,
-    Checkpoint,
-    Outcome,
-    Training,
-    open_training,
-    rounded_steps,
-    run_training,
-    train,
-    write_curves,
-)
+from tools.training import REPORT_FILE, StopRequest
 
 if TYPE_CHECKING:
     from tools.cli import ApplyOptions
 
-# OUT of a training holds the network, the report and its curves; OUT/checkpoint what an unfinished
-# one goes on from.
+# The network in the folder of a training; the report lies beside it.
 NETWORK_FILE = "network.safetensors"
-CURVES_FILE = "curves.png"
-ROWS = 40  # the number of rows of the history, roughly
-ROW_STEPS = 50  # the number of steps that are averaged into one row, at most
-SCORED = 16  # contents with a style each, by which a network is scored
-TIMED = 8  # the number of steps that are timed, to estimate how many fit the time
-UNTIMED = 2  # the number of steps before them that are not timed
+# Largest number of views of a scene that are learnt from.
+SCENE_VIEWS = 24
+# Every so many photos one is held out for scores.
+HOLDOUT = 8
+# Number of steps after which the losses are printed and the network is written.
+ROW_STEPS = 50
 
 
-def train_style(
-    options: StyleTrainOptions, *, progress: bool = True, checkpoint_s: float = CHECKPOINT_S
-) -> Outcome:
-    """Train a network into `options.out`, or go on with a training there.
+def train_style(options: StyleTrainOptions) -> dict[str, Any]:
+    """Train a network into `options.out`. Return the report, which is written beside it.
 
     Raises:
         ClimateGSError: options, data or the output folder cannot be used as they are.
     """
-    out = options.out
-    folder = checkpoint_folder(options.out)
-    if out.exists() and not out.is_dir():
-        raise OutputError(f"{out} is a file: choose another --out")
-    network = out / NETWORK_FILE
-    if not (options.overwrite or (folder / PLAN_FILE).is_file()) and network.exists():
-        raise OutputError(
-            f"{out} holds a network, and no checkpoint to go on from: choose another --out, or "
-            f"replace it with --overwrite"
-        )
-    return train(
-        options,
-        folder,
-        out,
-        report=out / REPORT_FILE,
-        stands=network.is_file,
-        show=lambda report: _show_end(out, report),
-        prepare=lambda before: _prepare(options, folder, before),
-        run=lambda run: _train(run, progress, checkpoint_s),
-    )
-
-
-def checkpoint_folder(out: Path) -> Path:
-    """Return the folder of the checkpoint from which a training in `out` goes on."""
-    return out / "checkpoint"
-
-
-class _Data(NamedTuple):
-    """Pictures of a training. scored: by which networks are scored. held_out: photos."""
-
-    pool: TrainingPool
-    scored: Draw
-    held_out: torch.Tensor
-    facts: dict[str, Any]
-    problems: tuple[str, ...]
-
-
-class _Run(NamedTuple):
-    """All that a training needs, opened and at the step to go on from."""
-
-    training: Training
-    features: FeatureExtractor
-    data: _Data
-
-
-def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None) -> _Run:
+    network_file = _check_network_out(options)
     _check_device(options.device)
-    data = _open_data(options)
-    for problem in data.problems:
-        print_note(f"note: {problem}")
-    views = len(data.pool.views)
-    photos = len(data.pool.photos)
-    print_note(f"{photos} photos and {views} views of {len(options.scenes)} scenes to learn from")
+    pool, photos, problems = _open_data(options)
     features = open_features(options.vgg)
-    training = open_training(
-        options,
-        folder,
-        before,
-        data.facts,
-        trainer=lambda steps: _trainer(options, steps, data.pool, features),
-        estimate=lambda budget_s: _estimate(options, budget_s, data.pool, features),
-        result="network",
-        changed=f"the photos or scenes are not those {options.out} was trained on so far",
-    )
-    return _Run(training, features, data)
+    net = _new_network(options)
+    progress = _progress(options)
+    about = {
+        "command": "style train",
+        "features": features.name,
+        "settings": options.settings(),
+        "data": {
+            "views": len(pool.views),
+            "photos": len(photos.train),
+            "held_out_photos": len(photos.held_out),
+        },
+    }
+    history: list[dict[str, float]] = []
+    records: list[StepRecord] = []
+    with StopRequest() as stop:
+        for record in train_network(
+            net,
+            pool,
+            features,
+            progress=progress,
+            seed=options.seed,
+            learning_rate=options.settings()["learning_rate"],
+            frozen_norm=options.encoder_weights is not None,
+        ):
+            records.append(record)
+            about["steps"] = record.step
+            is_last = stop.requested or progress(record.step) >= 1
+            if is_last or record.step % ROW_STEPS == 0:
+                history.append(_mean_losses(records))
+                print_note(", ".join(f"{name} {value:.4g}" for name, value in history[-1].items()))
+                records = []
+                save_network(network_file, net, about)
+            if is_last:
+                break
+    report = {
+        **about,
+        "complete": progress(about["steps"]) >= 1,
+        "network": NETWORK_FILE,
+        "problems": problems,
+        "scores": score_photos(net, photos.held_out),
+        "history": history,
+    }
+    write_atomic(options.out / REPORT_FILE, (json.dumps(report, indent=1) + "\n").encode())
+    if not report["complete"]:
+        print_note(f"stopped after step {about['steps']}; the network is as it was then")
+    for name, psnr_db in report["scores"].items():
+        print(f"{name}: {psnr_db:.2f} dB")
+    print(f"network: {network_file}")
+    return report
+
+
+def _check_network_out(options: StyleTrainOptions) -> Path:
+    """Return the path of the network to write; refuse a file, and a network that is there."""
+    if options.out.exists() and not options.out.is_dir():
+        raise OutputError(f"{options.out} is a file: choose another --out")
+    network_file = options.out / NETWORK_FILE
+    if network_file.exists() and not options.overwrite:
+        raise OutputError(
+            f"{options.out} holds a network: choose another --out, or replace it with --overwrite"
+        )
+    return network_file
 
 
 def _check_device(device: str) -> None:
@@ -167,155 +147,53 @@ def _check_device(device: str) -> None:
         raise ClimateGSError(f"--device {device}: {reason}; train on cpu, or cuda") from error
 
 
-def _open_data(options: StyleTrainOptions) -> _Data:
+def _open_data(options: StyleTrainOptions) -> tuple[TrainingPool, Photos, list[str]]:
+    """Return the pictures to learn from, all photos, and a sentence for each problem with them."""
     size_px = options.settings()["size_px"]
-    device = options.device
     views: list[Content] = []
     problems: list[str] = []
     for uri in options.scenes:
         scene = open_scene(uri)
-        views += scene_contents(scene, options.views, size_px, seed=options.seed, device=device)
+        views += scene_contents(
+            scene, SCENE_VIEWS, size_px, seed=options.seed, device=options.device
+        )
         problems += scene.problems
-    photos = read_photos(options.photos, size_px, holdout=options.holdout)
-    facts = {
-        "views": len(views),
-        "views_sha256": _digest(view.picture for view in views),
-        "photos": len(photos.train),
-        "photos_sha256": _digest([photos.train]),
-        "held_out_photos": len(photos.held_out),
-        "held_out_sha256": _digest([photos.held_out]),
-    }
-    pool = TrainingPool(views, photos.train.to(device))
-    # Networks are scored by held-out photos where there are any, and the scenes' views.
-    held_out = photos.held_out.to(device)
-    scored_pool = TrainingPool(views, held_out) if len(held_out) else pool
-    # Whatever the seed: trainings are compared by them.
-    scored = scored_pool.draw(generator_for(0, 0, "scores"), SCORED)
-    return _Data(pool, scored, photos.held_out, facts, (*problems, *photos.problems))
+    photos = read_photos(options.photos, size_px, holdout=HOLDOUT)
+    problems += photos.problems
+    pool = TrainingPool(views, photo_contents(photos.train, device=options.device))
+    for problem in problems:
+        print_note(f"note: {problem}")
+    num_photos = len(photos.train)
+    num_scenes = len(options.scenes)
+    print_note(f"{num_photos} photos and {len(views)} views of {num_scenes} scenes to learn from")
+    return pool, photos, problems
 
 
-def _digest(pictures: Iterable[torch.Tensor]) -> str:
-    digest = hashlib.sha256()
-    for picture in pictures:
-        digest.update(picture.cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _trainer(
-    options: StyleTrainOptions, steps: int, pool: TrainingPool, features: FeatureExtractor
-) -> StyleTrainer:
+def _new_network(options: StyleTrainOptions) -> Gscm:
+    """Return the network to train, with the encoder's pretrained weights if there are any."""
     net = new_network(options.encoder, seed=options.seed)
     if options.encoder_weights is not None:
         assert isinstance(net.encoder, B0Encoder)
         load_imagenet_weights(net.encoder, options.encoder_weights)
-    weights = {name: getattr(options, name) for name in ("style", "consistency", "cycle", "pairs")}
-    return StyleTrainer(
-        net,
-        pool,
-        features,
-        steps=steps,
-        seed=options.seed,
-        learning_rate=options.settings()["learning_rate"],
-        weights={**weights, "range": options.pair_range},
-        batch=options.batch,
-        pair_batch=options.pair_batch,
-        frozen_norm=options.encoder_weights is not None,
-    )
+    return net
 
 
-def _estimate(
-    options: StyleTrainOptions, budget_s: float, pool: TrainingPool, features: FeatureExtractor
-) -> tuple[int, float]:
-    """Estimate the steps that fill the time, and the seconds of one with all losses, by a trainer
-    that is thrown away.
-    """
-    trainer = _trainer(options, 1000, pool, features)
-    trainer.step = 500  # beyond the warm-up
-    seconds: list[float] = []
-    for _ in range(UNTIMED + TIMED):
-        start_s = time.perf_counter()
-        trainer.run_step()
-        seconds.append(time.perf_counter() - start_s)
-    step_s = sorted(seconds[UNTIMED:])[TIMED // 2]
-    return rounded_steps(int(budget_s * (1 - RESERVE) / step_s)), step_s
+def _progress(options: StyleTrainOptions) -> Callable[[int], float]:
+    """Return a function from steps done to the share of the training that is done, by now."""
+    if (num_steps := options.steps) is not None:
+        return lambda step: step / num_steps
+    budget_s = 60 * value_or(options.minutes, DEFAULT_MINUTES)
+    start_s = time.monotonic()
+    return lambda step: (time.monotonic() - start_s) / budget_s if step else 0.0
 
 
-def _train(run: _Run, progress: bool, checkpoint_s: float) -> Outcome:
-    training = run.training
-    steps = training.plan.steps
-    row_steps = min(max(steps // ROWS, 1), ROW_STEPS)
-
-    def add(record: StepRecord) -> None:
-        training.add({"steps": 1.0, "loss": record.loss})
-        for name, value in record.terms.items():  # of a part of the steps, where the warm-up ends
-            training.add({f"sum.{name}": value, f"count.{name}": 1})
-        if record.step % row_steps == 0 or record.step == steps:
-            sums = training.sums
-            training.sums = {}
-            names = [name.removeprefix("sum.") for name in sums if name.startswith("sum.")]
-            terms = {name: sums[f"sum.{name}"] / sums[f"count.{name}"] for name in names}
-            training.add_row(loss=sums["loss"] / sums["steps"], **terms)
-
-    def postfix(_: StepRecord) -> dict[str, str]:
-        sums = training.sums
-        return {"loss": f"{sums['loss'] / sums['steps']:.4f}"} if sums else {}
-
-    return run_training(
-        training,
-        "train",
-        add=add,
-        score=lambda: training.add_row(**_scores(run)),
-        postfix=postfix,
-        write=lambda complete: _write(run, complete),
-        checkpoint_s=checkpoint_s,
-        progress=progress,
-    )
-
-
-def _scores(run: _Run) -> dict[str, Any]:
-    """Return the scores of the network as it is now."""
-    return score_training(run.training.trainer.net, run.data.scored, run.features)
-
-
-def _write(run: _Run, complete: bool) -> dict[str, Any]:
-    training = run.training
-    options = training.options
-    plan = training.plan
-    net = training.trainer.net
-    about = {
-        "command": "style train",
-        "step": training.trainer.step,
-        "steps": plan.steps,
-        "features": run.features.name,
-        "settings": plan.settings,
-        "data": plan.data,
-    }
-    save_network(options.out / NETWORK_FILE, net, about)
-    report = {
-        **about,
-        "complete": complete,
-        "network": NETWORK_FILE,
-        "parameters": sum(parameter.numel() for parameter in net.parameters()),
-        "seconds": training.seconds(),
-        "scenes": [uri_text(uri) for uri in options.scenes],
-        "problems": list(run.data.problems),
-        "definitions": SCORE_DEFINITIONS,
-        "scores": _scores(run) | score_photos(net, run.data.held_out),
-        "history": training.rows,
-    }
-    write_atomic(options.out / REPORT_FILE, (json.dumps(report, indent=1) + "\n").encode())
-    write_curves(options.out / CURVES_FILE, training.rows, STYLE_PANELS)
-    if complete:
-        _show_end(options.out, report)
-    return report
-
-
-def _show_end(out: Path, report: dict[str, Any]) -> None:
-    numbers = {n: v for n, v in report["scores"].items() if isinstance(v, int | float)}
-    print(", ".join(f"{name} {v:.4g}" for name, v in numbers.items() if math.isfinite(v)))
-    if (out / CURVES_FILE).is_file():
-        print(f"curves: {out / CURVES_FILE}")
-    print(f"network: {out / NETWORK_FILE}")
+def _mean_losses(records: Sequence[StepRecord]) -> dict[str, float]:
+    """Return the last step's number and mean losses; a loss of some steps is averaged over them."""
+    row = {"step": float(records[-1].step), "loss": np.mean([record.loss for record in records])}
+    names = {name for record in records for name in record.terms}
+    for name in sorted(names):
+        row[name] = np.mean([record.terms[name] for record in records if name in record.terms])
+    return {name: float(value) for name, value in row.items()}
 
 
 VIEWS = 2  # that are drawn and measured

@@ -1,4 +1,4 @@
-"""The training loop of `fit` and `style train`, and its checkpoints.
+"""The training loop of `fit`, and its checkpoints.
 
 A training runs until its last step or a signal. It goes on from a checkpoint to the same bits.
 
@@ -477,22 +477,6 @@ FIT_PANELS = (
         "median depth error, m (log scale)", _by_split("depth_median_m"), log=True, last="{:.2g}"
     ),
     Panel("Gaussians", (Line("splats", color=_GREEN),), from_zero=True),
-)
-_TERMS = (
-    Line("cycle", "cycle", _BLUE),
-    Line("consistency", "consistency", _ORANGE),
-    Line("style", "style", _GREEN),
-)
-STYLE_PANELS = (
-    Panel("losses (log scale)", _TERMS, log=True),
-    Panel("loss: weighted sum, mean of some steps", (Line("loss"),)),
-    Panel("loss of pairs: logarithms of errors", (Line("pairs"),)),
-    Panel("restored after content space, PSNR, dB", (Line("restoration_psnr", is_marked=True),)),
-    Panel(
-        "content space: RMSE of Z_s, in deviations of Z_c (log scale)",
-        (Line("content_rmse", is_marked=True),),
-        log=True,
-    ),
 )
 
 

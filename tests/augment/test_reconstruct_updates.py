@@ -181,36 +181,25 @@ def test_a_perfect_picture_has_ssim_1_and_no_gradient():
     assert np.abs(loss.d_rgb).max() <= 1.01 * (1 / (3 * view.weight.sum()))
 
 
-def test_surfaces_are_pulled_to_be_opaque():
-    arguments = case(24, 33, seed=6)
-    view = arguments["view"]
-    with_it, without = (
-        view_loss(**{**arguments, "weights": LossWeights(surface=weight)}) for weight in (0.3, 0.0)
-    )
-    total = view.depth_weight.sum()
-    through = (1 - arguments["alpha"].reshape(-1)[view.depth_pixels]) * view.depth_weight
-    assert with_it.surface == pytest.approx(through.sum() / total)
-    assert with_it.total - without.total == pytest.approx(0.3 * with_it.surface)
-    change = (with_it.d_alpha - without.d_alpha).reshape(-1)
-    expected = np.zeros_like(change)
-    expected[view.depth_pixels] = -0.3 * view.depth_weight / total
-    # differences of float32 sums of about 1e-3
-    np.testing.assert_allclose(change, expected, atol=1e-8)
-
-
-def test_what_lies_below_the_horizon_is_pulled_to_be_opaque():
-    arguments = case(24, 33, seed=6)
-    view = arguments["view"]
+@pytest.mark.parametrize("term", ["surface", "ground"])
+def test_surfaces_and_what_lies_below_the_horizon_are_pulled_to_be_opaque(term):
     level = dataclasses.replace(camera_ahead(33, 24, 20.0), name="front")
-    arguments = with_view(arguments, camera=level)
+    arguments = with_view(case(24, 33, seed=6), camera=level)
+    view = arguments["view"]
     with_it, without = (
-        view_loss(**{**arguments, "weights": LossWeights(ground=weight)}) for weight in (0.3, 0.0)
+        view_loss(**{**arguments, "weights": LossWeights(**{term: weight})})
+        for weight in (0.3, 0.0)
     )
-    below = ~view.sky & (np.arange(24)[:, None] + 0.5 > level.cy)
-    through = (1 - arguments["alpha"])[below].sum() / below.size
-    assert with_it.total - without.total == pytest.approx(0.3 * through, rel=1e-5)
-    change = with_it.d_alpha - without.d_alpha
-    np.testing.assert_allclose(change, np.where(below, -0.3 / below.size, 0), atol=1e-8)
+    pull = np.zeros((24, 33))  # of each pixel, per unit of its transmittance
+    if term == "surface":
+        pull.reshape(-1)[view.depth_pixels] = view.depth_weight / view.depth_weight.sum()
+    else:
+        pull[~view.sky & (np.arange(24)[:, None] + 0.5 > level.cy)] = 1 / pull.size
+    value = (pull * (1 - arguments["alpha"])).sum()
+    assert with_it.total - without.total == pytest.approx(0.3 * value, rel=1e-5)
+    assert term == "ground" or with_it.surface == pytest.approx(value)
+    # differences of float32 sums of about 1e-3
+    np.testing.assert_allclose(with_it.d_alpha - without.d_alpha, -0.3 * pull, atol=1e-8)
 
 
 def test_pixels_without_weight_neither_count_nor_disturb_nor_learn():
@@ -284,9 +273,9 @@ def test_the_same_bits_for_any_threads_and_with_reused_buffers():
             np.testing.assert_array_equal(gradients(together, faces)[name], gradient)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
+def test_arrays_of_another_shape_type_or_order_are_refused():
+    arguments = case(13, 17)
+    for name, value in (
         ("rgb", np.zeros((13, 16, 3), np.float32)),
         ("rgb", np.zeros((13, 17, 3))),
         ("alpha", np.zeros((13, 17, 1), np.float32)),
@@ -295,23 +284,14 @@ def test_the_same_bits_for_any_threads_and_with_reused_buffers():
         ("sky_faces", np.zeros((6, 0, 0, 3), np.float32)),
         ("sky_faces", np.zeros((4, 3), np.float32)),
         ("color_map", np.eye(3, 4)),
-    ],
-)
-def test_arrays_of_another_shape_or_type_are_refused(name, value):
-    with pytest.raises(ValueError, match=rf"^{name} of camera 'front' must be float32 .*; got "):
-        view_loss(**{**case(13, 17), name: value})
-
-
-@pytest.mark.parametrize("pixels", [[0, 221], [-1, 3], [5, 5], [7, 4]], ids=str)
-def test_depth_pixels_outside_or_out_of_order_are_refused(pixels):
-    bad = with_view(
-        case(13, 17),
-        depth_pixels=np.array(pixels, np.int32),
-        depth_m=np.ones(2, np.float32),
-        depth_weight=np.ones(2, np.float32),
-    )
-    with pytest.raises(ValueError, match=r"'front'.* increasing indices from 0 to 220"):
-        view_loss(**bad)
+    ):
+        with pytest.raises(ValueError, match=rf"^{name} of camera 'front' must be float32 .*; got"):
+            view_loss(**{**arguments, name: value})
+    ones = np.ones(2, np.float32)
+    for pixels in ([0, 221], [-1, 3], [5, 5], [7, 4]):
+        priors = {"depth_pixels": np.array(pixels, np.int32), "depth_m": ones}
+        with pytest.raises(ValueError, match=r"'front'.* increasing indices from 0 to 220"):
+            view_loss(**with_view(arguments, **priors, depth_weight=ones))
 
 
 # ---- Adam on splats ------------------------------------------------------------------------------
@@ -362,9 +342,8 @@ def random_update(splats: Splats, seed: int, *, present=BOTH) -> Update:
         size = (len(touched[part]), NUM_GRADIENTS)
         signs = rng.choice([-1.0, 1.0], size)
         gradients[part] = (signs * 10 ** rng.uniform(-6, 2, size)).astype(np.float32)
-        gradients[part][:, [G_ABS_MEAN, G_MAX_SIGMA]] = np.abs(
-            gradients[part][:, [G_ABS_MEAN, G_MAX_SIGMA]]
-        )
+        for column in (G_ABS_MEAN, G_MAX_SIGMA):
+            gradients[part][:, column] = np.abs(gradients[part][:, column])
     camera = camera_ahead(64, 48, 40.0 + seed, yaw=0.05 * seed, position=(0.1 * seed, 0.0, 0.0))
     return Update(camera, list(present), touched, gradients, step=seed)
 
@@ -374,9 +353,8 @@ def apply_update(splats: Splats, update: Update, rates: LearningRates = FASTER) 
     parts = [part for part, _ in update.present]
     poses = stack_poses([pose for _, pose in update.present])
     inputs = splat_inputs(splats, parts, poses, update.camera, RasterSettings())
-    rows = np.full(
-        (inputs.num_slots, NUM_GRADIENTS), np.nan, np.float32
-    )  # what is not counted is not read
+    # Rows that are not counted are not read.
+    rows = np.full((inputs.num_slots, NUM_GRADIENTS), np.nan, np.float32)
     ids = np.full(inputs.num_slots, -1, np.int32)
     counts = np.zeros(len(inputs.blocks), np.int64)
     for block, (number, first, last) in enumerate(inputs.blocks):
@@ -475,11 +453,8 @@ class PlainAdam:
         self.values[name][used] -= size * hat[0] / (np.sqrt(hat[1]) + EPS)
 
     def activated(self) -> dict[str, np.ndarray]:
-        logits = self.values["opacities"][:, 0]
-        return self.values | {
-            "scales": np.exp(self.values["scales"]),
-            "opacities": 1 / (1 + np.exp(-logits)),
-        }
+        opacities = 1 / (1 + np.exp(-self.values["opacities"][:, 0]))
+        return self.values | {"scales": np.exp(self.values["scales"]), "opacities": opacities}
 
 
 def assert_close_to(splats: Splats, plain: PlainAdam) -> None:
@@ -487,11 +462,14 @@ def assert_close_to(splats: Splats, plain: PlainAdam) -> None:
     float32); values are rounded at every step to 6e-8 of themselves, means of up to 10 m to 1e-6.
     """
     expected = plain.activated()
-    np.testing.assert_allclose(splats.means, expected["means"], rtol=1e-6, atol=5e-6)
-    np.testing.assert_allclose(splats.quats, expected["quats"], rtol=0, atol=3e-6)
-    np.testing.assert_allclose(splats.scales, expected["scales"], rtol=5e-6)
-    np.testing.assert_allclose(splats.opacities, expected["opacities"], rtol=0, atol=5e-6)
-    np.testing.assert_allclose(splats.sh, expected["sh"], rtol=1e-6, atol=1e-6)
+    for name, rtol, atol in (
+        ("means", 1e-6, 5e-6),
+        ("quats", 0, 3e-6),
+        ("scales", 5e-6, 0),
+        ("opacities", 0, 5e-6),
+        ("sh", 1e-6, 1e-6),
+    ):
+        np.testing.assert_allclose(getattr(splats, name), expected[name], rtol, atol)
     assert np.array_equal(splats.age, plain.age)
     np.testing.assert_allclose(splats.grads, plain.grads, rtol=1e-5)
     # gradients of up to 1e2 times SH functions, which are good to 1e-6 where they cross 0
@@ -560,34 +538,24 @@ def test_a_gradient_that_is_not_finite_leaves_its_splat_as_it_was():
 
 
 def test_values_are_clamped():
-    """Scales between a millimetre and the scene's extent, opacities short of 0 and 1."""
+    """Scales between a millimetre, or what images resolve, and the scene's extent; opacities short
+    of 0 and 1.
+    """
     splats = some_splats()
+    splats.min_scale_m[::2] = 0.03
     rates = dataclasses.replace(FASTER, scales=5.0, opacities=8.0)
     update = random_update(splats, 0, present=BOTH[:1])
     at, g = update.touched[0], update.gradients[0]
     for _ in range(4):
         apply_update(splats, update, rates)
-    grows, shrinks = g[:, G_SCALE : G_SCALE + 3] < 0, g[:, G_SCALE : G_SCALE + 3] > 0
-    assert (splats.scales[at][grows] == np.float32(EXTENT_M)).all()
-    assert (splats.scales[at][shrinks] == np.float32(1e-3)).all()
+    grows = g[:, G_SCALE : G_SCALE + 3] < 0
+    least_m = np.where(at % 2 == 0, np.float32(0.03), np.float32(1e-3))[:, None]
+    np.testing.assert_array_equal(splats.scales[at], np.where(grows, np.float32(EXTENT_M), least_m))
     rises = g[:, G_OPACITY] < 0
     assert (splats.opacities[at][rises] == np.float32(0.9995)).all()
     assert (splats.opacities[at][~rises] == np.float32(1e-4)).all()
     for array in splats.arrays().values():
         assert np.isfinite(array).all()
-
-
-def test_no_splat_gets_smaller_than_images_resolve():
-    splats = some_splats()
-    splats.min_scale_m[::2] = 0.03
-    rates = dataclasses.replace(FASTER, scales=5.0)
-    update = random_update(splats, 0, present=BOTH[:1])
-    at, g = update.touched[0], update.gradients[0]
-    for _ in range(4):
-        apply_update(splats, update, rates)
-    shrinks = (g[:, G_SCALE : G_SCALE + 3] > 0).all(1)
-    least = np.where(at % 2 == 0, np.float32(0.03), np.float32(1e-3))[shrinks]
-    assert (splats.scales[at][shrinks] == least[:, None]).all() and shrinks.any()
 
 
 def test_same_bits_for_any_number_of_threads():
@@ -698,7 +666,7 @@ def pulled(splats: Splats, rows: list[int], radius: float) -> Splats:
 
 def round_of(splats: Splats, *, max_splats: int = 600_000, **growth) -> Splats:
     """A round, after which all that a step relies on holds; its input is left alone."""
-    before = {name: array.copy() for name, array in splats.arrays().items()}
+    before = copied(splats)
     grown = densify(splats, Growth(**growth), max_splats=max_splats, extent_m=GROWN_EXTENT_M)
     for name, array in grown.arrays().items():
         original = getattr(splats, name)
@@ -728,9 +696,6 @@ def origins(splats: Splats, before: Splats) -> np.ndarray:
     assert np.array_equal(splats.sh, before.sh[rows])
     assert np.array_equal(splats.semantic, before.semantic[rows])
     return rows
-
-
-# --- clones and splits ---
 
 
 def test_small_ones_are_cloned_and_let_through_what_one_did() -> None:
@@ -777,12 +742,12 @@ def test_the_budget_goes_to_the_best() -> None:
         assert len(round_of(splats, fraction=0.5, max_splats=limit)) == total
 
 
-# --- removal ---
-
-
-def test_faint_and_unusable_ones_are_removed() -> None:
+def test_refuted_faint_and_unusable_ones_are_removed() -> None:
     """Rows 0 to 8 unusable, each in its own way, 9 faint; 10 and 11 suspicious but sound."""
     splats = splats_of(*PARTS)
+    refuted = np.arange(50) % 7 == 0
+    grown = densify(splats, Growth(), max_splats=60, extent_m=GROWN_EXTENT_M, refuted=refuted)
+    assert same(grown, rebuild(splats, np.flatnonzero(~refuted)))
     splats.means[0, 1] = np.nan
     splats.quats[1, 2] = np.inf
     splats.scales[2, 0] = np.nan
@@ -808,16 +773,6 @@ def test_children_are_no_smaller_than_images_resolve() -> None:
     assert len(grown) == 52
     assert (grown.scales >= grown.min_scale_m[:, None]).all()
     assert (grown.scales.min(1) == grown.min_scale_m).sum() == 4
-
-
-def test_the_refuted_are_removed() -> None:
-    splats = splats_of(*PARTS)
-    refuted = np.arange(50) % 7 == 0
-    grown = densify(splats, Growth(), max_splats=60, extent_m=GROWN_EXTENT_M, refuted=refuted)
-    assert same(grown, rebuild(splats, np.flatnonzero(~refuted)))
-
-
-# --- what views tell of splats ---
 
 
 def test_the_view_that_sees_a_splat_best_bounds_its_size() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import pickle
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from augment.effects.style.losses import (
     open_features,
     picture_distance,
     style_loss,
-    weighted_sum,
 )
 from augment.effects.style.network import (
     FLOOR_STD,
@@ -330,10 +328,3 @@ def test_style_loss_of_shifted_and_stretched_features():
     assert float(style_loss((feature,), (stretched,))) == pytest.approx(wanted, rel=1e-4)
     both = style_loss((feature, feature), (feature + 0.3, stretched))
     assert float(both) == pytest.approx(0.3 + wanted, rel=1e-4)  # layers add up
-
-
-def test_only_terms_that_weigh_something_count():
-    terms = {"a": torch.tensor(2.0), "b": torch.tensor(math.nan), "c": torch.tensor(3.0)}
-    assert float(weighted_sum(terms, {"a": 10.0, "b": 0.0, "c": 0.5})) == 21.5
-    with pytest.raises(StyleError, match="none of the losses a, b, c weighs anything"):
-        weighted_sum(terms, {"b": 0.0})

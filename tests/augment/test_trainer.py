@@ -97,30 +97,28 @@ def frames() -> tuple[Frame, ...]:
     for index in range(FRAMES):
         cameras = {}
         for name, yaw, delay in (("left", 0.15, 0), ("right", -0.15, FRAME_NS // 10)):
-            camera = camera_ahead(
-                WIDTH,
-                HEIGHT,
-                32.0,
-                position=(0.3 * index, 0.1 * index, 0.0),
-                yaw=yaw,
-                timestamp_ns=index * FRAME_NS + delay,
-            )
+            place = {"position": (0.3 * index, 0.1 * index, 0.0), "yaw": yaw}
+            time_ns = index * FRAME_NS + delay
+            camera = camera_ahead(WIDTH, HEIGHT, 32.0, **place, timestamp_ns=time_ns)
             cameras[name] = dataclasses.replace(camera, name=name)
         world_from_ego = torch.eye(4, dtype=torch.float64)
         out.append(Frame(index, index * FRAME_NS, world_from_ego, cameras))
     return tuple(out)
 
 
+def pose(shift=(0.0, 0.0, 0.0), yaw_rad: float = 0.0) -> torch.Tensor:
+    quat = [math.cos(yaw_rad / 2), 0, 0, math.sin(yaw_rad / 2)]
+    rotation = rotmat_from_quat(torch.tensor(quat, dtype=torch.float64))
+    return rigid(rotation, torch.tensor(shift, dtype=torch.float64))
+
+
 def track(shift=(0.0, 0.0, 0.0), turn_rad: float = 0.0, last: int = FRAMES - 1) -> Track:
     """Across the view, from its first frame to `last`; a label may be shifted and turned."""
-    times = torch.arange(last + 1) * FRAME_NS
     poses = []
     for index in range(last + 1):
-        angle = 0.3 + 0.1 * index + turn_rad
-        quat = torch.tensor([math.cos(angle / 2), 0, 0, math.sin(angle / 2)], dtype=torch.float64)
-        centre = torch.tensor([4.0, 0.6 - 0.3 * index, 0.1], dtype=torch.float64)
-        centre = centre + torch.tensor(shift, dtype=torch.float64)
-        poses.append(rigid(rotmat_from_quat(quat), centre))
+        centre = np.array([4.0, 0.6 - 0.3 * index, 0.1]) + shift
+        poses.append(pose(centre, 0.3 + 0.1 * index + turn_rad))
+    times = torch.arange(last + 1) * FRAME_NS
     return Track(times, torch.stack(poses), hold_ns=FRAME_NS // 5)
 
 
@@ -171,13 +169,15 @@ def blurred(gaussians: Gaussians, seed: int) -> Gaussians:
     )
 
 
+def blurred_car(**changes) -> Actor:
+    actor = car(**changes)
+    return dataclasses.replace(actor, gaussians=blurred(actor.gaussians, 3))
+
+
 def start(**changes) -> Scene:
-    actors = tuple(
-        dataclasses.replace(actor, gaussians=blurred(actor.gaussians, 3)) for actor in (car(),)
-    )
     scene = truth(
         background=blurred(street(), 4),
-        actors=actors,
+        actors=(blurred_car(),),
         sky=CubemapSky(torch.full((6, 4, 4, 3), 0.5)),
         color_maps={},
     )
@@ -341,9 +341,8 @@ def test_the_fitted_scene_shows_what_the_trainer_sees(recorded):
         tape = rendered(trainer, camera)
         color_map = trainer.color_maps[key.camera]
         images = (tape.rgb, tape.alpha, camera, trainer.sky_faces, color_map)
-        own = reference_picture(
-            *(torch.from_numpy(i) if isinstance(i, np.ndarray) else i for i in images)
-        ).numpy()
+        tensors = (torch.from_numpy(i) if isinstance(i, np.ndarray) else i for i in images)
+        own = reference_picture(*tensors).numpy()
         # The right camera fires between samples of the track, where a fitted pose is interpolated
         # and a trained one is the interpolated label corrected: micrometres, 1e-4 of a pixel.
         tolerance = 1e-6 if key.camera == "left" else 2e-3
@@ -391,7 +390,7 @@ def test_a_fit_without_depth_or_sky(recorded, changes, depth_weight):
 
 def test_an_actor_that_views_do_not_show(recorded):
     """Its track ends before the last two frames: only the first two teach it anything."""
-    gone = dataclasses.replace(car(last=1), gaussians=blurred(car().gaussians, 3))
+    gone = blurred_car(last=1)
     truth_source = record(truth(actors=(car(last=1),)))
     late = truth_source.only([key for key in truth_source.views if key.frame >= 2])
     trainer = quick(start(actors=(gone,)), late)
@@ -414,14 +413,9 @@ def test_an_actor_that_views_do_not_show(recorded):
 NS = 1_000_000_000
 
 
-def pose(shift=(0.0, 0.0, 0.0), yaw=0.0) -> np.ndarray:
-    quat = torch.tensor([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)], dtype=torch.float64)
-    return rigid(rotmat_from_quat(quat), torch.tensor(shift, dtype=torch.float64)).numpy()
-
-
 def actor_on(times, label="Car", name="a") -> Actor:
-    poses = np.stack([pose((float(i), 0.0, 0.0)) for i in range(len(times))])
-    track = Track(torch.tensor(times), torch.from_numpy(poses))
+    poses = torch.stack([pose((float(i), 0.0, 0.0)) for i in range(len(times))])
+    track = Track(torch.tensor(times), poses)
     return Actor(name, label, Gaussians.empty(), track, (4.0, 2.0, 1.5))
 
 
@@ -458,7 +452,7 @@ def test_forces_are_the_slopes_of_the_loss():
     """Against central differences of the loss, in float32, of a part and of the camera."""
     splats = Splats.of([ahead(200, 5), ahead(150, 6)], 0)
     camera = camera_ahead(64, 48, 60.0)
-    poses = np.stack([np.eye(4), pose((1.0, 0.2, 0.1), 0.4)])
+    poses = np.stack([np.eye(4), pose((1.0, 0.2, 0.1), 0.4).numpy()])
     settings, scratch = RasterSettings(), Scratch()
     rows, columns = np.mgrid[:48, :64] / 20  # smooth, so that splats' cut-offs hardly show
     weights = np.cos(np.stack([rows + columns, 2 * rows, columns - rows], 2)).astype(np.float32)
@@ -510,7 +504,6 @@ def test_a_camera_is_found_again():
     def error(camera):
         return float(np.abs(render(camera).rgb - target).mean())
 
-    first = error(start)
     for step in range(200):
         camera = found.corrected(start)
         tape = render(camera)
@@ -518,12 +511,10 @@ def test_a_camera_is_found_again():
         forces = part_forces(tape.inputs, grads)
         found.update(camera, poses, forces, rate_px=0.02 * 0.98**step, pull=0.0)
     # Adam steps by its rate: 3 mm to begin with, 0.06 mm at the end, 15 cm in all
-    assert error(found.corrected(start)) < 0.2 * first
-    at_another_time = dataclasses.replace(start, timestamp_ns=5 * NS)
-    assert (
-        found.corrected(at_another_time).camera_from_world
-        == found.corrected(start).camera_from_world
-    ).all()  # the only knot holds
+    assert error(found.corrected(start)) < 0.2 * error(start)
+    later = found.corrected(dataclasses.replace(start, timestamp_ns=5 * NS))
+    # The only knot holds.
+    assert torch.equal(later.camera_from_world, found.corrected(start).camera_from_world)
     stranger = dataclasses.replace(start, name="another")
     assert found.corrected(stranger) is stranger
 
@@ -531,7 +522,7 @@ def test_a_camera_is_found_again():
 def test_an_actor_is_pushed_along_its_forces_in_the_world():
     times = [i * NS for i in range(9)]
     poses = ActorPoses([actor_on(times), actor_on(times, EGO_VEHICLE, "b")])
-    turned = pose((3.0, 0.0, 0.0), np.pi / 2)
+    turned = pose((3.0, 0.0, 0.0), np.pi / 2).numpy()
     forces = Forces(
         is_visible=np.array([True, True, True]),
         shift=np.array([[9.0, 9, 9], [1.0, 0, 0], [1.0, 0, 0]]),
@@ -552,13 +543,11 @@ def test_an_actor_is_pushed_along_its_forces_in_the_world():
 
 # ---- with gsplat ---------------------------------------------------------------------------------
 
-CONFIG = FitConfig(max_splats=600)
-TUNING = Tuning(steps_per_sh_band=1, growth=Growth(steps_per_round=3, start=0.1, stop=0.6))
-
 
 def trainer_on(device: str, source) -> Trainer:
     """Of a run of 8 steps, in which splats are added and a band joins."""
-    return Trainer(start(), source, CONFIG, 8, tuning=TUNING, device=device)
+    growth = Growth(steps_per_round=3, start=0.1, stop=0.6)
+    return quick(start(), source, 8, device=device, steps_per_sh_band=1, growth=growth)
 
 
 @pytest.fixture(scope="module")
@@ -594,7 +583,7 @@ def test_gradients_are_those_of_the_cpu_s_kernels(three_views):
     for device in ("cpu", "cuda"):
         trainer = quick(start(), three_views, device=device)
         trainer.step = QUICK.steps_per_sh_band  # two bands are learnt
-        tape = trainer._render(trainer._posed(view.camera), view.camera)
+        tape = rendered(trainer, view.camera)
         rows = dense_rows(trainer, tape.backward(*slopes), tape.inputs)
         found.append((tape.rgb, tape.alpha, tape.expected_depth, rows))
     for cpu, cuda in zip(*(images[:3] for images in found), strict=True):

@@ -33,7 +33,7 @@ from tools.fit_report import (
     true_depth_errors,
     write_report,
 )
-from tools.training import FIT_PANELS, STYLE_PANELS, write_curves
+from tools.training import FIT_PANELS, write_curves
 
 KEYS = tuple(ViewKey(frame, name) for frame in range(4) for name in ("left", "right"))
 FIGURES = ("psnr", "ssim", "flip")
@@ -302,6 +302,6 @@ def test_views_and_reports_that_lack_something_say_so(tmp_path, monkeypatch, cap
 def test_curves_have_a_panel_for_each_known_quantity(tmp_path):
     assert drawn(tmp_path, []) is None
     assert drawn(tmp_path, [{"step": 50, "seconds": 1.0, "loss": math.nan}]) is None
-    rows = [{"step": s, "seconds": s, "loss": v, "cycle": 1} for s, v in enumerate((0, -1, 1e30))]
-    image, one = drawn(tmp_path, rows, STYLE_PANELS), drawn(tmp_path, rows)
+    rows = [{"step": s, "seconds": s, "loss": v, "splats": 1} for s, v in enumerate((0, -1, 1e30))]
+    image, one = drawn(tmp_path, rows), drawn(tmp_path, rows, FIT_PANELS[:1])
     assert image.shape[1] == 2 * one.shape[1] and (image != 255).any(axis=2).mean() > 0.01

@@ -16,7 +16,7 @@ from adapters.base import open_scene
 from augment.effects.style.color_maps import style_gaussians, style_sky
 from augment.effects.style.network import load_network, network_facts
 from augment.effects.style.style import style_maps
-from augment.effects.style.train import StyleTrainer
+from augment.effects.style.train import train_network
 from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.files.scene_file import load_scene_parts, save_scene
 from recipes.style import Style
@@ -24,7 +24,7 @@ from tests.fitted_scenes import fitted_scene
 from tools import style
 from tools.cli import ApplyOptions
 from tools.options import StyleTrainOptions
-from tools.style import apply_style, checkpoint_folder, picture_path, style_text, train_style
+from tools.style import apply_style, picture_path, style_text, train_style
 
 
 def styled(scene, style, out, **options):
@@ -142,22 +142,6 @@ def test_styles_that_cannot_be_used(scene_uri, tmp_path):
 
 
 @pytest.fixture
-def light(monkeypatch):
-    """Few pictures to score by; torch in one thread, as trainings are."""
-    monkeypatch.setattr(style, "SCORED", 2)
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.fixture
-def without_curves(monkeypatch, light):
-    """Which take ten times as long to draw as what they show."""
-    monkeypatch.setattr(style, "write_curves", lambda *_: False)
-
-
-@pytest.fixture
 def photos(tmp_path) -> Path:
     folder = tmp_path / "photos"
     folder.mkdir()
@@ -168,121 +152,86 @@ def photos(tmp_path) -> Path:
     return folder
 
 
-def train(options, **more):
-    return train_style(options, progress=False, **more)
-
-
-def options_of(out: Path, photos: Path, **changes) -> StyleTrainOptions:
-    made = {
-        "out": out, "photos": (photos,), "steps": 5, "size_px": 16, "batch": 1, "pair_batch": 1,
-        "pairs": 0.0, "holdout": 0, **changes,
-    }  # fmt: skip
-    return StyleTrainOptions(**made)
+def options_of(out: Path, folder: Path, **changes) -> StyleTrainOptions:
+    return StyleTrainOptions(**{"out": out, "photos": (folder,), "size_px": 16, **changes})
 
 
 def learnt(out: Path) -> bytes:
     return (out / "network.safetensors").read_bytes()
 
 
-@pytest.mark.usefixtures("light")
 def test_photos_and_a_scene_become_a_network(tmp_path, photos, capsys):
     save_scene(fitted_scene(), tmp_path / "scene")
-    out = tmp_path / "out"
-    options = options_of(out, photos, scenes=(f"scene:{tmp_path / 'scene'}",), views=2, pairs=1.0)
-    outcome = train(options)
-    assert outcome.code == 0 and outcome.report["complete"] and outcome.report["steps"] == 5
-    assert outcome.report == json.loads((out / "report.json").read_bytes())
-    assert set(fitted_scene().problems) < set(outcome.report["problems"])
-    assert outcome.report["data"]["photos"] == 4 and outcome.report["data"]["views"] == 2
-    assert {"content_rmse", "restoration_psnr", "style_loss"} <= set(outcome.report["scores"])
-    steps = [row["step"] for row in outcome.report["history"] if "loss" in row]
-    assert steps == [1, 2, 3, 4, 5]
-    assert cv2.imread(str(out / "curves.png")) is not None
+    scenes = (f"scene:{tmp_path / 'scene'}",)
+    outs = [tmp_path / name for name in ("out", "again", "other")]
+    reports = [
+        train_style(options_of(out, photos, scenes=scenes, steps=3, seed=seed))
+        for out, seed in zip(outs, (0, 0, 1), strict=True)
+    ]
+    out, again, other = outs
+    assert learnt(out) == learnt(again) != learnt(other)
+    report = reports[0]
+    assert report == json.loads((out / "report.json").read_bytes())
+    assert report["complete"] and report["steps"] == 3
+    assert report["data"] == {"views": 4, "photos": 4, "held_out_photos": 0}
+    assert set(fitted_scene().problems) < set(report["problems"])
+    (row,) = report["history"]
+    assert row.keys() == {"step", "loss", "cycle", "consistency", "style", "pairs"}
     about = network_facts(out / "network.safetensors")["about"]
     settings = about["settings"]
     assert settings["scenes"] == ["scene:scene"] and settings["photos"] == ["photos"]
-    assert (settings["learning_rate"], settings["cycle"], settings["pair_range"]) == (1e-3, 10, 4)
+    assert settings["learning_rate"] == 1e-3
     assert str(tmp_path) not in json.dumps(about)  # the same bytes wherever it was trained
     assert not load_network(out / "network.safetensors").training
-    assert "4 photos and 2 views of 1 scenes" in capsys.readouterr().err
-
-    again = train(options)
-    assert "finished already" in capsys.readouterr().out and again.report == outcome.report
+    assert "4 photos and 4 views of 1 scenes" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("without_curves")
-def test_an_interrupted_training_ends_with_the_same_bytes(tmp_path, photos, monkeypatch, capsys):
-    whole = options_of(tmp_path / "whole", photos)
-    train(whole)
-    parted = options_of(tmp_path / "parted", photos)
-    step = StyleTrainer.run_step
+def test_a_training_stops_when_asked_to_or_when_its_time_is_over(
+    tmp_path, photos, monkeypatch, capsys
+):
+    whole = train_style(options_of(tmp_path / "whole", photos, minutes=0.02))
+    assert whole["complete"] and whole["steps"] > 1
 
-    def interrupted(trainer):
-        record = step(trainer)
-        if record.step == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-        return record
+    def interrupted(*arguments, **options):
+        for record in train_network(*arguments, **options):
+            if record.step == 2:
+                os.kill(os.getpid(), signal.SIGINT)
+            yield record
 
-    with monkeypatch.context() as patch:
-        patch.setattr(StyleTrainer, "run_step", interrupted)
-        outcome = train(parted)
-    assert outcome.code == 130 and outcome.report["step"] == 2 and not outcome.report["complete"]
-    assert "stopped after step 2 of 5; the same command goes on" in capsys.readouterr().err
-    assert learnt(parted.out) != learnt(whole.out)
-    torch.set_num_threads(2)
-    outcome = train(parted)
-    assert "going on after step 2 of 5" in capsys.readouterr().err
-    assert outcome.code == 0 and learnt(parted.out) == learnt(whole.out)
-    rows = [json.loads((o.out / "report.json").read_bytes())["history"] for o in (whole, parted)]
-    learning = [[{k: v for k, v in row.items() if k != "seconds"} for row in r] for r in rows]
-    assert learning[0] == learning[1]
-    other = options_of(tmp_path / "other", photos, seed=1)
-    train(other)
-    assert learnt(other.out) != learnt(whole.out)
+    monkeypatch.setattr(style, "train_network", interrupted)
+    options = options_of(tmp_path / "stopped", photos, steps=100)
+    assert options.run() == 130
+    assert network_facts(options.out / "network.safetensors")["about"]["steps"] == 2
+    report = json.loads((options.out / "report.json").read_bytes())
+    assert report["steps"] == 2 and not report["complete"]
+    assert "stopped after step 2" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("without_curves")
-def test_other_settings_or_data_need_another_folder(tmp_path, photos):
-    out = tmp_path / "out"
-    train(options_of(out, photos, steps=1))
-    with pytest.raises(OutputError, match=r"cycle was 10\.0, now 5\.0.*--overwrite"):
-        train(options_of(out, photos, steps=1, cycle=5.0))
-    with pytest.raises(OutputError, match="its length was --steps 1"):
-        train(options_of(out, photos, steps=2))
-    plan = checkpoint_folder(out) / "fit.json"
-    plan.write_text(plan.read_text().replace("true", "false"))
-    (photos / "3.png").unlink()
-    with pytest.raises(
-        OutputError, match=r"not those .* was trained on so far: photos was 4, now 3"
-    ):
-        train(options_of(out, photos, steps=1))
-    train(options_of(out, photos, steps=1, overwrite=True))
-    for path in checkpoint_folder(out).iterdir():
-        path.unlink()
-    with pytest.raises(OutputError, match="no checkpoint to go on from"):
-        train(options_of(out, photos, steps=1))
+def test_a_network_is_replaced_only_when_asked_to(tmp_path, photos):
+    options = options_of(tmp_path / "out", photos, steps=1)
+    assert options.run() == 0
+    with pytest.raises(OutputError, match=r"holds a network: .*--overwrite"):
+        train_style(options)
+    train_style(options.model_copy(update={"overwrite": True}))
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="is a file"):
-        train(options_of(tmp_path / "file", photos))
+        train_style(options_of(tmp_path / "file", photos))
 
 
 def test_options_that_cannot_be_are_named(tmp_path, photos):
+    (tmp_path / "empty").mkdir()
     for changes, match in (
-        ({"minutes": 1.0}, "--minutes or --steps, not both"),
+        ({"minutes": 1.0, "steps": 5}, "--minutes or --steps, not both"),
         ({"encoder": "b1"}, "--encoder must be 'small' or 'b0'; got b1"),
         ({"encoder_weights": photos / "0.png"}, "add --encoder b0"),
         ({"vgg": Path("absent.pth")}, "--vgg .*there is no file absent.pth"),
         ({"steps": 0}, "--steps must be greater than or equal to 1; got 0"),
         ({"size_px": 4}, "--size-px must be .* 16; got 4"),
-        ({"cycle": -1.0}, "--cycle must be .* 0; got -1"),
         ({"learning_rate": float("nan")}, "--learning-rate must be a finite number; got nan"),
-        (dict.fromkeys(["style", "consistency", "cycle", "pairs"], 0.0), "nothing would be learnt"),
+        ({"device": "nowhere"}, "--device nowhere: .*train on cpu, or cuda"),
+        ({"photos": ()}, "give --photos FOLDER, --scene URI"),
+        ({"photos": (tmp_path / "empty",)}, "holds no images"),
     ):
         with pytest.raises(ClimateGSError, match=match):
-            options_of(tmp_path / "out", photos, **changes)
-    with pytest.raises(ClimateGSError, match="give --photos FOLDER, --scene URI"):
-        StyleTrainOptions(out=tmp_path / "out")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(StyleError, match="holds no images"):
-        train(options_of(tmp_path / "out", tmp_path / "empty"))
+            train_style(options_of(tmp_path / "out", photos, **changes))
     assert not (tmp_path / "out").exists()

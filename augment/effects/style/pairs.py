@@ -268,8 +268,15 @@ _ERROR_FLOOR = 1e-4
 # Stride of the pixels whose colours are compared.
 _STRIDE_PX = 2
 
-# Weights of the losses in their sum. The weight of `range` is an option of the training.
-PAIR_WEIGHTS = {"same": 1.0, "half": 0.5, "look": 1.0, "consistency": 1.0, "cycle": 1.0}
+# Weights of the losses in their sum.
+PAIR_WEIGHTS = {
+    "same": 1.0,
+    "half": 0.5,
+    "look": 1.0,
+    "consistency": 1.0,
+    "cycle": 1.0,
+    "range": 4.0,
+}
 
 
 def pair_losses(net: Gscm, batch: PairBatch) -> dict[str, Float[Tensor, ""]]:
