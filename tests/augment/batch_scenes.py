@@ -19,7 +19,7 @@ import torch
 
 from augment.effects.effect import EffectPlan, LabelInputs
 from augment.effects.smog import SmogPlan
-from augment.effects.snow.snow import SnowPlan
+from augment.effects.snow.plan import SnowPlan
 from augment.effects.style.color_maps import StyleMaps
 from augment.errors import AdapterError
 from augment.exposure.cells import OPEN_EDGE, ExposedCells, ExposedSurface

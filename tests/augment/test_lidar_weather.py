@@ -31,7 +31,7 @@ from augment.effects.snow.lidar import (
     intersect_layers,
     make_snow_grid,
 )
-from augment.effects.snow.snow import SnowPlan, exposure_settings
+from augment.effects.snow.plan import SnowPlan, exposure_settings
 from augment.errors import OutputError
 from augment.exposure.cells import ExposedCells, ExposedSurface
 from augment.jobs.render_job import RenderJob, run_job

@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from augment.effects.snow.snow import exposure_settings
+from augment.effects.snow.plan import exposure_settings
 from augment.errors import OutputError, SceneError
 from augment.exposure.cells import (
     FLUSH,

@@ -31,7 +31,8 @@ from torch import Tensor
 from augment.effects.falling import kernels
 from augment.effects.falling.drops import Kind, Sizes, cell_counts, sizes_of
 from augment.effects.falling.shutter import STANDING, Motion
-from augment.effects.snow.light import display_from_linear, find_scene_light
+from augment.light.scene_light import find_scene_light
+from augment.light.srgb import display_from_linear
 from augment.memo import memo_of
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.fog import MAX_EXPONENT, Fog

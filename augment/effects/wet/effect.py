@@ -23,7 +23,6 @@ from augment.effects.effect import (
     Visibility,
 )
 from augment.effects.lidar.beam import Echoes
-from augment.effects.snow.light import find_scene_light
 from augment.effects.wet.darkening import darken_gaussians, wet_ratio, white_level
 from augment.effects.wet.ground import (
     PLACEMENT_SETTINGS,
@@ -45,6 +44,7 @@ from augment.effects.wet.reflection import (
 )
 from augment.effects.wet.ripples import make_rings
 from augment.exposure.exposed_surface import share_exposed_surface
+from augment.light.scene_light import find_scene_light
 from augment.memo import memo_of
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.fog import optical_depth

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from augment.effects.snow.layer import draw_octaves, sum_octaves
+from augment.effects.gradient_noise import draw_octaves, sum_octaves
 from augment.effects.wet.kernels import EXPOSURE, HEIGHT, NUM_CHANNELS
 from augment.exposure.cells import ExposedCells
 from augment.exposure.exposed_surface import exposed_surface_of
