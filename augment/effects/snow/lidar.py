@@ -17,7 +17,7 @@ from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import MOVED
 from augment.effects.snow import layer_kernels
 from augment.effects.snow.depth import find_depths, profile_on_part
-from augment.effects.snow.plan import SnowPlan, exposure_settings
+from augment.effects.snow.plan import SnowPlan, exposure_settings, naming_cell_field
 from augment.exposure.cells import ExposedCells, ExposedSurface
 from augment.exposure.exposed_surface import exposed_surface_of
 from augment.memo import memo_of
@@ -112,7 +112,8 @@ def find_lidar_snow(scene: Scene, recipe_snow: SnowPlan) -> LidarSnow:
     Raises:
         SceneError: this scene cannot have snow.
     """
-    exposed_surface = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene))
+    with naming_cell_field():
+        exposed_surface = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene))
     key = ("lidar snow", scene.name, recipe_snow)
     return memo_of(exposed_surface).get(
         key, lambda: _build_grids(exposed_surface, scene, recipe_snow)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-from augment.exposure.placement import ExposureSettings, has_invented_drive
+from augment.errors import SceneError
+from augment.exposure.search import ExposureSettings
+from augment.exposure.tiles import TooManyCellsError
+from augment.exposure.wheel_tracks import has_recorded_drive
 from augment.scene.scene import Scene
 from recipes.snow import Snow
 
@@ -24,5 +29,14 @@ def exposure_settings(snow: Snow, scene: Scene) -> ExposureSettings:
     return ExposureSettings(
         cell_m=snow.cell_m,
         max_slope_deg=snow.max_slope_deg,
-        has_invented_tracks=snow.tracks == "always" and has_invented_drive(scene),
+        has_tracks_without_drive=snow.tracks == "always" and not has_recorded_drive(scene),
     )
+
+
+@contextlib.contextmanager
+def naming_cell_field() -> Iterator[None]:
+    """Add the recipe's field to the error of an exposed surface with too many cells."""
+    try:
+        yield
+    except TooManyCellsError as error:
+        raise SceneError(f"{error}; weather.snow.cell_m sets the size of the cells") from error
