@@ -1,7 +1,7 @@
-"""Records of the cells of a scene's surfaces that are open to the sky: where snow can lie.
+"""Records of the cells of a scene's surfaces that are open to the sky.
 
-`placement` finds them once a scene, `support` stores them, and snow, wet ground and LiDAR read
-them. They do not depend on a recipe's depth: snow of any depth is laid on the same cells.
+`search` finds them once a scene, `exposed_surface` stores them, and effects that fall from the sky
+read them. They do not depend on how much falls: a layer of any depth lies on the same cells.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ExposedCells:
 
     Each of the C cells is a square seen from above, in the part's frame (an actor's frame has its
     origin at the box's centre, z up). B Gaussians of the part are the surface, or lie close beneath
-    it: snow can hide them.
+    it: a layer on the cells can hide them.
     """
 
     # Middle of each cell: x, y, and z of the surface there.
@@ -48,10 +48,10 @@ class ExposedCells:
     obstacle_vectors: Float32[Tensor, "C 2"]
     # Class of the surface; VEGETATION is foliage, not grass.
     semantic: Int16[Tensor, "C"]
-    # Indices of the Gaussians that snow can hide.
+    # Indices of the Gaussians that a layer on the cells can hide.
     hideable_ids: Int32[Tensor, "B"]
     # Cells over each of these Gaussians: at its middle, and at 1.5 standard deviations along its
-    # two longest axes. Snow on all of these cells hides the Gaussian; -1 (no cell) means never.
+    # two longest axes. A layer on all of these cells hides the Gaussian; -1 (no cell) means never.
     covering_cells: Int32[Tensor, "B 5"]
 
     def __len__(self) -> int:
@@ -63,4 +63,4 @@ class ExposedSurface:
     """Cells of a whole scene."""
 
     ground: ExposedCells  # cells of the background
-    actors: Mapping[str, ExposedCells]  # cells of the actors that can carry snow, by track_id
+    actors: Mapping[str, ExposedCells]  # cells of the actors that have any, by track_id

@@ -1,7 +1,7 @@
 """Finds a scene's exposed surface once. It is remembered while the scene lives, and stored.
 
-`placement.find_exposed_surface` does the work. Callers: snow and wet ground (`exposed_surface_of`
-for pictures and sweeps, `share_exposed_surface` at the start of a job).
+`search.find_exposed_surface` does the work. Callers: effects that fall from the sky
+(`exposed_surface_of` for pictures and sweeps, `share_exposed_surface` at the start of a job).
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from augment.effects.effect import JobContext
 from augment.errors import SceneError
 from augment.exposure.cells import FLUSH, ExposedCells, ExposedSurface
-from augment.exposure.placement import ExposureSettings, find_exposed_surface
+from augment.exposure.search import ExposureSettings, find_exposed_surface
 from augment.memo import memo_of
 from augment.output.atomic import write_atomic
 from augment.render.buffers import AUTO, CUDA
@@ -38,6 +37,7 @@ logger = logging.getLogger(__name__)
 FORMAT = "climategs-exposed-surface-8"
 _METADATA_KEY = "exposed_surface"  # key of the metadata in a file
 # Pattern of the names that files had up to version 7 of the format, which nobody reads any more.
+# They were named after their first user.
 _OLD_FILES = f"snow-{40 * '[0-9a-f]'}.safetensors"
 # Types of the fields of ExposedCells other than float32.
 _DTYPES = {
@@ -54,7 +54,7 @@ _COLUMNS = {
     "obstacle_vectors": 2,
     "covering_cells": 5,
 }
-# Fields of ExposedCells that have a row for each Gaussian that snow can hide, not for each cell.
+# Fields of ExposedCells that have a row for each Gaussian that can be hidden, not for each cell.
 _FIELDS_OF_GAUSSIANS = ("hideable_ids", "covering_cells")
 
 
@@ -83,7 +83,7 @@ def exposed_surface_key(
         _add_tensors(digest, camera.camera_from_world)
     _add_tensors(digest, *(frame.world_from_ego for frame in scene.frames))
     if scene.seen_frames is not None:  # wheel tracks are those of the recorded drive
-        digest.update(repr(settings.has_invented_tracks).encode())
+        digest.update(repr(settings.has_tracks_without_drive).encode())
         _add_tensors(digest, *(frame.world_from_ego for frame in scene.seen_frames))
     return digest.hexdigest()
 
@@ -220,6 +220,7 @@ def exposed_surface_of(
 
     Raises:
         SceneError: as find_exposed_surface.
+        TooManyCellsError: as find_exposed_surface.
         OutputError: the folder cannot be written.
     """
 
@@ -259,29 +260,32 @@ class StoredExposedSurface:
         return load_exposed_surface(Path(self.path), self.key)
 
 
-def share_exposed_surface(context: JobContext, settings: ExposureSettings) -> None:
+def share_exposed_surface(
+    scene: Scene,
+    settings: ExposureSettings,
+    *,
+    cameras: Sequence[Camera] | None,
+    folder: Path | None,
+    backend: str,
+    progress: bool,
+) -> None:
     """Find the exposed surface of a job's scene, and share it through the scene's memo.
 
-    Other processes of the job take over the memo. Where the job has a folder, the memo holds the
-    file instead of the surface.
+    Arguments and errors are those of `exposed_surface_of`. Other processes of the job take over the
+    memo. Where the job has a folder, the memo holds the file instead of the surface.
     """
     exposed_surface = exposed_surface_of(
-        context.scene,
-        settings,
-        cameras=context.cameras,
-        folder=context.folder,
-        backend=context.backend,
-        progress=context.progress,
+        scene, settings, cameras=cameras, folder=folder, backend=backend, progress=progress
     )
     stored: ExposedSurface | StoredExposedSurface = exposed_surface
-    if context.folder is not None:
-        viewing_cameras = all_cameras(context.scene) if context.cameras is None else context.cameras
-        key = exposed_surface_key(context.scene, viewing_cameras, settings, backend=context.backend)
-        path = exposed_surface_path(context.folder, key)
+    if folder is not None:
+        viewing_cameras = all_cameras(scene) if cameras is None else cameras
+        key = exposed_surface_key(scene, viewing_cameras, settings, backend=backend)
+        path = exposed_surface_path(folder, key)
         if not path.is_file():  # this process remembers it from a job in another folder
             save_exposed_surface(path, exposed_surface, key)
         stored = StoredExposedSurface(str(path), key)
-    memo = memo_of(context.scene)
+    memo = memo_of(scene)
     memo.put(("exposed surface", settings), stored, shared=True)
     memo.put(("exposed surface", settings), exposed_surface)
 

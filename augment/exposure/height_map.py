@@ -1,7 +1,7 @@
 """Renders parts of a scene from straight above, and the depth that the cameras of a drive see.
 
 Input: posed Gaussians. Output: `HeightMap` (heights, colours and classes of the highest surface)
-and `Views` (small depth images that tell if a camera sees a cell). Callers: `placement`, `surface`.
+and `Views` (small depth images that tell if a camera sees a cell). Callers: `search`, `surface`.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ DepthEstimator = Literal["mode", "expected", "median"]
 
 MIN_COVERED_ALPHA = 0.5  # least alpha of a pixel in which something lies
 _EYE_HEIGHT_M = 100.0  # height of the camera over the highest centre
-# Height over a surface: where half of the snow lands so high up, the surface is sheltered.
+# Height over a surface: where half of what falls lands so high up, the surface is sheltered.
 _MIN_OVERHANG_M = 1.0
 _MIN_SHELTER_HEIGHT_M = 1.0  # a thing less far above a cell hides no sky from it
 _MIN_SHELTER_CELLS = 2  # narrower things hide too little of the sky
@@ -132,13 +132,13 @@ class HeightMap:
     height_m: np.ndarray  # float32, z of the surface; 0 where not covered
     rgb: np.ndarray  # float32 [H, W, 3], colour of the surface, the same from all directions
     ids: np.ndarray  # int32, heaviest Gaussian, counted through the parts; -1 where there is none
-    # bool: the surface is narrower than a cell (a wall on edge, a fence, twigs). It keeps snow off
-    # what is below and carries none itself.
+    # bool: the surface is narrower than a cell (a wall on edge, a fence, twigs). It shelters
+    # what is below and is not exposed itself.
     is_thin: np.ndarray
 
     @property
     def covered(self) -> np.ndarray:
-        """Cells where something lies that can carry snow, bool [H, W]."""
+        """Cells where something solid lies, bool [H, W]."""
         return self.alpha >= MIN_COVERED_ALPHA
 
     def centers(self) -> tuple[np.ndarray, np.ndarray]:
@@ -328,12 +328,12 @@ def _top_m(part: PosedGaussians) -> float:
 # ---- Which points of the ground the cameras of a drive can see -----------------------------------
 
 DEPTH_IMAGE_WIDTH_PX = 200  # longer side of the depth images: they resolve houses, not posts
-LIFTS_M = (0.0, 0.3, 1.0)  # depths of snow at which a cell may be seen
+LIFTS_M = (0.0, 0.3, 1.0)  # heights of a layer's top over its cell at which it may be visible
 # A point is visible up to this factor of the image's depth plus this distance, since images are
 # blurred.
 _DEPTH_TOLERANCE_SHARE = 1.05
 _DEPTH_TOLERANCE_M = 0.3
-# The same factor for snow on top of a surface that shows its underside.
+# The same factor for a layer on top of a surface that shows its underside.
 _UNDERSIDE_SHARE = 1.02
 _MAX_NORMAL_ERROR_SINE = math.sin(math.radians(3))  # sine of the largest error of normals
 _MARGIN_PX = 3.0  # pixels beyond the image that count as inside

@@ -1,8 +1,8 @@
-"""Finds the surfaces on a height map that can carry snow.
+"""Finds the surfaces on a height map that are open to the sky and can hold a layer.
 
 Input: a `HeightMap` of one square, seen from above. Output: a `Surface` with slopes, sides and
 distances to open edges; `CellList` arrays of its cells; `ExposedCells`, the finished record.
-Callers: `placement` for the background, and `find_actor_cells` here for a vehicle.
+Callers: `search` for the background, and `find_actor_cells` here for a vehicle.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from augment.scene.semantics import SemanticClass, class_of_label
 
 MAX_STEP_M = 0.25  # lower steps, such as kerbs, do not break a layer
 _STEP_RADIUS_M = 0.4  # distance from a cell within which heights are compared for steps
-# A thing narrower and higher than this carries no snow: wires, arms of lamps.
+# A thing narrower and higher than this holds no layer: wires, arms of lamps.
 _MAX_NARROW_WIDTH_M = 0.4
 _MIN_NARROW_HEIGHT_M = 1.5
 _MIN_HIGH_AREA_M2 = 0.6  # smaller patches so high up are ledges, or float before walls
@@ -49,13 +49,13 @@ _MAX_GAP_M = 0.6  # wider gaps may be deep
 _MAX_BRIDGED_HEIGHT_M = 0.1  # height above a surface from which on a thing is not bridged
 MIN_AREA_M2 = 0.05  # smaller patches are specks
 MIN_CELLS = 4  # patches of fewer cells are specks
-MAX_POCKET_M2 = 0.1  # largest area of a gap that snow bridges
+MAX_POCKET_M2 = 0.1  # largest area of a gap that a layer bridges
 _MAX_POCKET_STEP_M = 0.3  # largest range of heights around such a gap
 _POCKET_BLUR_CELLS = 1.5  # standard deviation of the blur that fills it
 # Height over the lowest cell nearby from which on a thing is an obstacle.
 MIN_OBSTACLE_HEIGHT_M = 0.4
-_BANK_REACH_M = 1.0  # distance within which that lowest cell is searched
-_BANK_BLUR_M = 0.35  # standard deviation of the blur of obstacles
+_OBSTACLE_REACH_M = 1.0  # distance within which that lowest cell is searched
+_OBSTACLE_BLUR_M = 0.35  # standard deviation of the blur of obstacles
 # Scales of smoothing; one cell at least.
 _MEDIAN_RADIUS_M = 0.1
 _PLANE_RADIUS_M = 0.15
@@ -73,28 +73,28 @@ class Surface:
     map: HeightMap
     height_m: np.ndarray  # float32, without the noise of single cells
     slopes: np.ndarray  # float32 [H, W, 2], dz/dx and dz/dy
-    can_carry: np.ndarray  # bool, snow stays on the cell
+    is_exposed: np.ndarray  # bool, the cell can hold a layer
     sides: np.ndarray  # int8 [H, W, 4], see surface_kernels.compare_sides
-    edge_m: np.ndarray  # float32, see ExposedCells.edge_distance_m
+    edge_distance_m: np.ndarray  # float32, see ExposedCells.edge_distance_m
 
 
 def find_surface(
     height_map: HeightMap,
-    may_carry: np.ndarray,
+    is_candidate: np.ndarray,
     *,
     max_slope_deg: float,
     min_area_m2: float = MIN_AREA_M2,
     floor_m: float | None = None,
     on_vehicles: np.ndarray,
 ) -> Surface:
-    """Find the surface of a map, and where snow stays on it.
+    """Find the surface of a map, and its exposed cells.
 
     Args:
         height_map: heights of a square, seen from above.
-        may_carry: bool [H, W]; where it is False, nothing carries snow.
-        max_slope_deg: steeper surfaces carry no snow.
+        is_candidate: bool [H, W]; where it is False, nothing is exposed.
+        max_slope_deg: steeper surfaces hold no layer.
         min_area_m2: a patch that ends within the map and is smaller than this, or than MIN_CELLS,
-            carries no snow.
+            is not exposed.
         floor_m: z of what the map does not show. None: z is low there, except in small gaps.
         on_vehicles: bool [H, W], cells that show a vehicle's body, see `_close_vehicle_tops` and
             `_is_vehicle_top`.
@@ -129,46 +129,48 @@ def find_surface(
             is_fitted,
         )
     floor_heights = (
-        _floor_heights(fitted_m, covered & may_carry, cell)
+        _floor_heights(fitted_m, covered & is_candidate, cell)
         if floor_m is None
         else np.float32(floor_m)
     )
     lowest, local_range = _local_range(fitted_m, covered, floor_heights, cell)
     is_steep = np.hypot(slopes[..., 0], slopes[..., 1]) > math.tan(max_slope_rad)
-    can_carry = (
-        is_fitted & may_carry & ~_is_narrow(fitted_m, covered & may_carry, floor_heights, cell)
+    is_exposed = (
+        is_fitted
+        & is_candidate
+        & ~_is_narrow(fitted_m, covered & is_candidate, floor_heights, cell)
     )
-    can_carry &= ~(is_steep & (local_range > _highest_step(max_slope_rad, cell)))
-    can_carry &= ~on_vehicles | _is_vehicle_top(
-        fitted_m, covered, can_carry & on_vehicles, max_slope_rad, cell
+    is_exposed &= ~(is_steep & (local_range > _highest_step(max_slope_rad, cell)))
+    is_exposed &= ~on_vehicles | _is_vehicle_top(
+        fitted_m, covered, is_exposed & on_vehicles, max_slope_rad, cell
     )
     max_step_m = max(MAX_STEP_M, math.tan(max_slope_rad) * cell)
-    sides = _compare_sides(fitted_m, lowest, covered, can_carry, max_step_m)
+    sides = _compare_sides(fitted_m, lowest, covered, is_exposed, max_step_m)
     min_cells = max(MIN_CELLS, math.ceil(min_area_m2 / cell**2))
     is_high = fitted_m - lowest > _MIN_NARROW_HEIGHT_M
-    can_carry &= ~_find_specks(
-        can_carry, sides, is_high, min_cells, max(min_cells, round(_MIN_HIGH_AREA_M2 / cell**2))
+    is_exposed &= ~_find_specks(
+        is_exposed, sides, is_high, min_cells, max(min_cells, round(_MIN_HIGH_AREA_M2 / cell**2))
     )
-    filled_mask = _fill_pockets(fitted_m, slopes, can_carry, covered, cell)
-    can_carry |= filled_mask
+    filled_mask = _fill_pockets(fitted_m, slopes, is_exposed, covered, cell)
+    is_exposed |= filled_mask
     covered |= filled_mask
-    sides = _compare_sides(fitted_m, lowest, covered, can_carry, max_step_m)
+    sides = _compare_sides(fitted_m, lowest, covered, is_exposed, max_step_m)
     edges = np.empty(shape, np.float32)
     with kernel_threads(_ROWS_PER_TASK):
         surface_kernels.edge_distances(
-            can_carry, sides, max(MAX_EDGE_DISTANCE_M / cell, 0.5), edges
+            is_exposed, sides, max(MAX_EDGE_DISTANCE_M / cell, 0.5), edges
         )
-    return Surface(height_map, fitted_m, slopes, can_carry, sides, edges * np.float32(cell))
+    return Surface(height_map, fitted_m, slopes, is_exposed, sides, edges * np.float32(cell))
 
 
-def find_narrow_things(height_map: HeightMap, may_carry: np.ndarray) -> np.ndarray:
-    """Find high things so narrow that snow falls past them: lamps, wires; bool [H, W]."""
-    is_solid = height_map.covered & may_carry
+def find_narrow_things(height_map: HeightMap, is_candidate: np.ndarray) -> np.ndarray:
+    """Find high things so narrow that they shelter nothing: lamps, wires; bool [H, W]."""
+    is_solid = height_map.covered & is_candidate
     floor_heights = _floor_heights(height_map.height_m, is_solid, height_map.cell_m)
     return _is_narrow(height_map.height_m, is_solid, floor_heights, height_map.cell_m)
 
 
-def find_banks(surface: Surface) -> np.ndarray:
+def find_obstacle_vectors(surface: Surface) -> np.ndarray:
     """Vectors towards obstacles, float32 [H, W, 2]; 0 on obstacles.
 
     See ExposedCells.obstacle_vectors.
@@ -176,20 +178,20 @@ def find_banks(surface: Surface) -> np.ndarray:
     cell = surface.map.cell_m
     covered = surface.map.covered
     heights = np.where(covered, surface.height_m, np.float32(np.inf))
-    reach = max(1, round(_BANK_REACH_M / cell))
+    reach = max(1, round(_OBSTACLE_REACH_M / cell))
     lowest = cv2.erode(heights, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
     is_obstacle = covered & (surface.height_m - lowest > MIN_OBSTACLE_HEIGHT_M)
     if not is_obstacle.any():
         return np.zeros((*covered.shape, 2), np.float32)
-    sigma = max(_BANK_BLUR_M / cell, 0.5)
+    sigma = max(_OBSTACLE_BLUR_M / cell, 0.5)
     blurred = cv2.GaussianBlur(
         is_obstacle.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE
     )
-    banks = np.stack(_gradient(blurred), -1) * np.float32(sigma * math.sqrt(2 * math.pi))
-    length = np.hypot(banks[..., 0], banks[..., 1])
-    banks /= np.maximum(length, 1)[..., None]
-    banks[is_obstacle | ~surface.can_carry] = 0
-    return banks
+    obstacle_vectors = np.stack(_gradient(blurred), -1) * np.float32(sigma * math.sqrt(2 * math.pi))
+    length = np.hypot(obstacle_vectors[..., 0], obstacle_vectors[..., 1])
+    obstacle_vectors /= np.maximum(length, 1)[..., None]
+    obstacle_vectors[is_obstacle | ~surface.is_exposed] = 0
+    return obstacle_vectors
 
 
 def normals_from_slopes(slopes: np.ndarray) -> np.ndarray:
@@ -248,7 +250,7 @@ def _is_narrow(
 
 
 def _highest_step(max_slope_rad: float, cell: float) -> float:
-    """Return the height of the highest step that a layer of snow covers, metres.
+    """Return the height of the highest step that a layer covers, metres.
 
     A cell that is steeper than the limit lies on a low step, not on a slope, where heights around
     it differ by no more than this. A slope as steep as the limit may differ by less.
@@ -257,42 +259,42 @@ def _highest_step(max_slope_rad: float, cell: float) -> float:
 
 
 def _compare_sides(
-    height: np.ndarray, lowest: np.ndarray, covered: np.ndarray, can_carry: np.ndarray, step: float
+    height: np.ndarray, lowest: np.ndarray, covered: np.ndarray, is_exposed: np.ndarray, step: float
 ) -> np.ndarray:
     """Return the side codes of the cells, int8 [H, W, 4], see surface_kernels.compare_sides."""
     sides = np.empty((*height.shape, 4), np.int8)
     with kernel_threads(_ROWS_PER_TASK):
-        surface_kernels.compare_sides(height, lowest, covered, can_carry, step, sides)
+        surface_kernels.compare_sides(height, lowest, covered, is_exposed, step, sides)
     return sides
 
 
 def _find_specks(
-    can_carry: np.ndarray,
+    is_exposed: np.ndarray,
     sides: np.ndarray,
     is_high: np.ndarray,
     min_cells: int,
     min_high_cells: int,
 ) -> np.ndarray:
-    """Find the cells of patches that are too small to carry snow, bool [H, W].
+    """Find the cells of patches that are too small to hold a layer, bool [H, W].
 
     A patch of linked cells that ends within the grid is too small below `min_cells` cells, or below
     `min_high_cells` cells if all of it stands high above something beside it. A patch that stands
-    high     nearly everywhere is too narrow at any length.
+    high nearly everywhere is too narrow at any length.
 
     cv2 labels patches of pixels, so links become pixels between those of the cells.
     """
-    rows, columns = can_carry.shape
+    rows, columns = is_exposed.shape
     pixels = np.zeros((2 * rows - 1, 2 * columns - 1), np.uint8)
-    pixels[::2, ::2] = can_carry
+    pixels[::2, ::2] = is_exposed
     right_sides = sides[..., 1] == LINK
     up_sides = sides[..., 3] == LINK
-    pixels[::2, 1::2] = can_carry[:, :-1] & right_sides[:, :-1] & can_carry[:, 1:]
-    pixels[1::2, ::2] = can_carry[:-1] & up_sides[:-1] & can_carry[1:]
+    pixels[::2, 1::2] = is_exposed[:, :-1] & right_sides[:, :-1] & is_exposed[:, 1:]
+    pixels[1::2, ::2] = is_exposed[:-1] & up_sides[:-1] & is_exposed[1:]
     count, labels = cv2.connectedComponents(pixels, connectivity=4)
     labels = labels[::2, ::2]
     labels = labels.astype(np.int64)
     num_cells = np.bincount(labels.ravel(), minlength=count)
-    num_low_cells = np.bincount(labels[can_carry & ~is_high], minlength=count)
+    num_low_cells = np.bincount(labels[is_exposed & ~is_high], minlength=count)
     is_linear = num_low_cells <= (1 - _MIN_LINEAR_SHARE) * num_cells
     for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         num_cells[border] = min_high_cells  # the patch may go on outside
@@ -303,7 +305,7 @@ def _find_specks(
 
 # ---- Vehicles: a reconstruction leaves shells, tufts and slivers on their sides ------------------
 
-VEHICLE_MAX_SLOPE_DEG = 38.0  # wind screens carry snow, side and rear windows do not
+VEHICLE_MAX_SLOPE_DEG = 38.0  # wind screens hold a layer, side and rear windows do not
 _MAX_SHELL_GAP_M = 0.3  # narrower dips in a roof or bonnet are gaps between shells
 _BODY_BLUR_M = 0.1  # standard deviation of the blur with which slopes of bodies are measured
 _MIN_STRIP_WIDTH_M = 0.3  # narrower strips are sills, mirrors and the rims of doors
@@ -323,23 +325,23 @@ def _close_vehicle_tops(height_map: HeightMap, on_vehicles: np.ndarray) -> Heigh
 def _is_vehicle_top(
     height: np.ndarray,
     covered: np.ndarray,
-    can_carry: np.ndarray,
+    is_exposed: np.ndarray,
     max_slope_rad: float,
     cell: float,
 ) -> np.ndarray:
-    """Cells on the roof or bonnet of a vehicle that can carry snow, bool [H, W].
+    """Cells on the roof or bonnet of a vehicle that can hold a layer, bool [H, W].
 
     Such a cell is level, lies well inside the rim, and is no sliver. A step blurred by sigma is as
     steep as h / (sigma sqrt(2 pi)), which separates the rim of a door from the roof's curvature.
     """
-    if not can_carry.any():
-        return can_carry
+    if not is_exposed.any():
+        return is_exposed
     sigma = max(_BODY_BLUR_M / cell, 0.5)
     weights = covered.astype(np.float32)
     total = cv2.GaussianBlur(weights, (0, 0), sigma)
     mean = cv2.GaussianBlur(height * weights, (0, 0), sigma) / np.maximum(total, np.float32(1e-6))
     max_gradient = math.tan(min(max_slope_rad, math.radians(VEHICLE_MAX_SLOPE_DEG)))
-    is_level = can_carry & (np.hypot(*_gradient(mean)) <= max_gradient * cell)
+    is_level = is_exposed & (np.hypot(*_gradient(mean)) <= max_gradient * cell)
     return (
         cv2.morphologyEx(is_level.astype(np.uint8), cv2.MORPH_OPEN, _disc(_MIN_STRIP_WIDTH_M, cell))
         > 0
@@ -353,22 +355,22 @@ def _disc(width_m: float, cell: float) -> np.ndarray:
 
 
 def _fill_pockets(
-    height: np.ndarray, slopes: np.ndarray, can_carry: np.ndarray, covered: np.ndarray, cell: float
+    height: np.ndarray, slopes: np.ndarray, is_exposed: np.ndarray, covered: np.ndarray, cell: float
 ) -> np.ndarray:
-    """Fill small gaps in a surface, which snow bridges; return their cells, bool [H, W].
+    """Fill small gaps in a surface, which a layer bridges; return their cells, bool [H, W].
 
     Heights and slopes of the gaps are replaced by those around them, in place. A thing that stands
     out of the surface, or a gap between two levels, is not filled.
     """
-    count, labels = cv2.connectedComponents((~can_carry).astype(np.uint8), connectivity=4)
+    count, labels = cv2.connectedComponents((~is_exposed).astype(np.uint8), connectivity=4)
     labels = labels.astype(np.int64)
     is_pocket = np.bincount(labels.ravel(), minlength=count) <= max(1, MAX_POCKET_M2 / cell**2)
     for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         is_pocket[border] = False  # the gap may go on outside
-    is_pocket[labels[can_carry]] = False
+    is_pocket[labels[is_exposed]] = False
     kernel = np.ones((7, 7), np.uint8)
-    highest = cv2.dilate(np.where(can_carry, height, np.float32(-np.inf)), kernel)
-    lowest = cv2.erode(np.where(can_carry, height, np.float32(np.inf)), kernel)
+    highest = cv2.dilate(np.where(is_exposed, height, np.float32(-np.inf)), kernel)
+    lowest = cv2.erode(np.where(is_exposed, height, np.float32(np.inf)), kernel)
     pocket_mask = is_pocket[labels]
     with np.errstate(invalid="ignore", over="ignore"):  # far from any surface both are infinite
         broken_mask = pocket_mask & ~(highest - lowest < _MAX_POCKET_STEP_M)
@@ -377,7 +379,7 @@ def _fill_pockets(
     filled_mask = is_pocket[labels]
     if not filled_mask.any():
         return filled_mask
-    weights = can_carry.astype(np.float32)
+    weights = is_exposed.astype(np.float32)
     total = cv2.GaussianBlur(weights, (0, 0), _POCKET_BLUR_CELLS)
     for values in (height, slopes[..., 0], slopes[..., 1]):
         mean = cv2.GaussianBlur(values * weights, (0, 0), _POCKET_BLUR_CELLS)
@@ -395,14 +397,14 @@ def _gradient(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-# ---- Gaussians of the surface that snow lies on, which deep enough snow hides --------------------
+# ---- Gaussians of the surface, which a deep enough layer hides -----------------------------------
 
-BURIAL_DEPTH_M = 0.5  # depth below the surface down to which Gaussians are buried
-BURIAL_HEIGHT_M = 0.08  # height above it up to which they are buried; half a cell at least
+HIDEABLE_DEPTH_M = 0.5  # depth below the surface down to which Gaussians can be hidden
+HIDEABLE_HEIGHT_M = 0.08  # height above it up to which they can be hidden; half a cell at least
 # Largest angle between a flat Gaussian's normal and the surface's.
 MAX_FACING_ANGLE_RAD = math.radians(40)
 _MAX_FLATNESS = 0.5  # largest ratio of the shortest axis to the next one, of a flat Gaussian
-# A Gaussian with no longer axis than this, no deeper below the surface, is buried at any attitude,
+# A Gaussian with no longer axis than this, no deeper below the surface, is hidden at any attitude,
 _MAX_SMALL_SCALE_M = 0.06
 _MAX_SMALL_DEPTH_M = 0.15
 _MIN_EDGE_DISTANCE_M = 0.15  # but only so far from an open edge, where it may be a wall's top
@@ -414,31 +416,30 @@ _LOOKUP_SIGMAS = 1.5  # distance along a Gaussian's axes at which the cells over
 CellsUnder = Callable[[np.ndarray], np.ndarray]
 
 
-def find_buried(
+def find_hideable(
     gaussians: Gaussians, cells_under: CellsUnder, cells: CellList
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the Gaussians that are the surface or lie close beneath it.
 
     Returns:
-        buried int32 [B] and buried_by int32 [B, 5], see ExposedCells, of Gaussians that snow can
-        hide.
+        hideable_ids int32 [B] and covering_cells int32 [B, 5], see ExposedCells.
     """
     results = []
     if len(cells.sizes_m):
         slices = slices_of(len(gaussians))
         results = in_order(
-            lambda part: _find_buried_slice(gaussians, cells_under, part, cells), slices
+            lambda part: _find_hideable_slice(gaussians, cells_under, part, cells), slices
         )
     return (
-        np.concatenate([np.zeros(0, np.int32), *(buried for buried, _ in results)]),
+        np.concatenate([np.zeros(0, np.int32), *(ids for ids, _ in results)]),
         np.concatenate([np.zeros((0, 5), np.int32), *(cells_above for _, cells_above in results)]),
     )
 
 
-def _find_buried_slice(
+def _find_hideable_slice(
     gaussians: Gaussians, cells_under: CellsUnder, part_slice: slice, cells: CellList
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Do the work of `find_buried` for a slice of the Gaussians that fits a core's caches."""
+    """Do the work of `find_hideable` for a slice of the Gaussians that fits a core's caches."""
     normals = cells.normals
     means = gaussians.means[part_slice].numpy().astype(np.float64)
     ids_below = cells_under(means[:, :2])
@@ -448,8 +449,8 @@ def _find_buried_slice(
     rise = (offset * normals[cell_ids]).sum(1) / normals[
         cell_ids, 2
     ]  # above the cell's plane, along z
-    is_near = (rise > -BURIAL_DEPTH_M) & (
-        rise < np.maximum(BURIAL_HEIGHT_M, cells.sizes_m[cell_ids] / 2)
+    is_near = (rise > -HIDEABLE_DEPTH_M) & (
+        rise < np.maximum(HIDEABLE_HEIGHT_M, cells.sizes_m[cell_ids] / 2)
     )
     index = index[is_near]
     cell_ids = cell_ids[is_near]
@@ -465,7 +466,7 @@ def _find_buried_slice(
     is_small = (
         (scales[:, 2] < _MAX_SMALL_SCALE_M)
         & (rise > -_MAX_SMALL_DEPTH_M)
-        & (cells.edge_m[cell_ids] >= _MIN_EDGE_DISTANCE_M)
+        & (cells.edge_distance_m[cell_ids] >= _MIN_EDGE_DISTANCE_M)
     )
     is_surface = (is_flat & is_facing) | is_small
     index = index[is_surface]
@@ -477,11 +478,11 @@ def _find_buried_slice(
         for sign in (1, -1):
             offset_xy = sign * _LOOKUP_SIGMAS * scales[:, axis, None] * axes[:, :2, axis]
             lookups.append(cells_under(means[index, :2] + offset_xy))
-    buried_by = np.stack(lookups, 1)
-    is_covered = (buried_by >= 0).all(1)
-    return (part_slice.start + index[is_covered]).astype(np.int32), buried_by[is_covered].astype(
-        np.int32
-    )
+    covering_cells = np.stack(lookups, 1)
+    is_covered = (covering_cells >= 0).all(1)
+    return (part_slice.start + index[is_covered]).astype(np.int32), covering_cells[
+        is_covered
+    ].astype(np.int32)
 
 
 # ---- Cells of grids, joined list by list, and made into a record ---------------------------------
@@ -493,12 +494,12 @@ class CellList(NamedTuple):
     centers_m: np.ndarray
     normals: np.ndarray
     sizes_m: np.ndarray
-    edge_m: np.ndarray
+    edge_distance_m: np.ndarray
     # int8 [C, 4], LINK where a cell of the same size follows, or OPEN_EDGE or FLUSH.
     sides: np.ndarray
     luminance: np.ndarray  # luminance of the bare ground, see ground_luminance; NaN where unknown
-    tracks: np.ndarray
-    banks: np.ndarray
+    track_share: np.ndarray
+    obstacle_vectors: np.ndarray
     semantic: np.ndarray
 
     @staticmethod
@@ -534,8 +535,8 @@ def cells_at(
     *,
     sides: np.ndarray,
     luminance: np.ndarray | None = None,
-    tracks: np.ndarray | None = None,
-    banks: np.ndarray | None = None,
+    track_share: np.ndarray | None = None,
+    obstacle_vectors: np.ndarray | None = None,
     classes: np.ndarray,
 ) -> CellList:
     """Return the cells of a surface at rows and columns [C]; the other arrays are [H, W]."""
@@ -547,11 +548,13 @@ def cells_at(
         centers_m=np.stack([x[columns], y[rows], height], 1),
         normals=normals_from_slopes(surface.slopes[index]).astype(np.float32),
         sizes_m=np.full(num_cells, surface.map.cell_m, np.float32),
-        edge_m=surface.edge_m[index],
+        edge_distance_m=surface.edge_distance_m[index],
         sides=sides[index],
         luminance=np.full(num_cells, np.nan, np.float32) if luminance is None else luminance[index],
-        tracks=np.zeros(num_cells, np.float32) if tracks is None else tracks[index],
-        banks=np.zeros((num_cells, 2), np.float32) if banks is None else banks[index],
+        track_share=np.zeros(num_cells, np.float32) if track_share is None else track_share[index],
+        obstacle_vectors=np.zeros((num_cells, 2), np.float32)
+        if obstacle_vectors is None
+        else obstacle_vectors[index],
         semantic=classes[index],
     )
 
@@ -573,35 +576,35 @@ def _link_slice(
 def make_cells(
     cells: CellList, light: np.ndarray, cells_under: CellsUnder, gaussians: Gaussians
 ) -> ExposedCells:
-    """Make the record of cells: link neighbours by their places, and find the buried Gaussians."""
+    """Make the record of cells: link neighbours by their places, and find the Gaussians below."""
     neighbours = cells.sides.astype(np.int32)
     in_order(
         lambda part: _link_slice(cells, cells_under, part, neighbours[part]),
         slices_of(len(cells.sizes_m)),
     )
-    buried, buried_by = find_buried(gaussians, cells_under, cells)
+    hideable_ids, covering_cells = find_hideable(gaussians, cells_under, cells)
     return ExposedCells(
         centers_m=torch.from_numpy(cells.centers_m.astype(np.float32)),
         normals=torch.from_numpy(cells.normals),
         sizes_m=torch.from_numpy(cells.sizes_m),
-        edge_distance_m=torch.from_numpy(cells.edge_m),
+        edge_distance_m=torch.from_numpy(cells.edge_distance_m),
         neighbours=torch.from_numpy(neighbours),
         relative_light=torch.from_numpy(light),
-        track_share=torch.from_numpy(cells.tracks),
-        obstacle_vectors=torch.from_numpy(cells.banks),
+        track_share=torch.from_numpy(cells.track_share),
+        obstacle_vectors=torch.from_numpy(cells.obstacle_vectors),
         semantic=torch.from_numpy(cells.semantic),
-        hideable_ids=torch.from_numpy(buried),
-        covering_cells=torch.from_numpy(buried_by),
+        hideable_ids=torch.from_numpy(hideable_ids),
+        covering_cells=torch.from_numpy(covering_cells),
     )
 
 
-# ---- Snow on vehicles: cells in their own frames, carried along as they drive --------------------
+# ---- Vehicles: cells in their own frames, which move along as they drive -------------------------
 
 MAX_CELL_M = 0.05  # largest side of a vehicle's cells
 MIN_ACTOR_AREA_M2 = 0.3  # least area of all cells of a vehicle; less is not worth a layer
 MIN_TRAVEL_M = 0.5  # an actor that goes less far than this is parked
-# Steepest slope with snow on a moving vehicle: drivers clear their windows, and steeper snow
-# slides off.
+# Steepest slope that holds a layer on a moving vehicle: drivers clear their windows, and a steeper
+# layer slides off.
 MOVING_MAX_SLOPE_DEG = 25.0
 # Height of the box's bottom part, which holds wheels and the shadow on the road.
 _WHEEL_HEIGHT_M = 0.25
@@ -639,14 +642,14 @@ def find_actor_cells(
     estimator: DepthEstimator,
     backend: str = AUTO,
 ) -> ExposedCells | None:
-    """Find the cells on a vehicle, in its own frame; None where it has too few to carry snow.
+    """Find the cells on a vehicle, in its own frame; None where it has too few to hold a layer.
 
     All cells on its outline have open edges, since the surface falls away there.
 
     Args:
         actor: the vehicle.
         cell_m: side of the cells; MAX_CELL_M at most.
-        max_slope_deg: steeper surfaces carry no snow.
+        max_slope_deg: steeper surfaces hold no layer.
         estimator: depth buffer that heights are taken from.
         backend: backend that renders the vehicle from above.
     """
@@ -695,7 +698,7 @@ def find_actor_cells(
         floor_m=float(bottom_z_m),
         on_vehicles=is_body,
     )
-    rows, columns = np.nonzero(surface.can_carry)
+    rows, columns = np.nonzero(surface.is_exposed)
     if len(rows) * cell_side_m**2 < MIN_ACTOR_AREA_M2:
         return None
     grid = surface.map

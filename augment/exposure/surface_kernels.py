@@ -1,8 +1,8 @@
 """Numba kernels on grids of heights: visibility, smoothing, planes, links between cells, edges.
 
-`height_map`, `placement` and `surface` launch them. Grids are [H, W], rows towards +y. Each row's
-result depends on its inputs alone, so that bits do not depend on threads. Sides are in the order
--x, +x, -y, +y.
+`height_map`, `tiles`, `holes` and `surface` launch them. Grids are [H, W], rows towards +y. Each
+row's result depends on its inputs alone, so that bits do not depend on threads. Sides are in the
+order -x, +x, -y, +y.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def find_visible(points, normals, is_sure, views, sizes, depths, lifts, toleranc
             orthographic, cy.
         sizes: int64 [V, 3]: width, height, and where the view's depths begin.
         depths: float32, depths of all views, infinite where nothing is.
-        lifts: float64, depths of snow, metres.
+        lifts: float64, heights of a layer's top over the points, metres.
         tolerances: five numbers. A point that faces the view is visible up to the depth there times
             the first plus the second (metres); a point that shows only its underside up to the
             depth times the third. The fourth is the sine of the angle up to which a surface seen
@@ -347,16 +347,15 @@ def fit_planes(
 
 
 @kernel
-def compare_sides(height, lowest, covered, can_carry, max_step_m, sides):
-    """Write the code of each side of the cells that can carry snow, sides int8 [H, W, 4].
+def compare_sides(height, lowest, covered, is_exposed, max_step_m, sides):
+    """Write the code of each side of the exposed cells, sides int8 [H, W, 4].
 
-    - FALLS: nothing follows, or the next cell lies lower by more than max_step_m, or it carries no
-      snow and leads down so far.
-    - RISES: the next cell stands higher by more than max_step_m, or carries no snow and does not
-    lead
-      down.
-    - LINK: the same surface goes on. Cells at the grid's border, and cells without snow, have it,
-    too.
+    - FALLS: nothing follows, or the next cell lies lower by more than max_step_m, or it is not
+      exposed and leads down so far.
+    - RISES: the next cell stands higher by more than max_step_m, or is not exposed and does not
+      lead down.
+    - LINK: the same surface goes on. Cells at the grid's border have it, too, and those that are
+      not exposed.
 
     lowest: float32 [H, W], lowest height around each cell.
     """
@@ -366,7 +365,7 @@ def compare_sides(height, lowest, covered, can_carry, max_step_m, sides):
         for j in range(columns):
             for side in range(4):
                 sides[i, j, side] = LINK
-                if not can_carry[i, j]:
+                if not is_exposed[i, j]:
                     continue
                 k = i
                 m = j
@@ -382,38 +381,38 @@ def compare_sides(height, lowest, covered, can_carry, max_step_m, sides):
                     sides[i, j, side] = RISES
                 elif height[k, m] - height[i, j] < -max_step_m:
                     sides[i, j, side] = FALLS
-                elif not can_carry[k, m]:
+                elif not is_exposed[k, m]:
                     is_falling = lowest[k, m] - height[i, j] < -max_step_m
                     sides[i, j, side] = FALLS if is_falling else RISES
 
 
 @kernel
-def _find_links(can_carry, sides, links, offsets):
+def _find_links(is_exposed, sides, links, offsets):
     """Write links uint8 [H, W], the bits of the neighbours that each cell is linked to.
 
     offsets: int32 [H, W, 2], written: x and y, in half cells, of the cell's own open edge, or
     _NO_EDGE.
     """
-    rows, columns = can_carry.shape
+    rows, columns = is_exposed.shape
     for row in prange(rows):
         i = np.int64(row)
         for j in range(columns):
             links[i, j] = 0
             offsets[i, j, 0] = offsets[i, j, 1] = _NO_EDGE
-            if not can_carry[i, j]:
+            if not is_exposed[i, j]:
                 continue
             for side in range(4):
                 if sides[i, j, side] == FALLS:
                     sign = 1 if side % 2 else -1
                     offsets[i, j, 0] = sign if side < 2 else 0
                     offsets[i, j, 1] = 0 if side < 2 else sign
-            if j > 0 and sides[i, j, 0] == LINK and can_carry[i, j - 1]:
+            if j > 0 and sides[i, j, 0] == LINK and is_exposed[i, j - 1]:
                 links[i, j] |= _LEFT
-            if j < columns - 1 and sides[i, j, 1] == LINK and can_carry[i, j + 1]:
+            if j < columns - 1 and sides[i, j, 1] == LINK and is_exposed[i, j + 1]:
                 links[i, j] |= _RIGHT
-            if i > 0 and sides[i, j, 2] == LINK and can_carry[i - 1, j]:
+            if i > 0 and sides[i, j, 2] == LINK and is_exposed[i - 1, j]:
                 links[i, j] |= _DOWN
-            if i < rows - 1 and sides[i, j, 3] == LINK and can_carry[i + 1, j]:
+            if i < rows - 1 and sides[i, j, 3] == LINK and is_exposed[i + 1, j]:
                 links[i, j] |= _UP
 
 
@@ -526,17 +525,17 @@ def _edge_lengths(offsets, max_distance, distances):
 
 
 @serial_kernel
-def edge_distances(can_carry, sides, max_distance, distances):
+def edge_distances(is_exposed, sides, max_distance, distances):
     """Write the distance from each cell to the nearest open edge of its surface, [H, W].
 
     Distances are in cells, at most `max_distance`. Offsets to edges are handed from cell to cell
     (Danielsson 1980), along links only, in two sweeps there and back. In half cells they are whole
     numbers, and so exact.
     """
-    links = np.empty(can_carry.shape, np.uint8)
-    neighbour_bits = np.empty(can_carry.shape, np.uint8)
-    offsets = np.empty((can_carry.shape[0], can_carry.shape[1], 2), np.int32)
-    _find_links(can_carry, sides, links, offsets)
+    links = np.empty(is_exposed.shape, np.uint8)
+    neighbour_bits = np.empty(is_exposed.shape, np.uint8)
+    offsets = np.empty((is_exposed.shape[0], is_exposed.shape[1], 2), np.int32)
+    _find_links(is_exposed, sides, links, offsets)
     _find_diagonal_links(links, neighbour_bits)
     for _ in range(2):
         _sweep_edges(neighbour_bits, offsets)

@@ -1,8 +1,8 @@
 """Sun and shade on the ground of a scene, as its colours show them.
 
 In: a scene's background. Out: `CastShadows` (by `shadows_of`): the sun's direction, how dark its
-shadows are, and a map of lit ground. Smog fades these shadows (`faded_shadows`), and snow takes the
-sun from here.
+shadows are, and a map of lit ground. Smog fades these shadows (`faded_shadows`), and `scene_light`
+takes the sun from here.
 
 A dark ground is a shadow or dark asphalt. The things that stand on it tell which. They cast shadows
 on the ground from every direction of a coarse grid, and the direction whose shadows differ most in
@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Float, Float32, Int16
 from torch import Tensor
 
+from augment.light.srgb import linear_from_display
 from augment.memo import memo_of
 from augment.render.fog import Fog, vertical_optical_depth
 from augment.render.sh import SH_C0
@@ -183,11 +184,6 @@ def _wrapped(values: np.ndarray) -> np.ndarray:
 def _unwrapped(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the values of an image of `_wrapped` in their own shape."""
     return values.ravel()[: math.prod(shape)].reshape(shape)
-
-
-def linear_from_display(rgb: np.ndarray) -> np.ndarray:
-    """Return linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    return np.where(rgb <= 0.04045, rgb / 12.92, ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4)
 
 
 def is_low_and_level(g: Gaussians, scene: Scene) -> np.ndarray:

@@ -19,12 +19,12 @@ import torch
 
 from augment.effects.effect import EffectPlan, LabelInputs
 from augment.effects.smog import SmogPlan
-from augment.effects.snow.snow import SnowPlan
+from augment.effects.snow.plan import SnowPlan
 from augment.effects.style.color_maps import StyleMaps
 from augment.errors import AdapterError
 from augment.exposure.cells import OPEN_EDGE, ExposedCells, ExposedSurface
 from augment.exposure.exposed_surface import exposed_surface_of
-from augment.exposure.placement import ExposureSettings
+from augment.exposure.search import ExposureSettings
 from augment.jobs.render_job import RenderJob, run_job
 from augment.render.fog import Fog
 from augment.scene.cameras import Camera, Frame

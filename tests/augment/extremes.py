@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from augment import effects
-from augment.effects.snow.snow import exposure_settings
+from augment.effects.snow.plan import exposure_settings
 from augment.exposure.exposed_surface import exposed_surface_of
 from augment.memo import memo_of
 from augment.render.composite import to_byte_array

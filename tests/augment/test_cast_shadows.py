@@ -12,14 +12,10 @@ import torch
 from adapters.base import open_scene
 from adapters.street.layout import parse_parameters
 from adapters.street.world import build_street
-from augment.effects.snow.light import describe_light, find_scene_light, find_snow_light
-from augment.light.cast_shadows import (
-    CastShadows,
-    faded_shadows,
-    linear_from_display,
-    shadows_of,
-    sun_transmittance,
-)
+from augment.effects.snow.light import describe_light, find_snow_light
+from augment.light.cast_shadows import CastShadows, faded_shadows, shadows_of, sun_transmittance
+from augment.light.scene_light import find_scene_light
+from augment.light.srgb import linear_from_display
 from augment.render.fog import Fog
 from augment.render.sh import SH_C0
 from augment.scene.scene import PosedGaussians, Scene

@@ -19,8 +19,8 @@ import torch
 
 pytest.importorskip("triton")
 
-from augment.exposure import placement
-from augment.exposure.placement import ExposureSettings, find_exposed_surface
+from augment.exposure import search
+from augment.exposure.search import ExposureSettings, find_exposed_surface
 from augment.render.backends import available_backends
 from augment.render.buffers import CUDA, RenderOutput
 from augment.render.composite import apply_color_map, composite_sky, to_byte_array
@@ -272,7 +272,7 @@ def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
     scene = drive(ground, places=[(-3.0, 0.0, 1.5)])
     cameras = [camera.scaled(0.12) for camera in cameras_of(scene)]
     settings = ExposureSettings(cell_m=8.0)
-    monkeypatch.setattr(placement, "_MAX_SQUARE_CELLS", 16)  # several, which threads work on
+    monkeypatch.setattr(search, "_MAX_SQUARE_CELLS", 16)  # several, which threads work on
     expected = find_exposed_surface(scene, cameras, settings)
     assert len(expected.ground) > 5
     with pretended_gpu(monkeypatch):

@@ -13,8 +13,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from augment.effects.snow.layer import find_depths, find_snow_tops, make_depth_profile
-from augment.effects.snow.snow import exposure_settings
+from augment.effects.snow.depth import find_depths, make_depth_profile
+from augment.effects.snow.layer import find_snow_tops
+from augment.effects.snow.plan import exposure_settings
 from augment.exposure.cells import ExposedCells
 from augment.exposure.exposed_surface import exposed_surface_of
 from augment.rng import rng_for

@@ -28,8 +28,8 @@ from augment.effects.falling.lidar import (
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, PRECIPITATION, UNCHANGED
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.smog import fog_echoes
-from augment.effects.wet.ground import GROUND_CELL_M, WetGround
-from augment.effects.wet.kernels import EXPOSURE, NUM_CHANNELS, PUDDLE_ORDER
+from augment.effects.wet.film_kernels import EXPOSURE, NUM_CHANNELS, PUDDLE_ORDER
+from augment.effects.wet.ground_map import GROUND_CELL_M, WetGround
 from augment.effects.wet.lidar import dim_wet_echoes, wet_echo_ratio
 from augment.jobs.render_job import RenderJob, run_job
 from augment.output.box_weather import box_tables, combine_visibility

@@ -23,7 +23,7 @@ from box_views import (
 from adapters.base import open_scene
 from adapters.procedural import open_truth
 from augment.effects.flood.effect import count_hidden_pixels, flood_of_recipe, submerged_fraction
-from augment.effects.flood.flood import fresnel_reflectance, schlick_reflectance
+from augment.effects.flood.flood_medium import fresnel_reflectance, schlick_reflectance
 from augment.effects.flood.flood_view import visible_depth_m
 from augment.render.buffers import RenderOutput
 from augment.render.constants import RasterSettings

@@ -30,7 +30,7 @@ from batch_scenes import (
 from augment.dataset import WeatherDataset
 from augment.effects.flood.effect import count_hidden_pixels, submerged_fraction
 from augment.effects.smog import box_transmittance
-from augment.effects.snow.snow import count_snow_pixels
+from augment.effects.snow.snowy_boxes import count_snow_pixels
 from augment.effects.style import style as scene_maps
 from augment.errors import OutputError, StyleError
 from augment.jobs.render_job import JobResult, RenderJob, run_job, stored_names

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from augment.effects.flood.flood import FloodMedium
+from augment.effects.flood.flood_medium import FloodMedium
 from augment.effects.flood.lidar import ABSORPTION_905_PER_M, meet_water
 from augment.effects.flood.waves import make_waves
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost_returns
@@ -30,7 +30,7 @@ from augment.effects.snow.lidar import (
     intersect_layers,
     make_snow_grid,
 )
-from augment.effects.snow.snow import SnowPlan, exposure_settings
+from augment.effects.snow.plan import SnowPlan, exposure_settings
 from augment.errors import OutputError
 from augment.exposure.cells import ExposedCells, ExposedSurface
 from augment.jobs.render_job import RenderJob, run_job

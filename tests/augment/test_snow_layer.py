@@ -11,27 +11,28 @@ import numpy as np
 import pytest
 import torch
 
-from augment.effects.snow.kernels import MAX_FOLIAGE_DEPTH_M, MAX_GRAIN_DISTANCE_M, MIN_DEPTH_M
-from augment.effects.snow.layer import (
+from augment.effects.gradient_noise import gradient_noise
+from augment.effects.snow.depth import (
     PRESSED_SHARE,
     covered_share,
     define_depths,
     find_depths,
-    gradient_noise,
-    lay_snow,
     make_depth_profile,
     mottle_noise,
 )
-from augment.effects.snow.light import (
-    SnowIllumination,
-    display_from_linear,
-    find_scene_light,
-    find_snow_light,
+from augment.effects.snow.glints import Crystals
+from augment.effects.snow.layer import lay_snow
+from augment.effects.snow.layer_kernels import (
+    MAX_FOLIAGE_DEPTH_M,
+    MAX_GRAIN_DISTANCE_M,
+    MIN_DEPTH_M,
 )
-from augment.effects.snow.near_camera import Crystals, PartSnow, SnowLayers
+from augment.effects.snow.light import SnowIllumination, find_snow_light
+from augment.effects.snow.part_snow import PartSnow, SnowLayers
 from augment.effects.snow.relief import Carrier, Grain, add_grain
 from augment.exposure.cells import FLUSH, OPEN_EDGE
-from augment.light.cast_shadows import linear_from_display
+from augment.light.scene_light import find_scene_light
+from augment.light.srgb import display_from_linear, linear_from_display
 from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0

@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from augment.effects.snow.snow import exposure_settings
+from augment.effects.snow.plan import exposure_settings
 from augment.errors import OutputError, SceneError
 from augment.exposure.cells import (
     FLUSH,
@@ -28,14 +28,9 @@ from augment.exposure.exposed_surface import (
     load_exposed_surface,
     save_exposed_surface,
 )
-from augment.exposure.placement import (
-    EGO_WIDTH_M,
-    WHEEL_OFFSET_SHARE,
-    ExposureSettings,
-    find_exposed_surface,
-    find_wheel_paths,
-)
+from augment.exposure.search import ExposureSettings, find_exposed_surface
 from augment.exposure.surface import is_vehicle
+from augment.exposure.wheel_tracks import EGO_WIDTH_M, WHEEL_OFFSET_SHARE, find_wheel_paths
 from augment.render.threads import limit_threads
 from augment.scene.labels import EGO_VEHICLE
 from augment.scene.scene import Gaussians, Scene, Track
@@ -324,7 +319,7 @@ def test_wheel_tracks_are_those_of_a_recorded_drive() -> None:
     assert len(y_m) == 1
     invented = dataclasses.replace(recorded, seen_frames=())
     assert find_wheel_paths(invented) == ()
-    assert len(find_wheel_paths(invented, has_invented_path=True)) == 1
+    assert len(find_wheel_paths(invented, has_path_without_drive=True)) == 1
     aside = torch.eye(4, dtype=torch.float64)
     aside[1, 3] = 3.0
     frames = tuple(
@@ -335,8 +330,9 @@ def test_wheel_tracks_are_those_of_a_recorded_drive() -> None:
     assert [float(path.points_m[:, 1].mean()) for path in find_wheel_paths(on_path)] == y_m
     for tracks, expected in (("auto", False), ("always", True)):
         settings = exposure_settings(Snow(depth_m=0.1, tracks=tracks), invented)
-        assert settings.has_invented_tracks == expected
-        assert not exposure_settings(Snow(depth_m=0.1, tracks=tracks), recorded).has_invented_tracks
+        assert settings.has_tracks_without_drive == expected
+        on_drive = exposure_settings(Snow(depth_m=0.1, tracks=tracks), recorded)
+        assert not on_drive.has_tracks_without_drive
 
 
 def test_wheels_leave_tracks_beside_the_path() -> None:

@@ -21,9 +21,9 @@ from box_views import (
 
 from adapters.base import open_scene, parse_uri
 from adapters.procedural import open_truth
-from augment.effects.snow.snow import count_snow_pixels
+from augment.effects.snow.snowy_boxes import count_snow_pixels
 from augment.errors import SceneError
-from augment.exposure.placement import ExposureSettings, find_exposed_surface
+from augment.exposure.search import ExposureSettings, find_exposed_surface
 from augment.scene.boxes import SIDE_MARGIN_M
 from augment.scene.labels import Boxes
 from augment.scene.scene import Gaussians, Scene

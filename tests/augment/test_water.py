@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from augment.effects.flood import water as water_module
-from augment.effects.flood.flood import FloodMedium, Layer, reflectance
+from augment.effects.flood.flood_medium import FloodMedium, Layer, reflectance
 from augment.effects.flood.screen_space import ScreenReflection, trace_screen
 from augment.effects.flood.water_plane import Window, mirrored_camera, plane_depth, plane_window
 from augment.effects.flood.waves import (

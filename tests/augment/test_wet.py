@@ -11,7 +11,7 @@ import torch
 
 from augment.effects.flood.water_plane import mirrored_camera
 from augment.effects.flood.waves import WaveField
-from augment.effects.wet import kernels, reflection
+from augment.effects.wet import film_kernels, reflection
 from augment.effects.wet.darkening import (
     darken_gaussians,
     to_display,
@@ -20,15 +20,15 @@ from augment.effects.wet.darkening import (
     wet_ratio,
 )
 from augment.effects.wet.effect import DARKENING_PASS, MIRROR_PASS, REFLECTION_PASS
-from augment.effects.wet.ground import (
+from augment.effects.wet.film_kernels import EXPOSURE, HEIGHT, NUM_CHANNELS, PUDDLE_ORDER, SLOPE_X
+from augment.effects.wet.ground_map import (
+    EXPOSURE_SETTINGS,
     GROUND_CELL_M,
     NO_PUDDLES,
-    PLACEMENT_SETTINGS,
     WetGround,
     wet_ground,
     wet_splats,
 )
-from augment.effects.wet.kernels import EXPOSURE, HEIGHT, NUM_CHANNELS, PUDDLE_ORDER, SLOPE_X
 from augment.effects.wet.reflection import (
     Film,
     Mirror,
@@ -134,7 +134,7 @@ def scene_with(z_m: np.ndarray, cell_m=0.2, corner_m=(0.0, 0.0), above=(), frame
         frames=frames,
     )
     cells = cells_on_grid(z_m, cell_m, corner_m=corner_m)
-    memo_of(scene).put(("exposed surface", PLACEMENT_SETTINGS), ExposedSurface(cells, {}))
+    memo_of(scene).put(("exposed surface", EXPOSURE_SETTINGS), ExposedSurface(cells, {}))
     return scene
 
 
@@ -262,7 +262,7 @@ def test_a_lamps_reflection_lies_at_the_mirrored_pixel(rise):
     upright = float((light.sum(1) * (rows - y) ** 2).sum()) / total
     sideways = float((light.sum(0) * (columns - middle) ** 2).sum()) / total
     assert upright > 6 * sideways  # a long streak along the view
-    assert 0.2 < math.sqrt(upright) / (camera.fy * 2 * kernels.ASPHALT_ROUGHNESS * 0.6) < 1.5
+    assert 0.2 < math.sqrt(upright) / (camera.fy * 2 * film_kernels.ASPHALT_ROUGHNESS * 0.6) < 1.5
 
 
 def test_a_rough_film_reflects_more_at_grazing_angles():

@@ -27,10 +27,10 @@ from adapters.base import open_scene
 from adapters.procedural import RayHits, StreetTruth
 from augment.effects.snow.layer import lay_snow
 from augment.effects.snow.light import find_snow_light
-from augment.effects.snow.snow import exposure_settings
+from augment.effects.snow.plan import exposure_settings
 from augment.exposure.cells import ExposedCells, ExposedSurface
 from augment.exposure.height_map import DepthEstimator
-from augment.exposure.placement import ExposureSettings, find_exposed_surface
+from augment.exposure.search import ExposureSettings, find_exposed_surface
 from augment.metrics.consistency import DepthView, find_warp
 from augment.render.buffers import BUFFERS
 from augment.render.constants import RasterSettings

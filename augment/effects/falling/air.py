@@ -28,10 +28,11 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from augment.effects.falling import kernels
+from augment.effects.falling import drop_kernels
 from augment.effects.falling.drops import Kind, Sizes, cell_counts, sizes_of
 from augment.effects.falling.shutter import STANDING, Motion
-from augment.effects.snow.light import display_from_linear, find_scene_light
+from augment.light.scene_light import find_scene_light
+from augment.light.srgb import display_from_linear
 from augment.memo import memo_of
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.fog import MAX_EXPONENT, Fog
@@ -56,7 +57,7 @@ _DROP_LIGHT_FROM_BEHIND = 0.94  # share of a drop's light that comes from behind
 _FLAKE_LIGHT_FROM_BEHIND = 0.5  # share of a flake's light that comes from behind it
 _SCATTERED_SHARE = 0.5  # share of a flake's light that other flakes have scattered
 CLEAR = 0.95  # share of a pixel; the mask holds pixels of which near drops leave less
-SWAY_REACH_S = 0.95  # kernels._sway moves a flake by at most its speed times this, seconds
+SWAY_REACH_S = 0.95  # drop_kernels._sway moves a flake by at most its speed times this, seconds
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def _in_fog(glow: Glow, fog: Fog | None, eye_z_m: float, extinction_per_m: float
 
 
 class CellWalk(NamedTuple):
-    """Arguments of kernels.find_drops, in its order."""
+    """Arguments of drop_kernels.find_drops, in its order."""
 
     slabs: np.ndarray
     columns: np.ndarray
@@ -200,7 +201,7 @@ def cell_walk(precipitation: Precipitation, camera: Camera, motion: Motion, scen
         half_s * speeds + sizes.quantiles_m[:, -1] / 2 + SWAY_REACH_S * precipitation.sway_mps
     )
     spread_m += APERTURE_M / 2 * np.maximum(1, farthest / FOCUS_M)
-    spread_m += kernels.LEAST_RADIUS / math.sqrt(camera.fx * camera.fy) * farthest
+    spread_m += drop_kernels.LEAST_RADIUS / math.sqrt(camera.fx * camera.fy) * farthest
     reach = cells_m * math.sqrt(0.75) + spread_m
     # Inward normals of the view's sides, then of its front.
     normals = np.array(
@@ -235,7 +236,7 @@ def cell_walk(precipitation: Precipitation, camera: Camera, motion: Motion, scen
 
 
 def _sways(speed_mps: float, seconds: float) -> np.ndarray:
-    """Return `sways` as kernels.find_drops takes them.
+    """Return `sways` as drop_kernels.find_drops takes them.
 
     They are in turns, where reference.sway counts radians. Whole turns are left out, because they
     would cost digits.
@@ -274,29 +275,29 @@ def _columns_of(
 
 
 def find_drops(walk: CellWalk) -> Float32[np.ndarray, "N 9"]:
-    """Return the drops in a camera's view, in the format of kernels.find_drops, ordered by cell."""
+    """Return the drops in a camera's view, as drop_kernels.find_drops writes them, by cell."""
     slab_counts = np.zeros(len(walk.slabs), np.int64)
-    empty = np.empty((0, kernels.NUM_NUMBERS), np.float32)
+    empty = np.empty((0, drop_kernels.NUM_NUMBERS), np.float32)
     with kernel_threads(1):
-        kernels.find_drops(*walk, np.zeros_like(slab_counts), slab_counts, empty)
+        drop_kernels.find_drops(*walk, np.zeros_like(slab_counts), slab_counts, empty)
         if not slab_counts.any():
             return empty
-        drops = np.empty((int(slab_counts.sum()), kernels.NUM_NUMBERS), np.float32)
+        drops = np.empty((int(slab_counts.sum()), drop_kernels.NUM_NUMBERS), np.float32)
         offsets = np.cumsum(slab_counts) - slab_counts
         counts = np.empty_like(slab_counts)
-        kernels.find_drops(*walk, offsets, counts, drops)
+        drop_kernels.find_drops(*walk, offsets, counts, drops)
     return np.concatenate([drops[o : o + c] for o, c in zip(offsets, counts, strict=True)])
 
 
 def _list_drops(drops: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return drops, listed and begins as kernels.cover_pixels takes them."""
-    bands = -(-height // kernels.ROWS)
+    """Return drops, listed and begins as drop_kernels.cover_pixels takes them."""
+    bands = -(-height // drop_kernels.ROWS)
     begins = np.empty(bands + 1, np.int64)
     listed = np.empty(4 * len(drops), np.int64)
-    needed = kernels.list_drops(drops, bands, begins, listed)
+    needed = drop_kernels.list_drops(drops, bands, begins, listed)
     if needed > len(listed):
         listed = np.empty(needed, np.int64)
-        kernels.list_drops(drops, bands, begins, listed)
+        drop_kernels.list_drops(drops, bands, begins, listed)
     return drops, listed, begins
 
 
@@ -308,7 +309,7 @@ def compute_clear_share(
     clear = np.empty_like(surfaces[0])
     with kernel_threads(1):
         flat = (image.reshape(-1) for image in surfaces)
-        kernels.cover_pixels(*_list_drops(drops, len(depth)), *flat, clear)
+        drop_kernels.cover_pixels(*_list_drops(drops, len(depth)), *flat, clear)
     return clear[:, : depth.shape[1]]
 
 
@@ -324,7 +325,7 @@ def _padded(image: np.ndarray) -> np.ndarray:
 
 
 class Veil(NamedTuple):
-    """Arguments of kernels.blend_falling, float32."""
+    """Arguments of drop_kernels.blend_falling, float32."""
 
     rays: np.ndarray
     climb: np.ndarray
@@ -338,7 +339,7 @@ def veil_of(precipitation: Precipitation, camera: Camera, glow: Glow) -> Veil:
     """Return the veil: extinction of the drops that are not drawn, and its light."""
     extinctions = precipitation.sizes.extinctions_per_m
     full_depths = max_depths_m(precipitation, camera)
-    begin = kernels.FADE * full_depths
+    begin = drop_kernels.FADE * full_depths
     grows = full_depths - begin
     half_inverse = np.divide(0.5, grows, out=np.zeros_like(grows), where=grows > 0)
     world = camera.world_from_camera[:3, :3].numpy()
@@ -411,7 +412,7 @@ def draw_falling(
     padded, *surfaces = (_padded(image) for image in (picture, splat_colors, *surfaces))
     mask = np.empty(padded.shape[:2], bool)
     with kernel_threads(1):
-        kernels.blend_falling(
+        drop_kernels.blend_falling(
             *(image.reshape(-1) for image in (padded, *surfaces)),
             *_list_drops(drops, len(mask)),
             np.float32(CLEAR),

@@ -1,7 +1,7 @@
 """Reference of the kernels of falling drops in plain NumPy and torch: slow, and easy to check.
 
-Each function here has the same input and output as a kernel in `augment.effects.falling.kernels`.
-Tests compare the two.
+Each function here has the same input and output as a kernel in `drop_kernels`. Tests compare the
+two.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
+from augment.effects.falling.drop_kernels import EDGE, FADE, LEAST_RADIUS, SOFT
 from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL
-from augment.effects.falling.kernels import EDGE, FADE, LEAST_RADIUS, SOFT
 from augment.rng import STEP_X, mix
 
 if TYPE_CHECKING:
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 
 def find_drops_by_numpy(walk: CellWalk) -> Float32[np.ndarray, "N 9"]:
-    """Find drops as kernels.find_drops does, in all cells of the box around each class's view."""
+    """Find drops as drop_kernels.find_drops does, in all cells about each class's view."""
     drops = [_drops_of_class(walk, number) for number in range(len(walk.cells))]
     return np.concatenate(drops).astype(np.float32)
 
 
 def _drops_of_class(walk: CellWalk, class_number: int) -> np.ndarray:
-    """Return the drops of one size class, [N, 9], in the columns of kernels.find_drops."""
+    """Return the drops of one size class, [N, 9], in the columns of drop_kernels.find_drops."""
     size, reach, max_depth, _ = walk.cells[class_number]
     rows = walk.slabs[walk.slabs[:, 0] == class_number, 1]
     if len(rows) == 0:
@@ -82,7 +82,7 @@ def _drops_of_class(walk: CellWalk, class_number: int) -> np.ndarray:
 
 
 def sway(positions: np.ndarray, time: float, phase: np.ndarray, speed: float) -> np.ndarray:
-    """Return how far eddies and flutter move flakes, [N, 3], as kernels._sway does.
+    """Return how far eddies and flutter move flakes, [N, 3], as drop_kernels._sway does.
 
     Args:
         positions: positions of the flakes, metres, [N, 3].
@@ -158,7 +158,7 @@ def _streaks(
 def cover_by_numpy(
     drops: np.ndarray, alpha: np.ndarray, depth: np.ndarray
 ) -> Float[np.ndarray, "H W"]:
-    """Return the share of each pixel that no drop covers, as kernels.cover_pixels does.
+    """Return the share of each pixel that no drop covers, as drop_kernels.cover_pixels does.
 
     Args:
         drops: streaks from `find_drops_by_numpy`, [N, 9].
@@ -195,7 +195,7 @@ def blend_by_torch(
     veil: Veil,
     splats: Float[Tensor, "H W 3"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
-    """Return the picture behind the drops and their veil, as kernels.blend_falling computes it.
+    """Return the picture behind the drops and their veil, as drop_kernels.blend_falling does.
 
     Args:
         rgb: display-encoded picture.

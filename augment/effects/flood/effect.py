@@ -24,7 +24,7 @@ from augment.effects.effect import (
     Visibility,
     skipped_steps,
 )
-from augment.effects.flood.flood import FloodMedium
+from augment.effects.flood.flood_medium import FloodMedium
 from augment.effects.flood.flood_view import COARSE, MAX_MARGIN, MAX_SHIFT, render_flooded
 from augment.effects.flood.lidar import meet_flood
 from augment.effects.flood.water_plane import mirrored_camera, plane_depth, plane_window

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.effects.flood import water_kernels
-from augment.effects.flood.flood import FloodMedium, Layer, fresnel_reflectance
+from augment.effects.flood.flood_medium import FloodMedium, Layer, fresnel_reflectance
 from augment.effects.flood.screen_space import trace_screen
 from augment.effects.flood.water import is_smooth, shade_water
 from augment.effects.flood.water_kernels import HIDDEN_COVER

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from augment.effects.flood.flood import FloodMedium, reflectance
+from augment.effects.flood.flood_medium import FloodMedium, reflectance
 from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import LOST, SCATTERED
 from recipes.flood import PURE_WATER_PER_M

@@ -27,8 +27,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from augment.effects.flood import kernels
-from augment.effects.flood.flood import Layer
+from augment.effects.flood import mirror_ray_kernels
+from augment.effects.flood.flood_medium import Layer
 from augment.effects.flood.water_plane import Window, falling, window_offset
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.threads import kernel_threads
@@ -36,12 +36,13 @@ from augment.scene.cameras import Camera
 
 # The kernels' thresholds as Python floats, which torch accepts.
 MIN_COVERED_ALPHA, THICKNESS_M, THICKNESS = map(
-    float, (kernels.COVERED, kernels.THICKNESS_M, kernels.THICKNESS)
+    float,
+    (mirror_ray_kernels.COVERED, mirror_ray_kernels.THICKNESS_M, mirror_ray_kernels.THICKNESS),
 )
-HIDDEN_PX = float(kernels.HIDDEN_PX)
-NEAR_M = float(kernels.NEAR_M)
-AGREEING = float(kernels.AGREEING)
-EDGE = float(kernels.EDGE)
+HIDDEN_PX = float(mirror_ray_kernels.HIDDEN_PX)
+NEAR_M = float(mirror_ray_kernels.NEAR_M)
+AGREEING = float(mirror_ray_kernels.AGREEING)
+EDGE = float(mirror_ray_kernels.EDGE)
 
 SAMPLES = 1 << 23  # samples that the definition evaluates at a time
 MIN_PX = 16  # fewest pixels by which all rays advance at a time
@@ -127,7 +128,7 @@ def _run_kernels(
     (up, image, eye_height_m) = vertical
     alpha = front.alpha.detach().contiguous().numpy()
     needed_pixels = needed.contiguous().numpy()
-    block = kernels.BLOCK
+    block = mirror_ray_kernels.BLOCK
     padded_height, padded_width = (
         -(-size // block) * block for size in (image_camera.height, image_camera.width)
     )
@@ -148,10 +149,10 @@ def _run_kernels(
     ray_ratios, weights = np.empty((2, rows, columns), np.float32)
     distance, weight = np.empty((2, camera.height, camera.width), np.float32)
     with kernel_threads(ROWS):
-        kernels.build_pyramid(alpha, front.depth.detach().contiguous().numpy(), pyramid)
+        mirror_ray_kernels.build_pyramid(alpha, front.depth.detach().contiguous().numpy(), pyramid)
         traced = pyramid, view, alpha, needed_pixels, *origin, stride, ray_ratios, weights
-        kernels.trace(*traced)
-        kernels.spread(*traced, distance, weight)
+        mirror_ray_kernels.trace(*traced)
+        mirror_ray_kernels.spread(*traced, distance, weight)
     return torch.from_numpy(distance), torch.from_numpy(weight)
 
 

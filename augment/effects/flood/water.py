@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from augment.effects.flood import water_kernels as kernels
-from augment.effects.flood.flood import FloodMedium, Layer, reflectance
+from augment.effects.flood import water_kernels
+from augment.effects.flood.flood_medium import FloodMedium, Layer, reflectance
 from augment.effects.flood.screen_space import ScreenReflection
 from augment.effects.flood.water_kernels import (
     BED_STEPS,
@@ -570,7 +570,7 @@ def _run_kernel(water: Water) -> Tensor:
         distance = screen.distance
         weight = screen.weight
     x, y, variance = map(_array, (field.normal_x, field.normal_y, field.slope_variance))
-    pixels = kernels.Pixels(
+    pixels = water_kernels.Pixels(
         *image_coordinates(camera),
         axes,
         _array(water.cover),
@@ -578,15 +578,15 @@ def _run_kernel(water: Water) -> Tensor:
     )
     out = np.empty((camera.height, camera.width, 3), np.float32)
     with kernel_threads(ROWS):
-        kernels.shade(
+        water_kernels.shade(
             pixels,
-            kernels.Normals(x, y, variance, np.float32(limit)),
+            water_kernels.Normals(x, y, variance, np.float32(limit)),
             _image(water.bed),
             _image(water.mirror),
             _mips(water.mirror, bool((variance >= limit).any())),
             _image(front),
-            kernels.Rays(_array(distance), _array(weight)),
-            kernels.Faces(texels.numpy(), np.uint64(size)),
+            water_kernels.Rays(_array(distance), _array(weight)),
+            water_kernels.Faces(texels.numpy(), np.uint64(size)),
             _medium_numbers(water, layered),
             out,
         )
@@ -628,11 +628,11 @@ def _padded(faces: Tensor) -> Tensor:
     return out.reshape(-1)
 
 
-def _image(layer: Layer | None) -> kernels.Image:
+def _image(layer: Layer | None) -> water_kernels.Image:
     """Return a layer in the kernel's format; an empty image for None."""
     if layer is None:
         no_pixels = np.zeros(0, np.float32)
-        return kernels.Image(np.zeros(22, np.float32), no_pixels, no_pixels, no_pixels)
+        return water_kernels.Image(np.zeros(22, np.float32), no_pixels, no_pixels, no_pixels)
     camera = layer.camera
     rotation = camera.camera_from_world[:3, :3].numpy()
     fx = camera.fx
@@ -645,12 +645,12 @@ def _image(layer: Layer | None) -> kernels.Image:
     parts = [_array(part).reshape(-1) for part in (layer.rgb, layer.alpha, layer.depth)]
     if min(camera.width, camera.height) == 1:  # look-ups read the next column and row as well
         parts = [np.append(part, np.zeros(3 * camera.width + 3, np.float32)) for part in parts]
-    return kernels.Image(np.asarray(numbers, np.float32), *parts)
+    return water_kernels.Image(np.asarray(numbers, np.float32), *parts)
 
 
-def _mips(layer: Layer | None, rough: bool) -> kernels.Mips:
+def _mips(layer: Layer | None, rough: bool) -> water_kernels.Mips:
     if layer is None or not rough:
-        return kernels.Mips(np.zeros(1, np.float32), np.zeros((1, 3), np.int64))
+        return water_kernels.Mips(np.zeros(1, np.float32), np.zeros((1, 3), np.int64))
     rgb = _array(layer.rgb)
     alpha = _array(layer.alpha)
     height, width = alpha.shape
@@ -666,14 +666,14 @@ def _mips(layer: Layer | None, rough: bool) -> kernels.Mips:
     mips[first:] = 0
     images = [mips[start : start + w * h].reshape(h, w, 4) for start, w, h in sizes]
     with kernel_threads(MIP_ROWS):
-        kernels.pack(rgb, alpha, images[0])
+        water_kernels.pack(rgb, alpha, images[0])
         for fine, coarse in pairwise(images):
-            kernels.halve_mip(fine, coarse)
-    return kernels.Mips(mips.reshape(-1), np.asarray(sizes, np.int64))
+            water_kernels.halve_mip(fine, coarse)
+    return water_kernels.Mips(mips.reshape(-1), np.asarray(sizes, np.int64))
 
 
 def _medium_numbers(water: Water, layered: Fog | None) -> np.ndarray:
-    """Return the numbers of `kernels.Medium`. layered: the fog before the sky."""
+    """Return the numbers of `water_kernels.Medium`. layered: the fog before the sky."""
     medium = water.medium
     eye_z = float(water.camera.centre[2])
     level = medium.level_z_m

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from augment.effects.flood import kernels as waves_kernels
+from augment.effects.flood import wave_kernels
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
@@ -322,7 +322,7 @@ def _run_kernel(waves: WaveSet, camera: Camera, height: float) -> WaveField:
     phases = [dx, dy, turns_at(waves, camera.timestamp_ns)]
     pose = camera.world_from_camera
     with kernel_threads(ROWS):
-        waves_kernels.fill_field(
+        wave_kernels.fill_field(
             pose[:3, :3].contiguous().numpy(),
             pose[:2, 3].contiguous().numpy(),
             height,

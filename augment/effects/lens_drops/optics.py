@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from augment.effects.lens_drops import kernels
+from augment.effects.lens_drops import lens_drop_kernels
 from augment.effects.lens_drops.drops import Drops
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK, simplify_sky
@@ -275,7 +275,7 @@ def blend_drops(
         mask = np.empty((height, width), np.bool_)
         numbers = np.float32(step), margin, np.float32(MIN_SHARE), np.float32(MIN_MASK_SHARE)
         with kernel_threads(ROWS_PER_CHUNK):
-            kernels.blend_drops(rgb.detach().numpy(), layer, *numbers, mask)
+            lens_drop_kernels.blend_drops(rgb.detach().numpy(), layer, *numbers, mask)
         return rgb, torch.from_numpy(mask)
     cells = torch.from_numpy(layer).to(rgb.device, rgb.dtype)
     columns, rows = (

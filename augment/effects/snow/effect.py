@@ -26,18 +26,15 @@ from augment.effects.effect import (
     skipped_steps,
 )
 from augment.effects.lidar.beam import Echoes
-from augment.effects.snow.kernels import MAX_GRAIN_DISTANCE_M
+from augment.effects.snow.glints import GLINT_SIZE_M
 from augment.effects.snow.layer import lay_snow
+from augment.effects.snow.layer_kernels import MAX_GRAIN_DISTANCE_M
 from augment.effects.snow.lidar import intersect_snow
 from augment.effects.snow.light import describe_light, find_snow_light
-from augment.effects.snow.near_camera import GLINT_SIZE_M, PartSnow, SnowLayers
+from augment.effects.snow.part_snow import PartSnow, SnowLayers
+from augment.effects.snow.plan import SnowPlan, exposure_settings, naming_cell_field
 from augment.effects.snow.relief import Carrier, add_grain
-from augment.effects.snow.snow import (
-    SnowPlan,
-    count_snow_pixels,
-    exposure_settings,
-    extend_boxes_by_snow,
-)
+from augment.effects.snow.snowy_boxes import count_snow_pixels, extend_boxes_by_snow
 from augment.exposure.exposed_surface import exposed_surface_of, share_exposed_surface
 from augment.light.cast_shadows import precompute_shadows
 from augment.memo import memo_of
@@ -138,7 +135,15 @@ class SnowEffect(Effect):
         )
         for settings in distinct:
             precompute_shadows(context.scene)
-            share_exposed_surface(context, settings)
+            with naming_cell_field():
+                share_exposed_surface(
+                    context.scene,
+                    settings,
+                    cameras=context.cameras,
+                    folder=context.folder,
+                    backend=context.backend,
+                    progress=context.progress,
+                )
 
     def visibility(self, effect: EffectInScene, query: ViewQuery) -> Visibility:
         layers = effect.prepared_data
@@ -263,9 +268,10 @@ def build_snow_layers(
     Raises:
         SceneError: this scene cannot have snow, or not with cells this small.
     """
-    exposed_surface = exposed_surface_of(
-        scene, exposure_settings(recipe_snow.snow, scene), backend=backend
-    )
+    with naming_cell_field():
+        exposed_surface = exposed_surface_of(
+            scene, exposure_settings(recipe_snow.snow, scene), backend=backend
+        )
     light = None if light is scene else light
 
     def build_layers() -> SnowLayers:

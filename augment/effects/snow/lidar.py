@@ -15,9 +15,9 @@ import numpy as np
 
 from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import MOVED
-from augment.effects.snow import kernels
-from augment.effects.snow.layer import find_depths, profile_on_part
-from augment.effects.snow.snow import SnowPlan, exposure_settings
+from augment.effects.snow import layer_kernels
+from augment.effects.snow.depth import find_depths, profile_on_part
+from augment.effects.snow.plan import SnowPlan, exposure_settings, naming_cell_field
 from augment.exposure.cells import ExposedCells, ExposedSurface
 from augment.exposure.exposed_surface import exposed_surface_of
 from augment.memo import memo_of
@@ -43,7 +43,7 @@ _MAX_CLOCK_GAP_NS = 10**9  # largest difference of a sweep's times from its fram
 
 @dataclass(frozen=True, eq=False)
 class SnowGrid:
-    """Snow on one part, in the part's frame: see kernels.intersect_layer."""
+    """Snow on one part, in the part's frame: see layer_kernels.intersect_layer."""
 
     corner: np.ndarray
     cell_m: float
@@ -95,10 +95,10 @@ def make_snow_grid(
     columns, rows = (int(n) for n in np.ceil(extent / cell) + 1)
     base, top = np.full((2, rows, columns), -np.inf, np.float32)
     depths = np.ascontiguousarray(depths_m, np.float32)
-    kernels.fill_layer(centers, sizes, depths, low, cell, base, top)
+    layer_kernels.fill_layer(centers, sizes, depths, low, cell, base, top)
     radius = float(np.hypot(*(centers[covered, :2] + np.sign(centers[covered, :2]) * half).T).max())
     # The largest value of every block of the grid, so that the march can skip blocks.
-    block = kernels.BLOCK
+    block = layer_kernels.BLOCK
     blocks = [-(-n // block) for n in top.shape]
     padded = np.full([n * block for n in blocks], -np.inf, np.float32)
     padded[:rows, :columns] = top
@@ -112,7 +112,8 @@ def find_lidar_snow(scene: Scene, recipe_snow: SnowPlan) -> LidarSnow:
     Raises:
         SceneError: this scene cannot have snow.
     """
-    exposed_surface = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene))
+    with naming_cell_field():
+        exposed_surface = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene))
     key = ("lidar snow", scene.name, recipe_snow)
     return memo_of(exposed_surface).get(
         key, lambda: _build_grids(exposed_surface, scene, recipe_snow)
@@ -185,7 +186,7 @@ def _intersect_grid(
     part_from_world = np.eye(4)
     part_from_world[:3, :3] = world_from_part[:3, :3].T
     part_from_world[:3, 3] = -world_from_part[:3, :3].T @ world_from_part[:3, 3]
-    kernels.intersect_layer(
+    layer_kernels.intersect_layer(
         origins,
         directions,
         hits,

@@ -25,8 +25,8 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-from augment.effects.snow import kernels
-from augment.effects.snow.kernels import MAX_GRAIN_DISTANCE_M, GrainView
+from augment.effects.snow import layer_kernels
+from augment.effects.snow.layer_kernels import MAX_GRAIN_DISTANCE_M, GrainView
 from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
@@ -92,7 +92,7 @@ def add_grain(
     hidden_mask = np.zeros((0, 0), bool) if occluded is None else occluded.contiguous().numpy()
     rgb = rgb.contiguous()
     with kernel_threads(_ROWS_PER_TASK):
-        kernels.add_grain(
+        layer_kernels.add_grain(
             rgb.numpy(),
             depth_m.contiguous().numpy(),
             snow.contiguous().numpy(),
@@ -108,7 +108,9 @@ def _add_grain(
 ) -> Tensor:
     """Definition of what the kernel computes, on the tensors' own device."""
     device = rgb.device
-    is_snowy = (snow > kernels.MIN_SNOW_SHARE) & (depth_m > 0) & (depth_m < MAX_GRAIN_DISTANCE_M)
+    is_snowy = (
+        (snow > layer_kernels.MIN_SNOW_SHARE) & (depth_m > 0) & (depth_m < MAX_GRAIN_DISTANCE_M)
+    )
     if occluded is not None:
         is_snowy &= ~occluded
     rows, columns = is_snowy.nonzero(as_tuple=True)
@@ -157,7 +159,7 @@ def _pixels_on_snow(
         axis_m = z / float(lens[1 - axis])
         steps.append((change[:, None] * rays + axis_m[:, None] * pose[:, 1 - axis]).norm(dim=1))
     lengths = rays.norm(dim=1)
-    fall_sine = (rays[:, 2].abs() / lengths).clamp(min=kernels.MIN_FALL_SINE)
+    fall_sine = (rays[:, 2].abs() / lengths).clamp(min=layer_kernels.MIN_FALL_SINE)
     level_m = z * lengths / float(lens[0])
     return torch.stack([steps[0], steps[1] * fall_sine, level_m]).amax(0) / fall_sine.sqrt()
 
@@ -165,16 +167,16 @@ def _pixels_on_snow(
 def _brightness(places: Tensor, steps: Tensor, pixel_m: Tensor, view: GrainView) -> Tensor:
     """Return the change of brightness at points [P, 3], as the kernel's _grain_at does."""
     noise = torch.from_numpy(make_noise_table()).to(places.device).double()
-    mask = kernels.GRAIN_TABLE_SIDE - 1
+    mask = layer_kernels.GRAIN_TABLE_SIDE - 1
     places = places + torch.from_numpy(view.shift).to(places.device)
     (x, y, z) = places.unbind(1)
     (dx, dy) = steps[:, :2].unbind(1)
     brightness = torch.zeros_like(pixel_m)
-    texel = kernels.COARSEST_TEXEL_M
-    cos = kernels.TURN_COS
-    sin = kernels.TURN_SIN
-    for _ in range(kernels.NUM_GRAIN_OCTAVES):
-        visible_share = (kernels.VISIBILITY_RATIO * texel / pixel_m - 1).clamp(0, 1)
+    texel = layer_kernels.COARSEST_TEXEL_M
+    cos = layer_kernels.TURN_COS
+    sin = layer_kernels.TURN_SIN
+    for _ in range(layer_kernels.NUM_GRAIN_OCTAVES):
+        visible_share = (layer_kernels.VISIBILITY_RATIO * texel / pixel_m - 1).clamp(0, 1)
         texel_position = torch.stack([x, y, z]) * (1 / texel)
         u, v, w = texel_position - texel_position.floor()
         i, j, k = texel_position.floor().long() & mask
@@ -195,8 +197,8 @@ def _brightness(places: Tensor, steps: Tensor, pixel_m: Tensor, view: GrainView)
             cos * dx - sin * dy,
             sin * dx + cos * dy,
         )
-        texel *= kernels.TEXEL_RATIO
-    return brightness.clamp(-kernels.MAX_GRAIN, kernels.MAX_GRAIN)
+        texel *= layer_kernels.TEXEL_RATIO
+    return brightness.clamp(-layer_kernels.MAX_GRAIN, layer_kernels.MAX_GRAIN)
 
 
 def _grain_view(
@@ -232,7 +234,9 @@ def _grain_view(
 @functools.cache
 def make_noise_table() -> np.ndarray:
     """float32 [GRAIN_TABLE_SIDE] * 3 of unit deviation, smooth over texels; its faces meet."""
-    white = np.random.Generator(np.random.PCG64(0)).standard_normal(3 * (kernels.GRAIN_TABLE_SIDE,))
+    white = np.random.Generator(np.random.PCG64(0)).standard_normal(
+        3 * (layer_kernels.GRAIN_TABLE_SIDE,)
+    )
     smooth = ndimage.gaussian_filter(white, _NOISE_BLUR_TEXELS, mode="wrap")
     return (smooth / smooth.std()).astype(np.float32)
 

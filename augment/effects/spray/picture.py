@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.effects.spray import kernels
+from augment.effects.spray import puff_kernels
 from augment.effects.spray.puffs import CUT_DISTANCE2, Puffs
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK
@@ -122,7 +122,7 @@ def blend_puffs(
         surfaces = np.where((alpha.detach().numpy() >= 0.5) & (z > 0), z, np.float32(np.inf))
         rays = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         with kernel_threads(ROWS_PER_CHUNK):
-            kernels.blend_puffs(
+            puff_kernels.blend_puffs(
                 rgb.detach().numpy(),
                 surfaces,
                 rays,
@@ -137,7 +137,7 @@ def blend_puffs(
 
 
 def _numbers(puffs: Puffs, camera: Camera, fog: Fog | None) -> np.ndarray:
-    """Return the numbers of the puffs, [N, 15], as kernels.blend_puffs takes them."""
+    """Return the numbers of the puffs, [N, 15], as puff_kernels.blend_puffs takes them."""
     rotation = camera.camera_from_world[:3, :3].numpy()
     eye = camera.centre.numpy()
     camera_whitenings = puffs.whitenings @ rotation.T

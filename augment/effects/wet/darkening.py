@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.effects.snow.light import SceneLight
+from augment.light.scene_light import SceneLight
 from augment.render.sh import SH_C0
 from augment.scene.scene import Gaussians
 

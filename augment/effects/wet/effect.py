@@ -23,12 +23,12 @@ from augment.effects.effect import (
     Visibility,
 )
 from augment.effects.lidar.beam import Echoes
-from augment.effects.snow.light import find_scene_light
 from augment.effects.wet.darkening import darken_gaussians, wet_ratio, white_level
-from augment.effects.wet.ground import (
-    PLACEMENT_SETTINGS,
+from augment.effects.wet.ground_map import (
+    EXPOSURE_SETTINGS,
     WetGround,
     WetSplats,
+    refusing_cell_size,
     wet_ground,
     wet_splats,
 )
@@ -45,6 +45,7 @@ from augment.effects.wet.reflection import (
 )
 from augment.effects.wet.ripples import make_rings
 from augment.exposure.exposed_surface import share_exposed_surface
+from augment.light.scene_light import find_scene_light
 from augment.memo import memo_of
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.fog import optical_depth
@@ -138,7 +139,15 @@ class WetEffect(Effect):
         """Find where rain can fall, once for the job."""
         rains = (self.section_of(recipe) for recipe in context.recipes)
         if any(rain and rain.ground_wetness > 0 for rain in rains):
-            share_exposed_surface(context, PLACEMENT_SETTINGS)
+            with refusing_cell_size():
+                share_exposed_surface(
+                    context.scene,
+                    EXPOSURE_SETTINGS,
+                    cameras=context.cameras,
+                    folder=context.folder,
+                    backend=context.backend,
+                    progress=context.progress,
+                )
 
     def cameras(self, effect: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
         plane = _find_plane(effect, camera)

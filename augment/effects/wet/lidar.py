@@ -22,12 +22,11 @@ import functools
 import numpy as np
 import torch
 
-from augment.effects.flood.flood import fresnel_reflectance
+from augment.effects.flood.flood_medium import fresnel_reflectance
 from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import ATTENUATED, UNCHANGED
 from augment.effects.wet.darkening import INNER_REFLECTANCE, REFRACTION_INDEX
-from augment.effects.wet.ground import WetGround
-from augment.effects.wet.kernels import (
+from augment.effects.wet.film_kernels import (
     ASPHALT_ROUGHNESS,
     EXPOSURE,
     FILM_SHARE,
@@ -37,6 +36,7 @@ from augment.effects.wet.kernels import (
     SLOPE_X,
     SLOPE_Y,
 )
+from augment.effects.wet.ground_map import WetGround
 
 MAX_GROUND_DISTANCE_M = 0.2  # distance from the ground up to which a return is of it
 _NUM_COSINES = 256  # number of tabulated cosines

@@ -15,7 +15,7 @@ this moves a thing by q times as much, q = distance from the ground / distance f
 far behind the ground become long upright streaks, and a wall is sharp at its foot. M is blurred
 upright to a few widths once, and each pixel looks up between two of them.
 
-Caller: `WetEffect.edit_image` (`find_ground`, then `shade_wet`). On the CPU, `wet.kernels` compute
+Caller: `WetEffect.edit_image` (`find_ground`, then `shade_wet`). On the CPU, `film_kernels` compute
 the same.
 """
 
@@ -34,10 +34,9 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from augment.effects.wet import kernels
+from augment.effects.wet import film_kernels
 from augment.effects.wet.darkening import to_display, to_linear
-from augment.effects.wet.ground import GROUND_CELL_M, WetGround
-from augment.effects.wet.kernels import (
+from augment.effects.wet.film_kernels import (
     ASPHALT_ROUGHNESS,
     COARSE_AMPLITUDE,
     COARSE_TEXEL_M,
@@ -65,6 +64,7 @@ from augment.effects.wet.kernels import (
     TRACK_SMOOTHING,
     WHEEL_TRACK,
 )
+from augment.effects.wet.ground_map import GROUND_CELL_M, WetGround
 from augment.effects.wet.ripples import Rings, ring_arrays, ring_slopes
 from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.layout import ABOVE, NUM_LANES, HeightClip
@@ -186,7 +186,7 @@ def blur_upright(
     if choose_kernels(backend, rgb) == CPU and rgb.numel() >= NUM_LANES:
         linear = np.empty(tuple(rgb.shape), np.float32)
         with kernel_threads():
-            kernels.decode_srgb(_flat_array(rgb), linear.reshape(-1))
+            film_kernels.decode_srgb(_flat_array(rgb), linear.reshape(-1))
         image = linear
         levels = [torch.from_numpy(linear)]
         for k in range(1, NUM_LEVELS):
@@ -312,7 +312,7 @@ def find_ground(
         row_max = np.empty(len(share), np.float32)
         flat_share = share.reshape(-1)
         with kernel_threads(ROWS_PER_TASK):
-            kernels.find_ground(
+            film_kernels.find_ground(
                 *_map_view(camera, ground),
                 camera.width,
                 _flat_array(depth),
@@ -379,7 +379,7 @@ def shade_wet(
     is_wide_enough = camera.width >= NUM_LANES and mirror.camera.width >= 2
     if choose_kernels(backend, rgb, depth, share) == CPU and rgb.is_contiguous() and is_wide_enough:
         with kernel_threads(ROWS_PER_TASK):
-            kernels.shade_wet(
+            film_kernels.shade_wet(
                 *_map_view(camera, ground),
                 camera.width,
                 _flat_array(depth),
@@ -520,13 +520,13 @@ def _float_array(*numbers: float) -> np.ndarray:
     return np.array(numbers, np.float32)
 
 
-def _map_view(camera: Camera, ground: WetGround) -> tuple[kernels.MapView, np.ndarray]:
+def _map_view(camera: Camera, ground: WetGround) -> tuple[film_kernels.MapView, np.ndarray]:
     """Return the view on the map, and the map, as kernels take them."""
     pose = camera.world_from_camera.numpy()
     place = np.ascontiguousarray(pose[:2, 3])
     cells = (place - (ground.left_m, ground.bottom_m)) / GROUND_CELL_M - 0.5
     turns = [place / texel_m % MOTTLE_SIDE for texel_m in (COARSE_TEXEL_M, FINE_TEXEL_M)]
-    view = kernels.MapView(
+    view = film_kernels.MapView(
         _float_array(1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy),
         np.ascontiguousarray(pose[:3, :3], np.float32),
         _float_array(*cells, 1 / GROUND_CELL_M, pose[2, 3], *turns[0], *turns[1]),
@@ -538,11 +538,11 @@ def _map_view(camera: Camera, ground: WetGround) -> tuple[kernels.MapView, np.nd
 
 def _mirror_arrays(
     mirror: Mirror, camera: Camera
-) -> tuple[kernels.MirrorView, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[film_kernels.MirrorView, np.ndarray, np.ndarray, np.ndarray]:
     """Return the mirror as kernels take it: view, colours, levels, depth."""
     view = mirror.camera
     rows = np.array([len(level) for level in mirror.levels])
-    mirrored = kernels.MirrorView(
+    mirrored = film_kernels.MirrorView(
         _float_array(view.fx, view.fy, view.cx, view.cy),
         np.ascontiguousarray(view.camera_from_world.numpy()[:3, :3], np.float32),
         (view.centre - camera.centre).float().numpy(),
@@ -556,7 +556,7 @@ def _mirror_arrays(
     return mirrored, colors, levels, _flat_array(mirror.depth)
 
 
-def _water_arrays(film: Film) -> tuple[kernels.WaterOnGround, np.ndarray]:
+def _water_arrays(film: Film) -> tuple[film_kernels.WaterOnGround, np.ndarray]:
     """Return the water and the mottle table as kernels take them."""
     numbers = np.float32(film.wetness), np.float32(film.puddle_threshold), *ring_arrays(film.rings)
-    return kernels.WaterOnGround(*numbers), make_mottle_table().reshape(-1)
+    return film_kernels.WaterOnGround(*numbers), make_mottle_table().reshape(-1)

@@ -24,8 +24,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.effects.flood.waves import WaveField
-from augment.effects.wet import kernels
-from augment.effects.wet.kernels import (
+from augment.effects.wet import film_kernels
+from augment.effects.wet.film_kernels import (
     FADED_PX,
     FULL_PX,
     LIFE_NS,
@@ -203,7 +203,7 @@ def add_ring_waves(
         )
         pose = camera.world_from_camera.numpy()
         with kernel_threads(ROWS_PER_TASK):
-            kernels.add_rings(
+            film_kernels.add_rings(
                 np.ascontiguousarray(pose[:3, :3]),
                 np.ascontiguousarray(pose[:2, 3]),
                 height,

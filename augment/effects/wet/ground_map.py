@@ -8,6 +8,8 @@ ground keeps it dry, and the shelter's edge is soft.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,11 +20,13 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from augment.effects.snow.layer import draw_octaves, sum_octaves
-from augment.effects.wet.kernels import EXPOSURE, HEIGHT, NUM_CHANNELS
+from augment.effects.gradient_noise import draw_octaves, sum_octaves
+from augment.effects.wet.film_kernels import EXPOSURE, HEIGHT, NUM_CHANNELS
+from augment.errors import SceneError
 from augment.exposure.cells import ExposedCells
 from augment.exposure.exposed_surface import exposed_surface_of
-from augment.exposure.placement import ExposureSettings
+from augment.exposure.search import ExposureSettings
+from augment.exposure.tiles import TooManyCellsError
 from augment.memo import memo_of
 from augment.rng import rng_for
 from augment.scene.geometry import rotmat_from_quat
@@ -30,7 +34,7 @@ from augment.scene.scene import Gaussians, Scene
 from augment.scene.semantics import SemanticClass
 
 # Settings of the cells. They equal those of snow by default, so that both share one search.
-PLACEMENT_SETTINGS = ExposureSettings()
+EXPOSURE_SETTINGS = ExposureSettings()
 GROUND_CELL_M = 0.2  # side of the map's cells; the ground's water is less finely patched
 
 # Share of a wet surface that a film of water covers: asphalt and concrete hold a film, soil and
@@ -142,13 +146,25 @@ def wet_ground(scene: Scene, seed: int, *, backend: str = "auto") -> WetGround:
     Raises:
         SceneError: metres or gravity are not known.
     """
-    cells = exposed_surface_of(scene, PLACEMENT_SETTINGS, backend=backend).ground
+    with refusing_cell_size():
+        cells = exposed_surface_of(scene, EXPOSURE_SETTINGS, backend=backend).ground
     key = ("wet ground", seed)
     places = [frame.world_from_ego[:3, 3].numpy() for frame in scene.frames]
     places += [camera.centre.numpy() for f in scene.frames for camera in f.cameras.values()]
     return memo_of(scene).get(
         key, lambda: _make_ground(cells, np.array(places).reshape(-1, 3), seed)
     )
+
+
+@contextlib.contextmanager
+def refusing_cell_size() -> Iterator[None]:
+    """Add to the error of an exposed surface with too many cells that rain cannot change them."""
+    try:
+        yield
+    except TooManyCellsError as error:
+        raise SceneError(
+            f"{error}; weather.rain has no size of cells, take fewer frames"
+        ) from error
 
 
 def _make_ground(cells: ExposedCells, path: np.ndarray, seed: int) -> WetGround:

@@ -1,40 +1,14 @@
-"""Snow of a recipe before it is laid in a scene, and labelled boxes with snow on them."""
+"""Labelled boxes with snow on them, and the share of snow in what an image shows of them."""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from augment.exposure.placement import ExposureSettings, has_invented_drive
 from augment.scene.boxes import SIDE_MARGIN_M, BoxPixels, WorldBoxes, count_pixels
 from augment.scene.cameras import Camera
-from augment.scene.scene import Scene
-from recipes.snow import Snow
-
-
-@dataclass(frozen=True)
-class SnowPlan:
-    """Snow of one recipe."""
-
-    snow: Snow
-    seed: int  # seed of the drifts
-    # Height of the flood that melts the snow it reaches, world; None without a flood.
-    water_level_z_m: float | None = None
-
-
-def exposure_settings(snow: Snow, scene: Scene) -> ExposureSettings:
-    """Return the settings of a recipe's snow that decide where it can lie in a scene."""
-    return ExposureSettings(
-        cell_m=snow.cell_m,
-        max_slope_deg=snow.max_slope_deg,
-        has_invented_tracks=snow.tracks == "always" and has_invented_drive(scene),
-    )
-
-
-# ---- Share of snow in what an image shows of labelled boxes --------------------------------------
 
 SURFACE_MARGIN_M = 0.05  # width by which splats blur the layer's surface
 DRIFT_DEPTH_RATIO = 1.5  # depth of the layer in drifts over its depth on level ground

@@ -1,8 +1,8 @@
 """Numba kernels of lying snow: depths on cells, Gaussians, fine grain, and LiDAR beams.
 
-`layer` launches `find_depths`, `count_splats`, `fill_splats` and the kernels beside them; `relief`
-launches `add_grain`; `lidar` launches `intersect_layer` and `fill_layer`. Callers prepare the
-arrays, and kernels trust them. C counts cells, S Gaussians, N beams.
+`depth` launches `find_depths`; `layer` launches `count_splats`, `fill_splats` and the kernels
+beside them; `relief` launches `add_grain`; `lidar` launches `intersect_layer` and `fill_layer`.
+Callers prepare the arrays, and kernels trust them. C counts cells, S Gaussians, N beams.
 
 Every cell with snow gets one disc on the snow's surface. Where the surface drops by more than a
 disc can lean, over the cell's border, upright discs close the wall below it.
@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
+from augment.effects.gradient_noise import DEVIATION
 from augment.exposure.cells import OPEN_EDGE
 from augment.render.cpu.hash_kernels import mix
 from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
@@ -25,9 +26,6 @@ from augment.scene.semantics import SemanticClass
 
 # ---- Noise ---------------------------------------------------------------------------------------
 
-# Standard deviation of the noise over the plane if the gradients' components are uniform in
-# [-1, 1]: the mean over a square of 4 w^2 (x^2 + y^2) / 3, w the blend of a corner at (0, 0).
-DEVIATION = 0.17612713
 _COLUMN_STEP = np.uint64(STEP_X)  # step of the hash per lattice column
 _ROW_STEP = np.uint64(STEP_Y)  # step of the hash per lattice row
 _LOW_MASK = np.uint64(0xFFFFFFFF)  # mask of the low 32 bits
@@ -583,7 +581,7 @@ def _grain_at(x, y, z, dx, dy, pixel_m, relief, mottle, noise):
     return min(max(brightness, -MAX_GRAIN), MAX_GRAIN)
 
 
-# ---- The snow's depth, as `layer.define_depths` defines it ---------------------------------------
+# ---- The snow's depth, as `depth.define_depths` defines it ---------------------------------------
 
 MIN_DEPTH_M = 0.002  # depth of snow below which a surface is bare
 MIN_TRACK_DEPTH_M = 0.004  # least depth that wheels leave
