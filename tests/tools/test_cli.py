@@ -31,7 +31,7 @@ from tests.snow_scenes import box_car, drive, sheet
 from tools import explain
 from tools.cli import ExportOptions, GenerateOptions, main
 from tools.explain import explain_recipe, explanation_text, measure_passes
-from tools.render import ended_by_sigterm, generate_dataset
+from tools.generate import ended_by_sigterm, generate_dataset
 
 FOG = """
 version: 1

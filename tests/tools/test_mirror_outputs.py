@@ -27,7 +27,7 @@ from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recip
 from tests.augment.mirror_trees import contents
 from tools import render as render_tools
 from tools.cli import RenderOptions
-from tools.export import clear_notes, mirror_again, mirror_outputs, recipes_for_source
+from tools.mirror import clear_notes, mirror_again, mirror_outputs, recipes_for_source
 
 CAMERAS = {"front": "front", "rear/left": "left"}
 FRAMES = 4

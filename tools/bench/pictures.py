@@ -24,7 +24,7 @@ from augment.scene.scene import Scene
 from augment.view.render_view import render_view
 from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe
-from tools.drawing import resized, write, write_rgb, write_video
+from tools.pictures import resized, write, write_rgb, write_video
 
 Which = Literal["street", "drive", "lidar", "video"]  # A picture that is made.
 STREET = "procedural:street?seed=3&frames=40"  # The address of the street.
