@@ -19,24 +19,11 @@ from augment.scene.cameras import Camera
 from augment.view.quality import Trial
 from recipes.schema import KNOBS, TIERS, knobs_of
 from tests.streets import SMALL_STREET, open_street
-from tools.bench import (
-    EFFECTS,
-    dataset,
-    fit,
-    flood,
-    gpu,
-    jobs,
-    lod,
-    raster,
-    scenes,
-    snow,
-    style,
-    trade,
-)
+from tools.bench import dataset, effects, fit, gpu, jobs, lod, raster, trade
+from tools.bench.effects import EffectCase, measure_effect
 from tools.bench.gpu import GpuCase, Timing, measure
 from tools.bench.harness import WallClock, rounds, run_in_subprocess
-from tools.bench.pictures import DUSK, PRESETS, SWEEPS, recipe_of
-from tools.bench.scenes import EffectCase, RasterCase, measure_effect
+from tools.bench.scenes import RasterCase
 from tools.bench.trade import (
     ALL_KNOBS,
     DEPTH,
@@ -96,9 +83,6 @@ def test_without_the_source_checkout_the_command_says_so(monkeypatch, capsys):
     assert "part of the source checkout" in capsys.readouterr().err
 
 
-# ---- scenes and views ---------------------------------------------------------------------------
-
-
 # ---- subjects -----------------------------------------------------------------------------------
 
 
@@ -125,16 +109,12 @@ def test_levels_of_detail_are_measured_on_a_long_street():
     assert all(ms > 0 for ms, *_ in views.values())
     errors = [views[f"lod_px {px:g}"][-2] for px in lod.SIZES_PX]  # FLIP
     assert 0 <= errors[0] <= errors[-1] < 0.1
-    levels = [count for _, _, count, _ in tables["Levels"]]
-    assert levels == sorted(levels, reverse=True)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("name", effects.EFFECTS)
 def test_effects_have_their_tables(name, monkeypatch):
-    for module in (scenes, snow, style):
-        monkeypatch.setattr(module, "open_scene", open_street)
-    monkeypatch.setattr(flood, "WAVES", ("calm",))
+    monkeypatch.setattr(effects, "open_scene", open_street)
     size = {"width": 96, "height": 64, "scale": 0.2, "cell_m": 0.2, "splats": 2_000}
     views = {"frames": (0,), "cameras": ("front",), "presets": ("overcast",), "memory": False}
     case = EffectCase(scenes=(SMALL_STREET,), street=SMALL_STREET, **size, **views)
@@ -412,19 +392,3 @@ def test_errors_of_settings_grow_away_from_the_reference(monkeypatch):
     assert rows[DEPTH, "none"]["off_5cm"] is None
     assert rows[DEPTH, "median"]["depth_against"] == trade.TRUTH  # the street's surfaces
     assert 0.01 < rows[DEPTH, "median"]["abs_rel"] < 0.3  # a pixel of this picture is 15 of its own
-
-
-# ---- the documentation's pictures ----------------------------------------------------------------
-
-
-def test_the_documentations_pictures_show_what_their_captions_say():
-    for preset in PRESETS:
-        day, dusk = (recipe_of(preset, sets) for sets in ((), DUSK))
-        assert dusk.weather == day.weather and day.sections().keys() & {
-            "weather.rain",
-            "weather.snowfall",
-        }
-        assert dusk.style is not None and dusk.style.preset == "grey-dusk"
-    sections = [recipe_of("clear", sets).sections() for sets in SWEEPS.values()]
-    shown = [section.rpartition(".")[2] for each in sections for section in each]
-    assert shown == ["smog", "flood", "rain", "snowfall", "snow"]

@@ -1,6 +1,6 @@
-"""Make the documentation's pictures of rain and snowfall again. It takes some minutes.
+"""Draw the pictures of rain, snowfall and weathered LiDAR in this folder again, within minutes.
 
-    python -m tools.bench.pictures --drive scene:scenes/002
+    python docs/images/draw_rain.py --drive scene:scenes/002
 
 The pictures `drive` and `lidar` show a fitted PandaSet drive (docs/reconstruction.md). Without
 --drive they are not made.
