@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_fit import Fakes, FakeTrainer
 from safetensors import SafetensorError
 
 from adapters.base import open_scene
 from augment.errors import ClimateGSError, OutputError
 from augment.files.scene_file import FORMAT
 from augment.jobs.processes import OutputLock
+from tests.tools.fake_fit import Fakes, FakeTrainer
 from tools import fit, training
 from tools.cli import main
 from tools.fit import fit_scene, held_out_range, open_to_fit, state_folder

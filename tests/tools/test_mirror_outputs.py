@@ -396,7 +396,7 @@ def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
         opened.append(uri)
         return scene if uri == scene.source else other
 
-    monkeypatch.setattr("tools.export.open_scene", opened_scene)
+    monkeypatch.setattr("tools.mirror.open_scene", opened_scene)
     assert mirror_again(out) == 0
     assert opened == [scene.source]
     assert str(out / "source/fog-000/002") in capsys.readouterr().out
