@@ -32,7 +32,7 @@ from tools.options import (
 from tools.output import LABELS_OF_STORES, JsonFile, NoteHandler, check_local, write_json
 
 if TYPE_CHECKING:
-    from augment.scene.scene import Scene
+    pass
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
 Links = Literal["hard", "copy"]
@@ -158,7 +158,7 @@ class GenerateOptions(SceneCommand):
         return self
 
     def run(self) -> int:
-        from tools.render import generate_dataset, show_status
+        from tools.generate import generate_dataset, show_status
 
         return show_status(self.out) if self.status else generate_dataset(self)
 
@@ -180,19 +180,9 @@ class InspectOptions(SceneCommand):
     json_file: JsonFile = None
 
     def run(self) -> int:
-        from adapters.raw_drive import IncompleteDrive
-        from tools.explain import describe_drive, describe_scene, drive_text, scene_text
+        from tools.inspect import inspect_scene
 
-        try:
-            facts = describe_scene(open_with_path(self.uri, self.camera_path))
-        except IncompleteDrive as error:
-            facts = describe_drive(error)
-            print(drive_text(facts))
-            write_json(self.json_file, facts)
-            return 1
-        print(scene_text(facts))
-        write_json(self.json_file, facts)
-        return 0
+        return inspect_scene(self)
 
 
 class RecordOptions(Command):
@@ -220,36 +210,9 @@ class RecordOptions(Command):
     positions: Path | None = None
 
     def run(self) -> int:
-        from adapters.recording.from_colmap import record_colmap
+        from tools.record import record_drive
 
-        recording = record_colmap(
-            self.model,
-            self.images,
-            self.out,
-            fps=self.fps,
-            camera_height_m=self.camera_height,
-            positions=self.positions,
-        )
-        road = recording.road
-        print(
-            f"{recording.frames} frames, {recording.images} images; "
-            f"{recording.num_images_without_pose} have no pose, left out"
-        )
-        print(
-            f"road: {road.points} points, half of them within {100 * road.residual:.1f} % of the "
-            f"cameras' height of one plane, which is taken for level"
-        )
-        if recording.metres is None:
-            print("metres are not known: give --camera-height or --positions")
-        else:
-            print(
-                f"scale: {recording.metres:.4g} m a unit of COLMAP's; the cameras are "
-                f"{recording.metres * road.height:.2f} m above the road"
-            )
-        if recording.residual_m is not None:
-            print(f"positions: half of them within {recording.residual_m:.2f} m")
-        print(f"recording: {self.out}")
-        return 0
+        return record_drive(self)
 
 
 class ExplainOptions(RecipeCommand):
@@ -296,26 +259,9 @@ class RecipesOptions(Command):
     schema_file: Annotated[Path | None, arg(name="schema")] = None
 
     def run(self) -> int:
-        from recipes.load import (
-            describe_preset,
-            load_recipe,
-            preset_names,
-            read_overrides,
-            recipe_text,
-        )
-        from recipes.recipe_file import write_schema
+        from tools.recipes import show_recipes
 
-        if self.schema_file is not None:
-            write_schema(self.schema_file)
-            print(f"wrote {self.schema_file}")
-        elif self.name is None:
-            for name in preset_names():
-                print(f"{name:<14} {describe_preset(name)}")
-        else:
-            template = load_recipe(self.name, read_overrides(self.overrides))
-            text = recipe_text(self.name).rstrip("\n")
-            print(template.describe_draws() if self.draws or self.overrides else text)
-        return 0
+        return show_recipes(self)
 
 
 class SheetOptions(Command):
@@ -340,7 +286,7 @@ class SheetOptions(Command):
     fps: Annotated[float, Field(gt=0)] = 10.0
 
     def run(self) -> int:
-        from tools.drawing import draw_sheet, draw_video
+        from tools.sheet import draw_sheet, draw_video
 
         print(draw_sheet(self.out, self.recipe, self.camera, self.frame))
         if self.video_camera is not None:
@@ -453,7 +399,7 @@ def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
         out: The output folder.
         frames: How many frames of the drive.
     """
-    from tools.render import run_demo
+    from tools.demo import run_demo
 
     return run_demo(out, frames)
 
@@ -510,7 +456,7 @@ class MirrorOptions(Command):
     links: Links = "hard"
 
     def run(self) -> int:
-        from tools.export import mirror_again
+        from tools.mirror import mirror_again
 
         return mirror_again(self.out, self.scene, links=self.links)
 
@@ -534,7 +480,7 @@ class LabelsOptions(Command):
     overrides: Overrides = ()
 
     def run(self) -> int:
-        from tools.export import label_files
+        from tools.labels import label_files
 
         print("\n".join(label_files(self.out, self.split, self.seed, self.overrides)))
         return 0
@@ -597,18 +543,6 @@ def bench() -> None:
 def style() -> None:
     """Colour moods: apply one to a scene, train the network behind them, list the presets."""
     # A line in the list of commands; the words after it go to a table of their own (tools.cli).
-
-
-def open_with_path(uri: str, camera_path: Path | None) -> Scene:
-    """Open the scene of a URI, with the cameras of a path file, if given, in place of its own."""
-    from adapters.base import open_scene
-
-    scene = open_scene(uri)
-    if camera_path is None:
-        return scene
-    from adapters.camera_files.paths import with_camera_path
-
-    return with_camera_path(scene, camera_path)
 
 
 COMMANDS = {

@@ -45,10 +45,10 @@ from recipes.errors import RecipeError
 from recipes.schema import Output, Sensor
 from recipes.template import readable
 from recipes.yaml_tree import read_plain
-from tools.drawing import GAP_PX, captioned, color_mapped, resized, strip, write_rgb
+from tools.chosen_images import evenly
 from tools.options import names_in
 from tools.output import duration_text, print_note
-from tools.report_pictures import evenly
+from tools.pictures import GAP_PX, captioned, color_mapped, resized, strip, write_rgb
 
 if TYPE_CHECKING:
     from tools.cli import EvaluateOptions

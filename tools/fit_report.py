@@ -33,17 +33,10 @@ from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers
 from recipes.load import load_recipe
 from recipes.schema import Recipe
-from tools.drawing import (
-    color_bar,
-    color_mapped,
-    evenly,
-    log_ticks,
-    resized,
-    short_number,
-    write,
-    write_rgb,
-)
+from tools.axis_ticks import log_ticks, short_number
+from tools.chosen_images import evenly
 from tools.output import fill
+from tools.pictures import color_bar, color_mapped, resized, write, write_rgb
 from tools.training import FIT_PANELS, write_curves
 
 if TYPE_CHECKING:

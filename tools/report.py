@@ -30,7 +30,7 @@ from augment.output.box_weather import box_tables
 from augment.output.layout import STATE_FOLDER, folder_name, path_kinds
 from augment.output.manifest import OK, read_manifest_rows
 from augment.output.store import Store, StoredFile, open_store
-from tools.drawing import cameras_on_car, evenly, first_of_each, value_codes
+from tools.chosen_images import cameras_on_car, evenly, first_of_each, value_codes
 from tools.report_numbers import (
     byte_size,
     chart,

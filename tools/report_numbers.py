@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from augment.output.manifest import effect_masks, weather_columns
 from recipes.effect import Column
 from recipes.schema import columns_of_effects
-from tools.drawing import linear_ticks, log_ticks
+from tools.axis_ticks import linear_ticks, log_ticks
 
 MAX_BINS = 24
 LOG_RATIO = 10  # largest over smallest value from which an axis is logarithmic

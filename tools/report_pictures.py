@@ -28,7 +28,8 @@ from augment.output.manifest import Row
 from augment.output.store import Store, StoredFile, StoredFileMissing
 from augment.output.tables import read_table
 from augment.scene.semantics import SemanticClass
-from tools.drawing import color_mapped, evenly, resized
+from tools.chosen_images import evenly
+from tools.pictures import color_mapped, resized
 from tools.report_numbers import weather_text
 
 Value = TypeVar("Value")

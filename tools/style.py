@@ -48,9 +48,9 @@ from augment.scene.scene import Gaussians, Scene
 from augment.scene.semantics import SemanticClass
 from recipes.style import STYLES, Style, style_preset_names
 from recipes.template import readable
-from tools.drawing import captioned, strip, write_rgb
 from tools.options import DEFAULT_MINUTES, StyleTrainOptions, value_or
 from tools.output import check_scene_out, fill, path_beside, print_note
+from tools.pictures import captioned, strip, write_rgb
 from tools.training import REPORT_FILE, StopRequest
 
 if TYPE_CHECKING:

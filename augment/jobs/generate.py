@@ -1,7 +1,7 @@
 """Dataset job: renders many scenes under many recipes into one output, by any number of workers.
 
 In: a `GenerateJob` (recipes, scenes, output, executor). Out: images, labels and the manifest in the
-output, and a `GenerateResult`. Called by `climategs generate` (`tools/render.py`).
+output, and a `GenerateResult`. Called by `climategs generate` (`tools/generate.py`).
 
 The output alone says which images are finished. Therefore a job that was killed at any moment goes
 on when it is started again, and any number of processes on any number of machines can work on the

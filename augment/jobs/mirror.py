@@ -1,7 +1,7 @@
 """Copy of a dataset's folder in which images and sweeps of a variant replace the recorded ones.
 
 In: the dataset's folder (`DatasetFolder`), and the files to put in place (`Replacement`). Out: the
-copy, and a record of it. Called by `climategs export` (`tools/export.py`).
+copy, and a record of it. Called by `climategs mirror` (`tools/mirror.py`).
 
     <out>/source/<variant>/<dataset's folder>/...                    files for the dataset's tools
     <out>/source/<variant>/climategs-mirror-<dataset's folder>.json  record of the complete copy

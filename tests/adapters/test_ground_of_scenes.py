@@ -24,7 +24,7 @@ from augment.scene.ground import ground_of, load_open3d
 from augment.scene.labels import ClassifiesLidar, LidarSweep
 from augment.scene.scene import Ground, Scene
 from augment.scene.semantics import SemanticClass
-from tools.explain import describe_scene, scene_text
+from tools.inspect import describe_scene, scene_text
 
 SMALL = "voxel_m=0.15&image_scale=0.25&sky_size=16"
 

@@ -53,7 +53,7 @@ from augment.scene.labels import LidarSweep, StoresLidar
 from augment.scene.semantics import SemanticClass
 from recipes.load import load_recipe
 from tools.cli import main
-from tools.explain import describe_drive, drive_text
+from tools.inspect import describe_drive, drive_text
 
 QUERY = {"voxel_m": "0.3", "image_scale": "1", "sky_size": "8"}
 RAW: dict[str, tuple[Callable[[Path], Path], dict[str, str]]] = {

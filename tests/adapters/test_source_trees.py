@@ -31,7 +31,7 @@ from augment.scene.scene import Scene
 from recipes.schema import Recipe
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents, listing, snapshot
-from tools.export import clear_notes, mirror_outputs, recipes_for_source
+from tools.mirror import clear_notes, mirror_outputs, recipes_for_source
 
 SMALL = {"voxel_m": "0.5", "image_scale": "0.5", "sky_size": "16", "max_gaussians": "3000"}
 

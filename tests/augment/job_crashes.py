@@ -365,7 +365,7 @@ def kill_while_overwriting(folder: Path) -> dict:
 def stop_jobs_with_workers(folder: Path) -> dict:
     """Ctrl-C and SIGTERM let workers finish their images; after them, and after the parent alone
     was killed, a later run goes on."""
-    from tools.render import ended_by_sigterm
+    from tools.generate import ended_by_sigterm
 
     stops = []
     for job in (rendering, generating):

@@ -167,7 +167,8 @@ def test_the_list_of_signatures_names_kernels_and_types():
 
 COMPILED_BY_PRESETS = """
 from numba.core import event
-from tools.render import open_scene, warm_up
+from tools.render import open_scene
+from tools.warm_up import warm_up
 from recipes.load import load_recipe, preset_names
 log = event.RecordingListener()
 event.register("numba:compile", log)

@@ -43,8 +43,7 @@ from recipes.flood import Flood, Wave, Waves
 from recipes.schema import Output, Recipe, Smog, Weather
 from tests.augment.pretend_gpu import pretended_gpu
 from tests.scenes import camera_ahead, random_gaussians, sh_of
-from tools.bench import flood as flood_bench
-from tools.bench.flood import analytic_error, tier_error, water_masks
+from tools.bench.flood_truth import analytic_error, tier_error, water_masks
 
 ROAD_Z = -1.5
 ROAD, WALL, CAR, SKY = (0.45, 0.45, 0.47), (0.8, 0.2, 0.1), (0.1, 0.8, 0.1), (0.3, 0.5, 0.9)
@@ -615,9 +614,9 @@ def test_colours_that_depend_on_the_view_are_mirrored(monkeypatch):
     error = analytic_error(scene, camera)
     assert error["water_share"] > 0.2
     assert error["psnr_db"] >= 100  # without cut splats only rounding is left: measured 151 dB
-    kept = flood_bench.mirror_gaussians
+    kept = flood_truth.mirror_gaussians
     monkeypatch.setattr(
-        flood_bench, "mirror_gaussians", lambda own: dataclasses.replace(kept(own), sh=own.sh)
+        flood_truth, "mirror_gaussians", lambda own: dataclasses.replace(kept(own), sh=own.sh)
     )
     assert analytic_error(scene, camera)["psnr_db"] < 60  # colours as seen from the eye itself
 

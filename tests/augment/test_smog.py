@@ -26,7 +26,7 @@ from augment.scene.geometry import rotmat_from_quat
 from augment.scene.labels import Boxes
 from tests.streets import open_street
 from tools.bench.scenes import recipe_of
-from tools.bench.smog import smog_error, truth_view
+from tools.bench.smog_truth import smog_error, truth_view
 
 GREY = (0.7, 0.75, 0.8)
 

@@ -45,7 +45,6 @@ from tests.augment.pretend_gpu import pretended_gpu
 from tests.fitted_scenes import fitted_scene
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, sh_of
 from tests.snow_scenes import box_car, drive, sheet, side_wall, wall
-from tools.bench.style import style_recipe
 
 IDENTITY_MAPS = StyleMaps(torch.eye(3, 4)[None], torch.eye(3, 4), torch.eye(3, 4))
 
@@ -367,7 +366,7 @@ def test_folded_maps_draw_the_same_where_no_colour_is_clamped(scene, weather, ba
 
 def folding_error(scene, camera):
     """Largest channel difference [H, W] of colours mapped in SH and of mapped colours."""
-    recipes = (style_recipe(evaluated=where) for where in ("sh", "color"))
+    recipes = (recipe_of(Style(preset="overcast", evaluated=to)) for to in ("sh", "color"))
     folded, mapped = (render_buffers(scene, camera, make_plan(r, scene)).rgb for r in recipes)
     return (folded - mapped).abs().amax(2).numpy()
 

@@ -14,8 +14,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from fitted_scenes import assert_same, fitted_scene
-from streets import open_street
 
 from adapters.base import open_scene
 from augment.dataset import WeatherDataset
@@ -27,11 +25,13 @@ from augment.scene.labels import Boxes
 from augment.scene.scene import Gaussians, Scene
 from recipes.schema import Output, Recipe
 from recipes.style import style_preset_names
+from tests.fitted_scenes import assert_same, fitted_scene
 from tests.snow_scenes import box_car, drive, sheet
+from tests.streets import open_street
 from tools import explain
 from tools.cli import ExportOptions, GenerateOptions, main
 from tools.explain import explain_recipe, explanation_text, measure_passes
-from tools.render import ended_by_sigterm, generate_dataset
+from tools.generate import ended_by_sigterm, generate_dataset
 
 FOG = """
 version: 1

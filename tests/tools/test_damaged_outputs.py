@@ -23,9 +23,9 @@ from augment.output.tables import METADATA_KEY
 from recipes.flood import Flood
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
 from tools.cli import EvaluateOptions
-from tools.drawing import draw_sheet
 from tools.evaluate import evaluate_output
 from tools.report import write_report
+from tools.sheet import draw_sheet
 from tools.view.outputs import OutputViewer
 
 TYPES = [pa.int32(), pa.float64(), pa.string(), pa.binary(), pa.bool_(), pa.null(),

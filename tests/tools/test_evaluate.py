@@ -8,9 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from report_outputs import make_row
 from safetensors.torch import save_file
-from walls import FRAME_NS, board_boxes, driving_camera, wall_view
 
 from augment.errors import OutputError
 from augment.metrics.lpips import ALEX, expected_shapes
@@ -22,6 +20,8 @@ from augment.render.sensor import add_noise
 from augment.scene.cameras import Frame
 from recipes.load import dump_recipe
 from recipes.schema import Output, Recipe, Sensor
+from tests.tools.report_outputs import make_row
+from tests.walls import FRAME_NS, board_boxes, driving_camera, wall_view
 from tools.cli import EvaluateOptions
 from tools.evaluate import evaluate_output, evaluation_text
 from tools.output import write_json

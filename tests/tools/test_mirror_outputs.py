@@ -27,7 +27,7 @@ from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recip
 from tests.augment.mirror_trees import contents
 from tools import render as render_tools
 from tools.cli import RenderOptions
-from tools.export import clear_notes, mirror_again, mirror_outputs, recipes_for_source
+from tools.mirror import clear_notes, mirror_again, mirror_outputs, recipes_for_source
 
 CAMERAS = {"front": "front", "rear/left": "left"}
 FRAMES = 4
@@ -396,7 +396,7 @@ def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
         opened.append(uri)
         return scene if uri == scene.source else other
 
-    monkeypatch.setattr("tools.export.open_scene", opened_scene)
+    monkeypatch.setattr("tools.mirror.open_scene", opened_scene)
     assert mirror_again(out) == 0
     assert opened == [scene.source]
     assert str(out / "source/fog-000/002") in capsys.readouterr().out

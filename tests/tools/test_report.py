@@ -25,11 +25,14 @@ from augment.output.layout import MANIFEST_FILE
 from augment.output.manifest import publish_part, rows_to_table, write_manifest
 from augment.output.store import LocalStore
 from tests.tools.report_outputs import make_row, street_rows, write_output
-from tools import drawing, report
+from tools import report
+from tools.chosen_images import MAX_SHOWN, cameras_on_car, shown_variants
 from tools.cli import main
+from tools.pictures import write_video
 from tools.report import write_report
 from tools.report_numbers import find_draws, spreads
 from tools.report_pictures import BUDGET, MAX_IMAGES, ReportFiles, Shares
+from tools.sheet import VIDEO_WIDTH, draw_sheet, draw_video, sheet_lines, side_by_side
 
 EVIL = "\"><script>alert(1)</script><img src=x onerror='alert(2)'>\u202e"
 
@@ -378,7 +381,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def titles(folder: Path, **chosen: str) -> list[str]:
-    return [title for title, _ in drawing.sheet_lines(folder, **chosen)]
+    return [title for title, _ in sheet_lines(folder, **chosen)]
 
 
 def test_a_line_says_its_weather_and_the_driest_comes_first(folder) -> None:
@@ -394,17 +397,17 @@ def test_a_line_says_its_weather_and_the_driest_comes_first(folder) -> None:
 def test_a_picture_of_many_variants_shows_some_from_end_to_end() -> None:
     def names(count: int) -> list[str]:
         table = rows_to_table([row_of(f"{i:03d}") for i in range(count)])
-        return [row["recipe"] for row in drawing.shown_variants(table)]
+        return [row["recipe"] for row in shown_variants(table)]
 
-    assert names(drawing.MAX_SHOWN) == [f"{i:03d}" for i in range(drawing.MAX_SHOWN)]
+    assert names(MAX_SHOWN) == [f"{i:03d}" for i in range(MAX_SHOWN)]
     many = names(100)
-    assert len(many) <= drawing.MAX_SHOWN and many[0] == "000" and int(many[-1]) >= 90
+    assert len(many) <= MAX_SHOWN and many[0] == "000" and int(many[-1]) >= 90
 
 
 def test_a_sheet_shows_the_chosen_recipes_cameras_and_frames(tmp_path) -> None:
     rows = [row_of(r, n, c) for r in ("clear", "fog") for n in range(4) for c in ("a", "b", "c")]
     write_rows(tmp_path, rows)
-    lines = drawing.sheet_lines(tmp_path, "fog", "c,a", "0,2:4")
+    lines = sheet_lines(tmp_path, "fog", "c,a", "0,2:4")
     assert [title[:24] for title, _ in lines] == [f"street, frame {n}: fog-000" for n in (0, 2, 3)]
     assert all([name for name, _ in images] == ["a", "c"] for _, images in lines)
     assert [t.partition(":")[0] for t in titles(tmp_path)] == ["street, frame 2"] * 2
@@ -415,9 +418,9 @@ def test_a_sheet_shows_the_chosen_recipes_cameras_and_frames(tmp_path) -> None:
         ({"frame": "8:"}, "frame 8:; it has 0, 1, 2, 3"),
     ):
         with pytest.raises(OutputError, match=there):
-            drawing.draw_sheet(tmp_path, **chosen)
+            draw_sheet(tmp_path, **chosen)
     with pytest.raises(OutputError, match="camera d; it has a, b, c"):
-        drawing.draw_video(tmp_path, "d")
+        draw_video(tmp_path, "d")
 
 
 def calibration(cameras: dict[str, tuple[float, float]]) -> str:
@@ -443,7 +446,7 @@ def test_cameras_stand_in_their_order_on_the_car(tmp_path) -> None:
         (tmp_path / "calibration.json").write_text(text or calibration(cameras))
         path = {"calibration_path": "calibration.json"}
         table = rows_to_table([row_of("clear", camera=name, **path) for name in cameras])
-        return drawing.cameras_on_car(LocalStore(tmp_path), table)
+        return cameras_on_car(LocalStore(tmp_path), table)
 
     rig = {name: (float(bearing), 0.0) for name, bearing in RIG.items()}
     assert order(rig) == ["rear_left", "side", "front_left", "front", "front_right", "back"]
@@ -464,8 +467,8 @@ def pictures(count: int = 5) -> list[np.ndarray]:
 
 def test_a_video_is_h264_that_browsers_play_and_the_same_bytes_again(tmp_path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    drawing.write_video(tmp_path / "a.mp4", pictures(), 12.5)
-    drawing.write_video(tmp_path / "b.mp4", iter(pictures()), 12.5)
+    write_video(tmp_path / "a.mp4", pictures(), 12.5)
+    write_video(tmp_path / "b.mp4", iter(pictures()), 12.5)
     data = (tmp_path / "a.mp4").read_bytes()
     assert data == (tmp_path / "b.mp4").read_bytes()
     assert data.index(b"moov") < data.index(b"mdat")  # plays before it is loaded
@@ -483,13 +486,13 @@ def test_a_video_is_h264_that_browsers_play_and_the_same_bytes_again(tmp_path) -
     errors = [np.abs(a - b).mean() for a, b in zip(shown, pictures(), strict=True)]
     assert max(errors) < 4
     with pytest.raises(OutputError, match=r"cannot write the video .*not divisible by 2"):
-        drawing.write_video(tmp_path / "c.mp4", [pictures()[0][:63]], 10)
+        write_video(tmp_path / "c.mp4", [pictures()[0][:63]], 10)
     assert not list(tmp_path.glob("*c.mp4*"))
 
 
 def test_without_ffmpeg_a_video_is_mpeg4_part_2_and_says_so(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    drawing.write_video(tmp_path / "a.mp4", pictures(), 10)
+    write_video(tmp_path / "a.mp4", pictures(), 10)
     said = capsys.readouterr().err
     assert "MPEG-4 part 2" in said and "browsers" in said and "climategs[video]" in said
     assert b"mp4v" in (tmp_path / "a.mp4").read_bytes()
@@ -497,14 +500,14 @@ def test_without_ffmpeg_a_video_is_mpeg4_part_2_and_says_so(tmp_path, monkeypatc
 
 def test_a_video_is_of_frames_that_all_variants_have(tmp_path) -> None:
     write_rows(tmp_path, [row_of("clear", 1), row_of("clear", 2), row_of("fog", 2)])
-    frames = cv2.VideoCapture(str(drawing.draw_video(tmp_path, "front")))
+    frames = cv2.VideoCapture(str(draw_video(tmp_path, "front")))
     assert frames.get(cv2.CAP_PROP_FRAME_COUNT) == 1
-    frames = cv2.VideoCapture(str(drawing.draw_video(tmp_path, "front", recipe="clear")))
+    frames = cv2.VideoCapture(str(draw_video(tmp_path, "front", recipe="clear")))
     assert frames.get(cv2.CAP_PROP_FRAME_COUNT) == 2
     write_rows(tmp_path, [row_of("clear", 1), row_of("fog", 2)])
     with pytest.raises(OutputError, match="no frame of front in common"):
-        drawing.draw_video(tmp_path, "front")
+        draw_video(tmp_path, "front")
     for count in (1, 4, 9):
-        image = drawing.side_by_side([("", np.zeros((101, 333, 3), np.uint8))] * count)
+        image = side_by_side([("", np.zeros((101, 333, 3), np.uint8))] * count)
         height, width = image.shape[:2]
-        assert height % 2 == width % 2 == 0 and 1400 < width <= drawing.VIDEO_WIDTH
+        assert height % 2 == width % 2 == 0 and 1400 < width <= VIDEO_WIDTH

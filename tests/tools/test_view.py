@@ -22,9 +22,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from page_client import PageClient
-from report_outputs import make_row, write_output
-from streets import LABELLED_STREET, SMALL_STREET, open_street
 from websockets.exceptions import InvalidStatus
 
 from augment import effects
@@ -41,6 +38,9 @@ from recipes.load import load_recipe, preset_names
 from recipes.recipe_file import recipe_file
 from recipes.schema import SECTIONS
 from tests.augment.dust import DustEffect
+from tests.streets import LABELLED_STREET, SMALL_STREET, open_street
+from tests.tools.page_client import PageClient
+from tests.tools.report_outputs import make_row, write_output
 from tools.cli import main
 from tools.view.controls import (
     MAX_HINT,

@@ -13,13 +13,13 @@ from urllib.parse import urlsplit
 import msgspec
 import pytest
 import viser
-from page_client import PageClient
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from augment.errors import ClimateGSError, OutputError
 from recipes.errors import RecipeError
 from recipes.load import load_recipe
+from tests.tools.page_client import PageClient
 from tools.view import messages, text
 from tools.view.access import Access
 from tools.view.edits import create_file, rename_recipe, save_recipe, unused_path

@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from tyro.conf import UseAppendAction
 
@@ -15,7 +15,6 @@ from tools.output import JsonFile, write_json
 
 Device = Literal["cpu", "cuda"]
 Effect = Literal["smog", "flood", "snow", "rain", "style"]
-EFFECTS: tuple[Effect, ...] = ("smog", "flood", "snow", "rain", "style")
 
 
 def bench_raster(
@@ -50,7 +49,7 @@ def bench_lod(
 
 
 def bench_effects(
-    only: tuple[Effect, ...] = EFFECTS,
+    only: tuple[Effect, ...] = get_args(Effect),
     repeats: int = 7,
     quick: bool = False,
     scene: str | None = None,
@@ -68,7 +67,7 @@ def bench_effects(
         json_file: Also write the figures to this file, by effect.
     """
     results: dict[str, Any] = {}
-    subject = _subject("scenes")
+    subject = _subject("effects")
     case = dataclasses.replace(subject.QUICK_CASE if quick else subject.FULL_CASE, photos=photos)
     for name in only:
         results[name] = subject.measure_effect(name, repeats, case, scene)

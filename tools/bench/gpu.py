@@ -59,6 +59,7 @@ from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, Ground, PosedGaussians, Scene
 from augment.view.render_view import begin_view, render_view
 from recipes.schema import TIERS, Recipe, knobs_of, with_settings
+from tools.bench.effects import fold, placement, time_frames
 from tools.bench.harness import (
     Action,
     Cell,
@@ -91,11 +92,8 @@ from tools.bench.scenes import (
     random_scene,
     recipe_of,
     street_uri,
-    time_frames,
     water_camera,
 )
-from tools.bench.snow import placement
-from tools.bench.style import fold
 from tools.output import write_json
 
 BACKEND = "cuda"  # The backend that is measured.

@@ -10,14 +10,12 @@ import dataclasses
 import functools
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from adapters.base import open_scene
 from adapters.street.long_street import write_long_street
-from augment.detail.lod import levels_of
 from augment.metrics.image import flip, psnr
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, RGB, RenderOutput
 from augment.render.composite import composite_sky, to_bytes
@@ -44,17 +42,8 @@ NEAR_M = 100.0  # The largest distance from the camera of the street's nearest p
 SIZES_PX = (0.5, 1.0, 2.0)  # The values of lod_px that are measured, pixels.
 NEAR = f"nearest {NEAR_M:.0f} m alone"  # The row of the nearest part without levels.
 FULL = "everything"  # The row of the whole street without levels.
-# The columns of the table of views.
-COLUMNS = (
-    "drawn",
-    "ms",
-    "ms of the processor",
-    "over the nearest 100 m",
-    "least",
-    "p90",
-    "FLIP",
-    "PSNR",
-)
+# The columns of the table of views. Times are of the processor, whatever else runs.
+COLUMNS = ("drawn", "ms", "over the nearest 100 m", "least", "p90", "FLIP", "PSNR")
 WITHIN_S = 900.0  # The longest time of the process whose memory is measured, seconds.
 
 
@@ -111,75 +100,46 @@ class ProcessorClock(WallClock):
 def _measure(uri: str, repeats: int) -> Figures:
     """Measure a scene with levels at an address."""
     machine = machine_facts()
-    rows = []
-    begun = time.perf_counter()
-    memory = [[f"{px:g}" if px else "off", *_memory(uri, px)] for px in (1.0, 0.0)]
+    memory = [[f"{px:g}" if px else "off", _memory(uri, px)] for px in (1.0, 0.0)]
     full_scene = open_scene(uri)
-    opened_s = time.perf_counter() - begun
     camera = first_camera(full_scene)
     near_scene = nearest_part(full_scene, camera)
-    cases = {
-        NEAR: (near_scene, 0.0),
-        f"{NEAR}, lod_px 1": (near_scene, 1.0),
-        FULL: (full_scene, 0.0),
-    }
+    cases = {NEAR: (near_scene, 0.0), FULL: (full_scene, 0.0)}
     cases |= {f"lod_px {px:g}": (full_scene, px) for px in SIZES_PX}
     actions = {
         name: functools.partial(_draw, case_scene, camera, px)
         for name, (case_scene, px) in cases.items()
     }
-    seconds = rounds(actions, repeats)
-    processor_seconds = rounds(actions, max(repeats // 2, 1), warm_up=0, clock=ProcessorClock())
+    seconds = rounds(actions, repeats, clock=ProcessorClock())
     truth = _picture(full_scene, camera, 0.0)
-    for name, (case_scene, px) in cases.items():
-        ratio = spread_ratio(seconds[name], seconds[NEAR]).values()
+    rows = []
+    for name, (_, px) in cases.items():
         errors = [None, None]
-        if case_scene is full_scene and px > 0:
-            picture = _picture(case_scene, camera, px)
+        if px > 0:
+            picture = _picture(full_scene, camera, px)
             is_same = np.array_equal(picture, truth)
             errors = [flip(picture, truth), None if is_same else psnr(picture, truth)]
-        rows.append(
-            [name, median_ms(seconds[name]), median_ms(processor_seconds[name]), *ratio, *errors]
-        )
-    levels = levels_of(full_scene.background)
-    sizes = [
-        [
-            number,
-            levels.cell_m(number) if number else None,
-            len(level.gaussians),
-            len(level.squares),
-        ]
-        for number, level in enumerate(levels.levels)
-    ]
-    title = (
-        f"Views: {full_scene.name}, {len(full_scene.background):,} Gaussians, "
-        f"{camera.width}x{camera.height}"
-    )
+        ratio = spread_ratio(seconds[name], seconds[NEAR]).values()
+        rows.append([name, median_ms(seconds[name]), *ratio, *errors])
+    size = f"{len(full_scene.background):,} Gaussians, {camera.width}x{camera.height}"
+    note = f"{len(near_scene.background):,} Gaussians within {NEAR_M:g} m"
     tables = [
-        Table(
-            title, COLUMNS, rows, f"{len(near_scene.background):,} Gaussians within {NEAR_M:g} m"
-        ),
-        Table(
-            "Memory of a process that opens the scene and draws this view",
-            ("lod_px", "opened MiB", "most MiB"),
-            memory,
-        ),
-        Table("Levels", ("level", "cell m", "Gaussians", "squares"), sizes),
+        Table(f"Views: {full_scene.name}, {size}", COLUMNS, rows, note),
+        Table("Most memory of a process that draws this view", ("lod_px", "MiB"), memory),
     ]
-    return figures("lod", tables, machine=machine, opened_s=opened_s)
+    return figures("lod", tables, machine=machine)
 
 
-def _memory(uri: str, lod_px: float) -> Sequence[float | None]:
-    """Return the MiB of a fresh process with the scene open, and its peak when it draws a view."""
+def _memory(uri: str, lod_px: float) -> float:
+    """Return the peak MiB of a fresh process that opens a scene and draws a view."""
     memory_figures = run_in_subprocess(_measure_memory, (uri, lod_px), WITHIN_S)
     if "most" not in memory_figures:
         raise RuntimeError(f"measuring the memory of {uri} failed: {memory_figures}")
-    return memory_figures["opened"], memory_figures["most"]
+    return memory_figures["most"]
 
 
 def _measure_memory(uri: str, lod_px: float) -> Figures:
-    """Open a scene, draw a view, and return this process's memory after each of both, MiB."""
+    """Open a scene, draw a view, and return this process's peak of memory, MiB."""
     scene = open_scene(uri)
-    opened = status_mib("VmRSS")
     _draw(scene, first_camera(scene), lod_px)
-    return {"opened": opened, "most": status_mib("VmHWM")}
+    return {"most": status_mib("VmHWM")}

@@ -81,8 +81,8 @@ from recipes.schema import (
 from tools.bench import harness
 from tools.bench.harness import Figures, Table
 from tools.bench.scenes import frame_of, front_name, recipe_of
-from tools.drawing import captioned, strip, write_rgb
-from tools.render import warm_up
+from tools.pictures import captioned, strip, write_rgb
+from tools.warm_up import warm_up
 
 ALL_KNOBS = "whole"  # The word in place of a knob's path where several knobs are set.
 DEPTH = "output.depth"  # The knob of the estimator of depth.

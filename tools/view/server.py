@@ -43,7 +43,6 @@ from augment.view.render_view import render_view
 from recipes.errors import RecipeError, short
 from recipes.schema import TIERS, Recipe
 from tools.output import compiling_noted, print_note
-from tools.render import kernel_modules
 from tools.view.access import TOKEN_FIELD, Access, is_loopback, start_server
 from tools.view.browser import ARROWS_STAY_WITH_WIDGETS
 from tools.view.edits import Edits, rename_recipe, save_recipe, unused_path, without_weather
@@ -62,6 +61,7 @@ from tools.view.pictures import (
 )
 from tools.view.status import Activity, ShownPicture
 from tools.view.text import table
+from tools.warm_up import kernel_modules
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer

@@ -1,6 +1,6 @@
-"""Make the documentation's pictures of rain and snowfall again. It takes some minutes.
+"""Draw the pictures of rain, snowfall and weathered LiDAR in this folder again, within minutes.
 
-    python -m tools.bench.pictures --drive scene:scenes/002
+    python docs/images/draw_rain.py --drive scene:scenes/002
 
 The pictures `drive` and `lidar` show a fitted PandaSet drive (docs/reconstruction.md). Without
 --drive they are not made.
@@ -24,7 +24,7 @@ from augment.view.render_view import render_view
 from augment.view.weathered_sweep import weathered_sweep
 from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe
-from tools.drawing import resized, write, write_rgb, write_video
+from tools.pictures import resized, write, write_rgb, write_video
 
 Which = Literal["street", "drive", "lidar", "video"]  # A picture that is made.
 STREET = "procedural:street?seed=3&frames=40"  # The address of the street.

@@ -1,4 +1,4 @@
-"""Snow: its cost in a frame, the time of its placement, and errors of its places and heights.
+"""True places of snow on the procedural street, and errors of snow's places and heights.
 
 The true surface of the procedural street is known, and so are the points on which snow should lie.
 They are points on a grid of the ground plan, on the surface that is highest there, that are
@@ -13,25 +13,21 @@ Moving objects shelter no point and hide no point.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
 import torch
 
-from adapters.base import open_scene
 from adapters.procedural import RayHits, StreetTruth
 from augment.effects.snow.layer import lay_snow
 from augment.effects.snow.light import find_snow_light
-from augment.effects.snow.plan import exposure_settings
 from augment.exposure.cells import ExposedCells, ExposedSurface
 from augment.exposure.height_map import DepthEstimator
 from augment.exposure.search import ExposureSettings, find_exposed_surface
-from augment.metrics.consistency import DepthView, find_warp
 from augment.render.buffers import BUFFERS
 from augment.render.constants import RasterSettings
 from augment.render.layout import SURFACE_DEPTHS_ONLY
@@ -40,23 +36,10 @@ from augment.scene.cameras import Camera
 from augment.scene.geometry import rigid
 from augment.scene.scene import PosedGaussians, Scene
 from augment.scene.semantics import SemanticClass
-from recipes.schema import Output, Recipe
-from tools.bench.harness import Action, Cell, Table, peak_mib_in_subprocess, rounds
-from tools.bench.scenes import (
-    PICTURE_ONLY,
-    EffectCase,
-    all_cameras,
-    cost_tables,
-    frame_of,
-    recipe_of,
-)
+from tools.bench.scenes import all_cameras, recipe_of
 
-NEXT_CAMERA = "next camera"  # The kind of pairs of neighbouring cameras.
-AHEAD = "1 ahead"  # The kind of pairs of a camera and itself one frame ahead.
-SHADINGS = ("per_splat", "per_pixel")  # The shadings of snow that are measured.
 # The estimators of height that a placement can use.
 ESTIMATORS: tuple[DepthEstimator, ...] = get_args(DepthEstimator)
-DEPTHS_M = (0.02, 0.1, 0.4)  # The depths of snow whose heights are measured, metres.
 SKY_Z_M = 60.0  # A height above everything on the street, metres.
 # The largest height difference, metres, at which a cell still lies on the true surface.
 OVER_M = 0.2
@@ -64,102 +47,6 @@ OVER_M = 0.2
 RINGS_M = (0.0, 8.0, 16.0, 32.0)
 # The lift of a point above its surface, metres, before rays to cameras are cast from it.
 LIFT_M = 1e-3
-
-
-def snow_recipe(
-    shading: str = "per_splat",
-    cell_m: float = 0.05,
-    output: Output = PICTURE_ONLY,
-    **other_effects: Any,
-) -> Recipe:
-    """Return a recipe with 10 cm of snow.
-
-    Args:
-        shading: One of SHADINGS.
-        cell_m: The edge of the cells of the snow, metres.
-        output: The outputs of the recipe.
-        other_effects: Fields of other effects, by the effect's name.
-    """
-    snow = {"depth_m": 0.1, "shading": shading, "cell_m": cell_m}
-    return recipe_of({"snow": snow, **other_effects}, output)
-
-
-def tables(case: EffectCase, repeats: int) -> list[Table]:
-    """Measure placement, costs, accuracy and the agreement of masks between views.
-
-    Costs are those of both shadings alone, with depth and labels, and in smog; and of one shading
-    in a flood.
-    """
-    kinds = [
-        ("", {}, PICTURE_ONLY),
-        (", depth and labels", {}, Output()),
-        (", smog", {"smog": {"visibility_m": 200}}, PICTURE_ONLY),
-    ]
-    flood_kind = (", flood", {"flood": {"level_m": 0.15, "reference": "median"}}, PICTURE_ONLY)
-    cases = [(shading, *kind) for kind in kinds for shading in SHADINGS] + [
-        ("per_splat", *flood_kind)
-    ]
-    costs = {
-        shading + title: (
-            snow_recipe(shading, case.cell_m, output, **other_effects),
-            recipe_of(other_effects, output),
-        )
-        for shading, title, other_effects, output in cases
-    }
-    all_tables = [placement_table(uri, case, repeats) for uri in case.scenes]
-    all_tables += cost_tables(case, costs, SHADINGS, repeats)
-    street, truth = case.open_street()
-    reach_m, pixel_m = (16.0, 0.1) if case.cell_m >= 0.1 else (32.0, 0.05)
-    accuracy = snow_accuracy(street, truth, cell_m=case.cell_m, reach_m=reach_m, pixel_m=pixel_m)
-    all_tables += accuracy_tables(case.street, accuracy)
-    columns = ("other view", "points", "equal masks", "worst pair", "colour rms, 1/255")
-    for shading in SHADINGS:
-        rows = snow_masks(street, case.frames, case.scale / 2, shading, case.cell_m)
-        all_tables.append(Table(f"Masks of two views, {shading}", columns, rows))
-    return all_tables
-
-
-# ---- placement: its time and its accuracy -------------------------------------------------------
-
-
-def placement(scene: Scene, cell_m: float, backend: str = "auto") -> Callable[[], ExposedSurface]:
-    """Return an action that places snow for all cameras."""
-    settings = exposure_settings(snow_recipe(cell_m=cell_m).weather.snow, scene)
-    cameras = all_cameras(scene)
-    return functools.partial(find_exposed_surface, scene, cameras, settings, backend=backend)
-
-
-def placement_table(uri: str, case: EffectCase, repeats: int) -> Table:
-    """Time the placement of snow for all cameras, and the layer of snow on it."""
-    scene = open_scene(uri)
-    find = placement(scene, case.cell_m)
-    support = find()
-    stages = rounds({"all": find}, min(repeats, 3))
-    # Each layer has another depth than the last one, so that nothing of that can be used again.
-    depths_m = itertools.cycle((0.05, 0.1, 0.3))
-
-    def lay(shading: str) -> object:
-        snow = recipe_of({"snow": {"depth_m": next(depths_m), "shading": shading}}).weather.snow
-        return lay_snow(support, scene, snow, find_snow_light(scene, snow), seed=0)
-
-    layer_seconds = rounds({name: functools.partial(lay, name) for name in SHADINGS}, repeats)
-    stages |= {f"another depth, {name}": seconds for name, seconds in layer_seconds.items()}
-    mib = peak_mib_in_subprocess(_warm_placement, (uri, case.cell_m)) if case.memory else None
-    on_vehicles = sum(map(len, support.actors.values()))
-    return Table(
-        f"Placement: {uri}, {len(all_cameras(scene))} cameras, cells of {case.cell_m:g} m",
-        ("stage", "seconds", "least"),
-        [[stage, float(np.median(times)), min(times)] for stage, times in stages.items()],
-        f"{len(support.ground):,} cells, {on_vehicles:,} on {len(support.actors)} vehicles"
-        + ("" if mib is None else f"; {mib:.0f} MiB above the scene"),
-    )
-
-
-def _warm_placement(uri: str, cell_m: float) -> Action:
-    scene = open_scene(uri)
-    settings = exposure_settings(snow_recipe(cell_m=10 * cell_m).weather.snow, scene)
-    find_exposed_surface(scene, all_cameras(scene)[:1], settings)  # loads the kernels
-    return placement(scene, cell_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +194,7 @@ def snow_accuracy(
     cell_m: float,
     reach_m: float,
     pixel_m: float,
-    depths_m: Sequence[float] = DEPTHS_M,
+    depths_m: Sequence[float],
     estimators: Sequence[DepthEstimator] = ESTIMATORS,
 ) -> dict[str, Any]:
     """Measure the accuracy of snow's places and heights with every estimator of height.
@@ -353,47 +240,6 @@ def snow_accuracy(
             }
         )
     return {"points": len(flat), "scene_bias_m": bias, "estimators": estimator_rows}
-
-
-def accuracy_tables(street: str, accuracy: dict[str, Any]) -> list[Table]:
-    """Return the tables of `snow_accuracy`, with lengths in cm and shares in %."""
-
-    def hundredfold(values: Sequence[float | None]) -> list[float | None]:
-        return [None if value is None else 100 * value for value in values]
-
-    placement_rows = []
-    height_rows = []
-    for estimator_figures in accuracy["estimators"]:
-        shares = [
-            estimator_figures["covered"],
-            *estimator_figures["rings"].values(),
-            *estimator_figures["error_m"].values(),
-        ]
-        placement_rows.append([estimator_figures["estimator"], *hundredfold(shares)])
-        for depth_figures in estimator_figures["depths"]:
-            shares = [
-                depth_figures["depth_m"],
-                depth_figures["covered"],
-                depth_figures["sheltered"],
-                *depth_figures["error_m"].values(),
-            ]
-            median = depth_figures["error_on_scene_m"]["median"]
-            height_rows.append([estimator_figures["estimator"], *hundredfold([*shares, median])])
-    rings = accuracy["estimators"][0]["rings"]
-    lengths = ("error cm", "p95", "bias")
-    return [
-        Table(
-            f"Cells, %: {street}, {accuracy['points']:,} points open to the sky, flat and seen",
-            ("heights from", "covered", *rings, *lengths),
-            placement_rows,
-        ),
-        Table(
-            "Snow as drawn from above, %",
-            ("heights from", "depth cm", "covered", "sheltered", *lengths, "on the scene's own"),
-            height_rows,
-            f"the scene's own surface is off by {100 * accuracy['scene_bias_m']:+.1f} cm",
-        ),
-    ]
 
 
 def cells_over(cells: ExposedCells, points: TruePoints) -> np.ndarray:
@@ -515,95 +361,3 @@ def _measure_layer(
         "error_m": height_error(off),
         "error_on_scene_m": height_error(off - scene_bias),
     }
-
-
-def snow_masks(
-    scene: Scene, frames: Sequence[int], scale: float, shading: str, cell_m: float
-) -> list[list[Any]]:
-    """Compare masks of neighbouring cameras and of cameras a frame ahead where depths agree."""
-    recipe = snow_recipe(shading, cell_m, Output(depth="expected", labels=False))
-
-    def render(camera: Camera) -> tuple[DepthView, np.ndarray]:
-        buffers = frame_of(scene, camera, recipe)()
-        images = buffers.rgb.clamp(0, 1), buffers.raster.expected_depth, buffers.raster.alpha
-        return DepthView(camera, *(i.numpy() for i in images)), buffers.masks["snow"].numpy()
-
-    return mask_agreement(view_pairs(scene, frames, scale), render)
-
-
-# ---- views of one moment ------------------------------------------------------------------------
-
-
-def view_pairs(
-    scene: Scene, frames: Sequence[int], scale: float
-) -> Iterator[tuple[str, Camera, Camera]]:
-    """Yield the kind and the cameras of pairs of views at one time.
-
-    The pairs are each camera and the next one clockwise, and each camera and itself at its place
-    one frame ahead.
-    """
-    for index in frames:
-        frame = scene.frame(index)
-        ahead = next((f.cameras for f in scene.frames if f.index == index + 1), {})
-        now, later = (
-            {
-                n: dataclasses.replace(c.scaled(scale), timestamp_ns=frame.timestamp_ns)
-                for n, c in cameras.items()
-            }
-            for cameras in (frame.cameras, ahead)
-        )
-        ring = clockwise(frame.cameras)
-        yield from ((NEXT_CAMERA, now[a], now[b]) for a, b in ring if a != b)
-        yield from ((AHEAD, now[name], later[name]) for name in now if name in later)
-
-
-def clockwise(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
-    """Return each camera's name and the next one clockwise, by the cameras' optical axes."""
-
-    def bearing(name: str) -> float:
-        ahead = cameras[name].world_from_camera[:3, 2]
-        return math.atan2(float(ahead[1]), float(ahead[0]))
-
-    ring = sorted(cameras, key=bearing, reverse=True)
-    first = ring.index(next(iter(cameras)))
-    ring = ring[first:] + ring[:first]
-    return list(zip(ring, [*ring[1:], ring[0]], strict=True))
-
-
-def mask_agreement(
-    pairs: Iterator[tuple[str, Camera, Camera]],
-    view_of: Callable[[Camera], tuple[DepthView, np.ndarray]],
-) -> list[list[Cell]]:
-    """Compare masks at the points that both views of a pair show.
-
-    Args:
-        pairs: Kinds and cameras, from `view_pairs`.
-        view_of: A function from a camera to its view, whose depth tells which points are shared,
-            and its mask, bool [H, W].
-
-    Returns:
-        Rows of the kind of pairs, the number of shared points, the share of points with equal
-        masks, the same share of the worst pair, and the root mean square difference of colours,
-        1/255, where both masks are true.
-    """
-    view_of = functools.cache(view_of)
-    counts_by_kind: dict[str, list[tuple[int, int, float, int]]] = {}
-    for kind, first, second in pairs:
-        (first_view, first_mask) = view_of(first)
-        (second_view, second_mask) = view_of(second)
-        warp = find_warp(first_view, second_view)
-        ours = first_mask[warp.is_counted]
-        images = np.concatenate([second_view.picture, second_mask[..., None]], -1)
-        theirs = warp.sample(images)[warp.is_counted]
-        same = ours == (theirs[:, 3] > 0.5)
-        both = ours & same
-        squares = float(((first_view.picture[warp.is_counted][both] - theirs[both, :3]) ** 2).sum())
-        counts = (len(ours), int(same.sum()), squares, int(both.sum()))
-        counts_by_kind.setdefault(kind, []).append(counts)
-    rows: list[list[Cell]] = []
-    for kind, pair_counts in counts_by_kind.items():
-        points, same, squares, both = (sum(column) for column in zip(*pair_counts, strict=True))
-        worst = min((s / p for p, s, _, _ in pair_counts if p), default=None)
-        rms = 255 * math.sqrt(squares / (3 * both)) if both else None
-        rows.append([kind, points, same / points if points else None, worst, rms])
-    return rows

@@ -1,4 +1,4 @@
-"""Smog: its cost in a frame, and its errors against exact smog per pixel.
+"""Exact smog per pixel, and the errors of splats in smog against it.
 
 The surfaces of the procedural street are known, and so is the distance d of every pixel. The exact
 picture is t(d) c + (1 - t(d)) airlight with transmittance t. The colour c is that of the clean
@@ -22,53 +22,12 @@ from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 from augment.view.plan import make_plan
 from recipes.schema import Recipe
-from tools.bench.harness import Table
-from tools.bench.scenes import CLEAN, EffectCase, cost_tables, frame_of, recipe_of
+from tools.bench.scenes import CLEAN, frame_of
 
-# The fields of every measured smog, by its row's name.
-SMOGS = {
-    "uniform, visibility 80 m": {"visibility_m": 80},
-    "uniform, visibility 300 m": {"visibility_m": 300},
-    "scale height 15 m, visibility 80 m": {"visibility_m": 80, "scale_height_m": 15},
-}
 # The side of the square around a pixel, pixels. A pixel is away from silhouettes if the square
 # around it shows one surface.
 SMOOTH_SQUARE_PX = 5
 SMOOTH_DEPTH_RATIO = 0.1  # The largest relative change of depth within that square.
-
-
-def tables(case: EffectCase, repeats: int) -> list[Table]:
-    """Measure costs of every smog, and errors by region of the street's views."""
-    recipes = {
-        (name, model): recipe_of({"smog": {**smog, "model": model}})
-        for name, smog in SMOGS.items()
-        for model in ("per_gaussian", "deferred")
-    }
-    costs = {", ".join(key): (recipe, CLEAN) for key, recipe in recipes.items()}
-    staged = [name for name in costs if name.startswith("uniform, visibility 80 m")]
-    scene, truth = case.open_street()
-    views = [truth_view(scene, truth, camera) for camera in case.views(scene, 0.5)]
-    rows = []
-    for key, recipe in recipes.items():
-        errors = [smog_error(recipe, scene, view) for view in views]
-        for region in views[0].regions:
-            masks = [view.regions[region] for view in views]
-            masked_errors = np.concatenate([e[mask] for e, mask in zip(errors, masks, strict=True)])
-            if len(masked_errors):
-                median, p99 = map(float, np.quantile(masked_errors, [0.5, 0.99]))
-                rows.append(
-                    [
-                        *key,
-                        region,
-                        len(masked_errors),
-                        median,
-                        p99,
-                        100 * float((masked_errors > 4).mean()),
-                    ]
-                )
-    title = f"Largest channel error against exact smog, 1/255: {case.street}"
-    columns = ("smog", "model", "region", "pixels", "median", "p99", "above 4/255, %")
-    return [*cost_tables(case, costs, staged, repeats), Table(title, columns, rows)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Floods: their cost in a frame, and the errors of pictures of water and of its mask.
+"""Pictures and masks of water by other means, and the errors of a flood against them.
 
 Still, opaque water under the mirrored tier is compared with a picture that does not use the flood's
 mirror: here the Gaussians themselves are mirrored. Other tiers are compared with the mirrored tier.
@@ -8,6 +8,7 @@ The true mask of water is known on the procedural street by casting rays.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,20 +29,9 @@ from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, PosedGaussians, Scene
 from augment.view.plan import make_plan
-from recipes.schema import Output, Recipe
-from tools.bench.harness import Table
-from tools.bench.scenes import (
-    CLEAN,
-    PICTURE_ONLY,
-    WATER,
-    EffectCase,
-    cost_tables,
-    frame_of,
-    recipe_of,
-)
+from recipes.schema import Recipe
+from tools.bench.scenes import WATER, frame_of, recipe_of
 
-TIERS = ("sky", "screen_space", "mirrored")  # The reflections of a flood, the last one is exact.
-WAVES = ("still", "calm")  # The presets of waves that are measured.
 OPAQUE = {"absorption_per_m": (1e6, 1e6, 1e6)}  # The fields of water that light does not pass.
 # The distance from the water's border, pixels, within which a pixel shows two surfaces. Splats
 # extend as far over an edge.
@@ -53,52 +43,9 @@ BLOCK = 32  # The side of the squares of which the worst is reported, pixels.
 MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
 
 
-def flood_recipe(
-    reflection: str = "mirrored",
-    waves: str = "still",
-    output: Output = PICTURE_ONLY,
-    **other_effects: Any,
-) -> Recipe:
-    """Return a recipe of a flood. other_effects: further fields of the flood."""
-    fields = {**WATER, "reflection": reflection, "waves": {"preset": waves}, **other_effects}
-    return recipe_of({"flood": fields}, output)
-
-
-def tables(case: EffectCase, repeats: int) -> list[Table]:
-    """Measure costs and errors of floods.
-
-    Costs are those of every tier, still and with waves, as pictures only; of Schlick's formula; of
-    the default depth and labels; and of water below everything.
-    """
-    default = Recipe()
-    costs = {f"{t}, {w}": (flood_recipe(t, w), CLEAN) for t in TIERS for w in WAVES}
-    costs["mirrored, calm, schlick"] = flood_recipe("mirrored", "calm", fresnel="schlick"), CLEAN
-    for tier in TIERS:
-        recipe = flood_recipe(tier, "calm", default.output)
-        costs[f"{tier}, calm, depth and labels"] = recipe, default
-    costs["level below everything"] = flood_recipe(level_m=-100.0), CLEAN
-    street, truth = case.open_street()
-    rows: list[Any] = []
-    for camera in case.views(street):
-        errors = {"mirrored against mirrored splats": analytic_error(street, camera)} | {
-            f"{tier}, {waves}, against mirrored": tier_error(street, camera, tier, waves)
-            for tier in TIERS[:2]
-            for waves in WAVES
-        }
-        keys = ("psnr_db", "p99", "black_share", "worst_block", "worst_at")
-        name = f"{camera.name} at {camera.timestamp_ns} ns"
-        rows += [[name, picture, *map(error.get, keys)] for picture, error in errors.items()]
-    columns = ("view", "picture", "PSNR dB", "p99", "black", f"worst {BLOCK}x{BLOCK}", "at")
-    title = f"Errors inside the water, channels in 1/255: {case.street}"
-    masks = "Masks of water against the truth: shares of pixels"
-    mask_columns = ("view", "agreeing", "away from silhouettes", "which are")
-    shares = water_masks(street, truth, case.frames, scale=case.scale / 2)
-    staged = [f"{tier}, calm" for tier in TIERS]
-    return [
-        *cost_tables(case, costs, staged, repeats),
-        Table(title, columns, rows),
-        Table(masks, mask_columns, shares),
-    ]
+def flood_fields(reflection: str, waves: str = "still", **other_fields: Any) -> dict[str, Any]:
+    """Return the fields of a flood. other_fields: further fields of it."""
+    return {**WATER, "reflection": reflection, "waves": {"preset": waves}, **other_fields}
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,17 +72,13 @@ def inside(water: np.ndarray) -> np.ndarray:
     return cv2.erode(water.astype(np.uint8), kernel, borderValue=1).astype(bool)
 
 
-def analytic_error(scene: Scene, camera: Camera, fresnel: str = "exact") -> dict[str, Any]:
+def analytic_error(scene: Scene, camera: Camera) -> dict[str, Any]:
     """Compare the mirrored tier at full resolution with mirrored Gaussians.
 
     The water is still and opaque.
-
-    Args:
-        scene: The scene.
-        camera: The camera.
-        fresnel: The formula of the reflected share: "exact" or "schlick".
     """
-    recipe = flood_recipe(fresnel=fresnel, layers_px=1, **OPAQUE)
+    fields = flood_fields("mirrored", layers_px=1, **OPAQUE)
+    recipe = recipe_of({"flood": fields})
     picture = draw_picture(scene, camera, recipe)
     truth = mirrored_picture(scene, camera, recipe).clamp(0, 1).numpy()
     return {
@@ -148,8 +91,8 @@ def analytic_error(scene: Scene, camera: Camera, fresnel: str = "exact") -> dict
 
 def tier_error(scene: Scene, camera: Camera, reflection: str, waves: str) -> dict[str, Any]:
     """Compare a tier with the mirrored tier under the same waves, inside the water."""
-    tiers = (flood_recipe(tier, waves) for tier in (reflection, "mirrored"))
-    return water_error(*(draw_picture(scene, camera, recipe) for recipe in tiers))
+    tiers = (flood_fields(tier, waves) for tier in (reflection, "mirrored"))
+    return water_error(*(draw_picture(scene, camera, recipe_of({"flood": t})) for t in tiers))
 
 
 def water_error(picture: Picture, truth: Picture) -> dict[str, Any]:
@@ -158,26 +101,20 @@ def water_error(picture: Picture, truth: Picture) -> dict[str, Any]:
     Returns:
         psnr_db: PSNR in the water.
         black_share: the share of its pixels that are dark and should not be.
-        p99: 99 % quantile of the mean channel error, 1/255.
         worst_block: mean channel error, 1/255, of the worst square of BLOCK px that is at least
             half water.
-        worst_at: column and row of that square.
     """
     mask = inside(truth.water)
     black = (picture.rgb.max(-1) < DARK) & (truth.rgb.max(-1) >= LIT) & mask
     error = np.abs(picture.rgb - truth.rgb).mean(-1) * 255
-    worst = (0.0, 0, 0)
-    for row in range(0, error.shape[0], BLOCK):
-        for column in range(0, error.shape[1], BLOCK):
-            block = np.s_[row : row + BLOCK, column : column + BLOCK]
-            if 2 * mask[block].sum() >= BLOCK * BLOCK:
-                worst = max(worst, (float(error[block][mask[block]].mean()), column, row))
+    corners = itertools.product(range(0, mask.shape[0], BLOCK), range(0, mask.shape[1], BLOCK))
+    blocks = [np.s_[row : row + BLOCK, column : column + BLOCK] for row, column in corners]
+    watery_blocks = [block for block in blocks if 2 * mask[block].sum() >= BLOCK * BLOCK]
+    block_errors = [float(error[block][mask[block]].mean()) for block in watery_blocks]
     return {
         "psnr_db": psnr(picture.rgb, truth.rgb, mask),
         "black_share": float(black.sum() / mask.sum()),
-        "p99": float(np.quantile(error[mask], 0.99)),
-        "worst_block": worst[0],
-        "worst_at": f"{worst[1]}, {worst[2]}",
+        "worst_block": max(block_errors, default=0.0),
     }
 
 
@@ -279,7 +216,7 @@ def water_masks(
         silhouettes, and the share of pixels that are away from silhouettes.
     """
     rows: list[list[str | float]] = []
-    recipe = flood_recipe("sky")
+    recipe = recipe_of({"flood": flood_fields("sky")})
     level_z_m = make_plan(recipe, scene).water_level_z_m
     for camera in (c.scaled(scale) for n in frames for c in scene.frame(n).cameras.values()):
         depth = plane_depth(camera, level_z_m).numpy()
