@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # The kinds of the formats that are written, in the order of `splat_formats`.
 SplatKind = Literal["ply", "splat", "spz", "sog", "glb", "usd"]
-# All kinds of export; the first three are none of one moment.
+# All kinds of export. Files of the first three kinds hold more than one moment.
 ExportKind = Literal["file", "scene", "ply-parts", SplatKind]
 _ZIP = b"PK\x03\x04"  # first bytes of a zip, which several formats are
 
@@ -110,7 +110,7 @@ def _format_of(path: Path) -> SplatFormat | None:
         start = file.read(8)
     by_name = next((f for f in splat_formats() if f.fits_name(path)), None)
     if by_name is not None and start.startswith(_ZIP):
-        return by_name  # such as .usdz
+        return by_name  # a .usdz is a zip, and so is a .sog
     return next((f for f in splat_formats() if start.startswith(f.first_bytes)), by_name)
 
 

@@ -66,7 +66,7 @@ def saved(folder: Path, content: bytes) -> Path:
 def test_extreme_opacities_survive(tmp_path: Path) -> None:
     written = random_gaussians(4, 0)
     opacities = torch.tensor([0.0, 1.0, 1e-6, 1 - 2**-24])
-    write_ply(tmp_path / "a.ply", Gaussians(**{**vars(written), "opacities": opacities}))
+    write_ply(tmp_path / "a.ply", dataclasses.replace(written, opacities=opacities))
     raw = plyfile.PlyData.read(tmp_path / "a.ply")["vertex"]["opacity"]
     assert np.isfinite(raw).all()
     got = read_ply(tmp_path / "a.ply").gaussians.opacities
