@@ -36,6 +36,7 @@ from augment.scene.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from augment.view.render_view import WeatheredView, begin_view, render_view
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
+from recipes.speed import Speed
 from recipes.style import Style
 from tests import snow_scenes
 from tests.augment.kernel_compiling import Launch, compile_launches, complaints, recorded_launches
@@ -194,7 +195,7 @@ RECIPES = {
     ),
     "layered smog on buffers, early stop": Recipe(
         weather=Weather(smog=LOW),
-        render=Render(transmittance_stop=0.2),
+        render=Render(speed=Speed(transmittance_stop=0.2)),
         output=Output(depth="expected", instance=True),
     ),
     "snow, bare images": Recipe(

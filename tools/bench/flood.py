@@ -57,11 +57,13 @@ def flood_recipe(
     reflection: str = "mirrored",
     waves: str = "still",
     output: Output = PICTURE_ONLY,
-    **other_effects: Any,
+    layers_px: float = 2.0,
+    **other_fields: Any,
 ) -> Recipe:
-    """Return a recipe of a flood. other_effects: further fields of the flood."""
-    fields = {**WATER, "reflection": reflection, "waves": {"preset": waves}, **other_effects}
-    return recipe_of({"flood": fields}, output)
+    """Return a recipe of a flood. other_fields: further fields of the flood."""
+    fields = {**WATER, "reflection": reflection, "waves": {"preset": waves}, **other_fields}
+    speed = {"layers_px": layers_px}
+    return recipe_of({"flood": fields, "render": {"speed": speed}}, output)
 
 
 def tables(case: EffectCase, repeats: int) -> list[Table]:

@@ -22,7 +22,7 @@ CASES = {
 }
 # The weathers whose stages and memory are shown.
 STAGED = ("rain 10 mm/h, dry", "rain 10 mm/h", "snowfall 1 mm/h")
-# The values of min_width_px, the width from which a drop is drawn by itself, pixels.
+# The least widths of drops and flakes that are drawn one by one, pixels.
 WIDTHS_PX = (0.25, 0.35, 0.5, 1.0, 2.0)
 GRID = 32  # The side of the squares whose means are compared, pixels.
 
@@ -37,7 +37,8 @@ def tables(case: EffectCase, repeats: int) -> list[Table]:
         pictures = []
         for width in WIDTHS_PX:
             ((kind, fields),) = CASES[name].items()
-            recipe = recipe_of({kind: {**fields, "min_width_px": width}})
+            speed = {f"{kind}_min_width_px": width}
+            recipe = recipe_of({kind: fields, "render": {"speed": speed}})
             pictures.append(render_buffers(scene, camera, make_plan(recipe, scene)).rgb.numpy())
         for width, picture in zip(WIDTHS_PX, pictures, strict=True):
             change = 255 * (picture - pictures[0])
