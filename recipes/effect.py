@@ -31,7 +31,8 @@ class Knob:
             the field says what is written, or none of its values saves time.
         tiers: value by tier, if it is not the reference.
         applies_to: function of a section that returns True if the knob changes anything there.
-        section: dotted path of the section.
+        section: dotted path of the section that `applies_to` takes; without it the knob has no
+            effect. In a model, empty for the model's section.
     """
 
     path: str

@@ -90,7 +90,6 @@ class Flood(EffectModel):
     """Standing water with a horizontal surface: waves, reflection, refraction, absorption."""
 
     model_config = ConfigDict(json_schema_extra=_ONE_CLARITY)
-    later_fields = ("bed_cut", "layers_px")
     synonyms = (
         ("flood", "water puddle puddles"),
         ("level_m", "depth depth_m"),
@@ -112,14 +111,6 @@ class Flood(EffectModel):
             "waves that make up the surface",
             7,
             applies_to=lambda flood: flood.waves.is_drawn,
-        ),
-        Knob("bed_cut", (0.03, 0.006, 0.001), "bed that hardly shows through water", 6),
-        Knob(
-            "layers_px",
-            (4.0, 2.0, 1.0),
-            "width of the bed's and the mirrored view's pixels",
-            3,
-            tiers={"draft": 4.0, "balanced": 2.0},
         ),
         Knob("fresnel", ("schlick", "exact"), "share of reflected light", 8),
     )
@@ -173,13 +164,6 @@ class Flood(EffectModel):
     reflection: Literal["sky", "screen_space", "mirrored"] = "mirrored"
     """What is reflected: the sky alone; what the image shows, the rest from a coarse mirrored view;
     or a second view from the camera mirrored in the water."""
-    bed_cut: Number = Field(default=0.006, ge=0.001, le=0.1)
-    """Bed of which no more than this share comes up through the water is left out: at 0.006 one and
-    a half levels of 255, of a bed as far from the water's colour as white from black. Depth and
-    classes show it."""
-    layers_px: Number = Field(default=2.0, ge=1, le=8)
-    """Width of the pixels that the bed and the mirrored view are drawn in, of the picture's; the
-    bed's only where the picture alone is wanted."""
 
     @model_validator(mode="after")
     def _one_clarity(self) -> Flood:

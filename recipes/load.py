@@ -18,7 +18,8 @@ from recipes.files import file_below, open_file
 from recipes.guesses import show
 from recipes.ranges import is_number
 from recipes.recipe_file import Section, read_file, recipe_file
-from recipes.schema import VERSION, Recipe, free_knobs
+from recipes.schema import VERSION, Recipe, free_knobs, idle_speed_knobs
+from recipes.speed import MOVED_FIELDS
 from recipes.template import RecipeTemplate
 from recipes.yaml_tree import MapNode, Node, ScalarNode, check_text, read_tree
 
@@ -28,6 +29,9 @@ _LOG = logging.getLogger(__name__)
 MAX_BYTES = 65_536
 # Message about an empty file.
 EMPTY = "the file is empty; a recipe is a mapping such as 'weather: {smog: {visibility_m: 300}}'"
+
+# Beginning of a recipe in numbers, as jobs leave it beside their images.
+_NUMBERS_HEADER = "# A recipe in numbers, hash "
 
 Overrides = Mapping[str, object]  # dotted path -> what replaces the field: a Node, or plain YAML
 
@@ -199,6 +203,18 @@ def _read_mapping(text: str, place: Place, problems: Problems) -> MapNode:
         raise place.error(EMPTY)
     if not isinstance(tree, MapNode):
         raise tree.place.error(f"a recipe is a mapping of fields; got {show(tree)}")
+    return _with_moved_fields(tree) if text.startswith(_NUMBERS_HEADER) else tree
+
+
+def _with_moved_fields(tree: MapNode) -> MapNode:
+    """Return the tree of a recipe in numbers, of this or an older version, by today's paths."""
+    for former, path in MOVED_FIELDS.items():
+        section_path, _, name = former.rpartition(".")
+        section: Node | None = tree
+        for key in section_path.split("."):
+            section = section.get(key) if isinstance(section, MapNode) else None
+        if isinstance(section, MapNode) and name in section:
+            tree = _merge_trees(tree, _override(path, section.pop(name)), recipe_file())
     return tree
 
 
@@ -317,10 +333,12 @@ def dump_recipe(recipe: Recipe) -> str:
 
     `parse_recipe(dump_recipe(r), ...).resolve(0)` equals r, to the bit. Paths of files are written
     unchanged: make them relative to the recipe's folder first, as a job does. Settings that an open
-    quality has still to choose are left out.
+    quality has still to choose are left out, and so are settings of absent effects: a tier chooses
+    them for a recipe that adds the effect.
     """
     data = recipe.model_dump()
-    for knob in free_knobs(recipe) if recipe.quality.has_open_choice else ():
+    open_knobs = free_knobs(recipe) if recipe.has_open_choice else ()
+    for knob in (*open_knobs, *idle_speed_knobs(recipe)):
         *sections, name = knob.path.split(".")
         holder = data
         for section in sections:
@@ -334,4 +352,4 @@ def dump_recipe(recipe: Recipe) -> str:
     yaml.version = (1, 1)  # quotes what a reader of either version might take for something else
     yaml.dump(data, text)
     body = text.getvalue().removeprefix("%YAML 1.1\n---\n")
-    return f"# A recipe in numbers, hash {recipe.hash}.\n{body}"
+    return f"{_NUMBERS_HEADER}{recipe.hash}.\n{body}"

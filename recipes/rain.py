@@ -1,4 +1,4 @@
-"""The recipe section of rain: its fields, knobs and manifest columns."""
+"""The recipe section of rain: its fields and manifest columns."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 from pydantic import Field
 
-from recipes.effect import Column, EffectModel, Knob
+from recipes.effect import Column, EffectModel
 from recipes.fields import Angle, Colour, Flag, Number, Unit
 
 # Largest rate of rain. The hour's record of most cities is below.
@@ -32,23 +32,6 @@ class Rain(EffectModel):
         ("wind_from_deg", "wind_direction wind_deg"),
         ("wetness", "wet wet_road wet_ground"),
         ("puddles", "puddle standing_water"),
-    )
-    knobs = (
-        Knob(
-            "min_width_px",
-            (1.0, 0.5, 0.35, 0.25),
-            "drops drawn one by one; the rest is veil",
-            7,
-            tiers={"draft": 0.5, "balanced": 0.5},
-        ),
-        Knob(
-            "mirror_px",
-            (8.0, 4.0, 2.0),
-            "resolution of what wet ground mirrors",
-            6.5,
-            tiers={"draft": 4.0},
-            applies_to=lambda rain: rain.ground_wetness > 0,
-        ),
     )
     columns = (
         Column(
@@ -81,9 +64,6 @@ class Rain(EffectModel):
     """Where the wind comes from: 0 is world +x, 90 is +y."""
     color: Colour | None = None
     """Colour of the far veil, display-encoded sRGB; null for the sky's above the horizon."""
-    min_width_px: Number = Field(default=0.35, ge=0.1, le=16)
-    """Drops are drawn one by one up to where they are this wide, pixels of the rendered picture;
-    farther ones are the veil."""
 
     wetness: Unit | None = None
     """How wet the ground is that is open to the sky: 0 dry, 1 wet through; null follows from the
@@ -91,8 +71,6 @@ class Rain(EffectModel):
     puddles: Unit | None = None
     """Share of that ground on which water stands, in its hollows first; null follows from the rate;
     none where wetness is 0."""
-    mirror_px: Number = Field(default=2.0, ge=1, le=16)
-    """What wet ground mirrors is drawn with pixels this wide, pixels of the rendered picture."""
     spray: Flag = True
     """Vehicles that drive faster than 40 km/h lift spray, by their speed, the rate and the ground's
     wetness."""

@@ -57,6 +57,7 @@ from recipes.ranges import (
     is_number,
 )
 from recipes.schema import SECTIONS, Recipe
+from recipes.speed import MOVED_FIELDS
 from recipes.yaml_tree import MAX_NODES, ListNode, MapNode, Node, ScalarNode
 
 # Largest standard deviation of a normal range over its width. A wider normal is uniform for all
@@ -466,6 +467,8 @@ def _problem(item: ErrorDetails) -> tuple[Place, str]:
     for part in parents:
         section = section.INNER.get(str(part), section)
     in_range = len(item["loc"]) > len(location)
+    if kind == "extra_forbidden" and path in MOVED_FIELDS:
+        return node.place, f"{path}: has moved; write {MOVED_FIELDS[path]}"
     if kind == "extra_forbidden":
         why = why_no_key(str(key), section, recipe_file())
         return node.place, f"{path}: {'no part of a range' if in_range else why}"

@@ -37,6 +37,7 @@ from recipes.rain import Rain
 from recipes.smog import Smog
 from recipes.snow import Snow
 from recipes.snowfall import Snowfall
+from recipes.speed import Speed, put_in_former_places
 from recipes.style import Style
 
 # ---- Speed against accuracy: a tier, or what an error or a frame may cost ------------------------
@@ -61,27 +62,17 @@ class Quality(ClosedModel):
     budget_ms: Number | None = Field(default=None, gt=0, le=1e7)
     """The most accurate settings whose frames of this scene take no longer than this on the machine
     that starts the job: the median of a few views, writing left out."""
-    settled: Flag = False
-    """Whether max_flip or budget_ms has made its choice, which the recipe then holds: so it is in
-    the recipes that a job leaves, and nothing is chosen again."""
 
     @model_validator(mode="after")
     def _one_wish(self) -> Quality:
         names = [name for name in ("tier", *TARGETS) if getattr(self, name) is not None]
         if len(names) > 1:
             raise ValueError(f"{' and '.join(names)} each choose the settings: keep one of them")
-        if self.settled and not self.has_target:
-            raise ValueError("settled belongs to max_flip or budget_ms, and neither is given")
         return self
 
     @property
     def has_target(self) -> bool:
         return self.max_flip is not None or self.budget_ms is not None
-
-    @property
-    def has_open_choice(self) -> bool:
-        """Return True while settings have still to be chosen for a scene."""
-        return self.has_target and not self.settled
 
     @property
     def summary(self) -> str | None:
@@ -178,15 +169,7 @@ class Weather(ClosedModel):
 class Render(Section):
     """How the scene is drawn."""
 
-    later_fields = (
-        "base",
-        "exposure",
-        "transmittance_stop",
-        "radius_clip_px",
-        "fog_cut",
-        "lod_px",
-        "prune",
-    )
+    later_fields = ("base", "exposure")
     knobs = (
         Knob(
             "scale",
@@ -194,35 +177,6 @@ class Render(Section):
             "resolution, enlarged again for the comparison",
             0,
             tiers={"draft": 0.75},
-        ),
-        Knob("radius_clip_px", (3.0, 2.0, 1.0, 0.0), "splats no larger are left out", 4),
-        Knob(
-            "lod_px",
-            (2.0, 1.0, 0.5, 0.0),
-            "far splats are merged in cells as large",
-            13,
-            is_selectable=False,  # it saves in scenes of many millions, and there nothing is pruned
-        ),
-        Knob(
-            "transmittance_stop",
-            (0.05, 0.02, 0.01, 1e-3, 1e-4),
-            "light behind it is given up",
-            5,
-            tiers={"draft": 0.02, "balanced": 0.02},
-        ),
-        Knob(
-            "fog_cut",
-            (0.02, 0.0039, 0.0),
-            "splats behind so much fog are left out",
-            5.5,
-            tiers={"draft": 0.02, "balanced": 0.0039},
-        ),
-        Knob(
-            "prune",
-            (0.006, 0.001, 0.0007, 0.0004, 0.0),
-            "splats that no view would miss are left out",
-            1.5,
-            tiers={"draft": 0.006, "balanced": 0.0007},
         ),
         Knob("sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics", 6),
     )
@@ -234,36 +188,13 @@ class Render(Section):
     """Resolution relative to the cameras'."""
     near_m: Number = Field(default=0.01, gt=0, le=100)
     """Splats nearer to the camera's plane are dropped."""
-    alpha_max: Number = Field(default=0.999, gt=0, le=0.9999)
-    """Cap of one splat's alpha: 0.999, or the original 3DGS's 0.99."""
-    antialiased: Flag = False
-    """Opacity compensated for the screen blur."""
     sh_degree: Whole | None = Field(default=None, ge=0, le=3)
     """Highest spherical-harmonics band; null for all."""
     exposure: Literal["common", "recorded", "neutral"] = "common"
     """recorded gives each camera's picture the colours of its recording, fog included, where the
     scene knows them; common gives fog one colour in all cameras, by the mean of their exposures;
     neutral leaves the scene's own colours."""
-    transmittance_stop: Number = Field(default=1e-4, ge=1e-6, le=0.25)
-    """A pixel is finished once no more than this share of the light behind shines through; what it
-    shows by then stands for the rest. 1e-6 blends what no picture in 8 bits shows; 0.5 would leave
-    no median depth, hence the limit."""
-    radius_clip_px: Number = Field(default=0.0, ge=0, le=64)
-    """Splats that reach no farther than this from their centre along x or y, pixels of the rendered
-    picture, are left out; 0 leaves out none."""
-    fog_cut: Number = Field(default=0.0039, ge=0, le=0.1)
-    """Splats of which smog lets no more than this share through are left out, and pixels finished
-    once no more of what is behind would be seen: at 0.0039 a level of 255. It counts where the
-    picture alone is wanted: depth, classes, snow and water are drawn through any smog."""
-    lod_px: Number = Field(default=0.0, ge=0, le=64)
-    """Far splats of large backgrounds are merged, once a scene, in cells that are no larger than
-    this in the picture, pixels, or twice that where they are of one colour; 0 draws all as they
-    are. For scenes of many millions."""
-    prune: Number = Field(default=0.0, ge=0, le=0.5)
-    """Splats of the background are left out of which each alone changes the mean of a recorded view
-    so little that it adds up to no more than this share of white; 0 leaves out none. Found once a
-    scene, for views from within 2 m of a recorded one; of no effect with lod_px or on recorded
-    images."""
+    speed: Speed = Speed()
 
     @property
     def is_on_recorded(self) -> bool:
@@ -386,6 +317,15 @@ class Recipe(ClosedModel):
     output: Output = Output()
 
     @model_validator(mode="after")
+    def _settled_by_target(self) -> Recipe:
+        if self.render.speed.settled and not self.quality.has_target:
+            raise ValueError(
+                "render.speed.settled belongs to quality.max_flip or quality.budget_ms, and "
+                "neither is given"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _settings_of_tier(self) -> Recipe:
         """Replace a tier by its numbers. This happens once; the tier's name stays beside them."""
         if self.quality.tier is not None:
@@ -405,6 +345,7 @@ class Recipe(ClosedModel):
         those of `lidar: true`. Paths of files are left out: their digest identifies their contents.
         """
         data = self.model_dump(mode="json")
+        put_in_former_places(data)
         effects = self.sections()
         sections: dict[str, Section] = {"render": self.render, "output": self.output, **effects}
         omitted_paths = [] if self.quality != Quality() else ["quality"]
@@ -438,6 +379,11 @@ class Recipe(ClosedModel):
     def hash(self) -> str:
         """Return the first 16 hex digits of the SHA-256 of canonical_json()."""
         return hashlib.sha256(self.canonical_json().encode()).hexdigest()[:16]
+
+    @property
+    def has_open_choice(self) -> bool:
+        """Return True while a target has still to choose settings for a scene."""
+        return self.quality.has_target and not self.render.speed.settled
 
     @property
     def lidar(self) -> Literal["weather", "clean"] | None:
@@ -542,9 +488,14 @@ def _rebuild() -> None:
 
 
 def _collect_knobs() -> None:
-    sections: dict[str, type[Section]] = {"render": Render, "output": Output, **SECTIONS}
+    sections: dict[str, type[Section]] = {
+        "render": Render,
+        "render.speed": Speed,
+        "output": Output,
+        **SECTIONS,
+    }
     knobs = [
-        replace(knob, path=f"{path}.{knob.path}", section=path)
+        replace(knob, path=f"{path}.{knob.path}", section=knob.section or path)
         for path, model in sections.items()
         for knob in model.knobs
     ]
@@ -577,6 +528,17 @@ def knobs_of(recipe: Recipe) -> tuple[Knob, ...]:
 def free_knobs(recipe: Recipe) -> tuple[Knob, ...]:
     """Return the knobs that a tier or a target may set: the recipe does not give their field."""
     return tuple(k for k in knobs_of(recipe) if k.is_selectable and not is_given(recipe, k.path))
+
+
+def idle_speed_knobs(recipe: Recipe) -> tuple[Knob, ...]:
+    """Return the knobs in `render.speed` of absent effects, if the recipe does not give them."""
+    return tuple(
+        knob
+        for knob in KNOBS.values()
+        if knob.path.startswith("render.speed.")
+        and section_at(recipe, knob.section) is None
+        and not is_given(recipe, knob.path)
+    )
 
 
 def settings_of(recipe: Recipe) -> dict[str, Value]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from recipes.effect import Column, EffectModel, Knob
+from recipes.effect import Column, EffectModel
 from recipes.fields import Angle, Colour, Number
 from recipes.rain import MAX_WIND_MPS
 
@@ -16,15 +16,6 @@ class Snowfall(EffectModel):
     """Snow in the air: flakes near the camera, a white veil beyond; what lies is `snow`."""
 
     synonyms = (("rate_mm_h", "snow_rate snowfall_rate"), ("turbulence_mps", "turbulence gusts"))
-    knobs = (
-        Knob(
-            "min_width_px",
-            (2.0, 1.0, 0.5, 0.35),
-            "flakes drawn one by one; the rest is veil",
-            8,
-            tiers={"draft": 1.0},
-        ),
-    )
     columns = (
         Column(
             "snowfall_rate_mm_h",
@@ -49,9 +40,6 @@ class Snowfall(EffectModel):
     """Speed of eddies that the flakes follow, and of their own flutter."""
     color: Colour | None = None
     """Colour of the far veil, display-encoded sRGB; null for the sky's above the horizon."""
-    min_width_px: Number = Field(default=0.5, ge=0.1, le=16)
-    """Flakes are drawn one by one up to where they are this wide, pixels of the rendered picture;
-    farther ones are the veil."""
 
     @property
     def has_effect(self) -> bool:

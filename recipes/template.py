@@ -14,6 +14,7 @@ from recipes.files import with_digest
 from recipes.ranges import Draws, Fixed, Value, as_number, format_value
 from recipes.recipe_file import recipe_file
 from recipes.schema import VERSION, Recipe
+from recipes.speed import former_path
 
 _INDEX = re.compile(r"\[[0-9]+\]")
 _SHARE = ".probability"
@@ -104,7 +105,7 @@ class RecipeTemplate:
             parts = [f"{path.removesuffix('.')} absent" for path in absent_paths]
             for path, value in self.values.items():
                 if value.is_range and not path.startswith(absent_paths):
-                    parts.append(f"{path} = {format_value(value.draw(draws, path))}")
+                    parts.append(f"{path} = {format_value(value.draw(draws, former_path(path)))}")
             lines.append(f"{recipe.name}-{recipe.variant:03d} {recipe.hash}  {', '.join(parts)}")
         return "\n".join(lines)
 
@@ -126,7 +127,7 @@ def _draw(node: Any, draws: Draws, path: str) -> Any:
     if isinstance(node, list):
         return [_draw(item, draws, f"{path}[{index}]") for index, item in enumerate(node)]
     if not isinstance(node, Mapping):
-        return node.draw(draws, path)
+        return node.draw(draws, former_path(path))
     share = node.get("probability")
     if share is not None and draws.unit(path + _SHARE) >= share.value:
         return None

@@ -46,7 +46,7 @@ def explain_recipe(
         raise ClimateGSError(f"--variant {variant}: {template.name} has {variants_text}")
     resolved = template.resolve(variant)
     scene = open_scene(scene_uri)
-    is_open = resolved.quality.has_open_choice
+    is_open = resolved.has_open_choice
     if is_open and times:
         with compiling_noted():
             resolved = resolve_quality(resolved, scene, progress=True).recipe

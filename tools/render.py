@@ -162,7 +162,7 @@ def _with_quality(
     recipe: Recipe, scene: Scene, options: RenderOptions, path: Sequence[Frame] | None
 ) -> Recipe:
     """Return the recipe with the settings of its quality. A note names chosen settings."""
-    if not recipe.quality.has_open_choice:
+    if not recipe.has_open_choice:
         return recipe
     resolved = choose_settings(
         open_store(options.out),

@@ -542,7 +542,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
         renderer_problems = [
             f"{run.config_file}: the run was trained with trainer.render.antialiased, which draws "
             f"small splats fainter than they are drawn here; a recipe's render: "
-            f"{{antialiased: true}} does the same"
+            f"{{speed: {{antialiased: true}}}} does the same"
         ]
     return Scene(
         name=run.folder.absolute().name,

@@ -2,7 +2,7 @@
 
 In: the Gaussians of a large background (`levels_of` builds `Levels`, once). Out: `choose_parts`
 gives the parts that a camera needs, in place of the whole background. `rasterize` calls it where
-recipe.render.lod_px > 0; `augment.files.level_file` stores levels beside a scene.
+recipe.render.speed.lod_px > 0; `augment.files.level_file` stores levels beside a scene.
 
 The ground is cut into squares. Level 0 of a square holds its own splats. Level k holds, for a
 square of twice the side, the splats of level k - 1, with those merged that share a cell of side

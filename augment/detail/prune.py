@@ -74,7 +74,8 @@ SplatChanges = tuple[Int32[np.ndarray, "_"], Float[np.ndarray, "_"]]
 
 def prune_error_of(render: Render) -> float:
     """Return the recipe's error, or 0 where nothing is pruned: merged splats, recorded images."""
-    return 0.0 if render.is_on_recorded or render.lod_px > 0 else render.prune
+    has_pruning = not render.is_on_recorded and render.speed.lod_px == 0
+    return render.speed.prune if has_pruning else 0.0
 
 
 def prune_parts(

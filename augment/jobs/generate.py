@@ -350,7 +350,7 @@ def resolve_recipes(
         for entry in job.scenes
         if isinstance(record := scene_records[entry.uri, entry.name], SceneRecord)
         for recipe in job.recipes.resolve_for_scene(entry, record.name)
-        if recipe.quality.has_open_choice
+        if recipe.has_open_choice
     ]
     with ThreadPoolExecutor(_NUM_READS, thread_name_prefix="choices") as pool:
         answers = list(pool.map(lambda pair: read_choice(store, pair[0]), questions))

@@ -482,7 +482,7 @@ class _Run:
 
     def _resolve_quality(self, recipe: Recipe) -> Recipe:
         """Return the recipe with the settings that its quality chooses, or has chosen before."""
-        if not recipe.quality.has_open_choice:
+        if not recipe.has_open_choice:
             return recipe
         assert self.scene is not None
         with self.times.measure("choose_settings"):

@@ -36,6 +36,7 @@ from augment.output.layout import (
 from augment.output.store import Store, StoredFileMissing
 from augment.output.tables import read_table
 from recipes.schema import KNOBS, SECTIONS, Recipe, columns_of_effects, settings_of
+from recipes.speed import former_path
 
 # Status of an image whose files are complete.
 OK = "ok"
@@ -730,13 +731,16 @@ def recipe_columns(recipe: Recipe) -> dict[str, str | float | None]:
     """Return the values that a recipe gives its images, by columns.
 
     The column `settings` is JSON of the knobs that a quality may set (recipes.schema) and that have
-    an effect, by dotted path; None where the recipe has no quality.
+    an effect, by dotted path; None where the recipe has no quality. Fields of `render.speed` have
+    their former paths, so that rows of all versions agree.
     """
     quality_words = recipe.quality.summary
     settings = None
     if quality_words is not None:
         knob_values = {
-            path: v for path, v in settings_of(recipe).items() if KNOBS[path].is_selectable
+            former_path(path): value
+            for path, value in settings_of(recipe).items()
+            if KNOBS[path].is_selectable
         }
         settings = json.dumps(knob_values, separators=(",", ":"))
     return {

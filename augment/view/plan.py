@@ -127,7 +127,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         SceneError: the recipe needs what the scene does not have (the road's height, photos).
         RecipeError: the recipe's quality has still to choose its settings.
     """
-    if recipe.quality.has_open_choice:
+    if recipe.has_open_choice:
         raise RecipeError(
             f"recipe {recipe.name}, variant {recipe.variant}: quality {recipe.quality.summary} has "
             f"still to choose its settings for a scene, as jobs do; resolve its quality first "
@@ -163,13 +163,13 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         effect_plans=effect_plans,
         settings=RasterSettings(
             near_m=render.near_m,
-            alpha_max=render.alpha_max,
-            antialiased=render.antialiased,
+            alpha_max=render.speed.alpha_max,
+            antialiased=render.speed.antialiased,
             sh_degree=render.sh_degree,
-            transmittance_stop=render.transmittance_stop,
-            radius_clip_px=render.radius_clip_px,
-            fog_cut=render.fog_cut,
-            lod_px=render.lod_px,
+            transmittance_stop=render.speed.transmittance_stop,
+            radius_clip_px=render.speed.radius_clip_px,
+            fog_cut=render.speed.fog_cut,
+            lod_px=render.speed.lod_px,
         ),
         prune=prune_error_of(render),
         buffers=buffers,

@@ -37,6 +37,7 @@ from augment.view.render_view import render_view
 from augment.view.results import Renderer
 from recipes.fields import with_unchecked_field
 from recipes.schema import KNOBS, Recipe, Value, free_knobs, with_settings
+from recipes.speed import MOVED_FIELDS, former_path
 
 # ---- One picture, to measure its time and its error at the size of its reference -----------------
 
@@ -402,7 +403,7 @@ def resolve_quality(
         SceneError: The scene cannot be rendered under the recipe.
     """
     quality = recipe.quality
-    if not quality.has_open_choice:
+    if not recipe.has_open_choice:
         return SettingsChoice(recipe)
     start_s = perf_counter()
     views = calibration_views(scene.frames if camera_path is None else camera_path)
@@ -489,7 +490,7 @@ def apply_settings(recipe: Recipe, settings: Settings) -> Recipe:
             f"the settings are of {', '.join(sorted(settings)) or 'no knob'}; the recipe leaves "
             f"free {', '.join(sorted(free_paths)) or 'none'}"
         )
-    return with_settings(recipe, {**settings, "quality.settled": True})
+    return with_settings(recipe, {**settings, "render.speed.settled": True})
 
 
 def recipes_to_try(recipe: Recipe) -> list[Recipe]:
@@ -498,7 +499,7 @@ def recipes_to_try(recipe: Recipe) -> list[Recipe]:
     Kernels are compiled for these recipes. A recipe without anything to choose is returned as it
     is.
     """
-    if not recipe.quality.has_open_choice:
+    if not recipe.has_open_choice:
         return [recipe]
     values_of_knob = _allowed_values(recipe)
     reference = first_settings(values_of_knob)
@@ -560,7 +561,7 @@ class Question:
         """
         return {
             "recipe": json.loads(self.recipe.canonical_json()),
-            "free": sorted(knob.path for knob in free_knobs(self.recipe)),
+            "free": sorted(former_path(knob.path) for knob in free_knobs(self.recipe)),
             "scene": self.scene,
             "source": self.source,
             "trajectory": self.trajectory,
@@ -602,7 +603,7 @@ def choose_settings(
         choose_again: If True, choose again, and keep the new choice in place of the old one.
         keep_choice: If True, the output keeps a new choice.
     """
-    if not recipe.quality.has_open_choice:
+    if not recipe.has_open_choice:
         return recipe
     question = Question(recipe, scene.name, scene.source, trajectory_id(camera_path), backend)
 
@@ -641,7 +642,8 @@ def read_choice(store: Store, question: Question) -> Recipe | None:
             raise ValueError(f"its format is {document['format']!r}, not {_FORMAT}")
         if document["asked"] != question.facts():
             raise ValueError("it answers another question than its name says")
-        settings = document["choice"]["settings"]
+        stored_settings: Settings = document["choice"]["settings"]
+        settings = {MOVED_FIELDS.get(path, path): v for path, v in stored_settings.items()}
         for path, value in settings.items():
             knob = KNOBS.get(path)
             if knob is None or not any(value == v and type(value) is type(v) for v in knob.values):
@@ -651,7 +653,8 @@ def read_choice(store: Store, question: Question) -> Recipe | None:
 
 def _to_json(question: Question, result: SettingsChoice) -> bytes:
     """Return the file of a choice."""
-    values = vars(result)
+    settings = {former_path(path): value for path, value in result.settings.items()}
+    values = {**vars(result), "settings": settings}
     document = {
         "format": _FORMAT,
         "asked": question.facts(),

@@ -482,7 +482,7 @@ def check_buffers(buffers: WeatheredBuffers, recipe: Recipe) -> None:
         if raster.overlay is not None:
             # Two sums of the same weights: they differ by rounding. An alpha below float32's step
             # at 1 is lost in transmittance, which thousands of splats then leave at 1.
-            room = 1e-5 if recipe.render.alpha_max > 6e-8 else 1e-3
+            room = 1e-5 if recipe.render.speed.alpha_max > 6e-8 else 1e-3
             assert bool((raster.overlay >= 0).all())
             assert bool((raster.overlay <= alpha + room).all()), "more snow than surface"
     if buffers.depth_m is not None:

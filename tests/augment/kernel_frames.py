@@ -24,6 +24,7 @@ from augment.view.render_view import render_view
 from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
+from recipes.speed import Speed
 from recipes.style import Style
 
 WIDTH, HEIGHT = 20, 12
@@ -33,7 +34,7 @@ _PLAIN = Output(depth="none", labels=False)
 RECIPES = {
     "clean": Recipe(output=Output(semantic=True, instance=True)),
     "antialiased, stopped early": Recipe(
-        render=Render(antialiased=True, transmittance_stop=0.2),
+        render=Render(speed=Speed(antialiased=True, transmittance_stop=0.2)),
         output=Output(depth="expected", labels=False),
     ),
     "mode depth": Recipe(output=Output(depth="mode", labels=False)),

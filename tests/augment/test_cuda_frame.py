@@ -38,6 +38,7 @@ from augment.view.render_view import begin_view, render_view
 from augment.view.results import WeatheredView
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
+from recipes.speed import Speed
 from recipes.style import Style
 from tests import snow_scenes
 from tests.augment.kernel_compiling import Launch, compile_launches, complaints, recorded_launches
@@ -196,7 +197,7 @@ RECIPES = {
     ),
     "layered smog on buffers, early stop": Recipe(
         weather=Weather(smog=LOW),
-        render=Render(transmittance_stop=0.2),
+        render=Render(speed=Speed(transmittance_stop=0.2)),
         output=Output(depth="expected", instance=True),
     ),
     "snow, bare images": Recipe(

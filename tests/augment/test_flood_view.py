@@ -40,7 +40,8 @@ from augment.view import layers
 from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers, render_view
 from recipes.flood import Flood, Wave, Waves
-from recipes.schema import Output, Recipe, Smog, Weather
+from recipes.schema import Output, Recipe, Render, Smog, Weather
+from recipes.speed import Speed
 from tests.augment.pretend_gpu import pretended_gpu
 from tests.scenes import camera_ahead, random_gaussians, sh_of
 from tools.bench.flood_truth import analytic_error, tier_error, water_masks
@@ -48,6 +49,7 @@ from tools.bench.flood_truth import analytic_error, tier_error, water_masks
 ROAD_Z = -1.5
 ROAD, WALL, CAR, SKY = (0.45, 0.45, 0.47), (0.8, 0.2, 0.1), (0.1, 0.8, 0.1), (0.3, 0.5, 0.9)
 STILL = Waves(preset="still")
+DEFAULT_SPEED = Speed()
 
 
 def sheet(points, flat_axis: int, rgb, semantic: SemanticClass, size=0.25) -> Gaussians:
@@ -118,13 +120,16 @@ def scene() -> Scene:
     return make_scene()
 
 
-def recipe_of(flood: Flood | None, smog: Smog | None = None, **output) -> Recipe:
-    return Recipe(weather=Weather(flood=flood, smog=smog), output=Output(**output))
+def recipe_of(
+    flood: Flood | None, smog: Smog | None = None, speed: Speed = DEFAULT_SPEED, **output
+) -> Recipe:
+    weather = Weather(flood=flood, smog=smog)
+    return Recipe(weather=weather, render=Render(speed=speed), output=Output(**output))
 
 
-def view_of(scene, flood, view=None, *, smog=None, backend="auto", **output):
+def view_of(scene, flood, view=None, *, smog=None, speed=DEFAULT_SPEED, backend="auto", **output):
     output = {"depth": "expected", **output}
-    recipe = recipe_of(flood, smog, **output)
+    recipe = recipe_of(flood, smog, speed, **output)
     return render_view(scene, camera() if view is None else view, recipe, backend=backend)
 
 
@@ -241,8 +246,9 @@ def test_kernels_match_the_definition(scene, reflection):
 def test_layers_of_wider_pixels_match_the_definition_and_the_whole_ones(scene):
     views = {}
     for name, width in (("cpu", 1.0), ("cpu", 2.0), ("reference", 2.0)):
-        water = flood(waves=Waves(preset="breeze"), turbidity_ntu=1, layers_px=width)
-        plan = make_plan(recipe_of(water, depth="none", labels=False), scene)
+        water = flood(waves=Waves(preset="breeze"), turbidity_ntu=1)
+        speed = Speed(layers_px=width)
+        plan = make_plan(recipe_of(water, speed=speed, depth="none", labels=False), scene)
         views[name, width] = render_buffers(scene, camera(), plan, backend=name).rgb
     fast, slow = views["cpu", 2.0], views["reference", 2.0]
     error = (fast - slow).abs().amax(-1)
@@ -273,7 +279,8 @@ def test_a_smaller_image_widens_no_splat_with_the_blur_of_the_larger_one():
 
 def test_bed_that_hardly_comes_up_is_left_out_of_mere_pictures(scene):
     down = camera(pitch=0.5)
-    medium, _ = flood_of_recipe(flood(turbidity_ntu=20), 0, scene)  # 0.4 m of it: exp(-4) comes up
+    water = flood(turbidity_ntu=20)  # of 0.4 m of it exp(-4) comes up
+    medium, _ = flood_of_recipe(water, recipe_of(water), scene)
     cut = dataclasses.replace(medium, bed_cut=0.03)
     steepest = math.cos(math.radians(90) - (0.5 + math.atan2(30, 60)))  # sine to the horizon
     way = 1 / math.sqrt(1 - (1 - steepest**2) / 1.333**2)
@@ -283,14 +290,13 @@ def test_bed_that_hardly_comes_up_is_left_out_of_mere_pictures(scene):
     opaque = dataclasses.replace(medium, extinction_per_m=(math.inf,) * 3)
     assert visible_depth_m(opaque, down) == 0
     whole, less = (
-        view_of(scene, flood(turbidity_ntu=20, bed_cut=share), down, depth="none", labels=False)
+        view_of(scene, water, down, speed=Speed(bed_cut=share), depth="none", labels=False)
         for share in (0.001, 0.03)
     )
     road = (slice(45, 60), slice(5, 20))  # at the foot of wall and car a shallow bed is lost, too
     assert 0 < np.abs(whole.rgb.astype(int) - less.rgb)[road].max() <= 0.03 * 255
     depths = [
-        view_of(scene, flood(turbidity_ntu=20, bed_cut=share), down).depth_m
-        for share in (0.001, 0.03)
+        view_of(scene, water, down, speed=Speed(bed_cut=share)).depth_m for share in (0.001, 0.03)
     ]
     np.testing.assert_allclose(
         *(depth[road] for depth in depths), rtol=5e-3

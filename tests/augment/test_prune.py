@@ -21,6 +21,7 @@ from augment.scene.sky import ConstantSky
 from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers, render_view
 from recipes.schema import Output, Recipe, Render
+from recipes.speed import Speed
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, stack
 from tests.streets import open_street
 
@@ -39,7 +40,7 @@ def scene_of(gaussians: Gaussians, *cameras: Camera) -> Scene:
 
 
 def buffers(scene: Scene, camera: Camera, error: float):
-    recipe = Recipe(render=Render(prune=error), output=Output(depth="median"))
+    recipe = Recipe(render=Render(speed=Speed(prune=error)), output=Output(depth="median"))
     return render_buffers(scene, camera, make_plan(recipe, scene), backend="cpu")
 
 
@@ -154,7 +155,7 @@ def test_views_in_levels_change_nothing_for_those_after_them():
     g = random_gaussians(MIN_SPLATS, seed=2, sh_degree=0, size=0.05)
     scene = scene_of(g, camera := camera_ahead(64, 48, 50.0))
     before = buffers(scene, camera, 1e-3).rgb
-    recipe = Recipe(render=Render(lod_px=1.0))
+    recipe = Recipe(render=Render(speed=Speed(lod_px=1.0)))
     render_buffers(scene, camera, make_plan(recipe, scene), backend="cpu")
     assert torch.equal(buffers(scene, camera, 1e-3).rgb, before)
     assert not torch.equal(buffers(scene, camera, 0.0).rgb, before)
@@ -168,7 +169,7 @@ def test_views_from_elsewhere_draw_all():
         assert bool((opacities[117:217] == 0).all()) is is_pruned
 
 
-@pytest.mark.parametrize("render", [Render(), Render(prune=0.1, lod_px=1.0)])
+@pytest.mark.parametrize("render", [Render(), Render(speed=Speed(prune=0.1, lod_px=1.0))])
 def test_nothing_is_looked_for_where_nothing_is_left_out(render: Render):
     scene, camera = street_of_walls()
     recipe = Recipe(render=render)
@@ -178,12 +179,12 @@ def test_nothing_is_looked_for_where_nothing_is_left_out(render: Render):
     assert plan.prune == 0
     left = render_buffers(scene, camera, plan, backend="cpu").parts[0].gaussians.opacities
     assert left is scene.background.opacities
-    assert prune.prune_error_of(Render(prune=0.1, base="recorded")) == 0
+    assert prune.prune_error_of(Render(speed=Speed(prune=0.1), base="recorded")) == 0
 
 
 def test_other_processes_take_the_changes_over():
     scene, camera = street_of_walls()
-    recipe = Recipe(render=Render(prune=HIDDEN))
+    recipe = Recipe(render=Render(speed=Speed(prune=HIDDEN)))
     precompute_effects(JobContext(scene, [recipe]))
     other = dataclasses.replace(scene)
     memo_of(other).take_shared(pickle.loads(pickle.dumps(memo_of(scene).shared())))
@@ -200,7 +201,11 @@ def test_wet_ground_mirrors_what_recorded_views_would_not_miss():
     camera = scene.frames[0].cameras["front"].scaled(0.2)
     dry, wet = (
         [
-            render_view(scene, camera, Recipe(weather={"rain": rain}, render=Render(prune=error)))
+            render_view(
+                scene,
+                camera,
+                Recipe(weather={"rain": rain}, render=Render(speed=Speed(prune=error))),
+            )
             for error in (0.0, 2e-3)
         ]
         for rain in ({"rate_mm_h": 10, "wetness": 0.0, "puddles": 0.0}, {"rate_mm_h": 10})
@@ -215,7 +220,7 @@ def test_scenes_of_vehicles_alone_are_drawn_whole():
     nothing = street.background.select(torch.zeros(0, dtype=torch.int64))
     scene = dataclasses.replace(street, background=nothing)
     camera = scene.frames[0].cameras["front"].scaled(0.1)
-    recipes = [Recipe(render=Render(prune=error)) for error in (0.0, 1e-3)]
+    recipes = [Recipe(render=Render(speed=Speed(prune=error))) for error in (0.0, 1e-3)]
     precompute_effects(JobContext(scene, recipes))
     full_rgb, left = (render_view(scene, camera, recipe).rgb for recipe in recipes)
     np.testing.assert_array_equal(full_rgb, left)
@@ -226,7 +231,7 @@ def test_weather_is_drawn_on_what_is_left():
     camera = scene.frames[0].cameras["front"].scaled(0.1)
     weather = {"snow": {"depth_m": 0.1, "cell_m": 0.4}, "flood": {"level_m": 0.1}}
     views = [
-        render_view(scene, camera, Recipe(weather=weather, render=Render(prune=error)))
+        render_view(scene, camera, Recipe(weather=weather, render=Render(speed=Speed(prune=error))))
         for error in (0.0, 2e-3)
     ]
     off = np.abs(views[0].rgb.astype(int) - views[1].rgb).mean()

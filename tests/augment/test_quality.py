@@ -19,7 +19,7 @@ from augment.errors import OutputError, SceneError
 from augment.jobs.generate import plan_job, run_generate
 from augment.jobs.render_job import RenderJob, run_job
 from augment.metrics.image import flip
-from augment.output.manifest import read_manifest
+from augment.output.manifest import read_manifest, recipe_columns
 from augment.output.store import open_store
 from augment.scene.cameras import Frame
 from augment.view.plan import make_plan
@@ -221,7 +221,7 @@ def test_a_choice_by_error_is_within_the_bound_and_the_same_again() -> None:
     chosen = resolve_quality(recipe, scene)
     assert resolve_quality(recipe, scene).recipe == chosen.recipe
     assert chosen.is_met and chosen.ms is None
-    assert chosen.recipe.quality.settled and not chosen.recipe.quality.has_open_choice
+    assert chosen.recipe.render.speed.settled and not chosen.recipe.has_open_choice
     assert chosen.recipe.quality.summary == "max_flip 0.06"
     errors = []
     for view in calibration_views(scene.frames):
@@ -234,10 +234,12 @@ def test_a_choice_by_error_is_within_the_bound_and_the_same_again() -> None:
 
 
 def test_given_fields_stay_and_are_the_references_too(bench: Workbench) -> None:
-    recipe = open_recipe("max_flip: 0.9", "render: {scale: 0.5, transmittance_stop: 0.2}\n")
+    recipe = open_recipe(
+        "max_flip: 0.9", "render: {scale: 0.5, speed: {transmittance_stop: 0.2}}\n"
+    )
     chosen = resolve_quality(recipe, open_fake("fake:street"), renderer=bench.render)
     render = chosen.recipe.render
-    assert (render.scale, render.transmittance_stop, render.sh_degree) == (0.5, 0.2, 0)
+    assert (render.scale, render.speed.transmittance_stop, render.sh_degree) == (0.5, 0.2, 0)
     assert "render.scale" not in chosen.settings
     same = open_recipe("max_flip: 1e-9", "render: {scale: 0.5, sh_degree: 0}\n")
     assert resolve_quality(same, open_fake("fake:street"), renderer=bench.render).flip == 0
@@ -256,7 +258,7 @@ def test_a_budget_takes_as_little_as_it_needs(bench: Workbench) -> None:
     assert (render.scale, render.sh_degree) == (0.75, None)  # a smooth picture loses little
     assert half.ms == pytest.approx(67.5) and half.reference_ms == pytest.approx(120)
     assert half.is_met and 0 < half.flip < 0.1
-    assert render.radius_clip_px == 0  # saves nothing
+    assert render.speed.radius_clip_px == 0  # saves nothing
 
 
 def test_a_budget_beyond_reach_says_so(bench: Workbench, caplog: pytest.LogCaptureFixture) -> None:
@@ -287,7 +289,7 @@ def test_what_has_not_chosen_is_not_rendered() -> None:
     with pytest.raises(RecipeError, match=r"fog, variant 0: quality max_flip 0\.1 has still to"):
         render_view(scene, make_camera("front", 0, 0.0), recipe)
     tried = recipes_to_try(recipe)
-    assert len(tried) > 8 and not any(r.quality.has_open_choice for r in tried)
+    assert len(tried) > 8 and not any(r.has_open_choice for r in tried)
     assert recipes_to_try(tried[0]) == [tried[0]]
     assert resolve_quality(tried[0], scene).recipe is tried[0]
     with pytest.raises(ValueError, match="leaves free render"):
@@ -360,6 +362,23 @@ def test_a_damaged_choice_is_told(bench: Workbench, tmp_path: Path) -> None:
         message = r"recipe fog in scene a, is damaged: .*Delete it"
         with pytest.raises(OutputError, match=message):
             choose_settings(*arguments, backend="cpu", renderer=bench.render)
+
+
+def test_outputs_name_fields_of_speed_as_version_0_6_did(bench: Workbench, tmp_path: Path) -> None:
+    store = open_store(tmp_path)
+    recipe = open_recipe("max_flip: 0.5", "weather: {rain: {rate_mm_h: 5}}\n")
+    scene = open_fake("fake:a")
+    chosen = choose_settings(store, recipe, scene, backend="cpu", renderer=bench.render)
+    question = Question(recipe, scene.name, scene.source, "recorded", "cpu")
+    document = json.loads(store.read(question.path))
+    columns = recipe_columns(chosen)
+    for paths in (
+        document["asked"]["free"],
+        document["choice"]["settings"],
+        json.loads(str(columns["settings"])),
+    ):
+        assert {"render.prune", "weather.rain.mirror_px", "weather.rain.min_width_px"} <= {*paths}
+        assert not [path for path in paths if path.startswith("render.speed")]
 
 
 def test_what_a_recipe_leaves_free_is_part_of_the_question() -> None:

@@ -56,6 +56,7 @@ from augment.scene.semantics import SemanticClass
 from augment.scene.sky import ConstantSky
 from augment.view.plan import make_plan, plan_view
 from augment.view.render_view import render_buffers, render_view
+from recipes.fields import changed
 from recipes.rain import Rain
 from recipes.schema import Output, Recipe, Render, Weather
 from tests.scenes import one_gaussian, random_gaussians, stack
@@ -395,9 +396,12 @@ def test_a_dry_recipe_keeps_its_bits_and_a_wet_one_mirrors_the_wall():
 
 def test_a_coarse_mirror_shows_nearly_what_a_fine_one_does():
     scene, eye = street()
+    wet = rain(0.0, wetness=1.0)
     fine, coarse = (
-        render_view(scene, eye.scaled(4.0), rain(0.0, wetness=1.0, mirror_px=px)).rgb.astype(float)
-        for px in (2, 4)
+        render_view(
+            scene, eye.scaled(4.0), changed(wet, {"render.speed.mirror_px": px})
+        ).rgb.astype(float)
+        for px in (2.0, 4.0)
     )
     assert 0 < np.abs(fine - coarse).mean() < 0.5  # of 255: 0.2, most of it at the wall's edges
 

@@ -133,7 +133,10 @@ def test_a_wrong_field_is_named_with_its_line_and_what_is_allowed(field: str, me
         ("wether: {}", "r.yaml:1: wether: unknown field; did you mean weather?"),
         ("weather: 3", "r.yaml:1: weather = 3: must be a mapping, with smog"),
         ("weather: {smog: {choice: [1]}}", "weather.smog.choice: a range stands for one field"),
-        ("render: {antialiased: yes}", "antialiased = 'yes': must be true or false; write true"),
+        (
+            "render: {speed: {antialiased: yes}}",
+            "antialiased = 'yes': must be true or false; write true",
+        ),
         ("render: {sh_degree: 1.5}", "render.sh_degree = 1.5: must be a whole number >= 0 and <="),
         ("output: {jpeg_quality: {uniform: [1, 9.5]}}", "uniform[1] = 9.5: must be a whole number"),
         ("output: {image: PNG}", "image = 'PNG': must be one of png, jpg; did you mean png?"),

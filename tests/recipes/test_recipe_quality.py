@@ -75,7 +75,7 @@ def test_a_tier_is_numbers_once_resolved(tier: str) -> None:
 
 def test_a_target_is_open_until_it_is_settled() -> None:
     recipe = resolved(f"quality: {{max_flip: 0.03}}\nrender: {{sh_degree: 2}}\n{SNOW_AND_FLOOD}")
-    assert recipe.quality.has_open_choice and recipe.quality.summary == "max_flip 0.03"
+    assert recipe.has_open_choice and recipe.quality.summary == "max_flip 0.03"
     free = {knob.path for knob in knobs.free_knobs(recipe)}
     assert "render.sh_degree" not in free and "render.scale" in free
     assert "weather.smog.model" not in free and not any(p.startswith("output") for p in free)
@@ -86,9 +86,9 @@ def test_a_target_is_open_until_it_is_settled() -> None:
 
 def test_settings_count_as_given() -> None:
     recipe = resolved(f"quality: {{budget_ms: 150}}\n{SNOW_AND_FLOOD}")
-    chosen = {"render.scale": 0.5, "weather.flood.waves.count": 6, "quality.settled": True}
+    chosen = {"render.scale": 0.5, "weather.flood.waves.count": 6, "render.speed.settled": True}
     settled = knobs.with_settings(recipe, chosen)
-    assert not settled.quality.has_open_choice and settled.quality.summary == "budget_ms 150"
+    assert not settled.has_open_choice and settled.quality.summary == "budget_ms 150"
     assert settled.render.scale == 0.5 and settled.weather.flood is not None
     assert settled.weather.flood.waves.count == 6
     assert "render.scale" not in {knob.path for knob in knobs.free_knobs(settled)}
@@ -133,7 +133,7 @@ def test_knobs_of_what_is_not_there_have_no_effect() -> None:
         ("quality: {budget_ms: -1}", "> 0"),
         ("quality: {budget_ms: 100, max_flip: 0.1}", "keep one of them"),
         ("quality: {tier: draft, max_flip: 0.1}", "keep one of them"),
-        ("quality: {settled: true}", "settled belongs to"),
+        ("render: {speed: {settled: true}}", "settled belongs to"),
         ("quality: {tiers: draft}", "tier"),
         ("quality: [draft]", "must be a mapping"),
     ],

@@ -21,10 +21,11 @@ from recipes.lens_drops import LensDrops
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.rain import Rain
 from recipes.ranges import format_value
-from recipes.recipe_file import Leaf, recipe_file, recipe_json_schema, write_schema
+from recipes.recipe_file import Leaf, Section, recipe_file, recipe_json_schema, write_schema
 from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
 from recipes.snowfall import Snowfall
+from recipes.speed import Speed
 from recipes.style import Style, style_preset_names
 
 FIELDS = [
@@ -49,7 +50,6 @@ REFUSED: dict[type, list[dict[str, Any]]] = {
         {"rate_mm_h": 5.0, "wind_mps": 60.1},
         {"rate_mm_h": 5.0, "wind_mps": -1.0},
         {"rate_mm_h": 5.0, "wind_from_deg": 400},
-        {"rate_mm_h": 5.0, "min_width_px": 0},
         {"rate_mm_h": 5.0, "wetness": 1.01},
         {"rate_mm_h": 5.0, "puddles": -0.1},
     ],
@@ -97,7 +97,8 @@ REFUSED: dict[type, list[dict[str, Any]]] = {
         {"image": "a.jpg", "digest": "F" * 64},
         {"image": "a.jpg", "digest": "0" * 63},
     ],
-    Render: [{"sh_degree": 2.0}, {"antialiased": 1}],
+    Render: [{"sh_degree": 2.0}],
+    Speed: [{"antialiased": 1}, {"rain_min_width_px": 0}],
     Output: [{"jpeg_quality": True}, {"image": "gif"}],
     Recipe: [
         *({"seed": -1}, {"seed": 2**63}, {"version": 2}, {"wether": {}}),
@@ -206,7 +207,13 @@ def test_auto_weathers_lidar_where_the_depth_images_show_a_surface_of_the_weathe
 
 # what stands in place of another field, or changes nothing by itself
 ELSEWHERE = {"version", "weather.smog.extinction_per_m", "weather.flood.absorption_per_m"}
-ELSEWHERE |= {"style.image", "style.preset", "style.mask", "style.checkpoint", "quality.settled"}
+ELSEWHERE |= {
+    "style.image",
+    "style.preset",
+    "style.mask",
+    "style.checkpoint",
+    "render.speed.settled",
+}
 CANDIDATES = (0, 1, 2, 0.5, 0.1, True, False, "other", "1" * 64, (0.1, 0.2, 0.3))
 
 
@@ -229,7 +236,8 @@ def test_every_field_changes_the_hash() -> None:
             weather=Weather(smog=smog, flood=cleared, snow=snow, rain=rain, snowfall=snowfall)
         ).hash
     )
-    hashes.add(base.model_copy(update={"quality": Quality(max_flip=0.1, settled=True)}).hash)
+    settled = {"quality": Quality(max_flip=0.1), "render": Render(speed=Speed(settled=True))}
+    hashes.add(base.model_copy(update=settled).hash)
     hashes |= {Recipe(weather=weather, style=style).hash for style in (None, Style(preset="dusk"))}
     changed = [spec for spec in FIELDS if spec.path not in ELSEWHERE]
     for spec in changed:
@@ -449,10 +457,28 @@ def test_both_refuse(data: dict, validator: Any) -> None:
 PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
 
 
+SPEED = """
+## Speed
+
+`render.speed` holds settings of the renderer that trade accuracy for speed, and the mark of a \
+choice that a job has made. `quality` sets most of them, so that few recipes have this section. A \
+field that a recipe gives keeps its value under every `quality`. Up to version 0.6 these were \
+fields of `render`, `weather.flood`, `weather.rain`, `weather.snowfall` and `quality`. A recipe \
+with a former name is refused, and the message has the new name.
+
+"""
+
+
 def field_table() -> str:
-    """A row for every key of a recipe file, sections in their order."""
+    """A row for every key of a recipe file, sections in their order, `render.speed` at the end."""
+    speed = recipe_file().INNER["render"].INNER["speed"]
+    sections = [section for section in recipe_file().walk() if section is not speed]
+    return f"{table_of(sections)}{SPEED}{table_of([speed])}"
+
+
+def table_of(sections: list[type[Section]]) -> str:
     rows = ["| Field | Allowed | Default | Meaning |\n| --- | --- | --- | --- |\n"]
-    for section in recipe_file().walk():
+    for section in sections:
         if section.MAX_ITEMS is not None:
             path = section.PATH.removesuffix("[]")
             allowed = f"a list of up to {section.MAX_ITEMS} mappings, or null"

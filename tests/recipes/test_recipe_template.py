@@ -18,6 +18,7 @@ from recipes.load import dump_recipe, parse_recipe
 from recipes.ranges import Channels, Choice, Draws, Fixed, Normal, TripleLine, Uniform, Value
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
+from recipes.speed import Speed
 from recipes.template import RecipeTemplate
 
 TEXT = """
@@ -148,7 +149,7 @@ def test_a_dump_says_everything() -> None:
     assert text.startswith(
         f"# A recipe in numbers, hash {template().resolve(2).hash}.\nversion: 1\n"
     )
-    for line in ("name: foggy", "seed: 7", "variant: 2", "  alpha_max: 0.999", "  image: png"):
+    for line in ("name: foggy", "seed: 7", "variant: 2", "    alpha_max: 0.999", "  image: png"):
         assert f"\n{line}\n" in text
     assert "color: [0.7," in text
 
@@ -247,7 +248,7 @@ recipes = st.builds(
         Render,
         scale=st.floats(0, 4, exclude_min=True, **finite),
         sh_degree=st.none() | st.integers(0, 3),
-        antialiased=st.booleans(),
+        speed=st.builds(Speed, antialiased=st.booleans(), layers_px=st.floats(1, 8, **finite)),
     ),
     output=st.builds(
         Output, image=st.sampled_from(["png", "jpg"]), jpeg_quality=st.integers(1, 100)

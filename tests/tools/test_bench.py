@@ -244,7 +244,7 @@ def test_depth_figures_of_a_known_case():
 
 # ---- The rule, in tables made up -----------------------------------------------------------------
 
-STOP, CLIP = "render.transmittance_stop", "render.radius_clip_px"
+STOP, CLIP = "render.speed.transmittance_stop", "render.speed.radius_clip_px"
 
 
 def row(knob, value, over_reference, worst_flip, settings=None):

@@ -93,7 +93,8 @@ def test_every_field_of_every_effect_has_a_control_whose_ends_its_model_takes(du
         fields = {p for p in leaves if p.startswith(f"{group.path}.") and "[]" not in p}
         others = tuple(f"{path}." for path in SECTIONS if path != group.path)
         fields = {path for path in fields if not path.startswith(others)}
-        assert fields - there <= {f"{group.path}.digest", f"{group.path}.probability"}
+        hidden = {f"{group.path}.digest", f"{group.path}.probability", "render.speed.settled"}
+        assert fields - there <= hidden
         for control in group.walk():
             assert control.hint
             if control.kind != "slider":

@@ -77,8 +77,8 @@ def analytic_error(scene: Scene, camera: Camera) -> dict[str, Any]:
 
     The water is still and opaque.
     """
-    fields = flood_fields("mirrored", layers_px=1, **OPAQUE)
-    recipe = recipe_of({"flood": fields})
+    fields = flood_fields("mirrored", **OPAQUE)
+    recipe = recipe_of({"flood": fields, "render": {"speed": {"layers_px": 1}}})
     picture = draw_picture(scene, camera, recipe)
     truth = mirrored_picture(scene, camera, recipe).clamp(0, 1).numpy()
     return {

@@ -72,10 +72,8 @@ USEFUL_ENDS = {
     "weather.snow.cell_m": (0.01, 1.0),
     "weather.rain.rate_mm_h": (0.1, 200.0),  # drizzle; a cloudburst
     "weather.rain.wind_mps": (0.1, 40.0),  # a hurricane begins at 33
-    "weather.rain.min_width_px": (0.1, 4.0),
     "weather.snowfall.rate_mm_h": (0.05, 20.0),
     "weather.snowfall.wind_mps": (0.01, 40.0),
-    "weather.snowfall.min_width_px": (0.1, 4.0),
     "camera.lens_drops.radius_mm": (0.1, 5.0),
     "camera.lens_drops.glass_m": (0.01, 1.0),
     "camera.lens_drops.focal_mm": (1.0, 100.0),
@@ -86,8 +84,10 @@ USEFUL_ENDS = {
     "camera.exposure_ms": (0.1, 50.0),
     "render.scale": (0.1, 2.0),
     "render.near_m": (0.01, 10.0),
-    "render.radius_clip_px": (0.1, 10.0),
-    "render.lod_px": (0.1, 10.0),
+    "render.speed.radius_clip_px": (0.1, 10.0),
+    "render.speed.lod_px": (0.1, 10.0),
+    "render.speed.rain_min_width_px": (0.1, 4.0),
+    "render.speed.snowfall_min_width_px": (0.1, 4.0),
 }
 # A full turn, degrees: directions run from 0, though models allow -360 to 360 of them.
 FULL_TURN = 360.0
@@ -344,9 +344,10 @@ def split_by_rank(groups: Sequence[Group]) -> tuple[tuple[Group, ...], tuple[Gro
 
 def _group(section: type[Section], *, optional: bool) -> Group:
     fields = section.MODEL.model_fields
-    # The digest of a section's files is computed, not set.
+    # The digest of a section's files is computed, and jobs set the mark of a settled choice.
     has_files = issubclass(section.MODEL, EffectModel) and section.MODEL.file_fields
-    names = fields.keys() - ({"digest"} if has_files else set[str]())
+    hidden_names = {"digest"} if has_files else {"settled"}
+    names = fields.keys() - hidden_names
     leaves = [leaf for name, leaf in section.LEAVES.items() if name in names]
     lists = [inner for inner in section.INNER.values() if inner.MAX_ITEMS is not None]
     sections = (inner for inner in section.INNER.values() if inner.MAX_ITEMS is None)

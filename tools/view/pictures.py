@@ -40,7 +40,7 @@ DEPTH = "depth"  # The word for its depth in colours.
 CLASSES = "classes"  # The word for its semantic classes in colours.
 INSTANCES = "instances"  # The word for its instances in colours.
 SPLATS = "splat ids"  # The word for the splats that its pixels show, in colours.
-# The least values of the rasteriser's fields while something moves.
+# The least values of fields of `render.speed` while something moves.
 MOVING = {"transmittance_stop": 0.01, "radius_clip_px": 1.0}
 
 
@@ -193,8 +193,8 @@ def coarse_recipe(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
         changes = {"depth": "none", "semantic": False, "instance": False, "labels": False}
         recipe = recipe.model_copy(update={"output": recipe.output.model_copy(update=changes)})
     for name, value in MOVING.items():
-        value = max(value, getattr(recipe.render, name))
-        recipe = with_unchecked_field(recipe, f"render.{name}", value)
+        value = max(value, getattr(recipe.render.speed, name))
+        recipe = with_unchecked_field(recipe, f"render.speed.{name}", value)
     return recipe
 
 

@@ -67,14 +67,16 @@ class FallingEffect(Effect):
             if section is not None:
                 why = f"{self.section}.rate_mm_h is 0"
             return EffectPlan(None, skipped_steps((self.step,), why, PICTURE))
+        speed = recipe.render.speed
+        is_rain = isinstance(section, Rain)
         precipitation = Precipitation(
             self.kind,
             section.rate_mm_h,
             wind_velocity_mps(section.wind_mps, section.wind_from_deg),
-            section.turbulence_mps if isinstance(section, Snowfall) else 0.0,
+            0.0 if is_rain else section.turbulence_mps,
             recipe.seed,
             recipe.camera.exposure_ms / 1000,
-            section.min_width_px,
+            speed.rain_min_width_px if is_rain else speed.snowfall_min_width_px,
             section.color,
         )
         return _plan_of(precipitation, self.step, scene)

@@ -97,9 +97,7 @@ class FloodEffect(Effect):
             return EffectPlan(
                 None, tuple(Step(name, False, "the recipe has no flood") for name in PASSES)
             )
-        rain = recipe.weather.rain
-        rain_mm_h = rain.rate_mm_h if rain is not None else 0.0
-        medium, reason = flood_of_recipe(flood, recipe.seed, scene, rain_mm_h)
+        medium, reason = flood_of_recipe(flood, recipe, scene)
         level_z_m = medium.level_z_m
         if lowest_z_m(scene) >= level_z_m:
             why = f"no splat reaches below the level, z = {level_z_m:.2f} m"
@@ -161,20 +159,20 @@ def _is_under(medium: FloodMedium, camera: Camera) -> bool:
     return float(camera.centre[2]) <= medium.level_z_m
 
 
-def flood_of_recipe(
-    flood: Flood, seed: int, scene: Scene, rain_mm_h: float = 0.0
-) -> tuple[FloodMedium, str]:
+def flood_of_recipe(flood: Flood, recipe: Recipe, scene: Scene) -> tuple[FloodMedium, str]:
     """Return the flood at its height in the scene, and the text that explains it.
 
     Args:
         flood: the recipe's section.
-        seed: the recipe's seed.
+        recipe: the recipe. Drops of its rain draw rings on the water.
         scene: the scene; its road gives the height.
-        rain_mm_h: rate of the rain whose drops draw rings on the water.
 
     Raises:
         SceneError: the scene's scale, gravity or road is not known.
     """
+    rain = recipe.weather.rain
+    rain_mm_h = rain.rate_mm_h if rain is not None else 0.0
+    speed = recipe.render.speed
     ground = ground_of(scene)
     bases = {"lowest": ground.lowest_z_m, "median": ground.median_z_m, "absolute": 0.0}
     level_z_m = bases[flood.reference] + flood.level_m
@@ -183,14 +181,14 @@ def flood_of_recipe(
         level_z_m=level_z_m,
         extinction_per_m=flood.extinction_per_m_rgb,
         rgb=flood.color,
-        waves=make_waves(flood.waves, seed=seed, depth_m=depth_m),
+        waves=make_waves(flood.waves, seed=recipe.seed, depth_m=depth_m),
         refraction_index=flood.refraction_index,
         fresnel=flood.fresnel,
         reflection=flood.reflection,
-        bed_cut=flood.bed_cut,
-        layers_px=flood.layers_px,
+        bed_cut=speed.bed_cut,
+        layers_px=speed.layers_px,
         rain_mm_h=rain_mm_h,
-        seed=seed,
+        seed=recipe.seed,
     )
     reason = (
         f"surface at z = {level_z_m:.2f} m, {level_z_m - ground.lowest_z_m:.2f} m above the lowest "

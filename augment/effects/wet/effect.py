@@ -117,7 +117,8 @@ class WetEffect(Effect):
             )
         check_metric_and_level(scene)
         wet_description = f"wetness {rain.ground_wetness:.2g} of what is open to the sky"
-        mirror_description = f"at 1 / {rain.mirror_px:g} of the resolution, without the ground"
+        mirror_px = recipe.render.speed.mirror_px
+        mirror_description = f"at 1 / {mirror_px:g} of the resolution, without the ground"
         steps = (
             Step(DARKENING_PASS, True, wet_description, SCENE),
             Step(MIRROR_PASS, True, mirror_description, PICTURE),
@@ -128,7 +129,7 @@ class WetEffect(Effect):
                 PICTURE,
             ),
         )
-        numbers = rain.ground_wetness, rain.puddle_share, rain.rate_mm_h, rain.mirror_px
+        numbers = rain.ground_wetness, rain.puddle_share, rain.rate_mm_h, mirror_px
         data = WetGroundPlan(recipe.seed, *numbers)
         return EffectPlan(data, steps, frozenset({EXPECTED_DEPTH}))
 
