@@ -403,7 +403,7 @@ FALLING_FRAMES = {
     "rain 10 mm/h": Frames({"rain": {"rate_mm_h": 10}}),
     "snowfall 1 mm/h": Frames({"snowfall": {"rate_mm_h": 1}}),
 }
-# The values of min_width_px, the width from which a drop is drawn by itself, pixels.
+# The widths from which a drop or flake is drawn by itself, pixels.
 WIDTHS_PX = (0.25, 0.35, 0.5, 1.0, 2.0)
 
 
@@ -414,10 +414,11 @@ def falling_errors(case: EffectCase, repeats: int) -> Iterator[Table]:
     rows = []
     for name in ("rain 10 mm/h, dry", "snowfall 1 mm/h"):
         ((kind, fields),) = FALLING_FRAMES[name].effects.items()
-        pictures = [
-            frame_of(scene, camera, recipe_of({kind: {**fields, "min_width_px": width}}))().rgb
-            for width in WIDTHS_PX
-        ]
+        pictures = []
+        for width in WIDTHS_PX:
+            speed = {f"{kind}_min_width_px": width}
+            recipe = recipe_of({kind: fields, "render": {"speed": speed}})
+            pictures.append(frame_of(scene, camera, recipe)().rgb)
         for width, picture in zip(WIDTHS_PX, pictures, strict=True):
             change = 255 * (picture - pictures[0]).abs()
             rows.append([name, width, float(change.mean()), float(change.max())])
