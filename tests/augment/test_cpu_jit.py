@@ -167,7 +167,7 @@ def test_the_list_of_signatures_names_kernels_and_types():
 
 COMPILED_BY_PRESETS = """
 from numba.core import event
-from tools.render import open_scene
+from adapters.base import open_scene
 from tools.warm_up import warm_up
 from recipes.load import load_recipe, preset_names
 log = event.RecordingListener()

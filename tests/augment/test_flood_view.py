@@ -44,6 +44,7 @@ from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.speed import Speed
 from tests.augment.pretend_gpu import pretended_gpu
 from tests.scenes import camera_ahead, random_gaussians, sh_of
+from tools.bench import flood_truth
 from tools.bench.flood_truth import analytic_error, tier_error, water_masks
 
 ROAD_Z = -1.5

@@ -125,7 +125,6 @@ class Fakes:
     before_step: Callable[[int], None] = lambda step: None
     opened: list[str] = field(default_factory=list)
     trainers: list[FakeTrainer] = field(default_factory=list)
-    reported: list[Sequence[ViewKey]] = field(default_factory=list)
 
     def install(self, patch: pytest.MonkeyPatch) -> None:
         stand_ins = {
@@ -167,7 +166,6 @@ class Fakes:
         test: Any,
     ) -> dict[str, Any]:
         report = {"history": [dict(row) for row in history], **facts}
-        self.reported.append(test)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "report.json").write_text(json.dumps(report))
         (folder / "report.md").write_text("# Report\n\n| views | PSNR |\n|---|---|\n| 6 | 20.0 |\n")

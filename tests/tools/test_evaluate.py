@@ -238,16 +238,15 @@ def test_frames_that_are_not_consecutive_have_no_pairs(tmp_path):
 
 
 def test_errors_say_what_to_do(walls, tmp_path):
-    with pytest.raises(OutputError, match="nothing in it is finished yet"):
-        measure(tmp_path)
-    with pytest.raises(OutputError, match=r"no recipe \['snow'\]; finished are: clear, flood"):
-        measure(walls, recipes="snow")
     write_walls(tmp_path / "flat", frames=(0, 1), depth=False)
-    with pytest.raises(OutputError, match=r"has no depth images.*depth: median"):
-        measure(tmp_path / "flat")
-    one = tmp_path / "one"
     row = make_row("wall", "clear", 0, 0, "ahead", width=64, height=48)
-    write_image(one, row)
-    write_manifest(one, rows_to_table([row]))
-    with pytest.raises(OutputError, match="no two images to compare"):
-        measure(one)
+    write_image(tmp_path / "one", row)
+    write_manifest(tmp_path / "one", rows_to_table([row]))
+    for out, options, message in (
+        (tmp_path, {}, "nothing in it is finished yet"),
+        (walls, {"recipes": "snow"}, r"no recipe \['snow'\]; finished are: clear, flood"),
+        (tmp_path / "flat", {}, r"has no depth images.*depth: median"),
+        (tmp_path / "one", {}, "no two images to compare"),
+    ):
+        with pytest.raises(OutputError, match=message):
+            measure(out, **options)

@@ -17,7 +17,6 @@ from augment.effects.lidar import drop_lost_returns
 from augment.errors import AdapterError, ClimateGSError, OutputError
 from augment.jobs.mirror_sweeps import find_span_frames
 from augment.jobs.render_job import RenderJob, run_job
-from augment.output.manifest import read_manifest
 from augment.output.tables import read_lidar
 from augment.scene.labels import LidarSweep
 from augment.scene.scene import Scene
@@ -211,6 +210,11 @@ def test_weathered_sweeps_stand_in_the_copy(root, tmp_path, bin_sweeps):
         "0 of 3 LiDAR sweeps are weathered; 3 stay clear, as recorded"
     )
     assert not changed(root, copy) & LIDAR_FILES and contents(root) == before
+    # A dataset without files for them.
+    bare = dataclasses.replace(scene_of(root), labels=FakeLabels())
+    render(bare, tmp_path / "bare", make_recipe("wet", **WET), frames=[1, 2])
+    said = mirror_outputs(bare, tmp_path / "bare", progress=False)
+    assert "2 weathered LiDAR sweeps, the first of frame 1, have no file of their own" in said[-1]
 
 
 class Relabelled(Sweeps):
@@ -293,36 +297,28 @@ def test_sweeps_between_images_have_the_weather_too(root, tmp_path, bin_sweeps):
     assert (copy / "lidar/01.bin").read_bytes() == before["lidar/01.bin"]
 
 
-@pytest.mark.parametrize(
-    ("rendered", "span"),
-    [
+def test_the_span_has_the_frames_between_rendered_ones():
+    scene = open_fake("fake:street")
+    pictured, empty = scene.frames[0], dataclasses.replace(scene.frames[0], cameras={})
+    frames = [dataclasses.replace(pictured if n % 2 else empty, index=n) for n in range(7)]
+    for rendered, span in (
         ((1, 3, 5), (0, 1, 2, 3, 4, 5, 6)),
         ((1, 3), (0, 1, 2, 3)),
         ((3,), (3,)),
         ((1, 5), (0, 1, 5, 6)),
         ((), ()),
-    ],
-)
-def test_the_span_has_the_frames_between_rendered_ones(rendered, span):
-    scene = open_fake("fake:street")
-    pictured, empty = scene.frames[0], dataclasses.replace(scene.frames[0], cameras={})
-    frames = [dataclasses.replace(pictured if n % 2 else empty, index=n) for n in range(7)]
-    assert tuple(find_span_frames(frames, rendered, pictured.cameras)) == span
+    ):
+        assert tuple(find_span_frames(frames, rendered, pictured.cameras)) == span
 
 
 def test_what_will_stay_clear_is_said_before(root, bin_sweeps):
     scene = with_gap(with_sweeps(root, "one", (0, 1, 2)), 1)
-    assert clear_notes(scene, of_sweeps=True) == [
-        "4 of 8 camera images will stay clear in the dataset's copy: 4 that no frame of scene "
-        "'one' has (taken outside its frames, or of other scenes)"
-    ]
-    assert clear_notes(scene, {0, 1}, ["front"], of_sweeps=True) == [
-        "7 of 8 camera images will stay clear in the dataset's copy: 3 of frames or cameras that "
-        "are not rendered, 4 that no frame of scene 'one' has (taken outside its frames, or of "
-        "other scenes)",
-        "2 of 3 LiDAR sweeps will stay clear in the dataset's copy: 2 of frames or cameras that "
-        "are not rendered",
-    ]
+    (note,) = clear_notes(scene, of_sweeps=True)
+    assert note.startswith("4 of 8 camera images") and "4 that no frame of scene 'one'" in note
+    images, sweeps = clear_notes(scene, {0, 1}, ["front"], of_sweeps=True)
+    assert images.startswith("7 of 8 camera images") and "4 that no frame of scene 'one'" in images
+    assert "3 of frames or cameras that are not rendered" in images
+    assert sweeps.startswith("2 of 3 LiDAR") and "2 of frames or cameras that are not" in sweeps
     unlike = dataclasses.replace(scene, labels=FakeLabels())
     assert clear_notes(unlike, of_sweeps=True)[1].startswith("no LiDAR sweep has a file of its own")
     whole = with_sweeps(root, frames=(0, 1, 2, 3))
@@ -347,26 +343,6 @@ def test_a_deleted_variant_does_not_stop_the_others(root, tmp_path):
         mirror_outputs(scene, out, progress=False)
 
 
-def test_images_of_a_deleted_scene_give_way_to_recorded_ones(root, tmp_path):
-    one, two = scene_of(root, "one", (0,)), scene_of(root, "two", (1,))
-    out = tmp_path / "out"
-    for scene in (one, two):
-        render(scene, out)
-        mirror_outputs(scene, out, progress=False)
-    shutil.rmtree(out / "one")
-    said = mirror_outputs(two, out, progress=False)
-    assert "2 images of other scenes, such as camera/front/00.jpg, are no longer in" in said[-1]
-    place = "source/fog-000/002/camera/front/00.jpg"
-    assert (out / place).samefile(root / "camera/front/00.jpg")
-
-
-def test_sweeps_that_the_dataset_has_no_files_for_are_told(root, tmp_path):
-    scene = dataclasses.replace(scene_of(root), labels=FakeLabels())
-    render(scene, tmp_path / "out", make_recipe("wet", **WET), frames=[1, 2])
-    said = mirror_outputs(scene, tmp_path / "out", progress=False)
-    assert "2 weathered LiDAR sweeps, the first of frame 1, have no file of their own" in said[-1]
-
-
 def test_scenes_of_one_dataset_share_a_copy(root, tmp_path):
     """As the scenes of nuScenes, whose loader takes the dataset as a whole."""
     one, two = scene_of(root, "one", (0, 1)), scene_of(root, "two", (2,))
@@ -384,6 +360,11 @@ def test_scenes_of_one_dataset_share_a_copy(root, tmp_path):
     # Neither scene's next run gives up the other's.
     assert "(up to date)" in mirror_outputs(one, out, progress=False)[0]
     assert changed(root, copy) == whole
+    # Images of a deleted scene give way to recorded ones.
+    shutil.rmtree(out / "one")
+    said = mirror_outputs(two, out, progress=False)
+    assert "4 images of other scenes, such as camera/front/00.jpg, are no longer in" in said[-1]
+    assert (copy / "camera/front/00.jpg").samefile(root / "camera/front/00.jpg")
 
 
 def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
@@ -417,28 +398,29 @@ def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
 def test_wrong_scenes_and_folders_are_refused(root, tmp_path):
     scene, out = scene_of(root), tmp_path / "out"
     render(scene, out, frames=[0])
-    with pytest.raises(OutputError, match="has no images of scene 'other'"):
-        mirror_outputs(scene_of(root, "other"), out, progress=False)
-    with pytest.raises(OutputError, match="has no images of scene 'street' and snow-000"):
-        mirror_outputs(scene, out, variants=["fog-000", "snow-000"], progress=False)
+    other = scene_of(root, "other")
     elsewhere = dataclasses.replace(scene, source=f"{scene.source}&frames=0:2")
-    with pytest.raises(OutputError, match=r"was rendered from .*, not from .*frames=0:2"):
-        mirror_outputs(elsewhere, out, progress=False)
-    with pytest.raises(OutputError, match="lies in the dataset's own folder"):
-        recipes_for_source(scene, root / "out", [recipe_of()])
-    with pytest.raises(OutputError, match="is no finished output folder"):
-        mirror_outputs(scene, tmp_path / "nothing", progress=False)
+    named = scene_of(root, "source")
+    render(named, tmp_path / "named", frames=[0])
+    render(scene, tmp_path / "path", camera_path=scene.frames[:1])
+    for wrong_scene, folder, variants, message in (
+        (other, out, None, "has no images of scene 'other'"),
+        (scene, out, ["fog-000", "snow-000"], "has no images of scene 'street' and snow-000"),
+        (elsewhere, out, None, r"was rendered from .*, not from .*frames=0:2"),
+        (scene, tmp_path / "nothing", None, "is no finished output folder"),
+        (named, tmp_path / "named", None, "has images of a scene called 'source'"),
+        (scene, tmp_path / "path", None, "shows a camera path"),
+    ):
+        with pytest.raises(OutputError, match=message):
+            mirror_outputs(wrong_scene, folder, variants=variants, progress=False)
     mirror_outputs(scene, out, progress=False)
     namesake = scene_of(write_sequence(tmp_path / "more" / "002"), "other")
-    with pytest.raises(OutputError, match=r"is the copy of .*/002, not of .*/more/002: choose"):
-        recipes_for_source(namesake, out, [recipe_of()])
-    render(scene_of(root, "source"), tmp_path / "named", frames=[0])
-    with pytest.raises(OutputError, match="has images of a scene called 'source'"):
-        mirror_outputs(scene_of(root, "source"), tmp_path / "named", progress=False)
-    render(scene, tmp_path / "path", camera_path=scene.frames[:1])
-    assert read_manifest(tmp_path / "path")["trajectory"][0].as_py() != "recorded"
-    with pytest.raises(OutputError, match="shows a camera path"):
-        mirror_outputs(scene, tmp_path / "path", progress=False)
+    for wrong_scene, folder, message in (
+        (scene, root / "out", "lies in the dataset's own folder"),
+        (namesake, out, r"is the copy of .*/002, not of .*/more/002: choose"),
+    ):
+        with pytest.raises(OutputError, match=message):
+            recipes_for_source(wrong_scene, folder, [recipe_of()])
 
 
 def test_a_dataset_that_has_moved_is_taken(root, tmp_path):
