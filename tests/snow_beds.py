@@ -17,7 +17,7 @@ from augment.scene.geometry import rigid
 from augment.scene.scene import Actor, Gaussians, Scene
 from augment.scene.semantics import SemanticClass
 from augment.scene.sky import ConstantSky
-from tests.scenes import sh_of
+from tests.snow_scenes import splats
 
 LEFT, RIGHT, BACK, FRONT = range(4)
 
@@ -104,27 +104,15 @@ def grid_surface(
     x = corner_m[0] + (np.arange(nx) + 0.5) * cell_m
     y = corner_m[1] + (np.arange(ny) + 0.5) * cell_m
     centers = np.stack([*np.broadcast_arrays(x[:, None], y[None, :]), z_m], -1)
-    centers = centers[np.isfinite(z_m)]
-    count = len(centers)
-    return Gaussians(
-        means=_tensor(centers),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        scales=torch.tensor([0.75 * cell_m, 0.75 * cell_m, 0.002]).repeat(count, 1),
-        opacities=torch.ones(count),
-        sh=sh_of(np.tile(rgb, (count, 1))),
-        semantic=torch.full((count,), int(SemanticClass.ROAD), dtype=torch.int16),
+    scales = (0.75 * cell_m, 0.75 * cell_m, 0.002)
+    return splats(
+        centers[np.isfinite(z_m)], scales, rgb=rgb, semantic=SemanticClass.ROAD, opacity=1.0
     )
 
 
 def scene_of(background: Gaussians, actors: tuple[Actor, ...] = ()) -> Scene:
-    return Scene(
-        name="snow bed",
-        source="made by hand",
-        background=background,
-        actors=actors,
-        sky=ConstantSky(torch.tensor([0.62, 0.7, 0.8])),
-        frames=(),
-    )
+    sky = ConstantSky(torch.tensor([0.62, 0.7, 0.8]))
+    return Scene("snow bed", "made by hand", background, actors, sky, ())
 
 
 def looking(
@@ -139,14 +127,6 @@ def looking(
     right = torch.linalg.cross(forward, up)
     right = right / right.norm()
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    return Camera(
-        name="looking",
-        width=width,
-        height=height,
-        fx=focal,
-        fy=focal,
-        cx=width / 2,
-        cy=height / 2,
-        camera_from_world=rigid(rotation, -rotation @ eye),
-        timestamp_ns=timestamp_ns,
-    )
+    lens = (focal, focal, width / 2, height / 2)
+    pose = rigid(rotation, -rotation @ eye)
+    return Camera("looking", width, height, *lens, pose, timestamp_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -31,26 +32,23 @@ def sheet(
     spots = _spots(x, y)
     angle = math.radians(slope_deg)
     z = z_m + math.tan(angle) * (spots[:, :1] - x[0])
-    count = len(spots)
     turn = [math.cos(angle / 2), 0.0, -math.sin(angle / 2), 0.0]
     scales = [0.7 * STEP_M / math.cos(angle), 0.7 * STEP_M, 0.004]
-    return _flat(np.hstack([spots, z]), scales, turn, rgb, semantic, opacity, count)
+    return splats(np.hstack([spots, z]), scales, turn, rgb, semantic, opacity)
 
 
 def wall(x_m: float, y: tuple[float, float], z: tuple[float, float], *, rgb=(0.7, 0.6, 0.5)):
     """An opaque wall across the x axis."""
     spots = _spots(y, z)
     means = np.hstack([np.full((len(spots), 1), x_m), spots])
-    scales = [0.004, 0.7 * STEP_M, 0.7 * STEP_M]
-    return _flat(means, scales, [1.0, 0.0, 0.0, 0.0], rgb, None, 0.99, len(spots))
+    return splats(means, [0.004, 0.7 * STEP_M, 0.7 * STEP_M], rgb=rgb)
 
 
 def side_wall(y_m: float, x: tuple[float, float], z: tuple[float, float], *, rgb=(0.7, 0.6, 0.5)):
     """An opaque wall along the x axis."""
     spots = _spots(x, z)
     means = np.stack([spots[:, 0], np.full(len(spots), y_m), spots[:, 1]], 1)
-    scales = [0.7 * STEP_M, 0.004, 0.7 * STEP_M]
-    return _flat(means, scales, [1.0, 0.0, 0.0, 0.0], rgb, None, 0.99, len(spots))
+    return splats(means, [0.7 * STEP_M, 0.004, 0.7 * STEP_M], rgb=rgb)
 
 
 def drive(
@@ -88,9 +86,7 @@ def stack_all(parts: Sequence[Gaussians]) -> Gaussians:
     if any(part.semantic is None for part in parts):
         return joined
     classes = torch.cat([part.semantic for part in parts])
-    return Gaussians(
-        joined.means, joined.quats, joined.scales, joined.opacities, joined.sh, classes
-    )
+    return dataclasses.replace(joined, semantic=classes)
 
 
 def box_car(
@@ -118,14 +114,7 @@ def box_car(
         classes = torch.full((len(gaussians),), semantic, dtype=torch.int16)
         if with_shadow:
             classes[-len(shadow) :] = 1
-        gaussians = Gaussians(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            gaussians.opacities,
-            gaussians.sh,
-            classes,
-        )
+        gaussians = dataclasses.replace(gaussians, semantic=classes)
     times = torch.tensor([0, 100_000_000])
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[:, 0, 3] = torch.tensor([start[0], start[0] + moved_m])
@@ -143,12 +132,20 @@ def _spots(a: tuple[float, float], b: tuple[float, float]) -> np.ndarray:
     return np.stack([g.ravel() for g in grid], 1)
 
 
-def _flat(means, scales, turn, rgb, semantic, opacity, count) -> Gaussians:
+def splats(
+    means, scales, turn=(1.0, 0.0, 0.0, 0.0), rgb=(0.5, 0.5, 0.5), semantic=None, opacity=0.99
+) -> Gaussians:
+    """Gaussians at means [N, 3]; scales and turn: of each, or [N, 3] and [N, 4]; rgb: the same."""
+    count = len(means)
+    turns, sizes, colors = (
+        torch.as_tensor(values, dtype=torch.float64).expand(count, width).clone()
+        for values, width in ((turn, 4), (scales, 3), (rgb, 3))
+    )
     return Gaussians(
-        means=torch.from_numpy(np.asarray(means)).float(),
-        quats=torch.tensor([turn]).repeat(count, 1),
-        scales=torch.tensor([scales]).repeat(count, 1),
+        means=torch.as_tensor(means).float(),
+        quats=turns.float(),
+        scales=sizes.float(),
         opacities=torch.full((count,), opacity),
-        sh=sh_of(np.tile(np.asarray(rgb, np.float64), (count, 1))),
-        semantic=None if semantic is None else torch.full((count,), semantic, dtype=torch.int16),
+        sh=sh_of(colors.numpy()),
+        semantic=None if semantic is None else torch.full((count,), int(semantic)).short(),
     )

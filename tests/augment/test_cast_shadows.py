@@ -15,7 +15,7 @@ from adapters.street.world import build_street
 from augment.effects.snow.light import describe_light, find_snow_light
 from augment.light.cast_shadows import CastShadows, faded_shadows, shadows_of, sun_transmittance
 from augment.light.scene_light import find_scene_light
-from augment.light.srgb import linear_from_display
+from augment.light.srgb import display_from_linear, linear_from_display, luminance
 from augment.render.fog import Fog
 from augment.render.sh import SH_C0
 from augment.scene.scene import PosedGaussians, Scene
@@ -32,15 +32,11 @@ WALL_M, HIGH_M = 6.0, 3.0
 SUN_DEG = (90.0, 36.0)  # azimuth, elevation: behind the wall
 
 
-def display(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
 def street(lit: np.ndarray, *, albedo: np.ndarray | float = 0.1) -> Scene:
     """A road between walls of HIGH_M. lit: of its splats [N], 0 to 1. albedo: of these."""
     road = sheet((-15, 15), (-WALL_M, WALL_M), semantic=ROAD)
     light = RATIO + (1 - RATIO) * lit[:, None]
-    rgb = display(2.0 * np.broadcast_to(np.asarray(albedo), lit.shape)[:, None] * light)
+    rgb = display_from_linear(2.0 * np.broadcast_to(np.asarray(albedo), lit.shape)[:, None] * light)
     sh = torch.from_numpy(((rgb - 0.5) / SH_C0).astype(np.float32))[:, None]
     road = dataclasses.replace(road, sh=sh)
     ends = ((-15, 15), (0.1, HIGH_M))
@@ -92,13 +88,11 @@ def test_dark_asphalt_is_no_shadow_and_a_grey_day_has_none():
 
 def test_snow_has_the_contrast_of_the_ground():
     """Shaded over level lit snow, unless snow's own light fills the shadow or the recipe says."""
-    light = np.array([0.2126, 0.7152, 0.0722])
 
     def contrast(scene: Scene, snow: Snow) -> float:
         own = find_snow_light(scene, snow)
         lit, shadow = (
-            float(np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4) @ light)
-            for c in (np.array(own.lit_rgb), np.array(own.shadow_rgb))
+            luminance(linear_from_display(np.array(c))) for c in (own.lit_rgb, own.shadow_rgb)
         )
         return shadow / (shadow + (lit - shadow) * (own.sun[2] + own.wrap) / (1 + own.wrap))
 

@@ -12,7 +12,6 @@ import torch
 from pydantic import ValidationError
 
 from augment import effects
-from augment.dataset import WeatherDataset
 from augment.effects.effect import LabelInputs
 from augment.effects.falling.lidar import (
     DROP_REFLECTANCE,
@@ -31,9 +30,8 @@ from augment.effects.smog import fog_echoes
 from augment.effects.wet.film_kernels import EXPOSURE, NUM_CHANNELS, PUDDLE_ORDER
 from augment.effects.wet.ground_map import GROUND_CELL_M, WetGround
 from augment.effects.wet.lidar import dim_wet_echoes, wet_echo_ratio
-from augment.jobs.render_job import RenderJob, run_job
 from augment.output.box_weather import box_tables, combine_visibility
-from augment.output.manifest import effect_masks, read_manifest
+from augment.output.manifest import effect_masks
 from augment.output.tables import lidar_bytes
 from augment.render.fog import Fog
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes
@@ -51,7 +49,6 @@ from tests.lidar_sweeps import (
     sweep_of,
 )
 from tests.scenes import camera_ahead
-from tests.streets import LABELLED_STREET, open_street
 
 MODEL = LidarModel()
 
@@ -369,22 +366,6 @@ def test_boxes_say_what_rain_leaves_of_them() -> None:
     dry = make_plan(wet(0.0), scene).effect_plans["rain"]
     clear = effect.measure_boxes(placed, camera, LabelInputs(dry, None, None, None))
     np.testing.assert_array_equal(clear["rain_transmittance"], [1, 1, np.nan])
-
-
-@pytest.mark.long
-def test_files_of_a_job_have_rains_numbers(tmp_path) -> None:
-    rainy = wet(50.0).model_copy(update={"name": "rainy"})
-    job = RenderJob(LABELLED_STREET, [rainy], tmp_path, range(1), ["front"])
-    done = run_job(job, scene_loader=open_street, progress=False)
-    assert done.failed == 0
-    row = read_manifest(tmp_path).to_pylist()[0]
-    assert (row["rain_rate_mm_h"], row["lidar"]) == (50.0, "weather")
-    sample = WeatherDataset(tmp_path, load=("image", "rain", "boxes", "lidar"))[0]
-    assert sample["rain"].any() and not sample["rain"].all()
-    through = sample["boxes"]["rain_transmittance"].numpy()
-    assert ((through > 0.5) & (through < 1)).any()
-    assert (sample["boxes"]["visibility"].numpy() <= through).all()
-    assert set(np.unique(sample["lidar"]["weather_code"])) <= {ATTENUATED, LOST, PRECIPITATION}
 
 
 REFUSED = (

@@ -13,7 +13,6 @@ import sys
 import numpy as np
 import pytest
 import torch
-from scenes import camera_ahead, one_gaussian
 
 from augment.errors import BackendUnavailable, SceneError
 from augment.scene.cameras import Frame
@@ -22,6 +21,8 @@ from augment.scene.labels import Boxes, LidarSweep
 from augment.scene.scene import Gaussians, Ground, Scene
 from augment.scene.semantics import SemanticClass as Class
 from augment.scene.sky import ConstantSky
+from tests.scenes import camera_ahead, one_gaussian
+from tests.snow_scenes import splats, stack_all
 
 LENGTH_M, CAMERA_M, NOISE_M = 45.0, 1.6, 0.02
 FRAMES = 10
@@ -48,14 +49,9 @@ def road(slope: float = 0.0, *, count: int = 40_000, seed: int = 0) -> np.ndarra
 def clutter(*, seed: int = 1) -> np.ndarray:
     """Walls on both sides, a car's body beside the path, and strays far below the ground."""
     rng = np.random.default_rng(seed)
-    wall = np.stack(
-        [
-            rng.uniform(-10, 55, 8000),
-            rng.choice([-4.2, 4.2], 8000) + rng.normal(0, 0.02, 8000),
-            rng.uniform(0, 6, 8000),
-        ],
-        axis=1,
-    )
+    x = rng.uniform(-10, 55, 8000)
+    y = rng.choice([-4.2, 4.2], 8000) + rng.normal(0, 0.02, 8000)
+    wall = np.stack([x, y, rng.uniform(0, 6, 8000)], axis=1)
     car = rng.uniform([8, -3, 0.3], [12, -1.5, 1.5], (3000, 3))
     strays = rng.uniform([-5, -4, -5], [50, 4, -1], (60, 3))
     return np.concatenate([wall, car, strays])
@@ -93,16 +89,8 @@ class KnownLabels(PlainLabels):
         return np.where(numbers == 7, Class.ROAD, np.where(numbers == 9, -1, 0)).astype(np.int16)
 
 
-def splats(points: np.ndarray, semantic: int | None = None) -> Gaussians:
-    count = len(points)
-    return Gaussians(
-        means=torch.from_numpy(points).float(),
-        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-        scales=torch.full((count, 3), 0.05),
-        opacities=torch.full((count,), 0.9),
-        sh=torch.zeros(count, 1, 3),
-        semantic=None if semantic is None else torch.full((count,), semantic).short(),
-    )
+def balls(points: np.ndarray, semantic: int | None = None, opacity: float = 0.9) -> Gaussians:
+    return splats(points, (0.05, 0.05, 0.05), semantic=semantic, opacity=opacity)
 
 
 def scene(slope: float = 0.0, *, ego_m: float = 0.0, **changes) -> Scene:
@@ -160,16 +148,14 @@ def test_labelled_returns_come_first_and_are_the_datasets_minus_its_origin() -> 
     points = np.concatenate([road(0.05), clutter()])
     classes = np.repeat([7, 3], [40_000, len(points) - 40_000])
     labels = KnownLabels(points + origin, classes)
-    wrong = splats(road() + np.array([0, 0, 0.7]), Class.ROAD)
+    wrong = balls(road() + np.array([0, 0, 0.7]), Class.ROAD)
     labelled_scene = scene(0.05, labels=labels, world_origin_m=origin, background=wrong)
     ground = ground_of(labelled_scene)
     assert ground.source == "lidar labels"
     assert ground.lowest_z_m == pytest.approx(0, abs=HEIGHT_M)
     assert ground.median_z_m == pytest.approx(0.05 * LENGTH_M / 2, abs=HEIGHT_M)
     assert ground_of(labelled_scene) is ground  # remembered
-    assert (
-        ground_of(dataclasses.replace(labelled_scene)) == ground
-    )  # and the same when measured again
+    assert ground_of(dataclasses.replace(labelled_scene)) == ground
 
 
 def test_classes_nobody_explains_are_not_taken_for_roads(with_open3d) -> None:
@@ -182,13 +168,8 @@ def test_classes_nobody_explains_are_not_taken_for_roads(with_open3d) -> None:
 
 
 def test_road_splats_come_second() -> None:
-    background = splats(road(0.05), Class.LANE_MARKING)
-    faint = dataclasses.replace(
-        splats(road(0.05) - np.array([0, 0, 0.5]), Class.ROAD), opacities=torch.full((40_000,), 0.1)
-    )
-    parts = [background, faint]
-    names = [field.name for field in dataclasses.fields(Gaussians)]
-    both = Gaussians(**{n: torch.cat([getattr(p, n) for p in parts]) for n in names})
+    faint = balls(road(0.05) - np.array([0, 0, 0.5]), Class.ROAD, opacity=0.1)
+    both = stack_all([balls(road(0.05), Class.LANE_MARKING), faint])
     ground = ground_of(scene(0.05, background=both))
     assert ground.source == "road splats"
     assert ground.lowest_z_m == pytest.approx(0, abs=HEIGHT_M)
@@ -197,7 +178,7 @@ def test_road_splats_come_second() -> None:
 @pytest.mark.parametrize("slope", [0.0, 0.1])
 def test_planes_find_the_road_among_walls_cars_and_strays(with_open3d, slope: float) -> None:
     points = np.concatenate([road(slope), clutter() + np.array([0, 0, slope * LENGTH_M / 2])])
-    ground = ground_of(scene(slope, background=splats(points)))
+    ground = ground_of(scene(slope, background=balls(points)))
     assert ground.source == "ransac"
     assert ground.lowest_z_m == pytest.approx(0, abs=HEIGHT_M)
     assert ground.median_z_m == pytest.approx(slope * LENGTH_M / 2, abs=HEIGHT_M)
@@ -239,7 +220,7 @@ def test_without_open3d_the_path_stands_in_and_the_log_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)  # importing it then fails
     with caplog.at_level(logging.WARNING, logger="augment.scene.ground"):
-        ground = ground_of(scene(background=splats(np.concatenate([road(), clutter()]))))
+        ground = ground_of(scene(background=balls(np.concatenate([road(), clutter()]))))
     assert ground.source == "ego path"
     (record,) = caplog.records
     for package in ("pip install open3d", "libusb-1.0-0", "libgl1", "libx11-6", "libgomp1"):

@@ -5,21 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
-from augment.dataset import WeatherDataset
 from augment.effects.lens_drops.drops import Drops, LensDropsPlan, drops_at
-from augment.effects.lens_drops.optics import (
-    MIN_MASK_SHARE,
-    blend_drops,
-    draw_drops,
-    map_surroundings,
-)
-from augment.jobs.render_job import RenderJob, run_job
-from augment.output.manifest import read_manifest
+from augment.effects.lens_drops.optics import blend_drops, draw_drops, map_surroundings
 from augment.render.buffers import CPU, REFERENCE
 from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import rigid
@@ -247,17 +238,6 @@ def test_drops_touch_the_picture_alone_and_none_of_its_bits_without_drops():
     assert steps["lens drops"].runs and "20 drops" in steps["lens drops"].why
     why = {n: make_plan(street_recipe(n), scene).steps for n in (None, 0)}
     assert all(not s.runs for steps in why.values() for s in steps if s.name == "lens drops")
-
-
-def test_a_job_writes_the_mask_and_its_share(tmp_path):
-    scene, recipe = open_street(LABELLED_STREET), street_recipe(60)
-    job = RenderJob("street", [recipe], tmp_path, cameras=["front"], frames=[0])
-    assert run_job(job, scene_loader=lambda _: scene, progress=False).written == 1
-    (row,) = read_manifest(tmp_path).to_pylist()
-    mask = cv2.imread(str(tmp_path / row["lens_drops_path"]), cv2.IMREAD_UNCHANGED)
-    assert row["lens_drops_fraction"] == (mask == 255).mean() > 0
-    assert row["lens_drops_count"] == 60 and MIN_MASK_SHARE < 0.5
-    np.testing.assert_array_equal(WeatherDataset(tmp_path)[0]["lens_drops"].numpy(), mask == 255)
 
 
 def test_fields_are_limited_and_old_hashes_stay():

@@ -45,6 +45,7 @@ from augment.scene.sky import ConstantSky, LatLongSky, Sky
 from recipes.snow import Snow, SnowLight
 from tests.augment.pretend_gpu import AwayTensor, held_by, pretended_gpu
 from tests.snow_beds import bed_of_cells, cells_on_grid, grid_surface, level_bed, looking, scene_of
+from tests.snow_scenes import splats
 
 CELL_M = 0.05
 SUN = (0.8, 0.0, 0.6)
@@ -126,14 +127,10 @@ def test_snow_through_foliage_is_thin_and_in_flecks():
 # --- tracks and water -----------------------------------------------------------------------------
 
 
-def _rutted():
-    tracks = np.zeros((100, 60))
-    tracks[:, 20:26] = 1.0
-    return cells_on_grid(np.zeros((100, 60)), CELL_M, tracks=tracks)
-
-
 def test_tracks_are_pressed_where_the_recipe_says():
-    cells = _rutted()
+    wheel_tracks = np.zeros((100, 60))
+    wheel_tracks[:, 20:26] = 1.0
+    cells = cells_on_grid(np.zeros((100, 60)), CELL_M, tracks=wheel_tracks)
     rut = cells.track_share.numpy() == 1
     for depth_m, tracks, has_tracks in (
         (0.3, "auto", True),
@@ -235,13 +232,8 @@ def test_two_shadings_agree_where_normals_do():
 
 
 def _driving_scene(yaw: float, bed_cells):
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    turn = torch.tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=torch.float64)
-    pose = rigid(turn, torch.tensor([5.0, 2.0, 1.0], dtype=torch.float64))
-    track = Track(torch.tensor([0, 10]), torch.stack([pose, pose]))
     roof = grid_surface(np.zeros((4, 4)), 0.5, corner_m=(-1.0, -1.0))
-    actor = Actor("car", "car", roof, track, (2.0, 2.0, 1.0))
-    scene = scene_of(FAR_AWAY.background, (actor,))
+    scene = scene_of(FAR_AWAY.background, (standing_car("car", roof, yawed(yaw, 5.0, 2.0)),))
     return scene, bed_of_cells(level_bed(0.1).ground, car=bed_cells)
 
 
@@ -304,14 +296,10 @@ def test_same_bits_for_any_number_of_threads_and_another_seed_is_another_snow():
 SEED = np.uint64(77)
 
 
-def _points(count: int, *, seed: int = 0, far: float = 1e5) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return rng.uniform(-far, far, count), rng.uniform(-far, far, count)
-
-
 def test_noise_has_unit_deviation_and_median_zero():
     """400 000 points apart: the standard errors are 0.0012 and 0.0024; four of each are allowed."""
-    noise = gradient_noise(*_points(400_000), SEED)
+    u, v = np.random.default_rng(0).uniform(-1e5, 1e5, (2, 400_000))
+    noise = gradient_noise(u, v, SEED)
     assert abs(noise.std() - 1) < 0.005
     assert abs(np.median(noise)) < 0.01
 
@@ -383,16 +371,8 @@ def unit(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
 
 def discs(rgb: object, semantic: SemanticClass | None, *, count: int = 30, z: float = 0.0):
     """Level discs of one colour."""
-    sh = torch.as_tensor(np.asarray(rgb, np.float32) - 0.5).expand(count, 1, 3) / SH_C0
-    return Gaussians(
-        means=torch.tensor([0.0, 0.0, z])
-        + torch.arange(count)[:, None] * torch.tensor([1.0, 0, 0]),
-        quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4).contiguous(),
-        scales=torch.tensor([0.3, 0.3, 0.01]).expand(count, 3).contiguous(),
-        opacities=torch.full((count,), 0.9),
-        sh=sh.contiguous(),
-        semantic=None if semantic is None else torch.full((count,), int(semantic)).short(),
-    )
+    means = np.stack([np.arange(count), np.zeros(count), np.full(count, z)], 1)
+    return splats(means, (0.3, 0.3, 0.01), rgb=rgb, semantic=semantic, opacity=0.9)
 
 
 def scene(sky: Sky, ground: Gaussians, frames: tuple[Frame, ...] = ()) -> Scene:
@@ -628,18 +608,10 @@ def near_discs(count: int, seed: int, *, far_m: float = 11.0) -> Gaussians:
     drawn = torch.rand(count, 7, generator=generator)
     tilt = 0.3 * (drawn[:, 5] - 0.5)
     zero = torch.zeros(count)
-    return Gaussians(
-        means=torch.stack([1.5 + far_m * drawn[:, 0] ** 2, 4 * drawn[:, 1] - 2, zero], 1),
-        quats=torch.stack([torch.cos(tilt), torch.sin(tilt), zero, zero], 1),
-        scales=torch.stack([0.02 + 0.03 * drawn[:, 2], 0.02 + 0.03 * drawn[:, 3], zero + 0.01], 1),
-        opacities=torch.full((count,), 0.98),
-        sh=((drawn[:, 4:] - 0.5) / SH_C0)[:, None],
-        semantic=torch.full((count,), int(SemanticClass.SNOW), dtype=torch.int16),
-    )
-
-
-def moved(gaussians: Gaussians, shift) -> Gaussians:
-    return dataclasses.replace(gaussians, means=gaussians.means + torch.tensor(shift))
+    means = torch.stack([1.5 + far_m * drawn[:, 0] ** 2, 4 * drawn[:, 1] - 2, zero], 1)
+    turns = torch.stack([torch.cos(tilt), torch.sin(tilt), zero, zero], 1)
+    scales = torch.stack([0.02 + 0.03 * drawn[:, 2], 0.02 + 0.03 * drawn[:, 3], zero + 0.01], 1)
+    return splats(means, scales, turns, drawn[:, 4:], SemanticClass.SNOW, opacity=0.98)
 
 
 def crystals(count: int, seed: int, *, spread_m=6.0) -> Crystals:
@@ -649,14 +621,6 @@ def crystals(count: int, seed: int, *, spread_m=6.0) -> Crystals:
     flat = np.sqrt(1 - up * up)
     mirrors = np.stack([flat * np.cos(around), flat * np.sin(around), up], 1).astype(np.float32)
     return Crystals(torch.from_numpy(places), torch.from_numpy(mirrors), 0.9)
-
-
-def snow_layers_of(ground: PartSnow, **actors: PartSnow) -> SnowLayers:
-    return SnowLayers(ground, actors, tuple(CLOSE_SUN.tolist()), WRAP, 0.1, GRAIN)
-
-
-def layer(gaussians: Gaussians, own: int = 3, **options) -> PartSnow:
-    return PartSnow(gaussians, torch.ones(own), **options)
 
 
 def drawn_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -691,6 +655,11 @@ def yawed(angle: float, x: float, y: float) -> torch.Tensor:
     return rigid(turn, torch.tensor([x, y, 0.5], dtype=torch.float64))
 
 
+def standing_car(name: str, gaussians: Gaussians, pose: torch.Tensor) -> Actor:
+    track = Track(torch.tensor([0, 10]), torch.stack([pose, pose]))
+    return Actor(name, "car", gaussians, track, (2.0, 2.0, 1.0))
+
+
 @pytest.fixture
 def glinting_street():
     """Snow on the ground and on two vehicles, all of which glints."""
@@ -699,24 +668,25 @@ def glinting_street():
         + 0.5 * torch.rand(70, 3, generator=torch.Generator().manual_seed(4)),
         dim=1,
     )
-    ground = layer(moved(near_discs(300, 6), (12.0, 0.0, 0.0)), crystals=crystals(1500, 7))
+    far = near_discs(300, 6)
+    far = dataclasses.replace(far, means=far.means + torch.tensor([12.0, 0.0, 0.0]))
+    ground = PartSnow(far, torch.ones(3), crystals=crystals(1500, 7))
     cars = {
-        name: layer(
+        name: PartSnow(
             near_discs(count, seed, far_m=2.0),
-            own=2,
+            torch.ones(2),
             sunlight_rgb=0.3 * torch.ones(count, 3),
             normals=normals[:count],
             crystals=crystals(count, seed, spread_m=1.0) if seed == 8 else None,
         )
         for name, count, seed in (("a", 70, 8), ("b", 33, 9))
     }
-    own = {2: near_discs(2, 3), 3: near_discs(3, 4)}
     actors = tuple(
-        Actor(name, "car", own[2], Track(torch.tensor([0, 10]), torch.stack([pose, pose])),
-              (2.0, 2.0, 1.0))
+        standing_car(name, near_discs(2, 3), pose)
         for name, pose in (("a", yawed(0.7, 3.0, 1.0)), ("b", yawed(-2.0, 5.0, -2.0)))
-    )  # fmt: skip
-    return scene_of(own[3], actors), snow_layers_of(ground, **cars)
+    )
+    layers = SnowLayers(ground, cars, tuple(CLOSE_SUN.tolist()), WRAP, 0.1, GRAIN)
+    return scene_of(near_discs(3, 4), actors), layers
 
 
 def test_a_street_full_of_snow_is_the_cpus(glinting_street, monkeypatch):

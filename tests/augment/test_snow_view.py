@@ -8,16 +8,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from box_views import (
-    CAR_M,
-    UPRIGHT,
-    boxes_at_random,
-    count_by_hand,
-    make_boxes,
-    make_camera,
-    placed,
-    plane_depth,
-)
 
 from adapters.base import open_scene, parse_uri
 from adapters.procedural import open_truth
@@ -27,14 +17,24 @@ from augment.exposure.search import ExposureSettings, find_exposed_surface
 from augment.metrics.consistency import DepthView, find_warp
 from augment.scene.boxes import SIDE_MARGIN_M
 from augment.scene.labels import Boxes
-from augment.scene.scene import Gaussians, Scene
+from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
 from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers, render_view
 from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
-from tests.snow_scenes import box_car, drive, sheet, side_wall
+from tests.augment.box_views import (
+    CAR_M,
+    UPRIGHT,
+    boxes_at_random,
+    count_by_hand,
+    make_boxes,
+    make_camera,
+    placed,
+    plane_depth,
+)
+from tests.snow_scenes import box_car, drive, sheet, side_wall, splats, stack_all
 from tools.bench.scenes import all_cameras
 from tools.bench.snow_truth import (
     camera_from_above,
@@ -65,7 +65,7 @@ def scene() -> Scene:
     """A road, a wall beside it with a flat roof on it, and a car that drives away."""
     ground = sheet((-2.0, 24.0), (-4.0, 4.0), semantic=ROAD)
     wall = side_wall(4.0, (2.0, 24.0), (0.0, 1.0))
-    wall = dataclasses.replace(wall, semantic=torch.full((len(wall),), BUILDING, dtype=torch.int16))
+    wall = dataclasses.replace(wall, semantic=torch.full((len(wall),), BUILDING).short())
     roof = sheet((2.0, 24.0), (4.0, 8.0), 1.0, semantic=BUILDING)
     car = box_car(start=(8.0, -2.0), moved_m=3.0, size=(3.0, 1.8, 1.0), semantic=CAR)
     return drive(ground, wall, roof, actors=[car], labels=NoBoxes())
@@ -173,13 +173,9 @@ def test_fog_lies_over_the_snow(scene, model):
     foggy = view_of(scene, snow(), smog=fog, semantic=False, depth="none")
     assert np.array_equal(clear.masks["snow"], foggy.masks["snow"])
     lies = (clear.masks["snow"] == 255) & (clear.depth_m > 3)
-    t = np.exp(-0.2 * clear.depth_m * view_lengths(clear))[..., None]
+    t = np.exp(-0.2 * clear.depth_m * clear.camera.ray_lengths().numpy())[..., None]
     expected = t * clear.rgb + (1 - t) * 0.5 * 255
     assert np.median(np.abs(foggy.rgb - expected)[lies]) < 3
-
-
-def view_lengths(view) -> np.ndarray:
-    return view.camera.ray_lengths().numpy()
 
 
 def test_water_melts_the_snow_it_reaches_and_mirrors_the_rest(scene):
@@ -278,15 +274,10 @@ def true_street():
 
 
 @pytest.fixture(scope="module")
-def truth():
-    return open_truth(parse_uri(STREET)[2])
-
-
-@pytest.fixture(scope="module")
-def found(true_street, truth):
+def found(true_street):
     return snow_accuracy(
         true_street,
-        truth,
+        open_truth(parse_uri(STREET)[2]),
         cell_m=STREET_CELL_M,
         reach_m=REACH_M,
         pixel_m=0.1,
@@ -298,19 +289,6 @@ def found(true_street, truth):
 @pytest.fixture(scope="module")
 def mode(found):
     return found["estimators"][0]
-
-
-@pytest.fixture(scope="module")
-def points(true_street, truth):
-    above = camera_from_above(all_cameras(true_street), reach_m=REACH_M, pixel_m=0.3)
-    xy = pixel_positions(above).reshape(-1, 2)
-    return true_points(without_movers(truth), all_cameras(true_street), xy, reach_m=REACH_M)
-
-
-def covered_by(scene, points):
-    bed = find_exposed_surface(scene, all_cameras(scene), ExposureSettings(cell_m=0.2))
-    flat = points.select(points.is_seen & (points.slope < math.radians(30)))
-    return bed.ground, flat
 
 
 @pytest.mark.long
@@ -345,36 +323,22 @@ def test_mode_depth_beats_expected_depth(found):
 
 
 @pytest.mark.long
-def test_floaters_do_not_lift_the_snow(true_street, points):
+def test_floaters_do_not_lift_the_snow(true_street):
     """A thin veil a metre and a half above the road: it takes a fifth of the light from above."""
     spacing = 0.3
     x, y = np.meshgrid(np.arange(-6.0, 6.0, spacing), np.arange(-5.0, 2.0, spacing))
     count = x.size
     means = np.stack([x.ravel(), y.ravel(), np.full(count, 1.5)], 1)
-    veil = Gaussians(
-        means=torch.from_numpy(means).float(),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        scales=torch.full((count, 3), 0.2),
-        opacities=torch.full((count,), 0.08),
-        sh=torch.zeros(count, 1, 3),
-        semantic=torch.full((count,), int(SemanticClass.UNKNOWN), dtype=torch.int16),
-    )
-    background = true_street.background
-    assert background.semantic is not None and veil.semantic is not None
-    veiled = dataclasses.replace(
-        true_street,
-        background=Gaussians(
-            means=torch.cat([background.means, veil.means]),
-            quats=torch.cat([background.quats, veil.quats]),
-            scales=torch.cat([background.scales, veil.scales]),
-            opacities=torch.cat([background.opacities, veil.opacities]),
-            sh=torch.cat([background.sh, veil.sh]),
-            semantic=torch.cat([background.semantic, veil.semantic]),
-        ),
-    )
+    veil = splats(means, (0.2, 0.2, 0.2), semantic=SemanticClass.UNKNOWN, opacity=0.08)
+    background = stack_all([true_street.background, veil])
+    veiled = dataclasses.replace(true_street, background=background)
+    cameras = all_cameras(true_street)
+    above = camera_from_above(cameras, reach_m=REACH_M, pixel_m=0.3)
+    truth = without_movers(open_truth(parse_uri(STREET)[2]))
+    points = true_points(truth, cameras, pixel_positions(above).reshape(-1, 2), reach_m=REACH_M)
     under = (np.abs(points.xy[:, 0]) < 5) & (points.xy[:, 1] > -4) & (points.xy[:, 1] < 1)
-    cells, flat = covered_by(veiled, points)
-    open_points = flat.select(under[points.is_seen & (points.slope < math.radians(30))])
+    open_points = points.select(under & points.is_seen & (points.slope < math.radians(30)))
+    cells = find_exposed_surface(veiled, cameras, ExposureSettings(cell_m=0.2)).ground
     assert (cells_over(cells, open_points) >= 0).any()
     assert np.nanmedian(np.abs(support_heights(cells, open_points) - open_points.z)) < 0.06
 

@@ -1,4 +1,4 @@
-"""Where snow can lie: cells over scenes whose surfaces are known, and the files that keep them."""
+"""Open to the sky: cells over scenes whose surfaces are known, and the files that keep them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from augment.effects.snow.plan import exposure_settings
+from augment.effects.snow.plan import exposure_settings, naming_cell_field
+from augment.effects.wet.ground_map import refusing_cell_size
 from augment.errors import OutputError, SceneError
 from augment.exposure.cells import (
     FLUSH,
@@ -30,6 +31,7 @@ from augment.exposure.exposed_surface import (
 )
 from augment.exposure.search import ExposureSettings, find_exposed_surface
 from augment.exposure.surface import is_vehicle
+from augment.exposure.tiles import TooManyCellsError
 from augment.exposure.wheel_tracks import EGO_WIDTH_M, WHEEL_OFFSET_SHARE, find_wheel_paths
 from augment.render.threads import limit_threads
 from augment.scene.labels import EGO_VEHICLE
@@ -133,7 +135,7 @@ def test_bits_do_not_depend_on_threads_or_on_who_watches(flat_ground) -> None:
     told = list[PassProgress]()
     with watched(told.append):
         together = find_exposed_surface(scene, cameras_of(scene), COARSE)
-    assert_equal_cells(together.ground, bed.ground)
+    assert_equal(together, bed)
     total = told[0].num_steps
     assert [progress.num_done for progress in told] == [*range(total + 1)] and total > 1
     assert {progress.name for progress in told} == {"finding exposed surfaces"}
@@ -188,9 +190,15 @@ def test_nothing_lies_under_a_canopy() -> None:
 
 
 def test_cells_that_would_take_too_much_memory_are_refused_at_once() -> None:
+    """The caller adds the recipe's field."""
     scene = drive(GROUND)
-    with pytest.raises(SceneError, match=r"0\.001 m would take [\d,]+ million cells.* GB.*cell_m"):
+    refused = r"0\.001 m would take [\d,]+ million cells.* GB.*or fewer frames"
+    with pytest.raises(TooManyCellsError, match=refused):
         find_exposed_surface(scene, cameras_of(scene), ExposureSettings(cell_m=0.001))
+    with pytest.raises(SceneError, match=refused + "; weather.snow.cell_m"), naming_cell_field():
+        exposed_surface_of(scene, ExposureSettings(cell_m=0.001))
+    with pytest.raises(SceneError, match=refused + "; weather.rain has no"), refusing_cell_size():
+        exposed_surface_of(scene, ExposureSettings(cell_m=0.001))
 
 
 def test_unknown_scale_or_gravity_and_wrong_settings_are_refused(unchecked) -> None:
@@ -231,7 +239,7 @@ def test_holes_under_the_path_and_small_ones_are_closed(
 
 @pytest.mark.long
 @pytest.mark.parametrize("cell_m", [0.05, 0.4])
-def test_wires_and_boards_on_edge_carry_nothing(cell_m: float) -> None:
+def test_wires_and_boards_on_edge_are_not_exposed(cell_m: float) -> None:
     x = torch.linspace(6, 9, 40)
     wire = one_gaussian(mean=(0.0, 0.0, 5.0), scale=(0.08, 0.01, 0.01), opacity=0.99)
     wire = stack(*(dataclasses.replace(wire, means=torch.tensor([[v, 0.5, 5.0]])) for v in x))
@@ -397,11 +405,6 @@ def test_which_actors_are_vehicles() -> None:
     assert place(walker, ExposureSettings(cell_m=0.2)).actors == {}
 
 
-def assert_equal_cells(a: ExposedCells, b: ExposedCells) -> None:
-    for field in dataclasses.fields(ExposedCells):
-        assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
-
-
 # ---- exposed surfaces in files -------------------------------------------------------------------
 
 SETTINGS = ExposureSettings(cell_m=0.2)
@@ -429,7 +432,7 @@ def assert_equal(a: ExposedSurface, b: ExposedSurface) -> None:
 
 
 def test_a_file_gives_back_the_support_to_the_bit(support: ExposedSurface, tmp_path: Path) -> None:
-    path = tmp_path / "new" / "snow.safetensors"
+    path = tmp_path / "new" / "exposed.safetensors"
     save_exposed_surface(path, support, "a key")
     assert_equal(load_exposed_surface(path, "a key"), support)
     assert [p.name for p in path.parent.iterdir()] == [path.name]
@@ -494,35 +497,30 @@ def test_a_support_is_found_once_and_a_damaged_file_is_written_anew(
     assert "is found again" in caplog.text and path.read_bytes() == whole
 
 
-def test_files_of_something_else_are_refused(support: ExposedSurface, tmp_path: Path) -> None:
-    path = tmp_path / "snow.safetensors"
+def test_cut_files_and_those_of_something_else_are_refused(
+    support: ExposedSurface, tmp_path: Path
+) -> None:
+    path = tmp_path / "exposed.safetensors"
     with pytest.raises(SceneError, match="no such file"):
         load_exposed_surface(path, "k")
     save_exposed_surface(path, support, "k")
     with pytest.raises(SceneError, match="of something else: its key is 'k', expected 'other'"):
         load_exposed_surface(path, "other")
+    data = path.read_bytes()
+    lengths = (0, 1, 7, 100, len(data) // 2, len(data) - 1)
+    for damaged in (b"no tensors", *(data[:length] for length in lengths)):
+        path.write_bytes(damaged)
+        with pytest.raises(SceneError, match="damaged"):
+            load_exposed_surface(path, "k")
+    with pytest.raises(SceneError, match="damaged"):
+        load_exposed_surface(tmp_path, "k")
     save_file({"x": torch.zeros(3)}, path)
     with pytest.raises(SceneError, match="no exposed surface of this version"):
         load_exposed_surface(path, "k")
-    path.write_text("no tensors")
-    with pytest.raises(SceneError, match="damaged"):
-        load_exposed_surface(path, "k")
-    with pytest.raises(SceneError, match="damaged"):
-        load_exposed_surface(tmp_path, "k")
-
-
-def test_cut_files_are_refused(support: ExposedSurface, tmp_path: Path) -> None:
-    path = tmp_path / "snow.safetensors"
-    save_exposed_surface(path, support, "k")
-    data = path.read_bytes()
-    for length in (0, 1, 7, 100, len(data) // 2, len(data) - 1):
-        path.write_bytes(data[:length])
-        with pytest.raises(SceneError, match="damaged"):
-            load_exposed_surface(path, "k")
 
 
 def test_contents_that_do_not_fit_are_refused(support: ExposedSurface, tmp_path: Path) -> None:
-    path = tmp_path / "snow.safetensors"
+    path = tmp_path / "exposed.safetensors"
     save_exposed_surface(path, support, "k")
     whole = load_file(path)
     ids: dict = {"format": FORMAT, "key": "k", "track_ids": list(support.actors)}
