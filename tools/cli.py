@@ -295,6 +295,7 @@ class RecipesOptions(Command):
     schema_file: Annotated[Path | None, arg(name="schema")] = None
 
     def run(self) -> int:
+        from recipes.json_schema import write_schema
         from recipes.load import (
             describe_preset,
             load_recipe,
@@ -302,7 +303,6 @@ class RecipesOptions(Command):
             read_overrides,
             recipe_text,
         )
-        from recipes.recipe_file import write_schema
 
         if self.schema_file is not None:
             write_schema(self.schema_file)
