@@ -227,24 +227,24 @@ def _cases(values: dict[str, Any]) -> Iterator[Case]:
     """Yield ends of all fields, such that each end is tried.
 
     The first case takes the first end of every range, the next the second end, until the last has
-    the last end of all. For rules between two fields, pairs of ends within a section follow.
+    the last end of all. Pairs of ends follow, within sections that have rules between fields.
     """
-    fields = list(_fields(values, recipe_file()))
-    ends_of = {location: ends(value) for location, _, value in fields}
-    leaf_of = {location: section.leaves[str(location[-1])] for location, section, _ in fields}
-    for row in range(max(map(len, ends_of.values()), default=1)):
-        yield {location: few[min(row, len(few) - 1)] for location, few in ends_of.items()}
-    first = {location: few[0] for location, few in ends_of.items()}
-    ranged = [location for location, few in ends_of.items() if len(few) > 1]
-    for _, locations in itertools.groupby(sorted(ranged, key=_parent), key=_parent):
-        for pair in itertools.combinations(locations, 2):
-            pair_ends = (_telling_ends(ends_of[path], leaf_of[path]) for path in pair)
-            for combination in itertools.product(*pair_ends):
-                yield first | dict(zip(pair, combination, strict=True))
-
-
-def _parent(location: Location) -> str:
-    return dotted(location[:-1])
+    fields = {
+        location: (section, ends(value))
+        for location, section, value in _fields(values, recipe_file())
+    }
+    for row in range(max((len(few) for _, few in fields.values()), default=1)):
+        yield {location: few[min(row, len(few) - 1)] for location, (_, few) in fields.items()}
+    first_ends = {location: few[0] for location, (_, few) in fields.items()}
+    ranges_of: dict[Location, dict[Location, list[End]]] = {}
+    for location, (section, few) in fields.items():
+        if len(few) > 1 and section.has_rules:
+            leaf = section.leaves[str(location[-1])]
+            ranges_of.setdefault(location[:-1], {})[location] = _telling_ends(few, leaf)
+    for ranges in ranges_of.values():
+        for pair in itertools.combinations(ranges, 2):
+            for combination in itertools.product(*(ranges[location] for location in pair)):
+                yield first_ends | dict(zip(pair, combination, strict=True))
 
 
 def _telling_ends(field_ends: list[End], leaf: Leaf) -> list[End]:

@@ -207,6 +207,11 @@ class Section:
         """Return the fields that only recipe files have, such as `probability`."""
         return frozenset(self.keys) - self.model.model_fields.keys()
 
+    @cached_property
+    def has_rules(self) -> bool:
+        """Return True if the model has rules between fields."""
+        return bool(self.model.__pydantic_decorators__.model_validators)
+
     def walk(self) -> Iterator[Section]:
         """Yield this section, then all below it."""
         yield self
