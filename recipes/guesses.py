@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import re
-from typing import TYPE_CHECKING
 
 from recipes.errors import join, nearest_word, short
+from recipes.ranges import RANGE_KINDS
 from recipes.schema import SECTIONS
+from recipes.sections import Leaf, Section
 from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode
-
-if TYPE_CHECKING:
-    from recipes.recipe_file import Leaf, Section
-
-RANGE_KINDS = ("uniform", "log_uniform", "normal", "choice")
 
 # Words for a switch: YAML 1.1 read some of them as true and false, and other programs the rest.
 _SWITCHES = {
@@ -116,8 +112,7 @@ def why_no_range(node: MapNode, leaf: Leaf) -> str:
         return f"must be {leaf.describe_allowed_values()}; it cannot be a range"
     kinds = [key for key in node if key in RANGE_KINDS]
     if len(kinds) == 1:
-        allowed_kinds = "choice" if leaf.channel is None else "uniform or choice"
-        return f"{kinds[0]} is for numbers; a range here is {allowed_kinds}"
+        return f"{kinds[0]} is for numbers; a range here is {' or '.join(leaf.range_kinds)}"
     for key in node:
         kind = nearest_word(key, RANGE_KINDS)
         if kind is not None and kind != key:
@@ -129,33 +124,33 @@ def why_no_range(node: MapNode, leaf: Leaf) -> str:
 # ---- Keys ----------------------------------------------------------------------------------------
 
 
-def why_no_key(key: str, section: type[Section], root: type[Section]) -> str:
+def why_no_key(key: str, section: Section, root: Section) -> str:
     """Return why a section refuses `key`, and the nearest field that it has."""
     if key in RANGE_KINDS:
         return "a range stands for one field, not for a whole section"
     nearest = _nearest_key(key, section, root)
     if nearest is not None:
-        leaf = section.LEAVES.get(nearest)
+        leaf = section.leaves.get(nearest)
         unit = f" ({leaf.unit})" if leaf and leaf.unit else ""
         return f"unknown field; did you mean {nearest}{unit}?"
     other_places = [
-        (other.PATH, name)
+        (other.path, name)
         for name in dict.fromkeys((key, _synonyms().get(key, key)))
         for other in root.walk()
-        if name in other.model_fields and other is not section
+        if name in other.keys and other is not section
     ]
-    places_below = [place for place in other_places if place[0].startswith(f"{section.PATH}.")]
+    places_below = [place for place in other_places if place[0].startswith(f"{section.path}.")]
     if other_places:
         places = [
             join(path, name) if path else f"{name} at the top"
             for path, name in places_below or other_places
         ]
         return f"unknown field here; did you mean {' or '.join(places)}?"
-    return f"unknown field; known here: {', '.join(section.model_fields)}"
+    return f"unknown field; known here: {', '.join(section.keys)}"
 
 
-def _nearest_key(key: str, section: type[Section], root: type[Section]) -> str | None:
-    fields = tuple(section.model_fields)
+def _nearest_key(key: str, section: Section, root: Section) -> str | None:
+    fields = section.keys
     name = key.lower().replace("-", "_")
     if name in fields:
         return name
@@ -166,7 +161,7 @@ def _nearest_key(key: str, section: type[Section], root: type[Section]) -> str |
     for field in (synonyms.get(name), synonyms.get(_base(name))):
         if field in fields:
             return field
-    if any(name in other.model_fields for other in root.walk()):
+    if any(name in other.keys for other in root.walk()):
         return None  # spelt well, but in another place
     base = nearest_word(_base(name), bases)
     return nearest_word(name, fields) or (bases[base] if base else None)

@@ -17,8 +17,9 @@ from recipes.fields import packaged_names, packaged_text
 from recipes.files import file_below, open_file
 from recipes.guesses import show
 from recipes.ranges import is_number
-from recipes.recipe_file import Section, read_file, recipe_file
+from recipes.recipe_file import read_file
 from recipes.schema import VERSION, Recipe, free_knobs, idle_speed_knobs
+from recipes.sections import Section, recipe_file
 from recipes.speed import MOVED_FIELDS
 from recipes.template import RecipeTemplate
 from recipes.yaml_tree import MapNode, Node, ScalarNode, check_text, read_tree
@@ -171,16 +172,13 @@ def _template(
     _check_version(tree)
     if name is not None and "name" not in tree:
         tree["name"] = ScalarNode(place, name, name)
-        if not recipe_file().LEAVES["name"].accepts(name):
+        if not recipe_file().leaves["name"].accepts(name):
             problems.add(place, "the file's name cannot serve as the recipe's; add 'name: ...'")
     fields = read_file(_with_parents(tree, place, problems), problems)
     problems.raise_if_any()
-    top = {
-        key: fields.pop(key).value if key in fields else leaf.info.default
-        for key, leaf in recipe_file().LEAVES.items()
-    }
+    top = {key: fields.pop(key, leaf.info.default) for key, leaf in recipe_file().leaves.items()}
     last_variant = top["variant"] + top["variants"] - 1
-    if not recipe_file().LEAVES["variant"].accepts(last_variant):
+    if not recipe_file().leaves["variant"].accepts(last_variant):
         text = f"variant = {top['variant']}: too large with variants = {top['variants']}"
         raise tree["variant"].place.error(text)
     template = RecipeTemplate(
@@ -255,7 +253,7 @@ def _identity(place: Place) -> str:
 
 
 def _read_parent(parent: Node) -> tuple[str, Place]:
-    leaf = recipe_file().LEAVES["extends"]
+    leaf = recipe_file().leaves["extends"]
     place = parent.place
     name = parent.text if isinstance(parent, ScalarNode) else ""
     if not leaf.accepts(name):
@@ -273,11 +271,11 @@ def _read_parent(parent: Node) -> tuple[str, Place]:
         raise place.error(f"extends = {show(parent)}: {text}") from None
 
 
-def _merge_trees(base: MapNode, changes: MapNode, section: type[Section]) -> MapNode:
+def _merge_trees(base: MapNode, changes: MapNode, section: Section) -> MapNode:
     """Return `base` with the fields of `changes` in place of its own; sections merge."""
     entries = dict(base)
     for name, node in changes.items():
-        inner_section = section.INNER.get(name)
+        inner_section = section.sections.get(name)
         base_node = base.get(name)
         if (
             inner_section is not None

@@ -1,4 +1,4 @@
-"""Values of a recipe's fields: fixed ones, and draws from ranges.
+"""Ranges of a recipe's fields, and draws from them.
 
 The random numbers are pure functions of (seed, variant, path of the field). No generator carries
 its state from draw to draw, so a new field or variant leaves all others unchanged. Drawn floats
@@ -10,19 +10,26 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import NormalDist
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
+from recipes.errors import join
 from recipes.files import file_below
+from recipes.speed import former_path
 
 # Domain of the hashes. A change of the scheme changes it, so that no number changes silently.
 _DOMAIN = "climategs recipe draw 1"
 
+# In the order in which messages list them.
+RANGE_KINDS = ("uniform", "log_uniform", "normal", "choice")
+# Largest standard deviation of a normal range over its width. A wider normal is uniform for all
+# purposes, and loses digits.
+MAX_STD_PER_WIDTH = 1000
+
 Triple = tuple[float, float, float]  # a colour, or three rates
-Plain = bool | int | float | str | Triple | tuple[str, ...] | None
 
 
 @dataclass(frozen=True)
@@ -39,38 +46,26 @@ class Draws:
         return (int.from_bytes(digest[:8], "big") >> 11) * 2.0**-53
 
 
-# What a template holds for a field has `is_range`, False where every variant gets the same; `draw`,
-# the value of one variant, the path naming its random number; `probes`, the extreme values and
-# every option, all of which must be allowed; and `describe`, the range in words, without its unit.
+Location = tuple[int | str, ...]  # keys and indices: ("weather", "flood", "waves", "seed")
+Fault = tuple[Location, str]  # the part of a range, such as ("choice", 1), and what is wrong there
 
 
 @dataclass(frozen=True)
-class Fixed:
-    value: Plain
-    is_range = False
+class End:
+    """Value that a field can take: an end of its range, an option of its choice.
 
-    def draw(self, draws: Draws, path: str) -> Plain:
-        return self.value
+    parts: the parts of ranges from which it is, by their places in it: {(): ("uniform", 1)}, or
+    {(2,): ("uniform", 1)} for a colour whose third channel has a range.
+    """
 
-    def probes(self) -> tuple[Plain, ...]:
-        return (self.value,)
-
-    def describe(self) -> str:
-        return format_value(self.value)
+    value: Any
+    parts: dict[Location, Location]
 
 
-@dataclass(frozen=True)
-class NamedFile(Fixed):
-    """Name of a file as it is written. A draw has its absolute path."""
-
-    value: str
-    folder: Path
-
-    def draw(self, draws: Draws, path: str) -> str:
-        try:
-            return str(file_below(self.folder, self.value))
-        except ValueError as error:
-            raise ValueError(f"{path} = {self.value!r}: {error}") from None
+# ---- Ranges --------------------------------------------------------------------------------------
+#
+# `draw` returns the value of one variant; its path names its random number. `ends` are checked
+# first, and then `faults` says what else is wrong. `describe` is the range in words.
 
 
 @dataclass(frozen=True)
@@ -84,7 +79,6 @@ class Uniform:
     low: float
     high: float
     log: bool = False
-    is_range = True
 
     def draw(self, draws: Draws, path: str) -> float:
         unit = draws.unit(path)
@@ -104,8 +98,13 @@ class Uniform:
             _floor_to_range(number, low, high) if is_whole else _round_to_range(number, low, high)
         )
 
-    def probes(self) -> tuple[float, ...]:
-        return (self.low, self.high)
+    def ends(self) -> list[End]:
+        kind = "log_uniform" if self.log else "uniform"
+        return [End(self.low, {(): (kind, 0)}), End(self.high, {(): (kind, 1)})]
+
+    def faults(self) -> Iterator[Fault]:
+        if self.low > self.high:
+            yield (), "the low end comes first"
 
     def describe(self) -> str:
         kind = "log-uniform" if self.log else "uniform"
@@ -124,7 +123,6 @@ class Normal:
     std: float
     low: float
     high: float
-    is_range = True
 
     def draw(self, draws: Draws, path: str) -> float:
         is_whole = isinstance(self.low, int)
@@ -139,8 +137,16 @@ class Normal:
             return _floor_to_range(number + 0.5, self.low, self.high)
         return _round_to_range(number, self.low, self.high)
 
-    def probes(self) -> tuple[float, ...]:
-        return (self.low, self.high)
+    def ends(self) -> list[End]:
+        return [End(self.low, {(): ("normal", "min")}), End(self.high, {(): ("normal", "max")})]
+
+    def faults(self) -> Iterator[Fault]:
+        if not self.low < self.high:
+            yield (), "max must be > min"
+        elif not self.low <= self.mean <= self.high:
+            yield (), f"mean must be from min to max, {self.low:g} to {self.high:g}"
+        elif self.std > MAX_STD_PER_WIDTH * (self.high - self.low):
+            yield (), f"std must be <= {MAX_STD_PER_WIDTH} (max - min); wider is uniform"
 
     def describe(self) -> str:
         return (
@@ -151,15 +157,12 @@ class Normal:
 
 @dataclass(frozen=True)
 class Choice:
-    """Choice of one of the options, which may be ranges themselves. weights: >= 0, their sum >
-    0.
-    """
+    """Choice of one of the options, which may be ranges themselves, by weights >= 0."""
 
-    options: tuple[Value, ...]
+    options: tuple[Any, ...]
     weights: tuple[float, ...]
-    is_range = True
 
-    def draw(self, draws: Draws, path: str) -> Plain:
+    def draw(self, draws: Draws, path: str) -> Any:
         remaining = draws.unit(path) * math.fsum(self.weights)
         option_index = -1
         for index, weight in enumerate(self.weights):
@@ -168,16 +171,29 @@ class Choice:
                 if remaining < weight:
                     break
                 remaining -= weight
-        return self.options[option_index].draw(draws, f"{path}.choice[{option_index}]")
+        return draw(self.options[option_index], draws, f"{path}.choice[{option_index}]")
 
-    def probes(self) -> tuple[Plain, ...]:
-        return tuple(probe for option in self.options for probe in option.probes())
+    def ends(self) -> list[End]:
+        return [
+            End(end.value, {**end.parts, (): ("choice", i, *end.parts.get((), ()))})
+            for i, option in enumerate(self.options)
+            for end in ends(option)
+        ]
+
+    def faults(self) -> Iterator[Fault]:
+        for i, option in enumerate(self.options):
+            yield from (((("choice", i, *part), text)) for part, text in faults(option))
+        if len(self.weights) != len(self.options):
+            yield (), f"weights must be {len(self.options)} numbers, one for each option"
+        # bounds keep the sum finite and every share representable
+        elif not any(self.weights) or any(0 < weight < 1e-9 for weight in self.weights):
+            yield (), "each weight is 0 or from 1e-9 to 1e9, and one is above 0"
 
     def describe(self) -> str:
         total = math.fsum(self.weights)
         is_even = len(set(self.weights)) == 1
         parts = [
-            option.describe() + ("" if is_even else f" ({100 * weight / total:.3g} %)")
+            describe(option) + ("" if is_even else f" ({100 * weight / total:.3g} %)")
             for option, weight in zip(self.options, self.weights, strict=True)
         ]
         return f"one of {', '.join(parts)}"
@@ -189,39 +205,113 @@ class TripleLine:
 
     start: Triple
     end: Triple
-    is_range = True
 
     def draw(self, draws: Draws, path: str) -> Triple:
         unit = draws.unit(path)
         ends = zip(self.start, self.end, strict=True)
-        return as_triple(_round_to_range(a + unit * (b - a), min(a, b), max(a, b)) for a, b in ends)
+        red, green, blue = (
+            _round_to_range(a + unit * (b - a), min(a, b), max(a, b)) for a, b in ends
+        )
+        return (red, green, blue)
 
-    def probes(self) -> tuple[Triple, ...]:
-        return (self.start, self.end)
+    def ends(self) -> list[End]:
+        return [End(self.start, {(): ("uniform", 0)}), End(self.end, {(): ("uniform", 1)})]
+
+    def faults(self) -> Iterator[Fault]:
+        return iter(())
 
     def describe(self) -> str:
         return f"uniform from {format_value(self.start)} to {format_value(self.end)}"
 
 
 @dataclass(frozen=True)
-class Channels:
-    """Three channels that are drawn one by one."""
+class NamedFile:
+    """Name of a file as it is written. A draw has its absolute path. folder: None without one."""
 
-    channels: tuple[Value, Value, Value]
-    is_range = True
+    name: str
+    folder: Path | None
 
-    def draw(self, draws: Draws, path: str) -> Triple:
-        return as_triple(c.draw(draws, f"{path}[{i}]") for i, c in enumerate(self.channels))
+    def draw(self, draws: Draws, path: str) -> str:
+        for _, text in self.faults():
+            raise ValueError(f"{path} = {self.name!r}: {text}")
+        assert self.folder is not None
+        return str(file_below(self.folder, self.name))
 
-    def probes(self) -> tuple[Triple, ...]:
-        probes = [[as_number(probe) for probe in channel.probes()] for channel in self.channels]
-        return (as_triple(map(min, probes)), as_triple(map(max, probes)))
+    def ends(self) -> list[End]:
+        return [End(self.name, {})]
+
+    def faults(self) -> Iterator[Fault]:
+        if self.folder is None:
+            yield (), "this text is in no file, so there is no folder to look in; save it as one"
+            return
+        try:
+            file_below(self.folder, self.name)
+        except ValueError as error:
+            yield (), str(error)
 
     def describe(self) -> str:
-        return f"[{', '.join(channel.describe() for channel in self.channels)}]"
+        return self.name
 
 
-Value = Fixed | Uniform | Normal | Choice | TripleLine | Channels
+Range = Uniform | Normal | Choice | TripleLine
+
+
+# ---- Values of a template: plain ones, ranges, and mappings and lists of them --------------------
+
+
+def draw(value: Any, draws: Draws, path: str) -> Any:
+    """Return a template's value in one variant. Items of lists are drawn one by one."""
+    if isinstance(value, Range | NamedFile):
+        return value.draw(draws, former_path(path))
+    if isinstance(value, list | tuple):
+        return type(value)(draw(item, draws, f"{path}[{i}]") for i, item in enumerate(value))
+    if not isinstance(value, Mapping):
+        return value
+    share = value.get("probability")
+    if share is not None and draws.unit(join(path, "probability")) >= share:
+        return None  # the variant has not this effect
+    fields = {name: item for name, item in value.items() if name != "probability"}
+    return {name: draw(item, draws, join(path, name)) for name, item in fields.items()}
+
+
+def ends(value: Any) -> list[End]:
+    """Return the ends of a field's range and the options of a choice; a plain value is its end.
+
+    A colour whose channels have ranges takes the first ends of all, then the second ones.
+    """
+    if isinstance(value, Range | NamedFile):
+        return value.ends()
+    if not isinstance(value, tuple) or not value:
+        return [End(value, {})]
+    columns = [ends(item) for item in value]
+    rows = [[c[min(row, len(c) - 1)] for c in columns] for row in range(max(map(len, columns)))]
+    return [
+        End(
+            tuple(end.value for end in row),
+            {(i,): end.parts[()] for i, end in enumerate(row) if end.parts},
+        )
+        for row in rows
+    ]
+
+
+def faults(value: Any) -> Iterator[Fault]:
+    """Yield what is wrong with ranges and files' names, though every end is allowed."""
+    if isinstance(value, Range | NamedFile):
+        yield from value.faults()
+    for i, item in enumerate(value if isinstance(value, tuple) else ()):
+        yield from (((i, *part), text) for part, text in faults(item))
+
+
+def is_range(value: Any) -> bool:
+    """Return True if the value of a field differs between variants."""
+    return isinstance(value, Range) or (isinstance(value, tuple) and any(map(is_range, value)))
+
+
+def describe(value: Any) -> str:
+    """Return the value of a field in words, without its unit."""
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(describe, value))}]"
+    return value.describe() if isinstance(value, Range | NamedFile) else format_value(value)
 
 
 def _round_to_range(number: float, low: float, high: float) -> float:
@@ -237,20 +327,8 @@ def is_number(value: object) -> TypeGuard[int | float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def as_number(value: Plain) -> float:
-    """Return the value of a field that was checked to hold a number."""
-    assert is_number(value), value
-    return value
-
-
-def as_triple(values: Iterable[Plain]) -> Triple:
-    """Return the three channels of a field that was checked to hold a colour or rates."""
-    red, green, blue = map(as_number, values)
-    return (red, green, blue)
-
-
-def format_value(value: Plain) -> str:
-    """Return a value as it would be written in a recipe, floats shortened."""
+def format_value(value: object) -> str:
+    """Return a plain value as it would be written in a recipe, floats shortened."""
     if value is None:
         return "null"
     if isinstance(value, bool):

@@ -11,10 +11,9 @@ from pydantic import ValidationError
 
 from recipes.errors import RecipeError, join, readable
 from recipes.files import with_digest
-from recipes.ranges import Draws, Fixed, Value, as_number, format_value
-from recipes.recipe_file import recipe_file
+from recipes.ranges import Draws, describe, draw, format_value, is_range
 from recipes.schema import VERSION, Recipe
-from recipes.speed import former_path
+from recipes.sections import recipe_file
 
 _INDEX = re.compile(r"\[[0-9]+\]")
 _SHARE = ".probability"
@@ -30,8 +29,9 @@ class RecipeTemplate:
         seed: seed of the draws.
         variants: number of recipes that a run draws from it.
         first_variant: number of the first one.
-        field_values: given fields, by section: a Value for a field, a list for a list of mappings.
-            An effect's `probability` is the share of variants that have it.
+        field_values: given fields, by section: a value or a range for a field, a tuple for a
+            colour, a list for a list of mappings. An effect's `probability` is the share of
+            variants that have it.
     """
 
     name: str
@@ -53,14 +53,14 @@ class RecipeTemplate:
                 be read or has another digest than the recipe gives.
         """
         number = self.first_variant + variant
-        leaf = recipe_file().LEAVES["variant"]
+        leaf = recipe_file().leaves["variant"]
         if variant < 0 or not leaf.accepts(number):
             allowed = leaf.describe_allowed_values(number)
             raise RecipeError(f"{self.source}: variant = {variant}: must be {allowed}")
         prefix = f"{self.source}: variant {number}"
         names = {"version": VERSION, "name": self.name, "seed": self.seed, "variant": number}
         try:
-            fields = _draw(self.field_values, Draws(self.seed, number), "")
+            fields = draw(self.field_values, Draws(self.seed, number), "")
             return with_digest(Recipe.model_validate(names | fields))
         except ValidationError as error:
             raise RecipeError(*(f"{prefix}: {text}" for text in readable(error))) from None
@@ -70,26 +70,34 @@ class RecipeTemplate:
             raise RecipeError(f"{self.source}: {error}") from None
 
     @property
-    def values(self) -> dict[str, Value]:
+    def values(self) -> dict[str, Any]:
         """Return the value or range of every given field, by dotted path."""
         return {
             path: value for path, value in _walk(self.field_values) if not path.endswith(_SHARE)
         }
 
+    @property
+    def _shares(self) -> dict[str, float]:
+        """Return the probability of every effect that some variants lack, by its path."""
+        fields = _walk(self.field_values)
+        shares = {
+            path.removesuffix(_SHARE): value for path, value in fields if path.endswith(_SHARE)
+        }
+        return {path: share for path, share in shares.items() if share != 1}
+
     def describe_ranges(self) -> dict[str, str]:
         """Return the range in words, with the unit, of every field that differs between
         variants, by path.
         """
-        units = {leaf.path: leaf.unit for s in recipe_file().walk() for leaf in s.LEAVES.values()}
+        units = {leaf.path: leaf.unit for s in recipe_file().walk() for leaf in s.leaves.values()}
         ranges = {
-            path.removesuffix(_SHARE): f"present with probability {share.describe()}"
-            for path, share in _walk(self.field_values)
-            if path.endswith(_SHARE) and share != Fixed(1.0)
+            path: f"present with probability {format_value(share)}"
+            for path, share in self._shares.items()
         }
         for path, value in self.values.items():
-            if value.is_range:
+            if is_range(value):
                 unit = units.get(_INDEX.sub("[]", path))
-                ranges[path] = value.describe() + (f" ({unit})" if unit else "")
+                ranges[path] = describe(value) + (f" ({unit})" if unit else "")
         return ranges
 
     def describe_draws(self) -> str:
@@ -98,19 +106,17 @@ class RecipeTemplate:
         for variant in range(self.variants):
             recipe = self.resolve(variant)
             draws = Draws(self.seed, recipe.variant)
-            absent_paths = tuple[str, ...]()
-            for path, share in _walk(self.field_values):
-                if path.endswith(_SHARE) and draws.unit(path) >= as_number(share.draw(draws, path)):
-                    absent_paths += (path.removesuffix("probability"),)
-            parts = [f"{path.removesuffix('.')} absent" for path in absent_paths]
+            absent = [p for p, share in self._shares.items() if draws.unit(p + _SHARE) >= share]
+            parts = [f"{path} absent" for path in absent]
+            absent_paths = tuple(f"{path}." for path in absent)
             for path, value in self.values.items():
-                if value.is_range and not path.startswith(absent_paths):
-                    parts.append(f"{path} = {format_value(value.draw(draws, former_path(path)))}")
+                if is_range(value) and not path.startswith(absent_paths):
+                    parts.append(f"{path} = {format_value(draw(value, draws, path))}")
             lines.append(f"{recipe.name}-{recipe.variant:03d} {recipe.hash}  {', '.join(parts)}")
         return "\n".join(lines)
 
 
-def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Value]]:
+def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the dotted path and value of every field below a node of `field_values`."""
     if isinstance(node, Mapping):
         for name, inner_node in node.items():
@@ -120,16 +126,3 @@ def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Value]]:
             yield from _walk(item, f"{path}[{index}]")
     else:
         yield path, node
-
-
-def _draw(node: Any, draws: Draws, path: str) -> Any:
-    """Return a node of `field_values` in numbers; None for an effect that the variant has not."""
-    if isinstance(node, list):
-        return [_draw(item, draws, f"{path}[{index}]") for index, item in enumerate(node)]
-    if not isinstance(node, Mapping):
-        return node.draw(draws, former_path(path))
-    share = node.get("probability")
-    if share is not None and draws.unit(path + _SHARE) >= share.value:
-        return None
-    fields = {name: value for name, value in node.items() if name != "probability"}
-    return {name: _draw(value, draws, join(path, name)) for name, value in fields.items()}

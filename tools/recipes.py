@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from recipes.json_schema import write_schema
 from recipes.load import describe_preset, load_recipe, preset_names, read_overrides, recipe_text
-from recipes.recipe_file import write_schema
 
 if TYPE_CHECKING:
     from tools.cli import RecipesOptions

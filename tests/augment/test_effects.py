@@ -16,8 +16,8 @@ from augment.output.manifest import read_manifest
 from augment.view.plan import make_plan
 from augment.view.render_view import render_view
 from recipes.errors import RecipeError
+from recipes.json_schema import recipe_json_schema
 from recipes.load import load_recipe
-from recipes.recipe_file import recipe_json_schema
 from recipes.schema import KNOBS, Recipe
 from tests.augment.dust import TINT, DustEffect
 from tests.streets import LABELLED_STREET, open_street

@@ -14,8 +14,8 @@ from recipes.effect import Column, EffectModel, Knob
 from recipes.errors import RecipeError
 from recipes.fields import FilePath, Number, Unit, Whole
 from recipes.files import read_files
+from recipes.json_schema import recipe_json_schema
 from recipes.load import dump_recipe, load_recipe, parse_recipe
-from recipes.recipe_file import recipe_json_schema
 from recipes.schema import (
     KNOBS,
     SECTIONS,

@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from recipes.errors import MAX_SHOWN, Place, Problems, RecipeError
 from recipes.files import digest_of, read_files, with_digest
 from recipes.load import MAX_BYTES, dump_recipe, load_recipe, parse_recipe, preset_names
-from recipes.ranges import Channels, Choice, Fixed, Normal, TripleLine, Uniform
-from recipes.recipe_file import recipe_file
+from recipes.ranges import Choice, Normal, TripleLine, Uniform
 from recipes.schema import Recipe
+from recipes.sections import recipe_file
 from recipes.style import Style
 from recipes.template import RecipeTemplate
 from recipes.yaml_tree import ListNode, MapNode, plain, plain_value, read_tree
@@ -191,21 +191,21 @@ def test_a_flood_of_problems_is_cut_short() -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("base_height_m: 5", Fixed(5.0)),
-        ("base_height_m: 1e-3", Fixed(0.001)),
-        ("scale_height_m: null", Fixed(None)),
-        ("scale_height_m:", Fixed(None)),
-        ("model: deferred", Fixed("deferred")),
-        ("color: [0, 0.5, 1]", Fixed((0.0, 0.5, 1.0))),
+        ("base_height_m: 5", 5.0),
+        ("base_height_m: 1e-3", 0.001),
+        ("scale_height_m: null", None),
+        ("scale_height_m:", None),
+        ("model: deferred", "deferred"),
+        ("color: [0, 0.5, 1]", (0.0, 0.5, 1.0)),
         ("base_height_m: {uniform: [0, 2]}", Uniform(0.0, 2.0)),
         ("base_height_m: {uniform: [2, 2]}", Uniform(2.0, 2.0)),
         ("base_height_m: {log_uniform: [1, 2]}", Uniform(1.0, 2.0, log=True)),
         ("base_height_m: {normal: {mean: 1, std: 2, min: 0, max: 3}}", Normal(1.0, 2.0, 0.0, 3.0)),
-        ("scale_height_m: {choice: [null, 5]}", Choice((Fixed(None), Fixed(5.0)), (1.0, 1.0))),
-        ("model: {choice: [deferred], weights: [2]}", Choice((Fixed("deferred"),), (2.0,))),
+        ("scale_height_m: {choice: [null, 5]}", Choice((None, 5.0), (1.0, 1.0))),
+        ("model: {choice: [deferred], weights: [2]}", Choice(("deferred",), (2.0,))),
         ("color: {uniform: [[0, 0, 0], [1, 1, 1]]}", TripleLine((0.0,) * 3, (1.0,) * 3)),
-        ("color: [0, {uniform: [0, 1]}, 1]", Channels((Fixed(0.0), Uniform(0.0, 1.0), Fixed(1.0)))),
-        ("color: {choice: [[0, 0, 0]]}", Choice((Fixed((0.0, 0.0, 0.0)),), (1.0,))),
+        ("color: [0, {uniform: [0, 1]}, 1]", (0.0, Uniform(0.0, 1.0), 1.0)),
+        ("color: {choice: [[0, 0, 0]]}", Choice(((0.0, 0.0, 0.0),), (1.0,))),
     ],
 )
 def test_right_fields(field: str, value: object) -> None:
@@ -626,7 +626,7 @@ def test_what_is_written_from_the_folder_reads_back(folder: Path) -> None:
 
 
 KEYS = sorted(
-    {key for section in recipe_file().walk() for key in section.model_fields}
+    {key for section in recipe_file().walk() for key in section.keys}
     | {"uniform", "log_uniform", "normal", "choice", "weights", "mean", "std", "min", "max"}
     | {"<<", "visibility_km", "on"}
 )
@@ -657,8 +657,8 @@ FLOW = st.recursive(
     max_leaves=12,
 )
 TOP = st.dictionaries(st.sampled_from(KEYS), FLOW, max_size=5).map(block)
-EFFECTS = recipe_file().INNER["weather"].INNER
-WAVE_KEYS = list(EFFECTS["flood"].INNER["waves"].INNER["components"].model_fields)
+EFFECTS = recipe_file().sections["weather"].sections
+WAVE_KEYS = list(EFFECTS["flood"].sections["waves"].sections["components"].keys)
 WAVES = st.lists(st.dictionaries(st.sampled_from(WAVE_KEYS), SCALARS).map(flow), max_size=3).map(
     lambda items: "{components: [" + ", ".join(items) + "]}"
 )
@@ -666,7 +666,7 @@ WAVES = st.lists(st.dictionaries(st.sampled_from(WAVE_KEYS), SCALARS).map(flow),
 
 def effect(name: str, given: dict[str, str], extra: st.SearchStrategy) -> st.SearchStrategy[str]:
     """A recipe of one effect, with what it needs given."""
-    keys = [key for key in EFFECTS[name].model_fields if key not in given and key != "waves"]
+    keys = [key for key in EFFECTS[name].keys if key not in given and key != "waves"]
     head = f"weather:\n  {name}:\n"
     fields = st.dictionaries(st.sampled_from(keys), FLOW)
     return st.builds(lambda d, e: block({**given, **d, **e}, head, "    "), fields, extra)

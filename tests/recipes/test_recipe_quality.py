@@ -11,8 +11,8 @@ from recipes.fields import changed, is_given, section_at, with_unchecked_field
 from recipes.flood import Flood, Wave, Waves
 from recipes.job import scaled_recipe
 from recipes.load import dump_recipe, parse_recipe
-from recipes.recipe_file import recipe_file
 from recipes.schema import TIERS, Quality, Recipe, Render, Weather
+from recipes.sections import recipe_file
 from recipes.style import Style
 
 SNOW_AND_FLOOD = "weather: {snow: {depth_m: 0.1}, flood: {level_m: 0.2}}\n"
@@ -23,7 +23,7 @@ def resolved(text: str) -> Recipe:
 
 
 def test_every_knob_is_a_field_whose_values_the_schema_takes() -> None:
-    fields = {leaf.path: leaf for s in recipe_file().walk() for leaf in s.LEAVES.values()}
+    fields = {leaf.path: leaf for s in recipe_file().walk() for leaf in s.leaves.values()}
     for knob in knobs.KNOBS.values():
         assert all(fields[knob.path].accepts(value) for value in knob.values), knob
         assert len(set(knob.values)) == len(knob.values) >= 2

@@ -17,22 +17,23 @@ from pydantic import ValidationError
 
 from recipes.errors import RecipeError
 from recipes.flood import MAX_WAVES, Flood, Wave, Waves
+from recipes.json_schema import recipe_json_schema, write_schema
 from recipes.lens_drops import LensDrops
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.rain import Rain
 from recipes.ranges import format_value
-from recipes.recipe_file import Leaf, Section, recipe_file, recipe_json_schema, write_schema
 from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
+from recipes.sections import Leaf, recipe_file
 from recipes.snow import Snow, SnowLight, SnowWind
 from recipes.snowfall import Snowfall
 from recipes.speed import Speed
 from recipes.style import Style, style_preset_names
 
 FIELDS = [
-    section.LEAVES[name]
+    section.leaves[name]
     for section in recipe_file().walk()
-    for name in section.MODEL.model_fields
-    if name in section.LEAVES
+    for name in section.model.model_fields
+    if name in section.leaves
 ]
 NUMBERS = [part for leaf in FIELDS if (part := leaf.channel or leaf).is_number]
 
@@ -314,13 +315,13 @@ def test_every_field_is_in_the_schema_with_its_description() -> None:
     schema = recipe_json_schema()
     assert schema["$schema"] == "https://json-schema.org/draft/2020-12/schema"
     for section in recipe_file().walk():
-        node = schema["$defs"][section.__name__] if section.PATH else schema
+        node = schema["$defs"][section.model.__name__] if section.path else schema
         node = node.get("anyOf", [node])[0]  # quality takes a word, too
         assert node["additionalProperties"] is False
-        assert set(node["properties"]) == set(section.model_fields)
-        required = [name for name, leaf in section.LEAVES.items() if leaf.info.is_required()]
+        assert set(node["properties"]) == set(section.keys)
+        required = [name for name, leaf in section.leaves.items() if leaf.info.is_required()]
         assert node.get("required", []) == required
-        for name, leaf in section.LEAVES.items():
+        for name, leaf in section.leaves.items():
             assert leaf.description in node["properties"][name]["description"]
     visibility = schema["$defs"]["Smog"]["properties"]["visibility_m"]
     assert visibility["description"].endswith("[metres]")
@@ -471,7 +472,7 @@ with a former name is refused, and the message has the new name.
 
 def field_table() -> str:
     """A row for every key of a recipe file, sections in their order, `render.speed` at the end."""
-    speed = recipe_file().INNER["render"].INNER["speed"]
+    speed = recipe_file().sections["render"].sections["speed"]
     sections = [section for section in recipe_file().walk() if section is not speed]
     return f"{table_of(sections)}{SPEED}{table_of([speed])}"
 
@@ -479,11 +480,11 @@ def field_table() -> str:
 def table_of(sections: list[type[Section]]) -> str:
     rows = ["| Field | Allowed | Default | Meaning |\n| --- | --- | --- | --- |\n"]
     for section in sections:
-        if section.MAX_ITEMS is not None:
-            path = section.PATH.removesuffix("[]")
-            allowed = f"a list of up to {section.MAX_ITEMS} mappings, or null"
-            rows.append(f"| `{path}` | {allowed} | `null` | {section.LIST_DESCRIPTION} |\n")
-        for name, spec in section.LEAVES.items():
+        if section.max_items is not None:
+            path = section.path.removesuffix("[]")
+            allowed = f"a list of up to {section.max_items} mappings, or null"
+            rows.append(f"| `{path}` | {allowed} | `null` | {section.list_description} |\n")
+        for name, spec in section.leaves.items():
             if name == "probability":  # told once, above the table
                 continue
             default = spec.info.get_default()

@@ -88,7 +88,7 @@ def test_rules_are_tried_at_every_word_of_a_choice(folder: Path) -> None:
     text = "style: {image: {choice: [a.jpg, b.jpg]}, per_region: true, method: {choice: [%s]}}"
     assert template(text % "mkl, reinhard", folder).resolve(0).style is not None
     (problem,) = problems(text % "mkl, gscm", folder)
-    assert "(in a draw with image = a.jpg, method = gscm)" in problem
+    assert "(in a draw with image = b.jpg, method = gscm)" in problem
     (problem,) = problems("style: {image: {choice: [a.jpg, null, b.jpg]}}", folder)
     assert "neither gives the style" in problem and "image = null" in problem
 

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from recipes.errors import RecipeError
 from recipes.flood import MAX_WAVES, PURE_WATER_PER_M, Flood, Wave, Waves
 from recipes.load import parse_recipe
-from recipes.ranges import Choice, Fixed, Uniform
+from recipes.ranges import Choice, Uniform
 from recipes.template import RecipeTemplate
 
 
@@ -155,8 +155,8 @@ def test_problems_of_a_list_name_the_item_and_its_line() -> None:
                 "amplitude_m: 0.1, wavelength_m: 2, steepness: 0.4",
                 "amplitude_m: 0.1, wavelength_m: 2, steepness: {uniform: [0.1, 0.8]}",
             ),
-            "adds up to 1.2; above 1 the surface would loop (in a draw with all components at the "
-            "high ends of their ranges)",
+            "adds up to 1.2; above 1 the surface would loop (in a draw with "
+            "components[1].steepness = 0.8)",
         ),
     ],
 )
@@ -223,7 +223,7 @@ weather:
 def test_every_field_takes_ranges_at_every_depth() -> None:
     values = template(RANGED).values
     assert values["weather.snow.depth_m"] == Uniform(0.05, 0.2)
-    assert values["weather.snow.light.sun"] == Choice((Fixed(None), Fixed(0.5)), (1.0, 1.0))
+    assert values["weather.snow.light.sun"] == Choice((None, 0.5), (1.0, 1.0))
     weather = [template(RANGED).resolve(i).weather for i in range(30)]
     drawn = [each.snow for each in weather if each.snow is not None]
     assert len({snow.depth_m for snow in drawn}) == len({s.wind.direction_deg for s in drawn}) == 30

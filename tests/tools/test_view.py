@@ -35,8 +35,8 @@ from augment.view.render_view import render_view
 from recipes.errors import RecipeError
 from recipes.fields import section_at, with_unchecked_field
 from recipes.load import load_recipe, preset_names
-from recipes.recipe_file import recipe_file
 from recipes.schema import SECTIONS
+from recipes.sections import recipe_file
 from tests.augment.dust import DustEffect
 from tests.streets import LABELLED_STREET, SMALL_STREET, open_street
 from tests.tools.page_client import PageClient
@@ -85,7 +85,7 @@ def served(edits: Edits, uri: str = SMALL_STREET) -> Iterator[tuple[Viewer, str]
 
 
 def test_every_field_of_every_effect_has_a_control_whose_ends_its_model_takes(dust):
-    leaves = {leaf.path: leaf for s in recipe_file().walk() for leaf in s.LEAVES.values()}
+    leaves = {leaf.path: leaf for s in recipe_file().walk() for leaf in s.leaves.values()}
     groups = (*effect_groups(), group_of("camera"), group_of("render"))
     assert {group.path for group in groups} == {*SECTIONS, "camera", "render"}
     for group in groups:
@@ -129,7 +129,7 @@ def sliders() -> list[Control]:
 
 def test_sliders_reach_what_presets_draw_and_boxes_all_that_a_recipe_takes():
     recipes = [load_recipe(name).resolve(variant) for name in preset_names() for variant in (0, 1)]
-    leaves = {leaf.path: leaf for s in recipe_file().walk() for leaf in s.LEAVES.values()}
+    leaves = {leaf.path: leaf for s in recipe_file().walk() for leaf in s.leaves.values()}
     for control in sliders():
         section = control.path.rpartition(".")[0]
         for recipe in recipes:

@@ -19,8 +19,8 @@ from pydantic import ValidationError
 from recipes.effect import EffectModel
 from recipes.fields import FilePath
 from recipes.ranges import is_number
-from recipes.recipe_file import Leaf, Section, recipe_file
 from recipes.schema import SECTIONS
+from recipes.sections import Leaf, Section, recipe_file
 
 STEPS = 400  # The number of steps of a slider.
 # The upper end from which on a slider of numbers that are not negative is logarithmic.
@@ -326,7 +326,7 @@ def group_of(path: str) -> Group:
     """Return the group of the section at a dotted path, such as `weather.smog` or `camera`."""
     section = recipe_file()
     for name in path.split("."):
-        section = section.INNER[name]
+        section = section.sections[name]
     return _group(section, optional=path in SECTIONS)
 
 
@@ -342,29 +342,29 @@ def split_by_rank(groups: Sequence[Group]) -> tuple[tuple[Group, ...], tuple[Gro
     return main, tuple(group for group in groups if group.path not in MAIN_FIELDS)
 
 
-def _group(section: type[Section], *, optional: bool) -> Group:
-    fields = section.MODEL.model_fields
+def _group(section: Section, *, optional: bool) -> Group:
+    fields = section.model.model_fields
     # The digest of a section's files is computed, and jobs set the mark of a settled choice.
-    has_files = issubclass(section.MODEL, EffectModel) and section.MODEL.file_fields
+    has_files = issubclass(section.model, EffectModel) and section.model.file_fields
     hidden_names = {"digest"} if has_files else {"settled"}
     names = fields.keys() - hidden_names
-    leaves = [leaf for name, leaf in section.LEAVES.items() if name in names]
-    lists = [inner for inner in section.INNER.values() if inner.MAX_ITEMS is not None]
-    sections = (inner for inner in section.INNER.values() if inner.MAX_ITEMS is None)
+    leaves = [leaf for name, leaf in section.leaves.items() if name in names]
+    lists = [inner for inner in section.sections.values() if inner.max_items is not None]
+    sections = (inner for inner in section.sections.values() if inner.max_items is None)
     # Effects have groups of their own.
-    inner_sections = [inner for inner in sections if inner.PATH not in SECTIONS]
+    inner_sections = [inner for inner in sections if inner.path not in SECTIONS]
     return Group(
-        path=section.PATH,
-        hint=" ".join((section.MODEL.__doc__ or "").split()),
+        path=section.path,
+        hint=" ".join((section.model.__doc__ or "").split()),
         optional=optional,
         controls=(*map(_control, leaves), *map(_list_control, lists)),
         groups=tuple(_group(inner, optional=False) for inner in inner_sections),
     )
 
 
-def _list_control(item: type[Section]) -> Control:
-    hint = f"{item.LIST_DESCRIPTION} YAML, each with {', '.join(item.model_fields)}."
-    return Control(item.PATH.removesuffix("[]"), "list", hint, nullable=True)
+def _list_control(item: Section) -> Control:
+    hint = f"{item.list_description} YAML, each with {', '.join(item.keys)}."
+    return Control(item.path.removesuffix("[]"), "list", hint, nullable=True)
 
 
 def _control(leaf: Leaf) -> Control:
