@@ -24,8 +24,9 @@ from shown import assert_same_bits, psnr_of
 from adapters.av2.adapter import Av2Log, open_av2, read_av2
 from adapters.av2.files import GroundMap, sensor_of_laser
 from adapters.base import detect_scheme_of_path
+from adapters.datasets import DATASETS
 from adapters.raw_drive import DriveOptions
-from adapters.uri import SCHEMES, format_uri
+from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.scene.cameras import Camera
 from augment.scene.ground import ground_of
@@ -75,7 +76,7 @@ def test_images_between_sweeps_have_frames_of_their_own_where_asked(scene, folde
         car = files.city_from_ego(camera.timestamp_ns)[:3, 3] - ORIGIN
         centre = car + files.city_from_ego(camera.timestamp_ns)[:3, :3] @ mounting(scene, name)
         np.testing.assert_allclose(camera.centre, centre, atol=1e-3)
-    labels = SCHEMES["av2"].open_labels(str(folder), query)
+    labels = DATASETS["av2"].open_labels(str(folder), query)
     assert len(labels.lidar(2)) == len(scene.lidar(1)) and labels.lidar(1) is None
 
 

@@ -18,11 +18,12 @@ from splat_scenes import street
 
 from adapters.base import detect_scheme_of_path, expand_job_scenes, open_scene
 from adapters.camera_files.camera_files import read_views
-from adapters.detect_format import FILES, FOLDERS, describe_unrecognised, detect_scheme
+from adapters.datasets import DATASETS
+from adapters.detect_format import describe_unrecognised, detect_scheme
 from adapters.drivestudio.drive import read_config as drivestudio_config
 from adapters.lidar_scene.image_views import read_image
 from adapters.nuscenes.tables import read_rows
-from adapters.pandaset import PandaSetLabels
+from adapters.pandaset.adapter import PandaSetLabels
 from adapters.plain_files import check_image, read_json, read_numbers, read_pose, resolve_inside
 from adapters.recording.adapter import read_sweep
 from adapters.safe_pickle import read_array, read_frame
@@ -248,13 +249,12 @@ def test_what_is_not_known_is_answered_with_what_was_looked_for(tmp_path):
     grow(tmp_path / "set" / "seq", dict(TREES)["nuscenes"])
     with pytest.raises(AdapterError) as caught:
         detect_scheme_of_path(tmp_path / "set")
-    for signature in FOLDERS:
-        assert signature.kind_words in str(caught.value)
+    folders = [dataset.folder for dataset in DATASETS.values() if dataset.folder]
+    assert all(signature.kind_words in str(caught.value) for signature in folders)
     assert f"give one, such as {tmp_path}/set/seq. Looked for" in str(caught.value)
     (tmp_path / "a.txt").write_text("hello")
-    assert all(
-        signature.kind_words in describe_unrecognised(tmp_path / "a.txt") for signature in FILES
-    )
+    text = describe_unrecognised(tmp_path / "a.txt")
+    assert all(dataset.file.kind_words in text for dataset in DATASETS.values() if dataset.file)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from test_image_views import camera
 from adapters.lidar_scene.closing import close_parts
 from adapters.lidar_scene.image_views import View
 from adapters.lidar_scene.split import PointSet, join_tracks
-from adapters.pandaset import open_pandaset
+from adapters.pandaset.adapter import open_pandaset
 from adapters.raw_drive import BoxSample
 from augment.render.buffers import ALPHA
 from augment.render.rasterize import rasterize

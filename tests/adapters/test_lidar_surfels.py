@@ -38,7 +38,7 @@ from adapters.lidar_scene.surfels import (
     thin_points,
 )
 from adapters.nuscenes.adapter import nuscenes_labels
-from adapters.pandaset import SENSORS_M, PandaSetLabels, read_lidar
+from adapters.pandaset.adapter import SENSORS_M, PandaSetLabels, read_lidar
 from adapters.procedural import LOWEST_DEG, StreetLabels, lidar_rays
 from adapters.recording.adapter import RecordingLabels
 from adapters.street.layout import StreetParameters

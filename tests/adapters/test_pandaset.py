@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from shown import psnr, psnr_of, render
 
 from adapters.base import open_scene
-from adapters.pandaset import (
+from adapters.pandaset.adapter import (
     NO_SURFACE,
     PandaSetLabels,
     boxes_of_cuboids,

@@ -26,16 +26,16 @@ from shown import assert_same_bits
 
 from adapters.av2.adapter import Av2Log
 from adapters.base import open_scene
+from adapters.datasets import DATASETS
 from adapters.drivestudio.adapter import drivestudio_labels
 from adapters.kitti.adapter import KittiLabels
 from adapters.nuscenes.adapter import nuscenes_labels
-from adapters.pandaset import PandaSetLabels
+from adapters.pandaset.adapter import PandaSetLabels
 from adapters.plain_files import Number, read_json, read_numbers, read_yaml, validate_content
 from adapters.procedural import StreetLabels
 from adapters.raw_drive import NO_SURFACE, IncompleteDrive, Picture, class_of_air, usable_images
 from adapters.recording.adapter import RecordingLabels
 from adapters.street_gaussians.adapter import StreetGaussiansLabels
-from adapters.uri import SCHEMES
 from augment.effects.lidar import (
     ATTENUATED,
     LOST,
@@ -73,7 +73,7 @@ def test_held_out_frames_leave_no_trace_in_the_gaussians(scheme: str, tmp_path: 
     write, own = RAW[scheme]
     query = QUERY | own
     path = str(write(tmp_path / "data"))
-    scene = SCHEMES[scheme].open(path, query)
+    scene = DATASETS[scheme].open(path, query)
     number = 5 if scheme == "nuscenes" else 1
     frame, sweep = scene.frame(number), scene.lidar(number)
     # All of the frame changes: its images are black, and its LiDAR sees a roof over the street.
@@ -86,12 +86,12 @@ def test_held_out_frames_leave_no_trace_in_the_gaussians(scheme: str, tmp_path: 
     roofed = LidarSweep({**columns, "source_index": index, "weather_code": codes})
     for file in scene.labels.lidar_files(number):
         file.write_bytes(scene.labels.lidar_content(number, file, roofed))
-    again = SCHEMES[scheme].open(path, query)
+    again = DATASETS[scheme].open(path, query)
     assert len(again.lidar(number)) == 2 * len(sweep)
     assert_same_bits(scene, again)
     # The frame itself stays, as do its boxes, which are the same of the labels alone.
     assert len(again.frame(number).image_paths) == 2 and again.problems == ()
-    labels = pickle.loads(pickle.dumps(SCHEMES[scheme].open_labels(path, query)))
+    labels = pickle.loads(pickle.dumps(DATASETS[scheme].open_labels(path, query)))
     np.testing.assert_array_equal(labels.boxes(number).centers_m, scene.boxes(number).centers_m)
     assert len(scene.boxes(number)) >= 2
     np.testing.assert_array_equal(labels.lidar(0).points_m, scene.lidar(0).points_m)
@@ -176,7 +176,7 @@ def test_returns_beyond_any_reach_are_left_out_and_paths_must_be_metres(tmp_path
     records = np.fromfile(file, "<f4").reshape(-1, 4)
     records[100, 0], records[200, 1] = 1e20, -2000
     records.tofile(file)
-    scene = SCHEMES["kitti"].open(str(root), QUERY)
+    scene = DATASETS["kitti"].open(str(root), QUERY)
     said = "2 LiDAR returns lie further than 1000 m from the car's path and are left out"
     assert any(said in problem for problem in scene.problems)
     wide = write_recording(tmp_path / "wide")
@@ -188,7 +188,7 @@ def test_returns_beyond_any_reach_are_left_out_and_paths_must_be_metres(tmp_path
     edit_calibration(wide, jump)
     shutil.rmtree(wide / "lidar")
     with pytest.raises(AdapterError, match=r"4e\+07 x 0 m wide.*between frames 1 and 2"):
-        SCHEMES["recording"].open(str(wide), QUERY)
+        DATASETS["recording"].open(str(wide), QUERY)
 
 
 CODES = np.array(
@@ -262,7 +262,7 @@ def _ours(root: Path) -> RecordingLabels:
     return RecordingLabels(root)
 
 
-DATASETS: dict[str, Callable[[Path], StoresLidar]] = {
+STORED: dict[str, Callable[[Path], StoresLidar]] = {
     "pandaset": _pandaset,
     "nuscenes": _nuscenes,
     "kitti": _kitti,
@@ -297,9 +297,9 @@ def weathered(sweep: LidarSweep) -> LidarSweep:
     return LidarSweep({**columns, "source_index": index, "weather_code": codes})
 
 
-@pytest.mark.parametrize("dataset", DATASETS)
+@pytest.mark.parametrize("dataset", STORED)
 def test_files_give_back_the_weathered_sweep(dataset: str, tmp_path: Path) -> None:
-    labels = DATASETS[dataset](tmp_path / "data")
+    labels = STORED[dataset](tmp_path / "data")
     assert isinstance(labels, StoresLidar)
     source = labels.lidar(0)
     wanted = drop_lost_returns(weathered(source))

@@ -9,7 +9,7 @@ import drives
 import pytest
 import torch
 
-from adapters.pandaset import PandaSetLabels, read_frames
+from adapters.pandaset.adapter import PandaSetLabels, read_frames
 from adapters.raw_drive import DriveOptions
 from adapters.training_views.checks import check_views
 from adapters.training_views.views import RecordedViews
