@@ -11,7 +11,6 @@ import numpy as np
 import plyfile
 import pytest
 import torch
-from splat_scenes import gaussians_at, street
 
 from adapters.base import open_scene
 from adapters.camera_files.camera_files import look_at_pose
@@ -30,6 +29,7 @@ from augment.errors import AdapterError, SceneError
 from augment.files.ply import write_ply, write_splat
 from augment.output.view_files import check_frames
 from augment.scene.scene import Gaussians
+from tests.adapters.splat_scenes import gaussians_at, street
 
 TO_Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z-up world to COLMAP's usual y-down
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import drives
 import pytest
 import torch
 
@@ -15,6 +14,7 @@ from adapters.training_views.checks import check_views
 from adapters.training_views.views import RecordedViews
 from augment.scene.scene import Scene
 from augment.scene.sky import ConstantSky
+from tests.adapters import drives
 
 
 @pytest.fixture(scope="module")

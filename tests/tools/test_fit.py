@@ -1,11 +1,9 @@
 """The driver of reconstruction, on stand-ins for what it drives."""
 
 import dataclasses
-import importlib
 import json
 import os
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +14,7 @@ from adapters.base import open_scene
 from augment.errors import ClimateGSError, OutputError
 from augment.files.scene_file import FORMAT
 from augment.jobs.processes import OutputLock
+from tests.adapters.recording_files import write_as_recording
 from tools import fit, training
 from tools.cli import main
 from tools.fit import fit_scene, held_out_range, open_to_fit, state_folder
@@ -365,11 +364,9 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
 
 
 @pytest.fixture
-def recording(tmp_path, monkeypatch) -> str:
+def recording(tmp_path) -> str:
     """A street of 3 m with a moving car, recorded by small cameras."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "adapters"))
-    write_recording = importlib.import_module("recording_folder").write_recording
-    folder = write_recording(tmp_path / "drive")
+    folder = write_as_recording(tmp_path / "drive")
     return f"recording:{folder}?voxel_m=0.5&image_scale=1&sky_size=8"
 
 
