@@ -6,8 +6,12 @@ A new dataset joins with its `write_as_X` and `drive_of_X` in `all_drives.WRITER
 from __future__ import annotations
 
 import pickle
+import re
+from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,7 +20,7 @@ from adapters.datasets import DATASETS
 from adapters.uri import format_uri
 from augment.render.sh import SH_C0
 from augment.scene.scene import Scene
-from tests.adapters import street
+from tests.adapters import nuscenes_files, street
 from tests.adapters.all_drives import WRITERS, write_drive
 from tests.adapters.shown import psnr_of
 from tests.adapters.street import Drive
@@ -133,3 +137,81 @@ def test_sweeps_are_those_of_the_files_and_belong_to_the_labels_alone(opened: Op
     np.testing.assert_array_equal(labels.lidar(number).points_m, scene.lidar(number).points_m)
     np.testing.assert_array_equal(labels.boxes(number).centers_m, scene.boxes(number).centers_m)
     assert scene.lidar(99) is None and labels.lidar(99) is None
+
+
+def cut(num_bytes: int) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(path.read_bytes()[:-num_bytes])
+
+
+def shrink(path: Path) -> None:
+    cv2.imwrite(str(path), np.zeros((48, 80, 3), np.uint8))
+
+
+def nuscenes_file(channel: str, number: int) -> str:
+    return nuscenes_files.filename(1, channel, number)
+
+
+def lidarseg_file(number: int) -> str:
+    token = nuscenes_files.data_token(1, "LIDAR_TOP", number)
+    return f"lidarseg/{nuscenes_files.VERSION}/{token}_lidarseg.bin"
+
+
+# Files of a drive, what happens to them, the sentence on it, and what is lost: the sweep of a
+# frame, the image of a frame and camera, or neither.
+Damage = tuple[str, Callable[[Path], object], str, int | tuple[int, str] | None]
+DAMAGES: dict[str, tuple[Damage, ...]] = {
+    "pandaset": (
+        ("lidar/01.pkl.gz", Path.unlink, r"frame 1: lidar/01\.pkl\.gz is missing", 1),
+        ("annotations/cuboids/02.pkl.gz", Path.unlink, r"frame 2: .*cuboids/02.* is missing", None),
+        ("annotations/semseg/00.pkl.gz", Path.unlink, r"frame 0: .*semseg/00.* is missing", None),
+        ("camera/front_camera/00.jpg", Path.unlink,
+         r"camera front_camera, frame 0: .*00\.jpg does not exist", (0, "front_camera")),
+        ("camera/left_camera/01.jpg", cut(200),
+         r"camera left_camera, frame 1: .*01\.jpg is cut short", (1, "left_camera")),
+        ("camera/left_camera/02.jpg", shrink,
+         r"02\.jpg is 80x48 pixels, its camera 160x96", (2, "left_camera")),
+    ),
+    "nuscenes": (
+        (nuscenes_file("LIDAR_TOP", 3), Path.unlink,
+         r"LiDAR's files of 1 frame \(3\) are missing, their points too", 3),
+        (nuscenes_file("LIDAR_TOP", 4), cut(7),
+         r"frame 4: sweeps/LIDAR_TOP/.*not of whole records of 20: it is cut", 4),
+        (nuscenes_file("CAM_FRONT", 0), Path.unlink,
+         r"camera CAM_FRONT, frame 0: image .*does not exist", (0, "CAM_FRONT")),
+        (nuscenes_file("CAM_FRONT_LEFT", 1), cut(200),
+         r"camera CAM_FRONT_LEFT, frame 2: .*is cut short", (2, "CAM_FRONT_LEFT")),
+        (nuscenes_file("CAM_FRONT_LEFT", 4), shrink,
+         r"CAM_FRONT_LEFT, frame 10: .*80x48 pixels, its camera 160x96", (10, "CAM_FRONT_LEFT")),
+        (lidarseg_file(0), Path.unlink,
+         r"frame 0: lidarseg/.*is missing; its points have no class", None),
+        (lidarseg_file(5), lambda path: path.write_bytes(b"abc"),
+         r"frame 5: lidarseg/.*has 3 classes for 9442 returns", None),
+    ),
+    "recording": (
+        ("lidar/000001.parquet", Path.unlink, r"the files of 1 frame \(1\) are missing", 1),
+        ("images/left_camera/000000.png", Path.unlink,
+         r"camera left_camera, frame 0: its image is missing", (0, "left_camera")),
+        ("images/left_camera/000001.png", cut(30), r"000001\.png is cut short", (1, "left_camera")),
+        ("images/left_camera/000002.png", shrink,
+         r"000002\.png is 80x48 pixels, its camera 160x96", (2, "left_camera")),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("scheme", DAMAGES)
+def test_missing_and_damaged_files_are_said_and_cost_no_more(scheme: str, tmp_path: Path) -> None:
+    drive = write_drive(scheme, tmp_path / "drive")
+    for file, damage, _, _ in DAMAGES[scheme]:
+        damage(drive.path / file)
+    query = drive.query | {"voxel_m": "0.5", "image_scale": "0.5", "sky_size": "8"}
+    scene = DATASETS[scheme].open(str(drive.path), query)
+    sentences = [sentence for _, _, sentence, _ in DAMAGES[scheme]]
+    text = "\n".join(scene.problems)
+    assert all(re.search(sentence, text) for sentence in sentences), text
+    assert len(scene.problems) == len(sentences), text
+    losses = [loss for _, _, _, loss in DAMAGES[scheme]]
+    for frame in scene.frames:
+        assert (scene.lidar(frame.index) is None) == (frame.index in losses)
+        assert frame.cameras.keys() == drive.views[frame.index].keys()
+        lost = {name for name in frame.cameras if (frame.index, name) in losses}
+        assert frame.image_paths.keys() == frame.cameras.keys() - lost

@@ -455,41 +455,6 @@ def test_rows_are_the_same_wherever_the_file_is_cut(tmp_path):
     assert list(read_rows(path)) == []
 
 
-def test_missing_and_damaged_files_are_problems(copy):
-    (copy / files.filename(0, "LIDAR_TOP", 3)).unlink()
-    cut = copy / files.filename(0, "LIDAR_TOP", 4)
-    cut.write_bytes(cut.read_bytes()[:-7])
-    (copy / files.filename(0, "CAM_FRONT", 0)).unlink()
-    left = copy / files.filename(0, "CAM_FRONT_LEFT", 1)
-    left.write_bytes(left.read_bytes()[:-200])
-    wrong = copy / files.filename(0, "CAM_FRONT_LEFT", 4)
-    cv2.imwrite(str(wrong), np.zeros((48, 80, 3), np.uint8))
-    classes = copy / f"lidarseg/{files.VERSION}"
-    (classes / f"{files.data_token(0, 'LIDAR_TOP', 0)}_lidarseg.bin").unlink()
-    (classes / f"{files.data_token(0, 'LIDAR_TOP', 5)}_lidarseg.bin").write_bytes(b"abc")
-    scene = open_nuscenes(str(copy), QUICK)
-    expected = (
-        "LiDAR's files of 1 frame (3) are missing, their points too",
-        "frame 4: sweeps/LIDAR_TOP/",
-        "not of whole records of 20: it is cut",
-        "camera CAM_FRONT, frame 0: image ",
-        "does not exist",
-        "camera CAM_FRONT_LEFT, frame 2: ",
-        "is cut short",
-        "camera CAM_FRONT_LEFT, frame 10: ",
-        "is 80x48 pixels, its camera 160x96",
-        "frame 0: lidarseg/",
-        "is missing; its points have no class",
-        "frame 5: lidarseg/",
-        "has 3 classes for 9442 returns",
-    )
-    text = "\n".join(scene.problems)
-    assert len(scene.problems) == 7 and all(part in text for part in expected), text
-    assert scene.lidar(3) is None and scene.lidar(4) is None
-    assert set(scene.frame(0).image_paths) == {"CAM_FRONT_LEFT"}
-    assert set(scene.frame(0).cameras) == {"CAM_FRONT", "CAM_FRONT_LEFT"}
-
-
 def test_without_images_or_returns_there_is_no_scene(copy):
     for query, message in (
         ({"frames": "1:2"}, r"no usable image in 1 frame \(1\)"),

@@ -306,32 +306,6 @@ def test_one_vehicle_is_one_box_and_one_track_whatever_its_tables_say(own, missi
         labels.boxes(1)
 
 
-def test_missing_files_of_single_frames_are_problems(copy):
-    (copy / "lidar/01.pkl.gz").unlink()
-    (copy / "annotations/cuboids/02.pkl.gz").unlink()
-    (copy / "annotations/semseg/00.pkl.gz").unlink()
-    (copy / "camera/front_camera/00.jpg").unlink()
-    left = copy / "camera/left_camera"
-    (left / "01.jpg").write_bytes((left / "01.jpg").read_bytes()[:-200])
-    cv2.imwrite(str(left / "02.jpg"), np.zeros((48, 80, 3), np.uint8))
-    scene = open_pandaset(str(copy), QUERY)
-    expected = (
-        "frame 0: annotations/semseg/00.pkl.gz is missing",
-        "frame 1: lidar/01.pkl.gz is missing",
-        "frame 2: annotations/cuboids/02.pkl.gz is missing",
-        "camera front_camera, frame 0: ",
-        "00.jpg does not exist",
-        "camera left_camera, frame 1: ",
-        "01.jpg is cut short",
-        "02.jpg is 80x48 pixels, its camera 160x96",
-    )
-    text = "\n".join(scene.problems)
-    assert len(scene.problems) == 6 and all(part in text for part in expected), text
-    assert scene.lidar(1) is None and len(scene.boxes(2)) == 0
-    assert set(scene.frame(1).image_paths) == {"front_camera"}
-    assert set(scene.frame(1).cameras) == {"front_camera", "left_camera"}
-
-
 # A file, what is replaced in it by what, options, and the error
 REFUSALS = [
     ("camera/left_camera/intrinsics.json", WHOLE, '{"fx": 1.0}', {}, "intrinsics.json: fy is miss"),
