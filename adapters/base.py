@@ -20,12 +20,12 @@ from functools import partial
 from pathlib import Path
 
 from adapters.camera_files.paths import with_camera_path
+from adapters.datasets import DATASETS
 from adapters.detect_format import describe_unrecognised, detect_scheme
 from adapters.scene_cache import cached_scene
 from adapters.uri import (
     CAMERA_PATH_KEY,
     GROUND_KEY,
-    SCHEMES,
     add_to_uri,
     format_uri,
     known_schemes,
@@ -49,23 +49,23 @@ def open_scene(uri: str) -> Scene:
     ground_z = query.pop(GROUND_KEY, None)
     if scheme is None:
         scheme = detect_scheme_of_path(Path(path))
-    entry = SCHEMES.get(scheme)
-    if entry is None:
-        near = nearest_word(scheme, tuple(SCHEMES))
+    dataset = DATASETS.get(scheme)
+    if dataset is None:
+        near = nearest_word(scheme, tuple(DATASETS))
         guess = f"; did you mean {near}?" if near else ";"
         raise AdapterError(f"unknown scheme {scheme!r} in {uri!r}{guess} known: {known_schemes()}")
-    if entry.builtin:
-        if path not in entry.builtin:
+    if dataset.builtin:
+        if path not in dataset.builtin:
             raise AdapterError(
-                f"{scheme}:{path}: {scheme} scenes are {', '.join(entry.builtin)}; got {path!r}. "
-                f"Example: {entry.example}"
+                f"{scheme}:{path}: {scheme} scenes are {', '.join(dataset.builtin)}; got {path!r}. "
+                f"Example: {dataset.example}"
             )
-        scene = entry.open(query)
+        scene = dataset.open(query)
     else:
         _check_there(Path(path))
-        build = partial(entry.open, path, query)
+        build = partial(dataset.open, path, query)
         try:
-            scene = cached_scene(scheme, path, query, build) if entry.is_raw else build()
+            scene = cached_scene(scheme, path, query, build) if dataset.is_raw else build()
         except OSError as error:
             raise AdapterError(f"{uri!r}: cannot be read: {error}") from error
         except AdapterError:
@@ -150,13 +150,13 @@ def expand_job_scenes(entries: Iterable[JobScene], folder: Path) -> list[JobScen
 
 def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
     scheme, path, query = parse_uri(entry.uri)
-    scheme_entry = SCHEMES.get(scheme) if scheme is not None else None
+    dataset = DATASETS.get(scheme) if scheme is not None else None
     query = {
         key: value if key in _NAME_KEYS else _from(folder, value) for key, value in query.items()
     }
-    if scheme is not None and scheme_entry is None:
+    if scheme is not None and dataset is None:
         return [entry]  # refused where it is opened
-    if scheme is not None and scheme_entry is not None and path in scheme_entry.builtin:
+    if scheme is not None and dataset is not None and path in dataset.builtin:
         return [entry.model_copy(update={"uri": format_uri(scheme, path, query)})]
     full_path = folder.absolute() / path
     matches = [str(full_path)]

@@ -39,20 +39,13 @@ from typing import Any
 from llvmlite.binding import get_host_cpu_name
 
 import augment
+from adapters.datasets import DATASETS
 from adapters.detect_format import detect_scheme
 from adapters.scene_folder import with_images_in
-from adapters.uri import SCHEMES, format_uri, parse_uri
+from adapters.uri import format_uri, parse_uri
 from augment.errors import AdapterError, ClimateGSError, OutputError, SceneError
-from augment.files.formats import splat_suffixes
 from augment.files.recorded_images import has_image
-from augment.files.scene_file import FILES as SCENE_FILES
-from augment.files.scene_file import (
-    LEVELS,
-    SCENE_SUFFIX,
-    VERSION,
-    load_scene_parts,
-    save_scene_file,
-)
+from augment.files.scene_file import SCENE_SUFFIX, VERSION, load_scene_parts, save_scene_file
 from augment.output.atomic import (
     open_lock,
     read_file,
@@ -95,7 +88,7 @@ def cached_scene(
 ) -> Scene:
     """Return the scene that `build` would make of this URI, from the cache if it is there."""
     limit_bytes = _limit_bytes()
-    open_labels = functools.cache(partial(SCHEMES[scheme].open_labels, path, query))
+    open_labels = functools.cache(partial(DATASETS[scheme].open_labels, path, query))
     key = _scene_key(scheme, path, query, open_labels) if limit_bytes else None
     folder = _cache_folder()
     if key is None or folder is None:
@@ -193,14 +186,14 @@ def _scene_key(
     message.
     """
     try:
-        files = list(_facts_of(_files_of(scheme, path, query, open_labels)))
+        files = list(_facts_of(_read_files(scheme, path, query, open_labels)))
     except (OSError, ClimateGSError):
         return None
     facts = [VERSION, *_builder(), scheme, os.path.abspath(path), sorted(query.items()), files]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:32]
 
 
-def _files_of(
+def _read_files(
     scheme: str, path: str, query: Mapping[str, str], open_labels: Callable[[], LabelSource | None]
 ) -> Iterator[Path]:
     """Return the files that the adapter reads, including those that it would read if they
@@ -209,32 +202,7 @@ def _files_of(
     A folder stands for everything in it.
     """
     yield from (Path(value) for value in query.values() if Path(value).is_file())
-    root = Path(path)
-    if scheme == "nuscenes":  # a folder of hundreds of scenes
-        from adapters.nuscenes.adapter import NuScenesLabels
-
-        labels = open_labels()
-        assert isinstance(labels, NuScenesLabels)
-        tables = labels.tables
-        yield root / tables.version
-        for frame in labels.frames:
-            yield from (root / f.filename for f in (frame.sweep, *frame.images.values()))
-        yield from (root / name for name in tables.semantic_files.values())
-        return
-    if scheme == "waymo":  # so is a split
-        from adapters.waymo.adapter import waymo_files
-
-        yield from waymo_files(path, query)
-        return
-    yield root
-    if scheme == "kitti":
-        from adapters.kitti.files import kitti_root
-
-        yield from sorted(kitti_root(path)[1].glob("calib_*.txt"))
-    elif scheme == "recording":  # a variant of a job has its scene's sweeps
-        from augment.output.layout import SWEEP_FOLDER
-
-        yield root / os.pardir / SWEEP_FOLDER
+    yield from DATASETS[scheme].scene_files(path, dict(query), open_labels)
 
 
 def _facts_of(paths: Iterable[Path]) -> Iterator[tuple[str, int, int]]:
@@ -289,9 +257,6 @@ def _builder() -> tuple[str, ...]:
 
 _DIGEST_FORMAT = 1
 _DIGESTS = "digests"
-_WHOLE = ("scene", "gaussians")  # schemes
-# Endings of the files that belong to a folder of splats: splats, and what lies beside them.
-_SPLAT_FILES = {*splat_suffixes(), ".json", ".txt", ".bin", ".webp"}
 _IMAGES_OF_DRIVES = {".jpg", ".jpeg", ".png", ".webp"}
 _MAX_WHOLE_BYTES = 1 << 20
 _IMAGE_SAMPLE_BYTES = 1 << 12
@@ -309,8 +274,8 @@ def scene_digest(uri: str) -> str | None:
     try:
         scheme, path, query = parse_uri(uri)
         scheme = scheme or detect_scheme(Path(path))
-        entry = SCHEMES[scheme or ""]
-        if path in entry.builtin:
+        dataset = DATASETS[scheme or ""]
+        if path in dataset.builtin:
             return _sha256([_DIGEST_FORMAT, scheme, sorted(query.items()), augment.__version__])
         files = _digest_files(str(scheme), path, query)
         return _cached_digest([scheme, os.path.abspath(path), sorted(query.items())], files)
@@ -321,20 +286,16 @@ def scene_digest(uri: str) -> str | None:
 def _digest_files(scheme: str, path: str, query: Mapping[str, str]) -> dict[str, tuple[Path, bool]]:
     """Return the scene's files by name: the path of each, and whether it is read whole."""
     root = Path(path)
-    places: list[Path] = [root]
-    if scheme == "nuscenes":
-        places = [folder.parent for folder in sorted(root.glob("*/sample.json"))]
-    elif scheme == "scene" and root.is_dir():
-        places = [root / name for name in (*SCENE_FILES, LEVELS) if (root / name).is_file()]
-    elif scheme in ("waymo", "kitti", "recording"):
+    dataset = DATASETS[scheme]
+    if dataset.content_files is not None:
+        places = dataset.content_files(path)
+    else:
         options = {key: value for key, value in query.items() if not Path(value).is_file()}
-        places = list(_files_of(scheme, path, options, lambda: None))
+        places = dataset.scene_files(path, options, lambda: None)
     files: dict[str, tuple[Path, bool]] = {}
     for place in places:
-        for file in _visible_files(place) if place.is_dir() else (place,):
-            if scheme == "gaussians" and root.is_dir() and file.suffix.lower() not in _SPLAT_FILES:
-                continue
-            files[os.path.relpath(file, root)] = file, scheme in _WHOLE
+        for file in visible_files(place) if place.is_dir() else (place,):
+            files[os.path.relpath(file, root)] = file, dataset.is_hashed_whole
     for key, value in query.items():  # of cameras, say
         if Path(value).is_file():
             files[f"?{key}"] = Path(value), True
@@ -343,7 +304,7 @@ def _digest_files(scheme: str, path: str, query: Mapping[str, str]) -> dict[str,
     return files
 
 
-def _visible_files(folder: Path) -> Iterator[Path]:
+def visible_files(folder: Path) -> Iterator[Path]:
     """Return the files below a folder, without hidden ones and those of outputs that were
     written there.
     """

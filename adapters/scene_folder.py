@@ -14,7 +14,8 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, SCHEMES, format_uri, parse_uri
+from adapters.datasets import DATASETS
+from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, format_uri, parse_uri
 from augment.errors import AdapterError
 from augment.files.scene_file import read_saved_scene
 from augment.scene.cameras import Frame
@@ -38,7 +39,7 @@ class Recording:
 
     @property
     def is_there(self) -> bool:
-        return self.path in SCHEMES[self.scheme].builtin or Path(self.path).exists()
+        return self.path in DATASETS[self.scheme].builtin or Path(self.path).exists()
 
 
 def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
@@ -106,7 +107,7 @@ def recorded_labels(recording: Recording) -> LabelSource | None:
     if CAMERA_PATH_KEY in recording.query:  # the frames are not the recorded ones
         return None
     query = {key: value for key, value in recording.query.items() if key != GROUND_KEY}
-    return SCHEMES[recording.scheme].open_labels(recording.path, query)
+    return DATASETS[recording.scheme].open_labels(recording.path, query)
 
 
 def _recording_of_query(uri: str) -> Recording:
@@ -130,9 +131,9 @@ def _recording(uri: str, working_folder: Path) -> Recording | None:
         scheme, path, query = parse_uri(uri)
     except AdapterError:
         return None
-    if scheme is None or scheme not in SCHEMES or scheme == "scene":
+    if scheme is None or scheme not in DATASETS or scheme == "scene":
         return None
-    if path in SCHEMES[scheme].builtin:
+    if path in DATASETS[scheme].builtin:
         return Recording(scheme, path, query)
     return Recording(scheme, os.path.normpath(working_folder / path), query)
 

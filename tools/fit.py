@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from adapters.base import open_scene
+from adapters.datasets import DATASETS
 from adapters.training_views.checks import check_views, with_camera_times
 from adapters.training_views.starting_scene import complete_starting_scene
 from adapters.training_views.views import RecordedViews, holdout_step
-from adapters.uri import SCHEMES, format_uri
+from adapters.uri import format_uri
 from augment.errors import AdapterError, ClimateGSError
 from augment.files.scene_file import is_scene_folder, save_scene
 from augment.photo.trust import judge_scene
@@ -382,7 +383,7 @@ def _can_hold_out(scheme: str, path: str) -> bool:
         from adapters.street_gaussians.model import is_dataset
 
         return is_dataset(Path(path))
-    return scheme in SCHEMES and SCHEMES[scheme].is_raw
+    return scheme in DATASETS and DATASETS[scheme].is_raw
 
 
 def _check_recorded(scene: Scene) -> None:

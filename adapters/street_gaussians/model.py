@@ -21,6 +21,7 @@ from adapters.camera_files.camera_files import validate
 from adapters.plain_files import read_yaml
 from adapters.raw_drive import DriveOptions
 from adapters.street_gaussians.data import ModelConfig, Number
+from adapters.street_gaussians.dataset import DATA_FOLDERS
 from adapters.uri import UriOptions
 from augment.errors import AdapterError, SceneError
 from augment.files.checkpoints import (
@@ -117,8 +118,6 @@ def read_config(path: Path) -> ModelConfig:
 
 # ---- Where the files of a trained model are ------------------------------------------------------
 
-_DATA_FOLDERS = ("ego_pose", "extrinsics", "track")
-
 
 @dataclass(frozen=True)
 class ModelFiles:
@@ -143,7 +142,7 @@ class ModelFiles:
 
 def is_dataset(path: Path) -> bool:
     """Return True if a path is a dataset's folder and not a model's."""
-    return all((path / name).is_dir() for name in _DATA_FOLDERS) and not _find_saved_weights(path)
+    return all((path / name).is_dir() for name in DATA_FOLDERS) and not _find_saved_weights(path)
 
 
 def find_model(path: Path, options: ModelOptions) -> ModelFiles:
@@ -184,7 +183,7 @@ def _weights_of_folder(path: Path, options: ModelOptions) -> tuple[Path, Path, i
         raise AdapterError(
             f"{path} is no Street Gaussians model and no dataset of one: expected "
             f"trained_model/iteration_N.pth or point_cloud/iteration_N/point_cloud.ply in it, or "
-            f"{', '.join(f'{name}/' for name in _DATA_FOLDERS)}"
+            f"{', '.join(f'{name}/' for name in DATA_FOLDERS)}"
         )
     kind = options.weights or ("pth" if "pth" in saved else "ply")
     if kind not in saved:

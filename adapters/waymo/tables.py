@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from adapters.plain_files import LARGEST, checked_pose
 from adapters.raw_drive import describe_frames
 from adapters.scene_cache import image_folder
-from adapters.uri import WAYMO_REQUIRED, WAYMO_SPLITS
+from adapters.waymo.dataset import POSES, REQUIRED, SPLITS
 from augment.errors import AdapterError
 from augment.files.packed_images import NUMBER_LISTS, Lens, PackedImages, is_number, parquet_errors
 from augment.output.manifest import MAX_SIDE_PX
@@ -80,8 +80,8 @@ def find_segment(path: Path, segment_name: str | None) -> SegmentFiles:
 
     segment_name: the segment's name or the first part of it; None for the only one."""
     files = SegmentFiles("", path, is_alone=True)
-    if files.has(WAYMO_REQUIRED[0]):
-        file = files.path(WAYMO_REQUIRED[0])
+    if files.has(POSES):
+        file = files.path(POSES)
         with parquet_errors(file):
             table = read_table(file, str(file), [SEGMENT])
         names = set(_segment_names(table, file))
@@ -89,13 +89,13 @@ def find_segment(path: Path, segment_name: str | None) -> SegmentFiles:
     else:
         segments = {
             file.stem: SegmentFiles(file.stem, folder)
-            for folder in (path, *(path / split for split in WAYMO_SPLITS))
-            for file in sorted((folder / WAYMO_REQUIRED[0]).glob("*.parquet"))
+            for folder in (path, *(path / split for split in SPLITS))
+            for file in sorted((folder / POSES).glob("*.parquet"))
         }
     if not segments:
         raise AdapterError(
             f"{path} holds no segment of the Waymo Open Dataset v2; expected "
-            f"{WAYMO_REQUIRED[0]}/SEGMENT.parquet in it or in its {', '.join(WAYMO_SPLITS)}"
+            f"{POSES}/SEGMENT.parquet in it or in its {', '.join(SPLITS)}"
         )
     names = sorted(segments)
     if segment_name is not None:
@@ -397,10 +397,10 @@ def read_segment(files: SegmentFiles) -> Segment:
     lasers = _read_lasers(files) if files.has("lidar_calibration") else {}
     segment = Segment(files, stamps, poses, stamps * 1000 + _SPIN_NS // 2, cameras, lasers, {}, ())
     shots, problems = _read_shots(segment) if cameras and files.has("camera_image") else ({}, ())
-    if missing := [name for name in WAYMO_REQUIRED if not files.has(name)]:
+    if missing := [name for name in REQUIRED if not files.has(name)]:
         sentence = (
             f"the segment lacks {', '.join(str(files.path(name)) for name in missing)}; a scene "
-            f"needs the components {', '.join(WAYMO_REQUIRED)}, download them too"
+            f"needs the components {', '.join(REQUIRED)}, download them too"
         )
         problems = (sentence, *problems)
     times = [

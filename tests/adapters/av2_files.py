@@ -1,6 +1,6 @@
 """An Argoverse 2 log written after the published format, by code of its own.
 
-`write_log`: the little street of pandaset_folder, whose every pixel is known, in a city some
+`write_as_av2`: the tiny street, whose every pixel is known, in a city some
 kilometres from its origin. The car drives 8 m/s along the street's x and turns to the left on the
 spot, so that every moment has another pose. Two LiDARs turn clockwise half a turn apart.
 """
@@ -13,10 +13,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pandaset_folder as street
 import pyarrow as pa
 import pyarrow.feather as feather
 from scipy.spatial.transform import Rotation
+
+from tests.adapters import street
+from tests.adapters.street import PARKED_AT, PARKED_SIZE_M, Drive, LabelledBox, View, rigid
 
 NAME = "0a1b2c3d-0000-3000-8000-000000000001"
 START_NS = 315_966_253_660_357_000
@@ -27,18 +29,11 @@ FIRST_NS, TURN_NS = 2_654_000, 100_000_000
 YAW_RADPS, EGO_ABOVE_M = 0.25, 0.3
 GROUND_Z = street.GROUND_Z
 CAR, PARKED = "11111111-aaaa", "22222222-bbbb"
-PARKED_AT, PARKED_SIZE_M = np.array([-7.0, -5.0, 0.4]), np.array([4.5, 1.9, 1.6])
 EGO_CV = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # ego_from_camera of one that looks ahead
 
 
-def rigid(rotation: np.ndarray, place: Sequence[float]) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, place
-    return pose
-
-
 def turned(degrees: float) -> np.ndarray:
-    return Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    return street.turn(2, np.radians(degrees))
 
 
 CITY_FROM_STREET = rigid(turned(30), [5172.668, 2419.103, 66.93])
@@ -92,15 +87,9 @@ def sweep(frame: int) -> dict[str, np.ndarray]:
     at the stamp."""
     rng = np.random.default_rng(frame)
     stamp = STAMPS_NS[frame]
-    x, y = np.meshgrid(np.arange(-8, 30, 0.25), np.arange(-6, street.WALL_Y, 0.25))
-    ground = np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_Z)], 1)
-    ground[:, :2] += rng.uniform(-0.1, 0.1, (len(ground), 2))
-    x, z = np.meshgrid(np.arange(-8, 30, 0.25), np.arange(0, street.WALL_TOP_M, 0.25))
-    wall = np.stack([x.ravel(), np.full(x.size, street.WALL_Y), z.ravel()], 1)
-    a, b = rng.uniform(-0.5, 0.5, 700), rng.uniform(-0.4, 0.5, 700)
-    half = np.full_like(a, 0.5)
-    faces = [np.stack(face, 1) for face in ([-half, a, b], [a, -half, b], [a, b, half])]
-    local = np.concatenate(faces) * street.CAR_SIZE_M
+    ground, wall, local = street.scattered_surfaces(
+        rng, step_m=0.25, reach_m=30, jitter_m=0.1, num_on_face=700
+    )
     ego_from_street = np.linalg.inv(street_from_ego((stamp - START_NS) * 1e-9))
 
     def met(points: np.ndarray, sensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -155,7 +144,7 @@ def write_table(path: Path, columns: Mapping[str, object]) -> None:
     feather.write_feather(pa.table(dict(columns)), path)
 
 
-def write_log(root: Path, *, cameras: Sequence[str] = tuple(CAMERAS)) -> Path:
+def write_as_av2(root: Path, *, cameras: Sequence[str] = tuple(CAMERAS)) -> Path:
     """Write a log into a folder; returns the folder."""
     steps = np.arange(-80_000_000, 520_000_000, 4_300_000) + START_NS
     times = np.unique(np.concatenate([steps, STAMPS_NS]))
@@ -192,15 +181,73 @@ def write_log(root: Path, *, cameras: Sequence[str] = tuple(CAMERAS)) -> Path:
     return root
 
 
+def drive_of_av2(root: Path) -> Drive:
+    times_ns = dict(enumerate(STAMPS_NS))
+    views: dict[int, dict[str, View]] = {n: {} for n in times_ns}
+    for n, stamp in times_ns.items():
+        for name in CAMERAS:
+            nearest = min(image_times_ns(name), key=lambda time, stamp=stamp: abs(time - stamp))
+            views[n][name] = View(nearest, city_from_ego(nearest) @ CAMERAS[name][0])
+    # Argoverse's whole numbers are the middles of pixels, ours are their corners.
+    lenses = {
+        name: (*size, fx, fy, cx + 0.5, cy + 0.5)
+        for name, (_, size, (fx, fy, cx, cy), _) in CAMERAS.items()
+    }
+
+    def in_city(place: np.ndarray) -> np.ndarray:
+        return (CITY_FROM_STREET @ np.append(place, 1))[:3]
+
+    def world_from_car(timestamp_ns: int) -> np.ndarray:
+        time_s = (timestamp_ns - START_NS) * 1e-9
+        return CITY_FROM_STREET @ rigid(np.eye(3), street.car_centre(time_s))
+
+    parked = LabelledBox("BOX_TRUCK", in_city(PARKED_AT), PARKED_SIZE_M)
+    points_m = {}
+    for n, stamp in times_ns.items():
+        columns = sweep(n)
+        pose = city_from_ego(stamp)
+        local = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
+        points_m[n] = local @ pose[:3, :3].T + pose[:3, 3]
+    return Drive(
+        scheme="av2",
+        path=root,
+        name=root.name,
+        times_ns=times_ns,
+        world_from_ego={n: city_from_ego(stamp) for n, stamp in times_ns.items()},
+        views=views,
+        lenses=lenses,
+        boxes={
+            n: {
+                CAR: LabelledBox("REGULAR_VEHICLE", in_city(car_met(stamp)), street.CAR_SIZE_M),
+                PARKED: parked,
+            }
+            for n, stamp in times_ns.items()
+        },
+        points_m=points_m,
+        car=CAR,
+        world_from_car=world_from_car,
+        # Heights of 16 bits: 6 cm apart at 67 m.
+        ground_z_m=float(np.float16(GROUND_Z + CITY_FROM_STREET[2, 3])),
+        min_psnr_db=23.5,
+        pose_atol=2e-6,  # between two poses 4 ms apart the drive is straight to a micrometre
+        # Half a degree of bearing, which returns of 16 bits are wrong by, is 0.14 ms.
+        car_atol_m=0.01,
+    )
+
+
+def car_met(stamp_ns: int) -> np.ndarray:
+    """Place in the street at which the LiDARs of a sweep meet the car."""
+    time_s = (stamp_ns - START_NS) * 1e-9
+    middle = street.car_centre(time_s + 0.05)
+    return street.car_centre(time_s + met_ns(middle, stamp_ns) * 1e-9)
+
+
 def write_annotations(root: Path) -> None:
     rows: list[dict[str, object]] = []
     for stamp in STAMPS_NS:
         ego_from_city = np.linalg.inv(city_from_ego(stamp))
-        time_s = (stamp - START_NS) * 1e-9
-        car = street.car_centre(time_s + 0.05)
-        car = street.car_centre(time_s + met_ns(car, stamp) * 1e-9)
         things = {
-            CAR: ("REGULAR_VEHICLE", car, street.CAR_SIZE_M, 900),
+            CAR: ("REGULAR_VEHICLE", car_met(stamp), street.CAR_SIZE_M, 900),
             PARKED: ("BOX_TRUCK", PARKED_AT, PARKED_SIZE_M, 0),
         }
         for name, (category, place, size, count) in things.items():

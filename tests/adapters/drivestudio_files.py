@@ -18,6 +18,8 @@ import torch
 import yaml
 from scipy.spatial.transform import Rotation
 
+from tests.adapters.street import rigid, turn
+
 FRAMES, START, COUNT = 6, 1, 5
 CAMERAS = (0, 2, 3)  # numbers; the third is 866 pixels high in Waymo
 DOWNSCALE = 30
@@ -51,25 +53,14 @@ class Numbers:
     flat_from_model: np.ndarray
 
 
-def turn_z(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
-
-
-def pose(rotation: np.ndarray, place) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation, place
-    return out
-
-
 def dataset_from_ego(frame: int) -> np.ndarray:
-    return pose(turn_z(0.6 + 0.02 * frame), [3000 + 0.9 * frame, -2000 + 0.6 * frame, 55.0])
+    return rigid(turn(2, 0.6 + 0.02 * frame), [3000 + 0.9 * frame, -2000 + 0.6 * frame, 55.0])
 
 
 def ego_from_opencv(position: int) -> np.ndarray:
     """The mounting of a camera, the second and third looking to the right and left."""
     yaw = (0.0, -0.7, 0.9)[position]
-    return pose(turn_z(yaw) @ OPENCV_AXES, [1.5, (0.0, -0.2, 0.3)[position], 1.6])
+    return rigid(turn(2, yaw) @ OPENCV_AXES, [1.5, (0.0, -0.2, 0.3)[position], 1.6])
 
 
 def quat_of(rotation: np.ndarray) -> np.ndarray:
@@ -82,7 +73,7 @@ def rotation_of(quat: np.ndarray) -> np.ndarray:
     return Rotation.from_quat(np.roll(quat, -1)).as_matrix()
 
 
-def write_run(
+def write_as_drivestudio(
     folder: Path, *, dataset: str = "waymo", degree: int = 1, config: dict | None = None
 ) -> Numbers:
     """The run at folder/run and its data at folder/data/007. config: dotted keys that differ."""
@@ -91,7 +82,7 @@ def write_run(
     car_axes = RIGHT_AXES if dataset == "pandaset" else np.eye(3)
     egos = [dataset_from_ego(frame) for frame in range(FRAMES)]
     cameras = [[ego @ ego_from_opencv(p) for p in range(3)] for ego in egos]
-    cars = [ego @ pose(car_axes, [0, 0, 0]) for ego in egos]
+    cars = [ego @ rigid(car_axes, [0, 0, 0]) for ego in egos]
     flat_from_model = OPENCV_AXES if dataset == "nuscenes" else car_axes
     dataset_from_model = cameras[START][0] if dataset == "nuscenes" else cars[START]
     model_from_camera = np.stack(
@@ -171,13 +162,13 @@ def make_models(
 
     ahead = rng.uniform([6, -9, -1], [25, 9, 4], (80, 3))
     background = gaussians(turned(ahead), 0.8)
-    rigid = gaussians(rng.uniform(-0.9, 0.9, (40, 3)), 0.4)
-    rigid["points_ids"] = torch.arange(40)[:, None] % 2
+    rigid_nodes = gaussians(rng.uniform(-0.9, 0.9, (40, 3)), 0.4)
+    rigid_nodes["points_ids"] = torch.arange(40)[:, None] % 2
     sizes = np.array([[4.0, 1.8, 1.5], [4.5, 1.9, 1.6]])
-    rigid["instances_size"] = floats(sizes @ np.abs(box_axes))
+    rigid_nodes["instances_size"] = floats(sizes @ np.abs(box_axes))
     visible = torch.ones(COUNT, 2, dtype=torch.bool)
     visible[2, 1] = False
-    rigid["instances_fv"] = visible
+    rigid_nodes["instances_fv"] = visible
     places, quats = np.zeros((COUNT, 2, 3)), np.zeros((COUNT, 2, 4))
     for at in range(COUNT):
         # The held-out pose of the first is far from between its neighbours: it was not trained.
@@ -185,14 +176,14 @@ def make_models(
         places[at] = [[8 + 0.7 * at**1.2 + off, 1.5, 0.3], [13 - 0.5 * at, -2.5, 0.2]]
         for index, heading in enumerate((0.4, 2.9)):
             # Straight ahead: colours that stay with the world cannot be had of what turns.
-            rotation = flat_from_model.T @ turn_z(heading) @ box_axes
+            rotation = flat_from_model.T @ turn(2, heading) @ box_axes
             quats[at, index] = quat_of(rotation) * (1.3 + at)
-    rigid["instances_trans"] = floats(turned(places))
-    rigid["instances_quats"] = floats(quats)
+    rigid_nodes["instances_trans"] = floats(turned(places))
+    rigid_nodes["instances_quats"] = floats(quats)
     images = COUNT * len(CAMERAS)
     return {
         "Background": background,
-        "RigidNodes": rigid,
+        "RigidNodes": rigid_nodes,
         "SMPLNodes": OrderedDict(_means=torch.zeros(7, 3), smpl_qauts=torch.zeros(1, 1, 23, 4)),
         "DeformableNodes": OrderedDict(_means=torch.zeros(5, 3)),
         "Sky": OrderedDict(base=floats(rng.uniform(0, 1.1, (6, 8, 8, 3)))),
@@ -232,7 +223,7 @@ def _write_data(data: Path, dataset: str, cars: list, cameras: list) -> None:
         np.savetxt(data / "intrinsics" / f"{number}.txt", values)
         if is_fixed:
             axes = OPENCV_AXES.T if dataset == "waymo" else np.eye(3)
-            mounting = ego_from_opencv(position) @ pose(axes, [0, 0, 0])
+            mounting = ego_from_opencv(position) @ rigid(axes, [0, 0, 0])
             np.savetxt(data / "extrinsics" / f"{number}.txt", mounting)
     for frame in range(FRAMES):
         np.savetxt(poses / f"{frame:03d}.txt", cars[frame])
@@ -256,20 +247,20 @@ def lidar_rows(dataset: str, frame: int) -> np.ndarray:
     return np.random.default_rng(100 + frame).uniform(-20, 20, shape).astype("<f4")
 
 
-def _write_objects(data: Path, rigid: dict, dataset_from_model: np.ndarray) -> None:
+def _write_objects(data: Path, rigid_nodes: dict, dataset_from_model: np.ndarray) -> None:
     """A pedestrian first, then the model's two in the other order, each a hand's breadth away."""
-    walk = [pose(np.eye(3), [3000.0, -2000.0, 55.0]).tolist()] * FRAMES
+    walk = [rigid(np.eye(3), [3000.0, -2000.0, 55.0]).tolist()] * FRAMES
     info = {"0": _object("walker", "Pedestrian", range(FRAMES), walk, [0.6, 0.6, 1.8])}
     for key, index in (("1", 1), ("2", 0)):
         frames, poses = [], []
         for at in range(COUNT):
-            if bool(rigid["instances_fv"][at, index]):
-                quat = rigid["instances_quats"][at, index].double().numpy()
-                place = rigid["instances_trans"][at, index].double().numpy()
+            if bool(rigid_nodes["instances_fv"][at, index]):
+                quat = rigid_nodes["instances_quats"][at, index].double().numpy()
+                place = rigid_nodes["instances_trans"][at, index].double().numpy()
                 place = place + np.array([0.06, 0, 0.02])
                 frames.append(START + at)
-                poses.append((dataset_from_model @ pose(rotation_of(quat), place)).tolist())
-        size = rigid["instances_size"][index].double().tolist()
+                poses.append((dataset_from_model @ rigid(rotation_of(quat), place)).tolist())
+        size = rigid_nodes["instances_size"][index].double().tolist()
         info[key] = _object(f"car-{'ab'[index]}", "Vehicle", frames, poses, size)
     (data / "instances" / "instances_info.json").write_text(json.dumps(info))
 

@@ -13,6 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tests.adapters.street import Drive, LabelledBox, View, box_distance, nearest_hits, rigid, turn
+
 FRAMES, FRAME_S, SPEED_MPS, CAR_MPS = 3, 0.1, 8.0, 12.0
 START = "2011-09-26 13:02:25"
 START_NS = 1_317_042_145_000_000_000
@@ -23,20 +25,6 @@ SKY, WALL, END, CAR = np.array([[120.0, 160, 220], [200, 180, 130], [90, 110, 80
 ROAD, LINE = np.full(3, 90.0), np.full(3, 230.0)
 LATITUDE, LONGITUDE, ALTITUDE, YAW = 49.011212804408, 8.422885075119, 112.83, 0.35
 EARTH_M = 6378137.0
-
-
-def turn(axis: int, angle: float) -> np.ndarray:
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = np.cos(angle)
-    matrix[j, i], matrix[i, j] = np.sin(angle), -np.sin(angle)
-    return matrix
-
-
-def rigid(rotation: np.ndarray, translation) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, translation
-    return pose
 
 
 AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # a camera's axes in the Velodyne's
@@ -65,30 +53,23 @@ def world_from_street() -> np.ndarray:
     return rigid(turn(2, YAW), [scale * LONGITUDE * np.pi / 180, north, ALTITUDE])
 
 
-def car_centre(frame: int) -> np.ndarray:
+def car_centre(frame: float) -> np.ndarray:
     return np.array([10 + CAR_MPS * FRAME_S * frame, 2.5, GROUND_Z + CAR_SIZE_M[2] / 2])
 
 
 def colour_at(origin: np.ndarray, rays: np.ndarray, frame: int) -> np.ndarray:
     """What is seen along rays [.., 3] from a point of the street, RGB 0 to 255."""
-    best = np.full(rays.shape[:-1], np.inf)
-    colour = np.broadcast_to(SKY, rays.shape).copy()
     with np.errstate(divide="ignore", invalid="ignore"):
         ground = (GROUND_Z - origin[2]) / rays[..., 2]
         wall = (WALL_Y - origin[1]) / rays[..., 1]
         end = (END_X - origin[0]) / rays[..., 0]
-        low = (car_centre(frame) - CAR_SIZE_M / 2 - origin) / rays
-        high = (car_centre(frame) + CAR_SIZE_M / 2 - origin) / rays
-    enter, leave = np.fmin(low, high).max(-1), np.fmax(low, high).min(-1)
-    side = origin[1] + ground * rays[..., 1]
-    paint = np.where((np.abs(side + 1.5) < 0.25)[..., None], LINE, ROAD)
-    for distance, what in ((ground, paint), (wall, WALL), (end, END)):
+    is_line = np.abs(origin[1] + ground * rays[..., 1] + 1.5) < 0.25
+    paint = np.where(is_line[..., None], LINE, ROAD)
+    hits = [(box_distance(origin - car_centre(frame), rays, CAR_SIZE_M), CAR)]
+    for distance, colour in ((ground, paint), (wall, WALL), (end, END)):
         z = origin[2] + distance * rays[..., 2]
-        hit = (distance > 0) & (distance < best) & (z < WALL_TOP) & (z > GROUND_Z - 1e-6)
-        colour[hit] = what[hit] if what.ndim > 1 else what
-        best[hit] = distance[hit]
-    colour[(enter > 0) & (enter < leave) & (enter < best)] = CAR
-    return colour
+        hits.append((np.where((z < WALL_TOP) & (z > GROUND_Z - 1e-6), distance, np.inf), colour))
+    return nearest_hits(SKY, hits)[1]
 
 
 def points_at(frame: int) -> np.ndarray:
@@ -136,7 +117,7 @@ class Tracklet:
     size: tuple[float, float, float] = tuple(CAR_SIZE_M)
 
 
-def write_raw(day: Path, *, frames: int = FRAMES, cameras=("02", "03")) -> Path:
+def write_as_kitti(day: Path, *, frames: int = FRAMES, cameras=("02", "03")) -> Path:
     """Write a day's folder with calibration and one drive; returns the drive's folder."""
     drive = day / "2011_09_26_drive_0001_sync"
     write_calibration(day)
@@ -154,6 +135,48 @@ def write_raw(day: Path, *, frames: int = FRAMES, cameras=("02", "03")) -> Path:
     write_times(drive / "oxts", frames, offset_ms=7)
     write_tracklets(drive, [moving_tracklet(frames), Tracklet(1, ((9.0, -4, -1.7, 0, 0, 0),))])
     return drive
+
+
+def drive_of_kitti(root: Path) -> Drive:
+    world = world_from_street()
+    times_ns = {n: START_NS + 100_000_001 * n for n in range(FRAMES)}
+    world_from_velo = {n: world @ street_from_velo(n) for n in times_ns}
+
+    def view(n: int, number: str) -> View:
+        matrix = PROJECTIONS[number]
+        shift = rigid(np.eye(3), np.linalg.solve(matrix[:, :3], matrix[:, 3]))
+        world_from_camera = world_from_velo[n] @ np.linalg.inv(shift @ R_RECT @ VELO_TO_CAM)
+        return View(times_ns[n] + 3_000_000, world_from_camera)
+
+    def in_world(places: np.ndarray, pose: np.ndarray = world) -> np.ndarray:
+        return places @ pose[:3, :3].T + pose[:3, 3]
+
+    boxes = {n: {"0": LabelledBox("Car", in_world(car_centre(n)), CAR_SIZE_M)} for n in times_ns}
+    parked = np.array([9, -4, -1.7 + CAR_SIZE_M[2] / 2])
+    boxes[1]["1"] = LabelledBox("Car", in_world(parked, world_from_velo[1]), CAR_SIZE_M)
+    return Drive(
+        scheme="kitti",
+        path=root,
+        name=root.name,
+        times_ns=times_ns,
+        world_from_ego=world_from_velo,
+        views={n: {f"image_{c}": view(n, c) for c in ("02", "03")} for n in times_ns},
+        lenses={
+            f"image_{c}": (WIDTH, HEIGHT, *PROJECTIONS[c][[0, 1, 0, 1], [0, 1, 2, 2]])
+            for c in ("02", "03")
+        },
+        boxes=boxes,
+        points_m={n: in_world(points_at(n)) for n in times_ns},
+        car="0",
+        world_from_car=lambda time: world @ rigid(np.eye(3), car_centre((time - START_NS) * 1e-8)),
+        ground_z_m=ALTITUDE + GROUND_Z,
+        pose_atol=2e-6,
+        box_atol_m=2e-6,
+        point_atol_m=1e-5,  # float32 in the file
+        car_atol_m=1e-5,
+        min_psnr_db=23.5,
+        ground_atol_m=0.03,
+    )
 
 
 def moving_tracklet(frames: int) -> Tracklet:
@@ -262,7 +285,7 @@ OBJECT_FROM_VELO = PROJECTIONS["02"] @ OBJECT_VELO_TO_CAM
 STREET_FROM_OBJECT = rigid(np.eye(3), [0, 0, 0.8])  # the Velodyne of an object frame
 
 
-def write_object(root: Path, numbers=(1,)) -> Path:
+def write_as_kitti_object(root: Path, numbers=(1,)) -> Path:
     """Write an object folder; frame n is the street at its moment n."""
     for number in numbers:
         name = f"{number:06d}"

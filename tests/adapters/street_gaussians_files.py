@@ -16,6 +16,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tests.adapters.street import box_distance, nearest_hits, rigid, turn
+
 NAMES = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 CAMERA_YAWS = np.radians([0.0, 45.0, -45.0, 90.0, -90.0])
 CAMERA_DELAYS_S = (0.021, 0.013, 0.029, 0.007, 0.037)
@@ -128,10 +130,7 @@ class Facts:
 
 
 def pose_about_z(angle: float, position: Sequence[float]) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    pose[:3, 3] = position
-    return pose
+    return rigid(turn(2, angle), position)
 
 
 WORLD_FROM_STREET = pose_about_z(STREET_YAW, STREET_ORIGIN_M)
@@ -152,7 +151,7 @@ def image_size(size: tuple[int, int], camera: int) -> tuple[int, int]:
     return size if camera < 3 else (size[0], round(size[1] * 886 / 1280))
 
 
-def write_dataset(
+def write_as_street_gaussians(
     root: Path,
     *,
     frames: int = 4,
@@ -334,28 +333,15 @@ def picture(facts: Facts, number: int, camera: int) -> np.ndarray:
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], -1) @ pose[:3, :3].T
     eye = pose[:3, 3]
-    nearest = np.full((height, width), np.inf)
-    rgb = np.broadcast_to(np.array(SKY_RGB, np.uint8), (height, width, 3)).copy()
     with np.errstate(divide="ignore", invalid="ignore"):
-        road = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf)
-        hits = [(road, ROAD_RGB)]
+        hits = [(np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf), ROAD_RGB)]
         for side in (-WALL_Y_M, WALL_Y_M):
             reach = (side - eye[1]) / rays[..., 1]
             z = eye[2] + reach * rays[..., 2]
-            hits.append((np.where((reach > 0) & (z < WALL_TOP_M), reach, np.inf), WALL_RGB))
-        for found in facts.objects:
-            if found.is_in(number - facts.numbers[0]):
-                hits.append((_box_hit(eye, rays, found, seconds), found.rgb))
-    for reach, colour in hits:
-        nearer = reach < nearest
-        nearest[nearer], rgb[nearer] = reach[nearer], colour
-    return rgb
-
-
-def _box_hit(eye: np.ndarray, rays: np.ndarray, found: StreetObject, seconds: float) -> np.ndarray:
-    rotation = pose_about_z(found.heading, (0, 0, 0))[:3, :3]
-    start, along = (eye - found.centre(seconds)) @ rotation, rays @ rotation
-    half = np.array(found.size_m) / 2
-    a, b = (-half - start) / along, (half - start) / along
-    enter, leave = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
-    return np.where((enter < leave) & (enter > 0), enter, np.inf)
+            hits.append((np.where(z < WALL_TOP_M, reach, np.inf), WALL_RGB))
+    for thing in facts.objects:
+        if thing.is_in(number - facts.numbers[0]):
+            rotation = turn(2, thing.heading)
+            local = (eye - thing.centre(seconds)) @ rotation
+            hits.append((box_distance(local, rays @ rotation, thing.size_m), thing.rgb))
+    return nearest_hits(SKY_RGB, hits)[1].astype(np.uint8)

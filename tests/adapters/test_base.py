@@ -10,19 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fitted_scenes import assert_same, fitted_scene
 from hypothesis import given
 from hypothesis import strategies as st
-from pandaset_folder import write_sequence
-from splat_scenes import street
 
 from adapters.base import detect_scheme_of_path, expand_job_scenes, open_scene
 from adapters.camera_files.camera_files import read_views
-from adapters.detect_format import FILES, FOLDERS, describe_unrecognised, detect_scheme
+from adapters.datasets import DATASETS
+from adapters.detect_format import describe_unrecognised, detect_scheme
 from adapters.drivestudio.drive import read_config as drivestudio_config
 from adapters.lidar_scene.image_views import read_image
 from adapters.nuscenes.tables import read_rows
-from adapters.pandaset import PandaSetLabels
+from adapters.pandaset.adapter import PandaSetLabels
 from adapters.plain_files import check_image, read_json, read_numbers, read_pose, resolve_inside
 from adapters.recording.adapter import read_sweep
 from adapters.safe_pickle import read_array, read_frame
@@ -41,6 +39,9 @@ from augment.jobs.processes import share_scene
 from recipes.errors import RecipeError
 from recipes.job import JobScene, load_job
 from recipes.load import load_recipe
+from tests.adapters.pandaset_files import write_as_pandaset
+from tests.adapters.splat_scenes import street
+from tests.fitted_scenes import assert_same, fitted_scene
 
 
 @pytest.mark.parametrize(
@@ -108,18 +109,6 @@ def test_an_unknown_folder_says_what_it_nearly_is(said: str, tmp_path: Path) -> 
     with pytest.raises(AdapterError) as caught:
         open_scene(str(tmp_path))
     assert re.findall(r"It is nearly ([^.]*(?:\.[^ ][^.]*)*)\. ", str(caught.value)) == [said]
-
-
-def test_a_folder_of_pictures_says_how_it_becomes_a_recording(tmp_path: Path) -> None:
-    for name, words in {
-        "frames/000001.jpg": r"Its images make a recording with their poses: images/<camera>/",
-        "drive.mp4": r"Of a video's frames COLMAP and `climategs record` make a recording",
-    }.items():
-        folder = tmp_path / Path(name).stem
-        (folder / name).parent.mkdir(parents=True)
-        (folder / name).touch()
-        with pytest.raises(AdapterError, match=f"It holds 1 .*{words}"):
-            open_scene(str(folder))
 
 
 def test_names_with_special_characters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,13 +237,12 @@ def test_what_is_not_known_is_answered_with_what_was_looked_for(tmp_path):
     grow(tmp_path / "set" / "seq", dict(TREES)["nuscenes"])
     with pytest.raises(AdapterError) as caught:
         detect_scheme_of_path(tmp_path / "set")
-    for signature in FOLDERS:
-        assert signature.kind_words in str(caught.value)
+    folders = [dataset.folder for dataset in DATASETS.values() if dataset.folder]
+    assert all(signature.describe() in str(caught.value) for signature in folders)
     assert f"give one, such as {tmp_path}/set/seq. Looked for" in str(caught.value)
     (tmp_path / "a.txt").write_text("hello")
-    assert all(
-        signature.kind_words in describe_unrecognised(tmp_path / "a.txt") for signature in FILES
-    )
+    text = describe_unrecognised(tmp_path / "a.txt")
+    assert all(dataset.file.describe() in text for dataset in DATASETS.values() if dataset.file)
 
 
 @pytest.mark.parametrize(
@@ -264,10 +252,6 @@ def test_what_is_not_known_is_answered_with_what_was_looked_for(tmp_path):
         (["a/1.jpg", "a/2.jpg", "b/3.jpg", "x.db"], r"It holds 3 \.jpg \(a/ and others\), 1 \.db\. "
          r"Its images make a recording with their poses: images/<camera>/000000\.jpg and calib"),
         (["drive.mp4"], r"It holds 1 \.mp4\. Of a video's frames COLMAP and `climategs record`"),
-        (["images/front/000000.jpg"], r"nearly a recording: images/<camera>/000000\.jpg is there, "
-         r"calibration\.json not"),
-        (["image_02/data/0.png", "velodyne_points/data/0.bin"], r"nearly a KITTI drive: image_02/, "
-         r"velodyne_points/ are there, calib_cam_to_cam\.txt not"),
         (["sensors/lidar/1.feather"], r"nearly an Argoverse 2 log: sensors/lidar/ is there, "
          r"city_SE3_egovehicle\.feather, calibration/intrinsics\.feather, sensors/cameras/ not"),
         (["frames/1.jpg", "sparse/0/cameras.bin", "sparse/0/images.bin"],
@@ -447,7 +431,7 @@ def test_labels_come_from_the_recording(tmp_path):
 def test_a_recording_is_found_from_anywhere_and_after_it_moved(tmp_path, monkeypatch):
     """Its URI and its images are given relative to where the scene was saved."""
     (tmp_path / "raw").mkdir()
-    write_sequence(tmp_path / "raw" / "002")
+    write_as_pandaset(tmp_path / "raw" / "002")
     monkeypatch.chdir(tmp_path)
     image = {"ahead": "raw/002/camera/front_camera/00.jpg"}
     frames = (dataclasses.replace(fitted_scene().frames[0], image_paths=image),)

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from splat_scenes import gaussians_at, street
 
 from adapters.base import open_scene
 from adapters.camera_files.camera_files import PosedView, find_camera_file, look_at_pose, read_views
@@ -33,6 +32,7 @@ from augment.files.formats import read_splats
 from augment.files.ply import write_ply
 from augment.scene.scene import Scene
 from augment.scene.sky import ConstantSky
+from tests.adapters.splat_scenes import gaussians_at, street
 
 # A camera at (1, 2, 3) that looks along world +x with world +z up, OpenCV axes as columns.
 LOOKS_ALONG_X = np.array(

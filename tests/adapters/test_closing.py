@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pandaset_folder
 import torch
 from test_image_views import camera
 
 from adapters.lidar_scene.closing import close_parts
 from adapters.lidar_scene.image_views import View
 from adapters.lidar_scene.split import PointSet, join_tracks
-from adapters.pandaset import open_pandaset
+from adapters.pandaset.adapter import open_pandaset
 from adapters.raw_drive import BoxSample
 from augment.render.buffers import ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene.scene import Gaussians
 from augment.scene.semantics import SemanticClass as Class
+from tests.adapters import pandaset_files
 
 GREY, RED = (90, 90, 90), (200, 30, 30)
 HEIGHT_M = 1.5  # of the camera, over the road
@@ -138,7 +138,7 @@ def test_a_budget_makes_discs_larger_and_is_kept(tmp_path):
 
 
 def test_a_raw_scene_has_no_openings_below_the_horizon(tmp_path):
-    root = pandaset_folder.write_sequence(tmp_path / "002")
+    root = pandaset_files.write_as_pandaset(tmp_path / "002")
     scene = open_pandaset(str(root), {"voxel_m": "0.1", "image_scale": "1", "sky_size": "8"})
     for frame in scene.frames:
         for own in frame.cameras.values():

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 
-import drives
 import numpy as np
 import pytest
 import torch
 
 from adapters.drive_checks import camera_problems, lidar_problems
 from augment.scene.cameras import Camera, Frame
+from tests.adapters import drives
 
 OPENGL = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
 BEHIND = np.array([[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]])

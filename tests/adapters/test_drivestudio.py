@@ -8,11 +8,9 @@ import pickle
 from collections import OrderedDict
 from pathlib import Path
 
-import drivestudio_files as files
 import numpy as np
 import pytest
 import torch
-from drivestudio_files import COUNT, START, STRIDE, quat_of, rotation_of, write_run
 from scipy.spatial.transform import Rotation
 
 from adapters.base import open_scene
@@ -31,6 +29,15 @@ from augment.scene.sky import ConstantSky, CubemapSky, directions_of_cubemap
 from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers
 from recipes.schema import Recipe
+from tests.adapters import drivestudio_files as files
+from tests.adapters.drivestudio_files import (
+    COUNT,
+    START,
+    STRIDE,
+    quat_of,
+    rotation_of,
+    write_as_drivestudio,
+)
 
 FRAME_NS = 100_000_000
 C0 = 0.28209479177387814
@@ -38,7 +45,7 @@ C0 = 0.28209479177387814
 
 @pytest.fixture(scope="module", params=["waymo", "nuscenes", "pandaset", "argoverse"])
 def run(request, tmp_path_factory):
-    numbers = write_run(tmp_path_factory.mktemp(request.param), dataset=request.param)
+    numbers = write_as_drivestudio(tmp_path_factory.mktemp(request.param), dataset=request.param)
     return numbers, open_scene(f"drivestudio:{numbers.folder}")
 
 
@@ -88,7 +95,7 @@ def own_pose_change(row: np.ndarray) -> np.ndarray:
     x = a / np.linalg.norm(a)
     y = b - x.dot(b) * x
     y /= np.linalg.norm(y)
-    return files.pose(np.array([x, y, np.cross(x, y)]), row[:3])
+    return files.rigid(np.array([x, y, np.cross(x, y)]), row[:3])
 
 
 def own_object_pose(rigid: dict, at: int, index: int) -> np.ndarray | None:
@@ -100,8 +107,8 @@ def own_object_pose(rigid: dict, at: int, index: int) -> np.ndarray | None:
         return None
     if at == STRIDE and visible[at - 1, index] and visible[at + 1, index]:
         middle = (places[at - 1, index] + places[at + 1, index]) / 2
-        return files.pose(rotation_of(quats[at + 1, index]), middle)  # it does not turn
-    return files.pose(rotation_of(quats[at, index]), places[at, index])
+        return files.rigid(rotation_of(quats[at + 1, index]), middle)  # it does not turn
+    return files.rigid(rotation_of(quats[at, index]), places[at, index])
 
 
 def world_gaussians(content: dict, chosen: np.ndarray, world: np.ndarray) -> Gaussians:
@@ -171,7 +178,7 @@ def test_images_are_those_composed_from_the_checkpoint(run, at, position):
 
 
 def test_colours_without_spherical_harmonics_are_sigmoids(tmp_path):
-    numbers = write_run(tmp_path, degree=0)
+    numbers = write_as_drivestudio(tmp_path, degree=0)
     scene = open_scene(str(numbers.folder))
     raw = numbers.models["Background"]["_features_dc"]
     assert scene.background.sh.shape[1] == 1
@@ -183,7 +190,7 @@ def test_colours_without_spherical_harmonics_are_sigmoids(tmp_path):
 
 
 def test_degrees_that_training_had_not_switched_on_are_left_out(tmp_path):
-    numbers = write_run(tmp_path, degree=3)
+    numbers = write_as_drivestudio(tmp_path, degree=3)
     path = numbers.folder / "checkpoint_final.pth"
     content = torch.load(path, weights_only=True)
     torch.save({**content, "step": 1999}, path)
@@ -215,7 +222,7 @@ def test_objects_are_those_of_the_data_and_absent_where_not_visible(run):
         pose = scene.actors[0].track.pose_at(times[at]).numpy()
         trained = numbers.models["RigidNodes"]["instances_trans"][at, 0].double().numpy()
         assert np.allclose(pose[:3, 3], flat @ trained, atol=1e-9)
-        assert np.allclose(pose[:3, :3], level @ files.turn_z(0.4), atol=1e-6)
+        assert np.allclose(pose[:3, :3], level @ files.turn(2, 0.4), atol=1e-6)
     between = scene.actors[0].track.pose_at(times[0] + FRAME_NS // 2)[:3, 3].numpy()
     ends = [scene.actors[0].track.pose_at(t)[:3, 3].numpy() for t in times[:2]]
     assert np.allclose(between, np.mean(ends, 0))
@@ -224,20 +231,20 @@ def test_objects_are_those_of_the_data_and_absent_where_not_visible(run):
 @pytest.mark.parametrize(("stride", "is_between"), [(3, True), (5, False)])
 def test_held_out_frames_have_the_middle_of_their_neighbours(tmp_path, stride, is_between):
     """Of position 3; position 1 never has, as the first frame must not be among its neighbours."""
-    numbers = write_run(tmp_path, config={"data.pixel_source.test_image_stride": stride})
+    numbers = write_as_drivestudio(tmp_path, config={"data.pixel_source.test_image_stride": stride})
     path = numbers.folder / "checkpoint_final.pth"
     content = torch.load(path, weights_only=True)
     quats = content["models"]["RigidNodes"]["instances_quats"]
     for at, heading in enumerate((0.1, 0.3, 0.4, 2.0, 0.8)):
-        quats[at, 0] = files.floats(quat_of(files.turn_z(heading)) * (-1) ** at)
+        quats[at, 0] = files.floats(quat_of(files.turn(2, heading)) * (-1) ** at)
     torch.save(content, path)
     track = open_scene(str(numbers.folder)).actors[0].track
     places = numbers.models["RigidNodes"]["instances_trans"][:, 0].double().numpy()
-    between = files.pose(files.turn_z(0.6), (places[2] + places[4]) / 2)
-    trained = files.pose(files.turn_z(2.0), places[3])
+    between = files.rigid(files.turn(2, 0.6), (places[2] + places[4]) / 2)
+    trained = files.rigid(files.turn(2, 2.0), places[3])
     shown = [track.pose_at((START + at) * FRAME_NS).numpy() for at in range(COUNT)]
     assert np.allclose(shown[3], between if is_between else trained, atol=1e-6)
-    assert np.allclose(shown[1], files.pose(files.turn_z(0.3), places[1]), atol=1e-6)
+    assert np.allclose(shown[1], files.rigid(files.turn(2, 0.3), places[1]), atol=1e-6)
 
 
 def test_boxes_and_actors_agree(run):
@@ -262,7 +269,7 @@ def test_sweeps_are_moved_to_the_scene(run):
     axes = {"nuscenes": files.OPENCV_AXES}.get(numbers.dataset, np.eye(3))
     car = {"pandaset": files.RIGHT_AXES}.get(numbers.dataset, np.eye(3))
     moved = np.linalg.inv(numbers.dataset_from_model) @ files.dataset_from_ego(3)
-    moved = files.pose(axes, [0, 0, 0]) @ moved @ files.pose(car, [0, 0, 0])
+    moved = files.rigid(axes, [0, 0, 0]) @ moved @ files.rigid(car, [0, 0, 0])
     sweep = scene.lidar(3)
     first = 3 if is_waymo else 0
     expected = rows[:, first : first + 3] @ moved[:3, :3].T + moved[:3, 3]
@@ -390,7 +397,7 @@ def test_sky_network_is_baked(appearances):
 
 @pytest.fixture
 def numbers(tmp_path):
-    return files.write_run(tmp_path)
+    return files.write_as_drivestudio(tmp_path)
 
 
 def opened(numbers, **query):
@@ -685,8 +692,8 @@ def test_perturbed_poses_are_applied_before_the_learnt_ones(numbers):
 
     change_checkpoint(numbers, change)
     camera = opened(numbers).frame(1).cameras["front_camera"]
-    turned = files.pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), [0, 0, 0])
-    expected = files.ego_from_opencv(0) @ turned @ files.pose(np.eye(3), [0.5, 0, 0])
+    turned = files.rigid(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), [0, 0, 0])
+    expected = files.ego_from_opencv(0) @ turned @ files.rigid(np.eye(3), [0.5, 0, 0])
     assert np.allclose(camera.world_from_camera.numpy(), expected, atol=1e-7)
 
 
@@ -702,9 +709,9 @@ def test_perturbed_poses_are_applied_before_the_learnt_ones(numbers):
 def test_a_car_on_no_road_is_taken_to_stand_level(tmp_path, monkeypatch, dataset, slope, lies):
     level = files.dataset_from_ego
     c, s = np.cos(slope), np.sin(slope)
-    nose_up = files.pose(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), [0, 0, 0])
+    nose_up = files.rigid(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), [0, 0, 0])
     monkeypatch.setattr(files, "dataset_from_ego", lambda frame: level(frame) @ nose_up)
-    scene = opened(files.write_run(tmp_path, dataset=dataset))
+    scene = opened(files.write_as_drivestudio(tmp_path, dataset=dataset))
     assert any("taken to stand level" in problem for problem in scene.problems) == lies
     expected = np.eye(3)[2] if lies else [-s, 0, c]
     assert np.allclose(scene.frames[0].world_from_ego[2, :3].numpy(), expected, atol=1e-12)

@@ -8,11 +8,8 @@ import math
 from pathlib import Path
 
 import numpy as np
-import pandaset_folder
 import pytest
 import torch
-from recording_folder import write_recording
-from splat_scenes import gaussians_at, street
 
 from adapters.base import open_scene
 from adapters.gaussian_files import open_gaussians
@@ -24,6 +21,9 @@ from augment.scene.ground import ground_of, load_open3d
 from augment.scene.labels import ClassifiesLidar, LidarSweep
 from augment.scene.scene import Ground, Scene
 from augment.scene.semantics import SemanticClass
+from tests.adapters import pandaset_files, splat_scenes, street
+from tests.adapters.recording_files import write_as_recording
+from tests.adapters.splat_scenes import gaussians_at
 from tools.inspect import describe_scene, scene_text
 
 SMALL = "voxel_m=0.15&image_scale=0.25&sky_size=16"
@@ -102,27 +102,27 @@ def test_the_real_streets_sources_agree(real: Scene) -> None:
 
 
 def test_pandaset_keeps_what_opening_measured(tmp_path: Path) -> None:
-    root = pandaset_folder.write_sequence(tmp_path / "002")
+    root = pandaset_files.write_as_pandaset(tmp_path / "002")
     scene = open_scene(f"pandaset:{root}?{SMALL}")
     assert scene.ground is not None and scene.ground.source == "lidar labels"
     assert scene.ground_z_m == scene.ground.lowest_z_m
     assert ground_of(scene) is scene.ground
     again = ground_of(dataclasses.replace(scene, ground=None))
     # Points on a plane, in files of float64 against the scene's float32.
-    assert again.lowest_z_m == pytest.approx(pandaset_folder.GROUND_Z, abs=1e-5)
+    assert again.lowest_z_m == pytest.approx(street.GROUND_Z, abs=1e-5)
     assert again.residual_m == pytest.approx(0, abs=1e-6)
 
 
 def test_a_guessed_recording_says_that_the_path_is_all_it_knows(tmp_path: Path) -> None:
-    scene = open_scene(f"recording:{write_recording(tmp_path / 'drive', lidar=False)}?{SMALL}")
+    scene = open_scene(f"recording:{write_as_recording(tmp_path / 'drive', lidar=False)}?{SMALL}")
     ground = ground_of(scene)
     assert ground.source == "ego path" and ground.points == 0
-    assert ground.lowest_z_m == pytest.approx(pandaset_folder.GROUND_Z)
+    assert ground.lowest_z_m == pytest.approx(street.GROUND_Z)
     assert scene.ground_z_m == ground.lowest_z_m
 
 
 def test_recordings_say_what_their_classes_mean(tmp_path: Path) -> None:
-    root = write_recording(tmp_path / "drive")
+    root = write_as_recording(tmp_path / "drive")
     labels = RecordingLabels(root)
     assert isinstance(labels, ClassifiesLidar)
     sweep = labels.lidar(0)
@@ -161,7 +161,7 @@ def test_gravity_of_a_splat_file_without_a_ground_is_what_someone_said(
 
 def test_a_splat_file_has_a_ground_once_scale_and_up_are_given(tmp_path: Path) -> None:
     needs_open3d()
-    write_ply(tmp_path / "a.ply", street())
+    write_ply(tmp_path / "a.ply", splat_scenes.street())
     source = f"gaussians:{tmp_path / 'a.ply'}"
     ground = ground_of(open_scene(f"{source}?up=%2Bz&scale=1"))
     assert ground.source == "ransac"

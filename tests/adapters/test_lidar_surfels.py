@@ -7,15 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import nuscenes_files
-import pandaset_folder
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from drives import camera as drives_camera
-from drives import one_splat
-from drivestudio_files import write_run
 
 from adapters.drivestudio.adapter import drivestudio_labels
 from adapters.kitti.adapter import KittiLabels
@@ -38,7 +33,7 @@ from adapters.lidar_scene.surfels import (
     thin_points,
 )
 from adapters.nuscenes.adapter import nuscenes_labels
-from adapters.pandaset import SENSORS_M, PandaSetLabels, read_lidar
+from adapters.pandaset.adapter import SENSORS_M, PandaSetLabels, read_lidar
 from adapters.procedural import LOWEST_DEG, StreetLabels, lidar_rays
 from adapters.recording.adapter import RecordingLabels
 from adapters.street.layout import StreetParameters
@@ -50,6 +45,10 @@ from augment.scene.labels import Boxes, KnowsLidarOrigins, LidarSweep
 from augment.scene.scene import Actor, Scene, Track
 from augment.scene.semantics import SemanticClass as Class
 from augment.scene.sky import ConstantSky
+from tests.adapters import nuscenes_files, pandaset_files, street
+from tests.adapters.drives import camera as drives_camera
+from tests.adapters.drives import one_splat
+from tests.adapters.drivestudio_files import write_as_drivestudio
 
 ORIGIN = np.zeros((1, 3), np.float32)
 
@@ -364,14 +363,14 @@ def test_street_origins_give_back_the_beams() -> None:
 
 def test_pandasets_sensors_ride_on_the_car(tmp_path: Path) -> None:
     offset = np.array([1000.0, -50.0, 3.0])
-    labels = PandaSetLabels(pandaset_folder.write_sequence(tmp_path, offset_m=offset))
-    first = pandaset_folder.time_s(0)
+    labels = PandaSetLabels(pandaset_files.write_as_pandaset(tmp_path, offset_m=offset))
+    first = street.time_s(0)
     seconds = first + np.array([0.1, 0.05, 0.0, -0.1, 0.1])
     sweep = LidarSweep({name: np.zeros(5) for name in "xyz"} | {
         "t": seconds, "d": np.array([0, 0, 0, 0, 1]),
     })  # fmt: skip
     found = labels.lidar_origins(1, sweep) - offset
-    along = pandaset_folder.EGO_SPEED_MPS * (seconds - first)
+    along = street.EGO_SPEED_MPS * (seconds - first)
     expected = SENSORS_M[[0, 0, 0, 0, 1]] + along[:, None] * [1.0, 0.0, 0.0]
     np.testing.assert_allclose(found, expected, atol=1e-5)  # float64 seconds since 1970
     assert labels.lidar_origins(99, sweep) is None
@@ -408,7 +407,7 @@ def test_published_beams_of_each_sensor_do_not_cross() -> None:
 
 
 def test_nuscenes_sensor_at_the_files_time(tmp_path: Path) -> None:
-    root = nuscenes_files.write_dataset(tmp_path)
+    root = nuscenes_files.write_as_nuscenes(tmp_path)
     labels = nuscenes_labels(str(root), {"scene": "scene-0001"})
     sweep = labels.lidar(0)
     found = labels.lidar_origins(0, sweep)
@@ -440,7 +439,7 @@ def test_recordings_may_bring_their_own(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("dataset", ["waymo", "nuscenes", "pandaset"])
 def test_drivestudio_data(tmp_path: Path, dataset: str) -> None:
-    labels = drivestudio_labels(str(write_run(tmp_path, dataset=dataset).folder), {})
+    labels = drivestudio_labels(str(write_as_drivestudio(tmp_path, dataset=dataset).folder), {})
     sweep = labels.lidar(3)
     found = labels.lidar_origins(3, sweep)
     if dataset == "pandaset":

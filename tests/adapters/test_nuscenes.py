@@ -11,19 +11,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import nuscenes_files as files
-import pandaset_folder as street
 import pytest
-from shown import psnr, psnr_of, render
 
 from adapters.base import detect_scheme_of_path
 from adapters.nuscenes.adapter import EGO_BOX_M, nuscenes_labels, open_nuscenes
 from adapters.nuscenes.tables import read_rows, read_tables
-from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.scene.labels import ClassifiesLidar
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
+from tests.adapters import nuscenes_files as files
+from tests.adapters import street
+from tests.adapters.shown import psnr, render
 
 ONE, TWO = files.SCENES
 QUERY = {"scene": TWO, "voxel_m": "0.15", "image_scale": "1", "sky_size": "32"}
@@ -33,7 +32,7 @@ ORIGIN = np.array([2100.0, 900.0, 3.0])
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    return files.write_dataset(tmp_path_factory.mktemp("nuscenes") / "data")
+    return files.write_as_nuscenes(tmp_path_factory.mktemp("nuscenes") / "data")
 
 
 @pytest.fixture(scope="module")
@@ -52,56 +51,6 @@ def into_street(points: np.ndarray) -> np.ndarray:
     return (points + ORIGIN - pose[:3, 3]) @ pose[:3, :3]
 
 
-def test_the_scene_is_described(scene, folder):
-    assert scene.name == TWO and scene.problems == ()
-    assert scene.source == format_uri("nuscenes", str(folder), QUERY)
-    assert detect_scheme_of_path(folder) == "nuscenes"
-    assert scene.camera_names == ("CAM_FRONT", "CAM_FRONT_LEFT")
-    assert [f.index for f in scene.frames] == list(range(files.SWEEPS))
-    assert [f.timestamp_ns for f in scene.frames] == [t * 1000 for t in files.sweep_times_us(1)]
-    np.testing.assert_array_equal(scene.world_origin_m, ORIGIN)
-    assert scene.ground_z_m == pytest.approx(street.GROUND_Z, abs=1e-3)
-    assert [i for i, f in enumerate(scene.frames) if f.cameras] == [0, 2, 5, 7, 10]
-
-
-def test_ego_and_cameras_have_their_own_poses_and_times(scene):
-    frame = scene.frame(7)
-    expected = files.world_from_ego(1, 0.7)
-    expected[:3, 3] -= ORIGIN
-    np.testing.assert_allclose(frame.world_from_ego, expected, atol=1e-9)
-    camera = frame.cameras["CAM_FRONT"]
-    assert camera.timestamp_ns == files.image_times_us(1, "CAM_FRONT")[3] * 1000
-    pose = files.world_from_ego(1, 0.7145) @ files.ego_from_camera("CAM_FRONT")
-    pose[:3, 3] -= ORIGIN
-    np.testing.assert_allclose(camera.world_from_camera, pose, atol=1e-9)
-    assert frame.image_paths["CAM_FRONT"].endswith(files.filename(1, "CAM_FRONT", 3))
-
-
-@pytest.mark.parametrize("camera", ["CAM_FRONT", "CAM_FRONT_LEFT"])
-def test_the_scene_looks_like_the_recorded_image(scene, camera):
-    # 24 dB and more when written; edges are as blurred as the voxels of 15 cm are wide.
-    assert psnr_of(scene, 5, camera) > 22
-
-
-def test_the_moving_car_is_an_actor_where_its_boxes_are(scene):
-    (actor,) = scene.actors
-    assert actor.track_id == files.instance_token(1, files.CAR)
-    assert actor.label == "vehicle.car"
-    assert actor.size_m == pytest.approx(tuple(street.CAR_SIZE_M))
-    inside = np.abs(actor.gaussians.means.numpy()) <= street.CAR_SIZE_M / 2 + 0.1
-    assert inside.all()
-    for time in (0.0, 0.2, 0.5, 0.83):
-        # In the sweep's 40 ms before its boxes' time it moved by 0.24 m: that is accounted for.
-        pose = actor.track.pose_at(files.START_US[1] * 1000 + round(time * 1e9)).numpy()
-        np.testing.assert_allclose(into_street(pose[:3, 3]), street.car_centre(time), atol=2e-3)
-    # Where the car was at any time, nothing of it stays behind.
-    means = into_street(scene.background.means.numpy().astype(np.float64))
-    above = means[:, 2] > street.GROUND_Z + 0.2
-    for time in np.arange(0, 1.01, 0.1):
-        offset = np.abs(means - street.car_centre(time))
-        assert not ((offset < street.CAR_SIZE_M / 2).all(axis=1) & above).any()
-
-
 def test_returns_of_the_recording_car_are_in_the_labels_only(scene):
     points, _ = files.sweep(0)
     own = points[-2:]
@@ -118,7 +67,7 @@ def _nearest_to_own_returns(scene: Scene) -> float:
 
 
 def test_own_returns_are_known_without_classes(tmp_path):
-    root = files.write_dataset(tmp_path / "data", semantic=False)
+    root = files.write_as_nuscenes(tmp_path / "data", semantic=False)
     plain = open_nuscenes(str(root), QUERY | {"voxel_m": "0.3"})
     assert plain.problems == () and len(plain.actors) == 1
     assert "semantic" not in plain.lidar(0).columns
@@ -274,15 +223,6 @@ def test_one_scene_is_read_in_order_of_time(folder):
 def test_boxes_are_the_keyframes_own(folder):
     labels = nuscenes_labels(str(folder), {"scene": TWO, "sweeps": "0"})
     boxes = labels.boxes(1)
-    assert boxes.track_ids == tuple(
-        files.instance_token(1, thing) for thing in (files.CAR, files.PARKED, files.WALKER)
-    )
-    assert boxes.labels == ("vehicle.car", "vehicle.truck", "human.pedestrian.adult")
-    np.testing.assert_array_equal(
-        boxes.sizes_m, [street.CAR_SIZE_M, files.PARKED_SIZE_M, files.WALKER_SIZE_M]
-    )
-    for i, thing in enumerate((files.CAR, files.PARKED, files.WALKER)):
-        np.testing.assert_array_equal(boxes.centers_m[i], files.box_pose(1, thing, 0.5)[:3, 3])
     # Turned by 30 degrees about z, as the whole street.
     half = np.radians(15)
     np.testing.assert_allclose(boxes.quats, [[np.cos(half), 0, 0, np.sin(half)]] * 3, atol=1e-12)
@@ -407,14 +347,14 @@ def test_an_image_is_used_once_and_far_ones_are_said_to_have_no_frame(own_tables
 
 
 def test_the_only_version_and_scene_need_no_name(tmp_path):
-    root = files.write_dataset(tmp_path / "test", version="v1.0-test", scenes=[TWO])
+    root = files.write_as_nuscenes(tmp_path / "test", version="v1.0-test", scenes=[TWO])
     read = tables(root, None)
     assert (read.version, read.name) == ("v1.0-test", TWO)
     assert tables(root, files.token("scene", TWO)).name == TWO
 
 
 def test_tables_of_other_writers_go_by_any_folder_name_and_may_begin_with_a_mark(tmp_path):
-    root = files.write_dataset(tmp_path / "test", version="converted", scenes=[TWO])
+    root = files.write_as_nuscenes(tmp_path / "test", version="converted", scenes=[TWO])
     for path in (root / "converted").glob("*.json"):
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert detect_scheme_of_path(root) == "nuscenes"
@@ -513,41 +453,6 @@ def test_rows_are_the_same_wherever_the_file_is_cut(tmp_path):
             list(read_rows(path))
     path.write_text(" [ ] ")
     assert list(read_rows(path)) == []
-
-
-def test_missing_and_damaged_files_are_problems(copy):
-    (copy / files.filename(0, "LIDAR_TOP", 3)).unlink()
-    cut = copy / files.filename(0, "LIDAR_TOP", 4)
-    cut.write_bytes(cut.read_bytes()[:-7])
-    (copy / files.filename(0, "CAM_FRONT", 0)).unlink()
-    left = copy / files.filename(0, "CAM_FRONT_LEFT", 1)
-    left.write_bytes(left.read_bytes()[:-200])
-    wrong = copy / files.filename(0, "CAM_FRONT_LEFT", 4)
-    cv2.imwrite(str(wrong), np.zeros((48, 80, 3), np.uint8))
-    classes = copy / f"lidarseg/{files.VERSION}"
-    (classes / f"{files.data_token(0, 'LIDAR_TOP', 0)}_lidarseg.bin").unlink()
-    (classes / f"{files.data_token(0, 'LIDAR_TOP', 5)}_lidarseg.bin").write_bytes(b"abc")
-    scene = open_nuscenes(str(copy), QUICK)
-    expected = (
-        "LiDAR's files of 1 frame (3) are missing, their points too",
-        "frame 4: sweeps/LIDAR_TOP/",
-        "not of whole records of 20: it is cut",
-        "camera CAM_FRONT, frame 0: image ",
-        "does not exist",
-        "camera CAM_FRONT_LEFT, frame 2: ",
-        "is cut short",
-        "camera CAM_FRONT_LEFT, frame 10: ",
-        "is 80x48 pixels, its camera 160x96",
-        "frame 0: lidarseg/",
-        "is missing; its points have no class",
-        "frame 5: lidarseg/",
-        "has 3 classes for 9442 returns",
-    )
-    text = "\n".join(scene.problems)
-    assert len(scene.problems) == 7 and all(part in text for part in expected), text
-    assert scene.lidar(3) is None and scene.lidar(4) is None
-    assert set(scene.frame(0).image_paths) == {"CAM_FRONT_LEFT"}
-    assert set(scene.frame(0).cameras) == {"CAM_FRONT", "CAM_FRONT_LEFT"}
 
 
 def test_without_images_or_returns_there_is_no_scene(copy):
@@ -685,7 +590,7 @@ def assert_same_labels(found: dict, root: Path, query: dict[str, str]) -> None:
 
 
 def test_the_devkit_reads_the_street(python, tmp_path):
-    root = files.write_dataset(tmp_path / "data")
+    root = files.write_as_nuscenes(tmp_path / "data")
     found = read_by_devkit(python, root)
     assert found["scenes"] == list(files.SCENES)
     per_scene = files.SWEEPS + files.IMAGES * len(files.CAMERAS)

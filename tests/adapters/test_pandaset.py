@@ -9,15 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pandas as pd
-import pandaset_folder as street
 import pytest
 import torch
-from drives import WHOLE, changed
 from scipy.spatial.transform import Rotation
-from shown import psnr, psnr_of, render
 
 from adapters.base import open_scene
-from adapters.pandaset import (
+from adapters.pandaset.adapter import (
     NO_SURFACE,
     PandaSetLabels,
     boxes_of_cuboids,
@@ -32,18 +29,21 @@ from adapters.pandaset import (
     tie_boxes,
 )
 from adapters.raw_drive import DriveOptions
-from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.render.rasterize import rasterize
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.semantics import SemanticClass
+from tests.adapters import pandaset_files as files
+from tests.adapters import street
+from tests.adapters.drives import WHOLE, changed
+from tests.adapters.shown import psnr, render
 
 QUERY = {"voxel_m": "0.1", "image_scale": "1", "sky_size": "32"}
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    return street.write_sequence(tmp_path_factory.mktemp("pandaset") / "002")
+    return files.write_as_pandaset(tmp_path_factory.mktemp("pandaset") / "002")
 
 
 @pytest.fixture(scope="module")
@@ -56,72 +56,12 @@ def copy(folder, tmp_path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "002"))
 
 
-def test_the_scene_is_described(scene, folder):
-    assert scene.name == "002" and scene.problems == ()
-    assert scene.source == format_uri("pandaset", str(folder), QUERY)
-    assert scene.camera_names == ("front_camera", "left_camera")
-    assert [f.index for f in scene.frames] == [0, 1, 2]
-    assert [f.timestamp_ns for f in scene.frames] == sorted(f.timestamp_ns for f in scene.frames)
-    assert scene.ground_z_m == pytest.approx(street.GROUND_Z, abs=1e-3)
-    assert (scene.world_origin_m == 0).all()
-
-
-def test_ego_is_x_forward_y_left_z_up(scene):
-    for number, frame in enumerate(scene.frames):
-        # The street's car drives along the world's x, left is y.
-        np.testing.assert_allclose(frame.world_from_ego[:3, :3], np.eye(3), atol=1e-12)
-        np.testing.assert_allclose(frame.world_from_ego[:3, 3], street.ego_position(number))
-
-
-def test_cameras_have_their_own_pose_and_time(scene):
-    left = scene.frame(2).cameras["left_camera"]
-    assert (left.width, left.height, left.fx) == (street.WIDTH, street.HEIGHT, street.FOCAL_PX)
-    assert abs(left.timestamp_ns - street.START_NS - 200_000_000) < 1000  # float64 seconds
-    np.testing.assert_allclose(left.ray_directions()[48, 80], [0, 1, 0], atol=0.02)
-    np.testing.assert_allclose(
-        left.centre, street.ego_position(2) + np.array([0, 0, 1.1]), atol=1e-9
-    )
-
-
-@pytest.mark.parametrize("camera", ["front_camera", "left_camera"])
-def test_the_scene_looks_like_the_recorded_image(scene, camera):
-    # 26 dB when written; edges are as blurred as the voxels of 10 cm are wide.
-    assert psnr_of(scene, 1, camera) > 24.5
-
-
 def test_the_ground_is_closed_under_the_car_too(scene):
     camera = scene.frame(0).cameras["front_camera"]
     out = rasterize([next(iter(scene.parts_at(camera.timestamp_ns)))], camera)
     # Up to 20 m ahead and 5 m to the sides, also where the car hides it in every image.
     ground = out.alpha[street.HEIGHT // 2 + 6 :, 60:100]
     assert ground.min() > 0.8
-
-
-def test_background_has_no_trace_of_the_moving_car(scene):
-    means, half = scene.background.means.numpy(), street.CAR_SIZE_M / 2
-    for frame in range(street.FRAMES):
-        offset = np.abs(means - street.car_centre(street.FRAME_S * frame))
-        above = means[:, 2] > street.GROUND_Z + 0.2
-        assert not ((offset < half).all(axis=1) & above).any()
-
-
-def test_the_two_boxes_of_the_car_are_one_actor(scene):
-    (actor,) = scene.actors
-    assert actor.track_id == street.CAR_IDS[0] and actor.label == "Car"
-    assert actor.size_m == pytest.approx(tuple(street.CAR_SIZE_M))
-    inside = np.abs(actor.gaussians.means.numpy()) <= street.CAR_SIZE_M / 2 + 0.1
-    assert inside.all()
-    reds = actor.gaussians.sh[:, 0] * 0.2820948 + 0.5
-    np.testing.assert_allclose(reds.median(0).values, street.CAR / 255, atol=0.03)
-
-
-def test_the_actor_is_where_the_car_is(scene):
-    (actor,) = scene.actors
-    for time in (0.0, 0.05, 0.13):
-        pose = actor.track.pose_at(street.START_NS + round(time * 1e9))
-        # The boxes' own times are known to within the sweep's half width of 10 ms: 6 cm.
-        np.testing.assert_allclose(pose[:3, 3], street.car_centre(time), atol=0.07)
-        np.testing.assert_allclose(pose[:3, :3], np.eye(3), atol=1e-9)
 
 
 def test_the_sky_is_what_the_images_show_above(scene):
@@ -188,15 +128,15 @@ def test_real_returns_fall_on_the_pixels_that_the_sources_own_matrices_say(real)
 
 @pytest.fixture
 def own(tmp_path) -> Path:
-    return street.write_sequence(tmp_path / "002")
+    return files.write_as_pandaset(tmp_path / "002")
 
 
 # What JSON allows where a number is due: (as text, as in the error).
 def test_tables_without_their_columns_are_refused(own):
-    street.write_table(own / "lidar/00.pkl.gz", {"x": np.zeros(2), "y": np.zeros(2)})
+    files.write_table(own / "lidar/00.pkl.gz", {"x": np.zeros(2), "y": np.zeros(2)})
     with pytest.raises(AdapterError, match=r"00\.pkl\.gz lacks the columns \['z', 'i', 't', 'd'\]"):
         read_lidar(own, 0)
-    street.write_table(own / "annotations/semseg/01.pkl.gz", {"class": np.zeros(3, int)})
+    files.write_table(own / "annotations/semseg/01.pkl.gz", {"class": np.zeros(3, int)})
     rows = len(read_lidar(own, 1))
     with pytest.raises(AdapterError, match=f"each of the {rows} returns .* it has 3"):
         read_semantics(own, 1, rows)
@@ -204,14 +144,11 @@ def test_tables_without_their_columns_are_refused(own):
 
 def test_boxes_turn_to_x_forward_and_keep_every_column(own):
     boxes = PandaSetLabels(own).boxes(1)
-    assert boxes.track_ids == (street.CAR_IDS[0], "parked") and boxes.labels == ("Car",) * 2
-    np.testing.assert_allclose(boxes.sizes_m[0], street.CAR_SIZE_M)
-    np.testing.assert_allclose(boxes.centers_m[0], street.car_centre(0.1))
     forward = rotmat_from_quat(torch.from_numpy(boxes.quats))[0, :, 0]
     np.testing.assert_allclose(forward, [1, 0, 0], atol=1e-12)
     columns = boxes.attributes
     assert list(columns["attributes.rider_status"]) == [None, None]
-    assert list(columns["cuboids.sibling_id"]) == [street.CAR_IDS[1], "-"]
+    assert list(columns["cuboids.sibling_id"]) == [files.CAR_IDS[1], "-"]
     assert list(columns["cuboids.sensor_id"]) == [0, -1]
     np.testing.assert_allclose(columns["yaw"], -np.pi / 2)
     np.testing.assert_allclose(columns["dimensions.y"], street.CAR_SIZE_M[0])
@@ -224,8 +161,8 @@ def test_own_car_and_mirror_images_are_left_out(own):
     points = np.array([[0.5, 0.2, 0.8], [2.0, -0.6, 1.2], [4.0, 0.0, 0.3], [5.0, 0.0, 0.3]])
     columns = {c: points[:, i] for i, c in enumerate("xyz")}
     columns |= {"i": np.zeros(4), "t": np.full(4, table["t"].iloc[0]), "d": np.zeros(4, int)}
-    street.write_table(own / "lidar/00.pkl.gz", columns)
-    street.write_table(own / "annotations/semseg/00.pkl.gz", {"class": np.array([13, 13, 4, 13])})
+    files.write_table(own / "lidar/00.pkl.gz", columns)
+    files.write_table(own / "annotations/semseg/00.pkl.gz", {"class": np.array([13, 13, 4, 13])})
     frames, chosen, origin, _ = read_frames(own, DriveOptions(frames=range(1)))
     (sweep,), _, _ = read_sweeps(own, frames, chosen.held_out, origin)
     np.testing.assert_allclose(sweep.points, points[3:])  # two on the car itself, one reflection
@@ -233,10 +170,10 @@ def test_own_car_and_mirror_images_are_left_out(own):
 
 def test_a_box_called_stationary_that_travels_is_an_actor(own):
     for frame in range(street.FRAMES):
-        table = street._cuboids(frame, np.zeros(3)) | {"stationary": np.array([True] * 3)}
+        table = files.cuboids(frame, np.zeros(3)) | {"stationary": np.array([True] * 3)}
         table["position.x"] = table["position.x"] + [2.0 * frame, 2.0 * frame, 0]
-        street.write_table(own / f"annotations/cuboids/{frame:02d}.pkl.gz", table)
-    assert moving(own) == {street.CAR_IDS[0]}
+        files.write_table(own / f"annotations/cuboids/{frame:02d}.pkl.gz", table)
+    assert moving(own) == {files.CAR_IDS[0]}
 
 
 @pytest.mark.parametrize(
@@ -356,43 +293,17 @@ def moving(root: Path) -> set[str]:
 @pytest.mark.parametrize("missing", [[], LINKS, LINKS_AND_SENSORS])
 def test_one_vehicle_is_one_box_and_one_track_whatever_its_tables_say(own, missing):
     for frame in range(street.FRAMES):
-        table = street._cuboids(frame, np.zeros(3))
+        table = files.cuboids(frame, np.zeros(3))
         table = {name: table[name] for name in table if name not in missing}
-        street.write_table(own / f"annotations/cuboids/{frame:02d}.pkl.gz", table)
+        files.write_table(own / f"annotations/cuboids/{frame:02d}.pkl.gz", table)
     labels = PandaSetLabels(own)
-    assert [labels.boxes(f).track_ids for f in range(3)] == [(street.CAR_IDS[0], "parked")] * 3
-    assert moving(own) == {street.CAR_IDS[0]}
+    assert [labels.boxes(f).track_ids for f in range(3)] == [(files.CAR_IDS[0], "parked")] * 3
+    assert moving(own) == {files.CAR_IDS[0]}
     # A damaged table is an error of its own frame alone.
     (own / "annotations/cuboids/01.pkl.gz").write_bytes(b"no table")
     assert len(labels.boxes(0)) == len(labels.boxes(2)) == 2
     with pytest.raises(AdapterError, match=r"cuboids/01\.pkl\.gz"):
         labels.boxes(1)
-
-
-def test_missing_files_of_single_frames_are_problems(copy):
-    (copy / "lidar/01.pkl.gz").unlink()
-    (copy / "annotations/cuboids/02.pkl.gz").unlink()
-    (copy / "annotations/semseg/00.pkl.gz").unlink()
-    (copy / "camera/front_camera/00.jpg").unlink()
-    left = copy / "camera/left_camera"
-    (left / "01.jpg").write_bytes((left / "01.jpg").read_bytes()[:-200])
-    cv2.imwrite(str(left / "02.jpg"), np.zeros((48, 80, 3), np.uint8))
-    scene = open_pandaset(str(copy), QUERY)
-    expected = (
-        "frame 0: annotations/semseg/00.pkl.gz is missing",
-        "frame 1: lidar/01.pkl.gz is missing",
-        "frame 2: annotations/cuboids/02.pkl.gz is missing",
-        "camera front_camera, frame 0: ",
-        "00.jpg does not exist",
-        "camera left_camera, frame 1: ",
-        "01.jpg is cut short",
-        "02.jpg is 80x48 pixels, its camera 160x96",
-    )
-    text = "\n".join(scene.problems)
-    assert len(scene.problems) == 6 and all(part in text for part in expected), text
-    assert scene.lidar(1) is None and len(scene.boxes(2)) == 0
-    assert set(scene.frame(1).image_paths) == {"front_camera"}
-    assert set(scene.frame(1).cameras) == {"front_camera", "left_camera"}
 
 
 # A file, what is replaced in it by what, options, and the error

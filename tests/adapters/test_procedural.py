@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from shown import assert_same_bits
 
 from adapters.base import open_scene
 from adapters.procedural import ExactView, StreetTruth, open_procedural, open_truth
@@ -54,6 +53,7 @@ from augment.errors import AdapterError, SceneError
 from augment.render.rasterize import rasterize
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
+from tests.adapters.shown import assert_same_bits
 
 QUERY = {"seed": "3", "width": "480", "height": "270"}
 

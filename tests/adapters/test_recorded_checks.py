@@ -7,7 +7,6 @@ import json
 import math
 
 import cv2
-import drives
 import numpy as np
 import pytest
 import torch
@@ -15,6 +14,7 @@ import torch
 from adapters.training_views.checks import check_views, with_camera_times
 from adapters.training_views.views import RecordedViews
 from augment.errors import AdapterError
+from tests.adapters import drives
 
 SPEED_MPS = 5.0
 WALL_Y = 12.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import drives
 import numpy as np
 import pytest
 
@@ -22,6 +21,7 @@ from adapters.training_views.depth_priors import (
 from adapters.training_views.views import RecordedViews
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
+from tests.adapters import drives
 
 BOX_LOW, BOX_HIGH, WALL_X = np.array([8.0, -2, 0]), np.array([10.0, 2, 2.2]), 20.0
 KEY = ViewKey(0, "front")

@@ -6,7 +6,6 @@ import dataclasses
 from pathlib import Path
 
 import cv2
-import drives
 import numpy as np
 import pytest
 import torch
@@ -20,6 +19,7 @@ from augment.reconstruct.view import ViewKey
 from augment.scene.cameras import Frame
 from augment.scene.scene import Scene
 from augment.scene.sky import ConstantSky
+from tests.adapters import drives
 from tests.scenes import one_gaussian
 
 NO_RETURNS = np.zeros(0, np.int32)

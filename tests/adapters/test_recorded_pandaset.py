@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import drives
 import pytest
 import torch
 
-from adapters.pandaset import PandaSetLabels, read_frames
+from adapters.pandaset.adapter import PandaSetLabels, read_frames
 from adapters.raw_drive import DriveOptions
 from adapters.training_views.checks import check_views
 from adapters.training_views.views import RecordedViews
 from augment.scene.scene import Scene
 from augment.scene.sky import ConstantSky
+from tests.adapters import drives
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 
 import cv2
-import drives
 import numpy as np
 import pytest
 
@@ -15,6 +14,7 @@ from adapters.training_views.views import RecordedViews, holdout_step
 from augment.errors import AdapterError
 from augment.files.recorded_images import read_scaled
 from augment.reconstruct.view import ViewKey
+from tests.adapters import drives
 
 
 def rig(frame):

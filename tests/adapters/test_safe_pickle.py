@@ -20,12 +20,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from pandaset_folder import write_table
 
 from adapters.safe_pickle import read_array_dict, read_frame, stream_arrays
 from augment.errors import AdapterError
 from augment.files.checkpoints import load_checkpoint
 from augment.files.pickles import PickleError
+from tests.adapters.pandaset_files import write_table
 
 
 class Calls:

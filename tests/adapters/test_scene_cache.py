@@ -12,36 +12,21 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import kitti_files
-import nuscenes_files
 import pytest
-import waymo_files
-from fitted_scenes import assert_same, fitted_scene
-from pandaset_folder import write_sequence
-from recording_folder import write_recording
 
 from adapters.base import open_scene
 from adapters.scene_cache import LIMIT_KEY, cached_scene, scene_digest
+from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.files.export import export_splats
 from augment.files.scene_file import save_scene
 from augment.render.rasterize import rasterize
+from tests.adapters.all_drives import WRITERS, write_drive
+from tests.adapters.recording_files import write_as_recording
+from tests.fitted_scenes import assert_same, fitted_scene
 from tools.cli import main
 
-COARSE = "voxel_m=0.4&image_scale=0.5&sky_size=8&frames=0:2"
-
-
-def _nuscenes(root: Path) -> str:
-    return f"nuscenes:{nuscenes_files.write_dataset(root)}?scene={nuscenes_files.SCENES[0]}&"
-
-
-RAW: dict[str, Callable[[Path], str]] = {
-    "pandaset": lambda root: f"pandaset:{write_sequence(root)}?",
-    "recording": lambda root: f"recording:{write_recording(root)}?",
-    "kitti": lambda root: f"kitti:{kitti_files.write_raw(root)}?",
-    "nuscenes": _nuscenes,
-    "waymo": lambda root: f"waymo:{waymo_files.write_segment(root, frames=2)}?",
-}
+COARSE = {"voxel_m": "0.4", "image_scale": "0.5", "sky_size": "8", "frames": "0:2"}
 
 
 @pytest.fixture
@@ -56,11 +41,11 @@ def entries(cache: Path) -> set[str]:
     return {path.name for path in cache.iterdir()}
 
 
-@pytest.mark.parametrize("scheme", RAW)
+@pytest.mark.parametrize("scheme", WRITERS)
 def test_a_cached_scene_is_the_built_one_to_the_bit(
     scheme: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    uri = RAW[scheme](tmp_path / "data") + COARSE
+    uri = write_drive(scheme, tmp_path / "data").uri(**COARSE)
     monkeypatch.chdir(tmp_path)
     near = uri.replace(f"{tmp_path}/", "")  # a relative path: those of the images are so, too
     monkeypatch.setenv(LIMIT_KEY, "0")
@@ -85,8 +70,8 @@ def test_a_cached_scene_is_the_built_one_to_the_bit(
 
 
 def test_other_options_and_files_are_other_scenes(cache: Path, tmp_path: Path) -> None:
-    root = write_recording(tmp_path / "data")
-    uri = f"recording:{root}?{COARSE}"
+    root = write_as_recording(tmp_path / "data")
+    uri = format_uri("recording", root, COARSE)
     first = open_scene(uri)
     assert open_scene(f"{uri}&ground_z=-3").ground_z_m == -3  # laid over what is kept
     assert len(entries(cache)) == 1
@@ -180,7 +165,7 @@ def test_without_a_cache_to_write_to_scenes_open_with_one_warning(
 def test_no_cache_leaves_it_out(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    uri = f"recording:{write_recording(tmp_path / 'data')}?{COARSE}"
+    uri = write_drive("recording", tmp_path / "data").uri(**COARSE)
     assert main(["inspect", uri, "--no-cache"]) == 0
     assert not cache.exists()
     monkeypatch.setenv(LIMIT_KEY, "much")
@@ -220,23 +205,24 @@ def test_what_others_put_in_the_caches_folder_is_neither_emptied_nor_waited_for(
 
 def _scene(root: Path) -> str:
     save_scene(fitted_scene(), root)
-    return f"scene:{root}?"
+    return f"scene:{root}"
 
 
 def _splats(root: Path) -> str:
     root.mkdir(parents=True)
     export_splats(fitted_scene(), root / "point_cloud.ply", 0)
-    return f"gaussians:{root}?"
+    return f"gaussians:{root}"
 
 
-DIGESTED = {**RAW, "scene": _scene, "gaussians": _splats}
+OURS: dict[str, Callable[[Path], str]] = {"scene": _scene, "gaussians": _splats}
 
 
-@pytest.mark.parametrize("scheme", DIGESTED)
+@pytest.mark.parametrize("scheme", [*WRITERS, *OURS])
 def test_a_digest_is_of_the_content_wherever_it_lies(
     scheme: str, cache: Path, tmp_path: Path
 ) -> None:
-    uri = DIGESTED[scheme](tmp_path / "data")
+    data = tmp_path / "data"
+    uri = OURS[scheme](data) if scheme in OURS else write_drive(scheme, data).uri()
     first = scene_digest(uri)
     assert first is not None and len(first) == 32
     shutil.copytree(tmp_path / "data", tmp_path / "copy")  # with other times

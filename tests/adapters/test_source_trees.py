@@ -9,26 +9,29 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import av2_files
 import cv2
-import drivestudio_files
-import kitti_files
 import numpy as np
-import nuscenes_files
-import pandaset_folder
 import pytest
-import recording_folder
-import street_gaussians_files
 
 from adapters.base import open_scene
 from adapters.detect_format import source_tree
-from adapters.uri import format_uri
+from adapters.uri import format_uri, parse_uri
 from augment.errors import AdapterError
 from augment.files.scene_file import save_scene
 from augment.jobs.mirror import survey
 from augment.jobs.render_job import RenderJob, run_job
 from augment.scene.scene import Scene
 from recipes.schema import Recipe
+from tests.adapters import (
+    av2_files,
+    drivestudio_files,
+    kitti_files,
+    nuscenes_files,
+    pandaset_files,
+    street,
+    street_gaussians_files,
+)
+from tests.adapters.recording_files import write_as_recording
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents, listing, snapshot
 from tools.mirror import clear_notes, mirror_outputs, recipes_for_source
@@ -87,83 +90,84 @@ def assert_same_but_colours(scene: Scene, again: Scene, old: Path, new: Path) ->
                 assert np.array_equal(column, equal.columns[name])
 
 
-def test_a_pandaset_sequence(tmp_path):
-    root = pandaset_folder.write_sequence(tmp_path / "002")
-    scene = open_scene(format_uri("pandaset", root, SMALL))
+def _street_gaussians(folder: Path) -> str:
+    root = street_gaussians_files.write_as_street_gaussians(folder / "002", frames=2).root
+    return f"street_gaussians:{root}?"
+
+
+# Datasets whose images are all jpg or png files below one folder, and how many of them a scene has.
+COPIED = {
+    "pandaset": (
+        lambda folder: f"pandaset:{pandaset_files.write_as_pandaset(folder / '002')}?",
+        "6 of 6 camera images are weathered",
+    ),
+    "recording": (
+        lambda folder: f"recording:{write_as_recording(folder / 'drive', depth=True)}?",
+        "6 of 6 camera images are weathered",
+    ),
+    # Images come twice as often as sweeps.
+    "av2": (
+        lambda folder: f"av2:{av2_files.write_as_av2(folder / av2_files.NAME)}?",
+        "12 of 27 camera images are weathered; 15 stay clear, as recorded",
+    ),
+    # Of two scenes with five images of each of two cameras, keyframes of one.
+    "nuscenes": (
+        lambda folder: (
+            f"nuscenes:{nuscenes_files.write_as_nuscenes(folder / 'nuscenes')}"
+            "?scene=scene-0001&sweeps=0&"
+        ),
+        "6 of 20 camera images are weathered; 14 stay clear, as recorded",
+    ),
+    "street_gaussians": (_street_gaussians, "10 of 10 camera images are weathered"),
+}
+
+
+@pytest.mark.parametrize("scheme", COPIED)
+def test_a_copy_differs_in_its_images_alone(scheme, tmp_path):
+    write, sentence = COPIED[scheme]
+    uri = write(tmp_path / "data") + "&".join(f"{key}={value}" for key, value in SMALL.items())
+    root = Path(parse_uri(uri)[1])
+    scene = open_scene(uri)
     before = snapshot(root)
-    copy, said = weather(scene, tmp_path / "out")
-    assert changed_files(root, copy / "002") == relative_images(scene, root)
-    again = open_scene(format_uri("pandaset", copy / "002", SMALL))
+    folder, said = weather(scene, tmp_path / "out")
+    copy = folder / root.name
+    assert changed_files(root, copy) == relative_images(scene, root)
+    again = open_scene(uri.replace(str(root), str(copy)))
     assert again.problems == scene.problems
-    assert_same_but_colours(scene, again, root, copy / "002")
+    assert_same_but_colours(scene, again, root, copy)
     assert snapshot(root) == before
+    assert any(sentence in line for line in said), said
+
+
+def test_a_copys_pictures_are_the_rendered_ones(tmp_path):
+    root = pandaset_files.write_as_pandaset(tmp_path / "002")
+    copy, said = weather(open_scene(format_uri("pandaset", root, SMALL)), tmp_path / "out")
     shown = cv2.imread(str(copy / "002/camera/left_camera/01.jpg"))
     rendered = cv2.imread(str(tmp_path / "out/002/fog-000/images/left_camera/000001.jpg"))
-    assert shown.shape == (pandaset_folder.HEIGHT, pandaset_folder.WIDTH, 3)
+    assert shown.shape == (street.HEIGHT, street.WIDTH, 3)
     assert (shown == rendered).all()
     assert "stay clear" not in said[1]  # of the images
 
 
 def test_some_frames_and_cameras_of_a_sequence(tmp_path):
-    root = pandaset_folder.write_sequence(tmp_path / "002")
+    root = pandaset_files.write_as_pandaset(tmp_path / "002")
     scene = open_scene(format_uri("pandaset", root, {**SMALL, "frames": "0:2"}))
     copy, said = weather(scene, tmp_path / "out", frames=[1], cameras=["front_camera"])
     assert changed_files(root, copy / "002") == {"camera/front_camera/01.jpg"}
     assert "  1 of 6 camera images are weathered; 5 stay clear, as recorded" in said
 
 
-def test_a_recording(tmp_path):
-    root = recording_folder.write_recording(tmp_path / "drive", depth=True)
-    scene = open_scene(format_uri("recording", root, SMALL))
-    copy, _ = weather(scene, tmp_path / "out")
-    assert changed_files(root, copy / "drive") == relative_images(scene, root)
-    again = open_scene(format_uri("recording", copy / "drive", SMALL))
-    assert_same_but_colours(scene, again, root, copy / "drive")
-
-
-def test_an_argoverse_log(tmp_path):
-    root = av2_files.write_log(tmp_path / av2_files.NAME)
-    scene = open_scene(format_uri("av2", root, SMALL))
-    copy, said = weather(scene, tmp_path / "out")
-    assert changed_files(root, copy / root.name) == relative_images(scene, root)
-    again = open_scene(format_uri("av2", copy / root.name, SMALL))
-    assert_same_but_colours(scene, again, root, copy / root.name)
-    # Images come twice as often as sweeps.
-    assert "  12 of 27 camera images are weathered; 15 stay clear, as recorded" in said
-    (note,) = clear_notes(scene, of_sweeps=False)
-    assert note.endswith("; images=all in its URI takes those between its sweeps")
-
-
 def test_all_images_of_an_argoverse_log(tmp_path):
     """Those before the first sweep and after the last belong to no span."""
-    root = av2_files.write_log(tmp_path / av2_files.NAME)
+    root = av2_files.write_as_av2(tmp_path / av2_files.NAME)
+    (note,) = clear_notes(open_scene(format_uri("av2", root, SMALL)), of_sweeps=False)
+    assert note.endswith("; images=all in its URI takes those between its sweeps")
     scene = open_scene(format_uri("av2", root, {**SMALL, "images": "all"}))
     assert len(scene.frames) == 7
     copy, said = weather(scene, tmp_path / "out")
     assert changed_files(root, copy / root.name) == relative_images(scene, root)
     assert "  21 of 27 camera images are weathered; 6 stay clear, as recorded" in said
     assert "images=all" not in clear_notes(scene, of_sweeps=False)[0]
-
-
-def test_a_nuscenes_dataset(tmp_path):
-    root = nuscenes_files.write_dataset(tmp_path / "nuscenes")
-    uri = format_uri("nuscenes", root, {**SMALL, "scene": "scene-0001", "sweeps": "0"})
-    scene = open_scene(uri)
-    before = snapshot(root)
-    copy, said = weather(scene, tmp_path / "out")
-    copy = copy / "nuscenes"
-    assert changed_files(root, copy) == relative_images(scene, root)
-    assert len(relative_images(scene, root)) == nuscenes_files.SAMPLES * 2
-    for table in nuscenes_files.TABLES:
-        path = f"{nuscenes_files.VERSION}/{table}.json"
-        assert (copy / path).read_bytes() == (root / path).read_bytes()
-    for row in nuscenes_files.read_table(copy, "sample_data"):
-        assert (copy / row["filename"]).is_file()
-    again = open_scene(uri.replace(str(root), str(copy)))
-    assert_same_but_colours(scene, again, root, copy)
-    assert snapshot(root) == before
-    # Of two scenes with five images of each of two cameras, keyframes of one.
-    assert "  6 of 20 camera images are weathered; 14 stay clear, as recorded" in said
 
 
 DEVKIT = """
@@ -194,7 +198,7 @@ def test_the_official_devkit_reads_the_copy(tmp_path):
     python = os.environ.get("CLIMATEGS_NUSCENES_DEVKIT")
     if python is None:
         pytest.skip("CLIMATEGS_NUSCENES_DEVKIT names no Python with nuscenes-devkit")
-    root = nuscenes_files.write_dataset(tmp_path / "nuscenes", scenes=["scene-0001"])
+    root = nuscenes_files.write_as_nuscenes(tmp_path / "nuscenes", scenes=["scene-0001"])
     scene = open_scene(format_uri("nuscenes", root, SMALL))
     copy, _ = weather(scene, tmp_path / "out")
     command = [python, "-c", DEVKIT, str(root), str(copy / "nuscenes")]
@@ -206,7 +210,7 @@ def test_the_official_devkit_reads_the_copy(tmp_path):
 
 def write_kitti_drive(folder: Path, *, calibration: str) -> Path:
     """A drive whose calibration is in its own folder or the day's, beside another drive."""
-    drive = kitti_files.write_raw(folder / "2011_09_26", cameras=("02",))
+    drive = kitti_files.write_as_kitti(folder / "2011_09_26", cameras=("02",))
     if calibration == "drive":
         for path in drive.parent.glob("calib_*.txt"):
             path.rename(drive / path.name)
@@ -257,7 +261,7 @@ def test_a_kitti_drive(tmp_path, calibration):
 def test_kitti_object_frames(tmp_path):
     """Each is a scene of its own: one copy of the dataset takes the images of all of them."""
     root = tmp_path / "object"
-    kitti_files.write_object(root / "training", numbers=(1, 2, 3))
+    kitti_files.write_as_kitti_object(root / "training", numbers=(1, 2, 3))
     (root / "ImageSets").mkdir()
     expected = set()
     for frame in ("1", "2"):
@@ -285,17 +289,6 @@ def street_scene(root: Path, **changes) -> Scene:
     return dataclasses.replace(scene, frames=frames, **changes)
 
 
-def test_street_gaussians_data(tmp_path):
-    root = street_gaussians_files.write_dataset(tmp_path / "002", frames=2, depth=True).root
-    scene = open_scene(format_uri("street_gaussians", root, SMALL))
-    copy, said = weather(scene, tmp_path / "out", frames=[1])
-    changed = changed_files(root, copy / "002")
-    assert changed == {f"images/000001_{camera}.png" for camera in range(5)}
-    assert "  5 of 10 camera images are weathered; 5 stay clear, as recorded" in said
-    again = open_scene(format_uri("street_gaussians", copy / "002", SMALL))
-    assert_same_but_colours(scene, again, root, copy / "002")
-
-
 def test_a_street_gaussians_model_has_its_datas_tree(tmp_path):
     """Rendered at another size than recorded, as the project's own models are."""
     root = tmp_path / "data" / "waymo" / "002"
@@ -313,7 +306,7 @@ def test_a_street_gaussians_model_has_its_datas_tree(tmp_path):
 
 
 def test_a_drivestudio_run_has_its_datas_tree(tmp_path):
-    numbers = drivestudio_files.write_run(tmp_path)
+    numbers = drivestudio_files.write_as_drivestudio(tmp_path)
     scene = open_scene(f"drivestudio:{numbers.folder}?data={numbers.data}&ground_z=0")
     frame = scene.frames[1].index
     copy, _ = weather(scene, tmp_path / "out", scale=0.05, frames=[frame])
@@ -326,7 +319,7 @@ def test_a_drivestudio_run_has_its_datas_tree(tmp_path):
 
 
 def test_a_fitted_scene_has_its_recordings_tree(tmp_path):
-    root = pandaset_folder.write_sequence(tmp_path / "002")
+    root = pandaset_files.write_as_pandaset(tmp_path / "002")
     scene = open_scene(format_uri("pandaset", root, SMALL))
     save_scene(scene, tmp_path / "fitted")
     fitted = open_scene(f"scene:{tmp_path / 'fitted'}")
@@ -366,7 +359,7 @@ def test_a_dataset_without_images_is_refused(tmp_path):
 
 
 def test_images_are_counted_by_their_place(tmp_path):
-    root = nuscenes_files.write_dataset(tmp_path / "nuscenes")
+    root = nuscenes_files.write_as_nuscenes(tmp_path / "nuscenes")
     (root / "maps").mkdir(exist_ok=True)
     (root / "maps" / "more.png").write_bytes(b"")
     tree = source_tree(dataclasses.replace(open_fake("fake:x"), source=f"nuscenes:{root}"))

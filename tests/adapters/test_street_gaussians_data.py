@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from street_gaussians_files import NAMES, ROAD_RGB, Facts, write_dataset
 
 from adapters.street_gaussians.adapter import StreetGaussiansLabels, labels_of, open_raw
 from adapters.street_gaussians.data import ModelConfig, frames_of, held_out_steps, read_data
@@ -20,6 +19,7 @@ from augment.errors import AdapterError
 from augment.render.sh import SH_C0
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.labels import LabelSource
+from tests.adapters.street_gaussians_files import NAMES, ROAD_RGB, Facts, write_as_street_gaussians
 
 FRONT = ModelConfig(cameras=(0, 1, 2))
 ALL = ModelConfig(cameras=(0, 1, 2, 3, 4))
@@ -28,7 +28,7 @@ QUERY = {"voxel_m": "0.15", "image_scale": "1", "sky_size": "32"}
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    return write_dataset(tmp_path_factory.mktemp("street"))
+    return write_as_street_gaussians(tmp_path_factory.mktemp("street"))
 
 
 @pytest.fixture()
@@ -110,7 +110,7 @@ def test_the_split_counts_selected_frames_not_their_numbers(street):
 
 
 def test_frames_need_not_begin_at_zero(tmp_path):
-    facts = write_dataset(tmp_path, first_frame=17, frames=3, images=False, lidar=False)
+    facts = write_as_street_gaussians(tmp_path, first_frame=17, frames=3, images=False, lidar=False)
     data = read_data(facts.root, FRONT)
     assert data.frames == (17, 18, 19)
     assert {(i.frame, i.number) for i in data.images if i.cam == 0} == {(17, 0), (18, 3), (19, 6)}
@@ -118,7 +118,7 @@ def test_frames_need_not_begin_at_zero(tmp_path):
 
 
 def test_without_images_the_sizes_are_waymos(tmp_path):
-    facts = write_dataset(tmp_path, images=False, lidar=False)
+    facts = write_as_street_gaussians(tmp_path, images=False, lidar=False)
     data = read_data(facts.root, ALL)
     sizes = {(i.cam, i.camera.width, i.camera.height) for i in data.images}
     assert sizes == {(cam, 1920, 1280 if cam < 3 else 886) for cam in range(5)}
@@ -350,7 +350,7 @@ def test_a_scene_needs_lidar_and_images(own_street):
     shutil.rmtree(own_street.root / "images")
     with pytest.raises(AdapterError, match=r"there is no usable image in 4 frames"):
         open_raw(own_street.root, QUERY)
-    write_dataset(own_street.root)
+    write_as_street_gaussians(own_street.root)
     (own_street.root / "pointcloud.npz").unlink()
     with pytest.raises(AdapterError, match=r"no LiDAR returns in 4 frames.*npz lacks 4 frames"):
         open_raw(own_street.root, QUERY)

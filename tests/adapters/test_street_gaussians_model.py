@@ -10,15 +10,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from street_gaussians_models import (
-    RawModel,
-    RawPart,
-    checkpoint,
-    config_tree,
-    ply_bytes,
-    random_part,
-    write_model,
-)
 
 from adapters.street_gaussians.data import ModelConfig
 from adapters.street_gaussians.model import (
@@ -30,6 +21,15 @@ from adapters.street_gaussians.model import (
     read_ply_model,
 )
 from augment.errors import AdapterError
+from tests.adapters.street_gaussians_models import (
+    RawModel,
+    RawPart,
+    checkpoint,
+    config_tree,
+    ply_bytes,
+    random_part,
+    write_model,
+)
 
 PLAIN = ModelConfig()
 

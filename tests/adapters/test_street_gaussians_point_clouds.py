@@ -10,12 +10,12 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
-from street_gaussians_files import write_members, write_point_clouds
 
 from adapters.safe_pickle import stream_arrays
 from adapters.street_gaussians.adapter import iterate_point_clouds, read_point_cloud
 from augment.errors import AdapterError
 from augment.files.pickles import PickleError
+from tests.adapters.street_gaussians_files import write_members, write_point_clouds
 
 RNG = np.random.default_rng(7)
 

@@ -13,8 +13,6 @@ import pytest
 import torch
 import yaml
 from scipy.spatial.transform import Rotation
-from street_gaussians_files import Facts, write_dataset
-from street_gaussians_models import RawModel, RawPart, config_tree, random_part, write_model
 
 from adapters.base import open_scene
 from adapters.detect_format import detect_scheme
@@ -44,6 +42,14 @@ from augment.scene.sky import ConstantSky
 from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers
 from recipes.schema import Recipe
+from tests.adapters.street_gaussians_files import Facts, write_as_street_gaussians
+from tests.adapters.street_gaussians_models import (
+    RawModel,
+    RawPart,
+    config_tree,
+    random_part,
+    write_model,
+)
 from tests.assertions import assert_images_close
 
 C0, C1 = 0.28209479177387814, 0.4886025119029199
@@ -66,7 +72,7 @@ def drive(tmp_path_factory) -> Facts:
 
 def without_images(root: Path, **how) -> Facts:
     """Cameras are then those of Waymo; 96 pixels wide they are those of the facts."""
-    facts = write_dataset(root, images=False, lidar=False, **how)
+    facts = write_as_street_gaussians(root, images=False, lidar=False, **how)
     for cam in facts.cameras:
         path = root / "intrinsics" / f"{cam}.txt"
         values = np.loadtxt(path)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from street_gaussians_files import HEADER, StreetObject, pose_about_z, write_dataset
 
 from adapters.street_gaussians.data import (
     ModelConfig,
@@ -18,6 +17,12 @@ from adapters.street_gaussians.data import (
     tracklets_of,
 )
 from augment.errors import AdapterError
+from tests.adapters.street_gaussians_files import (
+    HEADER,
+    StreetObject,
+    pose_about_z,
+    write_as_street_gaussians,
+)
 
 FRONT = ModelConfig(cameras=(0, 1, 2))
 ALL = ModelConfig(cameras=(0, 1, 2, 3, 4))
@@ -25,13 +30,13 @@ ALL = ModelConfig(cameras=(0, 1, 2, 3, 4))
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    return write_dataset(tmp_path_factory.mktemp("street"), images=False, castrack=True)
+    return write_as_street_gaussians(tmp_path_factory.mktemp("street"), images=False, castrack=True)
 
 
 @pytest.fixture()
 def own_street(tmp_path):
     """A street whose files a test may change."""
-    return write_dataset(tmp_path / "own", images=False, lidar=False)
+    return write_as_street_gaussians(tmp_path / "own", images=False, lidar=False)
 
 
 def test_objects_stand_in_the_first_free_columns_in_the_files_order(street):
@@ -60,7 +65,7 @@ def test_places_and_turns_are_those_of_the_objects_in_the_vehicles_frame(street)
 
 def test_sizes_are_the_largest_of_the_whole_file(tmp_path):
     fast = StreetObject(1, "vehicle", (4.4, 1.9, 1.5), (16, 3, 0.75), (-30, 0), np.pi)
-    facts = write_dataset(tmp_path, objects=(fast,), images=False, lidar=False)
+    facts = write_as_street_gaussians(tmp_path, objects=(fast,), images=False, lidar=False)
     config = ModelConfig(cameras=(0,), selected_frames=(0, 1))
     (car,) = read_data(facts.root, config).objects
     # The largest box is of frame 2, which is not selected.
@@ -105,14 +110,18 @@ def test_rows_are_not_compacted_where_a_frame_still_fills_every_column(tmp_path)
     still = StreetObject(3, "vehicle", (4, 2, 1.5), (12, 4, 0.7), frames=(1, 2, 3))
     first = StreetObject(5, "vehicle", (4, 2, 1.5), (20, 3, 0.7), (-30, 0), frames=(0, 1))
     second = StreetObject(7, "vehicle", (4, 2, 1.5), (25, -3, 0.7), (15, 0))
-    facts = write_dataset(tmp_path, objects=(still, first, second), images=False, lidar=False)
+    facts = write_as_street_gaussians(
+        tmp_path, objects=(still, first, second), images=False, lidar=False
+    )
     data = read_data(facts.root, FRONT)
     # Frame 1 is the only one with three rows, so that there are three columns at first.
     assert data.tracklets.ids.tolist() == [[5, 7], [5, 7], [7, -1], [7, -1]]
 
     first = StreetObject(5, "vehicle", (4, 2, 1.5), (20, 3, 0.7), (-60, 0), frames=(0, 3))
     still = StreetObject(3, "vehicle", (4, 2, 1.5), (12, 4, 0.7), frames=(1, 2))
-    facts = write_dataset(tmp_path, objects=(still, first, second), images=False, lidar=False)
+    facts = write_as_street_gaussians(
+        tmp_path, objects=(still, first, second), images=False, lidar=False
+    )
     # Never more than two rows: where the still one was, its column stays empty.
     data = read_data(facts.root, FRONT)
     assert data.tracklets.ids.tolist() == [[5, 7], [-1, 7], [-1, 7], [5, 7]]

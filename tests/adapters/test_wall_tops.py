@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import drives
 import numpy as np
 import torch
 
@@ -12,6 +11,7 @@ from adapters.training_views.starting_scene import continue_walls
 from adapters.training_views.views import RecordedViews
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
+from tests.adapters import drives
 
 AWAY_M, LEFT_TOP_M, RIGHT_TOP_M = 20.0, 10.0, 2.0
 SIZE, FOCAL_PX = (160, 120), 100.0

@@ -1,11 +1,9 @@
 """The driver of reconstruction, on stand-ins for what it drives."""
 
 import dataclasses
-import importlib
 import json
 import os
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +13,7 @@ from adapters.base import open_scene
 from augment.errors import ClimateGSError, OutputError
 from augment.files.scene_file import FORMAT
 from augment.jobs.processes import OutputLock
+from tests.adapters.recording_files import write_as_recording
 from tests.tools.fake_fit import Fakes, FakeTrainer
 from tools import fit, training
 from tools.cli import main
@@ -357,6 +356,13 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
                 load_checkpoint(tmp_path)
 
 
+@pytest.fixture
+def recording(tmp_path) -> str:
+    """A street of 3 m with a moving car, recorded by small cameras."""
+    folder = write_as_recording(tmp_path / "drive")
+    return f"recording:{folder}?voxel_m=0.5&image_scale=1&sky_size=8"
+
+
 def real_fit(recording, out, before_step=lambda step: None):
     run_step = fit.Trainer.run_step
 
@@ -371,11 +377,7 @@ def real_fit(recording, out, before_step=lambda step: None):
 
 
 @pytest.mark.long
-def test_a_recording_is_fitted_and_interruptions_change_no_bit(tmp_path, monkeypatch):
-    """A street of 3 m with a moving car, recorded by small cameras."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "adapters"))
-    folder = importlib.import_module("recording_folder").write_recording(tmp_path / "drive")
-    recording = f"recording:{folder}?voxel_m=0.5&image_scale=1&sky_size=8"
+def test_a_recording_is_fitted_and_interruptions_change_no_bit(tmp_path, recording):
     whole = real_fit(recording, tmp_path / "whole")
     assert whole.code == 0
     stopped = real_fit(recording, tmp_path / "parts", interrupter(2))

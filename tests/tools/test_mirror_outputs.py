@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from adapters import detect_format as source_trees
+from adapters.dataset import fixed_tree
+from adapters.datasets import DATASETS
 from augment.effects.lidar import drop_lost_returns
 from augment.errors import AdapterError, ClimateGSError, OutputError
 from augment.jobs.mirror_sweeps import find_span_frames
@@ -166,12 +167,9 @@ def with_sweeps(root: Path, name: str = "street", frames: tuple[int, ...] = (0, 
 @pytest.fixture
 def bin_sweeps(monkeypatch):
     """The little sequence's sweeps are no pickles."""
-    found = source_trees._TREES["pandaset"]
-    monkeypatch.setitem(
-        source_trees._TREES,
-        "pandaset",
-        lambda *asked: found(*asked)._replace(sweeps=r"lidar/\d+\.bin"),
-    )
+    tree = fixed_tree(r"camera/[^/]+/\d+\.jpg", r"lidar/\d+\.bin")
+    dataset = dataclasses.replace(DATASETS["pandaset"], source_tree=tree)
+    monkeypatch.setitem(DATASETS, "pandaset", dataset)
 
 
 FLOOD = Flood(level_m=0.0, reference="absolute", turbidity_ntu=0)  # loses what is deep in it

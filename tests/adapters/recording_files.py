@@ -1,8 +1,9 @@
-"""The tiny street of pandaset_folder as a recording: images, calibration.json, plain Parquet files
-as any other program writes them."""
+"""The tiny street as a recording: images, calibration.json, and Parquet files as any program writes
+them."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pandaset_folder as street
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from augment.output.codecs import encode_depth
+from tests.adapters import street
+from tests.adapters.pandaset_files import drive_of_pandaset
+from tests.adapters.street import Drive
 
 # PandaSet's class numbers of the street's returns, by name of SemanticClass.
 CLASSES = {"7": "road", "41": "building", "13": "vehicle"}
@@ -22,7 +25,7 @@ EGO_ABOVE_GROUND_M = -street.GROUND_Z
 QUERY = {"voxel_m": "0.1", "image_scale": "1", "sky_size": "32"}
 
 
-def write_recording(
+def write_as_recording(
     root: Path,
     *,
     lidar: bool = True,
@@ -48,6 +51,15 @@ def write_recording(
     return root
 
 
+def drive_of_recording(root: Path) -> Drive:
+    same = drive_of_pandaset(root)
+    names = {"car-a": "car", "parked": "parked"}
+    boxes = {n: {names[k]: box for k, box in found.items()} for n, found in same.boxes.items()}
+    return dataclasses.replace(
+        same, scheme="recording", boxes=boxes, car="car", time_atol_ns=0, car_atol_m=1e-6
+    )
+
+
 def edit_calibration(root: Path, change: Callable[[dict[str, Any]], None]) -> None:
     """Change calibration.json in place."""
     path = root / "calibration.json"
@@ -57,7 +69,7 @@ def edit_calibration(root: Path, change: Callable[[dict[str, Any]], None]) -> No
 
 
 def sweep_columns(frame: int, offset: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    points, classes, times, _ = street._sweep(frame)
+    points, classes, times, _ = street.sweep(frame)
     points = points if offset is None else points + offset
     columns = {axis: points[:, i] for i, axis in enumerate("xyz")}
     return columns | {"t": times, "semantic": classes, "intensity": np.ones(len(points), "f4")}
@@ -73,10 +85,7 @@ def box_columns(frames: int, offset: np.ndarray | None = None) -> dict[str, list
     offset = np.zeros(3) if offset is None else offset
     rows = []
     for frame in range(frames):
-        places = {
-            "car": street.car_centre(street.FRAME_S * frame),
-            "parked": np.array([-7.0, -5, 0.4]),
-        }
+        places = {"car": street.car_centre(street.FRAME_S * frame), "parked": street.PARKED_AT}
         for name, centre in places.items():
             rows.append((frame, name, *(centre + offset), *street.CAR_SIZE_M, name == "parked"))
     names = ["frame", "track_id", "center_x_m", "center_y_m", "center_z_m"]
@@ -96,10 +105,6 @@ def time_ns(frame: int) -> int:
     return round(street.time_s(frame) * 1e9)
 
 
-def _camera_centre(frame: int) -> np.ndarray:
-    return street.ego_position(frame) + np.array([0, 0, street.CAMERA_HEIGHT_M + street.GROUND_Z])
-
-
 def _frame_entry(frame: int, cameras: tuple[str, ...], offset: np.ndarray) -> dict[str, Any]:
     intrinsics = {"width": street.WIDTH, "height": street.HEIGHT}
     intrinsics |= {"fx": street.FOCAL_PX, "fy": street.FOCAL_PX}
@@ -107,52 +112,23 @@ def _frame_entry(frame: int, cameras: tuple[str, ...], offset: np.ndarray) -> di
     return {
         "frame": frame,
         "timestamp_ns": time_ns(frame),
-        "world_from_ego": _pose(np.eye(3), street.ego_position(frame) + offset),
+        "world_from_ego": street.rigid(np.eye(3), street.ego_position(frame) + offset).tolist(),
         "cameras": {
             name: {
                 **intrinsics,
-                "world_from_camera": _pose(street.CAMERAS[name], _camera_centre(frame) + offset),
+                "world_from_camera": street.rigid(
+                    street.CAMERAS[name], street.camera_centre(frame) + offset
+                ).tolist(),
             }
             for name in cameras
         },
     }
 
 
-def _pose(rotation: np.ndarray, position: np.ndarray) -> list[list[float]]:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, position
-    return matrix.tolist()
-
-
 def _write_view(root: Path, name: str, frame: int, *, with_depth: bool) -> None:
-    u = (np.arange(street.WIDTH) + 0.5 - street.WIDTH / 2) / street.FOCAL_PX
-    v = (np.arange(street.HEIGHT) + 0.5 - street.HEIGHT / 2) / street.FOCAL_PX
-    local = np.stack([*np.meshgrid(u, v), np.ones((street.HEIGHT, street.WIDTH))], axis=-1)
-    rays, centre = local @ street.CAMERAS[name].T, _camera_centre(frame)
-    image = street.colour_at(centre, rays, street.FRAME_S * frame)
     for folder in ("images", "depth") if with_depth else ("images",):
         (root / folder / name).mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(root / "images" / name / f"{frame:06d}.png"), image[..., ::-1].astype(np.uint8))
+    cv2.imwrite(str(root / "images" / name / f"{frame:06d}.png"), street.image(name, frame))
     if with_depth:
-        depth_m = _depth(centre, rays, street.FRAME_S * frame).astype(np.float32)
+        depth_m = street.depth_image(name, frame).astype(np.float32)
         (root / "depth" / name / f"{frame:06d}.png").write_bytes(encode_depth(depth_m))
-
-
-def _depth(origin: np.ndarray, rays: np.ndarray, at_s: float) -> np.ndarray:
-    """Depth of what `street.colour_at` shows along rays of unit depth; 0 for sky."""
-    half = street.CAR_SIZE_M / 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ground = (street.GROUND_Z - origin[2]) / rays[..., 2]
-        wall = (street.WALL_Y - origin[1]) / rays[..., 1]
-        low = (street.car_centre(at_s) - half - origin) / rays
-        high = (street.car_centre(at_s) + half - origin) / rays
-        z = origin[2] + wall * rays[..., 2]
-    enter, leave = np.fmin(low, high).max(-1), np.fmax(low, high).min(-1)
-    on_wall = (wall > 0) & (z < street.WALL_TOP_M) & (z > street.GROUND_Z)
-    depths = [
-        np.where(ground > 0, ground, np.inf),
-        np.where(on_wall, wall, np.inf),
-        np.where((enter > 0) & (enter < leave), enter, np.inf),
-    ]
-    nearest = np.min(depths, axis=0)
-    return np.where(np.isfinite(nearest), nearest, 0)
