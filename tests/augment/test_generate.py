@@ -31,7 +31,7 @@ from augment.jobs.blocks import read_status, stored_plans
 from augment.jobs.generate import GenerateJob, GenerateResult, Workers, plan_job, run_generate
 from augment.jobs.processes import available_cores
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.worker import compute_time_shares
+from augment.jobs.time_shares import compute_time_shares
 from augment.output.atomic import write_atomic
 from augment.output.layout import STATE_FOLDER, folder_name
 from augment.output.manifest import list_parts, read_manifest, read_manifest_rows

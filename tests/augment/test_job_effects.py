@@ -33,9 +33,10 @@ from augment.effects.smog import box_transmittance
 from augment.effects.snow.snow import count_snow_pixels
 from augment.effects.style import style as scene_maps
 from augment.errors import OutputError, StyleError
-from augment.jobs.render_job import JobResult, RenderJob, run_job, stored_names
+from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.output.box_weather import box_tables, combine_visibility
 from augment.output.manifest import later_columns, read_manifest
+from augment.output.recipe_files import stored_names
 from augment.scene.boxes import WorldBoxes
 from augment.scene.cameras import Camera
 from augment.scene.labels import Boxes

@@ -36,7 +36,7 @@ from augment.errors import ClimateGSError, GpuLost, OutputError
 from augment.jobs import worker as runner
 from augment.jobs.processes import available_cores, share_scene, thread_limits
 from augment.jobs.render_job import JobResult, RenderJob, run_job
-from augment.jobs.worker import compute_time_shares
+from augment.jobs.time_shares import compute_time_shares
 from augment.jobs.write_pump import WritePump
 from augment.output.manifest import read_manifest
 from augment.render.threads import wait_for_result
