@@ -1,9 +1,9 @@
 """Publishing: moves a block from the folder it was rendered in to the output.
 
 In: a block's folder and the output. Out: files in the output, and a part of the manifest.
-`block_worker` calls it. Files go to the output first; to an object store, an image's files go as soon
-as it is finished. Readers see no image of the block before its rows follow in one step. Files that
-belong to several images are named by blocks, so that no two workers write one file:
+`block_worker` calls it. Files go to the output first; to an object store, an image's files go as
+soon as it is finished. Readers see no image of the block before its rows follow in one step. Files
+that belong to several images are named by blocks, so that no two workers write one file:
 `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
 """
 
