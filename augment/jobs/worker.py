@@ -400,11 +400,16 @@ def _lidar_entries(recipe: Recipe, fault: str | None) -> PassedLidar:
 
 
 def _make_pump(setup: SceneSetup) -> WritePump:
-    """Return the writing threads of one worker."""
-    if setup.workers == 1 or renders_on_gpu(setup.backend):
-        return WritePump.beside(setup.backend, max(1, available_cores() // setup.workers))
-    # One thread and a short queue: the memory of waiting views counts once per worker.
-    return WritePump(threads=1, waiting=2)
+    """Return the writing threads of one worker.
+
+    A GPU leaves the cores free, and renders faster than one core can encode. A CPU backend renders
+    on the same cores: two threads write. One thread and a short queue do where there are several
+    workers, because the memory of waiting views counts once per worker.
+    """
+    if renders_on_gpu(setup.backend):
+        cores = max(1, available_cores() // setup.workers)
+        return WritePump(cores, cores + 2)
+    return WritePump() if setup.workers == 1 else WritePump(threads=1, waiting=2)
 
 
 # ---- The worker of one open scene ----------------------------------------------------------------
