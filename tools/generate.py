@@ -16,7 +16,7 @@ from augment.errors import ClimateGSError
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.blocks import JobStatus, read_status, select_shard
 from augment.jobs.generate import GenerateJob, default_scratch, plan_job, run_generate
-from augment.jobs.worker import compute_time_shares
+from augment.jobs.time_shares import compute_time_shares
 from augment.output.layout import STATE_FOLDER
 from augment.output.store import open_store
 from recipes.job import load_job, load_job_recipes
@@ -94,7 +94,7 @@ def show_status(out: str) -> int:
 
 
 def _dry_run(job: GenerateJob) -> int:
-    from augment.jobs.generate import estimate_job
+    from augment.jobs.estimate import estimate_job
 
     plan = plan_job(job)
     page = fill(

@@ -10,7 +10,7 @@ from adapters.camera_files.paths import frames_from_path_file
 from adapters.scene_cache import scene_digest
 from augment.errors import ClimateGSError
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.worker import compute_time_shares
+from augment.jobs.time_shares import compute_time_shares
 from augment.output.layout import variant_name
 from augment.output.manifest import lidar_notes
 from augment.output.store import open_store

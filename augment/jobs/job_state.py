@@ -15,7 +15,6 @@ import contextlib
 import json
 import logging
 import os
-import shutil
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -34,6 +33,7 @@ from augment.output.atomic import (
     raise_output_error,
     read_file,
     remove_temporaries,
+    remove_tree,
     write_atomic,
 )
 from augment.output.box_tables import BoxNumbers, Item
@@ -182,7 +182,7 @@ def _take_over_old_logs(out_dir: Path) -> None:
                 make_folder(path.parent)
                 old_path.rename(path)
                 flush_folder(path.parent)
-    _remove_tree(old_dir)
+    remove_tree(old_dir)
 
 
 def _line(value: dict[str, Any]) -> bytes:
@@ -530,7 +530,7 @@ class JobState:
             self._replace_rows([], variants)
         for variant in variants:
             variant.progress_log.remove()
-        _remove_tree(trash_dir)
+        remove_tree(trash_dir)
 
     def _drop_sweeps(self) -> None:
         """Delete the scene's sweeps that no image has any more.
@@ -569,7 +569,7 @@ class JobState:
         # Blocks of other jobs may be at work below it.
         remove_temporaries(state_dir, recursive=False)
         remove_temporaries(state_dir / PROGRESS_LOGS)
-        _remove_tree(state_dir / "trash")
+        remove_tree(state_dir / "trash")
         job_folders = {variant.folder for variant in self.variants}
         sweeps = f"{folder_name(self.index.name)}/{SWEEP_FOLDER}"
         for folder in sorted({sweeps, *job_folders, *logged_variants(self.out_dir)}):
@@ -586,9 +586,3 @@ def _read_table(kind: str, path: Path) -> dict[Item, BoxNumbers]:
     except OutputError as error:
         _log.warning("%s; the images it belongs to are rendered again", error)
         return {}
-
-
-def _remove_tree(folder: Path) -> None:
-    """Delete a folder with everything in it, if it exists."""
-    with raise_output_error(folder), contextlib.suppress(FileNotFoundError):
-        shutil.rmtree(folder)

@@ -12,35 +12,27 @@ from __future__ import annotations
 import contextlib
 import copy
 import logging
-import re
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import augment
 from augment.effects import JobContext, precompute_effects
-from augment.errors import ClimateGSError, OutputError
+from augment.errors import ClimateGSError
 from augment.jobs.job_state import BoxCache, JobState
-from augment.jobs.pools import ProcessPool, SerialPool, Work, WorkerPool, run_tasks
+from augment.jobs.pools import ProcessPool, SerialPool, Work, run_tasks
 from augment.jobs.processes import OutputLock, SharedScene, check_sendable, share_scene
-from augment.jobs.worker import (
-    WORKERS,
-    Chunk,
-    Outcome,
-    RenderSetup,
-    SceneSetup,
-    TaskFailed,
-    WorkTimes,
-)
+from augment.jobs.time_shares import WORKERS, WorkTimes
+from augment.jobs.worker import Chunk, Outcome, SceneSetup, TaskFailed
 from augment.memo import memo_of
-from augment.output.atomic import path_below, read_file, write_atomic
 from augment.output.calibration import trajectory_id
-from augment.output.layout import MANIFEST_FILE, STATE_FOLDER, folder_name, variant_name
+from augment.output.layout import MANIFEST_FILE, STATE_FOLDER, variant_name
 from augment.output.manifest import FAILED, OK, Identity
+from augment.output.recipe_files import check_not_overwritten, lacks_recipe, write_recipe
 from augment.output.store import open_store
 from augment.photo.recorded_base import check_photos
 from augment.progress import ProgressBar
@@ -51,121 +43,8 @@ from augment.scene.scene_index import SceneIndex, select_frames
 from augment.view.box_labels import uses_boxes
 from augment.view.quality import choose_settings
 from augment.view.results import Renderer
-from recipes.fields import section_at, with_unchecked_field
-from recipes.files import read_files, with_digest
-from recipes.load import dump_recipe
-from recipes.schema import SECTIONS, Recipe
-
-# ---- Copies of the files that a recipe names: those of a style in `<variant>/style/` -------------
-# With these copies a variant's `recipe.yaml` renders it again wherever the folder is moved.
-
-# Name of the recipe in a variant's folder.
-RECIPE_FILE = "recipe.yaml"
-# Suffixes of file names that are safe on every system.
-_SUFFIX = re.compile(r"\.[A-Za-z0-9]{1,16}")
-
-
-def file_folders() -> tuple[str, ...]:
-    """Return the folders inside a variant's folder that hold files which recipes name."""
-    return tuple(path.split(".")[-1] for path, model in SECTIONS.items() if model.file_fields)
-
-
-def stored_names(recipe: Recipe) -> dict[str, str]:
-    """Return the name of each of the recipe's files in the variant's folder, by dotted field path.
-
-    A file keeps its own name where that is safe. A second file of the same name gets its field's
-    name in front.
-    """
-    name_of_field: dict[str, str] = {}
-    for section_path, section in recipe.sections().items():
-        names: dict[str, str] = {}
-        for key, path in section.files.items():
-            name = _safe_name(path)
-            while name.casefold() in {other_name.casefold() for other_name in names.values()}:
-                name = f"{key}-{name}"
-            names[key] = name
-        folder = section_path.split(".")[-1]
-        name_of_field |= {
-            f"{section_path}.{key}": f"{folder}/{name}" for key, name in names.items()
-        }
-    return name_of_field
-
-
-def portable_recipe(recipe: Recipe) -> Recipe:
-    """Return the recipe with its files named relative to the variant's folder.
-
-    Its hash is the same.
-    """
-    for path, name in stored_names(recipe).items():
-        recipe = with_unchecked_field(recipe, path, name)
-    return recipe
-
-
-def check_not_overwritten(recipe: Recipe, folders: Collection[Path]) -> None:
-    """Refuse to overwrite `folders` where the recipe needs files in them."""
-    for path in stored_names(recipe):
-        real_path = Path(section_at(recipe, path)).resolve()
-        for folder in folders:
-            if real_path.is_relative_to(folder.resolve()):
-                raise OutputError(
-                    f"{path} of recipe {recipe.name} is {real_path}, in the folder {folder}, "
-                    f"which is to be overwritten: copy the recipe and its files out of it first"
-                )
-
-
-def copy_files(recipe: Recipe, folder: Path) -> None:
-    """Put the recipe's files where `portable_recipe` names them.
-
-    Args:
-        folder: Folder of the variant.
-
-    Raises:
-        RecipeError: A file is unreadable, or is not the one of the recipe's digest.
-    """
-    names = stored_names(recipe)
-    for section_path, section in recipe.sections().items():
-        for key, data in read_files(section).items() if section.files else ():
-            path = folder / names[f"{section_path}.{key}"]
-            if not (path.is_file() and read_file(path) == data):
-                write_atomic(path, data)
-
-
-def write_recipe(recipe: Recipe, folder: Path) -> None:
-    """Write `recipe.yaml` and the files that it names.
-
-    Args:
-        folder: Folder of the variant.
-
-    Raises:
-        RecipeError: As of copy_files.
-        OutputError: The system refuses, or a link leads out of the output.
-    """
-    variant_parts = folder.parent.name, folder.name
-    for name in stored_names(recipe).values():
-        path_below(folder.parents[1], (*variant_parts, *PurePath(name).parts[:-1]))
-    copy_files(recipe, folder)
-    write_atomic(folder / RECIPE_FILE, dump_recipe(portable_recipe(recipe)).encode())
-
-
-def lacks_recipe(recipe: Recipe, folder: Path) -> bool:
-    """Return True if `recipe.yaml` or a file that it names is missing.
-
-    Args:
-        folder: Folder of the variant.
-    """
-    names = (RECIPE_FILE, *stored_names(recipe).values())
-    return not all((folder / name).is_file() for name in names)
-
-
-def _safe_name(path: str) -> str:
-    """Return the file's name as `folder_name` makes it, with its suffix still at the end."""
-    file_path = PurePath(path)
-    if _SUFFIX.fullmatch(file_path.suffix):
-        return folder_name(file_path.stem) + file_path.suffix
-    return folder_name(file_path.name)
-
-
-# ---- The job -------------------------------------------------------------------------------------
+from recipes.files import with_digest
+from recipes.schema import Recipe
 
 _log = logging.getLogger(__name__)
 SceneLoader = Callable[[str], Scene]
@@ -242,8 +121,8 @@ class JobResult:
     """One line for each failure."""
     timings: dict[str, float] = field(default_factory=dict)
     """Seconds by kind of work, summed over threads and workers, or of the job itself (open,
-    choose_settings, prepare, read_labels, share_scene, finish). `worker.compute_time_shares` says
-    what bound the job.
+    choose_settings, prepare, read_labels, share_scene, finish).
+    `time_shares.compute_time_shares` says what bound the job.
     """
 
 
@@ -440,45 +319,48 @@ class _Run:
         if chunks:
             self._begin(chunks)
             chunks = self._fail_unlabelled(chunks)
-        assert self.scene is not None
-        setup = RenderSetup(
+        if not chunks:
+            return
+        work = _ImageWork(chunks, self.job.workers, self._deliver, self.times)
+        with contextlib.ExitStack() as stack:
+            if self.job.workers == 1:
+                pool = SerialPool(self._setup())
+            else:
+                setup = self._setup()
+                shared_scene = self._share_scene()
+                stack.callback(shared_scene.remove)
+                setup = replace(setup, open_scene=shared_scene.open, lock=lock.inherited())
+                pool = ProcessPool(setup, self.job.workers)
+            stack.callback(pool.close)
+            run_tasks(pool, work)
+
+    def _setup(self) -> SceneSetup:
+        """Return the setup of a worker in this process."""
+        scene, _ = self._opened_scene()
+        return SceneSetup(
             out_dir=str(self.out_dir),
             recipes=self.recipes,
             backend=self.backend,
+            renderer=self.renderer,
+            open_scene=self._opened_scene,
             labelled=self.index.labelled_frames,
             instances=self.index.instances,
-            memo=memo_of(self.scene).shared(),
+            memo=memo_of(scene).shared(),
             overwrite=self.job.overwrite,
+            workers=self.job.workers,
         )
-        if not chunks:
-            return
-        shared_scene = None
-        if self.job.workers > 1:
-            check_sendable(self.renderer)
-            with self.times.measure("share_scene"):
-                shared_scene = share_scene(
-                    self.scene, self.index.frames, self.out_dir / STATE_FOLDER
-                )
-            self.scene = None  # this process needs only the index from now on
-        work = _ImageWork(chunks, self.job.workers, self._deliver, self.times)
-        try:
-            with contextlib.closing(self._pool(setup, shared_scene, lock)) as pool:
-                run_tasks(pool, work)
-        finally:
-            if shared_scene is not None:
-                shared_scene.remove()
 
-    def _pool(
-        self, setup: RenderSetup, shared_scene: SharedScene | None, lock: OutputLock
-    ) -> WorkerPool:
-        """Return a pool of this process, or of several processes that open the shared scene."""
-        workers = self.job.workers
-        if shared_scene is None:
-            assert self.scene is not None
-            opened_scene = (self.scene, self.index.frames)
-            return SerialPool(SceneSetup(setup, lambda: opened_scene, self.renderer))
-        scene_setup = SceneSetup(setup, shared_scene.open, self.renderer, lock.inherited(), workers)
-        return ProcessPool(scene_setup, workers)
+    def _opened_scene(self) -> tuple[Scene, Sequence[Frame]]:
+        assert self.scene is not None, "workers have it"
+        return self.scene, self.index.frames
+
+    def _share_scene(self) -> SharedScene:
+        """Hand the scene to worker processes; this process needs only the index from now on."""
+        check_sendable(self.renderer)
+        with self.times.measure("share_scene"):
+            shared_scene = share_scene(*self._opened_scene(), self.out_dir / STATE_FOLDER)
+        self.scene = None
+        return shared_scene
 
     def _resolve_quality(self, recipe: Recipe) -> Recipe:
         """Return the recipe with the settings that its quality chooses, or has chosen before."""

@@ -17,8 +17,8 @@ import pyarrow as pa
 import pyarrow.compute
 
 from augment.errors import OutputError
-from augment.jobs.block_worker import VARIANTS, clear_staged
 from augment.jobs.blocks import Block
+from augment.jobs.publishing import VARIANTS, clear_staged
 from augment.output.claims import hold_claim
 from augment.output.layout import MANIFEST_FILE, folder_name
 from augment.output.manifest import list_parts, read_manifest, write_manifest

@@ -1,6 +1,6 @@
 """Rendering of an opened scene's images, one frame of one variant at a time, and their writing.
 
-In: a scene, its frames and a `RenderSetup`. Out: files in the output folder, and an `Outcome` for
+In: a scene, its frames and a `SceneSetup`. Out: files in the output folder, and an `Outcome` for
 each image. `render_job` calls it. The same code runs in the job's own process and in its workers.
 """
 
@@ -10,10 +10,9 @@ import contextlib
 import logging
 import threading
 import time
-from collections import defaultdict, deque
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +21,18 @@ import numpy as np
 
 from augment.errors import GpuLost, OutputError
 from augment.jobs.processes import InheritedLock, available_cores, shorten_switch_interval
+from augment.jobs.time_shares import (
+    ENCODE,
+    LIDAR,
+    MEASURE,
+    RENDER,
+    RENDERERS,
+    WAIT_FOR_FILES,
+    WAIT_FOR_VIEWS,
+    WRITE,
+    WRITERS,
+    WorkTimes,
+)
 from augment.jobs.view_files import write_view
 from augment.jobs.write_pump import WritePump
 from augment.memo import memo_of
@@ -41,163 +52,6 @@ from augment.view.render_view import ViewPool
 from augment.view.results import Pending, Renderer, ViewResult, check_view
 from recipes.schema import Recipe
 
-# ---- Where a job's time goes: seconds by kind of work, and the kind that bounds the job ----------
-# In every worker one thread renders and hands finished views to threads that encode and write them.
-# The rendering thread waits for files while the writing threads have too many views in hand, and at
-# the end until they have written the last ones. The busiest threads bound the job: the work of
-# the other threads runs beside it and costs nothing.
-
-# Kinds of work of the rendering threads. `render` includes `wait_for_views`: waiting for
-# the view in flight.
-RENDER = "render"
-WAIT_FOR_VIEWS = "wait_for_views"
-# Waiting for the writing threads.
-WAIT_FOR_FILES = "wait_for_files"
-# All time of the rendering threads.
-RENDERERS = "renderers"
-# Kinds of work of the writing threads.
-ENCODE = "encode"
-WRITE = "write"
-MEASURE = "measure"
-LIDAR = "lidar"
-# All time of the writing threads.
-WRITERS = "writers"
-# All time of the job's workers, from its begin to its end.
-WORKERS = "workers"
-
-# Labels of the writing threads' kinds of work, for people.
-_WRITING_LABELS = {ENCODE: "encoding", WRITE: "writing to disk", MEASURE: "boxes", LIDAR: "LiDAR"}
-# Labels of the work beside rendering and writing, for people.
-_OTHER_LABELS = {
-    "open": "opening scenes",
-    "choose_settings": "choosing settings",
-    "prepare": "preparing effects",
-    "read_labels": "reading labels",
-    "share_scene": "handing the scene to workers",
-    "finish": "writing manifests",
-    "publish": "publishing",
-}
-
-
-class WorkTimes:
-    """Seconds by kind of work; several threads may add to them."""
-
-    def __init__(self) -> None:
-        self._seconds: defaultdict[str, float] = defaultdict(float)
-        self._lock = threading.Lock()
-
-    def add(self, kind: str, seconds: float) -> None:
-        """Add seconds to a kind of work."""
-        with self._lock:
-            self._seconds[kind] += seconds
-
-    @contextmanager
-    def measure(self, *kinds: str) -> Iterator[None]:
-        """Context manager that adds the time inside it to each of these kinds.
-
-        The time counts also where the block ends with an exception.
-        """
-        start_s = time.perf_counter()
-        try:
-            yield
-        finally:
-            for kind in kinds:
-                self.add(kind, time.perf_counter() - start_s)
-
-    def update(self, seconds: Mapping[str, float]) -> None:
-        """Add seconds by kind."""
-        for kind, kind_seconds in seconds.items():
-            self.add(kind, kind_seconds)
-
-    def so_far(self) -> dict[str, float]:
-        """Return a copy of the seconds by kind."""
-        with self._lock:
-            return dict(self._seconds)
-
-
-@dataclass(frozen=True)
-class TimeShares:
-    """Parts of a job's time, 0 to 1."""
-
-    rendering: float
-    """Part of the workers' time in which they render."""
-    waiting_for_views: float
-    """Part of the workers' time in which they wait for views in flight; included in `rendering`."""
-    waiting_for_files: float
-    """Part of the workers' time in which they wait for files to be written."""
-    other_work: float
-    """Part of the workers' time for all other work."""
-    beside_by: str
-    """Label of the greatest part of `beside`."""
-    writing: Mapping[str, float]
-    """Parts of the writing threads' time, by label of the kind of work."""
-
-    @property
-    def bound_by(self) -> str:
-        """Label of the work that bounds the job."""
-        if sum(self.writing.values()) > self.rendering + self.other_work:
-            return max(self.writing, key=self.writing.__getitem__)
-        return "rendering" if self.rendering >= self.other_work else self.beside_by
-
-    @property
-    def sentence(self) -> str:
-        """All shares in one line, for people."""
-        wait = (
-            f" ({_percent(self.waiting_for_views)} for views in flight)"
-            if self.waiting_for_views
-            else ""
-        )
-        beside = f"other work {_percent(self.other_work)}, first of all {self.beside_by}"
-        kinds = ", ".join(f"{kind} {_percent(share)}" for kind, share in self.writing.items())
-        return (
-            f"bound by {self.bound_by}: rendering {_percent(self.rendering)} of the time{wait}, "
-            f"waiting for files {_percent(self.waiting_for_files)}, {beside}; "
-            f"writing threads {_percent(sum(self.writing.values()))} busy ({kinds})"
-        )
-
-
-def compute_time_shares(
-    seconds: Mapping[str, float], num_waiting_workers: int = 1
-) -> TimeShares | None:
-    """Return the shares of a job's seconds by kind of work; None where nothing was rendered.
-
-    Args:
-        seconds: Seconds by kind of work.
-        num_waiting_workers: Number of workers that wait while the job itself does other work than
-            rendering.
-    """
-    workers_s = seconds.get(WORKERS, 0.0)
-    writers_s = seconds.get(WRITERS, 0.0)
-    if not (seconds.get(RENDER) and workers_s and writers_s):
-        return None
-    # A worker's writing threads exist as long as the worker does, at work or not.
-    writers_s *= workers_s / seconds[RENDERERS]
-    rendering_share = seconds[RENDER] / workers_s
-    waiting_share = seconds.get(WAIT_FOR_FILES, 0.0) / workers_s
-    other_share = max(0.0, 1 - rendering_share - waiting_share)
-    share_of_label = {
-        label: num_waiting_workers * seconds.get(k, 0.0) / workers_s
-        for k, label in _OTHER_LABELS.items()
-    }
-    share_of_label["workers that start or have nothing to do"] = other_share - sum(
-        share_of_label.values()
-    )
-    return TimeShares(
-        rendering=rendering_share,
-        waiting_for_views=seconds.get(WAIT_FOR_VIEWS, 0.0) / workers_s,
-        waiting_for_files=waiting_share,
-        other_work=other_share,
-        beside_by=max(share_of_label, key=share_of_label.__getitem__),
-        writing={
-            label: seconds.get(kind, 0.0) / writers_s for kind, label in _WRITING_LABELS.items()
-        },
-    )
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
-
-
 # ---- Frames rendered, labelled and written -------------------------------------------------------
 
 # Longest message of a failure in the manifest, characters.
@@ -206,31 +60,11 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class RenderSetup:
-    """Everything that rendering needs besides scene and frames; small and picklable."""
-
-    out_dir: str
-    """Output folder."""
-    recipes: tuple[Recipe, ...]
-    """Resolved recipes, one for each variant."""
-    backend: str
-    """Name of the rasteriser's backend."""
-    labelled: frozenset[int]
-    """Numbers of the frames whose labels and LiDAR pass through."""
-    instances: Instances
-    """Numbers of the scene's objects."""
-    memo: Mapping[Hashable, Any] = field(default_factory=dict)
-    """Data that the recipes' images share; the memo of the scene to render takes it over."""
-    overwrite: bool = False
-    """If True, LiDAR sweeps that exist already are written again."""
-
-
-@dataclass(frozen=True)
 class Chunk:
     """Images of one frame under one recipe."""
 
     variant: int
-    """Position in RenderSetup.recipes."""
+    """Position in SceneSetup.recipes."""
     frame: int
     """Frame number."""
     cameras: tuple[str, ...]
@@ -242,7 +76,7 @@ class Outcome:
     """Result of one image."""
 
     variant: int
-    """Position in RenderSetup.recipes."""
+    """Position in SceneSetup.recipes."""
     frame: int
     """Frame number."""
     camera: str
@@ -321,35 +155,32 @@ class FrameRunner:
     run.
 
     Attributes:
+        setup: Recipes, output, backend and renderer.
+        scene: Opened scene.
+        frames: Frames to render; may hold more.
         deliver: Called with each image's Outcome by the writing threads, once its files are on the
             disk.
-        pump: Threads that write.
-        renderer: Renderer of the images; the library's own if None.
-        frames: Frames to render; may hold more.
-        scene: Opened scene.
-        setup: Recipes, output and backend.
     """
 
     def __init__(
         self,
+        setup: SceneSetup,
         scene: Scene,
         frames: Sequence[Frame],
-        setup: RenderSetup,
-        renderer: Renderer | None,
         deliver: Callable[[Outcome], None],
-        pump: WritePump,
     ) -> None:
         self._cameras = {f.index: f.cameras for f in frames}
         self._scene = scene
         self._setup = setup
         self._views = None
+        renderer = setup.renderer
         if renderer is None:
             self._views = ViewPool(scene, setup.backend)
             renderer = self._views.begin
         self._renderer: Renderer = renderer
         self._ahead = 1 if self._views is None else self._views.num_in_flight
         self._deliver = deliver
-        self._pump = pump
+        self._pump = _make_pump(setup)
         self._boxes: dict[int, Boxes] = {}  # by number of the frames read so far
         self._reading_boxes = threading.Lock()
         self._warned: set[str] = set()  # variants with a sweep that stayed clear
@@ -568,33 +399,53 @@ def _lidar_entries(recipe: Recipe, fault: str | None) -> PassedLidar:
     return PassedLidar("clean", f"{recipe.lidar_note('clean')}: {fault}")
 
 
+def _make_pump(setup: SceneSetup) -> WritePump:
+    """Return the writing threads of one worker.
+
+    A GPU leaves the cores free, and renders faster than one core can encode. A CPU backend renders
+    on the same cores: two threads write. One thread and a short queue do where there are several
+    workers, because the memory of waiting views counts once per worker.
+    """
+    if renders_on_gpu(setup.backend):
+        cores = max(1, available_cores() // setup.workers)
+        return WritePump(cores, cores + 2)
+    return WritePump() if setup.workers == 1 else WritePump(threads=1, waiting=2)
+
+
 # ---- The worker of one open scene ----------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class SceneSetup:
-    """Everything that the workers of one scene share."""
+    """Everything that the workers of one scene share; small, and picklable if its parts are."""
 
-    setup: RenderSetup
-    """Recipes, output and backend."""
-    scene: Callable[[], tuple[Scene, Sequence[Frame]]]
-    """Opens the scene, with its frames, in the worker's process."""
+    out_dir: str
+    """Output folder."""
+    recipes: tuple[Recipe, ...]
+    """Resolved recipes, one for each variant."""
+    backend: str
+    """Name of the rasteriser's backend."""
     renderer: Renderer | None
     """Renderer of the images; the library's own if None."""
-    lock: InheritedLock | None = None
-    """Held only: the output stays locked for the job until its last worker ends."""
+    open_scene: Callable[[], tuple[Scene, Sequence[Frame]]]
+    """Opens the scene, with its frames, in the worker's process."""
+    labelled: frozenset[int]
+    """Numbers of the frames whose labels and LiDAR pass through."""
+    instances: Instances
+    """Numbers of the scene's objects."""
+    memo: Mapping[Hashable, Any]
+    """Data that the recipes' images share; the memo of the opened scene takes it over."""
+    overwrite: bool
+    """If True, LiDAR sweeps that exist already are written again."""
     workers: int = 1
     """Number of workers."""
-
-    @property
-    def backend(self) -> str:
-        """Name of the rasteriser's backend."""
-        return self.setup.backend
+    lock: InheritedLock | None = None
+    """Held only: the output stays locked for the job until its last worker ends."""
 
     @property
     def output(self) -> str:
-        """Output folder."""
-        return self.setup.out_dir
+        """Output folder, for messages."""
+        return self.out_dir
 
     def worker(self, on_outcome: Callable[[Outcome], None]) -> SceneWorker:
         """Return a worker for this process."""
@@ -613,31 +464,18 @@ class SceneWorker:
         self._opened: tuple[Scene, Sequence[Frame]] | None = None
 
     def do(self, task: tuple[Chunk, ...]) -> dict[str, float] | TaskFailed:
-        """Render the task's chunks."""
+        """Render the task's chunks, and wait until their files are written."""
+        if self._opened is None:
+            self._opened = self._setup.open_scene()
+            memo_of(self._opened[0]).take_shared(self._setup.memo)
         try:
-            return self._render(task)
+            with shorten_switch_interval(renders_on_gpu(self._setup.backend)):
+                runner = FrameRunner(self._setup, *self._opened, self._on_outcome)
+                try:
+                    for chunk in task:
+                        runner.run(chunk)
+                finally:
+                    seconds = runner.close()
         except OutputError as error:
             return TaskFailed(str(error), is_output=True)
-
-    def _render(self, task: tuple[Chunk, ...]) -> dict[str, float]:
-        scene_setup = self._setup
-        on_gpu = renders_on_gpu(self._setup.backend)
-        if self._opened is None:
-            self._opened = scene_setup.scene()
-            memo_of(self._opened[0]).take_shared(scene_setup.setup.memo)
-        if scene_setup.workers == 1 or on_gpu:
-            pump = WritePump.beside(
-                scene_setup.backend, max(1, available_cores() // scene_setup.workers)
-            )
-        else:  # one thread and a short queue: the memory of waiting views counts once per worker
-            pump = WritePump(threads=1, waiting=2)
-        runner = FrameRunner(
-            *self._opened, scene_setup.setup, scene_setup.renderer, self._on_outcome, pump
-        )
-        with shorten_switch_interval(on_gpu):
-            try:
-                for chunk in task:
-                    runner.run(chunk)
-            finally:
-                seconds = runner.close()
         return seconds

@@ -8,7 +8,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from augment.jobs.processes import run_uninterrupted
-from augment.render.backends import renders_on_gpu
 
 
 class WritePump:
@@ -29,15 +28,6 @@ class WritePump:
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="writer")
         self._slots = threading.BoundedSemaphore(waiting)
         self._error: BaseException | None = None
-
-    @staticmethod
-    def beside(backend: str, cores: int) -> WritePump:
-        """Return the pump of a process with so many cores.
-
-        A CPU backend renders on the same cores, so two threads write. A GPU leaves the cores free,
-        and renders faster than one core can encode.
-        """
-        return WritePump(cores, cores + 2) if renders_on_gpu(backend) else WritePump()
 
     def submit(self, task: Callable[[], Any]) -> Future:
         """Queue a task; blocks while too many wait. Tasks start in the order of the calls."""

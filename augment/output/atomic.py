@@ -224,6 +224,16 @@ def remove_temporaries(folder: Path, *, name: str = "", recursive: bool = True) 
             return
 
 
+def remove_tree(folder: Path) -> None:
+    """Delete a folder with everything in it, if it exists."""
+    try:
+        shutil.rmtree(folder)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise OutputError(f"cannot delete {folder}: {error.strerror}") from error
+
+
 def temporary_names(names: Iterable[str], name: str = "") -> list[str]:
     """Return the names that `temporary_path` has made, for the file `name` if it is given."""
     middle = rf"{re.escape(_shorten_name(name))}\.[^.]+(\.old)?" if name else ".*"

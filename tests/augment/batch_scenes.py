@@ -25,7 +25,7 @@ from augment.errors import AdapterError
 from augment.exposure.cells import OPEN_EDGE, ExposedCells, ExposedSurface
 from augment.exposure.exposed_surface import exposed_surface_of
 from augment.exposure.search import ExposureSettings
-from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.render.fog import Fog
 from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import Boxes, LidarSweep
@@ -323,10 +323,21 @@ def tree_digest(folder: Path) -> dict[str, str]:
     }
 
 
+def run_fake(job: RenderJob, renderer: Any = fake_render, **options) -> JobResult:
+    """Run a job on the stand-in scenes, with a stand-in renderer unless it is None."""
+    return run_job(
+        job, renderer=renderer, **{"scene_loader": open_fake, "progress": False, **options}
+    )
+
+
+def fog_job(out: Path, uri: str = "fake:street", **options) -> RenderJob:
+    """4 frames of 2 cameras in smog."""
+    return RenderJob(uri, [make_recipe()], out, **options)
+
+
 def write_scene(out: Path, recipes: list, name: str = "street", frames: int = 4) -> None:
     """A scene of two cameras under some recipes."""
-    job = RenderJob(f"fake:{name}?frames={frames}", recipes, out)
-    run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
+    run_fake(RenderJob(f"fake:{name}?frames={frames}", recipes, out))
 
 
 def assert_same_sample(a: Any, b: Any, *, but: tuple[str, ...] = ()) -> None:

@@ -155,7 +155,7 @@ def read_notes(path: Path) -> tuple[list[str], Counter[str]]:
 
 
 def _note_entries() -> None:
-    """Wrap Journal.append once, to note what it was told of and has returned from."""
+    """Wrap ProgressLog.append once, to note the rows that it has written."""
     append = ProgressLog.append
     if getattr(append, "notes", False):
         return

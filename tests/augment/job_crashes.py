@@ -40,7 +40,7 @@ from generate_jobs import (
 )
 from tqdm import tqdm
 
-import augment.jobs.generate as drive
+import augment.jobs.block_queue as block_queue
 import augment.jobs.pools as pools
 from augment.errors import OutputError
 from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
@@ -68,7 +68,7 @@ def main(folder: Path, names: list[str]) -> None:
     take_notes(folder / "notes")
     start_fork_server("generate_jobs", "augment.jobs.pools", "augment.jobs.worker")
     keep_in_forks()
-    drive.ELSEWHERE_S = pools.WAIT_S = 0.05
+    block_queue.ELSEWHERE_S = pools.WAIT_S = 0.05
     lidar_bytes(open_fake("fake:warm").labels.lidar(0))
     for number, work in enumerate((generating, rendering)):
         work(folder / f"warm-{number}")()  # imports what is imported late

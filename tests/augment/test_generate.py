@@ -13,7 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from batch_scenes import make_recipe, must_not_render, open_fake
+from batch_scenes import make_recipe, must_not_render, open_fake, run_fake
 from generate_jobs import (
     DRY,
     check_reader,
@@ -30,8 +30,8 @@ from augment.errors import ClimateGSError, OutputError
 from augment.jobs.blocks import read_status, stored_plans
 from augment.jobs.generate import GenerateJob, GenerateResult, Workers, plan_job, run_generate
 from augment.jobs.processes import available_cores
-from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.worker import compute_time_shares
+from augment.jobs.render_job import RenderJob
+from augment.jobs.time_shares import compute_time_shares
 from augment.output.atomic import write_atomic
 from augment.output.layout import STATE_FOLDER, folder_name
 from augment.output.manifest import list_parts, read_manifest, read_manifest_rows
@@ -286,7 +286,7 @@ def test_a_render_job_into_the_same_folder(tmp_path: Path) -> None:
 
     def render(name: str) -> None:
         job = RenderJob("fake:a?frames=2", [make_recipe(name, depth="none")], tmp_path)
-        run_job(job, scene_loader=open_fake, renderer=make_job("x").setup.renderer, progress=False)
+        run_fake(job)
 
     def variants() -> dict[str, int]:
         names = [row["variant"] for row in rows_of(tmp_path, status="ok")]

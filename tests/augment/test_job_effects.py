@@ -18,11 +18,11 @@ from batch_scenes import (
     FakeLabels,
     FakeView,
     fake_render,
-    make_frame,
     make_maps,
     make_recipe,
     must_not_render,
     open_fake,
+    run_fake,
     style_render,
     tree_digest,
 )
@@ -33,9 +33,10 @@ from augment.effects.smog import box_transmittance
 from augment.effects.snow.snowy_boxes import count_snow_pixels
 from augment.effects.style import style as scene_maps
 from augment.errors import OutputError, StyleError
-from augment.jobs.render_job import JobResult, RenderJob, run_job, stored_names
+from augment.jobs.render_job import JobResult, RenderJob
 from augment.output.box_weather import box_tables, combine_visibility
 from augment.output.manifest import later_columns, read_manifest
+from augment.output.recipe_files import stored_names
 from augment.scene.boxes import WorldBoxes
 from augment.scene.cameras import Camera
 from augment.scene.labels import Boxes
@@ -55,11 +56,6 @@ LABELS = FOLDER / "labels"
 CLEAR = make_recipe("clear")
 
 
-def run(job: RenderJob, renderer=fake_render, **options) -> JobResult:
-    options = {"scene_loader": open_fake, "progress": False, **options}
-    return run_job(job, renderer=renderer, **options)
-
-
 @pytest.fixture(scope="module")
 def recipe() -> Recipe:
     """All effects: none may get into another one's files."""
@@ -70,7 +66,7 @@ def recipe() -> Recipe:
 def finished_dir(recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of one uninterrupted run; shared, so nobody writes to it."""
     out = tmp_path_factory.mktemp("effects") / "out"
-    assert run(RenderJob("fake:street", [recipe], out)).failed == 0
+    assert run_fake(RenderJob("fake:street", [recipe], out)).failed == 0
     return out
 
 
@@ -171,7 +167,7 @@ def test_a_clear_day_has_the_same_labels_and_no_tables(finished_dir: Path, tmp_p
     assert sorted(p.name for p in (finished_dir / LABELS).iterdir()) == [
         f"{n}.parquet" for n in names
     ]
-    run(RenderJob("fake:street", [CLEAR], tmp_path))
+    run_fake(RenderJob("fake:street", [CLEAR], tmp_path))
     clear = tmp_path / "street/clear-000"
     assert sorted(p.name for p in (clear / "labels").iterdir()) == [
         f"{n}.parquet" for n in names[:2]
@@ -190,12 +186,12 @@ def test_a_clear_day_has_the_same_labels_and_no_tables(finished_dir: Path, tmp_p
 )
 def test_without_labels_there_are_only_the_masks(tmp_path: Path, uri: str, output: dict) -> None:
     job = RenderJob(uri, [make_recipe(snow=SNOW, flood=FLOOD, **output)], tmp_path)
-    assert run(job).failed == 0
+    assert run_fake(job).failed == 0
     rows = rows_of(tmp_path)
     assert all(row["snow_path"] and row["water_path"] for row in rows)
     assert {row[f"{kind}_path"] for row in rows for kind in box_tables()} == {None}
     assert not (tmp_path / LABELS).exists()
-    assert run(job, must_not_render).skipped == 8
+    assert run_fake(job, must_not_render).skipped == 8
 
 
 def test_a_view_that_breaks_its_contract_is_recorded(tmp_path, recipe, unchecked) -> None:
@@ -235,7 +231,7 @@ def test_a_view_that_breaks_its_contract_is_recorded(tmp_path, recipe, unchecked
             return dataclasses.replace(view, **{field: change(getattr(view, field))})
 
         out = tmp_path / str(number)
-        result = run(
+        result = run_fake(
             RenderJob("fake:s", [requested_recipe], out, frames=[1], cameras=["front"]), render
         )
         assert result.failed == 1 and re.search(message, result.failures[0]), result.failures
@@ -254,11 +250,11 @@ def test_what_is_lost_or_damaged_is_made_again(
     ):
         for name in lost:
             (copied_dir / FOLDER / name).unlink()
-        assert run(RenderJob("fake:street", [recipe], copied_dir)).written == rendered
+        assert run_fake(RenderJob("fake:street", [recipe], copied_dir)).written == rendered
         assert tree_digest(copied_dir) == tree_digest(finished_dir)
     table = copied_dir / LABELS / "water.parquet"
     table.write_bytes(table.read_bytes()[:100])
-    assert run(RenderJob("fake:street", [recipe], copied_dir)).written == 8
+    assert run_fake(RenderJob("fake:street", [recipe], copied_dir)).written == 8
     assert "water.parquet is missing or not a readable" in caplog.text
     assert tree_digest(copied_dir) == tree_digest(finished_dir)
 
@@ -266,26 +262,10 @@ def test_what_is_lost_or_damaged_is_made_again(
 def test_parts_in_any_order_give_the_files_of_one_run(
     finished_dir: Path, recipe, tmp_path: Path
 ) -> None:
-    run(RenderJob("fake:street", [recipe], tmp_path, frames=[3, 1], cameras=["rear/left"]))
+    run_fake(RenderJob("fake:street", [recipe], tmp_path, frames=[3, 1], cameras=["rear/left"]))
     assert len(box_tables()["box_snow"].read(tmp_path / LABELS / "snow.parquet")) == 2
-    run(RenderJob("fake:street", [recipe], tmp_path, cameras=["front"]))
-    assert run(RenderJob("fake:street", [recipe], tmp_path)).skipped == 6
-    assert tree_digest(tmp_path) == tree_digest(finished_dir)
-
-
-def test_a_progress_log_carries_the_numbers(finished_dir: Path, recipe, tmp_path: Path) -> None:
-    """As a kill leaves a folder: a log, and neither tables nor manifest."""
-
-    def stops(scene, camera, recipe, *, backend):
-        if camera.name == "front" and camera.timestamp_ns == make_frame(2).timestamp_ns:
-            raise SystemExit("stopped without a chance to tidy up")
-        return fake_render(scene, camera, recipe, backend=backend)
-
-    with pytest.raises(SystemExit):
-        run(RenderJob("fake:street", [recipe], tmp_path), stops)
-    assert not (tmp_path / "manifest.parquet").exists() and not (tmp_path / LABELS).exists()
-    result = run(RenderJob("fake:street", [recipe], tmp_path))
-    assert (result.skipped, result.written) == (4, 4)
+    run_fake(RenderJob("fake:street", [recipe], tmp_path, cameras=["front"]))
+    assert run_fake(RenderJob("fake:street", [recipe], tmp_path)).skipped == 6
     assert tree_digest(tmp_path) == tree_digest(finished_dir)
 
 
@@ -300,42 +280,42 @@ def test_a_finished_folder_of_an_older_version_stays_as_it_is(
     pq.write_table(pq.read_table(manifest).drop_columns(["box_smog_path"]), manifest)
     before = tree_digest(copied_dir)
     job = RenderJob("fake:street", [recipe], copied_dir)
-    assert run(job, must_not_render).skipped == 8
+    assert run_fake(job, must_not_render).skipped == 8
     assert tree_digest(copied_dir) == before
     sample = WeatherDataset(copied_dir)[5]
     assert sample["paths"]["box_smog"] is None and sample["boxes"]["transmittance"] is None
     for lost in ("labels/boxes.parquet", "calibration.json"):  # comes back without rendering
         (copied_dir / FOLDER / lost).unlink()
-        assert run(job, must_not_render).skipped == 8
+        assert run_fake(job, must_not_render).skipped == 8
         assert (copied_dir / FOLDER / lost).read_bytes() == (
             finished_dir / FOLDER / lost
         ).read_bytes()
     for frame in (0, 2):
         (copied_dir / FOLDER / "images" / "front" / f"{frame:06d}.png").unlink()
-    assert run(job).written == 2
+    assert run_fake(job).written == 2
     table = box_tables()["box_smog"].read(copied_dir / LABELS / "smog.parquet")
     has = {(r["frame"], r["camera"]) for r in rows_of(copied_dir) if r["box_smog_path"]}
     assert has == set(table) == {(0, "front"), (2, "front")}
-    assert run(job, must_not_render).skipped == 8
+    assert run_fake(job, must_not_render).skipped == 8
 
 
 def test_outputs_of_the_first_version_are_gone_on_with(tmp_path: Path) -> None:
     """Without the columns that came later: no style; no weather, so surfaces are alike."""
-    run(RenderJob("fake:street", [CLEAR], tmp_path, frames=[0, 1]))
+    run_fake(RenderJob("fake:street", [CLEAR], tmp_path, frames=[0, 1]))
     table = pq.read_table(tmp_path / "manifest.parquet")
     young = [n for n in table.column_names if n.startswith(("flood_", "snow_", "style_"))]
     pq.write_table(table.drop_columns([*{*young, *later_columns()}]), tmp_path / "manifest.parquet")
     assert read_manifest(tmp_path)["surface"].to_pylist() == ["solid"] * 4
     sample = WeatherDataset(tmp_path)[0]
     assert sample["surface"] == "solid" and sample["water"] is sample["snow"] is None
-    assert run(RenderJob("fake:street", [CLEAR], tmp_path)).skipped == 4
+    assert run_fake(RenderJob("fake:street", [CLEAR], tmp_path)).skipped == 4
     measured = [row["box_2d_path"] is not None for row in rows_of(tmp_path)]
     assert measured == [False] * 4 + [True] * 4  # only rendering tells
 
 
 def test_all_comes_through_smog_without_density(tmp_path: Path) -> None:
     thin = make_recipe().model_copy(update={"weather": Weather(smog=Smog(extinction_per_m=0))})
-    run(RenderJob("fake:street", [thin], tmp_path, frames=[1]))
+    run_fake(RenderJob("fake:street", [thin], tmp_path, frames=[1]))
     rows = pq.read_table(tmp_path / LABELS / "smog.parquet").to_pylist()
     assert {(row["transmittance"], row["pixels"]) for row in rows} == {(1.0, None)}
 
@@ -377,13 +357,13 @@ def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path)
     recipe = make_recipe(snow=Snow(depth_m=0.15, cell_m=0.2))
     uri = "fake:street?frames=2"
     one_run_dir, shared, parts = (tmp_path / name for name in ("whole", "shared", "parts"))
-    result = run(RenderJob(uri, [recipe], one_run_dir), None)
+    result = run_fake(RenderJob(uri, [recipe], one_run_dir), None)
     assert (result.written, result.failures) == (4, ())
-    assert run(RenderJob(uri, [recipe], shared, workers=2), None).failures == ()
-    run(RenderJob(uri, [recipe], parts, frames=[1], cameras=["front"]), None)
+    assert run_fake(RenderJob(uri, [recipe], shared, workers=2), None).failures == ()
+    run_fake(RenderJob(uri, [recipe], parts, frames=[1], cameras=["front"]), None)
     for bed in (parts / ".climategs").glob("exposed-*"):
         bed.unlink()
-    assert run(RenderJob(uri, [recipe], parts), None).skipped == 1
+    assert run_fake(RenderJob(uri, [recipe], parts), None).skipped == 1
     for out in (shared, parts):
         assert tree_digest(out / "street") == tree_digest(one_run_dir / "street")
         assert (out / "manifest.parquet").read_bytes() == (
@@ -396,7 +376,7 @@ def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path)
     (bed,) = (one_run_dir / ".climategs").glob("exposed-*")
     before = bed.stat().st_mtime_ns
     deeper = make_recipe(variant=1, snow=Snow(depth_m=0.3, cell_m=0.2))
-    assert run(RenderJob(uri, [deeper], one_run_dir), None).failures == ()
+    assert run_fake(RenderJob(uri, [deeper], one_run_dir), None).failures == ()
     assert [p.stat().st_mtime_ns for p in (one_run_dir / ".climategs").glob("exposed-*")] == [
         before
     ]
@@ -425,7 +405,7 @@ def styled(strength: float = 1.0, variant: int = 0, **style) -> Recipe:
 
 
 def run_styled(job: RenderJob, renderer=style_render) -> JobResult:
-    return run(job, renderer)
+    return run_fake(job, renderer)
 
 
 def image_at(path: Path, colour: int = 90) -> str:

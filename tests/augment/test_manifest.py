@@ -12,12 +12,11 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from batch_scenes import fake_render, make_recipe, open_fake
+from batch_scenes import fog_job, make_recipe, run_fake
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augment.errors import OutputError
-from augment.jobs.render_job import RenderJob, run_job
 from augment.output.layout import path_kinds
 from augment.output.manifest import (
     FAILED,
@@ -46,8 +45,7 @@ from augment.output.tables import read_table
 def manifest(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
     """Of eight images, as a job wrote it."""
     out = tmp_path_factory.mktemp("manifest")
-    job = RenderJob("fake:street", [make_recipe()], out)
-    run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
+    run_fake(fog_job(out))
     return pq.read_table(out / "manifest.parquet")
 
 
@@ -148,7 +146,9 @@ def test_what_jobs_and_careful_programs_write_is_read(manifest: pa.Table) -> Non
     old = parsed(manifest.drop_columns(list(later_columns())))
     assert old.column_names == manifest.column_names
     assert set(old["surface"].to_pylist()) == {"solid"} and old["quality"].null_count == 8
+    # An output whose only variant is being overwritten has no rows.
     assert parsed(manifest.slice(0, 0)).num_rows == 0
+    assert parse_manifest(manifest_bytes(rows_to_table([])), "manifest").num_rows == 0
 
 
 class Unpickling(pa.ExtensionType):
@@ -330,8 +330,3 @@ def test_a_damaged_note_in_the_manifest(tmp_path: Path) -> None:
         rows = rows.replace_schema_metadata({b"climategs.parts": note})
         store.write("manifest.parquet", manifest_bytes(rows))
         assert frames_of(store) == {0: (True, "")} and parts_to_merge(store) == 1
-
-
-def test_a_manifest_without_rows_is_one() -> None:
-    """As an output has it whose only variant is being overwritten."""
-    assert parse_manifest(manifest_bytes(rows_to_table([])), "manifest").num_rows == 0

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from batch_scenes import FakeView, make_camera, open_fake
+from batch_scenes import FakeView, make_camera, open_fake, run_fake
 from generate_jobs import make_job, make_recipes
 from hypothesis import given
 from hypothesis import strategies as st
 
 from augment.errors import OutputError, SceneError
 from augment.jobs.generate import plan_job, run_generate
-from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.render_job import RenderJob
 from augment.metrics.image import flip
 from augment.output.manifest import read_manifest, recipe_columns
 from augment.output.store import open_store
@@ -310,7 +310,7 @@ def test_a_job_goes_on_with_its_choice_whatever_the_clock_says(
 
     def run(**options):
         job = RenderJob("fake:street", [recipe], tmp_path / "a", **options)
-        return run_job(job, scene_loader=open_fake, renderer=bench.render, progress=False)
+        return run_fake(job, bench.render)
 
     assert run(frames=[1]).written == 2
     bench.slowness, before = 10.0, bench.rendered
@@ -327,7 +327,7 @@ def test_a_job_goes_on_with_its_choice_whatever_the_clock_says(
     # Elsewhere the recipe that the job leaves gives the same images, and chooses nothing.
     settled = load_recipe(tmp_path / "a/street/fog-000/recipe.yaml").resolve(0)
     job = RenderJob("fake:street", [settled], tmp_path / "b")
-    run_job(job, scene_loader=open_fake, renderer=bench.render, progress=False)
+    run_fake(job, bench.render)
     assert pictures(tmp_path / "b") == pictures(tmp_path / "a")
     assert len(pictures(tmp_path / "a")) == 8
     assert not (tmp_path / "b/.climategs/quality").exists()

@@ -520,7 +520,7 @@ def test_a_remote_output_has_the_files_of_a_local_one(server, tmp_path, monkeypa
         rendered.append(image_name(scene, camera, recipe))
         return make_job("x").setup.renderer(scene, camera, recipe, backend=backend)
 
-    uri = server.uri("out")
+    uri = server.uri("job")
     job = make_job(uri, scenes, recipes, renderer=renderer, scratch=tmp_path / "scratch")
     while stop_at:
         server.fail(1, status=503, method="PUT")

@@ -29,9 +29,10 @@ import torch
 from adapters.base import open_scene
 from augment.files.export import export_splats
 from augment.files.scene_file import save_scene, save_scene_file
+from augment.jobs.block_queue import BlockWork
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.blocks import Block, read_status
-from augment.jobs.generate import BlockWork, GenerateJob, Workers, plan_job, run_generate
+from augment.jobs.generate import GenerateJob, Workers, plan_job, run_generate
 from augment.jobs.write_pump import WritePump
 from augment.output.codecs import encode_depth, encode_image
 from augment.output.layout import variant_name

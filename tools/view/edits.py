@@ -14,8 +14,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from augment.errors import OutputError
-from augment.jobs.render_job import copy_files, portable_recipe
 from augment.output.atomic import write_new_file
+from augment.output.recipe_files import copy_files, portable_recipe
 from recipes.errors import RecipeError, short
 from recipes.fields import section_at, with_unchecked_field
 from recipes.job import scaled_recipe
