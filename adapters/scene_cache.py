@@ -53,7 +53,7 @@ from augment.output.atomic import (
     wait_for_lock,
     write_atomic,
 )
-from augment.output.layout import STATE_FOLDER
+from augment.output.names import STATE_FOLDER
 from augment.render.cpu.kernel_cache import user_cache_folder
 from augment.scene.labels import LabelSource
 from augment.scene.scene import Scene, is_drawable

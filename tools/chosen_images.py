@@ -16,8 +16,9 @@ import pyarrow.compute as pc
 
 from augment.errors import OutputError
 from augment.output.codecs import decode_image
-from augment.output.layout import parse_errors_as_output_errors, resolve_inside
+from augment.output.layout import parse_errors_as_output_errors
 from augment.output.manifest import OK, Row, read_manifest
+from augment.output.names import resolve_inside
 from augment.output.store import Store
 from recipes.schema import columns_of_effects, parse_frames
 

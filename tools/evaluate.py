@@ -34,8 +34,9 @@ from augment.metrics.consistency import (
 )
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
 from augment.output.codecs import depth_in_metres
-from augment.output.layout import folder_name, variant_folder
+from augment.output.layout import variant_folder
 from augment.output.manifest import OK, read_manifest_rows
+from augment.output.names import folder_name
 from augment.output.store import Store, open_store
 from augment.output.tables import read_boxes
 from augment.render.sensor import noise_variance

@@ -394,7 +394,8 @@ def _check_recorded(scene: Scene) -> None:
     """
     if any(frame.image_paths for frame in scene.frames):
         return
-    from augment.output.layout import folder_name, variant_name
+    from augment.output.layout import variant_name
+    from augment.output.names import folder_name
     from recipes.load import load_recipe
 
     folder = f"raw/{folder_name(scene.name)}/{variant_name(load_recipe('clear').resolve(0))}"

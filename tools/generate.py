@@ -17,7 +17,7 @@ from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.blocks import JobStatus, read_status, select_shard
 from augment.jobs.generate import GenerateJob, default_scratch, plan_job, run_generate
 from augment.jobs.time_shares import compute_time_shares
-from augment.output.layout import STATE_FOLDER
+from augment.output.names import STATE_FOLDER
 from augment.output.store import open_store
 from recipes.job import load_job, load_job_recipes
 from tools.labels import write_labels_of_job

@@ -31,8 +31,9 @@ from augment.jobs.mirror import (
 from augment.jobs.mirror_sweeps import find_span_frames, is_sweep_between, weather_sweeps_between
 from augment.jobs.processes import OutputLock
 from augment.output.calibration import RECORDED
-from augment.output.layout import MANIFEST_FILE, folder_name, variant_folder, variant_name
+from augment.output.layout import variant_folder, variant_name
 from augment.output.manifest import OK, read_manifest, select_variant_rows
+from augment.output.names import MANIFEST_FILE, folder_name
 from augment.scene.labels import StoresLidar
 from augment.scene.scene import Scene
 from recipes.load import load_recipe

@@ -27,8 +27,9 @@ from augment.effects.lidar import codes
 from augment.errors import OutputError
 from augment.output.atomic import write_atomic
 from augment.output.box_weather import box_tables
-from augment.output.layout import STATE_FOLDER, folder_name, path_kinds
+from augment.output.layout import path_kinds
 from augment.output.manifest import OK, read_manifest_rows
+from augment.output.names import STATE_FOLDER, folder_name
 from augment.output.store import Store, StoredFile, open_store
 from tools.chosen_images import cameras_on_car, evenly, first_of_each, value_codes
 from tools.report_numbers import (

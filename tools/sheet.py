@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from augment.errors import OutputError
-from augment.output.layout import folder_name
 from augment.output.manifest import Row
+from augment.output.names import folder_name
 from augment.output.store import open_store
 from tools.chosen_images import (
     cameras_on_car,

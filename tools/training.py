@@ -40,7 +40,7 @@ from augment.output.atomic import (
     temporary_path,
     write_atomic,
 )
-from augment.output.layout import STATE_FOLDER
+from augment.output.names import STATE_FOLDER
 from augment.progress import ProgressBar
 from tools.options import length_of
 from tools.output import print_note

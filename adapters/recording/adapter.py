@@ -65,7 +65,8 @@ from augment.effects.lidar.beam import find_intensity_column
 from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError, OutputError
 from augment.output.codecs import decode_png, depth_in_metres
-from augment.output.layout import SWEEP_FOLDER, folder_name
+from augment.output.layout import SWEEP_FOLDER
+from augment.output.names import folder_name
 from augment.output.tables import (
     ATTRIBUTE_PREFIX,
     has_climategs_metadata,

@@ -38,8 +38,8 @@ from pydantic import AfterValidator, BaseModel, Field
 from adapters.plain_files import Number, read_json, validate_content
 from adapters.raw_drive import NO_SURFACE, Picture, drive_origin, usable_images
 from augment.errors import AdapterError, SceneError
-from augment.output.layout import folder_name
 from augment.output.manifest import MAX_SIDE_PX
+from augment.output.names import folder_name
 from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import invert_rigid
 from augment.scene.semantics import SemanticClass

@@ -44,8 +44,8 @@ from augment.output.box_tables import BOXES_2D, MASK_SIDES, MASKS, SIDES
 from augment.output.box_weather import box_tables, combine_visibility
 from augment.output.calibration import CameraRecord
 from augment.output.claims import hold_claim
-from augment.output.layout import folder_name, resolve_inside
-from augment.output.manifest import MANIFEST_FILE, OK, read_manifest_rows
+from augment.output.manifest import OK, read_manifest_rows
+from augment.output.names import MANIFEST_FILE, folder_name, resolve_inside
 from augment.output.store import open_store
 from augment.output.tables import read_boxes
 from augment.scene.boxes import are_usable

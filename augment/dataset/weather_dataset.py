@@ -45,8 +45,9 @@ from augment.output.box_tables import BoxNumbers
 from augment.output.box_weather import box_tables
 from augment.output.calibration import CameraRecord, read_camera, read_entries
 from augment.output.codecs import decode_image, decode_png
-from augment.output.layout import mask_names, path_kinds, resolve_inside
+from augment.output.layout import mask_names, path_kinds
 from augment.output.manifest import OK, concat_rows, read_manifest_rows, weather_columns
+from augment.output.names import resolve_inside
 from augment.output.store import Store, StoredFileMissing, open_store
 from augment.output.tables import read_boxes, read_lidar
 

@@ -18,7 +18,7 @@ from augment.files.ply import write_ply
 from augment.files.scene_file import document_text, track_entry
 from augment.files.splat_format import SplatWriter
 from augment.output.atomic import raise_output_error, write_atomic, write_folder_atomically
-from augment.output.layout import folder_name
+from augment.output.names import folder_name
 from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, Scene
 from augment.scene.transform import bake_scene

@@ -32,8 +32,8 @@ from augment.jobs.render_job import RenderJob, SceneLoader, run_job
 from augment.jobs.time_shares import WorkTimes
 from augment.jobs.worker import Outcome, TaskFailed, describe_error
 from augment.output.claims import try_claim
-from augment.output.layout import STATE_FOLDER, folder_name
 from augment.output.manifest import Part, list_parts
+from augment.output.names import STATE_FOLDER, folder_name
 from augment.output.store import Store, open_store
 from augment.scene.scene import Scene
 from augment.view.quality import choose_settings

@@ -25,15 +25,13 @@ from augment.output.atomic import read_file
 from augment.output.calibration import RECORDED
 from augment.output.claims import CLAIMS_FOLDER, try_claim
 from augment.output.layout import (
-    MANIFEST_FILE,
     OLD_PROGRESS_LOGS,
     PROGRESS_LOGS,
-    STATE_FOLDER,
-    folder_name,
     parse_errors_as_output_errors,
     variant_name,
 )
 from augment.output.manifest import OK, Identity, ImageFacts, Part, list_parts, read_manifest
+from augment.output.names import MANIFEST_FILE, STATE_FOLDER, folder_name
 from augment.output.store import Store
 from augment.photo.trust import judge_scene, source_views, unfitted_cameras
 from augment.scene.cameras import scaled_size

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from augment.jobs.blocks import Block, JobPlan
 from augment.jobs.render_job import RenderJob, SceneLoader, run_job
-from augment.output.layout import STATE_FOLDER
+from augment.output.names import STATE_FOLDER
 from augment.scene.scene import Scene
 
 # Recipes for which pictures are rendered; other recipes take the mean of these.

@@ -39,14 +39,7 @@ from augment.jobs.time_shares import WORKERS
 from augment.output.atomic import raise_output_error
 from augment.output.calibration import RECORDED
 from augment.output.claims import try_claim
-from augment.output.layout import (
-    MANIFEST_FILE,
-    STATE_FOLDER,
-    FileListing,
-    path_kinds,
-    variant_folder,
-    variant_name,
-)
+from augment.output.layout import FileListing, path_kinds, variant_folder, variant_name
 from augment.output.manifest import (
     FAILED,
     KEY,
@@ -64,6 +57,7 @@ from augment.output.manifest import (
     rows_to_table,
     rows_without_files,
 )
+from augment.output.names import MANIFEST_FILE, STATE_FOLDER
 from augment.output.recipe_files import lacks_recipe, write_recipe
 from augment.output.store import Store, StoredFileMissing, open_store
 from augment.photo.trust import magnification_sentence, skipped_cameras_sentence

@@ -41,14 +41,11 @@ from augment.output.box_weather import box_tables
 from augment.output.calibration import calibration_bytes, frame_entry, read_entries
 from augment.output.claims import hold_claim
 from augment.output.layout import (
-    MANIFEST_FILE,
     OLD_PROGRESS_LOGS,
     PROGRESS_LOGS,
-    STATE_FOLDER,
     SWEEP_FOLDER,
     FileListing,
     box_weather_files,
-    folder_name,
     item_paths,
     parse_errors_as_output_errors,
     path_columns,
@@ -70,6 +67,7 @@ from augment.output.manifest import (
     select_variant_rows,
     write_manifest,
 )
+from augment.output.names import MANIFEST_FILE, STATE_FOLDER, folder_name
 from augment.output.store import open_store
 from augment.output.tables import FrameBoxes, boxes_bytes, read_boxes
 from augment.scene.cameras import Frame

@@ -48,8 +48,9 @@ from augment.output.atomic import (
     write_file_atomically,
 )
 from augment.output.codecs import decode_image, encode_image
-from augment.output.layout import folder_name, parse_errors_as_output_errors, resolve_inside
+from augment.output.layout import parse_errors_as_output_errors
 from augment.output.manifest import OK
+from augment.output.names import folder_name, resolve_inside
 from augment.output.tables import read_lidar
 from augment.scene.cameras import Frame
 from augment.scene.labels import LabelSource, StoresLidar

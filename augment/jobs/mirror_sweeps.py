@@ -20,8 +20,9 @@ from augment.effects import JobContext, precompute_effects
 from augment.errors import OutputError
 from augment.jobs.worker import describe_error
 from augment.output.atomic import write_atomic
-from augment.output.layout import STATE_FOLDER, SWEEP_FOLDER, item_paths, variant_folder
+from augment.output.layout import SWEEP_FOLDER, item_paths, variant_folder
 from augment.output.manifest import OK
+from augment.output.names import STATE_FOLDER
 from augment.output.tables import lidar_bytes, read_lidar_note
 from augment.scene.cameras import Frame
 from augment.scene.labels import StoresLidar

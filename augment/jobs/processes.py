@@ -41,7 +41,7 @@ from augment.output.atomic import (
     temporary_path,
     wait_for_lock,
 )
-from augment.output.layout import STATE_FOLDER
+from augment.output.names import STATE_FOLDER
 from augment.render.threads import wait_for_result
 from augment.scene.cameras import Frame
 from augment.scene.scene import Scene

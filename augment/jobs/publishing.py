@@ -29,11 +29,8 @@ from augment.output.atomic import (
 from augment.output.box_weather import box_tables
 from augment.output.claims import CLAIMS_FOLDER, hold_claim, try_claim
 from augment.output.layout import (
-    MANIFEST_FILE,
-    STATE_FOLDER,
     SWEEP_FOLDER,
     FileListing,
-    folder_name,
     item_paths,
     parse_errors_as_output_errors,
     path_kinds,
@@ -49,6 +46,7 @@ from augment.output.manifest import (
     read_manifest,
     write_manifest,
 )
+from augment.output.names import MANIFEST_FILE, STATE_FOLDER, folder_name
 from augment.output.recipe_files import file_folders
 from augment.output.store import LocalStore, Store, StoredFileMissing
 from augment.view.quality import CHOICES_FOLDER as QUALITY

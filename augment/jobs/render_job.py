@@ -30,8 +30,9 @@ from augment.jobs.time_shares import WORKERS, WorkTimes
 from augment.jobs.worker import Chunk, Outcome, SceneSetup, TaskFailed
 from augment.memo import memo_of
 from augment.output.calibration import trajectory_id
-from augment.output.layout import MANIFEST_FILE, STATE_FOLDER, variant_name
+from augment.output.layout import variant_name
 from augment.output.manifest import FAILED, OK, Identity
+from augment.output.names import MANIFEST_FILE, STATE_FOLDER
 from augment.output.recipe_files import check_not_overwritten, lacks_recipe, write_recipe
 from augment.output.store import open_store
 from augment.photo.recorded_base import check_photos

@@ -20,8 +20,8 @@ from augment.errors import OutputError
 from augment.jobs.blocks import Block
 from augment.jobs.publishing import VARIANTS, clear_staged
 from augment.output.claims import hold_claim
-from augment.output.layout import MANIFEST_FILE, folder_name
 from augment.output.manifest import list_parts, read_manifest, write_manifest
+from augment.output.names import MANIFEST_FILE, folder_name
 from augment.output.store import Store
 
 pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import

@@ -32,7 +32,7 @@ from pathlib import Path
 
 from augment.errors import OutputError
 from augment.output.atomic import is_named, open_lock, path_below, raise_output_error
-from augment.output.layout import STATE_FOLDER, folder_name
+from augment.output.names import STATE_FOLDER, folder_name
 from augment.output.store import RemoteStore, Store, StoredVersion
 
 # Folder of the claims.

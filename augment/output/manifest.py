@@ -25,14 +25,8 @@ import pyarrow.parquet as pq
 
 from augment.errors import OutputError
 from augment.output.atomic import read_file, write_atomic
-from augment.output.layout import (
-    MANIFEST_FILE,
-    STATE_FOLDER,
-    FileListing,
-    mask_share_columns,
-    path_kinds,
-    variant_name,
-)
+from augment.output.layout import FileListing, mask_share_columns, path_kinds, variant_name
+from augment.output.names import MANIFEST_FILE, STATE_FOLDER
 from augment.output.store import Store, StoredFileMissing
 from augment.output.tables import read_table
 from recipes.schema import KNOBS, SECTIONS, Recipe, columns_of_effects, settings_of

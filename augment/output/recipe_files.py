@@ -13,7 +13,7 @@ from pathlib import Path, PurePath
 
 from augment.errors import OutputError
 from augment.output.atomic import path_below, read_file, write_atomic
-from augment.output.layout import folder_name
+from augment.output.names import folder_name
 from recipes.fields import section_at, with_unchecked_field
 from recipes.files import read_files
 from recipes.load import dump_recipe

@@ -35,7 +35,7 @@ from augment.output.atomic import (
     read_file,
     write_atomic,
 )
-from augment.output.layout import relative_parts
+from augment.output.names import relative_parts
 
 # Control characters, and bytes that are not text.
 _UNSAFE_CHARACTERS = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")

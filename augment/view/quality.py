@@ -28,7 +28,8 @@ from augment.memo import memo_of
 from augment.metrics.image import flip
 from augment.output.calibration import trajectory_id
 from augment.output.claims import hold_claim
-from augment.output.layout import STATE_FOLDER, parse_errors_as_output_errors
+from augment.output.layout import parse_errors_as_output_errors
+from augment.output.names import STATE_FOLDER
 from augment.output.store import Store, StoredFileMissing
 from augment.progress import ProgressBar
 from augment.scene.cameras import Camera, Frame

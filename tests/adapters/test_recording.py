@@ -30,7 +30,7 @@ from adapters.recording.files import find_images, numbered_files, read_calibrati
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.jobs.render_job import RenderJob, run_job
-from augment.output.layout import folder_name
+from augment.output.names import folder_name
 from augment.output.tables import lidar_bytes
 from augment.photo.recorded_sky import recorded_sky
 from augment.scene.semantics import SemanticClass

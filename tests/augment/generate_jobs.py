@@ -21,8 +21,8 @@ from augment.errors import OutputError
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.generate import GenerateJob
 from augment.jobs.job_state import ProgressLog
-from augment.output.layout import STATE_FOLDER
 from augment.output.manifest import read_manifest_rows
+from augment.output.names import STATE_FOLDER
 from augment.output.store import open_store
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene

@@ -46,8 +46,8 @@ from augment.errors import OutputError
 from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
 from augment.jobs.render_job import RenderJob, run_job
 from augment.output.atomic import TEMPORARY_SUFFIX
-from augment.output.layout import STATE_FOLDER
 from augment.output.manifest import read_manifest_rows
+from augment.output.names import STATE_FOLDER
 from augment.output.store import open_store
 from augment.output.tables import lidar_bytes
 from recipes.flood import Flood

@@ -43,8 +43,8 @@ from augment.dataset.weather_dataset import Rows
 from augment.errors import BackendUnavailable, OutputError, SceneError
 from augment.jobs.render_job import RenderJob, run_job
 from augment.output.box_weather import box_tables
-from augment.output.layout import MANIFEST_FILE
 from augment.output.manifest import parse_manifest, publish_part
+from augment.output.names import MANIFEST_FILE
 from augment.output.store import StoredFile, StoredFileMissing
 from augment.scene.geometry import invert_rigid, rotmat_from_quat, transform_points
 from recipes.schema import Recipe

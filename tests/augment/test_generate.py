@@ -33,8 +33,8 @@ from augment.jobs.processes import available_cores
 from augment.jobs.render_job import RenderJob
 from augment.jobs.time_shares import compute_time_shares
 from augment.output.atomic import write_atomic
-from augment.output.layout import STATE_FOLDER, folder_name
 from augment.output.manifest import list_parts, read_manifest, read_manifest_rows
+from augment.output.names import STATE_FOLDER, folder_name
 from augment.output.store import open_store
 from recipes.job import JobRecipes, JobScene
 

@@ -33,8 +33,9 @@ import augment
 from augment.errors import OutputError, SceneError
 from augment.jobs.processes import OutputLock, process_mark
 from augment.jobs.render_job import RenderJob
-from augment.output.layout import item_paths, resolve_inside
+from augment.output.layout import item_paths
 from augment.output.manifest import read_manifest
+from augment.output.names import resolve_inside
 from augment.output.tables import read_boxes, read_lidar
 from augment.scene.cameras import Frame
 from recipes.load import load_recipe

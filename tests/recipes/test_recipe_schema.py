@@ -477,7 +477,7 @@ def field_table() -> str:
     return f"{table_of(sections)}{SPEED}{table_of([speed])}"
 
 
-def table_of(sections: list[type[Section]]) -> str:
+def table_of(sections: list[Any]) -> str:
     rows = ["| Field | Allowed | Default | Meaning |\n| --- | --- | --- | --- |\n"]
     for section in sections:
         if section.max_items is not None:

@@ -21,8 +21,8 @@ import pytest
 
 from augment.errors import OutputError
 from augment.output.box_weather import box_tables, combine_visibility
-from augment.output.layout import MANIFEST_FILE
 from augment.output.manifest import publish_part, rows_to_table, write_manifest
+from augment.output.names import MANIFEST_FILE
 from augment.output.store import LocalStore
 from tests.tools.report_outputs import make_row, street_rows, write_output
 from tools import report

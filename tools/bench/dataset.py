@@ -22,8 +22,8 @@ from torch.utils.data import DataLoader, Dataset
 from adapters.base import open_scene
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
 from augment.output.atomic import write_atomic
-from augment.output.layout import MANIFEST_FILE
 from augment.output.manifest import manifest_bytes, read_manifest
+from augment.output.names import MANIFEST_FILE
 from augment.view.render_view import render_view
 from recipes.load import load_recipe
 from recipes.schema import Output, Recipe

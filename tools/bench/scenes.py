@@ -15,7 +15,8 @@ import torch
 
 from adapters.base import open_scene
 from augment.jobs.render_job import RenderJob, run_job
-from augment.output.layout import folder_name, variant_name
+from augment.output.layout import variant_name
+from augment.output.names import folder_name
 from augment.render.sh import SH_C0
 from augment.scene.cameras import Camera
 from augment.scene.geometry import rigid

@@ -13,8 +13,9 @@ import numpy as np
 from augment.errors import OutputError
 from augment.files.image_size import image_header
 from augment.output.codecs import decode_image, decode_png, depth_in_metres
-from augment.output.layout import mask_names, resolve_inside
-from augment.output.manifest import MANIFEST_FILE, OK, Row, read_manifest_rows, weather_columns
+from augment.output.layout import mask_names
+from augment.output.manifest import OK, Row, read_manifest_rows, weather_columns
+from augment.output.names import MANIFEST_FILE, resolve_inside
 from augment.output.store import Store, open_store
 from recipes.files import open_file
 from recipes.schema import columns_of_effects

@@ -29,6 +29,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from augment.effects.falling import drop_kernels
+from augment.effects.falling.drop_kernels import CellWalk, Veil
 from augment.effects.falling.drops import Kind, Sizes, cell_counts, sizes_of
 from augment.effects.falling.shutter import STANDING, Motion
 from augment.light.scene_light import find_scene_light
@@ -147,22 +148,6 @@ def _in_fog(glow: Glow, fog: Fog | None, eye_z_m: float, extinction_per_m: float
 
 
 # ---- Drops in a camera's view --------------------------------------------------------------------
-
-
-class CellWalk(NamedTuple):
-    """Arguments of drop_kernels.find_drops, in its order."""
-
-    slabs: np.ndarray
-    columns: np.ndarray
-    cells: np.ndarray
-    keys: np.ndarray
-    moves: np.ndarray
-    sways: np.ndarray
-    quantiles: np.ndarray
-    shares: np.ndarray
-    planes: np.ndarray
-    shutter: np.ndarray
-    lens: np.ndarray
 
 
 def max_depths_m(precipitation: Precipitation, camera: Camera) -> np.ndarray:
@@ -322,17 +307,6 @@ def _padded(image: np.ndarray) -> np.ndarray:
 
 
 # ---- On a picture --------------------------------------------------------------------------------
-
-
-class Veil(NamedTuple):
-    """Arguments of drop_kernels.blend_falling, float32."""
-
-    rays: np.ndarray
-    climb: np.ndarray
-    bands: np.ndarray
-    upwards: np.ndarray
-    airlight: np.ndarray
-    glow: np.ndarray
 
 
 def veil_of(precipitation: Precipitation, camera: Camera, glow: Glow) -> Veil:

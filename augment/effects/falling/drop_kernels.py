@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
@@ -25,6 +26,33 @@ NUM_NUMBERS = 9  # numbers of a drop in the picture
 _HALF = float(2**-21)
 _CELL_X, _CELL_Y, _CELL_Z = (np.uint64(f) for f in CELL_FACTORS)
 _STEP = np.uint64(STEP_X)
+
+
+class CellWalk(NamedTuple):
+    """Arguments of `find_drops`, in its order."""
+
+    slabs: np.ndarray
+    columns: np.ndarray
+    cells: np.ndarray
+    keys: np.ndarray
+    moves: np.ndarray
+    sways: np.ndarray
+    quantiles: np.ndarray
+    shares: np.ndarray
+    planes: np.ndarray
+    shutter: np.ndarray
+    lens: np.ndarray
+
+
+class Veil(NamedTuple):
+    """Arguments of `blend_falling`, float32."""
+
+    rays: np.ndarray
+    climb: np.ndarray
+    bands: np.ndarray
+    upwards: np.ndarray
+    airlight: np.ndarray
+    glow: np.ndarray
 
 
 @kernel_function()

@@ -7,19 +7,15 @@ two.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from augment.effects.falling.drop_kernels import EDGE, FADE, LEAST_RADIUS, SOFT
+from augment.effects.falling.drop_kernels import EDGE, FADE, LEAST_RADIUS, SOFT, CellWalk, Veil
 from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL
 from augment.rng import STEP_X, mix
-
-if TYPE_CHECKING:
-    from augment.effects.falling.air import CellWalk, Veil
 
 
 def find_drops_by_numpy(walk: CellWalk) -> Float32[np.ndarray, "N 9"]:
