@@ -8,6 +8,7 @@ Imports inside functions and for type checking count as well.
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -95,6 +96,7 @@ def room_of(module: str) -> str:
     return max(fits)[1]
 
 
+@functools.cache
 def import_graph() -> dict[str, set[str]]:
     """Return the modules that each module imports."""
     modules = module_paths()

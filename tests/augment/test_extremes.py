@@ -55,7 +55,7 @@ def weather(depth: str = "expected", **effects) -> Recipe:
     return Recipe.model_validate({"weather": effects, "style": style, "output": output})
 
 
-@drawing(6)
+@drawing(3)
 @given(places(), cameras(levels_m=(0.2,)), recipes())
 def test_any_scene_from_anywhere_in_any_weather(place: Place, camera: Camera, recipe: Recipe):
     rendered(place.scene(), camera, recipe)

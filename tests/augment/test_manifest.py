@@ -252,7 +252,7 @@ STEPS = st.one_of(
 
 
 @given(st.lists(STEPS, max_size=6))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 def test_what_is_published_is_seen_whatever_is_merged_when(steps: list[tuple]) -> None:
     with tempfile.TemporaryDirectory() as where:
         store = open_store(where)
