@@ -225,7 +225,7 @@ def _all_steps(
             SENSOR_NOISE_PASS, recipe.camera.noise > 0, f"camera.noise is {recipe.camera.noise:g}"
         ),
         Step("depth image", output.depth != "none", f"output.depth is {output.depth!r}"),
-        Step("semantic image", output.semantic, _output_reason("semantic", recipe)),
+        _semantic_step(recipe, scene),
         Step("instance image", output.instance, _output_reason("instance", recipe)),
         Step("trust mask", output.trust, _output_reason("trust", recipe)),
     )
@@ -255,6 +255,15 @@ def _exposure_step(recipe: Recipe, scene: Scene) -> Step:
         return Step(name, False, "render.exposure is 'neutral'")
     why = f"{len(names)} of {len(scene.camera_names)} cameras have one, applied after the weather"
     return Step(name, True, why)
+
+
+def _semantic_step(recipe: Recipe, scene: Scene) -> Step:
+    """Return the pass that looks up the class of each pixel."""
+    why = _output_reason("semantic", recipe)
+    paints_boxes = recipe.output.instance and scene.labels is not None
+    if paints_boxes and not recipe.output.semantic:
+        why += ", but output.instance finds labelled boxes by their pixels' classes"
+    return Step("semantic image", recipe.output.semantic or paints_boxes, why)
 
 
 def _output_reason(name: str, recipe: Recipe) -> str:

@@ -31,7 +31,7 @@ from augment.view.render_view import render_view
 from recipes.schema import Rain, Recipe, Render, Weather
 from tests.lidar_sweeps import sweep_of
 from tests.scenes import camera_ahead, one_gaussian
-from tests.streets import LABELLED_STREET, open_street
+from tests.streets import LABELLED_STREET, open_fast_street, open_street
 
 CAMERA = camera_ahead(96, 64, 80.0, position=(0, 0, 1.5))
 LIGHT = np.array([0.4, 0.5, 0.6])
@@ -221,15 +221,7 @@ def test_a_recipe_has_spray_where_somebody_drives_fast_enough_and_else_the_same_
     camera = slow.frames[0].cameras["front"]
     dry, wet = (render_view(slow, camera, rainy(spray=on)) for on in (False, True))
     assert np.array_equal(dry.rgb, wet.rgb)
-
-    def hurried(actor: Actor) -> Actor:
-        poses, now = actor.track.world_from_actor.clone(), actor.track.world_from_actor[0, :3, 3]
-        poses[:, :3, 3] += 2 * (poses[:, :3, 3] - now)
-        return dataclasses.replace(
-            actor, track=dataclasses.replace(actor.track, world_from_actor=poses)
-        )
-
-    fast = dataclasses.replace(slow, actors=tuple(map(hurried, slow.actors)))
+    fast = open_fast_street()
     steps = [
         {s.name: s for s in make_plan(recipe, scene).steps}["spray behind vehicles"]
         for recipe, scene in ((Recipe(), fast), (rainy(spray=False), fast), (rainy(), slow),

@@ -358,8 +358,8 @@ def render_flooded(
     with timed("flood: mirrored view"):
         mirror = _mirror_layer(renderer, camera, medium, window, shows_water)
     screen = None
-    with timed("flood: screen march"):
-        if medium.reflection == "screen_space":
+    if medium.reflection == "screen_space":
+        with timed("flood: screen march"):
             needed = is_smooth(field, crop)  # rough water reflects the mirrored view alone
             layer = as_layer(camera, front)
             screen = trace_screen(layer, crop, medium.level_z_m, needed=needed, backend=backend)
