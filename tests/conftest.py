@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import shutil
@@ -46,6 +47,12 @@ def _checked_modules() -> list[str]:
 
 
 install_import_hook(_checked_modules(), "beartype.beartype")
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector what imports have made: jobs collect after every scene."""
+    gc.collect()
+    gc.freeze()
 
 
 # Files of a few long tests. At the end one of them would keep a single core busy.
