@@ -1,9 +1,9 @@
 """Tables of the numbers measured for a frame's boxes in each image: one row per box and image.
 
-In: numbers of boxes (`files.measure_boxes`). Out: lines of a job's progress log, and the variant's
-files (`labels/boxes_2d.parquet` ...). The numbers are measured where the image is rendered, are
-stored in the image's line of the progress log, and go to the variant's files when the job ends.
-Files that are missing, damaged or of another kind raise OutputError.
+In: numbers of boxes (`augment.view.box_labels.measure_boxes`). Out: lines of a job's progress log,
+and the variant's files (`labels/boxes_2d.parquet` ...). The numbers are measured where the image is
+rendered, are stored in the image's line of the progress log, and go to the variant's files when the
+job ends. Files that are missing, damaged or of another kind raise OutputError.
 """
 
 from __future__ import annotations

@@ -616,7 +616,7 @@ class Identity:
     recipe_hash: str
     """Hash of the recipe."""
     trajectory: str
-    """Camera path, as of `files.trajectory_id`."""
+    """Camera path, as of `calibration.trajectory_id`."""
     version: str
     """Version of this package."""
     backend: str

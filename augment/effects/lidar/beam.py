@@ -1,8 +1,8 @@
 """Models a LiDAR's beams and the strongest echo of each, which one effect after another changes.
 
-`sweep.weathered_sweep` makes `Echoes` from a recorded sweep, passes them to every effect, and takes
-the weathered sweep from them. Every return is a row of the source and stays one; `codes` names what
-became of it.
+`augment.view.weathered_sweep` makes `Echoes` from a recorded sweep, passes them to every effect,
+and takes the weathered sweep from them. Every return is a row of the source and stays one; `codes`
+names what became of it.
 """
 
 from __future__ import annotations
