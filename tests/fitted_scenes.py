@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 import torch
-from scenes import camera_ahead, random_gaussians, random_pose
 
 from augment.scene.cameras import Frame
 from augment.scene.scene import Actor, ColorSeries, Gaussians, Ground, Scene, Track
 from augment.scene.sky import CubemapSky
+from tests.scenes import camera_ahead, random_gaussians, random_pose
 
 START_NS = 1_557_540_079_200_123_457  # too many digits for a float64
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scenes import camera_ahead
 
 from augment.metrics.consistency import DepthView
 from augment.output.tables import FrameBoxes
 from augment.scene.cameras import Camera
 from augment.scene.labels import Boxes
+from tests.scenes import camera_ahead
 
 WALL_M, BOARD_M, THICKNESS_M = 12.0, 6.0, 0.4  # the board's front face, and how thick it is
 BOARD_SIZE_M = np.array([THICKNESS_M, 2.0, 1.6])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import torch
-from test_image_views import camera
 
 from adapters.lidar_scene.closing import close_parts
 from adapters.lidar_scene.image_views import View
@@ -17,6 +16,7 @@ from augment.render.rasterize import rasterize
 from augment.scene.scene import Gaussians
 from augment.scene.semantics import SemanticClass as Class
 from tests.adapters import pandaset_files
+from tests.adapters.test_image_views import camera
 
 GREY, RED = (90, 90, 90), (200, 30, 30)
 HEIGHT_M = 1.5  # of the camera, over the road

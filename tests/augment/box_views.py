@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from batch_scenes import ORIGIN_M
 
 from augment.scene.boxes import WorldBoxes
 from augment.scene.cameras import Camera
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.labels import Boxes
+from tests.augment.batch_scenes import ORIGIN_M
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 CAR_M = (4.0, 2.0, 1.5)

@@ -23,10 +23,8 @@ def start_fork_server(*modules: str) -> None:
     multiprocessing.set_forkserver_preload([*modules, "pandas", "pyarrow.parquet"])
     path = os.environ.get("PYTHONPATH")
     # It is told of this process's sys.path, and in Python 3.11 leaves it unused.
-    tests_dir = Path(__file__).parent
-    os.environ["PYTHONPATH"] = os.pathsep.join(
-        [str(tests_dir), str(tests_dir.parents[1]), path or ""]
-    )
+    root = Path(__file__).parents[2]
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(root), path or ""])
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         first = _FORK_SERVER.Process(target=int)

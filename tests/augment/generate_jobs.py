@@ -15,8 +15,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from batch_scenes import FakeView, fake_render, open_fake, tree_digest
-
 from augment.errors import OutputError
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.generate import GenerateJob
@@ -29,6 +27,7 @@ from augment.scene.scene import Scene
 from recipes.job import Job, JobRecipes, JobScene
 from recipes.load import parse_recipe
 from recipes.schema import Recipe
+from tests.augment.batch_scenes import FakeView, fake_render, open_fake, tree_digest
 
 NOTES = "CLIMATEGS_TEST_NOTES"
 

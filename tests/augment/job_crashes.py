@@ -23,21 +23,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import generate_jobs as jobs
-from batch_scenes import make_recipe, open_fake, tree_digest
-from fork_server import keep_in_forks, server_process, start_fork_server
-from generate_jobs import (
-    check_reader,
-    dying_render,
-    leftovers,
-    make_job,
-    noting_render,
-    open_dying,
-    outputs,
-    read_notes,
-    slow_noting_render,
-    take_notes,
-)
 from tqdm import tqdm
 
 import augment.jobs.block_queue as block_queue
@@ -52,6 +37,21 @@ from augment.output.store import open_store
 from augment.output.tables import lidar_bytes
 from recipes.flood import Flood
 from recipes.snow import Snow
+from tests.augment import generate_jobs as jobs
+from tests.augment.batch_scenes import make_recipe, open_fake, tree_digest
+from tests.augment.fork_server import keep_in_forks, server_process, start_fork_server
+from tests.augment.generate_jobs import (
+    check_reader,
+    dying_render,
+    leftovers,
+    make_job,
+    noting_render,
+    open_dying,
+    outputs,
+    read_notes,
+    slow_noting_render,
+    take_notes,
+)
 
 Work = Callable[[], object]
 CHANGES = ("fsync", "replace", "unlink", "rename", "rmdir", "link", "mkdir")
@@ -66,7 +66,7 @@ def main(folder: Path, names: list[str]) -> None:
     tqdm.monitor_interval = 0  # its thread may hold the lock while a process forks
     faulthandler.register(signal.SIGUSR1)
     take_notes(folder / "notes")
-    start_fork_server("generate_jobs", "augment.jobs.pools", "augment.jobs.worker")
+    start_fork_server("tests.augment.generate_jobs", "augment.jobs.pools", "augment.jobs.worker")
     keep_in_forks()
     block_queue.ELSEWHERE_S = pools.WAIT_S = 0.05
     lidar_bytes(open_fake("fake:warm").labels.lidar(0))

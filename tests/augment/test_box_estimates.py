@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from batch_scenes import ORIGIN_M
-from box_views import UPRIGHT, make_boxes, make_camera
 
 from augment.output.box_tables import BOXES_2D, BoxNumbers, BoxWeather
 from augment.scene.box_estimates import Evidence, SortedPoints, estimate_boxes
@@ -19,6 +17,8 @@ from augment.scene.semantics import SemanticClass
 from augment.view.box_labels import label_view
 from augment.view.results import LabelSurfaces, WeatheredView
 from recipes.schema import Output, Recipe, Render
+from tests.augment.batch_scenes import ORIGIN_M
+from tests.augment.box_views import UPRIGHT, make_boxes, make_camera
 
 CAR = ((30.0, 0.0, 0.75), (4.0, 1.8, 1.5), UPRIGHT)
 CAMERA = Camera("front", 640, 424, 600.0, 600.0, 320.2, 212.1, make_camera().camera_from_world)

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from snow_scenes import box_car, drive, stack_all
 
 from augment.dataset import SceneDataset, WeatherDataset, box_masks, boxes_2d, torchvision_sample
 from augment.dataset.samples import box_tensors, buffers
@@ -30,6 +29,7 @@ from augment.view.box_labels import label_view, measure_boxes
 from augment.view.render_view import render_view
 from recipes.schema import Output, Recipe, Render, Weather
 from recipes.snow import Snow
+from tests.snow_scenes import box_car, drive, stack_all
 
 PARKED = np.array([14.0, 0.0, 0.75])
 SIZE = np.array([4.0, 1.8, 1.5])

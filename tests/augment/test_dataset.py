@@ -15,20 +15,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 import torch
-from batch_scenes import (
-    CLEAR,
-    FLOODED,
-    FOGGY,
-    ORIGIN_M,
-    FakeLabels,
-    assert_same_sample,
-    fake_render,
-    make_frame,
-    make_recipe,
-    must_not_render,
-    open_fake,
-    write_scene,
-)
 from torch.utils.data import DataLoader
 
 from augment.dataset import (
@@ -48,6 +34,20 @@ from augment.output.names import MANIFEST_FILE
 from augment.output.store import StoredFile, StoredFileMissing
 from augment.scene.geometry import invert_rigid, rotmat_from_quat, transform_points
 from recipes.schema import Recipe
+from tests.augment.batch_scenes import (
+    CLEAR,
+    FLOODED,
+    FOGGY,
+    ORIGIN_M,
+    FakeLabels,
+    assert_same_sample,
+    fake_render,
+    make_frame,
+    make_recipe,
+    must_not_render,
+    open_fake,
+    write_scene,
+)
 
 FOLDER = Path("street") / "fog-000"
 RECIPES = [

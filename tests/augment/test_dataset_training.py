@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
-from batch_scenes import CLEAR, FLOODED, FOGGY, assert_same_sample, make_recipe, write_scene
 from torch.utils.data import DataLoader
 
 from augment.dataset import (
@@ -24,6 +23,14 @@ from augment.dataset import (
     split_by_scene,
 )
 from augment.dataset.weather_dataset import Rows
+from tests.augment.batch_scenes import (
+    CLEAR,
+    FLOODED,
+    FOGGY,
+    assert_same_sample,
+    make_recipe,
+    write_scene,
+)
 
 FRAMES = 6
 

@@ -9,16 +9,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from box_views import (
-    CAR_M,
-    UPRIGHT,
-    boxes_at_random,
-    count_by_hand,
-    make_boxes,
-    make_camera,
-    placed,
-    plane_depth,
-)
 
 from adapters.base import open_scene
 from adapters.procedural import open_truth
@@ -42,6 +32,16 @@ from augment.view.render_view import render_buffers, render_view
 from recipes.flood import Flood, Wave, Waves
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.speed import Speed
+from tests.augment.box_views import (
+    CAR_M,
+    UPRIGHT,
+    boxes_at_random,
+    count_by_hand,
+    make_boxes,
+    make_camera,
+    placed,
+    plane_depth,
+)
 from tests.augment.pretend_gpu import pretended_gpu
 from tests.scenes import camera_ahead, random_gaussians, sh_of
 from tools.bench import flood_truth

@@ -13,18 +13,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from batch_scenes import make_recipe, must_not_render, open_fake, run_fake
-from generate_jobs import (
-    DRY,
-    check_reader,
-    image_name,
-    leftovers,
-    make_job,
-    make_recipes,
-    open_without_memory,
-    outputs,
-    raising_render,
-)
 
 from augment.errors import ClimateGSError, OutputError
 from augment.jobs.blocks import read_status, stored_plans
@@ -37,6 +25,18 @@ from augment.output.manifest import list_parts, read_manifest, read_manifest_row
 from augment.output.names import STATE_FOLDER, folder_name
 from augment.output.store import open_store
 from recipes.job import JobRecipes, JobScene
+from tests.augment.batch_scenes import make_recipe, must_not_render, open_fake, run_fake
+from tests.augment.generate_jobs import (
+    DRY,
+    check_reader,
+    image_name,
+    leftovers,
+    make_job,
+    make_recipes,
+    open_without_memory,
+    outputs,
+    raising_render,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -406,10 +406,9 @@ def test_a_damaged_plan_is_told_and_written_again(tmp_path: Path) -> None:
 
 def found_by(folder: Path, *scenarios: str) -> dict[str, dict]:
     """What has to hold is in the script, which ends with a message where it does not."""
-    script = Path(__file__).with_name("job_crashes.py")
-    done = subprocess.run(
-        [sys.executable, script, folder, *scenarios], capture_output=True, text=True, timeout=600
-    )
+    command = [sys.executable, "-m", "tests.augment.job_crashes", str(folder), *scenarios]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

@@ -10,14 +10,14 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from batch_scenes import FakeView, fake_render, slow_render
-from generate_jobs import leftovers, make_job, outputs
 
 from augment.errors import ClimateGSError
 from augment.jobs.generate import run_generate
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 from recipes.schema import Recipe
+from tests.augment.batch_scenes import FakeView, fake_render, slow_render
+from tests.augment.generate_jobs import leftovers, make_job, outputs
 
 HERE = Path(__file__).parent
 PATHS = os.pathsep.join([str(HERE), str(HERE.parents[1])])

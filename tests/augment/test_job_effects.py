@@ -11,21 +11,6 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from batch_scenes import (
-    LEVEL_Z_M,
-    ORIGIN_M,
-    THICKNESS_M,
-    FakeLabels,
-    FakeView,
-    fake_render,
-    make_maps,
-    make_recipe,
-    must_not_render,
-    open_fake,
-    run_fake,
-    style_render,
-    tree_digest,
-)
 
 from augment.dataset import WeatherDataset
 from augment.effects.flood.effect import count_hidden_pixels, submerged_fraction
@@ -47,6 +32,21 @@ from recipes.load import load_recipe
 from recipes.schema import Recipe, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style
+from tests.augment.batch_scenes import (
+    LEVEL_Z_M,
+    ORIGIN_M,
+    THICKNESS_M,
+    FakeLabels,
+    FakeView,
+    fake_render,
+    make_maps,
+    make_recipe,
+    must_not_render,
+    open_fake,
+    run_fake,
+    style_render,
+    tree_digest,
+)
 
 # Snow of no depth is not laid, so no place is looked for; the stand-in draws some all the same.
 SNOW = Snow(depth_m=0)

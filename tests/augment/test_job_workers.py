@@ -17,7 +17,21 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from batch_scenes import (
+
+from augment.errors import ClimateGSError, GpuLost, OutputError
+from augment.jobs import worker as runner
+from augment.jobs.processes import share_scene, thread_limits
+from augment.jobs.render_job import RenderJob
+from augment.jobs.time_shares import compute_time_shares
+from augment.jobs.write_pump import WritePump
+from augment.output.manifest import read_manifest
+from augment.render.threads import wait_for_result
+from augment.scene.scene import Actor, Track
+from augment.scene.sky import LatLongSky
+from recipes.flood import Flood
+from recipes.snow import Snow
+from recipes.style import Style
+from tests.augment.batch_scenes import (
     FakeLabels,
     FakePending,
     bed_render,
@@ -33,22 +47,8 @@ from batch_scenes import (
     run_fake,
     tree_digest,
 )
-from fork_server import quick_context, start_fork_server
-from pretend_gpu import pretended_gpu
-
-from augment.errors import ClimateGSError, GpuLost, OutputError
-from augment.jobs import worker as runner
-from augment.jobs.processes import share_scene, thread_limits
-from augment.jobs.render_job import RenderJob
-from augment.jobs.time_shares import compute_time_shares
-from augment.jobs.write_pump import WritePump
-from augment.output.manifest import read_manifest
-from augment.render.threads import wait_for_result
-from augment.scene.scene import Actor, Track
-from augment.scene.sky import LatLongSky
-from recipes.flood import Flood
-from recipes.snow import Snow
-from recipes.style import Style
+from tests.augment.fork_server import quick_context, start_fork_server
+from tests.augment.pretend_gpu import pretended_gpu
 
 SOON_S = 10.0  # for what takes no time, on a machine that is busy
 
@@ -362,7 +362,7 @@ def test_who_is_busiest_bounds_the_job() -> None:
 
 @pytest.fixture
 def quick_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    start_fork_server("batch_scenes", "augment.jobs.pools")
+    start_fork_server("tests.augment.batch_scenes", "augment.jobs.pools")
     monkeypatch.setattr("multiprocessing.get_context", quick_context)
 
 

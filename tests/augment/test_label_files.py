@@ -11,9 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from batch_scenes import FakeLabels, fake_render, open_fake, tree_digest
-from generate_jobs import make_job, make_recipes
-from test_boxes_2d import StreetLabels, open_street, street
 
 from augment.dataset import LabelOptions, write_labels
 from augment.dataset.label_files import NothingLabelled, category_of, forecast_labels
@@ -26,6 +23,9 @@ from augment.scene.boxes import WorldBoxes, encode_masks, find_occlusion
 from augment.scene.labels import Boxes
 from recipes.load import parse_recipe
 from recipes.schema import Category, Recipe
+from tests.augment.batch_scenes import FakeLabels, fake_render, open_fake, tree_digest
+from tests.augment.generate_jobs import make_job, make_recipes
+from tests.augment.test_boxes_2d import StreetLabels, open_street, street
 
 ALL = "labels: [coco, kitti, yolo], lidar: false"
 

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from batch_scenes import FakeLabels, fake_render, make_recipe, open_fake
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
@@ -47,6 +46,7 @@ from recipes.flood import Flood, Waves
 from recipes.schema import Recipe, Smog, Weather
 from recipes.smog import KOSCHMIEDER
 from recipes.snow import Snow
+from tests.augment.batch_scenes import FakeLabels, fake_render, make_recipe, open_fake
 from tests.lidar_sweeps import (
     SENSOR_M,
     WORLD_ORIGIN_M,

@@ -12,7 +12,6 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from batch_scenes import fog_job, make_recipe, run_fake
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,6 +38,7 @@ from augment.output.manifest import (
 )
 from augment.output.store import Store, open_store
 from augment.output.tables import read_table
+from tests.augment.batch_scenes import fog_job, make_recipe, run_fake
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,7 @@ import os
 import shutil
 from pathlib import Path
 
-import batch_scenes
 import cv2
-import mirror_trees as trees
 import numpy as np
 import pytest
 
@@ -21,6 +19,8 @@ from augment.jobs import mirror as mirror_module
 from augment.jobs.mirror import dataset_format, mirror_folder, read_record, weathered_images
 from augment.output.atomic import TEMPORARY_SUFFIX
 from augment.output.codecs import decode_image
+from tests.augment import batch_scenes
+from tests.augment import mirror_trees as trees
 
 
 @pytest.fixture

@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from batch_scenes import FakeView, make_camera, open_fake, run_fake
-from generate_jobs import make_job, make_recipes
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -43,6 +41,8 @@ from recipes.errors import RecipeError
 from recipes.fields import section_at
 from recipes.load import load_recipe, parse_recipe
 from recipes.schema import Recipe, with_reference_settings
+from tests.augment.batch_scenes import FakeView, make_camera, open_fake, run_fake
+from tests.augment.generate_jobs import make_job, make_recipes
 
 # ---- The search, in tables of errors and times ---------------------------------------------------
 

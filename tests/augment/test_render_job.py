@@ -14,7 +14,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from batch_scenes import (
+
+import augment
+from augment.errors import OutputError, SceneError
+from augment.jobs.processes import OutputLock, process_mark
+from augment.jobs.render_job import RenderJob
+from augment.output.layout import item_paths
+from augment.output.manifest import read_manifest
+from augment.output.names import resolve_inside
+from augment.output.tables import read_boxes, read_lidar
+from augment.scene.cameras import Frame
+from recipes.load import load_recipe
+from recipes.schema import Render
+from tests.augment.batch_scenes import (
     ORIGIN_M,
     SIZE,
     FakeLabels,
@@ -28,18 +40,6 @@ from batch_scenes import (
     run_fake,
     tree_digest,
 )
-
-import augment
-from augment.errors import OutputError, SceneError
-from augment.jobs.processes import OutputLock, process_mark
-from augment.jobs.render_job import RenderJob
-from augment.output.layout import item_paths
-from augment.output.manifest import read_manifest
-from augment.output.names import resolve_inside
-from augment.output.tables import read_boxes, read_lidar
-from augment.scene.cameras import Frame
-from recipes.load import load_recipe
-from recipes.schema import Render
 
 IDENTITY = ("source", "recipe_hash", "trajectory", "version", "backend")
 FOLDER = Path("street") / "fog-000"

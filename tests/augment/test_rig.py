@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from batch_scenes import tree_digest
 from torch.utils.data import DataLoader
 
 import augment.view.render_view
@@ -32,6 +31,7 @@ from recipes.rain import Rain
 from recipes.schema import Output, Recipe, Render, Weather
 from recipes.smog import Smog
 from recipes.snow import Snow
+from tests.augment.batch_scenes import tree_digest
 from tests.scenes import random_gaussians
 from tests.streets import LABELLED_STREET, open_street
 

@@ -7,8 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from batch_scenes import ORIGIN_M
-from box_views import CAR_M, UPRIGHT, boxes_at_random, make_boxes, make_camera, placed
 
 from adapters.procedural import open_truth
 from adapters.uri import parse_uri
@@ -24,6 +22,8 @@ from augment.render.fog import (
 from augment.scene.boxes import BOTTOM_MARGIN_M, NOT_COUNTED, SIDE_MARGIN_M
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.labels import Boxes
+from tests.augment.batch_scenes import ORIGIN_M
+from tests.augment.box_views import CAR_M, UPRIGHT, boxes_at_random, make_boxes, make_camera, placed
 from tests.streets import open_street
 from tools.bench.scenes import recipe_of
 from tools.bench.smog_truth import smog_error, truth_view

@@ -27,7 +27,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from generate_jobs import image_name, make_job, make_recipes, outputs
 
 from augment.errors import OutputError
 from augment.jobs.blocks import read_status
@@ -41,6 +40,7 @@ from augment.output.store import (
     StoredFileMissing,
     open_store,
 )
+from tests.augment.generate_jobs import image_name, make_job, make_recipes, outputs
 from tools.view.outputs import OutputViewer, find_output
 
 # ---- An S3 server in this process, and failures to order ----------------------------------------

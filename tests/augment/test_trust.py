@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scenes import camera_ahead, one_gaussian, stack
-from streets import open_street
 
 from adapters.camera_files.paths import with_camera_path
 from augment.dataset.weather_dataset import WeatherDataset
@@ -38,6 +36,8 @@ from augment.view.render_view import render_view
 from recipes.fields import changed
 from recipes.load import load_recipe
 from recipes.schema import Recipe
+from tests.scenes import camera_ahead, one_gaussian, stack
+from tests.streets import open_street
 
 CLEAR = changed(load_recipe("clear").resolve(0), {"render.scale": 0.25, "output.depth": "none"})
 

@@ -18,11 +18,11 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 import pytest
-from test_view import SCALE, hostile_output, rendered, served
 
 from augment.output.store import open_store
 from augment.view.render_view import render_view
 from tests.streets import SMALL_STREET
+from tests.tools.test_view import SCALE, hostile_output, rendered, served
 from tools.view.edits import Edits
 from tools.view.outputs import OutputViewer
 from tools.view.server import import_viser, serve

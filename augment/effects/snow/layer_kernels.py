@@ -615,7 +615,7 @@ def _corner_noise(column_bits, row_bits, seed, x, y):
 
 @kernel_function()
 def _noise(u, v, seed):
-    """Return gradient noise at lattice coordinates, as `layer.gradient_noise` defines it."""
+    """Return gradient noise at lattice coordinates, as `gradient_noise` defines it."""
     column = math.floor(u)
     row = math.floor(v)
     x = u - column
@@ -638,7 +638,7 @@ def _noise(u, v, seed):
 
 @kernel_function()
 def _octave_sum(x, y, size, turns, amplitudes, lengths, seeds):
-    """Return the sum of octaves at a point, as `layer.sum_octaves` defines it."""
+    """Return the sum of octaves at a point, as `sum_octaves` of gradient_noise.py defines it."""
     total = 0.0
     for k in range(len(amplitudes)):
         visible_share = min(max(2.0 - 4.0 * size / lengths[k], 0.0), 1.0)
