@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from augment.exposure.height_map import HeightMap
+from augment.light.srgb import LUMINANCE_WEIGHTS
 from augment.scene.semantics import SemanticClass
 
 MIN_RELATIVE_LIGHT = 0.25  # lower limit of the relative light
@@ -16,7 +17,7 @@ MAX_RELATIVE_LIGHT = 1.5  # upper limit of the relative light
 # Standard deviation of the luminance blur: shadows have soft edges, and gravel is no shadow.
 _LUMINANCE_BLUR_M = 0.2
 _PAINT_MARGIN_M = 0.1  # distance beyond its own splats up to which a lane marking may show
-_LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722], np.float32)  # weights of linear sRGB
+_LUMINANCE_WEIGHTS = np.array(LUMINANCE_WEIGHTS, np.float32)  # weights of linear sRGB
 _MIN_BLUR_CELLS = 0.3  # a blur narrower than this number of cells is left out
 _MIN_WEIGHT = 0.02  # least weight of the blur at which luminance is known
 _MIN_SUNLIT_SHARE = 0.8  # least share of the light at which a cell counts as sunlit

@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float, Float32, Int16
 from torch import Tensor
 
-from augment.light.srgb import linear_from_display
+from augment.light.srgb import LUMINANCE_WEIGHTS, linear_from_display
 from augment.memo import memo_of
 from augment.render.fog import Fog, vertical_optical_depth
 from augment.render.sh import SH_C0
@@ -40,7 +40,7 @@ SOLID_OPACITY = 0.5
 # Cosine to +z from which a splat may be ground where no class says so.
 _LEVEL_COSINE = 0.9
 # Weights of linear red, green and blue in luminance.
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+_LUMINANCE = np.array(LUMINANCE_WEIGHTS)
 
 # Side of a cell of the map, metres.
 _CELL_M = 0.25

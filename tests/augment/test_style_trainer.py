@@ -13,7 +13,6 @@ import torch
 from augment.effects.style.losses import FilterBank, style_loss
 from augment.effects.style.network import apply_map
 from augment.effects.style.pairs import (
-    LUMA,
     PairBatch,
     RecolorSettings,
     closed_form_method,
@@ -38,6 +37,7 @@ from augment.effects.style.train import (
     view_picture,
 )
 from augment.errors import StyleError
+from augment.light.srgb import LUMINANCE_WEIGHTS
 from augment.render.buffers import ALPHA, RGB
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
@@ -306,7 +306,7 @@ def test_grey_and_night_are_reached():
     grey = sample_recolorings(64, seeded(), dataclasses.replace(STILL, grey_share=1.0))(images)
     spread = images.std(1).mean()
     assert (grey.std(1).mean((1, 2)) < 0.31 * spread).all()
-    luma = torch.tensor(LUMA)
+    luma = torch.tensor(LUMINANCE_WEIGHTS)
     torch.testing.assert_close(  # what is taken away is colour alone
         torch.einsum("c,bchw->bhw", luma, grey), torch.einsum("c,bchw->bhw", luma, images)
     )

@@ -124,11 +124,6 @@ class Window:
         window_columns = slice(columns.start - self.left, columns.stop - self.left)
         return (rows, columns), (window_rows, window_columns)
 
-    def paste(self, into: Tensor, values: Tensor) -> None:
-        """Write the window's pixels [h, w, ...] into an image [H, W, ...], where they overlap."""
-        image_slices, window_slices = self.overlap(into)
-        into[image_slices] = values[window_slices]
-
     def cut(self, image: Tensor) -> Tensor:
         """Return the window's pixels of an image [H, W, ...] that contains it."""
         return image[self.top : self.bottom, self.left : self.right]

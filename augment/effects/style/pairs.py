@@ -34,9 +34,8 @@ from torch.nn import functional
 
 from augment.effects.style.network import SIZE_PX, Gscm, apply_map, compose
 from augment.effects.style.statistics import ColorStatistics, color_statistics, mkl_map
+from augment.light.srgb import LUMINANCE_WEIGHTS
 
-# Luma of sRGB's primaries (ITU-R BT.709).
-LUMA = (0.2126, 0.7152, 0.0722)
 # Share of a batch's photos that share their square with another photo.
 MIXED_SHARE = 0.5
 # Factor on RecolorSettings by which each photo is recoloured before it is used.
@@ -238,7 +237,7 @@ def _turn_about_grey(
     sin = hue_rad.sin()[:, None, None]
     # Rodrigues' formula.
     hue_matrix = grey_projection + cos * (torch.eye(3) - grey_projection) + sin * cross_product
-    luma_matrix = torch.tensor(LUMA).expand(3, 3)
+    luma_matrix = torch.tensor(LUMINANCE_WEIGHTS).expand(3, 3)
     return torch.lerp(
         luma_matrix.expand(len(saturation), 3, 3), hue_matrix, saturation[:, None, None]
     )

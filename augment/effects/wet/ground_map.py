@@ -93,11 +93,6 @@ class WetGround:
     # Values of PUDDLE_ORDER on open ground, in rising order.
     sorted_puddle_order: np.ndarray
 
-    @property
-    def is_empty(self) -> bool:
-        """True if no ground is open to the sky."""
-        return not bool((self.channels[..., EXPOSURE] > 0).any())
-
     def interpolate(self, x_m: Tensor, y_m: Tensor) -> Float[Tensor, "*B C"]:
         """Return the channels between the cells' middles.
 
