@@ -40,6 +40,7 @@ from augment.light.cast_shadows import (
     shadows_of,
     sun_transmittance,
 )
+from augment.light.common_exposure import exposure_change
 from augment.output.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
@@ -61,8 +62,6 @@ ELEVATION = "airlight by elevation"
 SKY = "sky"
 SCATTER = "forward scatter"
 SHADOWS = "shadows in smog"
-
-DAMPING = 1e-4  # added to the squared gains of a camera's colour map when it is inverted
 
 
 @dataclass(frozen=True)
@@ -246,22 +245,15 @@ def fog_before_color_map(
 ) -> Fog:
     """Return the fog whose airlight, after a camera's colour map, looks as in the common exposure.
 
-    Let A be the fog's airlight, M the camera's map and C the common map. Maps are affine, so
-    M(t c + (1 - t) a) = t M(c) + (1 - t) M(a). The airlight a = M^-1 C(A) therefore gives fog the
-    common exposure, while surfaces keep the exposure of their camera. The inverse is damped,
-    a = A + (M'M + d)^-1 M' (C - M)(A) with d = DAMPING, so that none of its gains exceeds
-    1 / (2 sqrt d) = 50. The airlight keeps its colour where a camera records almost nothing of it,
-    and keeps its bits where M equals C.
+    The formula is that of `augment.light.common_exposure`. The airlight is not clipped, since its
+    dependence on the elevation is added to it.
 
     Args:
         fog: the fog with airlight A.
         color_map: M; None for the identity.
         common: C.
     """
-    camera_map = torch.eye(3, 4, dtype=torch.float64) if color_map is None else color_map.double()
-    left, gains, right = torch.linalg.svd(camera_map[:, :3])
-    damped = (gains / (gains**2 + DAMPING))[:, None]
-    change = right.T @ (damped * (left.T @ (common - camera_map)))  # [3, 4]
+    change = exposure_change(color_map, common)
     airlight = torch.tensor(fog.airlight_rgb, dtype=torch.float64)
     varying = airlight + change[:, :3] @ airlight
     rgb = varying + change[:, 3]

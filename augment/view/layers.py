@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from augment.light.common_exposure import AddedColors
 from augment.photo.recorded_base import Photo, blacken_parts, mix
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.composite import add_airlight_elevation, composite_sky
@@ -49,6 +50,8 @@ class LayerRenderer:
     None to show the splats."""
     unpruned_parts: Sequence[PosedGaussians] | None = None
     """The parts before pruning, if `parts` have been pruned (`augment.detail.prune`); else None."""
+    added_colors: AddedColors | None = None
+    """Map of the colours that effects add, before the camera's colour map; None to leave them."""
 
     def without_fog(self) -> LayerRenderer:
         """Return the same renderer in clear air."""

@@ -74,6 +74,8 @@ class Plan:
     """If True, labels or instance images need the depth of the solid surfaces."""
     uses_recorded_exposure: bool
     """If True, the cameras' colour maps are applied to the finished picture."""
+    uses_common_exposure: bool
+    """If True, the colours that effects add look as by the mean of all colour maps."""
     is_on_photo: bool
     """If True, the recorded image stays the picture, and the scene supplies the weather."""
     sensor: Sensor
@@ -181,6 +183,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         shows_first_hit=output.surface == "first",
         finds_boxes=finds_boxes,
         uses_recorded_exposure=exposure.runs,
+        uses_common_exposure=exposure.runs and recipe.render.exposure == "common",
         is_on_photo=recipe.render.is_on_recorded,
         sensor=recipe.camera,
         seed=recipe.seed,
@@ -254,6 +257,8 @@ def _exposure_step(recipe: Recipe, scene: Scene) -> Step:
     if recipe.render.exposure == "neutral":
         return Step(name, False, "render.exposure is 'neutral'")
     why = f"{len(names)} of {len(scene.camera_names)} cameras have one, applied after the weather"
+    if recipe.render.exposure == "common":
+        why += ", whose own colours look as by the mean of all maps"
     return Step(name, True, why)
 
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from augment import effects
 from augment.detail.prune import prune_parts
 from augment.effects.effect import LabelInputs, RenderedView
+from augment.light.common_exposure import added_colors
 from augment.output.layout import TRUST
 from augment.photo.own_car import own_car_mask
 from augment.photo.recorded_base import open_photo
@@ -118,6 +119,8 @@ def render_buffers(
         with timed("photo"):
             photo = open_photo(scene, camera, color_map, backend=backend)
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
+    if plan.uses_common_exposure:
+        layers = replace(layers, added_colors=added_colors(scene, camera))
     for effect in view.effects:
         layers = effect.hooks.edit_scene(effect, layers, camera)
     if plan.prune > 0:

@@ -20,7 +20,7 @@ linear light.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,7 @@ from augment.effects.falling import drop_kernels
 from augment.effects.falling.drop_kernels import CellWalk, Veil
 from augment.effects.falling.drops import Kind, Sizes, cell_counts, sizes_of
 from augment.effects.falling.shutter import STANDING, Motion
+from augment.light.common_exposure import AddedColors
 from augment.light.scene_light import find_scene_light
 from augment.light.srgb import display_from_linear
 from augment.memo import memo_of
@@ -127,6 +128,12 @@ def glow_of(scene: Scene) -> Glow:
         return Glow(light[is_above & (z < _HORIZON_SINE)].mean(0), light.mean(0), slope)
 
     return memo_of(scene).get(("light of precipitation",), compute)
+
+
+def _in_common_exposure(glow: Glow, added_colors: AddedColors) -> Glow:
+    """Return the light of drops as the common exposure of all cameras shows it."""
+    slope = added_colors.slope_of_light(glow.mean, glow.slope)
+    return Glow(added_colors.of_light(glow.airlight), added_colors.of_light(glow.mean), slope)
 
 
 def _in_fog(glow: Glow, fog: Fog | None, eye_z_m: float, extinction_per_m: float) -> Glow:
@@ -348,6 +355,7 @@ def draw_falling(
     fog: Fog | None = None,
     motion: Motion = STANDING,
     splats: Float[Tensor, "H W 3"] | None = None,
+    added_colors: AddedColors | None = None,
     backend: str = CPU,
 ) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
     """Return the picture behind the precipitation, and the mask of its drawn drops.
@@ -364,13 +372,19 @@ def draw_falling(
         fog: the fog in the air.
         motion: motion of the camera.
         splats: the surfaces' part of rgb; the other part is the sky's.
+        added_colors: map of the light of drops and veil; None to leave it.
         backend: on the CPU a kernel draws, equal to the definition in
             augment.effects.falling.reference within 1e-4, and `rgb` is overwritten.
     """
     surfaces = [t.detach().float().cpu().numpy() for t in (alpha, depth)]
     drops = find_drops(cell_walk(precipitation, camera, motion, scene.name))
     extinction = precipitation.sizes.extinction_per_m
-    glow = _in_fog(glow_of(scene), fog, float(camera.centre[2]), extinction)
+    glow = glow_of(scene)
+    if added_colors is not None:
+        glow = _in_common_exposure(glow, added_colors)
+        if precipitation.color is not None:
+            precipitation = replace(precipitation, color=added_colors.of_color(precipitation.color))
+    glow = _in_fog(glow, fog, float(camera.centre[2]), extinction)
     veil = veil_of(precipitation, camera, glow)
     if choose_kernels(backend, rgb, alpha, depth) != CPU:
         from augment.effects.falling.reference import blend_by_torch

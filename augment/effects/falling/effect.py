@@ -171,6 +171,7 @@ def _draw_over(
             fog=view.layers.fog,
             motion=motion_of(effect.scene, camera),
             splats=_surfaces_of(view),
+            added_colors=view.layers.added_colors,
             backend=effect.backend,
         )
     masks = {**view.masks, mask: drop_mask}

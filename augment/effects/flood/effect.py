@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -123,7 +124,10 @@ class FloodEffect(Effect):
     def draw(
         self, effect: EffectInScene, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
     ) -> RenderedView | None:
-        image = render_flooded(layers, camera, effect.settings, buffers)
+        medium: FloodMedium = effect.settings
+        if layers.added_colors is not None:
+            medium = replace(medium, rgb=layers.added_colors.of_color(medium.rgb))
+        image = render_flooded(layers, camera, medium, buffers)
         if image is None:
             return None
         why = "what stands before the water hides all of it"

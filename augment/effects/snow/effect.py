@@ -167,6 +167,9 @@ class SnowEffect(Effect):
             parts = effect.prepared_data.parts_for(
                 effect.scene, camera, layers.parts, effect.view_data, backend=effect.backend
             )
+            if layers.added_colors is not None:
+                in_exposure = layers.added_colors.of_part
+                parts = tuple(in_exposure(part) if part.is_overlay else part for part in parts)
         return replace(layers, parts=parts)
 
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:

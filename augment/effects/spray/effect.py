@@ -107,6 +107,9 @@ class SprayEffect(Effect):
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         raster = view.raster
         assert raster.alpha is not None and raster.expected_depth is not None
+        light = glow_of(effect.lit_scene).mean
+        if view.layers.added_colors is not None:
+            light = view.layers.added_colors.of_light(light)
         with timed(SPRAY):
             rgb = blend_puffs(
                 view.rgb,
@@ -114,7 +117,7 @@ class SprayEffect(Effect):
                 raster.expected_depth,
                 camera,
                 effect.view_data,
-                glow_of(effect.lit_scene).mean,
+                light,
                 fog=view.layers.fog,
                 backend=effect.backend,
             )
