@@ -92,7 +92,7 @@ def water_area(buffers):
         (
             water_area,
             {"flood": Flood(level_m=0.5, absorption_per_m=(90, 90, 90), refraction_index=1.0)},
-            0.2 * GREY_LEVEL,
+            2 * GREY_LEVEL,
         ),
     ],
 )
