@@ -47,6 +47,8 @@ class Snow(EffectModel):
         ("sun_azimuth_deg", "azimuth azimuth_deg"),
         ("sun_elevation_deg", "elevation elevation_deg"),
         ("drift", "drifts"),
+        ("dirt", "dirty soot grit"),
+        ("traffic", "cars slush"),
     )
     knobs = (
         Knob("cell_m", (0.2, 0.1, 0.05), "size of the snow's splats near the path", 2),
@@ -72,6 +74,8 @@ class Snow(EffectModel):
         ),
     )
 
+    later_fields = ("dirt", "traffic")
+
     depth_m: Number = Field(ge=0, le=10)
     """Depth of the layer on level ground."""
     coverage: Unit = 1.0
@@ -96,11 +100,21 @@ class Snow(EffectModel):
     """Size of the splats near the path; they grow with the distance from it."""
     seed: Whole | None = Field(default=None, ge=0, lt=2**63)
     """What drifts, patches and grain are drawn from; null for the recipe's seed."""
+    dirt: Unit = 0.0
+    """Soot and grit in the snow on and beside roads: 0 clean, 1 the grey-brown of old city snow."""
+    traffic: Unit = 0.0
+    """Cars that have driven since it snowed, in all lanes: 0 none but those of the scene, 0.3 some
+    grey tracks, 0.6 bare wet tracks with slush between them, 1 a busy road."""
 
     @property
     def has_effect(self) -> bool:
         """Return False for snow without depth or coverage, which changes nothing."""
         return self.depth_m > 0 and self.coverage > 0
+
+    @property
+    def has_traces(self) -> bool:
+        """Return True if dirt or traffic change the snow on roads."""
+        return self.dirt > 0 or self.traffic > 0
 
     def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:
         return (

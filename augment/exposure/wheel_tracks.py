@@ -172,14 +172,28 @@ def _ground_below(gaussians: Gaussians, positions: np.ndarray) -> float:
     return float(np.median(gaps)) if gaps else 0.0
 
 
-def _wheel_lines(path: WheelPath) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lines of the left and of the right wheels."""
-    points = path.points_m
+def parallel_path(path: WheelPath, offset_m: float) -> WheelPath:
+    """Return the path beside a path, at its height.
+
+    Args:
+        path: the path, of two or more points.
+        offset_m: distance to the left, metres; negative to the right.
+    """
+    return WheelPath(path.points_m + offset_m * _left_of(path.points_m), path.width_m)
+
+
+def _left_of(points: np.ndarray) -> np.ndarray:
+    """Return the level unit vectors to the left of a line, [P, 3]."""
     directions = np.gradient(points[:, :2], axis=0)
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
-    offsets = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(points))], -1)
+    return np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(points))], -1)
+
+
+def _wheel_lines(path: WheelPath) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lines of the left and of the right wheels."""
+    offsets = _left_of(path.points_m)
     offsets *= WHEEL_OFFSET_SHARE * path.width_m
-    return points + offsets, points - offsets
+    return path.points_m + offsets, path.points_m - offsets
 
 
 def _clip_line(line: np.ndarray, low: np.ndarray, high: np.ndarray) -> Sequence[np.ndarray]:

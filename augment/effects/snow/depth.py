@@ -126,6 +126,7 @@ def make_depth_profile(
     has_tracks = snow.tracks == "always" or (
         snow.tracks == "auto" and snow.depth_m <= MAX_AUTO_TRACKS_DEPTH_M
     )
+    has_tracks &= snow.traffic == 0  # `slush` then presses the tracks of many cars
     floor_z_m = -1e30
     if water_level_z_m is not None and on_ground:
         floor_z_m = water_level_z_m + layer_kernels.WATER_MARGIN_M

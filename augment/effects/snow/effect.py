@@ -35,6 +35,7 @@ from augment.effects.snow.part_snow import PartSnow, SnowLayers
 from augment.effects.snow.plan import SnowPlan, exposure_settings, naming_cell_field
 from augment.effects.snow.relief import Carrier, add_grain
 from augment.effects.snow.snowy_boxes import count_snow_pixels, extend_boxes_by_snow
+from augment.effects.snow.wet_tracks import wet_tracks
 from augment.exposure.exposed_surface import exposed_surface_of, share_exposed_surface
 from augment.light.cast_shadows import precompute_shadows
 from augment.memo import memo_of
@@ -54,6 +55,7 @@ from recipes.snow import Snow
 # Labels of the passes, in plans and timings.
 LAYER_PASS, LIGHT_PASS = PASSES = ("snow: exposed surface and layer", "snow: light per pixel")
 GRAIN_PASS = "snow: grain"
+WET_PASS = "snow: wet tracks"
 MIN_MASK_SHARE = 0.5  # least share of snow in a pixel of the mask
 _CHUNK_M = 8.0  # side of the squares in which snow is bounded
 _BOX_MARGIN_M = 0.3  # distance from a vehicle's box within which snow still lies on it
@@ -99,7 +101,7 @@ class SnowEffect(Effect):
                 reason = f"the snow has no {missing_field}, so it changes nothing"
             steps = (
                 *skipped_steps(PASSES, reason, SCENE),
-                Step(GRAIN_PASS, False, reason, PICTURE),
+                *skipped_steps((WET_PASS, GRAIN_PASS), reason, PICTURE),
             )
             return EffectPlan(None, steps)
         check_metric_and_level(scene)
@@ -112,15 +114,23 @@ class SnowEffect(Effect):
         level_z_m = next((level for level in levels if level is not None), None)
         if level_z_m is not None:
             reason += f"; none below the water's level, z = {level_z_m:.2f} m"
+        has_wet_ground = recipe.weather.rain is not None and recipe.weather.rain.ground_wetness > 0
+        has_wet_tracks = snow.traffic > 0 and not has_wet_ground
+        wet_reason = f"traffic is {snow.traffic:g}"
+        if has_wet_ground:
+            wet_reason = "weather.rain wets the road already"
         shading = f"shading is {snow.shading!r}"
         steps = (
             Step(LAYER_PASS, True, reason, SCENE),
             Step(LIGHT_PASS, snow.shading == "per_pixel", shading, SCENE),
+            Step(WET_PASS, has_wet_tracks, wet_reason, PICTURE),
             Step(GRAIN_PASS, snow.grain > 0, f"grain is {snow.grain:g}", PICTURE),
         )
         seed = recipe.seed if snow.seed is None else snow.seed
-        buffers = {OVERLAY, EXPECTED_DEPTH} if snow.grain > 0 else {OVERLAY}
-        return EffectPlan(SnowPlan(snow, seed, level_z_m), steps, frozenset(buffers))
+        needs_depth = snow.grain > 0 or has_wet_tracks
+        buffers = {OVERLAY, EXPECTED_DEPTH} if needs_depth else {OVERLAY}
+        plan = SnowPlan(snow, seed, level_z_m, has_wet_ground)
+        return EffectPlan(plan, steps, frozenset(buffers))
 
     def prepare(self, effect: EffectInScene) -> SnowLayers:
         return build_snow_layers(
@@ -151,7 +161,7 @@ class SnowEffect(Effect):
         owners = find_visible_owners(boxes, query.world_from_parts, query.cameras, query.near_m)
         if not owners:
             why = "neither snow nor what it buries can be in view"
-            return Visibility(False, dict.fromkeys((*PASSES, GRAIN_PASS), why))
+            return Visibility(False, dict.fromkeys((*PASSES, WET_PASS, GRAIN_PASS), why))
         is_lit_per_pixel = any(_is_lit_per_pixel(layers.layer_on(effect.scene, n)) for n in owners)
         why = (
             {} if is_lit_per_pixel else {LIGHT_PASS: "no snow that is lit per pixel can be in view"}
@@ -175,6 +185,8 @@ class SnowEffect(Effect):
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         snow = view.raster.overlay
         depth = view.raster.expected_depth
+        if not camera.is_orthographic and not effect.settings.has_wet_ground:
+            view = _wet_tracks(effect, view, camera)
         if (
             effect.settings.snow.grain == 0
             or camera.is_orthographic
@@ -219,6 +231,28 @@ class SnowEffect(Effect):
 
     def intersect_beams(self, effect: EffectInScene, echoes: Echoes, frame_ns: int) -> None:
         intersect_snow(echoes, effect.scene, effect.settings, echoes.source, frame_ns)
+
+
+def _wet_tracks(effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
+    """Return the view with the bare road in the tracks of traffic wet."""
+    wet_road = effect.prepared_data.wet_road
+    raster = view.raster
+    if wet_road is None or raster.alpha is None or raster.expected_depth is None:
+        return view
+    with timed(WET_PASS):
+        share = raster.alpha if raster.overlay is None else raster.alpha - raster.overlay
+        for mask in view.masks.values():
+            share = torch.where(mask, 0.0, share)
+        rgb = wet_tracks(
+            view.rgb,
+            raster.expected_depth,
+            share,
+            camera,
+            wet_road,
+            scene=effect.lit_scene,
+            fog=view.layers.fog,
+        )
+    return replace(view, rgb=rgb)
 
 
 def _find_carriers(snow_effect: EffectInScene, camera: Camera) -> list[Carrier]:

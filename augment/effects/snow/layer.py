@@ -27,8 +27,12 @@ from augment.effects.snow.glints import draw_crystals
 from augment.effects.snow.layer_kernels import CellDepths, SplatArrays
 from augment.effects.snow.light import SnowIllumination
 from augment.effects.snow.part_snow import PartSnow, SnowLayers
+from augment.effects.snow.plan import SnowPlan
 from augment.effects.snow.relief import Grain
+from augment.effects.snow.slush import RoadSnow, road_snow
+from augment.effects.snow.wet_tracks import make_wet_road
 from augment.exposure.cells import ExposedCells, ExposedSurface
+from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene.scene import Gaussians, Scene
@@ -76,21 +80,38 @@ def lay_snow(
             on actors stays. None without water.
     """
 
-    def layer_of(cells: ExposedCells, gaussians: Gaussians, track_id: str | None) -> PartSnow:
-        """Return the layer on one part; track_id: None for the background."""
+    plan = SnowPlan(snow, seed, water_level_z_m)
+
+    def layer_of(
+        cells: ExposedCells, gaussians: Gaussians, track_id: str | None
+    ) -> tuple[PartSnow, RoadSnow | None]:
+        """Return the layer on one part, and the traces on it; track_id: None for the background."""
         profile, rng = profile_on_part(track_id, scene, snow, seed, water_level_z_m)
-        return _build_part_layer(
-            cells, gaussians, snow, light, profile, rng, moves=track_id is not None
+        splat_seed = rng.integers(0, 2**64, dtype=np.uint64)
+        depths = find_depths(cells, profile, splat_seed)
+        traces = road_snow(depths, cells, scene, plan) if track_id is None else None
+        depths = depths if traces is None else traces.depths
+        tints = None if traces is None else traces.tints
+        moves = track_id is not None
+        part = _build_part_layer(
+            cells, gaussians, snow, light, profile, rng, depths, tints, moves=moves
         )
+        return part, traces
 
     actors = {actor.track_id: actor.gaussians for actor in scene.actors}
-    ground = layer_of(exposed_surface.ground, scene.background, None)
+    ground, traces = layer_of(exposed_surface.ground, scene.background, None)
     actor_layers = {
-        name: layer_of(cells, actors[name], name) for name, cells in exposed_surface.actors.items()
+        name: layer_of(cells, actors[name], name)[0]
+        for name, cells in exposed_surface.actors.items()
     }
-    grain = _grain_of_snow(snow, scene, light, seed)
     return SnowLayers(
-        ground, actor_layers, light.sun, light.wrap, thickness_m=snow.depth_m, grain=grain
+        ground,
+        actor_layers,
+        light.sun,
+        light.wrap,
+        thickness_m=snow.depth_m,
+        grain=_grain_of_snow(snow, scene, light, seed),
+        wet_road=traces and make_wet_road(exposed_surface.ground, traces.wetness),
     )
 
 
@@ -110,10 +131,12 @@ def _build_part_layer(
     light: SnowIllumination,
     profile: DepthProfile,
     rng: np.random.Generator,
+    depths: CellDepths,
+    tints: np.ndarray | None,
     *,
     moves: bool,
 ) -> PartSnow:
-    """Lay snow on one part of the scene."""
+    """Lay snow of known depths and tints (None for clean snow) on one part of the scene."""
     per_pixel = snow.shading == "per_pixel"
     colors = LayerColors(
         wrap=float(light.wrap),
@@ -122,14 +145,13 @@ def _build_part_layer(
         is_baked=not per_pixel and not moves,
     )
     lights = np.array([light.sun, light.lit_rgb, light.shadow_rgb], np.float64)
-    seed = rng.integers(0, 2**64, dtype=np.uint64)
-    depths = find_depths(cells, profile, seed)
     snow_gaussians, normals, slopes = _make_splats(
         cells,
         depths,
         profile.settings.depth_m,
         lights,
         colors,
+        tints,
         keep_normals=snow.sparkle > 0 or (moves and not per_pixel),
         keep_slopes=per_pixel or moves,
     )
@@ -153,6 +175,7 @@ def _make_splats(
     depth_m: float,
     lights: np.ndarray,
     colors: LayerColors,
+    tints: np.ndarray | None,
     *,
     keep_normals: bool,
     keep_slopes: bool,
@@ -178,10 +201,19 @@ def _make_splats(
         layer_kernels.fill_splats(
             arrays, depths, tops, end_offsets - counts, lights, colors, splats
         )
+    if tints is not None:
+        _tint_splats(splats, np.repeat(tints, counts, axis=0))
     opacities = torch.full((num_splats,), OPACITY)
     classes = torch.full((num_splats,), int(SemanticClass.SNOW), dtype=torch.int16)
     gaussians = Gaussians(means, quats, scales, opacities, sh, semantic=classes)
     return gaussians, normals if keep_normals else None, slopes if keep_slopes else None
+
+
+def _tint_splats(splats: SplatArrays, tints: np.ndarray) -> None:
+    """Multiply the display-encoded colours of S Gaussians by factors [S, 3], in place."""
+    splats.sh[:, 0] = (tints * (0.5 + SH_C0 * splats.sh[:, 0]) - 0.5) / np.float32(SH_C0)
+    if len(splats.slopes):
+        splats.slopes[:] *= tints
 
 
 def find_snow_tops(cells: ExposedCells, depths_m: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from augment.effects.lidar.codes import MOVED
 from augment.effects.snow import layer_kernels
 from augment.effects.snow.depth import find_depths, profile_on_part
 from augment.effects.snow.plan import SnowPlan, exposure_settings, naming_cell_field
+from augment.effects.snow.slush import road_snow
 from augment.exposure.cells import ExposedCells, ExposedSurface
 from augment.exposure.exposed_surface import exposed_surface_of
 from augment.memo import memo_of
@@ -210,7 +211,10 @@ def _build_grids(exposed_surface: ExposedSurface, scene: Scene, recipe_snow: Sno
         profile, rng = profile_on_part(track_id, scene, *snow_settings)
         seed = rng.integers(0, 2**64, dtype=np.uint64)
         grid_m = GRID_M if track_id is None else min(GRID_M, recipe_snow.snow.cell_m)
-        return make_snow_grid(cells, find_depths(cells, profile, seed).depths_m, grid_m=grid_m)
+        depths = find_depths(cells, profile, seed)
+        traces = road_snow(depths, cells, scene, recipe_snow) if track_id is None else None
+        depths = depths if traces is None else traces.depths
+        return make_snow_grid(cells, depths.depths_m, grid_m=grid_m)
 
     actors = {
         track_id: layer(cells, track_id) for track_id, cells in exposed_surface.actors.items()

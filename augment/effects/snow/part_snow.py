@@ -17,6 +17,7 @@ from torch import Tensor
 
 from augment.effects.snow.glints import Crystals
 from augment.effects.snow.relief import Grain
+from augment.effects.snow.wet_tracks import WetRoad
 from augment.memo import memo_of
 from augment.render.buffers import AUTO, CUDA
 from augment.render.cuda import runtime as gpu
@@ -51,6 +52,7 @@ class SnowLayers:
     wrap: float  # how far light reaches around, see SplatShading, for layers with slopes
     thickness_m: float  # depth of the snow on level ground
     grain: Grain  # how the snow looks from close by
+    wet_road: WetRoad | None = None  # bare wet road in the tracks of traffic; None without any
 
     def layer_on(self, scene: Scene, instance_id: int) -> PartSnow | None:
         """Return the snow on the background (0) or an actor (1 + its index), or None."""

@@ -22,6 +22,8 @@ class SnowPlan:
     seed: int  # seed of the drifts
     # Height of the flood that melts the snow it reaches, world; None without a flood.
     water_level_z_m: float | None = None
+    # True if rain wets the ground, so that the bare road in tracks is wet already.
+    has_wet_ground: bool = False
 
 
 def exposure_settings(snow: Snow, scene: Scene) -> ExposureSettings:

@@ -1,0 +1,218 @@
+"""Wet road in the tracks of traffic, on the finished picture: darker, with a sheen of the sky.
+
+Input: a picture, its depth, and a `WetRoad`, a map of the bare road's wetness that `layer` makes
+from the cells. Caller: `effect`. It is drawn pixel by pixel, so that recorded images get it too.
+
+Darkening is that of wet ground (`augment.effects.wet.darkening`). The sheen is Schlick's
+reflectance, averaged over the slopes of rough ground (Bruneton et al. 2010, "Real-time realistic
+ocean lighting", equation 18), times the sky in the mirrored direction. Towards the horizon, houses
+stand before the sky, and the colour of the ground takes its place. Cars and houses themselves are
+not mirrored: a recipe with `weather.rain.wetness` draws them, and this pass then does nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from augment.effects.falling.air import UNKNOWN_AIRLIGHT
+from augment.effects.snow.traffic import paint_cells
+from augment.effects.wet.darkening import to_display, to_linear, wet_ratio, white_level
+from augment.exposure.cells import ExposedCells
+from augment.light.scene_light import find_scene_light
+from augment.render.fog import Fog, airlight_gain, optical_depth
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
+from augment.scene.sky import is_unknown_sky
+
+GRID_M = 0.1  # side of a cell of the map
+_BLOCK = 128  # cells on a side of a block of the map
+_MAX_DISTANCE_M = 90.0  # distance beyond which tracks are left as they are
+_MAX_HEIGHT_M = 0.2  # height over or under the road within which a pixel shows it
+_MIN_SHARE = 0.02  # least share of a pixel that the road must have
+_MIN_TRANSMITTANCE = 0.05  # least transmittance of fog at which the road has a known colour
+_SLOPE = 0.12  # standard deviation of the wet road's slopes
+# Share of the wet road that is a film smooth enough to shine; the other part is damp grit.
+_FILM_SHARE = 0.2
+_WATER_FACING = 0.02  # reflectance of water that is seen from straight above
+# Mirrored elevation from which on all of the sheen is the sky's, degrees.
+_FULL_SKY_DEG = 14.0
+
+
+@dataclass(frozen=True, eq=False)
+class WetRoad:
+    """Map of the wetness of bare road in tracks, in B square blocks of n cells a side."""
+
+    corner: tuple[float, float]
+    """x and y of the first block's corner, world."""
+    block_ids: Int64[Tensor, "Y X"]
+    """Number of the block at each place, -1 where none is."""
+    wetness: Float[Tensor, "B n n"]
+    """Wetness, 0 to 1; rows go along y."""
+    height_m: Float[Tensor, "B n n"]
+    """Height of the road, world z."""
+
+    def sample(self, points_m: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """Return the wetness at points near the road; 0 elsewhere."""
+        ids, heights, wetness = (
+            t.to(points_m.device) for t in (self.block_ids, self.height_m, self.wetness)
+        )
+        place = (points_m[:, :2] - points_m.new_tensor(self.corner)) / GRID_M
+        cell = place.floor().long()
+        last = torch.tensor(ids.shape[::-1], device=ids.device) * _BLOCK - 1
+        is_inside = ((cell >= 0) & (cell <= last)).all(1)
+        cell = torch.minimum(cell.clamp_min(0), last)
+        block = ids[cell[:, 1] // _BLOCK, cell[:, 0] // _BLOCK]
+        inner = cell % _BLOCK
+        where = (block.clamp_min(0), inner[:, 1], inner[:, 0])
+        is_on_road = (points_m[:, 2] - heights[where]).abs() < _MAX_HEIGHT_M
+        return torch.where(is_inside & (block >= 0) & is_on_road, wetness[where], 0.0)
+
+
+def make_wet_road(cells: ExposedCells, wetness: np.ndarray) -> WetRoad | None:
+    """Return the map of wet road; None where no cell is wet.
+
+    The map reaches a little under the snow beside the tracks, whose edges it leaves to the snow.
+
+    Args:
+        cells: cells of the ground.
+        wetness: wetness of each cell, [C].
+    """
+    rows = np.flatnonzero(wetness > 0)
+    if not len(rows):
+        return None
+    centers = cells.centers_m.numpy()[rows].astype(np.float64)
+    sizes = cells.sizes_m.numpy()[rows].astype(np.float64)
+    values = wetness[rows]
+    side_m = _BLOCK * GRID_M
+    low = np.floor((centers[:, :2].min(0) - 1) / side_m) * side_m
+    num_columns, num_rows = np.ceil((centers[:, :2].max(0) + 1 - low) / side_m).astype(int)
+    block_ids = np.full((num_rows, num_columns), -1, np.int64)
+    maps = list[np.ndarray]()
+    heights = list[np.ndarray]()
+    margin = 4
+    shape = (_BLOCK + 2 * margin,) * 2
+    for row in range(num_rows):
+        for column in range(num_columns):
+            corner = low + np.array([column, row]) * side_m - margin * GRID_M
+            reach = sizes[:, None]
+            local = centers[:, :2] - corner
+            near = ((local > -reach) & (local < shape[0] * GRID_M + reach)).all(1)
+            if not near.any():
+                continue
+            mask = paint_cells(centers[near, :2], sizes[near], corner, GRID_M, shape)
+            at = np.clip((local[near] / GRID_M).astype(int), 0, shape[0] - 1)
+            known = np.zeros(shape, np.float32)
+            height = np.zeros(shape, np.float32)
+            wet = np.zeros(shape, np.float32)
+            known[at[:, 1], at[:, 0]] = 1
+            height[at[:, 1], at[:, 0]] = centers[near, 2]
+            wet[at[:, 1], at[:, 0]] = values[near]
+            weight = np.maximum(cv2.blur(known, (9, 9)), 1e-6)
+            spread = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
+            wet = spread * cv2.blur(wet, (9, 9)) / weight
+            height = cv2.blur(height, (9, 9)) / weight
+            inner = (slice(margin, -margin), slice(margin, -margin))
+            block_ids[row, column] = len(maps)
+            maps.append(np.clip(wet, 0, 1)[inner])
+            heights.append(height[inner])
+    return WetRoad(
+        (float(low[0]), float(low[1])),
+        torch.from_numpy(block_ids),
+        torch.from_numpy(np.stack(maps).astype(np.float32)),
+        torch.from_numpy(np.stack(heights).astype(np.float32)),
+    )
+
+
+def wet_tracks(
+    rgb: Float[Tensor, "H W 3"],
+    depth: Float[Tensor, "H W"],
+    share: Float[Tensor, "H W"],
+    camera: Camera,
+    wet_road: WetRoad,
+    *,
+    scene: Scene,
+    fog: Fog | None = None,
+) -> Float[Tensor, "H W 3"]:
+    """Return the picture with the bare road in tracks wet.
+
+    Args:
+        rgb: the picture, display-encoded.
+        depth: z of the surfaces, metres.
+        share: share of each pixel that shows the scene's surface without snow, 0 to 1.
+        camera: camera of the picture.
+        wet_road: map of the wet road.
+        scene: scene that gives the light.
+        fog: the fog before the road.
+    """
+    rows = _road_pixels(depth, share, camera)
+    if not len(rows):
+        return rgb
+    flat = rgb.reshape(-1, 3)
+    rays = camera.ray_directions(device=rgb.device).reshape(-1, 3)[rows]
+    offsets_m = rays * depth.reshape(-1)[rows, None]
+    wetness = wet_road.sample(offsets_m + camera.centre.to(offsets_m)) * share.reshape(-1)[rows]
+    chosen = torch.nonzero(wetness > _MIN_SHARE)[:, 0]
+    if not len(chosen):
+        return rgb
+    rows = rows[chosen]
+    wetness = wetness[chosen]
+    offsets_m = offsets_m[chosen]
+    directions = offsets_m / offsets_m.norm(dim=1, keepdim=True)
+    clear = flat[rows]
+    transmittance = torch.ones_like(wetness)
+    airlight = torch.zeros_like(clear)
+    if fog is not None:
+        eye_z_m = float(camera.centre[2])
+        tau = optical_depth(fog, offsets_m.norm(dim=1), eye_z_m, eye_z_m + offsets_m[:, 2])
+        transmittance = torch.exp(-tau)
+        airlight = airlight + airlight.new_tensor(fog.airlight_rgb)
+        if fog.elevation_gain > 0:
+            airlight = airlight + airlight_gain(fog, directions[:, 2])
+        clear = (clear - (1 - transmittance)[:, None] * airlight) / transmittance.clamp_min(
+            _MIN_TRANSMITTANCE
+        )[:, None]
+    clear = clear.clamp_min(0)
+    light = find_scene_light(scene)
+    dark = to_linear(clear * wet_ratio(clear, white_level(light), 1.0))
+    shine = (rough_reflectance(-directions[:, 2]))[:, None]
+    mirrored = directions * directions.new_tensor([1.0, 1.0, -1.0])
+    wet = to_display((1 - shine) * dark + shine * _mirrored_light(scene, mirrored))
+    out = flat.clone()
+    out[rows] += (wetness * transmittance)[:, None] * (wet - clear)
+    return out.reshape(rgb.shape)
+
+
+def rough_reflectance(cosine: Float[Tensor, "*B"]) -> Float[Tensor, "*B"]:
+    """Return the mean reflectance of wet, rough ground, by the cosine of the angle of incidence."""
+    exponent = 5 * math.exp(-2.69 * _SLOPE)
+    rough = (1 - cosine).clamp(0, 1) ** exponent / (1 + 22.7 * _SLOPE**1.5)
+    return _FILM_SHARE * (_WATER_FACING + (1 - _WATER_FACING) * rough)
+
+
+def _road_pixels(
+    depth: Float[Tensor, "H W"], share: Float[Tensor, "H W"], camera: Camera
+) -> Int64[Tensor, " N"]:
+    """Return the flat indices of pixels that may show a road nearby."""
+    fall = -camera.ray_directions(device=depth.device)[..., 2]
+    is_road: Bool[Tensor, "H W"] = (share > _MIN_SHARE) & (depth > 0) & (fall > 0)
+    return torch.nonzero((is_road & (depth < _MAX_DISTANCE_M)).reshape(-1))[:, 0]
+
+
+def _mirrored_light(scene: Scene, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Return the linear light that wet ground mirrors from directions above the horizon."""
+    light = find_scene_light(scene)
+    ground = directions.new_tensor(light.ground_rgb_linear)
+    if is_unknown_sky(scene.sky):
+        sky = directions.new_tensor(UNKNOWN_AIRLIGHT).expand_as(directions)
+    else:
+        sky = scene.sky.sample(directions)
+    share = (directions[:, 2] / math.sin(math.radians(_FULL_SKY_DEG))).clamp(0, 1)
+    share = (share * share * (3 - 2 * share))[:, None]
+    return ground + share * (to_linear(sky.clamp(0, 1)) - ground)
