@@ -125,8 +125,8 @@ def find_road_wear(
     count = len(cells)
     zeros = np.zeros(count, np.float32)
     wear = RoadWear(is_road, zeros, zeros.copy(), zeros.copy(), np.full_like(zeros, -_MAX_KERB_M))
-    for rows, corner in _blocks(centers[:, :2], sizes, is_road):
-        _fill_block(rows, corner, centers, sizes, points, wear)
+    for rows, road_rows, corner in _blocks(centers[:, :2], sizes, is_road):
+        _fill_block(rows, road_rows, corner, centers, sizes, points, wear)
     return wear
 
 
@@ -301,23 +301,33 @@ def _normals(points: np.ndarray) -> np.ndarray:
 
 def _blocks(
     centers_xy: np.ndarray, sizes: np.ndarray, is_road: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the rows of cells in each block that has road nearby, and the block's corner [2]."""
-    columns = np.floor(centers_xy / _BLOCK_M).astype(np.int64)
-    keys, inverse = np.unique(columns, axis=0, return_inverse=True)
-    order = np.argsort(inverse.reshape(-1), kind="stable")
-    ends = np.cumsum(np.bincount(inverse.reshape(-1), minlength=len(keys)))
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield the blocks that have road in them or in their margin.
+
+    Yields:
+        Rows of the cells in the block, rows of the cells of road in it and its margin, and the
+        corner [2] of the block with its margin.
+    """
+    keys, inverse = np.unique(
+        np.floor(centers_xy / _BLOCK_M).astype(np.int64), axis=0, return_inverse=True
+    )
+    inverse = inverse.reshape(-1)
+    order = np.argsort(inverse, kind="stable")
+    ends = np.cumsum(np.bincount(inverse, minlength=len(keys)))
+    road_rows = np.flatnonzero(is_road)
+    road_xy = centers_xy[road_rows]
+    reach = sizes[road_rows, None]
     for key, rows in zip(keys, np.split(order, ends[:-1]), strict=True):
         corner = key * _BLOCK_M - _MARGIN_M
         far = corner + _BLOCK_M + 2 * _MARGIN_M
-        reach = sizes[is_road, None]
-        road_xy = centers_xy[is_road]
-        if ((road_xy > corner - reach) & (road_xy < far + reach)).all(1).any():
-            yield rows, corner
+        nearby = road_rows[((road_xy > corner - reach) & (road_xy < far + reach)).all(1)]
+        if len(nearby):
+            yield rows, nearby, corner
 
 
 def _fill_block(
     rows: np.ndarray,
+    road_rows: np.ndarray,
     corner: np.ndarray,
     centers: np.ndarray,
     sizes: np.ndarray,
@@ -327,9 +337,8 @@ def _fill_block(
     """Write the traces on the cells of one block into `wear`."""
     side = round((_BLOCK_M + 2 * _MARGIN_M) / GRID_M)
     shape = (side, side)
-    road = paint_cells(
-        centers[wear.is_road, :2], sizes[wear.is_road], corner, GRID_M, shape
-    ).astype(np.uint8)
+    road_xy = centers[road_rows, :2]
+    road = paint_cells(road_xy, sizes[road_rows], corner, GRID_M, shape).astype(np.uint8)
     kernel = np.ones((round(_CLOSING_M / GRID_M) | 1,) * 2, np.uint8)
     road = cv2.morphologyEx(road, cv2.MORPH_CLOSE, kernel)
     inwards, outwards = (
