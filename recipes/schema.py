@@ -191,9 +191,9 @@ class Render(Section):
     sh_degree: Whole | None = Field(default=None, ge=0, le=3)
     """Highest spherical-harmonics band; null for all."""
     exposure: Literal["common", "recorded", "neutral"] = "common"
-    """recorded gives each camera's picture the colours of its recording, fog included, where the
-    scene knows them; common gives fog one colour in all cameras, by the mean of their exposures;
-    neutral leaves the scene's own colours."""
+    """recorded gives each camera's picture the colours of its recording, the weather's own colours
+    (fog, snow, rain, spray, water) included, where the scene knows them; common gives those one
+    look in all cameras, by the mean of their exposures; neutral leaves the scene's own colours."""
     speed: Speed = Speed()
 
     @property

@@ -26,7 +26,7 @@ STRONG = {
     "style": {"style": {"preset": "dusk"}},
     "wet": {"weather": {"rain": {"rate_mm_h": 20.0, "spray": False}}},
     "smog": {"weather": {"smog": {"visibility_m": 60.0}}},
-    "snow": {"weather": {"snow": {"depth_m": 0.1, "cell_m": 0.2}}},
+    "snow": {"weather": {"snow": {"depth_m": 0.1, "cell_m": 0.2, "traffic": 0.9, "dirt": 0.7}}},
     "flood": {"weather": {"flood": {"level_m": 0.2}}},
     "spray": {"weather": {"rain": {"rate_mm_h": 50.0, "spray": True}}},
     "rain": {"weather": {"rain": DOWNPOUR}},

@@ -421,7 +421,8 @@ def test_the_presets_are_there() -> None:
     assert preset_names() == (
         *("blizzard", "brown-smog", "clear", "deep-flood", "deep-snow", "dense-fog", "downpour"),
         *("drizzle", "dusting", "evening", "flurries", "fresh-snow", "light-haze", "overcast"),
-        *("puddled", "rain", "snowfall", "storm", "street-flood", "winter-day", "winter-fog"),
+        *("puddled", "rain", "slush", "snowfall", "storm", "street-flood", "winter-day"),
+        *("winter-fog", "winter-street"),
     )
     for name in preset_names():
         template = load_recipe(name)

@@ -45,11 +45,13 @@ PRESETS = {
     "overcast": "5f097c152a748005",
     "puddled": "bc75e7b5574e727a",
     "rain": "62dc7be361876ebd",
+    "slush": "3d860d8dae84e1db",
     "snowfall": "bdde9b144ab6c6bd",
     "storm": "b93e206ac51504d1",
     "street-flood": "57bcd16a1256403d",
     "winter-day": "dc738d7355359818",
     "winter-fog": "ff7064f7dbe9767b",
+    "winter-street": "6c8f8fad8d6e2027",
 }
 
 

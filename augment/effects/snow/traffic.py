@@ -36,13 +36,14 @@ NUM_SIDE_LANES = 3  # largest number of parallel lanes on each side of the ego's
 MIN_CARS = 2  # number of cars in a lane at the least traffic
 MAX_CARS = 40  # number of cars in a lane at a traffic of 1
 _EXTENSION_M = 30.0  # length by which lanes go straight on at both ends
-_STEP_M = 0.1  # distance of points along a wheel's line
+STEP_M = 0.05  # distance of points along a wheel's line
 _SMOOTHING_M = 1.5  # standard deviation of the blur along a path: labelled boxes jitter
 _SAME_LANE_M = 1.2  # distance of paths that share a lane
 _LANE_GAP_M = 1.9  # least distance of a parallel lane from the path of a vehicle
 _LANE_HALF_WIDTH_M = 0.95  # distance from a lane's middle at which there must be road
 _ROAD_REACH_M = 0.5  # largest distance of a cell of road from a point that counts as road
 _ROAD_WINDOW_M = 12.0  # length of the stretch over which the share of road is taken
+_RECORDED_WINDOW_M = 3.0  # the same for a path that a vehicle has taken
 _MIN_ROAD_SHARE = 0.55  # shares of road between which a lane begins
 _FULL_ROAD_SHARE = 0.8
 _OFFSET_M = 0.15  # standard deviation of a car's distance from the lane's middle
@@ -97,7 +98,7 @@ class _Lane(NamedTuple):
     is_recorded: bool  # False for a parallel lane
 
 
-class _WheelPoints(NamedTuple):
+class WheelPoints(NamedTuple):
     """Points under the wheels of cars."""
 
     xy_m: np.ndarray  # float64 [N, 2]
@@ -195,7 +196,8 @@ def _lane_on_road(path: WheelPath, share: np.ndarray, road: KDTree, *, is_record
             for points in (extended[:, :2], left, right)
         ]
     )
-    road_share = _smooth_share(is_road.mean(0), _ROAD_WINDOW_M)
+    window_m = _RECORDED_WINDOW_M if is_recorded else _ROAD_WINDOW_M
+    road_share = _smooth_share(is_road.mean(0), window_m)
     on_road = (road_share - _MIN_ROAD_SHARE) / (_FULL_ROAD_SHARE - _MIN_ROAD_SHARE)
     return _Lane(extended, path.width_m, extended_share * np.clip(on_road, 0, 1), is_recorded)
 
@@ -217,13 +219,15 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _smoothed(points: np.ndarray) -> np.ndarray:
-    """Return a path without the jitter of its points, [P, 3]; its ends stay."""
+    """Return a path in steps of about a metre and without jitter, [P, 3]; its ends stay."""
     lengths = _arc_length(points)
-    weights = np.exp(-0.5 * ((lengths[:, None] - lengths) / _SMOOTHING_M) ** 2)
+    along_m = np.linspace(0.0, lengths[-1], max(2, math.ceil(lengths[-1]) + 1))
+    even = np.stack([np.interp(along_m, lengths, points[:, k]) for k in range(3)], 1)
+    weights = np.exp(-0.5 * ((along_m[:, None] - along_m) / _SMOOTHING_M) ** 2)
     # Near its ends a path is averaged over as much before a point as behind it.
-    to_end = np.minimum(lengths, lengths[-1] - lengths)
-    weights *= np.abs(lengths[:, None] - lengths) <= to_end[:, None] + 1e-9
-    return (weights @ points) / weights.sum(1, keepdims=True)
+    to_end = np.minimum(along_m, along_m[-1] - along_m)
+    weights *= np.abs(along_m[:, None] - along_m) <= to_end[:, None] + 1e-9
+    return (weights @ even) / weights.sum(1, keepdims=True)
 
 
 def _smooth_share(values: np.ndarray, window_m: float) -> np.ndarray:
@@ -242,13 +246,13 @@ def _arc_length(points: np.ndarray) -> np.ndarray:
 # ---- Cars ----------------------------------------------------------------------------------------
 
 
-def _wheel_points(lanes: Sequence[_Lane], num_cars: int, seed: int, scene: str) -> _WheelPoints:
+def _wheel_points(lanes: Sequence[_Lane], num_cars: int, seed: int, scene: str) -> WheelPoints:
     """Return points under the wheels of the cars of all lanes."""
     xy = [np.zeros((0, 2))]
     weights = [np.zeros(0)]
     for number, lane in enumerate(lanes):
         lengths = _arc_length(lane.points_m)
-        along_m = np.arange(0.0, lengths[-1], _STEP_M)
+        along_m = np.arange(0.0, lengths[-1], STEP_M)
         middle = np.stack([np.interp(along_m, lengths, lane.points_m[:, k]) for k in (0, 1)], 1)
         share = np.interp(along_m, lengths, lane.share)
         normals = _normals(middle)
@@ -272,7 +276,7 @@ def _wheel_points(lanes: Sequence[_Lane], num_cars: int, seed: int, scene: str) 
                 weights.append(
                     np.full(int(is_here.sum()), _MIN_WEIGHT + (1 - _MIN_WEIGHT) * weight)
                 )
-    return _WheelPoints(np.concatenate(xy), np.concatenate(weights))
+    return WheelPoints(np.concatenate(xy), np.concatenate(weights))
 
 
 def _car_offset(along_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -331,7 +335,7 @@ def _fill_block(
     corner: np.ndarray,
     centers: np.ndarray,
     sizes: np.ndarray,
-    points: _WheelPoints,
+    points: WheelPoints,
     wear: RoadWear,
 ) -> None:
     """Write the traces on the cells of one block into `wear`."""
@@ -346,7 +350,7 @@ def _fill_block(
         for mask in (road, 1 - road)
     )
     kerb = np.clip(inwards - outwards, -_MAX_KERB_M, _MAX_KERB_M)
-    passes = _count_passes(points, corner, shape)
+    passes = count_passes(points, corner, shape)
     flattened = 1 - np.exp(-passes / SATURATION)
     splash = _blur(flattened, _SPLASH_M)
     ridge = np.maximum(_blur(flattened, _RIDGE_M) - flattened, 0)
@@ -367,7 +371,7 @@ def _fill_block(
         target[rows] = np.where(is_road | (target is wear.splash), values, 0)
 
 
-def _count_passes(points: _WheelPoints, corner: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def count_passes(points: WheelPoints, corner: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Return the number of passes over each cell of a block's grid, float32 [H, W]."""
     local = (points.xy_m - corner) / GRID_M
     is_inside = ((local >= 0) & (local < np.array(shape[::-1]))).all(1)
@@ -377,7 +381,7 @@ def _count_passes(points: _WheelPoints, corner: np.ndarray, shape: tuple[int, in
     )
     blurred = _blur(counts.reshape(shape).astype(np.float32), _TYRE_SIGMA_M)
     # One line of points has 1 in its middle.
-    return blurred * np.float32(math.sqrt(2 * math.pi) * _TYRE_SIGMA_M * _STEP_M / GRID_M**2)
+    return blurred * np.float32(math.sqrt(2 * math.pi) * _TYRE_SIGMA_M * STEP_M / GRID_M**2)
 
 
 def paint_cells(
