@@ -22,17 +22,20 @@ from augment.effects.snow.traffic import (
     find_road_wear,
     paint_cells,
 )
-from augment.effects.snow.wet_tracks import make_wet_road, rough_reflectance
+from augment.effects.snow.wet_tracks import make_wet_road, rough_reflectance, wet_tracks
 from augment.exposure.exposed_surface import exposed_surface_of
 from augment.exposure.wheel_tracks import WheelPath, find_wheel_paths, parallel_path
+from augment.render.fog import Fog
 from augment.render.sh import SH_C0
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
+from augment.scene.sky import ConstantSky
 from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers
 from recipes.rain import Rain
 from recipes.schema import Recipe, Smog, Weather
 from recipes.snow import Snow
+from tests.scenes import camera_ahead
 from tests.snow_scenes import box_car, drive, sheet
 
 ROAD = int(SemanticClass.ROAD)
@@ -291,3 +294,37 @@ def test_wet_ground_leaves_no_track_to_wet_twice(street):
     _, plan = picture(street, snow=snow(traffic=1.0), rain=rain)
     step = next(step for step in plan.steps if step.name == WET_PASS)
     assert not step.runs and "rain" in step.why
+
+
+FOGS = [
+    None,
+    Fog(0.02, (0.7, 0.72, 0.75)),
+    Fog(0.03, (0.7, 0.72, 0.75), scale_height_m=3.0, base_z_m=0.2),
+    Fog(0.05, (0.7, 0.6, 0.5), elevation_gain=0.8, varying_airlight_rgb=(0.5, 0.5, 0.4)),
+]
+
+
+@pytest.mark.parametrize("fog", FOGS)
+def test_the_kernel_wets_tracks_as_the_definition_does(street, fog):
+    cells, _, traces = traces_of(street, traffic=1.0)
+    road = make_wet_road(cells, traces.wetness)
+    camera = camera_ahead(83, 47, 40.0, position=(0.0, 0.3, 1.5))  # an odd size
+    plan = make_plan(Recipe(), street)
+    clear = render_buffers(street, camera, plan, backend="cpu")
+    depth = clear.raster.expected_depth
+    if depth is None:
+        fall = -camera.ray_directions()[..., 2]
+        depth = torch.where(fall > 0.05, 1.5 / fall.clamp_min(0.05), 0.0).float()
+    share = clear.raster.alpha * torch.linspace(0, 1, 83)
+    sky = ConstantSky(torch.tensor([0.9, 0.5, 0.2]))
+    scene = dataclasses.replace(street, sky=sky)
+    images = [
+        wet_tracks(
+            clear.rgb.clone(), depth, share, camera, road, scene=scene, fog=fog, backend=backend
+        )
+        for backend in ("cpu", "reference")
+    ]
+    # Pixels on the border between two cells of the map may fall on either side of it.
+    difference = (images[0] - images[1]).abs().amax(-1)
+    assert float((difference < 1e-4).float().mean()) > 0.998
+    assert float((images[0] - clear.rgb).abs().max()) > (0.05 if fog is None else 0.01)

@@ -251,6 +251,7 @@ def _wet_tracks(effect: EffectInScene, view: RenderedView, camera: Camera) -> Re
             wet_road,
             scene=effect.lit_scene,
             fog=view.layers.fog,
+            backend=effect.backend,
         )
     return replace(view, rgb=rgb)
 
