@@ -36,7 +36,7 @@ from recipes.rain import Rain
 from recipes.schema import Recipe, Smog, Weather
 from recipes.snow import Snow
 from tests.scenes import camera_ahead
-from tests.snow_scenes import box_car, drive, sheet
+from tests.snow_scenes import box_car, drive, sheet, stack_all
 
 ROAD = int(SemanticClass.ROAD)
 SIDEWALK = int(SemanticClass.SIDEWALK)
@@ -197,6 +197,20 @@ def test_dirt_is_grey_brown_on_the_road_and_nowhere_far_from_it(street):
     assert far.any() and (traces.tints[far] == 1).all()
     kerb, lane = (near(cells, y) for y in (ROAD_HALF_M - 0.15, 2 * WHEEL_M))
     assert red[kerb].mean() < red[lane].mean() - 0.05  # most of it lies at the kerb
+
+
+def test_roofs_and_cars_over_the_road_stay_clean(street):
+    """Also what lies within a metre of the road, seen from above."""
+    roof = sheet((8.0, 14.0), (ROAD_HALF_M - 1, ROAD_HALF_M + 3), 3.0, semantic=6)
+    low = dataclasses.replace(street, background=stack_all([street.background, roof]))
+    cameras = {"ahead": camera_ahead(160, 90, 80.0, position=(-4.0, 4.0, 6.0))}
+    frame = dataclasses.replace(low.frames[0], index=99, cameras=cameras)
+    cells, _, traces = traces_of(
+        dataclasses.replace(low, frames=(*low.frames, frame)), dirt=1.0, traffic=1.0
+    )
+    is_roof = cells.centers_m[:, 2].numpy() > 2
+    assert is_roof.sum() > 100 and (traces.tints[is_roof] == 1).all()
+    assert (traces.depths.depths_m[is_roof] > 0).all()
 
 
 def test_snow_without_traces_keeps_its_bits_and_its_hash(street):

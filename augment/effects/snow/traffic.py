@@ -65,6 +65,8 @@ SATURATION = 2.5  # passes that flatten all but 1/e of the snow
 _SPLASH_M = 0.45  # standard deviation of the splash beside wheels
 _RIDGE_M = 0.2  # standard deviation of the slush that wheels push aside
 _MAX_KERB_M = 2.5  # largest distance from the road's edge that is told apart
+# Height over or under the road from which on a cell beside it gets nothing from it.
+_MAX_VERGE_GAP_M = 0.35
 _CLOSING_M = 0.6  # width of gaps in the road's cells that count as road
 _MAX_HEIGHT_GAP_M = 0.8  # height over a lane up to which a cell belongs to its road
 _MAX_UNCLASSED_GAP_M = 0.3  # the same where the scene has no classes
@@ -128,7 +130,20 @@ def find_road_wear(
     wear = RoadWear(is_road, zeros, zeros.copy(), zeros.copy(), np.full_like(zeros, -_MAX_KERB_M))
     for rows, road_rows, corner in _blocks(centers[:, :2], sizes, is_road):
         _fill_block(rows, road_rows, corner, centers, sizes, points, wear)
+    _leave_out_high_cells(centers, wear)
     return wear
+
+
+def _leave_out_high_cells(centers: np.ndarray, wear: RoadWear) -> None:
+    """Put cells beside the road that lie high above or below it (roofs, crowns) far from it."""
+    rows = np.flatnonzero(~wear.is_road & (wear.kerb_m > -_MAX_KERB_M))
+    if not len(rows):
+        return
+    road = centers[wear.is_road]
+    nearest = KDTree(road[:, :2]).query(centers[rows, :2])[1]
+    is_high = np.abs(centers[rows, 2] - road[nearest, 2]) > _MAX_VERGE_GAP_M
+    wear.kerb_m[rows[is_high]] = -_MAX_KERB_M
+    wear.splash[rows[is_high]] = 0
 
 
 def _road_cells(cells: ExposedCells, paths: Sequence[WheelPath]) -> np.ndarray:
