@@ -142,8 +142,8 @@ def _heading_rad(paths: Sequence[WheelPath]) -> float:
     """Return the direction of the first path as a whole; 0 without paths."""
     if not paths:
         return 0.0
-    way = paths[0].points_m[-1] - paths[0].points_m[0]
-    return math.atan2(way[1], way[0])
+    displacement_m = paths[0].points_m[-1] - paths[0].points_m[0]
+    return math.atan2(displacement_m[1], displacement_m[0])
 
 
 def driven_depths(

@@ -123,13 +123,13 @@ def make_wet_road(cells: ExposedCells, wetness: np.ndarray) -> WetRoad | None:
                 continue
             mask = paint_cells(centers[near, :2], sizes[near], corner, GRID_M, shape)
             at = np.clip((local[near] / GRID_M).astype(int), 0, shape[0] - 1)
-            known = np.zeros(shape, np.float32)
+            cell_mask = np.zeros(shape, np.float32)
             height = np.zeros(shape, np.float32)
             wet = np.zeros(shape, np.float32)
-            known[at[:, 1], at[:, 0]] = 1
+            cell_mask[at[:, 1], at[:, 0]] = 1
             height[at[:, 1], at[:, 0]] = centers[near, 2]
             wet[at[:, 1], at[:, 0]] = values[near]
-            weight = np.maximum(cv2.blur(known, (9, 9)), 1e-6)
+            weight = np.maximum(cv2.blur(cell_mask, (9, 9)), 1e-6)
             spread = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
             wet = spread * cv2.blur(wet, (9, 9)) / weight
             height = cv2.blur(height, (9, 9)) / weight
