@@ -112,7 +112,7 @@ def make_wet_road(cells: ExposedCells, wetness: np.ndarray) -> WetRoad | None:
     maps = list[np.ndarray]()
     heights = list[np.ndarray]()
     margin = 4
-    shape = (_BLOCK + 2 * margin,) * 2
+    shape = (_BLOCK + 2 * margin, _BLOCK + 2 * margin)
     for row in range(num_rows):
         for column in range(num_columns):
             corner = low + np.array([column, row]) * side_m - margin * GRID_M
