@@ -38,6 +38,7 @@ MAX_CARS = 40  # number of cars in a lane at a traffic of 1
 _EXTENSION_M = 30.0  # length by which lanes go straight on at both ends
 STEP_M = 0.05  # distance of points along a wheel's line
 _SMOOTHING_M = 1.5  # standard deviation of the blur along a path: labelled boxes jitter
+_SMOOTHING_REACH = 4.0  # half width of that blur, in standard deviations
 _SAME_LANE_M = 1.2  # distance of paths that share a lane
 _LANE_GAP_M = 1.9  # least distance of a parallel lane from the path of a vehicle
 _LANE_HALF_WIDTH_M = 0.95  # distance from a lane's middle at which there must be road
@@ -53,6 +54,7 @@ _CAR_WIDTHS_M = (1.6, 2.0)  # narrowest and widest car
 _CHANGE_SHARE = 0.12  # share of cars that change lanes
 _CHANGE_LENGTHS_M = (18.0, 40.0)  # shortest and longest way of such a change
 _RECORDED_WEIGHT = 2.0  # passes of a vehicle whose path is recorded
+_LANE_REACH_M = 6.0  # distance from a lane's middle within which its wheels are
 _MIN_WEIGHT = 0.4  # least weight of a pass; others lie under fresh snow
 
 # ---- The grid ------------------------------------------------------------------------------------
@@ -107,6 +109,31 @@ class WheelPoints(NamedTuple):
     weights: np.ndarray  # float64 [N]
 
 
+class _Cars(NamedTuple):
+    """N cars of a lane, all [N] but the last two."""
+
+    threshold: np.ndarray  # a car drives where the lane's share exceeds this
+    weight: np.ndarray  # weight of its pass
+    half_width_m: np.ndarray  # distance of its wheels from its middle
+    offset_m: np.ndarray  # mean distance from the lane's middle
+    change_m: np.ndarray  # distance of a change of lane, 0 for most
+    change_begin_m: np.ndarray  # place along the lane where the change begins
+    change_length_m: np.ndarray  # length of the change
+    amplitudes_m: np.ndarray  # [N, W], amplitudes of the wandering, by wave
+    phases: np.ndarray  # [N, W], phases of the waves, turns
+
+
+class _Line(NamedTuple):
+    """Lane in steps of STEP_M, with its cars."""
+
+    along_m: np.ndarray  # [P], length up to each point
+    middle: np.ndarray  # [P, 2]
+    normals: np.ndarray  # [P, 2], unit vectors to the left
+    share: np.ndarray  # [P], share of the cars of a lane that drive here
+    recorded_width_m: float | None  # width of the vehicle whose path this is; None without one
+    cars: _Cars
+
+
 def find_road_wear(
     cells: ExposedCells, paths: Sequence[WheelPath], *, traffic: float, seed: int, scene_name: str
 ) -> RoadWear:
@@ -123,13 +150,13 @@ def find_road_wear(
     centers = cells.centers_m.numpy().astype(np.float64)
     lanes = _find_lanes(centers[is_road, :2], paths)
     num_cars = 0 if traffic == 0 else round(MIN_CARS + (MAX_CARS - MIN_CARS) * traffic**2)
-    points = _wheel_points(lanes, num_cars, seed, scene_name)
+    lines = _lines_of(lanes, num_cars, seed, scene_name)
     sizes = cells.sizes_m.numpy().astype(np.float64)
     count = len(cells)
     zeros = np.zeros(count, np.float32)
     wear = RoadWear(is_road, zeros, zeros.copy(), zeros.copy(), np.full_like(zeros, -_MAX_KERB_M))
     for rows, road_rows, corner in _blocks(centers[:, :2], sizes, is_road):
-        _fill_block(rows, road_rows, corner, centers, sizes, points, wear)
+        _fill_block(rows, road_rows, corner, centers, sizes, lines, wear)
     _leave_out_high_cells(centers, wear)
     return wear
 
@@ -238,11 +265,19 @@ def _smoothed(points: np.ndarray) -> np.ndarray:
     lengths = _arc_length(points)
     along_m = np.linspace(0.0, lengths[-1], max(2, math.ceil(lengths[-1]) + 1))
     even = np.stack([np.interp(along_m, lengths, points[:, k]) for k in range(3)], 1)
-    weights = np.exp(-0.5 * ((along_m[:, None] - along_m) / _SMOOTHING_M) ** 2)
     # Near its ends a path is averaged over as much before a point as behind it.
     to_end = np.minimum(along_m, along_m[-1] - along_m)
-    weights *= np.abs(along_m[:, None] - along_m) <= to_end[:, None] + 1e-9
-    return (weights @ even) / weights.sum(1, keepdims=True)
+    step_m = along_m[1] - along_m[0]
+    sums = np.zeros_like(even)
+    weight_sums = np.zeros(len(even))
+    reach = math.ceil(_SMOOTHING_REACH * _SMOOTHING_M / max(step_m, 1e-9))
+    rows = np.arange(len(even))
+    for shift in range(-min(reach, len(even)), min(reach, len(even)) + 1):
+        weight = math.exp(-0.5 * (shift * step_m / _SMOOTHING_M) ** 2)
+        weights = np.where(abs(shift) * step_m <= to_end + 1e-9, weight, 0.0)
+        sums += weights[:, None] * even[np.clip(rows + shift, 0, len(even) - 1)]
+        weight_sums += weights
+    return sums / weight_sums[:, None]
 
 
 def _smooth_share(values: np.ndarray, window_m: float) -> np.ndarray:
@@ -261,51 +296,86 @@ def _arc_length(points: np.ndarray) -> np.ndarray:
 # ---- Cars ----------------------------------------------------------------------------------------
 
 
-def _wheel_points(lanes: Sequence[_Lane], num_cars: int, seed: int, scene: str) -> WheelPoints:
-    """Return points under the wheels of the cars of all lanes."""
-    xy = [np.zeros((0, 2))]
-    weights = [np.zeros(0)]
+def _lines_of(lanes: Sequence[_Lane], num_cars: int, seed: int, scene: str) -> list[_Line]:
+    """Return the lanes in fine steps, with the cars that drive in them."""
+    lines = []
     for number, lane in enumerate(lanes):
         lengths = _arc_length(lane.points_m)
         along_m = np.arange(0.0, lengths[-1], STEP_M)
         middle = np.stack([np.interp(along_m, lengths, lane.points_m[:, k]) for k in (0, 1)], 1)
         share = np.interp(along_m, lengths, lane.share)
-        normals = _normals(middle)
-        if lane.is_recorded and num_cars > 0:
-            is_here = np.interp(along_m, lengths, (lane.share > 0).astype(np.float64)) > 0.5
-            for side in (-1, 1):
-                offset = side * WHEEL_OFFSET_SHARE * lane.width_m
-                xy.append((middle + offset * normals)[is_here])
-                weights.append(np.full(int(is_here.sum()), _RECORDED_WEIGHT))
         rng = rng_for(seed=seed, scene=scene, effect=f"snow.traffic of lane {number}")
-        for _ in range(num_cars):
-            threshold, weight, width = rng.uniform(0, 1, 3)
-            offset_m = _car_offset(along_m, rng)
-            is_here = share > threshold
-            half_width = WHEEL_OFFSET_SHARE * (
-                _CAR_WIDTHS_M[0] + (_CAR_WIDTHS_M[1] - _CAR_WIDTHS_M[0]) * width
-            )
-            for side in (-1, 1):
-                line = middle + (offset_m + side * half_width)[:, None] * normals
-                xy.append(line[is_here])
-                weights.append(
-                    np.full(int(is_here.sum()), _MIN_WEIGHT + (1 - _MIN_WEIGHT) * weight)
-                )
+        cars = _draw_cars(num_cars, along_m[-1], rng)
+        width_m = lane.width_m if lane.is_recorded and num_cars > 0 else None
+        lines.append(_Line(along_m, middle, _normals(middle), share, width_m, cars))
+    return lines
+
+
+def _draw_cars(num_cars: int, length_m: float, rng: np.random.Generator) -> _Cars:
+    """Draw the cars of a lane of a length."""
+    rows = []
+    num_waves = len(_WANDER_LENGTHS_M)
+    for _ in range(num_cars):
+        threshold, weight, width = rng.uniform(0, 1, 3)
+        offset_m = _OFFSET_M * rng.standard_normal()
+        waves = [(rng.standard_normal(), rng.uniform()) for _ in range(num_waves)]
+        amplitudes, phases = zip(*waves, strict=True)
+        changes, side, begin, length = rng.uniform(0, 1, 4)
+        change_m = math.copysign(LANE_WIDTH_M, side - 0.5) if changes < _CHANGE_SHARE else 0.0
+        shortest_m, longest_m = _CHANGE_LENGTHS_M
+        change = (change_m, begin * length_m, shortest_m + (longest_m - shortest_m) * length)
+        narrow_m, wide_m = _CAR_WIDTHS_M
+        half_width_m = WHEEL_OFFSET_SHARE * (narrow_m + (wide_m - narrow_m) * width)
+        pass_weight = _MIN_WEIGHT + (1 - _MIN_WEIGHT) * weight
+        rows.append((threshold, pass_weight, half_width_m, offset_m, *change, *amplitudes, *phases))
+    table = np.array(rows, np.float64).reshape(num_cars, 7 + 2 * num_waves)
+    amplitudes = _WANDER_M * math.sqrt(2 / num_waves) * table[:, 7 : 7 + num_waves]
+    return _Cars(*table[:, :7].T, amplitudes, table[:, 7 + num_waves :])
+
+
+def _car_offsets(cars: _Cars, along_m: np.ndarray) -> np.ndarray:
+    """Return the distances of N cars from the lane's middle at places along it, metres [N, P]."""
+    offsets = np.repeat(cars.offset_m[:, None], len(along_m), axis=1)
+    for number, wave_m in enumerate(_WANDER_LENGTHS_M):
+        turns = along_m / wave_m + cars.phases[:, number, None]
+        offsets += cars.amplitudes_m[:, number, None] * np.sin(2 * math.pi * turns)
+    t = (along_m - cars.change_begin_m[:, None]) / cars.change_length_m[:, None]
+    t = np.clip(t, 0, 1)
+    return offsets + cars.change_m[:, None] * t * t * (3 - 2 * t)
+
+
+def _points_between(lines: Sequence[_Line], low: np.ndarray, high: np.ndarray) -> WheelPoints:
+    """Return the points under wheels in and about a rectangle.
+
+    Args:
+        lines: lanes with their cars.
+        low: least x and y of the rectangle.
+        high: largest x and y.
+    """
+    xy = [np.zeros((0, 2))]
+    weights = [np.zeros(0)]
+    for line in lines:
+        is_near = ((line.middle > low - _LANE_REACH_M) & (line.middle < high + _LANE_REACH_M)).all(
+            1
+        )
+        rows = np.flatnonzero(is_near & (line.share > 0))
+        if not len(rows):
+            continue
+        middle = line.middle[rows]
+        normals = line.normals[rows]
+        if line.recorded_width_m is not None:
+            half_width_m = WHEEL_OFFSET_SHARE * line.recorded_width_m
+            xy += [middle + side * half_width_m * normals for side in (-1, 1)]
+            weights += 2 * [np.full(len(rows), _RECORDED_WEIGHT)]
+        cars = line.cars
+        is_here = line.share[rows] > cars.threshold[:, None]  # [N, P]
+        offsets_m = _car_offsets(cars, line.along_m[rows])
+        car, place = np.nonzero(is_here)
+        for side in (-1, 1):
+            beside_m = offsets_m[car, place] + side * cars.half_width_m[car]
+            xy.append(middle[place] + beside_m[:, None] * normals[place])
+            weights.append(cars.weight[car])
     return WheelPoints(np.concatenate(xy), np.concatenate(weights))
-
-
-def _car_offset(along_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return a car's distance from the lane's middle along its way, metres."""
-    offset = np.full(len(along_m), _OFFSET_M * rng.standard_normal())
-    for wave_m in _WANDER_LENGTHS_M:
-        amplitude = _WANDER_M * math.sqrt(2 / len(_WANDER_LENGTHS_M)) * rng.standard_normal()
-        offset += amplitude * np.sin(2 * math.pi * (along_m / wave_m + rng.uniform()))
-    changes, side, begin, length = rng.uniform(0, 1, 4)
-    if changes < _CHANGE_SHARE:
-        way_m = _CHANGE_LENGTHS_M[0] + (_CHANGE_LENGTHS_M[1] - _CHANGE_LENGTHS_M[0]) * length
-        t = np.clip((along_m - begin * along_m[-1]) / way_m, 0, 1)
-        offset += math.copysign(LANE_WIDTH_M, side - 0.5) * t * t * (3 - 2 * t)
-    return offset
 
 
 def _normals(points: np.ndarray) -> np.ndarray:
@@ -350,7 +420,7 @@ def _fill_block(
     corner: np.ndarray,
     centers: np.ndarray,
     sizes: np.ndarray,
-    points: WheelPoints,
+    lines: Sequence[_Line],
     wear: RoadWear,
 ) -> None:
     """Write the traces on the cells of one block into `wear`."""
@@ -365,7 +435,8 @@ def _fill_block(
         for mask in (road, 1 - road)
     )
     kerb = np.clip(inwards - outwards, -_MAX_KERB_M, _MAX_KERB_M)
-    passes = count_passes(points, corner, shape)
+    far_corner = corner + side * GRID_M
+    passes = count_passes(_points_between(lines, corner, far_corner), corner, shape)
     flattened = 1 - np.exp(-passes / SATURATION)
     splash = _blur(flattened, _SPLASH_M)
     ridge = np.maximum(_blur(flattened, _RIDGE_M) - flattened, 0)
