@@ -311,8 +311,8 @@ def _lines_of(lanes: Sequence[_Lane], num_cars: int, seed: int, scene: str) -> l
     return lines
 
 
-def _draw_cars(num_cars: int, length_m: float, rng: np.random.Generator) -> _Cars:
-    """Draw the cars of a lane of a length."""
+def _draw_cars(num_cars: int, lane_m: float, rng: np.random.Generator) -> _Cars:
+    """Draw the cars of a lane that is `lane_m` long."""
     rows = []
     num_waves = len(_WANDER_LENGTHS_M)
     for _ in range(num_cars):
@@ -323,14 +323,25 @@ def _draw_cars(num_cars: int, length_m: float, rng: np.random.Generator) -> _Car
         changes, side, begin, length = rng.uniform(0, 1, 4)
         change_m = math.copysign(LANE_WIDTH_M, side - 0.5) if changes < _CHANGE_SHARE else 0.0
         shortest_m, longest_m = _CHANGE_LENGTHS_M
-        change = (change_m, begin * length_m, shortest_m + (longest_m - shortest_m) * length)
+        change = (change_m, begin * lane_m, shortest_m + (longest_m - shortest_m) * length)
         narrow_m, wide_m = _CAR_WIDTHS_M
         half_width_m = WHEEL_OFFSET_SHARE * (narrow_m + (wide_m - narrow_m) * width)
         pass_weight = _MIN_WEIGHT + (1 - _MIN_WEIGHT) * weight
         rows.append((threshold, pass_weight, half_width_m, offset_m, *change, *amplitudes, *phases))
     table = np.array(rows, np.float64).reshape(num_cars, 7 + 2 * num_waves)
     amplitudes = _WANDER_M * math.sqrt(2 / num_waves) * table[:, 7 : 7 + num_waves]
-    return _Cars(*table[:, :7].T, amplitudes, table[:, 7 + num_waves :])
+    threshold, weight, half_width_m, offset_m, change_m, begin_m, length_m = table[:, :7].T
+    return _Cars(
+        threshold=threshold,
+        weight=weight,
+        half_width_m=half_width_m,
+        offset_m=offset_m,
+        change_m=change_m,
+        change_begin_m=begin_m,
+        change_length_m=length_m,
+        amplitudes_m=amplitudes,
+        phases=table[:, 7 + num_waves :],
+    )
 
 
 def _car_offsets(cars: _Cars, along_m: np.ndarray) -> np.ndarray:
