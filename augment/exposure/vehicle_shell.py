@@ -18,6 +18,7 @@ Coordinates: x forward, y left, z up from the *bottom* of the box.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -34,7 +35,9 @@ from augment.exposure.vehicle_forms import (
 
 STATION_M = 0.05  # distance between stations along the vehicle
 MIN_POINTS = 40  # fewest points that a shell is fitted to
-_MAX_STRAY_SHARE = 0.5  # largest share of stations that lie off the fitted line
+_MAX_STRAY_SHARE = 0.6  # largest share of stations that lie off the fitted line
+_MAX_KNOT_SHIFT = 6.0  # largest shift of a knot from its form, in standard deviations
+_MAX_ABOVE_SHARE = 0.25  # largest share of those that lie above it
 _STRAY_M = 0.12  # distance off the line from which a station is astray
 # Height over the box up to which a point can be the vehicle's, metres.
 _MAX_HEIGHT_OVER_BOX_M = 0.06
@@ -259,9 +262,7 @@ def fit_shell(
     weights = np.concatenate([sides[0].weights, _ALL_POINTS_WEIGHT * sides[1].weights])
     fit = _fit_forms(forms, stations, heights, weights, size_m)
     line, segments = _lines(fit.knots[None], stations, size_m, np.array([fit.rise_m]))[:2]
-    is_known = sides[1].weights > 0
-    is_astray = is_known & (np.abs(sides[1].heights_m - line[0]) > _STRAY_M)
-    if is_astray.sum() > _MAX_STRAY_SHARE * is_known.sum():
+    if fit.shift > _MAX_KNOT_SHIFT or not _is_likely(sides, line[0]):
         return None
     heights_m = _follow_points(line[0], segments[0], stations, heights, weights)
     return _measure_across(fit, points, stations, heights_m, size_m)
@@ -346,6 +347,25 @@ def _side_heights(x: np.ndarray, z: np.ndarray, stations: np.ndarray) -> _SideHe
     return _SideHeights(heights, weights)
 
 
+def _is_likely(sides: Sequence[_SideHeights], line: np.ndarray) -> bool:
+    """Return True if a fitted line agrees with the points.
+
+    Points below the line may be the interior. Surfaces above it cannot be.
+
+    Args:
+        sides: heights of points that face upwards, and of all points.
+        line: the fitted heights, float64 [K].
+    """
+    is_known = sides[1].weights > 0
+    is_astray = is_known & (np.abs(sides[1].heights_m - line) > _STRAY_M)
+    faces_up = sides[0].weights > 0
+    is_above = faces_up & (sides[0].heights_m > line + _STRAY_M)
+    return bool(
+        is_astray.sum() <= _MAX_STRAY_SHARE * is_known.sum()
+        and is_above.sum() <= _MAX_ABOVE_SHARE * faces_up.sum()
+    )
+
+
 # ---- Fit of the forms ----------------------------------------------------------------------------
 
 
@@ -355,6 +375,7 @@ class _FormFit(NamedTuple):
     form: VehicleForm
     knots: np.ndarray  # float64 [12], x of the knots, then their heights
     rise_m: float  # rise of the roof's middle
+    shift: float  # largest distance of a knot from its form, in standard deviations
 
 
 def _lines(
@@ -441,7 +462,8 @@ def _fit_forms(
     misfit = (station_weights * scales**2 * np.log1p((residuals / scales) ** 2)).sum(1)
     costs = misfit + (((knots - form_knots) / sigmas) ** 2).sum(1)
     best = int(costs.argmin())
-    return _FormFit(forms[best], knots[best], float(rises_m[best]))
+    shift = float(np.abs((knots[best] - form_knots[best]) / sigmas).max())
+    return _FormFit(forms[best], knots[best], float(rises_m[best]), shift)
 
 
 def _follow_points(
