@@ -76,7 +76,9 @@ class PlacedShell:
         knots = self.shell.knots_x_m
         nearest_places = []
         is_beside = []
-        for first, last in ((knots[0], knots[5]), (knots[2], knots[3])):
+        # The walls of a bed stand beside its floor.
+        rear = knots[0] if self.shell.bed_z_m is None else knots[1]
+        for first, last in ((rear, knots[5]), (knots[2], knots[3])):
             x = np.clip(local[:, 0], first + _END_INSET_M, max(last - _END_INSET_M, first))
             half = np.maximum(self.shell.half_width_m(x) - _EDGE_INSET_M, 0)
             y = np.clip(local[:, 1], -half, half)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -65,7 +66,10 @@ _OTHER_CLASSES = (
     *(SemanticClass[n] for n in ("VEGETATION", "BUILDING", "POLE", "SIGN", "PEDESTRIAN", "SKY")),
 )
 _MIN_OPACITY = 0.3  # fainter splats are no surface
-_MAX_SCALE_M = 0.3  # larger splats are no surface of a vehicle
+_MAX_SCALE_M = 0.6  # larger splats are no surface of a vehicle
+# Places of the points on a splat along its two longer axes, in standard deviations, by the largest
+# standard deviation to which they apply, metres.
+_SPREADS = ((0.05, (0.0,)), (0.1, (-0.5, 0.0, 0.5)), (math.inf, (-0.6, -0.3, 0.0, 0.3, 0.6)))
 _MIN_UPWARD = 0.5  # least z of the normal of a splat that faces upwards
 _MAX_LABELLED_FRAMES = 8  # number of frames whose boxes are read, spread over the drive
 _MIN_SPEED_STEP_NS = 400_000_000  # least time between two poses that tell a speed
@@ -94,11 +98,34 @@ def shell_of_gaussians(
     rows = np.flatnonzero(is_surface)
     if len(rows) < MIN_POINTS:
         return None
-    axes = rotmat_from_quat(gaussians.quats[_index_tensor(rows)]).numpy()  # columns: the axes
-    thinnest = scales[rows].argmin(1)
-    normal_z = np.abs(axes[np.arange(len(rows)), 2, thinnest])
-    points = gaussians.means.numpy()[rows].astype(np.float64)
-    return fit_shell(points, normal_z > _MIN_UPWARD, label, size_m)
+    points, is_facing_up = _surface_points(gaussians.select(_index_tensor(rows)))
+    return fit_shell(points, is_facing_up, label, size_m)
+
+
+def _surface_points(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Return points on flat Gaussians, float64 [N, 3], and those that face upwards, bool [N].
+
+    A large Gaussian gives several points, spread over its two longer axes.
+    """
+    axes = rotmat_from_quat(gaussians.quats).numpy().astype(np.float64)  # columns: the axes
+    scales = gaussians.scales.numpy().astype(np.float64)
+    means = gaussians.means.numpy().astype(np.float64)
+    order = np.argsort(scales, axis=1, kind="stable")
+    axes = np.take_along_axis(axes, order[:, None, :], 2)
+    scales = np.take_along_axis(scales, order, 1)
+    faces_up = np.abs(axes[:, 2, 0]) > _MIN_UPWARD
+    points = []
+    are_facing_up = []
+    low_m = 0.0
+    for high_m, sigmas in _SPREADS:
+        chosen = (scales[:, 2] >= low_m) & (scales[:, 2] < high_m)
+        spread = axes[chosen][:, :, 1:] * scales[chosen][:, None, 1:]  # [N, 3, 2]
+        offsets = np.stack(np.meshgrid(sigmas, sigmas), -1).reshape(-1, 2)
+        spots = means[chosen][:, None] + np.einsum("nij,kj->nki", spread, offsets)
+        points.append(spots.reshape(-1, 3))
+        are_facing_up.append(np.repeat(faces_up[chosen], len(offsets)))
+        low_m = high_m
+    return np.concatenate(points), np.concatenate(are_facing_up)
 
 
 @dataclass(frozen=True, eq=False)

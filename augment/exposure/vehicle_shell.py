@@ -87,11 +87,15 @@ _ROOF_HALF = (0.67, 0.58, 0.86)
 _BONNET_HALF = (0.80, 0.70, 0.90)
 _BOOT_HALF = (0.78, 0.66, 0.88)
 _CORNER_M = 0.3  # length over which the plan narrows towards its ends
-_RIM_M = 0.02  # width of the rim of roof, bonnet and boot that holds nothing
+_RIM_M = 0.01  # width of the rim of roof, bonnet and boot that holds nothing
 # The same at the ends of boot, roof and bonnet, as a shift of the knots.
-_KNOT_INSETS_M = np.array([0.05, 0.0, 0.03, -0.03, 0.0, -0.06])
-_CORNER_NARROWING = 0.3  # share of the width that it loses there
+_KNOT_INSETS_M = np.array([0.04, 0.0, 0.02, -0.02, 0.0, -0.05])
+_CORNER_NARROWING = 0.25  # share of the width that it loses there
 _MIN_BOOT_LENGTH_M = 0.25  # a shorter boot is the rim of a hatch
+# Steepest rear window over a boot shorter than the following length; below a steeper one lies the
+# face of a hatch.
+_MAX_REAR_SLOPE = 1.0
+_MIN_STEEP_BOOT_LENGTH_M = 0.6
 _BED_DEPTH_M = 0.48  # usual depth of a bed below its rails
 _BED_WALL_M = 0.08  # thickness of a bed's walls
 _MIN_BED_STEP_M = 0.2  # least depth of a bed's floor below the rails
@@ -172,7 +176,9 @@ class VehicleShell:
         chords = np.abs(np.diff(self.knots_z_m) / np.diff(knots))
         is_glass = np.isin(parts, GLASS_PARTS)
         steepness[is_glass] = chords[segment[is_glass] - 1]
-        if knots[1] - knots[0] < _MIN_BOOT_LENGTH_M:
+        boot_length = knots[1] - knots[0]
+        is_hatch = chords[1] > _MAX_REAR_SLOPE and boot_length < _MIN_STEEP_BOOT_LENGTH_M
+        if boot_length < _MIN_BOOT_LENGTH_M or is_hatch:
             parts[parts == VehiclePart.BOOT] = VehiclePart.SIDE
         is_side = np.abs(y) > self.half_width_m(x)
         parts[is_side] = VehiclePart.SIDE
@@ -313,14 +319,32 @@ class _SideHeights(NamedTuple):
 def _side_heights(x: np.ndarray, z: np.ndarray, stations: np.ndarray) -> _SideHeights:
     """Return the height of the highest surface at each station.
 
-    A surface has several points within _SUPPORT_RANGE_M; a stray point above it is none.
+    Points of the neighbouring stations count where a station has too few, since they would carry a
+    roof beyond its ends.
     """
-    count = len(stations)
+    nearest = np.floor((x - stations[0]) / STATION_M + 0.5).astype(np.int64)
+    alone = _surface_heights(nearest, z, len(stations))
+    around = np.concatenate([nearest - 1, nearest, nearest + 1])
+    together = _surface_heights(around, np.tile(z, 3), len(stations))
+    is_known = alone.weights > 0
+    return _SideHeights(
+        np.where(is_known, alone.heights_m, together.heights_m),
+        np.where(is_known, alone.weights, together.weights),
+    )
+
+
+def _surface_heights(station: np.ndarray, z: np.ndarray, count: int) -> _SideHeights:
+    """Return the height of the highest surface of each of `count` stations.
+
+    A surface has several points within _SUPPORT_RANGE_M; a stray point above it is none.
+
+    Args:
+        station: station of each point, int64 [N].
+        z: height of each point, float64 [N].
+        count: number of stations.
+    """
     heights = np.zeros(count)
     weights = np.zeros(count)
-    nearest = np.floor((x - stations[0]) / STATION_M + 0.5).astype(np.int64)
-    station = np.concatenate([nearest - 1, nearest, nearest + 1])
-    z = np.tile(z, 3)
     is_inside = (station >= 0) & (station < count)
     station = station[is_inside]
     z = z[is_inside]
