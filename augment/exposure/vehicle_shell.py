@@ -36,7 +36,8 @@ from augment.exposure.vehicle_forms import (
 STATION_M = 0.05  # distance between stations along the vehicle
 MIN_POINTS = 40  # fewest points that a shell is fitted to
 _MAX_STRAY_SHARE = 0.6  # largest share of stations that lie off the fitted line
-_MAX_KNOT_SHIFT = 6.0  # largest shift of a knot from its form, in standard deviations
+_MAX_AT_LIMIT = 1  # largest number of coordinates of knots at the limit of their form
+_LIMIT_SHARE = 0.98  # share of the largest shift from which on a coordinate is at that limit
 _MAX_ABOVE_SHARE = 0.25  # largest share of those that lie above it
 _STRAY_M = 0.12  # distance off the line from which a station is astray
 # Height over the box up to which a point can be the vehicle's, metres.
@@ -57,12 +58,14 @@ _FULL_COUNT = 6  # number of points at a station from which on it has full weigh
 
 _NUM_STEPS = 20  # number of Gauss-Newton steps
 _MAX_STEP_M = 0.15  # largest step of a knot
+_MAX_KNOT_SHIFT = 3.5  # largest shift of a knot from its form, in standard deviations
+_MAX_END_RISE_M = 0.02  # largest rise of a bonnet or boot towards its end
 _MIN_KNOT_GAP_M = 0.03  # least distance between knots along the vehicle
 _HEIGHT_SIGMA_M = 0.03  # standard deviation of a station's height
 _STATION_WEIGHT = 0.5  # weight of a station, since neighbours share points
 _FIRST_SCALE_M = 0.25  # scale of Cauchy's weights in the first step
 _LAST_SCALE_M = 0.04  # scale in the last steps; what lies lower may be the interior
-_UPPER_SCALE_M = 0.12  # least scale for points above the line: nothing floats within a box
+_UPPER_SCALE_M = 0.08  # least scale for points above the line: nothing floats within a box
 _COST_SCALE_M = 0.05  # scale for stations below the line, when forms are compared
 _ANCHOR_GAP_M = 0.06  # distance beyond the box of the feet of the two end faces
 _ANCHOR_HEIGHT_SHARE = 0.2  # height of those feet, in heights of the box
@@ -268,7 +271,7 @@ def fit_shell(
     weights = np.concatenate([sides[0].weights, _ALL_POINTS_WEIGHT * sides[1].weights])
     fit = _fit_forms(forms, stations, heights, weights, size_m)
     line, segments = _lines(fit.knots[None], stations, size_m, np.array([fit.rise_m]))[:2]
-    if fit.shift > _MAX_KNOT_SHIFT or not _is_likely(sides, line[0]):
+    if fit.num_at_limit > _MAX_AT_LIMIT or not _is_likely(sides, line[0]):
         return None
     heights_m = _follow_points(line[0], segments[0], stations, heights, weights)
     return _measure_across(fit, points, stations, heights_m, size_m)
@@ -399,7 +402,7 @@ class _FormFit(NamedTuple):
     form: VehicleForm
     knots: np.ndarray  # float64 [12], x of the knots, then their heights
     rise_m: float  # rise of the roof's middle
-    shift: float  # largest distance of a knot from its form, in standard deviations
+    num_at_limit: int  # number of coordinates of knots that are as far off the form as may be
 
 
 def _lines(
@@ -479,15 +482,22 @@ def _fit_forms(
         vector = np.einsum("fni,fn->fi", weighted, residuals) + (form_knots - knots) / sigmas**2
         change = np.linalg.solve(matrix, vector[..., None])[..., 0]
         knots = knots + np.clip(change, -_MAX_STEP_M, _MAX_STEP_M)
+        knots = np.clip(
+            knots, form_knots - _MAX_KNOT_SHIFT * sigmas, form_knots + _MAX_KNOT_SHIFT * sigmas
+        )
         for k in range(1, NUM_KNOTS):
             knots[:, k] = np.maximum(knots[:, k], knots[:, k - 1] + _MIN_KNOT_GAP_M)
+        for end, inner in ((0, 1), (5, 4)):  # bonnet and boot fall towards their ends
+            highest = knots[:, NUM_KNOTS + inner] + _MAX_END_RISE_M
+            knots[:, NUM_KNOTS + end] = np.minimum(knots[:, NUM_KNOTS + end], highest)
     residuals = heights - _lines(knots, x, size_m, rises_m)[0]
     scales = np.where((residuals > 0) & faces_up, _UPPER_SCALE_M, _COST_SCALE_M)
     misfit = (station_weights * scales**2 * np.log1p((residuals / scales) ** 2)).sum(1)
     costs = misfit + (((knots - form_knots) / sigmas) ** 2).sum(1)
     best = int(costs.argmin())
-    shift = float(np.abs((knots[best] - form_knots[best]) / sigmas).max())
-    return _FormFit(forms[best], knots[best], float(rises_m[best]), shift)
+    shifts = np.abs(knots[best] - form_knots[best]) / sigmas
+    num_at_limit = int((shifts >= _LIMIT_SHARE * _MAX_KNOT_SHIFT).sum())
+    return _FormFit(forms[best], knots[best], float(rises_m[best]), num_at_limit)
 
 
 def _follow_points(
