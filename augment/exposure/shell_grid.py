@@ -72,7 +72,8 @@ class PlacedShell:
             them; bool [N], True for places within the box.
         """
         local = (places - self.centre_m) @ self.rotation
-        is_in_box = (np.abs(local[:, :2]) <= np.array(self.shell.size_m[:2]) / 2).all(1)
+        half_size_m = np.array(self.shell.size_m[:2]) / 2
+        is_in_box = np.asarray((np.abs(local[:, :2]) <= half_size_m).all(1))
         knots = self.shell.knots_x_m
         nearest_places = []
         is_beside = []

@@ -36,6 +36,10 @@ class VehicleForm:
     """Rise of the roof's middle over the line between its edges, in heights of the box."""
     has_bed: bool = False
     """True if an open bed lies behind the cab."""
+    has_upright_rear: bool = False
+    """True if the rear window is too steep to hold a layer, whatever few points say."""
+    has_upright_front: bool = False
+    """True if the windscreen is."""
 
 
 HATCHBACK = VehicleForm(
@@ -51,10 +55,18 @@ SALOON = VehicleForm(
     0.025,
 )
 SUV = VehicleForm(
-    "suv", (-0.49, -0.47, -0.40, 0.08, 0.25, 0.47), (0.56, 0.62, 0.93, 0.96, 0.66, 0.56), 0.025
+    "suv",
+    (-0.49, -0.47, -0.40, 0.08, 0.25, 0.47),
+    (0.56, 0.62, 0.93, 0.96, 0.66, 0.56),
+    0.025,
+    has_upright_rear=True,
 )
 VAN = VehicleForm(
-    "van", (-0.495, -0.485, -0.46, 0.16, 0.34, 0.47), (0.50, 0.80, 0.96, 0.97, 0.64, 0.52), 0.015
+    "van",
+    (-0.495, -0.485, -0.46, 0.16, 0.34, 0.47),
+    (0.50, 0.80, 0.96, 0.97, 0.64, 0.52),
+    0.015,
+    has_upright_rear=True,
 )
 PICKUP = VehicleForm(
     "pickup",
@@ -62,15 +74,23 @@ PICKUP = VehicleForm(
     (0.70, 0.71, 0.955, 0.965, 0.68, 0.60),
     0.02,
     has_bed=True,
+    has_upright_rear=True,
 )
 BOX_TRUCK = VehicleForm(
     "box truck",
     (-0.497, -0.494, -0.49, 0.17, 0.20, 0.45),
     (0.70, 0.90, 0.985, 0.985, 0.74, 0.70),
     0.005,
+    has_upright_rear=True,
+    has_upright_front=True,
 )
 BUS = VehicleForm(
-    "bus", (-0.497, -0.495, -0.48, 0.47, 0.492, 0.497), (0.60, 0.80, 0.975, 0.975, 0.80, 0.60), 0.02
+    "bus",
+    (-0.497, -0.495, -0.48, 0.47, 0.492, 0.497),
+    (0.60, 0.80, 0.975, 0.975, 0.80, 0.60),
+    0.02,
+    has_upright_rear=True,
+    has_upright_front=True,
 )
 
 # Words in labels of vehicles that no form describes.

@@ -178,6 +178,10 @@ class VehicleShell:
         steepness = np.hypot(slope_x, slope_y)
         chords = np.abs(np.diff(self.knots_z_m) / np.diff(knots))
         is_glass = np.isin(parts, GLASS_PARTS)
+        if self.form.has_upright_rear:
+            chords[1] = np.inf
+        if self.form.has_upright_front:
+            chords[3] = np.inf
         steepness[is_glass] = chords[segment[is_glass] - 1]
         boot_length = knots[1] - knots[0]
         is_hatch = chords[1] > _MAX_REAR_SLOPE and boot_length < _MIN_STEEP_BOOT_LENGTH_M
