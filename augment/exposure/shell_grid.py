@@ -145,43 +145,44 @@ def draw_shells(
         np.zeros((*shape, 2), np.float32),
         np.ones(shape, np.float32),
     )
-    drawn = [
-        _draw_shell(grid, placed, height_map, classes, max_slope_deg) for placed in placed_shells
+    is_drawn = [
+        _draw_shell(grid, placed_shell, height_map, classes, max_slope_deg)
+        for placed_shell in placed_shells
     ]
-    return grid if any(drawn) else None
+    return grid if any(is_drawn) else None
 
 
 def _draw_shell(
     grid: ShellGrid,
-    placed: PlacedShell,
+    placed_shell: PlacedShell,
     height_map: HeightMap,
     classes: np.ndarray,
     max_slope_deg: float,
 ) -> bool:
     """Draw one shell, in place; return False where it lies beside the grid."""
     x, y = height_map.centers()
-    size = np.array(placed.shell.size_m)
+    size = np.array(placed_shell.shell.size_m)
     half = size[:2] / 2 + PLAN_MARGIN_M
-    reach = placed.reach_m
-    rows = np.flatnonzero(np.abs(y - placed.centre_m[1]) <= reach[1])
-    columns = np.flatnonzero(np.abs(x - placed.centre_m[0]) <= reach[0])
+    reach = placed_shell.reach_m
+    rows = np.flatnonzero(np.abs(y - placed_shell.centre_m[1]) <= reach[1])
+    columns = np.flatnonzero(np.abs(x - placed_shell.centre_m[0]) <= reach[0])
     if not (len(rows) and len(columns)):
         return False
     window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-    offsets = np.stack(np.meshgrid(x[window[1]], y[window[0]]), -1) - placed.centre_m[:2]
+    offsets = np.stack(np.meshgrid(x[window[1]], y[window[0]]), -1) - placed_shell.centre_m[:2]
     # The box stands nearly upright, so that its plan is the plan seen from above.
-    local = offsets @ placed.rotation[:2, :2]
-    sample = placed.shell.sample(local.reshape(-1, 2))
-    tilt = placed.rotation[2, :2]
+    local = offsets @ placed_shell.rotation[:2, :2]
+    sample = placed_shell.shell.sample(local.reshape(-1, 2))
+    tilt = placed_shell.rotation[2, :2]
     plan_shape = local.shape[:2]
-    z = sample.z_m.reshape(plan_shape) + local @ tilt + placed.centre_m[2]
-    slopes = (sample.slopes + tilt) @ placed.rotation[:2, :2].T
-    share = find_depth_shares(sample, max_slope_deg, placed.speed_mps).reshape(plan_shape)
+    z = sample.z_m.reshape(plan_shape) + local @ tilt + placed_shell.centre_m[2]
+    slopes = (sample.slopes + tilt) @ placed_shell.rotation[:2, :2].T
+    share = find_depth_shares(sample, max_slope_deg, placed_shell.speed_mps).reshape(plan_shape)
     is_in_box = (np.abs(local) <= size[:2] / 2).all(-1)
     is_in_margin = (np.abs(local) <= half).all(-1)
     height = height_map.height_m[window]
     covered = height_map.covered[window]
-    bottom_z = placed.centre_m[2] - size[2] / 2 + local @ tilt
+    bottom_z = placed_shell.centre_m[2] - size[2] / 2 + local @ tilt
     is_sheltered = covered & (height > np.maximum(z, bottom_z + 0.5 * size[2]) + MIN_OVERHANG_M)
     is_top = is_in_box & (share > 0) & ~is_sheltered
     is_body = covered & (height > bottom_z + MIN_BODY_HEIGHT_M) & ~is_sheltered

@@ -549,12 +549,14 @@ def find_strays(
         means = gaussians.means.numpy()[candidate_ids]
         order = np.argsort(means[:, 0], kind="stable")
         sorted_x = means[order, 0]
-        for placed in shells:
-            reach = placed.reach_m[0]
-            low, high = np.searchsorted(sorted_x, placed.centre_m[0] + np.array([-reach, reach]))
+        for placed_shell in shells:
+            reach = placed_shell.reach_m[0]
+            low, high = np.searchsorted(
+                sorted_x, placed_shell.centre_m[0] + np.array([-reach, reach])
+            )
             rows = np.sort(order[low:high])
             places = means[rows].astype(np.float64)
-            nearest_tops, is_beside, is_in_box = placed.nearest_tops(places)
+            nearest_tops, is_beside, is_in_box = placed_shell.nearest_tops(places)
             for nearest_xy, is_aside in zip(nearest_tops, is_beside, strict=True):
                 cell_ids = np.where(is_in_box, cells_under(nearest_xy), -1)
                 offset = places - cells.centers_m[cell_ids]

@@ -307,9 +307,9 @@ def find_actor_cells(
     return actor_cells
 
 
-def _surface_on_shell(placed: PlacedShell, cell_m: float, max_slope_deg: float) -> Surface:
+def _surface_on_shell(placed_shell: PlacedShell, cell_m: float, max_slope_deg: float) -> Surface:
     """Return the surface of a shell, in the frame of its box."""
-    shell = placed.shell
+    shell = placed_shell.shell
     half_m = np.array(shell.size_m[:2]) / 2 + cell_m  # a rim of cells without a layer
     half_cells = np.ceil(half_m / cell_m).astype(int)
     shape = (2 * int(half_cells[1]), 2 * int(half_cells[0]))
@@ -324,7 +324,7 @@ def _surface_on_shell(placed: PlacedShell, cell_m: float, max_slope_deg: float) 
         is_thin=np.zeros(shape, bool),
     )
     classes = np.full(shape, SemanticClass.VEHICLE, np.int16)
-    grid = draw_shells([placed], empty, classes, max_slope_deg=max_slope_deg)
+    grid = draw_shells([placed_shell], empty, classes, max_slope_deg=max_slope_deg)
     assert grid is not None
     height_map, _ = grid.put_under(empty, classes)
     return surface_of_shell(height_map, grid, floor_m=-shell.size_m[2] / 2)
