@@ -68,6 +68,7 @@ def cells_on_grid(
         track_share=flat(tracks, 0.0),
         obstacle_vectors=torch.tensor(banks).repeat(count, 1),
         semantic=torch.full((count,), int(SemanticClass.ROAD), dtype=torch.int16),
+        depth_share=flat(None, 1.0),
         hideable_ids=torch.zeros(0, dtype=torch.int32),
         covering_cells=torch.zeros(0, 5, dtype=torch.int32),
     )

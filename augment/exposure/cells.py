@@ -48,6 +48,9 @@ class ExposedCells:
     obstacle_vectors: Float32[Tensor, "C 2"]
     # Class of the surface; VEGETATION is foliage, not grass.
     semantic: Int16[Tensor, "C"]
+    # Share of a layer's depth that the surface holds, 0 to 1: less on the glass of a vehicle and on
+    # the bonnet of one that moves, 1 elsewhere.
+    depth_share: Float32[Tensor, "C"]
     # Indices of the Gaussians that a layer on the cells can hide.
     hideable_ids: Int32[Tensor, "B"]
     # Cells over each of these Gaussians: at its middle, and at 1.5 standard deviations along its

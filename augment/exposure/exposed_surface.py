@@ -24,6 +24,7 @@ from torch import Tensor
 from augment.errors import SceneError
 from augment.exposure.cells import FLUSH, ExposedCells, ExposedSurface
 from augment.exposure.search import ExposureSettings, find_exposed_surface
+from augment.exposure.vehicle_cells import parked_vehicles
 from augment.memo import memo_of
 from augment.output.atomic import write_atomic
 from augment.render.buffers import AUTO, CUDA
@@ -34,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 # Name of the file format. Its number goes up whenever the same scene would give another exposed
 # surface, or a file would hold it otherwise.
-FORMAT = "climategs-exposed-surface-8"
+FORMAT = "climategs-exposed-surface-9"
 _METADATA_KEY = "exposed_surface"  # key of the metadata in a file
 # Pattern of the names that files had up to version 7 of the format, which nobody reads any more.
 # They were named after their first user.
@@ -63,9 +64,9 @@ def exposed_surface_key(
 ) -> str:
     """Return a hex digest of everything that an exposed surface depends on.
 
-    That is Gaussians, tracks, cameras, poses, settings, the backend that finds it (the GPU rounds
-    otherwise than the CPU), and the version of this code. Of colours, it covers those that all
-    directions share. The order of the cameras counts.
+    That is Gaussians, tracks, boxes of parked vehicles, cameras, poses, settings, the backend that
+    finds it (the GPU rounds otherwise than the CPU), and the version of this code. Of colours, it
+    covers those that all directions share. The order of the cameras counts.
     """
     digest = hashlib.blake2b(FORMAT.encode(), digest_size=20)
     if backend == CUDA:
@@ -76,6 +77,9 @@ def exposed_surface_key(
         digest.update(repr((actor.track_id, actor.label, actor.size_m)).encode())
         _add_gaussians(digest, actor.gaussians)
         _add_tensors(digest, actor.track.timestamps_ns, actor.track.world_from_actor)
+    for vehicle in parked_vehicles(scene):
+        digest.update(repr((vehicle.label, vehicle.size_m)).encode())
+        digest.update(np.concatenate([vehicle.centre_m, vehicle.rotation.ravel()]).tobytes())
     for camera in cameras:
         numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         camera_values = (camera.name, *numbers, camera.timestamp_ns, camera.is_orthographic)

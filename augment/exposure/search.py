@@ -9,7 +9,8 @@ Input: a `Scene`, the cameras that must see the surfaces, `ExposureSettings`. Ou
 3. `_GroundSearch.find` works on one square of tiles at a time, each with a margin: it renders the
    square from above, closes holes, separates the surfaces, selects the cells that a camera sees,
    and finds their light, wheel tracks and obstacles.
-4. `find_actor_cells` does the same for each vehicle, in the vehicle's own frame.
+4. `find_actor_cells` finds the cells of each moving vehicle, in the vehicle's own frame. Shells
+   (`vehicle_shell`) are the surface of vehicles whose form is known, parked ones among them.
 5. `_GroundSearch.join` links neighbouring cells across squares and finds the Gaussians that a
    layer on the cells can hide.
 """
@@ -27,7 +28,12 @@ import torch
 
 from augment.exposure.cells import FLUSH, MAX_EDGE_DISTANCE_M, ExposedCells, ExposedSurface
 from augment.exposure.foliage import BARE_CLASSES, separate_foliage
-from augment.exposure.ground_light import ground_luminance, relative_light
+from augment.exposure.ground_light import (
+    MAX_RELATIVE_LIGHT,
+    MIN_RELATIVE_LIGHT,
+    ground_luminance,
+    relative_light,
+)
 from augment.exposure.height_map import (
     DepthEstimator,
     Footprints,
@@ -41,11 +47,11 @@ from augment.exposure.height_map import (
     top_of,
 )
 from augment.exposure.holes import fill_holes
+from augment.exposure.shell_grid import PlacedShell, ShellGrid, draw_shells
 from augment.exposure.surface import (
     CellList,
     Surface,
     cells_at,
-    find_actor_cells,
     find_narrow_things,
     find_obstacle_vectors,
     find_surface,
@@ -64,6 +70,7 @@ from augment.exposure.tiles import (
     plan_tiles,
     views_along,
 )
+from augment.exposure.vehicle_cells import find_actor_cells, parked_vehicles, shells_of_parked
 from augment.exposure.wheel_tracks import WheelPath, draw_tracks, find_wheel_paths
 from augment.light.cast_shadows import CastShadows, shadows_of
 from augment.progress import ProgressBar
@@ -168,6 +175,7 @@ def find_exposed_surface(
             paths,
             settings,
             shadows_of(scene),
+            shells_of_parked(parked_vehicles(scene), background),
             backend,
         )
         map_in_order = functools.partial(in_order, after_each=after_each, backend=backend)
@@ -217,12 +225,14 @@ class _GroundSearch:
         paths: tuple[WheelPath, ...],
         settings: ExposureSettings,
         shadows: CastShadows | None,
+        shells: tuple[PlacedShell, ...],
         backend: str,
     ) -> None:
         self._background = background
         self._parked_actors = parked
         self._plan = plan
         self._shadows = shadows
+        self._shells = shells
         self._views = views
         self._paths = paths
         self._settings = settings
@@ -236,11 +246,18 @@ class _GroundSearch:
         """Return the cells of one window of a level; None where it has none."""
         square = _with_margin(self._plan, *level_and_window)
         height_map, classes, candidate_mask, filled_mask = self._draw(square)
+        max_slope_deg = self._settings.max_slope_deg
+        shells = draw_shells(self._shells, height_map, classes, max_slope_deg=max_slope_deg)
+        if shells is not None:
+            height_map, classes = shells.put_under(height_map, classes)
+            candidate_mask = candidate_mask | shells.is_top
+            filled_mask = filled_mask | shells.is_top  # a shell is sure of its surface
         surface = find_surface(
             height_map,
             candidate_mask,
-            max_slope_deg=self._settings.max_slope_deg,
+            max_slope_deg=max_slope_deg,
             on_vehicles=candidate_mask & (classes == SemanticClass.VEHICLE),
+            shells=shells,
         )
         classes = separate_foliage(surface, classes)
         visible_mask = self._visible_cells(surface, square, filled_mask)
@@ -252,7 +269,9 @@ class _GroundSearch:
             rows,
             columns,
             sides=_side_codes(surface, visible_mask & square.level_mask),
-            luminance=ground_luminance(height_map, classes, surface.is_exposed),
+            luminance=_luminance_without_paint(
+                ground_luminance(height_map, classes, surface.is_exposed), shells
+            ),
             track_share=draw_tracks(self._paths, surface, classes),
             obstacle_vectors=find_obstacle_vectors(surface),
             classes=classes,
@@ -276,7 +295,13 @@ class _GroundSearch:
         if self._shadows is not None and self._shadows.certainty > 0:
             in_light = self._shadows.light_at(cells.centers_m.astype(np.float64))
         light = relative_light(cells.luminance, cells.semantic, in_light)
-        return make_cells(cells, light, numbers.at, self._background)
+        if in_light is not None:  # the paint of vehicles tells nothing about the light
+            is_in_known_light = np.isnan(cells.luminance) & np.isfinite(in_light)
+            is_in_known_light &= cells.semantic == SemanticClass.VEHICLE
+            light[is_in_known_light] = np.clip(
+                in_light[is_in_known_light], MIN_RELATIVE_LIGHT, MAX_RELATIVE_LIGHT
+            )
+        return make_cells(cells, light, numbers.at, self._background, self._shells)
 
     def _draw(self, square: _Square) -> tuple[HeightMap, np.ndarray, np.ndarray, np.ndarray]:
         """Render a square from above.
@@ -348,6 +373,11 @@ class _GroundSearch:
         )
         side = 2 * _VISIBLE_MARGIN_CELLS + 1
         return cv2.dilate(visible_mask, np.ones((side, side), np.uint8)).astype(bool)
+
+
+def _luminance_without_paint(luminance: np.ndarray, shells: ShellGrid | None) -> np.ndarray:
+    """Return the luminance with NaN on vehicles: their paint tells nothing about the light."""
+    return luminance if shells is None else np.where(shells.is_plan, np.float32(np.nan), luminance)
 
 
 def _with_margin(plan: TilePlan, level: int, window: Window) -> _Square:

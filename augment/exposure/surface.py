@@ -2,7 +2,7 @@
 
 Input: a `HeightMap` of one square, seen from above. Output: a `Surface` with slopes, sides and
 distances to open edges; `CellList` arrays of its cells; `ExposedCells`, the finished record.
-Callers: `search` for the background, and `find_actor_cells` here for a vehicle.
+Callers: `search` for the background, `vehicle_cells` for a vehicle.
 """
 
 from __future__ import annotations
@@ -19,22 +19,13 @@ import torch
 
 from augment.exposure import surface_kernels
 from augment.exposure.cells import FLUSH, MAX_EDGE_DISTANCE_M, ExposedCells
-from augment.exposure.height_map import (
-    DepthEstimator,
-    Footprints,
-    HeightMap,
-    classes_of,
-    draw_from_above,
-    in_order,
-    plain_gaussians,
-    slices_of,
-)
-from augment.exposure.surface_kernels import LINK, RISES
-from augment.render.buffers import AUTO
+from augment.exposure.height_map import HeightMap, classes_of, in_order, slices_of
+from augment.exposure.shell_grid import VEHICLE_MAX_SLOPE_DEG, PlacedShell, ShellGrid
+from augment.exposure.surface_kernels import LINK
 from augment.render.threads import kernel_threads
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.labels import EGO_VEHICLE
-from augment.scene.scene import Actor, Gaussians, PosedGaussians
+from augment.scene.scene import Actor, Gaussians
 from augment.scene.semantics import SemanticClass, class_of_label
 
 MAX_STEP_M = 0.25  # lower steps, such as kerbs, do not break a layer
@@ -76,6 +67,7 @@ class Surface:
     is_exposed: np.ndarray  # bool, the cell can hold a layer
     sides: np.ndarray  # int8 [H, W, 4], see surface_kernels.compare_sides
     edge_distance_m: np.ndarray  # float32, see ExposedCells.edge_distance_m
+    shells: ShellGrid | None = None  # shells of vehicles, which are the surface where they lie
 
 
 def find_surface(
@@ -86,6 +78,7 @@ def find_surface(
     min_area_m2: float = MIN_AREA_M2,
     floor_m: float | None = None,
     on_vehicles: np.ndarray,
+    shells: ShellGrid | None = None,
 ) -> Surface:
     """Find the surface of a map, and its exposed cells.
 
@@ -98,7 +91,11 @@ def find_surface(
         floor_m: z of what the map does not show. None: z is low there, except in small gaps.
         on_vehicles: bool [H, W], cells that show a vehicle's body, see `_close_vehicle_tops` and
             `_is_vehicle_top`.
+        shells: shells of vehicles, which are the surface where they lie; None without any. The
+            height map has their heights already.
     """
+    if shells is not None:
+        on_vehicles = on_vehicles & ~shells.is_plan
     height_map = _close_vehicle_tops(height_map, on_vehicles)
     cell = height_map.cell_m
     covered = height_map.covered.copy()
@@ -144,6 +141,8 @@ def find_surface(
     is_exposed &= ~on_vehicles | _is_vehicle_top(
         fitted_m, covered, is_exposed & on_vehicles, max_slope_rad, cell
     )
+    if shells is not None:
+        shells.put_on(fitted_m, slopes, is_exposed)
     max_step_m = max(MAX_STEP_M, math.tan(max_slope_rad) * cell)
     sides = _compare_sides(fitted_m, lowest, covered, is_exposed, max_step_m)
     min_cells = max(MIN_CELLS, math.ceil(min_area_m2 / cell**2))
@@ -154,13 +153,31 @@ def find_surface(
     filled_mask = _fill_pockets(fitted_m, slopes, is_exposed, covered, cell)
     is_exposed |= filled_mask
     covered |= filled_mask
+    if shells is not None:
+        shells.put_on(fitted_m, slopes, is_exposed)
     sides = _compare_sides(fitted_m, lowest, covered, is_exposed, max_step_m)
-    edges = np.empty(shape, np.float32)
-    with kernel_threads(_ROWS_PER_TASK):
-        surface_kernels.edge_distances(
-            is_exposed, sides, max(MAX_EDGE_DISTANCE_M / cell, 0.5), edges
-        )
-    return Surface(height_map, fitted_m, slopes, is_exposed, sides, edges * np.float32(cell))
+    edges = _edge_distances(is_exposed, sides, cell)
+    return Surface(height_map, fitted_m, slopes, is_exposed, sides, edges, shells)
+
+
+def surface_of_shell(
+    height_map: HeightMap, shells: ShellGrid, floor_m: float, max_step_m: float = MAX_STEP_M
+) -> Surface:
+    """Return the surface of vehicles alone, on a map that holds their shells.
+
+    Args:
+        height_map: map with the shells' heights.
+        shells: the shells.
+        floor_m: z of what lies beside them.
+        max_step_m: largest step between linked cells.
+    """
+    cell = height_map.cell_m
+    covered = height_map.covered
+    height = np.where(covered, height_map.height_m, np.float32(floor_m))
+    lowest, _ = _local_range(height, covered, np.float32(floor_m), cell)
+    sides = _compare_sides(height, lowest, covered, shells.is_top, max_step_m)
+    edges = _edge_distances(shells.is_top, sides, cell)
+    return Surface(height_map, height, shells.slopes, shells.is_top, sides, edges, shells)
 
 
 def find_narrow_things(height_map: HeightMap, is_candidate: np.ndarray) -> np.ndarray:
@@ -268,6 +285,16 @@ def _compare_sides(
     return sides
 
 
+def _edge_distances(is_exposed: np.ndarray, sides: np.ndarray, cell: float) -> np.ndarray:
+    """Return the distances to open edges, float32 [H, W], see ExposedCells.edge_distance_m."""
+    edges = np.empty(is_exposed.shape, np.float32)
+    with kernel_threads(_ROWS_PER_TASK):
+        surface_kernels.edge_distances(
+            is_exposed, sides, max(MAX_EDGE_DISTANCE_M / cell, 0.5), edges
+        )
+    return edges * np.float32(cell)
+
+
 def _find_specks(
     is_exposed: np.ndarray,
     sides: np.ndarray,
@@ -305,7 +332,6 @@ def _find_specks(
 
 # ---- Vehicles: a reconstruction leaves shells, tufts and slivers on their sides ------------------
 
-VEHICLE_MAX_SLOPE_DEG = 38.0  # wind screens hold a layer, side and rear windows do not
 _MAX_SHELL_GAP_M = 0.3  # narrower dips in a roof or bonnet are gaps between shells
 _BODY_BLUR_M = 0.1  # standard deviation of the blur with which slopes of bodies are measured
 _MIN_STRIP_WIDTH_M = 0.3  # narrower strips are sills, mirrors and the rims of doors
@@ -401,6 +427,8 @@ def _gradient(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 HIDEABLE_DEPTH_M = 0.5  # depth below the surface down to which Gaussians can be hidden
 HIDEABLE_HEIGHT_M = 0.08  # height above it up to which they can be hidden; half a cell at least
+# The same depth below a vehicle's shell: its rear window may stand close below a spoiler.
+SHELL_HIDEABLE_DEPTH_M = 0.06
 # Largest angle between a flat Gaussian's normal and the surface's.
 MAX_FACING_ANGLE_RAD = math.radians(40)
 _MAX_FLATNESS = 0.5  # largest ratio of the shortest axis to the next one, of a flat Gaussian
@@ -449,7 +477,8 @@ def _find_hideable_slice(
     rise = (offset * normals[cell_ids]).sum(1) / normals[
         cell_ids, 2
     ]  # above the cell's plane, along z
-    is_near = (rise > -HIDEABLE_DEPTH_M) & (
+    hideable_depth_m = np.where(cells.is_shell[cell_ids], SHELL_HIDEABLE_DEPTH_M, HIDEABLE_DEPTH_M)
+    is_near = (rise > -hideable_depth_m) & (
         rise < np.maximum(HIDEABLE_HEIGHT_M, cells.sizes_m[cell_ids] / 2)
     )
     index = index[is_near]
@@ -485,11 +514,70 @@ def _find_hideable_slice(
     ].astype(np.int32)
 
 
+# Standing things that lean into a vehicle's box, and the ground below it, do not stray.
+_FIXED_CLASSES = tuple(
+    SemanticClass[n]
+    for n in (
+        *("ROAD", "LANE_MARKING", "SIDEWALK", "TERRAIN"),
+        *("VEGETATION", "BUILDING", "POLE", "SIGN", "PEDESTRIAN"),
+    )
+)
+_MAX_STRAY_SCALE_M = 0.12  # longest axis of a Gaussian that strays; larger ones are no stray
+_MAX_STRAY_HEIGHT_M = 0.2  # height above a shell up to which Gaussians stray
+_MIN_STRAY_HEIGHT_M = 0.02  # height above a shell from which on they do
+_MIN_STRAY_HEIGHT_BESIDE_M = -0.04  # the same beside a roof or bonnet, over its edge
+
+
+def find_strays(
+    gaussians: Gaussians, shells: Sequence[PlacedShell], cells_under: CellsUnder, cells: CellList
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the Gaussians that float over a shell or beside its edges, within the vehicle's box.
+
+    Nothing of a vehicle is there but rails and aerials. A reconstruction leaves noise there, which
+    would lie before the layer.
+
+    Returns:
+        Ids of the Gaussians int32 [B], in order, and covering cells int32 [B, 5], five times the
+        cell below or next to each, see ExposedCells.
+    """
+    found_ids = [np.zeros(0, np.int64)]
+    found_cells = [np.zeros(0, np.int32)]
+    if len(cells.sizes_m) and len(shells):
+        is_fixed = np.isin(classes_of(gaussians), _FIXED_CLASSES)
+        is_small = gaussians.scales.numpy().max(1) < _MAX_STRAY_SCALE_M
+        candidate_ids = np.flatnonzero(is_small & ~is_fixed)
+        means = gaussians.means.numpy()[candidate_ids]
+        order = np.argsort(means[:, 0], kind="stable")
+        sorted_x = means[order, 0]
+        for placed_shell in shells:
+            reach = placed_shell.reach_m[0]
+            low, high = np.searchsorted(
+                sorted_x, placed_shell.centre_m[0] + np.array([-reach, reach])
+            )
+            rows = np.sort(order[low:high])
+            places = means[rows].astype(np.float64)
+            nearest_tops, is_beside, is_in_box = placed_shell.nearest_tops(places)
+            for nearest_xy, is_aside in zip(nearest_tops, is_beside, strict=True):
+                cell_ids = np.where(is_in_box, cells_under(nearest_xy), -1)
+                offset = places - cells.centers_m[cell_ids]
+                offset[:, :2] = nearest_xy - cells.centers_m[cell_ids, :2]
+                normals = cells.normals[cell_ids]
+                rise = (offset * normals).sum(1) / normals[:, 2]
+                lowest = np.where(is_aside, _MIN_STRAY_HEIGHT_BESIDE_M, _MIN_STRAY_HEIGHT_M)
+                is_stray = (cell_ids >= 0) & cells.is_shell[cell_ids]
+                is_stray &= (rise > lowest) & (rise < _MAX_STRAY_HEIGHT_M)
+                found_ids.append(candidate_ids[rows[is_stray]])
+                found_cells.append(cell_ids[is_stray])
+    ids, first = np.unique(np.concatenate(found_ids), return_index=True)
+    covering = np.concatenate(found_cells)[first]
+    return ids.astype(np.int32), np.repeat(covering[:, None], 5, 1).astype(np.int32)
+
+
 # ---- Cells of grids, joined list by list, and made into a record ---------------------------------
 
 
 class CellList(NamedTuple):
-    """Cells of some grid: C rows of arrays, with the fields of ExposedCells and two others."""
+    """Cells of some grid: C rows of arrays, with the fields of ExposedCells and three others."""
 
     centers_m: np.ndarray
     normals: np.ndarray
@@ -501,6 +589,8 @@ class CellList(NamedTuple):
     track_share: np.ndarray
     obstacle_vectors: np.ndarray
     semantic: np.ndarray
+    depth_share: np.ndarray
+    is_shell: np.ndarray  # bool [C], the surface is the shell of a vehicle
 
     @staticmethod
     def joined(lists: Sequence[CellList]) -> CellList:
@@ -525,6 +615,8 @@ class CellList(NamedTuple):
             no_values,
             no_pairs,
             semantic,
+            no_values,
+            np.zeros(0, bool),
         )
 
 
@@ -556,6 +648,12 @@ def cells_at(
         if obstacle_vectors is None
         else obstacle_vectors[index],
         semantic=classes[index],
+        depth_share=np.ones(num_cells, np.float32)
+        if surface.shells is None
+        else surface.shells.depth_share[index],
+        is_shell=np.zeros(num_cells, bool)
+        if surface.shells is None
+        else surface.shells.is_top[index],
     )
 
 
@@ -574,15 +672,31 @@ def _link_slice(
 
 
 def make_cells(
-    cells: CellList, light: np.ndarray, cells_under: CellsUnder, gaussians: Gaussians
+    cells: CellList,
+    light: np.ndarray,
+    cells_under: CellsUnder,
+    gaussians: Gaussians,
+    shells: Sequence[PlacedShell] = (),
 ) -> ExposedCells:
-    """Make the record of cells: link neighbours by their places, and find the Gaussians below."""
+    """Make the record of cells: link neighbours by their places, and find the Gaussians below.
+
+    Args:
+        cells: the cells.
+        light: light on them, float32 [C].
+        cells_under: function that finds the cells under points.
+        gaussians: Gaussians of the part.
+        shells: shells of vehicles in the part's frame; Gaussians that stray about them are hidden.
+    """
     neighbours = cells.sides.astype(np.int32)
     in_order(
         lambda part: _link_slice(cells, cells_under, part, neighbours[part]),
         slices_of(len(cells.sizes_m)),
     )
     hideable_ids, covering_cells = find_hideable(gaussians, cells_under, cells)
+    stray_ids, cells_beside = find_strays(gaussians, shells, cells_under, cells)
+    is_further = ~np.isin(stray_ids, hideable_ids)
+    hideable_ids = np.concatenate([hideable_ids, stray_ids[is_further]])
+    covering_cells = np.concatenate([covering_cells, cells_beside[is_further]])
     return ExposedCells(
         centers_m=torch.from_numpy(cells.centers_m.astype(np.float32)),
         normals=torch.from_numpy(cells.normals),
@@ -593,23 +707,15 @@ def make_cells(
         track_share=torch.from_numpy(cells.track_share),
         obstacle_vectors=torch.from_numpy(cells.obstacle_vectors),
         semantic=torch.from_numpy(cells.semantic),
+        depth_share=torch.from_numpy(cells.depth_share),
         hideable_ids=torch.from_numpy(hideable_ids),
         covering_cells=torch.from_numpy(covering_cells),
     )
 
 
-# ---- Vehicles: cells in their own frames, which move along as they drive -------------------------
+# ---- Vehicles among the actors -------------------------------------------------------------------
 
-MAX_CELL_M = 0.05  # largest side of a vehicle's cells
-MIN_ACTOR_AREA_M2 = 0.3  # least area of all cells of a vehicle; less is not worth a layer
 MIN_TRAVEL_M = 0.5  # an actor that goes less far than this is parked
-# Steepest slope that holds a layer on a moving vehicle: drivers clear their windows, and a steeper
-# layer slides off.
-MOVING_MAX_SLOPE_DEG = 25.0
-# Height of the box's bottom part, which holds wheels and the shadow on the road.
-_WHEEL_HEIGHT_M = 0.25
-_BOX_MARGIN_M = 0.3  # margin about the box, for mirrors and for boxes that are too small
-_MIN_PATCH_M2 = 0.15  # least area of a vehicle's patch
 _GROUND_CLASSES = tuple(SemanticClass[n] for n in ("ROAD", "LANE_MARKING", "SIDEWALK", "TERRAIN"))
 
 
@@ -632,106 +738,3 @@ def is_moving(actor: Actor) -> bool:
     """Tell if an actor goes anywhere during the drive."""
     positions = actor.track.world_from_actor[:, :3, 3]
     return bool(((positions - positions[0]).norm(dim=1) > MIN_TRAVEL_M).any())
-
-
-def find_actor_cells(
-    actor: Actor,
-    *,
-    cell_m: float,
-    max_slope_deg: float,
-    estimator: DepthEstimator,
-    backend: str = AUTO,
-) -> ExposedCells | None:
-    """Find the cells on a vehicle, in its own frame; None where it has too few to hold a layer.
-
-    All cells on its outline have open edges, since the surface falls away there.
-
-    Args:
-        actor: the vehicle.
-        cell_m: side of the cells; MAX_CELL_M at most.
-        max_slope_deg: steeper surfaces hold no layer.
-        estimator: depth buffer that heights are taken from.
-        backend: backend that renders the vehicle from above.
-    """
-    cell_side_m = min(cell_m, MAX_CELL_M)
-    gaussians = plain_gaussians(actor.gaussians)
-    half_size_m = np.array(actor.size_m[:2]) / 2 + _BOX_MARGIN_M
-    if not (np.isfinite(half_size_m).all() and (half_size_m < 100).all()):
-        return None
-    classes = classes_of(gaussians)
-    body_mask = ~np.isin(classes, _GROUND_CLASSES)
-    body_mask &= gaussians.means.numpy()[:, 2] > _WHEEL_HEIGHT_M - actor.size_m[2] / 2
-    body_ids = np.intersect1d(
-        Footprints(gaussians).in_box(-half_size_m, half_size_m), np.flatnonzero(body_mask)
-    )
-    if len(body_ids) == 0:
-        return None
-    half_size_cells = np.ceil(half_size_m / cell_side_m).astype(int)
-    shape = (2 * int(half_size_cells[1]), 2 * int(half_size_cells[0]))
-    body = gaussians.select(_index_tensor(body_ids))
-    height_map = draw_from_above(
-        [PosedGaussians(body)],
-        corner_m=(
-            -cell_side_m * float(half_size_cells[0]),
-            -cell_side_m * float(half_size_cells[1]),
-        ),
-        cell_m=cell_side_m,
-        shape=shape,
-        estimator=estimator,
-        with_thin=False,
-        backend=backend,
-    )
-    bottom_z_m = np.float32(_WHEEL_HEIGHT_M - actor.size_m[2] / 2)
-    max_slope = min(max_slope_deg, MOVING_MAX_SLOPE_DEG) if is_moving(actor) else max_slope_deg
-    is_body = height_map.height_m > bottom_z_m
-    is_body[[0, -1]] = is_body[:, [0, -1]] = (
-        False  # open edges all round, also where the body is cut off
-    )
-    height_map = dataclasses.replace(
-        height_map, alpha=np.where(is_body, height_map.alpha, np.float32(0))
-    )
-    surface = find_surface(
-        height_map,
-        is_body,
-        max_slope_deg=max_slope,
-        min_area_m2=_MIN_PATCH_M2,
-        floor_m=float(bottom_z_m),
-        on_vehicles=is_body,
-    )
-    rows, columns = np.nonzero(surface.is_exposed)
-    if len(rows) * cell_side_m**2 < MIN_ACTOR_AREA_M2:
-        return None
-    grid = surface.map
-    body_classes = classes[body_ids]
-    cell_classes = np.where(
-        grid.ids >= 0, body_classes[np.maximum(grid.ids, 0)], SemanticClass.VEHICLE
-    )
-    lookup = _grid_lookup(grid, rows, columns)
-    sides = np.where(surface.sides == RISES, FLUSH, surface.sides)
-    cells = cells_at(surface, rows, columns, sides=sides, classes=cell_classes.astype(np.int16))
-    actor_cells = make_cells(cells, np.ones(len(rows), np.float32), lookup, body)
-    actor_cells.hideable_ids.copy_(_index_tensor(body_ids)[actor_cells.hideable_ids.long()])
-    return actor_cells
-
-
-def _index_tensor(numbers: np.ndarray) -> torch.Tensor:
-    """Return an index tensor of an array."""
-    return torch.from_numpy(np.ascontiguousarray(numbers))
-
-
-def _grid_lookup(grid: HeightMap, rows: np.ndarray, columns: np.ndarray) -> CellsUnder:
-    """Return the lookup for a single grid that has cells at rows and columns [C]."""
-    corner = np.array([grid.left_m, grid.bottom_m])
-    numbers: np.ndarray = np.full(grid.alpha.shape, -1, np.int32)
-    numbers[rows, columns] = np.arange(len(rows), dtype=np.int32)
-
-    def cells_under(xy: np.ndarray) -> np.ndarray:
-        """Return the indices of the cells under points [P, 2]; -1 where there is no cell."""
-        grid_places = np.floor((xy - corner) / grid.cell_m)
-        is_inside = ((grid_places >= 0) & (grid_places < numbers.shape[::-1])).all(1)
-        cell_ids = np.full(len(xy), -1, np.int32)
-        indices = grid_places[is_inside].astype(np.int64)
-        cell_ids[is_inside] = numbers[indices[:, 1], indices[:, 0]]
-        return cell_ids
-
-    return cells_under

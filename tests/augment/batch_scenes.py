@@ -245,6 +245,7 @@ def make_bed(x_m: float) -> ExposedSurface:
         track_share=torch.zeros(1),
         obstacle_vectors=torch.zeros(1, 2),
         semantic=torch.zeros(1, dtype=torch.int16),
+        depth_share=torch.ones(1),
         hideable_ids=torch.zeros(0, dtype=torch.int32),
         covering_cells=torch.zeros(0, 5, dtype=torch.int32),
     )

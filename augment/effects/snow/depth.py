@@ -3,7 +3,8 @@
 Input: cells, the recipe's snow and a seed. The result depends on nothing else. `define_depths` is
 the definition, and `find_depths` launches its kernel. Callers: `layer` and `lidar`. The depth is
 
-h = depth * drift(x, y) * shoulder(edge), less in wheel tracks, and 0 between patches and by water.
+h = depth * drift(x, y) * shoulder(edge), less in wheel tracks and on the glass of vehicles, and 0
+between patches and by water.
 
 - drift = exp(noise), whose median is 1, times the height that the wind piles up before obstacles.
 - shoulder: at an open edge the layer is rounded like a pillow, a quarter of a circle.
@@ -206,7 +207,7 @@ def define_depths(cells: ExposedCells, profile: DepthProfile) -> np.ndarray:
         & (above_water > 0)
         & (~is_foliage | _is_fleck(profile.patches, x_m, y_m))
     )
-    return np.where(has_snow, depths, 0.0)
+    return _held_depths(cells, np.where(has_snow, depths, 0.0))
 
 
 def _is_fleck(patches: Octaves, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
@@ -265,7 +266,15 @@ def find_depths(cells: ExposedCells, profile: DepthProfile, seed: np.uint64) -> 
             seed,
             depths,
         )
-    return depths
+    return depths._replace(depths_m=_held_depths(cells, depths.depths_m))
+
+
+def _held_depths(cells: ExposedCells, depths_m: np.ndarray) -> np.ndarray:
+    """Return the depths that the surface holds, see ExposedCells.depth_share."""
+    share = cells.depth_share.numpy()
+    held_m = depths_m * share
+    is_bare = (share < 1) & (held_m < layer_kernels.MIN_DEPTH_M)
+    return np.where(is_bare, 0, held_m).astype(depths_m.dtype)
 
 
 def as_arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
