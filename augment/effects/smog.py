@@ -43,6 +43,7 @@ from augment.light.cast_shadows import (
 from augment.output.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
+from augment.render.linear_airlight import mix_linear_light
 from augment.render.scatter import scatter_forward
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes, pixels_of_boxes
 from augment.scene.cameras import Camera
@@ -59,6 +60,7 @@ PER_GAUSSIAN = "smog per Gaussian"
 ON_BUFFERS = "smog on buffers"
 ELEVATION = "airlight by elevation"
 SKY = "sky"
+LINEAR_LIGHT = "airlight in linear light"
 SCATTER = "forward scatter"
 SHADOWS = "shadows in smog"
 
@@ -83,6 +85,9 @@ class SmogPlan:
 
     sun: float = 1.0
     """Share of the sun's light that arrives at the ground; 1 leaves shadows as they are."""
+
+    is_linear: bool = False
+    """If True, the airlight of the finished picture is mixed in linear light."""
 
 
 class SmogEffect(Effect):
@@ -116,8 +121,8 @@ class SmogEffect(Effect):
         if fog is None:
             drawing_steps = skipped_steps((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason)
             shadow_steps = skipped_steps((SHADOWS,), reason, SCENE)
-            scatter_steps = skipped_steps((SCATTER,), reason, PICTURE)
-            return EffectPlan(None, (*shadow_steps, *drawing_steps, *scatter_steps))
+            picture_steps = skipped_steps((LINEAR_LIGHT, SCATTER), reason, PICTURE)
+            return EffectPlan(None, (*shadow_steps, *drawing_steps, *picture_steps))
         is_common = recipe.render.exposure == "common" and scene.common_color_map is not None
         if is_common:
             reason += "; one airlight for all cameras, by the mean of their exposures"
@@ -130,6 +135,7 @@ class SmogEffect(Effect):
         if fog.scale_height_m is None:
             sky = Step(SKY, False, "uniform smog hides it: the airlight colour stands for it")
         sun, shadow_reason = _sun_in(fog, smog, scene)
+        is_linear = smog.blend == "linear"
         steps = (
             Step(SHADOWS, sun < 1, shadow_reason, SCENE),
             Step(PER_GAUSSIAN, not on_buffers, other_reason if on_buffers else reason),
@@ -140,12 +146,13 @@ class SmogEffect(Effect):
                 f"weather.smog.overcast is {fog.elevation_gain:g}",
             ),
             sky,
+            Step(LINEAR_LIGHT, is_linear, f"weather.smog.blend is {smog.blend}", PICTURE),
             Step(SCATTER, smog.scatter > 0, f"weather.smog.scatter is {smog.scatter:g}", PICTURE),
         )
         buffers = {EXPECTED_DEPTH} if on_buffers or fog.elevation_gain > 0 else set[str]()
-        if smog.scatter > 0:
+        if smog.scatter > 0 or is_linear:
             buffers.add(MEDIAN_DEPTH)  # which costs nothing where depth images are written
-        data = SmogPlan(fog, on_buffers, is_common, smog.scatter, sun)
+        data = SmogPlan(fog, on_buffers, is_common, smog.scatter, sun, is_linear)
         return EffectPlan(data, steps, frozenset(buffers))
 
     def prepare(self, effect: EffectInScene) -> FadedShadows | None:
@@ -174,17 +181,25 @@ class SmogEffect(Effect):
         return replace(layers, fog=fog, applies_fog_to_buffers=effect.settings.on_buffers)
 
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
-        if effect.settings.scatter == 0:
+        settings = effect.settings
+        if settings.scatter == 0 and not settings.is_linear:
             return view
         alpha = view.raster.alpha
         depth = view.raster.median_depth
         assert alpha is not None and depth is not None
-        fog = effect.settings.fog
-        scatter = effect.settings.scatter
-        with timed(SCATTER):
-            rgb = scatter_forward(
-                view.rgb, alpha, depth, camera, fog, scatter, backend=effect.backend
-            )
+        rgb = view.rgb
+        if settings.is_linear:
+            # The airlight as the layers have it, in the camera's exposure.
+            fog = view.layers.fog or settings.fog
+            with timed(LINEAR_LIGHT):
+                rgb = mix_linear_light(rgb, alpha, depth, camera, fog, backend=effect.backend)
+        if settings.scatter > 0:
+            fog = settings.fog
+            strength = settings.scatter
+            with timed(SCATTER):
+                rgb = scatter_forward(
+                    rgb, alpha, depth, camera, fog, strength, backend=effect.backend
+                )
         return replace(view, rgb=rgb)
 
     def measure_boxes(

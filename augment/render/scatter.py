@@ -96,7 +96,7 @@ def scatter_forward(
     levels = max(0, min(NUM_LEVELS, int(math.log2(min(size))) - 1))
     shares = level_shares(DIFFRACTION_RAD * camera.fx / factor)[: levels + 1]
     if choose_kernels(backend, rgb, alpha, depth) == CPU:
-        weight = _scattered_share(alpha, depth, camera, fog, strength)
+        weight = _scattered_share_by_kernel(alpha, depth, camera, fog, strength)
         return _exchange_light(rgb, weight, size, shares)
     weight = _scattered_share_by_torch(alpha, depth, camera, fog, strength)[..., None]
     small_rgb = _resize(rgb, size)
@@ -142,7 +142,25 @@ def _exchange_light(
     return torch.from_numpy(sharp_rgb)
 
 
-def _scattered_share(
+def scattered_share(
+    alpha: Float[Tensor, "H W"],
+    depth: Float[Tensor, "H W"],
+    camera: Camera,
+    fog: Fog,
+    strength: float = 1.0,
+    *,
+    backend: str = AUTO,
+) -> Float[Tensor, "H W"]:
+    """Return 1 - exp(-strength tau) of every pixel; at strength 1 it is the fog's share.
+
+    The arguments are those of `scatter_forward`. A pixel is the mean of its surfaces and its sky.
+    """
+    if choose_kernels(backend, alpha, depth) == CPU:
+        return torch.from_numpy(_scattered_share_by_kernel(alpha, depth, camera, fog, strength))
+    return _scattered_share_by_torch(alpha, depth, camera, fog, strength)
+
+
+def _scattered_share_by_kernel(
     alpha: Tensor, depth: Tensor, camera: Camera, fog: Fog, strength: float
 ) -> Float32[np.ndarray, "H W"]:
     """Return `_scattered_share_by_torch`, by a kernel."""

@@ -30,11 +30,11 @@ def digest(templates: list[RecipeTemplate], num_variants: int) -> str:
 
 PRESETS = {
     "blizzard": "18e900c8ba7012e2",
-    "brown-smog": "0ff797de8cc6277e",
+    "brown-smog": "8decc4c09550077a",
     "clear": "1e1fd554a7f9ba30",
     "deep-flood": "960c1c744bff6617",
     "deep-snow": "22022722fefe7740",
-    "dense-fog": "01aad84d12c08b27",
+    "dense-fog": "d881a8e9a91dfdba",
     "downpour": "568fe3732cde5b26",
     "drizzle": "8c832df0db003d51",
     "dusting": "27448a9db136a29e",
@@ -49,7 +49,7 @@ PRESETS = {
     "storm": "b93e206ac51504d1",
     "street-flood": "57bcd16a1256403d",
     "winter-day": "dc738d7355359818",
-    "winter-fog": "ff7064f7dbe9767b",
+    "winter-fog": "04d46fd0a8855c77",
 }
 
 
