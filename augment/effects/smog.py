@@ -44,7 +44,7 @@ from augment.output.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
 from augment.render.linear_airlight import mix_linear_light
-from augment.render.scatter import scatter_forward
+from augment.render.scatter import scatter_forward, scattered_share
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes, pixels_of_boxes
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
@@ -188,17 +188,25 @@ class SmogEffect(Effect):
         depth = view.raster.median_depth
         assert alpha is not None and depth is not None
         rgb = view.rgb
+        fog_share = view.raster.fog_share
         if settings.is_linear:
-            # The airlight as the layers have it, in the camera's exposure.
-            fog = view.layers.fog or settings.fog
+            fog = view.layers.fog or settings.fog  # with the airlight in the camera's exposure
             with timed(LINEAR_LIGHT):
-                rgb = mix_linear_light(rgb, alpha, depth, camera, fog, backend=effect.backend)
+                share = fog_share
+                if share is None:
+                    share = scattered_share(alpha, depth, camera, fog, backend=effect.backend)
+                rgb = mix_linear_light(rgb, share, camera, fog, backend=effect.backend)
         if settings.scatter > 0:
-            fog = settings.fog
-            strength = settings.scatter
             with timed(SCATTER):
                 rgb = scatter_forward(
-                    rgb, alpha, depth, camera, fog, strength, backend=effect.backend
+                    rgb,
+                    alpha,
+                    depth,
+                    camera,
+                    settings.fog,
+                    settings.scatter,
+                    fog_share=fog_share,
+                    backend=effect.backend,
                 )
         return replace(view, rgb=rgb)
 
@@ -213,7 +221,10 @@ class SmogEffect(Effect):
     def attenuate_beams(
         self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
     ) -> None:
-        fog_echoes(echoes, effect.settings.fog, rng)
+        # A beam is narrower than the angle into which droplets diffract: that light is lost to it.
+        fog = effect.settings.fog
+        beam_extinction_per_m = (1 + effect.settings.scatter) * fog.extinction_per_m
+        fog_echoes(echoes, replace(fog, extinction_per_m=beam_extinction_per_m), rng)
 
 
 def _sun_in(fog: Fog, smog: Smog, scene: Scene) -> tuple[float, str]:

@@ -27,7 +27,6 @@ from augment.render import picture_kernels
 from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK, airlight_gains, unit_depth_coordinates
 from augment.render.fog import Fog, airlight_gain
-from augment.render.scatter import scattered_share
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
@@ -37,8 +36,7 @@ MIN_TRANSMITTANCE = 1e-4
 
 def mix_linear_light(
     rgb: Float[Tensor, "H W 3"],
-    alpha: Float[Tensor, "H W"],
-    depth: Float[Tensor, "H W"],
+    fog_share: Float[Tensor, "H W"],
     camera: Camera,
     fog: Fog,
     *,
@@ -48,20 +46,18 @@ def mix_linear_light(
 
     Args:
         rgb: the picture p in fog that was mixed display-encoded; on the CPU it is overwritten.
-        alpha: alpha of the surfaces; the rest of a pixel is sky, at its own optical depth.
-        depth: z of the surfaces, metres; 0 where there is no surface.
+        fog_share: 1 - t of each pixel (`augment.render.scatter.scattered_share`).
         camera: camera of the picture.
         fog: the fog.
         backend: on the CPU, pixels go through a kernel, equal to this definition within 1e-4.
     """
-    fog_share = scattered_share(alpha, depth, camera, fog, backend=backend)
     varying_rgb = fog.airlight_rgb if fog.varying_airlight_rgb is None else fog.varying_airlight_rgb
-    if choose_kernels(backend, rgb, alpha, depth) == CPU:
+    if choose_kernels(backend, rgb, fog_share) == CPU:
         picture = rgb.detach().contiguous().numpy()
         with kernel_threads(ROWS_PER_CHUNK):
             picture_kernels.mix_linear_light(
                 picture,
-                fog_share.numpy(),
+                fog_share.contiguous().numpy(),
                 *unit_depth_coordinates(camera),
                 camera.world_from_camera[2, :3].numpy().astype(np.float32),
                 airlight_gains(fog.elevation_gain),

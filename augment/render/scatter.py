@@ -77,6 +77,7 @@ def scatter_forward(
     fog: Fog,
     strength: float,
     *,
+    fog_share: Float[Tensor, "H W"] | None = None,
     backend: str = AUTO,
 ) -> Float[Tensor, "H W 3"]:
     """Return the finished image in fog, sky included, with its light smeared by the fog.
@@ -88,6 +89,7 @@ def scatter_forward(
         camera: camera of the image.
         fog: the fog.
         strength: factor of tau, > 0; 1 for the whole diffraction of a droplet.
+        fog_share: 1 - exp(-tau) of each pixel, where it is known better than by depth.
         backend: on the CPU, pixels go through kernels, equal to this definition within 1e-4.
     """
     factor = 2 ** max(0, math.floor(math.log2(DIFFRACTION_RAD * camera.fx / _MIN_PX)))
@@ -96,9 +98,15 @@ def scatter_forward(
     levels = max(0, min(NUM_LEVELS, int(math.log2(min(size))) - 1))
     shares = level_shares(DIFFRACTION_RAD * camera.fx / factor)[: levels + 1]
     if choose_kernels(backend, rgb, alpha, depth) == CPU:
-        weight = _scattered_share_by_kernel(alpha, depth, camera, fog, strength)
+        if fog_share is None:
+            weight = _scattered_share_by_kernel(alpha, depth, camera, fog, strength)
+        else:
+            weight = _share_at_strength(fog_share, strength).contiguous().numpy()
         return _exchange_light(rgb, weight, size, shares)
-    weight = _scattered_share_by_torch(alpha, depth, camera, fog, strength)[..., None]
+    if fog_share is None:
+        weight = _scattered_share_by_torch(alpha, depth, camera, fog, strength)[..., None]
+    else:
+        weight = _share_at_strength(fog_share, strength)[..., None]
     small_rgb = _resize(rgb, size)
     small_weight = _resize(weight, size)
     neighbourhood_scale = (1 / (_blur_by_pyramid(small_weight, shares) + _MIN_WEIGHT)).sqrt()
@@ -140,6 +148,11 @@ def _exchange_light(
         picture_kernels.scale_pixels(spread, neighbourhood_weight, np.float32(sum(shares[1:])))
         picture_kernels.blend_scattered(sharp_rgb, weight, _resize(spread, full_size))
     return torch.from_numpy(sharp_rgb)
+
+
+def _share_at_strength(fog_share: Tensor, strength: float) -> Tensor:
+    """Return 1 - exp(-strength tau) from 1 - exp(-tau)."""
+    return 1 - (1 - fog_share).clamp(0, 1) ** strength
 
 
 def scattered_share(

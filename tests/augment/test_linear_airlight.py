@@ -11,6 +11,7 @@ import torch
 
 from augment.render.fog import Fog, blend_airlight, optical_depth
 from augment.render.linear_airlight import mix_linear_light
+from augment.render.scatter import scattered_share
 from augment.scene.cameras import Camera
 from augment.view.plan import make_plan
 from augment.view.render_view import render_view
@@ -45,7 +46,8 @@ def test_the_light_of_a_surface_and_of_the_air_add_up(backend: str) -> None:
     t = torch.exp(-tau)[..., None]
     light = (t * rgb**2 + (1 - t) * torch.tensor(GREY) ** 2).sqrt()
     opaque = torch.ones_like(depth)
-    mixed = mix_linear_light(display.clone(), opaque, depth, view, FOG, backend=backend)
+    share = scattered_share(opaque, depth, view, FOG, backend=backend)
+    mixed = mix_linear_light(display.clone(), share, view, FOG, backend=backend)
     # Of roots of rounded differences: black surfaces deep in fog are the worst.
     torch.testing.assert_close(mixed, light, rtol=0, atol=1e-4)
     # Nothing is darker than it was, since a mean of squares is at least the square of the mean.
@@ -73,7 +75,13 @@ def test_the_kernel_does_as_the_definition_at_any_colour(size, medium) -> None:
     depth = 100 * torch.rand(view.height, view.width, generator=generator)
     depth[0, 0] = 0
     seen, expected = (
-        mix_linear_light(rgb.clone(), alpha, depth, view, medium, backend=backend)
+        mix_linear_light(
+            rgb.clone(),
+            scattered_share(alpha, depth, view, medium, backend=backend),
+            view,
+            medium,
+            backend=backend,
+        )
         for backend in ("cpu", "reference")
     )
     assert bool(torch.isfinite(seen).all())
@@ -83,9 +91,9 @@ def test_the_kernel_does_as_the_definition_at_any_colour(size, medium) -> None:
 
 def test_colours_that_two_distances_mix_change_without_a_jump() -> None:
     view = camera(64, 1)
-    depth = torch.full((1, 64), 20.0)
+    share = torch.full((1, 64), 0.6)
     ramp = torch.linspace(-0.05, 1.2, 64)[None, :, None].expand(-1, -1, 3).contiguous()
-    mixed = mix_linear_light(ramp.clone(), torch.ones(1, 64), depth, view, FOG)[0, :, 0]
+    mixed = mix_linear_light(ramp.clone(), share, view, FOG)[0, :, 0]
     steps = mixed.diff()
     assert float(steps.min()) > 0, "a brighter pixel stays brighter"
     # The steepest part is the one below (1 - t) airlight: 1 / sqrt(1 - t), which is 1.3 here.
@@ -97,10 +105,10 @@ def test_endless_fog_and_clear_air_keep_their_colours() -> None:
     sky = torch.tensor(GREY).expand(view.height, view.width, 3).contiguous()
     nothing = torch.zeros(view.height, view.width)
     torch.testing.assert_close(
-        mix_linear_light(sky.clone(), nothing, nothing, view, FOG), sky, rtol=0, atol=1e-5
+        mix_linear_light(sky.clone(), 1 - nothing, view, FOG), sky, rtol=0, atol=1e-5
     )
-    rgb, depth = random_view(view)
-    clear = mix_linear_light(rgb.clone(), torch.ones_like(depth), depth, view, Fog(1e-12, GREY))
+    rgb, _ = random_view(view)
+    clear = mix_linear_light(rgb.clone(), nothing, view, FOG)
     torch.testing.assert_close(clear, rgb, rtol=0, atol=1e-5)
 
 
