@@ -30,6 +30,7 @@ class Smog(EffectModel):
     synonyms = (
         ("smog", "fog haze mist"),
         ("extinction_per_m", "beta density sigma"),
+        ("mor_m", "mor meteorological_optical_range sensor_visibility_m"),
         ("color", "airlight"),
     )
     # Smog on buffers saves nothing here, whatever it costs.
