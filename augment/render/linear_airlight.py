@@ -56,7 +56,7 @@ def mix_linear_light(
         picture = rgb.detach().contiguous().numpy()
         with kernel_threads(ROWS_PER_CHUNK):
             picture_kernels.mix_linear_light(
-                picture,
+                picture.reshape(len(picture), -1),
                 fog_share.contiguous().numpy(),
                 *unit_depth_coordinates(camera),
                 camera.world_from_camera[2, :3].numpy().astype(np.float32),
@@ -66,7 +66,7 @@ def mix_linear_light(
                 np.float32(MIN_TRANSMITTANCE),
             )
         return torch.from_numpy(picture)
-    airlight = rgb.new_tensor(fog.airlight_rgb).expand(rgb.shape)
+    airlight = torch.tensor(fog.airlight_rgb, dtype=rgb.dtype, device=rgb.device)
     if fog.elevation_gain > 0:
         rays = camera.ray_directions(rgb.dtype, rgb.device)
         airlight = airlight + airlight_gain(fog, rays[..., 2] / rays.norm(dim=-1))

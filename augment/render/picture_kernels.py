@@ -88,7 +88,7 @@ def mix_linear_light(
     """Mix the airlight of a picture in linear light, in place (`linear_airlight`). All are float32.
 
     Args:
-        rgb: [H, W, 3].
+        rgb: [H, 3 W].
         fog_share: 1 - t, [H, W].
         u: image coordinates of the columns at unit depth, [W].
         v: image coordinates of the rows at unit depth, [H].
@@ -103,6 +103,9 @@ def mix_linear_light(
     varies = gains[0] != zero
     width = fog_share.shape[1]
     for i in prange(rgb.shape[0]):
+        # Plain arrays of all channels, which LLVM vectorises.
+        shares = np.empty(3 * width, np.float32)
+        airlight = np.empty(3 * width, np.float32)
         growth = np.zeros(width, np.float32)
         row_length_squared = one_f32 + v[i] * v[i]
         row_rise = v[i] * rise[1] + rise[2]
@@ -111,19 +114,21 @@ def mix_linear_light(
                 slope = (u[j] * rise[0] + row_rise) / math.sqrt(u[j] * u[j] + row_length_squared)
                 growth[j] = airlight_gain(slope, gains)
         for j in range(width):
-            share = fog_share[i, j]
-            transmittance = one_f32 - share
-            per_transmittance = one_f32 / max(transmittance, min_transmittance)
-            darkening = one_f32 / math.sqrt(max(share, min_transmittance))
             for c in range(Index(3)):
-                airlight = max(airlight_rgb[c] + growth[j] * varying_rgb[c], zero)
-                value = rgb[i, j, c]
-                of_things = value - share * airlight
-                within = min(max(of_things, zero), transmittance)
-                light = within * within * per_transmittance + share * airlight * airlight
-                mixed = math.sqrt(light) + (of_things - within)
-                darker = min(value, zero) + max(value, zero) * darkening
-                rgb[i, j, c] = darker if of_things < zero else mixed
+                shares[3 * j + c] = fog_share[i, j]
+                airlight[3 * j + c] = max(airlight_rgb[c] + growth[j] * varying_rgb[c], zero)
+        for k in range(3 * width):
+            share = shares[k]
+            value = rgb[i, k]
+            transmittance = one_f32 - share
+            of_things = value - share * airlight[k]
+            within = min(max(of_things, zero), transmittance)
+            light = within * within / max(transmittance, min_transmittance)
+            light += share * airlight[k] * airlight[k]
+            mixed = math.sqrt(light) + (of_things - within)
+            darkening = one_f32 / math.sqrt(max(share, min_transmittance))
+            darker = min(value, zero) + max(value, zero) * darkening
+            rgb[i, k] = darker if of_things < zero else mixed
 
 
 @kernel

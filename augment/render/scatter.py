@@ -101,12 +101,13 @@ def scatter_forward(
         if fog_share is None:
             weight = _scattered_share_by_kernel(alpha, depth, camera, fog, strength)
         else:
-            weight = _share_at_strength(fog_share, strength).contiguous().numpy()
+            transmittance = np.maximum(1 - fog_share.detach().numpy(), 0)
+            weight = 1 - cv2.pow(transmittance, strength)  # torch takes three times as long
         return _exchange_light(rgb, weight, size, shares)
     if fog_share is None:
         weight = _scattered_share_by_torch(alpha, depth, camera, fog, strength)[..., None]
     else:
-        weight = _share_at_strength(fog_share, strength)[..., None]
+        weight = 1 - ((1 - fog_share).clamp_min(0) ** strength)[..., None]
     small_rgb = _resize(rgb, size)
     small_weight = _resize(weight, size)
     neighbourhood_scale = (1 / (_blur_by_pyramid(small_weight, shares) + _MIN_WEIGHT)).sqrt()
@@ -148,11 +149,6 @@ def _exchange_light(
         picture_kernels.scale_pixels(spread, neighbourhood_weight, np.float32(sum(shares[1:])))
         picture_kernels.blend_scattered(sharp_rgb, weight, _resize(spread, full_size))
     return torch.from_numpy(sharp_rgb)
-
-
-def _share_at_strength(fog_share: Tensor, strength: float) -> Tensor:
-    """Return 1 - exp(-strength tau) from 1 - exp(-tau)."""
-    return 1 - (1 - fog_share).clamp(0, 1) ** strength
 
 
 def scattered_share(

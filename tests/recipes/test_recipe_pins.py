@@ -34,7 +34,7 @@ PRESETS = {
     "clear": "1e1fd554a7f9ba30",
     "deep-flood": "960c1c744bff6617",
     "deep-snow": "22022722fefe7740",
-    "dense-fog": "3f818fd9ecb6d88f",
+    "dense-fog": "7f809053755e9a79",
     "downpour": "568fe3732cde5b26",
     "drizzle": "8c832df0db003d51",
     "dusting": "27448a9db136a29e",
@@ -49,7 +49,7 @@ PRESETS = {
     "storm": "b93e206ac51504d1",
     "street-flood": "57bcd16a1256403d",
     "winter-day": "dc738d7355359818",
-    "winter-fog": "8b6eba91653d7a7f",
+    "winter-fog": "f4555144c486c662",
 }
 
 
