@@ -85,18 +85,21 @@ class Smog(EffectModel):
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:
-        given = [name for name in DENSITY_FIELDS if getattr(self, name) is not None]
-        if not given:
+        present_fields = [name for name in DENSITY_FIELDS if getattr(self, name) is not None]
+        if not present_fields:
             raise ValueError(
                 "needs a density: give visibility_m (metres) or extinction_per_m (1/metre), or "
                 "mor_m (metres), a sensor's reading"
             )
-        if len(given) > 1:
-            count = "both" if len(given) == 2 else "all"
-            raise ValueError(f"{' and '.join(given)} {count} give the density: keep one of them")
-        if self.resolved_extinction_per_m > MAX_EXTINCTION_PER_M:
+        if len(present_fields) > 1:
+            count = "both" if len(present_fields) == 2 else "all"
             raise ValueError(
-                f"{given[0]} = {getattr(self, given[0]):g} means an extinction of "
+                f"{' and '.join(present_fields)} {count} give the density: keep one of them"
+            )
+        if self.resolved_extinction_per_m > MAX_EXTINCTION_PER_M:
+            name = present_fields[0]
+            raise ValueError(
+                f"{name} = {getattr(self, name):g} means an extinction of "
                 f"{self.resolved_extinction_per_m:.3g}/metre; at most "
                 f"{MAX_EXTINCTION_PER_M:g}/metre is allowed"
             )
