@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pydantic import ConfigDict, Field, model_validator
@@ -11,19 +12,25 @@ from recipes.fields import Colour, Number, Unit, one_of
 
 # Optical depth of the visibility, -ln(0.02): contrast has fallen to 2 % there. No unit.
 KOSCHMIEDER = 3.912
+# Optical depth of the meteorological optical range, -ln(0.05): 5 % of a collimated beam arrives
+# there (CIE S 017, term 17-31-018). No unit.
+MOR_DEPTH = math.log(20)
 # Largest extinction: nothing is visible through 10 cm of it.
 MAX_EXTINCTION_PER_M = 100.0
+# Fields of which exactly one gives the density.
+DENSITY_FIELDS = ("visibility_m", "extinction_per_m", "mor_m")
 
 
 class Smog(EffectModel):
     """Fog, haze or smog: Beer-Lambert extinction towards an airlight colour."""
 
-    model_config = ConfigDict(json_schema_extra=one_of("visibility_m", "extinction_per_m"))
+    model_config = ConfigDict(json_schema_extra=one_of(*DENSITY_FIELDS))
     in_first_release = True
-    later_fields = ("overcast", "scatter", "shadow_fade")
+    later_fields = ("mor_m", "overcast", "scatter", "shadow_fade", "blend")
     synonyms = (
         ("smog", "fog haze mist"),
         ("extinction_per_m", "beta density sigma"),
+        ("mor_m", "mor meteorological_optical_range sensor_visibility_m"),
         ("color", "airlight"),
     )
     # Smog on buffers saves nothing here, whatever it costs.
@@ -51,6 +58,9 @@ class Smog(EffectModel):
     """Meteorological visibility at the base height: 3.912 / extinction."""
     extinction_per_m: Number | None = Field(default=None, ge=0, le=MAX_EXTINCTION_PER_M)
     """Extinction coefficient at the base height."""
+    mor_m: Number | None = Field(default=None, gt=0, le=1e6)
+    """Meteorological optical range at the base height, as a transmissometer or a forward-scatter
+    sensor reads it: 2.996 / (extinction (1 + scatter))."""
     color: Colour = (0.76, 0.78, 0.80)
     """Airlight colour, at the horizon: red, green, blue, display-encoded sRGB."""
     scale_height_m: Number | None = Field(default=None, ge=0.1, le=1e5)
@@ -69,16 +79,27 @@ class Smog(EffectModel):
     shadow_fade: Unit = 0.0
     """How much of the ground's cast shadows goes with the sun's light that smog keeps from it: 1
     all that its optical depth towards the sun says, 0 none."""
+    blend: Literal["display", "linear"] = "display"
+    """display mixes the display-encoded colours of things and air, as splats are blended; linear
+    mixes their light, as air does, so that dark things pale while they are still near."""
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:
-        both = "visibility_m and extinction_per_m both give the density: keep one of them"
-        neither = "needs a density: give visibility_m (metres) or extinction_per_m (1/metre)"
-        if (self.visibility_m is None) == (self.extinction_per_m is None):
-            raise ValueError(neither if self.visibility_m is None else both)
-        if self.resolved_extinction_per_m > MAX_EXTINCTION_PER_M:
+        present_fields = [name for name in DENSITY_FIELDS if getattr(self, name) is not None]
+        if not present_fields:
             raise ValueError(
-                f"visibility_m = {self.visibility_m:g} means an extinction of "
+                "needs a density: give visibility_m (metres) or extinction_per_m (1/metre), or "
+                "mor_m (metres), a sensor's reading"
+            )
+        if len(present_fields) > 1:
+            count = "both" if len(present_fields) == 2 else "all"
+            raise ValueError(
+                f"{' and '.join(present_fields)} {count} give the density: keep one of them"
+            )
+        if self.resolved_extinction_per_m > MAX_EXTINCTION_PER_M:
+            name = present_fields[0]
+            raise ValueError(
+                f"{name} = {getattr(self, name):g} means an extinction of "
                 f"{self.resolved_extinction_per_m:.3g}/metre; at most "
                 f"{MAX_EXTINCTION_PER_M:g}/metre is allowed"
             )
@@ -86,8 +107,14 @@ class Smog(EffectModel):
 
     @property
     def resolved_extinction_per_m(self) -> float:
-        """Return the extinction coefficient at the base height, 1/metre."""
+        """Return the extinction coefficient at the base height, 1/metre.
+
+        It is that of large things. A sensor's beam is narrow: the beam loses the light that
+        droplets diffract as well, which has `scatter` times the optical depth.
+        """
         if self.extinction_per_m is not None:
             return self.extinction_per_m
+        if self.mor_m is not None:
+            return MOR_DEPTH / (self.mor_m * (1 + self.scatter))
         assert self.visibility_m is not None
         return KOSCHMIEDER / self.visibility_m

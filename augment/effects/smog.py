@@ -44,7 +44,8 @@ from augment.light.common_exposure import exposure_change
 from augment.output.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
-from augment.render.scatter import scatter_forward
+from augment.render.linear_airlight import mix_linear_light
+from augment.render.scatter import scatter_forward, scattered_share
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes, pixels_of_boxes
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
@@ -60,6 +61,7 @@ PER_GAUSSIAN = "smog per Gaussian"
 ON_BUFFERS = "smog on buffers"
 ELEVATION = "airlight by elevation"
 SKY = "sky"
+LINEAR_LIGHT = "airlight in linear light"
 SCATTER = "forward scatter"
 SHADOWS = "shadows in smog"
 
@@ -82,6 +84,9 @@ class SmogPlan:
 
     sun: float = 1.0
     """Share of the sun's light that arrives at the ground; 1 leaves shadows as they are."""
+
+    is_linear: bool = False
+    """If True, the airlight of the finished picture is mixed in linear light."""
 
 
 class SmogEffect(Effect):
@@ -115,8 +120,8 @@ class SmogEffect(Effect):
         if fog is None:
             drawing_steps = skipped_steps((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason)
             shadow_steps = skipped_steps((SHADOWS,), reason, SCENE)
-            scatter_steps = skipped_steps((SCATTER,), reason, PICTURE)
-            return EffectPlan(None, (*shadow_steps, *drawing_steps, *scatter_steps))
+            picture_steps = skipped_steps((LINEAR_LIGHT, SCATTER), reason, PICTURE)
+            return EffectPlan(None, (*shadow_steps, *drawing_steps, *picture_steps))
         is_common = recipe.render.exposure == "common" and scene.common_color_map is not None
         if is_common:
             reason += "; one airlight for all cameras, by the mean of their exposures"
@@ -129,6 +134,7 @@ class SmogEffect(Effect):
         if fog.scale_height_m is None:
             sky = Step(SKY, False, "uniform smog hides it: the airlight colour stands for it")
         sun, shadow_reason = _sun_in(fog, smog, scene)
+        is_linear = smog.blend == "linear"
         steps = (
             Step(SHADOWS, sun < 1, shadow_reason, SCENE),
             Step(PER_GAUSSIAN, not on_buffers, other_reason if on_buffers else reason),
@@ -139,12 +145,13 @@ class SmogEffect(Effect):
                 f"weather.smog.overcast is {fog.elevation_gain:g}",
             ),
             sky,
+            Step(LINEAR_LIGHT, is_linear, f"weather.smog.blend is {smog.blend}", PICTURE),
             Step(SCATTER, smog.scatter > 0, f"weather.smog.scatter is {smog.scatter:g}", PICTURE),
         )
         buffers = {EXPECTED_DEPTH} if on_buffers or fog.elevation_gain > 0 else set[str]()
-        if smog.scatter > 0:
+        if smog.scatter > 0 or is_linear:
             buffers.add(MEDIAN_DEPTH)  # which costs nothing where depth images are written
-        data = SmogPlan(fog, on_buffers, is_common, smog.scatter, sun)
+        data = SmogPlan(fog, on_buffers, is_common, smog.scatter, sun, is_linear)
         return EffectPlan(data, steps, frozenset(buffers))
 
     def prepare(self, effect: EffectInScene) -> FadedShadows | None:
@@ -173,17 +180,33 @@ class SmogEffect(Effect):
         return replace(layers, fog=fog, applies_fog_to_buffers=effect.settings.on_buffers)
 
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
-        if effect.settings.scatter == 0:
+        settings = effect.settings
+        if settings.scatter == 0 and not settings.is_linear:
             return view
         alpha = view.raster.alpha
         depth = view.raster.median_depth
         assert alpha is not None and depth is not None
-        fog = effect.settings.fog
-        scatter = effect.settings.scatter
-        with timed(SCATTER):
-            rgb = scatter_forward(
-                view.rgb, alpha, depth, camera, fog, scatter, backend=effect.backend
-            )
+        rgb = view.rgb
+        fog_share = view.raster.fog_share
+        if settings.is_linear:
+            fog = view.layers.fog or settings.fog  # with the airlight in the camera's exposure
+            with timed(LINEAR_LIGHT):
+                share = fog_share
+                if share is None:
+                    share = scattered_share(alpha, depth, camera, fog, backend=effect.backend)
+                rgb = mix_linear_light(rgb, share, camera, fog, backend=effect.backend)
+        if settings.scatter > 0:
+            with timed(SCATTER):
+                rgb = scatter_forward(
+                    rgb,
+                    alpha,
+                    depth,
+                    camera,
+                    settings.fog,
+                    settings.scatter,
+                    fog_share=fog_share,
+                    backend=effect.backend,
+                )
         return replace(view, rgb=rgb)
 
     def measure_boxes(
@@ -197,7 +220,10 @@ class SmogEffect(Effect):
     def attenuate_beams(
         self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
     ) -> None:
-        fog_echoes(echoes, effect.settings.fog, rng)
+        # A beam is narrower than the angle into which droplets diffract: that light is lost to it.
+        fog = effect.settings.fog
+        beam_extinction_per_m = (1 + effect.settings.scatter) * fog.extinction_per_m
+        fog_echoes(echoes, replace(fog, extinction_per_m=beam_extinction_per_m), rng)
 
 
 def _sun_in(fog: Fog, smog: Smog, scene: Scene) -> tuple[float, str]:

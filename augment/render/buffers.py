@@ -65,6 +65,8 @@ class RenderOutput:
         metres; 0 where nothing was hit. z is that of expected_depth.
     overlay: sum of weights of the splats of parts that lie on the scene
         (PosedGaussians.is_overlay), in [0, alpha].
+    fog_share: 1 - transmittance of the fog that each pixel of a recorded image was mixed with, at
+        the image's own edges. It is no buffer of the rasteriser's: None where splats are drawn.
     """
 
     rgb: Float[Tensor, "H W 3"] | None = None
@@ -74,3 +76,4 @@ class RenderOutput:
     splat_ids: Int32[Tensor, "H W"] | None = None
     mode_depth: Float[Tensor, "H W"] | None = None
     overlay: Float[Tensor, "H W"] | None = None
+    fog_share: Float[Tensor, "H W"] | None = None

@@ -70,7 +70,7 @@ def _airlight(fog: Fog) -> Sky:
 
 
 @functools.lru_cache(maxsize=16)
-def _gains(elevation_gain: float) -> np.ndarray:
+def airlight_gains(elevation_gain: float) -> np.ndarray:
     """Return coefficients c of the varying airlight's growth with the slope, float32 [NUM_GAINS].
 
     At a slope s >= 0 the varying airlight is multiplied by 1 + s (c0 + c1 s + ...). The
@@ -136,7 +136,11 @@ def add_airlight_elevation(
         eye_above_base_m = float(camera.centre[2]) - fog.base_z_m
         per_height = 1 / fog.scale_height_m
     fog_numbers = fog.extinction_per_m, eye_above_base_m * per_height, per_height
-    kernel_inputs = camera.world_from_camera[2, :3].numpy(), fog_numbers, _gains(fog.elevation_gain)
+    kernel_inputs = (
+        camera.world_from_camera[2, :3].numpy(),
+        fog_numbers,
+        airlight_gains(fog.elevation_gain),
+    )
     kernel_inputs = (
         *unit_depth_coordinates(camera),
         *kernel_inputs,
@@ -215,12 +219,12 @@ def _composite_cubemap(
     """Return the image over a cube map, through fog if there is any, by a kernel."""
     out = np.empty((camera.height, camera.width, 3), np.float32)
     strength = -1.0
-    gains = _gains(0.0)
+    gains = airlight_gains(0.0)
     airlight = (0.0, 0.0, 0.0)
     varying = None
     if fog is not None:
         strength = vertical_optical_depth(fog, float(camera.centre[2]))
-        gains = _gains(fog.elevation_gain)
+        gains = airlight_gains(fog.elevation_gain)
         airlight = fog.airlight_rgb
         varying = fog.varying_airlight_rgb
     with kernel_threads(ROWS_PER_CHUNK):

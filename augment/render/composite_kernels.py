@@ -50,7 +50,7 @@ def renormalise_alpha(alpha, rgb, overlay, min_alpha):
 def airlight_gain(slope, gains):
     """Return the factor of varying airlight, minus 1.
 
-    gains [8]: coefficients of `composite._gains`.
+    gains [8]: coefficients of `composite.airlight_gains`.
     """
     steepness = abs(slope)
     one_f32 = np.float32(1)

@@ -1,7 +1,7 @@
-"""Numba kernels for passes over finished images: airlight by elevation, forward scatter, and noise.
+"""Numba kernels for passes over finished images: airlight, forward scatter, and noise.
 
-`composite`, `scatter` and `sensor` launch them. Each loop does one task, which lets LLVM vectorise
-it.
+`composite`, `linear_airlight`, `scatter` and `sensor` launch them. Each loop does one task, which
+lets LLVM vectorise it.
 """
 
 from __future__ import annotations
@@ -79,6 +79,56 @@ def add_elevation(rgb, alpha, depth, u, v, rise, fog_numbers, gains, varying, ai
                 rgb[i, j, c] += share[j] * varying[c]
                 if has_background > 0:
                     rgb[i, j, c] += (one_f32 - alpha[i, j]) * airlight_behind[c]
+
+
+@kernel
+def mix_linear_light(
+    rgb, fog_share, u, v, rise, gains, airlight_rgb, varying_rgb, min_transmittance
+):
+    """Mix the airlight of a picture in linear light, in place (`linear_airlight`). All are float32.
+
+    Args:
+        rgb: [H, 3 W].
+        fog_share: 1 - t, [H, W].
+        u: image coordinates of the columns at unit depth, [W].
+        v: image coordinates of the rows at unit depth, [H].
+        rise: world z along the camera's axes, [3].
+        gains: as in airlight_gain; zeros for the same airlight in all directions.
+        airlight_rgb: airlight at the horizon, [3].
+        varying_rgb: the share of the airlight that varies with elevation, [3].
+        min_transmittance: smallest transmittance that is divided by.
+    """
+    zero = np.float32(0)
+    one_f32 = np.float32(1)
+    varies = gains[0] != zero
+    width = fog_share.shape[1]
+    for i in prange(rgb.shape[0]):
+        # Plain arrays of all channels, which LLVM vectorises.
+        shares = np.empty(3 * width, np.float32)
+        airlight = np.empty(3 * width, np.float32)
+        growth = np.zeros(width, np.float32)
+        row_length_squared = one_f32 + v[i] * v[i]
+        row_rise = v[i] * rise[1] + rise[2]
+        if varies:
+            for j in range(width):
+                slope = (u[j] * rise[0] + row_rise) / math.sqrt(u[j] * u[j] + row_length_squared)
+                growth[j] = airlight_gain(slope, gains)
+        for j in range(width):
+            for c in range(Index(3)):
+                shares[3 * j + c] = fog_share[i, j]
+                airlight[3 * j + c] = max(airlight_rgb[c] + growth[j] * varying_rgb[c], zero)
+        for k in range(3 * width):
+            share = shares[k]
+            value = rgb[i, k]
+            transmittance = one_f32 - share
+            of_things = value - share * airlight[k]
+            within = min(max(of_things, zero), transmittance)
+            light = within * within / max(transmittance, min_transmittance)
+            light += share * airlight[k] * airlight[k]
+            mixed = math.sqrt(light) + (of_things - within)
+            darkening = one_f32 / math.sqrt(max(share, min_transmittance))
+            darker = min(value, zero) + max(value, zero) * darkening
+            rgb[i, k] = darker if of_things < zero else mixed
 
 
 @kernel

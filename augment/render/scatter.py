@@ -77,6 +77,7 @@ def scatter_forward(
     fog: Fog,
     strength: float,
     *,
+    fog_share: Float[Tensor, "H W"] | None = None,
     backend: str = AUTO,
 ) -> Float[Tensor, "H W 3"]:
     """Return the finished image in fog, sky included, with its light smeared by the fog.
@@ -88,6 +89,7 @@ def scatter_forward(
         camera: camera of the image.
         fog: the fog.
         strength: factor of tau, > 0; 1 for the whole diffraction of a droplet.
+        fog_share: 1 - exp(-tau) of each pixel, where it is known better than by depth.
         backend: on the CPU, pixels go through kernels, equal to this definition within 1e-4.
     """
     factor = 2 ** max(0, math.floor(math.log2(DIFFRACTION_RAD * camera.fx / _MIN_PX)))
@@ -96,9 +98,16 @@ def scatter_forward(
     levels = max(0, min(NUM_LEVELS, int(math.log2(min(size))) - 1))
     shares = level_shares(DIFFRACTION_RAD * camera.fx / factor)[: levels + 1]
     if choose_kernels(backend, rgb, alpha, depth) == CPU:
-        weight = _scattered_share(alpha, depth, camera, fog, strength)
+        if fog_share is None:
+            weight = _scattered_share_by_kernel(alpha, depth, camera, fog, strength)
+        else:
+            transmittance = np.maximum(1 - fog_share.detach().numpy(), 0)
+            weight = 1 - cv2.pow(transmittance, strength)  # torch takes three times as long
         return _exchange_light(rgb, weight, size, shares)
-    weight = _scattered_share_by_torch(alpha, depth, camera, fog, strength)[..., None]
+    if fog_share is None:
+        weight = _scattered_share_by_torch(alpha, depth, camera, fog, strength)[..., None]
+    else:
+        weight = 1 - ((1 - fog_share).clamp_min(0) ** strength)[..., None]
     small_rgb = _resize(rgb, size)
     small_weight = _resize(weight, size)
     neighbourhood_scale = (1 / (_blur_by_pyramid(small_weight, shares) + _MIN_WEIGHT)).sqrt()
@@ -142,7 +151,25 @@ def _exchange_light(
     return torch.from_numpy(sharp_rgb)
 
 
-def _scattered_share(
+def scattered_share(
+    alpha: Float[Tensor, "H W"],
+    depth: Float[Tensor, "H W"],
+    camera: Camera,
+    fog: Fog,
+    strength: float = 1.0,
+    *,
+    backend: str = AUTO,
+) -> Float[Tensor, "H W"]:
+    """Return 1 - exp(-strength tau) of every pixel; at strength 1 it is the fog's share.
+
+    The arguments are those of `scatter_forward`. A pixel is the mean of its surfaces and its sky.
+    """
+    if choose_kernels(backend, alpha, depth) == CPU:
+        return torch.from_numpy(_scattered_share_by_kernel(alpha, depth, camera, fog, strength))
+    return _scattered_share_by_torch(alpha, depth, camera, fog, strength)
+
+
+def _scattered_share_by_kernel(
     alpha: Tensor, depth: Tensor, camera: Camera, fog: Fog, strength: float
 ) -> Float32[np.ndarray, "H W"]:
     """Return `_scattered_share_by_torch`, by a kernel."""

@@ -194,5 +194,6 @@ class LayerRenderer:
         if self.fog is None:
             return rgb, raster
         with timed("smog on buffers"):
-            transmittance = photo.transmittance(raster, self.fog)
-            return mix(rgb, photo.airlight(self.fog), 1 - transmittance), raster
+            fog_share = 1 - photo.transmittance(raster, self.fog)
+            rgb = mix(rgb, photo.airlight(self.fog), fog_share)
+            return rgb, replace(raster, fog_share=fog_share)

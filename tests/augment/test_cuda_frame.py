@@ -188,7 +188,7 @@ def scene() -> Scene:
 
 
 SNOW = Snow(depth_m=0.1, cell_m=1.0, tracks="never", shading="per_splat")
-LOW = Smog(visibility_m=20, scale_height_m=9.0, model="deferred")
+LOW = Smog(visibility_m=20, scale_height_m=9.0, model="deferred", blend="linear", scatter=0.3)
 RECIPES = {
     "smog, style on the picture": Recipe(
         weather=Weather(smog=Smog(visibility_m=20)),

@@ -25,7 +25,7 @@ DOWNPOUR = {"rate_mm_h": 50.0, "wetness": 0.0, "spray": False}
 STRONG = {
     "style": {"style": {"preset": "dusk"}},
     "wet": {"weather": {"rain": {"rate_mm_h": 20.0, "spray": False}}},
-    "smog": {"weather": {"smog": {"visibility_m": 60.0}}},
+    "smog": {"weather": {"smog": {"visibility_m": 60.0, "scatter": 0.3, "blend": "linear"}}},
     "snow": {"weather": {"snow": {"depth_m": 0.1, "cell_m": 0.2, "traffic": 0.9, "dirt": 0.7}}},
     "flood": {"weather": {"flood": {"level_m": 0.2}}},
     "spray": {"weather": {"rain": {"rate_mm_h": 50.0, "spray": True}}},

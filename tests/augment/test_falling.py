@@ -213,12 +213,49 @@ def test_a_streak_takes_twice_its_drops_cross_section():
     for drop in drops[inside][:60]:
         nothing = np.zeros(shape, np.float32)
         clear = compute_clear_share(drop[None], nothing, nothing)
-        length = math.hypot(drop[2] - drop[0], drop[3] - drop[1])
-        i, o = drop[6], drop[7]
-        area = length * (2 * i + (2 * o + i) * (o - i) / (1.5 * (o + i)))
-        area += math.pi / 2 * (o * o + i * i)
+        area = math.pi / 2 * (drop[7] ** 2 + drop[6] ** 2)  # of the disc, by its profile
         # The smallest disc is sampled at five points or so.
         assert (1 - clear).sum() == pytest.approx(drop[8] * area, rel=0.1)
+
+
+def moving_disc(length: float, inside: float, outside: float, share: float = 1.0) -> np.ndarray:
+    """A drop at the middle of 120 rows of 160 pixels, moving upright, as `find_drops` writes it."""
+    v0 = 60 - length / 2
+    return np.array([[80.0, v0, 80.0, v0 + length, 0.5, 0.5, inside, outside, share]], np.float32)
+
+
+@pytest.mark.parametrize(("length", "inside", "outside"), [(30, 3, 6), (0, 8, 12), (4, 0, 1.25)])
+def test_a_drop_covers_a_pixel_for_the_time_that_its_disc_is_there(length, inside, outside):
+    """By Monte Carlo over the exposure, of the profile that the module states."""
+    nothing = np.zeros((120, 160), np.float32)
+    clear = compute_clear_share(moving_disc(length, inside, outside), nothing, nothing)
+    y, x = np.mgrid[:120, :160] + 0.5
+    times = (np.arange(400) + 0.5) / 400
+    distances2 = [(x - 80) ** 2 + (y - (60 + length * (t - 0.5))) ** 2 for t in times]
+    profiles = [((outside**2 - d) / (outside**2 - inside**2)).clip(0, 1) for d in distances2]
+    np.testing.assert_allclose(1 - clear, np.mean(profiles, 0), atol=2e-3)
+
+
+def test_a_flake_that_rests_is_a_soft_disc_and_one_that_moves_has_tapered_ends():
+    nothing = np.zeros((120, 160), np.float32)
+    disc = 1 - compute_clear_share(moving_disc(0, 6, 12), nothing, nothing)
+    np.testing.assert_allclose(disc[60, 76:84], 1, atol=1e-3)  # flat in the middle
+    rim = disc[60, 86:92]
+    assert (np.diff(rim) < 0).all() and 0 < rim[-1] < rim[0] < 1
+    streak = 1 - compute_clear_share(moving_disc(60, 3, 6), nothing, nothing)
+    along, across = streak[:, 80], (streak > 1e-4).sum(1)
+    # The middle is even; towards its end the streak fades and narrows over a disc's diameter.
+    np.testing.assert_allclose(along[45:75], along[60], rtol=1e-4)
+    assert (np.diff(along[84:96]) < 0).all()
+    assert across[60] > across[92] > across[94] > 0 == across[97]
+
+
+def test_no_drop_covers_more_than_all_of_a_pixel():
+    """A disc that rests would take two cross-sections from its own area."""
+    nothing = np.zeros((120, 160), np.float32)
+    drops = np.concatenate([moving_disc(0, 10, 12, share=2.0)] * 2)
+    clear = compute_clear_share(drops, nothing, nothing)
+    assert clear.min() == 0 and clear.max() == 1
 
 
 def test_what_is_not_drawn_is_veil():

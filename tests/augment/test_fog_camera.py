@@ -150,6 +150,20 @@ def test_kernels_do_as_the_definition(size, layered):
     torch.testing.assert_close(seen, expected, rtol=0, atol=1e-4)  # of exp by plain sums
 
 
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_a_known_share_of_fog_scatters_as_its_depth_does(backend):
+    """Recorded photos know the share at their own edges; here it is that of the depth."""
+    view = camera(96, 54, fx=98.0)
+    rgb = torch.rand(54, 96, 3, generator=torch.Generator().manual_seed(5))
+    depth = at_depth(view, 1.0, FOG) * torch.linspace(0.1, 2, 96)
+    share = -torch.expm1(-FOG.extinction_per_m * depth * view.ray_lengths())
+    rest = torch.ones_like(depth), depth, view, FOG, 0.3
+    by_depth = scatter_forward(rgb.clone(), *rest, backend=backend)
+    by_share = scatter_forward(rgb.clone(), *rest, fog_share=share, backend=backend)
+    torch.testing.assert_close(by_share, by_depth, rtol=0, atol=1e-4)
+    assert float((by_share - rgb).abs().max()) > 0.05
+
+
 @pytest.mark.parametrize("size", [(270, 480), (9, 9), (9, 8), (8, 9), (5, 4)])
 def test_the_pyramid_of_torch_is_opencvs(size):
     image = np.random.default_rng(1).random((*size, 4), np.float32)

@@ -261,6 +261,19 @@ def test_intensities_fall_by_two_ways() -> None:
     assert (out.points_m[is_attenuated] == sweep.points_m[is_attenuated]).all()
 
 
+def test_a_beam_loses_what_droplets_diffract() -> None:
+    """A LiDAR's beam is as narrow as a transmissometer's: `mor_m` gives its extinction."""
+    sweep = sweep_of(some_points(), intensity=0.5)
+    by_range, by_extinction = (
+        weathered_sweep(street(), recipe(smog=smog), 0, sweep).columns["intensity"]
+        for smog in (
+            Smog(mor_m=300.0, scatter=0.5),
+            Smog(extinction_per_m=math.log(20) / 300, scatter=0.0),
+        )
+    )
+    np.testing.assert_allclose(by_range, by_extinction, rtol=1e-6)
+
+
 @pytest.mark.parametrize("alpha", [0.002, 0.06, 0.5])
 def test_the_soft_echo_is_the_integral(alpha: float) -> None:
     w = MODEL.pulse_m

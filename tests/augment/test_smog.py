@@ -22,6 +22,8 @@ from augment.render.fog import (
 from augment.scene.boxes import BOTTOM_MARGIN_M, NOT_COUNTED, SIDE_MARGIN_M
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.labels import Boxes
+from recipes.schema import Smog
+from recipes.smog import KOSCHMIEDER
 from tests.augment.batch_scenes import ORIGIN_M
 from tests.augment.box_views import CAR_M, UPRIGHT, boxes_at_random, make_boxes, make_camera, placed
 from tests.streets import open_street
@@ -247,11 +249,12 @@ def street():
 @pytest.mark.long
 @pytest.mark.parametrize("model", ["per_gaussian", "deferred"])
 @pytest.mark.parametrize("scale_height_m", [None, 15.0])
-def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_height_m):
+@pytest.mark.parametrize("blend", ["display", "linear"])
+def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_height_m, blend):
     scene, view = street
     overcast = 0.5 if scale_height_m else 0.0
     smog = {"visibility_m": 80, "scale_height_m": scale_height_m, "overcast": overcast}
-    smog |= {"model": model}
+    smog |= {"model": model, "blend": blend}
     error = smog_error(recipe_of({"smog": smog}), scene, view)
     smooth = error[view.regions["smooth"]]
     assert len(smooth) > 10_000  # most of the picture that is not sky is measured
@@ -260,3 +263,21 @@ def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_
     assert np.quantile(smooth, 0.99) <= 4.0
     # And it is smog that is measured: silhouettes, where two distances mix, do differ.
     assert np.quantile(error[view.regions["silhouette"]], 0.99) > 4.0
+
+
+# ---- A sensor's reading --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.3, 1.0])
+def test_a_sensor_reads_the_range_that_the_fog_was_made_from(scatter):
+    """A transmissometer's beam is narrow: it loses what is absorbed, spread and diffracted."""
+    mor_m = 90.0
+    smog = Smog(mor_m=mor_m, scatter=scatter)
+    beam_extinction_per_m = smog.resolved_extinction_per_m * (1 + scatter)
+    assert math.exp(-beam_extinction_per_m * mor_m) == pytest.approx(0.05)
+    # The finest details lose as much as the beam (`augment.render.scatter`), large things less.
+    visibility_m = KOSCHMIEDER / smog.resolved_extinction_per_m
+    assert visibility_m == pytest.approx(mor_m * (1 + scatter) * KOSCHMIEDER / math.log(20))
+    assert Smog(visibility_m=visibility_m, scatter=scatter).resolved_extinction_per_m == (
+        pytest.approx(smog.resolved_extinction_per_m)
+    )

@@ -62,7 +62,7 @@ S = "r.yaml:4: weather.smog."
         ("probabilty: 1", "probabilty: unknown field; did you mean probability?"),
         ("scale: 1", "scale: unknown field here; did you mean render.scale?"),
         ("seed: 1", "seed: unknown field here; did you mean seed at the top or weather.flood.wave"),
-        ("qqq: 1", "qqq: unknown field; known here: visibility_m, extinction_per_m, color, scale_"),
+        ("qqq: 1", "qqq: unknown field; known here: visibility_m, extinction_per_m, mor_m, color"),
         ('"a\\nb": 1', "a\\nb: unknown field"),
         ("model: defered", "= 'defered': must be one of per_gaussian, deferred; did you mean def"),
         ("model: {uniform: [a, b]}", "uniform is for numbers; a range here is choice"),

@@ -30,11 +30,11 @@ def digest(templates: list[RecipeTemplate], num_variants: int) -> str:
 
 PRESETS = {
     "blizzard": "18e900c8ba7012e2",
-    "brown-smog": "0ff797de8cc6277e",
+    "brown-smog": "8decc4c09550077a",
     "clear": "1e1fd554a7f9ba30",
     "deep-flood": "960c1c744bff6617",
     "deep-snow": "22022722fefe7740",
-    "dense-fog": "01aad84d12c08b27",
+    "dense-fog": "7f809053755e9a79",
     "downpour": "568fe3732cde5b26",
     "drizzle": "8c832df0db003d51",
     "dusting": "27448a9db136a29e",
@@ -50,7 +50,7 @@ PRESETS = {
     "storm": "b93e206ac51504d1",
     "street-flood": "57bcd16a1256403d",
     "winter-day": "dc738d7355359818",
-    "winter-fog": "ff7064f7dbe9767b",
+    "winter-fog": "f4555144c486c662",
     "winter-street": "6c8f8fad8d6e2027",
 }
 

@@ -119,6 +119,8 @@ def test_the_models_are_strict_and_closed(model: type) -> None:
     ("smog", "message"),
     [
         ({}, "needs a density: give visibility_m (metres) or extinction_per_m (1/metre)"),
+        ({"visibility_m": 300, "mor_m": 80}, "visibility_m and mor_m both give the density"),
+        ({"mor_m": 0.01, "scatter": 1.0}, "mor_m = 0.01 means an extinction of 150/metre"),
         ({"visibility_m": 300, "extinction_per_m": 0.01}, "visibility_m and extinction_per_m both"),
         ({"visibility_m": 0.001}, "visibility_m = 0.001 means an extinction of 3.91e+03/metre"),
     ],
@@ -209,6 +211,7 @@ def test_auto_weathers_lidar_where_the_depth_images_show_a_surface_of_the_weathe
 # what stands in place of another field, or changes nothing by itself
 ELSEWHERE = {"version", "weather.smog.extinction_per_m", "weather.flood.absorption_per_m"}
 ELSEWHERE |= {
+    "weather.smog.mor_m",
     "style.image",
     "style.preset",
     "style.mask",
@@ -230,7 +233,7 @@ def test_every_field_changes_the_hash() -> None:
     output = Output(categories=(Category(label="car", name="Car"),))
     base = Recipe(weather=weather, style=style, camera=camera, output=output)
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
-    hashes = {base.hash, smoggy(extinction_per_m=0.01).hash}
+    hashes = {base.hash, smoggy(extinction_per_m=0.01).hash, smoggy(mor_m=300).hash}
     hashes.add(base.model_copy(update={"camera": Sensor()}).hash)
     hashes.add(
         Recipe(
@@ -251,7 +254,7 @@ def test_every_field_changes_the_hash() -> None:
         accepted = (value for value in (*spec.allowed_words, *CANDIDATES) if spec.accepts(value))
         inner[name] = next(value for value in accepted if value != inner[name])
         hashes.add(Recipe.model_validate(data).hash)
-    assert len(hashes) == len(changed) + 7
+    assert len(hashes) == len(changed) + 8
     scene = Recipe(output=Output(surface="scene"))
     assert len({scene.hash, Recipe().hash, Recipe(output=Output(surface="first")).hash}) == 3
 

@@ -249,7 +249,11 @@ def _warm_frame(uri: str, width: int, height: int, recipe: Recipe) -> Action:
 
 SMOG_MODELS = ("per_gaussian", "deferred")  # The models of a smog, the first is the default.
 # The fields of every measured smog, by its name.
-SMOGS = {"uniform": {"visibility_m": 80}, "overcast": {"visibility_m": 80, "overcast": 0.5}}
+SMOGS = {
+    "uniform": {"visibility_m": 80},
+    "overcast": {"visibility_m": 80, "overcast": 0.5},
+    "linear": {"visibility_m": 80, "blend": "linear"},
+}
 # The rows of smog: every smog by every model.
 SMOG_FRAMES = {
     f"{name}, {model}": Frames({"smog": {**smog, "model": model}})

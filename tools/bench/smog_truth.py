@@ -1,8 +1,9 @@
 """Exact smog per pixel, and the errors of splats in smog against it.
 
 The surfaces of the procedural street are known, and so is the distance d of every pixel. The exact
-picture is t(d) c + (1 - t(d)) airlight with transmittance t. The colour c is that of the clean
-splat render, so that only the smog is compared and not the splats' colours. Silhouettes, where one
+picture is t(d) c + (1 - t(d)) airlight with transmittance t, in squares of these colours where the
+smog is mixed in linear light. The colour c is that of the clean splat render, so that only the smog
+is compared and not the splats' colours. Silhouettes, where one
 pixel shows two distances, count separately.
 """
 
@@ -55,7 +56,8 @@ def truth_view(scene: Scene, truth: StreetTruth, camera: Camera) -> TruthView:
 
 def smog_error(recipe: Recipe, scene: Scene, view: TruthView) -> np.ndarray:
     """Return the largest channel error [H, W] of splats in smog against exact smog, in 1/255."""
-    fog = make_plan(recipe, scene).effect_plans["smog"].data.fog
+    smog_plan = make_plan(recipe, scene).effect_plans["smog"].data
+    fog = smog_plan.fog
     camera = view.camera
     fogged = frame_of(scene, camera, recipe)().rgb
     z = torch.from_numpy(np.where(np.isfinite(view.exact.depth), view.exact.depth, 1.0))
@@ -63,8 +65,13 @@ def smog_error(recipe: Recipe, scene: Scene, view: TruthView) -> np.ndarray:
     eye_z = float(camera.centre[2])
     lengths = rays.norm(dim=-1)
     tau = optical_depth(fog, z * lengths, eye_z, eye_z + z * rays[..., 2])
-    exact = blend_airlight(view.clean.double(), tau, fog, rays[..., 2] / lengths).float()
-    return (fogged - exact).abs().amax(-1).numpy() * 255
+    slopes = rays[..., 2] / lengths
+    exact = blend_airlight(view.clean.double(), tau, fog, slopes)
+    if smog_plan.is_linear:
+        airlight = blend_airlight(exact, torch.full_like(tau, torch.inf), fog, slopes)
+        t = torch.exp(-tau)[..., None]
+        exact = (t * view.clean.double().clamp_min(0) ** 2 + (1 - t) * airlight**2).sqrt()
+    return (fogged - exact.float()).abs().amax(-1).numpy() * 255
 
 
 def away_from_silhouettes(view: ExactView) -> np.ndarray:

@@ -62,6 +62,7 @@ PLAIN_WORDS = {
 USEFUL_ENDS = {
     "weather.smog.visibility_m": (10.0, 20_000.0),  # a car's length ahead; a clear day begins
     "weather.smog.extinction_per_m": (2e-4, 0.4),  # the same by Koschmieder's law
+    "weather.smog.mor_m": (10.0, 15_000.0),  # the same by a sensor
     "weather.smog.scale_height_m": (1.0, 2000.0),  # ground fog; the mixing layer
     "weather.smog.base_height_m": (-50.0, 50.0),  # a valley below, a hill above
     "weather.smog.scatter": (0.0, 2.0),  # twice what droplets diffract

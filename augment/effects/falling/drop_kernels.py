@@ -21,6 +21,7 @@ ROWS = 16  # image rows of a band, which a thread draws at a time
 FADE = 0.75  # share of a class's drawn depth beyond which its drops fade into the veil
 SOFT = 0.03  # share of its depth by which a drop is behind a surface when it is fully hidden
 LEAST_RADIUS = 1.25  # smallest radius, pixels; a smaller one would show the pixel grid
+LEAST_LENGTH = 0.05  # shortest path of a drop, pixels; rest is a path of this length
 EDGE = 0.02  # smallest alpha, and green from the sky, of a pixel that shows surface and sky
 NUM_NUMBERS = 9  # numbers of a drop in the picture
 _HALF = float(2**-21)
@@ -137,9 +138,10 @@ def find_drops(
             focus.
         offsets: [S] first row in `drops` of each slab.
         counts: output [S], number of drops of each slab that are in view.
-        drops: output [N, NUM_NUMBERS] column and row at both ends of a streak, 1 / z there, radius
-            up to which it covers as much as in its middle, radius beyond which it covers nothing,
-            covered share.
+        drops: output [N, NUM_NUMBERS] column and row of the disc as the shutter opens and as it
+            closes, 1 / z there, radius up to which the disc covers as much as in its middle, radius
+            beyond which it covers nothing, share that a resting disc covers in its middle (up to 2;
+            more than 1 counts where the disc moves).
     """
     is_counting = len(drops) == 0
     for slab in prange(len(slabs)):
@@ -258,14 +260,9 @@ def find_drops(
                         or min(v0, v1) > lens[5] + outside
                     ):
                         continue
-                    length = math.sqrt((u1 - u0) ** 2 + (v1 - v0) ** 2)
-                    slope = (2 * outside + inside) * (outside - inside)
-                    spread = length * (2 * inside + slope / (1.5 * (outside + inside)))
-                    spread += 0.5 * math.pi * (outside * outside + inside * inside)
                     fade = min(max((farthest - z) / ((1 - FADE) * farthest), 0.0), 1.0)
-                    cover = min(
-                        0.5 * math.pi * width_px * width_px / spread, 1.0
-                    )  # two cross-sections
+                    # Two cross-sections, over the integral of the disc's profile.
+                    cover = width_px * width_px / (outside * outside + inside * inside)
                     row = offsets[slab] + number
                     drops[row, 0] = u0
                     drops[row, 1] = v0
@@ -339,10 +336,34 @@ def _nearest_in_row(row, width, alpha, depth, eight):
 
 
 @kernel_function()
+def _path_integral(h2, start, length):
+    """Return the integral of (h^2 - x^2)+ over the path x = start to start + length.
+
+    h2: h^2; 0 is returned where it is negative.
+    """
+    zeros = v8.broadcast(np.float32(0))
+    third = v8.broadcast(np.float32(1 / 3))
+    h2 = v8.maximum(h2, zeros)
+    h = v8.sqrt(h2)
+    low = v8.maximum(start, zeros - h)
+    high = v8.minimum(start + length, h)
+    between = v8.maximum(high - low, zeros)
+    squares = v8.fmuladd(high, high + low, low * low)
+    return v8.maximum(between * (h2 - squares * third), zeros)
+
+
+@kernel_function()
 def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, clear):
     """Write the share of each pixel of image rows top to bottom that no drop covers into clear.
 
     The drops count in their order. alpha, depth: of all pixels.
+
+    A drop is a disc whose cover falls from the radius i to the radius o as a paraboloid, the
+    difference of (o^2 - r^2)+ and (i^2 - r^2)+ over o^2 - i^2. While the shutter is open it moves
+    by L, so a pixel has the mean over the disc's path, whose ends are tapered. At the offset y from
+    the path, with h^2 = R^2 - y^2 and the path's part from `low` to `high` within h of the pixel,
+
+        int (R^2 - y^2 - x^2) dx = (high - low) (h^2 - (high^2 + high low + low^2) / 3)
     """
     zero = np.float32(0)
     half = np.float32(0.5)
@@ -364,9 +385,18 @@ def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, cle
         du = drop[2] - u0
         dv = drop[3] - v0
         per_z_change = drop[5] - first_per_z
-        per_length = unit / max(du * du + dv * dv, np.float32(1e-12))
+        inside = drop[6]
+        length = math.sqrt(du * du + dv * dv)
+        if length < np.float32(LEAST_LENGTH):
+            length = np.float32(LEAST_LENGTH)
+            u0 = half * (u0 + drop[2] - length)
+            du = length
+            dv = zero
+        per_length = unit / (length * length)
         beyond = outside * outside
-        ramp = share / (beyond - drop[6] * drop[6])
+        within = inside * inside
+        ramp = share / ((beyond - within) * length)
+        ends = v8.broadcast(length)
         # In all rows a nearly upright streak is evaluated over its full width.
         is_slanted = abs(du) > np.float32(NUM_LANES / 2) and abs(dv) > np.float32(1e-3)
         per_row = unit / dv if is_slanted else zero
@@ -388,12 +418,15 @@ def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, cle
             for j in range(left, right, NUM_LANES):
                 at = min(j, last_block)  # the last eight pixels of a row take those before them
                 x = v8.broadcast(np.float32(at) + half - u0) + v8.lane_numbers()
-                along = v8.minimum(v8.maximum(v8.fmuladd(x, ax, base), zeros), ones)
-                x = v8.fmuladd(along, v8.broadcast(-du), x)
-                y = v8.fmuladd(along, v8.broadcast(-dv), v8.broadcast(v))
-                distance2 = v8.fmuladd(x, x, y * y)
-                covered = (v8.broadcast(beyond) - distance2) * v8.broadcast(ramp)
-                covered = v8.minimum(v8.maximum(covered, zeros), v8.broadcast(share))
+                along = v8.fmuladd(x, ax, base)
+                across = v8.fmuladd(x, v8.broadcast(dv / length), v8.broadcast(-v * du / length))
+                across2 = across * across
+                start = along * v8.broadcast(-length)  # of the path, from the pixel
+                covered = _path_integral(v8.broadcast(beyond) - across2, start, ends)
+                if inside > zero:
+                    covered = covered - _path_integral(v8.broadcast(within) - across2, start, ends)
+                covered = v8.minimum(covered * v8.broadcast(ramp), ones)
+                along = v8.minimum(v8.maximum(along, zeros), ones)
                 pixel = Index(row * width + at)
                 surface = v8.load(depth, pixel)
                 per_z = v8.fmuladd(along, v8.broadcast(per_z_change), v8.broadcast(first_per_z))

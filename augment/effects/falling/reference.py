@@ -13,7 +13,15 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from augment.effects.falling.drop_kernels import EDGE, FADE, LEAST_RADIUS, SOFT, CellWalk, Veil
+from augment.effects.falling.drop_kernels import (
+    EDGE,
+    FADE,
+    LEAST_LENGTH,
+    LEAST_RADIUS,
+    SOFT,
+    CellWalk,
+    Veil,
+)
 from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL
 from augment.rng import STEP_X, mix
 
@@ -138,23 +146,30 @@ def _streaks(
     inside = np.maximum(np.abs(width_px - blur) / 2 - 0.5, 0)
     u = np.stack([fx * opening_points[:, 0] / z0 + cx, fx * closing_points[:, 0] / z1 + cx])
     v = np.stack([fy * opening_points[:, 1] / z0 + cy, fy * closing_points[:, 1] / z1 + cy])
-    length = np.hypot(u[1] - u[0], v[1] - v[0])
-    # Cover is 1 up to `inside`, then falls as a parabola: across a line, and over a disc.
-    slope = (2 * outside + inside) * (outside - inside)
-    spread = length * (2 * inside + slope / (1.5 * (outside + inside)))
-    spread += math.pi / 2 * (outside**2 + inside**2)
     fade = np.clip((max_depth - mean_z) / ((1 - FADE) * max_depth), 0, 1)
-    cover = np.minimum(math.pi / 2 * width_px**2 / spread, 1) * fade
+    # The disc covers as much up to `inside` as in its middle, then less, as a paraboloid, whose
+    # integral is pi / 2 (outside^2 + inside^2). It takes two cross-sections.
+    cover = width_px**2 / (outside**2 + inside**2) * fade
     is_in_view = (mean_z < max_depth) & (u.max(0) >= -outside) & (v.max(0) >= -outside)
     is_in_view &= (u.min(0) <= width + outside) & (v.min(0) <= height + outside)
     numbers = (u[0], v[0], u[1], v[1], 1 / z0, 1 / z1, inside, outside, cover)
     return np.stack(numbers, 1)[is_in_view]
 
 
+def path_integral(h2: np.ndarray, start: np.ndarray, length: float) -> np.ndarray:
+    """Return the integral of (h2 - x^2)+ over the path x = start to start + length."""
+    h = np.sqrt(np.maximum(h2, 0))
+    low = np.clip(start, -h, h)
+    high = np.clip(start + length, -h, h)
+    return h**2 * (high - low) - (high**3 - low**3) / 3
+
+
 def cover_by_numpy(
     drops: np.ndarray, alpha: np.ndarray, depth: np.ndarray
 ) -> Float[np.ndarray, "H W"]:
     """Return the share of each pixel that no drop covers, as drop_kernels.cover_pixels does.
+
+    A pixel has the mean of the disc's profile over the path of the disc.
 
     Args:
         drops: streaks from `find_drops_by_numpy`, [N, 9].
@@ -171,10 +186,19 @@ def cover_by_numpy(
         y, x = np.mgrid[:height, :width][:, rows, columns] + 0.5
         du = u1 - u0
         dv = v1 - v0
-        along = ((x - u0) * du + (y - v0) * dv) / max(du * du + dv * dv, 1e-12)
+        length = math.hypot(du, dv)
+        if length < LEAST_LENGTH:
+            length = LEAST_LENGTH
+            u0 = (u0 + u1 - LEAST_LENGTH) / 2
+            du = LEAST_LENGTH
+            dv = 0.0
+        along = ((x - u0) * du + (y - v0) * dv) / length**2
+        start = -along * length
+        across2 = (((x - u0) * dv - (y - v0) * du) / length) ** 2
+        integral = path_integral(outside**2 - across2, start, length)
+        integral -= path_integral(inside**2 - across2, start, length)
+        covered = np.minimum(integral * share / ((outside**2 - inside**2) * length), 1)
         along = along.clip(0, 1)
-        distance2 = (x - u0 - along * du) ** 2 + (y - v0 - along * dv) ** 2
-        covered = ((outside**2 - distance2) / (outside**2 - inside**2)).clip(0, 1) * share
         per_z = start_per_z + along * (end_per_z - start_per_z)
         surface = depth[rows, columns]
         behind = ((1 - surface * per_z) / SOFT).clip(0, 1)
