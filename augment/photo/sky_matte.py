@@ -39,7 +39,7 @@ from augment.scene.scene import Scene
 # Difference of an image's proportions from the camera's beyond which it is another camera's.
 _MAX_SQUEEZE = 0.05
 # Difference from the sky's local mean that is noise, of 255.
-_NOISE_LEVELS = 10.0
+_NOISE_LEVELS = 14.0
 # The same in standard deviations of the sky around.
 _NOISE_DEVIATIONS = 2.0
 # Largest difference that is noise, of 255.
