@@ -11,15 +11,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from augment.photo.photo_objects import find_edges
 from augment.photo.recorded_base import Photo, blacken_parts, mix
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.composite import add_airlight_elevation, composite_sky
 from augment.render.constants import RasterSettings
 from augment.render.fog import Fog, apply_fog_to_render, blend_airlight, sky_optical_depth
-from augment.render.layout import HeightClip
+from augment.render.layout import ABOVE, HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera
 from augment.scene.scene import PosedGaussians
@@ -103,9 +105,13 @@ class LayerRenderer:
         buffer_fog = self.fog if self.applies_fog_to_buffers else None
         photo = self.photo if self.photo is not None and self.photo.is_seen_by(camera) else None
         parts = self.parts
+        is_photo = photo is not None and photo.camera is camera and photo_share is None
+        moves_edges = is_photo and (clip is None or clip.kept_side == ABOVE)
         if photo is not None:
             buffers = buffers | photo.buffers_for(parts)
             parts = blacken_parts(parts) if photo_share is None else parts
+            if moves_edges:
+                buffers = buffers | {ALPHA, EXPECTED_DEPTH}
         has_elevation_airlight = self.fog is not None and self.fog.elevation_gain > 0
         raster = rasterize(
             parts,
@@ -117,6 +123,8 @@ class LayerRenderer:
             pixel_mask=pixel_mask,
             backend=self.backend,
         )
+        if moves_edges:
+            raster = self._move_edges(raster, parts, camera, clip, buffers, self.settings)
         if photo is not None:
             with timed("photo"):
                 raster = photo.paint(raster, parts, camera, photo_share)
@@ -170,6 +178,50 @@ class LayerRenderer:
             sky = blend_airlight(sky, optical_depth, self.fog, ray_slope)
         return rgb + (1 - alpha)[..., None] * sky
 
+    def _move_edges(
+        self,
+        raster: RenderOutput,
+        parts: Sequence[PosedGaussians],
+        camera: Camera,
+        clip: HeightClip | None,
+        buffers: frozenset[str],
+        settings: RasterSettings,
+    ) -> RenderOutput:
+        """Return the buffers of the photo's view with objects that end where the photo shows it.
+
+        Args:
+            raster: the buffers.
+            parts: the parts that they show.
+            camera: the camera of the photo.
+            clip: the level plane above which they are drawn; None without a plane.
+            buffers: names of the buffers.
+            settings: settings of the rasteriser.
+        """
+        assert self.photo is not None and raster.alpha is not None
+        with timed("photo: outlines"):
+            edges = find_edges(
+                self.parts,
+                raster,
+                camera,
+                self.photo.pixels,
+                settings=settings,
+                clip=clip,
+                backend=self.backend,
+            )
+        if edges is None:
+            return raster
+        with timed("photo: background of objects"):
+            background = rasterize(
+                edges.background_of(parts),
+                camera,
+                buffers=buffers,
+                settings=settings,
+                clip=clip,
+                pixel_mask=torch.from_numpy(edges.shows_background).to(raster.alpha.device),
+                backend=self.backend,
+            )
+            return edges.apply(raster, background, parts)
+
     def _draw_on_photo(
         self, photo: Photo, camera: Camera, buffers: frozenset[str]
     ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
@@ -178,14 +230,13 @@ class LayerRenderer:
         and the buffers of the scene.
         """
         parts, photo_buffers = photo.prepare_parts(self.parts)
-        requested_buffers = (buffers - {RGB}) | photo_buffers | {ALPHA}
-        if self.fog is not None:
-            requested_buffers = requested_buffers | {EXPECTED_DEPTH}
+        requested_buffers = (buffers - {RGB}) | photo_buffers | {ALPHA, EXPECTED_DEPTH}
         with timed("rasterise"):
             settings = replace(self.settings, sh_degree=0)  # one colour in all bands
             raster = rasterize(
                 parts, camera, buffers=requested_buffers, settings=settings, backend=self.backend
             )
+        raster = self._move_edges(raster, parts, camera, None, requested_buffers, settings)
         with timed("photo"):
             rgb = photo.clear_picture(raster, parts)
         if self.fog is None:
