@@ -9,6 +9,7 @@ photo ends.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -47,6 +48,8 @@ DEPTH_TOLERANCE = 0.1
 DEPTH_TOLERANCE_M = 0.5
 # Height above an object within which its own snow may lie, metres.
 CAP_HEIGHT_M = 0.8
+# Share of a pixel that snow on the ground may hide where an object's buffers are taken.
+MAX_GROUND_SNOW = 0.3
 # Largest number of objects whose outlines are moved; the nearest ones are taken.
 MAX_OBJECTS = 60
 
@@ -182,7 +185,10 @@ def find_edges(
     if len(bare_parts) < len(moving_parts):
         covered = _draw(moving_parts, small, scene_depth, settings, backend)
     is_drawn = None if clip is None else alpha > 0.5
-    return _edges_of(objects, covered, is_drawn, clip, camera, has_caps=covered is not bare)
+    is_bare = None
+    if raster.overlay is not None:  # snow on the ground hides the feet of objects
+        is_bare = _shrink(raster.overlay, small) <= covered.overlay + MAX_GROUND_SNOW
+    return _edges_of(objects, covered, is_drawn, is_bare, clip, camera, covered is not bare)
 
 
 def copy_size(camera: Camera, width_px: int) -> tuple[int, int]:
@@ -235,13 +241,16 @@ def _find_objects(
     height, width = drawing.owners.shape
     scale = camera.width / width, camera.height / height
     owners = np.where(drawing.alpha > 0.5, drawing.owners, 0)
+    masks = [(owners == instance_id, instance_id) for instance_id in np.unique(owners[owners > 0])]
+    masks = [found for found in masks if np.count_nonzero(found[0]) >= MIN_AREA_PX]
+    depths_m = [float(np.median(drawing.depth[mask])) for mask, _ in masks]
     objects = list[_Object]()
-    for instance_id in np.unique(owners[owners > 0]).tolist():
-        mask = owners == instance_id
+    is_nearer = np.zeros(owners.shape, bool)
+    nearer_reach_px = 0.0
+    for number in np.argsort(depths_m, kind="stable")[:MAX_OBJECTS]:
+        mask, instance_id = masks[number]
+        depth_m = depths_m[number]
         left, top, mask_width, mask_height = cv2.boundingRect(mask.astype(np.uint8))
-        if np.count_nonzero(mask) < MIN_AREA_PX:
-            continue
-        depth_m = float(np.median(drawing.depth[mask]))
         reach_px = min(
             camera.fx * REACH_M / max(depth_m, 1e-3),
             MAX_REACH_FRACTION * camera.width,
@@ -249,6 +258,14 @@ def _find_objects(
         )
         if reach_px < MIN_REACH_PX:
             continue
+        if nearer_reach_px > 0:
+            # Splats of nearer objects hide more of it than the photo's objects do.
+            side = 2 * math.ceil(nearer_reach_px / scale[0]) + 1
+            grown_mask = cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+            mask = mask | (grown_mask & is_nearer)
+            left, top, mask_width, mask_height = cv2.boundingRect(mask.astype(np.uint8))
+        is_nearer |= mask
+        nearer_reach_px = max(nearer_reach_px, reach_px)
         window = mask[top : top + mask_height, left : left + mask_width]
         # An edge of the window is one of the object, unless it is the image's.
         margins = (
@@ -260,18 +277,17 @@ def _find_objects(
         silhouette = Silhouette(window, *corner, scale, reach_px)
         polygons = find_outlines(silhouette, pixels)
         if polygons:
-            objects.append(_Object(instance_id, depth_m, polygons))
-    objects.sort(key=lambda found: -found.depth_m)
-    return objects[-MAX_OBJECTS:]
+            objects.append(_Object(int(instance_id), depth_m, polygons))
+    return objects[::-1]
 
 
 def _edges_of(
     objects: Sequence[_Object],
     drawing: _Drawing,
     is_drawn: Bool[np.ndarray, "h w"] | None,
+    is_bare: Bool[np.ndarray, "h w"] | None,
     clip: HeightClip | None,
     camera: Camera,
-    *,
     has_caps: bool,
 ) -> ObjectEdges:
     """Return the pixels where the photo's outlines of objects differ from the drawn ones.
@@ -280,6 +296,7 @@ def _edges_of(
         objects: the objects, the nearest last.
         drawing: the moving parts with all that lies on them.
         is_drawn: True where the buffers show a surface; None without a clip.
+        is_bare: False where snow on the ground hides the objects; None without snow.
         clip: height above which the buffers show the parts; None if they show all.
         camera: the camera of the photo.
         has_caps: if True, snow may lie on the objects.
@@ -307,6 +324,8 @@ def _edges_of(
     target_labels = photo_labels.reshape(-1)[targets]
     square = np.ones((3, 3), np.uint8)
     is_pure = (alpha >= SOLID_ALPHA) & (cv2.erode(labels, square) == cv2.dilate(labels, square))
+    if is_bare is not None:
+        is_pure &= is_bare
     moves = list[tuple[np.ndarray, np.ndarray]]()
     for label in np.unique(target_labels).tolist():
         chosen = targets[target_labels == label]
@@ -386,7 +405,7 @@ def _find_sources(
     rows, columns = np.divmod(targets, camera.width)
     small_rows = rows * height // camera.height
     small_columns = columns * width // camera.width
-    nearest = _nearest_pixels(is_seed)[small_rows, small_columns]
+    nearest = nearest_pixels(is_seed)[small_rows, small_columns]
     seed_rows, seed_columns = np.divmod(nearest, width)
     # A target keeps its place within the small pixel, so that neighbours differ as they did.
     rows += np.rint((seed_rows - small_rows) * (camera.height / height)).astype(np.int64)
@@ -396,7 +415,7 @@ def _find_sources(
     return targets, rows * camera.width + columns
 
 
-def _nearest_pixels(is_seed: Bool[np.ndarray, "h w"]) -> Int64[np.ndarray, "h w"]:
+def nearest_pixels(is_seed: Bool[np.ndarray, "h w"]) -> Int64[np.ndarray, "h w"]:
     """Return the flat index of the seed nearest to each pixel."""
     _, numbers = cv2.distanceTransformWithLabels(
         (~is_seed).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.photo.photo_objects import find_edges
-from augment.photo.recorded_base import Photo, blacken_parts, mix
+from augment.photo.recorded_base import Photo, blacken_parts
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.composite import add_airlight_elevation, composite_sky
 from augment.render.constants import RasterSettings
@@ -127,7 +127,11 @@ class LayerRenderer:
             raster = self._move_edges(raster, parts, camera, clip, buffers, self.settings)
         if photo is not None:
             with timed("photo"):
-                raster = photo.paint(raster, parts, camera, photo_share)
+                if moves_edges:
+                    raster = photo.complete(raster, clip)
+                raster = photo.paint(
+                    raster, parts, camera, photo_share, parts_sky=self._parts_sky(photo)
+                )
         if buffer_fog is not None:
             with timed("smog on buffers"):
                 raster = replace(raster, rgb=apply_fog_to_render(raster, camera, buffer_fog))
@@ -170,7 +174,7 @@ class LayerRenderer:
         """
         if self.photo is None:
             return composite_sky(rgb, alpha, camera, self.sky, fog=self.fog, backend=self.backend)
-        sky = self.photo.sky_colors(camera)
+        sky = self.photo.sky_colors(camera, parts_sky=self._parts_sky(self.photo))
         if self.fog is not None:
             ray_slope = camera.ray_directions(rgb.dtype, rgb.device)[..., 2]
             ray_slope = ray_slope / camera.ray_lengths(rgb.dtype, rgb.device)
@@ -238,9 +242,12 @@ class LayerRenderer:
             )
         raster = self._move_edges(raster, parts, camera, None, requested_buffers, settings)
         with timed("photo"):
-            rgb = photo.clear_picture(raster, parts)
-        if self.fog is None:
-            return rgb, raster
+            raster = photo.complete(raster)
+            if self.fog is None:
+                return photo.clear_picture(raster, parts), raster
         with timed("smog on buffers"):
-            transmittance = photo.transmittance(raster, self.fog)
-            return mix(rgb, photo.airlight(self.fog), 1 - transmittance), raster
+            return photo.fade(raster, parts, self.fog), raster
+
+    def _parts_sky(self, photo: Photo) -> bool:
+        """Return True if sky and surfaces of a photo's mixed pixels get different weather."""
+        return photo.matte is not None and (self.fog is not None or photo.style is not None)
