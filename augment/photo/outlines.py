@@ -31,9 +31,9 @@ POINT_SPACING = 1 / 10
 # Smallest distance of the points of an outline, pixels of the photo.
 MIN_POINT_SPACING_PX = 2.0
 # Sigma with which the silhouette is smoothed, as a part of the reach.
-SMOOTHING = 0.3
+SMOOTHING = 0.45
 # Reach outside the silhouette over the reach inside it.
-OUTER_REACH = 0.4
+OUTER_REACH = 0.25
 # Width of the sides of an edge, as a part of the reach.
 SIDE_WIDTH = 1 / 8
 # Smallest and largest width of the sides of an edge, pixels.
@@ -45,9 +45,9 @@ BACKGROUND_POINTS = 9
 # Largest gain of an edge, levels of 255.
 MAX_EDGE_LEVELS = 40.0
 # Cost of a bend of the path by one offset, levels.
-BEND_COST_LEVELS = 5.0
+BEND_COST_LEVELS = 3.0
 # Gain of the region over the whole reach, levels.
-REGION_LEVELS = 12.0
+REGION_LEVELS = 25.0
 # Difference of colour that is one unit of being unlike the background, levels.
 UNLIKE_LEVELS = 18.0
 # Units of being unlike the background above which a pixel is the object's.
@@ -55,9 +55,9 @@ UNLIKE_THRESHOLD = 0.55
 # Largest number of units.
 MAX_UNLIKE = 1.5
 # Standard deviation of a background's brightness at which the region counts half, levels.
-PLAIN_LEVELS = 12.0
+PLAIN_LEVELS = 9.0
 # Cost of the prior at a distance of one reach from the usual offset, levels.
-PRIOR_LEVELS = 14.0
+PRIOR_LEVELS = 25.0
 # Usual offset, in reaches inside the silhouette.
 USUAL_OFFSET = 0.35
 # Distance from the image's border within which an outline stays, pixels.

@@ -50,6 +50,8 @@ DEPTH_TOLERANCE_M = 0.5
 CAP_HEIGHT_M = 0.8
 # Share of a pixel that snow on the ground may hide where an object's buffers are taken.
 MAX_GROUND_SNOW = 0.3
+# Quantile of the heights of an object's splats that is its bottom.
+LOWEST_QUANTILE = 0.01
 # Largest number of objects whose outlines are moved; the nearest ones are taken.
 MAX_OBJECTS = 60
 
@@ -145,6 +147,8 @@ class _Object:
     """Median z of its pixels, metres."""
     polygons: list[Float[np.ndarray, "N 2"]]
     """Its outlines in the photo."""
+    bottom_z_m: float = -math.inf
+    """Height of its lowest splats in the world, metres: it does not reach below."""
 
 
 def find_edges(
@@ -181,6 +185,7 @@ def find_edges(
     objects = _find_objects(bare, camera, pixels)
     if not objects:
         return None
+    objects = [replace(o, bottom_z_m=_bottom_of(bare_parts, o.instance_id)) for o in objects]
     covered = bare
     if len(bare_parts) < len(moving_parts):
         covered = _draw(moving_parts, small, scene_depth, settings, backend)
@@ -189,6 +194,21 @@ def find_edges(
     if raster.overlay is not None:  # snow on the ground hides the feet of objects
         is_bare = _shrink(raster.overlay, small) <= covered.overlay + MAX_GROUND_SNOW
     return _edges_of(objects, covered, is_drawn, is_bare, clip, camera, covered is not bare)
+
+
+def _bottom_of(parts: Sequence[PosedGaussians], instance_id: int) -> float:
+    """Return the height in the world of the lowest splats of an object, metres."""
+    heights = list[np.ndarray]()
+    for part in parts:
+        if part.instance_id != instance_id:
+            continue
+        means = part.gaussians.means.detach().cpu().double().numpy()
+        if part.world_from_part is None:
+            heights.append(means[:, 2])
+            continue
+        pose = part.world_from_part.detach().cpu().double().numpy()
+        heights.append(means @ pose[2, :3] + pose[2, 3])
+    return float(np.quantile(np.concatenate(heights), LOWEST_QUANTILE))
 
 
 def copy_size(camera: Camera, width_px: int) -> tuple[int, int]:
@@ -310,6 +330,7 @@ def _edges_of(
         fill_polygons(drawn_object.polygons, photo_labels, label)
         labels_by_id[drawn_object.instance_id] = label
     labels = labels_by_id[drawing.owners]
+    _cut_below(objects, photo_labels, labels, drawing, camera)
     alpha = np.where(labels > 0, drawing.alpha, np.float32(0))
     # The background may show through pixels beside those that are drawn: one more is taken.
     hides = cv2.dilate((alpha > CLEAR_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
@@ -351,8 +372,40 @@ def _edges_of(
     )
 
 
+def _cut_below(
+    objects: Sequence[_Object],
+    photo_labels: UInt8[np.ndarray, "H W"],
+    labels: UInt8[np.ndarray, "h w"],
+    drawing: _Drawing,
+    camera: Camera,
+) -> None:
+    """Take pixels below the ground on which an object stands from it, in place.
+
+    They show the shadow on the road beside its wheels, which is as dark as the object.
+    """
+    height, width = labels.shape
+    for label, drawn_object in enumerate(objects, 1):
+        is_object = (labels == label) & (drawing.alpha > 0.5)
+        left, top, box_width, box_height = cv2.boundingRect(
+            np.concatenate(drawn_object.polygons).astype(np.float32)
+        )
+        if not is_object.any():
+            continue
+        first_row = max(top + box_height // 2, 0)
+        first_column = max(left, 0)
+        window = photo_labels[first_row : top + box_height, first_column : left + box_width]
+        rows, columns = np.nonzero(window == label)
+        rows += first_row
+        columns += first_column
+        small = rows * height // camera.height, columns * width // camera.width
+        depths_m = drawing.depth.reshape(-1)[nearest_pixels(is_object)[small]]
+        pixels = rows * camera.width + columns
+        is_below = _heights_at(pixels, depths_m, camera) < drawn_object.bottom_z_m
+        photo_labels.reshape(-1)[pixels[is_below]] = 0
+
+
 def _heights_at(
-    targets: Int64[np.ndarray, " M"], depth_m: float, camera: Camera
+    targets: Int64[np.ndarray, " M"], depth_m: float | Float[np.ndarray, " M"], camera: Camera
 ) -> Float[np.ndarray, " M"]:
     """Return the height in the world of points at a depth in pixels."""
     rows, columns = np.divmod(targets, camera.width)
