@@ -218,7 +218,9 @@ def score_offsets(
     inside = (sums[:, ends] - sums[:, ends - side_px]) / side_px
     outside = (sums[:, ends + side_px] - sums[:, ends]) / side_px
     edges = np.minimum(np.abs(inside - outside).max(2), MAX_EDGE_LEVELS)
-    offsets = sampled[ends].astype(np.float64)
+    # The edge lies half a pixel before the first sample outside, and OpenCV paints half a pixel
+    # beyond the border of a polygon.
+    offsets = sampled[ends] - 1.0
     regions = _score_regions(samples, ends, outer_px)
     prior = PRIOR_LEVELS * (offsets / reach_px + USUAL_OFFSET) ** 2
     return offsets, (edges + REGION_LEVELS / reach_px * regions - prior).astype(np.float32)
