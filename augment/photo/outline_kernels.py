@@ -136,9 +136,9 @@ def spread_roots(pixels, state, step_costs, max_cost, roots):
                 continue
             difference = np.int64(0)
             for channel in range(3):
-                here = np.int64(pixels[i, j, channel])
-                there = np.int64(pixels[row, column, channel])
-                difference = max(difference, abs(here - there))
+                level = np.int64(pixels[i, j, channel])
+                next_level = np.int64(pixels[row, column, channel])
+                difference = max(difference, abs(level - next_level))
             next_cost = cost + min(difference + step_costs[direction], max_cost)
             if next_cost >= costs[row, column]:
                 continue

@@ -33,7 +33,7 @@ SILHOUETTE_PX = 480
 # Distance by which splats lie beside what the photo shows, at most, metres.
 REACH_M = 0.25
 # Smallest reach of an object whose outline is moved, pixels of the photo.
-MIN_REACH_PX = 4.0
+MIN_REACH_PX = 6.0
 # Largest reach, as a part of the image's width.
 MAX_REACH_FRACTION = 0.03
 # Largest reach, as a part of the object's smaller side.
@@ -262,7 +262,7 @@ def _find_objects(
     scale = camera.width / width, camera.height / height
     owners = np.where(drawing.alpha > 0.5, drawing.owners, 0)
     masks = [(owners == instance_id, instance_id) for instance_id in np.unique(owners[owners > 0])]
-    masks = [found for found in masks if np.count_nonzero(found[0]) >= MIN_AREA_PX]
+    masks = [pair for pair in masks if np.count_nonzero(pair[0]) >= MIN_AREA_PX]
     depths_m = [float(np.median(drawing.depth[mask])) for mask, _ in masks]
     objects = list[_Object]()
     is_nearer = np.zeros(owners.shape, bool)
@@ -398,7 +398,7 @@ def _cut_below(
         rows += first_row
         columns += first_column
         small = rows * height // camera.height, columns * width // camera.width
-        depths_m = drawing.depth.reshape(-1)[nearest_pixels(is_object)[small]]
+        depths_m = drawing.depth.reshape(-1)[_nearest_to(*small, is_object)]
         pixels = rows * camera.width + columns
         is_below = _heights_at(pixels, depths_m, camera) < drawn_object.bottom_z_m
         photo_labels.reshape(-1)[pixels[is_below]] = 0
@@ -431,7 +431,8 @@ def _are_caps(
         )
         left = max(left, 0)
         first = max(top - reach_px, 0)
-        rows, columns = slice(first, max(top + height, 0)), slice(left, max(left + width, 0))
+        rows = slice(first, max(top + height, 0))
+        columns = slice(left, max(left + width, 0))
         window = (photo_labels[rows, columns] == label).astype(np.uint8)
         if not window.size or reach_px < 1:
             continue
@@ -458,7 +459,7 @@ def _find_sources(
     rows, columns = np.divmod(targets, camera.width)
     small_rows = rows * height // camera.height
     small_columns = columns * width // camera.width
-    nearest = nearest_pixels(is_seed)[small_rows, small_columns]
+    nearest = _nearest_to(small_rows, small_columns, is_seed)
     seed_rows, seed_columns = np.divmod(nearest, width)
     # A target keeps its place within the small pixel, so that neighbours differ as they did.
     rows += np.rint((seed_rows - small_rows) * (camera.height / height)).astype(np.int64)
@@ -468,11 +469,28 @@ def _find_sources(
     return targets, rows * camera.width + columns
 
 
+def _nearest_to(
+    rows: Int64[np.ndarray, " M"], columns: Int64[np.ndarray, " M"], is_seed: np.ndarray
+) -> Int64[np.ndarray, " M"]:
+    """Return the flat index of the seed nearest to each of some pixels, of which there are some."""
+    if not len(rows):
+        return np.empty(0, np.int64)
+    left, top, width, height = cv2.boundingRect(is_seed.astype(np.uint8))
+    bottom = max(top + height, int(rows.max()) + 1)
+    right = max(left + width, int(columns.max()) + 1)
+    top = min(top, int(rows.min()))
+    left = min(left, int(columns.min()))
+    nearest = nearest_pixels(np.ascontiguousarray(is_seed[top:bottom, left:right]))
+    seed_rows, seed_columns = np.divmod(nearest[rows - top, columns - left], right - left)
+    return (seed_rows + top) * is_seed.shape[1] + seed_columns + left
+
+
 def nearest_pixels(is_seed: Bool[np.ndarray, "h w"]) -> Int64[np.ndarray, "h w"]:
     """Return the flat index of the seed nearest to each pixel."""
-    _, numbers = cv2.distanceTransformWithLabels(
+    _, label_image = cv2.distanceTransformWithLabels(
         (~is_seed).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    numbers = np.asarray(label_image, np.int64)
     seeds = np.flatnonzero(is_seed)
     indices = np.zeros(numbers.max() + 1, np.int64)
     indices[numbers.reshape(-1)[seeds]] = seeds

@@ -67,6 +67,8 @@ from recipes.schema import Recipe
 
 # Radius of the guided filter, as a part of the image's width.
 FILTER_RADIUS_FRACTION = 1 / 320
+# Resolution of the guided filter's windows where the photo's sky is known.
+MATTE_FILTER_SCALE = 0.5
 # Variance of display-encoded colour that the guided filter counts as an edge.
 EDGE_VARIANCE = 0.05**2
 # Radius for the sky's share, in radii: splats of sky and of pale walls are told apart badly.
@@ -551,8 +553,8 @@ class Photo:
         assert self.matte is not None
         share = self.matte.sky_share.reshape(-1)[self._mixed_pixels, None]
         surface = self.matte.surface_rgb.reshape(-1, 3)[self._mixed_pixels].astype(np.float32)
-        shown = self.pixels.reshape(-1, 3)[self._mixed_pixels]
-        sky = np.clip((shown - (1 - share) * surface) / share, 0, 255)
+        mixed_levels = self.pixels.reshape(-1, 3)[self._mixed_pixels]
+        sky = np.clip((mixed_levels - (1 - share) * surface) / share, 0, 255)
         style = self.style
         style_maps = (None, None) if style is None else (style.surface_maps[0], style.sky_map)
         surface_rgb, sky_rgb = (
@@ -582,10 +584,8 @@ class Photo:
         sky = self._land if self.style is None else self._sky
         if self.matte is None:
             return land, sky
-        return tuple(
-            self._with_mixed(image, colors)
-            for image, colors in zip((land, sky), self._mixed_colors, strict=True)
-        )
+        surface_rgb, sky_rgb = self._mixed_colors
+        return self._with_mixed(land, surface_rgb), self._with_mixed(sky, sky_rgb)
 
     def _with_mixed(
         self, image: Float[Tensor, "H W 3"], colors: Float[Tensor, "M 3"]
@@ -638,9 +638,9 @@ class Photo:
             if isinstance(transmittance, Tensor):
                 transmittance = transmittance.flatten()[pixels, None]
             sky = airlight + transmittance * (sky - airlight)
-        shown = rgb.flatten(0, 1)[pixels]
-        sky_part = torch.minimum((share * sky).clamp_min(0), shown)
-        return self._with_mixed(surface_part, shown - sky_part)
+        mixed_rgb = rgb.flatten(0, 1)[pixels]
+        sky_part = torch.minimum((share * sky).clamp_min(0), mixed_rgb)
+        return self._with_mixed(surface_part, mixed_rgb - sky_part)
 
     def _in_colors(self, style_map: Float[Tensor, "3 4"] | None) -> Float[Tensor, "H W 3"]:
         """Return the photo in the scene's colours, or in a style's map of them, which ends at 0."""
@@ -677,11 +677,13 @@ class Photo:
         rows = slice(
             max(0, rows_with_values[0] - 2 * radius), rows_with_values[-1] + 1 + 2 * radius
         )
-        # A guide in colour would take twice as long.
+        # A surface has no edge at the sky line of a matte, so that coarser windows are enough
+        # (He and Sun 2015, "Fast Guided Filter"). A guide in colour would take twice as long.
+        scale = 1.0 if self.matte is None else MATTE_FILTER_SCALE
         guide = cv2.cvtColor(self.pixels[rows], cv2.COLOR_RGB2GRAY)
         sharpened = np.zeros_like(source)
         sharpened[rows] = cv2.ximgproc.guidedFilter(
-            guide, source[rows], radius, EDGE_VARIANCE * 255**2
+            guide, source[rows], radius, EDGE_VARIANCE * 255**2, scale=scale
         )
         return torch.from_numpy(np.clip(sharpened, 0, 1, out=sharpened)).to(values.device)
 
@@ -695,17 +697,9 @@ class Photo:
         """
         if self.matte is None:
             return raster
-        road_depth = None
-        ray_fall = self.ray_fall.cpu().numpy()
-        if self.height_m is not None:
-            road_depth = np.where(
-                ray_fall > MIN_ROAD_FALL,
-                self.height_m / np.maximum(ray_fall, MIN_ROAD_FALL),
-                math.inf,
-            ).astype(np.float32)
-        is_complete = None if clip is None else ray_fall > 0
+        is_complete = None if clip is None else self.ray_fall.cpu().numpy() > 0
         return complete_surfaces(
-            raster, self.matte.sky_share, self.pixels, self.camera, road_depth, is_complete
+            raster, self.matte.sky_share, self.pixels, self.camera, self._road_depth, is_complete
         )
 
     def fade(
@@ -857,6 +851,17 @@ class Photo:
         with kernel_threads(ROWS_PER_THREAD):
             kernels.compute_transmittance(alpha.numpy(), depth.detach().numpy(), *arrays, out)
         return torch.from_numpy(out)
+
+    @cached_property
+    def _road_depth(self) -> Float[np.ndarray, "H W"] | None:
+        """Return z of the road in each pixel, metres, infinite where no ray falls to it."""
+        if self.height_m is None:
+            return None
+        ray_fall = self.ray_fall.cpu().numpy()
+        with np.errstate(divide="ignore"):
+            depth = np.float32(self.height_m) / ray_fall
+        depth[ray_fall <= MIN_ROAD_FALL] = math.inf
+        return depth
 
     @cached_property
     def ray_fall(self) -> Float[Tensor, "H W"]:
