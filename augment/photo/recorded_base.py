@@ -36,13 +36,15 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int16, UInt8
+from jaxtyping import Float, Int16, Int64, UInt8
 from torch import Tensor
 
 from augment.errors import SceneError
 from augment.files.recorded_images import ImageFault, has_image, read_scaled
 from augment.light.cast_shadows import FadedShadows
 from augment.memo import memo_of
+from augment.photo.photo_surface import CLEAR_ALPHA, OPAQUE_ALPHA, complete_surfaces
+from augment.photo.sky_matte import SkyMatte, sky_matte
 from augment.render import photo_kernels as kernels
 from augment.render.buffers import (
     AUTO,
@@ -57,18 +59,16 @@ from augment.render.buffers import (
 from augment.render.composite import add_airlight_elevation, apply_color_map, unit_depth_coordinates
 from augment.render.cuda import runtime as gpu
 from augment.render.fog import Fog, optical_depth, sky_optical_depth
+from augment.render.layout import HeightClip
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import PosedGaussians, Scene
 from recipes.schema import Recipe
 
-# Alpha of reconstructed surfaces up to which a pixel counts as empty. What a photo shows is opaque,
-# while reconstructed surfaces let some light through.
-CLEAR_ALPHA = 0.04
-# Alpha of reconstructed surfaces from which a pixel counts as opaque.
-OPAQUE_ALPHA = 0.96
 # Radius of the guided filter, as a part of the image's width.
 FILTER_RADIUS_FRACTION = 1 / 320
+# Resolution of the guided filter's windows where the photo's sky is known.
+MATTE_FILTER_SCALE = 0.5
 # Variance of display-encoded colour that the guided filter counts as an edge.
 EDGE_VARIANCE = 0.05**2
 # Radius for the sky's share, in radii: splats of sky and of pale walls are told apart badly.
@@ -265,6 +265,8 @@ class Photo:
     """Colour maps of a style; None without a style."""
     faded_shadows: FadedShadows | None = None
     """Shadows on the ground that fade in smog; None where none fade."""
+    matte: SkyMatte | None = None
+    """Sky of the photo; None where it is not known, or nobody asks: then splats tell the sky."""
 
     def is_seen_by(self, camera: Camera) -> bool:
         """Return True if the camera is a window of the photo's."""
@@ -302,6 +304,8 @@ class Photo:
         parts: Sequence[PosedGaussians],
         camera: Camera,
         photo_share: Float[Tensor, "H W"] | None = None,
+        *,
+        parts_sky: bool = False,
     ) -> RenderOutput:
         """Return a layer that shows the photo in place of its splats.
 
@@ -312,31 +316,42 @@ class Photo:
             camera: the view, a window of the photo's camera.
             photo_share: share of each pixel of the photo that shows the layer; the rest keeps the
                 parts' colours. None means 1 everywhere.
+            parts_sky: if True, mixed pixels show the colour of their surface without the sky.
         """
         assert raster.rgb is not None and raster.alpha is not None
-        surface_rgb, sky_rgb, sky_share = self.layer_colors(raster, parts, camera)
+        surface_rgb, sky_rgb, sky_share = self.layer_colors(
+            raster, parts, camera, parts_sky=parts_sky
+        )
         surface = surface_rgb if sky_share is None else mix(surface_rgb, sky_rgb, sky_share)
         surface = self._without_sun(surface, raster, camera)
         if photo_share is not None:
             weight = photo_share if camera is self.camera else photo_share * self._inside(camera)
             rest_rgb = (1 - weight)[..., None] * raster.rgb
             return replace(raster, rgb=add_weighted(rest_rgb, surface, weight * raster.alpha))
-        alpha = photo_alpha = opaque_alpha(raster.alpha)
+        is_complete = self.matte is not None and camera is self.camera
+        alpha = photo_alpha = raster.alpha if is_complete else opaque_alpha(raster.alpha)
         if raster.overlay is not None:
             alpha = torch.maximum(alpha, raster.overlay)
             photo_alpha = alpha - raster.overlay
         return replace(raster, rgb=add_weighted(raster.rgb, surface, photo_alpha), alpha=alpha)
 
     def clear_picture(
-        self, raster: RenderOutput, parts: Sequence[PosedGaussians]
+        self,
+        raster: RenderOutput,
+        parts: Sequence[PosedGaussians],
+        sky_weight: Float[Tensor, "H W"] | None = None,
     ) -> Float[Tensor, "H W 3"]:
         """Return the photo with what lies on the scene, before any smog.
 
         Args:
             raster: buffers of the parts that `prepare_parts` gives.
             parts: those parts.
+            sky_weight: weight of the sky's colour in each pixel, against the surface's; None for
+                the share that the photo shows.
         """
         rgb = self._land if self.style is None else self._styled(self.style, raster, parts)
+        if self.matte is not None and (sky_weight is not None or self.style is not None):
+            rgb = self._mix_parted(rgb, sky_weight)
         rgb = self._without_sun(rgb, raster, self.camera)
         if raster.overlay is None:
             return rgb
@@ -348,6 +363,8 @@ class Photo:
     ) -> Float[Tensor, "H W 3"]:
         """Return the photo in the colours of a style."""
         assert raster.alpha is not None
+        if self.matte is not None:
+            return self._styled_by_matte(style, raster, parts, self.matte)
         if not self._takes_marks(parts):
             surface_rgb, sky_rgb, sky_level = self.layer_colors(raster, parts, self.camera)
             return mix(
@@ -370,6 +387,30 @@ class Photo:
             () if style.other_splat_maps is None else style.other_splat_maps
         ):
             weight = (marks[..., 1 + number] / alpha.clamp_min(1e-6)).clamp_max(1)
+            surface_rgb = mix(surface_rgb, self._in_colors(splat_map), weight)
+        return mix(surface_rgb, self._sky, share)
+
+    def _styled_by_matte(
+        self,
+        style: PhotoStyle,
+        raster: RenderOutput,
+        parts: Sequence[PosedGaussians],
+        matte: SkyMatte,
+    ) -> Float[Tensor, "H W 3"]:
+        """Return the photo in the colours of a style, where the photo itself tells the sky."""
+        share = torch.from_numpy(matte.sky_share).to(self._device)
+        if not self._takes_marks(parts):
+            surface_rgb, sky_rgb, _ = self.layer_colors(raster, parts, self.camera)
+            return mix(surface_rgb, sky_rgb, share)
+        if style.other_splat_maps is None and self.backend == CPU:
+            return self._in_both_on_cpu(style, share)
+        assert raster.rgb is not None and raster.alpha is not None
+        surface_rgb = self._land
+        solid_alpha = raster.alpha.clamp_min(1e-6)
+        for number, splat_map in enumerate(
+            () if style.other_splat_maps is None else style.other_splat_maps
+        ):
+            weight = (raster.rgb[..., 1 + number] / solid_alpha).clamp_max(1)
             surface_rgb = mix(surface_rgb, self._in_colors(splat_map), weight)
         return mix(surface_rgb, self._sky, share)
 
@@ -410,7 +451,12 @@ class Photo:
         return torch.from_numpy(out)
 
     def layer_colors(
-        self, raster: RenderOutput, parts: Sequence[PosedGaussians], camera: Camera
+        self,
+        raster: RenderOutput,
+        parts: Sequence[PosedGaussians],
+        camera: Camera,
+        *,
+        parts_sky: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return colours of surfaces [H, W, 3] and of the sky, and the share of sky in surfaces [H,
         W].
@@ -418,11 +464,11 @@ class Photo:
         Colours are the scene's, not clamped, at the pixels of a window. The share is None where no
         surface shows sky.
         """
-        surface_rgb = self._cut(self._land, camera)
+        surface_rgb = self._cut(self._parted[0] if parts_sky else self._land, camera)
         style = self.style
         sky_share = None
         if style is None:
-            return surface_rgb, self.sky_colors(camera), None
+            return surface_rgb, self.sky_colors(camera, parts_sky=parts_sky), None
         if len(style.surface_maps) > 1:
             assert raster.splat_ids is not None
             has_splat = raster.splat_ids >= 0
@@ -436,11 +482,11 @@ class Photo:
                     surface_rgb = torch.where(
                         (classes == class_number)[..., None], class_rgb, surface_rgb
                     )
-        if style.sky_levels is not None:
+        if style.sky_levels is not None and self.matte is None:
             assert raster.splat_ids is not None
             levels = style.sky_levels.to(surface_rgb.device)
             sky_share = levels[(raster.splat_ids + 1).clamp_max(len(levels) - 1)]
-        return surface_rgb, self.sky_colors(camera), sky_share
+        return surface_rgb, self.sky_colors(camera, parts_sky=parts_sky), sky_share
 
     def _without_sun(
         self, rgb: Float[Tensor, "H W 3"], raster: RenderOutput, camera: Camera
@@ -470,8 +516,15 @@ class Photo:
         lit_steps = cv2.merge([np.rint(lit_share * 255).astype(np.uint8)] * 3)
         return rgb * torch.from_numpy(cv2.LUT(lit_steps, factors[None])).to(rgb.device)
 
-    def sky_colors(self, camera: Camera) -> Float[Tensor, "H W 3"]:
-        """Return the sky's colours at the pixels of a window."""
+    def sky_colors(self, camera: Camera, *, parts_sky: bool = False) -> Float[Tensor, "H W 3"]:
+        """Return the sky's colours at the pixels of a window.
+
+        Args:
+            camera: the window.
+            parts_sky: if True, mixed pixels show the colour of the sky without their surface.
+        """
+        if parts_sky:
+            return self._cut(self._parted[1], camera)
         return self._cut(self._land if self.style is None else self._sky, camera)
 
     @cached_property
@@ -484,6 +537,110 @@ class Photo:
         """Return the photo in the colours of the sky."""
         assert self.style is not None
         return self._in_colors(self.style.sky_map)
+
+    # ---- Mixed pixels at the sky line
+
+    @cached_property
+    def _mixed_pixels(self) -> Int64[np.ndarray, " M"]:
+        """Return the flat indices of pixels that show both sky and a surface."""
+        assert self.matte is not None
+        share = self.matte.sky_share
+        return np.flatnonzero((share > 0) & (share < 1))
+
+    @cached_property
+    def _mixed_colors(self) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+        """Return the colours of surfaces and of the sky in mixed pixels, in the scene's colours."""
+        assert self.matte is not None
+        share = self.matte.sky_share.reshape(-1)[self._mixed_pixels, None]
+        surface = self.matte.surface_rgb.reshape(-1, 3)[self._mixed_pixels].astype(np.float32)
+        mixed_levels = self.pixels.reshape(-1, 3)[self._mixed_pixels]
+        sky = np.clip((mixed_levels - (1 - share) * surface) / share, 0, 255)
+        style = self.style
+        style_maps = (None, None) if style is None else (style.surface_maps[0], style.sky_map)
+        surface_rgb, sky_rgb = (
+            self._map_levels(torch.from_numpy(levels), style_map)
+            for levels, style_map in zip((surface, sky), style_maps, strict=True)
+        )
+        return surface_rgb, sky_rgb
+
+    def _map_levels(
+        self, levels: Float[Tensor, "M 3"], style_map: Float[Tensor, "3 4"] | None
+    ) -> Float[Tensor, "M 3"]:
+        """Return colours of the photo, 0 to 255, as `_in_colors` does."""
+        rgb = levels.to(self._device) / 255
+        color_map = self.scene_from_recorded
+        if style_map is not None:
+            color_map = _composed(style_map, self.scene_from_recorded)
+        if color_map is None:
+            return rgb
+        color_map = color_map.to(rgb.device)
+        mapped = rgb @ color_map[:, :3].T + color_map[:, 3]
+        return mapped if style_map is None else mapped.clamp_min(0)
+
+    @cached_property
+    def _parted(self) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
+        """Return the colours of surfaces and of the sky, each without the other in mixed pixels."""
+        land = self._land
+        sky = self._land if self.style is None else self._sky
+        if self.matte is None:
+            return land, sky
+        surface_rgb, sky_rgb = self._mixed_colors
+        return self._with_mixed(land, surface_rgb), self._with_mixed(sky, sky_rgb)
+
+    def _with_mixed(
+        self, image: Float[Tensor, "H W 3"], colors: Float[Tensor, "M 3"]
+    ) -> Float[Tensor, "H W 3"]:
+        """Return a copy of an image with other colours in mixed pixels."""
+        pixels = torch.from_numpy(self._mixed_pixels).to(image.device)
+        return image.flatten(0, 1).index_copy(0, pixels, colors.to(image)).view_as(image)
+
+    def _mix_parted(
+        self, rgb: Float[Tensor, "H W 3"], sky_weight: Float[Tensor, "H W"] | None
+    ) -> Float[Tensor, "H W 3"]:
+        """Return a picture whose mixed pixels weigh the colours of sky and surface anew."""
+        assert self.matte is not None
+        pixels = self._mixed_pixels
+        if not len(pixels):
+            return rgb
+        if sky_weight is None:
+            sky_weight = torch.from_numpy(self.matte.sky_share)
+        flat_weight = sky_weight.flatten()
+        weight = flat_weight[torch.from_numpy(pixels).to(flat_weight.device), None]
+        surface_rgb, sky_rgb = self._mixed_colors
+        weight = weight.to(surface_rgb)
+        return self._with_mixed(rgb, (1 - weight) * surface_rgb + weight * sky_rgb)
+
+    def surface_part(
+        self, rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"], fog: Fog | None
+    ) -> Float[Tensor, "H W 3"] | None:
+        """Return the part of a finished picture that its surfaces have, without that of the sky.
+
+        None where the photo's sky is not known.
+
+        Args:
+            rgb: the picture.
+            alpha: share of surfaces in each pixel.
+            fog: the fog in the picture; None for clear air.
+        """
+        if self.matte is None:
+            return None
+        black = torch.zeros(1, 1, 3, device=rgb.device)
+        surface_part = mix(rgb, black, 1 - alpha)
+        pixels = torch.from_numpy(self._mixed_pixels).to(rgb.device)
+        if not len(pixels):
+            return surface_part
+        share = 1 - alpha.flatten()[pixels, None]
+        sky = self._mixed_colors[1]
+        if fog is not None:
+            airlight = self.airlight(fog)
+            airlight = airlight.expand_as(rgb).flatten(0, 1)[pixels]
+            transmittance = self._sky_transmittance(fog)
+            if isinstance(transmittance, Tensor):
+                transmittance = transmittance.flatten()[pixels, None]
+            sky = airlight + transmittance * (sky - airlight)
+        mixed_rgb = rgb.flatten(0, 1)[pixels]
+        sky_part = torch.minimum((share * sky).clamp_min(0), mixed_rgb)
+        return self._with_mixed(surface_part, mixed_rgb - sky_part)
 
     def _in_colors(self, style_map: Float[Tensor, "3 4"] | None) -> Float[Tensor, "H W 3"]:
         """Return the photo in the scene's colours, or in a style's map of them, which ends at 0."""
@@ -520,13 +677,68 @@ class Photo:
         rows = slice(
             max(0, rows_with_values[0] - 2 * radius), rows_with_values[-1] + 1 + 2 * radius
         )
-        # A guide in colour would take twice as long.
+        # A surface has no edge at the sky line of a matte, so that coarser windows are enough
+        # (He and Sun 2015, "Fast Guided Filter"). A guide in colour would take twice as long.
+        scale = 1.0 if self.matte is None else MATTE_FILTER_SCALE
         guide = cv2.cvtColor(self.pixels[rows], cv2.COLOR_RGB2GRAY)
         sharpened = np.zeros_like(source)
         sharpened[rows] = cv2.ximgproc.guidedFilter(
-            guide, source[rows], radius, EDGE_VARIANCE * 255**2
+            guide, source[rows], radius, EDGE_VARIANCE * 255**2, scale=scale
         )
         return torch.from_numpy(np.clip(sharpened, 0, 1, out=sharpened)).to(values.device)
+
+    def complete(self, raster: RenderOutput, clip: HeightClip | None = None) -> RenderOutput:
+        """Return the buffers with the surfaces that the photo shows; unchanged without a matte.
+
+        Args:
+            raster: the buffers, with alpha and expected depth.
+            clip: level plane above which they show the scene: pixels whose rays fall to it stay as
+                they are. None without a plane.
+        """
+        if self.matte is None:
+            return raster
+        is_complete = None if clip is None else self.ray_fall.cpu().numpy() > 0
+        return complete_surfaces(
+            raster, self.matte.sky_share, self.pixels, self.camera, self._road_depth, is_complete
+        )
+
+    def fade(
+        self, raster: RenderOutput, parts: Sequence[PosedGaussians], fog: Fog
+    ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+        """Return the photo with what lies on the scene, seen through the smog, and the smog's
+        share in each pixel.
+
+        Args:
+            raster: buffers of the parts that `prepare_parts` gives, with surfaces as `complete`
+                makes them.
+            parts: those parts.
+            fog: the smog.
+        """
+        if self.matte is None:
+            rgb = self.clear_picture(raster, parts)
+            fog_share = 1 - self.transmittance(raster, fog)
+            return mix(rgb, self.airlight(fog), fog_share), fog_share
+        alpha = raster.alpha
+        assert alpha is not None
+        opaque = replace(raster, alpha=torch.ones_like(alpha))
+        transmittance = alpha * self.transmittance(opaque, fog)
+        sky_transmittance = self._sky_transmittance(fog)
+        sky_weight = (alpha == 0).to(alpha)
+        if isinstance(sky_transmittance, Tensor):
+            sky_part = (1 - alpha) * sky_transmittance
+            transmittance = transmittance + sky_part
+            sky_weight = torch.maximum(sky_weight, sky_part / transmittance.clamp_min(1e-6))
+        rgb = self.clear_picture(raster, parts, sky_weight)
+        fog_share = 1 - transmittance
+        return mix(rgb, self.airlight(fog), fog_share), fog_share
+
+    def _sky_transmittance(self, fog: Fog) -> Float[Tensor, "H W"] | float:
+        """Return the transmittance of the smog up to the sky; 0.0 in uniform smog."""
+        if fog.scale_height_m is None:
+            return 0.0
+        lengths = self.camera.ray_lengths(device=self._device)
+        eye_z_m = float(self.camera.centre[2])
+        return torch.exp(-sky_optical_depth(fog, -self.ray_fall / lengths, eye_z_m))
 
     def transmittance(self, raster: RenderOutput, fog: Fog) -> Float[Tensor, "H W"]:
         """Return T of what the photo shows, up to the rendered depth, with the photo's edges.
@@ -644,6 +856,17 @@ class Photo:
         return torch.from_numpy(out)
 
     @cached_property
+    def _road_depth(self) -> Float[np.ndarray, "H W"] | None:
+        """Return z of the road in each pixel, metres, infinite where no ray falls to it."""
+        if self.height_m is None:
+            return None
+        ray_fall = self.ray_fall.cpu().numpy()
+        with np.errstate(divide="ignore"):
+            depth = np.float32(self.height_m) / ray_fall
+        depth[ray_fall <= MIN_ROAD_FALL] = math.inf
+        return depth
+
+    @cached_property
     def ray_fall(self) -> Float[Tensor, "H W"]:
         """Return the metres by which each pixel's ray falls per metre of depth."""
         camera = self.camera
@@ -683,7 +906,12 @@ class Photo:
 
 
 def open_photo(
-    scene: Scene, camera: Camera, color_map: Float[Tensor, "3 4"] | None, *, backend: str
+    scene: Scene,
+    camera: Camera,
+    color_map: Float[Tensor, "3 4"] | None,
+    *,
+    backend: str,
+    finds_sky: bool = False,
 ) -> Photo:
     """Return the photo of a camera of the scene, at the camera's size, before any style.
 
@@ -692,6 +920,7 @@ def open_photo(
         camera: one of its cameras, at any scale.
         color_map: colour map that the finished picture gets; None without one.
         backend: backend that draws.
+        finds_sky: if True, the photo has its sky matte.
 
     Raises:
         SceneError: there is no photo, it cannot be read, or the colour map has no inverse.
@@ -717,7 +946,8 @@ def open_photo(
     if scene.has_known_gravity and scene.ground_z_m is not None:
         camera_height_m = float(camera.centre[2]) - scene.ground_z_m
         height_m = min(camera_height_m, MAX_CAMERA_HEIGHT_M) if camera_height_m > 0 else None
-    return Photo(camera, pixels, backend, scene_from_recorded, height_m)
+    matte = sky_matte(scene, camera, pixels) if finds_sky else None
+    return Photo(camera, pixels, backend, scene_from_recorded, height_m, matte=matte)
 
 
 def _at_most(camera: Camera, width_px: int) -> tuple[int, int]:

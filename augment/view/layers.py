@@ -11,16 +11,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.light.common_exposure import AddedColors
-from augment.photo.recorded_base import Photo, blacken_parts, mix
+from augment.photo.photo_objects import find_edges
+from augment.photo.recorded_base import Photo, blacken_parts
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.composite import add_airlight_elevation, composite_sky
 from augment.render.constants import RasterSettings
 from augment.render.fog import Fog, apply_fog_to_render, blend_airlight, sky_optical_depth
-from augment.render.layout import HeightClip
+from augment.render.layout import ABOVE, HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera
 from augment.scene.scene import PosedGaussians
@@ -106,9 +108,13 @@ class LayerRenderer:
         buffer_fog = self.fog if self.applies_fog_to_buffers else None
         photo = self.photo if self.photo is not None and self.photo.is_seen_by(camera) else None
         parts = self.parts
+        is_photo = photo is not None and photo.camera is camera and photo_share is None
+        moves_edges = is_photo and (clip is None or clip.kept_side == ABOVE)
         if photo is not None:
             buffers = buffers | photo.buffers_for(parts)
             parts = blacken_parts(parts) if photo_share is None else parts
+            if moves_edges:
+                buffers = buffers | {ALPHA, EXPECTED_DEPTH}
         has_elevation_airlight = self.fog is not None and self.fog.elevation_gain > 0
         raster = rasterize(
             parts,
@@ -120,9 +126,15 @@ class LayerRenderer:
             pixel_mask=pixel_mask,
             backend=self.backend,
         )
+        if moves_edges:
+            raster = self._move_edges(raster, parts, camera, clip, buffers, self.settings)
         if photo is not None:
             with timed("photo"):
-                raster = photo.paint(raster, parts, camera, photo_share)
+                if moves_edges:
+                    raster = photo.complete(raster, clip)
+                raster = photo.paint(
+                    raster, parts, camera, photo_share, parts_sky=self._parts_sky(photo)
+                )
         if buffer_fog is not None:
             with timed("smog on buffers"):
                 raster = replace(raster, rgb=apply_fog_to_render(raster, camera, buffer_fog))
@@ -165,13 +177,57 @@ class LayerRenderer:
         """
         if self.photo is None:
             return composite_sky(rgb, alpha, camera, self.sky, fog=self.fog, backend=self.backend)
-        sky = self.photo.sky_colors(camera)
+        sky = self.photo.sky_colors(camera, parts_sky=self._parts_sky(self.photo))
         if self.fog is not None:
             ray_slope = camera.ray_directions(rgb.dtype, rgb.device)[..., 2]
             ray_slope = ray_slope / camera.ray_lengths(rgb.dtype, rgb.device)
             optical_depth = sky_optical_depth(self.fog, ray_slope, float(camera.centre[2]))
             sky = blend_airlight(sky, optical_depth, self.fog, ray_slope)
         return rgb + (1 - alpha)[..., None] * sky
+
+    def _move_edges(
+        self,
+        raster: RenderOutput,
+        parts: Sequence[PosedGaussians],
+        camera: Camera,
+        clip: HeightClip | None,
+        buffers: frozenset[str],
+        settings: RasterSettings,
+    ) -> RenderOutput:
+        """Return the buffers of the photo's view with objects that end where the photo shows it.
+
+        Args:
+            raster: the buffers.
+            parts: the parts that they show.
+            camera: the camera of the photo.
+            clip: the level plane above which they are drawn; None without a plane.
+            buffers: names of the buffers.
+            settings: settings of the rasteriser.
+        """
+        assert self.photo is not None and raster.alpha is not None
+        with timed("photo: outlines"):
+            edges = find_edges(
+                self.parts,
+                raster,
+                camera,
+                self.photo.pixels,
+                settings=settings,
+                clip=clip,
+                backend=self.backend,
+            )
+        if edges is None:
+            return raster
+        with timed("photo: background of objects"):
+            background = rasterize(
+                edges.background_of(parts),
+                camera,
+                buffers=buffers,
+                settings=settings,
+                clip=clip,
+                pixel_mask=torch.from_numpy(edges.shows_background).to(raster.alpha.device),
+                backend=self.backend,
+            )
+            return edges.apply(raster, background, parts)
 
     def _draw_on_photo(
         self, photo: Photo, camera: Camera, buffers: frozenset[str]
@@ -181,19 +237,21 @@ class LayerRenderer:
         and the buffers of the scene.
         """
         parts, photo_buffers = photo.prepare_parts(self.parts)
-        requested_buffers = (buffers - {RGB}) | photo_buffers | {ALPHA}
-        if self.fog is not None:
-            requested_buffers = requested_buffers | {EXPECTED_DEPTH}
+        requested_buffers = (buffers - {RGB}) | photo_buffers | {ALPHA, EXPECTED_DEPTH}
         with timed("rasterise"):
             settings = replace(self.settings, sh_degree=0)  # one colour in all bands
             raster = rasterize(
                 parts, camera, buffers=requested_buffers, settings=settings, backend=self.backend
             )
+        raster = self._move_edges(raster, parts, camera, None, requested_buffers, settings)
         with timed("photo"):
-            rgb = photo.clear_picture(raster, parts)
-        if self.fog is None:
-            return rgb, raster
+            raster = photo.complete(raster)
+            if self.fog is None:
+                return photo.clear_picture(raster, parts), raster
         with timed("smog on buffers"):
-            fog_share = 1 - photo.transmittance(raster, self.fog)
-            rgb = mix(rgb, photo.airlight(self.fog), fog_share)
+            rgb, fog_share = photo.fade(raster, parts, self.fog)
             return rgb, replace(raster, fog_share=fog_share)
+
+    def _parts_sky(self, photo: Photo) -> bool:
+        """Return True if sky and surfaces of a photo's mixed pixels get different weather."""
+        return photo.matte is not None and (self.fog is not None or photo.style is not None)

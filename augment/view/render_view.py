@@ -117,7 +117,11 @@ def render_buffers(
     photo = None
     if plan.is_on_photo:
         with timed("photo"):
-            photo = open_photo(scene, camera, color_map, backend=backend)
+            # Snow lies on surfaces that the scene has; all else looks at those of the photo.
+            finds_sky = plan.depth_buffer is not None or any(
+                not effect.hooks.adds_overlays for effect in view.effects
+            )
+            photo = open_photo(scene, camera, color_map, backend=backend, finds_sky=finds_sky)
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     if plan.uses_common_exposure:
         layers = replace(layers, added_colors=added_colors(scene, camera))

@@ -36,17 +36,22 @@ from tests.snow_scenes import drive, sheet, stack_all, wall
 AIRLIGHT = (0.7, 0.72, 0.75)
 COLOR_MAP = torch.tensor([[1.2, 0.1, 0.0, -0.05], [0.0, 0.8, 0.1, 0.02], [0.05, 0.0, 1.1, 0.0]])
 WALL_M = 20.0
+# Rows above the wall's top.
+SKY_ROWS = slice(0, 36)
 
 
 @pytest.fixture
 def scene(tmp_path) -> Scene:
-    """A road up to a wall, below an open sky; the photos are noise that no render could show."""
+    """A road up to a wall, below an open sky; the photos are noise that no render could show, up to
+    the wall's top, and a bright sky above it.
+    """
     road, end = sheet((0.6, WALL_M), (-12, 12)), wall(WALL_M, (-12, 12), (0, 3))
     recorded_scene = drive(road, end, ground_z_m=0.0)
     frames = []
     for frame in recorded_scene.frames:
         path = tmp_path / f"{frame.index}.png"
         image = np.random.default_rng(frame.index).integers(0, 256, (90, 160, 3), np.uint8)
+        image[SKY_ROWS] = (235, 228, 220)
         assert cv2.imwrite(str(path), image)
         frames.append(dataclasses.replace(frame, image_paths={"ahead": str(path)}))
     return dataclasses.replace(recorded_scene, frames=tuple(frames))
@@ -151,8 +156,11 @@ def test_a_hole_in_the_road_is_as_far_as_the_road(scene):
     full_rgb, holed = (render_view(s, ahead(s), recipe_of(smog=smog)).rgb for s in (scene, bare))
     road = slice(60, 90)
     assert np.abs(full_rgb[road].astype(int) - holed[road]).mean() < 1.0
+    # Where the road is unknown, a hole is as far as the wall that it borders on, and no sky.
     unknown = dataclasses.replace(bare, ground_z_m=None)
-    assert (render_view(unknown, ahead(unknown), recipe_of(smog=smog)).rgb[road] == 179).any()
+    rgb = render_view(unknown, ahead(unknown), recipe_of(smog=smog)).rgb
+    assert not (rgb[road] == 179).all(-1).any()
+    assert (rgb[SKY_ROWS.start : SKY_ROWS.stop - 6] == (179, 184, 191)).all()
 
 
 @pytest.mark.parametrize("scale_height_m", [None, 8.0])

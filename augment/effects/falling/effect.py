@@ -180,8 +180,14 @@ def _draw_over(
 
 def _surfaces_of(view: RenderedView) -> Float[Tensor, "H W 3"] | None:
     """Return the Gaussians' part of the picture; None if something was drawn over all of it."""
-    splats = view.raster.rgb
-    if splats is None or view.layers.photo is not None:
-        return None
     is_first = not view.masks.keys() & {"rain", "snowfall"}
+    photo = view.layers.photo
+    if photo is not None:
+        alpha = view.raster.alpha
+        if alpha is None or not is_first:
+            return None
+        return photo.surface_part(view.rgb, alpha, view.layers.fog)
+    splats = view.raster.rgb
+    if splats is None:
+        return None
     return splats if is_first and splats.data_ptr() != view.rgb.data_ptr() else None

@@ -1,0 +1,497 @@
+"""Pixels of a photo beside moving objects, and the surfaces that they show.
+
+In: the posed parts of a view, its depth and its photo. Out: `ObjectEdges`. They say which pixels
+show the background, although the splats of an object hide it, and which pixels show an object that
+its splats do not reach. The former take the buffers of a view without the objects, the latter those
+of the nearest pixel of the object. So snow, water, wet ground and fog end where the car of the
+photo ends.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int32, Int64, UInt8
+from torch import Tensor
+
+from augment.photo.outlines import MIN_AREA_PX, Silhouette, fill_polygons, find_outlines
+from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, OVERLAY, SPLAT_IDS, RenderOutput
+from augment.render.constants import RasterSettings
+from augment.render.layout import HeightClip
+from augment.render.rasterize import rasterize
+from augment.scene.cameras import Camera
+from augment.scene.scene import PosedGaussians
+
+# Width of the copy in which silhouettes are drawn, pixels.
+SILHOUETTE_PX = 480
+# Distance by which splats lie beside what the photo shows, at most, metres.
+REACH_M = 0.25
+# Smallest reach of an object whose outline is moved, pixels of the photo.
+MIN_REACH_PX = 6.0
+# Largest reach, as a part of the image's width.
+MAX_REACH_FRACTION = 0.03
+# Largest reach, as a part of the object's smaller side.
+MAX_REACH_SIDE = 0.3
+# Alpha of moving parts above which a pixel may show them.
+CLEAR_ALPHA = 0.02
+# Alpha of moving parts from which a pixel shows nothing else.
+SOLID_ALPHA = 0.95
+# Relative depth by which a moving part may lie behind the scene's surface and still be it.
+DEPTH_TOLERANCE = 0.1
+# Depth by which it may lie behind, metres.
+DEPTH_TOLERANCE_M = 0.5
+# Height above an object within which its own snow may lie, metres.
+CAP_HEIGHT_M = 0.8
+# Share of a pixel that snow on the ground may hide where an object's buffers are taken.
+MAX_GROUND_SNOW = 0.3
+# Quantile of the heights of an object's splats that is its bottom.
+LOWEST_QUANTILE = 0.01
+# Largest number of objects whose outlines are moved; the nearest ones are taken.
+MAX_OBJECTS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectEdges:
+    """Pixels around objects that show something else than their splats do."""
+
+    instance_ids: frozenset[int]
+    """Instance ids of the objects."""
+    shows_background: Bool[np.ndarray, "H W"]
+    """True where the photo shows the background, and splats of objects hide it."""
+    targets: Int64[np.ndarray, " M"]
+    """Flat indices of pixels where the photo shows an object, and its splats do not hide the
+    background."""
+    sources: Int64[np.ndarray, " M"]
+    """Flat indices of the nearest pixels of the same objects."""
+
+    def background_of(self, parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
+        """Return the parts without the objects and what lies on them."""
+        return tuple(part for part in parts if part.instance_id not in self.instance_ids)
+
+    def apply(
+        self, raster: RenderOutput, background: RenderOutput, parts: Sequence[PosedGaussians]
+    ) -> RenderOutput:
+        """Return the buffers with the edges of the photo. On the CPU they are written in place.
+
+        Args:
+            raster: buffers of the parts.
+            background: the same buffers of `background_of(parts)`; only the pixels of
+                `shows_background` are read.
+            parts: the parts.
+        """
+        moved_buffers = dict[str, Tensor]()
+        for name in BUFFERS:
+            buffer = getattr(raster, name)
+            if buffer is None:
+                continue
+            hidden_values = getattr(background, name)
+            if name == SPLAT_IDS:
+                hidden_values = self._count_through(hidden_values, parts)
+            if buffer.device.type == "cpu" and not buffer.requires_grad:
+                image = buffer.numpy()
+                image[self.shows_background] = hidden_values.numpy()[self.shows_background]
+                flat_image = image.reshape(-1, *image.shape[2:])
+                flat_image[self.targets] = flat_image[self.sources]
+                continue
+            mask, targets, sources = (
+                torch.from_numpy(indices).to(buffer.device)
+                for indices in (self.shows_background, self.targets, self.sources)
+            )
+            mask = mask if buffer.ndim == 2 else mask[..., None]
+            flat_buffer = torch.where(mask, hidden_values, buffer).flatten(0, 1)
+            moved = flat_buffer.index_copy(0, targets, flat_buffer[sources])
+            moved_buffers[name] = moved.view_as(buffer)
+        return replace(raster, **moved_buffers) if moved_buffers else raster
+
+    def _count_through(self, splat_ids: Tensor, parts: Sequence[PosedGaussians]) -> Tensor:
+        """Return indices of splats of the background as indices through all parts."""
+        counts = [len(part.gaussians) for part in parts]
+        starts = np.cumsum([0, *counts[:-1]])
+        is_kept = [part.instance_id not in self.instance_ids for part in parts]
+        shifts = [
+            np.full(count, start, np.int64)
+            for count, start, keeps in zip(counts, starts, is_kept, strict=True)
+            if keeps
+        ]
+        numbers = [np.arange(count) for count, keeps in zip(counts, is_kept, strict=True) if keeps]
+        table = torch.from_numpy(np.concatenate([*shifts, [0]]) + np.concatenate([*numbers, [-1]]))
+        return table.to(splat_ids.device)[splat_ids.long()].to(splat_ids.dtype)
+
+
+class _Drawing(NamedTuple):
+    """Moving parts alone, in the small copy."""
+
+    owners: Int32[np.ndarray, "h w"]
+    """Instance id of the part with the largest weight, 0 where there is none."""
+    alpha: Float[np.ndarray, "h w"]
+    """Alpha of the parts, 0 where the scene lies before them."""
+    depth: Float[np.ndarray, "h w"]
+    """z of the parts, metres."""
+    overlay: Float[np.ndarray, "h w"]
+    """Share of the pixel that shows what lies on the parts."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Object:
+    """An object whose outline is moved."""
+
+    instance_id: int
+    """Instance id of its parts."""
+    depth_m: float
+    """Median z of its pixels, metres."""
+    polygons: list[Float[np.ndarray, "N 2"]]
+    """Its outlines in the photo."""
+    bottom_z_m: float = -math.inf
+    """Height of its lowest splats in the world, metres: it does not reach below."""
+
+
+def find_edges(
+    parts: Sequence[PosedGaussians],
+    raster: RenderOutput,
+    camera: Camera,
+    pixels: UInt8[np.ndarray, "H W 3"],
+    *,
+    settings: RasterSettings,
+    clip: HeightClip | None = None,
+    backend: str,
+) -> ObjectEdges | None:
+    """Return the edges of the moving parts on the photo; None where there are none.
+
+    Args:
+        parts: the posed parts of the view.
+        raster: their buffers, with alpha and expected depth.
+        camera: the camera of the photo.
+        pixels: the photo.
+        settings: the rasteriser's settings.
+        clip: height above which the buffers show the parts; None if they show all.
+        backend: the rasteriser's backend.
+    """
+    moving_parts = [part for part in parts if part.instance_id > 0]
+    bare_parts = [part for part in moving_parts if not part.is_overlay]
+    if not bare_parts or camera.is_orthographic:
+        return None
+    assert raster.alpha is not None and raster.expected_depth is not None
+    small = camera.resized(*copy_size(camera, SILHOUETTE_PX))
+    alpha, depth = (_shrink(buffer, small) for buffer in (raster.alpha, raster.expected_depth))
+    scene_depth = np.where(alpha > 0.5, depth, np.float32(np.inf))
+    settings = replace(settings, sh_degree=0)
+    bare = _draw(bare_parts, small, scene_depth, settings, backend)
+    objects = _find_objects(bare, camera, pixels)
+    if not objects:
+        return None
+    objects = [replace(o, bottom_z_m=_bottom_of(bare_parts, o.instance_id)) for o in objects]
+    covered = bare
+    if len(bare_parts) < len(moving_parts):
+        covered = _draw(moving_parts, small, scene_depth, settings, backend)
+    is_drawn = None if clip is None else alpha > 0.5
+    is_bare = None
+    if raster.overlay is not None:  # snow on the ground hides the feet of objects
+        is_bare = _shrink(raster.overlay, small) <= covered.overlay + MAX_GROUND_SNOW
+    return _edges_of(objects, covered, is_drawn, is_bare, clip, camera, covered is not bare)
+
+
+def _bottom_of(parts: Sequence[PosedGaussians], instance_id: int) -> float:
+    """Return the height in the world of the lowest splats of an object, metres."""
+    heights = list[np.ndarray]()
+    for part in parts:
+        if part.instance_id != instance_id:
+            continue
+        means = part.gaussians.means.detach().cpu().double().numpy()
+        if part.world_from_part is None:
+            heights.append(means[:, 2])
+            continue
+        pose = part.world_from_part.detach().cpu().double().numpy()
+        heights.append(means @ pose[2, :3] + pose[2, 3])
+    return float(np.quantile(np.concatenate(heights), LOWEST_QUANTILE))
+
+
+def copy_size(camera: Camera, width_px: int) -> tuple[int, int]:
+    """Return width and height of a copy of the camera's image, at most `width_px` wide."""
+    factor = max(1.0, camera.width / width_px)
+    return max(1, round(camera.width / factor)), max(1, round(camera.height / factor))
+
+
+def _shrink(buffer: Tensor, small: Camera) -> np.ndarray:
+    """Return a small copy of a buffer, pixel by pixel."""
+    image = buffer.detach().cpu().float().contiguous().numpy()
+    return cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_NEAREST)
+
+
+def _draw(
+    parts: Sequence[PosedGaussians],
+    small: Camera,
+    scene_depth: Float[np.ndarray, "h w"],
+    settings: RasterSettings,
+    backend: str,
+) -> _Drawing:
+    """Return the moving parts, as far as the scene does not lie before them."""
+    raster = rasterize(
+        parts,
+        small,
+        buffers={ALPHA, EXPECTED_DEPTH, OVERLAY, SPLAT_IDS},
+        settings=settings,
+        backend=backend,
+    )
+    assert raster.alpha is not None and raster.expected_depth is not None
+    assert raster.splat_ids is not None and raster.overlay is not None
+    alpha, depth, overlay, splat_ids = (
+        buffer.detach().cpu().numpy()
+        for buffer in (raster.alpha, raster.expected_depth, raster.overlay, raster.splat_ids)
+    )
+    ends = np.cumsum([len(part.gaussians) for part in parts])
+    instance_ids = np.array([part.instance_id for part in parts], np.int32)
+    numbers = np.searchsorted(ends, np.maximum(splat_ids, 0), side="right")
+    is_visible = depth <= scene_depth * (1 + DEPTH_TOLERANCE) + DEPTH_TOLERANCE_M
+    is_visible &= splat_ids >= 0
+    owners = np.where(is_visible, instance_ids[np.minimum(numbers, len(parts) - 1)], 0)
+    alpha, overlay = (np.where(is_visible, share, np.float32(0)) for share in (alpha, overlay))
+    return _Drawing(owners, alpha, depth, overlay)
+
+
+def _find_objects(
+    drawing: _Drawing, camera: Camera, pixels: UInt8[np.ndarray, "H W 3"]
+) -> list[_Object]:
+    """Return the objects whose outlines are moved, from the farthest to the nearest."""
+    height, width = drawing.owners.shape
+    scale = camera.width / width, camera.height / height
+    owners = np.where(drawing.alpha > 0.5, drawing.owners, 0)
+    masks = [(owners == instance_id, instance_id) for instance_id in np.unique(owners[owners > 0])]
+    masks = [pair for pair in masks if np.count_nonzero(pair[0]) >= MIN_AREA_PX]
+    depths_m = [float(np.median(drawing.depth[mask])) for mask, _ in masks]
+    objects = list[_Object]()
+    is_nearer = np.zeros(owners.shape, bool)
+    nearer_reach_px = 0.0
+    for number in np.argsort(depths_m, kind="stable")[:MAX_OBJECTS]:
+        mask, instance_id = masks[number]
+        depth_m = depths_m[number]
+        left, top, mask_width, mask_height = cv2.boundingRect(mask.astype(np.uint8))
+        reach_px = min(
+            camera.fx * REACH_M / max(depth_m, 1e-3),
+            MAX_REACH_FRACTION * camera.width,
+            MAX_REACH_SIDE * min(mask_width * scale[0], mask_height * scale[1]),
+        )
+        if reach_px < MIN_REACH_PX:
+            continue
+        if nearer_reach_px > 0:
+            # Splats of nearer objects hide more of it than the photo's objects do.
+            side = 2 * math.ceil(nearer_reach_px / scale[0]) + 1
+            grown_mask = cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+            mask = mask | (grown_mask & is_nearer)
+            left, top, mask_width, mask_height = cv2.boundingRect(mask.astype(np.uint8))
+        is_nearer |= mask
+        nearer_reach_px = max(nearer_reach_px, reach_px)
+        window = mask[top : top + mask_height, left : left + mask_width]
+        # An edge of the window is one of the object, unless it is the image's.
+        margins = (
+            (int(top > 0), int(top + mask_height < height)),
+            (int(left > 0), int(left + mask_width < width)),
+        )
+        window = np.pad(window, margins)
+        corner = left - margins[1][0], top - margins[0][0]
+        silhouette = Silhouette(window, *corner, scale, reach_px)
+        polygons = find_outlines(silhouette, pixels)
+        if polygons:
+            objects.append(_Object(int(instance_id), depth_m, polygons))
+    return objects[::-1]
+
+
+def _edges_of(
+    objects: Sequence[_Object],
+    drawing: _Drawing,
+    is_drawn: Bool[np.ndarray, "h w"] | None,
+    is_bare: Bool[np.ndarray, "h w"] | None,
+    clip: HeightClip | None,
+    camera: Camera,
+    has_caps: bool,
+) -> ObjectEdges:
+    """Return the pixels where the photo's outlines of objects differ from the drawn ones.
+
+    Args:
+        objects: the objects, the nearest last.
+        drawing: the moving parts with all that lies on them.
+        is_drawn: True where the buffers show a surface; None without a clip.
+        is_bare: False where snow on the ground hides the objects; None without snow.
+        clip: height above which the buffers show the parts; None if they show all.
+        camera: the camera of the photo.
+        has_caps: if True, snow may lie on the objects.
+    """
+    size = camera.width, camera.height
+    photo_labels = np.zeros((camera.height, camera.width), np.uint8)
+    labels_by_id = np.zeros(
+        max(int(drawing.owners.max()), *(o.instance_id for o in objects)) + 1, np.uint8
+    )
+    for label, drawn_object in enumerate(objects, 1):
+        fill_polygons(drawn_object.polygons, photo_labels, label)
+        labels_by_id[drawn_object.instance_id] = label
+    labels = labels_by_id[drawing.owners]
+    _cut_below(objects, photo_labels, labels, drawing, camera)
+    alpha = np.where(labels > 0, drawing.alpha, np.float32(0))
+    # The background may show through pixels beside those that are drawn: one more is taken.
+    hides = cv2.dilate((alpha > CLEAR_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
+    hides = cv2.resize(hides, size, interpolation=cv2.INTER_NEAREST) > 0
+    shows_background = hides & (photo_labels == 0)
+    if has_caps:
+        shows_background &= ~_are_caps(objects, photo_labels, drawing.overlay, camera)
+    drawn_labels = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+    is_solid = cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR) >= SOLID_ALPHA
+    lacks_object = (photo_labels > 0) & ~(is_solid & (drawn_labels == photo_labels))
+    targets = np.flatnonzero(lacks_object)
+    target_labels = photo_labels.reshape(-1)[targets]
+    square = np.ones((3, 3), np.uint8)
+    is_pure = (alpha >= SOLID_ALPHA) & (cv2.erode(labels, square) == cv2.dilate(labels, square))
+    if is_bare is not None:
+        is_pure &= is_bare
+    moves = list[tuple[np.ndarray, np.ndarray]]()
+    for label in np.unique(target_labels).tolist():
+        chosen = targets[target_labels == label]
+        is_seed = is_pure & (labels == label)
+        if clip is None or is_drawn is None:
+            moves.append(_find_sources(chosen, is_seed, camera))
+            continue
+        # Water hides the lower part of an object, which then comes from pixels without a surface.
+        is_above = _heights_at(chosen, objects[label - 1].depth_m, camera) > clip.z_m
+        moves.append(_find_sources(chosen[is_above], is_seed & is_drawn, camera))
+        moves.append(_find_sources(chosen[~is_above], is_seed & ~is_drawn, camera))
+    empty = np.empty(0, np.int64)
+    targets, sources = (
+        (np.concatenate([empty, *flat]) for flat in zip(*moves, strict=True))
+        if moves
+        else (empty, empty)
+    )
+    return ObjectEdges(
+        frozenset(drawn_object.instance_id for drawn_object in objects),
+        shows_background,
+        targets,
+        sources,
+    )
+
+
+def _cut_below(
+    objects: Sequence[_Object],
+    photo_labels: UInt8[np.ndarray, "H W"],
+    labels: UInt8[np.ndarray, "h w"],
+    drawing: _Drawing,
+    camera: Camera,
+) -> None:
+    """Take pixels below the ground on which an object stands from it, in place.
+
+    They show the shadow on the road beside its wheels, which is as dark as the object.
+    """
+    height, width = labels.shape
+    for label, drawn_object in enumerate(objects, 1):
+        is_object = (labels == label) & (drawing.alpha > 0.5)
+        left, top, box_width, box_height = cv2.boundingRect(
+            np.concatenate(drawn_object.polygons).astype(np.float32)
+        )
+        if not is_object.any():
+            continue
+        first_row = max(top + box_height // 2, 0)
+        first_column = max(left, 0)
+        window = photo_labels[first_row : top + box_height, first_column : left + box_width]
+        rows, columns = np.nonzero(window == label)
+        rows += first_row
+        columns += first_column
+        small = rows * height // camera.height, columns * width // camera.width
+        depths_m = drawing.depth.reshape(-1)[_nearest_to(*small, is_object)]
+        pixels = rows * camera.width + columns
+        is_below = _heights_at(pixels, depths_m, camera) < drawn_object.bottom_z_m
+        photo_labels.reshape(-1)[pixels[is_below]] = 0
+
+
+def _heights_at(
+    targets: Int64[np.ndarray, " M"], depth_m: float | Float[np.ndarray, " M"], camera: Camera
+) -> Float[np.ndarray, " M"]:
+    """Return the height in the world of points at a depth in pixels."""
+    rows, columns = np.divmod(targets, camera.width)
+    x, y, z = camera.world_from_camera[2, :3].tolist()
+    rise = x * (columns + 0.5 - camera.cx) / camera.fx + y * (rows + 0.5 - camera.cy) / camera.fy
+    return float(camera.centre[2]) + depth_m * (rise + z)
+
+
+def _are_caps(
+    objects: Sequence[_Object],
+    photo_labels: UInt8[np.ndarray, "H W"],
+    overlay: Float[np.ndarray, "h w"],
+    camera: Camera,
+) -> Bool[np.ndarray, "H W"]:
+    """Return the mask of pixels above the objects of the photo that show snow on them."""
+    is_above = np.zeros(photo_labels.shape, bool)
+    for label, drawn_object in enumerate(objects, 1):
+        reach_px = min(
+            round(camera.fy * CAP_HEIGHT_M / max(drawn_object.depth_m, 1e-3)), camera.height // 4
+        )
+        left, top, width, height = cv2.boundingRect(
+            np.concatenate(drawn_object.polygons).astype(np.float32)
+        )
+        left = max(left, 0)
+        first = max(top - reach_px, 0)
+        rows = slice(first, max(top + height, 0))
+        columns = slice(left, max(left + width, 0))
+        window = (photo_labels[rows, columns] == label).astype(np.uint8)
+        if not window.size or reach_px < 1:
+            continue
+        column = np.ones((reach_px + 1, 1), np.uint8)
+        # The anchor is the kernel's first row, so that a pixel sees the rows below it.
+        is_above[rows, columns] |= cv2.dilate(window, column, anchor=(0, 0)) > 0
+    is_snowy = cv2.resize(overlay, (camera.width, camera.height)) > 0.5
+    return is_above & (photo_labels == 0) & is_snowy
+
+
+def _find_sources(
+    targets: Int64[np.ndarray, " M"], is_seed: Bool[np.ndarray, "h w"], camera: Camera
+) -> tuple[Int64[np.ndarray, " L"], Int64[np.ndarray, " L"]]:
+    """Return the targets and the pixels nearest to them that are seeds; none without seeds.
+
+    Args:
+        targets: flat indices of pixels.
+        is_seed: small pixels that show the same thing as the targets.
+        camera: the camera of the photo.
+    """
+    if not len(targets) or not is_seed.any():
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    height, width = is_seed.shape
+    rows, columns = np.divmod(targets, camera.width)
+    small_rows = rows * height // camera.height
+    small_columns = columns * width // camera.width
+    nearest = _nearest_to(small_rows, small_columns, is_seed)
+    seed_rows, seed_columns = np.divmod(nearest, width)
+    # A target keeps its place within the small pixel, so that neighbours differ as they did.
+    rows += np.rint((seed_rows - small_rows) * (camera.height / height)).astype(np.int64)
+    columns += np.rint((seed_columns - small_columns) * (camera.width / width)).astype(np.int64)
+    rows = np.clip(rows, 0, camera.height - 1)
+    columns = np.clip(columns, 0, camera.width - 1)
+    return targets, rows * camera.width + columns
+
+
+def _nearest_to(
+    rows: Int64[np.ndarray, " M"], columns: Int64[np.ndarray, " M"], is_seed: np.ndarray
+) -> Int64[np.ndarray, " M"]:
+    """Return the flat index of the seed nearest to each of some pixels, of which there are some."""
+    if not len(rows):
+        return np.empty(0, np.int64)
+    left, top, width, height = cv2.boundingRect(is_seed.astype(np.uint8))
+    bottom = max(top + height, int(rows.max()) + 1)
+    right = max(left + width, int(columns.max()) + 1)
+    top = min(top, int(rows.min()))
+    left = min(left, int(columns.min()))
+    nearest = nearest_pixels(np.ascontiguousarray(is_seed[top:bottom, left:right]))
+    seed_rows, seed_columns = np.divmod(nearest[rows - top, columns - left], right - left)
+    return (seed_rows + top) * is_seed.shape[1] + seed_columns + left
+
+
+def nearest_pixels(is_seed: Bool[np.ndarray, "h w"]) -> Int64[np.ndarray, "h w"]:
+    """Return the flat index of the seed nearest to each pixel."""
+    _, label_image = cv2.distanceTransformWithLabels(
+        (~is_seed).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    numbers = np.asarray(label_image, np.int64)
+    seeds = np.flatnonzero(is_seed)
+    indices = np.zeros(numbers.max() + 1, np.int64)
+    indices[numbers.reshape(-1)[seeds]] = seeds
+    return indices[numbers]

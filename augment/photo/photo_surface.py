@@ -1,0 +1,141 @@
+"""Surfaces of a photo: the share and the depth of what it shows in every pixel that is not sky.
+
+In: the buffers of a scene and the sky matte of the photo. Out: the buffers with the surfaces that
+the photo shows. Every pass that looks at alpha and depth afterwards sees the same: smog, rain,
+snowfall, spray, wet ground, water, styles, and depth images.
+
+Alpha becomes 1 - the matte's share of sky. A pixel with a surface in the photo and none in the
+scene takes the depth of the pixel to which the cheapest path leads through the photo: a path is
+cheap upwards and within one colour, and sky is a barrier. So a wall, a pole or a crown goes on
+above the LiDAR's highest beam as far as the photo shows it. What no path reaches stands at
+FAR_DEPTH_M.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int64, UInt8
+from torch import Tensor
+
+from augment.photo import outline_kernels as kernels
+from augment.photo.photo_objects import copy_size, nearest_pixels
+from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH, RenderOutput
+from augment.scene.cameras import Camera
+
+# Alpha of reconstructed surfaces up to which a pixel counts as empty. What a photo shows is opaque,
+# while reconstructed surfaces let some light through.
+CLEAR_ALPHA = 0.04
+# Alpha of reconstructed surfaces from which a pixel counts as opaque.
+OPAQUE_ALPHA = 0.96
+# Width of the copy in which depth spreads, pixels.
+FILL_PX = 480
+# Depth of things that nothing tells the depth of, metres.
+FAR_DEPTH_M = 300.0
+# Alpha from which the scene has a surface in a pixel.
+MIN_SURFACE_ALPHA = 0.5
+# Alpha from which a surface's depth spreads to others.
+MIN_SOURCE_ALPHA = 0.9
+# Share of sky from which a pixel is a barrier.
+BARRIER_SHARE = 0.97
+# Share of sky up to which a surface's depth spreads to others.
+MAX_SOURCE_SKY = 0.5
+# Cost of a step up, down, left, right from a known pixel, levels of 255.
+STEP_COSTS = (1, 24, 8, 8)
+# Largest cost of a step, levels.
+MAX_STEP_COST = 96
+# Estimators of depth among the buffers.
+DEPTH_BUFFERS = (EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH)
+
+
+def complete_surfaces(
+    raster: RenderOutput,
+    sky_share: Float32[np.ndarray, "H W"],
+    pixels: UInt8[np.ndarray, "H W 3"],
+    camera: Camera,
+    road_depth: Float[np.ndarray, "H W"] | None = None,
+    is_complete: Bool[np.ndarray, "H W"] | None = None,
+) -> RenderOutput:
+    """Return the buffers with the surfaces that the photo shows.
+
+    Args:
+        raster: the buffers, with alpha and expected depth.
+        sky_share: share of sky in each pixel of the photo.
+        pixels: the photo.
+        camera: its camera.
+        road_depth: z of the road, metres, infinite where a ray does not meet it: nothing lies
+            beyond. None where the road is unknown.
+        is_complete: pixels that stay as they are, apart from the stretch of alpha by
+            `opaque_alpha`; None for no pixels.
+    """
+    assert raster.alpha is not None and raster.expected_depth is not None
+    alpha = raster.alpha.detach().cpu().numpy()
+    depth = raster.expected_depth.detach().cpu().numpy()
+    solid_share = 1 - sky_share
+    if raster.overlay is not None:  # snow on a roof covers the sky behind it
+        np.maximum(solid_share, raster.overlay.detach().cpu().numpy(), out=solid_share)
+    is_missing = alpha < MIN_SURFACE_ALPHA
+    if is_complete is not None:
+        solid_share = np.where(is_complete, opaque_share(alpha), solid_share)
+        is_missing &= ~is_complete
+    changes: dict[str, Tensor] = {"alpha": torch.from_numpy(solid_share)}
+    if is_missing.any():
+        roots = _find_roots(alpha, sky_share, pixels, camera)
+        size = camera.width, camera.height
+        small_depth = _shrink(depth, roots)
+        filled = np.where(roots >= 0, small_depth.reshape(-1)[roots], np.float32(FAR_DEPTH_M))
+        filled = cv2.resize(filled.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
+        if road_depth is not None:
+            np.minimum(filled, road_depth, out=filled)
+        for name in DEPTH_BUFFERS:
+            buffer = getattr(raster, name)
+            if buffer is not None:
+                values = buffer.detach().cpu().numpy()
+                changes[name] = torch.from_numpy(np.where(is_missing, filled, values))
+        if raster.splat_ids is not None:
+            splat_ids = raster.splat_ids.detach().cpu().numpy()
+            small_ids = _shrink(splat_ids, roots).reshape(-1)[roots]
+            small_ids = np.where(roots >= 0, small_ids, -1).astype(np.int32)
+            spread_ids = cv2.resize(small_ids, size, interpolation=cv2.INTER_NEAREST)
+            changes["splat_ids"] = torch.from_numpy(np.where(is_missing, spread_ids, splat_ids))
+    device = raster.alpha.device
+    return replace(raster, **{name: change.to(device) for name, change in changes.items()})
+
+
+def opaque_share(alpha: np.ndarray) -> np.ndarray:
+    """Return the alpha of what the photo shows, 0 to 1, from the alpha of splats."""
+    return np.clip((alpha - CLEAR_ALPHA) / (OPAQUE_ALPHA - CLEAR_ALPHA), 0, 1)
+
+
+def _shrink(image: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """Return a copy of an image at the size of another one, pixel by pixel."""
+    return cv2.resize(image, like.shape[::-1], interpolation=cv2.INTER_NEAREST)
+
+
+def _find_roots(
+    alpha: Float32[np.ndarray, "H W"],
+    sky_share: Float32[np.ndarray, "H W"],
+    pixels: UInt8[np.ndarray, "H W 3"],
+    camera: Camera,
+) -> Int64[np.ndarray, "h w"]:
+    """Return for each small pixel the flat index of the one whose depth it takes; -1 for none.
+
+    A pixel of sky takes that of the nearest surface, so that depth has no edge at the sky line.
+    """
+    size = copy_size(camera, FILL_PX)
+    small_pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    small_sky = cv2.resize(sky_share, size, interpolation=cv2.INTER_AREA)
+    small_alpha = cv2.resize(alpha, size, interpolation=cv2.INTER_NEAREST)
+    is_barrier = small_sky > BARRIER_SHARE
+    is_known = (small_alpha > MIN_SOURCE_ALPHA) & (small_sky < MAX_SOURCE_SKY)
+    state = np.where(is_barrier, 0, np.where(is_known, 2, 1)).astype(np.uint8)
+    roots = np.empty(state.shape, np.int64)
+    kernels.spread_roots(
+        small_pixels, state, np.array(STEP_COSTS, np.int64), np.int64(MAX_STEP_COST), roots
+    )
+    if is_barrier.any() and not is_barrier.all():
+        roots[is_barrier] = roots.reshape(-1)[nearest_pixels(~is_barrier)[is_barrier]]
+    return roots
