@@ -1,7 +1,7 @@
 """Moving objects without a label: their returns are followed from sweep to sweep.
 
-Returns whose places are free in other sweeps (`adapters.lidar_scene.free_space`) are seeds. Together
-with the returns of vehicles and people around them they make clusters, one a sweep and object.
+Returns whose places are free in other sweeps (`adapters.lidar_scene.free_space`) are seeds.
+With the returns of vehicles and people around them they make clusters, one a sweep and object.
 Clusters of consecutive sweeps are linked by their places, and aligned to each other (iterated
 closest points, Besl and McKay 1992, in plan). An object that can be followed over some sweeps
 becomes an actor with a track of its own, as if it had been labelled. The returns of all others go.
@@ -134,25 +134,16 @@ def follow_movers(
     for number, sweep in enumerate(sweeps):
         sweep_clusters = _clusters(number, sweep, is_static[number], is_transient[number], start_ns)
         clusters.append(sweep_clusters)
-    good = []
+    good: list[Mover] = []
     for chain in _link(clusters):
-        mover = _mover(chain, start_ns)
+        mover = _mover(chain, f"unlabelled-{len(good)}", start_ns)
         if mover is not None:
             good.append(mover)
         # What hardly moves is as much of the world as it is a mover: only its seeds go.
         if mover is not None or not chain.stands_still():
             for cluster in chain.clusters:
                 stays[cluster.sweep][cluster.rows] = False
-    named = [
-        Mover(
-            ObjectTrack(
-                f"unlabelled-{n}", mover.track.label, mover.track.track, mover.track.size_m
-            ),
-            mover.points,
-        )
-        for n, mover in enumerate(good)
-    ]
-    return stays, tuple(named)
+    return stays, tuple(good)
 
 
 def _clusters(
@@ -224,7 +215,7 @@ def _link(clusters: Sequence[Sequence[_Cluster]]) -> list[_Chain]:
     return chains
 
 
-def _mover(chain: _Chain, start_ns: int) -> Mover | None:
+def _mover(chain: _Chain, track_id: str, start_ns: int) -> Mover | None:
     """Return the object of a chain, or None if it cannot be followed."""
     clusters = chain.clusters
     num_returns = sum(len(cluster.rows) for cluster in clusters)
@@ -258,7 +249,7 @@ def _mover(chain: _Chain, start_ns: int) -> Mover | None:
     votes = Counter(int(s) for s in semantic if s in MOVABLE)
     label = _LABELS[Class(votes.most_common(1)[0][0])] if votes else _OTHER_LABEL
     return Mover(
-        ObjectTrack("", label, track, high - low),
+        ObjectTrack(track_id, label, track, high - low),
         PointSet((joined - middle).astype(np.float32), semantic),
     )
 
@@ -267,9 +258,9 @@ def _align(clusters: Sequence[_Cluster]) -> tuple[list[np.ndarray], list[np.ndar
     """Align every cluster to those before it.
 
     Returns:
-        world_from_chain of each cluster, float64 [4, 4], which starts at the first cluster's centre;
-        the clusters' points, each carried to its cluster's time; and the median distance between
-        aligned points, metres.
+        world_from_chain of each cluster, float64 [4, 4]: the chain's frame has its origin at the
+        first cluster's centre; the clusters' points, each carried to its cluster's time; and the
+        median distance between aligned points, metres.
     """
     velocity = (clusters[-1].centre - clusters[0].centre) / max(
         clusters[-1].time_s - clusters[0].time_s, 1e-3
