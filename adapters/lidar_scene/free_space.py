@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapters.lidar_scene.split import SKIN_M, PointSet, inside_box
+from adapters.lidar_scene.split import PointSet, indices_between, inside_box
 from adapters.lidar_scene.surfels import edges_at, ground_points
 from adapters.raw_drive import BoxSample, Sweep
 from augment.render.cpu.jit import cached_njit
@@ -162,6 +162,18 @@ def find_transient_returns(
     return masks
 
 
+def in_still_boxes(places: np.ndarray, still: Sequence[BoxSample]) -> np.ndarray:
+    """Return True for places [N, 3] in a box of an object that stands still, bool [N]."""
+    is_inside = np.zeros(len(places), np.bool_)
+    for box in still:
+        pose = box.world_from_box
+        reach = float(np.linalg.norm(box.size_m)) / 2 + _STILL_MARGIN_M
+        near = indices_between(places, pose[:3, 3] - reach, pose[:3, 3] + reach)
+        local = (places[near] - pose[:3, 3]) @ pose[:3, :3]
+        is_inside[near] |= inside_box(local, np.asarray(box.size_m), _STILL_MARGIN_M)
+    return is_inside
+
+
 def _tested_rows(sweep: Sweep, is_static: np.ndarray) -> np.ndarray:
     rows = np.flatnonzero(is_static)
     ground = ground_points(PointSet(sweep.points[rows], sweep.semantic[rows]))
@@ -179,10 +191,7 @@ def _occupied_shares(
     low = path.min(axis=0) - _REACH_M
     high = path.max(axis=0) + _REACH_M
     is_tested &= ((cells.places > low) & (cells.places < high)).all(axis=1)
-    for box in still:
-        pose = box.world_from_box
-        local = (cells.places - pose[:3, 3]) @ pose[:3, :3]
-        is_tested &= ~inside_box(local, np.asarray(box.size_m), _STILL_MARGIN_M + SKIN_M)
+    is_tested &= ~in_still_boxes(cells.places, still)
     rows = np.flatnonzero(is_tested)
     num_free = np.zeros(len(rows), np.int32)
     num_occupied = np.zeros(len(rows), np.int32)
@@ -280,6 +289,19 @@ def _draw(points, origins, image, ranges):  # pragma: no cover - compiled
 
 
 @cached_njit(nogil=True)
+def _nearest_ray(image, row, column):  # pragma: no cover - compiled
+    """Return the return in the image that is nearest to a pixel, or -1 without one."""
+    for radius in range(_MOST_PIXELS + 1):
+        for r in range(max(row - radius, 0), min(row + radius + 1, _ROWS)):
+            # Only the window's border is new: whole rows at its ends, else two pixels.
+            step = 1 if r in (row - radius, row + radius) else 2 * radius
+            for c in range(column - radius, column + radius + 1, step):
+                if image[r, c % _COLUMNS] >= 0:
+                    return image[r, c % _COLUMNS]
+    return -1
+
+
+@cached_njit(nogil=True)
 def _look(places, cell_m, points, origins, ranges, image, centre):  # pragma: no cover - compiled
     """Return the verdict of a sweep on each place, int8 [M].
 
@@ -309,11 +331,7 @@ def _look(places, cell_m, points, origins, ranges, image, centre):  # pragma: no
             if row < 0 or row >= _ROWS:
                 is_in_image = False
                 break
-            near = -1
-            for aside in range(_MOST_PIXELS):
-                for c in (column - aside, column + aside):
-                    if near < 0:
-                        near = image[row, c % _COLUMNS]
+            near = _nearest_ray(image, row, column)
             if near < 0:
                 break
             start_x = np.float64(origins[near, 0])

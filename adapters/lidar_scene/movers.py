@@ -20,23 +20,23 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from adapters.lidar_scene.free_space import MOVABLE
+from adapters.lidar_scene.free_space import MOVABLE, in_still_boxes
 from adapters.lidar_scene.split import ObjectTrack, PointSet
-from adapters.raw_drive import Sweep
+from adapters.raw_drive import BoxSample, Sweep
 from augment.scene.scene import Track
 from augment.scene.semantics import SemanticClass as Class
 
 _LABELS = {Class.VEHICLE: "Car", Class.PEDESTRIAN: "Pedestrian", Class.TWO_WHEELER: "Bicycle"}
 _OTHER_LABEL = "Other"  # label of a mover without a class
 _VOXEL_M = 0.25  # edge of the voxels that are joined to clusters
-_JOIN_M = 0.6  # largest distance between voxels' means of one cluster
+_JOIN_M = 0.8  # largest distance between voxels' means of one cluster
 _REACH_M = 8.0  # distance from a seed up to which a cluster may go
 _MIN_SEEDS = 5  # fewest seeds of a cluster
 _SEED_PART = 0.12  # least part of seeds among a cluster's returns
 _MAX_LENGTH_M = 15.0  # longest side in plan of a cluster
 _MAX_GAP_S = 0.35  # longest time without a cluster in a chain
 _MAX_SPEED_MPS = 40.0  # fastest object
-_GATE_M = 1.5  # distance from the predicted place up to which a cluster is linked
+_GATE_M = 2.0  # distance from the predicted place up to which a cluster is linked
 _MIN_SWEEPS = 4  # shortest chain that becomes an actor
 _MIN_RETURNS = 30  # fewest returns of a chain that becomes an actor
 _MIN_TRAVEL_M = 1.0  # shortest way of a chain that becomes an actor
@@ -69,6 +69,12 @@ class _Cluster:
     def centre(self) -> np.ndarray:
         """Return the middle of its bounds, float64 [3]."""
         return (self.points.min(axis=0) + self.points.max(axis=0)) / 2
+
+    def overlaps(self, other: _Cluster, step: np.ndarray) -> bool:
+        """Return True if its bounds overlap those of another cluster that is moved by step [3]."""
+        low = np.maximum(self.points.min(axis=0), other.points.min(axis=0) + step)
+        high = np.minimum(self.points.max(axis=0), other.points.max(axis=0) + step)
+        return bool((low <= high).all())
 
     @property
     def time_s(self) -> float:
@@ -117,7 +123,10 @@ class Mover:
 
 
 def follow_movers(
-    sweeps: Sequence[Sweep], is_static: Sequence[np.ndarray], is_transient: Sequence[np.ndarray]
+    sweeps: Sequence[Sweep],
+    is_static: Sequence[np.ndarray],
+    is_transient: Sequence[np.ndarray],
+    still: Sequence[BoxSample],
 ) -> tuple[list[np.ndarray], tuple[Mover, ...]]:
     """Return a mask of each sweep's returns that stay in the static world, and the movers.
 
@@ -125,6 +134,7 @@ def follow_movers(
         sweeps: all sweeps, in order of time.
         is_static: bool [N] of each sweep, returns outside of labelled moving objects.
         is_transient: bool [N] of each sweep, returns of things that have gone.
+        still: boxes of objects that stand still, whose returns are no part of a mover.
     """
     stays = [mask & ~transient for mask, transient in zip(is_static, is_transient, strict=True)]
     if not any(mask.any() for mask in is_transient):
@@ -132,7 +142,9 @@ def follow_movers(
     start_ns = min(int(sweep.timestamps_ns.min()) for sweep in sweeps if len(sweep))
     clusters: list[list[_Cluster]] = []
     for number, sweep in enumerate(sweeps):
-        sweep_clusters = _clusters(number, sweep, is_static[number], is_transient[number], start_ns)
+        sweep_clusters = _clusters(
+            number, sweep, is_static[number], is_transient[number], still, start_ns
+        )
         clusters.append(sweep_clusters)
     good: list[Mover] = []
     for chain in _link(clusters):
@@ -147,7 +159,12 @@ def follow_movers(
 
 
 def _clusters(
-    number: int, sweep: Sweep, is_static: np.ndarray, is_transient: np.ndarray, start_ns: int
+    number: int,
+    sweep: Sweep,
+    is_static: np.ndarray,
+    is_transient: np.ndarray,
+    still: Sequence[BoxSample],
+    start_ns: int,
 ) -> list[_Cluster]:
     """Return the clusters of seeds with the movable returns around them."""
     seeds = np.flatnonzero(is_transient)
@@ -156,7 +173,7 @@ def _clusters(
     rows = np.flatnonzero((is_static & np.isin(sweep.semantic, MOVABLE)) | is_transient)
     points = sweep.points[rows].astype(np.float64)
     is_near = cKDTree(sweep.points[seeds, :2]).query(points[:, :2], distance_upper_bound=_REACH_M)
-    keep = np.isfinite(is_near[0])
+    keep = np.isfinite(is_near[0]) & ~(in_still_boxes(points, still) & ~is_transient[rows])
     rows = rows[keep]
     points = points[keep]
     labels = _joined(points)
@@ -201,8 +218,10 @@ def _link(clusters: Sequence[Sequence[_Cluster]]) -> list[_Chain]:
                 if not 0 < gap_s <= _MAX_GAP_S:
                     continue
                 reach = _GATE_M if len(chain.clusters) > 1 else gap_s * _MAX_SPEED_MPS
-                distance = float(np.linalg.norm(cluster.centre - chain.predicted(cluster.time_s)))
-                if distance <= reach:
+                step = chain.predicted(cluster.time_s) - chain.clusters[-1].centre
+                distance = float(np.linalg.norm(cluster.centre - chain.clusters[-1].centre - step))
+                # A side that comes into view moves the middle: then the bounds still overlap.
+                if distance <= reach or cluster.overlaps(chain.clusters[-1], step):
                     links.append((distance, i, j))
         linked_clusters: set[int] = set()
         linked_chains: set[int] = set()

@@ -119,7 +119,7 @@ def build_lidar_scene(
     still = _still_boxes(drive)
     is_static, actors = assign_returns(drive.sweeps, tracks)
     is_transient = find_transient_returns(drive.sweeps, is_static, still, path)
-    is_static, movers = follow_movers(drive.sweeps, is_static, is_transient)
+    is_static, movers = follow_movers(drive.sweeps, is_static, is_transient, still)
     background = static_points(drive.sweeps, is_static)
     tracks = (*tracks, *(mover.track for mover in movers))
     actors = (*actors, *(mover.points for mover in movers))
