@@ -88,7 +88,7 @@ class _Chain:
     clusters: list[_Cluster] = field(default_factory=list)
 
     def predicted(self, time_s: float) -> np.ndarray:
-        """Return the place at a time by the last two clusters, float64 [3]."""
+        """Return the place at a time by the last clusters, float64 [3]."""
         last = self.clusters[-1]
         if len(self.clusters) < 2:
             return last.centre
@@ -102,11 +102,14 @@ class _Chain:
         )
 
     def velocity(self) -> np.ndarray:
-        """Return the mean velocity over the last clusters, float64 [3]."""
-        first = self.clusters[max(0, len(self.clusters) - 4)]
-        last = self.clusters[-1]
-        seconds = max(last.time_s - first.time_s, 1e-3)
-        return (last.centre - first.centre) / seconds
+        """Return the median velocity over the last clusters, float64 [3].
+
+        Not the mean: the middle jumps where a side comes into view or leaves it.
+        """
+        last = self.clusters[-5:]
+        seconds = np.diff([cluster.time_s for cluster in last])
+        steps = np.diff([cluster.centre for cluster in last], axis=0)
+        return np.median(steps / np.maximum(seconds, 1e-3)[:, None], axis=0)
 
 
 @dataclass(frozen=True, eq=False)
