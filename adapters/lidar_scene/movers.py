@@ -243,15 +243,13 @@ def _mover(chain: _Chain, track_id: str, start_ns: int) -> Mover | None:
     num_returns = sum(len(cluster.rows) for cluster in clusters)
     if len(clusters) < _MIN_SWEEPS or num_returns < _MIN_RETURNS:
         return None
-    way = clusters[-1].centre[:2] - clusters[0].centre[:2]
-    if np.linalg.norm(way) < _MIN_TRAVEL_M:
+    if np.linalg.norm(clusters[-1].centre[:2] - clusters[0].centre[:2]) < _MIN_TRAVEL_M:
         return None
     poses, frozen, residual_m = _align(clusters)
-    way = (poses[-1] - poses[0])[:2, 3]
-    if residual_m > _MAX_RESIDUAL_M or np.linalg.norm(way) < _MIN_TRAVEL_M:
+    travel_m = (poses[-1] - poses[0])[:2, 3]
+    if residual_m > _MAX_RESIDUAL_M or np.linalg.norm(travel_m) < _MIN_TRAVEL_M:
         return None
-    yaw = float(np.arctan2(way[1], way[0]))
-    turn = _turn(yaw)
+    turn = _turn(float(np.arctan2(travel_m[1], travel_m[0])))
     local = [
         (points - pose[:3, 3]) @ pose[:3, :3] for points, pose in zip(frozen, poses, strict=True)
     ]  # in the frame of the first cluster, which has the world's axes
