@@ -301,26 +301,32 @@ class Sweep:
         points: float32 [N, 3] in the scene's world.
         timestamps_ns: int64 [N].
         semantic: int16 [N], SemanticClass values.
+        origins: float32 [N, 3], the sensor's place for each return, or None if it is not known.
     """
 
     points: np.ndarray
     timestamps_ns: np.ndarray
     semantic: np.ndarray
+    origins: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.points)
 
     @staticmethod
-    def of_unknown_class(points: np.ndarray, timestamp_ns: int) -> Sweep:
-        """Return a sweep of points [N, 3] of one time."""
+    def of_unknown_class(
+        points: np.ndarray, timestamp_ns: int, origins: np.ndarray | None = None
+    ) -> Sweep:
+        """Return a sweep of points [N, 3] of one time. origins: the sensor's places [N, 3]."""
         return Sweep(
             points.astype(np.float32),
             np.full(len(points), timestamp_ns, np.int64),
             np.full(len(points), SemanticClass.UNKNOWN, np.int16),
+            None if origins is None else origins.astype(np.float32),
         )
 
     def select(self, keep: np.ndarray) -> Sweep:
-        return Sweep(self.points[keep], self.timestamps_ns[keep], self.semantic[keep])
+        origins = None if self.origins is None else self.origins[keep]
+        return Sweep(self.points[keep], self.timestamps_ns[keep], self.semantic[keep], origins)
 
 
 def is_in_box(points: np.ndarray, low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:

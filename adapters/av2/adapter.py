@@ -280,16 +280,8 @@ class Av2Log:
         stamp = self._stamp(frame_index)
         if stamp is None:
             return None
-        pose = self.city.at(np.array([stamp]))[0]
-        ego_points = np.nan_to_num((sweep.points_m - pose[:3, 3]) @ pose[:3, :3])
         lasers = np.asarray(sweep.columns["laser_number"])
-        sensors = sensor_of_laser(lasers, ego_points, self.ego_from_sensor)
-        sensor_positions = np.stack([self.ego_from_sensor[name][:3, 3] for name in (UP, DOWN)])[
-            sensors
-        ]
-        times, pose_index = np.unique(sweep.columns["timestamp_ns"], return_inverse=True)
-        poses = self.city.at(times)[pose_index]
-        return np.einsum("nij,nj->ni", poses[:, :3, :3], sensor_positions) + poses[:, :3, 3]
+        return self.origins(stamp, sweep.points_m, lasers, sweep.columns["timestamp_ns"])
 
     def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
         """Return the file of a frame's sweep."""
@@ -354,6 +346,28 @@ class Av2Log:
         pose = self.city.at(np.array([stamp_ns]))[0]
         with np.errstate(all="ignore"):  # returns that are no numbers stay none
             return points @ pose[:3, :3].T + pose[:3, 3]
+
+    def origins(
+        self, stamp_ns: int, city_points: np.ndarray, lasers: np.ndarray, times_ns: np.ndarray
+    ) -> np.ndarray:
+        """Return the sensors' places at the returns' times, float64 [N, 3], city.
+
+        Args:
+            stamp_ns: stamp of the sweep.
+            city_points: float64 [N, 3], returns.
+            lasers: int [N], their laser numbers.
+            times_ns: int64 [N], their times.
+        """
+        pose = self.city.at(np.array([stamp_ns]))[0]
+        with np.errstate(all="ignore"):  # returns that are no numbers stay none
+            ego_points = np.nan_to_num((city_points - pose[:3, 3]) @ pose[:3, :3])
+        sensors = sensor_of_laser(lasers, ego_points, self.ego_from_sensor)
+        sensor_positions = np.stack([self.ego_from_sensor[name][:3, 3] for name in (UP, DOWN)])[
+            sensors
+        ]
+        times, pose_index = np.unique(times_ns, return_inverse=True)
+        poses = self.city.at(times)[pose_index]
+        return np.einsum("nij,nj->ni", poses[:, :3, :3], sensor_positions) + poses[:, :3, 3]
 
     def _stamp(self, frame_index: int) -> int | None:
         number, remainder = divmod(frame_index, self.step)
@@ -670,7 +684,9 @@ def _read_sweeps(
             classes = log.ground.classes(city_points)
         with np.errstate(over="ignore"):  # of returns that are no numbers
             points = (city_points - origin).astype(np.float32)
-        sweep = Sweep(points, stamp + returns.offsets_ns, classes)
+        times = stamp + returns.offsets_ns
+        origins = log.origins(stamp, city_points, returns.lasers, times) - origin
+        sweep = Sweep(points, times, classes, origins.astype(np.float32))
         pose = log.city.at(np.array([stamp]))[0]
         return sweep.select(is_usable(sweep, city_points, pose, _EGO_BOX_M))
 

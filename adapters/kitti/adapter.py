@@ -450,7 +450,8 @@ def _read_sweeps(
         pose = frame.world_from_ego.numpy()
         with np.errstate(over="ignore"):
             world_points = points @ pose[:3, :3].T + pose[:3, 3]
-            sweeps.append(Sweep.of_unknown_class(world_points, frame.timestamp_ns))
+            origins = np.broadcast_to(pose[:3, 3], world_points.shape)
+            sweeps.append(Sweep.of_unknown_class(world_points, frame.timestamp_ns, origins))
     return tuple(sweeps), tuple(problems)
 
 

@@ -15,15 +15,18 @@ from types import MappingProxyType
 import numpy as np
 
 from adapters.lidar_scene.closing import close_parts
+from adapters.lidar_scene.free_space import find_transient_returns
 from adapters.lidar_scene.image_views import Body, View, observe_views, read_image
 from adapters.lidar_scene.kernels import SkyGatherer
+from adapters.lidar_scene.movers import follow_movers
 from adapters.lidar_scene.split import (
     ObjectTrack,
     PointSet,
+    assign_returns,
     indices_between,
     is_flat,
     join_tracks,
-    split_sweeps,
+    static_points,
 )
 from adapters.lidar_scene.surfels import (
     Surfels,
@@ -33,6 +36,7 @@ from adapters.lidar_scene.surfels import (
     fill_walls,
     gaussians_from_surfels,
     levels_at,
+    set_back,
     surfels_from_points,
     thin_points,
 )
@@ -112,7 +116,13 @@ def build_lidar_scene(
     path = np.stack([frame.world_from_ego[:3, 3].numpy() for frame in drive.frames])
     times_ns = np.array([frame.timestamp_ns for frame in drive.frames], np.int64)
     tracks = join_tracks(drive.boxes)
-    background, actors = split_sweeps(drive.sweeps, tracks)
+    still = _still_boxes(drive)
+    is_static, actors = assign_returns(drive.sweeps, tracks)
+    is_transient = find_transient_returns(drive.sweeps, is_static, still, path)
+    is_static, movers = follow_movers(drive.sweeps, is_static, is_transient, still)
+    background = static_points(drive.sweeps, is_static)
+    tracks = (*tracks, *(mover.track for mover in movers))
+    actors = (*actors, *(mover.points for mover in movers))
     if ground is None:
         ground = measure_from_classes(background.points, background.semantic, path)
     paths = [path, *(_path_in(track, path, times_ns) for track in tracks)]
@@ -124,20 +134,19 @@ def build_lidar_scene(
     views = views_of(drive.used[:: drive.colour_every], drive.used_rows)
     views = with_own_car([v for v in views if v.camera.name not in drive.grey_cameras])
     body_colours, faults = observe_views(bodies, views, sky, image_scale=options.image_scale)
+    eyes = np.stack([_eye(frame) for frame in drive.frames])
+    eye_paths = [eyes, *(_path_in(track, eyes, times_ns) for track in tracks)]
     parts = [
-        _gaussians(*sample, body_surfels, *colours)
-        for sample, body_surfels, colours in zip(sampled, surfels, body_colours, strict=True)
+        _gaussians(*sample, set_back(body_surfels, sample[0].semantic, eye_path), *colours)
+        for sample, body_surfels, eye_path, colours in zip(
+            sampled, surfels, eye_paths, body_colours, strict=True
+        )
     ]
     if added is not None:
         parts[0] = join_gaussians([parts[0], added])
     elif any(map(len, parts)):
         parts = close_parts(
-            parts,
-            tracks,
-            _still_boxes(drive),
-            views,
-            sampled[0][0],
-            max_gaussians=options.max_gaussians,
+            parts, tracks, still, views, sampled[0][0], max_gaussians=options.max_gaussians
         )
     if not any(map(len, parts)):
         raise AdapterError(
@@ -257,10 +266,18 @@ def _sample(
     if len(thin) < _MIN_POINTS:
         return thin, edges
     surfels = surfels_from_points(thin.points, edges, semantic=thin.semantic)
+    thin = PointSet(surfels.centres, thin.semantic)
     parts = [thin, bridge_gaps(thin, edges, surfels)]
     if is_world:
         parts += [fill_walls(thin, edges, surfels), fill_ground(thin, path, voxel_m=voxel_m)]
     return thin_points(PointSet.join(parts), path, voxel_m=voxel_m)
+
+
+def _eye(frame: Frame) -> np.ndarray:
+    """Return the middle of the frame's cameras, float64 [3], or the car's place without any."""
+    if not frame.cameras:
+        return frame.world_from_ego[:3, 3].numpy()
+    return np.mean([camera.centre.numpy() for camera in frame.cameras.values()], axis=0)
 
 
 def _path_in(track: ObjectTrack, path: np.ndarray, times_ns: np.ndarray) -> np.ndarray:

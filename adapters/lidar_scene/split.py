@@ -226,7 +226,28 @@ def split_sweeps(
     Each return is assigned by the box as it stood at the return's own time. Ground in a box stays
     ground; without classes the lowest FLOOR_M of a box belongs to the world.
     """
-    static: list[PointSet] = []
+    is_static, actors = assign_returns(sweeps, tracks)
+    return static_points(sweeps, is_static), actors
+
+
+def static_points(sweeps: Sequence[Sweep], is_static: Sequence[np.ndarray]) -> PointSet:
+    """Return the points of the returns in the masks, bool [N] of each sweep."""
+    return PointSet.join(
+        [
+            PointSet(sweep.points[mask], sweep.semantic[mask])
+            for sweep, mask in zip(sweeps, is_static, strict=True)
+        ]
+    )
+
+
+def assign_returns(
+    sweeps: Sequence[Sweep], tracks: Sequence[ObjectTrack]
+) -> tuple[list[np.ndarray], tuple[PointSet, ...]]:
+    """Return a mask of each sweep's returns of the static world, and the points of each track.
+
+    See `split_sweeps`.
+    """
+    is_static_of_sweep: list[np.ndarray] = []
     actors: list[list[PointSet]] = [[] for _ in tracks]
     for sweep in sweeps:
         is_static = np.ones(len(sweep), dtype=bool)
@@ -241,8 +262,8 @@ def split_sweeps(
             is_object &= ~(low & (classes == SemanticClass.UNKNOWN))
             is_static[near[halo]] = False
             parts.append(PointSet(local[is_object].astype(np.float32), classes[is_object]))
-        static.append(PointSet(sweep.points[is_static], sweep.semantic[is_static]))
-    return PointSet.join(static), tuple(map(PointSet.join, actors))
+        is_static_of_sweep.append(is_static)
+    return is_static_of_sweep, tuple(map(PointSet.join, actors))
 
 
 @cached_njit()

@@ -39,6 +39,14 @@ _STRETCH_FIRM = 4.0  # the same on ground, walls and where there is no class
 _UPRIGHT = (Class.BUILDING, Class.BARRIER, Class.SIGN)
 _LINE = 0.02  # middle over largest variance below which neighbours lie on a line, not a plane
 _GROUND_SIGMA_PER_SPACING = 0.6  # wider than elsewhere: the ground must not leak
+_SETTLE_EDGES = 3.0  # largest distance along the normal, in edges, of points that are averaged
+_ONE_FACE = 0.7  # least cosine of two normals whose points are of one face, not around its edge
+_SETTLE_CROWN = 0.8  # part of the way that foliage is moved: crowns would shrink
+_SET_BACK = 0.55  # distance along the normal, in standard deviations, that a disc is set back
+_GROUND_SET_BACK = 0.38  # the same on the ground, which is seen at flatter angles
+_MOST_SET_BACK_M = 0.08  # largest distance that a disc is set back
+_MIN_SINE = 0.45  # least sine that is counted: other cameras see a disc at flatter angles
+_EDGE_ON = 0.1  # cosine of the normal and the view below which a disc has no side
 _THICKNESS = 0.15  # standard deviation along the normal over the smaller tangent one
 _MIN_THICKNESS_M = 0.005  # smallest standard deviation along the normal
 
@@ -230,7 +238,12 @@ def surfels_from_points(
     spacing = _spacing(points, index, axes[:, 0], axes[:, 2], edge_m, stretch, endless)
     # On a surface thinned to edge_m the fourth neighbour is a little over one edge away.
     isolated = distance[:, min(4, distance.shape[1] - 1)] > 4 * edge_m
-    return Surfels(points, axes[:, 2], axes[:, 0], spacing, isolated, index)
+    is_crown = semantic == Class.VEGETATION
+    part = np.where(is_crown, _SETTLE_CROWN, 1.0).astype(np.float32)
+    least_cosine = np.where(is_crown, 0.0, _ONE_FACE).astype(np.float32)
+    near = np.ascontiguousarray(index[:, : distance.shape[1]])
+    centres = _settle(points, near, axes[:, 2], edge_m, part, least_cosine)
+    return Surfels(centres, axes[:, 2], axes[:, 0], spacing, isolated, index)
 
 
 def find_neighbours(points: np.ndarray, edge_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -283,6 +296,44 @@ def _covariances(points, index):  # pragma: no cover - compiled
                 for b in range(3):
                     out[i, a, b] += da * (points[j, b] - mean[b])
     return out / k
+
+
+@cached_njit()
+def _settle(points, index, normals, edge_m, part, least_cosine):  # pragma: no cover - compiled
+    """Return the points moved along their normals to the middle of the points around them.
+
+    Noise spreads the returns of a surface over a layer that is thicker than the voxels. Its front
+    would hide the rest, and every surface would stand too near.
+
+    Args:
+        points, normals: float32 [N, 3].
+        index: int [N, K], nearest points of each point.
+        edge_m: float32 [N], distance to which the points were thinned.
+        part: float32 [N], part of the way to the middle that a point is moved.
+        least_cosine: float32 [N], least cosine of two normals whose points are of one face.
+    """
+    out = np.empty_like(points)
+    for i in range(len(points)):
+        limit = _SETTLE_EDGES * edge_m[i]
+        total = 0.0
+        weight = 0.0
+        for j in index[i]:
+            cosine = (
+                normals[i, 0] * normals[j, 0]
+                + normals[i, 1] * normals[j, 1]
+                + normals[i, 2] * normals[j, 2]
+            )
+            if abs(cosine) < least_cosine[i]:
+                continue
+            dx, dy, dz = _offset(points, i, j)
+            w = dx * normals[i, 0] + dy * normals[i, 1] + dz * normals[i, 2]
+            if abs(w) <= limit:
+                total += w
+                weight += 1.0
+        shift = part[i] * total / max(weight, 1.0)
+        for a in range(3):
+            out[i, a] = points[i, a] + shift * normals[i, a]
+    return out
 
 
 @cached_njit()
@@ -386,6 +437,35 @@ def gaussians_from_surfels(
         sh=((torch.from_numpy(colours).float() - 0.5) / SH_C0)[:, None, :],
         semantic=torch.from_numpy(semantic.astype(np.int16)),
     )
+
+
+def set_back(surfels: Surfels, semantic: np.ndarray, eyes: np.ndarray) -> Surfels:
+    """Return the surfels moved away from the eyes, so that their splats' depth is that of the
+    surface.
+
+    A pixel takes the depth of the centre of the first splat that covers it. Of splats that overlap,
+    that is one whose centre lies towards the eye. The mean of this is a part of the splats' width,
+    and the more of it the flatter the view. Along the normal it is about _SET_BACK of the width.
+
+    Args:
+        surfels: the surfels.
+        semantic: int16 [N], classes. Ground is seen from above.
+        eyes: float [E, 3], places of the cameras in the surfels' frame.
+    """
+    if len(surfels) == 0:
+        return surfels
+    _, nearest = cKDTree(eyes).query(surfels.centres)
+    to_eye = eyes[nearest] - surfels.centres
+    cosine = (to_eye * surfels.normals).sum(1) / np.maximum(np.linalg.norm(to_eye, axis=1), 1e-6)
+    sine = np.sqrt(np.maximum(1 - cosine**2, _MIN_SINE**2))
+    side = np.clip(cosine / _EDGE_ON, -1, 1) * sine
+    flat = is_flat(semantic)  # which is mostly seen from afar
+    side[flat] = np.sign(surfels.normals[flat, 2])
+    width = surfels.spacing.max(axis=1) * np.where(flat, _GROUND_SIGMA_PER_SPACING, 0.5)
+    part = np.where(flat, _GROUND_SET_BACK, _SET_BACK)
+    shift_m = np.clip(part * side * width, -_MOST_SET_BACK_M, _MOST_SET_BACK_M)
+    shift = shift_m[:, None] * surfels.normals
+    return dataclasses.replace(surfels, centres=(surfels.centres - shift).astype(np.float32))
 
 
 def borrow_colours(

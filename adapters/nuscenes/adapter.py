@@ -509,7 +509,10 @@ def read_sweeps(
         semantic = unknown_classes if classes is None else world_classes(classes, class_meanings)
         with np.errstate(over="ignore"):  # of returns that are no numbers
             points = (returns.points_m - world_origin_m).astype(np.float32)
-        sweep = Sweep(points, returns.timestamps_ns, semantic)
+        sensor = (frame.sweep.world_from_sensor[:3, 3] - world_origin_m).astype(np.float32)
+        sweep = Sweep(
+            points, returns.timestamps_ns, semantic, np.broadcast_to(sensor, points.shape)
+        )
         is_usable_return = is_usable(sweep, returns.points_m, frame.sweep.world_from_ego, EGO_BOX_M)
         sweeps.append(sweep.select(is_usable_return))
     if missing_frames:

@@ -346,6 +346,7 @@ def read_sweeps(
     meaning = class_meanings(root)
     cuboids = {frame.index: read_cuboids(root, frame.index) for frame in frames}
     moving = _moving_boxes(root, frames, cuboids, origin)
+    ego_track = read_ego_track(root)
     sweeps = []
     boxes = []
     problems = []
@@ -368,6 +369,7 @@ def read_sweeps(
                 np.full(len(lidar), SemanticClass.UNKNOWN, np.int16)
                 if classes is None
                 else world_classes(classes, meaning),
+                (_origins_at(*ego_track, n, lidar) - origin).astype(np.float32),
             )
             sensor = lidar["d"].to_numpy()
             if n not in held_out:
@@ -708,11 +710,7 @@ class PandaSetLabels:
         world_from_ego, times_ns = read_ego_track(self.root)
         if not 0 <= frame_index < len(times_ns):
             return None
-        turn = world_from_ego[frame_index, :3, :3]
-        seconds = np.asarray(sweep.columns["t"], np.float64) - times_ns[0] * 1e-9
-        places = places_at(world_from_ego[:, :3, 3], (times_ns - times_ns[0]) * 1e-9, seconds)
-        offsets = np.stack([turn @ SENSORS_M[0], turn @ SENSORS_M[1]])
-        return places + offsets[(np.asarray(sweep.columns["d"]) == 1).astype(np.int64)]
+        return _origins_at(world_from_ego, times_ns, frame_index, sweep.columns)
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
         table = read_lidar(self.root, frame_index)
@@ -744,6 +742,27 @@ class PandaSetLabels:
         stream = io.BytesIO()
         table.to_pickle(stream, compression=None, protocol=4)
         return gzip.compress(stream.getvalue(), compresslevel=6, mtime=0)
+
+
+def _origins_at(
+    world_from_ego: np.ndarray,
+    times_ns: np.ndarray,
+    frame: int,
+    columns: Mapping[str, np.ndarray] | pd.DataFrame,
+) -> np.ndarray:
+    """Return the sensors' places at the returns' times, float64 [N, 3], dataset world.
+
+    Args:
+        world_from_ego: float64 [F, 4, 4], the car's poses at the ends of the sweeps.
+        times_ns: int64 [F], their times.
+        frame: number of the sweep.
+        columns: t and d of its returns.
+    """
+    turn = world_from_ego[frame, :3, :3]
+    seconds = np.asarray(columns["t"], np.float64) - times_ns[0] * 1e-9
+    places = places_at(world_from_ego[:, :3, 3], (times_ns - times_ns[0]) * 1e-9, seconds)
+    offsets = np.stack([turn @ SENSORS_M[0], turn @ SENSORS_M[1]])
+    return places + offsets[(np.asarray(columns["d"]) == 1).astype(np.int64)]
 
 
 def places_at(places_m: np.ndarray, times_s: np.ndarray, wanted_s: np.ndarray) -> np.ndarray:

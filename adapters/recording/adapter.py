@@ -174,10 +174,14 @@ class RecordingLabels:
         """Return the columns origin_x, origin_y, origin_z, in the world of the returns, if all
         hold numbers.
         """
-        columns = [sweep.columns.get(f"origin_{axis}") for axis in "xyz"]
-        if any(c is None or np.asarray(c).dtype.kind not in "fiu" for c in columns):
-            return None
-        return np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
+        return _origins_of(sweep)
+
+
+def _origins_of(sweep: LidarSweep) -> np.ndarray | None:
+    columns = [sweep.columns.get(f"origin_{axis}") for axis in "xyz"]
+    if any(c is None or np.asarray(c).dtype.kind not in "fiu" for c in columns):
+        return None
+    return np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
 
 
 def recording_labels(path: str, query: dict[str, str]) -> RecordingLabels:
@@ -386,7 +390,11 @@ def _read_returns(
         times = sweep_times(sweep, frame.timestamp_ns)
     except ValueError as error:
         raise AdapterError(f"{path}: {error}") from None
-    returns = Sweep.of_unknown_class(world[keep], frame.timestamp_ns)
+    origins = _origins_of(sweep)
+    if origins is not None:
+        origins = (origins - calibration.world_origin_m)[keep]
+        origins = origins if np.isfinite(origins).all() else None
+    returns = Sweep.of_unknown_class(world[keep], frame.timestamp_ns, origins)
     if times is not None:
         returns = dataclasses.replace(returns, timestamps_ns=times[keep])
     column = sweep.columns.get("semantic")

@@ -777,6 +777,11 @@ def _usable_sweep(scans: _Scans, stride: int, origin: np.ndarray) -> Sweep | Non
         return None
     points = returns.points_m
     semantic = _semantic(returns.classes, returns.camera_classes, len(points))
-    sweep = Sweep((points - origin).astype(np.float32), returns.timestamps_ns, semantic)
+    sweep = Sweep(
+        (points - origin).astype(np.float32),
+        returns.timestamps_ns,
+        semantic,
+        (returns.origins_m - origin).astype(np.float32),
+    )
     pose = scans.segment.world_from_vehicle[scans.frame]
     return sweep.select(is_usable(sweep, points, pose, EGO_M))

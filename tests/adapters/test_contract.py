@@ -91,7 +91,8 @@ def test_the_car_is_the_only_actor_and_drives_where_it_was(opened: Opened) -> No
     box = next(iter(drive.boxes.values()))[drive.car]
     assert (actor.track_id, actor.label) == (drive.car, box.label)
     assert actor.size_m == pytest.approx(tuple(box.size_m))
-    assert (np.abs(actor.gaussians.means.numpy()) <= box.size_m / 2 + 0.1).all()
+    # Returns up to 0.1 m outside count as the car's, and discs are set back by up to 0.08 m.
+    assert (np.abs(actor.gaussians.means.numpy()) <= box.size_m / 2 + 0.18).all()
     for time_ns in list(drive.times_ns.values())[1:-1]:
         pose = actor.track.pose_at(time_ns).numpy()
         expected = drive.world_from_car(time_ns)
@@ -99,7 +100,8 @@ def test_the_car_is_the_only_actor_and_drives_where_it_was(opened: Opened) -> No
         np.testing.assert_allclose(pose[:3, 3], place, 0, drive.car_atol_m)
         np.testing.assert_allclose(pose[:3, :3], expected[:3, :3], 0, drive.car_turn_atol)
     rgb = (actor.gaussians.sh[:, 0] * SH_C0 + 0.5).median(0).values
-    np.testing.assert_allclose(rgb, drive.car_rgb / 255, atol=0.03)
+    # The car is some 20 pixels wide where its colours are read, and JPEG blurs red into grey.
+    np.testing.assert_allclose(rgb, drive.car_rgb / 255, atol=0.05)
 
 
 def test_nothing_of_the_car_stays_in_the_background(opened: Opened) -> None:
