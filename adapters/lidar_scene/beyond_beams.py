@@ -19,11 +19,15 @@ import cv2
 import numpy as np
 import torch
 
+from adapters.lidar_scene.closing import spread_views
 from adapters.lidar_scene.dense_depth import FAR_M, DenseDepth, KnownSurface, complete_depth
+from adapters.lidar_scene.image_views import View
+from adapters.lidar_scene.sky_conflicts import measure_conflicts, without_sky_splats
+from adapters.lidar_scene.solid_views import SolidView, read_solid_view
+from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
 from adapters.lidar_scene.wall_planes import WallPlanes, find_wall_planes
 from adapters.world import join_gaussians
-from augment.photo.sky_matte import SkyMatte
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
@@ -32,37 +36,68 @@ from augment.scene.scene import Gaussians, PosedGaussians
 
 logger = logging.getLogger(__name__)
 
-WORK_WIDTH = 480  # columns of the images in which surfaces are added, at most
-_OPEN_ALPHA = 0.9  # alpha of the Gaussians so far below which a pixel is open
+_STEP_M = 2.0  # distance on the path from one image that is taken to the next
+_FRAMES_PART = 1 / 6  # largest part of all frames whose images are taken, beyond a few
+_FINER = 2  # scale at which the Gaussians so far are drawn: leaks between splats are small
+_OPEN_ALPHA = 0.97  # mean alpha of the Gaussians so far around a pixel below which it is open
+_OPEN_WINDOW_PX = 5  # side of the square over which that mean is taken
+_SOLID_PART = 0.8  # part of that square with a surface above which it is no sky, whatever it shows
 _SOLID_SHARE = 0.5  # share of sky below which a pixel shows a surface
 _BEHIND = 0.002  # gap from a surface that leaks to the disc behind it, as a part of the depth
 _BEHIND_M = 0.02  # constant part of that gap, metres
 _SIDES_PX = (16, 8, 4, 2, 1)  # sides of discs, pixels
 # Largest standard deviations of CIELAB colours within a disc, in turn, until there is room for all.
 _COLOR_TOLERANCES = (2.0, 4.0, 8.0, 16.0)
+_SKY_SIDES = 1.2  # least distance of a disc from the sky, as a multiple of its side
 _DEPTH_TOLERANCE = 0.02  # largest standard deviation of the logarithm of depths within a disc
 _VIEWS_PER_SHARE = 8  # one view adds the remaining number over this at most, if so many follow
 _MIN_COSINE = 0.15  # of the angle between a ray and a wall's normal, to which a disc is stretched
-_SURE_SKY = 0.98  # share of sky above which an image shows sky
 _MAX_CONFLICTS = 0.3  # part of the images of a disc in which it may cover sky
 _SHAPE = SplatShape(sigma_per_spacing=0.65, opacity=0.99)
 
 
-class SolidView(NamedTuple):
-    """A recorded image in which surfaces are added, of H x W pixels."""
-
-    camera: Camera
-    """Camera at the image's size."""
-    rgb: np.ndarray
-    """The photo, uint8 [H, W, 3]."""
-    matte: SkyMatte
-    """Its sky."""
-    excluded: np.ndarray
-    """Pixels of the recording car and of moving objects, bool [H, W]."""
-
-
 # Background and camera to everything that is drawn, the background first.
 PosesParts = Callable[[Gaussians, Camera], Sequence[PosedGaussians]]
+
+
+def close_above_beams(
+    parts: Sequence[Gaussians],
+    tracks: Sequence[ObjectTrack],
+    views: Sequence[View],
+    *,
+    lidar_top_rad: float,
+    max_gaussians: int,
+) -> Gaussians:
+    """Return the world's Gaussians with discs where images show a surface above the LiDAR's view.
+
+    Args:
+        parts: Gaussians of the world, then those of the tracks, in their frames.
+        tracks: moving objects.
+        views: recorded images.
+        lidar_top_rad: highest elevation that the LiDAR measures.
+        max_gaussians: largest number for all parts.
+    """
+    solid_views = [
+        solid_view
+        for view in spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART)
+        if (solid_view := read_solid_view(view, tracks)) is not None
+    ]
+
+    def pose_parts(background: Gaussians, camera: Camera) -> list[PosedGaussians]:
+        posed = [PosedGaussians(background, None, instance_id=0)]
+        for number, (track, part) in enumerate(zip(tracks, parts[1:], strict=True), start=1):
+            pose = track.motion.pose_at(camera.timestamp_ns)
+            if pose is not None and len(part):
+                posed.append(PosedGaussians(part, torch.from_numpy(pose), instance_id=number))
+        return posed
+
+    return add_surfaces_beyond_beams(
+        parts[0],
+        solid_views,
+        pose_parts,
+        lidar_top_rad=lidar_top_rad,
+        max_added=max_gaussians - sum(map(len, parts)),
+    )
 
 
 def add_surfaces_beyond_beams(
@@ -82,14 +117,20 @@ def add_surfaces_beyond_beams(
         lidar_top_rad: highest elevation that the LiDAR looks at.
         max_added: largest number of discs.
     """
-    views = list(views)
+    background, views = without_sky_splats(background, list(views))
     walls = find_wall_planes(background)
     count = len(background)
     for number, view in enumerate(views):
         room = max_added - (len(background) - count)
         room //= min(_VIEWS_PER_SHARE, len(views) - number)
         alpha, known = _draw(background, view.camera, pose_parts)
-        is_open = (alpha < _OPEN_ALPHA) & (view.matte.sky_share < _SOLID_SHARE) & ~view.excluded
+        # A sheet behind all of a leaking wall takes fewer discs than one behind each leak.
+        window = (_OPEN_WINDOW_PX, _OPEN_WINDOW_PX)
+        is_open = (
+            (cv2.blur(alpha, window) < _OPEN_ALPHA)
+            & (view.matte.sky_share < _SOLID_SHARE)
+            & ~view.excluded
+        )
         is_open &= view.camera.ray_directions().numpy()[..., 2] > -0.5 / view.camera.fy
         if not is_open.any() or room < 1:
             continue
@@ -101,7 +142,8 @@ def add_surfaces_beyond_beams(
             depth_m=np.where(leaks, depth.depth_m * (1 + _BEHIND) + _BEHIND_M, depth.depth_m)
         )
         cells = _cells(view, depth, is_open, room)
-        discs = _discs(view, depth, cells, walls, [other for other in views if other is not view])
+        others = [other for other in views if other is not view]
+        discs = _discs(view, depth, leaks, cells, walls, others)
         background = join_gaussians([background, discs])
     logger.info("%d splats beyond the LiDAR's view", len(background) - count)
     return background
@@ -112,14 +154,25 @@ def _draw(
 ) -> tuple[np.ndarray, KnownSurface]:
     """Return alpha [H, W] and the surfaces of the Gaussians so far."""
     parts = pose_parts(background, camera)
-    raster = rasterize(parts, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
+    fine_camera = dataclasses.replace(
+        camera,
+        width=_FINER * camera.width,
+        height=_FINER * camera.height,
+        fx=_FINER * camera.fx,
+        fy=_FINER * camera.fy,
+        cx=_FINER * camera.cx,
+        cy=_FINER * camera.cy,
+    )
+    raster = rasterize(parts, fine_camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
     assert raster.alpha is not None and raster.median_depth is not None
     assert raster.splat_ids is not None and background.semantic is not None
-    alpha = raster.alpha.numpy()
-    ids = raster.splat_ids.numpy()
+    size = (camera.width, camera.height)
+    alpha = cv2.resize(raster.alpha.numpy(), size, interpolation=cv2.INTER_AREA)
+    ids = raster.splat_ids.numpy()[::_FINER, ::_FINER]
     in_background = (ids >= 0) & (ids < len(background))
     semantic = background.semantic.numpy()[np.where(in_background, ids, 0)]
-    depth = np.where(alpha >= SURFACE_ALPHA, raster.median_depth.numpy(), np.inf)
+    is_known = raster.alpha.numpy()[::_FINER, ::_FINER] >= SURFACE_ALPHA
+    depth = np.where(is_known, raster.median_depth.numpy()[::_FINER, ::_FINER], np.inf)
     return alpha, KnownSurface(depth, semantic.astype(np.int16), (ids >= len(background)))
 
 
@@ -137,23 +190,41 @@ class _Cells(NamedTuple):
         return _Cells(*(column[keep] for column in self))
 
 
+class _CellImages(NamedTuple):
+    """Images of H x W pixels that decide how large cells may be."""
+
+    lab: np.ndarray
+    """Colours in CIELAB, float32 [H, W, 3]."""
+    log_depth: np.ndarray
+    """Logarithm of the depth, float32 [H, W]."""
+    wall: np.ndarray
+    """Number of the wall, -1 for none, float32 [H, W]."""
+    from_sky_px: np.ndarray
+    """Distance from the nearest pixel of sky, pixels, float32 [H, W]."""
+
+
 def _cells(view: SolidView, depth: DenseDepth, is_open: np.ndarray, room: int) -> _Cells:
     """Return the cells that cover the open pixels, `room` at most.
 
     A cell is as large as colour and depth are even in it. If there are too many, colours may
     differ more; at last the smallest cells are left out.
     """
-    lab = cv2.cvtColor(view.matte.surface_rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
-    log_depth = np.log(np.maximum(depth.depth_m, 1e-3)).astype(np.float32)
+    is_solid = (view.matte.sky_share < _SOLID_SHARE).astype(np.uint8)
+    images = _CellImages(
+        lab=cv2.cvtColor(view.matte.surface_rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB),
+        log_depth=np.log(np.maximum(depth.depth_m, 1e-3)).astype(np.float32),
+        wall=depth.wall.astype(np.float32),
+        from_sky_px=cv2.distanceTransform(is_solid, cv2.DIST_L2, 3),
+    )
     for tolerance in _COLOR_TOLERANCES:
-        cells = _split(lab, log_depth, is_open, tolerance)
+        cells = _split(images, is_open, tolerance)
         if len(cells.rows) <= room:
             return cells
     largest_first = np.argsort(-cells.sides, kind="stable")[:room]
     return cells.select(np.sort(largest_first))
 
 
-def _split(lab: np.ndarray, log_depth: np.ndarray, is_open: np.ndarray, tolerance: float) -> _Cells:
+def _split(images: _CellImages, is_open: np.ndarray, tolerance: float) -> _Cells:
     """Return cells of a quadtree: of each open pixel the largest one that is open and even."""
     height, width = is_open.shape
     missing = is_open.copy()
@@ -170,9 +241,14 @@ def _split(lab: np.ndarray, log_depth: np.ndarray, is_open: np.ndarray, toleranc
             continue
         is_cell = mean(missing.astype(np.float32)) > 1 - 0.5 / side**2
         if side > 1:
-            variance = (mean(lab * lab) - mean(lab) ** 2).sum(-1)
-            depth_variance = mean(log_depth * log_depth) - mean(log_depth) ** 2
-            is_cell &= (variance < tolerance**2) & (depth_variance < _DEPTH_TOLERANCE**2)
+            variance = (mean(images.lab**2) - mean(images.lab) ** 2).sum(-1)
+            depth_variance = mean(images.log_depth**2) - mean(images.log_depth) ** 2
+            is_even = depth_variance < _DEPTH_TOLERANCE**2
+            # A disc on a wall leans with it.
+            wall_variance = mean(images.wall**2) - mean(images.wall) ** 2
+            is_even |= (mean(images.wall) >= 0) & (wall_variance < 1e-3)
+            is_cell &= mean(images.from_sky_px) > _SKY_SIDES * side  # it would reach into the sky
+            is_cell &= (variance < tolerance**2) & is_even
         cell_rows, cell_columns = np.nonzero(is_cell)
         found.append((cell_rows * side, cell_columns * side, np.full(len(cell_rows), side)))
         taken = np.kron(is_cell, np.ones((side, side), np.bool_))
@@ -183,11 +259,15 @@ def _split(lab: np.ndarray, log_depth: np.ndarray, is_open: np.ndarray, toleranc
 def _discs(
     view: SolidView,
     depth: DenseDepth,
+    leaks: np.ndarray,
     cells: _Cells,
     walls: WallPlanes,
     others: Sequence[SolidView],
 ) -> Gaussians:
-    """Return a disc for each cell, without those that other images see as sky."""
+    """Return a disc for each cell, without those that other images see as sky.
+
+    leaks: bool [H, W], pixels of surfaces that are known, but leak.
+    """
     camera = view.camera
     half = (cells.sides // 2,) * 2
     middle_rows = np.minimum(cells.rows + half[0], camera.height - 1)
@@ -197,10 +277,11 @@ def _discs(
     wall = depth.wall[middle_rows, middle_columns]
     centre = camera.centre.numpy()
     level = np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
-    conflicts = _conflicts(centre + depth_m[:, None] * rays, others)
+    is_known = leaks[middle_rows, middle_columns]
+    conflicts = np.where(is_known, 0, measure_conflicts(centre + depth_m[:, None] * rays, others))
     goes_far = np.flatnonzero(conflicts > 0)
     far_m = FAR_M / level[goes_far]
-    far_conflicts = _conflicts(centre + far_m[:, None] * rays[goes_far], others)
+    far_conflicts = measure_conflicts(centre + far_m[:, None] * rays[goes_far], others)
     better = far_conflicts < conflicts[goes_far]
     depth_m[goes_far[better]] = far_m[better]
     wall[goes_far[better]] = -1
@@ -265,25 +346,3 @@ def _colors_of_cells(view: SolidView, cells: _Cells) -> tuple[np.ndarray, np.nda
     total += sums[rows, columns] - sums[last_rows, columns]
     means = total / (cells.sides**2)[:, None]
     return means[:, :3].clip(0, 1).astype(np.float32), means[:, 3].clip(0, 1)
-
-
-def _conflicts(points: np.ndarray, views: Sequence[SolidView]) -> np.ndarray:
-    """Return the part of the views that see sky at each point, of those that see it, float64 [M].
-
-    Sky counts if all pixels around are sky as well: depths are not exact.
-    """
-    num_views = np.zeros(len(points))
-    num_sky = np.zeros(len(points))
-    for view in views:
-        camera = view.camera
-        pose = camera.camera_from_world.numpy()
-        x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
-        front = np.flatnonzero(z > 1.0)
-        u = np.floor(camera.fx * x[front] / z[front] + camera.cx).astype(np.int64)
-        v = np.floor(camera.fy * y[front] / z[front] + camera.cy).astype(np.int64)
-        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        index = front[inside]
-        sure_sky = cv2.erode(view.matte.sky_share, np.ones((3, 3), np.uint8)) > _SURE_SKY
-        num_views[index] += 1
-        num_sky[index] += sure_sky[v[inside], u[inside]]
-    return num_sky / np.maximum(num_views, 1)

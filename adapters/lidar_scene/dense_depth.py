@@ -79,7 +79,7 @@ class DenseDepth(NamedTuple):
     is_far: np.ndarray
     """True where the distance is FAR_M for want of any surface that goes on, bool [H, W]."""
     wall: np.ndarray
-    """Number of the wall on which an added surface lies, -1 for none, int64 [H, W]."""
+    """Number of the wall on which the surface lies, -1 for none, int64 [H, W]."""
 
 
 def complete_depth(
@@ -123,7 +123,7 @@ def complete_depth(
         depth_m[rows] = np.where(is_known[rows], depth_m[rows], part.depth_m)
         semantic[rows] = np.where(is_known[rows], semantic[rows], part.semantic)
         is_far[rows] &= part.is_far
-        wall[rows] = np.where(is_known[rows], -1, part.wall)
+        wall[rows] = part.wall
     return DenseDepth(depth_m, semantic, is_far, wall)
 
 
@@ -170,7 +170,8 @@ def _complete_rows(
     is_far = ~has_seed | is_far_seed.ravel()[seed]
     semantic = known.semantic.ravel()[seed]
     directions = rays[..., :2] / level[..., None]
-    wall = np.where(is_known, -1, wall.ravel()[seed])
+    seed_wall = wall
+    wall = np.where(is_known, -1, seed_wall.ravel()[seed])
     _stand_on_walls(out_m, wall, centre, directions, walls)
     behind = ~is_known & is_plant.ravel()[seed] & (plant_share < _PLANT_SHARE) & has_seed
     is_wall_behind = _meet_walls_behind(out_m, wall, behind, centre, directions, walls)
@@ -182,6 +183,7 @@ def _complete_rows(
         semantic = np.where(is_far, looks_like, semantic)
     smooth_m = np.exp(cv2.medianBlur(np.log(out_m).astype(np.float32), 5)).astype(np.float64)
     out_m = np.where(is_known | (wall >= 0), out_m, smooth_m)
+    wall = np.where(is_known, seed_wall, wall)
     return DenseDepth(out_m / level, semantic.astype(np.int16), is_far, wall)
 
 

@@ -14,10 +14,10 @@ from types import MappingProxyType
 
 import numpy as np
 
+from adapters.lidar_scene.beyond_beams import close_above_beams
 from adapters.lidar_scene.closing import close_parts
 from adapters.lidar_scene.image_views import Body, View, observe_views, read_image
 from adapters.lidar_scene.kernels import SkyGatherer
-from adapters.lidar_scene.solid_views import close_above_beams
 from adapters.lidar_scene.split import (
     ObjectTrack,
     PointSet,

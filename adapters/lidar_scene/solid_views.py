@@ -1,66 +1,35 @@
-"""Images of a raw drive in which surfaces beyond the LiDAR's view are added.
+"""Recorded images that tell surfaces from sky.
 
-The caller is `adapters.lidar_scene.scene`.
+The callers are `adapters.lidar_scene.beyond_beams` and `adapters.training_views.starting_scene`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-import torch
 
-from adapters.lidar_scene.beyond_beams import WORK_WIDTH, SolidView, add_surfaces_beyond_beams
-from adapters.lidar_scene.closing import spread_views
 from adapters.lidar_scene.image_views import IMAGE_SCALES, View, draw_cover, read_image
 from adapters.lidar_scene.split import ObjectTrack
-from augment.photo.sky_matte import find_sky_matte
+from augment.photo.sky_matte import SkyMatte, find_sky_matte
 from augment.scene.cameras import Camera
-from augment.scene.scene import Gaussians, PosedGaussians
 
-_STEP_M = 2.0  # distance on the path from one image that is taken to the next
-_FRAMES_PART = 1 / 6  # largest part of all frames whose images are taken, beyond a few
+WORK_WIDTH = 480  # columns of the images in which surfaces are added, at most
 
 
-def close_above_beams(
-    parts: Sequence[Gaussians],
-    tracks: Sequence[ObjectTrack],
-    views: Sequence[View],
-    *,
-    lidar_top_rad: float,
-    max_gaussians: int,
-) -> Gaussians:
-    """Return the world's Gaussians with discs where images show a surface above the LiDAR's view.
+class SolidView(NamedTuple):
+    """A recorded image in which surfaces are added, of H x W pixels."""
 
-    Args:
-        parts: Gaussians of the world, then those of the tracks, in their frames.
-        tracks: moving objects.
-        views: recorded images.
-        lidar_top_rad: highest elevation that the LiDAR measures.
-        max_gaussians: largest number for all parts.
-    """
-    solid_views = [
-        solid_view
-        for view in spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART)
-        if (solid_view := read_solid_view(view, tracks)) is not None
-    ]
-
-    def pose_parts(background: Gaussians, camera: Camera) -> list[PosedGaussians]:
-        posed = [PosedGaussians(background, None, instance_id=0)]
-        for number, (track, part) in enumerate(zip(tracks, parts[1:], strict=True), start=1):
-            pose = track.motion.pose_at(camera.timestamp_ns)
-            if pose is not None and len(part):
-                posed.append(PosedGaussians(part, torch.from_numpy(pose), instance_id=number))
-        return posed
-
-    return add_surfaces_beyond_beams(
-        parts[0],
-        solid_views,
-        pose_parts,
-        lidar_top_rad=lidar_top_rad,
-        max_added=max_gaussians - sum(map(len, parts)),
-    )
+    camera: Camera
+    """Camera at the image's size."""
+    rgb: np.ndarray
+    """The photo, uint8 [H, W, 3]."""
+    matte: SkyMatte
+    """Its sky."""
+    excluded: np.ndarray
+    """Pixels of the recording car and of moving objects, bool [H, W]."""
 
 
 def read_solid_view(view: View, tracks: Sequence[ObjectTrack]) -> SolidView | None:
