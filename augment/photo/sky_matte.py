@@ -1,12 +1,18 @@
 """Sky mattes of recorded images: the share of sky in each pixel, and colours without it.
 
-In: a recorded image and its camera. Out: a `SkyMatte`. A pixel at the edge of a roof, or of a wire,
-shows both: I = a S + (1 - a) F, with the sky's share a, the sky's colour S and the surface's colour
-F. A picture with another sky needs F, since I would keep a rim of the recorded sky.
+In: a recorded image and its camera, and LiDAR returns where there are any. Out: a `SkyMatte`.
+Trust, fits, pictures on photos and the sky of raw scenes use the same regions of sky.
+
+A pixel at the edge of a roof, or of a wire, shows both: I = a S + (1 - a) F, with the sky's share
+a, the sky's colour S and the surface's colour F. A picture with another sky needs F, since I keeps
+a rim of the recorded sky. `augment.photo.sky_regions` says where the sky surely is, and S is its
+local mean. With D = |I - S|, pure sky has D = 0, and pure surface beside it has the largest D
+around. So 1 - a = D / max D, and F = S + (I - S) / (1 - a).
 """
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,12 +23,36 @@ from jaxtyping import Bool, Float32, UInt8
 
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import memo_of
-from augment.photo.recorded_sky import elevation_rad, find_sky, recorded_sky
+from augment.photo.lidar_view import elevation_rad, find_returns, highest_channel_rad, sweep_of
+from augment.photo.sky_regions import EDGE, SKY, WORK_WIDTH, find_sky_regions, largest_channel
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import Scene
 
-# Columns of the image in which the sky is looked for, at most.
-WORK_WIDTH = 480
+# Difference from the sky's local mean that is noise, of 255.
+_NOISE_LEVELS = 10.0
+# The same in standard deviations of the sky around.
+_NOISE_DEVIATIONS = 2.0
+# Largest difference that is noise, of 255.
+_MAX_NOISE_LEVELS = 40.0
+# Share of the largest difference around up to which a pixel shows pure sky.
+_PURE_SHARE = 0.35
+# Distance over which an edge is blurred, and its neighbours are searched, pixels of 1920.
+_EDGE_PX = 3
+# Distance from pure sky up to which a pixel may show some of it, pixels of 1920.
+_MIXED_PX = 2
+# Difference of a dark thing beside which brighter pixels are overshoot of the camera's sharpening.
+_DARK_THING_LEVELS = 30
+# Width of thin things (wires, twigs) that are found by their darkness alone, pixels of 1920.
+_THIN_PX = 12
+# Darkness of thin things over their surroundings that is noise, of 255.
+_THIN_NOISE_LEVELS = 9
+# Darkness of a thin thing at its middle, at least, of 255.
+_MIN_THIN_LEVELS = 24
+# Radii of the windows over which the sky's colour is averaged, the narrowest that holds sky first,
+# pixels of half the working size.
+_SKY_WINDOWS_PX = (2, 8, 32)
+# Weight of each window over the one before.
+_WINDOW_WEIGHT = 1e-3
 
 
 class SkyMatte(NamedTuple):
@@ -32,9 +62,10 @@ class SkyMatte(NamedTuple):
     """Share of sky in each pixel: 0 for a surface, 1 for sky, between at soft edges."""
     surface_rgb: UInt8[np.ndarray, "H W 3"]
     """The image with the sky's colour taken out of mixed pixels; the image itself where
-    `sky_share` is 0. Pixels of sky have the colour of a surface beside them."""
+    `sky_share` is 0 or 1."""
     sky_rgb: UInt8[np.ndarray, "H W 3"]
-    """Colour of the sky at each pixel, or behind it; meaningless far from any sky."""
+    """Mean colour of the sky around each pixel, also behind surfaces; it means nothing far from any
+    sky. Black in an image without sky."""
 
 
 def sky_matte(
@@ -42,7 +73,7 @@ def sky_matte(
 ) -> SkyMatte | None:
     """Return the sky matte of the image that a camera recorded, at the camera's size.
 
-    The sky is looked for once for each recorded image, and kept in the scene's memo at WORK_WIDTH.
+    The regions of sky are found once for each recorded image, and kept in the scene's memo.
 
     Args:
         scene: the scene.
@@ -50,10 +81,13 @@ def sky_matte(
         rgb: the recorded image at the camera's size, if the caller has it; else it is read.
 
     Returns:
-        The matte; None where there is no image, or where it does not tell (at night).
+        The matte; None where there is no image that can be read, or where it is too dark to tell.
     """
-    frame = _recorded_frame(scene, camera)
+    frame = recorded_frame(scene, camera)
     if frame is None:
+        return None
+    regions = recorded_sky_regions(scene, frame, camera.name)
+    if regions is None:
         return None
     if rgb is None:
         try:
@@ -61,41 +95,57 @@ def sky_matte(
             rgb = read_scaled(path, frame.cameras[camera.name], camera)
         except ImageFault:
             return None
-    sky = recorded_sky(scene, frame, camera.name)
-    return None if sky is None else _refine(rgb, sky.is_sky)
+    return _refine(rgb, regions)
 
 
 def find_sky_matte(
     rgb: UInt8[np.ndarray, "H W 3"],
     camera: Camera,
     has_return: Bool[np.ndarray, "h w"] | None = None,
-    lidar_top_rad: float = float("inf"),
+    lidar_top_rad: float = math.inf,
 ) -> SkyMatte | None:
-    """Return the sky matte of an image; None where the image does not tell, as at night.
+    """Return the sky matte of an image; None where it is too dark to tell.
 
     Args:
         rgb: the image.
         camera: its camera, at the image's size.
-        has_return: pixels with a LiDAR return, at the image's size or smaller; None without LiDAR.
-        lidar_top_rad: elevation at which the LiDAR's view ends, as the camera sees it.
+        has_return: pixels with a LiDAR return, at the image's size or another; None without LiDAR.
+        lidar_top_rad: elevation of the LiDAR's highest channel, as the camera sees it.
     """
-    small = camera.scaled(min(1.0, 256 / camera.width))
-    size = small.width, small.height
-    hits = None
-    if has_return is not None:
-        factor = has_return.shape[1] / small.width, has_return.shape[0] / small.height
-        rows, columns = np.nonzero(has_return)
-        hits = np.zeros((small.height, small.width), bool)
-        hits[
-            np.minimum((rows / factor[1]).astype(int), small.height - 1),
-            np.minimum((columns / factor[0]).astype(int), small.width - 1),
-        ] = True
-    small_rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    sky = find_sky(small_rgb, elevation_rad(small), hits, lidar_top_rad)
-    return None if sky is None else _refine(rgb, sky.is_sky)
+    regions = find_regions(rgb, camera, has_return, lidar_top_rad)
+    return None if regions is None else _refine(rgb, regions)
 
 
-def _recorded_frame(scene: Scene, camera: Camera) -> Frame | None:
+def find_regions(
+    rgb: UInt8[np.ndarray, "H W 3"],
+    camera: Camera,
+    has_return: Bool[np.ndarray, "h w"] | None = None,
+    lidar_top_rad: float = math.inf,
+) -> UInt8[np.ndarray, "m n"] | None:
+    """Return the kinds of an image's pixels as `find_sky_regions`, at most WORK_WIDTH wide.
+
+    The arguments are those of `find_sky_matte`.
+    """
+    small = camera.scaled(min(1.0, WORK_WIDTH / camera.width))
+    if (small.height, small.width) != rgb.shape[:2]:
+        rgb = cv2.resize(rgb, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    if has_return is not None and has_return.shape != rgb.shape[:2]:
+        has_return = _resize_returns(has_return, small.height, small.width)
+    return find_sky_regions(rgb, elevation_rad(small), has_return, lidar_top_rad)
+
+
+def _resize_returns(has_return: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return a mask of returns at another size, without losing one."""
+    rows, columns = np.nonzero(has_return)
+    out = np.zeros((height, width), np.bool_)
+    out[rows * height // has_return.shape[0], columns * width // has_return.shape[1]] = True
+    return out
+
+
+# ---- The recorded images of a scene --------------------------------------------------------------
+
+
+def recorded_frame(scene: Scene, camera: Camera) -> Frame | None:
     """Return the frame in which a camera recorded an image at this time and pose; None without."""
 
     def index() -> dict[tuple[str, int], Frame]:
@@ -115,31 +165,176 @@ def _recorded_frame(scene: Scene, camera: Camera) -> Frame | None:
     return frame if is_same else None
 
 
-def _refine(rgb: np.ndarray, is_sky: np.ndarray) -> SkyMatte:
-    """Return the matte of an image from a small mask of its sky."""
+def recorded_sky_regions(scene: Scene, frame: Frame, name: str) -> UInt8[np.ndarray, "m n"] | None:
+    """Return the kinds of the pixels of a camera's recorded image, as `find_sky_regions`.
+
+    None where there is no image that can be read, or where it is too dark to tell.
+
+    Args:
+        scene: the scene.
+        frame: one of its frames.
+        name: name of the camera.
+    """
+    key = "sky regions", frame.index, name
+    return memo_of(scene).get(key, lambda: (_find_recorded_regions(scene, frame, name),))[0]
+
+
+def _find_recorded_regions(scene: Scene, frame: Frame, name: str) -> np.ndarray | None:
+    """Return the regions of a frame's image, as `recorded_sky_regions`."""
+    path = frame.image_paths.get(name)
+    if path is None:
+        return None
+    full_camera = frame.cameras[name]
+    camera = full_camera.scaled(min(1.0, WORK_WIDTH / full_camera.width))
+    try:
+        rgb = read_scaled(Path(path), full_camera, camera)
+    except ImageFault:
+        return None
+    points = sweep_of(scene, frame.index)
+    if points is None:
+        return find_regions(rgb, camera)
+    top_rad = highest_channel_rad(scene, points, camera)
+    return find_regions(rgb, camera, find_returns(points, camera), top_rad)
+
+
+# ---- From regions to shares ----------------------------------------------------------------------
+
+
+def _refine(rgb: np.ndarray, kinds: np.ndarray) -> SkyMatte:
+    """Return the matte of an image from the kinds of pixels of a smaller one."""
     height, width = rgb.shape[:2]
-    share = cv2.resize(is_sky.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-    radius = max(2, round(0.006 * width))
-    share = cv2.ximgproc.guidedFilter(rgb, share, radius, 8.0**2)
-    share = np.clip((share - 0.1) / 0.8, 0, 1).astype(np.float32)
-    sky_rgb = _spread(rgb, share >= 1)
-    surface_rgb = _spread(rgb, share <= 0)
-    surface_rgb = np.where((share > 0)[..., None], surface_rgb, rgb)
+    share = np.zeros((height, width), np.float32)
+    sky_rgb = np.zeros_like(rgb)
+    surface_rgb = rgb.copy()
+    is_sky_row = (kinds == SKY).any(axis=1)
+    if not is_sky_row.any():
+        return SkyMatte(share, surface_rgb, sky_rgb)
+    last = min(len(kinds), int(np.flatnonzero((kinds != 0).any(axis=1))[-1]) + 2)
+    rows = min(height, -(-last * height // len(kinds)))
+    kinds = kinds[:last]
+    size = width, rows
+    full_kinds = cv2.resize(kinds, size, interpolation=cv2.INTER_NEAREST)
+    sky, noise = _sky_color(rgb[:rows], kinds)
+    sky_rgb[:rows] = cv2.resize(sky, size, interpolation=cv2.INTER_LINEAR)
+    noise = cv2.resize(noise, size, interpolation=cv2.INTER_LINEAR)
+    _share_of_sky(rgb[:rows], full_kinds, sky_rgb[:rows], noise, share[:rows], surface_rgb[:rows])
     return SkyMatte(share, surface_rgb, sky_rgb)
 
 
-def _spread(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the mean colour of the pixels of a mask near each pixel."""
-    weight = mask.astype(np.float32)[..., None]
-    factor = max(1, rgb.shape[1] // WORK_WIDTH)
-    size = -(-rgb.shape[1] // factor), -(-rgb.shape[0] // factor)
-    sums = cv2.resize(np.concatenate([rgb * weight, weight], 2), size, interpolation=cv2.INTER_AREA)
-    out = np.zeros_like(sums[..., :3])
-    missing = np.ones(out.shape[:2], np.float32)
-    for side in (5, 21, 81, 321):
-        blurred = cv2.blur(sums, (side, side))
-        part = np.clip(blurred[..., 3] * side, 0, 1) * missing
-        out += part[..., None] * blurred[..., :3] / np.maximum(blurred[..., 3:], 1e-6)
-        missing -= part
-    full = cv2.resize(out, rgb.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    return np.clip(full + 0.5, 0, 255).astype(np.uint8)
+def _sky_color(rgb: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sky's mean colour around each pixel, and the difference from it that is noise.
+
+    Args:
+        rgb: rows of the image.
+        kinds: kinds of their pixels, in a smaller image.
+
+    Returns:
+        Colours, uint8 [h, w, 3], and differences, uint8 [h, w], at half the size of `kinds`.
+    """
+    size = max(1, kinds.shape[1] // 2), max(1, kinds.shape[0] // 2)
+    sure = cv2.erode((kinds == SKY).astype(np.uint8), np.ones((3, 3), np.uint8))
+    if not sure.any():
+        sure = (kinds == SKY).astype(np.uint8)
+    weight = cv2.resize(sure * 255, size, interpolation=cv2.INTER_AREA)
+    weight = (weight == 255 if (weight == 255).any() else weight > 0).astype(np.float32)
+    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    luma = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    values = np.dstack([small.astype(np.float32), luma * luma, np.ones_like(luma)])
+    values *= weight[..., None]
+    sums = values.mean(axis=(0, 1)) * _WINDOW_WEIGHT ** len(_SKY_WINDOWS_PX)
+    for number, radius in enumerate(_SKY_WINDOWS_PX):
+        side = 2 * radius + 1
+        window = cv2.blur(values, (side, side), borderType=cv2.BORDER_REPLICATE)
+        sums = sums + window * np.float32(_WINDOW_WEIGHT**number)
+    means = sums[..., :4] / np.maximum(sums[..., 4:], 1e-20)
+    mean_luma = means[..., :3] @ np.float32([0.299, 0.587, 0.114])
+    deviation = np.sqrt(np.maximum(means[..., 3] - mean_luma * mean_luma, 0))
+    noise = np.clip(_NOISE_DEVIATIONS * deviation, _NOISE_LEVELS, _MAX_NOISE_LEVELS)
+    return np.rint(means[..., :3]).astype(np.uint8), np.rint(noise).astype(np.uint8)
+
+
+def _share_of_sky(
+    rgb: np.ndarray,
+    kinds: np.ndarray,
+    sky_rgb: np.ndarray,
+    noise: np.ndarray,
+    share: np.ndarray,
+    surface_rgb: np.ndarray,
+) -> None:
+    """Write the sky's share and the surfaces' colours of some rows of an image.
+
+    Args:
+        rgb: the image's colours, uint8 [h, w, 3].
+        kinds: kinds of the pixels.
+        sky_rgb: the sky's colour at each pixel.
+        noise: difference from it that is noise, uint8 [h, w].
+        share: the sky's share, which is written.
+        surface_rgb: colours of the image, which are replaced in mixed pixels.
+    """
+    scale = _width_share(rgb)
+    smooth = cv2.GaussianBlur(rgb, (3, 3), 0) if scale > 0.4 else rgb
+    window = np.ones((2 * max(1, round(_EDGE_PX * scale)) + 1,) * 2, np.uint8)
+    can_be_sky = cv2.compare(kinds, 0, cv2.CMP_GT)
+    is_sure = cv2.compare(kinds, EDGE, cv2.CMP_GT)
+    # Difference from the sky. Beside dark things, brighter pixels are overshoot of sharpening.
+    darker = largest_channel(cv2.subtract(sky_rgb, smooth))
+    difference = cv2.max(darker, largest_channel(cv2.subtract(smooth, sky_rgb)))
+    is_brighter = cv2.compare(darker, 4, cv2.CMP_LT)
+    is_beside_dark = cv2.compare(cv2.dilate(darker, window), _DARK_THING_LEVELS, cv2.CMP_GT)
+    is_plain = cv2.bitwise_not(cv2.bitwise_and(is_brighter, is_beside_dark))
+    difference = cv2.bitwise_and(cv2.bitwise_and(difference, is_plain), can_be_sky)
+    largest = cv2.dilate(difference, window)
+    # Pure sky, and the pixels beside it that may be mixed.
+    pure_levels = cv2.max(cv2.convertScaleAbs(largest, alpha=_PURE_SHARE), noise)
+    is_pure = cv2.bitwise_and(cv2.compare(difference, pure_levels, cv2.CMP_LE), can_be_sky)
+    is_pure = cv2.bitwise_or(is_pure, is_sure)
+    reach = 2 * max(1, round(_MIXED_PX * scale)) + 1
+    is_mixed = cv2.bitwise_and(cv2.dilate(is_pure, np.ones((reach, reach), np.uint8)), can_be_sky)
+    is_mixed = cv2.bitwise_and(is_mixed, cv2.bitwise_not(is_sure))
+    share[is_sure > 0] = 1
+    rows, columns = np.nonzero(is_mixed)
+    floor = noise[rows, columns].astype(np.float32)
+    span = np.maximum(largest[rows, columns] - floor, 8)
+    solid = np.clip((difference[rows, columns] - floor) / span, 0, 1)
+    share[rows, columns] = 1 - solid
+    _remove_thin_things(smooth, cv2.bitwise_or(is_sure, is_mixed), share)
+    _unmix(rgb, sky_rgb, share, surface_rgb)
+
+
+def _remove_thin_things(smooth: np.ndarray, is_searched: np.ndarray, share: np.ndarray) -> None:
+    """Lower the sky's share where something dark and thin stands before it.
+
+    Args:
+        smooth: the image's colours.
+        is_searched: pixels that are looked at, uint8, 0 or 255.
+        share: the sky's share, which is written.
+    """
+    luma = cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY)
+    side = 2 * max(1, round(_THIN_PX * _width_share(luma) / 2)) + 1
+    darkness = cv2.morphologyEx(luma, cv2.MORPH_BLACKHAT, np.ones((side, side), np.uint8))
+    darkness = cv2.bitwise_and(darkness, is_searched)
+    darkest = cv2.dilate(darkness, np.ones((5, 5), np.uint8))
+    is_thin = cv2.bitwise_and(
+        cv2.compare(darkest, _MIN_THIN_LEVELS, cv2.CMP_GT),
+        cv2.compare(darkness, _THIN_NOISE_LEVELS, cv2.CMP_GT),
+    )
+    rows, columns = np.nonzero(is_thin)
+    over_noise = darkness[rows, columns] - np.float32(_THIN_NOISE_LEVELS)
+    solid = over_noise / (darkest[rows, columns] - np.float32(_THIN_NOISE_LEVELS))
+    share[rows, columns] = np.minimum(share[rows, columns], 1 - solid)
+
+
+def _width_share(image: np.ndarray) -> float:
+    """Return the width of an image over 1920 pixels."""
+    return image.shape[1] / 1920
+
+
+def _unmix(
+    rgb: np.ndarray, sky_rgb: np.ndarray, share: np.ndarray, surface_rgb: np.ndarray
+) -> None:
+    """Write the surfaces' colours of mixed pixels: F = S + (I - S) / (1 - a)."""
+    rows, columns = np.nonzero((share > 0.02) & (share < 0.98))
+    sky = sky_rgb[rows, columns].astype(np.float32)
+    solid = 1 - share[rows, columns][:, None]
+    color = sky + (rgb[rows, columns] - sky) / np.maximum(solid, 0.1)
+    surface_rgb[rows, columns] = np.clip(np.rint(color), 0, 255).astype(np.uint8)
