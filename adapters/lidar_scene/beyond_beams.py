@@ -22,7 +22,7 @@ import torch
 from adapters.lidar_scene.closing import spread_views
 from adapters.lidar_scene.dense_depth import FAR_M, DenseDepth, KnownSurface, complete_depth
 from adapters.lidar_scene.image_views import View
-from adapters.lidar_scene.sky_conflicts import measure_conflicts, without_sky_splats
+from adapters.lidar_scene.sky_conflicts import measure_agreement, without_sky_splats
 from adapters.lidar_scene.solid_views import SolidView, read_solid_view
 from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
@@ -42,7 +42,7 @@ _FINER = 2  # scale at which the Gaussians so far are drawn: leaks between splat
 _OPEN_ALPHA = 0.97  # mean alpha of the Gaussians so far around a pixel below which it is open
 _OPEN_WINDOW_PX = 5  # side of the square over which that mean is taken
 _SOLID_PART = 0.8  # part of that square with a surface above which it is no sky, whatever it shows
-_SOLID_SHARE = 0.5  # share of sky below which a pixel shows a surface
+_SOLID_SHARE = 0.4  # share of sky below which a pixel shows a surface
 _BEHIND = 0.002  # gap from a surface that leaks to the disc behind it, as a part of the depth
 _BEHIND_M = 0.02  # constant part of that gap, metres
 _SIDES_PX = (16, 8, 4, 2, 1)  # sides of discs, pixels
@@ -77,10 +77,11 @@ def close_above_beams(
         lidar_top_rad: highest elevation that the LiDAR measures.
         max_gaussians: largest number for all parts.
     """
+    points = parts[0].means.numpy()
     solid_views = [
         solid_view
         for view in spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART)
-        if (solid_view := read_solid_view(view, tracks)) is not None
+        if (solid_view := read_solid_view(view, tracks, points, lidar_top_rad)) is not None
     ]
 
     def pose_parts(background: Gaussians, camera: Camera) -> list[PosedGaussians]:
@@ -117,7 +118,12 @@ def add_surfaces_beyond_beams(
         lidar_top_rad: highest elevation that the LiDAR looks at.
         max_added: largest number of discs.
     """
-    background, views = without_sky_splats(background, list(views))
+    views = list(views)
+    background = without_sky_splats(background, views)
+    views = [
+        view._replace(known_m=_draw(background, view.camera, pose_parts)[1].depth_m)
+        for view in views
+    ]
     walls = find_wall_planes(background)
     count = len(background)
     for number, view in enumerate(views):
@@ -277,20 +283,26 @@ def _discs(
     wall = depth.wall[middle_rows, middle_columns]
     centre = camera.centre.numpy()
     level = np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
+    colors, share = _colors_of_cells(view, cells)
+    lab = view.lab[middle_rows, middle_columns]
+    agreement = measure_agreement(centre + depth_m[:, None] * rays, lab, others)
+    conflicts = agreement.conflicts
+    doubt = agreement.doubt()
     is_known = leaks[middle_rows, middle_columns]
-    conflicts = np.where(is_known, 0, measure_conflicts(centre + depth_m[:, None] * rays, others))
-    goes_far = np.flatnonzero(conflicts > 0)
-    far_m = FAR_M / level[goes_far]
-    far_conflicts = measure_conflicts(centre + far_m[:, None] * rays[goes_far], others)
-    better = far_conflicts < conflicts[goes_far]
-    depth_m[goes_far[better]] = far_m[better]
-    wall[goes_far[better]] = -1
-    conflicts[goes_far[better]] = far_conflicts[better]
+    conflicts[is_known] = doubt[is_known] = 0
+    unlikely = np.flatnonzero(doubt > 0)
+    far_m = FAR_M / level[unlikely]
+    far_points = centre + far_m[:, None] * rays[unlikely]
+    far_agreement = measure_agreement(far_points, lab[unlikely], others)
+    better = far_agreement.doubt() < doubt[unlikely]
+    goes_far = unlikely[better]
+    depth_m[goes_far] = far_m[better]
+    wall[goes_far] = -1
+    conflicts[goes_far] = far_agreement.conflicts[better]
     keep = conflicts <= _MAX_CONFLICTS
     surfels = _oriented_surfels(
         centre + (depth_m[:, None] * rays), rays, depth_m * cells.sides / camera.fx, wall, walls
     )
-    colors, share = _colors_of_cells(view, cells)
     semantic = depth.semantic[middle_rows, middle_columns]
     index = np.flatnonzero(keep)
     discs = gaussians_from_surfels(surfels.select(index), colors[index], semantic[index], _SHAPE)
