@@ -2,13 +2,11 @@
 
 `draw_depth` draws surfels into a z-buffer, `observe` stores the colours in which images show them,
 `blended_colours` combines the stored colours of each surfel. `SkyGatherer` makes a cube map from
-the pixels that no surface covers. The caller is `adapters.lidar_scene.image_views`.
+the pixels that show sky. The caller is `adapters.lidar_scene.image_views`.
 
-Every uncovered pixel is taken as infinitely far. This is true of clouds and, nearly, of distant
-towers. A wall above the LiDAR's field of view is near: it appears in the right direction, but
-drifts against the scene as the camera moves. Where one image surely shows sky in a direction,
-images that may show a wall there hardly count. Directions that no image shows are filled smoothly
-from the sky around them.
+`augment.photo.sky_regions` says which pixels of an image show sky. Other pixels that no surfel
+covers, as those of walls above the LiDAR's field of view, hardly count where another image shows
+sky in the same direction. Directions that no image shows are filled smoothly from the sky.
 
 Symbols: u, v are pixel coordinates; x, y, z are metres in the camera's frame; fx, fy, cx, cy are
 the pinhole intrinsics in pixels.
@@ -25,13 +23,15 @@ import numpy as np
 import torch
 
 from augment.jobs.processes import available_cores
+from augment.photo.sky_matte import find_regions
+from augment.photo.sky_regions import SOFT_EDGE
 from augment.render.cpu.jit import cached_njit
 from augment.scene.cameras import Camera
 from augment.scene.sky import CubemapSky, directions_of_cubemap
 
 # Images fade out over this fraction of their width, so that different exposures blend softly.
 _FEATHER_WIDTH = 0.12
-# Weight of pixels that may show a wall above the LiDAR's view instead of sky.
+# Weight of uncovered pixels that show no sky.
 _UNCERTAIN_WEIGHT = 0.02
 # Margin below the LiDAR's highest channel: the camera and the LiDAR stand at different places.
 _TOP_MARGIN_RAD = math.radians(4.0)
@@ -78,7 +78,7 @@ class SkyGatherer:
             lidar_top_rad: highest elevation that the LiDAR measures.
         """
         self._size = size
-        self._max_top_rise = math.sin(lidar_top_rad - _TOP_MARGIN_RAD)
+        self._lidar_top_rad = lidar_top_rad
         self._directions = directions_of_cubemap(size).reshape(-1, 3).numpy()
         self._sums = np.zeros((len(self._directions), 3), np.float32)
         self._weights = np.zeros(len(self._directions), np.float32)
@@ -107,7 +107,9 @@ class SkyGatherer:
         num_rows, num_columns = level_sizes[level]
         rotation = camera.camera_from_world[:3, :3].numpy().astype(np.float32)
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-        is_sky_column = self._find_sky_columns(camera, is_free)
+        sharpest = levels[0, : level_sizes[0, 0], : level_sizes[0, 1]]
+        is_sky = self._find_sky(camera, is_free, sharpest)
+        is_free = is_free | is_sky
         image = levels[level, :num_rows, :num_columns]
 
         def gather_rows(rows: slice) -> None:
@@ -116,7 +118,7 @@ class SkyGatherer:
                 rotation,
                 lens,
                 is_free,
-                is_sky_column,
+                is_sky,
                 image,
                 np.float32(_FEATHER_WIDTH),
                 np.float32(_UNCERTAIN_WEIGHT),
@@ -127,17 +129,21 @@ class SkyGatherer:
 
         list(pool.map(gather_rows, row_slices(len(self._directions))))
 
-    def _find_sky_columns(self, camera: Camera, is_free: np.ndarray) -> np.ndarray:
-        """Return the image columns whose free top surely is sky, bool [w].
+    def _find_sky(self, camera: Camera, is_free: np.ndarray, image: np.ndarray) -> np.ndarray:
+        """Return the pixels that show sky, bool [h, w] at the camera's size.
 
-        What is drawn in such a column ends below the LiDAR's highest channel. This channel
-        therefore looked over it and met nothing.
+        In an image that is too dark to tell, they are the free tops of the columns whose surfaces
+        end below the LiDAR's highest channel: it looked over them and met nothing.
         """
+        kinds = find_regions(image, camera, ~is_free, self._lidar_top_rad)
+        if kinds is not None:
+            return kinds >= SOFT_EDGE
         rays = camera.ray_directions().numpy()
         rise = rays[..., 2] / np.linalg.norm(rays, axis=2)
         is_covered = ~is_free
         top = np.where(is_covered.any(axis=0), is_covered.argmax(axis=0), len(is_free) - 1)
-        return rise[top, np.arange(is_free.shape[1])] < self._max_top_rise
+        max_top_rise = math.sin(self._lidar_top_rad - _TOP_MARGIN_RAD)
+        return is_free & (rise[top, np.arange(is_free.shape[1])] < max_top_rise)
 
     def finish(self) -> CubemapSky:
         """Return the mean colour of every direction; directions that no image shows are filled."""
@@ -212,7 +218,7 @@ def _gather(
     rotation,
     intrinsics,
     is_free,
-    is_sky_column,
+    is_sky,
     image,
     feather_width,
     uncertain_weight,
@@ -220,7 +226,7 @@ def _gather(
     weights,
     has_certain_sky,
 ):  # pragma: no cover - compiled
-    """Add one image's bilinear colours to the sums of the directions that it shows as free.
+    """Add one image's bilinear colours to the sums of the directions that it shows as free or sky.
 
     `sums`, `weights` and `has_certain_sky` are updated in place.
     """
@@ -241,7 +247,7 @@ def _gather(
             continue
         border = min(min(u, width - u) / width, min(v, height - v) / height)
         weight = min(border / feather_width, np.float32(1)) + np.float32(1e-3)
-        if is_sky_column[int(u)]:
+        if is_sky[int(v), int(u)]:
             has_certain_sky[i] = True
         else:
             weight *= uncertain_weight

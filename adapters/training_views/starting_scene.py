@@ -26,8 +26,8 @@ import torch
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
 from adapters.training_views.views import RecordedViews
 from adapters.world import join_gaussians
+from augment.photo.lidar_view import TOP_MARGIN_RAD
 from augment.photo.own_car import spread_evenly
-from augment.photo.recorded_sky import TOP_MARGIN_RAD
 from augment.reconstruct.view import ViewSource
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
 from augment.render.constants import SURFACE_ALPHA

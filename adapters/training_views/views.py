@@ -18,8 +18,9 @@ from adapters.training_views.masks import read_ego_mask
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import SceneMemo
+from augment.photo.lidar_view import lidar_top_rad
 from augment.photo.own_car import find_own_car_mask, moving_frames
-from augment.photo.recorded_sky import lidar_top_rad, sky_mask
+from augment.photo.sky_matte import sky_matte
 from augment.reconstruct.view import RecordedView, ViewKey
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
@@ -29,6 +30,7 @@ _EVERY = re.compile(r"every-(\d{1,6})(?:st|nd|rd|th)")
 CACHE_BYTES = 1 << 30
 _MAX_POSITION_M = 1e6  # float32 has a resolution of 6 cm there
 _SIZE_SHARE = 0.05  # by which the sides of one camera's images may differ
+_SKY_SHARE = 0.9  # share of sky from which a pixel is trained to be empty
 _TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
 
 
@@ -167,8 +169,8 @@ class RecordedViews:
     def _sky(self, key: ViewKey, camera: Camera, rgb: np.ndarray) -> np.ndarray:
         size = (camera.height, camera.width)
         if key not in self._skies:
-            returns = self._depth.lidar(key).pixels
-            mask = sky_mask(self._scene, camera, rgb, returns, self.lidar_top_rad)
+            matte = None if self.lidar_top_rad is None else sky_matte(self._scene, camera, rgb)
+            mask = np.zeros(size, np.bool_) if matte is None else matte.sky_share > _SKY_SHARE
             ego = self._ego(camera)
             self._skies[key] = np.packbits(mask if ego is None else mask & ~ego)
         bits = np.unpackbits(self._skies[key], count=camera.height * camera.width)

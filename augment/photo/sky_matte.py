@@ -21,13 +21,16 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, UInt8
 
-from augment.files.recorded_images import ImageFault, read_scaled
+from augment.files.image_size import read_image_header
+from augment.files.recorded_images import ImageFault, decode_image, read_scaled
 from augment.memo import memo_of
 from augment.photo.lidar_view import elevation_rad, find_returns, highest_channel_rad, sweep_of
 from augment.photo.sky_regions import EDGE, SKY, WORK_WIDTH, find_sky_regions, largest_channel
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import Scene
 
+# Difference of an image's proportions from the camera's beyond which it is another camera's.
+_MAX_SQUEEZE = 0.05
 # Difference from the sky's local mean that is noise, of 255.
 _NOISE_LEVELS = 10.0
 # The same in standard deviations of the sky around.
@@ -151,7 +154,7 @@ def recorded_frame(scene: Scene, camera: Camera) -> Frame | None:
     def index() -> dict[tuple[str, int], Frame]:
         return {
             (name, frame.cameras[name].timestamp_ns): frame
-            for frame in scene.frames
+            for frame in (*(scene.seen_frames or ()), *scene.frames)
             for name in frame.image_paths
             if name in frame.cameras
         }
@@ -185,16 +188,31 @@ def _find_recorded_regions(scene: Scene, frame: Frame, name: str) -> np.ndarray 
     if path is None:
         return None
     full_camera = frame.cameras[name]
-    camera = full_camera.scaled(min(1.0, WORK_WIDTH / full_camera.width))
-    try:
-        rgb = read_scaled(Path(path), full_camera, camera)
-    except ImageFault:
+    header = read_image_header(Path(path))
+    width = min(WORK_WIDTH, full_camera.width, WORK_WIDTH if header is None else header.size[0])
+    camera = full_camera.scaled(width / full_camera.width)
+    rgb = read_small_image(Path(path), camera)
+    if rgb is None:
         return None
     points = sweep_of(scene, frame.index)
     if points is None:
         return find_regions(rgb, camera)
     top_rad = highest_channel_rad(scene, points, camera)
     return find_regions(rgb, camera, find_returns(points, camera), top_rad)
+
+
+def read_small_image(path: Path, camera: Camera) -> np.ndarray | None:
+    """Return an image at the camera's size, RGB; None for what is no image of its proportions."""
+    header = read_image_header(path)
+    is_large = header is not None and header.size[0] >= 2 * camera.width
+    image = decode_image(path, cv2.IMREAD_REDUCED_COLOR_2 if is_large else cv2.IMREAD_COLOR)
+    if image is None:
+        return None
+    height, width = image.shape[:2]
+    if abs(width * camera.height / (height * camera.width) - 1) > _MAX_SQUEEZE:
+        return None
+    small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(small, cv2.COLOR_BGR2RGB)
 
 
 # ---- From regions to shares ----------------------------------------------------------------------
@@ -247,7 +265,7 @@ def _sky_color(rgb: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarr
         window = cv2.blur(values, (side, side), borderType=cv2.BORDER_REPLICATE)
         sums = sums + window * np.float32(_WINDOW_WEIGHT**number)
     means = sums[..., :4] / np.maximum(sums[..., 4:], 1e-20)
-    mean_luma = means[..., :3] @ np.float32([0.299, 0.587, 0.114])
+    mean_luma = means[..., :3] @ np.array([0.299, 0.587, 0.114], np.float32)
     deviation = np.sqrt(np.maximum(means[..., 3] - mean_luma * mean_luma, 0))
     noise = np.clip(_NOISE_DEVIATIONS * deviation, _NOISE_LEVELS, _MAX_NOISE_LEVELS)
     return np.rint(means[..., :3]).astype(np.uint8), np.rint(noise).astype(np.uint8)
@@ -274,14 +292,14 @@ def _share_of_sky(
     scale = _width_share(rgb)
     smooth = cv2.GaussianBlur(rgb, (3, 3), 0) if scale > 0.4 else rgb
     window = np.ones((2 * max(1, round(_EDGE_PX * scale)) + 1,) * 2, np.uint8)
-    can_be_sky = cv2.compare(kinds, 0, cv2.CMP_GT)
-    is_sure = cv2.compare(kinds, EDGE, cv2.CMP_GT)
+    can_be_sky = _above(kinds, 0)
+    is_sure = _above(kinds, EDGE)
     # Difference from the sky. Beside dark things, brighter pixels are overshoot of sharpening.
     darker = largest_channel(cv2.subtract(sky_rgb, smooth))
     difference = cv2.max(darker, largest_channel(cv2.subtract(smooth, sky_rgb)))
-    is_brighter = cv2.compare(darker, 4, cv2.CMP_LT)
-    is_beside_dark = cv2.compare(cv2.dilate(darker, window), _DARK_THING_LEVELS, cv2.CMP_GT)
-    is_plain = cv2.bitwise_not(cv2.bitwise_and(is_brighter, is_beside_dark))
+    is_darker = _above(darker, 3)
+    is_beside_dark = _above(cv2.dilate(darker, window), _DARK_THING_LEVELS)
+    is_plain = cv2.bitwise_or(is_darker, cv2.bitwise_not(is_beside_dark))
     difference = cv2.bitwise_and(cv2.bitwise_and(difference, is_plain), can_be_sky)
     largest = cv2.dilate(difference, window)
     # Pure sky, and the pixels beside it that may be mixed.
@@ -315,13 +333,17 @@ def _remove_thin_things(smooth: np.ndarray, is_searched: np.ndarray, share: np.n
     darkness = cv2.bitwise_and(darkness, is_searched)
     darkest = cv2.dilate(darkness, np.ones((5, 5), np.uint8))
     is_thin = cv2.bitwise_and(
-        cv2.compare(darkest, _MIN_THIN_LEVELS, cv2.CMP_GT),
-        cv2.compare(darkness, _THIN_NOISE_LEVELS, cv2.CMP_GT),
+        _above(darkest, _MIN_THIN_LEVELS), _above(darkness, _THIN_NOISE_LEVELS)
     )
     rows, columns = np.nonzero(is_thin)
     over_noise = darkness[rows, columns] - np.float32(_THIN_NOISE_LEVELS)
     solid = over_noise / (darkest[rows, columns] - np.float32(_THIN_NOISE_LEVELS))
     share[rows, columns] = np.minimum(share[rows, columns], 1 - solid)
+
+
+def _above(image: np.ndarray, level: int) -> np.ndarray:
+    """Return 255 where an image of bytes is above a level, else 0."""
+    return cv2.threshold(image, level, 255, cv2.THRESH_BINARY)[1]
 
 
 def _width_share(image: np.ndarray) -> float:

@@ -238,7 +238,7 @@ def _find_main_regions(regions: _Regions, num_pixels: int, has_lidar: bool) -> n
 
 def _color_scores(pixels: _Pixels, regions: _Regions, main: np.ndarray) -> np.ndarray:
     """Return the mean logarithm of each region's colour shares in the sky over surfaces', [R]."""
-    levels = (cv2.GaussianBlur(pixels.rgb, (5, 5), 0) >> 3).astype(np.int32)
+    levels = np.asarray(cv2.GaussianBlur(pixels.rgb, (5, 5), 0), np.int32) // 8
     colors = ((levels[..., 0] << 10) | (levels[..., 1] << 5) | levels[..., 2]).ravel()
     is_main = main[regions.labels]
     is_surface = ~is_main

@@ -33,13 +33,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from augment.memo import memo_of
-from augment.photo.recorded_sky import (
-    WORK_WIDTH,
-    RecordedSky,
-    elevation_rad,
-    read_small_image,
-    recorded_sky,
-)
+from augment.photo.lidar_view import elevation_rad
+from augment.photo.sky_matte import read_small_image, recorded_frame, recorded_sky_regions
+from augment.photo.sky_regions import SOFT_EDGE, SURFACE, WORK_WIDTH
 from augment.render.buffers import ALPHA, AUTO, MEDIAN_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
@@ -75,6 +71,8 @@ MAX_DISTANCE_M = 2.0
 # 60 degrees wide looks past what it saw.
 MAX_ANGLE_RAD = math.radians(15)
 
+# Columns of the views that are judged.
+_JUDGED_WIDTH = 256
 # Columns of the points that are looked for in the views of the scene.
 _GRID_WIDTH = 320
 # Columns of these views' depths.
@@ -298,6 +296,15 @@ def _fit_record(made_by: Mapping[str, Any], frames: Sequence[Frame]) -> FitRecor
 # ---- One view, pixel by pixel --------------------------------------------------------------------
 
 
+class _RecordedSky(NamedTuple):
+    """Sky of one image. Pixels in neither mask are at edges."""
+
+    is_sky: Bool[np.ndarray, "H W"]
+    """Pixels that surely show sky."""
+    is_solid: Bool[np.ndarray, "H W"]
+    """Pixels that surely show no sky."""
+
+
 class _ClearView(NamedTuple):
     """A view of the scene without weather."""
 
@@ -311,7 +318,7 @@ class _ClearView(NamedTuple):
     """Pixels that show the recording car."""
     elevation_rad: Float[np.ndarray, "H W"]
     """Elevation of the rays."""
-    sky: RecordedSky | None
+    sky: _RecordedSky | None
     """Sky of the recorded image; None where that is unknown."""
     rgb: Float[np.ndarray, "H W 3"] | None
     """Colours of the surfaces, 0 to 1, the scene's; None where nobody asks."""
@@ -389,20 +396,17 @@ def _unweight_colors(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return rgb / np.maximum(alpha, SURFACE_ALPHA)[..., None]
 
 
-def _find_recorded_sky(scene: Scene, camera: Camera) -> RecordedSky | None:
+def _find_recorded_sky(scene: Scene, camera: Camera) -> _RecordedSky | None:
     """Return the sky of the image that was recorded at the camera's place and time."""
-    for frame in _made_from(scene):
-        recorded_camera = frame.cameras.get(camera.name)
-        if (
-            recorded_camera is not None
-            and recorded_camera.timestamp_ns == camera.timestamp_ns
-            and _same_pose(recorded_camera, camera)
-        ):
-            sky = recorded_sky(scene, frame, camera.name)
-            if sky is None:
-                return None
-            return RecordedSky(*(_enlarge(mask, camera) for mask in sky))
-    return None
+    frame = recorded_frame(scene, camera)
+    if frame is None or all(frame.index != f.index for f in _made_from(scene)):
+        return None
+    kinds = recorded_sky_regions(scene, frame, camera.name)
+    if kinds is None:
+        return None
+    return _RecordedSky(
+        is_sky=_enlarge(kinds >= SOFT_EDGE, camera), is_solid=_enlarge(kinds == SURFACE, camera)
+    )
 
 
 def _enlarge(mask: np.ndarray, camera: Camera) -> np.ndarray:
@@ -911,7 +915,7 @@ def _judge_camera(
 
 def _shrink_camera(camera: Camera) -> Camera:
     """Return the camera at the size at which views are judged."""
-    return camera.scaled(min(1.0, WORK_WIDTH / camera.width))
+    return camera.scaled(min(1.0, _JUDGED_WIDTH / camera.width))
 
 
 def _is_away(nearest: NearestView) -> bool:

@@ -1,4 +1,4 @@
-"""Which pixels show sky, and which the recording car itself."""
+"""Pixels of the recording car, and how high the LiDAR looks."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import torch
 from adapters.training_views.masks import read_ego_mask
 from adapters.training_views.views import RecordedViews
 from augment.errors import AdapterError
+from augment.photo.lidar_view import lidar_top_rad
 from augment.photo.own_car import find_own_car_mask, moving_frames, own_car_mask
-from augment.photo.recorded_sky import find_sky_like_pixels, lidar_top_rad, sky_mask
 from augment.reconstruct.view import ViewKey
 from augment.scene.cameras import Frame
 from augment.scene.scene import Scene
@@ -22,7 +22,6 @@ from augment.scene.sky import ConstantSky
 from tests.adapters import drives
 from tests.scenes import one_gaussian
 
-NO_RETURNS = np.zeros(0, np.int32)
 SIZE = (160, 120)
 
 
@@ -39,68 +38,6 @@ def wall_scene(tmp_path, top_m: float, *, sweeps=None):
         background=drives.flat_splats(wall, 0.15),
         sweeps=sweeps,
     )
-
-
-def sky_picture(sky: int = 200, wall: int = 60) -> np.ndarray:
-    """Bright above the wall of 2 m (row 58), textured below."""
-    rgb = np.full((120, 160, 3), sky, np.uint8)
-    rgb[58:] = wall
-    rgb[58::4] = wall + 40
-    return rgb
-
-
-def test_sky_lies_above_walls_that_end_below_the_lidars_view(tmp_path):
-    scene = wall_scene(tmp_path, top_m=8.0)
-    camera = scene.frame(0).cameras["front"]
-    # The low wall ends at 1.4 degrees, the high one at 18, row 27: the LiDAR looks up to 15, or to
-    # 40, where it would have seen the high wall's end too.
-    rgb = sky_picture()
-    rgb[27:58, :80] = 150
-    for top_deg in (15, 40):
-        mask = sky_mask(scene, camera, rgb, NO_RETURNS, np.radians(top_deg))
-        assert mask[:50, 90:].all() and mask[:20, :70].all()
-        assert not mask[58:].any() and not mask[29:, :78].any()
-
-
-def test_the_picture_tells_how_high_a_wall_goes(tmp_path):
-    """The LiDAR ends at 4 m; the image shows 7 m of wall, with a window that is as bright as the
-    sky, and a pole before the sky."""
-    scene = wall_scene(tmp_path, top_m=4.0)
-    camera = scene.frame(0).cameras["front"]
-    rgb = sky_picture()
-    rgb[32:58, :80] = 110
-    rgb[42:48, 20:30] = 200
-    rgb[:50, 120] = 60
-    mask = sky_mask(scene, camera, rgb, NO_RETURNS, np.radians(10))
-    assert not mask[34:, :78].any()
-    assert mask[:28, :110].all() and mask[:50, 90:110].all()
-    assert not mask[:50, 120].any() and mask[10:40, 130:].all()
-    again = sky_mask(scene, camera, rgb, NO_RETURNS, np.radians(10))
-    assert np.array_equal(mask, again)
-
-
-def test_a_return_above_the_scene_is_no_sky(tmp_path):
-    scene = wall_scene(tmp_path, top_m=2.0)
-    camera = scene.frame(0).cameras["front"]
-    wire = np.array([20 * 160 + x for x in range(160)])
-    rgb = sky_picture()
-    rgb[20] = 90
-    mask = sky_mask(scene, camera, rgb, wire, np.radians(15))
-    assert not mask[19:22].any()
-    assert mask[:18, 10:150].all() and mask[24:50, 10:150].all()
-
-
-def test_the_picture_has_to_agree():
-    rgb = sky_picture()
-    rgb[10:30, 20:60] = 90  # a dark tower that no splat shows
-    rgb[30:50:3, 100:140] = 120  # a billboard
-    rgb[5, :] = 100  # a wire
-    found = find_sky_like_pixels(rgb, np.arange(120)[:, None] < np.full((1, 160), 58))
-    assert not found[10:30, 20:60].any() and not found[30:48, 100:140].any()
-    assert not found[5].any() and found[35:55, 20:60].all()
-    assert not find_sky_like_pixels(rgb, np.zeros((120, 160), bool)).any()
-    night = sky_picture(sky=30, wall=10)
-    assert not find_sky_like_pixels(night, np.ones((120, 160), bool)).any()
 
 
 def test_the_lidars_highest_view_is_measured(tmp_path):

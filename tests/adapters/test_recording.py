@@ -32,7 +32,7 @@ from augment.files.recorded_images import ImageFault, read_scaled
 from augment.jobs.render_job import RenderJob, run_job
 from augment.output.names import folder_name
 from augment.output.tables import lidar_bytes
-from augment.photo.recorded_sky import recorded_sky
+from augment.photo.sky_matte import recorded_sky_regions
 from augment.scene.semantics import SemanticClass
 from recipes.load import load_recipe
 from tests.adapters import recording_files as recording
@@ -307,7 +307,7 @@ def test_stored_pixels_count_whatever_exif_says_of_them(copy, tmp_path):
             photos = (read_scaled(Path(f.image_paths[name]), camera, camera) for f in (a, b))
             np.testing.assert_array_equal(*photos)
             np.testing.assert_array_equal(
-                recorded_sky(upright, a, name), recorded_sky(scene, b, name)
+                recorded_sky_regions(upright, a, name), recorded_sky_regions(scene, b, name)
             )
 
     size = {"width": street.HEIGHT, "height": street.WIDTH}

@@ -21,7 +21,7 @@ from adapters.waymo.tables import Rows, SegmentFiles
 from augment.effects.lidar.beam import find_reflectances
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, decode_image, has_image, is_whole_jpeg
-from augment.photo.recorded_sky import lidar_top_rad
+from augment.photo.lidar_view import lidar_top_rad
 from augment.scene.semantics import SemanticClass
 from tests.adapters import waymo_files as files
 from tests.adapters.waymo_files import DRIVER, ORIGIN, PARKED, Form, Rig, Street, car_pose, changed

@@ -19,7 +19,7 @@ from augment.jobs.blocks import SceneRecord, cut_into_blocks
 from augment.jobs.render_job import RenderJob, run_job
 from augment.output.layout import item_paths
 from augment.output.manifest import read_manifest
-from augment.photo.recorded_sky import elevation_rad, find_sky
+from augment.photo.lidar_view import elevation_rad
 from augment.photo.trust import (
     MAX_MAGNIFICATION,
     judge_scene,
@@ -148,7 +148,7 @@ def test_hardly_any_sky_is_not_judged_and_the_share_is_said(tmp_path):
         assert camera_trust.views[0].sky_covered > 0.3
         said += [text for text in camera_trust.problems if "of the sky" in text]
     (text,) = said
-    assert "of the sky, which is 31 % of the image, has a surface nearer than 200 m" in text
+    assert "of the sky, which is 29 % of the image, has a surface nearer than 200 m" in text
 
 
 def test_what_images_from_elsewhere_contradict_is_believed_less(tmp_path):
@@ -170,27 +170,6 @@ def test_what_images_from_elsewhere_contradict_is_believed_less(tmp_path):
     assert (trust_mask(alone, cameras[0]) == 255).all()
     unknown = tuple(dataclasses.replace(frame, image_paths={}) for frame in frames)
     assert (trust_mask(dataclasses.replace(scene, frames=unknown), cameras[0]) == 255).all()
-
-
-def test_sky_ends_at_lidar_returns_and_below_the_horizon():
-    camera = camera_ahead(120, 80, 90.0)
-    rgb = np.full((80, 120, 3), (150, 190, 240), np.uint8)
-    rgb[45:] = (70, 70, 70)
-    rgb[20:, 80:] = (60, 40, 30)  # a house that ends below the top
-    image_sky = find_sky(rgb, elevation_rad(camera))
-    assert (
-        image_sky.is_sky[:15].all()
-        and not image_sky.is_sky[46:].any()
-        and not image_sky.is_sky[25:, 85:].any()
-    )
-    assert image_sky.is_solid[46:].all()
-    hits = np.zeros((80, 120), bool)
-    hits[5:45:4, 10:40] = True  # a wall as bright as the sky, up to where the LiDAR sees
-    top_rad = float(elevation_rad(camera)[5, 20])
-    image_sky = find_sky(rgb, elevation_rad(camera), hits, top_rad)
-    assert not image_sky.is_sky[:40, 10:40].any() and not image_sky.is_solid[:2, 15:35].any()
-    assert image_sky.is_sky[:15, 60:].all()
-    assert find_sky(np.zeros((80, 120, 3), np.uint8), elevation_rad(camera)) is None  # night
 
 
 def test_cameras_that_were_never_fitted_are_named_and_left_out():
