@@ -42,7 +42,7 @@ _SOLID_CLASSES = (
     SemanticClass.OTHER,
 )
 _TOP_MARGIN_RAD = math.radians(3.0)  # below the LiDAR's top, from which a low thing may go on
-_FAR_MARGIN_RAD = math.radians(1.0)  # below the LiDAR's top, up to which it surely looked
+_FAR_MARGIN_RAD = math.radians(4.0)  # below the top, up to which it surely looked: rings are sparse
 _FAR_PART = 1 / 60  # of the image's width: distance from all surfaces of what is surely far
 _BELOW_ROWS_PART = 1 / 16  # of the image's width: rows below the lowest unknown pixel with seeds
 _UP_COST = 1.0  # cost of a step by a row, of an image of _COST_WIDTH columns

@@ -17,6 +17,11 @@ from augment.photo.sky_matte import SkyMatte, find_sky_matte
 from augment.scene.cameras import Camera
 
 WORK_WIDTH = 480  # columns of the images in which surfaces are added, at most
+_HALF = np.float32(0.5)  # share of sky that parts sky from surface
+_RIM_PX = 2  # width of rims that show mostly sky
+_RIM_LEVELS = 16  # largest difference from the sky of a rim, of 255
+_SPECK_PX = 300  # largest area of a speck of cloud
+_SPECK_SHARE = 0.8  # least brightness of a speck of cloud, as a part of the sky's
 _NEAREST_M = 1.0  # smallest depth of a point that a camera sees
 
 
@@ -56,20 +61,78 @@ def read_solid_view(
     if image is None:
         return None
     rgb = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    matte = find_sky_matte(rgb, camera, _has_point(camera, points), lidar_top_rad)
+    if matte is None:
+        return None
+    boxes = [
+        (pose, track.size_m)
+        for track in tracks
+        if (pose := track.motion.pose_at(camera.timestamp_ns)) is not None
+    ]
+    excluded = view.shows_car(camera.width, camera.height)
+    return make_solid_view(camera, rgb, matte, excluded, boxes, points)
+
+
+def make_solid_view(
+    camera: Camera,
+    rgb: np.ndarray,
+    matte: SkyMatte,
+    excluded: np.ndarray,
+    boxes: Sequence[tuple[np.ndarray, np.ndarray]],
+    points: np.ndarray,
+) -> SolidView:
+    """Return a recorded image with a cleaned matte, without the pixels of moving objects.
+
+    Args:
+        camera: the camera at the image's size.
+        rgb: uint8 [H, W, 3].
+        matte: the image's sky.
+        excluded: pixels of the recording car, bool [H, W].
+        boxes: world_from_box [4, 4] and size in metres [3] of the moving objects.
+        points: float [N, 3], surfaces of what stands still, world.
+    """
+    cover = np.full((camera.height, camera.width), np.inf, np.float32)
+    for world_from_box, size_m in boxes:
+        draw_cover(cover, camera, camera.camera_from_world.numpy() @ world_from_box, size_m)
+    has_point = _has_point(camera, points)
+    matte = matte._replace(sky_share=_without_specks(rgb, matte, has_point))
+    lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    return SolidView(camera, rgb, lab, matte, excluded | np.isfinite(cover))
+
+
+def _has_point(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return the pixels into which points fall, bool [H, W]."""
     has_point = np.zeros((camera.height, camera.width), np.bool_)
     _, rows, columns, _ = project_into(camera, points)
     has_point[rows, columns] = True
-    matte = find_sky_matte(rgb, camera, has_point, lidar_top_rad)
-    if matte is None:
-        return None
-    cover = np.full((camera.height, camera.width), np.inf, np.float32)
-    for track in tracks:
-        pose = track.motion.pose_at(camera.timestamp_ns)
-        if pose is not None:
-            draw_cover(cover, camera, camera.camera_from_world.numpy() @ pose, track.size_m)
-    excluded = view.shows_car(camera.width, camera.height) | np.isfinite(cover)
-    lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
-    return SolidView(camera, rgb, lab, matte, excluded)
+    return has_point
+
+
+def _without_specks(rgb: np.ndarray, matte: SkyMatte, has_point: np.ndarray) -> np.ndarray:
+    """Return the share of sky without specks of cloud, and without bright rims, float32 [H, W].
+
+    At this size an edge is a pixel wide, and half of it shows sky.
+
+    Args:
+        rgb: the photo, uint8 [H, W, 3].
+        matte: its sky.
+        has_point: pixels with a known surface, bool [H, W].
+    """
+    is_solid = matte.sky_share < _HALF
+    difference = np.abs(rgb.astype(np.int16) - matte.sky_rgb).max(axis=2)
+    square = np.ones((3, 3), np.uint8)
+    for _ in range(_RIM_PX):
+        beside_sky = cv2.dilate((~is_solid).astype(np.uint8), square) > 0
+        is_solid &= ~(beside_sky & (difference < _RIM_LEVELS))
+    luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    sky_luma = cv2.cvtColor(matte.sky_rgb, cv2.COLOR_RGB2GRAY)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(is_solid.astype(np.uint8))
+    flat = labels.ravel()
+    is_bright = np.bincount(flat, (luma - _SPECK_SHARE * sky_luma).ravel(), count) > 0
+    num_points = np.bincount(flat, has_point.ravel(), count)
+    is_speck = is_bright & (num_points == 0) & (stats[:, cv2.CC_STAT_AREA] < _SPECK_PX)
+    is_speck[0] = True  # sky itself
+    return np.where(is_speck[labels], np.maximum(matte.sky_share, _HALF), matte.sky_share)
 
 
 def project_into(
