@@ -131,25 +131,24 @@ def add_surfaces_beyond_beams(
         room //= min(_VIEWS_PER_SHARE, len(views) - number)
         alpha, known = _draw(background, view.camera, pose_parts)
         # A sheet behind all of a leaking wall takes fewer discs than one behind each leak.
-        window = (_OPEN_WINDOW_PX, _OPEN_WINDOW_PX)
-        is_open = (
-            (cv2.blur(alpha, window) < _OPEN_ALPHA)
-            & (view.matte.sky_share < _SOLID_SHARE)
-            & ~view.excluded
-        )
-        is_open &= view.camera.ray_directions().numpy()[..., 2] > -0.5 / view.camera.fy
-        if not is_open.any() or room < 1:
+        leaks = cv2.blur(alpha, (_OPEN_WINDOW_PX, _OPEN_WINDOW_PX)) < _OPEN_ALPHA
+        leaks &= view.camera.ray_directions().numpy()[..., 2] > -0.5 / view.camera.fy
+        leaks &= ~view.excluded
+        if not (leaks & (view.matte.sky_share < _SOLID_SHARE)).any() or room < 1:
             continue
         depth = complete_depth(
             view.camera, view.rgb, view.matte.sky_share, known, walls, lidar_top_rad
         )
-        leaks = np.isfinite(known.depth_m)
+        is_known = np.isfinite(known.depth_m)
         depth = depth._replace(
-            depth_m=np.where(leaks, depth.depth_m * (1 + _BEHIND) + _BEHIND_M, depth.depth_m)
+            depth_m=np.where(is_known, depth.depth_m * (1 + _BEHIND) + _BEHIND_M, depth.depth_m)
         )
-        cells = _cells(view, depth, is_open, room)
         others = [other for other in views if other is not view]
-        discs = _discs(view, depth, leaks, cells, walls, others)
+        panes = _find_panes(view.matte.sky_share, depth.wall)
+        sky_share = np.where(panes, np.float32(0), view.matte.sky_share)
+        view = view._replace(matte=view.matte._replace(sky_share=sky_share))
+        cells = _cells(view, depth, leaks & (sky_share < _SOLID_SHARE), room)
+        discs = _discs(view, depth, is_known | panes, cells, walls, others)
         background = join_gaussians([background, discs])
     logger.info("%d splats beyond the LiDAR's view", len(background) - count)
     return background
@@ -180,6 +179,27 @@ def _draw(
     is_known = raster.alpha.numpy()[::_FINER, ::_FINER] >= SURFACE_ALPHA
     depth = np.where(is_known, raster.median_depth.numpy()[::_FINER, ::_FINER], np.inf)
     return alpha, KnownSurface(depth, semantic.astype(np.int16), (ids >= len(background)))
+
+
+def _find_panes(sky_share: np.ndarray, wall: np.ndarray) -> np.ndarray:
+    """Return the pixels of glass that mirrors the sky: sky in the middle of one wall, bool [H, W].
+
+    wall: int64 [H, W], number of the wall, -1 for none.
+    """
+    panes = np.zeros(wall.shape, np.bool_)
+    is_sky = (sky_share >= _SOLID_SHARE).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(is_sky)
+    for number in range(1, count):
+        left, top, width, height, _ = stats[number]
+        if min(left, top) == 0 or left + width >= wall.shape[1]:
+            continue
+        window = slice(top - 1, top + height + 1), slice(left - 1, left + width + 1)
+        inside = labels[window] == number
+        rim = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        walls = np.unique(wall[window][rim & ~inside])
+        if len(walls) == 1 and walls[0] >= 0:
+            panes[window] |= inside
+    return panes
 
 
 class _Cells(NamedTuple):
@@ -265,14 +285,14 @@ def _split(images: _CellImages, is_open: np.ndarray, tolerance: float) -> _Cells
 def _discs(
     view: SolidView,
     depth: DenseDepth,
-    leaks: np.ndarray,
+    is_sure: np.ndarray,
     cells: _Cells,
     walls: WallPlanes,
     others: Sequence[SolidView],
 ) -> Gaussians:
     """Return a disc for each cell, without those that other images see as sky.
 
-    leaks: bool [H, W], pixels of surfaces that are known, but leak.
+    is_sure: bool [H, W], pixels whose surface is known, whatever other images show.
     """
     camera = view.camera
     half = (cells.sides // 2,) * 2
@@ -288,8 +308,8 @@ def _discs(
     agreement = measure_agreement(centre + depth_m[:, None] * rays, lab, others)
     conflicts = agreement.conflicts
     doubt = agreement.doubt()
-    is_known = leaks[middle_rows, middle_columns]
-    conflicts[is_known] = doubt[is_known] = 0
+    is_sure_cell = is_sure[middle_rows, middle_columns]
+    conflicts[is_sure_cell] = doubt[is_sure_cell] = 0
     unlikely = np.flatnonzero(doubt > 0)
     far_m = FAR_M / level[unlikely]
     far_points = centre + far_m[:, None] * rays[unlikely]

@@ -59,7 +59,7 @@ def test_a_wall_goes_on_to_the_sky_straight_above_what_the_lidar_saw(tmp_path):
     heights = torch.histc(z[(y > 1) & (y < 9)], 12, 0, 12)
     assert (heights[7:9] > 100).all()  # 8 m at 0.2 m are 40 a row, and five rows a metre
     in_window = (y > 10.2) & (y < 11.8) & (z > 4.2) & (z < 5.8)
-    assert in_window.sum() > 20
+    assert in_window.sum() > 8  # 6 x 10 pixels, in discs of one to four pixels each
     assert (new.semantic == SemanticClass.BUILDING).all()
     colours = new.sh[:, 0] * 0.28209479 + 0.5
     above = z > 7.5
