@@ -78,6 +78,8 @@ def close_above_beams(
         max_gaussians: largest number for all parts.
     """
     points = parts[0].means.numpy()
+    lowest_m = min((float(view.camera.centre[2]) for view in views), default=0.0)
+    points = points[points[:, 2] > lowest_m]
     solid_views = [
         solid_view
         for view in spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART)
@@ -121,7 +123,7 @@ def add_surfaces_beyond_beams(
     views = list(views)
     background = without_sky_splats(background, views)
     views = [
-        view._replace(known_m=_draw(background, view.camera, pose_parts)[1].depth_m)
+        view._replace(known_m=_draw(background, view.camera, pose_parts, finer=1)[1].depth_m)
         for view in views
     ]
     walls = find_wall_planes(background)
@@ -155,29 +157,32 @@ def add_surfaces_beyond_beams(
 
 
 def _draw(
-    background: Gaussians, camera: Camera, pose_parts: PosesParts
+    background: Gaussians, camera: Camera, pose_parts: PosesParts, *, finer: int = _FINER
 ) -> tuple[np.ndarray, KnownSurface]:
-    """Return alpha [H, W] and the surfaces of the Gaussians so far."""
+    """Return alpha [H, W] and the surfaces of the Gaussians so far.
+
+    finer: scale of the drawing over the camera's.
+    """
     parts = pose_parts(background, camera)
     fine_camera = dataclasses.replace(
         camera,
-        width=_FINER * camera.width,
-        height=_FINER * camera.height,
-        fx=_FINER * camera.fx,
-        fy=_FINER * camera.fy,
-        cx=_FINER * camera.cx,
-        cy=_FINER * camera.cy,
+        width=finer * camera.width,
+        height=finer * camera.height,
+        fx=finer * camera.fx,
+        fy=finer * camera.fy,
+        cx=finer * camera.cx,
+        cy=finer * camera.cy,
     )
     raster = rasterize(parts, fine_camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
     assert raster.alpha is not None and raster.median_depth is not None
     assert raster.splat_ids is not None and background.semantic is not None
     size = (camera.width, camera.height)
     alpha = cv2.resize(raster.alpha.numpy(), size, interpolation=cv2.INTER_AREA)
-    ids = raster.splat_ids.numpy()[::_FINER, ::_FINER]
+    ids = raster.splat_ids.numpy()[::finer, ::finer]
     in_background = (ids >= 0) & (ids < len(background))
     semantic = background.semantic.numpy()[np.where(in_background, ids, 0)]
-    is_known = raster.alpha.numpy()[::_FINER, ::_FINER] >= SURFACE_ALPHA
-    depth = np.where(is_known, raster.median_depth.numpy()[::_FINER, ::_FINER], np.inf)
+    is_known = raster.alpha.numpy()[::finer, ::finer] >= SURFACE_ALPHA
+    depth = np.where(is_known, raster.median_depth.numpy()[::finer, ::finer], np.inf)
     return alpha, KnownSurface(depth, semantic.astype(np.int16), (ids >= len(background)))
 
 

@@ -20,6 +20,7 @@ WORK_WIDTH = 480  # columns of the images in which surfaces are added, at most
 _HALF = np.float32(0.5)  # share of sky that parts sky from surface
 _RIM_PX = 2  # width of rims that show mostly sky
 _RIM_LEVELS = 16  # largest difference from the sky of a rim, of 255
+_RIM_SHARE = 0.4  # the same as a part of the largest difference around
 _SPECK_PX = 300  # largest area of a speck of cloud
 _SPECK_SHARE = 0.8  # least brightness of a speck of cloud, as a part of the sky's
 _NEAREST_M = 1.0  # smallest depth of a point that a camera sees
@@ -95,7 +96,9 @@ def make_solid_view(
     for world_from_box, size_m in boxes:
         draw_cover(cover, camera, camera.camera_from_world.numpy() @ world_from_box, size_m)
     has_point = _has_point(camera, points)
-    matte = matte._replace(sky_share=_without_specks(rgb, matte, has_point))
+    sky_share = _without_specks(rgb, matte, has_point)
+    surface_rgb = _without_rims(matte.surface_rgb, matte.sky_rgb, sky_share)
+    matte = matte._replace(sky_share=sky_share, surface_rgb=surface_rgb)
     lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     return SolidView(camera, rgb, lab, matte, excluded | np.isfinite(cover))
 
@@ -120,10 +123,12 @@ def _without_specks(rgb: np.ndarray, matte: SkyMatte, has_point: np.ndarray) -> 
     """
     is_solid = matte.sky_share < _HALF
     difference = np.abs(rgb.astype(np.int16) - matte.sky_rgb).max(axis=2)
+    around = cv2.dilate(difference, np.ones((5, 5), np.uint8))
+    looks_like_sky = difference < np.maximum(_RIM_LEVELS, _RIM_SHARE * around)
     square = np.ones((3, 3), np.uint8)
     for _ in range(_RIM_PX):
         beside_sky = cv2.dilate((~is_solid).astype(np.uint8), square) > 0
-        is_solid &= ~(beside_sky & (difference < _RIM_LEVELS))
+        is_solid &= ~(beside_sky & looks_like_sky)
     luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     sky_luma = cv2.cvtColor(matte.sky_rgb, cv2.COLOR_RGB2GRAY)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(is_solid.astype(np.uint8))
@@ -133,6 +138,33 @@ def _without_specks(rgb: np.ndarray, matte: SkyMatte, has_point: np.ndarray) -> 
     is_speck = is_bright & (num_points == 0) & (stats[:, cv2.CC_STAT_AREA] < _SPECK_PX)
     is_speck[0] = True  # sky itself
     return np.where(is_speck[labels], np.maximum(matte.sky_share, _HALF), matte.sky_share)
+
+
+def _without_rims(rgb: np.ndarray, sky_rgb: np.ndarray, sky_share: np.ndarray) -> np.ndarray:
+    """Return colours in which pixels beside sky have that of the neighbour least like sky.
+
+    Args:
+        rgb: colours of surfaces, uint8 [H, W, 3].
+        sky_rgb: colours of the sky around, uint8 [H, W, 3].
+        sky_share: share of sky, float32 [H, W].
+    """
+    height, width = sky_share.shape
+    is_sky = sky_share >= _HALF
+    difference = np.abs(rgb.astype(np.int16) - sky_rgb).max(axis=2)
+    difference[is_sky] = -1
+    beside_sky = cv2.dilate(is_sky.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    rows, columns = np.nonzero(beside_sky & ~is_sky)
+    best = difference[rows, columns]
+    out = rgb.copy()
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            near_rows = np.clip(rows + down, 0, height - 1)
+            near_columns = np.clip(columns + right, 0, width - 1)
+            is_better = difference[near_rows, near_columns] > best
+            best[is_better] = difference[near_rows, near_columns][is_better]
+            chosen = rgb[near_rows[is_better], near_columns[is_better]]
+            out[rows[is_better], columns[is_better]] = chosen
+    return out
 
 
 def project_into(
