@@ -25,7 +25,14 @@ from augment.files.image_size import read_image_header
 from augment.files.recorded_images import ImageFault, decode_image, read_scaled
 from augment.memo import memo_of
 from augment.photo.lidar_view import elevation_rad, find_returns, highest_channel_rad, sweep_of
-from augment.photo.sky_regions import EDGE, SKY, WORK_WIDTH, find_sky_regions, largest_channel
+from augment.photo.sky_regions import (
+    EDGE,
+    SKY,
+    SURFACE,
+    WORK_WIDTH,
+    find_sky_regions,
+    largest_channel,
+)
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import Scene
 
@@ -43,14 +50,26 @@ _PURE_SHARE = 0.35
 _EDGE_PX = 3
 # Distance from pure sky up to which a pixel may show some of it, pixels of 1920.
 _MIXED_PX = 2
-# Difference of a dark thing beside which brighter pixels are overshoot of the camera's sharpening.
-_DARK_THING_LEVELS = 30
+# Distance within which a surface is near, pixels of the working size.
+_SURFACE_REACH_PX = 9
+# Darkness of surfaces below the sky from which pixels brighter than the sky are no surface's.
+_DARK_SURFACE_LEVELS = 10
+# Difference of a channel by which the overshoot of sharpening may be paler than the sky, of 255.
+_PALE_LEVELS = 25
+# Least difference of a surface from the sky over the noise, of 255.
+_MIN_SPAN_LEVELS = 8
+# Share of sky or surface in a pixel below which its colour is not taken apart.
+_MIN_SHARE = 0.02
+# Share of a surface in a pixel by which its colour is divided, at least.
+_MIN_SOLID = 0.1
 # Width of thin things (wires, twigs) that are found by their darkness alone, pixels of 1920.
 _THIN_PX = 12
 # Darkness of thin things over their surroundings that is noise, of 255.
 _THIN_NOISE_LEVELS = 9
 # Darkness of a thin thing at its middle, at least, of 255.
 _MIN_THIN_LEVELS = 24
+# Luma of thin things against the sky over that of the sky: they show their unlit side.
+_THIN_LUMA_SHARE = 0.25
 # Radii of the windows over which the sky's colour is averaged, the narrowest that holds sky first,
 # pixels of half the working size.
 _SKY_WINDOWS_PX = (2, 8, 32)
@@ -233,9 +252,12 @@ def _refine(rgb: np.ndarray, kinds: np.ndarray) -> SkyMatte:
     size = width, rows
     full_kinds = cv2.resize(kinds, size, interpolation=cv2.INTER_NEAREST)
     sky, noise = _sky_color(rgb[:rows], kinds)
+    is_bright = _has_bright_surface(rgb[:rows], kinds, sky)
+    is_bright = cv2.resize(is_bright, size, interpolation=cv2.INTER_NEAREST)
     sky_rgb[:rows] = cv2.resize(sky, size, interpolation=cv2.INTER_LINEAR)
     noise = cv2.resize(noise, size, interpolation=cv2.INTER_LINEAR)
-    _share_of_sky(rgb[:rows], full_kinds, sky_rgb[:rows], noise, share[:rows], surface_rgb[:rows])
+    images = sky_rgb[:rows], noise, is_bright, share[:rows], surface_rgb[:rows]
+    _share_of_sky(rgb[:rows], full_kinds, *images)
     return SkyMatte(share, surface_rgb, sky_rgb)
 
 
@@ -271,11 +293,29 @@ def _sky_color(rgb: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.rint(means[..., :3]).astype(np.uint8), np.rint(noise).astype(np.uint8)
 
 
+def _has_bright_surface(rgb: np.ndarray, kinds: np.ndarray, sky: np.ndarray) -> np.ndarray:
+    """Return 255 where a surface as bright as the sky is near, else 0, at the size of `kinds`.
+
+    Args:
+        rgb: rows of the image.
+        kinds: kinds of their pixels, in a smaller image.
+        sky: the sky's colours, at any size.
+    """
+    size = kinds.shape[1], kinds.shape[0]
+    luma = cv2.cvtColor(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    is_surface = (kinds == SURFACE).astype(np.uint8)
+    luma *= cv2.morphologyEx(is_surface, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    brightest = cv2.dilate(luma, np.ones((2 * _SURFACE_REACH_PX + 1,) * 2, np.uint8))
+    sky_luma = cv2.cvtColor(cv2.resize(sky, size), cv2.COLOR_RGB2GRAY)
+    return cv2.bitwise_not(_above(cv2.subtract(sky_luma, brightest), _DARK_SURFACE_LEVELS))
+
+
 def _share_of_sky(
     rgb: np.ndarray,
     kinds: np.ndarray,
     sky_rgb: np.ndarray,
     noise: np.ndarray,
+    has_bright_surface: np.ndarray,
     share: np.ndarray,
     surface_rgb: np.ndarray,
 ) -> None:
@@ -286,6 +326,7 @@ def _share_of_sky(
         kinds: kinds of the pixels.
         sky_rgb: the sky's colour at each pixel.
         noise: difference from it that is noise, uint8 [h, w].
+        has_bright_surface: 255 where a surface as bright as the sky is near, else 0.
         share: the sky's share, which is written.
         surface_rgb: colours of the image, which are replaced in mixed pixels.
     """
@@ -294,13 +335,17 @@ def _share_of_sky(
     window = np.ones((2 * max(1, round(_EDGE_PX * scale)) + 1,) * 2, np.uint8)
     can_be_sky = _above(kinds, 0)
     is_sure = _above(kinds, EDGE)
-    # Difference from the sky. Beside dark things, brighter pixels are overshoot of sharpening.
+    # Difference from the sky. Where no bright surface is near, brighter pixels are clouds, or the
+    # overshoot of the camera's sharpening, which is paler than the sky.
+    luma = cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY)
+    difference = cv2.subtract(cv2.cvtColor(sky_rgb, cv2.COLOR_RGB2GRAY), luma)
     darker = largest_channel(cv2.subtract(sky_rgb, smooth))
-    difference = cv2.max(darker, largest_channel(cv2.subtract(smooth, sky_rgb)))
-    is_darker = _above(darker, 3)
-    is_beside_dark = _above(cv2.dilate(darker, window), _DARK_THING_LEVELS)
-    is_plain = cv2.bitwise_or(is_darker, cv2.bitwise_not(is_beside_dark))
-    difference = cv2.bitwise_and(cv2.bitwise_and(difference, is_plain), can_be_sky)
+    difference = cv2.max(difference, _subtract_level(darker, _PALE_LEVELS))
+    if has_bright_surface.any():
+        brighter = largest_channel(cv2.subtract(smooth, sky_rgb))
+        color_difference = cv2.bitwise_and(cv2.max(darker, brighter), has_bright_surface)
+        difference = cv2.max(difference, color_difference)
+    difference = cv2.bitwise_and(difference, can_be_sky)
     largest = cv2.dilate(difference, window)
     # Pure sky, and the pixels beside it that may be mixed.
     pure_levels = cv2.max(cv2.convertScaleAbs(largest, alpha=_PURE_SHARE), noise)
@@ -310,24 +355,23 @@ def _share_of_sky(
     is_mixed = cv2.bitwise_and(cv2.dilate(is_pure, np.ones((reach, reach), np.uint8)), can_be_sky)
     is_mixed = cv2.bitwise_and(is_mixed, cv2.bitwise_not(is_sure))
     share[is_sure > 0] = 1
-    rows, columns = np.nonzero(is_mixed)
-    floor = noise[rows, columns].astype(np.float32)
-    span = np.maximum(largest[rows, columns] - floor, 8)
-    solid = np.clip((difference[rows, columns] - floor) / span, 0, 1)
-    share[rows, columns] = 1 - solid
-    _remove_thin_things(smooth, cv2.bitwise_or(is_sure, is_mixed), share)
+    mixed = np.flatnonzero(is_mixed)
+    floor = noise.ravel()[mixed].astype(np.float32)
+    span = np.maximum(largest.ravel()[mixed] - floor, _MIN_SPAN_LEVELS)
+    solid = np.clip((difference.ravel()[mixed] - floor) / span, 0, 1)
+    share.ravel()[mixed] = 1 - solid
+    _remove_thin_things(luma, cv2.bitwise_or(is_sure, is_mixed), share)
     _unmix(rgb, sky_rgb, share, surface_rgb)
 
 
-def _remove_thin_things(smooth: np.ndarray, is_searched: np.ndarray, share: np.ndarray) -> None:
+def _remove_thin_things(luma: np.ndarray, is_searched: np.ndarray, share: np.ndarray) -> None:
     """Lower the sky's share where something dark and thin stands before it.
 
     Args:
-        smooth: the image's colours.
+        luma: the image's luma.
         is_searched: pixels that are looked at, uint8, 0 or 255.
         share: the sky's share, which is written.
     """
-    luma = cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY)
     side = 2 * max(1, round(_THIN_PX * _width_share(luma) / 2)) + 1
     darkness = cv2.morphologyEx(luma, cv2.MORPH_BLACKHAT, np.ones((side, side), np.uint8))
     darkness = cv2.bitwise_and(darkness, is_searched)
@@ -335,10 +379,16 @@ def _remove_thin_things(smooth: np.ndarray, is_searched: np.ndarray, share: np.n
     is_thin = cv2.bitwise_and(
         _above(darkest, _MIN_THIN_LEVELS), _above(darkness, _THIN_NOISE_LEVELS)
     )
-    rows, columns = np.nonzero(is_thin)
-    over_noise = darkness[rows, columns] - np.float32(_THIN_NOISE_LEVELS)
-    solid = over_noise / (darkest[rows, columns] - np.float32(_THIN_NOISE_LEVELS))
-    share[rows, columns] = np.minimum(share[rows, columns], 1 - solid)
+    thin = np.flatnonzero(is_thin)
+    depth = darkness.ravel()[thin].astype(np.float32)
+    # A wire is thinner than a pixel: how dark it is shows how much of the sky it hides.
+    solid = depth / ((1 - _THIN_LUMA_SHARE) * (luma.ravel()[thin] + depth))
+    share.ravel()[thin] = np.minimum(share.ravel()[thin], 1 - np.minimum(solid, 1))
+
+
+def _subtract_level(image: np.ndarray, level: int) -> np.ndarray:
+    """Return an image of bytes less a level, at least 0."""
+    return cv2.LUT(image, np.maximum(np.arange(256) - level, 0).astype(np.uint8))
 
 
 def _above(image: np.ndarray, level: int) -> np.ndarray:
@@ -355,8 +405,8 @@ def _unmix(
     rgb: np.ndarray, sky_rgb: np.ndarray, share: np.ndarray, surface_rgb: np.ndarray
 ) -> None:
     """Write the surfaces' colours of mixed pixels: F = S + (I - S) / (1 - a)."""
-    rows, columns = np.nonzero((share > 0.02) & (share < 0.98))
-    sky = sky_rgb[rows, columns].astype(np.float32)
-    solid = 1 - share[rows, columns][:, None]
-    color = sky + (rgb[rows, columns] - sky) / np.maximum(solid, 0.1)
-    surface_rgb[rows, columns] = np.clip(np.rint(color), 0, 255).astype(np.uint8)
+    mixed = np.flatnonzero((share > _MIN_SHARE) & (share < 1 - _MIN_SHARE))
+    sky = sky_rgb.reshape(-1, 3)[mixed].astype(np.float32)
+    solid = 1 - share.ravel()[mixed][:, None]
+    color = sky + (rgb.reshape(-1, 3)[mixed] - sky) / np.maximum(solid, _MIN_SOLID)
+    surface_rgb.reshape(-1, 3)[mixed] = np.clip(np.rint(color), 0, 255).astype(np.uint8)

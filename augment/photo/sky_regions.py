@@ -70,6 +70,8 @@ _BESIDE_SHARE = 0.015
 _CLOUD_LUMA_SHARE = 0.7
 # Distance from the sky up to which edges may show it, pixels.
 _EDGE_REACH_PX = 5
+# Area below which a region that lies wholly beside the sky counts as an edge, pixels.
+_SMALL_AREA_PX = 200
 # Distance from surfaces from which an edge is inside the sky, pixels.
 _INSIDE_PX = 6
 # Rows over the highest return of a column that its surface may still fill, as a part of the height.
@@ -183,8 +185,7 @@ def _contrast(rgb: np.ndarray) -> np.ndarray:
 
 def largest_channel(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
     """Return the largest of the three channels."""
-    first, second, third = cv2.split(image)
-    return cv2.max(cv2.max(first, second), third)
+    return np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2])
 
 
 def _grow(mask: np.ndarray, size: int) -> np.ndarray:
@@ -314,6 +315,9 @@ def _pixel_kinds(
     is_soft = cv2.dilate(pixels.contrast, square) < _SHARP_LEVELS
     is_soft |= cv2.erode(pixels.luma, square) > _CLOUD_LUMA_SHARE * sky_luma
     is_inside = ~_grow(is_solid, 2 * _INSIDE_PX + 1) & is_soft
-    is_near = is_edge & pixels.is_above & _grow(is_sky, 2 * _EDGE_REACH_PX + 1)
+    is_near = pixels.is_above & _grow(is_sky, 2 * _EDGE_REACH_PX + 1)
+    is_small = ~is_sky_region & (regions.area < _SMALL_AREA_PX) & (regions.returns < _FEW_RETURNS)
+    is_small[regions.labels[~is_near]] = False  # wholly beside the sky
+    is_near &= is_edge | is_small[regions.labels]
     kinds = np.where(is_near, np.where(is_inside, SOFT_EDGE, EDGE), SURFACE)
     return np.where(is_sky, SKY, kinds).astype(np.uint8)
