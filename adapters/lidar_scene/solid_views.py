@@ -18,6 +18,8 @@ from augment.scene.cameras import Camera
 
 WORK_WIDTH = 480  # columns of the images in which surfaces are added, at most
 _HALF = np.float32(0.5)  # share of sky that parts sky from surface
+_MIN_REGION_PX = 50  # least area of sky by the image alone
+_MAX_NEAR_SHARE = 0.2  # largest part of it that lies near surfaces
 _RIM_PX = 2  # width of rims that show mostly sky
 _RIM_LEVELS = 16  # largest difference from the sky of a rim, of 255
 _RIM_SHARE = 0.4  # the same as a part of the largest difference around
@@ -62,7 +64,7 @@ def read_solid_view(
     if image is None:
         return None
     rgb = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    matte = find_sky_matte(rgb, camera, _has_point(camera, points), lidar_top_rad)
+    matte = _find_matte(rgb, camera, _has_point(camera, points), lidar_top_rad)
     if matte is None:
         return None
     boxes = [
@@ -72,6 +74,35 @@ def read_solid_view(
     ]
     excluded = view.shows_car(camera.width, camera.height)
     return make_solid_view(camera, rgb, matte, excluded, boxes, points)
+
+
+def _find_matte(
+    rgb: np.ndarray, camera: Camera, has_point: np.ndarray, lidar_top_rad: float
+) -> SkyMatte | None:
+    """Return the sky of an image; None if it is too dark to tell.
+
+    With LiDAR, a wire that reaches the LiDAR's top hides the sky beside it. Regions that are sky by
+    the image alone count as well if hardly any surface lies in them.
+    """
+    matte = find_sky_matte(rgb, camera, has_point, lidar_top_rad)
+    alone = find_sky_matte(rgb, camera)
+    if matte is None or alone is None:
+        return matte
+    other = ((alone.sky_share >= _HALF) & (matte.sky_share < _HALF)).astype(np.uint8)
+    square = np.ones((5, 5), np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.erode(other, square))
+    near_point = cv2.dilate(has_point.astype(np.uint8), square)
+    num_near = np.bincount(labels.ravel(), near_point.ravel(), count)
+    area = stats[:, cv2.CC_STAT_AREA]
+    is_sky = (area >= _MIN_REGION_PX) & (num_near < _MAX_NEAR_SHARE * area)
+    is_sky[0] = False
+    added = cv2.dilate(is_sky[labels].astype(np.uint8), square) & other
+    rows, columns = np.nonzero(added)
+    sky_share = matte.sky_share.copy()
+    sky_rgb = matte.sky_rgb.copy()
+    sky_share[rows, columns] = alone.sky_share[rows, columns]
+    sky_rgb[rows, columns] = alone.sky_rgb[rows, columns]
+    return matte._replace(sky_share=sky_share, sky_rgb=sky_rgb)
 
 
 def make_solid_view(
