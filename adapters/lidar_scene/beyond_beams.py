@@ -21,6 +21,7 @@ import torch
 
 from adapters.lidar_scene.closing import spread_views
 from adapters.lidar_scene.dense_depth import FAR_M, DenseDepth, KnownSurface, complete_depth
+from adapters.lidar_scene.depth_maps import DepthMaps
 from adapters.lidar_scene.image_views import View
 from adapters.lidar_scene.sky_conflicts import measure_agreement, without_sky_splats
 from adapters.lidar_scene.solid_views import SolidView, read_solid_view
@@ -28,6 +29,8 @@ from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
 from adapters.lidar_scene.wall_planes import WallPlanes, find_wall_planes
 from adapters.world import join_gaussians
+from augment.errors import AdapterError
+from augment.reconstruct.view import ViewKey
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
@@ -67,8 +70,11 @@ def close_above_beams(
     *,
     lidar_top_rad: float,
     max_gaussians: int,
-) -> Gaussians:
+    depth_option: str | None = None,
+) -> tuple[Gaussians, tuple[str, ...]]:
     """Return the world's Gaussians with discs where images show a surface above the LiDAR's view.
+
+    The second result are sentences on a user's depth maps.
 
     Args:
         parts: Gaussians of the world, then those of the tracks, in their frames.
@@ -76,6 +82,7 @@ def close_above_beams(
         views: recorded images.
         lidar_top_rad: highest elevation that the LiDAR measures.
         max_gaussians: largest number for all parts.
+        depth_option: a user's depth maps, as in `DepthMaps.find`.
     """
     points = parts[0].means.numpy()
     lowest_m = min((float(view.camera.centre[2]) for view in views), default=0.0)
@@ -94,13 +101,57 @@ def close_above_beams(
                 posed.append(PosedGaussians(part, torch.from_numpy(pose), instance_id=number))
         return posed
 
-    return add_surfaces_beyond_beams(
+    image_paths = {ViewKey(view.frame, view.camera.name): view.path for view in views}
+    maps = None if depth_option is None else MapReader(DepthMaps.find(depth_option, image_paths))
+    background = add_surfaces_beyond_beams(
         parts[0],
         solid_views,
         pose_parts,
         lidar_top_rad=lidar_top_rad,
         max_added=max_gaussians - sum(map(len, parts)),
+        maps=maps,
     )
+    return background, () if maps is None else maps.sentences()
+
+
+class MapReader:
+    """Reads a user's depth maps, and counts what was found."""
+
+    def __init__(self, maps: DepthMaps) -> None:
+        self._maps = maps
+        self._errors: list[float] = []
+        self._faults: list[str] = []
+        self._num_missing = 0
+
+    def read(self, view: SolidView) -> np.ndarray | None:
+        """Return the user's depth of an image, float [H, W], NaN where unknown; None without."""
+        assert view.known_m is not None
+        try:
+            aligned = self._maps.read(view.key, view.camera, view.known_m)
+        except AdapterError as error:
+            where = f"camera {view.key.camera}, frame {view.key.frame}"
+            self._faults.append(f"{where}: {error}; its depth is guessed")
+            return None
+        if aligned is None:
+            self._num_missing += 1
+            return None
+        self._errors.append(aligned.error)
+        return aligned.depth_m
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return a sentence on the maps' error, and one on each kind of fault."""
+        folder = self._maps.folder
+        out = []
+        if self._errors:
+            out.append(
+                f"depth maps of {folder} are used for {len(self._errors)} images; aligned to the "
+                f"LiDAR, their median relative error is {np.median(self._errors):.1%}"
+            )
+        if self._num_missing:
+            out.append(f"{folder} has no depth map for {self._num_missing} images; it is guessed")
+        if self._faults:
+            out.append(f"{self._faults[0]} (so for {len(self._faults)} images)")
+        return tuple(out)
 
 
 def add_surfaces_beyond_beams(
@@ -110,6 +161,7 @@ def add_surfaces_beyond_beams(
     *,
     lidar_top_rad: float,
     max_added: int,
+    maps: MapReader | None = None,
 ) -> Gaussians:
     """Return the background with discs until the views' pixels without sky have a surface.
 
@@ -119,6 +171,7 @@ def add_surfaces_beyond_beams(
         pose_parts: places background and actors for a camera.
         lidar_top_rad: highest elevation that the LiDAR looks at.
         max_added: largest number of discs.
+        maps: a user's depth maps, which count before a guess.
     """
     views = list(views)
     background = without_sky_splats(background, views)
@@ -142,6 +195,9 @@ def add_surfaces_beyond_beams(
             view.camera, view.rgb, view.matte.sky_share, known, walls, lidar_top_rad
         )
         is_known = np.isfinite(known.depth_m)
+        user_m = None if maps is None else maps.read(view)
+        if user_m is not None:
+            depth = _take_user_depth(depth, user_m, ~is_known)
         depth = depth._replace(
             depth_m=np.where(is_known, depth.depth_m * (1 + _BEHIND) + _BEHIND_M, depth.depth_m)
         )
@@ -154,6 +210,16 @@ def add_surfaces_beyond_beams(
         background = join_gaussians([background, discs])
     logger.info("%d splats beyond the LiDAR's view", len(background) - count)
     return background
+
+
+def _take_user_depth(depth: DenseDepth, user_m: np.ndarray, is_open: np.ndarray) -> DenseDepth:
+    """Return the depth with a user's at open pixels where it is known."""
+    is_told = is_open & np.isfinite(user_m)
+    return depth._replace(
+        depth_m=np.where(is_told, user_m, depth.depth_m),
+        is_far=depth.is_far & ~is_told,
+        wall=np.where(is_told, -1, depth.wall),
+    )
 
 
 def _draw(

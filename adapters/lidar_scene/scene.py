@@ -141,13 +141,15 @@ def build_lidar_scene(
             sampled[0][0],
             max_gaussians=round(_CLOSED_PART * options.max_gaussians),
         )
-        parts[0] = close_above_beams(
+        parts[0], sentences = close_above_beams(
             parts,
             tracks,
             views,
             lidar_top_rad=math.radians(drive.lidar_top_deg),
             max_gaussians=options.max_gaussians,
+            depth_option=options.depth,
         )
+        faults = (*faults, *sentences)
     if not any(map(len, parts)):
         raise AdapterError(
             f"{drive.source}: none of the points that were measured is in any image; check that "

@@ -14,6 +14,7 @@ import numpy as np
 from adapters.lidar_scene.image_views import IMAGE_SCALES, View, draw_cover, read_image
 from adapters.lidar_scene.split import ObjectTrack
 from augment.photo.sky_matte import SkyMatte, find_sky_matte
+from augment.reconstruct.view import ViewKey
 from augment.scene.cameras import Camera
 
 WORK_WIDTH = 480  # columns of the images in which surfaces are added, at most
@@ -41,6 +42,8 @@ class SolidView(NamedTuple):
     """Its sky."""
     excluded: np.ndarray
     """Pixels of the recording car and of moving objects, bool [H, W]."""
+    key: ViewKey
+    """Frame and camera of the image."""
     known_m: np.ndarray | None = None
     """Depth of the surfaces that returns made, infinite without one, float [H, W]."""
 
@@ -73,7 +76,8 @@ def read_solid_view(
         if (pose := track.motion.pose_at(camera.timestamp_ns)) is not None
     ]
     excluded = view.shows_car(camera.width, camera.height)
-    return make_solid_view(camera, rgb, matte, excluded, boxes, points)
+    key = ViewKey(view.frame, view.camera.name)
+    return make_solid_view(key, camera, rgb, matte, excluded, boxes, points)
 
 
 def _find_matte(
@@ -106,6 +110,7 @@ def _find_matte(
 
 
 def make_solid_view(
+    key: ViewKey,
     camera: Camera,
     rgb: np.ndarray,
     matte: SkyMatte,
@@ -116,6 +121,7 @@ def make_solid_view(
     """Return a recorded image with a cleaned matte, without the pixels of moving objects.
 
     Args:
+        key: frame and camera of the image.
         camera: the camera at the image's size.
         rgb: uint8 [H, W, 3].
         matte: the image's sky.
@@ -131,7 +137,7 @@ def make_solid_view(
     surface_rgb = _without_rims(matte.surface_rgb, matte.sky_rgb, sky_share)
     matte = matte._replace(sky_share=sky_share, surface_rgb=surface_rgb)
     lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
-    return SolidView(camera, rgb, lab, matte, excluded | np.isfinite(cover))
+    return SolidView(camera, rgb, lab, matte, excluded | np.isfinite(cover), key)
 
 
 def _has_point(camera: Camera, points: np.ndarray) -> np.ndarray:

@@ -108,7 +108,7 @@ def _solid_view(scene: Scene, views: RecordedViews, key: ViewKey) -> SolidView |
         for actor in scene.actors
         if (pose := actor.track.pose_at(camera.timestamp_ns)) is not None
     ]
-    return make_solid_view(camera, rgb, matte, excluded, boxes, scene.background.means.numpy())
+    return make_solid_view(key, camera, rgb, matte, excluded, boxes, scene.background.means.numpy())
 
 
 def ego_body(scene: Scene, camera_name: str, mask: np.ndarray, source: ViewSource) -> Actor | None:
