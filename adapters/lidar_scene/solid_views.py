@@ -5,6 +5,7 @@ The callers are `adapters.lidar_scene.beyond_beams` and `adapters.training_views
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ WORK_WIDTH = 480  # columns of the images in which surfaces are added, at most
 _HALF = np.float32(0.5)  # share of sky that parts sky from surface
 _MIN_REGION_PX = 50  # least area of sky by the image alone
 _MAX_NEAR_SHARE = 0.2  # largest part of it that lies near surfaces
+_MAX_ABOVE_SHARE = 0.5  # largest part of it that stands above surfaces at the LiDAR's top
+_TOP_MARGIN_RAD = math.radians(4.0)  # below the LiDAR's top, from which a surface may go on
 _RIM_PX = 2  # width of rims that show mostly sky
 _RIM_LEVELS = 16  # largest difference from the sky of a rim, of 255
 _RIM_SHARE = 0.4  # the same as a part of the largest difference around
@@ -97,8 +100,14 @@ def _find_matte(
     count, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.erode(other, square))
     near_point = cv2.dilate(has_point.astype(np.uint8), square)
     num_near = np.bincount(labels.ravel(), near_point.ravel(), count)
+    rays = camera.ray_directions().numpy()
+    elevation_rad = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
+    reaches_top = has_point & (elevation_rad > lidar_top_rad - _TOP_MARGIN_RAD)
+    is_above_top = np.maximum.accumulate(reaches_top[::-1], axis=0)[::-1]
+    num_above = np.bincount(labels.ravel(), is_above_top.ravel(), count)
     area = stats[:, cv2.CC_STAT_AREA]
     is_sky = (area >= _MIN_REGION_PX) & (num_near < _MAX_NEAR_SHARE * area)
+    is_sky &= num_above < _MAX_ABOVE_SHARE * area
     is_sky[0] = False
     added = cv2.dilate(is_sky[labels].astype(np.uint8), square) & other
     rows, columns = np.nonzero(added)
