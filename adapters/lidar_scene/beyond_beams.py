@@ -115,7 +115,7 @@ def close_above_beams(
 
 
 class MapReader:
-    """Reads a user's depth maps, and counts what was found."""
+    """Reads a user's depth maps, and counts what it read."""
 
     def __init__(self, maps: DepthMaps) -> None:
         self._maps = maps
@@ -184,7 +184,7 @@ def add_surfaces_beyond_beams(
     for number, view in enumerate(views):
         room = max_added - (len(background) - count)
         room //= min(_VIEWS_PER_SHARE, len(views) - number)
-        alpha, known = _draw(background, view.camera, pose_parts)
+        alpha, known_surface = _draw(background, view.camera, pose_parts)
         # A sheet behind all of a leaking wall takes fewer discs than one behind each leak.
         leaks = cv2.blur(alpha, (_OPEN_WINDOW_PX, _OPEN_WINDOW_PX)) < _OPEN_ALPHA
         leaks &= view.camera.ray_directions().numpy()[..., 2] > -0.5 / view.camera.fy
@@ -192,21 +192,21 @@ def add_surfaces_beyond_beams(
         if not (leaks & (view.matte.sky_share < _SOLID_SHARE)).any() or room < 1:
             continue
         depth = complete_depth(
-            view.camera, view.rgb, view.matte.sky_share, known, walls, lidar_top_rad
+            view.camera, view.rgb, view.matte.sky_share, known_surface, walls, lidar_top_rad
         )
-        is_known = np.isfinite(known.depth_m)
+        is_known = np.isfinite(known_surface.depth_m)
         user_m = None if maps is None else maps.read(view)
         if user_m is not None:
             depth = _take_user_depth(depth, user_m, ~is_known)
         depth = depth._replace(
             depth_m=np.where(is_known, depth.depth_m * (1 + _BEHIND) + _BEHIND_M, depth.depth_m)
         )
-        others = [other for other in views if other is not view]
+        other_views = [other for other in views if other is not view]
         panes = _find_panes(view.matte.sky_share, depth.wall)
         sky_share = np.where(panes, np.float32(0), view.matte.sky_share)
         view = view._replace(matte=view.matte._replace(sky_share=sky_share))
         cells = _cells(view, depth, leaks & (sky_share < _SOLID_SHARE), room)
-        discs = _discs(view, depth, is_known | panes, cells, walls, others)
+        discs = _discs(view, depth, is_known | panes, cells, walls, other_views)
         background = join_gaussians([background, discs])
     logger.info("%d splats beyond the LiDAR's view", len(background) - count)
     return background
@@ -325,7 +325,7 @@ def _split(images: _CellImages, is_open: np.ndarray, tolerance: float) -> _Cells
     """Return cells of a quadtree: of each open pixel the largest one that is open and even."""
     height, width = is_open.shape
     missing = is_open.copy()
-    found = []
+    cell_lists = []
     for side in _SIDES_PX:
         rows = height // side
         columns = width // side
@@ -347,10 +347,10 @@ def _split(images: _CellImages, is_open: np.ndarray, tolerance: float) -> _Cells
             is_cell &= mean(images.from_sky_px) > _SKY_SIDES * side  # it would reach into the sky
             is_cell &= (variance < tolerance**2) & is_even
         cell_rows, cell_columns = np.nonzero(is_cell)
-        found.append((cell_rows * side, cell_columns * side, np.full(len(cell_rows), side)))
-        taken = np.kron(is_cell, np.ones((side, side), np.bool_))
-        missing[inside] &= ~taken
-    return _Cells(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        cell_lists.append((cell_rows * side, cell_columns * side, np.full(len(cell_rows), side)))
+        covered = np.kron(is_cell, np.ones((side, side), np.bool_))
+        missing[inside] &= ~covered
+    return _Cells(*(np.concatenate(parts) for parts in zip(*cell_lists, strict=True)))
 
 
 def _discs(
@@ -359,7 +359,7 @@ def _discs(
     is_sure: np.ndarray,
     cells: _Cells,
     walls: WallPlanes,
-    others: Sequence[SolidView],
+    other_views: Sequence[SolidView],
 ) -> Gaussians:
     """Return a disc for each cell, without those that other images see as sky.
 
@@ -376,7 +376,7 @@ def _discs(
     level = np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
     colors, share = _colors_of_cells(view, cells)
     lab = view.lab[middle_rows, middle_columns]
-    agreement = measure_agreement(centre + depth_m[:, None] * rays, lab, others)
+    agreement = measure_agreement(centre + depth_m[:, None] * rays, lab, other_views)
     conflicts = agreement.conflicts
     doubt = agreement.doubt()
     is_sure_cell = is_sure[middle_rows, middle_columns]
@@ -384,7 +384,7 @@ def _discs(
     unlikely = np.flatnonzero(doubt > 0)
     far_m = FAR_M / level[unlikely]
     far_points = centre + far_m[:, None] * rays[unlikely]
-    far_agreement = measure_agreement(far_points, lab[unlikely], others)
+    far_agreement = measure_agreement(far_points, lab[unlikely], other_views)
     better = far_agreement.doubt() < doubt[unlikely]
     goes_far = unlikely[better]
     depth_m[goes_far] = far_m[better]

@@ -86,7 +86,7 @@ def complete_depth(
     camera: Camera,
     rgb: np.ndarray,
     sky_share: np.ndarray,
-    known: KnownSurface,
+    known_surface: KnownSurface,
     walls: WallPlanes,
     lidar_top_rad: float,
 ) -> DenseDepth:
@@ -96,15 +96,15 @@ def complete_depth(
         camera: the image's camera.
         rgb: the photo at the camera's size, uint8 [H, W, 3].
         sky_share: share of sky in each pixel, float32 [H, W].
-        known: known surfaces.
+        known_surface: known surfaces.
         walls: walls of the scene.
         lidar_top_rad: highest elevation that the LiDAR looks at.
     """
-    is_known = np.isfinite(known.depth_m)
+    is_known = np.isfinite(known_surface.depth_m)
     rays = camera.ray_directions(torch.float64).numpy()
     level = np.hypot(rays[..., 0], rays[..., 1])
-    depth_m = np.where(is_known, known.depth_m, FAR_M / np.maximum(level, 1e-9))
-    semantic = known.semantic.copy()
+    depth_m = np.where(is_known, known_surface.depth_m, FAR_M / np.maximum(level, 1e-9))
+    semantic = known_surface.semantic.copy()
     is_far = ~is_known
     wall = np.full(is_known.shape, -1, np.int64)
     open_rows = np.flatnonzero((~is_known).any(axis=1))
@@ -116,7 +116,7 @@ def complete_depth(
             rays[rows],
             rgb[rows],
             sky_share[rows],
-            KnownSurface(*(image[rows] for image in known)),
+            KnownSurface(*(image[rows] for image in known_surface)),
             walls,
             lidar_top_rad,
         )
@@ -132,26 +132,26 @@ def _complete_rows(
     rays: np.ndarray,
     rgb: np.ndarray,
     sky_share: np.ndarray,
-    known: KnownSurface,
+    known_surface: KnownSurface,
     walls: WallPlanes,
     lidar_top_rad: float,
 ) -> DenseDepth:
     """Return depths of the image's upper rows. Arguments as in `complete_depth`."""
-    is_known = np.isfinite(known.depth_m)
+    is_known = np.isfinite(known_surface.depth_m)
     width = rgb.shape[1]
     level = np.maximum(np.hypot(rays[..., 0], rays[..., 1]), 1e-9)
     elevation_rad = np.arctan2(rays[..., 2], level)
-    plan_m = np.where(is_known, known.depth_m, 0.0) * level  # distance in plan
-    plant_share = _plant_share(rgb, is_known, known.semantic)
+    plan_m = np.where(is_known, known_surface.depth_m, 0.0) * level  # distance in plan
+    plant_share = _plant_share(rgb, is_known, known_surface.semantic)
 
-    is_low = np.isin(known.semantic, _LOW_CLASSES) & (
+    is_low = np.isin(known_surface.semantic, _LOW_CLASSES) & (
         elevation_rad < lidar_top_rad - _TOP_MARGIN_RAD
     )
-    is_seed = is_known & ~is_flat(known.semantic) & ~is_low & ~known.moves
+    is_seed = is_known & ~is_flat(known_surface.semantic) & ~is_low & ~known_surface.moves
     is_far_seed = _find_far(is_known, elevation_rad, lidar_top_rad, sky_share)
     plan_m[is_far_seed] = FAR_M
-    wall = _walls_of_seeds(centre, rays, level, plan_m, is_seed, known.semantic, walls)
-    is_plant = (known.semantic == SemanticClass.VEGETATION) & is_seed
+    wall = _walls_of_seeds(centre, rays, level, plan_m, is_seed, known_surface.semantic, walls)
+    is_plant = (known_surface.semantic == SemanticClass.VEGETATION) & is_seed
 
     seed = _cheapest_seeds(
         cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB),
@@ -168,7 +168,7 @@ def _complete_rows(
     seed = np.maximum(seed, 0)
     out_m = np.where(has_seed, plan_m.ravel()[seed], FAR_M)
     is_far = ~has_seed | is_far_seed.ravel()[seed]
-    semantic = known.semantic.ravel()[seed]
+    semantic = known_surface.semantic.ravel()[seed]
     directions = rays[..., :2] / level[..., None]
     seed_wall = wall
     wall = np.where(is_known, -1, seed_wall.ravel()[seed])
@@ -176,7 +176,7 @@ def _complete_rows(
     behind = ~is_known & is_plant.ravel()[seed] & (plant_share < _PLANT_SHARE) & has_seed
     is_wall_behind = _meet_walls_behind(out_m, wall, behind, centre, directions, walls)
     semantic = np.where(is_wall_behind, np.int16(SemanticClass.BUILDING), semantic)
-    if (known.semantic[is_known] != SemanticClass.UNKNOWN).any():
+    if (known_surface.semantic[is_known] != SemanticClass.UNKNOWN).any():
         looks_like = np.where(
             plant_share > 1 - _PLANT_SHARE, SemanticClass.VEGETATION, SemanticClass.BUILDING
         )
@@ -212,15 +212,15 @@ def _plant_share(rgb: np.ndarray, is_known: np.ndarray, semantic: np.ndarray) ->
     distributions.
     """
     plants = is_known & (semantic == SemanticClass.VEGETATION)
-    others = is_known & np.isin(semantic, _SOLID_CLASSES)
-    if min(plants.sum(), others.sum()) < _MIN_SAMPLES:
+    other_things = is_known & np.isin(semantic, _SOLID_CLASSES)
+    if min(plants.sum(), other_things.sum()) < _MIN_SAMPLES:
         return np.full(is_known.shape, 0.5, np.float32)
     lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     mean = cv2.blur(lab[..., 0], (7, 7))
     variance = np.maximum(cv2.blur(lab[..., 0] ** 2, (7, 7)) - mean * mean, 0)
     # A unit of roughness is to count about as much as a unit of colour.
     features = np.dstack([cv2.blur(lab, (5, 5)), 6 * np.log(np.sqrt(variance) + 1)])
-    evidence = _log_density(features, others) - _log_density(features, plants)
+    evidence = _log_density(features, other_things) - _log_density(features, plants)
     share = 1 / (1 + np.exp(np.clip(evidence, -30, 30)))
     return cv2.ximgproc.guidedFilter(rgb, share.astype(np.float32), 6, 200.0)
 

@@ -50,7 +50,7 @@ def hide_top_returns(drive: RawDrive, share: float) -> tuple[RawDrive, dict[int,
         elevations.append(elevation_rad)
         tops.append(np.quantile(elevation_rad[distance_m > _FROM_M], share))
     top_rad = float(np.median(tops))
-    hidden = {
+    hidden_points = {
         frame.index: sweep.points[elevation_rad > top_rad].astype(np.float64)
         for frame, sweep, elevation_rad in zip(frames, drive.sweeps, elevations, strict=True)
     }
@@ -59,24 +59,24 @@ def hide_top_returns(drive: RawDrive, share: float) -> tuple[RawDrive, dict[int,
         for sweep, elevation_rad in zip(drive.sweeps, elevations, strict=True)
     )
     top_deg = math.degrees(top_rad)
-    return dataclasses.replace(drive, sweeps=sweeps, lidar_top_deg=top_deg), hidden
+    return dataclasses.replace(drive, sweeps=sweeps, lidar_top_deg=top_deg), hidden_points
 
 
 def errors_at_hidden(
-    scene: Scene, frames: Sequence[Frame], hidden: Mapping[int, np.ndarray]
+    scene: Scene, frames: Sequence[Frame], hidden_points: Mapping[int, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Return relative errors of depth at hidden returns, by camera; infinite without a surface.
 
     Args:
         scene: the scene that was built without them.
         frames: frames to compare.
-        hidden: hidden returns by frame, as from `hide_top_returns`.
+        hidden_points: hidden returns by frame, as from `hide_top_returns`.
     """
     errors: dict[str, list[np.ndarray]] = {}
     for frame in frames:
         for name, full_camera in frame.cameras.items():
             camera = full_camera.scaled(min(1.0, _WIDTH / full_camera.width))
-            truth, _ = project_points(hidden[frame.index], camera, near_m=_NEAR_M)
+            truth, _ = project_points(hidden_points[frame.index], camera, near_m=_NEAR_M)
             truth = truth.select(is_visible_return(truth, camera))
             raster = rasterize(scene.parts_for(camera), camera, buffers=(ALPHA, MEDIAN_DEPTH))
             assert raster.alpha is not None and raster.median_depth is not None
