@@ -97,7 +97,7 @@ class DriveOptions(UriOptions):
     that images are decoded at for colours and sky, as JPEGs can be without a second resize.
     sky_size: texels along an edge of the sky's cube map. held_out: frames that the Gaussians, their
     colours and the sky are made without; they stay in the scene, and their boxes still make
-    tracks."""
+    tracks. depth: a user's depth maps for surfaces beyond the LiDAR's view."""
 
     frames: Annotated[range, BeforeValidator(lambda text: _frame_range(text, 2))] = Field(
         range(sys.maxsize),
@@ -115,6 +115,11 @@ class DriveOptions(UriOptions):
         None,
         description="first:stop:step, frame numbers with stop excluded, such as 1::2 for every "
         "other one",
+    )
+    depth: str | None = Field(
+        None,
+        description="a folder of depth maps, FOLDER/<camera>/<frame>.png or .npy, also as "
+        "metric:FOLDER or relative:FOLDER",
     )
 
     def select(self, numbers: Sequence[int], *, where: str) -> DriveFrames:

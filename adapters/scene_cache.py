@@ -26,6 +26,7 @@ import json
 import logging
 import math
 import os
+import re
 import secrets
 import shutil
 import time
@@ -202,7 +203,14 @@ def _read_files(
     A folder stands for everything in it.
     """
     yield from (Path(value) for value in query.values() if Path(value).is_file())
+    yield from _depth_folder(query)
     yield from DATASETS[scheme].scene_files(path, dict(query), open_labels)
+
+
+def _depth_folder(query: Mapping[str, str]) -> tuple[Path, ...]:
+    """Return the folder of a raw drive's option `depth`, which may begin with a kind of maps."""
+    option = query.get("depth")
+    return () if option is None else (Path(re.sub("^(metric|relative):", "", option)),)
 
 
 def _facts_of(paths: Iterable[Path]) -> Iterator[tuple[str, int, int]]:
@@ -299,6 +307,9 @@ def _digest_files(scheme: str, path: str, query: Mapping[str, str]) -> dict[str,
     for key, value in query.items():  # of cameras, say
         if Path(value).is_file():
             files[f"?{key}"] = Path(value), True
+    for folder in _depth_folder(query):
+        for file in visible_files(folder):
+            files[f"?depth/{os.path.relpath(file, folder)}"] = file, dataset.is_hashed_whole
     if len(files) > _MAX_FILES:
         raise AdapterError(f"{path} has more than {_MAX_FILES} files")
     return files

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from adapters.lidar_scene.image_views import View, draw_cover, read_image
+from adapters.lidar_scene.image_views import IMAGE_SCALES, View, draw_cover, read_image
 from adapters.lidar_scene.split import SKIN_M, ObjectTrack, PointSet, is_flat
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels, ground_points
 from adapters.raw_drive import BoxSample
@@ -43,7 +43,7 @@ from augment.scene.semantics import SemanticClass, class_of_label
 _WIDTH = 480  # columns of the images that are drawn
 _CELL_PX = 2  # smallest spacing of new discs, pixels of those images
 _MAX_CELL_PX = 8  # spacing that is doubled no further, pixels: larger discs hide the sky
-_IMAGE_SCALES = (0.125, 0.25, 0.5, 1.0)  # scales that recorded images can be decoded at
+
 _STEP_M = 1.2  # distance on the path from one image that is taken to the next
 _MIN_FRAMES = 4  # smallest limit on the number of frames whose images are taken
 _FRAMES_PART = 1 / 3  # the limit as a part of all frames, where that is more
@@ -99,7 +99,7 @@ def close_parts(
         _Box(0, box.world_from_box, np.asarray(box.size_m), class_of_label(box.label))
         for box in still
     ]
-    for view in _spread_views(views):
+    for view in spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART):
         poses = {0: np.eye(4)}
         for number, track in enumerate(tracks, start=1):
             pose = track.motion.pose_at(view.camera.timestamp_ns)
@@ -134,8 +134,11 @@ def close_parts(
     return parts
 
 
-def _spread_views(views: Sequence[View]) -> list[View]:
-    """Return the views of frames _STEP_M apart, the first and the last among them."""
+def spread_views(views: Sequence[View], *, step_m: float, frames_part: float) -> list[View]:
+    """Return the views of frames step_m apart, the first and the last among them.
+
+    Of more frames than frames_part of all and _MIN_FRAMES, as many are taken.
+    """
     by_frame: dict[int, list[View]] = {}
     for view in views:
         by_frame.setdefault(view.frame, []).append(view)
@@ -146,12 +149,12 @@ def _spread_views(views: Sequence[View]) -> list[View]:
         centre = frame_views[0].camera.centre.numpy()
         if (
             last_centre is None
-            or np.linalg.norm(centre - last_centre) >= _STEP_M
+            or np.linalg.norm(centre - last_centre) >= step_m
             or number == len(frames) - 1
         ):
             spread.append(frame_views)
             last_centre = centre
-    count = min(len(spread), max(_MIN_FRAMES, round(_FRAMES_PART * len(frames))))
+    count = min(len(spread), max(_MIN_FRAMES, round(frames_part * len(frames))))
     places = np.linspace(0, len(spread) - 1, count).round().astype(int)
     return [view for place in places for view in spread[place]]
 
@@ -345,7 +348,7 @@ class _Photo(NamedTuple):
 def _read_photo(view: View, camera: Camera, boxes: Sequence[_Box]) -> _Photo | None:
     """Read the photo at about half the camera's size, or None if it cannot be decoded."""
     scale = camera.width / view.camera.width
-    image = read_image(view.path, next(s for s in _IMAGE_SCALES if s >= scale))
+    image = read_image(view.path, next(s for s in IMAGE_SCALES if s >= scale))
     if image is None:
         return None
     small = camera.scaled(1 / _CELL_PX)

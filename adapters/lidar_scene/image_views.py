@@ -32,6 +32,7 @@ _KEEP_SCORE = 0.5  # part of a camera's best score from which its observations c
 _CAMERA_POWER = 2.0  # power of that best score that is the camera's weight
 _COVER_MARGIN_M = 0.15  # growth of a moving object's box to all sides, where it covers the world
 _AHEAD = 2  # images that are decoded before their turn
+IMAGE_SCALES = (0.125, 0.25, 0.5, 1.0)  # scales that recorded images can be decoded at
 _REDUCED = {
     1.0: cv2.IMREAD_COLOR,
     0.5: cv2.IMREAD_REDUCED_COLOR_2,

@@ -14,6 +14,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from adapters.lidar_scene.beyond_beams import close_above_beams
 from adapters.lidar_scene.closing import close_parts
 from adapters.lidar_scene.free_space import find_transient_returns
 from adapters.lidar_scene.image_views import Body, View, observe_views, read_image
@@ -56,6 +57,7 @@ _BORROW_EDGES = 6.0
 _BORROW_GROUND_M = 5.0
 _MASK_SCALE = 0.25  # scale of the images in which the recording car is looked for
 _MEASURED_PART = 0.9  # largest part of max_gaussians for measured points; the rest closes holes
+_CLOSED_PART = 0.95  # the same with the splats that close holes; the rest is for upper storeys
 _MIN_POINTS = 8  # fewest points that surfaces are sought in
 _TRIAL = 3.0  # edge of the trial's voxels over that of the finest voxels
 _REACHES_M = (8.0, 16.0)  # radii around the car in which its low height is sought, in turn
@@ -146,8 +148,22 @@ def build_lidar_scene(
         parts[0] = join_gaussians([parts[0], added])
     elif any(map(len, parts)):
         parts = close_parts(
-            parts, tracks, still, views, sampled[0][0], max_gaussians=options.max_gaussians
+            parts,
+            tracks,
+            still,
+            views,
+            sampled[0][0],
+            max_gaussians=round(_CLOSED_PART * options.max_gaussians),
         )
+        parts[0], sentences = close_above_beams(
+            parts,
+            tracks,
+            views,
+            lidar_top_rad=math.radians(drive.lidar_top_deg),
+            max_gaussians=options.max_gaussians,
+            depth_option=options.depth,
+        )
+        faults = (*faults, *sentences)
     if not any(map(len, parts)):
         raise AdapterError(
             f"{drive.source}: none of the points that were measured is in any image; check that "

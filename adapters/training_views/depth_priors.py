@@ -12,15 +12,21 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numba
 import numpy as np
 
 from adapters.lidar_scene.depth import DepthPixels, read_returns
-from adapters.plain_files import decode_image
-from adapters.safe_pickle import read_array, read_array_dict
+from adapters.lidar_scene.depth_maps import (
+    align,
+    check_aspect,
+    check_folder,
+    find_maps,
+    read_metric,
+    read_relative,
+)
+from adapters.safe_pickle import read_array_dict
 from augment.errors import AdapterError
 from augment.memo import SceneMemo
 from augment.reconstruct.view import ViewKey
@@ -31,16 +37,8 @@ from augment.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 
-METRIC_PER_M = 256.0  # levels per metre of 16-bit depth images
 _NUMBER = re.compile(r"\d{1,12}")
 _SPARSE_NAME = re.compile(r"(\d{1,12})_(.+)")
-_ASPECT_TOLERANCE = 0.02  # maps are often rounded to a multiple of 14 or 32 pixels
-_MIN_KNOWN = 30  # known distances that two numbers may be fitted to
-_ROUNDS = 30  # of reweighted least squares
-_MIN_SPREAD_PER_M = 1e-4  # residuals below this are as good as none
-_MIN_CORRELATION = 0.5  # of relative values and inverse depths; a map below it is refused
-_NEAREST_M = 0.5  # depth from which an aligned relative map is believed
-_FURTHEST_M = 120.0  # depth up to which an aligned relative map is believed
 _GRID_PX = 4  # dense maps are used at every such pixel of every such row
 _RELATIVE_WEIGHT = 0.1  # of relative maps beside LiDAR, which is 1
 _NEAREST_IN_FILE_M = 0.1  # values of a file that are larger are depths
@@ -54,31 +52,6 @@ _WIDEST_PART = 0.02  # of the image's width: what is further away says nothing
 ReferenceDepth = Callable[[ViewKey, Camera], np.ndarray]
 
 
-def find_maps(
-    folder: Path, keys: Collection[ViewKey], image_stems: Mapping[ViewKey, str], suffixes: set[str]
-) -> dict[ViewKey, Path]:
-    """Return the depth map's path of each view that has one.
-
-    A file is DIR/<camera>/<name>. Its name is that of the recorded image; where no file of the
-    camera has such a name, it is the frame's number."""
-    _check_folder(folder)
-    paths: dict[ViewKey, Path] = {}
-    for camera in dict.fromkeys(key.camera for key in keys):
-        camera_keys = [key for key in keys if key.camera == camera]
-        files = sorted(p for p in (folder / camera).glob("*") if p.suffix.lower() in suffixes)
-        path_by_stem = {path.stem: path for path in files}
-        paths_by_name = {
-            k: path_by_stem[image_stems[k]]
-            for k in camera_keys
-            if image_stems.get(k) in path_by_stem
-        }
-        path_by_number = {int(p.stem): p for p in files if _NUMBER.fullmatch(p.stem)}
-        paths |= paths_by_name or {
-            k: path_by_number[k.frame] for k in camera_keys if k.frame in path_by_number
-        }
-    return paths
-
-
 def find_sparse(
     folder: Path, keys: Collection[ViewKey], camera_names: Sequence[str]
 ) -> dict[ViewKey, Path]:
@@ -86,7 +59,7 @@ def find_sparse(
 
     <camera> is a camera's name, or its number in the scene's order as Street Gaussians counts them.
     """
-    _check_folder(folder)
+    check_folder(folder)
     requested = set(keys)
     paths: dict[ViewKey, Path] = {}
     for path in sorted(folder.glob("*.npy")):
@@ -100,40 +73,6 @@ def find_sparse(
         if key in requested:
             paths[key] = path
     return paths
-
-
-def read_metric(path: Path) -> np.ndarray:
-    """float32 [h, w] metres, 0 where unknown, from a 16-bit image of metres x 256."""
-    image = decode_image(path, cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise AdapterError(f"{path} cannot be decoded")
-    if image.dtype != np.uint16 or image.ndim != 2:
-        raise AdapterError(
-            f"{path} must be a 16-bit image of one channel, metres x {METRIC_PER_M:.0f}; "
-            f"it is {image.dtype} {list(image.shape)}"
-        )
-    return image.astype(np.float32) / np.float32(METRIC_PER_M)
-
-
-def read_relative(path: Path) -> np.ndarray:
-    """float32 [h, w] of any unit, larger where nearer, NaN where unknown, from .npy or an image."""
-    if path.suffix.lower() == ".npy":
-        values = read_array(path)
-    else:
-        values = decode_image(path, cv2.IMREAD_UNCHANGED)
-        if values is None:
-            raise AdapterError(f"{path} cannot be decoded")
-        if values.ndim == 3 and (values[..., :1] == values[..., :3]).all():
-            values = values[..., 0]  # grey written with three channels
-    values = values[0] if values.ndim == 3 and len(values) == 1 else values
-    if values.ndim != 2 or values.dtype.kind not in "fiu" or values.size == 0:
-        raise AdapterError(
-            f"{path} must be one inverse depth a pixel, [height, width], not colours; "
-            f"it is {values.dtype} {list(values.shape)}"
-        )
-    out = values.astype(np.float32)
-    out[~np.isfinite(out)] = np.nan
-    return out
 
 
 def read_sparse(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -155,87 +94,12 @@ def read_sparse(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return mask, value.astype(np.float32)
 
 
-def check_aspect(path: Path, shape: Sequence[int], camera: Camera) -> None:
-    """Refuse maps of another shape than the image: they are of another camera, or cropped."""
-    error = (shape[1] / shape[0]) / (camera.width / camera.height) - 1
-    if abs(error) > _ASPECT_TOLERANCE:
-        raise AdapterError(
-            f"{path} is of {shape[1]}x{shape[0]} pixels; a map of camera {camera.name!r} has the "
-            f"proportions of its image, {camera.width}x{camera.height}"
-        )
-
-
-def _check_folder(folder: Path) -> None:
-    if not folder.is_dir():
-        raise AdapterError(f"{folder}: no such folder; depth maps were to be read from it")
-
-
 def join_priors(priors: Sequence[DepthPixels]) -> DepthPixels:
     """Join one or more priors. If several have a pixel, the first in the sequence counts."""
     names = ("pixels", "depth_m", "weight")
     parts = [np.concatenate([getattr(prior, name) for prior in priors]) for name in names]
     _, first = np.unique(parts[0], return_index=True)  # the first occurrence, in order
     return DepthPixels(*parts).select(first)
-
-
-class Alignment(NamedTuple):
-    """Alignment of a relative map: 1 / z = scale relative + shift, in 1/m."""
-
-    scale: float
-    shift: float
-
-    def depth_m(self, relative: np.ndarray) -> np.ndarray:
-        """Return the depth of relative values, float32.
-
-        NaN if it is too near or far to be believed.
-        """
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = 1.0 / (self.scale * relative.astype(np.float64) + self.shift)
-            depth[~((depth >= _NEAREST_M) & (depth <= _FURTHEST_M))] = np.nan
-        return depth.astype(np.float32)
-
-
-def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
-    """Fit inverse depth by robust least squares over known pixels, both [M]. None if it fails.
-
-    The fit is iteratively reweighted with Cauchy's weights, whose spread follows the median
-    residual (Holland and Welsch 1977). It starts from a line through the quartiles. It fails with
-    fewer than 30 known pixels, without contrast, or if larger values are not clearly nearer.
-    """
-    x = relative.astype(np.float64)
-    y = 1.0 / depth_m.astype(np.float64)
-    is_finite = np.isfinite(x) & np.isfinite(y)
-    x = x[is_finite]
-    y = y[is_finite]
-    if len(x) < _MIN_KNOWN:
-        return None
-    low, middle, high = np.quantile(x, [0.1, 0.5, 0.9])
-    unit = high - low
-    if not unit > 0:
-        return None
-    x = (x - middle) / unit  # so that the normal equations are well conditioned
-    bottom, top = np.quantile(y, [0.1, 0.9])
-    scale = top - bottom
-    shift = float(np.median(y))
-    weight = np.ones_like(x)
-    for _ in range(_ROUNDS):
-        residual = y - (scale * x + shift)
-        spread = max(1.4826 * float(np.median(np.abs(residual))), _MIN_SPREAD_PER_M)
-        weight = 1.0 / (1.0 + (residual / (2.385 * spread)) ** 2)
-        weight /= weight.sum()
-        mean_x = float(weight @ x)
-        mean_y = float(weight @ y)
-        variance = float(weight @ (x - mean_x) ** 2)
-        covariance = float(weight @ ((x - mean_x) * (y - mean_y)))
-        if not variance > 0:
-            return None
-        scale = covariance / variance
-        shift = mean_y - scale * mean_x
-    spread_y = float(weight @ (y - mean_y) ** 2)
-    correlation = covariance / max((variance * spread_y) ** 0.5, 1e-12)
-    if correlation < _MIN_CORRELATION:
-        return None
-    return Alignment(scale / unit, shift - scale * middle / unit)
 
 
 def sparse_prior(path: Path, camera: Camera) -> DepthPixels:

@@ -1,9 +1,9 @@
 """Starting point of reconstruction: the scene of a recording, completed where LiDAR sees
 nothing.
 
-Walls and crowns continue above the LiDAR's view, and behind glass. Where images show neither sky
-nor a surface there, new surface stands straight over the surface below. Otherwise it would be
-learnt into the sky, where fog swallows it.
+Walls and crowns continue above the LiDAR's view, and behind glass, as in raw scenes
+(`adapters.lidar_scene.beyond_beams`). Otherwise they would be learnt into the sky, where fog
+swallows them.
 
 The recording car's own bonnet or roof stands before some cameras. It becomes an actor that travels
 with the camera; otherwise it would be learnt into the road below, anew in every frame. It stands
@@ -17,25 +17,22 @@ import dataclasses
 import logging
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 
+from adapters.lidar_scene.beyond_beams import add_surfaces_beyond_beams
+from adapters.lidar_scene.solid_views import WORK_WIDTH, SolidView, make_solid_view
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
 from adapters.training_views.views import RecordedViews
-from adapters.world import join_gaussians
-from augment.photo.lidar_view import TOP_MARGIN_RAD
 from augment.photo.own_car import spread_evenly
-from augment.reconstruct.view import ViewSource
-from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
-from augment.render.constants import SURFACE_ALPHA
-from augment.render.rasterize import rasterize
+from augment.photo.sky_matte import sky_matte
+from augment.reconstruct.view import ViewKey, ViewSource
 from augment.scene.cameras import Camera
 from augment.scene.geometry import rigid
 from augment.scene.labels import EGO_VEHICLE
-from augment.scene.scene import Actor, Gaussians, Scene, Track
+from augment.scene.scene import Actor, Gaussians, PosedGaussians, Scene, Track
 from augment.scene.semantics import SemanticClass
 
 logger = logging.getLogger(__name__)
@@ -52,17 +49,8 @@ _MIN_SLOPE = 0.05  # a roof below the camera is seen at no flatter angle than th
 _MARGIN_M = 0.01  # from the body's outermost splats to its box
 _BODY_SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
 
-_WALLS = (
-    SemanticClass.BUILDING,
-    SemanticClass.BARRIER,
-    SemanticClass.VEGETATION,
-    SemanticClass.UNKNOWN,
-)
-_WALL_COLUMNS = 240  # of the images in which walls are continued: one disc a pixel
-_MAX_WALL_IMAGES = 48  # in which walls are continued
-_MAX_WALL_M = 80.0  # beyond, a LiDAR's channels lie so far apart that a surface's end is unknown
-_MAX_WALL_SPLATS = 60_000  # that are added above walls, over all images
-_WALL_SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
+_MAX_WALL_IMAGES = 48  # in which surfaces beyond the LiDAR's view are added
+_MAX_WALL_SPLATS = 60_000  # that are added there, over all images
 
 # Camera axes (x right, y down, z forward) to an actor's (x forward, y left, z up).
 _ACTOR_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -82,102 +70,45 @@ def complete_starting_scene(scene: Scene, views: RecordedViews) -> Scene:
 
 
 def continue_walls(scene: Scene, views: RecordedViews) -> Gaussians:
-    """Return the background with discs where training views show neither sky nor a surface.
-
-    They stand straight over a wall or a crown that reaches the LiDAR's highest view, or that
-    continues above them.
-    """
+    """Return the background with discs where training views show neither sky nor a surface."""
     background = scene.background
     if views.lidar_top_rad is None or background.semantic is None:
         return background
-    classes = background.semantic.numpy()
-    room = _MAX_WALL_SPLATS
-    for key in spread_evenly(views.train, _MAX_WALL_IMAGES):
-        view = views.load(key)
-        camera = view.camera.scaled(min(1.0, _WALL_COLUMNS / view.camera.width))
-        parts = dataclasses.replace(scene, background=background).parts_for(camera)
-        raster = rasterize(parts, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
-        assert raster.alpha is not None
-        assert raster.median_depth is not None and raster.splat_ids is not None
-        ids = raster.splat_ids.numpy()
-        in_background = (ids >= 0) & (ids < len(background))
-        semantic = classes[np.where(in_background, ids, 0)]
-        size = (camera.width, camera.height)
-        closed = view.sky | views.own_car(key)
-        above_walls = _above_walls(
-            camera,
-            np.where(raster.alpha.numpy() >= SURFACE_ALPHA, raster.median_depth.numpy(), np.inf),
-            in_background & np.isin(semantic, _WALLS),
-            cv2.resize(closed.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0,
-            views.lidar_top_rad - TOP_MARGIN_RAD,
-        )
-        rows, columns = np.nonzero(above_walls.depth > 0)
-        room -= len(rows)
-        if room < 0:
-            break
-        rays = camera.ray_directions(torch.float64).numpy()[rows, columns]
-        depth = above_walls.depth[rows, columns]
-        normals = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        major = np.cross([0.0, 0.0, 1.0], normals)
-        major /= np.maximum(np.linalg.norm(major, axis=1, keepdims=True), 1e-9)
-        points = camera.centre.numpy() + depth[:, None] * rays
-        rgb = cv2.resize(view.rgb, size, interpolation=cv2.INTER_AREA)
-        discs = gaussians_from_surfels(
-            Surfels.discs(points, normals, major, depth / camera.fx),
-            (rgb[rows, columns] / 255).astype(np.float32),
-            semantic[above_walls.base[rows, columns], columns],
-            _WALL_SHAPE,
-        )
-        background = join_gaussians([background, discs])
-        classes = np.append(classes, semantic[above_walls.base[rows, columns], columns])
-    logger.info("%d splats above walls", len(background) - len(scene.background))
-    return background
+    solid_views = [
+        solid_view
+        for key in spread_evenly(views.train, _MAX_WALL_IMAGES)
+        if (solid_view := _solid_view(scene, views, key)) is not None
+    ]
+
+    def pose_parts(background: Gaussians, camera: Camera) -> Sequence[PosedGaussians]:
+        return dataclasses.replace(scene, background=background).parts_for(camera)
+
+    return add_surfaces_beyond_beams(
+        background,
+        solid_views,
+        pose_parts,
+        lidar_top_rad=views.lidar_top_rad,
+        max_added=_MAX_WALL_SPLATS,
+    )
 
 
-class _AboveWalls(NamedTuple):
-    """Surface that is added above walls.
-
-    Attributes:
-        depth: float64 [H, W], z of the new surface, 0 without one.
-        base: int64 [H, W], row of the surface below.
-    """
-
-    depth: np.ndarray
-    base: np.ndarray
-
-
-def _above_walls(
-    camera: Camera, depth: np.ndarray, is_wall: np.ndarray, closed: np.ndarray, top_rad: float
-) -> _AboveWalls:
-    """Return the surface to add above walls.
-
-    depth: [H, W], z of surfaces, infinite where there is none. is_wall: bool [H, W]. closed: bool
-    [H, W], sky and the recording car. top_rad: highest elevation of the LiDAR's view."""
-    height = camera.height
-    row = np.arange(height)[:, None]
-    solid = np.isfinite(depth)
-
-    def below(mask: np.ndarray) -> np.ndarray:
-        """Return each pixel's nearest row of the mask at or below it; height where none is."""
-        rows = np.where(mask, row, height)
-        return np.minimum.accumulate(rows[::-1], axis=0)[::-1]
-
-    def above(mask: np.ndarray) -> np.ndarray:
-        """Return each pixel's nearest row of the mask at or above it; -1 where none is."""
-        return np.maximum.accumulate(np.where(mask, row, -1), axis=0)
-
-    base = below(solid)
-    goes_on = ~solid & (base < height) & (below(closed) > base)
-    base = np.minimum(base, height - 1)
-    columns = np.arange(camera.width)[None]
-    rays = camera.ray_directions(torch.float64).numpy()
-    level = np.hypot(rays[..., 0], rays[..., 1])  # metres on the plan for a metre of depth
-    rise_rad = np.arctan2(rays[..., 2], level)
-    distance_m = np.where(solid, depth, 0.0)[base, columns] * level[base, columns]
-    goes_on &= (rise_rad > 0) & is_wall[base, columns] & (distance_m < _MAX_WALL_M)
-    is_enclosed = above(solid) > above(closed)
-    goes_on &= is_enclosed | (rise_rad[base, columns] > top_rad)
-    return _AboveWalls(np.where(goes_on, distance_m / np.maximum(level, 1e-9), 0.0), base)
+def _solid_view(scene: Scene, views: RecordedViews, key: ViewKey) -> SolidView | None:
+    """Return a training view with its sky, or None if it is too dark to tell."""
+    full_camera = views.camera(key)
+    camera = full_camera.scaled(min(1.0, WORK_WIDTH / full_camera.width))
+    size = (camera.width, camera.height)
+    rgb = cv2.resize(views.image(key), size, interpolation=cv2.INTER_AREA)
+    matte = sky_matte(scene, camera, rgb)
+    if matte is None:
+        return None
+    own_car = views.own_car(key).astype(np.float32)
+    excluded = cv2.resize(own_car, size, interpolation=cv2.INTER_AREA) > 0
+    boxes = [
+        (pose.numpy(), np.array(actor.size_m))
+        for actor in scene.actors
+        if (pose := actor.track.pose_at(camera.timestamp_ns)) is not None
+    ]
+    return make_solid_view(key, camera, rgb, matte, excluded, boxes, scene.background.means.numpy())
 
 
 def ego_body(scene: Scene, camera_name: str, mask: np.ndarray, source: ViewSource) -> Actor | None:

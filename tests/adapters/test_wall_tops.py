@@ -52,19 +52,20 @@ def test_a_wall_goes_on_to_the_sky_straight_above_what_the_lidar_saw(tmp_path):
     new = background.select(torch.arange(len(scene.background), len(background)))
     x, y, z = new.means.T
     # Where the wall was drawn last, within a splat's size; a pixel is 0.2 m there.
-    assert (x - AWAY_M).abs().max() < 0.3 and (y > -0.5).all()
+    assert (x - AWAY_M).abs().max() < 0.3
+    # Above the low wall is sky; below its top, discs close what leaks.
+    assert (y[z > RIGHT_TOP_M + 0.3] > -0.5).all()
     assert z.max() < LEFT_TOP_M + 0.3
     heights = torch.histc(z[(y > 1) & (y < 9)], 12, 0, 12)
     assert (heights[7:9] > 100).all()  # 8 m at 0.2 m are 40 a row, and five rows a metre
     in_window = (y > 10.2) & (y < 11.8) & (z > 4.2) & (z < 5.8)
-    assert in_window.sum() > 20
+    assert in_window.sum() > 8  # 6 x 10 pixels, in discs of one to four pixels each
     assert (new.semantic == SemanticClass.BUILDING).all()
     colours = new.sh[:, 0] * 0.28209479 + 0.5
     above = z > 7.5
     assert ((colours[above] > 0.4) & (colours[above] < 0.55)).all()
 
 
-def test_nothing_goes_on_above_a_car_or_where_the_lidars_top_is_unknown(tmp_path):
-    for scene in (drive(tmp_path, SemanticClass.VEHICLE), drive(tmp_path, sweep=False)):
-        views = RecordedViews(scene, scale=1.0)
-        assert len(continue_walls(scene, views)) == len(scene.background)
+def test_nothing_goes_on_where_the_lidars_top_is_unknown(tmp_path):
+    scene = drive(tmp_path, sweep=False)
+    assert len(continue_walls(scene, RecordedViews(scene, scale=1.0))) == len(scene.background)

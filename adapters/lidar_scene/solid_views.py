@@ -1,0 +1,230 @@
+"""Recorded images that tell surfaces from sky.
+
+The callers are `adapters.lidar_scene.beyond_beams` and `adapters.training_views.starting_scene`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from adapters.lidar_scene.image_views import IMAGE_SCALES, View, draw_cover, read_image
+from adapters.lidar_scene.split import ObjectTrack
+from augment.photo.sky_matte import SkyMatte, find_sky_matte
+from augment.reconstruct.view import ViewKey
+from augment.scene.cameras import Camera
+
+WORK_WIDTH = 480  # columns of the images in which surfaces are added, at most
+_HALF = np.float32(0.5)  # share of sky that parts sky from surface
+_MIN_REGION_PX = 50  # least area of sky by the image alone
+_MAX_NEAR_SHARE = 0.2  # largest part of it that lies near surfaces
+_MAX_ABOVE_SHARE = 0.5  # largest part of it that stands above surfaces at the LiDAR's top
+_TOP_MARGIN_RAD = math.radians(4.0)  # below the LiDAR's top, from which a surface may go on
+_RIM_PX = 2  # width of rims that show mostly sky
+_RIM_LEVELS = 16  # largest difference from the sky of a rim, of 255
+_RIM_SHARE = 0.4  # the same as a part of the largest difference around
+_SPECK_PX = 300  # largest area of a speck of cloud
+_SPECK_SHARE = 0.8  # least brightness of a speck of cloud, as a part of the sky's
+_NEAREST_M = 1.0  # smallest depth of a point that a camera sees
+
+
+class SolidView(NamedTuple):
+    """A recorded image in which surfaces are added, of H x W pixels."""
+
+    camera: Camera
+    """Camera at the image's size."""
+    rgb: np.ndarray
+    """The photo, uint8 [H, W, 3]."""
+    lab: np.ndarray
+    """The photo in CIELAB, float32 [H, W, 3]."""
+    matte: SkyMatte
+    """Its sky."""
+    excluded: np.ndarray
+    """Pixels of the recording car and of moving objects, bool [H, W]."""
+    key: ViewKey
+    """Frame and camera of the image."""
+    known_m: np.ndarray | None = None
+    """Depth of the surfaces that returns made, infinite without one, float [H, W]."""
+
+
+def read_solid_view(
+    view: View, tracks: Sequence[ObjectTrack], points: np.ndarray, lidar_top_rad: float
+) -> SolidView | None:
+    """Return a recorded image with its sky, at WORK_WIDTH columns at most.
+
+    The result is None if it cannot be decoded, or is too dark to tell its sky.
+
+    Args:
+        view: the image.
+        tracks: moving objects.
+        points: float [N, 3], surfaces of what stands still, world.
+        lidar_top_rad: highest elevation that the LiDAR measures.
+    """
+    camera = view.camera.scaled(min(1.0, WORK_WIDTH / view.camera.width))
+    scale = camera.width / view.camera.width
+    image = read_image(view.path, next(s for s in IMAGE_SCALES if s >= scale))
+    if image is None:
+        return None
+    rgb = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    matte = _find_matte(rgb, camera, _has_point(camera, points), lidar_top_rad)
+    if matte is None:
+        return None
+    boxes = [
+        (pose, track.size_m)
+        for track in tracks
+        if (pose := track.motion.pose_at(camera.timestamp_ns)) is not None
+    ]
+    excluded = view.shows_car(camera.width, camera.height)
+    key = ViewKey(view.frame, view.camera.name)
+    return make_solid_view(key, camera, rgb, matte, excluded, boxes, points)
+
+
+def _find_matte(
+    rgb: np.ndarray, camera: Camera, has_point: np.ndarray, lidar_top_rad: float
+) -> SkyMatte | None:
+    """Return the sky of an image; None if it is too dark to tell.
+
+    With LiDAR, a wire that reaches the LiDAR's top hides the sky beside it. Regions that are sky by
+    the image alone count as well if hardly any surface lies in them.
+    """
+    matte = find_sky_matte(rgb, camera, has_point, lidar_top_rad)
+    alone = find_sky_matte(rgb, camera)
+    if matte is None or alone is None:
+        return matte
+    other = ((alone.sky_share >= _HALF) & (matte.sky_share < _HALF)).astype(np.uint8)
+    square = np.ones((5, 5), np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.erode(other, square))
+    near_point = cv2.dilate(has_point.astype(np.uint8), square)
+    num_near = np.bincount(labels.ravel(), near_point.ravel(), count)
+    rays = camera.ray_directions().numpy()
+    elevation_rad = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
+    reaches_top = has_point & (elevation_rad > lidar_top_rad - _TOP_MARGIN_RAD)
+    is_above_top = np.maximum.accumulate(reaches_top[::-1], axis=0)[::-1]
+    num_above = np.bincount(labels.ravel(), is_above_top.ravel(), count)
+    area = stats[:, cv2.CC_STAT_AREA]
+    is_sky = (area >= _MIN_REGION_PX) & (num_near < _MAX_NEAR_SHARE * area)
+    is_sky &= num_above < _MAX_ABOVE_SHARE * area
+    is_sky[0] = False
+    added = cv2.dilate(is_sky[labels].astype(np.uint8), square) & other
+    rows, columns = np.nonzero(added)
+    sky_share = matte.sky_share.copy()
+    sky_rgb = matte.sky_rgb.copy()
+    sky_share[rows, columns] = alone.sky_share[rows, columns]
+    sky_rgb[rows, columns] = alone.sky_rgb[rows, columns]
+    return matte._replace(sky_share=sky_share, sky_rgb=sky_rgb)
+
+
+def make_solid_view(
+    key: ViewKey,
+    camera: Camera,
+    rgb: np.ndarray,
+    matte: SkyMatte,
+    excluded: np.ndarray,
+    boxes: Sequence[tuple[np.ndarray, np.ndarray]],
+    points: np.ndarray,
+) -> SolidView:
+    """Return a recorded image with a cleaned matte, without the pixels of moving objects.
+
+    Args:
+        key: frame and camera of the image.
+        camera: the camera at the image's size.
+        rgb: uint8 [H, W, 3].
+        matte: the image's sky.
+        excluded: pixels of the recording car, bool [H, W].
+        boxes: world_from_box [4, 4] and size in metres [3] of the moving objects.
+        points: float [N, 3], surfaces of what stands still, world.
+    """
+    cover = np.full((camera.height, camera.width), np.inf, np.float32)
+    for world_from_box, size_m in boxes:
+        draw_cover(cover, camera, camera.camera_from_world.numpy() @ world_from_box, size_m)
+    has_point = _has_point(camera, points)
+    sky_share = _without_specks(rgb, matte, has_point)
+    surface_rgb = _without_rims(matte.surface_rgb, matte.sky_rgb, sky_share)
+    matte = matte._replace(sky_share=sky_share, surface_rgb=surface_rgb)
+    lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    return SolidView(camera, rgb, lab, matte, excluded | np.isfinite(cover), key)
+
+
+def _has_point(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return the pixels into which points fall, bool [H, W]."""
+    has_point = np.zeros((camera.height, camera.width), np.bool_)
+    _, rows, columns, _ = project_into(camera, points)
+    has_point[rows, columns] = True
+    return has_point
+
+
+def _without_specks(rgb: np.ndarray, matte: SkyMatte, has_point: np.ndarray) -> np.ndarray:
+    """Return the share of sky without specks of cloud, and without bright rims, float32 [H, W].
+
+    At this size an edge is a pixel wide, and half of it shows sky.
+
+    Args:
+        rgb: the photo, uint8 [H, W, 3].
+        matte: its sky.
+        has_point: pixels with a known surface, bool [H, W].
+    """
+    is_solid = matte.sky_share < _HALF
+    difference = np.abs(rgb.astype(np.int16) - matte.sky_rgb).max(axis=2)
+    around = cv2.dilate(difference, np.ones((5, 5), np.uint8))
+    looks_like_sky = difference < np.maximum(_RIM_LEVELS, _RIM_SHARE * around)
+    square = np.ones((3, 3), np.uint8)
+    for _ in range(_RIM_PX):
+        beside_sky = cv2.dilate((~is_solid).astype(np.uint8), square) > 0
+        is_solid &= ~(beside_sky & looks_like_sky)
+    luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    sky_luma = cv2.cvtColor(matte.sky_rgb, cv2.COLOR_RGB2GRAY)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(is_solid.astype(np.uint8))
+    flat = labels.ravel()
+    is_bright = np.bincount(flat, (luma - _SPECK_SHARE * sky_luma).ravel(), count) > 0
+    num_points = np.bincount(flat, has_point.ravel(), count)
+    is_speck = is_bright & (num_points == 0) & (stats[:, cv2.CC_STAT_AREA] < _SPECK_PX)
+    is_speck[0] = True  # sky itself
+    return np.where(is_speck[labels], np.maximum(matte.sky_share, _HALF), matte.sky_share)
+
+
+def _without_rims(rgb: np.ndarray, sky_rgb: np.ndarray, sky_share: np.ndarray) -> np.ndarray:
+    """Return colours in which pixels beside sky have that of the neighbour least like sky.
+
+    Args:
+        rgb: colours of surfaces, uint8 [H, W, 3].
+        sky_rgb: colours of the sky around, uint8 [H, W, 3].
+        sky_share: share of sky, float32 [H, W].
+    """
+    height, width = sky_share.shape
+    is_sky = sky_share >= _HALF
+    difference = np.abs(rgb.astype(np.int16) - sky_rgb).max(axis=2)
+    difference[is_sky] = -1
+    beside_sky = cv2.dilate(is_sky.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    rows, columns = np.nonzero(beside_sky & ~is_sky)
+    best = difference[rows, columns]
+    out = rgb.copy()
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            near_rows = np.clip(rows + down, 0, height - 1)
+            near_columns = np.clip(columns + right, 0, width - 1)
+            is_better = difference[near_rows, near_columns] > best
+            best[is_better] = difference[near_rows, near_columns][is_better]
+            chosen = rgb[near_rows[is_better], near_columns[is_better]]
+            out[rows[is_better], columns[is_better]] = chosen
+    return out
+
+
+def project_into(
+    camera: Camera, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points inside the image, their rows, columns (all int64 [K]) and depths, [K].
+
+    points: float [N, 3], world.
+    """
+    pose = camera.camera_from_world.numpy()
+    x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
+    front = np.flatnonzero(z > _NEAREST_M)
+    u = np.floor(camera.fx * x[front] / z[front] + camera.cx)
+    v = np.floor(camera.fy * y[front] / z[front] + camera.cy)
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    index = front[inside]
+    return index, v[inside].astype(np.int64), u[inside].astype(np.int64), z[index]
