@@ -60,6 +60,7 @@ from augment.render.fog import Fog, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import PosedGaussians, Scene
+from augment.scene.semantics import SemanticClass
 from recipes.schema import Recipe
 
 # Alpha of reconstructed surfaces up to which a pixel counts as empty. What a photo shows is opaque,
@@ -469,6 +470,13 @@ class Photo:
             lit_share = self.sharpen(torch.from_numpy(lit_share), SKY_RADIUS_FACTOR).numpy()
         lit_steps = cv2.merge([np.rint(lit_share * 255).astype(np.uint8)] * 3)
         return rgb * torch.from_numpy(cv2.LUT(lit_steps, factors[None])).to(rgb.device)
+
+    @property
+    def own_car_colors(self) -> Float[Tensor, "H W 3"]:
+        """Return the photo in the colours of the recording car: those of vehicles."""
+        if self.style is None or len(self.style.surface_maps) == 1:
+            return self._land
+        return self._in_colors(self.style.surface_maps[int(SemanticClass.VEHICLE)])
 
     def sky_colors(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """Return the sky's colours at the pixels of a window."""

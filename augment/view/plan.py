@@ -76,6 +76,8 @@ class Plan:
     """If True, the cameras' colour maps are applied to the finished picture."""
     is_on_photo: bool
     """If True, the recorded image stays the picture, and the scene supplies the weather."""
+    covers_own_car: bool
+    """If True, snow lies on the recording car in a recorded image; else the car stays dry."""
     sensor: Sensor
     """Lens and sensor of the recipe."""
     seed: int
@@ -182,6 +184,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         finds_boxes=finds_boxes,
         uses_recorded_exposure=exposure.runs,
         is_on_photo=recipe.render.is_on_recorded,
+        covers_own_car=recipe.render.is_on_recorded and recipe.render.own_car == "snowy",
         sensor=recipe.camera,
         seed=recipe.seed,
         steps=_all_steps(recipe, scene, effect_plans, buffers, bare_buffers, exposure),
@@ -242,6 +245,7 @@ def _photo_step(recipe: Recipe) -> Step:
     why = f"render.base is {recipe.render.base!r}"
     if is_on_recorded:
         why += ": the recorded image is the picture, edges of the weather move to its own"
+        why += f"; the recording car in it stays {recipe.render.own_car}"
     return Step("photo", is_on_recorded, why)
 
 
