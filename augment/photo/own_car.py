@@ -15,6 +15,7 @@ to tell (`augment.photo.own_car_outline`), which also brings the outline to the 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Float64
 from torch import Tensor
 
@@ -151,8 +153,8 @@ def find_own_car_outline(
     height, width = images[0].shape[:2]
     images = [_in_size(image, (width, height)) for image in images]
     rough_tops = _outline_by_motion(cameras, images)
-    axis_column = _axis_column(cameras[0], None if world_from_egos is None else world_from_egos[0])
-    edge_tops = None if axis_column is None else find_symmetric_outline(images, axis_column)
+    axis = _axis_in(cameras[0], None if world_from_egos is None else world_from_egos[0])
+    edge_tops = None if axis is None else find_symmetric_outline(images, *axis)
     if edge_tops is None:
         return None if rough_tops is None else refine_outline(images, rough_tops)
     if rough_tops is not None and _distance(rough_tops, edge_tops) > _MAX_DISTANCE:
@@ -195,8 +197,9 @@ def _in_size(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _axis_column(camera: Camera, world_from_ego: Tensor | None) -> float | None:
-    """Return the column in which the car's axis vanishes, as a part of the width.
+def _axis_in(camera: Camera, world_from_ego: Tensor | None) -> tuple[float, float] | None:
+    """Return the column in which the car's axis vanishes, and the row from which the road below it
+    would be less than _REACH_M away, as parts of the width and height.
 
     None where the camera does not look along the axis, or where the car's pose is not known.
     """
@@ -205,7 +208,13 @@ def _axis_column(camera: Camera, world_from_ego: Tensor | None) -> float | None:
     axis = (camera.camera_from_world[:3, :3] @ world_from_ego[:3, 0]).tolist()
     if abs(axis[2]) < _MIN_AXIS_COSINE:
         return None
-    return (camera.fx * axis[0] / axis[2] + camera.cx) / camera.width
+    column = camera.fx * axis[0] / axis[2] + camera.cx
+    # The road's point at that distance ahead or behind, in the camera's axes.
+    ahead = math.copysign(_REACH_M, axis[2])
+    down = camera.camera_from_world[:3, :3] @ world_from_ego[:3, 2] * -_CAMERA_HEIGHT_M
+    point = (ahead * torch.tensor(axis, dtype=down.dtype) + down).tolist()
+    row = camera.fy * point[1] / point[2] + camera.cy
+    return column / camera.width, row / camera.height
 
 
 def _road_flow(cameras: Sequence[Camera]) -> np.ndarray:

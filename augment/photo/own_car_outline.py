@@ -36,8 +36,8 @@ _SMOOTH_LEVELS = 3.0
 # Contrast relative to the window's mean from which an edge counts no more.
 _MAX_RELATIVE_CONTRAST = 2.5
 
-# Heights at which the apex may lie, parts of the image's height from the top.
-_MIN_APEX_PART = 0.5
+# Width of images that show a bow, at least, pixels.
+_MIN_SEARCH_WIDTH = 240
 # Step between apexes that are tried, pixels.
 _APEX_STEP_PX = 1.0
 # Bows that are tried, parts of the image's width.
@@ -154,21 +154,27 @@ def _best_path(gain: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def find_symmetric_outline(
-    images: Sequence[np.ndarray], axis_column: float
+    images: Sequence[np.ndarray], axis_column: float, min_apex: float
 ) -> Float64[np.ndarray, " w"] | None:
     """Return the outline of a car that a camera sees along the car's axis; None without any.
 
     Args:
         images: images of one camera, uint8 [H, W, 3], of one size; one is enough.
         axis_column: column of the image in which the car's axis vanishes, as a part of the width.
+        min_apex: least row of the outline on the axis, as a part of the height. Above it lie the
+            road's borders, which meet on the axis as an outline's sides do.
 
     Returns:
         The first row of the car in each column of a small image, as a part of the height; 1 or
         more where the column shows no car.
     """
+    if images[0].shape[1] < _MIN_SEARCH_WIDTH:
+        return None
     search = _OutlineSearch.of(images, axis_column)
     bows = _BOWS * search.num_columns
-    apexes = np.arange(_MIN_APEX_PART * search.num_rows, search.num_rows - 4, _APEX_STEP_PX)
+    apexes = np.arange(min_apex * search.num_rows, search.num_rows - 4, _APEX_STEP_PX)
+    if len(apexes) == 0:
+        return None
     line, score = search.best_line(apexes, bows)
     if score < _MIN_SCORE:
         return None

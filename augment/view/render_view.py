@@ -21,6 +21,7 @@ from torch import Tensor
 from augment import effects
 from augment.detail.prune import prune_parts
 from augment.effects.effect import EffectInScene, LabelInputs, RenderedView
+from augment.light.cast_shadows import faded_shadows
 from augment.output.layout import TRUST
 from augment.photo.own_car import OwnCar, own_car_in_view
 from augment.photo.own_car_snow import cover_own_car
@@ -44,6 +45,7 @@ from augment.view.plan import (
     BARE_SURFACE_PASS,
     LENS_BLUR_PASS,
     SENSOR_NOISE_PASS,
+    SHADOW_PASS,
     Plan,
     ViewPlan,
     make_plan,
@@ -123,8 +125,14 @@ def render_buffers(
         with timed("photo"):
             photo = open_photo(scene, camera, color_map, backend=backend)
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
+    is_fading = plan.sun_share < 1
     for effect in view.effects:
+        if is_fading and _is_weather(effect):  # a style comes first, with maps of its own
+            layers = _fade_shadows(layers, scene, plan.sun_share)
+            is_fading = False
         layers = effect.hooks.edit_scene(effect, layers, camera)
+    if is_fading:
+        layers = _fade_shadows(layers, scene, plan.sun_share)
     if plan.prune > 0:
         with timed("prune"):
             parts = prune_parts(layers.parts, scene, camera, plan.prune)
@@ -189,6 +197,26 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> RenderedView
         if rendered is not None:
             return rendered
     return RenderedView(*layers.render_with_sky(camera, view.buffers), layers)
+
+
+def _fade_shadows(layers: LayerRenderer, scene: Scene, sun_share: float) -> LayerRenderer:
+    """Return the layers with the cast shadows on the ground faded.
+
+    Args:
+        layers: the layers, before any weather.
+        scene: the scene.
+        sun_share: share of the sun's light that arrives at the ground.
+    """
+    with timed(SHADOW_PASS):
+        shadows = faded_shadows(scene, sun_share)
+        if shadows is None:
+            return layers
+        parts = tuple(
+            part if part.instance_id or part.is_overlay else shadows.apply_to(part)
+            for part in layers.parts
+        )
+        photo = layers.photo and replace(layers.photo, faded_shadows=shadows)
+    return replace(layers, parts=parts, photo=photo)
 
 
 def _is_weather(effect: EffectInScene) -> bool:

@@ -91,7 +91,7 @@ def test_nothing_is_told_where_nothing_can_be_told():
         edge = np.rint(top).astype(int)
         for x in range(SIZE[0]):
             stones[edge[x] : edge[x] + 40, x] = 230 if x // 40 % 2 else 15
-        assert find_symmetric_outline([stones], 0.5) is None
+        assert find_symmetric_outline([stones], 0.5, 0.5) is None
 
 
 def test_the_edge_that_stands_still_is_taken():
