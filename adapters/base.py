@@ -1,9 +1,10 @@
 """Open scenes by URI: `open_scene("scheme:path?key=value&…")`.
 
 Schemes and syntax are those of adapters.uri. A path without a scheme is recognised by its contents.
-Two keys work with every scheme: `camera_path=FILE` replaces the scene's cameras (see
+Three keys work with every scheme: `camera_path=FILE` replaces the scene's cameras (see
 adapters.camera_files.paths); `ground_z=HEIGHT` gives the height of the road (scene world, metres)
-if the scene does not know it or is wrong.
+if the scene does not know it or is wrong; `ego_masks=FOLDER` gives the pixels of recorded images
+that show the recording car (see adapters.ego_masks).
 """
 
 from __future__ import annotations
@@ -22,9 +23,11 @@ from pathlib import Path
 from adapters.camera_files.paths import with_camera_path
 from adapters.datasets import DATASETS
 from adapters.detect_format import describe_unrecognised, detect_scheme
+from adapters.ego_masks import with_ego_masks
 from adapters.scene_cache import cached_scene
 from adapters.uri import (
     CAMERA_PATH_KEY,
+    EGO_MASKS_KEY,
     GROUND_KEY,
     add_to_uri,
     format_uri,
@@ -47,6 +50,7 @@ def open_scene(uri: str) -> Scene:
     scheme, path, query = parse_uri(uri)
     camera_path = query.pop(CAMERA_PATH_KEY, None)
     ground_z = query.pop(GROUND_KEY, None)
+    ego_masks = query.pop(EGO_MASKS_KEY, None)
     if scheme is None:
         scheme = detect_scheme_of_path(Path(path))
     dataset = DATASETS.get(scheme)
@@ -74,6 +78,8 @@ def open_scene(uri: str) -> Scene:
             raise AdapterError(f"{uri!r}: {error}") from error
     if ground_z is not None:
         scene = _with_ground(scene, ground_z)
+    if ego_masks is not None:
+        scene = with_ego_masks(scene, Path(ego_masks))
     if camera_path is None:
         return scene
     return with_camera_path(scene, Path(camera_path))
@@ -152,7 +158,8 @@ def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
     scheme, path, query = parse_uri(entry.uri)
     dataset = DATASETS.get(scheme) if scheme is not None else None
     query = {
-        key: value if key in _NAME_KEYS else _from(folder, value) for key, value in query.items()
+        key: value if key in _NAME_KEYS else _from(folder, key, value)
+        for key, value in query.items()
     }
     if scheme is not None and dataset is None:
         return [entry]  # refused where it is opened
@@ -219,10 +226,11 @@ def _matches(top: Path, parts: tuple[str, ...], scene_uri: str) -> list[str]:
     return sorted(set(below(str(top), parts)))
 
 
-def _from(folder: Path, value: str) -> str:
+def _from(folder: Path, key: str, value: str) -> str:
     """Return a value of the query that names a file beside the job as an absolute path."""
     beside = folder.absolute() / value
-    names_a_file = ("/" in value or "." in value) and beside.exists()
+    may_name_a_file = key == EGO_MASKS_KEY or "/" in value or "." in value
+    names_a_file = may_name_a_file and beside.exists()
     return str(beside) if names_a_file else value
 
 

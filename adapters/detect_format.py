@@ -15,7 +15,7 @@ from pathlib import Path
 
 from adapters.dataset import Signature
 from adapters.datasets import DATASETS, RECOGNITION_ORDER
-from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, parse_uri
+from adapters.uri import CAMERA_PATH_KEY, EGO_MASKS_KEY, GROUND_KEY, parse_uri
 from augment.errors import AdapterError
 from augment.jobs.mirror import DatasetFolder
 from augment.scene.scene import Scene
@@ -36,6 +36,7 @@ def source_tree(scene: Scene) -> DatasetFolder:
             )
     scheme, path, query = parse_uri(uri)
     query.pop(GROUND_KEY, None)
+    query.pop(EGO_MASKS_KEY, None)
     trees = {name: dataset.source_tree for name, dataset in DATASETS.items() if dataset.source_tree}
     find = trees.get(scheme or "")
     if find is None:

@@ -42,8 +42,9 @@ from llvmlite.binding import get_host_cpu_name
 import augment
 from adapters.datasets import DATASETS
 from adapters.detect_format import detect_scheme
+from adapters.ego_masks import mask_files
 from adapters.scene_folder import with_images_in
-from adapters.uri import format_uri, parse_uri
+from adapters.uri import EGO_MASKS_KEY, format_uri, parse_uri
 from augment.errors import AdapterError, ClimateGSError, OutputError, SceneError
 from augment.files.recorded_images import has_image
 from augment.files.scene_file import SCENE_SUFFIX, VERSION, load_scene_parts, save_scene_file
@@ -276,7 +277,8 @@ def scene_digest(uri: str) -> str | None:
     """Return a digest of a scene's content, 32 hexadecimal digits: other content, another
     digest.
 
-    For a procedural scene it is of its options and the package's version. The result is None if the
+    For a procedural scene it is of its options and the package's version. Masks of the recording
+    car count as files of the scene. The result is None if the
     scene's files cannot be listed or read; opening the scene then gives the reason.
     """
     try:
@@ -298,7 +300,11 @@ def _digest_files(scheme: str, path: str, query: Mapping[str, str]) -> dict[str,
     if dataset.content_files is not None:
         places = dataset.content_files(path)
     else:
-        options = {key: value for key, value in query.items() if not Path(value).is_file()}
+        options = {
+            key: value
+            for key, value in query.items()
+            if key != EGO_MASKS_KEY and not Path(value).is_file()
+        }
         places = dataset.scene_files(path, options, lambda: None)
     files: dict[str, tuple[Path, bool]] = {}
     for place in places:
@@ -307,6 +313,9 @@ def _digest_files(scheme: str, path: str, query: Mapping[str, str]) -> dict[str,
     for key, value in query.items():  # of cameras, say
         if Path(value).is_file():
             files[f"?{key}"] = Path(value), True
+        elif key == EGO_MASKS_KEY:
+            for file in mask_files(Path(value)):
+                files[f"?{key}/{file.name}"] = file, True
     for folder in _depth_folder(query):
         for file in visible_files(folder):
             files[f"?depth/{os.path.relpath(file, folder)}"] = file, dataset.is_hashed_whole

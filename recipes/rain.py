@@ -15,6 +15,9 @@ MAX_RATE_MM_H = 300.0
 MAX_WIND_MPS = 60.0
 # Wetness of the ground grows with the rain's rate as 1 - exp(-rate / WET_THROUGH_MM_H), mm/h.
 WET_THROUGH_MM_H = 1.5
+# Share of the sun that clouds hide grows with the rain's rate as 1 - exp(-rate / OVERCAST_MM_H),
+# mm/h.
+OVERCAST_MM_H = 0.1
 # Share of the open ground on which water stands at 1 mm/h, 0 to 1.
 PUDDLE_SHARE_AT_1_MM_H = 0.03
 # Power of the rate with which that share grows, about a square root; no unit.
@@ -26,6 +29,7 @@ MAX_PUDDLE_SHARE = 0.35
 class Rain(EffectModel):
     """Rain: drops that streak near the camera and veil what is far, and the wet ground below."""
 
+    later_fields = ("shadow_fade",)
     synonyms = (
         ("rate_mm_h", "rain_rate mm_h mm_per_hour"),
         ("wind_mps", "wind_speed"),
@@ -71,6 +75,9 @@ class Rain(EffectModel):
     puddles: Unit | None = None
     """Share of that ground on which water stands, in its hollows first; null follows from the rate;
     none where wetness is 0."""
+    shadow_fade: Unit | None = None
+    """How much of the ground's cast shadows goes, since clouds that rain hide the sun: 1 all, 0
+    none; null follows from the rate, and is all but in the lightest drizzle."""
     spray: Flag = True
     """Vehicles that drive faster than 40 km/h lift spray, by their speed, the rate and the ground's
     wetness."""
@@ -79,6 +86,13 @@ class Rain(EffectModel):
     def has_effect(self) -> bool:
         """Return False for rain without a rate, which changes nothing in the air."""
         return self.rate_mm_h > 0
+
+    @property
+    def sun_fade(self) -> float:
+        """Return the share of the sun's light that the rain's clouds take, 0 to 1."""
+        if self.shadow_fade is not None:
+            return self.shadow_fade
+        return -math.expm1(-self.rate_mm_h / OVERCAST_MM_H)
 
     @property
     def ground_wetness(self) -> float:

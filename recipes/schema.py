@@ -169,7 +169,7 @@ class Weather(ClosedModel):
 class Render(Section):
     """How the scene is drawn."""
 
-    later_fields = ("base", "exposure")
+    later_fields = ("base", "exposure", "own_car")
     knobs = (
         Knob(
             "scale",
@@ -194,6 +194,9 @@ class Render(Section):
     """recorded gives each camera's picture the colours of its recording, the weather's own colours
     (fog, snow, rain, spray, water) included, where the scene knows them; common gives those one
     look in all cameras, by the mean of their exposures; neutral leaves the scene's own colours."""
+    own_car: Literal["dry", "snowy"] = "dry"
+    """Of base recorded: dry keeps all weather off the pixels that show the recording car; snowy
+    lets snow that lies on the scene lie on it, too."""
     speed: Speed = Speed()
 
     @property

@@ -38,6 +38,7 @@ class SnowWind(ClosedModel):
 class Snow(EffectModel):
     """Snow lying on what is open to the sky: ground, roofs, vehicles."""
 
+    later_fields = ("shadow_fade",)
     synonyms = (
         ("depth_m", "level level_m height height_m thickness thickness_m"),
         ("coverage", "cover"),
@@ -93,6 +94,9 @@ class Snow(EffectModel):
     """Packed grey wheel tracks where the ego and the scene's vehicles drive; auto up to a depth of
     0.3 m, and not along a drive that is invented for a splat file without cameras."""
     light: SnowLight = SnowLight()
+    shadow_fade: Unit | None = None
+    """How much of the cast shadows goes on ground that no snow covers: 1 all, 0 none; null follows
+    from light.sun: all where that is 0, none where it is 1 or null."""
     wind: SnowWind = SnowWind()
     shading: Literal["per_splat", "per_pixel"] = "per_splat"
     """Lit by one normal a splat, or by one a pixel of every splat."""
@@ -115,6 +119,13 @@ class Snow(EffectModel):
     def has_traces(self) -> bool:
         """Return True if dirt or traffic change the snow on roads."""
         return self.dirt > 0 or self.traffic > 0
+
+    @property
+    def sun_fade(self) -> float:
+        """Return the share of the sun's light that the recipe's sky takes, 0 to 1."""
+        if self.shadow_fade is not None:
+            return self.shadow_fade
+        return 0.0 if self.light.sun is None else 1.0 - self.light.sun
 
     def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:
         return (

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 from pydantic import Field
 
 from recipes.effect import Column, EffectModel
-from recipes.fields import Angle, Colour, Number
-from recipes.rain import MAX_WIND_MPS
+from recipes.fields import Angle, Colour, Number, Unit
+from recipes.rain import MAX_WIND_MPS, OVERCAST_MM_H
 
 # Largest rate of snowfall, as water: more than half a metre of snow an hour.
 MAX_SNOWFALL_MM_H = 50.0
@@ -15,6 +17,7 @@ MAX_SNOWFALL_MM_H = 50.0
 class Snowfall(EffectModel):
     """Snow in the air: flakes near the camera, a white veil beyond; what lies is `snow`."""
 
+    later_fields = ("shadow_fade",)
     synonyms = (("rate_mm_h", "snow_rate snowfall_rate"), ("turbulence_mps", "turbulence gusts"))
     columns = (
         Column(
@@ -40,6 +43,17 @@ class Snowfall(EffectModel):
     """Speed of eddies that the flakes follow, and of their own flutter."""
     color: Colour | None = None
     """Colour of the far veil, display-encoded sRGB; null for the sky's above the horizon."""
+
+    shadow_fade: Unit | None = None
+    """How much of the ground's cast shadows goes, since clouds that snow hide the sun: 1 all, 0
+    none; null follows from the rate, and is all but in the lightest flurries."""
+
+    @property
+    def sun_fade(self) -> float:
+        """Return the share of the sun's light that the clouds take, 0 to 1."""
+        if self.shadow_fade is not None:
+            return self.shadow_fade
+        return -math.expm1(-self.rate_mm_h / OVERCAST_MM_H)
 
     @property
     def has_effect(self) -> bool:

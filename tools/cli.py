@@ -76,6 +76,8 @@ class RenderOptions(RecipeCommand):
         workers: Processes. The bits do not depend on it. One is best where a GPU draws.
         backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU.
         camera_path: A JSON file of camera poses to render instead of the scene's own.
+        ego_masks: A folder of masks of the recording car, as ego_masks=FOLDER in the scene's URI
+            (docs/scenes.md): CAMERA.png, white on it, or CAMERA.json with polygons.
         overwrite: Replace what this scene and recipe wrote before.
         sheet: Also write a contact sheet of the result.
         layout: source: also lay the images into a copy of the scene's dataset, in the place, format
@@ -98,6 +100,7 @@ class RenderOptions(RecipeCommand):
     workers: Count = 1
     backend: Backend = "auto"
     camera_path: Path | None = None
+    ego_masks: Path | None = None
     overwrite: bool = False
     sheet: bool = True
     layout: Literal["standard", "source"] = "standard"

@@ -99,7 +99,8 @@ class FitOptions(FitConfig, SceneCommand):
         image_cache_mb: Memory for decoded images. The result does not depend on it.
         depth: Depth priors: none, or kinds separated by commas: lidar, metric:DIR (depth maps as
             render writes them), relative:DIR (monocular networks), sparse:DIR (lidar_depth).
-        ego_masks: A folder of CAMERA.png, white where the image shows the recording car.
+        ego_masks: A folder of masks of the recording car (docs/scenes.md): CAMERA.png, white on it,
+            or CAMERA.json with polygons.
         truth: The procedural street that a recording was rendered from: the report then holds
             the error against its exact depth.
         device: Where views are rendered: cpu, or cuda by gsplat (an extra), of which no two runs
@@ -236,6 +237,26 @@ def resolved_uri(uri: str) -> tuple[str, str, dict[str, str]]:
         has_no_name = place.name in ("", "..")
         path = str(place.resolve() if has_no_name else place.parent.resolve() / place.name)
     return scheme, path, query
+
+
+def with_ego_masks_key(uri: str, folder: Path | None) -> str:
+    """The URI of a scene with the masks of a folder; the URI itself without a folder.
+
+    Raises:
+        AdapterError: the URI names a folder of masks already, or is not recognised.
+    """
+    if folder is None:
+        return uri
+    from adapters.uri import EGO_MASKS_KEY, format_uri
+    from augment.errors import AdapterError
+
+    scheme, path, query = resolved_uri(uri)
+    if EGO_MASKS_KEY in query:
+        raise AdapterError(
+            f"--ego-masks {folder} and {EGO_MASKS_KEY}={query[EGO_MASKS_KEY]} in the scene's URI "
+            f"both give masks of the recording car; keep one"
+        )
+    return format_uri(scheme, path, {**query, EGO_MASKS_KEY: str(folder.absolute())})
 
 
 def value_or(value: _Value | None, default: _Value) -> _Value:

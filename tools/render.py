@@ -27,7 +27,7 @@ from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe, free_knobs, parse_frames
 from tools.labels import write_labels_of_job
 from tools.mirror import clear_notes, mirror_outputs, recipes_for_source
-from tools.options import FITTED, names_in
+from tools.options import FITTED, names_in, with_ego_masks_key
 from tools.output import compiling_noted, print_images, print_note
 from tools.sheet import draw_sheet
 from tools.warm_up import kernel_modules, warm_up
@@ -40,12 +40,13 @@ def render_recipes(options: RenderOptions) -> int:
     """Run the job and print its result. Return the exit code: 1 if images failed."""
     out = options.out
     backend = options.backend
+    scene_uri = with_ego_masks_key(options.scene, options.ego_masks)
     recipes = resolve_recipes(options.recipes, options.variants, options.scale, options.overrides)
     trial_recipes = [recipe for resolved in recipes for recipe in recipes_to_try(resolved)]
     on_gpu = renders_on_gpu(backend)
     of_street = options.scene.startswith("procedural:")
     with compiling_noted(kernel_modules(trial_recipes, backend, of_street=of_street)):
-        scene = open_scene(options.scene)
+        scene = open_scene(scene_uri)
         if not on_gpu:
             warm_up(trial_recipes, backend)
     if on_gpu:
@@ -87,7 +88,7 @@ def render_recipes(options: RenderOptions) -> int:
         for note in notes:
             print_note(f"note: {note}")
     job = RenderJob(
-        scene_uri=options.scene,
+        scene_uri=scene_uri,
         recipes=recipes,
         out_dir=out,
         frames=frame_numbers,
@@ -96,7 +97,7 @@ def render_recipes(options: RenderOptions) -> int:
         workers=options.workers,
         backend=backend,
         overwrite=options.overwrite,
-        source_digest=scene_digest(options.scene),
+        source_digest=scene_digest(scene_uri),
     )
     result = run_job(job, scene_loader=lambda _uri: scene)
     print_images(result, f"{result.seconds:.1f} s")

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from adapters.ego_masks import read_ego_masks
 from adapters.training_views.depth_priors import DepthPriors, DepthSource, ReferenceDepth
-from adapters.training_views.masks import read_ego_mask
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import SceneMemo
@@ -83,9 +83,8 @@ class RecordedViews:
                 are read again.
             depth: sources of depth priors.
             reference_depth: depth by which relative maps are brought to metres without LiDAR.
-            masks_dir: folder of DIR/<camera>.png, white where the image shows the recording car. A
-                camera without a file does not see it. By default such pixels are found because they
-                stand still.
+            masks_dir: folder of masks of the recording car (adapters.ego_masks). By default the
+                scene's own masks, or else what the images tell.
         """
         if not 0 < scale <= 1:
             raise ValueError(f"scale must be > 0 and <= 1; got {scale}")
@@ -227,8 +226,10 @@ class RecordedViews:
     def _find_ego(self, names: Sequence[str], masks_dir: Path | None) -> dict[str, np.ndarray]:
         """Return each camera's mask of the recording car, without empty ones.
 
-        Masks come from the files in masks_dir, or from the images where masks_dir is None."""
+        Masks come from the files in masks_dir, else from the scene, else from the images."""
         masks: dict[str, np.ndarray] = {}
+        sizes: dict[str, Camera] = {}
+        world_from_egos = {f.index: f.world_from_ego for f in self._scene.frames}
         for name in names:
             views = [(k, c) for k, c in self._cameras.items() if k.camera == name]
             if not views:
@@ -236,19 +237,20 @@ class RecordedViews:
             # Should a camera's size change, masks are for about the size it has at first.
             size = (views[0][1].width, views[0][1].height)
             views = [(k, c) for k, c in views if _is_about(size, c)]
+            sizes[name] = views[0][1]
             if masks_dir is not None:
-                path = masks_dir / f"{name}.png"
-                if path.exists():
-                    masks[name] = read_ego_mask(path, views[0][1])
+                continue
+            if self._scene.ego_masks is not None:
+                mask = self._scene.ego_masks.get(name)
+                if mask is not None:
+                    masks[name] = _resized_mask(mask, views[0][1])
                 continue
             moving = [views[i] for i in moving_frames([camera for _, camera in views])]
             images = [self.image(key) for key, _ in moving]
-            masks[name] = find_own_car_mask([camera for _, camera in moving], images)
-        if masks_dir is not None and not masks:
-            raise AdapterError(
-                f"{masks_dir} holds no mask {names[0]}.png or of another camera; expected images "
-                f"named like the cameras ({', '.join(names)}), white on the recording car"
-            )
+            egos = [world_from_egos[key.frame] for key, _ in moving]
+            masks[name] = find_own_car_mask([camera for _, camera in moving], images, egos)
+        if masks_dir is not None:
+            masks = read_ego_masks(masks_dir, sizes, known_names=self._scene.camera_names)
         return {name: mask for name, mask in masks.items() if mask.any()}
 
     def _measure_lidar_top(self) -> float | None:
@@ -268,6 +270,12 @@ def _is_about(size: tuple[int, ...], camera: Camera) -> bool:
     Images that were undistorted one by one differ by a few pixels."""
     ratios = camera.width / size[0], camera.height / size[1]
     return all(abs(ratio - 1) <= _SIZE_SHARE for ratio in ratios)
+
+
+def _resized_mask(mask: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return a mask at the camera's size, bool [H, W]; any part of a pixel on the car counts."""
+    size = (camera.width, camera.height)
+    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.25
 
 
 def _check_camera(key: ViewKey, camera: Camera) -> None:

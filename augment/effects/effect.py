@@ -8,6 +8,7 @@ effect by name. The recipe's side of an effect (its model, manifest columns and 
 The hooks of `Effect`, by when they are called:
 
     once a recipe and scene    plan_in_scene    facts, with a reason for every pass
+                               sun_share        sunlight on the ground
     once a scene               prepare, relight, precompute
     once a view                cameras, visibility, edit_scene, draw, edit_image,
                                visible_mask, front_surface
@@ -304,6 +305,18 @@ class Effect:
             SceneError: the scene lacks a fact that the effect needs.
         """
         raise NotImplementedError
+
+    def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
+        """Return the share of the sun's light that reaches the ground, and the reason.
+
+        It is asked for where the ground shows cast shadows, which fade by the product of all
+        effects' shares. 1 leaves them as they are.
+
+        Args:
+            recipe: the recipe, also one without this effect.
+            scene: the scene to change.
+        """
+        return 1.0, ""
 
     def prepare(self, effect: EffectInScene) -> Any:
         """Return data that all views share; it is kept in the scene's memo (`memo_of`)."""

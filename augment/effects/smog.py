@@ -20,7 +20,6 @@ from torch import Tensor
 
 from augment.effects.effect import (
     PICTURE,
-    SCENE,
     Effect,
     EffectInScene,
     EffectPlan,
@@ -33,13 +32,7 @@ from augment.effects.effect import (
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.lidar.codes import LOST, SCATTERED
 from augment.errors import SceneError
-from augment.light.cast_shadows import (
-    FadedShadows,
-    faded_shadows,
-    precompute_shadows,
-    shadows_of,
-    sun_transmittance,
-)
+from augment.light.cast_shadows import precompute_shadows, shadows_of, sun_transmittance
 from augment.light.common_exposure import exposure_change
 from augment.output.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
@@ -63,7 +56,6 @@ ELEVATION = "airlight by elevation"
 SKY = "sky"
 LINEAR_LIGHT = "airlight in linear light"
 SCATTER = "forward scatter"
-SHADOWS = "shadows in smog"
 
 
 @dataclass(frozen=True)
@@ -81,9 +73,6 @@ class SmogPlan:
 
     scatter: float = 0.0
     """Strength of the forward scatter."""
-
-    sun: float = 1.0
-    """Share of the sun's light that arrives at the ground; 1 leaves shadows as they are."""
 
     is_linear: bool = False
     """If True, the airlight of the finished picture is mixed in linear light."""
@@ -119,9 +108,8 @@ class SmogEffect(Effect):
         fog, reason = _in_heights(smog, scene)
         if fog is None:
             drawing_steps = skipped_steps((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason)
-            shadow_steps = skipped_steps((SHADOWS,), reason, SCENE)
             picture_steps = skipped_steps((LINEAR_LIGHT, SCATTER), reason, PICTURE)
-            return EffectPlan(None, (*shadow_steps, *drawing_steps, *picture_steps))
+            return EffectPlan(None, (*drawing_steps, *picture_steps))
         is_common = recipe.render.exposure == "common" and scene.common_color_map is not None
         if is_common:
             reason += "; one airlight for all cameras, by the mean of their exposures"
@@ -133,10 +121,8 @@ class SmogEffect(Effect):
         sky = Step(SKY, True, "sampled, then faded through the smog up to infinity")
         if fog.scale_height_m is None:
             sky = Step(SKY, False, "uniform smog hides it: the airlight colour stands for it")
-        sun, shadow_reason = _sun_in(fog, smog, scene)
         is_linear = smog.blend == "linear"
         steps = (
-            Step(SHADOWS, sun < 1, shadow_reason, SCENE),
             Step(PER_GAUSSIAN, not on_buffers, other_reason if on_buffers else reason),
             Step(ON_BUFFERS, on_buffers, reason if on_buffers else other_reason),
             Step(
@@ -151,11 +137,18 @@ class SmogEffect(Effect):
         buffers = {EXPECTED_DEPTH} if on_buffers or fog.elevation_gain > 0 else set[str]()
         if smog.scatter > 0 or is_linear:
             buffers.add(MEDIAN_DEPTH)  # which costs nothing where depth images are written
-        data = SmogPlan(fog, on_buffers, is_common, smog.scatter, sun, is_linear)
+        data = SmogPlan(fog, on_buffers, is_common, smog.scatter, is_linear)
         return EffectPlan(data, steps, frozenset(buffers))
 
-    def prepare(self, effect: EffectInScene) -> FadedShadows | None:
-        return faded_shadows(effect.scene, effect.settings.sun)
+    def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
+        smog = self.section_of(recipe)
+        fog, _ = _in_heights(smog, scene)
+        shadows = shadows_of(scene) if fog is not None and smog.shadow_fade > 0 else None
+        if fog is None or shadows is None:
+            return 1.0, ""
+        ground_z_m = float(np.median(shadows.height_m[shadows.known_share > 0]))
+        share = 1 - smog.shadow_fade * (1 - sun_transmittance(fog, shadows, ground_z_m))
+        return share, f"{self.section} leaves {100 * share:.0f} % of the sun's light"
 
     def precompute(self, context: JobContext) -> None:
         if any(smog and smog.shadow_fade > 0 for smog in map(self.section_of, context.recipes)):
@@ -164,15 +157,6 @@ class SmogEffect(Effect):
     def edit_scene(
         self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
-        shadows = effect.prepared_data if effect.settings.sun < 1 else None
-        if shadows is not None:
-            with timed(SHADOWS):
-                parts = [
-                    p if p.instance_id or p.is_overlay else shadows.apply_to(p)
-                    for p in layers.parts
-                ]
-                photo = layers.photo and replace(layers.photo, faded_shadows=shadows)
-                layers = replace(layers, parts=tuple(parts), photo=photo)
         fog = effect.settings.fog
         common = effect.scene.common_color_map
         if effect.settings.is_common and common is not None:
@@ -224,21 +208,6 @@ class SmogEffect(Effect):
         fog = effect.settings.fog
         beam_extinction_per_m = (1 + effect.settings.scatter) * fog.extinction_per_m
         fog_echoes(echoes, replace(fog, extinction_per_m=beam_extinction_per_m), rng)
-
-
-def _sun_in(fog: Fog, smog: Smog, scene: Scene) -> tuple[float, str]:
-    """Return the share of the sun's light that arrives at the ground, and the reason."""
-    if smog.shadow_fade == 0:
-        return 1.0, "weather.smog.shadow_fade is 0"
-    shadows = shadows_of(scene)
-    if shadows is None or shadows.certainty == 0:
-        return 1.0, "the ground shows no shadows of a sun"
-    ground_z_m = float(np.median(shadows.height_m[shadows.known_share > 0]))
-    sun = 1 - smog.shadow_fade * (1 - sun_transmittance(fog, shadows, ground_z_m))
-    return sun, (
-        f"shadows have {shadows.luminance_ratio:.2f} of the light beside them; {100 * sun:.0f} % "
-        f"of the sun's light comes through"
-    )
 
 
 def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:

@@ -1,8 +1,8 @@
 """Sun and shade on the ground of a scene, as its colours show them.
 
 In: a scene's background. Out: `CastShadows` (by `shadows_of`): the sun's direction, how dark its
-shadows are, and a map of lit ground. Smog fades these shadows (`faded_shadows`), and `scene_light`
-takes the sun from here.
+shadows are, and a map of lit ground. Smog and clouds fade these shadows (`faded_shadows`), and
+`scene_light` takes the sun from here.
 
 A dark ground is a shadow or dark asphalt. The things that stand on it tell which. They cast shadows
 on the ground from every direction of a coarse grid, and the direction whose shadows differ most in
@@ -504,6 +504,10 @@ _LOWEST_SUN = math.sin(math.radians(10.0))
 NUM_FADES = 32
 # Exponent of encoded colours.
 _ENCODING = 2.2
+# Side of the square in which the light changes at an edge, cells.
+_EDGE_CELLS = 7
+# Change of the share of the sun within the square that is an edge.
+_EDGE_STEP = 0.4
 # Classes of ground whose shadows fade.
 _GROUND_CLASSES = (*_GROUNDS, SemanticClass.LANE_MARKING)
 
@@ -569,7 +573,7 @@ def faded_shadows(scene: Scene, transmittance: float) -> FadedShadows | None:
 
     def place() -> Tensor:
         g = scene.background
-        sun_share = _find_sun_share(shadows, *g.means.double().numpy().T)
+        sun_share = _sun_share_of_splats(shadows, g)
         rows = 1 + np.rint(sun_share * (NUM_FADES - 1))
         is_unchanged = np.abs(sun_share - shadows.lit_share) < 1e-6
         if g.semantic is not None:
@@ -609,6 +613,47 @@ def _find_sun_share(
     return shadows.lit_share + weight * (
         sun_share / np.maximum(known_share, 1e-6) - shadows.lit_share
     )
+
+
+def _sun_share_of_splats(shadows: CastShadows, g: Gaussians) -> np.ndarray:
+    """Return the share of the sun that N splats see, [N], as `_find_sun_share`.
+
+    The map of lit ground is a metre wide at edges of shadows. There the splats' own colours tell,
+    over the median of their class away from edges.
+    """
+    x_m, y_m, z_m = g.means.double().numpy().T
+    sun_share = _find_sun_share(shadows, x_m, y_m, z_m)
+    edges = _edges_of_light(shadows)
+    rows = np.nan_to_num((x_m - shadows.corner_m[0]) / shadows.cell_m, nan=-1.0)
+    columns = np.nan_to_num((y_m - shadows.corner_m[1]) / shadows.cell_m, nan=-1.0)
+    is_inside = (rows >= 0) & (rows < edges.shape[0]) & (columns >= 0) & (columns < edges.shape[1])
+    is_edge = np.zeros(len(g), bool)
+    is_edge[is_inside] = edges[rows[is_inside].astype(int), columns[is_inside].astype(int)]
+    is_on_ground = np.abs(sun_share - shadows.lit_share) > 1e-6
+    semantic = np.zeros(len(g), np.int16) if g.semantic is None else g.semantic.numpy()
+    rgb = (0.5 + SH_C0 * g.sh[:, 0].double().numpy()).clip(0, 1)
+    luminance = linear_from_display(np.nan_to_num(rgb)) @ _LUMINANCE
+    ratio = shadows.luminance_ratio
+    light = ratio + (1 - ratio) * sun_share
+    out = sun_share.copy()
+    for semantic_class in np.unique(semantic):
+        is_class = (semantic == semantic_class) & is_on_ground
+        is_sure = is_class & ~is_edge
+        if is_sure.sum() < _MIN_CELLS:
+            continue
+        albedo = max(float(np.median(luminance[is_sure] / light[is_sure])), 1e-4)
+        is_unsure = is_class & is_edge
+        out[is_unsure] = ((luminance[is_unsure] / albedo - ratio) / (1 - ratio)).clip(0, 1)
+    return out
+
+
+def _edges_of_light(shadows: CastShadows) -> np.ndarray:
+    """Return the cells of known ground beside an edge between sun and shade, bool [H, W]."""
+    square = np.ones((_EDGE_CELLS, _EDGE_CELLS), np.uint8)
+    known = shadows.known_share > 0.5
+    highest = cv2.dilate(np.where(known, shadows.sun_share, 0).astype(np.float32), square)
+    lowest = cv2.erode(np.where(known, shadows.sun_share, 1).astype(np.float32), square)
+    return known & (highest - lowest > _EDGE_STEP)
 
 
 def _fade_factors(shadows: CastShadows, transmittance: float, sun_shares: np.ndarray) -> np.ndarray:

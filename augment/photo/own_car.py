@@ -1,28 +1,35 @@
 """Pixels of a camera's images that show the recording car itself.
 
 In: the images of one camera, in the order in which the car moved. Out: a bool mask
-(`find_own_car_mask`; `own_car_mask` for a scene's recorded images). `augment.view.render_view`
-passes the mask on to the estimates of boxes; training views leave these pixels out of the loss.
+(`find_own_car_mask`; `own_car_mask` for a scene's recorded images, where a user's masks come
+first). `augment.view.render_view` keeps the weather off these pixels, and labels leave them out;
+training views leave them out of the loss.
 
 The recording car stays as it is while the road moves by. It is looked for from the image's bottom
 upwards, where the road would be less than ten metres away. Only contrast along the road's apparent
 motion counts, since kerbs and lane lines that run along it stay as they are, too. Smooth paint says
-nothing by itself; it belongs to the edge above it.
+nothing by itself; it belongs to the edge above it. Where the car did not move, the edge itself has
+to tell (`augment.photo.own_car_outline`), which also brings the outline to the pixel.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+import torch
+from jaxtyping import Bool, Float32, Float64
+from torch import Tensor
 
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import memo_of
+from augment.photo.own_car_outline import find_symmetric_outline, refine_outline
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 
@@ -32,10 +39,12 @@ T = TypeVar("T")
 _WORK_WIDTH = 320
 # Images that are compared, at most.
 MAX_IMAGES = 24
-# Images without which nothing is found.
+# Images without which motion tells nothing.
 _MIN_IMAGES = 6
 # Distance between the places of compared images, metres.
 _STEP_M = 0.25
+# The same in a clip that is too short for that many steps.
+_SHORT_STEP_M = 0.12
 # Height of a camera above the road, about, metres.
 _CAMERA_HEIGHT_M = 1.6
 # Distance within which the road is looked at, metres: nobody follows another car this closely for a
@@ -65,20 +74,36 @@ _JUMP_PART = 0.05
 _MIN_PART = 0.004
 # Width of the car, at least, as a part of the image's width.
 _MIN_WIDTH = 0.15
+# Cosine between a camera's axis and the car's from which the car looks symmetric.
+_MIN_AXIS_COSINE = 0.9
+# Median distance between the outlines by motion and by the edge up to which they agree, a part of
+# the height. The one by motion lies above the car by up to a window.
+_MAX_DISTANCE = 0.05
 
 
 def moving_frames(cameras: Sequence[Camera]) -> list[int]:
-    """Return positions of at most MAX_IMAGES images of a drive, in order, between which it
-    moved.
+    """Return positions of at most MAX_IMAGES images of a drive, in order, between which it moved.
+
+    Images of a car that stood still are all alike; some of them are returned.
     """
+    positions = _positions_apart(cameras, _STEP_M)
+    if len(positions) < _MIN_IMAGES:
+        positions = _positions_apart(cameras, _SHORT_STEP_M)
+    if len(positions) < _MIN_IMAGES:
+        positions = list(range(len(cameras)))
+    return spread_evenly(positions, MAX_IMAGES)
+
+
+def _positions_apart(cameras: Sequence[Camera], step_m: float) -> list[int]:
+    """Return the positions of images that lie a step apart along the drive."""
     positions: list[int] = []
     last_centre = None
     for i, camera in enumerate(cameras):
         centre = camera.centre.numpy()
-        if last_centre is None or np.linalg.norm(centre - last_centre) >= _STEP_M:
+        if last_centre is None or np.linalg.norm(centre - last_centre) >= step_m:
             positions.append(i)
             last_centre = centre
-    return spread_evenly(positions, MAX_IMAGES)
+    return positions
 
 
 def spread_evenly(items: Sequence[T], count: int) -> list[T]:
@@ -87,30 +112,109 @@ def spread_evenly(items: Sequence[T], count: int) -> list[T]:
     return [items[i] for i in places]
 
 
-def find_own_car_mask(cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> np.ndarray:
+def find_own_car_mask(
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    world_from_egos: Sequence[Tensor] | None = None,
+) -> np.ndarray:
     """Return the pixels that show the recording car, bool [H, W].
 
-    Nothing is found in fewer than six images, above the horizon, or where the car shows no edge
-    across the motion.
+    Nothing is found above the horizon, where the car shows no edge across the motion, or, in images
+    of a car that stood still, where the camera does not look along the car's axis.
 
     Args:
         cameras: the camera at each image.
         images: images of one camera, uint8 [H, W, 3], in the order in which the car moved
             (`moving_frames`); their sizes may differ a little.
+        world_from_egos: pose of the car at each image, float64 [4, 4]; None where unknown.
 
     Returns:
         The mask, at the first image's size.
     """
     height, width = images[0].shape[:2] if images else (0, 0)
-    if len(images) < _MIN_IMAGES:
+    tops = find_own_car_outline(cameras, images, world_from_egos)
+    if tops is None:
         return np.zeros((height, width), np.bool_)
+    return np.arange(height)[:, None] + 0.5 >= tops[None]
+
+
+def find_own_car_outline(
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    world_from_egos: Sequence[Tensor] | None = None,
+) -> Float64[np.ndarray, " W"] | None:
+    """Return the first row of the recording car in each column; None where nothing tells it.
+
+    Rows are pixels of the first image; its height stands for a column without the car. The
+    arguments are those of `find_own_car_mask`.
+    """
+    if not images:
+        return None
+    height, width = images[0].shape[:2]
+    images = [_in_size(image, (width, height)) for image in images]
+    rough_tops = _outline_by_motion(cameras, images)
+    axis = _axis_in(cameras[0], None if world_from_egos is None else world_from_egos[0])
+    edge_tops = None if axis is None else find_symmetric_outline(images, *axis)
+    if edge_tops is None:
+        return None if rough_tops is None else refine_outline(images, rough_tops)
+    if rough_tops is not None and _distance(rough_tops, edge_tops) > _MAX_DISTANCE:
+        return refine_outline(images, rough_tops)
+    return refine_outline(images, edge_tops, by_edge=True)
+
+
+def _outline_by_motion(
+    cameras: Sequence[Camera], images: Sequence[np.ndarray]
+) -> Float64[np.ndarray, " w"] | None:
+    """Return a rough outline, as parts of the height, of what stays while the road moves by.
+
+    None where the car did not move, or where it is not visible.
+    """
+    if len(images) < _MIN_IMAGES:
+        return None
+    height, width = images[0].shape[:2]
     num_columns = min(_WORK_WIDTH, width)
     size = (num_columns, max(1, round(height * num_columns / width)))
     flow = cv2.resize(_road_flow(cameras), size, interpolation=cv2.INTER_NEAREST)
-    evidence = _evidence(images, size, flow)
-    car_tops = _car_tops(evidence, np.isnan(flow[..., 0]))
-    mask = (np.arange(size[1])[:, None] >= car_tops[None]).astype(np.uint8)
-    return cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    is_unknown = np.isnan(flow[..., 0])
+    if is_unknown.all():
+        return None
+    car_tops = _car_tops(_evidence(images, size, flow), is_unknown)
+    return car_tops / size[1] if (car_tops < size[1]).any() else None
+
+
+def _distance(tops: np.ndarray, edge_tops: np.ndarray) -> float:
+    """Return the median distance of two outlines, as a part of the height."""
+    places = (np.arange(len(tops)) + 0.5) / len(tops)
+    edge_places = (np.arange(len(edge_tops)) + 0.5) / len(edge_tops)
+    edge_rows = np.minimum(np.interp(places, edge_places, edge_tops), 1)
+    return float(np.median(np.abs(edge_rows - tops)))
+
+
+def _in_size(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return the image at a width and height."""
+    if image.shape[1::-1] == size:
+        return image
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _axis_in(camera: Camera, world_from_ego: Tensor | None) -> tuple[float, float] | None:
+    """Return the column in which the car's axis vanishes, and the row from which the road below it
+    would be less than _REACH_M away, as parts of the width and height.
+
+    None where the camera does not look along the axis, or where the car's pose is not known.
+    """
+    if world_from_ego is None:
+        return None
+    axis = (camera.camera_from_world[:3, :3] @ world_from_ego[:3, 0]).tolist()
+    if abs(axis[2]) < _MIN_AXIS_COSINE:
+        return None
+    column = camera.fx * axis[0] / axis[2] + camera.cx
+    # The road's point at that distance ahead or behind, in the camera's axes.
+    ahead = math.copysign(_REACH_M, axis[2])
+    down = camera.camera_from_world[:3, :3] @ world_from_ego[:3, 2] * -_CAMERA_HEIGHT_M
+    point = (ahead * torch.tensor(axis, dtype=down.dtype) + down).tolist()
+    row = camera.fy * point[1] / point[2] + camera.cy
+    return column / camera.width, row / camera.height
 
 
 def _road_flow(cameras: Sequence[Camera]) -> np.ndarray:
@@ -213,43 +317,110 @@ def _car_tops(evidence: np.ndarray, is_unknown: np.ndarray) -> np.ndarray:
 # ---- The recording car in a scene's recorded images ----------------------------------------------
 
 # Scale of the images in which the recording car is looked for.
-_SCALE = 0.25
+_SCALE = 0.5
+# Width of the border outside the car in which the weather begins, pixels.
+_BORDER_PX = 2
 
 
 def own_car_mask(scene: Scene, camera: Camera) -> Bool[np.ndarray, "H W"] | None:
     """Return the pixels of a recorded image that show the recording car.
 
-    None where it shows none, or where too few of the scene's images are there to tell. The mask is
-    found once for all images of a camera.
+    They are a user's (`Scene.ego_masks`) or, without those, what the images tell. None where the
+    images show no car, or where too little tells. The mask is found once for all images of a
+    camera.
 
     Args:
         scene: the scene, whose frames have the images.
         camera: a camera of the scene, at any scale, or a window of it.
     """
-    camera_and_mask = memo_of(scene).get(
-        ("own car", camera.name), lambda: _find_own_car(scene, camera.name)
-    )
-    if camera_and_mask is None:
+    shape = memo_of(scene).get(("own car", camera.name), lambda: _shape_in(scene, camera.name))
+    if shape is None:
         return None
-    small_camera, mask = camera_and_mask
-    # The place of each pixel's centre in the small image.
-    small_columns = (np.arange(camera.width) + 0.5 - camera.cx) * (
-        small_camera.fx / camera.fx
-    ) + small_camera.cx
-    small_rows = (np.arange(camera.height) + 0.5 - camera.cy) * (
-        small_camera.fy / camera.fy
-    ) + small_camera.cy
-    columns = np.clip(small_columns.astype(int), 0, small_camera.width - 1)
-    rows = np.clip(small_rows.astype(int), 0, small_camera.height - 1)
-    return mask[np.ix_(rows, columns)]
+    # The place of each pixel's centre in the image of the shape.
+    columns = (np.arange(camera.width) + 0.5 - camera.cx) * (
+        shape.camera.fx / camera.fx
+    ) + shape.camera.cx
+    rows = (np.arange(camera.height) + 0.5 - camera.cy) * (
+        shape.camera.fy / camera.fy
+    ) + shape.camera.cy
+    if shape.mask is None:
+        assert shape.tops is not None
+        tops = np.interp(columns, np.arange(len(shape.tops)) + 0.5, shape.tops)
+        return rows[:, None] >= tops
+    # OpenCV's pixels are centred at whole numbers.
+    places = np.meshgrid((columns - 0.5).astype(np.float32), (rows - 0.5).astype(np.float32))
+    border = cv2.BORDER_REPLICATE
+    share = cv2.remap(shape.mask.astype(np.float32), *places, cv2.INTER_LINEAR, borderMode=border)
+    return share >= 0.5
 
 
-def _find_own_car(scene: Scene, name: str) -> tuple[Camera, np.ndarray] | None:
-    """Return a camera at _SCALE and the mask of its images; None where these show no car."""
+@dataclass(frozen=True, eq=False)
+class _CarShape:
+    """Shape of the recording car in the images of one camera: an outline or a mask."""
+
+    camera: Camera
+    """Camera at the size of the shape."""
+    tops: Float64[np.ndarray, " W"] | None = None
+    """First row of the car in each column, below which all pixels show it."""
+    mask: Bool[np.ndarray, "H W"] | None = None
+    """Pixels that show the car."""
+
+
+@dataclass(frozen=True, eq=False)
+class OwnCar:
+    """Recording car in the pixels of one view."""
+
+    mask: Bool[np.ndarray, "H W"]
+    """Pixels that show the car."""
+    rows: slice
+    """Rows with weights above 0."""
+    weights: Float32[np.ndarray, "h W"]
+    """Weight of the car's colours in these rows: 1 in the mask, less in a narrow border around it,
+    0 elsewhere."""
+
+
+def own_car_in_view(scene: Scene, camera: Camera) -> OwnCar | None:
+    """Return the recording car in a view of recorded images; None where they show none.
+
+    The result is computed once for all images of a camera.
+
+    Args:
+        scene: the scene, whose frames have the images.
+        camera: a camera of the scene, at any scale, or a window of it.
+    """
+
+    def make() -> tuple[OwnCar | None]:  # a value that is None would be made again
+        mask = own_car_mask(scene, camera)
+        if mask is None or not mask.any():
+            return (None,)
+        distance_px = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
+        weights = np.clip(1 - distance_px / np.float32(_BORDER_PX + 1), 0, 1)
+        rows_with_car = np.flatnonzero((weights > 0).any(axis=1))
+        rows = slice(int(rows_with_car[0]), int(rows_with_car[-1]) + 1)
+        return (OwnCar(mask, rows, np.ascontiguousarray(weights[rows])),)
+
+    lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return memo_of(scene).get(("own car in view", camera.name, *lens), make)[0]
+
+
+def _shape_in(scene: Scene, name: str) -> _CarShape | None:
+    """Return the car's shape in the images of a camera; None where these show no car."""
+    if scene.ego_masks is None:
+        return _find_own_car(scene, name)
+    mask = scene.ego_masks.get(name)
+    camera = next((f.cameras[name] for f in scene.frames if name in f.cameras), None)
+    if mask is None or camera is None or not mask.any():
+        return None
+    return _CarShape(camera.resized(mask.shape[1], mask.shape[0]), mask=mask)
+
+
+def _find_own_car(scene: Scene, name: str) -> _CarShape | None:
+    """Return the outline that a camera's images at _SCALE tell; None where they tell none."""
     frames = [f for f in scene.frames if name in f.cameras and name in f.image_paths]
     frames = [frames[i] for i in moving_frames([f.cameras[name] for f in frames])]
     cameras = []
     images = []
+    world_from_egos = []
     for frame in frames:
         camera = frame.cameras[name]
         try:
@@ -258,7 +429,8 @@ def _find_own_car(scene: Scene, name: str) -> tuple[Camera, np.ndarray] | None:
             continue
         cameras.append(camera)
         images.append(image)
+        world_from_egos.append(frame.world_from_ego)
     if len({image.shape for image in images}) != 1:  # none, or of several sizes
         return None
-    mask = find_own_car_mask(cameras, images)
-    return (cameras[0].scaled(_SCALE), mask) if mask.any() else None
+    tops = find_own_car_outline(cameras, images, world_from_egos)
+    return None if tops is None else _CarShape(cameras[0].scaled(_SCALE), tops=tops)

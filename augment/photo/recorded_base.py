@@ -63,6 +63,7 @@ from augment.render.layout import HeightClip
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import PosedGaussians, Scene
+from augment.scene.semantics import SemanticClass
 from recipes.schema import Recipe
 
 # Radius of the guided filter, as a part of the image's width.
@@ -515,6 +516,13 @@ class Photo:
             lit_share = self.sharpen(torch.from_numpy(lit_share), SKY_RADIUS_FACTOR).numpy()
         lit_steps = cv2.merge([np.rint(lit_share * 255).astype(np.uint8)] * 3)
         return rgb * torch.from_numpy(cv2.LUT(lit_steps, factors[None])).to(rgb.device)
+
+    @property
+    def own_car_colors(self) -> Float[Tensor, "H W 3"]:
+        """Return the photo in the colours of the recording car: those of vehicles."""
+        if self.style is None or len(self.style.surface_maps) == 1:
+            return self._land
+        return self._in_colors(self.style.surface_maps[int(SemanticClass.VEHICLE)])
 
     def sky_colors(self, camera: Camera, *, parts_sky: bool = False) -> Float[Tensor, "H W 3"]:
         """Return the sky's colours at the pixels of a window.

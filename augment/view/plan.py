@@ -8,6 +8,7 @@ facts, so they can be printed, compared and tested. `augment.view.render_view` c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -26,6 +27,7 @@ from augment.effects.effect import (
     Step,
     ViewQuery,
 )
+from augment.light.cast_shadows import shadows_of
 from augment.photo.recorded_base import check_base
 from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
@@ -39,6 +41,8 @@ from recipes.schema import Recipe, Sensor
 LENS_BLUR_PASS = "lens blur"
 # Name of the pass that adds sensor noise, the last one of all.
 SENSOR_NOISE_PASS = "sensor noise"
+# Name of the pass that fades the cast shadows on the ground.
+SHADOW_PASS = "cast shadows"
 # Name of the pass that renders the scene without what lies on it.
 BARE_SURFACE_PASS = "bare surface"
 
@@ -78,6 +82,10 @@ class Plan:
     """If True, the colours that effects add look as by the mean of all colour maps."""
     is_on_photo: bool
     """If True, the recorded image stays the picture, and the scene supplies the weather."""
+    covers_own_car: bool
+    """If True, snow lies on the recording car in a recorded image; else the car stays dry."""
+    sun_share: float
+    """Share of the sun's light that arrives at the ground; 1 leaves cast shadows as they are."""
     sensor: Sensor
     """Lens and sensor of the recipe."""
     seed: int
@@ -158,6 +166,9 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         bare_buffers = label_buffers
     if finds_boxes and depth_buffer not in image_buffers:
         image_buffers.add(EXPECTED_DEPTH)
+    sun_share, shadow_reason = _find_sun_share(recipe, scene)
+    if sun_share < 1 and render.is_on_recorded:  # depth says where a photo shows the ground
+        image_buffers.add(EXPECTED_DEPTH)
     effect_buffers = (p.buffers for p in effect_plans.values() if p.data is not None)
     buffers = frozenset(image_buffers).union(*effect_buffers)
     exposure = _exposure_step(recipe, scene)
@@ -185,9 +196,32 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         uses_recorded_exposure=exposure.runs,
         uses_common_exposure=exposure.runs and recipe.render.exposure == "common",
         is_on_photo=recipe.render.is_on_recorded,
+        covers_own_car=recipe.render.is_on_recorded and recipe.render.own_car == "snowy",
+        sun_share=sun_share,
         sensor=recipe.camera,
         seed=recipe.seed,
-        steps=_all_steps(recipe, scene, effect_plans, buffers, bare_buffers, exposure),
+        steps=(
+            Step(SHADOW_PASS, sun_share < 1, shadow_reason, SCENE),
+            *_all_steps(recipe, scene, effect_plans, buffers, bare_buffers, exposure),
+        ),
+    )
+
+
+def _find_sun_share(recipe: Recipe, scene: Scene) -> tuple[float, str]:
+    """Return the share of the sun's light that all effects let through, and the reason.
+
+    It is 1 where the ground shows no cast shadows.
+    """
+    shares = [effect.sun_share(recipe, scene) for effect in effects.EFFECTS]
+    share = math.prod(share for share, _ in shares)
+    if share == 1:
+        return 1.0, "no effect keeps the sun's light from the ground"
+    shadows = shadows_of(scene)
+    if shadows is None or shadows.certainty == 0:
+        return 1.0, "the ground shows no shadows of a sun"
+    reasons = "; ".join(reason for other, reason in shares if other < 1)
+    return share, (
+        f"shadows have {shadows.luminance_ratio:.2f} of the light beside them; {reasons}"
     )
 
 
@@ -245,6 +279,7 @@ def _photo_step(recipe: Recipe) -> Step:
     why = f"render.base is {recipe.render.base!r}"
     if is_on_recorded:
         why += ": the recorded image is the picture, edges of the weather move to its own"
+        why += f"; the recording car in it stays {recipe.render.own_car}"
     return Step("photo", is_on_recorded, why)
 
 

@@ -20,11 +20,13 @@ from torch import Tensor
 
 from augment import effects
 from augment.detail.prune import prune_parts
-from augment.effects.effect import LabelInputs, RenderedView
+from augment.effects.effect import EffectInScene, LabelInputs, RenderedView
+from augment.light.cast_shadows import faded_shadows
 from augment.light.common_exposure import added_colors
 from augment.output.layout import TRUST
-from augment.photo.own_car import own_car_mask
-from augment.photo.recorded_base import open_photo
+from augment.photo.own_car import OwnCar, own_car_in_view
+from augment.photo.own_car_snow import cover_own_car
+from augment.photo.recorded_base import mix, open_photo
 from augment.photo.trust import trust_mask
 from augment.render.backends import choose_backend, renders_on_gpu
 from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
@@ -33,15 +35,18 @@ from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.render.sensor import add_noise, blur_lens
 from augment.render.threads import num_concurrent_views, split_threads, wait_for_result
+from augment.rng import rng_for
 from augment.scene.cameras import Camera
 from augment.scene.scene import PosedGaussians, Scene
 from augment.timing import timed
+from augment.view.box_labels import OWN_CAR_DEPTH_M
 from augment.view.images import ViewImages, start_images
 from augment.view.layers import LayerRenderer
 from augment.view.plan import (
     BARE_SURFACE_PASS,
     LENS_BLUR_PASS,
     SENSOR_NOISE_PASS,
+    SHADOW_PASS,
     Plan,
     ViewPlan,
     make_plan,
@@ -92,9 +97,11 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
         with timed("trust mask"):
             trust[TRUST] = trust_mask(scene, camera, backend=backend)
     own_car = None
-    if plan.is_on_photo and plan.finds_boxes:
+    if plan.is_on_photo:
         with timed("recording car"):
-            own_car = own_car_mask(scene, camera)
+            own_car = own_car_in_view(scene, camera)
+    if own_car is not None:
+        trust = {name: np.where(own_car.mask, np.uint8(0), mask) for name, mask in trust.items()}
     return PendingView(lambda: _weathered(images(), camera, plan, recipe, trust, own_car))
 
 
@@ -125,15 +132,41 @@ def render_buffers(
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     if plan.uses_common_exposure:
         layers = replace(layers, added_colors=added_colors(scene, camera))
+    is_fading = plan.sun_share < 1
     for effect in view.effects:
+        if is_fading and _is_weather(effect):  # a style comes first, with maps of its own
+            layers = _fade_shadows(layers, scene, plan.sun_share)
+            is_fading = False
         layers = effect.hooks.edit_scene(effect, layers, camera)
+    if is_fading:
+        layers = _fade_shadows(layers, scene, plan.sun_share)
     if plan.prune > 0:
         with timed("prune"):
             parts = prune_parts(layers.parts, scene, camera, plan.prune)
             layers = replace(layers, parts=parts, unpruned_parts=layers.parts)
+    own_car = None
+    car_rgb = None
+    if photo is not None and layers.photo is not None and any(map(_is_weather, view.effects)):
+        with timed("recording car"):
+            own_car = own_car_in_view(scene, camera)
+        if own_car is not None:  # copied, since effects may write into the picture that they get
+            car_rgb = layers.photo.own_car_colors[own_car.rows].clone()
     rendered = _draw(view, layers, camera)
+    if own_car is not None and car_rgb is not None:
+        if plan.covers_own_car:
+            rng = rng_for(
+                seed=plan.seed, scene=scene.name, effect="snow on the own car", camera=camera.name
+            )
+            car_rgb = cover_own_car(car_rgb, own_car, rendered.raster, rng=rng)
+        rendered = _with_own_car(rendered, own_car, car_rgb)
     for effect in view.effects:
         rendered = effect.hooks.edit_image(effect, rendered, camera)
+        if own_car is None or car_rgb is None:
+            continue
+        if _is_weather(effect):
+            rendered = _with_own_car(rendered, own_car, car_rgb)
+        else:
+            car_rgb = rendered.rgb[own_car.rows].clone()
     rgb = rendered.rgb
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         with timed("camera colour map"):
@@ -157,7 +190,7 @@ def render_buffers(
         depth_m=depth_m,
         parts=tuple(layers.parts),
         plan=view.skip_steps(rendered.skip_reasons),
-        masks=_masks(view, rendered),
+        masks=_masks(view, rendered, own_car),
         bare_buffers=_bare(rendered.raster, bare_parts, camera, plan, view, backend),
     )
 
@@ -173,16 +206,63 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> RenderedView
     return RenderedView(*layers.render_with_sky(camera, view.buffers), layers)
 
 
-def _masks(view: ViewPlan, rendered: RenderedView) -> dict[str, Tensor]:
+def _fade_shadows(layers: LayerRenderer, scene: Scene, sun_share: float) -> LayerRenderer:
+    """Return the layers with the cast shadows on the ground faded.
+
+    Args:
+        layers: the layers, before any weather.
+        scene: the scene.
+        sun_share: share of the sun's light that arrives at the ground.
+    """
+    with timed(SHADOW_PASS):
+        shadows = faded_shadows(scene, sun_share)
+        if shadows is None:
+            return layers
+        parts = tuple(
+            part if part.instance_id or part.is_overlay else shadows.apply_to(part)
+            for part in layers.parts
+        )
+        photo = layers.photo and replace(layers.photo, faded_shadows=shadows)
+    return replace(layers, parts=parts, photo=photo)
+
+
+def _is_weather(effect: EffectInScene) -> bool:
+    """Return True if the effect lies in the air or on the scene: no style, and not on the lens."""
+    return effect.hooks.section.startswith("weather.")
+
+
+def _with_own_car(rendered: RenderedView, own_car: OwnCar, car_rgb: Tensor) -> RenderedView:
+    """Return the picture with the recording car in given colours, fading out in its border.
+
+    Args:
+        rendered: the picture.
+        own_car: the recording car in it.
+        car_rgb: colours of the car's rows, [h, W, 3].
+    """
+    with timed("recording car"):
+        weights = torch.from_numpy(own_car.weights).to(rendered.rgb.device)
+        rgb = rendered.rgb.clone()
+        rgb[own_car.rows] = mix(rgb[own_car.rows], car_rgb, weights)
+    return replace(rendered, rgb=rgb)
+
+
+def _masks(view: ViewPlan, rendered: RenderedView, own_car: OwnCar | None) -> dict[str, Tensor]:
     """Return a bool mask for each effect in view: the pixels that show the effect.
 
     A pixel that several opaque effects cover belongs to the one that is applied last.
+
+    Args:
+        view: the plan of the view.
+        rendered: the picture.
+        own_car: the recording car, which no weather covers; None where there is none.
     """
     masks = dict[str, Tensor]()
     opaque_masks = list[Tensor]()
     for effect in reversed(view.effects):
         mask = effect.hooks.visible_mask(effect, rendered)
         if mask is not None and effect.hooks.mask_name is not None:
+            if own_car is not None and _is_weather(effect):
+                mask = mask & ~torch.from_numpy(own_car.mask).to(mask.device)
             for opaque_mask in opaque_masks:
                 mask = mask & ~opaque_mask
             masks[effect.hooks.mask_name] = mask
@@ -242,9 +322,13 @@ def _weathered(
     plan: Plan,
     recipe: Recipe,
     trust: Mapping[str, np.ndarray],
-    own_car: np.ndarray | None,
+    own_car: OwnCar | None,
 ) -> WeatheredView:
-    """Return the finished view: the images, and what labels are measured from."""
+    """Return the finished view: the images, and what labels are measured from.
+
+    Surfaces behind the recording car are left out: a picture that shows the car does not show them.
+    """
+    car_mask = None if own_car is None else own_car.mask
     masks = dict(trust)
     views = dict[str, LabelInputs]()
     for effect in effects.EFFECTS:
@@ -254,6 +338,7 @@ def _weathered(
         mask = images.masks.get(effect.mask_name or "")
         is_in_view = effect_plan.data is not None and (effect.mask_name is None or mask is not None)
         depth = images.scene_depth_m if is_in_view else None
+        depth = _outside(car_mask, depth, OWN_CAR_DEPTH_M)
         views[effect.name] = LabelInputs(effect_plan, depth, mask, plan.water_level_z_m)
         if effect.mask_name is not None:
             empty_mask = np.zeros((camera.height, camera.width), np.uint8)
@@ -261,13 +346,20 @@ def _weathered(
     return WeatheredView(
         camera=camera,
         rgb=images.rgb,
-        depth_m=None if plan.depth_buffer is None else images.depth_m,
-        semantic=images.semantic if plan.has_semantic else None,
-        instance=images.instance,
+        depth_m=None if plan.depth_buffer is None else _outside(car_mask, images.depth_m, 0.0),
+        semantic=_outside(car_mask, images.semantic, 0.0) if plan.has_semantic else None,
+        instance=_outside(car_mask, images.instance, 0.0),
         masks=masks,
         effects=views,
-        surface=_surface_view(images, plan, own_car),
+        surface=_surface_view(images, plan, car_mask),
     )
+
+
+def _outside(mask: np.ndarray | None, image: np.ndarray | None, value: float) -> np.ndarray | None:
+    """Return an image with a value, in the image's type, where a mask is True."""
+    if mask is None or image is None:
+        return image
+    return np.where(mask, image.dtype.type(value), image)
 
 
 def _surface_view(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.training_views.masks import read_ego_mask
+from adapters.ego_masks import read_ego_mask
 from adapters.training_views.views import RecordedViews
 from augment.errors import AdapterError
 from augment.photo.lidar_view import lidar_top_rad
@@ -146,7 +146,8 @@ def test_frames_are_taken_where_the_car_moved():
     def standing(count: int, step_m: float):
         return [drives.camera("a", f, position=(step_m * f, 0, 1.6)) for f in range(count)]
 
-    assert moving_frames(standing(20, 0.0)) == [0]
+    assert moving_frames(standing(20, 0.0)) == list(range(20))  # all alike: the edge has to tell
+    assert moving_frames(standing(8, 0.13)) == list(range(8))  # a short clip, in shorter steps
     chosen = moving_frames(standing(100, 0.2))
     assert len(chosen) == 24 and chosen == sorted(set(chosen))
     assert not find_own_car_mask(*drive_pictures(frames=1, car_rows=np.full(160, 90))).any()
@@ -204,7 +205,7 @@ def test_images_that_differ_by_a_few_rows_share_a_mask(bonnet_drive):
 def test_masks_from_files(bonnet_drive, tmp_path):
     folder = tmp_path / "masks"
     folder.mkdir()
-    with pytest.raises(AdapterError, match=r"no mask front\.png"):
+    with pytest.raises(AdapterError, match=r"holds no mask; expected .*front\.png"):
         RecordedViews(bonnet_drive, scale=0.5, masks_dir=folder)
     mask = np.zeros((240, 320), np.uint8)
     mask[200:, :160] = 255

@@ -22,8 +22,10 @@ from augment.scene.scene import PosedGaussians, Scene
 from augment.scene.semantics import SemanticClass
 from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers, render_view
+from recipes.rain import Rain
 from recipes.schema import Recipe, Render, Smog, Weather
 from recipes.snow import Snow, SnowLight
+from recipes.snowfall import Snowfall
 from tests.snow_scenes import drive, sheet, side_wall, wall
 
 ROAD = int(SemanticClass.ROAD)
@@ -210,3 +212,60 @@ def test_the_streets_shadows_are_its_suns():
     is_lit = ~body.tree.occluded(spots + np.array([0, 0, 0.02]), body.lighting.to_sun)
     lit, known_share, _ = shadows.sample(spots[:, 0], spots[:, 1])
     assert ((lit > 0.5) == is_lit)[known_share > 0.99].mean() > 0.9
+
+
+# ---- Shadows under clouds ------------------------------------------------------------------------
+
+
+def sun_share_of(scene: Scene, **weather) -> float:
+    return make_plan(Recipe(weather=Weather(**weather)), scene).sun_share
+
+
+def test_clouds_that_rain_or_snow_take_the_sun():
+    """By the rate, by the snow's own light, or as a recipe says; the shares multiply."""
+    scene = street(in_sun())
+    assert sun_share_of(scene) == 1
+    assert sun_share_of(scene, rain=Rain(rate_mm_h=0.0, wetness=0.5)) == 1
+    drizzle, rain = (sun_share_of(scene, rain=Rain(rate_mm_h=r)) for r in (0.1, 3.0))
+    assert drizzle == pytest.approx(np.exp(-1)) and rain < 1e-9
+    assert sun_share_of(scene, rain=Rain(rate_mm_h=3.0, shadow_fade=0.0)) == 1
+    assert sun_share_of(scene, snowfall=Snowfall(rate_mm_h=1.0)) < 1e-4
+    assert sun_share_of(scene, snow=Snow(depth_m=0.1)) == 1
+    overcast = Snow(depth_m=0.1, light=SnowLight(sun=0.2))
+    assert sun_share_of(scene, snow=overcast) == pytest.approx(0.2)
+    fade = Rain(rate_mm_h=3.0, shadow_fade=0.5)
+    assert sun_share_of(scene, snow=overcast, rain=fade) == pytest.approx(0.1)
+    grey = street(np.ones(len(places())))
+    assert sun_share_of(grey, rain=Rain(rate_mm_h=3.0)) == 1
+
+
+def test_in_rain_and_snowfall_the_ground_has_one_light():
+    """Splats away from the edge and splats at it: the map's metre of blur leaves no stripe."""
+    scene = street(in_sun())
+    faded = faded_shadows(scene, 0.0)
+    assert faded is not None
+    gains = faded.maps[faded.rows.long()].diagonal(dim1=1, dim2=2).numpy()
+    count = len(places())
+    rgb = (0.5 + SH_C0 * scene.background.sh[:count, 0].numpy()).clip(0, 1)
+    before, after = (linear_from_display(c).mean(1) for c in (rgb, rgb * gains[:count]))
+    lit = in_sun() > 0.5
+    reach_m = HIGH_M / np.tan(np.radians(SUN_DEG[1]))
+    off_edge_m = np.abs(places()[:, 1] - (WALL_M - reach_m))
+    known = (np.abs(places()[:, 0]) < 10) & (np.abs(places()[:, 1]) < WALL_M - 0.6)
+    for near_m, far_m in ((1.0, 3.0), (0.1, 1.0)):
+        zone = known & (off_edge_m > near_m) & (off_edge_m < far_m)
+        ratio = np.median(after[zone & ~lit]) / np.median(after[zone & lit])
+        assert np.median(before[zone & ~lit]) < 0.35 * np.median(before[zone & lit])
+        assert 0.85 < ratio < 1.15, (near_m, ratio)
+
+
+def test_recipes_without_the_field_keep_their_hash_and_dry_pictures_their_bits():
+    weather = Weather(rain=Rain(rate_mm_h=2.0), snow=Snow(depth_m=0.1))
+    stated = Weather(rain=Rain(rate_mm_h=2.0, shadow_fade=None), snow=Snow(depth_m=0.1))
+    assert Recipe(weather=weather).hash == Recipe(weather=stated).hash
+    scene = street(in_sun())
+    camera = scene.frames[0].cameras["ahead"]
+    dry = Recipe(weather=Weather(snow=Snow(depth_m=0.1, coverage=0.0)))
+    np.testing.assert_array_equal(
+        render_view(scene, camera, dry).rgb, render_view(scene, camera, Recipe()).rgb
+    )

@@ -16,6 +16,7 @@ from augment.effects.effect import (
     Effect,
     EffectInScene,
     EffectPlan,
+    JobContext,
     LabelInputs,
     RenderedView,
     Step,
@@ -28,6 +29,7 @@ from augment.effects.falling.lidar import precipitation_echoes, scatterers_of
 from augment.effects.falling.shutter import frame_interval_s, motion_of
 from augment.effects.lidar.beam import Echoes
 from augment.errors import SceneError
+from augment.light.cast_shadows import precompute_shadows
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH
 from augment.scene.boxes import WorldBoxes
 from augment.scene.cameras import Camera
@@ -53,7 +55,19 @@ class FallingEffect(Effect):
     """Kind of the precipitation, as in `Precipitation`."""
 
     def reads_splats(self, recipe: Recipe) -> bool:
-        return False
+        section = self.section_of(recipe)
+        return section is not None and section.has_effect and section.sun_fade > 0
+
+    def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
+        section = self.section_of(recipe)
+        if section is None or not section.has_effect or section.sun_fade == 0:
+            return 1.0, ""
+        share = 1 - section.sun_fade
+        return share, f"{self.section} leaves {100 * share:.0f} % of the sun's light"
+
+    def precompute(self, context: JobContext) -> None:
+        if any(map(self.reads_splats, context.recipes)):
+            precompute_shadows(context.scene)
 
     def kernel_key(self, section: Rain | Snowfall) -> Any:
         return section.has_effect or None

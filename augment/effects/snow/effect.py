@@ -132,6 +132,13 @@ class SnowEffect(Effect):
         plan = SnowPlan(snow, seed, level_z_m, has_wet_ground)
         return EffectPlan(plan, steps, frozenset(buffers))
 
+    def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
+        snow = self.section_of(recipe)
+        if snow is None or not snow.has_effect or snow.sun_fade == 0:
+            return 1.0, ""
+        share = 1 - snow.sun_fade
+        return share, f"{self.section} leaves {100 * share:.0f} % of the sun's light"
+
     def prepare(self, effect: EffectInScene) -> SnowLayers:
         return build_snow_layers(
             effect.scene, effect.settings, effect.lit_scene, backend=effect.backend
