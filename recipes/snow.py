@@ -38,7 +38,7 @@ class SnowWind(ClosedModel):
 class Snow(EffectModel):
     """Snow lying on what is open to the sky: ground, roofs, vehicles."""
 
-    later_fields = ("shadow_fade",)
+    later_fields = ("dirt", "traffic", "shadow_fade")
     synonyms = (
         ("depth_m", "level level_m height height_m thickness thickness_m"),
         ("coverage", "cover"),
@@ -74,8 +74,6 @@ class Snow(EffectModel):
             linear=True,
         ),
     )
-
-    later_fields = ("dirt", "traffic")
 
     depth_m: Number = Field(ge=0, le=10)
     """Depth of the layer on level ground."""
