@@ -543,9 +543,9 @@ def find_strays(
     found_ids = [np.zeros(0, np.int64)]
     found_cells = [np.zeros(0, np.int32)]
     if len(cells.sizes_m) and len(shells):
-        is_fixed = np.isin(classes_of(gaussians), _FIXED_CLASSES)
-        is_small = gaussians.scales.numpy().max(1) < _MAX_STRAY_SCALE_M
-        candidate_ids = np.flatnonzero(is_small & ~is_fixed)
+        candidate_ids = np.flatnonzero(~np.isin(classes_of(gaussians), _FIXED_CLASSES))
+        is_small = gaussians.scales.numpy()[candidate_ids].max(1) < _MAX_STRAY_SCALE_M
+        candidate_ids = candidate_ids[is_small]
         means = gaussians.means.numpy()[candidate_ids]
         order = np.argsort(means[:, 0], kind="stable")
         sorted_x = means[order, 0]
