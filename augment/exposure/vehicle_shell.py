@@ -492,9 +492,9 @@ def _fit_forms(
         scale = _FIRST_SCALE_M * (_LAST_SCALE_M / _FIRST_SCALE_M) ** progress
         scales = np.where((residuals > 0) & faces_up, max(scale, _UPPER_SCALE_M), scale)
         w = station_weights / (1 + (residuals / scales) ** 2)
-        weighted = derivatives * w[..., None]
-        matrix = np.einsum("fni,fnj->fij", weighted, derivatives) + prior
-        vector = np.einsum("fni,fn->fi", weighted, residuals) + (form_knots - knots) / sigmas**2
+        weighted = (derivatives * w[..., None]).transpose(0, 2, 1)
+        matrix = weighted @ derivatives + prior
+        vector = (weighted @ residuals[..., None])[..., 0] + (form_knots - knots) / sigmas**2
         change = np.linalg.solve(matrix, vector[..., None])[..., 0]
         knots = knots + np.clip(change, -_MAX_STEP_M, _MAX_STEP_M)
         knots = np.clip(
