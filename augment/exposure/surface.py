@@ -522,10 +522,29 @@ _FIXED_CLASSES = tuple(
         *("VEGETATION", "BUILDING", "POLE", "SIGN", "PEDESTRIAN"),
     )
 )
+# Depth below the middle of a box down to which a bonnet or boot may lie, in heights of the box.
+_MAX_BELT_SHARE = 0.2
+_SQUARE_M = 2.0  # side of the squares in which Gaussians near shells are looked for
 _MAX_STRAY_SCALE_M = 0.12  # longest axis of a Gaussian that strays; larger ones are no stray
 _MAX_STRAY_HEIGHT_M = 0.2  # height above a shell up to which Gaussians stray
 _MIN_STRAY_HEIGHT_M = 0.02  # height above a shell from which on they do
 _MIN_STRAY_HEIGHT_BESIDE_M = -0.04  # the same beside a roof or bonnet, over its edge
+
+
+def _ids_near(means: np.ndarray, shells: Sequence[PlacedShell]) -> np.ndarray:
+    """Return the ids of means [N, 3] in the squares of a coarse grid that shells touch."""
+    centres = np.array([shell.centre_m[:2] for shell in shells])
+    reaches = np.array([shell.reach_m for shell in shells])
+    corner = (centres - reaches).min(0)
+    first = np.floor((centres - reaches - corner) / _SQUARE_M).astype(int)
+    last = np.floor((centres + reaches - corner) / _SQUARE_M).astype(int)
+    is_touched = np.zeros(last.max(0) + 1, bool)
+    for (x0, y0), (x1, y1) in zip(first, last, strict=True):
+        is_touched[x0 : x1 + 1, y0 : y1 + 1] = True
+    squares = np.floor((means[:, :2] - corner.astype(means.dtype)) / _SQUARE_M)
+    ids = np.flatnonzero(((squares >= 0) & (squares < is_touched.shape)).all(1))
+    chosen = squares[ids].astype(np.int64)
+    return ids[is_touched[chosen[:, 0], chosen[:, 1]]]
 
 
 def find_strays(
@@ -543,9 +562,11 @@ def find_strays(
     found_ids = [np.zeros(0, np.int64)]
     found_cells = [np.zeros(0, np.int32)]
     if len(cells.sizes_m) and len(shells):
-        is_fixed = np.isin(classes_of(gaussians), _FIXED_CLASSES)
-        is_small = gaussians.scales.numpy().max(1) < _MAX_STRAY_SCALE_M
-        candidate_ids = np.flatnonzero(is_small & ~is_fixed)
+        candidate_ids = _ids_near(gaussians.means.numpy(), shells)
+        classes = classes_of(gaussians)[candidate_ids]
+        candidate_ids = candidate_ids[~np.isin(classes, _FIXED_CLASSES)]
+        is_small = gaussians.scales.numpy()[candidate_ids].max(1) < _MAX_STRAY_SCALE_M
+        candidate_ids = candidate_ids[is_small]
         means = gaussians.means.numpy()[candidate_ids]
         order = np.argsort(means[:, 0], kind="stable")
         sorted_x = means[order, 0]
@@ -555,6 +576,8 @@ def find_strays(
                 sorted_x, placed_shell.centre_m[0] + np.array([-reach, reach])
             )
             rows = np.sort(order[low:high])
+            lowest_m = placed_shell.centre_m[2] - _MAX_BELT_SHARE * placed_shell.shell.size_m[2]
+            rows = rows[means[rows, 2] > lowest_m]
             places = means[rows].astype(np.float64)
             nearest_tops, is_beside, is_in_box = placed_shell.nearest_tops(places)
             for nearest_xy, is_aside in zip(nearest_tops, is_beside, strict=True):

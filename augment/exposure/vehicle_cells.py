@@ -65,6 +65,7 @@ _OTHER_CLASSES = (
     *_GROUND_CLASSES,
     *(SemanticClass[n] for n in ("VEGETATION", "BUILDING", "POLE", "SIGN", "PEDESTRIAN", "SKY")),
 )
+_MAX_SPLATS = 4000  # number of splats, spread over all, that a shell is fitted to
 _MIN_OPACITY = 0.3  # fainter splats are no surface
 _MAX_SCALE_M = 0.6  # larger splats are no surface of a vehicle
 # Places of the points on a splat along its two longer axes, in standard deviations, by the largest
@@ -98,6 +99,7 @@ def shell_of_gaussians(
     rows = np.flatnonzero(is_surface)
     if len(rows) < MIN_POINTS:
         return None
+    rows = rows[:: math.ceil(len(rows) / _MAX_SPLATS)]
     points, is_facing_up = _surface_points(gaussians.select(_index_tensor(rows)))
     return fit_shell(points, is_facing_up, label, size_m)
 

@@ -54,9 +54,10 @@ _TOP_DEPTH_M = 0.08  # depth below the highest such point down to which points a
 _TOP_SLACK_M = 0.02  # height above it up to which they are
 _TOP_QUANTILE = 0.6  # quantile of their heights that counts
 _ALL_POINTS_WEIGHT = 0.3  # weight of heights from points that do not face upwards
+_KEY_STEP_M = 1000.0  # step of sorting keys between stations, far above any height
 _FULL_COUNT = 6  # number of points at a station from which on it has full weight
 
-_NUM_STEPS = 20  # number of Gauss-Newton steps
+_NUM_STEPS = 14  # number of Gauss-Newton steps
 _MAX_STEP_M = 0.15  # largest step of a knot
 _MAX_KNOT_SHIFT = 3.5  # largest shift of a knot from its form, in standard deviations
 _MAX_END_RISE_M = 0.02  # largest rise of a bonnet or boot towards its end
@@ -331,9 +332,11 @@ def _side_heights(x: np.ndarray, z: np.ndarray, stations: np.ndarray) -> _SideHe
     """
     nearest = np.floor((x - stations[0]) / STATION_M + 0.5).astype(np.int64)
     alone = _surface_heights(nearest, z, len(stations))
-    around = np.concatenate([nearest - 1, nearest, nearest + 1])
-    together = _surface_heights(around, np.tile(z, 3), len(stations))
     is_known = alone.weights > 0
+    around = np.concatenate([nearest - 1, nearest, nearest + 1])
+    is_needed = (around >= 0) & (around < len(stations))
+    is_needed[is_needed] = ~is_known[around[is_needed]]
+    together = _surface_heights(around[is_needed], np.tile(z, 3)[is_needed], len(stations))
     return _SideHeights(
         np.where(is_known, alone.heights_m, together.heights_m),
         np.where(is_known, alone.weights, together.weights),
@@ -355,7 +358,10 @@ def _surface_heights(station: np.ndarray, z: np.ndarray, count: int) -> _SideHei
     is_inside = (station >= 0) & (station < count)
     station = station[is_inside]
     z = z[is_inside]
-    order = np.lexsort((-z, station))
+    # Keys rise with the station, and within a station as z falls.
+    keys = _KEY_STEP_M * station - z
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
     station = station[order]
     z = z[order]
     if len(z) <= _NUM_SUPPORTERS:
@@ -368,13 +374,13 @@ def _surface_heights(station: np.ndarray, z: np.ndarray, count: int) -> _SideHei
     tops = z[supported_rows[first]]
     starts = np.searchsorted(station, found_stations, side="left")
     ends = np.searchsorted(station, found_stations, side="right")
-    for number, top, start, end in zip(found_stations, tops, starts, ends, strict=True):
-        falling = -z[start:end]
-        low = np.searchsorted(falling, -(top + _TOP_SLACK_M))
-        high = np.searchsorted(falling, -(top - _TOP_DEPTH_M))
-        index = low + (1 - _TOP_QUANTILE) * (high - 1 - low)
-        heights[number] = z[start + round(index)]
-        weights[number] = min((end - start) / _FULL_COUNT, 1.0)
+    lows = np.searchsorted(keys, _KEY_STEP_M * found_stations - (tops + _TOP_SLACK_M))
+    highs = np.searchsorted(keys, _KEY_STEP_M * found_stations - (tops - _TOP_DEPTH_M))
+    index = np.clip(lows, starts, None) + (1 - _TOP_QUANTILE) * (
+        np.minimum(highs, ends) - 1 - np.clip(lows, starts, None)
+    )
+    heights[found_stations] = z[np.round(index).astype(np.int64)]
+    weights[found_stations] = np.minimum((ends - starts) / _FULL_COUNT, 1.0)
     return _SideHeights(heights, weights)
 
 
@@ -467,6 +473,11 @@ def _fit_forms(
     height = size_m[2]
     x = np.tile(stations, 2)
     faces_up = np.arange(len(x)) < len(stations)
+    is_known = weights > 0
+    x = x[is_known]
+    faces_up = faces_up[is_known]
+    heights = heights[is_known]
+    weights = weights[is_known]
     knot_scales = np.repeat([length, height], NUM_KNOTS)
     form_knots = knot_scales * np.array([[*form.knots_x, *form.knots_z] for form in forms])
     rises_m = np.array([form.roof_rise * height for form in forms])
@@ -481,9 +492,9 @@ def _fit_forms(
         scale = _FIRST_SCALE_M * (_LAST_SCALE_M / _FIRST_SCALE_M) ** progress
         scales = np.where((residuals > 0) & faces_up, max(scale, _UPPER_SCALE_M), scale)
         w = station_weights / (1 + (residuals / scales) ** 2)
-        weighted = derivatives * w[..., None]
-        matrix = np.einsum("fni,fnj->fij", weighted, derivatives) + prior
-        vector = np.einsum("fni,fn->fi", weighted, residuals) + (form_knots - knots) / sigmas**2
+        weighted = (derivatives * w[..., None]).transpose(0, 2, 1)
+        matrix = weighted @ derivatives + prior
+        vector = (weighted @ residuals[..., None])[..., 0] + (form_knots - knots) / sigmas**2
         change = np.linalg.solve(matrix, vector[..., None])[..., 0]
         knots = knots + np.clip(change, -_MAX_STEP_M, _MAX_STEP_M)
         knots = np.clip(
