@@ -37,8 +37,12 @@ WORK_WIDTH = 640
 _EDGE_LEVELS = 14
 # The same of an edge that no cloud has.
 _SHARP_LEVELS = 40
-# The same of the border of a cloud, on average.
+# The same below which an edge is as soft as a cloud's.
 _CLOUD_LEVELS = 28
+# Share of soft edges around a cloud, at least: the others are those of roofs below it.
+_CLOUD_EDGE_SHARE = 0.5
+# The same of a cloud that is brighter than the sky.
+_GLARE_EDGE_SHARE = 0.3
 # Factor by which an image is shrunk where it has no sky at its own size: its edges may be blurred.
 _BLURRED_FACTOR = 3
 # Columns of an image that is shrunk for this, at least.
@@ -122,8 +126,8 @@ class _Regions(NamedTuple):
     """Mean luma, [R]."""
     is_at_top: np.ndarray
     """True for regions that reach the image's first rows, [R]."""
-    edge_levels: np.ndarray
-    """Mean contrast of the edges around, [R]."""
+    soft_edges: np.ndarray
+    """Share of the edges around that are as soft as those of clouds, [R]."""
 
 
 def find_sky_regions(
@@ -245,7 +249,7 @@ def _measure_regions(pixels: _Pixels) -> _Regions:
     # Many small regions lie around few edges: the highest number beside an edge gets it.
     beside = cv2.dilate(labels.astype(np.uint16), np.ones((5, 5), np.uint8))[is_edge]
     num_edges = np.bincount(beside, minlength=count)
-    edge_sums = np.bincount(beside, pixels.contrast[is_edge], count)
+    num_soft = np.bincount(beside, pixels.contrast[is_edge] < _CLOUD_LEVELS, count)
     return _Regions(
         labels=labels,
         area=area,
@@ -253,7 +257,7 @@ def _measure_regions(pixels: _Pixels) -> _Regions:
         open=count_in(pixels.is_open) / area.clip(1),
         luma=np.bincount(labels.ravel(), pixels.luma.ravel(), count) / area.clip(1),
         is_at_top=stats[:, cv2.CC_STAT_TOP] <= _TOP_ROWS,
-        edge_levels=edge_sums / np.maximum(num_edges, 1),
+        soft_edges=num_soft / np.maximum(num_edges, 1),
     )
 
 
@@ -319,12 +323,10 @@ def _find_other_regions(
     if not has_lidar:
         return has_sky_color
     can_be_cloud = is_free & (regions.open > 0.9) & (score > _SURFACE_SCORE)
-    is_cloud = (
-        can_be_cloud
-        & (regions.edge_levels < _CLOUD_LEVELS)
-        & (regions.luma > _CLOUD_LUMA_SHARE * sky_luma)
-    )
-    is_glare = can_be_cloud & (regions.edge_levels < 45) & (regions.luma > sky_luma)
+    is_cloud = can_be_cloud & (regions.soft_edges > _CLOUD_EDGE_SHARE)
+    is_cloud &= regions.luma > _CLOUD_LUMA_SHARE * sky_luma
+    is_glare = can_be_cloud & (regions.soft_edges > _GLARE_EDGE_SHARE)
+    is_glare &= regions.luma > sky_luma
     return has_sky_color | is_cloud | is_glare
 
 
