@@ -355,7 +355,15 @@ def _edges_of(
             moves.append(_find_sources(chosen, is_seed, camera))
             continue
         # Water hides the lower part of an object, which then comes from pixels without a surface.
-        is_above = _heights_at(chosen, objects[label - 1].depth_m, camera) > clip.z_m
+        rows, columns = np.divmod(chosen, camera.width)
+        small_rows = rows * labels.shape[0] // camera.height
+        small_columns = columns * labels.shape[1] // camera.width
+        is_object = is_pure & (labels == label)
+        depths_m: float | np.ndarray = objects[label - 1].depth_m
+        if is_object.any():
+            nearest = _nearest_to(small_rows, small_columns, is_object)
+            depths_m = drawing.depth.reshape(-1)[nearest]
+        is_above = _heights_at(chosen, depths_m, camera) > clip.z_m
         moves.append(_find_sources(chosen[is_above], is_seed & is_drawn, camera))
         moves.append(_find_sources(chosen[~is_above], is_seed & ~is_drawn, camera))
     empty = np.empty(0, np.int64)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -26,7 +25,6 @@ SIZE = (480, 270)
 PERIMETER_PX = 573
 # Mean distance of an outline from the edge of a photo with noise of 6 levels, pixels.
 MEAN_ERROR_PX = 0.8
-MARKED_CARS = Path(__file__).parents[1] / "data" / "pandaset_moving_cars.json"
 
 
 def paint(mask: np.ndarray, inside: int, outside: int, noise: int = 6) -> np.ndarray:
