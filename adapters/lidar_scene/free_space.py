@@ -33,12 +33,14 @@ MIN_FREE_SWEEPS = 3  # fewest sweeps in which a cell is free
 MAX_SHARE = 0.5  # largest share of occupied sweeps of a free cell, of things that can move
 MAX_SHARE_UNKNOWN = 0.35  # the same without classes
 MAX_SHARE_FIXED = 0.2  # the same of classes that do not move: wires, poles, walls
-_REACH_M = 120.0  # distance from the path up to which cells are tested
+_REACH_M = 120.0  # distance from the sensor up to which a sweep is asked about cells
+_FIRST_STEP = 3  # step between the sweeps that are asked first
 _STILL_MARGIN_M = 0.3  # growth of the boxes of objects that stand still
 _PIXEL_RAD = math.radians(0.3)  # side of a pixel of a sweep's range image
 _LOW_RAD = -math.pi / 4  # elevation of the image's lowest row
 _ROWS = int(math.pi / 2 / _PIXEL_RAD)
 _COLUMNS = int(2 * math.pi / _PIXEL_RAD)
+_FEWEST_SLOTS = 1 << 19  # of the hash table of cells
 _MIN_RANGE_M = 0.5  # smallest range of a ray
 _MOST_PIXELS = 4  # largest radius of the window around a cell, pixels
 _NEAR_CELLS = 1.5  # distance from a cell's middle, in edges, within which rays count
@@ -117,9 +119,11 @@ class Cells:
     def of(points: np.ndarray, sweep: np.ndarray, path: np.ndarray) -> Cells:
         """Return the cells of points [N, 3], which are in the order of their sweeps [N]."""
         edge_m = edges_at(points, path, voxel_m=CELL_M)
-        slots = np.zeros(1 << max(4, math.ceil(math.log2(2 * len(points) + 1))), np.uint64)
-        numbers = np.zeros(len(slots), np.int32)
-        number, count = _number_cells(points, edge_m, slots, numbers)
+        num_slots = _FEWEST_SLOTS
+        number, count = _number_cells(points, edge_m, np.zeros(num_slots, np.uint64))
+        while count < 0:  # the table was too small
+            num_slots *= 4
+            number, count = _number_cells(points, edge_m, np.zeros(num_slots, np.uint64))
         places, edges, num_occupied = _cell_means(points, edge_m, number, sweep, count)
         return Cells(number, places, edges, num_occupied)
 
@@ -188,37 +192,41 @@ def _occupied_shares(
     It is 1 for cells that are not tested, or that are free in fewer than MIN_FREE_SWEEPS.
     """
     is_tested = cells.num_occupied <= MAX_SHARE * len(sweeps)
-    low = path.min(axis=0) - _REACH_M
-    high = path.max(axis=0) + _REACH_M
-    is_tested &= ((cells.places > low) & (cells.places < high)).all(axis=1)
     is_tested &= ~in_still_boxes(cells.places, still)
-    rows = np.flatnonzero(is_tested)
-    num_free = np.zeros(len(rows), np.int32)
-    num_occupied = np.zeros(len(rows), np.int32)
-    for sweep in sweeps:
-        assert sweep.origins is not None
-        rays = Rays.of(sweep.points, sweep.origins)
+    num_free = np.zeros(len(cells.places), np.int32)
+    num_occupied = np.zeros(len(cells.places), np.int32)
+    # Most cells are of what stands, which no sweep finds free: every third sweep tells them.
+    order = [n for start in range(_FIRST_STEP) for n in range(start, len(sweeps), _FIRST_STEP)]
+    num_first = len(range(0, len(sweeps), _FIRST_STEP))
+    for count, number in enumerate(order):
+        if count == num_first:
+            is_tested &= num_free > 0
+        origins = sweeps[number].origins
+        assert origins is not None
+        rays = Rays.of(sweeps[number].points, origins)
+        near = np.abs(cells.places[:, :2] - rays.centre[:2]).max(axis=1) < _REACH_M
+        rows = np.flatnonzero(is_tested & near)
         verdicts = rays.verdicts(cells.places[rows], cells.edge_m[rows])
-        num_free += verdicts == FREE
-        num_occupied += verdicts == OCCUPIED
-    num_occupied = np.maximum(num_occupied, cells.num_occupied[rows])
-    shares = np.ones(len(cells.places))
+        num_free[rows] += verdicts == FREE
+        num_occupied[rows] += verdicts == OCCUPIED
+    num_occupied = np.maximum(num_occupied, cells.num_occupied)
     share = num_occupied / np.maximum(num_occupied + num_free, 1)
-    shares[rows] = np.where(num_free >= MIN_FREE_SWEEPS, share, 1.0)
-    return shares
+    return np.where(is_tested & (num_free >= MIN_FREE_SWEEPS), share, 1.0)
 
 
 @cached_njit(nogil=True)
-def _number_cells(points, edge_m, slots, numbers):  # pragma: no cover - compiled
+def _number_cells(points, edge_m, slots):  # pragma: no cover - compiled
     """Return the number of each point's cell, int32 [N], and the number of cells.
+
+    The number is -1 if the cells fill more than half of the slots.
 
     Args:
         points: float32 [N, 3].
         edge_m: float32 [N], edge of the cell at each point. Cells of two edges are never the same.
-        slots: uint64 [2^k], more than N zeros. They become a hash table of cells.
-        numbers: int32 [2^k], the cells' numbers.
+        slots: uint64 [2^k], zeros. They become a hash table of cells.
     """
     mask = np.uint64(len(slots) - 1)
+    numbers = np.zeros(len(slots), np.int32)
     out = np.empty(len(points), np.int32)
     count = 0
     for i in range(len(points)):
@@ -230,6 +238,8 @@ def _number_cells(points, edge_m, slots, numbers):  # pragma: no cover - compile
         slot = (key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20) & mask
         while slots[slot] != key:
             if slots[slot] == 0:
+                if 2 * count >= len(slots):
+                    return out, -1
                 slots[slot] = key
                 numbers[slot] = count
                 count += 1

@@ -21,6 +21,7 @@ from adapters.lidar_scene.image_views import Body, View, observe_views, read_ima
 from adapters.lidar_scene.kernels import SkyGatherer
 from adapters.lidar_scene.movers import follow_movers
 from adapters.lidar_scene.split import (
+    SKIN_M,
     ObjectTrack,
     PointSet,
     assign_returns,
@@ -138,11 +139,17 @@ def build_lidar_scene(
     body_colours, faults = observe_views(bodies, views, sky, image_scale=options.image_scale)
     eyes = np.stack([_eye(frame) for frame in drive.frames])
     eye_paths = [eyes, *(_path_in(track, eyes, times_ns) for track in tracks)]
+    shifted = [
+        set_back(body_surfels, sample[0].semantic, eye_path)
+        for sample, body_surfels, eye_path in zip(sampled, surfels, eye_paths, strict=True)
+    ]
+    shifted[1:] = [
+        _inside(body_surfels, track.size_m / 2 + SKIN_M)
+        for body_surfels, track in zip(shifted[1:], tracks, strict=True)
+    ]
     parts = [
-        _gaussians(*sample, set_back(body_surfels, sample[0].semantic, eye_path), *colours)
-        for sample, body_surfels, eye_path, colours in zip(
-            sampled, surfels, eye_paths, body_colours, strict=True
-        )
+        _gaussians(*sample, body_surfels, *colours)
+        for sample, body_surfels, colours in zip(sampled, shifted, body_colours, strict=True)
     ]
     if added is not None:
         parts[0] = join_gaussians([parts[0], added])
@@ -287,6 +294,16 @@ def _sample(
     if is_world:
         parts += [fill_walls(thin, edges, surfels), fill_ground(thin, path, voxel_m=voxel_m)]
     return thin_points(PointSet.join(parts), path, voxel_m=voxel_m)
+
+
+def _inside(surfels: Surfels, half_m: np.ndarray) -> Surfels:
+    """Return the surfels with their centres moved into a box around the zero of their axes.
+
+    half_m: float [3], half its sides.
+    """
+    return dataclasses.replace(
+        surfels, centres=surfels.centres.clip(-half_m, half_m).astype(np.float32)
+    )
 
 
 def _eye(frame: Frame) -> np.ndarray:

@@ -331,6 +331,7 @@ def _settle(points, index, normals, edge_m, part, least_cosine):  # pragma: no c
                 total += w
                 weight += 1.0
         shift = part[i] * total / max(weight, 1.0)
+        shift = min(max(shift, -edge_m[i]), edge_m[i])
         for a in range(3):
             out[i, a] = points[i, a] + shift * normals[i, a]
     return out
