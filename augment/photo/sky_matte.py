@@ -39,7 +39,7 @@ from augment.scene.scene import Scene
 # Difference of an image's proportions from the camera's beyond which it is another camera's.
 _MAX_SQUEEZE = 0.05
 # Difference from the sky's local mean that is noise, of 255.
-_NOISE_LEVELS = 10.0
+_NOISE_LEVELS = 14.0
 # The same in standard deviations of the sky around.
 _NOISE_DEVIATIONS = 2.0
 # Largest difference that is noise, of 255.
@@ -55,9 +55,7 @@ _SURFACE_REACH_PX = 9
 # Darkness of surfaces below the sky from which pixels brighter than the sky are no surface's.
 _DARK_SURFACE_LEVELS = 10
 # Difference of a channel by which the overshoot of sharpening may be paler than the sky, of 255.
-_PALE_LEVELS = 25
-# Least difference of a surface from the sky over the noise, of 255.
-_MIN_SPAN_LEVELS = 8
+_PALE_LEVELS = 40
 # Share of sky or surface in a pixel below which its colour is not taken apart.
 _MIN_SHARE = 0.02
 # Share of a surface in a pixel by which its colour is divided, at least.
@@ -279,16 +277,15 @@ def _sky_color(rgb: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarr
     weight = (weight == 255 if (weight == 255).any() else weight > 0).astype(np.float32)
     small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
     luma = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    values = np.dstack([small.astype(np.float32), luma * luma, np.ones_like(luma)])
+    values = np.dstack([small.astype(np.float32), luma, luma * luma, np.ones_like(luma)])
     values *= weight[..., None]
     sums = values.mean(axis=(0, 1)) * _WINDOW_WEIGHT ** len(_SKY_WINDOWS_PX)
     for number, radius in enumerate(_SKY_WINDOWS_PX):
         side = 2 * radius + 1
         window = cv2.blur(values, (side, side), borderType=cv2.BORDER_REPLICATE)
         sums = sums + window * np.float32(_WINDOW_WEIGHT**number)
-    means = sums[..., :4] / np.maximum(sums[..., 4:], 1e-20)
-    mean_luma = means[..., :3] @ np.array([0.299, 0.587, 0.114], np.float32)
-    deviation = np.sqrt(np.maximum(means[..., 3] - mean_luma * mean_luma, 0))
+    means = sums[..., :5] / np.maximum(sums[..., 5:], 1e-20)
+    deviation = np.sqrt(np.maximum(means[..., 4] - means[..., 3] ** 2, 0))
     noise = np.clip(_NOISE_DEVIATIONS * deviation, _NOISE_LEVELS, _MAX_NOISE_LEVELS)
     return np.rint(means[..., :3]).astype(np.uint8), np.rint(noise).astype(np.uint8)
 
@@ -340,7 +337,8 @@ def _share_of_sky(
     luma = cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY)
     difference = cv2.subtract(cv2.cvtColor(sky_rgb, cv2.COLOR_RGB2GRAY), luma)
     darker = largest_channel(cv2.subtract(sky_rgb, smooth))
-    difference = cv2.max(difference, _subtract_level(darker, _PALE_LEVELS))
+    colored = cv2.threshold(darker, _PALE_LEVELS, 0, cv2.THRESH_TOZERO)[1]
+    difference = cv2.max(difference, colored)
     if has_bright_surface.any():
         brighter = largest_channel(cv2.subtract(smooth, sky_rgb))
         color_difference = cv2.bitwise_and(cv2.max(darker, brighter), has_bright_surface)
@@ -356,10 +354,9 @@ def _share_of_sky(
     is_mixed = cv2.bitwise_and(is_mixed, cv2.bitwise_not(is_sure))
     share[is_sure > 0] = 1
     mixed = np.flatnonzero(is_mixed)
-    floor = noise.ravel()[mixed].astype(np.float32)
-    span = np.maximum(largest.ravel()[mixed] - floor, _MIN_SPAN_LEVELS)
-    solid = np.clip((difference.ravel()[mixed] - floor) / span, 0, 1)
-    share.ravel()[mixed] = 1 - solid
+    levels = difference.ravel()[mixed]
+    solid = levels / np.maximum(largest.ravel()[mixed], np.float32(1))
+    share.ravel()[mixed] = 1 - solid * (levels > noise.ravel()[mixed])
     _remove_thin_things(luma, cv2.bitwise_or(is_sure, is_mixed), share)
     _unmix(rgb, sky_rgb, share, surface_rgb)
 
@@ -384,11 +381,6 @@ def _remove_thin_things(luma: np.ndarray, is_searched: np.ndarray, share: np.nda
     # A wire is thinner than a pixel: how dark it is shows how much of the sky it hides.
     solid = depth / ((1 - _THIN_LUMA_SHARE) * (luma.ravel()[thin] + depth))
     share.ravel()[thin] = np.minimum(share.ravel()[thin], 1 - np.minimum(solid, 1))
-
-
-def _subtract_level(image: np.ndarray, level: int) -> np.ndarray:
-    """Return an image of bytes less a level, at least 0."""
-    return cv2.LUT(image, np.maximum(np.arange(256) - level, 0).astype(np.uint8))
 
 
 def _above(image: np.ndarray, level: int) -> np.ndarray:

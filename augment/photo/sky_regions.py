@@ -39,6 +39,10 @@ _EDGE_LEVELS = 14
 _SHARP_LEVELS = 40
 # The same of the border of a cloud, on average.
 _CLOUD_LEVELS = 28
+# Factor by which an image is shrunk where it has no sky at its own size: its edges may be blurred.
+_BLURRED_FACTOR = 3
+# Columns of an image that is shrunk for this, at least.
+_MIN_BLURRED_WIDTH = 300
 # Luma of a region below which it is no sky, of 255, where the LiDAR says that it is open.
 _MIN_LUMA = 60.0
 # The same without LiDAR.
@@ -47,8 +51,10 @@ _MIN_LUMA_ALONE = 90.0
 _DARK_LEVELS = 70.0
 # Share of the image from which an open region is sky without a look at its colour.
 _MAIN_SHARE = 0.003
-# The same for a region that does not reach the image's first row.
+# The same for a region that does not reach the image's first rows.
 _INNER_MAIN_SHARE = 0.01
+# Last row at which a region reaches the image's top: lenses darken the first rows.
+_TOP_ROWS = 2
 # Share of a region's inner pixels with returns up to which it may be sky: poles near the camera
 # have moved between the LiDAR's look and the camera's.
 _FEW_RETURNS = 0.02
@@ -72,6 +78,10 @@ _CLOUD_LUMA_SHARE = 0.7
 _EDGE_REACH_PX = 5
 # Area below which a region that lies wholly beside the sky counts as an edge, pixels.
 _SMALL_AREA_PX = 200
+# Width of things before the sky, as poles and cables, between which it shows in gaps, pixels.
+_GAP_PX = 10
+# Rounds in which gaps beside gaps are found.
+_GAP_ROUNDS = 2
 # Distance from surfaces from which an edge is inside the sky, pixels.
 _INSIDE_PX = 6
 # Rows over the highest return of a column that its surface may still fill, as a part of the height.
@@ -111,7 +121,7 @@ class _Regions(NamedTuple):
     luma: np.ndarray
     """Mean luma, [R]."""
     is_at_top: np.ndarray
-    """True for regions that reach the image's first row, [R]."""
+    """True for regions that reach the image's first rows, [R]."""
     edge_levels: np.ndarray
     """Mean contrast of the edges around, [R]."""
 
@@ -157,13 +167,39 @@ def find_sky_regions(
     regions = _measure_regions(pixels)
     main = _find_main_regions(regions, kinds.size, pixels.has_lidar)
     if not main.any():
-        return None if np.quantile(pixels.luma[above], 0.9) < _MIN_LUMA_ALONE else kinds
+        if np.quantile(pixels.luma[above], 0.9) < _MIN_LUMA_ALONE:
+            return None
+        if rgb.shape[1] >= _MIN_BLURRED_WIDTH and has_return is not None:
+            kinds[:rows] = _find_in_smaller_image(rgb, elevation_rad, has_return, lidar_top_rad)
+        return kinds
     score = _color_scores(pixels, regions, main)
     sky_luma = float(np.average(regions.luma[main], weights=regions.area[main]))
-    is_sky_region = main | _find_other_regions(regions, score, sky_luma, pixels.has_lidar)
+    is_sky_region = main | _find_other_regions(regions, main, score, sky_luma, pixels.has_lidar)
     is_sky_region[0] = False
     kinds[:rows] = _pixel_kinds(pixels, regions, is_sky_region, score, sky_luma)
     return kinds
+
+
+def _find_in_smaller_image(
+    rgb: np.ndarray, elevation_rad: np.ndarray, has_return: np.ndarray, lidar_top_rad: float
+) -> np.ndarray:
+    """Return the kinds of pixels of some rows, as found in a smaller image.
+
+    In a blurred image, sky and walls run into each other without an edge of _EDGE_LEVELS.
+    """
+    rows, columns = rgb.shape[:2]
+    size = -(-columns // _BLURRED_FACTOR), -(-rows // _BLURRED_FACTOR)
+    square = np.ones((_BLURRED_FACTOR, _BLURRED_FACTOR), np.uint8)
+    grown_returns = cv2.dilate(has_return[:rows].astype(np.uint8), square)
+    kinds = find_sky_regions(
+        cv2.resize(rgb, size, interpolation=cv2.INTER_AREA),
+        cv2.resize(elevation_rad[:rows], size, interpolation=cv2.INTER_AREA),
+        cv2.resize(grown_returns, size, interpolation=cv2.INTER_NEAREST) > 0,
+        lidar_top_rad,
+    )
+    if kinds is None:
+        return np.zeros((rows, columns), np.uint8)
+    return cv2.resize(kinds, (columns, rows), interpolation=cv2.INTER_NEAREST)
 
 
 def _open_pixels(
@@ -216,7 +252,7 @@ def _measure_regions(pixels: _Pixels) -> _Regions:
         returns=count_in(pixels.is_hit & is_inner) / np.maximum(count_in(is_inner), 1),
         open=count_in(pixels.is_open) / area.clip(1),
         luma=np.bincount(labels.ravel(), pixels.luma.ravel(), count) / area.clip(1),
-        is_at_top=stats[:, cv2.CC_STAT_TOP] == 0,
+        is_at_top=stats[:, cv2.CC_STAT_TOP] <= _TOP_ROWS,
         edge_levels=edge_sums / np.maximum(num_edges, 1),
     )
 
@@ -234,7 +270,7 @@ def _find_main_regions(regions: _Regions, num_pixels: int, has_lidar: bool) -> n
     if main.any() or not has_lidar:
         return main
     is_wide = regions.area > _INNER_MAIN_SHARE * num_pixels
-    return is_wide & is_free & is_bright & (regions.open > 0.8)
+    return is_wide & is_free & is_bright
 
 
 def _color_scores(pixels: _Pixels, regions: _Regions, main: np.ndarray) -> np.ndarray:
@@ -266,13 +302,20 @@ def _blur_histogram(cube: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _find_other_regions(
-    regions: _Regions, score: np.ndarray, sky_luma: float, has_lidar: bool
+    regions: _Regions, main: np.ndarray, score: np.ndarray, sky_luma: float, has_lidar: bool
 ) -> np.ndarray:
     """Return the regions whose colour or soft edges say that they are sky, bool [R]."""
     is_free = (regions.returns < 1.5 * _FEW_RETURNS) & (regions.luma > _MIN_LUMA)
     is_open = regions.open > 0.5
-    has_sky_color = is_free & ((score > _SKY_SCORE) & is_open | (score > _SURE_SCORE))
-    has_sky_color |= (score > 1.5 * _SURE_SCORE) & (regions.returns < _SOME_RETURNS)
+    has_sky_color = is_free & is_open & (score > _SKY_SCORE)
+    # Gaps between things before the sky, under surfaces that hide whether they are open.
+    is_like_sky = is_free & (score > _SURE_SCORE)
+    is_like_sky |= (score > 1.5 * _SURE_SCORE) & (regions.returns < _SOME_RETURNS)
+    can_be_gap = regions.is_at_top
+    for _ in range(_GAP_ROUNDS):
+        has_sky_color |= can_be_gap & is_like_sky
+        can_be_gap = _regions_near(regions, main | has_sky_color)
+    has_sky_color |= can_be_gap & is_like_sky
     if not has_lidar:
         return has_sky_color
     can_be_cloud = is_free & (regions.open > 0.9) & (score > _SURFACE_SCORE)
@@ -283,6 +326,13 @@ def _find_other_regions(
     )
     is_glare = can_be_cloud & (regions.edge_levels < 45) & (regions.luma > sky_luma)
     return has_sky_color | is_cloud | is_glare
+
+
+def _regions_near(regions: _Regions, is_sky_region: np.ndarray) -> np.ndarray:
+    """Return the regions within _GAP_PX of some regions, bool [R]."""
+    is_sky = is_sky_region[regions.labels] & (regions.labels > 0)
+    is_near = _grow(is_sky, 2 * _GAP_PX + 1)
+    return np.bincount(regions.labels[is_near], minlength=len(is_sky_region)) > 0
 
 
 def _pixel_kinds(
