@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,8 +24,6 @@ from adapters.safe_pickle import read_array
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
 from augment.scene.cameras import Camera
-
-logger = logging.getLogger(__name__)
 
 METRIC_PER_M = 256.0  # levels per metre of 16-bit depth images
 _ASPECT_TOLERANCE = 0.02  # maps are often rounded to a multiple of 14 or 32 pixels
