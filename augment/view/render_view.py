@@ -37,6 +37,7 @@ from augment.render.sensor import add_noise, blur_lens
 from augment.render.threads import num_concurrent_views, split_threads, wait_for_result
 from augment.rng import rng_for
 from augment.scene.cameras import Camera
+from augment.scene.labels import EGO_VEHICLE
 from augment.scene.scene import PosedGaussians, Scene
 from augment.timing import timed
 from augment.view.box_labels import OWN_CAR_DEPTH_M
@@ -118,8 +119,15 @@ def render_buffers(
     """
     with timed("view plan"):
         view = plan_view(plan, scene, camera, backend=backend)
+    own_car = None
+    if plan.is_on_photo and any(map(_is_weather, view.effects)):
+        with timed("recording car"):
+            own_car = own_car_in_view(scene, camera)
     with timed("collect parts"):
-        bare_parts = scene.parts_for(camera, view.actor_ids)
+        actor_ids = view.actor_ids
+        if own_car is not None:  # the photo shows the car, and a fit's splats of it lie beside it
+            actor_ids = [i for i in actor_ids if scene.actors[i - 1].label != EGO_VEHICLE]
+        bare_parts = scene.parts_for(camera, actor_ids)
     color_map = scene.color_map(camera) if plan.uses_recorded_exposure else None
     photo = None
     if plan.is_on_photo:
@@ -144,13 +152,10 @@ def render_buffers(
         with timed("prune"):
             parts = prune_parts(layers.parts, scene, camera, plan.prune)
             layers = replace(layers, parts=parts, unpruned_parts=layers.parts)
-    own_car = None
     car_rgb = None
-    if photo is not None and layers.photo is not None and any(map(_is_weather, view.effects)):
-        with timed("recording car"):
-            own_car = own_car_in_view(scene, camera)
-        if own_car is not None:  # copied, since effects may write into the picture that they get
-            car_rgb = layers.photo.own_car_colors[own_car.rows].clone()
+    if own_car is not None and layers.photo is not None:
+        # Copied, since effects may write into the picture that they get.
+        car_rgb = layers.photo.own_car_colors[own_car.rows].clone()
     rendered = _draw(view, layers, camera)
     if own_car is not None and car_rgb is not None:
         if plan.covers_own_car:
@@ -158,13 +163,15 @@ def render_buffers(
                 seed=plan.seed, scene=scene.name, effect="snow on the own car", camera=camera.name
             )
             car_rgb = cover_own_car(car_rgb, own_car, rendered.raster, rng=rng)
-        rendered = _with_own_car(rendered, own_car, car_rgb)
+        rendered = replace(rendered, rgb=rendered.rgb.clone())  # it may be the photo itself
+        _put_own_car(rendered.rgb, own_car, car_rgb)
     for effect in view.effects:
+        unedited = rendered
         rendered = effect.hooks.edit_image(effect, rendered, camera)
-        if own_car is None or car_rgb is None:
+        if own_car is None or car_rgb is None or rendered is unedited:
             continue
         if _is_weather(effect):
-            rendered = _with_own_car(rendered, own_car, car_rgb)
+            _put_own_car(rendered.rgb, own_car, car_rgb)
         else:
             car_rgb = rendered.rgb[own_car.rows].clone()
     rgb = rendered.rgb
@@ -231,19 +238,17 @@ def _is_weather(effect: EffectInScene) -> bool:
     return effect.hooks.section.startswith("weather.")
 
 
-def _with_own_car(rendered: RenderedView, own_car: OwnCar, car_rgb: Tensor) -> RenderedView:
-    """Return the picture with the recording car in given colours, fading out in its border.
+def _put_own_car(rgb: Tensor, own_car: OwnCar, car_rgb: Tensor) -> None:
+    """Write the recording car in given colours into a picture, fading out in the car's border.
 
     Args:
-        rendered: the picture.
+        rgb: the picture, [H, W, 3].
         own_car: the recording car in it.
         car_rgb: colours of the car's rows, [h, W, 3].
     """
     with timed("recording car"):
-        weights = torch.from_numpy(own_car.weights).to(rendered.rgb.device)
-        rgb = rendered.rgb.clone()
+        weights = torch.from_numpy(own_car.weights).to(rgb.device)
         rgb[own_car.rows] = mix(rgb[own_car.rows], car_rgb, weights)
-    return replace(rendered, rgb=rgb)
 
 
 def _masks(view: ViewPlan, rendered: RenderedView, own_car: OwnCar | None) -> dict[str, Tensor]:
