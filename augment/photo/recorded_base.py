@@ -70,6 +70,8 @@ from recipes.schema import Recipe
 FILTER_RADIUS_FRACTION = 1 / 320
 # Resolution of the guided filter's windows where the photo's sky is known.
 MATTE_FILTER_SCALE = 0.5
+# Radius from which they are coarser, pixels.
+MIN_COARSE_RADIUS_PX = 4
 # Variance of display-encoded colour that the guided filter counts as an edge.
 EDGE_VARIANCE = 0.05**2
 # Radius for the sky's share, in radii: splats of sky and of pale walls are told apart badly.
@@ -687,7 +689,8 @@ class Photo:
         )
         # A surface has no edge at the sky line of a matte, so that coarser windows are enough
         # (He and Sun 2015, "Fast Guided Filter"). A guide in colour would take twice as long.
-        scale = 1.0 if self.matte is None else MATTE_FILTER_SCALE
+        is_coarse = self.matte is not None and radius >= MIN_COARSE_RADIUS_PX
+        scale = MATTE_FILTER_SCALE if is_coarse else 1.0
         guide = cv2.cvtColor(self.pixels[rows], cv2.COLOR_RGB2GRAY)
         sharpened = np.zeros_like(source)
         sharpened[rows] = cv2.ximgproc.guidedFilter(
