@@ -650,10 +650,10 @@ def _sun_share_of_splats(shadows: CastShadows, g: Gaussians) -> np.ndarray:
 def _edges_of_light(shadows: CastShadows) -> np.ndarray:
     """Return the cells of known ground beside an edge between sun and shade, bool [H, W]."""
     square = np.ones((_EDGE_CELLS, _EDGE_CELLS), np.uint8)
-    known = shadows.known_share > 0.5
-    highest = cv2.dilate(np.where(known, shadows.sun_share, 0).astype(np.float32), square)
-    lowest = cv2.erode(np.where(known, shadows.sun_share, 1).astype(np.float32), square)
-    return known & (highest - lowest > _EDGE_STEP)
+    is_known = shadows.known_share > 0.5
+    highest = cv2.dilate(np.where(is_known, shadows.sun_share, 0).astype(np.float32), square)
+    lowest = cv2.erode(np.where(is_known, shadows.sun_share, 1).astype(np.float32), square)
+    return is_known & (highest - lowest > _EDGE_STEP)
 
 
 def _fade_factors(shadows: CastShadows, transmittance: float, sun_shares: np.ndarray) -> np.ndarray:
