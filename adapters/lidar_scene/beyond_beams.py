@@ -24,6 +24,7 @@ from adapters.lidar_scene.dense_depth import FAR_M, DenseDepth, KnownSurface, co
 from adapters.lidar_scene.depth_maps import DepthMaps
 from adapters.lidar_scene.image_views import View
 from adapters.lidar_scene.sky_conflicts import measure_agreement, without_sky_splats
+from adapters.lidar_scene.sky_edges import trim_at_sky
 from adapters.lidar_scene.solid_views import SolidView, read_solid_view
 from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
@@ -56,7 +57,7 @@ _SKY_SIDES = 1.2  # least distance of a disc from the sky, as a multiple of its 
 _DEPTH_TOLERANCE = 0.02  # largest standard deviation of the logarithm of depths within a disc
 _VIEWS_PER_SHARE = 8  # one view adds the remaining number over this at most, if so many follow
 _MIN_COSINE = 0.15  # of the angle between a ray and a wall's normal, to which a disc is stretched
-_MAX_CONFLICTS = 0.3  # part of the images of a disc in which it may cover sky
+_MAX_CONFLICTS = 0.1  # part of the images of a disc in which it may cover sky
 _SHAPE = SplatShape(sigma_per_spacing=0.65, opacity=0.99)
 
 
@@ -200,6 +201,7 @@ def add_surfaces_beyond_beams(
         view._replace(known_m=_draw(background, view.camera, pose_parts)[1].depth_m)
         for view in views
     ]
+    background = trim_at_sky(background, views)
     walls = find_wall_planes(background)
     count = len(background)
     for number, view in enumerate(views):
@@ -227,6 +229,9 @@ def add_surfaces_beyond_beams(
         cells = _cells(view, depth, leaks & (sky_share < _SOLID_SHARE), room)
         discs = _discs(view, depth, is_known | panes, cells, walls, other_views)
         background = join_gaussians([background, discs])
+    added = background.select(torch.arange(count, len(background)))
+    background = background.select(torch.arange(count))
+    background = join_gaussians([background, trim_at_sky(added, views)])
     logger.info("%d splats beyond the LiDAR's view", len(background) - count)
     return background
 
@@ -419,7 +424,8 @@ def _discs(
     conflicts = agreement.conflicts
     doubt = agreement.doubt()
     is_sure_cell = is_sure[middle_rows, middle_columns]
-    conflicts[is_sure_cell] = doubt[is_sure_cell] = 0
+    doubt[is_sure_cell] = 0
+    conflicts[is_sure_cell & (conflicts < 0.3)] = 0
     unlikely = np.flatnonzero(doubt > 0)
     far_m = FAR_M / level[unlikely]
     far_points = centre + far_m[:, None] * rays[unlikely]
