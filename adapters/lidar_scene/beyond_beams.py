@@ -43,6 +43,8 @@ logger = logging.getLogger(__name__)
 
 _STEP_M = 2.0  # distance on the path from one image that is taken to the next
 _FRAMES_PART = 1 / 6  # largest part of all frames whose images are taken, beyond a few
+_SKY_STEP_M = 0.7  # distance from one image whose sky may refute splats to the next
+_SKY_FRAMES_PART = 1 / 3  # largest part of all frames whose images may
 _DEPTH_WIDTH = 480  # columns at which depth is searched for, at most
 _OPEN_ALPHA = 0.97  # mean alpha of the Gaussians so far around a pixel below which it is open
 _OPEN_WINDOW_PX = 5  # side of the square over which that mean is taken
@@ -58,6 +60,7 @@ _DEPTH_TOLERANCE = 0.02  # largest standard deviation of the logarithm of depths
 _VIEWS_PER_SHARE = 8  # one view adds the remaining number over this at most, if so many follow
 _MIN_COSINE = 0.15  # of the angle between a ray and a wall's normal, to which a disc is stretched
 _MAX_CONFLICTS = 0.1  # part of the images of a disc in which it may cover sky
+_MAX_MEASURED_CONFLICTS = 0.4  # the same of a splat that returns made
 _SHAPE = SplatShape(sigma_per_spacing=0.65, opacity=0.99)
 
 
@@ -89,16 +92,22 @@ def close_above_beams(
         depth_option: a user's depth maps, as in `DepthMaps.find`.
     """
     returns_at = _ReturnsAt(sweeps)
-    solid_views = [
-        solid_view
-        for view in spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART)
-        if (
-            solid_view := read_solid_view(
+
+    def read_views(chosen: Iterable[View]) -> list[SolidView]:
+        solid_views = (
+            read_solid_view(
                 view, tracks, returns_at.nearest(view.camera.timestamp_ns), lidar_top_rad
             )
+            for view in chosen
         )
-        is not None
-    ]
+        return [view for view in solid_views if view is not None]
+
+    solid_views = read_views(spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART))
+    used = {view.key for view in solid_views}
+    more_views = spread_views(views, step_m=_SKY_STEP_M, frames_part=_SKY_FRAMES_PART)
+    sky_views = read_views(
+        view for view in more_views if ViewKey(view.frame, view.camera.name) not in used
+    )
 
     def pose_parts(background: Gaussians, camera: Camera) -> list[PosedGaussians]:
         posed = [PosedGaussians(background, None, instance_id=0)]
@@ -114,6 +123,7 @@ def close_above_beams(
         parts[0],
         solid_views,
         pose_parts,
+        sky_views=sky_views,
         lidar_top_rad=lidar_top_rad,
         max_added=max_gaussians - sum(map(len, parts)),
         maps=maps,
@@ -183,6 +193,7 @@ def add_surfaces_beyond_beams(
     *,
     lidar_top_rad: float,
     max_added: int,
+    sky_views: Sequence[SolidView] = (),
     maps: MapReader | None = None,
 ) -> Gaussians:
     """Return the background with discs until the views' pixels without sky have a surface.
@@ -193,10 +204,12 @@ def add_surfaces_beyond_beams(
         pose_parts: places background and actors for a camera.
         lidar_top_rad: highest elevation that the LiDAR looks at.
         max_added: largest number of discs.
+        sky_views: more recorded images, whose sky refutes splats.
         maps: a user's depth maps, which count before a guess.
     """
     views = list(views)
-    background = without_sky_splats(background, views)
+    voters = [*views, *sky_views]
+    background = without_sky_splats(background, voters, max_conflicts=_MAX_MEASURED_CONFLICTS)
     views = [
         view._replace(known_m=_draw(background, view.camera, pose_parts)[1].depth_m)
         for view in views
@@ -231,6 +244,7 @@ def add_surfaces_beyond_beams(
         background = join_gaussians([background, discs])
     added = background.select(torch.arange(count, len(background)))
     background = background.select(torch.arange(count))
+    added = without_sky_splats(added, voters, min_views=1, max_conflicts=_MAX_CONFLICTS)
     background = join_gaussians([background, trim_at_sky(added, views)])
     logger.info("%d splats beyond the LiDAR's view", len(background) - count)
     return background
