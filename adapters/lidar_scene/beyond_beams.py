@@ -24,8 +24,8 @@ from adapters.lidar_scene.dense_depth import FAR_M, DenseDepth, KnownSurface, co
 from adapters.lidar_scene.depth_maps import DepthMaps
 from adapters.lidar_scene.image_views import View
 from adapters.lidar_scene.sky_conflicts import measure_agreement, without_sky_splats
-from adapters.lidar_scene.sky_edges import trim_at_sky
-from adapters.lidar_scene.solid_views import SolidView, read_solid_view
+from adapters.lidar_scene.sky_edges import shorten_ends_in_sky, trim_at_sky
+from adapters.lidar_scene.solid_views import WORK_WIDTH, SolidView, read_solid_view
 from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
 from adapters.lidar_scene.wall_planes import WallPlanes, find_wall_planes
@@ -93,20 +93,26 @@ def close_above_beams(
     """
     returns_at = _ReturnsAt(sweeps)
 
-    def read_views(chosen: Iterable[View]) -> list[SolidView]:
+    def read_views(chosen: Iterable[View], width: int) -> list[SolidView]:
         solid_views = (
             read_solid_view(
-                view, tracks, returns_at.nearest(view.camera.timestamp_ns), lidar_top_rad
+                view,
+                tracks,
+                returns_at.nearest(view.camera.timestamp_ns),
+                lidar_top_rad,
+                width=width,
             )
             for view in chosen
         )
         return [view for view in solid_views if view is not None]
 
-    solid_views = read_views(spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART))
+    main_views = spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART)
+    solid_views = read_views(main_views, WORK_WIDTH)
     used = {view.key for view in solid_views}
     more_views = spread_views(views, step_m=_SKY_STEP_M, frames_part=_SKY_FRAMES_PART)
     sky_views = read_views(
-        view for view in more_views if ViewKey(view.frame, view.camera.name) not in used
+        (view for view in more_views if ViewKey(view.frame, view.camera.name) not in used),
+        _DEPTH_WIDTH,
     )
 
     def pose_parts(background: Gaussians, camera: Camera) -> list[PosedGaussians]:
@@ -245,7 +251,8 @@ def add_surfaces_beyond_beams(
     added = background.select(torch.arange(count, len(background)))
     background = background.select(torch.arange(count))
     added = without_sky_splats(added, voters, min_views=1, max_conflicts=_MAX_CONFLICTS)
-    background = join_gaussians([background, trim_at_sky(added, views)])
+    added = shorten_ends_in_sky(trim_at_sky(added, views), voters)
+    background = join_gaussians([background, added])
     logger.info("%d splats beyond the LiDAR's view", len(background) - count)
     return background
 

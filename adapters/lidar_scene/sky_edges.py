@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import torch
 
+from adapters.lidar_scene.sky_conflicts import sure_sky
 from adapters.lidar_scene.solid_views import SolidView, project_into
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import Gaussians
@@ -22,6 +23,7 @@ from augment.scene.scene import Gaussians
 _SKY_SHARE = 0.5  # share of sky from which a pixel is sky
 _REACH = 1.5  # distance over the standard deviation up to which rows of splats hide the sky
 _MIN_FACTOR = 0.2  # smallest part of a standard deviation that stays
+_END_PARTS = (1.0, 0.5)  # parts of that distance that are looked at, from the far end inward
 _HIDDEN_RATIO = 1.05  # depth over that of the known surface from which a splat is hidden
 _HIDDEN_M = 0.5  # constant part of that, metres
 
@@ -71,6 +73,36 @@ def trim_at_sky(gaussians: Gaussians, views: Sequence[SolidView]) -> Gaussians:
         factor = np.maximum(factor, _MIN_FACTOR)
         shortened = 1 - (1 - factor)[:, None] * parts2 / sigma2[:, None]
         factors[index] = np.minimum(factors[index], shortened)
+    return dataclasses.replace(gaussians, scales=gaussians.scales * torch.from_numpy(factors))
+
+
+def shorten_ends_in_sky(gaussians: Gaussians, views: Sequence[SolidView]) -> Gaussians:
+    """Return splats without ends that images show as sky, wherever their centres are.
+
+    Args:
+        gaussians: splats of what stands still.
+        views: recorded images.
+    """
+    points = gaussians.means.numpy().astype(np.float64)
+    scales = gaussians.scales.numpy()
+    axes = rotmat_from_quat(gaussians.quats).numpy() * scales[:, None, :]  # [N, 3, 3], metres
+    factors = np.ones((len(points), 3), np.float32)
+    two_longest = np.argsort(-scales, axis=1)[:, :2]
+    number = np.arange(len(points))
+    for view in views:
+        is_sky = sure_sky(view)
+        if not is_sky.any():
+            continue
+        for axis in two_longest.T:
+            offset = axes[number, :, axis]
+            for part in _END_PARTS:
+                for sign in (-1, 1):
+                    index, rows, columns, _ = project_into(
+                        view.camera, points + sign * part * _REACH * offset
+                    )
+                    index = index[is_sky[rows, columns]]
+                    shorter = np.minimum(factors[index, axis[index]], np.float32(part / 2))
+                    factors[index, axis[index]] = shorter
     return dataclasses.replace(gaussians, scales=gaussians.scales * torch.from_numpy(factors))
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from adapters.lidar_scene.image_views import IMAGE_SCALES, View, draw_cover, read_image
 from adapters.lidar_scene.split import ObjectTrack
 from augment.photo.sky_matte import SkyMatte, find_sky_matte
+from augment.photo.sky_regions import largest_channel
 from augment.reconstruct.view import ViewKey
 from augment.scene.cameras import Camera
 
@@ -47,9 +48,14 @@ class SolidView(NamedTuple):
 
 
 def read_solid_view(
-    view: View, tracks: Sequence[ObjectTrack], returns: np.ndarray, lidar_top_rad: float
+    view: View,
+    tracks: Sequence[ObjectTrack],
+    returns: np.ndarray,
+    lidar_top_rad: float,
+    *,
+    width: int = WORK_WIDTH,
 ) -> SolidView | None:
-    """Return a recorded image with its sky, at WORK_WIDTH columns at most.
+    """Return a recorded image with its sky.
 
     The result is None if it cannot be decoded, or is too dark to tell its sky.
 
@@ -59,8 +65,9 @@ def read_solid_view(
         returns: float [N, 3], the LiDAR's returns at the image's time, world. Those of other times
             are no substitute: they lie behind what the image shows, and hide its sky.
         lidar_top_rad: highest elevation that the LiDAR measures.
+        width: columns of the result, at most.
     """
-    camera = view.camera.scaled(min(1.0, WORK_WIDTH / view.camera.width))
+    camera = view.camera.scaled(min(1.0, width / view.camera.width))
     scale = camera.width / view.camera.width
     image = read_image(view.path, next(s for s in IMAGE_SCALES if s >= scale))
     if image is None:
@@ -129,7 +136,7 @@ def _without_specks(rgb: np.ndarray, matte: SkyMatte, has_point: np.ndarray) -> 
         has_point: pixels with a known surface, bool [H, W].
     """
     is_solid = matte.sky_share < _HALF
-    difference = np.abs(rgb.astype(np.int16) - matte.sky_rgb).max(axis=2)
+    difference = largest_channel(cv2.absdiff(rgb, matte.sky_rgb))
     around = cv2.dilate(difference, np.ones((5, 5), np.uint8))
     looks_like_sky = difference < np.maximum(_RIM_LEVELS, _RIM_SHARE * around)
     square = np.ones((3, 3), np.uint8)
@@ -157,7 +164,7 @@ def _without_rims(rgb: np.ndarray, sky_rgb: np.ndarray, sky_share: np.ndarray) -
     """
     height, width = sky_share.shape
     is_sky = sky_share >= _HALF
-    difference = np.abs(rgb.astype(np.int16) - sky_rgb).max(axis=2)
+    difference = largest_channel(cv2.absdiff(rgb, sky_rgb)).astype(np.int16)
     difference[is_sky] = -1
     beside_sky = cv2.dilate(is_sky.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     rows, columns = np.nonzero(beside_sky & ~is_sky)
