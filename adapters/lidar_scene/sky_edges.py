@@ -29,7 +29,7 @@ _HIDDEN_M = 0.5  # constant part of that, metres
 
 
 class _SkyDistance(NamedTuple):
-    """Way from each of H x W pixels to the nearest pixel of sky."""
+    """Distance of each of H x W pixels from the nearest pixel of sky."""
 
     distance_px: np.ndarray
     """Distance from the sky's edge, pixels, float32 [H, W]; below 0 in the sky."""
@@ -50,12 +50,12 @@ def trim_at_sky(gaussians: Gaussians, views: Sequence[SolidView]) -> Gaussians:
     scales = gaussians.scales.numpy()
     factors = np.ones((len(points), 3), np.float32)
     for view in views:
-        way = _way_to_sky(view.matte.sky_share)
-        if way is None:
+        sky_distance = _measure_sky_distance(view.matte.sky_share)
+        if sky_distance is None:
             continue
         camera = view.camera
         index, rows, columns, depth_m = project_into(camera, points)
-        distance_px = way.distance_px[rows, columns]
+        distance_px = sky_distance.distance_px[rows, columns]
         longest_px = camera.fx * scales[index].max(axis=1) / depth_m
         may_reach = (distance_px > 0) & (distance_px < 2 * _REACH * longest_px)
         if view.known_m is not None:
@@ -64,7 +64,9 @@ def trim_at_sky(gaussians: Gaussians, views: Sequence[SolidView]) -> Gaussians:
         index = index[may_reach]
         rows = rows[may_reach]
         columns = columns[may_reach]
-        toward = np.stack([way.right_px[rows, columns], way.down_px[rows, columns]], axis=1)
+        toward = np.stack(
+            [sky_distance.right_px[rows, columns], sky_distance.down_px[rows, columns]], axis=1
+        )
         toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
         axes_px = _project_axes(gaussians, index, view)
         parts2 = np.einsum("kij,ki->kj", axes_px, toward) ** 2  # [K, 3], px^2 towards the sky
@@ -106,8 +108,8 @@ def shorten_ends_in_sky(gaussians: Gaussians, views: Sequence[SolidView]) -> Gau
     return dataclasses.replace(gaussians, scales=gaussians.scales * torch.from_numpy(factors))
 
 
-def _way_to_sky(sky_share: np.ndarray) -> _SkyDistance | None:
-    """Return the way from each pixel to the sky; None in an image without sky."""
+def _measure_sky_distance(sky_share: np.ndarray) -> _SkyDistance | None:
+    """Return the distance of each pixel from the sky; None in an image without sky."""
     is_surface = (sky_share < _SKY_SHARE).astype(np.uint8)
     if is_surface.all():
         return None
