@@ -24,10 +24,12 @@ from adapters.lidar_scene.dense_depth import FAR_M, DenseDepth, KnownSurface, co
 from adapters.lidar_scene.depth_maps import DepthMaps
 from adapters.lidar_scene.image_views import View
 from adapters.lidar_scene.sky_conflicts import measure_agreement, without_sky_splats
-from adapters.lidar_scene.solid_views import SolidView, read_solid_view
+from adapters.lidar_scene.sky_edges import shorten_ends_in_sky, trim_at_sky
+from adapters.lidar_scene.solid_views import WORK_WIDTH, SolidView, read_solid_view
 from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
 from adapters.lidar_scene.wall_planes import WallPlanes, find_wall_planes
+from adapters.raw_drive import Sweep
 from adapters.world import join_gaussians
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
@@ -41,21 +43,24 @@ logger = logging.getLogger(__name__)
 
 _STEP_M = 2.0  # distance on the path from one image that is taken to the next
 _FRAMES_PART = 1 / 6  # largest part of all frames whose images are taken, beyond a few
-_FINER = 2  # scale at which the Gaussians so far are drawn: leaks between splats are small
+_SKY_STEP_M = 0.7  # distance from one image whose sky may refute splats to the next
+_SKY_FRAMES_PART = 1 / 3  # largest part of all frames whose images may
+_DEPTH_WIDTH = 480  # columns at which depth is searched for, at most
 _OPEN_ALPHA = 0.97  # mean alpha of the Gaussians so far around a pixel below which it is open
 _OPEN_WINDOW_PX = 5  # side of the square over which that mean is taken
 _SOLID_PART = 0.8  # part of that square with a surface above which it is no sky, whatever it shows
 _SOLID_SHARE = 0.4  # share of sky below which a pixel shows a surface
 _BEHIND = 0.002  # gap from a surface that leaks to the disc behind it, as a part of the depth
 _BEHIND_M = 0.02  # constant part of that gap, metres
-_SIDES_PX = (16, 8, 4, 2, 1)  # sides of discs, pixels
+_SIDES_PX = (32, 16, 8, 4, 2, 1)  # sides of discs, pixels
 # Largest standard deviations of CIELAB colours within a disc, in turn, until there is room for all.
 _COLOR_TOLERANCES = (2.0, 4.0, 8.0, 16.0)
 _SKY_SIDES = 1.2  # least distance of a disc from the sky, as a multiple of its side
 _DEPTH_TOLERANCE = 0.02  # largest standard deviation of the logarithm of depths within a disc
 _VIEWS_PER_SHARE = 8  # one view adds the remaining number over this at most, if so many follow
 _MIN_COSINE = 0.15  # of the angle between a ray and a wall's normal, to which a disc is stretched
-_MAX_CONFLICTS = 0.3  # part of the images of a disc in which it may cover sky
+_MAX_CONFLICTS = 0.1  # part of the images of a disc in which it may cover sky
+_MAX_MEASURED_CONFLICTS = 0.4  # the same of a splat that returns made
 _SHAPE = SplatShape(sigma_per_spacing=0.65, opacity=0.99)
 
 
@@ -68,6 +73,7 @@ def close_above_beams(
     tracks: Sequence[ObjectTrack],
     views: Sequence[View],
     *,
+    sweeps: Sequence[Sweep],
     lidar_top_rad: float,
     max_gaussians: int,
     depth_option: str | None = None,
@@ -80,18 +86,34 @@ def close_above_beams(
         parts: Gaussians of the world, then those of the tracks, in their frames.
         tracks: moving objects.
         views: recorded images.
+        sweeps: the LiDAR's returns; those nearest in time tell an image's sky.
         lidar_top_rad: highest elevation that the LiDAR measures.
         max_gaussians: largest number for all parts.
         depth_option: a user's depth maps, as in `DepthMaps.find`.
     """
-    points = parts[0].means.numpy()
-    lowest_m = min((float(view.camera.centre[2]) for view in views), default=0.0)
-    points = points[points[:, 2] > lowest_m]
-    solid_views = [
-        solid_view
-        for view in spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART)
-        if (solid_view := read_solid_view(view, tracks, points, lidar_top_rad)) is not None
-    ]
+    returns_at = _ReturnsAt(sweeps)
+
+    def read_views(chosen: Iterable[View], width: int) -> list[SolidView]:
+        solid_views = (
+            read_solid_view(
+                view,
+                tracks,
+                returns_at.nearest(view.camera.timestamp_ns),
+                lidar_top_rad,
+                width=width,
+            )
+            for view in chosen
+        )
+        return [view for view in solid_views if view is not None]
+
+    main_views = spread_views(views, step_m=_STEP_M, frames_part=_FRAMES_PART)
+    solid_views = read_views(main_views, WORK_WIDTH)
+    used = {view.key for view in solid_views}
+    more_views = spread_views(views, step_m=_SKY_STEP_M, frames_part=_SKY_FRAMES_PART)
+    sky_views = read_views(
+        (view for view in more_views if ViewKey(view.frame, view.camera.name) not in used),
+        _DEPTH_WIDTH,
+    )
 
     def pose_parts(background: Gaussians, camera: Camera) -> list[PosedGaussians]:
         posed = [PosedGaussians(background, None, instance_id=0)]
@@ -107,11 +129,27 @@ def close_above_beams(
         parts[0],
         solid_views,
         pose_parts,
+        sky_views=sky_views,
         lidar_top_rad=lidar_top_rad,
         max_added=max_gaussians - sum(map(len, parts)),
         maps=maps,
     )
     return background, () if maps is None else maps.sentences()
+
+
+class _ReturnsAt:
+    """Finds the sweep that is nearest in time."""
+
+    def __init__(self, sweeps: Sequence[Sweep]) -> None:
+        self._sweeps = [sweep for sweep in sweeps if len(sweep)]
+        self._times_ns = [int(np.median(sweep.timestamps_ns)) for sweep in self._sweeps]
+
+    def nearest(self, timestamp_ns: int) -> np.ndarray:
+        """Return the points of the nearest sweep, float32 [N, 3]; none without a sweep."""
+        if not self._sweeps:
+            return np.zeros((0, 3), np.float32)
+        gaps_ns = [abs(time_ns - timestamp_ns) for time_ns in self._times_ns]
+        return self._sweeps[int(np.argmin(gaps_ns))].points
 
 
 class MapReader:
@@ -161,6 +199,7 @@ def add_surfaces_beyond_beams(
     *,
     lidar_top_rad: float,
     max_added: int,
+    sky_views: Sequence[SolidView] = (),
     maps: MapReader | None = None,
 ) -> Gaussians:
     """Return the background with discs until the views' pixels without sky have a surface.
@@ -171,14 +210,17 @@ def add_surfaces_beyond_beams(
         pose_parts: places background and actors for a camera.
         lidar_top_rad: highest elevation that the LiDAR looks at.
         max_added: largest number of discs.
+        sky_views: more recorded images, whose sky refutes splats.
         maps: a user's depth maps, which count before a guess.
     """
     views = list(views)
-    background = without_sky_splats(background, views)
+    voters = [*views, *sky_views]
+    background = without_sky_splats(background, voters, max_conflicts=_MAX_MEASURED_CONFLICTS)
     views = [
-        view._replace(known_m=_draw(background, view.camera, pose_parts, finer=1)[1].depth_m)
+        view._replace(known_m=_draw(background, view.camera, pose_parts)[1].depth_m)
         for view in views
     ]
+    background = trim_at_sky(background, views)
     walls = find_wall_planes(background)
     count = len(background)
     for number, view in enumerate(views):
@@ -191,9 +233,7 @@ def add_surfaces_beyond_beams(
         leaks &= ~view.excluded
         if not (leaks & (view.matte.sky_share < _SOLID_SHARE)).any() or room < 1:
             continue
-        depth = complete_depth(
-            view.camera, view.rgb, view.matte.sky_share, known_surface, walls, lidar_top_rad
-        )
+        depth = _complete_depth(view, known_surface, walls, lidar_top_rad)
         is_known = np.isfinite(known_surface.depth_m)
         user_m = None if maps is None else maps.read(view)
         if user_m is not None:
@@ -208,6 +248,11 @@ def add_surfaces_beyond_beams(
         cells = _cells(view, depth, leaks & (sky_share < _SOLID_SHARE), room)
         discs = _discs(view, depth, is_known | panes, cells, walls, other_views)
         background = join_gaussians([background, discs])
+    added = background.select(torch.arange(count, len(background)))
+    background = background.select(torch.arange(count))
+    added = without_sky_splats(added, voters, min_views=1, max_conflicts=_MAX_CONFLICTS)
+    added = shorten_ends_in_sky(trim_at_sky(added, views), voters)
+    background = join_gaussians([background, added])
     logger.info("%d splats beyond the LiDAR's view", len(background) - count)
     return background
 
@@ -222,33 +267,53 @@ def _take_user_depth(depth: DenseDepth, user_m: np.ndarray, is_open: np.ndarray)
     )
 
 
-def _draw(
-    background: Gaussians, camera: Camera, pose_parts: PosesParts, *, finer: int = _FINER
-) -> tuple[np.ndarray, KnownSurface]:
-    """Return alpha [H, W] and the surfaces of the Gaussians so far.
+def _complete_depth(
+    view: SolidView, known_surface: KnownSurface, walls: WallPlanes, lidar_top_rad: float
+) -> DenseDepth:
+    """Return a depth for every pixel of a view, searched for at _DEPTH_WIDTH columns at most.
 
-    finer: scale of the drawing over the camera's.
+    Args:
+        view: the recorded image.
+        known_surface: known surfaces, at the view's size.
+        walls: walls of the scene.
+        lidar_top_rad: highest elevation that the LiDAR looks at.
     """
-    parts = pose_parts(background, camera)
-    fine_camera = dataclasses.replace(
+    camera = view.camera.scaled(min(1.0, _DEPTH_WIDTH / view.camera.width))
+    size = (camera.width, camera.height)
+    rows = np.arange(camera.height) * view.camera.height // camera.height
+    columns = np.arange(camera.width) * view.camera.width // camera.width
+    depth = complete_depth(
         camera,
-        width=finer * camera.width,
-        height=finer * camera.height,
-        fx=finer * camera.fx,
-        fy=finer * camera.fy,
-        cx=finer * camera.cx,
-        cy=finer * camera.cy,
+        cv2.resize(view.rgb, size, interpolation=cv2.INTER_AREA),
+        cv2.resize(view.matte.sky_share, size, interpolation=cv2.INTER_AREA),
+        KnownSurface(*(image[rows[:, None], columns] for image in known_surface)),
+        walls,
+        lidar_top_rad,
     )
-    raster = rasterize(parts, fine_camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
+    rows = np.arange(view.camera.height) * camera.height // view.camera.height
+    columns = np.arange(view.camera.width) * camera.width // view.camera.width
+    depth = DenseDepth(*(image[rows[:, None], columns] for image in depth))
+    is_known = np.isfinite(known_surface.depth_m)
+    return depth._replace(
+        depth_m=np.where(is_known, known_surface.depth_m, depth.depth_m),
+        semantic=np.where(is_known, known_surface.semantic, depth.semantic),
+        is_far=depth.is_far & ~is_known,
+    )
+
+
+def _draw(
+    background: Gaussians, camera: Camera, pose_parts: PosesParts
+) -> tuple[np.ndarray, KnownSurface]:
+    """Return alpha [H, W] and the surfaces of the Gaussians so far."""
+    parts = pose_parts(background, camera)
+    raster = rasterize(parts, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
     assert raster.alpha is not None and raster.median_depth is not None
     assert raster.splat_ids is not None and background.semantic is not None
-    size = (camera.width, camera.height)
-    alpha = cv2.resize(raster.alpha.numpy(), size, interpolation=cv2.INTER_AREA)
-    ids = raster.splat_ids.numpy()[::finer, ::finer]
+    alpha = raster.alpha.numpy()
+    ids = raster.splat_ids.numpy()
     in_background = (ids >= 0) & (ids < len(background))
     semantic = background.semantic.numpy()[np.where(in_background, ids, 0)]
-    is_known = raster.alpha.numpy()[::finer, ::finer] >= SURFACE_ALPHA
-    depth = np.where(is_known, raster.median_depth.numpy()[::finer, ::finer], np.inf)
+    depth = np.where(alpha >= SURFACE_ALPHA, raster.median_depth.numpy(), np.inf)
     return alpha, KnownSurface(depth, semantic.astype(np.int16), (ids >= len(background)))
 
 
@@ -380,7 +445,8 @@ def _discs(
     conflicts = agreement.conflicts
     doubt = agreement.doubt()
     is_sure_cell = is_sure[middle_rows, middle_columns]
-    conflicts[is_sure_cell] = doubt[is_sure_cell] = 0
+    doubt[is_sure_cell] = 0
+    conflicts[is_sure_cell & (conflicts < 0.3)] = 0
     unlikely = np.flatnonzero(doubt > 0)
     far_m = FAR_M / level[unlikely]
     far_points = centre + far_m[:, None] * rays[unlikely]

@@ -166,6 +166,7 @@ def build_lidar_scene(
             parts,
             tracks,
             views,
+            sweeps=drive.sweeps,
             lidar_top_rad=math.radians(drive.lidar_top_deg),
             max_gaussians=options.max_gaussians,
             depth_option=options.depth,

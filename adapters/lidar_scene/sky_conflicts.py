@@ -17,13 +17,13 @@ import torch
 from adapters.lidar_scene.solid_views import SolidView, project_into
 from augment.scene.scene import Gaussians
 
-_SURE_SKY = 0.98  # share of sky above which an image shows sky
+_SURE_SKY = 0.5  # share of sky above which a pixel shows sky
+_AROUND_PART = 1 / 320  # side of the square that must show sky around, over the image's width
 _BEHIND_RATIO = 1.1  # ratio of depths from which a surface is clearly behind a point
 _BEHIND_M = 0.5  # the same as a difference, metres
 _ONE_COLOR = 12.0  # distance in CIELAB up to which two colours may be of one surface
 _NO_SUPPORT = 0.5  # doubt about a point whose colour no other image shows
 _MIN_VIEWS = 2  # fewest images that speak for or against a point
-_MAX_CONFLICTS = 0.6  # part of the images of a splat in which it may cover sky
 
 
 class Agreement(NamedTuple):
@@ -57,7 +57,7 @@ def measure_agreement(points: np.ndarray, lab: np.ndarray, views: Sequence[Solid
         index, rows, columns, depth_m = project_into(view.camera, points)
         difference = np.linalg.norm(view.lab[rows, columns] - lab[index], axis=1)
         has_color = difference < _ONE_COLOR
-        conflicts = _is_sure_sky(view)[rows, columns]
+        conflicts = sure_sky(view)[rows, columns]
         if view.known_m is not None:
             known_m = view.known_m[rows, columns]
             is_before = np.isfinite(known_m) & (known_m > _BEHIND_RATIO * depth_m + _BEHIND_M)
@@ -70,17 +70,27 @@ def measure_agreement(points: np.ndarray, lab: np.ndarray, views: Sequence[Solid
     )
 
 
-def _is_sure_sky(view: SolidView) -> np.ndarray:
+def sure_sky(view: SolidView) -> np.ndarray:
     """Return the pixels with sky all around, bool [H, W]: depths are not exact."""
-    return cv2.erode(view.matte.sky_share, np.ones((3, 3), np.uint8)) > _SURE_SKY
+    side = max(3, 2 * round(_AROUND_PART * view.camera.width) - 1)
+    square = np.ones((side, side), np.uint8)
+    return cv2.erode(view.matte.sky_share, square) > _SURE_SKY
 
 
-def without_sky_splats(background: Gaussians, views: Sequence[SolidView]) -> Gaussians:
+def without_sky_splats(
+    background: Gaussians,
+    views: Sequence[SolidView],
+    *,
+    min_views: int = _MIN_VIEWS,
+    max_conflicts: float,
+) -> Gaussians:
     """Return the background without splats that images see as sky.
 
     Args:
         background: splats of what stands still.
         views: recorded images.
+        min_views: fewest images that show sky at a splat that is left out.
+        max_conflicts: part of the images of a splat in which it may cover sky.
     """
     if not views:
         return background
@@ -92,8 +102,8 @@ def without_sky_splats(background: Gaussians, views: Sequence[SolidView]) -> Gau
     for view in views:
         index, rows, columns, _ = project_into(view.camera, points)
         num_views[index] += 1
-        num_sky[index] += _is_sure_sky(view)[rows, columns]
-    is_stray = (num_sky >= _MIN_VIEWS) & (num_sky > _MAX_CONFLICTS * num_views)
+        num_sky[index] += sure_sky(view)[rows, columns]
+    is_stray = (num_sky >= min_views) & (num_sky > max_conflicts * num_views)
     keep = np.ones(len(background), np.bool_)
     keep[high[is_stray]] = False
     return background.select(torch.from_numpy(np.flatnonzero(keep)))

@@ -5,7 +5,6 @@ The callers are `adapters.lidar_scene.beyond_beams` and `adapters.training_views
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,15 +14,12 @@ import numpy as np
 from adapters.lidar_scene.image_views import IMAGE_SCALES, View, draw_cover, read_image
 from adapters.lidar_scene.split import ObjectTrack
 from augment.photo.sky_matte import SkyMatte, find_sky_matte
+from augment.photo.sky_regions import largest_channel
 from augment.reconstruct.view import ViewKey
 from augment.scene.cameras import Camera
 
-WORK_WIDTH = 480  # columns of the images in which surfaces are added, at most
+WORK_WIDTH = 960  # columns of the images in which surfaces are added, at most
 _HALF = np.float32(0.5)  # share of sky that parts sky from surface
-_MIN_REGION_PX = 50  # least area of sky by the image alone
-_MAX_NEAR_SHARE = 0.2  # largest part of it that lies near surfaces
-_MAX_ABOVE_SHARE = 0.5  # largest part of it that stands above surfaces at the LiDAR's top
-_TOP_MARGIN_RAD = math.radians(4.0)  # below the LiDAR's top, from which a surface may go on
 _RIM_PX = 2  # width of rims that show mostly sky
 _RIM_LEVELS = 16  # largest difference from the sky of a rim, of 255
 _RIM_SHARE = 0.4  # the same as a part of the largest difference around
@@ -52,25 +48,32 @@ class SolidView(NamedTuple):
 
 
 def read_solid_view(
-    view: View, tracks: Sequence[ObjectTrack], points: np.ndarray, lidar_top_rad: float
+    view: View,
+    tracks: Sequence[ObjectTrack],
+    returns: np.ndarray,
+    lidar_top_rad: float,
+    *,
+    width: int = WORK_WIDTH,
 ) -> SolidView | None:
-    """Return a recorded image with its sky, at WORK_WIDTH columns at most.
+    """Return a recorded image with its sky.
 
     The result is None if it cannot be decoded, or is too dark to tell its sky.
 
     Args:
         view: the image.
         tracks: moving objects.
-        points: float [N, 3], surfaces of what stands still, world.
+        returns: float [N, 3], the LiDAR's returns at the image's time, world. Those of other times
+            are no substitute: they lie behind what the image shows, and hide its sky.
         lidar_top_rad: highest elevation that the LiDAR measures.
+        width: columns of the result, at most.
     """
-    camera = view.camera.scaled(min(1.0, WORK_WIDTH / view.camera.width))
+    camera = view.camera.scaled(min(1.0, width / view.camera.width))
     scale = camera.width / view.camera.width
     image = read_image(view.path, next(s for s in IMAGE_SCALES if s >= scale))
     if image is None:
         return None
     rgb = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    matte = _find_matte(rgb, camera, _has_point(camera, points), lidar_top_rad)
+    matte = find_sky_matte(rgb, camera, _has_point(camera, returns), lidar_top_rad)
     if matte is None:
         return None
     boxes = [
@@ -80,42 +83,7 @@ def read_solid_view(
     ]
     excluded = view.shows_car(camera.width, camera.height)
     key = ViewKey(view.frame, view.camera.name)
-    return make_solid_view(key, camera, rgb, matte, excluded, boxes, points)
-
-
-def _find_matte(
-    rgb: np.ndarray, camera: Camera, has_point: np.ndarray, lidar_top_rad: float
-) -> SkyMatte | None:
-    """Return the sky of an image; None if it is too dark to tell.
-
-    With LiDAR, a wire that reaches the LiDAR's top hides the sky beside it. Regions that are sky by
-    the image alone count as well if hardly any surface lies in them.
-    """
-    matte = find_sky_matte(rgb, camera, has_point, lidar_top_rad)
-    alone = find_sky_matte(rgb, camera)
-    if matte is None or alone is None:
-        return matte
-    other = ((alone.sky_share >= _HALF) & (matte.sky_share < _HALF)).astype(np.uint8)
-    square = np.ones((5, 5), np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.erode(other, square))
-    near_point = cv2.dilate(has_point.astype(np.uint8), square)
-    num_near = np.bincount(labels.ravel(), near_point.ravel(), count)
-    rays = camera.ray_directions().numpy()
-    elevation_rad = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
-    reaches_top = has_point & (elevation_rad > lidar_top_rad - _TOP_MARGIN_RAD)
-    is_above_top = np.maximum.accumulate(reaches_top[::-1], axis=0)[::-1]
-    num_above = np.bincount(labels.ravel(), is_above_top.ravel(), count)
-    area = stats[:, cv2.CC_STAT_AREA]
-    is_sky = (area >= _MIN_REGION_PX) & (num_near < _MAX_NEAR_SHARE * area)
-    is_sky &= num_above < _MAX_ABOVE_SHARE * area
-    is_sky[0] = False
-    added = cv2.dilate(is_sky[labels].astype(np.uint8), square) & other
-    rows, columns = np.nonzero(added)
-    sky_share = matte.sky_share.copy()
-    sky_rgb = matte.sky_rgb.copy()
-    sky_share[rows, columns] = alone.sky_share[rows, columns]
-    sky_rgb[rows, columns] = alone.sky_rgb[rows, columns]
-    return matte._replace(sky_share=sky_share, sky_rgb=sky_rgb)
+    return make_solid_view(key, camera, rgb, matte, excluded, boxes, returns)
 
 
 def make_solid_view(
@@ -136,7 +104,7 @@ def make_solid_view(
         matte: the image's sky.
         excluded: pixels of the recording car, bool [H, W].
         boxes: world_from_box [4, 4] and size in metres [3] of the moving objects.
-        points: float [N, 3], surfaces of what stands still, world.
+        points: float [N, 3], known surfaces, world.
     """
     cover = np.full((camera.height, camera.width), np.inf, np.float32)
     for world_from_box, size_m in boxes:
@@ -168,7 +136,7 @@ def _without_specks(rgb: np.ndarray, matte: SkyMatte, has_point: np.ndarray) -> 
         has_point: pixels with a known surface, bool [H, W].
     """
     is_solid = matte.sky_share < _HALF
-    difference = np.abs(rgb.astype(np.int16) - matte.sky_rgb).max(axis=2)
+    difference = largest_channel(cv2.absdiff(rgb, matte.sky_rgb))
     around = cv2.dilate(difference, np.ones((5, 5), np.uint8))
     looks_like_sky = difference < np.maximum(_RIM_LEVELS, _RIM_SHARE * around)
     square = np.ones((3, 3), np.uint8)
@@ -196,7 +164,7 @@ def _without_rims(rgb: np.ndarray, sky_rgb: np.ndarray, sky_share: np.ndarray) -
     """
     height, width = sky_share.shape
     is_sky = sky_share >= _HALF
-    difference = np.abs(rgb.astype(np.int16) - sky_rgb).max(axis=2)
+    difference = largest_channel(cv2.absdiff(rgb, sky_rgb)).astype(np.int16)
     difference[is_sky] = -1
     beside_sky = cv2.dilate(is_sky.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     rows, columns = np.nonzero(beside_sky & ~is_sky)

@@ -13,6 +13,7 @@ import torch
 from adapters.lidar_scene.dense_depth import FAR_M, KnownSurface, complete_depth
 from adapters.lidar_scene.depth_maps import DepthMaps
 from adapters.lidar_scene.sky_conflicts import measure_agreement, without_sky_splats
+from adapters.lidar_scene.sky_edges import shorten_ends_in_sky, trim_at_sky
 from adapters.lidar_scene.solid_views import SolidView
 from adapters.lidar_scene.surfels import Surfels, gaussians_from_surfels
 from adapters.lidar_scene.wall_planes import find_wall_planes
@@ -20,6 +21,7 @@ from adapters.raw_drive import DriveOptions
 from augment.errors import AdapterError
 from augment.photo.sky_matte import SkyMatte
 from augment.reconstruct.view import ViewKey
+from augment.scene.scene import Gaussians
 from augment.scene.semantics import SemanticClass
 from tests.adapters import drives
 
@@ -28,6 +30,7 @@ FOCAL_PX = 100.0
 LIDAR_TOP_RAD = np.radians(10.0)
 AWAY_M = 20.0
 KEY = ViewKey(0, "front")
+UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
 
 
 def camera():
@@ -119,8 +122,49 @@ def test_an_image_refutes_points_in_its_sky_and_before_its_surfaces():
     assert agreement.conflicts.tolist() == [0, 0, 1, 1]
     assert agreement.has_support.tolist() == [True, True, False, False]
     splats = wall_splats(np.stack([wall, in_sky]))
-    assert without_sky_splats(splats, [view] * 2).means[0].numpy() == pytest.approx(wall, abs=1e-4)
-    assert len(without_sky_splats(splats, [view] * 2)) == 1
+    below_sky = without_sky_splats(splats, [view] * 2, max_conflicts=0.4)
+    assert below_sky.means.numpy() == pytest.approx(wall[None], abs=1e-4)
+    # One image is too few for a measured splat, and enough for a guessed one.
+    assert len(without_sky_splats(splats, [view], max_conflicts=0.4)) == 2
+    assert len(without_sky_splats(splats, [view], min_views=1, max_conflicts=0.4)) == 1
+
+
+def upright_splat(point, width_m: float) -> Gaussians:
+    """A round splat in the plane across the view along x."""
+    scales = torch.tensor([[0.01, width_m, width_m]])
+    return dataclasses.replace(wall_splats(point[None]), scales=scales, quats=UPRIGHT)
+
+
+def test_a_splat_below_the_sky_line_is_shortened_upward_only():
+    view = solid_view(40)
+    rays = view.camera.ray_directions(torch.float64).numpy()
+    point = view.camera.centre.numpy() + AWAY_M * rays[42, 80]
+    pixel_m = AWAY_M / FOCAL_PX
+    splat = upright_splat(point, 10 * pixel_m)
+    _, aside_m, upward_m = trim_at_sky(splat, [view]).scales[0].tolist()
+    assert aside_m == pytest.approx(10 * pixel_m)
+    assert upward_m < 2.5 * pixel_m
+    # A surface before the splat hides it, and with it whatever it reaches.
+    hidden = view._replace(known_m=np.full((SIZE[1], SIZE[0]), AWAY_M / 2))
+    assert trim_at_sky(splat, [hidden]).scales.equal(splat.scales)
+    # Thin splats below the line do not reach it.
+    thin = upright_splat(point, 0.5 * pixel_m)
+    assert trim_at_sky(thin, [view]).scales.equal(thin.scales)
+
+
+def test_a_splat_beside_the_image_is_shortened_where_its_end_lies_in_sky():
+    view = solid_view(40)
+    rays = view.camera.ray_directions(torch.float64).numpy()
+    pixel_m = AWAY_M / FOCAL_PX
+    left = np.array([0.0, 10 * pixel_m, 0.0])
+    in_sky = view.camera.centre.numpy() + AWAY_M * rays[20, 0] + left
+    splat = upright_splat(in_sky, 10 * pixel_m)
+    _, aside_m, upward_m = shorten_ends_in_sky(splat, [view]).scales[0].tolist()
+    assert aside_m == pytest.approx(5 * pixel_m)
+    assert upward_m == pytest.approx(10 * pixel_m)
+    below_sky = view.camera.centre.numpy() + AWAY_M * rays[60, 0] + left
+    splat = upright_splat(below_sky, 10 * pixel_m)
+    assert shorten_ends_in_sky(splat, [view]).scales.equal(splat.scales)
 
 
 def write_map(folder: Path, values: np.ndarray, suffix: str) -> None:
