@@ -1,13 +1,14 @@
 """Numba kernels of surfaces on a photo: the best outline of an object, and depth that spreads.
 
-`augment.photo.outlines` and `augment.photo.photo_depth` call them, and say what the arrays mean.
+`augment.photo.outlines` and `augment.photo.photo_surface` call them, and say what the arrays mean.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numba import prange
 
-from augment.render.cpu.jit import serial_kernel
+from augment.render.cpu.jit import kernel, serial_kernel
 
 
 @serial_kernel
@@ -155,3 +156,62 @@ def spread_roots(pixels, state, step_costs, max_cost, roots):
             last_entries[bucket] = num_entries
             num_entries += 1
             num_waiting += 1
+
+
+@kernel
+def fill_surfaces(alpha, sky_share, overlay, is_complete, limits, out, is_missing):
+    """Write the alpha of what a photo shows, and the mask of surfaces that the scene lacks.
+
+    Args:
+        alpha: float32 [H, W], alpha of the scene.
+        sky_share: float32 [H, W], share of sky in each pixel.
+        overlay: float32 [H, W], share of snow in each pixel; [0, 0] without snow.
+        is_complete: bool [H, W], pixels that the scene shows in full; [0, 0] for none.
+        limits: float32 [3]; alphas that count as nothing and as everything, and the alpha below
+            which the scene lacks a surface.
+        out: output float32 [H, W], alpha.
+        is_missing: output bool [H, W].
+    """
+    height, width = alpha.shape
+    zero = np.float32(0)
+    one_f32 = np.float32(1)
+    has_overlay = len(overlay) > 0
+    has_complete = len(is_complete) > 0
+    for i in prange(height):
+        for j in range(width):
+            solid_share = one_f32 - sky_share[i, j]
+            if has_overlay:
+                solid_share = max(solid_share, overlay[i, j])
+            missing = alpha[i, j] < limits[2]
+            if has_complete and is_complete[i, j]:
+                solid_share = (alpha[i, j] - limits[0]) / (limits[1] - limits[0])
+                solid_share = min(max(solid_share, zero), one_f32)
+                missing = False
+            out[i, j] = solid_share
+            is_missing[i, j] = missing
+
+
+@kernel
+def fill_depth(depth, is_missing, small_depth, road_depth, out):
+    """Write depth with that of a smaller image where it is missing, no larger than the road's.
+
+    Args:
+        depth: float32 [H, W], metres.
+        is_missing: bool [H, W].
+        small_depth: float32 [h, w], depth of missing pixels, metres.
+        road_depth: float32 [H, W], z of the road, metres; [0, 0] where it is unknown.
+        out: output float32 [H, W].
+    """
+    height, width = depth.shape
+    small_height, small_width = small_depth.shape
+    has_road = len(road_depth) > 0
+    for i in prange(height):
+        row = np.int64(i) * small_height // height
+        for j in range(width):
+            if not is_missing[i, j]:
+                out[i, j] = depth[i, j]
+                continue
+            value = small_depth[row, np.int64(j) * small_width // width]
+            if has_road:
+                value = min(value, road_depth[i, j])
+            out[i, j] = value

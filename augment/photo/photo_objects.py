@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -70,6 +71,23 @@ class ObjectEdges:
     sources: Int64[np.ndarray, " M"]
     """Flat indices of the nearest pixels of the same objects."""
 
+    @cached_property
+    def window(self) -> tuple[slice, slice]:
+        """Return the rows and columns around the pixels that show the background."""
+        left, top, width, height = cv2.boundingRect(self.shows_background.view(np.uint8))
+        return slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
+
+    def window_of(self, camera: Camera) -> Camera:
+        """Return the view through the window.
+
+        Args:
+            camera: the camera of the photo.
+        """
+        rows, columns = self.window
+        return camera.cropped(
+            columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start
+        )
+
     def background_of(self, parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
         """Return the parts without the objects and what lies on them."""
         return tuple(part for part in parts if part.instance_id not in self.instance_ids)
@@ -81,36 +99,47 @@ class ObjectEdges:
 
         Args:
             raster: buffers of the parts.
-            background: the same buffers of `background_of(parts)`; only the pixels of
-                `shows_background` are read.
+            background: the same buffers of `background_of(parts)` in the window; only the pixels
+                of `shows_background` are read.
             parts: the parts.
         """
+        rows, columns = np.nonzero(self.shows_background[self.window])
+        hidden = (rows + self.window[0].start) * self.shows_background.shape[1]
+        hidden += columns + self.window[1].start
+        hidden_in_window = rows * (self.window[1].stop - self.window[1].start) + columns
         moved_buffers = dict[str, Tensor]()
         for name in BUFFERS:
             buffer = getattr(raster, name)
             if buffer is None:
                 continue
-            hidden_values = getattr(background, name)
-            if name == SPLAT_IDS:
-                hidden_values = self._count_through(hidden_values, parts)
+            hidden_values = getattr(background, name).flatten(0, 1)
             if buffer.device.type == "cpu" and not buffer.requires_grad:
-                image = buffer.numpy()
-                image[self.shows_background] = hidden_values.numpy()[self.shows_background]
-                flat_image = image.reshape(-1, *image.shape[2:])
+                values = hidden_values.numpy()[hidden_in_window]
+                if name == SPLAT_IDS:
+                    values = self._count_through(torch.from_numpy(values), parts).numpy()
+                flat_image = buffer.numpy().reshape(-1, *buffer.shape[2:])
+                flat_image[hidden] = values
                 flat_image[self.targets] = flat_image[self.sources]
                 continue
-            mask, targets, sources = (
-                torch.from_numpy(indices).to(buffer.device)
-                for indices in (self.shows_background, self.targets, self.sources)
+            from_window, to_pixels, targets, sources = (
+                torch.from_numpy(numbers).to(buffer.device)
+                for numbers in (hidden_in_window, hidden, self.targets, self.sources)
             )
-            mask = mask if buffer.ndim == 2 else mask[..., None]
-            flat_buffer = torch.where(mask, hidden_values, buffer).flatten(0, 1)
+            values = hidden_values[from_window]
+            if name == SPLAT_IDS:
+                values = self._count_through(values, parts)
+            flat_buffer = buffer.flatten(0, 1).index_copy(0, to_pixels, values)
             moved = flat_buffer.index_copy(0, targets, flat_buffer[sources])
             moved_buffers[name] = moved.view_as(buffer)
         return replace(raster, **moved_buffers) if moved_buffers else raster
 
     def _count_through(self, splat_ids: Tensor, parts: Sequence[PosedGaussians]) -> Tensor:
-        """Return indices of splats of the background as indices through all parts."""
+        """Return indices of splats of the background as indices through all parts.
+
+        Args:
+            splat_ids: indices among the splats of `background_of(parts)`; -1 for none.
+            parts: the parts.
+        """
         counts = [len(part.gaussians) for part in parts]
         starts = np.cumsum([0, *counts[:-1]])
         is_kept = [part.instance_id not in self.instance_ids for part in parts]

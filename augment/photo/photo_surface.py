@@ -24,6 +24,7 @@ from torch import Tensor
 from augment.photo import outline_kernels as kernels
 from augment.photo.photo_objects import copy_size, nearest_pixels
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH, RenderOutput
+from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
 # Alpha of reconstructed surfaces up to which a pixel counts as empty. What a photo shows is opaque,
@@ -47,6 +48,8 @@ MAX_SOURCE_SKY = 0.5
 STEP_COSTS = (1, 24, 8, 8)
 # Largest cost of a step, levels.
 MAX_STEP_COST = 96
+# Image rows that a thread takes at a time.
+ROWS_PER_THREAD = 32
 # Estimators of depth among the buffers.
 DEPTH_BUFFERS = (EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH)
 
@@ -72,37 +75,46 @@ def complete_surfaces(
             `opaque_alpha`; None for no pixels.
     """
     assert raster.alpha is not None and raster.expected_depth is not None
-    alpha = raster.alpha.detach().cpu().numpy()
-    depth = raster.expected_depth.detach().cpu().numpy()
-    solid_share = 1 - sky_share
-    if raster.overlay is not None:  # snow on a roof covers the sky behind it
-        np.maximum(solid_share, raster.overlay.detach().cpu().numpy(), out=solid_share)
-    is_missing = alpha < MIN_SURFACE_ALPHA
-    if is_complete is not None:
-        solid_share = np.where(is_complete, opaque_share(alpha), solid_share)
-        is_missing &= ~is_complete
+    alpha = _as_array(raster.alpha)
+    depth = _as_array(raster.expected_depth)
+    solid_share = np.empty_like(alpha)
+    is_missing = np.empty(alpha.shape, np.bool_)
+    # Snow on a roof covers the sky behind it.
+    overlay = np.empty((0, 0), np.float32) if raster.overlay is None else _as_array(raster.overlay)
+    complete_pixels = np.empty((0, 0), np.bool_) if is_complete is None else is_complete
+    limits = np.array([CLEAR_ALPHA, OPAQUE_ALPHA, MIN_SURFACE_ALPHA], np.float32)
+    with kernel_threads(ROWS_PER_THREAD):
+        kernels.fill_surfaces(
+            alpha, sky_share, overlay, complete_pixels, limits, solid_share, is_missing
+        )
     changes: dict[str, Tensor] = {"alpha": torch.from_numpy(solid_share)}
     if is_missing.any():
         roots = _find_roots(alpha, sky_share, pixels, camera)
-        size = camera.width, camera.height
-        small_depth = _shrink(depth, roots)
-        filled = np.where(roots >= 0, small_depth.reshape(-1)[roots], np.float32(FAR_DEPTH_M))
-        filled = cv2.resize(filled.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
-        if road_depth is not None:
-            np.minimum(filled, road_depth, out=filled)
+        small_depth = _shrink(depth, roots).reshape(-1)[roots]
+        small_depth[roots < 0] = FAR_DEPTH_M
+        far_depth = np.empty((0, 0), np.float32) if road_depth is None else road_depth
         for name in DEPTH_BUFFERS:
             buffer = getattr(raster, name)
-            if buffer is not None:
-                values = buffer.detach().cpu().numpy()
-                changes[name] = torch.from_numpy(np.where(is_missing, filled, values))
+            if buffer is None:
+                continue
+            filled = np.empty_like(depth)
+            with kernel_threads(ROWS_PER_THREAD):
+                kernels.fill_depth(_as_array(buffer), is_missing, small_depth, far_depth, filled)
+            changes[name] = torch.from_numpy(filled)
         if raster.splat_ids is not None:
             splat_ids = raster.splat_ids.detach().cpu().numpy()
             small_ids = _shrink(splat_ids, roots).reshape(-1)[roots]
             small_ids = np.where(roots >= 0, small_ids, -1).astype(np.int32)
+            size = camera.width, camera.height
             spread_ids = cv2.resize(small_ids, size, interpolation=cv2.INTER_NEAREST)
             changes["splat_ids"] = torch.from_numpy(np.where(is_missing, spread_ids, splat_ids))
     device = raster.alpha.device
     return replace(raster, **{name: change.to(device) for name, change in changes.items()})
+
+
+def _as_array(buffer: Tensor) -> np.ndarray:
+    """Return the values of a buffer."""
+    return np.ascontiguousarray(buffer.detach().cpu().numpy())
 
 
 def opaque_share(alpha: np.ndarray) -> np.ndarray:
