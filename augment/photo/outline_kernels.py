@@ -159,17 +159,16 @@ def spread_roots(pixels, state, step_costs, max_cost, roots):
 
 
 @kernel
-def fill_surfaces(alpha, sky_share, overlay, is_complete, limits, out, is_missing):
-    """Write the alpha of what a photo shows, and the mask of surfaces that the scene lacks.
+def fill_surfaces(sky_share, overlay, is_complete, limits, alpha, is_missing):
+    """Replace alpha by that of what a photo shows, and mark the surfaces that the scene lacks.
 
     Args:
-        alpha: float32 [H, W], alpha of the scene.
         sky_share: float32 [H, W], share of sky in each pixel.
         overlay: float32 [H, W], share of snow in each pixel; [0, 0] without snow.
         is_complete: bool [H, W], pixels that the scene shows in full; [0, 0] for none.
         limits: float32 [3]; alphas that count as nothing and as everything, and the alpha below
             which the scene lacks a surface.
-        out: output float32 [H, W], alpha.
+        alpha: float32 [H, W], alpha of the scene, which is replaced.
         is_missing: output bool [H, W].
     """
     height, width = alpha.shape
@@ -187,31 +186,29 @@ def fill_surfaces(alpha, sky_share, overlay, is_complete, limits, out, is_missin
                 solid_share = (alpha[i, j] - limits[0]) / (limits[1] - limits[0])
                 solid_share = min(max(solid_share, zero), one_f32)
                 missing = False
-            out[i, j] = solid_share
+            alpha[i, j] = solid_share
             is_missing[i, j] = missing
 
 
 @kernel
-def fill_depth(depth, is_missing, small_depth, road_depth, out):
-    """Write depth with that of a smaller image where it is missing, no larger than the road's.
+def fill_missing(is_missing, small_values, road_depth, values):
+    """Replace values where they are missing by those of a smaller image, at most the road's depth.
 
     Args:
-        depth: float32 [H, W], metres.
         is_missing: bool [H, W].
-        small_depth: float32 [h, w], depth of missing pixels, metres.
-        road_depth: float32 [H, W], z of the road, metres; [0, 0] where it is unknown.
-        out: output float32 [H, W].
+        small_values: [h, w], values of missing pixels.
+        road_depth: float32 [H, W], z of the road, metres; [0, 0] for no largest value.
+        values: [H, W], which is written.
     """
-    height, width = depth.shape
-    small_height, small_width = small_depth.shape
+    height, width = values.shape
+    small_height, small_width = small_values.shape
     has_road = len(road_depth) > 0
     for i in prange(height):
         row = np.int64(i) * small_height // height
         for j in range(width):
-            if not is_missing[i, j]:
-                out[i, j] = depth[i, j]
-                continue
-            value = small_depth[row, np.int64(j) * small_width // width]
-            if has_road:
-                value = min(value, road_depth[i, j])
-            out[i, j] = value
+            if is_missing[i, j]:
+                value = small_values[row, np.int64(j) * small_width // width]
+                if has_road and road_depth[i, j] < value:
+                    values[i, j] = road_depth[i, j]
+                else:
+                    values[i, j] = value

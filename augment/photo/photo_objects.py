@@ -350,7 +350,6 @@ def _edges_of(
         camera: the camera of the photo.
         has_caps: if True, snow may lie on the objects.
     """
-    size = camera.width, camera.height
     photo_labels = np.zeros((camera.height, camera.width), np.uint8)
     labels_by_id = np.zeros(
         max(int(drawing.owners.max()), *(o.instance_id for o in objects)) + 1, np.uint8
@@ -363,15 +362,21 @@ def _edges_of(
     alpha = np.where(labels > 0, drawing.alpha, np.float32(0))
     # The background may show through pixels beside those that are drawn: one more is taken.
     hides = cv2.dilate((alpha > CLEAR_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
-    hides = cv2.resize(hides, size, interpolation=cv2.INTER_NEAREST) > 0
-    shows_background = hides & (photo_labels == 0)
+    window = _Window(objects, hides, camera)
+    window_labels = photo_labels[window.rows, window.columns]
+    window_background = window.nearest(hides).view(np.bool_) & (window_labels == 0)
     if has_caps:
-        shows_background &= ~_are_caps(objects, photo_labels, drawing.overlay, camera)
-    drawn_labels = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
-    is_solid = cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR) >= SOLID_ALPHA
-    lacks_object = (photo_labels > 0) & ~(is_solid & (drawn_labels == photo_labels))
-    targets = np.flatnonzero(lacks_object)
-    target_labels = photo_labels.reshape(-1)[targets]
+        is_snowy = window.linear(drawing.overlay) > 0.5
+        is_cap = is_snowy & _are_above(objects, photo_labels, camera)[window.rows, window.columns]
+        window_background &= ~is_cap
+    shows_background = np.zeros(photo_labels.shape, np.bool_)
+    shows_background[window.rows, window.columns] = window_background
+    is_solid = window.linear(alpha) >= SOLID_ALPHA
+    lacks_object = (window_labels > 0) & ~(is_solid & (window.nearest(labels) == window_labels))
+    target_rows, target_columns = np.nonzero(lacks_object)
+    target_labels = window_labels[target_rows, target_columns]
+    targets = (target_rows + window.rows.start) * camera.width
+    targets += target_columns + window.columns.start
     square = np.ones((3, 3), np.uint8)
     is_pure = (alpha >= SOLID_ALPHA) & (cv2.erode(labels, square) == cv2.dilate(labels, square))
     if is_bare is not None:
@@ -451,13 +456,10 @@ def _heights_at(
     return float(camera.centre[2]) + depth_m * (rise + z)
 
 
-def _are_caps(
-    objects: Sequence[_Object],
-    photo_labels: UInt8[np.ndarray, "H W"],
-    overlay: Float[np.ndarray, "h w"],
-    camera: Camera,
+def _are_above(
+    objects: Sequence[_Object], photo_labels: UInt8[np.ndarray, "H W"], camera: Camera
 ) -> Bool[np.ndarray, "H W"]:
-    """Return the mask of pixels above the objects of the photo that show snow on them."""
+    """Return the mask of pixels above the objects of the photo that snow on them may hide."""
     is_above = np.zeros(photo_labels.shape, bool)
     for label, drawn_object in enumerate(objects, 1):
         reach_px = min(
@@ -476,8 +478,51 @@ def _are_caps(
         column = np.ones((reach_px + 1, 1), np.uint8)
         # The anchor is the kernel's first row, so that a pixel sees the rows below it.
         is_above[rows, columns] |= cv2.dilate(window, column, anchor=(0, 0)) > 0
-    is_snowy = cv2.resize(overlay, (camera.width, camera.height)) > 0.5
-    return is_above & (photo_labels == 0) & is_snowy
+    return is_above
+
+
+class _Window:
+    """Rows and columns of the photo around objects, as splats and as polygons show them."""
+
+    def __init__(
+        self, objects: Sequence[_Object], hides: UInt8[np.ndarray, "h w"], camera: Camera
+    ) -> None:
+        self._small_size = hides.shape[::-1]
+        self._size = camera.width, camera.height
+        left, top, width, height = cv2.boundingRect(hides)
+        corners = [np.array([[left, top], [left + width, top + height]]) * self._scale]
+        corners += [polygon for o in objects for polygon in o.polygons]
+        points = np.concatenate(corners)
+        first = np.clip(np.floor(points.min(0)).astype(int) - 1, 0, None)
+        last = np.minimum(np.ceil(points.max(0)).astype(int) + 2, self._size)
+        self.columns = slice(int(first[0]), int(last[0]))
+        self.rows = slice(int(first[1]), int(last[1]))
+
+    @property
+    def _scale(self) -> np.ndarray:
+        """Return the size of the photo over that of the small copy, x and y."""
+        return np.array(self._size) / self._small_size
+
+    def nearest(self, image: np.ndarray) -> np.ndarray:
+        """Return the values of a small image at the window's pixels."""
+        rows = np.arange(self.rows.start, self.rows.stop) * self._small_size[1] // self._size[1]
+        columns = np.arange(self.columns.start, self.columns.stop)
+        return image[rows][:, columns * self._small_size[0] // self._size[0]]
+
+    def linear(self, image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "m n"]:
+        """Return the values of a small image at the window's pixels, between its own."""
+        small_from_window = np.zeros((2, 3))
+        small_from_window[[0, 1], [0, 1]] = 1 / self._scale
+        start = np.array([self.columns.start, self.rows.start])
+        small_from_window[:, 2] = (start + 0.5) / self._scale - 0.5
+        size = self.columns.stop - self.columns.start, self.rows.stop - self.rows.start
+        return cv2.warpAffine(
+            image,
+            small_from_window,
+            size,
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
 
 
 def _find_sources(

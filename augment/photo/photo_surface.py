@@ -23,7 +23,14 @@ from torch import Tensor
 
 from augment.photo import outline_kernels as kernels
 from augment.photo.photo_objects import copy_size, nearest_pixels
-from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH, RenderOutput
+from augment.render.buffers import (
+    ALPHA,
+    EXPECTED_DEPTH,
+    MEDIAN_DEPTH,
+    MODE_DEPTH,
+    SPLAT_IDS,
+    RenderOutput,
+)
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
@@ -48,6 +55,8 @@ MAX_SOURCE_SKY = 0.5
 STEP_COSTS = (1, 24, 8, 8)
 # Largest cost of a step, levels.
 MAX_STEP_COST = 96
+# An image without pixels, for a kernel's optional input.
+NO_NUMBERS = np.empty((0, 0), np.float32)
 # Image rows that a thread takes at a time.
 ROWS_PER_THREAD = 32
 # Estimators of depth among the buffers.
@@ -64,6 +73,8 @@ def complete_surfaces(
 ) -> RenderOutput:
     """Return the buffers with the surfaces that the photo shows.
 
+    On the CPU they are written in place.
+
     Args:
         raster: the buffers, with alpha and expected depth.
         sky_share: share of sky in each pixel of the photo.
@@ -75,46 +86,46 @@ def complete_surfaces(
             `opaque_alpha`; None for no pixels.
     """
     assert raster.alpha is not None and raster.expected_depth is not None
-    alpha = _as_array(raster.alpha)
-    depth = _as_array(raster.expected_depth)
-    solid_share = np.empty_like(alpha)
+    images = {
+        name: _writable_array(buffer)
+        for name in (ALPHA, SPLAT_IDS, *DEPTH_BUFFERS)
+        if (buffer := getattr(raster, name)) is not None
+    }
+    alpha = images[ALPHA]
+    roots = None
+    if alpha.min(initial=1) < MIN_SURFACE_ALPHA:
+        roots = _find_roots(alpha, sky_share, pixels, camera)
     is_missing = np.empty(alpha.shape, np.bool_)
     # Snow on a roof covers the sky behind it.
-    overlay = np.empty((0, 0), np.float32) if raster.overlay is None else _as_array(raster.overlay)
+    overlay = NO_NUMBERS if raster.overlay is None else raster.overlay.detach().cpu().numpy()
     complete_pixels = np.empty((0, 0), np.bool_) if is_complete is None else is_complete
     limits = np.array([CLEAR_ALPHA, OPAQUE_ALPHA, MIN_SURFACE_ALPHA], np.float32)
     with kernel_threads(ROWS_PER_THREAD):
-        kernels.fill_surfaces(
-            alpha, sky_share, overlay, complete_pixels, limits, solid_share, is_missing
-        )
-    changes: dict[str, Tensor] = {"alpha": torch.from_numpy(solid_share)}
-    if is_missing.any():
-        roots = _find_roots(alpha, sky_share, pixels, camera)
+        kernels.fill_surfaces(sky_share, overlay, complete_pixels, limits, alpha, is_missing)
+    if roots is not None:
+        depth = images[EXPECTED_DEPTH]
         small_depth = _shrink(depth, roots).reshape(-1)[roots]
         small_depth[roots < 0] = FAR_DEPTH_M
-        far_depth = np.empty((0, 0), np.float32) if road_depth is None else road_depth
+        largest_depth = NO_NUMBERS if road_depth is None else road_depth
         for name in DEPTH_BUFFERS:
-            buffer = getattr(raster, name)
-            if buffer is None:
-                continue
-            filled = np.empty_like(depth)
+            if name in images:
+                with kernel_threads(ROWS_PER_THREAD):
+                    kernels.fill_missing(is_missing, small_depth, largest_depth, images[name])
+        if SPLAT_IDS in images:
+            small_ids = _shrink(images[SPLAT_IDS], roots).reshape(-1)[roots]
+            small_ids[roots < 0] = -1
             with kernel_threads(ROWS_PER_THREAD):
-                kernels.fill_depth(_as_array(buffer), is_missing, small_depth, far_depth, filled)
-            changes[name] = torch.from_numpy(filled)
-        if raster.splat_ids is not None:
-            splat_ids = raster.splat_ids.detach().cpu().numpy()
-            small_ids = _shrink(splat_ids, roots).reshape(-1)[roots]
-            small_ids = np.where(roots >= 0, small_ids, -1).astype(np.int32)
-            size = camera.width, camera.height
-            spread_ids = cv2.resize(small_ids, size, interpolation=cv2.INTER_NEAREST)
-            changes["splat_ids"] = torch.from_numpy(np.where(is_missing, spread_ids, splat_ids))
+                kernels.fill_missing(is_missing, small_ids, NO_NUMBERS, images[SPLAT_IDS])
     device = raster.alpha.device
-    return replace(raster, **{name: change.to(device) for name, change in changes.items()})
+    buffers = {name: torch.from_numpy(image).to(device) for name, image in images.items()}
+    return replace(raster, **buffers)
 
 
-def _as_array(buffer: Tensor) -> np.ndarray:
-    """Return the values of a buffer."""
-    return np.ascontiguousarray(buffer.detach().cpu().numpy())
+def _writable_array(buffer: Tensor) -> np.ndarray:
+    """Return a buffer's own memory on the CPU, and a copy of others."""
+    if buffer.device.type == "cpu" and not buffer.requires_grad and buffer.is_contiguous():
+        return buffer.numpy()
+    return buffer.detach().cpu().numpy().copy()
 
 
 def opaque_share(alpha: np.ndarray) -> np.ndarray:
