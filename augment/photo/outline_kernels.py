@@ -191,24 +191,29 @@ def fill_surfaces(sky_share, overlay, is_complete, limits, alpha, is_missing):
 
 
 @kernel
-def fill_missing(is_missing, small_values, road_depth, values):
+def fill_missing(is_missing, small_values, u, v, road, values):
     """Replace values where they are missing by those of a smaller image, at most the road's depth.
 
     Args:
         is_missing: bool [H, W].
         small_values: [h, w], values of missing pixels.
-        road_depth: float32 [H, W], z of the road, metres; [0, 0] for no largest value.
+        u: float32 [W], image coordinates of the columns at unit depth.
+        v: float32 [H], image coordinates of the rows at unit depth.
+        road: float32 [5]; fall of the camera's axes (3), the camera's height above the road (m; 0
+            for no largest value), and the smallest fall of a ray that meets the road.
         values: [H, W], which is written.
     """
     height, width = values.shape
     small_height, small_width = small_values.shape
-    has_road = len(road_depth) > 0
+    has_road = road[3] > 0
     for i in prange(height):
         row = np.int64(i) * small_height // height
         for j in range(width):
-            if is_missing[i, j]:
-                value = small_values[row, np.int64(j) * small_width // width]
-                if has_road and road_depth[i, j] < value:
-                    values[i, j] = road_depth[i, j]
-                else:
-                    values[i, j] = value
+            if not is_missing[i, j]:
+                continue
+            value = small_values[row, np.int64(j) * small_width // width]
+            values[i, j] = value
+            if has_road:
+                fall = (road[0] * u[j] + road[2]) + road[1] * v[i]
+                if fall > road[4] and road[3] / fall < value:
+                    values[i, j] = road[3] / fall

@@ -18,7 +18,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 from torch import Tensor
 
 from augment.photo import outline_kernels as kernels
@@ -31,6 +31,7 @@ from augment.render.buffers import (
     SPLAT_IDS,
     RenderOutput,
 )
+from augment.render.composite import unit_depth_coordinates
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
@@ -55,6 +56,9 @@ MAX_SOURCE_SKY = 0.5
 STEP_COSTS = (1, 24, 8, 8)
 # Largest cost of a step, levels.
 MAX_STEP_COST = 96
+# Fall of a ray, metres a metre, from which it meets the road, not the sky, where nothing is
+# rendered.
+MIN_ROAD_FALL = 0.02
 # An image without pixels, for a kernel's optional input.
 NO_NUMBERS = np.empty((0, 0), np.float32)
 # Image rows that a thread takes at a time.
@@ -68,7 +72,7 @@ def complete_surfaces(
     sky_share: Float32[np.ndarray, "H W"],
     pixels: UInt8[np.ndarray, "H W 3"],
     camera: Camera,
-    road_depth: Float[np.ndarray, "H W"] | None = None,
+    road_height_m: float | None = None,
     is_complete: Bool[np.ndarray, "H W"] | None = None,
 ) -> RenderOutput:
     """Return the buffers with the surfaces that the photo shows.
@@ -80,8 +84,8 @@ def complete_surfaces(
         sky_share: share of sky in each pixel of the photo.
         pixels: the photo.
         camera: its camera.
-        road_depth: z of the road, metres, infinite where a ray does not meet it: nothing lies
-            beyond. None where the road is unknown.
+        road_height_m: height of the camera above the road, metres: nothing lies beyond the road.
+            None where it is unknown.
         is_complete: pixels that stay as they are, apart from the stretch of alpha by
             `opaque_alpha`; None for no pixels.
     """
@@ -106,16 +110,20 @@ def complete_surfaces(
         depth = images[EXPECTED_DEPTH]
         small_depth = _shrink(depth, roots).reshape(-1)[roots]
         small_depth[roots < 0] = FAR_DEPTH_M
-        largest_depth = NO_NUMBERS if road_depth is None else road_depth
+        coordinates = [np.asarray(c, np.float32) for c in unit_depth_coordinates(camera)]
+        fall = (-camera.world_from_camera[2, :3]).tolist()
+        road = np.array([*fall, road_height_m or 0, MIN_ROAD_FALL], np.float32)
         for name in DEPTH_BUFFERS:
             if name in images:
                 with kernel_threads(ROWS_PER_THREAD):
-                    kernels.fill_missing(is_missing, small_depth, largest_depth, images[name])
+                    kernels.fill_missing(is_missing, small_depth, *coordinates, road, images[name])
         if SPLAT_IDS in images:
             small_ids = _shrink(images[SPLAT_IDS], roots).reshape(-1)[roots]
             small_ids[roots < 0] = -1
             with kernel_threads(ROWS_PER_THREAD):
-                kernels.fill_missing(is_missing, small_ids, NO_NUMBERS, images[SPLAT_IDS])
+                kernels.fill_missing(
+                    is_missing, small_ids, *coordinates, np.zeros_like(road), images[SPLAT_IDS]
+                )
     device = raster.alpha.device
     buffers = {name: torch.from_numpy(image).to(device) for name, image in images.items()}
     return replace(raster, **buffers)

@@ -43,7 +43,7 @@ from augment.errors import SceneError
 from augment.files.recorded_images import ImageFault, has_image, read_scaled
 from augment.light.cast_shadows import FadedShadows
 from augment.memo import memo_of
-from augment.photo.photo_surface import CLEAR_ALPHA, OPAQUE_ALPHA, complete_surfaces
+from augment.photo.photo_surface import CLEAR_ALPHA, MIN_ROAD_FALL, OPAQUE_ALPHA, complete_surfaces
 from augment.photo.sky_matte import SkyMatte, sky_matte
 from augment.render import photo_kernels as kernels
 from augment.render.buffers import (
@@ -97,9 +97,6 @@ MIN_WEIGHT = 0.02
 SMOOTHING_RADIUS_PX2 = 1000.0
 # Colour difference that stops the smoothing (sigma of Min et al. 2014), of 255.
 COLOR_SIGMA = 5.0
-# Fall of a ray, metres a metre, from which it meets the road, not the sky, where nothing is
-# rendered.
-MIN_ROAD_FALL = 0.02
 # Largest condition number of a colour map that is undone: 8 bits come back exactly.
 MAX_CONDITION = 1e3
 # Largest height of a camera above the road, metres; more is a hill's.
@@ -713,7 +710,7 @@ class Photo:
             return raster
         is_complete = None if clip is None else self.ray_fall.cpu().numpy() > 0
         return complete_surfaces(
-            raster, self.matte.sky_share, self.pixels, self.camera, self._road_depth, is_complete
+            raster, self.matte.sky_share, self.pixels, self.camera, self.height_m, is_complete
         )
 
     def fade(
@@ -887,17 +884,6 @@ class Photo:
         with kernel_threads(ROWS_PER_THREAD):
             kernels.compute_transmittance(alpha.numpy(), depth.detach().numpy(), *arrays, out)
         return torch.from_numpy(out)
-
-    @cached_property
-    def _road_depth(self) -> Float[np.ndarray, "H W"] | None:
-        """Return z of the road in each pixel, metres, infinite where no ray falls to it."""
-        if self.height_m is None:
-            return None
-        ray_fall = self.ray_fall.cpu().numpy()
-        with np.errstate(divide="ignore"):
-            depth = np.float32(self.height_m) / ray_fall
-        np.putmask(depth, ray_fall <= MIN_ROAD_FALL, np.float32(math.inf))
-        return depth
 
     @cached_property
     def ray_fall(self) -> Float[Tensor, "H W"]:
