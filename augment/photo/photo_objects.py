@@ -104,9 +104,9 @@ class ObjectEdges:
             parts: the parts.
         """
         rows, columns = np.nonzero(self.shows_background[self.window])
-        hidden = (rows + self.window[0].start) * self.shows_background.shape[1]
-        hidden += columns + self.window[1].start
-        hidden_in_window = rows * (self.window[1].stop - self.window[1].start) + columns
+        background_pixels = (rows + self.window[0].start) * self.shows_background.shape[1]
+        background_pixels += columns + self.window[1].start
+        window_pixels = rows * (self.window[1].stop - self.window[1].start) + columns
         moved_buffers = dict[str, Tensor]()
         for name in BUFFERS:
             buffer = getattr(raster, name)
@@ -114,16 +114,16 @@ class ObjectEdges:
                 continue
             hidden_values = getattr(background, name).flatten(0, 1)
             if buffer.device.type == "cpu" and not buffer.requires_grad:
-                values = hidden_values.numpy()[hidden_in_window]
+                values = hidden_values.numpy()[window_pixels]
                 if name == SPLAT_IDS:
                     values = self._count_through(torch.from_numpy(values), parts).numpy()
                 flat_image = buffer.numpy().reshape(-1, *buffer.shape[2:])
-                flat_image[hidden] = values
+                flat_image[background_pixels] = values
                 flat_image[self.targets] = flat_image[self.sources]
                 continue
             from_window, to_pixels, targets, sources = (
                 torch.from_numpy(numbers).to(buffer.device)
-                for numbers in (hidden_in_window, hidden, self.targets, self.sources)
+                for numbers in (window_pixels, background_pixels, self.targets, self.sources)
             )
             values = hidden_values[from_window]
             if name == SPLAT_IDS:

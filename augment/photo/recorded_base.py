@@ -738,8 +738,8 @@ class Photo:
         pixels = torch.from_numpy(self._mixed_pixels).to(alpha.device)
         mixed_alpha = alpha.flatten()[pixels]
         sky_weight = (mixed_alpha == 0).to(alpha)
-        one = torch.ones((), device=alpha.device)
-        fog_share = torch.addcmul(one, alpha, surface_transmittance, value=-1)
+        full_share = torch.ones((), device=alpha.device)
+        fog_share = torch.addcmul(full_share, alpha, surface_transmittance, value=-1)
         if isinstance(sky_transmittance, Tensor):
             sky_part = (1 - alpha) * sky_transmittance
             fog_share = fog_share - sky_part

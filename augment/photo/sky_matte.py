@@ -274,8 +274,16 @@ def _refine(rgb: np.ndarray, kinds: np.ndarray) -> SkyMatte:
             continue
         part_share = np.zeros(full_kinds[part].shape, np.float32)
         part_surface = rgb[part].copy()
-        images = (image[part].copy() for image in (rgb, full_kinds, sky_rgb, noise, is_bright))
-        _share_of_sky(*images, part_share, part_surface, width / 1920)
+        _share_of_sky(
+            rgb[part].copy(),
+            full_kinds[part].copy(),
+            sky_rgb[part].copy(),
+            noise[part].copy(),
+            is_bright[part].copy(),
+            part_share,
+            part_surface,
+            width / 1920,
+        )
         inner = (
             slice(top - first[0], end[0] - first[0]),
             slice(left - first[1], end[1] - first[1]),
