@@ -1,13 +1,14 @@
 """Numba kernels of surfaces on a photo: the best outline of an object, and depth that spreads.
 
-`augment.photo.outlines` and `augment.photo.photo_depth` call them, and say what the arrays mean.
+`augment.photo.outlines` and `augment.photo.photo_surface` call them, and say what the arrays mean.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numba import prange
 
-from augment.render.cpu.jit import serial_kernel
+from augment.render.cpu.jit import kernel, serial_kernel
 
 
 @serial_kernel
@@ -155,3 +156,64 @@ def spread_roots(pixels, state, step_costs, max_cost, roots):
             last_entries[bucket] = num_entries
             num_entries += 1
             num_waiting += 1
+
+
+@kernel
+def fill_surfaces(sky_share, overlay, is_complete, limits, alpha, is_missing):
+    """Replace alpha by that of what a photo shows, and mark the surfaces that the scene lacks.
+
+    Args:
+        sky_share: float32 [H, W], share of sky in each pixel.
+        overlay: float32 [H, W], share of snow in each pixel; [0, 0] without snow.
+        is_complete: bool [H, W], pixels that the scene shows in full; [0, 0] for none.
+        limits: float32 [3]; alphas that count as nothing and as everything, and the alpha below
+            which the scene lacks a surface.
+        alpha: float32 [H, W], alpha of the scene, which is replaced.
+        is_missing: output bool [H, W].
+    """
+    height, width = alpha.shape
+    zero = np.float32(0)
+    one_f32 = np.float32(1)
+    has_overlay = len(overlay) > 0
+    has_complete = len(is_complete) > 0
+    for i in prange(height):
+        for j in range(width):
+            solid_share = one_f32 - sky_share[i, j]
+            if has_overlay:
+                solid_share = max(solid_share, overlay[i, j])
+            missing = alpha[i, j] < limits[2]
+            if has_complete and is_complete[i, j]:
+                solid_share = (alpha[i, j] - limits[0]) / (limits[1] - limits[0])
+                solid_share = min(max(solid_share, zero), one_f32)
+                missing = False
+            alpha[i, j] = solid_share
+            is_missing[i, j] = missing
+
+
+@kernel
+def fill_missing(is_missing, small_values, u, v, road, values):
+    """Replace values where they are missing by those of a smaller image, at most the road's depth.
+
+    Args:
+        is_missing: bool [H, W].
+        small_values: [h, w], values of missing pixels.
+        u: float32 [W], image coordinates of the columns at unit depth.
+        v: float32 [H], image coordinates of the rows at unit depth.
+        road: float32 [5]; fall of the camera's axes (3), the camera's height above the road (m; 0
+            for no largest value), and the smallest fall of a ray that meets the road.
+        values: [H, W], which is written.
+    """
+    height, width = values.shape
+    small_height, small_width = small_values.shape
+    has_road = road[3] > 0
+    for i in prange(height):
+        row = np.int64(i) * small_height // height
+        for j in range(width):
+            if not is_missing[i, j]:
+                continue
+            value = small_values[row, np.int64(j) * small_width // width]
+            values[i, j] = value
+            if has_road:
+                fall = (road[0] * u[j] + road[2]) + road[1] * v[i]
+                if fall > road[4] and road[3] / fall < value:
+                    values[i, j] = road[3] / fall

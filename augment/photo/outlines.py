@@ -203,44 +203,61 @@ def score_offsets(
     outer_px = max(2, round(OUTER_REACH * reach_px))
     side_px = int(np.clip(SIDE_WIDTH * reach_px, *SIDE_LIMITS_PX))
     sampled = np.arange(-inner_px - side_px, outer_px + side_px + BACKGROUND_PX + 1)
-    places = (points[:, None] + normals[:, None] * sampled[:, None]).astype(np.float32)
+    places = (points + normals * sampled[:, None, None]).astype(np.float32)  # [M, N, 2]
     samples = cv2.remap(
         pixels,
         np.ascontiguousarray(places[..., 0]),
         np.ascontiguousarray(places[..., 1]),
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
-    ).astype(np.float32)
-    sums = np.zeros((len(points), len(sampled) + 1, 3), np.float32)
-    np.cumsum(samples, 1, out=sums[:, 1:])
-    # Samples before `ends[k]` lie inside the k-th offset.
-    ends = side_px + np.arange(inner_px + outer_px + 1)
-    inside = (sums[:, ends] - sums[:, ends - side_px]) / side_px
-    outside = (sums[:, ends + side_px] - sums[:, ends]) / side_px
-    edges = np.minimum(np.abs(inside - outside).max(2), MAX_EDGE_LEVELS)
+    )
+    # Channels first, then samples: sums along the normals then run over whole rows.
+    planes = np.ascontiguousarray(np.moveaxis(samples, 2, 0), np.float32)  # [3, M, N]
+    sums = np.zeros((3, len(sampled) + 1, len(points)), np.float32)
+    np.cumsum(planes, 1, out=sums[:, 1:])
+    # Samples before the k-th end lie inside the k-th offset.
+    count = inner_px + outer_px + 1
+    ends = slice(side_px, side_px + count)
+    after = sums[:, 2 * side_px : 2 * side_px + count]
+    # Twice the sums at the ends, less those on both sides: the mean inside less that outside.
+    difference = 2 * sums[:, ends]
+    difference -= sums[:, :count]
+    difference -= after
+    edges = np.minimum(np.abs(difference, out=difference).max(0) / side_px, MAX_EDGE_LEVELS)
     # The edge lies half a pixel before the first sample outside, and OpenCV paints half a pixel
     # beyond the border of a polygon.
     offsets = sampled[ends] - 1.0
-    regions = _score_regions(samples, ends, outer_px)
+    regions = _score_regions(planes, ends, outer_px)
     prior = PRIOR_LEVELS * (offsets / reach_px + USUAL_OFFSET) ** 2
-    return offsets, (edges + REGION_LEVELS / reach_px * regions - prior).astype(np.float32)
+    gains = edges + np.float32(REGION_LEVELS / reach_px) * regions
+    gains -= prior[:, None].astype(np.float32)
+    return offsets, np.ascontiguousarray(gains.T, np.float32)
 
 
 def _score_regions(
-    samples: Float[np.ndarray, "N M 3"], ends: np.ndarray, outer_px: int
-) -> Float[np.ndarray, "N K"]:
-    """Return how well each offset parts pixels unlike the background from pixels like it."""
-    background = _smooth(samples[:, -BACKGROUND_PX:].mean(1), BACKGROUND_POINTS)
-    unlike = np.abs(samples - background[:, None].astype(np.float32)).max(2) / UNLIKE_LEVELS
-    unlike = np.minimum(unlike, MAX_UNLIKE) - UNLIKE_THRESHOLD
-    sums = unlike.cumsum(1)
-    scores = 2 * sums[:, ends - 1] - sums[:, ends[-1:]]
-    scores -= scores.mean(1, keepdims=True)
-    brightness = samples[:, ends[-1] - outer_px :].mean(2)
+    planes: Float[np.ndarray, "3 M N"], ends: slice, outer_px: int
+) -> Float[np.ndarray, "K N"]:
+    """Return how well each offset parts pixels unlike the background from pixels like it.
+
+    Args:
+        planes: colours of the samples along the normals, 0 to 255.
+        ends: number of samples inside each offset.
+        outer_px: reach outside the silhouette, pixels.
+    """
+    background = _smooth(planes[:, -BACKGROUND_PX:].mean(1).T, BACKGROUND_POINTS)
+    difference = planes - np.ascontiguousarray(background.T, np.float32)[:, None]
+    unlike = np.abs(difference, out=difference).max(0) / np.float32(UNLIKE_LEVELS)
+    np.minimum(unlike, np.float32(MAX_UNLIKE), out=unlike)
+    unlike -= np.float32(UNLIKE_THRESHOLD)
+    sums = unlike.cumsum(0)
+    inside = sums[ends.start - 1 : ends.stop - 1]
+    scores = 2 * inside - sums[ends.stop - 1]
+    scores -= scores.mean(0)
+    brightness = planes[:, ends.stop - 1 - outer_px :].mean(0)
     count = 2 * BACKGROUND_POINTS - 3
-    mean = _smooth(brightness.mean(1), count)
-    variance = np.maximum(_smooth((brightness**2).mean(1), count) - mean**2, 0)
-    return scores / (1 + variance / PLAIN_LEVELS**2)[:, None]
+    mean = _smooth(brightness.mean(0), count)
+    variance = np.maximum(_smooth((brightness**2).mean(0), count) - mean**2, 0)
+    return scores / (1 + variance / PLAIN_LEVELS**2).astype(np.float32)
 
 
 def fill_polygons(

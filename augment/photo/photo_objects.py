@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -70,6 +71,23 @@ class ObjectEdges:
     sources: Int64[np.ndarray, " M"]
     """Flat indices of the nearest pixels of the same objects."""
 
+    @cached_property
+    def window(self) -> tuple[slice, slice]:
+        """Return the rows and columns around the pixels that show the background."""
+        left, top, width, height = cv2.boundingRect(self.shows_background.view(np.uint8))
+        return slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
+
+    def window_of(self, camera: Camera) -> Camera:
+        """Return the view through the window.
+
+        Args:
+            camera: the camera of the photo.
+        """
+        rows, columns = self.window
+        return camera.cropped(
+            columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start
+        )
+
     def background_of(self, parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
         """Return the parts without the objects and what lies on them."""
         return tuple(part for part in parts if part.instance_id not in self.instance_ids)
@@ -81,36 +99,47 @@ class ObjectEdges:
 
         Args:
             raster: buffers of the parts.
-            background: the same buffers of `background_of(parts)`; only the pixels of
-                `shows_background` are read.
+            background: the same buffers of `background_of(parts)` in the window; only the pixels
+                of `shows_background` are read.
             parts: the parts.
         """
+        rows, columns = np.nonzero(self.shows_background[self.window])
+        background_pixels = (rows + self.window[0].start) * self.shows_background.shape[1]
+        background_pixels += columns + self.window[1].start
+        window_pixels = rows * (self.window[1].stop - self.window[1].start) + columns
         moved_buffers = dict[str, Tensor]()
         for name in BUFFERS:
             buffer = getattr(raster, name)
             if buffer is None:
                 continue
-            hidden_values = getattr(background, name)
-            if name == SPLAT_IDS:
-                hidden_values = self._count_through(hidden_values, parts)
+            hidden_values = getattr(background, name).flatten(0, 1)
             if buffer.device.type == "cpu" and not buffer.requires_grad:
-                image = buffer.numpy()
-                image[self.shows_background] = hidden_values.numpy()[self.shows_background]
-                flat_image = image.reshape(-1, *image.shape[2:])
+                values = hidden_values.numpy()[window_pixels]
+                if name == SPLAT_IDS:
+                    values = self._count_through(torch.from_numpy(values), parts).numpy()
+                flat_image = buffer.numpy().reshape(-1, *buffer.shape[2:])
+                flat_image[background_pixels] = values
                 flat_image[self.targets] = flat_image[self.sources]
                 continue
-            mask, targets, sources = (
-                torch.from_numpy(indices).to(buffer.device)
-                for indices in (self.shows_background, self.targets, self.sources)
+            from_window, to_pixels, targets, sources = (
+                torch.from_numpy(numbers).to(buffer.device)
+                for numbers in (window_pixels, background_pixels, self.targets, self.sources)
             )
-            mask = mask if buffer.ndim == 2 else mask[..., None]
-            flat_buffer = torch.where(mask, hidden_values, buffer).flatten(0, 1)
+            values = hidden_values[from_window]
+            if name == SPLAT_IDS:
+                values = self._count_through(values, parts)
+            flat_buffer = buffer.flatten(0, 1).index_copy(0, to_pixels, values)
             moved = flat_buffer.index_copy(0, targets, flat_buffer[sources])
             moved_buffers[name] = moved.view_as(buffer)
         return replace(raster, **moved_buffers) if moved_buffers else raster
 
     def _count_through(self, splat_ids: Tensor, parts: Sequence[PosedGaussians]) -> Tensor:
-        """Return indices of splats of the background as indices through all parts."""
+        """Return indices of splats of the background as indices through all parts.
+
+        Args:
+            splat_ids: indices among the splats of `background_of(parts)`; -1 for none.
+            parts: the parts.
+        """
         counts = [len(part.gaussians) for part in parts]
         starts = np.cumsum([0, *counts[:-1]])
         is_kept = [part.instance_id not in self.instance_ids for part in parts]
@@ -321,7 +350,6 @@ def _edges_of(
         camera: the camera of the photo.
         has_caps: if True, snow may lie on the objects.
     """
-    size = camera.width, camera.height
     photo_labels = np.zeros((camera.height, camera.width), np.uint8)
     labels_by_id = np.zeros(
         max(int(drawing.owners.max()), *(o.instance_id for o in objects)) + 1, np.uint8
@@ -334,15 +362,21 @@ def _edges_of(
     alpha = np.where(labels > 0, drawing.alpha, np.float32(0))
     # The background may show through pixels beside those that are drawn: one more is taken.
     hides = cv2.dilate((alpha > CLEAR_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
-    hides = cv2.resize(hides, size, interpolation=cv2.INTER_NEAREST) > 0
-    shows_background = hides & (photo_labels == 0)
+    window = _Window(objects, hides, camera)
+    window_labels = photo_labels[window.rows, window.columns]
+    window_background = window.nearest(hides).view(np.bool_) & (window_labels == 0)
     if has_caps:
-        shows_background &= ~_are_caps(objects, photo_labels, drawing.overlay, camera)
-    drawn_labels = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
-    is_solid = cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR) >= SOLID_ALPHA
-    lacks_object = (photo_labels > 0) & ~(is_solid & (drawn_labels == photo_labels))
-    targets = np.flatnonzero(lacks_object)
-    target_labels = photo_labels.reshape(-1)[targets]
+        is_snowy = window.linear(drawing.overlay) > 0.5
+        is_cap = is_snowy & _are_above(objects, photo_labels, camera)[window.rows, window.columns]
+        window_background &= ~is_cap
+    shows_background = np.zeros(photo_labels.shape, np.bool_)
+    shows_background[window.rows, window.columns] = window_background
+    is_solid = window.linear(alpha) >= SOLID_ALPHA
+    lacks_object = (window_labels > 0) & ~(is_solid & (window.nearest(labels) == window_labels))
+    target_rows, target_columns = np.nonzero(lacks_object)
+    target_labels = window_labels[target_rows, target_columns]
+    targets = (target_rows + window.rows.start) * camera.width
+    targets += target_columns + window.columns.start
     square = np.ones((3, 3), np.uint8)
     is_pure = (alpha >= SOLID_ALPHA) & (cv2.erode(labels, square) == cv2.dilate(labels, square))
     if is_bare is not None:
@@ -422,13 +456,10 @@ def _heights_at(
     return float(camera.centre[2]) + depth_m * (rise + z)
 
 
-def _are_caps(
-    objects: Sequence[_Object],
-    photo_labels: UInt8[np.ndarray, "H W"],
-    overlay: Float[np.ndarray, "h w"],
-    camera: Camera,
+def _are_above(
+    objects: Sequence[_Object], photo_labels: UInt8[np.ndarray, "H W"], camera: Camera
 ) -> Bool[np.ndarray, "H W"]:
-    """Return the mask of pixels above the objects of the photo that show snow on them."""
+    """Return the mask of pixels above the objects of the photo that snow on them may hide."""
     is_above = np.zeros(photo_labels.shape, bool)
     for label, drawn_object in enumerate(objects, 1):
         reach_px = min(
@@ -447,8 +478,51 @@ def _are_caps(
         column = np.ones((reach_px + 1, 1), np.uint8)
         # The anchor is the kernel's first row, so that a pixel sees the rows below it.
         is_above[rows, columns] |= cv2.dilate(window, column, anchor=(0, 0)) > 0
-    is_snowy = cv2.resize(overlay, (camera.width, camera.height)) > 0.5
-    return is_above & (photo_labels == 0) & is_snowy
+    return is_above
+
+
+class _Window:
+    """Rows and columns of the photo around objects, as splats and as polygons show them."""
+
+    def __init__(
+        self, objects: Sequence[_Object], hides: UInt8[np.ndarray, "h w"], camera: Camera
+    ) -> None:
+        self._small_size = hides.shape[::-1]
+        self._size = camera.width, camera.height
+        left, top, width, height = cv2.boundingRect(hides)
+        corners = [np.array([[left, top], [left + width, top + height]]) * self._scale]
+        corners += [polygon for o in objects for polygon in o.polygons]
+        points = np.concatenate(corners)
+        first = np.clip(np.floor(points.min(0)).astype(int) - 1, 0, None)
+        last = np.minimum(np.ceil(points.max(0)).astype(int) + 2, self._size)
+        self.columns = slice(int(first[0]), int(last[0]))
+        self.rows = slice(int(first[1]), int(last[1]))
+
+    @property
+    def _scale(self) -> np.ndarray:
+        """Return the size of the photo over that of the small copy, x and y."""
+        return np.array(self._size) / self._small_size
+
+    def nearest(self, image: np.ndarray) -> np.ndarray:
+        """Return the values of a small image at the window's pixels."""
+        rows = np.arange(self.rows.start, self.rows.stop) * self._small_size[1] // self._size[1]
+        columns = np.arange(self.columns.start, self.columns.stop)
+        return image[rows][:, columns * self._small_size[0] // self._size[0]]
+
+    def linear(self, image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "m n"]:
+        """Return the values of a small image at the window's pixels, between its own."""
+        small_from_window = np.zeros((2, 3))
+        small_from_window[[0, 1], [0, 1]] = 1 / self._scale
+        start = np.array([self.columns.start, self.rows.start])
+        small_from_window[:, 2] = (start + 0.5) / self._scale - 0.5
+        size = self.columns.stop - self.columns.start, self.rows.stop - self.rows.start
+        return cv2.warpAffine(
+            image,
+            small_from_window,
+            size,
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
 
 
 def _find_sources(

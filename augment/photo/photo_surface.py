@@ -18,12 +18,21 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 from torch import Tensor
 
 from augment.photo import outline_kernels as kernels
 from augment.photo.photo_objects import copy_size, nearest_pixels
-from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH, RenderOutput
+from augment.render.buffers import (
+    ALPHA,
+    EXPECTED_DEPTH,
+    MEDIAN_DEPTH,
+    MODE_DEPTH,
+    SPLAT_IDS,
+    RenderOutput,
+)
+from augment.render.composite import unit_depth_coordinates
+from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
 # Alpha of reconstructed surfaces up to which a pixel counts as empty. What a photo shows is opaque,
@@ -47,6 +56,13 @@ MAX_SOURCE_SKY = 0.5
 STEP_COSTS = (1, 24, 8, 8)
 # Largest cost of a step, levels.
 MAX_STEP_COST = 96
+# Fall of a ray, metres a metre, from which it meets the road, not the sky, where nothing is
+# rendered.
+MIN_ROAD_FALL = 0.02
+# An image without pixels, for a kernel's optional input.
+NO_NUMBERS = np.empty((0, 0), np.float32)
+# Image rows that a thread takes at a time.
+ROWS_PER_THREAD = 32
 # Estimators of depth among the buffers.
 DEPTH_BUFFERS = (EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH)
 
@@ -56,53 +72,68 @@ def complete_surfaces(
     sky_share: Float32[np.ndarray, "H W"],
     pixels: UInt8[np.ndarray, "H W 3"],
     camera: Camera,
-    road_depth: Float[np.ndarray, "H W"] | None = None,
+    road_height_m: float | None = None,
     is_complete: Bool[np.ndarray, "H W"] | None = None,
 ) -> RenderOutput:
     """Return the buffers with the surfaces that the photo shows.
+
+    On the CPU they are written in place.
 
     Args:
         raster: the buffers, with alpha and expected depth.
         sky_share: share of sky in each pixel of the photo.
         pixels: the photo.
         camera: its camera.
-        road_depth: z of the road, metres, infinite where a ray does not meet it: nothing lies
-            beyond. None where the road is unknown.
+        road_height_m: height of the camera above the road, metres: nothing lies beyond the road.
+            None where it is unknown.
         is_complete: pixels that stay as they are, apart from the stretch of alpha by
             `opaque_alpha`; None for no pixels.
     """
     assert raster.alpha is not None and raster.expected_depth is not None
-    alpha = raster.alpha.detach().cpu().numpy()
-    depth = raster.expected_depth.detach().cpu().numpy()
-    solid_share = 1 - sky_share
-    if raster.overlay is not None:  # snow on a roof covers the sky behind it
-        np.maximum(solid_share, raster.overlay.detach().cpu().numpy(), out=solid_share)
-    is_missing = alpha < MIN_SURFACE_ALPHA
-    if is_complete is not None:
-        solid_share = np.where(is_complete, opaque_share(alpha), solid_share)
-        is_missing &= ~is_complete
-    changes: dict[str, Tensor] = {"alpha": torch.from_numpy(solid_share)}
-    if is_missing.any():
+    images = {
+        name: _writable_array(buffer)
+        for name in (ALPHA, SPLAT_IDS, *DEPTH_BUFFERS)
+        if (buffer := getattr(raster, name)) is not None
+    }
+    alpha = images[ALPHA]
+    roots = None
+    if alpha.min(initial=1) < MIN_SURFACE_ALPHA:
         roots = _find_roots(alpha, sky_share, pixels, camera)
-        size = camera.width, camera.height
-        small_depth = _shrink(depth, roots)
-        filled = np.where(roots >= 0, small_depth.reshape(-1)[roots], np.float32(FAR_DEPTH_M))
-        filled = cv2.resize(filled.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
-        if road_depth is not None:
-            np.minimum(filled, road_depth, out=filled)
+    is_missing = np.empty(alpha.shape, np.bool_)
+    # Snow on a roof covers the sky behind it.
+    overlay = NO_NUMBERS if raster.overlay is None else raster.overlay.detach().cpu().numpy()
+    complete_pixels = np.empty((0, 0), np.bool_) if is_complete is None else is_complete
+    limits = np.array([CLEAR_ALPHA, OPAQUE_ALPHA, MIN_SURFACE_ALPHA], np.float32)
+    with kernel_threads(ROWS_PER_THREAD):
+        kernels.fill_surfaces(sky_share, overlay, complete_pixels, limits, alpha, is_missing)
+    if roots is not None:
+        depth = images[EXPECTED_DEPTH]
+        small_depth = _shrink(depth, roots).reshape(-1)[roots]
+        small_depth[roots < 0] = FAR_DEPTH_M
+        coordinates = [np.asarray(c, np.float32) for c in unit_depth_coordinates(camera)]
+        fall = (-camera.world_from_camera[2, :3]).tolist()
+        road = np.array([*fall, road_height_m or 0, MIN_ROAD_FALL], np.float32)
         for name in DEPTH_BUFFERS:
-            buffer = getattr(raster, name)
-            if buffer is not None:
-                values = buffer.detach().cpu().numpy()
-                changes[name] = torch.from_numpy(np.where(is_missing, filled, values))
-        if raster.splat_ids is not None:
-            splat_ids = raster.splat_ids.detach().cpu().numpy()
-            small_ids = _shrink(splat_ids, roots).reshape(-1)[roots]
-            small_ids = np.where(roots >= 0, small_ids, -1).astype(np.int32)
-            spread_ids = cv2.resize(small_ids, size, interpolation=cv2.INTER_NEAREST)
-            changes["splat_ids"] = torch.from_numpy(np.where(is_missing, spread_ids, splat_ids))
+            if name in images:
+                with kernel_threads(ROWS_PER_THREAD):
+                    kernels.fill_missing(is_missing, small_depth, *coordinates, road, images[name])
+        if SPLAT_IDS in images:
+            small_ids = _shrink(images[SPLAT_IDS], roots).reshape(-1)[roots]
+            small_ids[roots < 0] = -1
+            with kernel_threads(ROWS_PER_THREAD):
+                kernels.fill_missing(
+                    is_missing, small_ids, *coordinates, np.zeros_like(road), images[SPLAT_IDS]
+                )
     device = raster.alpha.device
-    return replace(raster, **{name: change.to(device) for name, change in changes.items()})
+    buffers = {name: torch.from_numpy(image).to(device) for name, image in images.items()}
+    return replace(raster, **buffers)
+
+
+def _writable_array(buffer: Tensor) -> np.ndarray:
+    """Return a buffer's own memory on the CPU, and a copy of others."""
+    if buffer.device.type == "cpu" and not buffer.requires_grad and buffer.is_contiguous():
+        return buffer.numpy()
+    return buffer.detach().cpu().numpy().copy()
 
 
 def opaque_share(alpha: np.ndarray) -> np.ndarray:

@@ -43,7 +43,7 @@ from augment.errors import SceneError
 from augment.files.recorded_images import ImageFault, has_image, read_scaled
 from augment.light.cast_shadows import FadedShadows
 from augment.memo import memo_of
-from augment.photo.photo_surface import CLEAR_ALPHA, OPAQUE_ALPHA, complete_surfaces
+from augment.photo.photo_surface import CLEAR_ALPHA, MIN_ROAD_FALL, OPAQUE_ALPHA, complete_surfaces
 from augment.photo.sky_matte import SkyMatte, sky_matte
 from augment.render import photo_kernels as kernels
 from augment.render.buffers import (
@@ -97,9 +97,6 @@ MIN_WEIGHT = 0.02
 SMOOTHING_RADIUS_PX2 = 1000.0
 # Colour difference that stops the smoothing (sigma of Min et al. 2014), of 255.
 COLOR_SIGMA = 5.0
-# Fall of a ray, metres a metre, from which it meets the road, not the sky, where nothing is
-# rendered.
-MIN_ROAD_FALL = 0.02
 # Largest condition number of a colour map that is undone: 8 bits come back exactly.
 MAX_CONDITION = 1e3
 # Largest height of a camera above the road, metres; more is a hill's.
@@ -342,15 +339,15 @@ class Photo:
         self,
         raster: RenderOutput,
         parts: Sequence[PosedGaussians],
-        sky_weight: Float[Tensor, "H W"] | None = None,
+        sky_weight: Float[Tensor, " M"] | None = None,
     ) -> Float[Tensor, "H W 3"]:
         """Return the photo with what lies on the scene, before any smog.
 
         Args:
             raster: buffers of the parts that `prepare_parts` gives.
             parts: those parts.
-            sky_weight: weight of the sky's colour in each pixel, against the surface's; None for
-                the share that the photo shows.
+            sky_weight: weight of the sky's colour in each mixed pixel, against the surface's; None
+                for the share that the photo shows.
         """
         rgb = self._land if self.style is None else self._styled(self.style, raster, parts)
         if self.matte is not None and (sky_weight is not None or self.style is not None):
@@ -605,20 +602,22 @@ class Photo:
         return image.flatten(0, 1).index_copy(0, pixels, colors.to(image)).view_as(image)
 
     def _mix_parted(
-        self, rgb: Float[Tensor, "H W 3"], sky_weight: Float[Tensor, "H W"] | None
+        self, rgb: Float[Tensor, "H W 3"], sky_weight: Float[Tensor, " M"] | None
     ) -> Float[Tensor, "H W 3"]:
         """Return a picture whose mixed pixels weigh the colours of sky and surface anew."""
         assert self.matte is not None
-        pixels = self._mixed_pixels
-        if not len(pixels):
+        if not len(self._mixed_pixels):
             return rgb
         if sky_weight is None:
-            sky_weight = torch.from_numpy(self.matte.sky_share)
-        flat_weight = sky_weight.flatten()
-        weight = flat_weight[torch.from_numpy(pixels).to(flat_weight.device), None]
+            share = self.matte.sky_share.reshape(-1)[self._mixed_pixels]
+            sky_weight = torch.from_numpy(share)
+        return self._with_mixed(rgb, self._weigh_mixed(sky_weight))
+
+    def _weigh_mixed(self, sky_weight: Float[Tensor, " M"]) -> Float[Tensor, "M 3"]:
+        """Return the colours of mixed pixels by the weight of their sky."""
         surface_rgb, sky_rgb = self._mixed_colors
-        weight = weight.to(surface_rgb)
-        return self._with_mixed(rgb, (1 - weight) * surface_rgb + weight * sky_rgb)
+        weight = sky_weight.to(surface_rgb)[:, None]
+        return (1 - weight) * surface_rgb + weight * sky_rgb
 
     def surface_part(
         self, rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"], fog: Fog | None
@@ -650,7 +649,8 @@ class Photo:
             sky = airlight + transmittance * (sky - airlight)
         mixed_rgb = rgb.flatten(0, 1)[pixels]
         sky_part = torch.minimum((share * sky).clamp_min(0), mixed_rgb)
-        return self._with_mixed(surface_part, mixed_rgb - sky_part)
+        surface_part.flatten(0, 1).index_copy_(0, pixels, mixed_rgb - sky_part)
+        return surface_part
 
     def _in_colors(self, style_map: Float[Tensor, "3 4"] | None) -> Float[Tensor, "H W 3"]:
         """Return the photo in the scene's colours, or in a style's map of them, which ends at 0."""
@@ -710,7 +710,7 @@ class Photo:
             return raster
         is_complete = None if clip is None else self.ray_fall.cpu().numpy() > 0
         return complete_surfaces(
-            raster, self.matte.sky_share, self.pixels, self.camera, self._road_depth, is_complete
+            raster, self.matte.sky_share, self.pixels, self.camera, self.height_m, is_complete
         )
 
     def fade(
@@ -730,18 +730,33 @@ class Photo:
             fog_share = 1 - self.transmittance(raster, fog)
             return mix(rgb, self.airlight(fog), fog_share), fog_share
         alpha = raster.alpha
-        assert alpha is not None
-        opaque = replace(raster, alpha=torch.ones_like(alpha))
-        transmittance = alpha * self.transmittance(opaque, fog)
+        depth = raster.expected_depth
+        assert alpha is not None and depth is not None
+        surface_transmittance = self._transmittance_of(torch.ones_like(alpha), depth, fog)
         sky_transmittance = self._sky_transmittance(fog)
-        sky_weight = (alpha == 0).to(alpha)
+        # The weight of the sky counts in mixed pixels alone.
+        pixels = torch.from_numpy(self._mixed_pixels).to(alpha.device)
+        mixed_alpha = alpha.flatten()[pixels]
+        sky_weight = (mixed_alpha == 0).to(alpha)
+        full_share = torch.ones((), device=alpha.device)
+        fog_share = torch.addcmul(full_share, alpha, surface_transmittance, value=-1)
         if isinstance(sky_transmittance, Tensor):
             sky_part = (1 - alpha) * sky_transmittance
-            transmittance = transmittance + sky_part
-            sky_weight = torch.maximum(sky_weight, sky_part / transmittance.clamp_min(1e-6))
-        rgb = self.clear_picture(raster, parts, sky_weight)
-        fog_share = 1 - transmittance
-        return mix(rgb, self.airlight(fog), fog_share), fog_share
+            fog_share = fog_share - sky_part
+            transmittance = 1 - fog_share.flatten()[pixels]
+            mixed_sky_part = sky_part.flatten()[pixels]
+            sky_weight = torch.maximum(sky_weight, mixed_sky_part / transmittance.clamp_min(1e-6))
+        airlight = self.airlight(fog)
+        is_plain = self.style is None and self.faded_shadows is None and raster.overlay is None
+        if not is_plain:
+            rgb = self.clear_picture(raster, parts, sky_weight)
+            return mix(rgb, airlight, fog_share), fog_share
+        rgb = mix(self._land, airlight, fog_share)
+        mixed_share = fog_share.flatten()[pixels, None]
+        mixed_airlight = airlight.expand_as(rgb).flatten(0, 1)[pixels]
+        mixed_rgb = (1 - mixed_share) * self._weigh_mixed(sky_weight) + mixed_share * mixed_airlight
+        rgb.flatten(0, 1).index_copy_(0, pixels, mixed_rgb)
+        return rgb, fog_share
 
     def _sky_transmittance(self, fog: Fog) -> Float[Tensor, "H W"] | float:
         """Return the transmittance of the smog up to the sky; 0.0 in uniform smog."""
@@ -757,8 +772,12 @@ class Photo:
         Where nothing is rendered, T is that of the way to the road or to the sky.
         """
         assert raster.alpha is not None and raster.expected_depth is not None
-        alpha = opaque_alpha(raster.alpha)
-        depth = raster.expected_depth
+        return self._transmittance_of(opaque_alpha(raster.alpha), raster.expected_depth, fog)
+
+    def _transmittance_of(
+        self, alpha: Float[Tensor, "H W"], depth: Float[Tensor, "H W"], fog: Fog
+    ) -> Float[Tensor, "H W"]:
+        """Return T of surfaces of an alpha and a depth, with the photo's edges."""
         if choose_kernels(self.backend, alpha, depth) == CPU:
             transmittance = self._transmittance_on_cpu(alpha, depth, fog)
             return self.sharpen(self.align_edges(transmittance, alpha, depth))
@@ -865,17 +884,6 @@ class Photo:
         with kernel_threads(ROWS_PER_THREAD):
             kernels.compute_transmittance(alpha.numpy(), depth.detach().numpy(), *arrays, out)
         return torch.from_numpy(out)
-
-    @cached_property
-    def _road_depth(self) -> Float[np.ndarray, "H W"] | None:
-        """Return z of the road in each pixel, metres, infinite where no ray falls to it."""
-        if self.height_m is None:
-            return None
-        ray_fall = self.ray_fall.cpu().numpy()
-        with np.errstate(divide="ignore"):
-            depth = np.float32(self.height_m) / ray_fall
-        depth[ray_fall <= MIN_ROAD_FALL] = math.inf
-        return depth
 
     @cached_property
     def ray_fall(self) -> Float[Tensor, "H W"]:

@@ -12,6 +12,7 @@ around. So 1 - a = D / max D, and F = S + (I - S) / (1 - a).
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -60,6 +61,10 @@ _PALE_LEVELS = 40
 _MIN_SHARE = 0.02
 # Share of a surface in a pixel by which its colour is divided, at least.
 _MIN_SOLID = 0.1
+# Distance up to which pixels have a say in another's share of sky, pixels of 1920.
+_MARGIN_PX = 18
+# Height and width of the blocks of an image whose shares are found at a time, pixels.
+_BLOCK_SIZE_PX = (128, 480)
 # Width of thin things (wires, twigs) that are found by their darkness alone, pixels of 1920.
 _THIN_PX = 12
 # Darkness of thin things over their surroundings that is noise, of 255.
@@ -254,8 +259,37 @@ def _refine(rgb: np.ndarray, kinds: np.ndarray) -> SkyMatte:
     is_bright = cv2.resize(is_bright, size, interpolation=cv2.INTER_NEAREST)
     sky_rgb[:rows] = cv2.resize(sky, size, interpolation=cv2.INTER_LINEAR)
     noise = cv2.resize(noise, size, interpolation=cv2.INTER_LINEAR)
-    images = sky_rgb[:rows], noise, is_bright, share[:rows], surface_rgb[:rows]
-    _share_of_sky(rgb[:rows], full_kinds, *images)
+    # Blocks fit into the processor's cache, and those far from any sky are left out.
+    margin = math.ceil(_MARGIN_PX * max(1.0, width / 1920))
+    for top, left in itertools.product(
+        range(0, rows, _BLOCK_SIZE_PX[0]), range(0, width, _BLOCK_SIZE_PX[1])
+    ):
+        first = max(top - margin, 0), max(left - margin, 0)
+        end = min(top + _BLOCK_SIZE_PX[0], rows), min(left + _BLOCK_SIZE_PX[1], width)
+        part = (
+            slice(first[0], min(end[0] + margin, rows)),
+            slice(first[1], min(end[1] + margin, width)),
+        )
+        if not full_kinds[part].any():
+            continue
+        part_share = np.zeros(full_kinds[part].shape, np.float32)
+        part_surface = rgb[part].copy()
+        _share_of_sky(
+            rgb[part].copy(),
+            full_kinds[part].copy(),
+            sky_rgb[part].copy(),
+            noise[part].copy(),
+            is_bright[part].copy(),
+            part_share,
+            part_surface,
+            width / 1920,
+        )
+        inner = (
+            slice(top - first[0], end[0] - first[0]),
+            slice(left - first[1], end[1] - first[1]),
+        )
+        share[top : end[0], left : end[1]] = part_share[inner]
+        surface_rgb[top : end[0], left : end[1]] = part_surface[inner]
     return SkyMatte(share, surface_rgb, sky_rgb)
 
 
@@ -315,8 +349,9 @@ def _share_of_sky(
     has_bright_surface: np.ndarray,
     share: np.ndarray,
     surface_rgb: np.ndarray,
+    scale: float,
 ) -> None:
-    """Write the sky's share and the surfaces' colours of some rows of an image.
+    """Write the sky's share and the surfaces' colours of a part of an image.
 
     Args:
         rgb: the image's colours, uint8 [h, w, 3].
@@ -326,8 +361,8 @@ def _share_of_sky(
         has_bright_surface: 255 where a surface as bright as the sky is near, else 0.
         share: the sky's share, which is written.
         surface_rgb: colours of the image, which are replaced in mixed pixels.
+        scale: width of the whole image over 1920 pixels.
     """
-    scale = _width_share(rgb)
     smooth = cv2.GaussianBlur(rgb, (3, 3), 0) if scale > 0.4 else rgb
     window = np.ones((2 * max(1, round(_EDGE_PX * scale)) + 1,) * 2, np.uint8)
     can_be_sky = _above(kinds, 0)
@@ -352,31 +387,34 @@ def _share_of_sky(
     reach = 2 * max(1, round(_MIXED_PX * scale)) + 1
     is_mixed = cv2.bitwise_and(cv2.dilate(is_pure, np.ones((reach, reach), np.uint8)), can_be_sky)
     is_mixed = cv2.bitwise_and(is_mixed, cv2.bitwise_not(is_sure))
-    share[is_sure > 0] = 1
-    mixed = np.flatnonzero(is_mixed)
+    np.copyto(share, cv2.threshold(is_sure, 0, 1, cv2.THRESH_BINARY)[1])
+    mixed = np.flatnonzero(is_mixed != 0)
     levels = difference.ravel()[mixed]
     solid = levels / np.maximum(largest.ravel()[mixed], np.float32(1))
     share.ravel()[mixed] = 1 - solid * (levels > noise.ravel()[mixed])
-    _remove_thin_things(luma, cv2.bitwise_or(is_sure, is_mixed), share)
+    _remove_thin_things(luma, cv2.bitwise_or(is_sure, is_mixed), share, scale)
     _unmix(rgb, sky_rgb, share, surface_rgb)
 
 
-def _remove_thin_things(luma: np.ndarray, is_searched: np.ndarray, share: np.ndarray) -> None:
+def _remove_thin_things(
+    luma: np.ndarray, is_searched: np.ndarray, share: np.ndarray, scale: float
+) -> None:
     """Lower the sky's share where something dark and thin stands before it.
 
     Args:
         luma: the image's luma.
         is_searched: pixels that are looked at, uint8, 0 or 255.
         share: the sky's share, which is written.
+        scale: width of the whole image over 1920 pixels.
     """
-    side = 2 * max(1, round(_THIN_PX * _width_share(luma) / 2)) + 1
+    side = 2 * max(1, round(_THIN_PX * scale / 2)) + 1
     darkness = cv2.morphologyEx(luma, cv2.MORPH_BLACKHAT, np.ones((side, side), np.uint8))
     darkness = cv2.bitwise_and(darkness, is_searched)
     darkest = cv2.dilate(darkness, np.ones((5, 5), np.uint8))
     is_thin = cv2.bitwise_and(
         _above(darkest, _MIN_THIN_LEVELS), _above(darkness, _THIN_NOISE_LEVELS)
     )
-    thin = np.flatnonzero(is_thin)
+    thin = np.flatnonzero(is_thin != 0)
     depth = darkness.ravel()[thin].astype(np.float32)
     # A wire is thinner than a pixel: how dark it is shows how much of the sky it hides.
     solid = depth / ((1 - _THIN_LUMA_SHARE) * (luma.ravel()[thin] + depth))
@@ -388,16 +426,11 @@ def _above(image: np.ndarray, level: int) -> np.ndarray:
     return cv2.threshold(image, level, 255, cv2.THRESH_BINARY)[1]
 
 
-def _width_share(image: np.ndarray) -> float:
-    """Return the width of an image over 1920 pixels."""
-    return image.shape[1] / 1920
-
-
 def _unmix(
     rgb: np.ndarray, sky_rgb: np.ndarray, share: np.ndarray, surface_rgb: np.ndarray
 ) -> None:
     """Write the surfaces' colours of mixed pixels: F = S + (I - S) / (1 - a)."""
-    mixed = np.flatnonzero((share > _MIN_SHARE) & (share < 1 - _MIN_SHARE))
+    mixed = np.flatnonzero(np.abs(share - np.float32(0.5)) < 0.5 - _MIN_SHARE)
     sky = sky_rgb.reshape(-1, 3)[mixed].astype(np.float32)
     solid = 1 - share.ravel()[mixed][:, None]
     color = sky + (rgb.reshape(-1, 3)[mixed] - sky) / np.maximum(solid, _MIN_SOLID)

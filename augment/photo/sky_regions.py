@@ -225,7 +225,8 @@ def _contrast(rgb: np.ndarray) -> np.ndarray:
 
 def largest_channel(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
     """Return the largest of the three channels."""
-    return np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2])
+    first, second, third = cv2.split(image)
+    return cv2.max(cv2.max(first, second), third)
 
 
 def _grow(mask: np.ndarray, size: int) -> np.ndarray:

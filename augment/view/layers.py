@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -218,13 +219,14 @@ class LayerRenderer:
         if edges is None:
             return raster
         with timed("photo: background of objects"):
+            is_needed = np.ascontiguousarray(edges.shows_background[edges.window])
             background = rasterize(
                 edges.background_of(parts),
-                camera,
+                edges.window_of(camera),
                 buffers=buffers,
                 settings=settings,
                 clip=clip,
-                pixel_mask=torch.from_numpy(edges.shows_background).to(raster.alpha.device),
+                pixel_mask=torch.from_numpy(is_needed).to(raster.alpha.device),
                 backend=self.backend,
             )
             return edges.apply(raster, background, parts)

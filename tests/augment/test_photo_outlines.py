@@ -113,8 +113,13 @@ def test_beside_a_car_of_the_photo_the_buffers_are_those_of_the_road():
         expected_depth=raster.expected_depth.clone(),
         splat_ids=raster.splat_ids.clone(),
     )
-    moved_in_torch = edges.apply(in_torch, road, parts)
-    moved = edges.apply(raster, road, parts)
+    rows, columns = edges.window
+    window = {name: getattr(road, name)[rows, columns].contiguous() for name in buffers}
+    behind = replace(road, **window)
+    view = rasterize(parts[:1], edges.window_of(camera), buffers=buffers)
+    assert torch.allclose(view.expected_depth, behind.expected_depth, rtol=1e-3)
+    moved_in_torch = edges.apply(in_torch, behind, parts)
+    moved = edges.apply(raster, behind, parts)
     for name in buffers:
         assert torch.equal(getattr(moved, name), getattr(moved_in_torch, name).detach())
     splats = cv2.dilate(photo_of_car(camera, parts, 0).astype(np.uint8), np.ones((3, 3)))
