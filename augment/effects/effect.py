@@ -257,6 +257,9 @@ class Effect:
     `output.surface = "scene"` leaves them out.
     """
 
+    reads_neighbours: ClassVar[bool] = False
+    """If True, pixels of `edit_image` depend on other pixels of the picture that it gets."""
+
     precomputes_files: ClassVar[bool] = False
     """If True, `precompute` takes long and stores large results in files."""
 

@@ -83,6 +83,7 @@ class SmogEffect(Effect):
 
     name = "smog"
     section = "weather.smog"
+    reads_neighbours = True  # light that is scattered forward
     model = Smog
     off_switches: ClassVar = {PER_GAUSSIAN: ("weather.smog", None)}
     # transmittance: 0 to 1, of the smog between camera and box; NaN for a box whose numbers are
