@@ -257,9 +257,6 @@ class Effect:
     `output.surface = "scene"` leaves them out.
     """
 
-    reads_neighbours: ClassVar[bool] = False
-    """If True, pixels of `edit_image` depend on other pixels of the picture that it gets."""
-
     precomputes_files: ClassVar[bool] = False
     """If True, `precompute` takes long and stores large results in files."""
 
@@ -363,6 +360,10 @@ class Effect:
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         """Return the finished picture with the effect on it."""
         return view
+
+    def reads_neighbours(self, effect: EffectInScene) -> bool:
+        """Return True if pixels of `edit_image` depend on other pixels of its picture."""
+        return False
 
     def visible_mask(self, effect: EffectInScene, view: RenderedView) -> Bool[Tensor, "H W"] | None:
         """Return the pixels that show the effect.

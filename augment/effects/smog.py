@@ -83,7 +83,6 @@ class SmogEffect(Effect):
 
     name = "smog"
     section = "weather.smog"
-    reads_neighbours = True  # light that is scattered forward
     model = Smog
     off_switches: ClassVar = {PER_GAUSSIAN: ("weather.smog", None)}
     # transmittance: 0 to 1, of the smog between camera and box; NaN for a box whose numbers are
@@ -163,6 +162,9 @@ class SmogEffect(Effect):
         if effect.settings.is_common and common is not None:
             fog = fog_before_color_map(fog, effect.scene.color_map(camera), common)
         return replace(layers, fog=fog, applies_fog_to_buffers=effect.settings.on_buffers)
+
+    def reads_neighbours(self, effect: EffectInScene) -> bool:
+        return effect.settings.scatter > 0
 
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         settings = effect.settings

@@ -250,7 +250,7 @@ def _edit_around_own_car(
     is_car_covered = True
     for effect in view.effects:
         is_weather = _is_weather(effect)
-        if is_car_covered and (effect.hooks.reads_neighbours or not is_weather):
+        if is_car_covered and (not is_weather or effect.hooks.reads_neighbours(effect)):
             rendered = _with_own_car(rendered, drawn, own_car, car_rgb)
             is_car_covered = False
         unedited = rendered
