@@ -361,6 +361,10 @@ class Effect:
         """Return the finished picture with the effect on it."""
         return view
 
+    def reads_neighbours(self, effect: EffectInScene) -> bool:
+        """Return True if pixels of `edit_image` depend on other pixels of its picture."""
+        return False
+
     def visible_mask(self, effect: EffectInScene, view: RenderedView) -> Bool[Tensor, "H W"] | None:
         """Return the pixels that show the effect.
 

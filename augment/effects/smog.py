@@ -163,6 +163,9 @@ class SmogEffect(Effect):
             fog = fog_before_color_map(fog, effect.scene.color_map(camera), common)
         return replace(layers, fog=fog, applies_fog_to_buffers=effect.settings.on_buffers)
 
+    def reads_neighbours(self, effect: EffectInScene) -> bool:
+        return effect.settings.scatter > 0
+
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         settings = effect.settings
         if settings.scatter == 0 and not settings.is_linear:

@@ -175,7 +175,7 @@ def find_exposed_surface(
             paths,
             settings,
             shadows_of(scene),
-            shells_of_parked(parked_vehicles(scene), background),
+            shells_of_parked(parked_vehicles(scene), background, path_points(views)[:, :2]),
             backend,
         )
         map_in_order = functools.partial(in_order, after_each=after_each, backend=backend)
@@ -247,7 +247,13 @@ class _GroundSearch:
         square = _with_margin(self._plan, *level_and_window)
         height_map, classes, candidate_mask, filled_mask = self._draw(square)
         max_slope_deg = self._settings.max_slope_deg
-        shells = draw_shells(self._shells, height_map, classes, max_slope_deg=max_slope_deg)
+        shells = draw_shells(
+            self._shells,
+            height_map,
+            classes,
+            max_slope_deg=max_slope_deg,
+            pixel_mask=square.level_mask,
+        )
         if shells is not None:
             height_map, classes = shells.put_under(height_map, classes)
             candidate_mask = candidate_mask | shells.is_top

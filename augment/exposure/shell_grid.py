@@ -58,7 +58,12 @@ class PlacedShell:
         half = np.array(self.shell.size_m[:2]) / 2 + PLAN_MARGIN_M
         return np.abs(self.rotation[:2, :2]) @ half
 
-    def nearest_tops(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def has_in_plan(self, places: np.ndarray) -> np.ndarray:
+        """Return True for places [N, 3] of the grid's frame that lie in the plan of the box."""
+        local = (places - self.centre_m) @ self.rotation[:, :2]
+        return np.asarray((np.abs(local) <= np.array(self.shell.size_m[:2]) / 2).all(1))
+
+    def nearest_tops(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return places of the shell next to which, or over which, nothing of the vehicle stands.
 
         The first is the nearest across the vehicle, and between its ends. The second is the nearest
@@ -69,11 +74,9 @@ class PlacedShell:
 
         Returns:
             The two places, float64 [2, N, 2]; bool [2, N], True where the given place lies beside
-            them; bool [N], True for places within the box.
+            them.
         """
         local = (places - self.centre_m) @ self.rotation
-        half_size_m = np.array(self.shell.size_m[:2]) / 2
-        is_in_box = np.asarray((np.abs(local[:, :2]) <= half_size_m).all(1))
         knots = self.shell.knots_x_m
         nearest_places = []
         is_beside = []
@@ -86,7 +89,7 @@ class PlacedShell:
             nearest = np.stack([x, y], 1)
             nearest_places.append(nearest @ self.rotation[:2, :2].T + self.centre_m[:2])
             is_beside.append((nearest != local[:, :2]).any(1))
-        return np.array(nearest_places), np.array(is_beside), is_in_box
+        return np.array(nearest_places), np.array(is_beside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +130,7 @@ def draw_shells(
     classes: np.ndarray,
     *,
     max_slope_deg: float,
+    pixel_mask: np.ndarray | None = None,
 ) -> ShellGrid | None:
     """Draw shells on the cells of a height map; None where no shell lies on it.
 
@@ -136,7 +140,20 @@ def draw_shells(
         classes: classes of the cells, int16 [H, W]. Beyond a box, only vehicles are sills or
             mirrors.
         max_slope_deg: the recipe's steepest surface that holds a layer.
+        pixel_mask: bool [H, W], cells that count; shells beside them are left out. None: all.
     """
+    x, y = height_map.centers()
+    windows = []
+    for placed_shell in placed_shells:
+        reach = placed_shell.reach_m
+        rows = np.flatnonzero(np.abs(y - placed_shell.centre_m[1]) <= reach[1])
+        columns = np.flatnonzero(np.abs(x - placed_shell.centre_m[0]) <= reach[0])
+        if len(rows) and len(columns):
+            window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+            if pixel_mask is None or pixel_mask[window].any():
+                windows.append((placed_shell, window))
+    if not windows:
+        return None
     shape = height_map.alpha.shape
     grid = ShellGrid(
         np.zeros(shape, bool),
@@ -146,8 +163,8 @@ def draw_shells(
         np.ones(shape, np.float32),
     )
     is_drawn = [
-        _draw_shell(grid, placed_shell, height_map, classes, max_slope_deg)
-        for placed_shell in placed_shells
+        _draw_shell(grid, placed_shell, window, height_map, classes, max_slope_deg)
+        for placed_shell, window in windows
     ]
     return grid if any(is_drawn) else None
 
@@ -155,20 +172,15 @@ def draw_shells(
 def _draw_shell(
     grid: ShellGrid,
     placed_shell: PlacedShell,
+    window: tuple[slice, slice],
     height_map: HeightMap,
     classes: np.ndarray,
     max_slope_deg: float,
 ) -> bool:
-    """Draw one shell, in place; return False where it lies beside the grid."""
+    """Draw one shell in a window of the grid, in place; return False where nothing of it lies."""
     x, y = height_map.centers()
     size = np.array(placed_shell.shell.size_m)
     half = size[:2] / 2 + PLAN_MARGIN_M
-    reach = placed_shell.reach_m
-    rows = np.flatnonzero(np.abs(y - placed_shell.centre_m[1]) <= reach[1])
-    columns = np.flatnonzero(np.abs(x - placed_shell.centre_m[0]) <= reach[0])
-    if not (len(rows) and len(columns)):
-        return False
-    window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     offsets = np.stack(np.meshgrid(x[window[1]], y[window[0]]), -1) - placed_shell.centre_m[:2]
     # The box stands nearly upright, so that its plan is the plan seen from above.
     local = offsets @ placed_shell.rotation[:2, :2]

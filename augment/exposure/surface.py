@@ -531,20 +531,27 @@ _MIN_STRAY_HEIGHT_M = 0.02  # height above a shell from which on they do
 _MIN_STRAY_HEIGHT_BESIDE_M = -0.04  # the same beside a roof or bonnet, over its edge
 
 
-def _ids_near(means: np.ndarray, shells: Sequence[PlacedShell]) -> np.ndarray:
-    """Return the ids of means [N, 3] in the squares of a coarse grid that shells touch."""
-    centres = np.array([shell.centre_m[:2] for shell in shells])
-    reaches = np.array([shell.reach_m for shell in shells])
+def ids_near(means: np.ndarray, centres: np.ndarray, reaches: np.ndarray) -> np.ndarray:
+    """Return the ids of means in the squares of a coarse grid that some rectangles touch.
+
+    Args:
+        means: places, [N, 3].
+        centres: centres of the rectangles, [R, 2], at least one.
+        reaches: half their sizes, [R, 2].
+    """
     corner = (centres - reaches).min(0)
     first = np.floor((centres - reaches - corner) / _SQUARE_M).astype(int)
     last = np.floor((centres + reaches - corner) / _SQUARE_M).astype(int)
     is_touched = np.zeros(last.max(0) + 1, bool)
     for (x0, y0), (x1, y1) in zip(first, last, strict=True):
         is_touched[x0 : x1 + 1, y0 : y1 + 1] = True
-    squares = np.floor((means[:, :2] - corner.astype(means.dtype)) / _SQUARE_M)
-    ids = np.flatnonzero(((squares >= 0) & (squares < is_touched.shape)).all(1))
-    chosen = squares[ids].astype(np.int64)
-    return ids[is_touched[chosen[:, 0], chosen[:, 1]]]
+    side = means.dtype.type(_SQUARE_M)
+    columns = np.floor((means[:, 0] - means.dtype.type(corner[0])) / side)
+    rows = np.floor((means[:, 1] - means.dtype.type(corner[1])) / side)
+    is_inside = (columns >= 0) & (columns < is_touched.shape[0])
+    is_inside &= (rows >= 0) & (rows < is_touched.shape[1])
+    ids = np.flatnonzero(is_inside)
+    return ids[is_touched[columns[ids].astype(np.int64), rows[ids].astype(np.int64)]]
 
 
 def find_strays(
@@ -562,11 +569,14 @@ def find_strays(
     found_ids = [np.zeros(0, np.int64)]
     found_cells = [np.zeros(0, np.int32)]
     if len(cells.sizes_m) and len(shells):
-        candidate_ids = _ids_near(gaussians.means.numpy(), shells)
+        centres = np.array([shell.centre_m[:2] for shell in shells])
+        reaches = np.array([shell.reach_m for shell in shells])
+        candidate_ids = ids_near(gaussians.means.numpy(), centres, reaches)
         classes = classes_of(gaussians)[candidate_ids]
         candidate_ids = candidate_ids[~np.isin(classes, _FIXED_CLASSES)]
-        is_small = gaussians.scales.numpy()[candidate_ids].max(1) < _MAX_STRAY_SCALE_M
-        candidate_ids = candidate_ids[is_small]
+        for axis in range(3):
+            is_small = gaussians.scales.numpy()[candidate_ids, axis] < _MAX_STRAY_SCALE_M
+            candidate_ids = candidate_ids[is_small]
         means = gaussians.means.numpy()[candidate_ids]
         order = np.argsort(means[:, 0], kind="stable")
         sorted_x = means[order, 0]
@@ -578,10 +588,11 @@ def find_strays(
             rows = np.sort(order[low:high])
             lowest_m = placed_shell.centre_m[2] - _MAX_BELT_SHARE * placed_shell.shell.size_m[2]
             rows = rows[means[rows, 2] > lowest_m]
+            rows = rows[placed_shell.has_in_plan(means[rows])]
             places = means[rows].astype(np.float64)
-            nearest_tops, is_beside, is_in_box = placed_shell.nearest_tops(places)
+            nearest_tops, is_beside = placed_shell.nearest_tops(places)
             for nearest_xy, is_aside in zip(nearest_tops, is_beside, strict=True):
-                cell_ids = np.where(is_in_box, cells_under(nearest_xy), -1)
+                cell_ids = cells_under(nearest_xy)
                 offset = places - cells.centers_m[cell_ids]
                 offset[:, :2] = nearest_xy - cells.centers_m[cell_ids, :2]
                 normals = cells.normals[cell_ids]

@@ -34,11 +34,13 @@ from augment.exposure.surface import (
     Surface,
     cells_at,
     find_surface,
+    ids_near,
     is_moving,
     make_cells,
     surface_of_shell,
 )
 from augment.exposure.surface_kernels import RISES
+from augment.exposure.vehicle_forms import forms_of_label
 from augment.exposure.vehicle_shell import MIN_POINTS, VehicleShell, fit_shell
 from augment.memo import memo_of
 from augment.render.buffers import AUTO
@@ -46,7 +48,6 @@ from augment.scene.boxes import WorldBoxes
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import Actor, Gaussians, PosedGaussians, Scene
 from augment.scene.semantics import SemanticClass, class_of_label
-from augment.scene.transform import transform_gaussians_rigidly
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +76,8 @@ _MIN_UPWARD = 0.5  # least z of the normal of a splat that faces upwards
 _MAX_LABELLED_FRAMES = 8  # number of frames whose boxes are read, spread over the drive
 _MIN_SPEED_STEP_NS = 400_000_000  # least time between two poses that tell a speed
 _MAX_VEHICLE_M = 30.0  # longest box that counts
+# Distance from the path up to which parked vehicles have shells; cells beyond it are too large.
+_MAX_SHELL_DISTANCE_M = 60.0
 
 
 # ---- Shells --------------------------------------------------------------------------------------
@@ -90,28 +93,56 @@ def shell_of_gaussians(
         label: the dataset's name for the kind of vehicle.
         size_m: length, width and height of its box.
     """
-    if len(gaussians) < MIN_POINTS:
+    return _fit_to_rows(gaussians, np.arange(len(gaussians)), label, size_m, np.zeros(3), np.eye(3))
+
+
+def _fit_to_rows(
+    gaussians: Gaussians,
+    rows: np.ndarray,
+    label: str,
+    size_m: tuple[float, float, float],
+    centre_m: np.ndarray,
+    rotation: np.ndarray,
+) -> VehicleShell | None:
+    """Fit a shell to some rows of Gaussians; None if there is none.
+
+    Args:
+        gaussians: plain Gaussians.
+        rows: rows of those in the box and about it, int64 [N].
+        label: the dataset's name for the kind of vehicle.
+        size_m: length, width and height of its box.
+        centre_m: centre of its box, float64 [3], in the frame of the Gaussians.
+        rotation: their frame from the box's, float64 [3, 3].
+    """
+    if len(rows) < MIN_POINTS or not forms_of_label(label, size_m[2]):
         return None
-    scales = gaussians.scales.numpy()
-    is_surface = ~np.isin(classes_of(gaussians), _OTHER_CLASSES)
-    is_surface &= gaussians.opacities.numpy() > _MIN_OPACITY
-    is_surface &= scales.max(1) < _MAX_SCALE_M
-    rows = np.flatnonzero(is_surface)
+    is_surface = gaussians.opacities.numpy()[rows] > _MIN_OPACITY
+    is_surface &= gaussians.scales.numpy()[rows].max(1) < _MAX_SCALE_M
+    is_surface &= ~np.isin(classes_of(gaussians)[rows], _OTHER_CLASSES)
+    rows = rows[is_surface]
     if len(rows) < MIN_POINTS:
         return None
     rows = rows[:: math.ceil(len(rows) / _MAX_SPLATS)]
-    points, is_facing_up = _surface_points(gaussians.select(_index_tensor(rows)))
+    points, is_facing_up = _surface_points(gaussians, rows, centre_m, rotation)
     return fit_shell(points, is_facing_up, label, size_m)
 
 
-def _surface_points(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Return points on flat Gaussians, float64 [N, 3], and those that face upwards, bool [N].
+def _surface_points(
+    gaussians: Gaussians, rows: np.ndarray, centre_m: np.ndarray, rotation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points on flat Gaussians in the frame of a box, and those that face upwards.
 
-    A large Gaussian gives several points, spread over its two longer axes.
+    A large Gaussian gives several points, spread over its two longer axes. The arguments are those
+    of `_fit_to_rows`.
+
+    Returns:
+        The points, float64 [N, 3]; bool [N].
     """
-    axes = rotmat_from_quat(gaussians.quats).numpy().astype(np.float64)  # columns: the axes
-    scales = gaussians.scales.numpy().astype(np.float64)
-    means = gaussians.means.numpy().astype(np.float64)
+    ids = _index_tensor(rows)
+    # The columns are the axes.
+    axes = rotation.T @ rotmat_from_quat(gaussians.quats[ids]).numpy().astype(np.float64)
+    scales = gaussians.scales[ids].numpy().astype(np.float64)
+    means = (gaussians.means[ids].numpy().astype(np.float64) - centre_m) @ rotation
     order = np.argsort(scales, axis=1, kind="stable")
     axes = np.take_along_axis(axes, order[:, None, :], 2)
     scales = np.take_along_axis(scales, order, 1)
@@ -193,40 +224,45 @@ def _find_parked_vehicles(scene: Scene) -> tuple[ParkedVehicle, ...]:
 
 
 def shells_of_parked(
-    vehicles: Sequence[ParkedVehicle], background: Gaussians
+    vehicles: Sequence[ParkedVehicle], background: Gaussians, path_m: np.ndarray
 ) -> tuple[PlacedShell, ...]:
-    """Return the shells of those parked vehicles whose form is known.
+    """Return the shells of those parked vehicles whose form is known, and which are near the path.
 
     Args:
         vehicles: the vehicles.
         background: plain Gaussians of the background.
+        path_m: path of the cameras, float64 [P, 2].
     """
-    body_ids = np.flatnonzero(~np.isin(classes_of(background), _OTHER_CLASSES))
-    means = background.means.numpy()[body_ids]
+    vehicles = [
+        vehicle
+        for vehicle in vehicles
+        if np.hypot(*(path_m - vehicle.centre_m[:2]).T).min() <= _MAX_SHELL_DISTANCE_M
+    ]
+    if not vehicles:
+        return ()
+    means = background.means.numpy()
+    centres = np.array([vehicle.centre_m[:2] for vehicle in vehicles])
+    halves = [np.array(vehicle.size_m) / 2 + PLAN_MARGIN_M for vehicle in vehicles]
+    reaches = np.array(
+        [(np.abs(v.rotation) @ half)[:2] for v, half in zip(vehicles, halves, strict=True)]
+    )
+    body_ids = ids_near(means, centres, reaches)
+    body_ids = body_ids[~np.isin(classes_of(background)[body_ids], _OTHER_CLASSES)]
+    means = means[body_ids].astype(np.float64)
     order = np.argsort(means[:, 0], kind="stable")
     sorted_x = means[order, 0]
     placed_shells = []
-    for vehicle in vehicles:
-        half = np.array(vehicle.size_m) / 2 + PLAN_MARGIN_M
-        reach = np.abs(vehicle.rotation) @ half
+    for vehicle, half, reach in zip(vehicles, halves, reaches, strict=True):
         ends = np.searchsorted(sorted_x, vehicle.centre_m[0] + np.array([-reach[0], reach[0]]))
         nearby = np.sort(order[ends[0] : ends[1]])
         local = (means[nearby] - vehicle.centre_m) @ vehicle.rotation
-        is_inside = (np.abs(local) <= half).all(1)
-        if is_inside.sum() < MIN_POINTS:
-            continue
-        gaussians = background.select(_index_tensor(body_ids[nearby[is_inside]]))
-        shell = shell_of_gaussians(_in_box_frame(gaussians, vehicle), vehicle.label, vehicle.size_m)
+        rows = body_ids[nearby[(np.abs(local) <= half).all(1)]]
+        shell = _fit_to_rows(
+            background, rows, vehicle.label, vehicle.size_m, vehicle.centre_m, vehicle.rotation
+        )
         if shell is not None:
             placed_shells.append(PlacedShell(shell, vehicle.centre_m, vehicle.rotation))
     return tuple(placed_shells)
-
-
-def _in_box_frame(gaussians: Gaussians, vehicle: ParkedVehicle) -> Gaussians:
-    """Return Gaussians of the world in the frame of a vehicle's box."""
-    rotation = torch.from_numpy(np.ascontiguousarray(vehicle.rotation.T))
-    shift = -rotation @ torch.from_numpy(vehicle.centre_m)
-    return transform_gaussians_rigidly(gaussians, rotation, shift)
 
 
 def top_speed_mps(actor: Actor) -> float | None:

@@ -57,7 +57,9 @@ _ALL_POINTS_WEIGHT = 0.3  # weight of heights from points that do not face upwar
 _KEY_STEP_M = 1000.0  # step of sorting keys between stations, far above any height
 _FULL_COUNT = 6  # number of points at a station from which on it has full weight
 
-_NUM_STEPS = 14  # number of Gauss-Newton steps
+_NUM_STEPS = 14  # largest number of Gauss-Newton steps
+_NUM_SCALE_STEPS = 9  # number of steps in which the scale of Cauchy's weights is drawn in
+_MIN_STEP_M = 0.003  # largest step of any knot at which the fit ends
 _MAX_STEP_M = 0.15  # largest step of a knot
 _MAX_KNOT_SHIFT = 3.5  # largest shift of a knot from its form, in standard deviations
 _MAX_END_RISE_M = 0.02  # largest rise of a bonnet or boot towards its end
@@ -178,7 +180,7 @@ class VehicleShell:
         parts = _PARTS_OF_SEGMENTS[segment]
         steepness = np.hypot(slope_x, slope_y)
         chords = np.abs(np.diff(self.knots_z_m) / np.diff(knots))
-        is_glass = np.isin(parts, GLASS_PARTS)
+        is_glass = (parts == VehiclePart.WINDSCREEN) | (parts == VehiclePart.REAR_WINDOW)
         if self.form.has_upright_rear:
             chords[1] = np.inf
         if self.form.has_upright_front:
@@ -436,20 +438,22 @@ def _lines(
     all_x = np.concatenate([-end_x, knots[:, :NUM_KNOTS], end_x], 1)
     all_z = np.concatenate([end_z, knots[:, NUM_KNOTS:], end_z], 1)
     segments = (x[None, :, None] >= all_x[:, None, 1:-1]).sum(-1)
-    left_x, right_x = (np.take_along_axis(all_x, segments + i, 1) for i in (0, 1))
-    left_z, right_z = (np.take_along_axis(all_z, segments + i, 1) for i in (0, 1))
+    starts = (NUM_KNOTS + 2) * np.arange(num_lines)[:, None] + segments
+    left_x = all_x.ravel()[starts]
+    right_x = all_x.ravel()[starts + 1]
+    left_z = all_z.ravel()[starts]
+    right_z = all_z.ravel()[starts + 1]
     length = np.maximum(right_x - left_x, 1e-3)
     t = np.clip((x - left_x) / length, 0, 1)
     slope = (right_z - left_z) / length
     is_roof = segments == 3
     heights = left_z + t * (right_z - left_z)
     heights = heights + np.where(is_roof, 4 * t * (1 - t) * rises_m[:, None], 0.0)
-    derivatives = np.zeros((*segments.shape, 2, NUM_KNOTS + 2))
-    lines, places = np.indices(segments.shape)
-    for i, share in ((0, 1 - t), (1, t)):
-        derivatives[lines, places, 0, segments + i] = -slope * share
-        derivatives[lines, places, 1, segments + i] = share
-    derivatives = derivatives[..., 1:-1].reshape(*segments.shape, 2 * NUM_KNOTS)
+    # The share of each knot in each place; the feet of the end faces stay.
+    knots_before = np.arange(1, NUM_KNOTS + 1) - segments[..., None]
+    shares = np.where(knots_before == 0, (1 - t)[..., None], 0.0)
+    shares += np.where(knots_before == 1, t[..., None], 0.0)
+    derivatives = np.concatenate([-slope[..., None] * shares, shares], -1)
     return heights, segments, derivatives
 
 
@@ -486,9 +490,10 @@ def _fit_forms(
     station_weights = _STATION_WEIGHT * weights / _HEIGHT_SIGMA_M**2
     knots = form_knots.copy()
     for step in range(_NUM_STEPS):
+        last_knots = knots
         lines, _, derivatives = _lines(knots, x, size_m, rises_m)
         residuals = heights - lines
-        progress = min(step / (0.6 * _NUM_STEPS), 1.0)
+        progress = min(step / (_NUM_SCALE_STEPS - 1), 1.0)
         scale = _FIRST_SCALE_M * (_LAST_SCALE_M / _FIRST_SCALE_M) ** progress
         scales = np.where((residuals > 0) & faces_up, max(scale, _UPPER_SCALE_M), scale)
         w = station_weights / (1 + (residuals / scales) ** 2)
@@ -505,6 +510,8 @@ def _fit_forms(
         for end, inner in ((0, 1), (5, 4)):  # bonnet and boot fall towards their ends
             highest = knots[:, NUM_KNOTS + inner] + _MAX_END_RISE_M
             knots[:, NUM_KNOTS + end] = np.minimum(knots[:, NUM_KNOTS + end], highest)
+        if progress == 1.0 and np.abs(knots - last_knots).max() < _MIN_STEP_M:
+            break
     residuals = heights - _lines(knots, x, size_m, rises_m)[0]
     scales = np.where((residuals > 0) & faces_up, _UPPER_SCALE_M, _COST_SCALE_M)
     misfit = (station_weights * scales**2 * np.log1p((residuals / scales) ** 2)).sum(1)

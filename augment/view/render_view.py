@@ -157,23 +157,16 @@ def render_buffers(
         # Copied, since effects may write into the picture that they get.
         car_rgb = layers.photo.own_car_colors[own_car.rows].clone()
     rendered = _draw(view, layers, camera)
-    if own_car is not None and car_rgb is not None:
+    if own_car is None or car_rgb is None:
+        for effect in view.effects:
+            rendered = effect.hooks.edit_image(effect, rendered, camera)
+    else:
         if plan.covers_own_car:
             rng = rng_for(
                 seed=plan.seed, scene=scene.name, effect="snow on the own car", camera=camera.name
             )
             car_rgb = cover_own_car(car_rgb, own_car, rendered.raster, rng=rng)
-        rendered = replace(rendered, rgb=rendered.rgb.clone())  # it may be the photo itself
-        _put_own_car(rendered.rgb, own_car, car_rgb)
-    for effect in view.effects:
-        unedited = rendered
-        rendered = effect.hooks.edit_image(effect, rendered, camera)
-        if own_car is None or car_rgb is None or rendered is unedited:
-            continue
-        if _is_weather(effect):
-            _put_own_car(rendered.rgb, own_car, car_rgb)
-        else:
-            car_rgb = rendered.rgb[own_car.rows].clone()
+        rendered = _edit_around_own_car(view, rendered, camera, own_car, car_rgb)
     rgb = rendered.rgb
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         with timed("camera colour map"):
@@ -238,17 +231,56 @@ def _is_weather(effect: EffectInScene) -> bool:
     return effect.hooks.section.startswith("weather.")
 
 
-def _put_own_car(rgb: Tensor, own_car: OwnCar, car_rgb: Tensor) -> None:
-    """Write the recording car in given colours into a picture, fading out in the car's border.
+def _edit_around_own_car(
+    view: ViewPlan, drawn: RenderedView, camera: Camera, own_car: OwnCar, car_rgb: Tensor
+) -> RenderedView:
+    """Return the view with all effects on the picture, and no weather on the recording car.
+
+    The car is put into the picture before effects that the weather leaves to it or whose pixels
+    depend on their neighbours, and at the end.
 
     Args:
-        rgb: the picture, [H, W, 3].
+        view: the plan of the view.
+        drawn: the picture before `edit_image` of the effects.
+        camera: the view.
+        own_car: the recording car in it.
+        car_rgb: colours of the car's rows, [h, W, 3].
+    """
+    rendered = drawn
+    is_car_covered = True
+    for effect in view.effects:
+        is_weather = _is_weather(effect)
+        if is_car_covered and (not is_weather or effect.hooks.reads_neighbours(effect)):
+            rendered = _with_own_car(rendered, drawn, own_car, car_rgb)
+            is_car_covered = False
+        unedited = rendered
+        rendered = effect.hooks.edit_image(effect, rendered, camera)
+        if rendered is unedited:
+            continue
+        is_car_covered = is_weather
+        if not is_weather:
+            car_rgb = rendered.rgb[own_car.rows].clone()
+    return _with_own_car(rendered, drawn, own_car, car_rgb) if is_car_covered else rendered
+
+
+def _with_own_car(
+    rendered: RenderedView, drawn: RenderedView, own_car: OwnCar, car_rgb: Tensor
+) -> RenderedView:
+    """Return the view with the recording car in given colours, fading out in the car's border.
+
+    Args:
+        rendered: the picture, which is written into.
+        drawn: the picture before effects edited it. It may be the photo, and is copied.
         own_car: the recording car in it.
         car_rgb: colours of the car's rows, [h, W, 3].
     """
     with timed("recording car"):
-        weights = torch.from_numpy(own_car.weights).to(rgb.device)
-        rgb[own_car.rows] = mix(rgb[own_car.rows], car_rgb, weights)
+        if rendered.rgb is drawn.rgb:
+            rendered = replace(rendered, rgb=rendered.rgb.clone())
+        weights = torch.from_numpy(own_car.weights).to(rendered.rgb.device)
+        rows = rendered.rgb[own_car.rows]
+        rows.copy_(mix(rows, car_rgb, weights))
+    return rendered
 
 
 def _masks(view: ViewPlan, rendered: RenderedView, own_car: OwnCar | None) -> dict[str, Tensor]:

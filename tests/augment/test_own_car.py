@@ -174,6 +174,21 @@ def test_weather_leaves_every_bit_of_the_recording_car(scene, name, has_color_ma
     assert view.surface is None or view.surface.own_car is not None
 
 
+def test_the_border_shows_the_car_once_however_many_effects_there_are(scene):
+    view_camera = scene.frames[0].cameras["ahead"]
+    recipe = recipe_of(WEATHERS["blizzard"])
+    view = render_view(scene, view_camera, recipe)
+    covered = render_view(dataclasses.replace(scene, ego_masks={}), view_camera, recipe)
+    photo = cv2.imread(scene.frames[0].image_paths["ahead"], cv2.IMREAD_COLOR_RGB)
+    own_car = own_car_in_view(scene, view_camera)
+    assert own_car is not None
+    weights = own_car.weights[..., None]
+    assert ((weights > 0) & (weights < 1)).sum() > 100
+    rows = own_car.rows
+    blended = (1 - weights) * covered.rgb[rows] + weights * photo[rows]
+    assert np.abs(view.rgb[rows] - blended).max() < 1.6  # steps of 8 bits
+
+
 def test_a_style_colours_the_car_and_drops_lie_before_it(scene):
     view_camera = scene.frames[0].cameras["ahead"]
     car = scene.ego_masks["ahead"]

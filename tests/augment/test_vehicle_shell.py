@@ -31,12 +31,13 @@ from adapters.street.world import (
 )
 from augment.exposure.search import ExposureSettings, find_exposed_surface
 from augment.exposure.shell_grid import VEHICLE_MAX_SLOPE_DEG, find_depth_shares
-from augment.exposure.vehicle_cells import parked_vehicles, top_speed_mps
+from augment.exposure.vehicle_cells import parked_vehicles, shells_of_parked, top_speed_mps
 from augment.exposure.vehicle_forms import forms_of_label
 from augment.exposure.vehicle_shell import ShellSample, VehiclePart, VehicleShell, fit_shell
 from augment.scene.labels import Boxes, LidarSweep
 from augment.scene.scene import Actor, Gaussians, Scene
 from augment.scene.semantics import SemanticClass
+from augment.scene.transform import transform_gaussians_rigidly
 from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers
 from recipes.schema import Output, Recipe, Weather
@@ -340,6 +341,34 @@ def test_a_parked_car_is_covered_on_roof_bonnet_and_boot() -> None:
         assert height is None or float(z[is_here].median()) == pytest.approx(height, abs=0.03)
     assert float(cells.depth_share[is_car].min()) < 1  # glass of 36 degrees
     assert bool((cells.depth_share[~is_car] == 1).all())
+
+
+def test_parked_vehicles_far_from_the_path_have_no_shell() -> None:
+    vehicles = parked_vehicles(parked_scene(OneBox()))
+    splats = car_splats()
+    near = np.array([[7.0, -40.0], [0.0, 200.0]])
+    far = np.array([[7.0, 70.0], [7.0, -70.0]])
+    assert len(shells_of_parked(vehicles, splats, near)) == 1
+    assert shells_of_parked(vehicles, splats, far) == ()
+
+
+def test_a_turned_box_gives_the_same_shell() -> None:
+    """The frame of the world has no effect on a vehicle's form."""
+    vehicle = parked_vehicles(parked_scene(OneBox()))[0]
+    splats = car_splats()
+    turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    shift = np.array([30.0, -12.0, 2.0])
+    turned_splats = transform_gaussians_rigidly(
+        splats, torch.from_numpy(turn), torch.from_numpy(shift)
+    )
+    turned = dataclasses.replace(
+        vehicle, centre_m=turn @ vehicle.centre_m + shift, rotation=turn @ vehicle.rotation
+    )
+    path = np.zeros((1, 2))
+    (first,) = shells_of_parked([vehicle], splats, path)
+    (second,) = shells_of_parked([turned], turned_splats, path)
+    np.testing.assert_allclose(second.shell.knots_x_m, first.shell.knots_x_m, atol=0.01)
+    np.testing.assert_allclose(second.shell.knots_z_m, first.shell.knots_z_m, atol=0.01)
 
 
 def test_actors_lie_on_shells_too() -> None:
