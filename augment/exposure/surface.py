@@ -542,14 +542,15 @@ def ids_near(means: np.ndarray, centres: np.ndarray, reaches: np.ndarray) -> np.
     corner = (centres - reaches).min(0)
     first = np.floor((centres - reaches - corner) / _SQUARE_M).astype(int)
     last = np.floor((centres + reaches - corner) / _SQUARE_M).astype(int)
-    is_touched = np.zeros(last.max(0) + 1, bool)
+    num_squares = last.max(0) + 1
+    is_touched = np.zeros(num_squares, bool)
     for (x0, y0), (x1, y1) in zip(first, last, strict=True):
         is_touched[x0 : x1 + 1, y0 : y1 + 1] = True
     side = means.dtype.type(_SQUARE_M)
     columns = np.floor((means[:, 0] - means.dtype.type(corner[0])) / side)
     rows = np.floor((means[:, 1] - means.dtype.type(corner[1])) / side)
-    is_inside = (columns >= 0) & (columns < is_touched.shape[0])
-    is_inside &= (rows >= 0) & (rows < is_touched.shape[1])
+    is_inside = (columns >= 0) & (columns < num_squares[0])
+    is_inside &= (rows >= 0) & (rows < num_squares[1])
     ids = np.flatnonzero(is_inside)
     return ids[is_touched[columns[ids].astype(np.int64), rows[ids].astype(np.int64)]]
 

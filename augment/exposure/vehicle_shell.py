@@ -96,6 +96,9 @@ _CORNER_M = 0.3  # length over which the plan narrows towards its ends
 _RIM_M = 0.01  # width of the rim of roof, bonnet and boot that holds nothing
 # The same at the ends of boot, roof and bonnet, as a shift of the knots.
 _KNOT_INSETS_M = np.array([0.04, 0.0, 0.02, -0.02, 0.0, -0.05])
+# Largest width of the pillars beside windscreen and rear window. They hold nothing, and end at the
+# roof and at the bonnet or boot.
+_PILLAR_M = 0.08
 _CORNER_NARROWING = 0.25  # share of the width that it loses there
 _MIN_BOOT_LENGTH_M = 0.25  # a shorter boot is the rim of a hatch
 # Steepest rear window over a boot shorter than the following length; below a steeper one lies the
@@ -218,6 +221,9 @@ class VehicleShell:
             self.bonnet_half_m,
         )
         half = np.interp(x, knots, widths)
+        for start, end in ((1, 2), (3, 4)):
+            share = np.clip((x - knots[start]) / (knots[end] - knots[start]), 0, 1)
+            half = half - 4 * share * (1 - share) * _PILLAR_M
         to_end = np.minimum(knots[5] - x, x - knots[0])
         corner = np.clip(1 - to_end / _CORNER_M, 0, 1)
         return half * (1 - _CORNER_NARROWING * corner**2) - _RIM_M

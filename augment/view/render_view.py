@@ -232,7 +232,7 @@ def _is_weather(effect: EffectInScene) -> bool:
 
 
 def _edit_around_own_car(
-    view: ViewPlan, drawn: RenderedView, camera: Camera, own_car: OwnCar, car_rgb: Tensor
+    view: ViewPlan, first_view: RenderedView, camera: Camera, own_car: OwnCar, car_rgb: Tensor
 ) -> RenderedView:
     """Return the view with all effects on the picture, and no weather on the recording car.
 
@@ -241,17 +241,17 @@ def _edit_around_own_car(
 
     Args:
         view: the plan of the view.
-        drawn: the picture before `edit_image` of the effects.
+        first_view: the picture before `edit_image` of the effects.
         camera: the view.
         own_car: the recording car in it.
         car_rgb: colours of the car's rows, [h, W, 3].
     """
-    rendered = drawn
+    rendered = first_view
     is_car_covered = True
     for effect in view.effects:
         is_weather = _is_weather(effect)
         if is_car_covered and (not is_weather or effect.hooks.reads_neighbours(effect)):
-            rendered = _with_own_car(rendered, drawn, own_car, car_rgb)
+            rendered = _with_own_car(rendered, first_view, own_car, car_rgb)
             is_car_covered = False
         unedited = rendered
         rendered = effect.hooks.edit_image(effect, rendered, camera)
@@ -260,22 +260,22 @@ def _edit_around_own_car(
         is_car_covered = is_weather
         if not is_weather:
             car_rgb = rendered.rgb[own_car.rows].clone()
-    return _with_own_car(rendered, drawn, own_car, car_rgb) if is_car_covered else rendered
+    return _with_own_car(rendered, first_view, own_car, car_rgb) if is_car_covered else rendered
 
 
 def _with_own_car(
-    rendered: RenderedView, drawn: RenderedView, own_car: OwnCar, car_rgb: Tensor
+    rendered: RenderedView, first_view: RenderedView, own_car: OwnCar, car_rgb: Tensor
 ) -> RenderedView:
     """Return the view with the recording car in given colours, fading out in the car's border.
 
     Args:
         rendered: the picture, which is written into.
-        drawn: the picture before effects edited it. It may be the photo, and is copied.
+        first_view: the picture before effects edited it. It may be the photo, and is copied.
         own_car: the recording car in it.
         car_rgb: colours of the car's rows, [h, W, 3].
     """
     with timed("recording car"):
-        if rendered.rgb is drawn.rgb:
+        if rendered.rgb is first_view.rgb:
             rendered = replace(rendered, rgb=rendered.rgb.clone())
         weights = torch.from_numpy(own_car.weights).to(rendered.rgb.device)
         rows = rendered.rgb[own_car.rows]
