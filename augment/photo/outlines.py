@@ -87,7 +87,7 @@ class Silhouette(NamedTuple):
 
 def find_outlines(
     silhouette: Silhouette, pixels: UInt8[np.ndarray, "H W 3"]
-) -> list[Float[np.ndarray, "N 2"]]:
+) -> list[Float[np.ndarray, "_ 2"]]:
     """Return the polygons of an object as the photo shows it, in coordinates of the photo.
 
     A pixel's centre lies at whole coordinates, as OpenCV draws polygons.
@@ -261,7 +261,7 @@ def _score_regions(
 
 
 def fill_polygons(
-    polygons: list[Float[np.ndarray, "N 2"]], image: UInt8[np.ndarray, "H W"], value: int
+    polygons: list[Float[np.ndarray, "_ 2"]], image: UInt8[np.ndarray, "H W"], value: int
 ) -> None:
     """Paint polygons into an image."""
     for polygon in polygons:

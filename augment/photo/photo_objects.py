@@ -174,7 +174,7 @@ class _Object:
     """Instance id of its parts."""
     depth_m: float
     """Median z of its pixels, metres."""
-    polygons: list[Float[np.ndarray, "N 2"]]
+    polygons: list[Float[np.ndarray, "_ 2"]]
     """Its outlines in the photo."""
     bottom_z_m: float = -math.inf
     """Height of its lowest splats in the world, metres: it does not reach below."""

@@ -20,6 +20,8 @@ from recipes.load import load_recipe
 from recipes.schema import Render
 
 OUTLINES = Path(__file__).parents[1] / "data" / "pandaset_moving_cars.json"
+# Camera and frame of the view that is measured: one of eight with outlines, for the test's time.
+VIEW = ("front_camera", 12)
 # Fractional bits of the coordinates of polygons.
 SUBPIXEL_BITS = 4
 # Distances from an outline between which pixels are its ring.
@@ -54,39 +56,30 @@ def ring_shares(scene: Scene, recipe_name: str, mask_name: str) -> dict[str, flo
     recipe = recipe.model_copy(update={"render": Render(base="recorded")})
     empty_scene = replace(scene, actors=())
     cars = json.loads(OUTLINES.read_text())["cars"]
+    cars = [car for car in cars if (car["camera"], car["frame"]) == VIEW]
+    camera = scene.frames[VIEW[1]].cameras[VIEW[0]]
+    with_cars, without = (
+        render_buffers(s, camera, make_plan(recipe, s), backend="cpu").masks[mask_name].numpy()
+        for s in (scene, empty_scene)
+    )
     counts = dict[str, tuple[int, int]]()
-    for view in sorted({(car["camera"], car["frame"]) for car in cars}):
-        camera = scene.frames[view[1]].cameras[view[0]]
-        with_cars, without = (
-            render_buffers(s, camera, make_plan(recipe, s), backend="cpu").masks[mask_name].numpy()
-            for s in (scene, empty_scene)
-        )
-        cars_in_view = [car for car in cars if (car["camera"], car["frame"]) == view]
-        is_marked = paint([car["outline"] for car in cars_in_view], camera) > 0
-        for car in cars_in_view:
-            outline = paint([car["outline"]], camera)
-            distance_px = cv2.distanceTransform(1 - outline, cv2.DIST_L2, 5)
-            ring = (distance_px > RING_PX[0]) & (distance_px <= RING_PX[1]) & ~is_marked & without
-            ring &= paint(car.get("unsure", []), camera) == 0
-            ring &= alpha_of_others(scene, camera, outline) <= 0.3
-            name = f"{view[0]} {view[1]} {car['car']}"
-            counts[name] = int(ring.sum()), int((ring & ~with_cars).sum())
+    is_marked = paint([car["outline"] for car in cars], camera) > 0
+    for car in cars:
+        outline = paint([car["outline"]], camera)
+        distance_px = cv2.distanceTransform(1 - outline, cv2.DIST_L2, 5)
+        ring = (distance_px > RING_PX[0]) & (distance_px <= RING_PX[1]) & ~is_marked & without
+        ring &= paint(car.get("unsure", []), camera) == 0
+        ring &= alpha_of_others(scene, camera, outline) <= 0.3
+        counts[car["car"]] = int(ring.sum()), int((ring & ~with_cars).sum())
     total, dry = np.sum(list(counts.values()), 0)
     return {name: 100 * d / max(n, 1) for name, (n, d) in counts.items()} | {"": 100 * dry / total}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("recipe_name", "mask_name", "largest_share"),
-    [("fresh-snow", "snow", 8.5), ("street-flood", "water", 4.0)],
-)
-def test_weather_reaches_the_edges_of_moving_cars(
-    shared_dir, recipe_name: str, mask_name: str, largest_share: float
-) -> None:
+def test_snow_reaches_the_edges_of_moving_cars(shared_dir) -> None:
     folder = shared_dir / "data" / "pandaset_mini" / "002"
     if not folder.is_dir():
         pytest.skip(f"no PandaSet at {folder}")
-    shares = ring_shares(open_scene(f"pandaset:{folder}"), recipe_name, mask_name)
-    print(recipe_name, {name: round(share, 1) for name, share in shares.items()})
-    # Splats alone leave 40 % under snow, and 35 % in a flood.
-    assert shares[""] <= largest_share
+    shares = ring_shares(open_scene(f"pandaset:{folder}"), "fresh-snow", "snow")
+    # Measured: 4.3 %. Over all outlines, splats alone leave 40 %.
+    assert shares[""] <= 6
