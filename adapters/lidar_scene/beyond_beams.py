@@ -26,7 +26,7 @@ from adapters.lidar_scene.image_views import View
 from adapters.lidar_scene.sky_conflicts import measure_agreement, without_sky_splats
 from adapters.lidar_scene.sky_edges import shorten_ends_in_sky, trim_at_sky
 from adapters.lidar_scene.solid_views import WORK_WIDTH, SolidView, read_solid_view
-from adapters.lidar_scene.split import ObjectTrack
+from adapters.lidar_scene.split import ObjectTrack, is_flat
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
 from adapters.lidar_scene.wall_planes import WallPlanes, find_wall_planes
 from adapters.raw_drive import Sweep
@@ -38,6 +38,7 @@ from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, PosedGaussians
+from augment.scene.semantics import SemanticClass
 
 logger = logging.getLogger(__name__)
 
@@ -461,6 +462,7 @@ def _discs(
         centre + (depth_m[:, None] * rays), rays, depth_m * cells.sides / camera.fx, wall, walls
     )
     semantic = depth.semantic[middle_rows, middle_columns]
+    semantic = np.where(is_flat(semantic), np.int16(SemanticClass.UNKNOWN), semantic)
     index = np.flatnonzero(keep)
     discs = gaussians_from_surfels(surfels.select(index), colors[index], semantic[index], _SHAPE)
     opacities = np.minimum(_SHAPE.opacity, 1.2 * (1 - share[index])).astype(np.float32)

@@ -326,7 +326,10 @@ def find_actor_cells(
     placed_shells: tuple[PlacedShell, ...] = ()
     if shell is not None:
         placed_shells = (PlacedShell(shell, np.zeros(3), np.eye(3), top_speed_mps(actor)),)
-        surface = _surface_on_shell(placed_shells[0], cell_side_m, max_slope_deg)
+        shell_surface = _surface_on_shell(placed_shells[0], cell_side_m, max_slope_deg)
+        if shell_surface is None:
+            return None
+        surface = shell_surface
     else:
         surface = _surface_from_above(body, actor, cell_side_m, max_slope_deg, estimator, backend)
     rows, columns = np.nonzero(surface.is_exposed)
@@ -345,8 +348,10 @@ def find_actor_cells(
     return actor_cells
 
 
-def _surface_on_shell(placed_shell: PlacedShell, cell_m: float, max_slope_deg: float) -> Surface:
-    """Return the surface of a shell, in the frame of its box."""
+def _surface_on_shell(
+    placed_shell: PlacedShell, cell_m: float, max_slope_deg: float
+) -> Surface | None:
+    """Return the surface of a shell, in the frame of its box; None where no cell holds a layer."""
     shell = placed_shell.shell
     half_m = np.array(shell.size_m[:2]) / 2 + cell_m  # a rim of cells without a layer
     half_cells = np.ceil(half_m / cell_m).astype(int)
@@ -363,7 +368,8 @@ def _surface_on_shell(placed_shell: PlacedShell, cell_m: float, max_slope_deg: f
     )
     classes = np.full(shape, SemanticClass.VEHICLE, np.int16)
     grid = draw_shells([placed_shell], empty, classes, max_slope_deg=max_slope_deg)
-    assert grid is not None
+    if grid is None:
+        return None
     height_map, _ = grid.put_under(empty, classes)
     return surface_of_shell(height_map, grid, floor_m=-shell.size_m[2] / 2)
 
