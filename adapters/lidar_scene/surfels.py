@@ -40,6 +40,8 @@ _UPRIGHT = (Class.BUILDING, Class.BARRIER, Class.SIGN)
 _LINE = 0.02  # middle over largest variance below which neighbours lie on a line, not a plane
 _GROUND_SIGMA_PER_SPACING = 0.6  # wider than elsewhere: the ground must not leak
 _SETTLE_EDGES = 3.0  # largest distance along the normal, in edges, of points that are averaged
+_SETTLE_REACH_M = 0.3  # largest such distance: far and sparse points lie on no common plane
+_MOST_SETTLED_M = 0.1  # largest distance that a point is moved
 _ONE_FACE = 0.7  # least cosine of two normals whose points are of one face, not around its edge
 _SETTLE_CROWN = 0.8  # part of the way that foliage is moved: crowns would shrink
 _SET_BACK = 0.55  # distance along the normal, in standard deviations, that a disc is set back
@@ -314,7 +316,7 @@ def _settle(points, index, normals, edge_m, part, least_cosine):  # pragma: no c
     """
     out = np.empty_like(points)
     for i in range(len(points)):
-        limit = _SETTLE_EDGES * edge_m[i]
+        limit = min(_SETTLE_EDGES * edge_m[i], _SETTLE_REACH_M)
         total = 0.0
         weight = 0.0
         for j in index[i]:
@@ -331,7 +333,8 @@ def _settle(points, index, normals, edge_m, part, least_cosine):  # pragma: no c
                 total += w
                 weight += 1.0
         shift = part[i] * total / max(weight, 1.0)
-        shift = min(max(shift, -edge_m[i]), edge_m[i])
+        most = min(edge_m[i], _MOST_SETTLED_M)
+        shift = min(max(shift, -most), most)
         for a in range(3):
             out[i, a] = points[i, a] + shift * normals[i, a]
     return out
