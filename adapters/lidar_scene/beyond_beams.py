@@ -50,6 +50,7 @@ _DEPTH_WIDTH = 480  # columns at which depth is searched for, at most
 _OPEN_ALPHA = 0.97  # mean alpha of the Gaussians so far around a pixel below which it is open
 _OPEN_WINDOW_PX = 5  # side of the square over which that mean is taken
 _SOLID_PART = 0.8  # part of that square with a surface above which it is no sky, whatever it shows
+_SAME_TIME_NS = 10_000_000  # sweeps of one moment, as those of several depth images
 _SOLID_SHARE = 0.4  # share of sky below which a pixel shows a surface
 _BEHIND = 0.002  # gap from a surface that leaks to the disc behind it, as a part of the depth
 _BEHIND_M = 0.02  # constant part of that gap, metres
@@ -139,18 +140,19 @@ def close_above_beams(
 
 
 class _ReturnsAt:
-    """Finds the sweep that is nearest in time."""
+    """Finds the sweeps that are nearest in time."""
 
     def __init__(self, sweeps: Sequence[Sweep]) -> None:
         self._sweeps = [sweep for sweep in sweeps if len(sweep)]
         self._times_ns = [int(np.median(sweep.timestamps_ns)) for sweep in self._sweeps]
 
     def nearest(self, timestamp_ns: int) -> np.ndarray:
-        """Return the points of the nearest sweep, float32 [N, 3]; none without a sweep."""
+        """Return the points of the nearest sweeps, float32 [N, 3]; none without a sweep."""
         if not self._sweeps:
             return np.zeros((0, 3), np.float32)
-        gaps_ns = [abs(time_ns - timestamp_ns) for time_ns in self._times_ns]
-        return self._sweeps[int(np.argmin(gaps_ns))].points
+        gaps_ns = np.abs(np.array(self._times_ns) - timestamp_ns)
+        nearest = np.flatnonzero(gaps_ns <= gaps_ns.min() + _SAME_TIME_NS)
+        return np.concatenate([self._sweeps[number].points for number in nearest])
 
 
 class MapReader:
