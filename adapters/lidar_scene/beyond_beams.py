@@ -49,7 +49,6 @@ _SKY_FRAMES_PART = 1 / 3  # largest part of all frames whose images may
 _DEPTH_WIDTH = 480  # columns at which depth is searched for, at most
 _OPEN_ALPHA = 0.97  # mean alpha of the Gaussians so far around a pixel below which it is open
 _OPEN_WINDOW_PX = 5  # side of the square over which that mean is taken
-_SOLID_PART = 0.8  # part of that square with a surface above which it is no sky, whatever it shows
 _SAME_TIME_NS = 10_000_000  # sweeps of one moment, as those of several depth images
 _SOLID_SHARE = 0.4  # share of sky below which a pixel shows a surface
 _BEHIND = 0.002  # gap from a surface that leaks to the disc behind it, as a part of the depth

@@ -13,6 +13,7 @@ import numpy as np
 
 from adapters.lidar_scene.image_views import IMAGE_SCALES, View, draw_cover, read_image
 from adapters.lidar_scene.split import ObjectTrack
+from augment.photo.lidar_view import find_returns
 from augment.photo.sky_matte import SkyMatte, find_sky_matte
 from augment.photo.sky_regions import largest_channel
 from augment.reconstruct.view import ViewKey
@@ -73,7 +74,8 @@ def read_solid_view(
     if image is None:
         return None
     rgb = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    matte = find_sky_matte(rgb, camera, _has_point(camera, returns), lidar_top_rad)
+    has_return = find_returns(returns, camera)
+    matte = find_sky_matte(rgb, camera, has_return, lidar_top_rad)
     if matte is None:
         return None
     boxes = [
@@ -83,7 +85,7 @@ def read_solid_view(
     ]
     excluded = view.shows_car(camera.width, camera.height)
     key = ViewKey(view.frame, view.camera.name)
-    return make_solid_view(key, camera, rgb, matte, excluded, boxes, returns)
+    return make_solid_view(key, camera, rgb, matte, excluded, boxes, has_return)
 
 
 def make_solid_view(
@@ -93,7 +95,7 @@ def make_solid_view(
     matte: SkyMatte,
     excluded: np.ndarray,
     boxes: Sequence[tuple[np.ndarray, np.ndarray]],
-    points: np.ndarray,
+    has_point: np.ndarray,
 ) -> SolidView:
     """Return a recorded image with a cleaned matte, without the pixels of moving objects.
 
@@ -104,25 +106,16 @@ def make_solid_view(
         matte: the image's sky.
         excluded: pixels of the recording car, bool [H, W].
         boxes: world_from_box [4, 4] and size in metres [3] of the moving objects.
-        points: float [N, 3], known surfaces, world.
+        has_point: pixels with a known surface, bool [H, W].
     """
     cover = np.full((camera.height, camera.width), np.inf, np.float32)
     for world_from_box, size_m in boxes:
         draw_cover(cover, camera, camera.camera_from_world.numpy() @ world_from_box, size_m)
-    has_point = _has_point(camera, points)
     sky_share = _without_specks(rgb, matte, has_point)
     surface_rgb = _without_rims(matte.surface_rgb, matte.sky_rgb, sky_share)
     matte = matte._replace(sky_share=sky_share, surface_rgb=surface_rgb)
     lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     return SolidView(camera, rgb, lab, matte, excluded | np.isfinite(cover), key)
-
-
-def _has_point(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Return the pixels into which points fall, bool [H, W]."""
-    has_point = np.zeros((camera.height, camera.width), np.bool_)
-    _, rows, columns, _ = project_into(camera, points)
-    has_point[rows, columns] = True
-    return has_point
 
 
 def _without_specks(rgb: np.ndarray, matte: SkyMatte, has_point: np.ndarray) -> np.ndarray:

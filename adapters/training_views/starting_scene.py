@@ -26,6 +26,7 @@ from adapters.lidar_scene.beyond_beams import add_surfaces_beyond_beams
 from adapters.lidar_scene.solid_views import WORK_WIDTH, SolidView, make_solid_view
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
 from adapters.training_views.views import RecordedViews
+from augment.photo.lidar_view import find_returns
 from augment.photo.own_car import spread_evenly
 from augment.photo.sky_matte import sky_matte
 from augment.reconstruct.view import ViewKey, ViewSource
@@ -108,7 +109,8 @@ def _solid_view(scene: Scene, views: RecordedViews, key: ViewKey) -> SolidView |
         for actor in scene.actors
         if (pose := actor.track.pose_at(camera.timestamp_ns)) is not None
     ]
-    return make_solid_view(key, camera, rgb, matte, excluded, boxes, scene.background.means.numpy())
+    has_point = find_returns(scene.background.means.numpy(), camera)
+    return make_solid_view(key, camera, rgb, matte, excluded, boxes, has_point)
 
 
 def ego_body(scene: Scene, camera_name: str, mask: np.ndarray, source: ViewSource) -> Actor | None:

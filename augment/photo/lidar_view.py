@@ -16,8 +16,6 @@ from augment.scene.cameras import Camera
 from augment.scene.labels import KnowsLidarElevation
 from augment.scene.scene import Scene
 
-# Margin below the LiDAR's highest view, since cameras are not where the LiDAR is.
-TOP_MARGIN_RAD = math.radians(4.0)
 # Distance from which LiDAR and cameras see a return at nearly the same elevation, metres.
 _TOP_FROM_M = 10.0
 # Quantile of the returns' elevations that is the highest view; a few returns are stray.

@@ -136,11 +136,6 @@ def _writable_array(buffer: Tensor) -> np.ndarray:
     return buffer.detach().cpu().numpy().copy()
 
 
-def opaque_share(alpha: np.ndarray) -> np.ndarray:
-    """Return the alpha of what the photo shows, 0 to 1, from the alpha of splats."""
-    return np.clip((alpha - CLEAR_ALPHA) / (OPAQUE_ALPHA - CLEAR_ALPHA), 0, 1)
-
-
 def _shrink(image: np.ndarray, like: np.ndarray) -> np.ndarray:
     """Return a copy of an image at the size of another one, pixel by pixel."""
     return cv2.resize(image, like.shape[::-1], interpolation=cv2.INTER_NEAREST)

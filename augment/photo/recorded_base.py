@@ -43,6 +43,7 @@ from augment.errors import SceneError
 from augment.files.recorded_images import ImageFault, has_image, read_scaled
 from augment.light.cast_shadows import FadedShadows
 from augment.memo import memo_of
+from augment.photo.photo_objects import copy_size
 from augment.photo.photo_surface import CLEAR_ALPHA, MIN_ROAD_FALL, OPAQUE_ALPHA, complete_surfaces
 from augment.photo.sky_matte import SkyMatte, sky_matte
 from augment.render import photo_kernels as kernels
@@ -363,56 +364,34 @@ class Photo:
     ) -> Float[Tensor, "H W 3"]:
         """Return the photo in the colours of a style."""
         assert raster.alpha is not None
-        if self.matte is not None:
-            return self._styled_by_matte(style, raster, parts, self.matte)
+        alpha = raster.alpha
         if not self._takes_marks(parts):
             surface_rgb, sky_rgb, sky_level = self.layer_colors(raster, parts, self.camera)
-            return mix(
-                surface_rgb,
-                sky_rgb,
-                self.sharpen(self._sky_share(raster.alpha, sky_level), SKY_RADIUS_FACTOR),
-            )
-        alpha = raster.alpha
+            return mix(surface_rgb, sky_rgb, self._sharp_sky_share(alpha, sky_level))
         marks = raster.rgb
         assert marks is not None
-        if choose_kernels(self.backend, alpha, marks) == CPU:
+        solid_alpha = alpha.clamp_min(1e-6)
+        if self.matte is None and choose_kernels(self.backend, alpha, marks) == CPU:
             share = self.sharpen(self._marked_share_on_cpu(alpha, marks), SKY_RADIUS_FACTOR)
         else:
-            sky_level = (marks[..., 0] / alpha.clamp_min(1e-6)).clamp_max(1)
-            share = self.sharpen(self._sky_share(alpha, sky_level), SKY_RADIUS_FACTOR)
+            share = self._sharp_sky_share(alpha, (marks[..., 0] / solid_alpha).clamp_max(1))
         if style.other_splat_maps is None and self.backend == CPU:
             return self._in_both_on_cpu(style, share)
         surface_rgb = self._land
         for number, splat_map in enumerate(
             () if style.other_splat_maps is None else style.other_splat_maps
         ):
-            weight = (marks[..., 1 + number] / alpha.clamp_min(1e-6)).clamp_max(1)
+            weight = (marks[..., 1 + number] / solid_alpha).clamp_max(1)
             surface_rgb = mix(surface_rgb, self._in_colors(splat_map), weight)
         return mix(surface_rgb, self._sky, share)
 
-    def _styled_by_matte(
-        self,
-        style: PhotoStyle,
-        raster: RenderOutput,
-        parts: Sequence[PosedGaussians],
-        matte: SkyMatte,
-    ) -> Float[Tensor, "H W 3"]:
-        """Return the photo in the colours of a style, where the photo itself tells the sky."""
-        share = torch.from_numpy(matte.sky_share).to(self._device)
-        if not self._takes_marks(parts):
-            surface_rgb, sky_rgb, _ = self.layer_colors(raster, parts, self.camera)
-            return mix(surface_rgb, sky_rgb, share)
-        if style.other_splat_maps is None and self.backend == CPU:
-            return self._in_both_on_cpu(style, share)
-        assert raster.rgb is not None and raster.alpha is not None
-        surface_rgb = self._land
-        solid_alpha = raster.alpha.clamp_min(1e-6)
-        for number, splat_map in enumerate(
-            () if style.other_splat_maps is None else style.other_splat_maps
-        ):
-            weight = (raster.rgb[..., 1 + number] / solid_alpha).clamp_max(1)
-            surface_rgb = mix(surface_rgb, self._in_colors(splat_map), weight)
-        return mix(surface_rgb, self._sky, share)
+    def _sharp_sky_share(
+        self, alpha: Float[Tensor, "H W"], sky_level: Float[Tensor, "H W"] | None
+    ) -> Float[Tensor, "H W"]:
+        """Return the share of sky in each pixel, with the photo's edges: the matte's if known."""
+        if self.matte is not None:
+            return torch.from_numpy(self.matte.sky_share).to(self._device)
+        return self.sharpen(self._sky_share(alpha, sky_level), SKY_RADIUS_FACTOR)
 
     def _sky_share(
         self, alpha: Float[Tensor, "H W"], sky_level: Float[Tensor, "H W"] | None
@@ -496,7 +475,7 @@ class Photo:
         alpha = raster.alpha
         if self.faded_shadows is None or depth is None or alpha is None:
             return rgb
-        small_camera = camera.resized(*_at_most(camera, ALIGNED_PX))
+        small_camera = camera.resized(*copy_size(camera, ALIGNED_PX))
         z, small_alpha = (
             cv2.resize(
                 buffer.detach().cpu().float().contiguous().numpy(),
@@ -808,7 +787,7 @@ class Photo:
             alpha: alpha of the surfaces.
             depth: z of the surfaces, metres.
         """
-        size = _at_most(self.camera, ALIGNED_PX)
+        size = copy_size(self.camera, ALIGNED_PX)
         factor = self.camera.width / size[0]
         full_values, small_alpha, z = (
             image.detach().cpu().float().numpy() for image in (values, alpha, depth)
@@ -967,12 +946,6 @@ def open_photo(
         height_m = min(camera_height_m, MAX_CAMERA_HEIGHT_M) if camera_height_m > 0 else None
     matte = sky_matte(scene, camera, pixels) if finds_sky else None
     return Photo(camera, pixels, backend, scene_from_recorded, height_m, matte=matte)
-
-
-def _at_most(camera: Camera, width_px: int) -> tuple[int, int]:
-    """Return width and height of a copy of the camera's image, at most `width_px` wide."""
-    factor = max(1.0, camera.width / width_px)
-    return max(1, round(camera.width / factor)), max(1, round(camera.height / factor))
 
 
 def _contrast(image: np.ndarray) -> np.ndarray:

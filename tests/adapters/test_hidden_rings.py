@@ -10,7 +10,7 @@ import pytest
 from adapters.lidar_scene.scene import build_lidar_scene
 from adapters.pandaset.adapter import read_pandaset
 from adapters.raw_drive import DriveOptions
-from tools.bench.hidden_rings import errors_at_hidden, hide_top_returns
+from tests.adapters.hidden_rings import errors_at_hidden, hide_top_returns
 
 DRIVE = Path(__file__).resolve().parents[3] / "shared/data/pandaset_mini/002"
 
