@@ -142,7 +142,8 @@ def _complete_rows(
     level = np.maximum(np.hypot(rays[..., 0], rays[..., 1]), 1e-9)
     elevation_rad = np.arctan2(rays[..., 2], level)
     plan_m = np.where(is_known, known_surface.depth_m, 0.0) * level  # distance in plan
-    plant_share = _plant_share(rgb, is_known, known_surface.semantic)
+    lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    plant_share = _plant_share(rgb, lab, is_known, known_surface.semantic)
 
     is_low = np.isin(known_surface.semantic, _LOW_CLASSES) & (
         elevation_rad < lidar_top_rad - _TOP_MARGIN_RAD
@@ -154,7 +155,7 @@ def _complete_rows(
     is_plant = (known_surface.semantic == SemanticClass.VEGETATION) & is_seed
 
     seed = _cheapest_seeds(
-        cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB),
+        lab,
         is_seed | is_far_seed,
         is_plant,
         (_SKY_COST * sky_share).astype(np.float32),
@@ -205,7 +206,9 @@ def _find_far(
     )
 
 
-def _plant_share(rgb: np.ndarray, is_known: np.ndarray, semantic: np.ndarray) -> np.ndarray:
+def _plant_share(
+    rgb: np.ndarray, lab: np.ndarray, is_known: np.ndarray, semantic: np.ndarray
+) -> np.ndarray:
     """Return the probability that each pixel shows a plant, float32 [H, W]; 0.5 if unknown.
 
     Colour and roughness of the photo at known plants and at other known things are two normal
@@ -215,7 +218,6 @@ def _plant_share(rgb: np.ndarray, is_known: np.ndarray, semantic: np.ndarray) ->
     other_things = is_known & np.isin(semantic, _SOLID_CLASSES)
     if min(plants.sum(), other_things.sum()) < _MIN_SAMPLES:
         return np.full(is_known.shape, 0.5, np.float32)
-    lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     mean = cv2.blur(lab[..., 0], (7, 7))
     variance = np.maximum(cv2.blur(lab[..., 0] ** 2, (7, 7)) - mean * mean, 0)
     # A unit of roughness is to count about as much as a unit of colour.
