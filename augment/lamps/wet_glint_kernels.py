@@ -18,6 +18,7 @@ TILE_PX = 16  # pixels along a side of a tile, whose pixels share a list of lamp
 REFRACTION_INDEX = 1.33  # of water
 # Exponent of Beckmann's distribution, (tan theta_h / m)^2, from which on nothing glints.
 MAX_EXPONENT = 14.0
+NUM_SAMPLES = 5  # points of a tile at which the lamps are compared
 # Tangent of an angle over its sine, for the tilts of waves.
 TILT_MARGIN = 1.2
 # Least cosine between the normal and the eye.
@@ -145,27 +146,39 @@ def add_glints(
         for m in range(len(lamps.intensities)):
             if lamps.peaks[m] <= 0:
                 continue
-            # The tilt of h over the tile: at its middle, less its spread to the corners.
+            # The least tilt of h at some points, less what it may fall between them.
             smallest = np.inf
-            low = np.inf
-            high = -np.inf
-            brightest = 0.0
-            for corner in range(5):
-                p = count // 2 if corner == 4 else corner * (count - 1) // 3
-                tilt, bright = _tilt(points, p, eye, normal, lamps, m)
+            largest = 0.0
+            nearest = np.inf
+            for sample in range(NUM_SAMPLES):
+                p = sample * (count - 1) // (NUM_SAMPLES - 1)
+                tilt, squared = _tilt(points, p, eye, normal, lamps, m)
                 smallest = min(smallest, tilt)
-                low = min(low, tilt)
-                high = max(high, tilt)
-                brightest = max(brightest, bright)
-            reach = max(smallest - (high - low) - TILT_MARGIN * largest_tilt, 0.0)
-            m2 = largest_m * largest_m + 0.25 * lamps.softening[m] * brightest / lamps.peaks[m]
-            exponent = reach * reach / m2
+                largest = max(largest, tilt)
+                nearest = min(nearest, squared)
+            reach = 2.0 * smallest - largest - TILT_MARGIN * largest_tilt
+            m2 = largest_m * largest_m + 0.25 * lamps.softening[m] / nearest
+            exponent = max(reach, 0.0) ** 2 / m2
             if exponent > MAX_EXPONENT:
                 continue
-            score = brightest * math.exp(-exponent)
             # A bound of F D G / (4 cos), with G / cos at most about 1 / m.
-            if score / (4.0 * math.pi * m2 * largest_m) < min_luminance:
+            bound = lamps.peaks[m] / nearest * math.exp(-exponent)
+            bound /= 4.0 * math.pi * m2 * math.sqrt(m2)
+            if bound < min_luminance:
                 continue
+            # Lamps are ranked by their glints at the points, and those that pass between by a bit.
+            score = 1e-4 * bound
+            lamp = read_lamp(lamps, m)
+            for sample in range(NUM_SAMPLES):
+                p = sample * (count - 1) // (NUM_SAMPLES - 1)
+                rough = np.float64(roughness[pixels[p, 0], pixels[p, 1]])
+                strength = _glint_at(points, p, lamp, eye, normal, rough)
+                if strength > 0:
+                    x = points[p, 0] + eye[0]
+                    y = points[p, 1] + eye[1]
+                    z = points[p, 2] + eye[2]
+                    lux = lux_along_ray(lamps.tables, lamp, x, y, z)[0]
+                    score = max(score, strength * lux)
             if number == max_lamps and score <= scores[number - 1]:
                 continue
             number = min(number + 1, max_lamps)
@@ -184,38 +197,18 @@ def add_glints(
             red = lamps.colors[m, 0]
             green = lamps.colors[m, 1]
             blue = lamps.colors[m, 2]
-            place_x = lamp[0][0] - eye[0]
-            place_y = lamp[0][1] - eye[1]
-            place_z = lamp[0][2] - eye[2]
-            radius2 = lamps.softening[m]
             for p in range(count):
                 x = points[p, 0]
                 y = points[p, 1]
                 z = points[p, 2]
                 i = pixels[p, 0]
                 j = pixels[p, 1]
-                dx = place_x - x
-                dy = place_y - y
-                dz = place_z - z
-                squared = dx * dx + dy * dy + dz * dz
-                per_m = 1.0 / math.sqrt(squared)
-                to_eye = 1.0 / math.sqrt(x * x + y * y + z * z)
                 if has_waves:
                     a = up[0] + tilts[i, j, 0]
                     b = up[1] + tilts[i, j, 1]
                     normal = (a, b, math.sqrt(max(1.0 - a * a - b * b, 0.01)))
-                tangent2, cosine_h, incidence, to_lamp, cosine_eye = _half_tangent2(
-                    dx * per_m,
-                    dy * per_m,
-                    dz * per_m,
-                    -x * to_eye,
-                    -y * to_eye,
-                    -z * to_eye,
-                    normal,
-                )
-                # A lamp's disc, as wide as half its angle at the half vector, blurs the mirror.
-                rough = math.sqrt(np.float64(roughness[i, j]) ** 2 + 0.25 * radius2 / squared)
-                strength = glint(tangent2, cosine_h, incidence, to_lamp, cosine_eye, rough)
+                rough = np.float64(roughness[i, j])
+                strength = _glint_at(points, p, lamp, eye, normal, rough)
                 if strength <= 0:
                     continue
                 lux = lux_along_ray(tables, lamp, x + eye[0], y + eye[1], z + eye[2])[0]
@@ -229,17 +222,40 @@ def add_glints(
 
 @kernel_function()
 def _tilt(points, p, eye, normal, lamps, m):
-    """Return tan(theta_h) of a lamp at a point, and the most lux that it can send there."""
+    """Return tan(theta_h) of a lamp at a point, and the square of its distance."""
     x = points[p, 0]
     y = points[p, 1]
     z = points[p, 2]
     dx = lamps.positions[m, 0] - eye[0] - x
     dy = lamps.positions[m, 1] - eye[1] - y
     dz = lamps.positions[m, 2] - eye[2] - z
-    squared = dx * dx + dy * dy + dz * dz
+    squared = max(dx * dx + dy * dy + dz * dz, 1e-6)
     per_m = 1.0 / math.sqrt(squared)
     to_eye = 1.0 / math.sqrt(x * x + y * y + z * z)
     tangent2 = _half_tangent2(
         dx * per_m, dy * per_m, dz * per_m, -x * to_eye, -y * to_eye, -z * to_eye, normal
     )[0]
-    return math.sqrt(max(tangent2, 0.0)), lamps.peaks[m] / squared
+    return math.sqrt(max(tangent2, 0.0)), squared
+
+
+@kernel_function()
+def _glint_at(points, p, lamp, eye, normal, rough):
+    """Return a lamp's luminance per lux in a point of the water.
+
+    points: points from the eye, [N, 3]. p: row of the point. rough: roughness of the water.
+    """
+    x = points[p, 0]
+    y = points[p, 1]
+    z = points[p, 2]
+    dx = lamp[0][0] - eye[0] - x
+    dy = lamp[0][1] - eye[1] - y
+    dz = lamp[0][2] - eye[2] - z
+    squared = max(dx * dx + dy * dy + dz * dz, 1e-6)
+    per_m = 1.0 / math.sqrt(squared)
+    to_eye = 1.0 / math.sqrt(x * x + y * y + z * z)
+    tangent2, cosine_h, incidence, to_lamp, cosine_eye = _half_tangent2(
+        dx * per_m, dy * per_m, dz * per_m, -x * to_eye, -y * to_eye, -z * to_eye, normal
+    )
+    # The lamp's disc blurs the mirror by half its angle.
+    rough = math.sqrt(rough * rough + 0.25 * lamp[7] / squared)
+    return glint(tangent2, cosine_h, incidence, to_lamp, cosine_eye, rough)
