@@ -52,7 +52,7 @@ def test_kernel_equals_definition(is_snow: bool) -> None:
         camera,
         DropCover(covers, distances, is_snow),
         extinction_per_m=sigma,
-        min_luminance_cd_m2=0,
+        min_luminance_cd_m2=0.0,
     )
     near, far = (
         cell_luminance(lamps, camera, d, is_snow=is_snow, extinction_per_m=sigma)

@@ -35,14 +35,12 @@ def glints(lamps: Lamps, camera: Camera, water: WetSurface, **options: float) ->
 def test_mirrored_lamp_lies_on_the_mirrored_pixel(distance_m: float, y_m: float) -> None:
     camera = camera_at(EYE_M, width=600, height=400, focal_px=500)
     lamp = lamps_at([(distance_m, y_m, LAMP_M)], radius_m=0.01)
-    picture = glints(lamp, camera, flat_water(camera, 0.006))[..., 1]
-    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
-    row = float((picture * rows).sum() / picture.sum())
-    column = float((picture * columns).sum() / picture.sum())
+    picture = glints(lamp, camera, flat_water(camera, 0.003))[..., 1]
+    row, column = np.array(np.unravel_index(picture.argmax(), picture.shape)) + 0.5
     expected_row = camera.cy + camera.fy * (EYE_M + LAMP_M) / distance_m
     expected_column = camera.cx - camera.fx * y_m / distance_m
-    assert abs(row - expected_row) < 1
-    assert abs(column - expected_column) < 1
+    assert abs(row - expected_row) <= 1
+    assert abs(column - expected_column) <= 1
 
 
 def test_mirror_has_the_energy_of_fresnels_share() -> None:
@@ -60,10 +58,20 @@ def test_mirror_has_the_energy_of_fresnels_share() -> None:
     assert lux == pytest.approx(expected, rel=0.03)
 
 
+def test_light_of_a_far_streak_does_not_depend_on_where_the_pixels_are() -> None:
+    camera = camera_at(EYE_M, width=120, height=200, focal_px=500)
+    water = flat_water(camera, 0.02)
+    sums = [
+        glints(lamps_at([(50.0, y_m, LAMP_M)], radius_m=0.01), camera, water).sum()
+        for y_m in (0.0, 0.025, 0.05, 0.075)  # a quarter of a pixel apart
+    ]
+    assert max(sums) / min(sums) < 1.03
+
+
 def test_streak_is_as_many_times_longer_than_wide_as_the_grazing_angle_says() -> None:
     camera = camera_at(EYE_M, width=800, height=500, focal_px=1500, pitch_deg=6)
     lamp = lamps_at([(30.0, 0, LAMP_M)], radius_m=0.001)
-    picture = glints(lamp, camera, flat_water(camera, 0.01))[..., 1].astype(np.float64)
+    picture = glints(lamp, camera, flat_water(camera, 0.03))[..., 1].astype(np.float64)
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     total = picture.sum()
     row = (picture * rows).sum() / total
@@ -149,5 +157,3 @@ def test_images_of_other_sizes_are_refused() -> None:
     water = flat_water(camera, 0.1)
     with pytest.raises(ValueError, match="picture must be"):
         add_wet_glints(np.zeros((3, 3, 3), np.float32), lamps_at([(9, 0, 1)]), camera, water)
-    with pytest.raises(ValueError, match="depth_m must be"):
-        WetSurface(water.share, water.roughness, water.depth_m[1:], water.up)
