@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from recipes.effect import Column, EffectModel
-from recipes.fields import Angle, ClosedModel, Digest, FilePath, Flag, Number, Unit
+from recipes.fields import Angle, ClosedModel, Digest, FilePath, Number, Unit
 
 # Mean luminance of the sky by hour, cd/m2: pi times as many lux on level ground. 400 lx fall at
 # sunset and 3.4 lx at the dark end of civil twilight; dusk lies between. Over cities the night sky

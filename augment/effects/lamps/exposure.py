@@ -1,7 +1,7 @@
 """Exposure of a camera at dusk and night: from luminance to the light of a display, and noise.
 
-A scene of luminance L gives the sensor E = pi L T / (4 N^2) lux, with the lens's transmittance T and
-f-number N. A sensor of ISO speed S saturates at an exposure of 78 / S lux seconds (ISO 12232,
+A scene of luminance L gives the sensor E = pi L T / (4 N^2) lux, with the lens's transmittance T
+and f-number N. A sensor of ISO speed S saturates at an exposure of 78 / S lux seconds (ISO 12232,
 saturation-based speed). A pixel counts photons: 4.1e15 a lumen second at 555 nm.
 
 At 1 cd/m2, f/2, 10 ms, 3 um and a quantum efficiency of 0.6 these are 39 electrons.

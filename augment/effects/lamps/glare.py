@@ -9,12 +9,13 @@ each normalised to 1 within RADIUS_DEG. Of the eye they have 48 % and 14 %. A cl
 scatters far less: 2 % in f1 and 1 % in f2 (assumed), times the recipe's `glare`.
 
 Only light beyond saturation is scattered, since the rest changes nothing that is seen. A tail is a
-sum of Gaussians, one an octave, each as heavy as the tail's ring of that octave. Each is computed in
-pixels as coarse as it is wide.
+sum of Gaussians, one an octave, each as heavy as the tail's ring of that octave. Each is computed
+in pixels as coarse as it is wide.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import cv2
@@ -92,7 +93,7 @@ def tail_levels(focal_px: float, side_px: int) -> list[float]:
         NARROW_SHARE * _share_within(edge, 3) + WIDE_SHARE * _share_within(edge, 2)
         for edge in edges
     ]
-    return [max(outer - inner, 0.0) for inner, outer in zip(within, within[1:], strict=False)]
+    return [max(outer - inner, 0.0) for inner, outer in itertools.pairwise(within)]
 
 
 def _share_within(angle_deg: float, power: int) -> float:

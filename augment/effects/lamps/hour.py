@@ -94,7 +94,7 @@ def night_sky(light: Light, white_cd_m2: float, white: float) -> LatLongSky:
     """Return the sky of dusk or night in the codes of a day-lit picture.
 
     Luminance falls from (1 + glow) at the horizon to 1 overhead, times what gives the sky's
-    horizontal illuminance pi times its mean luminance. Below the horizon it stays as at the horizon.
+    horizontal illuminance pi times its mean luminance. Below the horizon it stays as it is there.
 
     Args:
         light: the recipe's section, of a dark hour.

@@ -144,3 +144,35 @@ def develop(light, glare, draws, numbers, code_table, out):
                     value += draw * np.float32(math.sqrt(variance))
                 value = min(max(value, zero), brightest)
                 out[i, j, k] = code_of_light(value, code_table)
+
+
+@kernel
+def find_reflectance(rgb, fog_share, airlight, numbers, light_table, out):
+    """Write the reflectance of surfaces, times the transmittance of the fog before them.
+
+    All floats are float32.
+
+    Args:
+        rgb: the picture, display-encoded, [H, W, 3].
+        fog_share: share of the airlight in each pixel, [H, W]; or empty [0, 0] for none.
+        airlight: linear light of the fog, [3].
+        numbers: linear light of white, least and greatest reflectance.
+        light_table: light by code.
+        out: output [H, W, 3].
+    """
+    white = numbers[0]
+    least = numbers[1]
+    most = numbers[2]
+    zero = np.float32(0)
+    one_f32 = np.float32(1)
+    has_fog = fog_share.shape[0] > 0
+    for i in prange(rgb.shape[0]):
+        for j in range(rgb.shape[1]):
+            share = zero
+            if has_fog:
+                share = min(max(fog_share[i, j], zero), one_f32)
+            through = one_f32 - share
+            for k in range(3):
+                light = light_of_code(max(rgb[i, j, k], zero), light_table)
+                light = (light - share * airlight[k]) / white
+                out[i, j, k] = min(max(light, least * through), most * through)

@@ -25,6 +25,10 @@ _MAX_CODE = 2.0
 _MAX_LIGHT = 6.25
 # Light, of saturation, that lamps must add for a saturated pixel to be theirs.
 MIN_LAMP_LIGHT = 0.1
+# Least reflectance of a surface; darker colours are shadows of the day.
+MIN_REFLECTANCE = 0.02
+# Greatest reflectance of a surface.
+MAX_REFLECTANCE = 0.9
 _NONE = np.zeros((0, 0, 3), np.float32)
 _NO_DRAWS = np.zeros((0, 0, 3), np.uint8)
 
@@ -161,3 +165,41 @@ def _developed_table() -> np.ndarray:
 def _table_lights() -> np.ndarray:
     """Return the light at each entry of a table of codes."""
     return (np.arange(round(_MAX_LIGHT**0.5 * ROOT_STEPS) + 2) / ROOT_STEPS) ** 2
+
+
+def find_reflectance(
+    rgb: Float32[np.ndarray, "H W 3"],
+    white: float,
+    fog_share: Float32[np.ndarray, "H W"] | None,
+    airlight_rgb: tuple[float, float, float],
+    *,
+    uses_kernels: bool = True,
+) -> Float32[np.ndarray, "H W 3"]:
+    """Return the reflectance of surfaces, times the transmittance of the fog before them.
+
+    Args:
+        rgb: the picture, display-encoded.
+        white: linear light of a white surface in it.
+        fog_share: share of the airlight in each pixel; None without fog.
+        airlight_rgb: colour of the fog, display-encoded.
+        uses_kernels: False for the plain definition.
+    """
+    airlight = linear_from_display(np.maximum(np.asarray(airlight_rgb), 0)).astype(np.float32)
+    if uses_kernels:
+        out = np.empty_like(rgb)
+        with kernel_threads(ROWS_PER_CHUNK):
+            light_kernels.find_reflectance(
+                np.ascontiguousarray(rgb),
+                np.zeros((0, 0), np.float32) if fog_share is None else fog_share,
+                airlight,
+                np.array([white, MIN_REFLECTANCE, MAX_REFLECTANCE], np.float32),
+                _light_table(),
+                out,
+            )
+        return out
+    share = np.zeros(rgb.shape[:2]) if fog_share is None else np.clip(fog_share, 0, 1)
+    share = share[..., None].astype(np.float64)
+    light = linear_from_display(np.maximum(rgb, 0).astype(np.float64))
+    light = (light - share * airlight) / white
+    bounds = MIN_REFLECTANCE * (1 - share), MAX_REFLECTANCE * (1 - share)
+    return np.clip(light, *bounds).astype(np.float32)
