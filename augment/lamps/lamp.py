@@ -227,11 +227,11 @@ _RGB_FROM_XYZ = np.array(
 def color_of_chromaticity(x: float, y: float) -> Float64[np.ndarray, "3"]:
     """Return the linear sRGB colour of luminance 1 of CIE 1931 coordinates x, y.
 
+    Colours outside sRGB lose their negative channels, and keep luminance 1.
+
     Args:
         x: red share of the chromaticity.
         y: green share of the chromaticity, > 0.
-
-    Colours outside sRGB lose their negative channels, and keep luminance 1.
     """
     rgb = np.maximum(_RGB_FROM_XYZ @ np.array([x / y, 1.0, (1 - x - y) / y]), 0.0)
     return rgb / (rgb @ np.array(LUMINANCE_WEIGHTS))
