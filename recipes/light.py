@@ -126,9 +126,9 @@ class Light(EffectModel):
     glare: Number = Field(default=1.0, ge=0, le=20)
     """Light that lens and glass scatter around bright lamps: 1 for a clean lens, whose halo has 3 %
     of it; 3 to 10 wet or dirty, 0 none."""
-    noise: Number = Field(default=1.0, ge=0, le=4)
-    """Noise of the picture at dusk and night, over that of its electrons and their reading; 0
-    none."""
+    noise: Number = Field(default=0.4, ge=0, le=4)
+    """Noise of the picture at dusk and night, over that of its electrons and their reading: 1 raw,
+    0.4 as cameras' denoising leaves it, 0 none."""
     digest: Digest | None = None
     """SHA-256 over what the file above holds; checked where given, worked out where null."""
 

@@ -169,7 +169,9 @@ def render_buffers(
         rendered = _edit_around_own_car(view, rendered, camera, own_car, car_rgb, color_map)
     rgb = rendered.rgb
     is_exposed = any(effect.hooks.sees_exposure for effect in view.effects)
-    if color_map is not None and not is_exposed:  # a camera exposes what the weather has left, so this comes last
+    if (
+        color_map is not None and not is_exposed
+    ):  # a camera exposes what the weather has left, so this comes last
         with timed("camera colour map"):
             rgb = apply_color_map(rgb, color_map, backend=backend)
     if plan.sensor.psf_px > 0:
@@ -248,7 +250,9 @@ def _edit_image(
     if color_map is not None and effect.hooks.sees_exposure:
         with timed("camera colour map"):
             rgb = rendered.rgb.clone()  # which may be the recorded image
-            rendered = replace(rendered, rgb=apply_color_map(rgb, color_map, backend=effect.backend))
+            rendered = replace(
+                rendered, rgb=apply_color_map(rgb, color_map, backend=effect.backend)
+            )
     return effect.hooks.edit_image(effect, rendered, camera)
 
 

@@ -97,13 +97,14 @@ class LampsEffect(Effect):
         plan = None
         if light is not None and not why:
             hour = find_hour(light, scene, is_foul=is_foul(recipe))
-            has_maps = bool(scene.color_mapped_cameras)
-            plan = make_light_plan(recipe, light, hour, has_color_maps=has_maps)
+            plan = make_light_plan(recipe, scene, light, hour)
             if not plan.has_lamps and not hour.is_dark:
                 why = f"no lamp is on: {auto_reason(recipe, hour)[1]}"
         if plan is None or why:
             sky = skipped_steps(SKY_STEPS, why, SCENE)
-            return EffectPlan(None, (*sky, *skipped_steps((*LAMP_STEPS, *CAMERA_STEPS), why, PICTURE)))
+            return EffectPlan(
+                None, (*sky, *skipped_steps((*LAMP_STEPS, *CAMERA_STEPS), why, PICTURE))
+            )
         lamp_reason = describe_lamps(plan, scene, auto_reason(recipe, plan.hour)[1])
         exposure_reason = exposure_of(plan, scene).reason if plan.hour.is_dark else ""
         steps = steps_of(plan, lamp_reason, exposure_reason)

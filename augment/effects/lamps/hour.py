@@ -35,9 +35,9 @@ FOUL_LUX = 5_000.0
 # Elevation above which the glow of the horizon has fallen to 1/e, degrees.
 GLOW_HEIGHT_DEG = 12.0
 # Linear colours of the sky overhead, before they get luminance 1.
-_ZENITH_TINTS = {"dusk": (0.55, 0.80, 1.60), "night": (0.85, 0.95, 1.25)}
+_ZENITH_TINTS = {"dusk": (0.45, 0.90, 1.75), "night": (0.85, 0.95, 1.25)}
 # Linear colours of the glow at the horizon, before they get luminance 1.
-_GLOW_TINTS = {"dusk": (1.45, 0.95, 0.75), "night": (1.35, 0.95, 0.65)}
+_GLOW_TINTS = {"dusk": (1.20, 0.98, 0.85), "night": (1.35, 0.95, 0.65)}
 # Rows of the sky's image over 180 degrees.
 _SKY_ROWS = 360
 # Columns of the sky's image, which is the same all around.

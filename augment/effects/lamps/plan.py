@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from augment.effects.effect import PICTURE, SCENE, Step
 from augment.effects.lamps.hour import Hour
+from augment.scene.scene import Scene
 from recipes.fields import section_at
 from recipes.light import Light
 from recipes.schema import Recipe
@@ -35,6 +36,9 @@ CAMERA_STEPS = (RELIGHT, GLARE, SENSOR)
 class LightPlan:
     """Numbers of the hour and the lamps in a scene, `EffectPlan.data` of `LampsEffect`."""
 
+    scene: Scene = field(repr=False, compare=False)
+    """The scene, which labels look up their lamps in."""
+
     light: Light
     """The recipe's section."""
 
@@ -62,6 +66,9 @@ class LightPlan:
     has_drops: bool
     """True if rain or snow falls through the lamps' light."""
 
+    extinction_per_m: float
+    """Extinction of the fog, 1/m; 0 without fog."""
+
     uses_color_map: bool
     """True if pictures have their cameras' colour maps."""
 
@@ -88,14 +95,14 @@ def is_foul(recipe: Recipe) -> bool:
     return _foul_weather(recipe) != ""
 
 
-def make_light_plan(recipe: Recipe, light: Light, hour: Hour, *, has_color_maps: bool) -> LightPlan:
+def make_light_plan(recipe: Recipe, scene: Scene, light: Light, hour: Hour) -> LightPlan:
     """Return the plan.
 
     Args:
         recipe: the recipe.
+        scene: the scene.
         light: its section.
         hour: light of the sky.
-        has_color_maps: True if the scene's cameras have colour maps.
     """
     is_auto_on = auto_reason(recipe, hour)[0]
     own_beam: str = light.own_beams
@@ -109,6 +116,7 @@ def make_light_plan(recipe: Recipe, light: Light, hour: Hour, *, has_color_maps:
     is_wet = (section_at(recipe, "weather.rain.ground_wetness") or 0.0) > 0
     speed = recipe.render.speed
     return LightPlan(
+        scene=scene,
         light=light,
         hour=hour,
         seed=recipe.seed,
@@ -118,7 +126,8 @@ def make_light_plan(recipe: Recipe, light: Light, hour: Hour, *, has_color_maps:
         has_air=any(extinction > 0 for extinction in extinctions),
         is_wet=is_wet or recipe.weather.flood is not None,
         has_drops=any(rate > 0 for rate in extinctions[1:]),
-        uses_color_map=has_color_maps and recipe.render.exposure != "neutral",
+        extinction_per_m=extinctions[0],
+        uses_color_map=bool(scene.color_mapped_cameras) and recipe.render.exposure != "neutral",
         lamp_points=speed.lamp_points,
         lamp_halo_px=speed.lamp_halo_px,
         lamps_per_pixel=speed.lamps_per_pixel,
@@ -179,27 +188,26 @@ def steps_of(plan: LightPlan, lamp_reason: str, exposure_reason: str) -> tuple[S
         Step(
             AIR,
             has_lamps and plan.has_air,
-            f"fog, rain or snowfall scatters light: {speed}" if plan.has_air else "the air is clear",
+            f"fog, rain or snowfall scatters light: {speed}"
+            if plan.has_air
+            else "the air is clear",
             PICTURE,
         ),
         Step(
             DROPS,
             has_lamps and is_dark and plan.has_drops,
-            "drops and flakes fall through the lamps' light"
-            if plan.has_drops
-            else "nothing falls",
+            "drops and flakes fall through the lamps' light" if plan.has_drops else "nothing falls",
             PICTURE,
         ),
         Step(EMITTERS, has_lamps, lamps_at_hour, PICTURE),
-        Step(RELIGHT, True, f"{plan.hour.reason}; {exposure_reason if is_dark else by_day}", PICTURE),
+        Step(
+            RELIGHT, True, f"{plan.hour.reason}; {exposure_reason if is_dark else by_day}", PICTURE
+        ),
         Step(
             GLARE,
             is_dark and light.glare > 0,
             f"light.glare is {light.glare:g}" if is_dark else by_day,
             PICTURE,
         ),
-        Step(
-            SENSOR, is_dark, f"light.noise is {light.noise:g}" if is_dark else by_day, PICTURE
-        ),
+        Step(SENSOR, is_dark, f"light.noise is {light.noise:g}" if is_dark else by_day, PICTURE),
     )
-

@@ -1,0 +1,137 @@
+"""Luminance that lamps add to a picture: on surfaces, in the air, and by the lamps themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float32
+
+from augment.effects.effect import EffectInScene, RenderedView
+from augment.effects.lamps.picture_light import find_reflectance
+from augment.effects.lamps.plan import AIR, EMITTERS, SURFACES, LightPlan
+from augment.lamps.air_light import air_light
+from augment.lamps.beam_shadows import draw_beam_shadows
+from augment.lamps.emitters import add_emitters, lamp_visibility
+from augment.lamps.fog_phase import AirExtinction
+from augment.lamps.lamp import Lamps
+from augment.lamps.surface_light import surface_light
+from augment.render.buffers import REFERENCE
+from augment.render.constants import SURFACE_ALPHA
+from augment.render.scatter import scattered_share
+from augment.scene.cameras import Camera
+from augment.timing import timed
+
+
+def add_lamp_light(
+    effect: EffectInScene,
+    view: RenderedView,
+    camera: Camera,
+    rgb: Float32[np.ndarray, "H W 3"],
+    white: float,
+    threshold_cd_m2: float,
+) -> Float32[np.ndarray, "H W 3"] | None:
+    """Return the luminance that lamps add to each pixel, cd/m2 in linear sRGB; None without lamps.
+
+    Args:
+        effect: the effect in the scene, with the view's lamps.
+        view: the picture before it, with its layers and buffers.
+        camera: the view.
+        rgb: the picture, display-encoded, in the camera's exposure.
+        white: linear light of a white surface in it.
+        threshold_cd_m2: luminance that need not be added, cd/m2.
+    """
+    plan: LightPlan = effect.settings
+    lamps: Lamps = effect.view_data
+    if lamps is None or len(lamps) == 0:
+        return None
+    raster = view.raster
+    assert raster.alpha is not None and raster.expected_depth is not None
+    alpha = np.ascontiguousarray(raster.alpha.detach().cpu().numpy(), np.float32)
+    z = np.ascontiguousarray(raster.expected_depth.detach().cpu().numpy(), np.float32)
+    depth_m = np.where((alpha >= SURFACE_ALPHA) & np.isfinite(z), z, np.float32(0))
+    air = air_of(effect, view)
+    added = np.zeros_like(rgb)
+    if plan.hour.is_dark:
+        with timed(SURFACES):
+            _add_surface_light(effect, view, camera, rgb, white, depth_m, air, threshold_cd_m2, added)
+    with timed(EMITTERS):
+        visible_shares = lamp_visibility(lamps, camera, depth_m, alpha)
+    if not air.is_clear:
+        with timed(AIR):
+            lengths = camera.ray_lengths().numpy()
+            distance_m = np.where(depth_m > 0, depth_m * lengths, np.float32(np.inf))
+            added += air_light(
+                lamps,
+                camera,
+                distance_m.astype(np.float32),
+                air,
+                num_points=plan.lamp_points,
+                step_px=plan.lamp_halo_px,
+                threshold_cd_m2=threshold_cd_m2,
+                visible_shares=visible_shares,
+            )
+    with timed(EMITTERS):
+        add_emitters(added, lamps, camera, visible_shares, air)
+    return added
+
+
+def air_of(effect: EffectInScene, view: RenderedView) -> AirExtinction:
+    """Return the extinction of fog, rain and snowfall in a view."""
+    per_m = 0.0
+    kind = "rain"
+    for other in effect.earlier_effects:
+        sizes = getattr(other.settings, "sizes", None)
+        if other.hooks.name in ("rain", "snowfall") and sizes is not None:
+            per_m += sizes.extinction_per_m
+            kind = "snow" if other.hooks.name == "snowfall" else kind
+    fog = next((o.settings.fog for o in effect.earlier_effects if o.hooks.name == "smog"), None)
+    return AirExtinction(fog, per_m, "snow" if kind == "snow" else "rain")
+
+
+def _add_surface_light(
+    effect: EffectInScene,
+    view: RenderedView,
+    camera: Camera,
+    rgb: np.ndarray,
+    white: float,
+    depth_m: np.ndarray,
+    air: AirExtinction,
+    threshold_cd_m2: float,
+    added: np.ndarray,
+) -> None:
+    """Add the light of surfaces under lamps, as it arrives through the fog before them."""
+    plan: LightPlan = effect.settings
+    lamps: Lamps = effect.view_data
+    fog = view.layers.fog
+    fog_share = None
+    airlight_rgb = (0.0, 0.0, 0.0)
+    if fog is not None:
+        share = view.raster.fog_share
+        if share is None:
+            alpha = view.raster.alpha
+            depth = view.raster.expected_depth
+            assert alpha is not None and depth is not None
+            share = scattered_share(alpha, depth, camera, fog, backend=effect.backend)
+        fog_share = np.ascontiguousarray(share.detach().cpu().numpy(), np.float32)
+        airlight_rgb = fog.airlight_rgb
+    reflectance = find_reflectance(
+        rgb, white, fog_share, airlight_rgb, uses_kernels=effect.backend != REFERENCE
+    )
+    shadows = draw_beam_shadows(
+        lamps,
+        tuple(view.layers.parts),
+        settings=view.layers.settings,
+        backend=effect.backend,
+        timestamp_ns=camera.timestamp_ns,
+    )
+    eyes = np.tile(camera.centre.numpy(), (len(lamps), 1))
+    surface_light(
+        lamps,
+        camera,
+        depth_m,
+        reflectance,
+        extinctions_per_m=air.mean_extinction_per_m(eyes, lamps.positions_m),
+        min_luminance_cd_m2=threshold_cd_m2,
+        lamps_per_pixel=plan.lamps_per_pixel,
+        shadows=shadows,
+        picture=added,
+    )
