@@ -37,7 +37,7 @@ class RoadHeights:
     heights_m: Float[np.ndarray, "C"]
     """Median height of each square, metres."""
     other_height_m: float | None
-    """Height where no square is near; None where it is not known."""
+    """Height of a scene without squares; None where it is not known."""
 
     def height_at(self, position_m: Float[np.ndarray, "3"], default_m: float) -> float:
         """Return the height of the ground at a place, metres.
@@ -60,13 +60,9 @@ class RoadHeights:
 
 def _find_heights(scene: Scene) -> RoadHeights:
     """Return the median height of the ground's Gaussians in squares."""
-    try:
-        other_height_m = ground_of(scene).median_z_m
-    except ClimateGSError:  # without metres or a level world
-        other_height_m = None
     background = scene.background
     if background.semantic is None:
-        return RoadHeights(None, np.zeros(0), other_height_m)
+        return RoadHeights(None, np.zeros(0), _median_height_m(scene))
     classes = np.array([int(c) for c in _GROUND_CLASSES])
     is_ground = np.isin(background.semantic.numpy(), classes)
     points = background.means.detach().numpy()[is_ground].astype(np.float64)
@@ -79,6 +75,14 @@ def _find_heights(scene: Scene) -> RoadHeights:
     heights = points[order[(ends - counts) + counts // 2], 2] if len(counts) else np.zeros(0)
     is_dense = counts >= _MIN_IN_CELL
     if not is_dense.any():
-        return RoadHeights(None, np.zeros(0), other_height_m)
+        return RoadHeights(None, np.zeros(0), _median_height_m(scene))
     middles = (unique_cells[is_dense] + 0.5) * CELL_M
-    return RoadHeights(KDTree(middles), heights[is_dense], other_height_m)
+    return RoadHeights(KDTree(middles), heights[is_dense], None)
+
+
+def _median_height_m(scene: Scene) -> float | None:
+    """Return the height of the scene's ground; None without metres or a level world."""
+    try:
+        return ground_of(scene).median_z_m
+    except ClimateGSError:
+        return None
