@@ -6,7 +6,8 @@ Spencer et al. 1995 ("Physically-based glare effects for digital images", photop
     f1 ~ 1 / (theta + 0.02)^3        f2 ~ 1 / (theta + 0.02)^2        theta in degrees
 
 each normalised to 1 within RADIUS_DEG. Of the eye they have 48 % and 14 %. A clean camera lens
-scatters far less: 2 % in f1 and 1 % in f2 (assumed), times the recipe's `glare`.
+scatters far less: 2 % in f1 and 1 % in f2 (assumed), times the recipe's `glare`. All but the
+innermost pixels of the tails is taken from the core, which needs no change: it is saturated.
 
 Only light beyond saturation is scattered, since the rest changes nothing that is seen. A tail is a
 sum of Gaussians, one an octave, each as heavy as the tail's ring of that octave. Each is computed
@@ -78,8 +79,8 @@ def add_glare(
 def tail_levels(focal_px: float, side_px: int) -> list[float]:
     """Return the share of a lamp's light in the Gaussian of each octave, finest first.
 
-    The last octave has what lies beyond it, and the first what lies within; together they have
-    NARROW_SHARE + WIDE_SHARE.
+    What the tails have within the first octave is the core's, and stays where it is. The last
+    octave has all that lies beyond it.
 
     Args:
         focal_px: focal length, pixels.
@@ -88,7 +89,8 @@ def tail_levels(focal_px: float, side_px: int) -> list[float]:
     count = max(1, math.ceil(math.log2(max(side_px, 8) / (8 * _FINEST_PX))))
     pixel_deg = math.degrees(1 / focal_px)
     middles = [_MEDIAN_RADIUS * _SIGMA * _FINEST_PX * 2**i * pixel_deg for i in range(count)]
-    edges = [0.0, *(math.sqrt(2) * middle for middle in middles[:-1]), RADIUS_DEG]
+    root = math.sqrt(2)
+    edges = [middles[0] / root, *(root * middle for middle in middles[:-1]), RADIUS_DEG]
     within = [
         NARROW_SHARE * _share_within(edge, 3) + WIDE_SHARE * _share_within(edge, 2)
         for edge in edges

@@ -13,6 +13,7 @@ from augment.lamps.beam_shadows import draw_beam_shadows
 from augment.lamps.emitters import add_emitters, lamp_visibility
 from augment.lamps.fog_phase import AirExtinction
 from augment.lamps.lamp import Lamps
+from augment.lamps.recorded_lamps import find_recorded_lamps, moving_vehicle_mask
 from augment.lamps.surface_light import surface_light
 from augment.render.buffers import REFERENCE
 from augment.render.constants import SURFACE_ALPHA
@@ -41,18 +42,21 @@ def add_lamp_light(
     """
     plan: LightPlan = effect.settings
     lamps: Lamps = effect.view_data
+    recorded = _recorded_light(effect, view, camera)
     if lamps is None or len(lamps) == 0:
-        return None
+        return recorded
     raster = view.raster
     assert raster.alpha is not None and raster.expected_depth is not None
     alpha = np.ascontiguousarray(raster.alpha.detach().cpu().numpy(), np.float32)
     z = np.ascontiguousarray(raster.expected_depth.detach().cpu().numpy(), np.float32)
     depth_m = np.where((alpha >= SURFACE_ALPHA) & np.isfinite(z), z, np.float32(0))
     air = air_of(effect, view)
-    added = np.zeros_like(rgb)
+    added = np.zeros_like(rgb) if recorded is None else recorded
     if plan.hour.is_dark:
         with timed(SURFACES):
-            _add_surface_light(effect, view, camera, rgb, white, depth_m, air, threshold_cd_m2, added)
+            _add_surface_light(
+                effect, view, camera, rgb, white, depth_m, air, threshold_cd_m2, added
+            )
     with timed(EMITTERS):
         visible_shares = lamp_visibility(lamps, camera, depth_m, alpha)
     if not air.is_clear:
@@ -85,6 +89,28 @@ def air_of(effect: EffectInScene, view: RenderedView) -> AirExtinction:
             kind = "snow" if other.hooks.name == "snowfall" else kind
     fog = next((o.settings.fog for o in effect.earlier_effects if o.hooks.name == "smog"), None)
     return AirExtinction(fog, per_m, "snow" if kind == "snow" else "rain")
+
+
+def _recorded_light(
+    effect: EffectInScene, view: RenderedView, camera: Camera
+) -> Float32[np.ndarray, "H W 3"] | None:
+    """Return the luminance of lamps that a recorded picture shows lit; None without any.
+
+    By day they are in the picture already.
+    """
+    photo = view.layers.photo
+    plan: LightPlan = effect.settings
+    if photo is None or not plan.hour.is_dark or not plan.has_vehicle_lamps:
+        return None
+    with timed(EMITTERS):
+        found = find_recorded_lamps(photo.pixels, moving_vehicle_mask(effect.scene, camera))
+        if not found.lamps:
+            return None
+        luminance = found.luminance_cd_m2
+        if view.raster.fog_share is not None:
+            share = view.raster.fog_share.detach().cpu().numpy()
+            luminance = luminance * (1 - np.clip(share, 0, 1))[..., None]
+    return np.ascontiguousarray(luminance, np.float32)
 
 
 def _add_surface_light(

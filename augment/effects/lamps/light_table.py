@@ -44,9 +44,7 @@ LIGHT_TABLE = BoxTable(
 )
 
 
-def measure_light(
-    boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
-) -> dict[str, np.ndarray]:
+def measure_light(boxes: WorldBoxes, camera: Camera, inputs: LabelInputs) -> dict[str, np.ndarray]:
     """Return the stored columns of LIGHT_TABLE."""
     count = len(boxes)
     columns = {

@@ -15,10 +15,7 @@ from augment.scene.sky import sample_at
 
 
 def replace_photo_sky(
-    rgb: Float32[np.ndarray, "H W 3"],
-    view: RenderedView,
-    camera: Camera,
-    color_map: Tensor | None,
+    rgb: Float32[np.ndarray, "H W 3"], view: RenderedView, camera: Camera, color_map: Tensor | None
 ) -> Float32[np.ndarray, "H W 3"]:
     """Return the picture with the sky of `view.layers` in place of the recorded one.
 

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from augment.effects.lamps.plan import LightPlan
-from augment.errors import SceneError
-from augment.lamps.lamp import (
-    AMBER,
-    GREEN,
-    MAX_LAMPS,
-    RED,
-    LampKind,
-    Lamps,
-    color_of_temperature,
-)
-from augment.lamps.lamp_types import LampType, make_lamps
-from augment.lamps.patterns import Pattern
+from augment.errors import LampError
+from augment.lamps.ies import MAX_BYTES, IesLuminaire, parse_ies
+from augment.lamps.lamp import AMBER, GREEN, MAX_LAMPS, RED, LampKind, Lamps
+from augment.lamps.street_lamps import ListedLamp as LampEntry
+from augment.lamps.street_lamps import StreetLampSettings, listed_lamps, street_lamps
 from augment.lamps.vehicle_lamps import (
     OwnLampSettings,
     VehicleLampSettings,
@@ -28,6 +22,7 @@ from augment.lamps.vehicle_lamps import (
 from augment.memo import memo_of
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
+from recipes.files import read_files
 from recipes.light import Light, ListedLamp
 
 # Distance from the camera beyond which lamps are left out, metres.
@@ -36,15 +31,15 @@ MAX_DISTANCE_M = 500.0
 _MARGIN = 0.1
 # Luminous intensity below which a lamp is dark, candela.
 _MIN_CD = 1e-3
-_KINDS: dict[str, tuple[LampKind, Pattern]] = {
-    "street": (LampKind.STREET, Pattern.STREET),
-    "dipped": (LampKind.DIPPED, Pattern.DIPPED_RIGHT),
-    "high": (LampKind.HIGH, Pattern.HIGH_BEAM),
-    "tail": (LampKind.TAIL, Pattern.REAR),
-    "stop": (LampKind.STOP, Pattern.REAR),
-    "signal": (LampKind.SIGNAL, Pattern.SIGNAL),
-    "flood": (LampKind.OTHER, Pattern.LAMBERT),
-    "bulb": (LampKind.OTHER, Pattern.ISOTROPIC),
+_KINDS = {
+    "street": LampKind.STREET,
+    "dipped": LampKind.DIPPED,
+    "high": LampKind.HIGH,
+    "tail": LampKind.TAIL,
+    "stop": LampKind.STOP,
+    "signal": LampKind.SIGNAL,
+    "flood": LampKind.WINDOW,
+    "bulb": LampKind.OTHER,
 }
 _COLORS = {"red": RED, "amber": AMBER, "green": GREEN}
 
@@ -72,10 +67,14 @@ def lamps_of_view(plan: LightPlan, scene: Scene, camera: Camera) -> Lamps:
         column = camera.fx * points[:, 0] / z + camera.cx
         row = camera.fy * points[:, 1] / z + camera.cy
         margin_px = _MARGIN * camera.width
-        is_near &= (points[:, 2] > 0.2) & (np.abs(column - camera.width / 2) < margin_px + camera.width / 2)
+        is_near &= (points[:, 2] > 0.2) & (
+            np.abs(column - camera.width / 2) < margin_px + camera.width / 2
+        )
         is_near &= np.abs(row - camera.height / 2) < margin_px + camera.height / 2
     if is_near.sum() > MAX_LAMPS:
-        is_near[np.argsort(np.where(is_near, distances_m, math.inf), kind="stable")[MAX_LAMPS:]] = False
+        is_near[np.argsort(np.where(is_near, distances_m, math.inf), kind="stable")[MAX_LAMPS:]] = (
+            False
+        )
     return lamps.select(is_near)
 
 
@@ -130,41 +129,55 @@ def describe_lamps(plan: LightPlan, scene: Scene, reason: str) -> str:
 
 def _make_fixed(plan: LightPlan, scene: Scene) -> Lamps:
     """Make the lamps that do not move."""
+    light = plan.light
     parts = []
-    if plan.light.lamps:
-        parts.append(_listed_lamps(plan.light, scene))
+    if plan.has_street_lamps:
+        settings = StreetLampSettings(
+            flux_lm=light.street_lumen,
+            temperature_k=light.street_kelvin,
+            spacing_m=light.street_spacing_m,
+            height_m=light.street_height_m,
+            luminaire=_luminaire(light),
+        )
+        parts.append(street_lamps(scene, settings))
+    if light.lamps:
+        entries = [_entry(lamp) for lamp in light.lamps]
+        lamps = listed_lamps(scene, entries)
+        colors = lamps.colors.copy()
+        for row, lamp in enumerate(light.lamps):
+            colors[row] = _COLORS.get(lamp.color, colors[row])
+        radii_m = np.array([lamp.radius_m for lamp in light.lamps])
+        parts.append(replace(lamps, colors=colors, radii_m=radii_m))
     return Lamps.concatenate(parts)
 
 
-def _listed_lamps(light: Light, scene: Scene) -> Lamps:
-    """Return the lamps of the recipe's list."""
-    return Lamps.concatenate(
-        [_listed_lamp(lamp, f"light.lamps[{i}]", scene) for i, lamp in enumerate(light.lamps or ())]
-    )
-
-
-def _listed_lamp(lamp: ListedLamp, path: str, scene: Scene) -> Lamps:
-    """Return one lamp of the recipe's list.
+def _luminaire(light: Light) -> IesLuminaire | None:
+    """Return the luminaire of the recipe's file; None without one.
 
     Raises:
-        SceneError: the lamp is below the ground.
+        RecipeError: the file cannot be read, or has changed.
+        LampError: it is no IES file.
     """
-    position = np.array([[lamp.x_m, lamp.y_m, lamp.z_m]]) - scene.world_origin_m
-    if scene.ground_z_m is not None and position[0, 2] < scene.ground_z_m - 1.0:
-        raise SceneError(
-            f"{path} is at z = {lamp.z_m:g} m, below the ground of scene {scene.name!r} at "
-            f"{scene.ground_z_m + scene.world_origin_m[2]:.2f} m; raise it, or remove it"
+    if light.street_ies is None:
+        return None
+    where = f"light.street_ies = {light.street_ies!r}"
+    content = read_files(light)["street_ies"]
+    if len(content) > MAX_BYTES:
+        raise LampError(
+            f"{where}: an IES file may have at most {MAX_BYTES:,} bytes; got {len(content):,}"
         )
-    kind, pattern = _KINDS[lamp.kind]
+    return parse_ies(content.decode("latin-1"), where)
+
+
+def _entry(lamp: ListedLamp) -> LampEntry:
+    """Return a lamp of the recipe's list as `listed_lamps` takes it."""
     azimuth = math.radians(lamp.azimuth_deg)
     elevation = math.radians(0.0 if lamp.kind == "street" else lamp.elevation_deg)
     level = math.cos(elevation)
-    axis = np.array([[level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)]])
-    up = (0.0, 0.0, 1.0)
-    if abs(axis[0, 2]) > 0.999:
-        up = (math.cos(azimuth), math.sin(azimuth), 0.0)
-    white = color_of_temperature(lamp.kelvin)
-    lamp_type = LampType(
-        kind, pattern, lamp.candela, _COLORS.get(lamp.color, white), lamp.radius_m
+    return LampEntry(
+        (lamp.x_m, lamp.y_m, lamp.z_m),
+        (level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)),
+        lamp.candela,
+        _KINDS[lamp.kind],
+        lamp.kelvin,
     )
-    return make_lamps(position, axis, lamp_type, up=up)
