@@ -28,6 +28,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
+from augment.lamps.drop_cover import DropCover
+from augment.lamps.wet_surface import WetSurface
 from augment.output.box_tables import BoxTable
 from augment.render.buffers import RenderOutput
 from augment.scene.boxes import WorldBoxes
@@ -193,6 +195,12 @@ class RenderedView:
 
     skip_reasons: Mapping[str, str] = field(default_factory=dict)
     """Reason for each pass that proved needless while drawing, by the pass's name."""
+
+    wet_surface: WetSurface | None = None
+    """Water that mirrors lamps; None without any, or unless `layers.needs_lamp_inputs`."""
+
+    drop_covers: tuple[DropCover, ...] = ()
+    """Drops and flakes that lamps light; none unless `layers.needs_lamp_inputs`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ theta: angle between the normal and the lamp; sigma: extinction of the air betwe
 r: half a decimetre at least, so that a lamp that touches a surface does not burn a hole into it.
 The surface's luminance is rho E / pi. The air before the surface is the caller's.
 
-Light changes slowly over a surface. So the sum is taken at nodes, `step_px` apart, and spread to the
-pixels of the same surface, which have reflectances of their own. In a tile of nodes only the
+Light changes slowly over a surface. So the sum is taken at nodes, `step_px` apart, and spread to
+the pixels of the same surface, which have reflectances of their own. In a tile of nodes only the
 brightest lamps count. Lamps that add less than `min_luminance_cd_m2` to a white surface of a tile
 do not light it.
 
@@ -43,7 +43,7 @@ from augment.lamps.surface_light_kernels import (
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
-# Distance below which a lamp is no point, metres; the light of larger lamps softens at their radius.
+# Distance below which a lamp is no point, metres; that of larger lamps is their radius.
 MIN_SOFTENING_M = 0.15
 # Largest reflectance of a surface.
 MAX_REFLECTANCE = 0.9
@@ -89,8 +89,9 @@ def find_nodes(
     """Return the nodes of a picture, with normals by its depth.
 
     A normal follows from the slopes of the inverse depth, on the side of the node that is smoother,
-    and is averaged with those about it. On ground, the normals are averaged over a wide window: a car's own lamps light a road at
-    so small an angle that each bump of the splats would throw a shadow.
+    and is averaged with those about it. On ground, the normals are averaged over a wide window: a
+    car's own lamps light a road at so small an angle that each bump of the splats would throw a
+    shadow.
 
     Args:
         camera: camera of the picture.
@@ -179,7 +180,9 @@ def surface_light(
     is_sign: np.ndarray | None = None,
     picture: Float32[np.ndarray, "H W 3"] | None = None,
 ) -> Float32[np.ndarray, "H W 3"]:
-    """Return the luminance of surfaces under lamps, cd/m2 in linear sRGB, without the air before them.
+    """Return the luminance of surfaces under lamps, without the air before them, cd/m2.
+
+    Colours are linear sRGB.
 
     Args:
         lamps: the lamps.

@@ -44,7 +44,7 @@ class NodeView(NamedTuple):
     """View of the nodes."""
 
     lens: Any
-    """1 / fx, 1 / fy (of pixels), cx, cy (pixels), pixels between nodes, pixel of the first node."""
+    """1 / fx, 1 / fy, cx, cy of pixels, pixels between nodes, middle of the first node's pixel."""
     axes: Any
     """World_from_camera, [3, 3]."""
     eye: Any
