@@ -135,7 +135,7 @@ class LampsEffect(Effect):
         with timed(NIGHT_SKY):
             white = white_level(find_scene_light(effect.lit_scene))
             sky = night_sky(plan.light, plan.hour.white_cd_m2, white)
-        return replace(layers, sky=sky)
+        return replace(layers, sky=sky, needs_lamp_inputs=plan.has_lamps)
 
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         if camera.is_orthographic:

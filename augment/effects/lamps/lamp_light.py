@@ -7,14 +7,16 @@ from jaxtyping import Float32
 
 from augment.effects.effect import EffectInScene, RenderedView
 from augment.effects.lamps.picture_light import find_reflectance
-from augment.effects.lamps.plan import AIR, EMITTERS, SURFACES, LightPlan
+from augment.effects.lamps.plan import AIR, DROPS, EMITTERS, SURFACES, WET, LightPlan
 from augment.lamps.air_light import air_light
 from augment.lamps.beam_shadows import draw_beam_shadows
+from augment.lamps.drop_light import add_drop_light
 from augment.lamps.emitters import add_emitters, lamp_visibility
 from augment.lamps.fog_phase import AirExtinction
 from augment.lamps.lamp import Lamps
 from augment.lamps.recorded_lamps import find_recorded_lamps, moving_vehicle_mask
 from augment.lamps.surface_light import surface_light
+from augment.lamps.wet_glints import add_wet_glints
 from augment.render.buffers import REFERENCE
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.scatter import scattered_share
@@ -53,10 +55,7 @@ def add_lamp_light(
     air = air_of(effect, view)
     added = np.zeros_like(rgb) if recorded is None else recorded
     if plan.hour.is_dark:
-        with timed(SURFACES):
-            _add_surface_light(
-                effect, view, camera, rgb, white, depth_m, air, threshold_cd_m2, added
-            )
+        _add_surface_light(effect, view, camera, rgb, white, depth_m, air, threshold_cd_m2, added)
     with timed(EMITTERS):
         visible_shares = lamp_visibility(lamps, camera, depth_m, alpha)
     if not air.is_clear:
@@ -73,6 +72,18 @@ def add_lamp_light(
                 threshold_cd_m2=threshold_cd_m2,
                 visible_shares=visible_shares,
             )
+    if plan.hour.is_dark and plan.has_drops:
+        with timed(DROPS):
+            eye = camera.centre.numpy()
+            for cover in view.drop_covers:
+                add_drop_light(
+                    added,
+                    lamps,
+                    camera,
+                    cover,
+                    extinction_per_m=float(air.mean_extinction_per_m(eye, eye + 1.0)),
+                    min_luminance_cd_m2=threshold_cd_m2,
+                )
     with timed(EMITTERS):
         add_emitters(added, lamps, camera, visible_shares, air)
     return added
@@ -124,40 +135,70 @@ def _add_surface_light(
     threshold_cd_m2: float,
     added: np.ndarray,
 ) -> None:
-    """Add the light of surfaces under lamps, as it arrives through the fog before them."""
+    """Add the light of surfaces and water under lamps, as it arrives through the fog before them."""
     plan: LightPlan = effect.settings
     lamps: Lamps = effect.view_data
+    with timed(SURFACES):
+        fog_share = _fog_share(effect, view, camera)
+        fog = view.layers.fog
+        reflectance = find_reflectance(
+            rgb,
+            white,
+            fog_share,
+            (0.0, 0.0, 0.0) if fog is None else fog.airlight_rgb,
+            uses_kernels=effect.backend != REFERENCE,
+        )
+        shadows = draw_beam_shadows(
+            lamps,
+            tuple(view.layers.parts),
+            settings=view.layers.settings,
+            backend=effect.backend,
+            timestamp_ns=camera.timestamp_ns,
+        )
+        eyes = np.tile(camera.centre.numpy(), (len(lamps), 1))
+        extinctions_per_m = air.mean_extinction_per_m(eyes, lamps.positions_m)
+        surface_light(
+            lamps,
+            camera,
+            depth_m,
+            reflectance,
+            extinctions_per_m=extinctions_per_m,
+            min_luminance_cd_m2=threshold_cd_m2,
+            lamps_per_pixel=plan.lamps_per_pixel,
+            shadows=shadows,
+            picture=added,
+        )
+    if not plan.is_wet:
+        return
+    with timed(WET):
+        if view.wet_surface is None:
+            return
+        glints = added if fog_share is None else np.zeros_like(added)
+        add_wet_glints(
+            glints,
+            lamps,
+            camera,
+            view.wet_surface,
+            extinctions_per_m=extinctions_per_m,
+            min_luminance_cd_m2=threshold_cd_m2,
+            lamps_per_pixel=plan.lamps_per_pixel,
+            shadows=shadows,
+        )
+        if fog_share is not None:
+            added += glints * (1 - np.clip(fog_share, 0, 1))[..., None]
+
+
+def _fog_share(
+    effect: EffectInScene, view: RenderedView, camera: Camera
+) -> Float32[np.ndarray, "H W"] | None:
+    """Return the share of the fog's airlight in each pixel; None without fog."""
     fog = view.layers.fog
-    fog_share = None
-    airlight_rgb = (0.0, 0.0, 0.0)
-    if fog is not None:
-        share = view.raster.fog_share
-        if share is None:
-            alpha = view.raster.alpha
-            depth = view.raster.expected_depth
-            assert alpha is not None and depth is not None
-            share = scattered_share(alpha, depth, camera, fog, backend=effect.backend)
-        fog_share = np.ascontiguousarray(share.detach().cpu().numpy(), np.float32)
-        airlight_rgb = fog.airlight_rgb
-    reflectance = find_reflectance(
-        rgb, white, fog_share, airlight_rgb, uses_kernels=effect.backend != REFERENCE
-    )
-    shadows = draw_beam_shadows(
-        lamps,
-        tuple(view.layers.parts),
-        settings=view.layers.settings,
-        backend=effect.backend,
-        timestamp_ns=camera.timestamp_ns,
-    )
-    eyes = np.tile(camera.centre.numpy(), (len(lamps), 1))
-    surface_light(
-        lamps,
-        camera,
-        depth_m,
-        reflectance,
-        extinctions_per_m=air.mean_extinction_per_m(eyes, lamps.positions_m),
-        min_luminance_cd_m2=threshold_cd_m2,
-        lamps_per_pixel=plan.lamps_per_pixel,
-        shadows=shadows,
-        picture=added,
-    )
+    if fog is None:
+        return None
+    share = view.raster.fog_share
+    if share is None:
+        alpha = view.raster.alpha
+        depth = view.raster.expected_depth
+        assert alpha is not None and depth is not None
+        share = scattered_share(alpha, depth, camera, fog, backend=effect.backend)
+    return np.ascontiguousarray(share.detach().cpu().numpy(), np.float32)
