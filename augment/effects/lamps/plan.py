@@ -69,6 +69,12 @@ class LightPlan:
     extinction_per_m: float
     """Extinction of the fog, 1/m; 0 without fog."""
 
+    wetness: float
+    """Wetness of the ground, 0 to 1; 1 in a flood."""
+
+    snow_cover: float
+    """Share of the ground that snow covers, 0 to 1."""
+
     uses_color_map: bool
     """True if pictures have their cameras' colour maps."""
 
@@ -113,7 +119,8 @@ def make_light_plan(recipe: Recipe, scene: Scene, light: Light, hour: Hour) -> L
         section_at(recipe, "weather.rain.rate_mm_h") or 0.0,
         section_at(recipe, "weather.snowfall.rate_mm_h") or 0.0,
     ]
-    is_wet = (section_at(recipe, "weather.rain.ground_wetness") or 0.0) > 0
+    wetness = section_at(recipe, "weather.rain.ground_wetness") or 0.0
+    snow = recipe.weather.snow
     speed = recipe.render.speed
     return LightPlan(
         scene=scene,
@@ -124,9 +131,11 @@ def make_light_plan(recipe: Recipe, scene: Scene, light: Light, hour: Hour) -> L
         own_beam=own_beam,
         has_street_lamps=light.street == "on" or (light.street == "auto" and hour.is_dark),
         has_air=any(extinction > 0 for extinction in extinctions),
-        is_wet=is_wet or recipe.weather.flood is not None,
+        is_wet=wetness > 0 or recipe.weather.flood is not None,
         has_drops=any(rate > 0 for rate in extinctions[1:]),
         extinction_per_m=extinctions[0],
+        wetness=1.0 if recipe.weather.flood is not None else wetness,
+        snow_cover=snow.coverage if snow is not None and snow.has_effect else 0.0,
         uses_color_map=bool(scene.color_mapped_cameras) and recipe.render.exposure != "neutral",
         lamp_points=speed.lamp_points,
         lamp_halo_px=speed.lamp_halo_px,

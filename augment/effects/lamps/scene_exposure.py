@@ -24,6 +24,10 @@ OWN_HIGH_LUX = 4.0
 SKY_WEIGHT = 0.15
 # Weight of the luminance of lit air in the metered one.
 AIR_WEIGHT = 0.5
+# Metered luminance that wet ground adds to a dry road's, over that.
+WET_GAIN = 2.0
+# Metered luminance that snow adds to a road's, over that.
+SNOW_GAIN = 2.0
 # Intensity of a lamp that lights the air, candela.
 OTHER_CD = 1000.0
 # Distance of that lamp, metres.
@@ -40,7 +44,8 @@ def exposure_of(plan: LightPlan, scene: Scene) -> Exposure:
     light = plan.light
     if light.exposure == "fixed":
         return fixed_exposure(light)
-    key = ("lamps, exposure", light, plan.has_street_lamps, plan.own_beam, plan.extinction_per_m)
+    key = ("lamps, exposure", light, plan.has_street_lamps, plan.own_beam)
+    key = (*key, plan.extinction_per_m, plan.wetness, plan.snow_cover)
     return memo_of(scene).get(key, lambda: auto_exposure(light, metered_luminance(plan, scene)))
 
 
@@ -48,13 +53,15 @@ def metered_luminance(plan: LightPlan, scene: Scene) -> float:
     """Return the luminance that the camera exposes for as if it were all road, cd/m2.
 
     Sky and lit air count with SKY_WEIGHT and AIR_WEIGHT, so that neither dusk nor fog turns white.
-    The lit air is that about a lamp of OTHER_CD at OTHER_M metres.
+    The lit air is that about a lamp of OTHER_CD at OTHER_M metres. A wet road mirrors lamps, and
+    snow is several times as bright as a road: the camera closes, but shows both brighter.
     """
     optical_depth = min(plan.extinction_per_m * OTHER_M, 1.0)
     has_traffic = plan.has_vehicle_lamps or plan.has_street_lamps
     halo_cd_m2 = HALO * OTHER_CD / OTHER_M**2 * optical_depth if has_traffic else 0.0
     light_of_sky = SKY_WEIGHT * plan.hour.sky_cd_m2
-    return road_luminance(plan, scene) + light_of_sky + AIR_WEIGHT * halo_cd_m2
+    road = road_luminance(plan, scene) * (1 + WET_GAIN * plan.wetness + SNOW_GAIN * plan.snow_cover)
+    return road + light_of_sky + AIR_WEIGHT * halo_cd_m2
 
 
 def road_luminance(plan: LightPlan, scene: Scene) -> float:
