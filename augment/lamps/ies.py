@@ -52,8 +52,8 @@ class IesLuminaire:
     """Radius of a disc with the area of the luminous opening, metres."""
 
     def candela_at(
-        self, vertical_deg: Float[np.ndarray, "*N"], horizontal_deg: Float[np.ndarray, "*N"]
-    ) -> Float64[np.ndarray, "*N"]:
+        self, vertical_deg: Float[np.ndarray, "..."], horizontal_deg: Float[np.ndarray, "..."]
+    ) -> Float64[np.ndarray, "..."]:
         """Return intensities in directions, bilinear between the file's angles, candela.
 
         Args:

@@ -194,6 +194,9 @@ def _join_tables(all_tables: Sequence[np.ndarray]) -> tuple[np.ndarray, list[int
             first_rows[id(tables)] = num_rows
             joined.append(tables)
             num_rows += len(tables)
+    sizes = {table.shape[1:] for table in joined}
+    if len(sizes) > 1:
+        raise ValueError(f"tables of lamps must have one size to be joined; got {sorted(sizes)}")
     offsets = [first_rows[id(tables)] for tables in all_tables]
     return (joined[0] if len(joined) == 1 else np.concatenate(joined)), offsets
 

@@ -93,7 +93,7 @@ class _Traits(NamedTuple):
 def _traits_of(scene: Scene, track_id: str, seed: int) -> _Traits:
     """Return the numbers that the hash of a vehicle's name gives."""
     rng = rng_for(seed=seed, scene=scene.name, effect=f"lamps.vehicle.{track_id}")
-    lit_level, front_fog_level, rear_fog_level, halogen_level, warmth = rng.random(5)
+    lit_level, front_fog_level, rear_fog_level, halogen_level, warmth = rng.random(5).tolist()
     factor = float(np.exp(_INTENSITY_SIGMA * np.clip(rng.standard_normal(), -3, 3)))
     low, high = _HALOGEN_K if halogen_level < HALOGEN_SHARE else _LED_K
     white = color_of_temperature(low + (high - low) * warmth)
