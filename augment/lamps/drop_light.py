@@ -122,7 +122,10 @@ def phase_function(cosine: np.ndarray, *, is_snow: bool) -> np.ndarray:
 
 
 def _lambert_sphere(alpha: np.ndarray) -> np.ndarray:
-    """Return the phase function of a white Lambertian sphere, 1/sr, by the angle lamp-sphere-eye."""
+    """Return the phase function of a white Lambertian sphere, 1/sr.
+
+    alpha: angle between lamp and eye, seen from the sphere, radians.
+    """
     return 2 / (3 * np.pi**2) * (np.sin(alpha) + (np.pi - alpha) * np.cos(alpha))
 
 

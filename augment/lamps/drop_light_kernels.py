@@ -40,7 +40,7 @@ def drop_phase(cosine):
 
 @kernel_function()
 def flake_phase(cosine):
-    """Return a flake's phase function, 1/sr: a Lambertian sphere's, of which a share shines through.
+    """Return a flake's phase function, 1/sr: a Lambertian sphere through which a share shines.
 
     cosine: of the angle between the light's ways in and out.
     """

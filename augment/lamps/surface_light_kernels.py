@@ -17,8 +17,8 @@ from augment.lamps.pattern_kernels import pattern_at
 from augment.render.cpu.jit import kernel, kernel_function
 
 TILE = 8  # nodes along a side of a tile, whose nodes share a list of lamps
-# Points of a tile at which the lamps are compared: corners, middle of the sides, middle.
-NUM_SAMPLES = 9
+# Nodes of a whole tile at which the lamps are compared: corners, middles of the sides, middle.
+SAMPLES = np.array([0, 3, 7, 24, 27, 31, 56, 59, 63])
 # Light that a lamp may have between these points, over the most that it has at one of them.
 SAMPLE_MARGIN = 4.0
 # Distance of the nodes over which slopes are first estimated, nodes.
@@ -322,9 +322,8 @@ def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
             continue
         score = 0.0
         lamp = read_lamp(lamps, m)
-        last = count - 1
-        for sample in range(min(count, NUM_SAMPLES)):
-            p = sample * last // max(min(count, NUM_SAMPLES) - 1, 1)
+        for sample in range(len(SAMPLES)):
+            p = SAMPLES[sample] * (count - 1) // (TILE * TILE - 1)
             lux = lux_along_ray(lamps.tables, lamp, points[p, 0], points[p, 1], points[p, 2])[0]
             score = max(score, lux)
         if SAMPLE_MARGIN * score < min_lux:

@@ -18,8 +18,15 @@ TILE_PX = 16  # pixels along a side of a tile, whose pixels share a list of lamp
 REFRACTION_INDEX = 1.33  # of water
 # Exponent of Beckmann's distribution, (tan theta_h / m)^2, from which on nothing glints.
 MAX_EXPONENT = 14.0
+# Pixels of a whole tile at which the lamps are compared: corners and middle.
+SAMPLES = np.array([0, 15, 119, 240, 255])
 # Tangent of an angle over its sine, for the tilts of waves.
 TILT_MARGIN = 1.2
+# Blur across the streak, in squares of a pixel, twice the variance: of half a pixel, so that a far
+# lamp's streak keeps its light wherever it lies between the pixels.
+PIXEL_BLUR = 0.5
+# Largest square of the tangent from pixel to pixel.
+MAX_PIXEL_TILT2 = 0.09
 # Least cosine between the normal and the eye.
 MIN_COSINE = 0.005
 
@@ -48,8 +55,14 @@ def masking(cosine, m):
 
 
 @kernel_function()
-def _half_tangent2(dx, dy, dz, eye_x, eye_y, eye_z, up):
-    """Return tan(theta_h)^2, and the cosines of lamp and eye to h and of each to the normal."""
+def _half_vector(dx, dy, dz, eye_x, eye_y, eye_z, up):
+    """Return the half vector between unit directions to a lamp and to the eye, by its tangents.
+
+    Returns:
+        The squares of the tangents of its angle to the normal, in the plane of eye and normal and
+        across it; its cosine to the normal; the cosines of the lamp to it, and of lamp and eye to
+        the normal.
+    """
     hx = dx + eye_x
     hy = dy + eye_y
     hz = dz + eye_z
@@ -58,19 +71,37 @@ def _half_tangent2(dx, dy, dz, eye_x, eye_y, eye_z, up):
     incidence = (dx * hx + dy * hy + dz * hz) * per_length
     to_lamp = dx * up[0] + dy * up[1] + dz * up[2]
     to_eye = eye_x * up[0] + eye_y * up[1] + eye_z * up[2]
-    tangent2 = 1.0 / max(cosine_h * cosine_h, 1e-9) - 1.0
-    return tangent2, cosine_h, incidence, to_lamp, to_eye
+    per_cosine2 = 1.0 / max(cosine_h * cosine_h, 1e-9)
+    tangent2 = max(per_cosine2 - 1.0, 0.0)
+    # The triple product of h, eye and normal, over the eye's level part, is h's part across.
+    across = (
+        hx * (eye_y * up[2] - eye_z * up[1])
+        + hy * (eye_z * up[0] - eye_x * up[2])
+        + hz * (eye_x * up[1] - eye_y * up[0])
+    ) * per_length
+    across2 = across * across * per_cosine2 / max(1.0 - to_eye * to_eye, 1e-9)
+    across2 = min(across2, tangent2)
+    return tangent2 - across2, across2, cosine_h, incidence, to_lamp, to_eye
 
 
 @kernel_function()
-def glint(tangent2, cosine_h, incidence, to_lamp, to_eye, m):
+def _pixel_tilt2(to_eye, eye_distance, to_lamp, lamp_distance, pixel_rad):
+    """Return the square of the half vector's tangent from one pixel to the next one beside it."""
+    cosines = max(to_eye, MIN_COSINE) + max(to_lamp, MIN_COSINE)
+    tilt = pixel_rad * (1.0 + eye_distance / lamp_distance) / cosines
+    return min(tilt * tilt, MAX_PIXEL_TILT2)
+
+
+@kernel_function()
+def glint(along2, across2, cosine_h, incidence, to_lamp, to_eye, m, pixel_tilt2):
     """Return F D G / (4 cos(eye)): luminance per lux on a surface that faces the lamp."""
     m2 = m * m
-    exponent = tangent2 / m2
+    across_m2 = m2 + PIXEL_BLUR * pixel_tilt2
+    exponent = along2 / m2 + across2 / across_m2
     if exponent > MAX_EXPONENT or to_lamp <= 0 or to_eye <= 0:
         return 0.0
     to_eye = max(to_eye, MIN_COSINE)
-    spread = math.exp(-exponent) / (math.pi * m2 * cosine_h**4)
+    spread = math.exp(-exponent) / (math.pi * m * math.sqrt(across_m2) * cosine_h**4)
     shares = masking(max(to_lamp, MIN_COSINE), m) * masking(to_eye, m)
     return fresnel(min(incidence, 1.0)) * spread * shares / (4.0 * to_eye)
 
@@ -145,27 +176,41 @@ def add_glints(
         for m in range(len(lamps.intensities)):
             if lamps.peaks[m] <= 0:
                 continue
-            # The tilt of h over the tile: at its middle, less its spread to the corners.
+            # The least tilt of h at some points, less what it may fall between them.
             smallest = np.inf
-            low = np.inf
-            high = -np.inf
-            brightest = 0.0
-            for corner in range(5):
-                p = count // 2 if corner == 4 else corner * (count - 1) // 3
-                tilt, bright = _tilt(points, p, eye, normal, lamps, m)
+            largest = 0.0
+            nearest = np.inf
+            blur2 = 0.0
+            for sample in range(len(SAMPLES)):
+                p = SAMPLES[sample] * (count - 1) // (TILE_PX * TILE_PX - 1)
+                tilt, squared, pixel_tilt2 = _tilt(points, p, eye, normal, lamps, m, lens[0])
                 smallest = min(smallest, tilt)
-                low = min(low, tilt)
-                high = max(high, tilt)
-                brightest = max(brightest, bright)
-            reach = max(smallest - (high - low) - TILT_MARGIN * largest_tilt, 0.0)
-            m2 = largest_m * largest_m + 0.25 * lamps.softening[m] * brightest / lamps.peaks[m]
-            exponent = reach * reach / m2
+                largest = max(largest, tilt)
+                nearest = min(nearest, squared)
+                blur2 = max(blur2, PIXEL_BLUR * pixel_tilt2)
+            reach = 2.0 * smallest - largest - TILT_MARGIN * largest_tilt
+            m2 = largest_m * largest_m + 0.25 * lamps.softening[m] / nearest
+            exponent = max(reach, 0.0) ** 2 / (m2 + blur2)
             if exponent > MAX_EXPONENT:
                 continue
-            score = brightest * math.exp(-exponent)
             # A bound of F D G / (4 cos), with G / cos at most about 1 / m.
-            if score / (4.0 * math.pi * m2 * largest_m) < min_luminance:
+            bound = lamps.peaks[m] / nearest * math.exp(-exponent)
+            bound /= 4.0 * math.pi * m2 * math.sqrt(m2)
+            if bound < min_luminance:
                 continue
+            # Lamps are ranked by their glints at the points, and those that pass between by a bit.
+            score = 1e-4 * bound
+            lamp = read_lamp(lamps, m)
+            for sample in range(len(SAMPLES)):
+                p = SAMPLES[sample] * (count - 1) // (TILE_PX * TILE_PX - 1)
+                rough = np.float64(roughness[pixels[p, 0], pixels[p, 1]])
+                strength = _glint_at(points, p, lamp, eye, normal, rough, lens[0])
+                if strength > 0:
+                    x = points[p, 0] + eye[0]
+                    y = points[p, 1] + eye[1]
+                    z = points[p, 2] + eye[2]
+                    lux = lux_along_ray(lamps.tables, lamp, x, y, z)[0]
+                    score = max(score, strength * lux)
             if number == max_lamps and score <= scores[number - 1]:
                 continue
             number = min(number + 1, max_lamps)
@@ -184,38 +229,18 @@ def add_glints(
             red = lamps.colors[m, 0]
             green = lamps.colors[m, 1]
             blue = lamps.colors[m, 2]
-            place_x = lamp[0][0] - eye[0]
-            place_y = lamp[0][1] - eye[1]
-            place_z = lamp[0][2] - eye[2]
-            radius2 = lamps.softening[m]
             for p in range(count):
                 x = points[p, 0]
                 y = points[p, 1]
                 z = points[p, 2]
                 i = pixels[p, 0]
                 j = pixels[p, 1]
-                dx = place_x - x
-                dy = place_y - y
-                dz = place_z - z
-                squared = dx * dx + dy * dy + dz * dz
-                per_m = 1.0 / math.sqrt(squared)
-                to_eye = 1.0 / math.sqrt(x * x + y * y + z * z)
                 if has_waves:
                     a = up[0] + tilts[i, j, 0]
                     b = up[1] + tilts[i, j, 1]
                     normal = (a, b, math.sqrt(max(1.0 - a * a - b * b, 0.01)))
-                tangent2, cosine_h, incidence, to_lamp, cosine_eye = _half_tangent2(
-                    dx * per_m,
-                    dy * per_m,
-                    dz * per_m,
-                    -x * to_eye,
-                    -y * to_eye,
-                    -z * to_eye,
-                    normal,
-                )
-                # A lamp's disc, as wide as half its angle at the half vector, blurs the mirror.
-                rough = math.sqrt(np.float64(roughness[i, j]) ** 2 + 0.25 * radius2 / squared)
-                strength = glint(tangent2, cosine_h, incidence, to_lamp, cosine_eye, rough)
+                rough = np.float64(roughness[i, j])
+                strength = _glint_at(points, p, lamp, eye, normal, rough, lens[0])
                 if strength <= 0:
                     continue
                 lux = lux_along_ray(tables, lamp, x + eye[0], y + eye[1], z + eye[2])[0]
@@ -228,18 +253,56 @@ def add_glints(
 
 
 @kernel_function()
-def _tilt(points, p, eye, normal, lamps, m):
-    """Return tan(theta_h) of a lamp at a point, and the most lux that it can send there."""
+def _tilt(points, p, eye, normal, lamps, m, pixel_rad):
+    """Return tan(theta_h) of a lamp at a point, the square of its distance, and `_pixel_tilt2`."""
     x = points[p, 0]
     y = points[p, 1]
     z = points[p, 2]
     dx = lamps.positions[m, 0] - eye[0] - x
     dy = lamps.positions[m, 1] - eye[1] - y
     dz = lamps.positions[m, 2] - eye[2] - z
-    squared = dx * dx + dy * dy + dz * dz
-    per_m = 1.0 / math.sqrt(squared)
-    to_eye = 1.0 / math.sqrt(x * x + y * y + z * z)
-    tangent2 = _half_tangent2(
-        dx * per_m, dy * per_m, dz * per_m, -x * to_eye, -y * to_eye, -z * to_eye, normal
-    )[0]
-    return math.sqrt(max(tangent2, 0.0)), lamps.peaks[m] / squared
+    squared = max(dx * dx + dy * dy + dz * dz, 1e-6)
+    distance = math.sqrt(squared)
+    per_m = 1.0 / distance
+    eye_distance = math.sqrt(x * x + y * y + z * z)
+    per_eye_m = 1.0 / eye_distance
+    along2, across2, _, _, to_lamp, to_eye = _half_vector(
+        dx * per_m, dy * per_m, dz * per_m, -x * per_eye_m, -y * per_eye_m, -z * per_eye_m, normal
+    )
+    pixel_tilt2 = _pixel_tilt2(to_eye, eye_distance, to_lamp, distance, pixel_rad)
+    return math.sqrt(along2 + across2), squared, pixel_tilt2
+
+
+@kernel_function()
+def _glint_at(points, p, lamp, eye, normal, rough, pixel_rad):
+    """Return a lamp's luminance per lux in a point of the water.
+
+    Args:
+        points: points from the eye, [N, 3].
+        p: row of the point.
+        lamp: result of `read_lamp`.
+        eye: place of the eye, world.
+        normal: normal of the water.
+        rough: roughness of the water.
+        pixel_rad: width of a pixel, radians.
+    """
+    x = points[p, 0]
+    y = points[p, 1]
+    z = points[p, 2]
+    dx = lamp[0][0] - eye[0] - x
+    dy = lamp[0][1] - eye[1] - y
+    dz = lamp[0][2] - eye[2] - z
+    squared = max(dx * dx + dy * dy + dz * dz, 1e-6)
+    distance = math.sqrt(squared)
+    per_m = 1.0 / distance
+    eye_distance = math.sqrt(x * x + y * y + z * z)
+    per_eye_m = 1.0 / eye_distance
+    along2, across2, cosine_h, incidence, to_lamp, to_eye = _half_vector(
+        dx * per_m, dy * per_m, dz * per_m, -x * per_eye_m, -y * per_eye_m, -z * per_eye_m, normal
+    )
+    # The lamp's disc blurs the mirror by half its angle.
+    m = math.sqrt(rough * rough + 0.25 * lamp[7] / squared)
+    if along2 > MAX_EXPONENT * m * m:
+        return 0.0
+    pixel_tilt2 = _pixel_tilt2(to_eye, eye_distance, to_lamp, distance, pixel_rad)
+    return glint(along2, across2, cosine_h, incidence, to_lamp, to_eye, m, pixel_tilt2)

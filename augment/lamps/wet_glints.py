@@ -4,7 +4,8 @@
 
 of each lamp, analytically, without tracing. D is Beckmann's distribution of roughness m, G is
 Smith's masking, F is Fresnel's reflectance for n = 1.33; theta_o is the eye's angle to the water's
-normal, theta_i the lamp's to the half vector. The lamp's disc widens m. At a grazing angle a the
+normal, theta_i the lamp's to the half vector. The lamp's disc widens m; across the streak, so does
+half a pixel, and the light stays the same. At a grazing angle a the
 streak is 1 / sin(a) times as long as wide. Things between lamp and water do not hide the lamp,
 but for the recording car's beams, which have shadows.
 
@@ -24,7 +25,13 @@ from augment.lamps.beam_shadows import BeamShadows
 from augment.lamps.lamp import Lamps
 from augment.lamps.patterns import pattern_value
 from augment.lamps.surface_light import lamp_arrays, shadow_arrays
-from augment.lamps.wet_glint_kernels import MAX_EXPONENT, MIN_COSINE, REFRACTION_INDEX
+from augment.lamps.wet_glint_kernels import (
+    MAX_EXPONENT,
+    MAX_PIXEL_TILT2,
+    MIN_COSINE,
+    PIXEL_BLUR,
+    REFRACTION_INDEX,
+)
 from augment.lamps.wet_surface import WetSurface
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
@@ -130,28 +137,23 @@ def glint_luminance(
         lux = lamps.intensities_cd[m] * share / (squared + radius2)
         lux *= np.exp(-extinctions[m] * np.sqrt(squared))
         rough = np.sqrt(water.roughness.astype(np.float64) ** 2 + 0.25 * radius2 / squared)
-        cosines = ((to_lamp * half).sum(2), *((ray * up).sum(2) for ray in (to_lamp, to_eye, half)))
-        luminance[..., m] = np.where(is_water, water.share * lux * _glint(*cosines, rough), 0)
+        incidence = (to_lamp * half).sum(2)
+        cosine_lamp, cosine_eye, cosine_half = ((v * up).sum(2) for v in (to_lamp, to_eye, half))
+        tilt = (1 + distance / np.sqrt(squared)) / camera.fx
+        tilt /= np.maximum(cosine_eye, MIN_COSINE) + np.maximum(cosine_lamp, MIN_COSINE)
+        across_m = np.sqrt(rough**2 + PIXEL_BLUR * np.minimum(tilt**2, MAX_PIXEL_TILT2))
+        sideways = np.cross(to_eye, up)
+        sideways /= np.maximum(np.linalg.norm(sideways, axis=2, keepdims=True), 1e-9)
+        across2 = ((half * sideways).sum(2) / cosine_half) ** 2
+        along2 = np.maximum(1 / cosine_half**2 - 1 - across2, 0)
+        exponent = along2 / rough**2 + across2 / across_m**2
+        spread = np.exp(-exponent) / (math.pi * rough * across_m * cosine_half**4)
+        eye = np.maximum(cosine_eye, MIN_COSINE)
+        masks = _masking(np.maximum(cosine_lamp, MIN_COSINE), rough) * _masking(eye, rough)
+        glint = fresnel_reflectance(np.minimum(incidence, 1)) * spread * masks / (4 * eye)
+        is_lit = is_water & (exponent <= MAX_EXPONENT) & (cosine_lamp > 0) & (cosine_eye > 0)
+        luminance[..., m] = np.where(is_lit, water.share * lux * glint, 0)
     return luminance
-
-
-def _glint(
-    incidence: np.ndarray,
-    to_lamp: np.ndarray,
-    to_eye: np.ndarray,
-    to_half: np.ndarray,
-    m: np.ndarray,
-) -> np.ndarray:
-    """Return F D G / (4 cos(theta_o)) by the cosines of the directions."""
-    tangent2 = 1 / np.maximum(to_half**2, 1e-9) - 1
-    exponent = tangent2 / np.maximum(m, 1e-9) ** 2
-    is_lit = (exponent <= MAX_EXPONENT) & (to_lamp > 0) & (to_eye > 0)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        spread = np.exp(-exponent) / (math.pi * m**2 * to_half**4)
-        eye = np.maximum(to_eye, MIN_COSINE)
-        shares = _masking(np.maximum(to_lamp, MIN_COSINE), m) * _masking(eye, m)
-        value = fresnel_reflectance(np.minimum(incidence, 1)) * spread * shares / (4 * eye)
-    return np.where(is_lit, value, 0)
 
 
 def _masking(cosine: np.ndarray, m: np.ndarray) -> np.ndarray:
