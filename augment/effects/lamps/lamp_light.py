@@ -11,7 +11,7 @@ from augment.effects.lamps.plan import AIR, DROPS, EMITTERS, SURFACES, WET, Ligh
 from augment.lamps.air_light import air_light
 from augment.lamps.beam_shadows import draw_beam_shadows
 from augment.lamps.drop_light import add_drop_light
-from augment.lamps.emitters import add_emitters, lamp_visibility
+from augment.lamps.emitters import HALO_RADIUS_M, add_emitters, lamp_visibility
 from augment.lamps.fog_phase import AirExtinction
 from augment.lamps.lamp import Lamps
 from augment.lamps.recorded_lamps import find_recorded_lamps, moving_vehicle_mask
@@ -22,6 +22,9 @@ from augment.render.constants import SURFACE_ALPHA
 from augment.render.scatter import scattered_share
 from augment.scene.cameras import Camera
 from augment.timing import timed
+
+# Opacity of a pixel up to which it shows no surface that hides a lamp.
+MIN_ALPHA = 1e-3
 
 
 def add_lamp_light(
@@ -56,8 +59,7 @@ def add_lamp_light(
     added = np.zeros_like(rgb) if recorded is None else recorded
     if plan.hour.is_dark:
         _add_surface_light(effect, view, camera, rgb, white, depth_m, air, threshold_cd_m2, added)
-    with timed(EMITTERS):
-        visible_shares = lamp_visibility(lamps, camera, depth_m, alpha)
+    surface_m = np.where(alpha > MIN_ALPHA, z, np.float32(np.inf))
     if not air.is_clear:
         with timed(AIR):
             lengths = camera.ray_lengths().numpy()
@@ -70,7 +72,9 @@ def add_lamp_light(
                 num_points=plan.lamp_points,
                 step_px=plan.lamp_halo_px,
                 threshold_cd_m2=threshold_cd_m2,
-                visible_shares=visible_shares,
+                visible_shares=lamp_visibility(
+                    lamps, camera, surface_m, alpha, radius_m=HALO_RADIUS_M
+                ),
             )
     if plan.hour.is_dark and plan.has_drops:
         with timed(DROPS):
@@ -85,6 +89,7 @@ def add_lamp_light(
                     min_luminance_cd_m2=threshold_cd_m2,
                 )
     with timed(EMITTERS):
+        visible_shares = lamp_visibility(lamps, camera, surface_m, alpha)
         add_emitters(added, lamps, camera, visible_shares, air)
     return added
 
