@@ -8,6 +8,7 @@ from jaxtyping import Float32
 from augment.effects.effect import EffectInScene, RenderedView
 from augment.effects.lamps.picture_light import find_reflectance
 from augment.effects.lamps.plan import AIR, DROPS, EMITTERS, SURFACES, WET, LightPlan
+from augment.effects.lamps.signs import sign_pixels
 from augment.lamps.air_light import air_light
 from augment.lamps.beam_shadows import draw_beam_shadows
 from augment.lamps.drop_light import add_drop_light
@@ -140,7 +141,7 @@ def _add_surface_light(
     threshold_cd_m2: float,
     added: np.ndarray,
 ) -> None:
-    """Add the light of surfaces and water under lamps, as it arrives through the fog before them."""
+    """Add the light of surfaces and water under lamps, as the fog before them lets it through."""
     plan: LightPlan = effect.settings
     lamps: Lamps = effect.view_data
     with timed(SURFACES):
@@ -171,6 +172,7 @@ def _add_surface_light(
             min_luminance_cd_m2=threshold_cd_m2,
             lamps_per_pixel=plan.lamps_per_pixel,
             shadows=shadows,
+            is_sign=sign_pixels(view) if plan.has_signs else None,
             picture=added,
         )
     if not plan.is_wet:
