@@ -280,7 +280,7 @@ class _Walls:
     def hidden_share(self, start_m: Float[np.ndarray, "3"], end_m: Float[np.ndarray, "3"]) -> float:
         """Return the share of light that Gaussians take on the way from one place to another.
 
-        Each takes its opacity at the point of the way that is nearest to its middle.
+        Each takes its opacity at the point of the segment that is nearest to its middle.
         """
         margin_m = 1.5
         low = np.minimum(start_m, end_m) - margin_m
@@ -296,10 +296,10 @@ class _Walls:
         offsets = background.means.detach()[ids].double().numpy() - start_m
         # In units of each Gaussian's standard deviations.
         local = np.einsum("nji,nj->ni", axes, offsets) / scales
-        way = np.einsum("nji,j->ni", axes, np.asarray(end_m, float) - start_m) / scales
-        squares = np.maximum((way**2).sum(1), 1e-12)
-        share = np.clip((local * way).sum(1) / squares, 0, 1)
-        distances = ((local - share[:, None] * way) ** 2).sum(1)
+        ray = np.einsum("nji,j->ni", axes, np.asarray(end_m, float) - start_m) / scales
+        squares = np.maximum((ray**2).sum(1), 1e-12)
+        share = np.clip((local * ray).sum(1) / squares, 0, 1)
+        distances = ((local - share[:, None] * ray) ** 2).sum(1)
         alphas = opacities * np.exp(-0.5 * distances) * (distances < _REACH_SIGMAS**2)
         return float(1 - np.prod(1 - np.minimum(alphas, 0.999)))
 
