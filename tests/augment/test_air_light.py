@@ -241,7 +241,7 @@ PASSING = {
 def test_factor_of_beams_is_that_of_photons_followed_one_by_one(off_axis_deg):
     gain = float(factor_gain(np.array([10.0]), np.array([off_axis_deg]))[0])
     ours = scatter_factor(gain, 1.0, np.radians([1.1, 3.6, 7.6, 15.2, 32.0]))
-    # A fit of one number to three angles: 15 % at most on the axis, 46 % in the widest bin beside it.
+    # A fit of one number to three angles: 15 % on the axis, 46 % in the widest bin beside it.
     assert ours / PASSING[off_axis_deg] == pytest.approx(np.ones(5), abs=0.5)
 
 
