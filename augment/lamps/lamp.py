@@ -194,6 +194,9 @@ def _join_tables(all_tables: Sequence[np.ndarray]) -> tuple[np.ndarray, list[int
             first_rows[id(tables)] = num_rows
             joined.append(tables)
             num_rows += len(tables)
+    sizes = {table.shape[1:] for table in joined}
+    if len(sizes) > 1:
+        raise ValueError(f"tables of lamps must have one size to be joined; got {sorted(sizes)}")
     offsets = [first_rows[id(tables)] for tables in all_tables]
     return (joined[0] if len(joined) == 1 else np.concatenate(joined)), offsets
 
@@ -227,11 +230,11 @@ _RGB_FROM_XYZ = np.array(
 def color_of_chromaticity(x: float, y: float) -> Float64[np.ndarray, "3"]:
     """Return the linear sRGB colour of luminance 1 of CIE 1931 coordinates x, y.
 
+    Colours outside sRGB lose their negative channels, and keep luminance 1.
+
     Args:
         x: red share of the chromaticity.
         y: green share of the chromaticity, > 0.
-
-    Colours outside sRGB lose their negative channels, and keep luminance 1.
     """
     rgb = np.maximum(_RGB_FROM_XYZ @ np.array([x / y, 1.0, (1 - x - y) / y]), 0.0)
     return rgb / (rgb @ np.array(LUMINANCE_WEIGHTS))
