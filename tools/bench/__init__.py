@@ -116,6 +116,29 @@ def bench_dataset(
     return _show(_subject("dataset").measure(quick, folder, repeats), json_file)
 
 
+def bench_training(
+    folder: Path | None = None,
+    quick: bool = False,
+    table: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """What training on weather and night does for a small network, tested on other streets.
+
+    Args:
+        folder: Where the images are rendered, and read again by a later run; by default a
+            temporary folder.
+        quick: A few small images and steps.
+        table: Also write the tables to this file, as Markdown.
+        json_file: Also write the figures to this file, with the IoU of every class and seed.
+    """
+    result = _subject("training").measure(quick, folder)
+    written = list[Path]()
+    if table is not None:
+        table.write_text(_subject("harness").markdown(result), encoding="utf-8")
+        written.append(table)
+    return _show(result, json_file, written)
+
+
 def bench_gpu(
     repeats: int = 30,
     quick: bool = False,
@@ -206,6 +229,7 @@ COMMANDS = {
     "fit": bench_fit,
     "jobs": bench_jobs,
     "dataset": bench_dataset,
+    "training": bench_training,
     "gpu": bench_gpu,
 }
 
