@@ -122,7 +122,7 @@ def bench_training(
     table: Path | None = None,
     json_file: JsonFile = None,
 ) -> int:
-    """What training on weather and night does for a small network, tested on other streets.
+    """Train a small network on clean images, on weather and on night; test it on other streets.
 
     Args:
         folder: Where the images are rendered, and read again by a later run; by default a

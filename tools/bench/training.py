@@ -1,4 +1,4 @@
-"""`climategs bench training`: what training on weather does for a small network.
+"""`climategs bench training`: the gain of a small network from training on weather and night.
 
 Procedural streets are rendered in clear air and in several kinds of weather. A small U-Net is
 trained in several ways from several seeds, and tested on other streets, in weather that it has and
@@ -182,7 +182,7 @@ ARMS: Mapping[str, Arm] = {
 
 @dataclass(frozen=True)
 class TrainingCase:
-    """What is rendered, learnt and tested."""
+    """The scenes and weather that are rendered, and the trainings."""
 
     train_scenes: tuple[str, ...]
     """URIs of the scenes to learn from."""
@@ -289,7 +289,7 @@ def measure(
     Args:
         quick: True for QUICK_CASE.
         folder: The folder of the images, which a later run reads again; None for a temporary one.
-        case: What is rendered and trained; None for FULL_CASE or QUICK_CASE.
+        case: The scenes and trainings; None for FULL_CASE or QUICK_CASE.
         scene_loader: Opens a scene from its URI.
 
     Raises:
@@ -470,8 +470,8 @@ def _score_rows(scores: Scores) -> list[tuple[str, ...]]:
 def _learnt_by(kind: str) -> str:
     """Return the remark of a condition that not all arms with weather have learnt."""
     if kind in DARK_HOURS:
-        return " (learnt by the last only)"
-    return "" if kind in (CLEAR, *DAY_WEATHER) else " (learnt by none)"
+        return "; learnt by the last only"
+    return "" if kind in (CLEAR, *DAY_WEATHER) else "; learnt by none"
 
 
 def _class_table(scores: Scores, kind: str) -> Table:
