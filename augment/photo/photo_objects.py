@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 
+from augment.photo import edge_kernels as kernels
 from augment.photo.outlines import MIN_AREA_PX, Silhouette, fill_polygons, find_outlines
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, OVERLAY, SPLAT_IDS, RenderOutput
 from augment.render.constants import RasterSettings
@@ -103,32 +104,33 @@ class ObjectEdges:
                 of `shows_background` are read.
             parts: the parts.
         """
-        rows, columns = np.nonzero(self.shows_background[self.window])
-        background_pixels = (rows + self.window[0].start) * self.shows_background.shape[1]
-        background_pixels += columns + self.window[1].start
-        window_pixels = rows * (self.window[1].stop - self.window[1].start) + columns
+        rows, columns = self.window
+        is_copied = np.ascontiguousarray(self.shows_background[rows, columns])
         moved_buffers = dict[str, Tensor]()
         for name in BUFFERS:
             buffer = getattr(raster, name)
             if buffer is None:
                 continue
-            hidden_values = getattr(background, name).flatten(0, 1)
+            window_values = getattr(background, name)
+            if name == SPLAT_IDS:
+                window_values = self._count_through(window_values, parts)
             if buffer.device.type == "cpu" and not buffer.requires_grad:
-                values = hidden_values.numpy()[window_pixels]
-                if name == SPLAT_IDS:
-                    values = self._count_through(torch.from_numpy(values), parts).numpy()
-                flat_image = buffer.numpy().reshape(-1, *buffer.shape[2:])
-                flat_image[background_pixels] = values
-                flat_image[self.targets] = flat_image[self.sources]
+                values = buffer.numpy().reshape(*buffer.shape[:2], -1)
+                window = window_values.numpy().reshape(*is_copied.shape, -1)
+                kernels.copy_window(is_copied, window, rows.start, columns.start, values)
+                flat_values = values.reshape(-1, values.shape[2])
+                kernels.move_pixels(self.targets, self.sources, flat_values)
                 continue
+            window_rows, window_columns = np.nonzero(is_copied)
+            background_pixels = (window_rows + rows.start) * buffer.shape[1]
+            background_pixels += window_columns + columns.start
+            window_pixels = window_rows * is_copied.shape[1] + window_columns
             from_window, to_pixels, targets, sources = (
                 torch.from_numpy(numbers).to(buffer.device)
                 for numbers in (window_pixels, background_pixels, self.targets, self.sources)
             )
-            values = hidden_values[from_window]
-            if name == SPLAT_IDS:
-                values = self._count_through(values, parts)
-            flat_buffer = buffer.flatten(0, 1).index_copy(0, to_pixels, values)
+            hidden_values = window_values.flatten(0, 1)[from_window]
+            flat_buffer = buffer.flatten(0, 1).index_copy(0, to_pixels, hidden_values)
             moved = flat_buffer.index_copy(0, targets, flat_buffer[sources])
             moved_buffers[name] = moved.view_as(buffer)
         return replace(raster, **moved_buffers) if moved_buffers else raster
@@ -140,17 +142,22 @@ class ObjectEdges:
             splat_ids: indices among the splats of `background_of(parts)`; -1 for none.
             parts: the parts.
         """
-        counts = [len(part.gaussians) for part in parts]
-        starts = np.cumsum([0, *counts[:-1]])
-        is_kept = [part.instance_id not in self.instance_ids for part in parts]
-        shifts = [
-            np.full(count, start, np.int64)
-            for count, start, keeps in zip(counts, starts, is_kept, strict=True)
-            if keeps
-        ]
-        numbers = [np.arange(count) for count, keeps in zip(counts, is_kept, strict=True) if keeps]
-        table = torch.from_numpy(np.concatenate([*shifts, [0]]) + np.concatenate([*numbers, [-1]]))
-        return table.to(splat_ids.device)[splat_ids.long()].to(splat_ids.dtype)
+        num_removed = 0
+        num_kept = 0
+        kept_starts = list[int]()
+        shifts = [0]
+        for part in parts:
+            if part.instance_id in self.instance_ids:
+                num_removed += len(part.gaussians)
+                continue
+            # Indices from -1 on are of no splat, from 0 on of the first part that is kept.
+            kept_starts.append(num_kept)
+            shifts.append(num_removed)
+            num_kept += len(part.gaussians)
+        device = splat_ids.device
+        first_ids = torch.tensor(kept_starts, device=device, dtype=splat_ids.dtype)
+        part_numbers = torch.bucketize(splat_ids, first_ids, right=True)
+        return splat_ids + torch.tensor(shifts, device=device)[part_numbers].to(splat_ids.dtype)
 
 
 class _Drawing(NamedTuple):
