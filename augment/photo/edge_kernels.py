@@ -88,6 +88,81 @@ def move_pixels(targets, sources, values):
             values[targets[m], c] = taken_values[m, c]
 
 
+@serial_kernel
+def mark_edges(
+    labels,
+    place,
+    small_hides,
+    small_labels,
+    alpha,
+    overlay,
+    is_above,
+    limits,
+    shows_background,
+    lacks_object,
+):
+    """Mark the pixels of a window where the photo's objects differ from the drawn ones.
+
+    Args:
+        labels: uint8 [h, w], object of the photo at each pixel of the window, 0 for none.
+        place: int64 [4], first row and column of the window, height and width of the photo.
+        small_hides: uint8 [m, n], 1 where drawn objects hide the background, in a small copy.
+        small_labels: uint8 [m, n], the drawn objects.
+        alpha: float32 [h, w], alpha of the drawn objects.
+        overlay: float32 [h, w], share of snow on objects; [0, 0] without.
+        is_above: bool [h, w], pixels that snow on objects may hide; [0, 0] without.
+        limits: float32 [2], alpha from which an object is solid, and share from which snow shows.
+        shows_background: output bool [H, W], pixels of the photo that show the background; the
+            window alone is written.
+        lacks_object: output bool [h, w], pixels that show an object which is not drawn there.
+    """
+    height, width = labels.shape
+    small_height, small_width = small_labels.shape
+    has_caps = len(overlay) > 0
+    for i in range(height):
+        row = place[0] + i
+        small_row = row * small_height // place[2]
+        for j in range(width):
+            column = place[1] + j
+            small_column = column * small_width // place[3]
+            label = labels[i, j]
+            shows = label == 0 and small_hides[small_row, small_column] > 0
+            if shows and has_caps and is_above[i, j] and overlay[i, j] > limits[1]:
+                shows = False
+            shows_background[row, column] = shows
+            is_drawn = alpha[i, j] >= limits[0] and small_labels[small_row, small_column] == label
+            lacks_object[i, j] = label > 0 and not is_drawn
+
+
+@serial_kernel
+def cut_below(label, window, nearest_depth, small_window, numbers, photo_labels):
+    """Take the pixels of an object that lie below a height from it.
+
+    Args:
+        label: uint8, the object.
+        window: int64 [4], first row and column, and height and width of the pixels to look at.
+        nearest_depth: float32 [m, n], depth (m) of the object nearest to each pixel of a small
+            copy's window.
+        small_window: int64 [4], first row and column of that window, and height and width of the
+            small copy.
+        numbers: float64 [9]; the camera's height (m), the rise of its axes (3), its lens (cx, cy,
+            fx, fy), and the height (m).
+        photo_labels: uint8 [H, W], objects of the photo, in which 0 is written.
+    """
+    height, width = photo_labels.shape
+    for row in range(window[0], window[0] + window[2]):
+        small_row = row * small_window[2] // height - small_window[0]
+        rise_of_row = numbers[2] * (row + 0.5 - numbers[5]) / numbers[7]
+        for column in range(window[1], window[1] + window[3]):
+            if photo_labels[row, column] != label:
+                continue
+            small_column = column * small_window[3] // width - small_window[1]
+            rise = numbers[1] * (column + 0.5 - numbers[4]) / numbers[6] + rise_of_row
+            depth_m = np.float64(nearest_depth[small_row, small_column])
+            if numbers[0] + depth_m * (rise + numbers[3]) < numbers[8]:
+                photo_labels[row, column] = 0
+
+
 @kernel_function()
 def smooth_ring(values, count):
     """Return the mean of `count` neighbours around a closed outline, float64 [N].
