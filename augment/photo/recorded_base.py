@@ -373,14 +373,22 @@ class Photo:
     def _cover_on_cpu(self, raster: RenderOutput) -> Float[Tensor, "H W 3"]:
         """Return the photo with what lies on the scene, in one pass over the pixels."""
         assert raster.rgb is not None and raster.overlay is not None
+        return self._in_one_pass(edge_kernels.cover_photo, raster.overlay, raster.rgb)
+
+    def _fade_on_cpu(
+        self, airlight: Float[Tensor, "#H #W 3"], fog_share: Float[Tensor, "H W"]
+    ) -> Float[Tensor, "H W 3"]:
+        """Return the photo in smog, in one pass over the pixels."""
+        return self._in_one_pass(edge_kernels.fade_photo, airlight, fog_share)
+
+    def _in_one_pass(self, kernel: Any, *images: Tensor) -> Float[Tensor, "H W 3"]:
+        """Return the image that a CPU kernel makes of the photo, its colour map and images."""
         color_map = self.scene_from_recorded
         matrix = np.eye(3, 4, dtype=np.float32) if color_map is None else color_map.numpy()
-        overlay, overlay_rgb = (
-            image.detach().contiguous().numpy() for image in (raster.overlay, raster.rgb)
-        )
         out = np.empty(self.pixels.shape, np.float32)
         with kernel_threads(ROWS_PER_THREAD):
-            edge_kernels.cover_photo(self.pixels, matrix, overlay, overlay_rgb, out)
+            arrays = (image.detach().contiguous().numpy() for image in images)
+            kernel(self.pixels, matrix, *arrays, out)
         return torch.from_numpy(out)
 
     def _styled(
@@ -775,7 +783,10 @@ class Photo:
         if not is_plain:
             rgb = self.clear_picture(raster, parts, sky_weight)
             return mix(rgb, airlight, fog_share), fog_share
-        rgb = mix(self._land, airlight, fog_share)
+        if choose_kernels(self.backend, airlight, fog_share) == CPU:
+            rgb = self._fade_on_cpu(airlight, fog_share)
+        else:
+            rgb = mix(self._land, airlight, fog_share)
         mixed_share = fog_share.flatten()[pixels, None]
         mixed_airlight = airlight.expand_as(rgb).flatten(0, 1)[pixels]
         mixed_rgb = (1 - mixed_share) * self._weigh_mixed(sky_weight) + mixed_share * mixed_airlight

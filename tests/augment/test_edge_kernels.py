@@ -19,7 +19,7 @@ from augment.photo.outlines import (
 )
 from augment.photo.packed_matte import pack_matte, unpack_matte
 from augment.photo.photo_objects import ObjectEdges
-from augment.photo.recorded_base import add_weighted
+from augment.photo.recorded_base import add_weighted, mix
 from augment.render import photo_kernels
 from augment.render.buffers import SPLAT_IDS, RenderOutput
 from augment.scene.scene import PosedGaussians
@@ -80,7 +80,7 @@ def test_gains_of_offsets_are_those_of_the_plain_form(num_points, side_px, count
     np.testing.assert_array_equal(gains, expected)
 
 
-def test_a_covered_photo_is_the_mapped_photo_under_what_lies_on_it():
+def test_a_photo_under_snow_or_smog_is_mapped_and_mixed_in_one_pass():
     rng = np.random.default_rng(2)
     pixels = rng.integers(0, 256, (37, 51, 3)).astype(np.uint8)
     color_map = rng.normal(size=(3, 4)).astype(np.float32)
@@ -94,6 +94,10 @@ def test_a_covered_photo_is_the_mapped_photo_under_what_lies_on_it():
     covered = np.empty_like(land)
     kernels.cover_photo(pixels, color_map, overlay, overlay_rgb, covered)
     np.testing.assert_array_equal(covered, expected.numpy())
+    for airlight in (overlay_rgb, overlay_rgb[:1, :1].copy()):
+        expected = mix(*map(torch.from_numpy, (land, airlight, overlay)))
+        kernels.fade_photo(pixels, color_map, airlight, overlay, covered)
+        np.testing.assert_array_equal(covered, expected.numpy())
 
 
 def test_edges_are_marked_where_the_photo_and_the_drawing_differ():
