@@ -154,7 +154,7 @@ def mirror_share(rgb: Float32[np.ndarray, "*B 3"], gloss: SkyGloss) -> Float32[n
     saturation, hue = _saturation_and_hue(gloss.relative(rgb))
     low, high = (gloss.saturation * factor for factor in SATURATION_END)
     share = _ramp(saturation, *SATURATION_START) * (1 - _ramp(saturation, low, high))
-    share = share * (1 - _ramp(np.abs(hue - gloss.hue), *HUE_END))
+    share = share * (1 - _ramp(np.asarray(np.abs(hue - gloss.hue)), *HUE_END))
     return np.asarray(share, np.float32)
 
 
