@@ -73,7 +73,7 @@ def grey_photo(
     share[(classes < 0) | _is_any(classes, MATTE_CLASSES)] = 0
     if photo.matte is not None:
         sky_share = cv2.resize(
-            photo.matte.sky_share, (small_width, small_height), interpolation=cv2.INTER_AREA
+            photo.matte.sky_share, (small_width, small_height), interpolation=cv2.INTER_NEAREST
         )
         share *= 1 - np.clip(sky_share, 0, 1)
     share = cv2.blur(share, (SMOOTHING_PX, SMOOTHING_PX))
