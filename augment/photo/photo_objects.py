@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 
+from augment.photo.object_underside import Underside, heights_at, underside_of
 from augment.photo.outlines import MIN_AREA_PX, Silhouette, fill_polygons, find_outlines
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, OVERLAY, SPLAT_IDS, RenderOutput
 from augment.render.constants import RasterSettings
@@ -50,9 +51,7 @@ DEPTH_TOLERANCE_M = 0.5
 # Height above an object within which its own snow may lie, metres.
 CAP_HEIGHT_M = 0.8
 # Share of a pixel that snow on the ground may hide where an object's buffers are taken.
-MAX_GROUND_SNOW = 0.3
-# Quantile of the heights of an object's splats that is its bottom.
-LOWEST_QUANTILE = 0.01
+MAX_GROUND_SNOW = 0.1
 # Largest number of objects whose outlines are moved; the nearest ones are taken.
 MAX_OBJECTS = 60
 
@@ -176,8 +175,8 @@ class _Object:
     """Median z of its pixels, metres."""
     polygons: list[Float[np.ndarray, "_ 2"]]
     """Its outlines in the photo."""
-    bottom_z_m: float = -math.inf
-    """Height of its lowest splats in the world, metres: it does not reach below."""
+    underside: Underside | None = None
+    """Its lower side: it does not reach below."""
 
 
 def find_edges(
@@ -214,7 +213,12 @@ def find_edges(
     objects = _find_objects(bare, camera, pixels)
     if not objects:
         return None
-    objects = [replace(o, bottom_z_m=_bottom_of(bare_parts, o.instance_id)) for o in objects]
+    objects = [
+        replace(
+            o, underside=underside_of([p for p in bare_parts if p.instance_id == o.instance_id])
+        )
+        for o in objects
+    ]
     covered = bare
     if len(bare_parts) < len(moving_parts):
         covered = _draw(moving_parts, small, scene_depth, settings, backend)
@@ -223,21 +227,6 @@ def find_edges(
     if raster.overlay is not None:  # snow on the ground hides the feet of objects
         is_bare = _shrink(raster.overlay, small) <= covered.overlay + MAX_GROUND_SNOW
     return _edges_of(objects, covered, is_drawn, is_bare, clip, camera, covered is not bare)
-
-
-def _bottom_of(parts: Sequence[PosedGaussians], instance_id: int) -> float:
-    """Return the height in the world of the lowest splats of an object, metres."""
-    heights = list[np.ndarray]()
-    for part in parts:
-        if part.instance_id != instance_id:
-            continue
-        means = part.gaussians.means.detach().cpu().double().numpy()
-        if part.world_from_part is None:
-            heights.append(means[:, 2])
-            continue
-        pose = part.world_from_part.detach().cpu().double().numpy()
-        heights.append(means @ pose[2, :3] + pose[2, 3])
-    return float(np.quantile(np.concatenate(heights), LOWEST_QUANTILE))
 
 
 def copy_size(camera: Camera, width_px: int) -> tuple[int, int]:
@@ -397,7 +386,7 @@ def _edges_of(
         if is_object.any():
             nearest = _nearest_to(small_rows, small_columns, is_object)
             depths_m = drawing.depth.reshape(-1)[nearest]
-        is_above = _heights_at(chosen, depths_m, camera) > clip.z_m
+        is_above = heights_at(chosen, depths_m, camera) > clip.z_m
         moves.append(_find_sources(chosen[is_above], is_seed & is_drawn, camera))
         moves.append(_find_sources(chosen[~is_above], is_seed & ~is_drawn, camera))
     empty = np.empty(0, np.int64)
@@ -442,18 +431,9 @@ def _cut_below(
         small = rows * height // camera.height, columns * width // camera.width
         depths_m = drawing.depth.reshape(-1)[_nearest_to(*small, is_object)]
         pixels = rows * camera.width + columns
-        is_below = _heights_at(pixels, depths_m, camera) < drawn_object.bottom_z_m
+        assert drawn_object.underside is not None
+        is_below = drawn_object.underside.is_above(pixels, depths_m, camera)
         photo_labels.reshape(-1)[pixels[is_below]] = 0
-
-
-def _heights_at(
-    targets: Int64[np.ndarray, " M"], depth_m: float | Float[np.ndarray, " M"], camera: Camera
-) -> Float[np.ndarray, " M"]:
-    """Return the height in the world of points at a depth in pixels."""
-    rows, columns = np.divmod(targets, camera.width)
-    x, y, z = camera.world_from_camera[2, :3].tolist()
-    rise = x * (columns + 0.5 - camera.cx) / camera.fx + y * (rows + 0.5 - camera.cy) / camera.fy
-    return float(camera.centre[2]) + depth_m * (rise + z)
 
 
 def _are_above(
@@ -543,11 +523,10 @@ def _find_sources(
     small_columns = columns * width // camera.width
     nearest = _nearest_to(small_rows, small_columns, is_seed)
     seed_rows, seed_columns = np.divmod(nearest, width)
-    # A target keeps its place within the small pixel, so that neighbours differ as they did.
-    rows += np.rint((seed_rows - small_rows) * (camera.height / height)).astype(np.int64)
-    columns += np.rint((seed_columns - small_columns) * (camera.width / width)).astype(np.int64)
-    rows = np.clip(rows, 0, camera.height - 1)
-    columns = np.clip(columns, 0, camera.width - 1)
+    # The pixel from which the small copy has its value: others of the seed were not looked at, and
+    # would repeat a pattern over all targets beside it.
+    rows = seed_rows * camera.height // height
+    columns = seed_columns * camera.width // width
     return targets, rows * camera.width + columns
 
 

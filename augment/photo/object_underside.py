@@ -1,0 +1,152 @@
+"""Lower side of a moving object: a car's wheels stand on the ground, its ends hang over it.
+
+In: the splats of an object. Out: an `Underside`, which tells pixels that show the ground below the
+object from pixels that show the object. The shadow below a bumper is as dark as the bumper, so that
+no edge of the photo parts them. Caller: `photo_objects`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from augment.scene.cameras import Camera
+from augment.scene.scene import PosedGaussians
+
+# Quantile of the heights of an object's splats that is its bottom.
+LOWEST_QUANTILE = 0.01
+# Distance between stations along an object, metres.
+STATION_M = 0.25
+# Quantile of the heights of a station's splats that is the object's lower side there.
+STATION_QUANTILE = 0.05
+# Fewest splats of a station that has a height.
+MIN_STATION_SPLATS = 8
+# Fewest stations of an object whose ends may lie higher than its bottom.
+MIN_STATIONS = 6
+# Largest height of an end above the bottom, metres.
+MAX_OVERHANG_M = 0.4
+# Sine of the angle between the view and the object's length from which on its side view counts
+# alone. Seen from its ends, the wheels beside a bumper hide the ground below it.
+SIDE_VIEW_SINE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Underside:
+    """Lower side of an object, as a line along its length."""
+
+    bottom_z_m: float
+    """Height of the lowest splats in the world."""
+    stations_m: Float[np.ndarray, " K"]
+    """Places along the object, in its frame; none where only the bottom is known."""
+    heights_m: Float[np.ndarray, " K"]
+    """Heights above the bottom at these places, a convex line: straight from wheel to wheel."""
+    object_from_world: Float[np.ndarray, "4 4"]
+    """Pose of the object."""
+
+    def is_above(
+        self, pixels: Int64[np.ndarray, " M"], depths_m: Float[np.ndarray, " M"], camera: Camera
+    ) -> np.ndarray:
+        """Return the mask [M] of pixels at whose depth the lower side lies above the ray.
+
+        Args:
+            pixels: flat indices of pixels.
+            depths_m: z of the object there, metres.
+            camera: the camera of the photo.
+        """
+        lowest_m = np.full(len(pixels), self.bottom_z_m)
+        if len(self.stations_m):
+            rows, columns = np.divmod(pixels, camera.width)
+            rays = np.stack(
+                [
+                    (columns + 0.5 - camera.cx) / camera.fx,
+                    (rows + 0.5 - camera.cy) / camera.fy,
+                    np.ones(len(pixels)),
+                ],
+                1,
+            )
+            object_from_camera = self.object_from_world @ camera.world_from_camera.numpy()
+            directions = rays @ object_from_camera[:3, :3].T
+            along_m = directions[:, 0] * depths_m + object_from_camera[0, 3]
+            sine = np.abs(directions[:, 1]) / np.maximum(np.hypot(*directions[:, :2].T), 1e-9)
+            rise_m = np.interp(along_m, self.stations_m, self.heights_m)
+            lowest_m += np.clip(sine / SIDE_VIEW_SINE, 0, 1) * rise_m
+        return heights_at(pixels, depths_m, camera) < lowest_m
+
+
+def underside_of(parts: Sequence[PosedGaussians]) -> Underside:
+    """Return the lower side of an object.
+
+    Args:
+        parts: its parts, without what lies on them; one at least.
+    """
+    heights = list[np.ndarray]()
+    for part in parts:
+        means = part.gaussians.means.detach().cpu().double().numpy()
+        if part.world_from_part is None:
+            heights.append(means[:, 2])
+            continue
+        pose = part.world_from_part.detach().cpu().double().numpy()
+        heights.append(means @ pose[2, :3] + pose[2, 3])
+    z_m = np.concatenate(heights)
+    bottom_z_m = float(np.quantile(z_m, LOWEST_QUANTILE))
+    pose = parts[0].world_from_part
+    none = np.empty(0)
+    if len(parts) > 1 or pose is None:
+        return Underside(bottom_z_m, none, none, np.eye(4))
+    object_from_world = np.eye(4)
+    rotation = pose[:3, :3].detach().cpu().double().numpy().T
+    object_from_world[:3, :3] = rotation
+    object_from_world[:3, 3] = -rotation @ pose[:3, 3].detach().cpu().double().numpy()
+    x_m = parts[0].gaussians.means[:, 0].detach().cpu().double().numpy()
+    stations_m, lowest_m = _lowest_by_station(x_m, z_m - bottom_z_m)
+    if len(stations_m) < MIN_STATIONS:
+        return Underside(bottom_z_m, none, none, object_from_world)
+    hull = _lower_hull(stations_m, lowest_m)
+    heights_m = np.clip(np.interp(stations_m, stations_m[hull], lowest_m[hull]), 0, MAX_OVERHANG_M)
+    return Underside(bottom_z_m, stations_m, heights_m, object_from_world)
+
+
+def _lowest_by_station(
+    x_m: Float[np.ndarray, " N"], z_m: Float[np.ndarray, " N"]
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
+    """Return the stations that have splats, and the heights of the lower side there."""
+    numbers = np.floor(x_m / STATION_M).astype(np.int64)
+    order = np.lexsort((z_m, numbers))
+    stations, first, counts = np.unique(numbers[order], return_index=True, return_counts=True)
+    has_height = counts >= MIN_STATION_SPLATS
+    rows = first + np.round(STATION_QUANTILE * (counts - 1)).astype(np.int64)
+    return (stations[has_height] + 0.5) * STATION_M, z_m[order][rows[has_height]]
+
+
+def _lower_hull(x: Float[np.ndarray, " K"], z: Float[np.ndarray, " K"]) -> list[int]:
+    """Return the numbers of the points on the lower convex hull; x rises."""
+    hull = list[int]()
+    for point in range(len(x)):
+        while len(hull) >= 2:
+            first, middle = hull[-2:]
+            turn = (x[middle] - x[first]) * (z[point] - z[first])
+            turn -= (z[middle] - z[first]) * (x[point] - x[first])
+            if turn > 0:
+                break
+            hull.pop()
+        hull.append(point)
+    return hull
+
+
+def heights_at(
+    pixels: Int64[np.ndarray, " M"], depth_m: float | Float[np.ndarray, " M"], camera: Camera
+) -> Float[np.ndarray, " M"]:
+    """Return the height in the world of points at a depth in pixels.
+
+    Args:
+        pixels: flat indices of pixels.
+        depth_m: z of the points, metres.
+        camera: the camera of the photo.
+    """
+    rows, columns = np.divmod(pixels, camera.width)
+    x, y, z = camera.world_from_camera[2, :3].tolist()
+    rise = x * (columns + 0.5 - camera.cx) / camera.fx + y * (rows + 0.5 - camera.cy) / camera.fy
+    return float(camera.centre[2]) + depth_m * (rise + z)
