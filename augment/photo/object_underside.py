@@ -76,37 +76,40 @@ class Underside:
         return heights_at(pixels, depths_m, camera) < lowest_m
 
 
-def underside_of(parts: Sequence[PosedGaussians]) -> Underside:
+def underside_of(
+    parts: Sequence[PosedGaussians], world_from_object: Float[np.ndarray, "4 4"] | None = None
+) -> Underside:
     """Return the lower side of an object.
 
     Args:
         parts: its parts, without what lies on them; one at least.
+        world_from_object: its pose, x along its length; None takes that of its parts.
     """
-    heights = list[np.ndarray]()
-    for part in parts:
-        means = part.gaussians.means.detach().cpu().double().numpy()
-        if part.world_from_part is None:
-            heights.append(means[:, 2])
-            continue
-        pose = part.world_from_part.detach().cpu().double().numpy()
-        heights.append(means @ pose[2, :3] + pose[2, 3])
-    z_m = np.concatenate(heights)
-    bottom_z_m = float(np.quantile(z_m, LOWEST_QUANTILE))
-    pose = parts[0].world_from_part
+    means = [_means_in_world(part) for part in parts]
+    bottom_z_m = float(np.quantile(np.concatenate(means)[:, 2], LOWEST_QUANTILE))
     none = np.empty(0)
-    if len(parts) > 1 or pose is None:
-        return Underside(bottom_z_m, none, none, np.eye(4))
-    object_from_world = np.eye(4)
-    rotation = pose[:3, :3].detach().cpu().double().numpy().T
-    object_from_world[:3, :3] = rotation
-    object_from_world[:3, 3] = -rotation @ pose[:3, 3].detach().cpu().double().numpy()
-    x_m = parts[0].gaussians.means[:, 0].detach().cpu().double().numpy()
-    stations_m, lowest_m = _lowest_by_station(x_m, z_m - bottom_z_m)
+    if world_from_object is None:
+        if len(parts) > 1 or parts[0].world_from_part is None:
+            return Underside(bottom_z_m, none, none, np.eye(4))
+        world_from_object = parts[0].world_from_part.detach().cpu().double().numpy()
+    object_from_world = np.linalg.inv(world_from_object)
+    points = np.concatenate(means)
+    x_m = points @ object_from_world[0, :3] + object_from_world[0, 3]
+    stations_m, lowest_m = _lowest_by_station(x_m, points[:, 2] - bottom_z_m)
     if len(stations_m) < MIN_STATIONS:
         return Underside(bottom_z_m, none, none, object_from_world)
     hull = _lower_hull(stations_m, lowest_m)
     heights_m = np.clip(np.interp(stations_m, stations_m[hull], lowest_m[hull]), 0, MAX_OVERHANG_M)
     return Underside(bottom_z_m, stations_m, heights_m, object_from_world)
+
+
+def _means_in_world(part: PosedGaussians) -> Float[np.ndarray, "N 3"]:
+    """Return the middles of a part's splats in the world."""
+    means = part.gaussians.means.detach().cpu().double().numpy()
+    if part.world_from_part is None:
+        return means
+    pose = part.world_from_part.detach().cpu().double().numpy()
+    return means @ pose[:3, :3].T + pose[:3, 3]
 
 
 def _lowest_by_station(

@@ -10,7 +10,7 @@ photo ends.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -23,6 +23,7 @@ from torch import Tensor
 
 from augment.photo.object_underside import Underside, heights_at, underside_of
 from augment.photo.outlines import MIN_AREA_PX, Silhouette, fill_polygons, find_outlines
+from augment.photo.parked_objects import ObjectParts
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, OVERLAY, SPLAT_IDS, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.layout import HeightClip
@@ -50,6 +51,8 @@ DEPTH_TOLERANCE = 0.1
 DEPTH_TOLERANCE_M = 0.5
 # Height above an object within which its own snow may lie, metres.
 CAP_HEIGHT_M = 0.8
+# Share of a pixel that shows snow on an object, up to which the pixel may take other buffers.
+CLEAR_OVERLAY = 0.05
 # Share of a pixel that snow on the ground may hide where an object's buffers are taken.
 MAX_GROUND_SNOW = 0.1
 # Largest number of objects whose outlines are moved; the nearest ones are taken.
@@ -187,9 +190,10 @@ def find_edges(
     *,
     settings: RasterSettings,
     clip: HeightClip | None = None,
+    parked: ObjectParts | None = None,
     backend: str,
 ) -> ObjectEdges | None:
-    """Return the edges of the moving parts on the photo; None where there are none.
+    """Return the edges of the objects on the photo; None where there are none.
 
     Args:
         parts: the posed parts of the view.
@@ -198,10 +202,18 @@ def find_edges(
         pixels: the photo.
         settings: the rasteriser's settings.
         clip: height above which the buffers show the parts; None if they show all.
+        parked: objects that stand still, taken from the background; None for none.
         backend: the rasteriser's backend.
     """
     moving_parts = [part for part in parts if part.instance_id > 0]
     bare_parts = [part for part in moving_parts if not part.is_overlay]
+    is_snowy = len(bare_parts) < len(moving_parts)
+    poses: Mapping[int, np.ndarray] = {}
+    if parked is not None:
+        moving_parts += parked.parts
+        bare_parts += parked.bare_parts
+        is_snowy |= any(part.is_overlay for part in parked.parts)
+        poses = parked.poses
     if not bare_parts or camera.is_orthographic:
         return None
     assert raster.alpha is not None and raster.expected_depth is not None
@@ -213,14 +225,16 @@ def find_edges(
     objects = _find_objects(bare, camera, pixels)
     if not objects:
         return None
-    objects = [
-        replace(
-            o, underside=underside_of([p for p in bare_parts if p.instance_id == o.instance_id])
+    undersides = {
+        o.instance_id: underside_of(
+            [part for part in bare_parts if part.instance_id == o.instance_id],
+            poses.get(o.instance_id),
         )
         for o in objects
-    ]
+    }
+    objects = [replace(o, underside=undersides[o.instance_id]) for o in objects]
     covered = bare
-    if len(bare_parts) < len(moving_parts):
+    if is_snowy:
         covered = _draw(moving_parts, small, scene_depth, settings, backend)
     is_drawn = None if clip is None else alpha > 0.5
     is_bare = None
@@ -362,6 +376,8 @@ def _edges_of(
     shows_background[window.rows, window.columns] = window_background
     is_solid = window.linear(alpha) >= SOLID_ALPHA
     lacks_object = (window_labels > 0) & ~(is_solid & (window.nearest(labels) == window_labels))
+    # The soft edge of its snow stays as it is drawn.
+    lacks_object &= window.linear(drawing.overlay) <= CLEAR_OVERLAY
     target_rows, target_columns = np.nonzero(lacks_object)
     target_labels = window_labels[target_rows, target_columns]
     targets = (target_rows + window.rows.start) * camera.width
