@@ -46,34 +46,28 @@ class Underside:
     object_from_world: Float[np.ndarray, "4 4"]
     """Pose of the object."""
 
-    def is_above(
-        self, pixels: Int64[np.ndarray, " M"], depths_m: Float[np.ndarray, " M"], camera: Camera
-    ) -> np.ndarray:
-        """Return the mask [M] of pixels at whose depth the lower side lies above the ray.
+    def lowest_at(
+        self, rows: np.ndarray, columns: np.ndarray, depths_m: np.ndarray, camera: Camera
+    ) -> Float[np.ndarray, "..."]:
+        """Return the height in the world below which places in an image are not the object's.
 
         Args:
-            pixels: flat indices of pixels.
+            rows: rows of the places, any shape, 0.5 in the middle of the first.
+            columns: columns of the places.
             depths_m: z of the object there, metres.
-            camera: the camera of the photo.
+            camera: the camera of the image.
         """
-        lowest_m = np.full(len(pixels), self.bottom_z_m)
-        if len(self.stations_m):
-            rows, columns = np.divmod(pixels, camera.width)
-            rays = np.stack(
-                [
-                    (columns + 0.5 - camera.cx) / camera.fx,
-                    (rows + 0.5 - camera.cy) / camera.fy,
-                    np.ones(len(pixels)),
-                ],
-                1,
-            )
-            object_from_camera = self.object_from_world @ camera.world_from_camera.numpy()
-            directions = rays @ object_from_camera[:3, :3].T
-            along_m = directions[:, 0] * depths_m + object_from_camera[0, 3]
-            sine = np.abs(directions[:, 1]) / np.maximum(np.hypot(*directions[:, :2].T), 1e-9)
-            rise_m = np.interp(along_m, self.stations_m, self.heights_m)
-            lowest_m += np.clip(sine / SIDE_VIEW_SINE, 0, 1) * rise_m
-        return heights_at(pixels, depths_m, camera) < lowest_m
+        lowest_m = np.full(depths_m.shape, self.bottom_z_m)
+        if not len(self.stations_m):
+            return lowest_m
+        x = (columns - camera.cx) / camera.fx
+        y = (rows - camera.cy) / camera.fy
+        object_from_camera = self.object_from_world @ camera.world_from_camera.numpy()
+        forward, aside = (a[0] * x + a[1] * y + a[2] for a in object_from_camera[:2, :3])
+        along_m = forward * depths_m + object_from_camera[0, 3]
+        sine = np.abs(aside) / np.maximum(np.hypot(forward, aside), 1e-9)
+        rise_m = np.interp(along_m, self.stations_m, self.heights_m)
+        return lowest_m + np.clip(sine / SIDE_VIEW_SINE, 0, 1) * rise_m
 
 
 def underside_of(
@@ -139,6 +133,12 @@ def _lower_hull(x: Float[np.ndarray, " K"], z: Float[np.ndarray, " K"]) -> list[
     return hull
 
 
+def height_numbers(camera: Camera) -> tuple[float, ...]:
+    """Return the numbers of `heights_at`: the camera's height, the rise of its axes, its lens."""
+    x, y, z = camera.world_from_camera[2, :3].tolist()
+    return float(camera.centre[2]), x, y, z, camera.cx, camera.cy, camera.fx, camera.fy
+
+
 def heights_at(
     pixels: Int64[np.ndarray, " M"], depth_m: float | Float[np.ndarray, " M"], camera: Camera
 ) -> Float[np.ndarray, " M"]:
@@ -150,6 +150,6 @@ def heights_at(
         camera: the camera of the photo.
     """
     rows, columns = np.divmod(pixels, camera.width)
-    x, y, z = camera.world_from_camera[2, :3].tolist()
-    rise = x * (columns + 0.5 - camera.cx) / camera.fx + y * (rows + 0.5 - camera.cy) / camera.fy
-    return float(camera.centre[2]) + depth_m * (rise + z)
+    eye_z_m, x, y, z, cx, cy, fx, fy = height_numbers(camera)
+    rise = x * (columns + 0.5 - cx) / fx + y * (rows + 0.5 - cy) / fy
+    return eye_z_m + depth_m * (rise + z)

@@ -34,7 +34,7 @@ TOP_MARGIN_OF_SNOW_M = 0.7
 # Height of a box's part in which snow lies on the ground, metres.
 BOTTOM_MARGIN_OF_SNOW_M = 0.5
 # Fewest splats of a vehicle whose outline is moved.
-MIN_SPLATS = 200
+MIN_SPLATS = 60
 # Classes of splats in a vehicle's box that are not the vehicle.
 OTHER_CLASSES = tuple(
     SemanticClass[name]
@@ -70,7 +70,7 @@ class ObjectBox:
         half_width = max(camera.cx, camera.width - camera.cx) / camera.fx
         distance_m = float(np.linalg.norm(self.centre_m - camera.centre.numpy()))
         is_in_view = abs(x) - half_width * z < reach_m * np.hypot(1, half_width)
-        return distance_m <= MAX_DISTANCE_M and z > -reach_m and bool(is_in_view)
+        return bool(distance_m <= MAX_DISTANCE_M and z > -reach_m and is_in_view)
 
     def rows_in(self, gaussians: Gaussians, *, is_overlay: bool) -> Int64[np.ndarray, " R"]:
         """Return the rows of the Gaussians that are the object's, or lie on it.
@@ -160,7 +160,9 @@ def take_objects(
     poses = dict[int, np.ndarray]()
     rows_by_part = dict[int, dict[int, np.ndarray]]()
     instance_id = max((part.instance_id for part in parts), default=0)
-    for box in () if objects is None else objects.boxes:
+    if objects is None:
+        return ObjectParts((), (), poses, rows_by_part)
+    for box in objects.boxes:
         if not box.is_near(camera):
             continue
         bare_rows = _rows_of(box, objects.background, is_overlay=False)

@@ -160,8 +160,7 @@ def render_buffers(
             layers = replace(layers, parts=parts, unpruned_parts=layers.parts)
     car_rgb = None
     if own_car is not None and layers.photo is not None:
-        # Copied, since effects may write into the picture that they get.
-        car_rgb = layers.photo.own_car_colors[own_car.rows].clone()
+        car_rgb = layers.photo.own_car_colors(own_car.rows)
     rendered = _draw(view, layers, camera)
     if own_car is None or car_rgb is None:
         for effect in view.effects:
@@ -276,17 +275,27 @@ def _with_own_car(
 
     Args:
         rendered: the picture, which is written into.
-        first_view: the picture before effects edited it. It may be the photo, and is copied.
+        first_view: the picture before effects edited it. If it is a picture that others read, it
+            is copied.
         own_car: the recording car in it.
         car_rgb: colours of the car's rows, [h, W, 3].
     """
     with timed("recording car"):
-        if rendered.rgb is first_view.rgb:
+        if rendered.rgb is first_view.rgb and _is_shared(first_view):
             rendered = replace(rendered, rgb=rendered.rgb.clone())
         weights = torch.from_numpy(own_car.weights).to(rendered.rgb.device)
         rows = rendered.rgb[own_car.rows]
         rows.copy_(mix(rows, car_rgb, weights))
     return rendered
+
+
+def _is_shared(rendered: RenderedView) -> bool:
+    """Return True if a picture is the photo itself, or one of the scene's buffers."""
+    raster_rgb = rendered.raster.rgb
+    if raster_rgb is not None and raster_rgb.data_ptr() == rendered.rgb.data_ptr():
+        return True
+    photo = rendered.layers.photo
+    return photo is None or photo.is_land(rendered.rgb)
 
 
 def _masks(view: ViewPlan, rendered: RenderedView, own_car: OwnCar | None) -> dict[str, Tensor]:
