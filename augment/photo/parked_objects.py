@@ -21,7 +21,7 @@ from augment.scene.scene import Gaussians, PosedGaussians
 from augment.scene.semantics import SemanticClass
 
 # Distance of a vehicle's centre from the camera up to which its outline is moved, metres.
-MAX_DISTANCE_M = 25.0
+MAX_DISTANCE_M = 12.0
 # Distance beyond the sides of a box in which splats are the vehicle's, metres: mirrors, and discs
 # of some centimetres.
 SIDE_MARGIN_M = 0.15
