@@ -21,6 +21,7 @@ from torch import Tensor
 from augment import effects
 from augment.detail.prune import prune_parts
 from augment.effects.effect import EffectInScene, LabelInputs, RenderedView
+from augment.exposure.vehicle_cells import parked_vehicles
 from augment.light.cast_shadows import faded_shadows
 from augment.light.common_exposure import added_colors
 from augment.light.sky_gloss import GreyedGloss, find_sky_gloss
@@ -28,6 +29,7 @@ from augment.output.layout import TRUST
 from augment.photo.greyed_photo import grey_photo, small_size
 from augment.photo.own_car import OwnCar, own_car_in_view
 from augment.photo.own_car_snow import cover_own_car
+from augment.photo.parked_objects import ObjectBox, ParkedObjects
 from augment.photo.recorded_base import mix, open_photo, splat_classes
 from augment.photo.trust import trust_mask
 from augment.render.backends import choose_backend, renders_on_gpu
@@ -141,6 +143,10 @@ def render_buffers(
             )
             photo = open_photo(scene, camera, color_map, backend=backend, finds_sky=finds_sky)
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
+    if photo is not None:
+        vehicles = parked_vehicles(scene)
+        boxes = tuple(ObjectBox(v.centre_m, v.rotation, v.size_m) for v in vehicles)
+        layers = replace(layers, parked=ParkedObjects(boxes, bare_parts[0].gaussians))
     if plan.uses_common_exposure:
         layers = replace(layers, added_colors=added_colors(scene, camera))
     is_fading = plan.sun_share < 1 or plan.gloss_fade > 0
