@@ -58,6 +58,8 @@ class LayerRenderer:
     """Map of the colours that effects add, before the camera's colour map; None to leave them."""
     parked: ParkedObjects | None = None
     """Parked vehicles, whose edges snow and water take from the photo; None for none."""
+    needs_lamp_inputs: bool = False
+    """If True, effects also fill those fields of `RenderedView` that only lamps read."""
 
     def without_fog(self) -> LayerRenderer:
         """Return the same renderer in clear air."""
