@@ -219,7 +219,7 @@ def add_surfaces_beyond_beams(
     voters = [*views, *sky_views]
     background = without_sky_splats(background, voters, max_conflicts=_MAX_MEASURED_CONFLICTS)
     views = [
-        view._replace(known_m=_draw(background, view.camera, pose_parts)[1].depth_m)
+        dataclasses.replace(view, known_m=_draw(background, view.camera, pose_parts)[1].depth_m)
         for view in views
     ]
     background = trim_at_sky(background, views)
@@ -246,7 +246,7 @@ def add_surfaces_beyond_beams(
         other_views = [other for other in views if other is not view]
         panes = _find_panes(view.matte.sky_share, depth.wall)
         sky_share = np.where(panes, np.float32(0), view.matte.sky_share)
-        view = view._replace(matte=view.matte._replace(sky_share=sky_share))
+        view = dataclasses.replace(view, matte=view.matte._replace(sky_share=sky_share))
         cells = _cells(view, depth, leaks & (sky_share < _SOLID_SHARE), room)
         discs = _discs(view, depth, is_known | panes, cells, walls, other_views)
         background = join_gaussians([background, discs])
@@ -380,43 +380,77 @@ def _cells(view: SolidView, depth: DenseDepth, is_open: np.ndarray, room: int) -
         wall=depth.wall.astype(np.float32),
         from_sky_px=cv2.distanceTransform(is_solid, cv2.DIST_L2, 3),
     )
+    evenness = [_measure_evenness(images, side) for side in _SIDES_PX]
     for tolerance in _COLOR_TOLERANCES:
-        cells = _split(images, is_open, tolerance)
+        cells = _split(evenness, is_open, tolerance)
         if len(cells.rows) <= room:
             return cells
     largest_first = np.argsort(-cells.sides, kind="stable")[:room]
     return cells.select(np.sort(largest_first))
 
 
-def _split(images: _CellImages, is_open: np.ndarray, tolerance: float) -> _Cells:
-    """Return cells of a quadtree: of each open pixel the largest one that is open and even."""
-    height, width = is_open.shape
+class _Evenness(NamedTuple):
+    """Evenness of the square cells of one side in an image, [R, C] each."""
+
+    side: int
+    """Side of the cells, pixels."""
+    color_variance: np.ndarray
+    """Variance of the colours in each cell, summed over the channels, float32."""
+    is_allowed: np.ndarray
+    """True where depths are even, and no sky is near."""
+
+
+def _measure_evenness(images: _CellImages, side: int) -> _Evenness:
+    """Return the evenness of the cells of one side."""
+    height, width = images.wall.shape
+    rows = height // side
+    columns = width // side
+    if side == 1 or rows == 0 or columns == 0:
+        shape = rows, columns
+        return _Evenness(side, np.zeros(shape, np.float32), np.ones(shape, np.bool_))
+
+    def mean(image: np.ndarray) -> np.ndarray:
+        return _means_of_cells(image, side)
+
+    variance = cv2.transform(mean(images.lab**2) - mean(images.lab) ** 2, np.ones((1, 3)))
+    depth_variance = mean(images.log_depth**2) - mean(images.log_depth) ** 2
+    # A disc on a wall leans with it.
+    mean_wall = mean(images.wall)
+    wall_variance = mean(images.wall**2) - mean_wall**2
+    is_even = depth_variance < _DEPTH_TOLERANCE**2
+    is_even |= (mean_wall >= 0) & (wall_variance < 1e-3)
+    # A cell that is nearer would reach into the sky.
+    is_apart = mean(images.from_sky_px) > _SKY_SIDES * side
+    return _Evenness(side, variance, is_even & is_apart)
+
+
+def _means_of_cells(image: np.ndarray, side: int) -> np.ndarray:
+    """Return the means [R, C, ...] of the image's whole square cells."""
+    rows = image.shape[0] // side
+    columns = image.shape[1] // side
+    inside = image[: rows * side, : columns * side]
+    return cv2.resize(inside, (columns, rows), interpolation=cv2.INTER_AREA)
+
+
+def _split(evenness: Sequence[_Evenness], is_open: np.ndarray, tolerance: float) -> _Cells:
+    """Return cells of a quadtree: of each open pixel the largest one that is open and even.
+
+    Args:
+        evenness: the cells of each side, the largest first.
+        is_open: open pixels, bool [H, W].
+        tolerance: largest standard deviation of colours within a cell.
+    """
     missing = is_open.copy()
     cell_lists = []
-    for side in _SIDES_PX:
-        rows = height // side
-        columns = width // side
-        inside = slice(0, rows * side), slice(0, columns * side)
-
-        def mean(image: np.ndarray, inside=inside, size=(columns, rows)) -> np.ndarray:
-            return cv2.resize(image[inside], size, interpolation=cv2.INTER_AREA)
-
-        if rows == 0 or columns == 0:
+    for side, color_variance, is_allowed in evenness:
+        if is_allowed.size == 0:
             continue
-        is_cell = mean(missing.astype(np.float32)) > 1 - 0.5 / side**2
-        if side > 1:
-            variance = (mean(images.lab**2) - mean(images.lab) ** 2).sum(-1)
-            depth_variance = mean(images.log_depth**2) - mean(images.log_depth) ** 2
-            is_even = depth_variance < _DEPTH_TOLERANCE**2
-            # A disc on a wall leans with it.
-            wall_variance = mean(images.wall**2) - mean(images.wall) ** 2
-            is_even |= (mean(images.wall) >= 0) & (wall_variance < 1e-3)
-            is_cell &= mean(images.from_sky_px) > _SKY_SIDES * side  # it would reach into the sky
-            is_cell &= (variance < tolerance**2) & is_even
+        is_cell = _means_of_cells(missing.astype(np.float32), side) > 1 - 0.5 / side**2
+        is_cell &= (color_variance < tolerance**2) & is_allowed
         cell_rows, cell_columns = np.nonzero(is_cell)
         cell_lists.append((cell_rows * side, cell_columns * side, np.full(len(cell_rows), side)))
-        covered = np.kron(is_cell, np.ones((side, side), np.bool_))
-        missing[inside] &= ~covered
+        covered = is_cell.repeat(side, axis=0).repeat(side, axis=1)
+        missing[: covered.shape[0], : covered.shape[1]] &= ~covered
     return _Cells(*(np.concatenate(parts) for parts in zip(*cell_lists, strict=True)))
 
 

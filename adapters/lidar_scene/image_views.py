@@ -6,6 +6,7 @@ The caller is `adapters.lidar_scene.scene`.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -32,6 +33,7 @@ _KEEP_SCORE = 0.5  # part of a camera's best score from which its observations c
 _CAMERA_POWER = 2.0  # power of that best score that is the camera's weight
 _COVER_MARGIN_M = 0.15  # growth of a moving object's box to all sides, where it covers the world
 _AHEAD = 2  # images that are decoded before their turn
+_MIN_SKY_FRAMES = 12  # frames whose images show the sky's colours, at least; others show the same
 IMAGE_SCALES = (0.125, 0.25, 0.5, 1.0)  # scales that recorded images can be decoded at
 _REDUCED = {
     1.0: cv2.IMREAD_COLOR,
@@ -113,15 +115,14 @@ def observe_views(
 
     In each image the bodies are drawn into a z-buffer as they stood then. A surfel at its front
     takes the image's colour there. A camera's best observations count by their median. Cameras are
-    averaged with weights that fall towards the border. Uncovered pixels go to the sky.
+    averaged with weights that fall towards the border. Uncovered pixels of some frames go to the
+    sky.
     """
     names = list(dict.fromkeys(view.camera.name for view in views))
-    stores = [
-        _Observations(
-            np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
-        )
-        for shape in ((len(body.surfels), kernels.NUM_OBSERVATIONS) for body in bodies)
-    ]
+    frames = list(dict.fromkeys(view.frame for view in views))
+    sky_frames = set(frames[:: max(1, len(frames) // _MIN_SKY_FRAMES)])
+    discs = [_Discs.of(body) for body in bodies]
+    levels = np.zeros((_LEVELS, 0, 0, 3), np.uint8)
     problems: list[str] = []
     with ThreadPoolExecutor(available_cores()) as pool:
         images = read_ahead(pool, views, image_scale)
@@ -135,9 +136,16 @@ def observe_views(
                 problems.append(f"{where} is {width} px wide, not {view.camera.width}; left out")
             else:
                 number = names.index(view.camera.name)
-                _observe_one(bodies, stores, view, number, image, sky, pool)
+                if levels.shape[1:] != image.shape:
+                    levels = np.zeros((_LEVELS, *image.shape), np.uint8)
+                sizes = _fill_pyramid(levels, image)
+                frame_sky = sky if view.frame in sky_frames else None
+                _observe_one(discs, view, number, levels, sizes, frame_sky, pool)
     # A camera's observations by their median, cameras averaged.
-    blended = (kernels.blended_colours(*store, _KEEP_SCORE, _CAMERA_POWER) for store in stores)
+    blended = (
+        kernels.blended_colours(*body_discs.store, _KEEP_SCORE, _CAMERA_POWER)
+        for body_discs in discs
+    )
     return tuple(SurfelColours(*columns) for columns in blended), tuple(problems)
 
 
@@ -163,6 +171,51 @@ def read_image(path: Path, image_scale: float) -> np.ndarray | None:
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
+class _Discs(NamedTuple):
+    """Discs of a body, and what images show of them."""
+
+    body: Body
+    """The body."""
+    store: _Observations
+    """Observations of its surfels."""
+    extent: np.ndarray
+    """Half axes of the discs, metres, float32 [N, 2]."""
+    middle: np.ndarray
+    """Middle of the discs in the body's frame, float64 [3]."""
+    radius_m: float
+    """Radius of a ball around the middle that holds all discs."""
+
+    @staticmethod
+    def of(body: Body) -> _Discs:
+        """Return the discs of a body, without observations."""
+        shape = len(body.surfels), kernels.NUM_OBSERVATIONS
+        store = _Observations(
+            np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
+        )
+        extent = body.surfels.spacing * np.float32(DISC_PER_SPACING)
+        if len(body.surfels) == 0:
+            return _Discs(body, store, extent, np.zeros(3), 0.0)
+        centres = body.surfels.centres.astype(np.float64)
+        middle = (centres.min(axis=0) + centres.max(axis=0)) / 2
+        radius_m = np.linalg.norm(centres - middle, axis=1).max() + extent.max()
+        return _Discs(body, store, extent, middle, float(radius_m))
+
+    def may_be_in(self, camera: Camera, camera_from_body: np.ndarray) -> bool:
+        """Return False if no disc reaches into the image."""
+        x, y, z = camera_from_body[:3, :3] @ self.middle + camera_from_body[:3, 3]
+        tangents = (
+            camera.cx / camera.fx,
+            (camera.width - camera.cx) / camera.fx,
+            camera.cy / camera.fy,
+            (camera.height - camera.cy) / camera.fy,
+        )
+        # Distances from the four sides of the image's pyramid; the ball may lie across them.
+        return z > -self.radius_m and all(
+            across + tangent * z > -self.radius_m * math.hypot(1.0, tangent)
+            for across, tangent in zip((x, -x, y, -y), tangents, strict=True)
+        )
+
+
 class _Part(NamedTuple):
     """Some surfels of a body, as it stood in one image.
 
@@ -184,17 +237,26 @@ class _Part(NamedTuple):
 
 
 def _observe_one(
-    bodies: Sequence[Body],
-    stores: Sequence[_Observations],
+    discs: Sequence[_Discs],
     view: View,
     camera_number: int,
-    image: np.ndarray,
-    sky: SkyGatherer,
+    levels: np.ndarray,
+    sizes: np.ndarray,
+    sky: SkyGatherer | None,
     pool: Executor,
 ) -> None:
     """Store what one image shows.
 
     Surfels are processed in slices by threads, with the bits of one pass.
+
+    Args:
+        discs: discs of all bodies.
+        view: the image.
+        camera_number: number of its camera.
+        levels: uint8 [L, H, W, 3], the image halved again and again.
+        sizes: int [L, 2], rows and columns of the levels.
+        sky: collects the colours of the sky; None if the image is left out of it.
+        pool: threads that run the loops.
     """
     camera = view.camera.scaled(DEPTH_WIDTH / view.camera.width)
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
@@ -202,7 +264,8 @@ def _observe_one(
     cover = depth.copy()
     no_cover = depth.copy()
     parts = []
-    for body, store in zip(bodies, stores, strict=True):
+    for body_discs in discs:
+        body = body_discs.body
         transform = camera.camera_from_world.numpy()
         if body.track is not None:
             pose = body.track.motion.pose_at(camera.timestamp_ns)
@@ -210,10 +273,18 @@ def _observe_one(
                 continue
             transform = transform @ pose
             draw_cover(cover, camera, transform, body.track.size_m)
-        extent = body.surfels.spacing * np.float32(DISC_PER_SPACING)
+            if not body_discs.may_be_in(camera, transform):
+                continue
         part_pose = transform[:3, :3].copy(), transform[:3, 3].copy()
         parts += [
-            _Part(body.surfels, store, extent, part_pose, body.track is not None, rows)
+            _Part(
+                body.surfels,
+                body_discs.store,
+                body_discs.extent,
+                part_pose,
+                body.track is not None,
+                rows,
+            )
             for rows in row_slices(len(body.surfels))
         ]
 
@@ -251,29 +322,33 @@ def _observe_one(
         )
 
     depth_images = pool.map(draw, parts)
-    levels, sizes = _pyramid(image)
     for nearest in depth_images:
         np.minimum(depth, nearest, out=depth)
     car = view.shows_car(camera.width, camera.height)
     cover[car] = no_cover[car] = 0  # it stands before all else
     observations = pool.map(observe, parts)
-    sky.add(camera, np.isinf(depth) & np.isinf(cover), levels, sizes, pool)
+    if sky is not None:
+        sky.add(camera, np.isinf(depth) & np.isinf(cover), levels, sizes, pool)
     list(observations)
 
 
-def _pyramid(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the image halved again and again, in one array with its corners filled.
+def _fill_pyramid(levels: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Fill an array with the image halved again and again, each in its corner.
 
-    Rows and columns.
+    Args:
+        levels: uint8 [L, H, W, 3], changed in place.
+        image: uint8 [H, W, 3].
+
+    Returns:
+        Rows and columns of the levels, int64 [L, 2].
     """
-    levels = np.zeros((_LEVELS, *image.shape), np.uint8)
-    sizes = np.zeros((_LEVELS, 2), np.int64)
-    for i in range(_LEVELS):
+    sizes = np.zeros((len(levels), 2), np.int64)
+    for i in range(len(levels)):
         levels[i, : image.shape[0], : image.shape[1]] = image
         sizes[i] = image.shape[:2]
         half = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
         image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
-    return levels, sizes
+    return sizes
 
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64) / 2
@@ -290,6 +365,8 @@ def draw_cover(
     """
     corners = _CORNERS * (size_m + 2 * _COVER_MARGIN_M)
     corners = corners @ camera_from_box[:3, :3].T + camera_from_box[:3, 3]
+    if corners[:, 2].max() < _CLIP_M:
+        return
     points = [c for c in corners if c[2] >= _CLIP_M]
     for a, b in _EDGES:
         za = corners[a, 2]
@@ -302,6 +379,14 @@ def draw_cover(
     u = np.clip(camera.fx * p[:, 0] / p[:, 2] + camera.cx, -1e4, 1e4)
     v = np.clip(camera.fy * p[:, 1] / p[:, 2] + camera.cy, -1e4, 1e4)
     hull = cv2.convexHull(np.stack([u, v], 1).astype(np.int32))
+    left, top, width, height = cv2.boundingRect(hull)
+    if left >= camera.width or top >= camera.height or left + width <= 0 or top + height <= 0:
+        return
     mask = np.zeros(cover.shape, np.uint8)
     cv2.fillConvexPoly(mask, hull, 1)
-    cover[mask > 0] = np.minimum(cover[mask > 0], np.float32(p[:, 2].min()))
+    window = (
+        slice(max(top, 0), min(top + height, camera.height)),
+        slice(max(left, 0), min(left + width, camera.width)),
+    )
+    depth_m = np.float32(p[:, 2].min())
+    np.minimum(cover[window], depth_m, out=cover[window], where=mask[window] > 0)

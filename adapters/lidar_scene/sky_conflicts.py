@@ -10,15 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 
 from adapters.lidar_scene.solid_views import SolidView, project_into
 from augment.scene.scene import Gaussians
 
-_SURE_SKY = 0.5  # share of sky above which a pixel shows sky
-_AROUND_PART = 1 / 320  # side of the square that must show sky around, over the image's width
 _BEHIND_RATIO = 1.1  # ratio of depths from which a surface is clearly behind a point
 _BEHIND_M = 0.5  # the same as a difference, metres
 _ONE_COLOR = 12.0  # distance in CIELAB up to which two colours may be of one surface
@@ -57,7 +54,7 @@ def measure_agreement(points: np.ndarray, lab: np.ndarray, views: Sequence[Solid
         index, rows, columns, depth_m = project_into(view.camera, points)
         difference = np.linalg.norm(view.lab[rows, columns] - lab[index], axis=1)
         has_color = difference < _ONE_COLOR
-        conflicts = sure_sky(view)[rows, columns]
+        conflicts = view.sure_sky[rows, columns]
         if view.known_m is not None:
             known_m = view.known_m[rows, columns]
             is_before = np.isfinite(known_m) & (known_m > _BEHIND_RATIO * depth_m + _BEHIND_M)
@@ -68,13 +65,6 @@ def measure_agreement(points: np.ndarray, lab: np.ndarray, views: Sequence[Solid
     return Agreement(
         num_conflicts / np.maximum(num_views, 1), (num_supports > 0) | (num_views < _MIN_VIEWS)
     )
-
-
-def sure_sky(view: SolidView) -> np.ndarray:
-    """Return the pixels with sky all around, bool [H, W]: depths are not exact."""
-    side = max(3, 2 * round(_AROUND_PART * view.camera.width) - 1)
-    square = np.ones((side, side), np.uint8)
-    return cv2.erode(view.matte.sky_share, square) > _SURE_SKY
 
 
 def without_sky_splats(
@@ -102,7 +92,7 @@ def without_sky_splats(
     for view in views:
         index, rows, columns, _ = project_into(view.camera, points)
         num_views[index] += 1
-        num_sky[index] += sure_sky(view)[rows, columns]
+        num_sky[index] += view.sure_sky[rows, columns]
     is_stray = (num_sky >= min_views) & (num_sky > max_conflicts * num_views)
     keep = np.ones(len(background), np.bool_)
     keep[high[is_stray]] = False

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import torch
 
-from adapters.lidar_scene.sky_conflicts import sure_sky
 from adapters.lidar_scene.solid_views import SolidView, project_into
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import Gaussians
@@ -92,7 +91,7 @@ def shorten_ends_in_sky(gaussians: Gaussians, views: Sequence[SolidView]) -> Gau
     two_longest = np.argsort(-scales, axis=1)[:, :2]
     number = np.arange(len(points))
     for view in views:
-        is_sky = sure_sky(view)
+        is_sky = view.sure_sky
         if not is_sky.any():
             continue
         for axis in two_longest.T:

@@ -6,7 +6,8 @@ The callers are `adapters.lidar_scene.beyond_beams` and `adapters.training_views
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -21,6 +22,8 @@ from augment.scene.cameras import Camera
 
 WORK_WIDTH = 960  # columns of the images in which surfaces are added, at most
 _HALF = np.float32(0.5)  # share of sky that parts sky from surface
+_SURE_SKY = 0.5  # share of sky above which a pixel shows sky
+_AROUND_PART = 1 / 320  # side of the square that must show sky around, over the image's width
 _RIM_PX = 2  # width of rims that show mostly sky
 _RIM_LEVELS = 16  # largest difference from the sky of a rim, of 255
 _RIM_SHARE = 0.4  # the same as a part of the largest difference around
@@ -29,7 +32,8 @@ _SPECK_SHARE = 0.8  # least brightness of a speck of cloud, as a part of the sky
 _NEAREST_M = 1.0  # smallest depth of a point that a camera sees
 
 
-class SolidView(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class SolidView:
     """A recorded image in which surfaces are added, of H x W pixels."""
 
     camera: Camera
@@ -46,6 +50,13 @@ class SolidView(NamedTuple):
     """Frame and camera of the image."""
     known_m: np.ndarray | None = None
     """Depth of the surfaces that returns made, infinite without one, float [H, W]."""
+
+    @cached_property
+    def sure_sky(self) -> np.ndarray:
+        """Pixels with sky all around, bool [H, W]: depths are not exact."""
+        side = max(3, 2 * round(_AROUND_PART * self.camera.width) - 1)
+        square = np.ones((side, side), np.uint8)
+        return cv2.erode(self.matte.sky_share, square) > _SURE_SKY
 
 
 def read_solid_view(

@@ -113,11 +113,23 @@ def inside_box(local: np.ndarray, size_m: np.ndarray, margin_m: float) -> np.nda
 
 def indices_between(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the indices of points [N, 3] strictly inside an axis-aligned box, int64, ascending."""
-    # One column first: it leaves few points for the others, and this runs once a box and sweep.
-    x = points[:, 0]
-    index = np.flatnonzero((x > low[0]) & (x < high[0]))
-    yz = points[index, 1:]
-    return index[((yz > low[1:]) & (yz < high[1:])).all(axis=1)]
+    # One pass without masks: this runs once a box and sweep.
+    return _indices_between(points, low.astype(np.float64), high.astype(np.float64))
+
+
+@cached_njit(nogil=True)
+def _indices_between(points, low, high):  # pragma: no cover - compiled
+    out = np.empty(len(points), np.int64)
+    count = 0
+    for i in range(len(points)):
+        if (
+            low[0] < points[i, 0] < high[0]
+            and low[1] < points[i, 1] < high[1]
+            and low[2] < points[i, 2] < high[2]
+        ):
+            out[count] = i
+            count += 1
+    return out[:count].copy()
 
 
 @dataclass(frozen=True, eq=False)

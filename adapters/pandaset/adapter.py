@@ -315,11 +315,23 @@ def read_semantics(root: Path, frame: int, rows: int) -> np.ndarray | None:
 
 
 def read_cuboids(root: Path, frame: int) -> pd.DataFrame | None:
-    """Read the boxes of a frame with all their columns, or None without a file."""
+    """Read the boxes of a frame with all their columns, or None without a file.
+
+    Several steps of opening a drive ask for them: they are cached as long as the file stays
+    unchanged, and callers must not change them.
+    """
     path = frame_file(root, "annotations/cuboids", frame)
+    if not path.exists():
+        return None
+    status = path.stat()
+    return _read_cuboids(path, (status.st_mtime_ns, status.st_size))
+
+
+@lru_cache(maxsize=128)  # tables of some 30 kB
+def _read_cuboids(path: Path, state: tuple[int, int]) -> pd.DataFrame:
     needed = ("uuid", "label", "yaw", "stationary")
     needed += tuple(f"{group}.{axis}" for group in ("position", "dimensions") for axis in "xyz")
-    return _read_table(path, needed) if path.exists() else None
+    return _read_table(path, needed)
 
 
 def _read_table(path: Path, needed: tuple[str, ...]) -> pd.DataFrame:

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.lidar_scene.split import FLOOR_M, HALO_M, Motion, join_tracks, split_sweeps
+from adapters.lidar_scene.split import (
+    FLOOR_M,
+    HALO_M,
+    Motion,
+    indices_between,
+    join_tracks,
+    split_sweeps,
+)
 from adapters.raw_drive import BoxSample, Sweep
 from augment.scene.geometry import rigid, rotmat_from_quat
 from augment.scene.scene import Track
@@ -152,3 +159,15 @@ def test_returns_after_the_track_belong_to_the_world():
     sweep = sweep_of([[0.5, 0, 0.7]], [300], [SemanticClass.VEHICLE])
     world, (actor,) = split_sweeps([sweep], [track])
     assert len(world) == 1 and len(actor) == 0
+
+
+def test_points_between_two_corners_lie_strictly_inside():
+    corners = np.array([[-1.0, 0.0, 2.0], [1.0, 0.5, 3.0]])
+    points = np.random.default_rng(0).uniform(-4, 4, (5000, 3)).astype(np.float32)
+    points[:1000] = points[:1000] * 0.2 + corners.mean(axis=0)
+    points[7] = np.nan
+    points[11] = corners[0]
+    expected = np.flatnonzero(((points > corners[0]) & (points < corners[1])).all(axis=1))
+    assert len(expected) > 100
+    np.testing.assert_array_equal(indices_between(points, *corners), expected)
+    assert len(indices_between(points[:0], *corners)) == 0

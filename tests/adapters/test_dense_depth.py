@@ -109,7 +109,7 @@ def test_a_wall_goes_on_straight_up_and_what_returned_nothing_is_far():
 
 def test_an_image_refutes_points_in_its_sky_and_before_its_surfaces():
     view = solid_view(40)
-    view = view._replace(known_m=np.full((SIZE[1], SIZE[0]), AWAY_M))
+    view = dataclasses.replace(view, known_m=np.full((SIZE[1], SIZE[0]), AWAY_M))
     eye = view.camera.centre.numpy()
     rays = view.camera.ray_directions(torch.float64).numpy()
     wall = eye + AWAY_M * rays[80, 80]
@@ -145,7 +145,7 @@ def test_a_splat_below_the_sky_line_is_shortened_upward_only():
     assert aside_m == pytest.approx(10 * pixel_m)
     assert upward_m < 2.5 * pixel_m
     # A surface before the splat hides it, and with it whatever it reaches.
-    hidden = view._replace(known_m=np.full((SIZE[1], SIZE[0]), AWAY_M / 2))
+    hidden = dataclasses.replace(view, known_m=np.full((SIZE[1], SIZE[0]), AWAY_M / 2))
     assert trim_at_sky(splat, [hidden]).scales.equal(splat.scales)
     # Thin splats below the line do not reach it.
     thin = upright_splat(point, 0.5 * pixel_m)

@@ -22,7 +22,7 @@ def test_hidden_returns_get_a_surface_at_about_their_depth():
     drive, hidden_points = hide_top_returns(read_pandaset(str(DRIVE), {}, options), 0.85)
     errors = errors_at_hidden(build_lidar_scene(drive, options), drive.used[1::8], hidden_points)
     joined = np.concatenate(list(errors.values()))
-    # Measured in every fourth frame: 0.1 % without a surface, median 1.3 %, 15.5 % beyond 20 %.
+    # Measured in every fourth frame: 0.1 % without a surface, median 1.3 %, 16.7 % beyond 20 %.
     assert np.isinf(joined).mean() < 0.01
     assert np.median(joined) < 0.05
     assert (joined > 0.2).mean() < 0.2

@@ -145,6 +145,43 @@ def test_actors_are_coloured_where_they_are_at_the_cameras_time(tmp_path):
     assert not seen.is_observed.any()
 
 
+def test_an_actor_at_the_images_border_takes_the_colours_of_a_wall_that_stands_there(tmp_path):
+    """Actors out of an image are not drawn into it; the world always is."""
+    actor = wall(0.0, 1.0)
+    world = dataclasses.replace(actor, centres=actor.centres + np.float32([4, 0, 0]))
+    shares = []
+    for degrees in (-70, -60, -50, -40, -30, 0, 30, 40, 50, 60, 70):
+        angle = math.radians(degrees)
+        sine = math.sin(angle)
+        cosine = math.cos(angle)
+        for turn in (
+            [[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]],
+            [[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]],
+        ):
+            views = [view(tmp_path / "a.png", solid(RED), camera(rotation=FORWARD @ turn))]
+            (expected,) = observed(Body(world), views=views)
+            (result,) = observed(Body(actor, *moving_box()), views=views)
+            np.testing.assert_array_equal(result.is_observed, expected.is_observed)
+            np.testing.assert_array_equal(result.colours, expected.colours)
+            shares.append(expected.is_observed.mean())
+    assert sum(0 < share < 1 for share in shares) >= 4 and min(shares) == 0 and max(shares) == 1
+
+
+def test_the_sky_of_a_long_drive_is_taken_from_some_of_its_frames(tmp_path):
+    for count, colour in ((23, (np.array(BLUE) + RED) / 2), (24, np.array(BLUE))):
+        views = [
+            dataclasses.replace(
+                view(tmp_path / f"{n}.png", solid((BLUE, RED)[n % 2]), camera()), frame=n
+            )
+            for n in range(count)
+        ]
+        sky = gatherer()
+        observed(Body(wall(-5.0, 1.0)), views=views, sky=sky)
+        ahead = sky.finish().sample(torch.tensor([1.0, 0.0, 0.1])).numpy()
+        # Of 23 images 12 are blue.
+        assert_coloured(ahead, colour, atol=0.03)
+
+
 def test_rows_that_show_the_recording_car_are_not_used(tmp_path):
     surfels = wall(5.0, 2.0)
     views = [view(tmp_path / "a.png", solid(RED), camera(), used_rows=0.5)]
