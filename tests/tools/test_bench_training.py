@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 
 import numpy as np
@@ -134,7 +135,7 @@ def refuse_scene(uri):
 @pytest.mark.long
 def test_a_second_run_renders_nothing_and_gives_the_same_scores(tiny_run):
     folder, first, opened_uris = tiny_run
-    assert opened_uris == [*TINY_CASE.train_scenes, *TINY_CASE.test_scenes]
+    assert opened_uris == [*TINY_CASE.test_scenes, *TINY_CASE.train_scenes]
     second = measure(folder=folder, case=TINY_CASE, scene_loader=refuse_scene)
     assert second["tables"][:-1] == first["tables"][:-1]
     assert second["facts"] == first["facts"]
@@ -144,6 +145,7 @@ def test_a_second_run_renders_nothing_and_gives_the_same_scores(tiny_run):
 
 @pytest.mark.long
 def test_the_table_has_a_row_for_every_condition_and_a_column_for_every_arm(tiny_run):
+    assert json.loads(json.dumps(tiny_run[1], allow_nan=False)) == tiny_run[1]
     table = tiny_run[1]["tables"][0]
     assert table["columns"] == ["tested on", *(arm.title for arm in ARMS.values())]
     assert [row[0].split(";")[0] for row in table["rows"]] == [
@@ -168,7 +170,7 @@ def test_an_interrupted_rendering_is_completed_and_a_missing_image_is_named(tiny
     folder = tmp_path / "images"
     shutil.copytree(tiny_run[0], folder)
     (uri,) = TINY_CASE.test_scenes
-    variant = "night-001"  # the training scene has night-000
+    variant = "night-100"
     for image in folder.glob(f"*/{variant}/**/*.png"):
         image.unlink()
     manifest = pq.read_table(folder / "manifest.parquet")
@@ -267,5 +269,6 @@ def test_iou_of_a_known_case():
     assert iou[:2].tolist() == pytest.approx([2 / 3, 1 / 3]) and np.isnan(iou[2])
 
 
-def test_a_spread_is_in_percent():
+def test_a_spread_is_in_percent_and_empty_for_a_class_that_no_image_shows():
     assert training.spread_text([0.2, 0.3, 0.4]) == "30.0 (20.0 to 40.0)"
+    assert not training.spread_text([float("nan")] * 2)

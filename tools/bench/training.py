@@ -8,6 +8,7 @@ are rendered once into a folder; an interrupted run goes on where it was.
 
 from __future__ import annotations
 
+import math
 import os
 import statistics
 import tempfile
@@ -159,6 +160,9 @@ weather:
 DAY_WEATHER = ("smog", "snow", "light", "rain", "snowfall")  # The conditions learnt by day.
 DARK_HOURS = ("dusk-lamps", "night", "night-rain", "night-fog")  # Those learnt at dusk and night.
 
+# The number of the first draw that is tested; those that are learnt lie below.
+FIRST_TEST_DRAW = 100
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -219,7 +223,7 @@ class TrainingCase:
             numbers = range(first, first + self.draws)
             weather = [draw_recipe(kind, number) for kind in learnt_kinds for number in numbers]
         else:
-            number = len(self.train_scenes) * self.draws + self.test_scenes.index(uri)
+            number = FIRST_TEST_DRAW + self.test_scenes.index(uri)
             weather = [draw_recipe(kind, number) for kind in CONDITIONS if kind != CLEAR]
         return [draw_recipe(CLEAR, 0), *weather]
 
@@ -330,7 +334,7 @@ def measure(
     ]
     per_seed = {
         arm: {
-            kind: [[None if np.isnan(iou) else float(iou) for iou in run[kind]] for run in runs]
+            kind: [[None if math.isnan(iou) else float(iou) for iou in run[kind]] for run in runs]
             for kind in CONDITIONS
         }
         for arm, runs in scores.items()
@@ -355,7 +359,7 @@ def render_missing(case: TrainingCase, folder: Path, scene_loader: SceneLoader =
         OutputError: an image failed.
     """
     num_rendered = 0
-    for uri in (*case.train_scenes, *case.test_scenes):
+    for uri in (*case.test_scenes, *case.train_scenes):
         recipes = case.recipes_of(uri)
         if _num_finished(case, folder, uri) == len(recipes) * case.frames * len(case.cameras):
             continue
@@ -485,7 +489,12 @@ def _class_table(scores: Scores, kind: str) -> Table:
 
 
 def spread_text(shares: Sequence[float]) -> str:
-    """Return the mean of shares in percent, and the least and the greatest in brackets."""
+    """Return the mean of shares in percent, and the least and the greatest in brackets.
+
+    The text is empty if a share is NaN: the class is in no test image.
+    """
+    if any(math.isnan(share) for share in shares):
+        return ""
     percents = [100 * share for share in shares]
     return f"{statistics.fmean(percents):.1f} ({min(percents):.1f} to {max(percents):.1f})"
 
