@@ -251,7 +251,7 @@ def test_the_learning_rate_rises_then_falls_to_nothing():
 def test_a_network_learns_two_halves_and_the_same_seed_gives_the_same_bits():
     views = make_views()
     views.images[..., 12:] += 100
-    settings = dataclasses.replace(SETTINGS, steps=40, batch=4, num_classes=2)
+    settings = dataclasses.replace(SETTINGS, steps=80, batch=4, num_classes=2)
     arguments = {"kinds": ("rain",), "is_jittered": True, "seed": 1}
     network, losses = train_network(views, settings, **arguments)
     again, _ = train_network(views, settings, **arguments)
