@@ -19,11 +19,12 @@ of the range, as the points of Gauss and Legendre are.
 Light that is scattered several times is a factor on L_1, fitted to photons followed one by one
 (isotropic lamp, endless fog; T = sigma D up to 4, gamma up to 45 degrees):
 
-    L = L_1 exp(c T sqrt(gamma in degrees)),     c = 0.19, for beams 0.19 s / (s + 8 degrees)
+    L = L_1 exp(c T sqrt(gamma in degrees)),     c = 0.19 for lamps that shine all around
 
-with gamma held at 45 degrees and T at 4. s is the standard deviation of a beam about its middle. A
-beam that passes by has little L_1 at the camera, but what is scattered often forgets where it went.
-So L is at least L_1 and what the factor adds to L_1 of a lamp of the beam's mean intensity.
+with gamma held at 45 degrees and T at 4. A beam of standard deviation s about its middle has
+c = 0.19 s / (s + 8 degrees) if it points at the camera, and up to 0.37 if it passes by: then little
+is scattered once towards the camera. From behind a beam has hardly any L_1. So L is at least L_1
+and FLOOR_SHARE of what the factor adds to L_1 of a lamp of the beam's mean intensity.
 
 The picture has a grid of nodes, `step_px` apart. A node has the light to the nearest and to the
 furthest surface of the pixels that read it. Near a lamp L goes as 1 / gamma: nodes have it
@@ -55,6 +56,10 @@ from augment.scene.cameras import Camera
 SCATTER_GAIN = 0.19
 # Spread of a beam, degrees, at which c is half as large.
 HALF_GAIN_SPREAD_DEG = 8.0
+# What c gains for a narrow beam that passes by the camera.
+PASSING_GAIN = 0.18
+# Angle off the axis, in spreads of the beam, at which most of that is gained.
+PASSING_SPREADS = 2.5
 # Largest optical distance in the factor; beyond it the factor was not compared with anything.
 MAX_FACTOR_DEPTH = 4.0
 # Largest angle in the factor, degrees; beyond it the factor gives too much light.
@@ -67,18 +72,30 @@ MIN_SURFACE_M = 0.05
 MAX_POINTS = 16
 # Spread of a beam, degrees, below which its planes are fine.
 FINE_SPREAD_DEG = 25.0
-# Rows and cells of the planes of such a beam.
-FINE_PLANES = (192, 128)
+# Rows and cells of the planes of such a beam of the recording car, along which its camera looks.
+OWN_PLANES = (192, 128)
+# Rows and cells of the planes of another such beam.
+FINE_PLANES = (96, 128)
 # Rows and cells of the planes of other lamps.
 WIDE_PLANES = (64, 64)
 # Angles at which a lamp's bound is compared with the threshold.
 _NUM_BOUND_ANGLES = 512
 
 
-def factor_gain(spreads_deg: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
-    """Return c of the factor for multiple scattering, from the spreads of beams in degrees."""
-    spreads = np.asarray(spreads_deg, np.float64)
-    gain = SCATTER_GAIN * spreads / (spreads + HALF_GAIN_SPREAD_DEG)
+def factor_gain(
+    spreads_deg: Float[np.ndarray, "*N"], off_axis_deg: Float[np.ndarray, "*N"]
+) -> Float64[np.ndarray, "*N"]:
+    """Return c of the factor for multiple scattering.
+
+    Args:
+        spreads_deg: standard deviations s of the beams about their middles, degrees.
+        off_axis_deg: angles alpha between the beams' axes and the directions to the camera.
+    """
+    spreads = np.minimum(np.asarray(spreads_deg, np.float64), MIN_WIDE_SPREAD_DEG)
+    on_axis = SCATTER_GAIN * spreads / (spreads + HALF_GAIN_SPREAD_DEG)
+    passing = SCATTER_GAIN + PASSING_GAIN * (1 - spreads / MIN_WIDE_SPREAD_DEG)
+    share = 1 - np.exp(-0.5 * (np.asarray(off_axis_deg) / (PASSING_SPREADS * spreads)) ** 2)
+    gain = on_axis + (passing - on_axis) * share
     return np.where(spreads >= MIN_WIDE_SPREAD_DEG, SCATTER_GAIN, gain)
 
 
@@ -262,14 +279,18 @@ def _prepare(
     planes = np.empty(int((layouts[:, 1] * (layouts[:, 2] + 1)).sum()), np.float32)
     plane_peaks = np.empty(len(rows))
     intensities = lamps.intensities_cd * shares[rows]
+    tables = lamps.tables.view()
+    tables.setflags(write=False)  # one type for the compiled kernel
     with kernel_threads():
         air_light_kernels.fill_planes(
-            lamps.tables, lamps.patterns, lamps.axes, lamps.ups, frames, intensities, layouts,
-            planes, plane_peaks,
+            np.ascontiguousarray(tables), lamps.patterns, lamps.axes, lamps.ups, frames,
+            intensities, layouts, planes, plane_peaks,
         )  # fmt: skip
     # A lamp that shines away from all that the camera sees has no peak in its planes.
     ends = _cut_off(np.maximum(plane_peaks, means[rows]), bound_gains[rows], threshold_cd_m2)
     depth = np.minimum(sigmas[rows] * distances[rows], MAX_FACTOR_DEPTH)
+    off_axis_deg = np.degrees(np.arccos(np.clip(-(lamps.axes * frames[:, 0]).sum(1), -1, 1)))
+    gains = factor_gain(lamps.spreads_deg, off_axis_deg)
     rotation = camera.camera_from_world[:3, :3].numpy()
     is_lit = ends > 0
     if not is_lit.any():
@@ -280,7 +301,7 @@ def _prepare(
         sigmas[rows][is_lit],
         np.ascontiguousarray(lamps.colors[is_lit]),
         means[rows][is_lit],
-        np.stack([factor_gain(lamps.spreads_deg) * depth, SCATTER_GAIN * depth], 1)[is_lit],
+        np.stack([gains * depth, SCATTER_GAIN * depth], 1)[is_lit],
         np.stack([ends, np.where(ends >= np.pi, -2.0, np.cos(ends))], 1)[is_lit],
         np.ascontiguousarray(layouts[is_lit]),
     )
@@ -302,7 +323,8 @@ def _layouts(lamps: Lamps, num_points: int) -> np.ndarray:
     is_fine = lamps.spreads_deg < FINE_SPREAD_DEG
     layouts = np.zeros((len(lamps), 5), np.int64)
     for column in range(2):
-        size = np.where(is_fine, FINE_PLANES[column], WIDE_PLANES[column])
+        fine_size = np.where(lamps.owners == EGO_OWNER, OWN_PLANES[column], FINE_PLANES[column])
+        size = np.where(is_fine, fine_size, WIDE_PLANES[column])
         layouts[:, 1 + column] = np.where(is_flat, 1, size)
     layouts[:, 3] = lamps.owners == EGO_OWNER
     layouts[:, 4] = np.where(is_flat, 1, num_points)
@@ -335,7 +357,7 @@ def _bound_gains(
     beyond = np.stack([scattered_beyond(lobe, gamma) for lobe in (lobes, own_lobes)])
     depths = sigmas * distances
     factors = np.exp(
-        SCATTER_GAIN
+        (SCATTER_GAIN + PASSING_GAIN)
         * np.minimum(depths, MAX_FACTOR_DEPTH)[:, None]
         * np.sqrt(np.minimum(np.degrees(gamma), MAX_FACTOR_ANGLE_DEG))
     )

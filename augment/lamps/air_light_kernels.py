@@ -11,9 +11,17 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from augment.lamps.fog_phase import DISTANCE_KNEE, MAX_DISTANCE, NUM_ANGLES, NUM_DISTANCES
 from augment.lamps.pattern_kernels import intensity
 from augment.render.cpu.jit import kernel, kernel_function
+
+# Number of optical distances u of the table of G.
+NUM_DISTANCES = 96
+# Number of steps of theta in that table.
+NUM_ANGLES = 512
+# Largest u of that table; the light of lamps further from the ray is zero.
+MAX_DISTANCE = 20.0
+# Optical distance at which the table's spacing turns from linear to logarithmic.
+DISTANCE_KNEE = 0.01
 
 # Rows of nodes or pixels that a thread computes at a time.
 BAND_ROWS = 8
@@ -23,6 +31,9 @@ SAME_DISTANCE = 0.15
 SOFT_PX = 0.28
 # Angle, radians, beyond which the factor for multiple scattering grows no more: 45 degrees.
 MAX_FACTOR_ANGLE_RAD = math.pi / 4
+# Least share of what multiple scattering adds to a lamp of a beam's mean intensity that the beam
+# itself has, from all sides.
+FLOOR_SHARE = 0.13
 # Share of the angle of cut-off from which on a halo fades to zero.
 FADE_FROM = 0.8
 
@@ -163,14 +174,14 @@ def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
     row_place = math.log(ratio + math.sqrt(ratio * ratio + 1)) * _DISTANCE_SCALE
     row = min(int(row_place), NUM_DISTANCES - 2)
     row_share = row_place - row
-    # Factor for multiple scattering: of this lamp, and as a floor, what a lamp of the mean
-    # intensity that is no beam would add by it.
+    # Factor for multiple scattering: of this lamp, and as a floor, a share of what it adds to a
+    # lamp of the mean intensity that is no beam.
     root = _ROOT_DEGREES * math.sqrt(min(gamma, MAX_FACTOR_ANGLE_RAD))
     beam_gain = math.exp(lamps.factors[index, 0] * root)
     wide_gain = beam_gain
     if lamps.factors[index, 1] != lamps.factors[index, 0]:
         wide_gain = math.exp(lamps.factors[index, 1] * root)
-    added_mean = lamps.means_cd[index] * (wide_gain - 1)
+    added_mean = FLOOR_SHARE * lamps.means_cd[index] * (wide_gain - 1)
     scale = sigma * math.exp(-sigma * distance * cosine)
     end = lamps.ends[index, 0]
     fade = (gamma - FADE_FROM * end) / ((1 - FADE_FROM) * end)

@@ -24,6 +24,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from augment.lamps.air_light_kernels import DISTANCE_KNEE, MAX_DISTANCE, NUM_ANGLES, NUM_DISTANCES
 from augment.render.fog import Fog, optical_depth_numpy
 
 # Asymmetry g of fog droplets, as in `augment.render.fog`.
@@ -44,15 +45,6 @@ DIFFRACTED_SHARE = 0.5
 # Number of steps to which the share of rain or snow in the scattering is rounded, so that few
 # tables are made.
 NUM_SHARE_STEPS = 16
-
-# Number of optical distances u of the table.
-NUM_DISTANCES = 96
-# Number of steps of theta in the table.
-NUM_ANGLES = 512
-# Largest u of the table; the light of lamps further from the ray is zero.
-MAX_DISTANCE = 20.0
-# Optical distance at which the table's spacing turns from linear to logarithmic.
-DISTANCE_KNEE = 0.01
 
 Lobes = tuple[tuple[float, float], ...]
 """Weight and asymmetry g of each lobe of a phase function. The weights sum to 1."""

@@ -38,8 +38,10 @@ _MIN_PEAK = 0.95
 _MIN_SIGNAL_PEAK = 0.88
 # Least difference of the main channel from the one that it is told by, as a share of it.
 _MIN_SATURATION = 0.25
-# Fewest pixels of a patch in an image 1920 px wide.
-_MIN_PIXELS = 4
+# Fewest pixels of a brake lamp. Fewer are specks of the sensor's colour filter.
+_MIN_STOP_PIXELS = 5
+# Fewest pixels of a signal.
+_MIN_SIGNAL_PIXELS = 10
 # Largest side of a patch, in widths of the image. A brake lamp 0.3 m wide has it at 10 m.
 _MAX_SIDE = 0.025
 # Least share of a signal's bounding box that its patch fills.
@@ -52,8 +54,10 @@ _MIN_STOP_CONTRAST = 2.5
 _MIN_SIGNAL_CONTRAST = 6.0
 # Width of the ring in which the surroundings are measured, in sides of the patch.
 _RING_SIDES = 0.8
-# Width of the images that pixels are counted for.
-_REFERENCE_WIDTH_PX = 1920
+# Length of the housing above a green disc and below a red one, in sides of the patch.
+_HOUSING_SIDES = 2.0
+# Largest linear brightness of the housing over that of the disc, for nine of ten of its pixels.
+_MAX_HOUSING = 0.2
 
 
 class RecordedLamp(NamedTuple):
@@ -85,16 +89,23 @@ class RecordedLamps:
     """The lamps, from top to bottom."""
 
 
-def find_recorded_lamps(
-    rgb: UInt8[np.ndarray, "H W 3"], vehicles: Bool[np.ndarray, "H W"]
-) -> RecordedLamps:
+class VehiclePixels(NamedTuple):
+    """Pixels of the boxes of vehicles in a photograph."""
+
+    moving: Bool[np.ndarray, "H W"]
+    """Vehicles that are not parked: brake lamps are looked for there."""
+    parked: Bool[np.ndarray, "H W"]
+    """Parked vehicles: reflectors in the sun are no lamps. Signals are looked for elsewhere."""
+
+
+def find_recorded_lamps(rgb: UInt8[np.ndarray, "H W 3"], vehicles: VehiclePixels) -> RecordedLamps:
     """Return the lit lamps that a photograph shows.
 
     Args:
         rgb: the photograph, display-encoded.
-        vehicles: pixels of vehicles that are not parked (`moving_vehicle_mask`). Brake lamps are
-            looked for there, signals elsewhere.
+        vehicles: pixels of vehicles, as from `vehicle_pixels`.
     """
+    is_open = ~(vehicles.moving | vehicles.parked)
     height, width = rgb.shape[:2]
     share = np.zeros((height, width), np.float32)
     luminance = np.zeros((height, width, 3), np.float32)
@@ -103,9 +114,9 @@ def find_recorded_lamps(
     green = rgb[..., 1].astype(np.float32) / 255
     blue = rgb[..., 2].astype(np.float32) / 255
     searches = (
-        (red, np.maximum(green, blue), vehicles, LampKind.STOP, True),
-        (red, np.maximum(green, blue), ~vehicles, LampKind.SIGNAL, True),
-        (green, red, ~vehicles, LampKind.SIGNAL, False),  # signals are bluish green
+        (red, np.maximum(green, blue), vehicles.moving, LampKind.STOP, True),
+        (red, np.maximum(green, blue), is_open, LampKind.SIGNAL, True),
+        (green, red, is_open, LampKind.SIGNAL, False),  # signals are bluish green
     )
     for main, other, area, kind, is_red in searches:
         is_lamp = (main > _MIN_VALUE) & (main - other > _MIN_SATURATION * main) & area
@@ -126,14 +137,14 @@ def _find_patches(
 ) -> list[tuple[RecordedLamp, tuple[slice, slice], np.ndarray]]:
     """Return the patches that are lamps, each with its window and its share of every pixel."""
     height, width = is_lamp.shape
-    scale = width / _REFERENCE_WIDTH_PX
     count, numbers, boxes, middles = cv2.connectedComponentsWithStats(is_lamp.astype(np.uint8))
     is_signal = kind == LampKind.SIGNAL
     patches = []
     for number in range(1, count):
         left, top, columns, rows, num_pixels = boxes[number].tolist()
         side = max(columns, rows)
-        if num_pixels < max(_MIN_PIXELS * scale**2, 2) or side > max(_MAX_SIDE * width, 3):
+        min_pixels = _MIN_SIGNAL_PIXELS if is_signal else _MIN_STOP_PIXELS
+        if num_pixels < min_pixels or side > max(_MAX_SIDE * width, 3):
             continue
         if is_signal and not _is_disc(columns, rows, num_pixels):
             continue
@@ -155,6 +166,8 @@ def _find_patches(
         contrast = core / max(outside, 1e-3)
         if contrast < (_MIN_SIGNAL_CONTRAST if is_signal else _MIN_STOP_CONTRAST):
             continue
+        if is_signal and not _has_housing(main, boxes[number].tolist(), core, is_red):
+            continue
         glow = np.clip((linear - outside) / max(core - outside, 1e-3), 0, 1)
         lamp_share = np.where(ring, 0, glow).astype(np.float32)
         column, row = middles[number]
@@ -171,8 +184,25 @@ def _is_disc(columns: int, rows: int, num_pixels: int) -> bool:
     return aspect <= _MAX_ASPECT and num_pixels >= _MIN_FILL * columns * rows
 
 
-def moving_vehicle_mask(scene: Scene, camera: Camera) -> Bool[np.ndarray, "H W"]:
-    """Return the pixels of boxes of vehicles that are not parked, where no parked one is nearer.
+def _has_housing(main: np.ndarray, box: list[int], core: float, is_red: bool) -> bool:
+    """Return True if dark lamps of a signal lie below a red patch or above a green one."""
+    left, top, columns, rows, _ = box
+    length = max(round(_HOUSING_SIDES * max(columns, rows)), 3)
+    # One pixel between the patch and its housing is glow.
+    first = top + rows + 1 if is_red else top - 1 - length
+    housing = main[max(first, 0) : max(first + length, 0), left : left + columns]
+    if housing.shape[0] < length:
+        return False
+    return float(np.quantile(linear_from_display(housing), 0.9)) <= _MAX_HOUSING * core
+
+
+# Values of the image in which boxes are painted.
+_MOVING = 1
+_PARKED = 2
+
+
+def vehicle_pixels(scene: Scene, camera: Camera) -> VehiclePixels:
+    """Return the pixels of the boxes of vehicles; where boxes overlap, of the nearer one.
 
     Args:
         scene: the scene, with actors and labelled boxes.
@@ -202,5 +232,5 @@ def moving_vehicle_mask(scene: Scene, camera: Camera) -> Bool[np.ndarray, "H W"]
         pixels = corners[:, :2] / corners[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         limit = 4.0 * max(camera.width, camera.height)
         hull = cv2.convexHull(np.clip(np.round(pixels), -limit, limit).astype(np.int32))
-        cv2.fillConvexPoly(mask, hull, 1 if may_be_lit else 0)
-    return mask.astype(bool)
+        cv2.fillConvexPoly(mask, hull, _MOVING if may_be_lit else _PARKED)
+    return VehiclePixels(mask == _MOVING, mask == _PARKED)

@@ -26,7 +26,7 @@ from augment.memo import memo_of
 from augment.rng import rng_for
 from augment.scene.cameras import Camera
 from augment.scene.geometry import invert_rigid
-from augment.scene.scene import Gaussians, Scene, Track
+from augment.scene.scene import Actor, Gaussians, Scene, Track
 
 # ---- Settings ------------------------------------------------------------------------------------
 
@@ -91,8 +91,15 @@ class _Traits(NamedTuple):
 
 
 def _traits_of(scene: Scene, track_id: str, seed: int) -> _Traits:
+    """Return the numbers that the hash of a vehicle's name gives, remembered for the scene."""
+    name = scene.name
+    key = ("lamps, traits of a vehicle", track_id, seed)
+    return memo_of(scene).get(key, lambda: _draw_traits(name, track_id, seed))
+
+
+def _draw_traits(scene_name: str, track_id: str, seed: int) -> _Traits:
     """Return the numbers that the hash of a vehicle's name gives."""
-    rng = rng_for(seed=seed, scene=scene.name, effect=f"lamps.vehicle.{track_id}")
+    rng = rng_for(seed=seed, scene=scene_name, effect=f"lamps.vehicle.{track_id}")
     lit_level, front_fog_level, rear_fog_level, halogen_level, warmth = rng.random(5).tolist()
     factor = float(np.exp(_INTENSITY_SIGMA * np.clip(rng.standard_normal(), -3, 3)))
     low, high = _HALOGEN_K if halogen_level < HALOGEN_SHARE else _LED_K
@@ -135,14 +142,40 @@ def vehicle_lamps(scene: Scene, timestamp_ns: int, settings: VehicleLampSettings
         if owner not in poses or body_of(actor.label, actor.size_m) is None:
             continue
         vehicle = _Vehicle(
-            actor.track_id, actor.label, actor.size_m, owner, travels(actor.track), actor.gaussians
+            actor.track_id,
+            actor.label,
+            actor.size_m,
+            owner,
+            _travels(scene, actor),
+            actor.gaussians,
         )
         if not _is_lit(scene, vehicle, settings):
             continue
-        lamps = _lamps_on_box(scene, vehicle, settings, is_braking(actor.track, timestamp_ns))
+        brakes = _brakes(scene, actor, timestamp_ns)
+        lamps = _lamps_on_box(scene, vehicle, settings, brakes)
         parts.append(_place(lamps, poses[owner]))
     parts.append(_parked_lamps(scene, settings))
     return Lamps.concatenate(parts)
+
+
+def _travels(scene: Scene, actor: Actor) -> bool | None:
+    """Return `travels` of an actor's track, remembered; None where it is not known."""
+    track = actor.track
+    key = ("lamps, travels", actor.track_id)
+    # A tuple, as the memo makes None anew.
+    return memo_of(scene).get(key, lambda: (travels(track),))[0]
+
+
+def _brakes(scene: Scene, actor: Actor, timestamp_ns: int) -> bool:
+    """Return True if an actor brakes at the sample of its track that is nearest to a time.
+
+    So the cameras of a frame, which fire one after another, show the same lamps.
+    """
+    track = actor.track
+    times_ns = track.timestamps_ns.numpy()
+    nearest = int(np.abs(times_ns - timestamp_ns).argmin())
+    key = ("lamps, braking", actor.track_id, nearest)
+    return memo_of(scene).get(key, lambda: (is_braking(track, int(times_ns[nearest])),))[0]
 
 
 def _parked_lamps(scene: Scene, settings: VehicleLampSettings) -> Lamps:

@@ -31,10 +31,15 @@ from augment.scene.semantics import SemanticClass, class_of_label
 TRUCK_LENGTH_M = 6.5
 # Height from which on it is one, metres.
 TRUCK_HEIGHT_M = 2.7
-# Height of a car's headlamps, in heights of its box: 0.65 m of 1.45 m.
-CAR_HEAD_SHARE = 0.45
-# Height of a car's tail lamps, in heights of its box: 0.87 m of 1.45 m.
-CAR_REAR_SHARE = 0.6
+# Height of a car's headlamps, in heights of its box: 0.70 m of 1.45 m.
+CAR_HEAD_SHARE = 0.48
+# Height of a car's tail lamps, in heights of its box: 0.90 m of 1.45 m.
+CAR_REAR_SHARE = 0.62
+# Distance of the middle of a car's headlamps from the sides of its box, metres. Labelled boxes
+# include mirrors.
+CAR_HEAD_INSET_M = 0.3
+# Distance of the middle of a car's tail lamps from the sides of its box, metres.
+CAR_REAR_INSET_M = 0.35
 # Length from which on a two-wheeler whose label does not say more is a motorcycle, metres.
 MOTORCYCLE_LENGTH_M = 2.0
 
@@ -102,12 +107,12 @@ def body_of(label: str, size_m: tuple[float, float, float]) -> Body | None:
 
 _PLACES: dict[Body, tuple[LampPlace, ...]] = {
     Body.CAR: (
-        LampPlace(DIPPED, 0.9, 0.25, 0.0, CAR_HEAD_SHARE),
-        LampPlace(HIGH, 0.9, 0.25, 0.0, CAR_HEAD_SHARE),
-        LampPlace(DAYTIME, 0.9, 0.25, 0.0, CAR_HEAD_SHARE),
+        LampPlace(DIPPED, 0.9, CAR_HEAD_INSET_M, 0.0, CAR_HEAD_SHARE),
+        LampPlace(HIGH, 0.9, CAR_HEAD_INSET_M, 0.0, CAR_HEAD_SHARE),
+        LampPlace(DAYTIME, 0.9, CAR_HEAD_INSET_M, 0.0, CAR_HEAD_SHARE),
         LampPlace(FRONT_FOG, 0.93, 0.3, 0.4),
-        LampPlace(TAIL, -0.98, 0.2, 0.0, CAR_REAR_SHARE),
-        LampPlace(STOP, -0.98, 0.2, 0.0, CAR_REAR_SHARE),
+        LampPlace(TAIL, -0.98, CAR_REAR_INSET_M, 0.0, CAR_REAR_SHARE),
+        LampPlace(STOP, -0.98, CAR_REAR_INSET_M, 0.0, CAR_REAR_SHARE),
         LampPlace(THIRD_STOP, -0.6, None, 0.0, 0.93),
         LampPlace(REAR_FOG, -0.98, 0.35, 0.6, is_left_only=True),
     ),

@@ -124,9 +124,7 @@ def test_pictures_below_saturation_have_no_glare() -> None:
 def test_kernels_equal_their_definitions() -> None:
     for added, gain, min_added in ((ADDED, 0.03, -1.0), (ADDED, 1.0, 3e-5), (None, 0.5, -1.0)):
         out, mask = relight(PICTURE, added, gain, 2e-3, min_added)
-        expected, expected_mask = relight(
-            PICTURE, added, gain, 2e-3, min_added, uses_kernels=False
-        )
+        expected, expected_mask = relight(PICTURE, added, gain, 2e-3, min_added, uses_kernels=False)
         assert np.allclose(out, expected, rtol=1e-4, atol=1e-5)
         assert np.array_equal(mask, expected_mask)
     assert np.allclose(decode(PICTURE), decode(PICTURE, uses_kernels=False), rtol=1e-4, atol=1e-6)

@@ -9,8 +9,9 @@ from augment.lamps.lamp import LUMINANCE_WEIGHTS, LampKind
 from augment.lamps.recorded_lamps import (
     SIGNAL_LUMINANCE_CD_M2,
     STOP_LUMINANCE_CD_M2,
+    VehiclePixels,
     find_recorded_lamps,
-    moving_vehicle_mask,
+    vehicle_pixels,
 )
 from tests.augment.test_vehicle_lamps import ParkedLabels, car, scene_of, straight_track
 from tests.scenes import camera_ahead
@@ -44,7 +45,7 @@ def test_a_lit_brake_lamp_and_signals_of_both_colours_are_found():
     signal(photo, 60, 300, LIT_GREEN)
     vehicles = np.zeros(photo.shape[:2], bool)
     vehicles[120:200, 60:140] = True
-    result = find_recorded_lamps(photo, vehicles)
+    result = find_recorded_lamps(photo, VehiclePixels(vehicles, np.zeros_like(vehicles)))
     facts = [(lamp.kind, lamp.is_red, round(lamp.row), lamp.column) for lamp in result.lamps]
     assert facts == [
         (LampKind.SIGNAL, True, 60, 200.5),
@@ -62,22 +63,29 @@ def test_dark_lamps_paint_and_banners_are_no_lit_lamps():
     photo = street_photo()
     disc(photo, 150, 100, (190, 40, 45))  # a brake lamp that is off
     disc(photo, 60, 200, LIT_RED)  # a red spot without a housing
+    signal(photo, 60, 300, LIT_GREEN)
+    photo[46:57, 292:309] = GREY  # a green spot whose upper half has none
+    signal(photo, 190, 30, LIT_RED)  # a reflector of a parked car
     photo[20:60, 20:80] = (255, 60, 60)  # a banner
     photo[100:110, 300:380] = (250, 70, 60)  # a stripe on a bus
     photo[160:190, 300:360] = (250, 80, 70)  # the side of a red car
     vehicles = np.zeros(photo.shape[:2], bool)
     vehicles[120:200, 60:140] = True
     vehicles[150:200, 290:370] = True
-    result = find_recorded_lamps(photo, vehicles)
+    parked = np.zeros_like(vehicles)
+    parked[165:210, 5:55] = True
+    result = find_recorded_lamps(photo, VehiclePixels(vehicles, parked))
     assert result.lamps == () and not result.share.any() and not result.luminance_cd_m2.any()
 
 
 def test_vehicles_that_are_parked_or_hidden_by_parked_ones_are_not_searched():
     moving = car("a", straight_track(lambda s: 20 + 5 * s))
     camera = camera_ahead(320, 200, 200.0, position=(0.0, 0.0, 1.5))
-    alone = moving_vehicle_mask(scene_of([moving]), camera)
+    alone = vehicle_pixels(scene_of([moving]), camera).moving
     assert alone[105:125, 140:165].mean() > 0.5 and not alone[:80].any()
     scene = scene_of([moving], labels=ParkedLabels(3, "Parked"))
-    assert moving_vehicle_mask(scene, camera).sum() <= alone.sum()
+    pixels = vehicle_pixels(scene, camera)
+    assert pixels.moving.sum() <= alone.sum() and pixels.parked.any()
+    assert not (pixels.moving & pixels.parked).any()
     stopped = scene_of([moving], labels=ParkedLabels(3, "Stopped"))
-    assert moving_vehicle_mask(stopped, camera).sum() > alone.sum()
+    assert vehicle_pixels(stopped, camera).moving.sum() > alone.sum()

@@ -139,7 +139,7 @@ def test_lamps_lie_on_the_box_and_turn_with_it():
         fronts = lamps.select(lamps.kinds == LampKind.DIPPED)
         offset = fronts.positions_m.mean(0) - np.array([12.0, 0.0, 0.725])
         np.testing.assert_allclose(offset[:2], 0.9 * 2.25 * np.array(forward)[:2], atol=1e-9)
-        np.testing.assert_allclose(fronts.positions_m[:, 2], 0.45 * 1.45)
+        np.testing.assert_allclose(fronts.positions_m[:, 2], 0.48 * 1.45)
         np.testing.assert_allclose(fronts.axes, [forward] * 2, atol=1e-12)
         assert lamps.owners.tolist() == [1] * 4
 
@@ -154,8 +154,8 @@ def test_braking_cars_have_stop_lamps_in_place_of_tail_lamps():
 
 def test_lamps_are_drawn_to_the_surface_of_the_vehicles_splats():
     actor = car("a", straight_track(lambda s: 12 * s))
-    wall = one_gaussian((2.1, 0.65, -0.07))
-    points = torch.tensor([2.1, 0.65, -0.07]).repeat(20, 1)
+    wall = one_gaussian((2.1, 0.6, -0.03))
+    points = torch.tensor([2.1, 0.6, -0.03]).repeat(20, 1)
     count = len(points)
     gaussians = dataclasses.replace(
         wall,

@@ -53,12 +53,12 @@ from augment.effects.lamps.sky_in_photo import replace_photo_sky
 from augment.effects.lamps.view_lamps import describe_lamps, lamps_of_view
 from augment.effects.wet.darkening import white_level
 from augment.light.scene_light import find_scene_light
-from augment.render.buffers import EXPECTED_DEPTH, REFERENCE
+from augment.render.buffers import EXPECTED_DEPTH, REFERENCE, SPLAT_IDS
 from augment.render.sensor import draw_noise
 from augment.scene.boxes import WorldBoxes
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
-from augment.scene.sky import ConstantSky
+from augment.scene.sky import ConstantSky, CubemapSky
 from augment.timing import timed
 from augment.view.layers import LayerRenderer
 from recipes.light import Light
@@ -108,7 +108,8 @@ class LampsEffect(Effect):
         lamp_reason = describe_lamps(plan, scene, auto_reason(recipe, plan.hour)[1])
         exposure_reason = exposure_of(plan, scene).reason if plan.hour.is_dark else ""
         steps = steps_of(plan, lamp_reason, exposure_reason)
-        return EffectPlan(plan, steps, frozenset({EXPECTED_DEPTH}))
+        buffers = {EXPECTED_DEPTH, SPLAT_IDS} if plan.has_signs else {EXPECTED_DEPTH}
+        return EffectPlan(plan, steps, frozenset(buffers))
 
     def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
         light = self.section_of(recipe)
@@ -227,8 +228,9 @@ def _exposed_layers(layers: LayerRenderer, gain: float) -> LayerRenderer:
         sky_rgb = torch.tensor(layers.fog.airlight_rgb, dtype=torch.float32)
         scaled, _ = relight(sky_rgb.clamp_min(0).view(1, 1, 3).numpy(), None, gain, 0.0, -1.0)
         return replace(layers, sky=ConstantSky(torch.from_numpy(scaled[0, 0])), fog=None)
-    image = getattr(layers.sky, "image", None)
-    if image is None:
+    if not isinstance(layers.sky, CubemapSky):
         return layers
-    scaled, _ = relight(image.numpy(), None, gain, 0.0, -1.0)
-    return replace(layers, sky=replace(layers.sky, image=torch.from_numpy(scaled)), fog=None)
+    faces = layers.sky.faces
+    scaled, _ = relight(faces.flatten(0, 1).numpy(), None, gain, 0.0, -1.0)
+    sky = CubemapSky(torch.from_numpy(scaled).view(faces.shape))
+    return replace(layers, sky=sky, fog=None)

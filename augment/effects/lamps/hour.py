@@ -13,6 +13,7 @@ horizon and the tints are assumed.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -23,7 +24,7 @@ from augment.effects.wet.darkening import to_display, white_level
 from augment.light.scene_light import find_scene_light
 from augment.light.srgb import LUMINANCE_WEIGHTS, linear_from_display
 from augment.scene.scene import Scene
-from augment.scene.sky import LatLongSky
+from augment.scene.sky import CubemapSky, directions_of_cubemap
 from recipes.light import Light
 
 # Illuminance of level ground out of the sun by day, lux.
@@ -38,10 +39,10 @@ GLOW_HEIGHT_DEG = 12.0
 _ZENITH_TINTS = {"dusk": (0.45, 0.90, 1.75), "night": (0.85, 0.95, 1.25)}
 # Linear colours of the glow at the horizon, before they get luminance 1.
 _GLOW_TINTS = {"dusk": (1.20, 0.98, 0.85), "night": (1.35, 0.95, 0.65)}
-# Rows of the sky's image over 180 degrees.
-_SKY_ROWS = 360
-# Columns of the sky's image, which is the same all around.
-_SKY_COLUMNS = 4
+# Texels along a side of a face of the sky's cube map.
+_FACE_PX = 128
+# Elevations over which the sky's light on level ground is summed.
+_NUM_ELEVATIONS = 180
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def find_hour(light: Light, scene: Scene, *, is_foul: bool) -> Hour:
     return Hour(False, lux, OVERCAST_LUX / math.pi, reason)
 
 
-def night_sky(light: Light, white_cd_m2: float, white: float) -> LatLongSky:
+def night_sky(light: Light, white_cd_m2: float, white: float) -> CubemapSky:
     """Return the sky of dusk or night in the codes of a day-lit picture.
 
     Luminance falls from (1 + glow) at the horizon to 1 overhead, times what gives the sky's
@@ -103,16 +104,32 @@ def night_sky(light: Light, white_cd_m2: float, white: float) -> LatLongSky:
     """
     mean_cd_m2 = light.sky_luminance
     assert mean_cd_m2 is not None
-    elevation_deg = 90 - (np.arange(_SKY_ROWS) + 0.5) * 180 / _SKY_ROWS
-    fall = np.exp(-np.maximum(elevation_deg, 0) / GLOW_HEIGHT_DEG)
-    elevation = np.radians(elevation_deg)
-    weights = np.where(elevation > 0, np.sin(elevation) * np.cos(elevation), 0)
-    glow = light.glow * fall
-    scale = weights.sum() / (weights * (1 + glow)).sum()
-    rgb = _tint(_ZENITH_TINTS[light.time]) + glow[:, None] * _tint(_GLOW_TINTS[light.time])
-    rgb = rgb * (scale * mean_cd_m2 / max(white_cd_m2, 1e-9) * white)
-    rows = to_display(torch.from_numpy(rgb)).float()
-    return LatLongSky(rows[:, None].expand(-1, _SKY_COLUMNS, -1).contiguous())
+    brightness = mean_cd_m2 / max(white_cd_m2, 1e-9) * white
+    return _make_sky(light.time, light.glow, brightness)
+
+
+@functools.lru_cache(maxsize=8)
+def _make_sky(time: str, glow: float, brightness: float) -> CubemapSky:
+    """Return the sky of `night_sky`.
+
+    Args:
+        time: dusk or night.
+        glow: luminance at the horizon over that overhead, less 1.
+        brightness: linear light of the mean luminance in the scene's colours.
+    """
+    elevations = (np.arange(_NUM_ELEVATIONS) + 0.5) * (math.pi / 2 / _NUM_ELEVATIONS)
+    weights = np.sin(elevations) * np.cos(elevations)
+    scale = weights.sum() / (weights * (1 + glow * _glow_fall(elevations))).sum()
+    x, y, z = np.moveaxis(directions_of_cubemap(_FACE_PX).double().numpy(), -1, 0)
+    glow_at_texels = glow * _glow_fall(np.arctan2(z, np.hypot(x, y)))[..., None]
+    rgb = _tint(_ZENITH_TINTS[time]) + glow_at_texels * _tint(_GLOW_TINTS[time])
+    rgb = rgb * (scale * brightness)
+    return CubemapSky(to_display(torch.from_numpy(rgb)).float().contiguous())
+
+
+def _glow_fall(elevations: np.ndarray) -> np.ndarray:
+    """Return the glow at elevations in radians over that at the horizon."""
+    return np.exp(-np.maximum(elevations, 0) / math.radians(GLOW_HEIGHT_DEG))
 
 
 def white_of_picture(scene: Scene, color_map: torch.Tensor | None) -> float:

@@ -8,13 +8,14 @@ from jaxtyping import Float32
 from augment.effects.effect import EffectInScene, RenderedView
 from augment.effects.lamps.picture_light import find_reflectance
 from augment.effects.lamps.plan import AIR, DROPS, EMITTERS, SURFACES, WET, LightPlan
+from augment.effects.lamps.signs import sign_pixels
 from augment.lamps.air_light import air_light
 from augment.lamps.beam_shadows import draw_beam_shadows
 from augment.lamps.drop_light import add_drop_light
 from augment.lamps.emitters import HALO_RADIUS_M, add_emitters, lamp_visibility
 from augment.lamps.fog_phase import AirExtinction
 from augment.lamps.lamp import Lamps
-from augment.lamps.recorded_lamps import find_recorded_lamps, moving_vehicle_mask
+from augment.lamps.recorded_lamps import find_recorded_lamps, vehicle_pixels
 from augment.lamps.surface_light import surface_light
 from augment.lamps.wet_glints import add_wet_glints
 from augment.render.buffers import REFERENCE
@@ -119,7 +120,7 @@ def _recorded_light(
     if photo is None or not plan.hour.is_dark or not plan.has_vehicle_lamps:
         return None
     with timed(EMITTERS):
-        found = find_recorded_lamps(photo.pixels, moving_vehicle_mask(effect.scene, camera))
+        found = find_recorded_lamps(photo.pixels, vehicle_pixels(effect.scene, camera))
         if not found.lamps:
             return None
         luminance = found.luminance_cd_m2
@@ -140,7 +141,7 @@ def _add_surface_light(
     threshold_cd_m2: float,
     added: np.ndarray,
 ) -> None:
-    """Add the light of surfaces and water under lamps, as it arrives through the fog before them."""
+    """Add the light of surfaces and water under lamps, as the fog before them lets it through."""
     plan: LightPlan = effect.settings
     lamps: Lamps = effect.view_data
     with timed(SURFACES):
@@ -171,6 +172,7 @@ def _add_surface_light(
             min_luminance_cd_m2=threshold_cd_m2,
             lamps_per_pixel=plan.lamps_per_pixel,
             shadows=shadows,
+            is_sign=sign_pixels(view) if plan.has_signs else None,
             picture=added,
         )
     if not plan.is_wet:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from augment.effects.effect import PICTURE, SCENE, Step
 from augment.effects.lamps.hour import Hour
+from augment.effects.lamps.signs import has_signs
 from augment.scene.scene import Scene
 from recipes.fields import section_at
 from recipes.light import Light
@@ -62,6 +63,9 @@ class LightPlan:
 
     is_wet: bool
     """True if wet ground or a flood mirrors lamps."""
+
+    has_signs: bool
+    """True if traffic signs throw the own beams' light back."""
 
     has_drops: bool
     """True if rain or snow falls through the lamps' light."""
@@ -132,6 +136,7 @@ def make_light_plan(recipe: Recipe, scene: Scene, light: Light, hour: Hour) -> L
         has_street_lamps=light.street == "on" or (light.street == "auto" and hour.is_dark),
         has_air=any(extinction > 0 for extinction in extinctions),
         is_wet=wetness > 0 or recipe.weather.flood is not None,
+        has_signs=own_beam != "off" and hour.is_dark and has_signs(scene),
         has_drops=any(rate > 0 for rate in extinctions[1:]),
         extinction_per_m=extinctions[0],
         wetness=1.0 if recipe.weather.flood is not None else wetness,
