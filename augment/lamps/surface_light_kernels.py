@@ -500,62 +500,55 @@ def spread_light(
     """
     height, width = depth.shape
     rows, columns = node_inverse.shape
-    per_pi = 1.0 / math.pi
+    one = np.float32(1)
+    zero = np.float32(0)
+    per_pi = np.float32(1.0 / math.pi)
+    per_step = np.float32(1.0 / step)
+    has_signs = return_per_lux.size > 0
     for row in prange(height):
-        weights = np.empty(4)
-        total = np.empty(3)
-        v = min(max((row - first) / step, 0.0), rows - 1.0)
+        v = np.float32(min(max((row - first) / step, 0.0), rows - 1.0))
         i = min(int(v), max(rows - 2, 0))
-        v -= i
+        v -= np.float32(i)
         below = min(i + 1, rows - 1)
         for column in range(width):
             z = depth[row, column]
-            if not (z > 0 and z < 1e6):
+            if not (z > zero and z < np.float32(1e6)):
                 continue
-            u = min(max((column - first) / step, 0.0), columns - 1.0)
+            u = min(max(np.float32(column - first) * per_step, zero), np.float32(columns - 1))
             j = min(int(u), max(columns - 2, 0))
-            u -= j
+            u -= np.float32(j)
             beside = min(j + 1, columns - 1)
-            brightest = np.float32(0)
+            sends_back = has_signs and return_per_lux[row, column] > zero
+            brightest = zero
             for k in range(3):
-                brightest = max(brightest, max(lux[i, j, k], lux[i, beside, k]))
-                brightest = max(brightest, max(lux[below, j, k], lux[below, beside, k]))
-            sends_back = return_per_lux.size > 0 and return_per_lux[row, column] > 0
-            if brightest <= 0 and not sends_back:
+                brightest += lux[i, j, k] + lux[i, beside, k] + lux[below, j, k]
+                brightest += lux[below, beside, k]
+            if brightest <= zero and not sends_back:
                 continue
-            weights[0] = (1.0 - u) * (1.0 - v)
-            weights[1] = u * (1.0 - v)
-            weights[2] = (1.0 - u) * v
-            weights[3] = u * v
-            whole = 0.0
-            for corner in range(4):
-                a = i if corner < 2 else below
-                b = j if corner % 2 == 0 else beside
-                gap = abs(node_inverse[a, b] * z - 1.0) * (1.0 / SAME_SURFACE)
-                weights[corner] *= max(1.0 - gap * gap, OTHER_SURFACE_WEIGHT)
-                if node_inverse[a, b] <= 0:
-                    weights[corner] = 0.0
-                whole += weights[corner]
-            if whole <= 0:
+            a = (one - u) * (one - v) * _likeness(node_inverse[i, j], z)
+            b = u * (one - v) * _likeness(node_inverse[i, beside], z)
+            c = (one - u) * v * _likeness(node_inverse[below, j], z)
+            d = u * v * _likeness(node_inverse[below, beside], z)
+            weight_sum = a + b + c + d
+            if weight_sum <= zero:
                 continue
+            share = one / weight_sum
             for k in range(3):
-                total[k] = 0.0
-            for corner in range(4):
-                a = i if corner < 2 else below
-                b = j if corner % 2 == 0 else beside
-                for k in range(3):
-                    total[k] += weights[corner] * lux[a, b, k]
-            for k in range(3):
-                luminance = total[k] / whole * reflectance[row, column, k] * per_pi
-                picture[row, column, k] += np.float32(luminance)
+                light = a * lux[i, j, k] + b * lux[i, beside, k]
+                light += c * lux[below, j, k] + d * lux[below, beside, k]
+                picture[row, column, k] += light * share * per_pi * reflectance[row, column, k]
             if sends_back:
+                share *= return_per_lux[row, column]
                 for k in range(3):
-                    total[k] = 0.0
-                for corner in range(4):
-                    a = i if corner < 2 else below
-                    b = j if corner % 2 == 0 else beside
-                    for k in range(3):
-                        total[k] += weights[corner] * own_lux[a, b, k]
-                for k in range(3):
-                    luminance = total[k] / whole * return_per_lux[row, column]
-                    picture[row, column, k] += np.float32(luminance * reflectance[row, column, k])
+                    light = a * own_lux[i, j, k] + b * own_lux[i, beside, k]
+                    light += c * own_lux[below, j, k] + d * own_lux[below, beside, k]
+                    picture[row, column, k] += light * share * reflectance[row, column, k]
+
+
+@kernel_function()
+def _likeness(inverse_depth, z):
+    """Return the weight of a node for a pixel: 1 on the same surface, 0 for the sky."""
+    if inverse_depth <= np.float32(0):
+        return np.float32(0)
+    gap = (inverse_depth * z - np.float32(1)) * np.float32(1.0 / SAME_SURFACE)
+    return max(np.float32(1) - gap * gap, np.float32(OTHER_SURFACE_WEIGHT))

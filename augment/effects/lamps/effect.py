@@ -29,11 +29,11 @@ from augment.effects.effect import (
     skipped_steps,
 )
 from augment.effects.lamps.exposure import READ_NOISE, Exposure
-from augment.effects.lamps.glare import add_glare
+from augment.effects.lamps.glare import spread_glare
 from augment.effects.lamps.hour import find_hour, night_sky, white_of_picture
 from augment.effects.lamps.lamp_light import add_lamp_light
 from augment.effects.lamps.light_table import LIGHT_TABLE, measure_light
-from augment.effects.lamps.picture_light import decode, develop, relight
+from augment.effects.lamps.picture_light import develop, halve_excess, relight
 from augment.effects.lamps.plan import (
     CAMERA_STEPS,
     GLARE,
@@ -185,18 +185,21 @@ class LampsEffect(Effect):
         uses_kernels = effect.backend != REFERENCE
         exposure = exposure_of(plan, effect.scene)
         light = plan.light
+        picture = rgb.detach().cpu().numpy()
         glare = None
-        with timed(SENSOR):
-            linear = decode(rgb.detach().cpu().numpy(), uses_kernels=uses_kernels)
         if light.glare > 0:
             with timed(GLARE):
-                glare = add_glare(linear, (camera.fx + camera.fy) / 2, light.glare)
+                excess = halve_excess(picture, uses_kernels=uses_kernels)
+                if excess is not None:
+                    focal_px = (camera.fx + camera.fy) / 2
+                    size = (camera.width, camera.height)
+                    glare = spread_glare(excess, *size, focal_px, light.glare)
         with timed(SENSOR):
             draws = None
             if light.noise > 0:
                 draws = draw_noise(camera, seed=plan.seed, scene=effect.scene.name)
             out = develop(
-                linear,
+                picture,
                 glare,
                 draws,
                 exposure.electrons / exposure.scale,
