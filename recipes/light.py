@@ -123,6 +123,9 @@ class Light(EffectModel):
     """Sensitivity of the sensor."""
     f_number: Number = Field(default=2.0, ge=0.5, le=32)
     """Focal length over the diameter of the lens."""
+    white_balance: Unit = 0.6
+    """How far the camera takes out the colour of the light on the road at dusk and night: 0 keeps
+    that of daylight, so that warm lamps turn all brown, 1 makes the road grey."""
     glare: Number = Field(default=1.0, ge=0, le=20)
     """Light that lens and glass scatter around bright lamps: 1 for a clean lens, whose halo has 3 %
     of it; 3 to 10 wet or dirty, 0 none."""

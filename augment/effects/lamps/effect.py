@@ -48,7 +48,7 @@ from augment.effects.lamps.plan import (
     make_light_plan,
     steps_of,
 )
-from augment.effects.lamps.scene_exposure import exposure_of
+from augment.effects.lamps.scene_exposure import exposure_of, white_balance_of
 from augment.effects.lamps.sky_in_photo import replace_photo_sky
 from augment.effects.lamps.view_lamps import describe_lamps, lamps_of_view
 from augment.effects.wet.darkening import white_level
@@ -152,7 +152,9 @@ class LampsEffect(Effect):
         # Light of the picture at 1 cd/m2, and the factor of the picture's own.
         exposure = exposure_of(plan, effect.scene) if is_dark else _day_exposure(plan, white)
         gain = plan.hour.white_cd_m2 / white * exposure.scale if is_dark else 1.0
-        added = add_lamp_light(effect, view, camera, rgb, white, MIN_ADDED / exposure.scale)
+        added = add_lamp_light(
+            effect, view, camera, rgb, white, MIN_ADDED / exposure.scale, color_map
+        )
         with timed(RELIGHT):
             if added is None and not is_dark:
                 return view
@@ -205,6 +207,7 @@ class LampsEffect(Effect):
                 exposure.electrons / exposure.scale,
                 READ_NOISE,
                 light.noise,
+                balance=white_balance_of(plan, effect.scene),
                 uses_kernels=uses_kernels,
             )
         return torch.from_numpy(out).to(rgb.device)

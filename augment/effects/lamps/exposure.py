@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from augment.light.srgb import LUMINANCE_WEIGHTS
 from recipes.light import Light
 
 # Transmittance of the lens.
@@ -35,6 +36,8 @@ SATURATION_LUX_S = 78.0
 # Linear light that the automatic exposure gives the road: darker than by day, as pictures of night
 # are.
 ROAD_TARGET = 0.10
+# Largest factor of a channel for the white balance.
+MAX_BALANCE = 3.0
 # Smallest ISO speed; brighter scenes shorten the exposure.
 MIN_ISO = 100.0
 # Linear light from which on the response curve bends.
@@ -94,6 +97,21 @@ def response(linear: np.ndarray) -> np.ndarray:
     room = 1 - SHOULDER_START
     beyond = np.maximum(linear - SHOULDER_START, 0)
     return np.minimum(linear, SHOULDER_START) + room * -np.expm1(-beyond / room)
+
+
+def white_balance(color: np.ndarray, share: float) -> np.ndarray:
+    """Return the factors [3] of the channels by which a camera takes out the colour of the light.
+
+    A grey surface keeps its luminance, within MAX_BALANCE.
+
+    Args:
+        color: linear sRGB of the light, of any luminance above 0.
+        share: 0 takes nothing out, 1 makes a grey surface grey.
+    """
+    weights = np.asarray(LUMINANCE_WEIGHTS)
+    unit = np.maximum(color / max(float(color @ weights), 1e-12), 1e-3)
+    factors = unit**-share
+    return np.minimum(factors / float((unit * factors) @ weights), MAX_BALANCE)
 
 
 def _image_lux(f_number: float) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from augment.effects.lamps import light_kernels
 from augment.effects.lamps.exposure import CROSSTALK, response
@@ -111,9 +111,10 @@ def develop(
     read_noise: float,
     noise: float,
     *,
+    balance: Float64[np.ndarray, "3"] | None = None,
     uses_kernels: bool = True,
 ) -> Float32[np.ndarray, "H W 3"]:
-    """Return the picture that a sensor makes of light: crosstalk, noise, response curve.
+    """Return the picture that a sensor makes of light: crosstalk, noise, balance, response curve.
 
     Args:
         rgb: exposed picture, display-encoded; 1 saturates the sensor.
@@ -122,8 +123,10 @@ def develop(
         electrons: electrons of a pixel at saturation.
         read_noise: standard deviation of reading, electrons.
         noise: factor of the noise.
+        balance: factors of the channels for the white balance; None for 1.
         uses_kernels: False for the plain definition.
     """
+    factors = np.ones(3) if balance is None else balance
     per_draw = (noise / LEVEL_SD) ** 2
     per_light = per_draw / electrons
     of_reading = per_draw * (read_noise / electrons) ** 2
@@ -134,7 +137,7 @@ def develop(
                 np.ascontiguousarray(rgb),
                 _NONE if glare is None else glare,
                 _NO_DRAWS if draws is None else draws,
-                np.array([CROSSTALK, per_light, of_reading], np.float32),
+                np.array([CROSSTALK, per_light, of_reading, *factors], np.float32),
                 _light_table(),
                 _developed_table(),
                 out,
@@ -147,7 +150,7 @@ def develop(
     if draws is not None:
         sigma = np.sqrt(per_light * np.maximum(total, 0) + of_reading)
         total += sigma * (draws.astype(np.float64) - 128)
-    linear = response(np.clip(total, 0, _MAX_LIGHT))
+    linear = response(np.clip(total * factors, 0, _MAX_LIGHT))
     return display_from_linear(linear).astype(np.float32)
 
 
