@@ -26,6 +26,8 @@ SLOPE_STEP = 2
 # Difference between the slopes on both sides of a node, as a share of the inverse depth and a node,
 # up to which both are its surface's.
 SLOPE_TOLERANCE = 0.02
+# Cosine to a lamp at least, where lamps of a tile are compared: its other nodes may face it.
+MIN_RANK_COSINE = 0.02
 # Rows of the nine nodes whose normals are averaged, from the one in the middle.
 MEAN_ROWS = np.array([0, -1, 1, 0, 0, -2, -2, 2, 2])
 # Columns of those nodes.
@@ -287,17 +289,21 @@ def lux_along_ray(tables, lamp, x, y, z):
 
 
 @kernel_function()
-def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
-    """Choose the brightest lamps of a tile, brightest first; return their number.
+def rank_lamps(lamps, points, facings, count, min_lux, max_lamps, chosen, scores):
+    """Choose the brightest lamps of a tile, brightest first.
+
+    Returns:
+        Their number, and the lux of the brightest lamp that is not among them.
 
     Args:
         lamps: the lamps.
         points: points of the tile, [N, 3].
+        facings: normals at the points, [N, 3].
         count: number of the points.
         min_lux: lux of all its points below which a lamp is left out.
         max_lamps: largest number of lamps.
         chosen: output, int64 [max_lamps], indices of the lamps.
-        scores: work space, float64 [max_lamps].
+        scores: output, float64 [max_lamps], the most lux of each at some of the points.
     """
     low = np.empty(3)
     high = np.empty(3)
@@ -309,6 +315,7 @@ def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
             low[k] = min(low[k], points[p, k])
             high[k] = max(high[k], points[p, k])
     number = 0
+    dropped = 0.0
     for m in range(len(lamps.intensities)):
         squared = 0.0
         for k in range(3):
@@ -318,18 +325,26 @@ def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
         if bound < min_lux:
             continue
         bound *= math.exp(-lamps.extinctions[m] * math.sqrt(squared))
-        if bound < min_lux or (number == max_lamps and bound <= scores[number - 1]):
+        if bound < min_lux or (number == max_lamps and bound <= dropped):
             continue
         score = 0.0
+        brightest = 0.0
         lamp = read_lamp(lamps, m)
         for sample in range(len(SAMPLES)):
             p = SAMPLES[sample] * (count - 1) // (TILE * TILE - 1)
-            lux = lux_along_ray(lamps.tables, lamp, points[p, 0], points[p, 1], points[p, 2])[0]
-            score = max(score, lux)
-        if SAMPLE_MARGIN * score < min_lux:
+            lux, dx, dy, dz = lux_along_ray(
+                lamps.tables, lamp, points[p, 0], points[p, 1], points[p, 2]
+            )
+            brightest = max(brightest, lux)
+            cosine = dx * facings[p, 0] + dy * facings[p, 1] + dz * facings[p, 2]
+            score = max(score, lux * max(cosine, MIN_RANK_COSINE))
+        if SAMPLE_MARGIN * brightest < min_lux:
             continue
-        if number == max_lamps and score <= scores[number - 1]:
-            continue
+        if number == max_lamps:
+            if score <= scores[number - 1]:
+                dropped = max(dropped, score)
+                continue
+            dropped = max(dropped, scores[number - 1])
         number = min(number + 1, max_lamps)
         place = number - 1
         while place > 0 and scores[place - 1] < score:
@@ -338,7 +353,7 @@ def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
             place -= 1
         scores[place] = score
         chosen[place] = m
-    return number
+    return number, dropped
 
 
 @kernel
@@ -366,6 +381,7 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
         top = (tile // tile_columns) * TILE
         left = (tile % tile_columns) * TILE
         points = np.empty((TILE * TILE, 3))
+        facings = np.empty((TILE * TILE, 3))
         nodes = np.empty((TILE * TILE, 2), np.int64)
         roughness = np.empty((TILE, TILE))
         chosen = np.empty(max_lamps, np.int64)
@@ -388,6 +404,7 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
                 length = 0.0
                 for k in range(3):
                     length += np.float64(normals[i, j, k]) ** 2
+                    facings[count, k] = normals[i, j, k]
                 # Shorter normals are means of some that disagree: leaves, grass, noise.
                 roughness[i - top, j - left] = max(
                     (1.0 - SMOOTH_LOSS - math.sqrt(length)) / (1.0 - SMOOTH_LOSS), 0.0
@@ -397,16 +414,20 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
                 count += 1
         if count == 0:
             continue
-        number = rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores)
+        number, dropped = rank_lamps(
+            lamps, points, facings, count, min_lux, max_lamps, chosen, scores
+        )
         for c in range(number):
             m = chosen[c]
             lamp = read_lamp(lamps, m)
             tables = lamps.tables
             shadow_map = lamps.shadow_maps[m]
             is_own = lamps.is_own[m]
-            red = lamps.colors[m, 0]
-            green = lamps.colors[m, 1]
-            blue = lamps.colors[m, 2]
+            # A lamp fades before it is dropped, so that tiles have no edges.
+            fade = 1.0 if dropped <= 0 else min(max(scores[c] / dropped - 1.0, 0.0), 1.0)
+            red = fade * lamps.colors[m, 0]
+            green = fade * lamps.colors[m, 1]
+            blue = fade * lamps.colors[m, 2]
             for p in range(count):
                 x = points[p, 0]
                 y = points[p, 1]
@@ -500,7 +521,7 @@ def spread_light(
     """
     height, width = depth.shape
     rows, columns = node_inverse.shape
-    one = np.float32(1)
+    unit = np.float32(1)
     zero = np.float32(0)
     per_pi = np.float32(1.0 / math.pi)
     per_step = np.float32(1.0 / step)
@@ -525,14 +546,14 @@ def spread_light(
                 brightest += lux[below, beside, k]
             if brightest <= zero and not sends_back:
                 continue
-            a = (one - u) * (one - v) * _likeness(node_inverse[i, j], z)
-            b = u * (one - v) * _likeness(node_inverse[i, beside], z)
-            c = (one - u) * v * _likeness(node_inverse[below, j], z)
+            a = (unit - u) * (unit - v) * _likeness(node_inverse[i, j], z)
+            b = u * (unit - v) * _likeness(node_inverse[i, beside], z)
+            c = (unit - u) * v * _likeness(node_inverse[below, j], z)
             d = u * v * _likeness(node_inverse[below, beside], z)
             weight_sum = a + b + c + d
             if weight_sum <= zero:
                 continue
-            share = one / weight_sum
+            share = unit / weight_sum
             for k in range(3):
                 light = a * lux[i, j, k] + b * lux[i, beside, k]
                 light += c * lux[below, j, k] + d * lux[below, beside, k]
