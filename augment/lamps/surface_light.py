@@ -53,6 +53,14 @@ _GROUND_COSINE = 0.906
 _MIN_GROUND_COSINE = 0.766
 # Sides of the window in which the normals of the ground are averaged, nodes: columns, rows.
 _GROUND_WINDOW = (65, 17)
+# Sides of the window in which most nodes are ground about one that is taken for it: columns, rows.
+_NEAR_WINDOW = (13, 9)
+# Share of them below which it is not.
+_MIN_NEAR_SHARE = 0.5
+# Share of them from which on it is for certain.
+_NEAR_SHARE = 0.75
+# Largest difference of its inverse depth from theirs, of theirs.
+_SAME_GROUND = 0.04
 # Coefficient of retroreflection of a white sign at 0.2 degrees, cd/m2 per lux: class RA2.
 SIGN_RETURN_PER_LUX = 250.0
 # Reflectance that the coefficient belongs to: a white sign's.
@@ -116,14 +124,29 @@ def find_nodes(
     with kernel_threads(depth.shape[0]):
         surface_light_kernels.find_slopes(inverse, node_view(camera, step_px), slopes)
         surface_light_kernels.average_normals(inverse, slopes, normals)
-    return Nodes(depth, _smooth_ground(normals), step_px)
+    return Nodes(depth, _smooth_ground(normals, inverse), step_px)
 
 
-def _smooth_ground(normals: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """Return the normals, those of the ground averaged over a window of the picture."""
+def _smooth_ground(
+    normals: Float32[np.ndarray, "h w 3"], inverse: Float32[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return the normals, those of the ground averaged over a window of the picture.
+
+    Single nodes whose normals differ count as ground where most of those about them do, at about
+    their depth.
+
+    Args:
+        normals: normals by the depth.
+        inverse: 1 / z of the nodes, 0 for the sky.
+    """
     share = (normals[..., 2] - _MIN_GROUND_COSINE) / (_GROUND_COSINE - _MIN_GROUND_COSINE)
-    share = np.clip(share, 0, 1)[..., None]
-    mean = normals * share
+    share = np.clip(share, 0, 1)
+    mean = normals * share[..., None]
+    near = cv2.blur(share, _NEAR_WINDOW, borderType=cv2.BORDER_REFLECT_101)
+    near_inverse = cv2.blur(share * inverse, _NEAR_WINDOW, borderType=cv2.BORDER_REFLECT_101)
+    is_near = np.abs(inverse * near - near_inverse) < _SAME_GROUND * near_inverse
+    filled = (near - _MIN_NEAR_SHARE) / (_NEAR_SHARE - _MIN_NEAR_SHARE)
+    share = np.maximum(share, np.where(is_near, np.clip(filled, 0, 1), 0))[..., None]
     for _ in range(2):
         mean = cv2.blur(mean, _GROUND_WINDOW, borderType=cv2.BORDER_CONSTANT)
     x, y, z = cv2.split(mean)

@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from augment.effects.effect import (
@@ -169,14 +169,17 @@ class LampsEffect(Effect):
         with timed(RELIGHT):
             if added is None and not is_dark:
                 return view
-            out, mask = relight(
-                rgb,
-                added,
-                gain,
-                exposure.scale,
-                -1.0 if is_dark else MIN_ADDED,
-                uses_kernels=effect.backend != REFERENCE,
-            )
+            min_added = -1.0 if is_dark else MIN_ADDED
+            uses_kernels = effect.backend != REFERENCE
+            numbers = gain, exposure.scale, min_added
+            out, mask = relight(rgb, added, *numbers, uses_kernels=uses_kernels)
+        if not is_dark and mask.any():
+            with timed(GLARE):
+                glare = _glare(out, camera, plan.light.glare, uses_kernels=uses_kernels)
+                if glare is not None:
+                    added += glare / np.float32(exposure.scale)
+                    out, _ = relight(rgb, added, *numbers, uses_kernels=uses_kernels)
+        with timed(RELIGHT):
             device = view.rgb.device
             layers = _exposed_layers(view.layers, gain) if is_dark else view.layers
         return replace(
@@ -199,14 +202,8 @@ class LampsEffect(Effect):
         exposure = exposure_of(plan, effect.scene)
         light = plan.light
         picture = rgb.detach().cpu().numpy()
-        glare = None
-        if light.glare > 0:
-            with timed(GLARE):
-                excess = halve_excess(picture, uses_kernels=uses_kernels)
-                if excess is not None:
-                    focal_px = (camera.fx + camera.fy) / 2
-                    size = (camera.width, camera.height)
-                    glare = spread_glare(excess, *size, focal_px, light.glare)
+        with timed(GLARE):
+            glare = _glare(picture, camera, light.glare, uses_kernels=uses_kernels)
         with timed(SENSOR):
             draws = None
             if light.noise > 0:
@@ -227,6 +224,26 @@ class LampsEffect(Effect):
         self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
     ) -> dict[str, np.ndarray]:
         return measure_light(boxes, camera, inputs)
+
+
+def _glare(
+    picture: Float32[np.ndarray, "H W 3"], camera: Camera, strength: float, *, uses_kernels: bool
+) -> Float32[np.ndarray, "H W 3"] | None:
+    """Return the light that the lens scatters about saturated pixels; None for none.
+
+    Args:
+        picture: the exposed picture, display-encoded, not clamped.
+        camera: the view.
+        strength: the recipe's `glare`.
+        uses_kernels: False for the plain definition.
+    """
+    if strength <= 0:
+        return None
+    excess = halve_excess(picture, uses_kernels=uses_kernels)
+    if excess is None:
+        return None
+    focal_px = (camera.fx + camera.fy) / 2
+    return spread_glare(excess, camera.width, camera.height, focal_px, strength)
 
 
 def _day_exposure(plan: LightPlan, white: float) -> Exposure:

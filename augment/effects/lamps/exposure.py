@@ -44,6 +44,9 @@ MIN_ISO = 100.0
 SHOULDER_START = 0.6
 # Share of the light beyond saturation that leaks into the other two channels: lamps turn white.
 CROSSTALK = 0.04
+# Largest light beyond saturation of which a share leaks, of saturation: the middle of a red lamp
+# stays pink, as cameras with a wide range show it (chosen by eye).
+MAX_LEAKING = 12.0
 
 
 @dataclass(frozen=True)

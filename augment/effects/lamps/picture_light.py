@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from augment.effects.lamps import light_kernels
-from augment.effects.lamps.exposure import CROSSTALK, response
+from augment.effects.lamps.exposure import CROSSTALK, MAX_LEAKING, response
 from augment.effects.lamps.light_kernels import CODE_STEPS, ROOT_STEPS
 from augment.light.srgb import display_from_linear, linear_from_display
 from augment.render.composite import ROWS_PER_CHUNK
@@ -25,8 +25,9 @@ _MAX_CODE = 2.0
 _MAX_LIGHT = 6.25
 # Light, of saturation, that lamps must add for a saturated pixel to be theirs.
 MIN_LAMP_LIGHT = 0.1
-# Least reflectance of a surface; darker colours are shadows of the day.
-MIN_REFLECTANCE = 0.02
+# Least reflectance of a surface. Darker colours are shadows of the day; with more than this they
+# turn to smoke in the beams, since they lose their texture.
+MIN_REFLECTANCE = 0.004
 # Greatest reflectance of a surface.
 MAX_REFLECTANCE = 0.9
 _NONE = np.zeros((0, 0, 3), np.float32)
@@ -137,7 +138,7 @@ def develop(
                 np.ascontiguousarray(rgb),
                 _NONE if glare is None else glare,
                 _NO_DRAWS if draws is None else draws,
-                np.array([CROSSTALK, per_light, of_reading, *factors], np.float32),
+                np.array([CROSSTALK, per_light, of_reading, *factors, MAX_LEAKING], np.float32),
                 _light_table(),
                 _developed_table(),
                 out,
@@ -145,7 +146,7 @@ def develop(
         return out
     total = linear_from_display(np.maximum(rgb, 0).astype(np.float64))
     total += 0 if glare is None else glare
-    excess = np.maximum(total - 1, 0)
+    excess = np.clip(total - 1, 0, MAX_LEAKING)
     total += CROSSTALK * (excess.sum(-1, keepdims=True) - excess)
     if draws is not None:
         sigma = np.sqrt(per_light * np.maximum(total, 0) + of_reading)

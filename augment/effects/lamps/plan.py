@@ -219,8 +219,8 @@ def steps_of(plan: LightPlan, lamp_reason: str, exposure_reason: str) -> tuple[S
         ),
         Step(
             GLARE,
-            is_dark and light.glare > 0,
-            f"light.glare is {light.glare:g}" if is_dark else by_day,
+            light.glare > 0 and (is_dark or has_lamps),
+            f"light.glare is {light.glare:g}",
             PICTURE,
         ),
         Step(SENSOR, is_dark, f"light.noise is {light.noise:g}" if is_dark else by_day, PICTURE),
