@@ -177,6 +177,7 @@ class LampsEffect(Effect):
             with timed(GLARE):
                 glare = _glare(out, camera, plan.light.glare, uses_kernels=uses_kernels)
                 if glare is not None:
+                    glare[glare.max(axis=-1) < MIN_LAMP_LIGHT_BY_DAY] = 0
                     added += glare / np.float32(exposure.scale)
                     out, _ = relight(rgb, added, *numbers, uses_kernels=uses_kernels)
         with timed(RELIGHT):
