@@ -49,11 +49,11 @@ def light_recording_car(
         camera: the view.
         uses_kernels: False for the plain definition.
     """
-    others = lamps.select(lamps.owners != EGO_OWNER)
-    if len(others) == 0:
+    foreign_lamps = lamps.select(lamps.owners != EGO_OWNER)
+    if len(foreign_lamps) == 0:
         return
     place = camera.centre.numpy()[None] - np.array([[0.0, 0.0, PAINT_M]])
-    lux = illuminance(others, place, np.array([[0.0, 0.0, 1.0]]))[0]
+    lux = illuminance(foreign_lamps, place, np.array([[0.0, 0.0, 1.0]]))[0]
     paint = np.ascontiguousarray(rgb[pixels])[None]
     reflectance = find_reflectance(paint, white, None, (0.0, 0.0, 0.0), uses_kernels=uses_kernels)
-    added[pixels] += reflectance[0] * ((lux @ others.colors) / np.pi).astype(np.float32)
+    added[pixels] += reflectance[0] * ((lux @ foreign_lamps.colors) / np.pi).astype(np.float32)
