@@ -54,13 +54,13 @@ _MIN_GROUND_COSINE = 0.766
 # Sides of the window in which the normals of the ground are averaged, nodes: columns, rows.
 _GROUND_WINDOW = (65, 17)
 # Sides of the window in which most nodes are ground about one that is taken for it: columns, rows.
-_NEAR_WINDOW = (13, 9)
+_NEAR_WINDOW = (33, 17)
 # Share of them below which it is not.
-_MIN_NEAR_SHARE = 0.5
+_MIN_NEAR_SHARE = 0.45
 # Share of them from which on it is for certain.
-_NEAR_SHARE = 0.75
+_NEAR_SHARE = 0.65
 # Largest difference of its inverse depth from theirs, of theirs.
-_SAME_GROUND = 0.04
+_SAME_GROUND = 0.03
 # Coefficient of retroreflection of a white sign at 0.2 degrees, cd/m2 per lux: class RA2.
 SIGN_RETURN_PER_LUX = 250.0
 # Reflectance that the coefficient belongs to: a white sign's.
