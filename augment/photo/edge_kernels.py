@@ -179,8 +179,8 @@ def mark_edges(
 
 
 @serial_kernel
-def cut_below(label, window, nearest_depth, small_window, numbers, photo_labels):
-    """Take the pixels of an object that lie below a height from it.
+def cut_below(label, window, nearest_depth, small_window, numbers, lowest, photo_labels):
+    """Take the pixels of an object that lie below its lower side from it.
 
     Args:
         label: uint8, the object.
@@ -189,8 +189,9 @@ def cut_below(label, window, nearest_depth, small_window, numbers, photo_labels)
             copy's window.
         small_window: int64 [4], first row and column of that window, and height and width of the
             small copy.
-        numbers: float64 [9]; the camera's height (m), the rise of its axes (3), its lens (cx, cy,
-            fx, fy), and the height (m).
+        numbers: float64 [8]; the camera's height (m), the rise of its axes (3), its lens (cx, cy,
+            fx, fy).
+        lowest: float64 [m, n], height (m) of the lower side at each pixel of the small window.
         photo_labels: uint8 [H, W], objects of the photo, in which 0 is written.
     """
     height, width = photo_labels.shape
@@ -203,7 +204,7 @@ def cut_below(label, window, nearest_depth, small_window, numbers, photo_labels)
             small_column = column * small_window[3] // width - small_window[1]
             rise = numbers[1] * (column + 0.5 - numbers[4]) / numbers[6] + rise_of_row
             depth_m = np.float64(nearest_depth[small_row, small_column])
-            if numbers[0] + depth_m * (rise + numbers[3]) < numbers[8]:
+            if numbers[0] + depth_m * (rise + numbers[3]) < lowest[small_row, small_column]:
                 photo_labels[row, column] = 0
 
 

@@ -63,6 +63,10 @@ PRIOR_LEVELS = 25.0
 USUAL_OFFSET = 0.35
 # Distance from the image's border within which an outline stays, pixels.
 BORDER_PX = 3
+# Number of points beside the border whose direction tells where the outline leaves the image.
+NUM_LEADING_POINTS = 8
+# Largest shift along the border of the place where it does, in reaches.
+MAX_BORDER_SHIFT = 4.0
 # Smallest area of a silhouette that has an outline, pixels of the small mask.
 MIN_AREA_PX = 12
 # Sobel's sum for a slope of one a pixel.
@@ -181,9 +185,54 @@ def _move_outline(
         np.concatenate([path[len(points) : len(points) + half], path[half : len(points)]])
     ]
     outline = points + normals * np.where(is_at_border, 0, moves)[:, None]
+    if is_at_border.any() and not is_at_border.all():
+        _narrow_at_border(outline, points, np.asarray(is_at_border), limit, reach_px)
     # An object that the image cuts reaches beyond the image's border.
     outline = np.where(points < BORDER_PX, np.minimum(outline, -1), outline)
     return np.where(points > limit, np.maximum(outline, limit + 1 + BORDER_PX), outline)
+
+
+def _narrow_at_border(
+    outline: Float[np.ndarray, "N 2"],
+    points: Float[np.ndarray, "N 2"],
+    is_at_border: Bool[np.ndarray, " N"],
+    limit: np.ndarray,
+    reach_px: float,
+) -> None:
+    """Move the ends of what the image cuts to where the outline beside them leads, in place.
+
+    Points at the image's border stay, and would keep the silhouette's width there.
+
+    Args:
+        outline: moved points; those at the border have not been moved.
+        points: points of the silhouette.
+        is_at_border: True for points at the border.
+        limit: largest x and y of points that are not at the border.
+        reach_px: distance inside the silhouette at which the photo's edge may lie, pixels.
+    """
+    num_points = len(points)
+    for step in (1, -1):
+        for last in np.flatnonzero(~is_at_border & np.roll(is_at_border, -step)):
+            first = (last + step) % num_points
+            is_beyond = (points[first] < BORDER_PX) | (points[first] > limit)
+            axis = int(is_beyond[1])
+            along = 1 - axis
+            before = (last - step * NUM_LEADING_POINTS) % num_points
+            lead = outline[last] - outline[before]
+            to_border = points[first, axis] - outline[last, axis]
+            if is_at_border[before] or is_beyond.all() or lead[axis] * to_border <= 0:
+                continue
+            end = outline[last, along] + to_border * lead[along] / lead[axis]
+            shift = end - points[first, along]
+            if abs(shift) > MAX_BORDER_SHIFT * reach_px:
+                continue
+            point = first
+            # Only points that the silhouette has beyond the end move: the object gets narrower.
+            while is_at_border[point] and (end - points[point, along]) * shift > 0:
+                if not (points[point, axis] < BORDER_PX or points[point, axis] > limit[axis]):
+                    break
+                outline[point, along] = end
+                point = (point + step) % num_points
 
 
 def score_offsets(

@@ -10,7 +10,7 @@ photo ends.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -22,7 +22,9 @@ from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 
 from augment.photo import edge_kernels as kernels
+from augment.photo.object_underside import Underside, height_numbers, heights_at, underside_of
 from augment.photo.outlines import MIN_AREA_PX, Silhouette, fill_polygons, find_outlines
+from augment.photo.parked_objects import ObjectParts
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, OVERLAY, SPLAT_IDS, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.layout import HeightClip
@@ -50,12 +52,12 @@ DEPTH_TOLERANCE = 0.1
 DEPTH_TOLERANCE_M = 0.5
 # Height above an object within which its own snow may lie, metres.
 CAP_HEIGHT_M = 0.8
+# Share of a pixel that shows snow on an object, up to which the pixel may take other buffers.
+CLEAR_OVERLAY = 0.05
 # Share of a pixel that snow on the ground may hide where an object's buffers are taken.
-MAX_GROUND_SNOW = 0.3
+MAX_GROUND_SNOW = 0.1
 # Share of a pixel from which snow on an object shows there.
 MIN_CAP_SHARE = 0.5
-# Quantile of the heights of an object's splats that is its bottom.
-LOWEST_QUANTILE = 0.01
 # Largest number of objects whose outlines are moved; the nearest ones are taken.
 MAX_OBJECTS = 60
 
@@ -185,8 +187,8 @@ class _Object:
     """Median z of its pixels, metres."""
     polygons: list[Float[np.ndarray, "_ 2"]]
     """Its outlines in the photo."""
-    bottom_z_m: float = -math.inf
-    """Height of its lowest splats in the world, metres: it does not reach below."""
+    underside: Underside | None = None
+    """Its lower side: it does not reach below."""
 
 
 def find_edges(
@@ -197,9 +199,10 @@ def find_edges(
     *,
     settings: RasterSettings,
     clip: HeightClip | None = None,
+    parked: ObjectParts | None = None,
     backend: str,
 ) -> ObjectEdges | None:
-    """Return the edges of the moving parts on the photo; None where there are none.
+    """Return the edges of the objects on the photo; None where there are none.
 
     Args:
         parts: the posed parts of the view.
@@ -208,10 +211,18 @@ def find_edges(
         pixels: the photo.
         settings: the rasteriser's settings.
         clip: height above which the buffers show the parts; None if they show all.
+        parked: objects that stand still, taken from the background; None for none.
         backend: the rasteriser's backend.
     """
     moving_parts = [part for part in parts if part.instance_id > 0]
     bare_parts = [part for part in moving_parts if not part.is_overlay]
+    is_snowy = len(bare_parts) < len(moving_parts)
+    poses: Mapping[int, np.ndarray] = {}
+    if parked is not None:
+        moving_parts += parked.parts
+        bare_parts += parked.bare_parts
+        is_snowy |= any(part.is_overlay for part in parked.parts)
+        poses = parked.poses
     if not bare_parts or camera.is_orthographic:
         return None
     assert raster.alpha is not None and raster.expected_depth is not None
@@ -223,30 +234,22 @@ def find_edges(
     objects = _find_objects(bare, camera, pixels)
     if not objects:
         return None
-    objects = [replace(o, bottom_z_m=_bottom_of(bare_parts, o.instance_id)) for o in objects]
+    undersides = {
+        o.instance_id: underside_of(
+            [part for part in bare_parts if part.instance_id == o.instance_id],
+            poses.get(o.instance_id),
+        )
+        for o in objects
+    }
+    objects = [replace(o, underside=undersides[o.instance_id]) for o in objects]
     covered = bare
-    if len(bare_parts) < len(moving_parts):
+    if is_snowy:
         covered = _draw(moving_parts, small, scene_depth, settings, backend)
     is_drawn = None if clip is None else alpha > 0.5
     is_bare = None
     if raster.overlay is not None:  # snow on the ground hides the feet of objects
         is_bare = _shrink(raster.overlay, small) <= covered.overlay + MAX_GROUND_SNOW
     return _edges_of(objects, covered, is_drawn, is_bare, clip, camera, covered is not bare)
-
-
-def _bottom_of(parts: Sequence[PosedGaussians], instance_id: int) -> float:
-    """Return the height in the world of the lowest splats of an object, metres."""
-    heights = list[np.ndarray]()
-    for part in parts:
-        if part.instance_id != instance_id:
-            continue
-        means = part.gaussians.means.detach().cpu().double().numpy()
-        if part.world_from_part is None:
-            heights.append(means[:, 2])
-            continue
-        pose = part.world_from_part.detach().cpu().double().numpy()
-        heights.append(means @ pose[2, :3] + pose[2, 3])
-    return float(np.quantile(np.concatenate(heights), LOWEST_QUANTILE))
 
 
 def copy_size(camera: Camera, width_px: int) -> tuple[int, int]:
@@ -384,9 +387,10 @@ def _edges_of(
     window_labels = np.ascontiguousarray(photo_labels[window.rows, window.columns])
     shows_background = np.zeros(photo_labels.shape, np.bool_)
     lacks_object = np.empty(window_labels.shape, np.bool_)
-    no_caps = np.empty((0, 0), np.float32)
+    overlay = np.empty((0, 0), np.float32)
     is_above = np.empty((0, 0), np.bool_)
     if has_caps:
+        overlay = window.linear(drawing.overlay)
         is_above = _are_above(objects, photo_labels, camera)[window.rows, window.columns]
     kernels.mark_edges(
         window_labels,
@@ -394,12 +398,14 @@ def _edges_of(
         hides,
         labels,
         window.linear(alpha),
-        window.linear(drawing.overlay) if has_caps else no_caps,
+        overlay,
         np.ascontiguousarray(is_above),
         np.array([SOLID_ALPHA, MIN_CAP_SHARE], np.float32),
         shows_background,
         lacks_object,
     )
+    if has_caps:  # the soft edge of its snow stays as it is drawn
+        lacks_object &= overlay <= CLEAR_OVERLAY
     target_rows, target_columns = np.nonzero(lacks_object)
     target_labels = window_labels[target_rows, target_columns]
     targets = (target_rows + window.rows.start) * camera.width
@@ -424,7 +430,7 @@ def _edges_of(
         if is_object.any():
             nearest = _nearest_to(small_rows, small_columns, is_object)
             depths_m = drawing.depth.reshape(-1)[nearest]
-        is_above = _heights_at(chosen, depths_m, camera) > clip.z_m
+        is_above = heights_at(chosen, depths_m, camera) > clip.z_m
         moves.append(_find_sources(chosen[is_above], is_seed & is_drawn, camera))
         moves.append(_find_sources(chosen[~is_above], is_seed & ~is_drawn, camera))
     empty = np.empty(0, np.int64)
@@ -481,30 +487,24 @@ def _cut_below(
             ),
             is_object,
         )
+        assert drawn_object.underside is not None
+        nearest_depths_m = drawing.depth.reshape(-1)[nearest]
+        small_rows, small_columns = np.indices(nearest.shape)
+        lowest_m = drawn_object.underside.lowest_at(
+            (small_rows + first[0] + 0.5) * (camera.height / height),
+            (small_columns + first[1] + 0.5) * (camera.width / width),
+            nearest_depths_m,
+            camera,
+        )
         kernels.cut_below(
             np.uint8(label),
             np.array([*corner, num_rows, num_columns], np.int64),
-            drawing.depth.reshape(-1)[nearest],
+            nearest_depths_m,
             np.array([*first, height, width], np.int64),
-            np.array([*_height_numbers(camera), drawn_object.bottom_z_m]),
+            np.array(height_numbers(camera)),
+            lowest_m,
             photo_labels,
         )
-
-
-def _height_numbers(camera: Camera) -> tuple[float, ...]:
-    """Return the numbers of `_heights_at`: the camera's height, the rise of its axes, its lens."""
-    x, y, z = camera.world_from_camera[2, :3].tolist()
-    return float(camera.centre[2]), x, y, z, camera.cx, camera.cy, camera.fx, camera.fy
-
-
-def _heights_at(
-    targets: Int64[np.ndarray, " M"], depth_m: float | Float[np.ndarray, " M"], camera: Camera
-) -> Float[np.ndarray, " M"]:
-    """Return the height in the world of points at a depth in pixels."""
-    rows, columns = np.divmod(targets, camera.width)
-    eye_z_m, x, y, z, cx, cy, fx, fy = _height_numbers(camera)
-    rise = x * (columns + 0.5 - cx) / fx + y * (rows + 0.5 - cy) / fy
-    return eye_z_m + depth_m * (rise + z)
 
 
 def _are_above(
@@ -588,11 +588,10 @@ def _find_sources(
     small_columns = columns * width // camera.width
     nearest = _nearest_to(small_rows, small_columns, is_seed)
     seed_rows, seed_columns = np.divmod(nearest, width)
-    # A target keeps its place within the small pixel, so that neighbours differ as they did.
-    rows += np.rint((seed_rows - small_rows) * (camera.height / height)).astype(np.int64)
-    columns += np.rint((seed_columns - small_columns) * (camera.width / width)).astype(np.int64)
-    rows = np.clip(rows, 0, camera.height - 1)
-    columns = np.clip(columns, 0, camera.width - 1)
+    # The pixel from which the small copy has its value: others of the seed were not looked at, and
+    # would repeat a pattern over all targets beside it.
+    rows = seed_rows * camera.height // height
+    columns = seed_columns * camera.width // width
     return targets, rows * camera.width + columns
 
 

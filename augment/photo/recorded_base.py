@@ -483,7 +483,7 @@ class Photo:
         if len(style.surface_maps) > 1:
             assert raster.splat_ids is not None
             has_splat = raster.splat_ids >= 0
-            table = _classes(parts, surface_rgb.device)
+            table = splat_classes(parts, surface_rgb.device)
             classes = torch.where(has_splat, table[raster.splat_ids.clamp_min(0)], 0)
             for class_number in torch.unique(classes).tolist():
                 if class_number and not torch.equal(
@@ -1068,7 +1068,7 @@ def _composed(
     return composed.float()
 
 
-def _classes(parts: Sequence[PosedGaussians], device: torch.device) -> Int16[Tensor, "N"]:
+def splat_classes(parts: Sequence[PosedGaussians], device: torch.device) -> Int16[Tensor, "N"]:
     """Return the class of every splat, in the order in which buffers count them; 0 where
     unknown.
     """

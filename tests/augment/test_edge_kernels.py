@@ -163,7 +163,8 @@ def test_pixels_below_a_height_are_taken_from_their_object_alone():
         np.array([5, 9, 50, 71], np.int64),
         nearest_depth[1:, 2:].copy(),
         np.array([1, 2, 20, 30], np.int64),
-        np.array([eye_z_m, rise_x, rise_y, rise_z, cx, cy, fx, fy, 0.3]),
+        np.array([eye_z_m, rise_x, rise_y, rise_z, cx, cy, fx, fy]),
+        np.full((19, 28), 0.3),
         labels,
     )
     np.testing.assert_array_equal(labels, expected)
