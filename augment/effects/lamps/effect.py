@@ -13,8 +13,6 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from augment.effects.effect import (
     PICTURE,
@@ -32,12 +30,19 @@ from augment.effects.lamps.exposure import READ_NOISE, Exposure
 from augment.effects.lamps.glare import add_glare
 from augment.effects.lamps.hour import find_hour, night_sky, white_of_picture
 from augment.effects.lamps.lamp_light import add_lamp_light
-from augment.effects.lamps.light_table import LIGHT_TABLE, measure_light
+from augment.effects.lamps.light_table import (
+    EXPOSURE_COLUMNS,
+    LIGHT_TABLE,
+    measure_exposure,
+    measure_light,
+)
+from augment.effects.lamps.luminance import read_light
 from augment.effects.lamps.picture_light import decode, develop, relight
 from augment.effects.lamps.plan import (
     CAMERA_STEPS,
     GLARE,
     LAMP_STEPS,
+    METER,
     NIGHT_SKY,
     RELIGHT,
     SENSOR,
@@ -48,7 +53,7 @@ from augment.effects.lamps.plan import (
     make_light_plan,
     steps_of,
 )
-from augment.effects.lamps.scene_exposure import exposure_of
+from augment.effects.lamps.scene_exposure import exposure_of, exposure_of_picture
 from augment.effects.lamps.sky_in_photo import replace_photo_sky
 from augment.effects.lamps.view_lamps import describe_lamps, lamps_of_view
 from augment.effects.wet.darkening import white_level
@@ -79,6 +84,7 @@ class LampsEffect(Effect):
     is_see_through = True
     share_column = "glare_fraction"
     sees_exposure = True
+    measured_columns = EXPOSURE_COLUMNS
     box_table = LIGHT_TABLE
     kernel_folders: ClassVar = ("augment.lamps",)
 
@@ -150,7 +156,7 @@ class LampsEffect(Effect):
             with timed(NIGHT_SKY):
                 rgb = replace_photo_sky(rgb, view, camera, color_map)
         # Light of the picture at 1 cd/m2, and the factor of the picture's own.
-        exposure = exposure_of(plan, effect.scene) if is_dark else _day_exposure(plan, white)
+        exposure = exposure_of_picture(plan, effect.scene, effect.lit_scene, camera)
         gain = plan.hour.white_cd_m2 / white * exposure.scale if is_dark else 1.0
         added = add_lamp_light(effect, view, camera, rgb, white, MIN_ADDED / exposure.scale)
         with timed(RELIGHT):
@@ -176,14 +182,15 @@ class LampsEffect(Effect):
     def reads_neighbours(self, effect: EffectInScene) -> bool:
         return True
 
-    def expose(
-        self, effect: EffectInScene, rgb: Float[Tensor, "H W 3"], camera: Camera
-    ) -> Float[Tensor, "H W 3"]:
+    def expose(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         plan: LightPlan = effect.settings
-        if not plan.hour.is_dark or camera.is_orthographic:
-            return rgb
+        if camera.is_orthographic:
+            return view
+        exposure = exposure_of_picture(plan, effect.scene, effect.lit_scene, camera)
+        if not plan.hour.is_dark:
+            return _read_light(effect, view, None, exposure) if plan.needs_luminance else view
+        rgb = view.rgb
         uses_kernels = effect.backend != REFERENCE
-        exposure = exposure_of(plan, effect.scene)
         light = plan.light
         glare = None
         with timed(SENSOR):
@@ -204,7 +211,12 @@ class LampsEffect(Effect):
                 light.noise,
                 uses_kernels=uses_kernels,
             )
-        return torch.from_numpy(out).to(rgb.device)
+        if light.glare > 0 or plan.needs_luminance:
+            view = _read_light(effect, view, glare, exposure)
+        return replace(view, rgb=torch.from_numpy(out).to(rgb.device))
+
+    def measure_view(self, camera: Camera, inputs: LabelInputs) -> dict[str, float]:
+        return measure_exposure(camera, inputs)
 
     def measure_boxes(
         self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
@@ -212,9 +224,34 @@ class LampsEffect(Effect):
         return measure_light(boxes, camera, inputs)
 
 
-def _day_exposure(plan: LightPlan, white: float) -> Exposure:
-    """Return the exposure of a picture of the day, by its white."""
-    return Exposure(white / max(plan.hour.white_cd_m2, 1e-9), 1.0, "recorded")
+def _read_light(
+    effect: EffectInScene, view: RenderedView, glare: np.ndarray | None, exposure: Exposure
+) -> RenderedView:
+    """Return the view with its luminance, where labels need it, and glare in its mask.
+
+    Args:
+        effect: the effect in the scene.
+        view: the exposed picture before the sensor.
+        glare: light that the lens scatters, [H, W, 3]; None for none.
+        exposure: the camera's exposure.
+    """
+    plan: LightPlan = effect.settings
+    with timed(METER):
+        reading = read_light(
+            view.rgb.detach().cpu().numpy(),
+            glare,
+            exposure.white_cd_m2,
+            needs_luminance=plan.needs_luminance,
+            uses_kernels=effect.backend != REFERENCE,
+        )
+        device = view.rgb.device
+        masks = dict(view.masks)
+        if glare is not None:
+            masks["glare"] = masks["glare"] | torch.from_numpy(reading.is_veiled).to(device)
+        luminance = reading.luminance_cd_m2
+        if luminance is None:
+            return replace(view, masks=masks)
+        return replace(view, masks=masks, luminance_cd_m2=torch.from_numpy(luminance).to(device))
 
 
 def _exposed_layers(layers: LayerRenderer, gain: float) -> LayerRenderer:

@@ -71,7 +71,7 @@ def relight(
             _NONE if added_cd_m2 is None else np.ascontiguousarray(added_cd_m2),
             np.array([gain, added_gain, MIN_LAMP_LIGHT], np.float32),
             np.float32(min_added),
-            _light_table(),
+            light_table(),
             _code_table(),
             out,
             mask,
@@ -93,7 +93,7 @@ def decode(
     out = np.empty_like(rgb)
     with kernel_threads(ROWS_PER_CHUNK):
         rows = np.ascontiguousarray(rgb).reshape(len(rgb), -1)
-        light_kernels.decode(rows, _light_table(), out.reshape(len(rgb), -1))
+        light_kernels.decode(rows, light_table(), out.reshape(len(rgb), -1))
     return out
 
 
@@ -144,7 +144,7 @@ def develop(
 
 
 @functools.cache
-def _light_table() -> np.ndarray:
+def light_table() -> np.ndarray:
     """Return the light of codes from 0 to _MAX_CODE."""
     codes = np.arange(round(_MAX_CODE * CODE_STEPS) + 2) / CODE_STEPS
     return linear_from_display(codes).astype(np.float32)
@@ -193,7 +193,7 @@ def find_reflectance(
                 np.zeros((0, 0), np.float32) if fog_share is None else fog_share,
                 airlight,
                 np.array([white, MIN_REFLECTANCE, MAX_REFLECTANCE], np.float32),
-                _light_table(),
+                light_table(),
                 out,
             )
         return out

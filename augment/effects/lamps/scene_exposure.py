@@ -7,11 +7,13 @@ import math
 import numpy as np
 
 from augment.effects.lamps.exposure import Exposure, auto_exposure, fixed_exposure
+from augment.effects.lamps.hour import white_of_picture
 from augment.effects.lamps.plan import LightPlan
 from augment.effects.lamps.view_lamps import fixed_lamps
 from augment.lamps.lamp import Lamps
 from augment.lamps.surface_light import illuminance
 from augment.memo import memo_of
+from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 
 # Reflectance of a road.
@@ -47,6 +49,24 @@ def exposure_of(plan: LightPlan, scene: Scene) -> Exposure:
     key = ("lamps, exposure", light, plan.has_street_lamps, plan.own_beam)
     key = (*key, plan.extinction_per_m, plan.wetness, plan.snow_cover)
     return memo_of(scene).get(key, lambda: auto_exposure(light, metered_luminance(plan, scene)))
+
+
+def exposure_of_picture(
+    plan: LightPlan, scene: Scene, lit_scene: Scene, camera: Camera
+) -> Exposure:
+    """Return the exposure of a picture: by day the recorded one, by the picture's white.
+
+    Args:
+        plan: the plan.
+        scene: the scene.
+        lit_scene: the scene as earlier effects relit it.
+        camera: the view.
+    """
+    if plan.hour.is_dark:
+        return exposure_of(plan, scene)
+    color_map = scene.color_map(camera) if plan.uses_color_map else None
+    white = white_of_picture(lit_scene, color_map)
+    return Exposure(white / max(plan.hour.white_cd_m2, 1e-9), 1.0, "recorded")
 
 
 def metered_luminance(plan: LightPlan, scene: Scene) -> float:
