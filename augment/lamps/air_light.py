@@ -40,7 +40,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from augment.lamps import air_light_kernels
-from augment.lamps.air_light_kernels import HaloLamps, ImageGrid
+from augment.lamps.air_light_kernels import FLOOR_SHARE, HaloLamps, ImageGrid
 from augment.lamps.fog_phase import (
     AirExtinction,
     Lobes,
@@ -288,22 +288,30 @@ def _prepare(
         )  # fmt: skip
     # A lamp that shines away from all that the camera sees has no peak in its planes.
     ends = _cut_off(np.maximum(plane_peaks, means[rows]), bound_gains[rows], threshold_cd_m2)
-    depth = np.minimum(sigmas[rows] * distances[rows], MAX_FACTOR_DEPTH)
-    off_axis_deg = np.degrees(np.arccos(np.clip(-(lamps.axes * frames[:, 0]).sum(1), -1, 1)))
-    gains = factor_gain(lamps.spreads_deg, off_axis_deg)
-    rotation = camera.camera_from_world[:3, :3].numpy()
     is_lit = ends > 0
     if not is_lit.any():
         return None
+    depths = sigmas[rows] * distances[rows]
+    factor_depths = np.minimum(depths, MAX_FACTOR_DEPTH)
+    off_axis_deg = np.degrees(np.arccos(np.clip(-(lamps.axes * frames[:, 0]).sum(1), -1, 1)))
+    gains = factor_gain(lamps.spreads_deg, off_axis_deg)
+    bounds = sigmas[rows] * np.exp(-depths) * (plane_peaks + FLOOR_SHARE * means[rows])
+    # The brightest lamps first: at many nodes the others can then be left out.
+    brightness = np.where(is_lit, bounds / distances[rows], -1.0)
+    order = np.argsort(-brightness, kind="stable")[: int(is_lit.sum())]
+    rotation = camera.camera_from_world[:3, :3].numpy()
+    colors = np.ascontiguousarray(lamps.colors[order])
     numbers = HaloLamps(
-        np.ascontiguousarray((frames @ rotation.T)[is_lit]),
-        distances[rows][is_lit],
-        sigmas[rows][is_lit],
-        np.ascontiguousarray(lamps.colors[is_lit]),
-        means[rows][is_lit],
-        np.stack([gains * depth, SCATTER_GAIN * depth], 1)[is_lit],
-        np.stack([ends, np.where(ends >= np.pi, -2.0, np.cos(ends))], 1)[is_lit],
-        np.ascontiguousarray(layouts[is_lit]),
+        frames=np.ascontiguousarray((frames @ rotation.T)[order]),
+        distances_m=distances[rows][order],
+        sigmas_per_m=sigmas[rows][order],
+        colors=colors,
+        inverse_colors=1 / np.maximum(colors, 1e-12),
+        bounds=bounds[order],
+        means_cd=means[rows][order],
+        factors=np.stack([gains * factor_depths, SCATTER_GAIN * factor_depths], 1)[order],
+        ends=np.stack([ends, np.where(ends >= np.pi, -2.0, np.cos(ends))], 1)[order],
+        tables=np.ascontiguousarray(layouts[order]),
     )
     return _Halos(numbers, np.stack([scatter_table(lobe) for lobe in lobes]), planes)
 

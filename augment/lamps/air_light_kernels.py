@@ -34,6 +34,9 @@ MAX_FACTOR_ANGLE_RAD = math.pi / 4
 # Least share of what multiple scattering adds to a lamp of a beam's mean intensity that the beam
 # itself has, from all sides.
 FLOOR_SHARE = 0.13
+# A lamp is left out at a node where it adds at most this share to the lamps before it. At 128 of
+# 255 an eighth of a grey level is a share of 0.002.
+LEAST_SHARE = 0.0005
 # Share of the angle of cut-off from which on a halo fades to zero.
 FADE_FROM = 0.8
 
@@ -49,6 +52,8 @@ class HaloLamps(NamedTuple):
     distances_m: np.ndarray  # float64 [M]
     sigmas_per_m: np.ndarray  # float64 [M]
     colors: np.ndarray  # float64 [M, 3]: linear sRGB of 1 cd
+    inverse_colors: np.ndarray  # float64 [M, 3]: 1 / colors, large where they are 0
+    bounds: np.ndarray  # float64 [M]: largest luminance times h per unit of what is scattered
     means_cd: np.ndarray  # float64 [M]: mean intensity over all directions
     factors: np.ndarray  # float64 [M, 2]: c T of the lamp, and of a lamp that is no beam
     ends: np.ndarray  # float64 [M, 2]: angle of cut-off in radians, and its cosine
@@ -80,27 +85,34 @@ def _angle(y, x):
 
 
 @kernel_function()
-def _scattered(table, row, row_share, theta):
-    """Return G between two rows of its table, at an angle in radians."""
+def _along(frames, index, axis, x, y, z):
+    """Return the part of a vector along an axis of a lamp's frame."""
+    return x * frames[index, axis, 0] + y * frames[index, axis, 1] + z * frames[index, axis, 2]
+
+
+@kernel_function()
+def _scattered(scatter, table, row, row_share, theta):
+    """Return G between two rows of one of its tables, at an angle in radians."""
     column = theta * _ANGLE_SCALE
     k = min(int(column), NUM_ANGLES - 1)
     q = column - k
-    near = table[row, k] * (1 - q) + table[row, k + 1] * q
-    far = table[row + 1, k] * (1 - q) + table[row + 1, k + 1] * q
+    near = scatter[table, row, k] * (1 - q) + scatter[table, row, k + 1] * q
+    far = scatter[table, row + 1, k] * (1 - q) + scatter[table, row + 1, k + 1] * q
     return near * (1 - row_share) + far * row_share
 
 
 @kernel_function()
-def _light_sums(scatter, planes, layout, plane, shares, row, row_share, gamma, reach):
+def _light_sums(lamps, index, scatter, planes, plane, shares, row, row_share, gamma, reach):
     """Return the integral of intensity times what is scattered, and that of 1 cd.
 
     The medium is integrated exactly in each interval, the intensity enters by its mean over the
     interval. So narrow beams do not fall between points.
 
     Args:
+        lamps: the lamps.
+        index: the lamp's row.
         scatter: float32 [P, U, T], tables of G.
         planes: float32, integrals of the intensity over the angle at the lamp, one plane a row.
-        layout: the lamp's row of HaloLamps.tables.
         plane: plane through lamp and ray, in rows of the lamp's planes.
         shares: float64 [17, 17, 2]; row K has the shares of the range at which K intervals end,
             and the inverse shares that they take.
@@ -109,30 +121,30 @@ def _light_sums(scatter, planes, layout, plane, shares, row, row_share, gamma, r
         gamma: angle at the camera between ray and lamp, radians.
         reach: angle at the lamp between the camera and the end of the ray, radians.
     """
-    num_rows = layout[1]
-    num_cells = layout[2]
-    num_intervals = layout[4]
-    table = scatter[layout[3]]
+    num_rows = lamps.tables[index, 1]
+    num_cells = lamps.tables[index, 2]
+    table = lamps.tables[index, 3]
+    num_intervals = lamps.tables[index, 4]
     upper = int(plane)
     plane_share = plane - upper
     lower = upper + 1 if upper + 1 < num_rows else 0
-    first = layout[0] + upper * (num_cells + 1)
-    second = layout[0] + lower * (num_cells + 1)
+    first = lamps.tables[index, 0] + upper * (num_cells + 1)
+    second = lamps.tables[index, 0] + lower * (num_cells + 1)
     cell_scale = num_cells / math.pi
-    first_scatter = _scattered(table, row, row_share, gamma)
+    first_scatter = _scattered(scatter, table, row, row_share, gamma)
     last_scatter = first_scatter
     last_flux = 0.0
     total = 0.0
-    for index in range(num_intervals):
-        angle = reach * shares[num_intervals, index, 0]
+    for interval in range(num_intervals):
+        angle = reach * shares[num_intervals, interval, 0]
         cell = angle * cell_scale
         k = min(int(cell), num_cells - 1)
         q = cell - k
         flux_a = planes[first + k] * (1 - q) + planes[first + k + 1] * q
         flux_b = planes[second + k] * (1 - q) + planes[second + k + 1] * q
         flux = flux_a * (1 - plane_share) + flux_b * plane_share
-        scattered = _scattered(table, row, row_share, gamma + angle)
-        inverse_share = shares[num_intervals, index, 1]
+        scattered = _scattered(scatter, table, row, row_share, gamma + angle)
+        inverse_share = shares[num_intervals, interval, 1]
         total += (flux - last_flux) * (scattered - last_scatter) * inverse_share
         last_scatter = scattered
         last_flux = flux
@@ -140,7 +152,7 @@ def _light_sums(scatter, planes, layout, plane, shares, row, row_share, gamma, r
 
 
 @kernel_function()
-def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
+def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far, least):
     """Return the luminance of a lamp's light along a ray times h, to two distances, h, and 1 if the
     lamp lies before the camera, else 0.
 
@@ -151,13 +163,13 @@ def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
         x: unit direction of the ray in camera axes, like y and z.
         near: inverse of the nearer distance to which the ray goes, 1/m.
         far: inverse of the further distance; where it is nearly the same, both get its light.
+        least: luminance below which the result may be 0.
     """
-    frame = lamps.frames[index]
-    cosine = x * frame[0, 0] + y * frame[0, 1] + z * frame[0, 2]
+    cosine = _along(lamps.frames, index, 0, x, y, z)
     if cosine <= lamps.ends[index, 1]:
         return 0.0, 0.0, 1.0, 0.0
-    side = x * frame[1, 0] + y * frame[1, 1] + z * frame[1, 2]
-    rise = x * frame[2, 0] + y * frame[2, 1] + z * frame[2, 2]
+    side = _along(lamps.frames, index, 1, x, y, z)
+    rise = _along(lamps.frames, index, 2, x, y, z)
     sine = max(math.sqrt(side * side + rise * rise), 1e-6)
     gamma = _angle(sine, cosine)
     distance = lamps.distances_m[index]
@@ -166,14 +178,6 @@ def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
     u = sigma * h
     if u >= MAX_DISTANCE:
         return 0.0, 0.0, 1.0, 0.0
-    layout = lamps.tables[index]
-    plane = _angle(abs(rise), side)
-    plane = (2 * math.pi - plane if rise < 0 else plane) * (layout[1] / (2 * math.pi))
-    plane = plane if plane < layout[1] else 0.0
-    ratio = u * (1 / DISTANCE_KNEE)
-    row_place = math.log(ratio + math.sqrt(ratio * ratio + 1)) * _DISTANCE_SCALE
-    row = min(int(row_place), NUM_DISTANCES - 2)
-    row_share = row_place - row
     # Factor for multiple scattering: of this lamp, and as a floor, a share of what it adds to a
     # lamp of the mean intensity that is no beam.
     root = _ROOT_DEGREES * math.sqrt(min(gamma, MAX_FACTOR_ANGLE_RAD))
@@ -181,7 +185,19 @@ def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
     wide_gain = beam_gain
     if lamps.factors[index, 1] != lamps.factors[index, 0]:
         wide_gain = math.exp(lamps.factors[index, 1] * root)
+    table = lamps.tables[index, 3]
+    beyond = scatter[table, 0, NUM_ANGLES] - _scattered(scatter, table, 0, 0.0, gamma)
+    if lamps.bounds[index] * beyond * max(beam_gain, wide_gain) < least * h:
+        return 0.0, 0.0, 1.0, 0.0
     added_mean = FLOOR_SHARE * lamps.means_cd[index] * (wide_gain - 1)
+    num_rows = lamps.tables[index, 1]
+    plane = _angle(abs(rise), side)
+    plane = (2 * math.pi - plane if rise < 0 else plane) * (num_rows / (2 * math.pi))
+    plane = plane if plane < num_rows else 0.0
+    ratio = u * (1 / DISTANCE_KNEE)
+    row_place = math.log(ratio + math.sqrt(ratio * ratio + 1)) * _DISTANCE_SCALE
+    row = min(int(row_place), NUM_DISTANCES - 2)
+    row_share = row_place - row
     scale = sigma * math.exp(-sigma * distance * cosine)
     end = lamps.ends[index, 0]
     fade = (gamma - FADE_FROM * end) / ((1 - FADE_FROM) * end)
@@ -192,14 +208,14 @@ def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
     first = far if has_two else 0.5 * (near + far)
     reach = min(_angle(sine, distance * first - cosine), math.pi - gamma)
     light, mean_light = _light_sums(
-        scatter, planes, layout, plane, shares, row, row_share, gamma, reach
+        lamps, index, scatter, planes, plane, shares, row, row_share, gamma, reach
     )
     far_light = scale * max(light * beam_gain, light + mean_light * added_mean)
     near_light = far_light
     if has_two:
         reach = min(_angle(sine, distance * near - cosine), math.pi - gamma)
         light, mean_light = _light_sums(
-            scatter, planes, layout, plane, shares, row, row_share, gamma, reach
+            lamps, index, scatter, planes, plane, shares, row, row_share, gamma, reach
         )
         near_light = scale * max(light * beam_gain, light + mean_light * added_mean)
     return near_light, far_light, h, 1.0 if cosine > 0 else 0.0
@@ -223,6 +239,8 @@ def fill_planes(tables, patterns, axes, ups, frames, intensities, layouts, plane
     for m in prange(len(patterns)):
         num_rows = layouts[m, 1]
         num_cells = layouts[m, 2]
+        axis = (axes[m, 0], axes[m, 1], axes[m, 2])
+        up = (ups[m, 0], ups[m, 1], ups[m, 2])
         peak = 0.0
         for row in range(num_rows):
             turn = 2 * math.pi * row / num_rows
@@ -243,8 +261,8 @@ def fill_planes(tables, patterns, axes, ups, frames, intensities, layouts, plane
                     mean += 0.5 * intensity(
                         tables,
                         patterns[m],
-                        axes[m],
-                        ups[m],
+                        axis,
+                        up,
                         along * frames[m, 0, 0] + aside * side_x,
                         along * frames[m, 0, 1] + aside * side_y,
                         along * frames[m, 0, 2] + aside * side_z,
@@ -311,21 +329,25 @@ def light_nodes(grid, lamps, scatter, planes, shares, ranges, nodes):
                 for column in range(num_columns):
                     u = (column * step - grid.lens[2]) / grid.lens[0]
                     z = 1 / math.sqrt(1 + u * u + v * v)
+                    least = min(
+                        nodes[row, column, 0] * lamps.inverse_colors[index, 0],
+                        nodes[row, column, 1] * lamps.inverse_colors[index, 1],
+                        nodes[row, column, 2] * lamps.inverse_colors[index, 2],
+                    )
                     near, far, h, is_ahead = _ray_light(
                         lamps, index, scatter, planes, shares, u * z, v * z, z,
-                        ranges[row, column, 0], ranges[row, column, 1],
+                        ranges[row, column, 0], ranges[row, column, 1], LEAST_SHARE * least,
                     )  # fmt: skip
                     if far > 0:
                         soft = 1 / math.sqrt(h * h + is_ahead * soft_square)
                         near *= soft
                         far *= soft
-                        node = nodes[row, column]
-                        node[0] += np.float32(near * red)
-                        node[1] += np.float32(near * green)
-                        node[2] += np.float32(near * blue)
-                        node[3] += np.float32(far * red)
-                        node[4] += np.float32(far * green)
-                        node[5] += np.float32(far * blue)
+                        nodes[row, column, 0] += np.float32(near * red)
+                        nodes[row, column, 1] += np.float32(near * green)
+                        nodes[row, column, 2] += np.float32(near * blue)
+                        nodes[row, column, 3] += np.float32(far * red)
+                        nodes[row, column, 4] += np.float32(far * green)
+                        nodes[row, column, 5] += np.float32(far * blue)
 
 
 @kernel
@@ -368,10 +390,9 @@ def spread_nodes(grid, inverse_distances, ranges, nodes, light):
                     share = min(max(share, np.float32(0.0)), np.float32(1.0))
                 near = weight * share
                 far = weight - near
-                node = nodes[i, j]
-                red += near * node[0] + far * node[3]
-                green += near * node[1] + far * node[4]
-                blue += near * node[2] + far * node[5]
+                red += near * nodes[i, j, 0] + far * nodes[i, j, 3]
+                green += near * nodes[i, j, 1] + far * nodes[i, j, 4]
+                blue += near * nodes[i, j, 2] + far * nodes[i, j, 5]
             light[y, x, 0] = red
             light[y, x, 1] = green
             light[y, x, 2] = blue
@@ -409,7 +430,6 @@ def add_cores(grid, lamps, scatter, planes, shares, windows, ranges, inverse_dis
             pixel_square = (pixel * distance) ** 2
             soft_square = (softness * distance) ** 2
             end_square = 16 * soft_square
-            frame = lamps.frames[index]
             for i in range(2):
                 v = ((band + i) * step - grid.lens[3]) / grid.lens[1]
                 for j in range(num_columns):
@@ -418,7 +438,7 @@ def add_cores(grid, lamps, scatter, planes, shares, windows, ranges, inverse_dis
                     z = 1 / math.sqrt(1 + u * u + v * v)
                     near, far, _, _ = _ray_light(
                         lamps, index, scatter, planes, shares, u * z, v * z, z,
-                        ranges[band + i, column, 0], ranges[band + i, column, 1],
+                        ranges[band + i, column, 0], ranges[band + i, column, 1], 0.0,
                     )  # fmt: skip
                     values[i, j, 0] = near
                     values[i, j, 1] = far
@@ -428,8 +448,8 @@ def add_cores(grid, lamps, scatter, planes, shares, windows, ranges, inverse_dis
                 for x in range(first_column * step, min((windows[index, 3] - 1) * step, width)):
                     u = (x + 0.5 - grid.lens[2]) / grid.lens[0]
                     z = 1 / math.sqrt(1 + u * u + v * v)
-                    side = (u * frame[1, 0] + v * frame[1, 1] + frame[1, 2]) * z
-                    rise = (u * frame[2, 0] + v * frame[2, 1] + frame[2, 2]) * z
+                    side = _along(lamps.frames, index, 1, u * z, v * z, z)
+                    rise = _along(lamps.frames, index, 2, u * z, v * z, z)
                     square = (side * side + rise * rise) * distance * distance
                     if square >= end_square:
                         continue

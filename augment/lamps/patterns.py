@@ -28,9 +28,9 @@ NUM_ROWS = 129
 # Columns of a table. Odd, so that there is a column at R = 0.
 NUM_COLUMNS = 129
 # Steps of elevation over which means are taken.
-_NUM_MEAN_ROWS = 720
+_NUM_MEAN_ROWS = 240
 # Steps of azimuth over which means are taken.
-_NUM_MEAN_COLUMNS = 1440
+_NUM_MEAN_COLUMNS = 480
 # Largest intensity of the dipped beam, candela; `dipped_beam_cd` says where.
 DIPPED_PEAK_CD = 14_000.0
 # Stray light of a dipped beam above its edge, candela (UN R112: B50L at most 350).
@@ -166,7 +166,7 @@ def spread_deg(table: Float32[np.ndarray, "V U"]) -> float:
 def _moments(table: np.ndarray) -> tuple[float, float]:
     """Return the mean over the sphere, and the spread in degrees."""
     up_deg = (np.arange(_NUM_MEAN_ROWS) + 0.5) / _NUM_MEAN_ROWS * 180 - 90
-    # Steps in azimuth are spaced evenly in the fourth root, so that a narrow beam is not missed.
+    # Steps are spaced evenly in the cube root of the angle, so that a narrow beam is not missed.
     fraction = (np.arange(_NUM_MEAN_COLUMNS) + 0.5) / _NUM_MEAN_COLUMNS * 2 - 1
     up_fraction = up_deg / 90
     up_fine_deg = 90 * up_fraction**3

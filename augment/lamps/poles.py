@@ -2,7 +2,8 @@
 
 In: Gaussians of the class pole. Out: for each mast the place of its head, under the arm's end.
 Masts of signs are too low to count. Utility poles and masts of signals have the same class, so some
-heads are on masts that carry none.
+heads are on masts that carry none. `unnamed_masts` finds masts by their form, where a dataset has
+no class for poles.
 """
 
 from __future__ import annotations
@@ -118,3 +119,58 @@ def _pole_points(background: Gaussians) -> Float64[np.ndarray, "N 3"]:
     is_long = scales[index, longest] > _LONG_M
     ends = [means[is_long] + offsets[is_long], means[is_long] - offsets[is_long]]
     return np.concatenate([means, *ends])
+
+
+# ---- Masts by their form -------------------------------------------------------------------------
+
+# Side of the squares that are looked at from above, metres.
+_SQUARE_M = 0.5
+# Heights above the road at which a mast must have splats, metres: one in each metre between.
+_FORM_HEIGHTS_M = (1, 9)
+# Fewest of these metres that have some: an arm or a gap of the LiDAR may miss three.
+_MIN_METRES = 5
+# Largest distance between high squares of one mast, metres.
+_MAST_WIDTH_M = 0.8
+# Distance within which no other square is high, metres. Walls go on.
+_CLEAR_M = 1.6
+# Classes that hold poles where a dataset has none for them.
+_FORM_CLASSES = (SemanticClass.POLE, SemanticClass.SIGN, SemanticClass.OTHER)
+
+
+def unnamed_masts(scene: Scene) -> Float64[np.ndarray, "N 3"]:
+    """Return the feet of thin upright things of at least 5 m, whatever they carry.
+
+    Args:
+        scene: the scene; without classes it has none.
+    """
+    background = scene.background
+    if background.semantic is None:
+        return np.zeros((0, 3))
+    classes = [int(c) for c in _FORM_CLASSES]
+    is_chosen = np.isin(background.semantic.numpy(), classes)
+    is_chosen &= background.opacities.detach().numpy() > _MIN_OPACITY
+    points = background.means.detach().numpy()[is_chosen].astype(np.float64)
+    if len(points) == 0:
+        return np.zeros((0, 3))
+    squares, square_of_point = np.unique(
+        np.floor(points[:, :2] / _SQUARE_M).astype(np.int64), axis=0, return_inverse=True
+    )
+    middles = (squares + 0.5) * _SQUARE_M
+    lowest = np.full(len(squares), np.inf)
+    np.minimum.at(lowest, square_of_point.ravel(), points[:, 2])
+    ground = RoadHeights.of_scene(scene).heights_at(np.column_stack([middles, lowest]), lowest)
+    metres = np.floor(points[:, 2] - ground[square_of_point.ravel()]).astype(np.int64)
+    low_m, high_m = _FORM_HEIGHTS_M
+    is_inside = (metres >= low_m) & (metres < high_m)
+    has_metre = np.zeros((len(squares), high_m), bool)
+    has_metre[square_of_point.ravel()[is_inside], metres[is_inside]] = True
+    is_high = has_metre.sum(1) >= _MIN_METRES
+    if not is_high.any():
+        return np.zeros((0, 3))
+    high = middles[is_high]
+    tree = KDTree(high)
+    is_mast = np.asarray(
+        tree.query_ball_point(high, _MAST_WIDTH_M, return_length=True)
+        == tree.query_ball_point(high, _CLEAR_M, return_length=True)
+    )
+    return np.column_stack([high, ground[is_high]])[is_mast]

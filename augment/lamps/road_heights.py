@@ -46,11 +46,25 @@ class RoadHeights:
             position_m: the place; its x and y count.
             default_m: height where neither squares nor the scene's ground tell one.
         """
-        if self.tree is not None:
-            distance, index = self.tree.query(position_m[:2], distance_upper_bound=REACH_M)
-            if np.isfinite(distance):
-                return float(self.heights_m[index])
-        return default_m if self.other_height_m is None else self.other_height_m
+        return float(self.heights_at(position_m[None], np.array([default_m]))[0])
+
+    def heights_at(
+        self, positions_m: Float[np.ndarray, "N 3"], defaults_m: Float[np.ndarray, "N"]
+    ) -> Float[np.ndarray, "N"]:
+        """Return the heights of the ground at places, metres.
+
+        Args:
+            positions_m: the places; their x and y count.
+            defaults_m: heights where neither squares nor the scene's ground tell one.
+        """
+        heights_m = np.array(defaults_m, np.float64)
+        if self.other_height_m is not None:
+            heights_m[:] = self.other_height_m
+        if self.tree is not None and len(positions_m):
+            distances, rows = self.tree.query(positions_m[:, :2], distance_upper_bound=REACH_M)
+            is_near = np.isfinite(distances)
+            heights_m[is_near] = self.heights_m[np.asarray(rows)[is_near]]
+        return heights_m
 
     @staticmethod
     def of_scene(scene: Scene) -> RoadHeights:

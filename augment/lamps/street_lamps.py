@@ -20,7 +20,7 @@ from augment.lamps.ies import IesLuminaire
 from augment.lamps.lamp import AMBER, RED, LampKind, Lamps, color_of_temperature
 from augment.lamps.lamp_types import LampType, make_lamps
 from augment.lamps.patterns import BATWING_PEAK_CD, Pattern, mean_over_directions
-from augment.lamps.poles import lamp_heads
+from augment.lamps.poles import lamp_heads, unnamed_masts
 from augment.lamps.road_heights import RoadHeights
 from augment.memo import memo_of
 from augment.scene.geometry import rotmat_from_quat
@@ -176,14 +176,15 @@ def _rule_places(
 ) -> tuple[Float64[np.ndarray, "M 3"], Float64[np.ndarray, "M 3"]]:
     """Return the places and axes of lamps along a path, without those that surfaces hide.
 
-    A lamp behind a front moves towards the road, by a metre at a time; it is dropped where no place
-    is free.
+    A lamp hangs at a mast where one stands nearby (`unnamed_masts`). A lamp behind a front moves
+    towards the road, by a metre at a time; it is dropped where no place is free.
     """
     positions: list[np.ndarray] = []
     axes: list[np.ndarray] = []
     if len(path.points_m):
         heights = RoadHeights.of_scene(scene)
         walls = _Walls.of_scene(scene)
+        masts = unnamed_masts(scene)
         numbers = np.arange(
             np.ceil(path.lengths_m[0] / settings.spacing_m),
             np.floor(path.lengths_m[-1] / settings.spacing_m) + 1,
@@ -194,14 +195,51 @@ def _rule_places(
             left = np.array([-heading[1], heading[0], 0.0])
             middle[2] = heights.height_at(middle, float(middle[2])) + settings.height_m
             offsets_m = np.arange(settings.offset_m, 0.0, -1.0) if settings.offset_m else [0.0]
-            for offset_m in offsets_m:
-                position = middle + side * offset_m * left
+            at_mast = _at_mast(masts, middle, heading, side, settings)
+            free_places = [middle + side * offset_m * left for offset_m in offsets_m]
+            for position in [*at_mast, *free_places]:
                 if not walls.cross(middle, position):
                     positions.append(position)
                     axes.append(side * heading)  # so that the road lies to the axis's right
                     break
     shape = (len(positions), 3)
     return np.array(positions).reshape(shape), np.array(axes).reshape(shape)
+
+
+# Distances from the path between which masts count, metres: one nearer stands on the carriageway.
+_MAST_OFFSETS_M = (3.5, 11.0)
+# Length of the arm by which a lamp reaches from its mast towards the road, metres.
+_ARM_M = 1.5
+
+
+def _at_mast(
+    masts_m: Float64[np.ndarray, "N 3"],
+    middle_m: Float64[np.ndarray, "3"],
+    heading: Float64[np.ndarray, "3"],
+    side: float,
+    settings: StreetLampSettings,
+) -> list[np.ndarray]:
+    """Return the place of a lamp at the mast that is nearest to its turn; none without one.
+
+    Args:
+        masts_m: feet of the masts.
+        middle_m: the lamp's turn: a point over the path, at the height of the lamps.
+        heading: level direction of the path there.
+        side: 1 for masts on the left, -1 for those on the right.
+        settings: spacing of the lamps.
+    """
+    left = np.array([-heading[1], heading[0], 0.0])
+    offsets = masts_m - middle_m
+    along_m = offsets @ heading
+    across_m = side * (offsets @ left)
+    low_m, high_m = _MAST_OFFSETS_M
+    is_near = (across_m >= low_m) & (across_m <= high_m)
+    is_near &= np.abs(along_m) < settings.spacing_m / 2
+    if not is_near.any():
+        return []
+    nearest = np.where(is_near, np.abs(along_m), np.inf).argmin()
+    reach_m = across_m[nearest] - _ARM_M
+    return [middle_m + along_m[nearest] * heading + side * reach_m * left]
 
 
 def _point_at(path: _Path, length_m: float) -> tuple[np.ndarray, np.ndarray]:

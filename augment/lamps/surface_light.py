@@ -57,8 +57,10 @@ _GROUND_WINDOW = (65, 17)
 SIGN_RETURN_PER_LUX = 250.0
 # Reflectance that the coefficient belongs to: a white sign's.
 SIGN_WHITE = 0.7
-# Nodes of the picture on a side of a block of pixels.
-DEFAULT_STEP_PX = 2
+# Nodes in a row of a picture, about.
+NODES_PER_ROW = 600
+# Pixels between nodes, at most.
+MAX_STEP_PX = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +85,13 @@ def _inverse(depth: np.ndarray) -> np.ndarray:
     return np.divide(1, depth, out=np.zeros_like(depth), where=is_surface)
 
 
+def default_step_px(camera: Camera) -> int:
+    """Return the pixels between nodes at which a picture has about NODES_PER_ROW in a row."""
+    return min(max(round(camera.width / NODES_PER_ROW), 1), MAX_STEP_PX)
+
+
 def find_nodes(
-    camera: Camera, depth_m: Float32[np.ndarray, "H W"], *, step_px: int = DEFAULT_STEP_PX
+    camera: Camera, depth_m: Float32[np.ndarray, "H W"], *, step_px: int | None = None
 ) -> Nodes:
     """Return the nodes of a picture, with normals by its depth.
 
@@ -96,8 +103,9 @@ def find_nodes(
     Args:
         camera: camera of the picture.
         depth_m: z of the surfaces, metres; 0 for the sky.
-        step_px: pixels between nodes.
+        step_px: pixels between nodes; None for `default_step_px`.
     """
+    step_px = default_step_px(camera) if step_px is None else step_px
     first = step_px // 2
     depth = np.ascontiguousarray(depth_m[first::step_px, first::step_px], np.float32)
     if not depth.size:

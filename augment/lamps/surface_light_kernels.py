@@ -26,6 +26,8 @@ SLOPE_STEP = 2
 # Difference between the slopes on both sides of a node, as a share of the inverse depth and a node,
 # up to which both are its surface's.
 SLOPE_TOLERANCE = 0.02
+# Cosine to a lamp at least, where lamps of a tile are compared: its other nodes may face it.
+MIN_RANK_COSINE = 0.02
 # Rows of the nine nodes whose normals are averaged, from the one in the middle.
 MEAN_ROWS = np.array([0, -1, 1, 0, 0, -2, -2, 2, 2])
 # Columns of those nodes.
@@ -287,17 +289,21 @@ def lux_along_ray(tables, lamp, x, y, z):
 
 
 @kernel_function()
-def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
-    """Choose the brightest lamps of a tile, brightest first; return their number.
+def rank_lamps(lamps, points, facings, count, min_lux, max_lamps, chosen, scores):
+    """Choose the brightest lamps of a tile, brightest first.
+
+    Returns:
+        Their number, and the lux of the brightest lamp that is not among them.
 
     Args:
         lamps: the lamps.
         points: points of the tile, [N, 3].
+        facings: normals at the points, [N, 3].
         count: number of the points.
         min_lux: lux of all its points below which a lamp is left out.
         max_lamps: largest number of lamps.
         chosen: output, int64 [max_lamps], indices of the lamps.
-        scores: work space, float64 [max_lamps].
+        scores: output, float64 [max_lamps], the most lux of each at some of the points.
     """
     low = np.empty(3)
     high = np.empty(3)
@@ -309,6 +315,7 @@ def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
             low[k] = min(low[k], points[p, k])
             high[k] = max(high[k], points[p, k])
     number = 0
+    dropped = 0.0
     for m in range(len(lamps.intensities)):
         squared = 0.0
         for k in range(3):
@@ -318,18 +325,26 @@ def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
         if bound < min_lux:
             continue
         bound *= math.exp(-lamps.extinctions[m] * math.sqrt(squared))
-        if bound < min_lux or (number == max_lamps and bound <= scores[number - 1]):
+        if bound < min_lux or (number == max_lamps and bound <= dropped):
             continue
         score = 0.0
+        brightest = 0.0
         lamp = read_lamp(lamps, m)
         for sample in range(len(SAMPLES)):
             p = SAMPLES[sample] * (count - 1) // (TILE * TILE - 1)
-            lux = lux_along_ray(lamps.tables, lamp, points[p, 0], points[p, 1], points[p, 2])[0]
-            score = max(score, lux)
-        if SAMPLE_MARGIN * score < min_lux:
+            lux, dx, dy, dz = lux_along_ray(
+                lamps.tables, lamp, points[p, 0], points[p, 1], points[p, 2]
+            )
+            brightest = max(brightest, lux)
+            cosine = dx * facings[p, 0] + dy * facings[p, 1] + dz * facings[p, 2]
+            score = max(score, lux * max(cosine, MIN_RANK_COSINE))
+        if SAMPLE_MARGIN * brightest < min_lux:
             continue
-        if number == max_lamps and score <= scores[number - 1]:
-            continue
+        if number == max_lamps:
+            if score <= scores[number - 1]:
+                dropped = max(dropped, score)
+                continue
+            dropped = max(dropped, scores[number - 1])
         number = min(number + 1, max_lamps)
         place = number - 1
         while place > 0 and scores[place - 1] < score:
@@ -338,7 +353,7 @@ def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
             place -= 1
         scores[place] = score
         chosen[place] = m
-    return number
+    return number, dropped
 
 
 @kernel
@@ -366,6 +381,7 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
         top = (tile // tile_columns) * TILE
         left = (tile % tile_columns) * TILE
         points = np.empty((TILE * TILE, 3))
+        facings = np.empty((TILE * TILE, 3))
         nodes = np.empty((TILE * TILE, 2), np.int64)
         roughness = np.empty((TILE, TILE))
         chosen = np.empty(max_lamps, np.int64)
@@ -388,6 +404,7 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
                 length = 0.0
                 for k in range(3):
                     length += np.float64(normals[i, j, k]) ** 2
+                    facings[count, k] = normals[i, j, k]
                 # Shorter normals are means of some that disagree: leaves, grass, noise.
                 roughness[i - top, j - left] = max(
                     (1.0 - SMOOTH_LOSS - math.sqrt(length)) / (1.0 - SMOOTH_LOSS), 0.0
@@ -397,16 +414,20 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
                 count += 1
         if count == 0:
             continue
-        number = rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores)
+        number, dropped = rank_lamps(
+            lamps, points, facings, count, min_lux, max_lamps, chosen, scores
+        )
         for c in range(number):
             m = chosen[c]
             lamp = read_lamp(lamps, m)
             tables = lamps.tables
             shadow_map = lamps.shadow_maps[m]
             is_own = lamps.is_own[m]
-            red = lamps.colors[m, 0]
-            green = lamps.colors[m, 1]
-            blue = lamps.colors[m, 2]
+            # A lamp fades before it is dropped, so that tiles have no edges.
+            fade = 1.0 if dropped <= 0 else min(max(scores[c] / dropped - 1.0, 0.0), 1.0)
+            red = fade * lamps.colors[m, 0]
+            green = fade * lamps.colors[m, 1]
+            blue = fade * lamps.colors[m, 2]
             for p in range(count):
                 x = points[p, 0]
                 y = points[p, 1]
@@ -500,62 +521,55 @@ def spread_light(
     """
     height, width = depth.shape
     rows, columns = node_inverse.shape
-    per_pi = 1.0 / math.pi
+    unit = np.float32(1)
+    zero = np.float32(0)
+    per_pi = np.float32(1.0 / math.pi)
+    per_step = np.float32(1.0 / step)
+    has_signs = return_per_lux.size > 0
     for row in prange(height):
-        weights = np.empty(4)
-        total = np.empty(3)
-        v = min(max((row - first) / step, 0.0), rows - 1.0)
+        v = np.float32(min(max((row - first) / step, 0.0), rows - 1.0))
         i = min(int(v), max(rows - 2, 0))
-        v -= i
+        v -= np.float32(i)
         below = min(i + 1, rows - 1)
         for column in range(width):
             z = depth[row, column]
-            if not (z > 0 and z < 1e6):
+            if not (z > zero and z < np.float32(1e6)):
                 continue
-            u = min(max((column - first) / step, 0.0), columns - 1.0)
+            u = min(max(np.float32(column - first) * per_step, zero), np.float32(columns - 1))
             j = min(int(u), max(columns - 2, 0))
-            u -= j
+            u -= np.float32(j)
             beside = min(j + 1, columns - 1)
-            brightest = np.float32(0)
+            sends_back = has_signs and return_per_lux[row, column] > zero
+            brightest = zero
             for k in range(3):
-                brightest = max(brightest, max(lux[i, j, k], lux[i, beside, k]))
-                brightest = max(brightest, max(lux[below, j, k], lux[below, beside, k]))
-            sends_back = return_per_lux.size > 0 and return_per_lux[row, column] > 0
-            if brightest <= 0 and not sends_back:
+                brightest += lux[i, j, k] + lux[i, beside, k] + lux[below, j, k]
+                brightest += lux[below, beside, k]
+            if brightest <= zero and not sends_back:
                 continue
-            weights[0] = (1.0 - u) * (1.0 - v)
-            weights[1] = u * (1.0 - v)
-            weights[2] = (1.0 - u) * v
-            weights[3] = u * v
-            whole = 0.0
-            for corner in range(4):
-                a = i if corner < 2 else below
-                b = j if corner % 2 == 0 else beside
-                gap = abs(node_inverse[a, b] * z - 1.0) * (1.0 / SAME_SURFACE)
-                weights[corner] *= max(1.0 - gap * gap, OTHER_SURFACE_WEIGHT)
-                if node_inverse[a, b] <= 0:
-                    weights[corner] = 0.0
-                whole += weights[corner]
-            if whole <= 0:
+            a = (unit - u) * (unit - v) * _likeness(node_inverse[i, j], z)
+            b = u * (unit - v) * _likeness(node_inverse[i, beside], z)
+            c = (unit - u) * v * _likeness(node_inverse[below, j], z)
+            d = u * v * _likeness(node_inverse[below, beside], z)
+            weight_sum = a + b + c + d
+            if weight_sum <= zero:
                 continue
+            share = unit / weight_sum
             for k in range(3):
-                total[k] = 0.0
-            for corner in range(4):
-                a = i if corner < 2 else below
-                b = j if corner % 2 == 0 else beside
-                for k in range(3):
-                    total[k] += weights[corner] * lux[a, b, k]
-            for k in range(3):
-                luminance = total[k] / whole * reflectance[row, column, k] * per_pi
-                picture[row, column, k] += np.float32(luminance)
+                light = a * lux[i, j, k] + b * lux[i, beside, k]
+                light += c * lux[below, j, k] + d * lux[below, beside, k]
+                picture[row, column, k] += light * share * per_pi * reflectance[row, column, k]
             if sends_back:
+                share *= return_per_lux[row, column]
                 for k in range(3):
-                    total[k] = 0.0
-                for corner in range(4):
-                    a = i if corner < 2 else below
-                    b = j if corner % 2 == 0 else beside
-                    for k in range(3):
-                        total[k] += weights[corner] * own_lux[a, b, k]
-                for k in range(3):
-                    luminance = total[k] / whole * return_per_lux[row, column]
-                    picture[row, column, k] += np.float32(luminance * reflectance[row, column, k])
+                    light = a * own_lux[i, j, k] + b * own_lux[i, beside, k]
+                    light += c * own_lux[below, j, k] + d * own_lux[below, beside, k]
+                    picture[row, column, k] += light * share * reflectance[row, column, k]
+
+
+@kernel_function()
+def _likeness(inverse_depth, z):
+    """Return the weight of a node for a pixel: 1 on the same surface, 0 for the sky."""
+    if inverse_depth <= np.float32(0):
+        return np.float32(0)
+    gap = (inverse_depth * z - np.float32(1)) * np.float32(1.0 / SAME_SURFACE)
+    return max(np.float32(1) - gap * gap, np.float32(OTHER_SURFACE_WEIGHT))

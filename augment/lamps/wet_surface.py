@@ -42,14 +42,13 @@ class WetSurface:
         if farther is None:
             return self
         is_here = self.share > 0
-        images = (
-            np.where(is_here, getattr(self, name), getattr(farther, name))
-            for name in ("share", "roughness", "depth_m")
-        )
+        share = np.where(is_here, self.share, farther.share)
+        roughness = np.where(is_here, self.roughness, farther.roughness)
+        depth_m = np.where(is_here, self.depth_m, farther.depth_m)
         tilts = None
         if self.tilts is not None or farther.tilts is not None:
             flat = np.zeros((*is_here.shape, 2), np.float32)
-            here = flat if self.tilts is None else self.tilts
-            there = flat if farther.tilts is None else farther.tilts
-            tilts = np.where(is_here[..., None], here, there)
-        return WetSurface(*images, self.up, tilts)
+            near_tilts = flat if self.tilts is None else self.tilts
+            far_tilts = flat if farther.tilts is None else farther.tilts
+            tilts = np.where(is_here[..., None], near_tilts, far_tilts)
+        return WetSurface(share, roughness, depth_m, self.up, tilts)

@@ -16,10 +16,10 @@ from augment.effects.lamps.exposure import (
     fixed_exposure,
     response,
 )
-from augment.effects.lamps.glare import NARROW_SHARE, WIDE_SHARE, add_glare, tail_levels
+from augment.effects.lamps.glare import NARROW_SHARE, WIDE_SHARE, spread_glare, tail_levels
 from augment.effects.lamps.hour import night_sky
-from augment.effects.lamps.picture_light import decode, develop, find_reflectance, relight
-from augment.light.srgb import linear_from_display
+from augment.effects.lamps.picture_light import develop, find_reflectance, halve_excess, relight
+from augment.light.srgb import display_from_linear, linear_from_display
 from augment.render.sensor import draw_noise
 from recipes.light import Light
 from tests.scenes import camera_ahead
@@ -28,6 +28,17 @@ NIGHT = Light(time="night")
 RNG = np.random.default_rng(7)
 PICTURE = RNG.uniform(-0.1, 1.3, (37, 61, 3)).astype(np.float32)
 ADDED = (RNG.uniform(0, 1, (37, 61, 3)) ** 12 * 1e4).astype(np.float32)
+
+
+def code_of(light: np.ndarray) -> np.ndarray:
+    return display_from_linear(light.astype(np.float64)).astype(np.float32)
+
+
+def glare_of(light: np.ndarray, focal_px: float, strength: float = 1.0) -> np.ndarray:
+    excess = halve_excess(code_of(light))
+    assert excess is not None
+    height, width = light.shape[:2]
+    return spread_glare(excess, width, height, focal_px, strength)
 
 
 def test_a_pixel_counts_39_electrons_at_one_candela_a_square_metre() -> None:
@@ -83,21 +94,19 @@ def test_the_sky_lights_level_ground_with_pi_times_its_mean(time: str, glow: flo
 def test_lens_scatters_its_share_of_a_lamps_light() -> None:
     light = np.zeros((401, 601, 3), np.float32)
     light[200, 300] = 1e5 + 1
-    glare = add_glare(light, 1200.0, 1.0)
-    assert glare is not None
+    glare = glare_of(light, 1200.0)
     shares = tail_levels(1200.0, 601)
     # the widest Gaussians reach beyond the picture
     inside = glare.astype(np.float64).sum((0, 1)) / 1e5
     assert inside == pytest.approx(np.full(3, sum(shares)), rel=0.2)
-    narrow = add_glare(light, 120.0, 1.0)
-    assert narrow is not None and (glare >= 0).all() and (narrow >= 0).all()
+    narrow = glare_of(light, 120.0)
+    assert (glare >= 0).all() and (narrow >= 0).all()
 
 
 def test_core_and_tails_of_the_point_spread_function_have_all_light() -> None:
     big = np.zeros((2048, 2048, 3), np.float32)
     big[1024, 1024] = 1e6 + 1
-    glare = add_glare(big, 4000.0, 1.0)
-    assert glare is not None
+    glare = glare_of(big, 4000.0)
     tails = glare.astype(np.float64).sum((0, 1))[0] / 1e6
     core = 1 - sum(tail_levels(4000.0, 2048))
     assert core + tails == pytest.approx(1.0, abs=0.01)
@@ -107,8 +116,7 @@ def test_core_and_tails_of_the_point_spread_function_have_all_light() -> None:
 def test_glare_falls_off_and_knows_no_direction() -> None:
     light = np.zeros((512, 512, 3), np.float32)
     light[255:257, 255:257] = 1e5
-    glare = add_glare(light, 1200.0, 1.0)
-    assert glare is not None
+    glare = glare_of(light, 1200.0)
     green = glare[..., 1]
     profile = green[256, 256:500]
     assert (np.diff(profile) <= 1e-6 * profile[:-1]).all()
@@ -117,8 +125,8 @@ def test_glare_falls_off_and_knows_no_direction() -> None:
 
 
 def test_pictures_below_saturation_have_no_glare() -> None:
-    assert add_glare(np.ones((9, 9, 3), np.float32), 500.0, 1.0) is None
-    assert add_glare(np.full((9, 9, 3), 9, np.float32), 500.0, 0.0) is None
+    assert halve_excess(np.ones((9, 9, 3), np.float32)) is None
+    assert not glare_of(np.full((9, 9, 3), 9, np.float32), 500.0, 0.0).any()
 
 
 def test_kernels_equal_their_definitions() -> None:
@@ -127,7 +135,10 @@ def test_kernels_equal_their_definitions() -> None:
         expected, expected_mask = relight(PICTURE, added, gain, 2e-3, min_added, uses_kernels=False)
         assert np.allclose(out, expected, rtol=1e-4, atol=1e-5)
         assert np.array_equal(mask, expected_mask)
-    assert np.allclose(decode(PICTURE), decode(PICTURE, uses_kernels=False), rtol=1e-4, atol=1e-6)
+    codes = code_of(ADDED[..., ::-1])
+    halves = [halve_excess(codes, uses_kernels=uses) for uses in (True, False)]
+    assert halves[0] is not None and halves[1] is not None
+    assert np.allclose(*halves, rtol=1e-4)
     share = RNG.uniform(0, 1, PICTURE.shape[:2]).astype(np.float32)
     for fog in (None, share):
         numbers = (PICTURE, 0.6, fog, (0.7, 0.75, 0.8))
@@ -137,7 +148,7 @@ def test_kernels_equal_their_definitions() -> None:
     light = ADDED[:, :, ::-1] * np.float32(1e-3)
     draws = RNG.integers(0, 256, light.shape, np.uint8)
     for glare, levels in ((None, None), (light * np.float32(0.1), draws)):
-        numbers = (np.ascontiguousarray(light), glare, levels, 300.0, READ_NOISE, 1.0)
+        numbers = (code_of(light), glare, levels, 300.0, READ_NOISE, 1.0)
         assert np.allclose(develop(*numbers), develop(*numbers, uses_kernels=False), atol=1e-4)
 
 
@@ -154,8 +165,10 @@ def test_noise_is_that_of_the_electrons() -> None:
     draws = draw_noise(camera, seed=3, scene="s")
     light = np.full((300, 400, 3), 0.2, np.float32)
     electrons = 500.0
-    noisy = decode(develop(light, None, draws, electrons, READ_NOISE, 1.0))
-    quiet = decode(develop(light, None, None, electrons, READ_NOISE, 1.0))
+    noisy, quiet = (
+        linear_from_display(develop(code_of(light), None, levels, electrons, READ_NOISE, 1.0))
+        for levels in (draws, None)
+    )
     sigma = math.sqrt(0.2 / electrons + (READ_NOISE / electrons) ** 2)
     # demosaicing leaves about three quarters of it
     assert (noisy - quiet).std() == pytest.approx(0.77 * sigma, rel=0.05)
@@ -166,5 +179,5 @@ def test_overexposed_red_lamps_turn_white_in_the_middle() -> None:
     light = np.zeros((1, 2, 3), np.float32)
     light[0, 0, 0] = 0.9
     light[0, 1, 0] = 50.0
-    out = develop(light, None, None, 1000.0, READ_NOISE, 0.0)
+    out = develop(code_of(light), None, None, 1000.0, READ_NOISE, 0.0)
     assert out[0, 0, 1] == 0 and out[0, 1, 1] > 0.8

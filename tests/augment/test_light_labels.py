@@ -1,5 +1,4 @@
-"""Labels of light: boxes, the mask of glare, and the manifest's numbers, as a light meter has them.
-"""
+"""Labels of light: boxes, the mask of glare, and the manifest's numbers, as a light meter has them."""
 
 from __future__ import annotations
 
@@ -47,7 +46,8 @@ def camera(street):
 
 
 def boxes_of(street) -> WorldBoxes:
-    return WorldBoxes.from_labels(street.labels.boxes(street.frames[0].index), street.world_origin_m)
+    boxes = street.labels.boxes(street.frames[0].index)
+    return WorldBoxes.from_labels(boxes, street.world_origin_m)
 
 
 def inputs_of(street, camera, recipe: Recipe) -> LabelInputs:

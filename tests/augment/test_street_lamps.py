@@ -110,6 +110,23 @@ def test_the_rule_sets_lamps_every_30_m_on_alternate_sides_8_m_over_the_road():
     assert (rights[:, 1] * lamps.positions_m[:, 1] < 0).all()  # the road lies to the right
 
 
+def test_lamps_of_the_rule_hang_at_masts_that_stand_nearby():
+    scene = road_scene()
+    heights = np.arange(0.4, 9.5, 0.3)
+    mast = surface(grid([33.2], [-7.2], heights), [0.05, 0.05, 0.2], SemanticClass.OTHER)
+    wall = grid(np.arange(60, 70, 0.25), [8.0], heights)
+    others = [mast, surface(wall, [0.2, 0.02, 0.2], SemanticClass.OTHER)]
+    names = ("means", "quats", "scales", "opacities", "sh", "semantic")
+    parts = [scene.background, *others]
+    background = Gaussians(**{n: torch.cat([getattr(part, n) for part in parts]) for n in names})
+    lamps = street_lamps(dataclasses.replace(scene, background=background), StreetLampSettings())
+    before = street_lamps(open_road(), StreetLampSettings())
+    moved = np.abs(lamps.positions_m - before.positions_m).max(1) > 0.01
+    # One lamp alone, 1.5 m from its mast over the road, to the half metre of the squares.
+    assert moved.sum() == 1
+    np.testing.assert_allclose(lamps.positions_m[moved], [[33.2, -5.7, 8.2]], atol=0.3)
+
+
 def test_lamps_of_the_rule_do_not_depend_on_where_the_drive_is_cut_off():
     whole = street_lamps(open_road(), StreetLampSettings()).positions_m
     first_half = street_lamps(road_scene(frames=6), StreetLampSettings()).positions_m

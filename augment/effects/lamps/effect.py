@@ -27,7 +27,7 @@ from augment.effects.effect import (
     skipped_steps,
 )
 from augment.effects.lamps.exposure import READ_NOISE, Exposure
-from augment.effects.lamps.glare import add_glare
+from augment.effects.lamps.glare import spread_glare
 from augment.effects.lamps.hour import find_hour, night_sky, white_of_picture
 from augment.effects.lamps.lamp_light import add_lamp_light
 from augment.effects.lamps.light_table import (
@@ -37,7 +37,7 @@ from augment.effects.lamps.light_table import (
     measure_light,
 )
 from augment.effects.lamps.luminance import read_light
-from augment.effects.lamps.picture_light import decode, develop, relight
+from augment.effects.lamps.picture_light import develop, halve_excess, relight
 from augment.effects.lamps.plan import (
     CAMERA_STEPS,
     GLARE,
@@ -192,18 +192,21 @@ class LampsEffect(Effect):
         rgb = view.rgb
         uses_kernels = effect.backend != REFERENCE
         light = plan.light
+        picture = rgb.detach().cpu().numpy()
         glare = None
-        with timed(SENSOR):
-            linear = decode(rgb.detach().cpu().numpy(), uses_kernels=uses_kernels)
         if light.glare > 0:
             with timed(GLARE):
-                glare = add_glare(linear, (camera.fx + camera.fy) / 2, light.glare)
+                excess = halve_excess(picture, uses_kernels=uses_kernels)
+                if excess is not None:
+                    focal_px = (camera.fx + camera.fy) / 2
+                    size = (camera.width, camera.height)
+                    glare = spread_glare(excess, *size, focal_px, light.glare)
         with timed(SENSOR):
             draws = None
             if light.noise > 0:
                 draws = draw_noise(camera, seed=plan.seed, scene=effect.scene.name)
             out = develop(
-                linear,
+                picture,
                 glare,
                 draws,
                 exposure.electrons / exposure.scale,
@@ -237,6 +240,8 @@ def _read_light(
     """
     plan: LightPlan = effect.settings
     with timed(METER):
+        if glare is None and not plan.needs_luminance:
+            return view
         reading = read_light(
             view.rgb.detach().cpu().numpy(),
             glare,

@@ -39,28 +39,25 @@ _SIGMA = 1.5
 _MEDIAN_RADIUS = math.sqrt(2 * math.log(2))
 
 
-def add_glare(
-    linear: Float32[np.ndarray, "H W 3"], focal_px: float, strength: float
-) -> Float32[np.ndarray, "H W 3"] | None:
-    """Return the light that tails of the point spread function add to a picture; None for none.
+def spread_glare(
+    excess: Float32[np.ndarray, "h w 3"], width: int, height: int, focal_px: float, strength: float
+) -> Float32[np.ndarray, "H W 3"]:
+    """Return the light that tails of the point spread function add to a picture.
 
     Args:
-        linear: exposed linear light; 1 saturates the sensor.
-        focal_px: focal length, pixels.
+        excess: light beyond saturation at half the resolution.
+        width: width of the picture, pixels.
+        height: height of the picture, pixels.
+        focal_px: focal length, pixels of the picture.
         strength: the tails' share of the light, over that of a clean lens.
     """
-    if strength <= 0 or not (linear > 1).any():
-        return None
-    height, width, _ = linear.shape
     levels = tail_levels(focal_px, max(height, width))
-    coarsest = _FINEST_PX << (len(levels) - 1)
-    padded_height = -(-height // coarsest) * coarsest
-    padded_width = -(-width // coarsest) * coarsest
-    source = np.zeros((padded_height, padded_width, 3), np.float32)
-    np.maximum(linear - np.float32(1), 0, out=source[:height, :width])
-    grids = [_half(source)]
+    coarsest = 1 << (len(levels) - 1)
+    padding = [-(-size // coarsest) * coarsest - size for size in excess.shape[:2]]
+    grids = [np.pad(excess, ((0, padding[0]), (0, padding[1]), (0, 0)))]
     for _ in levels[1:]:
-        grids.append(_half(grids[-1]))
+        size = (grids[-1].shape[1] // 2, grids[-1].shape[0] // 2)
+        grids.append(cv2.resize(grids[-1], size, interpolation=cv2.INTER_AREA))
     total: np.ndarray | None = None
     for weight, grid in zip(reversed(levels), reversed(grids), strict=True):
         blurred = cv2.GaussianBlur(grid, (0, 0), _SIGMA, borderType=cv2.BORDER_CONSTANT)
@@ -71,9 +68,10 @@ def add_glare(
             )
         total = blurred
     assert total is not None
-    size = (padded_width, padded_height)
-    full = cv2.resize(total, size, interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(full[:height, :width])
+    half = np.ascontiguousarray(total[: excess.shape[0], : excess.shape[1]])
+    size = (_FINEST_PX * half.shape[1], _FINEST_PX * half.shape[0])
+    full = cv2.resize(half, size, interpolation=cv2.INTER_LINEAR)
+    return full if size == (width, height) else np.ascontiguousarray(full[:height, :width])
 
 
 def tail_levels(focal_px: float, side_px: int) -> list[float]:
@@ -108,9 +106,3 @@ def _share_within(angle_deg: float, power: int) -> float:
         return ratio**2 / (2 * (1 + ratio) ** 2)
 
     return min(integral(angle_deg) / integral(RADIUS_DEG), 1.0)
-
-
-def _half(image: np.ndarray) -> np.ndarray:
-    """Return the image at half the resolution, the mean of four pixels."""
-    size = (image.shape[1] // 2, image.shape[0] // 2)
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)

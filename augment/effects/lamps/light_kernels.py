@@ -86,24 +86,41 @@ def relight(rgb, added, gains, min_added, light_table, code_table, out, mask):
 
 
 @kernel
-def decode(rgb, light_table, out):
-    """Write the light of float32 rows of codes; codes below 0 count as 0."""
+def halve_excess(rgb, light_table, out):
+    """Write the light beyond saturation at half the resolution. All floats are float32.
+
+    Args:
+        rgb: exposed picture, display-encoded, [H, W, 3].
+        light_table: light by code.
+        out: output [h, w, 3], the mean of four pixels; it may reach beyond the picture.
+    """
     zero = np.float32(0)
-    for i in prange(rgb.shape[0]):
-        for j in range(rgb.shape[1]):
-            out[i, j] = light_of_code(max(rgb[i, j], zero), light_table)
+    one_f32 = np.float32(1)
+    quarter = np.float32(0.25)
+    for i in prange(out.shape[0]):
+        for j in range(out.shape[1]):
+            for k in range(3):
+                out[i, j, k] = zero
+        for row in range(2 * i, min(2 * i + 2, rgb.shape[0])):
+            for column in range(rgb.shape[1]):
+                for k in range(3):
+                    code = rgb[row, column, k]
+                    if code > one_f32:
+                        excess = light_of_code(code, light_table) - one_f32
+                        out[i, column // 2, k] += quarter * excess
 
 
 @kernel
-def develop(light, glare, draws, numbers, code_table, out):
+def develop(rgb, glare, draws, numbers, light_table, code_table, out):
     """Write the picture that a sensor makes of light. All floats are float32.
 
     Args:
-        light: exposed linear light, [H, W, 3]; 1 saturates the sensor.
+        rgb: exposed picture, display-encoded, [H, W, 3]; 1 saturates the sensor.
         glare: light that the lens scatters, [H, W, 3]; or empty [0, 0, 3].
         draws: normal numbers in 8 bits about 128, [H, W, 3]; or empty [0, 0, 3] for no noise.
         numbers: crosstalk, variance per light, variance of reading; both variances for a draw of
             1 about 128.
+        light_table: light by code.
         code_table: codes by the square root of light, with the response curve.
         out: output [H, W, 3], display-encoded.
     """
@@ -117,11 +134,11 @@ def develop(light, glare, draws, numbers, code_table, out):
     has_noise = draws.shape[0] > 0
     last = np.float32((len(code_table) - 2) / ROOT_STEPS)
     brightest = last * last
-    for i in prange(light.shape[0]):
-        for j in range(light.shape[1]):
-            red = light[i, j, 0]
-            green = light[i, j, 1]
-            blue = light[i, j, 2]
+    for i in prange(rgb.shape[0]):
+        for j in range(rgb.shape[1]):
+            red = light_of_code(max(rgb[i, j, 0], zero), light_table)
+            green = light_of_code(max(rgb[i, j, 1], zero), light_table)
+            blue = light_of_code(max(rgb[i, j, 2], zero), light_table)
             if has_glare:
                 red += glare[i, j, 0]
                 green += glare[i, j, 1]

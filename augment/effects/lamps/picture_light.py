@@ -1,4 +1,4 @@
-"""Pictures between display-encoded colours and light: relighting, decoding, development.
+"""Pictures between display-encoded colours and light: relighting and development.
 
 On the CPU kernels do the work; they equal the plain definitions here within 1e-4. Arrays are
 float32 on the CPU; callers move those of a GPU.
@@ -79,26 +79,32 @@ def relight(
     return out, mask
 
 
-def decode(
+def halve_excess(
     rgb: Float32[np.ndarray, "H W 3"], *, uses_kernels: bool = True
-) -> Float32[np.ndarray, "H W 3"]:
-    """Return the linear light of display-encoded colours; those below 0 count as 0.
+) -> Float32[np.ndarray, "h w 3"] | None:
+    """Return the light beyond saturation, the mean of every four pixels; None for none.
 
     Args:
-        rgb: the picture.
+        rgb: exposed picture, display-encoded; 1 saturates the sensor.
         uses_kernels: False for the plain definition.
     """
+    if not (rgb > 1).any():
+        return None
+    height, width, _ = rgb.shape
+    shape = (-(-height // 2), -(-width // 2), 3)
     if not uses_kernels:
-        return linear_from_display(np.maximum(rgb, 0).astype(np.float64)).astype(np.float32)
-    out = np.empty_like(rgb)
+        excess = np.zeros((2 * shape[0], 2 * shape[1], 3))
+        light = linear_from_display(np.maximum(rgb, 0).astype(np.float64))
+        excess[:height, :width] = np.maximum(light - 1, 0)
+        return excess.reshape(shape[0], 2, shape[1], 2, 3).mean((1, 3)).astype(np.float32)
+    out = np.empty(shape, np.float32)
     with kernel_threads(ROWS_PER_CHUNK):
-        rows = np.ascontiguousarray(rgb).reshape(len(rgb), -1)
-        light_kernels.decode(rows, light_table(), out.reshape(len(rgb), -1))
+        light_kernels.halve_excess(np.ascontiguousarray(rgb), light_table(), out)
     return out
 
 
 def develop(
-    light: Float32[np.ndarray, "H W 3"],
+    rgb: Float32[np.ndarray, "H W 3"],
     glare: Float32[np.ndarray, "H W 3"] | None,
     draws: UInt8[np.ndarray, "H W 3"] | None,
     electrons: float,
@@ -110,7 +116,7 @@ def develop(
     """Return the picture that a sensor makes of light: crosstalk, noise, response curve.
 
     Args:
-        light: exposed linear light; 1 saturates the sensor.
+        rgb: exposed picture, display-encoded; 1 saturates the sensor.
         glare: light that the lens scatters; None for none.
         draws: result of `augment.render.sensor.draw_noise`; None for no noise.
         electrons: electrons of a pixel at saturation.
@@ -122,18 +128,20 @@ def develop(
     per_light = per_draw / electrons
     of_reading = per_draw * (read_noise / electrons) ** 2
     if uses_kernels:
-        out = np.empty_like(light)
+        out = np.empty_like(rgb)
         with kernel_threads(ROWS_PER_CHUNK):
             light_kernels.develop(
-                np.ascontiguousarray(light),
+                np.ascontiguousarray(rgb),
                 _NONE if glare is None else glare,
                 _NO_DRAWS if draws is None else draws,
                 np.array([CROSSTALK, per_light, of_reading], np.float32),
+                light_table(),
                 _developed_table(),
                 out,
             )
         return out
-    total = light.astype(np.float64) + (0 if glare is None else glare)
+    total = linear_from_display(np.maximum(rgb, 0).astype(np.float64))
+    total += 0 if glare is None else glare
     excess = np.maximum(total - 1, 0)
     total += CROSSTALK * (excess.sum(-1, keepdims=True) - excess)
     if draws is not None:

@@ -48,6 +48,7 @@ def _hash_sources() -> str:
         *sorted(render.glob("*_kernels.py")),
         render / "layout.py",
         render.parent / "lamps" / "pattern_kernels.py",
+        render.parent / "lamps" / "surface_light_kernels.py",
     ]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
