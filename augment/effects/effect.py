@@ -9,9 +9,9 @@ The hooks of `Effect`, by when they are called:
 
     once a recipe and scene    plan_in_scene    facts, with a reason for every pass
                                sun_share        sunlight on the ground
-    once a scene               prepare, relight, precompute
+    once a scene               prepare, relight, precompute, without_parts
     once a view                cameras, visibility, edit_scene, draw, edit_image,
-                               visible_mask, front_surface, expose
+                               visible_mask, front_surface, expose, count_parts
     labels of a view           measure_view, measure_boxes, grow_boxes, box_table
     once a sweep               intersect_beams, attenuate_beams
 """
@@ -354,7 +354,18 @@ class Effect:
         The results are `put` into the scene's memo as shared.
         """
 
+    def without_parts(self, effect: EffectInScene, recipe: Recipe) -> dict[str, Recipe]:
+        """Return recipes that each lack one part of the effect, by the part's name.
+
+        `explain` measures by them how long each part takes, and `count_parts` how many it has.
+        """
+        return {}
+
     # ---- Once a view -----------------------------------------------------------------------------
+
+    def count_parts(self, effect: EffectInScene, camera: Camera) -> dict[str, dict[str, int]]:
+        """Return how many things of each kind a view has, by the parts of `without_parts`."""
+        return {}
 
     def cameras(self, effect: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
         """Return the cameras that look into the scene for this view; None for `camera` alone."""

@@ -1,4 +1,4 @@
-"""Labels of light: boxes, the mask of glare, and the manifest's numbers, as a light meter has them."""
+"""Labels of light: boxes, the mask of glare, and the manifest's numbers."""
 
 from __future__ import annotations
 

@@ -55,6 +55,7 @@ from augment.effects.lamps.plan import (
 )
 from augment.effects.lamps.scene_exposure import exposure_of, exposure_of_picture
 from augment.effects.lamps.sky_in_photo import replace_photo_sky
+from augment.effects.lamps.sources import count_lamps, without_sources
 from augment.effects.lamps.view_lamps import describe_lamps, lamps_of_view
 from augment.effects.wet.darkening import white_level
 from augment.light.scene_light import find_scene_light
@@ -116,6 +117,12 @@ class LampsEffect(Effect):
         steps = steps_of(plan, lamp_reason, exposure_reason)
         buffers = {EXPECTED_DEPTH, SPLAT_IDS} if plan.has_signs else {EXPECTED_DEPTH}
         return EffectPlan(plan, steps, frozenset(buffers))
+
+    def without_parts(self, effect: EffectInScene, recipe: Recipe) -> dict[str, Recipe]:
+        return without_sources(effect.settings, effect.scene, recipe)
+
+    def count_parts(self, effect: EffectInScene, camera: Camera) -> dict[str, dict[str, int]]:
+        return count_lamps(effect.settings, effect.scene, camera)
 
     def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
         light = self.section_of(recipe)
