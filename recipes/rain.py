@@ -29,7 +29,7 @@ MAX_PUDDLE_SHARE = 0.35
 class Rain(EffectModel):
     """Rain: drops that streak near the camera and veil what is far, and the wet ground below."""
 
-    later_fields = ("shadow_fade",)
+    later_fields = ("shadow_fade", "gloss_fade")
     synonyms = (
         ("rate_mm_h", "rain_rate mm_h mm_per_hour"),
         ("wind_mps", "wind_speed"),
@@ -78,6 +78,9 @@ class Rain(EffectModel):
     shadow_fade: Unit | None = None
     """How much of the ground's cast shadows goes, since clouds that rain hide the sun: 1 all, 0
     none; null follows from the rate, and is all but in the lightest drizzle."""
+    gloss_fade: Unit | None = None
+    """How much of the blue that glossy surfaces mirror of a clear sky turns grey: 1 all, 0 none;
+    null follows from the rate, and is all but in the lightest drizzle."""
     spray: Flag = True
     """Vehicles that drive faster than 40 km/h lift spray, by their speed, the rate and the ground's
     wetness."""
@@ -92,6 +95,13 @@ class Rain(EffectModel):
         """Return the share of the sun's light that the rain's clouds take, 0 to 1."""
         if self.shadow_fade is not None:
             return self.shadow_fade
+        return -math.expm1(-self.rate_mm_h / OVERCAST_MM_H)
+
+    @property
+    def blue_fade(self) -> float:
+        """Return how much of the blue sky in glossy surfaces turns grey, 0 to 1."""
+        if self.gloss_fade is not None:
+            return self.gloss_fade
         return -math.expm1(-self.rate_mm_h / OVERCAST_MM_H)
 
     @property

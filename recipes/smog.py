@@ -26,7 +26,7 @@ class Smog(EffectModel):
 
     model_config = ConfigDict(json_schema_extra=one_of(*DENSITY_FIELDS))
     in_first_release = True
-    later_fields = ("mor_m", "overcast", "scatter", "shadow_fade", "blend")
+    later_fields = ("mor_m", "overcast", "scatter", "shadow_fade", "gloss_fade", "blend")
     synonyms = (
         ("smog", "fog haze mist"),
         ("extinction_per_m", "beta density sigma"),
@@ -79,6 +79,8 @@ class Smog(EffectModel):
     shadow_fade: Unit = 0.0
     """How much of the ground's cast shadows goes with the sun's light that smog keeps from it: 1
     all that its optical depth towards the sun says, 0 none."""
+    gloss_fade: Unit = 0.0
+    """How much of the blue that glossy surfaces mirror of a clear sky turns grey: 1 all, 0 none."""
     blend: Literal["display", "linear"] = "display"
     """display mixes the display-encoded colours of things and air, as splats are blended; linear
     mixes their light, as air does, so that dark things pale while they are still near."""

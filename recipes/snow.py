@@ -38,7 +38,7 @@ class SnowWind(ClosedModel):
 class Snow(EffectModel):
     """Snow lying on what is open to the sky: ground, roofs, vehicles."""
 
-    later_fields = ("dirt", "traffic", "shadow_fade")
+    later_fields = ("dirt", "traffic", "shadow_fade", "gloss_fade")
     synonyms = (
         ("depth_m", "level level_m height height_m thickness thickness_m"),
         ("coverage", "cover"),
@@ -95,6 +95,9 @@ class Snow(EffectModel):
     shadow_fade: Unit | None = None
     """How much of the cast shadows goes on ground that no snow covers: 1 all, 0 none; null follows
     from light.sun: all where that is 0, none where it is 1 or null."""
+    gloss_fade: Unit | None = None
+    """How much of the blue that glossy surfaces mirror of a clear sky turns grey: 1 all, 0 none;
+    null follows from light.sun: all where that is 0, none where it is 1 or null."""
     wind: SnowWind = SnowWind()
     shading: Literal["per_splat", "per_pixel"] = "per_splat"
     """Lit by one normal a splat, or by one a pixel of every splat."""
@@ -123,6 +126,13 @@ class Snow(EffectModel):
         """Return the share of the sun's light that the recipe's sky takes, 0 to 1."""
         if self.shadow_fade is not None:
             return self.shadow_fade
+        return 0.0 if self.light.sun is None else 1.0 - self.light.sun
+
+    @property
+    def blue_fade(self) -> float:
+        """Return how much of the blue sky in glossy surfaces turns grey, 0 to 1."""
+        if self.gloss_fade is not None:
+            return self.gloss_fade
         return 0.0 if self.light.sun is None else 1.0 - self.light.sun
 
     def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:

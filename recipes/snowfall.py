@@ -17,7 +17,7 @@ MAX_SNOWFALL_MM_H = 50.0
 class Snowfall(EffectModel):
     """Snow in the air: flakes near the camera, a white veil beyond; what lies is `snow`."""
 
-    later_fields = ("shadow_fade",)
+    later_fields = ("shadow_fade", "gloss_fade")
     synonyms = (("rate_mm_h", "snow_rate snowfall_rate"), ("turbulence_mps", "turbulence gusts"))
     columns = (
         Column(
@@ -47,12 +47,22 @@ class Snowfall(EffectModel):
     shadow_fade: Unit | None = None
     """How much of the ground's cast shadows goes, since clouds that snow hide the sun: 1 all, 0
     none; null follows from the rate, and is all but in the lightest flurries."""
+    gloss_fade: Unit | None = None
+    """How much of the blue that glossy surfaces mirror of a clear sky turns grey: 1 all, 0 none;
+    null follows from the rate, and is all but in the lightest flurries."""
 
     @property
     def sun_fade(self) -> float:
         """Return the share of the sun's light that the clouds take, 0 to 1."""
         if self.shadow_fade is not None:
             return self.shadow_fade
+        return -math.expm1(-self.rate_mm_h / OVERCAST_MM_H)
+
+    @property
+    def blue_fade(self) -> float:
+        """Return how much of the blue sky in glossy surfaces turns grey, 0 to 1."""
+        if self.gloss_fade is not None:
+            return self.gloss_fade
         return -math.expm1(-self.rate_mm_h / OVERCAST_MM_H)
 
     @property

@@ -9,6 +9,7 @@ The hooks of `Effect`, by when they are called:
 
     once a recipe and scene    plan_in_scene    facts, with a reason for every pass
                                sun_share        sunlight on the ground
+                               gloss_share      blue sky in glossy surfaces
     once a scene               prepare, relight, precompute, without_parts
     once a view                cameras, visibility, edit_scene, draw, edit_image,
                                visible_mask, front_surface, expose, count_parts
@@ -333,6 +334,18 @@ class Effect:
 
         It is asked for where the ground shows cast shadows, which fade by the product of all
         effects' shares. 1 leaves them as they are.
+
+        Args:
+            recipe: the recipe, also one without this effect.
+            scene: the scene to change.
+        """
+        return 1.0, ""
+
+    def gloss_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
+        """Return the share of the clear sky's blue that glossy surfaces keep, and the reason.
+
+        It is asked for where the scene's sky is blue. The picture has the product of all effects'
+        shares. 1 leaves gloss as it is.
 
         Args:
             recipe: the recipe, also one without this effect.

@@ -99,7 +99,7 @@ class SmogEffect(Effect):
 
     def reads_splats(self, recipe: Recipe) -> bool:
         smog = self.section_of(recipe)
-        return smog is not None and smog.shadow_fade > 0
+        return smog is not None and max(smog.shadow_fade, smog.gloss_fade) > 0
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
@@ -149,6 +149,13 @@ class SmogEffect(Effect):
         ground_z_m = float(np.median(shadows.height_m[shadows.known_share > 0]))
         share = 1 - smog.shadow_fade * (1 - sun_transmittance(fog, shadows, ground_z_m))
         return share, f"{self.section} leaves {100 * share:.0f} % of the sun's light"
+
+    def gloss_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
+        smog = self.section_of(recipe)
+        if smog is None or smog.resolved_extinction_per_m == 0 or smog.gloss_fade == 0:
+            return 1.0, ""
+        share = 1 - smog.gloss_fade
+        return share, f"{self.section} leaves {100 * share:.0f} % of the sky's blue"
 
     def precompute(self, context: JobContext) -> None:
         if any(smog and smog.shadow_fade > 0 for smog in map(self.section_of, context.recipes)):

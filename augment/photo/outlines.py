@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from augment.photo import edge_kernels
 from augment.photo import outline_kernels as kernels
 
 # Distance of the points of an outline, as a part of the reach.
@@ -62,6 +63,10 @@ PRIOR_LEVELS = 25.0
 USUAL_OFFSET = 0.35
 # Distance from the image's border within which an outline stays, pixels.
 BORDER_PX = 3
+# Number of points beside the border whose direction tells where the outline leaves the image.
+NUM_LEADING_POINTS = 8
+# Largest shift along the border of the place where it does, in reaches.
+MAX_BORDER_SHIFT = 4.0
 # Smallest area of a silhouette that has an outline, pixels of the small mask.
 MIN_AREA_PX = 12
 # Sobel's sum for a slope of one a pixel.
@@ -180,9 +185,54 @@ def _move_outline(
         np.concatenate([path[len(points) : len(points) + half], path[half : len(points)]])
     ]
     outline = points + normals * np.where(is_at_border, 0, moves)[:, None]
+    if is_at_border.any() and not is_at_border.all():
+        _narrow_at_border(outline, points, np.asarray(is_at_border), limit, reach_px)
     # An object that the image cuts reaches beyond the image's border.
     outline = np.where(points < BORDER_PX, np.minimum(outline, -1), outline)
     return np.where(points > limit, np.maximum(outline, limit + 1 + BORDER_PX), outline)
+
+
+def _narrow_at_border(
+    outline: Float[np.ndarray, "N 2"],
+    points: Float[np.ndarray, "N 2"],
+    is_at_border: Bool[np.ndarray, " N"],
+    limit: np.ndarray,
+    reach_px: float,
+) -> None:
+    """Move the ends of what the image cuts to where the outline beside them leads, in place.
+
+    Points at the image's border stay, and would keep the silhouette's width there.
+
+    Args:
+        outline: moved points; those at the border have not been moved.
+        points: points of the silhouette.
+        is_at_border: True for points at the border.
+        limit: largest x and y of points that are not at the border.
+        reach_px: distance inside the silhouette at which the photo's edge may lie, pixels.
+    """
+    num_points = len(points)
+    for step in (1, -1):
+        for last in np.flatnonzero(~is_at_border & np.roll(is_at_border, -step)):
+            first = (last + step) % num_points
+            is_beyond = (points[first] < BORDER_PX) | (points[first] > limit)
+            axis = int(is_beyond[1])
+            along = 1 - axis
+            before = (last - step * NUM_LEADING_POINTS) % num_points
+            lead = outline[last] - outline[before]
+            to_border = points[first, axis] - outline[last, axis]
+            if is_at_border[before] or is_beyond.all() or lead[axis] * to_border <= 0:
+                continue
+            end = outline[last, along] + to_border * lead[along] / lead[axis]
+            shift = end - points[first, along]
+            if abs(shift) > MAX_BORDER_SHIFT * reach_px:
+                continue
+            point = first
+            # Only points that the silhouette has beyond the end move: the object gets narrower.
+            while is_at_border[point] and (end - points[point, along]) * shift > 0:
+                if not (points[point, axis] < BORDER_PX or points[point, axis] > limit[axis]):
+                    break
+                outline[point, along] = end
+                point = (point + step) % num_points
 
 
 def score_offsets(
@@ -211,53 +261,20 @@ def score_offsets(
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    # Channels first, then samples: sums along the normals then run over whole rows.
-    planes = np.ascontiguousarray(np.moveaxis(samples, 2, 0), np.float32)  # [3, M, N]
-    sums = np.zeros((3, len(sampled) + 1, len(points)), np.float32)
-    np.cumsum(planes, 1, out=sums[:, 1:])
-    # Samples before the k-th end lie inside the k-th offset.
     count = inner_px + outer_px + 1
-    ends = slice(side_px, side_px + count)
-    after = sums[:, 2 * side_px : 2 * side_px + count]
-    # Twice the sums at the ends, less those on both sides: the mean inside less that outside.
-    difference = 2 * sums[:, ends]
-    difference -= sums[:, :count]
-    difference -= after
-    edges = np.minimum(np.abs(difference, out=difference).max(0) / side_px, MAX_EDGE_LEVELS)
     # The edge lies half a pixel before the first sample outside, and OpenCV paints half a pixel
     # beyond the border of a polygon.
-    offsets = sampled[ends] - 1.0
-    regions = _score_regions(planes, ends, outer_px)
+    offsets = sampled[side_px : side_px + count] - 1.0
     prior = PRIOR_LEVELS * (offsets / reach_px + USUAL_OFFSET) ** 2
-    gains = edges + np.float32(REGION_LEVELS / reach_px) * regions
-    gains -= prior[:, None].astype(np.float32)
-    return offsets, np.ascontiguousarray(gains.T, np.float32)
-
-
-def _score_regions(
-    planes: Float[np.ndarray, "3 M N"], ends: slice, outer_px: int
-) -> Float[np.ndarray, "K N"]:
-    """Return how well each offset parts pixels unlike the background from pixels like it.
-
-    Args:
-        planes: colours of the samples along the normals, 0 to 255.
-        ends: number of samples inside each offset.
-        outer_px: reach outside the silhouette, pixels.
-    """
-    background = _smooth(planes[:, -BACKGROUND_PX:].mean(1).T, BACKGROUND_POINTS)
-    difference = planes - np.ascontiguousarray(background.T, np.float32)[:, None]
-    unlike = np.abs(difference, out=difference).max(0) / np.float32(UNLIKE_LEVELS)
-    np.minimum(unlike, np.float32(MAX_UNLIKE), out=unlike)
-    unlike -= np.float32(UNLIKE_THRESHOLD)
-    sums = unlike.cumsum(0)
-    inside = sums[ends.start - 1 : ends.stop - 1]
-    scores = 2 * inside - sums[ends.stop - 1]
-    scores -= scores.mean(0)
-    brightness = planes[:, ends.stop - 1 - outer_px :].mean(0)
-    count = 2 * BACKGROUND_POINTS - 3
-    mean = _smooth(brightness.mean(0), count)
-    variance = np.maximum(_smooth((brightness**2).mean(0), count) - mean**2, 0)
-    return scores / (1 + variance / PLAIN_LEVELS**2).astype(np.float32)
+    numbers = (
+        *(side_px, count, outer_px, BACKGROUND_PX, BACKGROUND_POINTS, MAX_EDGE_LEVELS),
+        *(REGION_LEVELS / reach_px, UNLIKE_LEVELS, MAX_UNLIKE, UNLIKE_THRESHOLD, PLAIN_LEVELS**2),
+    )
+    gains = np.empty((len(points), count), np.float32)
+    edge_kernels.score_gains(
+        samples, np.array(numbers, np.float32), prior.astype(np.float32), gains
+    )
+    return offsets, gains
 
 
 def fill_polygons(

@@ -10,7 +10,7 @@ photo ends.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -21,7 +21,10 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 
+from augment.photo import edge_kernels as kernels
+from augment.photo.object_underside import Underside, height_numbers, heights_at, underside_of
 from augment.photo.outlines import MIN_AREA_PX, Silhouette, fill_polygons, find_outlines
+from augment.photo.parked_objects import ObjectParts
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, OVERLAY, SPLAT_IDS, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.layout import HeightClip
@@ -49,10 +52,12 @@ DEPTH_TOLERANCE = 0.1
 DEPTH_TOLERANCE_M = 0.5
 # Height above an object within which its own snow may lie, metres.
 CAP_HEIGHT_M = 0.8
+# Share of a pixel that shows snow on an object, up to which the pixel may take other buffers.
+CLEAR_OVERLAY = 0.05
 # Share of a pixel that snow on the ground may hide where an object's buffers are taken.
-MAX_GROUND_SNOW = 0.3
-# Quantile of the heights of an object's splats that is its bottom.
-LOWEST_QUANTILE = 0.01
+MAX_GROUND_SNOW = 0.1
+# Share of a pixel from which snow on an object shows there.
+MIN_CAP_SHARE = 0.5
 # Largest number of objects whose outlines are moved; the nearest ones are taken.
 MAX_OBJECTS = 60
 
@@ -103,32 +108,33 @@ class ObjectEdges:
                 of `shows_background` are read.
             parts: the parts.
         """
-        rows, columns = np.nonzero(self.shows_background[self.window])
-        background_pixels = (rows + self.window[0].start) * self.shows_background.shape[1]
-        background_pixels += columns + self.window[1].start
-        window_pixels = rows * (self.window[1].stop - self.window[1].start) + columns
+        rows, columns = self.window
+        is_copied = np.ascontiguousarray(self.shows_background[rows, columns])
         moved_buffers = dict[str, Tensor]()
         for name in BUFFERS:
             buffer = getattr(raster, name)
             if buffer is None:
                 continue
-            hidden_values = getattr(background, name).flatten(0, 1)
+            window_values = getattr(background, name)
+            if name == SPLAT_IDS:
+                window_values = self._count_through(window_values, parts)
             if buffer.device.type == "cpu" and not buffer.requires_grad:
-                values = hidden_values.numpy()[window_pixels]
-                if name == SPLAT_IDS:
-                    values = self._count_through(torch.from_numpy(values), parts).numpy()
-                flat_image = buffer.numpy().reshape(-1, *buffer.shape[2:])
-                flat_image[background_pixels] = values
-                flat_image[self.targets] = flat_image[self.sources]
+                values = buffer.numpy().reshape(*buffer.shape[:2], -1)
+                window = window_values.numpy().reshape(*is_copied.shape, -1)
+                kernels.copy_window(is_copied, window, rows.start, columns.start, values)
+                flat_values = values.reshape(-1, values.shape[2])
+                kernels.move_pixels(self.targets, self.sources, flat_values)
                 continue
+            window_rows, window_columns = np.nonzero(is_copied)
+            background_pixels = (window_rows + rows.start) * buffer.shape[1]
+            background_pixels += window_columns + columns.start
+            window_pixels = window_rows * is_copied.shape[1] + window_columns
             from_window, to_pixels, targets, sources = (
                 torch.from_numpy(numbers).to(buffer.device)
                 for numbers in (window_pixels, background_pixels, self.targets, self.sources)
             )
-            values = hidden_values[from_window]
-            if name == SPLAT_IDS:
-                values = self._count_through(values, parts)
-            flat_buffer = buffer.flatten(0, 1).index_copy(0, to_pixels, values)
+            hidden_values = window_values.flatten(0, 1)[from_window]
+            flat_buffer = buffer.flatten(0, 1).index_copy(0, to_pixels, hidden_values)
             moved = flat_buffer.index_copy(0, targets, flat_buffer[sources])
             moved_buffers[name] = moved.view_as(buffer)
         return replace(raster, **moved_buffers) if moved_buffers else raster
@@ -140,17 +146,22 @@ class ObjectEdges:
             splat_ids: indices among the splats of `background_of(parts)`; -1 for none.
             parts: the parts.
         """
-        counts = [len(part.gaussians) for part in parts]
-        starts = np.cumsum([0, *counts[:-1]])
-        is_kept = [part.instance_id not in self.instance_ids for part in parts]
-        shifts = [
-            np.full(count, start, np.int64)
-            for count, start, keeps in zip(counts, starts, is_kept, strict=True)
-            if keeps
-        ]
-        numbers = [np.arange(count) for count, keeps in zip(counts, is_kept, strict=True) if keeps]
-        table = torch.from_numpy(np.concatenate([*shifts, [0]]) + np.concatenate([*numbers, [-1]]))
-        return table.to(splat_ids.device)[splat_ids.long()].to(splat_ids.dtype)
+        num_removed = 0
+        num_kept = 0
+        kept_starts = list[int]()
+        shifts = [0]
+        for part in parts:
+            if part.instance_id in self.instance_ids:
+                num_removed += len(part.gaussians)
+                continue
+            # Indices from -1 on are of no splat, from 0 on of the first part that is kept.
+            kept_starts.append(num_kept)
+            shifts.append(num_removed)
+            num_kept += len(part.gaussians)
+        device = splat_ids.device
+        first_ids = torch.tensor(kept_starts, device=device, dtype=splat_ids.dtype)
+        part_numbers = torch.bucketize(splat_ids, first_ids, right=True)
+        return splat_ids + torch.tensor(shifts, device=device)[part_numbers].to(splat_ids.dtype)
 
 
 class _Drawing(NamedTuple):
@@ -176,8 +187,8 @@ class _Object:
     """Median z of its pixels, metres."""
     polygons: list[Float[np.ndarray, "_ 2"]]
     """Its outlines in the photo."""
-    bottom_z_m: float = -math.inf
-    """Height of its lowest splats in the world, metres: it does not reach below."""
+    underside: Underside | None = None
+    """Its lower side: it does not reach below."""
 
 
 def find_edges(
@@ -188,9 +199,10 @@ def find_edges(
     *,
     settings: RasterSettings,
     clip: HeightClip | None = None,
+    parked: ObjectParts | None = None,
     backend: str,
 ) -> ObjectEdges | None:
-    """Return the edges of the moving parts on the photo; None where there are none.
+    """Return the edges of the objects on the photo; None where there are none.
 
     Args:
         parts: the posed parts of the view.
@@ -199,10 +211,18 @@ def find_edges(
         pixels: the photo.
         settings: the rasteriser's settings.
         clip: height above which the buffers show the parts; None if they show all.
+        parked: objects that stand still, taken from the background; None for none.
         backend: the rasteriser's backend.
     """
     moving_parts = [part for part in parts if part.instance_id > 0]
     bare_parts = [part for part in moving_parts if not part.is_overlay]
+    is_snowy = len(bare_parts) < len(moving_parts)
+    poses: Mapping[int, np.ndarray] = {}
+    if parked is not None:
+        moving_parts += parked.parts
+        bare_parts += parked.bare_parts
+        is_snowy |= any(part.is_overlay for part in parked.parts)
+        poses = parked.poses
     if not bare_parts or camera.is_orthographic:
         return None
     assert raster.alpha is not None and raster.expected_depth is not None
@@ -214,30 +234,22 @@ def find_edges(
     objects = _find_objects(bare, camera, pixels)
     if not objects:
         return None
-    objects = [replace(o, bottom_z_m=_bottom_of(bare_parts, o.instance_id)) for o in objects]
+    undersides = {
+        o.instance_id: underside_of(
+            [part for part in bare_parts if part.instance_id == o.instance_id],
+            poses.get(o.instance_id),
+        )
+        for o in objects
+    }
+    objects = [replace(o, underside=undersides[o.instance_id]) for o in objects]
     covered = bare
-    if len(bare_parts) < len(moving_parts):
+    if is_snowy:
         covered = _draw(moving_parts, small, scene_depth, settings, backend)
     is_drawn = None if clip is None else alpha > 0.5
     is_bare = None
     if raster.overlay is not None:  # snow on the ground hides the feet of objects
         is_bare = _shrink(raster.overlay, small) <= covered.overlay + MAX_GROUND_SNOW
     return _edges_of(objects, covered, is_drawn, is_bare, clip, camera, covered is not bare)
-
-
-def _bottom_of(parts: Sequence[PosedGaussians], instance_id: int) -> float:
-    """Return the height in the world of the lowest splats of an object, metres."""
-    heights = list[np.ndarray]()
-    for part in parts:
-        if part.instance_id != instance_id:
-            continue
-        means = part.gaussians.means.detach().cpu().double().numpy()
-        if part.world_from_part is None:
-            heights.append(means[:, 2])
-            continue
-        pose = part.world_from_part.detach().cpu().double().numpy()
-        heights.append(means @ pose[2, :3] + pose[2, 3])
-    return float(np.quantile(np.concatenate(heights), LOWEST_QUANTILE))
 
 
 def copy_size(camera: Camera, width_px: int) -> tuple[int, int]:
@@ -275,12 +287,21 @@ def _draw(
     )
     ends = np.cumsum([len(part.gaussians) for part in parts])
     instance_ids = np.array([part.instance_id for part in parts], np.int32)
-    numbers = np.searchsorted(ends, np.maximum(splat_ids, 0), side="right")
-    is_visible = depth <= scene_depth * (1 + DEPTH_TOLERANCE) + DEPTH_TOLERANCE_M
-    is_visible &= splat_ids >= 0
-    owners = np.where(is_visible, instance_ids[np.minimum(numbers, len(parts) - 1)], 0)
-    alpha, overlay = (np.where(is_visible, share, np.float32(0)) for share in (alpha, overlay))
-    return _Drawing(owners, alpha, depth, overlay)
+    # Most pixels show no moving part.
+    pixels = np.flatnonzero(splat_ids >= 0)
+    limits = scene_depth.reshape(-1)[pixels] * (1 + DEPTH_TOLERANCE) + DEPTH_TOLERANCE_M
+    pixels = pixels[depth.reshape(-1)[pixels] <= limits]
+    numbers = np.searchsorted(ends, splat_ids.reshape(-1)[pixels], side="right")
+    owners = np.zeros(depth.shape, np.int32)
+    owners.reshape(-1)[pixels] = instance_ids[numbers]
+    return _Drawing(owners, _only_at(pixels, alpha), depth, _only_at(pixels, overlay))
+
+
+def _only_at(pixels: Int64[np.ndarray, " M"], image: np.ndarray) -> np.ndarray:
+    """Return an image with its values at some pixels, and 0 elsewhere."""
+    out = np.zeros_like(image)
+    out.reshape(-1)[pixels] = image.reshape(-1)[pixels]
+    return out
 
 
 def _find_objects(
@@ -363,16 +384,28 @@ def _edges_of(
     # The background may show through pixels beside those that are drawn: one more is taken.
     hides = cv2.dilate((alpha > CLEAR_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
     window = _Window(objects, hides, camera)
-    window_labels = photo_labels[window.rows, window.columns]
-    window_background = window.nearest(hides).view(np.bool_) & (window_labels == 0)
-    if has_caps:
-        is_snowy = window.linear(drawing.overlay) > 0.5
-        is_cap = is_snowy & _are_above(objects, photo_labels, camera)[window.rows, window.columns]
-        window_background &= ~is_cap
+    window_labels = np.ascontiguousarray(photo_labels[window.rows, window.columns])
     shows_background = np.zeros(photo_labels.shape, np.bool_)
-    shows_background[window.rows, window.columns] = window_background
-    is_solid = window.linear(alpha) >= SOLID_ALPHA
-    lacks_object = (window_labels > 0) & ~(is_solid & (window.nearest(labels) == window_labels))
+    lacks_object = np.empty(window_labels.shape, np.bool_)
+    overlay = np.empty((0, 0), np.float32)
+    is_above = np.empty((0, 0), np.bool_)
+    if has_caps:
+        overlay = window.linear(drawing.overlay)
+        is_above = _are_above(objects, photo_labels, camera)[window.rows, window.columns]
+    kernels.mark_edges(
+        window_labels,
+        np.array([window.rows.start, window.columns.start, camera.height, camera.width], np.int64),
+        hides,
+        labels,
+        window.linear(alpha),
+        overlay,
+        np.ascontiguousarray(is_above),
+        np.array([SOLID_ALPHA, MIN_CAP_SHARE], np.float32),
+        shows_background,
+        lacks_object,
+    )
+    if has_caps:  # the soft edge of its snow stays as it is drawn
+        lacks_object &= overlay <= CLEAR_OVERLAY
     target_rows, target_columns = np.nonzero(lacks_object)
     target_labels = window_labels[target_rows, target_columns]
     targets = (target_rows + window.rows.start) * camera.width
@@ -397,7 +430,7 @@ def _edges_of(
         if is_object.any():
             nearest = _nearest_to(small_rows, small_columns, is_object)
             depths_m = drawing.depth.reshape(-1)[nearest]
-        is_above = _heights_at(chosen, depths_m, camera) > clip.z_m
+        is_above = heights_at(chosen, depths_m, camera) > clip.z_m
         moves.append(_find_sources(chosen[is_above], is_seed & is_drawn, camera))
         moves.append(_find_sources(chosen[~is_above], is_seed & ~is_drawn, camera))
     empty = np.empty(0, np.int64)
@@ -435,25 +468,43 @@ def _cut_below(
             continue
         first_row = max(top + box_height // 2, 0)
         first_column = max(left, 0)
-        window = photo_labels[first_row : top + box_height, first_column : left + box_width]
-        rows, columns = np.nonzero(window == label)
-        rows += first_row
-        columns += first_column
-        small = rows * height // camera.height, columns * width // camera.width
-        depths_m = drawing.depth.reshape(-1)[_nearest_to(*small, is_object)]
-        pixels = rows * camera.width + columns
-        is_below = _heights_at(pixels, depths_m, camera) < drawn_object.bottom_z_m
-        photo_labels.reshape(-1)[pixels[is_below]] = 0
-
-
-def _heights_at(
-    targets: Int64[np.ndarray, " M"], depth_m: float | Float[np.ndarray, " M"], camera: Camera
-) -> Float[np.ndarray, " M"]:
-    """Return the height in the world of points at a depth in pixels."""
-    rows, columns = np.divmod(targets, camera.width)
-    x, y, z = camera.world_from_camera[2, :3].tolist()
-    rise = x * (columns + 0.5 - camera.cx) / camera.fx + y * (rows + 0.5 - camera.cy) / camera.fy
-    return float(camera.centre[2]) + depth_m * (rise + z)
+        end = max(top + box_height, 0), max(left + box_width, 0)
+        window = photo_labels[first_row : end[0], first_column : end[1]]
+        if not window.size:
+            continue
+        x, y, num_columns, num_rows = cv2.boundingRect((window == label).view(np.uint8))
+        if num_columns == 0:
+            continue
+        corner = first_row + y, first_column + x
+        nearest, first = _nearest_around(
+            (
+                corner[0] * height // camera.height,
+                (corner[0] + num_rows - 1) * height // camera.height,
+            ),
+            (
+                corner[1] * width // camera.width,
+                (corner[1] + num_columns - 1) * width // camera.width,
+            ),
+            is_object,
+        )
+        assert drawn_object.underside is not None
+        nearest_depths_m = drawing.depth.reshape(-1)[nearest]
+        small_rows, small_columns = np.indices(nearest.shape)
+        lowest_m = drawn_object.underside.lowest_at(
+            (small_rows + first[0] + 0.5) * (camera.height / height),
+            (small_columns + first[1] + 0.5) * (camera.width / width),
+            nearest_depths_m,
+            camera,
+        )
+        kernels.cut_below(
+            np.uint8(label),
+            np.array([*corner, num_rows, num_columns], np.int64),
+            nearest_depths_m,
+            np.array([*first, height, width], np.int64),
+            np.array(height_numbers(camera)),
+            lowest_m,
+            photo_labels,
+        )
 
 
 def _are_above(
@@ -503,12 +554,6 @@ class _Window:
         """Return the size of the photo over that of the small copy, x and y."""
         return np.array(self._size) / self._small_size
 
-    def nearest(self, image: np.ndarray) -> np.ndarray:
-        """Return the values of a small image at the window's pixels."""
-        rows = np.arange(self.rows.start, self.rows.stop) * self._small_size[1] // self._size[1]
-        columns = np.arange(self.columns.start, self.columns.stop)
-        return image[rows][:, columns * self._small_size[0] // self._size[0]]
-
     def linear(self, image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "m n"]:
         """Return the values of a small image at the window's pixels, between its own."""
         small_from_window = np.zeros((2, 3))
@@ -543,11 +588,10 @@ def _find_sources(
     small_columns = columns * width // camera.width
     nearest = _nearest_to(small_rows, small_columns, is_seed)
     seed_rows, seed_columns = np.divmod(nearest, width)
-    # A target keeps its place within the small pixel, so that neighbours differ as they did.
-    rows += np.rint((seed_rows - small_rows) * (camera.height / height)).astype(np.int64)
-    columns += np.rint((seed_columns - small_columns) * (camera.width / width)).astype(np.int64)
-    rows = np.clip(rows, 0, camera.height - 1)
-    columns = np.clip(columns, 0, camera.width - 1)
+    # The pixel from which the small copy has its value: others of the seed were not looked at, and
+    # would repeat a pattern over all targets beside it.
+    rows = seed_rows * camera.height // height
+    columns = seed_columns * camera.width // width
     return targets, rows * camera.width + columns
 
 
@@ -557,14 +601,31 @@ def _nearest_to(
     """Return the flat index of the seed nearest to each of some pixels, of which there are some."""
     if not len(rows):
         return np.empty(0, np.int64)
-    left, top, width, height = cv2.boundingRect(is_seed.astype(np.uint8))
-    bottom = max(top + height, int(rows.max()) + 1)
-    right = max(left + width, int(columns.max()) + 1)
-    top = min(top, int(rows.min()))
-    left = min(left, int(columns.min()))
+    nearest, (top, left) = _nearest_around(
+        (int(rows.min()), int(rows.max())), (int(columns.min()), int(columns.max())), is_seed
+    )
+    return nearest[rows - top, columns - left]
+
+
+def _nearest_around(
+    row_range: tuple[int, int], column_range: tuple[int, int], is_seed: Bool[np.ndarray, "h w"]
+) -> tuple[Int64[np.ndarray, "m n"], tuple[int, int]]:
+    """Return the flat index of the seed nearest to each pixel of a window, and its first row and
+    column.
+
+    Args:
+        row_range: first and last row that the window holds, beside those of the seeds.
+        column_range: first and last column.
+        is_seed: the seeds, of which there are some.
+    """
+    left, top, width, height = cv2.boundingRect(is_seed.view(np.uint8))
+    bottom = max(top + height, row_range[1] + 1)
+    right = max(left + width, column_range[1] + 1)
+    top = min(top, row_range[0])
+    left = min(left, column_range[0])
     nearest = nearest_pixels(np.ascontiguousarray(is_seed[top:bottom, left:right]))
-    seed_rows, seed_columns = np.divmod(nearest[rows - top, columns - left], right - left)
-    return (seed_rows + top) * is_seed.shape[1] + seed_columns + left
+    seed_rows, seed_columns = np.divmod(nearest, right - left)
+    return (seed_rows + top) * is_seed.shape[1] + seed_columns + left, (top, left)
 
 
 def nearest_pixels(is_seed: Bool[np.ndarray, "h w"]) -> Int64[np.ndarray, "h w"]:

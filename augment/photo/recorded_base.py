@@ -43,6 +43,7 @@ from augment.errors import SceneError
 from augment.files.recorded_images import ImageFault, has_image, read_scaled
 from augment.light.cast_shadows import FadedShadows
 from augment.memo import memo_of
+from augment.photo import edge_kernels
 from augment.photo.photo_objects import copy_size
 from augment.photo.photo_surface import CLEAR_ALPHA, MIN_ROAD_FALL, OPAQUE_ALPHA, complete_surfaces
 from augment.photo.sky_matte import SkyMatte, sky_matte
@@ -350,6 +351,8 @@ class Photo:
             sky_weight: weight of the sky's colour in each mixed pixel, against the surface's; None
                 for the share that the photo shows.
         """
+        if self._is_only_covered(raster, sky_weight):
+            return self._cover_on_cpu(raster)
         rgb = self._land if self.style is None else self._styled(self.style, raster, parts)
         if self.matte is not None and (sky_weight is not None or self.style is not None):
             rgb = self._mix_parted(rgb, sky_weight)
@@ -358,6 +361,35 @@ class Photo:
             return rgb
         assert raster.rgb is not None
         return add_weighted(raster.rgb, rgb, 1 - raster.overlay)
+
+    def _is_only_covered(self, raster: RenderOutput, sky_weight: Tensor | None) -> bool:
+        """Return True if the picture is the photo with snow on it, and the CPU draws it."""
+        has_weights = self.matte is not None and sky_weight is not None
+        if raster.overlay is None or raster.rgb is None or has_weights:
+            return False
+        is_plain = self.style is None and self.faded_shadows is None
+        return is_plain and choose_kernels(self.backend, raster.rgb, raster.overlay) == CPU
+
+    def _cover_on_cpu(self, raster: RenderOutput) -> Float[Tensor, "H W 3"]:
+        """Return the photo with what lies on the scene, in one pass over the pixels."""
+        assert raster.rgb is not None and raster.overlay is not None
+        return self._in_one_pass(edge_kernels.cover_photo, raster.overlay, raster.rgb)
+
+    def _fade_on_cpu(
+        self, airlight: Float[Tensor, "#H #W 3"], fog_share: Float[Tensor, "H W"]
+    ) -> Float[Tensor, "H W 3"]:
+        """Return the photo in smog, in one pass over the pixels."""
+        return self._in_one_pass(edge_kernels.fade_photo, airlight, fog_share)
+
+    def _in_one_pass(self, kernel: Any, *images: Tensor) -> Float[Tensor, "H W 3"]:
+        """Return the image that a CPU kernel makes of the photo, its colour map and images."""
+        color_map = self.scene_from_recorded
+        matrix = np.eye(3, 4, dtype=np.float32) if color_map is None else color_map.numpy()
+        out = np.empty(self.pixels.shape, np.float32)
+        with kernel_threads(ROWS_PER_THREAD):
+            arrays = (image.detach().contiguous().numpy() for image in images)
+            kernel(self.pixels, matrix, *arrays, out)
+        return torch.from_numpy(out)
 
     def _styled(
         self, style: PhotoStyle, raster: RenderOutput, parts: Sequence[PosedGaussians]
@@ -451,7 +483,7 @@ class Photo:
         if len(style.surface_maps) > 1:
             assert raster.splat_ids is not None
             has_splat = raster.splat_ids >= 0
-            table = _classes(parts, surface_rgb.device)
+            table = splat_classes(parts, surface_rgb.device)
             classes = torch.where(has_splat, table[raster.splat_ids.clamp_min(0)], 0)
             for class_number in torch.unique(classes).tolist():
                 if class_number and not torch.equal(
@@ -495,12 +527,28 @@ class Photo:
         lit_steps = cv2.merge([np.rint(lit_share * 255).astype(np.uint8)] * 3)
         return rgb * torch.from_numpy(cv2.LUT(lit_steps, factors[None])).to(rgb.device)
 
-    @property
-    def own_car_colors(self) -> Float[Tensor, "H W 3"]:
-        """Return the photo in the colours of the recording car: those of vehicles."""
-        if self.style is None or len(self.style.surface_maps) == 1:
-            return self._land
-        return self._in_colors(self.style.surface_maps[int(SemanticClass.VEHICLE)])
+    def own_car_colors(self, rows: slice) -> Float[Tensor, "h W 3"]:
+        """Return rows of the photo in the colours of the recording car: those of vehicles.
+
+        The caller may write into them.
+
+        Args:
+            rows: the rows.
+        """
+        style = self.style
+        if style is None:
+            return self._in_colors(None, rows)
+        number = 0 if len(style.surface_maps) == 1 else int(SemanticClass.VEHICLE)
+        return self._in_colors(style.surface_maps[number], rows)
+
+    def is_land(self, rgb: Float[Tensor, "H W 3"]) -> bool:
+        """Return True if an image is the photo that later passes read, so that nobody writes it.
+
+        Args:
+            rgb: the image.
+        """
+        land = self.__dict__.get("_land")
+        return land is not None and rgb.data_ptr() == land.data_ptr()
 
     def sky_colors(self, camera: Camera, *, parts_sky: bool = False) -> Float[Tensor, "H W 3"]:
         """Return the sky's colours at the pixels of a window.
@@ -631,20 +679,25 @@ class Photo:
         surface_part.flatten(0, 1).index_copy_(0, pixels, mixed_rgb - sky_part)
         return surface_part
 
-    def _in_colors(self, style_map: Float[Tensor, "3 4"] | None) -> Float[Tensor, "H W 3"]:
-        """Return the photo in the scene's colours, or in a style's map of them, which ends at 0."""
+    def _in_colors(
+        self, style_map: Float[Tensor, "3 4"] | None, rows: slice = slice(None)
+    ) -> Float[Tensor, "h W 3"]:
+        """Return rows of the photo in the scene's colours, or in a style's map of them, which ends
+        at 0.
+        """
         color_map = self.scene_from_recorded
         min_value = -math.inf
         if style_map is not None:
             color_map = _composed(style_map, self.scene_from_recorded)
             min_value = 0.0
         if self.backend == CPU:
-            out = np.empty(self.pixels.shape, np.float32)
+            levels = self.pixels[rows]
+            out = np.empty(levels.shape, np.float32)
             matrix = np.eye(3, 4, dtype=np.float32) if color_map is None else color_map.numpy()
             with kernel_threads(ROWS_PER_THREAD):
-                kernels.map_photo_colors(self.pixels, matrix, np.float32(min_value), out)
+                kernels.map_photo_colors(levels, matrix, np.float32(min_value), out)
             return torch.from_numpy(out)
-        pixels = torch.from_numpy(self.pixels)
+        pixels = torch.from_numpy(self.pixels[rows])
         rgb = (gpu.upload(pixels) if self.backend == CUDA else pixels).float() / 255
         if color_map is None:
             return rgb
@@ -730,7 +783,10 @@ class Photo:
         if not is_plain:
             rgb = self.clear_picture(raster, parts, sky_weight)
             return mix(rgb, airlight, fog_share), fog_share
-        rgb = mix(self._land, airlight, fog_share)
+        if choose_kernels(self.backend, airlight, fog_share) == CPU:
+            rgb = self._fade_on_cpu(airlight, fog_share)
+        else:
+            rgb = mix(self._land, airlight, fog_share)
         mixed_share = fog_share.flatten()[pixels, None]
         mixed_airlight = airlight.expand_as(rgb).flatten(0, 1)[pixels]
         mixed_rgb = (1 - mixed_share) * self._weigh_mixed(sky_weight) + mixed_share * mixed_airlight
@@ -1012,7 +1068,7 @@ def _composed(
     return composed.float()
 
 
-def _classes(parts: Sequence[PosedGaussians], device: torch.device) -> Int16[Tensor, "N"]:
+def splat_classes(parts: Sequence[PosedGaussians], device: torch.device) -> Int16[Tensor, "N"]:
     """Return the class of every splat, in the order in which buffers count them; 0 where
     unknown.
     """

@@ -26,6 +26,7 @@ from augment.files.image_size import read_image_header
 from augment.files.recorded_images import ImageFault, decode_image, read_scaled
 from augment.memo import memo_of
 from augment.photo.lidar_view import elevation_rad, find_returns, highest_channel_rad, sweep_of
+from augment.photo.packed_matte import PackedMatte, pack_matte, unpack_matte
 from augment.photo.sky_regions import (
     EDGE,
     SKY,
@@ -98,7 +99,7 @@ def sky_matte(
 ) -> SkyMatte | None:
     """Return the sky matte of the image that a camera recorded, at the camera's size.
 
-    The regions of sky are found once for each recorded image, and kept in the scene's memo.
+    The matte is found once for each recorded image and size, and kept in the scene's memo.
 
     Args:
         scene: the scene.
@@ -120,7 +121,10 @@ def sky_matte(
             rgb = read_scaled(path, frame.cameras[camera.name], camera)
         except ImageFault:
             return None
-    return _refine(rgb, regions)
+    image = rgb
+    key = "sky matte", frame.index, camera.name, camera.width, camera.height, camera.cx, camera.cy
+    packed = memo_of(scene).get(key, lambda: _refine(image, regions))
+    return SkyMatte(*unpack_matte(packed, image))
 
 
 def find_sky_matte(
@@ -138,7 +142,7 @@ def find_sky_matte(
         lidar_top_rad: elevation of the LiDAR's highest channel, as the camera sees it.
     """
     regions = find_regions(rgb, camera, has_return, lidar_top_rad)
-    return None if regions is None else _refine(rgb, regions)
+    return None if regions is None else SkyMatte(*unpack_matte(_refine(rgb, regions), rgb))
 
 
 def find_regions(
@@ -240,57 +244,63 @@ def read_small_image(path: Path, camera: Camera) -> np.ndarray | None:
 # ---- From regions to shares ----------------------------------------------------------------------
 
 
-def _refine(rgb: np.ndarray, kinds: np.ndarray) -> SkyMatte:
+def _refine(rgb: np.ndarray, kinds: np.ndarray) -> PackedMatte:
     """Return the matte of an image from the kinds of pixels of a smaller one."""
     height, width = rgb.shape[:2]
-    share = np.zeros((height, width), np.float32)
-    sky_rgb = np.zeros_like(rgb)
-    surface_rgb = rgb.copy()
     is_sky_row = (kinds == SKY).any(axis=1)
     if not is_sky_row.any():
-        return SkyMatte(share, surface_rgb, sky_rgb)
+        return pack_matte(np.zeros((0, width), np.float32), rgb[:0], np.zeros((0, 0, 3), np.uint8))
     last = min(len(kinds), int(np.flatnonzero((kinds != 0).any(axis=1))[-1]) + 2)
     rows = min(height, -(-last * height // len(kinds)))
     kinds = kinds[:last]
     size = width, rows
+    share = np.zeros((rows, width), np.float32)
+    surface_rgb = rgb[:rows].copy()
     full_kinds = cv2.resize(kinds, size, interpolation=cv2.INTER_NEAREST)
     sky, noise = _sky_color(rgb[:rows], kinds)
     is_bright = _has_bright_surface(rgb[:rows], kinds, sky)
     is_bright = cv2.resize(is_bright, size, interpolation=cv2.INTER_NEAREST)
-    sky_rgb[:rows] = cv2.resize(sky, size, interpolation=cv2.INTER_LINEAR)
+    sky_rgb = cv2.resize(sky, size, interpolation=cv2.INTER_LINEAR)
     noise = cv2.resize(noise, size, interpolation=cv2.INTER_LINEAR)
     # Blocks fit into the processor's cache, and those far from any sky are left out.
     margin = math.ceil(_MARGIN_PX * max(1.0, width / 1920))
     for top, left in itertools.product(
         range(0, rows, _BLOCK_SIZE_PX[0]), range(0, width, _BLOCK_SIZE_PX[1])
     ):
-        first = max(top - margin, 0), max(left - margin, 0)
-        end = min(top + _BLOCK_SIZE_PX[0], rows), min(left + _BLOCK_SIZE_PX[1], width)
-        part = (
-            slice(first[0], min(end[0] + margin, rows)),
-            slice(first[1], min(end[1] + margin, width)),
+        block = (
+            slice(top, min(top + _BLOCK_SIZE_PX[0], rows)),
+            slice(left, min(left + _BLOCK_SIZE_PX[1], width)),
         )
-        if not full_kinds[part].any():
+        # Pixels of surfaces have no share, so that the rectangle around all others is enough.
+        x, y, block_width, block_height = cv2.boundingRect(full_kinds[block])
+        if block_width == 0:
             continue
+        first = top + y, left + x
+        end = first[0] + block_height, first[1] + block_width
+        start = max(first[0] - margin, 0), max(first[1] - margin, 0)
+        part = (
+            slice(start[0], min(end[0] + margin, rows)),
+            slice(start[1], min(end[1] + margin, width)),
+        )
         part_share = np.zeros(full_kinds[part].shape, np.float32)
         part_surface = rgb[part].copy()
         _share_of_sky(
-            rgb[part].copy(),
-            full_kinds[part].copy(),
-            sky_rgb[part].copy(),
-            noise[part].copy(),
-            is_bright[part].copy(),
+            rgb[part],
+            full_kinds[part],
+            sky_rgb[part],
+            noise[part],
+            is_bright[part],
             part_share,
             part_surface,
             width / 1920,
         )
         inner = (
-            slice(top - first[0], end[0] - first[0]),
-            slice(left - first[1], end[1] - first[1]),
+            slice(first[0] - start[0], end[0] - start[0]),
+            slice(first[1] - start[1], end[1] - start[1]),
         )
-        share[top : end[0], left : end[1]] = part_share[inner]
-        surface_rgb[top : end[0], left : end[1]] = part_surface[inner]
-    return SkyMatte(share, surface_rgb, sky_rgb)
+        share[first[0] : end[0], first[1] : end[1]] = part_share[inner]
+        surface_rgb[first[0] : end[0], first[1] : end[1]] = part_surface[inner]
+    return pack_matte(share, surface_rgb, sky)
 
 
 def _sky_color(rgb: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.light.common_exposure import AddedColors
+from augment.photo.parked_objects import ParkedObjects, take_objects
 from augment.photo.photo_objects import find_edges
 from augment.photo.recorded_base import Photo, blacken_parts
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
@@ -55,6 +56,8 @@ class LayerRenderer:
     """The parts before pruning, if `parts` have been pruned (`augment.detail.prune`); else None."""
     added_colors: AddedColors | None = None
     """Map of the colours that effects add, before the camera's colour map; None to leave them."""
+    parked: ParkedObjects | None = None
+    """Parked vehicles, whose edges snow and water take from the photo; None for none."""
     needs_lamp_inputs: bool = False
     """If True, effects also fill those fields of `RenderedView` that only lamps read."""
 
@@ -209,6 +212,8 @@ class LayerRenderer:
         """
         assert self.photo is not None and raster.alpha is not None
         with timed("photo: outlines"):
+            covers_scene = clip is not None or any(part.is_overlay for part in self.parts)
+            parked = take_objects(self.parts, self.parked if covers_scene else None, camera)
             edges = find_edges(
                 self.parts,
                 raster,
@@ -216,6 +221,7 @@ class LayerRenderer:
                 self.photo.pixels,
                 settings=settings,
                 clip=clip,
+                parked=parked,
                 backend=self.backend,
             )
         if edges is None:
@@ -223,7 +229,7 @@ class LayerRenderer:
         with timed("photo: background of objects"):
             is_needed = np.ascontiguousarray(edges.shows_background[edges.window])
             background = rasterize(
-                edges.background_of(parts),
+                edges.background_of(parked.hide(parts, edges.instance_ids)),
                 edges.window_of(camera),
                 buffers=buffers,
                 settings=settings,

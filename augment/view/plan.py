@@ -28,6 +28,7 @@ from augment.effects.effect import (
     ViewQuery,
 )
 from augment.light.cast_shadows import shadows_of
+from augment.light.sky_gloss import find_sky_gloss
 from augment.photo.recorded_base import check_base
 from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
@@ -43,6 +44,8 @@ LENS_BLUR_PASS = "lens blur"
 SENSOR_NOISE_PASS = "sensor noise"
 # Name of the pass that fades the cast shadows on the ground.
 SHADOW_PASS = "cast shadows"
+# Name of the pass that turns the blue sky in glossy surfaces grey.
+GLOSS_PASS = "gloss of a clear day"
 # Name of the pass that renders the scene without what lies on it.
 BARE_SURFACE_PASS = "bare surface"
 
@@ -86,6 +89,8 @@ class Plan:
     """If True, snow lies on the recording car in a recorded image; else the car stays dry."""
     sun_share: float
     """Share of the sun's light that arrives at the ground; 1 leaves cast shadows as they are."""
+    gloss_fade: float
+    """How much of the blue sky in glossy surfaces turns grey, 0 to 1."""
     sensor: Sensor
     """Lens and sensor of the recipe."""
     seed: int
@@ -167,6 +172,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     if finds_boxes and depth_buffer not in image_buffers:
         image_buffers.add(EXPECTED_DEPTH)
     sun_share, shadow_reason = _find_sun_share(recipe, scene)
+    gloss_fade, gloss_reason = _find_gloss_fade(recipe, scene)
     if sun_share < 1 and render.is_on_recorded:  # depth says where a photo shows the ground
         image_buffers.add(EXPECTED_DEPTH)
     effect_buffers = (p.buffers for p in effect_plans.values() if p.data is not None)
@@ -198,10 +204,12 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         is_on_photo=recipe.render.is_on_recorded,
         covers_own_car=recipe.render.is_on_recorded and recipe.render.own_car == "snowy",
         sun_share=sun_share,
+        gloss_fade=gloss_fade,
         sensor=recipe.camera,
         seed=recipe.seed,
         steps=(
             Step(SHADOW_PASS, sun_share < 1, shadow_reason, SCENE),
+            Step(GLOSS_PASS, gloss_fade > 0, gloss_reason, SCENE),
             *_all_steps(recipe, scene, effect_plans, buffers, bare_buffers, exposure),
         ),
     )
@@ -223,6 +231,22 @@ def _find_sun_share(recipe: Recipe, scene: Scene) -> tuple[float, str]:
     return share, (
         f"shadows have {shadows.luminance_ratio:.2f} of the light beside them; {reasons}"
     )
+
+
+def _find_gloss_fade(recipe: Recipe, scene: Scene) -> tuple[float, str]:
+    """Return how much of the blue sky in glossy surfaces turns grey, and the reason.
+
+    It is 0 where the scene's sky is not blue.
+    """
+    shares = [effect.gloss_share(recipe, scene) for effect in effects.EFFECTS]
+    share = math.prod(share for share, _ in shares)
+    if share == 1:
+        return 0.0, "no effect hides the blue sky"
+    gloss = find_sky_gloss(scene)
+    if gloss is None:
+        return 0.0, "the scene has no blue sky, or no classes"
+    reasons = "; ".join(reason for other, reason in shares if other < 1)
+    return 1 - share, f"the sky has a saturation of {gloss.saturation:.2f}; {reasons}"
 
 
 def _all_steps(

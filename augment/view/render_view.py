@@ -21,15 +21,19 @@ from torch import Tensor
 from augment import effects
 from augment.detail.prune import prune_parts
 from augment.effects.effect import EffectInScene, LabelInputs, RenderedView
+from augment.exposure.vehicle_cells import parked_vehicles
 from augment.light.cast_shadows import faded_shadows
 from augment.light.common_exposure import added_colors
+from augment.light.sky_gloss import GreyedGloss, find_sky_gloss
 from augment.output.layout import TRUST
+from augment.photo.greyed_photo import grey_photo, small_size
 from augment.photo.own_car import OwnCar, own_car_in_view
 from augment.photo.own_car_snow import cover_own_car
-from augment.photo.recorded_base import mix, open_photo
+from augment.photo.parked_objects import ObjectBox, ParkedObjects
+from augment.photo.recorded_base import mix, open_photo, splat_classes
 from augment.photo.trust import trust_mask
 from augment.render.backends import choose_backend, renders_on_gpu
-from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
+from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, SPLAT_IDS, RenderOutput
 from augment.render.composite import apply_color_map
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
@@ -45,6 +49,7 @@ from augment.view.images import ViewImages, start_images
 from augment.view.layers import LayerRenderer
 from augment.view.plan import (
     BARE_SURFACE_PASS,
+    GLOSS_PASS,
     LENS_BLUR_PASS,
     SENSOR_NOISE_PASS,
     SHADOW_PASS,
@@ -138,24 +143,27 @@ def render_buffers(
             )
             photo = open_photo(scene, camera, color_map, backend=backend, finds_sky=finds_sky)
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
+    if photo is not None:
+        vehicles = parked_vehicles(scene)
+        boxes = tuple(ObjectBox(v.centre_m, v.rotation, v.size_m) for v in vehicles)
+        layers = replace(layers, parked=ParkedObjects(boxes, bare_parts[0].gaussians))
     if plan.uses_common_exposure:
         layers = replace(layers, added_colors=added_colors(scene, camera))
-    is_fading = plan.sun_share < 1
+    is_fading = plan.sun_share < 1 or plan.gloss_fade > 0
     for effect in view.effects:
         if is_fading and _is_weather(effect):  # a style comes first, with maps of its own
-            layers = _fade_shadows(layers, scene, plan.sun_share)
+            layers = _cover_sky(layers, scene, camera, plan, own_car)
             is_fading = False
         layers = effect.hooks.edit_scene(effect, layers, camera)
     if is_fading:
-        layers = _fade_shadows(layers, scene, plan.sun_share)
+        layers = _cover_sky(layers, scene, camera, plan, own_car)
     if plan.prune > 0:
         with timed("prune"):
             parts = prune_parts(layers.parts, scene, camera, plan.prune)
             layers = replace(layers, parts=parts, unpruned_parts=layers.parts)
     car_rgb = None
     if own_car is not None and layers.photo is not None:
-        # Copied, since effects may write into the picture that they get.
-        car_rgb = layers.photo.own_car_colors[own_car.rows].clone()
+        car_rgb = layers.photo.own_car_colors(own_car.rows)
     rendered = _draw(view, layers, camera)
     if own_car is None or car_rgb is None:
         for effect in view.effects:
@@ -212,6 +220,68 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> RenderedView
         if rendered is not None:
             return rendered
     return RenderedView(*layers.render_with_sky(camera, view.buffers), layers)
+
+
+def _cover_sky(
+    layers: LayerRenderer, scene: Scene, camera: Camera, plan: Plan, own_car: OwnCar | None
+) -> LayerRenderer:
+    """Return the layers without what the sun and the blue sky of a clear day leave on surfaces.
+
+    Args:
+        layers: the layers, before any weather.
+        scene: the scene.
+        camera: the view.
+        plan: the plan of all views.
+        own_car: the recording car in a photo, which stays as it is; None where there is none.
+    """
+    if plan.sun_share < 1:
+        layers = _fade_shadows(layers, scene, plan.sun_share)
+    if plan.gloss_fade > 0:
+        layers = _grey_gloss(layers, scene, camera, plan.gloss_fade, own_car)
+    return layers
+
+
+def _grey_gloss(
+    layers: LayerRenderer, scene: Scene, camera: Camera, fade: float, own_car: OwnCar | None
+) -> LayerRenderer:
+    """Return the layers with the blue sky in glossy surfaces turned grey.
+
+    Args:
+        layers: the layers, before any weather.
+        scene: the scene.
+        camera: the view.
+        fade: how much of the blue turns grey, 0 to 1.
+        own_car: the recording car in a photo, which stays as it is; None where there is none.
+    """
+    with timed(GLOSS_PASS):
+        gloss = find_sky_gloss(scene)
+        if gloss is None:
+            return layers
+        greyed = GreyedGloss(gloss, fade)
+        photo = layers.photo
+        if photo is not None:
+            small_camera = camera.resized(*small_size(camera.width, camera.height))
+            raster = rasterize(
+                layers.parts,
+                small_camera,
+                buffers=frozenset({SPLAT_IDS}),
+                settings=replace(layers.settings, sh_degree=0),
+                backend=layers.backend,
+            )
+            assert raster.splat_ids is not None
+            splat_ids = raster.splat_ids.cpu().long()
+            # The last class is that of pixels without a splat, whose id is -1.
+            classes = splat_classes(layers.parts, splat_ids.device)
+            classes = torch.cat([classes, torch.tensor([-1], dtype=torch.int16)])[splat_ids]
+            photo = grey_photo(photo, classes.numpy(), gloss, fade)
+            if own_car is not None and layers.photo is not None:
+                is_car = own_car.weights[..., None] > 0
+                recorded_rows = layers.photo.pixels[own_car.rows]
+                pixels = photo.pixels.copy()
+                pixels[own_car.rows] = np.where(is_car, recorded_rows, pixels[own_car.rows])
+                photo = replace(photo, pixels=pixels)
+        parts = tuple(part if part.is_overlay else greyed.apply_to(part) for part in layers.parts)
+    return replace(layers, parts=parts, photo=photo)
 
 
 def _fade_shadows(layers: LayerRenderer, scene: Scene, sun_share: float) -> LayerRenderer:
@@ -304,17 +374,27 @@ def _with_own_car(
 
     Args:
         rendered: the picture, which is written into.
-        first_view: the picture before effects edited it. It may be the photo, and is copied.
+        first_view: the picture before effects edited it. If it is a picture that others read, it
+            is copied.
         own_car: the recording car in it.
         car_rgb: colours of the car's rows, [h, W, 3].
     """
     with timed("recording car"):
-        if rendered.rgb is first_view.rgb:
+        if rendered.rgb is first_view.rgb and _is_shared(first_view):
             rendered = replace(rendered, rgb=rendered.rgb.clone())
         weights = torch.from_numpy(own_car.weights).to(rendered.rgb.device)
         rows = rendered.rgb[own_car.rows]
         rows.copy_(mix(rows, car_rgb, weights))
     return rendered
+
+
+def _is_shared(rendered: RenderedView) -> bool:
+    """Return True if a picture is the photo itself, or one of the scene's buffers."""
+    raster_rgb = rendered.raster.rgb
+    if raster_rgb is not None and raster_rgb.data_ptr() == rendered.rgb.data_ptr():
+        return True
+    photo = rendered.layers.photo
+    return photo is None or photo.is_land(rendered.rgb)
 
 
 def _masks(view: ViewPlan, rendered: RenderedView, own_car: OwnCar | None) -> dict[str, Tensor]:

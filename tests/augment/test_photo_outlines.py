@@ -78,6 +78,17 @@ def test_without_an_edge_in_the_photo_an_outline_keeps_its_form():
     assert found[inner].all() and not found[~thing(6)].any()
 
 
+def test_an_outline_leaves_the_image_where_the_photo_shows_it():
+    """The lower edge of a car that the image cuts is nearly level, and so meets the border late."""
+    rows, columns = np.mgrid[: SIZE[1], : SIZE[0]]
+    true = (rows > 100) & (columns > 60) & (rows + 0.3 * columns < 330)
+    grown = (rows > 92) & (columns > 52) & (rows + 0.3 * columns < 342)
+    outline = outlined(grown, paint(true, 30, 120), 24.0)
+    below = (rows > 250) & (columns > 150)
+    # 40 columns of the silhouette's 270th row are not the car's.
+    assert (outline ^ true)[below].sum() < 0.25 * (grown ^ true)[below].sum()
+
+
 def road_and_car() -> tuple[Camera, tuple[PosedGaussians, ...]]:
     """Return a camera above a road, and a car's back 8 m ahead as an actor of its own."""
     scene = drive(sheet((0.6, 40), (-20, 20)), ground_z_m=0.0)
@@ -171,3 +182,15 @@ def test_without_moving_parts_there_are_no_edges():
         find_edges(parts[:1], raster, camera, pixels, settings=RasterSettings(), backend="cpu")
         is None
     )
+
+
+def test_pixels_that_a_car_lacks_take_whole_values_of_pixels_that_were_looked_at():
+    """Patterns within the pixels of the small copy must not be repeated beside them."""
+    camera, parts = road_and_car()
+    large = camera.resized(2 * SIZE[0], 2 * SIZE[1])
+    raster = rasterize(parts, large, buffers={"alpha", "expected_depth"})
+    pixels = paint(photo_of_car(large, parts, 4), 30, 120)
+    edges = find_edges(parts, raster, large, pixels, settings=RasterSettings(), backend="cpu")
+    assert edges is not None and len(edges.sources) > 100
+    rows, columns = np.divmod(edges.sources, large.width)
+    assert (rows % 2 == 0).all() and (columns % 2 == 0).all()

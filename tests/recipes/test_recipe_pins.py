@@ -34,7 +34,7 @@ PRESETS = {
     "clear": "1e1fd554a7f9ba30",
     "deep-flood": "960c1c744bff6617",
     "deep-snow": "22022722fefe7740",
-    "dense-fog": "7f809053755e9a79",
+    "dense-fog": "0940ca220faf4622",
     "downpour": "568fe3732cde5b26",
     "drizzle": "8c832df0db003d51",
     "dusk-lamps": "13198c890a3e0e43",
@@ -55,7 +55,7 @@ PRESETS = {
     "storm": "b93e206ac51504d1",
     "street-flood": "57bcd16a1256403d",
     "winter-day": "dc738d7355359818",
-    "winter-fog": "f4555144c486c662",
+    "winter-fog": "3ed30feff48ae816",
     "winter-street": "6c8f8fad8d6e2027",
 }
 

@@ -82,7 +82,7 @@ USEFUL_ENDS = {
     "camera.lens_drops.focal_mm": (1.0, 100.0),
     "camera.lens_drops.f_number": (0.9, 22.0),
     "camera.lens_drops.wiper_s": (0.5, 60.0),
-    "light.sky_luminance_cd_m2": (0.001, 10.0),  # far from towns; sunset
+    "light.sky_luminance_cd_m2": (0.01, 100.0),  # a small town; shortly after sunset
     "light.moon_lux": (0.0, 0.3),  # a full moon
     "light.glow": (0.1, 10.0),
     "light.street_spacing_m": (10.0, 100.0),

@@ -57,7 +57,11 @@ class FallingEffect(Effect):
 
     def reads_splats(self, recipe: Recipe) -> bool:
         section = self.section_of(recipe)
-        return section is not None and section.has_effect and section.sun_fade > 0
+        return (
+            section is not None
+            and section.has_effect
+            and max(section.sun_fade, section.blue_fade) > 0
+        )
 
     def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
         section = self.section_of(recipe)
@@ -66,8 +70,16 @@ class FallingEffect(Effect):
         share = 1 - section.sun_fade
         return share, f"{self.section} leaves {100 * share:.0f} % of the sun's light"
 
+    def gloss_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
+        section = self.section_of(recipe)
+        if section is None or not section.has_effect or section.blue_fade == 0:
+            return 1.0, ""
+        share = 1 - section.blue_fade
+        return share, f"{self.section} leaves {100 * share:.0f} % of the sky's blue"
+
     def precompute(self, context: JobContext) -> None:
-        if any(map(self.reads_splats, context.recipes)):
+        sections = map(self.section_of, context.recipes)
+        if any(s is not None and s.has_effect and s.sun_fade > 0 for s in sections):
             precompute_shadows(context.scene)
 
     def kernel_key(self, section: Rain | Snowfall) -> Any:

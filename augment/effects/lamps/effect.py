@@ -75,6 +75,14 @@ from recipes.schema import Recipe
 MIN_ADDED = 3e-5
 
 
+# Linear light of a single lamp that may be left out: half a grey level of a black pixel.
+MIN_LAMP_LIGHT = 1.5e-4
+# The same in fog at dusk and night, where lit air leaves no pixel black.
+MIN_LAMP_LIGHT_IN_FOG = 4e-4
+# The same by day, whose fog is some hundred grey levels bright: half a level there.
+MIN_LAMP_LIGHT_BY_DAY = 1e-3
+
+
 class LampsEffect(Effect):
     """The hour of the day, lamps, and the camera in the dark."""
 
@@ -165,7 +173,10 @@ class LampsEffect(Effect):
         # Light of the picture at 1 cd/m2, and the factor of the picture's own.
         exposure = exposure_of_picture(plan, effect.scene, effect.lit_scene, camera)
         gain = plan.hour.white_cd_m2 / white * exposure.scale if is_dark else 1.0
-        added = add_lamp_light(effect, view, camera, rgb, white, MIN_ADDED / exposure.scale)
+        least_light = MIN_LAMP_LIGHT if is_dark else MIN_LAMP_LIGHT_BY_DAY
+        if is_dark and plan.extinction_per_m > 0:
+            least_light = MIN_LAMP_LIGHT_IN_FOG
+        added = add_lamp_light(effect, view, camera, rgb, white, least_light / exposure.scale)
         with timed(RELIGHT):
             if added is None and not is_dark:
                 return view

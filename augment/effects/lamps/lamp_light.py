@@ -19,6 +19,7 @@ from augment.lamps.recorded_lamps import find_recorded_lamps, vehicle_pixels
 from augment.lamps.surface_light import surface_light
 from augment.lamps.wet_glints import add_wet_glints
 from augment.render.buffers import REFERENCE
+from augment.render.composite import unit_depth_coordinates
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.scatter import scattered_share
 from augment.scene.cameras import Camera
@@ -26,6 +27,8 @@ from augment.timing import timed
 
 # Opacity of a pixel up to which it shows no surface that hides a lamp.
 MIN_ALPHA = 1e-3
+# Width of the pixels of halos by day, over that at night: they are faint.
+DAY_HALO_STEPS = 2
 
 
 def add_lamp_light(
@@ -63,15 +66,16 @@ def add_lamp_light(
     surface_m = np.where(alpha > MIN_ALPHA, z, np.float32(np.inf))
     if not air.is_clear:
         with timed(AIR):
-            lengths = camera.ray_lengths().numpy()
-            distance_m = np.where(depth_m > 0, depth_m * lengths, np.float32(np.inf))
+            u, v = unit_depth_coordinates(camera)
+            distance_m = np.sqrt(1 + u[None, :] ** 2 + v[:, None] ** 2) * depth_m
+            distance_m[depth_m <= 0] = np.inf
             added += air_light(
                 lamps,
                 camera,
-                distance_m.astype(np.float32),
+                distance_m,
                 air,
                 num_points=plan.lamp_points,
-                step_px=plan.lamp_halo_px,
+                step_px=plan.lamp_halo_px * (1 if plan.hour.is_dark else DAY_HALO_STEPS),
                 threshold_cd_m2=threshold_cd_m2,
                 visible_shares=lamp_visibility(
                     lamps, camera, surface_m, alpha, radius_m=HALO_RADIUS_M

@@ -139,6 +139,13 @@ class SnowEffect(Effect):
         share = 1 - snow.sun_fade
         return share, f"{self.section} leaves {100 * share:.0f} % of the sun's light"
 
+    def gloss_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
+        snow = self.section_of(recipe)
+        if snow is None or not snow.has_effect or snow.blue_fade == 0:
+            return 1.0, ""
+        share = 1 - snow.blue_fade
+        return share, f"{self.section} leaves {100 * share:.0f} % of the sky's blue"
+
     def prepare(self, effect: EffectInScene) -> SnowLayers:
         return build_snow_layers(
             effect.scene, effect.settings, effect.lit_scene, backend=effect.backend
