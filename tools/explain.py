@@ -162,17 +162,17 @@ def measure_parts(recipe: Recipe, scene: Scene, count: int = VIEWS) -> list[dict
     parts = []
     for in_scene in plan.active_effects(scene):
         effect = in_scene.hooks
-        others = effect.without_parts(in_scene, recipe)
+        recipes_without = effect.without_parts(in_scene, recipe)
         views = [effect.count_parts(in_scene, camera) for camera in cameras]
         counts = {
             name: _mean_counts([view[name] for view in views])
-            for name in others
+            for name in recipes_without
             if any(view.get(name) for view in views)
         }
         if not counts:
             continue
         seconds = _processor_seconds(
-            scene, cameras, {name: others[name] for name in counts} | {"": recipe}
+            scene, cameras, {name: recipes_without[name] for name in counts} | {"": recipe}
         )
         parts += [
             {

@@ -23,6 +23,7 @@ from augment.light.srgb import display_from_linear
 from augment.scene.boxes import WorldBoxes
 from augment.view.plan import make_plan
 from augment.view.render_view import render_view
+from augment.view.weathered_sweep import weathered_sweep
 from recipes.schema import Recipe
 from tests.streets import LABELLED_STREET, open_fast_street
 
@@ -208,6 +209,16 @@ def test_manifest_has_the_exposure_that_a_recipe_fixes(street, camera) -> None:
     by_day = measure_exposure(camera, inputs_of(street, camera, light(vehicles="on")))
     assert set(by_day) == set(EXPOSURE_COLUMNS) - {"light_exposure_ms", "light_iso"}
     assert measure_exposure(camera, inputs_of(street, camera, light(**OFF))) == {}
+
+
+def test_sweeps_are_the_same_at_night(street) -> None:
+    frame = street.frames[0].index
+    sweep = street.lidar(frame)
+    by_day = weathered_sweep(street, light(), frame, sweep)
+    by_night = weathered_sweep(street, light(time="night", vehicles="on"), frame, sweep)
+    assert by_day.columns.keys() == by_night.columns.keys()
+    for name, column in by_day.columns.items():
+        assert np.array_equal(column, by_night.columns[name]), name
 
 
 def test_damaged_boxes_have_no_light(street, camera) -> None:

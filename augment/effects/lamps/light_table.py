@@ -64,6 +64,7 @@ LIGHT_TABLE = BoxTable(
         "glare_fraction",
     ),
     derived_columns={"glare_fraction": pixel_fraction("glare_pixels")},
+    contrast_column="luminance_contrast",
 )
 # Manifest columns of what holds for a whole image: light on level ground, luminance that saturates
 # the sensor, exposure time, ISO speed, number of lamps that light the image.

@@ -42,8 +42,10 @@ def count_lamps(plan: LightPlan, scene: Scene, camera: Camera) -> dict[str, dict
         replace(dark, light=plan.light),
     )
     counts: dict[str, dict[str, int]] = {}
-    for name, lone in zip(SOURCES, plans, strict=True):
-        kinds, numbers = np.unique(lamps_of_view(lone, scene, camera).kinds, return_counts=True)
+    for name, plan_of_source in zip(SOURCES, plans, strict=True):
+        kinds, numbers = np.unique(
+            lamps_of_view(plan_of_source, scene, camera).kinds, return_counts=True
+        )
         counts[name] = {
             LampKind(kind).name.lower(): int(number)
             for kind, number in zip(kinds, numbers, strict=True)
