@@ -117,7 +117,7 @@ class Light(EffectModel):
     """Of the camera at dusk and night: auto is chosen once for a scene by the light of sky and
     lamps on its road, the same for all cameras and times, with exposure_ms and iso as its limits;
     fixed takes these as they are."""
-    exposure_ms: Number = Field(default=16.0, gt=0, le=1000)
+    exposure_ms: Number = Field(default=16.0, ge=0.001, le=1000)
     """How long the shutter is open."""
     iso: Number = Field(default=6400.0, ge=1, le=1e6)
     """Sensitivity of the sensor."""

@@ -182,13 +182,6 @@ def test_cameras_with_other_recorded_exposures_show_one_night(street, camera) ->
     assert by_day[1] / by_day[0] == pytest.approx(0.7, abs=0.01)
 
 
-def test_glare_mask_holds_pixels_that_lamps_saturate(street, camera) -> None:
-    view = render_view(street, camera, light(time="night", noise=0.0))
-    mask = view.masks["glare"] > 0
-    assert 0 < mask.mean() < 0.2
-    assert (view.rgb[mask].max(-1) > 220).all()
-
-
 def test_explain_names_lamps_and_their_passes(street, camera) -> None:
     plan = make_plan(light(time="night"), street)
     steps = {step.name: step for step in plan_view(plan, street, camera).steps}

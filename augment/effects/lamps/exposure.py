@@ -62,6 +62,17 @@ class Exposure:
     reason: str
     """The exposure in words."""
 
+    exposure_ms: float | None = None
+    """Time that the shutter is open; None for the recorded exposure."""
+
+    iso: float | None = None
+    """Sensitivity of the sensor; None for the recorded exposure."""
+
+    @property
+    def white_cd_m2(self) -> float:
+        """Return the luminance that saturates the sensor, cd/m2."""
+        return 1 / self.scale
+
 
 def electrons_per_cd_m2(exposure_ms: float, f_number: float) -> float:
     """Return the electrons that a pixel counts at 1 cd/m2."""
@@ -73,7 +84,8 @@ def fixed_exposure(light: Light) -> Exposure:
     """Return the exposure that the recipe gives."""
     scale = _image_lux(light.f_number) * light.exposure_ms / 1000 * light.iso / SATURATION_LUX_S
     words = f"{light.exposure_ms:g} ms, ISO {light.iso:g}, f/{light.f_number:g}"
-    return Exposure(scale, electrons_per_cd_m2(light.exposure_ms, light.f_number), words)
+    electrons = electrons_per_cd_m2(light.exposure_ms, light.f_number)
+    return Exposure(scale, electrons, words, light.exposure_ms, light.iso)
 
 
 def auto_exposure(light: Light, road_cd_m2: float) -> Exposure:
@@ -92,7 +104,8 @@ def auto_exposure(light: Light, road_cd_m2: float) -> Exposure:
         f"auto: {exposure_ms:.3g} ms, ISO {iso:.3g}, f/{light.f_number:g} "
         f"for a road of {road_cd_m2:.3g} cd/m2"
     )
-    return Exposure(scale, electrons_per_cd_m2(exposure_ms, light.f_number), words)
+    electrons = electrons_per_cd_m2(exposure_ms, light.f_number)
+    return Exposure(scale, electrons, words, exposure_ms, iso)
 
 
 def response(linear: np.ndarray) -> np.ndarray:

@@ -72,7 +72,7 @@ def relight(
             _NONE if added_cd_m2 is None else np.ascontiguousarray(added_cd_m2),
             np.array([gain, added_gain, MIN_LAMP_LIGHT], np.float32),
             np.float32(min_added),
-            _light_table(),
+            light_table(),
             _code_table(),
             out,
             mask,
@@ -100,7 +100,7 @@ def halve_excess(
         return excess.reshape(shape[0], 2, shape[1], 2, 3).mean((1, 3)).astype(np.float32)
     out = np.empty(shape, np.float32)
     with kernel_threads(ROWS_PER_CHUNK):
-        light_kernels.halve_excess(np.ascontiguousarray(rgb), _light_table(), out)
+        light_kernels.halve_excess(np.ascontiguousarray(rgb), light_table(), out)
     return out
 
 
@@ -139,7 +139,7 @@ def develop(
                 _NONE if glare is None else glare,
                 _NO_DRAWS if draws is None else draws,
                 np.array([CROSSTALK, per_light, of_reading, *factors, MAX_LEAKING], np.float32),
-                _light_table(),
+                light_table(),
                 _developed_table(),
                 out,
             )
@@ -156,7 +156,7 @@ def develop(
 
 
 @functools.cache
-def _light_table() -> np.ndarray:
+def light_table() -> np.ndarray:
     """Return the light of codes from 0 to _MAX_CODE."""
     codes = np.arange(round(_MAX_CODE * CODE_STEPS) + 2) / CODE_STEPS
     return linear_from_display(codes).astype(np.float32)
@@ -205,7 +205,7 @@ def find_reflectance(
                 np.zeros((0, 0), np.float32) if fog_share is None else fog_share,
                 airlight,
                 np.array([white, MIN_REFLECTANCE, MAX_REFLECTANCE], np.float32),
-                _light_table(),
+                light_table(),
                 out,
             )
         return out

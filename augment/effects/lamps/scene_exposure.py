@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from augment.effects.lamps.exposure import Exposure, auto_exposure, fixed_exposure, white_balance
-from augment.effects.lamps.hour import mean_sky_tint
+from augment.effects.lamps.hour import mean_sky_tint, white_of_picture
 from augment.effects.lamps.plan import LightPlan
 from augment.effects.lamps.view_lamps import fixed_lamps
 from augment.lamps.lamp import Lamps, color_of_temperature
 from augment.lamps.surface_light import illuminance
 from augment.memo import memo_of
+from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 
 # Reflectance of a road.
@@ -71,6 +72,24 @@ def _road_color(plan: LightPlan, scene: Scene) -> Float64[np.ndarray, "3"]:
         lux += illuminance(lamps, places, _upwards(places)) @ lamps.colors
     lux += _own_lux(plan) * color_of_temperature(OWN_K)
     return np.median(lux, axis=0)
+
+
+def exposure_of_picture(
+    plan: LightPlan, scene: Scene, lit_scene: Scene, camera: Camera
+) -> Exposure:
+    """Return the exposure of a picture: by day the recorded one, by the picture's white.
+
+    Args:
+        plan: the plan.
+        scene: the scene.
+        lit_scene: the scene as earlier effects relit it.
+        camera: the view.
+    """
+    if plan.hour.is_dark:
+        return exposure_of(plan, scene)
+    color_map = scene.color_map(camera) if plan.uses_color_map else None
+    white = white_of_picture(lit_scene, color_map)
+    return Exposure(white / max(plan.hour.white_cd_m2, 1e-9), 1.0, "recorded")
 
 
 def metered_luminance(plan: LightPlan, scene: Scene) -> float:
