@@ -187,7 +187,7 @@ class LampsEffect(Effect):
             uses_kernels = effect.backend != REFERENCE
             numbers = gain, exposure.scale, min_added
             out, mask = relight(rgb, added, *numbers, uses_kernels=uses_kernels)
-        if not is_dark and mask.any():
+        if not is_dark and added is not None and mask.any():
             with timed(GLARE):
                 glare = _glare(out, camera, plan.light.glare, uses_kernels=uses_kernels)
                 if glare is not None:
