@@ -92,6 +92,14 @@ def test_labels_of_light_have_no_infinite_number(fields: dict[str, object]):
     assert all(math.isfinite(value) for value in measure_exposure(camera, inputs).values())
 
 
+def test_rain_falls_through_lit_fog(street, camera):
+    for scale_height_m in (None, 20.0):
+        smog = {"visibility_m": 150.0, "blend": "linear", "scale_height_m": scale_height_m}
+        weather = {"smog": smog, "rain": {"rate_mm_h": 10.0, "spray": False}}
+        recipe = recipe_of(weather=weather, light={"time": "night", "noise": 0.0})
+        assert render_view(street, camera, recipe).rgb.max() > 200
+
+
 @pytest.mark.parametrize(
     ("field", "name"),
     [

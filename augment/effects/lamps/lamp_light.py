@@ -118,14 +118,15 @@ def add_lamp_light(
             )
     if plan.hour.is_dark and plan.has_drops:
         with timed(DROPS):
-            eye = camera.centre.numpy()
+            eye = camera.centre.numpy()[None]
+            extinction_per_m = float(air.mean_extinction_per_m(eye, eye + 1.0)[0])
             for cover in view.drop_covers:
                 add_drop_light(
                     added,
                     lamps,
                     camera,
                     cover,
-                    extinction_per_m=float(air.mean_extinction_per_m(eye, eye + 1.0)),
+                    extinction_per_m=extinction_per_m,
                     min_luminance_cd_m2=threshold_cd_m2,
                 )
     with timed(EMITTERS):
