@@ -117,12 +117,15 @@ class Light(EffectModel):
     """Of the camera at dusk and night: auto is chosen once for a scene by the light of sky and
     lamps on its road, the same for all cameras and times, with exposure_ms and iso as its limits;
     fixed takes these as they are."""
-    exposure_ms: Number = Field(default=16.0, gt=0, le=1000)
+    exposure_ms: Number = Field(default=16.0, ge=0.001, le=1000)
     """How long the shutter is open."""
     iso: Number = Field(default=6400.0, ge=1, le=1e6)
     """Sensitivity of the sensor."""
     f_number: Number = Field(default=2.0, ge=0.5, le=32)
     """Focal length over the diameter of the lens."""
+    white_balance: Unit = 0.6
+    """How far the camera takes out the colour of the light on the road at dusk and night: 0 keeps
+    that of daylight, so that warm lamps turn all brown, 1 makes the road grey."""
     glare: Number = Field(default=1.0, ge=0, le=20)
     """Light that lens and glass scatter around bright lamps: 1 for a clean lens, whose halo has 3 %
     of it; 3 to 10 wet or dirty, 0 none."""

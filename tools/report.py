@@ -69,6 +69,8 @@ MAX_BOX_FILES = 40  # the number of label files in which boxes are counted
 MAX_TABLES = 6  # the number of variants of each recipe whose box tables are read
 MAX_SWEEPS = 3  # the number of sweeps of each recipe that are read
 VISIBILITY_STEPS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95)  # lower bounds of the bins; the last is open
+# Bounds of the bins of luminance contrast; the first bin begins at -1, the last is open.
+CONTRAST_STEPS = (-0.2, 0.2, 1.0, 5.0, 20.0)
 _BOX = {"frame": pa.int64(), "camera": pa.string(), "box": pa.int64()}
 _CODES = {
     codes.UNCHANGED: "unchanged",
@@ -176,6 +178,7 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
         "classes": count_classes(finished, files),
         "trainers": read_trainers(files),
         "visible": share_visible(finished, sample_recipes, files),
+        "contrast": share_contrast(finished, sample_recipes, files),
         "codes": share_codes(finished, sample_recipes, files),
         "buffers": gallery.buffers(with_images),
         "recipes": recipes,
@@ -360,6 +363,39 @@ def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> di
     counts_by_recipe, sample = _count_by_recipe(table, recipes, columns, MAX_TABLES, count_boxes)
     bounds = [f"{100 * step:.0f}" for step in VISIBILITY_STEPS] + ["100"]
     keys = {i: (f"{a}–{b} %", f"s{i}") for i, (a, b) in enumerate(itertools.pairwise(bounds))}
+    return _bars(counts_by_recipe, sample, "box", keys)
+
+
+def share_contrast(
+    table: pa.Table, recipes: list[str], files: ReportFiles
+) -> dict[str, Any] | None:
+    """Count boxes by their luminance contrast to what is about them, in CONTRAST_STEPS.
+
+    None where no image has boxes with a contrast.
+    """
+    of_kind = {f"{kind}_path": t for kind, t in box_tables().items() if t.contrast_column}
+    columns = [column for column in of_kind if column in table.column_names]
+
+    def count_boxes(paths: dict[str, str | None]) -> Counter[int] | None:
+        total = Counter[int]()
+        for column, path in paths.items():
+            name = of_kind[column].contrast_column
+            part = None if path is None else files.read_columns(path, (name,))
+            if part is None or not part.num_columns:
+                continue
+            if part.schema.types != [pa.float64()]:
+                return files.note(str(path), "its columns are not of the types that a job writes")
+            contrasts = pc.fill_null(part[name], np.nan).to_numpy()
+            bins = np.digitize(contrasts[np.isfinite(contrasts)], CONTRAST_STEPS)
+            total += Counter(bins.tolist())
+        return total
+
+    if not columns:
+        return None
+    counts_by_recipe, sample = _count_by_recipe(table, recipes, columns, MAX_TABLES, count_boxes)
+    bounds = [f"{step:g}".replace("-", "−") for step in (-1.0, *CONTRAST_STEPS)]
+    names = [f"{a} to {b}" for a, b in itertools.pairwise(bounds)] + [f"over {bounds[-1]}"]
+    keys = {i: (name, f"s{i}") for i, name in enumerate(names)}
     return _bars(counts_by_recipe, sample, "box", keys)
 
 

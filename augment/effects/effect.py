@@ -10,10 +10,10 @@ The hooks of `Effect`, by when they are called:
     once a recipe and scene    plan_in_scene    facts, with a reason for every pass
                                sun_share        sunlight on the ground
                                gloss_share      blue sky in glossy surfaces
-    once a scene               prepare, relight, precompute
+    once a scene               prepare, relight, precompute, without_parts
     once a view                cameras, visibility, edit_scene, draw, edit_image,
-                               visible_mask, front_surface, expose
-    labels of a view           measure_boxes, grow_boxes, box_table
+                               visible_mask, front_surface, expose, count_parts
+    labels of a view           measure_view, measure_boxes, grow_boxes, box_table
     once a sweep               intersect_beams, attenuate_beams
 """
 
@@ -203,6 +203,9 @@ class RenderedView:
     drop_covers: tuple[DropCover, ...] = ()
     """Drops and flakes that lamps light; none unless `layers.needs_lamp_inputs`."""
 
+    luminance_cd_m2: Float[Tensor, "H W"] | None = None
+    """Luminance of the picture, for labels; None unless an effect measures it."""
+
 
 @dataclass(frozen=True, eq=False)
 class FrontSurface:
@@ -236,6 +239,9 @@ class LabelInputs:
     water_level_z_m: float | None
     """Height of the water that is drawn: scene world, metres."""
 
+    luminance_cd_m2: Float32[np.ndarray, "H W"] | None = None
+    """Luminance of the picture, as `RenderedView` has it; None where no effect measures it."""
+
 
 class Effect:
     """One effect. A hook that is not overridden leaves things as they are."""
@@ -257,6 +263,9 @@ class Effect:
 
     share_column: ClassVar[str | None] = None
     """Manifest column with the share of an image's pixels that lie in the mask."""
+
+    measured_columns: ClassVar[tuple[str, ...]] = ()
+    """Manifest columns of the numbers that `measure_view` returns; null for other images."""
 
     box_table: ClassVar[BoxTable | None] = None
     """Label table: how the effect changes the labelled boxes."""
@@ -358,7 +367,18 @@ class Effect:
         The results are `put` into the scene's memo as shared.
         """
 
+    def without_parts(self, effect: EffectInScene, recipe: Recipe) -> dict[str, Recipe]:
+        """Return recipes that each lack one part of the effect, by the part's name.
+
+        `explain` measures by them how long each part takes, and `count_parts` how many it has.
+        """
+        return {}
+
     # ---- Once a view -----------------------------------------------------------------------------
+
+    def count_parts(self, effect: EffectInScene, camera: Camera) -> dict[str, dict[str, int]]:
+        """Return how many things of each kind a view has, by the parts of `without_parts`."""
+        return {}
 
     def cameras(self, effect: EffectInScene, camera: Camera) -> tuple[Camera, ...] | None:
         """Return the cameras that look into the scene for this view; None for `camera` alone."""
@@ -387,19 +407,17 @@ class Effect:
         """Return the finished picture with the effect on it."""
         return view
 
-    def expose(
-        self, effect: EffectInScene, rgb: Float[Tensor, "H W 3"], camera: Camera
-    ) -> Float[Tensor, "H W 3"]:
+    def expose(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         """Return the picture as the camera's sensor records it.
 
         It is called after `edit_image` of all effects, the camera's colour map and the lens's blur.
 
         Args:
             effect: the effect in the scene.
-            rgb: the picture, display-encoded, not clamped; it may be written into.
+            view: the picture, not clamped; its colours may be written into.
             camera: the view.
         """
-        return rgb
+        return view
 
     def reads_neighbours(self, effect: EffectInScene) -> bool:
         """Return True if pixels of `edit_image` depend on other pixels of its picture."""
@@ -420,6 +438,15 @@ class Effect:
         return None
 
     # ---- Labels, in the writing threads ----------------------------------------------------------
+
+    def measure_view(self, camera: Camera, inputs: LabelInputs) -> dict[str, float]:
+        """Return numbers of `measured_columns` that hold for an image.
+
+        Args:
+            camera: camera of the image.
+            inputs: the plan of the effect, and what is measured in this view.
+        """
+        return {}
 
     def measure_boxes(
         self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs

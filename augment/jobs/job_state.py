@@ -416,7 +416,7 @@ class VariantState:
             checksum=outcome.checksum,
             lidar=outcome.lidar,
             lidar_note=outcome.lidar_note,
-            shares=outcome.shares,
+            measures=outcome.measures,
         )
 
 

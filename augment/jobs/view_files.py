@@ -16,9 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from augment import effects
 from augment.output.atomic import write_atomic
 from augment.output.codecs import encode_depth, encode_ids, encode_image, encode_mask
 from augment.output.layout import TRUST, mask_share_columns
+from augment.scene.cameras import Camera
 from augment.view.results import ViewResult
 from recipes.schema import Recipe
 
@@ -35,8 +37,8 @@ class ViewFiles:
     """Seconds of encoding."""
     write_s: float
     """Seconds of writing."""
-    shares: Mapping[str, float] = field(default_factory=dict)
-    """Shares of the image's pixels in masks, by the manifest's column."""
+    measures: Mapping[str, float] = field(default_factory=dict)
+    """Numbers that were measured of the image, by the manifest's column."""
 
 
 # Field of a view, and the function that encodes it, by kind of path.
@@ -48,12 +50,16 @@ _BUFFERS: Mapping[str, tuple[str, Callable[[Any], bytes]]] = {
 
 
 def write_view(
-    out_dir: Path, paths: Mapping[str, str | None], view: ViewResult, recipe: Recipe
+    out_dir: Path, paths: Mapping[str, str | None], view: ViewResult, camera: Camera, recipe: Recipe
 ) -> ViewFiles:
     """Encode and write all files of a view that `check_view` has passed.
 
     Args:
+        out_dir: Output folder.
         paths: Paths relative to the output folder, by kind.
+        view: The view.
+        camera: Camera of the view, at the written resolution.
+        recipe: Recipe of the view.
 
     Raises:
         ValueError: A buffer has another type or shape than ViewResult says.
@@ -75,9 +81,18 @@ def write_view(
     for relative, data in files.items():
         write_atomic(out_dir / relative, data, clear=False)
     write_s = time.perf_counter() - encoded_s
+    measures = _measure(view, camera)
+    return ViewFiles(checksum, tuple(files), encoded_s - start_s, write_s, measures)
+
+
+def _measure(view: ViewResult, camera: Camera) -> dict[str, float]:
+    """Return the numbers that the manifest has of a view: shares of masks, and effects' numbers."""
     columns = {mask: c for mask, c in mask_share_columns().items() if mask in view.masks}
-    shares = {column: _mean_share(view.masks[mask]) for mask, column in columns.items()}
-    return ViewFiles(checksum, tuple(files), encoded_s - start_s, write_s, shares)
+    measures = {column: _mean_share(view.masks[mask]) for mask, column in columns.items()}
+    for effect in effects.EFFECTS:
+        if effect.measured_columns and effect.name in view.effects:
+            measures |= effect.measure_view(camera, view.effects[effect.name])
+    return measures
 
 
 def _mean_share(mask: np.ndarray) -> float:

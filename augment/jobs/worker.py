@@ -93,8 +93,8 @@ class Outcome:
     """As `note` of PassedLidar."""
     box_weather: BoxWeather = field(default_factory=dict)
     """Measured numbers of the image's boxes."""
-    shares: Mapping[str, float] = field(default_factory=dict)
-    """Shares of the image's pixels, as of ViewFiles."""
+    measures: Mapping[str, float] = field(default_factory=dict)
+    """Numbers that were measured of the image, as of ViewFiles."""
 
 
 @dataclass(frozen=True)
@@ -284,7 +284,9 @@ class FrameRunner:
             with self._times.measure(MEASURE):
                 view, box_weather = self._label(chunk.frame, recipe, rendered.camera, view)
             activity = "encoding"
-            written_files = write_view(Path(self._setup.out_dir), paths, view, recipe)
+            written_files = write_view(
+                Path(self._setup.out_dir), paths, view, rendered.camera, recipe
+            )
         except OutputError:
             raise
         except Exception as error:
@@ -298,7 +300,7 @@ class FrameRunner:
             status=OK,
             checksum=written_files.checksum,
             box_weather=box_weather,
-            shares=written_files.shares,
+            measures=written_files.measures,
         )
         self._pump.after(
             rendered.lidar, lambda: self._complete(outcome, rendered.lidar, written_files.files)

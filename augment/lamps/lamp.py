@@ -29,7 +29,7 @@ _UNIT_TOLERANCE = 1e-6
 
 
 class LampKind(IntEnum):
-    """Kinds of lamps. The numbers are written to `labels/light.parquet` and never change."""
+    """Kinds of lamps. Their names are written to `labels/light.parquet` in lower case."""
 
     DIPPED = 0
     HIGH = 1

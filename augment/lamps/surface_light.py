@@ -53,6 +53,22 @@ _GROUND_COSINE = 0.906
 _MIN_GROUND_COSINE = 0.766
 # Sides of the window in which the normals of the ground are averaged, nodes: columns, rows.
 _GROUND_WINDOW = (65, 17)
+# Sides of the window in which most nodes are ground about one that is taken for it: columns, rows.
+_NEAR_WINDOW = (33, 17)
+# Share of them below which it is not.
+_MIN_NEAR_SHARE = 0.45
+# Share of them from which on it is for certain.
+_NEAR_SHARE = 0.65
+# Largest difference of its inverse depth from theirs, of theirs.
+_SAME_GROUND = 0.03
+# Sides of the window in which the normals of walls are averaged, nodes.
+_WALL_WINDOW = (49, 49)
+# Length of a mean normal below which a surface is rough, as leaves are.
+_MIN_SMOOTH = 0.8
+# Length from which on it is smooth.
+_SMOOTH = 0.95
+# Difference of a node's inverse depth from the window's, of that, up to which it is of one wall.
+_SAME_WALL = 0.02
 # Coefficient of retroreflection of a white sign at 0.2 degrees, cd/m2 per lux: class RA2.
 SIGN_RETURN_PER_LUX = 250.0
 # Reflectance that the coefficient belongs to: a white sign's.
@@ -116,19 +132,62 @@ def find_nodes(
     with kernel_threads(depth.shape[0]):
         surface_light_kernels.find_slopes(inverse, node_view(camera, step_px), slopes)
         surface_light_kernels.average_normals(inverse, slopes, normals)
-    return Nodes(depth, _smooth_ground(normals), step_px)
+    return Nodes(depth, _smooth_walls(_smooth_ground(normals, inverse), inverse), step_px)
 
 
-def _smooth_ground(normals: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """Return the normals, those of the ground averaged over a window of the picture."""
+def _smooth_ground(
+    normals: Float32[np.ndarray, "h w 3"], inverse: Float32[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return the normals, those of the ground averaged over a window of the picture.
+
+    Single nodes whose normals differ count as ground where most of those about them do, at about
+    their depth.
+
+    Args:
+        normals: normals by the depth.
+        inverse: 1 / z of the nodes, 0 for the sky.
+    """
     share = (normals[..., 2] - _MIN_GROUND_COSINE) / (_GROUND_COSINE - _MIN_GROUND_COSINE)
-    share = np.clip(share, 0, 1)[..., None]
-    mean = normals * share
+    share = np.clip(share, 0, 1)
+    mean = normals * share[..., None]
+    near = cv2.blur(share, _NEAR_WINDOW, borderType=cv2.BORDER_REFLECT_101)
+    near_inverse = cv2.blur(share * inverse, _NEAR_WINDOW, borderType=cv2.BORDER_REFLECT_101)
+    is_near = np.abs(inverse * near - near_inverse) < _SAME_GROUND * near_inverse
+    filled = (near - _MIN_NEAR_SHARE) / (_NEAR_SHARE - _MIN_NEAR_SHARE)
+    share = np.maximum(share, np.where(is_near, np.clip(filled, 0, 1), 0))[..., None]
     for _ in range(2):
         mean = cv2.blur(mean, _GROUND_WINDOW, borderType=cv2.BORDER_CONSTANT)
     x, y, z = cv2.split(mean)
     mean *= (1 / np.sqrt(np.maximum(x * x + y * y + z * z, 1e-12)))[..., None]
     return normals + share * (mean - normals)
+
+
+def _smooth_walls(
+    normals: Float32[np.ndarray, "h w 3"], inverse: Float32[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return the normals, those of smooth surfaces off the ground averaged over a window.
+
+    Fronts and paint have wide bulges in the depth of splats and sweeps, which a lamp would show as
+    blotches. Leaves, whose normals disagree from node to node, keep theirs; so does what stands
+    before something else.
+
+    Args:
+        normals: normals, as short as those about them disagree.
+        inverse: 1 / z of the nodes, 0 for the sky.
+    """
+    x, y, z = cv2.split(normals)
+    lengths = np.sqrt(x * x + y * y + z * z)
+    weights = np.clip((lengths - _MIN_SMOOTH) / (_SMOOTH - _MIN_SMOOTH), 0, 1)
+    weights *= np.clip((_GROUND_COSINE - z) / (_GROUND_COSINE - _MIN_GROUND_COSINE), 0, 1)
+    border = cv2.BORDER_CONSTANT
+    total = cv2.blur(weights, _WALL_WINDOW, borderType=border)
+    near_inverse = cv2.blur(weights * inverse, _WALL_WINDOW, borderType=border)
+    mean = cv2.blur(normals * weights[..., None], _WALL_WINDOW, borderType=border)
+    difference = np.abs(inverse * total - near_inverse) / np.maximum(near_inverse, 1e-12)
+    share = weights * np.clip(2 - difference / _SAME_WALL, 0, 1)
+    x, y, z = cv2.split(mean)
+    mean *= (lengths / np.sqrt(np.maximum(x * x + y * y + z * z, 1e-12)))[..., None]
+    return normals + share[..., None] * (mean - normals)
 
 
 def node_view(camera: Camera, step_px: int) -> NodeView:

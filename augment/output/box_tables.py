@@ -77,6 +77,10 @@ class BoxTable:
     """Column with the fraction of each box that the effect hides, 0 to 1; NaN where unknown. Empty
     if there is none.
     """
+    contrast_column: str = ""
+    """Column with the luminance contrast of each box to what is about it, -1 or more; NaN where
+    unknown. Empty if there is none.
+    """
     later_columns: Mapping[str, Any] = field(default_factory=dict)
     """The last columns, which files of older versions lack, with the values to assume."""
 

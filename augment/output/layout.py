@@ -72,6 +72,11 @@ def mask_share_columns() -> dict[str, str]:
     return {**{m: column for m, column in shares if m and column}, TRUST: "trusted_fraction"}
 
 
+def measured_columns() -> tuple[str, ...]:
+    """Return the manifest's columns of numbers that effects measure of an image."""
+    return tuple(name for effect in effects.EFFECTS for name in effect.measured_columns)
+
+
 def path_columns(paths: Mapping[str, str | None]) -> dict[str, str | None]:
     """Return paths by the manifest's columns instead of by kind."""
     return {f"{kind}_path": path for kind, path in paths.items()}

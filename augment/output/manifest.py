@@ -25,7 +25,13 @@ import pyarrow.parquet as pq
 
 from augment.errors import OutputError
 from augment.output.atomic import read_file, write_atomic
-from augment.output.layout import FileListing, mask_share_columns, path_kinds, variant_name
+from augment.output.layout import (
+    FileListing,
+    mask_share_columns,
+    measured_columns,
+    path_kinds,
+    variant_name,
+)
 from augment.output.names import MANIFEST_FILE, STATE_FOLDER
 from augment.output.store import Store, StoredFileMissing
 from augment.output.tables import read_table
@@ -80,6 +86,7 @@ def leading_columns() -> dict[str, pa.DataType]:
         **dict.fromkeys(("base", "surface", "lidar", "lidar_note", *text_columns, "quality"), text),
         **{"render_scale": pa.float64(), "settings": text, "source_digest": text},
         **dict.fromkeys(mask_share_columns().values(), pa.float64()),
+        **dict.fromkeys(measured_columns(), pa.float64()),
     }
 
 
@@ -692,7 +699,7 @@ def image_row(
     checksum: str = "",
     lidar: str | None = None,
     lidar_note: str | None = None,
-    shares: Mapping[str, float] | None = None,
+    measures: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Return the manifest's row of an image, by columns.
 
@@ -700,7 +707,7 @@ def image_row(
         pictured: The image.
         paths: Paths of the image's files by column; a failed image gets none, whatever they say.
         status: OK or FAILED.
-        shares: Shares of the image's pixels, as of `files.ViewFiles`.
+        measures: Numbers that were measured of the image, as of `view_files.ViewFiles`.
     """
     return {
         "scene": scene,
@@ -710,8 +717,8 @@ def image_row(
         **recipe_columns(recipe),
         "lidar": lidar,
         "lidar_note": lidar_note,
-        **dict.fromkeys(mask_share_columns().values()),
-        **(shares or {}),
+        **dict.fromkeys((*mask_share_columns().values(), *measured_columns())),
+        **(measures or {}),
         "seed": recipe.seed,
         "recipe": recipe.name,
         **vars(identity),

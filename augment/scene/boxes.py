@@ -152,6 +152,8 @@ class WorldBoxes:
     """Highest corner of that part."""
     corners_m: Float64[np.ndarray, "B 8 3"]
     """Corners of the labelled boxes, in the order of CORNERS."""
+    track_ids: tuple[str, ...]
+    """Tracks of the boxes."""
 
     def __len__(self) -> int:
         return len(self.is_usable)
@@ -177,7 +179,7 @@ class WorldBoxes:
             BOTTOM_MARGIN_M, MAX_BOTTOM_FRACTION * sizes[:, 2]
         )
         corners = _to_world(centres, rotations, CORNERS * sizes[:, None, :])
-        return WorldBoxes(is_usable, centres, sizes, rotations, low, high, corners)
+        return WorldBoxes(is_usable, centres, sizes, rotations, low, high, corners, boxes.track_ids)
 
     def without_margins(self) -> WorldBoxes:
         """Return the boxes with sides that own surfaces no further out than they are labelled.

@@ -45,6 +45,8 @@ class ViewImages:
     """The depth in the buffers, float32 [H, W], where labels are measured from it."""
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Masks of the effects in view, by name, uint8 [H, W], 0 or 255."""
+    luminance_cd_m2: np.ndarray | None = None
+    """Luminance of the picture, float32 [H, W]; None where no effect measures it."""
 
 
 def start_images(view: WeatheredBuffers, plan: Plan) -> Callable[[], ViewImages]:
@@ -106,6 +108,7 @@ def _make_images(view: WeatheredBuffers, plan: Plan) -> dict[str, Tensor | None]
         "semantic": None if semantic is None else semantic.to(torch.uint8),
         "instance": None if instance is None else instance.to(torch.int16).view(torch.uint16),
         "scene_depth_m": _floats(view.depth_m) if plan.finds_boxes else None,
+        "luminance_cd_m2": _floats(view.luminance_cd_m2),
         **{_MASK + name: mask.to(torch.uint8) * 255 for name, mask in view.masks.items()},
     }
 

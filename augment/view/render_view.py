@@ -185,8 +185,10 @@ def render_buffers(
     if plan.sensor.psf_px > 0:
         with timed(LENS_BLUR_PASS):
             rgb = blur_lens(rgb, plan.sensor.psf_px)
+    rendered = replace(rendered, rgb=rgb)
     for effect in view.effects:
-        rgb = effect.hooks.expose(effect, rgb, camera)
+        rendered = effect.hooks.expose(effect, rendered, camera)
+    rgb = rendered.rgb
     if plan.sensor.noise > 0:
         with timed(SENSOR_NOISE_PASS):
             noise_sigma = plan.sensor.noise
@@ -205,6 +207,7 @@ def render_buffers(
         plan=view.skip_steps(rendered.skip_reasons),
         masks=_masks(view, rendered, own_car),
         bare_buffers=_bare(rendered.raster, bare_parts, camera, plan, view, backend),
+        luminance_cd_m2=rendered.luminance_cd_m2,
     )
 
 
@@ -487,7 +490,8 @@ def _weathered(
         is_in_view = effect_plan.data is not None and (effect.mask_name is None or mask is not None)
         depth = images.scene_depth_m if is_in_view else None
         depth = _outside(car_mask, depth, OWN_CAR_DEPTH_M)
-        views[effect.name] = LabelInputs(effect_plan, depth, mask, plan.water_level_z_m)
+        luminance = images.luminance_cd_m2
+        views[effect.name] = LabelInputs(effect_plan, depth, mask, plan.water_level_z_m, luminance)
         if effect.mask_name is not None:
             empty_mask = np.zeros((camera.height, camera.width), np.uint8)
             masks[effect.mask_name] = empty_mask if mask is None else mask

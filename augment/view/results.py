@@ -59,6 +59,8 @@ class WeatheredBuffers:
     """Pixels that show an effect, by the effect's mask name; only effects that can be in view."""
     bare_buffers: BareBuffers | None = None
     """Buffers of the scene without what lies on it; None unless planned."""
+    luminance_cd_m2: Float[Tensor, "H W"] | None = None
+    """Luminance of the picture, for labels; None unless an effect measures it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -350,6 +350,8 @@ _TAMED: dict[str, st.SearchStrategy[Any]] = {
     "style.method": st.sampled_from(("mkl", "reinhard")),
     "style.preset": st.sampled_from(("dusk", "night")),
     **dict.fromkeys(("style.image", "style.mask", "style.checkpoint", "style.digest"), st.none()),
+    **dict.fromkeys(("light.street_ies", "light.digest", "light.lamps"), st.none()),
+    "light.street_spacing_m": st.sampled_from((30.0, 200.0)),
 }
 EFFECTS = ("smog", "flood", "snow", "style", "rain", "snowfall", "light", "lens_drops")
 _NOT_OF_FRAMES = ("quality", "output")  # chooses settings; drawn after the weather

@@ -33,7 +33,7 @@ from augment.output.manifest import parse_manifest, publish_part
 from augment.output.names import MANIFEST_FILE
 from augment.output.store import StoredFile, StoredFileMissing
 from augment.scene.geometry import invert_rigid, rotmat_from_quat, transform_points
-from recipes.schema import Recipe
+from recipes.schema import Recipe, columns_of_effects
 from tests.augment.batch_scenes import (
     CLEAR,
     FLOODED,
@@ -114,7 +114,8 @@ def test_a_sample_holds_what_it_says(written: Path) -> None:
     np.testing.assert_array_equal(
         pose[:3, 3].numpy(), camera.world_from_camera[:3, 3].numpy() + ORIGIN_M
     )
-    assert sample["weather"].keys() == recipe.columns().keys() - {"style", "style_method"}
+    words = {name for name, column in columns_of_effects().items() if not column.is_number}
+    assert sample["weather"].keys() == recipe.columns().keys() - words
     assert sample["weather"]["smog_extinction_per_m"] == pytest.approx(3.912 / 50)
     assert sample["paths"]["image"].endswith("000003.png") and sample["paths"]["lidar"] is None
     assert sample["recipe_hash"] == recipe.hash

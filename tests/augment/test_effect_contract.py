@@ -148,6 +148,8 @@ def test_masks_tables_and_sweeps_of_a_job_read_back(output, samples, name):
         assert 0 < share < 1
         if effect.share_column is not None:
             assert row[effect.share_column] == pytest.approx(share)
+    for column in effect.measured_columns:
+        assert np.isfinite(row[column])
     if effect.box_table is not None:
         boxes = sample["boxes"]
         for column in effect.box_table.sample_columns:

@@ -9,17 +9,20 @@ import pytest
 import torch
 
 from augment.effects.lamps.exposure import (
+    MAX_BALANCE,
     READ_NOISE,
     ROAD_TARGET,
     auto_exposure,
     electrons_per_cd_m2,
     fixed_exposure,
     response,
+    white_balance,
 )
 from augment.effects.lamps.glare import NARROW_SHARE, WIDE_SHARE, spread_glare, tail_levels
 from augment.effects.lamps.hour import night_sky
 from augment.effects.lamps.picture_light import develop, find_reflectance, halve_excess, relight
-from augment.light.srgb import display_from_linear, linear_from_display
+from augment.lamps.lamp import color_of_temperature
+from augment.light.srgb import LUMINANCE_WEIGHTS, display_from_linear, linear_from_display
 from augment.render.sensor import draw_noise
 from recipes.light import Light
 from tests.scenes import camera_ahead
@@ -149,7 +152,11 @@ def test_kernels_equal_their_definitions() -> None:
     draws = RNG.integers(0, 256, light.shape, np.uint8)
     for glare, levels in ((None, None), (light * np.float32(0.1), draws)):
         numbers = (code_of(light), glare, levels, 300.0, READ_NOISE, 1.0)
-        assert np.allclose(develop(*numbers), develop(*numbers, uses_kernels=False), atol=1e-4)
+        for balance in (None, np.array([0.8, 1.0, 2.1])):
+            out, expected = (
+                develop(*numbers, balance=balance, uses_kernels=uses) for uses in (True, False)
+            )
+            assert np.allclose(out, expected, atol=1e-4)
 
 
 def test_pixels_that_get_no_light_keep_their_bits() -> None:
@@ -175,9 +182,30 @@ def test_noise_is_that_of_the_electrons() -> None:
     assert (noisy - quiet).mean() == pytest.approx(0, abs=0.02 * sigma)
 
 
-def test_overexposed_red_lamps_turn_white_in_the_middle() -> None:
-    light = np.zeros((1, 2, 3), np.float32)
-    light[0, 0, 0] = 0.9
-    light[0, 1, 0] = 50.0
+def test_overexposed_red_lamps_are_pink_in_the_middle() -> None:
+    light = np.zeros((1, 3, 3), np.float32)
+    light[0, :, 0] = [0.9, 5.0, 5000.0]
     out = develop(code_of(light), None, None, 1000.0, READ_NOISE, 0.0)
-    assert out[0, 0, 1] == 0 and out[0, 1, 1] > 0.8
+    assert out[0, 0, 1] == 0 and 0.3 < out[0, 1, 1] < 0.6
+    assert 0.6 < out[0, 2, 1] < 0.8
+
+
+def test_white_balance_makes_the_road_grey_as_far_as_asked() -> None:
+    warm = color_of_temperature(4000.0)
+    weights = np.asarray(LUMINANCE_WEIGHTS)
+    for share in (0.0, 0.5, 1.0):
+        balanced = 7.0 * warm * white_balance(7.0 * warm, share)
+        assert balanced @ weights == pytest.approx(7.0 * (warm @ weights))
+        ratio = (warm[0] / warm[2]) ** (1 - share)
+        assert balanced[0] / balanced[2] == pytest.approx(ratio)
+    out = develop(
+        code_of(np.tile(0.2 * warm, (4, 4, 1))),
+        None,
+        None,
+        1000.0,
+        READ_NOISE,
+        0.0,
+        balance=white_balance(warm, 1.0),
+    )
+    assert np.ptp(out) < 1e-3
+    assert (white_balance(np.array([1.0, 0.5, 0.0]), 1.0) <= MAX_BALANCE).all()

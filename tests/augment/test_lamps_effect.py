@@ -9,8 +9,11 @@ import pytest
 import torch
 
 from augment.effects.lamps.plan import EMITTERS
+from augment.effects.lamps.recording_car import light_recording_car
 from augment.effects.lamps.scene_exposure import exposure_of
+from augment.effects.lamps.view_lamps import lamps_at
 from augment.errors import ClimateGSError
+from augment.lamps.lamp import EGO_OWNER
 from augment.scene.scene import Scene
 from augment.view.plan import make_plan, plan_view
 from augment.view.render_view import render_view, render_views
@@ -62,6 +65,40 @@ def test_lamps_by_day_change_pixels_about_them_alone(street, camera, clear) -> N
     assert (rgb[changed].astype(int) >= clear[changed].astype(int)).all()
 
 
+def test_lamps_bloom_by_day_as_far_as_the_glass_is_dirty(street, camera, clear) -> None:
+    changed = []
+    for glare in (0.0, 1.0, 10.0):
+        gloomy = light(vehicles="on", sky_luminance_cd_m2=300.0, glare=glare)
+        changed.append((render_view(street, camera, gloomy).rgb != clear).any(-1).sum())
+    assert 0 < changed[0] < changed[1] < changed[2]
+
+
+def test_white_balance_takes_the_warmth_out_of_the_road(street, camera) -> None:
+    warmth = []
+    for share in (0.0, 0.6, 1.0):
+        night = light(time="night", noise=0.0, street_kelvin=2200.0, white_balance=share)
+        road = render_view(street, camera, night).rgb[3 * camera.height // 4 :].astype(float)
+        warmth.append(road[..., 0].mean() / road[..., 2].mean())
+    assert warmth[0] > 1.5 and warmth[0] > 1.2 * warmth[1] > 1.2 * warmth[2]
+
+
+def test_paint_of_the_recording_car_is_lit_evenly(street, camera) -> None:
+    lamps = lamps_at(
+        make_plan(light(time="night"), street).effect_plans["lamps"].data, street, camera
+    )
+    rgb = np.full((camera.height, camera.width, 3), 0.5, np.float32)
+    added = np.zeros_like(rgb)
+    pixels = np.zeros(rgb.shape[:2], bool)
+    pixels[-9:] = True
+    light_recording_car(added, pixels, rgb, 0.9, lamps, camera, uses_kernels=True)
+    assert not added[:-9].any()
+    assert (added[-9:] > 0).all() and np.ptp(added[-9:], axis=(0, 1)).max() == 0
+    own = lamps.select(lamps.owners == EGO_OWNER)
+    again = added.copy()
+    light_recording_car(again, pixels, rgb, 0.9, own, camera, uses_kernels=True)
+    assert np.array_equal(again, added)
+
+
 def test_night_is_dark_but_for_lamps(street, camera, clear) -> None:
     off = {"vehicles": "off", "own_beams": "off", "street": "off"}
     dark = render_view(street, camera, light(time="night", noise=0.0, **off)).rgb
@@ -70,6 +107,7 @@ def test_night_is_dark_but_for_lamps(street, camera, clear) -> None:
     assert (lit > 250).any() and not (dark > 128).any()
     # both are metered: at equal exposure lamps only add light
     fixed = {"time": "night", "noise": 0.0, "glare": 0.0, "exposure": "fixed", "iso": 1600.0}
+    fixed["white_balance"] = 0.0
     dark = render_view(street, camera, light(**fixed, **off)).rgb.astype(int)
     lit = render_view(street, camera, light(**fixed)).rgb.astype(int)
     assert (lit >= dark - 1).all() and (lit - dark).mean() > 1
@@ -142,13 +180,6 @@ def test_cameras_with_other_recorded_exposures_show_one_night(street, camera) ->
     assert np.abs(plain - other).mean() < 3
     by_day = [render_view(scene, camera, recipe_of()).rgb.mean() for scene in (street, mapped)]
     assert by_day[1] / by_day[0] == pytest.approx(0.7, abs=0.01)
-
-
-def test_glare_mask_holds_pixels_that_lamps_saturate(street, camera) -> None:
-    view = render_view(street, camera, light(time="night", noise=0.0))
-    mask = view.masks["glare"] > 0
-    assert 0 < mask.mean() < 0.2
-    assert (view.rgb[mask].max(-1) > 220).all()
 
 
 def test_explain_names_lamps_and_their_passes(street, camera) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import shutil
 import signal
 import subprocess
@@ -299,6 +300,18 @@ def test_times_are_on_the_page_only_where_they_were_measured(scene, monkeypatch,
     monkeypatch.setattr(explain, "measure_passes", None)  # not called
     facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
     assert facts["times"] is None and "%" not in page and "skips  flood: bed" in page
+
+
+def test_lamps_are_explained_by_source_with_their_cost(scene, monkeypatch, tmp_path):
+    recipe = "light: {time: night, street: off}\noutput: {depth: none, labels: false}\n"
+    facts, page = explained(monkeypatch, tmp_path, scene, recipe)
+    parts = {part["name"]: part for part in facts["parts"]}
+    assert parts["own beams"]["counts"] == {"dipped": 2.0, "tail": 2.0}
+    assert "street lamps" not in parts and math.isfinite(parts["own beams"]["ms"])
+    assert "own beams: 2.0 dipped, 2.0 tail; " in page
+    assert "light.time = night" in page
+    facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
+    assert facts["parts"] == [] and "parts of effects" not in page
 
 
 def test_labels_for_trainers_are_explained(scene, monkeypatch, tmp_path):

@@ -342,6 +342,29 @@ def test_visibility_is_that_of_the_labels(tmp_path) -> None:
     assert shares["sample"] == ""  # all of them
 
 
+def test_contrast_of_boxes_is_counted_by_recipe(tmp_path) -> None:
+    light = box_tables()["box_light"]
+    rows = [row for row in street_rows(scenes=1, frames=1) if row["recipe"] == "wet"][:1]
+    path = "street/wet-000/labels/light.parquet"
+    rows[0]["box_light_path"] = path
+    contrasts = [-0.5, 0.0, 0.19, 30.0, np.nan]
+    stored = {
+        name: np.zeros(5, kind) if kind is not object else np.full(5, "", object)
+        for name, kind in light.columns.items()
+        if name in light.stored_columns
+    }
+    stored["luminance_contrast"] = np.array(contrasts)
+    numbers = light.make_numbers(("a", "b", "c", "d", "e"), **stored)
+    (tmp_path / path).parent.mkdir(parents=True)
+    (tmp_path / path).write_bytes(light.to_bytes({(0, "front"): numbers}))
+    shares = report.share_contrast(as_table(rows), ["wet"], files_of(tmp_path))
+    assert shares is not None
+    bars = [("s0", "−1 to −0.2", 1), ("s1", "−0.2 to 0.2", 2), ("s5", "over 20", 1)]
+    assert shares["rows"] == [("wet", bars)]
+    rows[0]["box_light_path"] = None
+    assert report.share_contrast(as_table(rows), ["wet"], files_of(tmp_path)) is None
+
+
 def test_an_image_too_large_to_decode_is_left_alone(tmp_path) -> None:
     header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (60_000).to_bytes(4, "big") * 2 + b"\x08\2\0\0\0"
     (tmp_path / "a.png").write_bytes(header + b"\0" * 40)

@@ -140,6 +140,7 @@ def test_sliders_reach_what_presets_draw_and_boxes_all_that_a_recipe_takes():
             )
             if value is not None and value != control.default:
                 assert control.low <= value <= control.high, control.path
+        assert len(control.marks) >= 2, control.path
         least, most = control.valid
         assert least <= control.low < control.high <= most
         for value in control.valid:  # the ends of the box
@@ -157,10 +158,10 @@ def test_sliders_reach_what_presets_draw_and_boxes_all_that_a_recipe_takes():
     assert boxes["weather.flood.level_m"] == (-10_000, 10_000)
 
 
-def test_ten_fields_come_first_and_tooltips_are_short():
+def test_twelve_fields_come_first_and_tooltips_are_short():
     main, others = split_by_rank(effect_groups())
     first = [control.path for group in main for control in group.main_controls]
-    assert len(first) == 10 and "weather.smog.visibility_m" in first
+    assert len(first) == 12 and "weather.smog.visibility_m" in first
     for group in main:
         paths = {control.path for control in (*group.main_controls, *group.secondary_group.walk())}
         assert paths == {control.path for control in group.walk()}  # none is lost
@@ -564,7 +565,7 @@ def test_a_photo_and_a_recipe_are_uploaded_and_saved(tmp_path):
     edits = Edits("clear", SCALE, folder=tmp_path / "views")
     with served(edits) as (_, url), PageClient(url) as page:
         clear, count = page.rest(after=0), len(page.pictures)
-        page.set("style (light)", True)
+        page.set("style (colours)", True)
         page.upload("more of style/upload image", "../../warm photo.png", photo)
         warm = page.rest(after=count)
         assert np.abs(warm.astype(int) - clear).mean() > 2

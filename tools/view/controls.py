@@ -45,7 +45,8 @@ MAIN_FIELDS = {
     "weather.snowfall": ("rate_mm_h",),
     "weather.snow": ("depth_m", "coverage"),  # whether kerbs and lane marks can be seen
     "weather.flood": ("level_m", "turbidity_ntu"),  # how far up, and whether the bed is seen
-    "style": ("preset", "strength"),  # the light of the day
+    "light": ("time", "vehicles"),  # the hour, and whether lamps are on
+    "style": ("preset", "strength"),  # the colours of another day
 }
 
 # Words beside a section's name, where the name alone does not tell a driver what it is.
@@ -53,7 +54,8 @@ PLAIN_WORDS = {
     "weather.smog": "fog, haze",
     "weather.snow": "lying",
     "weather.snowfall": "flakes",
-    "style": "light",
+    "light": "hour, lamps",
+    "style": "colours",
 }
 
 # Ends of sliders, where those that the recipe's model allows are far beyond what anyone looks for;
@@ -81,7 +83,7 @@ USEFUL_ENDS = {
     "camera.lens_drops.f_number": (0.9, 22.0),
     "camera.lens_drops.wiper_s": (0.5, 60.0),
     "light.sky_luminance_cd_m2": (0.01, 100.0),  # a small town; shortly after sunset
-    "light.moon_lux": (0.001, 0.3),  # a full moon
+    "light.moon_lux": (0.0, 0.3),  # a full moon
     "light.glow": (0.1, 10.0),
     "light.street_spacing_m": (10.0, 100.0),
     "light.street_height_m": (3.0, 15.0),
@@ -91,7 +93,7 @@ USEFUL_ENDS = {
     "light.iso": (100.0, 51_200.0),
     "light.f_number": (0.9, 22.0),
     "light.glare": (0.1, 10.0),
-    "light.noise": (0.05, 2.0),
+    "light.noise": (0.0, 2.0),
     "camera.noise": (0.0, 0.03),
     "camera.psf_px": (0.1, 4.0),
     "camera.exposure_ms": (0.1, 50.0),
@@ -418,8 +420,10 @@ def _numeric(leaf: Leaf, attributes: dict[str, Any]) -> Control:
     scale: Literal["linear", "log", "both sides"] = "linear"
     log_start = None
     if not is_integer and "_deg" not in leaf.path:
-        # By what the model allows: a field that may span decades is thought of in decades.
-        if low >= 0 and (high >= MAX_LINEAR or (low > 0 and high > 100 * low)):
+        # By what the model allows: a field that may span decades is thought of in decades, unless
+        # its slider spans less than one.
+        spans_decades = high >= MAX_LINEAR or (low > 0 and high > 100 * low)
+        if low >= 0 and spans_decades and not 0 < start < end < 10 * start:
             scale = "log"
             log_start = start or None
             start = 0.0 if low == 0 else start

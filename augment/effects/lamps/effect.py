@@ -13,8 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Float32
 
 from augment.effects.effect import (
     PICTURE,
@@ -32,12 +31,19 @@ from augment.effects.lamps.exposure import READ_NOISE, Exposure
 from augment.effects.lamps.glare import spread_glare
 from augment.effects.lamps.hour import find_hour, night_sky, white_of_picture
 from augment.effects.lamps.lamp_light import add_lamp_light
-from augment.effects.lamps.light_table import LIGHT_TABLE, measure_light
+from augment.effects.lamps.light_table import (
+    EXPOSURE_COLUMNS,
+    LIGHT_TABLE,
+    measure_exposure,
+    measure_light,
+)
+from augment.effects.lamps.luminance import read_light
 from augment.effects.lamps.picture_light import develop, halve_excess, relight
 from augment.effects.lamps.plan import (
     CAMERA_STEPS,
     GLARE,
     LAMP_STEPS,
+    METER,
     NIGHT_SKY,
     RELIGHT,
     SENSOR,
@@ -48,8 +54,9 @@ from augment.effects.lamps.plan import (
     make_light_plan,
     steps_of,
 )
-from augment.effects.lamps.scene_exposure import exposure_of
+from augment.effects.lamps.scene_exposure import exposure_of, exposure_of_picture, white_balance_of
 from augment.effects.lamps.sky_in_photo import replace_photo_sky
+from augment.effects.lamps.sources import count_lamps, without_sources
 from augment.effects.lamps.view_lamps import describe_lamps, lamps_of_view
 from augment.effects.wet.darkening import white_level
 from augment.light.scene_light import find_scene_light
@@ -87,6 +94,7 @@ class LampsEffect(Effect):
     is_see_through = True
     share_column = "glare_fraction"
     sees_exposure = True
+    measured_columns = EXPOSURE_COLUMNS
     box_table = LIGHT_TABLE
     kernel_folders: ClassVar = ("augment.lamps",)
 
@@ -118,6 +126,12 @@ class LampsEffect(Effect):
         steps = steps_of(plan, lamp_reason, exposure_reason)
         buffers = {EXPECTED_DEPTH, SPLAT_IDS} if plan.has_signs else {EXPECTED_DEPTH}
         return EffectPlan(plan, steps, frozenset(buffers))
+
+    def without_parts(self, effect: EffectInScene, recipe: Recipe) -> dict[str, Recipe]:
+        return without_sources(effect.settings, effect.scene, recipe)
+
+    def count_parts(self, effect: EffectInScene, camera: Camera) -> dict[str, dict[str, int]]:
+        return count_lamps(effect.settings, effect.scene, camera)
 
     def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
         light = self.section_of(recipe)
@@ -158,23 +172,29 @@ class LampsEffect(Effect):
             with timed(NIGHT_SKY):
                 rgb = replace_photo_sky(rgb, view, camera, color_map)
         # Light of the picture at 1 cd/m2, and the factor of the picture's own.
-        exposure = exposure_of(plan, effect.scene) if is_dark else _day_exposure(plan, white)
+        exposure = exposure_of_picture(plan, effect.scene, effect.lit_scene, camera)
         gain = plan.hour.white_cd_m2 / white * exposure.scale if is_dark else 1.0
         least_light = MIN_LAMP_LIGHT if is_dark else MIN_LAMP_LIGHT_BY_DAY
         if is_dark and plan.extinction_per_m > 0:
             least_light = MIN_LAMP_LIGHT_IN_FOG
-        added = add_lamp_light(effect, view, camera, rgb, white, least_light / exposure.scale)
+        added = add_lamp_light(
+            effect, view, camera, rgb, white, least_light / exposure.scale, color_map
+        )
         with timed(RELIGHT):
             if added is None and not is_dark:
                 return view
-            out, mask = relight(
-                rgb,
-                added,
-                gain,
-                exposure.scale,
-                -1.0 if is_dark else MIN_ADDED,
-                uses_kernels=effect.backend != REFERENCE,
-            )
+            min_added = -1.0 if is_dark else MIN_ADDED
+            uses_kernels = effect.backend != REFERENCE
+            numbers = gain, exposure.scale, min_added
+            out, mask = relight(rgb, added, *numbers, uses_kernels=uses_kernels)
+        if not is_dark and added is not None and mask.any():
+            with timed(GLARE):
+                glare = _glare(out, camera, plan.light.glare, uses_kernels=uses_kernels)
+                if glare is not None:
+                    glare[glare.max(axis=-1) < MIN_LAMP_LIGHT_BY_DAY] = 0
+                    added += glare / np.float32(exposure.scale)
+                    out, _ = relight(rgb, added, *numbers, uses_kernels=uses_kernels)
+        with timed(RELIGHT):
             device = view.rgb.device
             layers = _exposed_layers(view.layers, gain) if is_dark else view.layers
         return replace(
@@ -187,24 +207,19 @@ class LampsEffect(Effect):
     def reads_neighbours(self, effect: EffectInScene) -> bool:
         return True
 
-    def expose(
-        self, effect: EffectInScene, rgb: Float[Tensor, "H W 3"], camera: Camera
-    ) -> Float[Tensor, "H W 3"]:
+    def expose(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         plan: LightPlan = effect.settings
-        if not plan.hour.is_dark or camera.is_orthographic:
-            return rgb
+        if camera.is_orthographic:
+            return view
+        exposure = exposure_of_picture(plan, effect.scene, effect.lit_scene, camera)
+        if not plan.hour.is_dark:
+            return _read_light(effect, view, None, exposure) if plan.needs_luminance else view
+        rgb = view.rgb
         uses_kernels = effect.backend != REFERENCE
-        exposure = exposure_of(plan, effect.scene)
         light = plan.light
         picture = rgb.detach().cpu().numpy()
-        glare = None
-        if light.glare > 0:
-            with timed(GLARE):
-                excess = halve_excess(picture, uses_kernels=uses_kernels)
-                if excess is not None:
-                    focal_px = (camera.fx + camera.fy) / 2
-                    size = (camera.width, camera.height)
-                    glare = spread_glare(excess, *size, focal_px, light.glare)
+        with timed(GLARE):
+            glare = _glare(picture, camera, light.glare, uses_kernels=uses_kernels)
         with timed(SENSOR):
             draws = None
             if light.noise > 0:
@@ -216,9 +231,15 @@ class LampsEffect(Effect):
                 exposure.electrons / exposure.scale,
                 READ_NOISE,
                 light.noise,
+                balance=white_balance_of(plan, effect.scene),
                 uses_kernels=uses_kernels,
             )
-        return torch.from_numpy(out).to(rgb.device)
+        if light.glare > 0 or plan.needs_luminance:
+            view = _read_light(effect, view, glare, exposure)
+        return replace(view, rgb=torch.from_numpy(out).to(rgb.device))
+
+    def measure_view(self, camera: Camera, inputs: LabelInputs) -> dict[str, float]:
+        return measure_exposure(camera, inputs)
 
     def measure_boxes(
         self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
@@ -226,9 +247,56 @@ class LampsEffect(Effect):
         return measure_light(boxes, camera, inputs)
 
 
-def _day_exposure(plan: LightPlan, white: float) -> Exposure:
-    """Return the exposure of a picture of the day, by its white."""
-    return Exposure(white / max(plan.hour.white_cd_m2, 1e-9), 1.0, "recorded")
+def _glare(
+    picture: Float32[np.ndarray, "H W 3"], camera: Camera, strength: float, *, uses_kernels: bool
+) -> Float32[np.ndarray, "H W 3"] | None:
+    """Return the light that the lens scatters about saturated pixels; None for none.
+
+    Args:
+        picture: the exposed picture, display-encoded, not clamped.
+        camera: the view.
+        strength: the recipe's `glare`.
+        uses_kernels: False for the plain definition.
+    """
+    if strength <= 0:
+        return None
+    excess = halve_excess(picture, uses_kernels=uses_kernels)
+    if excess is None:
+        return None
+    focal_px = (camera.fx + camera.fy) / 2
+    return spread_glare(excess, camera.width, camera.height, focal_px, strength)
+
+
+def _read_light(
+    effect: EffectInScene, view: RenderedView, glare: np.ndarray | None, exposure: Exposure
+) -> RenderedView:
+    """Return the view with its luminance, where labels need it, and glare in its mask.
+
+    Args:
+        effect: the effect in the scene.
+        view: the exposed picture before the sensor.
+        glare: light that the lens scatters, [H, W, 3]; None for none.
+        exposure: the camera's exposure.
+    """
+    plan: LightPlan = effect.settings
+    with timed(METER):
+        if glare is None and not plan.needs_luminance:
+            return view
+        reading = read_light(
+            view.rgb.detach().cpu().numpy(),
+            glare,
+            exposure.white_cd_m2,
+            needs_luminance=plan.needs_luminance,
+            uses_kernels=effect.backend != REFERENCE,
+        )
+        device = view.rgb.device
+        masks = dict(view.masks)
+        if glare is not None:
+            masks["glare"] = masks["glare"] | torch.from_numpy(reading.is_veiled).to(device)
+        luminance = reading.luminance_cd_m2
+        if luminance is None:
+            return replace(view, masks=masks)
+        return replace(view, masks=masks, luminance_cd_m2=torch.from_numpy(luminance).to(device))
 
 
 def _exposed_layers(layers: LayerRenderer, gain: float) -> LayerRenderer:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from augment.light.srgb import LUMINANCE_WEIGHTS
 from recipes.light import Light
 
 # Transmittance of the lens.
@@ -35,12 +36,17 @@ SATURATION_LUX_S = 78.0
 # Linear light that the automatic exposure gives the road: darker than by day, as pictures of night
 # are.
 ROAD_TARGET = 0.10
+# Largest factor of a channel for the white balance.
+MAX_BALANCE = 3.0
 # Smallest ISO speed; brighter scenes shorten the exposure.
 MIN_ISO = 100.0
 # Linear light from which on the response curve bends.
 SHOULDER_START = 0.6
 # Share of the light beyond saturation that leaks into the other two channels: lamps turn white.
 CROSSTALK = 0.04
+# Largest light beyond saturation of which a share leaks, of saturation: the middle of a red lamp
+# stays pink, as cameras with a wide range show it (chosen by eye).
+MAX_LEAKING = 12.0
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,17 @@ class Exposure:
     reason: str
     """The exposure in words."""
 
+    exposure_ms: float | None = None
+    """Time that the shutter is open; None for the recorded exposure."""
+
+    iso: float | None = None
+    """Sensitivity of the sensor; None for the recorded exposure."""
+
+    @property
+    def white_cd_m2(self) -> float:
+        """Return the luminance that saturates the sensor, cd/m2."""
+        return 1 / self.scale
+
 
 def electrons_per_cd_m2(exposure_ms: float, f_number: float) -> float:
     """Return the electrons that a pixel counts at 1 cd/m2."""
@@ -67,7 +84,8 @@ def fixed_exposure(light: Light) -> Exposure:
     """Return the exposure that the recipe gives."""
     scale = _image_lux(light.f_number) * light.exposure_ms / 1000 * light.iso / SATURATION_LUX_S
     words = f"{light.exposure_ms:g} ms, ISO {light.iso:g}, f/{light.f_number:g}"
-    return Exposure(scale, electrons_per_cd_m2(light.exposure_ms, light.f_number), words)
+    electrons = electrons_per_cd_m2(light.exposure_ms, light.f_number)
+    return Exposure(scale, electrons, words, light.exposure_ms, light.iso)
 
 
 def auto_exposure(light: Light, road_cd_m2: float) -> Exposure:
@@ -86,7 +104,8 @@ def auto_exposure(light: Light, road_cd_m2: float) -> Exposure:
         f"auto: {exposure_ms:.3g} ms, ISO {iso:.3g}, f/{light.f_number:g} "
         f"for a road of {road_cd_m2:.3g} cd/m2"
     )
-    return Exposure(scale, electrons_per_cd_m2(exposure_ms, light.f_number), words)
+    electrons = electrons_per_cd_m2(exposure_ms, light.f_number)
+    return Exposure(scale, electrons, words, exposure_ms, iso)
 
 
 def response(linear: np.ndarray) -> np.ndarray:
@@ -94,6 +113,21 @@ def response(linear: np.ndarray) -> np.ndarray:
     room = 1 - SHOULDER_START
     beyond = np.maximum(linear - SHOULDER_START, 0)
     return np.minimum(linear, SHOULDER_START) + room * -np.expm1(-beyond / room)
+
+
+def white_balance(color: np.ndarray, share: float) -> np.ndarray:
+    """Return the factors [3] of the channels by which a camera takes out the colour of the light.
+
+    A grey surface keeps its luminance, within MAX_BALANCE.
+
+    Args:
+        color: linear sRGB of the light, of any luminance above 0.
+        share: 0 takes nothing out, 1 makes a grey surface grey.
+    """
+    weights = np.asarray(LUMINANCE_WEIGHTS)
+    unit = np.maximum(color / max(float(color @ weights), 1e-12), 1e-3)
+    factors = unit**-share
+    return np.minimum(factors / float((unit * factors) @ weights), MAX_BALANCE)
 
 
 def _image_lux(f_number: float) -> float:

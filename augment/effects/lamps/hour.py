@@ -148,6 +148,14 @@ def white_of_picture(scene: Scene, color_map: torch.Tensor | None) -> float:
     return max(float(linear @ np.asarray(LUMINANCE_WEIGHTS)), 1e-4)
 
 
+def mean_sky_tint(light: Light) -> np.ndarray:
+    """Return the linear colour of the sky's light on level ground, of luminance 1."""
+    elevations = (np.arange(_NUM_ELEVATIONS) + 0.5) * (math.pi / 2 / _NUM_ELEVATIONS)
+    weights = np.sin(elevations) * np.cos(elevations)
+    glow = light.glow * float((weights * _glow_fall(elevations)).sum() / weights.sum())
+    return (_tint(_ZENITH_TINTS[light.time]) + glow * _tint(_GLOW_TINTS[light.time])) / (1 + glow)
+
+
 def _tint(rgb: tuple[float, float, float]) -> np.ndarray:
     """Return a linear colour of luminance 1."""
     color = np.asarray(rgb)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from jaxtyping import Float32
+import torch
+from jaxtyping import Bool, Float32
+from torch import Tensor
 
 from augment.effects.effect import EffectInScene, RenderedView
 from augment.effects.lamps.picture_light import find_reflectance
 from augment.effects.lamps.plan import AIR, DROPS, EMITTERS, SURFACES, WET, LightPlan
+from augment.effects.lamps.recording_car import PAINT_M, light_recording_car, recording_car_pixels
 from augment.effects.lamps.signs import sign_pixels
 from augment.lamps.air_light import air_light
 from augment.lamps.beam_shadows import draw_beam_shadows
@@ -38,6 +43,7 @@ def add_lamp_light(
     rgb: Float32[np.ndarray, "H W 3"],
     white: float,
     threshold_cd_m2: float,
+    color_map: Tensor | None = None,
 ) -> Float32[np.ndarray, "H W 3"] | None:
     """Return the luminance that lamps add to each pixel, cd/m2 in linear sRGB; None without lamps.
 
@@ -48,6 +54,7 @@ def add_lamp_light(
         rgb: the picture, display-encoded, in the camera's exposure.
         white: linear light of a white surface in it.
         threshold_cd_m2: luminance that need not be added, cd/m2.
+        color_map: the camera's colour map [3, 4], which the picture has; None without one.
     """
     plan: LightPlan = effect.settings
     lamps: Lamps = effect.view_data
@@ -62,7 +69,35 @@ def add_lamp_light(
     air = air_of(effect, view)
     added = np.zeros_like(rgb) if recorded is None else recorded
     if plan.hour.is_dark:
-        _add_surface_light(effect, view, camera, rgb, white, depth_m, air, threshold_cd_m2, added)
+        car_pixels = recording_car_pixels(effect.scene, camera)
+        if car_pixels is not None:
+            depth_m[car_pixels] = 0
+            view = _without_water(view, car_pixels)
+        airlight_rgb = _airlight(view, color_map)
+        _add_surface_light(
+            effect,
+            view,
+            camera,
+            rgb,
+            white,
+            depth_m,
+            air,
+            threshold_cd_m2,
+            added,
+            airlight_rgb=airlight_rgb,
+        )
+        if car_pixels is not None:
+            depth_m[car_pixels] = PAINT_M
+            with timed(SURFACES):
+                light_recording_car(
+                    added,
+                    car_pixels,
+                    rgb,
+                    white,
+                    lamps,
+                    camera,
+                    uses_kernels=effect.backend != REFERENCE,
+                )
     surface_m = np.where(alpha > MIN_ALPHA, z, np.float32(np.inf))
     if not air.is_clear:
         with timed(AIR):
@@ -83,20 +118,42 @@ def add_lamp_light(
             )
     if plan.hour.is_dark and plan.has_drops:
         with timed(DROPS):
-            eye = camera.centre.numpy()
+            eye = camera.centre.numpy()[None]
+            extinction_per_m = float(air.mean_extinction_per_m(eye, eye + 1.0)[0])
             for cover in view.drop_covers:
                 add_drop_light(
                     added,
                     lamps,
                     camera,
                     cover,
-                    extinction_per_m=float(air.mean_extinction_per_m(eye, eye + 1.0)),
+                    extinction_per_m=extinction_per_m,
                     min_luminance_cd_m2=threshold_cd_m2,
                 )
     with timed(EMITTERS):
         visible_shares = lamp_visibility(lamps, camera, surface_m, alpha)
         add_emitters(added, lamps, camera, visible_shares, air)
     return added
+
+
+def _without_water(view: RenderedView, pixels: Bool[np.ndarray, "H W"]) -> RenderedView:
+    """Return the view without water at some pixels."""
+    water = view.wet_surface
+    if water is None:
+        return view
+    share = np.where(pixels, np.float32(0), water.share)
+    return replace(view, wet_surface=replace(water, share=share))
+
+
+def _airlight(view: RenderedView, color_map: Tensor | None) -> tuple[float, float, float]:
+    """Return the colour of the fog in a camera's finished picture; black without fog."""
+    fog = view.layers.fog
+    if fog is None:
+        return (0.0, 0.0, 0.0)
+    color = torch.tensor(fog.airlight_rgb, dtype=torch.float64)
+    if color_map is not None:
+        color = color_map[:, :3].double().cpu() @ color + color_map[:, 3].double().cpu()
+    red, green, blue = color.tolist()
+    return (red, green, blue)
 
 
 def air_of(effect: EffectInScene, view: RenderedView) -> AirExtinction:
@@ -144,19 +201,16 @@ def _add_surface_light(
     air: AirExtinction,
     threshold_cd_m2: float,
     added: np.ndarray,
+    *,
+    airlight_rgb: tuple[float, float, float],
 ) -> None:
     """Add the light of surfaces and water under lamps, as the fog before them lets it through."""
     plan: LightPlan = effect.settings
     lamps: Lamps = effect.view_data
     with timed(SURFACES):
         fog_share = _fog_share(effect, view, camera)
-        fog = view.layers.fog
         reflectance = find_reflectance(
-            rgb,
-            white,
-            fog_share,
-            (0.0, 0.0, 0.0) if fog is None else fog.airlight_rgb,
-            uses_kernels=effect.backend != REFERENCE,
+            rgb, white, fog_share, airlight_rgb, uses_kernels=effect.backend != REFERENCE
         )
         shadows = draw_beam_shadows(
             lamps,

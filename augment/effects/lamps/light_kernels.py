@@ -119,7 +119,8 @@ def develop(rgb, glare, draws, numbers, light_table, code_table, out):
         glare: light that the lens scatters, [H, W, 3]; or empty [0, 0, 3].
         draws: normal numbers in 8 bits about 128, [H, W, 3]; or empty [0, 0, 3] for no noise.
         numbers: crosstalk, variance per light, variance of reading; both variances for a draw of
-            1 about 128.
+            1 about 128; factors of the three channels for the white balance; largest light
+            beyond saturation that leaks.
         light_table: light by code.
         code_table: codes by the square root of light, with the response curve.
         out: output [H, W, 3], display-encoded.
@@ -143,9 +144,9 @@ def develop(rgb, glare, draws, numbers, light_table, code_table, out):
                 red += glare[i, j, 0]
                 green += glare[i, j, 1]
                 blue += glare[i, j, 2]
-            excess_red = max(red - one_f32, zero)
-            excess_green = max(green - one_f32, zero)
-            excess_blue = max(blue - one_f32, zero)
+            excess_red = min(max(red - one_f32, zero), numbers[6])
+            excess_green = min(max(green - one_f32, zero), numbers[6])
+            excess_blue = min(max(blue - one_f32, zero), numbers[6])
             red += crosstalk * (excess_green + excess_blue)
             green += crosstalk * (excess_red + excess_blue)
             blue += crosstalk * (excess_red + excess_green)
@@ -159,7 +160,7 @@ def develop(rgb, glare, draws, numbers, light_table, code_table, out):
                     variance = per_light * max(value, zero) + of_reading
                     draw = np.float32(draws[i, j, k]) - middle
                     value += draw * np.float32(math.sqrt(variance))
-                value = min(max(value, zero), brightest)
+                value = min(max(value * numbers[3 + k], zero), brightest)
                 out[i, j, k] = code_of_light(value, code_table)
 
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from augment.effects.lamps import light_kernels
-from augment.effects.lamps.exposure import CROSSTALK, response
+from augment.effects.lamps.exposure import CROSSTALK, MAX_LEAKING, response
 from augment.effects.lamps.light_kernels import CODE_STEPS, ROOT_STEPS
 from augment.light.srgb import display_from_linear, linear_from_display
 from augment.render.composite import ROWS_PER_CHUNK
@@ -25,8 +25,9 @@ _MAX_CODE = 2.0
 _MAX_LIGHT = 6.25
 # Light, of saturation, that lamps must add for a saturated pixel to be theirs.
 MIN_LAMP_LIGHT = 0.1
-# Least reflectance of a surface; darker colours are shadows of the day.
-MIN_REFLECTANCE = 0.02
+# Least reflectance of a surface. Darker colours are shadows of the day; with more than this they
+# turn to smoke in the beams, since they lose their texture.
+MIN_REFLECTANCE = 0.004
 # Greatest reflectance of a surface.
 MAX_REFLECTANCE = 0.9
 _NONE = np.zeros((0, 0, 3), np.float32)
@@ -71,7 +72,7 @@ def relight(
             _NONE if added_cd_m2 is None else np.ascontiguousarray(added_cd_m2),
             np.array([gain, added_gain, MIN_LAMP_LIGHT], np.float32),
             np.float32(min_added),
-            _light_table(),
+            light_table(),
             _code_table(),
             out,
             mask,
@@ -99,7 +100,7 @@ def halve_excess(
         return excess.reshape(shape[0], 2, shape[1], 2, 3).mean((1, 3)).astype(np.float32)
     out = np.empty(shape, np.float32)
     with kernel_threads(ROWS_PER_CHUNK):
-        light_kernels.halve_excess(np.ascontiguousarray(rgb), _light_table(), out)
+        light_kernels.halve_excess(np.ascontiguousarray(rgb), light_table(), out)
     return out
 
 
@@ -111,9 +112,10 @@ def develop(
     read_noise: float,
     noise: float,
     *,
+    balance: Float64[np.ndarray, "3"] | None = None,
     uses_kernels: bool = True,
 ) -> Float32[np.ndarray, "H W 3"]:
-    """Return the picture that a sensor makes of light: crosstalk, noise, response curve.
+    """Return the picture that a sensor makes of light: crosstalk, noise, balance, response curve.
 
     Args:
         rgb: exposed picture, display-encoded; 1 saturates the sensor.
@@ -122,8 +124,10 @@ def develop(
         electrons: electrons of a pixel at saturation.
         read_noise: standard deviation of reading, electrons.
         noise: factor of the noise.
+        balance: factors of the channels for the white balance; None for 1.
         uses_kernels: False for the plain definition.
     """
+    factors = np.ones(3) if balance is None else balance
     per_draw = (noise / LEVEL_SD) ** 2
     per_light = per_draw / electrons
     of_reading = per_draw * (read_noise / electrons) ** 2
@@ -134,25 +138,25 @@ def develop(
                 np.ascontiguousarray(rgb),
                 _NONE if glare is None else glare,
                 _NO_DRAWS if draws is None else draws,
-                np.array([CROSSTALK, per_light, of_reading], np.float32),
-                _light_table(),
+                np.array([CROSSTALK, per_light, of_reading, *factors, MAX_LEAKING], np.float32),
+                light_table(),
                 _developed_table(),
                 out,
             )
         return out
     total = linear_from_display(np.maximum(rgb, 0).astype(np.float64))
     total += 0 if glare is None else glare
-    excess = np.maximum(total - 1, 0)
+    excess = np.clip(total - 1, 0, MAX_LEAKING)
     total += CROSSTALK * (excess.sum(-1, keepdims=True) - excess)
     if draws is not None:
         sigma = np.sqrt(per_light * np.maximum(total, 0) + of_reading)
         total += sigma * (draws.astype(np.float64) - 128)
-    linear = response(np.clip(total, 0, _MAX_LIGHT))
+    linear = response(np.clip(total * factors, 0, _MAX_LIGHT))
     return display_from_linear(linear).astype(np.float32)
 
 
 @functools.cache
-def _light_table() -> np.ndarray:
+def light_table() -> np.ndarray:
     """Return the light of codes from 0 to _MAX_CODE."""
     codes = np.arange(round(_MAX_CODE * CODE_STEPS) + 2) / CODE_STEPS
     return linear_from_display(codes).astype(np.float32)
@@ -201,7 +205,7 @@ def find_reflectance(
                 np.zeros((0, 0), np.float32) if fog_share is None else fog_share,
                 airlight,
                 np.array([white, MIN_REFLECTANCE, MAX_REFLECTANCE], np.float32),
-                _light_table(),
+                light_table(),
                 out,
             )
         return out

@@ -27,10 +27,11 @@ DROPS = "lamps: drops and flakes in their light"
 EMITTERS = "lamps: lamps in view"
 RELIGHT = "hour and exposure"
 GLARE = "glare"
+METER = "luminance and glare for labels"
 SENSOR = "sensor in the dark"
 SKY_STEPS = (NIGHT_SKY,)
 LAMP_STEPS = (SURFACES, WET, AIR, DROPS, EMITTERS)
-CAMERA_STEPS = (RELIGHT, GLARE, SENSOR)
+CAMERA_STEPS = (RELIGHT, GLARE, METER, SENSOR)
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,9 @@ class LightPlan:
 
     uses_color_map: bool
     """True if pictures have their cameras' colour maps."""
+
+    needs_luminance: bool
+    """True if labels of boxes need the picture's luminance."""
 
     lamp_points: int
     """Points of the sum along each ray for light in the air."""
@@ -142,6 +146,7 @@ def make_light_plan(recipe: Recipe, scene: Scene, light: Light, hour: Hour) -> L
         wetness=1.0 if recipe.weather.flood is not None else wetness,
         snow_cover=snow.coverage if snow is not None and snow.has_effect else 0.0,
         uses_color_map=bool(scene.color_mapped_cameras) and recipe.render.exposure != "neutral",
+        needs_luminance=bool(recipe.output.labels) and scene.labels is not None,
         lamp_points=speed.lamp_points,
         lamp_halo_px=speed.lamp_halo_px,
         lamps_per_pixel=speed.lamps_per_pixel,
@@ -219,9 +224,19 @@ def steps_of(plan: LightPlan, lamp_reason: str, exposure_reason: str) -> tuple[S
         ),
         Step(
             GLARE,
-            is_dark and light.glare > 0,
-            f"light.glare is {light.glare:g}" if is_dark else by_day,
+            light.glare > 0 and (is_dark or has_lamps),
+            f"light.glare is {light.glare:g}",
             PICTURE,
         ),
+        Step(METER, *_meter_reason(plan), PICTURE),
         Step(SENSOR, is_dark, f"light.noise is {light.noise:g}" if is_dark else by_day, PICTURE),
     )
+
+
+def _meter_reason(plan: LightPlan) -> tuple[bool, str]:
+    """Return whether the picture's light is measured, and why."""
+    if plan.needs_luminance:
+        return True, "labels of boxes have the picture's luminance"
+    if plan.hour.is_dark and plan.light.glare > 0:
+        return True, "the mask glare has the pixels that glare outshines"
+    return False, "neither boxes nor glare need it"

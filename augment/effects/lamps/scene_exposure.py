@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from jaxtyping import Float64
 
-from augment.effects.lamps.exposure import Exposure, auto_exposure, fixed_exposure
+from augment.effects.lamps.exposure import Exposure, auto_exposure, fixed_exposure, white_balance
+from augment.effects.lamps.hour import mean_sky_tint, white_of_picture
 from augment.effects.lamps.plan import LightPlan
 from augment.effects.lamps.view_lamps import fixed_lamps
-from augment.lamps.lamp import Lamps
+from augment.lamps.lamp import Lamps, color_of_temperature
 from augment.lamps.surface_light import illuminance
 from augment.memo import memo_of
+from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 
 # Reflectance of a road.
@@ -20,6 +23,8 @@ ROAD_REFLECTANCE = 0.1
 OWN_BEAM_LUX = 2.0
 # The same of high beams.
 OWN_HIGH_LUX = 4.0
+# Colour temperature of these beams, about, kelvin.
+OWN_K = 4500.0
 # Weight of the sky's luminance in the metered one.
 SKY_WEIGHT = 0.15
 # Weight of the luminance of lit air in the metered one.
@@ -49,6 +54,44 @@ def exposure_of(plan: LightPlan, scene: Scene) -> Exposure:
     return memo_of(scene).get(key, lambda: auto_exposure(light, metered_luminance(plan, scene)))
 
 
+def white_balance_of(plan: LightPlan, scene: Scene) -> Float64[np.ndarray, "3"]:
+    """Return the factors of the channels for all cameras at all times."""
+    light = plan.light
+    key = ("lamps, white balance", light, plan.has_street_lamps, plan.own_beam)
+    return memo_of(scene).get(
+        key, lambda: white_balance(_road_color(plan, scene), light.white_balance)
+    )
+
+
+def _road_color(plan: LightPlan, scene: Scene) -> Float64[np.ndarray, "3"]:
+    """Return the colour of the median light on the road, linear sRGB, in lux."""
+    lamps = fixed_lamps(plan, scene)
+    places = _road_places(scene)
+    lux = plan.hour.ground_lux * mean_sky_tint(plan.light) + np.zeros((len(places), 3))
+    if len(lamps):
+        lux += illuminance(lamps, places, _upwards(places)) @ lamps.colors
+    lux += _own_lux(plan) * color_of_temperature(OWN_K)
+    return np.median(lux, axis=0)
+
+
+def exposure_of_picture(
+    plan: LightPlan, scene: Scene, lit_scene: Scene, camera: Camera
+) -> Exposure:
+    """Return the exposure of a picture: by day the recorded one, by the picture's white.
+
+    Args:
+        plan: the plan.
+        scene: the scene.
+        lit_scene: the scene as earlier effects relit it.
+        camera: the view.
+    """
+    if plan.hour.is_dark:
+        return exposure_of(plan, scene)
+    color_map = scene.color_map(camera) if plan.uses_color_map else None
+    white = white_of_picture(lit_scene, color_map)
+    return Exposure(white / max(plan.hour.white_cd_m2, 1e-9), 1.0, "recorded")
+
+
 def metered_luminance(plan: LightPlan, scene: Scene) -> float:
     """Return the luminance that the camera exposes for as if it were all road, cd/m2.
 
@@ -74,17 +117,23 @@ def road_luminance(plan: LightPlan, scene: Scene) -> float:
     lux = np.full(len(places), plan.hour.ground_lux)
     if len(lamps):
         lux += _lux_on_road(lamps, places)
-    if plan.own_beam == "high":
-        lux += OWN_HIGH_LUX
-    elif plan.own_beam == "dipped":
-        lux += OWN_BEAM_LUX
+    lux += _own_lux(plan)
     return ROAD_REFLECTANCE * float(np.median(lux)) / math.pi
 
 
 def _lux_on_road(lamps: Lamps, places: np.ndarray) -> np.ndarray:
     """Return the illuminance of level ground at places [N, 3], lux."""
-    normals = np.tile([0.0, 0.0, 1.0], (len(places), 1))
-    return illuminance(lamps, places, normals).sum(1)
+    return illuminance(lamps, places, _upwards(places)).sum(1)
+
+
+def _upwards(places: np.ndarray) -> np.ndarray:
+    """Return the normals of level ground at places."""
+    return np.tile([0.0, 0.0, 1.0], (len(places), 1))
+
+
+def _own_lux(plan: LightPlan) -> float:
+    """Return the illuminance of the road by the recording car's beams, lux."""
+    return {"dipped": OWN_BEAM_LUX, "high": OWN_HIGH_LUX}.get(plan.own_beam, 0.0)
 
 
 def _road_places(scene: Scene) -> np.ndarray:

@@ -124,7 +124,12 @@ def describe_lamps(plan: LightPlan, scene: Scene, reason: str) -> str:
         parts.append(f"{len(fixed_lamps(plan, scene)) - num_listed} street lamps")
     if light.lamps:
         parts.append(f"{len(light.lamps)} lamps of the recipe's")
-    return f"{', '.join(parts) or 'none'}; {reason}"
+    notes = [reason]
+    if not scene.has_metric_scale:
+        notes.append("the scene's unit is not known to be a metre, so distances are in scene units")
+    if plan.has_vehicle_lamps and scene.labels is None and not scene.actors:
+        notes.append("no vehicle has a box, so none has lamps")
+    return f"{', '.join(parts) or 'none'}; {'; '.join(notes)}"
 
 
 def _make_fixed(plan: LightPlan, scene: Scene) -> Lamps:

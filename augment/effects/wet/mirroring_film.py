@@ -25,6 +25,7 @@ from augment.effects.wet.film_kernels import (
 )
 from augment.effects.wet.ground_map import WetGround
 from augment.effects.wet.reflection import Film, Plane
+from augment.lamps.road_unevenness import RESOLVED_SHARE, make_uneven
 from augment.lamps.wet_surface import MIN_ROUGHNESS, WetSurface
 from augment.scene.cameras import Camera
 
@@ -77,11 +78,12 @@ def mirroring_film(
     roughness = asphalt + puddle * (puddle_roughness - asphalt)
     film_share = np.clip(FILM_SHARE + 0.1 * track, 0, 1)
     covered = film.wetness * (film_share + (1 - film_share) * puddle)
-    few = np.stack([roughness, covered], 2).astype(np.float32)
+    few = np.stack([roughness, covered, RESOLVED_SHARE * (1 - puddle)], 2).astype(np.float32)
     images = cv2.resize(few, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
-    return WetSurface(
+    water = WetSurface(
         np.ascontiguousarray(ground_share * images[..., 1], np.float32),
         np.ascontiguousarray(images[..., 0]),
         np.where(np.isfinite(depth_m), depth_m, 0).astype(np.float32),
         plane.up,
     )
+    return make_uneven(water, camera, np.ascontiguousarray(images[..., 2]))
