@@ -203,8 +203,8 @@ class LampsEffect(Effect):
                 excess = halve_excess(picture, uses_kernels=uses_kernels)
                 if excess is not None:
                     focal_px = (camera.fx + camera.fy) / 2
-                    size = (camera.width, camera.height)
-                    glare = spread_glare(excess, *size, focal_px, light.glare)
+                    side_px = max(camera.width, camera.height)
+                    glare = spread_glare(excess, side_px, focal_px, light.glare)
         with timed(SENSOR):
             draws = None
             if light.noise > 0:
