@@ -53,7 +53,7 @@ from augment.effects.lamps.sky_in_photo import replace_photo_sky
 from augment.effects.lamps.view_lamps import describe_lamps, lamps_of_view
 from augment.effects.wet.darkening import white_level
 from augment.light.scene_light import find_scene_light
-from augment.render.buffers import EXPECTED_DEPTH, REFERENCE, SPLAT_IDS
+from augment.render.buffers import EXPECTED_DEPTH, REFERENCE
 from augment.render.sensor import draw_noise
 from augment.scene.boxes import WorldBoxes
 from augment.scene.cameras import Camera
@@ -116,8 +116,7 @@ class LampsEffect(Effect):
         lamp_reason = describe_lamps(plan, scene, auto_reason(recipe, plan.hour)[1])
         exposure_reason = exposure_of(plan, scene).reason if plan.hour.is_dark else ""
         steps = steps_of(plan, lamp_reason, exposure_reason)
-        buffers = {EXPECTED_DEPTH, SPLAT_IDS} if plan.has_signs else {EXPECTED_DEPTH}
-        return EffectPlan(plan, steps, frozenset(buffers))
+        return EffectPlan(plan, steps, frozenset({EXPECTED_DEPTH}))
 
     def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
         light = self.section_of(recipe)
