@@ -14,11 +14,15 @@ from numba import prange
 
 from augment.effects.lamps.exposure import SHOULDER_START
 from augment.render.cpu.jit import kernel, kernel_function
+from augment.render.layout import Index
 
 # Largest display-encoded value of the polynomial.
 MAX_CODE = np.float32(2.0)
 # Display-encoded value below which a colour does not saturate, whatever the rounding.
 NEARLY_ONE = np.float32(0.999)
+# Values of a row that are computed together: 64 pixels. Rare values are looked for in those blocks
+# that have one.
+BLOCK = 192
 # Largest light of the polynomial.
 MAX_LIGHT = np.float32(6.25)
 # Display-encoded value and light at which the curve's straight part ends.
@@ -133,74 +137,76 @@ def relight(rgb, added, gains, min_added, out, mask):
             mask[i, j] = False
         if has_lamps:
             lamps = added[i]
-            num_high = 0
+            has_high = False
             for j in range(3 * width):
                 lights[j] = added_gain * lamps[j]
-                num_high += lights[j] > min_added
-            if min_added >= zero and num_high == 0:
+                has_high |= lights[j] > min_added
+            if min_added >= zero and not has_high:
                 for j in range(3 * width):
                     results[j] = codes[j]
                 continue
         else:
             for j in range(3 * width):
                 lights[j] = zero
-        num_high = 0
-        for j in range(3 * width):
-            code = max(codes[j], zero)
-            light = lights[j] + gain * light_of_code(min(code, MAX_CODE))
-            results[j] = code_of_light(min(light, MAX_LIGHT))
-            num_high += (light >= one_f32) | (code > MAX_CODE)
-        if min_added < zero and num_high == 0:
-            continue
-        for j in range(width):
-            at = 3 * j
-            most = max(lights[at], lights[at + 1], lights[at + 2])
-            if most <= min_added:
-                for k in range(at, at + 3):
-                    results[k] = codes[k]
+        for block in range(0, 3 * width, BLOCK):
+            start = Index(block)
+            end = Index(min(block + BLOCK, 3 * width))
+            has_high = False
+            for j in range(start, end):
+                code = max(codes[j], zero)
+                light = lights[j] + gain * light_of_code(min(code, MAX_CODE))
+                results[j] = code_of_light(min(light, MAX_LIGHT))
+                has_high |= (light >= one_f32) | (code > MAX_CODE)
+            if min_added < zero and not has_high:
                 continue
-            highest_code = max(codes[at], codes[at + 1], codes[at + 2])
-            highest = max(results[at], results[at + 1], results[at + 2])
-            if highest_code <= MAX_CODE and highest < NEARLY_ONE:
-                continue
-            brightest = zero
-            for k in range(at, at + 3):
-                code = max(codes[k], zero)
-                if code > MAX_CODE:
-                    light = lights[k] + gain * light_of_high_code(code)
-                    results[k] = code_of_light(min(light, MAX_LIGHT))
-                else:
-                    light = lights[k] + gain * light_of_code(code)
-                if light > MAX_LIGHT:
-                    results[k] = code_of_high_light(light)
-                brightest = max(brightest, light)
-            mask[i, j] = brightest >= one_f32 and most >= min_lamp
+            for at in range(start, end, Index(3)):
+                most = max(lights[at], lights[at + Index(1)], lights[at + Index(2)])
+                if most <= min_added:
+                    for k in range(at, at + Index(3)):
+                        results[k] = codes[k]
+                    continue
+                highest_code = max(codes[at], codes[at + Index(1)], codes[at + Index(2)])
+                highest = max(results[at], results[at + Index(1)], results[at + Index(2)])
+                if highest_code <= MAX_CODE and highest < NEARLY_ONE:
+                    continue
+                brightest = zero
+                for k in range(at, at + Index(3)):
+                    code = max(codes[k], zero)
+                    if code > MAX_CODE:
+                        light = lights[k] + gain * light_of_high_code(code)
+                        results[k] = code_of_light(min(light, MAX_LIGHT))
+                    else:
+                        light = lights[k] + gain * light_of_code(code)
+                    if light > MAX_LIGHT:
+                        results[k] = code_of_high_light(light)
+                    brightest = max(brightest, light)
+                mask[i, at // Index(3)] = brightest >= one_f32 and most >= min_lamp
 
 
 @kernel
-def halve_excess(rgb, out, num_saturated):
+def halve_excess(rgb, out, is_saturated):
     """Write the light beyond saturation at half the resolution. All floats are float32.
 
     Args:
         rgb: exposed picture, display-encoded, [H, 3 W]; 1 saturates the sensor.
         out: output [h, 3 w], the mean of four pixels; it may reach beyond the picture.
-        num_saturated: output int64 [h], number of values of each row that are saturated.
+        is_saturated: output bool [h], True for rows with a value beyond saturation.
     """
     zero = np.float32(0)
     one_f32 = np.float32(1)
     quarter = np.float32(0.25)
     for i in prange(out.shape[0]):
         results = out[i]
-        num_saturated[i] = 0
+        is_saturated[i] = False
         for j in range(len(results)):
             results[j] = zero
         for row in range(2 * i, min(2 * i + 2, rgb.shape[0])):
             codes = rgb[row]
-            num_high = 0
+            has_high = False
             for j in range(len(codes)):
-                num_high += codes[j] > one_f32
-            num_saturated[i] += num_high
-            if num_high == 0:
+                has_high |= codes[j] > one_f32
+            is_saturated[i] |= has_high
+            if not has_high:
                 continue
             for j in range(len(codes)):
                 code = codes[j]
@@ -235,12 +241,12 @@ def develop(rgb, glare, draws, numbers, out):
         results = out[i]
         num_values = len(codes)
         values = np.empty(num_values, np.float32)
-        num_high = 0
+        has_high = False
         for j in range(num_values):
             code = max(codes[j], zero)
             values[j] = light_of_code(min(code, MAX_CODE))
-            num_high += code > MAX_CODE
-        if num_high > 0:
+            has_high |= code > MAX_CODE
+        if has_high:
             for j in range(num_values):
                 if codes[j] > MAX_CODE:
                     values[j] = light_of_high_code(codes[j])
@@ -263,26 +269,35 @@ def develop(rgb, glare, draws, numbers, out):
             for j in range(num_values // 6 * 6, num_values):
                 at = j // 6 * 3 + 3 + j % 3
                 values[j] += mean[at] + quarter * (mean[at - 3] - mean[at])
-        num_high = 0
-        for j in range(num_values):
-            num_high += values[j] > one_f32
-        if num_high > 0:
-            for j in range(0, num_values, 3):
-                red = max(values[j] - one_f32, zero)
-                green = max(values[j + 1] - one_f32, zero)
-                blue = max(values[j + 2] - one_f32, zero)
-                values[j] += crosstalk * (green + blue)
-                values[j + 1] += crosstalk * (red + blue)
-                values[j + 2] += crosstalk * (red + green)
-        if has_noise:
-            numbers_row = draws[i]
-            for j in range(num_values):
-                variance = per_light * max(values[j], zero) + of_reading
-                draw = np.float32(numbers_row[j]) - middle
-                values[j] += draw * np.float32(math.sqrt(variance))
-        for j in range(num_values):
-            value = min(max(values[j], zero), MAX_LIGHT)
-            results[j] = code_of_light(bent_by_shoulder(value))
+        for block in range(0, num_values, BLOCK):
+            start = Index(block)
+            end = Index(min(block + BLOCK, num_values))
+            has_high = False
+            for j in range(start, end):
+                has_high |= values[j] > one_f32
+            if has_high:
+                for j in range(start, end, Index(3)):
+                    red = max(values[j] - one_f32, zero)
+                    green = max(values[j + Index(1)] - one_f32, zero)
+                    blue = max(values[j + Index(2)] - one_f32, zero)
+                    values[j] += crosstalk * (green + blue)
+                    values[j + Index(1)] += crosstalk * (red + blue)
+                    values[j + Index(2)] += crosstalk * (red + green)
+            if has_noise:
+                noise = draws[i]
+                for j in range(start, end):
+                    variance = per_light * max(values[j], zero) + of_reading
+                    draw = np.float32(noise[j]) - middle
+                    values[j] += draw * np.float32(math.sqrt(variance))
+            has_bent = False
+            for j in range(start, end):
+                value = min(max(values[j], zero), MAX_LIGHT)
+                results[j] = code_of_light(value)
+                has_bent |= value > _SHOULDER_START
+            if has_bent:
+                for j in range(start, end):
+                    value = min(max(values[j], zero), MAX_LIGHT)
+                    results[j] = code_of_light(bent_by_shoulder(value))
 
 
 @kernel

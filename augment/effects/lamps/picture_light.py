@@ -90,10 +90,10 @@ def halve_excess(
         out = excess.reshape(shape[0], 2, shape[1], 2, 3).mean((1, 3)).astype(np.float32)
         return out if out.any() else None
     out = np.empty(shape, np.float32)
-    num_saturated = np.empty(shape[0], np.int64)
+    is_saturated = np.empty(shape[0], np.bool_)
     with kernel_threads(ROWS_PER_CHUNK):
-        light_kernels.halve_excess(_rows(rgb), _rows(out), num_saturated)
-    return out if num_saturated.any() else None
+        light_kernels.halve_excess(_rows(rgb), _rows(out), is_saturated)
+    return out if is_saturated.any() else None
 
 
 def develop(
