@@ -54,6 +54,7 @@ from augment.effects.lamps.view_lamps import describe_lamps, lamps_of_view
 from augment.effects.wet.darkening import white_level
 from augment.light.scene_light import find_scene_light
 from augment.render.buffers import EXPECTED_DEPTH, REFERENCE
+from augment.render.cpu.order import cached_of_tensor
 from augment.render.sensor import draw_noise
 from augment.scene.boxes import WorldBoxes
 from augment.scene.cameras import Camera
@@ -244,6 +245,10 @@ def _exposed_layers(layers: LayerRenderer, gain: float) -> LayerRenderer:
     if not isinstance(layers.sky, CubemapSky):
         return layers
     faces = layers.sky.faces
-    scaled, _ = relight(faces.flatten(0, 1).numpy(), None, gain, 0.0, -1.0)
-    sky = CubemapSky(torch.from_numpy(scaled).view(faces.shape))
+
+    def expose_sky() -> CubemapSky:
+        scaled, _ = relight(faces.flatten(0, 1).numpy(), None, gain, 0.0, -1.0)
+        return CubemapSky(torch.from_numpy(scaled).view(faces.shape))
+
+    sky = cached_of_tensor(faces, f"exposed by {gain!r}", expose_sky)
     return replace(layers, sky=sky, fog=None)

@@ -163,7 +163,13 @@ def _add_surface_light(
         shadows = _own_shadows(effect, view, camera)
         is_sign = None
         if plan.has_signs:
-            is_sign = sign_pixels(view, camera, depth_m, backend=effect.backend)
+            is_sign = sign_pixels(
+                view.layers.parts,
+                camera,
+                depth_m,
+                settings=view.layers.settings,
+                backend=effect.backend,
+            )
         eyes = np.tile(camera.centre.numpy(), (len(lamps), 1))
         extinctions_per_m = air.mean_extinction_per_m(eyes, lamps.positions_m)
         surface_light(

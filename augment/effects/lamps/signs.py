@@ -1,26 +1,27 @@
 """Pixels of traffic signs, which throw the own beams' light back.
 
 The splats of signs are few. They are drawn alone, in the window of the picture that holds them, and
-count where the picture's depth shows their own surface.
+count where the picture's depth shows nothing before them.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 
-from augment.effects.effect import RenderedView
 from augment.memo import memo_of
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH
-from augment.render.constants import MAX_EXTENT_SIGMAS, SURFACE_ALPHA
+from augment.render.constants import MAX_EXTENT_SIGMAS, SURFACE_ALPHA, RasterSettings
 from augment.render.cpu.order import cached_of_tensor
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, PosedGaussians, Scene
 from augment.scene.semantics import SemanticClass
 
-# Difference of depths up to which a pixel shows the sign's surface, metres.
+# Distance behind the picture's surface up to which a sign is visible, metres.
 SAME_DEPTH_M = 0.15
 # The same, as a share of the depth.
 SAME_DEPTH_SHARE = 0.01
@@ -39,18 +40,24 @@ def has_signs(scene: Scene) -> bool:
 
 
 def sign_pixels(
-    view: RenderedView, camera: Camera, depth_m: Float32[np.ndarray, "H W"], *, backend: str
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    depth_m: Float32[np.ndarray, "H W"],
+    *,
+    settings: RasterSettings,
+    backend: str,
 ) -> Bool[np.ndarray, "H W"] | None:
     """Return the pixels that show the surface of a sign; None where no sign is in view.
 
     Args:
-        view: the picture with its layers.
+        parts: the posed Gaussians of the picture.
         camera: the view.
         depth_m: z of the surfaces, metres; 0 for the sky.
+        settings: settings of the rasteriser.
         backend: backend of the rasteriser.
     """
-    parts = [_signs_of(part) for part in view.layers.parts]
-    sign_parts = [part for part in parts if part is not None]
+    signs = [_signs_of(part) for part in parts]
+    sign_parts = [part for part in signs if part is not None]
     window = _window_of(sign_parts, camera)
     if window is None:
         return None
@@ -60,16 +67,17 @@ def sign_pixels(
         sign_parts,
         camera.cropped(columns.start, rows.start, *size),
         buffers={ALPHA, EXPECTED_DEPTH},
-        settings=view.layers.settings,
+        settings=settings,
         backend=backend,
     )
     assert raster.alpha is not None and raster.expected_depth is not None
     alpha = raster.alpha.detach().cpu().numpy()
     depth = raster.expected_depth.detach().cpu().numpy()
     surface = depth_m[window]
-    is_same = np.abs(surface - depth) <= SAME_DEPTH_M + SAME_DEPTH_SHARE * surface
+    # A sign's depth is mixed with that of things behind it at its edges, so it may lie before.
+    is_visible = depth <= surface + SAME_DEPTH_M + SAME_DEPTH_SHARE * surface
     is_sign = np.zeros(depth_m.shape, bool)
-    is_sign[window] = (alpha >= SURFACE_ALPHA) & is_same & (surface > 0)
+    is_sign[window] = (alpha >= SURFACE_ALPHA) & is_visible & (surface > 0)
     return is_sign
 
 
