@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from augment.lamps.lamp import EGO_OWNER, LampKind, Lamps
 from augment.lamps.surface_light_kernels import ShadowArrays
@@ -60,7 +60,7 @@ class BeamShadows:
     def maps_of(self, lamps: Lamps) -> Int64[np.ndarray, "M"]:
         """Return the index of each lamp's map; -1 for lamps without one."""
         indices = np.full(len(lamps), -1, np.int64)
-        for m in np.flatnonzero(_throws_shadows(lamps)):
+        for m in np.flatnonzero(throws_shadows(lamps)):
             gaps = np.linalg.norm(self.positions_m - lamps.positions_m[m], axis=1)
             is_fit = (gaps <= _SAME_PLACE_M) & (self.axes @ lamps.axes[m] >= _SAME_AXIS)
             if is_fit.any():
@@ -68,8 +68,31 @@ class BeamShadows:
         return indices
 
 
-def _throws_shadows(lamps: Lamps) -> np.ndarray:
+def throws_shadows(lamps: Lamps) -> Bool[np.ndarray, "M"]:
+    """Return True for each lamp that throws shadows: a beam of the recording car.
+
+    Args:
+        lamps: the lamps.
+    """
     return (lamps.owners == EGO_OWNER) & np.isin(lamps.kinds, [int(kind) for kind in _BEAMS])
+
+
+def looks_into(camera: Camera, beams: Lamps) -> bool:
+    """Return True if a view has directions in common with the map of any beam.
+
+    Beams and camera stand on one car, so that nothing else that a map shows is in view.
+
+    Args:
+        camera: a pinhole camera.
+        beams: lamps that throw shadows.
+    """
+    forward = camera.world_from_camera[:3, 2].numpy()
+    side = max(camera.cx, camera.width - camera.cx) / camera.fx
+    rise = max(camera.cy, camera.height - camera.cy) / camera.fy
+    map_corner = math.hypot(math.tan(math.radians(_SIDE_DEG)), math.tan(math.radians(_UP_DEG)))
+    reach = math.atan(math.hypot(side, rise)) + math.atan(map_corner)
+    angles = np.arccos(np.clip(beams.axes @ forward, -1, 1))
+    return bool((angles < reach).any())
 
 
 def draw_beam_shadows(
@@ -89,7 +112,7 @@ def draw_beam_shadows(
         backend: backend of the rasteriser.
         timestamp_ns: the moment.
     """
-    beams = lamps.select(_throws_shadows(lamps))
+    beams = lamps.select(throws_shadows(lamps))
     views = _views_of(beams)
     if not views:
         return None

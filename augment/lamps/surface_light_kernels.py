@@ -531,39 +531,67 @@ def spread_light(
         i = min(int(v), max(rows - 2, 0))
         v -= np.float32(i)
         below = min(i + 1, rows - 1)
-        for column in range(width):
-            z = depth[row, column]
-            if not (z > zero and z < np.float32(1e6)):
-                continue
-            u = min(max(np.float32(column - first) * per_step, zero), np.float32(columns - 1))
-            j = min(int(u), max(columns - 2, 0))
-            u -= np.float32(j)
+        depths = depth[row]
+        colors = reflectance[row]
+        lights = picture[row]
+        upper = node_inverse[i]
+        lower = node_inverse[below]
+        upper_lux = lux[i]
+        lower_lux = lux[below]
+        start = 0
+        # From node to node: pixels between two nodes share what they read of these.
+        for j in range(max(columns - 1, 1)):
             beside = min(j + 1, columns - 1)
-            sends_back = has_signs and return_per_lux[row, column] > zero
-            brightest = zero
-            for k in range(3):
-                brightest += lux[i, j, k] + lux[i, beside, k] + lux[below, j, k]
-                brightest += lux[below, beside, k]
-            if brightest <= zero and not sends_back:
+            end = width if j >= columns - 2 else min(first + (j + 1) * step, width)
+            a_red = upper_lux[j, 0]
+            a_green = upper_lux[j, 1]
+            a_blue = upper_lux[j, 2]
+            b_red = upper_lux[beside, 0]
+            b_green = upper_lux[beside, 1]
+            b_blue = upper_lux[beside, 2]
+            c_red = lower_lux[j, 0]
+            c_green = lower_lux[j, 1]
+            c_blue = lower_lux[j, 2]
+            d_red = lower_lux[beside, 0]
+            d_green = lower_lux[beside, 1]
+            d_blue = lower_lux[beside, 2]
+            brightest = a_red + a_green + a_blue + b_red + b_green + b_blue
+            brightest += c_red + c_green + c_blue + d_red + d_green + d_blue
+            if brightest <= zero and not has_signs:
+                start = end
                 continue
-            a = (unit - u) * (unit - v) * _likeness(node_inverse[i, j], z)
-            b = u * (unit - v) * _likeness(node_inverse[i, beside], z)
-            c = (unit - u) * v * _likeness(node_inverse[below, j], z)
-            d = u * v * _likeness(node_inverse[below, beside], z)
-            weight_sum = a + b + c + d
-            if weight_sum <= zero:
-                continue
-            share = unit / weight_sum
-            for k in range(3):
-                light = a * lux[i, j, k] + b * lux[i, beside, k]
-                light += c * lux[below, j, k] + d * lux[below, beside, k]
-                picture[row, column, k] += light * share * per_pi * reflectance[row, column, k]
-            if sends_back:
-                share *= return_per_lux[row, column]
-                for k in range(3):
-                    light = a * own_lux[i, j, k] + b * own_lux[i, beside, k]
-                    light += c * own_lux[below, j, k] + d * own_lux[below, beside, k]
-                    picture[row, column, k] += light * share * reflectance[row, column, k]
+            a_inverse = upper[j]
+            b_inverse = upper[beside]
+            c_inverse = lower[j]
+            d_inverse = lower[beside]
+            for column in range(start, end):
+                z = depths[column]
+                if not (z > zero and z < np.float32(1e6)):
+                    continue
+                u = min(max(np.float32(column - first) * per_step, zero), np.float32(columns - 1))
+                u -= np.float32(j)
+                a = (unit - u) * (unit - v) * _likeness(a_inverse, z)
+                b = u * (unit - v) * _likeness(b_inverse, z)
+                c = (unit - u) * v * _likeness(c_inverse, z)
+                d = u * v * _likeness(d_inverse, z)
+                weight_sum = a + b + c + d
+                if weight_sum <= zero:
+                    continue
+                share = unit / weight_sum
+                gain = share * per_pi
+                red = a * a_red + b * b_red + c * c_red + d * d_red
+                green = a * a_green + b * b_green + c * c_green + d * d_green
+                blue = a * a_blue + b * b_blue + c * c_blue + d * d_blue
+                lights[column, 0] += red * gain * colors[column, 0]
+                lights[column, 1] += green * gain * colors[column, 1]
+                lights[column, 2] += blue * gain * colors[column, 2]
+                if has_signs and return_per_lux[row, column] > zero:
+                    share *= return_per_lux[row, column]
+                    for k in range(3):
+                        light = a * own_lux[i, j, k] + b * own_lux[i, beside, k]
+                        light += c * own_lux[below, j, k] + d * own_lux[below, beside, k]
+                        lights[column, k] += light * share * colors[column, k]
+            start = end
 
 
 @kernel_function()

@@ -18,7 +18,13 @@ from augment.effects.lamps.exposure import (
     response,
     white_balance,
 )
-from augment.effects.lamps.glare import NARROW_SHARE, WIDE_SHARE, spread_glare, tail_levels
+from augment.effects.lamps.glare import (
+    NARROW_SHARE,
+    WIDE_SHARE,
+    spread_glare,
+    tail_levels,
+    widen_glare,
+)
 from augment.effects.lamps.hour import night_sky
 from augment.effects.lamps.picture_light import develop, find_reflectance, halve_excess, relight
 from augment.lamps.lamp import color_of_temperature
@@ -41,7 +47,8 @@ def glare_of(light: np.ndarray, focal_px: float, strength: float = 1.0) -> np.nd
     excess = halve_excess(code_of(light))
     assert excess is not None
     height, width = light.shape[:2]
-    return spread_glare(excess, width, height, focal_px, strength)
+    half = spread_glare(excess, max(width, height), focal_px, strength)
+    return widen_glare(half, width, height)
 
 
 def test_a_pixel_counts_39_electrons_at_one_candela_a_square_metre() -> None:
@@ -141,7 +148,7 @@ def test_kernels_equal_their_definitions() -> None:
     codes = code_of(ADDED[..., ::-1])
     halves = [halve_excess(codes, uses_kernels=uses) for uses in (True, False)]
     assert halves[0] is not None and halves[1] is not None
-    assert np.allclose(*halves, rtol=1e-4)
+    assert np.allclose(*halves, rtol=1e-4, atol=1e-4)  # light about 1 is 1e-5 off, and loses 1
     share = RNG.uniform(0, 1, PICTURE.shape[:2]).astype(np.float32)
     for fog in (None, share):
         numbers = (PICTURE, 0.6, fog, (0.7, 0.75, 0.8))
@@ -150,7 +157,7 @@ def test_kernels_equal_their_definitions() -> None:
         )
     light = ADDED[:, :, ::-1] * np.float32(1e-3)
     draws = RNG.integers(0, 256, light.shape, np.uint8)
-    for glare, levels in ((None, None), (light * np.float32(0.1), draws)):
+    for glare, levels in ((None, None), (light[:19, :31] * np.float32(0.1), draws)):
         numbers = (code_of(light), glare, levels, 300.0, READ_NOISE, 1.0)
         for balance in (None, np.array([0.8, 1.0, 2.1])):
             out, expected = (

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from augment.lamps import surface_light_kernels
-from augment.lamps.beam_shadows import draw_beam_shadows
+from augment.lamps.beam_shadows import draw_beam_shadows, looks_into
 from augment.lamps.lamp import EGO_OWNER, LampKind, Lamps
 from augment.lamps.patterns import DIPPED_PEAK_CD, Pattern
 from augment.lamps.surface_light import (
@@ -252,6 +253,26 @@ def test_own_beams_throw_shadows_and_the_road_none_on_itself() -> None:
 def _lit_share(shadows, point: np.ndarray) -> float:
     """Return the share of the first lamp's light at a point, as the kernel finds it."""
     return float(surface_light_kernels.lit_share.py_func(shadows.arrays, 0, *point))
+
+
+def test_views_beside_and_behind_the_beams_need_no_map() -> None:
+    own = lamps_at([(2, 0, 0.6)], (1, 0, 0), kind=LampKind.DIPPED, owner=EGO_OWNER)
+    assert looks_into(turned_camera(0), own)
+    assert looks_into(turned_camera(60), own)  # its image reaches 32 degrees to the side
+    assert not looks_into(turned_camera(120), own)
+    assert not looks_into(turned_camera(180), own)
+
+
+def turned_camera(yaw_deg: float) -> Camera:
+    """Return a camera that looks so far to the left of x."""
+    camera = camera_at(1.5)
+    yaw = math.radians(yaw_deg)
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:2, :2] = torch.tensor(
+        [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]], dtype=torch.float64
+    )
+    pose = camera.camera_from_world @ turn.T
+    return replace(camera, camera_from_world=pose)
 
 
 def test_no_own_lamps_need_no_map() -> None:

@@ -28,7 +28,7 @@ from augment.effects.effect import (
     skipped_steps,
 )
 from augment.effects.lamps.exposure import READ_NOISE, Exposure
-from augment.effects.lamps.glare import spread_glare
+from augment.effects.lamps.glare import spread_glare, widen_glare
 from augment.effects.lamps.hour import find_hour, night_sky, white_of_picture
 from augment.effects.lamps.lamp_light import add_lamp_light
 from augment.effects.lamps.light_table import (
@@ -60,7 +60,8 @@ from augment.effects.lamps.sources import count_lamps, without_sources
 from augment.effects.lamps.view_lamps import describe_lamps, lamps_of_view
 from augment.effects.wet.darkening import white_level
 from augment.light.scene_light import find_scene_light
-from augment.render.buffers import EXPECTED_DEPTH, REFERENCE, SPLAT_IDS
+from augment.render.buffers import EXPECTED_DEPTH, REFERENCE
+from augment.render.cpu.order import cached_of_tensor
 from augment.render.sensor import draw_noise
 from augment.scene.boxes import WorldBoxes
 from augment.scene.cameras import Camera
@@ -124,8 +125,7 @@ class LampsEffect(Effect):
         lamp_reason = describe_lamps(plan, scene, auto_reason(recipe, plan.hour)[1])
         exposure_reason = exposure_of(plan, scene).reason if plan.hour.is_dark else ""
         steps = steps_of(plan, lamp_reason, exposure_reason)
-        buffers = {EXPECTED_DEPTH, SPLAT_IDS} if plan.has_signs else {EXPECTED_DEPTH}
-        return EffectPlan(plan, steps, frozenset(buffers))
+        return EffectPlan(plan, steps, frozenset({EXPECTED_DEPTH}))
 
     def without_parts(self, effect: EffectInScene, recipe: Recipe) -> dict[str, Recipe]:
         return without_sources(effect.settings, effect.scene, recipe)
@@ -191,6 +191,7 @@ class LampsEffect(Effect):
             with timed(GLARE):
                 glare = _glare(out, camera, plan.light.glare, uses_kernels=uses_kernels)
                 if glare is not None:
+                    glare = widen_glare(glare, camera.width, camera.height)
                     glare[glare.max(axis=-1) < MIN_LAMP_LIGHT_BY_DAY] = 0
                     added += glare / np.float32(exposure.scale)
                     out, _ = relight(rgb, added, *numbers, uses_kernels=uses_kernels)
@@ -249,8 +250,10 @@ class LampsEffect(Effect):
 
 def _glare(
     picture: Float32[np.ndarray, "H W 3"], camera: Camera, strength: float, *, uses_kernels: bool
-) -> Float32[np.ndarray, "H W 3"] | None:
-    """Return the light that the lens scatters about saturated pixels; None for none.
+) -> Float32[np.ndarray, "h w 3"] | None:
+    """Return the light that the lens scatters about saturated pixels, at half the resolution.
+
+    None if there is none.
 
     Args:
         picture: the exposed picture, display-encoded, not clamped.
@@ -264,7 +267,7 @@ def _glare(
     if excess is None:
         return None
     focal_px = (camera.fx + camera.fy) / 2
-    return spread_glare(excess, camera.width, camera.height, focal_px, strength)
+    return spread_glare(excess, max(camera.width, camera.height), focal_px, strength)
 
 
 def _read_light(
@@ -275,16 +278,17 @@ def _read_light(
     Args:
         effect: the effect in the scene.
         view: the exposed picture before the sensor.
-        glare: light that the lens scatters, [H, W, 3]; None for none.
+        glare: light that the lens scatters, at half the resolution, [h, w, 3]; None for none.
         exposure: the camera's exposure.
     """
     plan: LightPlan = effect.settings
     with timed(METER):
         if glare is None and not plan.needs_luminance:
             return view
+        height, width = view.rgb.shape[:2]
         reading = read_light(
             view.rgb.detach().cpu().numpy(),
-            glare,
+            None if glare is None else widen_glare(glare, width, height),
             exposure.white_cd_m2,
             needs_luminance=plan.needs_luminance,
             uses_kernels=effect.backend != REFERENCE,
@@ -313,6 +317,10 @@ def _exposed_layers(layers: LayerRenderer, gain: float) -> LayerRenderer:
     if not isinstance(layers.sky, CubemapSky):
         return layers
     faces = layers.sky.faces
-    scaled, _ = relight(faces.flatten(0, 1).numpy(), None, gain, 0.0, -1.0)
-    sky = CubemapSky(torch.from_numpy(scaled).view(faces.shape))
+
+    def expose_sky() -> CubemapSky:
+        scaled, _ = relight(faces.flatten(0, 1).numpy(), None, gain, 0.0, -1.0)
+        return CubemapSky(torch.from_numpy(scaled).view(faces.shape))
+
+    sky = cached_of_tensor(faces, f"exposed by {gain!r}", expose_sky)
     return replace(layers, sky=sky, fog=None)

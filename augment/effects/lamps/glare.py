@@ -35,43 +35,78 @@ RADIUS_DEG = 40.0
 _FINEST_PX = 2
 # Standard deviation of each Gaussian in its own pixels.
 _SIGMA = 1.5
+# Radius of each Gaussian's window, its own pixels: four standard deviations.
+_RADIUS = 6
+# Light of a Gaussian that is left out: an eighth of a grey level of a black pixel.
+MIN_GLARE = 3.8e-5
 # Median radius of a Gaussian in two dimensions over its standard deviation.
 _MEDIAN_RADIUS = math.sqrt(2 * math.log(2))
 
 
 def spread_glare(
-    excess: Float32[np.ndarray, "h w 3"], width: int, height: int, focal_px: float, strength: float
-) -> Float32[np.ndarray, "H W 3"]:
-    """Return the light that tails of the point spread function add to a picture.
+    excess: Float32[np.ndarray, "h w 3"], side_px: int, focal_px: float, strength: float
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return the light that tails of the point spread function add, at half the resolution.
 
     Args:
         excess: light beyond saturation at half the resolution.
-        width: width of the picture, pixels.
-        height: height of the picture, pixels.
+        side_px: longer side of the picture, pixels.
         focal_px: focal length, pixels of the picture.
         strength: the tails' share of the light, over that of a clean lens.
     """
-    levels = tail_levels(focal_px, max(height, width))
+    levels = tail_levels(focal_px, side_px)
     coarsest = 1 << (len(levels) - 1)
     padding = [-(-size // coarsest) * coarsest - size for size in excess.shape[:2]]
     grids = [np.pad(excess, ((0, padding[0]), (0, padding[1]), (0, 0)))]
     for _ in levels[1:]:
         size = (grids[-1].shape[1] // 2, grids[-1].shape[0] // 2)
         grids.append(cv2.resize(grids[-1], size, interpolation=cv2.INTER_AREA))
-    total: np.ndarray | None = None
+    total = np.zeros_like(grids[-1])
     for weight, grid in zip(reversed(levels), reversed(grids), strict=True):
-        blurred = cv2.GaussianBlur(grid, (0, 0), _SIGMA, borderType=cv2.BORDER_CONSTANT)
-        blurred *= np.float32(weight * strength)
-        if total is not None:
-            blurred += cv2.resize(
-                total, (grid.shape[1], grid.shape[0]), interpolation=cv2.INTER_LINEAR
-            )
-        total = blurred
-    assert total is not None
-    half = np.ascontiguousarray(total[: excess.shape[0], : excess.shape[1]])
-    size = (_FINEST_PX * half.shape[1], _FINEST_PX * half.shape[0])
-    full = cv2.resize(half, size, interpolation=cv2.INTER_LINEAR)
-    return full if size == (width, height) else np.ascontiguousarray(full[:height, :width])
+        if total.shape != grid.shape:
+            size = (grid.shape[1], grid.shape[0])
+            total = cv2.resize(total, size, interpolation=cv2.INTER_LINEAR)
+        _add_blurred(total, grid, np.float32(weight * strength))
+    return np.ascontiguousarray(total[: excess.shape[0], : excess.shape[1]])
+
+
+def _add_blurred(
+    total: Float32[np.ndarray, "h w 3"], grid: Float32[np.ndarray, "h w 3"], weight: np.float32
+) -> None:
+    """Add a grid's light under a Gaussian to `total`, in place, where it can be seen.
+
+    Args:
+        total: the sum.
+        grid: light of the grid's pixels.
+        weight: factor of the light.
+    """
+    row_light = grid.reshape(len(grid), -1).max(1)
+    if row_light.max() * weight < MIN_GLARE:
+        return
+    rows = np.flatnonzero(row_light)
+    columns = np.flatnonzero(grid.max(0).any(1))
+    top = max(rows[0] - _RADIUS, 0)
+    left = max(columns[0] - _RADIUS, 0)
+    box = (slice(top, rows[-1] + _RADIUS + 1), slice(left, columns[-1] + _RADIUS + 1))
+    source = np.ascontiguousarray(grid[box])
+    size = (2 * _RADIUS + 1, 2 * _RADIUS + 1)
+    blurred = cv2.GaussianBlur(source, size, _SIGMA, borderType=cv2.BORDER_CONSTANT)
+    blurred *= weight
+    total[box] += blurred
+
+
+def widen_glare(
+    glare: Float32[np.ndarray, "h w 3"], width: int, height: int
+) -> Float32[np.ndarray, "H W 3"]:
+    """Return glare at the resolution of the picture, interpolated.
+
+    Args:
+        glare: result of `spread_glare`.
+        width: width of the picture, pixels.
+        height: height of the picture, pixels.
+    """
+    size = (_FINEST_PX * glare.shape[1], _FINEST_PX * glare.shape[0])
+    return cv2.resize(glare, size, interpolation=cv2.INTER_LINEAR)[:height, :width]
 
 
 def tail_levels(focal_px: float, side_px: int) -> list[float]:

@@ -15,7 +15,7 @@ from augment.effects.lamps.plan import AIR, DROPS, EMITTERS, SURFACES, WET, Ligh
 from augment.effects.lamps.recording_car import PAINT_M, light_recording_car, recording_car_pixels
 from augment.effects.lamps.signs import sign_pixels
 from augment.lamps.air_light import air_light
-from augment.lamps.beam_shadows import draw_beam_shadows
+from augment.lamps.beam_shadows import BeamShadows, draw_beam_shadows, looks_into, throws_shadows
 from augment.lamps.drop_light import add_drop_light
 from augment.lamps.emitters import HALO_RADIUS_M, add_emitters, lamp_visibility
 from augment.lamps.fog_phase import AirExtinction
@@ -23,11 +23,13 @@ from augment.lamps.lamp import Lamps
 from augment.lamps.recorded_lamps import find_recorded_lamps, vehicle_pixels
 from augment.lamps.surface_light import surface_light
 from augment.lamps.wet_glints import add_wet_glints
+from augment.memo import memo_of
 from augment.render.buffers import REFERENCE
 from augment.render.composite import unit_depth_coordinates
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.scatter import scattered_share
 from augment.scene.cameras import Camera
+from augment.scene.labels import EGO_VEHICLE
 from augment.timing import timed
 
 # Opacity of a pixel up to which it shows no surface that hides a lamp.
@@ -212,13 +214,16 @@ def _add_surface_light(
         reflectance = find_reflectance(
             rgb, white, fog_share, airlight_rgb, uses_kernels=effect.backend != REFERENCE
         )
-        shadows = draw_beam_shadows(
-            lamps,
-            tuple(view.layers.parts),
-            settings=view.layers.settings,
-            backend=effect.backend,
-            timestamp_ns=camera.timestamp_ns,
-        )
+        shadows = _own_shadows(effect, view, camera)
+        is_sign = None
+        if plan.has_signs:
+            is_sign = sign_pixels(
+                view.layers.parts,
+                camera,
+                depth_m,
+                settings=view.layers.settings,
+                backend=effect.backend,
+            )
         eyes = np.tile(camera.centre.numpy(), (len(lamps), 1))
         extinctions_per_m = air.mean_extinction_per_m(eyes, lamps.positions_m)
         surface_light(
@@ -230,7 +235,7 @@ def _add_surface_light(
             min_luminance_cd_m2=threshold_cd_m2,
             lamps_per_pixel=plan.lamps_per_pixel,
             shadows=shadows,
-            is_sign=sign_pixels(view) if plan.has_signs else None,
+            is_sign=is_sign,
             picture=added,
         )
     if not plan.is_wet:
@@ -251,6 +256,31 @@ def _add_surface_light(
         )
         if fog_share is not None:
             added += glints * (1 - np.clip(fog_share, 0, 1))[..., None]
+
+
+def _own_shadows(effect: EffectInScene, view: RenderedView, camera: Camera) -> BeamShadows | None:
+    """Return the depth maps of the own beams; None if the view does not look where they shine.
+
+    All cameras of a moment share the maps, so these have the scene's parts and not the view's.
+    """
+    lamps: Lamps = effect.view_data
+    beams = lamps.select(throws_shadows(lamps))
+    if len(beams) == 0 or not looks_into(camera, beams):
+        return None
+    scene = effect.scene
+    settings = view.layers.settings
+    moment = camera.timestamp_ns
+    places = (beams.positions_m.tobytes(), beams.axes.tobytes(), beams.ups.tobytes())
+
+    def draw() -> BeamShadows | None:
+        ids = [i for i, actor in enumerate(scene.actors, 1) if actor.label != EGO_VEHICLE]
+        parts = tuple(scene.parts_at(moment, ids))
+        return draw_beam_shadows(
+            beams, parts, settings=settings, backend=effect.backend, timestamp_ns=moment
+        )
+
+    key = ("lamps, beam shadows", moment, places, settings, effect.backend)
+    return memo_of(scene).get(key, draw)
 
 
 def _fog_share(

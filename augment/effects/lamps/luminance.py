@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from augment.effects.lamps.luminance_kernels import measure_luminance
-from augment.effects.lamps.picture_light import light_table
 from augment.light.srgb import LUMINANCE_WEIGHTS, linear_from_display
 from augment.render.composite import ROWS_PER_CHUNK
 from augment.render.threads import kernel_threads
@@ -64,7 +63,6 @@ def read_light(
             np.ascontiguousarray(rgb),
             _NO_GLARE if glare is None else np.ascontiguousarray(glare),
             np.array([*LUMINANCE_WEIGHTS, white_cd_m2, MIN_VEIL], np.float32),
-            light_table(),
             luminance,
             is_veiled,
         )

@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from augment.effects.lamps.light_kernels import light_of_code
+from augment.effects.lamps.light_kernels import MAX_CODE, light_of_code, light_of_high_code
 from augment.render.cpu.jit import kernel
 
 
 @kernel
-def measure_luminance(rgb, glare, numbers, light_table, luminance, is_veiled):
+def measure_luminance(rgb, glare, numbers, luminance, is_veiled):
     """Write the luminance of each pixel, and whether glare is most of it. All floats are float32.
 
     Args:
@@ -21,7 +21,6 @@ def measure_luminance(rgb, glare, numbers, light_table, luminance, is_veiled):
         glare: light that the lens scatters, [H, W, 3]; or empty [0, 0, 3] for none.
         numbers: weights of red, green and blue in luminance; cd/m2 of a light of 1; smallest light
             of glare that veils a pixel.
-        light_table: light by code.
         luminance: output [H, W], cd/m2; or empty [0, 0] for none.
         is_veiled: output [H, W].
     """
@@ -33,7 +32,9 @@ def measure_luminance(rgb, glare, numbers, light_table, luminance, is_veiled):
             light = zero
             veil = zero
             for k in range(3):
-                light += numbers[k] * light_of_code(max(rgb[i, j, k], zero), light_table)
+                code = max(rgb[i, j, k], zero)
+                value = light_of_high_code(code) if code > MAX_CODE else light_of_code(code)
+                light += numbers[k] * value
                 if has_glare:
                     veil += numbers[k] * glare[i, j, k]
             is_veiled[i, j] = veil > light and veil >= numbers[4]
