@@ -31,3 +31,7 @@ class StyleError(ClimateGSError):
 
 class MetricError(ClimateGSError):
     """A metric's weights cannot be used as they are."""
+
+
+class LampError(ClimateGSError):
+    """A lamp, or a file that describes one, cannot be used as it is."""

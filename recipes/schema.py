@@ -33,6 +33,7 @@ from recipes.fields import (
 )
 from recipes.flood import Flood
 from recipes.lens_drops import LensDrops
+from recipes.light import Light
 from recipes.rain import Rain
 from recipes.smog import Smog
 from recipes.snow import Snow
@@ -314,6 +315,7 @@ class Recipe(ClosedModel):
     """Which draw from the ranges this is; in a file with ranges, the first one."""
     weather: Weather = Weather()
     style: Style | None = None
+    light: Light | None = None
     quality: Quality = Quality()
     render: Render = Render()
     camera: Sensor = Sensor()
@@ -453,6 +455,7 @@ SECTIONS: dict[str, type[EffectModel]] = {
     "weather.rain": Rain,
     "weather.snowfall": Snowfall,
     "style": Style,
+    "light": Light,
     "camera.lens_drops": LensDrops,
 }
 # By dotted path, those that save most first.

@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import Field
 
 from recipes.effect import Knob, Section
-from recipes.fields import Flag, Number
+from recipes.fields import Flag, Number, Whole
 
 # Paths of the fields, by their former paths. Files that people write are refused with a former
 # path. Recipes in numbers, which jobs leave beside their images, are read with either.
@@ -31,6 +31,13 @@ MOVED_FIELDS = {
     "weather.snowfall.min_width_px": "render.speed.snowfall_min_width_px",
     "quality.settled": "render.speed.settled",
 }
+# Paths of all fields, by their places in hashes: the sections whose pictures they change.
+_HASHED_PLACES = {
+    **MOVED_FIELDS,
+    "light.lamp_points": "render.speed.lamp_points",
+    "light.lamp_halo_px": "render.speed.lamp_halo_px",
+    "light.lamps_per_pixel": "render.speed.lamps_per_pixel",
+}
 _FORMER_PATHS = {path: former for former, path in MOVED_FIELDS.items()}
 
 
@@ -47,6 +54,9 @@ class Speed(Section):
         "lod_px",
         "layers_px",
         "bed_cut",
+        "lamp_points",
+        "lamp_halo_px",
+        "lamps_per_pixel",
     )
     knobs = (
         Knob(
@@ -112,6 +122,30 @@ class Speed(Section):
             section="weather.snowfall",
         ),
         Knob(
+            "lamp_points",
+            (4, 8, 16),
+            "points of the sum for lamps' light in the air",
+            8.6,
+            tiers={"draft": 4, "balanced": 8},
+            section="light",
+        ),
+        Knob(
+            "lamp_halo_px",
+            (8, 4, 2),
+            "width of the pixels of lamps' halos",
+            8.7,
+            tiers={"draft": 8, "balanced": 4},
+            section="light",
+        ),
+        Knob(
+            "lamps_per_pixel",
+            (2, 4, 8),
+            "lamps that light one surface",
+            8.8,
+            tiers={"draft": 4},
+            section="light",
+        ),
+        Knob(
             "lod_px",
             (2.0, 1.0, 0.5, 0.0),
             "far splats are merged in cells as large",
@@ -159,6 +193,12 @@ class Speed(Section):
     snowfall_min_width_px: Number = Field(default=0.5, ge=0.1, le=16)
     """Flakes are drawn one by one up to where they are this wide, pixels of the rendered picture;
     farther ones are the veil."""
+    lamp_points: Whole = Field(default=8, ge=2, le=64)
+    """Points of the sum along each ray for the light that the air scatters out of lamps' beams."""
+    lamp_halo_px: Whole = Field(default=4, ge=1, le=32)
+    """Width of the pixels in which that light is computed, of the picture's."""
+    lamps_per_pixel: Whole = Field(default=8, ge=1, le=64)
+    """Lamps that light one part of a surface at most: the strongest."""
     settled: Flag = False
     """Whether max_flip or budget_ms has made its choice, which the recipe then holds: so it is in
     the recipes that a job leaves, and nothing is chosen again."""
@@ -177,7 +217,7 @@ def put_in_former_places(recipe: dict[str, Any]) -> None:
     has no place there. Later fields at their defaults are left out, as everywhere in hashes.
     """
     speed = recipe["render"].pop("speed")
-    for former, path in MOVED_FIELDS.items():
+    for former, path in _HASHED_PLACES.items():
         name = path.rpartition(".")[2]
         section_path, _, former_name = former.rpartition(".")
         section: Any = recipe

@@ -47,6 +47,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "light": ("augment.light",),
     "photo": ("augment.photo",),
     "exposure": ("augment.exposure",),
+    "lamps": ("augment.lamps",),
     "layers": ("augment.view.layers",),
     "effects": ("augment.effects",),
     "output": ("augment.output",),

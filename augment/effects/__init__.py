@@ -10,6 +10,7 @@ from augment.detail.prune import precompute_errors, prune_error_of
 from augment.effects.effect import Effect, JobContext
 from augment.effects.falling.effect import RainEffect, SnowfallEffect
 from augment.effects.flood.effect import FloodEffect
+from augment.effects.lamps.effect import LampsEffect
 from augment.effects.lens_drops.effect import LensDropsEffect
 from augment.effects.smog import SmogEffect
 from augment.effects.snow.effect import SnowEffect
@@ -20,7 +21,7 @@ from recipes.schema import add_section, remove_section
 
 # Effects in the order in which they are applied. Style colours the scene, and rain wets it. Then
 # come the air in front of it, the snow on it, the water over it, the spray, falling rain and snow,
-# and last the drops on the camera's lens.
+# the hour and its lamps, and last the drops on the camera's lens.
 EFFECTS: tuple[Effect, ...] = (
     StyleEffect(),
     WetEffect(),
@@ -30,6 +31,7 @@ EFFECTS: tuple[Effect, ...] = (
     SprayEffect(),
     RainEffect(),
     SnowfallEffect(),
+    LampsEffect(),
     LensDropsEffect(),
 )
 

@@ -12,7 +12,7 @@ The hooks of `Effect`, by when they are called:
                                gloss_share      blue sky in glossy surfaces
     once a scene               prepare, relight, precompute
     once a view                cameras, visibility, edit_scene, draw, edit_image,
-                               visible_mask, front_surface
+                               visible_mask, front_surface, expose
     labels of a view           measure_boxes, grow_boxes, box_table
     once a sweep               intersect_beams, attenuate_beams
 """
@@ -29,6 +29,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
+from augment.lamps.drop_cover import DropCover
+from augment.lamps.wet_surface import WetSurface
 from augment.output.box_tables import BoxTable
 from augment.render.buffers import RenderOutput
 from augment.scene.boxes import WorldBoxes
@@ -195,6 +197,12 @@ class RenderedView:
     skip_reasons: Mapping[str, str] = field(default_factory=dict)
     """Reason for each pass that proved needless while drawing, by the pass's name."""
 
+    wet_surface: WetSurface | None = None
+    """Water that mirrors lamps; None without any, or unless `layers.needs_lamp_inputs`."""
+
+    drop_covers: tuple[DropCover, ...] = ()
+    """Drops and flakes that lamps light; none unless `layers.needs_lamp_inputs`."""
+
 
 @dataclass(frozen=True, eq=False)
 class FrontSurface:
@@ -260,6 +268,11 @@ class Effect:
 
     precomputes_files: ClassVar[bool] = False
     """If True, `precompute` takes long and stores large results in files."""
+
+    sees_exposure: ClassVar[bool] = False
+    """If True, `edit_image` receives the picture in its camera's exposure: the camera's colour map
+    is applied before it instead of to the finished picture.
+    """
 
     raster_passes: ClassVar[tuple[str, ...]] = ()
     """Names of those passes that run the rasteriser."""
@@ -373,6 +386,20 @@ class Effect:
     def edit_image(self, effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
         """Return the finished picture with the effect on it."""
         return view
+
+    def expose(
+        self, effect: EffectInScene, rgb: Float[Tensor, "H W 3"], camera: Camera
+    ) -> Float[Tensor, "H W 3"]:
+        """Return the picture as the camera's sensor records it.
+
+        It is called after `edit_image` of all effects, the camera's colour map and the lens's blur.
+
+        Args:
+            effect: the effect in the scene.
+            rgb: the picture, display-encoded, not clamped; it may be written into.
+            camera: the view.
+        """
+        return rgb
 
     def reads_neighbours(self, effect: EffectInScene) -> bool:
         """Return True if pixels of `edit_image` depend on other pixels of its picture."""

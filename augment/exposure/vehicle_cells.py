@@ -46,6 +46,7 @@ from augment.memo import memo_of
 from augment.render.buffers import AUTO
 from augment.scene.boxes import WorldBoxes
 from augment.scene.geometry import rotmat_from_quat
+from augment.scene.labels import Boxes
 from augment.scene.scene import Actor, Gaussians, PosedGaussians, Scene
 from augment.scene.semantics import SemanticClass, class_of_label
 
@@ -173,6 +174,10 @@ class ParkedVehicle:
     """Centre of its box, float64 [3], world."""
     rotation: np.ndarray
     """world_from_box, float64 [3, 3]."""
+    track_id: str
+    """Track of its box."""
+    is_stopped: bool
+    """True where the dataset says that it has stopped in traffic, and is not parked."""
 
 
 def parked_vehicles(scene: Scene) -> tuple[ParkedVehicle, ...]:
@@ -210,7 +215,12 @@ def _find_parked_vehicles(scene: Scene) -> tuple[ParkedVehicle, ...]:
                 length, width, height = boxes.sizes_m[i].tolist()
                 vehicles_by_track.setdefault(track_id, []).append(
                     ParkedVehicle(
-                        label, (length, width, height), boxes.centres_m[i], boxes.rotations[i]
+                        label,
+                        (length, width, height),
+                        boxes.centres_m[i],
+                        boxes.rotations[i],
+                        track_id,
+                        _is_stopped(labels, i),
                     )
                 )
     return tuple(
@@ -221,6 +231,12 @@ def _find_parked_vehicles(scene: Scene) -> tuple[ParkedVehicle, ...]:
             for vehicle in vehicles
         )
     )
+
+
+def _is_stopped(boxes: Boxes, row: int) -> bool:
+    """Return True if a text of a box says that it has stopped: PandaSet's and nuScenes's word."""
+    texts = [column[row] for column in boxes.attributes.values() if column.dtype == object]
+    return any(isinstance(text, str) and "stopped" in text.lower() for text in texts)
 
 
 def shells_of_parked(

@@ -37,7 +37,7 @@ READ_SHARE = 0.005
 # Display-encoded level at which a recipe states the noise.
 MID_GREY = 0.5
 # Standard deviation of the draws in their 8 bits, which leaves 3 sigma to either side.
-_LEVEL_SD = 40.0
+LEVEL_SD = 40.0
 # Standard deviation that bilinear demosaicing leaves of the sites' noise: the root of the mean
 # variance, 5/8 for green, 9/16 for red and blue.
 _DEMOSAICED_SD = math.sqrt((0.625 + 2 * 0.5625) / 3)
@@ -83,7 +83,7 @@ def add_noise(
         backend: backend of the render. The noise is drawn on the CPU for every backend.
     """
     draws = draw_noise(camera, seed=seed, scene=scene)
-    sigmas = noise_sigmas() * np.float32(mid_grey_sigma / (_LEVEL_SD * _DEMOSAICED_SD))
+    sigmas = noise_sigmas() * np.float32(mid_grey_sigma / (LEVEL_SD * _DEMOSAICED_SD))
     if choose_kernels(backend, rgb) == CPU:
         noisy_rgb = rgb.detach().contiguous().numpy()
         with kernel_threads(ROWS_PER_CHUNK):
@@ -116,7 +116,7 @@ def noise_sigmas() -> Float[np.ndarray, "256"]:
 def draw_noise(camera: Camera, *, seed: int, scene: str) -> UInt8[np.ndarray, "H W 3"]:
     """Return demosaiced normal numbers in 8 bits about 128.
 
-    Their standard deviation at the sites of the Bayer pattern is _LEVEL_SD.
+    Their standard deviation at the sites of the Bayer pattern is LEVEL_SD.
     """
     # The pose distinguishes the frames of a path without times.
     pose = np.ascontiguousarray(camera.camera_from_world.numpy(), np.float64).tobytes()
@@ -185,4 +185,4 @@ def noise_covariance() -> Float[np.ndarray, "3 3 3"]:
 def _quantiles() -> UInt8[np.ndarray, "256"]:
     """Return a normal number for every byte."""
     values = norm.ppf((np.arange(256) + 0.5) / 256)
-    return np.rint(128 + _LEVEL_SD * values / values.std()).clip(0, 255).astype(np.uint8)
+    return np.rint(128 + LEVEL_SD * values / values.std()).clip(0, 255).astype(np.uint8)

@@ -55,6 +55,8 @@ class LayerRenderer:
     """The parts before pruning, if `parts` have been pruned (`augment.detail.prune`); else None."""
     added_colors: AddedColors | None = None
     """Map of the colours that effects add, before the camera's colour map; None to leave them."""
+    needs_lamp_inputs: bool = False
+    """If True, effects also fill those fields of `RenderedView` that only lamps read."""
 
     def without_fog(self) -> LayerRenderer:
         """Return the same renderer in clear air."""

@@ -161,21 +161,26 @@ def render_buffers(
     rendered = _draw(view, layers, camera)
     if own_car is None or car_rgb is None:
         for effect in view.effects:
-            rendered = effect.hooks.edit_image(effect, rendered, camera)
+            rendered = _edit_image(effect, rendered, camera, color_map)
     else:
         if plan.covers_own_car:
             rng = rng_for(
                 seed=plan.seed, scene=scene.name, effect="snow on the own car", camera=camera.name
             )
             car_rgb = cover_own_car(car_rgb, own_car, rendered.raster, rng=rng)
-        rendered = _edit_around_own_car(view, rendered, camera, own_car, car_rgb)
+        rendered = _edit_around_own_car(view, rendered, camera, own_car, car_rgb, color_map)
     rgb = rendered.rgb
-    if color_map is not None:  # a camera exposes what the weather has left, so this comes last
+    is_exposed = any(effect.hooks.sees_exposure for effect in view.effects)
+    if (
+        color_map is not None and not is_exposed
+    ):  # a camera exposes what the weather has left, so this comes last
         with timed("camera colour map"):
             rgb = apply_color_map(rgb, color_map, backend=backend)
     if plan.sensor.psf_px > 0:
         with timed(LENS_BLUR_PASS):
             rgb = blur_lens(rgb, plan.sensor.psf_px)
+    for effect in view.effects:
+        rgb = effect.hooks.expose(effect, rgb, camera)
     if plan.sensor.noise > 0:
         with timed(SENSOR_NOISE_PASS):
             noise_sigma = plan.sensor.noise
@@ -295,8 +300,33 @@ def _is_weather(effect: EffectInScene) -> bool:
     return effect.hooks.section.startswith("weather.")
 
 
+def _edit_image(
+    effect: EffectInScene, rendered: RenderedView, camera: Camera, color_map: Tensor | None
+) -> RenderedView:
+    """Return the picture with an effect on it, after the colour map if the effect needs that.
+
+    Args:
+        effect: the effect.
+        rendered: the picture.
+        camera: the view.
+        color_map: the camera's colour map, [3, 4]; None without one.
+    """
+    if color_map is not None and effect.hooks.sees_exposure:
+        with timed("camera colour map"):
+            rgb = rendered.rgb.clone()  # which may be the recorded image
+            rendered = replace(
+                rendered, rgb=apply_color_map(rgb, color_map, backend=effect.backend)
+            )
+    return effect.hooks.edit_image(effect, rendered, camera)
+
+
 def _edit_around_own_car(
-    view: ViewPlan, first_view: RenderedView, camera: Camera, own_car: OwnCar, car_rgb: Tensor
+    view: ViewPlan,
+    first_view: RenderedView,
+    camera: Camera,
+    own_car: OwnCar,
+    car_rgb: Tensor,
+    color_map: Tensor | None,
 ) -> RenderedView:
     """Return the view with all effects on the picture, and no weather on the recording car.
 
@@ -309,6 +339,7 @@ def _edit_around_own_car(
         camera: the view.
         own_car: the recording car in it.
         car_rgb: colours of the car's rows, [h, W, 3].
+        color_map: the camera's colour map, [3, 4]; None without one.
     """
     rendered = first_view
     is_car_covered = True
@@ -318,7 +349,7 @@ def _edit_around_own_car(
             rendered = _with_own_car(rendered, first_view, own_car, car_rgb)
             is_car_covered = False
         unedited = rendered
-        rendered = effect.hooks.edit_image(effect, rendered, camera)
+        rendered = _edit_image(effect, rendered, camera, color_map)
         if rendered is unedited:
             continue
         is_car_covered = is_weather

@@ -351,7 +351,7 @@ _TAMED: dict[str, st.SearchStrategy[Any]] = {
     "style.preset": st.sampled_from(("dusk", "night")),
     **dict.fromkeys(("style.image", "style.mask", "style.checkpoint", "style.digest"), st.none()),
 }
-EFFECTS = ("smog", "flood", "snow", "style", "rain", "snowfall", "lens_drops")
+EFFECTS = ("smog", "flood", "snow", "style", "rain", "snowfall", "light", "lens_drops")
 _NOT_OF_FRAMES = ("quality", "output")  # chooses settings; drawn after the weather
 
 

@@ -31,6 +31,7 @@ STRONG = {
     "spray": {"weather": {"rain": {"rate_mm_h": 50.0, "spray": True}}},
     "rain": {"weather": {"rain": DOWNPOUR}},
     "snowfall": {"weather": {"snowfall": {"rate_mm_h": 5.0}}},
+    "lamps": {"light": {"time": "night"}},
     "lens_drops": {"camera": {"lens_drops": {"count": 60}}},
 }
 WEAK = {
@@ -42,6 +43,7 @@ WEAK = {
     "spray": {"weather": {"rain": {"rate_mm_h": 0.0, "wetness": 0.0, "spray": True}}},
     "rain": {"weather": {"rain": {**DOWNPOUR, "rate_mm_h": 0.0}}},
     "snowfall": {"weather": {"snowfall": {"rate_mm_h": 0.0}}},
+    "lamps": {"light": {"time": "day", "vehicles": "off", "own_beams": "off"}},
     "lens_drops": {"camera": {"lens_drops": {"count": 0}}},
 }
 # The recipes without the effect, where another effect shares its section.

@@ -420,7 +420,8 @@ def test_a_preset_comes_before_a_file_of_its_name(
 def test_the_presets_are_there() -> None:
     assert preset_names() == (
         *("blizzard", "brown-smog", "clear", "deep-flood", "deep-snow", "dense-fog", "downpour"),
-        *("drizzle", "dusting", "evening", "flurries", "fresh-snow", "light-haze", "overcast"),
+        *("drizzle", "dusk-lamps", "dusting", "evening", "flurries", "foggy-lamps", "fresh-snow"),
+        *("light-haze", "night", "night-fog", "night-rain", "overcast"),
         *("puddled", "rain", "slush", "snowfall", "storm", "street-flood", "winter-day"),
         *("winter-fog", "winter-street"),
     )

@@ -19,6 +19,7 @@ from recipes.errors import RecipeError
 from recipes.flood import MAX_WAVES, Flood, Wave, Waves
 from recipes.json_schema import recipe_json_schema, write_schema
 from recipes.lens_drops import LensDrops
+from recipes.light import Light, ListedLamp
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.rain import Rain
 from recipes.ranges import format_value
@@ -216,9 +217,10 @@ ELSEWHERE |= {
     "style.preset",
     "style.mask",
     "style.checkpoint",
+    "light.street_ies",
     "render.speed.settled",
 }
-CANDIDATES = (0, 1, 2, 0.5, 0.1, True, False, "other", "1" * 64, (0.1, 0.2, 0.3))
+CANDIDATES = (0, 1, 2, 0.5, 0.1, True, False, "other", "1" * 64, (0.1, 0.2, 0.3), 10, 2000)
 
 
 def test_every_field_changes_the_hash() -> None:
@@ -231,7 +233,9 @@ def test_every_field_changes_the_hash() -> None:
     camera = Sensor(lens_drops=LensDrops(count=5))
     style = Style(image="a.png", digest="0" * 64)
     output = Output(categories=(Category(label="car", name="Car"),))
-    base = Recipe(weather=weather, style=style, camera=camera, output=output)
+    lamp = ListedLamp(x_m=0, y_m=5, z_m=6, candela=100)
+    light = Light(street_ies="a.ies", digest="0" * 64, lamps=(lamp,))
+    base = Recipe(weather=weather, style=style, light=light, camera=camera, output=output)
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
     hashes = {base.hash, smoggy(extinction_per_m=0.01).hash, smoggy(mor_m=300).hash}
     hashes.add(base.model_copy(update={"camera": Sensor()}).hash)

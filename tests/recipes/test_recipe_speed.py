@@ -86,7 +86,8 @@ def test_tiers_and_presets_have_the_hashes_of_version_0_6() -> None:
 
 
 def test_every_moved_field_is_in_the_section_and_nowhere_else() -> None:
-    assert [*MOVED_FIELDS.values()] == [f"render.speed.{name}" for name in Speed.model_fields]
+    moved_fields = [name for name in Speed.model_fields if not name.startswith("lamp")]
+    assert [*MOVED_FIELDS.values()] == [f"render.speed.{name}" for name in moved_fields]
     assert not MOVED_FIELDS.keys() & KNOBS.keys()
     assert former_path("render.speed.prune") == "render.prune"
     assert former_path("render.scale") == "render.scale"

@@ -23,6 +23,7 @@ from augment.effects.effect import (
     skipped_steps,
 )
 from augment.effects.falling.air import Precipitation, draw_falling
+from augment.effects.falling.drop_covers import cover_of_drops
 from augment.effects.falling.drops import Kind
 from augment.effects.falling.labels import falling_table, measure_falling
 from augment.effects.falling.lidar import precipitation_echoes, scatterers_of
@@ -201,7 +202,19 @@ def _draw_over(
             backend=effect.backend,
         )
     masks = {**view.masks, mask: drop_mask}
-    return replace(view, rgb=rgb, masks=masks)
+    view = replace(view, rgb=rgb, masks=masks)
+    if not view.layers.needs_lamp_inputs:
+        return view
+    with timed(f"{effect.hooks.name}: drops under lamps"):
+        cover = cover_of_drops(
+            alpha,
+            depth,
+            camera,
+            effect.settings,
+            motion=motion_of(effect.scene, camera),
+            scene_name=effect.lit_scene.name,
+        )
+    return replace(view, drop_covers=(*view.drop_covers, cover))
 
 
 def _surfaces_of(view: RenderedView) -> Float[Tensor, "H W 3"] | None:

@@ -28,6 +28,7 @@ from augment.effects.effect import (
 from augment.effects.flood.flood_medium import FloodMedium
 from augment.effects.flood.flood_view import COARSE, MAX_MARGIN, MAX_SHIFT, render_flooded
 from augment.effects.flood.lidar import meet_flood
+from augment.effects.flood.mirroring_water import mirroring_water
 from augment.effects.flood.water_plane import mirrored_camera, plane_depth, plane_window
 from augment.effects.flood.waves import make_waves
 from augment.effects.lidar.beam import Echoes
@@ -132,7 +133,10 @@ class FloodEffect(Effect):
             return None
         why = "what stands before the water hides all of it"
         skip_reasons = dict.fromkeys(PASSES if image.is_hidden else (), why)
-        return RenderedView(image.rgb, image.scene, layers, {"water": image.water}, skip_reasons)
+        view = RenderedView(image.rgb, image.scene, layers, {"water": image.water}, skip_reasons)
+        if not layers.needs_lamp_inputs:
+            return view
+        return replace(view, wet_surface=mirroring_water(image, camera, medium.level_z_m))
 
     def front_surface(self, effect: EffectInScene, camera: Camera) -> FrontSurface | None:
         if _is_under(effect.settings, camera):  # from below, the surface has no depth

@@ -39,7 +39,7 @@ from augment.effects.flood.water_plane import (
     plane_window,
     resized,
 )
-from augment.effects.flood.waves import wave_field
+from augment.effects.flood.waves import WaveField, wave_field
 from augment.effects.wet.ripples import add_ring_waves, make_rings
 from augment.render.buffers import ALPHA, CPU, EXPECTED_DEPTH, RGB, RenderOutput, choose_kernels
 from augment.render.composite import simplify_sky
@@ -293,6 +293,12 @@ class FloodedImage:
     is_hidden: bool = False
     """True if the front layer hides all of the water; no other layer was drawn then."""
 
+    field: WaveField | None = None
+    """Waves in the window's pixels; None where no surface was drawn from above."""
+
+    window: Window | None = None
+    """Part of the image that `field` covers."""
+
 
 def as_layer(camera: Camera, raster: RenderOutput) -> Layer:
     """Return a rasterised image with expected depth as a `Layer`."""
@@ -379,7 +385,7 @@ def render_flooded(
     with timed("flood: composite layers"):
         image = composite_water(front, camera, window, color, renderer)
         scene = merge_depths(front, bed, bed_window, buffers, backend=backend)
-    return FloodedImage(image, scene, water)
+    return FloodedImage(image, scene, water, field=field, window=window)
 
 
 def _draw_bed(

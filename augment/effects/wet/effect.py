@@ -33,6 +33,7 @@ from augment.effects.wet.ground_map import (
     wet_splats,
 )
 from augment.effects.wet.lidar import dim_wet_echoes
+from augment.effects.wet.mirroring_film import mirroring_film
 from augment.effects.wet.reflection import (
     Film,
     Mirror,
@@ -216,7 +217,14 @@ class WetEffect(Effect):
                 mirror,
                 backend=effect.backend,
             )
-        return replace(view, rgb=rgb)
+            view = replace(view, rgb=rgb)
+        if not view.layers.needs_lamp_inputs:
+            return view
+        with timed("wet ground: water under lamps"):
+            water = mirroring_film(
+                camera, depth, share, effect.prepared_data, film, plane, data.rate_mm_h
+            )
+        return replace(view, wet_surface=water.before(view.wet_surface))
 
     def attenuate_beams(
         self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator

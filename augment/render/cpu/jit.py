@@ -47,6 +47,7 @@ def _hash_sources() -> str:
         *sorted(folder.glob("*.py")),
         *sorted(render.glob("*_kernels.py")),
         render / "layout.py",
+        render.parent / "lamps" / "pattern_kernels.py",
     ]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 

@@ -1,0 +1,205 @@
+"""Pictures between display-encoded colours and light: relighting, decoding, development.
+
+On the CPU kernels do the work; they equal the plain definitions here within 1e-4. Arrays are
+float32 on the CPU; callers move those of a GPU.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from augment.effects.lamps import light_kernels
+from augment.effects.lamps.exposure import CROSSTALK, response
+from augment.effects.lamps.light_kernels import CODE_STEPS, ROOT_STEPS
+from augment.light.srgb import display_from_linear, linear_from_display
+from augment.render.composite import ROWS_PER_CHUNK
+from augment.render.sensor import LEVEL_SD
+from augment.render.threads import kernel_threads
+
+# Display-encoded value at which the table of light ends.
+_MAX_CODE = 2.0
+# Light at which the tables of codes end.
+_MAX_LIGHT = 6.25
+# Light, of saturation, that lamps must add for a saturated pixel to be theirs.
+MIN_LAMP_LIGHT = 0.1
+# Least reflectance of a surface; darker colours are shadows of the day.
+MIN_REFLECTANCE = 0.02
+# Greatest reflectance of a surface.
+MAX_REFLECTANCE = 0.9
+_NONE = np.zeros((0, 0, 3), np.float32)
+_NO_DRAWS = np.zeros((0, 0, 3), np.uint8)
+
+
+def relight(
+    rgb: Float32[np.ndarray, "H W 3"],
+    added_cd_m2: Float32[np.ndarray, "H W 3"] | None,
+    gain: float,
+    added_gain: float,
+    min_added: float,
+    *,
+    uses_kernels: bool = True,
+) -> tuple[Float32[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
+    """Return a picture whose light is scaled and gets that of lamps, and where they saturate it.
+
+    Args:
+        rgb: the picture, display-encoded.
+        added_cd_m2: luminance that lamps add, cd/m2; None for none.
+        gain: factor of the picture's own linear light.
+        added_gain: light of the picture for 1 cd/m2.
+        min_added: pixels keep their bits if no channel gets more light than this; negative to
+            change all.
+        uses_kernels: False for the plain definition.
+
+    Returns:
+        the picture, display-encoded, not clamped; and the mask of pixels that lamps saturate.
+    """
+    if not uses_kernels:
+        added = np.zeros_like(rgb) if added_cd_m2 is None else added_cd_m2 * np.float32(added_gain)
+        light = gain * linear_from_display(np.maximum(rgb, 0).astype(np.float64)) + added
+        is_changed = added.max(-1) > min_added
+        out = np.where(is_changed[..., None], display_from_linear(light), rgb).astype(np.float32)
+        is_saturated = (light.max(-1) >= 1) & (added.max(-1) >= MIN_LAMP_LIGHT)
+        return out, is_saturated & is_changed
+    out = np.empty_like(rgb)
+    mask = np.empty(rgb.shape[:2], np.bool_)
+    with kernel_threads(ROWS_PER_CHUNK):
+        light_kernels.relight(
+            np.ascontiguousarray(rgb),
+            _NONE if added_cd_m2 is None else np.ascontiguousarray(added_cd_m2),
+            np.array([gain, added_gain, MIN_LAMP_LIGHT], np.float32),
+            np.float32(min_added),
+            _light_table(),
+            _code_table(),
+            out,
+            mask,
+        )
+    return out, mask
+
+
+def decode(
+    rgb: Float32[np.ndarray, "H W 3"], *, uses_kernels: bool = True
+) -> Float32[np.ndarray, "H W 3"]:
+    """Return the linear light of display-encoded colours; those below 0 count as 0.
+
+    Args:
+        rgb: the picture.
+        uses_kernels: False for the plain definition.
+    """
+    if not uses_kernels:
+        return linear_from_display(np.maximum(rgb, 0).astype(np.float64)).astype(np.float32)
+    out = np.empty_like(rgb)
+    with kernel_threads(ROWS_PER_CHUNK):
+        rows = np.ascontiguousarray(rgb).reshape(len(rgb), -1)
+        light_kernels.decode(rows, _light_table(), out.reshape(len(rgb), -1))
+    return out
+
+
+def develop(
+    light: Float32[np.ndarray, "H W 3"],
+    glare: Float32[np.ndarray, "H W 3"] | None,
+    draws: UInt8[np.ndarray, "H W 3"] | None,
+    electrons: float,
+    read_noise: float,
+    noise: float,
+    *,
+    uses_kernels: bool = True,
+) -> Float32[np.ndarray, "H W 3"]:
+    """Return the picture that a sensor makes of light: crosstalk, noise, response curve.
+
+    Args:
+        light: exposed linear light; 1 saturates the sensor.
+        glare: light that the lens scatters; None for none.
+        draws: result of `augment.render.sensor.draw_noise`; None for no noise.
+        electrons: electrons of a pixel at saturation.
+        read_noise: standard deviation of reading, electrons.
+        noise: factor of the noise.
+        uses_kernels: False for the plain definition.
+    """
+    per_draw = (noise / LEVEL_SD) ** 2
+    per_light = per_draw / electrons
+    of_reading = per_draw * (read_noise / electrons) ** 2
+    if uses_kernels:
+        out = np.empty_like(light)
+        with kernel_threads(ROWS_PER_CHUNK):
+            light_kernels.develop(
+                np.ascontiguousarray(light),
+                _NONE if glare is None else glare,
+                _NO_DRAWS if draws is None else draws,
+                np.array([CROSSTALK, per_light, of_reading], np.float32),
+                _developed_table(),
+                out,
+            )
+        return out
+    total = light.astype(np.float64) + (0 if glare is None else glare)
+    excess = np.maximum(total - 1, 0)
+    total += CROSSTALK * (excess.sum(-1, keepdims=True) - excess)
+    if draws is not None:
+        sigma = np.sqrt(per_light * np.maximum(total, 0) + of_reading)
+        total += sigma * (draws.astype(np.float64) - 128)
+    linear = response(np.clip(total, 0, _MAX_LIGHT))
+    return display_from_linear(linear).astype(np.float32)
+
+
+@functools.cache
+def _light_table() -> np.ndarray:
+    """Return the light of codes from 0 to _MAX_CODE."""
+    codes = np.arange(round(_MAX_CODE * CODE_STEPS) + 2) / CODE_STEPS
+    return linear_from_display(codes).astype(np.float32)
+
+
+@functools.cache
+def _code_table() -> np.ndarray:
+    """Return the codes of light from 0 to _MAX_LIGHT, by its square root."""
+    return display_from_linear(_table_lights()).astype(np.float32)
+
+
+@functools.cache
+def _developed_table() -> np.ndarray:
+    """Return the codes of exposed light from 0 to _MAX_LIGHT, through the response curve."""
+    return display_from_linear(response(_table_lights())).astype(np.float32)
+
+
+def _table_lights() -> np.ndarray:
+    """Return the light at each entry of a table of codes."""
+    return (np.arange(round(_MAX_LIGHT**0.5 * ROOT_STEPS) + 2) / ROOT_STEPS) ** 2
+
+
+def find_reflectance(
+    rgb: Float32[np.ndarray, "H W 3"],
+    white: float,
+    fog_share: Float32[np.ndarray, "H W"] | None,
+    airlight_rgb: tuple[float, float, float],
+    *,
+    uses_kernels: bool = True,
+) -> Float32[np.ndarray, "H W 3"]:
+    """Return the reflectance of surfaces, times the transmittance of the fog before them.
+
+    Args:
+        rgb: the picture, display-encoded.
+        white: linear light of a white surface in it.
+        fog_share: share of the airlight in each pixel; None without fog.
+        airlight_rgb: colour of the fog, display-encoded.
+        uses_kernels: False for the plain definition.
+    """
+    airlight = linear_from_display(np.maximum(np.asarray(airlight_rgb), 0)).astype(np.float32)
+    if uses_kernels:
+        out = np.empty_like(rgb)
+        with kernel_threads(ROWS_PER_CHUNK):
+            light_kernels.find_reflectance(
+                np.ascontiguousarray(rgb),
+                np.zeros((0, 0), np.float32) if fog_share is None else fog_share,
+                airlight,
+                np.array([white, MIN_REFLECTANCE, MAX_REFLECTANCE], np.float32),
+                _light_table(),
+                out,
+            )
+        return out
+    share = np.zeros(rgb.shape[:2]) if fog_share is None else np.clip(fog_share, 0, 1)
+    share = share[..., None].astype(np.float64)
+    light = linear_from_display(np.maximum(rgb, 0).astype(np.float64))
+    light = (light - share * airlight) / white
+    bounds = MIN_REFLECTANCE * (1 - share), MAX_REFLECTANCE * (1 - share)
+    return np.clip(light, *bounds).astype(np.float32)

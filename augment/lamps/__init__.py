@@ -1,0 +1,1 @@
+"""Lamps of a scene at a moment: records of light sources, and the light that they send."""

@@ -1,0 +1,459 @@
+"""Numba kernels of the light that lamps send into the air: tables, nodes, pixels.
+
+`augment.lamps.air_light` calls them, gives the equations and says what the arrays mean.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+
+from augment.lamps.pattern_kernels import intensity
+from augment.render.cpu.jit import kernel, kernel_function
+
+# Number of optical distances u of the table of G.
+NUM_DISTANCES = 96
+# Number of steps of theta in that table.
+NUM_ANGLES = 512
+# Largest u of that table; the light of lamps further from the ray is zero.
+MAX_DISTANCE = 20.0
+# Optical distance at which the table's spacing turns from linear to logarithmic.
+DISTANCE_KNEE = 0.01
+
+# Rows of nodes or pixels that a thread computes at a time.
+BAND_ROWS = 8
+# Largest relative difference of the two inverse distances of a node that are computed as one.
+SAME_DISTANCE = 0.15
+# Pixels whose mean of 1 / r about a lamp is that at the lamp's own pixel: 1 / SOFT_PX.
+SOFT_PX = 0.28
+# Angle, radians, beyond which the factor for multiple scattering grows no more: 45 degrees.
+MAX_FACTOR_ANGLE_RAD = math.pi / 4
+# Least share of what multiple scattering adds to a lamp of a beam's mean intensity that the beam
+# itself has, from all sides.
+FLOOR_SHARE = 0.13
+# Share of the angle of cut-off from which on a halo fades to zero.
+FADE_FROM = 0.8
+
+_DISTANCE_SCALE = (NUM_DISTANCES - 1) / math.asinh(MAX_DISTANCE / DISTANCE_KNEE)
+_ANGLE_SCALE = NUM_ANGLES / math.pi
+_ROOT_DEGREES = math.sqrt(180 / math.pi)
+
+
+class HaloLamps(NamedTuple):
+    """Lamps as the kernels read them, in camera axes: M lamps."""
+
+    frames: np.ndarray  # float64 [M, 3, 3]: unit vectors to the lamp, and two at right angles to it
+    distances_m: np.ndarray  # float64 [M]
+    sigmas_per_m: np.ndarray  # float64 [M]
+    colors: np.ndarray  # float64 [M, 3]: linear sRGB of 1 cd
+    means_cd: np.ndarray  # float64 [M]: mean intensity over all directions
+    factors: np.ndarray  # float64 [M, 2]: c T of the lamp, and of a lamp that is no beam
+    ends: np.ndarray  # float64 [M, 2]: angle of cut-off in radians, and its cosine
+    tables: (
+        np.ndarray
+    )  # int64 [M, 5]: first number in planes, rows, cells, scatter table, intervals
+
+
+class ImageGrid(NamedTuple):
+    """An image, and the grid of nodes over it."""
+
+    lens: np.ndarray  # float64 [5]: fx, fy, cx, cy, focal length along the diagonal, pixels
+    size: np.ndarray  # int64 [3]: height, width, pixels between nodes
+
+
+@kernel_function()
+def _angle(y, x):
+    """Return atan2(y, x) for y >= 0, within 1e-5 rad and 3e-5 of itself, without a branch on x."""
+    size = abs(x)
+    ratio = min(y, size) / max(max(y, size), 1e-30)
+    q = ratio * ratio
+    p = -0.01172120 * q + 0.05265332
+    p = p * q - 0.11643287
+    p = p * q + 0.19354346
+    p = p * q - 0.33262347
+    p = (p * q + 0.99997726) * ratio
+    p = 0.5 * math.pi - p if y > size else p
+    return math.pi - p if x < 0 else p
+
+
+@kernel_function()
+def _scattered(table, row, row_share, theta):
+    """Return G between two rows of its table, at an angle in radians."""
+    column = theta * _ANGLE_SCALE
+    k = min(int(column), NUM_ANGLES - 1)
+    q = column - k
+    near = table[row, k] * (1 - q) + table[row, k + 1] * q
+    far = table[row + 1, k] * (1 - q) + table[row + 1, k + 1] * q
+    return near * (1 - row_share) + far * row_share
+
+
+@kernel_function()
+def _light_sums(scatter, planes, layout, plane, shares, row, row_share, gamma, reach):
+    """Return the integral of intensity times what is scattered, and that of 1 cd.
+
+    The medium is integrated exactly in each interval, the intensity enters by its mean over the
+    interval. So narrow beams do not fall between points.
+
+    Args:
+        scatter: float32 [P, U, T], tables of G.
+        planes: float32, integrals of the intensity over the angle at the lamp, one plane a row.
+        layout: the lamp's row of HaloLamps.tables.
+        plane: plane through lamp and ray, in rows of the lamp's planes.
+        shares: float64 [17, 17, 2]; row K has the shares of the range at which K intervals end,
+            and the inverse shares that they take.
+        row: row of the table of G.
+        row_share: share of the next row.
+        gamma: angle at the camera between ray and lamp, radians.
+        reach: angle at the lamp between the camera and the end of the ray, radians.
+    """
+    num_rows = layout[1]
+    num_cells = layout[2]
+    num_intervals = layout[4]
+    table = scatter[layout[3]]
+    upper = int(plane)
+    plane_share = plane - upper
+    lower = upper + 1 if upper + 1 < num_rows else 0
+    first = layout[0] + upper * (num_cells + 1)
+    second = layout[0] + lower * (num_cells + 1)
+    cell_scale = num_cells / math.pi
+    first_scatter = _scattered(table, row, row_share, gamma)
+    last_scatter = first_scatter
+    last_flux = 0.0
+    total = 0.0
+    for index in range(num_intervals):
+        angle = reach * shares[num_intervals, index, 0]
+        cell = angle * cell_scale
+        k = min(int(cell), num_cells - 1)
+        q = cell - k
+        flux_a = planes[first + k] * (1 - q) + planes[first + k + 1] * q
+        flux_b = planes[second + k] * (1 - q) + planes[second + k + 1] * q
+        flux = flux_a * (1 - plane_share) + flux_b * plane_share
+        scattered = _scattered(table, row, row_share, gamma + angle)
+        inverse_share = shares[num_intervals, index, 1]
+        total += (flux - last_flux) * (scattered - last_scatter) * inverse_share
+        last_scatter = scattered
+        last_flux = flux
+    return total / max(reach, 1e-12), last_scatter - first_scatter
+
+
+@kernel_function()
+def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
+    """Return the luminance of a lamp's light along a ray times h, to two distances, h, and 1 if the
+    lamp lies before the camera, else 0.
+
+    Args:
+        lamps: the lamps.
+        index: the lamp's row.
+        scatter: as in `_light_sums`, like planes and shares.
+        x: unit direction of the ray in camera axes, like y and z.
+        near: inverse of the nearer distance to which the ray goes, 1/m.
+        far: inverse of the further distance; where it is nearly the same, both get its light.
+    """
+    frame = lamps.frames[index]
+    cosine = x * frame[0, 0] + y * frame[0, 1] + z * frame[0, 2]
+    if cosine <= lamps.ends[index, 1]:
+        return 0.0, 0.0, 1.0, 0.0
+    side = x * frame[1, 0] + y * frame[1, 1] + z * frame[1, 2]
+    rise = x * frame[2, 0] + y * frame[2, 1] + z * frame[2, 2]
+    sine = max(math.sqrt(side * side + rise * rise), 1e-6)
+    gamma = _angle(sine, cosine)
+    distance = lamps.distances_m[index]
+    sigma = lamps.sigmas_per_m[index]
+    h = distance * sine
+    u = sigma * h
+    if u >= MAX_DISTANCE:
+        return 0.0, 0.0, 1.0, 0.0
+    layout = lamps.tables[index]
+    plane = _angle(abs(rise), side)
+    plane = (2 * math.pi - plane if rise < 0 else plane) * (layout[1] / (2 * math.pi))
+    plane = plane if plane < layout[1] else 0.0
+    ratio = u * (1 / DISTANCE_KNEE)
+    row_place = math.log(ratio + math.sqrt(ratio * ratio + 1)) * _DISTANCE_SCALE
+    row = min(int(row_place), NUM_DISTANCES - 2)
+    row_share = row_place - row
+    # Factor for multiple scattering: of this lamp, and as a floor, a share of what it adds to a
+    # lamp of the mean intensity that is no beam.
+    root = _ROOT_DEGREES * math.sqrt(min(gamma, MAX_FACTOR_ANGLE_RAD))
+    beam_gain = math.exp(lamps.factors[index, 0] * root)
+    wide_gain = beam_gain
+    if lamps.factors[index, 1] != lamps.factors[index, 0]:
+        wide_gain = math.exp(lamps.factors[index, 1] * root)
+    added_mean = FLOOR_SHARE * lamps.means_cd[index] * (wide_gain - 1)
+    scale = sigma * math.exp(-sigma * distance * cosine)
+    end = lamps.ends[index, 0]
+    fade = (gamma - FADE_FROM * end) / ((1 - FADE_FROM) * end)
+    if end < math.pi and fade > 0:
+        scale *= (1 - fade) * (1 - fade) * (1 + 2 * fade)
+    # The angle at the lamp to a point at distance d: atan2(d sin, D - d cos), times 1 / d.
+    has_two = near - far > SAME_DISTANCE * near
+    first = far if has_two else 0.5 * (near + far)
+    reach = min(_angle(sine, distance * first - cosine), math.pi - gamma)
+    light, mean_light = _light_sums(
+        scatter, planes, layout, plane, shares, row, row_share, gamma, reach
+    )
+    far_light = scale * max(light * beam_gain, light + mean_light * added_mean)
+    near_light = far_light
+    if has_two:
+        reach = min(_angle(sine, distance * near - cosine), math.pi - gamma)
+        light, mean_light = _light_sums(
+            scatter, planes, layout, plane, shares, row, row_share, gamma, reach
+        )
+        near_light = scale * max(light * beam_gain, light + mean_light * added_mean)
+    return near_light, far_light, h, 1.0 if cosine > 0 else 0.0
+
+
+@kernel
+def fill_planes(tables, patterns, axes, ups, frames, intensities, layouts, planes, peaks):
+    """Integrate each lamp's intensity over the angle at the lamp, in planes through the camera.
+
+    Args:
+        tables: float32 [K, V, U], packed patterns.
+        patterns: int64 [M], row of the tables of each lamp.
+        axes: float64 [M, 3], axes of the lamps, like ups.
+        frames: float64 [M, 3, 3], unit vectors from the camera to the lamp, and two at right
+            angles, in the axes of `axes`.
+        intensities: float64 [M], candela.
+        layouts: int64 [M, 5], HaloLamps.tables.
+        planes: output float32; a lamp has rows of cells + 1 integrals from 0 on, candela times rad.
+        peaks: output float64 [M], largest mean intensity of a cell.
+    """
+    for m in prange(len(patterns)):
+        num_rows = layouts[m, 1]
+        num_cells = layouts[m, 2]
+        peak = 0.0
+        for row in range(num_rows):
+            turn = 2 * math.pi * row / num_rows
+            cos_turn = math.cos(turn)
+            sin_turn = math.sin(turn)
+            side_x = cos_turn * frames[m, 1, 0] + sin_turn * frames[m, 2, 0]
+            side_y = cos_turn * frames[m, 1, 1] + sin_turn * frames[m, 2, 1]
+            side_z = cos_turn * frames[m, 1, 2] + sin_turn * frames[m, 2, 2]
+            place = layouts[m, 0] + row * (num_cells + 1)
+            planes[place] = 0.0
+            total = 0.0
+            for cell in range(num_cells):
+                mean = 0.0
+                for half in range(2):
+                    angle = math.pi * (cell + 0.25 + 0.5 * half) / num_cells
+                    along = -math.cos(angle)  # towards the camera at angle 0
+                    aside = math.sin(angle)
+                    mean += 0.5 * intensity(
+                        tables,
+                        patterns[m],
+                        axes[m],
+                        ups[m],
+                        along * frames[m, 0, 0] + aside * side_x,
+                        along * frames[m, 0, 1] + aside * side_y,
+                        along * frames[m, 0, 2] + aside * side_z,
+                    )
+                mean *= intensities[m]
+                peak = max(peak, mean)
+                total += mean * (math.pi / num_cells)
+                planes[place + cell + 1] = total
+        peaks[m] = peak
+
+
+@kernel
+def find_node_ranges(inverse_distances, step, ranges):
+    """Write the smallest and the largest inverse distance in the four cells about each node.
+
+    Args:
+        inverse_distances: float32 [H, W], 1/m, 0 for the sky.
+        step: pixels between nodes.
+        ranges: output float32 [rows, columns, 2]: largest and smallest.
+    """
+    height, width = inverse_distances.shape
+    for row in prange(ranges.shape[0]):
+        for column in range(ranges.shape[1]):
+            largest = np.float32(0.0)
+            smallest = np.float32(np.inf)
+            for y in range(max((row - 1) * step, 0), min((row + 1) * step, height)):
+                for x in range(max((column - 1) * step, 0), min((column + 1) * step, width)):
+                    value = inverse_distances[y, x]
+                    largest = max(largest, value)
+                    smallest = min(smallest, value)
+            ranges[row, column, 0] = largest
+            ranges[row, column, 1] = smallest
+
+
+@kernel
+def light_nodes(grid, lamps, scatter, planes, shares, ranges, nodes):
+    """Write the light of all lamps along the rays through the nodes, to two distances each.
+
+    Near a lamp it goes as 1 / r, which a grid cannot show. So r is softened here, and `add_cores`
+    adds the difference.
+
+    Args:
+        grid: the image and its grid.
+        lamps: the lamps.
+        scatter: as in `_light_sums`, like planes and shares.
+        ranges: float32 [rows, columns, 2] of `find_node_ranges`.
+        nodes: output float32 [rows, columns, 6]: colour to the nearer and to the further distance.
+    """
+    num_rows, num_columns, _ = nodes.shape
+    num_bands = (num_rows + BAND_ROWS - 1) // BAND_ROWS
+    step = grid.size[2]
+    softness = 1.5 * step / grid.lens[4]
+    for band in prange(num_bands):
+        begin = band * BAND_ROWS
+        stop = min(begin + BAND_ROWS, num_rows)
+        nodes[begin:stop] = 0.0
+        for index in range(len(lamps.distances_m)):
+            soft_square = (softness * lamps.distances_m[index]) ** 2
+            red = lamps.colors[index, 0]
+            green = lamps.colors[index, 1]
+            blue = lamps.colors[index, 2]
+            for row in range(begin, stop):
+                v = (row * step - grid.lens[3]) / grid.lens[1]
+                for column in range(num_columns):
+                    u = (column * step - grid.lens[2]) / grid.lens[0]
+                    z = 1 / math.sqrt(1 + u * u + v * v)
+                    near, far, h, is_ahead = _ray_light(
+                        lamps, index, scatter, planes, shares, u * z, v * z, z,
+                        ranges[row, column, 0], ranges[row, column, 1],
+                    )  # fmt: skip
+                    if far > 0:
+                        soft = 1 / math.sqrt(h * h + is_ahead * soft_square)
+                        near *= soft
+                        far *= soft
+                        node = nodes[row, column]
+                        node[0] += np.float32(near * red)
+                        node[1] += np.float32(near * green)
+                        node[2] += np.float32(near * blue)
+                        node[3] += np.float32(far * red)
+                        node[4] += np.float32(far * green)
+                        node[5] += np.float32(far * blue)
+
+
+@kernel
+def spread_nodes(grid, inverse_distances, ranges, nodes, light):
+    """Write each pixel's light from its four nodes, each at the pixel's own distance.
+
+    A node's two distances span those of all pixels that read it. So light does not cross a
+    silhouette.
+
+    Args:
+        grid: the image and its grid.
+        inverse_distances: float32 [H, W], 1/m.
+        ranges: as in `light_nodes`, like nodes.
+        light: output float32 [H, W, 3].
+    """
+    height, width, _ = light.shape
+    step = grid.size[2]
+    for y in prange(height):
+        row_place = np.float32((y + 0.5) / step)
+        row = int(row_place)
+        row_share = row_place - np.float32(row)
+        for x in range(width):
+            column_place = np.float32((x + 0.5) / step)
+            column = int(column_place)
+            column_share = column_place - np.float32(column)
+            inverse = inverse_distances[y, x]
+            red = np.float32(0.0)
+            green = np.float32(0.0)
+            blue = np.float32(0.0)
+            for corner in range(4):
+                i = row + (corner >> 1)
+                j = column + (corner & 1)
+                weight = row_share if corner >> 1 else np.float32(1) - row_share
+                weight *= column_share if corner & 1 else np.float32(1) - column_share
+                largest = ranges[i, j, 0]
+                smallest = ranges[i, j, 1]
+                share = np.float32(0.0)
+                if largest > smallest:
+                    share = (inverse - smallest) / (largest - smallest)
+                    share = min(max(share, np.float32(0.0)), np.float32(1.0))
+                near = weight * share
+                far = weight - near
+                node = nodes[i, j]
+                red += near * node[0] + far * node[3]
+                green += near * node[1] + far * node[4]
+                blue += near * node[2] + far * node[5]
+            light[y, x, 0] = red
+            light[y, x, 1] = green
+            light[y, x, 2] = blue
+
+
+@kernel
+def add_cores(grid, lamps, scatter, planes, shares, windows, ranges, inverse_distances, light):
+    """Add to the pixels about each lamp what softened nodes lack of 1 / r.
+
+    Luminance times h is smooth there. It is computed at the nodes, and 1 / h at the pixels.
+
+    Args:
+        grid: the image and its grid.
+        lamps: the lamps.
+        scatter: as in `_light_sums`, like planes and shares.
+        windows: int64 [M, 4], first row of nodes, last row + 1, first column, last column + 1, in
+            which each lamp's core is.
+        ranges: float32 [rows, columns, 2] of `find_node_ranges`.
+        inverse_distances: float32 [H, W], 1/m.
+        light: float32 [H, W, 3], changed in place.
+    """
+    height, width, _ = light.shape
+    step = grid.size[2]
+    softness = 1.5 * step / grid.lens[4]
+    pixel = SOFT_PX / grid.lens[4]
+    num_bands = ranges.shape[0] - 1
+    for band in prange(num_bands):  # a band lies between two rows of nodes
+        values = np.empty((2, ranges.shape[1], 2), np.float64)
+        for index in range(len(lamps.distances_m)):
+            if band < windows[index, 0] or band + 1 >= windows[index, 1]:
+                continue
+            first_column = windows[index, 2]
+            num_columns = windows[index, 3] - first_column
+            distance = lamps.distances_m[index]
+            pixel_square = (pixel * distance) ** 2
+            soft_square = (softness * distance) ** 2
+            end_square = 16 * soft_square
+            frame = lamps.frames[index]
+            for i in range(2):
+                v = ((band + i) * step - grid.lens[3]) / grid.lens[1]
+                for j in range(num_columns):
+                    column = first_column + j
+                    u = (column * step - grid.lens[2]) / grid.lens[0]
+                    z = 1 / math.sqrt(1 + u * u + v * v)
+                    near, far, _, _ = _ray_light(
+                        lamps, index, scatter, planes, shares, u * z, v * z, z,
+                        ranges[band + i, column, 0], ranges[band + i, column, 1],
+                    )  # fmt: skip
+                    values[i, j, 0] = near
+                    values[i, j, 1] = far
+            for y in range(band * step, min((band + 1) * step, height)):
+                v = (y + 0.5 - grid.lens[3]) / grid.lens[1]
+                row_share = (y + 0.5) / step - band
+                for x in range(first_column * step, min((windows[index, 3] - 1) * step, width)):
+                    u = (x + 0.5 - grid.lens[2]) / grid.lens[0]
+                    z = 1 / math.sqrt(1 + u * u + v * v)
+                    side = (u * frame[1, 0] + v * frame[1, 1] + frame[1, 2]) * z
+                    rise = (u * frame[2, 0] + v * frame[2, 1] + frame[2, 2]) * z
+                    square = (side * side + rise * rise) * distance * distance
+                    if square >= end_square:
+                        continue
+                    column_place = (x + 0.5) / step
+                    column = int(column_place)
+                    column_share = column_place - column
+                    value = 0.0
+                    for corner in range(4):
+                        i = corner >> 1
+                        j = column + (corner & 1)
+                        weight = row_share if i else 1 - row_share
+                        weight *= column_share if corner & 1 else 1 - column_share
+                        largest = ranges[band + i, j, 0]
+                        smallest = ranges[band + i, j, 1]
+                        share = 0.0
+                        if largest > smallest:
+                            share = (inverse_distances[y, x] - smallest) / (largest - smallest)
+                            share = min(max(share, 0.0), 1.0)
+                        k = j - first_column
+                        value += weight * (values[i, k, 0] * share + values[i, k, 1] * (1 - share))
+                    window = min((1 - square / end_square) * (1 / 0.75), 1.0)
+                    gain = 1 / math.sqrt(square + pixel_square)
+                    gain -= 1 / math.sqrt(square + soft_square)
+                    value *= gain * window * window * (3 - 2 * window)
+                    light[y, x, 0] += np.float32(value * lamps.colors[index, 0])
+                    light[y, x, 1] += np.float32(value * lamps.colors[index, 1])
+                    light[y, x, 2] += np.float32(value * lamps.colors[index, 2])
