@@ -26,6 +26,10 @@ from recipes.schema import SECTIONS, Recipe
 # Units in words, by the end of a field's name.
 UNITS = {
     "_per_m": "1/metre",
+    "_cd_m2": "candela per square metre",
+    "_lux": "lux",
+    "_lumen": "lumens",
+    "_kelvin": "kelvin",
     "_mm": "millimetres",
     "_m": "metres",
     "_s": "seconds",

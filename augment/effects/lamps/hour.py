@@ -91,7 +91,6 @@ def find_hour(light: Light, scene: Scene, *, is_foul: bool) -> Hour:
     return Hour(False, lux, OVERCAST_LUX / math.pi, reason)
 
 
-@functools.lru_cache(maxsize=8)
 def night_sky(light: Light, white_cd_m2: float, white: float) -> CubemapSky:
     """Return the sky of dusk or night in the codes of a day-lit picture.
 
@@ -105,13 +104,26 @@ def night_sky(light: Light, white_cd_m2: float, white: float) -> CubemapSky:
     """
     mean_cd_m2 = light.sky_luminance
     assert mean_cd_m2 is not None
+    brightness = mean_cd_m2 / max(white_cd_m2, 1e-9) * white
+    return _make_sky(light.time, light.glow, brightness)
+
+
+@functools.lru_cache(maxsize=8)
+def _make_sky(time: str, glow: float, brightness: float) -> CubemapSky:
+    """Return the sky of `night_sky`.
+
+    Args:
+        time: dusk or night.
+        glow: luminance at the horizon over that overhead, less 1.
+        brightness: linear light of the mean luminance in the scene's colours.
+    """
     elevations = (np.arange(_NUM_ELEVATIONS) + 0.5) * (math.pi / 2 / _NUM_ELEVATIONS)
     weights = np.sin(elevations) * np.cos(elevations)
-    scale = weights.sum() / (weights * (1 + light.glow * _glow_fall(elevations))).sum()
+    scale = weights.sum() / (weights * (1 + glow * _glow_fall(elevations))).sum()
     x, y, z = np.moveaxis(directions_of_cubemap(_FACE_PX).double().numpy(), -1, 0)
-    glow = light.glow * _glow_fall(np.arctan2(z, np.hypot(x, y)))[..., None]
-    rgb = _tint(_ZENITH_TINTS[light.time]) + glow * _tint(_GLOW_TINTS[light.time])
-    rgb = rgb * (scale * mean_cd_m2 / max(white_cd_m2, 1e-9) * white)
+    glow_at_texels = glow * _glow_fall(np.arctan2(z, np.hypot(x, y)))[..., None]
+    rgb = _tint(_ZENITH_TINTS[time]) + glow_at_texels * _tint(_GLOW_TINTS[time])
+    rgb = rgb * (scale * brightness)
     return CubemapSky(to_display(torch.from_numpy(rgb)).float().contiguous())
 
 

@@ -15,7 +15,7 @@ from augment.lamps.drop_light import add_drop_light
 from augment.lamps.emitters import HALO_RADIUS_M, add_emitters, lamp_visibility
 from augment.lamps.fog_phase import AirExtinction
 from augment.lamps.lamp import Lamps
-from augment.lamps.recorded_lamps import find_recorded_lamps, moving_vehicle_mask
+from augment.lamps.recorded_lamps import find_recorded_lamps, vehicle_pixels
 from augment.lamps.surface_light import surface_light
 from augment.lamps.wet_glints import add_wet_glints
 from augment.render.buffers import REFERENCE
@@ -120,7 +120,7 @@ def _recorded_light(
     if photo is None or not plan.hour.is_dark or not plan.has_vehicle_lamps:
         return None
     with timed(EMITTERS):
-        found = find_recorded_lamps(photo.pixels, moving_vehicle_mask(effect.scene, camera))
+        found = find_recorded_lamps(photo.pixels, vehicle_pixels(effect.scene, camera))
         if not found.lamps:
             return None
         luminance = found.luminance_cd_m2
