@@ -23,8 +23,10 @@ MAX_DISTANCE = 20.0
 # Optical distance at which the table's spacing turns from linear to logarithmic.
 DISTANCE_KNEE = 0.01
 
-# Rows of nodes or pixels that a thread computes at a time.
-BAND_ROWS = 8
+# Radius about a lamp within which nodes soften 1 / h, in their steps.
+SOFT_STEPS = 1.5
+# Square of the radius about a lamp in which nodes add what coarse nodes lack, in softened radii.
+COARSE_END = 9.0
 # Largest relative difference of the two inverse distances of a node that are computed as one.
 SAME_DISTANCE = 0.15
 # Pixels whose mean of 1 / r about a lamp is that at the lamp's own pixel: 1 / SOFT_PX.
@@ -61,7 +63,7 @@ class ImageGrid(NamedTuple):
     """An image, and the grid of nodes over it."""
 
     lens: np.ndarray  # float64 [5]: fx, fy, cx, cy, focal length along the diagonal, pixels
-    size: np.ndarray  # int64 [3]: height, width, pixels between nodes
+    size: np.ndarray  # int64 [4]: height, width, pixels between nodes, nodes between coarse ones
 
 
 @kernel_function()
@@ -140,22 +142,24 @@ def _light_sums(scatter, planes, layout, plane, shares, row, row_share, gamma, r
 
 
 @kernel_function()
-def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
-    """Return the luminance of a lamp's light along a ray times h, to two distances, h, and 1 if the
-    lamp lies before the camera, else 0.
+def _ray_at_lamp(lamps, index, x, y, z):
+    """Return a ray's geometry at a lamp, and the factors of the lamp's light along it.
 
     Args:
         lamps: the lamps.
         index: the lamp's row.
-        scatter: as in `_light_sums`, like planes and shares.
         x: unit direction of the ray in camera axes, like y and z.
-        near: inverse of the nearer distance to which the ray goes, 1/m.
-        far: inverse of the further distance; where it is nearly the same, both get its light.
+
+    Returns:
+        True if the lamp lights the ray; h, metres; cosine and sine of the angle between ray and
+        lamp; that angle, radians; row of the table of G and share of the next; plane through lamp
+        and ray, in rows of the lamp's planes; factor of the light; factor for multiple scattering
+        of the lamp; and what it adds at least, for 1 cd.
     """
     frame = lamps.frames[index]
     cosine = x * frame[0, 0] + y * frame[0, 1] + z * frame[0, 2]
     if cosine <= lamps.ends[index, 1]:
-        return 0.0, 0.0, 1.0, 0.0
+        return False, 1.0, cosine, 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0
     side = x * frame[1, 0] + y * frame[1, 1] + z * frame[1, 2]
     rise = x * frame[2, 0] + y * frame[2, 1] + z * frame[2, 2]
     sine = max(math.sqrt(side * side + rise * rise), 1e-6)
@@ -165,11 +169,11 @@ def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
     h = distance * sine
     u = sigma * h
     if u >= MAX_DISTANCE:
-        return 0.0, 0.0, 1.0, 0.0
-    layout = lamps.tables[index]
+        return False, h, cosine, sine, gamma, 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    num_planes = lamps.tables[index, 1]
     plane = _angle(abs(rise), side)
-    plane = (2 * math.pi - plane if rise < 0 else plane) * (layout[1] / (2 * math.pi))
-    plane = plane if plane < layout[1] else 0.0
+    plane = (2 * math.pi - plane if rise < 0 else plane) * (num_planes / (2 * math.pi))
+    plane = plane if plane < num_planes else 0.0
     ratio = u * (1 / DISTANCE_KNEE)
     row_place = math.log(ratio + math.sqrt(ratio * ratio + 1)) * _DISTANCE_SCALE
     row = min(int(row_place), NUM_DISTANCES - 2)
@@ -187,6 +191,31 @@ def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
     fade = (gamma - FADE_FROM * end) / ((1 - FADE_FROM) * end)
     if end < math.pi and fade > 0:
         scale *= (1 - fade) * (1 - fade) * (1 + 2 * fade)
+    return (
+        True, h, cosine, sine, gamma, row, row_share, plane, scale, beam_gain, added_mean,
+    )  # fmt: skip
+
+
+@kernel_function()
+def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
+    """Return the luminance of a lamp's light along a ray times h, to two distances, h, and 1 if the
+    lamp lies before the camera, else 0.
+
+    Args:
+        lamps: the lamps.
+        index: the lamp's row.
+        scatter: as in `_light_sums`, like planes and shares.
+        x: unit direction of the ray in camera axes, like y and z.
+        near: inverse of the nearer distance to which the ray goes, 1/m.
+        far: inverse of the further distance; where it is nearly the same, both get its light.
+    """
+    (
+        is_lit, h, cosine, sine, gamma, row, row_share, plane, scale, beam_gain, added_mean,
+    ) = _ray_at_lamp(lamps, index, x, y, z)  # fmt: skip
+    if not is_lit:
+        return 0.0, 0.0, 1.0, 0.0
+    layout = lamps.tables[index]
+    distance = lamps.distances_m[index]
     # The angle at the lamp to a point at distance d: atan2(d sin, D - d cos), times 1 / d.
     has_two = near - far > SAME_DISTANCE * near
     first = far if has_two else 0.5 * (near + far)
@@ -203,6 +232,80 @@ def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
         )
         near_light = scale * max(light * beam_gain, light + mean_light * added_mean)
     return near_light, far_light, h, 1.0 if cosine > 0 else 0.0
+
+
+@kernel_function()
+def _add_slices(
+    lamps, index, scatter, planes, shares, x, y, z, softness, slices, first, last, values
+):
+    """Add the luminance of a lamp's light along a ray, up to each of some distances.
+
+    The sum is that of `_light_sums`, with more intervals.
+
+    Args:
+        lamps: the lamps.
+        index: the lamp's row.
+        scatter: as in `_light_sums`, like planes and shares.
+        x: unit direction of the ray in camera axes, like y and z.
+        softness: radius about the lamp within which 1 / h is softened, radians.
+        slices: float64 [K], inverse distances, falling, 1/m.
+        first: the first slice that is wanted.
+        last: the last slice that is wanted.
+        values: float32 [K, 3], changed in place: luminance, linear sRGB, of the wanted slices.
+    """
+    (
+        is_lit, h, cosine, sine, gamma, row, row_share, plane, scale, beam_gain, added_mean,
+    ) = _ray_at_lamp(lamps, index, x, y, z)  # fmt: skip
+    if not is_lit:
+        return
+    layout = lamps.tables[index]
+    distance = lamps.distances_m[index]
+    num_cells = layout[2]
+    table = scatter[layout[3]]
+    upper = int(plane)
+    plane_share = plane - upper
+    lower = upper + 1 if upper + 1 < layout[1] else 0
+    upper_cells = layout[0] + upper * (num_cells + 1)
+    lower_cells = layout[0] + lower * (num_cells + 1)
+    cell_scale = num_cells / math.pi
+    soft = softness * distance if cosine > 0 else 0.0
+    scale /= math.sqrt(h * h + soft * soft)
+    first_scatter = _scattered(table, row, row_share, gamma)
+    last_scatter = first_scatter
+    last_flux = 0.0
+    last_angle = 0.0
+    total = 0.0
+    end = min(_angle(sine, distance * slices[last] - cosine), math.pi - gamma)
+    interval = 0
+    for k in range(first, last + 1):
+        reach = end
+        if k < last:
+            reach = min(_angle(sine, distance * slices[k] - cosine), end)
+        while last_angle < reach:
+            # Intervals end where those of `_light_sums` do, and at the slices.
+            angle = end * shares[layout[4], interval, 0]
+            if angle >= reach or interval == layout[4] - 1:
+                angle = reach
+            else:
+                interval += 1
+            cell = angle * cell_scale
+            c = min(int(cell), num_cells - 1)
+            q = cell - c
+            flux_a = planes[upper_cells + c] * (1 - q) + planes[upper_cells + c + 1] * q
+            flux_b = planes[lower_cells + c] * (1 - q) + planes[lower_cells + c + 1] * q
+            flux = flux_a * (1 - plane_share) + flux_b * plane_share
+            scattered = _scattered(table, row, row_share, gamma + angle)
+            if angle > last_angle:
+                mean = (flux - last_flux) / (angle - last_angle)
+                total += mean * (scattered - last_scatter)
+            last_scatter = scattered
+            last_flux = flux
+            last_angle = angle
+        mean_light = last_scatter - first_scatter
+        light = scale * max(total * beam_gain, total + mean_light * added_mean)
+        values[k, 0] += np.float32(light * lamps.colors[index, 0])
+        values[k, 1] += np.float32(light * lamps.colors[index, 1])
+        values[k, 2] += np.float32(light * lamps.colors[index, 2])
 
 
 @kernel
@@ -280,52 +383,163 @@ def find_node_ranges(inverse_distances, step, ranges):
 
 
 @kernel
-def light_nodes(grid, lamps, scatter, planes, shares, ranges, nodes):
-    """Write the light of all lamps along the rays through the nodes, to two distances each.
+def light_slices(grid, lamps, scatter, planes, shares, slices, ranges, volume):
+    """Write the light of all lamps along the rays through coarse nodes, up to slices of distance.
 
-    Near a lamp it goes as 1 / r, which a grid cannot show. So r is softened here, and `add_cores`
-    adds the difference.
+    Far from a lamp its light changes slowly, so that few nodes show it. About the lamp, where it
+    goes as 1 / h, it is softened here; `light_nodes` adds the difference.
+
+    Args:
+        grid: the image and its grid of fine nodes.
+        lamps: the lamps.
+        scatter: as in `_light_sums`, like planes and shares.
+        slices: float64 [K], inverse distances, falling, 1/m; the last is 0.
+        ranges: float32 [rows, columns, 2] of `find_node_ranges`.
+        volume: output float32 [coarse rows, coarse columns, K, 3], luminance in linear sRGB; 0 in
+            slices that no fine node looks up.
+    """
+    num_rows, num_columns, num_slices, _ = volume.shape
+    num_steps = grid.size[3]
+    step = num_steps * grid.size[2]
+    softness = SOFT_STEPS * step / grid.lens[4]
+    for row in prange(num_rows):
+        v = (row * step - grid.lens[3]) / grid.lens[1]
+        for column in range(num_columns):
+            largest = np.float32(0.0)
+            smallest = np.float32(np.inf)
+            top = max((row - 1) * num_steps, 0)
+            left = max((column - 1) * num_steps, 0)
+            for i in range(top, min((row + 1) * num_steps + 1, ranges.shape[0])):
+                for j in range(left, min((column + 1) * num_steps + 1, ranges.shape[1])):
+                    largest = max(largest, ranges[i, j, 0])
+                    smallest = min(smallest, ranges[i, j, 1])
+            first = 0
+            while first < num_slices - 2 and slices[first + 1] >= largest:
+                first += 1
+            last = first + 1
+            while last < num_slices - 1 and slices[last] > smallest:
+                last += 1
+            volume[row, column] = 0.0
+            u = (column * step - grid.lens[2]) / grid.lens[0]
+            z = 1 / math.sqrt(1 + u * u + v * v)
+            for index in range(len(lamps.distances_m)):
+                _add_slices(
+                    lamps, index, scatter, planes, shares, u * z, v * z, z, softness, slices, first,
+                    last, volume[row, column],
+                )  # fmt: skip
+
+
+@kernel_function()
+def _slice_place(slices, inverse):
+    """Return the slice beyond a distance, the share of the one before it, and a factor of both.
+
+    Args:
+        slices: float64 [K], inverse distances, falling, 1/m.
+        inverse: inverse of the distance, 1/m.
+    """
+    if inverse >= slices[0]:
+        return 1, 1.0, slices[0] / inverse
+    k = 1
+    while slices[k] > inverse:
+        k += 1
+    return k, (inverse - slices[k]) / (slices[k - 1] - slices[k]), 1.0
+
+
+@kernel
+def light_nodes(grid, lamps, scatter, planes, shares, slices, volume, windows, ranges, nodes):
+    """Add the light of all lamps along the rays through the nodes, to two distances each.
+
+    It is that of the coarse nodes, and about each lamp what softened coarse nodes lack. Near a lamp
+    it goes as 1 / h, which no grid can show. So h is softened here as well, and `add_cores` adds
+    the difference.
 
     Args:
         grid: the image and its grid.
         lamps: the lamps.
         scatter: as in `_light_sums`, like planes and shares.
+        slices: as in `light_slices`, like volume.
+        windows: int64 [M, 4], first row of nodes, last row + 1, first column, last column + 1, in
+            which the softening of coarse nodes about each lamp is seen.
         ranges: float32 [rows, columns, 2] of `find_node_ranges`.
-        nodes: output float32 [rows, columns, 6]: colour to the nearer and to the further distance.
+        nodes: float32 [rows, columns, 6], changed in place: colour to the nearer and to the further
+            distance.
     """
     num_rows, num_columns, _ = nodes.shape
-    num_bands = (num_rows + BAND_ROWS - 1) // BAND_ROWS
     step = grid.size[2]
-    softness = 1.5 * step / grid.lens[4]
-    for band in prange(num_bands):
-        begin = band * BAND_ROWS
-        stop = min(begin + BAND_ROWS, num_rows)
-        nodes[begin:stop] = 0.0
+    num_steps = grid.size[3]
+    per_step = 1 / num_steps
+    softness = SOFT_STEPS * step / grid.lens[4]
+    coarse_softness = num_steps * softness
+    last_row = volume.shape[0] - 1
+    last_column = volume.shape[1] - 1
+    for row in prange(num_rows):
+        i = row // num_steps
+        v_share = (row - i * num_steps) * per_step
+        below = min(i + 1, last_row)
+        light_before = np.zeros(3, np.float32)
+        for column in range(num_columns):
+            j = column // num_steps
+            u_share = (column - j * num_steps) * per_step
+            beside = min(j + 1, last_column)
+            weight_a = np.float32((1 - v_share) * (1 - u_share))
+            weight_b = np.float32((1 - v_share) * u_share)
+            weight_c = np.float32(v_share * (1 - u_share))
+            weight_d = np.float32(v_share * u_share)
+            is_one = ranges[row, column, 0] == ranges[row, column, 1]
+            for side in range(2):
+                if side == 1 and is_one:
+                    for channel in range(3):
+                        nodes[row, column, 3 + channel] += light_before[channel]
+                    continue
+                k, share, factor = _slice_place(slices, ranges[row, column, side])
+                before = np.float32(share * factor)
+                beyond = np.float32((1 - share) * factor)
+                for channel in range(3):
+                    light = weight_a * (
+                        before * volume[i, j, k - 1, channel] + beyond * volume[i, j, k, channel]
+                    )
+                    light += weight_b * (
+                        before * volume[i, beside, k - 1, channel]
+                        + beyond * volume[i, beside, k, channel]
+                    )
+                    light += weight_c * (
+                        before * volume[below, j, k - 1, channel]
+                        + beyond * volume[below, j, k, channel]
+                    )
+                    light += weight_d * (
+                        before * volume[below, beside, k - 1, channel]
+                        + beyond * volume[below, beside, k, channel]
+                    )
+                    nodes[row, column, 3 * side + channel] += light
+                    light_before[channel] = light
+        v = (row * step - grid.lens[3]) / grid.lens[1]
         for index in range(len(lamps.distances_m)):
-            soft_square = (softness * lamps.distances_m[index]) ** 2
-            red = lamps.colors[index, 0]
-            green = lamps.colors[index, 1]
-            blue = lamps.colors[index, 2]
-            for row in range(begin, stop):
-                v = (row * step - grid.lens[3]) / grid.lens[1]
-                for column in range(num_columns):
-                    u = (column * step - grid.lens[2]) / grid.lens[0]
-                    z = 1 / math.sqrt(1 + u * u + v * v)
-                    near, far, h, is_ahead = _ray_light(
-                        lamps, index, scatter, planes, shares, u * z, v * z, z,
-                        ranges[row, column, 0], ranges[row, column, 1],
-                    )  # fmt: skip
-                    if far > 0:
-                        soft = 1 / math.sqrt(h * h + is_ahead * soft_square)
-                        near *= soft
-                        far *= soft
-                        node = nodes[row, column]
-                        node[0] += np.float32(near * red)
-                        node[1] += np.float32(near * green)
-                        node[2] += np.float32(near * blue)
-                        node[3] += np.float32(far * red)
-                        node[4] += np.float32(far * green)
-                        node[5] += np.float32(far * blue)
+            if row < windows[index, 0] or row >= windows[index, 1]:
+                continue
+            frame = lamps.frames[index]
+            distance = lamps.distances_m[index]
+            soft_square = (softness * distance) ** 2
+            coarse_square = (coarse_softness * distance) ** 2
+            end_square = COARSE_END * coarse_square
+            for column in range(windows[index, 2], windows[index, 3]):
+                u = (column * step - grid.lens[2]) / grid.lens[0]
+                z = 1 / math.sqrt(1 + u * u + v * v)
+                side = (u * frame[1, 0] + v * frame[1, 1] + frame[1, 2]) * z
+                rise = (u * frame[2, 0] + v * frame[2, 1] + frame[2, 2]) * z
+                square = (side * side + rise * rise) * distance * distance
+                if square >= end_square:
+                    continue
+                near, far, _, is_ahead = _ray_light(
+                    lamps, index, scatter, planes, shares, u * z, v * z, z,
+                    ranges[row, column, 0], ranges[row, column, 1],
+                )  # fmt: skip
+                window = min((1 - square / end_square) * (1 / 0.75), 1.0)
+                gain = 1 / math.sqrt(square + soft_square) - 1 / math.sqrt(square + coarse_square)
+                gain *= is_ahead * window * window * (3 - 2 * window)
+                node = nodes[row, column]
+                for channel in range(3):
+                    node[channel] += np.float32(near * gain * lamps.colors[index, channel])
+                    node[3 + channel] += np.float32(far * gain * lamps.colors[index, channel])
 
 
 @kernel
@@ -395,7 +609,7 @@ def add_cores(grid, lamps, scatter, planes, shares, windows, ranges, inverse_dis
     """
     height, width, _ = light.shape
     step = grid.size[2]
-    softness = 1.5 * step / grid.lens[4]
+    softness = SOFT_STEPS * step / grid.lens[4]
     pixel = SOFT_PX / grid.lens[4]
     num_bands = ranges.shape[0] - 1
     for band in prange(num_bands):  # a band lies between two rows of nodes
