@@ -21,6 +21,8 @@ TILE = 8  # nodes along a side of a tile, whose nodes share a list of lamps
 SAMPLES = np.array([0, 3, 7, 24, 27, 31, 56, 59, 63])
 # Light that a lamp may have between these points, over the most that it has at one of them.
 SAMPLE_MARGIN = 4.0
+# Light of a lamp, as a share of the brightest lamp's, below which it does not light a tile.
+MIN_SHARE = 0.004
 # Distance of the nodes over which slopes are first estimated, nodes.
 SLOPE_STEP = 2
 # Difference between the slopes on both sides of a node, as a share of the inverse depth and a node,
@@ -287,13 +289,16 @@ def lux_along_ray(tables, lamp, x, y, z):
 
 
 @kernel_function()
-def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
-    """Choose the brightest lamps of a tile, brightest first; return their number.
+def rank_lamps(lamps, points, count, has_own, min_lux, max_lamps, chosen, scores):
+    """Choose the lamps that light a tile most, brightest first; return their number.
+
+    Lamps whose light is less than MIN_SHARE of the brightest one's are left out.
 
     Args:
         lamps: the lamps.
-        points: points of the tile, [N, 3].
+        points: points of the tile, [N, 7]: place, normal, roughness.
         count: number of the points.
+        has_own: True if signs send the light of the recording car's lamps back.
         min_lux: lux of all its points below which a lamp is left out.
         max_lamps: largest number of lamps.
         chosen: output, int64 [max_lamps], indices of the lamps.
@@ -315,18 +320,35 @@ def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
             gap = max(low[k] - lamps.positions[m, k], lamps.positions[m, k] - high[k], 0.0)
             squared += gap * gap
         bound = lamps.peaks[m] / (squared + lamps.softening[m])
-        if bound < min_lux:
+        least = min_lux
+        if number > 0:
+            least = max(least, MIN_SHARE * scores[0])
+        if number == max_lamps:
+            least = max(least, scores[number - 1])
+        if bound < least:
             continue
         bound *= math.exp(-lamps.extinctions[m] * math.sqrt(squared))
-        if bound < min_lux or (number == max_lamps and bound <= scores[number - 1]):
+        if bound < least:
             continue
         score = 0.0
         lamp = read_lamp(lamps, m)
+        is_returned = has_own and lamps.is_own[m]
         for sample in range(len(SAMPLES)):
             p = SAMPLES[sample] * (count - 1) // (TILE * TILE - 1)
-            lux = lux_along_ray(lamps.tables, lamp, points[p, 0], points[p, 1], points[p, 2])[0]
+            x = points[p, 0]
+            y = points[p, 1]
+            z = points[p, 2]
+            place = lamp[0]
+            above = points[p, 3] * (place[0] - x) + points[p, 4] * (place[1] - y)
+            above += points[p, 5] * (place[2] - z)
+            if above <= 0 and points[p, 6] <= 0 and not is_returned:
+                continue
+            lux, dx, dy, dz = lux_along_ray(lamps.tables, lamp, x, y, z)
+            if not is_returned:
+                cosine = points[p, 3] * dx + points[p, 4] * dy + points[p, 5] * dz
+                lux *= max(cosine, 0.0) + points[p, 6]
             score = max(score, lux)
-        if SAMPLE_MARGIN * score < min_lux:
+        if SAMPLE_MARGIN * score < least:
             continue
         if number == max_lamps and score <= scores[number - 1]:
             continue
@@ -338,6 +360,8 @@ def rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores):
             place -= 1
         scores[place] = score
         chosen[place] = m
+    while number > 1 and scores[number - 1] < MIN_SHARE * scores[0]:
+        number -= 1
     return number
 
 
@@ -365,9 +389,8 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
     for tile in prange(tile_columns * tile_rows):
         top = (tile // tile_columns) * TILE
         left = (tile % tile_columns) * TILE
-        points = np.empty((TILE * TILE, 3))
+        points = np.empty((TILE * TILE, 7))
         nodes = np.empty((TILE * TILE, 2), np.int64)
-        roughness = np.empty((TILE, TILE))
         chosen = np.empty(max_lamps, np.int64)
         scores = np.empty(max_lamps)
         count = 0
@@ -387,17 +410,17 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
                     points[count, k] = view.eye[k] + z * ray
                 length = 0.0
                 for k in range(3):
+                    points[count, 3 + k] = normals[i, j, k]
                     length += np.float64(normals[i, j, k]) ** 2
                 # Shorter normals are means of some that disagree: leaves, grass, noise.
-                roughness[i - top, j - left] = max(
-                    (1.0 - SMOOTH_LOSS - math.sqrt(length)) / (1.0 - SMOOTH_LOSS), 0.0
-                )
+                roughness = (1.0 - SMOOTH_LOSS - math.sqrt(length)) / (1.0 - SMOOTH_LOSS)
+                points[count, 6] = ROUGH_COSINE * max(roughness, 0.0)
                 nodes[count, 0] = i
                 nodes[count, 1] = j
                 count += 1
         if count == 0:
             continue
-        number = rank_lamps(lamps, points, count, min_lux, max_lamps, chosen, scores)
+        number = rank_lamps(lamps, points, count, has_own, min_lux, max_lamps, chosen, scores)
         for c in range(number):
             m = chosen[c]
             lamp = read_lamp(lamps, m)
@@ -411,20 +434,20 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
                 x = points[p, 0]
                 y = points[p, 1]
                 z = points[p, 2]
-                i = nodes[p, 0]
-                j = nodes[p, 1]
-                nx = np.float64(normals[i, j, 0])
-                ny = np.float64(normals[i, j, 1])
-                nz = np.float64(normals[i, j, 2])
+                nx = points[p, 3]
+                ny = points[p, 4]
+                nz = points[p, 5]
                 place = lamp[0]
                 above = nx * (place[0] - x) + ny * (place[1] - y) + nz * (place[2] - z)
-                rough = ROUGH_COSINE * roughness[i - top, j - left]
+                rough = points[p, 6]
                 is_returned = has_own and is_own
                 if above <= 0 and rough <= 0 and not is_returned:
                     continue
                 facing, dx, dy, dz = lux_along_ray(tables, lamp, x, y, z)
                 if shadow_map >= 0 and facing > 0:
                     facing *= lit_share(shadows, shadow_map, x, y, z)
+                i = nodes[p, 0]
+                j = nodes[p, 1]
                 lit = facing * (max(nx * dx + ny * dy + nz * dz, 0.0) + rough)
                 lux[i, j, 0] += np.float32(lit * red)
                 lux[i, j, 1] += np.float32(lit * green)
