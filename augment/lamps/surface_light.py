@@ -51,8 +51,10 @@ MAX_REFLECTANCE = 0.9
 _GROUND_COSINE = 0.906
 # The same, below which it does not: 40 degrees.
 _MIN_GROUND_COSINE = 0.766
-# Sides of the window in which the normals of the ground are averaged, nodes: columns, rows.
-_GROUND_WINDOW = (65, 17)
+# Nodes along a side of a block that counts as one where the normals of the ground are averaged.
+_GROUND_SHRINK = 4
+# Sides of the window in which they are averaged, blocks: columns, rows.
+_GROUND_WINDOW = (17, 5)
 # Coefficient of retroreflection of a white sign at 0.2 degrees, cd/m2 per lux: class RA2.
 SIGN_RETURN_PER_LUX = 250.0
 # Reflectance that the coefficient belongs to: a white sign's.
@@ -115,9 +117,13 @@ def _smooth_ground(normals: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray,
     """Return the normals, those of the ground averaged over a window of the picture."""
     share = (normals[..., 2] - _MIN_GROUND_COSINE) / (_GROUND_COSINE - _MIN_GROUND_COSINE)
     share = np.clip(share, 0, 1)[..., None]
-    mean = normals * share
+    # The window is so wide that a quarter of the resolution is enough.
+    height, width = share.shape[:2]
+    size = (max(width // _GROUND_SHRINK, 1), max(height // _GROUND_SHRINK, 1))
+    mean = cv2.resize(normals * share, size, interpolation=cv2.INTER_AREA)
     for _ in range(2):
         mean = cv2.blur(mean, _GROUND_WINDOW, borderType=cv2.BORDER_CONSTANT)
+    mean = cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR)
     x, y, z = cv2.split(mean)
     mean *= (1 / np.sqrt(np.maximum(x * x + y * y + z * z, 1e-12)))[..., None]
     return normals + share * (mean - normals)

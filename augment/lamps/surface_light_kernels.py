@@ -17,6 +17,16 @@ from augment.lamps.pattern_kernels import pattern_at
 from augment.render.cpu.jit import kernel, kernel_function
 
 TILE = 8  # nodes along a side of a tile, whose nodes share a list of lamps
+# Rows and columns of a tile on one plane in which nodes are lit; the others lie between.
+LIT_ROWS = np.array([0, 2, 5, 7])
+# Lit row before each row, by its place in LIT_ROWS.
+LIT_BEFORE = np.array([0, 0, 1, 1, 1, 2, 2, 2])
+# Share of the next lit row.
+LIT_SHARE = np.array([0, 1 / 2, 0, 1 / 3, 2 / 3, 0, 1 / 2, 1])
+# Least cosine of a node's normal to the mean normal of a tile on one plane.
+MIN_PLANE_NORMAL = 0.97
+# Largest distance of a node from the plane, as a share of the tile's diagonal.
+PLANE_TOLERANCE = 0.02
 # Nodes of a whole tile at which the lamps are compared: corners, middles of the sides, middle.
 SAMPLES = np.array([0, 3, 7, 24, 27, 31, 56, 59, 63])
 # Light that a lamp may have between these points, over the most that it has at one of them.
@@ -393,6 +403,7 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
         nodes = np.empty((TILE * TILE, 2), np.int64)
         chosen = np.empty(max_lamps, np.int64)
         scores = np.empty(max_lamps)
+        light = np.empty((TILE * TILE, 6))
         count = 0
         for i in range(top, min(top + TILE, height)):
             y = (i * view.lens[4] + view.lens[5] - view.lens[3]) * view.lens[1]
@@ -421,42 +432,93 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
         if count == 0:
             continue
         number = rank_lamps(lamps, points, count, has_own, min_lux, max_lamps, chosen, scores)
+        is_smooth = count == TILE * TILE and is_one_plane(points)
+        num_lit = len(LIT_ROWS) ** 2 if is_smooth else count
+        light[:num_lit] = 0.0
         for c in range(number):
             m = chosen[c]
             lamp = read_lamp(lamps, m)
             tables = lamps.tables
             shadow_map = lamps.shadow_maps[m]
-            is_own = lamps.is_own[m]
+            is_returned = has_own and lamps.is_own[m]
             red = lamps.colors[m, 0]
             green = lamps.colors[m, 1]
             blue = lamps.colors[m, 2]
-            for p in range(count):
+            place = lamp[0]
+            for e in range(num_lit):
+                p = e
+                if is_smooth:
+                    p = LIT_ROWS[e // len(LIT_ROWS)] * TILE + LIT_ROWS[e % len(LIT_ROWS)]
                 x = points[p, 0]
                 y = points[p, 1]
                 z = points[p, 2]
                 nx = points[p, 3]
                 ny = points[p, 4]
                 nz = points[p, 5]
-                place = lamp[0]
                 above = nx * (place[0] - x) + ny * (place[1] - y) + nz * (place[2] - z)
                 rough = points[p, 6]
-                is_returned = has_own and is_own
                 if above <= 0 and rough <= 0 and not is_returned:
                     continue
                 facing, dx, dy, dz = lux_along_ray(tables, lamp, x, y, z)
                 if shadow_map >= 0 and facing > 0:
                     facing *= lit_share(shadows, shadow_map, x, y, z)
-                i = nodes[p, 0]
-                j = nodes[p, 1]
                 lit = facing * (max(nx * dx + ny * dy + nz * dz, 0.0) + rough)
-                lux[i, j, 0] += np.float32(lit * red)
-                lux[i, j, 1] += np.float32(lit * green)
-                lux[i, j, 2] += np.float32(lit * blue)
+                light[e, 0] += lit * red
+                light[e, 1] += lit * green
+                light[e, 2] += lit * blue
                 if is_returned:
                     facing *= _return_share(view, x, y, z, dx, dy, dz)
-                    own_lux[i, j, 0] += np.float32(facing * red)
-                    own_lux[i, j, 1] += np.float32(facing * green)
-                    own_lux[i, j, 2] += np.float32(facing * blue)
+                    light[e, 3] += facing * red
+                    light[e, 4] += facing * green
+                    light[e, 5] += facing * blue
+        for p in range(count):
+            i = nodes[p, 0]
+            j = nodes[p, 1]
+            for k in range(6 if has_own else 3):
+                value = light[p, k]
+                if is_smooth:
+                    # Between the four lit nodes about this one.
+                    first = LIT_BEFORE[i - top] * len(LIT_ROWS) + LIT_BEFORE[j - left]
+                    second = first + len(LIT_ROWS)
+                    v = LIT_SHARE[i - top]
+                    u = LIT_SHARE[j - left]
+                    value = (light[first, k] * (1.0 - u) + light[first + 1, k] * u) * (1.0 - v)
+                    value += (light[second, k] * (1.0 - u) + light[second + 1, k] * u) * v
+                if k < 3:
+                    lux[i, j, k] = np.float32(value)
+                else:
+                    own_lux[i, j, k - 3] = np.float32(value)
+
+
+@kernel_function()
+def is_one_plane(points):
+    """Return True if all points of a whole tile lie in one plane, and their normals agree.
+
+    Args:
+        points: [N, 7]: place, normal, roughness.
+    """
+    mean = np.zeros(7)
+    for p in range(len(points)):
+        for k in range(7):
+            mean[k] += points[p, k]
+    for k in range(7):
+        mean[k] /= len(points)
+    length = math.sqrt(mean[3] * mean[3] + mean[4] * mean[4] + mean[5] * mean[5])
+    if mean[6] > 0 or length < MIN_PLANE_NORMAL:
+        return False
+    span = 0.0
+    for k in range(3):
+        span += (points[len(points) - 1, k] - points[0, k]) ** 2
+    limit = PLANE_TOLERANCE * math.sqrt(span) * length
+    for p in range(len(points)):
+        distance = 0.0
+        cosine = 0.0
+        for k in range(3):
+            distance += (points[p, k] - mean[k]) * mean[3 + k]
+            cosine += points[p, 3 + k] * mean[3 + k]
+        if abs(distance) > limit or cosine < MIN_PLANE_NORMAL * length:
+            return False
+    return True
 
 
 @kernel_function()
