@@ -172,6 +172,7 @@ def air_light(
     step_px: int = 4,
     threshold_cd_m2: float = 0.0,
     visible_shares: Float64[np.ndarray, "M"] | None = None,
+    picture: Float32[np.ndarray, "H W 3"] | None = None,
 ) -> Float32[np.ndarray, "H W 3"]:
     """Return the luminance that lamps add to each pixel by the air before its surface.
 
@@ -185,6 +186,7 @@ def air_light(
         step_px: pixels between the nodes.
         threshold_cd_m2: luminance below which a lamp's light may be left out, cd/m2.
         visible_shares: share of each lamp's light that is not hidden, 0 to 1; None for all of it.
+        picture: picture to which the light is added, in place; None for a new one.
 
     Returns:
         Linear sRGB, cd/m2.
@@ -193,7 +195,7 @@ def air_light(
         ValueError: an argument is out of its range or has a wrong shape.
     """
     _check_arguments(lamps, camera, ray_distance_m, num_points, step_px, threshold_cd_m2)
-    light = np.zeros((*ray_distance_m.shape, 3), np.float32)
+    light = np.zeros((*ray_distance_m.shape, 3), np.float32) if picture is None else picture
     if air.is_clear or len(lamps) == 0:
         return light
     halos = _prepare(lamps, camera, air, num_points, threshold_cd_m2, visible_shares)

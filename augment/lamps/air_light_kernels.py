@@ -23,6 +23,8 @@ MAX_DISTANCE = 20.0
 # Optical distance at which the table's spacing turns from linear to logarithmic.
 DISTANCE_KNEE = 0.01
 
+# Least difference of two inverse distances that are told apart, 1/m.
+TINY = np.float32(1e-9)
 # Radius about a lamp within which nodes soften 1 / h, in their steps.
 SOFT_STEPS = 1.5
 # Square of the radius about a lamp in which nodes add what coarse nodes lack, in softened radii.
@@ -338,21 +340,18 @@ def fill_planes(tables, patterns, axes, ups, frames, intensities, layouts, plane
             planes[place] = 0.0
             total = 0.0
             for cell in range(num_cells):
-                mean = 0.0
-                for half in range(2):
-                    angle = math.pi * (cell + 0.25 + 0.5 * half) / num_cells
-                    along = -math.cos(angle)  # towards the camera at angle 0
-                    aside = math.sin(angle)
-                    mean += 0.5 * intensity(
-                        tables,
-                        patterns[m],
-                        axes[m],
-                        ups[m],
-                        along * frames[m, 0, 0] + aside * side_x,
-                        along * frames[m, 0, 1] + aside * side_y,
-                        along * frames[m, 0, 2] + aside * side_z,
-                    )
-                mean *= intensities[m]
+                angle = math.pi * (cell + 0.5) / num_cells
+                along = -math.cos(angle)  # towards the camera at angle 0
+                aside = math.sin(angle)
+                mean = intensities[m] * intensity(
+                    tables,
+                    patterns[m],
+                    axes[m],
+                    ups[m],
+                    along * frames[m, 0, 0] + aside * side_x,
+                    along * frames[m, 0, 1] + aside * side_y,
+                    along * frames[m, 0, 2] + aside * side_z,
+                )
                 peak = max(peak, mean)
                 total += mean * (math.pi / num_cells)
                 planes[place + cell + 1] = total
@@ -369,17 +368,24 @@ def find_node_ranges(inverse_distances, step, ranges):
         ranges: output float32 [rows, columns, 2]: largest and smallest.
     """
     height, width = inverse_distances.shape
-    for row in prange(ranges.shape[0]):
-        for column in range(ranges.shape[1]):
-            largest = np.float32(0.0)
-            smallest = np.float32(np.inf)
-            for y in range(max((row - 1) * step, 0), min((row + 1) * step, height)):
-                for x in range(max((column - 1) * step, 0), min((column + 1) * step, width)):
+    num_rows, num_columns, _ = ranges.shape
+    for row in prange(num_rows):
+        largest = np.zeros(num_columns, np.float32)  # of the cell after each node
+        smallest = np.full(num_columns, np.inf, np.float32)
+        for y in range(max((row - 1) * step, 0), min((row + 1) * step, height)):
+            for cell in range(num_columns - 1):
+                high = largest[cell]
+                low = smallest[cell]
+                for x in range(cell * step, min((cell + 1) * step, width)):
                     value = inverse_distances[y, x]
-                    largest = max(largest, value)
-                    smallest = min(smallest, value)
-            ranges[row, column, 0] = largest
-            ranges[row, column, 1] = smallest
+                    high = max(high, value)
+                    low = min(low, value)
+                largest[cell] = high
+                smallest[cell] = low
+        for column in range(num_columns):
+            before = max(column - 1, 0)
+            ranges[row, column, 0] = max(largest[before], largest[column])
+            ranges[row, column, 1] = min(smallest[before], smallest[column])
 
 
 @kernel
@@ -544,51 +550,51 @@ def light_nodes(grid, lamps, scatter, planes, shares, slices, volume, windows, r
 
 @kernel
 def spread_nodes(grid, inverse_distances, ranges, nodes, light):
-    """Write each pixel's light from its four nodes, each at the pixel's own distance.
+    """Add each pixel's light from its four nodes, at the pixel's own distance.
 
-    A node's two distances span those of all pixels that read it. So light does not cross a
-    silhouette.
+    A node's two distances span those of all pixels that read it. Distances and light are
+    interpolated between the nodes; the pixel's own distance lies between the two. So light does not
+    cross a silhouette.
 
     Args:
         grid: the image and its grid.
         inverse_distances: float32 [H, W], 1/m.
         ranges: as in `light_nodes`, like nodes.
-        light: output float32 [H, W, 3].
+        light: float32 [H, W, 3], changed in place.
     """
     height, width, _ = light.shape
     step = grid.size[2]
+    num_columns = nodes.shape[1]
+    one_f32 = np.float32(1)
+    zero = np.float32(0)
     for y in prange(height):
         row_place = np.float32((y + 0.5) / step)
         row = int(row_place)
-        row_share = row_place - np.float32(row)
-        for x in range(width):
-            column_place = np.float32((x + 0.5) / step)
-            column = int(column_place)
-            column_share = column_place - np.float32(column)
-            inverse = inverse_distances[y, x]
-            red = np.float32(0.0)
-            green = np.float32(0.0)
-            blue = np.float32(0.0)
-            for corner in range(4):
-                i = row + (corner >> 1)
-                j = column + (corner & 1)
-                weight = row_share if corner >> 1 else np.float32(1) - row_share
-                weight *= column_share if corner & 1 else np.float32(1) - column_share
-                largest = ranges[i, j, 0]
-                smallest = ranges[i, j, 1]
-                share = np.float32(0.0)
-                if largest > smallest:
-                    share = (inverse - smallest) / (largest - smallest)
-                    share = min(max(share, np.float32(0.0)), np.float32(1.0))
-                near = weight * share
-                far = weight - near
-                node = nodes[i, j]
-                red += near * node[0] + far * node[3]
-                green += near * node[1] + far * node[4]
-                blue += near * node[2] + far * node[5]
-            light[y, x, 0] = red
-            light[y, x, 1] = green
-            light[y, x, 2] = blue
+        below = row_place - np.float32(row)
+        above = one_f32 - below
+        # The two distances, and the light to each, between the rows of nodes.
+        columns = np.empty((num_columns, 8), np.float32)
+        for j in range(num_columns):
+            for k in range(2):
+                columns[j, k] = above * ranges[row, j, k] + below * ranges[row + 1, j, k]
+            for k in range(6):
+                columns[j, 2 + k] = above * nodes[row, j, k] + below * nodes[row + 1, j, k]
+        for j in range(num_columns - 1):
+            brightest = zero
+            for k in range(2, 8):
+                brightest = max(brightest, max(columns[j, k], columns[j + 1, k]))
+            if brightest <= zero:
+                continue
+            for x in range(j * step, min((j + 1) * step, width)):
+                u = np.float32((x + 0.5) / step) - np.float32(j)
+                largest = columns[j, 0] + u * (columns[j + 1, 0] - columns[j, 0])
+                smallest = columns[j, 1] + u * (columns[j + 1, 1] - columns[j, 1])
+                share = (inverse_distances[y, x] - smallest) / max(largest - smallest, TINY)
+                share = min(max(share, zero), one_f32)
+                for k in range(3):
+                    near = columns[j, 2 + k] + u * (columns[j + 1, 2 + k] - columns[j, 2 + k])
+                    far = columns[j, 5 + k] + u * (columns[j + 1, 5 + k] - columns[j, 5 + k])
+                    light[y, x, k] += far + share * (near - far)
 
 
 @kernel

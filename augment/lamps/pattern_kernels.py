@@ -21,33 +21,43 @@ _COLUMN_SCALE = 1.0 / (math.sqrt(2.0 + ROOT_OFFSET) - _ROOT)
 
 
 @kernel_function()
+def pattern_place(last_row, last_column, forward, right, up):
+    """Return row and column of a direction in a pattern's table.
+
+    Args:
+        last_row: last row of the table.
+        last_column: last column of the table.
+        forward: unit direction from the lamp, along the lamp's axis.
+        right: the same, towards the lamp's right (axis x up).
+        up: the same, along the lamp's upward direction.
+    """
+    level = math.sqrt(forward * forward + right * right)
+    # The diamond angle of elevation, -1 to 1: as an angle, but without its arc functions.
+    fold = abs(up) / max(abs(up) + level, 1e-30)
+    row = (math.sqrt(fold + ROOT_OFFSET) - _ROOT) * _ROW_SCALE
+    row = -row if up < 0.0 else row
+    # The diamond angle of azimuth, -2 to 2.
+    fold = abs(right) / max(abs(forward) + abs(right), 1e-30)
+    fold = 2.0 - fold if forward < 0.0 else fold
+    column = (math.sqrt(fold + ROOT_OFFSET) - _ROOT) * _COLUMN_SCALE
+    column = -column if right < 0.0 else column
+    row = min(max((row + 1.0) * (0.5 * last_row), 0.0), float(last_row))
+    column = min(max((column + 1.0) * (0.5 * last_column), 0.0), float(last_column))
+    return row, column
+
+
+@kernel_function()
 def pattern_at(tables, pattern, forward, right, up):
     """Return a pattern's value in a direction, bilinear between the nodes.
 
     Args:
         tables: packed patterns, float32 [K, V, U].
         pattern: row of the tables.
-        forward: unit direction from the lamp, along the lamp's axis.
-        right: the same, towards the lamp's right (axis x up).
-        up: the same, along the lamp's upward direction.
+        forward: as in `pattern_place`, like right and up.
     """
     last_row = tables.shape[1] - 1
     last_column = tables.shape[2] - 1
-    level = math.sqrt(forward * forward + right * right)
-    # The diamond angle of elevation, -1 to 1: as an angle, but without its arc functions.
-    fold = abs(up) / max(abs(up) + level, 1e-30)
-    row = (math.sqrt(fold + ROOT_OFFSET) - _ROOT) * _ROW_SCALE
-    if up < 0.0:
-        row = -row
-    # The diamond angle of azimuth, -2 to 2.
-    fold = abs(right) / max(abs(forward) + abs(right), 1e-30)
-    if forward < 0.0:
-        fold = 2.0 - fold
-    column = (math.sqrt(fold + ROOT_OFFSET) - _ROOT) * _COLUMN_SCALE
-    if right < 0.0:
-        column = -column
-    row = min(max((row + 1.0) * (0.5 * last_row), 0.0), float(last_row))
-    column = min(max((column + 1.0) * (0.5 * last_column), 0.0), float(last_column))
+    row, column = pattern_place(last_row, last_column, forward, right, up)
     i = min(int(row), last_row - 1)
     j = min(int(column), last_column - 1)
     v = row - i

@@ -115,18 +115,19 @@ def find_nodes(
 
 def _smooth_ground(normals: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
     """Return the normals, those of the ground averaged over a window of the picture."""
-    share = (normals[..., 2] - _MIN_GROUND_COSINE) / (_GROUND_COSINE - _MIN_GROUND_COSINE)
-    share = np.clip(share, 0, 1)[..., None]
     # The window is so wide that a quarter of the resolution is enough.
-    height, width = share.shape[:2]
+    height, width = normals.shape[:2]
     size = (max(width // _GROUND_SHRINK, 1), max(height // _GROUND_SHRINK, 1))
-    mean = cv2.resize(normals * share, size, interpolation=cv2.INTER_AREA)
+    share = (normals[..., 2] - np.float32(_MIN_GROUND_COSINE)) * np.float32(
+        1 / (_GROUND_COSINE - _MIN_GROUND_COSINE)
+    )
+    np.clip(share, 0, 1, out=share)
+    mean = cv2.resize(normals * share[..., None], size, interpolation=cv2.INTER_AREA)
     for _ in range(2):
         mean = cv2.blur(mean, _GROUND_WINDOW, borderType=cv2.BORDER_CONSTANT)
-    mean = cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR)
-    x, y, z = cv2.split(mean)
-    mean *= (1 / np.sqrt(np.maximum(x * x + y * y + z * z, 1e-12)))[..., None]
-    return normals + share * (mean - normals)
+    lengths = np.sqrt(np.maximum((mean * mean).sum(-1, keepdims=True), 1e-12))
+    mean = cv2.resize(mean / lengths, (width, height), interpolation=cv2.INTER_LINEAR)
+    return cv2.blendLinear(mean, normals, share, 1 - share)
 
 
 def node_view(camera: Camera, step_px: int) -> NodeView:

@@ -23,6 +23,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from augment.effects.lamps import light_kernels
+from augment.render.threads import kernel_threads
+
 # Share of the light in the narrow tail f1, for a clean lens.
 NARROW_SHARE = 0.02
 # Share of the light in the wide tail f2, for a clean lens.
@@ -49,16 +52,21 @@ def add_glare(
         focal_px: focal length, pixels.
         strength: the tails' share of the light, over that of a clean lens.
     """
-    if strength <= 0 or not (linear > 1).any():
+    if strength <= 0:
         return None
     height, width, _ = linear.shape
     levels = tail_levels(focal_px, max(height, width))
     coarsest = _FINEST_PX << (len(levels) - 1)
     padded_height = -(-height // coarsest) * coarsest
     padded_width = -(-width // coarsest) * coarsest
-    source = np.zeros((padded_height, padded_width, 3), np.float32)
-    np.maximum(linear - np.float32(1), 0, out=source[:height, :width])
-    grids = [_half(source)]
+    source = np.empty((padded_height // _FINEST_PX, padded_width // _FINEST_PX, 3), np.float32)
+    with kernel_threads(len(source)):
+        light_kernels.saturated_light(
+            np.ascontiguousarray(linear).reshape(height, -1), source.reshape(len(source), -1)
+        )
+    if not source.any():
+        return None
+    grids = [source]
     for _ in levels[1:]:
         grids.append(_half(grids[-1]))
     total: np.ndarray | None = None

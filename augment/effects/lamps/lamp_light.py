@@ -65,7 +65,7 @@ def add_lamp_light(
         with timed(AIR):
             lengths = camera.ray_lengths().numpy()
             distance_m = np.where(depth_m > 0, depth_m * lengths, np.float32(np.inf))
-            added += air_light(
+            air_light(
                 lamps,
                 camera,
                 distance_m.astype(np.float32),
@@ -76,6 +76,7 @@ def add_lamp_light(
                 visible_shares=lamp_visibility(
                     lamps, camera, surface_m, alpha, radius_m=HALO_RADIUS_M
                 ),
+                picture=added,
             )
     if plan.hour.is_dark and plan.has_drops:
         with timed(DROPS):

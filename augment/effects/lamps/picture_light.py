@@ -6,31 +6,25 @@ float32 on the CPU; callers move those of a GPU.
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from augment.effects.lamps import light_kernels
 from augment.effects.lamps.exposure import CROSSTALK, response
-from augment.effects.lamps.light_kernels import CODE_STEPS, ROOT_STEPS
+from augment.effects.lamps.light_kernels import MAX_LIGHT
 from augment.light.srgb import display_from_linear, linear_from_display
 from augment.render.composite import ROWS_PER_CHUNK
 from augment.render.sensor import LEVEL_SD
 from augment.render.threads import kernel_threads
 
-# Display-encoded value at which the table of light ends.
-_MAX_CODE = 2.0
-# Light at which the tables of codes end.
-_MAX_LIGHT = 6.25
 # Light, of saturation, that lamps must add for a saturated pixel to be theirs.
 MIN_LAMP_LIGHT = 0.1
 # Least reflectance of a surface; darker colours are shadows of the day.
 MIN_REFLECTANCE = 0.02
 # Greatest reflectance of a surface.
 MAX_REFLECTANCE = 0.9
-_NONE = np.zeros((0, 0, 3), np.float32)
-_NO_DRAWS = np.zeros((0, 0, 3), np.uint8)
+_NONE = np.zeros((0, 0), np.float32)
+_NO_DRAWS = np.zeros((0, 0), np.uint8)
 
 
 def relight(
@@ -67,13 +61,11 @@ def relight(
     mask = np.empty(rgb.shape[:2], np.bool_)
     with kernel_threads(ROWS_PER_CHUNK):
         light_kernels.relight(
-            np.ascontiguousarray(rgb),
-            _NONE if added_cd_m2 is None else np.ascontiguousarray(added_cd_m2),
+            _rows(rgb),
+            _NONE if added_cd_m2 is None else _rows(added_cd_m2),
             np.array([gain, added_gain, MIN_LAMP_LIGHT], np.float32),
             np.float32(min_added),
-            _light_table(),
-            _code_table(),
-            out,
+            _rows(out),
             mask,
         )
     return out, mask
@@ -92,8 +84,7 @@ def decode(
         return linear_from_display(np.maximum(rgb, 0).astype(np.float64)).astype(np.float32)
     out = np.empty_like(rgb)
     with kernel_threads(ROWS_PER_CHUNK):
-        rows = np.ascontiguousarray(rgb).reshape(len(rgb), -1)
-        light_kernels.decode(rows, _light_table(), out.reshape(len(rgb), -1))
+        light_kernels.decode(_rows(rgb), _rows(out))
     return out
 
 
@@ -125,12 +116,11 @@ def develop(
         out = np.empty_like(light)
         with kernel_threads(ROWS_PER_CHUNK):
             light_kernels.develop(
-                np.ascontiguousarray(light),
-                _NONE if glare is None else glare,
-                _NO_DRAWS if draws is None else draws,
+                _rows(light),
+                _NONE if glare is None else _rows(glare),
+                _NO_DRAWS if draws is None else _rows(draws),
                 np.array([CROSSTALK, per_light, of_reading], np.float32),
-                _developed_table(),
-                out,
+                _rows(out),
             )
         return out
     total = light.astype(np.float64) + (0 if glare is None else glare)
@@ -139,32 +129,13 @@ def develop(
     if draws is not None:
         sigma = np.sqrt(per_light * np.maximum(total, 0) + of_reading)
         total += sigma * (draws.astype(np.float64) - 128)
-    linear = response(np.clip(total, 0, _MAX_LIGHT))
+    linear = response(np.clip(total, 0, MAX_LIGHT))
     return display_from_linear(linear).astype(np.float32)
 
 
-@functools.cache
-def _light_table() -> np.ndarray:
-    """Return the light of codes from 0 to _MAX_CODE."""
-    codes = np.arange(round(_MAX_CODE * CODE_STEPS) + 2) / CODE_STEPS
-    return linear_from_display(codes).astype(np.float32)
-
-
-@functools.cache
-def _code_table() -> np.ndarray:
-    """Return the codes of light from 0 to _MAX_LIGHT, by its square root."""
-    return display_from_linear(_table_lights()).astype(np.float32)
-
-
-@functools.cache
-def _developed_table() -> np.ndarray:
-    """Return the codes of exposed light from 0 to _MAX_LIGHT, through the response curve."""
-    return display_from_linear(response(_table_lights())).astype(np.float32)
-
-
-def _table_lights() -> np.ndarray:
-    """Return the light at each entry of a table of codes."""
-    return (np.arange(round(_MAX_LIGHT**0.5 * ROOT_STEPS) + 2) / ROOT_STEPS) ** 2
+def _rows(image: np.ndarray) -> np.ndarray:
+    """Return an image [H, W, 3] as rows of numbers [H, 3 W]."""
+    return np.ascontiguousarray(image).reshape(image.shape[0], 3 * image.shape[1])
 
 
 def find_reflectance(
@@ -189,12 +160,11 @@ def find_reflectance(
         out = np.empty_like(rgb)
         with kernel_threads(ROWS_PER_CHUNK):
             light_kernels.find_reflectance(
-                np.ascontiguousarray(rgb),
-                np.zeros((0, 0), np.float32) if fog_share is None else fog_share,
+                _rows(rgb),
+                _NONE if fog_share is None else fog_share,
                 airlight,
-                np.array([white, MIN_REFLECTANCE, MAX_REFLECTANCE], np.float32),
-                _light_table(),
-                out,
+                np.array([1 / white, MIN_REFLECTANCE, MAX_REFLECTANCE], np.float32),
+                _rows(out),
             )
         return out
     share = np.zeros(rgb.shape[:2]) if fog_share is None else np.clip(fog_share, 0, 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from jaxtyping import Bool
 
 from augment.effects.effect import RenderedView
@@ -29,15 +28,14 @@ def sign_pixels(view: RenderedView) -> Bool[np.ndarray, "H W"] | None:
     alpha = view.raster.alpha
     if index is None or alpha is None:
         return None
-    classes = [
-        torch.zeros(len(part.gaussians), dtype=torch.int16)
+    is_sign = [
+        np.zeros(len(part.gaussians), bool)
         if part.gaussians.semantic is None
-        else part.gaussians.semantic.cpu()
+        else part.gaussians.semantic.cpu().numpy() == SemanticClass.SIGN
         for part in view.layers.parts
     ]
-    table = torch.cat(classes) == SemanticClass.SIGN
-    if len(table) == 0:
+    if sum(map(len, is_sign)) == 0:
         return None
-    index = index.cpu().long()
-    is_surface = (index >= 0) & (alpha.detach().cpu() >= SURFACE_ALPHA)
-    return (is_surface & table[index.clamp(0, len(table) - 1)]).numpy()
+    table = np.concatenate([*is_sign, [False]])  # pixels without a splat have the index -1
+    signs = table[index.cpu().numpy()]
+    return signs & (alpha.detach().cpu().numpy() >= SURFACE_ALPHA)
