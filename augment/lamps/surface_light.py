@@ -10,8 +10,10 @@ The surface's luminance is rho E / pi. The air before the surface is the caller'
 
 Light changes slowly over a surface. So the sum is taken at nodes, `step_px` apart, and spread to
 the pixels of the same surface, which have reflectances of their own. In a tile of nodes only the
-brightest lamps count. Lamps that add less than `min_luminance_cd_m2` to a white surface of a tile
-do not light it.
+lamps that light it most count. Lamps that add less than `min_luminance_cd_m2` to a white surface of
+a tile do not light it.
+In tiles on one plane, far from their lamps, a quarter of the nodes is lit; the others lie between.
+With a `min_luminance_cd_m2` of 0 no such shortcut is taken.
 
 Signs of retroreflective sheeting send the recording car's light back to it: L = R_A E, E on the
 plane that faces the lamp.

@@ -23,6 +23,8 @@ LIT_ROWS = np.array([0, 2, 5, 7])
 LIT_BEFORE = np.array([0, 0, 1, 1, 1, 2, 2, 2])
 # Share of the next lit row.
 LIT_SHARE = np.array([0, 1 / 2, 0, 1 / 3, 2 / 3, 0, 1 / 2, 1])
+# Least distance of such a tile from the lamps that light it, in its diagonals.
+MIN_SPANS = 3.0
 # Least cosine of a node's normal to the mean normal of a tile on one plane.
 MIN_PLANE_NORMAL = 0.97
 # Largest distance of a node from the plane, as a share of the tile's diagonal.
@@ -31,8 +33,6 @@ PLANE_TOLERANCE = 0.02
 SAMPLES = np.array([0, 7, 18, 21, 42, 45, 56, 63])
 # Light that a lamp may have between these points, over the most that it has at one of them.
 SAMPLE_MARGIN = 4.0
-# Light of a lamp, as a share of the brightest lamp's, below which it does not light a tile.
-MIN_SHARE = 0.004
 # Distance of the nodes over which slopes are first estimated, nodes.
 SLOPE_STEP = 2
 # Difference between the slopes on both sides of a node, as a share of the inverse depth and a node,
@@ -358,8 +358,6 @@ def light_points(table, lamp, points, count, lux):
 def rank_lamps(lamps, points, count, has_own, min_lux, max_lamps, chosen, scores):
     """Choose the lamps that light a tile most, brightest first; return their number.
 
-    Lamps whose light is less than MIN_SHARE of the brightest one's are left out.
-
     Args:
         lamps: the lamps.
         points: points of the tile, [N, 7]: place, normal, roughness.
@@ -393,8 +391,6 @@ def rank_lamps(lamps, points, count, has_own, min_lux, max_lamps, chosen, scores
             squared += gap * gap
         bound = lamps.peaks[m] / (squared + lamps.softening[m])
         least = min_lux
-        if number > 0:
-            least = max(least, MIN_SHARE * scores[0])
         if number == max_lamps:
             least = max(least, scores[number - 1])
         if bound < least:
@@ -426,8 +422,6 @@ def rank_lamps(lamps, points, count, has_own, min_lux, max_lamps, chosen, scores
             place -= 1
         scores[place] = score
         chosen[place] = m
-    while number > 1 and scores[number - 1] < MIN_SHARE * scores[0]:
-        number -= 1
     return number
 
 
@@ -441,7 +435,7 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
         view: the view of the nodes.
         lamps: the lamps.
         shadows: depth maps of the lamps that have one.
-        min_lux: lux below which a lamp does not light a tile.
+        min_lux: lux below which a lamp does not light a tile; 0 for all light at all nodes.
         max_lamps: largest number of lamps that light a tile.
         lux: output, float32 [h, w, 3], lux in linear sRGB on the surfaces.
         own_lux: output, float32 [h, w, 3], lux of the recording car's lamps on surfaces that face
@@ -490,7 +484,12 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
         if count == 0:
             continue
         number = rank_lamps(lamps, points, count, has_own, min_lux, max_lamps, chosen, scores)
-        is_smooth = count == TILE * TILE and is_one_plane(points)
+        is_smooth = (
+            min_lux > 0
+            and count == TILE * TILE
+            and is_one_plane(points)
+            and is_far_from_lamps(points, lamps, chosen, number)
+        )
         num_lit = len(LIT_ROWS) ** 2 if is_smooth else count
         light[:num_lit] = 0.0
         for e in range(num_lit):
@@ -556,6 +555,30 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
                     lux[i, j, k] = np.float32(value)
                 else:
                     own_lux[i, j, k - 3] = np.float32(value)
+
+
+@kernel_function()
+def is_far_from_lamps(points, lamps, chosen, number):
+    """Return True if a tile is so far from its lamps that their light changes little over it.
+
+    Args:
+        points: points of the tile, [N, 7].
+        lamps: the lamps.
+        chosen: indices of the lamps that light the tile.
+        number: number of these lamps.
+    """
+    last = len(points) - 1
+    span = 0.0
+    for k in range(3):
+        span = span + (points[last, k] - points[0, k]) ** 2
+    for c in range(number):
+        squared = 0.0
+        for k in range(3):
+            middle = 0.5 * (points[0, k] + points[last, k])
+            squared += (lamps.positions[chosen[c], k] - middle) ** 2
+        if squared < MIN_SPANS**2 * span:
+            return False
+    return True
 
 
 @kernel_function()

@@ -146,7 +146,8 @@ def test_picture_is_the_sum_at_every_pixel():
         is_clear = gamma > 4 / view.fx
         error = np.abs(light[..., 1] / expected - 1)[is_clear]
         assert np.median(error) < 0.01
-        assert np.percentile(error, 99) < 0.05  # coarse nodes are 1 degree apart
+        # Neighbours at 7 m, at 40 m and in the sky share nodes.
+        assert np.percentile(error, 99) < 0.1
 
 
 @pytest.mark.parametrize("pattern", [Pattern.DIPPED_RIGHT, Pattern.REAR, Pattern.STREET])

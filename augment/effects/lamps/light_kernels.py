@@ -45,7 +45,7 @@ _EXP_4 = np.float32(0.0387034282)  # of power 4
 _EXP_3 = np.float32(-0.165271526)  # of power 3
 _EXP_2 = np.float32(0.499693296)  # of power 2
 _EXP_1 = np.float32(-0.999974538)  # of power 1
-_EXP_0 = np.float32(0.999999642)  # of power 0
+_EXP_0 = np.float32(1)  # of power 0; exactly 1, so that black stays black
 # Light from which on the response curve bends, and what is left of the range above it.
 _SHOULDER_START = np.float32(SHOULDER_START)
 _SHOULDER_ROOM = np.float32(1 - SHOULDER_START)
