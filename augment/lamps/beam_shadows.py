@@ -89,8 +89,8 @@ def draw_beam_shadows(
         backend: backend of the rasteriser.
         timestamp_ns: the moment.
     """
-    own = lamps.select(_throws_shadows(lamps))
-    views = _views_of(own)
+    own_lamps = lamps.select(_throws_shadows(lamps))
+    views = _views_of(own_lamps)
     if not views:
         return None
     images: list[np.ndarray] = []
@@ -119,17 +119,19 @@ def draw_beam_shadows(
     return BeamShadows(arrays, positions, np.stack([view[1] for view in views]))
 
 
-def _views_of(own: Lamps) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _views_of(own_lamps: Lamps) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Return place, axis and up of one view for each group of lamps with the same direction."""
     views: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    remaining = list(range(len(own)))
+    remaining = list(range(len(own_lamps)))
     while remaining:
         first = remaining[0]
-        gaps = np.linalg.norm(own.positions_m - own.positions_m[first], axis=1)
-        is_same = (gaps <= _SAME_PLACE_M) & (own.axes @ own.axes[first] >= _SAME_AXIS)
+        gaps = np.linalg.norm(own_lamps.positions_m - own_lamps.positions_m[first], axis=1)
+        is_same = (gaps <= _SAME_PLACE_M) & (own_lamps.axes @ own_lamps.axes[first] >= _SAME_AXIS)
         group = [m for m in remaining if is_same[m]]
         remaining = [m for m in remaining if not is_same[m]]
-        views.append((own.positions_m[group].mean(0), own.axes[first], own.ups[first]))
+        views.append(
+            (own_lamps.positions_m[group].mean(0), own_lamps.axes[first], own_lamps.ups[first])
+        )
     return views
 
 

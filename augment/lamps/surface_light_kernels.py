@@ -703,7 +703,7 @@ def spread_light(
             weights[1] = u * (1.0 - v)
             weights[2] = (1.0 - u) * v
             weights[3] = u * v
-            whole = 0.0
+            total_weight = 0.0
             for corner in range(4):
                 a = i if corner < 2 else below
                 b = j if corner % 2 == 0 else beside
@@ -711,8 +711,8 @@ def spread_light(
                 weights[corner] *= max(1.0 - gap * gap, OTHER_SURFACE_WEIGHT)
                 if node_inverse[a, b] <= 0:
                     weights[corner] = 0.0
-                whole += weights[corner]
-            if whole <= 0:
+                total_weight += weights[corner]
+            if total_weight <= 0:
                 continue
             for k in range(3):
                 total[k] = 0.0
@@ -722,7 +722,7 @@ def spread_light(
                 for k in range(3):
                     total[k] += weights[corner] * lux[a, b, k]
             for k in range(3):
-                luminance = total[k] / whole * reflectance[row, column, k] * per_pi
+                luminance = total[k] / total_weight * reflectance[row, column, k] * per_pi
                 picture[row, column, k] += np.float32(luminance)
             if sends_back:
                 for k in range(3):
@@ -733,5 +733,5 @@ def spread_light(
                     for k in range(3):
                         total[k] += weights[corner] * own_lux[a, b, k]
                 for k in range(3):
-                    luminance = total[k] / whole * return_per_lux[row, column]
+                    luminance = total[k] / total_weight * return_per_lux[row, column]
                     picture[row, column, k] += np.float32(luminance * reflectance[row, column, k])

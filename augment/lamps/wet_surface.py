@@ -49,7 +49,7 @@ class WetSurface:
         tilts = None
         if self.tilts is not None or farther.tilts is not None:
             flat = np.zeros((*is_here.shape, 2), np.float32)
-            here = flat if self.tilts is None else self.tilts
-            there = flat if farther.tilts is None else farther.tilts
-            tilts = np.where(is_here[..., None], here, there)
+            tilts_of_self = flat if self.tilts is None else self.tilts
+            tilts_of_farther = flat if farther.tilts is None else farther.tilts
+            tilts = np.where(is_here[..., None], tilts_of_self, tilts_of_farther)
         return WetSurface(*images, self.up, tilts)

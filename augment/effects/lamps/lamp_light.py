@@ -121,10 +121,10 @@ def _recorded_light(
     if photo is None or not plan.hour.is_dark or not plan.has_vehicle_lamps:
         return None
     with timed(EMITTERS):
-        found = find_recorded_lamps(photo.pixels, vehicle_pixels(effect.scene, camera))
-        if not found.lamps:
+        recorded_lamps = find_recorded_lamps(photo.pixels, vehicle_pixels(effect.scene, camera))
+        if not recorded_lamps.lamps:
             return None
-        luminance = found.luminance_cd_m2
+        luminance = recorded_lamps.luminance_cd_m2
         if view.raster.fog_share is not None:
             share = view.raster.fog_share.detach().cpu().numpy()
             luminance = luminance * (1 - np.clip(share, 0, 1))[..., None]
