@@ -126,25 +126,12 @@ class Speed(Section):
             (4, 8, 16),
             "points of the sum for lamps' light in the air",
             8.6,
-            tiers={"draft": 4, "balanced": 8},
             section="light",
         ),
         Knob(
-            "lamp_halo_px",
-            (8, 4, 2),
-            "width of the pixels of lamps' halos",
-            8.7,
-            tiers={"draft": 8, "balanced": 4},
-            section="light",
+            "lamp_halo_px", (8, 4, 2), "width of the pixels of lamps' halos", 8.7, section="light"
         ),
-        Knob(
-            "lamps_per_pixel",
-            (2, 4, 8),
-            "lamps that light one surface",
-            8.8,
-            tiers={"draft": 4},
-            section="light",
-        ),
+        Knob("lamps_per_pixel", (2, 4, 8), "lamps that light one surface", 8.8, section="light"),
         Knob(
             "lod_px",
             (2.0, 1.0, 0.5, 0.0),

@@ -40,7 +40,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from augment.lamps import air_light_kernels
-from augment.lamps.air_light_kernels import FLOOR_SHARE, HaloLamps, ImageGrid
+from augment.lamps.air_light_kernels import COARSE_END, SOFT_STEPS, HaloLamps, ImageGrid
 from augment.lamps.fog_phase import (
     AirExtinction,
     Lobes,
@@ -78,6 +78,22 @@ OWN_PLANES = (192, 128)
 FINE_PLANES = (96, 128)
 # Rows and cells of the planes of other lamps.
 WIDE_PLANES = (64, 64)
+# Largest angle between coarse nodes, radians: 1.4 degrees.
+MAX_COARSE_RAD = 0.025
+# The same for lamps of the recording car, radians: its camera looks along their beams' edges.
+MAX_OWN_COARSE_RAD = 0.0075
+# Largest number of nodes between coarse ones.
+MAX_COARSE_STEPS = 8
+# Number of distances to which coarse nodes hold the light along their rays, and the sky's.
+_NUM_SLICES = 23
+# Ratio of neighbouring distances.
+_SLICE_RATIO = 1.25
+# Nearest of these distances, metres.
+_FIRST_SLICE_M = 1.5
+# Inverse of these distances, falling, 1/m.
+SLICES_PER_M = np.append(
+    _SLICE_RATIO ** -np.arange(_NUM_SLICES, dtype=np.float64) / _FIRST_SLICE_M, 0.0
+)
 # Angles at which a lamp's bound is compared with the threshold.
 _NUM_BOUND_ANGLES = 512
 
@@ -156,6 +172,7 @@ def air_light(
     step_px: int = 4,
     threshold_cd_m2: float = 0.0,
     visible_shares: Float64[np.ndarray, "M"] | None = None,
+    picture: Float32[np.ndarray, "H W 3"] | None = None,
 ) -> Float32[np.ndarray, "H W 3"]:
     """Return the luminance that lamps add to each pixel by the air before its surface.
 
@@ -169,6 +186,7 @@ def air_light(
         step_px: pixels between the nodes.
         threshold_cd_m2: luminance below which a lamp's light may be left out, cd/m2.
         visible_shares: share of each lamp's light that is not hidden, 0 to 1; None for all of it.
+        picture: picture to which the light is added, in place; None for a new one.
 
     Returns:
         Linear sRGB, cd/m2.
@@ -177,35 +195,55 @@ def air_light(
         ValueError: an argument is out of its range or has a wrong shape.
     """
     _check_arguments(lamps, camera, ray_distance_m, num_points, step_px, threshold_cd_m2)
-    light = np.zeros((*ray_distance_m.shape, 3), np.float32)
+    light = np.zeros((*ray_distance_m.shape, 3), np.float32) if picture is None else picture
     if air.is_clear or len(lamps) == 0:
         return light
     halos = _prepare(lamps, camera, air, num_points, threshold_cd_m2, visible_shares)
     if halos is None:
         return light
-    grid = ImageGrid(
-        np.array(
-            [camera.fx, camera.fy, camera.cx, camera.cy, math.sqrt(camera.fx * camera.fy)],
-            np.float64,
-        ),
-        np.array([camera.height, camera.width, step_px], np.int64),
-    )
+    focal_px = math.sqrt(camera.fx * camera.fy)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, focal_px], np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.float32(1) / np.maximum(ray_distance_m, np.float32(MIN_SURFACE_M))
     inverse = np.ascontiguousarray(np.where(np.isfinite(inverse), inverse, np.float32(0)))
     num_rows = -(-camera.height // step_px) + 1
     num_columns = -(-camera.width // step_px) + 1
     ranges = np.empty((num_rows, num_columns, 2), np.float32)
-    nodes = np.empty((num_rows, num_columns, 6), np.float32)
-    shares = _interval_shares()
-    windows = _core_windows(halos.lamps, camera, step_px)
+    nodes = np.zeros((num_rows, num_columns, 6), np.float32)
+    windows = _lamp_windows(halos.lamps, camera, step_px, 4 * SOFT_STEPS * step_px)
+    tables = (halos.scatter, halos.planes, _interval_shares())
     with kernel_threads():
         air_light_kernels.find_node_ranges(inverse, step_px, ranges)
-        numbers = (halos.lamps, halos.scatter, halos.planes, shares)
-        air_light_kernels.light_nodes(grid, *numbers, ranges, nodes)
+        is_own = halos.lamps.tables[:, 3] == 1
+        for is_of_group, coarse_rad in ((~is_own, MAX_COARSE_RAD), (is_own, MAX_OWN_COARSE_RAD)):
+            if not is_of_group.any():
+                continue
+            lamps_of_group = HaloLamps(*(array[is_of_group] for array in halos.lamps))
+            num_steps = min(max(int(coarse_rad * focal_px / step_px), 1), MAX_COARSE_STEPS)
+            coarse_px = num_steps * step_px
+            size = (-(-camera.height // coarse_px) + 1, -(-camera.width // coarse_px) + 1)
+            volume = np.empty((*size, len(SLICES_PER_M), 3), np.float32)
+            radius_px = math.sqrt(COARSE_END) * SOFT_STEPS * coarse_px
+            coarse_windows = _lamp_windows(lamps_of_group, camera, step_px, radius_px)
+            if num_steps == 1:
+                coarse_windows[:] = 0  # the coarse nodes are the nodes
+            grid = _image_grid(camera, lens, step_px, num_steps)
+            air_light_kernels.light_slices(
+                grid, lamps_of_group, *tables, SLICES_PER_M, ranges, volume
+            )
+            air_light_kernels.light_nodes(
+                grid, lamps_of_group, *tables, SLICES_PER_M, volume, coarse_windows, ranges, nodes
+            )
+        grid = _image_grid(camera, lens, step_px, 1)
         air_light_kernels.spread_nodes(grid, inverse, ranges, nodes, light)
-        air_light_kernels.add_cores(grid, *numbers, windows, ranges, inverse, light)
+        air_light_kernels.add_cores(grid, halos.lamps, *tables, windows, ranges, inverse, light)
     return light
+
+
+def _image_grid(camera: Camera, lens: np.ndarray, step_px: int, num_steps: int) -> ImageGrid:
+    """Return the image and its grid as kernels take them."""
+    size = np.array([camera.height, camera.width, step_px, num_steps], np.int64)
+    return ImageGrid(lens, size)
 
 
 def _check_arguments(
@@ -288,30 +326,22 @@ def _prepare(
         )  # fmt: skip
     # A lamp that shines away from all that the camera sees has no peak in its planes.
     ends = _cut_off(np.maximum(plane_peaks, means[rows]), bound_gains[rows], threshold_cd_m2)
+    depth = np.minimum(sigmas[rows] * distances[rows], MAX_FACTOR_DEPTH)
+    off_axis_deg = np.degrees(np.arccos(np.clip(-(lamps.axes * frames[:, 0]).sum(1), -1, 1)))
+    gains = factor_gain(lamps.spreads_deg, off_axis_deg)
+    rotation = camera.camera_from_world[:3, :3].numpy()
     is_lit = ends > 0
     if not is_lit.any():
         return None
-    depths = sigmas[rows] * distances[rows]
-    factor_depths = np.minimum(depths, MAX_FACTOR_DEPTH)
-    off_axis_deg = np.degrees(np.arccos(np.clip(-(lamps.axes * frames[:, 0]).sum(1), -1, 1)))
-    gains = factor_gain(lamps.spreads_deg, off_axis_deg)
-    bounds = sigmas[rows] * np.exp(-depths) * (plane_peaks + FLOOR_SHARE * means[rows])
-    # The brightest lamps first: at many nodes the others can then be left out.
-    brightness = np.where(is_lit, bounds / distances[rows], -1.0)
-    order = np.argsort(-brightness, kind="stable")[: int(is_lit.sum())]
-    rotation = camera.camera_from_world[:3, :3].numpy()
-    colors = np.ascontiguousarray(lamps.colors[order])
     numbers = HaloLamps(
-        frames=np.ascontiguousarray((frames @ rotation.T)[order]),
-        distances_m=distances[rows][order],
-        sigmas_per_m=sigmas[rows][order],
-        colors=colors,
-        inverse_colors=1 / np.maximum(colors, 1e-12),
-        bounds=bounds[order],
-        means_cd=means[rows][order],
-        factors=np.stack([gains * factor_depths, SCATTER_GAIN * factor_depths], 1)[order],
-        ends=np.stack([ends, np.where(ends >= np.pi, -2.0, np.cos(ends))], 1)[order],
-        tables=np.ascontiguousarray(layouts[order]),
+        np.ascontiguousarray((frames @ rotation.T)[is_lit]),
+        distances[rows][is_lit],
+        sigmas[rows][is_lit],
+        np.ascontiguousarray(lamps.colors[is_lit]),
+        means[rows][is_lit],
+        np.stack([gains * depth, SCATTER_GAIN * depth], 1)[is_lit],
+        np.stack([ends, np.where(ends >= np.pi, -2.0, np.cos(ends))], 1)[is_lit],
+        np.ascontiguousarray(layouts[is_lit]),
     )
     return _Halos(numbers, np.stack([scatter_table(lobe) for lobe in lobes]), planes)
 
@@ -391,15 +421,22 @@ def _cut_off(
     return np.where(is_above.any(1), last / _NUM_BOUND_ANGLES * np.pi, 0.0)
 
 
-def _core_windows(lamps: HaloLamps, camera: Camera, step_px: int) -> np.ndarray:
-    """Return the nodes about each lamp that `add_cores` visits: int64 [M, 4]."""
+def _lamp_windows(lamps: HaloLamps, camera: Camera, step_px: int, radius_px: float) -> np.ndarray:
+    """Return the nodes about each lamp within a radius at the image's centre: int64 [M, 4].
+
+    Args:
+        lamps: the lamps.
+        camera: the camera.
+        step_px: pixels between nodes.
+        radius_px: the radius, pixels.
+    """
     x, y, z = lamps.frames[:, 0].T
     is_ahead = z > 0.02
     depth = np.where(is_ahead, z, 1.0)
     u = x / depth
     v = y / depth
     # A step is an angle at the image's centre; further out more pixels lie in it.
-    radius = 6 * step_px * (1 + u * u + v * v) * 1.05 + 1
+    radius = radius_px * (1 + u * u + v * v) * 1.05 + 1
     ratio = math.sqrt(camera.fx * camera.fy)
     half_width = radius * camera.fx / ratio
     half_height = radius * camera.fy / ratio

@@ -118,6 +118,7 @@ SUBJECTS = {
         ["Frames", "Stages", "Placement", "Snow"],
     ),
     "rain": (lambda: measure_effect("rain", 1, TINY_EFFECTS), ["Frames", "Stages", "Drops"]),
+    "light": (lambda: measure_effect("light", 1, TINY_EFFECTS), ["Frames", "Stages", "Lamps"]),
     "style": (
         lambda: measure_effect("style", 1, TINY_EFFECTS),
         ["Frames", "Stages", "Maps folded into", "Maps folded into SH against", "From a style"],

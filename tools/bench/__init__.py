@@ -14,7 +14,7 @@ from tyro.conf import UseAppendAction
 from tools.output import JsonFile, write_json
 
 Device = Literal["cpu", "cuda"]
-Effect = Literal["smog", "flood", "snow", "rain", "style"]
+Effect = Literal["smog", "flood", "snow", "rain", "light", "style"]
 
 
 def bench_raster(

@@ -430,6 +430,44 @@ def falling_errors(case: EffectCase, repeats: int) -> Iterator[Table]:
     yield Table(title, ("falls", "min_width_px", "mean error", "largest"), rows)
 
 
+# ---- hour and lamps -----------------------------------------------------------------------------
+
+NIGHT = {"time": "night", "sky_luminance_cd_m2": 0.05}  # The night that is measured.
+LAMPS_BY_DAY = {"time": "day", "vehicles": "on", "vehicle_share": 1}  # All vehicles' lamps by day.
+LIT_FOG = {"smog": {"visibility_m": 120, "blend": "linear"}}  # The fog about lamps.
+# The frames with lamps, by the name of their row.
+LIGHT_FRAMES = {
+    "night": Frames({"light": NIGHT}),
+    "night, fog 120 m": Frames({"light": NIGHT, **LIT_FOG}),
+    "night, rain 10 mm/h": Frames({"light": NIGHT, "rain": {"rate_mm_h": 10}}),
+    "fog 120 m by day, over the fog alone": Frames({"light": LAMPS_BY_DAY, **LIT_FOG}, LIT_FOG),
+    "clear day, no lamp on": Frames({"light": {"time": "day"}}),
+}
+# The values of each setting of `render.speed` for lamps, the most accurate one last.
+LAMP_SETTINGS = {"lamp_points": (4, 8, 16), "lamp_halo_px": (8, 4, 2), "lamps_per_pixel": (2, 4, 8)}
+
+
+def lamp_errors(case: EffectCase, repeats: int) -> Iterator[Table]:
+    """Compare pictures of fog at night with one of the most accurate settings."""
+    scene, _ = case.open_street()
+    camera = case.views(scene)[0]
+    exact = {name: values[-1] for name, values in LAMP_SETTINGS.items()}
+
+    def picture(speed: Mapping[str, int]) -> torch.Tensor:
+        light = {**NIGHT, "noise": 0}
+        recipe = recipe_of({"light": light, **LIT_FOG, "render": {"speed": speed}})
+        return frame_of(scene, camera, recipe)().rgb.clamp(0, 1)
+
+    reference = picture(exact)
+    rows = []
+    for name, values in LAMP_SETTINGS.items():
+        for value in values[:-1]:
+            change = 255 * (picture({**exact, name: value}) - reference).abs()
+            rows.append([name, value, float(change.mean()), float(change.max())])
+    title = f"Lamps in fog at night, against the most accurate settings; 1/255: {case.street}"
+    yield Table(title, ("setting", "value", "mean error", "largest"), rows)
+
+
 # ---- style --------------------------------------------------------------------------------------
 
 
@@ -535,5 +573,6 @@ EFFECTS = {
     "flood": EffectBench(FLOOD_FRAMES, [f"{tier}, calm" for tier in TIERS], flood_errors),
     "snow": EffectBench(SNOW_FRAMES, SHADINGS, snow_errors),
     "rain": EffectBench(FALLING_FRAMES, [*FALLING_FRAMES], falling_errors),
+    "light": EffectBench(LIGHT_FRAMES, ["night", "night, fog 120 m"], lamp_errors),
     "style": EffectBench(STYLE_FRAMES, ["one map"], style_errors),
 }

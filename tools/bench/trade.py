@@ -536,7 +536,8 @@ def setting_rows(
         case: The size of the measurements.
         backend: CPU or CUDA.
     """
-    clean = with_reference_settings(recipe.model_copy(update={"weather": Weather(), "style": None}))
+    no_effects = {"weather": Weather(), "style": None, "light": None}
+    clean = with_reference_settings(recipe.model_copy(update=no_effects))
     cameras = [standard.camera for standard in standards]
 
     def frame(trial_recipe: Recipe, camera: Camera) -> harness.Action:
