@@ -15,6 +15,7 @@ from adapters.base import open_scene
 from adapters.camera_files.paths import with_camera_path
 from adapters.raw_drive import IncompleteDrive
 from augment.errors import SceneError
+from augment.light.scene_light import find_scene_light
 from augment.photo.trust import judge_scene
 from augment.scene.cameras import Frame
 from augment.scene.ground import describe_ground, ground_of
@@ -24,6 +25,9 @@ from tools.output import fill, write_json
 
 if TYPE_CHECKING:
     from tools.cli import InspectOptions
+
+# Share of the light that is the sun's above which sunlit walls and shadows show at night.
+MAX_SUN_SHARE_AT_NIGHT = 0.5
 
 
 def inspect_scene(options: InspectOptions) -> int:
@@ -82,9 +86,21 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "color_maps": {name: matrix.tolist() for name, matrix in scene.color_maps.items()},
         "image_color_maps": dict(Counter(name for name, _ in scene.image_color_maps)),
         "made_by": dict(scene.made_by),
+        "light": _describe_light(scene),
         "problems": list(scene.problems),
         "trust": judge_scene(scene).as_dict(),
     }
+
+
+def _describe_light(scene: Scene) -> dict[str, Any]:
+    """Describe the light of the recording, and if its colours are fit for dusk and night."""
+    light = find_scene_light(scene)
+    share = f"the sun gives {100 * light.sun_share:.0f} % of it"
+    if light.sun_share > MAX_SUN_SHARE_AT_NIGHT:
+        sentence = f"{share}: not fit for dusk and night, where its lit walls and shadows stay"
+    else:
+        sentence = f"{share}: fit for dusk and night"
+    return {"sun_share": light.sun_share, "sentence": sentence}
 
 
 def _describe_gaussians(gaussians: Gaussians) -> dict[str, Any]:

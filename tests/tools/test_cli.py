@@ -21,6 +21,7 @@ from augment.dataset import WeatherDataset
 from augment.errors import ClimateGSError, OutputError
 from augment.files.ply import write_ply
 from augment.files.scene_file import load_scene_parts, save_scene
+from augment.light.scene_light import find_scene_light
 from augment.output.manifest import read_manifest
 from augment.scene.labels import Boxes
 from augment.scene.scene import Gaussians, Scene
@@ -166,6 +167,14 @@ def test_inspect_says_what_is_there_and_writes_json(scene_uri, tmp_path, capsys)
     assert facts["gaussians"] == 400
     assert facts["frames"]["count"] == 2
     assert "400" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("sun_share", "verdict"), [(0.2, ": fit for"), (0.8, ": not fit for")])
+def test_inspect_judges_the_light_for_nights(sun_share, verdict, monkeypatch, scene_uri, capsys):
+    light = dataclasses.replace(find_scene_light(open_scene(scene_uri)), sun_share=sun_share)
+    monkeypatch.setattr("tools.inspect.find_scene_light", lambda scene: light)
+    assert main(["inspect", scene_uri]) == 0
+    assert f"the sun gives {100 * sun_share:.0f} % of it{verdict} dusk" in capsys.readouterr().out
 
 
 def test_recipes_lists_prints_and_exports(tmp_path, capsys):
