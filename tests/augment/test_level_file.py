@@ -84,7 +84,7 @@ def test_numbers_are_looked_at_when_they_are_drawn_and_before_an_effect_works_on
     with pytest.raises(SceneError, match=r"levels.safetensors: splats 0 to .* cannot be drawn"):
         draw(opened.background, -7.0)
     smog = Smog(visibility_m=100.0)
-    snowfall = Snowfall(rate_mm_h=1.0, shadow_fade=0.0)
+    snowfall = Snowfall(rate_mm_h=1.0, shadow_fade=0.0, gloss_fade=0.0)
     make_plan(Recipe(weather=Weather(smog=smog, snowfall=snowfall)), opened)
     with pytest.raises(SceneError, match="splats 0 to"):
         make_plan(Recipe(weather=Weather(flood=Flood(level_m=0.1))), opened)
