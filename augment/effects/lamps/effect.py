@@ -190,11 +190,11 @@ class LampsEffect(Effect):
         if not is_dark and added is not None and mask.any():
             with timed(GLARE):
                 glare = _glare(out, camera, plan.light.glare, uses_kernels=uses_kernels)
-                if glare is not None:
-                    glare = widen_glare(glare, camera.width, camera.height)
-                    glare[glare.max(axis=-1) < MIN_LAMP_LIGHT_BY_DAY] = 0
-                    added += glare / np.float32(exposure.scale)
-                    out, _ = relight(rgb, added, *numbers, uses_kernels=uses_kernels)
+                rows = None if glare is None else _add_glare(added, glare, exposure.scale)
+                if rows is not None:
+                    out[rows], _ = relight(
+                        rgb[rows], added[rows], *numbers, uses_kernels=uses_kernels
+                    )
         with timed(RELIGHT):
             device = view.rgb.device
             layers = _exposed_layers(view.layers, gain) if is_dark else view.layers
@@ -268,6 +268,39 @@ def _glare(
         return None
     focal_px = (camera.fx + camera.fy) / 2
     return spread_glare(excess, max(camera.width, camera.height), focal_px, strength)
+
+
+def _add_glare(
+    added: Float32[np.ndarray, "H W 3"], glare: Float32[np.ndarray, "h w 3"], scale: float
+) -> slice | None:
+    """Add glare to the light of lamps, in place, where it can be seen by day.
+
+    Args:
+        added: light of lamps, cd/m2.
+        glare: light that the lens scatters, of saturation, at half the resolution.
+        scale: light of the picture at 1 cd/m2.
+
+    Returns:
+        The rows that have glare; None without any.
+    """
+    peaks = np.maximum(np.maximum(glare[..., 0], glare[..., 1]), glare[..., 2])
+    is_seen = peaks >= MIN_LAMP_LIGHT_BY_DAY
+    if not is_seen.any():
+        return None
+    box = []
+    for axis, size in ((1, added.shape[0]), (0, added.shape[1])):
+        lines = np.flatnonzero(is_seen.any(axis))
+        box.append(slice(max(2 * lines[0] - 2, 0), min(2 * lines[-1] + 4, size)))
+    rows, columns = box
+    coarse = (
+        slice(rows.start // 2, -(-rows.stop // 2)),
+        slice(columns.start // 2, -(-columns.stop // 2)),
+    )
+    source = np.where(is_seen[coarse][..., None], glare[coarse], np.float32(0))
+    height = rows.stop - rows.start
+    width = columns.stop - columns.start
+    added[rows, columns] += widen_glare(source, width, height) / np.float32(scale)
+    return rows
 
 
 def _read_light(
