@@ -289,7 +289,7 @@ def _add_glare(
         return None
     box = []
     for axis, size in ((1, added.shape[0]), (0, added.shape[1])):
-        lines = np.flatnonzero(is_seen.any(axis))
+        lines = np.flatnonzero(is_seen.any(axis)).tolist()
         box.append(slice(max(2 * lines[0] - 2, 0), min(2 * lines[-1] + 4, size)))
     rows, columns = box
     coarse = (
