@@ -110,12 +110,12 @@ def _find_sky_gloss(scene: Scene) -> SkyGloss | None:
     g = scene.background
     if g.semantic is None or is_unknown_sky(scene.sky):
         return None
-    is_grey = np.isin(g.semantic.numpy(), [int(semantic) for semantic in GREY_CLASSES])
-    gloss = SkyGloss(mean_sky(scene), grey_of(base_colors(g)[is_grey]))
+    is_grey = np.isin(g.semantic.numpy(), GREY_CLASSES)
+    gloss = SkyGloss(_mean_sky(scene), grey_of(_base_colors(g)[is_grey]))
     return gloss if gloss.is_blue else None
 
 
-def mean_sky(scene: Scene) -> tuple[float, float, float]:
+def _mean_sky(scene: Scene) -> tuple[float, float, float]:
     """Return the mean colour of the bluest part of the upper half of a scene's sky."""
     rows, columns = SKY_GRID
     sines = (torch.arange(rows) + 0.5) / rows  # equal steps of height are equal solid angles
@@ -217,8 +217,8 @@ class GreyedGloss:
         def find() -> tuple[Tensor | None]:
             if g.semantic is None:
                 return (None,)
-            share = mirror_share(base_colors(g), self.gloss)
-            share[np.isin(g.semantic.numpy(), [int(semantic) for semantic in MATTE_CLASSES])] = 0
+            share = mirror_share(_base_colors(g), self.gloss)
+            share[np.isin(g.semantic.numpy(), MATTE_CLASSES)] = 0
             steps = np.rint(share * NUM_STEPS).astype(np.int16)
             return (torch.from_numpy(steps) if steps.any() else None,)
 
@@ -240,7 +240,7 @@ def grey_weights(grey_rgb: Sequence[float]) -> tuple[float, ...]:
     return tuple(w / total for w in LUMINANCE_WEIGHTS)
 
 
-def base_colors(g: Gaussians) -> Float32[np.ndarray, "N 3"]:
+def _base_colors(g: Gaussians) -> Float32[np.ndarray, "N 3"]:
     """Return the colours of splats from all sides, display-encoded and clamped to 0 to 1."""
     rgb = 0.5 + SH_C0 * np.nan_to_num(g.sh[:, 0].float().numpy())
     return np.clip(rgb, 0, 1)

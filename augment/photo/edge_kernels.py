@@ -1,96 +1,14 @@
-"""Numba kernels of pictures on a photo: moved pixels, gains of outlines, covered photos.
+"""Numba kernels of objects' edges on a photo: moved pixels, gains of outlines.
 
-`augment.photo.photo_objects`, `augment.photo.outlines` and `augment.photo.recorded_base` call them.
+`augment.photo.photo_objects` and `augment.photo.outlines` call them.
 Each writes the same bits as the plain form that its test holds.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
-
-
-@kernel
-def cover_photo(pixels, color_map, overlay, overlay_rgb, out):
-    """Write out = overlay_rgb + (1 - overlay) (M (pixels / 255) + m).
-
-    Args:
-        pixels: uint8 [H, W, 3].
-        color_map: (M, m), float32 [3, 4].
-        overlay: float32 [H, W], share of each pixel that shows what lies on the scene.
-        overlay_rgb: float32 [H, W, 3], its colours times its share.
-        out: float32 [H, W, 3].
-    """
-    height, width, _ = pixels.shape
-    max_level = np.float32(255)
-    one_f32 = np.float32(1)
-    m00 = color_map[0, 0]
-    m01 = color_map[0, 1]
-    m02 = color_map[0, 2]
-    m03 = color_map[0, 3]
-    m10 = color_map[1, 0]
-    m11 = color_map[1, 1]
-    m12 = color_map[1, 2]
-    m13 = color_map[1, 3]
-    m20 = color_map[2, 0]
-    m21 = color_map[2, 1]
-    m22 = color_map[2, 2]
-    m23 = color_map[2, 3]
-    for i in prange(height):
-        for j in range(width):
-            r = np.float32(pixels[i, j, 0]) / max_level
-            g = np.float32(pixels[i, j, 1]) / max_level
-            b = np.float32(pixels[i, j, 2]) / max_level
-            w = one_f32 - overlay[i, j]
-            out[i, j, 0] = overlay_rgb[i, j, 0] + w * (m00 * r + m01 * g + m02 * b + m03)
-            out[i, j, 1] = overlay_rgb[i, j, 1] + w * (m10 * r + m11 * g + m12 * b + m13)
-            out[i, j, 2] = overlay_rgb[i, j, 2] + w * (m20 * r + m21 * g + m22 * b + m23)
-
-
-@kernel
-def fade_photo(pixels, color_map, airlight, fog_share, out):
-    """Write out = (1 - fog_share) (M (pixels / 255) + m) + fog_share airlight.
-
-    Args:
-        pixels: uint8 [H, W, 3].
-        color_map: (M, m), float32 [3, 4].
-        airlight: float32 [H, W, 3] or [1, 1, 3].
-        fog_share: float32 [H, W].
-        out: float32 [H, W, 3].
-    """
-    height, width, _ = pixels.shape
-    max_level = np.float32(255)
-    one_f32 = np.float32(1)
-    step = np.int64(len(airlight) > 1)
-    m00 = color_map[0, 0]
-    m01 = color_map[0, 1]
-    m02 = color_map[0, 2]
-    m03 = color_map[0, 3]
-    m10 = color_map[1, 0]
-    m11 = color_map[1, 1]
-    m12 = color_map[1, 2]
-    m13 = color_map[1, 3]
-    m20 = color_map[2, 0]
-    m21 = color_map[2, 1]
-    m22 = color_map[2, 2]
-    m23 = color_map[2, 3]
-    for i in prange(height):
-        row = np.int64(i) * step
-        for j in range(width):
-            column = np.int64(j) * step
-            r = np.float32(pixels[i, j, 0]) / max_level
-            g = np.float32(pixels[i, j, 1]) / max_level
-            b = np.float32(pixels[i, j, 2]) / max_level
-            f = fog_share[i, j]
-            w = one_f32 - f
-            air_0 = f * airlight[row, column, 0]
-            air_1 = f * airlight[row, column, 1]
-            air_2 = f * airlight[row, column, 2]
-            out[i, j, 0] = w * (m00 * r + m01 * g + m02 * b + m03) + air_0
-            out[i, j, 1] = w * (m10 * r + m11 * g + m12 * b + m13) + air_1
-            out[i, j, 2] = w * (m20 * r + m21 * g + m22 * b + m23) + air_2
+from augment.render.cpu.jit import kernel_function, serial_kernel
 
 
 @serial_kernel

@@ -10,7 +10,6 @@ colours.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import cv2
@@ -28,9 +27,9 @@ from augment.light.sky_gloss import (
     mirror_share,
 )
 from augment.photo.greyed_photo_kernels import grey_image
+from augment.photo.photo_objects import copy_size
 from augment.photo.recorded_base import ROWS_PER_THREAD, Photo
 from augment.render.threads import kernel_threads
-from augment.scene.semantics import SemanticClass
 
 # Largest width of the smaller image, pixels.
 SMALL_PX = 480
@@ -40,12 +39,6 @@ FULL_EXCESS = 0.06
 SMOOTHING_PX = 3
 # Share below which a pixel keeps its bits, of 255.
 MIN_LEVEL = 4
-
-
-def small_size(width: int, height: int) -> tuple[int, int]:
-    """Return the width and height of the smaller image."""
-    small_width = min(width, SMALL_PX)
-    return small_width, max(1, round(height * small_width / width))
 
 
 def grey_photo(
@@ -61,28 +54,28 @@ def grey_photo(
     """
     pixels = photo.pixels
     height, width = pixels.shape[:2]
-    small_width, small_height = small_size(width, height)
-    small = cv2.resize(pixels, (small_width, small_height), interpolation=cv2.INTER_AREA)
+    small_size = copy_size(photo.camera, SMALL_PX)
+    small = cv2.resize(pixels, small_size, interpolation=cv2.INTER_AREA)
     small_rgb = small.astype(np.float32) / 255
-    sky_rgb = recorded_color(gloss.sky_rgb, photo.scene_from_recorded)
-    grey_rgb = grey_of(small_rgb[_is_any(classes, GREY_CLASSES)])
+    sky_rgb = _recorded_color(gloss.sky_rgb, photo.scene_from_recorded)
+    grey_rgb = grey_of(small_rgb[np.isin(classes, GREY_CLASSES)])
     recorded_gloss = SkyGloss(sky_rgb, grey_rgb)
     if not recorded_gloss.is_blue:
         return photo
     share = mirror_share(small_rgb, recorded_gloss)
-    share[(classes < 0) | _is_any(classes, MATTE_CLASSES)] = 0
+    share[(classes < 0) | np.isin(classes, MATTE_CLASSES)] = 0
     if photo.matte is not None:
-        sky_share = cv2.resize(
-            photo.matte.sky_share, (small_width, small_height), interpolation=cv2.INTER_NEAREST
-        )
+        sky_share = cv2.resize(photo.matte.sky_share, small_size, interpolation=cv2.INTER_NEAREST)
         share *= 1 - np.clip(sky_share, 0, 1)
     share = cv2.blur(share, (SMOOTHING_PX, SMOOTHING_PX))
     levels = np.rint(255 * share).astype(np.uint8)
     levels = cv2.resize(levels, (width, height), interpolation=cv2.INTER_LINEAR)
+    if photo.matte is not None:  # the sky keeps its colour, also where a pixel mixes it
+        levels[photo.matte.sky_share > 0] = 0
     return replace(photo, pixels=_grey_on_cpu(pixels, levels, grey_rgb, fade))
 
 
-def recorded_color(
+def _recorded_color(
     rgb: tuple[float, float, float], scene_from_recorded: Float[Tensor, "3 4"] | None
 ) -> tuple[float, float, float]:
     """Return a colour of the scene as its photo shows it, clamped to 0 to 1."""
@@ -92,11 +85,6 @@ def recorded_color(
     color = torch.tensor(rgb, dtype=torch.float64) - color_map[:, 3]
     red, green, blue = torch.linalg.solve(color_map[:, :3], color).clamp(0, 1).tolist()
     return red, green, blue
-
-
-def _is_any(classes: np.ndarray, semantics: Iterable[SemanticClass]) -> np.ndarray:
-    """Return True for pixels of some classes."""
-    return np.isin(classes, [int(semantic) for semantic in semantics])
 
 
 def grey_pixels(

@@ -36,19 +36,16 @@ BOTTOM_MARGIN_OF_SNOW_M = 0.5
 # Fewest splats of a vehicle whose outline is moved.
 MIN_SPLATS = 60
 # Classes of splats in a vehicle's box that are not the vehicle.
-OTHER_CLASSES = tuple(
-    SemanticClass[name]
-    for name in (
-        "ROAD",
-        "LANE_MARKING",
-        "SIDEWALK",
-        "TERRAIN",
-        "VEGETATION",
-        "BUILDING",
-        "POLE",
-        "SIGN",
-        "PEDESTRIAN",
-    )
+OTHER_CLASSES = (
+    SemanticClass.ROAD,
+    SemanticClass.LANE_MARKING,
+    SemanticClass.SIDEWALK,
+    SemanticClass.TERRAIN,
+    SemanticClass.VEGETATION,
+    SemanticClass.BUILDING,
+    SemanticClass.POLE,
+    SemanticClass.SIGN,
+    SemanticClass.PEDESTRIAN,
 )
 
 

@@ -43,7 +43,6 @@ from augment.errors import SceneError
 from augment.files.recorded_images import ImageFault, has_image, read_scaled
 from augment.light.cast_shadows import FadedShadows
 from augment.memo import memo_of
-from augment.photo import edge_kernels
 from augment.photo.photo_objects import copy_size
 from augment.photo.photo_surface import CLEAR_ALPHA, MIN_ROAD_FALL, OPAQUE_ALPHA, complete_surfaces
 from augment.photo.sky_matte import SkyMatte, sky_matte
@@ -352,7 +351,8 @@ class Photo:
                 for the share that the photo shows.
         """
         if self._is_only_covered(raster, sky_weight):
-            return self._cover_on_cpu(raster)
+            assert raster.rgb is not None and raster.overlay is not None
+            return self._mix_on_cpu(raster.overlay, raster.rgb, is_premultiplied=True)
         rgb = self._land if self.style is None else self._styled(self.style, raster, parts)
         if self.matte is not None and (sky_weight is not None or self.style is not None):
             rgb = self._mix_parted(rgb, sky_weight)
@@ -370,25 +370,26 @@ class Photo:
         is_plain = self.style is None and self.faded_shadows is None
         return is_plain and choose_kernels(self.backend, raster.rgb, raster.overlay) == CPU
 
-    def _cover_on_cpu(self, raster: RenderOutput) -> Float[Tensor, "H W 3"]:
-        """Return the photo with what lies on the scene, in one pass over the pixels."""
-        assert raster.rgb is not None and raster.overlay is not None
-        return self._in_one_pass(edge_kernels.cover_photo, raster.overlay, raster.rgb)
-
-    def _fade_on_cpu(
-        self, airlight: Float[Tensor, "#H #W 3"], fog_share: Float[Tensor, "H W"]
+    def _mix_on_cpu(
+        self,
+        weight: Float[Tensor, "H W"],
+        other: Float[Tensor, "#H #W 3"],
+        *,
+        is_premultiplied: bool,
     ) -> Float[Tensor, "H W 3"]:
-        """Return the photo in smog, in one pass over the pixels."""
-        return self._in_one_pass(edge_kernels.fade_photo, airlight, fog_share)
+        """Return the photo mixed with another image, in one pass over the pixels.
 
-    def _in_one_pass(self, kernel: Any, *images: Tensor) -> Float[Tensor, "H W 3"]:
-        """Return the image that a CPU kernel makes of the photo, its colour map and images."""
+        Args:
+            weight: share of each pixel that shows the other image.
+            other: the other image.
+            is_premultiplied: True if the other image is given times its weight.
+        """
         color_map = self.scene_from_recorded
         matrix = np.eye(3, 4, dtype=np.float32) if color_map is None else color_map.numpy()
         out = np.empty(self.pixels.shape, np.float32)
+        arrays = (image.detach().contiguous().numpy() for image in (weight, other))
         with kernel_threads(ROWS_PER_THREAD):
-            arrays = (image.detach().contiguous().numpy() for image in images)
-            kernel(self.pixels, matrix, *arrays, out)
+            kernels.mix_photo(self.pixels, matrix, *arrays, is_premultiplied, out)
         return torch.from_numpy(out)
 
     def _styled(
@@ -784,7 +785,7 @@ class Photo:
             rgb = self.clear_picture(raster, parts, sky_weight)
             return mix(rgb, airlight, fog_share), fog_share
         if choose_kernels(self.backend, airlight, fog_share) == CPU:
-            rgb = self._fade_on_cpu(airlight, fog_share)
+            rgb = self._mix_on_cpu(fog_share, airlight, is_premultiplied=False)
         else:
             rgb = mix(self._land, airlight, fog_share)
         mixed_share = fog_share.flatten()[pixels, None]

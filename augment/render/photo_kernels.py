@@ -51,6 +51,52 @@ def map_photo_colors(pixels, color_map, min_color, out):
 
 
 @kernel
+def mix_photo(pixels, color_map, weight, other, is_premultiplied, out):
+    """Write out = s other + (1 - weight) (M (pixels / 255) + m); s is 1 or the weight.
+
+    Args:
+        pixels: uint8 [H, W, 3].
+        color_map: (M, m), float32 [3, 4].
+        weight: float32 [H, W], share of each pixel that shows the other image.
+        other: float32 [H, W, 3] or [1, 1, 3], the other image.
+        is_premultiplied: True if the other image is given times its weight.
+        out: float32 [H, W, 3].
+    """
+    height, width, _ = pixels.shape
+    max_level = np.float32(255)
+    one_f32 = np.float32(1)
+    row_step = np.int64(other.shape[0] > 1)
+    column_step = np.int64(other.shape[1] > 1)
+    m00 = color_map[0, 0]
+    m01 = color_map[0, 1]
+    m02 = color_map[0, 2]
+    m03 = color_map[0, 3]
+    m10 = color_map[1, 0]
+    m11 = color_map[1, 1]
+    m12 = color_map[1, 2]
+    m13 = color_map[1, 3]
+    m20 = color_map[2, 0]
+    m21 = color_map[2, 1]
+    m22 = color_map[2, 2]
+    m23 = color_map[2, 3]
+    for i in prange(height):
+        row = np.int64(i) * row_step
+        for j in range(width):
+            column = np.int64(j) * column_step
+            r = np.float32(pixels[i, j, 0]) / max_level
+            g = np.float32(pixels[i, j, 1]) / max_level
+            b = np.float32(pixels[i, j, 2]) / max_level
+            w = one_f32 - weight[i, j]
+            s = one_f32 if is_premultiplied else weight[i, j]
+            other_0 = s * other[row, column, 0]
+            other_1 = s * other[row, column, 1]
+            other_2 = s * other[row, column, 2]
+            out[i, j, 0] = other_0 + w * (m00 * r + m01 * g + m02 * b + m03)
+            out[i, j, 1] = other_1 + w * (m10 * r + m11 * g + m12 * b + m13)
+            out[i, j, 2] = other_2 + w * (m20 * r + m21 * g + m22 * b + m23)
+
+
+@kernel
 def map_photo_colors_with_sky(pixels, land, sky, share, out):
     """Write out = (1 - share) max(land, 0) + share max(sky, 0), each a map [3, 4] of pixels / 255.
 

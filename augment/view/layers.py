@@ -8,7 +8,7 @@ once a layer.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,8 +56,8 @@ class LayerRenderer:
     """The parts before pruning, if `parts` have been pruned (`augment.detail.prune`); else None."""
     added_colors: AddedColors | None = None
     """Map of the colours that effects add, before the camera's colour map; None to leave them."""
-    parked: ParkedObjects | None = None
-    """Parked vehicles, whose edges snow and water take from the photo; None for none."""
+    parked: Callable[[], ParkedObjects] | None = None
+    """Returns parked vehicles, whose edges snow and water take from the photo; None for none."""
     needs_lamp_inputs: bool = False
     """If True, effects also fill those fields of `RenderedView` that only lamps read."""
 
@@ -213,7 +213,8 @@ class LayerRenderer:
         assert self.photo is not None and raster.alpha is not None
         with timed("photo: outlines"):
             covers_scene = clip is not None or any(part.is_overlay for part in self.parts)
-            parked = take_objects(self.parts, self.parked if covers_scene else None, camera)
+            objects = self.parked() if covers_scene and self.parked is not None else None
+            parked = take_objects(self.parts, objects, camera)
             edges = find_edges(
                 self.parts,
                 raster,

@@ -13,6 +13,7 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -26,10 +27,11 @@ from augment.light.cast_shadows import faded_shadows
 from augment.light.common_exposure import added_colors
 from augment.light.sky_gloss import GreyedGloss, find_sky_gloss
 from augment.output.layout import TRUST
-from augment.photo.greyed_photo import grey_photo, small_size
+from augment.photo.greyed_photo import SMALL_PX, grey_photo
 from augment.photo.own_car import OwnCar, own_car_in_view
 from augment.photo.own_car_snow import cover_own_car
 from augment.photo.parked_objects import ObjectBox, ParkedObjects
+from augment.photo.photo_objects import copy_size
 from augment.photo.recorded_base import mix, open_photo, splat_classes
 from augment.photo.trust import trust_mask
 from augment.render.backends import choose_backend, renders_on_gpu
@@ -42,7 +44,7 @@ from augment.render.threads import num_concurrent_views, split_threads, wait_for
 from augment.rng import rng_for
 from augment.scene.cameras import Camera
 from augment.scene.labels import EGO_VEHICLE
-from augment.scene.scene import PosedGaussians, Scene
+from augment.scene.scene import Gaussians, PosedGaussians, Scene
 from augment.timing import timed
 from augment.view.box_labels import OWN_CAR_DEPTH_M
 from augment.view.images import ViewImages, start_images
@@ -125,7 +127,8 @@ def render_buffers(
     with timed("view plan"):
         view = plan_view(plan, scene, camera, backend=backend)
     own_car = None
-    if plan.is_on_photo and any(map(_is_weather, view.effects)):
+    is_fading = plan.sun_share < 1 or plan.gloss_fade > 0
+    if plan.is_on_photo and (is_fading or any(map(_is_weather, view.effects))):
         with timed("recording car"):
             own_car = own_car_in_view(scene, camera)
     with timed("collect parts"):
@@ -144,30 +147,28 @@ def render_buffers(
             photo = open_photo(scene, camera, color_map, backend=backend, finds_sky=finds_sky)
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     if photo is not None:
-        vehicles = parked_vehicles(scene)
-        boxes = tuple(ObjectBox(v.centre_m, v.rotation, v.size_m) for v in vehicles)
-        layers = replace(layers, parked=ParkedObjects(boxes, bare_parts[0].gaussians))
+        layers = replace(layers, parked=partial(_parked_objects, scene, bare_parts[0].gaussians))
     if plan.uses_common_exposure:
         layers = replace(layers, added_colors=added_colors(scene, camera))
-    is_fading = plan.sun_share < 1 or plan.gloss_fade > 0
     for effect in view.effects:
         if is_fading and _is_weather(effect):  # a style comes first, with maps of its own
-            layers = _cover_sky(layers, scene, camera, plan, own_car)
+            layers = _cover_sky(layers, scene, camera, plan)
             is_fading = False
         layers = effect.hooks.edit_scene(effect, layers, camera)
     if is_fading:
-        layers = _cover_sky(layers, scene, camera, plan, own_car)
+        layers = _cover_sky(layers, scene, camera, plan)
     if plan.prune > 0:
         with timed("prune"):
             parts = prune_parts(layers.parts, scene, camera, plan.prune)
             layers = replace(layers, parts=parts, unpruned_parts=layers.parts)
     car_rgb = None
-    if own_car is not None and layers.photo is not None:
-        car_rgb = layers.photo.own_car_colors(own_car.rows)
+    if own_car is not None and photo is not None and layers.photo is not None:
+        # In the colours of a style, and with the gloss that it was recorded with.
+        car_rgb = replace(layers.photo, pixels=photo.pixels).own_car_colors(own_car.rows)
     rendered = _draw(view, layers, camera)
     if own_car is None or car_rgb is None:
         for effect in view.effects:
-            rendered = _edit_image(effect, rendered, camera, color_map)
+            rendered = _edit_image(view, effect, rendered, camera, color_map)
     else:
         if plan.covers_own_car:
             rng = rng_for(
@@ -176,10 +177,8 @@ def render_buffers(
             car_rgb = cover_own_car(car_rgb, own_car, rendered.raster, rng=rng)
         rendered = _edit_around_own_car(view, rendered, camera, own_car, car_rgb, color_map)
     rgb = rendered.rgb
-    is_exposed = any(effect.hooks.sees_exposure for effect in view.effects)
-    if (
-        color_map is not None and not is_exposed
-    ):  # a camera exposes what the weather has left, so this comes last
+    # A camera exposes what the weather has left, so this comes last if no effect needs it before.
+    if color_map is not None and _first_exposed(view) is None:
         with timed("camera colour map"):
             rgb = apply_color_map(rgb, color_map, backend=backend)
     if plan.sensor.psf_px > 0:
@@ -211,6 +210,18 @@ def render_buffers(
     )
 
 
+def _parked_objects(scene: Scene, background: Gaussians) -> ParkedObjects:
+    """Return the labelled vehicles of the background that stand still.
+
+    Args:
+        scene: the scene.
+        background: the Gaussians of its background, without snow.
+    """
+    vehicles = parked_vehicles(scene)
+    boxes = tuple(ObjectBox(v.centre_m, v.rotation, v.size_m) for v in vehicles)
+    return ParkedObjects(boxes, background)
+
+
 def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> RenderedView:
     """Return the view as rendered by the last effect that draws the scene in layers of its own, or,
     without such an effect, as one layer with its sky.
@@ -222,9 +233,7 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> RenderedView
     return RenderedView(*layers.render_with_sky(camera, view.buffers), layers)
 
 
-def _cover_sky(
-    layers: LayerRenderer, scene: Scene, camera: Camera, plan: Plan, own_car: OwnCar | None
-) -> LayerRenderer:
+def _cover_sky(layers: LayerRenderer, scene: Scene, camera: Camera, plan: Plan) -> LayerRenderer:
     """Return the layers without what the sun and the blue sky of a clear day leave on surfaces.
 
     Args:
@@ -232,18 +241,15 @@ def _cover_sky(
         scene: the scene.
         camera: the view.
         plan: the plan of all views.
-        own_car: the recording car in a photo, which stays as it is; None where there is none.
     """
     if plan.sun_share < 1:
         layers = _fade_shadows(layers, scene, plan.sun_share)
     if plan.gloss_fade > 0:
-        layers = _grey_gloss(layers, scene, camera, plan.gloss_fade, own_car)
+        layers = _grey_gloss(layers, scene, camera, plan.gloss_fade)
     return layers
 
 
-def _grey_gloss(
-    layers: LayerRenderer, scene: Scene, camera: Camera, fade: float, own_car: OwnCar | None
-) -> LayerRenderer:
+def _grey_gloss(layers: LayerRenderer, scene: Scene, camera: Camera, fade: float) -> LayerRenderer:
     """Return the layers with the blue sky in glossy surfaces turned grey.
 
     Args:
@@ -251,7 +257,6 @@ def _grey_gloss(
         scene: the scene.
         camera: the view.
         fade: how much of the blue turns grey, 0 to 1.
-        own_car: the recording car in a photo, which stays as it is; None where there is none.
     """
     with timed(GLOSS_PASS):
         gloss = find_sky_gloss(scene)
@@ -260,7 +265,7 @@ def _grey_gloss(
         greyed = GreyedGloss(gloss, fade)
         photo = layers.photo
         if photo is not None:
-            small_camera = camera.resized(*small_size(camera.width, camera.height))
+            small_camera = camera.resized(*copy_size(camera, SMALL_PX))
             raster = rasterize(
                 layers.parts,
                 small_camera,
@@ -274,12 +279,6 @@ def _grey_gloss(
             classes = splat_classes(layers.parts, splat_ids.device)
             classes = torch.cat([classes, torch.tensor([-1], dtype=torch.int16)])[splat_ids]
             photo = grey_photo(photo, classes.numpy(), gloss, fade)
-            if own_car is not None and layers.photo is not None:
-                is_car = own_car.weights[..., None] > 0
-                recorded_rows = layers.photo.pixels[own_car.rows]
-                pixels = photo.pixels.copy()
-                pixels[own_car.rows] = np.where(is_car, recorded_rows, pixels[own_car.rows])
-                photo = replace(photo, pixels=pixels)
         parts = tuple(part if part.is_overlay else greyed.apply_to(part) for part in layers.parts)
     return replace(layers, parts=parts, photo=photo)
 
@@ -309,18 +308,29 @@ def _is_weather(effect: EffectInScene) -> bool:
     return effect.hooks.section.startswith("weather.")
 
 
+def _first_exposed(view: ViewPlan) -> EffectInScene | None:
+    """Return the first effect in view that needs the picture after the camera's colour map."""
+    return next((effect for effect in view.effects if effect.hooks.sees_exposure), None)
+
+
 def _edit_image(
-    effect: EffectInScene, rendered: RenderedView, camera: Camera, color_map: Tensor | None
+    view: ViewPlan,
+    effect: EffectInScene,
+    rendered: RenderedView,
+    camera: Camera,
+    color_map: Tensor | None,
 ) -> RenderedView:
-    """Return the picture with an effect on it, after the colour map if the effect needs that.
+    """Return the picture with an effect on it, after the colour map if the effect is the first
+    that needs that.
 
     Args:
+        view: the plan of the view.
         effect: the effect.
         rendered: the picture.
         camera: the view.
         color_map: the camera's colour map, [3, 4]; None without one.
     """
-    if color_map is not None and effect.hooks.sees_exposure:
+    if color_map is not None and effect is _first_exposed(view):
         with timed("camera colour map"):
             rgb = rendered.rgb.clone()  # which may be the recorded image
             rendered = replace(
@@ -358,7 +368,7 @@ def _edit_around_own_car(
             rendered = _with_own_car(rendered, first_view, own_car, car_rgb)
             is_car_covered = False
         unedited = rendered
-        rendered = _edit_image(effect, rendered, camera, color_map)
+        rendered = _edit_image(view, effect, rendered, camera, color_map)
         if rendered is unedited:
             continue
         is_car_covered = is_weather

@@ -92,11 +92,11 @@ def test_a_photo_under_snow_or_smog_is_mapped_and_mixed_in_one_pass():
         torch.from_numpy(overlay_rgb), torch.from_numpy(land), 1 - torch.from_numpy(overlay)
     )
     covered = np.empty_like(land)
-    kernels.cover_photo(pixels, color_map, overlay, overlay_rgb, covered)
+    photo_kernels.mix_photo(pixels, color_map, overlay, overlay_rgb, True, covered)
     np.testing.assert_array_equal(covered, expected.numpy())
     for airlight in (overlay_rgb, overlay_rgb[:1, :1].copy()):
         expected = mix(*map(torch.from_numpy, (land, airlight, overlay)))
-        kernels.fade_photo(pixels, color_map, airlight, overlay, covered)
+        photo_kernels.mix_photo(pixels, color_map, overlay, airlight, False, covered)
         np.testing.assert_array_equal(covered, expected.numpy())
 
 

@@ -47,8 +47,8 @@ def _hash_sources() -> str:
         *sorted(folder.glob("*.py")),
         *sorted(render.glob("*_kernels.py")),
         render / "layout.py",
-        render.parent / "lamps" / "pattern_kernels.py",
-        render.parent / "lamps" / "surface_light_kernels.py",
+        *sorted((render.parent / "lamps").glob("*_kernels.py")),
+        *sorted((render.parent / "effects" / "lamps").glob("*_kernels.py")),
     ]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
