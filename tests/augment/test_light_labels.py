@@ -19,12 +19,13 @@ from augment.effects.lamps.light_table import (
 from augment.effects.lamps.luminance import MIN_VEIL, read_light
 from augment.effects.lamps.view_lamps import lamps_at
 from augment.lamps.lamp import LampKind
-from augment.light.srgb import display_from_linear
+from augment.light.srgb import LUMINANCE_WEIGHTS, display_from_linear, linear_from_display
 from augment.scene.boxes import WorldBoxes
 from augment.view.plan import make_plan
 from augment.view.render_view import render_view
 from augment.view.weathered_sweep import weathered_sweep
 from recipes.schema import Recipe
+from recipes.style import Style
 from tests.streets import LABELLED_STREET, open_fast_street
 
 OFF = {"vehicles": "off", "own_beams": "off", "street": "off"}
@@ -209,6 +210,20 @@ def test_manifest_has_the_exposure_that_a_recipe_fixes(street, camera) -> None:
     by_day = measure_exposure(camera, inputs_of(street, camera, light(vehicles="on")))
     assert set(by_day) == set(EXPOSURE_COLUMNS) - {"light_exposure_ms", "light_iso"}
     assert measure_exposure(camera, inputs_of(street, camera, light(**OFF))) == {}
+
+
+def test_labels_by_day_take_the_white_of_a_style(street, camera) -> None:
+    recipe = light(vehicles="on")
+    recipe = recipe.model_copy(update={"style": Style(preset="dusk")})
+    view = render_view(street, camera, recipe)
+    inputs = view.effects["lamps"]
+    white_cd_m2 = measure_exposure(camera, inputs)["light_white_cd_m2"]
+    codes = view.rgb / 255
+    is_mid = ((codes > 0.3) & (codes < 0.9)).all(-1)
+    assert is_mid.sum() > 100
+    expected = linear_from_display(codes[is_mid]) @ np.array(LUMINANCE_WEIGHTS) * white_cd_m2
+    # 8 bits at a code of 0.3 are 0.4 % of the code, 1 % of the light.
+    np.testing.assert_allclose(inputs.luminance_cd_m2[is_mid], expected, rtol=0.02)
 
 
 def test_sweeps_are_the_same_at_night(street) -> None:
