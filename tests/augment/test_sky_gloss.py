@@ -129,7 +129,7 @@ def test_only_glossy_classes_of_a_photo_turn_grey():
     assert pane @ grey_weights((1.0, 1.0, 1.0)) == pytest.approx(
         pixels[20, 10] @ np.array(grey_weights((1.0, 1.0, 1.0))), abs=1
     )
-    # The share is smoothed over SMOOTHING_PX, so that a border of a class is soft for a pixel or two.
+    # The share is smoothed over SMOOTHING_PX, and so greys a class within two pixels of its border.
     np.testing.assert_array_equal(greyed[:, 32:], pixels[:, 32:])
     assert grey_photo(photo, classes, SkyGloss((0.7, 0.7, 0.71), (1.0, 1.0, 1.0)), 1.0) is photo
 
