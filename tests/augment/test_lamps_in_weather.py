@@ -5,13 +5,20 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import torch
 
+from augment.effects.wet.film_kernels import ASPHALT_ROUGHNESS
+from augment.effects.wet.ground_map import NO_PUDDLES
+from augment.effects.wet.mirroring_film import mirroring_film
+from augment.effects.wet.reflection import Film, Plane
 from augment.light.srgb import linear_from_display
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
 from augment.view.plan import make_plan
 from augment.view.render_view import WeatheredBuffers, render_buffers
 from recipes.schema import Recipe
+from tests.augment.test_wet import NO_RINGS, flat_map
+from tests.lamp_scenes import camera_at, road_depth
 from tests.snow_scenes import drive, sheet
 
 # A camera without noise and glare, whose pictures with and without a lamp can be subtracted.
@@ -92,3 +99,21 @@ def test_drops_near_a_lamp_shine_one_by_one(street, name) -> None:
     # The mask holds pixels that a drop or flake covers by more than a twentieth.
     mask = buffers.masks[name].numpy()[:30]
     assert mask.any() and is_bright[mask].mean() > 0.9
+
+
+def test_a_wet_road_is_as_rough_as_its_slopes_have_variance() -> None:
+    """Beckmann's m^2 is twice the variance of the slopes along one axis."""
+    camera = camera_at(1.5, width=160, height=100, focal_px=60.0)
+    depth = torch.from_numpy(road_depth(camera, 25.0))
+    share = (depth > 0).float()
+    film = Film(1.0, NO_PUDDLES, NO_RINGS)
+    plane = Plane((0.0, 0.0, 1.0), 0.0)
+    water = mirroring_film(camera, depth, share, flat_map(), film, plane, 0.0)
+    is_water = water.share > 0
+    m = np.sqrt(2) * ASPHALT_ROUGHNESS
+    assert (water.roughness[is_water] <= m * (1 + 1e-5)).all()
+    # A pixel has many waves from about 5 m on: none is drawn as a tilt.
+    is_far = is_water & (water.depth_m > 10)
+    assert is_far.sum() > 100
+    np.testing.assert_allclose(water.roughness[is_far], m, rtol=1e-5)
+    assert water.tilts is not None and not water.tilts[is_far].any()
