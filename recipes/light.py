@@ -89,8 +89,8 @@ class Light(EffectModel):
     glow: Number = Field(default=2.0, ge=0, le=20)
     """How much brighter the sky is at the horizon than overhead, at dusk and night: 0 evenly."""
     vehicles: Literal["auto", "on", "off"] = "auto"
-    """Lamps of vehicles; auto turns them on at dusk and night, in rain and snowfall, and where less
-    than 5 % of the light arrives over 500 m."""
+    """Lamps of vehicles; auto turns them on at dusk and night, in rain and snowfall, where less
+    than 5 % of the light arrives over 500 m, and by day where less than 1000 lx are stated."""
     vehicle_share: Unit = 1.0
     """Share of the vehicles whose lamps are on; parked ones stay dark but for a few."""
     own_beams: Literal["auto", "dipped", "high", "off"] = "auto"

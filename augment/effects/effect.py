@@ -242,6 +242,9 @@ class LabelInputs:
     luminance_cd_m2: Float32[np.ndarray, "H W"] | None = None
     """Luminance of the picture, as `RenderedView` has it; None where no effect measures it."""
 
+    effect: EffectInScene | None = None
+    """The effect at work in the scene; None if it changes nothing there."""
+
 
 class Effect:
     """One effect. A hook that is not overridden leaves things as they are."""

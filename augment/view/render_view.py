@@ -110,7 +110,8 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
             own_car = own_car_in_view(scene, camera)
     if own_car is not None:
         trust = {name: np.where(own_car.mask, np.uint8(0), mask) for name, mask in trust.items()}
-    return PendingView(lambda: _weathered(images(), camera, plan, recipe, trust, own_car))
+    active = {effect.hooks.name: effect for effect in plan.active_effects(scene, backend=backend)}
+    return PendingView(lambda: _weathered(images(), camera, plan, recipe, active, trust, own_car))
 
 
 def render_buffers(
@@ -482,6 +483,7 @@ def _weathered(
     camera: Camera,
     plan: Plan,
     recipe: Recipe,
+    active: Mapping[str, EffectInScene],
     trust: Mapping[str, np.ndarray],
     own_car: OwnCar | None,
 ) -> WeatheredView:
@@ -501,7 +503,14 @@ def _weathered(
         depth = images.scene_depth_m if is_in_view else None
         depth = _outside(car_mask, depth, OWN_CAR_DEPTH_M)
         luminance = images.luminance_cd_m2
-        views[effect.name] = LabelInputs(effect_plan, depth, mask, plan.water_level_z_m, luminance)
+        views[effect.name] = LabelInputs(
+            plan=effect_plan,
+            depth_m=depth,
+            mask=mask,
+            water_level_z_m=plan.water_level_z_m,
+            luminance_cd_m2=luminance,
+            effect=active.get(effect.name),
+        )
         if effect.mask_name is not None:
             empty_mask = np.zeros((camera.height, camera.width), np.uint8)
             masks[effect.mask_name] = empty_mask if mask is None else mask

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from augment.effects.falling.air import Precipitation
+from augment.effects.falling.air import Precipitation, cell_walk, find_drops
 from augment.effects.falling.drop_covers import LIT_DISTANCES_M, cover_of_drops
 from augment.effects.falling.shutter import STANDING
 from augment.lamps.drop_cover import DropCover
@@ -89,14 +89,9 @@ def test_covers_are_those_of_the_drops_that_are_drawn() -> None:
 def _cover(rain: Precipitation, camera, alpha: np.ndarray, depth: np.ndarray) -> DropCover:
     import torch
 
-    return cover_of_drops(
-        torch.from_numpy(alpha),
-        torch.from_numpy(depth),
-        camera,
-        rain,
-        motion=STANDING,
-        scene_name="street",
-    )
+    drops = find_drops(cell_walk(rain, camera, STANDING, "street"))
+    images = torch.from_numpy(alpha), torch.from_numpy(depth)
+    return cover_of_drops(drops, *images, camera, is_snow=False)
 
 
 def test_no_lamps_and_no_drops_change_nothing() -> None:

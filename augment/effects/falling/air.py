@@ -356,6 +356,7 @@ def draw_falling(
     motion: Motion = STANDING,
     splats: Float[Tensor, "H W 3"] | None = None,
     added_colors: AddedColors | None = None,
+    drops: Float32[np.ndarray, "N 9"] | None = None,
     backend: str = CPU,
 ) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
     """Return the picture behind the precipitation, and the mask of its drawn drops.
@@ -373,11 +374,13 @@ def draw_falling(
         motion: motion of the camera.
         splats: the surfaces' part of rgb; the other part is the sky's.
         added_colors: map of the light of drops and veil; None to leave it.
+        drops: the drops, if `find_drops` has found them; None to find them.
         backend: on the CPU a kernel draws, equal to the definition in
             augment.effects.falling.reference within 1e-4, and `rgb` is overwritten.
     """
     surfaces = [t.detach().float().cpu().numpy() for t in (alpha, depth)]
-    drops = find_drops(cell_walk(precipitation, camera, motion, scene.name))
+    if drops is None:
+        drops = find_drops(cell_walk(precipitation, camera, motion, scene.name))
     extinction = precipitation.sizes.extinction_per_m
     glow = glow_of(scene)
     if added_colors is not None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor
 
-from augment.effects.falling.air import Precipitation, cell_walk, compute_clear_share, find_drops
-from augment.effects.falling.shutter import Motion
+from augment.effects.falling.air import compute_clear_share
 from augment.lamps.drop_cover import DropCover
 from augment.scene.cameras import Camera
 
@@ -21,28 +20,23 @@ _INVERSE_DEPTHS = slice(4, 6)
 
 
 def cover_of_drops(
+    drops: Float32[np.ndarray, "N 9"],
     alpha: Float[Tensor, "H W"],
     depth: Float[Tensor, "H W"],
     camera: Camera,
-    precipitation: Precipitation,
     *,
-    motion: Motion,
-    scene_name: str,
+    is_snow: bool,
 ) -> DropCover:
     """Return the share of each pixel that drops of each range of distances cover.
 
-    They are the drops that `draw_falling` draws.
-
     Args:
+        drops: the drops, as `find_drops` gives them.
         alpha: opacity of the surfaces.
         depth: z of the surfaces, metres; 0 without a surface.
         camera: camera of the picture.
-        precipitation: the rain or snow in the air.
-        motion: motion of the camera.
-        scene_name: name of the scene, which the drops' places depend on.
+        is_snow: True if they are flakes.
     """
     surfaces = [image.detach().float().cpu().numpy() for image in (alpha, depth)]
-    drops = find_drops(cell_walk(precipitation, camera, motion, scene_name))
     inverse_depths = drops[:, _INVERSE_DEPTHS].mean(1)
     ranges = np.searchsorted(EDGES_M, 1 / np.maximum(inverse_depths, 1e-6))
     covers = np.zeros((len(LIT_DISTANCES_M), camera.height, camera.width), np.float32)
@@ -50,4 +44,4 @@ def cover_of_drops(
         drops_of_range = np.ascontiguousarray(drops[ranges == number])
         if len(drops_of_range):
             covers[number] = 1 - compute_clear_share(drops_of_range, *surfaces)
-    return DropCover(covers, LIT_DISTANCES_M, precipitation.kind == "snow")
+    return DropCover(covers, LIT_DISTANCES_M, is_snow)

@@ -22,7 +22,7 @@ from augment.effects.effect import (
     Step,
     skipped_steps,
 )
-from augment.effects.falling.air import Precipitation, draw_falling
+from augment.effects.falling.air import Precipitation, cell_walk, draw_falling, find_drops
 from augment.effects.falling.drop_covers import cover_of_drops
 from augment.effects.falling.drops import Kind
 from augment.effects.falling.labels import falling_table, measure_falling
@@ -187,7 +187,9 @@ def _draw_over(
     alpha = view.raster.alpha
     depth = view.raster.expected_depth
     assert alpha is not None and depth is not None
+    motion = motion_of(effect.scene, camera)
     with timed(step):
+        drops = find_drops(cell_walk(effect.settings, camera, motion, effect.lit_scene.name))
         rgb, drop_mask = draw_falling(
             view.rgb,
             alpha,
@@ -196,9 +198,10 @@ def _draw_over(
             effect.settings,
             scene=effect.lit_scene,
             fog=view.layers.fog,
-            motion=motion_of(effect.scene, camera),
+            motion=motion,
             splats=_surfaces_of(view),
             added_colors=view.layers.added_colors,
+            drops=drops,
             backend=effect.backend,
         )
     masks = {**view.masks, mask: drop_mask}
@@ -206,14 +209,8 @@ def _draw_over(
     if not view.layers.needs_lamp_inputs:
         return view
     with timed(f"{effect.hooks.name}: drops under lamps"):
-        cover = cover_of_drops(
-            alpha,
-            depth,
-            camera,
-            effect.settings,
-            motion=motion_of(effect.scene, camera),
-            scene_name=effect.lit_scene.name,
-        )
+        is_snow = effect.settings.kind == "snow"
+        cover = cover_of_drops(drops, alpha, depth, camera, is_snow=is_snow)
     return replace(view, drop_covers=(*view.drop_covers, cover))
 
 

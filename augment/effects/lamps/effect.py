@@ -75,8 +75,6 @@ from recipes.schema import Recipe
 # Linear light of the picture below which a lamp changes no pixel by day: an eighth of a grey level
 # of a dark pixel.
 MIN_ADDED = 3e-5
-
-
 # Linear light of a single lamp that may be left out: half a grey level of a black pixel.
 MIN_LAMP_LIGHT = 1.5e-4
 # The same in fog at dusk and night, where lit air leaves no pixel black.
@@ -189,7 +187,8 @@ class LampsEffect(Effect):
             out, mask = relight(rgb, added, *numbers, uses_kernels=uses_kernels)
         if not is_dark and added is not None and mask.any():
             with timed(GLARE):
-                glare = _glare(out, camera, plan.light.glare, uses_kernels=uses_kernels)
+                lit = np.where(mask[..., None], out, np.float32(0))  # a bright sky has none
+                glare = _glare(lit, camera, plan.light.glare, uses_kernels=uses_kernels)
                 rows = None if glare is None else _add_glare(added, glare, exposure.scale)
                 if rows is not None:
                     out[rows], _ = relight(
@@ -214,7 +213,7 @@ class LampsEffect(Effect):
             return view
         exposure = exposure_of_picture(plan, effect.scene, effect.lit_scene, camera)
         if not plan.hour.is_dark:
-            return _read_light(effect, view, None, exposure) if plan.needs_luminance else view
+            return _read_light(effect, view, None, exposure)
         rgb = view.rgb
         uses_kernels = effect.backend != REFERENCE
         light = plan.light
@@ -235,8 +234,7 @@ class LampsEffect(Effect):
                 balance=white_balance_of(plan, effect.scene),
                 uses_kernels=uses_kernels,
             )
-        if light.glare > 0 or plan.needs_luminance:
-            view = _read_light(effect, view, glare, exposure)
+        view = _read_light(effect, view, glare, exposure)
         return replace(view, rgb=torch.from_numpy(out).to(rgb.device))
 
     def measure_view(self, camera: Camera, inputs: LabelInputs) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -45,7 +46,7 @@ def add_lamp_light(
     rgb: Float32[np.ndarray, "H W 3"],
     white: float,
     threshold_cd_m2: float,
-    color_map: Tensor | None = None,
+    color_map: Tensor | None,
 ) -> Float32[np.ndarray, "H W 3"] | None:
     """Return the luminance that lamps add to each pixel, cd/m2 in linear sRGB; None without lamps.
 
@@ -161,14 +162,15 @@ def _airlight(view: RenderedView, color_map: Tensor | None) -> tuple[float, floa
 def air_of(effect: EffectInScene, view: RenderedView) -> AirExtinction:
     """Return the extinction of fog, rain and snowfall in a view."""
     per_m = 0.0
-    kind = "rain"
+    kind: Literal["rain", "snow"] = "rain"
     for other in effect.earlier_effects:
         sizes = getattr(other.settings, "sizes", None)
         if other.hooks.name in ("rain", "snowfall") and sizes is not None:
             per_m += sizes.extinction_per_m
-            kind = "snow" if other.hooks.name == "snowfall" else kind
+            if other.hooks.name == "snowfall":
+                kind = "snow"
     fog = next((o.settings.fog for o in effect.earlier_effects if o.hooks.name == "smog"), None)
-    return AirExtinction(fog, per_m, "snow" if kind == "snow" else "rain")
+    return AirExtinction(fog, per_m, kind)
 
 
 def _recorded_light(

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from augment.effects.effect import LabelInputs
+from augment.effects.lamps.exposure import Exposure
 from augment.effects.lamps.plan import LightPlan
 from augment.effects.lamps.scene_exposure import exposure_of_picture
 from augment.effects.lamps.view_lamps import lamps_at, lamps_of_view
@@ -87,7 +88,7 @@ def measure_exposure(camera: Camera, inputs: LabelInputs) -> dict[str, float]:
     plan: LightPlan | None = inputs.plan.data
     if plan is None:
         return {}
-    exposure = exposure_of_picture(plan, plan.scene, plan.scene, camera)
+    exposure = _exposure_of(plan, camera, inputs)
     values = {
         "light_ground_lux": plan.hour.ground_lux,
         "light_white_cd_m2": exposure.white_cd_m2,
@@ -96,6 +97,12 @@ def measure_exposure(camera: Camera, inputs: LabelInputs) -> dict[str, float]:
         "light_lamps": len(lamps_of_view(plan, plan.scene, camera)),
     }
     return {name: float(value) for name, value in values.items() if value is not None}
+
+
+def _exposure_of(plan: LightPlan, camera: Camera, inputs: LabelInputs) -> Exposure:
+    """Return the exposure of the picture, in the light that a style gave the scene."""
+    lit_scene = plan.scene if inputs.effect is None else inputs.effect.lit_scene
+    return exposure_of_picture(plan, plan.scene, lit_scene, camera)
 
 
 def measure_light(boxes: WorldBoxes, camera: Camera, inputs: LabelInputs) -> dict[str, np.ndarray]:
@@ -122,7 +129,7 @@ def measure_light(boxes: WorldBoxes, camera: Camera, inputs: LabelInputs) -> dic
     if inputs.depth_m is None or inputs.mask is None:
         return columns
     columns["pixels"] = np.zeros(count, np.int64)
-    white_cd_m2 = exposure_of_picture(plan, plan.scene, plan.scene, camera).white_cd_m2
+    white_cd_m2 = _exposure_of(plan, camera, inputs).white_cd_m2
     for box, rows, cols in pixels_of_boxes(boxes, camera, inputs.depth_m):
         columns["pixels"][box] = len(rows)
         columns["glare_pixels"][box] = np.count_nonzero(inputs.mask[rows, cols] == 255)

@@ -19,7 +19,7 @@ from augment.render.sensor import LEVEL_SD
 from augment.render.threads import kernel_threads
 
 # Light, of saturation, that lamps must add for a saturated pixel to be theirs.
-MIN_LAMP_LIGHT = 0.1
+MIN_SATURATING_LIGHT = 0.1
 # Least reflectance of a surface. Darker colours are shadows of the day; with more than this they
 # turn to smoke in the beams, since they lose their texture.
 MIN_REFLECTANCE = 0.004
@@ -57,7 +57,7 @@ def relight(
         light = gain * linear_from_display(np.maximum(rgb, 0).astype(np.float64)) + added
         is_changed = added.max(-1) > min_added
         out = np.where(is_changed[..., None], display_from_linear(light), rgb).astype(np.float32)
-        is_saturated = (light.max(-1) >= 1) & (added.max(-1) >= MIN_LAMP_LIGHT)
+        is_saturated = (light.max(-1) >= 1) & (added.max(-1) >= MIN_SATURATING_LIGHT)
         return out, is_saturated & is_changed
     out = np.empty_like(rgb)
     mask = np.empty(rgb.shape[:2], np.bool_)
@@ -65,7 +65,7 @@ def relight(
         light_kernels.relight(
             _rows(rgb),
             _NONE if added_cd_m2 is None else _rows(added_cd_m2),
-            np.array([gain, added_gain, MIN_LAMP_LIGHT], np.float32),
+            np.array([gain, added_gain, MIN_SATURATING_LIGHT], np.float32),
             np.float32(min_added),
             _rows(out),
             mask,
@@ -146,11 +146,6 @@ def develop(
     return display_from_linear(linear).astype(np.float32)
 
 
-def _rows(image: np.ndarray) -> np.ndarray:
-    """Return an image [H, W, 3] as rows of numbers [H, 3 W]."""
-    return np.ascontiguousarray(image).reshape(image.shape[0], 3 * image.shape[1])
-
-
 def find_reflectance(
     rgb: Float32[np.ndarray, "H W 3"],
     white: float,
@@ -186,3 +181,8 @@ def find_reflectance(
     light = (light - share * airlight) / white
     bounds = MIN_REFLECTANCE * (1 - share), MAX_REFLECTANCE * (1 - share)
     return np.clip(light, *bounds).astype(np.float32)
+
+
+def _rows(image: np.ndarray) -> np.ndarray:
+    """Return an image [H, W, 3] as rows of numbers [H, 3 W]."""
+    return np.ascontiguousarray(image).reshape(image.shape[0], 3 * image.shape[1])

@@ -59,12 +59,6 @@ class LightPlan:
     has_street_lamps: bool
     """True if street lamps are on."""
 
-    has_air: bool
-    """True if fog, rain or snowfall scatters the lamps' light."""
-
-    is_wet: bool
-    """True if wet ground or a flood mirrors lamps."""
-
     has_signs: bool
     """True if traffic signs throw the own beams' light back."""
 
@@ -96,6 +90,16 @@ class LightPlan:
     """Lamps that light one part of a surface at most."""
 
     @property
+    def has_air(self) -> bool:
+        """Return True if fog, rain or snowfall scatters the lamps' light."""
+        return self.extinction_per_m > 0 or self.has_drops
+
+    @property
+    def is_wet(self) -> bool:
+        """Return True if wet ground or a flood mirrors lamps."""
+        return self.wetness > 0
+
+    @property
     def has_lamps(self) -> bool:
         """Return True if any lamp can be on."""
         is_own_on = self.own_beam != "off" and self.hour.is_dark
@@ -122,11 +126,7 @@ def make_light_plan(recipe: Recipe, scene: Scene, light: Light, hour: Hour) -> L
     own_beam: str = light.own_beams
     if own_beam == "auto":
         own_beam = "dipped" if is_auto_on else "off"
-    extinctions = [
-        section_at(recipe, "weather.smog.resolved_extinction_per_m") or 0.0,
-        section_at(recipe, "weather.rain.rate_mm_h") or 0.0,
-        section_at(recipe, "weather.snowfall.rate_mm_h") or 0.0,
-    ]
+    rates = [section_at(recipe, f"weather.{name}.rate_mm_h") for name in ("rain", "snowfall")]
     wetness = section_at(recipe, "weather.rain.ground_wetness") or 0.0
     snow = recipe.weather.snow
     speed = recipe.render.speed
@@ -138,11 +138,9 @@ def make_light_plan(recipe: Recipe, scene: Scene, light: Light, hour: Hour) -> L
         has_vehicle_lamps=light.vehicles == "on" or (light.vehicles == "auto" and is_auto_on),
         own_beam=own_beam,
         has_street_lamps=light.street == "on" or (light.street == "auto" and hour.is_dark),
-        has_air=any(extinction > 0 for extinction in extinctions),
-        is_wet=wetness > 0 or recipe.weather.flood is not None,
         has_signs=own_beam != "off" and hour.is_dark and has_signs(scene),
-        has_drops=any(rate > 0 for rate in extinctions[1:]),
-        extinction_per_m=extinctions[0],
+        has_drops=any(rates),
+        extinction_per_m=section_at(recipe, "weather.smog.resolved_extinction_per_m") or 0.0,
         wetness=1.0 if recipe.weather.flood is not None else wetness,
         snow_cover=snow.coverage if snow is not None and snow.has_effect else 0.0,
         uses_color_map=bool(scene.color_mapped_cameras) and recipe.render.exposure != "neutral",

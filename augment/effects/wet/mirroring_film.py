@@ -71,10 +71,12 @@ def mirroring_film(
     puddle = film.wetness * t * t * (3 - 2 * t)
     stirred_share = min(rate_mm_h / _STIRRING_RATE_MM_H, 1.0)
     track = channels[..., WHEEL_TRACK]
-    asphalt = ASPHALT_ROUGHNESS + stirred_share * (STIRRED_ROUGHNESS - ASPHALT_ROUGHNESS)
+    # Beckmann's m is sqrt 2 times the standard deviation of slopes along an axis.
+    smooth = math.sqrt(2) * ASPHALT_ROUGHNESS
+    asphalt = smooth + stirred_share * (max(STIRRED_ROUGHNESS, smooth) - smooth)
     asphalt = asphalt * (1 - TRACK_SMOOTHING * track)
-    variance = PUDDLE_ROUGHNESS**2 + 0.5 * film.rings.variance
-    puddle_roughness = max(MIN_ROUGHNESS, math.sqrt(variance))
+    square = 2 * PUDDLE_ROUGHNESS**2 + film.rings.variance
+    puddle_roughness = max(MIN_ROUGHNESS, math.sqrt(square))
     roughness = asphalt + puddle * (puddle_roughness - asphalt)
     film_share = np.clip(FILM_SHARE + 0.1 * track, 0, 1)
     covered = film.wetness * (film_share + (1 - film_share) * puddle)
