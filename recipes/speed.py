@@ -32,7 +32,7 @@ MOVED_FIELDS = {
     "quality.settled": "render.speed.settled",
 }
 # Paths of all fields, by their places in hashes: the sections whose pictures they change.
-_HASHED_PLACES = {
+HASHED_PLACES = {
     **MOVED_FIELDS,
     "light.lamp_points": "render.speed.lamp_points",
     "light.lamp_halo_px": "render.speed.lamp_halo_px",
@@ -204,7 +204,7 @@ def put_in_former_places(recipe: dict[str, Any]) -> None:
     has no place there. Later fields at their defaults are left out, as everywhere in hashes.
     """
     speed = recipe["render"].pop("speed")
-    for former, path in _HASHED_PLACES.items():
+    for former, path in HASHED_PLACES.items():
         name = path.rpartition(".")[2]
         section_path, _, former_name = former.rpartition(".")
         section: Any = recipe

@@ -113,14 +113,16 @@ def test_lens_scatters_its_share_of_a_lamps_light() -> None:
     assert (glare >= 0).all() and (narrow >= 0).all()
 
 
-def test_core_and_tails_of_the_point_spread_function_have_all_light() -> None:
-    big = np.zeros((2048, 2048, 3), np.float32)
-    big[1024, 1024] = 1e6 + 1
+def test_tails_of_the_point_spread_function_have_their_share_of_the_light() -> None:
+    big = np.zeros((1024, 1024, 3), np.float32)  # no tail reaches beyond it
+    big[512, 512] = 1e6 + 1
     glare = glare_of(big, 4000.0)
-    tails = glare.astype(np.float64).sum((0, 1))[0] / 1e6
-    core = 1 - sum(tail_levels(4000.0, 2048))
-    assert core + tails == pytest.approx(1.0, abs=0.01)
-    assert sum(tail_levels(4000.0, 2048)) <= NARROW_SHARE + WIDE_SHARE
+    tails = glare.astype(np.float64).sum((0, 1)) / 1e6
+    share = sum(tail_levels(4000.0, 1024))
+    # measured: 1e-6, of float32 in the display code and the blurs
+    assert tails == pytest.approx(np.full(3, share), rel=1e-5)
+    # the core keeps what both tails have within their first octave
+    assert 0.5 * (NARROW_SHARE + WIDE_SHARE) < share < NARROW_SHARE + WIDE_SHARE
 
 
 def test_glare_falls_off_and_knows_no_direction() -> None:

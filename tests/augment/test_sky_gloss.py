@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -20,6 +21,7 @@ from augment.light.sky_gloss import (
 from augment.photo.greyed_photo import FULL_EXCESS, MIN_LEVEL, grey_photo, grey_pixels
 from augment.photo.greyed_photo_kernels import grey_image
 from augment.photo.recorded_base import Photo
+from augment.photo.sky_matte import SkyMatte
 from augment.render.sh import SH_C0
 from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, PosedGaussians, Scene
@@ -28,7 +30,7 @@ from augment.scene.sky import ConstantSky
 from augment.view.plan import make_plan
 from augment.view.render_view import render_buffers
 from recipes.rain import Rain
-from recipes.schema import Recipe, Smog, Weather
+from recipes.schema import Recipe, Render, Smog, Weather
 from recipes.snow import Snow, SnowLight
 from recipes.snowfall import Snowfall
 from tests.snow_scenes import drive, sheet, wall
@@ -127,8 +129,50 @@ def test_only_glossy_classes_of_a_photo_turn_grey():
     assert pane @ grey_weights((1.0, 1.0, 1.0)) == pytest.approx(
         pixels[20, 10] @ np.array(grey_weights((1.0, 1.0, 1.0))), abs=1
     )
+    # The share is smoothed over SMOOTHING_PX, and so greys a class within two pixels of its border.
     np.testing.assert_array_equal(greyed[:, 32:], pixels[:, 32:])
     assert grey_photo(photo, classes, SkyGloss((0.7, 0.7, 0.71), (1.0, 1.0, 1.0)), 1.0) is photo
+
+
+def test_pixels_that_show_some_sky_keep_their_bits_beside_a_mirroring_building():
+    height, width = 60, 90
+    pixels = np.tile(np.rint(255 * mixed(0.6)).astype(np.uint8), (height, width, 1))
+    sky_share = np.zeros((height, width), np.float32)
+    sky_share[:, 60:] = 1.0
+    sky_share[:, 58:60] = 0.4  # a soft edge
+    pose = torch.eye(4, dtype=torch.float64)
+    camera = Camera("front", width, height, 80.0, 80.0, 45.0, 30.0, pose, 0)
+    matte = SkyMatte(sky_share, pixels, np.zeros_like(pixels))
+    classes = np.full((height, width), BUILDING, np.int16)
+    greyed = grey_photo(Photo(camera, pixels, "cpu", matte=matte), classes, GLOSS, 1.0).pixels
+    np.testing.assert_array_equal(greyed[:, 58:], pixels[:, 58:])
+    assert (greyed[:, :57, 2].astype(int) - greyed[:, :57, 0] <= 2).all()
+
+
+def test_rain_greys_a_pane_of_a_photo_and_not_the_recording_car(tmp_path):
+    scene = street(GREY)
+    camera = scene.frames[0].cameras["ahead"]
+    photo = np.random.default_rng(0).integers(70, 85, (90, 160, 1), np.uint8).repeat(3, 2)
+    photo[:21] = (235, 228, 220)
+    pane = (slice(26, 37), slice(70, 110))
+    photo[pane] = np.rint(255 * mixed(0.6))
+    car = (slice(38, None), slice(0, 50))  # before the house, and as blue as the pane
+    photo[car] = np.rint(255 * mixed(0.6))
+    path = tmp_path / "0.png"
+    assert cv2.imwrite(str(path), photo[..., ::-1])
+    frame = dataclasses.replace(scene.frames[0], image_paths={"ahead": str(path)})
+    mask = np.zeros((90, 160), bool)
+    mask[car] = True
+    scene = dataclasses.replace(scene, frames=(frame,), ego_masks={"ahead": mask})
+    images = []
+    for fade in (0.0, None):
+        rain = {"rate_mm_h": 5.0, "wetness": 0.0, "gloss_fade": fade}
+        weather = Weather.model_validate({"rain": rain})
+        plan = make_plan(Recipe(weather=weather, render=Render(base="recorded")), scene)
+        images.append(render_buffers(scene, camera, plan, backend="cpu").rgb.numpy())
+        np.testing.assert_array_equal(np.rint(255 * images[-1])[mask], photo[mask])
+    excess = [(image[..., 2] - image[..., 0])[pane].mean() for image in images]
+    assert excess[1] < 0.35 * excess[0]  # the rain's veil has the sky's blue as well
 
 
 def test_splats_that_mirror_the_sky_turn_grey_under_rain():
