@@ -197,6 +197,10 @@ class RenderedView:
     skip_reasons: Mapping[str, str] = field(default_factory=dict)
     """Reason for each pass that proved needless while drawing, by the pass's name."""
 
+    mirrored_rgb: Float[Tensor, "H W 3"] | None = None
+    """Change of `rgb` by what wet ground mirrors of the day, where lamps ask for it: they light the
+    ground and not its mirror image."""
+
     wet_surface: WetSurface | None = None
     """Water that mirrors lamps; None without any, or unless `layers.needs_lamp_inputs`."""
 

@@ -85,6 +85,17 @@ def test_wet_ground_and_water_mirror_a_lamp_below_it(street, weather) -> None:
     assert wet[streak].mean() > 20 * dry[streak].mean()
 
 
+def test_a_wet_road_beside_the_streak_is_no_brighter_than_a_dry_one(street) -> None:
+    """Water darkens the road, and the day's sky in it is no colour of the road."""
+    camera = street.frames[0].cameras["ahead"]
+    dry, _ = lamp_gain(street, {})
+    wet, _ = lamp_gain(street, {"rain": {"rate_mm_h": 0.1, "wetness": 1.0, "spray": False}})
+    column = round(camera.cx)
+    beside = (slice(-12, None), slice(column + 30, column + 50))
+    assert dry[beside].mean() > 0
+    assert wet[beside].mean() < 1.02 * dry[beside].mean()
+
+
 @pytest.mark.parametrize("name", ["rain", "snowfall"])
 def test_drops_near_a_lamp_shine_one_by_one(street, name) -> None:
     near = {**LAMP, "x_m": 6.0, "candela": 5000.0}

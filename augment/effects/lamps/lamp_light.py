@@ -81,7 +81,7 @@ def add_lamp_light(
             effect,
             view,
             camera,
-            rgb,
+            _without_mirror(rgb, view, color_map),
             white,
             depth_m,
             air,
@@ -145,6 +145,18 @@ def _without_water(view: RenderedView, pixels: Bool[np.ndarray, "H W"]) -> Rende
         return view
     share = np.where(pixels, np.float32(0), water.share)
     return replace(view, wet_surface=replace(water, share=share))
+
+
+def _without_mirror(
+    rgb: Float32[np.ndarray, "H W 3"], view: RenderedView, color_map: Tensor | None
+) -> Float32[np.ndarray, "H W 3"]:
+    """Return the picture without what wet ground mirrors of the day."""
+    mirrored = view.mirrored_rgb
+    if mirrored is None:
+        return rgb
+    if color_map is not None:
+        mirrored = mirrored @ color_map[:, :3].to(mirrored).T
+    return np.maximum(rgb - mirrored.detach().cpu().numpy(), np.float32(0))
 
 
 def _airlight(view: RenderedView, color_map: Tensor | None) -> tuple[float, float, float]:

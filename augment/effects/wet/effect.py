@@ -207,6 +207,7 @@ class WetEffect(Effect):
             film = Film(
                 data.wetness, effect.prepared_data.find_puddle_threshold(data.puddle_share), rings
             )
+            unmirrored_rgb = rgb.clone() if view.layers.needs_lamp_inputs else None
             rgb = shade_wet(
                 rgb,
                 camera,
@@ -218,13 +219,14 @@ class WetEffect(Effect):
                 backend=effect.backend,
             )
             view = replace(view, rgb=rgb)
-        if not view.layers.needs_lamp_inputs:
+        if unmirrored_rgb is None:
             return view
         with timed("wet ground: water under lamps"):
             water = mirroring_film(
                 camera, depth, share, effect.prepared_data, film, plane, data.rate_mm_h
             )
-        return replace(view, wet_surface=water.before(view.wet_surface))
+        mirrored_rgb = rgb - unmirrored_rgb
+        return replace(view, wet_surface=water.before(view.wet_surface), mirrored_rgb=mirrored_rgb)
 
     def attenuate_beams(
         self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
