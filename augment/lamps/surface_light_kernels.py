@@ -289,6 +289,31 @@ def lux_along_ray(tables, lamp, x, y, z):
 
 
 @kernel_function()
+def insert_ranked(chosen, scores, number, m, score):
+    """Insert a lamp into those of a tile, highest score first; a full list loses its last.
+
+    Args:
+        chosen: indices of the lamps, int64 [max_lamps], changed in place.
+        scores: their scores, float64 [max_lamps], changed in place.
+        number: number of lamps in the list.
+        m: index of the lamp.
+        score: its score; higher than the last one's if the list is full.
+
+    Returns:
+        The number of lamps that the list then has.
+    """
+    number = min(number + 1, len(chosen))
+    place = number - 1
+    while place > 0 and scores[place - 1] < score:
+        scores[place] = scores[place - 1]
+        chosen[place] = chosen[place - 1]
+        place -= 1
+    scores[place] = score
+    chosen[place] = m
+    return number
+
+
+@kernel_function()
 def rank_lamps(lamps, points, facings, count, min_lux, max_lamps, chosen, scores):
     """Choose the brightest lamps of a tile, brightest first.
 
@@ -345,14 +370,7 @@ def rank_lamps(lamps, points, facings, count, min_lux, max_lamps, chosen, scores
                 dropped = max(dropped, score)
                 continue
             dropped = max(dropped, scores[number - 1])
-        number = min(number + 1, max_lamps)
-        place = number - 1
-        while place > 0 and scores[place - 1] < score:
-            scores[place] = scores[place - 1]
-            chosen[place] = chosen[place - 1]
-            place -= 1
-        scores[place] = score
-        chosen[place] = m
+        number = insert_ranked(chosen, scores, number, m, score)
     return number, dropped
 
 
