@@ -40,7 +40,14 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from augment.lamps import air_light_kernels
-from augment.lamps.air_light_kernels import COARSE_END, SOFT_STEPS, HaloLamps, ImageGrid
+from augment.lamps.air_light_kernels import (
+    COARSE_END,
+    CORE_END,
+    MAX_FACTOR_ANGLE_RAD,
+    SOFT_STEPS,
+    HaloLamps,
+    ImageGrid,
+)
 from augment.lamps.fog_phase import (
     AirExtinction,
     Lobes,
@@ -63,7 +70,7 @@ PASSING_SPREADS = 2.5
 # Largest optical distance in the factor; beyond it the factor was not compared with anything.
 MAX_FACTOR_DEPTH = 4.0
 # Largest angle in the factor, degrees; beyond it the factor gives too much light.
-MAX_FACTOR_ANGLE_DEG = 45.0
+MAX_FACTOR_ANGLE_DEG = math.degrees(MAX_FACTOR_ANGLE_RAD)
 # Nearest distance of a lamp from the camera, metres; nearer ones would be inside the lens.
 MIN_DISTANCE_M = 0.05
 # Nearest distance of a surface, metres.
@@ -194,7 +201,7 @@ def air_light(
     Raises:
         ValueError: an argument is out of its range or has a wrong shape.
     """
-    _check_arguments(lamps, camera, ray_distance_m, num_points, step_px, threshold_cd_m2)
+    _check_arguments(camera, ray_distance_m, num_points, step_px, threshold_cd_m2)
     light = np.zeros((*ray_distance_m.shape, 3), np.float32) if picture is None else picture
     if air.is_clear or len(lamps) == 0:
         return light
@@ -210,7 +217,8 @@ def air_light(
     num_columns = -(-camera.width // step_px) + 1
     ranges = np.empty((num_rows, num_columns, 2), np.float32)
     nodes = np.zeros((num_rows, num_columns, 6), np.float32)
-    windows = _lamp_windows(halos.lamps, camera, step_px, 4 * SOFT_STEPS * step_px)
+    core_px = math.sqrt(CORE_END) * SOFT_STEPS * step_px
+    windows = _lamp_windows(halos.lamps, camera, step_px, core_px)
     tables = (halos.scatter, halos.planes, _interval_shares())
     with kernel_threads():
         air_light_kernels.find_node_ranges(inverse, step_px, ranges)
@@ -227,27 +235,25 @@ def air_light(
             coarse_windows = _lamp_windows(lamps_of_group, camera, step_px, radius_px)
             if num_steps == 1:
                 coarse_windows[:] = 0  # the coarse nodes are the nodes
-            grid = _image_grid(camera, lens, step_px, num_steps)
+            grid = _image_grid(lens, step_px, num_steps)
             air_light_kernels.light_slices(
                 grid, lamps_of_group, *tables, SLICES_PER_M, ranges, volume
             )
             air_light_kernels.light_nodes(
                 grid, lamps_of_group, *tables, SLICES_PER_M, volume, coarse_windows, ranges, nodes
             )
-        grid = _image_grid(camera, lens, step_px, 1)
+        grid = _image_grid(lens, step_px, 1)
         air_light_kernels.spread_nodes(grid, inverse, ranges, nodes, light)
         air_light_kernels.add_cores(grid, halos.lamps, *tables, windows, ranges, inverse, light)
     return light
 
 
-def _image_grid(camera: Camera, lens: np.ndarray, step_px: int, num_steps: int) -> ImageGrid:
-    """Return the image and its grid as kernels take them."""
-    size = np.array([camera.height, camera.width, step_px, num_steps], np.int64)
-    return ImageGrid(lens, size)
+def _image_grid(lens: np.ndarray, step_px: int, num_steps: int) -> ImageGrid:
+    """Return the lens and the grid of nodes as kernels take them."""
+    return ImageGrid(lens, np.array([step_px, num_steps], np.int64))
 
 
 def _check_arguments(
-    lamps: Lamps,
     camera: Camera,
     ray_distance_m: np.ndarray,
     num_points: int,
@@ -278,7 +284,7 @@ class _Halos:
     lamps: HaloLamps
     """Numbers of the lamps."""
     scatter: Float32[np.ndarray, "P U T"]
-    """Tables of G: of lamps of the recording car, and of others."""
+    """Tables of G: of other lamps, and of lamps of the recording car."""
     planes: Float32[np.ndarray, "N"]
     """Integrals of the lamps' intensities over the angle at the lamp."""
 

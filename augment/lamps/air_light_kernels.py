@@ -29,6 +29,8 @@ TINY = np.float32(1e-9)
 SOFT_STEPS = 1.5
 # Square of the radius about a lamp in which nodes add what coarse nodes lack, in softened radii.
 COARSE_END = 9.0
+# Square of the radius about a lamp in which pixels add what nodes lack, in softened radii.
+CORE_END = 16.0
 # Largest relative difference of the two inverse distances of a node that are computed as one.
 SAME_DISTANCE = 0.15
 # Pixels whose mean of 1 / r about a lamp is that at the lamp's own pixel: 1 / SOFT_PX.
@@ -62,10 +64,10 @@ class HaloLamps(NamedTuple):
 
 
 class ImageGrid(NamedTuple):
-    """An image, and the grid of nodes over it."""
+    """The lens of an image, and the grid of nodes over it."""
 
-    lens: np.ndarray  # float64 [5]: fx, fy, cx, cy, focal length along the diagonal, pixels
-    size: np.ndarray  # int64 [4]: height, width, pixels between nodes, nodes between coarse ones
+    lens: np.ndarray  # float64 [5]: fx, fy, cx, cy and the geometric mean of fx and fy, pixels
+    steps: np.ndarray  # int64 [2]: pixels between nodes, nodes between coarse ones
 
 
 @kernel_function()
@@ -95,6 +97,40 @@ def _scattered(table, row, row_share, theta):
 
 
 @kernel_function()
+def _planes_beside(layout, plane):
+    """Return the first numbers of the two planes beside a place, and the second one's share.
+
+    Args:
+        layout: the lamp's row of HaloLamps.tables.
+        plane: plane through lamp and ray, in rows of the lamp's planes.
+    """
+    upper = int(plane)
+    lower = upper + 1 if upper + 1 < layout[1] else 0
+    length = layout[2] + 1
+    return layout[0] + upper * length, layout[0] + lower * length, plane - upper
+
+
+@kernel_function()
+def _flux(planes, first, second, second_share, num_cells, angle):
+    """Return the integral of a lamp's intensity from 0 to an angle, candela times rad.
+
+    Args:
+        planes: float32, integrals of the intensity over the angle at the lamp, one plane a row.
+        first: first number of a plane.
+        second: first number of the next plane.
+        second_share: share of the second plane.
+        num_cells: cells of a plane.
+        angle: angle at the lamp, radians.
+    """
+    cell = angle * (num_cells / math.pi)
+    k = min(int(cell), num_cells - 1)
+    q = cell - k
+    flux_a = planes[first + k] * (1 - q) + planes[first + k + 1] * q
+    flux_b = planes[second + k] * (1 - q) + planes[second + k + 1] * q
+    return flux_a * (1 - second_share) + flux_b * second_share
+
+
+@kernel_function()
 def _light_sums(scatter, planes, layout, plane, shares, row, row_share, gamma, reach):
     """Return the integral of intensity times what is scattered, and that of 1 cd.
 
@@ -113,28 +149,17 @@ def _light_sums(scatter, planes, layout, plane, shares, row, row_share, gamma, r
         gamma: angle at the camera between ray and lamp, radians.
         reach: angle at the lamp between the camera and the end of the ray, radians.
     """
-    num_rows = layout[1]
     num_cells = layout[2]
     num_intervals = layout[4]
     table = scatter[layout[3]]
-    upper = int(plane)
-    plane_share = plane - upper
-    lower = upper + 1 if upper + 1 < num_rows else 0
-    first = layout[0] + upper * (num_cells + 1)
-    second = layout[0] + lower * (num_cells + 1)
-    cell_scale = num_cells / math.pi
+    first_plane, second_plane, second_share = _planes_beside(layout, plane)
     first_scatter = _scattered(table, row, row_share, gamma)
     last_scatter = first_scatter
     last_flux = 0.0
     total = 0.0
     for index in range(num_intervals):
         angle = reach * shares[num_intervals, index, 0]
-        cell = angle * cell_scale
-        k = min(int(cell), num_cells - 1)
-        q = cell - k
-        flux_a = planes[first + k] * (1 - q) + planes[first + k + 1] * q
-        flux_b = planes[second + k] * (1 - q) + planes[second + k + 1] * q
-        flux = flux_a * (1 - plane_share) + flux_b * plane_share
+        flux = _flux(planes, first_plane, second_plane, second_share, num_cells, angle)
         scattered = _scattered(table, row, row_share, gamma + angle)
         inverse_share = shares[num_intervals, index, 1]
         total += (flux - last_flux) * (scattered - last_scatter) * inverse_share
@@ -200,8 +225,10 @@ def _ray_at_lamp(lamps, index, x, y, z):
 
 @kernel_function()
 def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
-    """Return the luminance of a lamp's light along a ray times h, to two distances, h, and 1 if the
-    lamp lies before the camera, else 0.
+    """Return the luminance of a lamp's light along a ray times h, to two distances.
+
+    Returns:
+        The two, and 1 if the lamp lies before the camera, else 0.
 
     Args:
         lamps: the lamps.
@@ -212,10 +239,10 @@ def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
         far: inverse of the further distance; where it is nearly the same, both get its light.
     """
     (
-        is_lit, h, cosine, sine, gamma, row, row_share, plane, scale, beam_gain, added_mean,
+        is_lit, _, cosine, sine, gamma, row, row_share, plane, scale, beam_gain, added_mean,
     ) = _ray_at_lamp(lamps, index, x, y, z)  # fmt: skip
     if not is_lit:
-        return 0.0, 0.0, 1.0, 0.0
+        return 0.0, 0.0, 0.0
     layout = lamps.tables[index]
     distance = lamps.distances_m[index]
     # The angle at the lamp to a point at distance d: atan2(d sin, D - d cos), times 1 / d.
@@ -233,7 +260,7 @@ def _ray_light(lamps, index, scatter, planes, shares, x, y, z, near, far):
             scatter, planes, layout, plane, shares, row, row_share, gamma, reach
         )
         near_light = scale * max(light * beam_gain, light + mean_light * added_mean)
-    return near_light, far_light, h, 1.0 if cosine > 0 else 0.0
+    return near_light, far_light, 1.0 if cosine > 0 else 0.0
 
 
 @kernel_function()
@@ -264,12 +291,7 @@ def _add_slices(
     distance = lamps.distances_m[index]
     num_cells = layout[2]
     table = scatter[layout[3]]
-    upper = int(plane)
-    plane_share = plane - upper
-    lower = upper + 1 if upper + 1 < layout[1] else 0
-    upper_cells = layout[0] + upper * (num_cells + 1)
-    lower_cells = layout[0] + lower * (num_cells + 1)
-    cell_scale = num_cells / math.pi
+    first_plane, second_plane, second_share = _planes_beside(layout, plane)
     soft = softness * distance if cosine > 0 else 0.0
     scale /= math.sqrt(h * h + soft * soft)
     first_scatter = _scattered(table, row, row_share, gamma)
@@ -290,12 +312,7 @@ def _add_slices(
                 angle = reach
             else:
                 interval += 1
-            cell = angle * cell_scale
-            c = min(int(cell), num_cells - 1)
-            q = cell - c
-            flux_a = planes[upper_cells + c] * (1 - q) + planes[upper_cells + c + 1] * q
-            flux_b = planes[lower_cells + c] * (1 - q) + planes[lower_cells + c + 1] * q
-            flux = flux_a * (1 - plane_share) + flux_b * plane_share
+            flux = _flux(planes, first_plane, second_plane, second_share, num_cells, angle)
             scattered = _scattered(table, row, row_share, gamma + angle)
             if angle > last_angle:
                 mean = (flux - last_flux) / (angle - last_angle)
@@ -396,7 +413,7 @@ def light_slices(grid, lamps, scatter, planes, shares, slices, ranges, volume):
     goes as 1 / h, it is softened here; `light_nodes` adds the difference.
 
     Args:
-        grid: the image and its grid of fine nodes.
+        grid: lens of the image, and its grid of fine nodes.
         lamps: the lamps.
         scatter: as in `_light_sums`, like planes and shares.
         slices: float64 [K], inverse distances, falling, 1/m; the last is 0.
@@ -405,8 +422,8 @@ def light_slices(grid, lamps, scatter, planes, shares, slices, ranges, volume):
             slices that no fine node looks up.
     """
     num_rows, num_columns, num_slices, _ = volume.shape
-    num_steps = grid.size[3]
-    step = num_steps * grid.size[2]
+    num_steps = grid.steps[1]
+    step = num_steps * grid.steps[0]
     softness = SOFT_STEPS * step / grid.lens[4]
     for row in prange(num_rows):
         v = (row * step - grid.lens[3]) / grid.lens[1]
@@ -460,7 +477,7 @@ def light_nodes(grid, lamps, scatter, planes, shares, slices, volume, windows, r
     the difference.
 
     Args:
-        grid: the image and its grid.
+        grid: lens of the image, and its grid of nodes.
         lamps: the lamps.
         scatter: as in `_light_sums`, like planes and shares.
         slices: as in `light_slices`, like volume.
@@ -471,8 +488,8 @@ def light_nodes(grid, lamps, scatter, planes, shares, slices, volume, windows, r
             distance.
     """
     num_rows, num_columns, _ = nodes.shape
-    step = grid.size[2]
-    num_steps = grid.size[3]
+    step = grid.steps[0]
+    num_steps = grid.steps[1]
     per_step = 1 / num_steps
     softness = SOFT_STEPS * step / grid.lens[4]
     coarse_softness = num_steps * softness
@@ -535,7 +552,7 @@ def light_nodes(grid, lamps, scatter, planes, shares, slices, volume, windows, r
                 square = (side * side + rise * rise) * distance * distance
                 if square >= end_square:
                     continue
-                near, far, _, is_ahead = _ray_light(
+                near, far, is_ahead = _ray_light(
                     lamps, index, scatter, planes, shares, u * z, v * z, z,
                     ranges[row, column, 0], ranges[row, column, 1],
                 )  # fmt: skip
@@ -557,13 +574,13 @@ def spread_nodes(grid, inverse_distances, ranges, nodes, light):
     cross a silhouette.
 
     Args:
-        grid: the image and its grid.
+        grid: lens of the image, and its grid of nodes.
         inverse_distances: float32 [H, W], 1/m.
         ranges: as in `light_nodes`, like nodes.
         light: float32 [H, W, 3], changed in place.
     """
     height, width, _ = light.shape
-    step = grid.size[2]
+    step = grid.steps[0]
     num_columns = nodes.shape[1]
     one_f32 = np.float32(1)
     zero = np.float32(0)
@@ -604,7 +621,7 @@ def add_cores(grid, lamps, scatter, planes, shares, windows, ranges, inverse_dis
     Luminance times h is smooth there. It is computed at the nodes, and 1 / h at the pixels.
 
     Args:
-        grid: the image and its grid.
+        grid: lens of the image, and its grid of nodes.
         lamps: the lamps.
         scatter: as in `_light_sums`, like planes and shares.
         windows: int64 [M, 4], first row of nodes, last row + 1, first column, last column + 1, in
@@ -614,7 +631,7 @@ def add_cores(grid, lamps, scatter, planes, shares, windows, ranges, inverse_dis
         light: float32 [H, W, 3], changed in place.
     """
     height, width, _ = light.shape
-    step = grid.size[2]
+    step = grid.steps[0]
     softness = SOFT_STEPS * step / grid.lens[4]
     pixel = SOFT_PX / grid.lens[4]
     num_bands = ranges.shape[0] - 1
@@ -628,7 +645,7 @@ def add_cores(grid, lamps, scatter, planes, shares, windows, ranges, inverse_dis
             distance = lamps.distances_m[index]
             pixel_square = (pixel * distance) ** 2
             soft_square = (softness * distance) ** 2
-            end_square = 16 * soft_square
+            end_square = CORE_END * soft_square
             frame = lamps.frames[index]
             for i in range(2):
                 v = ((band + i) * step - grid.lens[3]) / grid.lens[1]
@@ -636,7 +653,7 @@ def add_cores(grid, lamps, scatter, planes, shares, windows, ranges, inverse_dis
                     column = first_column + j
                     u = (column * step - grid.lens[2]) / grid.lens[0]
                     z = 1 / math.sqrt(1 + u * u + v * v)
-                    near, far, _, _ = _ray_light(
+                    near, far, _ = _ray_light(
                         lamps, index, scatter, planes, shares, u * z, v * z, z,
                         ranges[band + i, column, 0], ranges[band + i, column, 1],
                     )  # fmt: skip

@@ -19,7 +19,7 @@ import math
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from augment.lamps import drop_light_kernels
+from augment.lamps import drop_light_kernels, fog_phase
 from augment.lamps.drop_cover import DropCover
 from augment.lamps.drop_light_kernels import (
     DROP_BACKWARD,
@@ -112,13 +112,14 @@ def phase_function(cosine: np.ndarray, *, is_snow: bool) -> np.ndarray:
         cosine: cosine of the scattering angle, 1 for light that goes straight on.
         is_snow: True for flakes.
     """
+    theta = np.arccos(np.clip(cosine, -1, 1))
     if is_snow:
-        back = _lambert_sphere(np.pi - np.arccos(np.clip(cosine, -1, 1)))
-        through = _lambert_sphere(np.arccos(np.clip(cosine, -1, 1)))
+        back = _lambert_sphere(np.pi - theta)
+        through = _lambert_sphere(theta)
         return (1 - FLAKE_THROUGH_SHARE) * back + FLAKE_THROUGH_SHARE * through
-    forward = _henyey_greenstein(cosine, DROP_FORWARD)
-    backward = _henyey_greenstein(cosine, DROP_BACKWARD)
-    return (1 - DROP_BACKWARD_SHARE) * forward + DROP_BACKWARD_SHARE * backward
+    forward = (1 - DROP_BACKWARD_SHARE, DROP_FORWARD)
+    backward = (DROP_BACKWARD_SHARE, DROP_BACKWARD)
+    return fog_phase.phase_function((forward, backward), theta)
 
 
 def _lambert_sphere(alpha: np.ndarray) -> np.ndarray:
@@ -127,10 +128,6 @@ def _lambert_sphere(alpha: np.ndarray) -> np.ndarray:
     alpha: angle between lamp and eye, seen from the sphere, radians.
     """
     return 2 / (3 * np.pi**2) * (np.sin(alpha) + (np.pi - alpha) * np.cos(alpha))
-
-
-def _henyey_greenstein(cosine: np.ndarray, g: float) -> np.ndarray:
-    return (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5)
 
 
 def cell_luminance(

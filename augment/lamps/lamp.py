@@ -13,6 +13,8 @@ from enum import IntEnum
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 
+from augment.light.srgb import LUMINANCE_WEIGHTS
+
 # Largest number of lamps at one moment. Every pixel looks at those near to it, and the light in the
 # air sums over all that are bright enough.
 MAX_LAMPS = 5000
@@ -22,8 +24,6 @@ MIN_WIDE_SPREAD_DEG = 90.0
 MAP_OWNER = 0
 # `owners` of lamps of the recording car.
 EGO_OWNER = -1
-# Luminance of the linear sRGB primaries (ITU-R BT.709).
-LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
 # Largest error of the length of a unit vector, and of the cosine of a right angle.
 _UNIT_TOLERANCE = 1e-6
 

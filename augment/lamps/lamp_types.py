@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64, Int64
 
-from augment.lamps.lamp import AMBER, RED, LampKind, Lamps, color_of_temperature, lamp_frame
+from augment.lamps.lamp import RED, LampKind, Lamps, color_of_temperature, lamp_frame
 from augment.lamps.patterns import (
     DIPPED_PEAK_CD,
     Pattern,
@@ -50,7 +50,6 @@ TAIL = LampType(LampKind.TAIL, Pattern.REAR, 10.0, RED, 0.06)
 STOP = LampType(LampKind.STOP, Pattern.REAR, 110.0, RED, 0.06)  # tail and stop lamp together
 THIRD_STOP = LampType(LampKind.STOP, Pattern.REAR, 50.0, RED, 0.03)
 REAR_FOG = LampType(LampKind.REAR_FOG, Pattern.REAR, 200.0, RED, 0.04)
-INDICATOR = LampType(LampKind.INDICATOR, Pattern.REAR, 250.0, AMBER, 0.035)
 BICYCLE_FRONT = LampType(LampKind.DIPPED, Pattern.DIPPED_RIGHT, 1_000.0, _WHITE, 0.02)
 BICYCLE_REAR = LampType(LampKind.TAIL, Pattern.REAR, 5.0, RED, 0.015)
 

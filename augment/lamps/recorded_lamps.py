@@ -69,10 +69,6 @@ class RecordedLamp(NamedTuple):
     """Column of its middle, pixels."""
     row: float
     """Row of its middle, pixels."""
-    num_pixels: int
-    """Pixels of its patch."""
-    contrast: float
-    """Linear brightness over that of its surroundings."""
     is_red: bool
     """True for red lamps, False for green ones."""
 
@@ -171,9 +167,7 @@ def _find_patches(
         glow = np.clip((linear - outside) / max(core - outside, 1e-3), 0, 1)
         lamp_share = np.where(ring, 0, glow).astype(np.float32)
         column, row = middles[number]
-        lamp = RecordedLamp(
-            kind, float(column) + 0.5, float(row) + 0.5, num_pixels, contrast, is_red
-        )
+        lamp = RecordedLamp(kind, float(column) + 0.5, float(row) + 0.5, is_red)
         patches.append((lamp, window, lamp_share))
     return patches
 

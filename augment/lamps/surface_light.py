@@ -5,13 +5,13 @@ A lamp of intensity I in the direction of a point at a distance d lights a surfa
     E = I cos(theta) exp(-sigma d) / (d^2 + r^2)        lux, if the lamp is above the surface
 
 theta: angle between the normal and the lamp; sigma: extinction of the air between lamp and surface;
-r: half a decimetre at least, so that a lamp that touches a surface does not burn a hole into it.
+r: 0.15 m at least, so that a lamp that touches a surface does not burn a hole into it.
 The surface's luminance is rho E / pi. The air before the surface is the caller's.
 
 Light changes slowly over a surface. So the sum is taken at nodes, `step_px` apart, and spread to
 the pixels of the same surface, which have reflectances of their own. In a tile of nodes only the
-brightest lamps count. Lamps that add less than `min_luminance_cd_m2` to a white surface of a tile
-do not light it.
+brightest lamps count. Lamps that add less than `min_luminance_cd_m2` to a white surface of a tile,
+and to signs, do not light it.
 
 Signs of retroreflective sheeting send the recording car's light back to it: L = R_A E, E on the
 plane that faces the lamp.
@@ -73,6 +73,8 @@ _SAME_WALL = 0.02
 SIGN_RETURN_PER_LUX = 250.0
 # Reflectance that the coefficient belongs to: a white sign's.
 SIGN_WHITE = 0.7
+# Most luminance of a sign over that of a matt surface of its reflectance in the same light: 1,122.
+SIGN_GAIN = math.pi * SIGN_RETURN_PER_LUX / SIGN_WHITE
 # Nodes in a row of a picture, about.
 NODES_PER_ROW = 600
 # Pixels between nodes, at most.
@@ -257,7 +259,7 @@ def surface_light(
         depth_m: z of the surfaces, metres; 0 for the sky.
         reflectance: reflectance of the surfaces, linear, 0 to 1.
         extinctions_per_m: extinction of the air between each lamp and what it lights.
-        min_luminance_cd_m2: luminance of a white surface that need not be added.
+        min_luminance_cd_m2: luminance of a white surface or a sign that need not be added.
         lamps_per_pixel: largest number of lamps that light a tile.
         nodes: result of `find_nodes`; None computes it.
         shadows: depth maps from the recording car's lamps.
@@ -282,9 +284,8 @@ def surface_light(
         assert is_sign is not None
         return_per_lux = is_sign * np.float32(SIGN_RETURN_PER_LUX / SIGN_WHITE)
     arrays = lamp_arrays(lamps, extinctions_per_m, shadows)
-    if has_signs:  # a sign is as bright as a hundred white walls
-        min_luminance_cd_m2 = min_luminance_cd_m2 / 10
     min_lux = min_luminance_cd_m2 * math.pi / MAX_REFLECTANCE
+    min_own_lux = min_lux / SIGN_GAIN if has_signs else min_lux  # signs return own light alone
     with kernel_threads(shape[0]):
         surface_light_kernels.light_nodes(
             nodes.depth,
@@ -293,6 +294,7 @@ def surface_light(
             arrays,
             shadow_arrays(shadows),
             min_lux,
+            min_own_lux,
             lamps_per_pixel,
             lux,
             own_lux,

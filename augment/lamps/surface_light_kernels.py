@@ -289,7 +289,32 @@ def lux_along_ray(tables, lamp, x, y, z):
 
 
 @kernel_function()
-def rank_lamps(lamps, points, facings, count, min_lux, max_lamps, chosen, scores):
+def insert_ranked(chosen, scores, number, m, score):
+    """Insert a lamp into those of a tile, highest score first; a full list loses its last.
+
+    Args:
+        chosen: indices of the lamps, int64 [max_lamps], changed in place.
+        scores: their scores, float64 [max_lamps], changed in place.
+        number: number of lamps in the list.
+        m: index of the lamp.
+        score: its score; higher than the last one's if the list is full.
+
+    Returns:
+        The number of lamps that the list then has.
+    """
+    number = min(number + 1, len(chosen))
+    place = number - 1
+    while place > 0 and scores[place - 1] < score:
+        scores[place] = scores[place - 1]
+        chosen[place] = chosen[place - 1]
+        place -= 1
+    scores[place] = score
+    chosen[place] = m
+    return number
+
+
+@kernel_function()
+def rank_lamps(lamps, points, facings, count, min_lux, min_own_lux, max_lamps, chosen, scores):
     """Choose the brightest lamps of a tile, brightest first.
 
     Returns:
@@ -301,6 +326,7 @@ def rank_lamps(lamps, points, facings, count, min_lux, max_lamps, chosen, scores
         facings: normals at the points, [N, 3].
         count: number of the points.
         min_lux: lux of all its points below which a lamp is left out.
+        min_own_lux: the same for lamps of the recording car.
         max_lamps: largest number of lamps.
         chosen: output, int64 [max_lamps], indices of the lamps.
         scores: output, float64 [max_lamps], the most lux of each at some of the points.
@@ -321,11 +347,12 @@ def rank_lamps(lamps, points, facings, count, min_lux, max_lamps, chosen, scores
         for k in range(3):
             gap = max(low[k] - lamps.positions[m, k], lamps.positions[m, k] - high[k], 0.0)
             squared += gap * gap
+        least = min_own_lux if lamps.is_own[m] else min_lux
         bound = lamps.peaks[m] / (squared + lamps.softening[m])
-        if bound < min_lux:
+        if bound < least:
             continue
         bound *= math.exp(-lamps.extinctions[m] * math.sqrt(squared))
-        if bound < min_lux or (number == max_lamps and bound <= dropped):
+        if bound < least or (number == max_lamps and bound <= dropped):
             continue
         score = 0.0
         brightest = 0.0
@@ -338,26 +365,21 @@ def rank_lamps(lamps, points, facings, count, min_lux, max_lamps, chosen, scores
             brightest = max(brightest, lux)
             cosine = dx * facings[p, 0] + dy * facings[p, 1] + dz * facings[p, 2]
             score = max(score, lux * max(cosine, MIN_RANK_COSINE))
-        if SAMPLE_MARGIN * brightest < min_lux:
+        if SAMPLE_MARGIN * brightest < least:
             continue
         if number == max_lamps:
             if score <= scores[number - 1]:
                 dropped = max(dropped, score)
                 continue
             dropped = max(dropped, scores[number - 1])
-        number = min(number + 1, max_lamps)
-        place = number - 1
-        while place > 0 and scores[place - 1] < score:
-            scores[place] = scores[place - 1]
-            chosen[place] = chosen[place - 1]
-            place -= 1
-        scores[place] = score
-        chosen[place] = m
+        number = insert_ranked(chosen, scores, number, m, score)
     return number, dropped
 
 
 @kernel
-def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, own_lux):
+def light_nodes(
+    depth, normals, view, lamps, shadows, min_lux, min_own_lux, max_lamps, lux, own_lux
+):
     """Sum the lamps' illuminance at the nodes.
 
     Args:
@@ -367,6 +389,7 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
         lamps: the lamps.
         shadows: depth maps of the lamps that have one.
         min_lux: lux below which a lamp does not light a tile.
+        min_own_lux: the same for lamps of the recording car.
         max_lamps: largest number of lamps that light a tile.
         lux: output, float32 [h, w, 3], lux in linear sRGB on the surfaces.
         own_lux: output, float32 [h, w, 3], lux of the recording car's lamps on surfaces that face
@@ -415,7 +438,7 @@ def light_nodes(depth, normals, view, lamps, shadows, min_lux, max_lamps, lux, o
         if count == 0:
             continue
         number, dropped = rank_lamps(
-            lamps, points, facings, count, min_lux, max_lamps, chosen, scores
+            lamps, points, facings, count, min_lux, min_own_lux, max_lamps, chosen, scores
         )
         for c in range(number):
             m = chosen[c]

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.lamps.surface_light_kernels import lit_share, lux_along_ray, read_lamp
+from augment.lamps.surface_light_kernels import insert_ranked, lit_share, lux_along_ray, read_lamp
 from augment.render.cpu.jit import kernel, kernel_function
 
 TILE_PX = 16  # pixels along a side of a tile, whose pixels share a list of lamps
@@ -213,14 +213,7 @@ def add_glints(
                     score = max(score, strength * lux)
             if number == max_lamps and score <= scores[number - 1]:
                 continue
-            number = min(number + 1, max_lamps)
-            place = number - 1
-            while place > 0 and scores[place - 1] < score:
-                scores[place] = scores[place - 1]
-                chosen[place] = chosen[place - 1]
-                place -= 1
-            scores[place] = score
-            chosen[place] = m
+            number = insert_ranked(chosen, scores, number, m, score)
         for c in range(number):
             m = chosen[c]
             lamp = read_lamp(lamps, m)

@@ -7,18 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from augment.lamps.lamp import (
-    AMBER,
-    GREEN,
-    LUMINANCE_WEIGHTS,
-    MAX_LAMPS,
-    RED,
-    LampKind,
-    Lamps,
-    color_of_temperature,
-)
+from augment.lamps.lamp import AMBER, GREEN, MAX_LAMPS, RED, LampKind, Lamps, color_of_temperature
 from augment.lamps.lamp_types import DIPPED, STOP, TAIL, make_lamps
 from augment.lamps.patterns import standard_tables
+from augment.light.srgb import LUMINANCE_WEIGHTS
 
 
 def some_lamps(count: int = 3) -> Lamps:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from augment.lamps.lamp import LUMINANCE_WEIGHTS, LampKind
+from augment.lamps.lamp import LampKind
 from augment.lamps.recorded_lamps import (
     SIGNAL_LUMINANCE_CD_M2,
     STOP_LUMINANCE_CD_M2,
@@ -13,6 +13,7 @@ from augment.lamps.recorded_lamps import (
     find_recorded_lamps,
     vehicle_pixels,
 )
+from augment.light.srgb import LUMINANCE_WEIGHTS
 from tests.augment.test_vehicle_lamps import ParkedLabels, car, scene_of, straight_track
 from tests.scenes import camera_ahead
 
