@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 from recipes.fields import ClosedModel
+from recipes.moment import Moment
 
 Value = float | int | str | bool | None
 
@@ -139,6 +140,17 @@ class EffectModel(Section):
         """Return the paths of the files that the section names, by field."""
         paths = {name: getattr(self, name) for name in self.file_fields}
         return {name: path for name, path in paths.items() if path is not None}
+
+    def state_at(self, path: str, moment: Moment) -> EffectModel:
+        """Return the section with the numbers that follow from the weather up to a moment.
+
+        Its own timelines have been put in before: the fields hold their numbers at the moment.
+
+        Args:
+            path: dotted path of the section in the recipe.
+            moment: the moment, with the course of all numbers that change.
+        """
+        return self
 
     def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:
         """Return the surface on which a LiDAR beam can end, and whether depth images show it.
