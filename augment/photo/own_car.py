@@ -378,6 +378,18 @@ class OwnCar:
     """Weight of the car's colours in these rows: 1 in the mask, less in a narrow border around it,
     0 elsewhere."""
 
+    def mask_at(self, width: int, height: int) -> Bool[np.ndarray, "h w"]:
+        """Return the pixels of a smaller image that show some of the car.
+
+        Args:
+            width: width of the smaller image, pixels.
+            height: height of the smaller image, pixels.
+        """
+        area = cv2.resize(
+            self.mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA
+        )
+        return area > 0
+
 
 def own_car_in_view(scene: Scene, camera: Camera) -> OwnCar | None:
     """Return the recording car in a view of recorded images; None where they show none.

@@ -153,11 +153,11 @@ def render_buffers(
         layers = replace(layers, added_colors=added_colors(scene, camera))
     for effect in view.effects:
         if is_fading and _is_weather(effect):  # a style comes first, with maps of its own
-            layers = _cover_sky(layers, scene, camera, plan)
+            layers = _cover_sky(layers, scene, camera, plan, own_car)
             is_fading = False
         layers = effect.hooks.edit_scene(effect, layers, camera)
     if is_fading:
-        layers = _cover_sky(layers, scene, camera, plan)
+        layers = _cover_sky(layers, scene, camera, plan, own_car)
     if plan.prune > 0:
         with timed("prune"):
             parts = prune_parts(layers.parts, scene, camera, plan.prune)
@@ -234,7 +234,9 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> RenderedView
     return RenderedView(*layers.render_with_sky(camera, view.buffers), layers)
 
 
-def _cover_sky(layers: LayerRenderer, scene: Scene, camera: Camera, plan: Plan) -> LayerRenderer:
+def _cover_sky(
+    layers: LayerRenderer, scene: Scene, camera: Camera, plan: Plan, own_car: OwnCar | None
+) -> LayerRenderer:
     """Return the layers without what the sun and the blue sky of a clear day leave on surfaces.
 
     Args:
@@ -242,15 +244,18 @@ def _cover_sky(layers: LayerRenderer, scene: Scene, camera: Camera, plan: Plan) 
         scene: the scene.
         camera: the view.
         plan: the plan of all views.
+        own_car: the recording car in a recorded image; None where there is none.
     """
     if plan.sun_share < 1:
         layers = _fade_shadows(layers, scene, plan.sun_share)
     if plan.gloss_fade > 0:
-        layers = _grey_gloss(layers, scene, camera, plan.gloss_fade)
+        layers = _grey_gloss(layers, scene, camera, plan.gloss_fade, own_car)
     return layers
 
 
-def _grey_gloss(layers: LayerRenderer, scene: Scene, camera: Camera, fade: float) -> LayerRenderer:
+def _grey_gloss(
+    layers: LayerRenderer, scene: Scene, camera: Camera, fade: float, own_car: OwnCar | None
+) -> LayerRenderer:
     """Return the layers with the blue sky in glossy surfaces turned grey.
 
     Args:
@@ -258,6 +263,8 @@ def _grey_gloss(layers: LayerRenderer, scene: Scene, camera: Camera, fade: float
         scene: the scene.
         camera: the view.
         fade: how much of the blue turns grey, 0 to 1.
+        own_car: the recording car in a recorded image, whose pixels show no surface of the scene;
+            None where there is none.
     """
     with timed(GLOSS_PASS):
         gloss = find_sky_gloss(scene)
@@ -279,7 +286,10 @@ def _grey_gloss(layers: LayerRenderer, scene: Scene, camera: Camera, fade: float
             # The last class is that of pixels without a splat, whose id is -1.
             classes = splat_classes(layers.parts, splat_ids.device)
             classes = torch.cat([classes, torch.tensor([-1], dtype=torch.int16)])[splat_ids]
-            photo = grey_photo(photo, classes.numpy(), gloss, fade)
+            class_image = classes.numpy()
+            if own_car is not None:
+                class_image[own_car.mask_at(small_camera.width, small_camera.height)] = -1
+            photo = grey_photo(photo, class_image, gloss, fade)
         parts = tuple(part if part.is_overlay else greyed.apply_to(part) for part in layers.parts)
     return replace(layers, parts=parts, photo=photo)
 
