@@ -111,18 +111,28 @@ def water_frame(up: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
 
 def _water_arrays(water: WetSurface | WetRoad) -> WaterArrays:
     """Return the water as the kernel takes it."""
-    empty = np.zeros((0, 0), np.float32)
-    is_road = isinstance(water, WetRoad)
-    tilts = None if is_road else water.tilts
-    images = (
-        water.share,
-        water.depth_m,
-        empty if is_road else water.roughness,
-        np.zeros((0, 0, 2), np.float32) if tilts is None else tilts,
-        water.film if is_road else np.zeros((0, 0, 3), np.float32),
+    roughness = np.zeros((0, 0), np.float32)
+    tilts = np.zeros((0, 0, 2), np.float32)
+    film = np.zeros((0, 0, 3), np.float32)
+    if isinstance(water, WetRoad):
+        film = water.film
+    else:
+        roughness = water.roughness
+        tilts = tilts if water.tilts is None else water.tilts
+    return WaterArrays(
+        _writable(water.share),
+        _writable(water.depth_m),
+        _writable(roughness),
+        _writable(tilts),
+        _writable(film),
+        wave_octaves(),
+        wave_keys(),
     )
-    arrays = (np.require(image, np.float32, ["C", "W"]) for image in images)
-    return WaterArrays(*arrays, wave_octaves(), wave_keys())
+
+
+def _writable(image: np.ndarray) -> np.ndarray:
+    """Return an image as kernels are compiled for: contiguous float32 that may be written."""
+    return np.require(image, np.float32, ["C", "W"])
 
 
 # ---- Definition ----------------------------------------------------------------------------------

@@ -94,7 +94,11 @@ def cover_of_drops(
     ranges = np.searchsorted(EDGES_M, 1 / np.maximum(inverse_depths, 1e-6))
     order = np.argsort(ranges, kind="stable")
     ends = np.cumsum(np.bincount(ranges, minlength=len(LIT_DISTANCES_M)))
-    surfaces = (image.detach().float().cpu().numpy() for image in (alpha, depth))
     return DropsInRanges(
-        np.ascontiguousarray(drops[order]), ends, *surfaces, is_snow, LIT_DISTANCES_M
+        np.ascontiguousarray(drops[order]),
+        ends,
+        alpha.detach().float().cpu().numpy(),
+        depth.detach().float().cpu().numpy(),
+        is_snow,
+        LIT_DISTANCES_M,
     )
