@@ -30,7 +30,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
 from augment.lamps.drop_cover import DropCover
-from augment.lamps.wet_surface import WetSurface
+from augment.lamps.wet_surface import WetRoad, WetSurface
 from augment.output.box_tables import BoxTable
 from augment.render.buffers import RenderOutput
 from augment.scene.boxes import WorldBoxes
@@ -197,12 +197,15 @@ class RenderedView:
     skip_reasons: Mapping[str, str] = field(default_factory=dict)
     """Reason for each pass that proved needless while drawing, by the pass's name."""
 
-    mirrored_rgb: Float[Tensor, "H W 3"] | None = None
-    """Change of `rgb` by what wet ground mirrors of the day, where lamps ask for it: they light the
-    ground and not its mirror image."""
+    mirrored_rgb: Float[Tensor, "h W 3"] | None = None
+    """Change of some rows of `rgb` by what wet ground mirrors of the day, where lamps ask for it:
+    they light the ground and not its mirror image."""
 
-    wet_surface: WetSurface | None = None
-    """Water that mirrors lamps; None without any, or unless `layers.needs_lamp_inputs`."""
+    mirrored_rows: tuple[int, int] = (0, 0)
+    """The first of these rows, and one past the last."""
+
+    waters: tuple[WetSurface | WetRoad, ...] = ()
+    """Waters that mirror lamps, in pixels of their own; none unless `layers.needs_lamp_inputs`."""
 
     drop_covers: tuple[DropCover, ...] = ()
     """Drops and flakes that lamps light; none unless `layers.needs_lamp_inputs`."""

@@ -28,14 +28,14 @@ from augment.lamps.drop_light_kernels import (
     FLAKE_THROUGH_SHARE,
 )
 from augment.lamps.lamp import Lamps
-from augment.lamps.surface_light import illuminance, lamp_arrays
+from augment.lamps.lamp_lanes import lamp_table, pattern_starts
+from augment.lamps.surface_light import MIN_SOFTENING_M, illuminance
+from augment.render.layout import NUM_LANES
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
 # Side of a cell, pixels.
 CELL_PX = 16
-# Largest value of the phase functions, 1/sr.
-_MAX_PHASE = 6.5
 
 
 def add_drop_light(
@@ -60,33 +60,34 @@ def add_drop_light(
     Raises:
         ValueError: the images differ in size.
     """
-    if picture.shape[:2] != cover.covers.shape[1:]:
+    if picture.shape[:2] != cover.size_px:
         raise ValueError(
-            f"picture must be {[*cover.covers.shape[1:], 3]} (from cover); got "
-            f"{list(picture.shape)}"
+            f"picture must be {[*cover.size_px, 3]} (from cover); got {list(picture.shape)}"
         )
-    if not len(lamps) or not cover.covers.any():
+    if not len(lamps) or not cover.has_drops:
         return
     rays = cell_rays(camera)
-    cells = np.empty((len(cover.distances_m), *rays.shape), np.float32)
-    pose = camera.world_from_camera.numpy()
-    with kernel_threads(rays.shape[0]):
+    rows, columns = rays.shape[:2]
+    # Whole eights of columns; those beyond the last one are not looked at.
+    padded = np.zeros((3, rows, -(-columns // NUM_LANES) * NUM_LANES), np.float32)
+    padded[0] = 1
+    padded[:, :, :columns] = np.moveaxis(rays, 2, 0)
+    cells = np.empty((len(cover.distances_m), rows, 3, padded.shape[2]), np.float32)
+    softening_m2 = np.maximum(lamps.radii_m, MIN_SOFTENING_M) ** 2
+    eye = camera.centre.numpy()
+    with kernel_threads(len(cover.distances_m)):
         drop_light_kernels.light_cells(
-            rays,
-            np.array(cover.distances_m, np.float64),
-            np.ascontiguousarray(pose[:3, 3]),
-            lamp_arrays(lamps, extinction_per_m),
+            padded,
+            np.array(cover.distances_m, np.float32),
+            lamp_table(lamps, extinction_per_m, softening_m2, np.eye(3), eye),
+            np.require(lamps.tables, np.float32, ["C", "W"]),
+            pattern_starts(lamps),
             cover.is_snow,
-            min_luminance_cd_m2 / _MAX_PHASE,
+            float(min_luminance_cd_m2),
             cells,
         )
-        drop_light_kernels.add_cells(
-            np.require(cover.covers, np.float32, ["C", "W"]),
-            cells,
-            np.exp(-extinction_per_m * cover.distances_m),
-            CELL_PX,
-            picture,
-        )
+    cells *= np.exp(-extinction_per_m * cover.distances_m).astype(np.float32)[:, None, None, None]
+    cover.add_light(picture, cells, CELL_PX)
 
 
 def cell_rays(camera: Camera) -> Float64[np.ndarray, "h w 3"]:

@@ -1,6 +1,7 @@
-"""Numba kernels: lamps' light at points in the air, scattered by drops and flakes towards the eye.
+"""Numba kernel: lamps' light at points in the air, scattered by drops and flakes towards the eye.
 
-`augment.lamps.drop_light` prepares the arrays and holds the plain definition.
+`augment.lamps.drop_light` prepares the arrays and holds the plain definition. Eight columns are
+looked at at a time, in float32.
 """
 
 from __future__ import annotations
@@ -10,8 +11,10 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.lamps.surface_light_kernels import lux_along_ray, read_lamp
+from augment.lamps.lamp_lane_kernels import COLOR, dot, lux_of_lanes, read_lamp_lanes, splat
+from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel, kernel_function
+from augment.render.layout import NUM_LANES, Index
 
 # Asymmetry of the light that a drop refracts through itself.
 DROP_FORWARD = 0.85
@@ -21,126 +24,131 @@ DROP_BACKWARD = -0.6
 DROP_BACKWARD_SHARE = 0.08
 # Share of a flake's light that comes through it.
 FLAKE_THROUGH_SHARE = 0.4
+# acos(x) = sqrt(1 - x) times a polynomial, within 2e-8 for 0 <= x <= 1; lowest power first.
+# Source: Abramowitz and Stegun 1964, "Handbook of Mathematical Functions", 4.4.46.
+_ACOS = (
+    1.5707963050,
+    -0.2145988016,
+    0.0889789874,
+    -0.0501743046,
+    0.0308918810,
+    -0.0170881256,
+    0.0066700901,
+    -0.0012624911,
+)
 
 
 @kernel_function()
-def henyey_greenstein(cosine, g):
-    """Return the phase function of asymmetry g, whose mean over the sphere is 1 / 4 pi."""
-    base = 1.0 + g * g - 2.0 * g * cosine
-    return (1.0 - g * g) / (4.0 * math.pi * base * math.sqrt(base))
+def henyey_greenstein(gap, g):
+    """Return the phase function of asymmetry g, whose mean over the sphere is 1 / 4 pi.
+
+    gap: 1 - cosine of the angle between the light's ways in and out.
+    """
+    base = v8.fmuladd(gap, splat(2.0 * g), splat((1.0 - g) ** 2))
+    return splat((1.0 - g * g) / (4.0 * math.pi)) / (base * v8.sqrt(base))
 
 
 @kernel_function()
-def drop_phase(cosine):
-    """Return a drop's phase function, 1/sr; cosine of the angle between light's ways in and out."""
-    forward = henyey_greenstein(cosine, DROP_FORWARD)
-    backward = henyey_greenstein(cosine, DROP_BACKWARD)
-    return forward + DROP_BACKWARD_SHARE * (backward - forward)
+def drop_phase(gap):
+    """Return a drop's phase function, 1/sr. gap: as in `henyey_greenstein`."""
+    forward = henyey_greenstein(gap, DROP_FORWARD)
+    backward = henyey_greenstein(gap, DROP_BACKWARD)
+    return v8.fmuladd(backward - forward, splat(DROP_BACKWARD_SHARE), forward)
 
 
 @kernel_function()
-def flake_phase(cosine):
+def _acos(x):
+    """Return the arc cosine of x in [-1, 1]."""
+    size = v8.absolute(x)
+    value = splat(_ACOS[7])
+    value = v8.fmuladd(value, size, splat(_ACOS[6]))
+    value = v8.fmuladd(value, size, splat(_ACOS[5]))
+    value = v8.fmuladd(value, size, splat(_ACOS[4]))
+    value = v8.fmuladd(value, size, splat(_ACOS[3]))
+    value = v8.fmuladd(value, size, splat(_ACOS[2]))
+    value = v8.fmuladd(value, size, splat(_ACOS[1]))
+    value = v8.fmuladd(value, size, splat(_ACOS[0]))
+    value = value * v8.sqrt(v8.maximum(splat(1) - size, splat(0)))
+    return v8.select(v8.greater(splat(0), x), splat(math.pi) - value, value)
+
+
+@kernel_function()
+def flake_phase(gap):
     """Return a flake's phase function, 1/sr: a Lambertian sphere through which a share shines.
 
-    cosine: of the angle between the light's ways in and out.
+    gap: as in `henyey_greenstein`.
     """
-    alpha = math.acos(min(max(-cosine, -1.0), 1.0))  # between lamp and eye, seen from the flake
-    sine = math.sin(alpha)
-    scale = 2.0 / (3.0 * math.pi * math.pi)
-    back = (sine + (math.pi - alpha) * math.cos(alpha)) * scale
-    through = (sine - alpha * math.cos(alpha)) * scale
-    return back + FLAKE_THROUGH_SHARE * (through - back)
+    # Cosine of the angle alpha between lamp and eye, seen from the flake.
+    cosine = v8.minimum(v8.maximum(gap - splat(1), splat(-1)), splat(1))
+    alpha = _acos(cosine)
+    sine = v8.sqrt(splat(1) - cosine * cosine)
+    back = v8.fmuladd(splat(math.pi) - alpha, cosine, sine)
+    through = sine - alpha * cosine
+    scale = splat(2.0 / (3.0 * math.pi * math.pi))
+    return v8.fmuladd(through - back, splat(FLAKE_THROUGH_SHARE), back) * scale
 
 
 @kernel
-def light_cells(rays, distances, eye, lamps, is_snow, min_lux, cells):
+def light_cells(rays, distances, lamps, tables, starts, is_snow, min_luminance, cells):
     """Sum the luminance of drops in cells of the air: the lamps' lux times the phase function.
 
     Args:
-        rays: unit directions of the cells' columns, world, float64 [h, w, 3].
-        distances: distances of the cells, metres, float64 [K].
-        eye: place of the eye, world, float64 [3].
-        lamps: the lamps, `surface_light_kernels.LampArrays`.
+        rays: unit directions of the cells' columns, world, float32 [3, h, w]; w is a multiple of 8.
+        distances: distances of the cells, metres, float32 [K].
+        lamps: the lamps, from the eye, `lamp_lanes.lamp_table`.
+        tables: packed patterns, float32 [K, V, U].
+        starts: first value of each lamp's pattern in the flat tables, int32 [M].
         is_snow: True for flakes.
-        min_lux: lux below which a lamp does not light a cell.
-        cells: output, luminance in linear sRGB, cd/m2, float32 [K, h, w, 3].
+        min_luminance: luminance below which a lamp does not light eight cells, cd/m2.
+        cells: output, luminance in linear sRGB, cd/m2, float32 [K, h, 3, w].
     """
-    height = rays.shape[0]
-    width = rays.shape[1]
-    for row in prange(height):
-        for k in range(len(distances)):
-            for column in range(width):
-                for c in range(3):
-                    cells[k, row, column, c] = 0.0
-        for m in range(len(lamps.intensities)):
-            lamp = read_lamp(lamps, m)
-            tables = lamps.tables
-            for k in range(len(distances)):
-                for column in range(width):
-                    rx = rays[row, column, 0]
-                    ry = rays[row, column, 1]
-                    rz = rays[row, column, 2]
-                    x = eye[0] + distances[k] * rx
-                    y = eye[1] + distances[k] * ry
-                    z = eye[2] + distances[k] * rz
-                    dx = lamp[0][0] - x
-                    dy = lamp[0][1] - y
-                    dz = lamp[0][2] - z
-                    if lamps.peaks[m] < min_lux * (dx * dx + dy * dy + dz * dz):
-                        continue
-                    lux, dx, dy, dz = lux_along_ray(tables, lamp, x, y, z)
-                    if lux <= 0:
-                        continue
-                    # Light travels along -d, then along -ray to the eye.
-                    cosine = dx * rx + dy * ry + dz * rz
-                    phase = flake_phase(cosine) if is_snow else drop_phase(cosine)
-                    lux *= phase
-                    cells[k, row, column, 0] += np.float32(lux * lamps.colors[m, 0])
-                    cells[k, row, column, 1] += np.float32(lux * lamps.colors[m, 1])
-                    cells[k, row, column, 2] += np.float32(lux * lamps.colors[m, 2])
-
-
-@kernel
-def add_cells(covers, cells, transmittances, step, picture):
-    """Add the light of drops that cover pixels, nearest first, and hide what is behind them.
-
-    Args:
-        covers: share of each pixel that drops of each distance cover, float32 [K, H, W].
-        cells: result of `light_cells`.
-        transmittances: transmittance of the air before the drops of each distance, float64 [K].
-        step: pixels between the cells' columns.
-        picture: luminance in linear sRGB, cd/m2, changed in place, float32 [H, W, 3].
-    """
-    height, width = picture.shape[:2]
-    rows, columns = cells.shape[1:3]
-    for row in prange(height):
-        v = min(max((row + 0.5) / step - 0.5, 0.0), rows - 1.0)
-        i = min(int(v), max(rows - 2, 0))
-        v -= i
-        below = min(i + 1, rows - 1)
-        light = np.empty(3)
+    height, width = rays.shape[1:]
+    count = len(distances)
+    for line in prange(height * count):
+        row = line // count
+        k = line % count
+        texels = np.empty(NUM_LANES, np.int32)
+        firsts = np.empty(NUM_LANES, np.int32)
+        zero = splat(0)
+        distance = v8.broadcast(distances[k])
+        least = splat(min_luminance)
+        place = Index(row * width)
+        step = Index(height * width)
+        first_cell = Index((k * height + row) * 3 * width)
         for column in range(width):
-            clear = 1.0
-            has_drops = False
-            for k in range(len(covers)):
-                cover = covers[k, row, column]
-                if cover <= 0:
+            for c in range(3):
+                cells[k, row, c, column] = np.float32(0)
+        for m in range(len(lamps)):
+            lamp = read_lamp_lanes(lamps, m)
+            red = v8.broadcast(lamps[m, COLOR])
+            green = v8.broadcast(lamps[m, COLOR + 1])
+            blue = v8.broadcast(lamps[m, COLOR + 2])
+            for lane in range(NUM_LANES):
+                firsts[lane] = starts[m]
+            for column in range(Index(0), Index(width), Index(NUM_LANES)):
+                rx = v8.load(rays, place + column)
+                ry = v8.load(rays, place + step + column)
+                rz = v8.load(rays, place + step + step + column)
+                dx = lamp[0][0] - distance * rx
+                dy = lamp[0][1] - distance * ry
+                dz = lamp[0][2] - distance * rz
+                squared = v8.maximum(dot(dx, dy, dz, dx, dy, dz), splat(1e-12))
+                per_m = splat(1) / v8.sqrt(squared)
+                # Light travels along -d, then along -ray to the eye. The chord keeps the digits of
+                # 1 - cosine.
+                x = dx * per_m - rx
+                y = dy * per_m - ry
+                z = dz * per_m - rz
+                gap = splat(0.5) * dot(x, y, z, x, y, z)
+                phase = flake_phase(gap) if is_snow else drop_phase(gap)
+                most = phase * lamp[7] / (squared + lamp[6])
+                if v8.mask_bits(v8.greater(most, least)) == Index(0):
                     continue
-                if not has_drops:
-                    has_drops = True
-                    light[0] = 0.0
-                    light[1] = 0.0
-                    light[2] = 0.0
-                u = min(max((column + 0.5) / step - 0.5, 0.0), columns - 1.0)
-                j = min(int(u), max(columns - 2, 0))
-                u -= j
-                beside = min(j + 1, columns - 1)
-                weight = clear * cover * transmittances[k]
-                for c in range(3):
-                    above = cells[k, i, j, c] * (1.0 - u) + cells[k, i, beside, c] * u
-                    under = cells[k, below, j, c] * (1.0 - u) + cells[k, below, beside, c] * u
-                    light[c] += weight * (above + (under - above) * v)
-                clear *= 1.0 - cover
-            if has_drops:
-                for c in range(3):
-                    picture[row, column, c] += np.float32(light[c])
+                lux = lux_of_lanes(tables, firsts, texels, lamp, dx, dy, dz, squared, per_m)
+                light = v8.maximum(lux * phase, zero)
+                cell = first_cell + column
+                v8.store(cells, cell, v8.fmuladd(light, red, v8.load(cells, cell)))
+                cell += Index(width)
+                v8.store(cells, cell, v8.fmuladd(light, green, v8.load(cells, cell)))
+                cell += Index(width)
+                v8.store(cells, cell, v8.fmuladd(light, blue, v8.load(cells, cell)))

@@ -1,6 +1,6 @@
-"""Numba kernel: tilts of a wet road's surface, from waves of many lengths that are fixed to it.
+"""Kernel functions: tilts of a wet road's surface, from waves of many lengths that are fixed to it.
 
-`augment.lamps.road_unevenness` launches it and holds the plain definition.
+`augment.lamps.road_unevenness` holds the plain definition; `wet_glint_kernels` calls them.
 """
 
 from __future__ import annotations
@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
+from augment.lamps.lamp_lane_kernels import dot, splat
+from augment.render.cpu import simd as v8
 from augment.render.cpu.hash_kernels import mix
-from augment.render.cpu.jit import kernel, kernel_function
+from augment.render.cpu.jit import kernel_function
+from augment.render.layout import NUM_LANES, Index
 
 # Standard deviation of a smoothly interpolated lattice of numbers from -1 to 1, inverted.
 PER_DEVIATION = 2.33
@@ -21,6 +23,8 @@ _HALF_BITS = np.uint64(32)
 _LOW = np.uint64(0xFFFFFFFF)
 # Largest number of 32 bits, halved.
 HALF_RANGE = 2147483647.5
+# Row of m^2 among the numbers of a pixel.
+_ROUGHNESS2 = 13
 
 
 @kernel_function()
@@ -34,84 +38,134 @@ def _corner(column, row, key):
 
 
 @kernel_function()
-def _noise(x, y, key):
-    """Return two smooth numbers at a place; a cell of the lattice is 1 wide."""
-    column = math.floor(x)
-    row = math.floor(y)
-    u = x - column
-    v = y - row
-    u = u * u * (3.0 - 2.0 * u)
-    v = v * v * (3.0 - 2.0 * v)
-    j = np.int64(column)
-    i = np.int64(row)
-    a = _corner(j, i, key)
-    b = _corner(j + 1, i, key)
-    c = _corner(j, i + 1, key)
-    d = _corner(j + 1, i + 1, key)
-    first = (1 - v) * ((1 - u) * a[0] + u * b[0]) + v * ((1 - u) * c[0] + u * d[0])
-    second = (1 - v) * ((1 - u) * a[1] + u * b[1]) + v * ((1 - u) * c[1] + u * d[1])
-    return first, second
+def tilt_tile(pixels, resolved, view, octaves, keys, tilts):
+    """Write the tilts of a tile of a road, and take their variance out of its roughness.
 
-
-@kernel
-def tilt_road(share, depth, resolved, lens, axes, eye, up, octaves, keys, roughness, tilts):
-    """Write the tilts of a road, and take their variance out of its roughness.
+    Pixels side by side mostly lie in one cell of a lattice, whose corners are kept for them.
 
     Args:
-        share: share of each pixel that shows water, float32 [H, W].
-        depth: z of the road, metres, float32 [H, W].
-        resolved: share of the roughness's variance that waves may have, float32 [H, W].
-        lens: 1 / fx, 1 / fy, cx, cy, float64 [4].
-        axes: world_from_camera, float64 [3, 3].
-        eye: place of the eye, world, float64 [3].
-        up: normal of the road, world, float64 [3].
+        pixels: numbers of N pixels as `water_tile_kernels` has them, float32; m^2 is changed in
+            place.
+        resolved: share of the roughness's variance that waves may have, float32 [N].
+        view: view of the road, `water_tile_kernels.WaterView`.
         octaves: length of each octave's waves, metres, and cosine and sine of its lattice's angle,
             float64 [O, 3].
         keys: key of each octave's random numbers, uint64 [O].
-        roughness: Beckmann's m, float32 [H, W], changed in place.
-        tilts: output, x and y of the unit normal less those of `up`, float32 [H, W, 2].
+        tilts: output, x of the unit normals less those of the road's plane, world, then y, float32
+            [2 N], 0 before.
     """
-    height, width = share.shape
+    size = Index(pixels.shape[1])
     count = len(octaves)
-    for i in prange(height):
-        y = (i + 0.5 - lens[3]) * lens[1]
-        for j in range(width):
-            tilts[i, j, 0] = np.float32(0)
-            tilts[i, j, 1] = np.float32(0)
-            z = np.float64(depth[i, j])
-            if not (share[i, j] > 0 and resolved[i, j] > 0 and z > 0 and z < 1e6):
+    zero = splat(0)
+    half = splat(0.5)
+    unit = splat(1)
+    weights = np.empty(pixels.shape[1], np.float32)
+    deviations = np.empty(pixels.shape[1], np.float32)
+    longest_m = 0.0
+    for octave in range(count):
+        longest_m = max(longest_m, octaves[octave, 0])
+    per_focal = splat(view.lens[1])
+    has_waves = False
+    for first in range(Index(0), size, Index(NUM_LANES)):
+        px = v8.load(pixels, first)
+        py = v8.load(pixels, first + size)
+        pz = v8.load(pixels, first + size + size)
+        share = v8.load(resolved, first)
+        squared = dot(px, py, pz, px, py, pz)
+        length = v8.sqrt(squared)
+        # Length of a pixel on the road: its angle times the distance, over the grazing sine.
+        sine = v8.maximum(v8.absolute(pz), splat(1e-3) * length)
+        weight = half * sine / v8.maximum(squared * per_focal, splat(1e-20))
+        is_road = v8.mask_and(v8.greater(share, zero), v8.greater(squared, zero))
+        weight = v8.select(is_road, weight, zero)
+        v8.store(weights, first, weight)
+        variance = splat(0.5 / count) * v8.load(pixels, first + Index(_ROUGHNESS2) * size) * share
+        v8.store(deviations, first, v8.sqrt(v8.maximum(variance, zero)))
+        if v8.mask_bits(v8.greater(weight * splat(longest_m), half)) != Index(0):
+            has_waves = True
+    if not has_waves:
+        return
+    frame = view.frame
+    eye = view.eye
+    columns = np.empty(NUM_LANES, np.int32)
+    rows = np.empty(NUM_LANES, np.int32)
+    steps = np.empty(3 * NUM_LANES, np.float32)
+    limit = splat(1e9)
+    corners = np.empty(8, np.float32)
+    for octave in range(count):
+        wave_m = octaves[octave, 0]
+        cosine = octaves[octave, 1]
+        sine_angle = octaves[octave, 2]
+        per_cell = 2.0 / wave_m
+        # Coordinates in the lattice are linear in the place; those of the eye lose whole cells.
+        x0 = (cosine * eye[0] - sine_angle * eye[1]) * per_cell
+        y0 = (sine_angle * eye[0] + cosine * eye[1]) * per_cell
+        first_column = np.int64(math.floor(x0))
+        first_row = np.int64(math.floor(y0))
+        x0 -= math.floor(x0)
+        y0 -= math.floor(y0)
+        xx = splat((cosine * frame[0, 0] - sine_angle * frame[0, 1]) * per_cell)
+        xy = splat((cosine * frame[1, 0] - sine_angle * frame[1, 1]) * per_cell)
+        xz = splat((cosine * frame[2, 0] - sine_angle * frame[2, 1]) * per_cell)
+        yx = splat((sine_angle * frame[0, 0] + cosine * frame[0, 1]) * per_cell)
+        yy = splat((sine_angle * frame[1, 0] + cosine * frame[1, 1]) * per_cell)
+        yz = splat((sine_angle * frame[2, 0] + cosine * frame[2, 1]) * per_cell)
+        key = keys[octave]
+        last_column = np.int32(-(2**31))
+        last_row = np.int32(-(2**31))
+        for first in range(Index(0), size, Index(NUM_LANES)):
+            # Waves shorter than two pixels are roughness.
+            weight = v8.load(weights, first) * splat(wave_m) - half
+            weight = v8.minimum(v8.maximum(weight, zero), unit)
+            lanes = v8.mask_bits(v8.greater(weight, zero))
+            if lanes == Index(0):
                 continue
-            x = (j + 0.5 - lens[2]) * lens[0]
-            ray_x = axes[0, 0] * x + axes[0, 1] * y + axes[0, 2]
-            ray_y = axes[1, 0] * x + axes[1, 1] * y + axes[1, 2]
-            ray_z = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2]
-            length = math.sqrt(ray_x * ray_x + ray_y * ray_y + ray_z * ray_z)
-            sine = abs(ray_x * up[0] + ray_y * up[1] + ray_z * up[2]) / length
-            footprint_m = z * length * lens[1] / max(sine, 1e-3)
-            m2 = np.float64(roughness[i, j]) ** 2
-            variance = 0.5 * m2 * resolved[i, j] / count
-            deviation = PER_DEVIATION * math.sqrt(variance)
-            world_x = eye[0] + z * ray_x
-            world_y = eye[1] + z * ray_y
-            tilt_x = 0.0
-            tilt_y = 0.0
-            for octave in range(count):
-                wave_m = octaves[octave, 0]
-                # Waves shorter than two pixels are roughness.
-                weight = min(max(0.5 * wave_m / footprint_m - 0.5, 0.0), 1.0)
-                if weight <= 0:
-                    continue
-                cosine = octaves[octave, 1]
-                sine_angle = octaves[octave, 2]
-                per_cell = 2.0 / wave_m
-                first, second = _noise(
-                    (cosine * world_x - sine_angle * world_y) * per_cell,
-                    (sine_angle * world_x + cosine * world_y) * per_cell,
-                    keys[octave],
-                )
-                tilt_x += weight * deviation * first
-                tilt_y += weight * deviation * second
-                m2 -= weight * weight * 2.0 * variance
-            tilts[i, j, 0] = np.float32(tilt_x)
-            tilts[i, j, 1] = np.float32(tilt_y)
-            roughness[i, j] = np.float32(math.sqrt(m2))
+            px = v8.load(pixels, first)
+            py = v8.load(pixels, first + size)
+            pz = v8.load(pixels, first + size + size)
+            deviation = weight * v8.load(deviations, first)
+            at = first + Index(_ROUGHNESS2) * size
+            m2 = v8.load(pixels, at) - splat(2) * deviation * deviation
+            v8.store(pixels, at, v8.maximum(m2, zero))
+            x = dot(px, py, pz, xx, xy, xz) + splat(x0)
+            y = dot(px, py, pz, yx, yy, yz) + splat(y0)
+            j = v8.floor(v8.minimum(v8.maximum(x, v8.negate(limit)), limit))
+            i = v8.floor(v8.minimum(v8.maximum(y, v8.negate(limit)), limit))
+            v8.store_integers(columns, Index(0), j)
+            v8.store_integers(rows, Index(0), i)
+            u = x - j
+            v = y - i
+            v8.store(steps, Index(0), u * u * v8.fmuladd(splat(-2), u, splat(3)))
+            v8.store(steps, Index(NUM_LANES), v * v * v8.fmuladd(splat(-2), v, splat(3)))
+            v8.store(steps, Index(2 * NUM_LANES), deviation * splat(PER_DEVIATION))
+            while lanes != Index(0):
+                lane = v8.lowest_bit(lanes)
+                lanes &= lanes - Index(1)
+                if columns[lane] != last_column or rows[lane] != last_row:
+                    last_column = columns[lane]
+                    last_row = rows[lane]
+                    _read_cell(first_column + last_column, first_row + last_row, key, corners)
+                a = steps[lane]
+                b = steps[lane + Index(NUM_LANES)]
+                scale = steps[lane + Index(2 * NUM_LANES)]
+                slope = corners[0] + corners[1] * a + (corners[2] + corners[3] * a) * b
+                tilts[first + lane] += scale * slope
+                slope = corners[4] + corners[5] * a + (corners[6] + corners[7] * a) * b
+                tilts[size + first + lane] += scale * slope
+
+
+@kernel_function()
+def _read_cell(column, row, key, corners):
+    """Write both numbers' value at a cell's corner, and their changes to the other corners."""
+    a = _corner(column, row, key)
+    b = _corner(column + 1, row, key)
+    c = _corner(column, row + 1, key)
+    d = _corner(column + 1, row + 1, key)
+    corners[0] = a[0]
+    corners[1] = b[0] - a[0]
+    corners[2] = c[0] - a[0]
+    corners[3] = a[0] - b[0] - c[0] + d[0]
+    corners[4] = a[1]
+    corners[5] = b[1] - a[1]
+    corners[6] = c[1] - a[1]
+    corners[7] = a[1] - b[1] - c[1] + d[1]

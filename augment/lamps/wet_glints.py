@@ -23,8 +23,11 @@ from jaxtyping import Float32, Float64
 from augment.lamps import wet_glint_kernels
 from augment.lamps.beam_shadows import BeamShadows
 from augment.lamps.lamp import Lamps
+from augment.lamps.lamp_lanes import lamp_table, pattern_starts
 from augment.lamps.patterns import pattern_value
-from augment.lamps.surface_light import lamp_arrays, shadow_arrays
+from augment.lamps.road_unevenness import wave_keys, wave_octaves
+from augment.lamps.surface_light import shadow_arrays
+from augment.lamps.water_tile_kernels import TILE_PX, WaterArrays, WaterView
 from augment.lamps.wet_glint_kernels import (
     MAX_EXPONENT,
     MAX_PIXEL_TILT2,
@@ -32,7 +35,7 @@ from augment.lamps.wet_glint_kernels import (
     PIXEL_BLUR,
     REFRACTION_INDEX,
 )
-from augment.lamps.wet_surface import WetSurface
+from augment.lamps.wet_surface import WetRoad, WetSurface
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
@@ -41,7 +44,7 @@ def add_wet_glints(
     picture: Float32[np.ndarray, "H W 3"],
     lamps: Lamps,
     camera: Camera,
-    water: WetSurface,
+    water: WetSurface | WetRoad,
     *,
     extinctions_per_m: Float64[np.ndarray, "M"] | float = 0.0,
     min_luminance_cd_m2: float = 1e-4,
@@ -54,7 +57,7 @@ def add_wet_glints(
         picture: luminance in linear sRGB, cd/m2.
         lamps: the lamps.
         camera: camera of the picture.
-        water: the water.
+        water: the water, or a road under a film of water.
         extinctions_per_m: extinction of the air between each lamp and the water.
         min_luminance_cd_m2: luminance that need not be added.
         lamps_per_pixel: largest number of lamps that glint in a tile.
@@ -70,28 +73,66 @@ def add_wet_glints(
     if not len(lamps) or not water.share.any():
         return
     pose = camera.world_from_camera.numpy()
-    arrays = lamp_arrays(lamps, extinctions_per_m, shadows)._replace(softening=lamps.radii_m**2)
-    with kernel_threads(water.share.shape[0] // wet_glint_kernels.TILE_PX + 1):
+    frame = water_frame(water.up)
+    eye = np.ascontiguousarray(pose[:3, 3])
+    view = WaterView(
+        np.array([1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy]),
+        np.ascontiguousarray(frame @ pose[:3, :3]),
+        frame,
+        eye,
+    )
+    maps = np.full(len(lamps), -1, np.int64) if shadows is None else shadows.maps_of(lamps)
+    with kernel_threads(water.share.shape[0] // TILE_PX + 1):
         wet_glint_kernels.add_glints(
-            *(
-                np.require(image, np.float32, ["C", "W"])
-                for image in (water.share, water.roughness, water.depth_m)
-            ),
-            _no_tilts() if water.tilts is None else np.require(water.tilts, np.float32, ["C", "W"]),
-            np.array([1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy]),
-            np.ascontiguousarray(pose[:3, :3]),
-            np.ascontiguousarray(pose[:3, 3]),
-            np.array(water.up, np.float64),
-            arrays,
+            _water_arrays(water),
+            view,
+            lamp_table(lamps, extinctions_per_m, lamps.radii_m**2, frame, eye),
+            np.require(lamps.tables, np.float32, ["C", "W"]),
+            pattern_starts(lamps),
+            maps,
             shadow_arrays(shadows),
-            min_luminance_cd_m2,
+            float(min_luminance_cd_m2),
             lamps_per_pixel,
             picture,
         )
 
 
-def _no_tilts() -> np.ndarray:
-    return np.zeros((0, 0, 2), np.float32)
+def water_frame(up: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
+    """Return x, y and z of a frame whose z is a normal, in the world; x is nearest to the world's.
+
+    Args:
+        up: unit normal of water, which is about level.
+    """
+    z = np.array(up, np.float64)
+    x = np.array([1.0, 0.0, 0.0]) - z[0] * z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _water_arrays(water: WetSurface | WetRoad) -> WaterArrays:
+    """Return the water as the kernel takes it."""
+    roughness = np.zeros((0, 0), np.float32)
+    tilts = np.zeros((0, 0, 2), np.float32)
+    film = np.zeros((0, 0, 3), np.float32)
+    if isinstance(water, WetRoad):
+        film = water.film
+    else:
+        roughness = water.roughness
+        tilts = tilts if water.tilts is None else water.tilts
+    return WaterArrays(
+        _writable(water.share),
+        _writable(water.depth_m),
+        _writable(roughness),
+        _writable(tilts),
+        _writable(film),
+        wave_octaves(),
+        wave_keys(),
+    )
+
+
+def _writable(image: np.ndarray) -> np.ndarray:
+    """Return an image as kernels are compiled for: contiguous float32 that may be written."""
+    return np.require(image, np.float32, ["C", "W"])
 
 
 # ---- Definition ----------------------------------------------------------------------------------

@@ -2,19 +2,61 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import torch
 
-from augment.effects.falling.air import Precipitation, cell_walk, find_drops
-from augment.effects.falling.drop_covers import LIT_DISTANCES_M, cover_of_drops
+from augment.effects.falling.air import Precipitation, cell_walk, compute_clear_share, find_drops
+from augment.effects.falling.drop_covers import LIT_DISTANCES_M, DropsInRanges, cover_of_drops
 from augment.effects.falling.shutter import STANDING
-from augment.lamps.drop_cover import DropCover
 from augment.lamps.drop_light import CELL_PX, add_drop_light, cell_luminance, phase_function
 from augment.lamps.lamp import Lamps
 from augment.lamps.patterns import Pattern
 from tests.lamp_scenes import camera_at, lamps_at
+
+
+@dataclass(frozen=True)
+class PlainCover:
+    """Drops that cover a known share of each pixel: the definition of `DropCover.add_light`."""
+
+    covers: np.ndarray
+    """Share of each pixel that drops of each range cover, [K, H, W]."""
+    distances_m: np.ndarray
+    """Distance of each range."""
+    is_snow: bool
+    """True for flakes."""
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        return self.covers.shape[1:]
+
+    @property
+    def has_drops(self) -> bool:
+        return bool(self.covers.any())
+
+    def add_light(self, picture: np.ndarray, cells: np.ndarray, step_px: int) -> None:
+        height, width = self.size_px
+        rows = -(-height // step_px)
+        columns = -(-width // step_px)
+        v = np.clip((np.arange(height) + 0.5) / step_px - 0.5, 0, rows - 1)
+        u = np.clip((np.arange(width) + 0.5) / step_px - 0.5, 0, columns - 1)
+        clear = np.ones((height, width))
+        for cover, light in zip(self.covers, cells.astype(np.float64), strict=True):
+            by_row = np.array([_lerp(light[..., :columns], y) for y in v])  # [H, 3, w]
+            by_pixel = np.array([_lerp(np.moveaxis(by_row, 2, 0), x) for x in u])  # [W, H, 3]
+            picture += ((clear * cover)[..., None] * by_pixel.swapaxes(0, 1)).astype(np.float32)
+            clear *= 1 - cover
+
+
+def _lerp(values: np.ndarray, place: float) -> np.ndarray:
+    """Return what lies at a place between the rows of an array."""
+    i = min(int(place), max(len(values) - 2, 0))
+    beside = min(i + 1, len(values) - 1)
+    return values[i] + (values[beside] - values[i]) * (place - i)
 
 
 @pytest.mark.parametrize("is_snow", [False, True])
@@ -50,7 +92,7 @@ def test_kernel_equals_definition(is_snow: bool) -> None:
         picture,
         lamps,
         camera,
-        DropCover(covers, distances, is_snow),
+        PlainCover(covers, distances, is_snow),
         extinction_per_m=sigma,
         min_luminance_cd_m2=0.0,
     )
@@ -74,32 +116,38 @@ def test_kernel_equals_definition(is_snow: bool) -> None:
     assert (picture[:, 1::2] <= picture[:, ::2]).all()
 
 
-def test_covers_are_those_of_the_drops_that_are_drawn() -> None:
-    camera = camera_at(1.5, width=160, height=96, focal_px=120)
-    rain = Precipitation("rain", 30.0, (0.0, 0.0), 0.0, 3, 0.01, 0.5, None)
-    alpha, depth = (np.ones((96, 160), np.float32), np.full((96, 160), 5.0, np.float32))
-    cover = _cover(rain, camera, alpha, depth)
-    assert cover.covers.shape == (len(LIT_DISTANCES_M), 96, 160)
-    assert cover.covers[0].any()
-    assert not cover.covers[3:].any()  # behind the surface at 5 m
-    assert ((cover.covers >= 0) & (cover.covers <= 1)).all()
-    np.testing.assert_array_equal(cover.covers, _cover(rain, camera, alpha, depth).covers)
-
-
-def _cover(rain: Precipitation, camera, alpha: np.ndarray, depth: np.ndarray) -> DropCover:
-    import torch
-
+@pytest.mark.parametrize("width", [160, 93, 5])
+def test_drops_shine_as_their_covers_say(width: int) -> None:
+    camera = camera_at(1.5, width=width, height=90, focal_px=120)
+    rain = Precipitation("rain", 80.0, (2.0, 0.0), 0.0, 3, 0.01, 0.5, None)
+    alpha, depth = (np.ones((90, width), np.float32), np.full((90, width), 5.0, np.float32))
     drops = find_drops(cell_walk(rain, camera, STANDING, "street"))
-    images = torch.from_numpy(alpha), torch.from_numpy(depth)
-    return cover_of_drops(drops, *images, camera, is_snow=False)
+    cover = cover_of_drops(drops, *map(torch.from_numpy, (alpha, depth)), is_snow=False)
+    assert cover.size_px == (90, width)
+    covers = []
+    for start, end in itertools.pairwise([0, *cover.ends]):
+        part = np.ascontiguousarray(cover.drops[start:end])
+        covers.append(1 - compute_clear_share(part, alpha, depth))
+    assert covers[0].any()
+    assert not np.any(covers[3:])  # behind the surface at 5 m
+    shape = (len(LIT_DISTANCES_M), -(-90 // CELL_PX), 3, -(-width // CELL_PX) + 3)
+    cells = np.random.default_rng(1).uniform(0, 5, shape).astype(np.float32)
+    pictures = np.zeros((3, 90, width, 3), np.float32)
+    cover.add_light(pictures[0], cells, CELL_PX)
+    cover.add_light(pictures[1], cells, CELL_PX)
+    PlainCover(np.array(covers), cover.distances_m, False).add_light(pictures[2], cells, CELL_PX)
+    np.testing.assert_array_equal(pictures[0], pictures[1])
+    np.testing.assert_allclose(pictures[0], pictures[2], atol=2e-6)  # float32
+    empty = DropsInRanges(drops[:0], 0 * cover.ends, alpha, depth, False, LIT_DISTANCES_M)
+    assert not empty.has_drops
 
 
 def test_no_lamps_and_no_drops_change_nothing() -> None:
     camera = camera_at(1.5, width=32, height=32, focal_px=50)
     picture = np.full((32, 32, 3), 0.25, np.float32)
     before = picture.copy()
-    nothing = DropCover(np.zeros((1, 32, 32), np.float32), np.ones(1), False)
-    some = DropCover(np.ones((1, 32, 32), np.float32), np.ones(1), False)
+    nothing = PlainCover(np.zeros((1, 32, 32), np.float32), np.ones(1), False)
+    some = PlainCover(np.ones((1, 32, 32), np.float32), np.ones(1), False)
     add_drop_light(picture, lamps_at([(5, 0, 2)]), camera, nothing)
     add_drop_light(picture, Lamps.none(), camera, some)
     np.testing.assert_array_equal(picture, before)

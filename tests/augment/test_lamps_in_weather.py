@@ -11,6 +11,7 @@ from augment.effects.wet.film_kernels import ASPHALT_ROUGHNESS
 from augment.effects.wet.ground_map import NO_PUDDLES
 from augment.effects.wet.mirroring_film import mirroring_film
 from augment.effects.wet.reflection import Film, Plane
+from augment.lamps.road_unevenness import water_of_road
 from augment.light.srgb import linear_from_display
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
@@ -119,7 +120,8 @@ def test_a_wet_road_is_as_rough_as_its_slopes_have_variance() -> None:
     share = (depth > 0).float()
     film = Film(1.0, NO_PUDDLES, NO_RINGS)
     plane = Plane((0.0, 0.0, 1.0), 0.0)
-    water = mirroring_film(camera, depth, share, flat_map(), film, plane, 0.0)
+    road = mirroring_film(camera, depth, share, flat_map(), film, plane, 0.0)
+    water = water_of_road(road, camera)
     is_water = water.share > 0
     m = np.sqrt(2) * ASPHALT_ROUGHNESS
     assert (water.roughness[is_water] <= m * (1 + 1e-5)).all()

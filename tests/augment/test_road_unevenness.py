@@ -33,7 +33,7 @@ def test_waves_have_a_standard_deviation_of_1():
         np.testing.assert_allclose(slopes.mean(axis=0), 0, atol=0.02)
 
 
-def test_the_kernel_sums_the_waves_that_are_longer_than_two_pixels():
+def test_a_road_sums_the_waves_that_are_longer_than_two_pixels():
     camera, water = _road()
     uneven = make_uneven(water, camera, np.full(water.share.shape, 0.6, np.float32))
     rays = camera.ray_directions().double().numpy()

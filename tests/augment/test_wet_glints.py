@@ -9,8 +9,9 @@ import pytest
 
 from augment.lamps.lamp import Lamps
 from augment.lamps.patterns import Pattern
+from augment.lamps.road_unevenness import water_of_road
 from augment.lamps.wet_glints import add_wet_glints, fresnel_reflectance, glint_luminance
-from augment.lamps.wet_surface import WetSurface
+from augment.lamps.wet_surface import WetRoad, WetSurface
 from augment.scene.cameras import Camera
 from tests.lamp_scenes import camera_at, lamps_at, road_depth
 
@@ -24,7 +25,9 @@ def flat_water(camera: Camera, m: float, share: float = 1.0) -> WetSurface:
     return WetSurface(water, np.full_like(water, m), depth, (0.0, 0.0, 1.0))
 
 
-def glints(lamps: Lamps, camera: Camera, water: WetSurface, **options: float) -> np.ndarray:
+def glints(
+    lamps: Lamps, camera: Camera, water: WetSurface | WetRoad, **options: float
+) -> np.ndarray:
     picture = np.zeros((camera.height, camera.width, 3), np.float32)
     add_wet_glints(picture, lamps, camera, water, min_luminance_cd_m2=1e-6, **options)
     return picture
@@ -136,20 +139,34 @@ def test_dry_pixels_keep_their_bits() -> None:
     assert picture.any()
 
 
-def test_nearer_water_hides_the_one_behind() -> None:
-    camera = camera_at(EYE_M, width=8, height=6, focal_px=6, pitch_deg=40)
-    film = flat_water(camera, 0.1, 0.7)
-    flood = flat_water(camera, 0.02)
-    share = flood.share.copy()
-    share[3:] = 0
-    tilts = np.ones((6, 8, 2), np.float32)
-    flood = WetSurface(share, flood.roughness, flood.depth_m, flood.up, tilts)
-    both = flood.before(film)
-    np.testing.assert_array_equal(both.share[3:], film.share[3:])
-    np.testing.assert_array_equal(both.roughness[:3][share[:3] > 0], np.float32(0.02))
-    assert both.tilts is not None
-    assert not both.tilts[3:].any()
-    assert flood.before(None) is flood
+def test_road_shines_as_the_water_that_the_definition_puts_on_it() -> None:
+    camera = camera_at(EYE_M, width=150, height=110, focal_px=220, pitch_deg=12)
+    depth = road_depth(camera)
+    rng = np.random.default_rng(8)
+    film = np.empty((28, 38, 3), np.float32)
+    film[..., 0] = rng.uniform(0.03, 0.15, film.shape[:2])
+    film[..., 1] = rng.uniform(0.5, 1, film.shape[:2])
+    film[..., 2] = rng.uniform(0, 0.25, film.shape[:2])
+    share = np.where(depth > 0, 0.8, 0).astype(np.float32)
+    slope = np.array([0.01, -0.02, 1]) / math.hypot(0.01, 0.02, 1)
+    road = WetRoad(share, depth, film, (slope[0], slope[1], slope[2]))
+    lamps = lamps_at([(9, 1, 5), (14, -2, 0.7)], candela=3000)
+    water = water_of_road(road, camera)
+    assert water.tilts is not None and water.tilts.any()
+    picture = glints(lamps, camera, road)
+    expected = glint_luminance(lamps, camera, water) @ lamps.colors
+    # Places and lattices are in float32, which turns the finest waves by 1e-4 of their height.
+    np.testing.assert_allclose(picture, expected, rtol=3e-3, atol=1e-3 * expected.max())
+    assert np.abs(picture - expected).mean() < 1e-4 * expected.mean()
+
+
+def test_water_without_some_pixels_keeps_the_others() -> None:
+    water = flat_water(camera_at(EYE_M, width=8, height=6, focal_px=6, pitch_deg=40), 0.1, 0.7)
+    pixels = np.zeros((6, 8), bool)
+    pixels[3:] = True
+    part = water.without(pixels)
+    assert not part.share[3:].any()
+    np.testing.assert_array_equal(part.share[:3], water.share[:3])
 
 
 def test_images_of_other_sizes_are_refused() -> None:

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
 from augment.effects.falling import drop_kernels
@@ -281,8 +281,15 @@ def find_drops(walk: CellWalk) -> Float32[np.ndarray, "N 9"]:
     return np.concatenate([drops[o : o + c] for o, c in zip(offsets, counts, strict=True)])
 
 
-def _list_drops(drops: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return drops, listed and begins as drop_kernels.cover_pixels takes them."""
+def list_drops(
+    drops: Float32[np.ndarray, "N 9"], height: int
+) -> tuple[Float32[np.ndarray, "N 9"], Int64[np.ndarray, "L"], Int64[np.ndarray, "B"]]:
+    """Return drops, listed and begins as drop_kernels.cover_pixels takes them.
+
+    Args:
+        drops: the drops, as `find_drops` gives them.
+        height: height of the picture.
+    """
     bands = -(-height // drop_kernels.ROWS)
     begins = np.empty(bands + 1, np.int64)
     listed = np.empty(4 * len(drops), np.int64)
@@ -297,16 +304,20 @@ def compute_clear_share(
     drops: Float32[np.ndarray, "N 9"], alpha: np.ndarray, depth: np.ndarray
 ) -> Float32[np.ndarray, "H W"]:
     """Return the share of each pixel that no drop covers. alpha, depth: float32 [H, W]."""
-    surfaces = [_padded(image) for image in (alpha, depth)]
+    surfaces = [padded_image(image) for image in (alpha, depth)]
     clear = np.empty_like(surfaces[0])
     with kernel_threads(1):
         flat = (image.reshape(-1) for image in surfaces)
-        drop_kernels.cover_pixels(*_list_drops(drops, len(depth)), *flat, clear)
+        drop_kernels.cover_pixels(*list_drops(drops, len(depth)), *flat, clear)
     return clear[:, : depth.shape[1]]
 
 
-def _padded(image: np.ndarray) -> np.ndarray:
-    """Return the image, contiguous and padded to the width that kernels need."""
+def padded_image(image: np.ndarray) -> np.ndarray:
+    """Return the image, contiguous and padded to the width that kernels need.
+
+    Args:
+        image: [H, W], or [H, W, C].
+    """
     missing = max(0, NUM_LANES - image.shape[1])
     if missing:
         image = np.pad(image, [(0, 0), (0, missing)] + [(0, 0)] * (image.ndim - 2))
@@ -400,12 +411,12 @@ def draw_falling(
         if splats is None
         else splats.detach().numpy()
     )
-    padded, *surfaces = (_padded(image) for image in (picture, splat_colors, *surfaces))
+    padded, *surfaces = (padded_image(image) for image in (picture, splat_colors, *surfaces))
     mask = np.empty(padded.shape[:2], bool)
     with kernel_threads(1):
         drop_kernels.blend_falling(
             *(image.reshape(-1) for image in (padded, *surfaces)),
-            *_list_drops(drops, len(mask)),
+            *list_drops(drops, len(mask)),
             np.float32(CLEAR),
             *veil._replace(upwards=veil.upwards[()]),
             mask,

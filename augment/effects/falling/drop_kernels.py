@@ -478,6 +478,102 @@ def cover_pixels(drops, listed, begins, alpha, depth, clear):
 
 
 @kernel_function()
+def _light_row(row, width, clear, first, before, cells, step, picture):
+    """Add the light of a range's drops to a row of the picture, and note what they hide.
+
+    Args:
+        row: row of the picture.
+        width: its width.
+        clear: share of each pixel that the drops leave, from index `first` on.
+        first: index of the row's first pixel in `clear` and `before`.
+        before: share of each pixel that nearer drops leave, changed in place.
+        cells: luminance of the range's drops, [h, 3, w].
+        step: side of a cell.
+        picture: the picture, [H, W, 3], changed in place.
+    """
+    rows = cells.shape[0]
+    unit = np.float32(1)
+    zero = np.float32(0)
+    last_column = max((width + step - 1) // step - 1, 0)
+    v = min(
+        max((np.float32(row) + np.float32(0.5)) / np.float32(step) - np.float32(0.5), zero),
+        np.float32(rows - 1),
+    )
+    i = min(int(v), max(rows - 2, 0))
+    v -= np.float32(i)
+    below = min(i + 1, rows - 1)
+    for start in range(0, width, NUM_LANES):
+        end = min(start + NUM_LANES, width)
+        if end - start == NUM_LANES:
+            eight = v8.load(clear, first + Index(start))
+            if v8.mask_bits(v8.greater(v8.broadcast(unit), eight)) == Index(0):
+                continue
+        # Eight pixels lie between the same cells.
+        u = (np.float32(start) + np.float32(0.5)) / np.float32(step) - np.float32(0.5)
+        j = min(max(math.floor(u), 0), max(last_column - 1, 0))
+        beside = min(j + 1, last_column)
+        red = cells[i, 0, j] + (cells[below, 0, j] - cells[i, 0, j]) * v
+        green = cells[i, 1, j] + (cells[below, 1, j] - cells[i, 1, j]) * v
+        blue = cells[i, 2, j] + (cells[below, 2, j] - cells[i, 2, j]) * v
+        more_red = cells[i, 0, beside] + (cells[below, 0, beside] - cells[i, 0, beside]) * v - red
+        more_green = (
+            cells[i, 1, beside] + (cells[below, 1, beside] - cells[i, 1, beside]) * v - green
+        )
+        more_blue = cells[i, 2, beside] + (cells[below, 2, beside] - cells[i, 2, beside]) * v - blue
+        for column in range(start, end):
+            pixel = first + Index(column)
+            cover = unit - clear[pixel]
+            if cover <= zero:
+                continue
+            u = (np.float32(column) + np.float32(0.5)) / np.float32(step) - np.float32(0.5)
+            u = min(max(u, zero), np.float32(last_column)) - np.float32(j)
+            weight = before[pixel] * cover
+            before[pixel] *= clear[pixel]
+            picture[row, column, 0] += weight * (red + more_red * u)
+            picture[row, column, 1] += weight * (green + more_green * u)
+            picture[row, column, 2] += weight * (blue + more_blue * u)
+
+
+@kernel
+def add_lit_drops(drops, listed, begins, ends, alpha, depth, padded_width, cells, step, picture):
+    """Add the light of drops in ranges of distances to a picture, in place.
+
+    Args:
+        drops: result of find_drops, nearest range first; they count in their order.
+        listed: result of list_drops.
+        begins: result of list_drops.
+        ends: number of drops up to the end of each range, int64 [K].
+        alpha: opacity of the surfaces, flat, [H padded_width].
+        depth: z of the surfaces; 0 without a surface.
+        padded_width: width of the images, at least NUM_LANES.
+        cells: luminance of drops in cells of the picture, float32 [K, h, 3, w].
+        step: side of a cell, pixels, a multiple of 2 NUM_LANES.
+        picture: luminance, float32 [H, W, 3], changed in place.
+    """
+    height, width = picture.shape[:2]
+    for band in prange(len(begins) - 1):
+        if begins[band] == begins[band + 1]:
+            continue
+        top = np.int64(band) * ROWS
+        bottom = min(top + ROWS, height)
+        clear = np.empty(ROWS * padded_width, np.float32)
+        before = np.ones(ROWS * padded_width, np.float32)
+        position = begins[band]
+        for k in range(len(ends)):
+            first = position
+            while position < begins[band + 1] and listed[position] < ends[k]:
+                position += 1
+            if position == first:
+                continue
+            _cover_band(
+                drops, listed, first, position, top, bottom, padded_width, alpha, depth, clear
+            )
+            for row in range(top, bottom):
+                start = Index((row - top) * padded_width)
+                _light_row(row, width, clear, start, before, cells[k], step, picture)
+
+
+@kernel_function()
 def _classes_in_row(nearest, bands, partial):
     """Sort the classes of blend_falling's bands for one image row.
 

@@ -210,7 +210,7 @@ def _draw_over(
         return view
     with timed(f"{effect.hooks.name}: drops under lamps"):
         is_snow = effect.settings.kind == "snow"
-        cover = cover_of_drops(drops, alpha, depth, camera, is_snow=is_snow)
+        cover = cover_of_drops(drops, alpha, depth, is_snow=is_snow)
     return replace(view, drop_covers=(*view.drop_covers, cover))
 
 

@@ -136,7 +136,8 @@ class FloodEffect(Effect):
         view = RenderedView(image.rgb, image.scene, layers, {"water": image.water}, skip_reasons)
         if not layers.needs_lamp_inputs:
             return view
-        return replace(view, wet_surface=mirroring_water(image, camera, medium.level_z_m))
+        water = mirroring_water(image, camera, medium.level_z_m)
+        return view if water is None else replace(view, waters=(water,))
 
     def front_surface(self, effect: EffectInScene, camera: Camera) -> FrontSurface | None:
         if _is_under(effect.settings, camera):  # from below, the surface has no depth

@@ -140,11 +140,7 @@ def add_lamp_light(
 
 def _without_water(view: RenderedView, pixels: Bool[np.ndarray, "H W"]) -> RenderedView:
     """Return the view without water at some pixels."""
-    water = view.wet_surface
-    if water is None:
-        return view
-    share = np.where(pixels, np.float32(0), water.share)
-    return replace(view, wet_surface=replace(water, share=share))
+    return replace(view, waters=tuple(water.without(pixels) for water in view.waters))
 
 
 def _without_mirror(
@@ -156,7 +152,11 @@ def _without_mirror(
         return rgb
     if color_map is not None:
         mirrored = mirrored @ color_map[:, :3].to(mirrored).T
-    return np.maximum(rgb - mirrored.detach().cpu().numpy(), np.float32(0))
+    out = rgb.copy()
+    rows = out[slice(*view.mirrored_rows)]
+    rows -= mirrored.detach().cpu().numpy()
+    np.maximum(rows, np.float32(0), out=rows)
+    return out
 
 
 def _airlight(view: RenderedView, color_map: Tensor | None) -> tuple[float, float, float]:
@@ -255,19 +255,20 @@ def _add_surface_light(
     if not plan.is_wet:
         return
     with timed(WET):
-        if view.wet_surface is None:
+        if not view.waters:
             return
         glints = added if fog_share is None else np.zeros_like(added)
-        add_wet_glints(
-            glints,
-            lamps,
-            camera,
-            view.wet_surface,
-            extinctions_per_m=extinctions_per_m,
-            min_luminance_cd_m2=threshold_cd_m2,
-            lamps_per_pixel=plan.lamps_per_pixel,
-            shadows=shadows,
-        )
+        for water in view.waters:
+            add_wet_glints(
+                glints,
+                lamps,
+                camera,
+                water,
+                extinctions_per_m=extinctions_per_m,
+                min_luminance_cd_m2=threshold_cd_m2,
+                lamps_per_pixel=plan.lamps_per_pixel,
+                shadows=shadows,
+            )
         if fog_share is not None:
             added += glints * (1 - np.clip(fog_share, 0, 1))[..., None]
 

@@ -207,7 +207,8 @@ class WetEffect(Effect):
             film = Film(
                 data.wetness, effect.prepared_data.find_puddle_threshold(data.puddle_share), rings
             )
-            unmirrored_rgb = rgb.clone() if view.layers.needs_lamp_inputs else None
+            ground_rows = slice(*rows)
+            unmirrored_rgb = rgb[ground_rows].clone() if view.layers.needs_lamp_inputs else None
             rgb = shade_wet(
                 rgb,
                 camera,
@@ -222,11 +223,14 @@ class WetEffect(Effect):
         if unmirrored_rgb is None:
             return view
         with timed("wet ground: water under lamps"):
-            water = mirroring_film(
+            road = mirroring_film(
                 camera, depth, share, effect.prepared_data, film, plane, data.rate_mm_h
             )
-        mirrored_rgb = rgb - unmirrored_rgb
-        return replace(view, wet_surface=water.before(view.wet_surface), mirrored_rgb=mirrored_rgb)
+            far_waters = (water.without(road.share > 0) for water in view.waters)
+            mirrored_rgb = rgb[ground_rows] - unmirrored_rgb
+        return replace(
+            view, waters=(*far_waters, road), mirrored_rgb=mirrored_rgb, mirrored_rows=rows
+        )
 
     def attenuate_beams(
         self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator

@@ -16,12 +16,18 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
 from augment.effects.gradient_noise import draw_octaves, sum_octaves
-from augment.effects.wet.film_kernels import EXPOSURE, HEIGHT, NUM_CHANNELS
+from augment.effects.wet.film_kernels import (
+    EXPOSURE,
+    HEIGHT,
+    NUM_CHANNELS,
+    PUDDLE_ORDER,
+    WHEEL_TRACK,
+)
 from augment.errors import SceneError
 from augment.exposure.cells import ExposedCells
 from augment.exposure.exposed_surface import exposed_surface_of
@@ -98,6 +104,18 @@ class WetGround:
 
         Beyond the map they are those of its border, but not open.
         """
+        values, is_inside = self._interpolate(x_m, y_m, slice(None))
+        values[..., EXPOSURE] *= is_inside
+        return values
+
+    def puddles_and_tracks(self, x_m: Tensor, y_m: Tensor) -> Float[Tensor, "*B 2"]:
+        """Return PUDDLE_ORDER and WHEEL_TRACK as `interpolate` does."""
+        return self._interpolate(x_m, y_m, slice(PUDDLE_ORDER, WHEEL_TRACK + 1))[0]
+
+    def _interpolate(
+        self, x_m: Tensor, y_m: Tensor, channels: slice
+    ) -> tuple[Float[Tensor, "*B C"], Bool[Tensor, "*B"]]:
+        """Return some channels at points, and the points that lie on the map."""
         rows, columns = self.channels.shape[:2]
         x = (x_m - self.left_m) / GROUND_CELL_M - 0.5
         y = (y_m - self.bottom_m) / GROUND_CELL_M - 0.5
@@ -110,12 +128,10 @@ class WetGround:
         v = (y - j)[..., None].float()
         i1 = (i + 1).clamp_max(columns - 1)
         j1 = (j + 1).clamp_max(rows - 1)
-        flat = self.channels.reshape(-1, NUM_CHANNELS)
+        flat = self.channels.reshape(-1, NUM_CHANNELS)[:, channels]
         below = flat[j * columns + i] * (1 - u) + flat[j * columns + i1] * u
         above = flat[j1 * columns + i] * (1 - u) + flat[j1 * columns + i1] * u
-        values = below * (1 - v) + above * v
-        values[..., EXPOSURE] *= is_inside
-        return values
+        return below * (1 - v) + above * v, is_inside
 
     def nearest(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Return the channels of the cells about points; beyond the map, see `interpolate`."""

@@ -8,25 +8,22 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from augment.effects.wet.film_kernels import (
     ASPHALT_ROUGHNESS,
     FILM_SHARE,
-    PUDDLE_ORDER,
     PUDDLE_RIM,
     PUDDLE_ROUGHNESS,
     TRACK_SMOOTHING,
-    WHEEL_TRACK,
 )
 from augment.effects.wet.ground_map import WetGround
 from augment.effects.wet.reflection import Film, Plane
-from augment.lamps.road_unevenness import RESOLVED_SHARE, make_uneven
-from augment.lamps.wet_surface import MIN_ROUGHNESS, WetSurface
+from augment.lamps.road_unevenness import RESOLVED_SHARE
+from augment.lamps.wet_surface import MIN_ROUGHNESS, WetRoad
 from augment.scene.cameras import Camera
 
 # Pixels between those in which the map is looked up.
@@ -45,7 +42,7 @@ def mirroring_film(
     film: Film,
     plane: Plane,
     rate_mm_h: float,
-) -> WetSurface:
+) -> WetRoad:
     """Return the water on the ground of a picture.
 
     Args:
@@ -57,20 +54,69 @@ def mirroring_film(
         plane: plane of the ground in view.
         rate_mm_h: rate of the rain, whose drops stir the film.
     """
-    ground_share = share.detach().cpu().numpy()
-    depth_m = depth.detach().float().cpu().numpy()
+    ground_share = np.ascontiguousarray(share.detach().cpu().numpy(), np.float32)
+    depth_m = np.ascontiguousarray(depth.detach().cpu().numpy(), np.float32)
+    # Pixels in the middle of each STEP_PX x STEP_PX.
     first = STEP_PX // 2
-    few_depths = torch.from_numpy(np.ascontiguousarray(depth_m[first::STEP_PX, first::STEP_PX]))
-    rays = camera.ray_directions(torch.float64)[first::STEP_PX, first::STEP_PX]
-    is_finite = few_depths.isfinite()
-    points = rays * torch.where(is_finite, few_depths, 0.0).double()[..., None]
-    points = points + camera.centre
-    channels = ground.interpolate(points[..., 0], points[..., 1]).numpy()
-    t = (channels[..., PUDDLE_ORDER] - film.puddle_threshold + PUDDLE_RIM) / (2 * PUDDLE_RIM)
+    height = -(-max(camera.height - first, 1) // STEP_PX)
+    width = -(-max(camera.width - first, 1) // STEP_PX)
+    few = np.zeros((height, width, 3), np.float32)
+    rows = _rows_of_ground(ground_share, height)
+    few[rows] = _film_at(camera, depth_m, ground, film, rate_mm_h, rows, width)
+    return WetRoad(ground_share, depth_m, few, plane.up)
+
+
+def _rows_of_ground(share: Float32[np.ndarray, "H W"], height: int) -> slice:
+    """Return the rows of a film's pixels between which ground lies.
+
+    Args:
+        share: share of each pixel that shows open ground.
+        height: number of the film's rows.
+    """
+    rows = np.flatnonzero(share.any(1))
+    if not len(rows):
+        return slice(0, 0)
+    return slice(max(int(rows[0]) // STEP_PX - 1, 0), min(int(rows[-1]) // STEP_PX + 2, height))
+
+
+def _film_at(
+    camera: Camera,
+    depth_m: Float32[np.ndarray, "H W"],
+    ground: WetGround,
+    film: Film,
+    rate_mm_h: float,
+    rows: slice,
+    width: int,
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return the numbers of `WetRoad.film` in some of its rows.
+
+    Args:
+        camera: camera of the picture.
+        depth_m: z of what a pixel shows.
+        ground: map of the ground.
+        film: water on the ground.
+        rate_mm_h: rate of the rain.
+        rows: the film's rows.
+        width: number of the film's columns.
+    """
+    i = np.minimum(STEP_PX // 2 + STEP_PX * np.arange(rows.start, rows.stop), camera.height - 1)
+    j = np.minimum(STEP_PX // 2 + STEP_PX * np.arange(width), camera.width - 1)
+    z = depth_m[i[:, None], j].astype(np.float64)
+    z[~np.isfinite(z)] = 0
+    u = (j + 0.5 - camera.cx) / camera.fx
+    v = ((i + 0.5 - camera.cy) / camera.fy)[:, None]
+    axes = camera.world_from_camera[:3, :3].numpy()
+    x_m, y_m = (
+        torch.from_numpy(z * (axes[k, 0] * u + (axes[k, 1] * v + axes[k, 2]))) + camera.centre[k]
+        for k in range(2)
+    )
+    puddle_order, track = ground.puddles_and_tracks(x_m, y_m).unbind(-1)
+    puddle_order = puddle_order.numpy()
+    track = track.numpy()
+    t = (puddle_order - film.puddle_threshold + PUDDLE_RIM) / (2 * PUDDLE_RIM)
     t = np.clip(t, 0, 1)
     puddle = film.wetness * t * t * (3 - 2 * t)
     stirred_share = min(rate_mm_h / _STIRRING_RATE_MM_H, 1.0)
-    track = channels[..., WHEEL_TRACK]
     # Beckmann's m is sqrt 2 times the standard deviation of slopes along an axis.
     smooth = math.sqrt(2) * ASPHALT_ROUGHNESS
     asphalt = smooth + stirred_share * (max(STIRRED_ROUGHNESS, smooth) - smooth)
@@ -80,12 +126,4 @@ def mirroring_film(
     roughness = asphalt + puddle * (puddle_roughness - asphalt)
     film_share = np.clip(FILM_SHARE + 0.1 * track, 0, 1)
     covered = film.wetness * (film_share + (1 - film_share) * puddle)
-    few = np.stack([roughness, covered, RESOLVED_SHARE * (1 - puddle)], 2).astype(np.float32)
-    images = cv2.resize(few, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
-    water = WetSurface(
-        np.ascontiguousarray(ground_share * images[..., 1], np.float32),
-        np.ascontiguousarray(images[..., 0]),
-        np.where(np.isfinite(depth_m), depth_m, 0).astype(np.float32),
-        plane.up,
-    )
-    return make_uneven(water, camera, np.ascontiguousarray(images[..., 2]))
+    return np.stack([roughness, covered, RESOLVED_SHARE * (1 - puddle)], 2).astype(np.float32)
