@@ -37,7 +37,7 @@ from augment.photo.trust import judge_scene, source_views, unfitted_cameras
 from augment.scene.cameras import scaled_size
 from augment.scene.scene import Scene
 from augment.scene.scene_index import SceneIndex, has_lidar, select_frames
-from recipes.job import ALL_CAMERAS, JobRecipes, JobScene
+from recipes.job import ALL_CAMERAS, JobScene, SceneRecipes
 from recipes.schema import Recipe, parse_frames
 
 # ---- Record of a scene that is not open, and the blocks of images it is cut into -----------------
@@ -310,7 +310,7 @@ class JobPlan:
 
 
 def make_job_plan(
-    recipes: JobRecipes,
+    recipes: SceneRecipes,
     scenes: Sequence[JobScene],
     scene_records: Mapping[tuple[str, str | None], SceneRecord | str],
     backend: str,
