@@ -13,10 +13,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
-from augment.lamps.pattern_kernels import pattern_at
+from augment.lamps.pattern_kernels import COLUMN_SCALE, ROOT, ROOT_OFFSET, ROW_SCALE, pattern_at
+from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel, kernel_function
+from augment.render.layout import Index
 
 TILE = 8  # nodes along a side of a tile, whose nodes share a list of lamps
+TILE_NODES = TILE * TILE  # nodes of a tile
+NODE_LANES = 8  # nodes that are lit at a time
+# Rows of the numbers of a tile, each of TILE_NODES: x, y and z of the points from the eye.
+POINTS = 0
+NORMALS = 3 * TILE_NODES  # x, y and z of the normals
+ROUGH = 6 * TILE_NODES  # cosine to lamps anywhere, of rough surfaces
+SAMPLE_POINTS = 7 * TILE_NODES  # points at which lamps are compared
+SAMPLE_NORMALS = 10 * TILE_NODES  # their normals
+SPARE = 13 * TILE_NODES  # eight numbers that pass between lanes
+LUX = 14 * TILE_NODES  # red, green and blue lux
+OWN_LUX = 17 * TILE_NODES  # the same of own lamps, as signs return it
+NUM_FIELDS = 20  # number of these rows
 # Nodes of a whole tile at which the lamps are compared: corners, middles of the sides, middle.
 SAMPLES = np.array([0, 3, 7, 24, 27, 31, 56, 59, 63])
 # Light that a lamp may have between these points, over the most that it has at one of them.
@@ -314,7 +328,163 @@ def insert_ranked(chosen, scores, number, m, score):
 
 
 @kernel_function()
-def rank_lamps(lamps, points, facings, count, min_lux, min_own_lux, max_lamps, chosen, scores):
+def _number(value):
+    """Return eight copies of a number."""
+    return v8.broadcast(np.float32(value))
+
+
+@kernel_function()
+def _vector(x, y, z):
+    """Return eight copies of a vector."""
+    return _number(x), _number(y), _number(z)
+
+
+@kernel_function()
+def _dot(a, b):
+    """Return the dot products of eight vectors and eight others."""
+    return v8.fmuladd(a[0], b[0], v8.fmuladd(a[1], b[1], a[2] * b[2]))
+
+
+@kernel_function()
+def _load_vectors(numbers, index):
+    """Return eight vectors whose x, y and z lie in three rows of TILE_NODES numbers."""
+    return (
+        v8.load(numbers, Index(index)),
+        v8.load(numbers, Index(index + TILE_NODES)),
+        v8.load(numbers, Index(index + 2 * TILE_NODES)),
+    )
+
+
+@kernel_function()
+def _patterns_of_eight(tables, first, rows, columns, forward, right, up, texels):
+    """Return a pattern's values in eight directions, as `pattern_at` does for one.
+
+    Args:
+        tables: packed patterns, flat.
+        first: index of the pattern's first value.
+        rows: rows of a pattern.
+        columns: columns of a pattern.
+        forward: unit directions from the lamp, along its axis.
+        right: the same, towards the lamp's right.
+        up: the same, along the lamp's upward direction.
+        texels: work space, int32 [8].
+    """
+    zero = _number(0)
+    unit = _number(1)
+    tiny = _number(1e-30)
+    offset = _number(ROOT_OFFSET)
+    root = _number(ROOT)
+    level = v8.sqrt(v8.fmuladd(forward, forward, right * right))
+    rise = v8.absolute(up)
+    fold = rise / v8.maximum(rise + level, tiny)
+    row = (v8.sqrt(fold + offset) - root) * _number(ROW_SCALE)
+    row = v8.select(v8.greater(zero, up), v8.negate(row), row)
+    side = v8.absolute(right)
+    fold = side / v8.maximum(v8.absolute(forward) + side, tiny)
+    fold = v8.select(v8.greater(zero, forward), _number(2) - fold, fold)
+    column = (v8.sqrt(fold + offset) - root) * _number(COLUMN_SCALE)
+    column = v8.select(v8.greater(zero, right), v8.negate(column), column)
+    last_row = _number(rows - 1)
+    last_column = _number(columns - 1)
+    row = v8.minimum(v8.maximum((row + unit) * (_number(0.5) * last_row), zero), last_row)
+    column = (column + unit) * (_number(0.5) * last_column)
+    column = v8.minimum(v8.maximum(column, zero), last_column)
+    i = v8.floor(v8.minimum(row, last_row - unit))
+    j = v8.floor(v8.minimum(column, last_column - unit))
+    v = row - i
+    u = column - j
+    v8.store_integers(texels, Index(0), v8.fmuladd(i, _number(columns), j))
+    below_left = v8.gather(tables, texels, Index(0), Index(1), Index(first))
+    below_right = v8.gather(tables, texels, Index(0), Index(1), Index(first + 1))
+    above_left = v8.gather(tables, texels, Index(0), Index(1), Index(first + columns))
+    above_right = v8.gather(tables, texels, Index(0), Index(1), Index(first + columns + 1))
+    below = v8.fmuladd(below_right - below_left, u, below_left)
+    above = v8.fmuladd(above_right - above_left, u, above_left)
+    return v8.fmuladd(above - below, v, below)
+
+
+@kernel_function()
+def _lux_of_eight(tables, size, lamp, towards, squared, per_m, texels):
+    """Return lux of a lamp on eight surfaces that face it.
+
+    Args:
+        tables: packed patterns, flat.
+        size: rows and columns of a pattern.
+        lamp: result of `_read_near_lamp`.
+        towards: from the surfaces to the lamp, metres.
+        squared: their squared lengths.
+        per_m: one over their lengths.
+        texels: work space, int32 [8].
+    """
+    _, axis, right, up, candela, first, extinction, softening = lamp
+    away = v8.negate(per_m)
+    share = _patterns_of_eight(
+        tables,
+        first,
+        size[0],
+        size[1],
+        _dot(towards, _vector(*axis)) * away,
+        _dot(towards, _vector(*right)) * away,
+        _dot(towards, _vector(*up)) * away,
+        texels,
+    )
+    lux = _number(candela) * share / (squared + _number(softening))
+    if extinction > 0:
+        power = _number(-extinction) * v8.sqrt(squared) * v8.broadcast(v8.LOG2_E)
+        lux = lux * v8.exp2_fine(v8.maximum(power, _number(-126)))
+    return lux
+
+
+@kernel_function()
+def _read_near_lamp(lamps, eye, m):
+    """Return lamp m as `read_lamp` does, its place from the eye and its pattern's first index."""
+    place, axis, right, up, candela, pattern, extinction, softening = read_lamp(lamps, m)
+    first = pattern * lamps.tables.shape[1] * lamps.tables.shape[2]
+    near_place = (place[0] - eye[0], place[1] - eye[1], place[2] - eye[2])
+    return near_place, axis, right, up, candela, first, extinction, softening
+
+
+@kernel_function()
+def _box_of_tile(work, count):
+    """Return the least and the largest x, y and z of a tile's nodes, from the eye."""
+    low = _load_vectors(work, POINTS)
+    high = low
+    for p in range(NODE_LANES, count, NODE_LANES):
+        point = _load_vectors(work, POINTS + p)
+        low = (
+            v8.minimum(low[0], point[0]),
+            v8.minimum(low[1], point[1]),
+            v8.minimum(low[2], point[2]),
+        )
+        high = (
+            v8.maximum(high[0], point[0]),
+            v8.maximum(high[1], point[1]),
+            v8.maximum(high[2], point[2]),
+        )
+    return (
+        (_least(low[0], work), _least(low[1], work), _least(low[2], work)),
+        (_largest(high[0], work), _largest(high[1], work), _largest(high[2], work)),
+    )
+
+
+@kernel_function()
+def _largest(values, work):
+    """Return the largest of eight numbers."""
+    v8.store(work, Index(SPARE), values)
+    largest = work[SPARE]
+    for lane in range(1, NODE_LANES):
+        largest = max(largest, work[SPARE + lane])
+    return largest
+
+
+@kernel_function()
+def _least(values, work):
+    """Return the least of eight numbers."""
+    return -_largest(v8.negate(values), work)
+
+
+@kernel_function()
+def _rank_lamps(lamps, tables, size, eye, work, texels, count, least_lux, chosen, scores, before):
     """Choose the brightest lamps of a tile, brightest first.
 
     Returns:
@@ -322,58 +492,244 @@ def rank_lamps(lamps, points, facings, count, min_lux, min_own_lux, max_lamps, c
 
     Args:
         lamps: the lamps.
-        points: points of the tile, [N, 3].
-        facings: normals at the points, [N, 3].
-        count: number of the points.
-        min_lux: lux of all its points below which a lamp is left out.
-        min_own_lux: the same for lamps of the recording car.
-        max_lamps: largest number of lamps.
+        tables: packed patterns, flat.
+        size: rows and columns of a pattern.
+        eye: place of the eye.
+        work: numbers of the tile.
+        texels: work space, int32 [8].
+        count: number of the tile's nodes.
+        least_lux: lux of all nodes below which a lamp is left out, and the same for lamps of the
+            recording car.
         chosen: output, int64 [max_lamps], indices of the lamps.
         scores: output, float64 [max_lamps], the most lux of each at some of the points.
+        before: lamps of the tile before, which are tried first, and their number as the last.
     """
-    low = np.empty(3)
-    high = np.empty(3)
-    for k in range(3):
-        low[k] = points[0, k]
-        high[k] = points[0, k]
-    for p in range(1, count):
-        for k in range(3):
-            low[k] = min(low[k], points[p, k])
-            high[k] = max(high[k], points[p, k])
+    low, high = _box_of_tile(work, count)
+    for sample in range(2 * NODE_LANES):
+        p = SAMPLES[min(sample, len(SAMPLES) - 1)] * (count - 1) // (TILE_NODES - 1)
+        for k in range(6):
+            work[SAMPLE_POINTS + k * TILE_NODES + sample] = work[POINTS + k * TILE_NODES + p]
+    max_lamps = len(chosen)
     number = 0
     dropped = 0.0
-    for m in range(len(lamps.intensities)):
+    num_before = before[max_lamps]
+    for place in range(num_before + len(lamps.intensities)):
+        m = before[place] if place < num_before else place - num_before
+        is_known = False
+        if place >= num_before:
+            for k in range(num_before):
+                is_known |= before[k] == m
+        if is_known:
+            continue
         squared = 0.0
         for k in range(3):
-            gap = max(low[k] - lamps.positions[m, k], lamps.positions[m, k] - high[k], 0.0)
+            at = lamps.positions[m, k] - eye[k]
+            gap = max(low[k] - at, at - high[k], 0.0)
             squared += gap * gap
-        least = min_own_lux if lamps.is_own[m] else min_lux
+        least = least_lux[1] if lamps.is_own[m] else least_lux[0]
         bound = lamps.peaks[m] / (squared + lamps.softening[m])
-        if bound < least:
-            continue
-        bound *= math.exp(-lamps.extinctions[m] * math.sqrt(squared))
         if bound < least or (number == max_lamps and bound <= dropped):
             continue
-        score = 0.0
-        brightest = 0.0
-        lamp = read_lamp(lamps, m)
-        for sample in range(len(SAMPLES)):
-            p = SAMPLES[sample] * (count - 1) // (TILE * TILE - 1)
-            lux, dx, dy, dz = lux_along_ray(
-                lamps.tables, lamp, points[p, 0], points[p, 1], points[p, 2]
-            )
-            brightest = max(brightest, lux)
-            cosine = dx * facings[p, 0] + dy * facings[p, 1] + dz * facings[p, 2]
-            score = max(score, lux * max(cosine, MIN_RANK_COSINE))
-        if SAMPLE_MARGIN * brightest < least:
+        if lamps.extinctions[m] > 0:
+            bound *= math.exp(-lamps.extinctions[m] * math.sqrt(squared))
+            if bound < least or (number == max_lamps and bound <= dropped):
+                continue
+        lamp = _read_near_lamp(lamps, eye, m)
+        best = _number(0)
+        brightest = _number(0)
+        for p in range(0, 2 * NODE_LANES, NODE_LANES):
+            point = _load_vectors(work, SAMPLE_POINTS + p)
+            towards = _towards(lamp[0], point)
+            squares = _dot(towards, towards)
+            per_m = _number(1) / v8.maximum(v8.sqrt(squares), _number(1e-9))
+            lux = _lux_of_eight(tables, size, lamp, towards, squares, per_m, texels)
+            brightest = v8.maximum(brightest, lux)
+            cosine = _dot(towards, _load_vectors(work, SAMPLE_NORMALS + p)) * per_m
+            best = v8.maximum(best, lux * v8.maximum(cosine, _number(MIN_RANK_COSINE)))
+        if SAMPLE_MARGIN * _largest(brightest, work) < least:
             continue
+        score = np.float64(_largest(best, work))
         if number == max_lamps:
             if score <= scores[number - 1]:
                 dropped = max(dropped, score)
                 continue
             dropped = max(dropped, scores[number - 1])
         number = insert_ranked(chosen, scores, number, m, score)
+    for k in range(number):
+        before[k] = chosen[k]
+    before[max_lamps] = number
     return number, dropped
+
+
+@kernel_function()
+def _towards(place, point):
+    """Return the way from eight points to a place."""
+    return (
+        _number(place[0]) - point[0],
+        _number(place[1]) - point[1],
+        _number(place[2]) - point[2],
+    )
+
+
+@kernel_function()
+def _read_tile(depth, normals, view, top, left, work, nodes):
+    """Enter the nodes of a tile that show a surface into `work`; return their number.
+
+    Places after the last node, up to a multiple of eight, have its numbers.
+    """
+    height, width = depth.shape
+    count = 0
+    for i in range(top, min(top + TILE, height)):
+        y = (i * view.lens[4] + view.lens[5] - view.lens[3]) * view.lens[1]
+        for j in range(left, min(left + TILE, width)):
+            z = np.float64(depth[i, j])
+            if not (z > 0 and z < 1e6):
+                continue
+            x = (j * view.lens[4] + view.lens[5] - view.lens[2]) * view.lens[0]
+            squared = np.float32(0)
+            for k in range(3):
+                ray = view.axes[k, 0] * x + view.axes[k, 1] * y + view.axes[k, 2]
+                work[POINTS + k * TILE_NODES + count] = z * ray
+                normal = normals[i, j, k]
+                work[NORMALS + k * TILE_NODES + count] = normal
+                squared += normal * normal
+            # Shorter normals are means of some that disagree: leaves, grass, noise.
+            rough = (1.0 - SMOOTH_LOSS - math.sqrt(squared)) / (1.0 - SMOOTH_LOSS)
+            work[ROUGH + count] = ROUGH_COSINE * max(rough, 0.0)
+            nodes[count, 0] = i
+            nodes[count, 1] = j
+            count += 1
+    if count > 0:
+        for p in range(count, (count + NODE_LANES - 1) // NODE_LANES * NODE_LANES):
+            for k in range(7):
+                work[k * TILE_NODES + p] = work[k * TILE_NODES + count - 1]
+    return count
+
+
+@kernel_function()
+def _light_tile(lamps, tables, size, view, eye, shadows, work, texels, count, m, fade, has_own):
+    """Add the light of a lamp to a tile's nodes.
+
+    Args:
+        lamps: the lamps.
+        tables: packed patterns, flat.
+        size: rows and columns of a pattern.
+        view: the view of the nodes.
+        eye: place of the eye.
+        shadows: depth maps of the lamps that have one.
+        work: numbers of the tile, changed in place.
+        texels: work space, int32 [8].
+        count: number of the tile's nodes.
+        m: index of the lamp.
+        fade: factor of its light.
+        has_own: True if the light that comes back from signs is asked for.
+    """
+    zero = _number(0)
+    lamp = _read_near_lamp(lamps, eye, m)
+    shadow_map = lamps.shadow_maps[m]
+    is_returned = has_own and lamps.is_own[m]
+    red = fade * lamps.colors[m, 0]
+    green = fade * lamps.colors[m, 1]
+    blue = fade * lamps.colors[m, 2]
+    for p in range(0, count, NODE_LANES):
+        towards = _towards(lamp[0], _load_vectors(work, POINTS + p))
+        squared = _dot(towards, towards)
+        per_m = _number(1) / v8.maximum(v8.sqrt(squared), _number(1e-9))
+        cosine = _dot(towards, _load_vectors(work, NORMALS + p)) * per_m
+        gain = v8.maximum(cosine, zero) + v8.load(work, Index(ROUGH + p))
+        if v8.mask_bits(v8.greater(gain, zero)) == Index(0) and not is_returned:
+            continue
+        facing = _lux_of_eight(tables, size, lamp, towards, squared, per_m, texels)
+        if shadow_map >= 0:
+            v8.store(work, Index(SPARE), facing)
+            for lane in range(NODE_LANES):
+                if work[SPARE + lane] > 0:
+                    work[SPARE + lane] *= lit_share(
+                        shadows,
+                        shadow_map,
+                        eye[0] + work[POINTS + p + lane],
+                        eye[1] + work[POINTS + TILE_NODES + p + lane],
+                        eye[2] + work[POINTS + 2 * TILE_NODES + p + lane],
+                    )
+            facing = v8.load(work, Index(SPARE))
+        _add_color(work, LUX + p, facing * gain, red, green, blue)
+        if is_returned:
+            v8.store(work, Index(SPARE), facing)
+            for lane in range(NODE_LANES):
+                x = np.float64(work[POINTS + p + lane])
+                y = np.float64(work[POINTS + TILE_NODES + p + lane])
+                z = np.float64(work[POINTS + 2 * TILE_NODES + p + lane])
+                work[SPARE + lane] *= _return_share(x, y, z, lamp[0])
+            facing = v8.load(work, Index(SPARE))
+            _add_color(work, OWN_LUX + p, facing, red, green, blue)
+
+
+@kernel_function()
+def _add_color(work, index, light, red, green, blue):
+    """Add light of a colour to eight nodes."""
+    sums = _load_vectors(work, index)
+    v8.store(work, Index(index), v8.fmuladd(light, _number(red), sums[0]))
+    v8.store(work, Index(index + TILE_NODES), v8.fmuladd(light, _number(green), sums[1]))
+    v8.store(work, Index(index + 2 * TILE_NODES), v8.fmuladd(light, _number(blue), sums[2]))
+
+
+@kernel_function()
+def _light_row_of_tiles(
+    tile_row, depth, normals, view, lamps, tables, shadows, least_lux, max_lamps, lux, own_lux
+):
+    """Sum the lamps' illuminance at the nodes of a row of tiles."""
+    height, width = depth.shape
+    top = tile_row * TILE
+    has_own = own_lux.size > 0
+    eye = (view.eye[0], view.eye[1], view.eye[2])
+    size = (lamps.tables.shape[1], lamps.tables.shape[2])
+    work = np.zeros(NUM_FIELDS * TILE_NODES, np.float32)
+    nodes = np.empty((TILE_NODES, 2), np.int64)
+    texels = np.empty(NODE_LANES, np.int32)
+    chosen = np.empty(max_lamps, np.int64)
+    scores = np.empty(max_lamps)
+    before = np.zeros(max_lamps + 1, np.int64)
+    for i in range(top, min(top + TILE, height)):
+        for j in range(width):
+            for k in range(3):
+                lux[i, j, k] = 0.0
+                if has_own:
+                    own_lux[i, j, k] = 0.0
+    for left in range(0, width, TILE):
+        count = _read_tile(depth, normals, view, top, left, work, nodes)
+        if count == 0:
+            continue
+        number, dropped = _rank_lamps(
+            lamps, tables, size, eye, work, texels, count, least_lux, chosen, scores, before
+        )
+        if number == 0:
+            continue
+        work[LUX:] = 0
+        for c in range(number):
+            # A lamp fades before it is dropped, so that tiles have no edges.
+            fade = 1.0 if dropped <= 0 else min(max(scores[c] / dropped - 1.0, 0.0), 1.0)
+            if fade > 0:
+                _light_tile(
+                    lamps,
+                    tables,
+                    size,
+                    view,
+                    eye,
+                    shadows,
+                    work,
+                    texels,
+                    count,
+                    chosen[c],
+                    fade,
+                    has_own,
+                )
+        for p in range(count):
+            i = nodes[p, 0]
+            j = nodes[p, 1]
+            for k in range(3):
+                lux[i, j, k] = work[LUX + k * TILE_NODES + p]
+                if has_own:
+                    own_lux[i, j, k] = work[OWN_LUX + k * TILE_NODES + p]
 
 
 @kernel
@@ -396,101 +752,42 @@ def light_nodes(
             them, times how much of their light comes back to the eye (`return_share`); empty if it
             is not asked for.
     """
-    height, width = depth.shape
-    tile_columns = (width + TILE - 1) // TILE
-    tile_rows = (height + TILE - 1) // TILE
-    has_own = own_lux.size > 0
-    for tile in prange(tile_columns * tile_rows):
-        top = (tile // tile_columns) * TILE
-        left = (tile % tile_columns) * TILE
-        points = np.empty((TILE * TILE, 3))
-        facings = np.empty((TILE * TILE, 3))
-        nodes = np.empty((TILE * TILE, 2), np.int64)
-        roughness = np.empty((TILE, TILE))
-        chosen = np.empty(max_lamps, np.int64)
-        scores = np.empty(max_lamps)
-        count = 0
-        for i in range(top, min(top + TILE, height)):
-            y = (i * view.lens[4] + view.lens[5] - view.lens[3]) * view.lens[1]
-            for j in range(left, min(left + TILE, width)):
-                for k in range(3):
-                    lux[i, j, k] = 0.0
-                    if has_own:
-                        own_lux[i, j, k] = 0.0
-                z = np.float64(depth[i, j])
-                if not (z > 0 and z < 1e6):
-                    continue
-                x = (j * view.lens[4] + view.lens[5] - view.lens[2]) * view.lens[0]
-                for k in range(3):
-                    ray = view.axes[k, 0] * x + view.axes[k, 1] * y + view.axes[k, 2]
-                    points[count, k] = view.eye[k] + z * ray
-                length = 0.0
-                for k in range(3):
-                    length += np.float64(normals[i, j, k]) ** 2
-                    facings[count, k] = normals[i, j, k]
-                # Shorter normals are means of some that disagree: leaves, grass, noise.
-                roughness[i - top, j - left] = max(
-                    (1.0 - SMOOTH_LOSS - math.sqrt(length)) / (1.0 - SMOOTH_LOSS), 0.0
-                )
-                nodes[count, 0] = i
-                nodes[count, 1] = j
-                count += 1
-        if count == 0:
-            continue
-        number, dropped = rank_lamps(
-            lamps, points, facings, count, min_lux, min_own_lux, max_lamps, chosen, scores
+    tables = lamps.tables.reshape(lamps.tables.size)
+    for tile_row in prange((depth.shape[0] + TILE - 1) // TILE):
+        _light_row_of_tiles(
+            tile_row,
+            depth,
+            normals,
+            view,
+            lamps,
+            tables,
+            shadows,
+            (min_lux, min_own_lux),
+            max_lamps,
+            lux,
+            own_lux,
         )
-        for c in range(number):
-            m = chosen[c]
-            lamp = read_lamp(lamps, m)
-            tables = lamps.tables
-            shadow_map = lamps.shadow_maps[m]
-            is_own = lamps.is_own[m]
-            # A lamp fades before it is dropped, so that tiles have no edges.
-            fade = 1.0 if dropped <= 0 else min(max(scores[c] / dropped - 1.0, 0.0), 1.0)
-            red = fade * lamps.colors[m, 0]
-            green = fade * lamps.colors[m, 1]
-            blue = fade * lamps.colors[m, 2]
-            for p in range(count):
-                x = points[p, 0]
-                y = points[p, 1]
-                z = points[p, 2]
-                i = nodes[p, 0]
-                j = nodes[p, 1]
-                nx = np.float64(normals[i, j, 0])
-                ny = np.float64(normals[i, j, 1])
-                nz = np.float64(normals[i, j, 2])
-                place = lamp[0]
-                above = nx * (place[0] - x) + ny * (place[1] - y) + nz * (place[2] - z)
-                rough = ROUGH_COSINE * roughness[i - top, j - left]
-                is_returned = has_own and is_own
-                if above <= 0 and rough <= 0 and not is_returned:
-                    continue
-                facing, dx, dy, dz = lux_along_ray(tables, lamp, x, y, z)
-                if shadow_map >= 0 and facing > 0:
-                    facing *= lit_share(shadows, shadow_map, x, y, z)
-                lit = facing * (max(nx * dx + ny * dy + nz * dz, 0.0) + rough)
-                lux[i, j, 0] += np.float32(lit * red)
-                lux[i, j, 1] += np.float32(lit * green)
-                lux[i, j, 2] += np.float32(lit * blue)
-                if is_returned:
-                    facing *= _return_share(view, x, y, z, dx, dy, dz)
-                    own_lux[i, j, 0] += np.float32(facing * red)
-                    own_lux[i, j, 1] += np.float32(facing * green)
-                    own_lux[i, j, 2] += np.float32(facing * blue)
 
 
 @kernel_function()
-def _return_share(view, x, y, z, dx, dy, dz):
-    """Return `return_share` at the angle between the eye and a lamp, seen from a sign."""
-    ex = view.eye[0] - x
-    ey = view.eye[1] - y
-    ez = view.eye[2] - z
-    per_m = 1.0 / max(math.sqrt(ex * ex + ey * ey + ez * ez), 1e-9)
+def _return_share(x, y, z, place):
+    """Return `return_share` at the angle between the eye and a lamp, seen from a sign.
+
+    Args:
+        x: x of the sign, from the eye, metres.
+        y: y of the sign.
+        z: z of the sign.
+        place: place of the lamp, from the eye.
+    """
+    dx = place[0] - x
+    dy = place[1] - y
+    dz = place[2] - z
+    per_lamp_m = 1.0 / max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-9)
+    per_eye_m = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-9)
     # The chord of the angle, which is exact for small angles where a cosine loses its digits.
-    ax = ex * per_m - dx
-    ay = ey * per_m - dy
-    az = ez * per_m - dz
+    ax = x * per_eye_m + dx * per_lamp_m
+    ay = y * per_eye_m + dy * per_lamp_m
+    az = z * per_eye_m + dz * per_lamp_m
     return return_share(math.sqrt(ax * ax + ay * ay + az * az))
 
 
