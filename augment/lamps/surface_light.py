@@ -36,6 +36,8 @@ from augment.lamps.surface_light_kernels import (
     LAST_RETURN_RAD,
     MIDDLE_RETURN,
     MIDDLE_RETURN_RAD,
+    SIGN_RETURN_PER_LUX,
+    SIGN_WHITE,
     LampArrays,
     NodeView,
     ShadowArrays,
@@ -69,10 +71,6 @@ _MIN_SMOOTH = 0.8
 _SMOOTH = 0.95
 # Difference of a node's inverse depth from the window's, of that, up to which it is of one wall.
 _SAME_WALL = 0.02
-# Coefficient of retroreflection of a white sign at 0.2 degrees, cd/m2 per lux: class RA2.
-SIGN_RETURN_PER_LUX = 250.0
-# Reflectance that the coefficient belongs to: a white sign's.
-SIGN_WHITE = 0.7
 # Most luminance of a sign over that of a matt surface of its reflectance in the same light: 1,122.
 SIGN_GAIN = math.pi * SIGN_RETURN_PER_LUX / SIGN_WHITE
 # Nodes in a row of a picture, about.
@@ -279,26 +277,28 @@ def surface_light(
     lux = np.empty(shape, np.float32)
     has_signs = is_sign is not None and bool((lamps.owners == EGO_OWNER).any()) and is_sign.any()
     own_lux = np.empty(shape if has_signs else (0, 0, 3), np.float32)
-    return_per_lux = np.empty((0, 0), np.float32)
+    signs = np.zeros((0, 0), np.bool_)
     if has_signs:
         assert is_sign is not None
-        return_per_lux = is_sign * np.float32(SIGN_RETURN_PER_LUX / SIGN_WHITE)
+        signs = np.ascontiguousarray(is_sign, np.bool_)
     arrays = lamp_arrays(lamps, extinctions_per_m, shadows)
     min_lux = min_luminance_cd_m2 * math.pi / MAX_REFLECTANCE
     min_own_lux = min_lux / SIGN_GAIN if has_signs else min_lux  # signs return own light alone
-    with kernel_threads(shape[0]):
+    with kernel_threads():
         surface_light_kernels.light_nodes(
             nodes.depth,
             nodes.normals,
             node_view(camera, nodes.step_px),
             arrays,
             shadow_arrays(shadows),
+            signs,
             min_lux,
             min_own_lux,
             lamps_per_pixel,
             lux,
             own_lux,
         )
+    with kernel_threads(8):
         surface_light_kernels.spread_light(
             np.ascontiguousarray(depth_m, np.float32),
             nodes.inverse_depth,
@@ -307,7 +307,7 @@ def surface_light(
             nodes.step_px,
             nodes.step_px // 2,
             np.ascontiguousarray(reflectance, np.float32),
-            return_per_lux,
+            signs,
             picture,
         )
     return picture

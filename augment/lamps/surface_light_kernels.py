@@ -56,6 +56,12 @@ SAME_SURFACE = 0.08
 OTHER_SURFACE_WEIGHT = 1e-4
 
 
+# Coefficient of retroreflection of a white sign at 0.2 degrees, cd/m2 per lux: class RA2.
+SIGN_RETURN_PER_LUX = 250.0
+# Reflectance that the coefficient belongs to: a white sign's.
+SIGN_WHITE = 0.7
+
+
 class NodeView(NamedTuple):
     """View of the nodes."""
 
@@ -675,12 +681,27 @@ def _add_color(work, index, light, red, green, blue):
 
 @kernel_function()
 def _light_row_of_tiles(
-    tile_row, depth, normals, view, lamps, tables, shadows, least_lux, max_lamps, lux, own_lux
+    tile_row,
+    depth,
+    normals,
+    view,
+    lamps,
+    tables,
+    shadows,
+    is_sign,
+    min_lux,
+    min_own_lux,
+    max_lamps,
+    lux,
+    own_lux,
 ):
     """Sum the lamps' illuminance at the nodes of a row of tiles."""
     height, width = depth.shape
     top = tile_row * TILE
-    has_own = own_lux.size > 0
+    step = np.int64(view.lens[4])
+    top_px = max((top - 1) * step, 0)
+    bottom_px = is_sign.shape[0] if top + TILE >= height else (top + TILE + 1) * step
+    bottom_px = min(bottom_px, is_sign.shape[0])
     eye = (view.eye[0], view.eye[1], view.eye[2])
     size = (lamps.tables.shape[1], lamps.tables.shape[2])
     work = np.zeros(NUM_FIELDS * TILE_NODES, np.float32)
@@ -693,12 +714,21 @@ def _light_row_of_tiles(
         for j in range(width):
             for k in range(3):
                 lux[i, j, k] = 0.0
-                if has_own:
+                if own_lux.size > 0:
                     own_lux[i, j, k] = 0.0
     for left in range(0, width, TILE):
         count = _read_tile(depth, normals, view, top, left, work, nodes)
         if count == 0:
             continue
+        # Signs read the nodes of this tile, or those of the next tile beside these.
+        left_px = max((left - 1) * step, 0)
+        right_px = is_sign.shape[1] if left + TILE >= width else (left + TILE + 1) * step
+        right_px = min(right_px, is_sign.shape[1])
+        has_own = False
+        for i in range(top_px, bottom_px):
+            for j in range(left_px, right_px):
+                has_own |= is_sign[i, j]
+        least_lux = (min_lux, min_own_lux if has_own else min_lux)
         number, dropped = _rank_lamps(
             lamps, tables, size, eye, work, texels, count, least_lux, chosen, scores, before
         )
@@ -734,7 +764,7 @@ def _light_row_of_tiles(
 
 @kernel
 def light_nodes(
-    depth, normals, view, lamps, shadows, min_lux, min_own_lux, max_lamps, lux, own_lux
+    depth, normals, view, lamps, shadows, is_sign, min_lux, min_own_lux, max_lamps, lux, own_lux
 ):
     """Sum the lamps' illuminance at the nodes.
 
@@ -744,25 +774,28 @@ def light_nodes(
         view: the view of the nodes.
         lamps: the lamps.
         shadows: depth maps of the lamps that have one.
+        is_sign: pixels of signs, bool [H, W]; empty if no sign sends own light back.
         min_lux: lux below which a lamp does not light a tile.
-        min_own_lux: the same for lamps of the recording car.
+        min_own_lux: the same for lamps of the recording car, where signs are.
         max_lamps: largest number of lamps that light a tile.
         lux: output, float32 [h, w, 3], lux in linear sRGB on the surfaces.
         own_lux: output, float32 [h, w, 3], lux of the recording car's lamps on surfaces that face
-            them, times how much of their light comes back to the eye (`return_share`); empty if it
-            is not asked for.
+            them, times how much of their light comes back to the eye (`return_share`), in tiles
+            with signs; empty without any.
     """
     tables = lamps.tables.reshape(lamps.tables.size)
     for tile_row in prange((depth.shape[0] + TILE - 1) // TILE):
         _light_row_of_tiles(
-            tile_row,
+            np.int64(tile_row),
             depth,
             normals,
             view,
             lamps,
             tables,
             shadows,
-            (min_lux, min_own_lux),
+            is_sign,
+            min_lux,
+            min_own_lux,
             max_lamps,
             lux,
             own_lux,
@@ -819,10 +852,147 @@ def return_share(angle_rad):
 # ---- From nodes to pixels ------------------------------------------------------------------------
 
 
+@kernel_function()
+def _read_row_of_nodes(node_inverse, lux, row, nodes, start, length):
+    """Enter inverse depths and red, green and blue lux of a row of nodes as rows of `length`.
+
+    A copy of the first node stands before it, and one of the last node after it.
+    """
+    rows, columns = node_inverse.shape
+    row = min(max(row, 0), rows - 1)
+    for j in range(columns + 2):
+        column = min(max(j - 1, 0), columns - 1)
+        nodes[start + j] = node_inverse[row, column]
+        nodes[start + length + j] = lux[row, column, 0]
+        nodes[start + 2 * length + j] = lux[row, column, 1]
+        nodes[start + 3 * length + j] = lux[row, column, 2]
+
+
+@kernel_function()
+def _likeness_of_eight(inverse_depth, z):
+    """Return `_likeness` of eight nodes and pixels, for nodes that are not of the sky."""
+    gap = v8.fmuladd(inverse_depth, z, _number(-1)) * _number(1.0 / SAME_SURFACE)
+    return v8.maximum(_number(1) - gap * gap, _number(OTHER_SURFACE_WEIGHT))
+
+
+@kernel_function()
+def _sum_of_four(a, b, c, d, nodes, index, length):
+    """Return the sum of four weights times the numbers of the four nodes about each pixel."""
+    below = index + Index(4 * length)
+    total = d * v8.load(nodes, below + Index(1))
+    total = v8.fmuladd(c, v8.load(nodes, below), total)
+    total = v8.fmuladd(b, v8.load(nodes, index + Index(1)), total)
+    return v8.fmuladd(a, v8.load(nodes, index), total)
+
+
+@kernel_function()
+def _spread_row(nodes, length, step, v, ramp, depths, lights, spare):
+    """Write the light of a row of pixels that a surface of reflectance 1 sends back.
+
+    Pixels at the same place between two nodes have the same weights, so eight of them, `step`
+    pixels apart, are done at a time.
+
+    Args:
+        nodes: results of `_read_row_of_nodes` for the nodes above and below the row.
+        length: length of a row of them.
+        step: pixels between nodes.
+        v: share of the way from the nodes above to those below.
+        ramp: 0 to 7, int32.
+        depths: z of the pixels from the copy of the first node on, 0 beyond the picture.
+        lights: output, cd/m2, red, green and blue of those pixels.
+        spare: work space, float32 [24].
+    """
+    zero = _number(0)
+    unit = _number(1)
+    far = _number(1e6)
+    lower = _number(v)
+    upper = unit - lower
+    wide = Index(length)
+    stride = Index(step)
+    for first_cell in range(0, length - NODE_LANES, NODE_LANES):
+        cell = Index(first_cell)
+        a_inverse = v8.load(nodes, cell)
+        b_inverse = v8.load(nodes, cell + Index(1))
+        c_inverse = v8.load(nodes, cell + Index(4) * wide)
+        d_inverse = v8.load(nodes, cell + Index(4) * wide + Index(1))
+        a_share = v8.select(v8.greater(a_inverse, zero), upper, zero)
+        b_share = v8.select(v8.greater(b_inverse, zero), upper, zero)
+        c_share = v8.select(v8.greater(c_inverse, zero), lower, zero)
+        d_share = v8.select(v8.greater(d_inverse, zero), lower, zero)
+        for phase in range(step):
+            z = v8.gather(depths, ramp, Index(0), stride, cell * stride + Index(phase))
+            u = _number(np.float32(phase) / np.float32(step))
+            a = (unit - u) * a_share * _likeness_of_eight(a_inverse, z)
+            b = u * b_share * _likeness_of_eight(b_inverse, z)
+            c = (unit - u) * c_share * _likeness_of_eight(c_inverse, z)
+            d = u * d_share * _likeness_of_eight(d_inverse, z)
+            total = (a + b) + (c + d)
+            is_lit = v8.mask_and(v8.greater(total, zero), v8.greater(z, zero))
+            is_lit = v8.mask_and(is_lit, v8.greater(far, z))
+            gain = v8.select(is_lit, _number(1.0 / math.pi) / total, zero)
+            red = _sum_of_four(a, b, c, d, nodes, cell + wide, length) * gain
+            green = _sum_of_four(a, b, c, d, nodes, cell + Index(2) * wide, length) * gain
+            blue = _sum_of_four(a, b, c, d, nodes, cell + Index(3) * wide, length) * gain
+            v8.store(spare, Index(0), red)
+            v8.store(spare, Index(NODE_LANES), green)
+            v8.store(spare, Index(2 * NODE_LANES), blue)
+            at = Index(3) * (cell * stride + Index(phase))
+            for lane in range(Index(NODE_LANES)):
+                lights[at] = spare[lane]
+                lights[at + Index(1)] = spare[lane + Index(NODE_LANES)]
+                lights[at + Index(2)] = spare[lane + Index(2 * NODE_LANES)]
+                at += Index(3) * stride
+
+
+@kernel_function()
+def _add_row(lights, start, reflectance, picture, first, count):
+    """Add light times reflectance to `count` numbers of the picture from `first` on."""
+    done = count // NODE_LANES * NODE_LANES
+    for k in range(Index(0), Index(done), Index(NODE_LANES)):
+        at = Index(first) + k
+        light = v8.load(lights, Index(start) + k)
+        light = v8.fmuladd(light, v8.load(reflectance, at), v8.load(picture, at))
+        v8.store(picture, at, light)
+    for k in range(Index(done), Index(count)):
+        at = Index(first) + k
+        picture[at] += lights[Index(start) + k] * reflectance[at]
+
+
+@kernel_function()
+def _add_sign_light(row, depth, node_inverse, own_lux, step, first, reflectance, is_sign, picture):
+    """Add what the signs in a row of pixels send back of the own lamps' light."""
+    rows, columns = node_inverse.shape
+    unit = np.float32(1)
+    v = np.float32(min(max((row - first) / step, 0.0), rows - 1.0))
+    i = min(int(v), max(rows - 2, 0))
+    v -= np.float32(i)
+    below = min(i + 1, rows - 1)
+    for column in range(depth.shape[1]):
+        if not is_sign[row, column]:
+            continue
+        z = depth[row, column]
+        if not (z > np.float32(0) and z < np.float32(1e6)):
+            continue
+        u = np.float32(min(max((column - first) / step, 0.0), columns - 1.0))
+        j = min(int(u), max(columns - 2, 0))
+        u -= np.float32(j)
+        beside = min(j + 1, columns - 1)
+        a = (unit - u) * (unit - v) * _likeness(node_inverse[i, j], z)
+        b = u * (unit - v) * _likeness(node_inverse[i, beside], z)
+        c = (unit - u) * v * _likeness(node_inverse[below, j], z)
+        d = u * v * _likeness(node_inverse[below, beside], z)
+        total = a + b + c + d
+        if total <= np.float32(0):
+            continue
+        share = np.float32(SIGN_RETURN_PER_LUX / SIGN_WHITE) / total
+        for k in range(3):
+            light = a * own_lux[i, j, k] + b * own_lux[i, beside, k]
+            light += c * own_lux[below, j, k] + d * own_lux[below, beside, k]
+            picture[row, column, k] += light * share * reflectance[row, column, k]
+
+
 @kernel
-def spread_light(
-    depth, node_inverse, lux, own_lux, step, first, reflectance, return_per_lux, picture
-):
+def spread_light(depth, node_inverse, lux, own_lux, step, first, reflectance, is_sign, picture):
     """Add the nodes' light to the picture: reflectance / pi times lux, and what signs send back.
 
     Each pixel takes the four nodes about it, those on its surface first.
@@ -835,83 +1005,51 @@ def spread_light(
         step: pixels between nodes.
         first: column and row of the first node's pixel.
         reflectance: float32 [H, W, 3].
-        return_per_lux: coefficient of retroreflection, cd/m2 per lux, float32 [H, W]; empty if no
-            surface has one.
+        is_sign: pixels of signs, bool [H, W]; empty without any.
         picture: luminance in linear sRGB, cd/m2, changed in place, float32 [H, W, 3].
     """
     height, width = depth.shape
     rows, columns = node_inverse.shape
-    unit = np.float32(1)
-    zero = np.float32(0)
-    per_pi = np.float32(1.0 / math.pi)
-    per_step = np.float32(1.0 / step)
-    has_signs = return_per_lux.size > 0
-    for row in prange(height):
-        v = np.float32(min(max((row - first) / step, 0.0), rows - 1.0))
-        i = min(int(v), max(rows - 2, 0))
-        v -= np.float32(i)
-        below = min(i + 1, rows - 1)
-        depths = depth[row]
-        colors = reflectance[row]
-        lights = picture[row]
-        upper = node_inverse[i]
-        lower = node_inverse[below]
-        upper_lux = lux[i]
-        lower_lux = lux[below]
-        start = 0
-        # From node to node: pixels between two nodes share what they read of these.
-        for j in range(max(columns - 1, 1)):
-            beside = min(j + 1, columns - 1)
-            end = width if j >= columns - 2 else min(first + (j + 1) * step, width)
-            a_red = upper_lux[j, 0]
-            a_green = upper_lux[j, 1]
-            a_blue = upper_lux[j, 2]
-            b_red = upper_lux[beside, 0]
-            b_green = upper_lux[beside, 1]
-            b_blue = upper_lux[beside, 2]
-            c_red = lower_lux[j, 0]
-            c_green = lower_lux[j, 1]
-            c_blue = lower_lux[j, 2]
-            d_red = lower_lux[beside, 0]
-            d_green = lower_lux[beside, 1]
-            d_blue = lower_lux[beside, 2]
-            brightest = a_red + a_green + a_blue + b_red + b_green + b_blue
-            brightest += c_red + c_green + c_blue + d_red + d_green + d_blue
-            if brightest <= zero and not has_signs:
-                start = end
-                continue
-            a_inverse = upper[j]
-            b_inverse = upper[beside]
-            c_inverse = lower[j]
-            d_inverse = lower[beside]
-            for column in range(start, end):
-                z = depths[column]
-                if not (z > zero and z < np.float32(1e6)):
-                    continue
-                u = min(max(np.float32(column - first) * per_step, zero), np.float32(columns - 1))
-                u -= np.float32(j)
-                a = (unit - u) * (unit - v) * _likeness(a_inverse, z)
-                b = u * (unit - v) * _likeness(b_inverse, z)
-                c = (unit - u) * v * _likeness(c_inverse, z)
-                d = u * v * _likeness(d_inverse, z)
-                weight_sum = a + b + c + d
-                if weight_sum <= zero:
-                    continue
-                share = unit / weight_sum
-                gain = share * per_pi
-                red = a * a_red + b * b_red + c * c_red + d * d_red
-                green = a * a_green + b * b_green + c * c_green + d * d_green
-                blue = a * a_blue + b * b_blue + c * c_blue + d * d_blue
-                lights[column, 0] += red * gain * colors[column, 0]
-                lights[column, 1] += green * gain * colors[column, 1]
-                lights[column, 2] += blue * gain * colors[column, 2]
-                if has_signs and return_per_lux[row, column] > zero:
-                    share *= return_per_lux[row, column]
-                    for k in range(3):
-                        light = a * own_lux[i, j, k] + b * own_lux[i, beside, k]
-                        light += c * own_lux[below, j, k] + d * own_lux[below, beside, k]
-                        lights[column, k] += light * share * colors[column, k]
-            start = end
+    # Between nodes lie columns + 1 cells, whose first and last reach beyond the picture.
+    length = (columns + NODE_LANES) // NODE_LANES * NODE_LANES + NODE_LANES
+    offset = step - first
+    flat_reflectance = reflectance.reshape(reflectance.size)
+    flat_picture = picture.reshape(picture.size)
+    for number in prange(rows + 1):
+        cell_row = np.int64(number)
+        top = max(first + (cell_row - 1) * step, 0)
+        bottom = min(first + cell_row * step, height)
+        if cell_row == rows:
+            bottom = height
+        nodes = np.zeros(8 * length, np.float32)
+        _read_row_of_nodes(node_inverse, lux, cell_row - 1, nodes, 0, length)
+        _read_row_of_nodes(node_inverse, lux, cell_row, nodes, 4 * length, length)
+        depths = np.zeros(length * step, np.float32)
+        lights = np.empty(3 * length * step, np.float32)
+        spare = np.empty(3 * NODE_LANES, np.float32)
+        ramp = np.arange(NODE_LANES).astype(np.int32)
+        for row in range(top, bottom):
+            for column in range(width):
+                depths[offset + column] = depth[row, column]
+            v = np.float32(row - first - (cell_row - 1) * step) / np.float32(step)
+            _spread_row(nodes, length, step, v, ramp, depths, lights, spare)
+            _add_row(lights, 3 * offset, flat_reflectance, flat_picture, 3 * width * row, 3 * width)
+            if is_sign.size > 0:
+                has_sign = False
+                for column in range(width):
+                    has_sign |= is_sign[row, column]
+                if has_sign:
+                    _add_sign_light(
+                        row,
+                        depth,
+                        node_inverse,
+                        own_lux,
+                        step,
+                        first,
+                        reflectance,
+                        is_sign,
+                        picture,
+                    )
 
 
 @kernel_function()
