@@ -1,8 +1,8 @@
-"""Numba kernels: normals of a picture's surfaces, and the lamps' light on them.
+"""Numba kernels: the lamps' light at the nodes of a picture.
 
 `augment.lamps.surface_light` prepares the arrays and holds the plain definitions. A picture is
-looked at in nodes, one in each block of `step` x `step` pixels; `spread_light` takes the light from
-the nodes to the pixels.
+looked at in nodes, one in each block of pixels, whose normals `surface_normals` finds;
+`surface_spread_kernels` takes the light from the nodes to the pixels.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
-from augment.lamps.pattern_kernels import COLUMN_SCALE, ROOT, ROOT_OFFSET, ROW_SCALE, pattern_at
+from augment.lamps.pattern_kernels import pattern_at, patterns_of_eight
+from augment.lamps.vector_kernels import NUM_LANES, copies, dot, vector_copies
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.layout import Index
 
 TILE = 8  # nodes along a side of a tile, whose nodes share a list of lamps
 TILE_NODES = TILE * TILE  # nodes of a tile
-NODE_LANES = 8  # nodes that are lit at a time
 # Rows of the numbers of a tile, each of TILE_NODES: x, y and z of the points from the eye.
 POINTS = 0
 NORMALS = 3 * TILE_NODES  # x, y and z of the normals
@@ -35,42 +35,12 @@ NUM_FIELDS = 20  # number of these rows
 SAMPLES = np.array([0, 3, 7, 24, 27, 31, 56, 59, 63])
 # Light that a lamp may have between these points, over the most that it has at one of them.
 SAMPLE_MARGIN = 4.0
-# Distance of the nodes over which slopes are first estimated, nodes.
-SLOPE_STEP = 2
-# Difference between the slopes on both sides of a node, as a share of the inverse depth and a node,
-# up to which both are its surface's.
-SLOPE_TOLERANCE = 0.02
 # Cosine to a lamp at least, where lamps of a tile are compared: its other nodes may face it.
 MIN_RANK_COSINE = 0.02
-# Rows of the nine nodes whose normals are averaged, from the one in the middle.
-MEAN_ROWS = np.array([0, -1, 1, 0, 0, -2, -2, 2, 2])
-# Columns of those nodes.
-MEAN_COLUMNS = np.array([0, 0, 0, -1, 1, -2, 2, -2, 2])
 # Loss of length of a mean normal up to which the surface is smooth.
 SMOOTH_LOSS = 0.1
 # Mean cosine of a lamp to surfaces whose normals point anywhere.
 ROUGH_COSINE = 0.25
-# Difference of inverse depths, as a share, at which a node does not light a pixel.
-SAME_SURFACE = 0.08
-# Weight of nodes on other surfaces, for pixels whose surface no node has.
-OTHER_SURFACE_WEIGHT = 1e-4
-
-
-# Coefficient of retroreflection of a white sign at 0.2 degrees, cd/m2 per lux: class RA2.
-SIGN_RETURN_PER_LUX = 250.0
-# Reflectance that the coefficient belongs to: a white sign's.
-SIGN_WHITE = 0.7
-
-
-class NodeView(NamedTuple):
-    """View of the nodes."""
-
-    lens: Any
-    """1 / fx, 1 / fy, cx, cy of pixels, pixels between nodes, middle of the first node's pixel."""
-    axes: Any
-    """World_from_camera, [3, 3]."""
-    eye: Any
-    """Place of the eye, world, metres."""
 
 
 class LampArrays(NamedTuple):
@@ -113,105 +83,6 @@ class ShadowArrays(NamedTuple):
     """fx, fy, cx, cy, float64 [S, 4]."""
     tolerances: Any
     """Share of the inverse depth, and inverse metres, by which a surface may be behind, [2]."""
-
-
-# ---- Normals -------------------------------------------------------------------------------------
-
-
-@kernel_function()
-def _least_slope(inverse, row, column, d_row, d_column, centre):
-    """Return the change of the inverse depth per node along a direction, on the smoother side."""
-    height, width = inverse.shape
-    ahead = 0.0
-    behind = 0.0
-    has_ahead = False
-    has_behind = False
-    i = row + d_row * SLOPE_STEP
-    j = column + d_column * SLOPE_STEP
-    if i < height and j < width and inverse[i, j] > 0:
-        ahead = (inverse[i, j] - centre) / SLOPE_STEP
-        has_ahead = True
-    i = row - d_row * SLOPE_STEP
-    j = column - d_column * SLOPE_STEP
-    if i >= 0 and j >= 0 and inverse[i, j] > 0:
-        behind = (centre - inverse[i, j]) / SLOPE_STEP
-        has_behind = True
-    if has_ahead and has_behind:
-        # Where both agree they share the noise; at an edge the smaller one is the surface's own.
-        if abs(ahead - behind) < SLOPE_TOLERANCE * centre:
-            return 0.5 * (ahead + behind)
-        return ahead if abs(ahead) < abs(behind) else behind
-    if has_ahead:
-        return ahead
-    return behind if has_behind else 0.0
-
-
-@kernel
-def find_slopes(inverse, view, normals):
-    """Find each node's normal by the slopes of the inverse depth about it.
-
-    A plane is linear in inverse depth: a + b x + c y = 1 / z, at unit depth (x, y). Its normal is
-    along (b, c, a) in the camera.
-
-    Args:
-        inverse: 1 / z of the nodes, 0 for the sky, float32 [h, w].
-        view: the view of the nodes.
-        normals: output, unit normals towards the eye, world, float32 [h, w, 3]; 0 for the sky.
-    """
-    height, width = inverse.shape
-    for row in prange(height):
-        ifx = view.lens[0]
-        ify = view.lens[1]
-        step = view.lens[4]
-        y = (row * step + view.lens[5] - view.lens[3]) * ify
-        for column in range(width):
-            centre = np.float64(inverse[row, column])
-            if centre <= 0:
-                for k in range(3):
-                    normals[row, column, k] = 0.0
-                continue
-            b = _least_slope(inverse, row, column, 0, 1, centre) / (step * ifx)
-            c = _least_slope(inverse, row, column, 1, 0, centre) / (step * ify)
-            x = (column * step + view.lens[5] - view.lens[2]) * ifx
-            a = centre - b * x - c * y
-            per_length = -1.0 / math.sqrt(a * a + b * b + c * c)
-            for k in range(3):
-                n = view.axes[k, 0] * b + view.axes[k, 1] * c + view.axes[k, 2] * a
-                normals[row, column, k] = n * per_length
-
-
-@kernel
-def average_normals(inverse, normals, means):
-    """Average the normals of nine nodes of the same surface about each node.
-
-    Args:
-        inverse: 1 / z of the nodes, 0 for the sky, float32 [h, w].
-        normals: result of `find_slopes`.
-        means: output, means, float32 [h, w, 3]. They are as short as the normals disagree.
-    """
-    height, width = inverse.shape
-    for row in prange(height):
-        for column in range(width):
-            centre = inverse[row, column]
-            x = np.float32(0)
-            y = np.float32(0)
-            z = np.float32(0)
-            count = np.float32(0)
-            limit = centre * np.float32(SAME_SURFACE)
-            for sample in range(9):
-                i = row + MEAN_ROWS[sample]
-                j = column + MEAN_COLUMNS[sample]
-                if i < 0 or j < 0 or i >= height or j >= width:
-                    continue
-                if abs(inverse[i, j] - centre) <= limit and centre > 0:
-                    x += normals[i, j, 0]
-                    y += normals[i, j, 1]
-                    z += normals[i, j, 2]
-                    count += np.float32(1)
-            share = np.float32(1) / max(count, np.float32(1))
-            means[row, column, 0] = x * share
-            means[row, column, 1] = y * share
-            means[row, column, 2] = z * share
 
 
 # ---- Light at the nodes --------------------------------------------------------------------------
@@ -334,24 +205,6 @@ def insert_ranked(chosen, scores, number, m, score):
 
 
 @kernel_function()
-def _number(value):
-    """Return eight copies of a number."""
-    return v8.broadcast(np.float32(value))
-
-
-@kernel_function()
-def _vector(x, y, z):
-    """Return eight copies of a vector."""
-    return _number(x), _number(y), _number(z)
-
-
-@kernel_function()
-def _dot(a, b):
-    """Return the dot products of eight vectors and eight others."""
-    return v8.fmuladd(a[0], b[0], v8.fmuladd(a[1], b[1], a[2] * b[2]))
-
-
-@kernel_function()
 def _load_vectors(numbers, index):
     """Return eight vectors whose x, y and z lie in three rows of TILE_NODES numbers."""
     return (
@@ -359,54 +212,6 @@ def _load_vectors(numbers, index):
         v8.load(numbers, Index(index + TILE_NODES)),
         v8.load(numbers, Index(index + 2 * TILE_NODES)),
     )
-
-
-@kernel_function()
-def _patterns_of_eight(tables, first, rows, columns, forward, right, up, texels):
-    """Return a pattern's values in eight directions, as `pattern_at` does for one.
-
-    Args:
-        tables: packed patterns, flat.
-        first: index of the pattern's first value.
-        rows: rows of a pattern.
-        columns: columns of a pattern.
-        forward: unit directions from the lamp, along its axis.
-        right: the same, towards the lamp's right.
-        up: the same, along the lamp's upward direction.
-        texels: work space, int32 [8].
-    """
-    zero = _number(0)
-    unit = _number(1)
-    tiny = _number(1e-30)
-    offset = _number(ROOT_OFFSET)
-    root = _number(ROOT)
-    level = v8.sqrt(v8.fmuladd(forward, forward, right * right))
-    rise = v8.absolute(up)
-    fold = rise / v8.maximum(rise + level, tiny)
-    row = (v8.sqrt(fold + offset) - root) * _number(ROW_SCALE)
-    row = v8.select(v8.greater(zero, up), v8.negate(row), row)
-    side = v8.absolute(right)
-    fold = side / v8.maximum(v8.absolute(forward) + side, tiny)
-    fold = v8.select(v8.greater(zero, forward), _number(2) - fold, fold)
-    column = (v8.sqrt(fold + offset) - root) * _number(COLUMN_SCALE)
-    column = v8.select(v8.greater(zero, right), v8.negate(column), column)
-    last_row = _number(rows - 1)
-    last_column = _number(columns - 1)
-    row = v8.minimum(v8.maximum((row + unit) * (_number(0.5) * last_row), zero), last_row)
-    column = (column + unit) * (_number(0.5) * last_column)
-    column = v8.minimum(v8.maximum(column, zero), last_column)
-    i = v8.floor(v8.minimum(row, last_row - unit))
-    j = v8.floor(v8.minimum(column, last_column - unit))
-    v = row - i
-    u = column - j
-    v8.store_integers(texels, Index(0), v8.fmuladd(i, _number(columns), j))
-    below_left = v8.gather(tables, texels, Index(0), Index(1), Index(first))
-    below_right = v8.gather(tables, texels, Index(0), Index(1), Index(first + 1))
-    above_left = v8.gather(tables, texels, Index(0), Index(1), Index(first + columns))
-    above_right = v8.gather(tables, texels, Index(0), Index(1), Index(first + columns + 1))
-    below = v8.fmuladd(below_right - below_left, u, below_left)
-    above = v8.fmuladd(above_right - above_left, u, above_left)
-    return v8.fmuladd(above - below, v, below)
 
 
 @kernel_function()
@@ -424,20 +229,20 @@ def _lux_of_eight(tables, size, lamp, towards, squared, per_m, texels):
     """
     _, axis, right, up, candela, first, extinction, softening = lamp
     away = v8.negate(per_m)
-    share = _patterns_of_eight(
+    share = patterns_of_eight(
         tables,
         first,
         size[0],
         size[1],
-        _dot(towards, _vector(*axis)) * away,
-        _dot(towards, _vector(*right)) * away,
-        _dot(towards, _vector(*up)) * away,
+        dot(towards, vector_copies(*axis)) * away,
+        dot(towards, vector_copies(*right)) * away,
+        dot(towards, vector_copies(*up)) * away,
         texels,
     )
-    lux = _number(candela) * share / (squared + _number(softening))
+    lux = copies(candela) * share / (squared + copies(softening))
     if extinction > 0:
-        power = _number(-extinction) * v8.sqrt(squared) * v8.broadcast(v8.LOG2_E)
-        lux = lux * v8.exp2_fine(v8.maximum(power, _number(-126)))
+        power = copies(-extinction) * v8.sqrt(squared) * v8.broadcast(v8.LOG2_E)
+        lux = lux * v8.exp2_fine(v8.maximum(power, copies(-126)))
     return lux
 
 
@@ -455,7 +260,7 @@ def _box_of_tile(work, count):
     """Return the least and the largest x, y and z of a tile's nodes, from the eye."""
     low = _load_vectors(work, POINTS)
     high = low
-    for p in range(NODE_LANES, count, NODE_LANES):
+    for p in range(NUM_LANES, count, NUM_LANES):
         point = _load_vectors(work, POINTS + p)
         low = (
             v8.minimum(low[0], point[0]),
@@ -478,7 +283,7 @@ def _largest(values, work):
     """Return the largest of eight numbers."""
     v8.store(work, Index(SPARE), values)
     largest = work[SPARE]
-    for lane in range(1, NODE_LANES):
+    for lane in range(1, NUM_LANES):
         largest = max(largest, work[SPARE + lane])
     return largest
 
@@ -511,7 +316,7 @@ def _rank_lamps(lamps, tables, size, eye, work, texels, count, least_lux, chosen
         before: lamps of the tile before, which are tried first, and their number as the last.
     """
     low, high = _box_of_tile(work, count)
-    for sample in range(2 * NODE_LANES):
+    for sample in range(2 * NUM_LANES):
         p = SAMPLES[min(sample, len(SAMPLES) - 1)] * (count - 1) // (TILE_NODES - 1)
         for k in range(6):
             work[SAMPLE_POINTS + k * TILE_NODES + sample] = work[POINTS + k * TILE_NODES + p]
@@ -541,17 +346,17 @@ def _rank_lamps(lamps, tables, size, eye, work, texels, count, least_lux, chosen
             if bound < least or (number == max_lamps and bound <= dropped):
                 continue
         lamp = _read_near_lamp(lamps, eye, m)
-        best = _number(0)
-        brightest = _number(0)
-        for p in range(0, 2 * NODE_LANES, NODE_LANES):
+        best = copies(0)
+        brightest = copies(0)
+        for p in range(0, 2 * NUM_LANES, NUM_LANES):
             point = _load_vectors(work, SAMPLE_POINTS + p)
             towards = _towards(lamp[0], point)
-            squares = _dot(towards, towards)
-            per_m = _number(1) / v8.maximum(v8.sqrt(squares), _number(1e-9))
+            squares = dot(towards, towards)
+            per_m = copies(1) / v8.maximum(v8.sqrt(squares), copies(1e-9))
             lux = _lux_of_eight(tables, size, lamp, towards, squares, per_m, texels)
             brightest = v8.maximum(brightest, lux)
-            cosine = _dot(towards, _load_vectors(work, SAMPLE_NORMALS + p)) * per_m
-            best = v8.maximum(best, lux * v8.maximum(cosine, _number(MIN_RANK_COSINE)))
+            cosine = dot(towards, _load_vectors(work, SAMPLE_NORMALS + p)) * per_m
+            best = v8.maximum(best, lux * v8.maximum(cosine, copies(MIN_RANK_COSINE)))
         if SAMPLE_MARGIN * _largest(brightest, work) < least:
             continue
         score = np.float64(_largest(best, work))
@@ -570,11 +375,7 @@ def _rank_lamps(lamps, tables, size, eye, work, texels, count, least_lux, chosen
 @kernel_function()
 def _towards(place, point):
     """Return the way from eight points to a place."""
-    return (
-        _number(place[0]) - point[0],
-        _number(place[1]) - point[1],
-        _number(place[2]) - point[2],
-    )
+    return (copies(place[0]) - point[0], copies(place[1]) - point[1], copies(place[2]) - point[2])
 
 
 @kernel_function()
@@ -606,7 +407,7 @@ def _read_tile(depth, normals, view, top, left, work, nodes):
             nodes[count, 1] = j
             count += 1
     if count > 0:
-        for p in range(count, (count + NODE_LANES - 1) // NODE_LANES * NODE_LANES):
+        for p in range(count, (count + NUM_LANES - 1) // NUM_LANES * NUM_LANES):
             for k in range(7):
                 work[k * TILE_NODES + p] = work[k * TILE_NODES + count - 1]
     return count
@@ -630,25 +431,25 @@ def _light_tile(lamps, tables, size, view, eye, shadows, work, texels, count, m,
         fade: factor of its light.
         has_own: True if the light that comes back from signs is asked for.
     """
-    zero = _number(0)
+    zero = copies(0)
     lamp = _read_near_lamp(lamps, eye, m)
     shadow_map = lamps.shadow_maps[m]
     is_returned = has_own and lamps.is_own[m]
     red = fade * lamps.colors[m, 0]
     green = fade * lamps.colors[m, 1]
     blue = fade * lamps.colors[m, 2]
-    for p in range(0, count, NODE_LANES):
+    for p in range(0, count, NUM_LANES):
         towards = _towards(lamp[0], _load_vectors(work, POINTS + p))
-        squared = _dot(towards, towards)
-        per_m = _number(1) / v8.maximum(v8.sqrt(squared), _number(1e-9))
-        cosine = _dot(towards, _load_vectors(work, NORMALS + p)) * per_m
+        squared = dot(towards, towards)
+        per_m = copies(1) / v8.maximum(v8.sqrt(squared), copies(1e-9))
+        cosine = dot(towards, _load_vectors(work, NORMALS + p)) * per_m
         gain = v8.maximum(cosine, zero) + v8.load(work, Index(ROUGH + p))
         if v8.mask_bits(v8.greater(gain, zero)) == Index(0) and not is_returned:
             continue
         facing = _lux_of_eight(tables, size, lamp, towards, squared, per_m, texels)
         if shadow_map >= 0:
             v8.store(work, Index(SPARE), facing)
-            for lane in range(NODE_LANES):
+            for lane in range(NUM_LANES):
                 if work[SPARE + lane] > 0:
                     work[SPARE + lane] *= lit_share(
                         shadows,
@@ -661,7 +462,7 @@ def _light_tile(lamps, tables, size, view, eye, shadows, work, texels, count, m,
         _add_color(work, LUX + p, facing * gain, red, green, blue)
         if is_returned:
             v8.store(work, Index(SPARE), facing)
-            for lane in range(NODE_LANES):
+            for lane in range(NUM_LANES):
                 x = np.float64(work[POINTS + p + lane])
                 y = np.float64(work[POINTS + TILE_NODES + p + lane])
                 z = np.float64(work[POINTS + 2 * TILE_NODES + p + lane])
@@ -674,9 +475,9 @@ def _light_tile(lamps, tables, size, view, eye, shadows, work, texels, count, m,
 def _add_color(work, index, light, red, green, blue):
     """Add light of a colour to eight nodes."""
     sums = _load_vectors(work, index)
-    v8.store(work, Index(index), v8.fmuladd(light, _number(red), sums[0]))
-    v8.store(work, Index(index + TILE_NODES), v8.fmuladd(light, _number(green), sums[1]))
-    v8.store(work, Index(index + 2 * TILE_NODES), v8.fmuladd(light, _number(blue), sums[2]))
+    v8.store(work, Index(index), v8.fmuladd(light, copies(red), sums[0]))
+    v8.store(work, Index(index + TILE_NODES), v8.fmuladd(light, copies(green), sums[1]))
+    v8.store(work, Index(index + 2 * TILE_NODES), v8.fmuladd(light, copies(blue), sums[2]))
 
 
 @kernel_function()
@@ -706,7 +507,7 @@ def _light_row_of_tiles(
     size = (lamps.tables.shape[1], lamps.tables.shape[2])
     work = np.zeros(NUM_FIELDS * TILE_NODES, np.float32)
     nodes = np.empty((TILE_NODES, 2), np.int64)
-    texels = np.empty(NODE_LANES, np.int32)
+    texels = np.empty(NUM_LANES, np.int32)
     chosen = np.empty(max_lamps, np.int64)
     scores = np.empty(max_lamps)
     before = np.zeros(max_lamps + 1, np.int64)
@@ -847,215 +648,3 @@ def return_share(angle_rad):
     if angle_rad <= MIDDLE_RETURN_RAD:
         return (angle_rad / FULL_RETURN_RAD) ** _MIDDLE_POWER
     return MIDDLE_RETURN * (angle_rad / MIDDLE_RETURN_RAD) ** _LAST_POWER
-
-
-# ---- From nodes to pixels ------------------------------------------------------------------------
-
-
-@kernel_function()
-def _read_row_of_nodes(node_inverse, lux, row, nodes, start, length):
-    """Enter inverse depths and red, green and blue lux of a row of nodes as rows of `length`.
-
-    A copy of the first node stands before it, and one of the last node after it.
-    """
-    rows, columns = node_inverse.shape
-    row = min(max(row, 0), rows - 1)
-    for j in range(columns + 2):
-        column = min(max(j - 1, 0), columns - 1)
-        nodes[start + j] = node_inverse[row, column]
-        nodes[start + length + j] = lux[row, column, 0]
-        nodes[start + 2 * length + j] = lux[row, column, 1]
-        nodes[start + 3 * length + j] = lux[row, column, 2]
-
-
-@kernel_function()
-def _likeness_of_eight(inverse_depth, z):
-    """Return `_likeness` of eight nodes and pixels, for nodes that are not of the sky."""
-    gap = v8.fmuladd(inverse_depth, z, _number(-1)) * _number(1.0 / SAME_SURFACE)
-    return v8.maximum(_number(1) - gap * gap, _number(OTHER_SURFACE_WEIGHT))
-
-
-@kernel_function()
-def _sum_of_four(a, b, c, d, nodes, index, length):
-    """Return the sum of four weights times the numbers of the four nodes about each pixel."""
-    below = index + Index(4 * length)
-    total = d * v8.load(nodes, below + Index(1))
-    total = v8.fmuladd(c, v8.load(nodes, below), total)
-    total = v8.fmuladd(b, v8.load(nodes, index + Index(1)), total)
-    return v8.fmuladd(a, v8.load(nodes, index), total)
-
-
-@kernel_function()
-def _spread_row(nodes, length, step, v, ramp, depths, lights, spare):
-    """Write the light of a row of pixels that a surface of reflectance 1 sends back.
-
-    Pixels at the same place between two nodes have the same weights, so eight of them, `step`
-    pixels apart, are done at a time.
-
-    Args:
-        nodes: results of `_read_row_of_nodes` for the nodes above and below the row.
-        length: length of a row of them.
-        step: pixels between nodes.
-        v: share of the way from the nodes above to those below.
-        ramp: 0 to 7, int32.
-        depths: z of the pixels from the copy of the first node on, 0 beyond the picture.
-        lights: output, cd/m2, red, green and blue of those pixels.
-        spare: work space, float32 [24].
-    """
-    zero = _number(0)
-    unit = _number(1)
-    far = _number(1e6)
-    lower = _number(v)
-    upper = unit - lower
-    wide = Index(length)
-    stride = Index(step)
-    for first_cell in range(0, length - NODE_LANES, NODE_LANES):
-        cell = Index(first_cell)
-        a_inverse = v8.load(nodes, cell)
-        b_inverse = v8.load(nodes, cell + Index(1))
-        c_inverse = v8.load(nodes, cell + Index(4) * wide)
-        d_inverse = v8.load(nodes, cell + Index(4) * wide + Index(1))
-        a_share = v8.select(v8.greater(a_inverse, zero), upper, zero)
-        b_share = v8.select(v8.greater(b_inverse, zero), upper, zero)
-        c_share = v8.select(v8.greater(c_inverse, zero), lower, zero)
-        d_share = v8.select(v8.greater(d_inverse, zero), lower, zero)
-        for phase in range(step):
-            z = v8.gather(depths, ramp, Index(0), stride, cell * stride + Index(phase))
-            u = _number(np.float32(phase) / np.float32(step))
-            a = (unit - u) * a_share * _likeness_of_eight(a_inverse, z)
-            b = u * b_share * _likeness_of_eight(b_inverse, z)
-            c = (unit - u) * c_share * _likeness_of_eight(c_inverse, z)
-            d = u * d_share * _likeness_of_eight(d_inverse, z)
-            total = (a + b) + (c + d)
-            is_lit = v8.mask_and(v8.greater(total, zero), v8.greater(z, zero))
-            is_lit = v8.mask_and(is_lit, v8.greater(far, z))
-            gain = v8.select(is_lit, _number(1.0 / math.pi) / total, zero)
-            red = _sum_of_four(a, b, c, d, nodes, cell + wide, length) * gain
-            green = _sum_of_four(a, b, c, d, nodes, cell + Index(2) * wide, length) * gain
-            blue = _sum_of_four(a, b, c, d, nodes, cell + Index(3) * wide, length) * gain
-            v8.store(spare, Index(0), red)
-            v8.store(spare, Index(NODE_LANES), green)
-            v8.store(spare, Index(2 * NODE_LANES), blue)
-            at = Index(3) * (cell * stride + Index(phase))
-            for lane in range(Index(NODE_LANES)):
-                lights[at] = spare[lane]
-                lights[at + Index(1)] = spare[lane + Index(NODE_LANES)]
-                lights[at + Index(2)] = spare[lane + Index(2 * NODE_LANES)]
-                at += Index(3) * stride
-
-
-@kernel_function()
-def _add_row(lights, start, reflectance, picture, first, count):
-    """Add light times reflectance to `count` numbers of the picture from `first` on."""
-    done = count // NODE_LANES * NODE_LANES
-    for k in range(Index(0), Index(done), Index(NODE_LANES)):
-        at = Index(first) + k
-        light = v8.load(lights, Index(start) + k)
-        light = v8.fmuladd(light, v8.load(reflectance, at), v8.load(picture, at))
-        v8.store(picture, at, light)
-    for k in range(Index(done), Index(count)):
-        at = Index(first) + k
-        picture[at] += lights[Index(start) + k] * reflectance[at]
-
-
-@kernel_function()
-def _add_sign_light(row, depth, node_inverse, own_lux, step, first, reflectance, is_sign, picture):
-    """Add what the signs in a row of pixels send back of the own lamps' light."""
-    rows, columns = node_inverse.shape
-    unit = np.float32(1)
-    v = np.float32(min(max((row - first) / step, 0.0), rows - 1.0))
-    i = min(int(v), max(rows - 2, 0))
-    v -= np.float32(i)
-    below = min(i + 1, rows - 1)
-    for column in range(depth.shape[1]):
-        if not is_sign[row, column]:
-            continue
-        z = depth[row, column]
-        if not (z > np.float32(0) and z < np.float32(1e6)):
-            continue
-        u = np.float32(min(max((column - first) / step, 0.0), columns - 1.0))
-        j = min(int(u), max(columns - 2, 0))
-        u -= np.float32(j)
-        beside = min(j + 1, columns - 1)
-        a = (unit - u) * (unit - v) * _likeness(node_inverse[i, j], z)
-        b = u * (unit - v) * _likeness(node_inverse[i, beside], z)
-        c = (unit - u) * v * _likeness(node_inverse[below, j], z)
-        d = u * v * _likeness(node_inverse[below, beside], z)
-        total = a + b + c + d
-        if total <= np.float32(0):
-            continue
-        share = np.float32(SIGN_RETURN_PER_LUX / SIGN_WHITE) / total
-        for k in range(3):
-            light = a * own_lux[i, j, k] + b * own_lux[i, beside, k]
-            light += c * own_lux[below, j, k] + d * own_lux[below, beside, k]
-            picture[row, column, k] += light * share * reflectance[row, column, k]
-
-
-@kernel
-def spread_light(depth, node_inverse, lux, own_lux, step, first, reflectance, is_sign, picture):
-    """Add the nodes' light to the picture: reflectance / pi times lux, and what signs send back.
-
-    Each pixel takes the four nodes about it, those on its surface first.
-
-    Args:
-        depth: z of the pixels, metres, 0 for the sky, float32 [H, W].
-        node_inverse: 1 / z of the nodes, 0 for the sky, float32 [h, w].
-        lux: result of `light_nodes`.
-        own_lux: result of `light_nodes`, or empty.
-        step: pixels between nodes.
-        first: column and row of the first node's pixel.
-        reflectance: float32 [H, W, 3].
-        is_sign: pixels of signs, bool [H, W]; empty without any.
-        picture: luminance in linear sRGB, cd/m2, changed in place, float32 [H, W, 3].
-    """
-    height, width = depth.shape
-    rows, columns = node_inverse.shape
-    # Between nodes lie columns + 1 cells, whose first and last reach beyond the picture.
-    length = (columns + NODE_LANES) // NODE_LANES * NODE_LANES + NODE_LANES
-    offset = step - first
-    flat_reflectance = reflectance.reshape(reflectance.size)
-    flat_picture = picture.reshape(picture.size)
-    for number in prange(rows + 1):
-        cell_row = np.int64(number)
-        top = max(first + (cell_row - 1) * step, 0)
-        bottom = min(first + cell_row * step, height)
-        if cell_row == rows:
-            bottom = height
-        nodes = np.zeros(8 * length, np.float32)
-        _read_row_of_nodes(node_inverse, lux, cell_row - 1, nodes, 0, length)
-        _read_row_of_nodes(node_inverse, lux, cell_row, nodes, 4 * length, length)
-        depths = np.zeros(length * step, np.float32)
-        lights = np.empty(3 * length * step, np.float32)
-        spare = np.empty(3 * NODE_LANES, np.float32)
-        ramp = np.arange(NODE_LANES).astype(np.int32)
-        for row in range(top, bottom):
-            for column in range(width):
-                depths[offset + column] = depth[row, column]
-            v = np.float32(row - first - (cell_row - 1) * step) / np.float32(step)
-            _spread_row(nodes, length, step, v, ramp, depths, lights, spare)
-            _add_row(lights, 3 * offset, flat_reflectance, flat_picture, 3 * width * row, 3 * width)
-            if is_sign.size > 0:
-                has_sign = False
-                for column in range(width):
-                    has_sign |= is_sign[row, column]
-                if has_sign:
-                    _add_sign_light(
-                        row,
-                        depth,
-                        node_inverse,
-                        own_lux,
-                        step,
-                        first,
-                        reflectance,
-                        is_sign,
-                        picture,
-                    )
-
-
-@kernel_function()
-def _likeness(inverse_depth, z):
-    """Return the weight of a node for a pixel: 1 on the same surface, 0 for the sky."""
-    if inverse_depth <= np.float32(0):
-        return np.float32(0)
-    gap = (inverse_depth * z - np.float32(1)) * np.float32(1.0 / SAME_SURFACE)
-    return max(np.float32(1) - gap * gap, np.float32(OTHER_SURFACE_WEIGHT))
