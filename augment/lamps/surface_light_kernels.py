@@ -39,6 +39,8 @@ SAMPLE_MARGIN = 4.0
 MIN_RANK_COSINE = 0.02
 # Loss of length of a mean normal up to which the surface is smooth.
 SMOOTH_LOSS = 0.1
+# Depth from a lamp up to which nothing shades a point, metres.
+MIN_SHADOW_DEPTH_M = 0.05
 # Mean cosine of a lamp to surfaces whose normals point anywhere.
 ROUGH_COSINE = 0.25
 
@@ -98,7 +100,7 @@ def lit_share(shadows, shadow_map, x, y, z):
     pose = shadows.poses[shadow_map]
     lens = shadows.lenses[shadow_map]
     depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-    if depth <= 0.05:
+    if depth <= MIN_SHADOW_DEPTH_M:
         return 1.0
     per_z = 1.0 / depth
     u = (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) * per_z
@@ -119,6 +121,59 @@ def lit_share(shadows, shadow_map, x, y, z):
     # From fully lit to dark over one more tolerance.
     tolerance = shadows.tolerances[0] * per_z + shadows.tolerances[1]
     return min(max(2.0 - (nearest - per_z) / tolerance, 0.0), 1.0)
+
+
+@kernel_function()
+def _lit_shares(shadows, shadow_map, eye, point, texels):
+    """Return `lit_share` of eight points.
+
+    Args:
+        shadows: depth maps of lamps.
+        shadow_map: index of the map.
+        eye: place of the eye.
+        point: the points, from the eye.
+        texels: work space, int32 [8].
+    """
+    pose = shadows.poses[shadow_map]
+    lens = shadows.lenses[shadow_map]
+    images = shadows.inverse_depths.reshape(shadows.inverse_depths.size)
+    height, width = shadows.inverse_depths.shape[1:]
+    x = _row_times(pose[0], eye, point)
+    y = _row_times(pose[1], eye, point)
+    depth = _row_times(pose[2], eye, point)
+    zero = copies(0)
+    unit = copies(1)
+    per_z = unit / v8.maximum(depth, copies(MIN_SHADOW_DEPTH_M))
+    last_column = copies(width - 1)
+    last_row = copies(height - 1)
+    u = v8.fmuladd(x * per_z, copies(lens[0]), copies(lens[2] - 0.5))
+    v = v8.fmuladd(y * per_z, copies(lens[1]), copies(lens[3] - 0.5))
+    is_inside = v8.mask_and(v8.at_least(u, zero), v8.at_least(last_column, u))
+    is_inside = v8.mask_and(is_inside, v8.at_least(v, zero))
+    is_inside = v8.mask_and(is_inside, v8.at_least(last_row, v))
+    is_inside = v8.mask_and(is_inside, v8.greater(depth, copies(MIN_SHADOW_DEPTH_M)))
+    i = v8.floor(v8.minimum(v8.maximum(v, zero), last_row - unit))
+    j = v8.floor(v8.minimum(v8.maximum(u, zero), last_column - unit))
+    v8.store_integers(texels, Index(0), v8.fmuladd(i, copies(width), j))
+    first = shadow_map * height * width
+    above_left = v8.gather(images, texels, Index(0), Index(1), Index(first))
+    above_right = v8.gather(images, texels, Index(0), Index(1), Index(first + 1))
+    below_left = v8.gather(images, texels, Index(0), Index(1), Index(first + width))
+    below_right = v8.gather(images, texels, Index(0), Index(1), Index(first + width + 1))
+    above = v8.fmuladd(above_right - above_left, u - j, above_left)
+    below = v8.fmuladd(below_right - below_left, u - j, below_left)
+    nearest = v8.fmuladd(below - above, v - i, above)
+    tolerance = v8.fmuladd(copies(shadows.tolerances[0]), per_z, copies(shadows.tolerances[1]))
+    share = copies(2) - (nearest - per_z) / tolerance
+    share = v8.minimum(v8.maximum(share, zero), unit)
+    return v8.select(is_inside, share, unit)
+
+
+@kernel_function()
+def _row_times(row, eye, point):
+    """Return a row of a pose times eight points, which are from the eye."""
+    at_eye = row[0] * eye[0] + row[1] * eye[1] + row[2] * eye[2] + row[3]
+    return dot(vector_copies(row[0], row[1], row[2]), point) + copies(at_eye)
 
 
 @kernel_function()
@@ -448,17 +503,8 @@ def _light_tile(lamps, tables, size, view, eye, shadows, work, texels, count, m,
             continue
         facing = _lux_of_eight(tables, size, lamp, towards, squared, per_m, texels)
         if shadow_map >= 0:
-            v8.store(work, Index(SPARE), facing)
-            for lane in range(NUM_LANES):
-                if work[SPARE + lane] > 0:
-                    work[SPARE + lane] *= lit_share(
-                        shadows,
-                        shadow_map,
-                        eye[0] + work[POINTS + p + lane],
-                        eye[1] + work[POINTS + TILE_NODES + p + lane],
-                        eye[2] + work[POINTS + 2 * TILE_NODES + p + lane],
-                    )
-            facing = v8.load(work, Index(SPARE))
+            point = _load_vectors(work, POINTS + p)
+            facing = facing * _lit_shares(shadows, shadow_map, eye, point, texels)
         _add_color(work, LUX + p, facing * gain, red, green, blue)
         if is_returned:
             v8.store(work, Index(SPARE), facing)
