@@ -232,40 +232,41 @@ def _mirrored(index, count):
 
 
 @kernel_function()
-def _average_row(values, length, first, last, width, radius, is_mirrored, means):
-    """Average the planes `first` to `last` of a row over windows of 2 radius + 1 nodes.
+def _average_row(values, length, num_planes, width, is_ground, means):
+    """Average the first planes of a row over windows.
 
     Args:
         values: planes of a row, each of `length` numbers.
         length: length of a row of numbers.
-        first: first plane.
-        last: last plane.
+        num_planes: number of the planes.
         width: nodes of the row.
-        radius: nodes of the window on each side of its middle.
-        is_mirrored: True if the row goes on mirrored beyond its ends; False if it is 0 there.
+        is_ground: True for the windows of the ground, False for those of walls.
         means: output, planes as those of `values`.
     """
-    per_node = 1.0 / (2 * radius + 1)
-    for k in range(first, last + 1):
+    for k in range(num_planes):
+        # Shares of ground go on mirrored beyond the picture; all else is 0 there.
+        is_mirrored = is_ground and k >= WEIGHT
+        radius = WALL_RADIUS
+        if is_ground:
+            radius = NEAR_COLUMNS if is_mirrored else GROUND_COLUMNS
+        per_node = 1.0 / (2 * radius + 1)
         start = k * length
         total = 0.0
         for j in range(-radius, radius + 1):
-            if is_mirrored:
-                total += values[start + _mirrored(j, width)]
-            elif 0 <= j < width:
-                total += values[start + j]
+            at = _mirrored(j, width) if is_mirrored else j
+            if 0 <= at < width:
+                total += values[start + at]
         for j in range(width):
             means[start + j] = total * per_node
             ahead = j + radius + 1
             behind = j - radius
+            if is_mirrored:
+                ahead = _mirrored(ahead, width)
+                behind = _mirrored(behind, width)
             if ahead < width:
                 total += values[start + ahead]
-            elif is_mirrored:
-                total += values[start + _mirrored(ahead, width)]
             if behind >= 0:
                 total -= values[start + behind]
-            elif is_mirrored:
-                total -= values[start + _mirrored(behind, width)]
 
 
 @kernel_function()
@@ -295,11 +296,11 @@ def weigh_ground(inverse, normals, planes):
         for column in range(0, length, NUM_LANES):
             x, y, z, depth = _load_row(work, length, column)
             _store_weighted(weighted, length, column, _ground_weight(z), x, y, z, depth)
-        _average_row(weighted, length, WEIGHT, DEPTH, width, NEAR_COLUMNS, True, means)
-        _average_row(weighted, length, 0, WEIGHT - 1, width, GROUND_COLUMNS, False, means)
-        _average_row(means, length, 0, WEIGHT - 1, width, GROUND_COLUMNS, False, weighted)
-        for k in range(WEIGHT * length, NUM_PLANES * length):
-            weighted[k] = means[k]
+        for turn in range(2):
+            count = NUM_PLANES if turn == 0 else WEIGHT  # normals are averaged twice
+            _average_row(weighted, length, count, width, True, means)
+            for k in range(count * length):
+                weighted[k] = means[k]
         _store_planes(weighted, length, planes, np.int64(row))
 
 
@@ -311,11 +312,9 @@ def _average_block(values, height, radius, is_mirrored, means):
     for column in range(0, BLOCK_COLUMNS, NUM_LANES):
         total = zero
         for i in range(-radius, radius + 1):
-            if is_mirrored:
-                at = _mirrored(i, height) * BLOCK_COLUMNS + column
-                total = total + v8.load(values, Index(at))
-            elif 0 <= i < height:
-                total = total + v8.load(values, Index(i * BLOCK_COLUMNS + column))
+            at = _mirrored(i, height) if is_mirrored else i
+            if 0 <= at < height:
+                total = total + v8.load(values, Index(at * BLOCK_COLUMNS + column))
         for i in range(height):
             v8.store(means, Index(i * BLOCK_COLUMNS + column), total * per_node)
             ahead = i + radius + 1
@@ -347,15 +346,14 @@ def average_columns(planes, is_ground):
         for i in range(height):
             for j in range(BLOCK_COLUMNS):
                 values[i * BLOCK_COLUMNS + j] = planes[k, i, left + j]
-        if not is_ground:
-            _average_block(values, height, WALL_RADIUS, False, means)
-        elif k >= WEIGHT:
-            _average_block(values, height, NEAR_ROWS, True, means)
-        else:
-            _average_block(values, height, GROUND_ROWS, False, means)
-            _average_block(means, height, GROUND_ROWS, False, values)
+        is_share = is_ground and k >= WEIGHT
+        radius = WALL_RADIUS
+        if is_ground:
+            radius = NEAR_ROWS if is_share else GROUND_ROWS
+        for _ in range(2 if is_ground and k < WEIGHT else 1):
+            _average_block(values, height, radius, is_share, means)
             for i in range(height * BLOCK_COLUMNS):
-                means[i] = values[i]
+                values[i] = means[i]
         for i in range(height):
             for j in range(BLOCK_COLUMNS):
                 planes[k, i, left + j] = means[i * BLOCK_COLUMNS + j]
@@ -433,7 +431,7 @@ def smooth_ground(inverse, normals, planes, smooth_normals):
             _store_normals(work, length, column, x, y, z)
             _store_weighted(weighted, length, column, _wall_weight(x, y, z), x, y, z, depth)
         _write_row(work, length, row, smooth_normals)
-        _average_row(weighted, length, 0, DEPTH, width, WALL_RADIUS, False, means)
+        _average_row(weighted, length, NUM_PLANES, width, False, means)
         _store_planes(means, length, planes, row)
 
 
