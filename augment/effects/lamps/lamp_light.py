@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from augment.effects.effect import EffectInScene, RenderedView
-from augment.effects.lamps.picture_light import find_reflectance
+from augment.effects.lamps.picture_light import find_reflectance, find_surfaces
 from augment.effects.lamps.plan import AIR, DROPS, EMITTERS, SURFACES, WET, LightPlan
 from augment.effects.lamps.recording_car import PAINT_M, light_recording_car, recording_car_pixels
 from augment.effects.lamps.signs import sign_pixels
@@ -27,14 +27,11 @@ from augment.lamps.wet_glints import add_wet_glints
 from augment.memo import memo_of
 from augment.render.buffers import REFERENCE
 from augment.render.composite import unit_depth_coordinates
-from augment.render.constants import SURFACE_ALPHA
 from augment.render.scatter import scattered_share
 from augment.scene.cameras import Camera
 from augment.scene.labels import EGO_VEHICLE
 from augment.timing import timed
 
-# Opacity of a pixel up to which it shows no surface that hides a lamp.
-MIN_ALPHA = 1e-3
 # Width of the pixels of halos by day, over that at night: they are faint.
 DAY_HALO_STEPS = 2
 
@@ -68,9 +65,9 @@ def add_lamp_light(
     assert raster.alpha is not None and raster.expected_depth is not None
     alpha = np.ascontiguousarray(raster.alpha.detach().cpu().numpy(), np.float32)
     z = np.ascontiguousarray(raster.expected_depth.detach().cpu().numpy(), np.float32)
-    depth_m = np.where((alpha >= SURFACE_ALPHA) & np.isfinite(z), z, np.float32(0))
+    depth_m, surface_m = find_surfaces(alpha, z, uses_kernels=effect.backend != REFERENCE)
     air = air_of(effect, view)
-    added = np.zeros_like(rgb) if recorded is None else recorded
+    added = np.zeros(rgb.shape, np.float32) if recorded is None else recorded
     if plan.hour.is_dark:
         car_pixels = recording_car_pixels(effect.scene, camera)
         if car_pixels is not None:
@@ -101,7 +98,6 @@ def add_lamp_light(
                     camera,
                     uses_kernels=effect.backend != REFERENCE,
                 )
-    surface_m = np.where(alpha > MIN_ALPHA, z, np.float32(np.inf))
     if not air.is_clear:
         with timed(AIR):
             u, v = unit_depth_coordinates(camera)
