@@ -13,11 +13,12 @@ from augment.render.cpu.jit import kernel_function
 # Offset of the square root that spaces a table's nodes: nodes are 0.07 to 0.1 degrees apart at the
 # axis, and 2 to 4 degrees apart far from it.
 ROOT_OFFSET = 0.001
-_ROOT = math.sqrt(ROOT_OFFSET)
+# Square root of that offset.
+ROOT = math.sqrt(ROOT_OFFSET)
 # Scale that brings the last row (straight up) to 1.
-_ROW_SCALE = 1.0 / (math.sqrt(1.0 + ROOT_OFFSET) - _ROOT)
+ROW_SCALE = 1.0 / (math.sqrt(1.0 + ROOT_OFFSET) - ROOT)
 # Scale that brings the last column (straight back) to 1.
-_COLUMN_SCALE = 1.0 / (math.sqrt(2.0 + ROOT_OFFSET) - _ROOT)
+COLUMN_SCALE = 1.0 / (math.sqrt(2.0 + ROOT_OFFSET) - ROOT)
 
 
 @kernel_function()
@@ -36,14 +37,14 @@ def pattern_at(tables, pattern, forward, right, up):
     level = math.sqrt(forward * forward + right * right)
     # The diamond angle of elevation, -1 to 1: as an angle, but without its arc functions.
     fold = abs(up) / max(abs(up) + level, 1e-30)
-    row = (math.sqrt(fold + ROOT_OFFSET) - _ROOT) * _ROW_SCALE
+    row = (math.sqrt(fold + ROOT_OFFSET) - ROOT) * ROW_SCALE
     if up < 0.0:
         row = -row
     # The diamond angle of azimuth, -2 to 2.
     fold = abs(right) / max(abs(forward) + abs(right), 1e-30)
     if forward < 0.0:
         fold = 2.0 - fold
-    column = (math.sqrt(fold + ROOT_OFFSET) - _ROOT) * _COLUMN_SCALE
+    column = (math.sqrt(fold + ROOT_OFFSET) - ROOT) * COLUMN_SCALE
     if right < 0.0:
         column = -column
     row = min(max((row + 1.0) * (0.5 * last_row), 0.0), float(last_row))
