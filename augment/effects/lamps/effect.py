@@ -316,10 +316,9 @@ def _read_light(
     with timed(METER):
         if glare is None and not plan.needs_luminance:
             return view
-        height, width = view.rgb.shape[:2]
         reading = read_light(
             view.rgb.detach().cpu().numpy(),
-            None if glare is None else widen_glare(glare, width, height),
+            glare,
             exposure.white_cd_m2,
             needs_luminance=plan.needs_luminance,
             uses_kernels=effect.backend != REFERENCE,
