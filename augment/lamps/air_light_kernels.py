@@ -121,7 +121,6 @@ def light_slices(grid, lamps, slice_table, slices, ranges, volume):
     num_steps = grid.steps[1]
     step = num_steps * grid.steps[0]
     softness = SOFT_STEPS * step / grid.lens[4]
-    one = Index(1)
     for row in prange(num_rows):
         v = (row * step - grid.lens[3]) / grid.lens[1]
         volume[row] = np.float32(0)
@@ -177,7 +176,7 @@ def light_slices(grid, lamps, slice_table, slices, ranges, volume):
                 reds = volume[row, column, 0]
                 greens = volume[row, column, 1]
                 blues = volume[row, column, 2]
-                for k in range(ends[column, 0], ends[column, 1], one):
+                for k in range(ends[column, 0], ends[column, 1], Index(1)):
                     light = weight_a * slice_table[first + k] + weight_b * slice_table[second + k]
                     light += weight_c * slice_table[third + k] + weight_d * slice_table[fourth + k]
                     reds[k] += light * red

@@ -222,8 +222,8 @@ def _factors_at(lamps, index, gamma, cosine):
     end = lamps.ends[index, 0]
     fade = (gamma - FADE_FROM * end) / ((1 - FADE_FROM) * end)
     if end < math.pi and fade > 0:
-        rest = max(1 - fade, 0.0)
-        scale *= rest * rest * (1 + 2 * fade)
+        weight = max(1 - fade, 0.0)
+        scale *= weight * weight * (1 + 2 * fade)
     return scale, beam_gain, added_mean
 
 
@@ -349,8 +349,8 @@ def place_at_lamp(lamps, index, x, y, z):
     rise = x * frame[2, 0] + y * frame[2, 1] + z * frame[2, 2]
     square = side * side + rise * rise
     sine = max(math.sqrt(square), 1e-6)
-    less = 1 - abs(cosine)
-    w = math.sqrt(math.sqrt(square + less * less))
+    cosine_gap = 1 - abs(cosine)
+    w = math.sqrt(math.sqrt(square + cosine_gap * cosine_gap))
     w = w if cosine > 0 else W_END - w
     node_place = max(w * NODES_PER_W - layout[FIRST_NODE], 0.0)
     node = min(int(node_place), layout[NUM_NODES] - 2)
@@ -379,7 +379,7 @@ def _corner_light(reach_table, first, second, third, fourth, shares, j, q):
 
 
 @kernel_function()
-def light_to_ends(lamps, index, reach_table, x, y, z, near, far, same):
+def light_to_ends(lamps, index, reach_table, x, y, z, near, far, max_difference):
     """Return the luminance of a lamp's light along a ray times h, to two distances.
 
     Args:
@@ -389,7 +389,8 @@ def light_to_ends(lamps, index, reach_table, x, y, z, near, far, same):
         x: unit direction of the ray in camera axes, like y and z.
         near: inverse of the nearer distance to which the ray goes, 1/m.
         far: inverse of the further distance.
-        same: largest relative difference of the two at which both get the light to their mean.
+        max_difference: largest relative difference of the two at which both get the light to their
+            mean.
 
     Returns:
         The two, and 1 if the lamp lies before the camera, else 0.
@@ -407,7 +408,7 @@ def light_to_ends(lamps, index, reach_table, x, y, z, near, far, same):
     )  # fmt: skip
     shares = (node_share, plane_share)
     distance = lamps.distances_m[index]
-    has_two = near - far > same * near
+    has_two = near - far > max_difference * near
     first = far if has_two else 0.5 * (near + far)
     place = num_intervals * math.sqrt(angle_of(sine, distance * first - cosine) * (1 / math.pi))
     j = min(int(place), num_intervals - 1)

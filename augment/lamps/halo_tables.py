@@ -56,7 +56,7 @@ MAX_POINTS = 16
 FINE_SPREAD_DEG = 25.0
 # Planes, and samples in half a turn, of such a beam of the recording car, along which its camera
 # looks.
-OWN_PLANES = (192, 128)
+OWN_PLANES = (192, 384)
 # Planes, and samples in half a turn, of another such beam.
 FINE_PLANES = (96, 128)
 # Planes, and samples in half a turn, of other lamps.

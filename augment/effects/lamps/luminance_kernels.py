@@ -28,7 +28,6 @@ def measure_luminance(rgb, glare, numbers, luminance, is_veiled):
     """
     zero = np.float32(0)
     quarter = np.float32(0.25)
-    one = Index(1)
     has_glare = glare.shape[0] > 0
     has_luminance = luminance.shape[0] > 0
     red_weight = numbers[0]
@@ -62,7 +61,7 @@ def measure_luminance(rgb, glare, numbers, luminance, is_veiled):
             continue
         lights = np.empty(rgb.shape[1], np.float32)
         has_high = False
-        for j in range(Index(0), width, one):
+        for j in range(Index(0), width, Index(1)):
             red = max(rgb[i, j, 0], zero)
             green = max(rgb[i, j, 1], zero)
             blue = max(rgb[i, j, 2], zero)
@@ -79,8 +78,8 @@ def measure_luminance(rgb, glare, numbers, luminance, is_veiled):
                         value = light_of_high_code(code) if code > MAX_CODE else light_of_code(code)
                         light += numbers[k] * value
                     lights[j] = light
-        for j in range(Index(0), width, one):
+        for j in range(Index(0), width, Index(1)):
             is_veiled[i, j] = (veils[j] > lights[j]) & (veils[j] >= least_veil)
         if has_luminance:
-            for j in range(Index(0), width, one):
+            for j in range(Index(0), width, Index(1)):
                 luminance[i, j] = (lights[j] + veils[j]) * numbers[3]
