@@ -173,7 +173,7 @@ def _ranges_of_nodes(cells: Float32[np.ndarray, "R C 2"]) -> Float32[np.ndarray,
     rows = np.empty((cells.shape[0] - 1, *cells.shape[1:]), np.float32)
     np.maximum(cells[:-1, :, 0], cells[1:, :, 0], out=rows[..., 0])
     np.minimum(cells[:-1, :, 1], cells[1:, :, 1], out=rows[..., 1])
-    ranges = np.empty((rows.shape[0], rows.shape[1] - 1, 2), np.float32)
+    ranges = np.empty((cells.shape[0] - 1, cells.shape[1] - 1, 2), np.float32)
     np.maximum(rows[:, :-1, 0], rows[:, 1:, 0], out=ranges[..., 0])
     np.minimum(rows[:, :-1, 1], rows[:, 1:, 1], out=ranges[..., 1])
     return ranges
