@@ -16,6 +16,7 @@ from augment.render.layout import Index
 # Offset of the square root that spaces a table's nodes: nodes are 0.07 to 0.1 degrees apart at the
 # axis, and 2 to 4 degrees apart far from it.
 ROOT_OFFSET = 0.001
+# Square root of that offset.
 ROOT = math.sqrt(ROOT_OFFSET)
 # Scale that brings the last row (straight up) to 1.
 ROW_SCALE = 1.0 / (math.sqrt(1.0 + ROOT_OFFSET) - ROOT)

@@ -26,7 +26,6 @@ from augment.lamps.surface_light import surface_light
 from augment.lamps.wet_glints import add_wet_glints
 from augment.memo import memo_of
 from augment.render.buffers import REFERENCE
-from augment.render.composite import unit_depth_coordinates
 from augment.render.scatter import scattered_share
 from augment.scene.cameras import Camera
 from augment.scene.labels import EGO_VEHICLE
@@ -65,8 +64,9 @@ def add_lamp_light(
     assert raster.alpha is not None and raster.expected_depth is not None
     alpha = np.ascontiguousarray(raster.alpha.detach().cpu().numpy(), np.float32)
     z = np.ascontiguousarray(raster.expected_depth.detach().cpu().numpy(), np.float32)
-    depth_m, surface_m = find_surfaces(alpha, z, uses_kernels=effect.backend != REFERENCE)
+    depth_m = find_surfaces(alpha, z, uses_kernels=effect.backend != REFERENCE)
     air = air_of(effect, view)
+    # Not zeros_like, which would write to memory where no light is added.
     added = np.zeros(rgb.shape, np.float32) if recorded is None else recorded
     if plan.hour.is_dark:
         car_pixels = recording_car_pixels(effect.scene, camera)
@@ -100,20 +100,17 @@ def add_lamp_light(
                 )
     if not air.is_clear:
         with timed(AIR):
-            u, v = unit_depth_coordinates(camera)
-            distance_m = np.sqrt(1 + u[None, :] ** 2 + v[:, None] ** 2) * depth_m
-            distance_m[depth_m <= 0] = np.inf
-            added += air_light(
+            air_light(
                 lamps,
                 camera,
-                distance_m,
+                depth_m,
                 air,
                 num_points=plan.lamp_points,
                 step_px=plan.lamp_halo_px * (1 if plan.hour.is_dark else DAY_HALO_STEPS),
                 threshold_cd_m2=threshold_cd_m2,
-                visible_shares=lamp_visibility(
-                    lamps, camera, surface_m, alpha, radius_m=HALO_RADIUS_M
-                ),
+                visible_shares=lamp_visibility(lamps, camera, z, alpha, radius_m=HALO_RADIUS_M),
+                picture=added,
+                is_depth=True,
             )
     if plan.hour.is_dark and plan.has_drops:
         with timed(DROPS):
@@ -129,7 +126,7 @@ def add_lamp_light(
                     min_luminance_cd_m2=threshold_cd_m2,
                 )
     with timed(EMITTERS):
-        visible_shares = lamp_visibility(lamps, camera, surface_m, alpha)
+        visible_shares = lamp_visibility(lamps, camera, z, alpha)
         add_emitters(added, lamps, camera, visible_shares, air)
     return added
 

@@ -347,24 +347,19 @@ def find_reflectance(rgb, fog_share, airlight, numbers, out):
 
 
 @kernel
-def find_surfaces(alpha, depth, bounds, surface_m, hiding_m):
-    """Write the depth of pixels that show a surface, and of those that hide what is behind them.
+def find_surfaces(alpha, depth, min_alpha, surface_m):
+    """Write the depth of pixels that show a surface.
 
     Args:
         alpha: opacity, float32 [H, W].
         depth: z of what the pixels show, metres, float32 [H, W].
-        bounds: opacity from which on a pixel shows a surface, and above which it hides things.
+        min_alpha: opacity from which on a pixel shows a surface.
         surface_m: output, z of the surfaces, 0 without one or where z is not finite.
-        hiding_m: output, z of what hides things, infinite without it.
     """
-    least = bounds[0]
-    hiding = bounds[1]
     zero = np.float32(0)
-    far = np.float32(np.inf)
     largest = np.float32(np.finfo(np.float32).max)
     for i in prange(alpha.shape[0]):
         for j in range(alpha.shape[1]):
             z = depth[i, j]
-            is_surface = (alpha[i, j] >= least) & (abs(z) <= largest)
+            is_surface = (alpha[i, j] >= min_alpha) & (abs(z) <= largest)
             surface_m[i, j] = z if is_surface else zero
-            hiding_m[i, j] = z if alpha[i, j] > hiding else far

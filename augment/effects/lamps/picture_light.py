@@ -26,8 +26,6 @@ MIN_SATURATING_LIGHT = 0.1
 MIN_REFLECTANCE = 0.004
 # Greatest reflectance of a surface.
 MAX_REFLECTANCE = 0.9
-# Opacity of a pixel up to which it shows no surface that hides a lamp.
-MIN_ALPHA = 1e-3
 _NONE = np.zeros((0, 0), np.float32)
 _NO_DRAWS = np.zeros((0, 0), np.uint8)
 
@@ -191,28 +189,21 @@ def find_surfaces(
     depth_m: Float32[np.ndarray, "H W"],
     *,
     uses_kernels: bool = True,
-) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-    """Return the depth of pixels that show a surface, and of those that hide a lamp behind them.
+) -> Float32[np.ndarray, "H W"]:
+    """Return the depth of pixels that show a surface, 0 for the sky.
 
     Args:
         alpha: opacity of the pixels.
         depth_m: z of what they show, metres.
         uses_kernels: False for the plain definition.
-
-    Returns:
-        z of the surfaces, 0 for the sky; and z of what hides lamps, infinite where nothing does.
     """
     if not uses_kernels:
         is_surface = (alpha >= SURFACE_ALPHA) & np.isfinite(depth_m)
-        surface_m = np.where(is_surface, depth_m, np.float32(0))
-        return surface_m, np.where(alpha > MIN_ALPHA, depth_m, np.float32(np.inf))
+        return np.where(is_surface, depth_m, np.float32(0))
     surface_m = np.empty_like(depth_m)
-    hiding_m = np.empty_like(depth_m)
     with kernel_threads(ROWS_PER_CHUNK):
-        light_kernels.find_surfaces(
-            alpha, depth_m, np.array([SURFACE_ALPHA, MIN_ALPHA], np.float32), surface_m, hiding_m
-        )
-    return surface_m, hiding_m
+        light_kernels.find_surfaces(alpha, depth_m, np.float32(SURFACE_ALPHA), surface_m)
+    return surface_m
 
 
 def _rows(image: np.ndarray) -> np.ndarray:
