@@ -24,6 +24,7 @@ import functools
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -55,7 +56,7 @@ _OCTAVES = ((9.0, 0.7), (3.6, 0.55), (1.5, 0.3), (0.6, 0.14))
 # Distance over which a place is compared with its surroundings, metres.
 _SURROUNDINGS_M = 2.5
 # Weight of a centimetre below the surroundings, in standard deviations of the noise.
-_WEIGHT_PER_CM = 0.45
+_WEIGHT_PER_CM = 0.6
 # Largest height that counts, cm.
 _MAX_HEIGHT_CM = 4.0
 # Weight of a wheel track.
@@ -212,7 +213,7 @@ def stain_levels(share: float) -> np.ndarray:
     level = (stain_table() < share).astype(np.float32)
     levels = [level.ravel()]
     for _ in range(1, NUM_STAIN_LEVELS):
-        level = level.reshape(len(level) // 2, 2, -1, 2).mean((1, 3), dtype=np.float32)
+        level = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         levels.append(level.ravel())
     return np.concatenate(levels)
 

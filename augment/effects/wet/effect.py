@@ -219,6 +219,9 @@ class WetEffect(Effect):
         if effect.settings.film is not None:
             with timed(DARKENING_PASS):
                 rgb, share = _wet_by_film(effect, view, camera, share)
+            if not bool(share.any()):
+                skip_reasons = dict.fromkeys((MIRROR_PASS, REFLECTION_PASS), "no film mirrors")
+                return replace(view, rgb=rgb, skip_reasons={**view.skip_reasons, **skip_reasons})
         elif view.layers.photo is not None:
             with timed(DARKENING_PASS):
                 rgb = _darken_photo(effect, view, camera, share)
@@ -333,13 +336,13 @@ def _wet_by_film(
     data: WetGroundPlan = wet_effect.settings
     ground: WetGround = wet_effect.prepared_data
     assert data.film is not None and view.raster.expected_depth is not None
-    has_fog = view.layers.fog is not None
     clear_rgb = view.rgb
     transmittance = None
-    if has_fog:
+    if view.layers.fog is not None:
         clear_rgb, transmittance = _without_fog(view, camera)
+    is_shared = view.layers.photo is not None or transmittance is not None
     wet_rgb, mirror_share = wet_by_film(
-        clear_rgb,
+        clear_rgb.clone() if is_shared else clear_rgb,
         camera,
         view.raster.expected_depth,
         share,

@@ -752,18 +752,18 @@ DRYING_RANK, PUDDLE_RANK, TRACK, NUM_DRYING_CHANNELS = range(4)
 # Share of the largest film at which the first places are dry; assumed.
 FIRST_DRY_SHARE = 0.65
 # Film from which on ground is as dark as it gets, mm; assumed.
-DARK_FILM_MM = 0.08
+DARK_FILM_MM = 0.05
 # Film below which stones of asphalt break the mirror image, mm; assumed.
-MATT_FILM_MM = 0.05
+MATT_FILM_MM = 0.04
 # Change of the drying rank per deviation of the coarse and of the fine noise.
-COARSE_RANK = 0.045
-FINE_RANK = 0.02
+COARSE_RANK = 0.06
+FINE_RANK = 0.035
 # Side of the table of stains, texels; a power of 2.
 STAIN_SIDE = 1024
 # Side of its texels, metres.
 STAIN_TEXEL_M = 0.001
 # Number of levels of the table; each halves its side.
-NUM_STAIN_LEVELS = 8
+NUM_STAIN_LEVELS = 6
 
 
 class RoadWaterNumbers(NamedTuple):
@@ -788,8 +788,10 @@ def _stain_lanes(stains, px, py, texel_size, mean, eye_xy, texels, spare):
     """Return the share of stained ground about points; `mean` where texels are larger than all."""
     v8.store(spare, Index(0), px)
     v8.store(spare, Index(NUM_LANES), py)
-    v8.store(spare, Index(RESULTS_START), log2(texel_size * _splat(1 / STAIN_TEXEL_M)))
-    for lane in range(Index(NUM_LANES)):
+    level_of = log2(texel_size * _splat(1 / STAIN_TEXEL_M))
+    is_small = v8.greater(_splat(NUM_STAIN_LEVELS - 1), level_of)
+    v8.store(spare, Index(RESULTS_START), level_of)
+    for lane in range(_lanes_if(_any(is_small))):
         level = max(spare[Index(RESULTS_START) + lane], np.float32(0))
         value = np.float32(mean)
         if level < np.float32(NUM_STAIN_LEVELS - 1):
@@ -802,16 +804,14 @@ def _stain_lanes(stains, px, py, texel_size, mean, eye_xy, texels, spare):
                 above = _stain_at(stains, k + 1, x, y)
             value = below + (above - below) * (level - np.float32(k))
         spare[Index(RESULTS_START) + lane] = value
-    return v8.load(spare, Index(RESULTS_START))
+    return v8.select(is_small, v8.load(spare, Index(RESULTS_START)), _splat(mean))
 
 
 @kernel_function()
 def _stain_at(stains, level, x, y):
     """Return one level of the table between its texels, at world x and y."""
     side = STAIN_SIDE >> level
-    start = np.int64(0)
-    for k in range(level):
-        start += (STAIN_SIDE >> k) * (STAIN_SIDE >> k)
+    start = (STAIN_SIDE * STAIN_SIDE - side * side) * 4 // 3  # texels of all finer levels
     scale = 1.0 / (STAIN_TEXEL_M * (1 << level))
     u = x * scale - 0.5
     v = y * scale - 0.5
@@ -839,7 +839,7 @@ def _wet_light(encoded, wetness, water):
 
 
 @kernel_function()
-def _wet_row(line, width, view, drying, depth, share, water, noise, stains, mirror_share, rgb):
+def _wet_row(line, width, view, drying, depth, share, water, noise, stains, rgb):
     """Darken one row of the image, and find how much of each pixel mirrors."""
     view = _read_view(view)
     lens = view.lens
@@ -906,9 +906,10 @@ def _wet_row(line, width, view, drying, depth, share, water, noise, stains, mirr
             dark * v8.broadcast(water.film_wetness), puddle * v8.broadcast(water.puddle_wetness)
         )
         mirror = v8.maximum(mirror * v8.broadcast(film_mirror), puddle)
-        old = v8.load(mirror_share, pixel)
-        v8.store(mirror_share, pixel, v8.select(is_ground, ground_share * mirror, old))
-        dark = dark * ground_share
+        v8.store(share, pixel, v8.select(is_ground, ground_share * mirror, ground_share))
+        dark = v8.select(is_ground, dark * ground_share, zero)
+        if not _any(v8.greater(dark, zero)):
+            continue
         red, green, blue = v8.load_colours(rgb, Index(3) * pixel)
         red = v8.select(is_ground, _wet_light(red, dark, water), red)
         green = v8.select(is_ground, _wet_light(green, dark, water), green)
@@ -917,17 +918,15 @@ def _wet_row(line, width, view, drying, depth, share, water, noise, stains, mirr
 
 
 @kernel
-def wet_ground(view, drying, width, depth, share, water, noise, stains, mirror_share, rgb):
+def wet_ground(view, drying, width, depth, share, water, noise, stains, rgb):
     """Darken ground in rgb [3 H W], in place, by the film that lies on it.
 
-    mirror_share [H W], zeros at first, receives the share of each pixel whose film mirrors.
-    drying: flat, NUM_DRYING_CHANNELS of each cell of the map. depth, share: as of find_ground.
+    share [H W], as of find_ground, receives the share of each pixel whose film mirrors.
+    drying: flat, NUM_DRYING_CHANNELS of each cell of the map. depth: as of find_ground.
     noise: flat, MOTTLE_SIDE squared. stains: all levels of the table, flat.
     """
     for y in prange(depth.size // width):
-        _wet_row(
-            np.int64(y), width, view, drying, depth, share, water, noise, stains, mirror_share, rgb
-        )
+        _wet_row(np.int64(y), width, view, drying, depth, share, water, noise, stains, rgb)
 
 
 @kernel

@@ -378,6 +378,8 @@ def wet_by_film(
 ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
     """Darken the ground of a picture by the film that lies on it.
 
+    On the CPU, `rgb` and `share` are overwritten.
+
     Args:
         rgb: display-encoded picture of the dry ground, without fog.
         camera: the camera.
@@ -394,8 +396,8 @@ def wet_by_film(
         The picture, and the share of each pixel whose film mirrors.
     """
     if choose_kernels(backend, rgb, depth, share) == CPU and camera.width >= NUM_LANES:
-        rgb = rgb.clone(memory_format=torch.contiguous_format)
-        mirror_share = np.zeros(tuple(depth.shape), np.float32)
+        rgb = rgb.contiguous()
+        share = share.contiguous()
         view, _ = _map_view(camera, ground)
         with kernel_threads(ROWS_PER_TASK):
             film_kernels.wet_ground(
@@ -407,10 +409,9 @@ def wet_by_film(
                 water_numbers(film, puddle_threshold, white),
                 make_mottle_table().reshape(-1),
                 stain_levels(film.spots),
-                mirror_share.reshape(-1),
                 _flat_array(rgb),
             )
-        return rgb, torch.from_numpy(mirror_share)
+        return rgb, share
     points, distance, _ = _ground_points(camera, depth, ground)
     eye = camera.centre.to(points.device)
     x = points[..., 0].double() + eye[0]
