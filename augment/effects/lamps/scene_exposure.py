@@ -112,7 +112,8 @@ def road_luminance(plan: LightPlan, scene: Scene) -> float:
 
     It has the light of sky and moon, of lamps that do not move, and of the car's own beams.
     """
-    key = ("lamps, luminance of the road", plan.light, plan.has_street_lamps, plan.own_beam)
+    key = ("lamps, luminance of the road", plan.light, plan.hour, plan.has_street_lamps)
+    key = (*key, plan.own_beam)
     return memo_of(scene).get(key, lambda: _find_road_luminance(plan, scene))
 
 
