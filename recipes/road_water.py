@@ -55,7 +55,7 @@ _MAX_TRACK_MM = (1 - TRACK_FILM_SHARE) * MAX_FILM_MM
 _TRACK_CLEARING_H = 2 / 60
 # Number of parts into which the time between two points of the air's curves is cut. Evaporation is
 # constant in each; air that does not change is exact.
-_NUM_AIR_PARTS = 32
+_NUM_AIR_PARTS = 16
 
 # ---- Evaporation ---------------------------------------------------------------------------------
 
@@ -68,6 +68,12 @@ _MOISTURE_HEIGHT_M = 2.0
 # Roughness lengths of a road for momentum and for moisture, metres (NORTRIP).
 _ROUGHNESS_M = 0.01
 _MOISTURE_ROUGHNESS_M = 1e-5
+# Resistance of the air to moisture, times the wind.
+_RESISTANCE = (
+    math.log(_WIND_HEIGHT_M / _ROUGHNESS_M)
+    * math.log(_MOISTURE_HEIGHT_M / _MOISTURE_ROUGHNESS_M)
+    / _KARMAN**2
+)
 # Least wind: a calm road still dries, m/s.
 _MIN_WIND_M_S = 0.2
 # Density of air, kg/m3.
@@ -81,14 +87,17 @@ def evaporation_mm_h(air: Air) -> float:
 
     E = rho (q_s(T_road) - q) / r, r = ln(z / z0) ln(z_q / z0q) / (kappa^2 U), the bulk formula.
     """
-    resistance_s_m = (
-        math.log(_WIND_HEIGHT_M / _ROUGHNESS_M)
-        * math.log(_MOISTURE_HEIGHT_M / _MOISTURE_ROUGHNESS_M)
-        / (_KARMAN**2 * max(air.wind_m_s, _MIN_WIND_M_S))
-    )
-    road_moisture = _saturated_moisture(air.temperature_c + air.road_warmer_k)
-    moisture = air.humidity * _saturated_moisture(air.temperature_c)
-    return max(3600 * _AIR_KG_M3 * (road_moisture - moisture) / resistance_s_m, 0.0)
+    return _evaporation(air.temperature_c, air.humidity, air.wind_m_s, air.road_warmer_k)
+
+
+def _evaporation(
+    temperature_c: float, humidity: float, wind_m_s: float, road_warmer_k: float
+) -> float:
+    """Return `evaporation_mm_h` of the numbers of the air."""
+    conductance_m_s = max(wind_m_s, _MIN_WIND_M_S) / _RESISTANCE
+    moisture = _saturated_moisture(temperature_c + road_warmer_k)
+    moisture -= humidity * _saturated_moisture(temperature_c)
+    return max(3600 * _AIR_KG_M3 * moisture * conductance_m_s, 0.0)
 
 
 def _saturated_moisture(temperature_c: float) -> float:
@@ -124,15 +133,7 @@ class AirCurves(NamedTuple):
 
     def evaporation_mm_h(self, time_s: float) -> float:
         """Return the evaporation at a time, mm/h."""
-        temperature_c, humidity, wind_m_s, road_warmer_k = (c.value(time_s) for c in self)
-        return evaporation_mm_h(
-            Air(
-                temperature_c=temperature_c,
-                humidity=humidity,
-                wind_m_s=wind_m_s,
-                road_warmer_k=road_warmer_k,
-            )
-        )
+        return _evaporation(*(curve.value(time_s) for curve in self))
 
 
 # ---- Rain and evaporation in parts ---------------------------------------------------------------
@@ -199,20 +200,27 @@ class _Span(NamedTuple):
     """Its length."""
 
 
-def _spans(part: _Part, gain: float) -> Iterator[_Span]:
+def _spans(part: _Part, gain: float) -> list[_Span]:
     """Cut a part where the store's gain equals its loss."""
     piece = part.rate
     crossing = _crossing(piece, part.evaporation_mm_h / gain)
     times = [piece.start_s, *([] if crossing is None else [crossing]), piece.end_s]
+    spans: list[_Span] = []
+    fallen = 0.0
     for start, end in itertools.pairwise(times):
         hours = (end - start) / 3600
-        yield _Span(
-            piece.value(start),
-            piece.value(end),
-            (piece.integral(end) - piece.integral(start)) / 3600,
-            part.evaporation_mm_h * hours,
-            hours,
+        fallen_before = fallen
+        fallen = piece.integral(end)
+        spans.append(
+            _Span(
+                piece.value(start),
+                piece.value(end),
+                (fallen - fallen_before) / 3600,
+                part.evaporation_mm_h * hours,
+                hours,
+            )
         )
+    return spans
 
 
 # ---- Stores of water -----------------------------------------------------------------------------
@@ -244,9 +252,9 @@ class _Store:
         self.peak_mm = self.level_mm
         self.peak_rate_mm_h = rate_mm_h
 
-    def advance(self, part: _Part) -> None:
-        """Follow the level through a part."""
-        for span in _spans(part, self.gain):
+    def advance(self, spans: list[_Span]) -> None:
+        """Follow the level through a part that `_spans` has cut for the store's gain."""
+        for span in spans:
             if self.level_mm == 0:
                 self.peak_rate_mm_h = 0.0
                 self.peak_mm = 0.0
@@ -304,10 +312,11 @@ def road_state(rate: Curve, air: AirCurves, time_s: float) -> RoadState:
     stains.settle(film.peak_rate_mm_h if film.level_mm > 0 else 0.0, 0.0)
     track_mm = _MAX_TRACK_MM if film.level_mm > 0 else 0.0
     for part in _parts(rate, air, time_s):
-        film.advance(part)
-        puddles.advance(part)
-        stains.advance(part)
-        for span in _spans(part, 1.0):
+        spans = _spans(part, 1.0)
+        film.advance(spans)
+        puddles.advance(_spans(part, CATCHMENT))
+        stains.advance(spans)
+        for span in spans:
             gained_mm = span.rain_mm - span.loss_mm
             if gained_mm > 0:
                 track_mm = min(track_mm + gained_mm, _MAX_TRACK_MM)
@@ -370,8 +379,8 @@ def water_balance(rate: Curve, air: AirCurves, time_s: float) -> WaterBalance:
     rain_mm = 0.0
     for part in _parts(rate, air, time_s):
         rain_mm += part.rate.integral(part.rate.end_s) / 3600
-        film.advance(part)
-        puddles.advance(part)
+        film.advance(_spans(part, 1.0))
+        puddles.advance(_spans(part, CATCHMENT))
     film_share = 1 - HOLLOW_SHARE * CATCHMENT
     return WaterBalance(
         rain_mm,
