@@ -752,12 +752,12 @@ DRYING_RANK, PUDDLE_RANK, TRACK, NUM_DRYING_CHANNELS = range(4)
 # Share of the largest film at which the first places are dry; assumed.
 FIRST_DRY_SHARE = 0.65
 # Film from which on ground is as dark as it gets, mm; assumed.
-DARK_FILM_MM = 0.05
+DARK_FILM_MM = 0.06
 # Film below which stones of asphalt break the mirror image, mm; assumed.
 MATT_FILM_MM = 0.04
 # Change of the drying rank per deviation of the coarse and of the fine noise.
-COARSE_RANK = 0.06
-FINE_RANK = 0.035
+COARSE_RANK = 0.05
+FINE_RANK = 0.015
 # Side of the table of stains, texels; a power of 2.
 STAIN_SIDE = 1024
 # Side of its texels, metres.
