@@ -464,6 +464,8 @@ class Recipe(ClosedModel):
         recipe = self
         curves: dict[str, Curve] = {}
         for timeline in self.timelines:
+            if section_at(self, timeline.path.rpartition(".")[0]) is None:
+                continue  # the effect was taken out of the recipe
             times_s = timeline.times_s(self.weather.clock, scene_times)
             if timeline.is_number:
                 curves[timeline.path] = timeline.curve(times_s)
