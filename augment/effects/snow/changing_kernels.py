@@ -23,6 +23,8 @@ RIM = 0.5  # rise of that noise over which the layer gets its depth
 TRANSLUCENT_DEPTH_M = 0.0015  # depth of snow that hides all but 1/e of what it lies on
 OVERLAP = 0.35  # 1 over the number of discs that cover a place
 BARE_BAND = 0.5  # change of the passes, in those that bare the road, over which snow goes
+MAX_TABLE_DEPTH_M = 0.05  # depth of the snow at the end of tables; deeper snow looks like it
+TABLE_SIZE = 1025  # number of values of a table
 # Shares of snow between which the scene's Gaussians beneath it fade.
 FADE_BEGIN = 0.35
 FADE_END = 0.93
@@ -78,10 +80,17 @@ class SnowState(NamedTuple):
     """Largest height of a ridge over the depth."""
     max_ridge_m: float
     """Largest height of a ridge, metres."""
-    thin_loss: float
-    """Loss of brightness of the thinnest snow."""
-    thin_depth_m: float
-    """Depth over which that loss falls to 1/e."""
+
+
+class SnowTables(NamedTuple):
+    """Tables of functions that cost much, read with linear interpolation."""
+
+    opacity: np.ndarray
+    """float32, opacity of a disc, by the share that is covered from 0 to 1."""
+    translucency: np.ndarray
+    """float32, share of light that snow hides, by its depth from 0 to MAX_TABLE_DEPTH_M."""
+    brightness: np.ndarray
+    """float32, brightness of snow over that of deep snow, by the same depth."""
 
 
 class LaidSplats(NamedTuple):
@@ -104,7 +113,15 @@ def _smooth(t):
 
 
 @kernel_function()
-def cell_snow(i, cells, state):
+def _look_up(table, t):
+    """Return the value of a table at t, 0 to 1."""
+    place = min(max(t, 0.0), 1.0) * (TABLE_SIZE - 1)
+    k = min(np.int64(place), TABLE_SIZE - 2)
+    return table[k] + (place - k) * (table[k + 1] - table[k])
+
+
+@kernel_function()
+def cell_snow(i, cells, state, tables):
     """Return the share of cell i that snow covers, and its depth, as `define_snow` defines it."""
     laid_m = np.float64(cells.depths_m[i])
     if laid_m == 0.0:
@@ -131,11 +148,11 @@ def cell_snow(i, cells, state):
         depth_m += ridge_m * state.driven * cells.ridge[i]
         baring = (state.baring_passes + state.baring_passes_per_m * fresh_m) * cells.baring[i]
         share *= 1.0 - _smooth(0.5 + (passes / baring - 1.0) / BARE_BAND)
-    return share * (1.0 - math.exp(-depth_m / TRANSLUCENT_DEPTH_M)), depth_m
+    return share * _look_up(tables.translucency, depth_m / MAX_TABLE_DEPTH_M), depth_m
 
 
 @kernel
-def scale_splats(runs, laid, floors, cell_ids, cells, state, opacity, scaled):
+def scale_splats(runs, laid, floors, cell_ids, cells, state, tables, shares, scaled):
     """Write the Gaussians of runs of the laid layer as they are at a moment.
 
     Args:
@@ -145,52 +162,63 @@ def scale_splats(runs, laid, floors, cell_ids, cells, state, opacity, scaled):
         cell_ids: int32 [S], cell of each Gaussian.
         cells: the cells.
         state: the moment.
-        opacity: opacity of a full disc.
+        tables: the tables.
+        shares: float32 [C], share that is covered of each cell that has one; written.
         scaled: Gaussians at the moment, [V]; written.
     """
     for r in prange(len(runs)):
-        _scale_run(runs[r], laid, floors, cell_ids, cells, state, opacity, scaled)
+        _scale_run(runs[r], laid, floors, cell_ids, cells, state, tables, shares, scaled)
 
 
 @kernel_function()
-def _scale_run(run, laid, floors, cell_ids, cells, state, opacity, scaled):
+def _scale_run(run, laid, floors, cell_ids, cells, state, tables, shares, scaled):
     """Write the Gaussians of one run."""
     last_cell = -1
-    hiding = 0.0
-    ratio = 0.0
-    brightness = 1.0
+    opacity = np.float32(0)
+    ratio = np.float32(0)
+    brightness = np.float32(1)
+    shift = np.float32(0)
+    thickness = np.float32(1)
+    grey = np.float32(0.5 / SH_C0)
     for s in range(run[0], run[1]):
         v = run[2] + s - run[0]
         i = cell_ids[s]
         if i != last_cell:
             last_cell = i
-            share, depth_m = cell_snow(i, cells, state)
+            share, depth_m = cell_snow(i, cells, state, tables)
             laid_m = max(np.float64(cells.depths_m[i]), 1e-6)
-            ratio = depth_m / laid_m
-            hiding = opacity * (1.0 - (1.0 - share) ** OVERLAP)
-            brightness = 1.0 - state.thin_loss * math.exp(-depth_m / state.thin_depth_m)
-            brightness /= 1.0 - state.thin_loss * math.exp(-laid_m / state.thin_depth_m)
-        scaled.opacities[v] = np.float32(hiding)
+            shares[i] = np.float32(share)
+            ratio = np.float32(depth_m / laid_m)
+            thickness = np.float32(min(0.4 + 0.6 * ratio, 1.0))
+            opacity = np.float32(_look_up(tables.opacity, share))
+            brightness = np.float32(
+                _look_up(tables.brightness, depth_m / MAX_TABLE_DEPTH_M)
+                / _look_up(tables.brightness, laid_m / MAX_TABLE_DEPTH_M)
+            )
+            shift = (brightness - np.float32(1)) * grey
+        scaled.opacities[v] = opacity
         scaled.means[v, 0] = laid.means[s, 0]
         scaled.means[v, 1] = laid.means[s, 1]
-        scaled.means[v, 2] = np.float32(floors[s] + ratio * (laid.means[s, 2] - floors[s]))
+        scaled.means[v, 2] = floors[s] + ratio * (laid.means[s, 2] - floors[s])
         for k in range(4):
             scaled.quats[v, k] = laid.quats[s, k]
         scaled.scales[v, 0] = laid.scales[s, 0]
         scaled.scales[v, 1] = laid.scales[s, 1]
-        thickness = laid.scales[s, 2] * min(0.4 + 0.6 * ratio, 1.0)
-        scaled.scales[v, 2] = np.float32(thickness)
+        scaled.scales[v, 2] = thickness * laid.scales[s, 2]
         for c in range(3):
-            colour = 0.5 + SH_C0 * laid.sh[s, 0, c]
-            scaled.sh[v, 0, c] = np.float32((brightness * colour - 0.5) / SH_C0)
-            if len(laid.slopes) > 0:
-                scaled.slopes[v, c] = np.float32(brightness * laid.slopes[s, c])
-            if len(laid.normals) > 0:
+            scaled.sh[v, 0, c] = brightness * laid.sh[s, 0, c] + shift
+        if len(laid.slopes) > 0:
+            for c in range(3):
+                scaled.slopes[v, c] = brightness * laid.slopes[s, c]
+        if len(laid.normals) > 0:
+            for c in range(3):
                 scaled.normals[v, c] = laid.normals[s, c]
 
 
 @kernel
-def fade_buried(runs, hideable_ids, covering_cells, cells, state, laid_opacities, opacities):
+def fade_buried(
+    runs, hideable_ids, covering_cells, cells, state, tables, shares, laid_opacities, opacities
+):
     """Fade the Gaussians that snow buries by the least share of it over them, in place.
 
     Args:
@@ -199,20 +227,22 @@ def fade_buried(runs, hideable_ids, covering_cells, cells, state, laid_opacities
         covering_cells: int32 [B, 5], cells over each.
         cells: the cells.
         state: the moment.
+        tables: the tables.
+        shares: float32 [C], share that is covered of each cell; below 0 it is computed here.
         laid_opacities: float32 [N], opacities without snow.
         opacities: float32 [N]; written.
     """
     for r in prange(len(runs)):
         for b in range(runs[r, 0], runs[r, 1]):
-            least = 1.0
+            least = np.float32(1)
             for k in range(covering_cells.shape[1]):
                 cell_id = covering_cells[b, k]
                 if cell_id < 0:
-                    least = 0.0
+                    least = np.float32(0)
                     break
-                if k > 0 and cell_id == covering_cells[b, k - 1]:
-                    continue
-                share, _ = cell_snow(cell_id, cells, state)
+                share = shares[cell_id]
+                if share < 0:
+                    share = np.float32(cell_snow(cell_id, cells, state, tables)[0])
                 least = min(least, share)
                 if least <= FADE_BEGIN:
                     break
@@ -223,8 +253,8 @@ def fade_buried(runs, hideable_ids, covering_cells, cells, state, laid_opacities
 
 
 @kernel
-def find_cell_depths(cells, state, depths_m):
+def find_cell_depths(cells, state, tables, depths_m):
     """Compute the depth on all cells whose snow hides half of what it lies on; 0 elsewhere."""
     for i in prange(len(depths_m)):
-        share, depth_m = cell_snow(np.int64(i), cells, state)
+        share, depth_m = cell_snow(np.int64(i), cells, state, tables)
         depths_m[i] = np.float32(depth_m if share >= 0.5 else 0.0)

@@ -19,6 +19,7 @@ All of it is a function of place and depth, without steps.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,11 +34,15 @@ from augment.effects.gradient_noise import draw_octaves, find_threshold, sum_oct
 from augment.effects.snow import layer_kernels, slush
 from augment.effects.snow.changing_kernels import (
     BARE_BAND,
+    MAX_TABLE_DEPTH_M,
+    OVERLAP,
     RIM,
+    TABLE_SIZE,
     TRANSLUCENT_DEPTH_M,
     ChangingCells,
     LaidSplats,
     SnowState,
+    SnowTables,
     fade_buried,
     find_cell_depths,
     scale_splats,
@@ -144,6 +149,7 @@ class ChangingPart:
         laid = _arrays_of(self.laid)
         tensors = [torch.empty(total if len(array) else 0, *array.shape[1:]) for array in laid]
         scaled = LaidSplats(*(tensor.numpy() for tensor in tensors))
+        shares = np.full(len(self.cells.noise), -1, np.float32)
         with kernel_threads(_RUNS_PER_TASK):
             scale_splats(
                 np.concatenate([runs, firsts[:, None]], 1),
@@ -152,20 +158,23 @@ class ChangingPart:
                 self.cell_ids,
                 self.cells,
                 state,
-                OPACITY,
+                _tables(),
+                shares,
                 scaled,
             )
         means, quats, scales, opacities, sh, normals, slopes = tensors
         classes = torch.full((total,), int(SemanticClass.SNOW), dtype=torch.int16)
         return PartSnow(
             gaussians=Gaussians(means, quats, scales, opacities, sh, semantic=classes),
-            visible_opacities=self._fade_buried(state, cameras),
+            visible_opacities=self._fade_buried(state, shares, cameras),
             sunlight_rgb=None if self.laid.sunlight_rgb is None else slopes,
             normals=None if self.laid.normals is None else normals,
             crystals=self._crystals_at(state),
         )
 
-    def _fade_buried(self, state: SnowState, cameras: Sequence[Camera] | None) -> Tensor:
+    def _fade_buried(
+        self, state: SnowState, shares: np.ndarray, cameras: Sequence[Camera] | None
+    ) -> Tensor:
         """Return the opacities of the part's Gaussians at a moment, [N]."""
         runs = self.buried_runs.visible(cameras)
         if not len(runs):
@@ -179,6 +188,8 @@ class ChangingPart:
                 self.covering_cells,
                 self.cells,
                 state,
+                _tables(),
+                shares,
                 laid.numpy(),
                 faded.numpy(),
             )
@@ -317,8 +328,6 @@ def state_of(snow: Snow) -> SnowState:
         baring_passes_per_m=slush.BARING_PASSES_PER_M,
         ridge_share=slush.RIDGE_SHARE,
         max_ridge_m=slush.MAX_RIDGE_M,
-        thin_loss=layer_kernels.THIN_LOSS,
-        thin_depth_m=layer_kernels.THIN_DEPTH_M,
     )
 
 
@@ -329,8 +338,21 @@ def find_depths_at(cells: ChangingCells, state: SnowState) -> np.ndarray:
     """
     depths_m = np.empty(len(cells.noise), np.float32)
     with kernel_threads(CELLS_PER_TASK):
-        find_cell_depths(cells, state, depths_m)
+        find_cell_depths(cells, state, _tables(), depths_m)
     return depths_m
+
+
+@functools.cache
+def _tables() -> SnowTables:
+    """Return the tables that kernels read."""
+    shares = np.linspace(0, 1, TABLE_SIZE)
+    depths_m = MAX_TABLE_DEPTH_M * shares
+    tables = (
+        OPACITY * (1 - (1 - shares) ** OVERLAP),
+        1 - np.exp(-depths_m / TRANSLUCENT_DEPTH_M),
+        1 - layer_kernels.THIN_LOSS * np.exp(-depths_m / layer_kernels.THIN_DEPTH_M),
+    )
+    return SnowTables(*(table.astype(np.float32) for table in tables))
 
 
 def _band(depth_m: float) -> float:
