@@ -206,7 +206,7 @@ class Snow(EffectModel):
         if weather is not None:
             road = Surface(moment.curve("weather.air.road_warmer_k", _road_warmer_k(moment)), True)
             fields["depth_m"] = layer_at(moment.time_s, weather).depth_m
-            largest_m = largest_depth_m(weather)
+            largest_m = largest_depth_m(weather, moment.end_s)
             if self.road is None:
                 layer = layer_at(moment.time_s, weather, road)
                 if self.depth_m == 0:

@@ -163,16 +163,16 @@ def first_snow_s(weather: SnowWeather) -> float:
     return times_s[-1] if weather.snowfall_mm_h.value(times_s[-1]) > 0 else weather.begin_s
 
 
-def largest_depth_m(weather: SnowWeather, surface: Surface = _GROUND) -> float:
-    """Return the largest depth at any point of the weather's curves, metres."""
-    times_s = {
-        weather.begin_s,
-        *weather.snowfall_mm_h.times_s,
-        *weather.rain_mm_h.times_s,
-        *weather.air_c.times_s,
-        *surface.warmer_k.times_s,
-    }
-    return max(layer_at(time_s, weather, surface).depth_m for time_s in sorted(times_s))
+def largest_depth_m(weather: SnowWeather, end_s: float) -> float:
+    """Return the largest depth at any point of the weather's curves, or at the end, metres.
+
+    Args:
+        weather: the weather.
+        end_s: the end, seconds.
+    """
+    curves = (weather.snowfall_mm_h, weather.rain_mm_h, weather.air_c)
+    times_s = {weather.begin_s, end_s, *(t for curve in curves for t in curve.times_s)}
+    return max(layer_at(time_s, weather).depth_m for time_s in sorted(times_s))
 
 
 def _depth_per_water(weather: SnowWeather, bare_s: float, end_s: float, begin_mm: float) -> float:
