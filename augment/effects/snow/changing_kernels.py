@@ -62,6 +62,10 @@ class SnowState(NamedTuple):
     """Rise of a cell's noise from its first snow to its full share."""
     road_band: float
     """The same on roads."""
+    onset: float
+    """Factor of all shares: below 1 only for the first flakes."""
+    road_onset: float
+    """The same on roads."""
     scale: float
     """Depth over the depth as laid."""
     road_scale: float
@@ -134,6 +138,7 @@ def cell_snow(i, cells, state, tables):
     )
     over = np.float64(cells.noise[i]) - threshold
     share = _smooth(0.5 + over / (state.band + road * (state.road_band - state.band)))
+    share *= state.onset + road * (state.road_onset - state.onset)
     if share <= 0.0:
         return 0.0, 0.0
     depth_m = laid_m * (state.scale + road * (state.road_scale - state.scale))

@@ -84,6 +84,8 @@ _MAX_THRESHOLD = 6.0
 _DEEP_BAND = 0.35
 _THIN_BAND = 1.1
 _BAND_DEPTH_M = 0.01
+# Depth up to which the first flakes are fainter, so that none appears at once, metres.
+_ONSET_DEPTH_M = 0.0002
 _NUM_SMOOTHING_STEPS = 4  # steps that even out the borders of roads and grass
 _CHUNK_M = 4.0  # side of the squares in which the layer is tested for views
 _RUNS_PER_TASK = 4  # runs that a thread takes at a time
@@ -319,6 +321,8 @@ def state_of(snow: Snow) -> SnowState:
         road_threshold=on_road,
         band=_band(snow.depth_m),
         road_band=_band(road_depth_m),
+        onset=min(snow.depth_m / _ONSET_DEPTH_M, 1.0),
+        road_onset=min(road_depth_m / _ONSET_DEPTH_M, 1.0),
         scale=_settled_m(snow.depth_m) / laid_m,
         road_scale=_settled_m(road_depth_m) / laid_m,
         driven=driven,
@@ -385,7 +389,7 @@ def define_snow(
     threshold += road * (state.road_threshold - state.hard_threshold)
     over = noise - threshold
     place = 0.5 + over / (state.band + road * (state.road_band - state.band))
-    share = _smooth(place)
+    share = _smooth(place) * (state.onset + road * (state.road_onset - state.onset))
     fresh_m = laid_m * (state.scale + road * (state.road_scale - state.scale))
     least_m = layer_kernels.MIN_DEPTH_M
     fresh_m = least_m + np.maximum(fresh_m - least_m, 0) * np.clip(0.5 + over / RIM, 0, 1)
@@ -397,8 +401,8 @@ def define_snow(
     is_driven = passes > 0
     depth_m = np.where(is_driven, driven_m, fresh_m)
     gone = np.where(is_driven, _smooth(0.5 + (passes / baring - 1) / BARE_BAND), 0)
+    has_snow = (laid_m > 0) & (share > 0)
     share = share * (1 - gone) * (1 - np.exp(-depth_m / TRANSLUCENT_DEPTH_M))
-    has_snow = (laid_m > 0) & (place > 0)
     return np.where(has_snow, share, 0.0), np.where(has_snow, depth_m, 0.0)
 
 
