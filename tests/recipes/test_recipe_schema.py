@@ -26,7 +26,7 @@ from recipes.rain import Rain
 from recipes.ranges import format_value
 from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
 from recipes.sections import Leaf, recipe_file
-from recipes.snow import Snow, SnowLight, SnowWind
+from recipes.snow import Snow, SnowLight, SnowRoad, SnowWind
 from recipes.snowfall import Snowfall
 from recipes.speed import Speed
 from recipes.style import Style, style_preset_names
