@@ -64,6 +64,7 @@ from augment.effects.snow.plan import SnowPlan
 from augment.effects.snow.traffic import SATURATION
 from augment.effects.snow.wet_tracks import WetRoad, make_wet_road
 from augment.exposure.cells import ExposedCells, ExposedSurface
+from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene.bounds import Bounds, may_show
@@ -87,7 +88,7 @@ _BAND_DEPTH_M = 0.01
 # Depth up to which the first flakes are fainter, so that none appears at once, metres.
 _ONSET_DEPTH_M = 0.0002
 _NUM_SMOOTHING_STEPS = 4  # steps that even out the borders of roads and grass
-_CHUNK_M = 4.0  # side of the squares in which the layer is tested for views
+_CHUNK_M = 3.0  # side of the squares in which the layer is tested for views
 _RUNS_PER_TASK = 4  # runs that a thread takes at a time
 # Largest depth over the laid depth; more is scaled, and its boxes are not tested.
 _MAX_TESTED_SCALE = 1.5
@@ -164,8 +165,8 @@ class ChangingPart:
                 shares,
                 scaled,
             )
-        means, quats, scales, opacities, sh, normals, slopes = tensors
-        classes = torch.full((total,), int(SemanticClass.SNOW), dtype=torch.int16)
+        means, quats, scales, opacities, sh, normals, slopes = map(torch.from_numpy, scaled)
+        classes = torch.from_numpy(np.full(total, int(SemanticClass.SNOW), np.int16))
         return PartSnow(
             gaussians=Gaussians(means, quats, scales, opacities, sh, semantic=classes),
             visible_opacities=self._fade_buried(state, shares, cameras),
@@ -181,8 +182,8 @@ class ChangingPart:
         runs = self.buried_runs.visible(cameras)
         if not len(runs):
             return self.opacities
-        laid = self.opacities.detach()
-        faded = laid.clone()
+        laid = self.opacities.detach().numpy()
+        faded = laid.copy()
         with kernel_threads(_RUNS_PER_TASK):
             fade_buried(
                 runs,
@@ -192,10 +193,10 @@ class ChangingPart:
                 state,
                 _tables(),
                 shares,
-                laid.numpy(),
-                faded.numpy(),
+                laid,
+                faded,
             )
-        return faded
+        return torch.from_numpy(faded)
 
     def _crystals_at(self, state: SnowState) -> Crystals | None:
         """Return the crystals on snow that hides half of what it lies on."""
@@ -375,7 +376,7 @@ def define_snow(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the share of cells that snow covers, and its depth in metres, float64 [R] each.
 
-    This is the definition of `changing_kernels.cell_snow`.
+    This is the definition of `changing_kernels`.
 
     Args:
         cells: the cells.
@@ -501,7 +502,7 @@ def _lay_part(
     floors = cells.centers_m.numpy()[cell_ids, 2].copy()
     means = laid.gaussians.means.numpy()
     order, splat_rows = _by_squares(means)
-    laid = _in_order(laid, order)
+    laid = _in_deep_tones(_in_order(laid, order), depths.depths_m[cell_ids[order]])
     cell_ids = cell_ids[order]
     floors = floors[order]
     hideable_ids, covering_cells = as_arrays(cells.hideable_ids, cells.covering_cells)
@@ -647,6 +648,21 @@ def _in_order(part: PartSnow, order: np.ndarray) -> PartSnow:
         sunlight_rgb=None if part.sunlight_rgb is None else part.sunlight_rgb[rows],
         normals=None if part.normals is None else part.normals[rows],
         crystals=crystals,
+    )
+
+
+def _in_deep_tones(part: PartSnow, depths_m: np.ndarray) -> PartSnow:
+    """Return a layer without the darkness of thin snow. depths_m: depth of each Gaussian's cell."""
+    loss = layer_kernels.THIN_LOSS * np.exp(-depths_m / layer_kernels.THIN_DEPTH_M)
+    tones = torch.from_numpy((1 - loss).astype(np.float32))[:, None]
+    gaussians = part.gaussians
+    sh = gaussians.sh.clone()
+    sh[:, 0] = ((0.5 + SH_C0 * sh[:, 0]) / tones - 0.5) / SH_C0
+    slopes = part.sunlight_rgb
+    return dataclasses.replace(
+        part,
+        gaussians=dataclasses.replace(gaussians, sh=sh),
+        sunlight_rgb=None if slopes is None else slopes / tones,
     )
 
 
