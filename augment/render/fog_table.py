@@ -220,6 +220,14 @@ def point_means_numpy(fog: Fog, camera: Camera, points_m: np.ndarray) -> np.ndar
     return point_means(fog, camera, offsets).numpy()
 
 
+def pixel_means(
+    fog: Fog, camera: Camera, u: np.ndarray, v: np.ndarray, distance_m: np.ndarray
+) -> np.ndarray:
+    """Return the mean density of the banks along rays through x/z = u, y/z = v, [N]."""
+    rays = (torch.from_numpy(np.asarray(a, np.float64)) for a in (u, v, distance_m))
+    return look_up(bank_table(fog, camera), *rays).numpy()
+
+
 def look_up(
     table: BankTable, u: Float[Tensor, "*B"], v: Float[Tensor, "*B"], distance: Float[Tensor, "*B"]
 ) -> Float[Tensor, "*B"]:
@@ -284,6 +292,22 @@ def thinnest_fog(fog: Fog, camera: Camera) -> Fog:
         return fog
     least = bank_table(fog, camera).least
     return replace(fog, extinction_per_m=0.999 * least * fog.extinction_per_m, banks=None)
+
+
+def visible_distances(
+    fog: Fog, origin_m: np.ndarray, directions: np.ndarray, depth: float
+) -> np.ndarray:
+    """Return how far rays [N, 3] from a point go up to an optical depth, metres.
+
+    fog: fog with banks that does not thin with height.
+    """
+    steps = 2.0 ** (np.arange(-24, 25) / 8)
+    distances = steps * depth / max(fog.extinction_per_m, 1e-12)
+    rays = np.repeat(directions, len(steps), 0)
+    origins = np.broadcast_to(origin_m, rays.shape)
+    means = ray_means(fog, origins, rays, np.tile(distances, len(directions)))
+    tau = fog.extinction_per_m * distances * means.reshape(len(directions), -1)
+    return np.array([np.interp(depth, row, distances) for row in np.maximum.accumulate(tau, 1)])
 
 
 # Distance of the rays that give the fog around a camera, metres.
