@@ -38,13 +38,7 @@ from augment.output.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
 from augment.render.fog_banks import FogBanks, bank_seed
-from augment.render.fog_table import (
-    densities_at,
-    pixel_means,
-    point_means_numpy,
-    ray_means,
-    visible_distances,
-)
+from augment.render.fog_table import densities_at, point_means_numpy, ray_means, visible_distances
 from augment.render.linear_airlight import mix_linear_light
 from augment.render.scatter import scatter_forward, scattered_share
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes, pixels_of_boxes
@@ -393,7 +387,8 @@ def box_transmittance(
     transmittance = transmittance_to(distance, points[..., 2], means).mean(axis=1)
     if surface_depth_m is not None:
         pixels[:] = 0
-        upwards = camera.world_from_camera[2, :3].numpy()  # the world's z along the camera's axes
+        rotation = camera.world_from_camera[:3, :3].numpy()
+        upwards = rotation[2]  # the world's z along the camera's axes
         for number, rows, columns in pixels_of_boxes(boxes, camera, surface_depth_m):
             z = surface_depth_m[rows, columns].astype(np.float64)
             across = (columns + 0.5 - camera.cx) / camera.fx
@@ -402,7 +397,8 @@ def box_transmittance(
             distance = z * np.sqrt(1 + across**2 + down**2)
             pixels[number] = len(rows)
             if fog.banks is not None:
-                means = pixel_means(fog, camera, across, down, distance)
+                offsets = np.stack([z * across, z * down, z], -1) @ rotation.T
+                means = point_means_numpy(fog, camera, offsets + eye_m)
             transmittance[number] = float(transmittance_to(distance, point_z, means).mean())
     return BoxTransmittance(np.where(boxes.is_usable, transmittance, np.nan), pixels)
 

@@ -4,7 +4,8 @@
 
 sigma0 is the extinction of plain fog (`augment.render.fog`), s the patchiness, U the wind, and n a
 sum of octaves of gradient noise with variance 1. The field is frozen: it drifts and does not change
-(Taylor 1938, "The spectrum of turbulence"). The mean of m over space is 1, so sigma0 is the mean of
+(Taylor 1938, "The spectrum of turbulence"). It varies along the ground alone, so a bank is a column
+whose density sigma0 thins with height. The mean of m over space is 1, so sigma0 is the mean of
 the field. Its logarithm is s^2 / 2 for a normal n; the noise has shorter tails, see `log_mean`.
 
 Octaves: lacunarity 2, persistence 2^(-1/3), from E(k) ~ k^(-5/3). The first octave has the outer
@@ -33,21 +34,17 @@ LACUNARITY = 2.0
 PERSISTENCE = 2 ** (-1 / 3)
 # Length of banks along the wind over their width.
 ASPECT = 2.0
-# Odd factor of the third lattice coordinate, far from STEP_X and STEP_Y in all its bits.
-STEP_Z = 0xD6E8FEB86659FD93
-# Standard deviation over space of one octave whose gradients have components uniform in [-1, 1]:
-# the square is the mean over a cube of 8 w^2 (x^2 + y^2 + z^2) / 3, w the blend of a corner.
-DEVIATION = 0.1909436378767241
+# Standard deviation over the plane of one octave whose gradients have components uniform in
+# [-1, 1]: the square is the mean over a square of 4 w^2 (x^2 + y^2) / 3, w the blend of a corner.
+DEVIATION = 0.17612713
 # ln E[exp(a g)] of one octave g of variance 1 is a^2 / 2 plus these times a^4 and a^6, to 1e-4 up
 # to a = 1.2. Fitted to ten million points.
-CUMULANTS = (-0.00836, 0.00049)
+CUMULANTS = (-0.00273, -0.00056)
 # Angle by which the lattice of an octave is turned against that of the one before, radians: the
 # golden angle, so that no two lattices line up.
 TURN_RAD = math.pi * (3 - math.sqrt(5))
-# Side of the cube from which the octaves' origins are drawn, lattice steps.
+# Side of the square from which the octaves' origins are drawn, lattice steps.
 ORIGIN_STEPS = 4096.0
-# Bits of a gradient's component.
-_BITS = 21
 
 
 @dataclass(frozen=True)
@@ -74,29 +71,26 @@ class FogBanks:
 
     @property
     def lattices(self) -> np.ndarray:
-        """Return the octaves, float64 [NUM_OCTAVES, 14]: lattice coordinates are M x + o.
+        """Return the octaves, float64 [NUM_OCTAVES, 7]: lattice coordinates are M x + o.
 
-        A row has the nine numbers of M (per metre), the three of o, the amplitude, and an unused
-        number. `seeds` has the hashes' seeds.
+        A row has the four numbers of M (per metre), the two of o, and the amplitude. `seeds` has
+        the hashes' seeds.
         """
-        rows = np.zeros((NUM_OCTAVES, 14))
+        rows = np.zeros((NUM_OCTAVES, 7))
         amplitudes = PERSISTENCE ** np.arange(NUM_OCTAVES)
         amplitudes *= self.patchiness / np.linalg.norm(amplitudes)
         cos = math.cos(self.wind_from_rad)
         sin = math.sin(self.wind_from_rad)
-        # Axes along the wind, across it and up. Air that comes from +x moves towards -x.
-        axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        axes = np.array([[cos, sin], [-sin, cos]])  # along the wind, and across it
+        air_way_m = -self.drift_m * axes[0]  # air that comes from +x moves towards -x
         steps_m = self.bank_m / LACUNARITY ** np.arange(NUM_OCTAVES)
         for octave, step_m in enumerate(steps_m):
             turn = octave * TURN_RAD
-            turned = np.eye(3)
-            turned[:2, :2] = [[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]
-            matrix = turned @ np.diag([1 / (ASPECT * step_m), 1 / step_m, 1 / step_m]) @ axes
-            origin = _origins(self.seed)[0][octave]
-            drift = matrix @ np.array([-cos, -sin, 0.0]) * self.drift_m
-            rows[octave, :9] = matrix.reshape(-1)
-            rows[octave, 9:12] = origin - drift
-            rows[octave, 12] = amplitudes[octave]
+            turned = [[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]
+            matrix = turned @ np.diag([1 / (ASPECT * step_m), 1 / step_m]) @ axes
+            rows[octave, :4] = matrix.reshape(-1)
+            rows[octave, 4:6] = _origins(self.seed)[0][octave] - matrix @ air_way_m
+            rows[octave, 6] = amplitudes[octave]
         return rows
 
     @property
@@ -107,16 +101,16 @@ class FogBanks:
     @property
     def log_mean(self) -> float:
         """Return ln E[exp(s n)], which is s^2 / 2 but for the noise's shorter tails."""
-        squares = np.square(self.lattices[:, 12])
+        squares = np.square(self.lattices[:, 6])
         fourth, sixth = CUMULANTS
         return float((squares / 2 + fourth * squares**2 + sixth * squares**3).sum())
 
 
 @functools.lru_cache(maxsize=64)
 def _origins(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the origins of the octaves, lattice steps, [NUM_OCTAVES, 3], and the hashes' seeds."""
+    """Return the origins of the octaves, lattice steps, [NUM_OCTAVES, 2], and the hashes' seeds."""
     rng = np.random.default_rng(seed)
-    origins = rng.uniform(0, ORIGIN_STEPS, (NUM_OCTAVES, 3))
+    origins = rng.uniform(0, ORIGIN_STEPS, (NUM_OCTAVES, 2))
     return origins, rng.integers(0, 2**64, NUM_OCTAVES, np.uint64)
 
 
@@ -125,42 +119,31 @@ def bank_seed(seed: int, scene: str) -> int:
     return int(rng_for(seed=seed, scene=scene, effect="smog.banks").integers(0, 2**62))
 
 
-def bank_density(banks: FogBanks, points_m: np.ndarray) -> np.ndarray:
-    """Return m, the extinction over its mean, at points.
+def bank_density(banks: FogBanks, places_m: np.ndarray) -> np.ndarray:
+    """Return m, the extinction over its mean, at places.
 
     Args:
         banks: the banks.
-        points_m: points [N, 3], scene world, metres.
+        places_m: x and y of the places [N, 2], scene world, metres.
     """
-    exponent = np.full(len(points_m), -banks.log_mean)
+    exponent = np.full(len(places_m), -banks.log_mean)
     for row, seed in zip(banks.lattices, banks.seeds, strict=True):
-        lattice = points_m @ row[:9].reshape(3, 3).T + row[9:12]
-        exponent += row[12] * _gradient_noise(lattice, seed)
+        exponent += row[6] * _gradient_noise(places_m @ row[:4].reshape(2, 2).T + row[4:6], seed)
     return np.exp(exponent)
 
 
-def _gradient_noise(points: np.ndarray, seed: np.uint64) -> np.ndarray:
-    """Return gradient noise of variance 1 at lattice coordinates [N, 3]."""
-    cells = np.floor(points)
-    x, y, z = (points - cells).T
-    columns, rows, layers = cells.astype(np.int64).T
-    fades = [t * t * t * (t * (t * 6 - 15) + 10) for t in (x, y, z)]
-    total = np.zeros(len(points))
-    for corner in range(8):
-        i, j, k = corner & 1, corner >> 1 & 1, corner >> 2
-        bits = (columns + i).astype(np.uint64) * np.uint64(STEP_X)
-        bits += (rows + j).astype(np.uint64) * np.uint64(STEP_Y)
-        bits += (layers + k).astype(np.uint64) * np.uint64(STEP_Z)
-        bits = mix(bits ^ seed)
-        gradients = (
-            (bits >> np.uint64(shift) & np.uint64(2**_BITS - 1)).astype(np.float64)
-            * 2.0 ** (1 - _BITS)
-            - 1
-            for shift in (0, _BITS, 2 * _BITS)
-        )
-        offsets = (x - i, y - j, z - k)
-        value = sum(g * offset for g, offset in zip(gradients, offsets, strict=True))
-        for chosen, fade in zip((i, j, k), fades, strict=True):
-            value = value * (fade if chosen else 1 - fade)
-        total += value
+def _gradient_noise(places: np.ndarray, seed: np.uint64) -> np.ndarray:
+    """Return gradient noise of variance 1 at lattice coordinates [N, 2]."""
+    cells = np.floor(places)
+    x, y = (places - cells).T
+    columns, rows = cells.astype(np.int64).T
+    fade_x, fade_y = (t * t * t * (t * (t * 6 - 15) + 10) for t in (x, y))
+    total = np.zeros(len(places))
+    for i, weight_x in ((0, 1 - fade_x), (1, fade_x)):
+        for j, weight_y in ((0, 1 - fade_y), (1, fade_y)):
+            bits = (columns + i).astype(np.uint64) * np.uint64(STEP_X)
+            bits = mix((bits + (rows + j).astype(np.uint64) * np.uint64(STEP_Y)) ^ seed)
+            gx = (bits >> np.uint64(32)).astype(np.float64) * 2.0**-31 - 1
+            gy = (bits & np.uint64(0xFFFFFFFF)).astype(np.float64) * 2.0**-31 - 1
+            total += weight_x * weight_y * (gx * (x - i) + gy * (y - j))
     return total / DEVIATION

@@ -1,13 +1,11 @@
-"""Fog banks before a camera: a table of their mean along rays, from which all passes read.
+"""Fog banks before a camera: a table of their mean density along rays, from which all passes read.
 
 The optical depth of a ray through fog with banks is that of plain fog times the mean of the banks'
-density along the ray (`augment.render.fog_bank_kernels`). That mean is smooth: it hardly changes
-from a ray to its neighbour, nor from a distance to a little more. So it is tabulated once for a
-camera, over x/z, y/z and the logarithm of the distance, and interpolated linearly.
-
-The columns and rows lie at multiples of a step that follows from the fog alone. So windows of an
-image and images of another resolution read the same numbers. Beams of a LiDAR, which have no image,
-are integrated one by one.
+density along the ray. Banks vary along the ground alone, so the mean depends on the ray's heading,
+on its level distance, and, where plain fog thins with height, on its climb. It is tabulated once
+for an eye, over the heading, the logarithm of the distance and the climb, and interpolated
+linearly. The table goes once around, so windows of an image, images of another resolution and
+mirrored cameras read the same numbers. Beams of a LiDAR are integrated one by one.
 """
 
 from __future__ import annotations
@@ -19,51 +17,53 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
-from augment.render import fog_bank_kernels
+from augment.render import fog_bank_kernels as kernels
 from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.fog import Fog
-from augment.render.fog_bank_kernels import HEAD
+from augment.render.fog_bank_kernels import HEAD, STEP, STEP_GROWTH
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
 # Optical depth of plain fog up to which rays are integrated; banks behind it are the mean of the
 # ray before it.
-MAX_DEPTH = 20.0
+MAX_DEPTH = 16.0
 # Largest distance up to which rays are integrated, in widths of the largest banks, at least.
 MIN_BANKS = 4.0
 # The same, at most.
 MAX_BANKS = 40.0
-# Optical depth of plain fog at whose distance the table's columns resolve the banks.
+# Optical depth of plain fog at whose distance the headings resolve the banks.
 RESOLVED_DEPTH = 5.0
-# Step between columns of the table, for banks whose last octave is as far away as it is wide.
-STEP_SCALE = 0.3
-# Growth of that step with the angle of the last octave: rays average what is far away.
-STEP_POWER = 0.75
-# Largest step between columns; the largest number of steps along a side of the image.
-MAX_STEP = 0.25
-MAX_STEPS = 72
-# Width of the border around the image, for splats whose centres lie outside, in image widths.
-BORDER = 0.1
+# Distance there between headings that are integrated, in lattice steps of the last octave.
+HEADING_STEP = 0.3
+# Smallest number of headings that are integrated.
+MIN_HEADINGS = 48
+# Largest number of headings that are integrated.
+MAX_HEADINGS = 400
+# Headings of the table for each that is integrated.
+REFINEMENT = 3
 # Nodes of the table per doubling of the distance.
-NODES_PER_DOUBLING = 12.0
+NODES_PER_DOUBLING = 14.0
 # Distance at which the nodes begin to grow apart, in lattice steps of the last octave.
 NEAR_STEPS = 3.0
-# Columns of the table per column of rays that are integrated; splines fill it.
-REFINEMENT = 3
+# Nodes per doubling of the climb.
+CLIMBS_PER_DOUBLING = 1.5
+# Steepest slope that has a node of its own.
+MAX_SLOPE = 10.0
 # Rows that a thread takes at a time.
 _ROWS_PER_CHUNK = 32
+# Level distance below which a ray has the density at its eye, metres.
+_MIN_LEVEL_M = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class BankTable:
     """Mean density of fog banks along the rays of a camera.
 
-    numbers: float32, flat: the head that `fog_bank_kernels.interpolate_mean` reads, and log2 of the
-        means, which keeps the same share of a thin and of a dense bank.
-    shape: number of distances, rows and columns.
+    numbers: float32, flat: the head that `fog_bank_kernels` reads, and log2 of the means, which
+        keeps the same share of a thin and of a dense bank.
+    shape: number of climbs, headings and distances.
     """
 
     numbers: np.ndarray
@@ -71,7 +71,7 @@ class BankTable:
 
     @property
     def means(self) -> np.ndarray:
-        """Return the means [distances, rows, columns]."""
+        """Return the means [climbs, headings, distances]."""
         return np.exp2(self.numbers[HEAD:].reshape(self.shape))
 
     @functools.cached_property
@@ -83,72 +83,127 @@ class BankTable:
 def bank_table(fog: Fog, camera: Camera) -> BankTable:
     """Return the table of a fog with banks before a pinhole camera."""
     pose = camera.world_from_camera.numpy()
-    lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     plain = replace(fog, airlight_rgb=(0.0, 0.0, 0.0), varying_airlight_rgb=None, elevation_gain=0)
-    return _table(plain, lens, pose[:3].tobytes())
+    return _table(plain, pose[:3].tobytes())
 
 
 @functools.lru_cache(maxsize=16)
-def _table(fog: Fog, lens: tuple[float, ...], pose_bytes: bytes) -> BankTable:
-    """Return the table for the numbers of a camera; a pure function, so that it may be kept."""
+def _table(fog: Fog, pose_bytes: bytes) -> BankTable:
+    """Return the table for a camera's pose [3, 4]; a pure function, so that it may be kept."""
+    pose = np.frombuffer(pose_bytes).reshape(3, 4)
+    scales, logs = _log_means(fog, float(pose[0, 3]), float(pose[1, 3]))
+    numbers = np.empty(HEAD + logs.size, np.float32)
+    numbers[: kernels.H_PER_M] = pose[:, :3].reshape(-1)
+    numbers[kernels.H_PER_M : kernels.H_SHAPE] = scales
+    numbers[kernels.H_SHAPE : HEAD] = logs.shape
+    numbers[HEAD:] = logs.reshape(-1)
+    return BankTable(numbers, logs.shape)
+
+
+@functools.lru_cache(maxsize=16)
+def _log_means(fog: Fog, x_m: float, y_m: float) -> tuple[tuple[float, ...], np.ndarray]:
+    """Return the head's numbers from H_PER_M on, and log2 of the means, of an eye's place."""
     banks = fog.banks
     assert banks is not None
-    pose = np.frombuffer(pose_bytes).reshape(3, 4)
-    width, height, fx, fy, cx, cy = lens
-    far_m = _far_distance(fog)
-    low_u, high_u = _padded(-cx / fx, (width - cx) / fx)
-    low_v, high_v = _padded(-cy / fy, (height - cy) / fy)
-    step = max(_grid_step(fog), max(high_u - low_u, high_v - low_v) / MAX_STEPS)
-    columns = np.arange(math.floor(low_u / step), math.ceil(high_u / step) + 1)
-    rows = np.arange(math.floor(low_v / step), math.ceil(high_v / step) + 1)
-    scale_m = NEAR_STEPS * banks.finest_m
-    num_nodes = math.ceil(math.log2(1 + far_m / scale_m) * NODES_PER_DOUBLING) + 1
-    distances = scale_m * (2 ** (np.arange(num_nodes) / NODES_PER_DOUBLING) - 1)
-    means = np.empty((num_nodes, len(rows), len(columns)))
-    axes = np.ascontiguousarray(pose[:, :3])
+    edges, nodes = _steps_of_rays(fog)
+    num_headings = _num_headings(fog)
+    climb_gain, climb_nodes = _climbs(fog)
+    # Parabolas through a step's start, middle and end, under its weight.
+    lengths = np.diff(edges)
+    weights = _weights(np.outer(climb_nodes, lengths))
+    shares = _shares(climb_nodes, edges)
+    quarters = np.arange(num_headings) * 4 / num_headings
+    turn = np.where(quarters < 2, quarters - 1, 3 - quarters)
+    east = np.where(quarters < 2, 1 - np.abs(turn), np.abs(turn) - 1)
+    headings = np.stack([east, turn], 1) / np.hypot(east, turn)[:, None]
+    shape = (len(climb_nodes), REFINEMENT * num_headings + 1, int(nodes.max()) + 1)
+    logs = np.empty(shape, np.float32)
     with kernel_threads():
-        fog_bank_kernels.tabulate_means(
-            pose[:, 3].copy(),
-            axes,
-            float(columns[0] * step),
-            float(rows[0] * step),
-            step,
-            distances,
-            axes[2].copy(),
-            _scale_rate(fog),
-            *bank_numbers(fog),
-            means,
+        kernels.tabulate_means(
+            np.array([x_m, y_m]),
+            headings,
+            edges,
+            nodes,
+            weights,
+            shares,
+            *bank_numbers(fog)[1:],
+            REFINEMENT,
+            logs,
         )
-    fine = _refining(len(rows)) @ np.log2(means) @ _refining(len(columns)).T
-    head = (
-        REFINEMENT / step,
-        -columns[0] * REFINEMENT,
-        -rows[0] * REFINEMENT,
-        fine.shape[2],
-        fine.shape[1],
-        num_nodes,
-        1 / scale_m,
+    max_climb = float(climb_nodes.max() * climb_gain) if len(climb_nodes) > 1 else 0.0
+    scale_rate = 0.0 if fog.scale_height_m is None else 1 / fog.scale_height_m
+    scales = (
+        1 / (NEAR_STEPS * banks.finest_m),
         NODES_PER_DOUBLING,
+        REFINEMENT * num_headings / 4,
+        scale_rate * climb_gain,
+        CLIMBS_PER_DOUBLING,
+        max_climb,
     )
-    numbers = np.concatenate([head, fine.reshape(-1)]).astype(np.float32)
-    return BankTable(numbers, fine.shape)
+    return scales, logs
 
 
-@functools.lru_cache(maxsize=64)
-def _refining(count: int) -> np.ndarray:
-    """Return the matrix [(count - 1) REFINEMENT + 1, count] of cubic splines between nodes."""
-    nodes = np.arange(count)
-    spline = make_interp_spline(nodes, np.eye(count), k=min(3, count - 1))
-    return spline(np.arange((count - 1) * REFINEMENT + 1) / REFINEMENT)
+def _steps_of_rays(fog: Fog) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges of the steps along rays, level metres, and the table's node at each."""
+    banks = fog.banks
+    assert banks is not None
+    near_m = NEAR_STEPS * banks.finest_m
+    num_nodes = math.ceil(math.log2(1 + far_distance(fog) / near_m) * NODES_PER_DOUBLING) + 1
+    distances = near_m * (2 ** (np.arange(num_nodes) / NODES_PER_DOUBLING) - 1)
+    edges = [np.zeros(1)]
+    nodes = [np.zeros(1, np.int64)]
+    for node in range(1, num_nodes):
+        start_m, end_m = distances[node - 1 : node + 1]
+        step_m = 2 * STEP * banks.finest_m + STEP_GROWTH * start_m
+        count = math.ceil((end_m - start_m) / step_m)
+        edges.append(start_m + (end_m - start_m) * np.arange(1, count + 1) / count)
+        nodes.append(np.append(np.full(count - 1, -1), node))
+    return np.concatenate(edges), np.concatenate(nodes)
 
 
-def _padded(low: float, high: float) -> tuple[float, float]:
-    margin = BORDER * (high - low)
-    return low - margin, high + margin
+def _num_headings(fog: Fog) -> int:
+    """Return how many headings are integrated, a multiple of 4."""
+    assert fog.banks is not None
+    resolved_m = min(RESOLVED_DEPTH / max(fog.extinction_per_m, 1e-9), far_distance(fog))
+    count = 2 * math.pi * resolved_m / (HEADING_STEP * fog.banks.finest_m)
+    return 4 * math.ceil(min(max(count, MIN_HEADINGS), MAX_HEADINGS) / 4)
 
 
-def _scale_rate(fog: Fog) -> float:
-    return 0.0 if fog.scale_height_m is None else 1 / fog.scale_height_m
+def _climbs(fog: Fog) -> tuple[float, np.ndarray]:
+    """Return the distance that climbs are measured by, metres, and the nodes of climbs, 1/m.
+
+    Nodes are level rays and, either way, climbs that grow by sinh.
+    """
+    if fog.scale_height_m is None:
+        return 0.0, np.zeros(1)
+    gain_m = 0.5 * RESOLVED_DEPTH / max(fog.extinction_per_m, 1e-9)
+    gain_m = min(gain_m, far_distance(fog))
+    largest = MAX_SLOPE / fog.scale_height_m * gain_m
+    count = max(1, math.ceil(math.log2(largest + math.hypot(largest, 1)) * CLIMBS_PER_DOUBLING))
+    nodes = np.arange(-count, count + 1) / CLIMBS_PER_DOUBLING
+    return gain_m, np.sinh(nodes * math.log(2)) / gain_m
+
+
+def _weights(kd: np.ndarray) -> np.ndarray:
+    """Return weights of a step's start, middle and end for k times its length, [..., 3]."""
+    x = np.where(np.abs(kd) < 1e-3, 1.0, np.clip(kd, -500, 500))
+    centre = np.where(np.abs(kd) < 1e-3, 0.5 - kd / 12, 1 / x - 1 / np.expm1(x))
+    x = np.clip(np.abs(kd), 0.1, 500)
+    variance = 1 / np.square(x) - 0.25 / np.square(np.sinh(0.5 * x))
+    variance = np.where(np.abs(kd) < 0.1, 1 / 12 - np.square(kd) / 240, variance)
+    square = variance + np.square(centre)
+    return np.stack(
+        [1 - 3 * centre + 2 * square, 4 * (centre - square), 2 * square - centre], axis=-1
+    )
+
+
+def _shares(climbs: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return the share of each step in the weight of a ray up to its end, [climbs, steps]."""
+    start_m, end_m = edges[:-1], edges[1:]
+    k = np.where(np.abs(climbs) * edges[-1] < 1e-6, 1e-6 / edges[-1], climbs)[:, None]
+    rising = np.exp(-np.abs(k) * start_m) * np.expm1(-np.abs(k) * (end_m - start_m))
+    falling = np.expm1(-np.abs(k) * (end_m - start_m))
+    return np.where(k > 0, rising, falling) / np.expm1(-np.abs(k) * end_m)
 
 
 def bank_numbers(fog: Fog) -> tuple[float, np.ndarray, np.ndarray, float]:
@@ -158,19 +213,12 @@ def bank_numbers(fog: Fog) -> tuple[float, np.ndarray, np.ndarray, float]:
     return banks.finest_m, banks.lattices, banks.seeds, banks.log_mean
 
 
-def _far_distance(fog: Fog) -> float:
-    """Return the distance up to which rays are integrated, metres."""
+def far_distance(fog: Fog) -> float:
+    """Return the level distance up to which rays are integrated, metres."""
     assert fog.banks is not None
     bank_m = fog.banks.bank_m
     opaque_m = MAX_DEPTH / max(fog.extinction_per_m, 1e-9)
     return min(max(opaque_m, MIN_BANKS * bank_m), MAX_BANKS * bank_m)
-
-
-def _grid_step(fog: Fog) -> float:
-    """Return the step of x/z and y/z in the table."""
-    assert fog.banks is not None
-    resolved_m = min(RESOLVED_DEPTH / max(fog.extinction_per_m, 1e-9), _far_distance(fog))
-    return min(STEP_SCALE * (fog.banks.finest_m / resolved_m) ** STEP_POWER, MAX_STEP)
 
 
 def image_means(
@@ -181,23 +229,18 @@ def image_means(
     Args:
         fog: fog with banks.
         camera: the camera.
-        depth: z of what the pixels show, metres; infinite for the sky.
+        depth: z of what the pixels show, finite, metres.
         backend: on the CPU, pixels go through a kernel.
     """
     table = bank_table(fog, camera)
-    u = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
-    v = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
-    u, v = u.float(), v.float()
     if choose_kernels(backend, depth) == CPU:
+        lens = np.array([1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy], np.float32)
         out = np.empty(tuple(depth.shape), np.float32)
         with kernel_threads(_ROWS_PER_CHUNK):
-            fog_bank_kernels.look_up_image(
-                table.numbers, u.numpy(), v.numpy(), depth.detach().contiguous().numpy(), out
-            )
+            kernels.look_up_image(table.numbers, lens, depth.detach().contiguous().numpy(), out)
         return torch.from_numpy(out)
-    u = u.to(depth.device, depth.dtype).expand_as(depth)
-    v = v[:, None].to(depth.device, depth.dtype).expand_as(depth)
-    return look_up(table, u, v, depth * (1 + u * u + v * v).sqrt())
+    rays = camera.ray_directions(depth.dtype, depth.device)
+    return look_up(table, rays * depth[..., None])
 
 
 def point_means(fog: Fog, camera: Camera, offsets: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:
@@ -208,10 +251,7 @@ def point_means(fog: Fog, camera: Camera, offsets: Float[Tensor, "*B 3"]) -> Flo
         camera: the camera.
         offsets: vectors from the eye to the points, in the world's axes, metres.
     """
-    rotation = camera.camera_from_world[:3, :3].to(offsets.device, offsets.dtype)
-    x, y, z = (offsets @ rotation.T).unbind(-1)
-    z = z.clamp_min(1e-3 * offsets.norm(dim=-1).clamp_min(1e-6))
-    return look_up(bank_table(fog, camera), x / z, y / z, offsets.norm(dim=-1))
+    return look_up(bank_table(fog, camera), offsets)
 
 
 def point_means_numpy(fog: Fog, camera: Camera, points_m: np.ndarray) -> np.ndarray:
@@ -220,37 +260,40 @@ def point_means_numpy(fog: Fog, camera: Camera, points_m: np.ndarray) -> np.ndar
     return point_means(fog, camera, offsets).numpy()
 
 
-def pixel_means(
-    fog: Fog, camera: Camera, u: np.ndarray, v: np.ndarray, distance_m: np.ndarray
-) -> np.ndarray:
-    """Return the mean density of the banks along rays through x/z = u, y/z = v, [N]."""
-    rays = (torch.from_numpy(np.asarray(a, np.float64)) for a in (u, v, distance_m))
-    return look_up(bank_table(fog, camera), *rays).numpy()
-
-
-def look_up(
-    table: BankTable, u: Float[Tensor, "*B"], v: Float[Tensor, "*B"], distance: Float[Tensor, "*B"]
-) -> Float[Tensor, "*B"]:
-    """Return the table's means: the definition of `look_up_image`."""
+def look_up(table: BankTable, offsets: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:
+    """Return the table's means at offsets in the world: the definition of `look_up_image`."""
     head = table.numbers[:HEAD].tolist()
-    num_distances, num_rows, num_columns = table.shape
-    means = torch.from_numpy(table.numbers[HEAD:]).to(u.device, u.dtype)
-    x = (u * head[0] + head[1]).clamp(0, num_columns - 1)
-    y = (v * head[0] + head[2]).clamp(0, num_rows - 1)
-    q = (torch.log2(1 + distance * head[6]) * head[7]).clamp(0, num_distances - 1)
-    column = x.long().clamp_max(num_columns - 2)
-    row = y.long().clamp_max(num_rows - 2)
-    node = q.long().clamp_max(num_distances - 2)
-    x, y, q = x - column, y - row, q - node
-    first = (node * num_rows + row) * num_columns + column
+    num_climbs, num_headings, num_nodes = table.shape
+    logs = torch.from_numpy(table.numbers[HEAD:]).to(offsets.device, offsets.dtype)
+    east, north, up = offsets.unbind(-1)
+    level = (east * east + north * north).sqrt()
+    turn = north / (east.abs() + north.abs()).clamp_min(1e-30)
+    turn = torch.where(east >= 0, turn, 2 - turn) + 1
+    turn = (turn * head[kernels.H_QUARTER]).clamp(0, num_headings - 1)
+    along = torch.log2(1 + level * head[kernels.H_PER_M]) * head[kernels.H_DOUBLING]
+    along = along.clamp(0, num_nodes - 1)
+    heading = turn.long().clamp_max(num_headings - 2)
+    node = along.long().clamp_max(num_nodes - 2)
+    turn, along = turn - heading, along - node
+    first = heading * num_nodes + node
 
-    def plane(start: Tensor) -> Tensor:
-        """Return the value between four neighbours at one distance."""
-        upper = torch.lerp(means[start], means[start + 1], x)
-        start = start + num_columns
-        return torch.lerp(upper, torch.lerp(means[start], means[start + 1], x), y)
+    def layer_value(start: Tensor) -> Tensor:
+        """Return the value between four neighbours at one climb."""
+        near = torch.lerp(logs[start], logs[start + 1], along)
+        start = start + num_nodes
+        return torch.lerp(near, torch.lerp(logs[start], logs[start + 1], along), turn)
 
-    return torch.exp2(torch.lerp(plane(first), plane(first + num_rows * num_columns), q))
+    if num_climbs == 1:
+        return torch.exp2(layer_value(first))
+    climb = (up.abs() * head[kernels.H_CLIMB]) / level.clamp_min(1e-30)
+    climb = climb.clamp_max(head[kernels.H_MAX_CLIMB])
+    climb = torch.log2(climb + (climb * climb + 1).sqrt()) * head[kernels.H_CLIMBS]
+    climb = torch.where(up >= 0, climb, -climb) + (num_climbs - 1) // 2
+    climb = climb.clamp(0, num_climbs - 1)
+    layer = climb.long().clamp_max(num_climbs - 2)
+    stride = num_headings * num_nodes
+    first = first + layer * stride
+    return torch.exp2(torch.lerp(layer_value(first), layer_value(first + stride), climb - layer))
 
 
 def ray_means(
@@ -264,14 +307,19 @@ def ray_means(
         directions: unit directions [N, 3].
         distances_m: lengths [N], metres; what is farther than the table reaches is the mean before.
     """
-    out = np.empty(len(distances_m))
-    lengths = np.clip(np.nan_to_num(distances_m, nan=0.0), 0.0, _far_distance(fog))
+    directions = np.asarray(directions, np.float64)
+    level = np.linalg.norm(directions[:, :2], axis=1)
+    safe_level = np.maximum(level, _MIN_LEVEL_M)
+    scale_rate = 0.0 if fog.scale_height_m is None else 1 / fog.scale_height_m
+    distances = np.nan_to_num(distances_m, nan=0.0) * level
+    places = np.broadcast_to(origins_m, directions.shape)[:, :2]
+    out = np.empty(len(directions))
     with kernel_threads():
-        fog_bank_kernels.means_of_rays(
-            np.ascontiguousarray(np.broadcast_to(origins_m, directions.shape), np.float64),
-            np.ascontiguousarray(directions, np.float64),
-            lengths.astype(np.float64),
-            _scale_rate(fog),
+        kernels.means_of_rays(
+            np.ascontiguousarray(places, np.float64),
+            np.ascontiguousarray(directions[:, :2] / safe_level[:, None]),
+            np.clip(distances, 0.0, far_distance(fog)),
+            scale_rate * directions[:, 2] / safe_level,
             *bank_numbers(fog),
             out,
         )
@@ -281,9 +329,8 @@ def ray_means(
 def densities_at(fog: Fog, points_m: np.ndarray) -> np.ndarray:
     """Return the banks' density at points [N, 3], relative to its mean."""
     points = np.asarray(points_m, np.float64)
-    return ray_means(
-        fog, points, np.broadcast_to([1.0, 0.0, 0.0], points.shape), np.zeros(len(points))
-    )
+    directions = np.broadcast_to([1.0, 0.0, 0.0], points.shape)
+    return ray_means(fog, points, directions, np.zeros(len(points)))
 
 
 def thinnest_fog(fog: Fog, camera: Camera) -> Fog:
@@ -312,6 +359,8 @@ def visible_distances(
 
 # Distance of the rays that give the fog around a camera, metres.
 LOCAL_M = 30.0
+# Number of those rays, across the image.
+NUM_LOCAL_RAYS = 9
 
 
 def local_fog(fog: Fog | None, camera: Camera) -> Fog | None:
@@ -321,7 +370,9 @@ def local_fog(fog: Fog | None, camera: Camera) -> Fog | None:
     """
     if fog is None or fog.banks is None:
         return fog
-    table = bank_table(fog, camera)
-    node = math.log2(1 + LOCAL_M / (NEAR_STEPS * fog.banks.finest_m)) * NODES_PER_DOUBLING
-    mean = float(table.means[min(round(node), table.shape[0] - 1)].mean(dtype=np.float64))
+    rotation = camera.world_from_camera[:3, :3]
+    u = torch.linspace(-0.5, 0.5, NUM_LOCAL_RAYS) * camera.width / camera.fx
+    rays = torch.stack([u, torch.zeros_like(u), torch.ones_like(u)], 1).double() @ rotation.T
+    rays = LOCAL_M * rays / rays.norm(dim=1, keepdim=True)
+    mean = float(point_means(fog, camera, rays).mean())
     return replace(fog, extinction_per_m=mean * fog.extinction_per_m, banks=None)

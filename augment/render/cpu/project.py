@@ -40,7 +40,7 @@ from augment.render.cpu.geometry import (
 from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at, log2, scalar_fmuladd, shorts_at
 from augment.render.fog import MAX_EXPONENT
-from augment.render.fog_bank_kernels import interpolate_mean
+from augment.render.fog_bank_kernels import write_log_means
 from augment.render.layout import (
     BIN_SHIFT,
     BLOCK_SIZE,
@@ -135,36 +135,6 @@ def _layered_density(dx, dy, dz, view):
         LOG2_E
     )
     return exp2_fine(v8.maximum(power, v8.broadcast(np.float32(-126)))) * mean
-
-
-@kernel_function()
-def _write_bank_means(d, position, modes, rows):
-    """Write log2 of the mean density of the fog's banks before eight splats.
-
-    Args:
-        d: vectors from the eye, in the part's axes.
-        position: x, y and z of the splats in the camera.
-        modes: modes, which have the table's address.
-        rows: COLOR_ROWS rows of eight numbers, flat; the row of the transmittance is written, and
-            the first three are overwritten.
-    """
-    table = floats_at(np.uint64(modes[L.M_BANKS]), modes[L.M_BANKS_COUNT])
-    ones = v8.broadcast(np.float32(1))
-    x, y, z = position
-    distance = v8.sqrt(dot(d[0], d[1], d[2], d[0], d[1], d[2]))
-    node = log2(v8.fmuladd(distance, v8.broadcast(table[6]), ones)) * v8.broadcast(table[7])
-    inverse = ones / z
-    v8.store(
-        rows, Index(0), v8.fmuladd(x * inverse, v8.broadcast(table[0]), v8.broadcast(table[1]))
-    )
-    second = v8.fmuladd(y * inverse, v8.broadcast(table[0]), v8.broadcast(table[2]))
-    v8.store(rows, Index(NUM_LANES), second)
-    v8.store(rows, Index(2 * NUM_LANES), node)
-    for lane in range(Index(NUM_LANES)):
-        mean = interpolate_mean(
-            table, rows[lane], rows[Index(NUM_LANES) + lane], rows[Index(2 * NUM_LANES) + lane]
-        )
-        rows[Index(TRANSMITTANCE * NUM_LANES) + lane] = mean
 
 
 @kernel_function()
@@ -696,7 +666,8 @@ def _project_eight(
         directions = rotation_row(view, Index(2)) if view[L.V_PARALLEL] > 0 else d
         has_banks = modes[L.M_BANKS] != 0
         if has_banks:
-            _write_bank_means(d, (x, y, z), modes, rows)
+            table = floats_at(np.uint64(modes[L.M_BANKS]), modes[L.M_BANKS_COUNT])
+            write_log_means(table, x, y, z, rows, Index(TRANSMITTANCE * NUM_LANES))
         prepare_colors(
             directions[0],
             directions[1],
