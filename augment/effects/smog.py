@@ -208,6 +208,8 @@ class SmogEffect(Effect):
                 share = fog_share
                 if share is None:
                     share = scattered_share(alpha, depth, camera, fog, backend=effect.backend)
+                if fog.banks is not None:
+                    fog_share = share  # which scatter would look up again
                 rgb = mix_linear_light(rgb, share, camera, fog, backend=effect.backend)
         if settings.scatter > 0:
             with timed(SCATTER):

@@ -23,6 +23,7 @@ from augment.render.fog_image import (
     fits_plain_kernels,
     image_optical_depth,
     plain_fog_depth,
+    sky_image_means,
     sky_ray_depth,
 )
 from augment.render.threads import kernel_threads
@@ -190,8 +191,7 @@ def composite_sky(
             f"camera {camera.name!r} is orthographic: its rays are parallel and see the sky in one "
             f"direction only; composite a ConstantSky, without layered fog"
         )
-    is_plain = fog is None or fog.banks is None
-    if isinstance(sky, CubemapSky) and is_plain and choose_kernels(backend, rgb, alpha) == CPU:
+    if isinstance(sky, CubemapSky) and choose_kernels(backend, rgb, alpha) == CPU:
         return _composite_cubemap(rgb, alpha, camera, bordered_faces(sky), fog)
     directions = camera.ray_directions(rgb.dtype, rgb.device)
     color = sample_at(sky, directions)
@@ -227,6 +227,9 @@ def _composite_cubemap(
         gains = airlight_gains(fog.elevation_gain)
         airlight = fog.airlight_rgb
         varying = fog.varying_airlight_rgb
+    bank_means = np.empty((0, 0), np.float32)
+    if fog is not None and fog.banks is not None:
+        bank_means = sky_image_means(fog, camera, alpha).numpy()
     with kernel_threads(ROWS_PER_CHUNK):
         composite_kernels.composite_cubemap(
             rgb.detach().contiguous().numpy(),
@@ -241,6 +244,7 @@ def _composite_cubemap(
             gains,
             np.asarray(airlight, np.float32),
             np.asarray(varying or airlight, np.float32),
+            bank_means,
             out,
         )
     return torch.from_numpy(out)

@@ -100,7 +100,21 @@ def sky_image_depth(
     tau = sky_optical_depth(fog, slope, float(camera.centre[2]))
     if fog.banks is None:
         return tau
-    return tau * image_means(fog, camera, torch.full_like(slope, SKY_M), backend=backend)
+    return tau * sky_image_means(fog, camera, slope, backend=backend)
+
+
+def sky_image_means(
+    fog: Fog, camera: Camera, like: Float[Tensor, "H W"], *, backend: str = AUTO
+) -> Float[Tensor, "H W"]:
+    """Return the mean density of the banks up to the sky in every pixel.
+
+    Args:
+        fog: fog with banks.
+        camera: camera of the image.
+        like: an image of the type and device of the result.
+        backend: as in `image_means`.
+    """
+    return image_means(fog, camera, torch.full_like(like, SKY_M), backend=backend)
 
 
 def plain_fog_depth(

@@ -40,11 +40,11 @@ HEADING_STEP = 0.3
 # Smallest number of headings that are integrated.
 MIN_HEADINGS = 48
 # Largest number of headings that are integrated.
-MAX_HEADINGS = 400
+MAX_HEADINGS = 480
 # Headings of the table for each that is integrated.
 REFINEMENT = 3
 # Nodes of the table per doubling of the distance.
-NODES_PER_DOUBLING = 14.0
+NODES_PER_DOUBLING = 20.0
 # Distance at which the nodes begin to grow apart, in lattice steps of the last octave.
 NEAR_STEPS = 3.0
 # Nodes per doubling of the climb.
@@ -83,7 +83,9 @@ class BankTable:
 def bank_table(fog: Fog, camera: Camera) -> BankTable:
     """Return the table of a fog with banks before a pinhole camera."""
     pose = camera.world_from_camera.numpy()
-    plain = replace(fog, airlight_rgb=(0.0, 0.0, 0.0), varying_airlight_rgb=None, elevation_gain=0)
+    plain = replace(
+        fog, airlight_rgb=(0.0, 0.0, 0.0), varying_airlight_rgb=None, elevation_gain=0.0
+    )
     return _table(plain, pose[:3].tobytes())
 
 
