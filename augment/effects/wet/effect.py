@@ -51,7 +51,8 @@ from augment.exposure.exposed_surface import share_exposed_surface
 from augment.light.scene_light import find_scene_light
 from augment.memo import memo_of
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
-from augment.render.fog import airlight_gain, optical_depth
+from augment.render.fog import airlight_gain
+from augment.render.fog_image import image_optical_depth
 from augment.scene.cameras import Camera
 from augment.scene.ground import check_metric_and_level
 from augment.scene.scene import Gaussians, Scene
@@ -369,19 +370,19 @@ def _without_fog(
     photo = view.layers.photo
     fog = view.layers.fog
     rgb = view.rgb
-    assert view.raster.expected_depth is not None
+    depth = view.raster.expected_depth
+    assert depth is not None
     if fog is None:
-        return rgb, torch.ones_like(view.raster.expected_depth)
-    points = camera.ray_directions(device=rgb.device) * view.raster.expected_depth[..., None]
-    distance = points.norm(dim=-1)
-    eye_z_m = float(camera.centre[2])
-    transmittance = torch.exp(-optical_depth(fog, distance, eye_z_m, eye_z_m + points[..., 2]))
+        return rgb, torch.ones_like(depth)
+    transmittance = torch.exp(-image_optical_depth(fog, camera, depth))
     if photo is not None:
         airlight = photo.airlight(fog)
     else:
         airlight = rgb.new_tensor(fog.airlight_rgb)
         if fog.elevation_gain > 0:
-            airlight = airlight + airlight_gain(fog, points[..., 2] / distance.clamp_min(1e-6))
+            directions = camera.ray_directions(device=rgb.device)
+            slope = directions[..., 2] / directions.norm(dim=-1)
+            airlight = airlight + airlight_gain(fog, slope)
     clear_rgb = (rgb - (1 - transmittance)[..., None] * airlight) / transmittance.clamp_min(
         MIN_PHOTO_TRANSMITTANCE
     )[..., None]
