@@ -1,0 +1,382 @@
+"""Numba kernel: a picture behind drops and the veil of a shower, whose rate differs by place.
+
+The veil is that of `drop_kernels.blend_falling` at the eye's rate, plus what the rays' rates differ
+from it. `augment.effects.falling.shower` has the equations and the tables.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from augment.effects.falling.drop_kernels import (
+    EDGE,
+    ROWS,
+    blend_colour,
+    classes_in_row,
+    cover_band,
+    decay,
+    nearest_in_row,
+)
+from augment.effects.falling.drops import NUM_CLASSES
+from augment.effects.falling.shower import (
+    CLOUD_EXTINCTION_PER_M,
+    CLOUD_TOP_M,
+    LAYER_M,
+    LUMP_CLIMB,
+    LUMP_DEPTH,
+    LUMP_LIGHT,
+    LUMP_STEP_M,
+    MIN_ALONG_M,
+    STEP_M,
+)
+from augment.render.cpu import simd as v8
+from augment.render.cpu.jit import kernel, kernel_function
+from augment.render.layout import NUM_LANES, Index
+
+_MIN_CLIMB = np.float32(1e-6)  # smallest climb of a ray to the sky over its way ahead
+_MIN_ALONG = np.float32(MIN_ALONG_M)
+_PER_STEP = np.float32(1 / STEP_M)
+_LAYER = np.float32(LAYER_M)
+_TOP = np.float32(CLOUD_TOP_M)
+_CLOUD_DEPTH = np.float32(CLOUD_EXTINCTION_PER_M * (CLOUD_TOP_M - LAYER_M))  # straight up
+_MIN_INTEGRAL = np.float32(1e-9)  # smallest G that the light of the veil is divided by
+# Numbers of a pixel in the rows between the two steps of a row.
+_EXCESS, _SURFACE_LIGHT, _SKY_DEPTH, _CLOUD, _SKY_LIGHT, _CLOUD_LIGHT = range(6)
+NUM_ROW_NUMBERS = 6
+_LAYER_CELLS = np.float32(LAYER_M / LUMP_STEP_M)  # height of the cloud's base in cells of lumps
+_PER_LUMP_CLIMB = np.float32(1 / LUMP_CLIMB)
+_LUMP_DEPTH = np.float32(LUMP_DEPTH)
+_LUMP_LIGHT = np.float32(LUMP_LIGHT)
+
+
+@kernel_function()
+def _integral(rows, distance, column):
+    """Return a column of ShowerTable's rows at a distance from the eye along the way."""
+    x = distance * _PER_STEP + np.float32(len(rows) // 2)
+    last = np.float32(len(rows) - 2)
+    low = np.int64(min(max(x, np.float32(0)), last))
+    share = x - np.float32(low)
+    first = rows[low, column]
+    return first + share * (rows[low + 1, column] - first)
+
+
+@kernel_function()
+def _lump(lumps, x, y):
+    """Return a periodic tile's value between its cells."""
+    size = np.int64(len(lumps))
+    column = np.floor(x)
+    row = np.floor(y)
+    i = np.int64(column) % size
+    j = np.int64(row) % size
+    right = (i + 1) % size
+    below = (j + 1) % size
+    x -= column
+    y -= row
+    # Smooth weights, since the cells of a linear mean would show.
+    x = x * x * (np.float32(3) - np.float32(2) * x)
+    y = y * y * (np.float32(3) - np.float32(2) * y)
+    upper = lumps[j, i] + x * (lumps[j, right] - lumps[j, i])
+    lower = lumps[below, i] + x * (lumps[below, right] - lumps[below, i])
+    return upper + y * (lower - upper)
+
+
+@kernel_function()
+def _integrate_row(row, width, alpha, depth, rays, climb, table, way, at_eye, lumps, eye, numbers):
+    """Write what the shower differs by on the rays of an image row into numbers.
+
+    Args:
+        numbers: output [NUM_ROW_NUMBERS, width]. Of surfaces: the optical depth that the rate at
+            the eye leaves out, over the ray's length at unit depth, and the light of the veil. Of
+            the sky: its optical depth over that length, that of the cloud, the light of the veil,
+            the light of the cloud.
+    """
+    zero = np.float32(0)
+    one = np.float32(1)
+    half = np.float32(0.5)
+    v = (np.float32(row) + half - rays[3]) * rays[1]
+    level = climb[1] * v + climb[2]
+    along_row = way[0, 1] * v + way[0, 2]
+    across_row = way[1, 1] * v + way[1, 2]
+    for j in range(Index(width)):
+        pixel = Index(row * width) + j
+        u = (np.float32(j) + half - rays[2]) * rays[0]
+        along = way[0, 0] * u + along_row
+        z = depth[pixel]
+        opacity = alpha[pixel] if z > zero else zero
+        numbers[_EXCESS, j] = zero
+        numbers[_SURFACE_LIGHT, j] = one
+        if opacity > zero:
+            distance = z * along
+            if abs(distance) > _MIN_ALONG:
+                integral = _integral(table, distance, 0)
+                numbers[_EXCESS, j] = z * (integral / distance - at_eye[0])
+                if abs(integral) > _MIN_INTEGRAL:
+                    numbers[_SURFACE_LIGHT, j] = _integral(table, distance, 1) / integral
+        numbers[_SKY_DEPTH, j] = zero
+        numbers[_CLOUD, j] = zero
+        numbers[_SKY_LIGHT, j] = one
+        numbers[_CLOUD_LIGHT, j] = one
+        if opacity < one:
+            slope = max(climb[0] * u + level, _MIN_CLIMB)
+            per_climb = one / slope
+            base = _LAYER * along * per_climb
+            top = _TOP * along * per_climb
+            mean = at_eye[0]
+            if abs(base) > _MIN_ALONG:
+                integral = _integral(table, base, 0)
+                mean = integral / base
+                if abs(integral) > _MIN_INTEGRAL:
+                    numbers[_SKY_LIGHT, j] = _integral(table, base, 1) / integral
+            cover = at_eye[1]
+            if abs(top - base) > _MIN_ALONG:
+                cover = (_integral(table, top, 2) - _integral(table, base, 2)) / (top - base)
+            numbers[_SKY_DEPTH, j] = _LAYER * per_climb * mean
+            lump_weight = slope * _PER_LUMP_CLIMB - half
+            if cover > zero and lump_weight > zero:
+                across = way[1, 0] * u + across_row
+                reach = _LAYER_CELLS * per_climb
+                lump = _lump(lumps, eye[0] + reach * along, eye[1] + reach * across)
+                lump *= min(lump_weight, one)
+                cover *= one + _LUMP_DEPTH * lump
+                numbers[_CLOUD_LIGHT, j] = one + _LUMP_LIGHT * lump
+            numbers[_CLOUD, j] = _CLOUD_DEPTH * per_climb * cover
+
+
+@kernel_function()
+def _veil(color, splats, is_mixed, edge, light, opacity, surface, sky):
+    """Return the square of a colour behind the veil, as drop_kernels does.
+
+    Args:
+        light: airlight and light of a cloud, in places 0 and 4.
+        surface: transmittance up to the surfaces, and the light of the veil before them.
+        sky: transmittance up to the sky, and the shares of airlight and cloud in its light.
+    """
+    zeros = v8.broadcast(np.float32(0))
+    air = v8.broadcast(light[0])
+    surface_air = air * surface[1]
+    sky_air = air * sky[1] + v8.broadcast(light[4]) * sky[2]
+    squares = color * color
+    before_surface = surface_air + surface[0] * (squares - surface_air)
+    before_sky = sky_air + sky[0] * squares
+    veiled = before_sky + opacity * (before_surface - before_sky)
+    if is_mixed:
+        sky_share = v8.broadcast(np.float32(1)) - opacity
+        sky_part = v8.minimum(v8.maximum(color - splats, zeros), sky_share)
+        surface_part = (color - sky_part) / v8.maximum(opacity, v8.broadcast(np.float32(EDGE)))
+        sky_part = sky_part / v8.maximum(sky_share, v8.broadcast(np.float32(EDGE)))
+        surface_part = surface_air + surface[0] * (surface_part * surface_part - surface_air)
+        sky_part = sky_air + sky[0] * sky_part * sky_part
+        mixed = opacity * v8.sqrt(v8.maximum(surface_part, zeros))
+        mixed = mixed + sky_share * v8.sqrt(v8.maximum(sky_part, zeros))
+        veiled = v8.select(edge, mixed * mixed, veiled)
+    return veiled
+
+
+@kernel_function()
+def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, surface, sky, light):
+    """Blend eight pixels with the veil and the drops, in place. light [3, 5]: as in blend_shower.
+
+    surface, sky: as in _veil.
+    """
+    ones = v8.broadcast(np.float32(1))
+    zeros = v8.broadcast(np.float32(0))
+    per_length = ones / lengths
+    red, green, blue = v8.load_colours(pixels, at)
+    r = red
+    g = green
+    b = blue
+    edge = v8.minimum(opacity, ones - opacity) - v8.broadcast(np.float32(EDGE))
+    is_mixed = False
+    if splats.size > 0 and v8.has_nonnegative_lane(edge):
+        r, g, b = v8.load_colours(splats, Index(3) * pixel)
+        edge = v8.minimum(edge, green - g - v8.broadcast(np.float32(EDGE)))
+        is_mixed = v8.has_nonnegative_lane(edge)
+    edge = v8.at_least(edge, zeros)
+    red = _veil(v8.maximum(red, zeros), r, is_mixed, edge, light[0], opacity, surface, sky)
+    green = _veil(v8.maximum(green, zeros), g, is_mixed, edge, light[1], opacity, surface, sky)
+    blue = _veil(v8.maximum(blue, zeros), b, is_mixed, edge, light[2], opacity, surface, sky)
+    red = blend_colour(red, light[0], u, clear, per_length)
+    green = blend_colour(green, light[1], u, clear, per_length)
+    blue = blend_colour(blue, light[2], u, clear, per_length)
+    v8.store_colours(pixels, at, red, green, blue)
+
+
+@kernel_function()
+def _blend_row(
+    row,
+    width,
+    rgb,
+    splats,
+    alpha,
+    depth,
+    clear,
+    first,
+    nearest,
+    rays,
+    bands,
+    light,
+    partial,
+    numbers,
+    pixels,
+):
+    """Blend a row of blend_shower. clear: from index `first` on. partial, pixels: scratch."""
+    zeros = v8.broadcast(np.float32(0))
+    ones = v8.broadcast(np.float32(1))
+    half = np.float32(0.5)
+    count, slope, offset = classes_in_row(nearest, bands, partial)
+    v = (np.float32(row) + half - rays[3]) * rays[1]
+    flat = v8.broadcast(np.float32(1) + v * v)
+    for j in range(0, width, NUM_LANES):
+        # The last eight pixels of a row include earlier ones, which are not written.
+        at = min(j, width - NUM_LANES)
+        pixel = Index(row * width + at)
+        u = v8.broadcast(np.float32(at) + half - rays[2]) + v8.lane_numbers()
+        u = u * v8.broadcast(rays[0])
+        lengths = v8.sqrt(flat + u * u)
+        z = v8.load(depth, pixel)
+        tau = v8.broadcast(slope) * z + v8.broadcast(offset)
+        for b in range(Index(count)):
+            inside = v8.maximum(z - v8.broadcast(partial[b, 1]), zeros)
+            inside = v8.minimum(inside, v8.broadcast(partial[b, 2]))
+            beyond = v8.maximum(z - v8.broadcast(partial[b, 4]), zeros)
+            tau = tau + v8.broadcast(partial[b, 0]) * (
+                inside * inside * v8.broadcast(partial[b, 3]) + beyond
+            )
+        tau = tau + v8.load(numbers[_EXCESS], Index(at))
+        surface = (decay(tau * lengths), v8.load(numbers[_SURFACE_LIGHT], Index(at)))
+        through_rain = decay(v8.load(numbers[_SKY_DEPTH], Index(at)) * lengths)
+        through_cloud = decay(v8.load(numbers[_CLOUD], Index(at)) * lengths)
+        sky = (
+            through_rain * through_cloud,
+            (ones - through_rain) * v8.load(numbers[_SKY_LIGHT], Index(at)),
+            through_rain * (ones - through_cloud) * v8.load(numbers[_CLOUD_LIGHT], Index(at)),
+        )
+        opacity = v8.select(v8.greater(z, zeros), v8.load(alpha, pixel), zeros)
+        clear_share = v8.load(clear, first + Index(at))
+        if at == j:
+            _blend_pixels(
+                rgb,
+                Index(3) * pixel,
+                splats,
+                pixel,
+                u,
+                lengths,
+                opacity,
+                clear_share,
+                surface,
+                sky,
+                light,
+            )
+        else:
+            for k in range(Index(3 * NUM_LANES)):
+                pixels[k] = rgb[Index(3) * pixel + k]
+            _blend_pixels(
+                pixels,
+                Index(0),
+                splats,
+                pixel,
+                u,
+                lengths,
+                opacity,
+                clear_share,
+                surface,
+                sky,
+                light,
+            )
+            for k in range(Index(3 * (j - at)), Index(3 * NUM_LANES)):
+                rgb[Index(3) * pixel + k] = pixels[k]
+
+
+@kernel
+def blend_shower(
+    rgb,
+    splats,
+    alpha,
+    depth,
+    drops,
+    listed,
+    begins,
+    min_clear_share,
+    rays,
+    climb,
+    bands,
+    airlight,
+    glow,
+    table,
+    way,
+    at_eye,
+    cloud,
+    lumps,
+    eye,
+    mask,
+):
+    """Blend a picture with the drops and the veil of a shower, in place.
+
+    Args:
+        rgb: as in drop_kernels.blend_falling, like all arguments that are not named here.
+        splats: the same.
+        alpha: the same.
+        depth: the same.
+        drops: the same, of the rate at the eye.
+        listed: the same.
+        begins: the same.
+        min_clear_share: the same.
+        rays: the same.
+        climb: the same.
+        bands: the same, of the rate at the eye.
+        airlight: the same.
+        glow: the same.
+        table: rows of ShowerTable.
+        way: [2, 3] the direction in which the shower moves, and that across it to the left, along
+            the camera's axes.
+        at_eye: [2] extinction by all drops at the eye, 1/m, and cover of the sky by cloud.
+        cloud: [3] light of a cloud from below.
+        lumps: [N, N] lumps of the cloud's base, a tile that repeats.
+        eye: [2] the eye's column and row in that tile.
+        mask: output, the same.
+    """
+    height, width = mask.shape
+    for band in prange(len(begins) - 1):
+        top = np.int64(band) * ROWS
+        bottom = min(top + ROWS, height)
+        clear = np.empty(ROWS * width, np.float32)
+        nearest = np.empty(ROWS, np.float32)
+        light = np.empty((3, 5), np.float32)
+        partial = np.empty((NUM_CLASSES, 5), np.float32)
+        numbers = np.empty((NUM_ROW_NUMBERS, width), np.float32)
+        pixels = np.empty(3 * NUM_LANES, np.float32)
+        for row in range(top, bottom):  # this also brings the surfaces into the cache, in order
+            nearest[row - top] = nearest_in_row(row, width, alpha, depth, pixels)
+        cover_band(
+            drops, listed, begins[band], begins[band + 1], top, bottom, width, alpha, depth, clear
+        )
+        for row in range(top, bottom):
+            first = Index((row - top) * width)
+            for j in range(Index(width)):
+                mask[Index(row), j] = clear[first + j] < min_clear_share
+            v = (np.float32(row) + np.float32(0.5) - rays[3]) * rays[1]
+            for c in range(3):
+                light[c, 0], light[c, 1], light[c, 2] = airlight[c], glow[c, 3], glow[c, 0]
+                light[c, 3] = glow[c, 1] * v + glow[c, 2]
+                light[c, 4] = cloud[c]
+            _integrate_row(
+                row, width, alpha, depth, rays, climb, table, way, at_eye, lumps, eye, numbers
+            )
+            _blend_row(
+                row,
+                width,
+                rgb,
+                splats,
+                alpha,
+                depth,
+                clear,
+                first,
+                nearest[row - top],
+                rays,
+                bands,
+                light,
+                partial,
+                numbers,
+                pixels,
+            )
