@@ -21,6 +21,7 @@ from recipes.json_schema import recipe_json_schema, write_schema
 from recipes.lens_drops import LensDrops
 from recipes.light import Light, ListedLamp
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
+from recipes.moment import Air
 from recipes.rain import Rain
 from recipes.ranges import format_value
 from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
@@ -229,7 +230,7 @@ def test_every_field_changes_the_hash() -> None:
     smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1)
     rain = Rain(rate_mm_h=5.0)
     snowfall = Snowfall(rate_mm_h=1.0)
-    weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain, snowfall=snowfall)
+    weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain, snowfall=snowfall, air=Air())
     camera = Sensor(lens_drops=LensDrops(count=5))
     style = Style(image="a.png", digest="0" * 64)
     output = Output(categories=(Category(label="car", name="Car"),))
