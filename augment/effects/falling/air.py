@@ -31,13 +31,8 @@ from torch import Tensor
 from augment.effects.falling import drop_kernels, shower_kernels
 from augment.effects.falling.drop_kernels import CellWalk, Veil
 from augment.effects.falling.drops import Kind, Sizes, cell_counts, lattice_of, sizes_of
-from augment.effects.falling.shower import (
-    LAYER_M,
-    Shower,
-    ShowerTable,
-    shower_about,
-    shower_in_view,
-)
+from augment.effects.falling.shower import Shower, ShowerTable, shower_about, shower_in_view
+from augment.effects.falling.shower_kernels import LAYER_M
 from augment.effects.falling.shutter import STANDING, Motion
 from augment.light.common_exposure import AddedColors
 from augment.light.scene_light import find_scene_light

@@ -24,7 +24,8 @@ from augment.effects.falling.drop_kernels import (
     Veil,
 )
 from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL
-from augment.effects.falling.shower import (
+from augment.effects.falling.shower import ShowerInView
+from augment.effects.falling.shower_kernels import (
     CLOUD_EXTINCTION_PER_M,
     CLOUD_TOP_M,
     LAYER_M,
@@ -34,7 +35,6 @@ from augment.effects.falling.shower import (
     LUMP_STEP_M,
     MIN_ALONG_M,
     STEP_M,
-    ShowerInView,
 )
 from augment.rng import STEP_X, mix
 
@@ -272,9 +272,9 @@ def blend_by_torch(
         through_cloud = torch.exp(-(rays_in_shower.cloud_depth * length).clamp(0, 80))
         sky_transmittance = through_rain * through_cloud
         cloud = torch.from_numpy(shower.cloud).to(airlight)
-        sky_glow = (1 - through_rain)[..., None] * airlight * rays_in_shower.sky_light[
-            ..., None
-        ] + (through_rain * (1 - through_cloud))[..., None] * cloud
+        rain_share = (1 - through_rain) * rays_in_shower.sky_light
+        cloud_share = through_rain * (1 - through_cloud) * rays_in_shower.cloud_light
+        sky_glow = rain_share[..., None] * airlight + cloud_share[..., None] * cloud
         sky_air = airlight.new_zeros(3)
     surface_share = torch.where(depth > 0, alpha, 0)
     surface_transmittance = torch.exp(-(tau * length).clamp(0, 80))

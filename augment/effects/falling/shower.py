@@ -26,39 +26,24 @@ import numpy as np
 from jaxtyping import Float64
 
 from augment.effects.falling.drops import Kind, sizes_of
+from augment.effects.falling.shower_kernels import LUMP_STEP_M, MIN_ALONG_M, STEP_M
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 from recipes.rain import OVERCAST_MM_H
 from recipes.shower import CLOUD_EDGE_M
 
-# Height above the eye from which rain and snow fall, metres.
-LAYER_M = 1000.0
-# Distance between two rows of the table, metres.
-STEP_M = 16.0
 # Number of rows, half of them before the eye and half behind.
-NUM_ROWS = 4001
+NUM_ROWS = 8001
 # Number of places in each step at which the rate is taken.
-_NUM_PLACES = 8
-# Height of the cloud's top above the eye, metres. Assumed.
-CLOUD_TOP_M = 4000.0
-# Extinction of light by the cloud, 1/m: below a real one, so that its edge is soft. Assumed.
-CLOUD_EXTINCTION_PER_M = 2e-3
+_NUM_PLACES = 4
 # Share of the light that is left in the air under a cloud. Assumed.
 LIGHT_UNDER_CLOUD = 0.6
 # Light of a cloud from below, over that of the sky above the horizon. Assumed.
 CLOUD_LIGHT = 0.42
 # Size of the largest lumps of a cloud's base, metres. Assumed.
 LUMP_M = 1500.0
-# Distance between two cells of the tile of lumps, metres.
-LUMP_STEP_M = 60.0
 # Number of cells of the tile in each direction.
 NUM_LUMPS = 256
-# Change of a cloud's light by a lump. Assumed.
-LUMP_LIGHT = 0.25
-# Change of a cloud's depth by a lump. Assumed.
-LUMP_DEPTH = 0.7
-# Climb of a ray over its length below which lumps fade: they are smaller than a pixel there.
-LUMP_CLIMB = 0.12
 # Share of its hue that a cloud keeps of the sky above the horizon. Assumed.
 CLOUD_HUE = 0.5
 # Smallest rate of the table of extinctions, mm/h; below it, the extinction is in proportion.
@@ -87,7 +72,7 @@ class Shower:
         """Return the distance of points [..., 2 or 3] from the reference place, along the way."""
         x = points_m[..., 0] - self.reference_m[0]
         y = points_m[..., 1] - self.reference_m[1]
-        return self.direction[0] * x + self.direction[1] * y
+        return np.asarray(self.direction[0] * x + self.direction[1] * y)
 
     def rates(self, distance_m: np.ndarray) -> np.ndarray:
         """Return the rates at distances from the reference place, mm/h.
@@ -100,14 +85,14 @@ class Shower:
         low = np.maximum(high - 1, 0)
         width = known_m[high] - known_m[low]
         offset = distance_m - known_m[low]
-        share = np.divide(offset, width, out=np.ones_like(offset), where=width > 0).clip(0, 1)
-        between = rates[low] + share * (rates[high] - rates[low])
+        share = np.divide(offset, width, out=np.ones_like(offset), where=width > 0)
+        between = rates[low] + np.clip(share, 0, 1) * (rates[high] - rates[low])
         between = np.where(distance_m <= known_m[0], rates[0], between)
-        return np.where(after == len(known_m), rates[-1], between)
+        return np.asarray(np.where(after == len(known_m), rates[-1], between))
 
     def rate_at(self, point_m: np.ndarray) -> float:
         """Return the rate at a point of the world, mm/h."""
-        return float(self.rates(self.distance_m(point_m)[None])[0])
+        return float(self.rates(self.distance_m(point_m)))
 
 
 def reference_place(scene: Scene) -> tuple[float, float]:
@@ -137,7 +122,7 @@ def extinctions_of(kind: Kind, rates_mm_h: np.ndarray) -> np.ndarray:
     log_rates, log_extinctions = _extinction_table(kind)
     logs = np.log(np.maximum(rates_mm_h, _MIN_RATE_MM_H))
     extinctions = np.exp(np.interp(logs, log_rates, log_extinctions))
-    return extinctions * np.minimum(rates_mm_h / _MIN_RATE_MM_H, 1.0)
+    return np.asarray(extinctions * np.minimum(rates_mm_h / _MIN_RATE_MM_H, 1.0))
 
 
 class ShowerTable(NamedTuple):
@@ -172,11 +157,7 @@ class ShowerTable(NamedTuple):
             out=np.full(np.shape(along), self.extinction_per_m),
             where=has_course,
         )
-        return lengths * mean
-
-
-# Distance along the way below which a ray has the rate of its eye, metres.
-MIN_ALONG_M = 0.5
+        return np.asarray(lengths * mean)
 
 
 def shower_about(shower: Shower, kind: Kind, eye_m: np.ndarray) -> ShowerTable:
@@ -195,8 +176,8 @@ def shower_about(shower: Shower, kind: Kind, eye_m: np.ndarray) -> ShowerTable:
     parts = np.stack([extinctions, extinctions * np.minimum(light, 1.0), covers], 1)
     rows = np.concatenate([np.zeros((1, 3)), np.cumsum(STEP_M * parts, axis=0)])
     rows -= rows[middle]
-    rate = float(shower.rates(np.array([eye_along_m]))[0])
-    extinction = float(extinctions_of(kind, np.array([rate]))[0])
+    rate = float(shower.rates(np.array(eye_along_m)))
+    extinction = float(extinctions_of(kind, np.array(rate)))
     x, y = np.asarray(eye_m, np.float64)[:2] - shower.reference_m
     across_m = float(shower.direction[0] * y - shower.direction[1] * x)
     # The lumps move with the shower, so they count from its first place.

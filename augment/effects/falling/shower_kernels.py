@@ -19,20 +19,28 @@ from augment.effects.falling.drop_kernels import (
     nearest_in_row,
 )
 from augment.effects.falling.drops import NUM_CLASSES
-from augment.effects.falling.shower import (
-    CLOUD_EXTINCTION_PER_M,
-    CLOUD_TOP_M,
-    LAYER_M,
-    LUMP_CLIMB,
-    LUMP_DEPTH,
-    LUMP_LIGHT,
-    LUMP_STEP_M,
-    MIN_ALONG_M,
-    STEP_M,
-)
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.layout import NUM_LANES, Index
+
+# Height above the eye from which rain and snow fall, metres.
+LAYER_M = 1000.0
+# Distance between two rows of the table, metres.
+STEP_M = 5.0
+# Height of the cloud's top above the eye, metres. Assumed.
+CLOUD_TOP_M = 4000.0
+# Extinction of light by the cloud, 1/m: below a real one, so that its edge is soft. Assumed.
+CLOUD_EXTINCTION_PER_M = 2e-3
+# Distance between two cells of the tile of lumps, metres.
+LUMP_STEP_M = 60.0
+# Change of a cloud's light by a lump. Assumed.
+LUMP_LIGHT = 0.25
+# Change of a cloud's depth by a lump. Assumed.
+LUMP_DEPTH = 0.7
+# Climb of a ray over its length below which lumps fade: they are smaller than a pixel there.
+LUMP_CLIMB = 0.12
+# Distance along the way below which a ray has the rate of its eye, metres.
+MIN_ALONG_M = 0.5
 
 _MIN_CLIMB = np.float32(1e-6)  # smallest climb of a ray to the sky over its way ahead
 _MIN_ALONG = np.float32(MIN_ALONG_M)
