@@ -107,19 +107,25 @@ def test_a_step_has_the_rate_of_the_side_that_it_comes_from():
 @pytest.mark.parametrize("yaw", [np.pi, 0.3, np.pi / 2])
 @pytest.mark.parametrize("offset_m", [0.0, -1700.0, 2000.0])
 def test_the_kernel_equals_its_definition(yaw, offset_m):
-    """Before, within and behind a shower, along the wind and across it, with and without edges."""
-    camera = view(yaw=yaw, position=(offset_m, 0, 1.5))
+    """Before, within and behind a shower, along the wind and across it, with and without edges.
+
+    The kernel has straight lines over eight pixels in the sky, which the definition has not.
+    """
+    camera = view(yaw=yaw, width=1280, position=(offset_m, 0, 1.5)).cropped(1, 300, 349, 240)
     rng = np.random.default_rng(1)
-    alpha, depth = (torch.from_numpy(rng.random((120, 160), np.float32)) for _ in range(2))
-    rgb = torch.from_numpy(rng.random((120, 160, 3), np.float32))
+    shape = (240, 349)
+    alpha, depth = (torch.from_numpy(rng.random(shape, np.float32)) for _ in range(2))
+    rgb = torch.from_numpy(rng.random((*shape, 3), np.float32))
     depth = torch.where(depth > 0.2, 600 * depth**4, 0.0)
+    alpha[100:120] = 1
     rest = alpha, depth, camera, raining(COMING, camera=camera)
     for splats in (0.5 * rgb, None):
         fast, mask = draw_falling(rgb.clone(), *rest, scene=scene_of(camera), splats=splats)
         slow, slow_mask = draw_falling(
             rgb.clone(), *rest, scene=scene_of(camera), splats=splats, backend=REFERENCE
         )
-        np.testing.assert_allclose(fast, slow, atol=3e-4)
+        np.testing.assert_allclose(fast, slow, atol=0.02)
+        assert (fast - slow).abs().mean() < 3e-4
         assert (mask == slow_mask).all()
         assert torch.isfinite(fast).all()
 

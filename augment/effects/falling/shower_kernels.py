@@ -49,9 +49,7 @@ _LAYER = np.float32(LAYER_M)
 _TOP = np.float32(CLOUD_TOP_M)
 _CLOUD_DEPTH = np.float32(CLOUD_EXTINCTION_PER_M * (CLOUD_TOP_M - LAYER_M))  # straight up
 _MIN_INTEGRAL = np.float32(1e-9)  # smallest G that the light of the veil is divided by
-# Numbers of a pixel in the rows between the two steps of a row.
-_EXCESS, _SURFACE_LIGHT, _SKY_DEPTH, _CLOUD, _SKY_LIGHT, _CLOUD_LIGHT = range(6)
-NUM_ROW_NUMBERS = 6
+NUM_SKY_NUMBERS = 4
 _LAYER_CELLS = np.float32(LAYER_M / LUMP_STEP_M)  # height of the cloud's base in cells of lumps
 _PER_LUMP_CLIMB = np.float32(1 / LUMP_CLIMB)
 _LUMP_DEPTH = np.float32(LUMP_DEPTH)
@@ -90,65 +88,109 @@ def _lump(lumps, x, y):
 
 
 @kernel_function()
-def _integrate_row(row, width, alpha, depth, rays, climb, table, way, at_eye, lumps, eye, numbers):
-    """Write what the shower differs by on the rays of an image row into numbers.
+def _integrate_surfaces(row, width, depth, rays, table, way, at_eye, excess, light):
+    """Write what the shower differs by up to the surfaces of an image row.
 
     Args:
-        numbers: output [NUM_ROW_NUMBERS, width]. Of surfaces: the optical depth that the rate at
-            the eye leaves out, over the ray's length at unit depth, and the light of the veil. Of
-            the sky: its optical depth over that length, that of the cloud, the light of the veil,
-            the light of the cloud.
+        excess: output [width], optical depth that the rate at the eye leaves out, over the length
+            of the ray at unit depth.
+        light: output [width], light of the veil.
     """
     zero = np.float32(0)
     one = np.float32(1)
-    half = np.float32(0.5)
-    v = (np.float32(row) + half - rays[3]) * rays[1]
-    level = climb[1] * v + climb[2]
-    along_row = way[0, 1] * v + way[0, 2]
-    across_row = way[1, 1] * v + way[1, 2]
+    v = (np.float32(row) + np.float32(0.5) - rays[3]) * rays[1]
+    start = way[0, 1] * v + way[0, 2] + (np.float32(0.5) - rays[2]) * rays[0] * way[0, 0]
+    step = rays[0] * way[0, 0]
+    middle = np.float32(len(table) // 2)
+    last = np.float32(len(table) - 2)
+    extinction = at_eye[0]
+    first = Index(row * width)
     for j in range(Index(width)):
-        pixel = Index(row * width) + j
-        u = (np.float32(j) + half - rays[2]) * rays[0]
-        along = way[0, 0] * u + along_row
-        z = depth[pixel]
-        opacity = alpha[pixel] if z > zero else zero
-        numbers[_EXCESS, j] = zero
-        numbers[_SURFACE_LIGHT, j] = one
-        if opacity > zero:
-            distance = z * along
-            if abs(distance) > _MIN_ALONG:
-                integral = _integral(table, distance, 0)
-                numbers[_EXCESS, j] = z * (integral / distance - at_eye[0])
-                if abs(integral) > _MIN_INTEGRAL:
-                    numbers[_SURFACE_LIGHT, j] = _integral(table, distance, 1) / integral
-        numbers[_SKY_DEPTH, j] = zero
-        numbers[_CLOUD, j] = zero
-        numbers[_SKY_LIGHT, j] = one
-        numbers[_CLOUD_LIGHT, j] = one
-        if opacity < one:
-            slope = max(climb[0] * u + level, _MIN_CLIMB)
-            per_climb = one / slope
-            base = _LAYER * along * per_climb
-            top = _TOP * along * per_climb
-            mean = at_eye[0]
-            if abs(base) > _MIN_ALONG:
-                integral = _integral(table, base, 0)
-                mean = integral / base
-                if abs(integral) > _MIN_INTEGRAL:
-                    numbers[_SKY_LIGHT, j] = _integral(table, base, 1) / integral
-            cover = at_eye[1]
-            if abs(top - base) > _MIN_ALONG:
-                cover = (_integral(table, top, 2) - _integral(table, base, 2)) / (top - base)
-            numbers[_SKY_DEPTH, j] = _LAYER * per_climb * mean
-            lump_weight = slope * _PER_LUMP_CLIMB - half
-            if cover > zero and lump_weight > zero:
-                across = way[1, 0] * u + across_row
-                reach = _LAYER_CELLS * per_climb
-                lump = _lump(lumps, eye[0] + reach * along, eye[1] + reach * across)
-                lump *= min(lump_weight, one)
-                cover *= one + _LUMP_DEPTH * lump
-                numbers[_CLOUD_LIGHT, j] = one + _LUMP_LIGHT * lump
-            numbers[_CLOUD, j] = _CLOUD_DEPTH * per_climb * cover
+        z = depth[first + j]
+        distance = z * (start + np.float32(j) * step)
+        x = distance * _PER_STEP + middle
+        low = np.int32(min(max(x, zero), last))
+        share = x - np.float32(low)
+        integral = table[low, 0] + share * (table[low + 1, 0] - table[low, 0])
+        lit = table[low, 1] + share * (table[low + 1, 1] - table[low, 1])
+        is_long = abs(distance) > _MIN_ALONG
+        mean = integral / distance if is_long else extinction
+        excess[j] = z * (mean - extinction)
+        light[j] = lit / integral if is_long and abs(integral) > _MIN_INTEGRAL else one
+
+
+@kernel_function()
+def _shows_sky(row, width, alpha, depth):
+    """Return True if any pixel of an image row shows some sky."""
+    first = Index(row * width)
+    for j in range(Index(width)):
+        if not (alpha[first + j] >= np.float32(1) and depth[first + j] > np.float32(0)):
+            return True
+    return False
+
+
+@kernel_function()
+def _integrate_sky(column, row, rays, climb, table, way, at_eye, lumps, eye, numbers):
+    """Write what lies before the sky on the ray through a place of the image.
+
+    Args:
+        column: column of the place, pixels.
+        row: row of the place, pixels.
+        numbers: output [NUM_SKY_NUMBERS]: optical depth of the rain, and of the cloud, over the
+            length of the ray at unit depth; light of the veil, and of the cloud.
+    """
+    one = np.float32(1)
+    u = (column - rays[2]) * rays[0]
+    v = (row - rays[3]) * rays[1]
+    slope = max(climb[0] * u + climb[1] * v + climb[2], _MIN_CLIMB)
+    per_climb = one / slope
+    along = way[0, 0] * u + way[0, 1] * v + way[0, 2]
+    base = _LAYER * along * per_climb
+    top = _TOP * along * per_climb
+    mean = at_eye[0]
+    light = one
+    if abs(base) > _MIN_ALONG:
+        integral = _integral(table, base, 0)
+        mean = integral / base
+        if abs(integral) > _MIN_INTEGRAL:
+            light = _integral(table, base, 1) / integral
+    cover = at_eye[1]
+    if abs(top - base) > _MIN_ALONG:
+        cover = (_integral(table, top, 2) - _integral(table, base, 2)) / (top - base)
+    cloud_light = one
+    lump_weight = slope * _PER_LUMP_CLIMB - np.float32(0.5)
+    if cover > 0 and lump_weight > 0:
+        across = way[1, 0] * u + way[1, 1] * v + way[1, 2]
+        reach = _LAYER_CELLS * per_climb
+        lump = _lump(lumps, eye[0] + reach * along, eye[1] + reach * across)
+        lump *= min(lump_weight, one)
+        cover *= one + _LUMP_DEPTH * lump
+        cloud_light += _LUMP_LIGHT * lump
+    numbers[0] = _LAYER * per_climb * mean
+    numbers[1] = _CLOUD_DEPTH * per_climb * cover
+    numbers[2] = light
+    numbers[3] = cloud_light
+
+
+@kernel_function()
+def _integrate_sky_row(row, width, rays, climb, table, way, at_eye, lumps, eye, nodes):
+    """Write what lies before the sky at the ends of each eight pixels of an image row.
+
+    The numbers change slowly with the direction, so they are straight lines in between.
+
+    Args:
+        nodes: output [blocks + 2, NUM_SKY_NUMBERS] at every eighth column, then at both
+            ends of the last eight pixels.
+    """
+    count = -(-width // NUM_LANES)
+    v = np.float32(row) + np.float32(0.5)
+    for block in range(count + 2):
+        column = np.float32(min(block, count - 1) * NUM_LANES)
+        if block >= count:
+            column = np.float32(width - NUM_LANES * (count + 1 - block))
+        # Lane 0 is in the middle of its pixel.
+        column += np.float32(0.5)
+        _integrate_sky(column, v, rays, climb, table, way, at_eye, lumps, eye, nodes[block])
 
 
 @kernel_function()
@@ -211,6 +253,13 @@ def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, surface
 
 
 @kernel_function()
+def _between(begin, end):
+    """Return eight numbers on a straight line, of which the first is `begin`, the ninth `end`."""
+    step = (end - begin) * np.float32(1 / NUM_LANES)
+    return v8.broadcast(begin) + v8.lane_numbers() * v8.broadcast(step)
+
+
+@kernel_function()
 def _blend_row(
     row,
     width,
@@ -225,10 +274,21 @@ def _blend_row(
     bands,
     light,
     partial,
-    numbers,
+    excess,
+    veil_light,
+    nodes,
     pixels,
 ):
-    """Blend a row of blend_shower. clear: from index `first` on. partial, pixels: scratch."""
+    """Blend a row of blend_shower.
+
+    Args:
+        clear: from index `first` on.
+        excess: as in _integrate_surfaces.
+        veil_light: its `light`.
+        nodes: as in _integrate_sky_row.
+        partial: scratch.
+        pixels: scratch.
+    """
     zeros = v8.broadcast(np.float32(0))
     ones = v8.broadcast(np.float32(1))
     half = np.float32(0.5)
@@ -251,14 +311,19 @@ def _blend_row(
             tau = tau + v8.broadcast(partial[b, 0]) * (
                 inside * inside * v8.broadcast(partial[b, 3]) + beyond
             )
-        tau = tau + v8.load(numbers[_EXCESS], Index(at))
-        surface = (decay(tau * lengths), v8.load(numbers[_SURFACE_LIGHT], Index(at)))
-        through_rain = decay(v8.load(numbers[_SKY_DEPTH], Index(at)) * lengths)
-        through_cloud = decay(v8.load(numbers[_CLOUD], Index(at)) * lengths)
+        tau = tau + v8.load(excess, Index(at))
+        surface = (decay(tau * lengths), v8.load(veil_light, Index(at)))
+        block = Index(j // NUM_LANES)
+        if at < j or j + NUM_LANES >= width:
+            block = Index(-(-width // NUM_LANES))
+        begin = nodes[block]
+        end = nodes[block + 1]
+        through_rain = decay(_between(begin[0], end[0]) * lengths)
+        through_cloud = decay(_between(begin[1], end[1]) * lengths)
         sky = (
             through_rain * through_cloud,
-            (ones - through_rain) * v8.load(numbers[_SKY_LIGHT], Index(at)),
-            through_rain * (ones - through_cloud) * v8.load(numbers[_CLOUD_LIGHT], Index(at)),
+            (ones - through_rain) * _between(begin[2], end[2]),
+            through_rain * (ones - through_cloud) * _between(begin[3], end[3]),
         )
         opacity = v8.select(v8.greater(z, zeros), v8.load(alpha, pixel), zeros)
         clear_share = v8.load(clear, first + Index(at))
@@ -352,7 +417,10 @@ def blend_shower(
         nearest = np.empty(ROWS, np.float32)
         light = np.empty((3, 5), np.float32)
         partial = np.empty((NUM_CLASSES, 5), np.float32)
-        numbers = np.empty((NUM_ROW_NUMBERS, width), np.float32)
+        excess = np.empty(width, np.float32)
+        veil_light = np.empty(width, np.float32)
+        # Rows without sky leave the numbers of earlier rows: their weight is 0.
+        nodes = np.zeros((-(-width // NUM_LANES) + 2, NUM_SKY_NUMBERS), np.float32)
         pixels = np.empty(3 * NUM_LANES, np.float32)
         for row in range(top, bottom):  # this also brings the surfaces into the cache, in order
             nearest[row - top] = nearest_in_row(row, width, alpha, depth, pixels)
@@ -368,9 +436,9 @@ def blend_shower(
                 light[c, 0], light[c, 1], light[c, 2] = airlight[c], glow[c, 3], glow[c, 0]
                 light[c, 3] = glow[c, 1] * v + glow[c, 2]
                 light[c, 4] = cloud[c]
-            _integrate_row(
-                row, width, alpha, depth, rays, climb, table, way, at_eye, lumps, eye, numbers
-            )
+            _integrate_surfaces(row, width, depth, rays, table, way, at_eye, excess, veil_light)
+            if _shows_sky(row, width, alpha, depth):
+                _integrate_sky_row(row, width, rays, climb, table, way, at_eye, lumps, eye, nodes)
             _blend_row(
                 row,
                 width,
@@ -385,6 +453,8 @@ def blend_shower(
                 bands,
                 light,
                 partial,
-                numbers,
+                excess,
+                veil_light,
+                nodes,
                 pixels,
             )
