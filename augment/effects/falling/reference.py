@@ -321,7 +321,7 @@ class _RaysInShower(NamedTuple):
 def _rays_in_shower(
     shower: ShowerInView, u: Tensor, v: Tensor, depth: Tensor, slope: Tensor
 ) -> _RaysInShower:
-    rows, way, at_eye, _, lumps, eye = (torch.from_numpy(numbers).to(u) for numbers in shower)
+    rows, axes, at_eye, _, lumps, eye = (torch.from_numpy(numbers).to(u) for numbers in shower)
 
     def integrals(distance: Tensor) -> Tensor:
         x = distance / STEP_M + len(rows) // 2
@@ -336,8 +336,8 @@ def _rays_in_shower(
         light = parts[..., 1] / torch.where(has_light, parts[..., 0], 1)
         return mean, torch.where(has_light, light, 1)
 
-    along = way[0, 0] * u + way[0, 1] * v + way[0, 2]
-    across = way[1, 0] * u + way[1, 1] * v + way[1, 2]
+    along = axes[0, 0] * u + axes[0, 1] * v + axes[0, 2]
+    across = axes[1, 0] * u + axes[1, 1] * v + axes[1, 2]
     per_climb = 1 / slope.clamp_min(1e-6)
     lump = _lump(
         lumps,

@@ -198,7 +198,7 @@ class ShowerInView(NamedTuple):
     """Arguments of `shower_kernels.blend_shower`, float32."""
 
     rows: np.ndarray  # [NUM_ROWS, 3] as in ShowerTable
-    way: np.ndarray  # [2, 3] the shower's way and across it, along the camera's axes
+    axes: np.ndarray  # [2, 3] the shower's way and across it, along the camera's axes
     at_eye: np.ndarray  # [2] extinction by all drops at the eye, 1/m, and cover of the sky by cloud
     cloud: np.ndarray  # [3] light of a cloud from below, squares of display-encoded colours
     lumps: np.ndarray  # [NUM_LUMPS, NUM_LUMPS] lumps of the cloud, -1 to 1, a tile that repeats
@@ -215,13 +215,13 @@ def shower_in_view(table: ShowerTable, camera: Camera, airlight: np.ndarray) -> 
     """
     world = camera.world_from_camera[:3, :3].numpy()
     along, across = table.direction
-    way = np.array([[along, across], [-across, along]]) @ world[:2]
+    axes = np.array([[along, across], [-across, along]]) @ world[:2]
     exposure = 1 - (1 - LIGHT_UNDER_CLOUD) * table.cloud_cover
     grey = float(airlight.mean())
     cloud = CLOUD_LIGHT / exposure * (grey + CLOUD_HUE * (airlight - grey))
     at_eye = (table.extinction_per_m, table.cloud_cover)
     eye = np.asarray(table.eye_m) / LUMP_STEP_M % NUM_LUMPS
-    numbers = (table.rows, way, at_eye, cloud, lumps_of_cloud(table.seed), eye)
+    numbers = (table.rows, axes, at_eye, cloud, lumps_of_cloud(table.seed), eye)
     return ShowerInView(*(np.asarray(n, np.float32, order="C") for n in numbers))
 
 

@@ -88,7 +88,7 @@ def _lump(lumps, x, y):
 
 
 @kernel_function()
-def _integrate_surfaces(row, width, depth, rays, table, way, at_eye, excess, light):
+def _integrate_surfaces(row, width, depth, rays, table, axes, at_eye, excess, light):
     """Write what the shower differs by up to the surfaces of an image row.
 
     Args:
@@ -97,10 +97,10 @@ def _integrate_surfaces(row, width, depth, rays, table, way, at_eye, excess, lig
         light: output [width], light of the veil.
     """
     zero = np.float32(0)
-    one = np.float32(1)
+    unit = np.float32(1)
     v = (np.float32(row) + np.float32(0.5) - rays[3]) * rays[1]
-    start = way[0, 1] * v + way[0, 2] + (np.float32(0.5) - rays[2]) * rays[0] * way[0, 0]
-    step = rays[0] * way[0, 0]
+    start = axes[0, 1] * v + axes[0, 2] + (np.float32(0.5) - rays[2]) * rays[0] * axes[0, 0]
+    step = rays[0] * axes[0, 0]
     middle = np.float32(len(table) // 2)
     last = np.float32(len(table) - 2)
     extinction = at_eye[0]
@@ -116,7 +116,7 @@ def _integrate_surfaces(row, width, depth, rays, table, way, at_eye, excess, lig
         is_long = abs(distance) > _MIN_ALONG
         mean = integral / distance if is_long else extinction
         excess[j] = z * (mean - extinction)
-        light[j] = lit / integral if is_long and abs(integral) > _MIN_INTEGRAL else one
+        light[j] = lit / integral if is_long and abs(integral) > _MIN_INTEGRAL else unit
 
 
 @kernel_function()
@@ -130,7 +130,7 @@ def _shows_sky(row, width, alpha, depth):
 
 
 @kernel_function()
-def _integrate_sky(column, row, rays, climb, table, way, at_eye, lumps, eye, numbers):
+def _integrate_sky(column, row, rays, climb, table, axes, at_eye, lumps, eye, numbers):
     """Write what lies before the sky on the ray through a place of the image.
 
     Args:
@@ -139,16 +139,16 @@ def _integrate_sky(column, row, rays, climb, table, way, at_eye, lumps, eye, num
         numbers: output [NUM_SKY_NUMBERS]: optical depth of the rain, and of the cloud, over the
             length of the ray at unit depth; light of the veil, and of the cloud.
     """
-    one = np.float32(1)
+    unit = np.float32(1)
     u = (column - rays[2]) * rays[0]
     v = (row - rays[3]) * rays[1]
     slope = max(climb[0] * u + climb[1] * v + climb[2], _MIN_CLIMB)
-    per_climb = one / slope
-    along = way[0, 0] * u + way[0, 1] * v + way[0, 2]
+    per_climb = unit / slope
+    along = axes[0, 0] * u + axes[0, 1] * v + axes[0, 2]
     base = _LAYER * along * per_climb
     top = _TOP * along * per_climb
     mean = at_eye[0]
-    light = one
+    light = unit
     if abs(base) > _MIN_ALONG:
         integral = _integral(table, base, 0)
         mean = integral / base
@@ -157,14 +157,14 @@ def _integrate_sky(column, row, rays, climb, table, way, at_eye, lumps, eye, num
     cover = at_eye[1]
     if abs(top - base) > _MIN_ALONG:
         cover = (_integral(table, top, 2) - _integral(table, base, 2)) / (top - base)
-    cloud_light = one
+    cloud_light = unit
     lump_weight = slope * _PER_LUMP_CLIMB - np.float32(0.5)
     if cover > 0 and lump_weight > 0:
-        across = way[1, 0] * u + way[1, 1] * v + way[1, 2]
+        across = axes[1, 0] * u + axes[1, 1] * v + axes[1, 2]
         reach = _LAYER_CELLS * per_climb
         lump = _lump(lumps, eye[0] + reach * along, eye[1] + reach * across)
-        lump *= min(lump_weight, one)
-        cover *= one + _LUMP_DEPTH * lump
+        lump *= min(lump_weight, unit)
+        cover *= unit + _LUMP_DEPTH * lump
         cloud_light += _LUMP_LIGHT * lump
     numbers[0] = _LAYER * per_climb * mean
     numbers[1] = _CLOUD_DEPTH * per_climb * cover
@@ -173,7 +173,7 @@ def _integrate_sky(column, row, rays, climb, table, way, at_eye, lumps, eye, num
 
 
 @kernel_function()
-def _integrate_sky_row(row, width, rays, climb, table, way, at_eye, lumps, eye, nodes):
+def _integrate_sky_row(row, width, rays, climb, table, axes, at_eye, lumps, eye, nodes):
     """Write what lies before the sky at the ends of each eight pixels of an image row.
 
     The numbers change slowly with the direction, so they are straight lines in between.
@@ -190,7 +190,7 @@ def _integrate_sky_row(row, width, rays, climb, table, way, at_eye, lumps, eye, 
             column = np.float32(width - NUM_LANES * (count + 1 - block))
         # Lane 0 is in the middle of its pixel.
         column += np.float32(0.5)
-        _integrate_sky(column, v, rays, climb, table, way, at_eye, lumps, eye, nodes[block])
+        _integrate_sky(column, v, rays, climb, table, axes, at_eye, lumps, eye, nodes[block])
 
 
 @kernel_function()
@@ -377,7 +377,7 @@ def blend_shower(
     airlight,
     glow,
     table,
-    way,
+    axes,
     at_eye,
     cloud,
     lumps,
@@ -401,7 +401,7 @@ def blend_shower(
         airlight: the same.
         glow: the same.
         table: rows of ShowerTable.
-        way: [2, 3] the direction in which the shower moves, and that across it to the left, along
+        axes: [2, 3] the direction in which the shower moves, and that across it to the left, along
             the camera's axes.
         at_eye: [2] extinction by all drops at the eye, 1/m, and cover of the sky by cloud.
         cloud: [3] light of a cloud from below.
@@ -433,12 +433,14 @@ def blend_shower(
                 mask[Index(row), j] = clear[first + j] < min_clear_share
             v = (np.float32(row) + np.float32(0.5) - rays[3]) * rays[1]
             for c in range(3):
-                light[c, 0], light[c, 1], light[c, 2] = airlight[c], glow[c, 3], glow[c, 0]
+                light[c, 0] = airlight[c]
+                light[c, 1] = glow[c, 3]
+                light[c, 2] = glow[c, 0]
                 light[c, 3] = glow[c, 1] * v + glow[c, 2]
                 light[c, 4] = cloud[c]
-            _integrate_surfaces(row, width, depth, rays, table, way, at_eye, excess, veil_light)
+            _integrate_surfaces(row, width, depth, rays, table, axes, at_eye, excess, veil_light)
             if _shows_sky(row, width, alpha, depth):
-                _integrate_sky_row(row, width, rays, climb, table, way, at_eye, lumps, eye, nodes)
+                _integrate_sky_row(row, width, rays, climb, table, axes, at_eye, lumps, eye, nodes)
             _blend_row(
                 row,
                 width,
