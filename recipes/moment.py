@@ -44,6 +44,10 @@ class SceneTimes:
         return (timestamp_ns - self.start_ns) / NS_PER_S
 
 
+# A drive that is longer than all others, where the scene is not known: no timeline goes beyond it.
+ANY_DRIVE = SceneTimes(0, 10**7 * NS_PER_S)
+
+
 class Clock(ClosedModel):
     """The time of the weather, by which timelines go, from the time of the drive."""
 

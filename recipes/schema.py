@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import json
 import operator
 import re
@@ -35,7 +36,7 @@ from recipes.fields import (
 from recipes.flood import Flood
 from recipes.lens_drops import LensDrops
 from recipes.light import Light
-from recipes.moment import Air, Clock, Moment, SceneTimes
+from recipes.moment import ANY_DRIVE, Air, Clock, Moment, SceneTimes
 from recipes.rain import Rain
 from recipes.smog import Smog
 from recipes.snow import Snow
@@ -413,6 +414,19 @@ class Recipe(ClosedModel):
             data["output"]["lidar"] = True
         return json.dumps(data, sort_keys=True, separators=(",", ":"))
 
+    # ---- Over time
+
+    @functools.cached_property
+    def is_at_moment(self) -> bool:
+        """True of a recipe that `at` has made: it holds the numbers of one moment."""
+        return False
+
+    @property
+    def changes_over_time(self) -> bool:
+        """Return True if images of different times may have different weather."""
+        has_history = bool(self.timelines) or self.weather.air is not None
+        return has_history and not self.is_at_moment
+
     def weather_time_s(self, scene_times: SceneTimes, timestamp_ns: int) -> float:
         """Return the time of the weather at an image, seconds.
 
@@ -426,7 +440,8 @@ class Recipe(ClosedModel):
         """Return the recipe at the time of an image: numbers only, also those that have a history.
 
         Timelines give way to their values, and every section derives its state from them
-        (`EffectModel.state_at`). A recipe in which nothing changes is returned as it is.
+        (`EffectModel.state_at`). A recipe in which nothing changes is returned as it is, and so is
+        one that is at a moment already.
 
         Args:
             scene_times: the drive's times.
@@ -444,9 +459,13 @@ class Recipe(ClosedModel):
             scene_times: the drive's times.
             time_s: the time of the weather, seconds.
         """
+        if self.is_at_moment:
+            return self
         recipe = self
         curves: dict[str, Curve] = {}
         for timeline in self.timelines:
+            if section_at(self, timeline.path.rpartition(".")[0]) is None:
+                continue  # the effect was taken out of the recipe
             times_s = timeline.times_s(self.weather.clock, scene_times)
             if timeline.is_number:
                 curves[timeline.path] = timeline.curve(times_s)
@@ -459,7 +478,59 @@ class Recipe(ClosedModel):
             state = section.state_at(path, moment)
             if state is not section:
                 recipe = with_unchecked_field(recipe, path, state)
+        if recipe is not self:
+            vars(recipe)["is_at_moment"] = True  # as a cached property, which no comparison reads
         return recipe
+
+    def check_times(self, scene_times: SceneTimes) -> None:
+        """Refuse timelines that do not fit a drive.
+
+        Args:
+            scene_times: the drive's times.
+
+        Raises:
+            RecipeError: a timeline goes beyond the drive, or has shares of a drive without length.
+        """
+        for timeline in self.timelines:
+            timeline.times_s(self.weather.clock, scene_times)
+
+    def key_times_s(self, scene_times: SceneTimes) -> tuple[float, ...]:
+        """Return the times of the weather at which the recipe is at its extremes, in order.
+
+        These are the drive's ends and the points of all timelines in it, and the middles between
+        them, since what has a history may be largest there.
+
+        Args:
+            scene_times: the drive's times.
+        """
+        clock = self.weather.clock
+        start_s = clock.start_s
+        end_s = clock.time_s(scene_times.duration_s)
+        times = {start_s, end_s}
+        for timeline in self.timelines:
+            times.update(t for t in timeline.times_s(clock, scene_times) if start_s < t < end_s)
+        ordered = sorted(times)
+        middles = [(a + b) / 2 for a, b in itertools.pairwise(ordered)]
+        return tuple(sorted({*ordered, *middles}))
+
+    def over_time(self, scene_times: SceneTimes) -> tuple[Recipe, ...]:
+        """Return the recipe at its key times, each once; a recipe that never changes is the only
+        one.
+
+        Args:
+            scene_times: the drive's times.
+
+        Raises:
+            RecipeError: a timeline goes beyond the drive.
+        """
+        if not self.changes_over_time:
+            return (self,)
+        states: list[Recipe] = []
+        for time_s in self.key_times_s(scene_times):
+            state = self.at_weather_time(scene_times, time_s)
+            if state not in states:
+                states.append(state)
+        return tuple(states)
 
     @property
     def hash(self) -> str:
@@ -508,10 +579,17 @@ class Recipe(ClosedModel):
         """Return the weather's surfaces on which a beam can end, and whether depth images show
         each.
         """
-        surfaces = [
-            section.beam_surface(self.output.surface) for section in self.sections().values()
-        ]
-        return dict(sorted(surface for surface in surfaces if surface is not None))
+        surfaces = {
+            path: section.beam_surface(self.output.surface)
+            for path, section in self.sections().items()
+            if type(section).beam_surface is not EffectModel.beam_surface
+        }
+        if self.changes_over_time and None in surfaces.values():
+            for state in self.over_time(ANY_DRIVE):
+                for path, surface in surfaces.items():
+                    in_state = state.sections()[path].beam_surface(self.output.surface)
+                    surfaces[path] = surface or in_state
+        return dict(sorted(surface for surface in surfaces.values() if surface is not None))
 
     def sections(self) -> dict[str, EffectModel]:
         """Return the effects of the recipe, by dotted path."""

@@ -163,6 +163,17 @@ def plan_at(recipe: Recipe, scene: Scene, timestamp_ns: int) -> tuple[Recipe, Pl
     return recipe, make_plan(recipe, scene, weather_time_s=time_s)
 
 
+def check_plans(recipe: Recipe, scene: Scene) -> None:
+    """Refuse a recipe that is impossible in a scene at any time of its drive.
+
+    Raises:
+        SceneError: the recipe needs what the scene does not have.
+        RecipeError: a timeline goes beyond the drive, or the quality is open.
+    """
+    for state in recipe.over_time(scene_times(scene)):
+        make_plan(state, scene)
+
+
 def make_plan(recipe: Recipe, scene: Scene, *, weather_time_s: float = 0.0) -> Plan:
     """Return the passes that `recipe` requires of `scene`.
 

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from augment.dataset.live import SceneDataset
+from augment.effects import JobContext, precompute_effects
+from augment.jobs.generate import plan_job, run_generate
+from augment.jobs.render_job import RenderJob
+from augment.output.manifest import read_manifest
 from augment.scene.scene_times import scene_times
 from augment.view.plan import make_plan, plan_at
+from augment.view.quality import calibration_views
 from augment.view.render_view import render_view, render_views
 from augment.view.weathered_sweep import weathered_sweep
+from recipes.errors import RecipeError
 from recipes.load import parse_recipe
 from recipes.schema import Recipe
+from tests.augment.batch_scenes import open_fake, run_fake
+from tests.augment.generate_jobs import make_job, make_recipes
 from tests.streets import LABELLED_STREET, open_street
 
 STREET = LABELLED_STREET.replace("frames=2", "frames=4")
@@ -97,3 +108,103 @@ def test_a_live_sample_states_the_weather_of_its_own_time() -> None:
         assert sample["weather"]["rain_rate_mm_h"] == plain.columns()["rain_rate_mm_h"]
         rates.append(sample["weather"]["rain_rate_mm_h"])
     assert rates[0] != rates[1]
+
+
+# ---- Jobs, on stand-in scenes of 0.3 s ---------------------------------------------------------
+
+CLEARING = recipe_of(
+    "{clock: {speed: 10}, smog: {visibility_m: {timeline: [[0, 50], [1, 350]], times: share}, "
+    "scale_height_m: {timeline: [[0, 10], [2, 40]], shape: smooth}}}"
+)
+
+
+def manifest_rows(out: Path, **options) -> list[dict]:
+    run_fake(RenderJob("fake:street", [CLEARING], out, **options))
+    return list(map(no_nan, read_manifest(out).to_pylist()))
+
+
+def no_nan(row: dict) -> dict:
+    """A row with None in place of NaN, which equals itself."""
+    return {name: None if value != value else value for name, value in row.items()}
+
+
+def test_a_manifest_has_the_values_at_each_images_own_time(tmp_path) -> None:
+    scene = open_fake("fake:street")
+    rows = manifest_rows(tmp_path / "all")
+    assert len(rows) == 8
+    assert len({row["smog_extinction_per_m"] for row in rows}) == 8  # two cameras, 1 ns apart
+    for row in rows:
+        smog = CLEARING.at(scene_times(scene), row["timestamp_ns"]).weather.smog
+        assert smog is not None
+        assert row["smog_extinction_per_m"] == smog.resolved_extinction_per_m
+        assert row["smog_scale_height_m"] == smog.scale_height_m
+        assert json.loads(row["timeline_values"]) == {
+            "weather.smog.scale_height_m": smog.scale_height_m,
+            "weather.smog.visibility_m": smog.visibility_m,
+        }
+        first_ns = min(row["timestamp_ns"] for row in rows)
+        assert row["weather_time_s"] == pytest.approx((row["timestamp_ns"] - first_ns) / 1e8)
+        assert row["recipe_hash"] == CLEARING.hash
+
+
+def test_rows_are_the_same_for_a_frame_alone_and_after_a_second_run(tmp_path) -> None:
+    rows = manifest_rows(tmp_path / "all")
+    alone = manifest_rows(tmp_path / "alone", frames=[2])
+    assert alone == [row for row in rows if row["frame"] == 2]
+    assert manifest_rows(tmp_path / "all") == rows  # nothing is rendered again
+    first = manifest_rows(tmp_path / "parts", frames=[0, 1])
+    assert manifest_rows(tmp_path / "parts") == rows and first == rows[:4]
+
+
+def test_a_recipe_that_never_changes_has_no_time_in_its_rows(tmp_path) -> None:
+    plain = recipe_of("{smog: {visibility_m: 80}}")
+    run_fake(RenderJob("fake:street", [plain], tmp_path / "out"))
+    rows = read_manifest(tmp_path / "out").to_pylist()
+    assert {(row["weather_time_s"], row["timeline_values"]) for row in rows} == {(None, None)}
+
+
+def test_a_scene_that_ends_before_a_timeline_is_left_out_of_a_job(tmp_path) -> None:
+    text = "weather: {smog: {visibility_m: {timeline: [[0, 50], [0.39, 350]]}}}"
+    recipes = make_recipes(("fog",), texts={"fog": text})  # 4 frames last 0.4 s, 3 frames 0.3 s
+    planned = plan_job(make_job(tmp_path / "out", recipes=recipes), progress=False)
+    assert set(planned.records) == {"a"}
+    (why,) = planned.unusable.values()
+    assert "fog.yaml:4: weather.smog.visibility_m.timeline[1]" in why and "beyond the drive" in why
+
+
+def test_a_job_of_many_scenes_notes_each_images_time(tmp_path) -> None:
+    text = "weather: {smog: {visibility_m: {timeline: [[0, 50], [1, 350]], times: share}}}"
+    out = tmp_path / "out"
+    run_generate(make_job(out, recipes=make_recipes(("fog",), texts={"fog": text})), progress=False)
+    rows = read_manifest(out).to_pylist()
+    last = {scene: max((r for r in rows if r["scene"] == scene), key=timestamp) for scene in "ab"}
+    values = [json.loads(row["timeline_values"]) for row in last.values()]
+    assert values == [{"weather.smog.visibility_m": 350.0}] * 2
+
+
+def timestamp(row: dict) -> int:
+    return row["timestamp_ns"]
+
+
+def test_a_timeline_beyond_the_drive_stops_a_job_before_it_renders() -> None:
+    late = recipe_of("{smog: {visibility_m: {timeline: [[0, 50], [30, 350]]}}}")
+    with pytest.raises(RecipeError, match="beyond the drive"):
+        precompute_effects(JobContext(open_fake("fake:street"), [late]))
+
+
+def test_quality_is_measured_at_the_weathers_extremes_too() -> None:
+    frames = open_fake("fake:street?frames=40").frames
+    usual = calibration_views(frames)
+    more = calibration_views(frames, times_ns=[frames[0].timestamp_ns, frames[39].timestamp_ns])
+    assert more[: len(usual)] == usual
+    assert [view.frame for view in more[len(usual) :]] == [0, 39]
+
+
+def test_key_times_are_the_drives_ends_the_points_and_the_middles_between() -> None:
+    times = scene_times(open_fake("fake:street"))
+    assert CLEARING.key_times_s(times) == pytest.approx((0, 1, 2, 2.5, 3))
+    states = CLEARING.over_time(times)
+    visibilities = [state.weather.smog.visibility_m for state in states if state.weather.smog]
+    assert visibilities == pytest.approx([50, 150, 250, 300, 350])
+    plain = recipe_of("{smog: {visibility_m: 80}}")
+    assert plain.over_time(times) == (plain,) and plain.over_time(times)[0] is plain
