@@ -26,7 +26,8 @@ from augment.render.buffers import CUDA, RenderOutput
 from augment.render.composite import apply_color_map, composite_sky, to_byte_array
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.runtime import upload
-from augment.render.fog import Fog, apply_fog_to_render
+from augment.render.fog import Fog
+from augment.render.fog_image import apply_fog_to_render
 from augment.render.rasterize import renormalise_alpha
 from augment.scene.cameras import Camera
 from augment.scene.geometry import rigid, rotmat_from_quat

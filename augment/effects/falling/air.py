@@ -40,6 +40,7 @@ from augment.light.srgb import display_from_linear
 from augment.memo import memo_of
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.fog import MAX_EXPONENT, Fog
+from augment.render.fog_table import local_fog
 from augment.render.layout import NUM_LANES
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
@@ -417,7 +418,7 @@ def draw_falling(
         glow = _in_common_exposure(glow, added_colors)
         if precipitation.color is not None:
             precipitation = replace(precipitation, color=added_colors.of_color(precipitation.color))
-    glow = _in_fog(glow, fog, float(camera.centre[2]), extinction)
+    glow = _in_fog(glow, local_fog(fog, camera), float(camera.centre[2]), extinction)
     veil = veil_of(precipitation, camera, glow)
     table = precipitation.shower_about(camera.centre.numpy())
     shower = None

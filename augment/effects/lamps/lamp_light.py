@@ -28,6 +28,7 @@ from augment.memo import memo_of
 from augment.render.buffers import REFERENCE
 from augment.render.composite import unit_depth_coordinates
 from augment.render.constants import SURFACE_ALPHA
+from augment.render.fog_table import local_fog
 from augment.render.scatter import scattered_share
 from augment.scene.cameras import Camera
 from augment.scene.labels import EGO_VEHICLE
@@ -69,7 +70,7 @@ def add_lamp_light(
     alpha = np.ascontiguousarray(raster.alpha.detach().cpu().numpy(), np.float32)
     z = np.ascontiguousarray(raster.expected_depth.detach().cpu().numpy(), np.float32)
     depth_m = np.where((alpha >= SURFACE_ALPHA) & np.isfinite(z), z, np.float32(0))
-    air = air_of(effect, view)
+    air = air_of(effect, view, camera)
     added = np.zeros_like(rgb) if recorded is None else recorded
     if plan.hour.is_dark:
         car_pixels = recording_car_pixels(effect.scene, camera)
@@ -171,8 +172,11 @@ def _airlight(view: RenderedView, color_map: Tensor | None) -> tuple[float, floa
     return (red, green, blue)
 
 
-def air_of(effect: EffectInScene, view: RenderedView) -> AirExtinction:
-    """Return the extinction of fog, rain and snowfall in a view."""
+def air_of(effect: EffectInScene, view: RenderedView, camera: Camera) -> AirExtinction:
+    """Return the extinction of fog, rain and snowfall in a view.
+
+    Fog with banks counts as plain fog that is as dense as the banks around the camera.
+    """
     per_m = 0.0
     kind: Literal["rain", "snow"] = "rain"
     for other in effect.earlier_effects:
@@ -181,7 +185,10 @@ def air_of(effect: EffectInScene, view: RenderedView) -> AirExtinction:
             per_m += sizes.extinction_per_m
             if other.hooks.name == "snowfall":
                 kind = "snow"
-    fog = next((o.settings.fog for o in effect.earlier_effects if o.hooks.name == "smog"), None)
+    smog = next((o for o in effect.earlier_effects if o.hooks.name == "smog"), None)
+    fog = None
+    if smog is not None:
+        fog = local_fog(smog.settings.fog_at(smog.weather_time_s), camera)
     return AirExtinction(fog, per_m, kind)
 
 

@@ -42,6 +42,7 @@ from augment.memo import memo_of
 from augment.output.box_tables import BoxTable, pixel_fraction
 from augment.render.buffers import EXPECTED_DEPTH, OVERLAY
 from augment.render.fog import Fog, optical_depth_numpy
+from augment.render.fog_table import local_fog
 from augment.scene.bounds import Bounds, bound_points, bound_squares, find_visible_owners
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes
 from augment.scene.cameras import Camera
@@ -294,6 +295,7 @@ def _find_carriers(snow_effect: EffectInScene, camera: Camera) -> list[Carrier]:
 
 def _extinction_at(camera: Camera, fog: Fog | None) -> float:
     """Return the fog's extinction at the camera, 1/metre."""
+    fog = local_fog(fog, camera)
     if fog is None:
         return 0.0
     eye_z_m = np.array([float(camera.centre[2])])

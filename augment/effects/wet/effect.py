@@ -49,7 +49,7 @@ from augment.exposure.exposed_surface import share_exposed_surface
 from augment.light.scene_light import find_scene_light
 from augment.memo import memo_of
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
-from augment.render.fog import optical_depth
+from augment.render.fog_image import image_optical_depth
 from augment.scene.cameras import Camera
 from augment.scene.ground import check_metric_and_level
 from augment.scene.scene import Gaussians, Scene
@@ -302,11 +302,7 @@ def _darken_photo(
     clear_rgb = rgb
     transmittance = torch.ones_like(share)
     if fog is not None:
-        points = camera.ray_directions(device=rgb.device) * view.raster.expected_depth[..., None]
-        eye_z_m = float(camera.centre[2])
-        transmittance = torch.exp(
-            -optical_depth(fog, points.norm(dim=-1), eye_z_m, eye_z_m + points[..., 2])
-        )
+        transmittance = torch.exp(-image_optical_depth(fog, camera, view.raster.expected_depth))
         airlight = photo.airlight(fog)
         clear_rgb = (rgb - (1 - transmittance)[..., None] * airlight) / transmittance.clamp_min(
             MIN_PHOTO_TRANSMITTANCE
