@@ -27,7 +27,7 @@ from recipes.ranges import format_value
 from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
 from recipes.sections import Leaf, recipe_file
 from recipes.shower import RateAtPlace
-from recipes.snow import Snow, SnowLight, SnowWind
+from recipes.snow import Snow, SnowLight, SnowRoad, SnowWind
 from recipes.snowfall import Snowfall
 from recipes.speed import Speed
 from recipes.style import Style, style_preset_names
@@ -228,7 +228,7 @@ CANDIDATES = (0, 1, 2, 0.5, 0.1, True, False, "other", "1" * 64, (0.1, 0.2, 0.3)
 def test_every_field_changes_the_hash() -> None:
     wave = Wave(amplitude_m=0.01, wavelength_m=1.0)
     flood = Flood(level_m=0.2, waves=Waves(components=(wave,)))
-    smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1)
+    smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1, road=SnowRoad())
     along = (RateAtPlace(distance_m=5, rate_mm_h=5),)
     rain = Rain(rate_mm_h=5.0, along=along)
     snowfall = Snowfall(rate_mm_h=1.0, along=along)
