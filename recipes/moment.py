@@ -70,7 +70,7 @@ class Air(ClosedModel):
     humidity: Unit = 0.6
     """Relative humidity: 0 dry, 1 saturated."""
     wind_m_s: Number = Field(default=3.0, ge=0, le=60)
-    """Speed of the wind 2 m above the ground."""
+    """Speed of the wind 10 m above the ground, as weather services state it."""
     road_warmer_k: Number = Field(default=0.0, ge=-30, le=50)
     """How much warmer the road's surface is than the air, kelvin: some 5 in a weak sun."""
 

@@ -22,7 +22,7 @@ from recipes.lens_drops import LensDrops
 from recipes.light import Light, ListedLamp
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.moment import Air
-from recipes.rain import Rain
+from recipes.rain import Rain, RoadWater
 from recipes.ranges import format_value
 from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
 from recipes.sections import Leaf, recipe_file
@@ -230,7 +230,7 @@ def test_every_field_changes_the_hash() -> None:
     flood = Flood(level_m=0.2, waves=Waves(components=(wave,)))
     smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1, road=SnowRoad())
     along = (RateAtPlace(distance_m=5, rate_mm_h=5),)
-    rain = Rain(rate_mm_h=5.0, along=along)
+    rain = Rain(rate_mm_h=5.0, along=along, road=RoadWater())
     snowfall = Snowfall(rate_mm_h=1.0, along=along)
     weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain, snowfall=snowfall, air=Air())
     camera = Sensor(lens_drops=LensDrops(count=5))
