@@ -591,11 +591,13 @@ class Recipe(ClosedModel):
             for path, section in self.sections().items()
             if type(section).beam_surface is not EffectModel.beam_surface
         }
-        if self.changes_over_time and None in surfaces.values():
-            for state in self.over_time(ANY_DRIVE):
+        if self.changes_over_time:
+            for time_s in reversed(self.key_times_s(ANY_DRIVE)):
+                if None not in surfaces.values():
+                    break
+                sections = self.at_weather_time(ANY_DRIVE, time_s).sections()
                 for path, surface in surfaces.items():
-                    in_state = state.sections()[path].beam_surface(self.output.surface)
-                    surfaces[path] = surface or in_state
+                    surfaces[path] = surface or sections[path].beam_surface(self.output.surface)
         return dict(sorted(surface for surface in surfaces.values() if surface is not None))
 
     def sections(self) -> dict[str, EffectModel]:

@@ -21,7 +21,8 @@ from augment.view.weathered_sweep import weathered_sweep
 from recipes.errors import RecipeError
 from recipes.load import parse_recipe
 from recipes.schema import Recipe
-from tests.augment.batch_scenes import open_fake, run_fake
+from tests.augment.batch_scenes import open_fake, run_fake, tree_digest
+from tests.augment.fork_server import quick_context, start_fork_server
 from tests.augment.generate_jobs import make_job, make_recipes
 from tests.streets import LABELLED_STREET, open_street
 
@@ -154,6 +155,31 @@ def test_rows_are_the_same_for_a_frame_alone_and_after_a_second_run(tmp_path) ->
     assert manifest_rows(tmp_path / "all") == rows  # nothing is rendered again
     first = manifest_rows(tmp_path / "parts", frames=[0, 1])
     assert manifest_rows(tmp_path / "parts") == rows and first == rows[:4]
+
+
+@pytest.fixture
+def quick_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    start_fork_server("tests.augment.batch_scenes", "augment.jobs.pools")
+    monkeypatch.setattr("multiprocessing.get_context", quick_context)
+
+
+@pytest.mark.usefixtures("quick_workers")
+def test_two_workers_write_what_one_writes(tmp_path) -> None:
+    fog = recipe_of("{smog: {visibility_m: {timeline: [[0, 10], [1, 90]], times: share}}}")
+    for workers in (1, 2):
+        job = RenderJob("fake:street", [fog], tmp_path / str(workers), workers=workers)
+        run_fake(job, renderer=None)
+    trees = [tree_digest(tmp_path / name / "street") for name in "12"]
+    assert trees[0] == trees[1]
+    manifests = [(tmp_path / name / "manifest.parquet").read_bytes() for name in "12"]
+    assert manifests[0] == manifests[1]
+    alone = RenderJob("fake:street", [fog], tmp_path / "3", frames=[2])
+    run_fake(alone, renderer=None)
+    checksums = [
+        {(row["frame"], row["camera"]): row["checksum"] for row in read_manifest(path).to_pylist()}
+        for path in (tmp_path / "1", tmp_path / "3")
+    ]
+    assert len(checksums[1]) == 2 and checksums[1].items() <= checksums[0].items()
 
 
 def test_a_recipe_that_never_changes_has_no_time_in_its_rows(tmp_path) -> None:

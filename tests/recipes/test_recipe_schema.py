@@ -394,6 +394,20 @@ WAVE = {"amplitude_m": 0.02, "wavelength_m": 2.0}
         with_smog(visibility_m={"log_uniform": [1.0, 2.0]}),
         with_smog(visibility_m={"normal": {"mean": 2.0, "std": 1.0, "min": 1.0, "max": 3.0}}),
         with_smog(scale_height_m={"choice": [None, 5.0, {"uniform": [1.0, 2.0]}]}),
+        with_smog(
+            visibility_m={"timeline": [[-3, 50], [{"uniform": [0, 1]}, {"choice": [60, 70]}]]}
+        ),
+        with_smog(
+            visibility_m={"timeline": [[0, 50], [1, 9]], "shape": "smooth", "times": "share"}
+        ),
+        with_smog(scale_height_m={"choice": [None, {"timeline": [[0, 50.0], [1, 9.0]]}]}),
+        with_snow(tracks={"timeline": [[0, "never"], [2, "always"]], "shape": "step"}),
+        {
+            "weather": {
+                "air": {"humidity": {"timeline": [[0, 0.9], [60, 0.4]]}},
+                "clock": {"speed": 60},
+            }
+        },
         with_smog(color=[0.5, {"uniform": [0.0, 1.0]}, {"choice": [0.5]}]),
         with_smog(color={"uniform": [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]}),
         with_smog(model={"choice": ["deferred"], "weights": [2.0]}),
@@ -434,6 +448,18 @@ def test_both_accept(data: dict, validator: Any) -> None:
         with_smog(visibility_m={"uniform": [None, 1.0]}),
         with_smog(visibility_m={"unifrom": [1.0, 2.0]}),
         with_smog(visibility_m={"choice": []}),
+        with_smog(visibility_m={"timeline": []}),
+        with_smog(visibility_m={"timeline": [[0, 0.0], [1, 5.0]]}),
+        with_smog(visibility_m={"timeline": [[0, None], [1, 5.0]]}),
+        with_smog(visibility_m={"timeline": [[0, 3.0, 4.0]]}),
+        with_smog(visibility_m={"timeline": [[0, 3.0], ["late", 5.0]]}),
+        with_smog(visibility_m={"timeline": [[0, 3.0], [1, 5.0]], "shape": "round"}),
+        with_smog(visibility_m={"timeline": [[0, 3.0], [1, 5.0]], "times": "minutes"}),
+        with_smog(color={"timeline": [[0, [0.1, 0.1, 0.1]], [1, [0.5, 0.5, 0.5]]]}),
+        with_snow(cell_m={"timeline": [[0, 0.1], [1, 0.2]]}),
+        with_snow(tracks={"timeline": [[0, "never"], [2, "always"]], "shape": "linear"}),
+        {"render": {"scale": {"timeline": [[0, 1.0], [1, 0.5]]}}},
+        {"timelines": []},
         with_smog(base_height_m={"log_uniform": [0.0, 2.0]}),
         with_smog(base_height_m={"normal": {"mean": 1.0, "std": 0.0, "min": 0.0, "max": 2.0}}),
         with_smog(color={"log_uniform": [[0.1, 0.1, 0.1], [1.0, 1.0, 1.0]]}),

@@ -175,7 +175,8 @@ def hold_weather(recipe: Recipe, scene: Scene, camera: Camera, drive_s: float) -
     time_s = clock.time_s(drive_s)
     start_s = time_s - clock.speed * times.drive_s(camera.timestamp_ns)
     state = recipe.at_weather_time(times, time_s)
-    return with_unchecked_field(state, "weather.clock.start_s", start_s)
+    state = with_unchecked_field(state, "weather.clock.start_s", start_s)
+    return with_unchecked_field(state, "weather.air", None)  # or a saved recipe would change again
 
 
 def rename_recipe(recipe: Recipe, name: str) -> Recipe:
