@@ -120,6 +120,9 @@ class SmogEffect(Effect):
         smog = self.section_of(recipe)
         return smog is not None and max(smog.shadow_fade, smog.gloss_fade) > 0
 
+    def kernel_key(self, section: Smog) -> bool | None:
+        return section.patchiness > 0 or None
+
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:

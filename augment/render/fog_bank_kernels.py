@@ -286,8 +286,8 @@ def write_log_means(table, x, y, z, rows, target):
         rows: flat float32; rows of eight numbers at 0, 1 and 2 are overwritten.
         target: position in `rows` where the eight results go.
     """
-    zero = v8.broadcast(np.float32(0))
-    one = v8.broadcast(np.float32(1))
+    zeros = v8.broadcast(np.float32(0))
+    ones = v8.broadcast(np.float32(1))
     tiny = v8.broadcast(np.float32(1e-30))
     east = _turned(table, Index(H_ROTATION), x, y, z)
     north = _turned(table, Index(H_ROTATION + 3), x, y, z)
@@ -295,9 +295,9 @@ def write_log_means(table, x, y, z, rows, target):
     # Heading on a square that stands on its corner, 0 to 4 quarters.
     size = v8.maximum(east, v8.negate(east)) + v8.maximum(north, v8.negate(north))
     turn = north / v8.maximum(size, tiny)
-    turn = v8.select(v8.at_least(east, zero), turn, v8.broadcast(np.float32(2)) - turn) + one
+    turn = v8.select(v8.at_least(east, zeros), turn, v8.broadcast(np.float32(2)) - turn) + ones
     v8.store(rows, Index(0), turn * v8.broadcast(table[H_QUARTER]))
-    node = log2(v8.fmuladd(level, v8.broadcast(table[H_PER_M]), one))
+    node = log2(v8.fmuladd(level, v8.broadcast(table[H_PER_M]), ones))
     v8.store(rows, Index(NUM_LANES), node * v8.broadcast(table[H_DOUBLING]))
     has_climb = table[H_CLIMB] > np.float32(0)
     if has_climb:
@@ -305,9 +305,9 @@ def write_log_means(table, x, y, z, rows, target):
         limit = v8.broadcast(table[H_MAX_CLIMB])
         climb = v8.maximum(up, v8.negate(up)) * v8.broadcast(table[H_CLIMB])
         climb = v8.minimum(climb / v8.maximum(level, tiny), limit)
-        climb = log2(climb + v8.sqrt(v8.fmuladd(climb, climb, one)))
+        climb = log2(climb + v8.sqrt(v8.fmuladd(climb, climb, ones)))
         climb = climb * v8.broadcast(table[H_CLIMBS])
-        climb = v8.select(v8.at_least(up, zero), climb, v8.negate(climb))
+        climb = v8.select(v8.at_least(up, zeros), climb, v8.negate(climb))
         v8.store(rows, Index(2 * NUM_LANES), climb)
     num_climbs = Index(table[H_SHAPE])
     num_headings = Index(table[H_SHAPE + 1])

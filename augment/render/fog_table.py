@@ -201,7 +201,8 @@ def _weights(kd: np.ndarray) -> np.ndarray:
 
 def _shares(climbs: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return the share of each step in the weight of a ray up to its end, [climbs, steps]."""
-    start_m, end_m = edges[:-1], edges[1:]
+    start_m = edges[:-1]
+    end_m = edges[1:]
     k = np.where(np.abs(climbs) * edges[-1] < 1e-6, 1e-6 / edges[-1], climbs)[:, None]
     rising = np.exp(-np.abs(k) * start_m) * np.expm1(-np.abs(k) * (end_m - start_m))
     falling = np.expm1(-np.abs(k) * (end_m - start_m))
@@ -276,7 +277,8 @@ def look_up(table: BankTable, offsets: Float[Tensor, "*B 3"]) -> Float[Tensor, "
     along = along.clamp(0, num_nodes - 1)
     heading = turn.long().clamp_max(num_headings - 2)
     node = along.long().clamp_max(num_nodes - 2)
-    turn, along = turn - heading, along - node
+    turn = turn - heading
+    along = along - node
     first = heading * num_nodes + node
 
     def layer_value(start: Tensor) -> Tensor:

@@ -11,7 +11,9 @@ import torch
 
 from adapters.base import open_scene
 from augment import render_view
-from augment.effects.smog import local_visibility
+from augment.effects.lidar.beam import DEFAULT_MODEL, Echoes
+from augment.effects.lidar.codes import SCATTERED
+from augment.effects.smog import box_transmittance, fog_echoes, local_visibility, wavelength_factor
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.constants import RasterSettings
 from augment.render.fog import Fog
@@ -36,6 +38,8 @@ from augment.scene.scene import PosedGaussians
 from recipes.errors import RecipeError
 from recipes.load import parse_recipe
 from recipes.moment import SceneTimes
+from tests.augment.box_views import UPRIGHT, make_boxes, make_camera, placed
+from tests.lidar_sweeps import SENSOR_M, WORLD_ORIGIN_M, some_points, sweep_of
 from tests.scenes import camera_ahead, random_gaussians, random_pose
 
 GREY = (0.7, 0.7, 0.7)
@@ -245,6 +249,36 @@ def test_every_pass_takes_banks(scale_height, model):
     scene = open_scene(STREET)
     view = render_view(scene, scene.frames[0].cameras["front"], recipe)
     assert np.isfinite(np.asarray(view.rgb)).all()
+
+
+@pytest.mark.parametrize("fog", [UNIFORM, LAYERED])
+def test_beams_and_images_have_the_same_depth(fog):
+    """Beams are integrated one by one, pixels read the table: within the table's 1.2 %."""
+    points = some_points()
+    origins = np.tile(SENSOR_M, (len(points), 1)) + WORLD_ORIGIN_M
+    echoes = Echoes.from_sweep(sweep_of(points), origins, WORLD_ORIGIN_M, DEFAULT_MODEL)
+    fog_echoes(echoes, fog, np.random.default_rng(0))
+    hit = echoes.codes != SCATTERED
+    assert hit.sum() > 50
+    # At this density the LiDAR's wavelength has the extinction of visible light.
+    assert wavelength_factor(fog.extinction_per_m) == 1
+    camera = camera_ahead(position=tuple(SENSOR_M))
+    tau = point_optical_depth_numpy(fog, camera, points[hit])
+    np.testing.assert_allclose(-0.5 * np.log(echoes.gain[hit]), tau, rtol=0.012)
+
+
+@pytest.mark.parametrize("fog", [UNIFORM, LAYERED])
+def test_a_boxs_transmittance_is_that_of_its_rays(fog):
+    tiny = (1e-6, 1e-6, 1e-6)
+    places = np.array([[40.0, 3.0, 1.6], [90.0, -20.0, 4.0]])
+    boxes = make_boxes(*((tuple(place), tiny, UPRIGHT) for place in places))
+    camera = make_camera()
+    got = box_transmittance(placed(boxes), camera, fog, None)
+    offsets = places - camera.centre.numpy()
+    distances = np.linalg.norm(offsets, axis=1)
+    means = ray_means(fog, camera.centre.numpy(), offsets / distances[:, None], distances)
+    plain = point_optical_depth_numpy(replace(fog, banks=None), camera, places)
+    np.testing.assert_allclose(-np.log(got.transmittance), plain * means, rtol=0.012)
 
 
 def test_visibility_of_an_image_is_that_of_its_rays():
