@@ -211,7 +211,7 @@ def stain_levels(share: float) -> np.ndarray:
     if not 0 < share < 1:
         return np.zeros(1, np.float32)
     level = (stain_table() < share).astype(np.float32)
-    levels = [level.ravel()]
+    levels: list[np.ndarray] = [level.ravel()]
     for _ in range(1, NUM_STAIN_LEVELS):
         level = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         levels.append(level.ravel())
