@@ -22,22 +22,20 @@ from augment.view.render_view import render_view
 from recipes.fields import changed, section_at
 from recipes.load import load_recipe
 from recipes.schema import Recipe
-from tools.pictures import resized, write_rgb
+from tools.pictures import resized, write, write_rgb
 
 Preset = Literal["fog-bank", "passing-shower", "drying-road", "first-snow"]  # Strip to draw.
 STREET = "procedural:street?seed=3&frames=40&width=1280&height=720"
 # Width of one picture, pixels.
-CELL_WIDTH = 480
+CELL_WIDTH = 400
 # Number of pictures of a drive.
-NUM_PICTURES = 4
+NUM_PICTURES = 5
 # Share of a picture's rows that are cut off below.
 LOWER_SHARE = 0.08
 # Quality of the JPEG files.
-QUALITY = 70
+QUALITY = 74
 # Scale of the rendering.
 SCALE = 0.75
-# First and last picture's share of the drive.
-SHARES = {"fog-bank": (0.0, 0.95), "passing-shower": (0.0, 1.0)}
 # Where the shower of the street and that of the recorded drive come from: ahead of the cameras.
 FROM_DEG = {"splats": 20.0, "recorded": 60.0}
 
@@ -66,8 +64,7 @@ def draw_row(preset: str, scene: Scene, camera: str, base: str) -> np.ndarray:
     if preset == "passing-shower":
         fields["weather.rain.wind_from_deg"] = FROM_DEG[base]
     recipe = changed(recipe, fields)
-    first, last = SHARES.get(preset, (0.0, 1.0))
-    numbers = np.linspace(first, last, NUM_PICTURES) * (len(scene.frames) - 1)
+    numbers = np.linspace(0, len(scene.frames) - 1, NUM_PICTURES)
     pictures = []
     for number in numbers.round().astype(int):
         view = scene.frames[number].cameras[camera]
@@ -77,8 +74,8 @@ def draw_row(preset: str, scene: Scene, camera: str, base: str) -> np.ndarray:
         times = scene_times(scene)
         minutes = recipe.weather_time_s(times, view.timestamp_ns) / 60
         label = label_of(recipe.at(times, view.timestamp_ns), minutes)
-        for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(picture, label, (6, 18), 0, 0.44, color, width, cv2.LINE_AA)
+        for color, offset_px in (((0, 0, 0), 1), ((255, 255, 255), 0)):
+            write(picture, label, 6 + offset_px, 17 + offset_px, size=0.42, color=color)
         pictures.append(picture)
     return np.hstack(pictures)
 

@@ -30,8 +30,9 @@ from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import Boxes
 from augment.scene.scene import Scene
 from augment.scene.sky import ConstantSky
-from augment.view.plan import make_plan
+from augment.view.plan import make_plan, plan_at
 from augment.view.render_view import render_view
+from recipes.load import parse_recipe
 from recipes.rain import Rain
 from recipes.schema import Recipe, Weather
 from recipes.shower import RateAtPlace
@@ -192,6 +193,49 @@ def test_the_same_bytes_from_any_number_of_threads():
         limit_threads(threads)
         images.append(render_view(scene, camera, recipe).rgb)
     np.testing.assert_array_equal(images[0], images[1])
+
+
+SHOWER = """
+weather:
+  rain:
+    rate_mm_h: {timeline: [[0, 0], [20, 30], [40, 4]], shape: smooth}
+    front_mps: 12
+    wind_from_deg: 180
+  clock: {speed: 100, start_s: 3}
+"""
+
+
+def driving_away() -> Scene:
+    """Four frames, a tenth of a second and 120 m of a shower apart, beside each other."""
+    frames = []
+    for index in range(4):
+        camera = view(position=(120.0 * index, 0, 1.5), timestamp_ns=10**8 * index, yaw=np.pi)
+        camera = dataclasses.replace(camera, name="front")
+        pose = torch.eye(4, dtype=torch.float64)
+        frames.append(Frame(index, camera.timestamp_ns, pose, {"front": camera}))
+    return dataclasses.replace(scene_of(frames[0].cameras["front"]), frames=tuple(frames))
+
+
+def test_an_image_alone_has_the_bits_of_the_image_in_sequence():
+    recipe = parse_recipe(SHOWER, source="shower").resolve(0)
+    scene = driving_away()
+    images = [render_view(scene, frame.cameras["front"], recipe).rgb for frame in scene.frames]
+    alone = driving_away()
+    last = render_view(alone, alone.frames[-1].cameras["front"], recipe)
+    np.testing.assert_array_equal(images[-1], last.rgb)
+    assert (images[0] != images[2]).any()
+
+
+def test_who_drives_with_the_shower_stays_in_its_rate():
+    recipe = parse_recipe(SHOWER, source="shower").resolve(0)
+    scene = driving_away()
+    rates = []
+    for frame in scene.frames:
+        camera = frame.cameras["front"]
+        _, plan = plan_at(recipe, scene, camera.timestamp_ns)
+        rates.append(plan.effect_plans["rain"].data.at(camera).rate_mm_h)
+    assert rates[0] > 0
+    np.testing.assert_allclose(rates, rates[0], rtol=0.02)
 
 
 # ---- Drops ---------------------------------------------------------------------------------------

@@ -84,7 +84,7 @@ class FallingEffect(Effect):
             precompute_shadows(context.scene)
 
     def kernel_key(self, section: Rain | Snowfall) -> Any:
-        return section.has_effect or None
+        return (section.has_effect, section.along is not None) if section.has_effect else None
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
