@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from recipes.effect import Column, EffectModel, Section
 from recipes.fields import Angle, Colour, Flag, Number, Unit
 from recipes.moment import Moment
 from recipes.road_water import MAX_FILM_MM, AirCurves, road_state
+from recipes.shower import MAX_FRONT_MPS, MAX_PLACES, Along, check_along, with_shower
 
 # Largest rate of rain. The hour's record of most cities is below.
 MAX_RATE_MM_H = 300.0
@@ -76,7 +77,7 @@ class RoadWater(Section):
 class Rain(EffectModel):
     """Rain: drops that streak near the camera and veil what is far, and the wet ground below."""
 
-    later_fields = ("shadow_fade", "gloss_fade", "road")
+    later_fields = ("shadow_fade", "gloss_fade", "road", "front_mps", "along", "peak_mm_h")
     synonyms = (
         ("rate_mm_h", "rain_rate mm_h mm_per_hour"),
         ("wind_mps", "wind_speed"),
@@ -130,6 +131,15 @@ class Rain(EffectModel):
     color: Colour | None = None
     """Colour of the far veil, display-encoded sRGB; null for the sky's above the horizon."""
 
+    front_mps: Number | None = Field(default=None, gt=0, le=MAX_FRONT_MPS)
+    """Speed over the ground at which a shower passes, from where the wind comes; rate_mm_h is then
+    the rate at the drive's first camera; null for a rate that is the same everywhere."""
+    along: Along | None = Field(default=None, min_length=1, max_length=MAX_PLACES)
+    """Rates along the way of a shower; null follows from the rate's course and front_mps."""
+    peak_mm_h: Number | None = Field(default=None, ge=0, le=MAX_RATE_MM_H)
+    """Largest rate of the weather's course, whose drops the others are a share of, so that drops
+    last from image to image; null follows from the rate's course."""
+
     wetness: Unit | None = None
     """How wet the ground is that is open to the sky: 0 dry, 1 wet through; null follows from the
     rate."""
@@ -149,23 +159,29 @@ class Rain(EffectModel):
     """Vehicles that drive faster than 40 km/h lift spray, by their speed, the rate and the ground's
     wetness."""
 
+    @model_validator(mode="after")
+    def _along_in_order(self) -> Rain:
+        check_along(self.along)
+        return self
+
     def state_at(self, path: str, moment: Moment) -> Rain:
         """Return the rain with the water that has gathered on the road up to a moment.
 
         The road follows if the rate or the air changes or the air is given, unless the recipe
-        states the road or its wetness itself.
+        states the road or its wetness itself. What `recipes.shower` derives follows, too.
         """
+        rain = with_shower(self, path, moment, OVERCAST_MM_H)
         is_stated = self.road is not None or self.wetness is not None
         if is_stated or not (f"{path}.rate_mm_h" in moment.curves or moment.air is not None):
-            return self
+            return rain
         rate = moment.curve(f"{path}.rate_mm_h", self.rate_mm_h)
         state = road_state(rate, AirCurves.at(moment), moment.time_s)
-        return self.model_copy(update={"road": RoadWater.model_validate(vars(state))})
+        return rain.model_copy(update={"road": RoadWater.model_validate(vars(state))})
 
     @property
     def has_effect(self) -> bool:
         """Return False for rain without a rate, which changes nothing in the air."""
-        return self.rate_mm_h > 0
+        return self.rate_mm_h > 0 or any(place.rate_mm_h > 0 for place in self.along or ())
 
     @property
     def sun_fade(self) -> float:

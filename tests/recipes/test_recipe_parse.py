@@ -420,8 +420,9 @@ def test_a_preset_comes_before_a_file_of_its_name(
 def test_the_presets_are_there() -> None:
     assert preset_names() == (
         *("blizzard", "brown-smog", "clear", "deep-flood", "deep-snow", "dense-fog", "downpour"),
-        *("drizzle", "dusk-lamps", "dusting", "evening", "flurries", "foggy-lamps", "fresh-snow"),
-        *("light-haze", "night", "night-fog", "night-rain", "overcast"),
+        *("drizzle", "drying-road", "dusk-lamps", "dusting", "evening", "first-snow", "flurries"),
+        *("fog-bank", "foggy-lamps", "fresh-snow"),
+        *("light-haze", "night", "night-fog", "night-rain", "overcast", "passing-shower"),
         *("puddled", "rain", "slush", "snowfall", "storm", "street-flood", "winter-day"),
         *("winter-fog", "winter-street"),
     )

@@ -26,6 +26,7 @@ from recipes.rain import Rain, RoadWater
 from recipes.ranges import format_value
 from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
 from recipes.sections import Leaf, recipe_file
+from recipes.shower import RateAtPlace
 from recipes.snow import Snow, SnowLight, SnowRoad, SnowWind
 from recipes.snowfall import Snowfall
 from recipes.speed import Speed
@@ -229,8 +230,9 @@ def test_every_field_changes_the_hash() -> None:
     flood = Flood(level_m=0.2, waves=Waves(components=(wave,)))
     smog = Smog(visibility_m=300)
     snow = Snow(depth_m=0.1, road=SnowRoad())
-    rain = Rain(rate_mm_h=5.0, road=RoadWater())
-    snowfall = Snowfall(rate_mm_h=1.0)
+    along = (RateAtPlace(distance_m=5, rate_mm_h=5),)
+    rain = Rain(rate_mm_h=5.0, along=along, road=RoadWater())
+    snowfall = Snowfall(rate_mm_h=1.0, along=along)
     weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain, snowfall=snowfall, air=Air())
     camera = Sensor(lens_drops=LensDrops(count=5))
     style = Style(image="a.png", digest="0" * 64)
