@@ -11,7 +11,8 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.lamps.lamp_lane_kernels import COLOR, dot, lux_of_lanes, read_lamp_lanes, splat
+from augment.lamps.lamp_lane_kernels import COLOR, lux_of_lanes, read_lamp_lanes
+from augment.lamps.vector_kernels import copies, dot
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.layout import NUM_LANES, Index
@@ -44,8 +45,8 @@ def henyey_greenstein(gap, g):
 
     gap: 1 - cosine of the angle between the light's ways in and out.
     """
-    base = v8.fmuladd(gap, splat(2.0 * g), splat((1.0 - g) ** 2))
-    return splat((1.0 - g * g) / (4.0 * math.pi)) / (base * v8.sqrt(base))
+    base = v8.fmuladd(gap, copies(2.0 * g), copies((1.0 - g) ** 2))
+    return copies((1.0 - g * g) / (4.0 * math.pi)) / (base * v8.sqrt(base))
 
 
 @kernel_function()
@@ -53,23 +54,23 @@ def drop_phase(gap):
     """Return a drop's phase function, 1/sr. gap: as in `henyey_greenstein`."""
     forward = henyey_greenstein(gap, DROP_FORWARD)
     backward = henyey_greenstein(gap, DROP_BACKWARD)
-    return v8.fmuladd(backward - forward, splat(DROP_BACKWARD_SHARE), forward)
+    return v8.fmuladd(backward - forward, copies(DROP_BACKWARD_SHARE), forward)
 
 
 @kernel_function()
 def _acos(x):
     """Return the arc cosine of x in [-1, 1]."""
     size = v8.absolute(x)
-    value = splat(_ACOS[7])
-    value = v8.fmuladd(value, size, splat(_ACOS[6]))
-    value = v8.fmuladd(value, size, splat(_ACOS[5]))
-    value = v8.fmuladd(value, size, splat(_ACOS[4]))
-    value = v8.fmuladd(value, size, splat(_ACOS[3]))
-    value = v8.fmuladd(value, size, splat(_ACOS[2]))
-    value = v8.fmuladd(value, size, splat(_ACOS[1]))
-    value = v8.fmuladd(value, size, splat(_ACOS[0]))
-    value = value * v8.sqrt(v8.maximum(splat(1) - size, splat(0)))
-    return v8.select(v8.greater(splat(0), x), splat(math.pi) - value, value)
+    value = copies(_ACOS[7])
+    value = v8.fmuladd(value, size, copies(_ACOS[6]))
+    value = v8.fmuladd(value, size, copies(_ACOS[5]))
+    value = v8.fmuladd(value, size, copies(_ACOS[4]))
+    value = v8.fmuladd(value, size, copies(_ACOS[3]))
+    value = v8.fmuladd(value, size, copies(_ACOS[2]))
+    value = v8.fmuladd(value, size, copies(_ACOS[1]))
+    value = v8.fmuladd(value, size, copies(_ACOS[0]))
+    value = value * v8.sqrt(v8.maximum(copies(1) - size, copies(0)))
+    return v8.select(v8.greater(copies(0), x), copies(math.pi) - value, value)
 
 
 @kernel_function()
@@ -79,13 +80,13 @@ def flake_phase(gap):
     gap: as in `henyey_greenstein`.
     """
     # Cosine of the angle alpha between lamp and eye, seen from the flake.
-    cosine = v8.minimum(v8.maximum(gap - splat(1), splat(-1)), splat(1))
+    cosine = v8.minimum(v8.maximum(gap - copies(1), copies(-1)), copies(1))
     alpha = _acos(cosine)
-    sine = v8.sqrt(splat(1) - cosine * cosine)
-    back = v8.fmuladd(splat(math.pi) - alpha, cosine, sine)
+    sine = v8.sqrt(copies(1) - cosine * cosine)
+    back = v8.fmuladd(copies(math.pi) - alpha, cosine, sine)
     through = sine - alpha * cosine
-    scale = splat(2.0 / (3.0 * math.pi * math.pi))
-    return v8.fmuladd(through - back, splat(FLAKE_THROUGH_SHARE), back) * scale
+    scale = copies(2.0 / (3.0 * math.pi * math.pi))
+    return v8.fmuladd(through - back, copies(FLAKE_THROUGH_SHARE), back) * scale
 
 
 @kernel
@@ -109,9 +110,9 @@ def light_cells(rays, distances, lamps, tables, starts, is_snow, min_luminance, 
         k = line % count
         texels = np.empty(NUM_LANES, np.int32)
         firsts = np.empty(NUM_LANES, np.int32)
-        zero = splat(0)
+        zero = copies(0)
         distance = v8.broadcast(distances[k])
-        least = splat(min_luminance)
+        least = copies(min_luminance)
         place = Index(row * width)
         step = Index(height * width)
         first_cell = Index((k * height + row) * 3 * width)
@@ -132,14 +133,14 @@ def light_cells(rays, distances, lamps, tables, starts, is_snow, min_luminance, 
                 dx = lamp[0][0] - distance * rx
                 dy = lamp[0][1] - distance * ry
                 dz = lamp[0][2] - distance * rz
-                squared = v8.maximum(dot(dx, dy, dz, dx, dy, dz), splat(1e-12))
-                per_m = splat(1) / v8.sqrt(squared)
+                squared = v8.maximum(dot((dx, dy, dz), (dx, dy, dz)), copies(1e-12))
+                per_m = copies(1) / v8.sqrt(squared)
                 # Light travels along -d, then along -ray to the eye. The chord keeps the digits of
                 # 1 - cosine.
                 x = dx * per_m - rx
                 y = dy * per_m - ry
                 z = dz * per_m - rz
-                gap = splat(0.5) * dot(x, y, z, x, y, z)
+                gap = copies(0.5) * dot((x, y, z), (x, y, z))
                 phase = flake_phase(gap) if is_snow else drop_phase(gap)
                 most = phase * lamp[7] / (squared + lamp[6])
                 if v8.mask_bits(v8.greater(most, least)) == Index(0):

@@ -32,6 +32,8 @@ MIN_DEPTH_M = 0.3
 HIDDEN_MARGIN_M = 0.6
 # The same, as a share of the depth: the error of surfaces grows with it.
 HIDDEN_MARGIN_SHARE = 0.01
+# Opacity of a pixel up to which it shows no surface that hides a lamp.
+MIN_ALPHA = 1e-3
 # Points of a lamp's disc at which it is tested.
 NUM_POINTS = 32
 # Smallest radius of the disc that is tested, pixels.
@@ -84,7 +86,8 @@ def lamp_visibility(
         lamps: the lamps.
         camera: a pinhole camera.
         depth_m: depth along the optical axis, metres; inf for the sky.
-        alpha: share of each pixel that its surface covers, 0 to 1.
+        alpha: share of each pixel that its surface covers, 0 to 1; with MIN_ALPHA or less the depth
+            has no meaning.
         radius_m: radius of the disc that is tested, metres; None for the lamp's own. With
             HALO_RADIUS_M it tells how far the air about a lamp can be seen.
     """
@@ -110,8 +113,9 @@ def lamp_visibility(
     x_index = np.where(is_inside, x, 0).astype(np.int64)
     y_index = np.where(is_inside, y, 0).astype(np.int64)
     limits = safe_depths - HIDDEN_MARGIN_M - HIDDEN_MARGIN_SHARE * safe_depths
-    is_before = depth_m[y_index, x_index] < limits[:, None]
-    visible = np.where(is_before, 1.0 - np.clip(alpha[y_index, x_index], 0, 1), 1.0)
+    covered = alpha[y_index, x_index]
+    is_before = (depth_m[y_index, x_index] < limits[:, None]) & (covered > MIN_ALPHA)
+    visible = np.where(is_before, 1.0 - np.clip(covered, 0, 1), 1.0)
     counts = is_inside.sum(1)
     sums = (visible * is_inside).sum(1)
     return np.where(counts > 0, sums / np.maximum(counts, 1), 1.0)

@@ -24,7 +24,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from augment.lamps.air_light_kernels import DISTANCE_KNEE, MAX_DISTANCE, NUM_ANGLES, NUM_DISTANCES
+from augment.lamps.halo_table_kernels import DISTANCE_KNEE, MAX_DISTANCE, NUM_ANGLES, NUM_DISTANCES
 from augment.render.fog import Fog, optical_depth_numpy
 
 # Asymmetry g of fog droplets, as in `augment.render.fog`.

@@ -6,11 +6,8 @@ of a table, float32, whose columns are named here; `augment.lamps.lamp_lanes` fi
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
-
-from augment.lamps.pattern_kernels import COLUMN_SCALE, ROOT_OFFSET, ROW_SCALE
+from augment.lamps.pattern_kernels import between_nodes, place_eight
+from augment.lamps.vector_kernels import copies, dot
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel_function
 from augment.render.cpu.simd import LOG2_E, exp2_fine
@@ -30,19 +27,6 @@ SOFTENING = 14
 PEAK = 15
 COLOR = 16
 NUM_COLUMNS = 19  # number of columns of a lamp's row
-_ROOT = math.sqrt(ROOT_OFFSET)
-
-
-@kernel_function()
-def splat(number):
-    """Return eight copies of a number."""
-    return v8.broadcast(np.float32(number))
-
-
-@kernel_function()
-def dot(x, y, z, a, b, c):
-    """Return the dot product of (x, y, z) and (a, b, c)."""
-    return v8.fmuladd(x, a, v8.fmuladd(y, b, z * c))
 
 
 @kernel_function()
@@ -115,13 +99,6 @@ def gather_lamp_lanes(lamps, rows):
 
 
 @kernel_function()
-def _place_of_root(fold, scale):
-    """Return the place of a diamond angle among the nodes, 0 to 1."""
-    root = v8.sqrt(fold + splat(ROOT_OFFSET)) - splat(_ROOT)
-    return root * splat(scale)
-
-
-@kernel_function()
 def pattern_of_lanes(tables, starts, texels, forward, right, up):
     """Return `pattern_kernels.pattern_at` of eight unit directions.
 
@@ -133,39 +110,11 @@ def pattern_of_lanes(tables, starts, texels, forward, right, up):
         right: the same, towards the lamp's right.
         up: the same, along the lamp's upward direction.
     """
-    zero = splat(0)
-    unit = splat(1)
-    tiny = splat(1e-30)
-    last_row = tables.shape[1] - 1
-    last_column = tables.shape[2] - 1
-    level = v8.sqrt(v8.fmuladd(forward, forward, right * right))
-    height = v8.absolute(up)
-    row = _place_of_root(height / v8.maximum(height + level, tiny), ROW_SCALE)
-    row = v8.select(v8.greater(zero, up), v8.negate(row), row)
-    side = v8.absolute(right)
-    fold = side / v8.maximum(v8.absolute(forward) + side, tiny)
-    fold = v8.select(v8.greater(zero, forward), splat(2) - fold, fold)
-    column = _place_of_root(fold, COLUMN_SCALE)
-    column = v8.select(v8.greater(zero, right), v8.negate(column), column)
-    row = v8.minimum(v8.maximum((row + unit) * splat(0.5 * last_row), zero), splat(last_row))
-    column = (column + unit) * splat(0.5 * last_column)
-    column = v8.minimum(v8.maximum(column, zero), splat(last_column))
-    i = v8.minimum(v8.floor(row), splat(last_row - 1))
-    j = v8.minimum(v8.floor(column), splat(last_column - 1))
-    v = row - i
-    u = column - j
-    v8.store_integers(texels, Index(0), v8.fmuladd(i, splat(last_column + 1), j))
+    columns = tables.shape[2]
+    u, v = place_eight(tables.shape[1], columns, forward, right, up, texels)
     for lane in range(Index(NUM_LANES)):
         texels[lane] += starts[lane]
-    one_on = Index(1)
-    down = Index(last_column + 1)
-    a = v8.gather(tables, texels, Index(0), one_on, Index(0))
-    b = v8.gather(tables, texels, Index(0), one_on, one_on)
-    c = v8.gather(tables, texels, Index(0), one_on, down)
-    d = v8.gather(tables, texels, Index(0), one_on, down + one_on)
-    below = v8.fmuladd(b - a, u, a)
-    above = v8.fmuladd(d - c, u, c)
-    return v8.fmuladd(above - below, v, below)
+    return between_nodes(tables, texels, 0, columns, u, v)
 
 
 @kernel_function()
@@ -189,10 +138,10 @@ def lux_of_lanes(tables, starts, texels, lamp, dx, dy, dz, squared, per_m):
         tables,
         starts,
         texels,
-        dot(dx, dy, dz, axis[0], axis[1], axis[2]) * away,
-        dot(dx, dy, dz, right[0], right[1], right[2]) * away,
-        dot(dx, dy, dz, up[0], up[1], up[2]) * away,
+        dot((dx, dy, dz), axis) * away,
+        dot((dx, dy, dz), right) * away,
+        dot((dx, dy, dz), up) * away,
     )
     # Air thicker than exp(-80) is black.
-    path = v8.minimum(extinction * squared * per_m, splat(80))
+    path = v8.minimum(extinction * squared * per_m, copies(80))
     return candela * share / (squared + softening) * exp2_fine(path * v8.broadcast(-LOG2_E))

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from augment.lamps.lamp_lane_kernels import dot, splat
+from augment.lamps.vector_kernels import copies, dot
 from augment.render.cpu import simd as v8
 from augment.render.cpu.hash_kernels import mix
 from augment.render.cpu.jit import kernel_function
@@ -56,32 +56,32 @@ def tilt_tile(pixels, resolved, view, octaves, keys, tilts):
     """
     size = Index(pixels.shape[1])
     count = len(octaves)
-    zero = splat(0)
-    half = splat(0.5)
-    unit = splat(1)
+    zero = copies(0)
+    half = copies(0.5)
+    unit = copies(1)
     weights = np.empty(pixels.shape[1], np.float32)
     deviations = np.empty(pixels.shape[1], np.float32)
     longest_m = 0.0
     for octave in range(count):
         longest_m = max(longest_m, octaves[octave, 0])
-    per_focal = splat(view.lens[1])
+    per_focal = copies(view.lens[1])
     has_waves = False
     for first in range(Index(0), size, Index(NUM_LANES)):
         px = v8.load(pixels, first)
         py = v8.load(pixels, first + size)
         pz = v8.load(pixels, first + size + size)
         share = v8.load(resolved, first)
-        squared = dot(px, py, pz, px, py, pz)
+        squared = dot((px, py, pz), (px, py, pz))
         length = v8.sqrt(squared)
         # Length of a pixel on the road: its angle times the distance, over the grazing sine.
-        sine = v8.maximum(v8.absolute(pz), splat(1e-3) * length)
-        weight = half * sine / v8.maximum(squared * per_focal, splat(1e-20))
+        sine = v8.maximum(v8.absolute(pz), copies(1e-3) * length)
+        weight = half * sine / v8.maximum(squared * per_focal, copies(1e-20))
         is_road = v8.mask_and(v8.greater(share, zero), v8.greater(squared, zero))
         weight = v8.select(is_road, weight, zero)
         v8.store(weights, first, weight)
-        variance = splat(0.5 / count) * v8.load(pixels, first + Index(_ROUGHNESS2) * size) * share
+        variance = copies(0.5 / count) * v8.load(pixels, first + Index(_ROUGHNESS2) * size) * share
         v8.store(deviations, first, v8.sqrt(v8.maximum(variance, zero)))
-        if v8.mask_bits(v8.greater(weight * splat(longest_m), half)) != Index(0):
+        if v8.mask_bits(v8.greater(weight * copies(longest_m), half)) != Index(0):
             has_waves = True
     if not has_waves:
         return
@@ -90,7 +90,7 @@ def tilt_tile(pixels, resolved, view, octaves, keys, tilts):
     columns = np.empty(NUM_LANES, np.int32)
     rows = np.empty(NUM_LANES, np.int32)
     steps = np.empty(3 * NUM_LANES, np.float32)
-    limit = splat(1e9)
+    limit = copies(1e9)
     corners = np.empty(8, np.float32)
     for octave in range(count):
         wave_m = octaves[octave, 0]
@@ -104,18 +104,18 @@ def tilt_tile(pixels, resolved, view, octaves, keys, tilts):
         first_row = np.int64(math.floor(y0))
         x0 -= math.floor(x0)
         y0 -= math.floor(y0)
-        xx = splat((cosine * frame[0, 0] - sine_angle * frame[0, 1]) * per_cell)
-        xy = splat((cosine * frame[1, 0] - sine_angle * frame[1, 1]) * per_cell)
-        xz = splat((cosine * frame[2, 0] - sine_angle * frame[2, 1]) * per_cell)
-        yx = splat((sine_angle * frame[0, 0] + cosine * frame[0, 1]) * per_cell)
-        yy = splat((sine_angle * frame[1, 0] + cosine * frame[1, 1]) * per_cell)
-        yz = splat((sine_angle * frame[2, 0] + cosine * frame[2, 1]) * per_cell)
+        xx = copies((cosine * frame[0, 0] - sine_angle * frame[0, 1]) * per_cell)
+        xy = copies((cosine * frame[1, 0] - sine_angle * frame[1, 1]) * per_cell)
+        xz = copies((cosine * frame[2, 0] - sine_angle * frame[2, 1]) * per_cell)
+        yx = copies((sine_angle * frame[0, 0] + cosine * frame[0, 1]) * per_cell)
+        yy = copies((sine_angle * frame[1, 0] + cosine * frame[1, 1]) * per_cell)
+        yz = copies((sine_angle * frame[2, 0] + cosine * frame[2, 1]) * per_cell)
         key = keys[octave]
         last_column = np.int32(-(2**31))
         last_row = np.int32(-(2**31))
         for first in range(Index(0), size, Index(NUM_LANES)):
             # Waves shorter than two pixels are roughness.
-            weight = v8.load(weights, first) * splat(wave_m) - half
+            weight = v8.load(weights, first) * copies(wave_m) - half
             weight = v8.minimum(v8.maximum(weight, zero), unit)
             lanes = v8.mask_bits(v8.greater(weight, zero))
             if lanes == Index(0):
@@ -125,19 +125,19 @@ def tilt_tile(pixels, resolved, view, octaves, keys, tilts):
             pz = v8.load(pixels, first + size + size)
             deviation = weight * v8.load(deviations, first)
             at = first + Index(_ROUGHNESS2) * size
-            m2 = v8.load(pixels, at) - splat(2) * deviation * deviation
+            m2 = v8.load(pixels, at) - copies(2) * deviation * deviation
             v8.store(pixels, at, v8.maximum(m2, zero))
-            x = dot(px, py, pz, xx, xy, xz) + splat(x0)
-            y = dot(px, py, pz, yx, yy, yz) + splat(y0)
+            x = dot((px, py, pz), (xx, xy, xz)) + copies(x0)
+            y = dot((px, py, pz), (yx, yy, yz)) + copies(y0)
             j = v8.floor(v8.minimum(v8.maximum(x, v8.negate(limit)), limit))
             i = v8.floor(v8.minimum(v8.maximum(y, v8.negate(limit)), limit))
             v8.store_integers(columns, Index(0), j)
             v8.store_integers(rows, Index(0), i)
             u = x - j
             v = y - i
-            v8.store(steps, Index(0), u * u * v8.fmuladd(splat(-2), u, splat(3)))
-            v8.store(steps, Index(NUM_LANES), v * v * v8.fmuladd(splat(-2), v, splat(3)))
-            v8.store(steps, Index(2 * NUM_LANES), deviation * splat(PER_DEVIATION))
+            v8.store(steps, Index(0), u * u * v8.fmuladd(copies(-2), u, copies(3)))
+            v8.store(steps, Index(NUM_LANES), v * v * v8.fmuladd(copies(-2), v, copies(3)))
+            v8.store(steps, Index(2 * NUM_LANES), deviation * copies(PER_DEVIATION))
             while lanes != Index(0):
                 lane = v8.lowest_bit(lanes)
                 lanes &= lanes - Index(1)

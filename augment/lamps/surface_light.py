@@ -20,13 +20,11 @@ plane that faces the lamp.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from augment.lamps import surface_light_kernels
+from augment.lamps import surface_light_kernels, surface_spread_kernels
 from augment.lamps.beam_shadows import BeamShadows
 from augment.lamps.lamp import EGO_OWNER, Lamps
 from augment.lamps.patterns import pattern_value
@@ -37,9 +35,10 @@ from augment.lamps.surface_light_kernels import (
     MIDDLE_RETURN,
     MIDDLE_RETURN_RAD,
     LampArrays,
-    NodeView,
     ShadowArrays,
 )
+from augment.lamps.surface_normals import Nodes, find_nodes, node_view
+from augment.lamps.surface_spread_kernels import SIGN_RETURN_PER_LUX, SIGN_WHITE
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
@@ -47,160 +46,8 @@ from augment.scene.cameras import Camera
 MIN_SOFTENING_M = 0.15
 # Largest reflectance of a surface.
 MAX_REFLECTANCE = 0.9
-# Cosine to the vertical from which on a node counts as ground for certain: 25 degrees.
-_GROUND_COSINE = 0.906
-# The same, below which it does not: 40 degrees.
-_MIN_GROUND_COSINE = 0.766
-# Sides of the window in which the normals of the ground are averaged, nodes: columns, rows.
-_GROUND_WINDOW = (65, 17)
-# Sides of the window in which most nodes are ground about one that is taken for it: columns, rows.
-_NEAR_WINDOW = (33, 17)
-# Share of them below which it is not.
-_MIN_NEAR_SHARE = 0.45
-# Share of them from which on it is for certain.
-_NEAR_SHARE = 0.65
-# Largest difference of its inverse depth from theirs, of theirs.
-_SAME_GROUND = 0.03
-# Sides of the window in which the normals of walls are averaged, nodes.
-_WALL_WINDOW = (49, 49)
-# Length of a mean normal below which a surface is rough, as leaves are.
-_MIN_SMOOTH = 0.8
-# Length from which on it is smooth.
-_SMOOTH = 0.95
-# Difference of a node's inverse depth from the window's, of that, up to which it is of one wall.
-_SAME_WALL = 0.02
-# Coefficient of retroreflection of a white sign at 0.2 degrees, cd/m2 per lux: class RA2.
-SIGN_RETURN_PER_LUX = 250.0
-# Reflectance that the coefficient belongs to: a white sign's.
-SIGN_WHITE = 0.7
 # Most luminance of a sign over that of a matt surface of its reflectance in the same light: 1,122.
 SIGN_GAIN = math.pi * SIGN_RETURN_PER_LUX / SIGN_WHITE
-# Nodes in a row of a picture, about.
-NODES_PER_ROW = 600
-# Pixels between nodes, at most.
-MAX_STEP_PX = 4
-
-
-@dataclass(frozen=True, eq=False)
-class Nodes:
-    """Points of a picture at which light is summed."""
-
-    depth: Float32[np.ndarray, "h w"]
-    """z, metres; 0 for the sky."""
-    normals: Float32[np.ndarray, "h w 3"]
-    """Normals towards the eye, world, as short as those about them disagree; 0 for the sky."""
-    step_px: int
-    """Pixels between nodes."""
-
-    @property
-    def inverse_depth(self) -> Float32[np.ndarray, "h w"]:
-        """Return 1 / z; 0 for the sky."""
-        return _inverse(self.depth)
-
-
-def _inverse(depth: np.ndarray) -> np.ndarray:
-    is_surface = (depth > 0) & (depth < 1e6)
-    return np.divide(1, depth, out=np.zeros_like(depth), where=is_surface)
-
-
-def default_step_px(camera: Camera) -> int:
-    """Return the pixels between nodes at which a picture has about NODES_PER_ROW in a row."""
-    return min(max(round(camera.width / NODES_PER_ROW), 1), MAX_STEP_PX)
-
-
-def find_nodes(
-    camera: Camera, depth_m: Float32[np.ndarray, "H W"], *, step_px: int | None = None
-) -> Nodes:
-    """Return the nodes of a picture, with normals by its depth.
-
-    A normal follows from the slopes of the inverse depth, on the side of the node that is smoother,
-    and is averaged with those about it. On ground, the normals are averaged over a wide window: a
-    car's own lamps light a road at so small an angle that each bump of the splats would throw a
-    shadow.
-
-    Args:
-        camera: camera of the picture.
-        depth_m: z of the surfaces, metres; 0 for the sky.
-        step_px: pixels between nodes; None for `default_step_px`.
-    """
-    step_px = default_step_px(camera) if step_px is None else step_px
-    first = step_px // 2
-    depth = np.ascontiguousarray(depth_m[first::step_px, first::step_px], np.float32)
-    if not depth.size:
-        depth = np.ascontiguousarray(depth_m[:1, :1], np.float32)
-    slopes = np.empty((*depth.shape, 3), np.float32)
-    normals = np.empty_like(slopes)
-    inverse = _inverse(depth)
-    with kernel_threads(depth.shape[0]):
-        surface_light_kernels.find_slopes(inverse, node_view(camera, step_px), slopes)
-        surface_light_kernels.average_normals(inverse, slopes, normals)
-    return Nodes(depth, _smooth_walls(_smooth_ground(normals, inverse), inverse), step_px)
-
-
-def _smooth_ground(
-    normals: Float32[np.ndarray, "h w 3"], inverse: Float32[np.ndarray, "h w"]
-) -> Float32[np.ndarray, "h w 3"]:
-    """Return the normals, those of the ground averaged over a window of the picture.
-
-    Single nodes whose normals differ count as ground where most of those about them do, at about
-    their depth.
-
-    Args:
-        normals: normals by the depth.
-        inverse: 1 / z of the nodes, 0 for the sky.
-    """
-    share = (normals[..., 2] - _MIN_GROUND_COSINE) / (_GROUND_COSINE - _MIN_GROUND_COSINE)
-    share = np.clip(share, 0, 1)
-    mean = normals * share[..., None]
-    near = cv2.blur(share, _NEAR_WINDOW, borderType=cv2.BORDER_REFLECT_101)
-    near_inverse = cv2.blur(share * inverse, _NEAR_WINDOW, borderType=cv2.BORDER_REFLECT_101)
-    is_near = np.abs(inverse * near - near_inverse) < _SAME_GROUND * near_inverse
-    filled = (near - _MIN_NEAR_SHARE) / (_NEAR_SHARE - _MIN_NEAR_SHARE)
-    share = np.maximum(share, np.where(is_near, np.clip(filled, 0, 1), 0))[..., None]
-    for _ in range(2):
-        mean = cv2.blur(mean, _GROUND_WINDOW, borderType=cv2.BORDER_CONSTANT)
-    x, y, z = cv2.split(mean)
-    mean *= (1 / np.sqrt(np.maximum(x * x + y * y + z * z, 1e-12)))[..., None]
-    return normals + share * (mean - normals)
-
-
-def _smooth_walls(
-    normals: Float32[np.ndarray, "h w 3"], inverse: Float32[np.ndarray, "h w"]
-) -> Float32[np.ndarray, "h w 3"]:
-    """Return the normals, those of smooth surfaces off the ground averaged over a window.
-
-    Fronts and paint have wide bulges in the depth of splats and sweeps, which a lamp would show as
-    blotches. Leaves, whose normals disagree from node to node, keep theirs; so does what stands
-    before something else.
-
-    Args:
-        normals: normals, as short as those about them disagree.
-        inverse: 1 / z of the nodes, 0 for the sky.
-    """
-    x, y, z = cv2.split(normals)
-    lengths = np.sqrt(x * x + y * y + z * z)
-    weights = np.clip((lengths - _MIN_SMOOTH) / (_SMOOTH - _MIN_SMOOTH), 0, 1)
-    weights *= np.clip((_GROUND_COSINE - z) / (_GROUND_COSINE - _MIN_GROUND_COSINE), 0, 1)
-    border = cv2.BORDER_CONSTANT
-    total = cv2.blur(weights, _WALL_WINDOW, borderType=border)
-    near_inverse = cv2.blur(weights * inverse, _WALL_WINDOW, borderType=border)
-    mean = cv2.blur(normals * weights[..., None], _WALL_WINDOW, borderType=border)
-    difference = np.abs(inverse * total - near_inverse) / np.maximum(near_inverse, 1e-12)
-    share = weights * np.clip(2 - difference / _SAME_WALL, 0, 1)
-    x, y, z = cv2.split(mean)
-    mean *= (lengths / np.sqrt(np.maximum(x * x + y * y + z * z, 1e-12)))[..., None]
-    return normals + share[..., None] * (mean - normals)
-
-
-def node_view(camera: Camera, step_px: int) -> NodeView:
-    """Return the view of the nodes as kernels take it."""
-    pose = camera.world_from_camera.numpy()
-    lens = (1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy, step_px, step_px // 2 + 0.5)
-    return NodeView(
-        np.array(lens, np.float64),
-        np.ascontiguousarray(pose[:3, :3]),
-        np.ascontiguousarray(pose[:3, 3]),
-    )
 
 
 def lamp_arrays(
@@ -279,27 +126,29 @@ def surface_light(
     lux = np.empty(shape, np.float32)
     has_signs = is_sign is not None and bool((lamps.owners == EGO_OWNER).any()) and is_sign.any()
     own_lux = np.empty(shape if has_signs else (0, 0, 3), np.float32)
-    return_per_lux = np.empty((0, 0), np.float32)
+    signs = np.zeros((0, 0), np.bool_)
     if has_signs:
         assert is_sign is not None
-        return_per_lux = is_sign * np.float32(SIGN_RETURN_PER_LUX / SIGN_WHITE)
+        signs = np.ascontiguousarray(is_sign, np.bool_)
     arrays = lamp_arrays(lamps, extinctions_per_m, shadows)
     min_lux = min_luminance_cd_m2 * math.pi / MAX_REFLECTANCE
     min_own_lux = min_lux / SIGN_GAIN if has_signs else min_lux  # signs return own light alone
-    with kernel_threads(shape[0]):
+    with kernel_threads():
         surface_light_kernels.light_nodes(
             nodes.depth,
             nodes.normals,
             node_view(camera, nodes.step_px),
             arrays,
             shadow_arrays(shadows),
+            signs,
             min_lux,
             min_own_lux,
             lamps_per_pixel,
             lux,
             own_lux,
         )
-        surface_light_kernels.spread_light(
+    with kernel_threads(8):
+        surface_spread_kernels.spread_light(
             np.ascontiguousarray(depth_m, np.float32),
             nodes.inverse_depth,
             lux,
@@ -307,7 +156,7 @@ def surface_light(
             nodes.step_px,
             nodes.step_px // 2,
             np.ascontiguousarray(reflectance, np.float32),
-            return_per_lux,
+            signs,
             picture,
         )
     return picture

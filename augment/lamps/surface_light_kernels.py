@@ -1,8 +1,8 @@
-"""Numba kernels: normals of a picture's surfaces, and the lamps' light on them.
+"""Numba kernels: the lamps' light at the nodes of a picture.
 
 `augment.lamps.surface_light` prepares the arrays and holds the plain definitions. A picture is
-looked at in nodes, one in each block of `step` x `step` pixels; `spread_light` takes the light from
-the nodes to the pixels.
+looked at in nodes, one in each block of pixels, whose normals `surface_normals` finds;
+`surface_spread_kernels` takes the light from the nodes to the pixels.
 """
 
 from __future__ import annotations
@@ -13,44 +13,36 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
-from augment.lamps.pattern_kernels import pattern_at
+from augment.lamps.pattern_kernels import pattern_at, patterns_of_eight
+from augment.lamps.vector_kernels import copies, dot, vector_copies
+from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel, kernel_function
+from augment.render.layout import NUM_LANES, Index
 
 TILE = 8  # nodes along a side of a tile, whose nodes share a list of lamps
+TILE_NODES = TILE * TILE  # nodes of a tile
+# Rows of the numbers of a tile, each of TILE_NODES: x, y and z of the points from the eye.
+POINTS = 0
+NORMALS = 3 * TILE_NODES  # x, y and z of the normals
+ROUGH = 6 * TILE_NODES  # cosine to lamps anywhere, of rough surfaces
+SAMPLE_POINTS = 7 * TILE_NODES  # points at which lamps are compared
+SAMPLE_NORMALS = 10 * TILE_NODES  # their normals
+SPARE = 13 * TILE_NODES  # eight numbers that pass between lanes
+LUX = 14 * TILE_NODES  # red, green and blue lux
+OWN_LUX = 17 * TILE_NODES  # the same of own lamps, as signs return it
+NUM_FIELDS = 20  # number of these rows
 # Nodes of a whole tile at which the lamps are compared: corners, middles of the sides, middle.
 SAMPLES = np.array([0, 3, 7, 24, 27, 31, 56, 59, 63])
 # Light that a lamp may have between these points, over the most that it has at one of them.
 SAMPLE_MARGIN = 4.0
-# Distance of the nodes over which slopes are first estimated, nodes.
-SLOPE_STEP = 2
-# Difference between the slopes on both sides of a node, as a share of the inverse depth and a node,
-# up to which both are its surface's.
-SLOPE_TOLERANCE = 0.02
 # Cosine to a lamp at least, where lamps of a tile are compared: its other nodes may face it.
 MIN_RANK_COSINE = 0.02
-# Rows of the nine nodes whose normals are averaged, from the one in the middle.
-MEAN_ROWS = np.array([0, -1, 1, 0, 0, -2, -2, 2, 2])
-# Columns of those nodes.
-MEAN_COLUMNS = np.array([0, 0, 0, -1, 1, -2, 2, -2, 2])
 # Loss of length of a mean normal up to which the surface is smooth.
 SMOOTH_LOSS = 0.1
+# Depth from a lamp up to which nothing shades a point, metres.
+MIN_SHADOW_DEPTH_M = 0.05
 # Mean cosine of a lamp to surfaces whose normals point anywhere.
 ROUGH_COSINE = 0.25
-# Difference of inverse depths, as a share, at which a node does not light a pixel.
-SAME_SURFACE = 0.08
-# Weight of nodes on other surfaces, for pixels whose surface no node has.
-OTHER_SURFACE_WEIGHT = 1e-4
-
-
-class NodeView(NamedTuple):
-    """View of the nodes."""
-
-    lens: Any
-    """1 / fx, 1 / fy, cx, cy of pixels, pixels between nodes, middle of the first node's pixel."""
-    axes: Any
-    """World_from_camera, [3, 3]."""
-    eye: Any
-    """Place of the eye, world, metres."""
 
 
 class LampArrays(NamedTuple):
@@ -95,105 +87,6 @@ class ShadowArrays(NamedTuple):
     """Share of the inverse depth, and inverse metres, by which a surface may be behind, [2]."""
 
 
-# ---- Normals -------------------------------------------------------------------------------------
-
-
-@kernel_function()
-def _least_slope(inverse, row, column, d_row, d_column, centre):
-    """Return the change of the inverse depth per node along a direction, on the smoother side."""
-    height, width = inverse.shape
-    ahead = 0.0
-    behind = 0.0
-    has_ahead = False
-    has_behind = False
-    i = row + d_row * SLOPE_STEP
-    j = column + d_column * SLOPE_STEP
-    if i < height and j < width and inverse[i, j] > 0:
-        ahead = (inverse[i, j] - centre) / SLOPE_STEP
-        has_ahead = True
-    i = row - d_row * SLOPE_STEP
-    j = column - d_column * SLOPE_STEP
-    if i >= 0 and j >= 0 and inverse[i, j] > 0:
-        behind = (centre - inverse[i, j]) / SLOPE_STEP
-        has_behind = True
-    if has_ahead and has_behind:
-        # Where both agree they share the noise; at an edge the smaller one is the surface's own.
-        if abs(ahead - behind) < SLOPE_TOLERANCE * centre:
-            return 0.5 * (ahead + behind)
-        return ahead if abs(ahead) < abs(behind) else behind
-    if has_ahead:
-        return ahead
-    return behind if has_behind else 0.0
-
-
-@kernel
-def find_slopes(inverse, view, normals):
-    """Find each node's normal by the slopes of the inverse depth about it.
-
-    A plane is linear in inverse depth: a + b x + c y = 1 / z, at unit depth (x, y). Its normal is
-    along (b, c, a) in the camera.
-
-    Args:
-        inverse: 1 / z of the nodes, 0 for the sky, float32 [h, w].
-        view: the view of the nodes.
-        normals: output, unit normals towards the eye, world, float32 [h, w, 3]; 0 for the sky.
-    """
-    height, width = inverse.shape
-    for row in prange(height):
-        ifx = view.lens[0]
-        ify = view.lens[1]
-        step = view.lens[4]
-        y = (row * step + view.lens[5] - view.lens[3]) * ify
-        for column in range(width):
-            centre = np.float64(inverse[row, column])
-            if centre <= 0:
-                for k in range(3):
-                    normals[row, column, k] = 0.0
-                continue
-            b = _least_slope(inverse, row, column, 0, 1, centre) / (step * ifx)
-            c = _least_slope(inverse, row, column, 1, 0, centre) / (step * ify)
-            x = (column * step + view.lens[5] - view.lens[2]) * ifx
-            a = centre - b * x - c * y
-            per_length = -1.0 / math.sqrt(a * a + b * b + c * c)
-            for k in range(3):
-                n = view.axes[k, 0] * b + view.axes[k, 1] * c + view.axes[k, 2] * a
-                normals[row, column, k] = n * per_length
-
-
-@kernel
-def average_normals(inverse, normals, means):
-    """Average the normals of nine nodes of the same surface about each node.
-
-    Args:
-        inverse: 1 / z of the nodes, 0 for the sky, float32 [h, w].
-        normals: result of `find_slopes`.
-        means: output, means, float32 [h, w, 3]. They are as short as the normals disagree.
-    """
-    height, width = inverse.shape
-    for row in prange(height):
-        for column in range(width):
-            centre = inverse[row, column]
-            x = np.float32(0)
-            y = np.float32(0)
-            z = np.float32(0)
-            count = np.float32(0)
-            limit = centre * np.float32(SAME_SURFACE)
-            for sample in range(9):
-                i = row + MEAN_ROWS[sample]
-                j = column + MEAN_COLUMNS[sample]
-                if i < 0 or j < 0 or i >= height or j >= width:
-                    continue
-                if abs(inverse[i, j] - centre) <= limit and centre > 0:
-                    x += normals[i, j, 0]
-                    y += normals[i, j, 1]
-                    z += normals[i, j, 2]
-                    count += np.float32(1)
-            share = np.float32(1) / max(count, np.float32(1))
-            means[row, column, 0] = x * share
-            means[row, column, 1] = y * share
-            means[row, column, 2] = z * share
-
-
 # ---- Light at the nodes --------------------------------------------------------------------------
 
 
@@ -207,7 +100,7 @@ def lit_share(shadows, shadow_map, x, y, z):
     pose = shadows.poses[shadow_map]
     lens = shadows.lenses[shadow_map]
     depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-    if depth <= 0.05:
+    if depth <= MIN_SHADOW_DEPTH_M:
         return 1.0
     per_z = 1.0 / depth
     u = (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) * per_z
@@ -228,6 +121,59 @@ def lit_share(shadows, shadow_map, x, y, z):
     # From fully lit to dark over one more tolerance.
     tolerance = shadows.tolerances[0] * per_z + shadows.tolerances[1]
     return min(max(2.0 - (nearest - per_z) / tolerance, 0.0), 1.0)
+
+
+@kernel_function()
+def _lit_shares(shadows, shadow_map, eye, point, texels):
+    """Return `lit_share` of eight points.
+
+    Args:
+        shadows: depth maps of lamps.
+        shadow_map: index of the map.
+        eye: place of the eye.
+        point: the points, from the eye.
+        texels: work space, int32 [8].
+    """
+    pose = shadows.poses[shadow_map]
+    lens = shadows.lenses[shadow_map]
+    images = shadows.inverse_depths.reshape(shadows.inverse_depths.size)
+    height, width = shadows.inverse_depths.shape[1:]
+    x = _row_times(pose[0], eye, point)
+    y = _row_times(pose[1], eye, point)
+    depth = _row_times(pose[2], eye, point)
+    zero = copies(0)
+    unit = copies(1)
+    per_z = unit / v8.maximum(depth, copies(MIN_SHADOW_DEPTH_M))
+    last_column = copies(width - 1)
+    last_row = copies(height - 1)
+    u = v8.fmuladd(x * per_z, copies(lens[0]), copies(lens[2] - 0.5))
+    v = v8.fmuladd(y * per_z, copies(lens[1]), copies(lens[3] - 0.5))
+    is_inside = v8.mask_and(v8.at_least(u, zero), v8.at_least(last_column, u))
+    is_inside = v8.mask_and(is_inside, v8.at_least(v, zero))
+    is_inside = v8.mask_and(is_inside, v8.at_least(last_row, v))
+    is_inside = v8.mask_and(is_inside, v8.greater(depth, copies(MIN_SHADOW_DEPTH_M)))
+    i = v8.floor(v8.minimum(v8.maximum(v, zero), last_row - unit))
+    j = v8.floor(v8.minimum(v8.maximum(u, zero), last_column - unit))
+    v8.store_integers(texels, Index(0), v8.fmuladd(i, copies(width), j))
+    first = shadow_map * height * width
+    above_left = v8.gather(images, texels, Index(0), Index(1), Index(first))
+    above_right = v8.gather(images, texels, Index(0), Index(1), Index(first + 1))
+    below_left = v8.gather(images, texels, Index(0), Index(1), Index(first + width))
+    below_right = v8.gather(images, texels, Index(0), Index(1), Index(first + width + 1))
+    above = v8.fmuladd(above_right - above_left, u - j, above_left)
+    below = v8.fmuladd(below_right - below_left, u - j, below_left)
+    nearest = v8.fmuladd(below - above, v - i, above)
+    tolerance = v8.fmuladd(copies(shadows.tolerances[0]), per_z, copies(shadows.tolerances[1]))
+    share = copies(2) - (nearest - per_z) / tolerance
+    share = v8.minimum(v8.maximum(share, zero), unit)
+    return v8.select(is_inside, share, unit)
+
+
+@kernel_function()
+def _row_times(row, eye, point):
+    """Return a row of a pose times eight points, which are from the eye."""
+    at_eye = row[0] * eye[0] + row[1] * eye[1] + row[2] * eye[2] + row[3]
+    return dot(vector_copies(row[0], row[1], row[2]), point) + copies(at_eye)
 
 
 @kernel_function()
@@ -314,7 +260,97 @@ def insert_ranked(chosen, scores, number, m, score):
 
 
 @kernel_function()
-def rank_lamps(lamps, points, facings, count, min_lux, min_own_lux, max_lamps, chosen, scores):
+def _load_vectors(numbers, index):
+    """Return eight vectors whose x, y and z lie in three rows of TILE_NODES numbers."""
+    return (
+        v8.load(numbers, Index(index)),
+        v8.load(numbers, Index(index + TILE_NODES)),
+        v8.load(numbers, Index(index + 2 * TILE_NODES)),
+    )
+
+
+@kernel_function()
+def _lux_of_eight(tables, size, lamp, towards, squared, per_m, texels):
+    """Return lux of a lamp on eight surfaces that face it.
+
+    Args:
+        tables: packed patterns, flat.
+        size: rows and columns of a pattern.
+        lamp: result of `_read_near_lamp`.
+        towards: from the surfaces to the lamp, metres.
+        squared: their squared lengths.
+        per_m: one over their lengths.
+        texels: work space, int32 [8].
+    """
+    _, axis, right, up, candela, first, extinction, softening = lamp
+    away = v8.negate(per_m)
+    share = patterns_of_eight(
+        tables,
+        first,
+        size[0],
+        size[1],
+        dot(towards, vector_copies(*axis)) * away,
+        dot(towards, vector_copies(*right)) * away,
+        dot(towards, vector_copies(*up)) * away,
+        texels,
+    )
+    lux = copies(candela) * share / (squared + copies(softening))
+    if extinction > 0:
+        power = copies(-extinction) * v8.sqrt(squared) * v8.broadcast(v8.LOG2_E)
+        lux = lux * v8.exp2_fine(v8.maximum(power, copies(-126)))
+    return lux
+
+
+@kernel_function()
+def _read_near_lamp(lamps, eye, m):
+    """Return lamp m as `read_lamp` does, its place from the eye and its pattern's first index."""
+    place, axis, right, up, candela, pattern, extinction, softening = read_lamp(lamps, m)
+    first = pattern * lamps.tables.shape[1] * lamps.tables.shape[2]
+    near_place = (place[0] - eye[0], place[1] - eye[1], place[2] - eye[2])
+    return near_place, axis, right, up, candela, first, extinction, softening
+
+
+@kernel_function()
+def _box_of_tile(work, count):
+    """Return the least and the largest x, y and z of a tile's nodes, from the eye."""
+    low = _load_vectors(work, POINTS)
+    high = low
+    for p in range(NUM_LANES, count, NUM_LANES):
+        point = _load_vectors(work, POINTS + p)
+        low = (
+            v8.minimum(low[0], point[0]),
+            v8.minimum(low[1], point[1]),
+            v8.minimum(low[2], point[2]),
+        )
+        high = (
+            v8.maximum(high[0], point[0]),
+            v8.maximum(high[1], point[1]),
+            v8.maximum(high[2], point[2]),
+        )
+    return (
+        (_least(low[0], work), _least(low[1], work), _least(low[2], work)),
+        (_largest(high[0], work), _largest(high[1], work), _largest(high[2], work)),
+    )
+
+
+@kernel_function()
+def _largest(values, work):
+    """Return the largest of eight numbers."""
+    v8.store(work, Index(SPARE), values)
+    largest = work[SPARE]
+    for lane in range(1, NUM_LANES):
+        largest = max(largest, work[SPARE + lane])
+    return largest
+
+
+@kernel_function()
+def _least(values, work):
+    """Return the least of eight numbers."""
+    return -_largest(v8.negate(values), work)
+
+
+@kernel_function()
+def _rank_lamps(lamps, tables, size, eye, work, texels, count, least_lux, chosen, scores, before):
     """Choose the brightest lamps of a tile, brightest first.
 
     Returns:
@@ -322,63 +358,260 @@ def rank_lamps(lamps, points, facings, count, min_lux, min_own_lux, max_lamps, c
 
     Args:
         lamps: the lamps.
-        points: points of the tile, [N, 3].
-        facings: normals at the points, [N, 3].
-        count: number of the points.
-        min_lux: lux of all its points below which a lamp is left out.
-        min_own_lux: the same for lamps of the recording car.
-        max_lamps: largest number of lamps.
+        tables: packed patterns, flat.
+        size: rows and columns of a pattern.
+        eye: place of the eye.
+        work: numbers of the tile.
+        texels: work space, int32 [8].
+        count: number of the tile's nodes.
+        least_lux: lux of all nodes below which a lamp is left out, and the same for lamps of the
+            recording car.
         chosen: output, int64 [max_lamps], indices of the lamps.
         scores: output, float64 [max_lamps], the most lux of each at some of the points.
+        before: lamps of the tile before, which are tried first, and their number as the last.
     """
-    low = np.empty(3)
-    high = np.empty(3)
-    for k in range(3):
-        low[k] = points[0, k]
-        high[k] = points[0, k]
-    for p in range(1, count):
-        for k in range(3):
-            low[k] = min(low[k], points[p, k])
-            high[k] = max(high[k], points[p, k])
+    low, high = _box_of_tile(work, count)
+    for sample in range(2 * NUM_LANES):
+        p = SAMPLES[min(sample, len(SAMPLES) - 1)] * (count - 1) // (TILE_NODES - 1)
+        for k in range(6):
+            work[SAMPLE_POINTS + k * TILE_NODES + sample] = work[POINTS + k * TILE_NODES + p]
+    max_lamps = len(chosen)
     number = 0
     dropped = 0.0
-    for m in range(len(lamps.intensities)):
+    num_before = before[max_lamps]
+    for place in range(num_before + len(lamps.intensities)):
+        m = before[place] if place < num_before else place - num_before
+        is_known = False
+        if place >= num_before:
+            for k in range(num_before):
+                is_known |= before[k] == m
+        if is_known:
+            continue
         squared = 0.0
         for k in range(3):
-            gap = max(low[k] - lamps.positions[m, k], lamps.positions[m, k] - high[k], 0.0)
+            at = lamps.positions[m, k] - eye[k]
+            gap = max(low[k] - at, at - high[k], 0.0)
             squared += gap * gap
-        least = min_own_lux if lamps.is_own[m] else min_lux
+        least = least_lux[1] if lamps.is_own[m] else least_lux[0]
         bound = lamps.peaks[m] / (squared + lamps.softening[m])
-        if bound < least:
-            continue
-        bound *= math.exp(-lamps.extinctions[m] * math.sqrt(squared))
         if bound < least or (number == max_lamps and bound <= dropped):
             continue
-        score = 0.0
-        brightest = 0.0
-        lamp = read_lamp(lamps, m)
-        for sample in range(len(SAMPLES)):
-            p = SAMPLES[sample] * (count - 1) // (TILE * TILE - 1)
-            lux, dx, dy, dz = lux_along_ray(
-                lamps.tables, lamp, points[p, 0], points[p, 1], points[p, 2]
-            )
-            brightest = max(brightest, lux)
-            cosine = dx * facings[p, 0] + dy * facings[p, 1] + dz * facings[p, 2]
-            score = max(score, lux * max(cosine, MIN_RANK_COSINE))
-        if SAMPLE_MARGIN * brightest < least:
+        if lamps.extinctions[m] > 0:
+            bound *= math.exp(-lamps.extinctions[m] * math.sqrt(squared))
+            if bound < least or (number == max_lamps and bound <= dropped):
+                continue
+        lamp = _read_near_lamp(lamps, eye, m)
+        best = copies(0)
+        brightest = copies(0)
+        for p in range(0, 2 * NUM_LANES, NUM_LANES):
+            point = _load_vectors(work, SAMPLE_POINTS + p)
+            towards = _towards(lamp[0], point)
+            squares = dot(towards, towards)
+            per_m = copies(1) / v8.maximum(v8.sqrt(squares), copies(1e-9))
+            lux = _lux_of_eight(tables, size, lamp, towards, squares, per_m, texels)
+            brightest = v8.maximum(brightest, lux)
+            cosine = dot(towards, _load_vectors(work, SAMPLE_NORMALS + p)) * per_m
+            best = v8.maximum(best, lux * v8.maximum(cosine, copies(MIN_RANK_COSINE)))
+        if SAMPLE_MARGIN * _largest(brightest, work) < least:
             continue
+        score = np.float64(_largest(best, work))
         if number == max_lamps:
             if score <= scores[number - 1]:
                 dropped = max(dropped, score)
                 continue
             dropped = max(dropped, scores[number - 1])
         number = insert_ranked(chosen, scores, number, m, score)
+    for k in range(number):
+        before[k] = chosen[k]
+    before[max_lamps] = number
     return number, dropped
+
+
+@kernel_function()
+def _towards(place, point):
+    """Return the way from eight points to a place."""
+    return (copies(place[0]) - point[0], copies(place[1]) - point[1], copies(place[2]) - point[2])
+
+
+@kernel_function()
+def _read_tile(depth, normals, view, top, left, work, nodes):
+    """Enter the nodes of a tile that show a surface into `work`; return their number.
+
+    Places after the last node, up to a multiple of eight, have its numbers.
+    """
+    height, width = depth.shape
+    count = 0
+    for i in range(top, min(top + TILE, height)):
+        y = (i * view.lens[4] + view.lens[5] - view.lens[3]) * view.lens[1]
+        for j in range(left, min(left + TILE, width)):
+            z = np.float64(depth[i, j])
+            if not (z > 0 and z < 1e6):
+                continue
+            x = (j * view.lens[4] + view.lens[5] - view.lens[2]) * view.lens[0]
+            squared = np.float32(0)
+            for k in range(3):
+                ray = view.axes[k, 0] * x + view.axes[k, 1] * y + view.axes[k, 2]
+                work[POINTS + k * TILE_NODES + count] = z * ray
+                normal = normals[i, j, k]
+                work[NORMALS + k * TILE_NODES + count] = normal
+                squared += normal * normal
+            # Shorter normals are means of some that disagree: leaves, grass, noise.
+            rough = (1.0 - SMOOTH_LOSS - math.sqrt(squared)) / (1.0 - SMOOTH_LOSS)
+            work[ROUGH + count] = ROUGH_COSINE * max(rough, 0.0)
+            nodes[count, 0] = i
+            nodes[count, 1] = j
+            count += 1
+    if count > 0:
+        for p in range(count, (count + NUM_LANES - 1) // NUM_LANES * NUM_LANES):
+            for k in range(7):
+                work[k * TILE_NODES + p] = work[k * TILE_NODES + count - 1]
+    return count
+
+
+@kernel_function()
+def _light_tile(lamps, tables, size, view, eye, shadows, work, texels, count, m, fade, has_own):
+    """Add the light of a lamp to a tile's nodes.
+
+    Args:
+        lamps: the lamps.
+        tables: packed patterns, flat.
+        size: rows and columns of a pattern.
+        view: the view of the nodes.
+        eye: place of the eye.
+        shadows: depth maps of the lamps that have one.
+        work: numbers of the tile, changed in place.
+        texels: work space, int32 [8].
+        count: number of the tile's nodes.
+        m: index of the lamp.
+        fade: factor of its light.
+        has_own: True if the light that comes back from signs is asked for.
+    """
+    zero = copies(0)
+    lamp = _read_near_lamp(lamps, eye, m)
+    shadow_map = lamps.shadow_maps[m]
+    is_returned = has_own and lamps.is_own[m]
+    red = fade * lamps.colors[m, 0]
+    green = fade * lamps.colors[m, 1]
+    blue = fade * lamps.colors[m, 2]
+    for p in range(0, count, NUM_LANES):
+        towards = _towards(lamp[0], _load_vectors(work, POINTS + p))
+        squared = dot(towards, towards)
+        per_m = copies(1) / v8.maximum(v8.sqrt(squared), copies(1e-9))
+        cosine = dot(towards, _load_vectors(work, NORMALS + p)) * per_m
+        gain = v8.maximum(cosine, zero) + v8.load(work, Index(ROUGH + p))
+        if v8.mask_bits(v8.greater(gain, zero)) == Index(0) and not is_returned:
+            continue
+        facing = _lux_of_eight(tables, size, lamp, towards, squared, per_m, texels)
+        if shadow_map >= 0:
+            point = _load_vectors(work, POINTS + p)
+            facing = facing * _lit_shares(shadows, shadow_map, eye, point, texels)
+        _add_color(work, LUX + p, facing * gain, red, green, blue)
+        if is_returned:
+            v8.store(work, Index(SPARE), facing)
+            for lane in range(NUM_LANES):
+                x = np.float64(work[POINTS + p + lane])
+                y = np.float64(work[POINTS + TILE_NODES + p + lane])
+                z = np.float64(work[POINTS + 2 * TILE_NODES + p + lane])
+                work[SPARE + lane] *= _return_share(x, y, z, lamp[0])
+            facing = v8.load(work, Index(SPARE))
+            _add_color(work, OWN_LUX + p, facing, red, green, blue)
+
+
+@kernel_function()
+def _add_color(work, index, light, red, green, blue):
+    """Add light of a colour to eight nodes."""
+    sums = _load_vectors(work, index)
+    v8.store(work, Index(index), v8.fmuladd(light, copies(red), sums[0]))
+    v8.store(work, Index(index + TILE_NODES), v8.fmuladd(light, copies(green), sums[1]))
+    v8.store(work, Index(index + 2 * TILE_NODES), v8.fmuladd(light, copies(blue), sums[2]))
+
+
+@kernel_function()
+def _light_row_of_tiles(
+    tile_row,
+    depth,
+    normals,
+    view,
+    lamps,
+    tables,
+    shadows,
+    is_sign,
+    min_lux,
+    min_own_lux,
+    max_lamps,
+    lux,
+    own_lux,
+):
+    """Sum the lamps' illuminance at the nodes of a row of tiles."""
+    height, width = depth.shape
+    top = tile_row * TILE
+    step = np.int64(view.lens[4])
+    top_px = max((top - 1) * step, 0)
+    bottom_px = is_sign.shape[0] if top + TILE >= height else (top + TILE + 1) * step
+    bottom_px = min(bottom_px, is_sign.shape[0])
+    eye = (view.eye[0], view.eye[1], view.eye[2])
+    size = (lamps.tables.shape[1], lamps.tables.shape[2])
+    work = np.zeros(NUM_FIELDS * TILE_NODES, np.float32)
+    nodes = np.empty((TILE_NODES, 2), np.int64)
+    texels = np.empty(NUM_LANES, np.int32)
+    chosen = np.empty(max_lamps, np.int64)
+    scores = np.empty(max_lamps)
+    before = np.zeros(max_lamps + 1, np.int64)
+    for i in range(top, min(top + TILE, height)):
+        for j in range(width):
+            for k in range(3):
+                lux[i, j, k] = 0.0
+                if own_lux.size > 0:
+                    own_lux[i, j, k] = 0.0
+    for left in range(0, width, TILE):
+        count = _read_tile(depth, normals, view, top, left, work, nodes)
+        if count == 0:
+            continue
+        # Signs read the nodes of this tile, or those of the next tile beside these.
+        left_px = max((left - 1) * step, 0)
+        right_px = is_sign.shape[1] if left + TILE >= width else (left + TILE + 1) * step
+        right_px = min(right_px, is_sign.shape[1])
+        has_own = False
+        for i in range(top_px, bottom_px):
+            for j in range(left_px, right_px):
+                has_own |= is_sign[i, j]
+        least_lux = (min_lux, min_own_lux if has_own else min_lux)
+        number, dropped = _rank_lamps(
+            lamps, tables, size, eye, work, texels, count, least_lux, chosen, scores, before
+        )
+        if number == 0:
+            continue
+        work[LUX:] = 0
+        for c in range(number):
+            # A lamp fades before it is dropped, so that tiles have no edges.
+            fade = 1.0 if dropped <= 0 else min(max(scores[c] / dropped - 1.0, 0.0), 1.0)
+            if fade > 0:
+                _light_tile(
+                    lamps,
+                    tables,
+                    size,
+                    view,
+                    eye,
+                    shadows,
+                    work,
+                    texels,
+                    count,
+                    chosen[c],
+                    fade,
+                    has_own,
+                )
+        for p in range(count):
+            i = nodes[p, 0]
+            j = nodes[p, 1]
+            for k in range(3):
+                lux[i, j, k] = work[LUX + k * TILE_NODES + p]
+                if has_own:
+                    own_lux[i, j, k] = work[OWN_LUX + k * TILE_NODES + p]
 
 
 @kernel
 def light_nodes(
-    depth, normals, view, lamps, shadows, min_lux, min_own_lux, max_lamps, lux, own_lux
+    depth, normals, view, lamps, shadows, is_sign, min_lux, min_own_lux, max_lamps, lux, own_lux
 ):
     """Sum the lamps' illuminance at the nodes.
 
@@ -388,109 +621,53 @@ def light_nodes(
         view: the view of the nodes.
         lamps: the lamps.
         shadows: depth maps of the lamps that have one.
+        is_sign: pixels of signs, bool [H, W]; empty if no sign sends own light back.
         min_lux: lux below which a lamp does not light a tile.
-        min_own_lux: the same for lamps of the recording car.
+        min_own_lux: the same for lamps of the recording car, where signs are.
         max_lamps: largest number of lamps that light a tile.
         lux: output, float32 [h, w, 3], lux in linear sRGB on the surfaces.
         own_lux: output, float32 [h, w, 3], lux of the recording car's lamps on surfaces that face
-            them, times how much of their light comes back to the eye (`return_share`); empty if it
-            is not asked for.
+            them, times how much of their light comes back to the eye (`return_share`), in tiles
+            with signs; empty without any.
     """
-    height, width = depth.shape
-    tile_columns = (width + TILE - 1) // TILE
-    tile_rows = (height + TILE - 1) // TILE
-    has_own = own_lux.size > 0
-    for tile in prange(tile_columns * tile_rows):
-        top = (tile // tile_columns) * TILE
-        left = (tile % tile_columns) * TILE
-        points = np.empty((TILE * TILE, 3))
-        facings = np.empty((TILE * TILE, 3))
-        nodes = np.empty((TILE * TILE, 2), np.int64)
-        roughness = np.empty((TILE, TILE))
-        chosen = np.empty(max_lamps, np.int64)
-        scores = np.empty(max_lamps)
-        count = 0
-        for i in range(top, min(top + TILE, height)):
-            y = (i * view.lens[4] + view.lens[5] - view.lens[3]) * view.lens[1]
-            for j in range(left, min(left + TILE, width)):
-                for k in range(3):
-                    lux[i, j, k] = 0.0
-                    if has_own:
-                        own_lux[i, j, k] = 0.0
-                z = np.float64(depth[i, j])
-                if not (z > 0 and z < 1e6):
-                    continue
-                x = (j * view.lens[4] + view.lens[5] - view.lens[2]) * view.lens[0]
-                for k in range(3):
-                    ray = view.axes[k, 0] * x + view.axes[k, 1] * y + view.axes[k, 2]
-                    points[count, k] = view.eye[k] + z * ray
-                length = 0.0
-                for k in range(3):
-                    length += np.float64(normals[i, j, k]) ** 2
-                    facings[count, k] = normals[i, j, k]
-                # Shorter normals are means of some that disagree: leaves, grass, noise.
-                roughness[i - top, j - left] = max(
-                    (1.0 - SMOOTH_LOSS - math.sqrt(length)) / (1.0 - SMOOTH_LOSS), 0.0
-                )
-                nodes[count, 0] = i
-                nodes[count, 1] = j
-                count += 1
-        if count == 0:
-            continue
-        number, dropped = rank_lamps(
-            lamps, points, facings, count, min_lux, min_own_lux, max_lamps, chosen, scores
+    tables = lamps.tables.reshape(lamps.tables.size)
+    for tile_row in prange((depth.shape[0] + TILE - 1) // TILE):
+        _light_row_of_tiles(
+            np.int64(tile_row),
+            depth,
+            normals,
+            view,
+            lamps,
+            tables,
+            shadows,
+            is_sign,
+            min_lux,
+            min_own_lux,
+            max_lamps,
+            lux,
+            own_lux,
         )
-        for c in range(number):
-            m = chosen[c]
-            lamp = read_lamp(lamps, m)
-            tables = lamps.tables
-            shadow_map = lamps.shadow_maps[m]
-            is_own = lamps.is_own[m]
-            # A lamp fades before it is dropped, so that tiles have no edges.
-            fade = 1.0 if dropped <= 0 else min(max(scores[c] / dropped - 1.0, 0.0), 1.0)
-            red = fade * lamps.colors[m, 0]
-            green = fade * lamps.colors[m, 1]
-            blue = fade * lamps.colors[m, 2]
-            for p in range(count):
-                x = points[p, 0]
-                y = points[p, 1]
-                z = points[p, 2]
-                i = nodes[p, 0]
-                j = nodes[p, 1]
-                nx = np.float64(normals[i, j, 0])
-                ny = np.float64(normals[i, j, 1])
-                nz = np.float64(normals[i, j, 2])
-                place = lamp[0]
-                above = nx * (place[0] - x) + ny * (place[1] - y) + nz * (place[2] - z)
-                rough = ROUGH_COSINE * roughness[i - top, j - left]
-                is_returned = has_own and is_own
-                if above <= 0 and rough <= 0 and not is_returned:
-                    continue
-                facing, dx, dy, dz = lux_along_ray(tables, lamp, x, y, z)
-                if shadow_map >= 0 and facing > 0:
-                    facing *= lit_share(shadows, shadow_map, x, y, z)
-                lit = facing * (max(nx * dx + ny * dy + nz * dz, 0.0) + rough)
-                lux[i, j, 0] += np.float32(lit * red)
-                lux[i, j, 1] += np.float32(lit * green)
-                lux[i, j, 2] += np.float32(lit * blue)
-                if is_returned:
-                    facing *= _return_share(view, x, y, z, dx, dy, dz)
-                    own_lux[i, j, 0] += np.float32(facing * red)
-                    own_lux[i, j, 1] += np.float32(facing * green)
-                    own_lux[i, j, 2] += np.float32(facing * blue)
 
 
 @kernel_function()
-def _return_share(view, x, y, z, dx, dy, dz):
-    """Return `return_share` at the angle between the eye and a lamp, seen from a sign."""
-    ex = view.eye[0] - x
-    ey = view.eye[1] - y
-    ez = view.eye[2] - z
-    per_m = 1.0 / max(math.sqrt(ex * ex + ey * ey + ez * ez), 1e-9)
+def _return_share(x, y, z, place):
+    """Return `return_share` at the angle between the eye and a lamp, seen from a sign.
+
+    Args:
+        x: x of the sign, from the eye, metres.
+        y: y of the sign.
+        z: z of the sign.
+        place: place of the lamp, from the eye.
+    """
+    dx = place[0] - x
+    dy = place[1] - y
+    dz = place[2] - z
+    per_lamp_m = 1.0 / max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-9)
+    per_eye_m = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-9)
     # The chord of the angle, which is exact for small angles where a cosine loses its digits.
-    ax = ex * per_m - dx
-    ay = ey * per_m - dy
-    az = ez * per_m - dz
+    ax = x * per_eye_m + dx * per_lamp_m
+    ay = y * per_eye_m + dy * per_lamp_m
+    az = z * per_eye_m + dz * per_lamp_m
     return return_share(math.sqrt(ax * ax + ay * ay + az * az))
 
 
@@ -517,110 +694,3 @@ def return_share(angle_rad):
     if angle_rad <= MIDDLE_RETURN_RAD:
         return (angle_rad / FULL_RETURN_RAD) ** _MIDDLE_POWER
     return MIDDLE_RETURN * (angle_rad / MIDDLE_RETURN_RAD) ** _LAST_POWER
-
-
-# ---- From nodes to pixels ------------------------------------------------------------------------
-
-
-@kernel
-def spread_light(
-    depth, node_inverse, lux, own_lux, step, first, reflectance, return_per_lux, picture
-):
-    """Add the nodes' light to the picture: reflectance / pi times lux, and what signs send back.
-
-    Each pixel takes the four nodes about it, those on its surface first.
-
-    Args:
-        depth: z of the pixels, metres, 0 for the sky, float32 [H, W].
-        node_inverse: 1 / z of the nodes, 0 for the sky, float32 [h, w].
-        lux: result of `light_nodes`.
-        own_lux: result of `light_nodes`, or empty.
-        step: pixels between nodes.
-        first: column and row of the first node's pixel.
-        reflectance: float32 [H, W, 3].
-        return_per_lux: coefficient of retroreflection, cd/m2 per lux, float32 [H, W]; empty if no
-            surface has one.
-        picture: luminance in linear sRGB, cd/m2, changed in place, float32 [H, W, 3].
-    """
-    height, width = depth.shape
-    rows, columns = node_inverse.shape
-    unit = np.float32(1)
-    zero = np.float32(0)
-    per_pi = np.float32(1.0 / math.pi)
-    per_step = np.float32(1.0 / step)
-    has_signs = return_per_lux.size > 0
-    for row in prange(height):
-        v = np.float32(min(max((row - first) / step, 0.0), rows - 1.0))
-        i = min(int(v), max(rows - 2, 0))
-        v -= np.float32(i)
-        below = min(i + 1, rows - 1)
-        depths = depth[row]
-        colors = reflectance[row]
-        lights = picture[row]
-        upper = node_inverse[i]
-        lower = node_inverse[below]
-        upper_lux = lux[i]
-        lower_lux = lux[below]
-        start = 0
-        # From node to node: pixels between two nodes share what they read of these.
-        for j in range(max(columns - 1, 1)):
-            beside = min(j + 1, columns - 1)
-            end = width if j >= columns - 2 else min(first + (j + 1) * step, width)
-            a_red = upper_lux[j, 0]
-            a_green = upper_lux[j, 1]
-            a_blue = upper_lux[j, 2]
-            b_red = upper_lux[beside, 0]
-            b_green = upper_lux[beside, 1]
-            b_blue = upper_lux[beside, 2]
-            c_red = lower_lux[j, 0]
-            c_green = lower_lux[j, 1]
-            c_blue = lower_lux[j, 2]
-            d_red = lower_lux[beside, 0]
-            d_green = lower_lux[beside, 1]
-            d_blue = lower_lux[beside, 2]
-            brightest = a_red + a_green + a_blue + b_red + b_green + b_blue
-            brightest += c_red + c_green + c_blue + d_red + d_green + d_blue
-            if brightest <= zero and not has_signs:
-                start = end
-                continue
-            a_inverse = upper[j]
-            b_inverse = upper[beside]
-            c_inverse = lower[j]
-            d_inverse = lower[beside]
-            for column in range(start, end):
-                z = depths[column]
-                if not (z > zero and z < np.float32(1e6)):
-                    continue
-                u = min(max(np.float32(column - first) * per_step, zero), np.float32(columns - 1))
-                u -= np.float32(j)
-                a = (unit - u) * (unit - v) * _likeness(a_inverse, z)
-                b = u * (unit - v) * _likeness(b_inverse, z)
-                c = (unit - u) * v * _likeness(c_inverse, z)
-                d = u * v * _likeness(d_inverse, z)
-                weight_sum = a + b + c + d
-                if weight_sum <= zero:
-                    continue
-                share = unit / weight_sum
-                gain = share * per_pi
-                red = a * a_red + b * b_red + c * c_red + d * d_red
-                green = a * a_green + b * b_green + c * c_green + d * d_green
-                blue = a * a_blue + b * b_blue + c * c_blue + d * d_blue
-                lights[column, 0] += red * gain * colors[column, 0]
-                lights[column, 1] += green * gain * colors[column, 1]
-                lights[column, 2] += blue * gain * colors[column, 2]
-                if has_signs and return_per_lux[row, column] > zero:
-                    share *= return_per_lux[row, column]
-                    for k in range(3):
-                        light = a * own_lux[i, j, k] + b * own_lux[i, beside, k]
-                        light += c * own_lux[below, j, k] + d * own_lux[below, beside, k]
-                        lights[column, k] += light * share * colors[column, k]
-            start = end
-
-
-@kernel_function()
-def _likeness(inverse_depth, z):
-    """Return the weight of a node for a pixel: 1 on the same surface, 0 for the sky."""
-    if inverse_depth <= np.float32(0):
-        return np.float32(0)
-    gap = (inverse_depth * z - np.float32(1)) * np.float32(1.0 / SAME_SURFACE)
-    return max(np.float32(1) - gap * gap, np.float32(OTHER_SURFACE_WEIGHT))

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from augment.lamps.lamp_lane_kernels import dot, splat
 from augment.lamps.road_unevenness_kernels import tilt_tile
+from augment.lamps.vector_kernels import copies, dot, vector_copies
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel_function
 from augment.render.layout import NUM_LANES, Index
@@ -174,22 +174,22 @@ def _fill_places(top, left, view, pixels):
     lens = view.lens
     axes = view.axes
     size = Index(TILE_SIZE)
-    ax = splat(axes[0, 0])
-    ay = splat(axes[1, 0])
-    az = splat(axes[2, 0])
-    per_focal = splat(lens[0])
+    ax = copies(axes[0, 0])
+    ay = copies(axes[1, 0])
+    az = copies(axes[2, 0])
+    per_focal = copies(lens[0])
     for group in range(NUM_GROUPS):
         first = Index(group * NUM_LANES)
         row = group * NUM_LANES // TILE_PX
         column = group * NUM_LANES % TILE_PX
         y = (top + row + 0.5 - lens[3]) * lens[1]
         x = v8.fmuladd(
-            v8.lane_numbers(), per_focal, splat((left + column + 0.5 - lens[2]) * lens[0])
+            v8.lane_numbers(), per_focal, copies((left + column + 0.5 - lens[2]) * lens[0])
         )
         z = v8.load(pixels, first)
-        v8.store(pixels, first, z * v8.fmuladd(ax, x, splat(axes[0, 1] * y + axes[0, 2])))
-        v8.store(pixels, first + size, z * v8.fmuladd(ay, x, splat(axes[1, 1] * y + axes[1, 2])))
-        z = z * v8.fmuladd(az, x, splat(axes[2, 1] * y + axes[2, 2]))
+        v8.store(pixels, first, z * v8.fmuladd(ax, x, copies(axes[0, 1] * y + axes[0, 2])))
+        v8.store(pixels, first + size, z * v8.fmuladd(ay, x, copies(axes[1, 1] * y + axes[1, 2])))
+        z = z * v8.fmuladd(az, x, copies(axes[2, 1] * y + axes[2, 2]))
         v8.store(pixels, first + size + size, z)
 
 
@@ -203,8 +203,8 @@ def _fill_normals(pixels, tilts, frame):
         frame: rotation from the world to the water's frame.
     """
     size = Index(TILE_SIZE)
-    unit = splat(1)
-    largest = splat(0)
+    unit = copies(1)
+    largest = copies(0)
     for group in range(NUM_GROUPS):
         first = Index(group * NUM_LANES)
         px = v8.load(pixels, first)
@@ -213,17 +213,17 @@ def _fill_normals(pixels, tilts, frame):
         a = v8.load(tilts, first)
         b = v8.load(tilts, first + size)
         largest = v8.maximum(largest, v8.fmuladd(a, a, b * b))
-        a = a + splat(frame[2, 0])
-        b = b + splat(frame[2, 1])
-        c = v8.sqrt(v8.maximum(unit - v8.fmuladd(a, a, b * b), splat(0.01)))
-        nx = dot(splat(frame[0, 0]), splat(frame[0, 1]), splat(frame[0, 2]), a, b, c)
-        ny = dot(splat(frame[1, 0]), splat(frame[1, 1]), splat(frame[1, 2]), a, b, c)
-        nz = dot(splat(frame[2, 0]), splat(frame[2, 1]), splat(frame[2, 2]), a, b, c)
+        a = a + copies(frame[2, 0])
+        b = b + copies(frame[2, 1])
+        c = v8.sqrt(v8.maximum(unit - v8.fmuladd(a, a, b * b), copies(0.01)))
+        nx = dot(vector_copies(frame[0, 0], frame[0, 1], frame[0, 2]), (a, b, c))
+        ny = dot(vector_copies(frame[1, 0], frame[1, 1], frame[1, 2]), (a, b, c))
+        nz = dot(vector_copies(frame[2, 0], frame[2, 1], frame[2, 2]), (a, b, c))
         cx = pz * ny - py * nz
         cy = px * nz - pz * nx
         cz = py * nx - px * ny
-        squared = dot(px, py, pz, px, py, pz)
-        r2 = v8.maximum(dot(cx, cy, cz, cx, cy, cz), splat(1e-9) * squared)
+        squared = dot((px, py, pz), (px, py, pz))
+        r2 = v8.maximum(dot((cx, cy, cz), (cx, cy, cz)), copies(1e-9) * squared)
         v8.store(pixels, first + Index(3) * size, nx)
         v8.store(pixels, first + Index(4) * size, ny)
         v8.store(pixels, first + Index(5) * size, nz)
@@ -231,9 +231,9 @@ def _fill_normals(pixels, tilts, frame):
         v8.store(pixels, first + Index(7) * size, cy)
         v8.store(pixels, first + Index(8) * size, cz)
         v8.store(pixels, first + Index(9) * size, v8.sqrt(squared))
-        v8.store(pixels, first + Index(10) * size, v8.negate(dot(px, py, pz, nx, ny, nz)))
+        v8.store(pixels, first + Index(10) * size, v8.negate(dot((px, py, pz), (nx, ny, nz))))
         v8.store(pixels, first + Index(11) * size, r2)
-        v8.store(pixels, first + Index(12) * size, unit / v8.maximum(r2, splat(1e-20)))
+        v8.store(pixels, first + Index(12) * size, unit / v8.maximum(r2, copies(1e-20)))
     most = np.float32(0)
     for lane in range(Index(NUM_LANES)):
         most = max(most, v8.lane(largest, lane))

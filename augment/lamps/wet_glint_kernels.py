@@ -17,13 +17,12 @@ from numba import prange
 from augment.lamps.lamp_lane_kernels import (
     COLOR,
     PEAK,
-    dot,
     gather_lamp_lanes,
     lux_of_lanes,
     read_lamp_lanes,
-    splat,
 )
 from augment.lamps.surface_light_kernels import insert_ranked, lit_share
+from augment.lamps.vector_kernels import copies, dot
 from augment.lamps.water_tile_kernels import (
     NUM_GROUPS,
     NUM_PIXEL_NUMBERS,
@@ -73,9 +72,9 @@ def _half_vector(dx, dy, dz, distance, pixel, pixel_rad):
         normal part; D n; D E; square of the tangent from a pixel to the one beside it.
     """
     px, py, pz, nx, ny, nz, cx, cy, cz, eye_m, eye_n, r2, per_r2 = pixel
-    lamp_n = dot(dx, dy, dz, nx, ny, nz)
-    cosine = v8.negate(dot(dx, dy, dz, px, py, pz))
-    triple = dot(dx, dy, dz, cx, cy, cz)
+    lamp_n = dot((dx, dy, dz), (nx, ny, nz))
+    cosine = v8.negate(dot((dx, dy, dz), (px, py, pz)))
+    triple = dot((dx, dy, dz), (cx, cy, cz))
     triple2 = triple * triple
     q = lamp_n * eye_n - cosine
     eye_part = q * eye_n
@@ -84,28 +83,28 @@ def _half_vector(dx, dy, dz, distance, pixel, pixel_rad):
     ahead = (eye_part - lamp_part) * (eye_part + lamp_part) * per_r2 - triple2
     ahead = ahead / v8.fmuladd(q, eye_m, far_m)
     behind = q * eye_m - far_m
-    along2 = v8.select(v8.greater(q, splat(0)), ahead * ahead * r2, behind * behind * per_r2)
+    along2 = v8.select(v8.greater(q, copies(0)), ahead * ahead * r2, behind * behind * per_r2)
     across2 = triple2 * (eye_m * eye_m * per_r2)
     half_n = v8.fmuladd(lamp_n, eye_m, eye_n * distance)
-    half_n2 = v8.maximum(half_n * half_n, splat(1e-20))
-    least = splat(MIN_COSINE)
+    half_n2 = v8.maximum(half_n * half_n, copies(1e-20))
+    least = copies(MIN_COSINE)
     cosines = v8.maximum(eye_n, least * eye_m) * distance
     cosines = v8.fmuladd(v8.maximum(lamp_n, least * distance), eye_m, cosines)
-    tilt = (eye_m + distance) * eye_m * splat(pixel_rad) / cosines
-    pixel_tilt2 = v8.minimum(tilt * tilt, splat(MAX_PIXEL_TILT2))
+    tilt = (eye_m + distance) * eye_m * copies(pixel_rad) / cosines
+    pixel_tilt2 = v8.minimum(tilt * tilt, copies(MAX_PIXEL_TILT2))
     return along2, across2, half_n2, lamp_n, cosine, pixel_tilt2
 
 
 @kernel_function()
 def fresnel(cosine):
     """Return the reflectance of water for unpolarised light by the cosines of its incidence."""
-    unit = splat(1)
-    n = splat(REFRACTION_INDEX)
-    sine2 = (unit - cosine * cosine) * splat(1.0 / (REFRACTION_INDEX * REFRACTION_INDEX))
+    unit = copies(1)
+    n = copies(REFRACTION_INDEX)
+    sine2 = (unit - cosine * cosine) * copies(1.0 / (REFRACTION_INDEX * REFRACTION_INDEX))
     inside = v8.sqrt(unit - sine2)
     s = (cosine - n * inside) / (cosine + n * inside)
     p = (inside - n * cosine) / (inside + n * cosine)
-    return splat(0.5) * v8.fmuladd(s, s, p * p)
+    return copies(0.5) * v8.fmuladd(s, s, p * p)
 
 
 @kernel_function()
@@ -114,13 +113,13 @@ def masking(cosine, m):
 
     The rational approximation of Walter et al. 2007, "Microfacet Models for Refraction".
     """
-    unit = splat(1)
-    sine = v8.sqrt(v8.maximum(unit - cosine * cosine, splat(0)))
+    unit = copies(1)
+    sine = v8.sqrt(v8.maximum(unit - cosine * cosine, copies(0)))
     # 1 / a; from a = 1.6 on the share is 1.
-    b = v8.maximum(m * sine / cosine, splat(1.0 / 1.6))
-    share = v8.fmuladd(splat(3.535), b, splat(2.181))
-    below = v8.fmuladd(v8.fmuladd(b, b, splat(2.577)), splat(1), splat(2.276) * b)
-    return v8.select(v8.greater(b, splat(1.0 / 1.6)), share / below, unit)
+    b = v8.maximum(m * sine / cosine, copies(1.0 / 1.6))
+    share = v8.fmuladd(copies(3.535), b, copies(2.181))
+    below = v8.fmuladd(v8.fmuladd(b, b, copies(2.577)), copies(1), copies(2.276) * b)
+    return v8.select(v8.greater(b, copies(1.0 / 1.6)), share / below, unit)
 
 
 @kernel_function()
@@ -130,19 +129,19 @@ def _glint(half, distance, per_m, eye_m, eye_n, m2, across_m2, exponent):
     half: result of `_half_vector`.
     """
     along2, across2, half_n2, lamp_n, cosine, _ = half
-    unit = splat(1)
+    unit = copies(1)
     per_eye_m = unit / eye_m
-    least = splat(MIN_COSINE)
+    least = copies(MIN_COSINE)
     to_lamp = v8.maximum(lamp_n * per_m, least)
     to_eye = v8.maximum(eye_n * per_eye_m, least)
     # cos(theta_h)^-2 = 1 + tan(theta_h)^2.
     per_cosine2 = unit + (along2 + across2) / half_n2
-    double = v8.maximum(v8.fmuladd(cosine, per_m * per_eye_m, unit), splat(0))
-    incidence = v8.minimum(v8.sqrt(splat(0.5) * double), unit)
+    double = v8.maximum(v8.fmuladd(cosine, per_m * per_eye_m, unit), copies(0))
+    incidence = v8.minimum(v8.sqrt(copies(0.5) * double), unit)
     m = v8.sqrt(m2)
     shares = masking(to_lamp, m) * masking(to_eye, m) * fresnel(incidence)
     spread = exp2_fine(exponent * v8.broadcast(-LOG2_E)) * (per_cosine2 * per_cosine2)
-    widths = v8.sqrt(m2 * across_m2) * to_eye * splat(4.0 * math.pi)
+    widths = v8.sqrt(m2 * across_m2) * to_eye * copies(4.0 * math.pi)
     return shares * spread / widths
 
 
@@ -152,23 +151,23 @@ def _strength(lamp, dx, dy, dz, squared, distance, pixel, rough2, pixel_rad, max
 
     The luminance is 0 where nothing glints, and in all lanes at once without further work.
     """
-    zero = splat(0)
+    zero = copies(0)
     eye_m = pixel[9]
     eye_n = pixel[10]
     half = _half_vector(dx, dy, dz, distance, pixel, pixel_rad)
     along2, across2, half_n2, lamp_n, _, pixel_tilt2 = half
     # The lamp's disc blurs the mirror by half its angle.
-    m2 = v8.fmuladd(splat(0.25) * lamp[6], splat(1) / squared, rough2)
-    across_m2 = v8.fmuladd(splat(PIXEL_BLUR), pixel_tilt2, m2)
+    m2 = v8.fmuladd(copies(0.25) * lamp[6], copies(1) / squared, rough2)
+    across_m2 = v8.fmuladd(copies(PIXEL_BLUR), pixel_tilt2, m2)
     exponent = v8.fmuladd(along2, across_m2, across2 * m2) / (half_n2 * m2 * across_m2)
-    is_lit = v8.at_least(splat(max_exponent), exponent)
+    is_lit = v8.at_least(copies(max_exponent), exponent)
     is_lit = v8.mask_and(is_lit, v8.greater(lamp_n, zero))
     is_lit = v8.mask_and(is_lit, v8.greater(eye_n, zero))
     strength = zero
     per_m = zero
     if v8.mask_bits(is_lit) != Index(0):
-        per_m = splat(1) / distance
-        exponent = v8.minimum(exponent, splat(MAX_EXPONENT))
+        per_m = copies(1) / distance
+        exponent = v8.minimum(exponent, copies(MAX_EXPONENT))
         strength = _glint(half, distance, per_m, eye_m, eye_n, m2, across_m2, exponent)
         strength = v8.select(is_lit, strength, zero)
     return strength, per_m
@@ -180,7 +179,7 @@ def _gap(lamp, pixel):
     dx = lamp[0][0] - pixel[0]
     dy = lamp[0][1] - pixel[1]
     dz = lamp[0][2] - pixel[2]
-    squared = v8.maximum(dot(dx, dy, dz, dx, dy, dz), splat(1e-6))
+    squared = v8.maximum(dot((dx, dy, dz), (dx, dy, dz)), copies(1e-6))
     return dx, dy, dz, squared, v8.sqrt(squared)
 
 
@@ -214,21 +213,21 @@ def _flat_pixel(pixels, p):
     pz = np.float64(pixels[2, p])
     squared = px * px + py * py + pz * pz
     r2 = max(px * px + py * py, 1e-9 * squared)
-    zero = splat(0)
+    zero = copies(0)
     return (
-        splat(px),
-        splat(py),
-        splat(pz),
+        copies(px),
+        copies(py),
+        copies(pz),
         zero,
         zero,
-        splat(1),
-        splat(-py),
-        splat(px),
+        copies(1),
+        copies(-py),
+        copies(px),
         zero,
-        splat(math.sqrt(squared)),
-        splat(-pz),
-        splat(r2),
-        splat(1.0 / r2),
+        copies(math.sqrt(squared)),
+        copies(-pz),
+        copies(r2),
+        copies(1.0 / r2),
     )
 
 
@@ -255,16 +254,16 @@ def _find_candidates(
     """
     eight = np.empty(NUM_LANES, np.int32)
     lane_bounds = np.empty(NUM_LANES, np.float32)
-    zero = splat(0)
+    zero = copies(0)
     number = 0
     for start in range(0, len(lamps), NUM_LANES):
         for lane in range(NUM_LANES):
             eight[lane] = min(start + lane, len(lamps) - 1)
         lamp = gather_lamp_lanes(lamps, eight)
         # The least tilt of h at some points, less what it may fall between them.
-        smallest = splat(1e18)
+        smallest = copies(1e18)
         largest = zero
-        nearest = splat(1e30)
+        nearest = copies(1e30)
         blur2 = zero
         for sample in range(len(SAMPLES)):
             pixel = _flat_pixel(pixels, wet[SAMPLES[sample] * (count - 1) // (TILE_SIZE - 1)])
@@ -276,18 +275,18 @@ def _find_candidates(
             smallest = v8.minimum(smallest, tilt)
             largest = v8.maximum(largest, tilt)
             nearest = v8.minimum(nearest, squared)
-            blur2 = v8.maximum(blur2, splat(PIXEL_BLUR) * pixel_tilt2)
-        reach = smallest + smallest - largest - splat(TILT_MARGIN * largest_tilt)
+            blur2 = v8.maximum(blur2, copies(PIXEL_BLUR) * pixel_tilt2)
+        reach = smallest + smallest - largest - copies(TILT_MARGIN * largest_tilt)
         reach = v8.maximum(reach, zero)
-        m2 = v8.fmuladd(splat(0.25) * lamp[6], splat(1) / nearest, splat(largest_m * largest_m))
+        m2 = v8.fmuladd(copies(0.25) * lamp[6], copies(1) / nearest, copies(largest_m * largest_m))
         exponent = reach * reach / (m2 + blur2)
-        is_near = v8.at_least(splat(MAX_EXPONENT), exponent)
+        is_near = v8.at_least(copies(MAX_EXPONENT), exponent)
         if v8.mask_bits(is_near) == Index(0):
             continue
         # A bound of F D G / (4 cos), with G / cos at most about 1 / m.
-        exponent = v8.minimum(exponent, splat(MAX_EXPONENT))
+        exponent = v8.minimum(exponent, copies(MAX_EXPONENT))
         bound = lamp[7] / nearest * exp2_fine(exponent * v8.broadcast(-LOG2_E))
-        bound = bound / (splat(4.0 * math.pi) * m2 * v8.sqrt(m2))
+        bound = bound / (copies(4.0 * math.pi) * m2 * v8.sqrt(m2))
         bound = v8.select(is_near, bound, zero)
         v8.store(lane_bounds, Index(0), bound)
         for lane in range(min(NUM_LANES, len(lamps) - start)):
@@ -322,7 +321,7 @@ def _choose_lamps(
     firsts = np.empty(NUM_LANES, np.int32)
     texels = np.empty(NUM_LANES, np.int32)
     lights = np.empty(NUM_LANES, np.float32)
-    zero = splat(0)
+    zero = copies(0)
     num_chosen = 0
     for start in range(0, number, NUM_LANES):
         for lane in range(NUM_LANES):
@@ -401,7 +400,7 @@ def _add_lamp(
     red = v8.broadcast(lamps[m, COLOR])
     green = v8.broadcast(lamps[m, COLOR + 1])
     blue = v8.broadcast(lamps[m, COLOR + 2])
-    least = splat(min_light)
+    least = copies(min_light)
     for g in range(num_groups):
         group = Index(groups[g])
         first = group * Index(NUM_LANES)

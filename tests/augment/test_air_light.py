@@ -10,13 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.lamps.air_light import (
-    SCATTER_GAIN,
-    air_light,
-    equiangular_sum,
-    factor_gain,
-    scatter_factor,
-)
+from augment.lamps.air_light import air_light, equiangular_sum
 from augment.lamps.fog_phase import (
     FOG_ASYMMETRY,
     AirExtinction,
@@ -24,6 +18,7 @@ from augment.lamps.fog_phase import (
     scatter_table,
     table_distances,
 )
+from augment.lamps.halo_tables import SCATTER_GAIN, factor_gain, scatter_factor
 from augment.lamps.lamp import EGO_OWNER, Lamps
 from augment.lamps.patterns import (
     Pattern,
@@ -393,7 +388,7 @@ def test_rain_scatters_wider_than_fog_and_adds_to_its_extinction():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"ray_distance_m": np.ones((3, 4), np.float32)}, r"must be \[107, 161\].*got \[3, 4\]"),
+        ({"distance_m": np.ones((3, 4), np.float32)}, r"must be \[107, 161\].*got \[3, 4\]"),
         ({"num_points": 0}, "num_points must be 1 to 16; got 0"),
         ({"num_points": 17}, "num_points must be 1 to 16; got 17"),
         ({"step_px": 0}, "step_px must be >= 1; got 0"),
@@ -402,7 +397,7 @@ def test_rain_scatters_wider_than_fog_and_adds_to_its_extinction():
 )
 def test_wrong_arguments_are_refused(change, message):
     view = camera()
-    arguments = {"ray_distance_m": sky(view), "air": FOG} | change
+    arguments = {"distance_m": sky(view), "air": FOG} | change
     with pytest.raises(ValueError, match=message):
         air_light(lamp((0.0, 0.0, 9.0)), view, **arguments)
     with pytest.raises(ValueError, match="precipitation_per_m must be finite"):

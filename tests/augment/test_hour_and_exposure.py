@@ -26,7 +26,13 @@ from augment.effects.lamps.glare import (
     widen_glare,
 )
 from augment.effects.lamps.hour import night_sky
-from augment.effects.lamps.picture_light import develop, find_reflectance, halve_excess, relight
+from augment.effects.lamps.picture_light import (
+    develop,
+    find_reflectance,
+    find_surfaces,
+    halve_excess,
+    relight,
+)
 from augment.lamps.lamp import color_of_temperature
 from augment.light.srgb import LUMINANCE_WEIGHTS, display_from_linear, linear_from_display
 from augment.render.sensor import draw_noise
@@ -157,6 +163,10 @@ def test_kernels_equal_their_definitions() -> None:
         assert np.allclose(
             find_reflectance(*numbers), find_reflectance(*numbers, uses_kernels=False), atol=1e-5
         )
+    alpha = RNG.choice(np.array([0, 0.01, 0.5, 1], np.float32), (9, 17))
+    z = RNG.choice(np.array([0, 3, np.inf, np.nan], np.float32), (9, 17))
+    surfaces = [find_surfaces(alpha, z, uses_kernels=uses) for uses in (True, False)]
+    np.testing.assert_array_equal(*surfaces)
     light = ADDED[:, :, ::-1] * np.float32(1e-3)
     draws = RNG.integers(0, 256, light.shape, np.uint8)
     for glare, levels in ((None, None), (light[:19, :31] * np.float32(0.1), draws)):

@@ -10,19 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from augment.lamps import surface_light_kernels
+from augment.lamps import surface_light_kernels, surface_normal_kernels
 from augment.lamps.beam_shadows import draw_beam_shadows, looks_into
 from augment.lamps.lamp import EGO_OWNER, LampKind, Lamps
 from augment.lamps.patterns import DIPPED_PEAK_CD, Pattern
-from augment.lamps.surface_light import (
-    Nodes,
-    find_nodes,
-    illuminance,
-    node_view,
-    return_share,
-    surface_light,
-)
+from augment.lamps.surface_light import illuminance, return_share, surface_light
 from augment.lamps.surface_light_kernels import TILE
+from augment.lamps.surface_normals import Nodes, find_nodes, node_view
 from augment.render.constants import RasterSettings
 from augment.scene.cameras import Camera
 from augment.scene.scene import PosedGaussians
@@ -222,8 +216,8 @@ def test_bulges_of_a_front_leave_it_evenly_lit_and_edges_stay() -> None:
     raw = np.empty((135, 240, 3), np.float32)
     slopes = np.empty_like(raw)
     inverse = np.ascontiguousarray(1 / depth[1::2, 1::2])
-    surface_light_kernels.find_slopes(inverse, node_view(camera, 2), slopes)
-    surface_light_kernels.average_normals(inverse, slopes, raw)
+    surface_normal_kernels.find_slopes(inverse, node_view(camera, 2), slopes)
+    surface_normal_kernels.average_normals(inverse, slopes, raw)
     unsmoothed = surface_light(
         lamp, camera, depth, white(camera), nodes=Nodes(depth[1::2, 1::2].copy(), raw, 2)
     )[..., 1]

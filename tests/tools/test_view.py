@@ -30,13 +30,15 @@ from augment.output.manifest import rows_to_table, write_manifest
 from augment.output.store import open_store
 from augment.scene.cameras import Camera
 from augment.scene.geometry import invert_rigid
+from augment.scene.scene_times import scene_times
 from augment.timing import PassProgress, counted_steps
 from augment.view.render_view import render_view
 from recipes.errors import RecipeError
 from recipes.fields import section_at, with_unchecked_field
-from recipes.load import load_recipe, preset_names
+from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.schema import SECTIONS
 from recipes.sections import recipe_file
+from tests.augment.batch_scenes import open_fake
 from tests.augment.dust import DustEffect
 from tests.streets import LABELLED_STREET, SMALL_STREET, open_street
 from tests.tools.page_client import PageClient
@@ -50,7 +52,14 @@ from tools.view.controls import (
     group_of,
     split_by_rank,
 )
-from tools.view.edits import Edits, save_recipe, start_values, unused_path, without_weather
+from tools.view.edits import (
+    Edits,
+    hold_weather,
+    save_recipe,
+    start_values,
+    unused_path,
+    without_weather,
+)
 from tools.view.outputs import OutputViewer, find_output
 from tools.view.page import ViewRequest
 from tools.view.pictures import (
@@ -278,6 +287,23 @@ def test_of_two_fields_that_exclude_each_other_the_older_gives_way():
     assert Edits("clear").without_conflict("seed", others) == Edits("clear")
 
 
+def test_held_weather_is_that_of_another_time_and_stays_so_when_it_is_saved():
+    scene = open_fake("fake:street")
+    text = "weather: {clock: {speed: 10}, smog: {visibility_m: {timeline: [[0, 10], [3, 70]]}}}"
+    recipe = parse_recipe(text, source="page", name="page").resolve(0)
+    camera = scene.frames[3].cameras["front"]
+    held = hold_weather(recipe, scene, camera, 0.1)
+    times = scene_times(scene)
+    assert held.weather.smog is not None and held.timelines == ()
+    assert held.weather.smog.visibility_m == pytest.approx(30)
+    assert held.at(times, camera.timestamp_ns) is held
+    assert held.weather_time_s(times, camera.timestamp_ns) == pytest.approx(1)
+    saved = parse_recipe(dump_recipe(held), source="saved").resolve(0)
+    assert saved == held and saved.at(times, camera.timestamp_ns) == held
+    clear = without_weather(recipe)
+    assert clear.at(times, camera.timestamp_ns) is clear
+
+
 def test_a_saved_recipe_reads_back_with_its_files_and_replaces_none(tmp_path):
     for blue in (40, 200):
         photo = tmp_path / "uploads" / "photo.png"
@@ -372,6 +398,32 @@ def test_the_picture_at_rest_is_the_one_that_render_writes(tmp_path):
     assert np.array_equal(rendered(tmp_path / "copied", copied), shown)
     assert np.array_equal(rendered(tmp_path / "saved", saved), shown)
     assert load_recipe(tmp_path / "views" / "mine.yaml").resolve(0).hash != recipe.hash  # its name
+
+
+@pytest.mark.long
+def test_a_page_holds_the_weather_of_another_time_and_saves_it(tmp_path):
+    path = tmp_path / "clearing.yaml"
+    path.write_text(
+        "weather: {smog: {visibility_m: {timeline: [[0, 20], [1, 300]], times: share}}}"
+    )
+    edits = Edits(str(path), SCALE, folder=tmp_path / "views")
+    with served(edits) as (viewer, url), PageClient(url) as page:
+        scene = viewer.scene
+        camera = scene.frames[0].cameras["front"]
+        first = page.rest(after=0)
+        assert np.array_equal(first, render_view(scene, camera, edits.recipe()).rgb)
+        assert "Changes over time: weather.smog.visibility_m" in page.status()
+        count = len(page.pictures)
+        page.set("time of the weather/at [%]", 100.0)
+        page.set("time of the weather/hold", True)
+        shown = page.rest(after=count)
+        held = hold_weather(edits.recipe(), scene, camera, scene_times(scene).duration_s)
+        assert np.array_equal(shown, render_view(scene, camera, held).rgb)
+        assert not np.array_equal(shown, first)
+        command_of(page, "# weather of another time: save the recipe first")
+        page.press("Save picture")
+        saved = command_of(page, f"climategs render {tmp_path}")
+    assert np.array_equal(rendered(tmp_path / "saved", saved), shown)
 
 
 @pytest.mark.long

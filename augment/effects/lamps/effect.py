@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from augment.effects.effect import (
     PICTURE,
@@ -187,8 +187,8 @@ class LampsEffect(Effect):
             out, mask = relight(rgb, added, *numbers, uses_kernels=uses_kernels)
         if not is_dark and added is not None and mask.any():
             with timed(GLARE):
-                lit = np.where(mask[..., None], out, np.float32(0))  # a bright sky has none
-                glare = _glare(lit, camera, plan.light.glare, uses_kernels=uses_kernels)
+                # A bright sky by day has no glare.
+                glare = _glare(out, camera, plan.light.glare, mask, uses_kernels=uses_kernels)
                 rows = None if glare is None else _add_glare(added, glare, exposure.scale)
                 if rows is not None:
                     out[rows], _ = relight(
@@ -247,7 +247,12 @@ class LampsEffect(Effect):
 
 
 def _glare(
-    picture: Float32[np.ndarray, "H W 3"], camera: Camera, strength: float, *, uses_kernels: bool
+    picture: Float32[np.ndarray, "H W 3"],
+    camera: Camera,
+    strength: float,
+    mask: Bool[np.ndarray, "H W"] | None = None,
+    *,
+    uses_kernels: bool,
 ) -> Float32[np.ndarray, "h w 3"] | None:
     """Return the light that the lens scatters about saturated pixels, at half the resolution.
 
@@ -257,15 +262,47 @@ def _glare(
         picture: the exposed picture, display-encoded, not clamped.
         camera: the view.
         strength: the recipe's `glare`.
+        mask: pixels that have glare; None for all that are saturated.
         uses_kernels: False for the plain definition.
     """
     if strength <= 0:
         return None
-    excess = halve_excess(picture, uses_kernels=uses_kernels)
+    if mask is None:
+        excess = halve_excess(picture, uses_kernels=uses_kernels)
+    else:
+        excess = _masked_excess(picture, mask, uses_kernels=uses_kernels)
     if excess is None:
         return None
     focal_px = (camera.fx + camera.fy) / 2
     return spread_glare(excess, max(camera.width, camera.height), focal_px, strength)
+
+
+def _masked_excess(
+    picture: Float32[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"], *, uses_kernels: bool
+) -> Float32[np.ndarray, "h w 3"] | None:
+    """Return the light beyond saturation of the pixels in a mask, at half the resolution.
+
+    None if there is none.
+
+    Args:
+        picture: the exposed picture, display-encoded, not clamped.
+        mask: the pixels; at least one is True.
+        uses_kernels: False for the plain definition.
+    """
+    sides = []
+    for axis in (1, 0):
+        lines = np.flatnonzero(mask.any(axis)).tolist()
+        sides.append(slice(lines[0] // 2 * 2, lines[-1] // 2 * 2 + 2))
+    box = (sides[0], sides[1])
+    lit = np.where(mask[box][..., None], picture[box], np.float32(0))
+    excess_of_box = halve_excess(lit, uses_kernels=uses_kernels)
+    if excess_of_box is None:
+        return None
+    height, width = mask.shape
+    excess = np.zeros((-(-height // 2), -(-width // 2), 3), np.float32)
+    coarse_box = tuple(slice(side.start // 2, side.stop // 2) for side in box)
+    excess[coarse_box] = excess_of_box
+    return excess
 
 
 def _add_glare(
@@ -316,10 +353,9 @@ def _read_light(
     with timed(METER):
         if glare is None and not plan.needs_luminance:
             return view
-        height, width = view.rgb.shape[:2]
         reading = read_light(
             view.rgb.detach().cpu().numpy(),
-            None if glare is None else widen_glare(glare, width, height),
+            glare,
             exposure.white_cd_m2,
             needs_luminance=plan.needs_luminance,
             uses_kernels=effect.backend != REFERENCE,

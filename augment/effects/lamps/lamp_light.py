@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from augment.effects.effect import EffectInScene, RenderedView
-from augment.effects.lamps.picture_light import find_reflectance
+from augment.effects.lamps.picture_light import find_reflectance, find_surfaces
 from augment.effects.lamps.plan import AIR, DROPS, EMITTERS, SURFACES, WET, LightPlan
 from augment.effects.lamps.recording_car import PAINT_M, light_recording_car, recording_car_pixels
 from augment.effects.lamps.signs import sign_pixels
@@ -26,15 +26,12 @@ from augment.lamps.surface_light import surface_light
 from augment.lamps.wet_glints import add_wet_glints
 from augment.memo import memo_of
 from augment.render.buffers import REFERENCE
-from augment.render.composite import unit_depth_coordinates
-from augment.render.constants import SURFACE_ALPHA
+from augment.render.fog_table import local_fog
 from augment.render.scatter import scattered_share
 from augment.scene.cameras import Camera
 from augment.scene.labels import EGO_VEHICLE
 from augment.timing import timed
 
-# Opacity of a pixel up to which it shows no surface that hides a lamp.
-MIN_ALPHA = 1e-3
 # Width of the pixels of halos by day, over that at night: they are faint.
 DAY_HALO_STEPS = 2
 
@@ -68,9 +65,10 @@ def add_lamp_light(
     assert raster.alpha is not None and raster.expected_depth is not None
     alpha = np.ascontiguousarray(raster.alpha.detach().cpu().numpy(), np.float32)
     z = np.ascontiguousarray(raster.expected_depth.detach().cpu().numpy(), np.float32)
-    depth_m = np.where((alpha >= SURFACE_ALPHA) & np.isfinite(z), z, np.float32(0))
-    air = air_of(effect, view)
-    added = np.zeros_like(rgb) if recorded is None else recorded
+    depth_m = find_surfaces(alpha, z, uses_kernels=effect.backend != REFERENCE)
+    air = air_of(effect, view, camera)
+    # Not zeros_like, which would write to memory where no light is added.
+    added = np.zeros(rgb.shape, np.float32) if recorded is None else recorded
     if plan.hour.is_dark:
         car_pixels = recording_car_pixels(effect.scene, camera)
         if car_pixels is not None:
@@ -101,23 +99,19 @@ def add_lamp_light(
                     camera,
                     uses_kernels=effect.backend != REFERENCE,
                 )
-    surface_m = np.where(alpha > MIN_ALPHA, z, np.float32(np.inf))
     if not air.is_clear:
         with timed(AIR):
-            u, v = unit_depth_coordinates(camera)
-            distance_m = np.sqrt(1 + u[None, :] ** 2 + v[:, None] ** 2) * depth_m
-            distance_m[depth_m <= 0] = np.inf
-            added += air_light(
+            air_light(
                 lamps,
                 camera,
-                distance_m,
+                depth_m,
                 air,
                 num_points=plan.lamp_points,
                 step_px=plan.lamp_halo_px * (1 if plan.hour.is_dark else DAY_HALO_STEPS),
                 threshold_cd_m2=threshold_cd_m2,
-                visible_shares=lamp_visibility(
-                    lamps, camera, surface_m, alpha, radius_m=HALO_RADIUS_M
-                ),
+                visible_shares=lamp_visibility(lamps, camera, z, alpha, radius_m=HALO_RADIUS_M),
+                picture=added,
+                is_depth=True,
             )
     if plan.hour.is_dark and plan.has_drops:
         with timed(DROPS):
@@ -133,7 +127,7 @@ def add_lamp_light(
                     min_luminance_cd_m2=threshold_cd_m2,
                 )
     with timed(EMITTERS):
-        visible_shares = lamp_visibility(lamps, camera, surface_m, alpha)
+        visible_shares = lamp_visibility(lamps, camera, z, alpha)
         add_emitters(added, lamps, camera, visible_shares, air)
     return added
 
@@ -171,8 +165,11 @@ def _airlight(view: RenderedView, color_map: Tensor | None) -> tuple[float, floa
     return (red, green, blue)
 
 
-def air_of(effect: EffectInScene, view: RenderedView) -> AirExtinction:
-    """Return the extinction of fog, rain and snowfall in a view."""
+def air_of(effect: EffectInScene, view: RenderedView, camera: Camera) -> AirExtinction:
+    """Return the extinction of fog, rain and snowfall in a view.
+
+    Fog with banks counts as plain fog that is as dense as the banks around the camera.
+    """
     per_m = 0.0
     kind: Literal["rain", "snow"] = "rain"
     for other in effect.earlier_effects:
@@ -181,7 +178,10 @@ def air_of(effect: EffectInScene, view: RenderedView) -> AirExtinction:
             per_m += sizes.extinction_per_m
             if other.hooks.name == "snowfall":
                 kind = "snow"
-    fog = next((o.settings.fog for o in effect.earlier_effects if o.hooks.name == "smog"), None)
+    smog = next((o for o in effect.earlier_effects if o.hooks.name == "smog"), None)
+    fog = None
+    if smog is not None:
+        fog = local_fog(smog.settings.fog_at(smog.weather_time_s), camera)
     return AirExtinction(fog, per_m, kind)
 
 

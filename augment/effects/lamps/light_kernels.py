@@ -344,3 +344,22 @@ def find_reflectance(rgb, fog_share, airlight, numbers, out):
             for j in range(len(codes)):
                 code = min(max(codes[j], zero), MAX_CODE)
                 results[j] = min(max(light_of_code(code) * per_white, least), most)
+
+
+@kernel
+def find_surfaces(alpha, depth, min_alpha, surface_m):
+    """Write the depth of pixels that show a surface.
+
+    Args:
+        alpha: opacity, float32 [H, W].
+        depth: z of what the pixels show, metres, float32 [H, W].
+        min_alpha: opacity from which on a pixel shows a surface.
+        surface_m: output, z of the surfaces, 0 without one or where z is not finite.
+    """
+    zero = np.float32(0)
+    largest = np.float32(np.finfo(np.float32).max)
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            z = depth[i, j]
+            is_surface = (alpha[i, j] >= min_alpha) & (abs(z) <= largest)
+            surface_m[i, j] = z if is_surface else zero

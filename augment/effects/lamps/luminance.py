@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from augment.effects.lamps.glare import widen_glare
 from augment.effects.lamps.luminance_kernels import measure_luminance
 from augment.light.srgb import LUMINANCE_WEIGHTS, linear_from_display
 from augment.render.composite import ROWS_PER_CHUNK
@@ -32,7 +33,7 @@ class LightMeter(NamedTuple):
 
 def read_light(
     rgb: Float32[np.ndarray, "H W 3"],
-    glare: Float32[np.ndarray, "H W 3"] | None,
+    glare: Float32[np.ndarray, "h w 3"] | None,
     white_cd_m2: float,
     *,
     needs_luminance: bool,
@@ -42,7 +43,7 @@ def read_light(
 
     Args:
         rgb: exposed picture, display-encoded; 1 saturates the sensor.
-        glare: light that the lens scatters; None for none.
+        glare: light that the lens scatters, at half the resolution; None for none.
         white_cd_m2: luminance that saturates the sensor, cd/m2.
         needs_luminance: False for the veiled pixels alone.
         uses_kernels: False for the plain definition.
@@ -51,7 +52,9 @@ def read_light(
     if not uses_kernels:
         weights = np.asarray(LUMINANCE_WEIGHTS)
         light = linear_from_display(np.maximum(rgb, 0).astype(np.float64)) @ weights
-        veil = np.zeros(shape) if glare is None else glare.astype(np.float64) @ weights
+        veil = np.zeros(shape)
+        if glare is not None:
+            veil = widen_glare(glare, rgb.shape[1], rgb.shape[0]).astype(np.float64) @ weights
         luminance = ((light + veil) * white_cd_m2).astype(np.float32)
         return LightMeter(
             luminance if needs_luminance else None, (veil > light) & (veil >= MIN_VEIL)

@@ -15,6 +15,7 @@ from augment.effects.lamps.glare import widen_glare
 from augment.effects.lamps.light_kernels import MAX_LIGHT
 from augment.light.srgb import display_from_linear, linear_from_display
 from augment.render.composite import ROWS_PER_CHUNK
+from augment.render.constants import SURFACE_ALPHA
 from augment.render.sensor import LEVEL_SD
 from augment.render.threads import kernel_threads
 
@@ -181,6 +182,28 @@ def find_reflectance(
     light = (light - share * airlight) / white
     bounds = MIN_REFLECTANCE * (1 - share), MAX_REFLECTANCE * (1 - share)
     return np.clip(light, *bounds).astype(np.float32)
+
+
+def find_surfaces(
+    alpha: Float32[np.ndarray, "H W"],
+    depth_m: Float32[np.ndarray, "H W"],
+    *,
+    uses_kernels: bool = True,
+) -> Float32[np.ndarray, "H W"]:
+    """Return the depth of pixels that show a surface, 0 for the sky.
+
+    Args:
+        alpha: opacity of the pixels.
+        depth_m: z of what they show, metres.
+        uses_kernels: False for the plain definition.
+    """
+    if not uses_kernels:
+        is_surface = (alpha >= SURFACE_ALPHA) & np.isfinite(depth_m)
+        return np.where(is_surface, depth_m, np.float32(0))
+    surface_m = np.empty_like(depth_m)
+    with kernel_threads(ROWS_PER_CHUNK):
+        light_kernels.find_surfaces(alpha, depth_m, np.float32(SURFACE_ALPHA), surface_m)
+    return surface_m
 
 
 def _rows(image: np.ndarray) -> np.ndarray:
