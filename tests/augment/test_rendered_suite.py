@@ -17,6 +17,7 @@ from augment.effects.lens_drops.drops import LensDropsPlan, drops_at
 from augment.effects.lidar.codes import ATTENUATED
 from augment.effects.smog import wavelength_factor
 from augment.errors import OutputError
+from augment.output.manifest import read_manifest_rows
 from augment.output.names import STATE_FOLDER
 from augment.output.store import open_store
 from augment.render.scatter import scattered_share
@@ -279,13 +280,18 @@ def test_a_real_street_on_the_fly_has_the_bytes_of_its_files(tmp_path: Path):
         return open_street(LABELLED_STREET)
 
     run = make_run(
-        tmp_path, scenes=["street"], effects=["fog"], levels=[2], frames="0",
+        tmp_path, scenes=["street"], effects=["fog", "lens"], levels=[5], frames="0",
         renderer=None, opener=opener,
     )  # fmt: skip
     assert run_suite(run, progress=False).images.failed == 0
     suite_file = read_suite_file(open_store(tmp_path))
-    live = SuiteDataset([open_street(LABELLED_STREET)], "fog-2", frames="0", cameras=["front"])
-    live.check(0, suite_file)
+    for variant in ("fog-5", "lens-5"):
+        scenes = [open_street(LABELLED_STREET)]
+        SuiteDataset(scenes, variant, frames="0", cameras=["front"]).check(0, suite_file)
+    rows = read_manifest_rows(open_store(tmp_path)).to_pylist()
+    shares = [row["lens_drops_fraction"] for row in rows if row["recipe"] == "lens-5"]
+    # The mask has what a tenth of the light of is from drops: some more than their share.
+    assert 0.25 < np.mean(shares) < 0.6
 
 
 # ---- One number for camera and LiDAR, and for every lens -----------------------------------------
