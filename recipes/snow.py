@@ -193,12 +193,16 @@ class Snow(EffectModel):
         depths = moment.curves.get(f"{path}.depth_m")
         traffic = moment.curves.get(f"{path}.traffic")
         changes = {f"{path}.coverage", f"{path}.depth_m", f"{path}.traffic"} & set(moment.curves)
+        changes |= {name for name in moment.curves if name.startswith(f"{path}.road.")}
         weather = _snow_weather(self.depth_m, moment) if depths is None else None
         if weather is None and not changes:
             return self
         fields: dict[str, object] = {}
         driven = 1.0
         largest_m = self.depth_m if depths is None else max(depths.values)
+        if self.road is not None:
+            road_depths = moment.curve(f"{path}.road.depth_m", self.road.depth_m)
+            largest_m = max(largest_m, *road_depths.values)
         if traffic is not None:
             largest_traffic = max(traffic.values)
             driven = (self.traffic / largest_traffic) ** 2  # as the number of cars grows
@@ -206,7 +210,7 @@ class Snow(EffectModel):
         if weather is not None:
             road = Surface(moment.curve("weather.air.road_warmer_k", _road_warmer_k(moment)), True)
             fields["depth_m"] = layer_at(moment.time_s, weather).depth_m
-            largest_m = largest_depth_m(weather, moment.end_s)
+            largest_m = max(largest_m, largest_depth_m(weather, moment.end_s))
             if self.road is None:
                 layer = layer_at(moment.time_s, weather, road)
                 if self.depth_m == 0:

@@ -177,6 +177,15 @@ def test_traffic_over_time_is_the_share_of_its_most_cars() -> None:
     assert state.road.depth_m == 0.05
 
 
+def test_a_road_over_time_by_hand_has_one_laid_depth() -> None:
+    curves = {"weather.snow.road.depth_m": Curve((0, 10), (0.0, 0.3))}
+    states = [
+        at(Snow(depth_m=0.1, road=SnowRoad(depth_m=depth_m)), 5.0, curves)
+        for depth_m in (0.0, 0.15, 0.3)
+    ]
+    assert [state.placed_depth_m for state in states] == [0.3] * 3
+
+
 def test_a_recipe_without_the_later_fields_has_snow_only_with_depth() -> None:
     assert not Snow(depth_m=0.0).has_effect
     assert not Snow(depth_m=0.0, placed_depth_m=0.1).has_effect

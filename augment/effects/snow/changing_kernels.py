@@ -14,7 +14,7 @@ from numba import prange
 
 from augment.effects.snow.layer_kernels import MIN_DEPTH_M
 from augment.effects.snow.traffic import SATURATION
-from augment.render.cpu.jit import kernel, kernel_function
+from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
 from augment.render.sh import SH_C0
 
 # ---- Constants of the share and depth; all are judgement -----------------------------------------
@@ -24,6 +24,7 @@ TRANSLUCENT_DEPTH_M = 0.0015  # depth of snow that hides all but 1/e of what it 
 OVERLAP = 0.35  # 1 over the number of discs that cover a place
 BARE_BAND = 0.5  # change of the passes, in those that bare the road, over which snow goes
 MAX_TABLE_DEPTH_M = 0.05  # depth of the snow at the end of tables; deeper snow looks like it
+TABLES_PER_M = 1 / MAX_TABLE_DEPTH_M  # its reciprocal
 TABLE_SIZE = 1025  # number of values of a table
 # Shares of snow between which the scene's Gaussians beneath it fade.
 FADE_BEGIN = 0.35
@@ -98,7 +99,7 @@ class SnowTables(NamedTuple):
 
 
 class LaidSplats(NamedTuple):
-    """Gaussians of a layer as it was laid, or at a moment."""
+    """Gaussians of a layer as it was laid, in the colours of deep snow, or at a moment."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -124,19 +125,33 @@ def _look_up(table, t):
     return table[k] + (place - k) * (table[k + 1] - table[k])
 
 
+# Arrays of a record are read into variables before a loop, and numbers are handed on: numba counts
+# references to each array of a record that it hands on, which takes ten times as long.
+
+
 @kernel_function()
-def cell_snow(i, cells, state, tables):
-    """Return the share of cell i that snow covers, and its depth, as `define_snow` defines it."""
-    laid_m = np.float64(cells.depths_m[i])
+def _cell_snow(noise, laid_m, road, soft, passes, factor, ridge, state, translucency):
+    """Return the share of a cell that snow covers, and its depth, as `define_snow` defines it.
+
+    Args:
+        noise: the cell's number in `ChangingCells`, and so on up to `ridge`.
+        laid_m: its `depths_m`.
+        road: its `road`.
+        soft: its `soft`.
+        passes: its `passes`.
+        factor: its `baring`.
+        ridge: its `ridge`.
+        state: the moment.
+        translucency: the table of that name.
+    """
     if laid_m == 0.0:
         return 0.0, 0.0
-    road = np.float64(cells.road[i])
     threshold = (
         state.hard_threshold
-        + cells.soft[i] * (state.soft_threshold - state.hard_threshold)
+        + soft * (state.soft_threshold - state.hard_threshold)
         + road * (state.road_threshold - state.hard_threshold)
     )
-    over = np.float64(cells.noise[i]) - threshold
+    over = noise - threshold
     share = _smooth(0.5 + over / (state.band + road * (state.road_band - state.band)))
     share *= state.onset + road * (state.road_onset - state.onset)
     if share <= 0.0:
@@ -144,16 +159,16 @@ def cell_snow(i, cells, state, tables):
     depth_m = laid_m * (state.scale + road * (state.road_scale - state.scale))
     rim = min(max(0.5 + over / RIM, 0.0), 1.0)
     depth_m = MIN_DEPTH_M + max(depth_m - MIN_DEPTH_M, 0.0) * rim
-    passes = cells.passes[i] * state.driven
+    passes = passes * state.driven
     if passes > 0.0:
         fresh_m = depth_m
         pressed = 1.0 - math.exp(-passes / SATURATION)
         depth_m *= (1.0 - road * state.scraped) * (1.0 - state.pressed_share * pressed)
         ridge_m = min(state.ridge_share * fresh_m, state.max_ridge_m)
-        depth_m += ridge_m * state.driven * cells.ridge[i]
-        baring = (state.baring_passes + state.baring_passes_per_m * fresh_m) * cells.baring[i]
+        depth_m += ridge_m * state.driven * ridge
+        baring = (state.baring_passes + state.baring_passes_per_m * fresh_m) * factor
         share *= 1.0 - _smooth(0.5 + (passes / baring - 1.0) / BARE_BAND)
-    return share * _look_up(tables.translucency, depth_m / MAX_TABLE_DEPTH_M), depth_m
+    return share * _look_up(translucency, depth_m * TABLES_PER_M), depth_m
 
 
 @kernel
@@ -175,49 +190,85 @@ def scale_splats(runs, laid, floors, cell_ids, cells, state, tables, shares, sca
         _scale_run(runs[r], laid, floors, cell_ids, cells, state, tables, shares, scaled)
 
 
+@serial_kernel
+def scale_few_splats(run, laid, floors, cell_ids, cells, state, tables, shares, scaled):
+    """Write the Gaussians of one run, int64 [3], as `scale_splats` does, without other threads."""
+    _scale_run(run, laid, floors, cell_ids, cells, state, tables, shares, scaled)
+
+
 @kernel_function()
 def _scale_run(run, laid, floors, cell_ids, cells, state, tables, shares, scaled):
     """Write the Gaussians of one run."""
     last_cell = -1
     opacity = np.float32(0)
     ratio = np.float32(0)
-    brightness = np.float32(1)
+    tone = np.float32(1)
     shift = np.float32(0)
     thickness = np.float32(1)
     grey = np.float32(0.5 / SH_C0)
+    noise = cells.noise
+    depths_m = cells.depths_m
+    road = cells.road
+    soft = cells.soft
+    passes = cells.passes
+    baring = cells.baring
+    ridge = cells.ridge
+    has_cars = state.driven > 0.0  # the three tables above need not be read without any
+    translucency = tables.translucency
+    opacities = tables.opacity
+    tones = tables.brightness
+    means = laid.means
+    quats = laid.quats
+    scales = laid.scales
+    sh = laid.sh
+    slopes = laid.slopes
+    normals = laid.normals
+    new_means = scaled.means
+    new_quats = scaled.quats
+    new_scales = scaled.scales
+    new_opacities = scaled.opacities
+    new_sh = scaled.sh
+    new_slopes = scaled.slopes
+    new_normals = scaled.normals
     for s in range(run[0], run[1]):
         v = run[2] + s - run[0]
         i = cell_ids[s]
         if i != last_cell:
             last_cell = i
-            share, depth_m = cell_snow(i, cells, state, tables)
-            laid_m = max(np.float64(cells.depths_m[i]), 1e-6)
-            shares[i] = np.float32(share)
-            ratio = np.float32(depth_m / laid_m)
-            thickness = np.float32(min(0.4 + 0.6 * ratio, 1.0))
-            opacity = np.float32(_look_up(tables.opacity, share))
-            brightness = np.float32(
-                _look_up(tables.brightness, depth_m / MAX_TABLE_DEPTH_M)
-                / _look_up(tables.brightness, laid_m / MAX_TABLE_DEPTH_M)
+            share, depth_m = _cell_snow(
+                np.float64(noise[i]),
+                np.float64(depths_m[i]),
+                np.float64(road[i]),
+                np.float64(soft[i]),
+                np.float64(passes[i]) if has_cars else 0.0,
+                np.float64(baring[i]) if has_cars else 1.0,
+                np.float64(ridge[i]) if has_cars else 0.0,
+                state,
+                translucency,
             )
-            shift = (brightness - np.float32(1)) * grey
-        scaled.opacities[v] = opacity
-        scaled.means[v, 0] = laid.means[s, 0]
-        scaled.means[v, 1] = laid.means[s, 1]
-        scaled.means[v, 2] = floors[s] + ratio * (laid.means[s, 2] - floors[s])
+            shares[i] = np.float32(share)
+            ratio = np.float32(depth_m / max(np.float64(depths_m[i]), 1e-6))
+            thickness = min(np.float32(0.4) + np.float32(0.6) * ratio, np.float32(1))
+            opacity = np.float32(_look_up(opacities, share))
+            tone = np.float32(_look_up(tones, depth_m * TABLES_PER_M))
+            shift = (tone - np.float32(1)) * grey
+        new_opacities[v] = opacity
+        new_means[v, 0] = means[s, 0]
+        new_means[v, 1] = means[s, 1]
+        new_means[v, 2] = floors[s] + ratio * (means[s, 2] - floors[s])
         for k in range(4):
-            scaled.quats[v, k] = laid.quats[s, k]
-        scaled.scales[v, 0] = laid.scales[s, 0]
-        scaled.scales[v, 1] = laid.scales[s, 1]
-        scaled.scales[v, 2] = thickness * laid.scales[s, 2]
+            new_quats[v, k] = quats[s, k]
+        new_scales[v, 0] = scales[s, 0]
+        new_scales[v, 1] = scales[s, 1]
+        new_scales[v, 2] = thickness * scales[s, 2]
         for c in range(3):
-            scaled.sh[v, 0, c] = brightness * laid.sh[s, 0, c] + shift
-        if len(laid.slopes) > 0:
+            new_sh[v, 0, c] = tone * sh[s, 0, c] + shift
+        if len(slopes) > 0:
             for c in range(3):
-                scaled.slopes[v, c] = brightness * laid.slopes[s, c]
-        if len(laid.normals) > 0:
+                new_slopes[v, c] = tone * slopes[s, c]
+        if len(normals) > 0:
             for c in range(3):
-                scaled.normals[v, c] = laid.normals[s, c]
+                new_normals[v, c] = normals[s, c]
 
 
 @kernel
@@ -238,28 +289,93 @@ def fade_buried(
         opacities: float32 [N]; written.
     """
     for r in prange(len(runs)):
-        for b in range(runs[r, 0], runs[r, 1]):
-            least = np.float32(1)
-            for k in range(covering_cells.shape[1]):
-                cell_id = covering_cells[b, k]
-                if cell_id < 0:
-                    least = np.float32(0)
-                    break
-                share = shares[cell_id]
-                if share < 0:
-                    share = np.float32(cell_snow(cell_id, cells, state, tables)[0])
-                least = min(least, share)
-                if least <= FADE_BEGIN:
-                    break
-            if least > FADE_BEGIN:
-                n = hideable_ids[b]
-                fade = _smooth((least - FADE_BEGIN) / (FADE_END - FADE_BEGIN))
-                opacities[n] = np.float32(laid_opacities[n] * (1.0 - fade))
+        _fade_run(
+            runs[r],
+            hideable_ids,
+            covering_cells,
+            cells,
+            state,
+            tables,
+            shares,
+            laid_opacities,
+            opacities,
+        )
+
+
+@serial_kernel
+def fade_few_buried(
+    run, hideable_ids, covering_cells, cells, state, tables, shares, laid_opacities, opacities
+):
+    """Fade the Gaussians of one run, int64 [2], as `fade_buried` does, without other threads."""
+    _fade_run(
+        run, hideable_ids, covering_cells, cells, state, tables, shares, laid_opacities, opacities
+    )
+
+
+@kernel_function()
+def _fade_run(
+    run, hideable_ids, covering_cells, cells, state, tables, shares, laid_opacities, opacities
+):
+    """Fade the Gaussians of one run."""
+    noise = cells.noise
+    depths_m = cells.depths_m
+    road = cells.road
+    soft = cells.soft
+    passes = cells.passes
+    baring = cells.baring
+    ridge = cells.ridge
+    translucency = tables.translucency
+    for b in range(run[0], run[1]):
+        least = np.float32(1)
+        for k in range(covering_cells.shape[1]):
+            cell_id = covering_cells[b, k]
+            if cell_id < 0:
+                least = np.float32(0)
+                break
+            share = shares[cell_id]
+            if share < 0:
+                exact_share, _ = _cell_snow(
+                    np.float64(noise[cell_id]),
+                    np.float64(depths_m[cell_id]),
+                    np.float64(road[cell_id]),
+                    np.float64(soft[cell_id]),
+                    np.float64(passes[cell_id]),
+                    np.float64(baring[cell_id]),
+                    np.float64(ridge[cell_id]),
+                    state,
+                    translucency,
+                )
+                share = np.float32(exact_share)
+            least = min(least, share)
+            if least <= FADE_BEGIN:
+                break
+        if least > FADE_BEGIN:
+            n = hideable_ids[b]
+            fade = _smooth((least - FADE_BEGIN) / (FADE_END - FADE_BEGIN))
+            opacities[n] = np.float32(laid_opacities[n] * (1.0 - fade))
 
 
 @kernel
 def find_cell_depths(cells, state, tables, depths_m):
     """Compute the depth on all cells whose snow hides half of what it lies on; 0 elsewhere."""
+    noise = cells.noise
+    laid_depths_m = cells.depths_m
+    road = cells.road
+    soft = cells.soft
+    passes = cells.passes
+    baring = cells.baring
+    ridge = cells.ridge
+    translucency = tables.translucency
     for i in prange(len(depths_m)):
-        share, depth_m = cell_snow(np.int64(i), cells, state, tables)
+        share, depth_m = _cell_snow(
+            np.float64(noise[i]),
+            np.float64(laid_depths_m[i]),
+            np.float64(road[i]),
+            np.float64(soft[i]),
+            np.float64(passes[i]),
+            np.float64(baring[i]),
+            np.float64(ridge[i]),
+            state,
+            translucency,
+        )
         depths_m[i] = np.float32(depth_m if share >= 0.5 else 0.0)
