@@ -106,6 +106,20 @@ class Rain(EffectModel):
             decides_absence=False,
             linear=True,
         ),
+        Column(
+            "rain_film_mm",
+            lambda rain: None if rain.road is None else rain.road.film_mm,
+            "Film of water on the road",
+            "mm",
+            linear=True,
+        ),
+        Column(
+            "rain_puddles",
+            lambda rain: rain.puddle_share if rain.wets_ground else 0.0,
+            "Share of the ground under puddles",
+            value_if_absent=0.0,
+            linear=True,
+        ),
     )
 
     rate_mm_h: Number = Field(ge=0, le=MAX_RATE_MM_H)

@@ -121,7 +121,7 @@ class WetGround:
         v = (y - j)[..., None].float()
         i1 = (i + 1).clamp_max(columns - 1)
         j1 = (j + 1).clamp_max(rows - 1)
-        flat = values.reshape(rows * columns, -1)
+        flat = values.reshape(rows * columns, -1).to(x_m.device)
         below = flat[j * columns + i] * (1 - u) + flat[j * columns + i1] * u
         above = flat[j1 * columns + i] * (1 - u) + flat[j1 * columns + i1] * u
         return below * (1 - v) + above * v
