@@ -494,6 +494,7 @@ def _find_worst(run: _Run) -> list[WorstImage]:
             number=number,
             **run.suite.images[number]._asdict(),
             path=run.suite.rows[name][number]["image_path"],
+            clean_path=run.suite.rows[CLEAN_VARIANT][number]["image_path"],
             found_clean=clean_counts[number],
             found=counts[name][number],
             objects=_worst_objects(run, name, number),

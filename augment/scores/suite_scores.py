@@ -133,6 +133,8 @@ class WorstImage(_Closed):
     """Name of the camera."""
     path: str
     """Path of the image in the output."""
+    clean_path: str
+    """Path of the clean render."""
     found_clean: float
     """Objects that are found in the clean render; of semantics the share of right pixels."""
     found: float

@@ -15,8 +15,14 @@ from augment.output.box_tables import BOXES_2D, BoxNumbers
 from augment.output.box_weather import box_tables
 from augment.output.codecs import encode_ids, encode_image
 from augment.output.layout import item_paths, path_columns, variant_folder, variant_name
-from augment.output.manifest import OK, Identity, ImageFacts, image_row, rows_to_table
-from augment.output.manifest import write_manifest
+from augment.output.manifest import (
+    OK,
+    Identity,
+    ImageFacts,
+    image_row,
+    rows_to_table,
+    write_manifest,
+)
 from augment.output.tables import FrameBoxes, boxes_bytes
 from augment.scene.labels import Boxes
 from augment.scores.probe import probe
@@ -165,10 +171,8 @@ def _write_tables(top: Path, transmittance: float | None) -> None:
         **{"fx": 90.0, "fy": 90.0, "cx": WIDTH / 2, "cy": HEIGHT / 2},
         "world_from_camera": np.eye(4).tolist(),
     }
-    frames = [
-        {"frame": f, "timestamp_ns": f, "world_from_ego": np.eye(4).tolist(), "cameras": {CAMERA: camera}}
-        for f in FRAMES
-    ]  # fmt: skip
+    pose = {"timestamp_ns": 0, "world_from_ego": np.eye(4).tolist(), "cameras": {CAMERA: camera}}
+    frames = [{"frame": f, **pose} for f in FRAMES]
     _write(top / "calibration.json", json.dumps({"frames": frames}).encode())
 
 
