@@ -80,9 +80,10 @@ def _bytes_problem(suite: RenderedSuite, path: str, answer: str) -> str:
     """Return the fault of a SHA-256 that a loader gave of an image's bytes."""
     if answer == suite.entries.files.get(path):
         return ""
-    others = [other for other, digest in suite.entries.files.items() if digest == answer]
-    named = f"the bytes of {others[0]}" if others else "bytes that no file of the suite has"
-    return f"for {path} the loader gave {named}"
+    other_paths = [other for other, digest in suite.entries.files.items() if digest == answer]
+    if other_paths:
+        return f"for {path} the loader gave the bytes of {other_paths[0]}"
+    return f"for {path} the loader gave bytes that no file of the suite has"
 
 
 def _pixels_problem(suite: RenderedSuite, variant: str, path: str, answer: str) -> str:

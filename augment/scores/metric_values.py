@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -33,6 +33,7 @@ class MetricValue(NamedTuple):
     """Value of each category; None where no object counts."""
 
 
+@runtime_checkable
 class Metric(Protocol):
     """A metric of predictions on images of a suite."""
 
@@ -85,7 +86,18 @@ class KittiMetric:
         return f"AP|R40 {self.view} {self.difficulty} (KITTI)"
 
     def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
-        """Return the mean AP on the images of some numbers."""
+        """Return the mean AP on the images of some numbers.
+
+        Raises:
+            ScoreError: The view needs 3D boxes, and a detection has none.
+        """
+        sizes = np.concatenate([image.boxes_3d[:, 3:6] for image in predictions.detections])
+        without_size = int((~np.all(sizes > 0, axis=1)).sum())
+        if self.view != "bbox" and without_size:
+            raise ScoreError(
+                f"{predictions.folder}: {without_size} of {len(sizes)} detections have no height, "
+                f"width and length above 0, which the view {self.view} needs"
+            )
         precisions = kitti_average_precision(
             [self.truth.images[number] for number in numbers],
             [predictions.detections[number] for number in numbers],

@@ -68,7 +68,7 @@ class ImageDetections:
     scores: Float64[np.ndarray, " N"]
     """Confidence of each detection."""
     boxes_3d: Float64[np.ndarray, "N 7"]
-    """3D boxes, as of `ImageTruth`; no rows where the predictions have none."""
+    """3D boxes, as of `ImageTruth`; NaN where the predictions have none."""
 
     def __len__(self) -> int:
         return len(self.categories)
@@ -188,7 +188,8 @@ def read_coco(
     wrong: list[str] = []
     for k, entry in enumerate(entries):
         try:
-            image_id, category_id = entry["image_id"], entry["category_id"]
+            image_id = entry["image_id"]
+            category_id = entry["category_id"]
             left, top, width, height = (float(value) for value in entry["bbox"])
             score = float(entry["score"])
             is_finite = all(map(math.isfinite, (left, top, width, height, score)))
@@ -230,11 +231,9 @@ def read_coco(
 
 def _detections(rows: np.ndarray, boxes_3d: np.ndarray | None = None) -> ImageDetections:
     """Return the detections of rows [N, 6] of category, box and score."""
-    empty = np.zeros((0, NUM_BOX_3D_COLUMNS))
-    categories = rows[:, 0].astype(np.int64)
-    return ImageDetections(
-        categories, rows[:, 1:5], rows[:, 5], empty if boxes_3d is None else boxes_3d
-    )
+    if boxes_3d is None:
+        boxes_3d = np.full((len(rows), NUM_BOX_3D_COLUMNS), np.nan)
+    return ImageDetections(rows[:, 0].astype(np.int64), rows[:, 1:5], rows[:, 5], boxes_3d)
 
 
 def read_kitti(
@@ -300,9 +299,9 @@ def refuse(path: Path, problem: str, names: Iterable[object]) -> None:
 def _check_folder(folder: Path, ending: str, expected: ExpectedImages) -> str:
     """Compare the files of a folder with the suite's images; return the SHA-256 of them all."""
     names = {f"{number:06d}{ending}" for number in range(len(expected.images))}
-    there = {path.name for path in folder.iterdir()}
-    refuse(folder, "files for images that the suite does not have", sorted(there - names))
-    refuse(folder, "missing files", sorted(names - there))
+    file_names = {path.name for path in folder.iterdir()}
+    refuse(folder, "files for images that the suite does not have", sorted(file_names - names))
+    refuse(folder, "missing files", sorted(names - file_names))
     digest = hashlib.sha256()
     for name in sorted(names):
         data = read_file(folder / name)

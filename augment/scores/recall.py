@@ -91,13 +91,13 @@ class RecallBin:
     """Upper bound; inf for none."""
     objects: int
     """Number of objects."""
-    found: int
+    num_found: int
     """Number of them that are found."""
 
     @property
     def recall(self) -> float | None:
         """Return the share that is found; None without objects."""
-        return self.found / self.objects if self.objects else None
+        return self.num_found / self.objects if self.objects else None
 
 
 def recall_by(

@@ -174,11 +174,12 @@ def _open_run(suite: RenderedSuite, folder: Path, options: ScoreOptions) -> _Run
     effects = _choose_effects(suite, options.effects)
     variants = [CLEAN_VARIANT, *(name for names in effects.values() for name in names)]
     check_variants(variants, lambda name: (folder / name).is_dir(), str(folder))
-    others = {path.name for path in folder.iterdir() if path.is_dir()} - {*suite.rows, RECORDED}
-    if others:
+    folder_names = {path.name for path in folder.iterdir() if path.is_dir()}
+    other_folders = folder_names - {*suite.rows, RECORDED}
+    if other_folders:
         raise ScoreError(
             f"{folder} has folders that are no variant of {suite.name}: "
-            f"{list_names(sorted(others))}"
+            f"{list_names(sorted(other_folders))}"
         )
     kinds = {name: find_kind(folder / name) for name in variants}
     if len(set(kinds.values())) > 1:
@@ -204,7 +205,7 @@ def _open_run(suite: RenderedSuite, folder: Path, options: ScoreOptions) -> _Run
 def _match_images(truth: SuiteTruth, predictions: Predictions) -> list[ImageHits]:
     """Return the matched objects of each image."""
     pairs = zip(truth.images, predictions.detections, strict=True)
-    return [match_image(objects, found, predictions.kind) for objects, found in pairs]
+    return [match_image(objects, boxes, predictions.kind) for objects, boxes in pairs]
 
 
 def _choose_effects(
@@ -249,9 +250,7 @@ def _choose_metric(
     if kind == "semantic":
         return SemanticMetric(suite)
     if options.nuscenes_root is None:
-        raise ScoreError(
-            "nuScenes results are scored with the dataset's annotations: --nuscenes PATH"
-        )
+        raise ScoreError("nuScenes results need the dataset's annotations: --nuscenes PATH")
     return NuScenesMetric(options.nuscenes_root, options.nuscenes_version, options.nuscenes_split)
 
 
@@ -364,8 +363,8 @@ def _recall(run: _Run, variant: str, numbers: Sequence[int]) -> float | None:
         return None
     images = [run.hits[variant][number] for number in numbers]
     count = sum(int(image.is_counted.sum()) for image in images)
-    found = sum(int(image.found(run.threshold).sum()) for image in images)
-    return found / count if count else None
+    num_found = sum(int(image.found(run.threshold).sum()) for image in images)
+    return num_found / count if count else None
 
 
 def _false_per_image(run: _Run, variant: str, numbers: Sequence[int]) -> float | None:
@@ -432,14 +431,14 @@ def _recall_bins(run: _Run, effect: str) -> RecallBins:
             visible_fractions.append(truth.visible_fractions[hits.is_counted])
             ranges_m.append(truth.ranges_m[hits.is_counted])
             is_found.append(hits.found(run.threshold)[hits.is_counted])
-    found = np.concatenate(is_found)
+    is_object_found = np.concatenate(is_found)
     columns = {
         "transmittance": (transmittances, SHARE_BOUNDS),
         "visible_fraction": (visible_fractions, SHARE_BOUNDS),
         "range_m": (ranges_m, RANGE_BOUNDS_M),
     }
     bins = {
-        name: tuple(map(_bin_score, recall_by(np.concatenate(arrays), found, bounds)))
+        name: tuple(map(_bin_score, recall_by(np.concatenate(arrays), is_object_found, bounds)))
         for name, (arrays, bounds) in columns.items()
     }
     return RecallBins(**bins)
@@ -451,7 +450,7 @@ def _bin_score(counted: RecallBin) -> RecallBinScore:
         lower=counted.lower,
         upper=counted.upper if np.isfinite(counted.upper) else None,
         objects=counted.objects,
-        found=counted.found,
+        num_found=counted.num_found,
         recall=counted.recall,
     )
 
@@ -495,8 +494,8 @@ def _find_worst(run: _Run) -> list[WorstImage]:
             **run.suite.images[number]._asdict(),
             path=run.suite.rows[name][number]["image_path"],
             clean_path=run.suite.rows[CLEAN_VARIANT][number]["image_path"],
-            found_clean=clean_counts[number],
-            found=counts[name][number],
+            clean_hits=clean_counts[number],
+            hits=counts[name][number],
             objects=_worst_objects(run, name, number),
         )
         for _, name, number in worst[:MAX_WORST]

@@ -13,7 +13,7 @@ NUM_CLASSES = len(SemanticClass)
 
 def count_pixels(
     true_classes: np.ndarray, predicted_classes: np.ndarray
-) -> Int64[np.ndarray, "C C"]:
+) -> Int64[np.ndarray, "C D"]:
     """Return the number of pixels of each true class (rows) that have each predicted class.
 
     Pixels of the true class UNKNOWN do not count. The last column has pixels without a prediction.

@@ -90,7 +90,7 @@ class RecallBinScore(_Closed):
     """Upper bound; None for none."""
     objects: int
     """Number of objects, over all levels."""
-    found: int
+    num_found: int
     """Number of them that are found at the clean threshold."""
     recall: float | None
     """Share that is found; None without objects."""
@@ -135,9 +135,9 @@ class WorstImage(_Closed):
     """Path of the image in the output."""
     clean_path: str
     """Path of the clean render."""
-    found_clean: float
+    clean_hits: float
     """Objects that are found in the clean render; of semantics the share of right pixels."""
-    found: float
+    hits: float
     """The same in this variant."""
     objects: tuple[WorstObject, ...]
     """Objects that count; none for semantics."""
@@ -245,11 +245,11 @@ def check_baseline(scores: SuiteScores, baseline: SuiteScores, where: str) -> li
             for record in (scores, baseline)
         ),
     }  # fmt: skip
-    for name, (here, there) in facts.items():
-        if here != there:
+    for name, (value, baseline_value) in facts.items():
+        if value != baseline_value:
             raise ScoreError(
-                f"the baseline {where} is of another {name}: {there} there, {here} here; score the "
-                f"baseline's predictions on this suite"
+                f"the baseline {where} is of another {name}: {baseline_value} there, {value} here; "
+                f"score the baseline's predictions on this suite"
             )
     if scores.suite_sha256 == baseline.suite_sha256:
         return []
