@@ -46,17 +46,27 @@ def check_probes(suite: RenderedSuite, predictions: Mapping[str, Predictions]) -
             f"augment.scores.probe.probe with your loader and the paths of `climategs suite probe` "
             f'and write {{"variant": NAME, "probe": ANSWER}}'
         )
+    fields_by_path: dict[str, np.ndarray] = {}
     problems = [
         problem
         for name, of_variant in predictions.items()
-        if (problem := _probe_problem(suite, name, of_variant))
+        if (problem := _probe_problem(suite, name, of_variant, fields_by_path))
     ]
     if problems:
         raise ScoreError("\n".join(problems))
 
 
-def _probe_problem(suite: RenderedSuite, variant: str, predictions: Predictions) -> str:
-    """Return the fault of a variant's probe as a sentence; empty if there is none."""
+def _probe_problem(
+    suite: RenderedSuite,
+    variant: str,
+    predictions: Predictions,
+    fields_by_path: dict[str, np.ndarray],
+) -> str:
+    """Return the fault of a variant's probe as a sentence; empty if there is none.
+
+    Args:
+        fields_by_path: Mean colours of images that were decoded already, which are added to.
+    """
     meta = predictions.meta
     assert meta is not None, "checked before"
     where = predictions.folder / META_FILE
@@ -70,7 +80,7 @@ def _probe_problem(suite: RenderedSuite, variant: str, predictions: Predictions)
         if len(answer) == SHA256_DIGITS:
             problem = _bytes_problem(suite, path, answer)
         else:
-            problem = _pixels_problem(suite, variant, path, answer)
+            problem = _pixels_problem(suite, variant, path, answer, fields_by_path)
         if problem:
             return f"{where}: {problem}. The network was not shown {variant}: run it again"
     return ""
@@ -86,7 +96,13 @@ def _bytes_problem(suite: RenderedSuite, path: str, answer: str) -> str:
     return f"for {path} the loader gave bytes that no file of the suite has"
 
 
-def _pixels_problem(suite: RenderedSuite, variant: str, path: str, answer: str) -> str:
+def _pixels_problem(
+    suite: RenderedSuite,
+    variant: str,
+    path: str,
+    answer: str,
+    fields_by_path: dict[str, np.ndarray],
+) -> str:
     """Return the fault of the mean colours that a loader gave of an image."""
     try:
         fields = _parse_fields(answer)
@@ -100,11 +116,11 @@ def _pixels_problem(suite: RenderedSuite, variant: str, path: str, answer: str) 
     differences: dict[str, float] = {}
     for name, rows in suite.rows.items():
         other_path = rows[number]["image_path"]
-        image = decode_image(suite.store.read(other_path))
-        stated = probe(lambda _, image=image: image, (other_path,))[other_path]
-        other_fields = (
-            np.frombuffer(bytes.fromhex(stated), np.uint8).reshape(-1, 3).astype(np.int64)
-        )
+        if other_path not in fields_by_path:
+            image = decode_image(suite.store.read(other_path))
+            stated = probe(lambda _, image=image: image, (other_path,))[other_path]
+            fields_by_path[other_path] = _parse_fields(stated)
+        other_fields = fields_by_path[other_path]
         if other_fields.shape != fields.shape:
             return f"for {path} the answer has {len(fields)} fields; expected {len(other_fields)}"
         # A loader may order its channels blue, green, red.
@@ -138,18 +154,15 @@ def check_equal_predictions(suite: RenderedSuite, predictions: Mapping[str, Pred
     for name, of_variant in predictions.items():
         if not of_variant.is_empty:
             by_hash.setdefault(of_variant.content_hash, []).append(name)
-    shared = [
-        group
+    groups = (
+        [names[0], *(name for name in names[1:] if not suite.has_same_images(names[0], name))]
         for names in by_hash.values()
-        if len(
-            group := [names[0], *(n for n in names[1:] if not suite.has_same_images(names[0], n))]
-        )
-        > 1
-    ]
+    )
+    shared = [" = ".join(group) for group in groups if len(group) > 1]
     if shared:
-        texts = "; ".join(" = ".join(group) for group in shared)
         raise ScoreError(
-            f"variants have the same predictions, though their pictures differ: {texts}. The "
+            f"variants have the same predictions, though their pictures differ: "
+            f"{'; '.join(shared)}. The "
             f"network was shown one of them for the others"
         )
 

@@ -36,7 +36,7 @@ class ImageHits:
     is_counted: Bool[np.ndarray, " T"]
     """True for the objects that count."""
 
-    def found(self, threshold: float) -> Bool[np.ndarray, " T"]:
+    def are_found(self, threshold: float) -> Bool[np.ndarray, " T"]:
         """Return True for objects that count and are found at a threshold."""
         return self.is_counted & (self.object_scores >= threshold)
 

@@ -363,7 +363,7 @@ def _recall(run: _Run, variant: str, numbers: Sequence[int]) -> float | None:
         return None
     images = [run.hits[variant][number] for number in numbers]
     count = sum(int(image.is_counted.sum()) for image in images)
-    num_found = sum(int(image.found(run.threshold).sum()) for image in images)
+    num_found = sum(int(image.are_found(run.threshold).sum()) for image in images)
     return num_found / count if count else None
 
 
@@ -390,7 +390,7 @@ def _half_recall(run: _Run, effect: str) -> HalfRecallScore | None:
 
     def hits_by_scene(variant: str) -> np.ndarray:
         images = [run.hits[variant][number] for number in numbers]
-        return count_by_scene([int(image.found(run.threshold).sum()) for image in images])
+        return count_by_scene([int(image.are_found(run.threshold).sum()) for image in images])
 
     objects = count_by_scene([int(run.hits[CLEAN_VARIANT][n].is_counted.sum()) for n in numbers])
     half = find_half_recall(
@@ -430,7 +430,7 @@ def _recall_bins(run: _Run, effect: str) -> RecallBins:
             transmittances.append(shares[number][hits.is_counted])
             visible_fractions.append(truth.visible_fractions[hits.is_counted])
             ranges_m.append(truth.ranges_m[hits.is_counted])
-            is_found.append(hits.found(run.threshold)[hits.is_counted])
+            is_found.append(hits.are_found(run.threshold)[hits.is_counted])
     is_object_found = np.concatenate(is_found)
     columns = {
         "transmittance": (transmittances, SHARE_BOUNDS),
@@ -507,8 +507,8 @@ def _worst_objects(run: _Run, variant: str, number: int) -> tuple[WorstObject, .
     if run.truth is None:
         return ()
     hits = run.hits[variant][number]
-    is_found = hits.found(run.threshold)
-    was_found = run.hits[CLEAN_VARIANT][number].found(run.threshold)
+    is_found = hits.are_found(run.threshold)
+    was_found = run.hits[CLEAN_VARIANT][number].are_found(run.threshold)
     boxes = run.truth.images[number].boxes
     return tuple(
         WorstObject(
@@ -526,7 +526,7 @@ def _found_counts(run: _Run, variant: str) -> list[float]:
     Empty for NDS.
     """
     if run.hits:
-        return [float(image.found(run.threshold).sum()) for image in run.hits[variant]]
+        return [float(image.are_found(run.threshold).sum()) for image in run.hits[variant]]
     if isinstance(run.metric, SemanticMetric):
         pixel_counts = run.metric.count(run.predictions[variant])
         right = np.trace(pixel_counts, axis1=1, axis2=2)

@@ -27,6 +27,12 @@ CLEAN_VARIANT = "clean-0"
 # Number of names that a message lists.
 MAX_NAMES = 5
 
+# Columns of the manifest that scores read, besides paths: a row of all columns takes much memory.
+_COLUMNS = (
+    *("scene", "variant", "frame", "camera", "recipe", "status", "checksum", "width", "height"),
+    "timestamp_ns",
+)
+
 Row = Mapping[str, Any]
 
 
@@ -155,7 +161,9 @@ def read_suite(store: Store) -> RenderedSuite:
             f"render it into this output"
         )
     rows: dict[str, dict[ImageKey, Row]] = {name: {} for name in entries.variants}
-    for row in read_manifest_rows(store).to_pylist():
+    table = read_manifest_rows(store)
+    columns = [name for name in table.column_names if name in _COLUMNS or name.endswith("_path")]
+    for row in table.select(columns).to_pylist():
         if row["status"] == OK and row["recipe"] in rows and row["scene"] in entries.scenes:
             key = ImageKey(row["scene"], row["frame"], row["camera"])
             if key in rows[row["recipe"]]:

@@ -260,8 +260,8 @@ def test_recall_prefers_the_threshold_with_the_largest_f1():
     hits = match_image(truth, detections, "coco")
     # F1 at 0.9: 2/4, at 0.8: 2/5, at 0.7: 4/6, at 0.6: 4/7.
     assert best_threshold([hits]) == 0.7
-    assert hits.found(0.7).tolist() == [True, True, False]
-    assert hits.found(0.8).tolist() == [True, False, False]
+    assert hits.are_found(0.7).tolist() == [True, True, False]
+    assert hits.are_found(0.8).tolist() == [True, False, False]
     assert hits.count_false(0.7) == 1
     nothing = ImageHits(np.full(2, -np.inf), np.array([0.9]), np.ones(2, bool))
     assert best_threshold([nothing]) == np.inf
@@ -272,7 +272,7 @@ def test_other_categories_and_ignored_objects_are_no_hits():
     inside_ignored = [110, 110, 150, 150]
     detections = make_detections([SQUARES[0], inside_ignored], [0.9, 0.8], categories=[1, 0])
     hits = match_image(truth, detections, "coco")
-    assert not hits.found(0.0).any()
+    assert not hits.are_found(0.0).any()
     assert hits.false_scores.tolist() == [0.9]  # the second lies inside an ignored object
 
 

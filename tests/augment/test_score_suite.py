@@ -55,7 +55,8 @@ def predictions(good_predictions, tmp_path) -> Path:
 def edit_json(path: Path, change: Callable) -> None:
     """Apply a function to the content of a JSON file."""
     content = json.loads(path.read_text())
-    path.write_text(json.dumps(change(content) or content))
+    changed = change(content)
+    path.write_text(json.dumps(content if changed is None else changed))
 
 
 def test_recall_of_every_level_is_that_of_the_objects_that_were_written(suite, good_predictions):
@@ -437,11 +438,6 @@ def test_scenes_recorded_in_an_effect_do_not_count_for_it(tmp_path, good_predict
         return [] if level and number in (2, 3) else [0, 1, 2][: 3 if level < 5 else 2]
 
     top = write_coco(tmp_path / "p", omitting, only_b_fails)
-    for level, variant in enumerate(omitting.variants[1:5]):
-        edit_json(
-            top / variant / "results.json",
-            lambda entries, n=level: [{**e, "score": e["score"] - 0.001 * n} for e in entries],
-        )
     scores = score_suite(open_store(omitting.path), top)
     assert scores.effects["fog"].omitted_scenes == ("scene-b",)
     assert [level.metric for level in scores.effects["fog"].levels[:4]] == pytest.approx([1.0] * 4)
