@@ -180,6 +180,17 @@ def equal_score_warnings(
     ]
 
 
+def equal_picture_warnings(suite: RenderedSuite, variants: Sequence[str]) -> list[str]:
+    """Return a warning if variants have the pictures of the clean render, byte by byte."""
+    unchanged = [name for name in variants if suite.has_same_images(name, CLEAN_VARIANT)]
+    if not unchanged:
+        return []
+    return [
+        f"{len(unchanged)} variants have the same pictures as {CLEAN_VARIANT}, byte by byte, so "
+        f"their scores say nothing: {', '.join(unchanged)}"
+    ]
+
+
 def check_variants(
     names: Sequence[str], has_predictions: Callable[[str], bool], where: str
 ) -> None:

@@ -20,6 +20,7 @@ from augment.scores.guards import (
     check_equal_predictions,
     check_probes,
     check_variants,
+    equal_picture_warnings,
     equal_score_warnings,
 )
 from augment.scores.half_recall import HalfRecall, find_half_recall
@@ -279,7 +280,9 @@ def _make_scores(run: _Run, folder: Path) -> SuiteScores:
         for effect, of_effect in levels.items()
     }
     summary = summarize(values)
-    warnings = [
+    variants = [name for names in run.effects.values() for name in names]
+    warnings = equal_picture_warnings(suite, variants)
+    warnings += [
         warning
         for effect, names in run.effects.items()
         for warning in equal_score_warnings(

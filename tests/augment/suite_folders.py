@@ -65,13 +65,17 @@ class SuiteFolder:
 
 
 def write_suite(
-    path: Path, omitted: Mapping[str, Sequence[str]] | None = None, name: str = "weather-c-v1"
+    path: Path,
+    omitted: Mapping[str, Sequence[str]] | None = None,
+    name: str = "weather-c-v1",
+    unchanged: Sequence[str] = (),
 ) -> SuiteFolder:
     """Write a suite: manifest, images, label tables and `suite.json`.
 
     Args:
         omitted: Effects that do not count, by scene.
         name: Name of the suite.
+        unchanged: Variants with the pictures of the clean render.
     """
     variants = ("clean-0", *(f"fog-{k}" for k in range(1, 6)))
     rows: list[dict[str, Any]] = []
@@ -83,7 +87,8 @@ def write_suite(
             top = path / variant_folder(scene, variant_name(recipe))
             for frame in FRAMES:
                 paths = item_paths(scene, recipe, CAMERA, frame)
-                pixels = np.full((HEIGHT, WIDTH, 3), 40 + 30 * number + frame, np.uint8)
+                gray = 40 + 30 * (0 if variant in unchanged else number) + frame
+                pixels = np.full((HEIGHT, WIDTH, 3), gray, np.uint8)
                 data = encode_image(pixels, recipe.output)
                 _write(path / str(paths["image"]), data)
                 hashes[str(paths["image"])] = hashlib.sha256(data).hexdigest()

@@ -300,6 +300,15 @@ def test_a_score_equal_to_the_clean_one_gives_a_warning(suite, predictions):
     assert warning.startswith("fog-1 scores 1.0000 as clean-0 does")
 
 
+def test_variants_with_the_pictures_of_the_clean_render_give_a_warning(tmp_path):
+    suite = write_suite(tmp_path / "out", unchanged=("fog-1", "fog-2"))
+    top = write_coco(tmp_path / "p", suite)
+    shutil.copy(top / "clean-0" / "results.json", top / "fog-1" / "results.json")  # equal: right
+    (warning,) = score_suite(open_store(suite.path), top).warnings
+    assert warning.startswith("2 variants have the same pictures as clean-0, byte by byte")
+    assert warning.endswith("fog-1, fog-2")
+
+
 # ---- Bad input -----------------------------------------------------------------------------------
 
 

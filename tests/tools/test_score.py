@@ -38,7 +38,8 @@ def test_score_prints_a_table_and_writes_page_and_json(suite, predictions, tmp_p
     page = html.read_text()
     assert page.count("<polyline") == 2  # the metric and recall
     assert page.count("data:image/jpeg") == 4  # two worst images, each with its clean render
-    assert not re.findall(r"""(?:src|href)=["']?(?!data:)""", page)  # nothing from outside
+    sources = re.findall(r'(?:src|href)="([^"]*)"', page)
+    assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
     assert "Recall has halved at <b>150 m</b>" in page
     scores = json.loads(facts.read_text())
     assert scores["robustness"]["mce"] == 1.0
