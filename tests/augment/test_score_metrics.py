@@ -102,6 +102,52 @@ def test_kitti_precision_worked_by_hand():
     assert kitti_average_precision(one, [shifted], ["Pedestrian"])[0] == 1.0
 
 
+def slow_precision(truths, detections) -> float:
+    """Return KITTI's AP of one category by its definition: matching anew at every threshold."""
+    scores = sorted({score for image in detections for score in image.scores.tolist()})
+    num_objects = sum(len(truth) for truth in truths)
+    points = []
+    for threshold in scores:
+        hits = misses = 0
+        for truth, image in zip(truths, detections, strict=True):
+            taken = set()
+            for score, box in sorted(zip(image.scores, image.boxes.tolist(), strict=True))[::-1]:
+                if score < threshold:
+                    continue
+                best = (0.0, -1)
+                for k, other in enumerate(truth.boxes.tolist()):
+                    width = min(box[2], other[2]) - max(box[0], other[0])
+                    height = min(box[3], other[3]) - max(box[1], other[1])
+                    shared = max(width, 0) * max(height, 0)
+                    areas = [(b[2] - b[0]) * (b[3] - b[1]) for b in (box, other)]
+                    if k not in taken:
+                        best = max(best, (shared / (sum(areas) - shared), k))
+                if best[0] >= 0.7:
+                    taken.add(best[1])
+                    hits += 1
+                else:
+                    misses += 1
+        points.append((hits / num_objects, hits / (hits + misses)))
+    steps = [k / 40 for k in range(1, 41)]
+    return sum(max((p for r, p in points if r >= step - 1e-12), default=0.0) for step in steps) / 40
+
+
+def test_kitti_precision_equals_its_definition_on_random_detections():
+    rng = np.random.default_rng(4)
+    truths = []
+    detections = []
+    for _ in range(8):
+        corners = rng.uniform(0, 300, (5, 2))
+        boxes = np.concatenate([corners, corners + rng.uniform(30, 120, (5, 2))], axis=1)
+        truths.append(make_truth(boxes))
+        rows = boxes[rng.integers(0, 5, 8)] + rng.normal(0, 3, (8, 4))
+        is_high = rows[:, 3] - rows[:, 1] >= 25  # lower ones are ignored where they find nothing
+        detections.append(make_detections(rows[is_high], rng.uniform(0, 1, is_high.sum())))
+    ours = kitti_average_precision(truths, detections, ["Car"])[0]
+    assert 0.05 < ours < 0.95
+    assert ours == pytest.approx(slow_precision(truths, detections), abs=1e-12)
+
+
 def test_kitti_ignores_objects_of_harder_classes_and_low_detections():
     low = [300, 100, 360, 120]  # 20 pixels high: counts at no difficulty
     truth = make_truth([SQUARES[0], low])
