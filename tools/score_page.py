@@ -39,6 +39,8 @@ class Curve(NamedTuple):
     """CSS colour."""
     points: list[tuple[float, float, str]]
     """Place in the chart, and a text, of each value; the clean value first."""
+    whiskers: list[tuple[float, float, float]]
+    """Place, upper and lower end of each interval."""
 
 
 class Chart(NamedTuple):
@@ -92,19 +94,31 @@ def make_chart(name: str, effect: EffectScores) -> Chart:
 
     def line(title: str, css: str, values: Sequence[float]) -> Curve:
         points = [
-            (x, FLOOR - (FLOOR - TOP) * min(max(value, 0.0), 1.0), f"{title}, {text}: {value:.3f}")
+            (x, height_of(value), f"{title}, {text}: {value:.3f}")
             for x, value, text in zip(places_x, values, texts, strict=True)
         ]
-        return Curve(title, css, points)
+        return Curve(title, css, points, [])
 
     curves = [line("metric", "var(--accent)", [effect.clean, *(v.metric for v in effect.levels)])]
     recalls = [effect.clean_recall, *(level.recall for level in effect.levels)]
     if None not in recalls:
-        curves.append(line("recall", "var(--s2)", [value or 0.0 for value in recalls]))
+        recall_line = line("recall", "var(--s2)", [value or 0.0 for value in recalls])
+        intervals = [level.recall_interval for level in effect.levels]
+        whiskers = [
+            (x, height_of(interval[1]), height_of(interval[0]))
+            for x, interval in zip(places_x[1:], intervals, strict=True)
+            if interval is not None
+        ]
+        curves.append(recall_line._replace(whiskers=whiskers))
     numbers = ["clean"] + [
         str(level.level) if level.value is None else f"{level.value:g}" for level in effect.levels
     ]
     return Chart(name, effect, curves, list(zip(places_x, numbers, strict=True)))
+
+
+def height_of(value: float) -> float:
+    """Return the height in a chart, from the top, of a value of 0 to 1."""
+    return FLOOR - (FLOOR - TOP) * min(max(value, 0.0), 1.0)
 
 
 def bin_tables(scores: SuiteScores) -> list[tuple[str, list[str], list[tuple[str, Any]]]]:

@@ -1,8 +1,7 @@
 """V50: the physical number of an effect at which recall has halved against clear air.
 
 Recall is interpolated between neighbouring levels over the logarithm of the number. Intervals are
-those of a bootstrap by scene: images of one scene resemble each other, so boxes or images as units
-would give intervals that are too narrow.
+those of a bootstrap by scene.
 """
 
 from __future__ import annotations
@@ -11,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
-# Number of resamples of the bootstrap.
-NUM_RESAMPLES = 10_000
-# Share of resamples inside an interval.
-CONFIDENCE = 0.95
+from augment.scores.scene_bootstrap import interval_ends, resample_scenes
+
 # Place of a limit that is milder than the first level, or harsher than the last.
 MILDER = -np.inf
 HARSHER = np.inf
@@ -64,13 +61,6 @@ def value_at(place: float, values: Sequence[float]) -> float:
     return float(np.exp(np.interp(place, np.arange(len(values)), logarithms)))
 
 
-def resample_scenes(
-    num_scenes: int, rng: np.random.Generator, num_resamples: int = NUM_RESAMPLES
-) -> Int64[np.ndarray, "R S"]:
-    """Return how often each scene is in each resample of a bootstrap."""
-    return rng.multinomial(num_scenes, np.full(num_scenes, 1 / num_scenes), size=num_resamples)
-
-
 def find_half_recall(
     hits: Float64[np.ndarray, "S L"],
     clean_hits: Float64[np.ndarray, " S"],
@@ -99,11 +89,8 @@ def find_half_recall(
     place = float(places[0])
     interval = None
     if len(hits) > 1:
-        usable = places[1:][clean_recalls[1:] > 0]
-        tail = (1 - CONFIDENCE) / 2
-        # Whole order statistics: some places are infinite.
-        ends = np.quantile(usable, [tail, 1 - tail], method="inverted_cdf")
-        interval = (place_text(ends[0], values, unit), place_text(ends[1], values, unit))
+        milder, harsher = interval_ends(places[1:][clean_recalls[1:] > 0])
+        interval = (place_text(milder, values, unit), place_text(harsher, values, unit))
     return HalfRecall(
         value=value_at(place, values) if np.isfinite(place) else None,
         bound="" if np.isfinite(place) else "milder" if place < 0 else "harsher",

@@ -44,6 +44,7 @@ from augment.scores.recall import (
     recall_by,
 )
 from augment.scores.robustness import EffectValues, summarize
+from augment.scores.scene_bootstrap import recall_interval
 from augment.scores.suite_facts import CLEAN_VARIANT, RenderedSuite, list_names, read_suite
 from augment.scores.suite_scores import (
     EffectScores,
@@ -349,6 +350,7 @@ def _effect_scores(
                 ability=measured.value / values.clean,
                 by_category=measured.by_category,
                 recall=_recall(run, name, numbers),
+                recall_interval=_recall_interval(run, name, numbers),
                 false_per_image=_false_per_image(run, name, numbers),
             )
             for name, measured in zip(names, levels, strict=True)
@@ -385,29 +387,50 @@ def _half_recall(run: _Run, effect: str) -> HalfRecallScore | None:
     if not run.hits or not facts[0].unit or len(values) < len(names):
         return None
     numbers = run.suite.numbers_of(effect)
-    scenes = sorted({run.suite.images[number].scene for number in numbers})
-    places = [scenes.index(run.suite.images[number].scene) for number in numbers]
-
-    def count_by_scene(counts: list[int]) -> np.ndarray:
-        return np.bincount(places, weights=counts, minlength=len(scenes))
-
-    def hits_by_scene(variant: str) -> np.ndarray:
-        images = [run.hits[variant][number] for number in numbers]
-        return count_by_scene([int(image.are_found(run.threshold).sum()) for image in images])
-
-    objects = count_by_scene([int(run.hits[CLEAN_VARIANT][n].is_counted.sum()) for n in numbers])
     half = find_half_recall(
-        np.stack([hits_by_scene(name) for name in names], axis=1),
-        hits_by_scene(CLEAN_VARIANT),
-        objects,
+        np.stack([_hits_by_scene(run, name, numbers) for name in names], axis=1),
+        _hits_by_scene(run, CLEAN_VARIANT, numbers),
+        _objects_by_scene(run, numbers),
         values,
         facts[0].unit,
         np.random.default_rng(BOOTSTRAP_SEED),
     )
     if half is None:
         return None
-    return HalfRecallScore(text=_half_text(half, values, facts[0].unit), value=half.value,
-                           interval=half.interval)  # fmt: skip
+    text = _half_text(half, values, facts[0].unit)
+    return HalfRecallScore(text=text, value=half.value, interval=half.interval)
+
+
+def _recall_interval(run: _Run, variant: str, numbers: Sequence[int]) -> tuple[float, float] | None:
+    """Return the interval of a variant's recall."""
+    if not run.hits:
+        return None
+    return recall_interval(
+        _hits_by_scene(run, variant, numbers),
+        _objects_by_scene(run, numbers),
+        np.random.default_rng(BOOTSTRAP_SEED),
+    )
+
+
+def _hits_by_scene(run: _Run, variant: str, numbers: Sequence[int]) -> np.ndarray:
+    """Return the number of objects that are found in each scene, float64 [scenes]."""
+    images = (run.hits[variant][number] for number in numbers)
+    return _sum_by_scene(
+        run, numbers, [int(image.are_found(run.threshold).sum()) for image in images]
+    )
+
+
+def _objects_by_scene(run: _Run, numbers: Sequence[int]) -> np.ndarray:
+    """Return the number of objects that count in each scene, float64 [scenes]."""
+    images = (run.hits[CLEAN_VARIANT][number] for number in numbers)
+    return _sum_by_scene(run, numbers, [int(image.is_counted.sum()) for image in images])
+
+
+def _sum_by_scene(run: _Run, numbers: Sequence[int], counts: list[int]) -> np.ndarray:
+    """Return the sum of counts of images over each scene."""
+    names = [run.suite.images[number].scene for number in numbers]
+    _, places = np.unique(names, return_inverse=True)
+    return np.bincount(places, weights=counts)
 
 
 def _half_text(half: HalfRecall, values: Sequence[float], unit: str) -> str:

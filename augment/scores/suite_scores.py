@@ -36,6 +36,8 @@ class LevelScore(_Closed):
     """The metric by category; None where no object counts."""
     recall: float | None
     """Share of the objects that are found at the clean threshold; None for semantics and NDS."""
+    recall_interval: tuple[float, float] | None
+    """Its interval of 95 %, a bootstrap by scene; None with a single scene."""
     false_per_image: float | None
     """False positives per image at the clean threshold."""
 

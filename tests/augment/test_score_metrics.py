@@ -24,6 +24,7 @@ from augment.scores.matching import assign_detections, box_overlaps
 from augment.scores.predictions import ImageDetections
 from augment.scores.recall import ImageHits, best_threshold, match_image, recall_by
 from augment.scores.robustness import EffectValues, summarize
+from augment.scores.scene_bootstrap import recall_interval
 from augment.scores.semantic_metric import class_overlaps, count_pixels
 from augment.scores.truth import ImageTruth
 
@@ -398,6 +399,16 @@ def test_interval_of_half_recall_covers_the_scenes_and_is_reproducible():
     assert alone is not None and alone.interval is None
     nothing = np.zeros(12)
     assert find_half_recall(hits, nothing, clean_hits, values, "", np.random.default_rng(5)) is None
+
+
+def test_interval_of_recall_is_that_of_scenes_and_not_of_boxes():
+    # All or nothing by scene: a tenth of the scenes holds as many independent facts.
+    hits = np.tile([100.0, 0.0], 20)
+    low, high = recall_interval(hits, np.full(40, 100.0), np.random.default_rng(2)) or (0, 0)
+    # Binomial of 40 scenes: 0.5 +- 1.96 sqrt(0.25 / 40) = 0.345 ... 0.655.
+    assert low == pytest.approx(0.345, abs=0.02)
+    assert high == pytest.approx(0.655, abs=0.02)
+    assert recall_interval(hits[:1], hits[:1], np.random.default_rng(2)) is None
 
 
 def test_bootstrap_interval_covers_the_truth_as_often_as_it_says():
