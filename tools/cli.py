@@ -630,6 +630,57 @@ class LabelsOptions(Command):
         return 0
 
 
+class ScoreCommand(Command):
+    """Score a detector or a segmentation network on a robustness suite (docs/score.md).
+
+    Nothing is scored unless everything fits: images, categories, variants, the probe of the loader,
+    the baseline.
+
+    Args:
+        out: A folder or URI in which a suite was rendered.
+        predictions: A folder with a folder of predictions for each variant: results.json (COCO or
+            nuScenes), kitti/000000.txt or semantic/000000.png, and meta.json.
+        baseline: Predictions of a baseline, or the JSON of its scores.
+        effects: Names of effects separated by commas, or all.
+        categories: Categories and the labels that belong to them, as in Car=vehicle.car
+            Truck=vehicle.* (the first that takes a label counts). By default every label is one.
+        kitti_view: KITTI's AP by overlaps in the image, from above, or in space.
+        kitti_difficulty: Objects that count for KITTI's AP.
+        nuscenes: The folder of nuScenes, for NDS by nuscenes-devkit.
+        nuscenes_version: The version of its tables.
+        nuscenes_split: The split whose samples the predictions have.
+        truth: Write the truth of each variant as a COCO file into this folder, with the numbers of
+            images and categories, and score nothing.
+        html: The page to write. By default PREDICTIONS/score.html.
+        json_file: Also write the scores to this file; it serves as a baseline.
+    """
+
+    out: Positional[str]
+    predictions: Path | None = None
+    baseline: Path | None = None
+    effects: str = "all"
+    categories: tuple[str, ...] = ()
+    kitti_view: Literal["bbox", "bev", "3d"] = "bbox"
+    kitti_difficulty: Literal["easy", "moderate", "hard"] = "moderate"
+    nuscenes: Path | None = None
+    nuscenes_version: str = "v1.0-trainval"
+    nuscenes_split: str = "val"
+    truth: Path | None = None
+    html: Path | None = None
+    json_file: JsonFile = None
+
+    @model_validator(mode="after")
+    def _names_predictions(self) -> Self:
+        if self.predictions is None and self.truth is None:
+            raise ValueError("no predictions are named: climategs score OUT --predictions FOLDER")
+        return self
+
+    def run(self) -> int:
+        from tools.score import score_predictions, write_truth
+
+        return score_predictions(self) if self.truth is None else write_truth(self)
+
+
 class ApplyOptions(SceneCommand):
     """Write a scene in the colours of a photograph or a preset, with a picture of both beside it.
 
@@ -707,6 +758,7 @@ COMMANDS = {
     "sheet": SheetOptions,
     "report": ReportOptions,
     "evaluate": EvaluateOptions,
+    "score": ScoreCommand,
     "bench": bench,
     "demo": demo,
     "style": style,
