@@ -11,8 +11,10 @@ from pydantic import TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
+from recipes.recipe_file import SHAPE, TIME, TIMES
 from recipes.schema import Recipe
 from recipes.sections import Leaf, recipe_file
+from recipes.timeline import TIMELINE
 
 _NULL = {"type": "null"}
 
@@ -35,6 +37,7 @@ def recipe_json_schema() -> JsonSchemaValue:
     """
     schema = Recipe.model_json_schema(schema_generator=_FileSchema)
     definitions = schema["$defs"]
+    del definitions["FieldTimeline"]
     for section in recipe_file().walk():
         node = definitions[section.model.__name__] if section.path else schema
         properties = {}
@@ -73,7 +76,14 @@ def _reference(leaf: Leaf, definitions: dict[str, Any]) -> dict[str, Any]:
             value = _list(*[_reference(leaf.channel, definitions)] * 3)
         reference = {"$ref": f"#/$defs/{name}"}
         nulls = [_NULL] if leaf.nullable else []
-        definitions[name] = {"anyOf": [value, *nulls, *_ranges(leaf, reference)]}
+        ranges = _ranges(leaf, reference)
+        timelines = []
+        if leaf.takes_timeline:
+            time = _reference(TIME, definitions)
+            definitions[f"{name}_point"] = {"anyOf": [value, *_ranges(leaf.point, reference)]}
+            point = {"$ref": f"#/$defs/{name}_point"}
+            timelines = [_timeline(leaf, time, point)]
+        definitions[name] = {"anyOf": [value, *nulls, *ranges, *timelines]}
     return {"$ref": f"#/$defs/{name}"}
 
 
@@ -96,7 +106,15 @@ def _ranges(leaf: Leaf, reference: dict[str, Any]) -> list[dict[str, Any]]:
         "normal": _mapping({"normal": _mapping(normal)}),
         "choice": _mapping({"choice": options}, weights=weights),
     }
-    return [kinds[kind] for kind in leaf.range_kinds]
+    return [kinds[kind] for kind in leaf.range_kinds if kind in kinds]
+
+
+def _timeline(leaf: Leaf, time: dict[str, Any], value: dict[str, Any]) -> dict[str, Any]:
+    """Return the schema of a timeline. time, value: the schemas of a point's parts."""
+    points = {"type": "array", "items": _list(time, value), "minItems": 1}
+    shapes = SHAPE.allowed_words if leaf.kind is float else ("step",)
+    options = {"shape": {"enum": [*shapes]}, "times": {"enum": [*TIMES.allowed_words]}}
+    return _mapping({TIMELINE: points}, **options)
 
 
 def _mapping(required: dict[str, Any], **optional: Any) -> dict[str, Any]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import logging
+import operator
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -335,6 +337,10 @@ def dump_recipe(recipe: Recipe) -> str:
     them for a recipe that adds the effect.
     """
     data = recipe.model_dump()
+    del data["timelines"]
+    for timeline in recipe.timelines:
+        *sections, name = timeline.path.split(".")
+        functools.reduce(operator.getitem, sections, data)[name] = timeline.as_field()
     open_knobs = free_knobs(recipe) if recipe.has_open_choice else ()
     for knob in (*open_knobs, *idle_speed_knobs(recipe)):
         *sections, name = knob.path.split(".")

@@ -14,6 +14,53 @@ from pydantic import Field
 from recipes.curve import Curve
 from recipes.fields import ClosedModel, Number, Unit
 
+# Nanoseconds of a second.
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class SceneTimes:
+    """The time that a drive takes: of its images, in the dataset's own nanoseconds."""
+
+    start_ns: int
+    """Time of the first image."""
+    end_ns: int
+    """Time of the last image."""
+    num_frames: int = 2
+    """Number of frames, of which each has the images of one moment."""
+
+    @property
+    def duration_s(self) -> float:
+        """Return the time from the first image to the last one, seconds."""
+        return (self.end_ns - self.start_ns) / NS_PER_S
+
+    @property
+    def frame_s(self) -> float:
+        """Return the mean time from frame to frame, seconds; 0 for a single frame."""
+        return self.duration_s / max(self.num_frames - 1, 1)
+
+    def drive_s(self, timestamp_ns: int) -> float:
+        """Return the time of an image since the first one, seconds."""
+        return (timestamp_ns - self.start_ns) / NS_PER_S
+
+
+# A drive that is longer than all others, where the scene is not known: no timeline goes beyond it.
+ANY_DRIVE = SceneTimes(0, 10**7 * NS_PER_S)
+
+
+class Clock(ClosedModel):
+    """The time of the weather, by which timelines go, from the time of the drive."""
+
+    start_s: Number = Field(default=0.0, ge=-1e7, le=1e7)
+    """Time of the weather at the drive's first image."""
+    speed: Number = Field(default=1.0, gt=0, le=1e4)
+    """Seconds of weather in a second of the drive: 60 lets a road dry within a drive of some
+    seconds."""
+
+    def time_s(self, drive_s: float) -> float:
+        """Return the time of the weather at a time of the drive, both in seconds."""
+        return self.start_s + self.speed * drive_s
+
 
 class Air(ClosedModel):
     """The air near the ground, which dries roads and decides how snow lies and melts."""

@@ -19,12 +19,15 @@ from typing import Any, TypeGuard
 from recipes.errors import join
 from recipes.files import file_below
 from recipes.speed import former_path
+from recipes.timeline import TIMELINE, DrawnTimeline, Shape, TimeUnit
 
 # Domain of the hashes. A change of the scheme changes it, so that no number changes silently.
 _DOMAIN = "climategs recipe draw 1"
 
 # In the order in which messages list them.
 RANGE_KINDS = ("uniform", "log_uniform", "normal", "choice")
+# Kinds of mappings that stand in the place of a field's value.
+FIELD_KINDS = (*RANGE_KINDS, TIMELINE)
 # Largest standard deviation of a normal range over its width. A wider normal is uniform for all
 # purposes, and loses digits.
 MAX_STD_PER_WIDTH = 1000
@@ -253,6 +256,59 @@ class NamedFile:
         return self.name
 
 
+@dataclass(frozen=True)
+class Timeline:
+    """Values over time. Times and values may have ranges; draws keep the times in order.
+
+    Attributes:
+        points: pairs of a time and a value, in the order of the times.
+        shape: form of the curve between points: linear, step or smooth.
+        times: unit of the times: seconds, or share of the drive.
+        place: file and line of the timeline, for messages.
+    """
+
+    points: tuple[tuple[Any, Any], ...]
+    shape: Shape = "linear"
+    times: TimeUnit = "seconds"
+    place: str = ""
+
+    def draw(self, draws: Draws, path: str) -> DrawnTimeline:
+        points = tuple(
+            (
+                float(draw(time, draws, f"{path}.{TIMELINE}[{i}][0]")),
+                draw(value, draws, f"{path}.{TIMELINE}[{i}][1]"),
+            )
+            for i, (time, value) in enumerate(self.points)
+        )
+        return DrawnTimeline(points, self.shape, self.times, self.place)
+
+    def ends(self) -> list[End]:
+        return [
+            End(end.value, {(): (TIMELINE, i, 1, *end.parts.get((), ()))})
+            for i, (_, value) in enumerate(self.points)
+            for end in ends(value)
+        ]
+
+    def faults(self) -> Iterator[Fault]:
+        latest = -math.inf
+        for i, (time, value) in enumerate(self.points):
+            place = (TIMELINE, i)
+            for j, part in enumerate((time, value)):
+                yield from (((*place, j, *inner), text) for inner, text in faults(part))
+            times = [end.value for end in ends(time)]
+            if min(times) <= latest:
+                text = f"times must rise from point to point; the point before is at {latest:g}"
+                yield (*place, 0), text + (" in some draws" if is_range(time) else "")
+            latest = max(latest, *times)
+            if self.times == "share" and max(times) > 1:
+                yield (*place, 0), "must be <= 1, the drive's end; negative is before its start"
+
+    def describe(self) -> str:
+        unit = "of the drive" if self.times == "share" else "s"
+        texts = [f"{describe(value)} at {describe(time)} {unit}" for time, value in self.points]
+        return f"{self.shape} timeline: {', '.join(texts)}"
+
+
 Range = Uniform | Normal | Choice | TripleLine
 
 
@@ -261,7 +317,7 @@ Range = Uniform | Normal | Choice | TripleLine
 
 def draw(value: Any, draws: Draws, path: str) -> Any:
     """Return a template's value in one variant. Items of lists are drawn one by one."""
-    if isinstance(value, Range | NamedFile):
+    if isinstance(value, Range | NamedFile | Timeline):
         return value.draw(draws, former_path(path))
     if isinstance(value, list | tuple):
         return type(value)(draw(item, draws, f"{path}[{i}]") for i, item in enumerate(value))
@@ -279,7 +335,7 @@ def ends(value: Any) -> list[End]:
 
     A colour whose channels have ranges takes the first ends of all, then the second ones.
     """
-    if isinstance(value, Range | NamedFile):
+    if isinstance(value, Range | NamedFile | Timeline):
         return value.ends()
     if not isinstance(value, tuple) or not value:
         return [End(value, {})]
@@ -296,7 +352,7 @@ def ends(value: Any) -> list[End]:
 
 def faults(value: Any) -> Iterator[Fault]:
     """Yield what is wrong with ranges and files' names, though every end is allowed."""
-    if isinstance(value, Range | NamedFile):
+    if isinstance(value, Range | NamedFile | Timeline):
         yield from value.faults()
     for i, item in enumerate(value if isinstance(value, tuple) else ()):
         yield from (((i, *part), text) for part, text in faults(item))
@@ -304,6 +360,8 @@ def faults(value: Any) -> Iterator[Fault]:
 
 def is_range(value: Any) -> bool:
     """Return True if the value of a field differs between variants."""
+    if isinstance(value, Timeline):
+        return is_range(value.points)
     return isinstance(value, Range) or (isinstance(value, tuple) and any(map(is_range, value)))
 
 
@@ -311,7 +369,8 @@ def describe(value: Any) -> str:
     """Return the value of a field in words, without its unit."""
     if isinstance(value, tuple):
         return f"[{', '.join(map(describe, value))}]"
-    return value.describe() if isinstance(value, Range | NamedFile) else format_value(value)
+    is_plain = not isinstance(value, Range | NamedFile | Timeline)
+    return format_value(value) if is_plain else value.describe()
 
 
 def _round_to_range(number: float, low: float, high: float) -> float:
@@ -335,4 +394,6 @@ def format_value(value: object) -> str:
         return str(value).lower()
     if isinstance(value, tuple):
         return f"[{', '.join(format_value(channel) for channel in value)}]"
+    if isinstance(value, DrawnTimeline):
+        return format_value(value.points)
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Container, Iterator, Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 from pydantic_core import ErrorDetails
@@ -19,12 +19,13 @@ from recipes.errors import Place, Problems, dotted
 from recipes.fields import FilePath, Number
 from recipes.guesses import guess_section, guess_value, show, why_no_key, why_no_range
 from recipes.ranges import (
-    RANGE_KINDS,
+    FIELD_KINDS,
     Choice,
     End,
     Location,
     NamedFile,
     Normal,
+    Timeline,
     TripleLine,
     Uniform,
     ends,
@@ -35,6 +36,7 @@ from recipes.ranges import (
 from recipes.schema import Recipe
 from recipes.sections import Leaf, Section, recipe_file
 from recipes.speed import MOVED_FIELDS
+from recipes.timeline import TIMELINE
 from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, plain
 
 # Largest number of ranges whose values a message about a rule lists.
@@ -49,6 +51,9 @@ def read_file(tree: MapNode, problems: Problems) -> dict[str, Any]:
     Everything that is wrong with the tree is added to `problems`.
     """
     values = _read_mapping(tree, recipe_file())
+    if values.pop("timelines", None) is not None:
+        text = "timelines: unknown field; write a timeline in the place of the field that changes"
+        problems.add(tree["timelines"].place, text)
     messages = _Messages(tree)
     for case in _cases(values):
         try:
@@ -115,6 +120,10 @@ def _read_value(node: Node, leaf: Leaf) -> Any:
 
 _MEAN = Leaf("mean", Annotated[Number, Field(allow_inf_nan=False)], rangeable=False)
 _STD = Leaf("std", Annotated[Number, Field(gt=0, allow_inf_nan=False)], rangeable=False)
+# Parts of a timeline.
+TIME = Leaf("time", Annotated[Number, Field(ge=-1e7, le=1e7)])
+SHAPE = Leaf("shape", Literal["linear", "step", "smooth"], rangeable=False)
+TIMES = Leaf("times", Literal["seconds", "share"], rangeable=False)
 _WEIGHT = Leaf("weight", Annotated[Number, Field(ge=0, le=1e9)], rangeable=False)
 
 Message = tuple[Place, str]
@@ -128,12 +137,19 @@ def _range_kind(node: Node, leaf: Leaf) -> str | None:
 
 def _named_kind(node: Node, leaf: Leaf) -> str | None:
     """Return the kind of range that a mapping names, if the field takes it."""
-    kinds = [kind for kind in RANGE_KINDS if isinstance(node, MapNode) and kind in node]
+    kinds = [kind for kind in FIELD_KINDS if isinstance(node, MapNode) and kind in node]
     return kinds[0] if len(kinds) == 1 and kinds[0] in leaf.range_kinds else None
 
 
 def _read_range(kind: str, node: MapNode, leaf: Leaf) -> Any:
     body: Any = node[kind]
+    if kind == TIMELINE:
+        points = tuple(
+            (_read_value(time, TIME), _read_value(value, leaf.point)) for time, value in body
+        )
+        shape: Any = plain(node["shape"]) if "shape" in node else _default_shape(leaf)
+        times: Any = plain(node["times"]) if "times" in node else "seconds"
+        return Timeline(points, shape, times, str(node.place))
     if kind == "choice":
         options = tuple(_read_value(option, leaf) for option in body)
         weights: Any = node.get("weights")
@@ -153,6 +169,9 @@ def _range_faults(kind: str, node: Any, leaf: Leaf, location: Location) -> Itera
     """Yield what is wrong with a range, but for its ends and options: `Recipe` checks those."""
     body: Any = node[kind]
     inside = (*location, kind)
+    if kind == TIMELINE:
+        yield from _timeline_faults(node, leaf, location)
+        return
     keys = (kind, "weights") if kind == "choice" else (kind,)
     yield from _unknown_parts(node, keys, location)
     if kind == "choice":
@@ -187,10 +206,55 @@ def _range_faults(kind: str, node: Any, leaf: Leaf, location: Location) -> Itera
                 yield _message(end, (*inside, i), "must be > 0")
 
 
-def _unknown_parts(node: MapNode, keys: Container[str], location: Location) -> Iterator[Message]:
+def _timeline_faults(node: MapNode, leaf: Leaf, location: Location) -> Iterator[Message]:
+    """Yield what is wrong with a timeline, but for its values: `Recipe` checks those."""
+    body: Any = node[TIMELINE]
+    inside = (*location, TIMELINE)
+    yield from _unknown_parts(node, (TIMELINE, "shape", "times"), location, "a timeline")
+    for name, part in {"shape": SHAPE, "times": TIMES}.items():
+        if name in node:
+            yield from _value_faults(node[name], part, (*location, name))
+    if "shape" in node and _only_steps(leaf) and plain(node["shape"]) in ("linear", "smooth"):
+        text = "must be step: whole numbers and words have nothing between them"
+        yield _message(node["shape"], (*location, "shape"), text)
+    if not isinstance(body, ListNode) or not body:
+        yield _message(body, inside, "must be a list of at least one point, [time, value]")
+        return
+    for i, point in enumerate(body):
+        if not isinstance(point, ListNode) or len(point) != 2:
+            yield _message(point, (*inside, i), "must be a point, [time, value]")
+            continue
+        time, value = point
+        yield from _value_faults(time, TIME, (*inside, i, 0))
+        if _is_null(value):
+            yield from _explain(value, leaf.point, (*inside, i, 1))
+
+
+def _only_steps(leaf: Leaf) -> bool:
+    """Return True if the field has no values between those of two points."""
+    return leaf.kind is not float
+
+
+def _default_shape(leaf: Leaf) -> str:
+    return "step" if _only_steps(leaf) else "linear"
+
+
+def _value_faults(node: Node, leaf: Leaf, location: Location) -> Iterator[Message]:
+    """Yield what is wrong with a value or a range, its ends included."""
+    value = _read_value(node, leaf)
+    for end in ends(value):
+        if not leaf.end.accepts(end.value):
+            inner = end.parts.get((), ())
+            at_end = leaf.end if inner else leaf
+            yield from _explain(_node_at(node, inner), at_end, (*location, *inner))
+
+
+def _unknown_parts(
+    node: MapNode, keys: Container[str], location: Location, kind: str = "a range"
+) -> Iterator[Message]:
     for key, part in node.items():
         if key not in keys:
-            yield part.place, f"{dotted((*location, key))}: no part of a range"
+            yield part.place, f"{dotted((*location, key))}: no part of {kind}"
 
 
 def _number_faults(node: Node, leaf: Leaf, location: Location) -> Iterator[Message]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import json
 import operator
 import re
@@ -18,6 +19,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 from pydantic.fields import FieldInfo
 
+from recipes.curve import Curve
 from recipes.effect import Column, EffectModel, Knob, Section, Value
 from recipes.fields import (
     ClosedModel,
@@ -34,12 +36,14 @@ from recipes.fields import (
 from recipes.flood import Flood
 from recipes.lens_drops import LensDrops
 from recipes.light import Light
+from recipes.moment import ANY_DRIVE, Air, Clock, Moment, SceneTimes
 from recipes.rain import Rain
 from recipes.smog import Smog
 from recipes.snow import Snow
 from recipes.snowfall import Snowfall
 from recipes.speed import Speed, put_in_former_places
 from recipes.style import Style
+from recipes.timeline import FieldTimeline, take_timelines
 
 # ---- Speed against accuracy: a tier, or what an error or a frame may cost ------------------------
 
@@ -158,13 +162,15 @@ VERSION = 1
 
 
 class Weather(ClosedModel):
-    """The effects of a recipe; null if one is absent."""
+    """The effects of a recipe, null if one is absent, and what they share: time and air."""
 
     smog: Smog | None = None
     flood: Flood | None = None
     snow: Snow | None = None
     rain: Rain | None = None
     snowfall: Snowfall | None = None
+    air: Air | None = None
+    clock: Clock = Clock()
 
 
 class Render(Section):
@@ -320,6 +326,28 @@ class Recipe(ClosedModel):
     render: Render = Render()
     camera: Sensor = Sensor()
     output: Output = Output()
+    timelines: tuple[FieldTimeline, ...] = ()
+    """Fields whose values change over time; their sections hold the largest value."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_timelines(cls, data: Any) -> Any:
+        """Move timelines from the places of their fields to `timelines`."""
+        if not isinstance(data, Mapping) or data.get("timelines"):
+            return data
+        fields, timelines = take_timelines(data)
+        return {**fields, "timelines": timelines} if timelines else fields
+
+    @model_validator(mode="after")
+    def _values_of_timelines(self) -> Recipe:
+        for timeline in self.timelines:
+            holder, _, name = timeline.path.rpartition(".")
+            section = section_at(self, holder)
+            if section is None:
+                raise ValueError(f"{timeline.path} has a timeline, and {holder} is absent")
+            for value in dict.fromkeys(timeline.values):
+                type(section).model_validate({**section.model_dump(), name: value})
+        return self
 
     @model_validator(mode="after")
     def _settled_by_target(self) -> Recipe:
@@ -354,6 +382,12 @@ class Recipe(ClosedModel):
         effects = self.sections()
         sections: dict[str, Section] = {"render": self.render, "output": self.output, **effects}
         omitted_paths = [] if self.quality != Quality() else ["quality"]
+        if not self.timelines:
+            omitted_paths.append("timelines")
+        if self.weather.clock == Clock():
+            omitted_paths.append("weather.clock")
+        if self.weather.air is None:
+            omitted_paths.append("weather.air")
         if self.camera == Sensor():
             omitted_paths.append("camera")
         else:
@@ -379,6 +413,124 @@ class Recipe(ClosedModel):
         if self.output.lidar == "auto" and self.lidar == "clean":
             data["output"]["lidar"] = True
         return json.dumps(data, sort_keys=True, separators=(",", ":"))
+
+    # ---- Over time
+
+    @functools.cached_property
+    def is_at_moment(self) -> bool:
+        """True of a recipe that `at` has made: it holds the numbers of one moment."""
+        return False
+
+    @property
+    def changes_over_time(self) -> bool:
+        """Return True if images of different times may have different weather."""
+        has_history = bool(self.timelines) or self.weather.air is not None
+        return has_history and not self.is_at_moment
+
+    def weather_time_s(self, scene_times: SceneTimes, timestamp_ns: int) -> float:
+        """Return the time of the weather at an image, seconds.
+
+        Args:
+            scene_times: the drive's times.
+            timestamp_ns: the image's time.
+        """
+        return self.weather.clock.time_s(scene_times.drive_s(timestamp_ns))
+
+    def at(self, scene_times: SceneTimes, timestamp_ns: int) -> Recipe:
+        """Return the recipe at the time of an image: numbers only, also those that have a history.
+
+        Timelines give way to their values, and every section derives its state from them
+        (`EffectModel.state_at`). A recipe in which nothing changes is returned as it is, and so is
+        one that is at a moment already.
+
+        Args:
+            scene_times: the drive's times.
+            timestamp_ns: the image's time.
+
+        Raises:
+            RecipeError: a timeline goes beyond the drive.
+        """
+        return self.at_weather_time(scene_times, self.weather_time_s(scene_times, timestamp_ns))
+
+    def at_weather_time(self, scene_times: SceneTimes, time_s: float) -> Recipe:
+        """Return the recipe at a time of the weather; see `at`.
+
+        Args:
+            scene_times: the drive's times.
+            time_s: the time of the weather, seconds.
+        """
+        if self.is_at_moment:
+            return self
+        recipe = self
+        curves: dict[str, Curve] = {}
+        for timeline in self.timelines:
+            if section_at(self, timeline.path.rpartition(".")[0]) is None:
+                continue  # the effect was taken out of the recipe
+            times_s = timeline.times_s(self.weather.clock, scene_times)
+            if timeline.is_number:
+                curves[timeline.path] = timeline.curve(times_s)
+            value = timeline.value(times_s, time_s)
+            recipe = with_unchecked_field(recipe, timeline.path, value)
+        if self.timelines:
+            recipe = recipe.model_copy(update={"timelines": ()})
+        moment = Moment(time_s, recipe.weather.air, curves)
+        for path, section in recipe.sections().items():
+            state = section.state_at(path, moment)
+            if state is not section:
+                recipe = with_unchecked_field(recipe, path, state)
+        if recipe is not self:
+            vars(recipe)["is_at_moment"] = True  # as a cached property, which no comparison reads
+        return recipe
+
+    def check_times(self, scene_times: SceneTimes) -> None:
+        """Refuse timelines that do not fit a drive.
+
+        Args:
+            scene_times: the drive's times.
+
+        Raises:
+            RecipeError: a timeline goes beyond the drive, or has shares of a drive without length.
+        """
+        for timeline in self.timelines:
+            timeline.times_s(self.weather.clock, scene_times)
+
+    def key_times_s(self, scene_times: SceneTimes) -> tuple[float, ...]:
+        """Return the times of the weather at which the recipe is at its extremes, in order.
+
+        These are the drive's ends and the points of all timelines in it, and the middles between
+        them, since what has a history may be largest there.
+
+        Args:
+            scene_times: the drive's times.
+        """
+        clock = self.weather.clock
+        start_s = clock.start_s
+        end_s = clock.time_s(scene_times.duration_s)
+        times = {start_s, end_s}
+        for timeline in self.timelines:
+            times.update(t for t in timeline.times_s(clock, scene_times) if start_s < t < end_s)
+        ordered = sorted(times)
+        middles = [(a + b) / 2 for a, b in itertools.pairwise(ordered)]
+        return tuple(sorted({*ordered, *middles}))
+
+    def over_time(self, scene_times: SceneTimes) -> tuple[Recipe, ...]:
+        """Return the recipe at its key times, each once; a recipe that never changes is the only
+        one.
+
+        Args:
+            scene_times: the drive's times.
+
+        Raises:
+            RecipeError: a timeline goes beyond the drive.
+        """
+        if not self.changes_over_time:
+            return (self,)
+        states: list[Recipe] = []
+        for time_s in self.key_times_s(scene_times):
+            state = self.at_weather_time(scene_times, time_s)
+            if state not in states:
+                states.append(state)
+        return tuple(states)
 
     @property
     def hash(self) -> str:
@@ -427,10 +579,19 @@ class Recipe(ClosedModel):
         """Return the weather's surfaces on which a beam can end, and whether depth images show
         each.
         """
-        surfaces = [
-            section.beam_surface(self.output.surface) for section in self.sections().values()
-        ]
-        return dict(sorted(surface for surface in surfaces if surface is not None))
+        surfaces = {
+            path: section.beam_surface(self.output.surface)
+            for path, section in self.sections().items()
+            if type(section).beam_surface is not EffectModel.beam_surface
+        }
+        if self.changes_over_time:
+            for time_s in reversed(self.key_times_s(ANY_DRIVE)):
+                if None not in surfaces.values():
+                    break
+                sections = self.at_weather_time(ANY_DRIVE, time_s).sections()
+                for path, surface in surfaces.items():
+                    surfaces[path] = surface or sections[path].beam_surface(self.output.surface)
+        return dict(sorted(surface for surface in surfaces.values() if surface is not None))
 
     def sections(self) -> dict[str, EffectModel]:
         """Return the effects of the recipe, by dotted path."""
@@ -463,6 +624,11 @@ KNOBS: dict[str, Knob] = {}
 # What each tier sets, by dotted path, of the fields that a recipe does not give; the rest are at
 # reference, the last value of every knob. By the rule of docs/trade.md from docs/trade/*.json.
 TIERS: dict[str, dict[str, Value]] = {"draft": {}, "balanced": {}}
+
+
+def timeline_holders() -> tuple[str, ...]:
+    """Return the dotted paths of the sections whose fields may have timelines."""
+    return (*SECTIONS, "weather.air")
 
 
 def add_section(path: str, model: type[EffectModel]) -> None:

@@ -19,9 +19,10 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 
 from recipes.errors import join
-from recipes.fields import ClosedModel, Digest, Unit, Whole
+from recipes.fields import ClosedModel, Digest, FilePath, Unit, Whole
 from recipes.ranges import RANGE_KINDS, is_number
-from recipes.schema import SECTIONS, Recipe
+from recipes.schema import KNOBS, SECTIONS, Recipe, timeline_holders
+from recipes.timeline import TIMELINE
 
 # Units in words, by the end of a field's name.
 UNITS = {
@@ -31,6 +32,9 @@ UNITS = {
     "_lumen": "lumens",
     "_kelvin": "kelvin",
     "_mm": "millimetres",
+    "_m_s": "metres per second",
+    "temperature_c": "degrees Celsius",
+    "_warmer_k": "kelvin",
     "_m": "metres",
     "_s": "seconds",
     "_deg": "degrees",
@@ -52,6 +56,7 @@ class Leaf:
         annotation: type of a value that is not null.
         nullable: True if null is allowed.
         rangeable: True if a range is allowed.
+        takes_timeline: True if the value may change over time.
         info: further facts that pydantic has on the field.
     """
 
@@ -59,6 +64,7 @@ class Leaf:
     annotation: Any
     nullable: bool = False
     rangeable: bool = True
+    takes_timeline: bool = False
     info: FieldInfo = field(default_factory=FieldInfo)
 
     @property
@@ -90,17 +96,23 @@ class Leaf:
 
     @property
     def range_kinds(self) -> tuple[str, ...]:
-        """Return the kinds of ranges that the field takes."""
+        """Return the kinds of ranges that the field takes, and of timelines."""
         if not self.rangeable:
             return ()
+        timeline = (TIMELINE,) if self.takes_timeline else ()
         if self.channel is not None:
             return ("uniform", "choice")
-        return RANGE_KINDS if self.is_number else ("choice",)
+        return (*(RANGE_KINDS if self.is_number else ("choice",)), *timeline)
 
     @cached_property
     def end(self) -> Leaf:
         """Return the leaf of one end of a range."""
-        return replace(self, nullable=False, rangeable=False)
+        return replace(self, nullable=False, rangeable=False, takes_timeline=False)
+
+    @cached_property
+    def point(self) -> Leaf:
+        """Return the leaf of the value at a point of a timeline, which may be a range."""
+        return replace(self, nullable=False, takes_timeline=False)
 
     @property
     def unit(self) -> str | None:
@@ -264,6 +276,8 @@ def _section(
     leaves: dict[str, Leaf] = {}
     sections: dict[str, Section] = {}
     infos = {**model.model_fields, **file_fields.model_fields}
+    if model is Recipe:
+        del infos["timelines"]  # in a file each one stands in its field
     for name, info in infos.items():
         field_path = join(path, name)
         kind, nullable = _without_none(info.annotation)
@@ -276,12 +290,25 @@ def _section(
         else:
             rangeable = bool(path) and name not in file_fields.model_fields and kind != Digest
             annotation = Annotated[kind, *info.metadata] if info.metadata else kind
-            leaves[name] = Leaf(field_path, annotation, nullable, rangeable, info)
+            leaf = Leaf(field_path, annotation, nullable, rangeable, info=info)
+            leaves[name] = replace(leaf, takes_timeline=_can_change(leaf))
     if list_info is None:
         return Section(path, model, tuple(infos), leaves, sections)
     (max_items,) = (m.max_length for m in list_info.metadata if isinstance(m, MaxLen))
     description = _one_line(list_info.description)
     return Section(path, model, tuple(infos), leaves, sections, max_items, description)
+
+
+def _can_change(leaf: Leaf) -> bool:
+    """Return True if a field may have a timeline.
+
+    Seeds, files and settings of speed hold for a whole scene.
+    """
+    holder, _, name = leaf.path.rpartition(".")
+    is_state = any(f"{holder}.".startswith(f"{path}.") for path in timeline_holders())
+    is_value = leaf.is_number or leaf.kind is bool or bool(leaf.allowed_words)
+    has_place = leaf.rangeable and "[]" not in leaf.path and leaf.annotation != FilePath
+    return is_state and is_value and has_place and name != "seed" and leaf.path not in KNOBS
 
 
 def _without_none(annotation: Any) -> tuple[Any, bool]:

@@ -226,6 +226,9 @@ class ExplainOptions(RecipeCommand):
         scene: The scene, as for render.
         variant: Which draw from the recipe's ranges.
         times: Render a few views to measure each pass's share of the time.
+        at: Time at which weather that changes is explained, seconds since the drive's first image.
+            The middle of the drive if absent.
+        plot: Also draw all numbers that change over the drive to this PNG file.
         json_file: Also write the plan to this file.
     """
 
@@ -233,6 +236,8 @@ class ExplainOptions(RecipeCommand):
     scene: str
     variant: Annotated[int, Field(ge=0)] = 0
     times: bool = True
+    at: float | None = None
+    plot: Path | None = None
     json_file: JsonFile = None
 
     def run(self) -> int:
@@ -240,7 +245,9 @@ class ExplainOptions(RecipeCommand):
         from tools.explain import explain_recipe, explanation_text
 
         template = load_recipe(self.recipe, read_overrides(self.overrides))
-        facts = explain_recipe(template, self.scene, self.variant, times=self.times)
+        facts = explain_recipe(
+            template, self.scene, self.variant, times=self.times, at_s=self.at, plot=self.plot
+        )
         print(explanation_text(facts))
         write_json(self.json_file, facts)
         return 0

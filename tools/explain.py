@@ -5,8 +5,10 @@ Times are measured on a few of the scene's views.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from adapters.base import open_scene
@@ -16,15 +18,18 @@ from augment.errors import ClimateGSError
 from augment.render.threads import num_kernel_threads
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
+from augment.scene.scene_times import scene_times
 from augment.timing import stopwatch
 from augment.view.plan import Plan, make_plan, plan_view
 from augment.view.quality import apply_settings, resolve_quality
 from augment.view.render_view import render_view
 from recipes.fields import with_unchecked_field
 from recipes.load import load_recipe
+from recipes.moment import SceneTimes
 from recipes.schema import SECTIONS, Recipe, free_knobs, settings_of
 from recipes.template import RecipeTemplate
 from tools.output import compiling_noted, fill
+from tools.weather_course import course_of, write_course
 
 FRAME = "frame"  # the whole view
 ROUNDS = 3  # of all views; the fastest of each counts
@@ -32,13 +37,28 @@ VIEWS = 3
 
 
 def explain_recipe(
-    recipe: str | RecipeTemplate, scene_uri: str, variant: int = 0, *, times: bool = True
+    recipe: str | RecipeTemplate,
+    scene_uri: str,
+    variant: int = 0,
+    *,
+    times: bool = True,
+    at_s: float | None = None,
+    plot: Path | None = None,
 ) -> dict[str, Any]:
     """Resolved numbers, plan and scene facts that decide what is rendered, and, with times, where
     the time of a few rendered views went.
 
     A quality that has still to choose its settings does so with times, which also takes rendering;
-    without, the plan is that of reference.
+    without, the plan is that of reference. A recipe that changes over time is explained at one
+    time of the drive.
+
+    Args:
+        recipe: a preset's name, a file, or a template.
+        scene_uri: the scene.
+        variant: number of the draw.
+        times: if True, views are rendered to measure their time.
+        at_s: seconds since the drive's first image; None for the drive's middle.
+        plot: file for a picture of all numbers that change; None for none.
     """
     template = load_recipe(recipe) if isinstance(recipe, str) else recipe
     if variant >= (count := template.variants):
@@ -53,10 +73,18 @@ def explain_recipe(
     elif is_open:
         reference = {knob.path: knob.reference for knob in free_knobs(resolved)}
         resolved = apply_settings(resolved, reference)
-    plan = make_plan(resolved, scene)
+    drive = scene_times(scene)
+    course = course_of(resolved, drive)
+    state, moment = _state_at(resolved, drive, at_s)
+    if plot is not None:
+        write_course(plot, resolved, drive, moment["drive_s"])
+    plan = make_plan(state, scene, weather_time_s=moment["weather_s"])
     facts = {
         "recipe": resolved.model_dump(mode="json"),
         "recipe_hash": resolved.hash,
+        "moment": moment if course.values or at_s is not None else None,
+        "state": state.model_dump(mode="json"),
+        "course": dataclasses.asdict(course),
         "variants": template.variants,
         "quality": resolved.quality.summary,
         "is_chosen": times or not is_open,
@@ -74,9 +102,30 @@ def explain_recipe(
     }
     if times and any(frame.cameras for frame in scene.frames):
         with compiling_noted():
-            facts["times"] = measure_passes(resolved, scene)
-            facts["parts"] = measure_parts(resolved, scene)
+            facts["times"] = measure_passes(state, scene)
+            facts["parts"] = measure_parts(state, scene)
     return facts | {"views": _view_facts(plan, scene, resolved.render.scale, all_of_it=times)}
+
+
+def _state_at(
+    recipe: Recipe, drive: SceneTimes, at_s: float | None
+) -> tuple[Recipe, dict[str, float]]:
+    """Return the recipe at a time of the drive, and that time, also of the weather, seconds.
+
+    Args:
+        recipe: the recipe.
+        drive: the drive's times.
+        at_s: seconds since the first image; None for the drive's middle.
+    """
+    if at_s is not None and not 0 <= at_s <= drive.duration_s + drive.frame_s:
+        raise ClimateGSError(
+            f"--at {at_s:g}: the scene's drive goes from 0 to {drive.duration_s:g} s after its "
+            f"first image"
+        )
+    drive_s = drive.duration_s / 2 if at_s is None else at_s
+    weather_s = recipe.weather.clock.time_s(drive_s)
+    moment = {"drive_s": drive_s, "weather_s": weather_s}
+    return recipe.at_weather_time(drive, weather_s), moment
 
 
 def _view_facts(plan: Plan, scene: Scene, scale: float, *, all_of_it: bool) -> dict[str, Any]:
@@ -253,11 +302,12 @@ def _sum(times: Sequence[Mapping[str, float]], *names: str) -> float:
 
 def explanation_text(facts: dict[str, Any]) -> str:
     """Return the facts of `explain_recipe` as a page of text."""
-    sections = _sections(facts["recipe"])
+    sections = _sections(facts["state"])
     return fill(
         "explain.txt",
         **facts,
         numbers=[item for name, n in sections.items() if n for item in _flat(name, n)],
+        rows=_course_lines(facts["course"]),
         passes=_pass_lines(facts["plan"]["steps"], facts["times"]),
         seen=[*(e.mask_name for e in reversed(effects.EFFECTS) if e.mask_name), "actors"],
         absent=[name for name, count in facts["views"].items() if count is None],
@@ -273,6 +323,23 @@ def _sections(recipe: Mapping[str, Any]) -> dict[str, Any]:
             value = value[name]
         sections[path.rpartition(".")[2]] = value
     return sections
+
+
+def _course_lines(course: Mapping[str, Any]) -> list[str]:
+    """Return a table of the numbers that change: a line of times, then one for each number."""
+    values = course["values"]
+    if not values:
+        return []
+    rows = {"seconds of the drive": course["drive_s"], **values}
+    if course["weather_s"] != course["drive_s"]:
+        rows = {"seconds of the weather": course["weather_s"], **rows}
+    texts = {name: [f"{value:.4g}" for value in row] for name, row in rows.items()}
+    width = max(map(len, texts))
+    column = max(len(text) for row in texts.values() for text in row)
+    return [
+        f"  {name:<{width}}  " + "  ".join(f"{text:>{column}}" for text in row)
+        for name, row in texts.items()
+    ]
 
 
 def _pass_lines(steps: list[dict[str, Any]], times: dict[str, Any] | None) -> list[str]:

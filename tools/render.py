@@ -19,7 +19,7 @@ from augment.render.backends import choose_backend, renders_on_gpu
 from augment.scene.cameras import Frame
 from augment.scene.scene import Scene
 from augment.scene.scene_index import SceneIndex, check_frames, has_lidar
-from augment.view.plan import make_plan
+from augment.view.plan import check_plans
 from augment.view.quality import choose_settings, recipes_to_try
 from recipes.fields import section_at
 from recipes.job import scaled_recipe
@@ -68,7 +68,7 @@ def render_recipes(options: RenderOptions) -> int:
         path = frames_from_path_file(options.camera_path, scene)
     recipes = [_with_quality(resolved, scene, options, path) for resolved in recipes]
     for resolved in recipes:
-        make_plan(resolved, scene)  # refuse once, not for every image
+        check_plans(resolved, scene)  # refuse once, not for every image
     frame_numbers = parse_frames(options.frames).select([frame.index for frame in scene.frames])
     cameras = _cameras(options, scene, path)
     frames = [f for f in path or scene.frames if frame_numbers is None or f.index in frame_numbers]

@@ -24,6 +24,7 @@ from augment.view.box_labels import uses_boxes
 from augment.view.plan import make_plan
 from augment.view.render_view import render_view
 from augment.view.weathered_sweep import weathered_sweep
+from recipes.moment import ANY_DRIVE
 from recipes.schema import Recipe
 from tools.output import compiling_noted
 from tools.pictures import write_rgb
@@ -35,7 +36,8 @@ SPACING_M = 0.1  # the distance between two of these splats, in metres
 
 
 def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> None:
-    """Compile the kernels that the recipes take, or load them."""
+    """Compile the kernels that the recipes take at any time, or load them."""
+    recipes = [state for recipe in recipes for state in recipe.over_time(ANY_DRIVE)]
     if not renders_on_gpu(backend):
         _warm_recipes(recipes)
     elif not is_interpreted():  # there is nothing to compile then, and drawing takes long

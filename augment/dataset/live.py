@@ -32,6 +32,7 @@ from augment.scene.box_estimates import evidence_of
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import Scene
 from augment.scene.scene_index import SceneIndex, select_frames
+from augment.scene.scene_times import scene_times
 from augment.view.box_labels import label_view, uses_boxes
 from augment.view.quality import resolve_quality
 from augment.view.render_view import render_views
@@ -150,6 +151,7 @@ class SceneDataset(Dataset):
         camera = frame.cameras[name].scaled(recipe.render.scale)
         check_view(view, camera, recipe)
         view, labels = self._label(frame, camera, view)
+        weather = recipe.at(scene_times(self.scene), camera.timestamp_ns)
         world_from_ego = frame.world_from_ego.clone()
         world_from_ego[:3, 3] += torch.from_numpy(origin_m)
         return make_sample(
@@ -159,7 +161,7 @@ class SceneDataset(Dataset):
             world_from_ego=world_from_ego,
             labels=labels,
             metadata={
-                "weather": {n: v for n, v in recipe.columns().items() if isinstance(v, float)},
+                "weather": {n: v for n, v in weather.columns().items() if isinstance(v, float)},
                 "paths": dict.fromkeys(path_kinds()),
                 "scene": self.scene.name,
                 "variant": variant_name(recipe),

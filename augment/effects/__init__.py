@@ -6,6 +6,8 @@ may extend the list by `add_effect`.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from augment.detail.prune import precompute_errors, prune_error_of
 from augment.effects.effect import Effect, JobContext
 from augment.effects.falling.effect import RainEffect, SnowfallEffect
@@ -17,6 +19,7 @@ from augment.effects.snow.effect import SnowEffect
 from augment.effects.spray.effect import SprayEffect
 from augment.effects.style.effect import StyleEffect
 from augment.effects.wet.effect import WetEffect
+from augment.scene.scene_times import scene_times
 from recipes.schema import add_section, remove_section
 
 # Effects in the order in which they are applied. Style colours the scene, and rain wets it. Then
@@ -48,7 +51,11 @@ def precompute_effects(context: JobContext, *, only_files: bool = False) -> None
     Raises:
         SceneError: an effect is impossible in this scene.
         StyleError: a style cannot be used.
+        RecipeError: a timeline goes beyond the scene's drive.
     """
+    times = scene_times(context.scene)
+    recipes = [state for recipe in context.recipes for state in recipe.over_time(times)]
+    context = replace(context, recipes=recipes)
     for effect in EFFECTS:
         if effect.precomputes_files or not only_files:
             effect.precompute(context)

@@ -107,6 +107,9 @@ class EffectInScene:
     view_data: Any = None
     """`Visibility.view_data` of the view at hand, as `Effect.visibility` returned it."""
 
+    weather_time_s: float = 0.0
+    """Time of the weather at the image, seconds; the clock of the recipe has given it its speed."""
+
     @cached_property
     def prepared_data(self) -> Any:
         """Result of `Effect.prepare`."""

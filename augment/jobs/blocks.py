@@ -37,7 +37,9 @@ from augment.photo.trust import judge_scene, source_views, unfitted_cameras
 from augment.scene.cameras import scaled_size
 from augment.scene.scene import Scene
 from augment.scene.scene_index import SceneIndex, has_lidar, select_frames
+from recipes.errors import RecipeError
 from recipes.job import ALL_CAMERAS, JobRecipes, JobScene
+from recipes.moment import SceneTimes
 from recipes.schema import Recipe, parse_frames
 
 # ---- Record of a scene that is not open, and the blocks of images it is cut into -----------------
@@ -109,6 +111,13 @@ class SceneRecord:
             problems=judge_scene(scene, cameras=cameras, scale=None, count=1).problems,
             digest=digest,
         )
+
+    @property
+    def times(self) -> SceneTimes:
+        """Times of the scene's images, by which its weather changes."""
+        images = [time for frame in self.frames for _, _, time in frame.cameras.values()]
+        times = images or [frame.timestamp_ns for frame in self.frames] or [0]
+        return SceneTimes(min(times), max(times), len(self.frames))
 
     def to_json(self) -> bytes:
         """Return the record as JSON."""
@@ -341,6 +350,12 @@ def make_job_plan(
         resolved_recipes = [
             resolved.get((record.name, variant_name(recipe)), recipe) for recipe in recipe_draws
         ]
+        try:
+            for recipe in recipe_draws:
+                recipe.check_times(record.times)
+        except RecipeError as error:
+            unusable[entry.uri] = str(error)
+            continue
         if failures := [why for why in resolved_recipes if isinstance(why, str)]:
             unusable[entry.uri] = failures[0]
             continue

@@ -506,6 +506,7 @@ class _Generation:
                 block.recipe,
                 identity,
                 pictured,
+                record.times,
                 paths=empty_paths,
                 status=FAILED,
                 message=message,

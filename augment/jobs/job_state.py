@@ -62,6 +62,7 @@ from augment.output.manifest import (
     image_row,
     later_columns,
     merge_rows,
+    moment_columns,
     read_manifest,
     recipe_columns,
     select_variant_rows,
@@ -267,7 +268,15 @@ class VariantState:
         recipe_values = recipe_columns(self.recipe)
         if self._adopts_rows:
             recipe_values["source_digest"] = self.identity.source_digest
-        all_rows = [{**later_columns(), **row, **recipe_values} for row in [*rows, *logged_rows]]
+        all_rows = [
+            {
+                **later_columns(),
+                **row,
+                **recipe_values,
+                **moment_columns(self.recipe, self.index.times, row["timestamp_ns"]),
+            }
+            for row in [*rows, *logged_rows]
+        ]
         self.rows = {(row["frame"], row["camera"]): row for row in all_rows}
         return False
 
@@ -410,6 +419,7 @@ class VariantState:
             recipe,
             self.identity,
             ImageFacts(frame.index, camera.name, camera.timestamp_ns, camera.width, camera.height),
+            index.times,
             paths=paths | {f"{kind}_path": None for kind in absent_kinds},
             status=outcome.status,
             message=outcome.message,

@@ -35,6 +35,8 @@ from augment.output.layout import (
 from augment.output.names import MANIFEST_FILE, STATE_FOLDER
 from augment.output.store import Store, StoredFileMissing
 from augment.output.tables import read_table
+from recipes.fields import section_at
+from recipes.moment import SceneTimes
 from recipes.schema import KNOBS, SECTIONS, Recipe, columns_of_effects, settings_of
 from recipes.speed import former_path
 
@@ -85,6 +87,7 @@ def leading_columns() -> dict[str, pa.DataType]:
         **{"width": integer, "height": integer},
         **dict.fromkeys(("base", "surface", "lidar", "lidar_note", *text_columns, "quality"), text),
         **{"render_scale": pa.float64(), "settings": text, "source_digest": text},
+        **{"weather_time_s": pa.float64(), "timeline_values": text},
         **dict.fromkeys(mask_share_columns().values(), pa.float64()),
         **dict.fromkeys(measured_columns(), pa.float64()),
     }
@@ -692,6 +695,7 @@ def image_row(
     recipe: Recipe,
     identity: Identity,
     pictured: ImageFacts,
+    scene_times: SceneTimes,
     *,
     paths: Mapping[str, str | None],
     status: str,
@@ -705,6 +709,7 @@ def image_row(
 
     Args:
         pictured: The image.
+        scene_times: Times of the scene's drive.
         paths: Paths of the image's files by column; a failed image gets none, whatever they say.
         status: OK or FAILED.
         measures: Numbers that were measured of the image, as of `view_files.ViewFiles`.
@@ -715,6 +720,7 @@ def image_row(
         **pictured._asdict(),
         **(paths if status == OK else dict.fromkeys(paths)),
         **recipe_columns(recipe),
+        **moment_columns(recipe, scene_times, pictured.timestamp_ns),
         "lidar": lidar,
         "lidar_note": lidar_note,
         **dict.fromkeys((*mask_share_columns().values(), *measured_columns())),
@@ -728,8 +734,32 @@ def image_row(
     }
 
 
+def moment_columns(
+    recipe: Recipe, scene_times: SceneTimes, timestamp_ns: int
+) -> dict[str, str | float | None]:
+    """Return the values that a recipe gives an image at its own time, by columns.
+
+    The column `timeline_values` is JSON of the values of all timelines, by dotted path. The dict is
+    empty for a recipe that never changes, whose rows hold null there.
+
+    Args:
+        recipe: The recipe.
+        scene_times: Times of the scene's drive.
+        timestamp_ns: Time of the image.
+    """
+    if not recipe.changes_over_time:
+        return {}
+    state = recipe.at(scene_times, timestamp_ns)
+    values = {timeline.path: section_at(state, timeline.path) for timeline in recipe.timelines}
+    return {
+        **state.columns(),
+        "weather_time_s": recipe.weather_time_s(scene_times, timestamp_ns),
+        "timeline_values": json.dumps(values, separators=(",", ":")) if values else None,
+    }
+
+
 def recipe_columns(recipe: Recipe) -> dict[str, str | float | None]:
-    """Return the values that a recipe gives its images, by columns.
+    """Return the values that a recipe gives all its images, by columns.
 
     The column `settings` is JSON of the knobs that a quality may set (recipes.schema) and that have
     an effect, by dotted path; None where the recipe has no quality. Fields of `render.speed` have

@@ -17,6 +17,8 @@ from augment.scene.boxes import Instances, instances_of
 from augment.scene.cameras import Frame
 from augment.scene.labels import LabelSource
 from augment.scene.scene import Scene
+from augment.scene.scene_times import scene_times
+from recipes.moment import SceneTimes
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,8 @@ class SceneIndex:
     """Origin that was subtracted from the dataset's world, metres."""
     has_metric_scale: bool
     """True if the scene's unit is the metre."""
+    times: SceneTimes
+    """Times of the scene's own images, by which its weather changes."""
 
     @staticmethod
     def of(scene: Scene, camera_path: Sequence[Frame] | None = None) -> SceneIndex:
@@ -59,6 +63,7 @@ class SceneIndex:
             instances=instances_of(scene),
             world_origin_m=np.asarray(scene.world_origin_m, np.float64),
             has_metric_scale=scene.has_metric_scale,
+            times=scene_times(scene),
         )
 
     @functools.cached_property

@@ -35,6 +35,7 @@ from augment.render.constants import RasterSettings
 from augment.scene.bounds import actor_boxes, find_visible_owners
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
+from augment.scene.scene_times import scene_times
 from recipes.errors import RecipeError
 from recipes.schema import Recipe, Sensor
 
@@ -97,6 +98,8 @@ class Plan:
     """Seed of the recipe."""
     steps: tuple[Step, ...]
     """Every pass considered, in order."""
+    weather_time_s: float = 0.0
+    """Time of the weather at the image, seconds: the wind has moved its fields for as long."""
 
     @property
     def water_level_z_m(self) -> float | None:
@@ -117,7 +120,14 @@ class Plan:
             if data is not None:
                 active_effects = (
                     *active_effects,
-                    EffectInScene(effect, data, scene, backend, active_effects),
+                    EffectInScene(
+                        effect,
+                        data,
+                        scene,
+                        backend,
+                        active_effects,
+                        weather_time_s=self.weather_time_s,
+                    ),
                 )
         return active_effects
 
@@ -135,8 +145,42 @@ class Plan:
         }
 
 
-def make_plan(recipe: Recipe, scene: Scene) -> Plan:
+def plan_at(recipe: Recipe, scene: Scene, timestamp_ns: int) -> tuple[Recipe, Plan]:
+    """Return the recipe at the time of an image, and the passes that it requires of the scene.
+
+    Args:
+        recipe: the recipe, in which values may change over time.
+        scene: the scene.
+        timestamp_ns: time of the image.
+
+    Raises:
+        SceneError: the recipe needs what the scene does not have.
+        RecipeError: a timeline goes beyond the drive, or the quality is open.
+    """
+    times = scene_times(scene)
+    time_s = recipe.weather_time_s(times, timestamp_ns)
+    recipe = recipe.at_weather_time(times, time_s)
+    return recipe, make_plan(recipe, scene, weather_time_s=time_s)
+
+
+def check_plans(recipe: Recipe, scene: Scene) -> None:
+    """Refuse a recipe that is impossible in a scene at any time of its drive.
+
+    Raises:
+        SceneError: the recipe needs what the scene does not have.
+        RecipeError: a timeline goes beyond the drive, or the quality is open.
+    """
+    for state in recipe.over_time(scene_times(scene)):
+        make_plan(state, scene)
+
+
+def make_plan(recipe: Recipe, scene: Scene, *, weather_time_s: float = 0.0) -> Plan:
     """Return the passes that `recipe` requires of `scene`.
+
+    Args:
+        recipe: the recipe at the time of an image (`plan_at`).
+        scene: the scene.
+        weather_time_s: time of the weather at that image, seconds.
 
     Raises:
         SceneError: the recipe needs what the scene does not have (the road's height, photos).
@@ -212,6 +256,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             Step(GLOSS_PASS, gloss_fade > 0, gloss_reason, SCENE),
             *_all_steps(recipe, scene, effect_plans, buffers, bare_buffers, exposure),
         ),
+        weather_time_s=weather_time_s,
     )
 
 

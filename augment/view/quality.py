@@ -34,6 +34,7 @@ from augment.output.store import Store, StoredFileMissing
 from augment.progress import ProgressBar
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import Scene
+from augment.scene.scene_times import scene_times
 from augment.view.render_view import render_view
 from augment.view.results import Renderer
 from recipes.fields import with_unchecked_field
@@ -41,6 +42,10 @@ from recipes.schema import KNOBS, Recipe, Value, free_knobs, with_settings
 from recipes.speed import MOVED_FIELDS, former_path
 
 # ---- One picture, to measure its time and its error at the size of its reference -----------------
+
+
+# Largest number of views that are rendered because the weather is at an extreme then.
+MAX_EXTREMES = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +118,18 @@ class CalibrationView(NamedTuple):
     """The camera."""
 
 
-def calibration_views(frames: Sequence[Frame], count: int = 3) -> tuple[CalibrationView, ...]:
-    """Return images spread over the frames and over each frame's cameras.
+def calibration_views(
+    frames: Sequence[Frame], count: int = 3, times_ns: Sequence[int] = ()
+) -> tuple[CalibrationView, ...]:
+    """Return images spread over the frames and over each frame's cameras, and some of other times.
 
-    There are at most `count`, and at least one.
+    There are at most `count` and one for each time, and at least one.
 
     Args:
         frames: All frames of the scene or the camera path, never a selection, so that the choice
             does not depend on which images are rendered.
+        count: Number of images spread over the frames.
+        times_ns: Times at which the weather is at an extreme; the nearest frame of each counts.
     """
     frames_with_cameras = sorted((f for f in frames if f.cameras), key=lambda frame: frame.index)
     if not frames_with_cameras:
@@ -133,7 +142,24 @@ def calibration_views(frames: Sequence[Frame], count: int = 3) -> tuple[Calibrat
         views.setdefault(
             (frame.index, name), CalibrationView(frame.index, name, frame.cameras[name])
         )
+    for number, time_ns in enumerate(times_ns):
+        frame = min(frames_with_cameras, key=lambda frame: abs(frame.timestamp_ns - time_ns))
+        if any(index == frame.index for index, _ in views):
+            continue
+        name = sorted(frame.cameras)[number % len(frame.cameras)]
+        views[frame.index, name] = CalibrationView(frame.index, name, frame.cameras[name])
     return tuple(views.values())
+
+
+def _extreme_times_ns(recipe: Recipe, scene: Scene) -> list[int]:
+    """Return some times of the drive at which a changing recipe is at its extremes."""
+    if not recipe.changes_over_time:
+        return []
+    drive = scene_times(scene)
+    clock = recipe.weather.clock
+    times_s = recipe.key_times_s(drive)
+    rows = np.linspace(0, len(times_s) - 1, min(len(times_s), MAX_EXTREMES)).round().astype(int)
+    return [drive.start_ns + round((times_s[i] - clock.start_s) / clock.speed * 1e9) for i in rows]
 
 
 # ---- The search ----------------------------------------------------------------------------------
@@ -407,7 +433,10 @@ def resolve_quality(
     if not recipe.has_open_choice:
         return SettingsChoice(recipe)
     start_s = perf_counter()
-    views = calibration_views(scene.frames if camera_path is None else camera_path)
+    views = calibration_views(
+        scene.frames if camera_path is None else camera_path,
+        times_ns=_extreme_times_ns(recipe, scene),
+    )
     cameras = None
     if camera_path is not None:
         cameras = [camera for frame in camera_path for camera in frame.cameras.values()]

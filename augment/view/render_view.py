@@ -57,7 +57,7 @@ from augment.view.plan import (
     SHADOW_PASS,
     Plan,
     ViewPlan,
-    make_plan,
+    plan_at,
     plan_view,
 )
 from augment.view.results import (
@@ -95,7 +95,7 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
     if backend == AUTO:
         backend = choose_backend(backend, scene)
     with timed("plan"):
-        plan = make_plan(recipe, scene)
+        recipe, plan = plan_at(recipe, scene, camera.timestamp_ns)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     images = start_images(buffers, plan)
     # The closure below holds the camera and not the buffers, which the images may long outlive.
@@ -122,7 +122,7 @@ def render_buffers(
     Args:
         scene: the scene.
         camera: the view, at the resolution to render.
-        plan: the passes that the recipe requires (`augment.view.plan.make_plan`).
+        plan: the passes that the recipe requires (`augment.view.plan.plan_at`).
         backend: as for `rasterize`.
     """
     with timed("view plan"):

@@ -18,7 +18,7 @@ from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN
 from augment.rng import rng_for
 from augment.scene.labels import LidarSweep
 from augment.scene.scene import Scene
-from augment.view.plan import make_plan
+from augment.view.plan import plan_at
 from recipes.schema import Recipe
 
 
@@ -39,7 +39,7 @@ def weathered_sweep(
 
     Args:
         scene: the scene, with its labels.
-        recipe: the weather.
+        recipe: the weather; the sweep has that of the frame's time.
         frame_index: index of the frame.
         sweep: the recorded sweep.
         model: optics of the sensor.
@@ -55,7 +55,7 @@ def weathered_sweep(
                 f"the sweep of frame {frame_index} has a column {name!r} already: it is weathered, "
                 f"or the dataset's own column must be renamed"
             )
-    plan = make_plan(recipe, scene)
+    recipe, plan = plan_at(recipe, scene, scene.frame(frame_index).timestamp_ns)
     origins = find_beam_origins(scene, frame_index, sweep)
     echoes = Echoes.from_sweep(sweep, origins, np.asarray(scene.world_origin_m), model)
     active_effects = plan.active_effects(scene)

@@ -38,6 +38,7 @@ from augment.output.manifest import (
 )
 from augment.output.store import Store, open_store
 from augment.output.tables import read_table
+from recipes.moment import SceneTimes
 from tests.augment.batch_scenes import fog_job, make_recipe, run_fake
 
 
@@ -206,7 +207,8 @@ PATHS = {f"{kind}_path": "a.png" if kind == "image" else None for kind in path_k
 def table(frames: dict[int, bool], message: str = "", scene: str = "a") -> pa.Table:
     """Rows of frames; the values say whether they are finished."""
     rows = [
-        image_row(scene, RECIPE, IDENTITY, ImageFacts(frame, "front", frame, 4, 3), paths=PATHS,
+        image_row(scene, RECIPE, IDENTITY, ImageFacts(frame, "front", frame, 4, 3),
+                  SceneTimes(0, 1), paths=PATHS,
                   status=OK if done else FAILED, message=message)
         for frame, done in frames.items()
     ]  # fmt: skip

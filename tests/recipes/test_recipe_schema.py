@@ -21,6 +21,7 @@ from recipes.json_schema import recipe_json_schema, write_schema
 from recipes.lens_drops import LensDrops
 from recipes.light import Light, ListedLamp
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
+from recipes.moment import Air
 from recipes.rain import Rain
 from recipes.ranges import format_value
 from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
@@ -229,7 +230,7 @@ def test_every_field_changes_the_hash() -> None:
     smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1)
     rain = Rain(rate_mm_h=5.0)
     snowfall = Snowfall(rate_mm_h=1.0)
-    weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain, snowfall=snowfall)
+    weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain, snowfall=snowfall, air=Air())
     camera = Sensor(lens_drops=LensDrops(count=5))
     style = Style(image="a.png", digest="0" * 64)
     output = Output(categories=(Category(label="car", name="Car"),))
@@ -391,6 +392,20 @@ WAVE = {"amplitude_m": 0.02, "wavelength_m": 2.0}
         with_smog(visibility_m={"log_uniform": [1.0, 2.0]}),
         with_smog(visibility_m={"normal": {"mean": 2.0, "std": 1.0, "min": 1.0, "max": 3.0}}),
         with_smog(scale_height_m={"choice": [None, 5.0, {"uniform": [1.0, 2.0]}]}),
+        with_smog(
+            visibility_m={"timeline": [[-3, 50], [{"uniform": [0, 1]}, {"choice": [60, 70]}]]}
+        ),
+        with_smog(
+            visibility_m={"timeline": [[0, 50], [1, 9]], "shape": "smooth", "times": "share"}
+        ),
+        with_smog(scale_height_m={"choice": [None, {"timeline": [[0, 50.0], [1, 9.0]]}]}),
+        with_snow(tracks={"timeline": [[0, "never"], [2, "always"]], "shape": "step"}),
+        {
+            "weather": {
+                "air": {"humidity": {"timeline": [[0, 0.9], [60, 0.4]]}},
+                "clock": {"speed": 60},
+            }
+        },
         with_smog(color=[0.5, {"uniform": [0.0, 1.0]}, {"choice": [0.5]}]),
         with_smog(color={"uniform": [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]}),
         with_smog(model={"choice": ["deferred"], "weights": [2.0]}),
@@ -431,6 +446,18 @@ def test_both_accept(data: dict, validator: Any) -> None:
         with_smog(visibility_m={"uniform": [None, 1.0]}),
         with_smog(visibility_m={"unifrom": [1.0, 2.0]}),
         with_smog(visibility_m={"choice": []}),
+        with_smog(visibility_m={"timeline": []}),
+        with_smog(visibility_m={"timeline": [[0, 0.0], [1, 5.0]]}),
+        with_smog(visibility_m={"timeline": [[0, None], [1, 5.0]]}),
+        with_smog(visibility_m={"timeline": [[0, 3.0, 4.0]]}),
+        with_smog(visibility_m={"timeline": [[0, 3.0], ["late", 5.0]]}),
+        with_smog(visibility_m={"timeline": [[0, 3.0], [1, 5.0]], "shape": "round"}),
+        with_smog(visibility_m={"timeline": [[0, 3.0], [1, 5.0]], "times": "minutes"}),
+        with_smog(color={"timeline": [[0, [0.1, 0.1, 0.1]], [1, [0.5, 0.5, 0.5]]]}),
+        with_snow(cell_m={"timeline": [[0, 0.1], [1, 0.2]]}),
+        with_snow(tracks={"timeline": [[0, "never"], [2, "always"]], "shape": "linear"}),
+        {"render": {"scale": {"timeline": [[0, 1.0], [1, 0.5]]}}},
+        {"timelines": []},
         with_smog(base_height_m={"log_uniform": [0.0, 2.0]}),
         with_smog(base_height_m={"normal": {"mean": 1.0, "std": 0.0, "min": 0.0, "max": 2.0}}),
         with_smog(color={"log_uniform": [[0.1, 0.1, 0.1], [1.0, 1.0, 1.0]]}),

@@ -25,6 +25,7 @@ from augment.light.scene_light import find_scene_light
 from augment.output.manifest import read_manifest
 from augment.scene.labels import Boxes
 from augment.scene.scene import Gaussians, Scene
+from augment.scene.scene_times import scene_times
 from recipes.schema import Output, Recipe
 from recipes.style import style_preset_names
 from tests.fitted_scenes import assert_same, fitted_scene
@@ -309,6 +310,36 @@ def test_times_are_on_the_page_only_where_they_were_measured(scene, monkeypatch,
     monkeypatch.setattr(explain, "measure_passes", None)  # not called
     facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
     assert facts["times"] is None and "%" not in page and "skips  flood: bed" in page
+
+
+CHANGING = """
+weather:
+  clock: {speed: 10}
+  smog: {visibility_m: {timeline: [[0, 50], [1, 250]], times: share}}
+output: {depth: none, labels: false}
+"""
+
+
+def test_changing_weather_is_explained_at_a_time_and_drawn(scene, monkeypatch, tmp_path):
+    facts, page = explained(monkeypatch, tmp_path, scene, CHANGING, times=False)
+    drive_s = scene_times(scene).duration_s
+    assert facts["moment"] == {"drive_s": drive_s / 2, "weather_s": 5 * drive_s}
+    assert "smog.visibility_m = 150" in page and "numbers that change over the drive:" in page
+    assert facts["course"]["values"]["weather.smog.visibility_m"] == pytest.approx(
+        [50 + 25 * i for i in range(9)]
+    )
+    picture = tmp_path / "curves.png"
+    options = {"times": False, "at_s": 0.0, "plot": picture}
+    facts, page = explained(monkeypatch, tmp_path, scene, CHANGING, **options)
+    assert "0 s after the drive's first image" in page and "smog.visibility_m = 50" in page
+    assert cv2.imread(str(picture)).shape[2] == 3
+    with pytest.raises(ClimateGSError, match="--at 99: the scene's drive goes from 0 to"):
+        explained(monkeypatch, tmp_path, scene, CHANGING, times=False, at_s=99.0)
+    plain = "weather: {smog: {visibility_m: 40}}\n"
+    with pytest.raises(ClimateGSError, match="no number of recipe recipe changes"):
+        explained(monkeypatch, tmp_path, scene, plain, times=False, plot=picture)
+    _, page = explained(monkeypatch, tmp_path, scene, plain, times=False)
+    assert "change over the drive" not in page and "first image" not in page
 
 
 def test_lamps_are_explained_by_source_with_their_cost(scene, monkeypatch, tmp_path):

@@ -30,13 +30,15 @@ from augment.output.manifest import rows_to_table, write_manifest
 from augment.output.store import open_store
 from augment.scene.cameras import Camera
 from augment.scene.geometry import invert_rigid
+from augment.scene.scene_times import scene_times
 from augment.timing import PassProgress, counted_steps
 from augment.view.render_view import render_view
 from recipes.errors import RecipeError
 from recipes.fields import section_at, with_unchecked_field
-from recipes.load import load_recipe, preset_names
+from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.schema import SECTIONS
 from recipes.sections import recipe_file
+from tests.augment.batch_scenes import open_fake
 from tests.augment.dust import DustEffect
 from tests.streets import LABELLED_STREET, SMALL_STREET, open_street
 from tests.tools.page_client import PageClient
@@ -50,7 +52,14 @@ from tools.view.controls import (
     group_of,
     split_by_rank,
 )
-from tools.view.edits import Edits, save_recipe, start_values, unused_path, without_weather
+from tools.view.edits import (
+    Edits,
+    hold_weather,
+    save_recipe,
+    start_values,
+    unused_path,
+    without_weather,
+)
 from tools.view.outputs import OutputViewer, find_output
 from tools.view.page import ViewRequest
 from tools.view.pictures import (
@@ -276,6 +285,23 @@ def test_of_two_fields_that_exclude_each_other_the_older_gives_way():
     smog = edits.without_conflict("weather.smog.extinction_per_m", others).recipe().weather.smog
     assert smog is not None and (smog.extinction_per_m, smog.visibility_m) == (0.1, None)
     assert Edits("clear").without_conflict("seed", others) == Edits("clear")
+
+
+def test_held_weather_is_that_of_another_time_and_stays_so_when_it_is_saved():
+    scene = open_fake("fake:street")
+    text = "weather: {clock: {speed: 10}, smog: {visibility_m: {timeline: [[0, 10], [3, 70]]}}}"
+    recipe = parse_recipe(text, source="page", name="page").resolve(0)
+    camera = scene.frames[3].cameras["front"]
+    held = hold_weather(recipe, scene, camera, 0.1)
+    times = scene_times(scene)
+    assert held.weather.smog is not None and held.timelines == ()
+    assert held.weather.smog.visibility_m == pytest.approx(30)
+    assert held.at(times, camera.timestamp_ns) is held
+    assert held.weather_time_s(times, camera.timestamp_ns) == pytest.approx(1)
+    saved = parse_recipe(dump_recipe(held), source="saved").resolve(0)
+    assert saved == held and saved.at(times, camera.timestamp_ns) == held
+    clear = without_weather(recipe)
+    assert clear.at(times, camera.timestamp_ns) is clear
 
 
 def test_a_saved_recipe_reads_back_with_its_files_and_replaces_none(tmp_path):

@@ -16,6 +16,9 @@ from pydantic import ValidationError
 from augment.errors import OutputError
 from augment.output.atomic import write_new_file
 from augment.output.recipe_files import copy_files, portable_recipe
+from augment.scene.cameras import Camera
+from augment.scene.scene import Scene
+from augment.scene.scene_times import scene_times
 from recipes.errors import RecipeError, short
 from recipes.fields import section_at, with_unchecked_field
 from recipes.job import scaled_recipe
@@ -152,7 +155,28 @@ def without_weather(recipe: Recipe) -> Recipe:
     """Return the recipe of the same picture without effects, through a clean camera."""
     for section in recipe.sections():
         recipe = with_unchecked_field(recipe, section, None)
-    return recipe.model_copy(update={"camera": Sensor()})
+    return recipe.model_copy(update={"camera": Sensor(), "timelines": ()})
+
+
+def hold_weather(recipe: Recipe, scene: Scene, camera: Camera, drive_s: float) -> Recipe:
+    """Return the recipe of a picture whose weather is that of another time.
+
+    Args:
+        recipe: The recipe.
+        scene: The scene.
+        camera: The camera of the picture.
+        drive_s: Time of the weather's drive, seconds since its first image.
+
+    Raises:
+        RecipeError: a timeline goes beyond the drive.
+    """
+    times = scene_times(scene)
+    clock = recipe.weather.clock
+    time_s = clock.time_s(drive_s)
+    start_s = time_s - clock.speed * times.drive_s(camera.timestamp_ns)
+    state = recipe.at_weather_time(times, time_s)
+    state = with_unchecked_field(state, "weather.clock.start_s", start_s)
+    return with_unchecked_field(state, "weather.air", None)  # or a saved recipe would change again
 
 
 def rename_recipe(recipe: Recipe, name: str) -> Recipe:

@@ -25,13 +25,14 @@ from augment.photo.trust import unfitted_cameras
 from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import quat_from_rotmat
 from augment.scene.scene import Scene
+from augment.scene.scene_times import scene_times
 from recipes.errors import RecipeError
 from recipes.fields import section_at
 from recipes.load import describe_preset, preset_names
 from recipes.schema import TIERS, Recipe
 from tools.view.browser import page_style
 from tools.view.controls import MAIN_FIELDS, Control, Group, effect_groups, group_of, split_by_rank
-from tools.view.edits import Edits, as_yaml, create_file
+from tools.view.edits import Edits, as_yaml, create_file, hold_weather
 from tools.view.fields import NONE, Field
 from tools.view.pictures import (
     PICTURE,
@@ -118,6 +119,10 @@ class ViewRequest:
     """True if the picture has the recipe's full resolution, whatever the window's size."""
     is_playing: bool = False
     """True while the drive is played."""
+    is_weather_held: bool = False
+    """True if the weather is that of `weather_percent`, whatever the frame."""
+    weather_percent: float = 0.0
+    """The time of weather that is held, percent of the drive."""
 
     @property
     def needs_depth(self) -> bool:
@@ -209,6 +214,17 @@ class Page:
             raise result[1]
         self._last_valid_recipe = result[1]
         return result[1]
+
+    def recipe_at(self, request: ViewRequest, recipe: Recipe) -> Recipe:
+        """Return the recipe with the weather that the page holds, or as it is.
+
+        Raises:
+            RecipeError: a timeline goes beyond the drive.
+        """
+        if not request.is_weather_held:
+            return recipe
+        drive_s = scene_times(self.viewer.scene).duration_s * request.weather_percent / 100
+        return hold_weather(recipe, self.viewer.scene, self.camera_of(request), drive_s)
 
     @property
     def last_valid_recipe(self) -> Recipe | None:
@@ -505,6 +521,11 @@ class Page:
         self._subscribe(self._time, self.go_to_frame)
         self._subscribe(camera, lambda word: self._end_flight(cameras[word]))
         self._subscribe(back, lambda _: self._end_flight(self.request.camera), "on_click")
+        with gui.add_folder("time of the weather", expand_by_default=False):
+            hint = "Weather that changes is that of the time below, and not of the frame."
+            self._toggle("hold", "is_weather_held", hint)
+            hint = "From the drive's first image to its last, percent of the time between."
+            percent = gui.add_slider("at [%]", 0.0, 100.0, 0.5, 0.0, hint=hint)
         with gui.add_folder("before and after"):
             self._toggle("split", "is_split", "Left of the line the scene without its weather.")
             line = gui.add_slider("line", 0.0, 1.0, 0.005, self.request.share)
@@ -520,6 +541,7 @@ class Page:
         self._bind(play, "is_playing")
         self._bind(shows, "shows")
         self._bind(line, "share")
+        self._bind(percent, "weather_percent")
 
     def _toggle(self, label: str, name: str, hint: str) -> None:
         self._bind(self.gui.add_checkbox(label, False, hint=hint), name)
@@ -620,6 +642,11 @@ class Page:
                 recipe_field.show(section_at(recipe, path))
         source = self.request.edits.source
         about = describe_preset(source) if source in preset_names() else "Your recipe."
+        if recipe.timelines:
+            paths = ", ".join(timeline.path for timeline in recipe.timelines)
+            about += (
+                f" Changes over time: {paths}. A change of such a field here gives it one value."
+            )
         self._about.content = paragraph(about, style="padding-bottom:0.6em")
         self._seed.value = min(recipe.seed, 2**53 - 1)
         self._variant.value = recipe.variant

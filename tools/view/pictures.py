@@ -25,7 +25,7 @@ from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import invert_rigid, rigid, rotmat_from_quat
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
-from augment.view.plan import make_plan
+from augment.view.plan import plan_at
 from augment.view.render_view import render_buffers, render_view
 from augment.view.weathered_sweep import weathered_sweep
 from recipes.fields import with_unchecked_field
@@ -227,7 +227,8 @@ def draw(
 
 
 def _draw_splat_ids(scene: Scene, camera: Camera, recipe: Recipe, backend: str) -> PageImage:
-    plan = make_plan(with_unchecked_field(recipe, "output.semantic", True), scene)
+    recipe = with_unchecked_field(recipe, "output.semantic", True)
+    _, plan = plan_at(recipe, scene, camera.timestamp_ns)
     view = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     ids = getattr(view.raster, SPLAT_IDS).cpu().numpy()
     rgb = np.where(ids[..., None] >= 0, color_numbers(ids), 0).astype(np.uint8)

@@ -38,7 +38,7 @@ from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 from augment.scene.scene_index import check_frames
 from augment.timing import PassProgress, stopwatch, watched
-from augment.view.plan import make_plan, plan_view
+from augment.view.plan import check_plans, plan_at, plan_view
 from augment.view.render_view import render_view
 from recipes.errors import RecipeError, short
 from recipes.schema import TIERS, Recipe
@@ -86,7 +86,7 @@ def view_scene(options: ViewOptions) -> int:
     overrides = (text.partition("=") for text in options.overrides)
     values = {path.strip(): value for path, _, value in overrides}
     edits = Edits(options.recipe, options.scale, values, folder=options.out)
-    make_plan(edits.recipe(), scene)  # refuse before a page opens
+    check_plans(edits.recipe(), scene)  # refuse before a page opens
     backend = choose_backend(options.backend, scene)
     viewer = Viewer(scene, options.scene, edits, options.out, backend)
     return _serve_until_interrupted(viser, viewer, options)
@@ -397,6 +397,7 @@ class Viewer:
             recipe = page.last_valid_recipe
             if recipe is None:
                 raise
+        recipe = page.recipe_at(request, recipe)
         camera = page.camera_of(request)
         factor = self._factor(page, request, recipe, camera)
         if moving:
@@ -536,7 +537,8 @@ class Viewer:
         if page.overlay_key != key:
             page.show_overlays(request, points)
             page.overlay_key = key
-        steps = plan_view(make_plan(recipe, self.scene), self.scene, camera).steps
+        _, plan = plan_at(recipe, self.scene, camera.timestamp_ns)
+        steps = plan_view(plan, self.scene, camera).steps
         rows = [(step.name, _milliseconds(pass_seconds.get(step.name)), step.why) for step in steps]
         page.show_plan(table(("pass", "ms", "why, or why not"), rows, [s.runs for s in steps]))
         page.show_command(self._command(page, request))
@@ -566,7 +568,7 @@ class Viewer:
         check_size(camera.width * scale, camera.height * scale)
         pictures: dict[str, tuple[float, np.ndarray]] = {}
         for tier in (*TIERS, "reference"):
-            recipe = request.edits.with_tier(tier).recipe()
+            recipe = page.recipe_at(request, request.edits.with_tier(tier).recipe())
             recipe = recipe_to_show(recipe, request.shows, with_depth=False, factor=1.0)
             rgb = render_view(self.scene, camera, recipe, backend=self.backend).rgb
             times = []  # without what is prepared once
@@ -597,7 +599,7 @@ class Viewer:
             ClimateGSError: the picture is too large, or the folder cannot be written.
         """
         request = page.request
-        recipe = rename_recipe(page.recipe(request.edits), name)
+        recipe = rename_recipe(page.recipe_at(request, page.recipe(request.edits)), name)
         if with_picture:
             camera = page.camera_of(request)
             scale = recipe.render.scale
@@ -669,8 +671,10 @@ class Viewer:
         note instead.
         """
         files = any(path.endswith(("image", "mask", "checkpoint")) for path in request.edits.values)
-        if files or request.pose is not None:
+        if files or request.pose is not None or request.is_weather_held:
             unsaved_part = "a flight" if request.pose is not None else "an uploaded file"
+            if request.is_weather_held:
+                unsaved_part = "weather of another time"
             return f"# {unsaved_part}: save the recipe first, and the command will stand here"
         return request.edits.command(f"{self._view_words(request, None)} --out out/view")
 
