@@ -496,6 +496,30 @@ class LabelsOptions(Command):
         return 0
 
 
+class TagsOptions(Command):
+    """Say an output's weather in the classes and words of standards: OSI, OpenSCENARIO, OpenLABEL.
+
+    Each variant has one entry; each frame, where its weather changes over time (docs/tags.md).
+
+    Args:
+        out: A folder that `climategs render` or `generate` wrote.
+        format: csv: a table of all numbers and classes. osi: EnvironmentalConditions of ASAM OSI as
+            JSON. openscenario: a catalog of Environments, XML 1.2. openlabel: OpenLABEL 1.0.0.
+        file: Write to this file instead of printing.
+    """
+
+    out: Positional[Annotated[Path, _local("copy manifest.parquet and the recipe.yaml files here")]]
+    format: Literal["csv", "osi", "openscenario", "openlabel"] = "csv"
+    file: Path | None = None
+
+    def run(self) -> int:
+        from tools.tags import write_tags
+
+        text = write_tags(self.out, self.format, self.file)
+        print(text if self.file is None else f"wrote {self.file}\n", end="")
+        return 0
+
+
 class ApplyOptions(SceneCommand):
     """Write a scene in the colours of a photograph or a preset, with a picture of both beside it.
 
@@ -573,6 +597,7 @@ COMMANDS = {
     "export": ExportOptions,
     "mirror": MirrorOptions,
     "labels": LabelsOptions,
+    "tags": TagsOptions,
 }
 # Commands of commands, which take over where the first word names one.
 GROUPS = {"style": {"apply": ApplyOptions, "train": StyleTrainOptions, "presets": presets}}
