@@ -180,6 +180,33 @@ def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
     return [entry.model_copy(update={"uri": _uri(scheme, match, query)}) for match in matches]
 
 
+def expand_datasets(entries: Iterable[JobScene]) -> list[JobScene]:
+    """Return a job's scenes, with every scene of a folder of many scenes in place of the folder."""
+    scenes: list[JobScene] = []
+    for entry in entries:
+        scheme, path, query = parse_uri(entry.uri)
+        if scheme is None:
+            scheme = detect_scheme_of_path(Path(path))
+        dataset = DATASETS.get(scheme)
+        if dataset is None or path in dataset.builtin:
+            scenes.append(entry)
+            continue
+        queries = dataset.scene_queries(path, query)
+        uris = [format_uri(scheme, path, scene_query) for scene_query in queries]
+        scenes += [entry.model_copy(update={"uri": uri}) for uri in uris]
+    return scenes
+
+
+def recorded_conditions(uri: str) -> tuple[str, ...]:
+    """Return the conditions that a scene's dataset states of its recording, sorted by name.
+
+    They are some of rain, snow, fog and night; none where the dataset says nothing.
+    """
+    scheme, path, query = parse_uri(uri)
+    dataset = DATASETS.get(scheme) if scheme is not None else None
+    return () if dataset is None else dataset.recorded_conditions(path, query)
+
+
 def _matches(top: Path, parts: tuple[str, ...], scene_uri: str) -> list[str]:
     """Return the paths that match a pattern, in order.
 

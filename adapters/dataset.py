@@ -112,6 +112,12 @@ class Dataset:
     content_files: Callable[[str], Iterable[Path]] | None = None
     """Function from the path to the files whose content makes the scene's digest; None if they are
     those of `scene_files`."""
+    list_scenes: str | None = None
+    """Function from path and query to the query of each scene in a folder of many scenes; None if a
+    path is one scene."""
+    conditions: str | None = None
+    """Function from path and query to the conditions that the dataset states of a recording: some
+    of rain, snow, fog and night. None if it states none."""
     is_hashed_whole: bool = False
     """True if the digest reads all bytes. Of other scenes large files and images are sampled."""
 
@@ -120,6 +126,14 @@ class Dataset:
 
     def open_labels(self, path: str, query: Mapping[str, str]) -> LabelSource | None:
         return _imported(self.labels)(path, query) if self.labels else None
+
+    def scene_queries(self, path: str, query: dict[str, str]) -> list[dict[str, str]]:
+        """Return the query of each scene that a path and a query stand for."""
+        return _imported(self.list_scenes)(path, query) if self.list_scenes else [query]
+
+    def recorded_conditions(self, path: str, query: dict[str, str]) -> tuple[str, ...]:
+        """Return the conditions that the dataset states of a recording, sorted by name."""
+        return tuple(sorted(_imported(self.conditions)(path, query))) if self.conditions else ()
 
 
 def _imported(name: str) -> Callable[..., Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
@@ -110,6 +110,19 @@ class Job(ClosedModel):
 
 def _repeated_names(names: list[str]) -> str:
     return ", ".join(sorted({name for name in names if names.count(name) > 1}))
+
+
+class SceneRecipes(Protocol):
+    """Recipes of a dataset job, in numbers for one scene after the other."""
+
+    @property
+    def job(self) -> Job:
+        """Job that the recipes belong to."""
+        ...
+
+    def resolve_for_scene(self, entry: JobScene, scene_name: str) -> list[Recipe]:
+        """Return the recipes in numbers under which a scene is rendered."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)

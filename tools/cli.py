@@ -54,6 +54,12 @@ def _check_shard(text: str) -> str:
     return text
 
 
+def _check_levels(text: str) -> str:
+    if text != "all" and not all(level.isdecimal() for level in text.split(",")):
+        raise ValueError(f"{text!r}: write levels separated by commas, as in 1,3,5, or all")
+    return text
+
+
 def _local(instead: str) -> AfterValidator:
     return AfterValidator(partial(check_local, instead=instead))
 
@@ -164,6 +170,134 @@ class GenerateOptions(SceneCommand):
         from tools.generate import generate_dataset, show_status
 
         return show_status(self.out) if self.status else generate_dataset(self)
+
+
+class SuiteSelection(SceneCommand):
+    """Scenes and variants of the robustness suite weather-c.
+
+    Args:
+        scenes: Scenes, as for render; a folder of nuScenes or Waymo stands for all its scenes, and
+            `*` in a path for all that match.
+        effects: Names of effects separated by commas: fog, rain, wet, snowfall, snow, flood, night,
+            lens, combined; or all.
+        levels: Levels separated by commas, 1 to 5, or all. Level 0, the clean render, is always
+            there; 0 alone renders nothing else.
+        frames: Frame numbers: all, 4, 0,5,9, 0:20:2, or ::5.
+        cameras: Camera names separated by commas, or all. fitted: all, but of a fitted scene those
+            that it was fitted to.
+        scale: Resolution relative to the recorded.
+        quarter: Every fourth frame: the suite weather-c-v1-q.
+        overrides: Replace a field of render or output in all recipes, level 0 too, as in
+            render.base=recorded or output.image=png. The weather's numbers are fixed.
+    """
+
+    scenes: Positional[
+        Annotated[
+            tuple[str, ...], arg(metavar="SCENE [SCENE ...]", help_behavior_hint="(required)")
+        ]
+    ]
+    effects: str = "all"
+    levels: Annotated[str, AfterValidator(_check_levels)] = "all"
+    frames: Annotated[str, AfterValidator(_check_frames)] = "all"
+    cameras: str = FITTED
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    quarter: bool = False
+    overrides: Overrides = ()
+
+    @model_validator(mode="after")
+    def _names_scenes(self) -> Self:
+        if not self.scenes:
+            raise ValueError("no scene is named: climategs suite weather-c SCENE --out OUT")
+        if self.quarter and self.frames != "all":
+            raise ValueError("--quarter has its own frames: leave --frames out")
+        return self
+
+
+class SuiteOptions(SuiteSelection):
+    """Render scenes under the robustness suite weather-c, or go on with it (docs/suite.md).
+
+    Args:
+        out: The output: a folder, or s3://bucket/path, gs://bucket/path.
+        executor: Who renders: this process, processes of this machine, or actors of a Ray cluster.
+        workers: How many; a process for every core by default, one where a GPU draws.
+        shard: i/n: do only the i-th of n parts, for schedulers such as SLURM.
+        scratch: Where images are kept until their block is uploaded, for outputs elsewhere.
+        backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU.
+        layout: source: also lay the images of each variant into a copy of the dataset.
+        links: Of that copy: hard: unchanged files share the dataset's disk space. copy: nothing is
+            shared.
+    """
+
+    out: str = ""
+    executor: Literal["serial", "processes", "ray"] = "processes"
+    workers: Count | None = None
+    shard: Annotated[str, AfterValidator(_check_shard)] = "1/1"
+    scratch: Path | None = None
+    backend: Backend = "auto"
+    layout: Literal["standard", "source"] = "standard"
+    links: Links = "hard"
+
+    @model_validator(mode="after")
+    def _names_out(self) -> Self:
+        if not self.out:
+            raise ValueError("--out is missing: a folder, or s3://bucket/path")
+        if self.layout == "source" and "://" in self.out:
+            raise ValueError("--layout source needs a folder on this machine as --out")
+        return self
+
+    def run(self) -> int:
+        from tools.suite import render_suite
+
+        return render_suite(self)
+
+
+class SuitePlanOptions(SuiteSelection):
+    """Say how many images a suite has, and about how long they take and how large they get.
+
+    Two pictures of each effect are rendered; nothing is written.
+
+    Args:
+        backend: Which rasteriser draws.
+    """
+
+    backend: Backend = "auto"
+
+    def run(self) -> int:
+        from tools.suite import show_plan
+
+        return show_plan(self)
+
+
+class SuiteVerifyOptions(Command):
+    """Hash all files of a suite and compare them with its suite.json. Exit code 1 if any differs.
+
+    Args:
+        out: A folder or URI in which a suite was rendered.
+    """
+
+    out: Positional[str]
+
+    def run(self) -> int:
+        from tools.suite import verify_output
+
+        return verify_output(self.out)
+
+
+class SuiteProbeOptions(Command):
+    """Print the three files of each variant by which a user's loader is probed, with their hashes.
+
+    Args:
+        out: A folder or URI in which a suite was rendered.
+        variant: Only of this variant, such as fog-3.
+    """
+
+    out: Positional[str]
+    variant: str | None = None
+
+    def run(self) -> int:
+        from tools.suite import show_probes
+
+        return show_probes(self.out, self.variant)
 
 
 class InspectOptions(SceneCommand):
@@ -579,9 +713,15 @@ def style() -> None:
     # A line in the list of commands; the words after it go to a table of their own (tools.cli).
 
 
+def suite() -> None:
+    """Robustness suite weather-c: render, plan and verify it (docs/suite.md)."""
+    # A line in the list of commands; the words after it go to a table of their own (tools.cli).
+
+
 COMMANDS = {
     "render": RenderOptions,
     "generate": GenerateOptions,
+    "suite": suite,
     "fit": FitOptions,
     "record": RecordOptions,
     "inspect": InspectOptions,
@@ -600,7 +740,15 @@ COMMANDS = {
     "tags": TagsOptions,
 }
 # Commands of commands, which take over where the first word names one.
-GROUPS = {"style": {"apply": ApplyOptions, "train": StyleTrainOptions, "presets": presets}}
+GROUPS = {
+    "style": {"apply": ApplyOptions, "train": StyleTrainOptions, "presets": presets},
+    "suite": {
+        "weather-c": SuiteOptions,
+        "plan": SuitePlanOptions,
+        "verify": SuiteVerifyOptions,
+        "probe": SuiteProbeOptions,
+    },
+}
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -110,13 +110,13 @@ def _dry_run(job: GenerateJob) -> int:
     guess = estimate_job(plan, open_scene, on_recipe=lambda name: print_note(f"trying {name}"))
     for name, sample in guess.samples.items():
         print(
-            f"  {name}: {sample.seconds_per_mpx:.2f} s and {_size(sample.bytes_per_mpx)} a "
+            f"  {name}: {sample.seconds_per_mpx:.2f} s and {size_text(sample.bytes_per_mpx)} a "
             f"megapixel, {sample.prepare_s:.1f} s to prepare"
         )
     if guess.unsampled_recipes:
         print(f"  taken as their mean: {', '.join(guess.unsampled_recipes)}")
     print(
-        f"about {duration_text(guess.seconds)} of one worker, {_size(guess.bytes)} "
+        f"about {duration_text(guess.seconds)} of one worker, {size_text(guess.bytes)} "
         f"(from one picture a recipe; right to a factor of two or so)"
     )
     return 1 if plan.unusable else 0
@@ -150,7 +150,7 @@ def ended_by_sigterm() -> Iterator[None]:
         signal.signal(signal.SIGTERM, previous_handler)
 
 
-def _size(count: float) -> str:
+def size_text(count: float) -> str:
     steps = ("B", "kB", "MB", "GB", "TB")
     step = min(int(math.log(max(count, 1), 1000)), len(steps) - 1)
     return f"{count / 1000**step:.1f} {steps[step]}"

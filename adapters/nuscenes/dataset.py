@@ -52,5 +52,7 @@ NUSCENES = Dataset(
         r"(samples|sweeps)/CAM_[^/]+/[^/]+\.jpg", r"(samples|sweeps)/LIDAR_TOP/[^/]+\.pcd\.bin"
     ),
     scene_files=_files_of_scene,
+    list_scenes="adapters.nuscenes.recordings:list_scenes",
+    conditions="adapters.nuscenes.recordings:recorded_conditions",
     content_files=_tables,
 )

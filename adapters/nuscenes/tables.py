@@ -407,8 +407,8 @@ class SceneTables:
 
 def read_tables(root: Path, version: str | None, scene: str | None) -> SceneTables:
     """Read the tables of the scene of a name or token. version, scene: None for the only one."""
-    folder = root / _choose_version(root, version)
-    row = _choose_scene(folder, scene)
+    folder = root / choose_version(root, version)
+    row = choose_scene(folder, scene)
     samples = read_table(folder / "sample.json", "scene_token", {row.token})
     if not samples:
         raise AdapterError(f"{row}: {folder / 'sample.json'} has no keyframe of this scene")
@@ -452,7 +452,7 @@ def _read_turn(lidar: Sequence[SensorFile], images: Mapping[str, tuple[SensorFil
     )
 
 
-def _choose_version(root: Path, version: str | None) -> str:
+def choose_version(root: Path, version: str | None) -> str:
     """Return the folder of tables of a version, or the only one."""
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a nuScenes dataset with v1.0-*/")
@@ -493,7 +493,7 @@ def _holds_tables(folder: Path) -> bool:
     return is_file[0] and any(is_file[1:])
 
 
-def _choose_scene(folder: Path, scene: str | None) -> Row:
+def choose_scene(folder: Path, scene: str | None) -> Row:
     """Return the row of the scene of a name or token, or the only one."""
     rows = list(read_table(folder / "scene.json").values())
     matching_rows = [row for row in rows if scene in (None, row.token, row.text("name"))]

@@ -46,4 +46,6 @@ WAYMO = Dataset(
         ),
     ),
     scene_files=_scene_files,
+    list_scenes="adapters.waymo.recordings:list_segments",
+    conditions="adapters.waymo.recordings:recorded_conditions",
 )

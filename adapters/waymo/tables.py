@@ -75,23 +75,27 @@ class SegmentFiles:
         return self.path(component).is_file()
 
 
-def find_segment(path: Path, segment_name: str | None) -> SegmentFiles:
-    """Return the files of one segment at a path.
-
-    segment_name: the segment's name or the first part of it; None for the only one."""
+def find_segments(path: Path) -> dict[str, SegmentFiles]:
+    """Return the files of all segments at a path, by the segment's name."""
     files = SegmentFiles("", path, is_alone=True)
     if files.has(POSES):
         file = files.path(POSES)
         with parquet_errors(file):
             table = read_table(file, str(file), [SEGMENT])
         names = set(_segment_names(table, file))
-        segments = {str(name): SegmentFiles(str(name), path, is_alone=True) for name in names}
-    else:
-        segments = {
-            file.stem: SegmentFiles(file.stem, folder)
-            for folder in (path, *(path / split for split in SPLITS))
-            for file in sorted((folder / POSES).glob("*.parquet"))
-        }
+        return {str(name): SegmentFiles(str(name), path, is_alone=True) for name in names}
+    return {
+        file.stem: SegmentFiles(file.stem, folder)
+        for folder in (path, *(path / split for split in SPLITS))
+        for file in sorted((folder / POSES).glob("*.parquet"))
+    }
+
+
+def find_segment(path: Path, segment_name: str | None) -> SegmentFiles:
+    """Return the files of one segment at a path.
+
+    segment_name: the segment's name or the first part of it; None for the only one."""
+    segments = find_segments(path)
     if not segments:
         raise AdapterError(
             f"{path} holds no segment of the Waymo Open Dataset v2; expected "

@@ -135,6 +135,17 @@ class SceneDataset(Dataset):
             for (frame, name), view in zip(items, views, strict=True)
         ]
 
+    @property
+    def images(self) -> list[tuple[int, str]]:
+        """Return the frame and the camera of every sample."""
+        return [(frame.index, name) for frame, name in self._items]
+
+    def image_bytes(self, index: int) -> bytes:
+        """Return the bytes of the image file that a job would write for a sample."""
+        frame, name = self._items[check_index(index, len(self))]
+        view = next(iter(self._views([frame.cameras[name]])))
+        return encode_image(view.rgb, self.recipe.output)
+
     def _views(self, cameras: Sequence[Camera]) -> Iterator[Any]:
         """Return the views of some cameras, rendered as they are asked for."""
         if self._backend == CUDA and self._process != os.getpid():  # not unpickled: forked

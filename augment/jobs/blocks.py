@@ -38,7 +38,7 @@ from augment.scene.cameras import scaled_size
 from augment.scene.scene import Scene
 from augment.scene.scene_index import SceneIndex, has_lidar, select_frames
 from recipes.errors import RecipeError
-from recipes.job import ALL_CAMERAS, JobRecipes, JobScene
+from recipes.job import ALL_CAMERAS, JobScene, SceneRecipes
 from recipes.moment import SceneTimes
 from recipes.schema import Recipe, parse_frames
 
@@ -319,7 +319,7 @@ class JobPlan:
 
 
 def make_job_plan(
-    recipes: JobRecipes,
+    recipes: SceneRecipes,
     scenes: Sequence[JobScene],
     scene_records: Mapping[tuple[str, str | None], SceneRecord | str],
     backend: str,

@@ -48,7 +48,11 @@ class Estimate:
 
 
 def estimate_job(
-    plan: JobPlan, open_scene: SceneLoader, *, on_recipe: Callable[[str], None] = lambda name: None
+    plan: JobPlan,
+    open_scene: SceneLoader,
+    *,
+    on_recipe: Callable[[str], None] = lambda name: None,
+    max_sampled: int = MAX_SAMPLED,
 ) -> Estimate:
     """Estimate time and size of a job from two pictures of each recipe.
 
@@ -60,11 +64,13 @@ def estimate_job(
     Args:
         open_scene: Opens a scene by its URI.
         on_recipe: Called with a recipe's name before its pictures.
+        max_sampled: Number of recipes for which pictures are rendered; other recipes take the mean
+            of these.
     """
     first_blocks: dict[str, Block] = {}
     for block in plan.blocks:
         first_blocks.setdefault(block.recipe.name, block)
-    sampled_blocks = dict(list(first_blocks.items())[:MAX_SAMPLED])
+    sampled_blocks = dict(list(first_blocks.items())[:max_sampled])
     samples: dict[str, Sample] = {}
     scene_by_uri: dict[str, Scene] = {}  # at most one scene at a time
     for name, block in sampled_blocks.items():

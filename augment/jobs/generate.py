@@ -66,7 +66,7 @@ from augment.render.backends import renders_on_gpu
 from augment.render.buffers import AUTO, CUDA
 from augment.view.quality import Question, read_choice
 from recipes.files import with_digest
-from recipes.job import JobRecipes, JobScene
+from recipes.job import JobScene, SceneRecipes
 from recipes.schema import Recipe, columns_of_effects
 
 _log = logging.getLogger(__name__)
@@ -165,7 +165,7 @@ _MAX_NOTES = 20
 class GenerateJob:
     """A dataset job: recipes, scenes and output, and the workers that render it."""
 
-    recipes: JobRecipes
+    recipes: SceneRecipes
     """Loaded recipes of the job."""
     scenes: Sequence[JobScene]
     """Scenes of the job, with patterns already expanded."""

@@ -21,13 +21,12 @@ from augment.memo import memo_of
 from augment.rng import STEP_X, mix, rng_for
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
-from recipes.lens_drops import LensDrops
+from recipes.lens_drops import MAX_COUNT, LensDrops
 
 LIFE_S = (8.0, 40.0)  # shortest and longest life of a drop on glass without a wiper
 # Drops above 0.5 mm that come down on a square metre in a second, by the rate in mm/h to the power
 # of 0.53: Marshall and Palmer's sizes at Atlas's speeds within 8 % from 2.5 to 100 mm/h.
 FLUX = 850.0
-MAX_COUNT = 500  # most drops on a camera's glass
 RUNS_FROM_M = 1.2e-3  # radius from which a drop runs down the glass
 RUN_MPS = 3e-3  # speed of a drop whose radius is larger than that by a millimetre
 BALANCE_MPS = 15.0  # speed of the car at which the air stream drives drops as strongly as gravity
@@ -63,12 +62,16 @@ class LensDropsPlan:
     def count_on(self, camera: Camera) -> int:
         """Return the number of drops on a camera's glass.
 
-        It is the recipe's number, or the number that its rain brings to an upright pane in the time
-        that drops stay.
+        It is the recipe's number; or the number that covers the recipe's share of the picture where
+        drops lie independently of each other; or the number that its rain brings to an upright pane
+        in the time that drops stay.
         """
         if self.drops.count is not None:
             return self.drops.count
         area_m2 = self.drops.glass_m**2 * camera.width * camera.height / (camera.fx * camera.fy)
+        if self.drops.share is not None:
+            count = -math.log1p(-self.drops.share) * area_m2 / self.drops.mean_area_m2
+            return min(round(count), MAX_COUNT)
         stay_s = sum(LIFE_S) / 2 if self.drops.wiper_s is None else self.drops.wiper_s
         return min(round(FLUX * self.rate_mm_h**0.53 * area_m2 * stay_s), MAX_COUNT)
 
