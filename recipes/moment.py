@@ -70,7 +70,7 @@ class Air(ClosedModel):
     humidity: Unit = 0.6
     """Relative humidity: 0 dry, 1 saturated."""
     wind_m_s: Number = Field(default=3.0, ge=0, le=60)
-    """Speed of the wind 2 m above the ground."""
+    """Speed of the wind 10 m above the ground, as weather services state it."""
     road_warmer_k: Number = Field(default=0.0, ge=-30, le=50)
     """How much warmer the road's surface is than the air, kelvin: some 5 in a weak sun."""
 
@@ -85,7 +85,16 @@ class Moment:
     """The air; None if the recipe says nothing about it."""
     curves: Mapping[str, Curve] = field(default_factory=dict)
     """Numbers that change over time, by the dotted path of their field."""
+    constants: Mapping[str, float] = field(default_factory=dict)
+    """Rates of rain and snowfall that stay as they are, by the dotted path of their field."""
+    end_s: float = 0.0
+    """Time of the weather at the drive's last image, seconds."""
 
     def curve(self, path: str, value: float) -> Curve:
-        """Return a number's course: its timeline, or else the constant `value`."""
-        return self.curves.get(path) or Curve.constant(value)
+        """Return a number's course: its timeline, or else a constant.
+
+        Args:
+            path: dotted path of the number's field.
+            value: the number if the recipe has no such rate.
+        """
+        return self.curves.get(path) or Curve.constant(self.constants.get(path, value))

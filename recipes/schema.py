@@ -473,7 +473,14 @@ class Recipe(ClosedModel):
             recipe = with_unchecked_field(recipe, timeline.path, value)
         if self.timelines:
             recipe = recipe.model_copy(update={"timelines": ()})
-        moment = Moment(time_s, recipe.weather.air, curves)
+        weather = self.weather
+        constants = {
+            f"weather.{name}.rate_mm_h": section.rate_mm_h
+            for name, section in (("rain", weather.rain), ("snowfall", weather.snowfall))
+            if section is not None
+        }
+        end_s = weather.clock.time_s(scene_times.duration_s)
+        moment = Moment(time_s, recipe.weather.air, curves, constants, end_s)
         for path, section in recipe.sections().items():
             state = section.state_at(path, moment)
             if state is not section:

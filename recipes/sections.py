@@ -18,6 +18,7 @@ from pydantic import BaseModel, Field, Strict, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 
+from recipes.effect import EffectModel
 from recipes.errors import join
 from recipes.fields import ClosedModel, Digest, FilePath, Unit, Whole
 from recipes.ranges import RANGE_KINDS, is_number
@@ -285,7 +286,8 @@ def _section(
         if get_origin(kind) is tuple and arguments[1:] == (...,):
             sections[name] = _section(f"{field_path}[]", arguments[0], list_info=info)
         elif isinstance(kind, type) and issubclass(kind, BaseModel):
-            inner_fields = _EffectFields if nullable else ClosedModel
+            is_effect = nullable and not issubclass(model, EffectModel)
+            inner_fields = _EffectFields if is_effect else ClosedModel
             sections[name] = _section(field_path, kind, inner_fields)
         else:
             rangeable = bool(path) and name not in file_fields.model_fields and kind != Digest

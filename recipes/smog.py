@@ -8,13 +8,16 @@ from typing import Literal
 from pydantic import ConfigDict, Field, model_validator
 
 from recipes.effect import Column, EffectModel, Knob
-from recipes.fields import Colour, Number, Unit, one_of
+from recipes.fields import Angle, Colour, Number, Unit, one_of
+from recipes.moment import Moment
 
 # Optical depth of the visibility, -ln(0.02): contrast has fallen to 2 % there. No unit.
 KOSCHMIEDER = 3.912
 # Optical depth of the meteorological optical range, -ln(0.05): 5 % of a collimated beam arrives
 # there (CIE S 017, term 17-31-018). No unit.
 MOR_DEPTH = math.log(20)
+# Largest speed of the wind.
+MAX_WIND_MPS = 60.0
 # Largest extinction: nothing is visible through 10 cm of it.
 MAX_EXTINCTION_PER_M = 100.0
 # Fields of which exactly one gives the density.
@@ -26,12 +29,27 @@ class Smog(EffectModel):
 
     model_config = ConfigDict(json_schema_extra=one_of(*DENSITY_FIELDS))
     in_first_release = True
-    later_fields = ("mor_m", "overcast", "scatter", "shadow_fade", "gloss_fade", "blend")
+    later_fields = (
+        "mor_m",
+        "overcast",
+        "scatter",
+        "shadow_fade",
+        "gloss_fade",
+        "blend",
+        "patchiness",
+        "bank_m",
+        "wind_mps",
+        "wind_from_deg",
+        "drift_m",
+    )
     synonyms = (
         ("smog", "fog haze mist"),
         ("extinction_per_m", "beta density sigma"),
         ("mor_m", "mor meteorological_optical_range sensor_visibility_m"),
         ("color", "airlight"),
+        ("patchiness", "banks patchy fog_banks"),
+        ("wind_mps", "wind_speed"),
+        ("wind_from_deg", "wind_direction wind_deg"),
     )
     # Smog on buffers saves nothing here, whatever it costs.
     knobs = (
@@ -84,6 +102,17 @@ class Smog(EffectModel):
     blend: Literal["display", "linear"] = "display"
     """display mixes the display-encoded colours of things and air, as splats are blended; linear
     mixes their light, as air does, so that dark things pale while they are still near."""
+    patchiness: Number = Field(default=0.0, ge=0, le=2)
+    """Standard deviation of the logarithm of the density in space, whose mean is the density given:
+    0 is the same fog everywhere, 0.3 hardly uneven, 0.7 patchy, 2 clear gaps between banks."""
+    bank_m: Number = Field(default=300.0, ge=50, le=10_000)
+    """Width of the largest banks; they are twice as long along the wind."""
+    wind_mps: Number = Field(default=2.0, ge=0, le=MAX_WIND_MPS)
+    """Speed of the wind, with which banks drift; of no effect without patchiness."""
+    wind_from_deg: Angle = 0.0
+    """Where the wind comes from: 0 is world +x, 90 is +y."""
+    drift_m: Number | None = Field(default=None, ge=-1e9, le=1e9)
+    """Way that banks have drifted since the time 0; null for wind_mps times the time."""
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:
@@ -106,6 +135,15 @@ class Smog(EffectModel):
                 f"{MAX_EXTINCTION_PER_M:g}/metre is allowed"
             )
         return self
+
+    def state_at(self, path: str, moment: Moment) -> EffectModel:
+        """Return the section with the way that its banks have drifted, if the wind changes."""
+        wind = moment.curves.get(f"{path}.wind_mps")
+        if wind is None or self.patchiness == 0 or self.drift_m is not None:
+            return self
+        time_s = moment.time_s
+        way_m = wind.integral(0, time_s) if time_s >= 0 else -wind.integral(time_s, 0)
+        return self.model_copy(update={"drift_m": way_m})
 
     @property
     def resolved_extinction_per_m(self) -> float:

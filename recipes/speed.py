@@ -102,7 +102,7 @@ class Speed(Section):
             "resolution of what wet ground mirrors",
             6.5,
             tiers={"draft": 4.0},
-            applies_to=lambda rain: rain.ground_wetness > 0,
+            applies_to=lambda rain: rain.wets_ground,
             section="weather.rain",
         ),
         Knob(

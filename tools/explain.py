@@ -5,7 +5,6 @@ Times are measured on a few of the scene's views.
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -84,7 +83,7 @@ def explain_recipe(
         "recipe_hash": resolved.hash,
         "moment": moment if course.values or at_s is not None else None,
         "state": state.model_dump(mode="json"),
-        "course": dataclasses.asdict(course),
+        "course": course.as_dict(),
         "variants": template.variants,
         "quality": resolved.quality.summary,
         "is_chosen": times or not is_open,
@@ -333,7 +332,10 @@ def _course_lines(course: Mapping[str, Any]) -> list[str]:
     rows = {"seconds of the drive": course["drive_s"], **values}
     if course["weather_s"] != course["drive_s"]:
         rows = {"seconds of the weather": course["weather_s"], **rows}
-    texts = {name: [f"{value:.4g}" for value in row] for name, row in rows.items()}
+    texts = {
+        name: ["-" if value is None else f"{value:.4g}" for value in row]
+        for name, row in rows.items()
+    }
     width = max(map(len, texts))
     column = max(len(text) for row in texts.values() for text in row)
     return [

@@ -44,7 +44,16 @@ class WeatherCourse:
     weather_s: tuple[float, ...]
     """The same times of the weather, seconds."""
     values: Mapping[str, tuple[float, ...]]
-    """Values of every number that changes, by the dotted path of its field or its column."""
+    """Values of every number that changes, by the dotted path of its field or its column; NaN
+    where there is none."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the course for JSON, with None in place of NaN."""
+        values = {
+            path: [value if math.isfinite(value) else None for value in row]
+            for path, row in self.values.items()
+        }
+        return {"drive_s": self.drive_s, "weather_s": self.weather_s, "values": values}
 
 
 def course_of(recipe: Recipe, times: SceneTimes, count: int = NUM_ROWS) -> WeatherCourse:

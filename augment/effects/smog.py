@@ -37,6 +37,8 @@ from augment.light.common_exposure import exposure_change
 from augment.output.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
+from augment.render.fog_banks import FogBanks, bank_seed
+from augment.render.fog_table import densities_at, point_means_numpy, ray_means, visible_distances
 from augment.render.linear_airlight import mix_linear_light
 from augment.render.scatter import scatter_forward, scattered_share
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes, pixels_of_boxes
@@ -56,6 +58,11 @@ ELEVATION = "airlight by elevation"
 SKY = "sky"
 LINEAR_LIGHT = "airlight in linear light"
 SCATTER = "forward scatter"
+
+# Manifest column of the visibility that an image has.
+LOCAL_VISIBILITY = "smog_local_visibility_m"
+# Number of level rays that it is measured along.
+_NUM_RAYS = 33
 
 
 @dataclass(frozen=True)
@@ -77,6 +84,17 @@ class SmogPlan:
     is_linear: bool = False
     """If True, the airlight of the finished picture is mixed in linear light."""
 
+    wind_mps: float = 0.0
+    """Speed of the wind, with which the fog's banks drift."""
+
+    def fog_at(self, time_s: float) -> Fog:
+        """Return the fog at a time of the weather, its banks moved by the wind."""
+        banks = self.fog.banks
+        if banks is None:
+            return self.fog
+        drift_m = banks.drift_m + self.wind_mps * time_s
+        return replace(self.fog, banks=replace(banks, drift_m=drift_m))
+
 
 class SmogEffect(Effect):
     """Smog, haze and fog, in front of the scene and its sky."""
@@ -84,6 +102,7 @@ class SmogEffect(Effect):
     name = "smog"
     section = "weather.smog"
     model = Smog
+    measured_columns = (LOCAL_VISIBILITY,)
     off_switches: ClassVar = {PER_GAUSSIAN: ("weather.smog", None)}
     # transmittance: 0 to 1, of the smog between camera and box; NaN for a box whose numbers are
     # not finite. pixels: number of pixels that the transmittance is the mean of. With 0 pixels or
@@ -101,11 +120,14 @@ class SmogEffect(Effect):
         smog = self.section_of(recipe)
         return smog is not None and max(smog.shadow_fade, smog.gloss_fade) > 0
 
+    def kernel_key(self, section: Smog) -> bool | None:
+        return section.patchiness > 0 or None
+
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:
         smog = self.section_of(recipe)
-        fog, reason = _in_heights(smog, scene)
+        fog, reason = _in_heights(smog, scene, recipe.seed)
         if fog is None:
             drawing_steps = skipped_steps((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason)
             picture_steps = skipped_steps((LINEAR_LIGHT, SCATTER), reason, PICTURE)
@@ -137,12 +159,13 @@ class SmogEffect(Effect):
         buffers = {EXPECTED_DEPTH} if on_buffers or fog.elevation_gain > 0 else set[str]()
         if smog.scatter > 0 or is_linear:
             buffers.add(MEDIAN_DEPTH)  # which costs nothing where depth images are written
-        data = SmogPlan(fog, on_buffers, is_common, smog.scatter, is_linear)
+        wind_mps = smog.wind_mps if smog.drift_m is None else 0.0
+        data = SmogPlan(fog, on_buffers, is_common, smog.scatter, is_linear, wind_mps)
         return EffectPlan(data, steps, frozenset(buffers))
 
     def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
         smog = self.section_of(recipe)
-        fog, _ = _in_heights(smog, scene)
+        fog, _ = _in_heights(smog, scene, recipe.seed)
         shadows = shadows_of(scene) if fog is not None and smog.shadow_fade > 0 else None
         if fog is None or shadows is None:
             return 1.0, ""
@@ -164,7 +187,7 @@ class SmogEffect(Effect):
     def edit_scene(
         self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
-        fog = effect.settings.fog
+        fog = effect.settings.fog_at(effect.weather_time_s)
         common = effect.scene.common_color_map
         if effect.settings.is_common and common is not None:
             fog = fog_before_color_map(fog, effect.scene.color_map(camera), common)
@@ -188,6 +211,8 @@ class SmogEffect(Effect):
                 share = fog_share
                 if share is None:
                     share = scattered_share(alpha, depth, camera, fog, backend=effect.backend)
+                if fog.banks is not None:
+                    fog_share = share  # which scatter would look up again
                 rgb = mix_linear_light(rgb, share, camera, fog, backend=effect.backend)
         if settings.scatter > 0:
             with timed(SCATTER):
@@ -196,18 +221,23 @@ class SmogEffect(Effect):
                     alpha,
                     depth,
                     camera,
-                    settings.fog,
+                    settings.fog_at(effect.weather_time_s),
                     settings.scatter,
                     fog_share=fog_share,
                     backend=effect.backend,
                 )
         return replace(view, rgb=rgb)
 
+    def measure_view(self, camera: Camera, inputs: LabelInputs) -> dict[str, float]:
+        fog = _measured_fog(inputs)
+        if fog is None:
+            return {}
+        return {LOCAL_VISIBILITY: local_visibility(fog, camera)}
+
     def measure_boxes(
         self, boxes: WorldBoxes, camera: Camera, inputs: LabelInputs
     ) -> dict[str, np.ndarray]:
-        data = inputs.plan.data
-        fog = None if data is None else data.fog
+        fog = _measured_fog(inputs)
         estimate = box_transmittance(boxes, camera, fog, inputs.depth_m, inputs.water_level_z_m)
         return {"transmittance": estimate.transmittance, "pixels": estimate.num_pixels}
 
@@ -215,12 +245,38 @@ class SmogEffect(Effect):
         self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
     ) -> None:
         # A beam is narrower than the angle into which droplets diffract: that light is lost to it.
-        fog = effect.settings.fog
+        fog = effect.settings.fog_at(effect.weather_time_s)
         beam_extinction_per_m = (1 + effect.settings.scatter) * fog.extinction_per_m
         fog_echoes(echoes, replace(fog, extinction_per_m=beam_extinction_per_m), rng)
 
 
-def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:
+def _measured_fog(inputs: LabelInputs) -> Fog | None:
+    """Return the fog at the time of an image whose labels are measured; None without fog."""
+    data = inputs.plan.data
+    if data is None:
+        return None
+    return data.fog_at(0.0 if inputs.effect is None else inputs.effect.weather_time_s)
+
+
+def local_visibility(fog: Fog, camera: Camera) -> float:
+    """Return the visibility from a camera, metres: how far an optical depth of 3.912 reaches.
+
+    It is the median of level rays through the columns of the image, at the height of the eye.
+    """
+    eye = camera.centre.numpy()
+    fog_per_m = float(extinction_at(fog, eye[2:])[0])
+    if fog.banks is None:
+        return KOSCHMIEDER / max(fog_per_m, 1e-12)
+    u = (np.linspace(0, camera.width, _NUM_RAYS) - camera.cx) / camera.fx
+    rotation = camera.world_from_camera[:3, :3].numpy()
+    directions = rotation @ np.stack([u, np.zeros(_NUM_RAYS), np.ones(_NUM_RAYS)])
+    directions[2] = 0
+    directions = (directions / np.maximum(np.linalg.norm(directions, axis=0), 1e-9)).T
+    level = replace(fog, extinction_per_m=fog_per_m, scale_height_m=None)
+    return float(np.median(visible_distances(level, eye, directions, KOSCHMIEDER)))
+
+
+def _in_heights(smog: Smog | None, scene: Scene, seed: int) -> tuple[Fog | None, str]:
     """Return the smog in the scene's heights and the reason; None if it would change nothing."""
     if smog is None:
         return None, "the recipe has no smog"
@@ -239,8 +295,23 @@ def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:
         reason += f", scale height {smog.scale_height_m:g} m above z = {base_z_m:.2f} m"
     if not scene.has_metric_scale:
         reason += "; the scene's unit is not known to be a metre, so densities are per scene unit"
+    banks = None
+    if smog.patchiness > 0:
+        banks = FogBanks(
+            smog.patchiness,
+            smog.bank_m,
+            math.radians(smog.wind_from_deg),
+            smog.drift_m or 0.0,
+            bank_seed(seed, scene.name),
+        )
+        reason += f", in banks of {smog.bank_m:g} m, patchiness {smog.patchiness:g}"
     fog = Fog(
-        smog.resolved_extinction_per_m, smog.color, smog.scale_height_m, base_z_m, smog.overcast
+        smog.resolved_extinction_per_m,
+        smog.color,
+        smog.scale_height_m,
+        base_z_m,
+        smog.overcast,
+        banks=banks,
     )
     return fog, reason
 
@@ -309,16 +380,20 @@ def box_transmittance(
     eye_m = camera.centre.numpy()
     is_dry = water_level_z_m is None or eye_m[2] > water_level_z_m
 
-    def transmittance_to(distance_m: np.ndarray, point_z_m: np.ndarray) -> np.ndarray:
-        t = np.exp(-optical_depth_numpy(fog, distance_m, eye_m[2], point_z_m))
+    def transmittance_to(
+        distance_m: np.ndarray, point_z_m: np.ndarray, bank_means: np.ndarray | float
+    ) -> np.ndarray:
+        t = np.exp(-bank_means * optical_depth_numpy(fog, distance_m, eye_m[2], point_z_m))
         return t if is_dry else np.where(point_z_m <= water_level_z_m, 1.0, t)
 
     points = np.concatenate([boxes.corners_m, boxes.centres_m[:, None]], axis=1)  # [B, 9, 3]
     distance = np.linalg.norm(points - eye_m, axis=-1)
-    transmittance = transmittance_to(distance, points[..., 2]).mean(axis=1)
+    means = 1.0 if fog.banks is None else point_means_numpy(fog, camera, points)
+    transmittance = transmittance_to(distance, points[..., 2], means).mean(axis=1)
     if surface_depth_m is not None:
         pixels[:] = 0
-        upwards = camera.world_from_camera[2, :3].numpy()  # the world's z along the camera's axes
+        rotation = camera.world_from_camera[:3, :3].numpy()
+        upwards = rotation[2]  # the world's z along the camera's axes
         for number, rows, columns in pixels_of_boxes(boxes, camera, surface_depth_m):
             z = surface_depth_m[rows, columns].astype(np.float64)
             across = (columns + 0.5 - camera.cx) / camera.fx
@@ -326,7 +401,10 @@ def box_transmittance(
             point_z = eye_m[2] + z * (across * upwards[0] + down * upwards[1] + upwards[2])
             distance = z * np.sqrt(1 + across**2 + down**2)
             pixels[number] = len(rows)
-            transmittance[number] = float(transmittance_to(distance, point_z).mean())
+            if fog.banks is not None:
+                offsets = np.stack([z * across, z * down, z], -1) @ rotation.T
+                means = point_means_numpy(fog, camera, offsets + eye_m)
+            transmittance[number] = float(transmittance_to(distance, point_z, means).mean())
     return BoxTransmittance(np.where(boxes.is_usable, transmittance, np.nan), pixels)
 
 
@@ -426,18 +504,24 @@ class Scatter(NamedTuple):
 
 
 def scatter_before(
-    fog: Fog, eyes_z_m: np.ndarray, ends_m: np.ndarray, model: LidarModel, rng: np.random.Generator
+    fog: Fog,
+    eyes_z_m: np.ndarray,
+    ends_m: np.ndarray,
+    model: LidarModel,
+    rng: np.random.Generator,
+    bank_densities: np.ndarray | float = 1.0,
 ) -> Scatter:
     """Draw the echoes of the smog in front of surfaces at ranges ends_m [N].
 
     The strength varies with the clumps that a beam meets (CLUMPS). The range of the strongest echo
     is drawn from the echo's shape. N numbers of each kind are drawn at any density, so that
-    only the density differs between two smogs.
+    only the density differs between two smogs. bank_densities: density of the smog's banks at the
+    sensor [N], relative to its mean; echoes come from the next metres.
     """
     count = len(ends_m)
     clump = rng.standard_gamma(CLUMPS, count) / CLUMPS
     quantile = rng.random(count)
-    alpha = extinction_at(fog, eyes_z_m)
+    alpha = extinction_at(fog, eyes_z_m) * bank_densities
     out = Scatter(np.zeros(count), np.zeros(count))
     usable = (alpha > 0) & (ends_m > model.overlap_from_m) & np.isfinite(alpha)
     group = np.rint(np.log(np.where(usable, alpha, 1.0)) / _DENSITY_STEP).astype(np.int64)
@@ -446,7 +530,7 @@ def scatter_before(
         rows = np.flatnonzero(usable & (group == number)) if high > low else np.flatnonzero(usable)
         if not len(rows):
             continue
-        is_uniform = fog.scale_height_m is None
+        is_uniform = fog.scale_height_m is None and fog.banks is None
         mean = fog.extinction_per_m if is_uniform else math.exp(number * _DENSITY_STEP)
         echo = soft_echo(float(mean), model)
         last = ((ends_m[rows] - echo.ranges_m[0]) / _STEP_M).astype(np.int64)
@@ -469,9 +553,13 @@ def fog_echoes(echoes: Echoes, fog: Fog, rng: np.random.Generator) -> None:
     air = echoes.air_path_m
     ends_z = eyes_z + air * echoes.directions[:, 2]
     tau = optical_depth_numpy(fog, air, eyes_z, ends_z, series_below=1e-4)
+    densities: np.ndarray | float = 1.0
+    if fog.banks is not None:
+        tau = tau * ray_means(fog, echoes.origins, echoes.directions, air)
+        densities = densities_at(fog, echoes.origins)
     echoes.gain *= np.exp(-2 * tau)
-    scatter = scatter_before(fog, eyes_z, air, model, rng)
-    echoes.extinction_per_m += extinction_at(fog, eyes_z)
+    scatter = scatter_before(fog, eyes_z, air, model, rng, densities)
+    echoes.extinction_per_m += extinction_at(fog, eyes_z) * densities
     echo = signal(echoes.reflectance * echoes.gain, np.maximum(echoes.ranges_m, 1e-3))
     wins = (scatter.signal > echo) & (echoes.ranges_m > 0) & (echoes.codes != LOST)
     rows = np.flatnonzero(wins)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from augment.memo import memo_of
+from augment.render.cpu.order import cached_of_tensor
 from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, PosedGaussians
 from augment.scene.semantics import SemanticClass
@@ -195,8 +195,13 @@ def _select(gaussians: Gaussians, rows: Int64[np.ndarray, " R"]) -> Gaussians:
 
 
 def _rows_of(box: ObjectBox, gaussians: Gaussians, *, is_overlay: bool) -> Int64[np.ndarray, " R"]:
-    """Return the rows that are an object's; remembered as long as the Gaussians live."""
+    """Return the rows that are an object's; remembered as long as the Gaussians' means live.
+
+    Opacities may change from image to image, as snow buries more.
+    """
     pose = (box.centre_m.tobytes(), box.rotation.tobytes(), box.size_m)
-    return memo_of(gaussians).get(
-        ("rows of a box", is_overlay, *pose), lambda: box.rows_in(gaussians, is_overlay=is_overlay)
+    return cached_of_tensor(
+        gaussians.means,
+        f"rows of a box {is_overlay} {pose}",
+        lambda: box.rows_in(gaussians, is_overlay=is_overlay),
     )

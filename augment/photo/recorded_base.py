@@ -59,7 +59,8 @@ from augment.render.buffers import (
 )
 from augment.render.composite import add_airlight_elevation, apply_color_map, unit_depth_coordinates
 from augment.render.cuda import runtime as gpu
-from augment.render.fog import Fog, optical_depth, sky_optical_depth
+from augment.render.fog import Fog
+from augment.render.fog_image import image_optical_depth, sky_image_depth
 from augment.render.layout import HeightClip
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera, Frame
@@ -799,8 +800,8 @@ class Photo:
         if fog.scale_height_m is None:
             return 0.0
         lengths = self.camera.ray_lengths(device=self._device)
-        eye_z_m = float(self.camera.centre[2])
-        return torch.exp(-sky_optical_depth(fog, -self.ray_fall / lengths, eye_z_m))
+        slope = -self.ray_fall / lengths
+        return torch.exp(-sky_image_depth(fog, self.camera, slope, backend=self.backend))
 
     def transmittance(self, raster: RenderOutput, fog: Fog) -> Float[Tensor, "H W"]:
         """Return T of what the photo shows, up to the rendered depth, with the photo's edges.
@@ -814,22 +815,19 @@ class Photo:
         self, alpha: Float[Tensor, "H W"], depth: Float[Tensor, "H W"], fog: Fog
     ) -> Float[Tensor, "H W"]:
         """Return T of surfaces of an alpha and a depth, with the photo's edges."""
-        if choose_kernels(self.backend, alpha, depth) == CPU:
+        if fog.banks is None and choose_kernels(self.backend, alpha, depth) == CPU:
             transmittance = self._transmittance_on_cpu(alpha, depth, fog)
             return self.sharpen(self.align_edges(transmittance, alpha, depth))
         camera = self.camera
         device = alpha.device
         fall = self.ray_fall
         lengths = camera.ray_lengths(device=device)
-        eye_z_m = float(camera.centre[2])
-        surface_transmittance = torch.exp(
-            -optical_depth(fog, depth * lengths, eye_z_m, eye_z_m - depth * fall)
-        )
-        background_depth = sky_optical_depth(fog, -fall / lengths, eye_z_m)
+        surface_depth = image_optical_depth(fog, camera, depth, backend=self.backend)
+        surface_transmittance = torch.exp(-surface_depth)
+        background_depth = sky_image_depth(fog, camera, -fall / lengths, backend=self.backend)
         if self.height_m is not None:
-            distance = self.height_m / fall.clamp_min(MIN_ROAD_FALL) * lengths
-            road_z_m = torch.full_like(fall, eye_z_m - self.height_m)
-            road_depth = optical_depth(fog, distance, eye_z_m, road_z_m)
+            road_m = self.height_m / fall.clamp_min(MIN_ROAD_FALL)
+            road_depth = image_optical_depth(fog, camera, road_m, backend=self.backend)
             background_depth = torch.where(fall > MIN_ROAD_FALL, road_depth, background_depth)
         transmittance = alpha * surface_transmittance + (1 - alpha) * torch.exp(-background_depth)
         return self.sharpen(self.align_edges(transmittance, alpha, depth))

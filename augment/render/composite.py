@@ -18,14 +18,13 @@ from torch import Tensor
 
 from augment.render import composite_kernels, picture_kernels
 from augment.render.buffers import AUTO, CPU, RenderOutput, choose_kernels
-from augment.render.fog import (
-    Fog,
-    airlight_gain,
-    blend_airlight,
-    optical_depth,
-    ray_distances,
-    sky_optical_depth,
-    vertical_optical_depth,
+from augment.render.fog import Fog, airlight_gain, blend_airlight, vertical_optical_depth
+from augment.render.fog_image import (
+    fits_plain_kernels,
+    image_optical_depth,
+    plain_fog_depth,
+    sky_image_means,
+    sky_ray_depth,
 )
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
@@ -120,8 +119,9 @@ def add_airlight_elevation(
     alpha = raster.alpha
     depth = raster.expected_depth
     assert rgb is not None and alpha is not None and depth is not None
-    if choose_kernels(backend, rgb, alpha) != CPU or not rgb.is_contiguous():
-        tau = optical_depth(fog, *ray_distances(raster, camera, fog))
+    uses_kernel = choose_kernels(backend, rgb, alpha) == CPU and rgb.is_contiguous()
+    if not (uses_kernel and fits_plain_kernels(fog)):
+        tau = image_optical_depth(fog, camera, depth, backend=backend)
         rays = camera.ray_directions(rgb.dtype, rgb.device)
         gain = airlight_gain(fog, rays[..., 2] / rays.norm(dim=-1))
         colors = rgb + (alpha * -torch.expm1(-tau))[..., None] * gain
@@ -151,7 +151,7 @@ def add_airlight_elevation(
         picture_kernels.add_elevation(
             rgb.detach().numpy(),
             alpha.detach().contiguous().numpy(),
-            depth.detach().contiguous().numpy(),
+            plain_fog_depth(fog, camera, depth.detach()).contiguous().numpy(),
             *(np.ascontiguousarray(n, np.float32) for n in kernel_inputs),
         )
     return rgb
@@ -196,9 +196,9 @@ def composite_sky(
     directions = camera.ray_directions(rgb.dtype, rgb.device)
     color = sample_at(sky, directions)
     if fog is not None:
-        slope = directions[..., 2] / directions.norm(dim=-1)
-        tau = sky_optical_depth(fog, slope, float(camera.centre[2]))
-        color = blend_airlight(color, tau, fog, slope)
+        directions = directions / directions.norm(dim=-1, keepdim=True)
+        tau = sky_ray_depth(fog, camera, directions)
+        color = blend_airlight(color, tau, fog, directions[..., 2])
     return rgb + (1 - alpha)[..., None] * color
 
 
@@ -227,6 +227,9 @@ def _composite_cubemap(
         gains = airlight_gains(fog.elevation_gain)
         airlight = fog.airlight_rgb
         varying = fog.varying_airlight_rgb
+    bank_means = np.empty((0, 0), np.float32)
+    if fog is not None and fog.banks is not None:
+        bank_means = sky_image_means(fog, camera, alpha).numpy()
     with kernel_threads(ROWS_PER_CHUNK):
         composite_kernels.composite_cubemap(
             rgb.detach().contiguous().numpy(),
@@ -241,6 +244,7 @@ def _composite_cubemap(
             gains,
             np.asarray(airlight, np.float32),
             np.asarray(varying or airlight, np.float32),
+            bank_means,
             out,
         )
     return torch.from_numpy(out)

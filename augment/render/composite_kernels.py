@@ -98,7 +98,20 @@ def composite_constant(rgb, alpha, color, out):
 
 @kernel
 def composite_cubemap(
-    rgb, alpha, faces, rotation, ifx, ify, cx, cy, vertical_depth, gains, airlight, varying, out
+    rgb,
+    alpha,
+    faces,
+    rotation,
+    ifx,
+    ify,
+    cx,
+    cy,
+    vertical_depth,
+    gains,
+    airlight,
+    varying,
+    bank_means,
+    out,
 ):
     """Write out = rgb + (1 - alpha) sky of a cube map, through fog if vertical_depth >= 0.
 
@@ -115,6 +128,7 @@ def composite_cubemap(
         gains: as in airlight_gain.
         airlight: airlight of the fog at the horizon [3].
         varying: the share of it that varies with elevation [3].
+        bank_means: mean density of the fog's banks before the sky [H, W]; [0, 0] without banks.
         out: float32 [H, W, 3].
     """
     height, width = alpha.shape
@@ -174,7 +188,10 @@ def composite_cubemap(
                     sky_transmittance = np.float32(0)
                     slope = z / math.sqrt(x * x + y * y + z * z)
                     if z > 0:
-                        sky_transmittance = math.exp(-vertical_depth / slope)
+                        sky_depth = vertical_depth / slope
+                        if bank_means.size > 0:
+                            sky_depth *= bank_means[i, j]
+                        sky_transmittance = math.exp(-sky_depth)
                     gain = airlight_gain(slope, gains)
                 for c in range(Index(3)):
                     top = (

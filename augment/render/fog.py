@@ -32,8 +32,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.render.buffers import RenderOutput
-from augment.scene.cameras import Camera
+from augment.render.fog_banks import FogBanks
 
 # Exponent of display encoding: display-encoded colour is about this root of luminance.
 ENCODING = 2.2
@@ -53,6 +52,8 @@ class Fog:
     base_z_m: height of the base, metres, scene world.
     elevation_gain: k / 2 of the module's equation; 0 for the same airlight in all directions.
     varying_airlight_rgb: the share of `airlight_rgb` that g multiplies; None for all of it.
+    banks: variation of the extinction in space; None for plain fog. The functions of this file are
+        those of plain fog; those of `augment.render.fog_image` are of any fog.
     """
 
     extinction_per_m: float
@@ -61,6 +62,7 @@ class Fog:
     base_z_m: float = 0.0
     elevation_gain: float = 0.0
     varying_airlight_rgb: tuple[float, float, float] | None = None
+    banks: FogBanks | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.extinction_per_m) and self.extinction_per_m >= 0):
@@ -167,12 +169,7 @@ def airlight_gain(fog: Fog, slope: Float[Tensor, "*B"]) -> Float[Tensor, "*B 3"]
 
 
 def apply_deferred_fog(
-    rgb: Float[Tensor, "H W 3"],
-    alpha: Float[Tensor, "H W"],
-    ray_distance: Float[Tensor, "H W"],
-    fog: Fog,
-    eye_z_m: float,
-    point_z_m: Float[Tensor, "H W"] | None = None,
+    rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"], tau: Float[Tensor, "H W"], fog: Fog
 ) -> Float[Tensor, "H W 3"]:
     """Return premultiplied colour in deferred fog (the paper's way), sky not included.
 
@@ -182,45 +179,12 @@ def apply_deferred_fog(
     Args:
         rgb: premultiplied colour.
         alpha: alpha of the surfaces.
-        ray_distance: distance along the ray, from the depth divided by alpha, metres.
+        tau: optical depth before the surfaces.
         fog: the fog.
-        eye_z_m: world height of the eye, metres.
-        point_z_m: world heights of the surfaces, metres; needed for fog with a scale height.
     """
-    tau = optical_depth(fog, ray_distance, eye_z_m, point_z_m)
     t = torch.exp(-tau)[..., None]
     airlight = torch.tensor(fog.airlight_rgb, dtype=rgb.dtype, device=rgb.device)
     return t * rgb + (1 - t) * alpha[..., None] * airlight
-
-
-def apply_fog_to_render(raster: RenderOutput, camera: Camera, fog: Fog) -> Float[Tensor, "H W 3"]:
-    """Return the colours of a render in deferred fog. The render has colour, alpha and expected
-    depth.
-    """
-    assert raster.rgb is not None and raster.alpha is not None
-    distance_and_heights = ray_distances(raster, camera, fog)
-    return apply_deferred_fog(
-        raster.rgb, raster.alpha, distance_and_heights[0], fog, *distance_and_heights[1:]
-    )
-
-
-def ray_distances(
-    raster: RenderOutput, camera: Camera, fog: Fog
-) -> tuple[Float[Tensor, "H W"], float, Float[Tensor, "H W"] | None]:
-    """Return what `optical_depth` takes for a render with expected depth.
-
-    Returns:
-        The ray distance of every pixel [H, W], the eye's world height, and the world heights of the
-        surfaces [H, W] (None for uniform fog), all in metres.
-    """
-    depth = raster.expected_depth
-    assert depth is not None
-    ray_distance = depth * camera.ray_lengths(depth.dtype, depth.device)
-    eye_z_m = float(camera.centre[2])
-    point_z_m = None
-    if fog.scale_height_m is not None:
-        point_z_m = eye_z_m + depth * camera.ray_directions(depth.dtype, depth.device)[..., 2]
-    return ray_distance, eye_z_m, point_z_m
 
 
 def optical_depth_numpy(

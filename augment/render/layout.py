@@ -289,8 +289,12 @@ M_FOG = 3
 M_CLIP = 4
 # 1 if any part is lit pixel by pixel.
 M_LIGHT = 5
+# Address of the table of fog banks (augment.render.fog_table), float32; 0 without banks.
+M_BANKS = 6
+# Number of the table's numbers.
+M_BANKS_COUNT = 7
 # Number of the modes.
-MODES = 6
+MODES = 8
 # Values of M_FOG.
 NO_FOG = 0
 UNIFORM_FOG = 1

@@ -14,6 +14,7 @@ import torch
 from augment.render import layout
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, TAN_FOV_MARGIN, RasterSettings
 from augment.render.fog import Fog
+from augment.render.fog_table import thinnest_fog
 from augment.render.layout import MAX_DEPTH_GROWTH, HeightClip
 from augment.render.sh import MAX_DEGREE
 from augment.scene.cameras import Camera
@@ -109,7 +110,8 @@ def view_numbers(
             views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / fog.scale_height_m
     views[:, layout.V_FOG_FAR] = _NO_FAR
     if fog is not None and fog.scale_height_m is None and settings.fog_cut > 0:
-        fog_far_m = -math.log(settings.fog_cut) / max(fog.extinction_per_m, 1 / _NO_FAR)
+        least_per_m = thinnest_fog(fog, camera).extinction_per_m
+        fog_far_m = -math.log(settings.fog_cut) / max(least_per_m, 1 / _NO_FAR)
         views[:, layout.V_FOG_FAR] = min(fog_far_m, _NO_FAR)
     views[:, layout.V_PARALLEL] = camera.is_orthographic
     views[:, layout.V_RADIUS_CLIP] = settings.radius_clip_px or _NO_RADIUS_CLIP

@@ -23,6 +23,7 @@ from augment.render.buffers import (
     CPU,
     CUDA,
     DIFFERENTIABLE,
+    EXPECTED_DEPTH,
     REFERENCE,
     RGB,
     RenderOutput,
@@ -36,6 +37,7 @@ from augment.render.constants import (
 )
 from augment.render.cpu.order import cut_in_fog
 from augment.render.fog import Fog
+from augment.render.fog_image import apply_fog_to_render
 from augment.render.gsplat_backend import GEOMETRY, tracked_geometry
 from augment.render.layout import HeightClip
 from augment.render.reference import rasterize_reference
@@ -185,9 +187,22 @@ def _call_backend(image: _Image, backend: str) -> RenderOutput:
         return rasterize_with_gradients(*image[:4])
     parts = [_detach_part(p) for p in image.parts]
     mask = image.pixel_mask
+    if backend == CUDA and image.fog is not None and image.fog.banks is not None:
+        return _fog_buffers(image._replace(parts=parts), image.fog)
     if backend == CUDA:
         return module.rasterize_cuda(parts, *image[1:])
     return module.rasterize_cpu(parts, *image[1:-1], None if mask is None else mask.numpy())
+
+
+def _fog_buffers(image: _Image, fog: Fog) -> RenderOutput:
+    """Return the image on the GPU with fog on the finished buffers; kernels there know no banks."""
+    if RGB not in image.buffers:
+        return _call_backend(image._replace(fog=None), CUDA)
+    buffers = image.buffers | {ALPHA, EXPECTED_DEPTH}
+    clear = _call_backend(image._replace(fog=None, buffers=buffers), CUDA)
+    fogged = dataclasses.replace(clear, rgb=apply_fog_to_render(clear, image.camera, fog))
+    extra: dict[str, None] = dict.fromkeys(buffers - image.buffers)
+    return dataclasses.replace(fogged, **extra)
 
 
 def _choose_backend(image: _Image, backend: str) -> str:

@@ -47,6 +47,7 @@ from augment.render.constants import (
     RasterSettings,
 )
 from augment.render.fog import Fog, blend_airlight, optical_depth
+from augment.render.fog_table import point_means
 from augment.render.layout import FAR_PX, MAX_DEPTH_GROWTH, SHARP_PX2, HeightClip
 from augment.render.mode_depth import Clusters
 from augment.render.sh import evaluate_sh
@@ -430,7 +431,12 @@ def _optical_depths(
         heights = gaussians.means[:, 2]
         if part.world_from_part is not None:
             heights = transform_points(part.world_from_part, gaussians.means)[:, 2]
-    return optical_depth(fog, offsets.norm(dim=-1), float(camera.centre[2]), heights)
+    tau = optical_depth(fog, offsets.norm(dim=-1), float(camera.centre[2]), heights)
+    if fog.banks is None:
+        return tau
+    if part.world_from_part is not None:
+        offsets = offsets @ part.world_from_part[:3, :3].T.to(offsets)
+    return tau * point_means(fog, camera, offsets)
 
 
 def _lights(

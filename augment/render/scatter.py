@@ -46,7 +46,13 @@ from torch import Tensor
 from augment.render import picture_kernels
 from augment.render.buffers import AUTO, CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK, unit_depth_coordinates
-from augment.render.fog import MAX_EXPONENT, Fog, optical_depth, sky_optical_depth
+from augment.render.fog import MAX_EXPONENT, Fog
+from augment.render.fog_image import (
+    fits_plain_kernels,
+    image_optical_depth,
+    plain_fog_depth,
+    sky_image_depth,
+)
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
@@ -172,7 +178,9 @@ def scattered_share(
 def _scattered_share_by_kernel(
     alpha: Tensor, depth: Tensor, camera: Camera, fog: Fog, strength: float
 ) -> Float32[np.ndarray, "H W"]:
-    """Return `_scattered_share_by_torch`, by a kernel."""
+    """Return `_scattered_share_by_torch`, by a kernel where there is one for the fog."""
+    if not fits_plain_kernels(fog):
+        return _scattered_share_by_torch(alpha, depth, camera, fog, strength).numpy()
     scale_height_m = fog.scale_height_m
     extinction_per_m = fog.extinction_per_m
     if scale_height_m is not None:
@@ -182,7 +190,7 @@ def _scattered_share_by_kernel(
     with kernel_threads(ROWS_PER_CHUNK):
         picture_kernels.scattered_share(
             alpha.contiguous().numpy(),
-            depth.contiguous().numpy(),
+            plain_fog_depth(fog, camera, depth).contiguous().numpy(),
             *unit_depth_coordinates(camera),
             camera.world_from_camera[2, :3].numpy().astype(np.float32),
             np.float32(strength),
@@ -197,15 +205,12 @@ def _scattered_share_by_torch(
     alpha: Tensor, depth: Tensor, camera: Camera, fog: Fog, strength: float
 ) -> Float[Tensor, "H W"]:
     """Return 1 - exp(-strength tau) of every pixel: the share of its light that is deflected."""
-    lengths = camera.ray_lengths(depth.dtype, depth.device)
-    eye_z_m = float(camera.centre[2])
-    point_z_m = None
     sky_share = 1.0
     if fog.scale_height_m is not None:
         climb = camera.ray_directions(depth.dtype, depth.device)[..., 2]
-        point_z_m = eye_z_m + depth * climb
-        sky_share = -torch.expm1(-strength * sky_optical_depth(fog, climb / lengths, eye_z_m))
-    tau = optical_depth(fog, depth * lengths, eye_z_m, point_z_m)
+        slope = climb / camera.ray_lengths(depth.dtype, depth.device)
+        sky_share = -torch.expm1(-strength * sky_image_depth(fog, camera, slope))
+    tau = image_optical_depth(fog, camera, depth)
     shown_alpha = torch.where(depth > 0, alpha, 0.0)
     return (sky_share + shown_alpha * (-torch.expm1(-strength * tau) - sky_share)).clamp(0, 1)
 

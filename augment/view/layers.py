@@ -23,7 +23,8 @@ from augment.photo.recorded_base import Photo, blacken_parts
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.composite import add_airlight_elevation, composite_sky
 from augment.render.constants import RasterSettings
-from augment.render.fog import Fog, apply_fog_to_render, blend_airlight, sky_optical_depth
+from augment.render.fog import Fog, blend_airlight
+from augment.render.fog_image import apply_fog_to_render, sky_image_depth
 from augment.render.layout import ABOVE, HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera
@@ -143,7 +144,8 @@ class LayerRenderer:
                 )
         if buffer_fog is not None:
             with timed("smog on buffers"):
-                raster = replace(raster, rgb=apply_fog_to_render(raster, camera, buffer_fog))
+                rgb = apply_fog_to_render(raster, camera, buffer_fog, backend=self.backend)
+                raster = replace(raster, rgb=rgb)
         return raster
 
     def render_with_sky(
@@ -187,8 +189,8 @@ class LayerRenderer:
         if self.fog is not None:
             ray_slope = camera.ray_directions(rgb.dtype, rgb.device)[..., 2]
             ray_slope = ray_slope / camera.ray_lengths(rgb.dtype, rgb.device)
-            optical_depth = sky_optical_depth(self.fog, ray_slope, float(camera.centre[2]))
-            sky = blend_airlight(sky, optical_depth, self.fog, ray_slope)
+            tau = sky_image_depth(self.fog, camera, ray_slope, backend=self.backend)
+            sky = blend_airlight(sky, tau, self.fog, ray_slope)
         return rgb + (1 - alpha)[..., None] * sky
 
     def _move_edges(

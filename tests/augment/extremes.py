@@ -329,6 +329,8 @@ def number_fields(spec: Schema = SCHEMA, path: str = "") -> Iterator[tuple[str, 
     """Every field of a recipe that holds numbers: its path, the number, whether there are three."""
     for name, field in spec["properties"].items():
         own, at = resolved(field)[0], f"{path}.{name}".lstrip(".")
+        if at == "timelines":  # points over the fields that are listed
+            continue
         if "properties" in own:
             yield from number_fields(own, at)
         elif "items" in own:
@@ -349,11 +351,13 @@ _TAMED: dict[str, st.SearchStrategy[Any]] = {
     "weather.snow.max_slope_deg": st.sampled_from(SLOPES_DEG),
     "style.method": st.sampled_from(("mkl", "reinhard")),
     "style.preset": st.sampled_from(("dusk", "night")),
+    "timelines": st.just(()),
     **dict.fromkeys(("style.image", "style.mask", "style.checkpoint", "style.digest"), st.none()),
     **dict.fromkeys(("light.street_ies", "light.digest", "light.lamps"), st.none()),
     "light.street_spacing_m": st.sampled_from((30.0, 200.0)),
 }
 EFFECTS = ("smog", "flood", "snow", "style", "rain", "snowfall", "light", "lens_drops")
+_OPTIONAL_SECTIONS = ("road",)  # sections of an effect that most recipes lack
 _NOT_OF_FRAMES = ("quality", "output")  # chooses settings; drawn after the weather
 
 
@@ -383,7 +387,9 @@ def mappings(draw: st.DrawFn, spec: Schema, path: str, effects: frozenset[str]) 
         is_section = "properties" in own
         if name in _NOT_OF_FRAMES or (is_section and name in EFFECTS and name not in effects):
             continue
-        chance = 3 if is_section or name in spec.get("required", ()) else draw(st.integers(0, 3))
+        is_certain = is_section and name not in _OPTIONAL_SECTIONS
+        is_certain |= name in spec.get("required", ())
+        chance = 3 if is_certain else draw(st.integers(0, 3))
         if chance:
             given_null = may_be_null and not is_section and chance == 1
             at = f"{path}.{name}".lstrip(".")

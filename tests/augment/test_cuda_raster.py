@@ -28,6 +28,9 @@ from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.driver import list_tiles
 from augment.render.cuda.splats import BLOCK, HIDDEN, TILE, CudaSplats, CudaTiles
+from augment.render.fog import Fog
+from augment.render.fog_banks import FogBanks
+from augment.render.fog_image import apply_fog_to_render
 from augment.render.layout import SURFACE_DEPTHS_ONLY, HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene.scene import Gaussians, PosedGaussians
@@ -400,3 +403,16 @@ def test_a_crowd_has_the_same_bits_every_time(crowd):
     first = render(*crowd)
     for _ in range(3):
         assert_same_bits(render(*crowd), first)
+
+
+def test_fog_with_banks_is_applied_to_the_finished_buffers():
+    """Kernels of the GPU know no banks."""
+    banks = FogBanks(1.0, 100.0, 0.3, 5.0, 7)
+    fog = Fog(0.2, (0.5, 0.6, 0.7), banks=banks)
+    parts = [PosedGaussians(random_gaussians(40, seed=3))]
+    camera = camera_ahead(33, 21)
+    got = render(parts, camera, {RGB}, fog=fog)
+    clear = render(parts, camera, {RGB, ALPHA, EXPECTED_DEPTH})
+    torch.testing.assert_close(got.rgb, apply_fog_to_render(clear, camera, fog), atol=1e-5, rtol=0)
+    assert got.alpha is None and got.expected_depth is None
+    assert render(parts, camera, {ALPHA}, fog=fog).alpha is not None

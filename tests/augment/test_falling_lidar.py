@@ -27,9 +27,10 @@ from augment.effects.falling.lidar import (
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, PRECIPITATION, UNCHANGED
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.smog import fog_echoes
+from augment.effects.wet.drying import RoadFilm, drying_map
 from augment.effects.wet.film_kernels import EXPOSURE, NUM_CHANNELS, PUDDLE_ORDER
-from augment.effects.wet.ground_map import GROUND_CELL_M, WetGround
-from augment.effects.wet.lidar import dim_wet_echoes, wet_echo_ratio
+from augment.effects.wet.ground_map import GROUND_CELL_M, NO_PUDDLES, WetGround
+from augment.effects.wet.lidar import dim_echoes_by_film, dim_wet_echoes, wet_echo_ratio
 from augment.output.box_weather import box_tables, combine_visibility
 from augment.output.manifest import effect_masks
 from augment.output.tables import lidar_bytes
@@ -38,6 +39,7 @@ from augment.scene.boxes import NOT_COUNTED, WorldBoxes
 from augment.scene.labels import Boxes
 from augment.view.plan import make_plan
 from augment.view.weathered_sweep import weathered_sweep
+from recipes.road_water import MAX_FILM_MM
 from recipes.schema import Output, Rain, Recipe, Snow, Snowfall, Weather
 from tests.lidar_sweeps import (
     SENSOR_M,
@@ -276,6 +278,30 @@ def test_wet_ground_returns_less_and_nothing_else_does() -> None:
     covered.codes[:] = MOVED  # onto snow
     dim_wet_echoes(covered, ground_of(), 1.0, 0.0)
     assert (covered.gain == 1).all()
+
+
+def test_a_drying_road_gives_its_echoes_back() -> None:
+    points = ground_points(np.linspace(2, 40, 200))
+    ground = ground_of()
+    order = drying_map(ground, 3)
+
+    def gains(film: RoadFilm) -> np.ndarray:
+        echoes = echoes_of(points, 0.02)
+        dim_echoes_by_film(echoes, ground, order, film, NO_PUDDLES)
+        return echoes.gain
+
+    full = RoadFilm(MAX_FILM_MM, MAX_FILM_MM, 1.0, 1.0, 0.0, 1.0)
+    plain = echoes_of(points, 0.02)
+    dim_wet_echoes(plain, ground, 1.0, 0.0)
+    np.testing.assert_allclose(gains(full), plain.gain, rtol=1e-6)
+    states = [
+        gains(RoadFilm(MAX_FILM_MM * share, MAX_FILM_MM, 1.0, 1.0, 1.0, 0.0))
+        for share in (1.0, 0.7, 0.4, 0.2, 0.0)
+    ]
+    for wetter, drier in itertools.pairwise(states):
+        assert (drier >= wetter).all() and drier.mean() > wetter.mean()
+    assert (states[-1] == 1).all()
+    assert 0.1 < (states[3] == 1).mean() < 0.95  # some places are dry, others not
 
 
 # ---- By a recipe ---------------------------------------------------------------------------------

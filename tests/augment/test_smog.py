@@ -118,7 +118,7 @@ def test_deferred_smog_fogs_what_covers_the_pixel_and_leaves_the_rest_to_the_sky
     medium = Fog(0.1, GREY)
     rgb = torch.tensor([[[0.2, 0.2, 0.2], [0.0, 0.0, 0.0]]])  # half covered; not covered
     alpha = torch.tensor([[0.5, 0.0]])
-    out = apply_deferred_fog(rgb, alpha, torch.tensor([[10.0, 0.0]]), medium, 0.0)
+    out = apply_deferred_fog(rgb, alpha, torch.tensor([[1.0, 0.0]]), medium)
     t = math.exp(-1)
     assert torch.allclose(out[0, 0], t * rgb[0, 0] + (1 - t) * 0.5 * torch.tensor(GREY))
     assert torch.equal(out[0, 1], torch.zeros(3))

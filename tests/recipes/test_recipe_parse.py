@@ -147,7 +147,7 @@ def test_a_wrong_field_is_named_with_its_line_and_what_is_allowed(field: str, me
         ("snow: {depth_m: 0.1}", "snow: unknown field here; did you mean weather.snow?"),
         ("weather: {snows: 1}", "weather.snows: unknown field; did you mean snow?"),
         ("weather: {snow: 0.1}", "weather.snow = 0.1: must be a mapping, with depth_m, coverage"),
-        ("weather: {depth_m: 0.1}", "did you mean weather.snow.depth_m or weather.flood.level_m?"),
+        ("weather: {depth_m: 0.1}", "weather.snow.depth_m or weather.snow.road.depth_m or"),
         ("weather: {wind: {}}", "did you mean weather.snow.wind or weather.flood.waves?"),
         ("weather: {flood: {level_m: 1, wind: 3}}", "wind: unknown field; did you mean waves?"),
         ("weather: {flood: {level_m: 1, depth_cm: 3}}", "unknown field; did you mean level_m (m"),
@@ -420,8 +420,9 @@ def test_a_preset_comes_before_a_file_of_its_name(
 def test_the_presets_are_there() -> None:
     assert preset_names() == (
         *("blizzard", "brown-smog", "clear", "deep-flood", "deep-snow", "dense-fog", "downpour"),
-        *("drizzle", "dusk-lamps", "dusting", "evening", "flurries", "foggy-lamps", "fresh-snow"),
-        *("light-haze", "night", "night-fog", "night-rain", "overcast"),
+        *("drizzle", "drying-road", "dusk-lamps", "dusting", "evening", "first-snow", "flurries"),
+        *("fog-bank", "foggy-lamps", "fresh-snow"),
+        *("light-haze", "night", "night-fog", "night-rain", "overcast", "passing-shower"),
         *("puddled", "rain", "slush", "snowfall", "storm", "street-flood", "winter-day"),
         *("winter-fog", "winter-street"),
     )

@@ -22,11 +22,12 @@ from recipes.lens_drops import LensDrops
 from recipes.light import Light, ListedLamp
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.moment import Air
-from recipes.rain import Rain
+from recipes.rain import Rain, RoadWater
 from recipes.ranges import format_value
 from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
 from recipes.sections import Leaf, recipe_file
-from recipes.snow import Snow, SnowLight, SnowWind
+from recipes.shower import RateAtPlace
+from recipes.snow import Snow, SnowLight, SnowRoad, SnowWind
 from recipes.snowfall import Snowfall
 from recipes.speed import Speed
 from recipes.style import Style, style_preset_names
@@ -227,9 +228,11 @@ CANDIDATES = (0, 1, 2, 0.5, 0.1, True, False, "other", "1" * 64, (0.1, 0.2, 0.3)
 def test_every_field_changes_the_hash() -> None:
     wave = Wave(amplitude_m=0.01, wavelength_m=1.0)
     flood = Flood(level_m=0.2, waves=Waves(components=(wave,)))
-    smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1)
-    rain = Rain(rate_mm_h=5.0)
-    snowfall = Snowfall(rate_mm_h=1.0)
+    smog = Smog(visibility_m=300)
+    snow = Snow(depth_m=0.1, road=SnowRoad())
+    along = (RateAtPlace(distance_m=5, rate_mm_h=5),)
+    rain = Rain(rate_mm_h=5.0, along=along, road=RoadWater())
+    snowfall = Snowfall(rate_mm_h=1.0, along=along)
     weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain, snowfall=snowfall, air=Air())
     camera = Sensor(lens_drops=LensDrops(count=5))
     style = Style(image="a.png", digest="0" * 64)

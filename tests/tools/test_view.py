@@ -401,6 +401,32 @@ def test_the_picture_at_rest_is_the_one_that_render_writes(tmp_path):
 
 
 @pytest.mark.long
+def test_a_page_holds_the_weather_of_another_time_and_saves_it(tmp_path):
+    path = tmp_path / "clearing.yaml"
+    path.write_text(
+        "weather: {smog: {visibility_m: {timeline: [[0, 20], [1, 300]], times: share}}}"
+    )
+    edits = Edits(str(path), SCALE, folder=tmp_path / "views")
+    with served(edits) as (viewer, url), PageClient(url) as page:
+        scene = viewer.scene
+        camera = scene.frames[0].cameras["front"]
+        first = page.rest(after=0)
+        assert np.array_equal(first, render_view(scene, camera, edits.recipe()).rgb)
+        assert "Changes over time: weather.smog.visibility_m" in page.status()
+        count = len(page.pictures)
+        page.set("time of the weather/at [%]", 100.0)
+        page.set("time of the weather/hold", True)
+        shown = page.rest(after=count)
+        held = hold_weather(edits.recipe(), scene, camera, scene_times(scene).duration_s)
+        assert np.array_equal(shown, render_view(scene, camera, held).rgb)
+        assert not np.array_equal(shown, first)
+        command_of(page, "# weather of another time: save the recipe first")
+        page.press("Save picture")
+        saved = command_of(page, f"climategs render {tmp_path}")
+    assert np.array_equal(rendered(tmp_path / "saved", saved), shown)
+
+
+@pytest.mark.long
 def test_a_flight_is_repeated_by_the_command_line(tmp_path):
     edits = Edits("clear", SCALE, folder=tmp_path)
     with served(edits) as (_, url), PageClient(url) as page:

@@ -28,9 +28,11 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
-from augment.effects.falling import drop_kernels
+from augment.effects.falling import drop_kernels, shower_kernels
 from augment.effects.falling.drop_kernels import CellWalk, Veil
-from augment.effects.falling.drops import Kind, Sizes, cell_counts, sizes_of
+from augment.effects.falling.drops import Kind, Sizes, cell_counts, lattice_of, sizes_of
+from augment.effects.falling.shower import Shower, ShowerTable, shower_about, shower_in_view
+from augment.effects.falling.shower_kernels import LAYER_M
 from augment.effects.falling.shutter import STANDING, Motion
 from augment.light.common_exposure import AddedColors
 from augment.light.scene_light import find_scene_light
@@ -38,6 +40,7 @@ from augment.light.srgb import display_from_linear
 from augment.memo import memo_of
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.fog import MAX_EXPONENT, Fog
+from augment.render.fog_table import local_fog
 from augment.render.layout import NUM_LANES
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
@@ -45,7 +48,6 @@ from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 from augment.scene.sky import is_unknown_sky
 
-LAYER_M = 1000.0  # height of the layer from which rain and snow fall, metres
 MAX_DROPS = 50_000  # most drops that are drawn in a picture; more make the veil begin sooner
 APERTURE_M = 3e-3  # diameter of the aperture, metres: a lens of 6 mm at f/2, usual on cars
 FOCUS_M = 6.0  # depth in focus, metres
@@ -90,9 +92,32 @@ class Precipitation:
     color: tuple[float, float, float] | None = None
     """Display-encoded colour of the veil; None for the sky's."""
 
+    peak_mm_h: float | None = None
+    """Largest rate of the weather's course; None if the rate does not change."""
+
+    shower: Shower | None = None
+    """Rates by place; None if the rate is the same everywhere."""
+
     @property
     def sizes(self) -> Sizes:
         return sizes_of(self.kind, self.rate_mm_h)
+
+    @property
+    def lattice(self) -> Sizes:
+        """Return the sizes whose lattice the drops are in: those of the rate, or of its course."""
+        if self.peak_mm_h is None:
+            return self.sizes
+        return lattice_of(self.kind, max(self.peak_mm_h, self.rate_mm_h))
+
+    def at(self, camera: Camera) -> Precipitation:
+        """Return the precipitation with the rate at a camera."""
+        if self.shower is None:
+            return self
+        return replace(self, rate_mm_h=self.shower.rate_at(camera.centre.numpy()))
+
+    def shower_about(self, eye_m: np.ndarray) -> ShowerTable | None:
+        """Return the shower about an eye [3], world; None if the rate is the same everywhere."""
+        return None if self.shower is None else shower_about(self.shower, self.kind, eye_m)
 
 
 # ---- The light of drops --------------------------------------------------------------------------
@@ -175,18 +200,23 @@ def max_depths_m(precipitation: Precipitation, camera: Camera) -> np.ndarray:
 
 
 def cell_walk(precipitation: Precipitation, camera: Camera, motion: Motion, scene: str) -> CellWalk:
-    """Return the cells that the camera's view crosses, and their drops' motion."""
+    """Return the cells that the camera's view crosses, and their drops' motion.
+
+    The lattice is that of the largest rate of the weather's course, so that a drop stays where it
+    is while the rate changes. A share of its drops falls.
+    """
     sizes = precipitation.sizes
+    lattice = precipitation.lattice
     farthest = max_depths_m(precipitation, camera)
     half_s = precipitation.exposure_s / 2
     seconds = camera.timestamp_ns * 1e-9
     times = seconds + np.array([-half_s, 0.0, half_s])
     velocity = np.zeros((len(farthest), 3))
     velocity[:, :2] = precipitation.wind_mps
-    velocity[:, 2] = -sizes.speeds_mps
+    velocity[:, 2] = -lattice.speeds_mps
     moves = velocity[:, None] * times[:, None]  # [B, 3, 3]
     poses = np.stack([motion.pose_after(camera, s) for s in (-half_s, half_s)])
-    cells_m = sizes.cells_m
+    cells_m = lattice.cells_m
     speeds = np.linalg.norm(velocity - motion.velocity_mps, axis=1)
     speeds += np.linalg.norm(motion.turn_radps) * farthest
     spread_m = (
@@ -209,13 +239,14 @@ def cell_walk(precipitation: Precipitation, camera: Camera, motion: Motion, scen
     pose = camera.camera_from_world.numpy()
     planes = np.concatenate([normals @ pose[:3, :3], normals @ pose[:3, 3:]], 1)
     planes[4, 3] -= NEAR_M
+    falling_share = np.minimum(sizes.counts_per_m3 / lattice.counts_per_m3, 1.0)
     slabs, columns = _columns_of(camera, cells_m, reach, farthest, moves[:, 1])
     rng = rng_for(seed=precipitation.seed, scene=scene, effect=f"{precipitation.kind} in the air")
     lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     return CellWalk(
         slabs,
         columns,
-        np.stack([cells_m, reach, farthest, spread_m], 1),
+        np.stack([cells_m, reach, farthest, spread_m, falling_share], 1),
         rng.integers(0, 2**64, len(farthest), np.uint64),
         moves,
         _sways(precipitation.sway_mps, seconds),
@@ -379,7 +410,7 @@ def draw_falling(
         alpha: opacity of the surfaces.
         depth: z of the surfaces, metres; 0 without a surface.
         camera: camera of the picture.
-        precipitation: the rain or snow in the air.
+        precipitation: the rain or snow in the air, with the rate at the camera.
         scene: the scene whose light the drops have.
         fog: the fog in the air.
         motion: motion of the camera.
@@ -398,13 +429,17 @@ def draw_falling(
         glow = _in_common_exposure(glow, added_colors)
         if precipitation.color is not None:
             precipitation = replace(precipitation, color=added_colors.of_color(precipitation.color))
-    glow = _in_fog(glow, fog, float(camera.centre[2]), extinction)
+    glow = _in_fog(glow, local_fog(fog, camera), float(camera.centre[2]), extinction)
     veil = veil_of(precipitation, camera, glow)
+    table = precipitation.shower_about(camera.centre.numpy())
+    shower = None
+    if table is not None:
+        shower = shower_in_view(table, camera, np.asarray(veil.airlight, np.float64))
     if choose_kernels(backend, rgb, alpha, depth) != CPU:
         from augment.effects.falling.reference import blend_by_torch
 
         clear = torch.from_numpy(compute_clear_share(drops, *surfaces)).to(rgb.device)
-        return blend_by_torch(rgb, alpha, depth, clear, veil, splats), clear < CLEAR
+        return blend_by_torch(rgb, alpha, depth, clear, veil, splats, shower), clear < CLEAR
     picture = rgb.detach().numpy()
     splat_colors = (
         np.empty((0, picture.shape[1], 3), np.float32)
@@ -413,13 +448,13 @@ def draw_falling(
     )
     padded, *surfaces = (padded_image(image) for image in (picture, splat_colors, *surfaces))
     mask = np.empty(padded.shape[:2], bool)
+    images = (*(image.reshape(-1) for image in (padded, *surfaces)), *list_drops(drops, len(mask)))
     with kernel_threads(1):
-        drop_kernels.blend_falling(
-            *(image.reshape(-1) for image in (padded, *surfaces)),
-            *list_drops(drops, len(mask)),
-            np.float32(CLEAR),
-            *veil._replace(upwards=veil.upwards[()]),
-            mask,
-        )
+        if shower is None:
+            numbers = veil._replace(upwards=veil.upwards[()])
+            drop_kernels.blend_falling(*images, np.float32(CLEAR), *numbers, mask)
+        else:
+            light = (veil.rays, veil.climb, veil.bands, veil.airlight, veil.glow)
+            shower_kernels.blend_shower(*images, np.float32(CLEAR), *light, *shower, mask)
     width = camera.width
     return torch.from_numpy(padded[:, :width]), torch.from_numpy(mask[:, :width])

@@ -122,9 +122,9 @@ def find_drops(
     Args:
         slabs: [S, 2] class, x of the cells.
         columns: [B, 2] first y, end.
-        cells: [B, 4] size; largest distance of a visible part of a drop from its cell's middle;
+        cells: [B, 5] size; largest distance of a visible part of a drop from its cell's middle;
             depth up to which the class is drawn; largest distance of a visible part from the drop's
-            position in the lattice.
+            position in the lattice; share of the lattice's drops that fall.
         keys: [B] keys of the hashes.
         moves: [B, 3, 3] displacement of the lattice as the shutter opens, in the middle, and as it
             closes.
@@ -152,6 +152,7 @@ def find_drops(
         farthest = cells[b, 2]
         number = np.int64(0)
         spread_m = cells[b, 3]
+        falling_share = cells[b, 4]
         point = np.empty(3)
         ends = np.empty((2, 3))
         for j in range(columns[b, 0], columns[b, 1]):
@@ -205,6 +206,8 @@ def find_drops(
                     if inside < -spread_m or ahead > farthest + spread_m:
                         continue
                     more = mix(bits ^ _STEP)
+                    if falling_share < 1.0 and _unit(more, 42) >= falling_share:
+                        continue
                     for c in range(3):
                         point[c] += moves[b, 0, c] - moves[b, 1, c]
                     if sways[0] > 0:  # the sway while the shutter is open is below a flake's size
@@ -318,7 +321,7 @@ def list_drops(drops, bands, begins, listed):
 
 
 @kernel_function()
-def _nearest_in_row(row, width, alpha, depth, eight):
+def nearest_in_row(row, width, alpha, depth, eight):
     """Return the depth of the nearest surface in an image row. eight: scratch."""
     zeros = v8.broadcast(np.float32(0))
     no_surface = v8.broadcast(np.float32(np.inf))
@@ -353,7 +356,7 @@ def _path_integral(h2, start, length):
 
 
 @kernel_function()
-def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, clear):
+def cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, clear):
     """Write the share of each pixel of image rows top to bottom that no drop covers into clear.
 
     The drops count in their order. alpha, depth: of all pixels.
@@ -460,7 +463,7 @@ def cover_pixels(drops, listed, begins, alpha, depth, clear):
         top = np.int64(band) * ROWS
         bottom = min(top + ROWS, height)
         band_clear = np.empty(ROWS * width, np.float32)
-        _cover_band(
+        cover_band(
             drops,
             listed,
             begins[band],
@@ -574,7 +577,7 @@ def add_lit_drops(drops, listed, begins, ends, alpha, depth, padded_width, cells
 
 
 @kernel_function()
-def _classes_in_row(nearest, bands, partial):
+def classes_in_row(nearest, bands, partial):
     """Sort the classes of blend_falling's bands for one image row.
 
     partial [NUM_CLASSES, 5]: output, bands of the classes that are not completely veil at the
@@ -599,7 +602,7 @@ def _classes_in_row(nearest, bands, partial):
 
 
 @kernel_function()
-def _decay(x):
+def decay(x):
     """Return exp(-x) for x >= 0; larger x than MAX_EXPONENT count as MAX_EXPONENT."""
     x = v8.minimum(
         v8.maximum(x, v8.broadcast(np.float32(0))), v8.broadcast(np.float32(MAX_EXPONENT))
@@ -617,7 +620,7 @@ def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, tau, sk
     """
     zeros = v8.broadcast(np.float32(0))
     ones = v8.broadcast(np.float32(1))
-    surface_transmittance = _decay(tau * lengths)
+    surface_transmittance = decay(tau * lengths)
     per_length = ones / lengths
     red, green, blue = v8.load_colours(pixels, at)
     r = red
@@ -639,9 +642,9 @@ def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, tau, sk
     blue = _veil(
         v8.maximum(blue, zeros), b, is_mixed, edge, light[2], opacity, surface_transmittance, sky
     )
-    red = _blend_colour(red, light[0], u, clear, per_length)
-    green = _blend_colour(green, light[1], u, clear, per_length)
-    blue = _blend_colour(blue, light[2], u, clear, per_length)
+    red = blend_colour(red, light[0], u, clear, per_length)
+    green = blend_colour(green, light[1], u, clear, per_length)
+    blue = blend_colour(blue, light[2], u, clear, per_length)
     v8.store_colours(pixels, at, red, green, blue)
 
 
@@ -669,7 +672,7 @@ def _veil(color, splats, is_mixed, edge, light, opacity, surface_transmittance, 
 
 
 @kernel_function()
-def _blend_colour(veiled, light, u, clear, per_length):
+def blend_colour(veiled, light, u, clear, per_length):
     """Return the colour whose square is `veiled`, behind the drops."""
     glow = (
         v8.broadcast(light[1]) + (v8.broadcast(light[2]) * u + v8.broadcast(light[3])) * per_length
@@ -701,7 +704,7 @@ def _blend_row(
     zeros = v8.broadcast(np.float32(0))
     half = np.float32(0.5)
     min_climb = np.float32(1e-6)
-    count, slope, offset = _classes_in_row(nearest, bands, partial)
+    count, slope, offset = classes_in_row(nearest, bands, partial)
     v = (np.float32(row) + half - rays[3]) * rays[1]
     flat = v8.broadcast(np.float32(1) + v * v)
     level = climb[1] * v + climb[2]
@@ -727,7 +730,7 @@ def _blend_row(
         sky = zeros
         if shows_sky:  # below the horizon nothing is visible through so much veil
             steep = v8.broadcast(climb[0]) * u + v8.broadcast(level)
-            sky = _decay(
+            sky = decay(
                 v8.broadcast(upwards) * lengths / v8.maximum(steep, v8.broadcast(min_climb))
             )
         opacity = v8.select(v8.greater(z, zeros), v8.load(alpha, pixel), zeros)
@@ -808,8 +811,8 @@ def blend_falling(
         partial = np.empty((NUM_CLASSES, 5), np.float32)
         pixels = np.empty(3 * NUM_LANES, np.float32)
         for row in range(top, bottom):  # this also brings the surfaces into the cache, in order
-            nearest[row - top] = _nearest_in_row(row, width, alpha, depth, pixels)
-        _cover_band(
+            nearest[row - top] = nearest_in_row(row, width, alpha, depth, pixels)
+        cover_band(
             drops, listed, begins[band], begins[band + 1], top, bottom, width, alpha, depth, clear
         )
         for row in range(top, bottom):

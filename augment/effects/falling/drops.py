@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -42,6 +42,7 @@ _SNOW_DENSITY = 0.1  # density of a flake over that of water
 # Rate below which sizes stay the same, mm/h: the laws were measured at much higher rates.
 _MIN_RATE_MM_H = 1e-3
 _NUM_STEPS = 400  # steps of the integral over a class
+_NUM_LATTICE_RATES = 33  # rates among which a lattice looks for the most drops
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +116,16 @@ def sizes_of(kind: Kind, rate_mm_h: float) -> Sizes:
         quantiles_m=swelling * np.array(quantiles) / 1000,
         mass_kg=(counts * mass).sum(1) / number,
     )
+
+
+@functools.lru_cache(maxsize=64)
+def lattice_of(kind: Kind, peak_mm_h: float) -> Sizes:
+    """Return sizes at a rate, with the most drops of each class that any smaller rate has."""
+    sizes = sizes_of(kind, peak_mm_h)
+    lowest = min(peak_mm_h, _MIN_RATE_MM_H)
+    rates = np.geomspace(lowest, max(peak_mm_h, lowest), _NUM_LATTICE_RATES)
+    counts = [sizes_of.__wrapped__(kind, float(rate)).counts_per_m3 for rate in rates]
+    return replace(sizes, counts_per_m3=np.max([sizes.counts_per_m3, *counts], axis=0))
 
 
 # ---- Positions of drops --------------------------------------------------------------------------

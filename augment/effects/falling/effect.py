@@ -27,6 +27,7 @@ from augment.effects.falling.drop_covers import cover_of_drops
 from augment.effects.falling.drops import Kind
 from augment.effects.falling.labels import falling_table, measure_falling
 from augment.effects.falling.lidar import precipitation_echoes, scatterers_of
+from augment.effects.falling.shower import Shower, reference_place, unit_direction
 from augment.effects.falling.shutter import frame_interval_s, motion_of
 from augment.effects.lidar.beam import Echoes
 from augment.errors import SceneError
@@ -83,7 +84,7 @@ class FallingEffect(Effect):
             precompute_shadows(context.scene)
 
     def kernel_key(self, section: Rain | Snowfall) -> Any:
-        return section.has_effect or None
+        return (section.has_effect, section.along is not None) if section.has_effect else None
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
@@ -105,6 +106,8 @@ class FallingEffect(Effect):
             recipe.camera.exposure_ms / 1000,
             speed.rain_min_width_px if is_rain else speed.snowfall_min_width_px,
             section.color,
+            section.peak_mm_h,
+            _shower_of(section, scene, recipe.seed),
         )
         return _plan_of(precipitation, self.step, scene)
 
@@ -121,9 +124,18 @@ class FallingEffect(Effect):
     def attenuate_beams(
         self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
     ) -> None:
-        kind = effect.settings.kind
-        rate = float(effect.settings.rate_mm_h)
-        precipitation_echoes(echoes, scatterers_of(kind, rate), rng)
+        settings: Precipitation = effect.settings
+        table = None
+        if settings.shower is not None:
+            # The sensor's own place: its beams start within a metre of each other.
+            origins_m = echoes.origins[echoes.ranges_m > 0]
+            if len(origins_m) == 0:
+                return
+            sensor_m = np.median(origins_m, axis=0)
+            table = settings.shower_about(sensor_m)
+            settings = replace(settings, rate_mm_h=settings.shower.rate_at(sensor_m))
+        scatterers = scatterers_of(settings.kind, float(settings.rate_mm_h))
+        precipitation_echoes(echoes, scatterers, rng, table)
 
 
 class RainEffect(FallingEffect):
@@ -156,6 +168,18 @@ def wind_velocity_mps(speed_mps: float, from_deg: float) -> tuple[float, float]:
     return -speed_mps * math.cos(angle), -speed_mps * math.sin(angle)
 
 
+def _shower_of(section: Rain | Snowfall, scene: Scene, seed: int) -> Shower | None:
+    """Return the shower of a recipe's section in a scene; None if its rate is the same everywhere.
+
+    Places of one rate are rain that is the same everywhere, if it is the section's own rate.
+    """
+    places = tuple((place.distance_m, place.rate_mm_h) for place in section.along or ())
+    if all(rate == section.rate_mm_h for _, rate in places):
+        return None
+    direction = unit_direction(section.wind_from_deg)
+    return Shower(places, direction, reference_place(scene), seed)
+
+
 def _plan_of(precipitation: Precipitation, step: str, scene: Scene) -> EffectPlan:
     """Return the plan. Raise SceneError if the exposure is longer than the frame interval."""
     interval = frame_interval_s(scene)
@@ -170,6 +194,9 @@ def _plan_of(precipitation: Precipitation, step: str, scene: Scene) -> EffectPla
         f"extinction {1000 * precipitation.sizes.extinction_per_m:.3g}/km, "
         f"shutter open for {precipitation.exposure_s * 1000:g} ms"
     )
+    if precipitation.shower is not None:
+        rates = [rate for _, rate in precipitation.shower.places]
+        why += f"; a shower of {min(rates):g} to {max(rates):g} mm/h along the wind"
     if interval is None:
         why += "; the cameras' speed is not known, so they stand"
     if not scene.has_metric_scale:
@@ -188,14 +215,15 @@ def _draw_over(
     depth = view.raster.expected_depth
     assert alpha is not None and depth is not None
     motion = motion_of(effect.scene, camera)
+    precipitation = effect.settings.at(camera)
     with timed(step):
-        drops = find_drops(cell_walk(effect.settings, camera, motion, effect.lit_scene.name))
+        drops = find_drops(cell_walk(precipitation, camera, motion, effect.lit_scene.name))
         rgb, drop_mask = draw_falling(
             view.rgb,
             alpha,
             depth,
             camera,
-            effect.settings,
+            precipitation,
             scene=effect.lit_scene,
             fog=view.layers.fog,
             motion=motion,

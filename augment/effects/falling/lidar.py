@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from augment.effects.falling.drops import Kind, sizes_of
+from augment.effects.falling.shower import ShowerTable
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.lidar.codes import LOST, PRECIPITATION
 
@@ -189,12 +190,28 @@ def strongest_drops(
     return strength, ranges
 
 
-def precipitation_echoes(echoes: Echoes, scatterers: Scatterers, rng: np.random.Generator) -> None:
-    """Weaken echoes by precipitation, add range noise, and replace those that a drop exceeds."""
+def precipitation_echoes(
+    echoes: Echoes,
+    scatterers: Scatterers,
+    rng: np.random.Generator,
+    shower: ShowerTable | None = None,
+) -> None:
+    """Weaken echoes by precipitation, add range noise, and replace those that a drop exceeds.
+
+    Args:
+        echoes: changed in place.
+        scatterers: the drops about the sensor.
+        rng: generator of the drops.
+        shower: the shower about the sensor; None if the rate is the same everywhere.
+    """
     model = echoes.model
     air = echoes.air_path_m
     before = echoes.gain.copy()
-    echoes.gain *= np.exp(-2 * scatterers.extinction_per_m * air)
+    if shower is None:
+        optical_depth = scatterers.extinction_per_m * air
+    else:
+        optical_depth = shower.optical_depth(air[:, None] * echoes.directions)
+    echoes.gain *= np.exp(-2 * optical_depth)
     echoes.add_range_noise(before, rng.standard_normal(len(air)))
     strength, ranges = strongest_drops(echo_table(scatterers, model), air, rng)
     # The fog between sensor and drop is taken as dense as at the sensor.

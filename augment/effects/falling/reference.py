@@ -7,6 +7,7 @@ two.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +24,18 @@ from augment.effects.falling.drop_kernels import (
     Veil,
 )
 from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL
+from augment.effects.falling.shower import ShowerInView
+from augment.effects.falling.shower_kernels import (
+    CLOUD_EXTINCTION_PER_M,
+    CLOUD_TOP_M,
+    LAYER_M,
+    LUMP_CLIMB,
+    LUMP_DEPTH,
+    LUMP_LIGHT,
+    LUMP_STEP_M,
+    MIN_ALONG_M,
+    STEP_M,
+)
 from augment.rng import STEP_X, mix
 
 
@@ -34,7 +47,7 @@ def find_drops_by_numpy(walk: CellWalk) -> Float32[np.ndarray, "N 9"]:
 
 def _drops_of_class(walk: CellWalk, class_number: int) -> np.ndarray:
     """Return the drops of one size class, [N, 9], in the columns of drop_kernels.find_drops."""
-    size, reach, max_depth, _ = walk.cells[class_number]
+    size, reach, max_depth, _, falling_share = walk.cells[class_number]
     rows = walk.slabs[walk.slabs[:, 0] == class_number, 1]
     if len(rows) == 0:
         return np.zeros((0, 9))
@@ -61,6 +74,11 @@ def _drops_of_class(walk: CellWalk, class_number: int) -> np.ndarray:
         drop_numbers, drop_cells = np.nonzero(is_drop)
         bits = mix(cell_keys[drop_cells] + (drop_numbers + 1).astype(np.uint64) * np.uint64(STEP_X))
         more_bits = mix(bits ^ np.uint64(STEP_X))
+    # 22 bits are left above the 42nd; `unit` takes 21 of them.
+    falls = ((more_bits >> np.uint64(42)) & np.uint64(0x1FFFFF)) / 2.0**21 < falling_share
+    drop_cells = drop_cells[falls]
+    bits = bits[falls]
+    more_bits = more_bits[falls]
 
     def unit(values: np.ndarray, shift: int) -> np.ndarray:
         return ((values >> np.uint64(shift)) & np.uint64(0x1FFFFF)) / 2.0**21
@@ -214,8 +232,11 @@ def blend_by_torch(
     clear: Float[Tensor, "H W"],
     veil: Veil,
     splats: Float[Tensor, "H W 3"] | None = None,
+    shower: ShowerInView | None = None,
 ) -> Float[Tensor, "H W 3"]:
     """Return the picture behind the drops and their veil, as drop_kernels.blend_falling does.
+
+    With a shower it does as shower_kernels.blend_shower.
 
     Args:
         rgb: display-encoded picture.
@@ -224,6 +245,7 @@ def blend_by_torch(
         clear: share of each pixel that no drop covers.
         veil: veil of the drops that are not drawn.
         splats: colour of the splats alone; None if edges are not separated from the sky.
+        shower: the shower; None if the rate is the same everywhere.
     """
     rays, rise, bands, upwards, airlight, glow = (
         torch.from_numpy(numbers).to(rgb.device, rgb.dtype) for numbers in veil
@@ -238,23 +260,38 @@ def blend_by_torch(
     depth_in_band = torch.minimum((z - band_start).clamp_min(0), band_depth)
     tau = (extinction * (depth_in_band**2 * half_inverse + (z - full_depth).clamp_min(0))).sum(-1)
     slope = rise[0] * u + rise[1] * v + rise[2]
-    sky_transmittance = torch.exp(-(upwards * length / slope.clamp_min(1e-6)).clamp_max(80))
+    surface_air = sky_air = airlight
+    sky_glow = airlight.new_zeros(3)
+    if shower is None:
+        sky_transmittance = torch.exp(-(upwards * length / slope.clamp_min(1e-6)).clamp_max(80))
+    else:
+        rays_in_shower = _rays_in_shower(shower, u, v, depth, slope)
+        tau = tau + rays_in_shower.excess
+        surface_air = airlight * rays_in_shower.surface_light[..., None]
+        through_rain = torch.exp(-(rays_in_shower.sky_depth * length).clamp(0, 80))
+        through_cloud = torch.exp(-(rays_in_shower.cloud_depth * length).clamp(0, 80))
+        sky_transmittance = through_rain * through_cloud
+        cloud = torch.from_numpy(shower.cloud).to(airlight)
+        rain_share = (1 - through_rain) * rays_in_shower.sky_light
+        cloud_share = through_rain * (1 - through_cloud) * rays_in_shower.cloud_light
+        sky_glow = rain_share[..., None] * airlight + cloud_share[..., None] * cloud
+        sky_air = airlight.new_zeros(3)
     surface_share = torch.where(depth > 0, alpha, 0)
-    surface_transmittance = torch.exp(-(tau * length).clamp_max(80))
+    surface_transmittance = torch.exp(-(tau * length).clamp(0, 80))
     directions = torch.stack([u, v, torch.ones_like(u)], -1) / length[..., None]
     drop_light = directions @ glow[:, :3].T + glow[:, 3]
     rgb_linear = rgb.clamp_min(0)
-    veiled_rgb = airlight + (
-        sky_transmittance + surface_share * (surface_transmittance - sky_transmittance)
-    )[..., None] * (rgb_linear**2 - airlight)
+    before_surface = surface_air + surface_transmittance[..., None] * (rgb_linear**2 - surface_air)
+    before_sky = sky_air + sky_transmittance[..., None] * (rgb_linear**2 - sky_air) + sky_glow
+    veiled_rgb = before_sky + surface_share[..., None] * (before_surface - before_sky)
     if splats is not None:
         surface_parts = surface_share[..., None]
         sky_share = 1 - surface_share[..., None]
         sky_rgb = torch.minimum((rgb_linear - splats).clamp_min(0), sky_share)
         surface_rgb = ((rgb_linear - sky_rgb) / surface_parts.clamp_min(EDGE)) ** 2
         sky_rgb = (sky_rgb / sky_share.clamp_min(EDGE)) ** 2
-        surface_rgb = airlight + surface_transmittance[..., None] * (surface_rgb - airlight)
-        sky_rgb = airlight + sky_transmittance[..., None] * (sky_rgb - airlight)
+        surface_rgb = surface_air + surface_transmittance[..., None] * (surface_rgb - surface_air)
+        sky_rgb = sky_air + sky_transmittance[..., None] * (sky_rgb - sky_air) + sky_glow
         edge_rgb = (
             surface_parts * surface_rgb.clamp_min(0).sqrt()
             + sky_share * sky_rgb.clamp_min(0).sqrt()
@@ -268,3 +305,76 @@ def blend_by_torch(
         .clamp_min(0)
         .sqrt()
     )
+
+
+class _RaysInShower(NamedTuple):
+    """Numbers of the rays of a picture in a shower, [H, W] each; depths at unit length of a ray."""
+
+    excess: Tensor  # optical depth up to the surface that the rate at the eye leaves out
+    surface_light: Tensor  # light of the veil before the surface
+    sky_depth: Tensor  # optical depth of the rain before the sky
+    cloud_depth: Tensor  # that of the cloud
+    sky_light: Tensor  # light of the veil before the sky
+    cloud_light: Tensor  # light of the cloud over its mean
+
+
+def _rays_in_shower(
+    shower: ShowerInView, u: Tensor, v: Tensor, depth: Tensor, slope: Tensor
+) -> _RaysInShower:
+    rows, axes, at_eye, _, lumps, eye = (torch.from_numpy(numbers).to(u) for numbers in shower)
+
+    def integrals(distance: Tensor) -> Tensor:
+        x = distance / STEP_M + len(rows) // 2
+        low = x.clamp(0, len(rows) - 2).long()
+        return rows[low] + (x - low)[..., None] * (rows[low + 1] - rows[low])
+
+    def mean_and_light(distance: Tensor) -> tuple[Tensor, Tensor]:
+        in_reach = distance.abs() > MIN_ALONG_M
+        parts = integrals(distance)
+        mean = torch.where(in_reach, parts[..., 0] / torch.where(in_reach, distance, 1), at_eye[0])
+        has_light = in_reach & (parts[..., 0].abs() > 1e-9)
+        light = parts[..., 1] / torch.where(has_light, parts[..., 0], 1)
+        return mean, torch.where(has_light, light, 1)
+
+    along = axes[0, 0] * u + axes[0, 1] * v + axes[0, 2]
+    across = axes[1, 0] * u + axes[1, 1] * v + axes[1, 2]
+    per_climb = 1 / slope.clamp_min(1e-6)
+    lump = _lump(
+        lumps,
+        eye[0] + LAYER_M / LUMP_STEP_M * along * per_climb,
+        eye[1] + LAYER_M / LUMP_STEP_M * across * per_climb,
+    )
+    lump = lump * (slope / LUMP_CLIMB - 0.5).clamp(0, 1)
+    mean, surface_light = mean_and_light(depth * along)
+    base = LAYER_M * along * per_climb
+    top = CLOUD_TOP_M * along * per_climb
+    sky_mean, sky_light = mean_and_light(base)
+    crosses = (top - base).abs() > MIN_ALONG_M
+    cover = (integrals(top) - integrals(base))[..., 2] / torch.where(crosses, top - base, 1)
+    cover = torch.where(crosses, cover, at_eye[1]) * (1 + LUMP_DEPTH * lump)
+    cloud_depth = CLOUD_EXTINCTION_PER_M * (CLOUD_TOP_M - LAYER_M) * per_climb * cover
+    excess = depth * (mean - at_eye[0])
+    return _RaysInShower(
+        excess,
+        surface_light,
+        LAYER_M * per_climb * sky_mean,
+        cloud_depth,
+        sky_light,
+        1 + LUMP_LIGHT * lump,
+    )
+
+
+def _lump(lumps: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return a periodic tile's values between its cells."""
+    size = len(lumps)
+    i = x.floor().long() % size
+    j = y.floor().long() % size
+    right = (i + 1) % size
+    below = (j + 1) % size
+    x = x - x.floor()
+    y = y - y.floor()
+    x = x * x * (3 - 2 * x)
+    y = y * y * (3 - 2 * y)
+    upper = lumps[j, i] + x * (lumps[j, right] - lumps[j, i])
+    lower = lumps[below, i] + x * (lumps[below, right] - lumps[below, i])
+    return upper + y * (lower - upper)

@@ -45,6 +45,7 @@ from augment.render.buffers import ALPHA, CPU, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.composite import simplify_sky
 from augment.render.constants import DEPTH_EPS
 from augment.render.fog import Fog, blend_airlight, sky_optical_depth
+from augment.render.fog_table import local_fog
 from augment.render.layout import ABOVE, BELOW, HeightClip
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
@@ -224,7 +225,7 @@ def view_from_below(
     up = directions[..., 2] / lengths
     air_directions = _into_air(directions / lengths[..., None], medium.refraction_index)
     reflected = fresnel_reflectance(up.clamp_min(0), 1 / medium.refraction_index)[..., None]
-    sky_behind, fog = simplify_sky(sky, fog)
+    sky_behind, fog = simplify_sky(sky, local_fog(fog, camera))
     sky_rgb = sample_at(sky_behind, air_directions)
     if fog is not None:
         tau = sky_optical_depth(fog, air_directions[..., 2], medium.level_z_m)

@@ -40,6 +40,7 @@ from augment.memo import memo_of
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.composite import simplify_sky
 from augment.render.fog import Fog, blend_airlight, optical_depth, vertical_optical_depth
+from augment.render.fog_table import local_fog
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 from augment.scene.sky import (
@@ -95,7 +96,7 @@ def shade_water(
         mirror: the scene above the water, from the mirrored eye.
         screen: screen-space reflections, for the smooth pixels.
         sky: the sky.
-        fog: the fog.
+        fog: the fog; of fog with banks, its density around the camera counts here.
         backend: the CPU's kernel equals the definition within float rounding.
 
     Raises:
@@ -103,6 +104,7 @@ def shade_water(
     """
     if fog is not None and fog.extinction_per_m == 0:
         fog = None
+    fog = local_fog(fog, camera)
     water = Water(camera, cover, medium, field, bed, mirror, screen, sky, fog)
     layers = (bed, mirror, None if screen is None else screen.layer)
     images = [(i.rgb, i.alpha, i.depth) for i in layers if i is not None]

@@ -26,6 +26,7 @@ from augment.lamps.surface_light import surface_light
 from augment.lamps.wet_glints import add_wet_glints
 from augment.memo import memo_of
 from augment.render.buffers import REFERENCE
+from augment.render.fog_table import local_fog
 from augment.render.scatter import scattered_share
 from augment.scene.cameras import Camera
 from augment.scene.labels import EGO_VEHICLE
@@ -65,7 +66,7 @@ def add_lamp_light(
     alpha = np.ascontiguousarray(raster.alpha.detach().cpu().numpy(), np.float32)
     z = np.ascontiguousarray(raster.expected_depth.detach().cpu().numpy(), np.float32)
     depth_m = find_surfaces(alpha, z, uses_kernels=effect.backend != REFERENCE)
-    air = air_of(effect, view)
+    air = air_of(effect, view, camera)
     # Not zeros_like, which would write to memory where no light is added.
     added = np.zeros(rgb.shape, np.float32) if recorded is None else recorded
     if plan.hour.is_dark:
@@ -164,8 +165,11 @@ def _airlight(view: RenderedView, color_map: Tensor | None) -> tuple[float, floa
     return (red, green, blue)
 
 
-def air_of(effect: EffectInScene, view: RenderedView) -> AirExtinction:
-    """Return the extinction of fog, rain and snowfall in a view."""
+def air_of(effect: EffectInScene, view: RenderedView, camera: Camera) -> AirExtinction:
+    """Return the extinction of fog, rain and snowfall in a view.
+
+    Fog with banks counts as plain fog that is as dense as the banks around the camera.
+    """
     per_m = 0.0
     kind: Literal["rain", "snow"] = "rain"
     for other in effect.earlier_effects:
@@ -174,7 +178,10 @@ def air_of(effect: EffectInScene, view: RenderedView) -> AirExtinction:
             per_m += sizes.extinction_per_m
             if other.hooks.name == "snowfall":
                 kind = "snow"
-    fog = next((o.settings.fog for o in effect.earlier_effects if o.hooks.name == "smog"), None)
+    smog = next((o for o in effect.earlier_effects if o.hooks.name == "smog"), None)
+    fog = None
+    if smog is not None:
+        fog = local_fog(smog.settings.fog_at(smog.weather_time_s), camera)
     return AirExtinction(fog, per_m, kind)
 
 

@@ -112,6 +112,13 @@ def road_luminance(plan: LightPlan, scene: Scene) -> float:
 
     It has the light of sky and moon, of lamps that do not move, and of the car's own beams.
     """
+    key = ("lamps, luminance of the road", plan.light, plan.hour, plan.has_street_lamps)
+    key = (*key, plan.own_beam)
+    return memo_of(scene).get(key, lambda: _find_road_luminance(plan, scene))
+
+
+def _find_road_luminance(plan: LightPlan, scene: Scene) -> float:
+    """Return the median luminance of the road, cd/m2; wetness and snow do not change it."""
     lamps = fixed_lamps(plan, scene)
     places = _road_places(scene)
     lux = np.full(len(places), plan.hour.ground_lux)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from augment.effects.effect import RenderedView
 from augment.render.composite import apply_color_map
-from augment.render.fog import sky_optical_depth
+from augment.render.fog_image import sky_image_depth
 from augment.scene.cameras import Camera
 from augment.scene.sky import sample_at
 
@@ -38,7 +38,7 @@ def replace_photo_sky(
             return rgb
         directions = camera.ray_directions()
         slope = directions[..., 2] / directions.norm(dim=-1)
-        weight = weight * torch.exp(-sky_optical_depth(fog, slope, float(camera.centre[2])))
+        weight = weight * torch.exp(-sky_image_depth(fog, camera, slope))
     rows, columns = torch.nonzero(weight > 0, as_tuple=True)
     if len(rows) == 0:
         return rgb

@@ -26,7 +26,8 @@ from augment.effects.lens_drops import lens_drop_kernels
 from augment.effects.lens_drops.drops import Drops
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK, simplify_sky
-from augment.render.fog import blend_airlight, sky_optical_depth
+from augment.render.fog import blend_airlight
+from augment.render.fog_image import sky_ray_depth
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 from augment.scene.sky import is_unknown_sky
@@ -74,7 +75,7 @@ def map_surroundings(
         rays = np.stack([u, v, np.ones_like(u)], -1) @ rotation.T
         beside = (columns < -0.5) | (columns > size[0] - 0.5)
         outside = (beside | (rows < -0.5) | (rows > size[1] - 0.5)) & (rays[..., 2] > 0)
-        picture[outside] = _sky_colors(layers, rays[outside], float(camera.centre[2]))
+        picture[outside] = _sky_colors(layers, rays[outside], camera)
     return np.square(np.maximum(picture, 0))
 
 
@@ -86,14 +87,14 @@ def _shrunk(rgb: Float[Tensor, "H W 3"], size: tuple[int, int]) -> Float32[np.nd
     return small[0].permute(1, 2, 0).cpu().contiguous().numpy()
 
 
-def _sky_colors(layers: LayerRenderer, rays: np.ndarray, eye_z_m: float) -> np.ndarray:
+def _sky_colors(layers: LayerRenderer, rays: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the sky's colours in world directions [N, 3], through the fog."""
     sky, fog = simplify_sky(layers.sky, layers.fog)
     directions = F.normalize(torch.from_numpy(rays).float(), dim=-1)
     colors = sky.sample(directions)
     if fog is not None:
-        slope = directions[:, 2]
-        colors = blend_airlight(colors, sky_optical_depth(fog, slope, eye_z_m), fog, slope)
+        tau = sky_ray_depth(fog, camera, directions)
+        colors = blend_airlight(colors, tau, fog, directions[:, 2])
     return colors.numpy()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -26,6 +26,7 @@ from augment.effects.effect import (
     skipped_steps,
 )
 from augment.effects.lidar.beam import Echoes
+from augment.effects.snow.changing_snow import ChangingLayers, laid_plan, lay_changing_snow
 from augment.effects.snow.glints import GLINT_SIZE_M
 from augment.effects.snow.layer import lay_snow
 from augment.effects.snow.layer_kernels import MAX_GRAIN_DISTANCE_M
@@ -36,12 +37,14 @@ from augment.effects.snow.plan import SnowPlan, exposure_settings, naming_cell_f
 from augment.effects.snow.relief import Carrier, add_grain
 from augment.effects.snow.snowy_boxes import count_snow_pixels, extend_boxes_by_snow
 from augment.effects.snow.wet_tracks import wet_tracks
+from augment.exposure.cells import ExposedSurface
 from augment.exposure.exposed_surface import exposed_surface_of, share_exposed_surface
 from augment.light.cast_shadows import precompute_shadows
 from augment.memo import memo_of
 from augment.output.box_tables import BoxTable, pixel_fraction
 from augment.render.buffers import EXPECTED_DEPTH, OVERLAY
 from augment.render.fog import Fog, optical_depth_numpy
+from augment.render.fog_table import local_fog
 from augment.scene.bounds import Bounds, bound_points, bound_squares, find_visible_owners
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes
 from augment.scene.cameras import Camera
@@ -59,6 +62,16 @@ WET_PASS = "snow: wet tracks"
 MIN_MASK_SHARE = 0.5  # least share of snow in a pixel of the mask
 _CHUNK_M = 8.0  # side of the squares in which snow is bounded
 _BOX_MARGIN_M = 0.3  # distance from a vehicle's box within which snow still lies on it
+
+
+@dataclass(frozen=True)
+class SnowView:
+    """Snow in one view."""
+
+    owners: frozenset[int]
+    """Instance ids of the parts whose snow may be in view."""
+    cameras: tuple[Camera, ...]
+    """Cameras that look into the scene for this view."""
 
 
 class SnowEffect(Effect):
@@ -106,17 +119,24 @@ class SnowEffect(Effect):
             return EffectPlan(None, steps)
         check_metric_and_level(scene)
         reason = (
-            f"{snow.depth_m:g} m deep on {100 * snow.coverage:.3g} % of what is open to the sky, "
+            f"{snow.depth_m:.4g} m deep on {100 * snow.coverage:.3g} % of what is open to the sky, "
             f"no steeper than {snow.max_slope_deg:g} deg and seen by a camera; cells of "
             f"{100 * snow.cell_m:g} cm near the path; {describe_light(scene, snow)}"
         )
+        if snow.is_scaled:
+            reason += f"; laid once for {snow.laid_depth_m:.3g} m, and scaled"
+        if snow.road is not None:
+            reason += f"; {snow.road.depth_m:.2g} m on roads"
         levels = (other.water_level_z_m for other in later_plans.values())
         level_z_m = next((level for level in levels if level is not None), None)
         if level_z_m is not None:
             reason += f"; none below the water's level, z = {level_z_m:.2f} m"
         has_wet_ground = recipe.weather.rain is not None and recipe.weather.rain.ground_wetness > 0
-        has_wet_tracks = snow.traffic > 0 and not has_wet_ground
+        road_wetness = 0.0 if snow.road is None else snow.road.wetness
+        has_wet_tracks = (snow.traffic > 0 or road_wetness > 0) and not has_wet_ground
         wet_reason = f"traffic is {snow.traffic:g}"
+        if snow.road is not None:
+            wet_reason += f", road.wetness {road_wetness:.2g}"
         if has_wet_ground:
             wet_reason = "weather.rain wets the road already"
         shading = f"shading is {snow.shading!r}"
@@ -134,28 +154,29 @@ class SnowEffect(Effect):
 
     def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
         snow = self.section_of(recipe)
-        if snow is None or not snow.has_effect or snow.sun_fade == 0:
+        if snow is None or not (snow.has_effect or snow.placed_depth_m) or snow.sun_fade == 0:
             return 1.0, ""
         share = 1 - snow.sun_fade
         return share, f"{self.section} leaves {100 * share:.0f} % of the sun's light"
 
     def gloss_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
         snow = self.section_of(recipe)
-        if snow is None or not snow.has_effect or snow.blue_fade == 0:
+        if snow is None or not (snow.has_effect or snow.placed_depth_m) or snow.blue_fade == 0:
             return 1.0, ""
         share = 1 - snow.blue_fade
         return share, f"{self.section} leaves {100 * share:.0f} % of the sky's blue"
 
-    def prepare(self, effect: EffectInScene) -> SnowLayers:
-        return build_snow_layers(
-            effect.scene, effect.settings, effect.lit_scene, backend=effect.backend
-        )
+    def prepare(self, effect: EffectInScene) -> SnowLayers | ChangingLayers:
+        build = build_changing_layers if effect.settings.snow.is_scaled else build_snow_layers
+        return build(effect.scene, effect.settings, effect.lit_scene, backend=effect.backend)
 
     def precompute(self, context: JobContext) -> None:
         """Find the exposed surface of the scene, once for all recipes of the job."""
         sections = (self.section_of(recipe) for recipe in context.recipes)
         distinct = dict.fromkeys(
-            exposure_settings(snow, context.scene) for snow in sections if snow and snow.has_effect
+            exposure_settings(snow, context.scene)
+            for snow in sections
+            if snow and (snow.has_effect or snow.placed_depth_m)
         )
         for settings in distinct:
             precompute_shadows(context.scene)
@@ -170,7 +191,7 @@ class SnowEffect(Effect):
                 )
 
     def visibility(self, effect: EffectInScene, query: ViewQuery) -> Visibility:
-        layers = effect.prepared_data
+        layers = _laid_layers(effect)
         boxes = memo_of(layers).get(("boxes of snow",), lambda: _bound_layers(effect.scene, layers))
         owners = find_visible_owners(boxes, query.world_from_parts, query.cameras, query.near_m)
         if not owners:
@@ -181,15 +202,26 @@ class SnowEffect(Effect):
             {} if is_lit_per_pixel else {LIGHT_PASS: "no snow that is lit per pixel can be in view"}
         )
         return Visibility(
-            skip_reasons=why, instance_ids=frozenset(owners - {0}), view_data=frozenset(owners)
+            skip_reasons=why,
+            instance_ids=frozenset(owners - {0}),
+            view_data=SnowView(frozenset(owners), query.cameras),
         )
 
     def edit_scene(
         self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
         with timed(LAYER_PASS):
-            parts = effect.prepared_data.parts_for(
-                effect.scene, camera, layers.parts, effect.view_data, backend=effect.backend
+            view = effect.view_data
+            snow_layers = effect.prepared_data
+            if isinstance(snow_layers, ChangingLayers):
+                cameras = None if view is None else view.cameras
+                snow_layers = snow_layers.at(effect.settings.snow, cameras)
+            parts = snow_layers.parts_for(
+                effect.scene,
+                camera,
+                layers.parts,
+                None if view is None else view.owners,
+                backend=effect.backend,
             )
             if layers.added_colors is not None:
                 in_exposure = layers.added_colors.of_part
@@ -208,7 +240,7 @@ class SnowEffect(Effect):
             or depth is None
         ):
             return view
-        layers = effect.prepared_data
+        layers = _laid_layers(effect)
         masks_before_snow = list(view.masks.values())  # water lies before the snow beneath it
         with timed(GRAIN_PASS):
             rgb = add_grain(
@@ -249,7 +281,11 @@ class SnowEffect(Effect):
 
 def _wet_tracks(effect: EffectInScene, view: RenderedView, camera: Camera) -> RenderedView:
     """Return the view with the bare road in the tracks of traffic wet."""
-    wet_road = effect.prepared_data.wet_road
+    layers = effect.prepared_data
+    if isinstance(layers, ChangingLayers):
+        wet_road = layers.wet_road_at(effect.settings.snow)
+    else:
+        wet_road = layers.wet_road
     raster = view.raster
     if wet_road is None or raster.alpha is None or raster.expected_depth is None:
         return view
@@ -273,7 +309,7 @@ def _wet_tracks(effect: EffectInScene, view: RenderedView, camera: Camera) -> Re
 def _find_carriers(snow_effect: EffectInScene, camera: Camera) -> list[Carrier]:
     """Return the vehicles close to the camera that snow lies on."""
     carriers = list[Carrier]()
-    for number in sorted(snow_effect.view_data - {0}):
+    for number in sorted(snow_effect.view_data.owners - {0}):
         actor = snow_effect.scene.actors[number - 1]
         world_from_actor = actor.track.pose_at(camera.timestamp_ns)
         half_size_m = np.array(actor.size_m) / 2 + _BOX_MARGIN_M
@@ -294,6 +330,7 @@ def _find_carriers(snow_effect: EffectInScene, camera: Camera) -> list[Carrier]:
 
 def _extinction_at(camera: Camera, fog: Fog | None) -> float:
     """Return the fog's extinction at the camera, 1/metre."""
+    fog = local_fog(fog, camera)
     if fog is None:
         return 0.0
     eye_z_m = np.array([float(camera.centre[2])])
@@ -320,10 +357,7 @@ def build_snow_layers(
     Raises:
         SceneError: this scene cannot have snow, or not with cells this small.
     """
-    with naming_cell_field():
-        exposed_surface = exposed_surface_of(
-            scene, exposure_settings(recipe_snow.snow, scene), backend=backend
-        )
+    exposed_surface = _exposed_surface(scene, recipe_snow, backend)
     light = None if light is scene else light
 
     def build_layers() -> SnowLayers:
@@ -337,6 +371,38 @@ def build_snow_layers(
         )
 
     return memo_of(scene).get(("snow layers", recipe_snow, exposed_surface, light), build_layers)
+
+
+def build_changing_layers(
+    scene: Scene, recipe_snow: SnowPlan, light: Scene | None = None, *, backend: str = "auto"
+) -> ChangingLayers:
+    """Return the snow in the scene, for all depths up to the recipe's `placed_depth_m`.
+
+    The arguments and errors are those of `build_snow_layers`.
+    """
+    plan = laid_plan(recipe_snow)
+    exposed_surface = _exposed_surface(scene, plan, backend)
+    light = None if light is scene else light
+
+    def build_layers() -> ChangingLayers:
+        illumination = find_snow_light(light or scene, plan.snow)
+        return lay_changing_snow(exposed_surface, scene, plan, illumination)
+
+    return memo_of(scene).get(("changing snow", plan, exposed_surface, light), build_layers)
+
+
+def _exposed_surface(scene: Scene, recipe_snow: SnowPlan, backend: str) -> ExposedSurface:
+    """Return the cells of the scene that a recipe's snow lies on."""
+    with naming_cell_field():
+        return exposed_surface_of(
+            scene, exposure_settings(recipe_snow.snow, scene), backend=backend
+        )
+
+
+def _laid_layers(effect: EffectInScene) -> SnowLayers:
+    """Return the snow of a recipe, or the most of it that a changing recipe can have."""
+    layers = effect.prepared_data
+    return layers.laid if isinstance(layers, ChangingLayers) else layers
 
 
 def _bound_layers(scene: Scene, layers: SnowLayers) -> Bounds:

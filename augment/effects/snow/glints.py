@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from augment.memo import memo_of
@@ -45,6 +45,7 @@ class Crystals:
     places_m: Float32[Tensor, "G 3"]  # positions
     mirrors: Float32[Tensor, "G 3"]  # unit normals of the mirrors
     strength: float  # strength of their light, 0 to 1
+    disc_ids: Int64[Tensor, "G"] | None = None  # discs of the layer that they lie on
 
     def glints(
         self, sun: Float[Tensor, "3"], eye_m: Float[Tensor, "3"], *, backend: str = AUTO
@@ -150,7 +151,7 @@ def draw_crystals(
     thickness_m = gaussians.scales[disc_ids, 2:3]
     offsets = torch.stack([draws[3] - 0.5, draws[4] - 0.5, torch.zeros_like(mirror_z)], 1) * side_m
     places = gaussians.means[disc_ids] + GLINT_LIFT * thickness_m * normals[disc_ids] + offsets
-    return Crystals(places, mirrors, strength)
+    return Crystals(places, mirrors, strength, disc_ids)
 
 
 def _find_near_rows(

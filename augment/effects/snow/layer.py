@@ -93,7 +93,7 @@ def lay_snow(
         depths = depths if traces is None else traces.depths
         tints = None if traces is None else traces.tints
         moves = track_id is not None
-        part = _build_part_layer(
+        part, _ = build_part_layer(
             cells, gaussians, snow, light, profile, rng, depths, tints, moves=moves
         )
         return part, traces
@@ -110,12 +110,12 @@ def lay_snow(
         light.sun,
         light.wrap,
         thickness_m=snow.depth_m,
-        grain=_grain_of_snow(snow, scene, light, seed),
+        grain=grain_of_snow(snow, scene, light, seed),
         wet_road=traces and make_wet_road(exposed_surface.ground, traces.wetness),
     )
 
 
-def _grain_of_snow(snow: Snow, scene: Scene, light: SnowIllumination, seed: int) -> Grain:
+def grain_of_snow(snow: Snow, scene: Scene, light: SnowIllumination, seed: int) -> Grain:
     """Return the grain of the recipe's snow in the scene's light."""
     rng = rng_for(seed=seed, scene=scene.name, effect="snow.grain")
     lit = math.fsum(light.lit_rgb)
@@ -124,7 +124,7 @@ def _grain_of_snow(snow: Snow, scene: Scene, light: SnowIllumination, seed: int)
     return Grain(snow.grain, contrast, int(rng.integers(0, 2**63)))
 
 
-def _build_part_layer(
+def build_part_layer(
     cells: ExposedCells,
     gaussians: Gaussians,
     snow: Snow,
@@ -135,8 +135,12 @@ def _build_part_layer(
     tints: np.ndarray | None,
     *,
     moves: bool,
-) -> PartSnow:
-    """Lay snow of known depths and tints (None for clean snow) on one part of the scene."""
+) -> tuple[PartSnow, np.ndarray]:
+    """Lay snow of known depths and tints (None for clean snow) on one part of the scene.
+
+    Returns:
+        The layer, and the number of its Gaussians on each cell, int64 [C].
+    """
     per_pixel = snow.shading == "per_pixel"
     colors = LayerColors(
         wrap=float(light.wrap),
@@ -145,7 +149,7 @@ def _build_part_layer(
         is_baked=not per_pixel and not moves,
     )
     lights = np.array([light.sun, light.lit_rgb, light.shadow_rgb], np.float64)
-    snow_gaussians, normals, slopes = _make_splats(
+    snow_gaussians, normals, slopes, counts = _make_splats(
         cells,
         depths,
         profile.settings.depth_m,
@@ -160,13 +164,14 @@ def _build_part_layer(
         assert normals is not None
         sun_contrast = float(lights[1].mean() - lights[2].mean())
         crystals = draw_crystals(snow_gaussians, normals, sun_contrast, snow.sparkle, rng)
-    return PartSnow(
+    part = PartSnow(
         gaussians=snow_gaussians,
         visible_opacities=_hide_buried(cells, gaussians, depths.depths_m),
         sunlight_rgb=slopes,
         normals=normals if moves and not per_pixel else None,
         crystals=crystals,
     )
+    return part, counts
 
 
 def _make_splats(
@@ -179,8 +184,8 @@ def _make_splats(
     *,
     keep_normals: bool,
     keep_slopes: bool,
-) -> tuple[Gaussians, Tensor | None, Tensor | None]:
-    """Make the Gaussians of the snow, with their normals and slopes if asked for."""
+) -> tuple[Gaussians, Tensor | None, Tensor | None, np.ndarray]:
+    """Make the Gaussians of the snow, their normals and slopes if asked for, and their counts."""
     depths_m = depths.depths_m
     arrays = cell_arrays(cells)._replace(light=_soften_light(cells, depths_m, depth_m))
     tops = find_snow_tops(cells, depths_m)
@@ -206,7 +211,7 @@ def _make_splats(
     opacities = torch.full((num_splats,), OPACITY)
     classes = torch.full((num_splats,), int(SemanticClass.SNOW), dtype=torch.int16)
     gaussians = Gaussians(means, quats, scales, opacities, sh, semantic=classes)
-    return gaussians, normals if keep_normals else None, slopes if keep_slopes else None
+    return gaussians, normals if keep_normals else None, slopes if keep_slopes else None, counts
 
 
 def _tint_splats(splats: SplatArrays, tints: np.ndarray) -> None:

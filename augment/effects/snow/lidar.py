@@ -16,6 +16,7 @@ import numpy as np
 from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import MOVED
 from augment.effects.snow import layer_kernels
+from augment.effects.snow.changing_snow import changing_cells, find_depths_at, laid_plan, state_of
 from augment.effects.snow.depth import find_depths, profile_on_part
 from augment.effects.snow.plan import SnowPlan, exposure_settings, naming_cell_field
 from augment.effects.snow.slush import road_snow
@@ -115,6 +116,8 @@ def find_lidar_snow(scene: Scene, recipe_snow: SnowPlan) -> LidarSnow:
     """
     with naming_cell_field():
         exposed_surface = exposed_surface_of(scene, exposure_settings(recipe_snow.snow, scene))
+    if recipe_snow.snow.is_scaled:
+        return _scale_grids(exposed_surface, scene, recipe_snow)
     key = ("lidar snow", scene.name, recipe_snow)
     return memo_of(exposed_surface).get(
         key, lambda: _build_grids(exposed_surface, scene, recipe_snow)
@@ -222,6 +225,28 @@ def _build_grids(exposed_surface: ExposedSurface, scene: Scene, recipe_snow: Sno
     return LidarSnow(
         ground=layer(exposed_surface.ground, None),
         actors={track_id: grid for track_id, grid in actors.items() if grid is not None},
+        reflectance=ALBEDO_AT_905 * recipe_snow.snow.albedo,
+    )
+
+
+def _scale_grids(exposed_surface: ExposedSurface, scene: Scene, recipe_snow: SnowPlan) -> LidarSnow:
+    """Return the snow of a recipe at a moment; the numbers of cells are found once a scene."""
+    plan = laid_plan(recipe_snow)
+    parts = {None: exposed_surface.ground, **exposed_surface.actors}
+    numbers = memo_of(exposed_surface).get(
+        ("changing cells", scene.name, plan),
+        lambda: {name: changing_cells(cells, name, scene, plan) for name, cells in parts.items()},
+    )
+    state = state_of(recipe_snow.snow)
+    grids = dict[str | None, SnowGrid]()
+    for name, cells in parts.items():
+        grid_m = GRID_M if name is None else min(GRID_M, recipe_snow.snow.cell_m)
+        grid = make_snow_grid(cells, find_depths_at(numbers[name], state), grid_m=grid_m)
+        if grid is not None:
+            grids[name] = grid
+    return LidarSnow(
+        ground=grids.pop(None, None),
+        actors={name: grid for name, grid in grids.items() if name is not None},
         reflectance=ALBEDO_AT_905 * recipe_snow.snow.albedo,
     )
 

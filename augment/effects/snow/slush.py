@@ -27,18 +27,19 @@ from augment.exposure.wheel_tracks import WheelPath, find_wheel_paths
 from augment.memo import memo_of
 from augment.rng import rng_for
 from augment.scene.scene import Scene
+from recipes.snow import Snow
 
 # ---- Depth ---------------------------------------------------------------------------------------
 
 PRESSED_SHARE = 0.8  # share of the depth that passing wheels take
 SCRAPED_SHARE = 0.4  # share of the depth that a traffic of 1 takes on all of the road
 # Passes after which the road is bare, of thin snow, and further ones per metre of depth.
-_BARING_PASSES = 1.8
-_BARING_PASSES_PER_M = 16.0
-_BARE_SCATTER = 0.42  # change of that number per deviation of the noise
-_MAX_RIDGE_M = 0.035  # largest height of a ridge of slush
-_RIDGE_SHARE = 0.9  # height of a ridge in the depth of the snow
-_LUMPINESS = 0.45  # change of a ridge's height per deviation of the lumps' noise
+BARING_PASSES = 1.8
+BARING_PASSES_PER_M = 16.0
+BARE_SCATTER = 0.42  # change of that number per deviation of the noise
+MAX_RIDGE_M = 0.035  # largest height of a ridge of slush
+RIDGE_SHARE = 0.9  # height of a ridge in the depth of the snow
+LUMPINESS = 0.45  # change of a ridge's height per deviation of the lumps' noise
 # Octaves of the noises: (lattice step in metres, standard deviation).
 # Noises but those of lumps are stretched along the road, by these factors each way.
 _EDGE_STRETCH = 1.9
@@ -63,7 +64,7 @@ _VERGE_DIRT = 0.6  # dirt beside the road, falling off within _VERGE_WIDTH_M
 _VERGE_WIDTH_M = 0.45
 _MAX_VERGE_M = 1.5  # distance from the road beyond which no dirt lies
 _BLOTCHINESS = 0.38  # relative change of dirt per deviation of the blotches' noise
-_WET_PASSES = (1.2, 3.5)  # passes between which a bare road gets wet through
+WET_PASSES = (1.2, 3.5)  # passes between which a bare road gets wet through
 _LEAST_TRAFFIC = 0.35  # traffic whose splashes dirty the snow, where the recipe has less
 
 
@@ -79,7 +80,7 @@ class RoadSnow:
     """float32 [C], wetness of the bare road in the tracks, 0 to 1; 0 under snow."""
 
 
-class _Noises(NamedTuple):
+class RoadNoises(NamedTuple):
     """Noises of one recipe."""
 
     edges: Octaves
@@ -87,12 +88,12 @@ class _Noises(NamedTuple):
     blotches: Octaves
 
 
-class _Traces(NamedTuple):
+class Traces(NamedTuple):
     """Traces of a recipe's traffic."""
 
     wear: RoadWear  # of the cars that press the snow
     splashing_wear: RoadWear  # of the cars that splash dirt
-    heading_rad: float  # direction of the ego's path, 0 is world +x
+    noises: RoadNoises
 
 
 def road_snow(
@@ -107,35 +108,49 @@ def road_snow(
         recipe_snow: snow of a recipe.
     """
     snow = recipe_snow.snow
+    traces = find_traces(cells, scene, recipe_snow)
+    if traces is None:
+        return None
+    if snow.traffic > 0:
+        depths, wetness = driven_depths(depths, cells, traces.wear, snow.traffic, traces.noises)
+    else:
+        wetness = np.zeros(len(cells), np.float32)
+    return RoadSnow(depths, road_tints(depths, cells, traces, snow), wetness)
+
+
+def find_traces(cells: ExposedCells, scene: Scene, recipe_snow: SnowPlan) -> Traces | None:
+    """Return the traces of a recipe's traffic and dirt on the ground; None without these.
+
+    Args:
+        cells: cells of the ground.
+        scene: the scene.
+        recipe_snow: snow of a recipe.
+    """
+    snow = recipe_snow.snow
     if not snow.has_traces or not len(cells):
         return None
     seed = recipe_snow.seed
 
-    def find_wear() -> _Traces:
-        """Return the traces of the recipe's traffic."""
+    def find_wear() -> tuple[RoadWear, RoadWear, float]:
+        """Return the traces of pressing and of splashing cars, and the direction of the path."""
         paths = find_wheel_paths(scene, has_path_without_drive=snow.tracks == "always")
         splashing = max(snow.traffic, _LEAST_TRAFFIC)
         wears = {
             traffic: find_road_wear(cells, paths, traffic=traffic, seed=seed, scene_name=scene.name)
             for traffic in {snow.traffic, splashing}
         }
-        return _Traces(wears[snow.traffic], wears[splashing], _heading_rad(paths))
+        return wears[snow.traffic], wears[splashing], _heading_rad(paths)
 
     key = ("road wear", scene.name, snow.traffic, snow.tracks == "always", seed)
     wear, splashing_wear, heading_rad = memo_of(cells).get(key, find_wear)
     across_rad = heading_rad + math.pi / 2
     rng = rng_for(seed=seed, scene=scene.name, effect="snow.slush")
-    noises = _Noises(
+    noises = RoadNoises(
         draw_octaves(_EDGE_OCTAVES, rng, direction_rad=across_rad, stretch=_EDGE_STRETCH),
         draw_octaves(_LUMP_OCTAVES, rng),
         draw_octaves(_BLOTCH_OCTAVES, rng, direction_rad=across_rad, stretch=_BLOTCH_STRETCH),
     )
-    if snow.traffic > 0:
-        depths, wetness = driven_depths(depths, cells, wear, snow.traffic, noises)
-    else:
-        wetness = np.zeros(len(cells), np.float32)
-    tints = _tints(depths, cells, wear, splashing_wear, snow.dirt, snow.traffic, noises)
-    return RoadSnow(depths, tints, wetness)
+    return Traces(wear, splashing_wear, noises)
 
 
 def _heading_rad(paths: Sequence[WheelPath]) -> float:
@@ -147,7 +162,7 @@ def _heading_rad(paths: Sequence[WheelPath]) -> float:
 
 
 def driven_depths(
-    depths: CellDepths, cells: ExposedCells, wear: RoadWear, traffic: float, noises: _Noises
+    depths: CellDepths, cells: ExposedCells, wear: RoadWear, traffic: float, noises: RoadNoises
 ) -> tuple[CellDepths, np.ndarray]:
     """Return the depths of snow that cars have driven over, and the wetness of bare road [C]."""
     fresh_m = depths.depths_m
@@ -163,27 +178,27 @@ def driven_depths(
     lumps = sum_octaves(noises.lumps, x_m, y_m, sizes_m)
     pressed = 1 - np.exp(-passes / SATURATION)
     depth = fresh * (1 - SCRAPED_SHARE * traffic) * (1 - PRESSED_SHARE * pressed)
-    ridge_m = np.minimum(_RIDGE_SHARE * fresh, _MAX_RIDGE_M)
-    depth += ridge_m * wear.ridge[rows] * np.maximum(1 + _LUMPINESS * lumps, 0)
-    baring = (_BARING_PASSES + _BARING_PASSES_PER_M * fresh) * np.exp(_BARE_SCATTER * edges)
+    ridge_m = np.minimum(RIDGE_SHARE * fresh, MAX_RIDGE_M)
+    depth += ridge_m * wear.ridge[rows] * np.maximum(1 + LUMPINESS * lumps, 0)
+    baring = (BARING_PASSES + BARING_PASSES_PER_M * fresh) * np.exp(BARE_SCATTER * edges)
     is_bare = passes > baring
     depth = np.where(is_bare, 0.0, np.maximum(depth, np.minimum(fresh, MIN_DEPTH_M)))
     new_m[rows] = depth
-    first, full = _WET_PASSES
+    first, full = WET_PASSES
     wetness[rows] = np.where(is_bare, np.clip((passes - first) / (full - first), 0, 1), 0)
     return depths._replace(depths_m=new_m), wetness
 
 
-def _tints(
-    depths: CellDepths,
-    cells: ExposedCells,
-    wear: RoadWear,
-    splashing_wear: RoadWear,
-    dirt: float,
-    traffic: float,
-    noises: _Noises,
-) -> np.ndarray:
-    """Return the factors of the colour of clean snow, float32 [C, 3]."""
+def road_tints(depths: CellDepths, cells: ExposedCells, traces: Traces, snow: Snow) -> np.ndarray:
+    """Return the factors of the colour of clean snow, float32 [C, 3].
+
+    Args:
+        depths: the snow.
+        cells: cells of the ground.
+        traces: traces of traffic.
+        snow: the recipe's snow.
+    """
+    wear, splashing_wear, noises = traces
     tints = np.ones((len(cells), 3))
     covered = depths.depths_m > 0
     rows = np.flatnonzero(covered & (wear.kerb_m > -_MAX_VERGE_M))
@@ -195,9 +210,9 @@ def _tints(
     pressed = 1 - np.exp(-wear.passes[rows].astype(np.float64) / SATURATION)
     ridge = wear.ridge[rows].astype(np.float64)
     tint = 1 - pressed[:, None] * (1 - np.array(_PACKED_TINT))
-    slush = np.clip(ridge, 0, 1) * min(1.0, 2 * traffic)
+    slush = np.clip(ridge, 0, 1) * min(1.0, 2 * snow.traffic)
     tint *= 1 - slush[:, None] * (1 - np.array(_SLUSH_TINT))
-    if dirt > 0:
+    if snow.dirt > 0:
         blotches = sum_octaves(noises.blotches, x_m, y_m, sizes_m)
         splash = np.clip(splashing_wear.splash[rows].astype(np.float64), 0, 1)
         at_kerb = np.exp(-((np.maximum(kerb_m, 0) / _KERB_WIDTH_M) ** 2))
@@ -205,7 +220,7 @@ def _tints(
         on_road += _RIDGE_DIRT * np.clip(splashing_wear.ridge[rows], 0, 1)
         beside = _VERGE_DIRT * np.exp(np.minimum(kerb_m, 0) / _VERGE_WIDTH_M)
         amount = np.where(is_road, on_road, beside) * np.exp(_BLOTCHINESS * blotches)
-        amount = np.clip(dirt * amount, 0, 1)
+        amount = np.clip(snow.dirt * amount, 0, 1)
         tint *= 1 - amount[:, None] * (1 - np.array(_DIRTIEST_TINT))
     tints[rows] = tint
     return tints.astype(np.float32)

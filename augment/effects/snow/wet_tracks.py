@@ -40,7 +40,8 @@ from augment.exposure.cells import ExposedCells
 from augment.light.scene_light import SceneLight, find_scene_light
 from augment.memo import memo_of
 from augment.render.buffers import CPU, choose_kernels
-from augment.render.fog import Fog, airlight_gain, optical_depth
+from augment.render.fog import Fog, airlight_gain
+from augment.render.fog_image import point_optical_depth
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
@@ -171,7 +172,9 @@ def wet_tracks(
         backend: name of the backend.
     """
     sheen = _sheen_of(scene)
-    if choose_kernels(backend, rgb, depth, share) != CPU or not rgb.is_contiguous():
+    has_banks = fog is not None and fog.banks is not None
+    uses_kernel = choose_kernels(backend, rgb, depth, share) == CPU and rgb.is_contiguous()
+    if has_banks or not uses_kernel:
         return wet_by_definition(rgb, depth, share, camera, wet_road, sheen, fog)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     pose = np.ascontiguousarray(camera.world_from_camera[:3].double().numpy())
@@ -220,9 +223,7 @@ def wet_by_definition(
     clear = flat[rows]
     transmittance = torch.ones_like(wetness)
     if fog is not None and fog.extinction_per_m > 0:
-        eye_z_m = float(camera.centre[2])
-        tau = optical_depth(fog, offsets_m.norm(dim=1), eye_z_m, eye_z_m + offsets_m[:, 2])
-        transmittance = torch.exp(-tau)
+        transmittance = torch.exp(-point_optical_depth(fog, camera, offsets_m))
         airlight = clear.new_tensor(fog.airlight_rgb).expand_as(clear)
         if fog.elevation_gain > 0:
             airlight = airlight + airlight_gain(fog, directions[:, 2])

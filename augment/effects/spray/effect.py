@@ -24,7 +24,7 @@ from augment.effects.spray.picture import blend_puffs, windows_of
 from augment.effects.spray.puffs import (
     MIN_SPEED_MPS,
     Puffs,
-    film_depth_m,
+    lifted_water_m,
     spray_puffs,
     spraying_actors,
 )
@@ -68,14 +68,14 @@ class SprayEffect(Effect):
         return False
 
     def kernel_key(self, section: Rain) -> Hashable:
-        return (section.has_effect and section.spray) or None
+        return (_lifts_water(section) and section.spray) or None
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:
         rain = self.section_of(recipe)
         why = ""
-        if rain is None or not rain.has_effect:
+        if rain is None or not _lifts_water(rain):
             why = "the recipe has no rain" if rain is None else "weather.rain.rate_mm_h is 0"
         elif not rain.spray:
             why = "weather.rain.spray is false"
@@ -86,8 +86,7 @@ class SprayEffect(Effect):
         if rain is None or why:
             return EffectPlan(None, skipped_steps((SPRAY,), why, PICTURE))
         wind_mps = wind_velocity_mps(rain.wind_mps, rain.wind_from_deg)
-        water_m = film_depth_m(rain.rate_mm_h) * rain.ground_wetness
-        spray = SprayPlan(water_m, wind_mps, recipe.seed)
+        spray = SprayPlan(lifted_water_m(rain), wind_mps, recipe.seed)
         why = (
             f"{len(spraying_actors(scene))} actors drive faster than {3.6 * MIN_SPEED_MPS:.0f} "
             f"km/h on {1000 * spray.water_m:.2g} mm of water"
@@ -127,3 +126,8 @@ class SprayEffect(Effect):
         key = f"lidar.spray at {frame_ns} ns"
         rng = rng_for(seed=effect.settings.seed, scene=effect.scene.name, effect=key)
         spray_echoes(echoes, effect.settings.puffs(effect.scene, frame_ns), rng)
+
+
+def _lifts_water(rain: Rain) -> bool:
+    """Return True if rain falls, or has left a film on the road."""
+    return rain.has_effect or (rain.road is not None and rain.road.film_mm > 0)

@@ -23,7 +23,8 @@ from augment.effects.spray import puff_kernels
 from augment.effects.spray.puffs import CUT_DISTANCE2, Puffs
 from augment.render.buffers import CPU, choose_kernels
 from augment.render.composite import ROWS_PER_CHUNK
-from augment.render.fog import Fog, optical_depth_numpy
+from augment.render.fog import Fog
+from augment.render.fog_image import point_optical_depth_numpy
 from augment.render.threads import kernel_threads
 from augment.scene.cameras import Camera
 
@@ -145,11 +146,7 @@ def _numbers(puffs: Puffs, camera: Camera, fog: Fog | None) -> np.ndarray:
     whitened = (puffs.whitenings @ offsets[:, :, None])[..., 0]
     fog_transmittance = np.ones(len(camera_whitenings))
     if fog is not None:
-        distances = np.linalg.norm(offsets, axis=1)
-        heights = puffs.centres_m[:, 2]
-        fog_transmittance = np.exp(
-            -optical_depth_numpy(fog, distances, np.full(len(camera_whitenings), eye[2]), heights)
-        )
+        fog_transmittance = np.exp(-point_optical_depth_numpy(fog, camera, puffs.centres_m))
     strength = math.sqrt(2 * math.pi) * puffs.extinction_per_m
     numbers = [
         camera_whitenings.reshape(-1, 9),

@@ -25,6 +25,8 @@ import numpy as np
 from augment.memo import memo_of
 from augment.rng import STEP_X, mix, rng_for
 from augment.scene.scene import Actor, Scene
+from recipes.rain import Rain
+from recipes.road_water import TRACK_FILM_SHARE
 
 # Speed from which a vehicle lifts spray.
 MIN_SPEED_MPS = 40 / 3.6
@@ -44,6 +46,8 @@ _CAR_SIZE_M = (4.5, 1.8)
 _FLOW_M = 5.0
 # Slope of the road across.
 _CROSSFALL = 0.02
+# Film that tyres do not lift, mm.
+_LEAST_FILM_MM = 0.05
 # Time between two puffs of a vehicle.
 INTERVAL_S = 0.1
 # Life of a puff.
@@ -86,6 +90,19 @@ def film_depth_m(rate_mm_h: float) -> float:
     It follows the empirical law of road drainage, 0.046 mm sqrt(length rate) / slope^0.2.
     """
     return 0.046e-3 * math.sqrt(_FLOW_M * rate_mm_h) / _CROSSFALL**0.2
+
+
+def lifted_water_m(rain: Rain) -> float:
+    """Return the depth of the water that tyres meet on the road.
+
+    While it rains it is the film that runs off. After rain it is what wheels leave in their tracks,
+    less a film that tyres do not lift (NORTRIP).
+    """
+    running_m = film_depth_m(rain.rate_mm_h) * rain.ground_wetness
+    if rain.road is None:
+        return running_m
+    track_m = 1e-3 * TRACK_FILM_SHARE * max(rain.road.film_mm - _LEAST_FILM_MM, 0.0)
+    return max(running_m, track_m * rain.film_wetness)
 
 
 def spraying_actors(scene: Scene) -> tuple[int, ...]:

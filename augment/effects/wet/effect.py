@@ -24,6 +24,7 @@ from augment.effects.effect import (
 )
 from augment.effects.lidar.beam import Echoes
 from augment.effects.wet.darkening import darken_gaussians, wet_ratio, white_level
+from augment.effects.wet.drying import RoadFilm, drying_map, road_film
 from augment.effects.wet.ground_map import (
     EXPOSURE_SETTINGS,
     WetGround,
@@ -32,7 +33,7 @@ from augment.effects.wet.ground_map import (
     wet_ground,
     wet_splats,
 )
-from augment.effects.wet.lidar import dim_wet_echoes
+from augment.effects.wet.lidar import dim_echoes_by_film, dim_wet_echoes
 from augment.effects.wet.mirroring_film import mirroring_film
 from augment.effects.wet.reflection import (
     Film,
@@ -43,13 +44,15 @@ from augment.effects.wet.reflection import (
     mirror_camera,
     plane_in_view,
     shade_wet,
+    wet_by_film,
 )
 from augment.effects.wet.ripples import make_rings
 from augment.exposure.exposed_surface import share_exposed_surface
 from augment.light.scene_light import find_scene_light
 from augment.memo import memo_of
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
-from augment.render.fog import optical_depth
+from augment.render.fog import airlight_gain
+from augment.render.fog_image import image_optical_depth
 from augment.scene.cameras import Camera
 from augment.scene.ground import check_metric_and_level
 from augment.scene.scene import Gaussians, Scene
@@ -86,6 +89,13 @@ class WetGroundPlan:
     puddle_share: float  # share of the ground under puddles, 0 to 1
     rate_mm_h: float  # rate of the rain
     mirror_px: float  # width of a pixel of the mirrored view, in pixels of the picture
+    film: RoadFilm | None  # water on the road at this moment; None if it has no history
+
+    def puddle_threshold(self, ground: WetGround) -> float:
+        """Return the value of PUDDLE_ORDER above which water stands."""
+        if self.film is None:
+            return ground.find_puddle_threshold(self.puddle_share)
+        return ground.interpolate_puddle_threshold(self.puddle_share)
 
 
 class WetEffect(Effect):
@@ -100,14 +110,14 @@ class WetEffect(Effect):
 
     def reads_splats(self, recipe: Recipe) -> bool:
         rain = self.section_of(recipe)
-        return rain is not None and rain.ground_wetness > 0
+        return rain is not None and rain.wets_ground
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]
     ) -> EffectPlan:
         rain = self.section_of(recipe)
         reason = ""
-        if rain is None or rain.ground_wetness == 0:
+        if rain is None or not rain.wets_ground:
             reason = "the recipe has no rain" if rain is None else "the rain leaves the ground dry"
         elif rain.wetness is None and not (scene.has_metric_scale and scene.has_known_gravity):
             reason = "wetness is null, and the scene's metres or gravity are not known"
@@ -120,8 +130,10 @@ class WetEffect(Effect):
         wet_description = f"wetness {rain.ground_wetness:.2g} of what is open to the sky"
         mirror_px = recipe.render.speed.mirror_px
         mirror_description = f"at 1 / {mirror_px:g} of the resolution, without the ground"
+        if rain.road is not None:
+            wet_description = f"{rain.road.film_mm:.2g} mm of water on the road"
         steps = (
-            Step(DARKENING_PASS, True, wet_description, SCENE),
+            Step(DARKENING_PASS, True, wet_description, SCENE if rain.road is None else PICTURE),
             Step(MIRROR_PASS, True, mirror_description, PICTURE),
             Step(
                 REFLECTION_PASS,
@@ -130,8 +142,15 @@ class WetEffect(Effect):
                 PICTURE,
             ),
         )
-        numbers = rain.ground_wetness, rain.puddle_share, rain.rate_mm_h, mirror_px
-        data = WetGroundPlan(recipe.seed, *numbers)
+        film = road_film(rain)
+        data = WetGroundPlan(
+            seed=recipe.seed,
+            wetness=rain.ground_wetness if film is None else film.puddle_wetness,
+            puddle_share=rain.puddle_share,
+            rate_mm_h=rain.rate_mm_h,
+            mirror_px=mirror_px,
+            film=film,
+        )
         return EffectPlan(data, steps, frozenset({EXPECTED_DEPTH}))
 
     def prepare(self, effect: EffectInScene) -> WetGround:
@@ -140,7 +159,7 @@ class WetEffect(Effect):
     def precompute(self, context: JobContext) -> None:
         """Find where rain can fall, once for the job."""
         rains = (self.section_of(recipe) for recipe in context.recipes)
-        if any(rain and rain.ground_wetness > 0 for rain in rains):
+        if any(rain and rain.wets_ground for rain in rains):
             with refusing_cell_size():
                 share_exposed_surface(
                     context.scene,
@@ -166,6 +185,8 @@ class WetEffect(Effect):
     def edit_scene(
         self, effect: EffectInScene, layers: LayerRenderer, camera: Camera
     ) -> LayerRenderer:
+        if effect.settings.film is not None:  # the picture is darkened, place by place
+            return layers
         splats = wet_splats(effect.scene, effect.prepared_data)
         with timed(DARKENING_PASS):
             parts = [
@@ -196,7 +217,13 @@ class WetEffect(Effect):
                 skip_reasons={**view.skip_reasons, MIRROR_PASS: reason, REFLECTION_PASS: reason},
             )
         rgb = view.rgb
-        if view.layers.photo is not None:
+        if effect.settings.film is not None:
+            with timed(DARKENING_PASS):
+                rgb, share = _wet_by_film(effect, view, camera, share)
+            if not bool(share.any()):
+                skip_reasons = dict.fromkeys((MIRROR_PASS, REFLECTION_PASS), "no film mirrors")
+                return replace(view, rgb=rgb, skip_reasons={**view.skip_reasons, **skip_reasons})
+        elif view.layers.photo is not None:
             with timed(DARKENING_PASS):
                 rgb = _darken_photo(effect, view, camera, share)
         with timed(MIRROR_PASS):
@@ -204,9 +231,7 @@ class WetEffect(Effect):
         with timed(REFLECTION_PASS):
             data = effect.settings
             rings = make_rings(data.rate_mm_h, data.seed, camera.timestamp_ns)
-            film = Film(
-                data.wetness, effect.prepared_data.find_puddle_threshold(data.puddle_share), rings
-            )
+            film = Film(data.wetness, data.puddle_threshold(effect.prepared_data), rings)
             ground_rows = slice(*rows)
             unmirrored_rgb = rgb[ground_rows].clone() if view.layers.needs_lamp_inputs else None
             rgb = shade_wet(
@@ -235,9 +260,13 @@ class WetEffect(Effect):
     def attenuate_beams(
         self, effect: EffectInScene, echoes: Echoes, rng: np.random.Generator
     ) -> None:
-        dim_wet_echoes(
-            echoes, effect.prepared_data, effect.settings.wetness, effect.settings.puddle_share
-        )
+        data: WetGroundPlan = effect.settings
+        ground: WetGround = effect.prepared_data
+        if data.film is None:
+            dim_wet_echoes(echoes, ground, data.wetness, data.puddle_share)
+        else:
+            order = drying_map(ground, data.seed)
+            dim_echoes_by_film(echoes, ground, order, data.film, data.puddle_threshold(ground))
 
 
 def _find_plane(wet_effect: EffectInScene, camera: Camera) -> Plane | None:
@@ -299,25 +328,65 @@ def _darken_photo(
 
     Only the part of a pixel's colour that comes through the fog is darkened.
     """
+    clear_rgb, transmittance = _without_fog(view, camera)
+    white = white_level(find_scene_light(wet_effect.lit_scene))
+    ratio = wet_ratio(clear_rgb.clamp_min(0), white, wet_effect.settings.wetness * share)
+    return view.rgb + transmittance[..., None] * clear_rgb * (ratio - 1)
+
+
+def _wet_by_film(
+    wet_effect: EffectInScene, view: RenderedView, camera: Camera, share: Float[Tensor, "H W"]
+) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+    """Return the picture darkened by the film on the road, and the share that mirrors."""
+    data: WetGroundPlan = wet_effect.settings
+    ground: WetGround = wet_effect.prepared_data
+    assert data.film is not None and view.raster.expected_depth is not None
+    clear_rgb = view.rgb
+    transmittance = None
+    if view.layers.fog is not None:
+        clear_rgb, transmittance = _without_fog(view, camera)
+    is_shared = view.layers.photo is not None or transmittance is not None
+    wet_rgb, mirror_share = wet_by_film(
+        clear_rgb.clone() if is_shared else clear_rgb,
+        camera,
+        view.raster.expected_depth,
+        share,
+        ground,
+        drying_map(ground, data.seed),
+        data.film,
+        data.puddle_threshold(ground),
+        white_level(find_scene_light(wet_effect.lit_scene)),
+        backend=wet_effect.backend,
+    )
+    if transmittance is not None:
+        wet_rgb = view.rgb + transmittance[..., None] * (wet_rgb - clear_rgb)
+    return wet_rgb, mirror_share
+
+
+def _without_fog(
+    view: RenderedView, camera: Camera
+) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+    """Return the picture's surfaces without the fog before them, and the fog's transmittance."""
     photo = view.layers.photo
     fog = view.layers.fog
     rgb = view.rgb
-    assert photo is not None and view.raster.expected_depth is not None
-    clear_rgb = rgb
-    transmittance = torch.ones_like(share)
-    if fog is not None:
-        points = camera.ray_directions(device=rgb.device) * view.raster.expected_depth[..., None]
-        eye_z_m = float(camera.centre[2])
-        transmittance = torch.exp(
-            -optical_depth(fog, points.norm(dim=-1), eye_z_m, eye_z_m + points[..., 2])
-        )
+    depth = view.raster.expected_depth
+    assert depth is not None
+    if fog is None:
+        return rgb, torch.ones_like(depth)
+    transmittance = torch.exp(-image_optical_depth(fog, camera, depth))
+    if photo is not None:
         airlight = photo.airlight(fog)
-        clear_rgb = (rgb - (1 - transmittance)[..., None] * airlight) / transmittance.clamp_min(
-            MIN_PHOTO_TRANSMITTANCE
-        )[..., None]
-    white = white_level(find_scene_light(wet_effect.lit_scene))
-    ratio = wet_ratio(clear_rgb.clamp_min(0), white, wet_effect.settings.wetness * share)
-    return rgb + transmittance[..., None] * clear_rgb * (ratio - 1)
+    else:
+        airlight = rgb.new_tensor(fog.airlight_rgb)
+        if fog.elevation_gain > 0:
+            directions = camera.ray_directions(device=rgb.device)
+            slope = directions[..., 2] / directions.norm(dim=-1)
+            airlight = airlight + airlight_gain(fog, slope)
+    clear_rgb = (rgb - (1 - transmittance)[..., None] * airlight) / transmittance.clamp_min(
+        MIN_PHOTO_TRANSMITTANCE
+    )[..., None]
+    return clear_rgb, transmittance
 
 
 def _darken_part(gaussians: Gaussians, splats: WetSplats, wet_effect: EffectInScene) -> Gaussians:

@@ -249,13 +249,13 @@ def _find_cells(px, py, view, texels, spare):
 
 
 @kernel_function()
-def _interpolate_channels(cells, columns, channel, count, texels, spare):
-    """Interpolate `count` channels from `channel` on between the map's cells.
+def _interpolate_channels(cells, num_channels, columns, channel, count, texels, spare):
+    """Interpolate `count` of `num_channels` channels from `channel` on between the map's cells.
 
     The results go to spare[RESULTS_START + k NUM_LANES + lane].
     """
-    step = Index(NUM_CHANNELS)
-    down = Index(columns * NUM_CHANNELS)
+    step = Index(num_channels)
+    down = Index(columns * num_channels)
     for lane in range(Index(NUM_LANES)):
         start = (
             Index(texels[lane + Index(NUM_LANES)]) * down
@@ -312,7 +312,7 @@ def _find_ground_in_row(row, width, view, cells, depth, visible_share, share):
         is_ground = v8.mask_and(is_ground, _find_cells(px, py, view, texels, spare))
         if not _any(is_ground):
             continue
-        _interpolate_channels(cells, view.columns, HEIGHT, 2, texels, spare)
+        _interpolate_channels(cells, NUM_CHANNELS, view.columns, HEIGHT, 2, texels, spare)
         height_gap = v8.absolute(
             pz + v8.broadcast(view.eye[3]) - v8.load(spare, Index(RESULTS_START))
         )
@@ -656,7 +656,7 @@ def _shade_row(
         py = z * _rotate(axes[1], a, b, ones)
         pz = z * _rotate(axes[2], a, b, ones)
         _find_cells(px, py, view, texels, spare)
-        _interpolate_channels(cells, view.columns, SLOPE_X, 4, texels, spare)
+        _interpolate_channels(cells, NUM_CHANNELS, view.columns, SLOPE_X, 4, texels, spare)
         slope_x = v8.load(spare, Index(RESULTS_START))
         slope_y = v8.load(spare, Index(RESULTS_START + NUM_LANES))
         puddle_order = v8.load(spare, Index(RESULTS_START + 2 * NUM_LANES))
@@ -743,6 +743,190 @@ def shade_wet(
             noise,
             rgb,
         )
+
+
+# ---- A road that gets wet and dries --------------------------------------------------------------
+
+# Channels of the map that says how a road dries, see drying.DryingMap.
+DRYING_RANK, PUDDLE_RANK, TRACK, NUM_DRYING_CHANNELS = range(4)
+# Share of the largest film at which the first places are dry; assumed.
+FIRST_DRY_SHARE = 0.65
+# Film from which on ground is as dark as it gets, mm; assumed.
+DARK_FILM_MM = 0.06
+# Film below which stones of asphalt break the mirror image, mm; assumed.
+MATT_FILM_MM = 0.04
+# Change of the drying rank per deviation of the coarse and of the fine noise.
+COARSE_RANK = 0.05
+FINE_RANK = 0.015
+# Side of the table of stains, texels; a power of 2.
+STAIN_SIDE = 1024
+# Side of its texels, metres.
+STAIN_TEXEL_M = 0.001
+# Number of levels of the table; each halves its side.
+NUM_STAIN_LEVELS = 6
+
+
+class RoadWaterNumbers(NamedTuple):
+    """Water on a road at one moment, see drying.RoadFilm."""
+
+    film_share: Any  # film over the largest since the road was dry
+    peak_mm: Any  # that largest film, mm
+    full_mm: Any  # film of a full road, mm
+    film_wetness: Any  # wetness under a full film
+    puddle_wetness: Any  # wetness under puddles
+    track_loss: Any  # share of the film that wheels have pushed out of their tracks
+    spots: Any  # share of the ground that drops have stained
+    puddle_threshold: Any  # value of PUDDLE_RANK above which water stands
+    # Light that a white surface reflects, and Angstrom's (1 - R) (1 - p) and p.
+    white: Any
+    wet_gain: Any
+    wet_loss: Any
+
+
+@kernel_function()
+def _stain_lanes(stains, px, py, texel_size, mean, eye_xy, texels, spare):
+    """Return the share of stained ground about points; `mean` where texels are larger than all."""
+    v8.store(spare, Index(0), px)
+    v8.store(spare, Index(NUM_LANES), py)
+    level_of = log2(texel_size * _splat(1 / STAIN_TEXEL_M))
+    is_small = v8.greater(_splat(NUM_STAIN_LEVELS - 1), level_of)
+    v8.store(spare, Index(RESULTS_START), level_of)
+    for lane in range(_lanes_if(_any(is_small))):
+        level = max(spare[Index(RESULTS_START) + lane], np.float32(0))
+        value = np.float32(mean)
+        if level < np.float32(NUM_STAIN_LEVELS - 1):
+            k = np.int64(level)
+            x = eye_xy[0] + spare[lane]
+            y = eye_xy[1] + spare[lane + Index(NUM_LANES)]
+            below = _stain_at(stains, k, x, y)
+            above = np.float32(mean)
+            if k + 1 < NUM_STAIN_LEVELS - 1:
+                above = _stain_at(stains, k + 1, x, y)
+            value = below + (above - below) * (level - np.float32(k))
+        spare[Index(RESULTS_START) + lane] = value
+    return v8.select(is_small, v8.load(spare, Index(RESULTS_START)), _splat(mean))
+
+
+@kernel_function()
+def _stain_at(stains, level, x, y):
+    """Return one level of the table between its texels, at world x and y."""
+    side = STAIN_SIDE >> level
+    start = (STAIN_SIDE * STAIN_SIDE - side * side) * 4 // 3  # texels of all finer levels
+    scale = 1.0 / (STAIN_TEXEL_M * (1 << level))
+    u = x * scale - 0.5
+    v = y * scale - 0.5
+    i = math.floor(u)
+    j = math.floor(v)
+    u = np.float32(u - i)
+    v = np.float32(v - j)
+    left = np.int64(i) & (side - 1)
+    right = (left + 1) & (side - 1)
+    low = start + (np.int64(j) & (side - 1)) * side
+    high = start + ((np.int64(j) + 1) & (side - 1)) * side
+    a = stains[low + left] + (stains[low + right] - stains[low + left]) * u
+    b = stains[high + left] + (stains[high + right] - stains[high + left]) * u
+    return a + (b - a) * v
+
+
+@kernel_function()
+def _wet_light(encoded, wetness, water):
+    """Return display-encoded values of ground of which a share is wet."""
+    linear = _to_linear(encoded)
+    albedo = _clamp(linear * v8.broadcast(np.float32(1) / water.white), 1e-4, 0.95)
+    ones = _splat(1)
+    ratio = v8.broadcast(water.wet_gain) / (ones - v8.broadcast(water.wet_loss) * albedo)
+    return _to_display(linear * v8.fmuladd(wetness, ratio - ones, ones))
+
+
+@kernel_function()
+def _wet_row(line, width, view, drying, depth, share, water, noise, stains, rgb):
+    """Darken one row of the image, and find how much of each pixel mirrors."""
+    view = _read_view(view)
+    lens = view.lens
+    axes = view.axes
+    eye = view.eye
+    texels = np.empty(2 * NUM_LANES, np.int32)
+    spare = np.empty(SPARE_SIZE, np.float32)
+    ones = _splat(1)
+    zero = _splat(0)
+    b = v8.broadcast((np.float32(line) + np.float32(0.5) - lens[3]) * lens[1])
+    has_stains = np.float32(0) < water.spots and water.spots < np.float32(1)
+    full_mm = v8.broadcast(np.float32(1) / (water.full_mm - np.float32(MATT_FILM_MM)))
+    film_mirror = water.film_wetness / water.puddle_wetness
+    for j in range(0, width, NUM_LANES):
+        first = min(j, width - NUM_LANES)
+        pixel = Index(line * width + first)
+        ground_share = v8.load(share, pixel)
+        is_ground = v8.mask_and(
+            v8.greater(ground_share, zero), v8.at_least(v8.lane_numbers(), _splat(j - first))
+        )
+        if not _any(is_ground):
+            continue
+        a = _ray_x(first, lens)
+        z = v8.select(is_ground, v8.load(depth, pixel), ones)
+        px = z * _rotate(axes[0], a, b, ones)
+        py = z * _rotate(axes[1], a, b, ones)
+        pz = z * _rotate(axes[2], a, b, ones)
+        _find_cells(px, py, view, texels, spare)
+        _interpolate_channels(
+            drying, NUM_DRYING_CHANNELS, view.columns, DRYING_RANK, 3, texels, spare
+        )
+        rank = v8.load(spare, Index(RESULTS_START))
+        puddle_rank = v8.load(spare, Index(RESULTS_START + NUM_LANES))
+        track = v8.load(spare, Index(RESULTS_START + 2 * NUM_LANES))
+        distance = v8.sqrt(_dot(px, py, pz, px, py, pz))
+        sine = v8.maximum(v8.negate(pz) / distance, _splat(MIN_FOOTPRINT_SINE))
+        across = distance * v8.broadcast(lens[1])
+        footprint = across / sine
+        coarse = _splat(COARSE_RANK) * _clamp(
+            _linear(footprint, -1 / COARSE_TEXEL_M, 2.0), 0.0, 1.0
+        )
+        rank = rank + _mottle(
+            noise, px, py, coarse, 1 / COARSE_TEXEL_M, eye[4], eye[5], texels, spare
+        )
+        fine = _splat(FINE_RANK) * _clamp(_linear(footprint, -1 / FINE_TEXEL_M, 2.0), 0.0, 1.0)
+        rank = rank + _mottle(noise, px, py, fine, 1 / FINE_TEXEL_M, eye[6], eye[7], texels, spare)
+        # Film at which the place is dry, over the largest; then the film that lies there, mm.
+        dry_share = _splat(FIRST_DRY_SHARE) * (ones - _clamp(rank, 0.0, 1.0))
+        film = v8.maximum(v8.broadcast(water.film_share) - dry_share, zero) / (ones - dry_share)
+        film = film * v8.broadcast(water.peak_mm)
+        film = film * (ones - v8.broadcast(water.track_loss) * track)
+        dark = _smoothstep(film * _splat(1 / DARK_FILM_MM))
+        mirror = _smoothstep((film - _splat(MATT_FILM_MM)) * full_mm)
+        if has_stains:
+            size = across / v8.sqrt(sine)
+            spots = _stain_lanes(stains, px, py, size, water.spots, view.eye_xy, texels, spare)
+            dark = v8.maximum(dark, spots)
+        else:
+            dark = v8.maximum(dark, v8.broadcast(water.spots))
+        puddle = _smoothstep(
+            _linear(puddle_rank - v8.broadcast(water.puddle_threshold), 0.5 / PUDDLE_RIM, 0.5)
+        )
+        dark = v8.maximum(
+            dark * v8.broadcast(water.film_wetness), puddle * v8.broadcast(water.puddle_wetness)
+        )
+        mirror = v8.maximum(mirror * v8.broadcast(film_mirror), puddle)
+        v8.store(share, pixel, v8.select(is_ground, ground_share * mirror, ground_share))
+        dark = v8.select(is_ground, dark * ground_share, zero)
+        if not _any(v8.greater(dark, zero)):
+            continue
+        red, green, blue = v8.load_colours(rgb, Index(3) * pixel)
+        red = v8.select(is_ground, _wet_light(red, dark, water), red)
+        green = v8.select(is_ground, _wet_light(green, dark, water), green)
+        blue = v8.select(is_ground, _wet_light(blue, dark, water), blue)
+        v8.store_colours(rgb, Index(3) * pixel, red, green, blue)
+
+
+@kernel
+def wet_ground(view, drying, width, depth, share, water, noise, stains, rgb):
+    """Darken ground in rgb [3 H W], in place, by the film that lies on it.
+
+    share [H W], as of find_ground, receives the share of each pixel whose film mirrors.
+    drying: flat, NUM_DRYING_CHANNELS of each cell of the map. depth: as of find_ground.
+    noise: flat, MOTTLE_SIDE squared. stains: all levels of the table, flat.
+    """
+    for y in prange(depth.size // width):
+        _wet_row(np.int64(y), width, view, drying, depth, share, water, noise, stains, rgb)
 
 
 @kernel

@@ -16,16 +16,17 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from augment.effects.gradient_noise import draw_octaves, sum_octaves
+from augment.effects.gradient_noise import Octaves, draw_octaves, sum_octaves
 from augment.effects.wet.film_kernels import (
     EXPOSURE,
     HEIGHT,
     NUM_CHANNELS,
     PUDDLE_ORDER,
+    PUDDLE_RIM,
     WHEEL_TRACK,
 )
 from augment.errors import SceneError
@@ -72,6 +73,8 @@ _MAX_PUDDLE_SLOPE = np.tan(np.radians(15.0))  # steepest slope with standing wat
 _PUDDLE_OCTAVES = ((7.0, 0.8), (2.9, 0.5), (1.2, 0.25), (0.55, 0.1))
 _WEIGHT_PER_CM = 0.8  # weight of a hollow's centimetre, in standard deviations of that noise
 _NOISE_STRIDE = 2  # distance between samples of the noise, cells
+# Inverse of the share of ground below which the rims of the last puddles close.
+_CLOSING = 200.0
 NO_PUDDLES = 1e6  # value of PUDDLE_ORDER that no place has
 
 
@@ -104,34 +107,35 @@ class WetGround:
 
         Beyond the map they are those of its border, but not open.
         """
-        values, is_inside = self._interpolate(x_m, y_m, slice(None))
-        values[..., EXPOSURE] *= is_inside
-        return values
-
-    def puddles_and_tracks(self, x_m: Tensor, y_m: Tensor) -> Float[Tensor, "*B 2"]:
-        """Return PUDDLE_ORDER and WHEEL_TRACK as `interpolate` does."""
-        return self._interpolate(x_m, y_m, slice(PUDDLE_ORDER, WHEEL_TRACK + 1))[0]
-
-    def _interpolate(
-        self, x_m: Tensor, y_m: Tensor, channels: slice
-    ) -> tuple[Float[Tensor, "*B C"], Bool[Tensor, "*B"]]:
-        """Return some channels at points, and the points that lie on the map."""
         rows, columns = self.channels.shape[:2]
         x = (x_m - self.left_m) / GROUND_CELL_M - 0.5
         y = (y_m - self.bottom_m) / GROUND_CELL_M - 0.5
         is_inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
-        x = x.clamp(0, columns - 1)
-        y = y.clamp(0, rows - 1)
+        values = self.interpolate_values(self.channels, x_m, y_m)
+        values[..., EXPOSURE] *= is_inside
+        return values
+
+    def interpolate_values(
+        self, values: Float[Tensor, "Y X C"], x_m: Tensor, y_m: Tensor
+    ) -> Float[Tensor, "*B C"]:
+        """Return values of the map's cells between their middles; beyond the map its border's."""
+        rows, columns = values.shape[:2]
+        x = ((x_m - self.left_m) / GROUND_CELL_M - 0.5).clamp(0, columns - 1)
+        y = ((y_m - self.bottom_m) / GROUND_CELL_M - 0.5).clamp(0, rows - 1)
         i = x.long().clamp_max(max(columns - 2, 0))
         j = y.long().clamp_max(max(rows - 2, 0))
         u = (x - i)[..., None].float()
         v = (y - j)[..., None].float()
         i1 = (i + 1).clamp_max(columns - 1)
         j1 = (j + 1).clamp_max(rows - 1)
-        flat = self.channels.reshape(-1, NUM_CHANNELS)[:, channels]
+        flat = values.reshape(rows * columns, -1).to(x_m.device)
         below = flat[j * columns + i] * (1 - u) + flat[j * columns + i1] * u
         above = flat[j1 * columns + i] * (1 - u) + flat[j1 * columns + i1] * u
-        return below * (1 - v) + above * v, is_inside
+        return below * (1 - v) + above * v
+
+    def puddles_and_tracks(self, x_m: Tensor, y_m: Tensor) -> Float[Tensor, "*B 2"]:
+        """Return PUDDLE_ORDER and WHEEL_TRACK as `interpolate` does."""
+        return self.interpolate_values(self.channels[..., PUDDLE_ORDER : WHEEL_TRACK + 1], x_m, y_m)
 
     def nearest(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Return the channels of the cells about points; beyond the map, see `interpolate`."""
@@ -149,6 +153,19 @@ class WetGround:
         if share <= 0 or not len(ordered):
             return NO_PUDDLES
         return float(ordered[min(int((1 - share) * len(ordered)), len(ordered) - 1)])
+
+    def interpolate_puddle_threshold(self, share: float) -> float:
+        """Return the same threshold as a continuous function of the share.
+
+        A share of 0 has a threshold above all water. Thresholds between values are interpolated.
+        """
+        ordered = self.sorted_puddle_order
+        if share <= 0 or not len(ordered):
+            return NO_PUDDLES
+        position = (1 - share) * len(ordered) - 0.5
+        threshold = float(np.interp(position, np.arange(len(ordered)), ordered))
+        # The rim of the last puddle closes while its share goes to nothing.
+        return threshold + PUDDLE_RIM * max(1 - share * _CLOSING, 0.0)
 
 
 def wet_ground(scene: Scene, seed: int, *, backend: str = "auto") -> WetGround:
@@ -207,14 +224,16 @@ def _make_ground(cells: ExposedCells, path: np.ndarray, seed: int) -> WetGround:
     track = np.where(is_ground, np.nan_to_num(painter.mean(tracks.astype(np.float64))), 0)
     exposed = _soften_mask(np.isfinite(tops))
     openness = _soften_mask(is_ground) * np.where(is_ground, film, 0)
-    openness = _blur(openness, _SHELTER_SIGMA_M / 2)
+    openness = blur_map(openness, _SHELTER_SIGMA_M / 2)
     heights = _smooth_heights(tops, is_ground, _HEIGHT_BLUR_M)
     level = _smooth_heights(tops, is_ground, _SLOPE_BLUR_M)
     rise_y, rise_x = np.gradient(level, GROUND_CELL_M)
     puddle_order = _puddle_order(
         heights, np.hypot(rise_x, rise_y), is_ground, track, low_cell, seed
     )
-    channels = np.stack([heights, openness, rise_x, rise_y, puddle_order, _blur(track, 0.15)], -1)
+    channels = np.stack(
+        [heights, openness, rise_x, rise_y, puddle_order, blur_map(track, 0.15)], -1
+    )
     ordered = np.sort(puddle_order[openness > 0.5]).astype(np.float32)
     left_m, bottom_m = (low_cell * GROUND_CELL_M).tolist()
     return WetGround(
@@ -284,11 +303,11 @@ def _is_ground_by_path(tops: np.ndarray, path: np.ndarray, low: np.ndarray) -> n
 
 def _soften_mask(mask: np.ndarray) -> np.ndarray:
     """Blur a mask: 1 inside, falling to 0 at the edge."""
-    return np.clip(2 * _blur(mask.astype(np.float64), _SHELTER_SIGMA_M) - 0.9, 0, 1)
+    return np.clip(2 * blur_map(mask.astype(np.float64), _SHELTER_SIGMA_M) - 0.9, 0, 1)
 
 
-def _blur(values: np.ndarray, sigma_m: float) -> np.ndarray:
-    """Blur values of the map."""
+def blur_map(values: np.ndarray, sigma_m: float) -> np.ndarray:
+    """Return values of the map's cells [Y, X], blurred by a standard deviation in metres."""
     sigma = sigma_m / GROUND_CELL_M
     return cv2.GaussianBlur(
         values.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE
@@ -299,8 +318,8 @@ def _smooth_heights(tops: np.ndarray, is_ground: np.ndarray, sigma_m: float) -> 
     """Return heights of the ground, blurred over ground alone; the nearest beyond it."""
     # Heights relative to their median keep float32's digits.
     median_height = float(np.median(tops[is_ground])) if is_ground.any() else 0.0
-    weight = _blur(is_ground.astype(np.float64), sigma_m)
-    sums = _blur(np.where(is_ground, np.nan_to_num(tops) - median_height, 0), sigma_m)
+    weight = blur_map(is_ground.astype(np.float64), sigma_m)
+    sums = blur_map(np.where(is_ground, np.nan_to_num(tops) - median_height, 0), sigma_m)
     is_known = weight > 0.02
     if not is_known.any():
         return np.zeros(tops.shape)
@@ -328,22 +347,33 @@ def _puddle_order(
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
     heights_m = heights.astype(np.float32)
     closed = cv2.morphologyEx(heights_m, cv2.MORPH_CLOSE, disc)
-    depth_cm = _blur(np.clip(closed - heights_m, 0, _MAX_WATER_DEPTH_M) * 100, 0.2)
+    depth_cm = blur_map(np.clip(closed - heights_m, 0, _MAX_WATER_DEPTH_M) * 100, 0.2)
     rng = rng_for(seed=seed, scene="", effect="puddles")
-    rows, columns = (-(-n // _NOISE_STRIDE) + 1 for n in heights.shape)
+    noise = noise_on_map(draw_octaves(_PUDDLE_OCTAVES, rng), low, heights.shape)
+    order = _WEIGHT_PER_CM * depth_cm + noise + 0.3 * track
+    return (
+        order
+        - 4 * np.clip(slope / _MAX_PUDDLE_SLOPE, 0, 2)
+        - 6.0 * (blur_map(is_ground, 0.2) < 0.5)
+    )
+
+
+def noise_on_map(octaves: Octaves, low: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return noise in the cells of a map, [Y, X].
+
+    Args:
+        octaves: the noise.
+        low: column and row of the map's first cell, counted from the world's origin.
+        shape: rows and columns of the map.
+    """
+    rows, columns = (-(-n // _NOISE_STRIDE) + 1 for n in shape)
     x = (low[0] + (np.arange(columns) + 0.5) * _NOISE_STRIDE) * GROUND_CELL_M
     y = (low[1] + (np.arange(rows) + 0.5) * _NOISE_STRIDE) * GROUND_CELL_M
     grid_x, grid_y = np.meshgrid(x, y)
-    noise = sum_octaves(draw_octaves(_PUDDLE_OCTAVES, rng), grid_x.ravel(), grid_y.ravel()).reshape(
-        rows, columns
-    )
+    noise = sum_octaves(octaves, grid_x.ravel(), grid_y.ravel()).reshape(rows, columns)
     size = (columns * _NOISE_STRIDE, rows * _NOISE_STRIDE)
     noise = cv2.resize(noise, size, interpolation=cv2.INTER_CUBIC)
-    noise = noise[: heights.shape[0], : heights.shape[1]]
-    order = _WEIGHT_PER_CM * depth_cm + noise + 0.3 * track
-    return (
-        order - 4 * np.clip(slope / _MAX_PUDDLE_SLOPE, 0, 2) - 6.0 * (_blur(is_ground, 0.2) < 0.5)
-    )
+    return noise[: shape[0], : shape[1]]
 
 
 # ---- Splats that rain wets -----------------------------------------------------------------------

@@ -18,6 +18,7 @@ Flat beams lose most. Asphalt of 10 % that is 5, 20 and 60 m from a sensor 1.8 m
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ from augment.effects.flood.flood_medium import fresnel_reflectance
 from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import ATTENUATED, UNCHANGED
 from augment.effects.wet.darkening import INNER_REFLECTANCE, REFRACTION_INDEX
+from augment.effects.wet.drying import DryingMap, RoadFilm, local_water
 from augment.effects.wet.film_kernels import (
     ASPHALT_ROUGHNESS,
     EXPOSURE,
@@ -62,22 +64,27 @@ def mean_transmission(slope: float) -> np.ndarray:
     return (weights * transmission).sum(1) / weights.sum(1)
 
 
-def wet_echo_ratio(cosine: np.ndarray, reflectance: np.ndarray, puddle: np.ndarray) -> np.ndarray:
+def wet_echo_ratio(
+    cosine: np.ndarray, reflectance: np.ndarray, puddle: np.ndarray, film: np.ndarray | float = 1.0
+) -> np.ndarray:
     """Return the echo of wet ground over that of dry ground, [N].
 
     Args:
         cosine: [N], cosine of incidence.
         reflectance: [N], recorded, incidence included.
         puddle: [N], share of the spot that is under standing water.
+        film: [N], share of a full film's mirroring area that wet asphalt has; damp stones have
+            none.
     """
     cosines = np.linspace(0, 1, _NUM_COSINES)
     asphalt_transmission, puddle_transmission = (
         np.interp(cosine, cosines, mean_transmission(s))
         for s in (ASPHALT_ROUGHNESS, PUDDLE_ROUGHNESS)
     )
+    film_share = FILM_SHARE * film
     asphalt_transmission = (
-        FILM_SHARE * asphalt_transmission
-        + (1 - FILM_SHARE) * mean_transmission(ASPHALT_ROUGHNESS)[-1]
+        film_share * asphalt_transmission
+        + (1 - film_share) * mean_transmission(ASPHALT_ROUGHNESS)[-1]
     )
     albedo = np.clip(reflectance / np.maximum(cosine, 1e-3), 0.0, 1.0)
     film_factor = REFRACTION_INDEX**2 * (1 - INNER_REFLECTANCE * albedo)
@@ -88,18 +95,59 @@ def wet_echo_ratio(cosine: np.ndarray, reflectance: np.ndarray, puddle: np.ndarr
 
 def dim_wet_echoes(echoes: Echoes, ground: WetGround, wetness: float, puddle_share: float) -> None:
     """Dim the echoes of wet ground; echoes of other weather's surfaces stay as they are."""
+    hits = _find_hits(echoes, ground)
+    is_puddle = (
+        hits.channels[:, PUDDLE_ORDER] > ground.find_puddle_threshold(puddle_share)
+    ).astype(np.float64)
+    gain = wet_echo_ratio(hits.cosine, echoes.reflectance[hits.rows], is_puddle)
+    echoes.gain[hits.rows] *= 1 + wetness * hits.exposure * (gain - 1)
+
+
+def dim_echoes_by_film(
+    echoes: Echoes, ground: WetGround, order: DryingMap, film: RoadFilm, puddle_threshold: float
+) -> None:
+    """Dim the echoes of a road that gets wet or dries, by the film where each beam meets it.
+
+    Args:
+        echoes: the sweep, changed in place.
+        ground: map of the ground.
+        order: order in which the ground dries.
+        film: water on the road.
+        puddle_threshold: value of PUDDLE_ORDER above which water stands.
+    """
+    hits = _find_hits(echoes, ground)
+    x, y = (torch.from_numpy(places) for places in (hits.x, hits.y))
+    rank, puddle_order, track = ground.interpolate_values(order.channels, x, y).unbind(-1)
+    puddle = (puddle_order > puddle_threshold).to(rank)
+    spots = torch.full_like(rank, film.spots)
+    wetness, mirror = (
+        part.double().numpy() for part in local_water(film, rank, track, spots, puddle)
+    )
+    is_puddle = puddle.double().numpy()
+    gain = wet_echo_ratio(hits.cosine, echoes.reflectance[hits.rows], is_puddle, mirror)
+    echoes.gain[hits.rows] *= 1 + wetness * hits.exposure * (gain - 1)
+
+
+class _Hits(NamedTuple):
+    """Echoes [N] that may come from dry or wet ground."""
+
+    rows: np.ndarray  # rows of the sweep
+    x: np.ndarray  # world
+    y: np.ndarray  # world
+    channels: np.ndarray  # [N, NUM_CHANNELS] of the map
+    exposure: np.ndarray  # how open the ground is, 0 for echoes off the ground
+    cosine: np.ndarray  # cosine of incidence
+
+
+def _find_hits(echoes: Echoes, ground: WetGround) -> _Hits:
+    """Return the echoes that no other weather's surface sent back, and the ground there."""
     is_dry_surface = (echoes.codes == UNCHANGED) | (echoes.codes == ATTENUATED)
     rows = np.flatnonzero(is_dry_surface & (echoes.ranges_m > 0))
     directions = echoes.directions[rows]
     x, y, z = (echoes.origins[rows] + echoes.ranges_m[rows, None] * directions).T
     channels = ground.interpolate(torch.from_numpy(x), torch.from_numpy(y)).double().numpy()
     is_near = np.abs(z - channels[:, HEIGHT]) < MAX_GROUND_DISTANCE_M
-    local_wetness = wetness * np.where(is_near, channels[:, EXPOSURE], 0.0)
     slope = channels[:, [SLOPE_X, SLOPE_Y]]
     cosine = (slope * directions[:, :2]).sum(1) - directions[:, 2]
     cosine = np.clip(cosine / np.sqrt(1 + (slope**2).sum(1)), 0.0, 1.0)
-    is_puddle = (channels[:, PUDDLE_ORDER] > ground.find_puddle_threshold(puddle_share)).astype(
-        np.float64
-    )
-    gain = wet_echo_ratio(cosine, echoes.reflectance[rows], is_puddle)
-    echoes.gain[rows] *= 1 + local_wetness * (gain - 1)
+    return _Hits(rows, x, y, channels, np.where(is_near, channels[:, EXPOSURE], 0.0), cosine)

@@ -35,14 +35,24 @@ from scipy import ndimage
 from torch import Tensor
 
 from augment.effects.wet import film_kernels
-from augment.effects.wet.darkening import to_display, to_linear
+from augment.effects.wet.darkening import to_display, to_linear, wet_ratio
+from augment.effects.wet.drying import (
+    DryingMap,
+    RoadFilm,
+    local_water,
+    stain_levels,
+    stained_share,
+    water_numbers,
+)
 from augment.effects.wet.film_kernels import (
     ASPHALT_ROUGHNESS,
     COARSE_AMPLITUDE,
+    COARSE_RANK,
     COARSE_TEXEL_M,
     EXPOSURE,
     FILM_SHARE,
     FINE_AMPLITUDE,
+    FINE_RANK,
     FINE_TEXEL_M,
     GROUND_TOLERANCE_M,
     GROUND_TOLERANCE_PER_M,
@@ -351,6 +361,74 @@ def _ground_points(
     eye = camera.centre.to(depth.device)
     channels = ground.interpolate(points[..., 0] + eye[0], points[..., 1] + eye[1])
     return points.float(), points.norm(dim=-1).float(), channels
+
+
+def wet_by_film(
+    rgb: Float[Tensor, "H W 3"],
+    camera: Camera,
+    depth: Float[Tensor, "H W"],
+    share: Float[Tensor, "H W"],
+    ground: WetGround,
+    order: DryingMap,
+    film: RoadFilm,
+    puddle_threshold: float,
+    white: float,
+    *,
+    backend: str = AUTO,
+) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+    """Darken the ground of a picture by the film that lies on it.
+
+    On the CPU, `rgb` and `share` are overwritten.
+
+    Args:
+        rgb: display-encoded picture of the dry ground, without fog.
+        camera: the camera.
+        depth: z of what a pixel shows.
+        share: result of `find_ground`.
+        ground: map of the ground.
+        order: order in which the ground dries.
+        film: water on the road.
+        puddle_threshold: value of PUDDLE_ORDER above which water stands.
+        white: result of `darkening.white_level`.
+        backend: the CPU's kernel equals the definition within float rounding.
+
+    Returns:
+        The picture, and the share of each pixel whose film mirrors.
+    """
+    if choose_kernels(backend, rgb, depth, share) == CPU and camera.width >= NUM_LANES:
+        rgb = rgb.contiguous()
+        share = share.contiguous()
+        view, _ = _map_view(camera, ground)
+        with kernel_threads(ROWS_PER_TASK):
+            film_kernels.wet_ground(
+                view,
+                order.channels.numpy().reshape(-1),
+                camera.width,
+                _flat_array(depth),
+                _flat_array(share),
+                water_numbers(film, puddle_threshold, white),
+                make_mottle_table().reshape(-1),
+                stain_levels(film.spots),
+                _flat_array(rgb),
+            )
+        return rgb, share
+    points, distance, _ = _ground_points(camera, depth, ground)
+    eye = camera.centre.to(points.device)
+    x = points[..., 0].double() + eye[0]
+    y = points[..., 1].double() + eye[1]
+    rank, puddle_order, track = ground.interpolate_values(order.channels, x, y).unbind(-1)
+    across = distance / camera.fy
+    sine = (-points[..., 2] / distance.clamp_min(1e-6)).clamp_min(MIN_FOOTPRINT_SINE)
+    for amplitude, texel in ((COARSE_RANK, COARSE_TEXEL_M), (FINE_RANK, FINE_TEXEL_M)):
+        weight = (2 - across / sine / texel).clamp(0, 1)
+        rank = rank + amplitude * weight * _mottle(x, y, texel)
+    puddle = _smoothstep(puddle_threshold - PUDDLE_RIM, puddle_threshold + PUDDLE_RIM, puddle_order)
+    spots = stained_share(film.spots, x, y, across / sine.sqrt())
+    wetness, mirror = local_water(film, rank, track, spots, puddle)
+    is_ground = share > 0
+    ratio = wet_ratio(rgb.clamp_min(0), white, torch.where(is_ground, share * wetness, 0.0))
+    darkened = torch.where(is_ground[..., None], rgb * ratio, rgb)
+    return darkened, torch.where(is_ground, share * mirror, 0.0)
 
 
 def shade_wet(

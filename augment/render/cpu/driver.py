@@ -48,6 +48,7 @@ from augment.render.cpu import geometry
 from augment.render.cpu import project as project_kernels
 from augment.render.cpu.order import cut_in_fog, spatial_order
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
+from augment.render.fog_table import bank_table, thinnest_fog
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
 from augment.render.threads import kernel_threads, num_kernel_threads, usable_cores
@@ -160,6 +161,11 @@ def gather_inputs(
     counts = [size[0] for size in sizes]
     modes = raster_modes(settings, fog, clip, with_color=with_color)
     modes[layout.M_LIGHT] = with_color and any(part.shading is not None for part in parts)
+    if fog is not None and fog.banks is not None and with_color:
+        table = bank_table(fog, camera).numbers
+        kept_alive.append(table)
+        modes[layout.M_BANKS] = _address(table)
+        modes[layout.M_BANKS_COUNT] = table.size
     return Inputs(
         addresses=np.array(addresses, np.uint64).reshape(-1, layout.NUM_ADDRESSES),
         sizes=np.array(sizes, np.int64).reshape(-1, 2),
@@ -335,6 +341,7 @@ def _max_transmittance(fog: Fog, camera: Camera, distance_m: float) -> float:
     """
     eye_z_m = float(camera.centre[2])
     ray_distance = np.array([distance_m])
+    fog = thinnest_fog(fog, camera)
     depth = float(optical_depth_numpy(fog, ray_distance, eye_z_m, eye_z_m + ray_distance)[0])
     return math.exp(-min(depth, MAX_EXPONENT))
 

@@ -49,6 +49,7 @@ def _hash_sources() -> str:
         render / "layout.py",
         *sorted((render.parent / "lamps").glob("*_kernels.py")),
         *sorted((render.parent / "effects" / "lamps").glob("*_kernels.py")),
+        *sorted((render.parent / "effects" / "falling").glob("*_kernels.py")),
     ]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 

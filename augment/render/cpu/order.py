@@ -23,6 +23,7 @@ from augment.render import layout
 from augment.render.buffers import ALPHA, RGB
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSettings
 from augment.render.fog import Fog, optical_depth_numpy
+from augment.render.fog_table import thinnest_fog
 from augment.render.layout import HeightClip
 from augment.scene.bounds import Bounds, may_show
 from augment.scene.cameras import Camera
@@ -301,7 +302,7 @@ def find_visible_boxes(
         )
         is_visible &= ~((farthest < 0) | (nearest > clip.max_distance_m))
     if fog is not None and settings.fog_cut > 0:
-        depths = _min_optical_depth(bounds, pose, camera, fog)
+        depths = _min_optical_depth(bounds, pose, camera, thinnest_fog(fog, camera))
         is_visible &= ~(depths > -math.log(settings.fog_cut))
     return is_visible
 

@@ -40,6 +40,7 @@ from augment.render.cpu.geometry import (
 from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at, log2, scalar_fmuladd, shorts_at
 from augment.render.fog import MAX_EXPONENT
+from augment.render.fog_bank_kernels import write_log_means
 from augment.render.layout import (
     BIN_SHIFT,
     BLOCK_SIZE,
@@ -82,7 +83,7 @@ _C3_CUBIC, _C3_XYZ, _C3_ZZ, _C3_ZZZ, _C3_ZXX = map(
 
 
 @kernel_function()
-def prepare_colors(dx, dy, dz, view, num_functions, fog, rows):
+def prepare_colors(dx, dy, dz, view, num_functions, fog, has_banks, rows):
     """Write SH functions and transmittance of eight splats.
 
     Args:
@@ -90,6 +91,8 @@ def prepare_colors(dx, dy, dz, view, num_functions, fog, rows):
         view: numbers of the view.
         num_functions: number of SH functions.
         fog: mode of the fog.
+        has_banks: if True, the row of the transmittance holds log2 of the mean density of the fog's
+            banks.
         rows: COLOR_ROWS rows of eight numbers, flat; written.
     """
     distance = v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
@@ -99,6 +102,8 @@ def prepare_colors(dx, dy, dz, view, num_functions, fog, rows):
         tau = v8.broadcast(view[L.V_EXTINCTION]) * distance
         if fog == L.LAYERED_FOG:
             tau = tau * _layered_density(dx, dy, dz, view)
+        if has_banks:
+            tau = tau * exp2_fine(v8.load(rows, Index(TRANSMITTANCE * NUM_LANES)))
         lowest = v8.broadcast(np.float32(-126))  # 1e-38: fog that deep is opaque
         transmittance = exp2_fine(v8.maximum(tau * v8.broadcast(-LOG2_E), lowest))
         v8.store(rows, Index(TRANSMITTANCE * NUM_LANES), transmittance)
@@ -656,13 +661,24 @@ def _project_eight(
     """Write records, pixel boxes and colour rows of eight Gaussians, side by side in `rows`."""
     # SH functions and fog towards the eye.
     d = offsets_from_eye(means, gaussian_ids, group, view)
+    x, y, z = to_camera(d, view)
     if modes[L.M_COLOR]:
         directions = rotation_row(view, Index(2)) if view[L.V_PARALLEL] > 0 else d
+        has_banks = modes[L.M_BANKS] != 0
+        if has_banks:
+            table = floats_at(np.uint64(modes[L.M_BANKS]), modes[L.M_BANKS_COUNT])
+            write_log_means(table, x, y, z, rows, Index(TRANSMITTANCE * NUM_LANES))
         prepare_colors(
-            directions[0], directions[1], directions[2], view, num_functions, modes[L.M_FOG], rows
+            directions[0],
+            directions[1],
+            directions[2],
+            view,
+            num_functions,
+            modes[L.M_FOG],
+            has_banks,
+            rows,
         )
-    # Centre in the camera, and covariance in the image.
-    x, y, z = to_camera(d, view)
+    # Covariance in the image.
     inverse = inverse_divisor(z, view)
     xx, xy, yy, minors = image_covariance(quats, scales, gaussian_ids, group, x, y, inverse, view)
 
