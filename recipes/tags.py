@@ -112,6 +112,8 @@ SNOWFALL_EXPONENT = 0.41
 STREET_UTILISATION = 0.24
 # Width of that carriageway.
 CARRIAGEWAY_M = 7.0
+# Film of water from which a road is moist, mm (DATEX II).
+MOIST_FILM_MM = 0.01
 # Share of the open ground under standing water from which a road counts as wet with puddles. A
 # convention of ours: ASAM gives no number.
 MIN_PUDDLE_SHARE = 0.01
@@ -318,9 +320,13 @@ def _wetness(recipe: Recipe) -> Wetness:
     if flood is not None and flood.level_m > 0:
         return "highFlooded" if flood.level_m >= HIGH_FLOOD_M else "lowFlooded"
     rain = recipe.weather.rain
-    if rain is None or rain.ground_wetness <= 0:
+    if rain is None or not rain.wets_ground:
         return "dry"
-    return "wetWithPuddles" if rain.puddle_share >= MIN_PUDDLE_SHARE else "moist"
+    if rain.puddle_share >= MIN_PUDDLE_SHARE:
+        return "wetWithPuddles"
+    road = rain.road
+    is_moist = road is None or road.film_mm >= MOIST_FILM_MM or road.spots > 0
+    return "moist" if is_moist else "dry"
 
 
 def _friction_key(snow_depth_m: float, wetness: Wetness) -> str:

@@ -300,6 +300,65 @@ class SuiteProbeOptions(Command):
         return show_probes(self.out, self.variant)
 
 
+class SuiteSearchOptions(SceneCommand):
+    """Find the mildest weather at which a detector breaks, by halving a physical number.
+
+    Each number is rendered into a folder OUT/EFFECT-NUMBER, on which the command is run
+    (docs/tags.md).
+
+    Args:
+        scenes: Scenes, as for `climategs suite weather-c`.
+        effect: fog, rain, snowfall, snow, flood or lens: an effect whose levels are one number.
+        until: The condition: SCORE<NUMBER, with <, <=, > or >=.
+        command: A program with its arguments; the folder is added to them. The last line that it
+            prints must be a JSON object of scores, such as {"recall": 0.48}.
+        out: A folder for the images. Run it again to go on after an interruption.
+        mildest: Where to begin. Level 1 by default.
+        harshest: Where to end. Level 5 by default.
+        tolerance: Width of the interval, relative, at which the search ends.
+        max_evaluations: At most so many numbers.
+        frames: Frame numbers, as for render.
+        cameras: Camera names separated by commas, or all; as for render.
+        scale: Resolution relative to the recorded.
+        workers: Processes. 1 renders in this one.
+        backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU.
+        overrides: Replace a field of render or output, as for `climategs suite weather-c`.
+        json_file: Also write the result and all evaluations to this file.
+    """
+
+    scenes: Positional[
+        Annotated[
+            tuple[str, ...], arg(metavar="SCENE [SCENE ...]", help_behavior_hint="(required)")
+        ]
+    ]
+    effect: str
+    until: str
+    command: str
+    out: Annotated[Path, _local("the command reads a folder on this machine")]
+    mildest: Annotated[float, Field(gt=0)] | None = None
+    harshest: Annotated[float, Field(gt=0)] | None = None
+    tolerance: Annotated[float, Field(gt=0, lt=10)] = 0.05
+    max_evaluations: Annotated[int, Field(ge=5)] = 24
+    frames: Annotated[str, AfterValidator(_check_frames)] = "all"
+    cameras: str = FITTED
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    workers: Count = 1
+    backend: Backend = "auto"
+    overrides: Overrides = ()
+    json_file: JsonFile = None
+
+    @model_validator(mode="after")
+    def _names_scenes(self) -> Self:
+        if not self.scenes:
+            raise ValueError("no scene is named: climategs suite search SCENE --out OUT")
+        return self
+
+    def run(self) -> int:
+        from tools.search import search_suite
+
+        return search_suite(self)
+
+
 class InspectOptions(SceneCommand):
     """Show what is in a scene: Gaussians, actors, cameras, frames, LiDAR, labels, problems.
 
@@ -747,6 +806,7 @@ GROUPS = {
         "plan": SuitePlanOptions,
         "verify": SuiteVerifyOptions,
         "probe": SuiteProbeOptions,
+        "search": SuiteSearchOptions,
     },
 }
 

@@ -12,7 +12,7 @@ import pytest
 from augment.effects.falling.drops import sizes_of
 from recipes.flood import Flood
 from recipes.light import Light
-from recipes.rain import Rain
+from recipes.rain import Rain, RoadWater
 from recipes.schema import Recipe, Weather
 from recipes.smog import MOR_DEPTH, Smog
 from recipes.snow import Snow
@@ -250,6 +250,16 @@ def test_roads_dry_from_puddles_to_moist_to_dry() -> None:
     assert wetness(rate_mm_h=0, wetness=0.8, puddles=0.2) == "wetWithPuddles"
     assert wetness(rate_mm_h=0, wetness=0.8, puddles=0.0) == "moist"
     assert wetness(rate_mm_h=0, wetness=0.0, puddles=0.5) == "dry"
+
+    def after_rain(**water: float) -> str:
+        road = RoadWater(puddle_fill=0.0, **water)
+        weather = Weather(rain=Rain(rate_mm_h=0, road=road))
+        return tags_of(Recipe(weather=weather)).openscenario_wetness
+
+    assert [after_rain(film_mm=film_mm) for film_mm in (0.0, 0.009, 0.01, 0.6)] == [
+        *("dry", "dry", "moist", "moist")
+    ]
+    assert after_rain(film_mm=0.0, spots=0.1) == "moist"
 
 
 def test_light_of_the_street_counts_where_lamps_are_on() -> None:
