@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
@@ -112,6 +112,7 @@ def _repeated_names(names: list[str]) -> str:
     return ", ".join(sorted({name for name in names if names.count(name) > 1}))
 
 
+@runtime_checkable
 class SceneRecipes(Protocol):
     """Recipes of a dataset job, in numbers for one scene after the other."""
 

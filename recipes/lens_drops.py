@@ -50,8 +50,9 @@ class LensDrops(EffectModel):
     """Drops on the part of the glass that the camera looks through; with a wiper, just before it
     wipes. null for as many as the recipe's rain brings, none without rain."""
     share: Number | None = Field(default=None, ge=0, le=MAX_SHARE)
-    """Share of each camera's picture that lies behind drops, in the mean over time, in place of
-    count: the number of drops follows from the camera's field of view."""
+    """Share of each camera's picture that lies behind drops, in place of count: the number of drops
+    follows from the camera's field of view, in whole drops. Drops above 1.2 mm run out of the
+    picture, and leave less."""
     radius_mm: Number = Field(default=1.0, gt=0, le=20)
     """Median radius of a drop on the glass."""
     radius_spread: Number = Field(default=0.4, ge=0, le=1.5)

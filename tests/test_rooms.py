@@ -56,6 +56,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "reconstruct": ("augment.reconstruct",),
     "dataset": ("augment.dataset",),
     "jobs": ("augment.jobs",),
+    "suite": ("augment.suite",),
     "adapters": ("adapters",),
     "tools": ("tools",),
 }

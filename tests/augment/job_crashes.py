@@ -35,6 +35,8 @@ from augment.output.manifest import read_manifest_rows
 from augment.output.names import STATE_FOLDER
 from augment.output.store import open_store
 from augment.output.tables import lidar_bytes
+from augment.suite.run import run_suite
+from augment.suite.verify import verify_suite
 from recipes.flood import Flood
 from recipes.snow import Snow
 from tests.augment import generate_jobs as jobs
@@ -52,6 +54,7 @@ from tests.augment.generate_jobs import (
     slow_noting_render,
     take_notes,
 )
+from tests.augment.suite_runs import make_run
 
 Work = Callable[[], object]
 CHANGES = ("fsync", "replace", "unlink", "rename", "rmdir", "link", "mkdir")
@@ -102,6 +105,12 @@ def generating(out: Path, renderer: Callable = noting_render, **options) -> Work
         options["executor"] = "processes"
     job = make_job(out, renderer=renderer, **options)
     return lambda: generate(job)
+
+
+def rendering_suite(out: Path) -> Work:
+    """`climategs suite`: five variants of one scene, 20 images, and their hashes."""
+    run = make_run(out, scenes=("fake:a?frames=2",), renderer=noting_render)
+    return lambda: run_suite(run, progress=False)
 
 
 def generate(job: GenerateJob) -> GenerateResult:
@@ -336,6 +345,14 @@ def kill_generate_jobs(folder: Path) -> dict:
     return kill_until_through(folder, generating, 6, 500)
 
 
+def kill_suites(folder: Path) -> dict:
+    """Suites that were killed end with the same files, `suite.json` with their hashes included."""
+    result = kill_until_through(folder, rendering_suite, 2, 300)
+    for out in folder.iterdir():
+        require(verify_suite(open_store(out)).is_intact, f"{out} is not intact")
+    return result
+
+
 def kill_while_overwriting(folder: Path) -> dict:
     """Kill a run that overwrites an older variant: the old job or the new one must go on."""
 
@@ -491,6 +508,7 @@ SCENARIOS = (
     kill_a_few_times,
     kill_render_jobs,
     kill_generate_jobs,
+    kill_suites,
     kill_while_overwriting,
     stop_jobs_with_workers,
     fill_the_disk,

@@ -417,6 +417,10 @@ def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
     assert found_by(quick_folder, "kill_a_few_times")["kill_a_few_times"]["kills"] == 8
 
 
+def test_a_killed_suite_goes_on_to_identical_files_and_hashes(quick_folder: Path) -> None:
+    assert found_by(quick_folder, "kill_suites")["kill_suites"]["kills"] >= 4
+
+
 @pytest.mark.long
 def test_jobs_that_are_killed_stopped_or_starved_of_disk_go_on(quick_folder: Path) -> None:
     counts = found_by(quick_folder)
