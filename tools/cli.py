@@ -304,7 +304,7 @@ class SuiteSearchOptions(SceneCommand):
     """Find the mildest weather at which a detector breaks, by halving a physical number.
 
     Each number is rendered into a folder OUT/EFFECT-NUMBER, on which the command is run
-    (docs/tags.md).
+    (docs/suite.md).
 
     Args:
         scenes: Scenes, as for `climategs suite weather-c`.

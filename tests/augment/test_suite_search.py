@@ -12,19 +12,24 @@ from pathlib import Path
 
 import pytest
 
-from augment.suite.search import (
-    Condition,
-    SearchError,
+from augment.errors import OutputError
+from augment.jobs.block_worker import JobWorkerSetup
+from augment.output.manifest import read_manifest
+from augment.suite.search import Condition, SearchError, search
+from augment.suite.searched_weather import (
+    NumberRenderer,
     command_judge,
-    search,
     search_range,
     search_weather,
     suite_at,
 )
 from recipes.errors import RecipeError
+from recipes.job import JobScene
 from recipes.smog import MOR_DEPTH
 from recipes.suite import Suite, SuiteVariant, load_suite
 from recipes.tags import tags_of
+from tests.augment.batch_scenes import fake_render, must_not_render, open_fake
+from tools.cli import main
 
 SUITE = load_suite("weather-c-v1")
 
@@ -207,7 +212,60 @@ def test_commands_that_cannot_be_run_are_refused(tmp_path: Path) -> None:
     for command, message in (
         ("", "the command is empty"),
         ("'detect", "cannot be read"),
-        (str(tmp_path / "none"), "cannot be run: No such file"),
+        (str(tmp_path / "none"), "cannot be run: there is no such program"),
     ):
         with pytest.raises(SearchError, match=message):
             command_judge(command)(tmp_path)
+
+
+# ---- Images and the command ----------------------------------------------------------------------
+
+
+def renderer_in(out: Path, renderer: Callable = fake_render) -> NumberRenderer:
+    def setup_of(folder: str) -> JobWorkerSetup:
+        return JobWorkerSetup(folder, None, "auto", open_fake, renderer)
+
+    scenes = [JobScene(uri="fake:a?frames=2"), JobScene(uri="fake:b?frames=2")]
+    return NumberRenderer(scenes, setup_of, out, {"output.image": "png"}, progress=False)
+
+
+def test_each_number_is_a_folder_that_a_detector_reads_and_a_second_search_takes_over(
+    tmp_path: Path,
+) -> None:
+    def judge(folder: Path) -> Mapping[str, float]:
+        table = read_manifest(folder)
+        assert table.num_rows == 8 and set(table["status"].to_pylist()) == {"ok"}
+        (mor_m,) = set(table["mor_m"].to_pylist())
+        return {"recall": 1 / (1 + 120 / mor_m)}
+
+    options = {"tolerance": 0.5, "num_checks": 1}
+    first = search_weather(
+        SUITE, "fog", renderer_in(tmp_path).render, judge, "recall<0.5", **options
+    )
+    assert first.interval[1] < 120 < first.interval[0]
+    folders = {f"fog-{e.number:.6g}" for e in first.evaluations}
+    assert {path.name for path in tmp_path.iterdir()} == folders
+    again = renderer_in(tmp_path, must_not_render)
+    assert search_weather(SUITE, "fog", again.render, judge, "recall<0.5", **options) == first
+
+
+def broken_render(*args: object, **options: object) -> None:
+    raise ValueError("no memory")
+
+
+def test_images_that_fail_end_the_search(tmp_path: Path) -> None:
+    broken = renderer_in(tmp_path, broken_render)
+    with pytest.raises(OutputError, match="fog-600: 8 images failed and 0 scenes"):
+        search_weather(SUITE, "fog", broken.render, recall_in_fog, "recall<0.5")
+
+
+def test_the_command_refuses_before_it_renders(tmp_path: Path, capsys) -> None:
+    command = ["suite", "search", "procedural:street?seed=3", "--out", str(tmp_path / "out")]
+    for options, message in (
+        (["--effect", "night", "--until", "r<1", "--command", "true"], "night of weather-c-v1"),
+        (["--effect", "fog", "--until", "r=1", "--command", "true"], "is no condition"),
+        (["--effect", "fog", "--until", "r<1", "--command", "no-such-x"], "no such program"),
+    ):
+        assert main([*command, *options]) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
