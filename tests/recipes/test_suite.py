@@ -19,6 +19,11 @@ LEVELS = range(1, 6)
 TABLE = {
     "fog": {"weather.smog.extinction_per_m": (0.005, 0.01, 0.02, 0.04, 0.08)},
     "rain": {"weather.rain.rate_mm_h": (1, 4, 16, 50, 100)},
+    "wet": {
+        "weather.rain.road.film_mm": (0.02, 0.06, 0.2, 0.6, 0.6),
+        "weather.rain.rate_mm_h": (0, 0, 0, 0, 0),
+        "weather.rain.puddle_share": (0, 0, 0, 0, 0.2),
+    },
     "snowfall": {"weather.snowfall.rate_mm_h": (0.3, 0.6, 1.2, 2.4, 4.8)},
     "snow": {
         "weather.snow.depth_m": (0.01, 0.03, 0.08, 0.15, 0.30),
@@ -70,6 +75,7 @@ def test_night_has_the_light_of_the_table() -> None:
 def test_level_values_are_the_recipes_numbers_in_their_units() -> None:
     for effect, path, factor in (
         ("rain", "weather.rain.rate_mm_h", 1),
+        ("wet", "weather.rain.road.film_mm", 1),
         ("snowfall", "weather.snowfall.rate_mm_h", 1),
         ("snow", "weather.snow.depth_m", 100),
         ("flood", "weather.flood.level_m", 1),
