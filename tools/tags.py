@@ -10,7 +10,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,17 +21,28 @@ from augment.output.atomic import write_atomic
 from augment.output.layout import variant_folder
 from augment.output.manifest import read_manifest
 from augment.output.recipe_files import RECIPE_FILE
+from recipes.errors import RecipeError
 from recipes.fields import with_unchecked_field
 from recipes.load import load_recipe
-from recipes.moment import ANY_DRIVE
+from recipes.moment import ANY_DRIVE, SceneTimes
 from recipes.schema import Recipe
-from recipes.tags import Tags, tags_of
+from recipes.tags import CLASS_COLUMNS, NUMBER_COLUMNS, Tags, tags_of
 
 # Ontology of OpenLABEL's tags.
 OPENLABEL_ONTOLOGY = (
     "https://openlabel.asam.net/V1-0-0/ontologies/openlabel_ontology_scenario_tags.ttl"
 )
 OPENLABEL_VERSION = "1.0.0"
+# Columns of the manifest from which the tags of an image follow.
+_IMAGE_COLUMNS = (
+    "scene",
+    "variant",
+    "frame",
+    "timestamp_ns",
+    "recipe_hash",
+    "weather_time_s",
+    "timeline_values",
+)
 # Values of OSI's fields are these words and the class in capitals.
 _OSI_PREFIXES = {
     "ambient_illumination": "AMBIENT_ILLUMINATION_",
@@ -77,10 +88,12 @@ def read_tags(out: Path) -> list[TaggedWeather]:
         OutputError: no output folder, or a recipe.yaml is not that of the variant's images.
     """
     table = read_manifest(out)
-    columns = ("scene", "variant", "frame", "recipe_hash", "weather_time_s", "timeline_values")
+    columns = (*_IMAGE_COLUMNS, *NUMBER_COLUMNS, *CLASS_COLUMNS)
     variant_rows: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    scene_rows: dict[str, list[dict[str, Any]]] = {}
     for row in table.select(columns).to_pylist():
         variant_rows.setdefault((row["scene"], row["variant"]), []).append(row)
+        scene_rows.setdefault(row["scene"], []).append(row)
     weathers = []
     for (scene, variant), rows in sorted(variant_rows.items()):
         path = Path(out) / variant_folder(scene, variant) / RECIPE_FILE
@@ -94,25 +107,40 @@ def read_tags(out: Path) -> list[TaggedWeather]:
         if not recipe.changes_over_time:
             weathers.append(TaggedWeather(scene, variant, None, tags_of(recipe)))
             continue
+        times = _times_of_rows(scene_rows[scene])
         row_of_frame = {row["frame"]: row for row in reversed(rows)}
         weathers += [
-            TaggedWeather(scene, variant, frame, tags_of(_recipe_of_row(recipe, row)))
+            TaggedWeather(scene, variant, frame, _tags_of_row(recipe, row, times))
             for frame, row in sorted(row_of_frame.items())
         ]
     return weathers
 
 
-def _recipe_of_row(recipe: Recipe, row: Mapping[str, Any]) -> Recipe:
-    """Return a recipe that changes over time, at the time of an image.
+def _times_of_rows(rows: Sequence[Mapping[str, Any]]) -> SceneTimes:
+    """Return the times of a drive by its images in an output."""
+    stamps = [row["timestamp_ns"] for row in rows]
+    return SceneTimes(min(stamps), max(stamps), len({row["frame"] for row in rows}))
+
+
+def _tags_of_row(recipe: Recipe, row: Mapping[str, Any], times: SceneTimes) -> Tags:
+    """Return the tags of a recipe that changes over time, at the time of an image.
+
+    Timelines and tags of the row hold where the output has only a part of the drive.
 
     Args:
         recipe: the recipe.
         row: the image's row of the manifest, which has the values of all timelines.
+        times: times of the drive.
     """
-    state = recipe.at_weather_time(ANY_DRIVE, row["weather_time_s"] or 0.0)
+    time_s = row["weather_time_s"] or 0.0
+    try:
+        state = recipe.at_weather_time(times, time_s)
+    except RecipeError:  # a timeline goes beyond the images that are here
+        state = recipe.at_weather_time(ANY_DRIVE, time_s)
     for path, value in json.loads(row["timeline_values"] or "{}").items():
         state = with_unchecked_field(state, path, value)
-    return state
+    names = [name for name in (*NUMBER_COLUMNS, *CLASS_COLUMNS) if row[name] is not None]
+    return replace(tags_of(state), **{name: row[name] for name in names})
 
 
 # ---- Formats -------------------------------------------------------------------------------------
