@@ -26,6 +26,7 @@ from augment.output.layout import (
 from augment.output.manifest import OK, read_manifest_rows
 from augment.output.names import MANIFEST_FILE, STATE_FOLDER, folder_name
 from augment.output.store import Store, StoredFileMissing
+from recipes.job import scaled_recipe
 from recipes.schema import Recipe
 from recipes.suite import CLEAN, Suite, SuiteVariant
 from recipes.tags import columns_of_tags
@@ -202,11 +203,11 @@ def check_same_suite(store: Store, request: SuiteRequest) -> None:
         "scale": (earlier.scale, request.scale),
         "changes": (earlier.changes, dict(request.changes)),
     }
-    for name, (there, here) in facts.items():
-        if there != here:
+    for name, (stored_value, requested_value) in facts.items():
+        if stored_value != requested_value:
             raise OutputError(
-                f"{store.uri} holds a suite with another {name}: {there!r} there, {here!r} here; "
-                f"choose another --out"
+                f"{store.uri} holds a suite with another {name}: {stored_value!r} there, "
+                f"{requested_value!r} here; choose another --out"
             )
 
 
@@ -295,7 +296,7 @@ def _variant_facts(request: SuiteRequest, name: str, rows: list[dict[str, Any]])
     effect = None if variant.effect == CLEAN else request.suite.effects[variant.effect]
     scenes = sorted({row["scene"] for row in rows})
     seeds = {row["scene"]: row["seed"] for row in rows}
-    recipe = request.suite.recipe(variant, scenes[0], request.changes)
+    recipe = scaled_recipe(request.suite.recipe(variant, scenes[0], request.changes), request.scale)
     return VariantFacts(
         effect=variant.effect,
         level=variant.level,

@@ -347,7 +347,7 @@ def kill_generate_jobs(folder: Path) -> dict:
 
 def kill_suites(folder: Path) -> dict:
     """Suites that were killed end with the same files, `suite.json` with their hashes included."""
-    result = kill_until_through(folder, rendering_suite, 2, 300)
+    result = kill_until_through(folder, rendering_suite, 1, 300)
     for out in folder.iterdir():
         require(verify_suite(open_store(out)).is_intact, f"{out} is not intact")
     return result

@@ -215,6 +215,7 @@ def test_auto_weathers_lidar_where_the_depth_images_show_a_surface_of_the_weathe
 ELSEWHERE = {"version", "weather.smog.extinction_per_m", "weather.flood.absorption_per_m"}
 ELSEWHERE |= {
     "weather.smog.mor_m",
+    "camera.lens_drops.share",
     "style.image",
     "style.preset",
     "style.mask",
@@ -243,6 +244,7 @@ def test_every_field_changes_the_hash() -> None:
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
     hashes = {base.hash, smoggy(extinction_per_m=0.01).hash, smoggy(mor_m=300).hash}
     hashes.add(base.model_copy(update={"camera": Sensor()}).hash)
+    hashes.add(Recipe(camera=Sensor(lens_drops=LensDrops(share=0.1))).hash)
     hashes.add(
         Recipe(
             weather=Weather(smog=smog, flood=cleared, snow=snow, rain=rain, snowfall=snowfall)
@@ -262,7 +264,7 @@ def test_every_field_changes_the_hash() -> None:
         accepted = (value for value in (*spec.allowed_words, *CANDIDATES) if spec.accepts(value))
         inner[name] = next(value for value in accepted if value != inner[name])
         hashes.add(Recipe.model_validate(data).hash)
-    assert len(hashes) == len(changed) + 8
+    assert len(hashes) == len(changed) + 9
     scene = Recipe(output=Output(surface="scene"))
     assert len({scene.hash, Recipe().hash, Recipe(output=Output(surface="first")).hash}) == 3
 
