@@ -38,9 +38,19 @@ def render_suite(options: SuiteOptions) -> int:
         options, options.out, executor=options.executor, workers=options.workers,
         shard=(number, count), backend=options.backend, scratch=options.scratch,
     )  # fmt: skip
+
+    def lay_into_datasets() -> None:
+        """Lay the images into copies of their datasets; sweeps between images are added."""
+        if options.layout == "source":
+            from tools.mirror import mirror_again
+
+            mirror_again(Path(options.out), links=options.links)
+
     with ended_by_sigterm():
         result = run_suite(
-            run, prepare=lambda recipes: warm_up_for_workers(recipes, options.backend)
+            run,
+            prepare=lambda recipes: warm_up_for_workers(recipes, options.backend),
+            before_hashes=lay_into_datasets,
         )
     print_images(result.images, duration_text(result.images.seconds))
     for uri, why in result.images.unusable.items():
@@ -49,10 +59,6 @@ def render_suite(options: SuiteOptions) -> int:
         print_note(f"{SUITE_FILE} is written when all shards are done")
     else:
         print_suite(result.suite_file)
-        if options.layout == "source":
-            from tools.mirror import mirror_again
-
-            mirror_again(Path(options.out), links=options.links)
     print(f"output: {options.out}   (climategs suite verify {shlex.quote(options.out)} checks it)")
     return 1 if result.images.failed or result.images.unusable else 0
 

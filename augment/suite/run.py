@@ -82,7 +82,11 @@ def suite_recipes(
         changes: Fields of `render` and `output` that differ from the definition, by dotted path.
         scale: Resolution over that of the definition.
         block_images: Approximate number of images in a block.
+
+    Raises:
+        RecipeError: A change is not allowed.
     """
+    suite.recipe(variants[0], suite.name, changes)  # refuses changes before scenes are opened
     job = Job.model_validate({
         "name": suite.name,
         "scenes": ("any",),  # the run has the scenes
@@ -113,6 +117,7 @@ def run_suite(
     *,
     progress: bool = True,
     prepare: Callable[[list[Recipe]], None] = lambda recipes: None,
+    before_hashes: Callable[[], None] = lambda: None,
 ) -> SuiteResult:
     """Render the images of a suite that are not finished yet, and write `suite.json`.
 
@@ -123,6 +128,8 @@ def run_suite(
         run: Scenes and variants.
         progress: If True, show bars on stderr.
         prepare: Called before the first image is rendered, with one recipe of each name.
+        before_hashes: Called when all images of the job are there, before files are hashed: it may
+            add files to the variants' folders.
 
     Raises:
         OutputError: The output cannot be written, or holds another suite.
@@ -136,6 +143,7 @@ def run_suite(
     images = run_generate(run.job, progress=progress, prepare=prepare)
     if not is_finished(store, run.recipes.job.name):
         return SuiteResult(images, None)
+    before_hashes()
     sources = sorted({*read_manifest_rows(store)["source"].to_pylist()})
     conditions = {source: run.conditions_of(source) for source in sources}
     suite_file = describe_suite(store, request._replace(conditions=conditions))

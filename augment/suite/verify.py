@@ -5,12 +5,15 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+from augment.jobs.mirror import MIRROR_FOLDER
 from augment.output.names import STATE_FOLDER
 from augment.output.store import Store, StoredFileMissing
 from augment.suite.suite_file import SUITE_FILE, SuiteFile, hash_file, read_suite_file
 
 # Files that are read at a time.
 _NUM_READS = 8
+# Folders that hold no file of a suite: the jobs' state, and copies of datasets.
+_OTHER_FOLDERS = (f"{STATE_FOLDER}/", f"{MIRROR_FOLDER}/")
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ def verify_suite(store: Store) -> Verification:
 
     with ThreadPoolExecutor(_NUM_READS, thread_name_prefix="hashes") as pool:
         digest_by_path = dict(zip(paths, pool.map(digest_of, paths), strict=True))
-    stored_paths = [path for path in store.list("") if not path.startswith(f"{STATE_FOLDER}/")]
+    stored_paths = [path for path in store.list("") if not path.startswith(_OTHER_FOLDERS)]
     return Verification(
         suite_file,
         changed=tuple(
