@@ -35,3 +35,7 @@ class MetricError(ClimateGSError):
 
 class LampError(ClimateGSError):
     """A lamp, or a file that describes one, cannot be used as it is."""
+
+
+class ScoreError(ClimateGSError):
+    """Predictions, a baseline or a suite cannot be scored as they are."""

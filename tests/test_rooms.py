@@ -55,6 +55,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "view": ("augment.view",),
     "reconstruct": ("augment.reconstruct",),
     "dataset": ("augment.dataset",),
+    "scores": ("augment.scores",),
     "jobs": ("augment.jobs",),
     "suite": ("augment.suite",),
     "adapters": ("adapters",),

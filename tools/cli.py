@@ -300,6 +300,65 @@ class SuiteProbeOptions(Command):
         return show_probes(self.out, self.variant)
 
 
+class SuiteSearchOptions(SceneCommand):
+    """Find the mildest weather at which a detector breaks, by halving a physical number.
+
+    Each number is rendered into a folder OUT/EFFECT-NUMBER, on which the command is run
+    (docs/suite.md).
+
+    Args:
+        scenes: Scenes, as for `climategs suite weather-c`.
+        effect: fog, rain, snowfall, snow, flood or lens: an effect whose levels are one number.
+        until: The condition: SCORE<NUMBER, with <, <=, > or >=.
+        command: A program with its arguments; the folder is added to them. The last line that it
+            prints must be a JSON object of scores, such as {"recall": 0.48}.
+        out: A folder for the images. Run it again to go on after an interruption.
+        mildest: Where to begin. Level 1 by default.
+        harshest: Where to end. Level 5 by default.
+        tolerance: Width of the interval, relative, at which the search ends.
+        max_evaluations: At most so many numbers.
+        frames: Frame numbers, as for render.
+        cameras: Camera names separated by commas, or all; as for render.
+        scale: Resolution relative to the recorded.
+        workers: Processes. 1 renders in this one.
+        backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU.
+        overrides: Replace a field of render or output, as for `climategs suite weather-c`.
+        json_file: Also write the result and all evaluations to this file.
+    """
+
+    scenes: Positional[
+        Annotated[
+            tuple[str, ...], arg(metavar="SCENE [SCENE ...]", help_behavior_hint="(required)")
+        ]
+    ]
+    effect: str
+    until: str
+    command: str
+    out: Annotated[Path, _local("the command reads a folder on this machine")]
+    mildest: Annotated[float, Field(gt=0)] | None = None
+    harshest: Annotated[float, Field(gt=0)] | None = None
+    tolerance: Annotated[float, Field(gt=0, lt=10)] = 0.05
+    max_evaluations: Annotated[int, Field(ge=5)] = 24
+    frames: Annotated[str, AfterValidator(_check_frames)] = "all"
+    cameras: str = FITTED
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    workers: Count = 1
+    backend: Backend = "auto"
+    overrides: Overrides = ()
+    json_file: JsonFile = None
+
+    @model_validator(mode="after")
+    def _names_scenes(self) -> Self:
+        if not self.scenes:
+            raise ValueError("no scene is named: climategs suite search SCENE --out OUT")
+        return self
+
+    def run(self) -> int:
+        from tools.search import search_suite
+
+        return search_suite(self)
+
+
 class InspectOptions(SceneCommand):
     """Show what is in a scene: Gaussians, actors, cameras, frames, LiDAR, labels, problems.
 
@@ -630,6 +689,81 @@ class LabelsOptions(Command):
         return 0
 
 
+class ScoreCommand(Command):
+    """Score a detector or a segmentation network on a robustness suite (docs/score.md).
+
+    Nothing is scored unless everything fits: images, categories, variants, the probe of the loader,
+    the baseline.
+
+    Args:
+        out: A folder or URI in which a suite was rendered.
+        predictions: A folder with a folder of predictions for each variant: results.json (COCO or
+            nuScenes), kitti/000000.txt or semantic/000000.png, and meta.json.
+        baseline: Predictions of a baseline, or the JSON of its scores.
+        effects: Names of effects separated by commas, or all.
+        categories: Categories and the labels that belong to them, as in Car=vehicle.car
+            Truck=vehicle.* (the first that takes a label counts). By default every label is one.
+        kitti_view: KITTI's AP by overlaps in the image, from above, or in space.
+        kitti_difficulty: Objects that count for KITTI's AP.
+        nuscenes: The folder of nuScenes, for NDS by nuscenes-devkit.
+        nuscenes_version: The version of its tables.
+        nuscenes_split: The split whose samples the predictions have.
+        truth: Write the truth of each variant as a COCO file into this folder, with the numbers of
+            images and categories, and score nothing.
+        html: The page to write. By default PREDICTIONS/score.html.
+        json_file: Also write the scores to this file; it serves as a baseline.
+    """
+
+    out: Positional[str]
+    predictions: Path | None = None
+    baseline: Path | None = None
+    effects: str = "all"
+    categories: tuple[str, ...] = ()
+    kitti_view: Literal["bbox", "bev", "3d"] = "bbox"
+    kitti_difficulty: Literal["easy", "moderate", "hard"] = "moderate"
+    nuscenes: Path | None = None
+    nuscenes_version: str = "v1.0-trainval"
+    nuscenes_split: str = "val"
+    truth: Path | None = None
+    html: Path | None = None
+    json_file: JsonFile = None
+
+    @model_validator(mode="after")
+    def _names_predictions(self) -> Self:
+        if self.predictions is None and self.truth is None:
+            raise ValueError("no predictions are named: climategs score OUT --predictions FOLDER")
+        return self
+
+    def run(self) -> int:
+        from tools.score import score_predictions, write_truth
+
+        return score_predictions(self) if self.truth is None else write_truth(self)
+
+
+class TagsOptions(Command):
+    """Say an output's weather in the classes and words of standards: OSI, OpenSCENARIO, OpenLABEL.
+
+    Each variant has one entry; each frame, where its weather changes over time (docs/tags.md).
+
+    Args:
+        out: A folder that `climategs render` or `generate` wrote.
+        format: csv: a table of all numbers and classes. osi: EnvironmentalConditions of ASAM OSI as
+            JSON. openscenario: a catalog of Environments, XML 1.2. openlabel: OpenLABEL 1.0.0.
+        file: Write to this file instead of printing.
+    """
+
+    out: Positional[Annotated[Path, _local("copy manifest.parquet and the recipe.yaml files here")]]
+    format: Literal["csv", "osi", "openscenario", "openlabel"] = "csv"
+    file: Path | None = None
+
+    def run(self) -> int:
+        from tools.tags import write_tags
+
+        text = write_tags(self.out, self.format, self.file)
+        print(text if self.file is None else f"wrote {self.file}\n", end="")
+        return 0
+
+
 class ApplyOptions(SceneCommand):
     """Write a scene in the colours of a photograph or a preset, with a picture of both beside it.
 
@@ -707,12 +841,14 @@ COMMANDS = {
     "sheet": SheetOptions,
     "report": ReportOptions,
     "evaluate": EvaluateOptions,
+    "score": ScoreCommand,
     "bench": bench,
     "demo": demo,
     "style": style,
     "export": ExportOptions,
     "mirror": MirrorOptions,
     "labels": LabelsOptions,
+    "tags": TagsOptions,
 }
 # Commands of commands, which take over where the first word names one.
 GROUPS = {
@@ -722,6 +858,7 @@ GROUPS = {
         "plan": SuitePlanOptions,
         "verify": SuiteVerifyOptions,
         "probe": SuiteProbeOptions,
+        "search": SuiteSearchOptions,
     },
 }
 

@@ -165,8 +165,8 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
     gallery = Gallery(finished, clear_draws, cameras, files, Shares.of(images), is_beside)
     sample_recipes = evenly(with_images, MAX_RECIPES)
     number_spreads = spreads(draws)
-    environment = _environment()
-    style, script = (_asset(environment, name) for name in ("report.css", "report.js"))
+    environment = make_environment()
+    style, script = (page_asset(environment, name) for name in ("report.css", "report.js"))
     # Dictionaries keep their order: in this one files are read, and noted where they are damaged.
     facts = {
         "name": _name_of(store),
@@ -208,7 +208,8 @@ def visible_text(value: object) -> object:
     return _INVISIBLE.sub("\ufffd", text)
 
 
-def _environment() -> Environment:
+def make_environment() -> Environment:
+    """Return jinja's environment of HTML pages: every value is escaped and cut."""
     environment = Environment(
         loader=PackageLoader("tools"),
         autoescape=True,
@@ -229,7 +230,8 @@ def _environment() -> Environment:
     return environment
 
 
-def _asset(environment: Environment, name: str) -> Markup:
+def page_asset(environment: Environment, name: str) -> Markup:
+    """Return the text of a template file, such as a style sheet, that is not escaped."""
     return Markup(environment.loader.get_source(environment, name)[0])
 
 

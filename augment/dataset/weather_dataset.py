@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import tempfile
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -50,6 +51,7 @@ from augment.output.manifest import OK, concat_rows, read_manifest_rows, weather
 from augment.output.names import resolve_inside
 from augment.output.store import Store, StoredFileMissing, open_store
 from augment.output.tables import read_boxes, read_lidar
+from recipes.tags import CLASS_COLUMNS
 
 pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import
 
@@ -444,8 +446,9 @@ class WeatherDataset(Dataset):
     Args:
         root: where jobs have written or are writing: a path, a URI (`s3://bucket/fog`), or an open
             store; or a list of them.
-        where: Arrow expression over the manifest's columns, such as
-            `pyarrow.compute.field("smog_extinction_per_m") > 0.02`.
+        where: Arrow expression over the manifest's columns, numbers and tags, such as
+            `pyarrow.compute.field("smog_extinction_per_m") > 0.02`, or
+            `pyarrow.compute.field("osi_fog").isin(["thick", "dense"])`.
         scenes: names of the scenes to keep; None for all.
         variants: names of the variants to keep; None for all.
         cameras: names of the cameras to keep; None for all.
@@ -461,9 +464,10 @@ class WeatherDataset(Dataset):
     Raises:
         OutputError: no finished output folder; later, from indexing, a file that is missing,
             damaged, or outside the folder.
-        ValueError: a name in a filter that no manifest has, an unknown option, no root, or what
-            `load` asks for is there for some variants and not for others (the masks of water and
-            snow excepted, which only such weather has): batches would not stack.
+        ValueError: a name in a filter that no manifest has, a tag in `where` that rows of older
+            versions lack, an unknown option, no root, or what `load` asks for is there for some
+            variants and not for others (the masks of water and snow excepted, which only such
+            weather has): batches would not stack.
     """
 
     def __init__(
@@ -572,11 +576,34 @@ def _read_rows(
             raise ValueError(f"{', '.join(uris)}: no {name} {unknown}; finished are: {message}")
         mask = pc.and_(mask, pc.is_in(rows[name], pa.array(list(values), finished_values.type)))
     if where is not None:
+        _check_has_tags(rows, finished, where, uris)
         columns = {"fits": where}
         fits = pyarrow.dataset.dataset(table).scanner(columns, use_threads=False).to_table()["fits"]
         mask = pc.and_(mask, fits.fill_null(False).combine_chunks())
     mask = mask.to_numpy(zero_copy_only=False)
     return rows if mask.all() else rows.take(mask)
+
+
+def _check_has_tags(rows: Rows, finished: Any, where: Expression, uris: list[str]) -> None:
+    """Raise ValueError if a filter names a class of weather that finished rows lack.
+
+    Such rows are older than the columns, and would be left out in silence.
+
+    Args:
+        rows: all rows.
+        finished: Arrow mask of the finished rows, [N].
+        where: the filter.
+        uris: the outputs.
+    """
+    names = set(re.findall(r"\w+", re.sub(r'"[^"]*"', "", str(where))))
+    for name in CLASS_COLUMNS:
+        if name in names and (num_lacking := rows[name].filter(finished).null_count):
+            raise ValueError(
+                f"where asks for {name}, and {num_lacking} of {pc.sum(finished).as_py()} finished "
+                f"images of {', '.join(uris)} have none: an older version wrote them. "
+                f"Filter by numbers, such as smog_extinction_per_m; `climategs tags` lists the "
+                f"tags of any output"
+            )
 
 
 def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:

@@ -303,6 +303,7 @@ def _in_heights(smog: Smog | None, scene: Scene, seed: int) -> tuple[Fog | None,
             math.radians(smog.wind_from_deg),
             smog.drift_m or 0.0,
             bank_seed(seed, scene.name),
+            (float(scene.world_origin_m[0]), float(scene.world_origin_m[1])),
         )
         reason += f", in banks of {smog.bank_m:g} m, patchiness {smog.patchiness:g}"
     fog = Fog(

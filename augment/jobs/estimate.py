@@ -54,7 +54,7 @@ def estimate_job(
     on_recipe: Callable[[str], None] = lambda name: None,
     max_sampled: int = MAX_SAMPLED,
 ) -> Estimate:
-    """Estimate time and size of a job from two pictures of each recipe.
+    """Estimate time and size of a job from two to four pictures of each recipe.
 
     The estimate is right to within a factor of about two. Both pictures show the middle frame of
     the recipe's first scene in one camera, and their cost is scaled by the pixels of the job. The
@@ -107,30 +107,39 @@ def _megapixels(plan: JobPlan) -> tuple[dict[str, float], dict[str, int]]:
 
 
 def _sample(block: Block, loader: SceneLoader, plan: JobPlan) -> Sample:
-    """Render the block's middle frame twice and return its cost."""
+    """Render the block's middle frame twice and return its cost.
+
+    Of a recipe that changes over time the second run has the first and the last frame, too.
+    """
     record = plan.records[block.scene]
     camera = block.cameras[0]
     frame_numbers = [f.number for f in record.frames if camera in f.cameras]
     pictured = next(p for p in block.list_images(record) if p.camera == camera)
     megapixels = pictured.width * pictured.height / 1e6
+    middle = frame_numbers[len(frame_numbers) // 2]
+    last_frames = [middle]
+    if block.recipe.changes_over_time:
+        last_frames = sorted({frame_numbers[0], middle, frame_numbers[-1]})
     picture_times_s = []
-    num_bytes = 0
+    num_bytes = 0.0
     with tempfile.TemporaryDirectory(prefix="climategs-estimate-") as folder:
-        for output_dir in (Path(folder) / "0", Path(folder) / "1"):
+        runs = {Path(folder) / "0": [middle], Path(folder) / "1": last_frames}
+        for output_dir, frames in runs.items():
             job = RenderJob(
                 block.uri,
                 [block.recipe],
                 output_dir,
-                frames=[frame_numbers[len(frame_numbers) // 2]],
+                frames=frames,
                 cameras=[camera],
                 backend=plan.backend,
                 shared_files_dir=Path(folder) / "shared",
             )
             start_s = time.perf_counter()
             run_job(job, scene_loader=loader, progress=False)
-            picture_times_s.append(time.perf_counter() - start_s)
+            picture_times_s.append((time.perf_counter() - start_s) / len(frames))
             files = [p for p in output_dir.rglob("*") if p.is_file()]
-            num_bytes = sum(p.stat().st_size for p in files if STATE_FOLDER not in p.parts)
+            sizes = [p.stat().st_size for p in files if STATE_FOLDER not in p.parts]
+            num_bytes = sum(sizes) / len(frames)
     return Sample(
         picture_times_s[1] / megapixels,
         num_bytes / megapixels,

@@ -39,6 +39,7 @@ from recipes.fields import section_at
 from recipes.moment import SceneTimes
 from recipes.schema import KNOBS, SECTIONS, Recipe, columns_of_effects, settings_of
 from recipes.speed import former_path
+from recipes.tags import CLASS_COLUMNS, NUMBER_COLUMNS, columns_of_tags
 
 # Status of an image whose files are complete.
 OK = "ok"
@@ -88,6 +89,8 @@ def leading_columns() -> dict[str, pa.DataType]:
         **dict.fromkeys(("base", "surface", "lidar", "lidar_note", *text_columns, "quality"), text),
         **{"render_scale": pa.float64(), "settings": text, "source_digest": text},
         **{"weather_time_s": pa.float64(), "timeline_values": text},
+        **dict.fromkeys(NUMBER_COLUMNS, pa.float64()),
+        **dict.fromkeys(CLASS_COLUMNS, text),
         **dict.fromkeys(mask_share_columns().values(), pa.float64()),
         **dict.fromkeys(measured_columns(), pa.float64()),
     }
@@ -753,6 +756,7 @@ def moment_columns(
     values = {timeline.path: section_at(state, timeline.path) for timeline in recipe.timelines}
     return {
         **state.columns(),
+        **columns_of_tags(state),
         "weather_time_s": recipe.weather_time_s(scene_times, timestamp_ns),
         "timeline_values": json.dumps(values, separators=(",", ":")) if values else None,
     }
@@ -778,6 +782,7 @@ def recipe_columns(recipe: Recipe) -> dict[str, str | float | None]:
         "base": recipe.render.base,
         "surface": recipe.output.surface,
         **recipe.columns(),
+        **columns_of_tags(recipe),
         "quality": quality_words,
         "render_scale": recipe.render.scale,
         "settings": settings,

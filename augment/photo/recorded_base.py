@@ -824,6 +824,8 @@ class Photo:
         lengths = camera.ray_lengths(device=device)
         surface_depth = image_optical_depth(fog, camera, depth, backend=self.backend)
         surface_transmittance = torch.exp(-surface_depth)
+        if fog.banks is not None and bool((alpha >= 1).all()):  # no background has to be looked up
+            return self.sharpen(self.align_edges(surface_transmittance, alpha, depth))
         background_depth = sky_image_depth(fog, camera, -fall / lengths, backend=self.backend)
         if self.height_m is not None:
             road_m = self.height_m / fall.clamp_min(MIN_ROAD_FALL)

@@ -52,6 +52,8 @@ H_MAX_CLIMB = 14
 H_SHAPE = 15
 # Numbers of the head.
 HEAD = 18
+# Largest depth that is looked up, metres: beyond every table.
+FARTHEST_M = 1e7
 # Step of a ray near the eye, in lattice steps of the last octave.
 STEP = 0.5
 # Growth of the steps with the distance.
@@ -371,10 +373,11 @@ def look_up_image(table, lens, depth, out):
         mean_row = np.empty(padded, np.float32)
         rows = np.empty(4 * NUM_LANES, np.float32)
         half = np.float32(0.5)
+        farthest = v8.broadcast(np.float32(FARTHEST_M))
         v = v8.broadcast((np.float32(i) + half - lens[3]) * lens[1])
         for first in range(Index(0), Index(padded), Index(NUM_LANES)):
             u = v8.broadcast(np.float32(first) + half - lens[2]) + v8.lane_numbers()
-            z = v8.load(z_row, first)
+            z = v8.minimum(v8.load(z_row, first), farthest)
             x = u * v8.broadcast(lens[0]) * z
             write_log_means(table, x, v * z, z, rows, Index(3 * NUM_LANES))
             v8.store(mean_row, first, exp2_fine(v8.load(rows, Index(3 * NUM_LANES))))

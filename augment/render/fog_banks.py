@@ -56,6 +56,8 @@ class FogBanks:
     wind_from_rad: direction that the wind comes from, radians from world +x towards +y.
     drift_m: way of the field along the wind since the scene's start, metres.
     seed: seed of the field.
+    origin_m: x and y of the scene world's origin in the dataset's world, metres. The field is fixed
+        to the latter, so that it does not depend on which frames of a drive are opened.
     """
 
     patchiness: float
@@ -63,6 +65,7 @@ class FogBanks:
     wind_from_rad: float
     drift_m: float
     seed: int
+    origin_m: tuple[float, float] = (0.0, 0.0)
 
     @property
     def finest_m(self) -> float:
@@ -83,13 +86,14 @@ class FogBanks:
         sin = math.sin(self.wind_from_rad)
         axes = np.array([[cos, sin], [-sin, cos]])  # along the wind, and across it
         air_way_m = -self.drift_m * axes[0]  # air that comes from +x moves towards -x
+        start_m = np.array(self.origin_m) - air_way_m
         steps_m = self.bank_m / LACUNARITY ** np.arange(NUM_OCTAVES)
         for octave, step_m in enumerate(steps_m):
             turn = octave * TURN_RAD
             turned = [[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]
             matrix = turned @ np.diag([1 / (ASPECT * step_m), 1 / step_m]) @ axes
             rows[octave, :4] = matrix.reshape(-1)
-            rows[octave, 4:6] = _origins(self.seed)[0][octave] - matrix @ air_way_m
+            rows[octave, 4:6] = _origins(self.seed)[0][octave] + matrix @ start_m
             rows[octave, 6] = amplitudes[octave]
         return rows
 

@@ -20,11 +20,9 @@ from augment.render.fog import (
     optical_depth_numpy,
     sky_optical_depth,
 )
+from augment.render.fog_bank_kernels import FARTHEST_M
 from augment.render.fog_table import image_means, point_means, point_means_numpy
 from augment.scene.cameras import Camera
-
-# Distance at which points of the sky are looked up, metres: beyond every table.
-SKY_M = 1e7
 
 
 def image_optical_depth(
@@ -83,7 +81,7 @@ def sky_ray_depth(
     tau = sky_optical_depth(fog, directions[..., 2], float(camera.centre[2]))
     if fog.banks is None:
         return tau
-    return tau * point_means(fog, camera, directions * SKY_M)
+    return tau * point_means(fog, camera, directions * FARTHEST_M)
 
 
 def sky_image_depth(
@@ -114,7 +112,7 @@ def sky_image_means(
         like: an image of the type and device of the result.
         backend: as in `image_means`.
     """
-    return image_means(fog, camera, torch.full_like(like, SKY_M), backend=backend)
+    return image_means(fog, camera, torch.full_like(like, FARTHEST_M), backend=backend)
 
 
 def plain_fog_depth(

@@ -41,6 +41,8 @@ HEADING_STEP = 0.3
 MIN_HEADINGS = 48
 # Largest number of headings that are integrated.
 MAX_HEADINGS = 480
+# The same in fog that thins with height, whose table has many climbs.
+MAX_LAYERED_HEADINGS = 240
 # Headings of the table for each that is integrated.
 REFINEMENT = 3
 # Nodes of the table per doubling of the distance.
@@ -89,7 +91,7 @@ def bank_table(fog: Fog, camera: Camera) -> BankTable:
     return _table(plain, pose[:3].tobytes())
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=8)
 def _table(fog: Fog, pose_bytes: bytes) -> BankTable:
     """Return the table for a camera's pose [3, 4]; a pure function, so that it may be kept."""
     pose = np.frombuffer(pose_bytes).reshape(3, 4)
@@ -102,7 +104,7 @@ def _table(fog: Fog, pose_bytes: bytes) -> BankTable:
     return BankTable(numbers, logs.shape)
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=8)
 def _log_means(fog: Fog, x_m: float, y_m: float) -> tuple[tuple[float, ...], np.ndarray]:
     """Return the head's numbers from H_PER_M on, and log2 of the means, of an eye's place."""
     banks = fog.banks
@@ -168,7 +170,8 @@ def _num_headings(fog: Fog) -> int:
     assert fog.banks is not None
     resolved_m = min(RESOLVED_DEPTH / max(fog.extinction_per_m, 1e-9), far_distance(fog))
     count = 2 * math.pi * resolved_m / (HEADING_STEP * fog.banks.finest_m)
-    return 4 * math.ceil(min(max(count, MIN_HEADINGS), MAX_HEADINGS) / 4)
+    limit = MAX_HEADINGS if fog.scale_height_m is None else MAX_LAYERED_HEADINGS
+    return 4 * math.ceil(min(max(count, MIN_HEADINGS), limit) / 4)
 
 
 def _climbs(fog: Fog) -> tuple[float, np.ndarray]:
@@ -243,7 +246,7 @@ def image_means(
             kernels.look_up_image(table.numbers, lens, depth.detach().contiguous().numpy(), out)
         return torch.from_numpy(out)
     rays = camera.ray_directions(depth.dtype, depth.device)
-    return look_up(table, rays * depth[..., None])
+    return look_up(table, rays * depth.clamp_max(kernels.FARTHEST_M)[..., None])
 
 
 def point_means(fog: Fog, camera: Camera, offsets: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:

@@ -29,6 +29,7 @@ from augment.output.store import Store, StoredFileMissing
 from recipes.job import scaled_recipe
 from recipes.schema import Recipe
 from recipes.suite import CLEAN, Suite, SuiteVariant
+from recipes.tags import columns_of_tags
 
 # Name of the file.
 SUITE_FILE = "suite.json"
@@ -62,7 +63,7 @@ class VariantFacts(_Closed):
     folder: str
     """Name of the variant's folder in each scene's folder."""
     numbers: dict[str, float | str]
-    """Numbers of the weather, by the manifest's columns."""
+    """Numbers of the weather and its classes by standards, by the manifest's columns."""
     recipe: dict[str, Any]
     """Recipe in numbers, without its seed."""
     seeds: dict[str, int]
@@ -311,8 +312,8 @@ def _variant_facts(request: SuiteRequest, name: str, rows: list[dict[str, Any]])
 
 
 def _numbers_of(recipe: Recipe) -> dict[str, float | str]:
-    """Return the numbers of a recipe's weather by column, without those that are not there."""
-    columns = recipe.columns().items()
+    """Return numbers and tags of a recipe's weather by column, without those that are not there."""
+    columns = {**recipe.columns(), **columns_of_tags(recipe)}.items()
     # NaN, which no JSON has, stands for an absent effect.
     return {name: value for name, value in columns if value is not None and value == value}
 

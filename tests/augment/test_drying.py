@@ -116,6 +116,16 @@ def test_a_film_that_has_never_been_larger_is_even():
     assert float(wetness[0]) == pytest.approx(0.8) and float(mirror[0]) == 1
 
 
+def test_first_drops_leave_dry_ground_between_them():
+    rank = torch.full((2,), 0.5)
+    zero = torch.zeros(2)
+    spots = torch.tensor([0.0, 1.0])
+    for film_mm, darkest in ((0.01, 0.02), (0.03, 0.1)):
+        film = RoadFilm(film_mm, film_mm, 1.0, 1.0, 0.0, 0.5)
+        wetness, _ = local_water(film, rank, zero, spots, zero)
+        assert float(wetness[0]) < darkest and float(wetness[1]) == 1
+
+
 def test_wheels_dry_their_tracks_and_puddles_stay():
     rank = torch.full((3,), 0.6)
     track = torch.tensor([0.0, 1.0, 0.0])

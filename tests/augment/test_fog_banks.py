@@ -108,6 +108,16 @@ def test_banks_drift_with_the_wind_and_do_not_change():
         )
 
 
+def test_the_field_is_fixed_to_the_datasets_world():
+    """Scenes of the same drive may have other origins, by the frames that are opened."""
+    places = np.random.default_rng(2).uniform(-500, 500, (500, 2))
+    far = replace(PATCHY, origin_m=(448_262.0, 4_421_337.0))
+    moved = replace(PATCHY, origin_m=(448_200.0, 4_421_300.0))
+    np.testing.assert_allclose(
+        bank_density(far, places), bank_density(moved, places + np.array([62.0, 37.0])), rtol=1e-6
+    )
+
+
 def test_banks_are_longer_along_the_wind():
     banks = replace(PATCHY, wind_from_rad=0.0, bank_m=100.0)
     places = np.random.default_rng(3).uniform(-1e5, 1e5, (50_000, 2))

@@ -240,6 +240,17 @@ def test_drops_touch_the_picture_alone_and_none_of_its_bits_without_drops():
     assert all(not s.runs for steps in why.values() for s in steps if s.name == "lens drops")
 
 
+def test_drops_by_the_share_of_the_picture_need_no_rain():
+    scene = open_street(LABELLED_STREET)
+    view = next(iter(scene.frames[0].cameras.values()))
+    shares = []
+    for share in (0.05, 0.35):
+        recipe = Recipe(camera=Sensor(lens_drops=LensDrops(share=share)))
+        rendered = render_view(scene, view, recipe)
+        shares.append((rendered.masks["lens_drops"] == 255).mean())
+    assert 0 < shares[0] < shares[1]
+
+
 def test_fields_are_limited_and_old_hashes_stay():
     for wrong in (
         {"count": -1}, {"count": 501}, {"count": 2.5}, {"count": 3, "radius_mm": 0},

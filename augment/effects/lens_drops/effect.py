@@ -50,16 +50,19 @@ class LensDropsEffect(Effect):
         why = ""
         if drops is None or not drops.has_effect:
             absent = "the recipe has no drops on the lens"
-            why = absent if drops is None else "camera.lens_drops has no drops"
+            why = absent if drops is None else "camera.lens_drops says that there are none"
         elif drops.count is None and drops.share is None and rate_mm_h == 0:
             why = "camera.lens_drops.count is null, and there is no rain"
         if drops is None or why:
             return EffectPlan(None, skipped_steps((ON_GLASS,), why, PICTURE))
         blur_mrad = 2000 * drops.aperture_m / drops.glass_m
-        many = f"{rate_mm_h:g} mm/h of" if drops.count is None else f"{drops.count}"
-        many = many if drops.share is None else f"{drops.share:.0%} of the picture behind"
+        number = f"{rate_mm_h:g} mm/h of"
+        if drops.count is not None:
+            number = f"{drops.count}"
+        elif drops.share is not None:
+            number = f"{100 * drops.share:g} % of the picture behind"
         why = (
-            f"{many} drops about {drops.radius_mm:g} mm in radius, {drops.glass_m:g} m "
+            f"{number} drops about {drops.radius_mm:g} mm in radius, {drops.glass_m:g} m "
             f"before the lens, blurred over {blur_mrad:.3g} mrad; "
         )
         why += "never wiped" if drops.wiper_s is None else f"wiped every {drops.wiper_s:g} s"

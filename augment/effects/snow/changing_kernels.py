@@ -14,7 +14,7 @@ from numba import prange
 
 from augment.effects.snow.layer_kernels import MIN_DEPTH_M
 from augment.effects.snow.traffic import SATURATION
-from augment.render.cpu.jit import kernel, kernel_function
+from augment.render.cpu.jit import kernel, kernel_function, serial_kernel
 from augment.render.sh import SH_C0
 
 # ---- Constants of the share and depth; all are judgement -----------------------------------------
@@ -190,6 +190,12 @@ def scale_splats(runs, laid, floors, cell_ids, cells, state, tables, shares, sca
         _scale_run(runs[r], laid, floors, cell_ids, cells, state, tables, shares, scaled)
 
 
+@serial_kernel
+def scale_few_splats(run, laid, floors, cell_ids, cells, state, tables, shares, scaled):
+    """Write the Gaussians of one run, int64 [3], as `scale_splats` does, without other threads."""
+    _scale_run(run, laid, floors, cell_ids, cells, state, tables, shares, scaled)
+
+
 @kernel_function()
 def _scale_run(run, laid, floors, cell_ids, cells, state, tables, shares, scaled):
     """Write the Gaussians of one run."""
@@ -294,6 +300,16 @@ def fade_buried(
             laid_opacities,
             opacities,
         )
+
+
+@serial_kernel
+def fade_few_buried(
+    run, hideable_ids, covering_cells, cells, state, tables, shares, laid_opacities, opacities
+):
+    """Fade the Gaussians of one run, int64 [2], as `fade_buried` does, without other threads."""
+    _fade_run(
+        run, hideable_ids, covering_cells, cells, state, tables, shares, laid_opacities, opacities
+    )
 
 
 @kernel_function()

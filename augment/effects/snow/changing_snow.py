@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -44,7 +44,9 @@ from augment.effects.snow.changing_kernels import (
     SnowState,
     SnowTables,
     fade_buried,
+    fade_few_buried,
     find_cell_depths,
+    scale_few_splats,
     scale_splats,
 )
 from augment.effects.snow.depth import (
@@ -89,6 +91,7 @@ _BAND_DEPTH_M = 0.01
 _ONSET_DEPTH_M = 0.0002
 _NUM_SMOOTHING_STEPS = 4  # steps that even out the borders of roads and grass
 _CHUNK_M = 3.0  # side of the squares in which the layer is tested for views
+_MAX_FEW = 4096  # largest number of Gaussians for which waking other threads costs more
 _RUNS_PER_TASK = 4  # runs that a thread takes at a time
 # Largest depth over the laid depth; more is scaled, and its boxes are not tested.
 _MAX_TESTED_SCALE = 1.5
@@ -153,18 +156,13 @@ class ChangingPart:
         tensors = [torch.empty(total if len(array) else 0, *array.shape[1:]) for array in laid]
         scaled = LaidSplats(*(tensor.numpy() for tensor in tensors))
         shares = np.full(len(self.cells.noise), -1, np.float32)
-        with kernel_threads(_RUNS_PER_TASK):
-            scale_splats(
-                np.concatenate([runs, firsts[:, None]], 1),
-                laid,
-                self.floors,
-                self.cell_ids,
-                self.cells,
-                state,
-                _tables(),
-                shares,
-                scaled,
-            )
+        numbers = (laid, self.floors, self.cell_ids, self.cells, state, _tables(), shares, scaled)
+        if total > _MAX_FEW:
+            with kernel_threads(_RUNS_PER_TASK):
+                scale_splats(np.concatenate([runs, firsts[:, None]], 1), *numbers)
+        else:
+            for (first, end), place in zip(runs.tolist(), firsts.tolist(), strict=True):
+                scale_few_splats(np.array([first, end, place]), *numbers)
         means, quats, scales, opacities, sh, normals, slopes = map(torch.from_numpy, scaled)
         classes = torch.from_numpy(np.full(total, int(SemanticClass.SNOW), np.int16))
         return PartSnow(
@@ -184,18 +182,22 @@ class ChangingPart:
             return self.opacities
         laid = self.opacities.detach().numpy()
         faded = laid.copy()
-        with kernel_threads(_RUNS_PER_TASK):
-            fade_buried(
-                runs,
-                self.hideable_ids,
-                self.covering_cells,
-                self.cells,
-                state,
-                _tables(),
-                shares,
-                laid,
-                faded,
-            )
+        numbers = (
+            self.hideable_ids,
+            self.covering_cells,
+            self.cells,
+            state,
+            _tables(),
+            shares,
+            laid,
+            faded,
+        )
+        if len(self.hideable_ids) > _MAX_FEW:
+            with kernel_threads(_RUNS_PER_TASK):
+                fade_buried(runs, *numbers)
+        else:
+            for run in runs:
+                fade_few_buried(run, *numbers)
         return torch.from_numpy(faded)
 
     def _crystals_at(self, state: SnowState) -> Crystals | None:
@@ -255,19 +257,29 @@ class ChangingLayers:
     road_water: RoadWater | None
     """Water on roads; None without any."""
 
-    def at(self, snow: Snow, cameras: Sequence[Camera] | None = None) -> SnowLayers:
+    def at(
+        self,
+        snow: Snow,
+        cameras: Sequence[Camera] | None = None,
+        track_ids: Container[str] | None = None,
+    ) -> SnowLayers:
         """Return the snow of a recipe at a moment, without the water on roads.
 
         Args:
             snow: the recipe's snow at the moment.
             cameras: cameras that see the ground; None for the whole scene.
+            track_ids: actors whose snow is in view; None for all.
         """
         state = state_of(snow)
         is_tested = max(state.scale, state.road_scale) <= _MAX_TESTED_SCALE
         return dataclasses.replace(
             self.laid,
             ground=self.ground.at(state, cameras if is_tested else None),
-            actors={name: part.at(state, None) for name, part in self.actors.items()},
+            actors={
+                name: part.at(state, None)
+                for name, part in self.actors.items()
+                if track_ids is None or name in track_ids
+            },
             thickness_m=snow.depth_m,
         )
 
@@ -501,13 +513,13 @@ def _lay_part(
     cell_ids = np.repeat(np.arange(len(cells), dtype=np.int32), counts)
     floors = cells.centers_m.numpy()[cell_ids, 2].copy()
     means = laid.gaussians.means.numpy()
-    order, splat_rows = _by_squares(means)
+    order, splat_rows = _by_squares(means, math.inf if moves else _CHUNK_M)
     laid = _in_deep_tones(_in_order(laid, order), depths.depths_m[cell_ids[order]])
     cell_ids = cell_ids[order]
     floors = floors[order]
     hideable_ids, covering_cells = as_arrays(cells.hideable_ids, cells.covering_cells)
     buried_means = gaussians.means.detach().numpy()[hideable_ids]
-    buried_order, buried_rows = _by_squares(buried_means)
+    buried_order, buried_rows = _by_squares(buried_means, math.inf if moves else _CHUNK_M)
     hideable_ids = hideable_ids[buried_order]
     scales = gaussians.scales.detach().numpy()[hideable_ids]
     part = ChangingPart(
@@ -606,11 +618,18 @@ def _road_water(
     return None if everywhere is None or in_tracks is None else RoadWater(everywhere, in_tracks)
 
 
-def _by_squares(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the order of points by squares of the ground, and each square's rows [K, 2]."""
+def _by_squares(means: np.ndarray, side_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the order of points by squares of the ground, and each square's rows [K, 2].
+
+    Args:
+        means: the points, [N, 3].
+        side_m: side of the squares; infinite for one.
+    """
     if not len(means):
         return np.zeros(0, np.int64), np.zeros((0, 2), np.int64)
-    squares = np.floor(means[:, :2] / _CHUNK_M).astype(np.int64)
+    if math.isinf(side_m):
+        return np.arange(len(means)), np.array([[0, len(means)]])
+    squares = np.floor(means[:, :2] / side_m).astype(np.int64)
     numbers = np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1)
     order = np.argsort(numbers, kind="stable")
     ends = np.cumsum(np.bincount(numbers))

@@ -214,8 +214,13 @@ class SnowEffect(Effect):
             view = effect.view_data
             snow_layers = effect.prepared_data
             if isinstance(snow_layers, ChangingLayers):
-                cameras = None if view is None else view.cameras
-                snow_layers = snow_layers.at(effect.settings.snow, cameras)
+                snow = effect.settings.snow
+                if view is None:
+                    snow_layers = snow_layers.at(snow)
+                else:
+                    actors = effect.scene.actors
+                    track_ids = {actors[n - 1].track_id for n in view.owners if n > 0}
+                    snow_layers = snow_layers.at(snow, view.cameras, track_ids)
             parts = snow_layers.parts_for(
                 effect.scene,
                 camera,

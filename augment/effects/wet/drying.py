@@ -35,6 +35,7 @@ from augment.effects.wet import film_kernels
 from augment.effects.wet.darkening import INNER_REFLECTANCE, OUTER_REFLECTANCE
 from augment.effects.wet.film_kernels import (
     DARK_FILM_MM,
+    EVEN_FILM_MM,
     EXPOSURE,
     FIRST_DRY_SHARE,
     HEIGHT,
@@ -94,6 +95,12 @@ class RoadFilm:
     def film_share(self) -> float:
         """Return the film over its peak, 0 to 1."""
         return self.film_mm / self.peak_mm if self.peak_mm > 0 else 0.0
+
+    @property
+    def hit_share(self) -> float:
+        """Return how far a film has reached all places; before that, there are stains alone."""
+        t = min(self.peak_mm / EVEN_FILM_MM, 1.0)
+        return t * t * (3 - 2 * t)
 
     @property
     def track_loss(self) -> float:
@@ -284,7 +291,7 @@ def local_water(
     dry_share = FIRST_DRY_SHARE * (1 - rank.clamp(0, 1))
     film_mm = film.peak_mm * (film.film_share - dry_share).clamp_min(0) / (1 - dry_share)
     film_mm = film_mm * (1 - film.track_loss * track)
-    dark = torch.maximum(_smoothstep(film_mm / DARK_FILM_MM), spots)
+    dark = torch.maximum(film.hit_share * _smoothstep(film_mm / DARK_FILM_MM), spots)
     wetness = torch.maximum(film.film_wetness * dark, film.puddle_wetness * puddle)
     if film.puddle_wetness == 0:
         return wetness, torch.zeros_like(wetness)
@@ -309,7 +316,7 @@ def water_numbers(
         white: result of `darkening.white_level`.
     """
     numbers = (
-        *(film.film_share, film.peak_mm, MAX_FILM_MM, film.film_wetness),
+        *(film.film_share, film.peak_mm, MAX_FILM_MM, film.hit_share, film.film_wetness),
         *(max(film.puddle_wetness, 1e-6), film.track_loss, film.spots, puddle_threshold, white),
         (1 - OUTER_REFLECTANCE) * (1 - INNER_REFLECTANCE),
         INNER_REFLECTANCE,

@@ -753,6 +753,8 @@ DRYING_RANK, PUDDLE_RANK, TRACK, NUM_DRYING_CHANNELS = range(4)
 FIRST_DRY_SHARE = 0.65
 # Film from which on ground is as dark as it gets, mm; assumed.
 DARK_FILM_MM = 0.06
+# Largest film from which on no place is left that no drop has hit, mm; stains cover 99 % at it.
+EVEN_FILM_MM = 0.15
 # Film below which stones of asphalt break the mirror image, mm; assumed.
 MATT_FILM_MM = 0.04
 # Change of the drying rank per deviation of the coarse and of the fine noise.
@@ -772,6 +774,7 @@ class RoadWaterNumbers(NamedTuple):
     film_share: Any  # film over the largest since the road was dry
     peak_mm: Any  # that largest film, mm
     full_mm: Any  # film of a full road, mm
+    hit_share: Any  # share of the ground that an even film has reached
     film_wetness: Any  # wetness under a full film
     puddle_wetness: Any  # wetness under puddles
     track_loss: Any  # share of the film that wheels have pushed out of their tracks
@@ -891,7 +894,7 @@ def _wet_row(line, width, view, drying, depth, share, water, noise, stains, rgb)
         film = v8.maximum(v8.broadcast(water.film_share) - dry_share, zero) / (ones - dry_share)
         film = film * v8.broadcast(water.peak_mm)
         film = film * (ones - v8.broadcast(water.track_loss) * track)
-        dark = _smoothstep(film * _splat(1 / DARK_FILM_MM))
+        dark = v8.broadcast(water.hit_share) * _smoothstep(film * _splat(1 / DARK_FILM_MM))
         mirror = _smoothstep((film - _splat(MATT_FILM_MM)) * full_mm)
         if has_stains:
             size = across / v8.sqrt(sine)

@@ -1,0 +1,1 @@
+"""Scores of detectors and segmentation networks on a robustness suite. Nothing is rendered here."""

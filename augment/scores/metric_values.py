@@ -1,0 +1,197 @@
+"""A task's metric on some images of a variant: mAP, KITTI's AP, mIoU or NDS.
+
+One class for each kind of predictions, all with the method of `Metric`.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from augment.errors import ScoreError
+from augment.output.codecs import decode_png
+from augment.scene.semantics import SemanticClass
+from augment.scores.coco_metric import coco_average_precision
+from augment.scores.kitti_metric import DIFFICULTIES, KittiView, kitti_average_precision
+from augment.scores.predictions import Predictions
+from augment.scores.semantic_metric import class_overlaps, count_pixels
+from augment.scores.suite_facts import CLEAN_VARIANT, RenderedSuite
+from augment.scores.truth import SuiteTruth
+
+
+class MetricValue(NamedTuple):
+    """A metric's value on some images."""
+
+    value: float
+    """Mean over the categories that have objects, 0 to 1."""
+    by_category: dict[str, float | None]
+    """Value of each category; None where no object counts."""
+
+
+@runtime_checkable
+class Metric(Protocol):
+    """A metric of predictions on images of a suite."""
+
+    @property
+    def name(self) -> str:
+        """Name of the metric, for reports and to compare baselines."""
+        ...
+
+    def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
+        """Return the metric's value on the images of some numbers."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class CocoMetric:
+    """COCO's mAP of boxes."""
+
+    truth: SuiteTruth
+    """True objects."""
+
+    @property
+    def name(self) -> str:
+        """Name of the metric."""
+        return "mAP@[.5:.95] (COCO)"
+
+    def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
+        """Return mAP on the images of some numbers."""
+        precisions = coco_average_precision(
+            [self.truth.images[number] for number in numbers],
+            [predictions.detections[number] for number in numbers],
+            len(self.truth.categories),
+        )
+        return mean_of_categories(precisions, self.truth.categories)
+
+
+@dataclass(frozen=True, eq=False)
+class KittiMetric:
+    """KITTI's AP at 40 recalls."""
+
+    truth: SuiteTruth
+    """True objects."""
+    view: KittiView
+    """Overlap of boxes in the image, from above, or in space."""
+    difficulty: str
+    """Name of the difficulty."""
+
+    @property
+    def name(self) -> str:
+        """Name of the metric."""
+        return f"AP|R40 {self.view} {self.difficulty} (KITTI)"
+
+    def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
+        """Return the mean AP on the images of some numbers.
+
+        Raises:
+            ScoreError: The view needs 3D boxes, and a detection has none.
+        """
+        sizes = np.concatenate([image.boxes_3d[:, 3:6] for image in predictions.detections])
+        without_size = int((~np.all(sizes > 0, axis=1)).sum())
+        if self.view != "bbox" and without_size:
+            raise ScoreError(
+                f"{predictions.folder}: {without_size} of {len(sizes)} detections have no height, "
+                f"width and length above 0, which the view {self.view} needs"
+            )
+        precisions = kitti_average_precision(
+            [self.truth.images[number] for number in numbers],
+            [predictions.detections[number] for number in numbers],
+            self.truth.categories,
+            view=self.view,
+            difficulty=DIFFICULTIES[self.difficulty],
+        )
+        return mean_of_categories(precisions, self.truth.categories)
+
+
+@dataclass(frozen=True, eq=False)
+class SemanticMetric:
+    """Mean intersection over union against the classes of the clean render."""
+
+    suite: RenderedSuite
+    """The suite."""
+    pixel_counts: dict[str, np.ndarray] = field(default_factory=dict)
+    """Counts [images, true class, predicted class] of the predictions that were measured, by their
+    hash."""
+
+    @property
+    def name(self) -> str:
+        """Name of the metric."""
+        return "mIoU"
+
+    def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
+        """Return mIoU on the images of some numbers."""
+        counts = self.count(predictions)[np.asarray(numbers, np.int64)].sum(axis=0)
+        names = [semantic_class.name.lower() for semantic_class in SemanticClass]
+        return mean_of_categories(class_overlaps(counts), names)
+
+    def count(self, predictions: Predictions) -> np.ndarray:
+        """Return the pixels of each true and predicted class, [images, true, predicted].
+
+        Raises:
+            ScoreError: An image is missing, of another size, or has unknown classes.
+        """
+        key = predictions.content_hash
+        if key not in self.pixel_counts:
+            self.pixel_counts[key] = np.stack(
+                [self._count_image(predictions, number) for number in range(len(self.suite.images))]
+            )
+        return self.pixel_counts[key]
+
+    def _count_image(self, predictions: Predictions, number: int) -> np.ndarray:
+        """Return the pixels of an image by true and predicted class."""
+        path = self.suite.rows[CLEAN_VARIANT][number]["semantic_path"]
+        if path is None:
+            raise ScoreError(
+                f"{self.suite.store.uri}: {CLEAN_VARIANT} has no semantic images to compare with; "
+                f"render the suite with --set output.semantic=true"
+            )
+        true_classes = decode_png(self.suite.store.read(path), np.uint8)
+        try:
+            return count_pixels(true_classes, predictions.class_image(number))
+        except ValueError as error:
+            raise ScoreError(f"{predictions.folder}: image {number:06d}: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class NuScenesMetric:
+    """nuScenes detection score, computed by nuscenes-devkit on a whole split."""
+
+    root: Path
+    """Folder of the nuScenes dataset, which has the annotations."""
+    version: str
+    """Version of its tables, such as v1.0-trainval."""
+    split: str
+    """Split whose samples the predictions have, such as val or mini_val."""
+
+    @property
+    def name(self) -> str:
+        """Name of the metric."""
+        return f"NDS ({self.split})"
+
+    def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
+        """Return NDS on the split. The numbers of images do not matter."""
+        from augment.scores.nuscenes_metric import detection_score
+
+        return MetricValue(*detection_score(predictions, self.root, self.version, self.split))
+
+
+def mean_of_categories(values: np.ndarray, names: Sequence[str]) -> MetricValue:
+    """Return the mean over the categories that have a value; NaN if none has.
+
+    Args:
+        values: Value of each category, NaN where no object counts.
+        names: Names of the categories.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # the mean of nothing
+        mean = float(np.nanmean(values))
+    by_category = {
+        name: None if np.isnan(value) else float(value)
+        for name, value in zip(names, values, strict=True)
+    }
+    return MetricValue(mean, by_category)
