@@ -26,6 +26,7 @@ from augment.output.manifest import (
 from augment.output.tables import FrameBoxes, boxes_bytes
 from augment.scene.labels import Boxes
 from augment.scores.probe import probe
+from recipes.moment import SceneTimes
 from recipes.schema import Output, Recipe, Smog, Weather
 
 WIDTH = 96
@@ -100,6 +101,7 @@ def write_suite(
                         recipe,
                         Identity(f"made:{scene}", recipe.hash, "recorded", "0.6.0", "cpu"),
                         ImageFacts(frame, CAMERA, frame, WIDTH, HEIGHT),
+                        SceneTimes(FRAMES[0], FRAMES[-1]),
                         paths=path_columns(paths),
                         status=OK,
                         checksum=hashes[str(paths["image"])],

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from augment.effects.snow.effect import SnowView
 from augment.render.constants import RasterSettings
 from augment.render.reference import half_extents, project_parts
 from augment.scene.bounds import Bounds, bound_squares, may_show
@@ -210,9 +211,9 @@ def around(camera: Camera) -> list[Camera]:
 def everything(plan, scene: Scene, camera: Camera, **_) -> ViewPlan:
     """Nothing left out of the plan."""
     actors = tuple(range(1, len(scene.actors) + 1))
+    in_view = SnowView(frozenset((0, *actors)), tuple(around(camera)))
     active = tuple(
-        dataclasses.replace(effect, view_data=frozenset((0, *actors)))
-        for effect in plan.active_effects(scene)
+        dataclasses.replace(effect, view_data=in_view) for effect in plan.active_effects(scene)
     )
     return ViewPlan(actors, active, plan.buffers, plan.bare_buffers, plan.steps)
 

@@ -568,7 +568,7 @@ def add_lit_drops(drops, listed, begins, ends, alpha, depth, padded_width, cells
                 position += 1
             if position == first:
                 continue
-            _cover_band(
+            cover_band(
                 drops, listed, first, position, top, bottom, padded_width, alpha, depth, clear
             )
             for row in range(top, bottom):
