@@ -417,6 +417,7 @@ def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
     assert found_by(quick_folder, "kill_a_few_times")["kill_a_few_times"]["kills"] == 8
 
 
+@pytest.mark.long
 def test_a_killed_suite_goes_on_to_identical_files_and_hashes(quick_folder: Path) -> None:
     assert found_by(quick_folder, "kill_suites")["kill_suites"]["kills"] >= 2
 

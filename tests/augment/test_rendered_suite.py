@@ -123,6 +123,7 @@ def test_a_second_run_renders_nothing_and_writes_the_same(finished: Path, tmp_pa
     assert (out / SUITE_FILE).read_bytes() == (finished / SUITE_FILE).read_bytes()
 
 
+@pytest.mark.long
 def test_the_last_shard_writes_suite_json(finished: Path, tmp_path: Path):
     first, second = (make_run(tmp_path, shard=(number, 2)) for number in (1, 2))
     assert run_suite(first, progress=False).suite_file is None
@@ -131,6 +132,7 @@ def test_the_last_shard_writes_suite_json(finished: Path, tmp_path: Path):
     assert (tmp_path / SUITE_FILE).read_bytes() == (finished / SUITE_FILE).read_bytes()
 
 
+@pytest.mark.long
 def test_effects_that_are_added_later_give_the_same_files(finished: Path, tmp_path: Path):
     for options in ({"effects": ["flood"], "levels": [3]}, {"levels": [1]}, {}):
         run_suite(make_run(tmp_path, **options), progress=False)
@@ -147,6 +149,7 @@ def test_a_scene_alone_has_the_files_that_it_has_among_others(finished: Path, tm
     assert len(pictures) > 8 and all(alone[path] == among[path] for path in pictures)
 
 
+@pytest.mark.long
 def test_a_quarter_has_every_fourth_frame_with_the_bytes_of_the_whole(
     finished: Path, tmp_path: Path
 ):

@@ -229,6 +229,7 @@ def renderer_in(out: Path, renderer: Callable = fake_render) -> NumberRenderer:
     return NumberRenderer(scenes, setup_of, out, {"output.image": "png"}, progress=False)
 
 
+@pytest.mark.long
 def test_each_number_is_a_folder_that_a_detector_reads_and_a_second_search_takes_over(
     tmp_path: Path,
 ) -> None:
