@@ -180,7 +180,7 @@ class Speed(Section):
     snowfall_min_width_px: Number = Field(default=0.5, ge=0.1, le=16)
     """Flakes are drawn one by one up to where they are this wide, pixels of the rendered picture;
     farther ones are the veil."""
-    lamp_points: Whole = Field(default=8, ge=2, le=64)
+    lamp_points: Whole = Field(default=8, ge=2, le=16)
     """Points of the sum along each ray for the light that the air scatters out of lamps' beams."""
     lamp_halo_px: Whole = Field(default=4, ge=1, le=32)
     """Width of the pixels in which that light is computed, of the picture's."""
