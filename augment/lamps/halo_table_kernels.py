@@ -161,7 +161,7 @@ def fill_flux(tables, patterns, local_frames, intensities, layouts, flux, peaks)
                 forward_along = along * frame[0, 0]
                 right_along = along * frame[0, 1]
                 up_along = along * frame[0, 2]
-                # Places in the pattern, as `pattern_kernels.pattern_at` defines them.
+                # Places in the pattern, as `pattern_kernels.place_eight` finds them.
                 for p in range(num_planes):
                     forward = forward_along + aside * sides[0, p]
                     right = right_along + aside * sides[1, p]

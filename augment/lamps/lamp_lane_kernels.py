@@ -100,7 +100,7 @@ def gather_lamp_lanes(lamps, rows):
 
 @kernel_function()
 def pattern_of_lanes(tables, starts, texels, forward, right, up):
-    """Return `pattern_kernels.pattern_at` of eight unit directions.
+    """Return the values of eight patterns, each in a unit direction.
 
     Args:
         tables: packed patterns, float32 [K, V, U].
@@ -119,7 +119,7 @@ def pattern_of_lanes(tables, starts, texels, forward, right, up):
 
 @kernel_function()
 def lux_of_lanes(tables, starts, texels, lamp, dx, dy, dz, squared, per_m):
-    """Return lux on surfaces that face a lamp, as `surface_light_kernels.lux_along_ray`.
+    """Return lux on surfaces that face a lamp, as `surface_light.illuminance` defines it.
 
     Args:
         tables: packed patterns, float32 [K, V, U].

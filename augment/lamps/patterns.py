@@ -114,7 +114,7 @@ def pack_pattern(candela_at: CandelaByAngle) -> Float32[np.ndarray, "V U"]:
 def pattern_value(
     table: Float32[np.ndarray, "V U"], directions: Float[np.ndarray, "N 3"]
 ) -> Float64[np.ndarray, "N"]:
-    """Return a pattern's values in directions: the definition of `pattern_kernels.pattern_at`.
+    """Return a pattern's values in directions: the definition of `patterns_of_eight`.
 
     Args:
         table: a packed table.

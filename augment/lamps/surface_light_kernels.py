@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
-from augment.lamps.pattern_kernels import pattern_at, patterns_of_eight
-from augment.lamps.vector_kernels import copies, dot, vector_copies
+from augment.lamps.pattern_kernels import between_nodes, patterns_of_eight
+from augment.lamps.vector_kernels import copies, dot, largest_of, vector_copies
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel, kernel_function
 from augment.render.layout import NUM_LANES, Index
@@ -156,13 +156,7 @@ def _lit_shares(shadows, shadow_map, eye, point, texels):
     j = v8.floor(v8.minimum(v8.maximum(u, zero), last_column - unit))
     v8.store_integers(texels, Index(0), v8.fmuladd(i, copies(width), j))
     first = shadow_map * height * width
-    above_left = v8.gather(images, texels, Index(0), Index(1), Index(first))
-    above_right = v8.gather(images, texels, Index(0), Index(1), Index(first + 1))
-    below_left = v8.gather(images, texels, Index(0), Index(1), Index(first + width))
-    below_right = v8.gather(images, texels, Index(0), Index(1), Index(first + width + 1))
-    above = v8.fmuladd(above_right - above_left, u - j, above_left)
-    below = v8.fmuladd(below_right - below_left, u - j, below_left)
-    nearest = v8.fmuladd(below - above, v - i, above)
+    nearest = between_nodes(images, texels, first, width, u - j, v - i)
     tolerance = v8.fmuladd(copies(shadows.tolerances[0]), per_z, copies(shadows.tolerances[1]))
     share = copies(2) - (nearest - per_z) / tolerance
     share = v8.minimum(v8.maximum(share, zero), unit)
@@ -174,64 +168,6 @@ def _row_times(row, eye, point):
     """Return a row of a pose times eight points, which are from the eye."""
     at_eye = row[0] * eye[0] + row[1] * eye[1] + row[2] * eye[2] + row[3]
     return dot(vector_copies(row[0], row[1], row[2]), point) + copies(at_eye)
-
-
-@kernel_function()
-def read_lamp(lamps, m):
-    """Return lamp m as numbers: place, axis, right, up, candela, pattern, extinction, softening.
-
-    Loops over points read it once: numba counts references to arrays, which takes long.
-    """
-    ax = lamps.axes[m, 0]
-    ay = lamps.axes[m, 1]
-    az = lamps.axes[m, 2]
-    ux = lamps.ups[m, 0]
-    uy = lamps.ups[m, 1]
-    uz = lamps.ups[m, 2]
-    return (
-        (lamps.positions[m, 0], lamps.positions[m, 1], lamps.positions[m, 2]),
-        (ax, ay, az),
-        (ay * uz - az * uy, az * ux - ax * uz, ax * uy - ay * ux),
-        (ux, uy, uz),
-        lamps.intensities[m],
-        lamps.patterns[m],
-        lamps.extinctions[m],
-        lamps.softening[m],
-    )
-
-
-@kernel_function()
-def lux_along_ray(tables, lamp, x, y, z):
-    """Return lux of a lamp on a surface that faces it, and the unit direction to the lamp.
-
-    Args:
-        tables: packed patterns.
-        lamp: result of `read_lamp`.
-        x: x of the point, world, metres.
-        y: y of the point.
-        z: z of the point.
-    """
-    place, axis, right, up, candela, pattern, extinction, softening = lamp
-    dx = place[0] - x
-    dy = place[1] - y
-    dz = place[2] - z
-    squared = dx * dx + dy * dy + dz * dz
-    distance = math.sqrt(squared)
-    per_m = 1.0 / max(distance, 1e-9)
-    dx *= per_m
-    dy *= per_m
-    dz *= per_m
-    share = pattern_at(
-        tables,
-        pattern,
-        -(dx * axis[0] + dy * axis[1] + dz * axis[2]),
-        -(dx * right[0] + dy * right[1] + dz * right[2]),
-        -(dx * up[0] + dy * up[1] + dz * up[2]),
-    )
-    lux = candela * share / (squared + softening)
-    if extinction > 0:
-        lux *= math.exp(-extinction * distance)
-    return lux, dx, dy, dz
 
 
 @kernel_function()
@@ -276,7 +212,7 @@ def _lux_of_eight(tables, size, lamp, towards, squared, per_m, texels):
     Args:
         tables: packed patterns, flat.
         size: rows and columns of a pattern.
-        lamp: result of `_read_near_lamp`.
+        lamp: result of `_read_lamp`.
         towards: from the surfaces to the lamp, metres.
         squared: their squared lengths.
         per_m: one over their lengths.
@@ -302,12 +238,33 @@ def _lux_of_eight(tables, size, lamp, towards, squared, per_m, texels):
 
 
 @kernel_function()
-def _read_near_lamp(lamps, eye, m):
-    """Return lamp m as `read_lamp` does, its place from the eye and its pattern's first index."""
-    place, axis, right, up, candela, pattern, extinction, softening = read_lamp(lamps, m)
-    first = pattern * lamps.tables.shape[1] * lamps.tables.shape[2]
-    near_place = (place[0] - eye[0], place[1] - eye[1], place[2] - eye[2])
-    return near_place, axis, right, up, candela, first, extinction, softening
+def _read_lamp(lamps, eye, m):
+    """Return lamp m as numbers: place from the eye, axis, right, up, candela, pattern, air, size.
+
+    The pattern is the index of its first value in the flat tables, the air is its extinction, the
+    size is the lamp's softening. Loops over points read a lamp once: numba counts references to
+    arrays, which takes long.
+    """
+    ax = lamps.axes[m, 0]
+    ay = lamps.axes[m, 1]
+    az = lamps.axes[m, 2]
+    ux = lamps.ups[m, 0]
+    uy = lamps.ups[m, 1]
+    uz = lamps.ups[m, 2]
+    return (
+        (
+            lamps.positions[m, 0] - eye[0],
+            lamps.positions[m, 1] - eye[1],
+            lamps.positions[m, 2] - eye[2],
+        ),
+        (ax, ay, az),
+        (ay * uz - az * uy, az * ux - ax * uz, ax * uy - ay * ux),
+        (ux, uy, uz),
+        lamps.intensities[m],
+        lamps.patterns[m] * lamps.tables.shape[1] * lamps.tables.shape[2],
+        lamps.extinctions[m],
+        lamps.softening[m],
+    )
 
 
 @kernel_function()
@@ -328,25 +285,13 @@ def _box_of_tile(work, count):
             v8.maximum(high[2], point[2]),
         )
     return (
-        (_least(low[0], work), _least(low[1], work), _least(low[2], work)),
-        (_largest(high[0], work), _largest(high[1], work), _largest(high[2], work)),
+        (
+            -largest_of(v8.negate(low[0])),
+            -largest_of(v8.negate(low[1])),
+            -largest_of(v8.negate(low[2])),
+        ),
+        (largest_of(high[0]), largest_of(high[1]), largest_of(high[2])),
     )
-
-
-@kernel_function()
-def _largest(values, work):
-    """Return the largest of eight numbers."""
-    v8.store(work, Index(SPARE), values)
-    largest = work[SPARE]
-    for lane in range(1, NUM_LANES):
-        largest = max(largest, work[SPARE + lane])
-    return largest
-
-
-@kernel_function()
-def _least(values, work):
-    """Return the least of eight numbers."""
-    return -_largest(v8.negate(values), work)
 
 
 @kernel_function()
@@ -400,7 +345,7 @@ def _rank_lamps(lamps, tables, size, eye, work, texels, count, least_lux, chosen
             bound *= math.exp(-lamps.extinctions[m] * math.sqrt(squared))
             if bound < least or (number == max_lamps and bound <= dropped):
                 continue
-        lamp = _read_near_lamp(lamps, eye, m)
+        lamp = _read_lamp(lamps, eye, m)
         best = copies(0)
         brightest = copies(0)
         for p in range(0, 2 * NUM_LANES, NUM_LANES):
@@ -412,9 +357,9 @@ def _rank_lamps(lamps, tables, size, eye, work, texels, count, least_lux, chosen
             brightest = v8.maximum(brightest, lux)
             cosine = dot(towards, _load_vectors(work, SAMPLE_NORMALS + p)) * per_m
             best = v8.maximum(best, lux * v8.maximum(cosine, copies(MIN_RANK_COSINE)))
-        if SAMPLE_MARGIN * _largest(brightest, work) < least:
+        if SAMPLE_MARGIN * largest_of(brightest) < least:
             continue
-        score = np.float64(_largest(best, work))
+        score = np.float64(largest_of(best))
         if number == max_lamps:
             if score <= scores[number - 1]:
                 dropped = max(dropped, score)
@@ -487,7 +432,7 @@ def _light_tile(lamps, tables, size, view, eye, shadows, work, texels, count, m,
         has_own: True if the light that comes back from signs is asked for.
     """
     zero = copies(0)
-    lamp = _read_near_lamp(lamps, eye, m)
+    lamp = _read_lamp(lamps, eye, m)
     shadow_map = lamps.shadow_maps[m]
     is_returned = has_own and lamps.is_own[m]
     red = fade * lamps.colors[m, 0]

@@ -10,6 +10,7 @@ import numpy as np
 
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel_function
+from augment.render.layout import NUM_LANES, Index
 
 
 @kernel_function()
@@ -28,3 +29,12 @@ def vector_copies(x, y, z):
 def dot(a, b):
     """Return the dot products of eight vectors and eight others."""
     return v8.fmuladd(a[0], b[0], v8.fmuladd(a[1], b[1], a[2] * b[2]))
+
+
+@kernel_function()
+def largest_of(values):
+    """Return the largest of eight numbers."""
+    largest = v8.lane(values, Index(0))
+    for lane in range(Index(1), Index(NUM_LANES)):
+        largest = max(largest, v8.lane(values, lane))
+    return largest

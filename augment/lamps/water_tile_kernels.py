@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from augment.lamps.road_unevenness_kernels import tilt_tile
-from augment.lamps.vector_kernels import copies, dot, vector_copies
+from augment.lamps.vector_kernels import copies, dot, largest_of, vector_copies
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import kernel_function
 from augment.render.layout import NUM_LANES, Index
@@ -234,7 +234,4 @@ def _fill_normals(pixels, tilts, frame):
         v8.store(pixels, first + Index(10) * size, v8.negate(dot((px, py, pz), (nx, ny, nz))))
         v8.store(pixels, first + Index(11) * size, r2)
         v8.store(pixels, first + Index(12) * size, unit / v8.maximum(r2, copies(1e-20)))
-    most = np.float32(0)
-    for lane in range(Index(NUM_LANES)):
-        most = max(most, v8.lane(largest, lane))
-    return np.float64(most)
+    return np.float64(largest_of(largest))

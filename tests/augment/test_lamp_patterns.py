@@ -7,9 +7,11 @@ import pytest
 
 from augment.lamps import patterns
 from augment.lamps.lamp_types import DAYTIME, HIGH, REAR_FOG, STOP, TAIL
-from augment.lamps.pattern_kernels import intensity
+from augment.lamps.pattern_kernels import patterns_of_eight
 from augment.lamps.patterns import Pattern, standard_tables
+from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import serial_kernel
+from augment.render.layout import NUM_LANES, Index
 
 # Test points of UN R112 class B, right-hand traffic: name, degrees up, degrees right, least and
 # largest candela.
@@ -105,27 +107,38 @@ def test_means_over_directions_equal_those_of_known_patterns():
 
 
 @serial_kernel
-def _look_up(tables, pattern, axes, ups, directions, values):
-    for i in range(len(directions)):
-        values[i] = intensity(
-            tables, pattern, axes[0], ups[0], directions[i, 0], directions[i, 1], directions[i, 2]
+def _look_up(tables, pattern, directions, values):
+    """Write a pattern's values in directions [3, N], N a multiple of eight, flat."""
+    rows, columns = tables.shape[1:]
+    texels = np.empty(NUM_LANES, np.int32)
+    count = Index(len(values))
+    for i in range(Index(0), count, Index(NUM_LANES)):
+        eight = patterns_of_eight(
+            tables,
+            pattern * rows * columns,
+            rows,
+            columns,
+            v8.load(directions, i),
+            v8.load(directions, count + i),
+            v8.load(directions, count + count + i),
+            texels,
         )
+        v8.store(values, i, eight)
 
 
 def test_kernel_equals_the_plain_definition_in_all_directions():
     rng = np.random.default_rng(1)
-    directions = rng.normal(size=(500, 3))
+    directions = rng.normal(size=(504, 3))
     directions[:6] = np.concatenate([np.eye(3), -np.eye(3)])  # the corners of the folds
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    axis = np.array([0.6, 0.8, 0.0])
-    up = np.array([0.0, 0.0, 1.0])
-    frame = np.stack([axis, np.cross(axis, up), up])
+    directions = directions.astype(np.float32)
+    tables = np.require(standard_tables(), np.float32, ["C", "W"])
     for pattern in Pattern:
-        values = np.empty(len(directions))
-        _look_up(standard_tables(), int(pattern), axis[None], up[None], directions, values)
-        expected = patterns.pattern_value(standard_tables()[pattern], directions @ frame.T)
-        # Rounding of float64, times the steepest cell of a table.
-        np.testing.assert_allclose(values, expected, atol=1e-12)
+        values = np.empty(len(directions), np.float32)
+        _look_up(tables, int(pattern), directions.T.ravel(), values)
+        expected = patterns.pattern_value(tables[pattern], directions)
+        # Rounding of float32, times the steepest cell of a table.
+        np.testing.assert_allclose(values, expected, atol=2e-5)
 
 
 def test_packed_tables_equal_their_functions_between_nodes():
