@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from augment.effects.wet.mirroring_film import mirroring_film
 from augment.effects.wet.reflection import Film, Plane
 from augment.lamps.road_unevenness import water_of_road
 from augment.light.srgb import linear_from_display
+from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
 from augment.view.plan import make_plan
@@ -47,11 +50,14 @@ def street() -> Scene:
 
 
 def lamp_gain(
-    scene: Scene, weather: dict[str, object], lamp: dict[str, object] = LAMP
+    scene: Scene,
+    weather: dict[str, object],
+    lamp: dict[str, object] = LAMP,
+    camera: Camera | None = None,
 ) -> tuple[np.ndarray, WeatheredBuffers]:
     """Return the linear light that a lamp adds to each pixel, and the picture with the lamp."""
     pictures = list[np.ndarray]()
-    camera = scene.frames[0].cameras["ahead"]
+    camera = camera or scene.frames[0].cameras["ahead"]
     for lamps in ((), (lamp,)):
         output = {"depth": "none", "labels": False}
         sections = {"weather": weather, "output": output, "light": {**NIGHT, "lamps": lamps}}
@@ -111,6 +117,31 @@ def test_drops_near_a_lamp_shine_one_by_one(street, name) -> None:
     # The mask holds pixels that a drop or flake covers by more than a twentieth.
     mask = buffers.masks[name].numpy()[:30]
     assert mask.any() and is_bright[mask].mean() > 0.9
+
+
+@pytest.mark.parametrize(("name", "rate_mm_h"), [("rain", 30.0), ("snowfall", 5.0)])
+def test_air_and_drops_under_lamps_have_the_showers_rate_at_the_camera(street, name, rate_mm_h):
+    """It is dry where the drive began, 200 m away."""
+    first = street.frames[0].cameras["ahead"]
+    world_from_moved = torch.eye(4, dtype=torch.float64)
+    world_from_moved[0, 3] = 200.0
+    camera = replace(first, camera_from_world=first.camera_from_world @ world_from_moved)
+    lamp = {**LAMP, "x_m": -194.0, "candela": 5000.0}
+    section = {"wetness": 0.0, "spray": False} if name == "rain" else {}
+    along = [
+        {"distance_m": 0, "rate_mm_h": 0},
+        {"distance_m": 50, "rate_mm_h": 0},
+        {"distance_m": 50, "rate_mm_h": rate_mm_h},
+    ]
+    shower = {name: {**section, "rate_mm_h": 0, "along": along}}
+    in_shower, _ = lamp_gain(street, shower, lamp, camera)
+    everywhere, _ = lamp_gain(street, {name: {**section, "rate_mm_h": rate_mm_h}}, lamp, camera)
+    assert everywhere.mean() > 1e-3
+    # The veil before the lamp ends at the shower's edge, 150 m away.
+    np.testing.assert_allclose(in_shower, everywhere, atol=0.02)
+    assert in_shower.mean() == pytest.approx(everywhere.mean(), rel=0.02)
+    dry, _ = lamp_gain(street, {}, lamp, camera)
+    assert dry.mean() < 0.8 * everywhere.mean()
 
 
 def test_a_wet_road_is_as_rough_as_its_slopes_have_variance() -> None:

@@ -168,14 +168,14 @@ def _airlight(view: RenderedView, color_map: Tensor | None) -> tuple[float, floa
 def air_of(effect: EffectInScene, view: RenderedView, camera: Camera) -> AirExtinction:
     """Return the extinction of fog, rain and snowfall in a view.
 
-    Fog with banks counts as plain fog that is as dense as the banks around the camera.
+    Fog with banks counts as plain fog that is as dense as the banks around the camera, and a shower
+    as rain or snowfall of the rate at the camera.
     """
     per_m = 0.0
     kind: Literal["rain", "snow"] = "rain"
     for other in effect.earlier_effects:
-        sizes = getattr(other.settings, "sizes", None)
-        if other.hooks.name in ("rain", "snowfall") and sizes is not None:
-            per_m += sizes.extinction_per_m
+        if other.hooks.name in ("rain", "snowfall") and other.settings is not None:
+            per_m += other.settings.at(camera).sizes.extinction_per_m
             if other.hooks.name == "snowfall":
                 kind = "snow"
     smog = next((o for o in effect.earlier_effects if o.hooks.name == "smog"), None)

@@ -126,7 +126,7 @@ def make_light_plan(recipe: Recipe, scene: Scene, light: Light, hour: Hour) -> L
     own_beam: str = light.own_beams
     if own_beam == "auto":
         own_beam = "dipped" if is_auto_on else "off"
-    rates = [section_at(recipe, f"weather.{name}.rate_mm_h") for name in ("rain", "snowfall")]
+    falling = (recipe.weather.rain, recipe.weather.snowfall)
     wetness = section_at(recipe, "weather.rain.ground_wetness") or 0.0
     snow = recipe.weather.snow
     speed = recipe.render.speed
@@ -139,7 +139,7 @@ def make_light_plan(recipe: Recipe, scene: Scene, light: Light, hour: Hour) -> L
         own_beam=own_beam,
         has_street_lamps=light.street == "on" or (light.street == "auto" and hour.is_dark),
         has_signs=own_beam != "off" and hour.is_dark and has_signs(scene),
-        has_drops=any(rates),
+        has_drops=any(section is not None and section.has_effect for section in falling),
         extinction_per_m=section_at(recipe, "weather.smog.resolved_extinction_per_m") or 0.0,
         wetness=1.0 if recipe.weather.flood is not None else wetness,
         snow_cover=snow.coverage if snow is not None and snow.has_effect else 0.0,
