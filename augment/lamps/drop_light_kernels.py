@@ -145,7 +145,7 @@ def light_cells(rays, distances, lamps, tables, starts, is_snow, min_luminance, 
                 most = phase * lamp[7] / (squared + lamp[6])
                 if v8.mask_bits(v8.greater(most, least)) == Index(0):
                     continue
-                lux = lux_of_lanes(tables, firsts, texels, lamp, dx, dy, dz, squared, per_m)
+                lux = lux_of_lanes(tables, firsts, texels, lamp, (dx, dy, dz), squared, per_m)
                 light = v8.maximum(lux * phase, zero)
                 cell = first_cell + column
                 v8.store(cells, cell, v8.fmuladd(light, red, v8.load(cells, cell)))

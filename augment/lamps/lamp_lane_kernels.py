@@ -118,7 +118,7 @@ def pattern_of_lanes(tables, starts, texels, forward, right, up):
 
 
 @kernel_function()
-def lux_of_lanes(tables, starts, texels, lamp, dx, dy, dz, squared, per_m):
+def lux_of_lanes(tables, starts, texels, lamp, towards, squared, per_m):
     """Return lux on surfaces that face a lamp, as `surface_light.illuminance` defines it.
 
     Args:
@@ -126,11 +126,9 @@ def lux_of_lanes(tables, starts, texels, lamp, dx, dy, dz, squared, per_m):
         starts: index of each lane's first value in the flat tables, int32 [8].
         texels: work space, int32 [8].
         lamp: result of `read_lamp_lanes` or `gather_lamp_lanes`.
-        dx: x from the place to the lamp, metres.
-        dy: y of that.
-        dz: z of that.
-        squared: square of the distance, m2.
-        per_m: inverse of the distance, 1 / metres.
+        towards: from the places to the lamps, metres.
+        squared: their squared lengths.
+        per_m: one over their lengths.
     """
     _, axis, right, up, candela, extinction, softening, _ = lamp
     away = v8.negate(per_m)
@@ -138,9 +136,9 @@ def lux_of_lanes(tables, starts, texels, lamp, dx, dy, dz, squared, per_m):
         tables,
         starts,
         texels,
-        dot((dx, dy, dz), axis) * away,
-        dot((dx, dy, dz), right) * away,
-        dot((dx, dy, dz), up) * away,
+        dot(towards, axis) * away,
+        dot(towards, right) * away,
+        dot(towards, up) * away,
     )
     # Air thicker than exp(-80) is black.
     path = v8.minimum(extinction * squared * per_m, copies(80))

@@ -56,7 +56,7 @@ MIN_LUMINANCE_SHARE = 1.0 / 16.0
 
 
 @kernel_function()
-def _half_vector(dx, dy, dz, distance, pixel, pixel_rad):
+def _half_vector(towards, distance, pixel, pixel_rad):
     """Return the tangents of the half vector of lamp and eye, and what it takes to find them.
 
     D and E are the vectors from the water to lamp and eye, n is the normal, g the direction along
@@ -72,9 +72,9 @@ def _half_vector(dx, dy, dz, distance, pixel, pixel_rad):
         normal part; D n; D E; square of the tangent from a pixel to the one beside it.
     """
     px, py, pz, nx, ny, nz, cx, cy, cz, eye_m, eye_n, r2, per_r2 = pixel
-    lamp_n = dot((dx, dy, dz), (nx, ny, nz))
-    cosine = v8.negate(dot((dx, dy, dz), (px, py, pz)))
-    triple = dot((dx, dy, dz), (cx, cy, cz))
+    lamp_n = dot(towards, (nx, ny, nz))
+    cosine = v8.negate(dot(towards, (px, py, pz)))
+    triple = dot(towards, (cx, cy, cz))
     triple2 = triple * triple
     q = lamp_n * eye_n - cosine
     eye_part = q * eye_n
@@ -146,15 +146,24 @@ def _glint(half, distance, per_m, eye_m, eye_n, m2, across_m2, exponent):
 
 
 @kernel_function()
-def _strength(lamp, dx, dy, dz, squared, distance, pixel, rough2, pixel_rad, max_exponent):
+def _strength(lamp, gap, pixel, rough2, pixel_rad, max_exponent):
     """Return luminance per lux of eight pairs of lamp and pixel, and the inverse distances.
 
     The luminance is 0 where nothing glints, and in all lanes at once without further work.
+
+    Args:
+        lamp: the lamps, as `lamp_lane_kernels` reads them.
+        gap: result of `_gap`.
+        pixel: numbers of the pixels.
+        rough2: m^2 of the pixels.
+        pixel_rad: width of a pixel, radians.
+        max_exponent: exponent from which on nothing glints.
     """
+    towards, squared, distance = gap
     zero = copies(0)
     eye_m = pixel[9]
     eye_n = pixel[10]
-    half = _half_vector(dx, dy, dz, distance, pixel, pixel_rad)
+    half = _half_vector(towards, distance, pixel, pixel_rad)
     along2, across2, half_n2, lamp_n, _, pixel_tilt2 = half
     # The lamp's disc blurs the mirror by half its angle.
     m2 = v8.fmuladd(copies(0.25) * lamp[6], copies(1) / squared, rough2)
@@ -175,12 +184,10 @@ def _strength(lamp, dx, dy, dz, squared, distance, pixel, rough2, pixel_rad, max
 
 @kernel_function()
 def _gap(lamp, pixel):
-    """Return x, y, z from the water to the lamp, the square of the distance, and the distance."""
-    dx = lamp[0][0] - pixel[0]
-    dy = lamp[0][1] - pixel[1]
-    dz = lamp[0][2] - pixel[2]
-    squared = v8.maximum(dot((dx, dy, dz), (dx, dy, dz)), copies(1e-6))
-    return dx, dy, dz, squared, v8.sqrt(squared)
+    """Return the ways from the water to the lamps, the squares of their lengths, and these."""
+    towards = (lamp[0][0] - pixel[0], lamp[0][1] - pixel[1], lamp[0][2] - pixel[2])
+    squared = v8.maximum(dot(towards, towards), copies(1e-6))
+    return towards, squared, v8.sqrt(squared)
 
 
 @kernel_function()
@@ -246,8 +253,8 @@ def _find_candidates(
         largest_m: largest roughness.
         largest_tilt: largest tilt of a wave.
         min_luminance: luminance that need not be added.
-        rows: output, rows of the lamps, int32 [M + 8].
-        bounds: output, luminances, float32 [M + 8].
+        rows: output, rows of the lamps, int32 [M].
+        bounds: output, luminances, float32 [M].
 
     Returns:
         The number of the lamps.
@@ -267,9 +274,9 @@ def _find_candidates(
         blur2 = zero
         for sample in range(len(SAMPLES)):
             pixel = _flat_pixel(pixels, wet[SAMPLES[sample] * (count - 1) // (TILE_SIZE - 1)])
-            dx, dy, dz, squared, distance = _gap(lamp, pixel)
+            towards, squared, distance = _gap(lamp, pixel)
             along2, across2, half_n2, _, _, pixel_tilt2 = _half_vector(
-                dx, dy, dz, distance, pixel, pixel_rad
+                towards, distance, pixel, pixel_rad
             )
             tilt = v8.sqrt((along2 + across2) / half_n2)
             smallest = v8.minimum(smallest, tilt)
@@ -311,7 +318,7 @@ def _choose_lamps(
         wet: its pixels that show water.
         count: their number.
         pixel_rad: width of a pixel, radians.
-        rows: lamps that may glint, int32 [M + 8].
+        rows: lamps that may glint, int32 [M].
         bounds: the most luminance that they may have.
         number: their number.
         chosen: output, rows of the lamps, int64 [max_lamps].
@@ -332,21 +339,11 @@ def _choose_lamps(
         for sample in range(len(SAMPLES)):
             p = wet[SAMPLES[sample] * (count - 1) // (TILE_SIZE - 1)]
             pixel = _flat_pixel(pixels, p)
-            dx, dy, dz, squared, distance = _gap(lamp, pixel)
-            strength, per_m = _strength(
-                lamp,
-                dx,
-                dy,
-                dz,
-                squared,
-                distance,
-                pixel,
-                v8.broadcast(pixels[ROUGHNESS2, p]),
-                pixel_rad,
-                MAX_EXPONENT,
-            )
+            gap = _gap(lamp, pixel)
+            rough2 = v8.broadcast(pixels[ROUGHNESS2, p])
+            strength, per_m = _strength(lamp, gap, pixel, rough2, pixel_rad, MAX_EXPONENT)
             if v8.mask_bits(v8.greater(strength, zero)) != Index(0):
-                lux = lux_of_lanes(tables, firsts, texels, lamp, dx, dy, dz, squared, per_m)
+                lux = lux_of_lanes(tables, firsts, texels, lamp, gap[0], gap[1], per_m)
                 brightest = v8.maximum(brightest, strength * lux)
         v8.store(lights, Index(0), brightest)
         for lane in range(min(NUM_LANES, number - start)):
@@ -405,23 +402,13 @@ def _add_lamp(
         group = Index(groups[g])
         first = group * Index(NUM_LANES)
         pixel = _load_pixels(pixels, group)
-        dx, dy, dz, squared, distance = _gap(lamp, pixel)
-        strength, per_m = _strength(
-            lamp,
-            dx,
-            dy,
-            dz,
-            squared,
-            distance,
-            pixel,
-            v8.load(pixels, first + Index(ROUGHNESS2) * size),
-            pixel_rad,
-            max_exponent,
-        )
+        gap = _gap(lamp, pixel)
+        rough2 = v8.load(pixels, first + Index(ROUGHNESS2) * size)
+        strength, per_m = _strength(lamp, gap, pixel, rough2, pixel_rad, max_exponent)
         most = strength * (lamp[7] * per_m * per_m)
         if v8.mask_bits(v8.greater(most, least)) == Index(0):
             continue
-        lux = lux_of_lanes(tables, firsts, texels, lamp, dx, dy, dz, squared, per_m)
+        lux = lux_of_lanes(tables, firsts, texels, lamp, gap[0], gap[1], per_m)
         light = strength * lux * v8.load(pixels, first + Index(SHARE) * size)
         if shadow_map >= 0:
             v8.store(lights, Index(0), light)
